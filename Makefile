@@ -1,0 +1,47 @@
+# Everything runs in one virtual environment, .venv, made on first use. PYTHON chooses the interpreter (>= 3.11).
+PYTHON ?= python3
+TABLE ?=
+MODEL ?= law
+OUT ?= report
+
+BIN := .venv/bin
+SETUP := .venv/.installed
+
+.PHONY: help setup fit test check lint types slow bench clean
+.DEFAULT_GOAL := help
+
+help: ## list the targets
+	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -e 's/:.*##/:/' -e 's/^/  make /'
+
+setup: $(SETUP) ## make .venv with the package and what its tests need
+
+$(SETUP): pyproject.toml
+	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "afm-jax needs Python >= 3.11; name one with: make PYTHON=python3.12 ...")'
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	@touch $@
+
+fit: $(SETUP) ## fit the bundled table (or TABLE=..., MODEL=...), print the impact law, write OUT=report/
+	$(BIN)/afm-jax fit $(if $(TABLE),'$(TABLE)',--example) --model $(MODEL) --out $(OUT)
+
+test: $(SETUP) ## the tests (under 10 minutes on two cores)
+	$(BIN)/python -m pytest
+
+lint: $(SETUP)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+
+types: $(SETUP)
+	$(BIN)/pyright
+
+slow: $(SETUP)
+	$(BIN)/python -m pytest -m slow
+
+check: lint types test slow ## all that CI runs: format, lint, types, tests, slow tests with the notebooks
+
+bench: $(SETUP) ## impacts per second, next to SciPy
+	$(BIN)/afm-jax bench --out $(OUT)
+
+clean: ## remove the environment, caches and reports
+	rm -rf .venv report results .pytest_cache .ruff_cache .hypothesis .coverage build dist *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,1 @@
+"""What exists in a scene: cantilever, platform, and the container that holds them."""

@@ -1,0 +1,20 @@
+"""A scene: a cantilever, a moving platform, and what happens when they meet."""
+
+import equinox as eqx
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
+
+
+class Scene(eqx.Module):
+    """A container, nothing more: its parts are traced parameters, its structure says what is simulated.
+
+    Args:
+        cantilever: the tip and its spring.
+        platform: the moving sample.
+        interaction: an `ImpactLaw`, with or without a collision delay.
+    """
+
+    cantilever: Cantilever
+    platform: Platform
+    interaction: eqx.Module

@@ -1,0 +1,206 @@
+"""The switching condition (eq. 3): the first time after an impact at which the tip meets the platform again.
+
+The search cannot miss a root. With a gap g >= 0, its slope g' and a bound |g''| <= M over the whole flight, the gap
+stays positive for at least h = (g' + sqrt(g'^2 + 2 M g))/M, so a step of h never passes a root; it leaves the surface
+by itself after an impact (g = 0, g' > 0) and closes in quadratically. M = Omega sqrt(E) sqrt(1 + 1/Q^2) + beta omega^2,
+with E = v^2 + Omega^2 z^2, which a free flight never raises. The same bound against the highest point the platform can
+reach gives a second, often much longer, safe step.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.trigonometry import sine_cosine
+from afm_jax.impact.implicit import implicit_root
+from afm_jax.outcome import Outcome
+
+DEFAULT_MAX_STEPS = 2000
+DEFAULT_ROOT_TOLERANCE_US = 1e-13
+
+
+class Flight(NamedTuple):
+    """A free flight that leaves the platform at `start_us` (us) with the lab velocity `velocity` (nm/us)."""
+
+    cantilever: Cantilever
+    platform: Platform
+    start_us: Float[Array, ""]
+    velocity: Float[Array, ""]
+
+
+class FirstImpact(NamedTuple):
+    """The first impact of a flight.
+
+    ``duration_us`` is the time from the flight's start to the impact; 0 where ``outcome`` is not `Outcome.IMPACT`.
+    """
+
+    duration_us: Float[Array, ""]
+    outcome: Int[Array, ""]
+
+
+def flight_gap(duration_us: Float[Array, ""], flight: Flight) -> Float[Array, ""]:
+    """Return the gap z - z_p in nm, a duration in us after the start of a flight (eq. 3: its first zero)."""
+    cantilever, platform, start, velocity = flight
+    position, _ = cantilever.propagator(duration_us)(platform.position(start), velocity)
+    return position - platform.position(start + duration_us)
+
+
+def first_impact(
+    flight: Flight,
+    *,
+    skip_us: ArrayLike | None = None,
+    max_steps: int = DEFAULT_MAX_STEPS,
+    root_tolerance_us: ArrayLike = DEFAULT_ROOT_TOLERANCE_US,
+) -> FirstImpact:
+    """Return the first impact of a flight, guaranteed to be the first, with implicit derivatives.
+
+    Args:
+        flight: where, when and how fast the tip leaves the platform.
+        skip_us: the gap counts from this time (us) after the start on, after a negative collision delay; None: at once.
+        max_steps: steps before the search gives up with `Outcome.STEP_LIMIT`.
+        root_tolerance_us: the remaining error of the impact time at which the search stops, in us.
+
+    Returns:
+        Duration and outcome; the duration's derivatives of any order and mode follow the implicit function theorem.
+    """
+    skip = None if skip_us is None else jnp.asarray(skip_us, flight.velocity.dtype)
+    search = _Search.begin(*lax.stop_gradient((flight, skip)))
+    found, ended = search.run(max_steps, jnp.asarray(root_tolerance_us, flight.velocity.dtype))
+    hit = ended == Outcome.IMPACT
+    root = implicit_root(flight_gap, jnp.where(hit, found, 0.0), flight)
+    return FirstImpact(jnp.where(hit, root, 0.0), ended)
+
+
+class _Search(NamedTuple):
+    """What the search for the first root needs of a flight: the constants of its closed form, and its bounds."""
+
+    angular_frequency: Float[Array, ""]  # of the flight, damped
+    decay_rate: Float[Array, ""] | None
+    position: Float[Array, ""]  # at the start
+    velocity: Float[Array, ""]
+    position_sine: Float[Array, ""]  # factor of the sine in z e^(gamma s)
+    velocity_sine: Float[Array, ""]
+    platform: Platform
+    start_us: Float[Array, ""]
+    skip_us: Float[Array, ""] | None
+    reach: Float[Array, ""]  # highest point the platform can get to; infinite with a rising offset
+    latest_us: Float[Array, ""]  # no impact can happen after this duration
+    tip_bound: Float[Array, ""]  # bound of |z''|
+    gap_bound: Float[Array, ""]  # bound of |g''|
+    clearance_speed: Float[Array, ""]  # at the start
+
+    @classmethod
+    def begin(cls, flight: Flight, skip_us: Float[Array, ""] | None) -> "_Search":
+        cantilever, platform, start, velocity = flight
+        position, platform_velocity = platform.position_and_velocity(start)
+        omega, omega_d, gamma = (
+            cantilever.angular_frequency,
+            cantilever.damped_angular_frequency,
+            cantilever.decay_rate,
+        )
+        damped = cantilever.quality_factor is not None
+        tip_bound = omega * jnp.sqrt(velocity**2 + (omega * position) ** 2)
+        if damped:
+            tip_bound = tip_bound * jnp.sqrt(1.0 + (2.0 * gamma / omega) ** 2)
+        rate = platform.offset_rate_nm_per_us
+        reach = jnp.where(rate > 0.0, jnp.inf, platform.offset_nm + rate * start + platform.amplitude_nm)
+        amplitude = jnp.sqrt(position**2 + ((velocity + gamma * position) / omega_d) ** 2)
+        return cls(
+            angular_frequency=omega_d,
+            decay_rate=gamma if damped else None,
+            position=position,
+            velocity=velocity,
+            position_sine=(velocity + gamma * position) / omega_d,
+            velocity_sine=-(gamma * velocity + omega**2 * position) / omega_d,
+            platform=platform,
+            start_us=start,
+            skip_us=skip_us,
+            reach=reach,
+            latest_us=_latest_impact(amplitude, reach, gamma if damped else None, rate),
+            tip_bound=tip_bound,
+            gap_bound=tip_bound + platform.top_speed_nm_per_us * platform.angular_frequency,
+            clearance_speed=velocity - platform_velocity,
+        )
+
+    def safe_step(self, duration: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Return a step in us that cannot pass the first root, and the error of the root it would leave."""
+        sine, cosine = sine_cosine(self.angular_frequency * duration)
+        position = self.position * cosine + self.position_sine * sine
+        velocity = self.velocity * cosine + self.velocity_sine * sine
+        if self.decay_rate is not None:
+            decay = jnp.exp(-self.decay_rate * duration)
+            position, velocity = decay * position, decay * velocity
+        platform_position, platform_velocity = self.platform.position_and_velocity(self.start_us + duration)
+        gap_rate = velocity - platform_velocity
+        step = _time_above(position - platform_position, gap_rate, self.gap_bound)
+        clear = _time_above(position - self.reach, velocity, self.tip_bound)
+        # Once M h is small against |g'|, the root exists and is at most M h^2/|g'| further on.
+        bend = self.gap_bound * step
+        error = jnp.where(4.0 * bend <= -gap_rate, bend * step / jnp.maximum(-gap_rate, 1e-30), jnp.inf)
+        return jnp.maximum(step, clear), error
+
+    def run(self, max_steps: int, tolerance: Float[Array, ""]) -> tuple[Float[Array, ""], Int[Array, ""]]:
+        """Step until the root is met, out of reach, or the steps are used up."""
+        resolution = 4.0 * jnp.finfo(self.velocity.dtype).eps
+
+        def searching(state):
+            duration, step, steps = state
+            return (step > 0.0) & (duration < self.latest_us) & (steps < max_steps)
+
+        def advance(state):
+            duration, step, steps = state
+            duration = duration + step
+            step, error = self.safe_step(duration)
+            met = (error <= tolerance) | (step <= resolution * duration)
+            return jnp.where(met, duration + step, duration), jnp.where(met, 0.0, step), steps + 1
+
+        leaving = self.clearance_speed > 0.0
+        finite = jnp.isfinite(self.gap_bound) & jnp.isfinite(self.start_us) & jnp.isfinite(self.clearance_speed)
+        begin, first, inside = self._first_step()
+        start = (begin, jnp.where(finite & leaving, first, 0.0), jnp.zeros_like(begin, dtype=jnp.int32))
+        duration, step, _ = lax.while_loop(searching, advance, start)
+        ended = jnp.where(
+            step <= 0.0,
+            Outcome.IMPACT,
+            jnp.where(duration >= self.latest_us, Outcome.NO_FURTHER_IMPACT, Outcome.STEP_LIMIT),
+        )
+        ended = jnp.where(inside, Outcome.DELAY_EXCEEDS_FLIGHT, ended)
+        return duration, jnp.where(finite & leaving, ended, Outcome.INVALID_START).astype(jnp.int32)
+
+    def _first_step(self) -> tuple[Float[Array, ""], Float[Array, ""], Bool[Array, ""]]:
+        """Return where the search begins, its first step, and whether the tip is inside the platform there."""
+        leave = 2.0 * self.clearance_speed / self.gap_bound
+        if self.skip_us is None:
+            return jnp.zeros_like(leave), leave, jnp.zeros_like(leave, dtype=bool)
+        skips = self.skip_us > 0.0
+        step, _ = self.safe_step(self.skip_us)
+        return jnp.where(skips, self.skip_us, 0.0), jnp.where(skips, step, leave), skips & (step <= 0.0)
+
+
+def _time_above(height: Float[Array, ""], rate: Float[Array, ""], bound: Float[Array, ""]) -> Float[Array, ""]:
+    """Return how long a height above a level stays positive at least, its second derivative within the bound.
+
+    (g' + sqrt(g'^2 + 2 M g))/M, for g' <= 0 in the form 2 g/(sqrt(g'^2 + 2 M g) - g') that does not cancel.
+    """
+    above = height > 0.0
+    root = jnp.sqrt(rate * rate + 2.0 * bound * jnp.where(above, height, 0.0))
+    falling = rate <= 0.0
+    step = jnp.where(falling, 2.0 * height, rate + root) / jnp.where(falling, root - rate, bound)
+    return jnp.where(above, step, 0.0)
+
+
+def _latest_impact(
+    amplitude: Float[Array, ""], reach: Float[Array, ""], decay_rate: Float[Array, ""] | None, rate: Float[Array, ""]
+) -> Float[Array, ""]:
+    """Return the duration in us after which the flight's envelope lies above all that the platform can reach."""
+    retreats = rate < 0.0
+    latest = jnp.where(retreats, (reach + amplitude) / jnp.where(retreats, -rate, 1.0), jnp.inf)
+    if decay_rate is None:
+        return latest
+    below = reach < 0.0
+    decayed = jnp.log(amplitude / jnp.where(below, -reach, 1.0)) / decay_rate
+    return jnp.minimum(latest, jnp.where(below, decayed, jnp.inf))

@@ -1,0 +1,168 @@
+"""Single-impact orbits: one impact in N drive periods (eq. 9); admissible, stable, and what one measures of them."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from afm_jax.apparatus.scene import Scene
+from afm_jax.impact.first_impact import Flight, first_impact
+from afm_jax.impact.implicit import implicit_root
+from afm_jax.impact.jacobian import flight_jacobian, impact_jacobian
+from afm_jax.impact.law import impact_law_of
+from afm_jax.impact.orbit_amplitude import FlightEnds, lockin, peak_amplitude
+from afm_jax.impact.orbit_closure import OrbitProblem, closing_residual, closure, speeds_at
+from afm_jax.impact.orbit_search import find_roots
+from afm_jax.outcome import Outcome
+from afm_jax.parameters import is_traced, require_float64
+
+NEAR_DOUBLE = 1e-3
+"""Slope of the closing condition per relative change of speed below which a root counts as near-double (a fold)."""
+_ARRIVAL_TOLERANCE = 1e-7
+"""How far (in drive periods) the first impact found may lie before the orbit's own, by rounding."""
+
+
+class SingleImpactOrbits(eqx.Module):
+    """All (1, N) orbits of a scene, ascending in approach speed, in a fixed number of slots.
+
+    Without a collision delay there are 4 slots, as many as eq. 9 can have roots; with one there are 16. Every
+    attribute has the slots' shape; where ``exists`` is False the numbers are NaN.
+
+    Attributes:
+        exists: the slot holds a root of eq. 9 with V' > v_p > V that satisfies eq. 6 with the positive root.
+        admissible: the flight does not pass through the platform on its way.
+        stable: |trace| < |1 + determinant| and |determinant| <= 1 of the linearised map.
+        near_double: close to a fold, where two orbits merge and derivatives diverge.
+        phase_rad: drive phase omega t just after impact, in [0, 2 pi).
+        velocity_after_nm_per_us: tip velocity V' in the lab just after impact.
+        velocity_before_nm_per_us: tip velocity V just before.
+        approach_speed_nm_per_us: u_in relative to the platform.
+        rebound_speed_nm_per_us: u_out relative to the platform.
+        delay_us: collision delay.
+        peak_amplitude_nm: largest height above the rest position.
+        lockin_amplitude_nm: amplitude at the response frequency omega/N.
+        lockin_phase_deg: its phase, modulo 360/N; t = 0 when the platform is highest.
+        trace: T of the linearised map.
+        determinant: D of the linearised map.
+        complete: scalar; False if there were more orbits than slots (with a delay only).
+    """
+
+    exists: Bool[Array, "..."]
+    admissible: Bool[Array, "..."]
+    stable: Bool[Array, "..."]
+    near_double: Bool[Array, "..."]
+    phase_rad: Float[Array, "..."]
+    velocity_after_nm_per_us: Float[Array, "..."]
+    velocity_before_nm_per_us: Float[Array, "..."]
+    approach_speed_nm_per_us: Float[Array, "..."]
+    rebound_speed_nm_per_us: Float[Array, "..."]
+    delay_us: Float[Array, "..."]
+    peak_amplitude_nm: Float[Array, "..."]
+    lockin_amplitude_nm: Float[Array, "..."]
+    lockin_phase_deg: Float[Array, "..."]
+    trace: Float[Array, "..."]
+    determinant: Float[Array, "..."]
+    complete: Bool[Array, "..."]
+
+
+def single_impact_orbits(scene: Scene, order: ArrayLike) -> SingleImpactOrbits:
+    """Return every single-impact orbit of an order (eq. 9; damped, with viscous loss and delay).
+
+    Args:
+        scene: a scene whose interaction is an `ImpactLaw`, without offset ramp.
+        order: N, drive periods between impacts; a positive integer, scalar.
+
+    Returns:
+        The orbits in a fixed number of slots with a mask, differentiable in the scene's parameters. Without a delay
+        they are all roots of a quartic; with one, all that a scan of 8192 speeds brackets, close pairs included.
+
+    Raises:
+        RuntimeError: if JAX is not set to 64-bit floats.
+        TypeError: if the scene's interaction is not an impact law.
+        ValueError: if the order is not a positive integer, or the platform's offset ramps.
+    """
+    require_float64()
+    impact_law_of(scene)
+    _check_order(order)
+    rate = scene.platform.offset_rate_nm_per_us
+    if not is_traced(rate) and np.any(np.asarray(rate) != 0.0):
+        raise ValueError(f"`offset_rate_nm_per_us` must be 0 for a periodic orbit, but is {np.asarray(rate).flat[0]:g}")
+    return _single_impact_orbits(scene, jnp.asarray(order, scene.platform.frequency_khz.dtype))
+
+
+def _check_order(order: ArrayLike) -> None:
+    if is_traced(order):
+        return
+    number = np.asarray(order)
+    if number.ndim or not np.isfinite(number) or number != np.round(number) or number < 1:
+        raise ValueError(f"`order` must be a positive integer, but is {order}")
+
+
+@jax.jit
+def _single_impact_orbits(scene: Scene, order: Float[Array, ""]) -> SingleImpactOrbits:
+    problem = OrbitProblem(scene.cantilever, scene.platform, impact_law_of(scene), order)
+    roots = find_roots(problem)
+    orbits = jax.vmap(_orbit, in_axes=(0, 0, None))(roots.coordinate, roots.found, problem)
+    return eqx.tree_at(lambda result: result.complete, orbits, roots.complete)
+
+
+def _orbit(coordinate: Float[Array, ""], found: Bool[Array, ""], problem: OrbitProblem) -> SingleImpactOrbits:
+    """Return what there is to know about one root; harmless numbers, then NaN, where there is none."""
+    cantilever, platform, law, order = problem
+    # An empty slot computes with the speeds of some flight well above capture.
+    coordinate = jnp.where(found, coordinate, 2.0 * platform.top_speed_nm_per_us + 2.0 * jnp.sqrt(law.epsilon + 1.0))
+    coordinate = implicit_root(closing_residual, coordinate, problem)
+    speeds = speeds_at(coordinate, law)
+    cosine, sine, determinant = closure(coordinate, problem)
+    found = found & (determinant != 0.0)
+    safe = jnp.where(found, determinant, 1.0)
+    a, b = jnp.where(found, cosine / safe, 1.0), jnp.where(found, sine / safe, 0.0)
+    phase = jnp.arctan2(b, a) % (2.0 * jnp.pi)
+    start = phase / platform.angular_frequency
+    duration = order * platform.period_us - speeds.delay
+    velocity = platform.velocity(start) + speeds.rebound
+    arrival = start + duration
+    end_position, before = cantilever.propagator(duration)(platform.position(start), velocity)
+    jacobian = impact_jacobian(law, platform, arrival, before) @ flight_jacobian(
+        cantilever, platform, start, velocity, arrival
+    )
+    trace, det = jnp.trace(jacobian), jnp.linalg.det(jacobian)
+    ends = FlightEnds(start, duration, platform.position(start), velocity, end_position, before)
+    amplitude, angle = lockin(cantilever, platform, ends, order)
+    slope = jax.grad(closing_residual)(coordinate, problem) * coordinate
+    # An empty slot does not leave the platform, so that its search ends at once.
+    flight = Flight(cantilever, platform, start, jnp.where(found, velocity, -jnp.inf))
+
+    def known(value):
+        return jnp.where(found, value, jnp.nan)
+
+    return SingleImpactOrbits(
+        exists=found,
+        admissible=found & _admissible(problem, flight, duration, speeds.delay),
+        stable=found & (jnp.abs(trace) < jnp.abs(1.0 + det)) & (jnp.abs(det) <= 1.0),
+        near_double=found & (jnp.abs(slope) < NEAR_DOUBLE),
+        phase_rad=known(phase),
+        velocity_after_nm_per_us=known(velocity),
+        velocity_before_nm_per_us=known(before),
+        approach_speed_nm_per_us=known(speeds.approach),
+        rebound_speed_nm_per_us=known(speeds.rebound),
+        delay_us=known(speeds.delay),
+        peak_amplitude_nm=known(peak_amplitude(cantilever, ends)),
+        lockin_amplitude_nm=known(amplitude),
+        lockin_phase_deg=known(angle),
+        trace=known(trace),
+        determinant=known(det),
+        complete=found,
+    )
+
+
+def _admissible(problem: OrbitProblem, flight: Flight, duration, delay) -> Bool[Array, ""]:
+    """Say whether the first impact of the flight is the orbit's own; the flight counts from max(t_in, t_out) on."""
+    skip = None if problem.law.delay is None else jnp.maximum(-delay, 0.0)
+    first = first_impact(flight, skip_us=skip)
+    tolerance = _ARRIVAL_TOLERANCE * problem.platform.period_us
+    # Rounding can lift the end of the flight off the platform where the impact is a graze.
+    missed = first.outcome == Outcome.NO_FURTHER_IMPACT
+    hit = (first.outcome == Outcome.IMPACT) & (first.duration_us >= duration - tolerance)
+    return (duration > 0.0) & (hit | missed)

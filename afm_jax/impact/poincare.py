@@ -1,0 +1,173 @@
+"""The impact map: from just after one impact to just after the next, and its iteration."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from afm_jax.apparatus.scene import Scene
+from afm_jax.impact.first_impact import DEFAULT_MAX_STEPS, DEFAULT_ROOT_TOLERANCE_US, Flight, first_impact
+from afm_jax.impact.law import ImpactLaw, impact_law_of
+from afm_jax.outcome import Outcome
+from afm_jax.parameters import require_float64
+
+NEAR_GRAZING = 1e-3
+"""Approach speed over beta omega below which an impact counts as near grazing: its derivatives lose their meaning."""
+
+
+class NextImpact(eqx.Module):
+    """The impact that follows a start, one tip and one time; batches by `vmap`.
+
+    Attributes:
+        time_us: when the next flight starts: the impact, plus the collision delay if the law has one. Infinite where
+            there is no further impact within the search.
+        arrival_time_us: when the free flight reaches gap 0; equal to `time_us` without a delay.
+        velocity_before_nm_per_us: tip velocity in the lab just before; NaN where there is no impact (see `outcome`).
+        velocity_after_nm_per_us: tip velocity in the lab just after; the platform's where the tip is captured, NaN
+            where there is no impact.
+        outcome: an `Outcome` as an integer.
+        near_grazing: the approach is slower than 1e-3 beta omega.
+    """
+
+    time_us: Float[Array, "..."]
+    arrival_time_us: Float[Array, "..."]
+    velocity_before_nm_per_us: Float[Array, "..."]
+    velocity_after_nm_per_us: Float[Array, "..."]
+    outcome: Int[Array, "..."]
+    near_grazing: Bool[Array, "..."]
+
+
+def next_impact(
+    scene: Scene,
+    time_us: ArrayLike,
+    velocity_nm_per_us: ArrayLike,
+    *,
+    max_steps: int = DEFAULT_MAX_STEPS,
+    root_tolerance_us: ArrayLike = DEFAULT_ROOT_TOLERANCE_US,
+) -> NextImpact:
+    """Return the next impact of a tip that has just left the platform (eqs. 2-4 and 6; the Poincare map).
+
+    Args:
+        scene: a scene whose interaction is an `ImpactLaw`.
+        time_us: when the flight starts, scalar; the tip is then at the platform's position.
+        velocity_nm_per_us: tip velocity in the lab just after the impact, scalar, above the platform's velocity.
+        max_steps: steps of the search for the impact before it gives up.
+        root_tolerance_us: remaining error of the impact time at which the search stops.
+
+    Returns:
+        The impact, differentiable in everything: forward, reverse, to any order (implicit function theorem).
+
+    Raises:
+        RuntimeError: if JAX is not set to 64-bit floats.
+        TypeError: if the scene's interaction is not an impact law.
+
+    >>> import jax
+    >>> from afm_jax import Cantilever, ImpactLaw, Platform, Scene
+    >>> with jax.enable_x64(True):
+    ...     scene = Scene(Cantilever(90.0), Platform(amplitude_nm=2.0, frequency_khz=180.0), ImpactLaw(r=0.5))
+    ...     print(round(float(next_impact(scene, 4.0, 6.0).time_us), 6))
+    9.568155
+    """
+    require_float64()
+    impact_law_of(scene)
+    dtype = scene.platform.frequency_khz.dtype
+    start = (jnp.asarray(time_us, dtype), jnp.asarray(velocity_nm_per_us, dtype))
+    return _next_impact(scene, start, jnp.asarray(root_tolerance_us, dtype), max_steps=max_steps)
+
+
+def iterate_map(
+    scene: Scene,
+    time_us: ArrayLike,
+    velocity_nm_per_us: ArrayLike,
+    impacts: int,
+    *,
+    max_steps: int = DEFAULT_MAX_STEPS,
+    root_tolerance_us: ArrayLike = DEFAULT_ROOT_TOLERANCE_US,
+) -> NextImpact:
+    """Return a sequence of impacts: `next_impact` iterated.
+
+    Args:
+        scene: a scene whose interaction is an `ImpactLaw`.
+        time_us: when the first flight starts, scalar.
+        velocity_nm_per_us: tip velocity in the lab at that time, scalar.
+        impacts: how many impacts to follow; a plain integer, it shapes the result.
+        max_steps: steps of the search for one impact before it gives up.
+        root_tolerance_us: remaining error of an impact time at which a search stops.
+
+    Returns:
+        A `NextImpact` with a leading axis of length `impacts`. After an impact that is the last (captured, no further
+        impact) the rows say `Outcome.NOT_REACHED`.
+
+    Raises:
+        RuntimeError: if JAX is not set to 64-bit floats.
+        TypeError: if the scene's interaction is not an impact law.
+        ValueError: if `impacts` is not positive.
+    """
+    require_float64()
+    impact_law_of(scene)
+    if impacts < 1:
+        raise ValueError(f"`impacts` must be a positive integer, but is {impacts}")
+    dtype = scene.platform.frequency_khz.dtype
+    start = (jnp.asarray(time_us, dtype), jnp.asarray(velocity_nm_per_us, dtype))
+    tolerance = jnp.asarray(root_tolerance_us, dtype)
+    return _iterate_map(scene, start, tolerance, impacts=impacts, max_steps=max_steps)
+
+
+@partial(jax.jit, static_argnames=("max_steps",))
+def _next_impact(scene: Scene, start, tolerance: Float[Array, ""], *, max_steps: int) -> NextImpact:
+    law = impact_law_of(scene)
+    time, velocity = start
+    flight = Flight(scene.cantilever, scene.platform, time, velocity)
+    impact = first_impact(flight, skip_us=_overlap(law, flight), max_steps=max_steps, root_tolerance_us=tolerance)
+    arrival = time + impact.duration_us
+    _, before = scene.cantilever.propagator(impact.duration_us)(scene.platform.position(time), velocity)
+    hit = impact.outcome == Outcome.IMPACT
+    approach = jnp.where(hit, scene.platform.velocity(arrival) - before, 1.0)
+    leaving = arrival + law.collision_delay(approach) if law.delay is not None else arrival
+    after = scene.platform.velocity(leaving) + law.rebound_speed(approach)
+    captured = hit & law.captures(approach)
+    return NextImpact(
+        time_us=jnp.where(hit, leaving, jnp.inf),
+        arrival_time_us=jnp.where(hit, arrival, jnp.inf),
+        velocity_before_nm_per_us=jnp.where(hit, before, jnp.nan),
+        velocity_after_nm_per_us=jnp.where(hit, after, jnp.nan),
+        outcome=jnp.where(captured, Outcome.CAPTURED, impact.outcome),
+        near_grazing=hit & (approach < NEAR_GRAZING * scene.platform.top_speed_nm_per_us),
+    )
+
+
+def _overlap(law: ImpactLaw, flight: Flight) -> Float[Array, ""] | None:
+    """Return how long a flight that a negative delay let begin early overlaps the last one, in us after its start."""
+    if law.delay is None:
+        return None
+    rebound = flight.velocity - flight.platform.velocity(flight.start_us)
+    delay = law.collision_delay(law.approach_speed(jnp.maximum(rebound, 0.0)))
+    return jnp.maximum(-delay, 0.0)
+
+
+@partial(jax.jit, static_argnames=("impacts", "max_steps"))
+def _iterate_map(scene: Scene, start, tolerance: Float[Array, ""], *, impacts: int, max_steps: int) -> NextImpact:
+    def one(state, _):
+        flying, time, velocity = state
+        impact = _next_impact(scene, (time, velocity), tolerance, max_steps=max_steps)
+        outcome = jnp.where(flying, impact.outcome, Outcome.NOT_REACHED)
+        impact = eqx.tree_at(lambda row: row.outcome, impact, outcome)
+        flying = outcome == Outcome.IMPACT
+        # A finished tip keeps a state to compute with; its rows are marked, not used.
+        time = jnp.where(flying, impact.time_us, time)
+        velocity = jnp.where(flying, impact.velocity_after_nm_per_us, velocity)
+        return (flying, time, velocity), impact
+
+    _, rows = lax.scan(one, (jnp.array(True), *start), length=impacts)  # noqa: FBT003
+    ended = rows.outcome == Outcome.NOT_REACHED
+    return NextImpact(
+        time_us=jnp.where(ended, jnp.inf, rows.time_us),
+        arrival_time_us=jnp.where(ended, jnp.inf, rows.arrival_time_us),
+        velocity_before_nm_per_us=jnp.where(ended, jnp.nan, rows.velocity_before_nm_per_us),
+        velocity_after_nm_per_us=jnp.where(ended, jnp.nan, rows.velocity_after_nm_per_us),
+        outcome=rows.outcome,
+        near_grazing=rows.near_grazing & ~ended,
+    )

@@ -1,0 +1,81 @@
+"""Physical parameters as arrays, and the checks of their values.
+
+Values are checked only while they are concrete; inside ``jit``, ``grad`` or ``vmap`` a parameter is traced and the
+check is skipped, because a compiled program cannot raise.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
+
+
+def as_parameter(value: ArrayLike) -> Float[Array, "..."]:
+    """Return a parameter as a floating-point array; arrays that are floating-point already keep their precision.
+
+    Python numbers become arrays of the default precision and never weakly typed, so that one compiled program serves
+    numbers and arrays alike.
+    """
+    array = jnp.asarray(value)
+    return jnp.asarray(array, array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else float)
+
+
+def as_argument(value: ArrayLike) -> Float[Array, "..."]:
+    """Return the argument of a formula as a floating-point array; Python numbers adapt to the parameters' precision."""
+    array = jnp.asarray(value)
+    return array if jnp.issubdtype(array.dtype, jnp.floating) else array * 1.0
+
+
+def as_optional_parameter(value: ArrayLike | None) -> Float[Array, "..."] | None:
+    """Return `as_parameter(value)`, or None where the effect is absent."""
+    return None if value is None else as_parameter(value)
+
+
+def is_traced(value: ArrayLike) -> bool:
+    """Say whether a value is an abstract one inside `jit`, `grad` or `vmap`, whose number cannot be looked at."""
+    return isinstance(value, Tracer)
+
+
+def check_parameter(name: str, value: ArrayLike | None, allowed: str) -> None:
+    """Check a parameter that is a concrete number.
+
+    Args:
+        name: what the message calls it, with its unit.
+        value: the number or array; None (an absent effect) and traced values pass.
+        allowed: "finite", "positive", "not negative", "above 0.5" or "in (0, 1]".
+
+    Raises:
+        ValueError: if a value is not finite or not in the allowed range.
+    """
+    if value is None or is_traced(value):
+        return
+    number = np.asarray(value)
+    # An infinite quality factor is a meaningful limit; every other infinity is a mistake.
+    finite = ~np.isnan(number) if allowed == "above 0.5" else np.isfinite(number)
+    good = finite & _RANGES[allowed](number)
+    if not np.all(good):
+        offender = float(number[~good].flat[0]) if number.ndim else float(number)
+        must = "a finite number" if allowed == "finite" else allowed
+        raise ValueError(f"`{name}` must be {must}, but is {offender:g}")
+
+
+_RANGES = {
+    "finite": lambda number: np.full(number.shape, fill_value=True),
+    "positive": lambda number: number > 0,
+    "not negative": lambda number: number >= 0,
+    "above 0.5": lambda number: number > 0.5,
+    "in (0, 1]": lambda number: (number > 0) & (number <= 1),
+}
+
+
+def require_float64() -> None:
+    """Check that JAX computes in 64 bits.
+
+    Raises:
+        RuntimeError: if it does not; results in 32 bits are not trustworthy by default.
+    """
+    if not jax.config.read("jax_enable_x64"):
+        raise RuntimeError(
+            "afm_jax needs 64-bit floats: add `jax.config.update('jax_enable_x64', True)` before the first computation"
+        )

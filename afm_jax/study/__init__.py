@@ -1,0 +1,1 @@
+"""Questions about scenes: verification, accuracy against time, benchmarks, stability regions."""

@@ -1,0 +1,27 @@
+"""What all tests share: 64-bit floats, strict promotion, and annotations that are checked at run time."""
+
+from pathlib import Path
+
+import jax
+import pytest
+from jaxtyping import install_import_hook
+
+# Before the packages are imported for the first time: every annotated function checks its arguments and results.
+install_import_hook(["afm_jax", "fitting"], "beartype.beartype")
+
+jax.config.update("jax_enable_x64", True)  # noqa: FBT003
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+# Compilation is what a JAX test costs; a second run finds it done.
+jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parent.parent / ".pytest_cache" / "jax"))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+
+SHARED_DATA = Path(__file__).parent.parent.parent / "shared" / "data"
+
+
+@pytest.fixture
+def contact_table_path() -> Path:
+    """The amplitude table of an independent contact simulation; its tests are skipped where it is not at hand."""
+    path = SHARED_DATA / "amplitudes_contact.csv"
+    if not path.exists():
+        pytest.skip("the contact table lies outside this checkout")
+    return path
