@@ -1,0 +1,160 @@
+"""Profile-likelihood intervals: how far a parameter can go while the others follow and chi2 rises by 3.84."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from fitting.optimise import Objective
+
+CHI2_95 = 3.841458820694124
+"""95 % quantile of chi2 with one degree of freedom."""
+_OUTER_STEPS = 30
+_INNER_STEPS = 25
+_FARTHEST = 100.0
+"""Distance in standard errors at which a search gives up: the data do not determine the parameter on that side."""
+
+
+@dataclass(frozen=True)
+class Interval:
+    """A 95 % interval; an end that is open is None, with the reason."""
+
+    low: float | None
+    high: float | None
+    reason: str | None = None
+
+
+@dataclass
+class _Side:
+    """The search for one end of one interval."""
+
+    index: int
+    direction: float
+    others: Float[np.ndarray, " p"]  # optimiser coordinates; the profiled one is not used
+    inside: float = 0.0  # distance in errors that lies inside the interval
+    outside: float = np.inf
+    trial: float = 1.96
+    end: float | None = None
+    reason: str | None = None
+
+
+def profile_intervals(
+    objective: Objective,
+    values: Float[np.ndarray, " p"],
+    errors: Float[np.ndarray, " p"],
+    chi2: float,
+    chi2_scale: float = 1.0,
+) -> list[Interval]:
+    """Return the 95 % profile interval of every parameter.
+
+    Args:
+        objective: chi2 of a table and a model.
+        values: the fitted values.
+        errors: their standard errors, to measure steps in; infinite ones give open intervals.
+        chi2: at the fitted values.
+        chi2_scale: factor on the rise of 3.84 where the errors of the table were scaled.
+    """
+    start = objective.problem.coordinates(values)
+    sides = [
+        _Side(index, direction, start.copy())
+        for index in range(len(values))
+        for direction in (-1.0, 1.0)
+        if np.isfinite(errors[index])
+    ]
+    rise = CHI2_95 * chi2_scale
+    for _ in range(_OUTER_STEPS):
+        active = [side for side in sides if side.end is None and side.reason is None]
+        if not active:
+            break
+        _advance(objective, active, values, errors, (chi2, rise))
+    return [_interval(sides, index) for index in range(len(values))]
+
+
+def _advance(objective: Objective, sides: list[_Side], values, errors, levels) -> None:
+    """Take one trial distance on every side and narrow its bracket."""
+    chi2, rise = levels
+    targets = np.array([_target(side, objective, values, errors) for side in sides])
+    found, others = _minimise_others(objective, sides, targets)
+    for side, target, value, coordinates in zip(sides, targets, found, others, strict=True):
+        parameter = objective.problem.parameters[side.index]
+        end = parameter.lowest if side.direction < 0 else parameter.highest
+        distance = abs(target - values[side.index]) / errors[side.index]
+        above = value - chi2
+        if above < rise:
+            side.inside, side.others = max(side.inside, distance), coordinates
+            if target == end:
+                side.reason = f"reaches the end of its range, {end:g}"
+            elif distance >= _FARTHEST:
+                side.reason = "the data set no limit on this side"
+        else:
+            side.outside = min(side.outside, distance)
+        if side.outside - side.inside < 1e-5 * max(side.outside, 1e-300) or abs(above - rise) < 1e-4 * rise:
+            side.end = float(target)
+        # sqrt(chi2 - minimum) is close to proportional to the distance.
+        guess = distance * np.sqrt(rise / above) if above > 1e-6 * rise else 2.0 * distance
+        safe = side.inside + 0.5 * (side.outside - side.inside) if np.isfinite(side.outside) else 3.0 * distance
+        margin = 1e-3 * (side.outside - side.inside) if np.isfinite(side.outside) else 0.0
+        inside = side.inside + margin < guess < side.outside - margin
+        side.trial = min(guess if inside else safe, _FARTHEST)
+
+
+def _target(side: _Side, objective: Objective, values, errors) -> float:
+    parameter = objective.problem.parameters[side.index]
+    target = values[side.index] + side.direction * side.trial * errors[side.index]
+    return float(np.clip(target, parameter.lowest, parameter.highest))
+
+
+def _minimise_others(objective: Objective, sides: list[_Side], targets):
+    """Minimise chi2 over the parameters that are not profiled, by damped Gauss-Newton steps, on all sides at once."""
+    problem = objective.problem
+    y = np.array([side.others for side in sides])
+    index = np.array([side.index for side in sides])
+    rows = np.arange(len(sides))
+    free = np.ones_like(y, dtype=bool)
+    free[rows, index] = False
+
+    def evaluate(coordinates):
+        held = coordinates.copy()
+        held[rows, index] = [
+            problem.parameters[k].to_coordinate(np.asarray(t)) for k, t in zip(index, targets, strict=True)
+        ]
+        residual, jacobian = objective.linearise(held)
+        return np.sum(residual**2, axis=1), residual, jacobian * free[:, None, :]
+
+    chi2, residual, jacobian = evaluate(y)
+    damping = np.full(len(sides), 1e-6)
+    for _ in range(_INNER_STEPS if y.shape[1] > 1 else 0):
+        step = np.array([_step(*lane) for lane in zip(residual, jacobian, free, damping, strict=True)])
+        new_chi2, new_residual, new_jacobian = evaluate(y + step)
+        better = new_chi2 <= chi2
+        gain = np.where(better, chi2 - new_chi2, 0.0)
+        y = np.where(better[:, None], y + step, y)
+        residual = np.where(better[:, None], new_residual, residual)
+        jacobian = np.where(better[:, None, None], new_jacobian, jacobian)
+        chi2 = np.where(better, new_chi2, chi2)
+        damping = np.where(better, 0.1 * damping, np.maximum(30.0 * damping, 1e-4))
+        if np.all((gain < 1e-6) & (better | (damping > 1e6))):
+            break
+    return chi2, y
+
+
+def _step(residual, jacobian, free, damping) -> Float[np.ndarray, " p"]:
+    """Return a damped Gauss-Newton step; the profiled parameter and directions without effect stay."""
+    normal = jacobian.T @ jacobian
+    diagonal = np.diag(normal).copy()
+    held = ~free | (diagonal == 0.0)
+    normal[np.diag_indices_from(normal)] = np.where(held, 1.0, diagonal * (1.0 + damping))
+    return np.where(held, 0.0, -np.linalg.solve(normal, jacobian.T @ residual))
+
+
+def _interval(sides: list[_Side], index: int) -> Interval:
+    mine = [side for side in sides if side.index == index]
+    if not mine:
+        return Interval(None, None, "the data do not determine this parameter")
+    low, high = mine
+    reasons = [
+        f"{name} end: {side.reason or 'the search did not settle'}"
+        for name, side in (("lower", low), ("upper", high))
+        if side.end is None
+    ]
+    return Interval(low.end, high.end, "; ".join(reasons) or None)

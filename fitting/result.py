@@ -1,0 +1,147 @@
+"""What a fit found, and everything that went into it."""
+
+import math
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from fitting.checks import Convergence
+from fitting.table import AmplitudeTable
+
+FORMAT_VERSION = 1
+"""Version of the JSON layout; raised when a key changes its meaning or goes."""
+
+
+@dataclass(frozen=True)
+class FittedParameter:
+    """One parameter of a fit.
+
+    Attributes:
+        value: in the unit beside it.
+        unit: the unit, empty for a number.
+        standard_error: Wald's, from the Fisher information; None where the data do not determine it or at a bound.
+        interval95: profile-likelihood interval; an end is None where it is open.
+        interval_reason: why an end is open; None if none is.
+        at_bound: the loss vanishes within the resolution of the data.
+        did_not_move: the optimiser left the parameter where it started.
+        constraint: (value, standard error) that the table gives for it, or None.
+    """
+
+    value: float
+    unit: str
+    standard_error: float | None
+    interval95: tuple[float | None, float | None]
+    interval_reason: str | None
+    at_bound: bool
+    did_not_move: bool
+    constraint: tuple[float, float] | None
+
+
+@dataclass(frozen=True)
+class FittedLaw:
+    """The impact law over the speeds that the rows reached, with a pointwise 95 % band (all arrays in nm/us)."""
+
+    approach_speed_nm_per_us: Float[np.ndarray, " points"]
+    rebound_speed_nm_per_us: Float[np.ndarray, " points"]
+    rebound_low_nm_per_us: Float[np.ndarray, " points"]
+    rebound_high_nm_per_us: Float[np.ndarray, " points"]
+
+
+@dataclass(frozen=True)
+class FittedRows:
+    """The rows of the table beside their prediction; NaN where nothing was measured or predicted.
+
+    Amplitudes have shape (rows, 2): peak, lock-in.
+    """
+
+    predicted_nm: Float[np.ndarray, "rows 2"]
+    measured_nm: Float[np.ndarray, "rows 2"]
+    residual: Float[np.ndarray, "rows 2"]
+    approach_speed_nm_per_us: Float[np.ndarray, " rows"]
+    orbits: Int[np.ndarray, " rows"]
+    near_fold: Bool[np.ndarray, " rows"]
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """The outcome of `fit`; attributes are named like the keys of its JSON.
+
+    Attributes:
+        model: the model's name.
+        parameters: by name, the law's first.
+        correlations: matrix in the parameters' order; NaN where a variance is unknown.
+        chi2: sum of squared normalised residuals, the constraint on Q included.
+        degrees_of_freedom: measured amplitudes plus constraints minus parameters.
+        p_value: probability of a larger chi2 if the model is right.
+        aic: chi2 + 2 k.
+        bic: chi2 + k log(n).
+        valid: converged, explained and determined; `reasons` say why not.
+        reasons: what makes the result invalid.
+        warnings: what a reader should know besides.
+        law: the fitted impact law with its band.
+        rows: measured and predicted amplitudes.
+        residual_autocorrelation: lag-1 correlation of neighbouring rows' residuals.
+        convergence: what the checks of the minimum found.
+        table: the table that was fitted.
+        settings: every option of the fit.
+        versions: of the packages that computed it.
+    """
+
+    model: str
+    parameters: dict[str, FittedParameter]
+    correlations: Float[np.ndarray, "p p"]
+    chi2: float
+    degrees_of_freedom: int
+    p_value: float
+    aic: float
+    bic: float
+    valid: bool
+    reasons: list[str]
+    warnings: list[str]
+    law: FittedLaw
+    rows: FittedRows
+    residual_autocorrelation: float
+    convergence: Convergence
+    table: AmplitudeTable
+    settings: dict[str, Any] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain lists, numbers and strings; what is not known is None."""
+        return {
+            "format": "afm-jax fit",
+            "format_version": FORMAT_VERSION,
+            "model": self.model,
+            "valid": self.valid,
+            "reasons": self.reasons,
+            "warnings": self.warnings,
+            "parameters": {name: _plain(asdict(value)) for name, value in self.parameters.items()},
+            "correlations": {"names": list(self.parameters), "matrix": _plain(self.correlations)},
+            "chi2": _plain(self.chi2),
+            "degrees_of_freedom": self.degrees_of_freedom,
+            "p_value": _plain(self.p_value),
+            "aic": _plain(self.aic),
+            "bic": _plain(self.bic),
+            "residual_autocorrelation": _plain(self.residual_autocorrelation),
+            "law": {name: _plain(column) for name, column in vars(self.law).items()},
+            "rows": {name: _plain(column) for name, column in vars(self.rows).items()},
+            "convergence": _plain(asdict(self.convergence)),
+            "input": _plain(vars(self.table)),
+            "settings": _plain(self.settings),
+            "versions": self.versions,
+        }
+
+
+def _plain(value: Any) -> Any:
+    """Return a value without arrays, tuples and numbers that JSON does not have."""
+    if isinstance(value, dict):
+        return {name: _plain(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return [_plain(item) for item in value]
+    if isinstance(value, np.generic):
+        return _plain(value.item())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

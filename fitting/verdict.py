@@ -1,0 +1,129 @@
+"""Whether to believe a fit, in words: what makes it invalid, and what a reader should know besides."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fitting.checks import Convergence
+from fitting.result import FittedParameter, FittedRows
+from fitting.table import AmplitudeTable
+
+_IMPROBABLE = 1e-3
+"""Probability of the chi2 below which the model does not explain the table."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """All that the verdict looks at."""
+
+    table: AmplitudeTable
+    parameters: dict[str, FittedParameter]
+    convergence: Convergence
+    rows: FittedRows
+    chi2: float
+    freedom: int
+    p_value: float
+    autocorrelation: float
+    other_minimum: dict[str, float] | None
+    scale_errors: bool
+
+
+def judge_fit(evidence: Evidence) -> tuple[list[str], list[str]]:
+    """Return what makes a fit invalid, and its warnings; each a sentence."""
+    return _reasons(evidence), _warnings(evidence)
+
+
+def _reasons(evidence: Evidence) -> list[str]:
+    reasons = []
+    convergence = evidence.convergence
+    if not convergence.converged:
+        reasons.append(
+            f"Not converged: chi2 lies an estimated {convergence.estimated_distance:.2g} above its minimum"
+            + ("" if convergence.outward else ", and a parameter is held at a bound it would leave")
+            + "."
+        )
+    missing = np.flatnonzero(evidence.rows.orbits == 0)
+    if missing.size:
+        reasons.append(f"No stable orbit at the fitted law for {_rows_in_words(evidence.table, missing)}.")
+    if evidence.p_value < _IMPROBABLE:
+        reasons.append(
+            f"The model does not explain the data: chi2/dof = {evidence.chi2 / evidence.freedom:.3g} "
+            f"(probability {evidence.p_value:.1g}). The impacts may last too long for an instantaneous law (a "
+            "collision delay decides amplitudes near resonance), the errors may be too small, or the calibration off."
+        )
+    if evidence.freedom <= 0:
+        reasons.append("As many parameters as amplitudes: the goodness of fit cannot be judged.")
+    for name, parameter in evidence.parameters.items():
+        if parameter.interval95 == (None, None):
+            reasons.append(f"{name} is not identified: {parameter.interval_reason}.")
+    return reasons
+
+
+def _warnings(evidence: Evidence) -> list[str]:
+    return [
+        *_damping_warnings(evidence.table),
+        *_parameter_warnings(evidence),
+        *_row_warnings(evidence),
+    ]
+
+
+def _damping_warnings(table: AmplitudeTable) -> list[str]:
+    if table.quality_factor is None:
+        message = (
+            "The table gives no quality_factor: air damping is left out, and what it takes is counted as impact loss. "
+            "Add a line like `# quality_factor = 40 +- 1`."
+        )
+        return [message]
+    if table.quality_factor_error is None:
+        known = f"quality_factor = {table.quality_factor:g}"
+        message = (
+            f"{known} is taken as exact. Amplitudes tell the impact's loss from the air's only as well as Q is known: "
+            f"`# {known} +- 1` lets the intervals show it."
+        )
+        return [message]
+    return []
+
+
+def _parameter_warnings(evidence: Evidence) -> list[str]:
+    warnings = []
+    for name, parameter in evidence.parameters.items():
+        low, high = parameter.interval95
+        if parameter.at_bound:
+            limit = f"< {high:.4g}" if high is not None else f"> {low:.4g}" if low is not None else "without limit"
+            warnings.append(f"{name} is at its bound {parameter.value:.4g}: read it as a limit, {name} {limit} (95 %).")
+        if parameter.did_not_move:
+            warnings.append(f"{name} did not move from the grid point it started at.")
+    if evidence.other_minimum is not None:
+        values = ", ".join(f"{name} = {value:.5g}" for name, value in evidence.other_minimum.items())
+        warnings.append(f"Another minimum explains the data about as well: {values}.")
+    return warnings
+
+
+def _row_warnings(evidence: Evidence) -> list[str]:
+    warnings = []
+    several = np.flatnonzero(evidence.rows.orbits > 1)
+    if several.size:
+        warnings.append(
+            f"Several stable orbits coexist for {_rows_in_words(evidence.table, several)}: the one closest to the "
+            "measurement was taken."
+        )
+    folds = np.flatnonzero(evidence.rows.near_fold)
+    if folds.size:
+        warnings.append(f"Close to a fold, where errors are not linear: {_rows_in_words(evidence.table, folds)}.")
+    pairs = max(int(np.isfinite(evidence.rows.residual).sum()) - 2, 1)
+    if abs(evidence.autocorrelation) > 3.0 / np.sqrt(pairs):
+        warnings.append(
+            f"Neighbouring residuals are correlated ({evidence.autocorrelation:+.2f}): something systematic is left."
+        )
+    if evidence.scale_errors:
+        warnings.append("Errors were scaled so that chi2/dof = 1: the goodness of fit cannot be judged.")
+    elif evidence.p_value > 1.0 - 1e-6:
+        warnings.append("The errors look too large: chi2 is improbably small.")
+    return warnings
+
+
+def _rows_in_words(table: AmplitudeTable, rows: np.ndarray) -> str:
+    """Return 'line 7' or 'lines 7, 9, 12 and 3 more' of the table's file."""
+    numbers = [str(int(table.lines[i])) if len(table.lines) else str(int(i) + 1) for i in rows]
+    shown = ", ".join(numbers[:6]) + (f" and {len(numbers) - 6} more" if len(numbers) > 6 else "")
+    return f"{'line' if len(numbers) == 1 else 'lines'} {shown}"
