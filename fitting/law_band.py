@@ -33,9 +33,10 @@ def law_with_band(
     speeds = np.geomspace(slow, fast, _POINTS)
 
     rebound, slope = (np.asarray(array) for array in _law_and_slope(jnp.asarray(values), jnp.asarray(speeds), problem))
-    with np.errstate(invalid="ignore"):
+    if np.all(np.isfinite(covariance)):
         width = _TWO_SIDED_95 * np.sqrt(np.einsum("np,pq,nq->n", slope, covariance, slope))
-    width = np.where(np.isfinite(width), width, np.nan)
+    else:
+        width = np.full_like(rebound, np.nan)
     return FittedLaw(speeds, rebound, np.maximum(rebound - width, 0.0), rebound + width)
 
 

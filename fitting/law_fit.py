@@ -16,7 +16,7 @@ from fitting.models import Problem, law_parameters
 from fitting.optimise import BATCH, PLAIN, SOFT, Objective, grid, polish
 from fitting.result import FitResult, FittedParameter, FittedRows
 from fitting.table import AmplitudeTable
-from fitting.verdict import Evidence, judge_fit
+from fitting.verdict import IMPROBABLE, Evidence, judge_fit
 
 _PACKAGES = ("afm-jax", "jax", "optax", "numpy")
 
@@ -94,12 +94,18 @@ class _Summary:
         self.covariance = covariance(objective, self.values, self.free) * self.chi2_scale
 
     def result(self, start: Float[np.ndarray, " p"], minima) -> FitResult:
+        judged = self.freedom > 0 and not self.scale_errors
+        p_value = float(chi2_distribution.sf(self.chi2, self.freedom)) if judged else float("nan")
         errors = np.sqrt(np.diag(self.covariance))
-        intervals = profile_intervals(self.objective, self.values, errors, self.chi2, self.chi2_scale)
         moved = np.abs(self.values - start) > 1e-3 * errors
-        parameters = self._parameters(errors, intervals, moved)
+        if p_value < IMPROBABLE:
+            # Errors that assume the model would be confident numbers about a law that is not there.
+            intervals = [Interval(None, None, "the model does not explain the data")] * len(errors)
+            parameters = self._parameters(np.full_like(errors, np.inf), intervals, moved)
+        else:
+            intervals = profile_intervals(self.objective, self.values, errors, self.chi2, self.chi2_scale)
+            parameters = self._parameters(errors, intervals, moved)
         rows = self._rows()
-        p_value = float(chi2_distribution.sf(self.chi2, self.freedom)) if self.freedom > 0 else float("nan")
         evidence = Evidence(
             table=self.table,
             parameters=parameters,
@@ -107,7 +113,7 @@ class _Summary:
             rows=rows,
             chi2=self.chi2,
             freedom=self.freedom,
-            p_value=float("nan") if self.scale_errors else p_value,
+            p_value=p_value,
             autocorrelation=_autocorrelation(rows.residual),
             other_minimum=self._other_minimum(minima, errors),
             scale_errors=self.scale_errors,
@@ -125,7 +131,9 @@ class _Summary:
             valid=not reasons,
             reasons=reasons,
             warnings=warnings,
-            law=law_with_band(self.problem, self.values, self.covariance, rows.approach_speed_nm_per_us),
+            law=law_with_band(
+                self.problem, self.values, self._shown_covariance(p_value), rows.approach_speed_nm_per_us
+            ),
             rows=rows,
             residual_autocorrelation=evidence.autocorrelation,
             convergence=self.convergence,
@@ -133,6 +141,10 @@ class _Summary:
             settings={"model": self.problem.model, "scale_errors": self.scale_errors, "starts": BATCH, "soft": SOFT},
             versions={name: version(name) for name in _PACKAGES},
         )
+
+    def _shown_covariance(self, p_value: float) -> Float[np.ndarray, "p p"]:
+        """Return the covariance, infinite where the model does not explain the data."""
+        return np.full_like(self.covariance, np.inf) if p_value < IMPROBABLE else self.covariance
 
     def _parameters(
         self, errors: Float[np.ndarray, " p"], intervals: list[Interval], moved: Bool[np.ndarray, " p"]

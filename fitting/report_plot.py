@@ -16,14 +16,15 @@ _SMALL = 8
 def fit_figure(result: FitResult) -> Figure:
     """Return the figure: amplitudes and residuals row by row on the left, the impact law on the right."""
     figure = Figure(figsize=(11.0, 6.2), layout="constrained")
-    amplitudes, residuals, law, losses = figure.subplot_mosaic(
+    axes = figure.subplot_mosaic(
         [["amplitudes", "law"], ["residuals", "losses"]], width_ratios=(1.5, 1.0), height_ratios=(1.7, 1.0)
-    ).values()
-    _draw_amplitudes(amplitudes, result)
-    _draw_residuals(residuals, result)
-    residuals.sharex(amplitudes)
-    _draw_law(law, result)
-    _draw_losses(losses, result)
+    )
+    axes["residuals"].sharex(axes["amplitudes"])
+    axes["losses"].sharex(axes["law"])
+    _draw_amplitudes(axes["amplitudes"], result)
+    _draw_residuals(axes["residuals"], result)
+    _draw_law(axes["law"], result)
+    _draw_losses(axes["losses"], result)
     title = f"Impact law from {result.table.rows} rows, model {result.model}, chi²/dof = "
     title += f"{result.chi2:.4g}/{result.degrees_of_freedom}"
     colour = "black" if result.valid else "#B00020"
@@ -54,6 +55,8 @@ def _draw_amplitudes(axes: Axes, result: FitResult) -> None:
         axes.axvline(place, color="#B00020", lw=0.8, ls=":", label="no stable orbit" if place == missing[0] else None)
     _mark_orders(axes, result.table.order[ranking], breaks)
     axes.set_yscale("log")
+    # Room for the legend below the smallest amplitude.
+    axes.set_ylim(bottom=0.35 * np.nanmin(result.rows.measured_nm))
     axes.set_ylabel("amplitude (nm)")
     axes.tick_params(labelbottom=False)
     axes.legend(fontsize=_SMALL, ncols=2, loc="lower right")
@@ -116,15 +119,15 @@ def _law_title(result: FitResult) -> str:
 
 
 def _draw_losses(axes: Axes, result: FitResult) -> None:
-    """Draw what the impact takes: u_in^2 - u_out^2, where the laws differ visibly."""
+    """Draw the share of its energy that the tip loses, where the laws differ visibly."""
     law = result.law
     speed = law.approach_speed_nm_per_us
     lost, most, least = (
-        speed**2 - column**2
+        100.0 * (1.0 - (column / speed) ** 2)
         for column in (law.rebound_speed_nm_per_us, law.rebound_low_nm_per_us, law.rebound_high_nm_per_us)
     )
     axes.fill_between(speed, least, most, color=_COLOURS[0], alpha=0.3, lw=0)
     axes.plot(speed, lost, color=_COLOURS[0])
     axes.set_xlabel("approach speed (nm/µs)")
-    axes.set_ylabel(r"$u_\mathrm{in}^2 - u_\mathrm{out}^2$ (nm²/µs²)")
+    axes.set_ylabel("energy lost (%)")
     axes.set_ylim(bottom=0)

@@ -8,7 +8,7 @@ from fitting.checks import Convergence
 from fitting.result import FittedParameter, FittedRows
 from fitting.table import AmplitudeTable
 
-_IMPROBABLE = 1e-3
+IMPROBABLE = 1e-3
 """Probability of the chi2 below which the model does not explain the table."""
 
 
@@ -45,7 +45,7 @@ def _reasons(evidence: Evidence) -> list[str]:
     missing = np.flatnonzero(evidence.rows.orbits == 0)
     if missing.size:
         reasons.append(f"No stable orbit at the fitted law for {_rows_in_words(evidence.table, missing)}.")
-    if evidence.p_value < _IMPROBABLE:
+    if evidence.p_value < IMPROBABLE:
         reasons.append(
             f"The model does not explain the data: chi2/dof = {evidence.chi2 / evidence.freedom:.3g} "
             f"(probability {evidence.p_value:.1g}). The impacts may last too long for an instantaneous law (a "
@@ -54,7 +54,7 @@ def _reasons(evidence: Evidence) -> list[str]:
     if evidence.freedom <= 0:
         reasons.append("As many parameters as amplitudes: the goodness of fit cannot be judged.")
     for name, parameter in evidence.parameters.items():
-        if parameter.interval95 == (None, None):
+        if parameter.interval95 == (None, None) and not evidence.p_value < IMPROBABLE:
             reasons.append(f"{name} is not identified: {parameter.interval_reason}.")
     return reasons
 
@@ -89,8 +89,9 @@ def _parameter_warnings(evidence: Evidence) -> list[str]:
     for name, parameter in evidence.parameters.items():
         low, high = parameter.interval95
         if parameter.at_bound:
-            limit = f"< {high:.4g}" if high is not None else f"> {low:.4g}" if low is not None else "without limit"
-            warnings.append(f"{name} is at its bound {parameter.value:.4g}: read it as a limit, {name} {limit} (95 %).")
+            limit = f"< {high:.4g}" if high is not None else f"> {low:.6g}" if low is not None else None
+            reading = f": read it as a limit, {name} {limit} (95 %)" if limit else ""
+            warnings.append(f"{name} is at its bound, {parameter.value:.3g}{reading}.")
         if parameter.did_not_move:
             warnings.append(f"{name} did not move from the grid point it started at.")
     if evidence.other_minimum is not None:

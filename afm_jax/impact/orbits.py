@@ -7,20 +7,12 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from afm_jax.apparatus.scene import Scene
-from afm_jax.impact.first_impact import Flight, first_impact
-from afm_jax.impact.implicit import implicit_root
-from afm_jax.impact.jacobian import flight_jacobian, impact_jacobian
 from afm_jax.impact.law import impact_law_of
-from afm_jax.impact.orbit_amplitude import FlightEnds, lockin, peak_amplitude
-from afm_jax.impact.orbit_closure import OrbitProblem, closing_residual, closure, speeds_at
+from afm_jax.impact.orbit_amplitude import lockin, peak_amplitude
+from afm_jax.impact.orbit_closure import OrbitProblem
 from afm_jax.impact.orbit_search import find_roots
-from afm_jax.outcome import Outcome
+from afm_jax.impact.orbit_state import empty_coordinate, judge, orbit_state
 from afm_jax.parameters import is_traced, require_float64
-
-NEAR_DOUBLE = 1e-3
-"""Slope of the closing condition per relative change of speed below which a root counts as near-double (a fold)."""
-_ARRIVAL_TOLERANCE = 1e-7
-"""How far (in drive periods) the first impact found may lie before the orbit's own, by rounding."""
 
 
 class SingleImpactOrbits(eqx.Module):
@@ -108,61 +100,31 @@ def _single_impact_orbits(scene: Scene, order: Float[Array, ""]) -> SingleImpact
 
 
 def _orbit(coordinate: Float[Array, ""], found: Bool[Array, ""], problem: OrbitProblem) -> SingleImpactOrbits:
-    """Return what there is to know about one root; harmless numbers, then NaN, where there is none."""
-    cantilever, platform, law, order = problem
-    # An empty slot computes with the speeds of some flight well above capture.
-    coordinate = jnp.where(found, coordinate, 2.0 * platform.top_speed_nm_per_us + 2.0 * jnp.sqrt(law.epsilon + 1.0))
-    coordinate = implicit_root(closing_residual, coordinate, problem)
-    speeds = speeds_at(coordinate, law)
-    cosine, sine, determinant = closure(coordinate, problem)
-    found = found & (determinant != 0.0)
-    safe = jnp.where(found, determinant, 1.0)
-    a, b = jnp.where(found, cosine / safe, 1.0), jnp.where(found, sine / safe, 0.0)
-    phase = jnp.arctan2(b, a) % (2.0 * jnp.pi)
-    start = phase / platform.angular_frequency
-    duration = order * platform.period_us - speeds.delay
-    velocity = platform.velocity(start) + speeds.rebound
-    arrival = start + duration
-    end_position, before = cantilever.propagator(duration)(platform.position(start), velocity)
-    jacobian = impact_jacobian(law, platform, arrival, before) @ flight_jacobian(
-        cantilever, platform, start, velocity, arrival
-    )
-    trace, det = jnp.trace(jacobian), jnp.linalg.det(jacobian)
-    ends = FlightEnds(start, duration, platform.position(start), velocity, end_position, before)
-    amplitude, angle = lockin(cantilever, platform, ends, order)
-    slope = jax.grad(closing_residual)(coordinate, problem) * coordinate
-    # An empty slot does not leave the platform, so that its search ends at once.
-    flight = Flight(cantilever, platform, start, jnp.where(found, velocity, -jnp.inf))
+    """Return what there is to know about one root; NaN where there is none."""
+    coordinate = jnp.where(found, coordinate, empty_coordinate(problem))
+    state = orbit_state(coordinate, problem)
+    verdict = judge(coordinate, found, state, problem)
+    flight, speeds = state.flight, state.speeds
+    amplitude, angle = lockin(problem.cantilever, problem.platform, flight, problem.order)
 
     def known(value):
         return jnp.where(found, value, jnp.nan)
 
     return SingleImpactOrbits(
         exists=found,
-        admissible=found & _admissible(problem, flight, duration, speeds.delay),
-        stable=found & (jnp.abs(trace) < jnp.abs(1.0 + det)) & (jnp.abs(det) <= 1.0),
-        near_double=found & (jnp.abs(slope) < NEAR_DOUBLE),
-        phase_rad=known(phase),
-        velocity_after_nm_per_us=known(velocity),
-        velocity_before_nm_per_us=known(before),
+        admissible=verdict.admissible,
+        stable=verdict.stable,
+        near_double=verdict.near_double,
+        phase_rad=known(state.phase),
+        velocity_after_nm_per_us=known(flight.start_velocity),
+        velocity_before_nm_per_us=known(flight.end_velocity),
         approach_speed_nm_per_us=known(speeds.approach),
         rebound_speed_nm_per_us=known(speeds.rebound),
         delay_us=known(speeds.delay),
-        peak_amplitude_nm=known(peak_amplitude(cantilever, ends)),
+        peak_amplitude_nm=known(peak_amplitude(problem.cantilever, flight)),
         lockin_amplitude_nm=known(amplitude),
         lockin_phase_deg=known(angle),
-        trace=known(trace),
-        determinant=known(det),
+        trace=known(verdict.trace),
+        determinant=known(verdict.determinant),
         complete=found,
     )
-
-
-def _admissible(problem: OrbitProblem, flight: Flight, duration, delay) -> Bool[Array, ""]:
-    """Say whether the first impact of the flight is the orbit's own; the flight counts from max(t_in, t_out) on."""
-    skip = None if problem.law.delay is None else jnp.maximum(-delay, 0.0)
-    first = first_impact(flight, skip_us=skip)
-    tolerance = _ARRIVAL_TOLERANCE * problem.platform.period_us
-    # Rounding can lift the end of the flight off the platform where the impact is a graze.
-    missed = first.outcome == Outcome.NO_FURTHER_IMPACT
-    hit = (first.outcome == Outcome.IMPACT) & (first.duration_us >= duration - tolerance)
-    return (duration > 0.0) & (hit | missed)

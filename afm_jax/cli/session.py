@@ -1,0 +1,121 @@
+"""What every command shares: `--json`, `--out`, messages on standard error, and the start of a computation.
+
+>>> import click
+>>> from afm_jax.cli.session import Session, with_session
+>>> @click.command()
+... @with_session
+... def command(session: Session) -> None:
+...     session.start_computing()  # only then import JAX and what needs it
+...     session.emit({"answer": 42}, "The answer is 42.")
+"""
+
+import functools
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+
+from afm_jax.cli.out_folder import prepare_folder, write_csv
+from afm_jax.cli.strict_json import strict_json
+
+_WIDTH_OF_A_PIPE = 160
+"""Columns of text that nobody looks at in a terminal; wide enough that no table is cut."""
+
+
+@dataclass(frozen=True)
+class Session:
+    """One call of a command.
+
+    Attributes:
+        json: write one JSON object to standard output, and nothing else there.
+        out: folder for tables and pictures, made already; None if none was asked for.
+    """
+
+    json: bool
+    out: Path | None
+
+    def start_computing(self) -> None:
+        """Start JAX with 64-bit floats and its compilation cache; call it before importing the physics."""
+        from afm_jax.cli.compilation import start_jax  # noqa: PLC0415
+
+        start_jax()
+
+    def note(self, message: str) -> None:
+        """Write a message to standard error."""
+        _console(stderr=True).print(message, markup=False, highlight=False, soft_wrap=True)
+
+    def working(self, what: str) -> AbstractContextManager[object]:
+        """Show on standard error what is being done, for as long as it takes, if that is a terminal."""
+        return _console(stderr=True).status(what)
+
+    def emit(self, payload: Mapping[str, Any], *text: Any) -> None:
+        """Write the result to standard output: the JSON object if asked for, else the text.
+
+        Args:
+            payload: the object; arrays become lists, NaN and infinity null.
+            text: strings and rich tables, one below the other; strings are printed as they are.
+        """
+        if self.json:
+            click.echo(strict_json(payload))
+            return
+        console = _console(stderr=False)
+        for part in text:
+            if isinstance(part, str):
+                console.print(part, markup=False, highlight=False, soft_wrap=True)
+            else:
+                console.print(part)
+        sys.stdout.flush()
+
+    def write_table(self, name: str, rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> None:
+        """Write a table as CSV into the `--out` folder, if there is one, and say so.
+
+        Args:
+            name: file name, "orbits.csv".
+            rows: a mapping from column to value each; what is missing, None or not finite stays empty.
+            columns: the columns in order.
+        """
+        if self.out is not None:
+            write_csv(self.out / name, rows, columns)
+            self.note(f"wrote {self.out / name}")
+
+
+def with_session(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command `--json` and `--out`, and pass it a `Session` as first argument."""
+
+    @click.option("--json", "as_json", is_flag=True, help="Write one JSON object to standard output, nothing else.")
+    @click.option(
+        "--out",
+        metavar="DIR",
+        type=click.Path(path_type=Path),
+        callback=_prepared,
+        help="Write tables (CSV) and pictures (PNG) into this folder.",
+    )
+    @functools.wraps(function)
+    def command(*args: Any, as_json: bool, out: Path | None, **options: Any) -> Any:
+        return function(Session(as_json, out), *args, **options)
+
+    return command
+
+
+def _prepared(ctx: click.Context, parameter: click.Parameter, folder: Path | None) -> Path | None:
+    """Make the folder before anything is computed, so that no result is lost at the end."""
+    if folder is None or ctx.resilient_parsing:
+        return folder
+    try:
+        prepare_folder(folder)
+    except OSError as error:
+        raise click.BadParameter(
+            f"{folder}: cannot write there ({error.strerror}); choose another folder", ctx=ctx, param=parameter
+        ) from error
+    return folder
+
+
+def _console(*, stderr: bool) -> Any:
+    from rich.console import Console  # noqa: PLC0415
+
+    stream = sys.stderr if stderr else sys.stdout
+    return Console(stderr=stderr, width=None if stream.isatty() else _WIDTH_OF_A_PIPE)

@@ -1,0 +1,124 @@
+"""A root of the closing condition as a motion: its impact, its flight, whether it can be, and whether it lasts."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from afm_jax.impact.first_impact import Flight, first_impact
+from afm_jax.impact.implicit import implicit_root
+from afm_jax.impact.jacobian import flight_jacobian, impact_jacobian
+from afm_jax.impact.orbit_amplitude import FlightEnds, lockin, peak_amplitude
+from afm_jax.impact.orbit_closure import OrbitProblem, Speeds, closing_residual, closure, speeds_at
+from afm_jax.impact.orbit_search import find_roots
+from afm_jax.outcome import Outcome
+
+NEAR_DOUBLE = 1e-3
+"""Slope of the closing condition per relative change of speed below which a root counts as near-double (a fold)."""
+_ARRIVAL_TOLERANCE = 1e-7
+"""How far (in drive periods) the first impact found may lie before the orbit's own, by rounding."""
+
+
+class OrbitState(NamedTuple):
+    """The motion at one root: drive phase in rad just after impact, speeds, and the flight's ends."""
+
+    phase: Float[Array, ""]
+    speeds: Speeds
+    flight: FlightEnds
+
+
+class Verdict(NamedTuple):
+    """What a root is good for: see `SingleImpactOrbits`."""
+
+    admissible: Bool[Array, ""]
+    stable: Bool[Array, ""]
+    near_double: Bool[Array, ""]
+    trace: Float[Array, ""]
+    determinant: Float[Array, ""]
+
+
+class SteadyOrbits(NamedTuple):
+    """The roots of a problem and which of them are steady (admissible and stable); arrays of the slots' shape."""
+
+    coordinate: Float[Array, " slots"]
+    steady: Bool[Array, " slots"]
+    near_double: Bool[Array, " slots"]
+
+
+def empty_coordinate(problem: OrbitProblem) -> Float[Array, ""]:
+    """Return a coordinate for slots without a root: some speed well above capture, harmless to compute with."""
+    return 2.0 * problem.platform.top_speed_nm_per_us + 2.0 * jnp.sqrt(problem.law.epsilon + 1.0)
+
+
+def orbit_state(coordinate: Float[Array, ""], problem: OrbitProblem) -> OrbitState:
+    """Return the motion at a root, with the root's derivatives (implicit function theorem)."""
+    cantilever, platform, law, order = problem
+    coordinate = implicit_root(closing_residual, coordinate, problem)
+    speeds = speeds_at(coordinate, law)
+    cosine, sine, determinant = closure(coordinate, problem)
+    regular = determinant != 0.0
+    safe = jnp.where(regular, determinant, 1.0)
+    phase = jnp.arctan2(jnp.where(regular, sine / safe, 0.0), jnp.where(regular, cosine / safe, 1.0)) % (2.0 * jnp.pi)
+    start = phase / platform.angular_frequency
+    duration = order * platform.period_us - speeds.delay
+    position, platform_velocity = platform.position_and_velocity(start)
+    velocity = platform_velocity + speeds.rebound
+    end_position, end_velocity = cantilever.propagator(duration)(position, velocity)
+    return OrbitState(phase, speeds, FlightEnds(start, duration, position, velocity, end_position, end_velocity))
+
+
+def judge(coordinate: Float[Array, ""], found: Bool[Array, ""], state: OrbitState, problem: OrbitProblem) -> Verdict:
+    """Return whether an orbit is admissible, stable (eq. 8 and its generalisation) and close to a fold."""
+    cantilever, platform, law, _ = problem
+    start, velocity = state.flight.start_us, state.flight.start_velocity
+    arrival = start + state.flight.duration_us
+    jacobian = impact_jacobian(law, platform, arrival, state.flight.end_velocity) @ flight_jacobian(
+        cantilever, platform, start, velocity, arrival
+    )
+    trace = jacobian[0, 0] + jacobian[1, 1]
+    determinant = jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]
+    slope = jax.grad(closing_residual)(coordinate, problem) * coordinate
+    return Verdict(
+        admissible=found & _admissible(problem, found, state),
+        stable=found & (jnp.abs(trace) < jnp.abs(1.0 + determinant)) & (jnp.abs(determinant) <= 1.0),
+        near_double=found & (jnp.abs(slope) < NEAR_DOUBLE),
+        trace=trace,
+        determinant=determinant,
+    )
+
+
+def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
+    """Return the roots that are steady motions, without derivatives: what an experiment can settle on."""
+    problem = lax.stop_gradient(problem)
+    roots = find_roots(problem)
+    coordinate = jnp.where(roots.found, roots.coordinate, empty_coordinate(problem))
+
+    def one(root, found):
+        verdict = judge(root, found, orbit_state(root, problem), problem)
+        return verdict.admissible & verdict.stable, verdict.near_double
+
+    return SteadyOrbits(coordinate, *jax.vmap(one)(coordinate, roots.found))
+
+
+def amplitudes(coordinate: Float[Array, ""], problem: OrbitProblem) -> Float[Array, " 2"]:
+    """Return peak and lock-in amplitude in nm of the orbit at a root, differentiable in the problem."""
+    state = orbit_state(coordinate, problem)
+    peak = peak_amplitude(problem.cantilever, state.flight)
+    length, _ = lockin(problem.cantilever, problem.platform, state.flight, problem.order)
+    return jnp.stack([peak, length])
+
+
+def _admissible(problem: OrbitProblem, found: Bool[Array, ""], state: OrbitState) -> Bool[Array, ""]:
+    """Say whether the first impact of the flight is the orbit's own; the flight counts from max(t_in, t_out) on."""
+    skip = None if problem.law.delay is None else jnp.maximum(-state.speeds.delay, 0.0)
+    # An empty slot does not leave the platform, so that its search ends at once.
+    velocity = jnp.where(found, state.flight.start_velocity, -jnp.inf)
+    first = first_impact(Flight(problem.cantilever, problem.platform, state.flight.start_us, velocity), skip_us=skip)
+    duration = state.flight.duration_us
+    hit = (first.outcome == Outcome.IMPACT) & (
+        first.duration_us >= duration - _ARRIVAL_TOLERANCE * problem.platform.period_us
+    )
+    # Rounding can lift the end of the flight off the platform where the impact is a graze.
+    return (duration > 0.0) & (hit | (first.outcome == Outcome.NO_FURTHER_IMPACT))

@@ -1,0 +1,210 @@
+"""The frame of the command line: what is imported when, what goes to which stream, and how a command ends."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+
+import click
+import jax
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+import afm_jax
+import fitting
+from afm_jax.cli import main, strict_json
+from afm_jax.cli.failures import NotValid
+from afm_jax.cli.session import Session, with_session
+from tests.fresh_python import python
+
+HEAVY = "{'jax', 'numpy', 'matplotlib', 'equinox', 'rich'}"
+
+
+@pytest.fixture
+def trial(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
+    """Run a function as the command `trial` of afm-jax."""
+
+    def run(body: Callable[[Session], None], *arguments: str) -> Result:
+        module = ModuleType("trial_command")
+        module.__dict__["command"] = click.command()(with_session(body))
+        monkeypatch.setitem(sys.modules, "trial_command", module)
+        monkeypatch.setitem(main.COMMANDS, "trial", ("trial_command", "Try something."))
+        return CliRunner().invoke(main.main, ["trial", *arguments])
+
+    return run
+
+
+def one_line(result: Result) -> str:
+    """Return the single line on standard error, without the program's name; standard output must be empty."""
+    assert result.stdout == ""
+    lines = result.stderr.splitlines()
+    assert len(lines) == 1, result.stderr
+    assert lines[0].startswith("afm-jax: ")
+    return lines[0].removeprefix("afm-jax: ")
+
+
+@pytest.mark.parametrize("package", ["afm_jax", "fitting"])
+def test_packages_import_nothing_heavy(package: str):
+    assert python(f"import sys, {package}; print({HEAVY} & set(sys.modules))") == "set()"
+
+
+@pytest.mark.parametrize(
+    "arguments", [["--help"], ["--version"], ["orbit"], *([name, "--help"] for name in main.COMMANDS)]
+)
+def test_help_imports_nothing_heavy(arguments: list[str]):
+    code = (
+        "import sys\nfrom afm_jax.cli.main import main\n"
+        f"try:\n    main({arguments})\nexcept SystemExit:\n    print('found', {HEAVY} & set(sys.modules))"
+    )
+    assert python(code).splitlines()[-1] == "found set()"
+
+
+def test_exports_are_what_the_modules_define():
+    for name in set(afm_jax.__all__) - {"__version__"}:
+        assert getattr(afm_jax, name).__name__ == name
+        assert name in dir(afm_jax)
+    for name in fitting.__all__:
+        assert getattr(fitting, name).__name__ == name
+    assert set(fitting.__all__) <= set(dir(fitting))
+    with pytest.raises(AttributeError, match="module 'afm_jax' has no attribute 'Cantilevr'"):
+        getattr(afm_jax, "Cantilevr")  # noqa: B009
+
+
+def test_help_lists_all_commands():
+    text = CliRunner().invoke(main.main, ["--help"]).stdout
+    words = " ".join(text.split())
+    for name, (_, line) in main.COMMANDS.items():
+        assert f" {name} {line}" in words
+
+
+def test_version_is_the_installed_one():
+    done = subprocess.run([sys.executable, "-m", "afm_jax", "--version"], capture_output=True, text=True, check=True)
+    assert done.stdout == f"afm-jax {afm_jax.__version__}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["orbit"], "there is no command `orbit`; did you mean `orbits`?"),
+        (["--versoin"], "there is no option `--versoin`; did you mean `--version`?"),
+        (["orbits", "a.toml", "--ordr", "1"], "there is no option `--ordr`; did you mean `--order`?"),
+        (["orbits", "a.toml"], "Missing option '--order' (see afm-jax orbits --help)"),
+        (["orbits", "a.toml", "--order", "0"], "must be a positive integer up to 1000000, but is 0"),
+        (["orbits", "a.toml", "--order", "1.5"], "must be a positive integer up to 1000000, but is 1.5"),
+    ],
+)
+def test_wrong_calls_are_one_line(arguments: list[str], expected: str):
+    result = CliRunner().invoke(main.main, arguments, prog_name="afm-jax")
+    assert result.exit_code == 2
+    assert expected in one_line(result)
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "line"),
+    [
+        (ValueError("`r` must be in (0, 1],\nbut is 2"), 2, "`r` must be in (0, 1], but is 2"),
+        (fitting.TableError("t.csv, line 3: bad"), 2, "t.csv, line 3: bad"),
+        (FileNotFoundError(2, "No such file or directory", "t.csv"), 2, "t.csv: No such file or directory"),
+        (OSError(28, "No space left on device"), 2, "No space left on device"),
+        (
+            ModuleNotFoundError("No module named 'mpmath'", name="mpmath"),
+            2,
+            "the Python package `mpmath` is missing; install it with: pip install mpmath",
+        ),
+        (click.BadParameter("no good"), 2, "Invalid value: no good"),
+        (NotValid("no orbit"), 3, "not valid: no orbit"),
+        (KeyboardInterrupt(), 130, "interrupted"),
+    ],
+)
+def test_failures_end_in_one_line_and_a_code(trial: Callable[..., Result], error: BaseException, code: int, line: str):
+    def body(session: Session) -> None:  # noqa: ARG001
+        raise error
+
+    result = trial(body)
+    assert result.exit_code == code
+    # click ends the line on which a terminal shows ^C
+    assert result.stderr.strip("\n").splitlines()[0].startswith(f"afm-jax: {line}")
+    assert len(result.stderr.strip("\n").splitlines()) == 1
+
+
+def test_a_mistake_in_the_program_is_not_hidden(trial: Callable[..., Result]):
+    def body(session: Session) -> None:  # noqa: ARG001
+        raise TypeError("a bug")
+
+    assert isinstance(trial(body).exception, TypeError)
+
+
+def test_json_is_the_only_output_and_strict(trial: Callable[..., Result]):
+    def body(session: Session) -> None:
+        session.note("[platform] is not markup")
+        session.emit({"speeds": np.array([1.0, np.nan]), "stuck": np.bool_(0), "count": np.int64(3)}, "text")
+
+    result = trial(body, "--json")
+    assert json.loads(result.stdout) == {"speeds": [1.0, None], "stuck": False, "count": 3}
+    assert result.stderr == "[platform] is not markup\n"
+    assert trial(body).stdout == "text\n"
+
+
+def test_strict_json_knows_jax_arrays_and_refuses_what_it_does_not_know():
+    value = {"a": jax.numpy.array([[0.1, -jax.numpy.inf]]), "b": (True, None, "x"), "c": Path("d")}
+    assert json.loads(strict_json.strict_json(value)) == {"a": [[0.1, None]], "b": [True, None, "x"], "c": "d"}
+    with pytest.raises(TypeError):
+        strict_json.strict_json({"a": object()})
+
+
+def test_result_is_printed_before_it_is_called_not_valid(trial: Callable[..., Result]):
+    def body(session: Session) -> None:
+        session.emit({"reason": "open"})
+        raise NotValid("open")
+
+    result = trial(body, "--json")
+    assert (result.exit_code, json.loads(result.stdout)) == (3, {"reason": "open"})
+
+
+def test_tables_land_in_the_folder(trial: Callable[..., Result], tmp_path: Path):
+    def body(session: Session) -> None:
+        rows = [{"x": 0.1, "ok": True}, {"x": float("nan"), "ok": np.bool_(0)}, {"ok": None}]
+        session.write_table("rows.csv", rows, ["x", "ok"])
+
+    folder = tmp_path / "new" / "folder"
+    assert trial(body, "--out", str(folder)).exit_code == 0
+    assert (folder / "rows.csv").read_text("utf-8") == "x,ok\n0.1,true\n,false\n,\n"
+
+
+def test_unusable_folder_ends_before_computing(trial: Callable[..., Result], tmp_path: Path):
+    (tmp_path / "file").touch()
+    called = []
+    result = trial(called.append, "--out", str(tmp_path / "file" / "below"))
+    assert result.exit_code == 2
+    assert "cannot write there" in one_line(result)
+    assert called == []
+
+
+def test_closed_pipe_is_quiet():
+    code = "from afm_jax.cli.main import main\nmain(['--help'])"
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run([sys.executable, "-c", code], stdout=writer, stderr=subprocess.PIPE, check=False)
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (1, b"")
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signal")
+def test_interrupt_ends_with_130():
+    code = (
+        "import sys, time, types, click\nfrom afm_jax.cli import main\n"
+        "module = types.ModuleType('waiting')\n"
+        "module.command = click.command()(lambda: (print('ready', flush=True), time.sleep(60)))\n"
+        "sys.modules['waiting'] = module\nmain.COMMANDS['wait'] = ('waiting', 'Wait.')\nmain.main(['wait'])"
+    )
+    with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == b"ready\n"
+        process.send_signal(signal.SIGINT)
+        _, complaint = process.communicate(timeout=30)
+    assert (process.returncode, complaint.strip()) == (130, b"afm-jax: interrupted")

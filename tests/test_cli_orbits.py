@@ -1,0 +1,98 @@
+"""`afm-jax orbits`, compared with the 50-digit orbits of the references."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, save_scene
+from afm_jax.cli.main import main
+from afm_jax.cli.orbits import COLUMNS
+from tests.reference_examples import SCENES, scene
+from tests.reference_orbits import single_impact_orbits
+from tests.reference_systems import Parameters
+
+KEYS = {*COLUMNS}
+
+
+def saved(p: Parameters, path: Path, *, offset_rate: float = 0.0) -> str:
+    """Write a reference's parameters as a scene file and return its path."""
+    delay = None if p.delay is None else CollisionDelay(*p.delay)
+    law = ImpactLaw(p.r, p.epsilon, p.viscous_loss, delay)
+    platform = Platform(p.amplitude_nm, p.drive_frequency_khz, p.offset_nm, offset_rate)
+    save_scene(Scene(Cantilever(p.frequency_khz, p.quality_factor), platform, law), path)
+    return str(path)
+
+
+def orbits(*arguments: str) -> Result:
+    return CliRunner().invoke(main, ["orbits", *arguments], prog_name="afm-jax")
+
+
+@pytest.mark.parametrize("name", sorted(SCENES))
+def test_json_is_the_references_list(name: str, tmp_path: Path):
+    result = orbits(saved(SCENES[name], tmp_path / "scene.toml"), "--order", "1", "--json")
+    assert result.exit_code == 0, result.stderr
+    answer = json.loads(result.stdout)
+    expected = single_impact_orbits(SCENES[name], 1)
+    assert (answer["order"], answer["reason"], answer["complete"]) == (1, None, True)
+    assert len(answer["orbits"]) == len(expected) > 0
+    for orbit, exact in zip(answer["orbits"], expected, strict=True):
+        assert set(orbit) == KEYS
+        for key in KEYS - {"near_double"}:
+            # a root near a fold keeps half of float64's digits at worst; these are well separated
+            np.testing.assert_allclose(orbit[key], float(getattr(exact, key)), rtol=1e-8, atol=1e-8, err_msg=key)
+
+
+def test_table_and_file_show_the_same_orbits(tmp_path: Path):
+    path = saved(SCENES["damped"], tmp_path / "scene.toml")
+    result = orbits(path, "--order", "1", "--out", str(tmp_path / "out"))
+    assert result.exit_code == 0
+    with (tmp_path / "out" / "orbits.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    expected = single_impact_orbits(SCENES["damped"], 1)
+    assert [float(row["phase_rad"]) for row in rows] == pytest.approx([float(o.phase_rad) for o in expected], rel=1e-8)
+    assert [row["stable"] for row in rows] == ["false", "true"]
+    for orbit in expected:
+        assert f"{float(orbit.peak_amplitude_nm):.6g}" in result.stdout
+
+
+def test_no_orbit_ends_with_3_and_says_why(tmp_path: Path):
+    weak = scene(amplitude_nm=0.01)
+    assert single_impact_orbits(weak, 1) == []
+    result = orbits(saved(weak, tmp_path / "scene.toml"), "--order", "1", "--json")
+    answer = json.loads(result.stdout)
+    assert (result.exit_code, answer["orbits"]) == (3, [])
+    assert "larger drive amplitude" in answer["reason"]
+    assert result.stderr == f"afm-jax: not valid: {answer['reason']}\n"
+
+
+def test_orbits_through_the_platform_do_not_count(tmp_path: Path):
+    centred = scene(offset_nm=0.0)
+    expected = single_impact_orbits(centred, 3)
+    assert expected
+    assert not any(orbit.admissible for orbit in expected)
+    result = orbits(saved(centred, tmp_path / "scene.toml"), "--order", "3", "--json")
+    answer = json.loads(result.stdout)
+    assert (result.exit_code, len(answer["orbits"])) == (3, len(expected))
+    assert "try --order 1" in answer["reason"]
+
+
+def test_a_ramp_has_no_periodic_orbit(tmp_path: Path):
+    path = saved(SCENES["damped"], tmp_path / "scene.toml", offset_rate=1e-3)
+    result = orbits(path, "--order", "1")
+    assert result.exit_code == 2
+    line = f"afm-jax: {path}: `offset_rate_nm_per_us` must be 0 for a periodic orbit, but is 0.001\n"
+    assert (result.stdout, result.stderr) == ("", line)
+
+
+def test_a_wrong_scene_is_one_line(tmp_path: Path):
+    path = tmp_path / "scene.toml"
+    path.write_text("[platform]\nfrequency_hz = 1\n", encoding="utf-8")
+    result = orbits(str(path), "--order", "1", "--json")
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert len(result.stderr.splitlines()) == 1
+    assert str(path) in result.stderr
