@@ -6,7 +6,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.apparatus.cantilever import Cantilever
@@ -90,6 +89,27 @@ def measurement_of(table: AmplitudeTable) -> Measurement:
     )
 
 
+class Linearised(NamedTuple):
+    """Residuals (sets, n), their Jacobian by the parameters' values (sets, n, p), and predictions (sets, ...).
+
+    The residuals are (predicted - measured)/error of all amplitudes, row by row, 0 where nothing was measured; the last
+    one is the constraint on Q. The sum of their squares is chi2.
+    """
+
+    residual: Float[Array, "sets n"]
+    jacobian: Float[Array, "sets n p"]
+    prediction: Prediction
+
+
+class _Branch(NamedTuple):
+    """The orbit that a row is taken to be on: its coordinate, whether there is one, and how many there are."""
+
+    coordinate: Float[Array, ""]
+    exists: Bool[Array, ""]
+    orbits: Int[Array, ""]
+    near_fold: Bool[Array, ""]
+
+
 def predict(values: Float[Array, " p"], measurement: Measurement, problem: Problem) -> Prediction:
     """Return the amplitudes that parameters predict for every row.
 
@@ -97,63 +117,77 @@ def predict(values: Float[Array, " p"], measurement: Measurement, problem: Probl
     counts; a row without any is predicted as 0, which misses the measurement by all of it: a fixed penalty.
     Derivatives run through the orbit by the implicit function theorem.
     """
-    law = problem.law(values)
-    cantilever = problem.cantilever(values, measurement.cantilever)
 
     def one(row: Rows) -> Prediction:
-        platform = Platform(row.drive_amplitude_nm, row.drive_frequency_khz, row.offset_nm)
-        orbit = OrbitProblem(cantilever, platform, law, row.order)
-        roots = steady_orbits(orbit)
-        # Choosing the branch needs no derivatives; the chosen one gets them below.
-        candidates = jax.vmap(amplitudes, in_axes=(0, None))(roots.coordinate, lax.stop_gradient(orbit))
-        misfit = jnp.where(row.measured, (candidates - row.amplitude_nm) / row.error_nm, 0.0)
-        slot = jnp.argmin(jnp.where(roots.steady, jnp.sum(misfit**2, axis=1), jnp.inf))
-        exists, coordinate = roots.steady[slot], roots.coordinate[slot]
-        return Prediction(
-            amplitude_nm=jnp.where(exists, amplitudes(coordinate, orbit), 0.0),
-            orbits=jnp.sum(roots.steady, dtype=jnp.int32),
-            near_fold=exists & roots.near_double[slot],
-            approach_speed_nm_per_us=speeds_at(coordinate, law).approach,
-        )
+        orbit = _orbit_problem(values, row, measurement, problem)
+        return _prediction(_branch(orbit, row), orbit)
 
     return jax.vmap(one)(measurement.rows)
-
-
-def residuals(
-    values: Float[Array, " p"], measurement: Measurement, problem: Problem
-) -> tuple[Float[Array, " n"], Prediction]:
-    """Return the normalised residuals (predicted - measured)/error of all amplitudes and of the constraint on Q.
-
-    Shape (2 rows + 1,); 0 where nothing was measured. The sum of squares is chi2. The prediction comes beside them.
-    """
-    rows = measurement.rows
-    prediction = predict(values, measurement, problem)
-    misfit = jnp.where(rows.measured, (prediction.amplitude_nm - rows.amplitude_nm) / rows.error_nm, 0.0)
-    constraint = jnp.zeros(1, values.dtype)
-    if "quality_factor" in problem.names:
-        fitted = values[problem.names.index("quality_factor")]
-        constraint = ((fitted - measurement.quality_factor) / measurement.quality_factor_error)[None]
-    return jnp.concatenate([misfit.ravel(), constraint]), prediction
-
-
-class Linearised(NamedTuple):
-    """Residuals (sets, n), their Jacobian by the parameters' values (sets, n, p), and predictions (sets, ...)."""
-
-    residual: Float[Array, "sets n"]
-    jacobian: Float[Array, "sets n p"]
-    prediction: Prediction
 
 
 @partial(jax.jit, static_argnames=("problem",))
 def linearise(values: Float[Array, "sets p"], measurement: Measurement, problem: Problem) -> Linearised:
     """Return residuals, their Jacobian (forward mode through the implicit roots) and predictions for several sets."""
+    sets, rows = values.shape[0], measurement.rows.order.shape[0]
 
-    def one(point):
+    def one(point: Float[Array, " p"], row: Rows):
+        branch = _branch(_orbit_problem(point, row, measurement, problem), row)
+
         def twice(v):
-            value, prediction = residuals(v, measurement, problem)
-            return value, (value, prediction)
+            prediction = _prediction(branch, _orbit_problem(v, row, measurement, problem))
+            return prediction.amplitude_nm, prediction
 
-        jacobian, (value, prediction) = jax.jacfwd(twice, has_aux=True)(point)
-        return Linearised(value, jacobian, prediction)
+        # The search stays outside the differentiation: a program that compiles in half the time.
+        return jax.jacfwd(twice, has_aux=True)(point)
 
-    return jax.vmap(one)(values)
+    # One vmap over all pairs of a set and a row, not two nested ones: tracing costs as much as a fit otherwise.
+    every_row = jax.tree.map(lambda column: jnp.concatenate([column] * sets), measurement.rows)
+    slope, prediction = jax.vmap(one)(jnp.repeat(values, rows, axis=0), every_row)
+    weight = jnp.where(every_row.measured, 1.0 / every_row.error_nm, 0.0)
+    misfit = weight * (prediction.amplitude_nm - every_row.amplitude_nm)
+    constraint, constraint_slope = _constraint(values, measurement, problem)
+    return Linearised(
+        residual=jnp.concatenate([misfit.reshape(sets, -1), constraint[:, None]], axis=1),
+        jacobian=jnp.concatenate(
+            [(weight[:, :, None] * slope).reshape(sets, 2 * rows, -1), constraint_slope[:, None]], axis=1
+        ),
+        prediction=jax.tree.map(lambda leaf: leaf.reshape(sets, rows, *leaf.shape[1:]), prediction),
+    )
+
+
+def _orbit_problem(values: Float[Array, " p"], row: Rows, measurement: Measurement, problem: Problem) -> OrbitProblem:
+    platform = Platform(row.drive_amplitude_nm, row.drive_frequency_khz, row.offset_nm)
+    return OrbitProblem(problem.cantilever(values, measurement.cantilever), platform, problem.law(values), row.order)
+
+
+def _branch(orbit: OrbitProblem, row: Rows) -> _Branch:
+    """Choose among a row's steady orbits by the measurement; no derivatives."""
+    roots = steady_orbits(orbit)
+    misfit = jnp.where(row.measured, (roots.amplitude_nm - row.amplitude_nm) / row.error_nm, 0.0)
+    slot = jnp.argmin(jnp.where(roots.steady, jnp.sum(misfit**2, axis=1), jnp.inf))
+    return _Branch(
+        coordinate=roots.coordinate[slot],
+        exists=roots.steady[slot],
+        orbits=jnp.sum(roots.steady, dtype=jnp.int32),
+        near_fold=roots.steady[slot] & roots.near_double[slot],
+    )
+
+
+def _prediction(branch: _Branch, orbit: OrbitProblem) -> Prediction:
+    return Prediction(
+        amplitude_nm=jnp.where(branch.exists, amplitudes(branch.coordinate, orbit), 0.0),
+        orbits=branch.orbits,
+        near_fold=branch.near_fold,
+        approach_speed_nm_per_us=speeds_at(branch.coordinate, orbit.law).approach,
+    )
+
+
+def _constraint(
+    values: Float[Array, "sets p"], measurement: Measurement, problem: Problem
+) -> tuple[Float[Array, " sets"], Float[Array, "sets p"]]:
+    """Return the residual of the measured Q and its slope; 0 where Q is not a parameter."""
+    if "quality_factor" not in problem.names:
+        return jnp.zeros_like(values[:, 0]), jnp.zeros_like(values)
+    index = problem.names.index("quality_factor")
+    residual = (values[:, index] - measurement.quality_factor) / measurement.quality_factor_error
+    return residual, jnp.zeros_like(values).at[:, index].set(1.0 / measurement.quality_factor_error)

@@ -13,6 +13,8 @@ _OUTER_STEPS = 30
 _INNER_STEPS = 25
 _FARTHEST = 100.0
 """Distance in standard errors at which a search gives up: the data do not determine the parameter on that side."""
+_FIRST_TRIAL = float(np.sqrt(CHI2_95))
+"""In standard errors: where the end lies if chi2 is a parabola."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +35,7 @@ class _Side:
     others: Float[np.ndarray, " p"]  # optimiser coordinates; the profiled one is not used
     inside: float = 0.0  # distance in errors that lies inside the interval
     outside: float = np.inf
-    trial: float = 1.96
+    trial: float = _FIRST_TRIAL
     end: float | None = None
     reason: str | None = None
 
@@ -41,7 +43,7 @@ class _Side:
 def profile_intervals(
     objective: Objective,
     values: Float[np.ndarray, " p"],
-    errors: Float[np.ndarray, " p"],
+    covariance: Float[np.ndarray, "p p"],
     chi2: float,
     chi2_scale: float = 1.0,
 ) -> list[Interval]:
@@ -50,13 +52,13 @@ def profile_intervals(
     Args:
         objective: chi2 of a table and a model.
         values: the fitted values.
-        errors: their standard errors, to measure steps in; infinite ones give open intervals.
+        covariance: theirs, for steps and first guesses; an infinite variance gives an open interval.
         chi2: at the fitted values.
         chi2_scale: factor on the rise of 3.84 where the errors of the table were scaled.
     """
-    start = objective.problem.coordinates(values)
+    errors = np.sqrt(np.diag(covariance))
     sides = [
-        _Side(index, direction, start.copy())
+        _Side(index, direction, _followers(objective, values, covariance, index, direction))
         for index in range(len(values))
         for direction in (-1.0, 1.0)
         if np.isfinite(errors[index])
@@ -88,7 +90,7 @@ def _advance(objective: Objective, sides: list[_Side], values, errors, levels) -
                 side.reason = "the data set no limit on this side"
         else:
             side.outside = min(side.outside, distance)
-        if side.outside - side.inside < 1e-5 * max(side.outside, 1e-300) or abs(above - rise) < 1e-4 * rise:
+        if side.outside - side.inside < 1e-5 * max(side.outside, 1e-300) or abs(above - rise) < 1e-3 * rise:
             side.end = float(target)
         # sqrt(chi2 - minimum) is close to proportional to the distance.
         guess = distance * np.sqrt(rise / above) if above > 1e-6 * rise else 2.0 * distance
@@ -96,6 +98,15 @@ def _advance(objective: Objective, sides: list[_Side], values, errors, levels) -
         margin = 1e-3 * (side.outside - side.inside) if np.isfinite(side.outside) else 0.0
         inside = side.inside + margin < guess < side.outside - margin
         side.trial = min(guess if inside else safe, _FARTHEST)
+
+
+def _followers(objective: Objective, values, covariance, index: int, direction: float) -> Float[np.ndarray, " p"]:
+    """Return where the other parameters go, to first order, when one moves to its first trial (coordinates)."""
+    variance = covariance[index, index]
+    shift = direction * _FIRST_TRIAL * covariance[:, index] / np.sqrt(variance) if variance > 0.0 else 0.0
+    parameters = objective.problem.parameters
+    guess = np.clip(values + shift, [p.lowest for p in parameters], [p.highest for p in parameters])
+    return objective.problem.coordinates(np.where(np.isfinite(guess), guess, values))
 
 
 def _target(side: _Side, objective: Objective, values, errors) -> float:
@@ -133,7 +144,7 @@ def _minimise_others(objective: Objective, sides: list[_Side], targets):
         jacobian = np.where(better[:, None, None], new_jacobian, jacobian)
         chi2 = np.where(better, new_chi2, chi2)
         damping = np.where(better, 0.1 * damping, np.maximum(30.0 * damping, 1e-4))
-        if np.all((gain < 1e-6) & (better | (damping > 1e6))):
+        if np.all((gain < 1e-4) & (better | (damping > 1e6))):
             break
     return chi2, y
 

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtrc
 
 from afm_jax.parameters import require_float64
 from fitting.checks import Convergence, at_bound, check_minimum, covariance
@@ -66,8 +66,8 @@ def _minimise(objective: Objective):
     points = grid(objective.problem, objective.measurement)
     best = np.argsort(objective.screen(points), kind="stable")[:BATCH]
     starts = objective.problem.coordinates(points[best])
-    soft = polish(objective, starts, SOFT)
-    final = polish(objective, soft.coordinates, PLAIN)
+    soft = polish(objective, starts, SOFT, settled=1e-2)
+    final = polish(objective, soft.coordinates, PLAIN, settled=1e-10)
     winner = int(np.argmin(final.objective))
     minima = objective.problem.values(final.coordinates), final.objective
     return final.coordinates[winner], points[best[winner]], minima
@@ -95,7 +95,7 @@ class _Summary:
 
     def result(self, start: Float[np.ndarray, " p"], minima) -> FitResult:
         judged = self.freedom > 0 and not self.scale_errors
-        p_value = float(chi2_distribution.sf(self.chi2, self.freedom)) if judged else float("nan")
+        p_value = float(chdtrc(self.freedom, self.chi2)) if judged else float("nan")
         errors = np.sqrt(np.diag(self.covariance))
         moved = np.abs(self.values - start) > 1e-3 * errors
         if p_value < IMPROBABLE:
@@ -103,7 +103,7 @@ class _Summary:
             intervals = [Interval(None, None, "the model does not explain the data")] * len(errors)
             parameters = self._parameters(np.full_like(errors, np.inf), intervals, moved)
         else:
-            intervals = profile_intervals(self.objective, self.values, errors, self.chi2, self.chi2_scale)
+            intervals = profile_intervals(self.objective, self.values, self.covariance, self.chi2, self.chi2_scale)
             parameters = self._parameters(errors, intervals, moved)
         rows = self._rows()
         evidence = Evidence(

@@ -22,10 +22,8 @@ SOFT = 5.0
 """Residual, in errors, beyond which the screening and the first polish count a row linearly (soft-l1)."""
 PLAIN = np.inf
 """The same for plain least squares: no residual gets there."""
-_GRID_PER_PARAMETER = {1: 96, 2: 20}
+_GRID_PER_PARAMETER = {1: 96, 2: 16}
 _MAX_STEPS = 60
-_SETTLED = 1e-10
-"""Estimated distance of chi2 to its minimum at which a polish stops."""
 _LBFGS = optax.lbfgs(learning_rate=1.0, linesearch=None, scale_init_precond=False)
 _lbfgs_init = jax.jit(jax.vmap(_LBFGS.init))
 _lbfgs_update = jax.jit(jax.vmap(_LBFGS.update))
@@ -115,13 +113,14 @@ class Objective:
         return axes / np.sqrt(np.maximum(curvature, 1e-8 * largest))[:, None, :]
 
 
-def polish(objective: Objective, starts: Float[np.ndarray, "starts p"], softness: float) -> Polished:
+def polish(objective: Objective, starts: Float[np.ndarray, "starts p"], softness: float, *, settled: float) -> Polished:
     """Minimise from every start at once by optax's L-BFGS, steps halved until they descend (Armijo).
 
     Args:
         objective: what to minimise.
         starts: optimiser coordinates, at most `BATCH` of them.
         softness: residual in errors beyond which rows count linearly; `PLAIN` for least squares.
+        settled: estimated distance of the objective to its minimum at which a start is done.
     """
     scale = objective.scale(starts)
 
@@ -135,7 +134,7 @@ def polish(objective: Objective, starts: Float[np.ndarray, "starts p"], softness
     step, state = _lbfgs_update(jnp.asarray(gradient), _lbfgs_init(jnp.asarray(z)), jnp.asarray(z))
     step, share = _descending(np.asarray(step), gradient), np.ones(len(z))
     count = 0
-    while count < _MAX_STEPS and np.any((_squared(gradient) > _SETTLED) & (share > 1e-9)):
+    while count < _MAX_STEPS and np.any((_squared(gradient) > settled) & (share > 1e-9)):
         count += 1
         trial = z + share[:, None] * step
         new_value, new_gradient = evaluate(trial)

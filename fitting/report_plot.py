@@ -122,12 +122,12 @@ def _draw_losses(axes: Axes, result: FitResult) -> None:
     """Draw the share of its energy that the tip loses, where the laws differ visibly."""
     law = result.law
     speed = law.approach_speed_nm_per_us
-    lost, most, least = (
+    lost, least, most = (
         100.0 * (1.0 - (column / speed) ** 2)
-        for column in (law.rebound_speed_nm_per_us, law.rebound_low_nm_per_us, law.rebound_high_nm_per_us)
+        for column in (law.rebound_speed_nm_per_us, law.rebound_high_nm_per_us, law.rebound_low_nm_per_us)
     )
     axes.fill_between(speed, least, most, color=_COLOURS[0], alpha=0.3, lw=0)
     axes.plot(speed, lost, color=_COLOURS[0])
     axes.set_xlabel("approach speed (nm/µs)")
     axes.set_ylabel("energy lost (%)")
-    axes.set_ylim(bottom=0)
+    axes.set_ylim(0, 1.15 * np.max(np.where(np.isfinite(most), most, lost)))

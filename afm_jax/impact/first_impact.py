@@ -75,6 +75,15 @@ def first_impact(
     return FirstImpact(jnp.where(hit, root, 0.0), ended)
 
 
+class _Motion(NamedTuple):
+    """The tip's height in nm and velocity in nm/us, and how far and how fast (g, g') it is from the platform."""
+
+    position: Float[Array, ""]
+    velocity: Float[Array, ""]
+    gap: Float[Array, ""]
+    gap_rate: Float[Array, ""]
+
+
 class _Search(NamedTuple):
     """What the search for the first root needs of a flight: the constants of its closed form, and its bounds."""
 
@@ -126,8 +135,8 @@ class _Search(NamedTuple):
             clearance_speed=velocity - platform_velocity,
         )
 
-    def safe_step(self, duration: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """Return a step in us that cannot pass the first root, and the error of the root it would leave."""
+    def motion(self, duration: Float[Array, ""]) -> _Motion:
+        """Return tip and gap a duration in us after the start."""
         sine, cosine = sine_cosine(self.angular_frequency * duration)
         position = self.position * cosine + self.position_sine * sine
         velocity = self.velocity * cosine + self.velocity_sine * sine
@@ -135,9 +144,15 @@ class _Search(NamedTuple):
             decay = jnp.exp(-self.decay_rate * duration)
             position, velocity = decay * position, decay * velocity
         platform_position, platform_velocity = self.platform.position_and_velocity(self.start_us + duration)
-        gap_rate = velocity - platform_velocity
-        step = _time_above(position - platform_position, gap_rate, self.gap_bound)
-        clear = _time_above(position - self.reach, velocity, self.tip_bound)
+        return _Motion(position, velocity, position - platform_position, velocity - platform_velocity)
+
+    def safe_step(self, duration: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """Return a step in us that cannot pass the first root, and the error of the root it would leave."""
+        position, velocity, gap, gap_rate = self.motion(duration)
+        # A gap that opens is a true one even where rounding makes it negative: right after a slow departure.
+        step = jnp.where((gap > 0.0) | (gap_rate > 0.0), _time_above(gap, gap_rate, self.gap_bound), 0.0)
+        clearance = position - self.reach
+        clear = jnp.where(clearance > 0.0, _time_above(clearance, velocity, self.tip_bound), 0.0)
         # Once M h is small against |g'|, the root exists and is at most M h^2/|g'| further on.
         bend = self.gap_bound * step
         error = jnp.where(4.0 * bend <= -gap_rate, bend * step / jnp.maximum(-gap_rate, 1e-30), jnp.inf)
@@ -147,50 +162,50 @@ class _Search(NamedTuple):
         """Step until the root is met, out of reach, or the steps are used up."""
         resolution = 4.0 * jnp.finfo(self.velocity.dtype).eps
 
+        # One number says how far the search is and, by its sign, whether it has ended: with every further output of
+        # the loop XLA would compute the sines and square roots once more.
         def searching(state):
-            duration, step, steps = state
-            return (step > 0.0) & (duration < self.latest_us) & (steps < max_steps)
+            duration, steps = state
+            return (duration >= 0.0) & (duration < self.latest_us) & (steps < max_steps)
 
         def advance(state):
-            duration, step, steps = state
-            duration = duration + step
+            duration, steps = state
             step, error = self.safe_step(duration)
             met = (error <= tolerance) | (step <= resolution * duration)
-            return jnp.where(met, duration + step, duration), jnp.where(met, 0.0, step), steps + 1
+            reached = duration + step
+            return jnp.where(met, -reached, reached), steps + 1
 
         leaving = self.clearance_speed > 0.0
         finite = jnp.isfinite(self.gap_bound) & jnp.isfinite(self.start_us) & jnp.isfinite(self.clearance_speed)
-        begin, first, inside = self._first_step()
-        start = (begin, jnp.where(finite & leaving, first, 0.0), jnp.zeros_like(begin, dtype=jnp.int32))
-        duration, step, _ = lax.while_loop(searching, advance, start)
+        begin, inside = self._first_step()
+        begin = jnp.where(finite & leaving & ~inside, begin, -1.0)  # an ended search
+        duration, _ = lax.while_loop(searching, advance, (begin, jnp.zeros_like(begin, dtype=jnp.int32)))
         ended = jnp.where(
-            step <= 0.0,
+            duration < 0.0,
             Outcome.IMPACT,
             jnp.where(duration >= self.latest_us, Outcome.NO_FURTHER_IMPACT, Outcome.STEP_LIMIT),
         )
         ended = jnp.where(inside, Outcome.DELAY_EXCEEDS_FLIGHT, ended)
-        return duration, jnp.where(finite & leaving, ended, Outcome.INVALID_START).astype(jnp.int32)
+        return -duration, jnp.where(finite & leaving, ended, Outcome.INVALID_START).astype(jnp.int32)
 
-    def _first_step(self) -> tuple[Float[Array, ""], Float[Array, ""], Bool[Array, ""]]:
-        """Return where the search begins, its first step, and whether the tip is inside the platform there."""
+    def _first_step(self) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+        """Return a duration in us before which there is no impact, and whether the tip is in the platform there."""
         leave = 2.0 * self.clearance_speed / self.gap_bound
         if self.skip_us is None:
-            return jnp.zeros_like(leave), leave, jnp.zeros_like(leave, dtype=bool)
+            return leave, jnp.zeros_like(leave, dtype=bool)
         skips = self.skip_us > 0.0
-        step, _ = self.safe_step(self.skip_us)
-        return jnp.where(skips, self.skip_us, 0.0), jnp.where(skips, step, leave), skips & (step <= 0.0)
+        return jnp.where(skips, self.skip_us, leave), skips & (self.motion(self.skip_us).gap <= 0.0)
 
 
 def _time_above(height: Float[Array, ""], rate: Float[Array, ""], bound: Float[Array, ""]) -> Float[Array, ""]:
     """Return how long a height above a level stays positive at least, its second derivative within the bound.
 
-    (g' + sqrt(g'^2 + 2 M g))/M, for g' <= 0 in the form 2 g/(sqrt(g'^2 + 2 M g) - g') that does not cancel.
+    (g' + sqrt(g'^2 + 2 M g))/M, for g' <= 0 in the form 2 g/(sqrt(g'^2 + 2 M g) - g') that does not cancel. Counts a
+    negative height as 0; not to be used at height and rate 0.
     """
-    above = height > 0.0
-    root = jnp.sqrt(rate * rate + 2.0 * bound * jnp.where(above, height, 0.0))
+    root = jnp.sqrt(rate * rate + 2.0 * bound * jnp.maximum(height, 0.0))
     falling = rate <= 0.0
-    step = jnp.where(falling, 2.0 * height, rate + root) / jnp.where(falling, root - rate, bound)
-    return jnp.where(above, step, 0.0)
+    return jnp.where(falling, 2.0 * height, rate + root) / jnp.where(falling, root - rate, bound)
 
 
 def _latest_impact(

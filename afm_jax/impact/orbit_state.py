@@ -40,11 +40,12 @@ class Verdict(NamedTuple):
 
 
 class SteadyOrbits(NamedTuple):
-    """The roots of a problem and which of them are steady (admissible and stable); arrays of the slots' shape."""
+    """The roots of a problem, which of them are steady (admissible and stable), and their amplitudes in nm."""
 
     coordinate: Float[Array, " slots"]
     steady: Bool[Array, " slots"]
     near_double: Bool[Array, " slots"]
+    amplitude_nm: Float[Array, "slots 2"]
 
 
 def empty_coordinate(problem: OrbitProblem) -> Float[Array, ""]:
@@ -79,7 +80,8 @@ def judge(coordinate: Float[Array, ""], found: Bool[Array, ""], state: OrbitStat
     )
     trace = jacobian[0, 0] + jacobian[1, 1]
     determinant = jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]
-    slope = jax.grad(closing_residual)(coordinate, problem) * coordinate
+    # How fast the closing condition changes with the logarithm of Y.
+    _, slope = jax.jvp(lambda y: closing_residual(y, problem), (coordinate,), (coordinate,))
     return Verdict(
         admissible=found & _admissible(problem, found, state),
         stable=found & (jnp.abs(trace) < jnp.abs(1.0 + determinant)) & (jnp.abs(determinant) <= 1.0),
@@ -96,15 +98,19 @@ def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
     coordinate = jnp.where(roots.found, roots.coordinate, empty_coordinate(problem))
 
     def one(root, found):
-        verdict = judge(root, found, orbit_state(root, problem), problem)
-        return verdict.admissible & verdict.stable, verdict.near_double
+        state = orbit_state(root, problem)
+        verdict = judge(root, found, state, problem)
+        return verdict.admissible & verdict.stable, verdict.near_double, _amplitudes_of(state, problem)
 
     return SteadyOrbits(coordinate, *jax.vmap(one)(coordinate, roots.found))
 
 
 def amplitudes(coordinate: Float[Array, ""], problem: OrbitProblem) -> Float[Array, " 2"]:
     """Return peak and lock-in amplitude in nm of the orbit at a root, differentiable in the problem."""
-    state = orbit_state(coordinate, problem)
+    return _amplitudes_of(orbit_state(coordinate, problem), problem)
+
+
+def _amplitudes_of(state: OrbitState, problem: OrbitProblem) -> Float[Array, " 2"]:
     peak = peak_amplitude(problem.cantilever, state.flight)
     length, _ = lockin(problem.cantilever, problem.platform, state.flight, problem.order)
     return jnp.stack([peak, length])
