@@ -4,6 +4,9 @@ Values are checked only while they are concrete; inside ``jit``, ``grad`` or ``v
 check is skipped, because a compiled program cannot raise.
 """
 
+import dataclasses
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -67,6 +70,21 @@ _RANGES = {
     "above 0.5": lambda number: number > 0.5,
     "in (0, 1]": lambda number: (number > 0) & (number <= 1),
 }
+
+
+def readable(module: eqx.Module, /) -> str:
+    """Return a module with its numbers, the way it was written: for `__repr__`.
+
+    Traced values and abstract shapes show as JAX shows them.
+    """
+    fields = ", ".join(f"{field.name}={_number(getattr(module, field.name))}" for field in dataclasses.fields(module))
+    return f"{type(module).__name__}({fields})"
+
+
+def _number(value: object) -> str:
+    if isinstance(value, jax.Array) and not is_traced(value):
+        return repr(np.asarray(value).item()) if value.ndim == 0 else np.array2string(np.asarray(value), separator=", ")
+    return repr(value)
 
 
 def require_float64() -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import optax
 from jaxtyping import Bool, Float
 
+from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.forward import Linearised, Measurement, linearise
 from fitting.models import Problem
 
@@ -49,7 +50,7 @@ def grid(problem: Problem, measurement: Measurement) -> Float[np.ndarray, "point
     Adhesion and viscous loss are laid out in terms of the drive's speed beta omega, on which capture depends.
     """
     rows = measurement.rows
-    drive = np.asarray(rows.drive_amplitude_nm * rows.drive_frequency_khz) * 2e-3 * np.pi
+    drive = RAD_PER_US_PER_KHZ * np.asarray(rows.drive_amplitude_nm * rows.drive_frequency_khz)
     slow, fast = float(drive.min()), float(drive.max())
     laws = [name for name in problem.names if name != "quality_factor"]
     count = _GRID_PER_PARAMETER[len(laws)]

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.apparatus.trigonometry import sine_cosine
-from afm_jax.parameters import as_argument, as_optional_parameter, as_parameter, check_parameter
+from afm_jax.parameters import as_argument, as_optional_parameter, as_parameter, check_parameter, readable
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
 
@@ -45,6 +45,8 @@ class Cantilever(eqx.Module):
     frequency_khz: Float[Array, "..."] = eqx.field(converter=as_parameter)
     quality_factor: Float[Array, "..."] | None = eqx.field(converter=as_optional_parameter, default=None)
     mass_ng: Float[Array, "..."] = eqx.field(converter=as_parameter, default=1.0)
+
+    __repr__ = readable
 
     def __check_init__(self):
         check_parameter("frequency_khz", self.frequency_khz, "positive")

@@ -1,10 +1,11 @@
 """The moving platform that carries the sample: offset + ramp + cosine."""
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.apparatus.trigonometry import sine_cosine
-from afm_jax.parameters import as_argument, as_parameter, check_parameter
+from afm_jax.parameters import as_argument, as_parameter, check_parameter, readable
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
 
@@ -26,6 +27,8 @@ class Platform(eqx.Module):
     offset_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.0)
     offset_rate_nm_per_us: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.0)
 
+    __repr__ = readable
+
     def __check_init__(self):
         check_parameter("amplitude_nm", self.amplitude_nm, "not negative")
         check_parameter("frequency_khz", self.frequency_khz, "positive")
@@ -40,7 +43,7 @@ class Platform(eqx.Module):
     @property
     def period_us(self) -> Float[Array, "..."]:
         """Drive period in us."""
-        return 1e3 / self.frequency_khz
+        return 2.0 * jnp.pi / self.angular_frequency
 
     @property
     def top_speed_nm_per_us(self) -> Float[Array, "..."]:

@@ -4,6 +4,7 @@ import equinox as eqx
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
+from afm_jax.parameters import readable
 
 
 class Scene(eqx.Module):
@@ -18,3 +19,5 @@ class Scene(eqx.Module):
     cantilever: Cantilever
     platform: Platform
     interaction: eqx.Module
+
+    __repr__ = readable

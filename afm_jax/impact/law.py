@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from afm_jax.apparatus.scene import Scene
-from afm_jax.parameters import as_argument, as_parameter, check_parameter
+from afm_jax.parameters import as_argument, as_parameter, check_parameter, readable
 
 
 def squared_rebound_speed(
@@ -35,6 +35,8 @@ class CollisionDelay(eqx.Module):
     hertz: Float[Array, "..."] = eqx.field(converter=as_parameter)
     lead_nm: Float[Array, "..."] = eqx.field(converter=as_parameter)
     offset_nm: Float[Array, "..."] = eqx.field(converter=as_parameter)
+
+    __repr__ = readable
 
     def __check_init__(self):
         check_parameter("hertz", self.hertz, "finite")
@@ -77,6 +79,8 @@ class ImpactLaw(eqx.Module):
     epsilon: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.0)
     viscous_loss: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.0)
     delay: CollisionDelay | None = None
+
+    __repr__ = readable
 
     def __check_init__(self):
         check_parameter("r", self.r, "in (0, 1]")

@@ -12,7 +12,7 @@ from afm_jax.impact.orbit_amplitude import lockin, peak_amplitude
 from afm_jax.impact.orbit_closure import OrbitProblem
 from afm_jax.impact.orbit_search import find_roots
 from afm_jax.impact.orbit_state import empty_coordinate, judge, orbit_state
-from afm_jax.parameters import is_traced, require_float64
+from afm_jax.parameters import is_traced, readable, require_float64
 
 
 class SingleImpactOrbits(eqx.Module):
@@ -56,6 +56,8 @@ class SingleImpactOrbits(eqx.Module):
     trace: Float[Array, "..."]
     determinant: Float[Array, "..."]
     complete: Bool[Array, "..."]
+
+    __repr__ = readable
 
 
 def single_impact_orbits(scene: Scene, order: ArrayLike) -> SingleImpactOrbits:

@@ -12,7 +12,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.first_impact import DEFAULT_MAX_STEPS, DEFAULT_ROOT_TOLERANCE_US, Flight, first_impact
 from afm_jax.impact.law import ImpactLaw, impact_law_of
 from afm_jax.outcome import Outcome
-from afm_jax.parameters import require_float64
+from afm_jax.parameters import readable, require_float64
 
 NEAR_GRAZING = 1e-3
 """Approach speed over beta omega below which an impact counts as near grazing: its derivatives lose their meaning."""
@@ -38,6 +38,8 @@ class NextImpact(eqx.Module):
     velocity_after_nm_per_us: Float[Array, "..."]
     outcome: Int[Array, "..."]
     near_grazing: Bool[Array, "..."]
+
+    __repr__ = readable
 
 
 def next_impact(

@@ -1,0 +1,209 @@
+"""One impact to the next with 50 digits: the map, its derivative by two methods, and eqs. 5, 7 and 8 as printed."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from tests.brute_force import Flights, first_impact
+from tests.reference_flight import (
+    Constants,
+    Matrix,
+    Number,
+    Parameters,
+    capture_limit,
+    collision_delay,
+    collision_delay_slope,
+    constants,
+    high_precision,
+    mp,
+    outgoing,
+    outgoing_slope,
+    platform,
+    propagator,
+)
+
+
+class Impact(NamedTuple):
+    """One impact, in us and nm/us; `time_us` is when the next flight starts. After a capture the last two are NaN."""
+
+    time_us: Number
+    arrival_time_us: Number
+    velocity_before_nm_per_us: Number
+    velocity_after_nm_per_us: Number
+    delay_us: Number
+    captured: bool
+
+
+def _arrival(k: Constants, t1: Number, v1: Number, guess: Number) -> Number:
+    """Return the root of the gap next to a guess (Newton's method)."""
+    z0 = platform(k, t1)[0]
+
+    def gap(t: Number) -> Number:
+        p11, p12, _, _ = propagator(k, t - t1)
+        return p11 * z0 + p12 * v1 - platform(k, t)[0]
+
+    def slope(t: Number) -> Number:
+        _, _, p21, p22 = propagator(k, t - t1)
+        return p21 * z0 + p22 * v1 - platform(k, t)[1]
+
+    return mp.findroot(gap, guess, solver="newton", df=slope)
+
+
+def _impact(k: Constants, t1: Number, v1: Number, guess: Number) -> Impact:
+    """Return the impact whose arrival lies next to a guess."""
+    arrival = _arrival(k, t1, v1, guess)
+    _, _, p21, p22 = propagator(k, arrival - t1)
+    before = p21 * platform(k, t1)[0] + p22 * v1
+    approach = platform(k, arrival)[1] - before
+    if approach <= capture_limit(k):
+        return Impact(arrival, arrival, before, mp.nan, mp.nan, captured=True)
+    delay = collision_delay(k, approach)
+    leaving = arrival + delay
+    after = platform(k, leaving)[1] + outgoing(k, approach)
+    return Impact(leaving, arrival, before, after, delay, captured=False)
+
+
+@high_precision
+def next_impact(p: Parameters, t1: Number, v1: Number, guess: Number) -> Impact:
+    """Return the impact next to a guessed arrival time.
+
+    Args:
+        p: tip, platform and law.
+        t1: time in us at which the tip leaves the platform.
+        v1: its velocity then, nm/us.
+        guess: arrival time in us, right to about 1e-6.
+
+    Raises:
+        ValueError: if the root found is not the one guessed.
+    """
+    impact = _impact(constants(p), mp.mpf(t1), mp.mpf(v1), mp.mpf(guess))
+    if abs(impact.arrival_time_us - guess) > 1e-5:
+        raise ValueError(f"guess {float(guess)} us led to another root, {float(impact.arrival_time_us)} us")
+    return impact
+
+
+def flights_of(p: Parameters, time_us: Number, velocity_nm_per_us: Number) -> Flights:
+    """Return one flight of these parameters for the brute-force search."""
+    quality = np.inf if p.quality_factor is None else p.quality_factor
+    fields = (p.frequency_khz, quality, p.amplitude_nm, p.drive_frequency_khz, p.offset_nm)
+    return Flights(*(np.array([float(field)]) for field in (*fields, time_us, velocity_nm_per_us)))
+
+
+@high_precision
+def iterate(p: Parameters, t1: Number, v1: Number, impacts: int, *, duration_us: float = 1000.0) -> list[Impact]:
+    """Return up to `impacts` impacts in a row: fewer after a capture or a flight longer than `duration_us`.
+
+    Each root is first found by brute force in float64, so it is the first one, and then refined.
+    """
+    history: list[Impact] = []
+    for _ in range(impacts):
+        # Reduced by whole drive periods, in which the map is periodic: late times keep their digits in float64.
+        shift = constants(p).drive_period * mp.floor(t1 / constants(p).drive_period)
+        search = first_impact(flights_of(p, t1 - shift, v1), duration_us=duration_us)
+        if not search.found[0]:
+            break
+        history.append(next_impact(p, t1, v1, shift + search.arrival_time_us[0]))
+        if history[-1].captured:
+            break
+        t1, v1 = history[-1].time_us, history[-1].velocity_after_nm_per_us
+    return history
+
+
+@high_precision
+def map_jacobian(p: Parameters, t1: Number, v1: Number, guess: Number) -> Matrix:
+    """Return d(time_us, velocity_after)/d(t1, v1) by the implicit function theorem, 2 x 2."""
+    k, t1 = constants(p), mp.mpf(t1)
+    impact = next_impact(p, t1, v1, guess)
+    z1, w1, _ = platform(k, t1)
+    p11, p12, p21, p22 = propagator(k, impact.arrival_time_us - t1)
+    before = impact.velocity_before_nm_per_us
+    pull = -(k.free**2) * (p11 * z1 + p12 * v1) - 2 * k.decay * before  # acceleration of the tip at arrival
+    _, w2, a2 = platform(k, impact.arrival_time_us)
+    approach = w2 - before
+    # gap = p11 z1 + p12 v1 - z_p(t_in) = 0, with d(p)/dt1 = -d(p)/dt_in
+    arrival = [(p11 * w1 - before) / approach, p12 / approach]
+    velocity = [pull * (arrival[0] - 1) + p21 * w1, pull * arrival[1] + p22]
+    slope, delay_slope = outgoing_slope(k, approach), collision_delay_slope(k, approach)
+    leaving_acceleration = platform(k, impact.time_us)[2]
+    jacobian = mp.matrix(2, 2)
+    for column in range(2):
+        faster = a2 * arrival[column] - velocity[column]
+        jacobian[0, column] = arrival[column] + delay_slope * faster
+        jacobian[1, column] = leaving_acceleration * jacobian[0, column] + slope * faster
+    return jacobian
+
+
+@high_precision
+def differenced_jacobian(p: Parameters, t1: Number, v1: Number, guess: Number) -> Matrix:
+    """Return the same matrix by central differences with 180 digits and step 1e-30: some 55 digits are right."""
+    with mp.workdps(180):
+        k, step = constants(p), mp.mpf(10) ** -30
+        start = mp.mpf(t1), mp.mpf(v1)
+        arrival = _arrival(k, *start, mp.mpf(guess))
+        jacobian = mp.matrix(2, 2)
+        for column in range(2):
+            shift = (step, 0) if column == 0 else (0, step)
+            ahead = _impact(k, start[0] + shift[0], start[1] + shift[1], arrival)
+            behind = _impact(k, start[0] - shift[0], start[1] - shift[1], arrival)
+            jacobian[0, column] = (ahead.time_us - behind.time_us) / (2 * step)
+            rise = ahead.velocity_after_nm_per_us - behind.velocity_after_nm_per_us
+            jacobian[1, column] = rise / (2 * step)
+        return jacobian
+
+
+def _demand_papers_model(p: Parameters) -> None:
+    """Refuse parameters that the printed equations do not cover."""
+    if p.quality_factor is not None or p.delay is not None or p.viscous_loss:
+        raise ValueError("the paper's equations know no air damping, viscous loss or delay: leave them out")
+
+
+@high_precision
+def eq5(p: Parameters, t1: Number, v1: Number, t2: Number) -> Matrix:
+    """Return d(t2, V2)/d(t1, V1') as printed in the paper's eq. 5, 2 x 2 (undamped)."""
+    _demand_papers_model(p)
+    k = constants(p)
+    W, w, beta = k.free, k.drive, k.amplitude
+    C, S = mp.cos(W * (t2 - t1)), mp.sin(W * (t2 - t1))
+    s1, s2 = mp.sin(w * t1), mp.sin(w * t2)
+    A, B = k.offset + beta * mp.cos(w * t1), v1 / W
+    below = A * W * S - B * W * C - beta * w * s2
+    first = [(-beta * w * s1 * C + A * W * S - B * W * C) / below, S / W / below]
+    second = [
+        beta * w * W * s1 * S - W**2 * (A * C + B * S) * beta * w * (s2 - s1 * C) / below,
+        C - W * (A * C + B * S) * S / below,
+    ]
+    return mp.matrix([first, second])
+
+
+@high_precision
+def eq7(p: Parameters, t2: Number, v2: Number) -> Matrix:
+    """Return d(t2, V2')/d(t2, V2) as printed in the paper's eq. 7, 2 x 2; v2 is the velocity before the impact."""
+    _demand_papers_model(p)
+    k = constants(p)
+    fall = v2 + k.amplitude * k.drive * mp.sin(k.drive * t2)
+    ratio = k.r**2 * fall / mp.sqrt(k.r**2 * fall**2 - k.epsilon)
+    return mp.matrix([[1, 0], [k.amplitude * k.drive**2 * mp.cos(k.drive * t2) * (ratio - 1), ratio]])
+
+
+@high_precision
+def eq8_traces(p: Parameters, order: int, phase_rad: Number, after: Number) -> tuple[Number, Number]:
+    """Return the trace T of the paper's eq. 8 on a (1, order) orbit in both printed forms.
+
+    Args:
+        p: without damping, viscous loss and delay.
+        order: drive periods of a response period.
+        phase_rad: omega t at the impact.
+        after: V' in nm/us; V = -V' on an undamped orbit.
+    """
+    _demand_papers_model(p)
+    k = constants(p)
+    c, s = mp.cos(phase_rad), mp.sin(phase_rad)
+    C, S = mp.cos(k.free * order * k.drive_period), mp.sin(k.free * order * k.drive_period)
+    swing, wp, before = k.amplitude * k.drive * s, -k.amplitude * k.drive * s, -after
+    ratio = (before - wp) / (after - wp)
+    bracket = swing - swing * C - (after + swing * C) * k.r**2 * ratio
+    bracket += k.amplitude * k.drive**2 / k.free * c * S * (k.r**2 * ratio - 1)
+    alpha = after / wp
+    gain = k.r**2 * (alpha + 1) / (alpha - 1)
+    short = C - 1 + (alpha - C) * gain + k.drive / k.free * c / s * S * (gain + 1)
+    return 1 + bracket / (wp - before), 1 + short / (1 + alpha)
