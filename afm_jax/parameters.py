@@ -72,13 +72,13 @@ _RANGES = {
 }
 
 
-def readable(module: eqx.Module, /) -> str:
+def readable(self: eqx.Module) -> str:
     """Return a module with its numbers, the way it was written: for `__repr__`.
 
     Traced values and abstract shapes show as JAX shows them.
     """
-    fields = ", ".join(f"{field.name}={_number(getattr(module, field.name))}" for field in dataclasses.fields(module))
-    return f"{type(module).__name__}({fields})"
+    fields = ", ".join(f"{field.name}={_number(getattr(self, field.name))}" for field in dataclasses.fields(self))
+    return f"{type(self).__name__}({fields})"
 
 
 def _number(value: object) -> str:

@@ -1,5 +1,14 @@
-"""The version of the installed package."""
+"""The versions of this package and of what it computes with."""
 
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 
-__version__ = version("afm-jax")
+
+def version_of(package: str) -> str:
+    """Return the installed version of a package; "not installed" for one that runs from its source folder."""
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+__version__ = version_of("afm-jax")

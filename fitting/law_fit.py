@@ -1,6 +1,5 @@
 """The fit: screen, polish, check, and say what was found and whether to believe it."""
 
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -8,6 +7,7 @@ from jaxtyping import Bool, Float
 from scipy.special import chdtrc
 
 from afm_jax.parameters import require_float64
+from afm_jax.version import version_of
 from fitting.checks import Convergence, at_bound, check_minimum, covariance
 from fitting.forward import Measurement, measurement_of
 from fitting.intervals import Interval, profile_intervals
@@ -139,7 +139,7 @@ class _Summary:
             convergence=self.convergence,
             table=self.table,
             settings={"model": self.problem.model, "scale_errors": self.scale_errors, "starts": BATCH, "soft": SOFT},
-            versions={name: version(name) for name in _PACKAGES},
+            versions={name: version_of(name) for name in _PACKAGES},
         )
 
     def _shown_covariance(self, p_value: float) -> Float[np.ndarray, "p p"]:
