@@ -7,7 +7,7 @@ OUT ?= report
 BIN := .venv/bin
 SETUP := .venv/.installed
 
-.PHONY: help setup fit test check lint types slow bench clean
+.PHONY: help setup fit test check lint types coverage slow bench clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -34,10 +34,14 @@ lint: $(SETUP)
 types: $(SETUP)
 	$(BIN)/pyright
 
+coverage: $(SETUP)
+	$(BIN)/python -m coverage run -m pytest -q
+	$(BIN)/python -m coverage report --fail-under=85
+
 slow: $(SETUP)
 	$(BIN)/python -m pytest -m slow
 
-check: lint types test slow ## all that CI runs: format, lint, types, tests, slow tests with the notebooks
+check: lint types test coverage slow ## all that CI runs: format, lint, types, tests, coverage, slow tests, notebooks
 
 bench: $(SETUP) ## impacts per second, next to SciPy
 	$(BIN)/afm-jax bench --out $(OUT)

@@ -97,7 +97,7 @@ class _Summary:
         judged = self.freedom > 0 and not self.scale_errors
         p_value = float(chdtrc(self.freedom, self.chi2)) if judged else float("nan")
         errors = np.sqrt(np.diag(self.covariance))
-        moved = np.abs(self.values - start) > 1e-3 * errors
+        moved = ~self.free | ~np.isfinite(errors) | (np.abs(self.values - start) > 1e-3 * errors)
         if p_value < IMPROBABLE:
             # Errors that assume the model would be confident numbers about a law that is not there.
             intervals = [Interval(None, None, "the model does not explain the data")] * len(errors)
@@ -122,7 +122,7 @@ class _Summary:
         return FitResult(
             model=self.problem.model,
             parameters=parameters,
-            correlations=_correlations(self.covariance),
+            correlations=_correlations(self._shown_covariance(p_value)),
             chi2=self.chi2,
             degrees_of_freedom=self.freedom,
             p_value=evidence.p_value,
