@@ -1,0 +1,152 @@
+"""The linearised map and the implicit derivative, against 50 digits, differences and closed forms."""
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene
+from afm_jax.impact.implicit import implicit_root
+from afm_jax.impact.jacobian import eq7, map_jacobian, paper_flight
+from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from afm_jax.impact.poincare import next_impact
+from tests import reference_systems as reference
+from tests.reference_examples import SCENES
+from tests.reference_systems import Parameters
+
+STARTS = [(4.0, 60.0), (0.7, 35.0), (2.2, 120.0)]
+
+
+def scene_of(p: Parameters) -> Scene:
+    delay = None if p.delay is None else CollisionDelay(*p.delay)
+    return Scene(
+        Cantilever(p.frequency_khz, p.quality_factor),
+        Platform(p.amplitude_nm, p.drive_frequency_khz, p.offset_nm),
+        ImpactLaw(r=p.r, epsilon=p.epsilon, viscous_loss=p.viscous_loss, delay=delay),
+    )
+
+
+def ends(start, scene):
+    """Return (time, velocity after) of the next impact."""
+    impact = next_impact(scene, start[0], start[1])
+    return jnp.stack([impact.time_us, impact.velocity_after_nm_per_us])
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("start", STARTS)
+def test_written_and_automatic_jacobians_have_twelve_digits(name, start):
+    p, scene = SCENES[name], scene_of(SCENES[name])
+    guess = float(next_impact(scene, *start).arrival_time_us)
+    time, velocity = start
+    exact = np.array(reference.map_jacobian(p, time, velocity, guess).tolist(), dtype=float)
+    at = jnp.array(start)
+    # Condition numbers of these impacts stay below a few hundred.
+    for found in (map_jacobian(scene, *start), jax.jacfwd(ends)(at, scene), jax.jacrev(ends)(at, scene)):
+        np.testing.assert_allclose(found, exact, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_central_differences_agree(name):
+    scene, start, step = scene_of(SCENES[name]), np.array(STARTS[0]), 1e-5
+    moved = [(ends(start + d, scene) - ends(start - d, scene)) / (2.0 * step) for d in step * np.eye(2)]
+    # Error of the differences: step^2 times third derivatives, and rounding 1e-16 * 60 / step.
+    np.testing.assert_allclose(np.stack(moved, axis=1), map_jacobian(scene, *start), rtol=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["paper", "damped"])
+def test_second_derivatives_of_the_impact_time_have_nine_digits(name):
+    p, scene, (time, velocity) = SCENES[name], scene_of(SCENES[name]), STARTS[0]
+    guess = float(next_impact(scene, time, velocity).arrival_time_us)
+
+    def arrival(t, v):
+        return reference.next_impact(p, t, v, guess).arrival_time_us
+
+    with mpmath.workdps(60):
+        pairs = [(2, 0), (1, 1), (0, 2)]
+        exact = [float(mpmath.diff(arrival, (mpmath.mpf(time), mpmath.mpf(velocity)), pair)) for pair in pairs]
+
+    def automatic(at):
+        return next_impact(scene, at[0], at[1]).arrival_time_us
+
+    for second in (jax.hessian(automatic), jax.jacfwd(jax.jacfwd(automatic))):
+        hessian = np.array(second(jnp.array([time, velocity])))
+        np.testing.assert_allclose(hessian[[0, 0, 1], [0, 1, 1]], exact, rtol=1e-9)
+        np.testing.assert_allclose(hessian[0, 1], hessian[1, 0], rtol=1e-10)
+
+
+@settings(deadline=None, max_examples=25)
+@given(phase=st.floats(0.0, 1.0), velocity=st.floats(30.0, 150.0), periods=st.integers(-20, 20))
+def test_a_shift_by_drive_periods_changes_nothing(phase, velocity, periods):
+    scene = scene_of(SCENES["damped"])
+    period = float(scene.platform.period_us)
+    here = np.array(map_jacobian(scene, phase * period, velocity))
+    there = np.array(map_jacobian(scene, (phase + periods) * period, velocity))
+    # Times up to 110 us are known to 1e-14 us, phases to 1e-14; elements reach about 10.
+    np.testing.assert_allclose(there, here, rtol=1e-9, atol=1e-9)
+
+
+@settings(deadline=None)
+@given(r=st.floats(0.3, 1.0), phase=st.floats(0.0, 6.0), velocity=st.floats(-100.0, -30.0))
+def test_equation_7_without_adhesion_is_that_of_equation_1(r, phase, velocity):
+    platform = Platform(amplitude_nm=2.0, frequency_khz=180.0)
+    end = phase / float(platform.angular_frequency)
+    matrix = np.array(eq7(paper_flight(Cantilever(90.0), platform, 0.0, 1.0, end), velocity, r, 0.0))
+    turn = -(1.0 + r) * 2.0 * float(platform.angular_frequency) ** 2 * np.cos(phase)
+    # V' = -r V + (1 + r) v_p: a few roundings.
+    np.testing.assert_allclose(matrix, [[1.0, 0.0], [turn, -r]], rtol=1e-13, atol=1e-14)
+
+
+def test_undamped_map_scales_areas_by_restitution_and_speeds():
+    scene = scene_of(SCENES["paper"])
+    impact = next_impact(scene, *STARTS[0])
+    platform = scene.platform
+    leaving = STARTS[0][1] - float(platform.velocity(STARTS[0][0]))
+    rebound = float(impact.velocity_after_nm_per_us - platform.velocity(impact.time_us))
+    # det = r^2 u_out(1)/u_out(2): the flight turns u_out(1) into u_in(2), the law r^2 u_in/u_out.
+    expected = SCENES["paper"].r ** 2 * leaving / rebound
+    assert float(jnp.linalg.det(map_jacobian(scene, *STARTS[0]))) == pytest.approx(expected, rel=1e-11)
+
+
+def test_a_captured_tip_has_no_jacobian():
+    scene = scene_of(SCENES["paper"])
+    assert np.all(np.isnan(map_jacobian(scene, 0.0, 2.0)))
+
+
+def test_batch_equals_single():
+    scene = scene_of(SCENES["delayed"])
+    times, velocities = np.linspace(0.0, 5.0, 9), np.linspace(30.0, 90.0, 9)
+    batch = jax.jit(jax.vmap(map_jacobian, in_axes=(None, 0, 0)))(scene, times, velocities)
+    single = np.stack([map_jacobian(scene, t, v) for t, v in zip(times, velocities, strict=True)])
+    # Compiled differently, rounded differently; condition numbers stay below 1e4.
+    np.testing.assert_allclose(batch, single, rtol=1e-10)
+
+
+def _cubic(x, p):
+    return x**3 + p * x - 1.0
+
+
+@pytest.mark.parametrize("p", [0.5, 2.0])
+def test_implicit_root_differentiates_twice_in_both_modes(p):
+    def root(value):
+        found = jax.lax.stop_gradient(jnp.real(jnp.roots(jnp.array([1.0, 0.0, p, -1.0]), strip_zeros=False)))
+        x = found[jnp.argmin(jnp.abs(found**3 + p * found - 1.0))]
+        return implicit_root(_cubic, x, value)
+
+    with mpmath.workdps(40):
+        exact = [
+            mpmath.diff(lambda q: mpmath.findroot(lambda x: x**3 + q * x - 1, 0.6), mpmath.mpf(p), n) for n in (1, 2)
+        ]
+    for first in (jax.jacfwd(root), jax.jacrev(root)):
+        # The root is found by an eigenvalue solver, to about 1e-14.
+        assert float(first(p)) == pytest.approx(float(exact[0]), rel=1e-12)
+        assert float(jax.jacfwd(first)(p)) == pytest.approx(float(exact[1]), rel=1e-11)
+
+
+def test_implicit_root_at_a_fold_has_zero_derivative():
+    # x^2 = p at p = 0: no derivative exists; the rule says 0 and leaves the flag to the caller.
+    assert float(jax.grad(lambda p: implicit_root(lambda x, q: x**2 - q, jnp.zeros(()), p))(0.0)) == 0.0

@@ -1,0 +1,112 @@
+"""The impact law: energies, limits, its inverse and its slopes."""
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene
+from afm_jax.impact.law import CollisionDelay, ImpactLaw, impact_law_of
+from tests.reference_examples import DELAY, SCENES
+from tests.reference_systems import Parameters, capture_speed, delay_us, rebound_slope, rebound_speed
+
+restitution = st.floats(0.3, 1.0)
+losses = st.floats(0.0, 300.0)
+speeds = st.floats(1.0, 300.0)
+
+
+def law_of(p: Parameters) -> ImpactLaw:
+    delay = None if p.delay is None else CollisionDelay(*p.delay)
+    return ImpactLaw(r=p.r, epsilon=p.epsilon, viscous_loss=p.viscous_loss, delay=delay)
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("speed", [12.0, 40.0, 200.0])
+def test_law_agrees_with_fifty_digits(name, speed):
+    p, law = SCENES[name], law_of(SCENES[name])
+    # A few roundings, and 144/(144 - 122) times as many close to the capture speed of 11 nm/us.
+    assert float(law.rebound_speed(speed)) == pytest.approx(float(rebound_speed(p, speed)), rel=1e-14)
+    assert float(law.rebound_slope(speed)) == pytest.approx(float(rebound_slope(p, speed)), rel=1e-14)
+    assert float(law.capture_speed_nm_per_us) == pytest.approx(float(capture_speed(p)), rel=1e-14)
+    assert float(law.collision_delay(speed)) == pytest.approx(float(delay_us(p, speed)), rel=1e-12)
+
+
+@pytest.mark.parametrize("speed", [12.0, 40.0, 200.0])
+def test_delay_slope_is_the_derivative(speed):
+    p, law = SCENES["delayed"], law_of(SCENES["delayed"])
+    with mpmath.workdps(60):
+        exact = float(mpmath.diff(lambda u: delay_us(p, u), mpmath.mpf(speed)))
+    # Three terms that partly cancel, hence not the last two digits.
+    assert float(law.delay_slope(speed)) == pytest.approx(exact, rel=1e-12)
+    assert float(jax.grad(law.collision_delay)(speed)) == pytest.approx(exact, rel=1e-12)
+
+
+@settings(deadline=None)
+@given(r=restitution, epsilon=losses, c=st.floats(0.0, 2.0), u=speeds)
+def test_an_impact_takes_the_energy_it_names(r, epsilon, c, u):
+    law = ImpactLaw(r=r, epsilon=epsilon, viscous_loss=c)
+    lost = 0.5 * ((1.0 - r**2) * u**2 + c * u + epsilon)
+    captured = bool(law.captures(u))
+    # Rounding of u^2 remains.
+    assert float(law.energy_lost(u)) == pytest.approx(0.5 * u**2 if captured else lost, rel=1e-12, abs=1e-12 * u**2)
+    assert float(law.rebound_speed(u)) <= u
+    assert float(law.energy_lost(u, 3.0)) == pytest.approx(3.0 * float(law.energy_lost(u)), rel=1e-14)
+
+
+@settings(deadline=None)
+@given(r=restitution, epsilon=losses, c=st.floats(0.0, 2.0), w=st.floats(0.1, 300.0))
+def test_read_backwards_and_forwards_it_is_the_identity(r, epsilon, c, w):
+    law = ImpactLaw(r=r, epsilon=epsilon, viscous_loss=c)
+    u = law.approach_speed(w)
+    assert not bool(law.captures(u))
+    # u_out^2 is a difference of numbers as large as r^2 u^2.
+    allowed = 1e-14 * (1.0 + (r * float(u) / w) ** 2)
+    assert float(law.rebound_speed(u)) == pytest.approx(w, rel=allowed)
+
+
+@settings(deadline=None)
+@given(r=restitution, u=speeds)
+def test_without_losses_it_is_equation_1(r, u):
+    # Exact but for the rounding of a square and its root.
+    assert float(ImpactLaw(r=r).rebound_speed(u)) == pytest.approx(r * u, rel=1e-15)
+    assert float(ImpactLaw(r=r).rebound_slope(u)) == pytest.approx(r, rel=1e-15)
+    assert float(ImpactLaw(r=1.0).energy_lost(u)) == pytest.approx(0.0, abs=1e-15 * u**2)
+    assert float(ImpactLaw(r=r).capture_speed_nm_per_us) == 0.0
+
+
+@pytest.mark.parametrize("speed", [0.0, 5.0, 10.0])
+def test_a_captured_tip_has_finite_derivatives(speed):
+    law = ImpactLaw(r=0.9, epsilon=100.0, viscous_loss=0.5, delay=CollisionDelay(*DELAY))
+    for function in (law.rebound_speed, law.rebound_slope, law.collision_delay, law.delay_slope):
+        assert float(function(speed)) == 0.0
+        assert float(jax.grad(function)(speed)) == 0.0
+    slopes = jax.grad(lambda some: some.rebound_speed(speed))(law)
+    assert all(np.isfinite(leaf) for leaf in jax.tree.leaves(slopes))
+
+
+def test_batch_equals_loop():
+    law, many = law_of(SCENES["delayed"]), np.linspace(5.0, 200.0, 40)
+    batch = jax.jit(jax.vmap(lambda u: jnp.stack([law.rebound_speed(u), law.collision_delay(u)])))(many)
+    loop = [[float(law.rebound_speed(u)), float(law.collision_delay(u))] for u in many]
+    # Compiled code may fuse multiply and add; terms of the delay cancel.
+    np.testing.assert_allclose(batch, loop, rtol=1e-13)
+
+
+@pytest.mark.parametrize(("name", "value"), [("r", 0.0), ("r", 1.1), ("epsilon", -1.0), ("viscous_loss", -0.1)])
+def test_impossible_values_are_named(name, value):
+    values = {"r": 0.9, "epsilon": 0.0, "viscous_loss": 0.0} | {name: value}
+    with pytest.raises(ValueError, match=f"`{name}` must be"):
+        ImpactLaw(r=values["r"], epsilon=values["epsilon"], viscous_loss=values["viscous_loss"])
+    with pytest.raises(ValueError, match="`lead_nm` must be a finite number"):
+        CollisionDelay(0.2, float("inf"), 0.7)
+
+
+def test_a_scene_without_law_is_refused():
+    scene = Scene(Cantilever(90.0), Platform(1.0, 180.0), Cantilever(90.0))
+    with pytest.raises(TypeError, match="an ImpactLaw, not Cantilever"):
+        impact_law_of(scene)
