@@ -12,11 +12,14 @@ w = (Y - q^2/Y)/2, q^2 = epsilon + c^2/4r^2. Without a delay the condition is th
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from afm_jax.apparatus.cantilever import Cantilever, Propagator
 from afm_jax.apparatus.platform import Platform
 from afm_jax.impact.law import ImpactLaw
+
+_REGULAR = 1e-12
+"""Relative size below which a determinant is taken for the rounding of 0."""
 
 
 class OrbitProblem(NamedTuple):
@@ -31,12 +34,14 @@ class OrbitProblem(NamedTuple):
 class Closure(NamedTuple):
     """The linear system at one Y: a = cosine/determinant, b = sine/determinant of the phase just after impact.
 
-    All three in units of the drive (lengths over beta, speeds over beta omega), numbers.
+    All three in units of the drive (lengths over beta, speeds over beta omega), numbers. ``regular`` is False where the
+    flight returns every state (a whole number of free periods): the determinant is 0 then but for rounding.
     """
 
     cosine: Float[Array, ""]
     sine: Float[Array, ""]
     determinant: Float[Array, ""]
+    regular: Bool[Array, ""]
 
 
 class Speeds(NamedTuple):
@@ -72,54 +77,83 @@ def closure(coordinate: Float[Array, ""], problem: OrbitProblem) -> Closure:
     """
     cantilever, platform, law, order = problem
     speeds = speeds_at(coordinate, law)
-    flight = cantilever.propagator(order * platform.period_us - speeds.delay)
+    if law.delay is None:
+        flight = _returning_flight(cantilever, order * platform.period_us)
+        top_speed = platform.top_speed_nm_per_us
+        cosine, sine = _instantaneous(speeds.approach / top_speed, speeds.rebound / top_speed, 1.0, flight, platform)
+        return Closure(cosine, sine, flight.closing, flight.regular(platform))
+    propagator = cantilever.propagator(order * platform.period_us - speeds.delay)
     turn = platform.angular_frequency * speeds.delay
-    return _solve(flight, speeds, platform, (jnp.cos(turn), jnp.sin(turn)))
+    return _delayed(propagator, speeds, platform, (jnp.cos(turn), jnp.sin(turn)))
 
 
-def instantaneous_closure(problem: OrbitProblem) -> tuple[Float[Array, " 3"], Float[Array, " 3"], Float[Array, ""]]:
-    """Return Y cosine, Y sine of `closure` without a delay as quadratics in Y/(beta omega), and the determinant.
-
-    Written without cancellation at T Omega = 2 pi k, where the flight returns every state and no orbit exists.
-    """
+def instantaneous_quartic(problem: OrbitProblem) -> Float[Array, " 5"]:
+    """Return Y^2 (cosine^2 + sine^2 - determinant^2) without a delay: a quartic in Y/(beta omega)."""
     cantilever, platform, law, order = problem
-    omega, top_speed = platform.angular_frequency, platform.top_speed_nm_per_us
-    rest, velocity_after, velocity_before = _returning_flight(cantilever, order * platform.period_us)
-    closing = velocity_after - velocity_before
+    flight = _returning_flight(cantilever, order * platform.period_us)
+    top_speed = platform.top_speed_nm_per_us
     square = (law.epsilon + (law.viscous_loss / (2.0 * law.r)) ** 2) / top_speed**2
-    middle = law.viscous_loss / (2.0 * law.r**2) / top_speed
-    half = 0.5 / law.r
-    approach = jnp.array([half, middle, half * square])  # Y times u, in powers of Y
-    rebound = jnp.array([0.5, 0.0, -0.5 * square])  # Y times w
-    offset = jnp.array([0.0, 1.0, 0.0]) * (platform.offset_nm / platform.amplitude_nm) * closing
-    # z_out = rest (u + w)/closing and v_p = (u V'_0 + w V_0)/closing on a flight (rest, V'_0) -> (rest, V_0).
-    cosine = rest * omega * (approach + rebound) - offset
-    sine = -(approach * velocity_after + rebound * velocity_before)
-    return cosine, sine, closing
+    middle, half = law.viscous_loss / (2.0 * law.r**2) / top_speed, 0.5 / law.r
+    # Y times u, Y times w and Y itself, in powers of Y.
+    approach, rebound = jnp.array([half, middle, half * square]), jnp.array([0.5, 0.0, -0.5 * square])
+    cosine, sine = _instantaneous(approach, rebound, jnp.array([0.0, 1.0, 0.0]), flight, platform)
+    quartic = _squared(cosine) + _squared(sine)
+    return quartic.at[2].add(-(flight.closing**2))
 
 
 def closing_residual(coordinate: Float[Array, ""], problem: OrbitProblem) -> Float[Array, ""]:
     """Return a^2 + b^2 - 1 times the squared determinant, relative to the sum of its terms: 0 on an orbit."""
-    cosine, sine, determinant = closure(coordinate, problem)
+    cosine, sine, determinant, _ = closure(coordinate, problem)
     total = cosine**2 + sine**2 + determinant**2
     return (cosine**2 + sine**2 - determinant**2) / total
 
 
-def _returning_flight(cantilever: Cantilever, duration):
-    """Return (z, V', V) up to a factor: the flights that come back to their height z (us) with V from V' (numbers)."""
+class _ReturningFlight(NamedTuple):
+    """The flights that come back to the height they left, up to a common factor.
+
+    ``rest`` is that height in us, ``after`` and ``before`` the velocities at the start and at the end (numbers).
+    """
+
+    rest: Float[Array, ""]
+    after: Float[Array, ""]
+    before: Float[Array, ""]
+
+    @property
+    def closing(self) -> Float[Array, ""]:
+        """By how much the velocity changes between end and start: what the impact has to supply."""
+        return self.after - self.before
+
+    def regular(self, platform: Platform) -> Bool[Array, ""]:
+        """Say whether the impact supplies anything beyond rounding."""
+        size = jnp.abs(self.after) + jnp.abs(self.before) + jnp.abs(self.rest) * platform.angular_frequency
+        return jnp.abs(self.closing) > _REGULAR * size
+
+
+def _returning_flight(cantilever: Cantilever, duration: Float[Array, ""]) -> _ReturningFlight:
+    """Return the flight of a duration in us, written so that nothing cancels near a whole number of free periods."""
     omega_d = cantilever.damped_angular_frequency
     half_sine, half_cosine = jnp.sin(0.5 * omega_d * duration), jnp.cos(0.5 * omega_d * duration)
     if cantilever.quality_factor is None:
-        return half_cosine / omega_d, half_sine, -half_sine
+        return _ReturningFlight(half_cosine / omega_d, half_sine, -half_sine)
     loss = -jnp.expm1(-cantilever.decay_rate * duration)
     sine, dip = 2.0 * half_sine * half_cosine, 2.0 * half_sine**2
     lag = cantilever.decay_rate / omega_d * sine
     kept = 1.0 - loss
-    return kept * sine / omega_d, loss + kept * (dip - lag), kept * (loss - dip - lag)
+    return _ReturningFlight(kept * sine / omega_d, loss + kept * (dip - lag), kept * (loss - dip - lag))
 
 
-def _solve(p: Propagator, speeds: Speeds, platform: Platform, turn) -> Closure:
-    """Cramer's rule, every length over beta and every speed over beta omega."""
+def _instantaneous(approach, rebound, one, flight: _ReturningFlight, platform: Platform):
+    """Return cosine and sine of the linear system for speeds over beta omega (or their coefficients, `one` for 1).
+
+    z_out = rest (u + w)/closing and v_p = (u after + w before)/closing on a returning flight.
+    """
+    height = flight.rest * platform.angular_frequency * (approach + rebound)
+    offset = one * (platform.offset_nm / platform.amplitude_nm * flight.closing)
+    return height - offset, -(approach * flight.after + rebound * flight.before)
+
+
+def _delayed(p: Propagator, speeds: Speeds, platform: Platform, turn) -> Closure:
+    """Solve both rows by Cramer's rule, every length over beta and every speed over beta omega."""
     omega, top_speed = platform.angular_frequency, platform.top_speed_nm_per_us
     cos_turn, sin_turn = turn
     sigma = platform.offset_nm / platform.amplitude_nm
@@ -129,8 +163,17 @@ def _solve(p: Propagator, speeds: Speeds, platform: Platform, turn) -> Closure:
     m21, m22 = sin_turn - p21, p.velocity_per_velocity - cos_turn
     right1 = (p.position_per_position - 1.0) * sigma + p12 * rebound
     right2 = approach + p21 * sigma + p.velocity_per_velocity * rebound
+    determinant = m11 * m22 - m12 * m21
+    # Here the determinant is of second order in the distance to a whole number of free periods, its rounding of zeroth.
     return Closure(
         cosine=right1 * m22 - right2 * m12,
         sine=m11 * right2 - m21 * right1,
-        determinant=m11 * m22 - m12 * m21,
+        determinant=determinant,
+        regular=jnp.abs(determinant) > _REGULAR,
     )
+
+
+def _squared(quadratic: Float[Array, " 3"]) -> Float[Array, " 5"]:
+    """Return the square of a quadratic (jnp.polymul's convolution takes 50 times as long under vmap)."""
+    a, b, c = quadratic
+    return jnp.array([a * a, 2.0 * a * b, b * b + 2.0 * a * c, 2.0 * b * c, c * c])

@@ -12,7 +12,8 @@ from afm_jax.impact.orbit_closure import (
     OrbitProblem,
     capture_coordinate,
     closing_residual,
-    instantaneous_closure,
+    closure,
+    instantaneous_quartic,
     speeds_at,
 )
 from afm_jax.impact.polynomial_roots import real_roots
@@ -41,34 +42,32 @@ def slots_of(law: ImpactLaw) -> int:
 
 
 def find_roots(problem: OrbitProblem) -> OrbitRoots:
-    """Return all coordinates of orbits, ascending in approach speed; no derivatives."""
+    """Return all coordinates of orbits, ascending in approach speed, without derivatives; harmless ones elsewhere."""
     problem = lax.stop_gradient(problem)
     driven = (problem.platform.amplitude_nm > 0.0) & (problem.platform.offset_rate_nm_per_us == 0.0)
     search = _quartic_roots if problem.law.delay is None else _scanned_roots
     coordinate, found, complete = search(problem)
-    return OrbitRoots(coordinate, found & driven, complete)
+    safe = jnp.where(found, coordinate, empty_coordinate(problem))
+    regular = jax.vmap(closure, in_axes=(0, None))(safe, problem).regular
+    return OrbitRoots(safe, found & driven & regular, complete)
+
+
+def empty_coordinate(problem: OrbitProblem) -> Float[Array, ""]:
+    """Return a coordinate for slots without a root: some speed well above capture, harmless to compute with."""
+    return 2.0 * problem.platform.top_speed_nm_per_us + 2.0 * jnp.sqrt(problem.law.epsilon + 1.0)
 
 
 def _quartic_roots(problem: OrbitProblem) -> OrbitRoots:
     """Solve (Y cosine)^2 + (Y sine)^2 = (Y determinant)^2, a quartic in Y over beta omega."""
-    cosine, sine, determinant = instantaneous_closure(problem)
+    quartic = instantaneous_quartic(problem)
     scale = problem.platform.top_speed_nm_per_us
-    quartic = _squared(cosine) + _squared(sine)
-    quartic = quartic.at[2].add(-(determinant**2))
     low = capture_coordinate(problem.law) / scale
     # Cauchy's bound; a quartic without leading term (no loss at exact resonance) has a root at infinity, not here.
     top = jnp.max(jnp.abs(quartic))
     leading = jnp.maximum(jnp.abs(quartic[0]), 1e-15 * top)
     high = jnp.maximum(1.0 + top / jnp.where(leading > 0.0, leading, 1.0), 2.0 * low + 1.0)
     roots, found = real_roots(quartic, low, high)
-    regular = (determinant != 0.0) & (roots > low)
-    return OrbitRoots(roots * scale, found & regular, jnp.array(True))  # noqa: FBT003
-
-
-def _squared(quadratic: Float[Array, " 3"]) -> Float[Array, " 5"]:
-    """Return the square of a quadratic (jnp.polymul's convolution takes 50 times as long under vmap)."""
-    a, b, c = quadratic
-    return jnp.array([a * a, 2.0 * a * b, b * b + 2.0 * a * c, 2.0 * b * c, c * c])
+    return OrbitRoots(roots * scale, found & (roots > low), jnp.array(True))  # noqa: FBT003
 
 
 def _scanned_roots(problem: OrbitProblem) -> OrbitRoots:

@@ -48,18 +48,12 @@ class SteadyOrbits(NamedTuple):
     amplitude_nm: Float[Array, "slots 2"]
 
 
-def empty_coordinate(problem: OrbitProblem) -> Float[Array, ""]:
-    """Return a coordinate for slots without a root: some speed well above capture, harmless to compute with."""
-    return 2.0 * problem.platform.top_speed_nm_per_us + 2.0 * jnp.sqrt(problem.law.epsilon + 1.0)
-
-
 def orbit_state(coordinate: Float[Array, ""], problem: OrbitProblem) -> OrbitState:
     """Return the motion at a root, with the root's derivatives (implicit function theorem)."""
     cantilever, platform, law, order = problem
     coordinate = implicit_root(closing_residual, coordinate, problem)
     speeds = speeds_at(coordinate, law)
-    cosine, sine, determinant = closure(coordinate, problem)
-    regular = determinant != 0.0
+    cosine, sine, determinant, regular = closure(coordinate, problem)
     safe = jnp.where(regular, determinant, 1.0)
     phase = jnp.arctan2(jnp.where(regular, sine / safe, 0.0), jnp.where(regular, cosine / safe, 1.0)) % (2.0 * jnp.pi)
     start = phase / platform.angular_frequency
@@ -95,14 +89,13 @@ def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
     """Return the roots that are steady motions, without derivatives: what an experiment can settle on."""
     problem = lax.stop_gradient(problem)
     roots = find_roots(problem)
-    coordinate = jnp.where(roots.found, roots.coordinate, empty_coordinate(problem))
 
     def one(root, found):
         state = orbit_state(root, problem)
         verdict = judge(root, found, state, problem)
         return verdict.admissible & verdict.stable, verdict.near_double, _amplitudes_of(state, problem)
 
-    return SteadyOrbits(coordinate, *jax.vmap(one)(coordinate, roots.found))
+    return SteadyOrbits(roots.coordinate, *jax.vmap(one)(roots.coordinate, roots.found))
 
 
 def amplitudes(coordinate: Float[Array, ""], problem: OrbitProblem) -> Float[Array, " 2"]:

@@ -11,7 +11,7 @@ from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.orbit_amplitude import lockin, peak_amplitude
 from afm_jax.impact.orbit_closure import OrbitProblem
 from afm_jax.impact.orbit_search import find_roots
-from afm_jax.impact.orbit_state import empty_coordinate, judge, orbit_state
+from afm_jax.impact.orbit_state import judge, orbit_state
 from afm_jax.parameters import is_traced, readable, require_float64
 
 
@@ -103,7 +103,6 @@ def _single_impact_orbits(scene: Scene, order: Float[Array, ""]) -> SingleImpact
 
 def _orbit(coordinate: Float[Array, ""], found: Bool[Array, ""], problem: OrbitProblem) -> SingleImpactOrbits:
     """Return what there is to know about one root; NaN where there is none."""
-    coordinate = jnp.where(found, coordinate, empty_coordinate(problem))
     state = orbit_state(coordinate, problem)
     verdict = judge(coordinate, found, state, problem)
     flight, speeds = state.flight, state.speeds

@@ -154,11 +154,12 @@ def _overlap(law: ImpactLaw, flight: Flight) -> Float[Array, ""] | None:
 def _iterate_map(scene: Scene, start, tolerance: Float[Array, ""], *, impacts: int, max_steps: int) -> NextImpact:
     def one(state, _):
         flying, time, velocity = state
-        impact = _next_impact(scene, (time, velocity), tolerance, max_steps=max_steps)
+        # A finished tip does not leave the platform, so that its search ends at once; its rows are marked below.
+        resting = scene.platform.velocity(time) - 1.0
+        impact = _next_impact(scene, (time, jnp.where(flying, velocity, resting)), tolerance, max_steps=max_steps)
         outcome = jnp.where(flying, impact.outcome, Outcome.NOT_REACHED)
         impact = eqx.tree_at(lambda row: row.outcome, impact, outcome)
         flying = outcome == Outcome.IMPACT
-        # A finished tip keeps a state to compute with; its rows are marked, not used.
         time = jnp.where(flying, impact.time_us, time)
         velocity = jnp.where(flying, impact.velocity_after_nm_per_us, velocity)
         return (flying, time, velocity), impact

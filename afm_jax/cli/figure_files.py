@@ -1,0 +1,53 @@
+"""A figure's files: its picture and its table."""
+
+from pathlib import Path
+
+from afm_jax import presets
+from afm_jax.cli.out_folder import write_csv
+from afm_jax.plots.offset_amplitude import draw_offset_amplitudes
+from afm_jax.plots.stability_regions import draw_stability_chart
+from afm_jax.study import offset_amplitude, stability_regions
+from afm_jax.study.figure_statements import adhesion_limit_nm
+from afm_jax.study.offset_amplitude import OffsetAmplitudes
+from afm_jax.study.paper_figures import FigureData
+
+
+def write_figure(number: str, figure: FigureData, folder: Path) -> list[str]:
+    """Write a figure as PNG and CSV into a folder.
+
+    Args:
+        number: "2", "3" or "9".
+        figure: its data.
+        folder: exists and can be written to.
+
+    Returns:
+        The names of the files.
+    """
+    picture, table = f"figure{number}.png", f"figure{number}.csv"
+    data = figure.data
+    if isinstance(data, OffsetAmplitudes):
+        draw_offset_amplitudes(data, folder / picture, title=_AMPLITUDE_TITLE)
+        columns = offset_amplitude.TABLE_COLUMNS
+    else:
+        draw_stability_chart(
+            data,
+            folder / picture,
+            title=_CHART_TITLES[number],
+            compared_with=figure.compared_with,
+            limit_nm=adhesion_limit_nm(data.reduced_frequency) if number == "3" else None,
+        )
+        columns = stability_regions.TABLE_COLUMNS
+    write_csv(folder / table, data.table(), columns)
+    return [picture, table]
+
+
+_CHART_CONDITIONS = rf"$r$ = {presets.STABILITY_R:g}, $\sigma = {presets.STABILITY_OFFSET_NM:g}$ nm"
+_CHART_TITLES = {
+    "2": rf"Stable single-impact orbits (white), {_CHART_CONDITIONS}, $\epsilon$ = 0",
+    "3": rf"Stable single-impact orbits with adhesion (white), {_CHART_CONDITIONS}, "
+    rf"$\epsilon$ = {presets.ADHESION:g} $\mu$J/kg",
+}
+_AMPLITUDE_TITLE = (
+    r"Amplitude of the stable (1,1) orbit, "
+    rf"$\beta$ = {presets.OFFSET_SWEEP_AMPLITUDE_NM:g} nm, $\epsilon$ = {presets.ADHESION:g} $\mu$J/kg"
+)

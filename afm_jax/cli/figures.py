@@ -1,0 +1,141 @@
+"""`afm-jax figures --only 2,3,9`: the paper's figures as PNG and CSV, and the paper's words about them checked."""
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from afm_jax.cli.failures import NotValid
+from afm_jax.cli.out_folder import prepare_folder
+from afm_jax.cli.session import Session, with_session
+
+if TYPE_CHECKING:
+    from afm_jax.study.paper_figures import FigureData
+
+AVAILABLE = ("2", "3", "9")
+_LATER = ("4", "5", "6", "7", "8", "10", "11")
+_DEFAULT_FOLDER = Path("figures")
+_SPOT_CHECKS = 60
+_COARSE_SPOT_CHECKS = 20
+
+
+def _chosen(ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[str, ...]:
+    """Return the numbers in a comma list, without repetitions and in the order of the paper."""
+    numbers = {part.strip() for part in text.split(",") if part.strip()}
+    have = ", ".join(AVAILABLE)
+    for number in sorted(numbers):
+        if number in _LATER:
+            message = f"figure {number} is not in this version; choose from {have}"
+            raise click.BadParameter(message, ctx=ctx, param=parameter)
+        if number not in AVAILABLE:
+            message = f"there is no figure `{number}` to draw; choose from {have}"
+            raise click.BadParameter(message, ctx=ctx, param=parameter)
+    if not numbers:
+        raise click.BadParameter(f"names no figure; choose from {have}", ctx=ctx, param=parameter)
+    return tuple(number for number in AVAILABLE if number in numbers)
+
+
+@click.command()
+@click.option(
+    "--only",
+    metavar="2,3,9",
+    default=",".join(AVAILABLE),
+    callback=_chosen,
+    help="Draw these figures of the paper only (comma list); all that there are if left out.",
+)
+@click.option("--coarse", is_flag=True, help="A quick look: a sixteenth of the points.")
+@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the random spot checks.")
+@with_session
+def command(session: Session, *, only: tuple[str, ...], coarse: bool, seed: int) -> None:
+    """Draw the paper's figures, with their data as CSV (into the folder `figures` without --out).
+
+    Figures 2 and 3: where single-impact orbits are stable, without and with adhesion. Figure 9: amplitude of the
+    (1,1) orbit against the tip-sample offset, below and above resonance. What the paper says of each figure is
+    checked on the data, and random points against long iterations of the impact map.
+    """
+    folder = session.out or _DEFAULT_FOLDER
+    prepare_folder(folder)
+    session.start_computing()
+    results = _compute(session, only, coarse=coarse, seed=seed)
+    from afm_jax.cli.figure_files import write_figure  # noqa: PLC0415
+
+    payload = []
+    for number, figure in results.items():
+        files = write_figure(number, figure, folder)
+        payload.append(_payload(number, figure, files))
+        for name in files:
+            session.note(f"wrote {folder / name}")
+    valid = all(figure.valid for figure in results.values())
+    session.emit({"figures": payload, "folder": str(folder), "valid": valid}, *_text(payload))
+    if not valid:
+        wrong = [number for number, figure in results.items() if not figure.valid]
+        raise NotValid(f"figure {', '.join(wrong)}: a statement or a spot check fails, see the output")
+
+
+def _compute(session: Session, only: tuple[str, ...], *, coarse: bool, seed: int) -> "dict[str, FigureData]":
+    """Compute the figures; each one's time goes to standard error."""
+    from afm_jax.study import paper_figures  # noqa: PLC0415
+
+    results: dict[str, FigureData] = {}
+    points = _COARSE_SPOT_CHECKS if coarse else _SPOT_CHECKS
+    start = time.perf_counter()
+
+    # One line a step, not a bar: it is as readable in a log as in a terminal.
+    def report(what: str) -> None:
+        session.note(f"{time.perf_counter() - start:5.1f} s  {what}")
+
+    if "2" in only or "3" in only:
+        without = paper_figures.figure2_chart(coarse=coarse, report=report)
+        if "2" in only:
+            report("figure 2: statements and spot checks")
+            results["2"] = paper_figures.figure2(without, seed=seed, points=points)
+        if "3" in only:
+            adhesive = paper_figures.figure3_chart(coarse=coarse, report=report)
+            report("figure 3: statements and spot checks")
+            results["3"] = paper_figures.figure3(adhesive, without, seed=seed, points=points)
+    if "9" in only:
+        report("figure 9: amplitudes and spot checks")
+        results["9"] = paper_figures.figure9(coarse=coarse, seed=seed, points=points)
+    report("drawing")
+    return results
+
+
+def _payload(number: str, figure: "FigureData", files: list[str]) -> dict[str, Any]:
+    from afm_jax.study.spot_checks import CLEARANCE_NM, STABILITY_MARGIN  # noqa: PLC0415
+
+    checks = figure.spot_checks
+    return {
+        "figure": int(number),
+        "files": files,
+        **figure.numbers,
+        "statements": [
+            {"statement": each.statement, "holds": each.holds, **each.numbers} for each in figure.statements
+        ],
+        "spot_checks": {
+            "checked": checks.checked,
+            "excluded": checks.excluded,
+            "excluded_share": checks.excluded_share,
+            "excluded_within": {"trace_margin": STABILITY_MARGIN, "clearance_nm": CLEARANCE_NM},
+            "failures": checks.failures,
+        },
+        "valid": figure.valid,
+    }
+
+
+def _text(payload: list[dict[str, Any]]) -> list[str]:
+    lines = []
+    for figure in payload:
+        lines.append(f"Figure {figure['figure']}: {', '.join(figure['files'])}")
+        lines.append(f"  stable share of the points: {figure['stable_share']:.3f}")
+        lines += [
+            f"  {'holds' if statement['holds'] else 'FAILS'}: {statement['statement']}"
+            for statement in figure["statements"]
+        ]
+        checks = figure["spot_checks"]
+        counts = ", ".join(f"{count} {verdict}" for verdict, count in checks["checked"].items())
+        lines.append(
+            f"  spot checks by long iteration: {counts}; {len(checks['failures'])} failed, "
+            f"{100.0 * checks['excluded_share']:.1f} % too close to a boundary to check"
+        )
+    return lines

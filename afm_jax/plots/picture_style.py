@@ -1,0 +1,33 @@
+"""What all pictures share: size, fonts, resolution, without a display and without touching matplotlib's own state."""
+
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+DARK = "#3b4a5a"
+ACCENT = "#b34700"
+"""A dark orange that stands off white, black and DARK for every kind of colour vision."""
+GRID = "#9aa5b1"
+_FONT = 11.0
+_DPI = 200
+
+
+def new_figure(width_in: float, height_in: float) -> Figure:
+    """Return an empty figure of a size in inches."""
+    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def label_axes(axes: Axes, *, x: str, y: str) -> None:
+    """Label both axes in the common size, ticks inside the labels' size."""
+    axes.set_xlabel(x, fontsize=_FONT + 1)
+    axes.set_ylabel(y, fontsize=_FONT + 1)
+    axes.tick_params(labelsize=_FONT)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure as PNG."""
+    figure.savefig(path, dpi=_DPI, format="png")

@@ -1,0 +1,65 @@
+"""The paper's scenes, with what each figure varies as arguments. They can be batched: `eqx.filter_vmap(figure2_scene)`.
+
+The reduced frequency is n = omega/2 Omega; the free frequency is 90 kHz throughout, and sections II and III leave air
+damping out.
+"""
+
+from jaxtyping import Array, ArrayLike, Float
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene
+from afm_jax.impact.law import ImpactLaw
+from afm_jax.parameters import as_argument
+
+FREE_FREQUENCY_KHZ = 90.0
+STABILITY_R = 0.5
+STABILITY_OFFSET_NM = -1.0
+ADHESION = 1.0
+"""Epsilon of figures 3 and 9 in nm^2/us^2 = uJ/kg."""
+OFFSET_SWEEP_AMPLITUDE_NM = 0.75
+"""Drive amplitude of figure 9."""
+OFFSET_SWEEP_BELOW, OFFSET_SWEEP_ABOVE = 0.97, 1.03
+"""Reduced frequencies of figures 9a and 9b: just below and just above the first resonance."""
+
+
+def stability_scene(
+    reduced_frequency: ArrayLike, drive_amplitude_nm: ArrayLike, offset_nm: ArrayLike, epsilon: ArrayLike
+) -> Scene:
+    """Return a scene of the stability charts: r = 0.5, no air damping.
+
+    Args:
+        reduced_frequency: n = omega/2 Omega.
+        drive_amplitude_nm: beta.
+        offset_nm: sigma.
+        epsilon: adhesion in nm^2/us^2.
+    """
+    platform = Platform(drive_amplitude_nm, drive_frequency_khz(reduced_frequency), offset_nm)
+    return Scene(Cantilever(FREE_FREQUENCY_KHZ), platform, ImpactLaw(STABILITY_R, epsilon))
+
+
+def figure2_scene(reduced_frequency: ArrayLike, drive_amplitude_nm: ArrayLike) -> Scene:
+    """Return a point of figure 2: sigma = -1 nm, no adhesion."""
+    return stability_scene(reduced_frequency, drive_amplitude_nm, STABILITY_OFFSET_NM, 0.0)
+
+
+def figure3_scene(reduced_frequency: ArrayLike, drive_amplitude_nm: ArrayLike) -> Scene:
+    """Return a point of figure 3: figure 2 with adhesion."""
+    return stability_scene(reduced_frequency, drive_amplitude_nm, STABILITY_OFFSET_NM, ADHESION)
+
+
+def figure9_scene(reduced_frequency: ArrayLike, offset_nm: ArrayLike, r: ArrayLike) -> Scene:
+    """Return a point of figure 9: beta = 0.75 nm, with adhesion, no air damping.
+
+    Args:
+        reduced_frequency: 0.97 in figure 9a, 1.03 in figure 9b.
+        offset_nm: sigma.
+        r: coefficient of restitution.
+    """
+    platform = Platform(OFFSET_SWEEP_AMPLITUDE_NM, drive_frequency_khz(reduced_frequency), offset_nm)
+    return Scene(Cantilever(FREE_FREQUENCY_KHZ), platform, ImpactLaw(r, ADHESION))
+
+
+def drive_frequency_khz(reduced_frequency: ArrayLike) -> Float[Array, "..."]:
+    """Return the drive frequency 2 n Omega / 2 pi of a reduced frequency n."""
+    return 2.0 * FREE_FREQUENCY_KHZ * as_argument(reduced_frequency)
