@@ -63,25 +63,26 @@ def measurement_of(table: AmplitudeTable) -> Measurement:
     def padded(column, filler=None):
         column = np.asarray(column, float)
         filler = column[-1] if filler is None else filler
-        return jnp.asarray(np.concatenate([column, np.full(size - column.shape[0], filler)]))
+        return np.concatenate([column, np.full(size - column.shape[0], filler)])
 
     def pair(peak, lockin):
         columns = [np.full(table.rows, np.nan) if c is None else c for c in (peak, lockin)]
-        return jnp.stack([padded(column, np.nan) for column in columns], axis=1)
+        return np.stack([padded(column, np.nan) for column in columns], axis=1)
 
+    # NumPy up to here: every JAX operation outside a compiled program would be compiled by itself.
     amplitude = pair(table.peak_amplitude_nm, table.lockin_amplitude_nm)
     error = pair(table.peak_amplitude_error_nm, table.lockin_amplitude_error_nm)
-    measured = jnp.isfinite(amplitude)
+    measured = np.isfinite(amplitude)
     quality_factor = table.quality_factor
     return Measurement(
         rows=Rows(
-            order=padded(table.order),
-            drive_frequency_khz=padded(table.drive_frequency_khz),
-            drive_amplitude_nm=padded(table.drive_amplitude_nm),
-            offset_nm=padded(table.offset_nm),
-            amplitude_nm=jnp.where(measured, amplitude, 1.0),
-            error_nm=jnp.where(measured, error, 1.0),
-            measured=measured,
+            order=jnp.asarray(padded(table.order)),
+            drive_frequency_khz=jnp.asarray(padded(table.drive_frequency_khz)),
+            drive_amplitude_nm=jnp.asarray(padded(table.drive_amplitude_nm)),
+            offset_nm=jnp.asarray(padded(table.offset_nm)),
+            amplitude_nm=jnp.asarray(np.where(measured, amplitude, 1.0)),
+            error_nm=jnp.asarray(np.where(measured, error, 1.0)),
+            measured=jnp.asarray(measured),
         ),
         cantilever=Cantilever(table.free_frequency_khz, quality_factor, table.mass_ng),
         quality_factor=jnp.asarray(1.0 if quality_factor is None else float(quality_factor)),

@@ -50,7 +50,7 @@ def grid(problem: Problem, measurement: Measurement) -> Float[np.ndarray, "point
     Adhesion and viscous loss are laid out in terms of the drive's speed beta omega, on which capture depends.
     """
     rows = measurement.rows
-    drive = RAD_PER_US_PER_KHZ * np.asarray(rows.drive_amplitude_nm * rows.drive_frequency_khz)
+    drive = RAD_PER_US_PER_KHZ * np.asarray(rows.drive_amplitude_nm) * np.asarray(rows.drive_frequency_khz)
     slow, fast = float(drive.min()), float(drive.max())
     laws = [name for name in problem.names if name != "quality_factor"]
     count = _GRID_PER_PARAMETER[len(laws)]

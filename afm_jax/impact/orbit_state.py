@@ -105,7 +105,9 @@ def amplitudes(coordinate: Float[Array, ""], problem: OrbitProblem) -> Float[Arr
 
 def _amplitudes_of(state: OrbitState, problem: OrbitProblem) -> Float[Array, " 2"]:
     peak = peak_amplitude(problem.cantilever, state.flight)
-    length, _ = lockin(problem.cantilever, problem.platform, state.flight, problem.order)
+    length, _ = lockin(
+        problem.cantilever, problem.platform, state.flight, problem.order, delayed=problem.law.delay is not None
+    )
     return jnp.stack([peak, length])
 
 

@@ -106,7 +106,9 @@ def _orbit(coordinate: Float[Array, ""], found: Bool[Array, ""], problem: OrbitP
     state = orbit_state(coordinate, problem)
     verdict = judge(coordinate, found, state, problem)
     flight, speeds = state.flight, state.speeds
-    amplitude, angle = lockin(problem.cantilever, problem.platform, flight, problem.order)
+    amplitude, angle = lockin(
+        problem.cantilever, problem.platform, flight, problem.order, delayed=problem.law.delay is not None
+    )
 
     def known(value):
         return jnp.where(found, value, jnp.nan)
