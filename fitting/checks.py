@@ -101,11 +101,14 @@ def _pushes_outward(objective: Objective, coordinates, free) -> bool:
 
 
 def _inverse(fisher: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
-    """Return the inverse of a Fisher matrix, infinite variances where it has none."""
+    """Return the inverse of a Fisher matrix; rows and columns of parameters that it does not determine are infinite."""
+    if not np.all(np.isfinite(fisher)):
+        return np.full_like(fisher, np.inf)
     scale = np.sqrt(np.diag(fisher))
-    if not np.all(np.isfinite(fisher)) or np.any(scale == 0.0):
-        return np.full_like(fisher, np.inf)
-    relative = fisher / np.outer(scale, scale)
-    if np.linalg.eigvalsh(relative)[0] < 1e-12:
-        return np.full_like(fisher, np.inf)
-    return np.linalg.inv(relative) / np.outer(scale, scale)
+    safe = np.where(scale > 0.0, scale, 1.0)
+    curvature, axes = np.linalg.eigh(fisher / np.outer(safe, safe))
+    flat = curvature < 1e-12
+    undetermined = np.any(np.abs(axes[:, flat]) > 1e-6, axis=1)
+    inverse = (axes / np.where(flat, np.inf, curvature)) @ axes.T / np.outer(safe, safe)
+    inverse[undetermined, :] = inverse[:, undetermined] = np.inf
+    return inverse

@@ -45,7 +45,6 @@ def profile_intervals(
     values: Float[np.ndarray, " p"],
     covariance: Float[np.ndarray, "p p"],
     chi2: float,
-    chi2_scale: float = 1.0,
 ) -> list[Interval]:
     """Return the 95 % profile interval of every parameter.
 
@@ -54,7 +53,6 @@ def profile_intervals(
         values: the fitted values.
         covariance: theirs, for steps and first guesses; an infinite variance gives an open interval.
         chi2: at the fitted values.
-        chi2_scale: factor on the rise of 3.84 where the errors of the table were scaled.
     """
     errors = np.sqrt(np.diag(covariance))
     sides = [
@@ -63,18 +61,17 @@ def profile_intervals(
         for direction in (-1.0, 1.0)
         if np.isfinite(errors[index])
     ]
-    rise = CHI2_95 * chi2_scale
     for _ in range(_OUTER_STEPS):
         active = [side for side in sides if side.end is None and side.reason is None]
         if not active:
             break
-        _advance(objective, active, values, errors, (chi2, rise))
+        _advance(objective, active, values, errors, chi2)
     return [_interval(sides, index) for index in range(len(values))]
 
 
-def _advance(objective: Objective, sides: list[_Side], values, errors, levels) -> None:
+def _advance(objective: Objective, sides: list[_Side], values, errors, chi2: float) -> None:
     """Take one trial distance on every side and narrow its bracket."""
-    chi2, rise = levels
+    rise = CHI2_95
     targets = np.array([_target(side, objective, values, errors) for side in sides])
     found, others = _minimise_others(objective, sides, targets)
     for side, target, value, coordinates in zip(sides, targets, found, others, strict=True):

@@ -12,8 +12,9 @@ from fitting.checks import Convergence, at_bound, check_minimum, covariance
 from fitting.forward import Measurement, measurement_of
 from fitting.intervals import Interval, profile_intervals
 from fitting.law_band import law_with_band
+from fitting.minimum import Minimum, minimise, rescale_errors
 from fitting.models import Problem, law_parameters
-from fitting.optimise import BATCH, PLAIN, SOFT, Objective, grid, polish
+from fitting.optimise import BATCH, SOFT, Objective
 from fitting.result import FitResult, FittedParameter, FittedRows
 from fitting.table import AmplitudeTable
 from fitting.verdict import IMPROBABLE, Evidence, judge_fit
@@ -27,8 +28,8 @@ def fit(table: AmplitudeTable, model: str = "law", *, scale_errors: bool = False
     Args:
         table: from `read_table`; Q is a nuisance with a Gaussian constraint if the table gives it with an error.
         model: "restitution" (r), "law" (r, epsilon; eq. 6) or "viscous" (epsilon, viscous_loss).
-        scale_errors: take the table's errors as relative only and scale them until chi2 equals its degrees of
-            freedom; goodness of fit can then not be judged, and the result says so.
+        scale_errors: take the amplitudes' errors as relative only and scale them until chi2 equals its degrees of
+            freedom (the error of Q stays); goodness of fit can then not be judged, and the result says so.
 
     Returns:
         Values, errors, intervals, goodness of fit and a verdict; see `FitResult`.
@@ -47,8 +48,10 @@ def fit(table: AmplitudeTable, model: str = "law", *, scale_errors: bool = False
             f"parameters of the model {model!r}; measure at other drives, orders or offsets too"
         )
     objective = Objective(measurement, problem)
-    coordinates, start, minima = _minimise(objective)
-    return _Summary(objective, table, coordinates, scale_errors=scale_errors).result(start, minima)
+    minimum, scale = minimise(objective), None
+    if scale_errors:
+        objective, minimum, scale = rescale_errors(objective, minimum, len(law_parameters(model)))
+    return _Summary(objective, table, minimum, scale).result()
 
 
 def problem_of(table: AmplitudeTable, model: str) -> Problem:
@@ -61,27 +64,15 @@ def problem_of(table: AmplitudeTable, model: str) -> Problem:
     return Problem(model, law_parameters(model) + nuisance)
 
 
-def _minimise(objective: Objective):
-    """Return the best coordinates, the grid point they came from (values), and all minima (values and chi2)."""
-    points = grid(objective.problem, objective.measurement)
-    best = np.argsort(objective.screen(points), kind="stable")[:BATCH]
-    starts = objective.problem.coordinates(points[best])
-    soft = polish(objective, starts, SOFT, settled=1e-2)
-    final = polish(objective, soft.coordinates, PLAIN, settled=1e-10)
-    winner = int(np.argmin(final.objective))
-    minima = objective.problem.values(final.coordinates), final.objective
-    return final.coordinates[winner], points[best[winner]], minima
-
-
 class _Summary:
     """Turns a minimum into a `FitResult`: errors, intervals, checks, verdict."""
 
-    def __init__(self, objective: Objective, table: AmplitudeTable, coordinates, *, scale_errors: bool):
-        self.objective, self.table, self.scale_errors = objective, table, scale_errors
+    def __init__(self, objective: Objective, table: AmplitudeTable, minimum: Minimum, error_scale: float | None):
+        self.objective, self.table, self.minimum, self.error_scale = objective, table, minimum, error_scale
         self.problem = objective.problem
-        self.values = self.problem.values(coordinates)
+        self.values = self.problem.values(minimum.coordinates)
         self.free = ~at_bound(objective, self.values)
-        self.convergence: Convergence = check_minimum(objective, coordinates, self.free)
+        self.convergence: Convergence = check_minimum(objective, minimum.coordinates, self.free)
         linear = objective.at_values(self.values[None])
         self.residual = np.asarray(linear.residual)[0]
         self.prediction = linear.prediction
@@ -89,21 +80,23 @@ class _Summary:
         constraints = int("quality_factor" in self.problem.names)
         self.data = int(np.asarray(objective.measurement.rows.measured).sum()) + constraints
         self.freedom = self.data - len(self.values)
-        scaled = scale_errors and self.freedom > 0
-        self.chi2_scale = self.chi2 / self.freedom if scaled else 1.0
-        self.covariance = covariance(objective, self.values, self.free) * self.chi2_scale
+        self.covariance = covariance(objective, self.values, self.free)
 
-    def result(self, start: Float[np.ndarray, " p"], minima) -> FitResult:
-        judged = self.freedom > 0 and not self.scale_errors
+    def result(self) -> FitResult:
+        judged = self.freedom > 0 and self.error_scale is None
         p_value = float(chdtrc(self.freedom, self.chi2)) if judged else float("nan")
         errors = np.sqrt(np.diag(self.covariance))
-        moved = ~self.free | ~np.isfinite(errors) | (np.abs(self.values - start) > 1e-3 * errors)
+        moved = ~self.free | ~np.isfinite(errors) | (np.abs(self.values - self.minimum.start) > 1e-3 * errors)
         if p_value < IMPROBABLE:
             # Errors that assume the model would be confident numbers about a law that is not there.
             intervals = [Interval(None, None, "the model does not explain the data")] * len(errors)
             parameters = self._parameters(np.full_like(errors, np.inf), intervals, moved)
+        elif not np.all(np.isfinite(errors)):
+            # With one parameter adrift there is no minimum to follow for the others.
+            intervals = [Interval(None, None, "the data do not determine the parameters")] * len(errors)
+            parameters = self._parameters(errors, intervals, moved)
         else:
-            intervals = profile_intervals(self.objective, self.values, self.covariance, self.chi2, self.chi2_scale)
+            intervals = profile_intervals(self.objective, self.values, self.covariance, self.chi2)
             parameters = self._parameters(errors, intervals, moved)
         rows = self._rows()
         evidence = Evidence(
@@ -115,8 +108,8 @@ class _Summary:
             freedom=self.freedom,
             p_value=p_value,
             autocorrelation=_autocorrelation(rows.residual),
-            other_minimum=self._other_minimum(minima, errors),
-            scale_errors=self.scale_errors,
+            other_minimum=self._other_minimum(errors),
+            error_scale=self.error_scale,
         )
         reasons, warnings = judge_fit(evidence)
         return FitResult(
@@ -138,7 +131,7 @@ class _Summary:
             residual_autocorrelation=evidence.autocorrelation,
             convergence=self.convergence,
             table=self.table,
-            settings={"model": self.problem.model, "scale_errors": self.scale_errors, "starts": BATCH, "soft": SOFT},
+            settings={"model": self.problem.model, "error_scale": self.error_scale, "starts": BATCH, "soft": SOFT},
             versions={name: version_of(name) for name in _PACKAGES},
         )
 
@@ -159,6 +152,7 @@ class _Summary:
                 standard_error=float(errors[i]) if self.free[i] and np.isfinite(errors[i]) else None,
                 interval95=(intervals[i].low, intervals[i].high),
                 interval_reason=intervals[i].reason,
+                undetermined=not np.isfinite(self.covariance[i, i]),
                 at_bound=not bool(self.free[i]),
                 did_not_move=not bool(moved[i]) and parameter.name != "quality_factor",
                 constraint=constraint if parameter.name == "quality_factor" else None,
@@ -183,12 +177,12 @@ class _Summary:
             near_fold=prediction.near_fold[0][:count],
         )
 
-    def _other_minimum(self, minima, errors: Float[np.ndarray, " p"]) -> dict[str, float] | None:
+    def _other_minimum(self, errors: Float[np.ndarray, " p"]) -> dict[str, float] | None:
         """Return the values of another minimum that the data hardly tell from the best one, if there is one."""
-        values, chi2 = minima
+        values, chi2 = self.minimum.ends, self.minimum.chi2
         known = np.where(np.isfinite(errors) & (errors > 0.0), errors, np.inf)
         apart = np.max(np.abs(values - self.values) / known, axis=1) > 5.0
-        rival = apart & (chi2 < self.chi2 + 4.0 * self.chi2_scale)
+        rival = apart & (chi2 < self.chi2 + 4.0)
         if not rival.any():
             return None
         index = int(np.argmin(np.where(rival, chi2, np.inf)))

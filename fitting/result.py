@@ -24,6 +24,7 @@ class FittedParameter:
         standard_error: Wald's, from the Fisher information; None where the data do not determine it or at a bound.
         interval95: profile-likelihood interval; an end is None where it is open.
         interval_reason: why an end is open; None if none is.
+        undetermined: the data do not determine it, not even to first order.
         at_bound: the loss vanishes within the resolution of the data.
         did_not_move: the optimiser left the parameter where it started.
         constraint: (value, standard error) that the table gives for it, or None.
@@ -34,6 +35,7 @@ class FittedParameter:
     standard_error: float | None
     interval95: tuple[float | None, float | None]
     interval_reason: str | None
+    undetermined: bool
     at_bound: bool
     did_not_move: bool
     constraint: tuple[float, float] | None

@@ -25,7 +25,7 @@ class Evidence:
     p_value: float
     autocorrelation: float
     other_minimum: dict[str, float] | None
-    scale_errors: bool
+    error_scale: float | None
 
 
 def judge_fit(evidence: Evidence) -> tuple[list[str], list[str]]:
@@ -36,7 +36,13 @@ def judge_fit(evidence: Evidence) -> tuple[list[str], list[str]]:
 def _reasons(evidence: Evidence) -> list[str]:
     reasons = []
     convergence = evidence.convergence
-    if not convergence.converged:
+    undetermined = [name for name, parameter in evidence.parameters.items() if parameter.undetermined]
+    if undetermined:
+        reasons.append(
+            f"Not identified: the amplitudes do not determine {' and '.join(undetermined)}; measure at other drives, "
+            "orders or offsets too."
+        )
+    elif not convergence.converged:
         reasons.append(
             f"Not converged: chi2 lies an estimated {convergence.estimated_distance:.2g} above its minimum"
             + ("" if convergence.outward else ", and a parameter is held at a bound it would leave")
@@ -54,7 +60,8 @@ def _reasons(evidence: Evidence) -> list[str]:
     if evidence.freedom <= 0:
         reasons.append("As many parameters as amplitudes: the goodness of fit cannot be judged.")
     for name, parameter in evidence.parameters.items():
-        if parameter.interval95 == (None, None) and not evidence.p_value < IMPROBABLE:
+        explained = not evidence.p_value < IMPROBABLE
+        if parameter.interval95 == (None, None) and explained and not undetermined:
             reasons.append(f"{name} is not identified: {parameter.interval_reason}.")
     return reasons
 
@@ -116,8 +123,11 @@ def _row_warnings(evidence: Evidence) -> list[str]:
         warnings.append(
             f"Neighbouring residuals are correlated ({evidence.autocorrelation:+.2f}): something systematic is left."
         )
-    if evidence.scale_errors:
-        warnings.append("Errors were scaled so that chi2/dof = 1: the goodness of fit cannot be judged.")
+    if evidence.error_scale is not None:
+        warnings.append(
+            f"The amplitudes' errors were scaled by {evidence.error_scale:.3g} so that chi2/dof = 1: the goodness of "
+            "fit cannot be judged."
+        )
     elif evidence.p_value > 1.0 - 1e-6:
         warnings.append("The errors look too large: chi2 is improbably small.")
     return warnings
