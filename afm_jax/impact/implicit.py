@@ -2,19 +2,23 @@
 
 A root x(p) of f(x, p) = 0 that some search has found obeys dx/dp = -(df/dp)/(df/dx). The rule calls itself for the
 root it differentiates at, so that second derivatives (forward over reverse, Hessians) are right as well; a Newton step
-behind `stop_gradient` would give wrong Hessians.
+behind `stop_gradient` would give wrong Hessians. So would `jax.custom_jvp` as soon as the root is found inside
+`lax.scan`: reverse mode evaluates a loop's body partially to move what does not change out of the loop, and drops
+custom rules on the way (jax 0.10.1). A primitive keeps its rule.
 """
 
 from collections.abc import Callable
-from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float
 
+_implicit_root = Primitive("implicit_root")
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
+
 def implicit_root(
     residual: Callable[[Float[Array, ""], Any], Float[Array, ""]], root: Float[Array, ""], parameters: Any
 ) -> Float[Array, ""]:
@@ -23,23 +27,77 @@ def implicit_root(
     Args:
         residual: f(x, parameters), smooth near the root; a plain function, the same object at every call.
         root: the value of x that the search found; its own derivative is ignored.
-        parameters: pytree of what the root depends on.
+        parameters: pytree of arrays, of what the root depends on.
 
     Returns:
         `root`, differentiable with respect to `parameters`. Where df/dx is 0 (grazing, fold) the derivative is 0: such
         points have none, and the caller flags them.
     """
-    del residual, parameters
+    leaves, structure = jax.tree.flatten(parameters)
+    return _implicit_root.bind(root, *leaves, residual=residual, structure=structure)
+
+
+class _Mapped(NamedTuple):
+    """A residual for a batch: row by row the same function; ``axes``: 0 or None for each leaf of the parameters."""
+
+    residual: Callable[[Any, Any], Any]
+    structure: Any
+    axes: tuple[int | None, ...]
+
+    def __call__(self, x: Array, parameters: Any) -> Array:
+        def one(value, *leaves):
+            return self.residual(value, jax.tree.unflatten(self.structure, leaves))
+
+        return jax.vmap(one, in_axes=(0, *self.axes))(x, *jax.tree.leaves(parameters))
+
+
+@_implicit_root.def_impl
+def _evaluate(root, *leaves, residual, structure):
+    del leaves, residual, structure
     return root
 
 
-@implicit_root.defjvp
-def _implicit_root_jvp(residual, primals, tangents):
-    """Differentiate: dx = -(df/dp dp) / (df/dx) at the root."""
-    root, parameters = primals
-    _, parameter_rates = tangents
-    x = implicit_root(residual, root, parameters)
-    _, slope = jax.jvp(lambda value: residual(value, parameters), (x,), (jnp.ones_like(x),))
-    _, shift = jax.jvp(lambda value: residual(x, value), (parameters,), (parameter_rates,))
+@_implicit_root.def_abstract_eval
+def _shape(root, *leaves, residual, structure):
+    del leaves, residual, structure
+    return root
+
+
+def _lower(context, root, *leaves, residual, structure):
+    del context, leaves, residual, structure
+    return [root]
+
+
+def _differentiate(primals, tangents, *, residual, structure):
+    """Differentiate: dx = -(df/dp dp) / (df/dx) at the root, summed over the parameters that move."""
+    root, *leaves = primals
+    x = _implicit_root.bind(root, *leaves, residual=residual, structure=structure)
+    rates = {place: rate for place, rate in enumerate(tangents[1:]) if not isinstance(rate, ad.Zero)}
+    if not rates:
+        return x, jnp.zeros_like(x)
+
+    def at(value, moved):
+        return residual(value, jax.tree.unflatten(structure, [moved.get(i, leaf) for i, leaf in enumerate(leaves)]))
+
+    moving = {place: leaves[place] for place in rates}
+    _, slope = jax.jvp(lambda value: at(value, moving), (x,), (jnp.ones_like(x),))
+    _, shift = jax.jvp(lambda moved: at(x, moved), (moving,), (rates,))
     regular = slope != 0.0
     return x, jnp.where(regular, -shift / jnp.where(regular, slope, 1.0), 0.0)
+
+
+def _map_over_batch(arguments, axes, *, residual, structure):
+    size = next(argument.shape[axis] for argument, axis in zip(arguments, axes, strict=True) if axis is not None)
+    root, *leaves = (
+        argument if axis is None else jnp.moveaxis(argument, axis, 0)
+        for argument, axis in zip(arguments, axes, strict=True)
+    )
+    if axes[0] is None:
+        root = jnp.broadcast_to(root, (size, *root.shape))
+    mapped = _Mapped(residual, structure, tuple(None if axis is None else 0 for axis in axes[1:]))
+    return _implicit_root.bind(root, *leaves, residual=mapped, structure=structure), 0
+
+
+mlir.register_lowering(_implicit_root, _lower)
+ad.primitive_jvps[_implicit_root] = _differentiate
+batching.primitive_batchers[_implicit_root] = _map_over_batch

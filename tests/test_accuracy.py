@@ -1,0 +1,116 @@
+"""The accuracy study: achieved errors are right, and the cheapest setting is the cheapest. No times are judged."""
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+
+from afm_jax.cli.accuracy import COLUMNS
+from afm_jax.cli.main import main
+from afm_jax.plots.accuracy import accuracy_figure
+from afm_jax.study import own_process
+from afm_jax.study.accuracy import cheapest_settings, map_accuracy
+from tests.run_here import run_here
+
+
+@pytest.fixture(scope="module")
+def study() -> dict:
+    return map_accuracy(
+        root_tolerances_us=[1e-2, 1e-6, 1e-13], scipy_tolerances=[1e-9], batch=20, impacts=5, lanes=2, repetitions=1
+    )
+
+
+def rows_of(study: dict, method: str) -> list[dict]:
+    return [row for row in study["rows"] if row["method"] == method]
+
+
+def test_every_scene_and_setting_has_its_row(study: dict):
+    assert {row["scene"] for row in study["rows"]} == {"regular", "grazing", "order 5"}
+    assert len(study["rows"]) == 3 * (2 * 3 + 1)
+    for row in study["rows"]:
+        assert set(row) <= set(COLUMNS)
+    assert study["reference_error_us"] < 1e-40  # fifty digits
+
+
+def test_float64_keeps_its_tolerance_and_reaches_rounding(study: dict):
+    for row in rows_of(study, "next_impact float64"):
+        # the tolerance bounds the error; rounding of times up to 30 us and of the gap adds 1e-14 or so
+        assert row["error_us"] <= row["tolerance"] + 1e-13, row
+        assert row["impacts_checked"] + row["near_grazing"] == 10
+    coarse, _, fine = rows_of(study, "next_impact float64")[:3]
+    assert fine["error_us"] < 1e-13
+    assert coarse["error_us"] > 1e-4
+
+
+def test_float32_ends_at_its_rounding(study: dict):
+    for row in rows_of(study, "next_impact float32"):
+        if row["tolerance"] == 1e-13:
+            # times of 1 to 30 us have a rounding of 1e-7 to 4e-6; slow impacts multiply it
+            assert 1e-8 < row["error_us"] < 1e-3, row
+
+
+def test_scipy_misses_no_impact_and_keeps_near_its_tolerance(study: dict):
+    for row in rows_of(study, "SciPy DOP853"):
+        assert row["missed_impacts"] == 0
+        # 1e-9 relative of 10 nm/us, divided by slow approaches
+        assert row["error_us"] < 1e-6
+
+
+def test_cheapest_is_the_fastest_that_is_good_enough():
+    def row(scene: str, tolerance: float, time: float, error: float | None) -> dict:
+        return {
+            "scene": scene,
+            "method": "next_impact float64",
+            "tolerance": tolerance,
+            "microseconds_per_impact": time,
+            "error_us": error,
+        }
+
+    rows = [row("a", 1e-2, 1.0, 1e-3), row("a", 1e-8, 2.0, 1e-9)]
+    rows += [row("b", 1e-2, 1.0, 1e-9), row("b", 1e-8, 3.0, 1e-10)]
+    scipy = {**row("a", 1e-2, 0.1, 1e-12), "method": "SciPy DOP853"}
+    chosen = cheapest_settings([*rows, scipy], 1e-8)
+    assert [(one["scene"], one["tolerance"], one["microseconds_per_impact"]) for one in chosen] == [
+        ("a", 1e-8, 2.0),
+        ("b", 1e-2, 1.0),
+        ("all", 1e-8, 3.0),
+    ]
+    assert [one["method"] for one in cheapest_settings(rows, 1e-12)] == [None, None, None]
+    # an error that could not be measured is not a good one
+    assert cheapest_settings([row("a", 1e-2, 1.0, None)], 1.0)[0]["method"] is None
+
+
+def test_figure_has_a_labelled_panel_for_each_scene(study: dict):
+    figure = accuracy_figure(study["rows"], 1e-9)
+    assert [axes.get_title() for axes in figure.axes] == ["scene: regular", "scene: grazing", "scene: order 5"]
+    for axes in figure.axes:
+        assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
+        assert "µs" in axes.get_xlabel()
+        assert len(axes.get_lines()) == 4
+
+
+def test_command_writes_table_picture_and_one_json_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(own_process, "run_in_own_process", run_here)
+    result = CliRunner().invoke(main, ["accuracy", "map", "--quick", "--json", "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.stderr
+    payload = json.loads(result.stdout)
+    assert {"rows", "cheapest", "wanted_error_us", "reference_error_us", "default_root_tolerance_us"} == set(payload)
+    assert json.loads((tmp_path / "accuracy.json").read_text("utf-8")) == payload
+    assert (tmp_path / "accuracy.csv").read_text("utf-8").splitlines()[0] == ",".join(COLUMNS)
+    assert (tmp_path / "accuracy.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "line"),
+    [
+        (["accuracy", "collide"], "there is no accuracy study of `collide`; choose: map"),
+        (["accuracy", "--wanted-error-us", "0"], "0.0 is not in the range"),
+    ],
+)
+def test_wrong_calls_are_one_line(arguments: list[str], line: str):
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert line in result.stderr
+    assert len(result.stderr.splitlines()) == 1

@@ -1,0 +1,149 @@
+"""The benchmark: its rows, its errors, its processes. Nothing here looks at how long something took."""
+
+import json
+import os
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from afm_jax import NextImpact, iterate_map
+from afm_jax.cli.bench import AIMED_BATCH, COLUMNS, aim_sentence, aims
+from afm_jax.cli.main import main
+from afm_jax.study import own_process
+from afm_jax.study.benchmark import all_cores, one_core
+from afm_jax.study.benchmark_scenes import chaotic_scene, regular_scene, settled_starts
+from afm_jax.study.exact_impacts import ExactMap, reference_error
+from afm_jax.study.impact_errors import lane_states, sequence_errors, single_errors
+from afm_jax.study.own_process import run_in_own_process
+from afm_jax.study.scipy_baseline import scipy_impacts
+from tests.run_here import run_here
+
+
+def test_one_core_measures_what_it_says():
+    rows = one_core(batches=[1, 6], blocks=[4], impacts=4, repetitions=1, derivative_batch=6)["rows"]
+    for row in rows:
+        assert set(row) <= set(COLUMNS)
+        assert row["impacts_per_second"] == pytest.approx(1e6 / row["microseconds_per_impact"], rel=1e-12)
+    maps = [row for row in rows if row["what"].startswith("next_impact")]
+    assert [(row["scene"], row["batch"], row["block"]) for row in maps] == [
+        ("regular", 1, 1),
+        ("regular", 6, 6),
+        ("regular", 6, 4),
+        ("regular", 6, 6),
+        ("chaotic", 6, 6),
+    ]
+    # the stated aim; rounding of times around 30 us is 4e-15
+    assert all(row["error_us"] < 1e-11 for row in maps)
+    assert maps[-1]["error_kind"] == "impact by impact"
+    slopes = [row["derivative_relative_error"] for row in rows if "derivative_relative_error" in row]
+    assert len(slopes) == 2
+    # near the attractor, whose phase does not depend on r, a derivative is a small difference: it loses five digits
+    assert max(slopes) < 1e-10
+    scipy = [row for row in rows if row["what"].startswith("SciPy")]
+    # its tolerance is 1e-10: an honest error is neither ours nor useless
+    assert all(1e-14 < row["error_us"] < 1e-7 for row in scipy)
+
+
+def test_batches_that_no_number_of_devices_divides_still_run():
+    rows = all_cores(batches=[1, 3], impacts=2, repetitions=1)["rows"]
+    assert [(row["batch"], row["cores"]) for row in rows] == [(1, 1), (3, 1)]
+
+
+def test_all_cores_really_are_several():
+    settings = {"batches": [3, 4], "impacts": 2, "repetitions": 1}
+    rows = run_in_own_process("afm_jax.study.benchmark:all_cores", settings, cores=2)["rows"]
+    assert [(row["batch"], row["cores"]) for row in rows] == [(3, 1), (4, 2)]
+    assert all(row["error_us"] < 1e-11 for row in rows)
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system cannot pin a process")
+def test_one_core_really_is_one():
+    assert run_in_own_process("afm_jax.study.own_process:available_cores", {}, cores=1) == 1
+
+
+def test_a_process_that_fails_is_an_error():
+    with pytest.raises(ValueError, match="ended with exit code 1"):
+        run_in_own_process("afm_jax.study.own_process:no_such_function", {}, cores=1)
+
+
+def test_the_error_is_that_of_the_times():
+    case = regular_scene()
+    starts = settled_starts(case.scene, 1)
+    rows = iterate_map(case.scene, starts.time_us[0], starts.velocity_nm_per_us[0], 5)
+    states = lane_states(starts, batch_of_one(rows), 0)
+    assert sequence_errors(case, states)[0] < 1e-13  # rounding of times around 30 us: 4e-15 each
+    wrong = states.copy()
+    wrong[3, 0] += 1e-6
+    # a wrong time in the middle is the largest error of the sequence, and nothing else changes
+    assert sequence_errors(case, wrong)[0] == pytest.approx(1e-6, rel=1e-6)
+
+
+def test_single_errors_restart_from_each_state():
+    case = chaotic_scene()
+    starts = settled_starts(case.scene, 2)
+    rows = batch_of_one(iterate_map(case.scene, starts.time_us[0], starts.velocity_nm_per_us[0], 30))
+    errors = single_errors(case, starts, rows, lanes=1)
+    assert len(errors.ordinary) + len(errors.near_grazing) == 30
+    assert np.nanmax(errors.ordinary) < 1e-11
+    # as a whole sequence it has lost its digits: 30 impacts in a chaotic scene
+    states = lane_states(starts, rows, 0)
+    whole = ExactMap(case.scene).error_of_sequence(tuple(states[0]), states[1:, 0])
+    assert not whole < 1e-12
+
+
+def test_the_reference_is_better_than_what_it_judges():
+    case = regular_scene()
+    states = scipy_impacts(case.scene, (4.0, 6.0), 5, tolerance=1e-10).states
+    # fifty digits; five impacts lose a few
+    assert reference_error(case.scene, tuple(states[0]), states[1:, 0]) < 1e-40
+
+
+def test_scipy_and_the_map_agree():
+    case = regular_scene()
+    states = scipy_impacts(case.scene, (4.0, 6.0), 5, tolerance=1e-12).states
+    rows = iterate_map(case.scene, 4.0, 6.0, 5)
+    # SciPy's tolerance, grown over five impacts
+    np.testing.assert_allclose(np.asarray(rows.time_us), states[1:, 0], rtol=0.0, atol=1e-9)
+    np.testing.assert_allclose(np.asarray(rows.velocity_after_nm_per_us), states[1:, 1], rtol=0.0, atol=1e-8)
+
+
+def test_starts_are_the_same_for_every_batch():
+    scene = regular_scene().scene
+    few, many = settled_starts(scene, 3), settled_starts(scene, 70)
+    for one, other in zip(few, many, strict=True):
+        np.testing.assert_array_equal(np.asarray(one), np.asarray(other)[:3])
+
+
+def test_aims_are_judged_and_not_invented():
+    plain = {"what": "next_impact iterated", "batch": AIMED_BATCH, "impacts_per_second": 2e6, "error_us": 1e-14}
+    rows = [plain, {"what": "reverse gradient", "ratio_to_plain": 3.0}]
+    judged = {aim["aim"].split(",")[0]: aim for aim in aims(rows)}
+    assert [aim["met"] for aim in judged.values()] == [False, True, None, True]
+    assert aim_sentence(judged["impacts per second"]).endswith("2e+06 reached, not met")
+    assert aim_sentence(judged["one forward derivative"]).endswith("not measured in this run")
+
+
+def test_command_writes_tables_and_one_json_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(own_process, "run_in_own_process", run_here)
+    result = CliRunner().invoke(main, ["bench", "--quick", "--batch", "2", "--json", "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.stderr
+    payload = json.loads(result.stdout)
+    assert {"rows", "aims", "machine"} == set(payload)
+    assert json.loads((tmp_path / "bench.json").read_text("utf-8")) == payload
+    lines = (tmp_path / "bench.csv").read_text("utf-8").splitlines()
+    assert lines[0] == ",".join(COLUMNS)
+    assert len(lines) == 1 + len(payload["rows"])
+
+
+def test_wrong_batch_is_one_line():
+    result = CliRunner().invoke(main, ["bench", "--batch", "0"])
+    assert result.exit_code == 2
+    assert "0 is not in the range" in result.stderr
+
+
+def batch_of_one(rows: NextImpact) -> NextImpact:
+    """Return a tip's impacts with a leading axis of one."""
+    return jax.tree.map(lambda part: part[None], rows)

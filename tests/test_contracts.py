@@ -1,0 +1,200 @@
+"""What every public object promises: it goes through jit, vmap, jvp and vjp, in one compilation, and says what it needs."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene
+from afm_jax.impact import orbits as orbits_module
+from afm_jax.impact import poincare
+from afm_jax.impact.jacobian import map_jacobian
+from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from afm_jax.impact.orbits import single_impact_orbits
+from afm_jax.impact.poincare import iterate_map, next_impact
+from tests.package_scenes import bouncing, next_impacts, repeated, stacked
+
+TIME, VELOCITY = 4.0, 60.0
+
+
+def free_flight(scene: Scene) -> Any:
+    tip = scene.cantilever
+    return jnp.stack([*tip.propagator(3.0)(-3.0, VELOCITY), tip.acceleration(-3.0, VELOCITY), tip.stiffness_n_per_m])
+
+
+def platform_motion(scene: Scene) -> Any:
+    platform = scene.platform
+    return jnp.stack([*platform.position_and_velocity(2.0), platform.acceleration(2.0), platform.period_us])
+
+
+def impact_law(scene: Scene) -> Any:
+    law = scene.interaction
+    return jnp.stack(
+        [law.rebound_speed(40.0), law.rebound_slope(40.0), law.approach_speed(30.0), law.energy_lost(40.0)]
+    )
+
+
+def collision_delay(scene: Scene) -> Any:
+    law = scene.interaction
+    return jnp.stack([law.collision_delay(40.0), law.delay_slope(40.0), law.delay(40.0, 35.0)])
+
+
+def next_state(scene: Scene) -> Any:
+    impact = next_impact(scene, TIME, VELOCITY)
+    return jnp.stack([impact.time_us, impact.velocity_before_nm_per_us, impact.velocity_after_nm_per_us])
+
+
+def three_impacts(scene: Scene) -> Any:
+    rows = iterate_map(scene, TIME, VELOCITY, 3)
+    return jnp.stack([rows.time_us, rows.velocity_after_nm_per_us])
+
+
+def jacobian(scene: Scene) -> Any:
+    return map_jacobian(scene, TIME, VELOCITY)
+
+
+def orbits(scene: Scene) -> Any:
+    found = single_impact_orbits(scene, 1)
+    return jnp.where(found.exists, found.peak_amplitude_nm + found.trace, 0.0)
+
+
+OBJECTS = [free_flight, platform_motion, impact_law, collision_delay, next_state, three_impacts, jacobian, orbits]
+LIGHT = OBJECTS[:-1]  # the derivatives of orbits have a file of their own
+SCENES = [bouncing(reduced, offset_nm=offset) for reduced, offset in ((1.01, -1.0), (1.03, 0.5), (0.98, -1.5))]
+
+
+@pytest.mark.parametrize("function", OBJECTS)
+def test_compiled_batched_and_plain_agree(function: Callable[[Scene], Any]):
+    batch = np.asarray(jax.jit(jax.vmap(function))(stacked(SCENES)))
+    assert np.all(np.isfinite(batch))
+    for row, scene in zip(batch, SCENES, strict=True):
+        # Compiled code fuses multiply and add; the condition of an impact is below 1e3, of a trace near capture 1e4.
+        np.testing.assert_allclose(function(scene), row, rtol=1e-11)
+    assert not np.allclose(batch[0], batch[1])
+
+
+@pytest.mark.parametrize("function", LIGHT)
+def test_jvp_vjp_and_differences_agree(function: Callable[[Scene], Any]):
+    scene, random = SCENES[0], np.random.default_rng(5)
+    direction = jax.tree.map(lambda leaf: leaf * random.uniform(-1, 1), scene)
+    value, rate = jax.jvp(function, (scene,), (direction,))
+    weight = jnp.asarray(random.normal(size=value.shape))
+    (gradient,) = jax.vjp(function, scene)[1](weight)
+    forward = float(jnp.sum(weight * rate))
+    pairs = zip(jax.tree.leaves(gradient), jax.tree.leaves(direction), strict=True)
+    terms = [float(jnp.sum(slope * step)) for slope, step in pairs]
+    # Sums in another order.
+    assert sum(terms) == pytest.approx(forward, rel=1e-10, abs=1e-12 * float(np.sum(np.abs(terms))))
+    near, far = (
+        np.asarray(
+            function(jax.tree.map(lambda x, d, h=h: x + h * d, scene, direction))
+            - function(jax.tree.map(lambda x, d, h=h: x - h * d, scene, direction))
+        )
+        / (2 * h)
+        for h in (1e-5, 2e-5)
+    )
+    # Fourth order in 1e-5, rounding of 1e-13 over 1e-5; three impacts stretch both.
+    scale = float(np.max(np.abs(rate)))
+    np.testing.assert_allclose(rate, (4 * near - far) / 3, rtol=1e-6, atol=1e-7 * scale)
+
+
+@pytest.mark.parametrize("function", OBJECTS[:6])
+def test_single_precision_goes_as_far_as_it_can(function: Callable[[Scene], Any]):
+    double = np.asarray(function(SCENES[0]))
+    single = np.asarray(function(jax.tree.map(lambda leaf: leaf.astype(jnp.float32), SCENES[0])))
+    assert single.dtype == np.float32
+    assert np.all(np.isfinite(single))
+    # 6e-8 of phases of 10 rad and lengths of 100 nm, stretched by up to three impacts.
+    np.testing.assert_allclose(single, double, rtol=3e-3 if function is three_impacts else 3e-4)
+
+
+def built_in_many_ways() -> list[tuple[Scene, Any, Any]]:
+    """Return scenes of one structure, their numbers given as Python, NumPy and JAX numbers, with a start."""
+    ways = []
+    for number in (float, int, np.float64, np.asarray, jnp.asarray, lambda x: jnp.asarray(float(x))):
+        delay = CollisionDelay(number(1), number(6), number(2))
+        law = ImpactLaw(r=number(1), epsilon=number(100), viscous_loss=number(1), delay=delay)
+        ways.append(
+            (Scene(Cantilever(number(90), number(40)), Platform(number(4), number(181), number(-1)), law), 4, 60)
+        )
+        ways.append((SCENES[len(ways) % 3], number(4), number(60)))
+    return ways
+
+
+@pytest.mark.parametrize(
+    "function", [next_impact, map_jacobian, lambda scene, t, v: iterate_map(scene, t, v, 3).outcome]
+)
+def test_one_compilation_serves_all_values(function: Callable[..., Any]):
+    traced = []
+
+    @jax.jit
+    def counted(scene, time, velocity):
+        traced.append(scene)
+        return function(scene, time, velocity)
+
+    for scene, time, velocity in built_in_many_ways():
+        jax.block_until_ready(counted(scene, jnp.asarray(time, float), jnp.asarray(velocity, float)))
+    assert len(traced) == 1
+
+
+def test_calls_without_jit_compile_once_too():
+    for scene, time, velocity in built_in_many_ways()[:1]:
+        next_impact(scene, time, velocity)
+        single_impact_orbits(scene, 1)
+    programs = poincare._next_impact, orbits_module._single_impact_orbits
+    before = [program._cache_size() for program in programs]
+    for order, (scene, time, velocity) in enumerate(built_in_many_ways()):
+        next_impact(scene, time, velocity)
+        single_impact_orbits(scene, np.int64(order + 1) if order % 2 else order + 1)
+    assert [program._cache_size() for program in programs] == before
+
+
+def test_row_sums_of_large_batches_are_right():
+    # Wrong above 16,384 rows in jax 0.10.2 on a CPU (jax issue 39103), silently, in the last row.
+    rows = np.random.default_rng(2).normal(size=(16_384 + 77, 5))
+    compiled = jax.jit(jax.vmap(jnp.sum))(rows)
+    # Five terms in any order.
+    np.testing.assert_allclose(compiled, rows.sum(axis=1), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(jax.vmap(jnp.sum)(jnp.asarray(rows)), compiled, rtol=0, atol=1e-14)
+
+
+def test_a_large_batch_of_impacts_equals_small_ones():
+    count = 16_384 + 77
+    random = np.random.default_rng(3)
+    scene, times, velocities = bouncing(), random.uniform(0, 5, count), random.uniform(30, 150, count)
+    whole = jax.jit(jax.vmap(next_impact, in_axes=(None, 0, 0)))(scene, times, velocities)
+    blocks = next_impacts(repeated(scene, count), times, velocities)
+    np.testing.assert_array_equal(whole.outcome, blocks.outcome)
+    landed = np.isin(blocks.outcome, [0, 1])
+    # Vectorised differently.
+    np.testing.assert_allclose(whole.time_us[landed], blocks.time_us[landed], rtol=1e-11)
+    after = np.abs(np.asarray(whole.velocity_after_nm_per_us) - blocks.velocity_after_nm_per_us)[landed]
+    assert np.max(after) < 1e-6  # next to capture d u_out/d u_in reaches some 1e4
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda scene: next_impact(scene, TIME, VELOCITY),
+        lambda scene: iterate_map(scene, TIME, VELOCITY, 2),
+        lambda scene: map_jacobian(scene, TIME, VELOCITY),
+        lambda scene: single_impact_orbits(scene, 1),
+    ],
+)
+def test_entry_points_ask_for_64_bits(call: Callable[[Scene], Any]):
+    with jax.enable_x64(False), pytest.raises(RuntimeError, match="jax_enable_x64', True") as error:  # noqa: FBT003
+        call(bouncing())
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "call", [lambda s: next_impact(s, TIME, VELOCITY), lambda s: iterate_map(s, TIME, VELOCITY, 2), jacobian, orbits]
+)
+def test_entry_points_ask_for_an_impact_law(call: Callable[[Scene], Any]):
+    with pytest.raises(TypeError, match="whose interaction is an ImpactLaw, not Cantilever"):
+        call(Scene(Cantilever(90.0), Platform(1.0, 180.0), Cantilever(90.0)))
