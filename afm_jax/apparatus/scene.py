@@ -1,5 +1,7 @@
 """A scene: a cantilever, a moving platform, and what happens when they meet."""
 
+from typing import Any
+
 import equinox as eqx
 
 from afm_jax.apparatus.cantilever import Cantilever
@@ -18,6 +20,6 @@ class Scene(eqx.Module):
 
     cantilever: Cantilever
     platform: Platform
-    interaction: eqx.Module
+    interaction: Any  # the modules of the interactions import this one, not the other way round
 
     __repr__ = readable
