@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from afm_jax.apparatus.cantilever import Cantilever
     from afm_jax.apparatus.platform import Platform
     from afm_jax.apparatus.scene import Scene
+    from afm_jax.impact.batch import iterate_batch
     from afm_jax.impact.jacobian import map_jacobian
     from afm_jax.impact.law import CollisionDelay, ImpactLaw
     from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
@@ -31,6 +32,7 @@ else:
         "SceneError": "afm_jax.scenefile",
         "SingleImpactOrbits": "afm_jax.impact.orbits",
         "__version__": "afm_jax.version",
+        "iterate_batch": "afm_jax.impact.batch",
         "iterate_map": "afm_jax.impact.poincare",
         "load_scene": "afm_jax.scenefile",
         "map_jacobian": "afm_jax.impact.jacobian",
@@ -57,6 +59,7 @@ __all__ = [
     "SceneError",
     "SingleImpactOrbits",
     "__version__",
+    "iterate_batch",
     "iterate_map",
     "load_scene",
     "map_jacobian",

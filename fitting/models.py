@@ -12,6 +12,9 @@ from jaxtyping import Array, Float
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.impact.law import ImpactLaw
 
+Numbers = Float[np.ndarray, "..."] | float
+"""Arrays, and the NumPy scalars that come of taking one element of them."""
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -34,18 +37,18 @@ class Parameter:
         """The value at which the loss vanishes; None for a parameter without such an end."""
         return self.reference if self.sign else None
 
-    def to_coordinate(self, value: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    def to_coordinate(self, value: Numbers) -> Numbers:
         """Return the optimiser's coordinate of a value."""
         if self.sign:
             return np.sqrt(np.maximum(self.sign * (value - self.reference), 0.0))
         return np.log(value)
 
-    def from_coordinate(self, coordinate: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    def from_coordinate(self, coordinate: Numbers) -> Numbers:
         """Return the value at a coordinate, kept in the allowed range."""
         value = self.reference + self.sign * coordinate**2 if self.sign else np.exp(coordinate)
         return np.clip(value, self.lowest, self.highest)
 
-    def slope(self, coordinate: Float[np.ndarray, "..."]) -> Float[np.ndarray, "..."]:
+    def slope(self, coordinate: Numbers) -> Numbers:
         """Return d value/d coordinate; 0 where the value is held at the end of its range."""
         value = self.reference + self.sign * coordinate**2 if self.sign else np.exp(coordinate)
         inside = (value >= self.lowest) & (value <= self.highest)

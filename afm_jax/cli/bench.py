@@ -1,0 +1,156 @@
+"""`afm-jax bench`: impacts per second, next to SciPy."""
+
+import os
+import platform
+from collections.abc import Sequence
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from afm_jax.cli.session import Session, with_session
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+COLUMNS = (
+    "what",
+    "scene",
+    "batch",
+    "cores",
+    "block",
+    "impacts",
+    "microseconds_per_impact",
+    "median_microseconds_per_impact",
+    "impacts_per_second",
+    "compile_s",
+    "error_us",
+    "error_kind",
+    "near_grazing",
+    "ratio_to_plain",
+    "derivative_relative_error",
+)
+"""What `bench.csv` tells of a measurement."""
+AIMED_BATCH = 10_000
+
+
+@click.command()
+@click.option("--quick", is_flag=True, help="Few and small measurements: to see that it works.")
+@click.option(
+    "--batch",
+    "batches",
+    type=click.IntRange(1, 10_000_000),
+    multiple=True,
+    metavar="N",
+    help="How many tips at once; may be given several times. Default: 1, 100, 10000 and 100000.",
+)
+@with_session
+def command(session: Session, batches: tuple[int, ...], *, quick: bool) -> None:
+    """Measure impacts per second of next_impact iterated, on one core and on all.
+
+    The same run measures a chaotic scene, derivatives, and SciPy's solve_ivp with events on the same problem. Errors of
+    impact times are against 50 digits. Times are the best of several repetitions, compilation apart; the machine should
+    have nothing else to do. With --out bench.csv and bench.json.
+    """
+    session.start_computing()
+    from afm_jax.cli.strict_json import strict_json  # noqa: PLC0415
+    from afm_jax.study.own_process import available_cores, run_in_own_process  # noqa: PLC0415
+
+    sizes = list(batches) or ([1, 100] if quick else [1, 100, AIMED_BATCH, 100_000])
+    common = {"batches": sizes, "impacts": 20, "repetitions": 2 if quick else 7}
+    blocks = [] if quick else [250, 1000, 2000]
+    cores = available_cores()
+    machine = machine_facts(cores)
+    if (machine["load_before"] or 0.0) > 0.3 * cores:
+        session.note(f"other programs are running (load {machine['load_before']:.1f}): times will be too long")
+    with session.working("measuring"):
+        alone = {**common, "blocks": blocks, "derivative_batch": 100 if quick else AIMED_BATCH}
+        rows = run_in_own_process("afm_jax.study.benchmark:one_core", alone, cores=1)["rows"]
+        if cores > 1:
+            rows += run_in_own_process("afm_jax.study.benchmark:all_cores", common, cores=cores)["rows"]
+    payload = {"rows": rows, "aims": aims(rows), "machine": machine}
+    session.write_table("bench.csv", rows, COLUMNS)
+    if session.out is not None:
+        (session.out / "bench.json").write_text(strict_json(payload) + "\n", encoding="utf-8")
+        session.note(f"wrote {session.out / 'bench.json'}")
+    session.emit(payload, bench_table(rows), *(aim_sentence(aim) for aim in payload["aims"]))
+
+
+def aims(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the stated aims with what was reached; None where it was not measured.
+
+    One core, float64, the regular scene: impacts per second at batch 10,000, the error after 20 impacts, and the cost
+    of derivatives in plain runs.
+    """
+    plain = next((row for row in rows if row["what"] == "next_impact iterated" and row["batch"] == AIMED_BATCH), {})
+    ratios = {row["what"].split()[0]: row["ratio_to_plain"] for row in rows if "ratio_to_plain" in row}
+    return [
+        _aim("impacts per second, one core, batch 10000", plain.get("impacts_per_second"), at_least=3e6),
+        _aim("error after 20 impacts, us", plain.get("error_us"), at_most=1e-11),
+        _aim("one forward derivative, plain runs", ratios.get("forward"), at_most=1.5),
+        _aim("full reverse gradient, plain runs", ratios.get("reverse"), at_most=4.0),
+    ]
+
+
+def _aim(
+    name: str, reached: float | None, *, at_least: float | None = None, at_most: float | None = None
+) -> dict[str, Any]:
+    met = None
+    if reached is not None:
+        met = (at_least is None or reached >= at_least) and (at_most is None or reached <= at_most)
+    return {"aim": name, "at_least": at_least, "at_most": at_most, "reached": reached, "met": met}
+
+
+def aim_sentence(aim: dict[str, Any]) -> str:
+    """Say what was aimed at, what was reached, and whether that is enough."""
+    bound = f"at least {aim['at_least']:g}" if aim["at_least"] is not None else f"at most {aim['at_most']:g}"
+    if aim["reached"] is None:
+        return f"{aim['aim']}: {bound} wanted, not measured in this run"
+    return f"{aim['aim']}: {bound} wanted, {aim['reached']:.3g} reached{'' if aim['met'] else ', not met'}"
+
+
+def machine_facts(cores: int) -> dict[str, Any]:
+    """Return what a reader needs to know of the machine and the programs; no names, no folders."""
+    packages = {name: version(name) for name in ("jax", "numpy", "scipy")}
+    return {
+        "cores": cores,
+        "load_before": os.getloadavg()[0] if hasattr(os, "getloadavg") else None,
+        "architecture": platform.machine(),
+        "system": platform.system(),
+        "python": platform.python_version(),
+        **packages,
+    }
+
+
+def bench_table(rows: Sequence[dict[str, Any]]) -> "Table":
+    """Return the measurements as a table."""
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table(title="Time of an impact: best of several repetitions, compilation apart")
+    table.add_column("what")
+    table.add_column("scene")
+    for heading in ("batch", "cores", "us/impact", "median", "impacts/s", "compile s", "ratio"):
+        table.add_column(heading, justify="right")
+    table.add_column("error us")
+    for row in rows:
+        ratio, compile_s = row.get("ratio_to_plain"), row["compile_s"]
+        table.add_row(
+            row["what"],
+            row["scene"],
+            f"{row['batch']:,}",
+            str(row["cores"]),
+            f"{row['microseconds_per_impact']:.3g}",
+            f"{row['median_microseconds_per_impact']:.3g}",
+            f"{row['impacts_per_second']:,.0f}",
+            "-" if compile_s is None else f"{compile_s:.1f}",
+            "-" if ratio is None else f"{ratio:.2f}",
+            _error_cell(row),
+        )
+    return table
+
+
+def _error_cell(row: dict[str, Any]) -> str:
+    if "error_us" in row:
+        return f"{row['error_us']:.1e} {row['error_kind']}"
+    slope = row.get("derivative_relative_error")
+    return "-" if slope is None else f"derivative: {slope:.1e} relative"
