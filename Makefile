@@ -25,7 +25,7 @@ fit: $(SETUP) ## fit the bundled table (or TABLE=..., MODEL=...), print the impa
 	$(BIN)/afm-jax fit $(if $(TABLE),'$(TABLE)',--example) --model $(MODEL) --out $(OUT)
 
 test: $(SETUP) ## the tests (under 10 minutes on two cores)
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadscope
 
 lint: $(SETUP)
 	$(BIN)/ruff format --check .

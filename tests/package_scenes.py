@@ -11,7 +11,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
-from afm_jax.impact.poincare import NextImpact, next_impact
+from afm_jax.impact.poincare import next_impact
 from tests.brute_force import Flights
 from tests.reference_examples import DELAY
 from tests.reference_systems import Parameters
@@ -56,14 +56,15 @@ def scenes_of(flights: Flights, **law: Any) -> Scene:
     platform = Platform(flights.amplitude_nm, flights.drive_frequency_khz, flights.offset_nm, np.zeros(rows))
     cantilever = Cantilever(flights.frequency_khz, flights.quality_factor, np.ones(rows))
     values = {"r": 0.5, "epsilon": 0.0, "viscous_loss": 0.0} | law
-    return Scene(cantilever, platform, ImpactLaw(**{name: np.full(rows, value) for name, value in values.items()}))
+    full = {name: np.full(rows, value) for name, value in values.items()}
+    return Scene(cantilever, platform, ImpactLaw(full["r"], full["epsilon"], full["viscous_loss"]))
 
 
 _batch = jax.jit(jax.vmap(next_impact))
 
 
-def next_impacts(scenes: Scene, times: Any, velocities: Any) -> NextImpact:
-    """Return the next impacts of a batch of any size, LANES at a time, as NumPy arrays."""
+def next_impacts(scenes: Scene, times: Any, velocities: Any) -> Any:
+    """Return the `NextImpact` of a batch of any size, LANES at a time, its attributes NumPy arrays."""
     count = len(times)
     blocks = []
     for first in range(0, count, LANES):

@@ -2,7 +2,6 @@
 
 import jax
 import jax.numpy as jnp
-import mpmath
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -16,6 +15,7 @@ from afm_jax.apparatus.trigonometry import sine_cosine
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from tests.package_scenes import bouncing
 from tests.reference_examples import scene
+from tests.reference_flight import mp
 from tests.reference_systems import free_flight, platform_motion
 
 OMEGA = 2e-3 * np.pi * 90.0
@@ -107,8 +107,8 @@ def test_sine_and_cosine_are_right_to_the_last_digit():
     angles = np.concatenate(
         [random.uniform(-10, 10, 400), random.uniform(-1e5, 1e5, 400), 0.25 * np.pi * np.arange(-40, 41)]
     )
-    with mpmath.workdps(40):
-        exact = np.array([[float(mpmath.sin(float(a))), float(mpmath.cos(float(a)))] for a in angles]).T
+    with mp.workdps(40):
+        exact = np.array([[float(mp.sin(float(a))), float(mp.cos(float(a)))] for a in angles]).T
     sine, cosine = sine_cosine(jnp.asarray(angles))
     # One unit in the last place of 1, and one more near the ends of a quadrant.
     np.testing.assert_allclose(sine, exact[0], rtol=0, atol=2.3e-16)

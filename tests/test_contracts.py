@@ -1,4 +1,4 @@
-"""What every public object promises: it goes through jit, vmap, jvp and vjp, in one compilation, and says what it needs."""
+"""What every public object promises: jit, vmap, jvp and vjp, one compilation, and a clear word on needs."""
 
 from collections.abc import Callable
 from typing import Any
@@ -14,7 +14,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.impact import orbits as orbits_module
 from afm_jax.impact import poincare
 from afm_jax.impact.jacobian import map_jacobian
-from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from afm_jax.impact.law import CollisionDelay, ImpactLaw, impact_law_of
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.impact.poincare import iterate_map, next_impact
 from tests.package_scenes import bouncing, next_impacts, repeated, stacked
@@ -33,14 +33,15 @@ def platform_motion(scene: Scene) -> Any:
 
 
 def impact_law(scene: Scene) -> Any:
-    law = scene.interaction
+    law = impact_law_of(scene)
     return jnp.stack(
         [law.rebound_speed(40.0), law.rebound_slope(40.0), law.approach_speed(30.0), law.energy_lost(40.0)]
     )
 
 
 def collision_delay(scene: Scene) -> Any:
-    law = scene.interaction
+    law = impact_law_of(scene)
+    assert law.delay is not None
     return jnp.stack([law.collision_delay(40.0), law.delay_slope(40.0), law.delay(40.0, 35.0)])
 
 
@@ -65,7 +66,14 @@ def orbits(scene: Scene) -> Any:
 
 OBJECTS = [free_flight, platform_motion, impact_law, collision_delay, next_state, three_impacts, jacobian, orbits]
 LIGHT = OBJECTS[:-1]  # the derivatives of orbits have a file of their own
-SCENES = [bouncing(reduced, offset_nm=offset) for reduced, offset in ((1.01, -1.0), (1.03, 0.5), (0.98, -1.5))]
+SCENES = [
+    bouncing(reduced, frequency_khz=frequency, offset_nm=offset, r=r, delay=(hertz, 5.64, 0.726))
+    for reduced, frequency, offset, r, hertz in (
+        (1.01, 90.0, -1.0, 0.9981, 0.206),
+        (1.03, 91.0, 0.5, 0.99, 0.21),
+        (0.99, 89.5, -1.5, 0.98, 0.19),
+    )
+]
 
 
 @pytest.mark.parametrize("function", OBJECTS)
@@ -146,7 +154,7 @@ def test_calls_without_jit_compile_once_too():
     for scene, time, velocity in built_in_many_ways()[:1]:
         next_impact(scene, time, velocity)
         single_impact_orbits(scene, 1)
-    programs = poincare._next_impact, orbits_module._single_impact_orbits
+    programs: list[Any] = [poincare._next_impact, orbits_module._single_impact_orbits]
     before = [program._cache_size() for program in programs]
     for order, (scene, time, velocity) in enumerate(built_in_many_ways()):
         next_impact(scene, time, velocity)

@@ -89,7 +89,7 @@ def test_orbits_that_almost_merge_are_found_and_flagged(name, beyond, orbits, fl
     with mp.workdps(30):
         middle, fold = fold_of(p)
         amplitude = fold * (1 + beyond)
-        exact = []
+        exact: Any = []
         if orbits:
             width = min(0.9999, 100.0 * beyond**0.5) * float(middle - capture_speed(p))
             excess = lambda u: float(drive_amplitude(p, mp.mpf(u)) - amplitude)  # noqa: E731

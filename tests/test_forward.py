@@ -1,0 +1,86 @@
+"""Predicted amplitudes of a table's rows and their derivatives, against the reference's orbits."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fitting.forward import Linearised, linearise, measurement_of
+from fitting.models import Problem
+from fitting.table import AmplitudeTable
+from tests.reference_examples import scene
+from tests.reference_systems import Parameters, single_impact_orbits
+
+VALUES = {"r": 0.98, "epsilon": 100.0, "quality_factor": 38.0}
+ROWS = [(1, 1.01, 4.0, -1.0), (1, 1.03, 3.0, 1.0), (2, 2.02, 4.0, 0.0), (1, 1.01, 0.1, 0.0)]  # the last: no orbit
+
+
+def parameters(row: tuple[int, float, float, float], values: dict[str, float]) -> Parameters:
+    _, reduced, amplitude, offset = row
+    return scene(reduced, amplitude_nm=amplitude, offset_nm=offset, **values)
+
+
+def amplitudes(row: tuple[int, float, float, float], values: dict[str, float]) -> np.ndarray:
+    """Return peak and lock-in amplitude of the steady orbit; 0 where there is none."""
+    steady = [o for o in single_impact_orbits(parameters(row, values), row[0]) if o.stable and o.admissible]
+    assert len(steady) <= 1
+    return np.array([[o.peak_amplitude_nm, o.lockin_amplitude_nm] for o in steady] or [[0.0, 0.0]])[0]
+
+
+MEASURED = np.array([[100.0, 40.0], [80.0, 30.0], [np.nan, 25.0], [5.0, 2.0]])  # peak and lock-in, nm
+ERRORS = np.array([[2.0, 0.5], [1.0, 1.0], [np.nan, 4.0], [0.5, 0.25]])
+
+
+def table() -> AmplitudeTable:
+    order, reduced, amplitude, offset = (np.array(column) for column in zip(*ROWS, strict=True))
+    return AmplitudeTable(
+        order=order,
+        drive_frequency_khz=180.0 * reduced,
+        drive_amplitude_nm=amplitude,
+        offset_nm=offset,
+        free_frequency_khz=90.0,
+        peak_amplitude_nm=MEASURED[:, 0],
+        peak_amplitude_error_nm=ERRORS[:, 0],
+        lockin_amplitude_nm=MEASURED[:, 1],
+        lockin_amplitude_error_nm=ERRORS[:, 1],
+        quality_factor=40.0,
+        quality_factor_error=4.0,
+    )
+
+
+@pytest.fixture(scope="module")
+def linear() -> Linearised:
+    problem = Problem("law", tuple(VALUES))
+    return linearise(jnp.array([list(VALUES.values())]), measurement_of(table()), problem)
+
+
+def test_predictions_are_the_orbits_amplitudes(linear):
+    for row, drive in enumerate(ROWS):
+        # 20,001 samples and a parabola in the reference's peak.
+        np.testing.assert_allclose(linear.prediction.amplitude_nm[0, row], amplitudes(drive, VALUES), rtol=1e-9)
+    assert [int(n) for n in linear.prediction.orbits[0, : len(ROWS)]] == [1, 1, 1, 0]
+    (orbit,) = [o for o in single_impact_orbits(parameters(ROWS[0], VALUES), 1) if o.stable and o.admissible]
+    speed = float(linear.prediction.approach_speed_nm_per_us[0, 0])
+    assert speed == pytest.approx(float(orbit.approach_speed_nm_per_us), rel=1e-10)
+
+
+def test_residuals_are_misfits_in_errors_and_the_constraint(linear):
+    predicted = np.stack([amplitudes(drive, VALUES) for drive in ROWS])
+    misfit = np.where(np.isfinite(MEASURED), (predicted - MEASURED) / ERRORS, 0.0)
+    residual = np.asarray(linear.residual[0])
+    np.testing.assert_allclose(residual[: 2 * len(ROWS)].reshape(-1, 2), misfit, rtol=1e-8, atol=1e-10)
+    np.testing.assert_array_equal(residual[2 * len(ROWS) : -1], 0.0)
+    assert residual[-1] == pytest.approx((38.0 - 40.0) / 4.0, rel=1e-14)
+
+
+@pytest.mark.parametrize("column", range(3))
+def test_jacobian_is_that_of_differences(linear, column):
+    name = list(VALUES)[column]
+    step = 1e-4 * VALUES[name]
+    found = np.asarray(linear.jacobian[0, :, column])
+    for row in range(3):
+        ahead, behind = (amplitudes(ROWS[row], VALUES | {name: VALUES[name] + h}) for h in (step, -step))
+        slope = (ahead - behind) / (2 * step)
+        expected = np.where(np.isfinite(ERRORS[row]), slope / ERRORS[row], 0.0)
+        # Differences: 1e-8 of the value times its third logarithmic derivative.
+        np.testing.assert_allclose(found[2 * row : 2 * row + 2], expected, rtol=1e-4)
+    assert found[-1] == (0.25 if name == "quality_factor" else 0.0)

@@ -1,0 +1,107 @@
+"""Tests that bite: each wrong formula of `mutations`, put into a copy of the packages, must turn a named test red."""
+
+import os
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from tests.mutations import MUTATIONS, Mutation
+
+ROOT = Path(__file__).parent.parent
+AT_ONCE = 2
+TIME_LIMIT_S = 300
+UNCHANGED = "unchanged"
+
+pytestmark = pytest.mark.slow
+
+
+def copy_of_the_packages(folder: Path, cache: Path) -> Path:
+    """Copy what the tests need; compiled programs are kept in a folder that all copies share."""
+    for name in ("afm_jax", "fitting", "tests"):
+        shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
+    shutil.copy(ROOT / "pyproject.toml", folder)
+    (folder / ".pytest_cache").symlink_to(cache, target_is_directory=True)
+    return folder
+
+
+def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run Python in a copy, whose packages come before the installed ones."""
+    return subprocess.run(
+        [sys.executable, *arguments],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": str(folder), "PYTHONDONTWRITEBYTECODE": "1", "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+        timeout=TIME_LIMIT_S,
+        check=False,
+    )
+
+
+def run_tests(folder: Path, tests: list[str]) -> subprocess.CompletedProcess[str]:
+    # -x ends at the first red test; a fixed seed keeps hypothesis from looking elsewhere in each run.
+    return run(folder, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--hypothesis-seed=0", *tests)
+
+
+def mutate(folder: Path, name: str, mutation: Mutation) -> None:
+    """Apply an edit; its text must stand in the file exactly once."""
+    path = folder / mutation.file
+    text = path.read_text()
+    count = text.count(mutation.before)
+    assert count == 1, f"mutation {name!r}: {mutation.before!r} stands {count} times in {mutation.file}, not once"
+    path.write_text(text.replace(mutation.before, mutation.after))
+
+
+@pytest.fixture(scope="module")
+def outcome(
+    tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureRequest
+) -> Iterator[Callable[[str], subprocess.CompletedProcess[str]]]:
+    """Run the unchanged copy first, then the mutations that were selected, two at a time."""
+    base = tmp_path_factory.mktemp("mutations")
+    (base / "cache").mkdir()
+    unchanged = run_tests(
+        copy_of_the_packages(base / UNCHANGED, base / "cache"), sorted({m.test for m in MUTATIONS.values()})
+    )
+    selected = {
+        vars(item)["callspec"].params.get("name") for item in request.session.items if hasattr(item, "callspec")
+    }
+
+    def job(number: int, name: str) -> subprocess.CompletedProcess[str]:
+        folder = copy_of_the_packages(base / f"copy{number}", base / "cache")
+        mutate(folder, name, MUTATIONS[name])
+        return run_tests(folder, [MUTATIONS[name].test])
+
+    with ThreadPoolExecutor(AT_ONCE) as pool:
+        jobs: dict[str, Future[subprocess.CompletedProcess[str]]] = {
+            name: pool.submit(job, number, name) for number, name in enumerate(MUTATIONS) if name in selected
+        }
+        yield lambda name: unchanged if name == UNCHANGED else jobs[name].result()
+
+
+def test_the_copy_is_what_runs(tmp_path: Path):
+    (tmp_path / "cache").mkdir()
+    folder = copy_of_the_packages(tmp_path / "copy", tmp_path / "cache")
+    done = run(
+        folder, "-c", "import afm_jax, fitting, tests; print(afm_jax.__file__, fitting.__file__, tests.__file__)"
+    )
+    for path, name in zip(done.stdout.split(), ("afm_jax", "fitting", "tests"), strict=True):
+        assert Path(path) == folder / name / "__init__.py"
+
+
+def test_the_unchanged_copy_is_green(outcome):
+    done = outcome(UNCHANGED)
+    assert done.returncode == 0, done.stdout[-4000:]
+
+
+@pytest.mark.parametrize("name", MUTATIONS)
+def test_a_wrong_formula_turns_a_test_red(outcome, name: str):
+    done = outcome(name)
+    # 1: tests ran and failed; anything else (2 interrupted, 4 no such test, 5 none) proves nothing.
+    assert done.returncode == 1, (
+        f"{name}: {MUTATIONS[name].test} did not notice\n{done.stdout[-3000:]}{done.stderr[-1000:]}"
+    )
+    assert " failed" in done.stdout
