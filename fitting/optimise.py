@@ -26,8 +26,8 @@ PLAIN = np.inf
 _GRID_PER_PARAMETER = {1: 96, 2: 16}
 _MAX_STEPS = 60
 _LBFGS = optax.lbfgs(learning_rate=1.0, linesearch=None, scale_init_precond=False)
-_lbfgs_init = jax.jit(jax.vmap(_LBFGS.init))
-_lbfgs_update = jax.jit(jax.vmap(_LBFGS.update))
+_init = jax.jit(jax.vmap(_LBFGS.init))
+_update = jax.jit(jax.vmap(_LBFGS.update))
 
 
 class Polished(NamedTuple):
@@ -132,8 +132,8 @@ def polish(objective: Objective, starts: Float[np.ndarray, "starts p"], softness
 
     z = np.zeros_like(starts)
     value, gradient = evaluate(z)
-    step, state = _lbfgs_update(jnp.asarray(gradient), _lbfgs_init(jnp.asarray(z)), jnp.asarray(z))
-    step, share = _descending(np.asarray(step), gradient), np.ones(len(z))
+    step, state = _lbfgs(gradient, None, z)
+    step, share = _descending(step, gradient), np.ones(len(z))
     count = 0
     while count < _MAX_STEPS and np.any((_squared(gradient) > settled) & (share > 1e-9)):
         count += 1
@@ -143,10 +143,21 @@ def polish(objective: Objective, starts: Float[np.ndarray, "starts p"], softness
         kept = accepted[:, None]
         z, gradient = np.where(kept, trial, z), np.where(kept, new_gradient, gradient)
         value, share = np.where(accepted, new_value, value), np.where(accepted, 1.0, 0.5 * share)
-        new_step, new_state = _lbfgs_update(jnp.asarray(gradient), state, jnp.asarray(z))
+        new_step, new_state = _lbfgs(gradient, state, z)
         state = _choose(accepted, new_state, state)
-        step = np.where(kept, _descending(np.asarray(new_step), gradient), step)
+        step = np.where(kept, _descending(new_step, gradient), step)
     return Polished(starts + np.einsum("spq,sq->sp", scale, z), value, count)
+
+
+def _lbfgs(
+    gradient: Float[np.ndarray, "sets p"], state: optax.OptState | None, z: Float[np.ndarray, "sets p"]
+) -> tuple[Float[np.ndarray, "sets p"], optax.OptState]:
+    """Return optax's L-BFGS step of every set and its new state; no state: the first step."""
+    # optax mixes integers of 32 and 64 bits, which strict promotion would refuse.
+    with jax.numpy_dtype_promotion("standard"):
+        before = _init(jnp.asarray(z)) if state is None else state
+        step, after = _update(jnp.asarray(gradient), before, jnp.asarray(z))
+    return np.asarray(step), after
 
 
 def _squared(gradient: Float[np.ndarray, "sets p"]) -> Float[np.ndarray, " sets"]:
