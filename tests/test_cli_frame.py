@@ -197,7 +197,9 @@ def test_closed_pipe_is_quiet():
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signal")
 def test_interrupt_ends_with_130():
     code = (
-        "import sys, time, types, click\nfrom afm_jax.cli import main\n"
+        # a test run in the background inherits that interrupts are ignored
+        "import signal, sys, time, types, click\nfrom afm_jax.cli import main\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "module = types.ModuleType('waiting')\n"
         "module.command = click.command()(lambda: (print('ready', flush=True), time.sleep(60)))\n"
         "sys.modules['waiting'] = module\nmain.COMMANDS['wait'] = ('waiting', 'Wait.')\nmain.main(['wait'])"
