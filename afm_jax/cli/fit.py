@@ -76,6 +76,8 @@ def command(
 
 
 def _example_path() -> Path:
+    """Return where the bundled table lies, the short way if that is below the working folder."""
     import fitting.examples  # noqa: PLC0415
 
-    return Path(fitting.examples.__path__[0]) / "amplitudes_law.csv"
+    path = Path(fitting.examples.__path__[0]) / "amplitudes_law.csv"
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path
