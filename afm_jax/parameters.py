@@ -59,8 +59,8 @@ def check_parameter(name: str, value: ArrayLike | None, allowed: str) -> None:
     good = finite & _RANGES[allowed](number)
     if not np.all(good):
         offender = float(number[~good].flat[0]) if number.ndim else float(number)
-        must = "a finite number" if allowed == "finite" else allowed
-        raise ValueError(f"`{name}` must be {must}, but is {offender:g}")
+        must = {"finite": "be a finite number", "not negative": "not be negative"}.get(allowed, f"be {allowed}")
+        raise ValueError(f"`{name}` must {must}, but is {offender:g}")
 
 
 _RANGES = {

@@ -111,21 +111,6 @@ class _Branch(NamedTuple):
     near_fold: Bool[Array, ""]
 
 
-def predict(values: Float[Array, " p"], measurement: Measurement, problem: Problem) -> Prediction:
-    """Return the amplitudes that parameters predict for every row.
-
-    Of a row's stable admissible orbits (there can be several) the one that explains its measured amplitudes best
-    counts; a row without any is predicted as 0, which misses the measurement by all of it: a fixed penalty.
-    Derivatives run through the orbit by the implicit function theorem.
-    """
-
-    def one(row: Rows) -> Prediction:
-        orbit = _orbit_problem(values, row, measurement, problem)
-        return _prediction(_branch(orbit, row), orbit)
-
-    return jax.vmap(one)(measurement.rows)
-
-
 @partial(jax.jit, static_argnames=("problem",))
 def linearise(values: Float[Array, "sets p"], measurement: Measurement, problem: Problem) -> Linearised:
     """Return residuals, their Jacobian (forward mode through the implicit roots) and predictions for several sets."""
@@ -162,7 +147,11 @@ def _orbit_problem(values: Float[Array, " p"], row: Rows, measurement: Measureme
 
 
 def _branch(orbit: OrbitProblem, row: Rows) -> _Branch:
-    """Choose among a row's steady orbits by the measurement; no derivatives."""
+    """Choose among a row's steady orbits; no derivatives.
+
+    There can be several: the one that explains the measured amplitudes best counts. A row without any is predicted as
+    0, which misses the measurement by all of it: a fixed penalty.
+    """
     roots = steady_orbits(orbit)
     misfit = jnp.where(row.measured, (roots.amplitude_nm - row.amplitude_nm) / row.error_nm, 0.0)
     slot = jnp.argmin(jnp.where(roots.steady, jnp.sum(misfit**2, axis=1), jnp.inf))

@@ -100,7 +100,7 @@ def test_batch_equals_loop():
 @pytest.mark.parametrize(("name", "value"), [("r", 0.0), ("r", 1.1), ("epsilon", -1.0), ("viscous_loss", -0.1)])
 def test_impossible_values_are_named(name, value):
     values = {"r": 0.9, "epsilon": 0.0, "viscous_loss": 0.0} | {name: value}
-    with pytest.raises(ValueError, match=f"`{name}` must be"):
+    with pytest.raises(ValueError, match=f"`{name}` must (not )?be"):
         ImpactLaw(r=values["r"], epsilon=values["epsilon"], viscous_loss=values["viscous_loss"])
     with pytest.raises(ValueError, match="`lead_nm` must be a finite number"):
         CollisionDelay(0.2, float("inf"), 0.7)

@@ -165,8 +165,8 @@ WRONG_VALUES = [
     ("cantilever", f"mass_ng = 1{'0' * 400}", "[cantilever] mass_ng: is too large a number"),
     ("cantilever", "quality_factor = 0.5", "[cantilever] `quality_factor` must be above 0.5, but is 0.5"),
     ("platform", "offset_nm = nan", "[platform] `offset_nm` must be a finite number, but is nan"),
-    ("interaction", "epsilon = -1", "[interaction] `epsilon` must be not negative, but is -1"),
-    ("interaction", "viscous_loss = -1e-9", "[interaction] `viscous_loss` must be not negative, but is -1e-09"),
+    ("interaction", "epsilon = -1", "[interaction] `epsilon` must not be negative, but is -1"),
+    ("interaction", "viscous_loss = -1e-9", "[interaction] `viscous_loss` must not be negative, but is -1e-09"),
     ("interaction", "delay = 3", "interaction.delay must be a table, [interaction.delay], but is a number"),
 ]
 
@@ -186,7 +186,7 @@ def test_a_wrong_line_is_named(written, table: str, line: str, expected: str):
         ("frequency_khz = 90", "frequency_khz = -90", "[cantilever] `frequency_khz` must be positive, but is -90"),
         ("frequency_khz = 90", "", "[cantilever] frequency_khz: missing; add it"),
         ("frequency_khz = 90", "frequency = 90", "[cantilever] frequency: the unit is missing; use frequency_khz"),
-        ("amplitude_nm = 4", "amplitude_nm = -4", "[platform] `amplitude_nm` must be not negative, but is -4"),
+        ("amplitude_nm = 4", "amplitude_nm = -4", "[platform] `amplitude_nm` must not be negative, but is -4"),
         (
             "frequency_khz = 181.8",
             "",
@@ -212,7 +212,7 @@ def test_a_wrong_line_is_named(written, table: str, line: str, expected: str):
         (
             "height_above_platform_nm = 5",
             "height_above_platform_nm = -5",
-            "[start] `height_above_platform_nm` must be not negative, but is -5",
+            "[start] `height_above_platform_nm` must not be negative, but is -5",
         ),
         ("velocity_nm_per_us = 80", "velocity_nm_per_us = nan", "[start] `velocity_nm_per_us` must be a finite number"),
         ("phase_deg = 270", "", "[start] phase_deg: missing; add it"),
