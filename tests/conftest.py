@@ -1,7 +1,9 @@
 """What all tests share: 64-bit floats, strict promotion, and annotations that are checked at run time."""
 
+import os
 from pathlib import Path
 
+import hypothesis
 import jax
 import pytest
 from jaxtyping import install_import_hook
@@ -14,6 +16,11 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 # Compilation is what a JAX test costs; a second run finds it done.
 jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parent.parent / ".pytest_cache" / "jax"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+
+# The same examples on every run: a failure is then a change of the code. HYPOTHESIS_PROFILE=random rolls new ones.
+hypothesis.settings.register_profile("repeatable", derandomize=True, database=None, print_blob=True)
+hypothesis.settings.register_profile("random", print_blob=True)
+hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
 
 SHARED_DATA = Path(__file__).parent.parent.parent / "shared" / "data"
 

@@ -1,24 +1,19 @@
-"""The fit as a whole: the bundled table, SciPy on the same residuals, bounds, identification, the contact table."""
+"""The fit as a whole: the bundled table, SciPy on the same residuals, other models, the contact table."""
 
-import dataclasses
-from pathlib import Path
-
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from scipy.stats import chi2
 
-import fitting.examples
 from fitting import fit, read_table
-from fitting.checks import check_minimum, covariance
 from fitting.examples.make_amplitudes import TRUTH, example_table
-from fitting.forward import linearise, measurement_of
+from fitting.forward import measurement_of
 from fitting.law_fit import problem_of
 from fitting.optimise import Objective
 from fitting.result import FitResult
 from fitting.table import AmplitudeTable
-
-EXAMPLE = Path(fitting.examples.__path__[0]) / "amplitudes_law.csv"
+from tests.fit_tables import EXAMPLE, amplitudes_and_errors, rows, values_of, with_amplitudes
+from tests.reference_systems import Parameters, single_impact_orbits
 
 
 @pytest.fixture(scope="module")
@@ -36,28 +31,38 @@ def objective(table) -> Objective:
     return Objective(measurement_of(table), problem_of(table, "law"))
 
 
-def rows(table: AmplitudeTable, keep: slice | np.ndarray, **changes) -> AmplitudeTable:
-    """Return some rows of a table, with changed values."""
-    columns = {
-        field.name: getattr(table, field.name)[keep]
-        for field in dataclasses.fields(table)
-        if isinstance(getattr(table, field.name), np.ndarray)
-    }
-    return dataclasses.replace(table, **(columns | changes))
-
-
-def values_of(result: FitResult) -> np.ndarray:
-    return np.array([parameter.value for parameter in result.parameters.values()])
-
-
 def test_the_bundled_table_is_what_its_script_makes(table):
     made = example_table()
-    assert made.rows == table.rows
     for name in ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm"):
         np.testing.assert_array_equal(getattr(made, name), getattr(table, name))
-    for name in ("peak_amplitude_nm", "lockin_amplitude_nm", "peak_amplitude_error_nm"):
-        # five digits are written: another processor's rounding may move the last one
-        np.testing.assert_allclose(getattr(made, name), getattr(table, name), rtol=2e-5)
+    for name in ("free_frequency_khz", "quality_factor", "quality_factor_error", "mass_ng", "remarks"):
+        assert getattr(made, name) == getattr(table, name)
+    for name in ("peak", "peak_error", "lockin", "lockin_error"):
+        column = f"{name.removesuffix('_error')}_amplitude{'_error' * name.endswith('_error')}_nm"
+        ours, stored = getattr(made, column), getattr(table, column)
+        # five digits are written: another processor's rounding may turn a last one over, here and there
+        last_digit = 10.0 ** (np.floor(np.log10(stored)) - 4.0)
+        assert np.all(np.abs(ours - stored) < 1.5 * last_digit)
+        assert np.mean(ours != stored) < 0.1
+
+
+def test_the_bundled_table_is_the_reference_with_one_per_cent_noise(table):
+    for row in (0, 30, 60):
+        truth = Parameters(
+            frequency_khz=90.0,
+            quality_factor=40.0,
+            drive_frequency_khz=float(table.drive_frequency_khz[row]),
+            amplitude_nm=float(table.drive_amplitude_nm[row]),
+            offset_nm=float(table.offset_nm[row]),
+            r=TRUTH["r"],
+            epsilon=TRUTH["epsilon"],
+        )
+        (orbit,) = [o for o in single_impact_orbits(truth, int(table.order[row])) if o.stable and o.admissible]
+        for kind in ("peak", "lockin"):
+            exact = getattr(orbit, f"{kind}_amplitude_nm")
+            error = getattr(table, f"{kind}_amplitude_error_nm")[row]
+            assert error == pytest.approx(0.01 * exact, rel=5.1e-5)  # written with five digits
+            assert abs(getattr(table, f"{kind}_amplitude_nm")[row] - exact) < 4.0 * error
 
 
 def test_the_truth_lies_in_the_intervals(law):
@@ -84,11 +89,9 @@ def test_scipy_finds_the_same_minimum(law, objective):
 
 
 def test_goodness_of_fit_follows_from_the_residuals(law, table):
-    from scipy.stats import chi2  # noqa: PLC0415
-
-    residual = (law.rows.predicted_nm - law.rows.measured_nm) / np.stack(
-        [table.peak_amplitude_error_nm, table.lockin_amplitude_error_nm], axis=1
-    )
+    amplitude, error = amplitudes_and_errors(table)
+    np.testing.assert_array_equal(law.rows.measured_nm, amplitude)
+    residual = (law.rows.predicted_nm - amplitude) / error
     np.testing.assert_allclose(law.rows.residual, residual, rtol=1e-12)
     pull = (law.parameters["quality_factor"].value - 40.0) / 0.4
     assert law.chi2 == pytest.approx(np.sum(residual**2) + pull**2, rel=1e-12)
@@ -112,22 +115,6 @@ def test_profile_interval_ends_are_where_scipy_finds_chi2_risen_by_3_84(law, obj
             assert 2.0 * scipy.cost - law.chi2 == pytest.approx(3.8415, rel=5e-3)
 
 
-def test_away_from_the_minimum_the_checks_say_so(law, objective):
-    problem = objective.problem
-    free = np.ones(3, dtype=bool)
-    at_minimum = check_minimum(objective, problem.coordinates(values_of(law)), free)
-    assert at_minimum.converged
-    # close to a parabola: the Hessian of chi2/2 is the Fisher matrix, 1 in its own units
-    np.testing.assert_allclose(at_minimum.hessian_eigenvalues, 1.0, atol=0.05)
-    errors = np.sqrt(np.diag(covariance(objective, values_of(law), free)))
-    moved = values_of(law) + 0.1 * errors * [1, 0, 0]
-    away = check_minimum(objective, problem.coordinates(moved), free)
-    assert not away.converged
-    # chi2 falls by this much on the way back; the estimate is exact for a parabola
-    above = np.sum(np.asarray(objective.at_values(moved[None]).residual) ** 2) - law.chi2
-    assert away.estimated_distance == pytest.approx(above, rel=0.02)
-
-
 def test_other_models_are_refused_by_their_chi2(table):
     for model in ("restitution", "viscous"):
         result = fit(table, model=model)
@@ -137,57 +124,18 @@ def test_other_models_are_refused_by_their_chi2(table):
         assert all(parameter.standard_error is None for parameter in result.parameters.values())
 
 
-def test_an_uncertain_quality_factor_widens_the_interval_of_r(table, law):
-    exact = fit(dataclasses.replace(table, quality_factor_error=None), model="law")
-    vague = fit(dataclasses.replace(table, quality_factor_error=2.0), model="law")
-    errors = [result.parameters["r"].standard_error or 0.0 for result in (exact, law, vague)]
-    assert 0.0 < errors[0] < 0.6 * errors[1] < 0.5 * errors[2]
-    assert any("taken as exact" in warning for warning in exact.warnings)
-
-
-def test_without_adhesion_epsilon_is_an_upper_limit(table):
-    """The same drives with epsilon = 0: the fit ends at the bound, or so close that the interval is open there."""
-    measurement = measurement_of(table)
-    problem = problem_of(table, "law")
-    truth = linearise(jnp.array([[0.95, 0.0, 40.0]]), measurement, problem).prediction.amplitude_nm[0]
-    clean = np.asarray(truth)[: table.rows]
-    bare = rows(
-        table,
-        slice(None),
-        peak_amplitude_nm=clean[:, 0],
-        lockin_amplitude_nm=clean[:, 1],
-        peak_amplitude_error_nm=0.01 * clean[:, 0],
-        lockin_amplitude_error_nm=0.01 * clean[:, 1],
-    )
-    result = fit(bare, model="law")
-    epsilon = result.parameters["epsilon"]
-    assert epsilon.at_bound
-    low, high = epsilon.interval95
-    assert low is None
-    assert high is not None
-    assert high > 0.0
-    assert result.parameters["r"].value == pytest.approx(0.95, abs=1e-6)
-
-
-def test_one_row_does_not_determine_two_parameters(table):
-    result = fit(rows(table, slice(0, 1)), model="law")
-    assert not result.valid
-    assert any("Not identified" in reason for reason in result.reasons)
-    assert result.parameters["r"].interval95 == (None, None)
-
-
 def test_scaled_errors_bring_chi2_to_its_degrees_of_freedom(table):
-    wide = rows(
-        table,
-        slice(None),
-        peak_amplitude_error_nm=3.0 * table.peak_amplitude_error_nm,
-        lockin_amplitude_error_nm=3.0 * table.lockin_amplitude_error_nm,
-    )
+    amplitude, error = amplitudes_and_errors(table)
+    wide = with_amplitudes(table, amplitude, 3.0 * error)
     narrow, scaled = fit(table, scale_errors=True), fit(wide, scale_errors=True)
     # whatever the errors' scale was, the result is the same
     np.testing.assert_allclose(values_of(scaled), values_of(narrow), rtol=1e-6)
     assert scaled.settings["error_scale"] == pytest.approx(narrow.settings["error_scale"] / 3.0, rel=1e-4)
+    pull = (values_of(scaled)[2] - 40.0) / 0.4
+    # three rounds; the constraint on Q, which is not scaled, moves the rest by less than this
+    assert scaled.chi2 - pull**2 == pytest.approx(2 * table.rows - 2, rel=1e-5)
     assert np.isnan(scaled.p_value)
+    assert any("errors were scaled by" in warning for warning in scaled.warnings)
 
 
 def test_a_fit_is_reproducible(table, law):
@@ -204,6 +152,11 @@ def test_the_law_without_delay_does_not_explain_contact_data(contact_table_path)
     assert "does not explain" in result.reasons[0]
 
 
-def test_unknown_models_and_empty_measurements_are_errors(table):
+def test_unknown_models_and_too_few_amplitudes_are_errors(table):
     with pytest.raises(ValueError, match="must be one of restitution, law, viscous, but is 'jkr'"):
         fit(table, model="jkr")
+    peak_alone = rows(table, slice(0, 1), lockin_amplitude_nm=None, lockin_amplitude_error_nm=None)
+    with pytest.raises(ValueError, match=r"1 measured amplitude\(s\) cannot determine the 2 parameters"):
+        fit(peak_alone, model="law")
+    with pytest.raises(ValueError, match="scaling the errors needs more amplitudes than parameters"):
+        fit(peak_alone, model="restitution", scale_errors=True)

@@ -2,19 +2,43 @@
 
 import csv
 import json
+import math
 from pathlib import Path
+from typing import Any
 
 import pytest
 from click.testing import CliRunner
 
-import fitting.examples
 from afm_jax.cli.main import main
-
-EXAMPLE = Path(fitting.examples.__path__[0]) / "amplitudes_law.csv"
+from tests.fit_tables import EXAMPLE
 
 
 def run(*arguments: object):
     return CliRunner().invoke(main, ["fit", *(str(argument) for argument in arguments)])
+
+
+def strictly(text: str) -> Any:
+    """Return the one JSON object of a text; NaN and Infinity, which JSON does not have, are refused."""
+
+    def refuse(constant: str):
+        raise AssertionError(constant)
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def records(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a CSV file, without its comments."""
+    with path.open(encoding="utf-8") as file:
+        return list(csv.DictReader(line for line in file if not line.startswith("#")))
+
+
+def shortened(path: Path, rows: int, *, without_errors: bool) -> Path:
+    """Write the first rows of the bundled table, with or without its columns of errors."""
+    comments = [line for line in EXAMPLE.read_text(encoding="utf-8").splitlines() if line.startswith("#")]
+    kept = [name for name in records(EXAMPLE)[0] if not (without_errors and "error" in name)]
+    cells = [",".join(row[name] for name in kept) for row in records(EXAMPLE)[:rows]]
+    path.write_text("\n".join([*comments, ",".join(kept), *cells]) + "\n", encoding="utf-8")
+    return path
 
 
 @pytest.fixture(scope="module")
@@ -26,7 +50,7 @@ def reported(tmp_path_factory):
 def test_json_holds_the_promised_keys_and_nothing_else_is_printed(reported):
     result, _ = reported
     assert result.exit_code == 0
-    answer = json.loads(result.stdout)
+    answer = strictly(result.stdout)
     assert answer["model"] == "law"
     assert answer["valid"] is True
     assert answer["degrees_of_freedom"] == 162
@@ -41,16 +65,40 @@ def test_json_holds_the_promised_keys_and_nothing_else_is_printed(reported):
 
 
 def test_report_is_written_and_holds_every_input(reported):
-    _, folder = reported
+    result, folder = reported
     assert {"fit.txt", "fit.json", "fit.png", "fit_rows.csv", "law.csv"} <= {path.name for path in folder.iterdir()}
-    kept = json.loads((folder / "fit.json").read_text(encoding="utf-8"))
-    with EXAMPLE.open(encoding="utf-8") as file:
-        given = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    result, folder = reported
+    kept = strictly((folder / "fit.json").read_text(encoding="utf-8"))
+    assert kept == strictly(result.stdout)
+    given = records(EXAMPLE)
     for column in given[0]:
         assert kept["input"][column] == [float(row[column]) for row in given]
-    with (folder / "fit_rows.csv").open(encoding="utf-8") as file:
-        assert len(list(csv.DictReader(file))) == len(given)
+    head = {"free_frequency_khz": 90.0, "quality_factor": 40.0, "quality_factor_error": 0.4, "mass_ng": 1.0}
+    assert head.items() <= kept["input"].items()
+    assert "seed 1997" in " ".join(kept["input"]["remarks"])
     assert (folder / "fit.png").read_bytes().startswith(b"\x89PNG")
+    assert "VALID" in (folder / "fit.txt").read_text(encoding="utf-8").splitlines()
+
+
+def test_tables_of_the_report_hold_the_fit(reported):
+    result, folder = reported
+    answer = strictly(result.stdout)
+    r, epsilon = (answer["parameters"][name]["value"] for name in ("r", "epsilon"))
+    for point in records(folder / "law.csv"):
+        speed, rebound, low, high = (float(number) for number in point.values())
+        assert rebound == pytest.approx(math.sqrt(r**2 * speed**2 - epsilon), rel=1e-12)
+        assert low < rebound < high
+    rows = records(folder / "fit_rows.csv")
+    pulls = []
+    for row, given in zip(rows, records(EXAMPLE), strict=True):
+        for kind in ("peak", "lockin"):
+            misfit = float(row[f"predicted_{kind}_amplitude_nm"]) - float(given[f"{kind}_amplitude_nm"])
+            assert float(row[f"{kind}_residual"]) == pytest.approx(
+                misfit / float(given[f"{kind}_amplitude_error_nm"]), rel=1e-9
+            )
+            pulls.append(float(row[f"{kind}_residual"]))
+    pulls.append((answer["parameters"]["quality_factor"]["value"] - 40.0) / 0.4)
+    assert answer["chi2"] == pytest.approx(sum(pull**2 for pull in pulls), rel=1e-12)
 
 
 def test_text_says_the_verdict_and_the_law():
@@ -64,11 +112,51 @@ def test_text_says_the_verdict_and_the_law():
 def test_contact_data_end_with_exit_code_3(contact_table_path):
     result = run(contact_table_path, "--model", "law", "--json")
     assert result.exit_code == 3
-    answer = json.loads(result.stdout)
+    answer = strictly(result.stdout)
     assert answer["valid"] is False
+    assert answer["p_value"] < 1e-100
     assert answer["chi2"] / answer["degrees_of_freedom"] > 100.0
     assert answer["parameters"]["r"]["interval95"] == [None, None]
     assert "does not explain" in result.stderr
+
+
+def test_a_table_that_does_not_identify_the_law_ends_with_exit_code_3(tmp_path):
+    result = run(shortened(tmp_path / "one.csv", 1, without_errors=False), "--json")
+    assert result.exit_code == 3
+    answer = strictly(result.stdout)
+    assert answer["valid"] is False
+    for name in ("r", "epsilon"):
+        assert answer["parameters"][name]["interval95"] == [None, None]
+        assert answer["parameters"][name]["interval_reason"]
+    (line,) = result.stderr.strip().splitlines()
+    assert "not valid: Not identified: the amplitudes do not determine r and epsilon" in line
+
+
+def test_errors_come_from_the_noise_option(tmp_path):
+    bare = shortened(tmp_path / "bare.csv", 30, without_errors=True)
+    refused = run(bare)
+    assert refused.exit_code == 2
+    assert "--noise" in refused.stderr
+    assert len(refused.stderr.strip().splitlines()) == 1
+    first, second = (strictly(run(bare, "--json", "--noise", share).stdout) for share in ("1%", "0.02"))
+    assert first["valid"] is True
+    assert first["input"]["peak_amplitude_error_nm"] == pytest.approx(
+        [0.01 * peak for peak in first["input"]["peak_amplitude_nm"]], rel=1e-12
+    )
+    # twice the errors: a quarter of chi2, but for the constraint on Q
+    assert second["chi2"] == pytest.approx(first["chi2"] / 4.0, rel=2e-2)
+    errors = [answer["parameters"]["epsilon"]["standard_error"] for answer in (first, second)]
+    assert errors[1] == pytest.approx(2.0 * errors[0], rel=5e-2)
+
+
+def test_scaled_errors_are_said(tmp_path):
+    wide = shortened(tmp_path / "bare.csv", 30, without_errors=True)
+    answer = strictly(run(wide, "--json", "--noise", "5%", "--scale-errors").stdout)
+    assert answer["valid"] is True
+    assert answer["p_value"] is None
+    # the bundled table's noise is 1 %
+    assert answer["settings"]["error_scale"] == pytest.approx(0.2, rel=0.3)
+    assert any("errors were scaled" in warning for warning in answer["warnings"])
 
 
 @pytest.mark.parametrize(

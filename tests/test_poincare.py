@@ -85,7 +85,13 @@ def test_energy_never_grows_at_an_impact(r, epsilon, viscous_loss, rebound, time
     kept = max(0.0, (r * approach) ** 2 - viscous_loss * approach - epsilon)
     assert leaving**2 <= approach**2 * (1.0 + 1e-12)
     assert leaving**2 == pytest.approx(kept, rel=1e-9, abs=1e-11 * (1.0 + approach**2))
-    assert (int(impact.outcome) == Outcome.CAPTURED) == (leaving == 0.0)
+    rounding = 1e-15 * (1.0 + abs(platform) + approach)
+    if impact.outcome == Outcome.CAPTURED:
+        # the tip moves with the platform; `leaving` is the difference of two velocities
+        assert abs(leaving) <= rounding
+        assert kept <= 1e-11 * (1.0 + approach**2)
+    else:
+        assert leaving > -rounding
 
 
 def test_limits_of_the_law_and_of_damping():

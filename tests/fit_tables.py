@@ -1,0 +1,92 @@
+"""Amplitude tables for the tests of the fit: the bundled one, parts of it, and tables of another law."""
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import fitting.examples
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene
+from afm_jax.impact.law import ImpactLaw
+from afm_jax.impact.orbits import single_impact_orbits
+from fitting.result import FitResult
+from fitting.table import AmplitudeTable
+
+EXAMPLE = Path(fitting.examples.__path__[0]) / "amplitudes_law.csv"
+NOISE = 0.01
+
+
+def rows(table: AmplitudeTable, keep: slice | np.ndarray, **changes: Any) -> AmplitudeTable:
+    """Return some rows of a table, with changed values."""
+    columns = {
+        field.name: getattr(table, field.name)[keep]
+        for field in dataclasses.fields(table)
+        if isinstance(getattr(table, field.name), np.ndarray)
+    }
+    return dataclasses.replace(table, **(columns | changes))
+
+
+def with_amplitudes(table: AmplitudeTable, amplitude: np.ndarray, error: np.ndarray, **changes: Any) -> AmplitudeTable:
+    """Return a table with other peak and lock-in amplitudes and their errors, both of shape (rows, 2)."""
+    return dataclasses.replace(
+        table,
+        peak_amplitude_nm=amplitude[:, 0],
+        lockin_amplitude_nm=amplitude[:, 1],
+        peak_amplitude_error_nm=error[:, 0],
+        lockin_amplitude_error_nm=error[:, 1],
+        **changes,
+    )
+
+
+def amplitudes_and_errors(table: AmplitudeTable) -> tuple[np.ndarray, np.ndarray]:
+    """Return peak and lock-in amplitude of a table that has both, and their errors, each of shape (rows, 2)."""
+    names = (("peak_amplitude_nm", "lockin_amplitude_nm"), ("peak_amplitude_error_nm", "lockin_amplitude_error_nm"))
+    amplitude, error = (np.stack([getattr(table, name) for name in pair], axis=1) for pair in names)
+    return amplitude, error
+
+
+def steady_amplitudes(table: AmplitudeTable, law: ImpactLaw, quality_factor: float = 40.0) -> np.ndarray:
+    """Return peak and lock-in amplitude (rows, 2) of each row's one steady orbit; NaN where there is none."""
+    drives = (table.order.astype(float), table.drive_frequency_khz, table.drive_amplitude_nm, table.offset_nm)
+    cantilever = Cantilever(table.free_frequency_khz, quality_factor)
+    steady, amplitude = (np.asarray(a) for a in _orbits(cantilever, law, *map(jnp.asarray, drives)))
+    assert np.all(steady.sum(axis=1) <= 1)
+    first = amplitude[np.arange(table.rows), np.argmax(steady, axis=1)]
+    return np.where(np.any(steady, axis=1, keepdims=True), first, np.nan)
+
+
+@jax.jit
+def _orbits(cantilever: Cantilever, law: ImpactLaw, *drives: jax.Array):
+    def one(order, frequency_khz, drive_nm, offset_nm):
+        orbits = single_impact_orbits(Scene(cantilever, Platform(drive_nm, frequency_khz, offset_nm), law), order)
+        amplitude = jnp.stack([orbits.peak_amplitude_nm, orbits.lockin_amplitude_nm], axis=-1)
+        return orbits.stable & orbits.admissible, amplitude
+
+    return jax.vmap(one)(*drives)
+
+
+def simulated(table: AmplitudeTable, law: ImpactLaw, *, seed: int | None) -> AmplitudeTable:
+    """Return the amplitudes of a law at a table's drives, with 1 % errors and as much noise (none without a seed).
+
+    Drives without a steady orbit are left out.
+    """
+    clean = steady_amplitudes(table, law)
+    kept = np.isfinite(clean[:, 0])
+    clean = clean[kept]
+    noise = 0.0 if seed is None else np.random.default_rng(seed).normal(size=clean.shape)
+    return with_amplitudes(rows(table, kept), clean * (1.0 + NOISE * noise), NOISE * clean)
+
+
+def values_of(result: FitResult) -> np.ndarray:
+    """Return the fitted values in the order of the parameters."""
+    return np.array([parameter.value for parameter in result.parameters.values()])
+
+
+def standard_errors_of(result: FitResult) -> np.ndarray:
+    """Return the standard errors in the order of the parameters; NaN where there is none."""
+    return np.array([parameter.standard_error or np.nan for parameter in result.parameters.values()])

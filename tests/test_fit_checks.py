@@ -1,0 +1,136 @@
+"""What is said of a minimum: curvature, distance, bounds, the share of Q in the errors, the band of the law."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.linalg import eigh
+from scipy.optimize import least_squares
+
+from fitting import fit, read_table
+from fitting.checks import check_minimum, covariance
+from fitting.forward import measurement_of
+from fitting.law_fit import problem_of
+from fitting.optimise import Objective
+from fitting.result import FitResult
+from fitting.table import AmplitudeTable
+from tests.fit_tables import EXAMPLE, standard_errors_of, values_of
+
+FREE = np.ones(3, dtype=bool)
+STEPS = np.array([1e-6, 1e-2, 1e-3])  # of r, epsilon and Q: hundredths of a standard error and less
+
+
+@pytest.fixture(scope="module")
+def table() -> AmplitudeTable:
+    return read_table(EXAMPLE)
+
+
+@pytest.fixture(scope="module")
+def law(table) -> FitResult:
+    return fit(table, model="law")
+
+
+@pytest.fixture(scope="module")
+def objective(table) -> Objective:
+    return Objective(measurement_of(table), problem_of(table, "law"))
+
+
+def differenced(objective: Objective, values: np.ndarray) -> np.ndarray:
+    """Return the Jacobian of the residuals by central differences, shape (n, 3)."""
+    ahead, behind = (objective.residual(values + sign * np.diag(STEPS)) for sign in (1.0, -1.0))
+    return ((ahead - behind) / (2.0 * STEPS[:, None])).T
+
+
+def differenced_hessian(objective: Objective, point: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Return the Hessian of chi2/2 by the optimiser's coordinates from values of chi2 alone."""
+
+    def chi2(shift):
+        return np.sum(objective.residual(objective.problem.values(point + shift)[None]) ** 2)
+
+    hessian = np.zeros((len(point), len(point)))
+    for i, along in enumerate(np.diag(steps)):
+        for j, beside in enumerate(np.diag(steps)):
+            even = chi2(along + beside) + chi2(-along - beside)
+            odd = chi2(along - beside) + chi2(beside - along)
+            hessian[i, j] = (even - odd) / (8.0 * steps[i] * steps[j])
+    return hessian
+
+
+@pytest.mark.parametrize("errors_away", [0.0, 20.0])
+def test_hessian_is_that_of_second_differences_of_chi2(law, objective, errors_away):
+    values = values_of(law) + errors_away * standard_errors_of(law) * [-1.0, 1.0, 0.0]
+    point = objective.problem.coordinates(values)
+    # r = 1 - y^2, epsilon = y^2, Q = exp y
+    slopes = np.array([-2.0 * point[0], 2.0 * point[1], values[2]])
+    jacobian = differenced(objective, values) * slopes
+    # a fiftieth of a standard error: chi2 changes by 1e-3, 1e8 times its rounding
+    hessian = differenced_hessian(objective, point, 0.02 * standard_errors_of(law) / np.abs(slopes))
+    expected = eigh(hessian, jacobian.T @ jacobian, eigvals_only=True)
+    # away from the minimum the residuals bend chi2: an eigenvalue of 1 throughout would not pass
+    assert errors_away == 0.0 or np.abs(expected - 1.0).max() > 0.02
+    found = check_minimum(objective, point, FREE).hessian_eigenvalues
+    np.testing.assert_allclose(found, expected, atol=2e-4)
+
+
+def test_away_from_the_minimum_the_checks_say_so(law, objective):
+    problem = objective.problem
+    assert check_minimum(objective, problem.coordinates(values_of(law)), FREE).converged
+    errors = np.sqrt(np.diag(covariance(objective, values_of(law), FREE)))
+    moved = values_of(law) + 0.1 * errors * [1, 0, 0]
+    away = check_minimum(objective, problem.coordinates(moved), FREE)
+    assert not away.converged
+    # chi2 falls by this much on the way back; the estimate is exact for a parabola
+    above = np.sum(objective.residual(moved[None]) ** 2) - law.chi2
+    assert away.estimated_distance == pytest.approx(above, rel=0.02)
+
+
+def test_a_bound_that_chi2_pushes_inward_from_is_no_minimum(objective):
+    """SciPy's minimum with epsilon held at 0, where the data ask for 60."""
+
+    def residual(others):
+        return objective.residual(np.array([[others[0], 0.0, others[1]]]))[0]
+
+    scipy = least_squares(residual, [0.94, 40.0], x_scale=[1e-3, 1.0], xtol=1e-12, ftol=1e-12)
+    at_zero = np.array([scipy.x[0], 0.0, scipy.x[1]])
+    step = at_zero + np.array([0.0, 0.1, 0.0])
+    assert np.sum(residual(scipy.x) ** 2) > np.sum(objective.residual(step[None]) ** 2)
+    held = check_minimum(objective, objective.problem.coordinates(at_zero), np.array([True, False, True]))
+    assert not held.outward
+    assert not held.converged
+    # nothing else is wrong there: the others are at their minimum
+    assert held.estimated_distance < 1e-4
+
+
+def test_errors_hold_the_share_of_an_uncertain_quality_factor(table, law, objective):
+    """The Fisher matrix in blocks: var(r) = exact + (what Q leaves to r)^2/(what all say of Q)."""
+    exact = fit(dataclasses.replace(table, quality_factor_error=None), model="law")
+    assert any("taken as exact" in warning for warning in exact.warnings)
+    jacobian = differenced(objective, values_of(law))[:-1]  # without the constraint
+    of_law, of_q = jacobian[:, :2], jacobian[:, 2]
+    inverse = np.linalg.inv(of_law.T @ of_law)
+    slope = inverse @ of_law.T @ of_q
+    left = of_q @ of_q - of_q @ of_law @ slope
+
+    def predicted(error_of_q):
+        return np.sqrt(np.diag(inverse) + slope**2 / (left + error_of_q**-2))
+
+    # at 40 exactly the slopes differ by the shift of Q, a tenth of its error
+    np.testing.assert_allclose(standard_errors_of(exact), np.sqrt(np.diag(inverse)), rtol=2e-2)
+    np.testing.assert_allclose(standard_errors_of(law)[:2], predicted(0.4), rtol=1e-4)  # numerical Jacobian
+    vague = fit(dataclasses.replace(table, quality_factor_error=2.0), model="law")
+    np.testing.assert_allclose(standard_errors_of(vague)[:2], predicted(2.0), rtol=5e-2)  # where Q ends differs
+    assert standard_errors_of(exact)[0] < 0.6 * standard_errors_of(law)[0]
+
+
+def test_the_law_and_its_band_are_those_of_the_squared_law(law):
+    (r, epsilon), errors = values_of(law)[:2], standard_errors_of(law)[:2]
+    speed, rebound = law.law.approach_speed_nm_per_us, law.law.rebound_speed_nm_per_us
+    np.testing.assert_allclose(rebound, np.sqrt(r**2 * speed**2 - epsilon), rtol=1e-12)
+    slope = np.stack([r * speed**2 / rebound, -0.5 / rebound])
+    matrix = law.correlations[:2, :2] * np.outer(errors, errors)
+    width = 1.959964 * np.sqrt(np.einsum("pn,pq,qn->n", slope, matrix, slope))
+    np.testing.assert_allclose(law.law.rebound_high_nm_per_us - rebound, width, rtol=1e-6)
+    np.testing.assert_allclose(rebound - law.law.rebound_low_nm_per_us, width, rtol=1e-6)
+    reached = law.rows.approach_speed_nm_per_us
+    assert speed[0] == pytest.approx(0.8 * reached.min())
+    assert speed[-1] == pytest.approx(1.2 * reached.max())

@@ -1,0 +1,218 @@
+"""Fits at the edges: closed forms, parameters at their bound, what amplitudes cannot tell, rows without an orbit."""
+
+import dataclasses
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import fitting.forward
+from afm_jax.impact.law import ImpactLaw
+from afm_jax.impact.orbit_state import SteadyOrbits
+from fitting import fit, read_table
+from fitting.forward import Rows, _branch, _orbit_problem, measurement_of
+from fitting.law_fit import problem_of
+from fitting.optimise import Objective
+from fitting.table import AmplitudeTable
+from tests.fit_tables import (
+    EXAMPLE,
+    amplitudes_and_errors,
+    rows,
+    simulated,
+    standard_errors_of,
+    values_of,
+    with_amplitudes,
+)
+
+
+@pytest.fixture(scope="module")
+def table() -> AmplitudeTable:
+    return read_table(EXAMPLE)
+
+
+def chi2_beside(table: AmplitudeTable, held: dict[str, float], start: dict[str, float]) -> float:
+    """Return SciPy's minimum of chi2 over the other parameters of the law."""
+    objective = Objective(measurement_of(table), problem_of(table, "law"))
+    names = objective.problem.names
+
+    def residual(others):
+        values = held | dict(zip(start, others, strict=True))
+        return objective.residual(np.array([[values[name] for name in names]]))[0]
+
+    found = least_squares(residual, list(start.values()), x_scale=[1e-2 * value for value in start.values()])
+    return 2.0 * found.cost
+
+
+def on_resonance(r: float) -> AmplitudeTable:
+    """Return amplitudes without air damping or adhesion, 1 % errors: V' = W (1 + r)/(1 - r), half a free period.
+
+    The tip is at rest height at the impact, so that W = omega sqrt(beta^2 - sigma^2); its half wave of height
+    V'/Omega has the component 4/(3 pi) at the response frequency 2 Omega.
+    """
+    order = np.array([1, 1, 2, 2, 3, 3])
+    beta, sigma = np.array([1.0, 3.0, 1.5, 4.0, 2.0, 5.0]), np.array([0.0, 1.0, -0.5, 2.0, 0.5, -1.0])
+    platform_speed = 2e-3 * np.pi * 180.0 * order * np.sqrt(beta**2 - sigma**2)
+    peak = platform_speed * (1.0 + r) / (1.0 - r) / (2e-3 * np.pi * 90.0)
+    both = peak[:, None] * [1.0, 4.0 / (3.0 * np.pi)]
+    drives = {"order": order, "drive_frequency_khz": 180.0 * order, "drive_amplitude_nm": beta, "offset_nm": sigma}
+    return AmplitudeTable(
+        **drives,
+        free_frequency_khz=90.0,
+        peak_amplitude_nm=both[:, 0],
+        peak_amplitude_error_nm=0.01 * both[:, 0],
+        lockin_amplitude_nm=both[:, 1],
+        lockin_amplitude_error_nm=0.01 * both[:, 1],
+    )
+
+
+@pytest.mark.parametrize("r", [0.5, 0.9, 0.99])
+def test_restitution_on_resonance_is_that_of_the_closed_form(r):
+    result = fit(on_resonance(r), model="restitution")
+    assert result.valid
+    assert result.parameters["r"].value == pytest.approx(r, rel=1e-10)
+    # d ln(amplitude)/dr = 2/(1 - r^2), for twelve amplitudes with 1 %
+    assert result.parameters["r"].standard_error == pytest.approx(0.01 * (1 - r**2) / 2 / np.sqrt(12), rel=1e-8)
+    low, high = result.parameters["r"].interval95
+    gain = (1 + r) / (1 - r)
+    for end, side in ((low, -1), (high, 1)):
+        # chi2 is 12 (g/g0 - 1)^2/0.01^2 for g = (1 + r)/(1 - r); the search stops within a thousandth of its rise
+        edge = gain * (1 + side * 0.01 * 1.959964 / np.sqrt(12))
+        assert end - r == pytest.approx((edge - 1) / (edge + 1) - r, rel=1e-3)
+    assert any("air damping is left out" in warning for warning in result.warnings)
+
+
+def test_without_adhesion_epsilon_is_an_upper_limit(table):
+    bare = simulated(table, ImpactLaw(0.95, 0.0), seed=None)
+    result = fit(bare, model="law")
+    epsilon = result.parameters["epsilon"]
+    assert result.valid
+    assert epsilon.at_bound
+    assert epsilon.standard_error is None
+    low, high = epsilon.interval95
+    assert low is None
+    assert high is not None
+    assert "reaches the end of its range, 0" in str(epsilon.interval_reason)
+    assert any("epsilon is at its bound" in warning for warning in result.warnings)
+    assert result.parameters["r"].value == pytest.approx(0.95, abs=1e-6)
+    rise = chi2_beside(bare, {"epsilon": high}, {"r": 0.95, "quality_factor": 40.0}) - result.chi2
+    assert rise == pytest.approx(3.8415, rel=5e-3)  # the search stops within a thousandth
+
+
+def test_without_restitution_loss_both_laws_end_at_their_bound(table):
+    """With r = 1 and with viscous_loss = 0 it is the same law, u_out^2 = u_in^2 - epsilon."""
+    elastic = simulated(table, ImpactLaw(1.0, 60.0), seed=3)
+    law, viscous = (fit(elastic, model=model) for model in ("law", "viscous"))
+    start = {"epsilon": 50.0, "quality_factor": 41.0}
+    expected = chi2_beside(elastic, {"r": 1.0}, start)
+    assert law.valid
+    assert law.parameters["r"].at_bound
+    assert law.chi2 == pytest.approx(expected, rel=1e-6)
+    assert viscous.chi2 <= expected * (1 + 1e-6)
+    low, high = law.parameters["r"].interval95
+    assert high is None
+    assert low is not None
+    assert low < 1.0
+    assert chi2_beside(elastic, {"r": low}, start) - law.chi2 == pytest.approx(3.8415, rel=5e-3)
+    for result in (law, viscous):
+        low, high = result.parameters["epsilon"].interval95
+        assert low is not None
+        assert low < 60.0 < (high or np.inf)
+
+
+def test_viscous_data_prefer_the_viscous_law(table):
+    viscous = simulated(table, ImpactLaw(1.0, 60.0, 2.0), seed=5)
+    right, wrong = (fit(viscous, model=model) for model in ("viscous", "law"))
+    assert right.valid
+    for name, truth in (("epsilon", 60.0), ("viscous_loss", 2.0), ("quality_factor", 40.0)):
+        low, high = right.parameters[name].interval95
+        assert low is not None
+        assert high is not None
+        assert low < truth < high
+    assert not wrong.valid
+    assert right.aic < wrong.aic - 100.0
+
+
+@pytest.mark.parametrize("keep", [slice(0, 1), slice(70, 71)])
+def test_one_row_does_not_determine_two_parameters(table, keep):
+    """Both amplitudes of a row follow from its impact phase alone, and that from one combination of r and epsilon."""
+    result = fit(rows(table, keep), model="law")
+    assert not result.valid
+    assert "Not identified: the amplitudes do not determine r and epsilon" in result.reasons[0]
+    for name in ("r", "epsilon"):
+        parameter = result.parameters[name]
+        assert parameter.undetermined
+        assert parameter.standard_error is None
+        assert parameter.interval95 == (None, None)
+
+
+def test_one_row_determines_one_parameter(table):
+    result = fit(rows(table, slice(5, 6)), model="restitution")
+    assert result.valid
+    assert standard_errors_of(result)[0] > 0.0
+
+
+def test_a_row_without_orbit_counts_its_whole_amplitude_and_is_named(table):
+    few = rows(table, slice(0, 30))
+    unreachable = {
+        "order": 1,
+        "drive_frequency_khz": 181.8,
+        "drive_amplitude_nm": 0.1,  # far too slow to leave the sample
+        "offset_nm": 0.0,
+        "peak_amplitude_nm": 5.0,
+        "peak_amplitude_error_nm": 2.0,
+        "lockin_amplitude_nm": np.nan,
+        "lockin_amplitude_error_nm": np.nan,
+        "lines": 99,
+    }
+    more = dataclasses.replace(few, **{name: np.append(getattr(few, name), x) for name, x in unreachable.items()})
+    without, result = fit(few, model="law"), fit(more, model="law")
+    assert without.valid
+    assert not result.valid
+    assert result.reasons == ["No stable orbit at the fitted law for line 99."]
+    assert np.isnan(result.rows.predicted_nm[-1]).all()
+    assert result.chi2 == pytest.approx(without.chi2 + (5.0 / 2.0) ** 2, rel=1e-9)
+    assert result.degrees_of_freedom == without.degrees_of_freedom + 1
+    # a penalty without slope moves nothing; both fits stop within 1e-5 errors of the minimum
+    assert np.all(np.abs(values_of(result) - values_of(without)) < 1e-4 * standard_errors_of(without))
+
+
+def test_blank_cells_weigh_as_much_as_infinite_errors(table):
+    few = rows(table, slice(0, 30))
+    amplitude, error = amplitudes_and_errors(few)
+    blank = np.zeros_like(amplitude, dtype=bool)
+    blank[::3, 0], blank[1::3, 1] = True, True
+    cells = with_amplitudes(few, np.where(blank, np.nan, amplitude), np.where(blank, np.nan, error))
+    result = fit(cells, model="law")
+    vague = fit(with_amplitudes(few, amplitude, np.where(blank, 1e9, error)), model="law")
+    assert np.all(np.abs(values_of(result) - values_of(vague)) < 1e-4 * standard_errors_of(vague))
+    np.testing.assert_allclose(standard_errors_of(result), standard_errors_of(vague), rtol=1e-6)
+    assert result.degrees_of_freedom == vague.degrees_of_freedom - 20
+    np.testing.assert_array_equal(np.isnan(result.rows.residual), blank)
+
+
+def test_the_order_of_the_rows_does_not_matter(table):
+    few = rows(table, slice(0, 30))
+    shuffled = rows(few, np.random.default_rng(7).permutation(30))
+    first, second = fit(few, model="law"), fit(shuffled, model="law")
+    assert second.chi2 == pytest.approx(first.chi2, rel=1e-9)
+    assert np.all(np.abs(values_of(second) - values_of(first)) < 1e-4 * standard_errors_of(first))
+
+
+@pytest.mark.parametrize(
+    ("measured", "slot"), [((100.0, 40.0), 0), ((61.0, 40.0), 2), ((np.nan, 26.0), 2), ((61.0, np.nan), 2)]
+)
+def test_of_coexisting_orbits_the_measured_one_is_taken(table, monkeypatch, measured, slot):
+    """Made-up orbits: without a delay no drive of 140,000 random ones had two stable ones."""
+    amplitude = jnp.array([[100.0, 40.0], [60.0, 26.0], [60.0, 25.0], [61.0, 40.0]])
+    steady = jnp.array([True, False, True, False])
+    made_up = SteadyOrbits(jnp.arange(4.0), steady, jnp.zeros(4, dtype=bool), amplitude)
+    monkeypatch.setattr(fitting.forward, "steady_orbits", lambda _: made_up)
+    error = np.where(np.isnan(measured), np.nan, 1.0)[None]
+    measurement = measurement_of(with_amplitudes(rows(table, slice(0, 1)), np.array([measured]), error))
+    row = Rows(*(column[0] for column in measurement.rows))
+    orbit = _orbit_problem(jnp.array([0.95, 60.0, 40.0]), row, measurement, problem_of(table, "law"))
+    branch = _branch(orbit, row)
+    assert int(branch.coordinate) == slot
+    assert int(branch.orbits) == 2
+    assert bool(branch.exists)
