@@ -35,3 +35,33 @@ _SENTENCES = {
     ),
     Outcome.NOT_REACHED: "An earlier impact of this sequence was the last one.",
 }
+
+
+class CollisionOutcome(enum.IntEnum):
+    """How the collision of a free tip with a contact ended."""
+
+    REBOUND = 0
+    TURNED_IN_BRIDGE = 1
+    CAPTURED_BY_BRIDGE = 2
+    CAPTURED_BY_JUNCTION = 3
+    NO_JUNCTION = 4
+    INVALID_START = 5
+    UNRESOLVED = 6
+
+    @property
+    def sentence(self) -> str:
+        """What happened, in words."""
+        return _COLLISION_SENTENCES[self]
+
+
+_COLLISION_SENTENCES = {
+    CollisionOutcome.REBOUND: "The tip formed the junction, broke it and left.",
+    CollisionOutcome.TURNED_IN_BRIDGE: "The bridge turned the tip round before the junction formed; it left.",
+    CollisionOutcome.CAPTURED_BY_BRIDGE: "The tip came too slowly to leave again: the liquid bridge holds it.",
+    CollisionOutcome.CAPTURED_BY_JUNCTION: "The tip came too slowly to leave again: the solid junction holds it.",
+    CollisionOutcome.NO_JUNCTION: "With these parameters no junction forms: force and stiffness are equal nowhere.",
+    CollisionOutcome.INVALID_START: "The approach speed is not a positive finite number.",
+    CollisionOutcome.UNRESOLVED: (
+        "The integration did not resolve this impact: its dissipation is too strong for the steps taken."
+    ),
+}

@@ -46,7 +46,8 @@ def check_parameter(name: str, value: ArrayLike | None, allowed: str) -> None:
     Args:
         name: what the message calls it, with its unit.
         value: the number or array; None (an absent effect) and traced values pass.
-        allowed: "finite", "positive", "not negative", "above 0.5" or "in (0, 1]".
+        allowed: "finite", "positive", "not negative", "above 0.5", "in (0, 1]" or
+            "between 0 and 1" (neither of the two).
 
     Raises:
         ValueError: if a value is not finite or not in the allowed range.
@@ -69,6 +70,7 @@ _RANGES = {
     "not negative": lambda number: number >= 0,
     "above 0.5": lambda number: number > 0.5,
     "in (0, 1]": lambda number: (number > 0) & (number <= 1),
+    "between 0 and 1": lambda number: (number > 0) & (number < 1),
 }
 
 

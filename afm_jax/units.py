@@ -18,3 +18,15 @@ import math
 
 RAD_PER_US_PER_KHZ = 2.0 * math.pi * 1e-3
 """Angular frequency in rad/us of a frequency of 1 kHz."""
+
+GAS_CONSTANT_J_PER_MOL_K = 8.31446261815324
+"""Molar gas constant in J/(mol K), exact in the SI."""
+
+NM_PER_CM3_PER_M2 = 1e3
+"""Length in nm of 1 cm^3 spread over 1 m^2."""
+
+NN_US_PER_NM2_PER_PA_S = 1e-3
+"""Viscosity of 1 Pa s in nN us/nm^2."""
+
+AJ_NM6_PER_J_M6 = 1e72
+"""Core constant of 1 J m^6 in aJ nm^6."""

@@ -1,0 +1,54 @@
+"""The forces between tip and sample, one formula a file; `Capillary() + Structural()` acts as their sum."""
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from afm_jax.contact.forces.capillary import Capillary
+    from afm_jax.contact.forces.core_repulsion import CoreRepulsion
+    from afm_jax.contact.forces.dmt import Dmt
+    from afm_jax.contact.forces.force import DissipativeForce, ForceSum, StaticForce
+    from afm_jax.contact.forces.hertz import Hertz
+    from afm_jax.contact.forces.jkr import Jkr
+    from afm_jax.contact.forces.liquid import Liquid
+    from afm_jax.contact.forces.structural import Structural
+    from afm_jax.contact.forces.van_der_waals import VanDerWaals
+    from afm_jax.contact.forces.viscous import Viscous
+else:
+    from afm_jax.lazy_names import import_name
+
+    _HOMES = {
+        "Capillary": "afm_jax.contact.forces.capillary",
+        "CoreRepulsion": "afm_jax.contact.forces.core_repulsion",
+        "DissipativeForce": "afm_jax.contact.forces.force",
+        "Dmt": "afm_jax.contact.forces.dmt",
+        "ForceSum": "afm_jax.contact.forces.force",
+        "Hertz": "afm_jax.contact.forces.hertz",
+        "Jkr": "afm_jax.contact.forces.jkr",
+        "Liquid": "afm_jax.contact.forces.liquid",
+        "StaticForce": "afm_jax.contact.forces.force",
+        "Structural": "afm_jax.contact.forces.structural",
+        "VanDerWaals": "afm_jax.contact.forces.van_der_waals",
+        "Viscous": "afm_jax.contact.forces.viscous",
+    }
+
+    def __getattr__(name):
+        return import_name(__name__, _HOMES, name)
+
+    def __dir__():
+        return sorted({*globals(), *__all__})
+
+
+__all__ = [
+    "Capillary",
+    "CoreRepulsion",
+    "DissipativeForce",
+    "Dmt",
+    "ForceSum",
+    "Hertz",
+    "Jkr",
+    "Liquid",
+    "StaticForce",
+    "Structural",
+    "VanDerWaals",
+    "Viscous",
+]

@@ -1,0 +1,138 @@
+"""The adhesive elastic contact of Johnson, Kendall and Roberts, in Maugis' normalised variables (eq. 15).
+
+With s = sqrt(A), the root of the normalised contact radius, load and depth are polynomials:
+P = s^6 - sqrt(6) s^3, Delta = s^4 - (2 sqrt(6)/3) s, in units of pi w R and of (pi^2 w^2 R / K^2)^(1/3). The contact
+breaks under displacement control at the fold s = 6^(-1/6), where dP/dDelta is infinite; s itself stays smooth there.
+"""
+
+import math
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from afm_jax.parameters import as_argument, as_parameter, check_parameter, readable
+
+SLOPE = 2.0 * math.sqrt(6.0) / 3.0
+"""The linear coefficient of the depth: Delta = s^4 - SLOPE s."""
+FOLD = 6.0 ** (-1.0 / 6.0)
+"""s at which the contact breaks when it is pulled: d Delta/ds = 0."""
+FOLD_DEPTH = -3.0 * 6.0 ** (-2.0 / 3.0)
+"""Delta at the fold."""
+
+
+def load(s: ArrayLike) -> Float[Array, "..."]:
+    """Return the normalised load s^6 - sqrt(6) s^3 (eq. 15)."""
+    cube = as_argument(s) ** 3
+    return cube * (cube - math.sqrt(6.0))
+
+
+def depth(s: ArrayLike) -> Float[Array, "..."]:
+    """Return the normalised depth s^4 - (2 sqrt(6)/3) s (eq. 15)."""
+    root = as_argument(s)
+    return root * (root**3 - SLOPE)
+
+
+def depth_slope(s: ArrayLike) -> Float[Array, "..."]:
+    """Return d Delta/ds = 4 s^3 - 2 sqrt(6)/3; 0 at the fold."""
+    return 4.0 * as_argument(s) ** 3 - SLOPE
+
+
+def work(s: ArrayLike) -> Float[Array, "..."]:
+    """Return the normalised potential, the integral of P dDelta from s = 0: (2/5) s^10 - (2 sqrt(6)/3) s^7 + s^4."""
+    root = as_argument(s)
+    cube = root**3
+    return root * cube * (cube * (0.4 * cube - SLOPE) + 1.0)
+
+
+def root_of_load(normalised_load: ArrayLike) -> Float[Array, "..."]:
+    """Return the s of the stable branch under load control, s^3 = (sqrt(6) + sqrt(6 + 4 P))/2, for P >= -3/2."""
+    return jnp.cbrt(cube_of_load(normalised_load))
+
+
+def cube_of_load(normalised_load: ArrayLike) -> Float[Array, "..."]:
+    """Return s^3 of the stable branch under load control; at the pull-off load where P is below -3/2."""
+    square = 6.0 + 4.0 * as_argument(normalised_load)
+    held = square > 0.0
+    return 0.5 * (math.sqrt(6.0) + jnp.where(held, jnp.sqrt(jnp.where(held, square, 1.0)), 0.0))
+
+
+def root_of_depth(normalised_depth: ArrayLike) -> Float[Array, "..."]:
+    """Return the s of the branch that is stable when pulled, for Delta >= -3 6^(-2/3).
+
+    The quartic s^4 - q s - Delta = 0 is split into two quadratics by the one positive root y of y^3 + Delta y = 1/3.
+    """
+    third = as_argument(normalised_depth) / 3.0
+    discriminant = 1.0 / 36.0 + third**3
+    above = discriminant > 0.0
+    large = jnp.cbrt(1.0 / 6.0 + jnp.where(above, jnp.sqrt(jnp.where(above, discriminant, 1.0)), 0.0))
+    # y = large - small with large * small = Delta/3 and large^3 - small^3 = 1/3, without the cancellation
+    small = third / large
+    y = 1.0 / (3.0 * (large**2 + third + small**2))
+    inner = SLOPE * jnp.sqrt(2.0 / y) - 2.0 * y
+    inside = inner > 0.0
+    return 0.5 * (jnp.sqrt(2.0 * y) + jnp.where(inside, jnp.sqrt(jnp.where(inside, inner, 1.0)), 0.0))
+
+
+class Jkr(eqx.Module):
+    """The JKR contact of a sphere and a plane, eq. 15.
+
+    Args:
+        adhesion_energy_j_per_m2: Dupre's adhesion energy w in J/m^2 = nN/nm.
+        modulus_gpa: reduced modulus K in GPa = nN/nm^2.
+        tip_radius_nm: R in nm.
+
+    Raises:
+        ValueError: if a value is not positive.
+    """
+
+    adhesion_energy_j_per_m2: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.3)
+    modulus_gpa: Float[Array, "..."] = eqx.field(converter=as_parameter, default=100.0)
+    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=100.0)
+
+    __repr__ = readable
+
+    def __check_init__(self):
+        check_parameter("adhesion_energy_j_per_m2", self.adhesion_energy_j_per_m2, "positive")
+        check_parameter("modulus_gpa", self.modulus_gpa, "positive")
+        check_parameter("tip_radius_nm", self.tip_radius_nm, "positive")
+
+    @property
+    def load_scale_nn(self) -> Float[Array, "..."]:
+        """The unit of the load, pi w R, in nN; the contact bears 3/2 of it in tension."""
+        return jnp.pi * self.adhesion_energy_j_per_m2 * self.tip_radius_nm
+
+    @property
+    def depth_scale_nm(self) -> Float[Array, "..."]:
+        """The unit of the depth, (pi^2 w^2 R / K^2)^(1/3), in nm."""
+        return jnp.cbrt(self.tip_radius_nm * (jnp.pi * self.adhesion_energy_j_per_m2 / self.modulus_gpa) ** 2)
+
+    @property
+    def energy_scale_aj(self) -> Float[Array, "..."]:
+        """The unit of the energy, load times depth, in aJ."""
+        return self.load_scale_nn * self.depth_scale_nm
+
+    @property
+    def pull_off_depth_nm(self) -> Float[Array, "..."]:
+        """The depth, negative, at which the contact breaks when it is pulled, in nm."""
+        return FOLD_DEPTH * self.depth_scale_nm
+
+    def force(self, depth_nm: ArrayLike) -> Float[Array, "..."]:
+        """Return the force on the tip in nN at a depth in nm, on the branch that is stable when pulled (eq. 15).
+
+        The depth counts into the sample; below `pull_off_depth_nm` there is no contact and the value at the fold is
+        returned.
+        """
+        return self.load_scale_nn * load(self._root(depth_nm))
+
+    def potential(self, depth_nm: ArrayLike) -> Float[Array, "..."]:
+        """Return the potential energy in aJ at a depth in nm, 0 where the contact radius would vanish."""
+        return self.energy_scale_aj * work(self._root(depth_nm))
+
+    def contact_radius_nm(self, depth_nm: ArrayLike) -> Float[Array, "..."]:
+        """Return the contact radius a in nm at a depth in nm."""
+        scale = jnp.cbrt(jnp.pi * self.adhesion_energy_j_per_m2 * self.tip_radius_nm**2 / self.modulus_gpa)
+        return scale * self._root(depth_nm) ** 2
+
+    def _root(self, depth_nm: ArrayLike) -> Float[Array, "..."]:
+        return root_of_depth(as_argument(depth_nm) / self.depth_scale_nm)

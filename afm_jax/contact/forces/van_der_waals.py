@@ -1,0 +1,35 @@
+"""The van der Waals attraction between a sphere and a plane, not retarded (Hamaker 1937)."""
+
+import equinox as eqx
+from jaxtyping import Array, ArrayLike, Float
+
+from afm_jax.contact.forces.force import StaticForce
+from afm_jax.parameters import as_argument, as_parameter, check_parameter
+
+
+class VanDerWaals(StaticForce):
+    """F = -H R / (6 D^2) for gaps small against the radius.
+
+    Args:
+        hamaker_constant_aj: H in aJ = 1e-18 J; 0.1 is typical in air, 0.01 across water.
+        tip_radius_nm: R in nm.
+
+    Raises:
+        ValueError: if the Hamaker constant is negative or the radius not positive.
+    """
+
+    hamaker_constant_aj: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.1)
+    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=100.0)
+
+    def __check_init__(self):
+        check_parameter("hamaker_constant_aj", self.hamaker_constant_aj, "not negative")
+        check_parameter("tip_radius_nm", self.tip_radius_nm, "positive")
+
+    def __call__(self, gap_nm: ArrayLike, gap_rate_nm_per_us: ArrayLike = 0.0) -> Float[Array, "..."]:
+        """Return the force in nN at a gap in nm; the rate does not matter."""
+        del gap_rate_nm_per_us
+        return -self.hamaker_constant_aj * self.tip_radius_nm / (6.0 * as_argument(gap_nm) ** 2)
+
+    def potential(self, gap_nm: ArrayLike) -> Float[Array, "..."]:
+        """Return -H R / (6 D) in aJ at a gap in nm; 0 far away."""
+        return -self.hamaker_constant_aj * self.tip_radius_nm / (6.0 * as_argument(gap_nm))

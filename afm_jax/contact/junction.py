@@ -1,0 +1,151 @@
+"""Where the solid junction forms and where it breaks: tangency of bridge and JKR curve, and the JKR fold.
+
+An approaching tip changes from the bridge's force curve to the JKR curve where force and stiffness of both are equal.
+The force of the bridge at a gap fixes the point of the JKR curve that bears it (closed form), so that the stiffness is
+one equation for the gap; the point found fixes where the JKR curve sits on the gap axis: depth = shift - gap.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.forces import jkr
+from afm_jax.contact.forces.force import ForceSum
+from afm_jax.impact.implicit import implicit_root
+
+SMALLEST_GAP_NM = 0.01
+"""The tangency is looked for between this gap and the one at which the bridge forms."""
+_POINTS = 48
+
+
+class Junction(NamedTuple):
+    """The junction of a contact, and the energies that its hysteresis takes; all arrays of the parameters' shape."""
+
+    exists: Bool[Array, "..."]
+    """Whether there is a tangency; without one the rest is meaningless."""
+    forms_gap_nm: Float[Array, "..."]
+    """D_on, the gap at which an approaching tip forms the junction."""
+    forms_root: Float[Array, "..."]
+    """sqrt(A) of the JKR contact that forms."""
+    shift_nm: Float[Array, "..."]
+    """Gap at which the JKR depth is 0: depth = shift - gap."""
+    breaks_gap_nm: Float[Array, "..."]
+    """D_off, the gap at which a leaving tip breaks the junction: the fold of the JKR curve."""
+    force_nn: Float[Array, "..."]
+    """Force at D_on in nN."""
+    stiffness_nn_per_nm: Float[Array, "..."]
+    """Stiffness -dF/dD at D_on in nN/nm."""
+    bridge_hysteresis_aj: Float[Array, "..."]
+    """Energy that stretching the bridge beyond the gap where it formed takes."""
+    junction_hysteresis_aj: Float[Array, "..."]
+    """Energy that the JKR contact takes beyond the bridge between D_on and D_off."""
+
+    @property
+    def hysteresis_aj(self) -> Float[Array, "..."]:
+        """Energy lost by hysteresis in one impact, in aJ."""
+        return self.bridge_hysteresis_aj + self.junction_hysteresis_aj
+
+
+def find_junction(contact: Contact) -> Junction:
+    """Return the junction of a contact; differentiable in every parameter, for one set of them.
+
+    Of several tangencies the one that an approaching tip meets with the bridge stiffening beyond the JKR contact is
+    taken, at the largest gap; the spurious ones near the JKR pull-off cross the other way.
+    """
+    forces, solid = contact.forces.static, contact.junction
+    found, exists = _tangency(lax.stop_gradient((forces, solid)), lax.stop_gradient(contact.bridge_forms_nm))
+    gap = jnp.exp(implicit_root(_excess_stiffness, found, (forces, solid)))
+    force = forces(gap)
+    root = jkr.root_of_load(force / solid.load_scale_nn)
+    shift = gap + solid.depth_scale_nm * jkr.depth(root)
+    breaks = shift - solid.pull_off_depth_nm
+    # where the junction outlives the bridge's range, the bridge counts as stretched as far as the junction holds
+    outer = jnp.maximum(breaks, contact.bridge_breaks_nm)
+    stretched = forces.potential(outer) - forces.potential(contact.bridge_forms_nm)
+    elastic = solid.energy_scale_aj * (jkr.work(jkr.FOLD) - jkr.work(root))
+    return Junction(
+        exists=exists & _meniscus_fits(contact),
+        forms_gap_nm=gap,
+        forms_root=root,
+        shift_nm=shift,
+        breaks_gap_nm=breaks,
+        force_nn=force,
+        stiffness_nn_per_nm=forces.stiffness(gap),
+        bridge_hysteresis_aj=stretched,
+        junction_hysteresis_aj=elastic - (forces.potential(breaks) - forces.potential(gap)),
+    )
+
+
+def _excess_stiffness(log_gap: Float[Array, "..."], model: tuple[ForceSum, jkr.Jkr]) -> Float[Array, "..."]:
+    """Return by how much the bridge is stiffer than the JKR contact that bears the same force, in nN/nm."""
+    forces, solid = model
+    gap = jnp.exp(log_gap)
+    cube = jkr.cube_of_load(forces(gap) / solid.load_scale_nn)
+    # dP/dDelta = (6 s^5 - 3 sqrt(6) s^2)/(4 s^3 - SLOPE)
+    elastic = jnp.cbrt(cube) ** 2 * (6.0 * cube - 3.0 * jnp.sqrt(6.0)) / (4.0 * cube - jkr.SLOPE)
+    return forces.stiffness(gap) - elastic * solid.load_scale_nn / solid.depth_scale_nm
+
+
+def _tangency(model: tuple[ForceSum, jkr.Jkr], forms_nm: Float[Array, ""]) -> tuple[Array, Array]:
+    """Return ln D_on and whether it exists: two nested scans for the sign change, then Newton's method."""
+    forces, solid = model
+
+    def scan(low, high):
+        points = low + (high - low) * jnp.linspace(0.0, 1.0, _POINTS, dtype=low.dtype)
+        gaps = jnp.exp(points)
+        borne = forces(gaps) > -1.5 * solid.load_scale_nn
+        excess = jnp.where(borne, _excess_stiffness(points, model), jnp.inf)
+        stiffer = excess > 0.0
+        crossing = stiffer[:-1] & ~stiffer[1:] & borne[:-1]
+        last = _POINTS - 2 - jnp.argmax(crossing[::-1])
+        # no crossing seen: it may hide where the excess is least among the gaps whose force the contact bears
+        least = jnp.argmin(jnp.where(forces.stiffness(gaps) > 0.0, excess, jnp.inf))
+        found = crossing.any()
+        left = jnp.where(found, last, jnp.maximum(least - 1, 0))
+        right = jnp.where(found, last + 1, jnp.minimum(least + 1, _POINTS - 1))
+        return points[left], points[right], found
+
+    low = jnp.log(jnp.full_like(forms_nm, SMALLEST_GAP_NM))
+    low, high, _ = scan(low, jnp.maximum(jnp.log(forms_nm), low))
+    low, high, found = scan(low, high)
+
+    def newton(_, point):
+        excess, slope = jax.jvp(lambda at: _excess_stiffness(at, model), (point,), (jnp.ones_like(point),))
+        return jnp.clip(point - excess / jnp.where(slope == 0.0, 1.0, slope), low, high)
+
+    return lax.fori_loop(0, 5, newton, 0.5 * (low + high)), found
+
+
+def _meniscus_fits(contact: Contact) -> Bool[Array, "..."]:
+    """Say whether the Kelvin radius stays below the tip's, where a force of the contact has a liquid."""
+    fits = contact.bridge_forms_nm > 0.0
+    for term in contact.forces.terms:
+        liquid = getattr(term, "liquid", None)
+        if liquid is not None:
+            fits = fits & (liquid.kelvin_radius_nm < getattr(term, "tip_radius_nm", jnp.inf))
+    return fits
+
+
+def explain_missing_junction(contact: Contact) -> str:
+    """Say in one line why a contact has no junction, and what would mend it."""
+    if not bool(_meniscus_fits(contact)):
+        return "the Kelvin radius exceeds the tip radius; lower `relative_humidity` or take a larger `tip_radius_nm`"
+    gaps = jnp.geomspace(SMALLEST_GAP_NM, contact.bridge_forms_nm, 400)
+    stiffness, force = contact.forces.static.stiffness(gaps), contact.forces.static(gaps)
+    tension = 1.5 * contact.junction.load_scale_nn
+    if not bool((stiffness[0] > 0) & (force[0] > 0)):
+        return "the bridge does not get stiffer than the JKR contact as the gap closes: it needs a core repulsion"
+    if bool(((force < -tension) & (stiffness > 0.0)).any()):
+        return (
+            f"the bridge pulls harder than the JKR contact bears in tension ({float(tension):.3g} nN); "
+            "a larger `adhesion_energy_j_per_m2` would bear it"
+        )
+    return (
+        f"force and stiffness of bridge and JKR contact are equal at no gap from {SMALLEST_GAP_NM} nm to "
+        f"{float(contact.bridge_forms_nm):.4g} nm, where the bridge forms; check the core constant, the modulus and "
+        "`bridge_forms_nm`"
+    )

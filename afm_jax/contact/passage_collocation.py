@@ -1,0 +1,44 @@
+"""A way through the bridge by collocation: Gauss nodes over the whole of it, the dissipation by Picard sweeps."""
+
+from functools import cache
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from afm_jax.contact.passage import Passage, Way
+
+
+def pass_by_collocation(way: Way, nodes: int, sweeps: int) -> Passage:
+    """Return the passage from the values at Gauss nodes, improved in sweeps; exact for sweeps = 0 without dissipation.
+
+    Args:
+        way: the way.
+        nodes: number of Gauss nodes.
+        sweeps: how often the dissipation is recomputed from the speeds that it leaves.
+    """
+    points, weights, cumulative = (jnp.asarray(part, way.length.dtype) for part in gauss_nodes(nodes))
+    length = way.length
+    y, gap = way.place(length * points)
+    available = way.available_aj(gap)
+    spent = jnp.zeros_like(available)
+    for _ in range(sweeps):
+        losses, _ = way.rates(y, gap, available - spent)
+        spent = length * (cumulative @ losses)
+    losses, times = way.rates(y, gap, available - spent)
+    return way.end(length * (weights @ losses), length * (weights @ times))
+
+
+@cache
+def gauss_nodes(count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return Gauss-Legendre nodes and weights on [0, 1], and the matrix that integrates from 0 to each node."""
+    roots, weights = np.polynomial.legendre.leggauss(count)
+    degrees = np.arange(count)
+    # integral of P_k from -1 to x is (P_(k+1) - P_(k-1))/(2k + 1)
+    values = np.polynomial.legendre.legvander(roots, count)
+    integrals = np.empty((count, count))
+    integrals[:, 0] = roots + 1.0
+    integrals[:, 1:] = (values[:, 2:] - values[:, :-2]) / (2.0 * degrees[1:] + 1.0)
+    # coefficients of the interpolant: c_k = (2k + 1)/2 sum_j w_j P_k(x_j) f_j, exact up to the highest degree
+    project = (degrees[:, None] + 0.5) * values[:, :-1].T * weights
+    return 0.5 * (roots + 1.0), 0.5 * weights, 0.5 * integrals @ project
