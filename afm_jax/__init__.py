@@ -9,12 +9,18 @@ if TYPE_CHECKING:
     from afm_jax.apparatus.cantilever import Cantilever
     from afm_jax.apparatus.platform import Platform
     from afm_jax.apparatus.scene import Scene
+    from afm_jax.contact.capture import capture_speed
+    from afm_jax.contact.collide import collide
+    from afm_jax.contact.collision import Collision
+    from afm_jax.contact.contact import Contact
+    from afm_jax.contact.junction import Junction, find_junction
+    from afm_jax.contact.phases import Phase
     from afm_jax.impact.batch import iterate_batch
     from afm_jax.impact.jacobian import map_jacobian
     from afm_jax.impact.law import CollisionDelay, ImpactLaw
     from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
     from afm_jax.impact.poincare import NextImpact, iterate_map, next_impact
-    from afm_jax.outcome import Outcome
+    from afm_jax.outcome import CollisionOutcome, Outcome
     from afm_jax.scenefile import SceneError, load_scene, save_scene
 
     __version__: str
@@ -23,15 +29,23 @@ else:
 
     _HOMES = {
         "Cantilever": "afm_jax.apparatus.cantilever",
+        "Collision": "afm_jax.contact.collision",
         "CollisionDelay": "afm_jax.impact.law",
+        "CollisionOutcome": "afm_jax.outcome",
+        "Contact": "afm_jax.contact.contact",
         "ImpactLaw": "afm_jax.impact.law",
+        "Junction": "afm_jax.contact.junction",
         "NextImpact": "afm_jax.impact.poincare",
         "Outcome": "afm_jax.outcome",
+        "Phase": "afm_jax.contact.phases",
         "Platform": "afm_jax.apparatus.platform",
         "Scene": "afm_jax.apparatus.scene",
         "SceneError": "afm_jax.scenefile",
         "SingleImpactOrbits": "afm_jax.impact.orbits",
         "__version__": "afm_jax.version",
+        "capture_speed": "afm_jax.contact.capture",
+        "collide": "afm_jax.contact.collide",
+        "find_junction": "afm_jax.contact.junction",
         "iterate_batch": "afm_jax.impact.batch",
         "iterate_map": "afm_jax.impact.poincare",
         "load_scene": "afm_jax.scenefile",
@@ -50,15 +64,23 @@ else:
 
 __all__ = [
     "Cantilever",
+    "Collision",
     "CollisionDelay",
+    "CollisionOutcome",
+    "Contact",
     "ImpactLaw",
+    "Junction",
     "NextImpact",
     "Outcome",
+    "Phase",
     "Platform",
     "Scene",
     "SceneError",
     "SingleImpactOrbits",
     "__version__",
+    "capture_speed",
+    "collide",
+    "find_junction",
     "iterate_batch",
     "iterate_map",
     "load_scene",

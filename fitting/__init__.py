@@ -6,7 +6,10 @@ Names are imported when they are first used: `import fitting` is cheap and does 
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from fitting.calibration import calibrate
+    from fitting.calibration_result import Calibration
     from fitting.law_fit import fit
+    from fitting.resonance_sweep import ResonanceSweep, read_sweep
     from fitting.result import FitResult
     from fitting.table import AmplitudeTable, TableError, read_table, write_table
 else:
@@ -14,9 +17,13 @@ else:
 
     _HOMES = {
         "AmplitudeTable": "fitting.table",
+        "Calibration": "fitting.calibration_result",
         "FitResult": "fitting.result",
+        "ResonanceSweep": "fitting.resonance_sweep",
         "TableError": "fitting.table",
+        "calibrate": "fitting.calibration",
         "fit": "fitting.law_fit",
+        "read_sweep": "fitting.resonance_sweep",
         "read_table": "fitting.table",
         "write_table": "fitting.table",
     }
@@ -28,4 +35,15 @@ else:
         return sorted({*globals(), *__all__})
 
 
-__all__ = ["AmplitudeTable", "FitResult", "TableError", "fit", "read_table", "write_table"]
+__all__ = [
+    "AmplitudeTable",
+    "Calibration",
+    "FitResult",
+    "ResonanceSweep",
+    "TableError",
+    "calibrate",
+    "fit",
+    "read_sweep",
+    "read_table",
+    "write_table",
+]

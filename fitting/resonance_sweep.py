@@ -11,7 +11,7 @@ unit); ``phase_deg``, ``amplitude_error_nm`` (or ``amplitude_error``) and ``phas
 form is recognised by its line ``[DATA]``.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,7 @@ from fitting.sweep_nanonis import MARK, parse_nanonis
 from fitting.table_faults import Faults, TableError
 from fitting.table_file import read_text
 
-__all__ = ["ResonanceSweep", "TableError", "read_sweep"]
+__all__ = ["ResonanceSweep", "TableError", "read_sweep", "without_phase"]
 
 _COLUMNS = ("frequency_khz", "amplitude", "phase_deg", "amplitude_error", "phase_error_deg")
 _POSITIVE = ("frequency_khz", "amplitude_error", "phase_error_deg")
@@ -147,3 +147,8 @@ def read_sweep(path: str | Path) -> ResonanceSweep:
         lines=parsed.lines,
         remarks=parsed.remarks,
     )
+
+
+def without_phase(sweep: ResonanceSweep) -> ResonanceSweep:
+    """Return a sweep without its phase, to be fitted by the amplitude alone."""
+    return replace(sweep, phase_deg=None, phase_error_deg=None)

@@ -13,6 +13,7 @@ from afm_jax.cli.failures import exit_code_of
 COMMANDS = {
     "accuracy": ("afm_jax.cli.accuracy", "Show error against time, and the cheapest setting for a wanted accuracy."),
     "bench": ("afm_jax.cli.bench", "Measure impacts per second, next to SciPy."),
+    "calibrate": ("afm_jax.cli.calibrate", "Fit frequency and quality factor to a free resonance sweep."),
     "figures": ("afm_jax.cli.figures", "Draw the paper's figures 2, 3 and 9, with their statements checked."),
     "fit": ("afm_jax.cli.fit", "Fit the impact law to a table of vibration amplitudes."),
     "orbits": ("afm_jax.cli.orbits", "Find all single-impact orbits of a scene, and whether they are stable."),

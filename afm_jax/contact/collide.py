@@ -1,18 +1,20 @@
 """Batches of collisions: many speeds, or many contacts, in blocks of flat memory."""
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from afm_jax.contact.accuracy_settings import CAREFUL, Setting, setting_of
-from afm_jax.contact.collision import Collision, collision_of, go_through
+from afm_jax.contact.collision import Collision, collision_of, collision_of_turn, go_through
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import Junction, explain_missing_junction, find_junction
-from afm_jax.contact.turned import turn_in_bridge
+from afm_jax.contact.turned import Turn, turn_in_bridge
 from afm_jax.outcome import CollisionOutcome
 from afm_jax.parameters import as_parameter, check_parameter, is_traced
 
@@ -61,9 +63,12 @@ def collide(
             raise ValueError(
                 f"parameters must be numbers or have the speeds' shape {speeds.shape}, but one has {leaf.shape}"
             )
-    result = _collide(contact, speeds, mass, setting)
+    # one axis of tips inside, the speeds' own shape outside
+    contact, mass = jax.tree.map(lambda leaf: leaf.ravel() if leaf.ndim else leaf, (contact, mass))
+    quick, resolved = _quick(contact, mass, speeds.ravel(), setting)
+    result = _resolve(contact, mass, speeds.ravel(), quick, resolved)
     _complain(contact, result)
-    return result
+    return jax.tree.map(lambda part: part.reshape(speeds.shape), result)
 
 
 def _complain(contact: Contact, result: Collision) -> None:
@@ -75,87 +80,110 @@ def _complain(contact: Contact, result: Collision) -> None:
 
 
 @partial(jax.jit, static_argnames="setting")
-def _collide(contact: Contact, speeds: Float[Array, "..."], mass: Float[Array, "..."], setting: Setting) -> Collision:
-    leaves, structure = jax.tree.flatten((contact, mass))
-    varied = [leaf.ndim > 0 for leaf in leaves]
-    contact_varies = any(varied[:-1])
-    junction = None if contact_varies else find_junction(contact)
-
-    def block(values: tuple[Array, ...]) -> Collision:
-        speed, *own = values
-        rest = iter(own)
-        lanes = [next(rest) if varies else leaf for varies, leaf in zip(varied, leaves, strict=True)]
-        return _collide_block(*jax.tree.unflatten(structure, lanes), junction, speed, setting)
-
-    columns = [speeds.ravel(), *(leaf.ravel() for leaf, varies in zip(leaves, varied, strict=True) if varies)]
-    size = columns[0].shape[0]
-    if size <= BLOCK:
-        result = block(tuple(columns))
-        return jax.tree.map(lambda part: part.reshape(speeds.shape), result)
-    rows = -(-size // BLOCK)
-    # the last block is filled up with the last tip
-    filled = [jnp.concatenate([column, jnp.broadcast_to(column[-1:], (rows * BLOCK - size,))]) for column in columns]
-    result = lax.map(block, tuple(column.reshape(rows, BLOCK) for column in filled))
-    return jax.tree.map(lambda part: part.reshape(rows * BLOCK)[:size].reshape(speeds.shape), result)
-
-
-def _collide_block(contact, mass, junction: Junction | None, speeds: Array, setting: Setting) -> Collision:
-    """Return the collisions of one block; those that few steps do not resolve are computed again with many."""
-    axes = jax.tree.map(lambda leaf: 0 if leaf.ndim else None, (contact, mass))
-    lanes_differ = any(leaf.ndim for leaf in jax.tree.leaves(contact))
+def _quick(
+    contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."], setting: Setting
+) -> tuple[Collision, Bool[Array, "..."]]:
+    """Return the collisions of a batch in few steps, and which of them these resolve."""
+    leaves = jax.tree.leaves(contact)
+    shared = None if any(leaf.ndim for leaf in leaves) else find_junction(contact)
 
     def one(contact, mass, speed):
-        place = find_junction(contact) if junction is None else junction
+        place = _junctions(contact) if shared is None else shared
         valid = (speed > 0.0) & jnp.isfinite(speed)
         safe = jnp.where(valid, speed, 1.0)
         ways = go_through(contact, place, safe, mass, setting)
-        return place, safe, collision_of(contact, place, safe, mass, ways), ways.resolved, valid
+        found = collision_of(contact, place, safe, mass, ways)
+        return _judged(found, speed, place.exists, valid), ways.resolved | ~valid | ~place.exists
 
-    place, safe, quick, resolved, valid = jax.vmap(
-        one, in_axes=(*axes, 0), out_axes=(0 if lanes_differ else None, 0, 0, 0, 0)
-    )(contact, mass, speeds)
+    return _in_blocks(one, contact, mass, speeds)
 
-    def careful():
-        return jax.vmap(_careful, in_axes=(axes[0], 0 if lanes_differ else None, axes[1], 0))(
-            contact, place, mass, safe
-        )
 
-    checked = lax.cond(jnp.all(resolved | ~valid), lambda: (quick, resolved), careful)
-    result = jax.tree.map(lambda fast, slow: jnp.where(resolved, fast, slow), quick, checked[0])
-    trusted = resolved | checked[1]
-    exists = place.exists
-    outcome = jnp.where(trusted, result.outcome, CollisionOutcome.UNRESOLVED)
+@jax.jit
+def _careful(contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."]) -> Collision:
+    """Return the collisions of a batch in many steps, turning points in the bridge included."""
+
+    def one(contact, mass, speed):
+        place = _junctions(contact)
+        valid = (speed > 0.0) & jnp.isfinite(speed)
+        safe = jnp.where(valid, speed, 1.0)
+        ways = go_through(contact, place, safe, mass, CAREFUL)
+        turn = _turns(contact, place, mass, safe, ways.inward.dissipated_aj)
+        through = collision_of(contact, place, safe, mass, ways)
+        turned = collision_of_turn(contact, place, safe, mass, turn)
+        turns = turn.turns & (ways.inward.energy_aj <= 0.0)
+        found = jax.tree.map(lambda a, b: jnp.where(turns, a, b), turned, through)
+        finite = jnp.isfinite(found.end_energy_aj) & jnp.isfinite(found.viscous_loss_aj) & (turn.settled | ~turns)
+        return _judged(found, speed, place.exists, valid, finite), finite
+
+    return _in_blocks(one, contact, mass, speeds)[0]
+
+
+def _axes(tree: Any) -> Any:
+    """Return the axes of `vmap` for parameters that are numbers or have one value a tip."""
+    return jax.tree.map(lambda leaf: 0 if leaf.ndim else None, tree)
+
+
+def _junctions(contact: Contact) -> Junction:
+    """Return the junction of a contact, or of each of many."""
+    if not any(leaf.ndim for leaf in jax.tree.leaves(contact)):
+        return find_junction(contact)
+    return jax.vmap(find_junction, in_axes=(_axes(contact),))(contact)
+
+
+def _turns(contact: Contact, place: Junction, mass: Array, speeds: Array, spent: Array) -> Turn:
+    return jax.vmap(turn_in_bridge, in_axes=(_axes(contact), _axes(place), 0, _axes(mass), 0))(
+        contact, place, speeds, mass, spent
+    )
+
+
+def _judged(found: Collision, speed, exists, valid, finite=True) -> Collision:  # noqa: FBT002
+    """Return a collision with its outcome, and with zeros where there is none."""
+    outcome = jnp.where(finite, found.outcome, CollisionOutcome.UNRESOLVED)
     outcome = jnp.where(exists, outcome, CollisionOutcome.NO_JUNCTION)
     outcome = jnp.where(valid, outcome, CollisionOutcome.INVALID_START).astype(jnp.int32)
     good = outcome <= CollisionOutcome.CAPTURED_BY_JUNCTION
-    cleared = jax.tree.map(lambda part: jnp.where(good, part, jnp.zeros_like(part)), result)
-    return cleared._replace(approach_speed_nm_per_us=speeds, outcome=outcome)
+    cleared = jax.tree.map(lambda part: jnp.where(good, part, jnp.zeros_like(part)), found)
+    return cleared._replace(approach_speed_nm_per_us=speed, outcome=outcome)
 
 
-def _careful(contact, place: Junction, mass, speed):
-    """Return one collision in many steps, and whether these resolve it."""
-    ways = go_through(contact, place, speed, mass, CAREFUL)
-    through = collision_of(contact, place, speed, mass, ways)
-    turn = turn_in_bridge(contact, place, speed, mass, ways.inward.dissipated_aj)
-    leaves = turn.energy_aj > 0.0
-    rebound = jnp.where(leaves, jnp.sqrt(2.0 * jnp.where(leaves, turn.energy_aj, 1.0) / mass), 0.0)
-    outside = contact.bridge_forms_nm / speed + contact.bridge_breaks_nm / jnp.where(leaves, rebound, 1.0)
-    turned = through._replace(
-        rebound_speed_nm_per_us=rebound,
-        collision_delay_us=jnp.where(leaves, turn.time_us - outside, 0.0),
-        captured=~leaves,
-        outcome=jnp.where(leaves, CollisionOutcome.TURNED_IN_BRIDGE, CollisionOutcome.CAPTURED_BY_BRIDGE).astype(
-            jnp.int32
-        ),
-        time_in_contact_us=jnp.where(leaves, turn.time_us, 0.0),
-        time_in_junction_us=jnp.zeros_like(rebound),
-        deepest_gap_nm=turn.gap_nm,
-        junction_hysteresis_aj=jnp.zeros_like(rebound),
-        viscous_loss_aj=turn.dissipated_aj,
-        end_energy_aj=turn.energy_aj,
-    )
-    result = jax.tree.map(lambda a, b: jnp.where(turn.turns, a, b), turned, through)
-    start = 0.5 * mass * speed**2
-    # dissipation cannot exceed what there was: the start's energy and what the bridge's pull adds
-    sane = jnp.isfinite(result.end_energy_aj) & jnp.isfinite(result.viscous_loss_aj) & jnp.isfinite(start)
-    return result, sane
+def _in_blocks(one: Callable, contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."]) -> Any:
+    """Map a collision over a batch, in blocks that stay in the processor's cache: memory does not grow with it."""
+    leaves, structure = jax.tree.flatten((contact, mass))
+    varied = [leaf.ndim > 0 for leaf in leaves]
+
+    def block(columns: list[Array]) -> Any:
+        speed, *own = columns
+        rest = iter(own)
+        lanes = [next(rest) if varies else leaf for varies, leaf in zip(varied, leaves, strict=True)]
+        return one(*jax.tree.unflatten(structure, lanes), speed)
+
+    columns = [speeds, *(leaf for leaf, varies in zip(leaves, varied, strict=True) if varies)]
+    size = speeds.shape[0]
+    if size <= BLOCK:
+        return block(columns)
+    rows = -(-size // BLOCK)
+    # the last block is filled up with the last tip
+    filled = [jnp.concatenate([column, jnp.broadcast_to(column[-1:], (rows * BLOCK - size,))]) for column in columns]
+    result = lax.map(block, [column.reshape(rows, BLOCK) for column in filled])
+    return jax.tree.map(lambda part: part.reshape(rows * BLOCK)[:size], result)
+
+
+def _resolve(
+    contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."], quick: Collision, resolved: Array
+) -> Collision:
+    """Return the quick collisions, with those that few steps do not resolve computed again in many.
+
+    Where the numbers can be looked at, only those tips are computed again; inside `jit` all are, if any needs it.
+    """
+    if is_traced(resolved):
+        again = lax.cond(jnp.all(resolved), lambda: quick, lambda: _careful(contact, mass, speeds))
+        return jax.tree.map(lambda fast, slow: jnp.where(resolved, fast, slow), quick, again)
+    open_tips = np.flatnonzero(~np.asarray(resolved))
+    if not open_tips.size:
+        return quick
+    # sizes are rounded up to powers of two, so that few programs serve all batches
+    chosen = np.resize(open_tips, 1 << int(np.ceil(np.log2(open_tips.size))))
+    own_contact, own_mass = jax.tree.map(lambda leaf: leaf[chosen] if leaf.ndim else leaf, (contact, mass))
+    slow = _careful(own_contact, own_mass, speeds[chosen])
+    count = open_tips.size
+    return jax.tree.map(lambda fast, careful: fast.at[open_tips].set(careful[:count]), quick, slow)

@@ -2,19 +2,20 @@
 
 from typing import NamedTuple
 
+import diffrax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.contact.accuracy_settings import Setting
+from afm_jax.contact.bridge import bridge_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import Junction
 from afm_jax.contact.junction_way import JunctionWay, pass_through_junction
-from afm_jax.contact.passage import Passage, Way, margin_of
+from afm_jax.contact.passage import Passage, Way, margin_of, way_through
 from afm_jax.contact.passage_collocation import pass_by_collocation
 from afm_jax.contact.passage_steps import pass_in_steps
+from afm_jax.contact.turned import Turn
 from afm_jax.outcome import CollisionOutcome
-
-_QUADRATURE_NODES = 14
 
 
 class Collision(NamedTuple):
@@ -55,65 +56,54 @@ class Ways(NamedTuple):
 
 
 def go_through(
-    contact: Contact, junction: Junction, approach_speed: Float[Array, ""], mass: Float[Array, ""], setting: Setting
+    contact: Contact,
+    junction: Junction,
+    approach_speed: Float[Array, "..."],
+    mass: Float[Array, "..."],
+    setting: Setting,
 ) -> Ways:
     """Return the three parts of one collision, each from the energy that the one before leaves."""
-    forces = contact.forces
+    bridge, forces = bridge_of(contact), contact.forces.static
+    forms, breaks = contact.bridge_forms_nm, junction.breaks_gap_nm
+    outer = jnp.maximum(contact.bridge_breaks_nm, breaks)
+    pull_in, pull_out = (-forces(gap) * gap for gap in (forms, outer))
+
     start = 0.5 * mass * approach_speed * approach_speed
-    forms, gap = contact.bridge_forms_nm, junction.forms_gap_nm
-    way_in = Way(forces, mass, forms, gap, start, margin_of(start, forces, forms), inward=True)
-    inward = _pass(way_in, setting, setting.inward)
+    gaps = (forms, junction.forms_gap_nm)
+    inward = _pass(way_through(bridge, mass, gaps, start, margin_of(start, pull_in), inward=True), setting)
     solid = pass_through_junction(contact.junction, junction, inward.energy_aj, mass, setting.junction_nodes)
-    outer = jnp.maximum(contact.bridge_breaks_nm, junction.breaks_gap_nm)
-    way_out = Way(
-        forces, mass, outer, junction.breaks_gap_nm, solid.energy_aj, jnp.full_like(start, 1e-3), inward=False
-    )
+
+    def way_out(margin: Float[Array, "..."]) -> Way:
+        return way_through(bridge, mass, (outer, breaks), solid.energy_aj, margin, inward=False)
+
     # a short first pass tells how fast the tip is at the end, and so which variable takes the square root out
-    if forces.dissipative.terms:
-        end = pass_by_collocation(way_out, 8, 2).energy_aj
-    else:
-        end = way_out.available_aj(outer)
-    way_out = Way(
-        forces, mass, outer, junction.breaks_gap_nm, solid.energy_aj, margin_of(end, forces, outer), inward=False
+    sweeps = 0 if bridge.conserves else 1
+    end = pass_by_collocation(way_out(jnp.full_like(start, 1e-3)), 6, sweeps).energy_aj
+    outward = _pass(way_out(margin_of(end, pull_out)), setting)
+
+    drag_in, drag_out = (
+        bridge.damping(gap) * gap * jnp.sqrt(2.0 * jnp.maximum(pull, 0.0) / mass)
+        for gap, pull in ((forms, pull_in), (outer, pull_out))
     )
-    outward = _pass(way_out, setting, setting.outward)
-    return Ways(inward, solid, outward, outer, _resolved(way_in, inward, way_out, outward))
+    # Few steps are enough where dissipation is small against the energies along the way, where a slow tip's drag is
+    # small against the pull at the outer end, and where no repulsion almost stops the tip inside the bridge.
+    reach = jnp.minimum(start + jnp.maximum(pull_in, 0.0), inward.energy_aj)
+    easy_in = (inward.dissipated_aj < 0.2 * reach) & (inward.energy_aj > 0.1 * start) & (drag_in <= 0.1 * pull_in)
+    easy_out = (outward.dissipated_aj < 0.2 * solid.energy_aj) & (drag_out <= 0.1 * pull_out)
+    return Ways(inward, solid, outward, outer, easy_in & (easy_out | (solid.energy_aj <= 0.0)))
 
 
-def _pass(way: Way, setting: Setting, size: int) -> Passage:
-    if not way.forces.dissipative.terms:
-        return pass_by_collocation(way, max(size, _QUADRATURE_NODES), 0)
+def _pass(way: Way, setting: Setting) -> Passage:
+    size = setting.inward if way.inward else setting.outward
+    if way.bridge.conserves:
+        return pass_by_collocation(way, max(size, setting.junction_nodes), 0)
     if setting.rule == "collocation":
         return pass_by_collocation(way, size, setting.sweeps)
-    return pass_in_steps(way, size)
-
-
-def _resolved(way_in: Way, inward: Passage, way_out: Way, outward: Passage) -> Bool[Array, ""]:
-    """Say whether dissipation and turning points are far enough from what few steps resolve.
-
-    Dissipation must be small against the energies along the way; at the outer end a slow tip's drag must be small
-    against the pull of the bridge. A tip that hardly reaches the junction is slow inside the bridge.
-    """
-
-    def pull(way: Way) -> Float[Array, ""]:
-        return jnp.maximum(-way.forces.static(way.outer_gap_nm) * way.outer_gap_nm, 0.0)
-
-    def drag(way: Way) -> Float[Array, ""]:
-        speed = way.speed(pull(way))
-        return way.forces.damping(way.outer_gap_nm) * way.outer_gap_nm * speed
-
-    reach = way_in.start_energy_aj + pull(way_in)
-    fast_in = (inward.dissipated_aj < 0.2 * jnp.minimum(reach, inward.energy_aj)) & (
-        inward.energy_aj > 0.1 * way_in.start_energy_aj
-    )
-    captured = way_out.start_energy_aj <= 0.0
-    fast_out = outward.dissipated_aj < 0.2 * jnp.maximum(way_out.start_energy_aj, 0.0)
-    calm = (drag(way_in) <= 0.1 * pull(way_in)) & (drag(way_out) <= 0.1 * pull(way_out))
-    return fast_in & (captured | (fast_out & calm))
+    return pass_in_steps(way, size, getattr(diffrax, setting.solver)(scan_kind="bounded"))
 
 
 def collision_of(
-    contact: Contact, junction: Junction, approach_speed: Float[Array, ""], mass: Float[Array, ""], ways: Ways
+    contact: Contact, junction: Junction, approach_speed: Float[Array, "..."], mass: Float[Array, "..."], ways: Ways
 ) -> Collision:
     """Return the collision that three ways make, for a tip that forms the junction."""
     energy = ways.outward.energy_aj
@@ -144,4 +134,29 @@ def collision_of(
         end_energy_aj=jnp.where(
             free, energy, jnp.minimum(energy, jnp.minimum(ways.junction.energy_aj, ways.inward.energy_aj))
         ),
+    )
+
+
+def collision_of_turn(
+    contact: Contact, junction: Junction, approach_speed: Float[Array, "..."], mass: Float[Array, "..."], turn: Turn
+) -> Collision:
+    """Return the collision of a tip that turns in the bridge."""
+    free = turn.energy_aj > 0.0
+    rebound = jnp.where(free, jnp.sqrt(2.0 * jnp.where(free, turn.energy_aj, 1.0) / mass), 0.0)
+    outside = contact.bridge_forms_nm / approach_speed + contact.bridge_breaks_nm / jnp.where(free, rebound, 1.0)
+    outcome = jnp.where(free, CollisionOutcome.TURNED_IN_BRIDGE, CollisionOutcome.CAPTURED_BY_BRIDGE)
+    forces = contact.forces
+    return Collision(
+        approach_speed_nm_per_us=approach_speed,
+        rebound_speed_nm_per_us=rebound,
+        collision_delay_us=jnp.where(free, turn.time_us - outside, 0.0),
+        captured=~free,
+        outcome=outcome.astype(jnp.int32),
+        time_in_contact_us=jnp.where(free, turn.time_us, 0.0),
+        time_in_junction_us=jnp.zeros_like(rebound),
+        deepest_gap_nm=turn.gap_nm,
+        bridge_hysteresis_aj=forces.potential(contact.bridge_breaks_nm) - forces.potential(contact.bridge_forms_nm),
+        junction_hysteresis_aj=jnp.zeros_like(junction.junction_hysteresis_aj),
+        viscous_loss_aj=turn.dissipated_aj,
+        end_energy_aj=turn.energy_aj,
     )

@@ -17,16 +17,24 @@ def pass_by_collocation(way: Way, nodes: int, sweeps: int) -> Passage:
         nodes: number of Gauss nodes.
         sweeps: how often the dissipation is recomputed from the speeds that it leaves.
     """
-    points, weights, cumulative = (jnp.asarray(part, way.length.dtype) for part in gauss_nodes(nodes))
     length = way.length
+    points, weights, cumulative = nodes_along(nodes, length)
     y, gap = way.place(length * points)
     available = way.available_aj(gap)
     spent = jnp.zeros_like(available)
     for _ in range(sweeps):
         losses, _ = way.rates(y, gap, available - spent)
-        spent = length * (cumulative @ losses)
+        spent = length * jnp.tensordot(cumulative, losses, axes=1)
     losses, times = way.rates(y, gap, available - spent)
-    return way.end(length * (weights @ losses), length * (weights @ times))
+    return way.end(length * jnp.tensordot(weights, losses, axes=1), length * jnp.tensordot(weights, times, axes=1))
+
+
+def nodes_along(
+    count: int, like: Float[Array, "..."]
+) -> tuple[Float[Array, "..."], Float[Array, "nodes"], Float[Array, "nodes nodes"]]:  # noqa: F821
+    """Return `gauss_nodes` as arrays, the nodes with axes behind them that broadcast against `like`."""
+    points, weights, cumulative = (jnp.asarray(part, like.dtype) for part in gauss_nodes(count))
+    return points.reshape(-1, *(1,) * like.ndim), weights, cumulative
 
 
 @cache

@@ -22,17 +22,19 @@ def pass_in_steps(way: Way, steps: int, solver: diffrax.AbstractERK | None = Non
     chosen = diffrax.Dopri8(scan_kind="bounded") if solver is None else solver
     length = way.length
 
-    def field(p, state, args):
+    # The share of p is the time of the solver, one for all tips: a batch is an axis of the state, which costs less than
+    # a batch of solvers.
+    def field(share, state, args):
         del args
-        y, gap = way.place(p)
-        return way.rates(y, gap, way.available_aj(gap) - state[0])
+        y, gap = way.place(length * share)
+        loss, time = way.rates(y, gap, way.available_aj(gap) - state[0])
+        return length * loss, length * time
 
     term = diffrax.ODETerm(field)
 
     def step(carried, ends):
         state, memory = carried
-        begin, end = length * ends[0], length * ends[1]
-        after, _, _, memory, _ = chosen.step(term, begin, end, state, None, memory, made_jump=False)
+        after, _, _, memory, _ = chosen.step(term, ends[0], ends[1], state, None, memory, made_jump=False)
         return (after, memory), None
 
     fractions = np.linspace(0.0, 1.0, steps + 1)
@@ -40,6 +42,6 @@ def pass_in_steps(way: Way, steps: int, solver: diffrax.AbstractERK | None = Non
         fractions = 1.0 - (1.0 - fractions) ** GRADING
     ends = jnp.asarray(np.stack([fractions[:-1], fractions[1:]], axis=1), length.dtype)
     nothing = (jnp.zeros_like(length), jnp.zeros_like(length))
-    memory = chosen.init(term, length * ends[0, 0], length * ends[0, 1], nothing, None)
+    memory = chosen.init(term, ends[0, 0], ends[0, 1], nothing, None)
     ((loss, time), _), _ = lax.scan(step, (nothing, memory), ends)
     return way.end(loss, time)

@@ -11,10 +11,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from afm_jax.contact.bridge import Bridge, bridge_of
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.forces.force import ForceSum
 from afm_jax.contact.junction import Junction
-from afm_jax.contact.passage_collocation import gauss_nodes
+from afm_jax.contact.passage_collocation import nodes_along
 
 _NODES = 48
 _SWEEPS = 12
@@ -25,22 +25,24 @@ _SCAN = 256
 class Turn(NamedTuple):
     """What an impact that turns in the bridge ends with."""
 
-    turns: Bool[Array, ""]
+    turns: Bool[Array, "..."]
     """Whether the tip turns before it reaches the gap where the junction forms."""
-    gap_nm: Float[Array, ""]
-    energy_aj: Float[Array, ""]
+    gap_nm: Float[Array, "..."]
+    energy_aj: Float[Array, "..."]
     """Kinetic energy where the bridge breaks, signed."""
-    dissipated_aj: Float[Array, ""]
-    time_us: Float[Array, ""]
+    dissipated_aj: Float[Array, "..."]
+    time_us: Float[Array, "..."]
     """From the formation of the bridge to its breaking."""
+    settled: Bool[Array, "..."]
+    """Whether the sweeps for the dissipated energy settled."""
 
 
 def turn_in_bridge(
     contact: Contact,
     junction: Junction,
-    approach_speed: Float[Array, ""],
-    mass: Float[Array, ""],
-    spent: Float[Array, ""],
+    approach_speed: Float[Array, "..."],
+    mass: Float[Array, "..."],
+    spent: Float[Array, "..."],
 ) -> Turn:
     """Return the impact of a tip that turns in the bridge.
 
@@ -51,24 +53,24 @@ def turn_in_bridge(
         mass: in ng.
         spent: energy dissipated on the way in, estimated, in aJ.
     """
-    forces = contact.forces
+    bridge = bridge_of(contact)
     forms, breaks = contact.bridge_forms_nm, contact.bridge_breaks_nm
-    total = 0.5 * mass * approach_speed**2 + forces.potential(forms)
+    total = 0.5 * mass * approach_speed**2 + bridge.potential(forms)
     lost, gap, turns = spent, junction.forms_gap_nm, jnp.asarray(approach_speed > 0.0)
     for _ in range(_ROUNDS):
-        gap, turns = _turning_gap(forces, forms, junction.forms_gap_nm, total - lost)
-        lost, time_in = _cross(forces, mass, forms, gap, total)
-    left = forces.potential(gap)
-    lost_out, time_out = _cross(forces, mass, gap, breaks, left)
-    energy = left - forces.potential(breaks) - lost_out
-    return Turn(turns, gap, energy, lost + lost_out, time_in + time_out)
+        gap, turns = _turning_gap(bridge, forms, junction.forms_gap_nm, total - lost)
+        lost, time_in, settled_in = _cross(bridge, mass, forms, gap, total)
+    left = bridge.potential(gap)
+    lost_out, time_out, settled_out = _cross(bridge, mass, gap, breaks, left)
+    energy = left - bridge.potential(breaks) - lost_out
+    return Turn(turns, gap, energy, lost + lost_out, time_in + time_out, settled_in & settled_out)
 
 
 def _turning_gap(
-    forces: ForceSum, outer: Float[Array, ""], inner: Float[Array, ""], level: Float[Array, ""]
-) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    bridge: Bridge, outer: Float[Array, "..."], inner: Float[Array, "..."], level: Float[Array, "..."]
+) -> tuple[Float[Array, "..."], Bool[Array, "..."]]:
     """Return the largest gap at which the potential rises to a level, and whether there is one."""
-    fixed, known = lax.stop_gradient((forces, level))
+    fixed, known = lax.stop_gradient((bridge, level))
 
     def missing(log_gap, model=fixed, value=known):
         return model.potential(jnp.exp(log_gap)) - value
@@ -76,7 +78,10 @@ def _turning_gap(
     points = lax.stop_gradient(
         jnp.log(outer) + jnp.log(inner / outer) * jnp.linspace(0.0, 1.0, _SCAN, dtype=level.dtype)
     )
-    stopped = missing(points) >= 0.0
+    potential = fixed.potential(jnp.exp(points))
+    # only repulsion stops a tip, so that it turns closer to the sample than where the potential is least
+    beyond = jnp.arange(_SCAN) > jnp.argmin(potential)
+    stopped = beyond & (potential >= known)
     first = jnp.maximum(jnp.argmax(stopped), 1)
 
     def halve(_, ends):
@@ -87,23 +92,27 @@ def _turning_gap(
     _, point = lax.fori_loop(0, 60, halve, (points[first - 1], points[first]))
     # two Newton steps carry first and second derivatives
     for _ in range(2):
-        slope = jax.grad(lambda at: missing(at, forces, level))(point)
+        slope = jax.grad(lambda at: missing(at, bridge, level))(point)
         steep = slope != 0.0
-        point = point - jnp.where(steep, missing(point, forces, level) / jnp.where(steep, slope, 1.0), 0.0)
+        point = point - jnp.where(steep, missing(point, bridge, level) / jnp.where(steep, slope, 1.0), 0.0)
     return jnp.exp(point), stopped.any()
 
 
 def _cross(
-    forces: ForceSum, mass: Float[Array, ""], start: Float[Array, ""], end: Float[Array, ""], level: Float[Array, ""]
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return energy dissipated and time between two gaps, for a total energy at the start."""
-    points, weights, cumulative = (jnp.asarray(part, level.dtype) for part in gauss_nodes(_NODES))
+    bridge: Bridge,
+    mass: Float[Array, "..."],
+    start: Float[Array, "..."],
+    end: Float[Array, "..."],
+    level: Float[Array, "..."],
+) -> tuple[Float[Array, "..."], Float[Array, "..."], Bool[Array, "..."]]:
+    """Return energy dissipated, time, and whether the sweeps settled, for a total energy at the start."""
+    points, weights, cumulative = nodes_along(_NODES, level)
     share = jnp.sin(0.5 * jnp.pi * points) ** 2
     width = jnp.log(end / start)
     gap = start * jnp.exp(width * share)
     path = jnp.abs(width) * 0.5 * jnp.pi * jnp.sin(jnp.pi * points) * gap
-    damping = forces.damping(gap)
-    available = level - forces.potential(gap)
+    damping = bridge.damping(gap)
+    available = level - bridge.potential(gap)
 
     def rates(spent):
         kinetic = available - spent
@@ -112,7 +121,11 @@ def _cross(
         return jnp.where(moving, path * damping * speed, 0.0), jnp.where(moving, path / speed, 0.0)
 
     spent = jnp.zeros_like(available)
-    for _ in range(_SWEEPS if forces.dissipative.terms else 0):
-        spent = cumulative @ rates(spent)[0]
+    before = jnp.zeros_like(level)
+    for _ in range(0 if bridge.conserves else _SWEEPS):
+        losses, _ = rates(spent)
+        spent, before = jnp.tensordot(cumulative, losses, axes=1), jnp.tensordot(weights, losses, axes=1)
     losses, times = rates(spent)
-    return weights @ losses, weights @ times
+    lost = jnp.tensordot(weights, losses, axes=1)
+    settled = jnp.abs(lost - before) <= 1e-9 * (jnp.abs(level) + jnp.abs(lost)) + 1e-12
+    return lost, jnp.tensordot(weights, times, axes=1), settled

@@ -37,7 +37,13 @@ class Capillary(StaticForce):
         del gap_rate_nm_per_us
         return -self.pull_nn / (1.0 + as_argument(gap_nm) / (2.0 * self.liquid.kelvin_radius_nm))
 
-    def potential(self, gap_nm: ArrayLike) -> Float[Array, "..."]:
-        """Return 8 pi R gamma_l r_K ln(1 + D/2 r_K) in aJ at a gap in nm; 0 at contact."""
+    def coefficients(self) -> tuple[Float[Array, "..."], ...]:
+        """Return 8 pi R gamma_l r_K and 1/(2 r_K)."""
         length = 2.0 * self.liquid.kelvin_radius_nm
-        return self.pull_nn * length * jnp.log(1.0 + as_argument(gap_nm) / length)
+        return self.pull_nn * length, 1.0 / length
+
+    @staticmethod
+    def potential_of(coefficients: tuple[Float[Array, "..."], ...], gap: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return 8 pi R gamma_l r_K ln(1 + D/2 r_K) in aJ; 0 at contact."""
+        energy, rate = coefficients
+        return energy * jnp.log(1.0 + gap * rate)

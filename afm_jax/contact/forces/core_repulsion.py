@@ -30,6 +30,11 @@ class CoreRepulsion(StaticForce):
         del gap_rate_nm_per_us
         return self.constant_aj_nm6 * self.tip_radius_nm / 180.0 / as_argument(gap_nm) ** 8
 
-    def potential(self, gap_nm: ArrayLike) -> Float[Array, "..."]:
-        """Return B R / (1260 D^7) in aJ at a gap in nm; 0 far away."""
-        return self.constant_aj_nm6 * self.tip_radius_nm / 1260.0 / as_argument(gap_nm) ** 7
+    def coefficients(self) -> tuple[Float[Array, "..."], ...]:
+        """Return B R / 1260."""
+        return (self.constant_aj_nm6 * self.tip_radius_nm / 1260.0,)
+
+    @staticmethod
+    def potential_of(coefficients: tuple[Float[Array, "..."], ...], gap: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return B R / (1260 D^7) in aJ; 0 far away."""
+        return coefficients[0] / gap**7

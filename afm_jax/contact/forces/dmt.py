@@ -52,9 +52,14 @@ class Dmt(StaticForce):
         reach = self.contact_gap_nm / jnp.maximum(gap, self.contact_gap_nm)
         return self._elastic(gap) - self.pull_off_nn * reach**2
 
-    def potential(self, gap_nm: ArrayLike) -> Float[Array, "..."]:
-        """Return the potential in aJ at a gap in nm; 0 far away."""
-        gap = as_argument(gap_nm)
-        outside = jnp.maximum(gap, self.contact_gap_nm)
-        away = -self.pull_off_nn * self.contact_gap_nm**2 / outside
-        return self._elastic.potential(gap) + away - self.pull_off_nn * (outside - gap)
+    def coefficients(self) -> tuple[Float[Array, "..."], ...]:
+        """Return (2/5) K sqrt(R), D_0 and 2 pi w R."""
+        return (*self._elastic.coefficients(), self.pull_off_nn)
+
+    @staticmethod
+    def potential_of(coefficients: tuple[Float[Array, "..."], ...], gap: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return the potential in aJ; 0 far away."""
+        factor, contact_gap, pull_off = coefficients
+        outside = jnp.maximum(gap, contact_gap)
+        away = -pull_off * contact_gap**2 / outside
+        return Hertz.potential_of((factor, contact_gap), gap) + away - pull_off * (outside - gap)

@@ -34,8 +34,17 @@ class StaticForce(Force):
     """A force that depends on the gap alone and conserves energy."""
 
     @abc.abstractmethod
+    def coefficients(self) -> tuple[Float[Array, "..."], ...]:
+        """Return what the parameters contribute to `potential_of`: computed once for many gaps."""
+
+    @staticmethod
+    @abc.abstractmethod
+    def potential_of(coefficients: tuple[Float[Array, "..."], ...], gap: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return the potential energy in aJ from the coefficients, at a gap in nm."""
+
     def potential(self, gap_nm: ArrayLike) -> Float[Array, "..."]:
         """Return the potential energy in aJ at a gap in nm; the force is minus its slope."""
+        return self.potential_of(self.coefficients(), as_argument(gap_nm))
 
     def stiffness(self, gap_nm: ArrayLike) -> Float[Array, "..."]:
         """Return -dF/dD in nN/nm at a gap in nm, by automatic differentiation of the force."""
@@ -47,8 +56,17 @@ class DissipativeForce(Force):
     """A force opposed to the motion, -damping(D) dD/dt."""
 
     @abc.abstractmethod
+    def coefficients(self) -> tuple[Float[Array, "..."], ...]:
+        """Return what the parameters contribute to `damping_of`: computed once for many gaps."""
+
+    @staticmethod
+    @abc.abstractmethod
+    def damping_of(coefficients: tuple[Float[Array, "..."], ...], gap: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return the damping in nN us/nm from the coefficients, at a gap in nm."""
+
     def damping(self, gap_nm: ArrayLike) -> Float[Array, "..."]:
         """Return the damping in nN us/nm at a gap in nm."""
+        return self.damping_of(self.coefficients(), as_argument(gap_nm))
 
     def __call__(self, gap_nm: ArrayLike, gap_rate_nm_per_us: ArrayLike = 0.0) -> Float[Array, "..."]:
         """Return the force on the tip in nN: -damping(D) dD/dt."""

@@ -32,16 +32,23 @@ class Hertz(StaticForce):
     def __call__(self, gap_nm: ArrayLike, gap_rate_nm_per_us: ArrayLike = 0.0) -> Float[Array, "..."]:
         """Return the force in nN at a gap in nm; the rate does not matter."""
         del gap_rate_nm_per_us
-        depth, root = self._depth_and_root(gap_nm)
+        depth, root = depth_and_root(self.contact_gap_nm - as_argument(gap_nm))
         return self.modulus_gpa * jnp.sqrt(self.tip_radius_nm) * depth * root
 
-    def potential(self, gap_nm: ArrayLike) -> Float[Array, "..."]:
-        """Return (2/5) K sqrt(R) (D_0 - D)^(5/2) in aJ at a gap in nm; 0 out of contact."""
-        depth, root = self._depth_and_root(gap_nm)
-        return 0.4 * self.modulus_gpa * jnp.sqrt(self.tip_radius_nm) * depth**2 * root
+    def coefficients(self) -> tuple[Float[Array, "..."], ...]:
+        """Return (2/5) K sqrt(R) and D_0."""
+        return 0.4 * self.modulus_gpa * jnp.sqrt(self.tip_radius_nm), self.contact_gap_nm
 
-    def _depth_and_root(self, gap_nm: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        depth = self.contact_gap_nm - as_argument(gap_nm)
-        touching = depth > 0.0
-        inside = jnp.where(touching, depth, 1.0)
-        return jnp.where(touching, inside, 0.0), jnp.where(touching, jnp.sqrt(inside), 0.0)
+    @staticmethod
+    def potential_of(coefficients: tuple[Float[Array, "..."], ...], gap: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return (2/5) K sqrt(R) (D_0 - D)^(5/2) in aJ; 0 out of contact."""
+        factor, contact_gap = coefficients
+        depth, root = depth_and_root(contact_gap - gap)
+        return factor * depth**2 * root
+
+
+def depth_and_root(depth_nm: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Return an indentation and its square root, both 0 where it is not positive."""
+    touching = depth_nm > 0.0
+    inside = jnp.where(touching, depth_nm, 1.0)
+    return jnp.where(touching, inside, 0.0), jnp.where(touching, jnp.sqrt(inside), 0.0)

@@ -49,6 +49,12 @@ class Structural(StaticForce):
         del gap_rate_nm_per_us
         return self.strength_nn * jnp.exp(-as_argument(gap_nm) / self.decay_nm)
 
-    def potential(self, gap_nm: ArrayLike) -> Float[Array, "..."]:
-        """Return tau F in aJ at a gap in nm; 0 far away."""
-        return self.decay_nm * self(gap_nm)
+    def coefficients(self) -> tuple[Float[Array, "..."], ...]:
+        """Return tau times the force at gap 0, and -1/tau."""
+        return self.decay_nm * self.strength_nn, -1.0 / self.decay_nm
+
+    @staticmethod
+    def potential_of(coefficients: tuple[Float[Array, "..."], ...], gap: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return tau F in aJ; 0 far away."""
+        energy, rate = coefficients
+        return energy * jnp.exp(gap * rate)

@@ -30,6 +30,11 @@ class VanDerWaals(StaticForce):
         del gap_rate_nm_per_us
         return -self.hamaker_constant_aj * self.tip_radius_nm / (6.0 * as_argument(gap_nm) ** 2)
 
-    def potential(self, gap_nm: ArrayLike) -> Float[Array, "..."]:
-        """Return -H R / (6 D) in aJ at a gap in nm; 0 far away."""
-        return -self.hamaker_constant_aj * self.tip_radius_nm / (6.0 * as_argument(gap_nm))
+    def coefficients(self) -> tuple[Float[Array, "..."], ...]:
+        """Return -H R / 6."""
+        return (-self.hamaker_constant_aj * self.tip_radius_nm / 6.0,)
+
+    @staticmethod
+    def potential_of(coefficients: tuple[Float[Array, "..."], ...], gap: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return -H R / (6 D) in aJ; 0 far away."""
+        return coefficients[0] / gap

@@ -2,10 +2,10 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from afm_jax.contact.forces.force import DissipativeForce
-from afm_jax.parameters import as_argument, as_parameter, check_parameter
+from afm_jax.parameters import as_parameter, check_parameter
 from afm_jax.units import NN_US_PER_NM2_PER_PA_S
 
 
@@ -27,7 +27,11 @@ class Viscous(DissipativeForce):
         check_parameter("viscosity_pa_s", self.viscosity_pa_s, "not negative")
         check_parameter("tip_radius_nm", self.tip_radius_nm, "positive")
 
-    def damping(self, gap_nm: ArrayLike) -> Float[Array, "..."]:
-        """Return (3 pi/2) eta R^2 / D in nN us/nm at a gap in nm."""
-        viscosity = self.viscosity_pa_s * NN_US_PER_NM2_PER_PA_S
-        return 1.5 * jnp.pi * viscosity * self.tip_radius_nm**2 / as_argument(gap_nm)
+    def coefficients(self) -> tuple[Float[Array, "..."], ...]:
+        """Return (3 pi/2) eta R^2 in nN us."""
+        return (1.5 * jnp.pi * self.viscosity_pa_s * NN_US_PER_NM2_PER_PA_S * self.tip_radius_nm**2,)
+
+    @staticmethod
+    def damping_of(coefficients: tuple[Float[Array, "..."], ...], gap: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return (3 pi/2) eta R^2 / D in nN us/nm."""
+        return coefficients[0] / gap

@@ -1,0 +1,167 @@
+"""`afm-jax calibrate`: what it prints, writes and returns."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from matplotlib.image import imread
+
+from afm_jax.cli.main import main
+from fitting import read_table
+from fitting.resonance_sweep import ResonanceSweep
+from tests.resonance_sweeps import FREQUENCY_KHZ, QUALITY_FACTOR, synthetic_sweep
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(main, ["calibrate", *(str(argument) for argument in arguments)])
+
+
+def strictly(text: str) -> Any:
+    """Return the one JSON object of a text; NaN and Infinity, which JSON does not have, are refused."""
+
+    def refuse(constant: str):
+        raise AssertionError(constant)
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def saved(sweep: ResonanceSweep, path: Path) -> Path:
+    names = {"frequency_khz": "frequency_khz", "amplitude_nm": "amplitude", "phase_deg": "phase_deg"}
+    columns = {name: getattr(sweep, key) for name, key in names.items() if getattr(sweep, key) is not None}
+    rows = [",".join(map(repr, row)) for row in zip(*(column.tolist() for column in columns.values()), strict=True)]
+    path.write_text("\n".join([",".join(columns), *rows]) + "\n", encoding="utf-8")
+    return path
+
+
+@pytest.fixture(scope="module")
+def sweep_path(tmp_path_factory) -> Path:
+    sweep = synthetic_sweep(noise=2e-3, background=0.05 + 0.03j)
+    return saved(sweep, tmp_path_factory.mktemp("sweep") / "sweep.csv")
+
+
+@pytest.fixture(scope="module")
+def reported(sweep_path, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    return run(sweep_path, "--json", "--out", folder), folder
+
+
+def test_json_holds_the_promised_keys_and_nothing_else_is_printed(reported):
+    result, _ = reported
+    assert result.exit_code == 0, result.stderr
+    answer = strictly(result.stdout)
+    assert answer["valid"] is True
+    assert answer["model"] == "phase"
+    # two numbers a point, six parameters
+    assert answer["degrees_of_freedom"] == 2 * 120 - 6
+    assert answer["p_value"] is None
+    assert {"chi2", "warnings", "reasons", "errors", "alternatives", "input", "versions"} <= set(answer)
+    for name, truth in (("frequency_khz", FREQUENCY_KHZ), ("quality_factor", QUALITY_FACTOR)):
+        low, high = answer[name]["interval95"]
+        assert low < answer[name]["value"] < high
+        assert abs(answer[name]["value"] - truth) < 4.0 * answer[name]["standard_error"]
+
+
+def test_report_is_written(reported, sweep_path):
+    result, folder = reported
+    names = {"calibration.txt", "calibration.json", "calibration.png", "calibration_points.csv"}
+    assert names == {path.name for path in folder.iterdir()}
+    assert strictly((folder / "calibration.json").read_text(encoding="utf-8")) == strictly(result.stdout)
+    assert "VALID" in (folder / "calibration.txt").read_text(encoding="utf-8").splitlines()
+    with (folder / "calibration_points.csv").open(encoding="utf-8") as file:
+        points = list(csv.DictReader(file))
+    with sweep_path.open(encoding="utf-8") as file:
+        given = list(csv.DictReader(file))
+    for point, row in zip(points, given, strict=True):
+        assert float(point["measured_amplitude"]) == float(row["amplitude_nm"])
+        misfit = float(point["fitted_amplitude"]) - float(row["amplitude_nm"])
+        # a difference of numbers of order 5
+        assert float(point["amplitude_misfit"]) == pytest.approx(misfit, abs=1e-14)
+
+
+def test_picture_shows_data_fit_and_misfit(reported):
+    _, folder = reported
+    pixels = imread(folder / "calibration.png")[..., :3]
+    height, width, _ = pixels.shape
+    assert width > height > 800
+    dark = np.all(np.abs(pixels - np.array([0x3B, 0x4A, 0x5A]) / 255.0) < 0.05, axis=2)
+    orange = np.all(np.abs(pixels - np.array([0xB3, 0x47, 0x00]) / 255.0) < 0.05, axis=2)
+    # data in all four panels, the fit in the upper two
+    for rows in (slice(0, height // 2), slice(2 * height // 3, height)):
+        for columns in (slice(0, width // 2), slice(width // 2, width)):
+            assert dark[rows, columns].sum() > 200
+    assert orange[: height // 2, : width // 2].sum() > 200
+    assert orange[: height // 2, width // 2 :].sum() > 200
+    assert orange[2 * height // 3 :].sum() == 0
+
+
+def test_comment_lines_go_into_an_amplitude_table(sweep_path, tmp_path):
+    result = run(sweep_path)
+    assert result.exit_code == 0
+    comments = result.stdout.splitlines()[-2:]
+    table = tmp_path / "table.csv"
+    names = "order,drive_frequency_khz,drive_amplitude_nm,offset_nm,peak_amplitude_nm,peak_amplitude_error_nm"
+    table.write_text("\n".join([*comments, names, "1,180,4,0,163.3,1.63"]) + "\n", encoding="utf-8")
+    read, answer = read_table(table), strictly(run(sweep_path, "--json").stdout)
+    error = answer["quality_factor"]["standard_error"]
+    # two digits of the error are written
+    assert read.quality_factor == pytest.approx(answer["quality_factor"]["value"], abs=0.06 * error)
+    assert read.quality_factor_error == pytest.approx(error, rel=0.06)
+    frequency = answer["frequency_khz"]
+    assert read.free_frequency_khz == pytest.approx(frequency["value"], abs=0.01 * frequency["standard_error"])
+
+
+def test_options_reach_the_fit(sweep_path):
+    answer = strictly(run(sweep_path, "--json", "--amplitude-only", "--background", "none", "--noise", "10%").stdout)
+    assert (answer["model"], answer["background"], answer["errors"]["origin"]) == ("amplitude", "none", "noise")
+    assert answer["degrees_of_freedom"] == 120 - 3
+    assert answer["p_value"] > 0.999
+    scaled = strictly(run(sweep_path, "--json", "--noise", "10%", "--scale-errors").stdout)
+    assert scaled["chi2"] == pytest.approx(scaled["degrees_of_freedom"], rel=1e-9)
+    # the sweep's noise is 0.2 % of 5 nm
+    assert scaled["errors"]["scale"] == pytest.approx(0.02, rel=0.2)
+
+
+@pytest.mark.parametrize("as_json", [True, False])
+def test_a_sweep_beside_the_resonance_ends_with_exit_code_3(tmp_path, as_json):
+    path = saved(synthetic_sweep(noise=0.01, centre=40.0, phase=False), tmp_path / "beside.csv")
+    result = run(path, "--out", tmp_path / "out", *(["--json"] if as_json else []))
+    assert result.exit_code == 3
+    assert "not valid: No resonance stands out" in result.stderr
+    if as_json:
+        answer = strictly(result.stdout)
+        assert answer["valid"] is False
+        assert answer["table_comments"] == []
+    else:
+        assert "NOT VALID" in result.stdout
+        assert "free_frequency_khz" not in result.stdout
+    assert (tmp_path / "out" / "calibration.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.parametrize(
+    ("text", "arguments", "said"),
+    [
+        (None, [], "there is no such file"),
+        ("frequency_khz,amplitude_nm\n1,x\n", [], "line 2, column amplitude_nm: 'x' is not a number"),
+        ("frequency_khz,amplitude_nm\n1,2\n2,3\n", [], "2 frequencies are too few for the 5 parameters"),
+        (
+            "frequency_khz,amplitude_nm\n1,2\n2,3\n",
+            ["--background", "linear"],
+            "without phase is none, floor, constant",
+        ),
+        ("frequency_khz,amplitude_nm\n1,2\n", ["--noise", "0"], "must be a relative error such as 1% or 0.01"),
+        ("frequency_khz,amplitude_nm\n1,2\n", ["--background", "flat"], "is not one of 'none', 'floor'"),
+    ],
+)
+def test_wrong_calls_end_with_one_line_and_exit_code_2(tmp_path, text, arguments, said):
+    path = tmp_path / "sweep.csv"
+    if text is not None:
+        path.write_text(text, encoding="utf-8")
+    result = run(path, *arguments)
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert said in result.stderr

@@ -1,0 +1,175 @@
+"""Reading resonance sweeps: both forms, and every fault as one line that says what, where and how to mend it."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fitting import read_sweep
+from fitting.resonance_sweep import ResonanceSweep, TableError
+
+PLAIN = "frequency_khz,amplitude_nm,phase_deg\n89.5,1.25,60\n90,2.5,-3.5e1\n90.5,1.125,-120\n"
+NANONIS = (
+    "Experiment\tFrequency Sweep\t\nDate\t27.02.2023 14:26:53\t\nUser\t\t\nf_res (Hz)\t30281.5\t\nQ\t1161\t\n\n[DATA]\n"
+    "Frequency Shift (Hz)\tCenter Frequency (Hz)\tAmplitude (m)\tPhase (deg)\tExcitation (V)\n"
+    "-38.1000E+0\t30.2829E+3\t520.545E-12\t90.3060E+0\tx\n"
+    "37.8013E+0\t30.2829E+3\t459.461E-12\t-39.6350E+0\tx\n"
+)
+
+
+def written(folder: Path, data: str | bytes) -> Path:
+    path = folder / "sweep.txt"
+    path.write_bytes(data.encode() if isinstance(data, str) else data)
+    return path
+
+
+def fault_of(path: Path) -> str:
+    """Return the message without the path in front; it must be one line."""
+    with pytest.raises(TableError) as caught:
+        read_sweep(path)
+    message = str(caught.value)
+    assert message.startswith(str(path))
+    assert message.isprintable()
+    return message.removeprefix(str(path)).lstrip(",: ")
+
+
+def test_plain_columns_come_back(tmp_path):
+    sweep = read_sweep(written(tmp_path, "# driven at 20 mV\r\n#\r\n" + PLAIN.replace("\n", "\r\n")))
+    assert sweep.frequency_khz.tolist() == [89.5, 90.0, 90.5]
+    assert sweep.amplitude.tolist() == [1.25, 2.5, 1.125]
+    assert sweep.phase_deg is not None
+    assert sweep.phase_deg.tolist() == [60.0, -35.0, -120.0]
+    assert sweep.amplitude_unit == "nm"
+    assert sweep.remarks == ("driven at 20 mV",)
+    assert sweep.lines.tolist() == [4, 5, 6]
+    assert not sweep.amplitude.flags.writeable
+
+
+def test_hertz_and_amplitudes_of_any_unit(tmp_path):
+    text = "amplitude, frequency_hz, amplitude_error\n0.5,30000,0.01\n1.5,30001.5,0.02\n"
+    sweep = read_sweep(written(tmp_path, text))
+    assert sweep.frequency_khz.tolist() == [30.0, 30.0015]
+    assert sweep.amplitude_unit == ""
+    assert sweep.phase_deg is None
+    assert sweep.amplitude_error is not None
+    assert sweep.amplitude_error.tolist() == [0.01, 0.02]
+
+
+def test_nanonis_text_comes_back(tmp_path):
+    sweep = read_sweep(written(tmp_path, NANONIS))
+    # sums and units of decimal numbers: to the rounding of the last bit
+    assert sweep.frequency_khz == pytest.approx([30.2448, 30.3207013], rel=1e-14)
+    assert sweep.amplitude == pytest.approx([0.520545, 0.459461], rel=1e-14)
+    assert sweep.phase_deg is not None
+    assert sweep.phase_deg.tolist() == [90.306, -39.635]
+    assert sweep.instrument == {"frequency_khz": pytest.approx(30.2815, rel=1e-14), "quality_factor": 1161.0}
+    assert sweep.remarks == ("Experiment: Frequency Sweep", "Date: 27.02.2023 14:26:53")
+    assert sweep.lines.tolist() == [9, 10]
+
+
+def test_absolute_frequencies_of_nanonis_and_a_missing_phase(tmp_path):
+    text = "[DATA]\nFrequency (Hz)\tAmplitude (m)\n30000\t1e-9\n30001\t2e-9\n"
+    sweep = read_sweep(written(tmp_path, text))
+    assert sweep.frequency_khz.tolist() == [30.0, 30.001]
+    assert sweep.phase_deg is None
+    assert sweep.instrument == {}
+
+
+@pytest.mark.parametrize(("order", "reordered"), [((2, 1, 0), False), ((1, 0, 2), True), ((0, 1, 2), False)])
+def test_points_are_sorted_with_their_lines(tmp_path, order, reordered):
+    head, *rows = PLAIN.splitlines()
+    sweep = read_sweep(written(tmp_path, "\n".join([head, *(rows[i] for i in order)])))
+    assert sweep.frequency_khz.tolist() == [89.5, 90.0, 90.5]
+    assert sweep.amplitude.tolist() == [1.25, 2.5, 1.125]
+    assert sweep.lines.tolist() == [2 + order.index(i) for i in range(3)]
+    assert sweep.reordered is reordered
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("90,2.5", "90,abc", "line 3, column amplitude_nm: 'abc' is not a number; write it like 90.25 or 9.025e1"),
+        ("90,2.5", "90,nan", "line 3, column amplitude_nm: 'nan' is not a number"),
+        ("90,2.5", "90,", "line 3, column amplitude_nm: is blank; every point needs it"),
+        ("90,2.5", '"90,1",2.5', "line 3, column frequency_khz: '90,1' has a decimal comma; write a point"),
+        ("90,2.5,", "90,1,2,5,", "line 3: there are 5 cells for 3 columns; a decimal comma must be a point"),
+        ("90,2.5,-3.5e1", "90,2.5", "line 3: there are 2 cells for 3 columns; fill the row up"),
+        ("90,2.5", "0,2.5", "line 3, column frequency_khz: must be finite and above 0, but is 0; correct it or remove"),
+        ("90,2.5", "90,-2.5", "line 3, column amplitude: must be finite and not negative, but is -2.5"),
+        ("-3.5e1", "1e999", "line 3, column phase_deg: must be finite, but is inf"),
+        ("frequency_khz", "frequency_mhz", "line 1: unknown column 'frequency_mhz'; did you mean frequency_khz?"),
+        ("amplitude_nm", "signal", "line 1: unknown column 'signal'; the columns are frequency_khz, frequency_hz"),
+        ("phase_deg", "frequency_hz", "line 1, column frequency_hz: says again what another column says; remove one"),
+        ("phase_deg", "", "line 1: column 3 has no name; name it or remove its comma"),
+        ("phase_deg", "phase_error_deg", "column phase_error_deg: stands without phase_deg; add that column"),
+        ("frequency_khz,amplitude_nm,phase_deg\n", "", "line 1: the first row holds numbers; put the row of column"),
+        (",", ";", "line 1: the columns are separated by semicolons; separate them by commas, decimals by points"),
+        (",", "\t", "line 1: the columns are separated by tabs; separate them by commas"),
+        ("89.5,1.25,60\n90,2.5,-3.5e1\n90.5,1.125,-120\n", "", "line 1: there are column names but no rows below them"),
+        ("frequency_khz,amplitude_nm", "phase_error_deg,amplitude_nm", "line 1: there is no frequency column; add"),
+        ("amplitude_nm,phase_deg", "amplitude_error_nm,phase_deg", "line 1: there is no amplitude column; add"),
+    ],
+)
+def test_faults_of_plain_files(tmp_path, old, new, message):
+    assert old in PLAIN
+    assert fault_of(written(tmp_path, PLAIN.replace(old, new))).startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            "520.545E-12",
+            "520,545E-12",
+            "line 9, column Amplitude (m): '520,545E-12' has a decimal comma; write a point",
+        ),
+        ("520.545E-12", "", "line 9, column Amplitude (m): is blank; every point needs it"),
+        ("\t520.545E-12", "", "line 9: there are 4 cells for 5 columns; fill the row up"),
+        ("520.545E-12", "-1E-12", "line 9, column amplitude: must be finite and not negative, but is -0.001"),
+        ("Amplitude (m)", "Current (A)", "line 8: the column is missing: Amplitude (m); export the sweep with it"),
+        (
+            "Frequency Shift (Hz)\tCenter Frequency (Hz)",
+            "a\tb",
+            "line 8: the columns are missing: Frequency Shift (Hz)",
+        ),
+        (NANONIS[NANONIS.index("Frequency Shift") :], "", "line 7: there is nothing below [DATA]; export"),
+        (NANONIS[NANONIS.index("-38.1") :], "", "line 8: there are column names but no rows below them"),
+    ],
+)
+def test_faults_of_nanonis_files(tmp_path, old, new, message):
+    assert old in NANONIS
+    assert fault_of(written(tmp_path, NANONIS.replace(old, new))).startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ("", "the file holds nothing; add a row of column names"),
+        ("# only words\n", "the file holds only comments; add a row of column names"),
+        ("amplitude_nm\xb5\n".encode("latin-1"), "line 1: is not UTF-8 text"),
+    ],
+)
+def test_files_without_a_sweep(tmp_path, data, message):
+    assert fault_of(written(tmp_path, data)).startswith(message)
+
+
+def test_missing_files_are_named(tmp_path):
+    assert fault_of(tmp_path / "none.csv").startswith("there is no such file")
+    assert fault_of(tmp_path).startswith("is a folder")
+
+
+def test_the_first_fault_is_said_and_the_others_counted(tmp_path):
+    text = PLAIN.replace("1.125", "x").replace("2.5", "y")
+    assert fault_of(written(tmp_path, text)).endswith("(and 1 more fault)")
+
+
+def test_faults_of_sweeps_in_memory():
+    frequency, amplitude = np.array([1.0, 2.0]), np.array([1.0, 2.0])
+    with pytest.raises(TableError, match=r"sweep in memory, column frequency_khz: has the shape \(0,\); every column"):
+        ResonanceSweep(frequency_khz=np.zeros(0), amplitude=np.zeros(0))
+    with pytest.raises(TableError, match="row 2, column amplitude_error: must be finite and above 0, but is 0"):
+        ResonanceSweep(frequency_khz=frequency, amplitude=amplitude, amplitude_error=np.array([0.1, 0.0]))
+    with pytest.raises(TableError, match="the phase has errors but the amplitude has none"):
+        ResonanceSweep(
+            frequency_khz=frequency, amplitude=amplitude, phase_deg=amplitude, phase_error_deg=np.array([1.0, 1.0])
+        )
