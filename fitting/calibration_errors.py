@@ -6,7 +6,7 @@ from jaxtyping import Float
 from fitting.resonance_model import SweepObjective, model_at, slope_at
 from fitting.resonance_sweep import ResonanceSweep
 
-_SMALLEST = 1e-7
+SMALLEST = 1e-7
 """Error of an estimated noise in units of the largest amplitude: a sweep without noise must not divide by zero."""
 
 
@@ -22,7 +22,7 @@ def first_errors(
     """
     largest = sweep.amplitude.max()
     if sweep.amplitude_error is None:
-        along = np.full(sweep.points, max(guess, _SMALLEST) if noise is None else noise)
+        along = np.full(sweep.points, max(guess, SMALLEST) if noise is None else noise)
     else:
         along = sweep.amplitude_error / largest
     if sweep.phase_error_deg is None:
@@ -49,14 +49,14 @@ def with_estimated_errors(
     parameters = len(values)
     if objective.kind == "amplitude":
         noise = float(np.sqrt(np.sum(np.real(misfit) ** 2) / (points - parameters)))
-        along = np.full(points, max(noise, _SMALLEST))
+        along = np.full(points, max(noise, SMALLEST))
         return objective.with_errors(along, along), noise, 0.0
     slope = np.asarray(slope_at(values, objective.points, objective.kind))[:points]
     steep = np.abs(slope)
     direction = np.where(steep > 0.0, slope, 1.0) / np.where(steep > 0.0, steep, 1.0)
     turned = misfit * np.conj(direction)
     freedom = points - parameters / 2.0
-    noise = max(float(np.sqrt(np.sum(np.imag(turned) ** 2) / freedom)), _SMALLEST)
+    noise = max(float(np.sqrt(np.sum(np.imag(turned) ** 2) / freedom)), SMALLEST)
     excess = np.sum(np.real(turned) ** 2) * points / freedom - points * noise**2
     jitter = float(np.sqrt(max(excess, 0.0) / np.sum(steep**2)))
     along = np.hypot(noise, jitter * steep)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from fitting.calibration_errors import first_errors, with_estimated_errors
+from fitting.calibration_errors import SMALLEST, first_errors, with_estimated_errors
 from fitting.calibration_result import PointErrors
 from fitting.checks import Convergence, check_minimum
 from fitting.optimise import PLAIN, polish
@@ -92,7 +92,12 @@ def fit_sweep(sweep: ResonanceSweep, background: str, noise: float | None, *, sc
     for _ in range(_ROUNDS):
         objective, level, jitter = with_estimated_errors(objective, problem.values(coordinates), sweep.points)
         coordinates = _polished(objective, coordinates[None])
-    errors = PointErrors("estimated", None, level * largest, _HZ_PER_KHZ * jitter if kind == "phase" else None)
+    # The two sums of squares are met, their weighted sum only nearly; a sweep without noise keeps its least errors.
+    factor = _misfit(objective, coordinates, data) if level > SMALLEST else 1.0
+    along, across = factor / np.asarray(objective.points.weight)[: sweep.points].T
+    objective = objective.with_errors(along, across)
+    jitter_hz = _HZ_PER_KHZ * jitter * factor if kind == "phase" else None
+    errors = PointErrors("estimated", None, level * factor * largest, jitter_hz)
     return _finished(objective, coordinates, errors, reverse=reverse, data=data)
 
 

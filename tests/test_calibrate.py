@@ -178,6 +178,7 @@ def test_errors_follow_the_noise_they_are_told():
     assert scaled.errors.origin == "estimated"
     # 240 residuals: the noise is found to 1/sqrt(480), here 3 of those
     assert scaled.errors.amplitude == pytest.approx(0.05, rel=0.15)
+    assert scaled.chi2 == pytest.approx(scaled.degrees_of_freedom, rel=1e-9)
     assert np.isnan(scaled.p_value)
     assert any("cannot be judged" in warning for warning in scaled.warnings)
     assert doubled.chi2 == pytest.approx(told.chi2 / 4.0, rel=1e-9)
