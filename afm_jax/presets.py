@@ -1,7 +1,7 @@
 """The paper's scenes, with what each figure varies as arguments. They can be batched: `eqx.filter_vmap(figure2_scene)`.
 
-The reduced frequency is n = omega/2 Omega; the free frequency is 90 kHz throughout, and sections II and III leave air
-damping out.
+The reduced frequency is n = omega/2 Omega; the free frequency is 90 kHz throughout. Sections II and III leave air
+damping out; section IV, with the resolved contact, has Q = 40.
 """
 
 from jaxtyping import Array, ArrayLike, Float
@@ -9,6 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
+from afm_jax.contact.contact import Contact
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.parameters import as_argument
 
@@ -21,6 +22,9 @@ OFFSET_SWEEP_AMPLITUDE_NM = 0.75
 """Drive amplitude of figure 9."""
 OFFSET_SWEEP_BELOW, OFFSET_SWEEP_ABOVE = 0.97, 1.03
 """Reduced frequencies of figures 9a and 9b: just below and just above the first resonance."""
+
+QUALITY_FACTOR = 40.0
+"""Of the cantilever in figures 8, 10 and 11."""
 
 
 def stability_scene(
@@ -58,6 +62,44 @@ def figure9_scene(reduced_frequency: ArrayLike, offset_nm: ArrayLike, r: ArrayLi
     """
     platform = Platform(OFFSET_SWEEP_AMPLITUDE_NM, drive_frequency_khz(reduced_frequency), offset_nm)
     return Scene(Cantilever(FREE_FREQUENCY_KHZ), platform, ImpactLaw(r, ADHESION))
+
+
+def figure8_scene() -> Scene:
+    """Return the scene of figure 8: n = 5.277, beta = 4 nm, sigma = 0; attractors coexist, so that the start matters.
+
+    From drive phase 270 degrees, 5 nm above the platform, upward at 40 or 60 nm/us the motion is broadband; from
+    80 nm/us it settles near a (1,5) orbit.
+    """
+    return contact_scene(reduced_frequency=5.277, drive_amplitude_nm=4.0, offset_nm=0.0)
+
+
+def figure10_scene(offset_nm: ArrayLike = -0.5, offset_rate_nm_per_us: ArrayLike = 0.0) -> Scene:
+    """Return the scene of figure 10, below resonance: n = 0.97, beta = 2 nm, the paper's offsets -0.5 to 5 nm."""
+    return contact_scene(0.97, 2.0, offset_nm, offset_rate_nm_per_us)
+
+
+def figure11_scene(offset_nm: ArrayLike = -2.0, offset_rate_nm_per_us: ArrayLike = 0.0) -> Scene:
+    """Return the scene of figure 11, above resonance: n = 1.01, beta = 4 nm, offsets -2 to 2 nm."""
+    return contact_scene(1.01, 4.0, offset_nm, offset_rate_nm_per_us)
+
+
+def contact_scene(
+    reduced_frequency: ArrayLike,
+    drive_amplitude_nm: ArrayLike,
+    offset_nm: ArrayLike,
+    offset_rate_nm_per_us: ArrayLike = 0.0,
+) -> Scene:
+    """Return a scene of section IV: the paper's contact, 90 kHz, Q = 40, 1 ng.
+
+    Args:
+        reduced_frequency: n = omega/2 Omega.
+        drive_amplitude_nm: beta.
+        offset_nm: sigma at time 0.
+        offset_rate_nm_per_us: how fast sigma changes, in nm/us.
+    """
+    drive = drive_frequency_khz(reduced_frequency)
+    platform = Platform(drive_amplitude_nm, drive, offset_nm, offset_rate_nm_per_us)
+    return Scene(Cantilever(FREE_FREQUENCY_KHZ, QUALITY_FACTOR, 1.0), platform, Contact.paper())
 
 
 def drive_frequency_khz(reduced_frequency: ArrayLike) -> Float[Array, "..."]:

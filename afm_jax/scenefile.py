@@ -11,7 +11,7 @@ frequency_khz = 180          # or reduced_frequency = omega / 2 Omega
 offset_nm = 0
 offset_rate_nm_per_us = 0
 [interaction]
-model = "law"
+model = "law"                # or "contact"
 r = 0.998
 epsilon = 122                # nm^2/us^2
 viscous_loss = 0             # nm/us
@@ -24,12 +24,15 @@ phase_deg = 270
 height_above_platform_nm = 5
 velocity_nm_per_us = 80
 ```
+
+A resolved contact instead of a law: `model = "contact"`, `effects = ["capillary", "structural", "core", "viscous",
+"jkr"]` (all of them if left out) and any of the parameters in `CONTACT_RANGES`; the paper's values if left out.
 """
 
 import os
 import tomllib
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import tomli_w
@@ -38,10 +41,13 @@ from jaxtyping import ArrayLike
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
-from afm_jax.impact.law import CollisionDelay, ImpactLaw, impact_law_of
+from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.parameters import check_parameter
-from afm_jax.scenefile_keys import KEYS, advise_table
+from afm_jax.scenefile_keys import CONTACT_RANGES, KEYS, advise_table
 from afm_jax.scenefile_table import SceneError, SceneTable, in_words, printable
+
+if TYPE_CHECKING:
+    from afm_jax.contact.contact import Contact
 
 
 class Start(NamedTuple):
@@ -59,8 +65,8 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
         path: the file.
 
     Raises:
-        SceneError: if the file cannot be read, or a table, key, type or value in it is wrong; the message names the
-            place and says how to mend it.
+        SceneError: if the file cannot be read, a table, key, type or value in it is wrong, or its contact has no
+            junction; the message names the place and says how to mend it.
     """
     return _scene_of(_tables(path))
 
@@ -79,10 +85,12 @@ def load_start(path: str | os.PathLike[str]) -> Start | None:
 def save_scene(scene: Scene, path: str | os.PathLike[str], *, start: Start | None = None) -> None:
     """Write a scene, and a start if there is one, to a TOML file from which `load_scene` returns an equal scene.
 
+    The file names a contact's effects in the paper's order, whatever the order of its forces.
+
     Raises:
         OSError: if the file cannot be written.
-        TypeError: if the interaction is not an impact law.
-        ValueError: if the scene is a batch of scenes.
+        TypeError: if the interaction is neither an impact law nor a contact.
+        ValueError: if the scene is a batch of scenes, or its contact has what the format has no key for.
     """
     tables = scene_tables(scene)
     if start is not None:
@@ -94,18 +102,33 @@ def scene_tables(scene: Scene) -> dict[str, dict[str, Any]]:
     """Return a scene as the tables of its file, dicts of numbers; what is absent is left out.
 
     Raises:
-        TypeError: if the interaction is not an impact law.
-        ValueError: if the scene is a batch of scenes.
+        TypeError: if the interaction is neither an impact law nor a contact.
+        ValueError: if the scene is a batch of scenes, or its contact has what the format has no key for.
     """
-    law = impact_law_of(scene)
-    interaction = {"model": "law", **_numbers_of(law, "interaction")}
-    if law.delay is not None:
-        interaction["delay"] = _numbers_of(law.delay, "interaction.delay")
+    law = scene.interaction
     return {
         "cantilever": _numbers_of(scene.cantilever, "cantilever"),
         "platform": _numbers_of(scene.platform, "platform"),
-        "interaction": interaction,
+        "interaction": _law_table(law) if isinstance(law, ImpactLaw) else _contact_table(law),
     }
+
+
+def _law_table(law: ImpactLaw) -> dict[str, Any]:
+    table = {"model": "law", **_numbers_of(law, "interaction")}
+    if law.delay is not None:
+        table["delay"] = _numbers_of(law.delay, "interaction.delay")
+    return table
+
+
+def _contact_table(contact: Any) -> dict[str, Any]:
+    # only here, so that scenes with a law do without the contact's modules
+    from afm_jax.contact.contact import EFFECTS, Contact  # noqa: PLC0415
+    from afm_jax.scenefile_contact import contact_parameters  # noqa: PLC0415
+
+    if not isinstance(contact, Contact):
+        raise TypeError(f"a scene file holds an ImpactLaw or a Contact as interaction, not {type(contact).__name__}")
+    numbers = {key: _number_of(value, key) for key, value in contact_parameters(contact).items()}
+    return {"model": "contact", "effects": [name for name in EFFECTS if name in contact.effects], **numbers}
 
 
 def _numbers_of(part: Cantilever | Platform | ImpactLaw | CollisionDelay, table: str) -> dict[str, Any]:
@@ -132,8 +155,9 @@ def _tables(path: str | os.PathLike[str]) -> dict[str, SceneTable]:
     for name in ("cantilever", "platform", "interaction"):
         if name not in tables:
             raise SceneError(f"{printable(source)}: [{name}] is missing; add it with {', '.join(KEYS[name])}")
-    _check_model(tables["interaction"])
-    if "delay" in tables["interaction"].values:
+    model = _model_of(tables["interaction"])
+    tables["interaction"] = tables["interaction"]._replace(model=model)
+    if model == "law" and "delay" in tables["interaction"].values:
         tables["interaction.delay"] = _table(source, "interaction.delay", tables["interaction"].values["delay"])
     for table in tables.values():
         table.check_keys()
@@ -164,15 +188,14 @@ def _table(source: str, name: str, value: Any) -> SceneTable:
     return SceneTable(source, name, value)
 
 
-def _check_model(table: SceneTable) -> None:
-    """Look at the model first: the keys of a contact are not unknown, they are of another model."""
+def _model_of(table: SceneTable) -> str:
+    """Return the model, looked at first: it decides which keys are known."""
     model = table.values.get("model")
     if model is None:
-        table.fail('missing; add model = "law"', "model")
-    if model == "contact":
-        table.fail('this version simulates only the impact law; use model = "law" with r and epsilon', "model")
-    if model != "law":
-        table.fail('must be "law"', "model")
+        table.fail('missing; add model = "law" or model = "contact"', "model")
+    if model not in ("law", "contact"):
+        table.fail('must be "law" or "contact"', "model")
+    return model
 
 
 def _scene_of(tables: dict[str, SceneTable]) -> Scene:
@@ -181,10 +204,22 @@ def _scene_of(tables: dict[str, SceneTable]) -> Scene:
     cantilever = table.build(Cantilever, **cantilever_numbers)
     platform = _platform_of(tables["platform"], cantilever_numbers["frequency_khz"])
     table = tables["interaction"]
+    _start_of(tables)
+    if table.model == "contact":
+        return Scene(cantilever, platform, _contact_of(table))
     law = table.numbers(required=("r",), optional=("epsilon", "viscous_loss"))
     interaction = table.build(ImpactLaw, **law, delay=_delay_of(tables.get("interaction.delay")))
-    _start_of(tables)
     return Scene(cantilever, platform, interaction)
+
+
+def _contact_of(table: SceneTable) -> "Contact":
+    # only here, so that scenes with a law do without the contact's modules
+    from afm_jax.contact.contact import EFFECTS  # noqa: PLC0415
+    from afm_jax.scenefile_contact import make_contact  # noqa: PLC0415
+
+    effects = table.texts("effects")
+    numbers = table.numbers(optional=tuple(CONTACT_RANGES))
+    return table.build(make_contact, EFFECTS if effects is None else effects, numbers)
 
 
 def _platform_of(table: SceneTable, free_frequency_khz: float) -> Platform:

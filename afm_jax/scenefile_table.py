@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, NoReturn, TypeVar
 
-from afm_jax.scenefile_keys import KEYS, advise_key
+from afm_jax.scenefile_keys import advise_key, keys_of
 
 Built = TypeVar("Built")
 
@@ -19,11 +19,13 @@ class SceneTable(NamedTuple):
         source: the file's name, as it begins every message.
         name: the table's name, a key of `KEYS`.
         values: what it contains.
+        model: of the scene's interaction, "law" or "contact".
     """
 
     source: str
     name: str
     values: Mapping[str, Any]
+    model: str = "law"
 
     def fail(self, message: str, key: str | None = None) -> NoReturn:
         """Raise a `SceneError` that names the file, this table and the key."""
@@ -37,8 +39,8 @@ class SceneTable(NamedTuple):
             SceneError: at the first unknown key, with the one to use instead.
         """
         for key in self.values:
-            if key not in KEYS[self.name]:
-                self.fail(advise_key(self.name, key), key)
+            if key not in keys_of(self.name, self.model):
+                self.fail(advise_key(self.name, key, self.model), key)
 
     def numbers(self, *, required: tuple[str, ...] = (), optional: tuple[str, ...] = ()) -> dict[str, float]:
         """Return the numbers that the table has under these keys.
@@ -50,6 +52,22 @@ class SceneTable(NamedTuple):
             if key not in self.values:
                 self.fail("missing; add it", key)
         return {key: self._number(key) for key in (*required, *optional) if key in self.values}
+
+    def texts(self, key: str) -> list[str] | None:
+        """Return the list of texts that the table has under a key; None if the key is left out.
+
+        Raises:
+            SceneError: if there is something else.
+        """
+        value = self.values.get(key)
+        if value is None:
+            return None
+        if not isinstance(value, list):
+            self.fail(f'must be a list of texts, ["..."], but is {in_words(value)}', key)
+        for entry in value:
+            if not isinstance(entry, str):
+                self.fail(f"must be a list of texts, but one entry is {in_words(entry)}", key)
+        return value
 
     def build(self, kind: Callable[..., Built], *arguments: Any, **parameters: Any) -> Built:
         """Return `kind(*arguments, **parameters)`; what that finds wrong becomes an error of this table.

@@ -78,27 +78,34 @@ def fit_sweep(sweep: ResonanceSweep, background: str, noise: float | None, *, sc
     problem = SweepProblem(background, names, reference_khz=float(best[0]), width_khz=float(best[0] / best[1] / 2.0))
     objective = SweepObjective(points_of(sweep, reverse=reverse), kind, problem).with_errors(along, across)
     coordinates = _polished(objective, problem.coordinates(values))
-    largest = float(sweep.amplitude.max())
-    if sweep.amplitude_error is not None or noise is not None:
+    if sweep.amplitude_error is None and noise is None:
+        objective, coordinates, errors = _estimated(objective, coordinates, sweep, data)
+    else:
         factor = _misfit(objective, coordinates, data) if scale_errors else 1.0
         # A fit without any misfit keeps its errors.
         factor = factor if factor > 0.0 else 1.0
         objective = objective.with_errors(along * factor, across * factor)
         origin = "noise" if sweep.amplitude_error is None else "file"
-        typical = float(np.median(along)) * factor * largest
+        typical = float(np.median(along) * factor * sweep.amplitude.max())
         errors = PointErrors(origin, factor if scale_errors else None, typical, None)
-        return _finished(objective, coordinates, errors, reverse=reverse, data=data)
+    return _finished(objective, coordinates, errors, reverse=reverse, data=data)
+
+
+def _estimated(
+    objective: SweepObjective, coordinates: Float[np.ndarray, " p"], sweep: ResonanceSweep, data: int
+) -> tuple[SweepObjective, Float[np.ndarray, " p"], PointErrors]:
+    """Estimate the errors from the misfit and fit again, a few times over."""
     level = jitter = 0.0
     for _ in range(_ROUNDS):
-        objective, level, jitter = with_estimated_errors(objective, problem.values(coordinates), sweep.points)
+        values = objective.problem.values(coordinates)
+        objective, level, jitter = with_estimated_errors(objective, values, sweep.points)
         coordinates = _polished(objective, coordinates[None])
     # The two sums of squares are met, their weighted sum only nearly; a sweep without noise keeps its least errors.
     factor = _misfit(objective, coordinates, data) if level > SMALLEST else 1.0
     along, across = factor / np.asarray(objective.points.weight)[: sweep.points].T
-    objective = objective.with_errors(along, across)
-    jitter_hz = _HZ_PER_KHZ * jitter * factor if kind == "phase" else None
-    errors = PointErrors("estimated", None, level * factor * largest, jitter_hz)
-    return _finished(objective, coordinates, errors, reverse=reverse, data=data)
+    jitter_hz = _HZ_PER_KHZ * jitter * factor if objective.kind == "phase" else None
+    errors = PointErrors("estimated", None, float(level * factor * sweep.amplitude.max()), jitter_hz)
+    return objective.with_errors(along, across), coordinates, errors
 
 
 def refit(fit: SweepFit, sweep: ResonanceSweep, background: str) -> SweepFit:

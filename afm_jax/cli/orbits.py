@@ -68,10 +68,16 @@ def command(session: Session, scene: Path, order: int) -> None:
     admissible (its flight stays above the platform). With --out a table orbits.csv. Exit code 3 if none is admissible.
     """
     session.start_computing()
+    from afm_jax.impact.law import ImpactLaw  # noqa: PLC0415
     from afm_jax.impact.orbits import single_impact_orbits  # noqa: PLC0415
     from afm_jax.scenefile import load_scene, scene_tables  # noqa: PLC0415
 
     loaded = load_scene(scene)
+    if not isinstance(loaded.interaction, ImpactLaw):
+        raise ValueError(
+            f'{scene}: [interaction] model: orbits are found for model = "law" only; `afm-jax fit-law {scene}` gives the '
+            "law of a contact"
+        )
     try:
         with session.working("searching for orbits"):
             found = single_impact_orbits(loaded, order)

@@ -136,7 +136,7 @@ def _turns(contact: Contact, place: Junction, mass: Array, speeds: Array, spent:
     )
 
 
-def _judged(found: Collision, speed, exists, valid, finite=True) -> Collision:  # noqa: FBT002
+def _judged(found: Collision, speed: Array, exists: Array, valid: Array, finite: ArrayLike = True) -> Collision:  # noqa: FBT002
     """Return a collision with its outcome, and with zeros where there is none."""
     outcome = jnp.where(finite, found.outcome, CollisionOutcome.UNRESOLVED)
     outcome = jnp.where(exists, outcome, CollisionOutcome.NO_JUNCTION)

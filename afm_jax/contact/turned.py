@@ -18,7 +18,7 @@ from afm_jax.contact.passage_collocation import nodes_along
 
 _NODES = 48
 _SWEEPS = 12
-_ROUNDS = 3
+_ROUNDS = 2
 _SCAN = 256
 
 
@@ -56,10 +56,11 @@ def turn_in_bridge(
     bridge = bridge_of(contact)
     forms, breaks = contact.bridge_forms_nm, contact.bridge_breaks_nm
     total = 0.5 * mass * approach_speed**2 + bridge.potential(forms)
-    lost, gap, turns = spent, junction.forms_gap_nm, jnp.asarray(approach_speed > 0.0)
+    gap, turns = _turning_gap(bridge, forms, junction.forms_gap_nm, total - spent)
     for _ in range(_ROUNDS):
+        lost, _, _ = _cross(bridge, mass, forms, gap, total)
         gap, turns = _turning_gap(bridge, forms, junction.forms_gap_nm, total - lost)
-        lost, time_in, settled_in = _cross(bridge, mass, forms, gap, total)
+    lost, time_in, settled_in = _cross(bridge, mass, forms, gap, total)
     left = bridge.potential(gap)
     lost_out, time_out, settled_out = _cross(bridge, mass, gap, breaks, left)
     energy = left - bridge.potential(breaks) - lost_out
