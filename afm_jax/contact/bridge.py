@@ -1,6 +1,7 @@
 """The liquid bridge as its crossings need it: potential and damping, with everything computed once that can be."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -28,6 +29,14 @@ class Bridge(eqx.Module):
         """Return the potential of all static forces in aJ at a gap in nm."""
         terms = zip(self.static_kinds, self.static, strict=True)
         return sum((kind.potential_of(parts, gap) for kind, parts in terms), start=jnp.zeros_like(gap))
+
+    def force(self, gap: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return the force of all static forces in nN at a gap in nm."""
+        return -jax.jvp(self.potential, (gap,), (jnp.ones_like(gap),))[1]
+
+    def stiffness(self, gap: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return -dF/dD of all static forces in nN/nm at a gap in nm."""
+        return -jax.jvp(self.force, (gap,), (jnp.ones_like(gap),))[1]
 
     def damping(self, gap: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return the damping of all dissipative forces in nN us/nm at a gap in nm."""

@@ -164,7 +164,7 @@ def _in_blocks(one: Callable, contact: Contact, mass: Float[Array, "..."], speed
     rows = -(-size // BLOCK)
     # the last block is filled up with the last tip
     filled = [jnp.concatenate([column, jnp.broadcast_to(column[-1:], (rows * BLOCK - size,))]) for column in columns]
-    result = lax.map(block, [column.reshape(rows, BLOCK) for column in filled])
+    result = lax.map(jax.checkpoint(block), [column.reshape(rows, BLOCK) for column in filled])
     return jax.tree.map(lambda part: part.reshape(rows * BLOCK)[:size], result)
 
 
@@ -176,7 +176,9 @@ def _resolve(
     Where the numbers can be looked at, only those tips are computed again; inside `jit` all are, if any needs it.
     """
     if is_traced(resolved):
-        again = lax.cond(jnp.all(resolved), lambda: quick, lambda: _careful(contact, mass, speeds))
+        # recomputed in reverse mode: what many steps leave behind would not fit into memory
+        careful = jax.checkpoint(lambda: _careful(contact, mass, speeds))
+        again = lax.cond(jnp.all(resolved), lambda: quick, careful)
         return jax.tree.map(lambda fast, slow: jnp.where(resolved, fast, slow), quick, again)
     open_tips = np.flatnonzero(~np.asarray(resolved))
     if not open_tips.size:

@@ -5,6 +5,7 @@ The force of the bridge at a gap fixes the point of the JKR curve that bears it 
 one equation for the gap; the point found fixes where the JKR curve sits on the gap axis: depth = shift - gap.
 """
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -12,14 +13,16 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from afm_jax.contact.bridge import Bridge, bridge_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.forces import jkr
-from afm_jax.contact.forces.force import ForceSum
 from afm_jax.impact.implicit import implicit_root
 
 SMALLEST_GAP_NM = 0.01
 """The tangency is looked for between this gap and the one at which the bridge forms."""
-_POINTS = 48
+_POINTS = 28
+Tangent = tuple[Bridge, Float[Array, "..."], Float[Array, "..."]]
+"""The bridge and the JKR contact's units of load and depth."""
 
 
 class Junction(NamedTuple):
@@ -56,10 +59,11 @@ def find_junction(contact: Contact) -> Junction:
     Of several tangencies the one that an approaching tip meets with the bridge stiffening beyond the JKR contact is
     taken, at the largest gap; the spurious ones near the JKR pull-off cross the other way.
     """
-    forces, solid = contact.forces.static, contact.junction
-    found, exists = _tangency(lax.stop_gradient((forces, solid)), lax.stop_gradient(contact.bridge_forms_nm))
-    gap = jnp.exp(implicit_root(_excess_stiffness, found, (forces, solid)))
-    force = forces(gap)
+    forces, solid = bridge_of(contact), contact.junction
+    scales = solid.load_scale_nn, solid.depth_scale_nm
+    found, exists = _tangency(lax.stop_gradient((forces, *scales)), lax.stop_gradient(contact.bridge_forms_nm))
+    gap = jnp.exp(implicit_root(_excess_stiffness, found, (forces, *scales)))
+    force = forces.force(gap)
     root = jkr.root_of_load(force / solid.load_scale_nn)
     shift = gap + solid.depth_scale_nm * jkr.depth(root)
     breaks = shift - solid.pull_off_depth_nm
@@ -80,44 +84,68 @@ def find_junction(contact: Contact) -> Junction:
     )
 
 
-def _excess_stiffness(log_gap: Float[Array, "..."], model: tuple[ForceSum, jkr.Jkr]) -> Float[Array, "..."]:
+def _excess_stiffness(log_gap: Float[Array, "..."], model: Tangent) -> Float[Array, "..."]:
     """Return by how much the bridge is stiffer than the JKR contact that bears the same force, in nN/nm."""
-    forces, solid = model
+    bridge, load_scale, depth_scale = model
     gap = jnp.exp(log_gap)
-    cube = jkr.cube_of_load(forces(gap) / solid.load_scale_nn)
-    # dP/dDelta = (6 s^5 - 3 sqrt(6) s^2)/(4 s^3 - SLOPE)
-    elastic = jnp.cbrt(cube) ** 2 * (6.0 * cube - 3.0 * jnp.sqrt(6.0)) / (4.0 * cube - jkr.SLOPE)
-    return forces.stiffness(gap) - elastic * solid.load_scale_nn / solid.depth_scale_nm
+    return bridge.stiffness(gap) - jnp.cbrt(_elastic_cube(bridge.force(gap) / load_scale)) * load_scale / depth_scale
 
 
-def _tangency(model: tuple[ForceSum, jkr.Jkr], forms_nm: Float[Array, ""]) -> tuple[Array, Array]:
+def _elastic_cube(load: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the third power of the JKR contact's normalised stiffness dP/dDelta at a normalised load."""
+    cube = jkr.cube_of_load(load)
+    # dP/dDelta = s^2 (6 s^3 - 3 sqrt(6))/(4 s^3 - SLOPE); the cube spares the scan a hundred cube roots
+    share = (6.0 * cube - 3.0 * math.sqrt(6.0)) / (4.0 * cube - jkr.SLOPE)
+    return cube * cube * share * share * share
+
+
+def _tangency(model: Tangent, forms_nm: Float[Array, ""]) -> tuple[Array, Array]:
     """Return ln D_on and whether it exists: two nested scans for the sign change, then Newton's method."""
-    forces, solid = model
-
-    def scan(low, high):
-        points = low + (high - low) * jnp.linspace(0.0, 1.0, _POINTS, dtype=low.dtype)
-        gaps = jnp.exp(points)
-        borne = forces(gaps) > -1.5 * solid.load_scale_nn
-        excess = jnp.where(borne, _excess_stiffness(points, model), jnp.inf)
-        stiffer = excess > 0.0
-        crossing = stiffer[:-1] & ~stiffer[1:] & borne[:-1]
-        last = _POINTS - 2 - jnp.argmax(crossing[::-1])
-        # no crossing seen: it may hide where the excess is least among the gaps whose force the contact bears
-        least = jnp.argmin(jnp.where(forces.stiffness(gaps) > 0.0, excess, jnp.inf))
-        found = crossing.any()
-        left = jnp.where(found, last, jnp.maximum(least - 1, 0))
-        right = jnp.where(found, last + 1, jnp.minimum(least + 1, _POINTS - 1))
-        return points[left], points[right], found
-
     low = jnp.log(jnp.full_like(forms_nm, SMALLEST_GAP_NM))
-    low, high, _ = scan(low, jnp.maximum(jnp.log(forms_nm), low))
-    low, high, found = scan(low, high)
+    low, high, _ = _scan(model, low, jnp.maximum(jnp.log(forms_nm), low))
+    low, high, found = _scan(model, low, high)
 
     def newton(_, point):
         excess, slope = jax.jvp(lambda at: _excess_stiffness(at, model), (point,), (jnp.ones_like(point),))
         return jnp.clip(point - excess / jnp.where(slope == 0.0, 1.0, slope), low, high)
 
-    return lax.fori_loop(0, 5, newton, 0.5 * (low + high)), found
+    root = lax.fori_loop(0, 4, newton, 0.5 * (low + high))
+    return jnp.where(found, root, jnp.zeros_like(root)), found
+
+
+def _scan(model: Tangent, low: Float[Array, ""], high: Float[Array, ""]) -> tuple[Array, Array, Array]:
+    """Return the outermost interval of ln D where the bridge gets stiffer than the JKR contact, and if there is one.
+
+    Without one, the interval around the least excess of stiffness is returned: a narrow crossing may hide there.
+    """
+    bridge, load_scale, depth_scale = model
+    step = (high - low) / (_POINTS - 1)
+
+    def inward(carry, count):
+        softer_before, found, left, least, place = carry
+        point = high - step * count
+        gap = jnp.exp(point)
+        load = bridge.force(gap) / load_scale
+        stiffness = bridge.stiffness(gap) * depth_scale / load_scale
+        borne = load > -1.5
+        excess = stiffness * stiffness * stiffness - _elastic_cube(load)
+        stiffer = borne & (excess > 0.0)
+        crossing = stiffer & softer_before & ~found
+        close = borne & (stiffness > 0.0) & (excess < least)
+        carry = (
+            borne & ~stiffer,
+            found | crossing,
+            jnp.where(crossing, point, left),
+            jnp.where(close, excess, least),
+            jnp.where(close, point, place),
+        )
+        return carry, None
+
+    never = jnp.zeros_like(low, bool)
+    start = (never, never, low, jnp.full_like(low, jnp.inf), low)
+    # a loop rather than an array of points: what depends on the parameters alone is then computed once
+    (_, found, left, _, place), _ = lax.scan(inward, start, jnp.arange(_POINTS, dtype=low.dtype))
+    return jnp.where(found, left, place - step), jnp.where(found, left + step, place + step), found
 
 
 def _meniscus_fits(contact: Contact) -> Bool[Array, "..."]:

@@ -1,0 +1,136 @@
+"""`afm-jax collide [SCENE.toml] --speeds 12,15,20`: free tips through the contact."""
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from afm_jax.cli.contact_options import ContactOptions, chosen_contact, with_contact_options
+from afm_jax.cli.failures import NotValid
+from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.speeds import Speeds
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+COLUMNS = (
+    "approach_speed_nm_per_us",
+    "rebound_speed_nm_per_us",
+    "collision_delay_us",
+    "captured",
+    "outcome",
+    "time_in_contact_us",
+    "time_in_junction_us",
+    "deepest_gap_nm",
+    "bridge_hysteresis_aj",
+    "junction_hysteresis_aj",
+    "viscous_loss_aj",
+    "end_energy_aj",
+)
+"""What is told of a tip."""
+_SHOWN = 40
+
+
+@click.command()
+@with_contact_options
+@click.option(
+    "--speeds",
+    type=Speeds(),
+    metavar="LIST",
+    help="Approach speeds in nm/us: 12,15,20 or start:stop:step as 12:200:10 (with the stop where it fits), or both. "
+    "Left out: 20 speeds from 1.1 times the capture speed to 200.",
+)
+@click.option(
+    "--accuracy",
+    type=click.FloatRange(min=0.0, min_open=True),
+    default=1e-9,
+    show_default=True,
+    help="Wanted relative accuracy of the rebound speed.",
+)
+@click.option(
+    "--method",
+    type=click.Choice(("diffrax", "collocation")),
+    default="diffrax",
+    show_default=True,
+    help="How the way through the bridge is integrated.",
+)
+@with_session
+def command(
+    session: Session,
+    *,
+    contact_options: ContactOptions,
+    speeds: tuple[float, ...] | None,
+    accuracy: float,
+    method: str,
+) -> None:
+    """Let free tips collide with a sample at rest, through liquid bridge and solid junction.
+
+    The contact is the paper's, or that of SCENE.toml, changed by the options. Of every speed: rebound speed, collision
+    delay, whether the tip is captured, times, deepest gap, and where the energy went; and the capture speed. With
+    --out collide.csv, collide.json and collide.png. Captured tips are a result, even if all are; exit code 3 if the
+    integration does not resolve one.
+    """
+    session.start_computing()
+    from afm_jax.study.collisions import collisions  # noqa: PLC0415
+
+    contact, mass, description = chosen_contact(contact_options)
+    with session.working("colliding (the first run compiles for some seconds)"):
+        result = collisions(contact, speeds, mass, accuracy=accuracy, method=method)
+    rows = result.rows
+    payload = {
+        **{name: [row[name] for row in rows] for name in COLUMNS},
+        "capture_speed_nm_per_us": result.capture_speed_nm_per_us,
+        "capture_speed_reason": result.capture_speed_reason,
+        "junction": result.junction,
+        "contact": description,
+        "mass_ng": mass,
+        "settings": {"accuracy": accuracy, "method": method, "default_speeds": speeds is None},
+    }
+    session.write_table("collide.csv", rows, COLUMNS)
+    if session.out is not None:
+        from afm_jax.cli.strict_json import strict_json  # noqa: PLC0415
+        from afm_jax.plots.collisions import draw_collisions  # noqa: PLC0415
+
+        (session.out / "collide.json").write_text(strict_json(payload) + "\n", encoding="utf-8")
+        title = f"Collisions of a free tip of {mass:g} ng: {', '.join(description['effects'])}"
+        draw_collisions(rows, result.capture_speed_nm_per_us, session.out / "collide.png", title=title)
+        session.note(f"wrote {session.out / 'collide.json'} and {session.out / 'collide.png'}")
+    session.emit(payload, collision_table(rows), *sentences(payload))
+    if result.unresolved:
+        raise NotValid(f"{len(result.unresolved)} of {len(rows)} collisions: {result.unresolved[0]}")
+
+
+def collision_table(rows: list[dict[str, Any]]) -> "Table":
+    """Return the collisions as a table to print."""
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table(title="Collisions of a free tip with the sample at rest", title_justify="left")
+    headings = (("approach", "nm/us"), ("rebound", "nm/us"), ("delay", "us"), ("in junction", "us"))
+    headings += (("deepest gap", "nm"), ("bridge", "aJ lost"), ("junction", "aJ lost"), ("viscous", "aJ lost"))
+    for name, unit in headings:
+        table.add_column(f"{name}\n{unit}", justify="right")
+    table.add_column("outcome")
+    names = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us", "time_in_junction_us")
+    names += ("deepest_gap_nm", "bridge_hysteresis_aj", "junction_hysteresis_aj", "viscous_loss_aj")
+    for row in rows[:_SHOWN]:
+        table.add_row(*("-" if row[name] is None else f"{row[name]:.6g}" for name in names), row["outcome_name"])
+    return table
+
+
+def sentences(payload: dict[str, Any]) -> list[str]:
+    """Return what is said below the table: the capture speed, the junction, and what the outcomes mean."""
+    junction, speeds, captured = payload["junction"], payload["approach_speed_nm_per_us"], payload["captured"]
+    lines = []
+    if len(speeds) > _SHOWN:
+        lines.append(f"The first {_SHOWN} of {len(speeds)} collisions; --json and --out give all.")
+    lines += sorted(set(payload["outcome"]))
+    if all(captured):
+        lines.append("All of these tips are captured: faster ones may leave again.")
+    capture = payload["capture_speed_nm_per_us"]
+    lines.append(payload["capture_speed_reason"] or f"Capture speed: {capture:.6g} nm/us.")
+    lines.append(
+        f"The junction forms at a gap of {junction['forms_gap_nm']:.4g} nm and breaks at "
+        f"{junction['breaks_gap_nm']:.4g} nm; hysteresis takes {junction['hysteresis_aj']:.4g} aJ: "
+        f"{junction['bridge_hysteresis_aj']:.4g} in the bridge, {junction['junction_hysteresis_aj']:.4g} in the "
+        "junction."
+    )
+    return lines
