@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from fitting.calibration import calibrate
     from fitting.calibration_result import Calibration
+    from fitting.contact_delay import ContactDelay, fit_delay
+    from fitting.contact_law import ContactLaw, fit_law
     from fitting.law_fit import fit
     from fitting.resonance_sweep import ResonanceSweep, read_sweep
     from fitting.result import FitResult
@@ -18,11 +20,15 @@ else:
     _HOMES = {
         "AmplitudeTable": "fitting.table",
         "Calibration": "fitting.calibration_result",
+        "ContactDelay": "fitting.contact_delay",
+        "ContactLaw": "fitting.contact_law",
         "FitResult": "fitting.result",
         "ResonanceSweep": "fitting.resonance_sweep",
         "TableError": "fitting.table",
         "calibrate": "fitting.calibration",
         "fit": "fitting.law_fit",
+        "fit_delay": "fitting.contact_delay",
+        "fit_law": "fitting.contact_law",
         "read_sweep": "fitting.resonance_sweep",
         "read_table": "fitting.table",
         "write_table": "fitting.table",
@@ -38,11 +44,15 @@ else:
 __all__ = [
     "AmplitudeTable",
     "Calibration",
+    "ContactDelay",
+    "ContactLaw",
     "FitResult",
     "ResonanceSweep",
     "TableError",
     "calibrate",
     "fit",
+    "fit_delay",
+    "fit_law",
     "read_sweep",
     "read_table",
     "write_table",

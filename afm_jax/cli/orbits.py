@@ -74,8 +74,8 @@ def command(session: Session, scene: Path, order: int) -> None:
 
     loaded = load_scene(scene)
     if not isinstance(loaded.interaction, ImpactLaw):
-        raise ValueError(
-            f'{scene}: [interaction] model: orbits are found for model = "law" only; `afm-jax fit-law {scene}` gives the '
+        raise ValueError(  # noqa: TRY004
+            f'{scene}: [interaction] model: must be "law" here, but is "contact"; `afm-jax fit-law {scene}` gives the '
             "law of a contact"
         )
     try:

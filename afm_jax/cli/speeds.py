@@ -46,6 +46,24 @@ def parse_speeds(text: str) -> tuple[float, ...]:
     return tuple(speeds)
 
 
+def parse_speed_range(text: str) -> tuple[float, float]:
+    """Return the two speeds of `low:high`.
+
+    >>> parse_speed_range("12:150")
+    (12.0, 150.0)
+
+    Raises:
+        ValueError: if it is no rising pair of positive numbers.
+    """
+    ends = text.split(":")
+    if len(ends) != 2:
+        raise ValueError(f"`{text.strip()}` is no range")
+    low, high = _positive(ends[0], "lower end"), _positive(ends[1], "upper end")
+    if high <= low:
+        raise ValueError(f"`{text.strip()}` does not rise")
+    return low, high
+
+
 def _range(part: str) -> list[float]:
     ends = part.split(":")
     if len(ends) != 3:

@@ -7,7 +7,8 @@ class Setting(NamedTuple):
     """The numbers of steps and nodes of one collision; hashable, for it shapes the program.
 
     `rule` is "steps" (a Diffrax solver with fixed steps) or "collocation" (`sweeps` Picard sweeps at `inward` and
-    `outward` Gauss nodes). Without dissipation both are one quadrature.
+    `outward` Gauss nodes). Without dissipation both are one quadrature. `careful`: the short first pass of the way out
+    takes as many steps as the way itself.
     """
 
     rule: str
@@ -16,6 +17,7 @@ class Setting(NamedTuple):
     junction_nodes: int
     sweeps: int = 0
     solver: str = "Dopri8"
+    careful: bool = False
 
 
 SETTINGS = {
@@ -37,7 +39,7 @@ Accuracy a means an error of the rebound speed below a (relative) and of the del
 paper's contact from 1.1 times the capture speed to 200 nm/us (`afm-jax accuracy collide`).
 """
 
-CAREFUL = Setting("steps", 256, 256, 40)
+CAREFUL = Setting("steps", 256, 256, 40, careful=True)
 """For impacts that the quick setting does not resolve: strong dissipation, or a turning point close to the junction."""
 
 

@@ -77,8 +77,11 @@ def go_through(
         return way_through(bridge, mass, (outer, breaks), solid.energy_aj, margin, inward=False)
 
     # a short first pass tells how fast the tip is at the end, and so which variable takes the square root out
-    sweeps = 0 if bridge.conserves else 1
-    end = pass_by_collocation(way_out(jnp.full_like(start, 1e-3)), 6, sweeps).energy_aj
+    trial = way_out(jnp.full_like(start, 1e-3))
+    if setting.careful:
+        end = _pass(trial, setting).energy_aj
+    else:
+        end = pass_by_collocation(trial, 6, 0 if bridge.conserves else 1).energy_aj
     outward = _pass(way_out(margin_of(end, pull_out)), setting)
 
     drag_in, drag_out = (

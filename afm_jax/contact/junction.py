@@ -67,12 +67,12 @@ def find_junction(contact: Contact) -> Junction:
     root = jkr.root_of_load(force / solid.load_scale_nn)
     shift = gap + solid.depth_scale_nm * jkr.depth(root)
     breaks = shift - solid.pull_off_depth_nm
-    # where the junction outlives the bridge's range, the bridge counts as stretched as far as the junction holds
-    outer = jnp.maximum(breaks, contact.bridge_breaks_nm)
-    stretched = forces.potential(outer) - forces.potential(contact.bridge_forms_nm)
+    stretched = forces.potential(contact.bridge_breaks_nm) - forces.potential(contact.bridge_forms_nm)
+    # where the junction outlives the bridge, what it takes beyond the bridge's breaking is its own
+    regained = forces.potential(jnp.minimum(breaks, contact.bridge_breaks_nm)) - forces.potential(gap)
     elastic = solid.energy_scale_aj * (jkr.work(jkr.FOLD) - jkr.work(root))
     return Junction(
-        exists=exists & _meniscus_fits(contact),
+        exists=exists & (gap <= contact.bridge_forms_nm) & _meniscus_fits(contact),
         forms_gap_nm=gap,
         forms_root=root,
         shift_nm=shift,
@@ -80,7 +80,7 @@ def find_junction(contact: Contact) -> Junction:
         force_nn=force,
         stiffness_nn_per_nm=forces.stiffness(gap),
         bridge_hysteresis_aj=stretched,
-        junction_hysteresis_aj=elastic - (forces.potential(breaks) - forces.potential(gap)),
+        junction_hysteresis_aj=elastic - regained,
     )
 
 

@@ -4,12 +4,12 @@ import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
 from afm_jax.contact.capture import capture_speed
 from afm_jax.contact.collide import BLOCK, collide
-from afm_jax.contact.collision import Collision
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import find_junction
 from afm_jax.outcome import CollisionOutcome
@@ -65,8 +65,8 @@ def collisions(
     require_float64()
     capture = float(capture_speed(contact, mass_ng))
     chosen = default_speeds(capture) if speeds is None else np.asarray(speeds, dtype=float)
-    junction = find_junction(contact)
-    rows = _rows(collide_many(contact, chosen, mass_ng, accuracy=accuracy, method=method))
+    junction = _junction(contact)
+    rows = _rows(_collide_all(contact, chosen, mass_ng, accuracy=accuracy, method=method))
     numbers = {name: float(getattr(junction, name)) for name in (*junction._fields, "hysteresis_aj")}
     invalid = [row["outcome"] for row in rows if row["captured"] is None]
     return Collisions(
@@ -86,25 +86,27 @@ def default_speeds(capture_speed_nm_per_us: float) -> Float[np.ndarray, " n"]:
     return np.array([float(f"{speed:.4g}") for speed in speeds])
 
 
-def collide_many(
-    contact: Contact, speeds: Float[np.ndarray, " n"], mass_ng: float, *, accuracy: float = 1e-9, method: str
-) -> Collision:
-    """Return the collisions of any number of speeds, filled up to whole blocks so that one program serves all."""
+def _collide_all(
+    contact: Contact, speeds: Float[np.ndarray, " n"], mass_ng: float, *, accuracy: float, method: str
+) -> dict[str, list[Any]]:
+    """Return the fields of `Collision` of many speeds, filled up to whole blocks so that one program serves all."""
     size = BLOCK * -(-len(speeds) // BLOCK)
     filled = np.concatenate([speeds, np.full(size - len(speeds), speeds[-1])])
     found = collide(contact, filled, mass_ng, accuracy=accuracy, method=method)
-    return Collision(*(np.asarray(part)[: len(speeds)] for part in found))
+    return {name: part[: len(speeds)].tolist() for name, part in found._asdict().items()}
 
 
-def _rows(found: Collision) -> list[dict[str, Any]]:
-    columns = {name: part.tolist() for name, part in found._asdict().items()}
+_junction = eqx.filter_jit(find_junction)
+
+
+def _rows(columns: dict[str, list[Any]]) -> list[dict[str, Any]]:
     rows = []
     for values in zip(*columns.values(), strict=True):
         row = dict(zip(columns, values, strict=True))
         outcome = CollisionOutcome(row["outcome"])
         row |= {"outcome": outcome.sentence, "outcome_name": outcome.name.lower().replace("_", " ")}
         if outcome > CollisionOutcome.CAPTURED_BY_JUNCTION:
-            row |= {name: None for name in found._fields if name not in ("approach_speed_nm_per_us", "outcome")}
+            row |= {name: None for name in columns if name not in ("approach_speed_nm_per_us", "outcome")}
         elif row["captured"]:
             row |= dict.fromkeys(_ONLY_FREE)
         rows.append(row)

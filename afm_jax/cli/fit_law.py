@@ -1,0 +1,235 @@
+"""`afm-jax fit-law [SCENE.toml]`: the impact law and the delay law of a simulated contact."""
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from afm_jax.cli.contact_options import ContactOptions, chosen_contact, with_contact_options
+from afm_jax.cli.failures import NotValid
+from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.speeds import parse_speed_range
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from fitting.contact_delay import ContactDelay
+    from fitting.contact_law import ContactLaw
+
+MODEL_KEYS = (
+    "model",
+    "r",
+    "epsilon",
+    "viscous_loss",
+    "worst_relative_error",
+    "rms_relative_error",
+    "worst_error_nm_per_us",
+    "rms_error_nm_per_us",
+    "worst_share_of_top_speed",
+    "capture_speed_nm_per_us",
+    "converged",
+)
+"""What is told of a model: attributes of `ContactLaw`."""
+DELAY_COLUMNS = (
+    "approach_speed_nm_per_us",
+    "rebound_speed_nm_per_us",
+    "delay_us",
+    "lag_us",
+    "lead_us",
+    "fitted_us",
+)
+"""What is told of the delay at a speed: attributes of `ContactDelay`."""
+_SHOWN = 9
+
+
+class SpeedRange(click.ParamType):
+    """Two speeds, low:high."""
+
+    name = "range"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
+        """Return the two speeds.
+
+        Raises:
+            click.BadParameter: if it is no rising pair of positive numbers.
+        """
+        if isinstance(value, tuple):
+            return value
+        try:
+            return parse_speed_range(str(value))
+        except ValueError as error:
+            self.fail(f"{error}; write low:high, as 12:150", param, ctx)
+
+
+@click.command()
+@with_contact_options
+@click.option(
+    "--speed-range",
+    type=SpeedRange(),
+    metavar="LOW:HIGH",
+    help="Approach speeds of the fit in nm/us. Left out: 1.5 times the capture speed to 250.",
+)
+@click.option(
+    "--delay-range",
+    type=SpeedRange(),
+    metavar="LOW:HIGH",
+    help="The same for the delay law. Left out: 1.37 times the capture speed to 700.",
+)
+@click.option(
+    "--residuals",
+    type=click.Choice(("relative", "absolute")),
+    default="relative",
+    show_default=True,
+    help="What is made small: u_fit/u_out - 1 or u_fit - u_out.",
+)
+@click.option(
+    "--points", type=click.IntRange(min=10, max=100_000), default=512, show_default=True, help="Number of speeds."
+)
+@with_session
+def command(
+    session: Session,
+    *,
+    contact_options: ContactOptions,
+    speed_range: tuple[float, float] | None,
+    delay_range: tuple[float, float] | None,
+    residuals: str,
+    points: int,
+) -> None:
+    """Fit the impact law and the delay law to a simulated contact.
+
+    Three laws of the rebound speed, at uniform speeds: the paper's (r and epsilon), a viscous one (epsilon and a loss
+    linear in speed), and all three. Beside them the collision delay, its lag (time in the solid junction) and lead
+    (the rest), and the compact delay law. The contact is the paper's, or that of SCENE.toml, changed by the options.
+    With --out fit_law.csv, fit_delay.csv, fit_law.json, fit_law.png.
+    """
+    session.start_computing()
+    from fitting.contact_delay import fit_delay  # noqa: PLC0415
+    from fitting.contact_law import FREE, fit_law  # noqa: PLC0415
+
+    contact, mass, description = chosen_contact(contact_options)
+    with session.working("fitting (the first run compiles for some seconds)"):
+        laws = [
+            fit_law(contact, speed_range=speed_range, model=model, residuals=residuals, mass_ng=mass, points=points)
+            for model in FREE
+        ]
+        delay = fit_delay(contact, speed_range=delay_range, mass_ng=mass, points=points)
+    payload = {
+        "residuals": residuals,
+        "speed_range_nm_per_us": laws[0].speed_range,
+        "points": points,
+        "models": [{name: getattr(law, name) for name in MODEL_KEYS} for law in laws],
+        "contact_capture_speed_nm_per_us": laws[0].contact_capture_speed_nm_per_us,
+        "delay": delay_payload(delay),
+        "contact": description,
+        "mass_ng": mass,
+    }
+    session.write_table("fit_law.csv", *law_rows(laws))
+    session.write_table("fit_delay.csv", _delay_rows(delay), DELAY_COLUMNS)
+    if session.out is not None:
+        from afm_jax.cli.strict_json import strict_json  # noqa: PLC0415
+        from fitting.contact_law_plot import draw_contact_law  # noqa: PLC0415
+
+        (session.out / "fit_law.json").write_text(strict_json(payload) + "\n", encoding="utf-8")
+        draw_contact_law(laws, delay, session.out / "fit_law.png")
+        session.note(f"wrote {session.out / 'fit_law.json'} and {session.out / 'fit_law.png'}")
+    session.emit(payload, law_table(laws), *law_sentences(laws), "", delay_table(delay), *delay_sentences(delay))
+    lost = [law.model for law in laws if not law.converged]
+    if lost:
+        raise NotValid(f"the fit of {', '.join(lost)} did not converge; try another --speed-range")
+
+
+def delay_payload(delay: "ContactDelay") -> dict[str, Any]:
+    """Return the delay law, its errors, and delay, lag and lead at a few speeds."""
+    shown = _thinned(delay)
+    return {
+        "hertz": delay.delay.hertz,
+        "lead_nm": delay.delay.lead_nm,
+        "offset_nm": delay.delay.offset_nm,
+        "rms_us": delay.rms_us,
+        "worst_us": delay.worst_us,
+        "speed_range_nm_per_us": delay.speed_range,
+        **{name: [row[name] for row in shown] for name in DELAY_COLUMNS},
+    }
+
+
+def law_rows(laws: Sequence["ContactLaw"]) -> tuple[list[dict[str, float]], tuple[str, ...]]:
+    """Return contact and laws speed by speed as rows, and their columns."""
+    columns = {
+        "approach_speed_nm_per_us": laws[0].approach_speed_nm_per_us,
+        "rebound_speed_nm_per_us": laws[0].rebound_speed_nm_per_us,
+        **{f"{law.model}_speed_nm_per_us": law.fitted_speed_nm_per_us for law in laws},
+        **{f"{law.model}_relative_error": law.relative_error for law in laws},
+    }
+    lists = [column.tolist() for column in columns.values()]
+    return [dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)], tuple(columns)
+
+
+def _delay_rows(delay: "ContactDelay") -> list[dict[str, float]]:
+    lists = [getattr(delay, name).tolist() for name in DELAY_COLUMNS]
+    return [dict(zip(DELAY_COLUMNS, row, strict=True)) for row in zip(*lists, strict=True)]
+
+
+def _thinned(delay: "ContactDelay") -> list[dict[str, float]]:
+    """Return a few rows, first and last among them."""
+    rows = _delay_rows(delay)
+    return [rows[round(place * (len(rows) - 1) / (_SHOWN - 1))] for place in range(_SHOWN)]
+
+
+def law_table(laws: Sequence["ContactLaw"]) -> "Table":
+    """Return the laws as a table to print."""
+    from rich.table import Table  # noqa: PLC0415
+
+    low, high = laws[0].speed_range
+    title = f"u_out^2 = r^2 u_in^2 - c u_in - epsilon from {low:.5g} to {high:.5g} nm/us, {laws[0].residuals} residuals"
+    table = Table(title=title, title_justify="left")
+    table.add_column("law")
+    headings = (("r", ""), ("epsilon", "nm^2/us^2"), ("c", "nm/us"), ("worst error", "%"), ("rms error", "%"))
+    headings += (("worst error", "nm/us"), ("of top speed", "%"), ("capture speed", "nm/us"))
+    for name, unit in headings:
+        table.add_column(f"{name}\n{unit}", justify="right")
+    for law in laws:
+        errors = (100.0 * law.worst_relative_error, 100.0 * law.rms_relative_error, law.worst_error_nm_per_us)
+        shares = (100.0 * law.worst_share_of_top_speed, law.capture_speed_nm_per_us)
+        numbers = (f"{number:.3g}" for number in errors)
+        table.add_row(
+            law.model,
+            f"{law.r:.5f}",
+            f"{law.epsilon:.5g}",
+            f"{law.viscous_loss:.3g}",
+            *numbers,
+            f"{shares[0]:.2g}",
+            f"{shares[1]:.5g}",
+        )
+    return table
+
+
+def law_sentences(laws: Sequence["ContactLaw"]) -> list[str]:
+    """Return what is said below the laws."""
+    return [
+        f"Capture speed of the contact: {laws[0].contact_capture_speed_nm_per_us:.6g} nm/us.",
+        "law: the paper's eq. 6; viscous: r = 1 and a loss c linear in speed; full: all three.",
+    ]
+
+
+def delay_table(delay: "ContactDelay") -> "Table":
+    """Return the delay at a few speeds as a table to print."""
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table(title="Collision delay = lag - lead", title_justify="left")
+    for name in ("approach\nnm/us", "rebound\nnm/us", "delay\nus", "lag\nus", "lead\nus", "delay law\nus"):
+        table.add_column(name, justify="right")
+    for row in _thinned(delay):
+        speeds, times = list(row.values())[:2], list(row.values())[2:]
+        table.add_row(*(f"{value:.5g}" for value in speeds), *(f"{value:.4f}" for value in times))
+    return table
+
+
+def delay_sentences(delay: "ContactDelay") -> list[str]:
+    """Return what is said below the delays."""
+    law, (low, high) = delay.delay, delay.speed_range
+    values = ", ".join(f"{name} {float(getattr(law, name)):.4g}" for name in ("hertz", "lead_nm", "offset_nm"))
+    errors = f"rms error {delay.rms_us:.2g} us, worst {delay.worst_us:.2g} us"
+    return [
+        "lag: time in the solid junction; lead: what straight paths to gap 0 would take longer outside it.",
+        f"Delay law: {values}; {errors}, from {low:.4g} to {high:.4g} nm/us.",
+    ]

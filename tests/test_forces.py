@@ -1,0 +1,163 @@
+"""Every force against its formula in mpmath, and its potential against the force; sums; bad parameters."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from afm_jax.contact.forces import (
+    Capillary,
+    CoreRepulsion,
+    Dmt,
+    ForceSum,
+    Hertz,
+    Jkr,
+    Liquid,
+    Structural,
+    VanDerWaals,
+    Viscous,
+)
+from afm_jax.contact.forces import jkr as jkr_formulas
+from tests.reference_contact_forces import ContactParameters, constants, static_force, static_potential
+
+GAPS = (0.11, 0.2, 0.7, 1.3, 3.1, 6.0)
+STATIC = {
+    "capillary": Capillary(),
+    "structural": Structural(),
+    "core": CoreRepulsion(),
+    "van der Waals": VanDerWaals(),
+    "Hertz": Hertz(contact_gap_nm=0.9),
+    "DMT": Dmt(contact_gap_nm=0.9),
+}
+
+
+@pytest.mark.parametrize("name", ["capillary", "structural", "core"])
+@pytest.mark.parametrize("humidity", [0.01, 0.5, 0.99])
+def test_forces_of_the_paper_are_their_formulas_in_mpmath(name, humidity):
+    liquid = Liquid(relative_humidity=humidity)
+    force = {"capillary": Capillary(liquid=liquid), "structural": Structural(liquid=liquid), "core": CoreRepulsion()}[
+        name
+    ]
+    reference = constants(ContactParameters(relative_humidity=humidity, effects=(name,)))
+    for gap in GAPS:
+        # a handful of rounded operations; r_K near saturation carries the logarithm's own 1/ln(p/p_s)
+        assert float(force(gap)) == pytest.approx(float(static_force(reference, gap)), rel=3e-14)
+    levels = [float(force.potential(gap)) for gap in GAPS]
+    expected = [float(static_potential(reference, gap)) for gap in GAPS]
+    # potentials are compared by differences: each side is free to choose its zero
+    np.testing.assert_allclose(np.diff(levels), np.diff(expected), rtol=1e-12, atol=1e-13)
+
+
+@pytest.mark.parametrize("name", STATIC)
+def test_the_force_is_minus_the_slope_of_the_potential(name):
+    force = STATIC[name]
+    for low, high in itertools.pairwise(GAPS):
+        parts = [low, *(gap for gap in (0.9,) if low < gap < high), high]
+        work = float(mpmath.quad(lambda gap: float(force(float(gap))), parts))
+        # quadrature of a float64 function
+        assert float(force.potential(low) - force.potential(high)) == pytest.approx(work, rel=1e-9, abs=1e-12)
+
+
+@pytest.mark.parametrize("name", STATIC)
+def test_stiffness_is_minus_the_slope_of_the_force(name):
+    force = STATIC[name]
+    for gap in GAPS:
+        step = 1e-6 * gap
+        slope = (float(force(gap + step)) - float(force(gap - step))) / (2.0 * step)
+        # central differences of float64 values
+        assert float(force.stiffness(gap)) == pytest.approx(-slope, rel=1e-7, abs=1e-7)
+
+
+def test_closed_forms_of_the_further_forces():
+    # sphere and plane: H R/(6 D^2); K sqrt(R) depth^1.5; 2 pi w R at pull-off
+    assert float(VanDerWaals(hamaker_constant_aj=0.1, tip_radius_nm=60.0)(2.0)) == pytest.approx(-0.25, rel=1e-15)
+    assert float(Hertz(modulus_gpa=2.0, tip_radius_nm=25.0)(-0.09)) == pytest.approx(2.0 * 5.0 * 0.027, rel=1e-14)
+    assert float(Hertz()(0.5)) == 0.0
+    dmt = Dmt(adhesion_energy_j_per_m2=0.05, tip_radius_nm=10.0, contact_gap_nm=0.2)
+    assert float(dmt(0.2)) == pytest.approx(-2.0 * np.pi * 0.5, rel=1e-15)
+    assert float(dmt(0.4)) == pytest.approx(-2.0 * np.pi * 0.5 / 4.0, rel=1e-15)
+    # DMT and van der Waals join when H = 12 pi w D_0^2
+    attraction = VanDerWaals(hamaker_constant_aj=12.0 * np.pi * 0.05 * 0.04, tip_radius_nm=10.0)
+    assert float(dmt(0.7)) == pytest.approx(float(attraction(0.7)), rel=1e-14)
+
+
+def test_viscous_force_of_water_is_the_number_of_the_unit_page():
+    # physics.md: 0.047360 nN (dD/dt in nm/us)/(D in nm)
+    assert float(Viscous()(2.0, 3.0)) == pytest.approx(-0.047360 * 1.5, rel=1.1e-5)  # five digits are printed
+    assert float(Viscous()(2.0, -3.0)) > 0.0
+
+
+def test_kelvin_radius_is_054_nm_over_ln_2():
+    assert float(Liquid().kelvin_radius_nm) == pytest.approx(0.54 / np.log(2.0), rel=1e-6)  # V_m has 6 digits
+
+
+@given(
+    st.permutations([Capillary(), Structural(), CoreRepulsion(), Viscous()]),
+    st.floats(0.1, 5.0),
+    st.floats(-99.0, 99.0),
+)
+def test_a_sum_does_not_depend_on_order_or_brackets(forces, gap, rate):
+    a, b, c, d = forces
+    left, right = ((a + b) + c) + d, a + (b + (c + d))
+    assert isinstance(left, ForceSum)
+    assert left.terms == right.terms
+    expected = sum(float(force(gap, rate)) for force in forces)
+    size = sum(abs(float(force(gap, rate))) for force in forces)
+    assert float(left(gap, rate)) == pytest.approx(expected, rel=0, abs=4e-16 * size * 4)
+    assert len(left.static.terms) == 3
+    assert len(left.dissipative.terms) == 1
+
+
+@given(st.floats(jkr_formulas.FOLD + 1e-6, 30.0))
+def test_the_quartic_is_inverted_in_closed_form(s):
+    with mpmath.workdps(40):
+        exact = mpmath.mpf(s) ** 4 - 2 * mpmath.sqrt(6) / 3 * s
+        back = float(jkr_formulas.root_of_depth(float(exact)))
+    # near the fold the root is a square root of the depth: half of the digits
+    assert back == pytest.approx(s, rel=4e-15 + 3e-16 / (s - jkr_formulas.FOLD))
+
+
+def test_jkr_at_its_fold_and_at_its_largest_tension():
+    solid = Jkr()
+    assert float(solid.force(solid.pull_off_depth_nm)) == pytest.approx(
+        -5.0 / 6.0 * float(solid.load_scale_nn), rel=1e-7
+    )
+    # load control: -3/2 pi w R where s^3 = sqrt(6)/2
+    deepest = float(jkr_formulas.load((6.0**0.5 / 2.0) ** (1.0 / 3.0)))
+    assert deepest == pytest.approx(-1.5, rel=1e-15)
+    assert jnp.isfinite(jax.grad(solid.force)(solid.pull_off_depth_nm + 1e-9))
+    for depth in (-0.1, 0.0, 0.5, 4.0):
+        work = float(mpmath.quad(lambda d: float(solid.force(float(d))), [-0.15, depth]))
+        rise = float(solid.potential(depth) - solid.potential(-0.15))
+        assert rise == pytest.approx(work, rel=1e-8, abs=1e-10)
+
+
+def test_adhesionless_limit_of_jkr_is_hertz():
+    soft = Jkr(adhesion_energy_j_per_m2=1e-9)
+    # the first correction is (depth scale/depth)^(3/4)
+    assert float(soft.force(2.0)) == pytest.approx(float(Hertz()(-2.0)), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: Liquid(relative_humidity=1.0), "`relative_humidity` must be between 0 and 1, but is 1"),
+        (lambda: Liquid(temperature_k=-3.0), "`temperature_k` must be positive"),
+        (lambda: Capillary(tip_radius_nm=0.0), "`tip_radius_nm` must be positive"),
+        (
+            lambda: Structural(liquid=Liquid(relative_humidity=0.995)),
+            "Kelvin radius of 107.7 nm, more than the tip radius",
+        ),
+        (lambda: CoreRepulsion(constant_aj_nm6=float("nan")), "`constant_aj_nm6` must be positive"),
+        (lambda: Viscous(viscosity_pa_s=-1e-3), "`viscosity_pa_s` must not be negative"),
+        (lambda: Jkr(modulus_gpa=0.0), "`modulus_gpa` must be positive"),
+    ],
+)
+def test_impossible_parameters_are_named(make, said):
+    with pytest.raises(ValueError, match=said):
+        make()
