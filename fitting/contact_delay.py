@@ -87,7 +87,7 @@ def fit_delay(
     low, high = range_above_capture(speed_range, float(capture_speed(contact, mass_ng)), LOWEST_SPEED, TOP_SPEED)
     found = rebounds(contact, np.geomspace(low, high, points), mass_ng)
     names = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us", "time_in_junction_us")
-    approach, rebound, delay, lag = (np.asarray(getattr(found, name)) for name in names)
+    approach, rebound, delay, lag = (found[name] for name in names)
     terms = np.stack([approach**-0.2, 1.0 / approach - 1.0 / rebound, -1.0 / approach], axis=1)
     values, *_ = np.linalg.lstsq(terms, delay, rcond=None)
     return ContactDelay(

@@ -12,11 +12,10 @@ from jaxtyping import Float
 from scipy.optimize import OptimizeResult, least_squares, nnls
 
 from afm_jax.contact.capture import capture_speed
-from afm_jax.contact.collide import collide
-from afm_jax.contact.collision import Collision
 from afm_jax.contact.contact import Contact
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.parameters import require_float64
+from afm_jax.study.collisions import collide_in_blocks
 
 FREE = {"law": ("r", "epsilon"), "viscous": ("epsilon", "viscous_loss"), "full": ("r", "epsilon", "viscous_loss")}
 """For every model the parameters that are fitted; the others are r = 1 and no viscous loss."""
@@ -153,8 +152,8 @@ def fit_law(
         raise ValueError(f"`points` must be at least the number of parameters, {len(FREE[model])}, but is {points}")
     capture = float(capture_speed(contact, mass_ng))
     low, high = range_above_capture(speed_range, capture, LOWEST_SPEED, TOP_SPEED)
-    found = rebounds(contact, np.linspace(low, high, points), mass_ng)
-    approach, rebound = (np.asarray(part) for part in (found.approach_speed_nm_per_us, found.rebound_speed_nm_per_us))
+    approach = np.linspace(low, high, points)
+    rebound = rebounds(contact, approach, mass_ng)["rebound_speed_nm_per_us"]
     law, converged = closest_law(approach, rebound, model, residuals)
     return ContactLaw(
         model=model,
@@ -215,14 +214,14 @@ def closest_law(
     return ImpactLaw(r=math.sqrt(max(1.0 - loss, 1e-12)), epsilon=epsilon, viscous_loss=viscous_loss), found.status > 0
 
 
-def rebounds(contact: Contact, speeds: Float[np.ndarray, " n"], mass_ng: float) -> Collision:
-    """Return the collisions of tips that all leave.
+def rebounds(contact: Contact, speeds: Float[np.ndarray, " n"], mass_ng: float) -> dict[str, np.ndarray]:
+    """Return the fields of `Collision` for tips that all leave.
 
     Raises:
         ValueError: if one is captured, or not resolved.
     """
-    found = collide(contact, speeds, mass_ng)
-    stays = np.flatnonzero(np.asarray(found.captured) | (np.asarray(found.rebound_speed_nm_per_us) <= 0.0))
+    found = collide_in_blocks(contact, speeds, mass_ng)
+    stays = np.flatnonzero(~(found["rebound_speed_nm_per_us"] > 0.0))
     if stays.size:
         raise ValueError(
             f"`speed_range` must hold rebounding tips only, but the one of {speeds[stays[-1]]:.6g} nm/us does not leave"

@@ -123,9 +123,9 @@ def sentences(payload: dict[str, Any]) -> list[str]:
     if len(speeds) > _SHOWN:
         lines.append(f"The first {_SHOWN} of {len(speeds)} collisions; --json and --out give all.")
     lines += sorted(set(payload["outcome"]))
-    if all(captured):
-        lines.append("All of these tips are captured: faster ones may leave again.")
     capture = payload["capture_speed_nm_per_us"]
+    if all(captured):
+        lines.append(f"All of these tips are captured{'; faster ones leave again' if capture else ''}.")
     lines.append(payload["capture_speed_reason"] or f"Capture speed: {capture:.6g} nm/us.")
     lines.append(
         f"The junction forms at a gap of {junction['forms_gap_nm']:.4g} nm and breaks at "

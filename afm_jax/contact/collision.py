@@ -78,21 +78,24 @@ def go_through(
 
     # a short first pass tells how fast the tip is at the end, and so which variable takes the square root out
     trial = way_out(jnp.full_like(start, 1e-3))
-    if setting.careful:
+    if bridge.conserves:
+        end = trial.total_aj - trial.end_potential_aj
+    elif setting.careful:
         end = _pass(trial, setting).energy_aj
     else:
-        end = pass_by_collocation(trial, 6, 0 if bridge.conserves else 1).energy_aj
+        end = pass_by_collocation(trial, 6, 1).energy_aj
     outward = _pass(way_out(margin_of(end, pull_out)), setting)
 
-    drag_in, drag_out = (
-        bridge.damping(gap) * gap * jnp.sqrt(2.0 * jnp.maximum(pull, 0.0) / mass)
+    # at an end that pulls, a slow tip's drag must be small against the pull for the substitution to hold
+    calm_in, calm_out = (
+        (pull <= 0.0) | (bridge.damping(gap) * gap * jnp.sqrt(2.0 * jnp.maximum(pull, 0.0) / mass) <= 0.1 * pull)
         for gap, pull in ((forms, pull_in), (outer, pull_out))
     )
-    # Few steps are enough where dissipation is small against the energies along the way, where a slow tip's drag is
-    # small against the pull at the outer end, and where no repulsion almost stops the tip inside the bridge.
+    # Few steps are enough where dissipation is small against the energies along the way and no repulsion almost stops
+    # the tip inside the bridge.
     reach = jnp.minimum(start + jnp.maximum(pull_in, 0.0), inward.energy_aj)
-    easy_in = (inward.dissipated_aj < 0.2 * reach) & (inward.energy_aj > 0.1 * start) & (drag_in <= 0.1 * pull_in)
-    easy_out = (outward.dissipated_aj < 0.2 * solid.energy_aj) & (drag_out <= 0.1 * pull_out)
+    easy_in = (inward.dissipated_aj < 0.2 * reach) & (inward.energy_aj > 0.1 * start) & calm_in
+    easy_out = (outward.dissipated_aj < 0.2 * solid.energy_aj) & calm_out
     return Ways(inward, solid, outward, outer, easy_in & (easy_out | (solid.energy_aj <= 0.0)))
 
 

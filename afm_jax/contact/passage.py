@@ -68,8 +68,8 @@ class Way(NamedTuple):
         moving = kinetic > 0.0
         speed = jnp.sqrt(jnp.where(moving, kinetic * self.twice_inverse_mass, 1.0))
         path = 2.0 * y * gap
-        loss = jnp.where(moving, path * self.bridge.damping(gap) * speed, 0.0)
-        return loss, jnp.where(moving, path / speed, 0.0)
+        drag = path * self.bridge.damping(gap) * speed if not self.bridge.conserves else jnp.zeros_like(path)
+        return jnp.where(moving, drag, 0.0), jnp.where(moving, path / speed, 0.0)
 
     def end(self, dissipated: Float[Array, "..."], time: Float[Array, "..."]) -> Passage:
         """Return the passage that dissipates so much and takes so long."""

@@ -4,6 +4,7 @@ from functools import cache
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from afm_jax.contact.passage import Passage, Way
@@ -18,6 +19,8 @@ def pass_by_collocation(way: Way, nodes: int, sweeps: int) -> Passage:
         sweeps: how often the dissipation is recomputed from the speeds that it leaves.
     """
     length = way.length
+    if way.bridge.conserves:
+        return way.end(jnp.zeros_like(length), _time_alone(way, nodes))
     points, weights, cumulative = nodes_along(nodes, length)
     y, gap = way.place(length * points)
     available = way.available_aj(gap)
@@ -27,6 +30,18 @@ def pass_by_collocation(way: Way, nodes: int, sweeps: int) -> Passage:
         spent = length * jnp.tensordot(cumulative, losses, axes=1)
     losses, times = way.rates(y, gap, available - spent)
     return way.end(length * jnp.tensordot(weights, losses, axes=1), length * jnp.tensordot(weights, times, axes=1))
+
+
+def _time_alone(way: Way, nodes: int) -> Float[Array, "..."]:
+    """Return the time of a way without dissipation: one quadrature, its nodes in a loop of one small body."""
+    points, weights, _ = gauss_nodes(nodes)
+
+    def add(total, node):
+        y, gap = way.place(way.length * node[0])
+        return total + node[1] * way.rates(y, gap, way.available_aj(gap))[1], None
+
+    pairs = jnp.asarray(np.stack([points, weights], axis=1), way.length.dtype)
+    return way.length * lax.scan(add, jnp.zeros_like(way.length), pairs)[0]
 
 
 def nodes_along(

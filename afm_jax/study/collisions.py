@@ -18,8 +18,8 @@ from afm_jax.parameters import require_float64
 _POINTS = 20
 _TOP_SPEED = 200.0
 _ONLY_FREE = ("rebound_speed_nm_per_us", "collision_delay_us", "time_in_contact_us", "time_in_junction_us")
-# a captured tip loses only a part of them
-_ONLY_FREE += ("bridge_hysteresis_aj", "junction_hysteresis_aj")
+# a captured tip stops before it has lost all of that
+_ONLY_FREE += ("bridge_hysteresis_aj", "junction_hysteresis_aj", "viscous_loss_aj")
 
 
 class Collisions(NamedTuple):
@@ -66,7 +66,7 @@ def collisions(
     capture = float(capture_speed(contact, mass_ng))
     chosen = default_speeds(capture) if speeds is None else np.asarray(speeds, dtype=float)
     junction = _junction(contact)
-    rows = _rows(_collide_all(contact, chosen, mass_ng, accuracy=accuracy, method=method))
+    rows = _rows(collide_in_blocks(contact, chosen, mass_ng, accuracy=accuracy, method=method))
     numbers = {name: float(getattr(junction, name)) for name in (*junction._fields, "hysteresis_aj")}
     invalid = [row["outcome"] for row in rows if row["captured"] is None]
     return Collisions(
@@ -86,20 +86,30 @@ def default_speeds(capture_speed_nm_per_us: float) -> Float[np.ndarray, " n"]:
     return np.array([float(f"{speed:.4g}") for speed in speeds])
 
 
-def _collide_all(
-    contact: Contact, speeds: Float[np.ndarray, " n"], mass_ng: float, *, accuracy: float, method: str
-) -> dict[str, list[Any]]:
-    """Return the fields of `Collision` of many speeds, filled up to whole blocks so that one program serves all."""
+def collide_in_blocks(
+    contact: Contact,
+    speeds: Float[np.ndarray, " n"],
+    mass_ng: float = 1.0,
+    *,
+    accuracy: float = 1e-9,
+    method: str = "diffrax",
+) -> dict[str, np.ndarray]:
+    """Return the fields of `Collision` of many speeds, filled up to whole blocks so that one program serves all.
+
+    Raises:
+        ValueError: as `collide`.
+    """
     size = BLOCK * -(-len(speeds) // BLOCK)
     filled = np.concatenate([speeds, np.full(size - len(speeds), speeds[-1])])
     found = collide(contact, filled, mass_ng, accuracy=accuracy, method=method)
-    return {name: part[: len(speeds)].tolist() for name, part in found._asdict().items()}
+    return {name: np.asarray(part)[: len(speeds)] for name, part in found._asdict().items()}
 
 
 _junction = eqx.filter_jit(find_junction)
 
 
-def _rows(columns: dict[str, list[Any]]) -> list[dict[str, Any]]:
+def _rows(found: dict[str, np.ndarray]) -> list[dict[str, Any]]:
+    columns = {name: part.tolist() for name, part in found.items()}
     rows = []
     for values in zip(*columns.values(), strict=True):
         row = dict(zip(columns, values, strict=True))

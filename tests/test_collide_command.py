@@ -1,0 +1,247 @@
+"""`afm-jax collide`: its numbers against 30 digits and closed forms, its output, and how it ends."""
+
+import csv
+import inspect
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from matplotlib.image import imread
+
+from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, save_scene
+from afm_jax.cli.collide import COLUMNS
+from afm_jax.cli.contact_options import PARAMETERS
+from afm_jax.cli.main import main
+from afm_jax.cli.speeds import parse_speeds
+from afm_jax.study.collisions import default_speeds
+from tests.reference_contact import ContactParameters, capture_speed, collision, junction
+
+EFFECTS = ("capillary", "structural", "core", "jkr")
+SPEEDS = (12.0, 15.0, 20.0, 200.0)
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(main, ["collide", *(str(argument) for argument in arguments)])
+
+
+def answer(*arguments: object) -> dict[str, Any]:
+    """Return the JSON object of a successful call; NaN and Infinity, which JSON does not have, are refused."""
+    result = run(*arguments, "--json")
+    assert result.exit_code == 0, result.stderr
+
+    def refuse(constant: str):
+        raise AssertionError(constant)
+
+    return json.loads(result.stdout, parse_constant=refuse)
+
+
+@pytest.fixture(scope="module")
+def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("collide")
+
+
+@pytest.fixture(scope="module")
+def paper(out: Path) -> dict[str, Any]:
+    return answer("--speeds", "5,12,15,20,200", "--out", out)
+
+
+def test_speeds_and_delays_are_the_references(paper: dict[str, Any]):
+    parameters = ContactParameters()
+    for index, speed in enumerate(SPEEDS, start=1):
+        exact = collision(parameters, speed, digits=15)
+        # the accuracy asked for: 1e-9, ten times that in us for the delay
+        for name, value, (rtol, atol) in (
+            ("rebound_speed_nm_per_us", exact.rebound_speed_nm_per_us, (1e-9, 0.0)),
+            ("collision_delay_us", exact.delay_us, (0.0, 1e-8)),
+            ("time_in_junction_us", exact.time_in_junction_us, (1e-8, 0.0)),
+            ("deepest_gap_nm", exact.deepest_gap_nm, (1e-8, 0.0)),
+            ("viscous_loss_aj", exact.viscous_loss_aj, (1e-7, 0.0)),
+        ):
+            np.testing.assert_allclose(paper[name][index], float(value), rtol=rtol, atol=atol)
+    np.testing.assert_allclose(paper["capture_speed_nm_per_us"], float(capture_speed(parameters, digits=15)), rtol=1e-9)
+    solid = junction(parameters, digits=15)
+    for name, value in (("forms_gap_nm", solid.snap_on_gap_nm), ("breaks_gap_nm", solid.snap_off_gap_nm)):
+        np.testing.assert_allclose(paper["junction"][name], float(value), rtol=1e-10, atol=0.0)
+    hysteresis = solid.bridge_hysteresis_aj + solid.junction_hysteresis_aj
+    np.testing.assert_allclose(paper["junction"]["hysteresis_aj"], float(hysteresis), rtol=1e-10, atol=0.0)
+
+
+def test_a_captured_tip_has_no_numbers_but_a_sentence(paper: dict[str, Any]):
+    assert paper["captured"] == [True, False, False, False, False]
+    for name in ("rebound_speed_nm_per_us", "collision_delay_us", "time_in_contact_us", "bridge_hysteresis_aj"):
+        assert paper[name][0] is None
+        assert None not in paper[name][1:]
+    assert "the liquid bridge holds it" in paper["outcome"][0]
+    assert paper["end_energy_aj"][0] < 0.0
+    assert paper["capture_speed_reason"] is None
+
+
+def test_energy_ledger_closes(paper: dict[str, Any]):
+    rows = [dict(zip(COLUMNS, row, strict=True)) for row in zip(*(paper[name] for name in COLUMNS), strict=True)]
+    for row in rows[1:]:
+        kept = 0.5 * row["rebound_speed_nm_per_us"] ** 2
+        lost = row["bridge_hysteresis_aj"] + row["junction_hysteresis_aj"] + row["viscous_loss_aj"]
+        # of numbers of 2e4 aJ, each to the accuracy of the rebound speed
+        np.testing.assert_allclose(kept + lost, 0.5 * row["approach_speed_nm_per_us"] ** 2, rtol=3e-9, atol=0.0)
+
+
+def test_files_hold_what_is_printed(paper: dict[str, Any], out: Path):
+    assert {path.name for path in out.iterdir()} == {"collide.csv", "collide.json", "collide.png"}
+    assert json.loads((out / "collide.json").read_text("utf-8")) == paper
+    with (out / "collide.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0]) == COLUMNS
+    assert rows[0]["rebound_speed_nm_per_us"] == ""
+    assert [float(row["rebound_speed_nm_per_us"]) for row in rows[1:]] == paper["rebound_speed_nm_per_us"][1:]
+    assert [row["captured"] for row in rows] == ["true", "false", "false", "false", "false"]
+
+
+def test_picture_shows_curve_capture_and_delay(out: Path, paper: dict[str, Any]):
+    assert paper
+    pixels = imread(out / "collide.png")[..., :3]
+    height, width, _ = pixels.shape
+    dark = np.all(np.abs(pixels - np.array([0x3B, 0x4A, 0x5A]) / 255.0) < 0.05, axis=2)
+    orange = np.all(np.abs(pixels - np.array([0xB3, 0x47, 0x00]) / 255.0) < 0.05, axis=2)
+    # curves in both panels; the capture speed on the far left
+    assert dark[: height // 2].sum() > 500
+    assert dark[2 * height // 3 :].sum() > 500
+    assert orange[:, : width // 4].sum() > 300
+    assert orange[:, width // 2 :].sum() == 0
+
+
+def test_without_viscosity_the_speed_follows_from_the_energy():
+    found = answer("--no-viscous", "--speeds", "20:60:20", "--mass-ng", "2")
+    hysteresis = found["junction"]["hysteresis_aj"]
+    speeds = np.array([20.0, 40.0, 60.0])
+    # nothing is integrated but potentials in closed form
+    np.testing.assert_allclose(found["rebound_speed_nm_per_us"], np.sqrt(speeds**2 - hysteresis), rtol=1e-12, atol=0.0)
+    np.testing.assert_allclose(found["capture_speed_nm_per_us"], np.sqrt(hysteresis), rtol=1e-9, atol=0.0)
+    assert found["viscous_loss_aj"] == [0.0, 0.0, 0.0]
+    assert found["contact"]["effects"] == list(EFFECTS)
+    assert "viscosity_pa_s" not in found["contact"]
+
+
+def test_options_and_scenes_reach_the_contact(tmp_path: Path):
+    path = tmp_path / "scene.toml"
+    contact = Contact.paper(effects=EFFECTS, modulus_gpa=80.0, relative_humidity=0.45)
+    save_scene(Scene(Cantilever(90.0, mass_ng=1.5), Platform(4.0, 180.0), contact), path)
+    found = answer(path, "--speeds", "30", "--relative-humidity", "0.4", "--bridge-forms-nm", "3")
+    assert found["mass_ng"] == 1.5
+    changes = {"modulus_gpa": 80.0, "relative_humidity": 0.4, "bridge_forms_nm": 3.0}
+    exact = collision(ContactParameters(**changes, mass_ng=1.5, effects=EFFECTS), 30.0, digits=15)
+    # the accuracy that is asked for by default
+    np.testing.assert_allclose(found["rebound_speed_nm_per_us"], [float(exact.rebound_speed_nm_per_us)], rtol=1e-9)
+    assert {name: found["contact"][name] for name in changes} == changes
+    assert answer(path, "--speeds", "30", "--mass-ng", "1")["mass_ng"] == 1.0
+
+
+def test_help_names_the_papers_values():
+    keywords = inspect.signature(Contact.paper).parameters
+    assert {name: float(value) for name, (_, value) in PARAMETERS.items()} == {
+        name: keyword.default for name, keyword in keywords.items() if name != "effects"
+    }
+
+
+def test_default_speeds_begin_above_the_capture_speed():
+    speeds = answer()["approach_speed_nm_per_us"]
+    # four digits
+    np.testing.assert_allclose(speeds[0], 1.1 * 10.93845, rtol=1e-3, atol=0.0)
+    assert speeds[-1] == 200.0
+    assert len(speeds) == 20
+    assert default_speeds(100.0)[-1] == 1100.0
+    assert default_speeds(np.inf)[0] == default_speeds(0.0)[0] == 10.0
+
+
+@pytest.mark.parametrize(
+    ("text", "speeds"),
+    [
+        ("12,15,20", (12, 15, 20)),
+        ("12:200:47", (12, 59, 106, 153, 200)),
+        ("12:20:5", (12, 17)),
+        ("7", (7,)),
+        (" 30 , 10:12:1", (30, 10, 11, 12)),
+    ],
+)
+def test_speeds_are_read(text: str, speeds: tuple[float, ...]):
+    assert parse_speeds(text) == speeds
+
+
+def test_a_range_holds_its_stop_in_spite_of_rounding():
+    # 0.1 is no binary number: eighty steps of it reach 20 only nearly
+    assert len(parse_speeds("12:20:0.1")) == 81
+    assert len(parse_speeds("0.1:0.3:0.1")) == 3
+
+
+def test_that_all_are_captured_is_a_result():
+    result = run("--speeds", "1,2")
+    assert result.exit_code == 0
+    assert "All of these tips are captured; faster ones leave again." in result.stdout
+    drowned = answer("--viscosity-pa-s", "1e6", "--speeds", "20")
+    assert drowned["captured"] == [True]
+    assert drowned["capture_speed_nm_per_us"] is None
+    assert "There is no capture speed" in drowned["capture_speed_reason"]
+
+
+def test_unresolved_collisions_end_with_exit_code_3():
+    result = run("--speeds", "20,1e300", "--json")
+    assert result.exit_code == 3
+    assert "not valid: 1 of 2 collisions: The integration did not resolve" in result.stderr
+    found = json.loads(result.stdout)
+    assert found["captured"] == [False, None]
+    assert found["rebound_speed_nm_per_us"][1] is None
+
+
+def test_long_lists_are_cut_in_the_text_only():
+    result = run("--speeds", "12:60:1")
+    assert result.exit_code == 0
+    assert "The first 40 of 49 collisions" in result.stdout
+    assert "unit" not in result.stderr
+    assert len(answer("--speeds", "12:60:1")["captured"]) == 49
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--speeds", "fast"], "the speed `fast` is not a positive number; write 12,15,20 or start:stop:step"),
+        (["--speeds=-3"], "the speed `-3` is not a positive number"),
+        (["--speeds", "nan"], "the speed `nan` is not a positive number"),
+        (["--speeds", "inf"], "the speed `inf` is not a positive number"),
+        (["--speeds", ""], "names no speed"),
+        (["--speeds", "12,,15"], "the speed `` is not a positive number"),
+        (["--speeds", "20:10:1"], "`20:10:1` ends below its start"),
+        (["--speeds", "10:20"], "`10:20` is no range"),
+        (["--speeds", "10:20:0"], "the step `0` is not a positive number"),
+        (["--speeds", "1:1e9:1e-3"], "has more than 1000000 speeds"),
+        (["--no-core"], "--no-core is not possible: without the core repulsion"),
+        (["--no-jkr"], "--no-jkr is not possible: the JKR contact is the solid junction itself"),
+        (["--no-viscous", "--viscosity-pa-s", "1"], "--viscosity-pa-s changes nothing without the effect viscous"),
+        (["--relative-humidity", "1.2"], "`--relative-humidity` must be between 0 and 1, but is 1.2"),
+        (["--relative-humidity", "wet"], "'wet' is not a valid float"),
+        (["--mass-ng", "0"], "`--mass-ng` must be positive, but is 0"),
+        (["--adhesion-energy-j-per-m2", "0.05"], "the contact has no junction: the bridge pulls harder"),
+        (["--accuracy", "1e-15"], "`accuracy` must be at least 1e-11"),
+        (["none.toml"], "none.toml: there is no such file"),
+        (["law.toml"], 'law.toml: [interaction] model: must be "contact" here, but is "law"'),
+    ],
+)
+def test_wrong_calls_end_with_one_line_and_exit_code_2(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], said: str
+):
+    monkeypatch.chdir(tmp_path)
+    save_scene(Scene(Cantilever(90.0), Platform(4.0, 180.0), ImpactLaw(r=0.9)), tmp_path / "law.toml")
+    result = run(*arguments)
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert said in result.stderr
+
+
+def test_orbits_want_a_law(tmp_path: Path):
+    path = tmp_path / "contact.toml"
+    save_scene(Scene(Cantilever(90.0), Platform(4.0, 180.0), Contact.paper()), path)
+    result = CliRunner().invoke(main, ["orbits", str(path), "--order", "1"])
+    assert result.exit_code == 2
+    assert '[interaction] model: must be "law" here' in result.stderr

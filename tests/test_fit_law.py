@@ -1,0 +1,272 @@
+"""The impact law and the delay law of a contact: the published table, closed forms, SciPy, and the command."""
+
+import csv
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from matplotlib.image import imread
+from scipy.optimize import minimize
+
+from afm_jax import Contact, ImpactLaw, find_junction
+from afm_jax.cli.main import main
+from fitting import ContactLaw, fit_delay, fit_law
+from fitting.contact_law import closest_law
+from tests.reference_contact import ContactParameters, collision
+
+PAPER = Contact.paper()
+
+
+# Rows of the table of laws fitted to this contact by independent code, as printed there: r, epsilon, c in nm/us, worst
+# error in percent of the rebound speed. The last digit printed is what they are good for.
+@pytest.mark.parametrize(
+    ("model", "residuals", "r", "epsilon", "viscous_loss", "worst_percent"),
+    [
+        ("law", "relative", 0.9981, 122.0, 0.0, 0.48),
+        ("viscous", "relative", 1.0, 113.6, 0.50, 0.05),
+        ("full", "relative", 0.9999, 114.0, 0.48, 0.03),
+        ("law", "absolute", 0.9988, 127.0, 0.0, 1.8),
+    ],
+)
+def test_published_table_of_laws(model, residuals, r, epsilon, viscous_loss, worst_percent):
+    law = fit_law(PAPER, model=model, residuals=residuals)
+    assert law.converged
+    np.testing.assert_allclose(law.r, r, rtol=0.0, atol=0.6e-4)
+    np.testing.assert_allclose(law.epsilon, epsilon, rtol=0.0, atol=0.5 if epsilon != 113.6 else 0.05)
+    np.testing.assert_allclose(law.viscous_loss, viscous_loss, rtol=0.0, atol=0.006)
+    np.testing.assert_allclose(100.0 * law.worst_relative_error, worst_percent, rtol=0.12, atol=0.0)
+    np.testing.assert_allclose(law.speed_range, (1.5 * 10.93845, 250.0), rtol=1e-6, atol=0.0)
+
+
+def test_absolute_residuals_over_a_given_range():
+    law = fit_law(PAPER, speed_range=(12.0, 150.0), residuals="absolute")
+    np.testing.assert_allclose((law.r, law.epsilon), (0.9980, 122.0), rtol=0.0, atol=0.5)
+    np.testing.assert_allclose(law.r, 0.9980, rtol=0.0, atol=0.5e-4)
+    # printed as 0.26 nm/us and 0.17 % without the number of speeds; the ends weigh more where there are fewer
+    assert 0.20 < law.worst_error_nm_per_us < 0.27
+    np.testing.assert_allclose(law.worst_share_of_top_speed, law.worst_error_nm_per_us / 150.0, rtol=1e-14, atol=0.0)
+
+
+def test_without_viscosity_the_law_is_the_hysteresis():
+    contact = Contact.paper(effects=("capillary", "structural", "core", "jkr"))
+    for model in ("law", "viscous", "full"):
+        law = fit_law(contact, model=model, mass_ng=2.0)
+        # u_out^2 = u_in^2 - 2 hysteresis/m exactly: only rounding and the fit's tolerance are left
+        np.testing.assert_allclose(law.epsilon, float(find_junction(contact).hysteresis_aj), rtol=1e-9, atol=0.0)
+        np.testing.assert_allclose(law.r, 1.0, rtol=0.0, atol=1e-11)
+        np.testing.assert_allclose(law.viscous_loss, 0.0, rtol=0.0, atol=1e-9)
+        assert law.worst_relative_error < 1e-10
+        np.testing.assert_allclose(
+            law.capture_speed_nm_per_us, law.contact_capture_speed_nm_per_us, rtol=1e-8, atol=0.0
+        )
+
+
+@pytest.mark.parametrize("residuals", ["relative", "absolute"])
+@pytest.mark.parametrize("model", ["law", "viscous", "full"])
+def test_no_other_law_is_closer(model: str, residuals: str):
+    fitted = fit_law(PAPER, model=model, residuals=residuals, points=60)
+    speeds, rebound = fitted.approach_speed_nm_per_us, fitted.rebound_speed_nm_per_us
+
+    def misfit(values):
+        loss, epsilon, viscous_loss = (
+            (values[0], 100.0 * values[1], 0.0)
+            if model == "law"
+            else (0.0, 100.0 * values[0], values[1])
+            if model == "viscous"
+            else (values[0], 100.0 * values[1], values[2])
+        )
+        predicted = np.sqrt((1.0 - 1e-2 * loss) * speeds**2 - viscous_loss * speeds - epsilon)
+        return np.sum(((predicted - rebound) / (rebound if residuals == "relative" else 1.0)) ** 2)
+
+    start = {"law": [0.3, 1.2], "viscous": [1.1, 0.4], "full": [0.1, 1.1, 0.4]}[model]
+    # another method, without gradients
+    other = minimize(misfit, start, method="Nelder-Mead", options={"xatol": 1e-10, "fatol": 0.0, "maxiter": 4000})
+    error = fitted.relative_error if residuals == "relative" else fitted.error_nm_per_us
+    # the sum is flat at its minimum
+    np.testing.assert_allclose(np.sum(error**2), other.fun, rtol=1e-6, atol=0.0)
+
+
+def test_a_law_is_found_again():
+    speeds = np.linspace(20.0, 200.0, 40)
+    truth = ImpactLaw(r=0.95, epsilon=80.0, viscous_loss=2.0)
+    law, converged = closest_law(speeds, np.asarray(truth.rebound_speed(speeds)), "full", "relative")
+    assert converged
+    for name in ("r", "epsilon", "viscous_loss"):
+        # conditioning of the three columns over this range: some 1e4 roundings
+        np.testing.assert_allclose(float(getattr(law, name)), float(getattr(truth, name)), rtol=1e-8, atol=0.0)
+
+
+def test_errors_are_those_of_the_law():
+    law = fit_law(PAPER, model="viscous", points=20)
+    own = ImpactLaw(r=law.r, epsilon=law.epsilon, viscous_loss=law.viscous_loss)
+    error = np.asarray(own.rebound_speed(law.approach_speed_nm_per_us)) - law.rebound_speed_nm_per_us
+    np.testing.assert_allclose(law.worst_error_nm_per_us, np.abs(error).max(), rtol=1e-12, atol=0.0)
+    np.testing.assert_allclose(law.rms_error_nm_per_us, np.sqrt(np.mean(error**2)), rtol=1e-12, atol=0.0)
+    np.testing.assert_allclose(
+        law.rms_relative_error, np.sqrt(np.mean((error / law.rebound_speed_nm_per_us) ** 2)), rtol=1e-12, atol=0.0
+    )
+    assert isinstance(law, ContactLaw)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"model": "restitution"}, "`model` must be one of law, viscous, full, but is 'restitution'"),
+        ({"residuals": "squared"}, "`residuals` must be one of relative, absolute, but is 'squared'"),
+        ({"points": 1}, "`points` must be at least the number of parameters, 2, but is 1"),
+        ({"speed_range": (20.0, 10.0)}, "must rise between two positive speeds, but is 20 to 10"),
+        ({"speed_range": (5.0, 20.0)}, "must begin above the capture speed of 10.9385 nm/us, but does at 5"),
+        ({"speed_range": (float("nan"), 20.0)}, "must rise between two positive speeds"),
+        ({"mass_ng": 0.0}, "`mass_ng` must be positive"),
+    ],
+)
+def test_impossible_fits_are_named(options: dict[str, Any], said: str):
+    with pytest.raises(ValueError, match=said):
+        fit_law(PAPER, **options)
+
+
+def test_contacts_without_a_law_are_named():
+    with pytest.raises(ValueError, match=r"is 405\.\d+ to 250 \(the capture speed is 270\.?\d* nm/us\); give a range"):
+        fit_law(Contact.paper(viscosity_pa_s=1.0))
+    with pytest.raises(ValueError, match="there is no law to fit"):
+        fit_law(Contact.paper(viscosity_pa_s=1e6))
+
+
+@pytest.fixture(scope="module")
+def delay():
+    return fit_delay(PAPER, speed_range=(15.0, 700.0))
+
+
+def test_lag_and_lead_are_the_definitions(delay):
+    np.testing.assert_allclose(delay.lag_us - delay.lead_us, delay.delay_us, rtol=0.0, atol=1e-16)
+    parameters = ContactParameters()
+    for index in (0, 200, 511):
+        speed = float(delay.approach_speed_nm_per_us[index])
+        exact = collision(parameters, speed, digits=15)
+        # ten times the relative accuracy of the rebound speed
+        np.testing.assert_allclose(delay.delay_us[index], float(exact.delay_us), rtol=0.0, atol=1e-8)
+        np.testing.assert_allclose(delay.lag_us[index], float(exact.time_in_junction_us), rtol=0.0, atol=1e-8)
+        lead = exact.time_in_junction_us - exact.delay_us
+        np.testing.assert_allclose(delay.lead_us[index], float(lead), rtol=0.0, atol=2e-8)
+
+
+def test_lag_and_lead_are_the_papers(delay):
+    # the paper at 15 nm/us: lag 0.11 us, lead 0.2 us, read off a picture
+    np.testing.assert_allclose(delay.lag_us[0], 0.11, rtol=0.0, atol=0.01)
+    np.testing.assert_allclose(delay.lead_us[0], 0.2, rtol=0.0, atol=0.02)
+    # "we find it to scale as 1/V": of fast tips, for which the ways outside the junction are straight
+    junction = find_junction(PAPER)
+    straight = float(junction.forms_gap_nm + junction.breaks_gap_nm)
+    fast = delay.approach_speed_nm_per_us > 300.0
+    np.testing.assert_allclose((delay.lead_us * delay.approach_speed_nm_per_us)[fast], straight, rtol=0.01, atol=0.0)
+    # and a lag that falls with the speed more slowly than 1/V
+    assert np.all(np.diff(delay.lag_us) < 0.0)
+    assert np.all(np.diff(delay.lag_us * delay.approach_speed_nm_per_us) > 0.0)
+
+
+def test_delay_law_is_the_published_one(delay):
+    law = delay.delay
+    # published: 0.206, 5.64 nm, 0.726 nm with rms 0.001 us, for speeds between the same ends spaced otherwise; the
+    # three are correlated, so that they move by some percent with the spacing
+    np.testing.assert_allclose(float(law.hertz), 0.206, rtol=0.01, atol=0.0)
+    np.testing.assert_allclose(float(law.lead_nm), 5.64, rtol=0.03, atol=0.0)
+    np.testing.assert_allclose(float(law.offset_nm), 0.726, rtol=0.06, atol=0.0)
+    np.testing.assert_allclose(delay.rms_us, 0.001, rtol=0.0, atol=1e-4)
+    u, w = delay.approach_speed_nm_per_us, delay.rebound_speed_nm_per_us
+    np.testing.assert_allclose(np.asarray(law(u, w)), delay.fitted_us, rtol=0.0, atol=1e-15)
+    published = 0.206 * u**-0.2 - 5.64 * (1.0 / w - 1.0 / u) - 0.726 / u
+    assert delay.rms_us < np.sqrt(np.mean((published - delay.delay_us) ** 2)) < 1.1 * delay.rms_us
+
+
+def test_delay_fits_check_their_arguments():
+    with pytest.raises(ValueError, match="`points` must be at least the number of parameters, 3, but is 2"):
+        fit_delay(PAPER, points=2)
+    with pytest.raises(ValueError, match="must begin above the capture speed"):
+        fit_delay(PAPER, speed_range=(10.0, 20.0))
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(main, ["fit-law", *(str(argument) for argument in arguments)])
+
+
+@pytest.fixture(scope="module")
+def reported(tmp_path_factory: pytest.TempPathFactory):
+    folder = tmp_path_factory.mktemp("fit_law")
+    result = run("--json", "--out", folder)
+    assert result.exit_code == 0, result.stderr
+    return json.loads(result.stdout), folder
+
+
+def test_command_tells_what_the_functions_find(reported):
+    answer, _ = reported
+    assert [row["model"] for row in answer["models"]] == ["law", "viscous", "full"]
+    for row in answer["models"]:
+        law = fit_law(PAPER, model=row["model"])
+        for name, value in row.items():
+            assert value == getattr(law, name)
+    found = fit_delay(PAPER)
+    assert answer["delay"]["hertz"] == float(found.delay.hertz)
+    assert answer["delay"]["lag_us"][0] == found.lag_us[0]
+    assert answer["delay"]["approach_speed_nm_per_us"][-1] == found.speed_range[1]
+    assert answer["contact"]["effects"] == list(PAPER.effects)
+
+
+def test_command_writes_tables_and_picture(reported):
+    answer, folder = reported
+    assert {path.name for path in folder.iterdir()} == {"fit_law.csv", "fit_delay.csv", "fit_law.json", "fit_law.png"}
+    assert json.loads((folder / "fit_law.json").read_text("utf-8")) == answer
+    with (folder / "fit_law.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == answer["points"] == 512
+    for model in answer["models"]:
+        errors = [
+            float(row[f"{model['model']}_speed_nm_per_us"]) / float(row["rebound_speed_nm_per_us"]) - 1.0
+            for row in rows
+        ]
+        np.testing.assert_allclose(np.abs(errors).max(), model["worst_relative_error"], rtol=1e-9, atol=0.0)
+    with (folder / "fit_delay.csv").open(encoding="utf-8") as file:
+        delays = list(csv.DictReader(file))
+    assert all(abs(float(row["lag_us"]) - float(row["lead_us"]) - float(row["delay_us"])) < 1e-15 for row in delays)
+    pixels = imread(folder / "fit_law.png")[..., :3]
+    _, width, _ = pixels.shape
+    # Okabe and Ito's orange and blue: two laws on the left, lead and lag on the right
+    for colour in ((0xD5, 0x5E, 0x00), (0x00, 0x72, 0xB2)):
+        drawn = np.all(np.abs(pixels - np.array(colour) / 255.0) < 0.05, axis=2)
+        assert drawn[:, : width // 2].sum() > 500
+        assert drawn[:, width // 2 :].sum() > 500
+
+
+def test_command_takes_ranges_and_contacts():
+    result = run(
+        "--no-viscous", "--speed-range", "20:60", "--delay-range", "20:90", "--residuals", "absolute", "--json"
+    )
+    assert result.exit_code == 0, result.stderr
+    answer = json.loads(result.stdout)
+    assert answer["speed_range_nm_per_us"] == [20.0, 60.0]
+    assert answer["delay"]["speed_range_nm_per_us"] == [20.0, 90.0]
+    np.testing.assert_allclose([row["epsilon"] for row in answer["models"]], 111.5086, rtol=1e-5, atol=0.0)
+    text = run("--no-viscous").stdout
+    assert "Collision delay = lag - lead" in text
+    assert "Delay law: hertz" in text
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--speed-range", "20:5"], "`20:5` does not rise; write low:high, as 12:150"),
+        (["--speed-range", "20"], "`20` is no range"),
+        (["--speed-range", "x:5"], "the lower end `x` is not a positive number"),
+        (["--speed-range", "5:20"], "must begin above the capture speed"),
+        (["--points", "3"], "3 is not in the range"),
+        (["--no-jkr"], "--no-jkr is not possible"),
+        (["--viscosity-pa-s", "1e6"], "there is no law to fit"),
+    ],
+)
+def test_wrong_calls_end_with_one_line_and_exit_code_2(arguments: list[str], said: str):
+    result = run(*arguments)
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert said in result.stderr

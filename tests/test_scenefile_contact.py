@@ -1,0 +1,209 @@
+"""Scene files with a contact: every key, exact loops, and one line for every mistake."""
+
+import inspect
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from afm_jax import Cantilever, Contact, Platform, Scene, SceneError, load_scene, presets, save_scene
+from afm_jax.contact.contact import EFFECTS
+from afm_jax.contact.forces import Capillary, CoreRepulsion, Jkr, VanDerWaals
+from afm_jax.scenefile_keys import CONTACT_RANGES
+from tests.fresh_python import python
+
+HEAD = "[cantilever]\nfrequency_khz = 90\n[platform]\namplitude_nm = 4\nfrequency_khz = 181.8\n[interaction]\n"
+CONTACT = HEAD + 'model = "contact"\n'
+# near the paper's values, where every contact has its junction
+CHANGED: dict[str, Any] = {
+    "relative_humidity": 0.41,
+    "temperature_k": 300.5,
+    "surface_tension_n_per_m": 0.07,
+    "molar_volume_cm3_per_mol": 18.2,
+    "viscosity_pa_s": 1.3e-3,
+    "tip_radius_nm": 77.7,
+    "structural_amplitude_n_per_m": 33.0,
+    "structural_decay_nm": 0.57,
+    "structural_offset_nm": 0.62,
+    "core_constant_j_m6": 3.3e-78,
+    "adhesion_energy_j_per_m2": 0.37,
+    "modulus_gpa": 81.0,
+    "bridge_forms_nm": 3.3,
+    "bridge_breaks_nm": 5.1,
+}
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "scene.toml"
+
+
+def complaint(path: Path, text: str) -> str:
+    """Return the one line that loading a text ends with, from the table's name on."""
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(SceneError) as caught:
+        load_scene(path)
+    line = str(caught.value)
+    assert line.isprintable()
+    assert line.startswith(f"{path}: [interaction] ")
+    return line.removeprefix(f"{path}: [interaction] ")
+
+
+def test_keys_and_ranges_are_those_of_the_contact():
+    keywords = inspect.signature(Contact.paper).parameters
+    assert {"effects", *CONTACT_RANGES} == set(keywords)
+    assert set(CHANGED) == set(CONTACT_RANGES)
+
+
+def test_what_is_left_out_is_the_papers(path: Path):
+    path.write_text(CONTACT, encoding="utf-8")
+    assert eqx.tree_equal(load_scene(path), Scene(Cantilever(90.0), Platform(4.0, 181.8), Contact.paper()))
+
+
+@pytest.mark.parametrize("name", CHANGED)
+def test_every_key_is_read(path: Path, name: str):
+    path.write_text(f"{CONTACT}{name} = {CHANGED[name]!r}\n", encoding="utf-8")
+    contact = load_scene(path).interaction
+    assert eqx.tree_equal(contact, Contact.paper(**{name: CHANGED[name]}))
+    assert not eqx.tree_equal(contact, Contact.paper())
+
+
+def test_effects_are_chosen_in_any_order(path: Path):
+    path.write_text(f'{CONTACT}effects = ["jkr", "viscous", "core"]\nstructural_decay_nm = 0.5\n', encoding="utf-8")
+    contact = load_scene(path).interaction
+    assert contact.effects == ("core", "viscous", "jkr")
+    assert eqx.tree_equal(contact, Contact.paper(effects=("core", "viscous", "jkr")))
+
+
+@pytest.mark.parametrize(
+    "effects", [EFFECTS, ("core", "jkr"), ("capillary", "core", "jkr"), ("viscous", "core", "jkr")]
+)
+def test_loop_is_exact_for_every_choice_of_effects(path: Path, effects: tuple[str, ...]):
+    contact = Contact.paper(effects=effects, **CHANGED)
+    scene = Scene(Cantilever(90.0, 40.0, 1.5), Platform(4.0, 181.8, -1.0, 1e-3), contact)
+    save_scene(scene, path)
+    assert eqx.tree_equal(load_scene(path), scene)
+
+
+@given(values=st.fixed_dictionaries({name: st.floats(0.98 * value, 1.02 * value) for name, value in CHANGED.items()}))
+def test_loop_is_exact(values: dict[str, Any], tmp_path_factory: pytest.TempPathFactory):
+    path = tmp_path_factory.getbasetemp() / "contact.toml"
+    scene = Scene(Cantilever(90.0), Platform(4.0, 181.8), Contact.paper(**values))
+    save_scene(scene, path)
+    assert eqx.tree_equal(load_scene(path), scene)
+    assert tomllib.loads(path.read_text("utf-8"))["interaction"] == {
+        "model": "contact",
+        "effects": list(EFFECTS),
+        # a core constant may be a neighbour with the same product
+        **values,
+        "core_constant_j_m6": pytest.approx(values["core_constant_j_m6"], rel=1e-15),
+    }
+
+
+def test_loop_is_exact_in_32_bits(path: Path):
+    with jax.enable_x64(False):  # noqa: FBT003
+        scene = Scene(Cantilever(90.0), Platform(4.0, 181.8), Contact.paper(core_constant_j_m6=2.3e-78))
+        assert scene.interaction.bridge_forms_nm.dtype == jnp.float32
+        save_scene(scene, path)
+        assert eqx.tree_equal(load_scene(path), scene)
+
+
+@pytest.mark.parametrize(
+    ("contact", "said"),
+    [
+        (Contact(Capillary() + CoreRepulsion() + VanDerWaals()), "the contact has capillary, core, VanDerWaals, jkr"),
+        (Contact(CoreRepulsion() + CoreRepulsion()), "the contact has core, core, jkr"),
+        (Contact(Capillary() + CoreRepulsion(tip_radius_nm=90.0)), "one `tip_radius_nm`, but the contact's forces"),
+        (Contact(CoreRepulsion(), junction=Jkr(tip_radius_nm=90.0)), "one `tip_radius_nm`, but the contact's forces"),
+        (
+            Contact.paper(relative_humidity=jnp.array([0.4, 0.5])),
+            r"`relative_humidity` has shape \(2,\), but a scene file holds one scene",
+        ),
+    ],
+)
+def test_what_the_format_has_no_key_for_is_not_saved(path: Path, contact: Contact, said: str):
+    with pytest.raises(ValueError, match=said):
+        save_scene(Scene(Cantilever(90.0), Platform(4.0, 181.8), contact), path)
+    assert not path.exists()
+
+
+def test_another_interaction_is_not_saved(path: Path):
+    with pytest.raises(TypeError, match="holds an ImpactLaw or a Contact as interaction, not Jkr"):
+        save_scene(Scene(Cantilever(90.0), Platform(4.0, 181.8), Jkr()), path)
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("humidity = 0.5", "humidity: unknown key; use relative_humidity"),
+        ("temperature = 300", "temperature: the unit is missing; use temperature_k"),
+        ("tip_radius = 100", "tip_radius: the unit is missing; use tip_radius_nm"),
+        ("core_constant = 1e-78", "core_constant: the unit is missing; use core_constant_j_m6"),
+        ("molar_volume = 18", "molar_volume: the unit is missing; use molar_volume_cm3_per_mol"),
+        ("viscocity_pa_s = 1", "viscocity_pa_s: unknown key; use viscosity_pa_s"),
+        ("mass_ng = 1", "mass_ng: unknown key; it belongs in [cantilever]"),
+        ("r = 0.9", 'r: unknown key of a contact; it belongs to model = "law"'),
+        ("[interaction.delay]\nhertz = 1", 'delay: unknown key of a contact; it belongs to model = "law"'),
+        ("modulus_gpa = '1'", "modulus_gpa: must be a number, but is the text '1'; leave out the quotes"),
+        ("modulus_gpa = true", "modulus_gpa: must be a number, but is true"),
+        ("modulus_gpa = nan", "`modulus_gpa` must be positive, but is nan"),
+        ("modulus_gpa = inf", "`modulus_gpa` must be positive, but is inf"),
+        ("relative_humidity = 1", "`relative_humidity` must be between 0 and 1, but is 1"),
+        ("viscosity_pa_s = -1", "`viscosity_pa_s` must not be negative, but is -1"),
+        ("structural_amplitude_n_per_m = -1", "`structural_amplitude_n_per_m` must not be negative, but is -1"),
+        ("structural_offset_nm = nan", "`structural_offset_nm` must be a finite number, but is nan"),
+        ("core_constant_j_m6 = 0", "`core_constant_j_m6` must be positive, but is 0"),
+        ("bridge_breaks_nm = 1", "`bridge_breaks_nm` must not be smaller than `bridge_forms_nm`"),
+        ('effects = ["core", "jkr"]\nviscosity_pa_s = -1', "`viscosity_pa_s` must not be negative, but is -1"),
+        ("effects = 3", 'effects: must be a list of texts, ["..."], but is a number'),
+        ("effects = [1]", "effects: must be a list of texts, but one entry is a number"),
+        ("effects = []", "`effects` must hold 'core': without the core repulsion"),
+        ('effects = ["core"]', "`effects` must hold 'jkr': the JKR contact is the solid junction itself"),
+        (
+            'effects = ["core", "jkr", "glue"]',
+            "`effects` must be chosen from capillary, structural, core, viscous, jkr",
+        ),
+        ('effects = ["core", "jkr", "core"]', "`effects` must not name an effect twice"),
+        # no junction: the causes of physics and of geometry
+        (
+            "adhesion_energy_j_per_m2 = 0.05",
+            "the contact has no junction: the bridge pulls harder than the JKR contact",
+        ),
+        ("relative_humidity = 0.995", "`relative_humidity` 0.995 gives a Kelvin radius of"),
+        ("core_constant_j_m6 = 1e-300", "the contact has no junction: the bridge does not get stiffer"),
+    ],
+)
+def test_a_wrong_line_is_named(path: Path, line: str, expected: str):
+    assert complaint(path, f"{CONTACT}{line}\n").startswith(expected)
+
+
+def test_scenes_with_a_law_do_without_the_contact(path: Path):
+    path.write_text(f'{HEAD}model = "law"\nr = 0.9\n', encoding="utf-8")
+    code = (
+        "import sys; from afm_jax.scenefile import load_scene, save_scene\n"
+        f"save_scene(load_scene({str(path)!r}), {str(path)!r})\n"
+        "print([name for name in sys.modules if name.startswith(('afm_jax.contact', 'diffrax', 'scipy.optimize'))])"
+    )
+    assert python(code) == "[]"
+
+
+def test_preset_scenes_are_those_of_section_iv(path: Path):
+    figure8, figure10, figure11 = presets.figure8_scene(), presets.figure10_scene(), presets.figure11_scene()
+    # the drive is n times twice 90 kHz; one rounding of the product is all that may differ
+    for scene, reduced, amplitude in ((figure8, 5.277, 4.0), (figure10, 0.97, 2.0), (figure11, 1.01, 4.0)):
+        np.testing.assert_allclose(scene.platform.frequency_khz, 180.0 * reduced, rtol=3e-16, atol=0.0)
+        assert eqx.tree_equal(scene.cantilever, Cantilever(90.0, 40.0, 1.0))
+        assert float(scene.platform.amplitude_nm) == amplitude
+        save_scene(scene, path)
+        assert eqx.tree_equal(load_scene(path), scene)
+        assert eqx.tree_equal(scene.interaction, Contact.paper())
+    assert [float(scene.platform.offset_nm) for scene in (figure8, figure10, figure11)] == [0.0, -0.5, -2.0]
+    swept = eqx.filter_vmap(presets.figure11_scene)(jnp.array([-2.0, 2.0]), jnp.array([0.0, 1e-4]))
+    np.testing.assert_array_equal(swept.platform.offset_rate_nm_per_us, [0.0, 1e-4])
