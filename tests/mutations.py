@@ -17,6 +17,12 @@ ORBIT = f"{ORBITS}[damped]"
 DELAYED_ORBIT = f"{ORBITS}[delayed]"
 FORWARD = "tests/test_forward.py"
 INTERVALS = "tests/test_profile_intervals.py"
+FORCES = "tests/test_forces.py::"
+FORMULAS = f"{FORCES}test_forces_of_the_paper_are_their_formulas_in_mpmath"
+JUNCTION = "tests/test_junction.py::test_numbers_of_the_paper_to_five_digits"
+COLLIDE = "tests/test_collide.py::"
+COLLISIONS = f"{COLLIDE}test_default_accuracy_is_reached_from_11_times_the_capture_speed[diffrax]"
+COLLOCATION = f"{COLLIDE}test_default_accuracy_is_reached_from_11_times_the_capture_speed[collocation]"
 
 
 class Mutation(NamedTuple):
@@ -173,4 +179,64 @@ MUTATIONS = {
         "fitting/intervals.py", "CHI2_95 = 3.841458820694124", "CHI2_95 = 2.705543454095404", INTERVALS
     ),
     "rise of chi2 from zero": Mutation("fitting/intervals.py", "above = value - chi2", "above = value", INTERVALS),
+    "capillary twice as wide": Mutation(
+        "afm_jax/contact/forces/capillary.py",
+        "as_argument(gap_nm) / (2.0 * self",
+        "as_argument(gap_nm) / (4.0 * self",
+        FORMULAS,
+    ),
+    "structural share without its curvature": Mutation(
+        "afm_jax/contact/forces/structural.py", "(1.0 - kelvin / self.tip_radius_nm)", "1.0", FORMULAS
+    ),
+    "core with 8 for 7 in its potential": Mutation(
+        "afm_jax/contact/forces/core_repulsion.py", "tip_radius_nm / 1260.0", "tip_radius_nm / 1440.0", FORMULAS
+    ),
+    "viscous force with half its drag": Mutation(
+        "afm_jax/contact/forces/viscous.py",
+        "1.5 * jnp.pi * self",
+        "0.75 * jnp.pi * self",
+        f"{FORCES}test_viscous_force_of_water_is_the_number_of_the_unit_page",
+    ),
+    "JKR work without its last term": Mutation(
+        "afm_jax/contact/forces/jkr.py", "(0.4 * cube - SLOPE) + 1.0)", "(0.4 * cube - SLOPE))", JUNCTION
+    ),
+    "junction at the JKR stiffness of half the load": Mutation(
+        "afm_jax/contact/junction.py", "(6.0 * cube - 3.0 * math", "(6.0 * cube - 1.5 * math", JUNCTION
+    ),
+    "dissipation left out of the time": Mutation(
+        "afm_jax/contact/passage_steps.py", "way.available_aj(gap) - state[0])", "way.available_aj(gap))", COLLISIONS
+    ),
+    "energy lost where it is gained": Mutation(
+        "afm_jax/contact/passage.py",
+        "- self.end_potential_aj - dissipated",
+        "- self.end_potential_aj + dissipated",
+        COLLISIONS,
+    ),
+    "collocation that sweeps from the end": Mutation(
+        "afm_jax/contact/passage_collocation.py",
+        "integrals[:, 0] = roots + 1.0",
+        "integrals[:, 0] = 1.0 - roots",
+        COLLOCATION,
+    ),
+    "time in the junction counted once": Mutation(
+        "afm_jax/contact/junction_way.py", "pace * (2.0 * inside + outside)", "pace * (inside + outside)", COLLISIONS
+    ),
+    "delay counted from where the bridge forms, both ways": Mutation(
+        "afm_jax/contact/collision.py",
+        "approach_speed + ways.outer_gap_nm",
+        "approach_speed + contact.bridge_forms_nm",
+        COLLISIONS,
+    ),
+    "bridge that breaks where it formed": Mutation(
+        "afm_jax/contact/collision.py",
+        "outer = jnp.maximum(contact.bridge_breaks_nm, breaks)",
+        "outer = jnp.maximum(contact.bridge_forms_nm, breaks)",
+        COLLISIONS,
+    ),
+    "turning point on the wrong side of the well": Mutation(
+        "afm_jax/contact/turned.py",
+        "> jnp.argmin(potential)",
+        "< jnp.argmin(potential)",
+        "tests/test_collide_hard_cases.py::test_a_sharp_tip_turns_in_the_bridge[3.0]",
+    ),
 }

@@ -21,6 +21,7 @@ LEVELS = {
     "contact": 4,
     "motion": 5,
     "scenefile": 6,
+    "scenefile_contact": 6,
     "scenefile_keys": 6,
     "scenefile_table": 6,
     "presets": 6,

@@ -1,5 +1,7 @@
 """The capture speed: the approach speed below which a contact does not let the tip go again."""
 
+import math
+
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -13,8 +15,8 @@ from afm_jax.contact.turned import turn_in_bridge
 from afm_jax.impact.implicit import implicit_root
 from afm_jax.parameters import as_parameter, check_parameter, is_traced
 
-_SCAN = 96
-_HALVINGS = 52
+_POINTS = 64
+_ROUNDS = 9
 
 
 def capture_speed(contact: Contact, mass_ng: ArrayLike = 1.0) -> Float[Array, ""]:
@@ -43,21 +45,22 @@ def _capture_speed(contact: Contact, mass: Float[Array, ""]) -> tuple[Array, Arr
     junction = find_junction(contact)
     fixed = lax.stop_gradient((contact, junction, mass))
     # sqrt(2 hysteresis / m) without dissipation, which raises it; less where the bridge turns the tip round
-    least = jnp.sqrt(2.0 * jnp.maximum(lax.stop_gradient(junction.hysteresis_aj), 1e-6) / fixed[2])
-    speeds = least * jnp.geomspace(0.01, 1e3, _SCAN, dtype=least.dtype)
-    bound = jax.vmap(lambda speed: end_energy(speed, fixed))(speeds) <= 0.0
-    last = _SCAN - 1 - jnp.argmax(bound[::-1])
+    scale = jnp.log(jnp.sqrt(2.0 * jnp.maximum(fixed[1].hysteresis_aj, 1e-6) / fixed[2]))
+    width = jnp.asarray([math.log(0.01), math.log(1e3)], scale.dtype)
 
-    def halve(_, ends):
-        middle = 0.5 * (ends[0] + ends[1])
-        held = end_energy(middle, fixed) <= 0.0
-        return jnp.where(held, middle, ends[0]), jnp.where(held, ends[1], middle)
+    def narrow(ends, _):
+        # one small program for all rounds: the first looks far and wide, each further one inside an interval
+        points = ends[0] + (ends[1] - ends[0]) * jnp.linspace(0.0, 1.0, _POINTS, dtype=scale.dtype)
+        held = jax.vmap(lambda point: end_energy(jnp.exp(point), fixed))(points) <= 0.0
+        last = _POINTS - 1 - jnp.argmax(held[::-1])
+        inside = jnp.stack([points[last], points[jnp.minimum(last + 1, _POINTS - 1)]])
+        return inside, (held.any(), held[-1])
 
-    ends = speeds[last], speeds[jnp.minimum(last + 1, _SCAN - 1)]
-    found, _ = lax.fori_loop(0, _HALVINGS, halve, ends)
+    ends, (any_held, top_held) = lax.scan(narrow, scale + width, None, length=_ROUNDS)
+    found = jnp.exp(ends[0])
     root = implicit_root(end_energy, found, (contact, junction, mass))
-    held = jnp.where(bound[-1], jnp.inf, root)
-    return jnp.where(bound.any(), held, 0.0), junction.exists
+    held = jnp.where(top_held[0], jnp.inf, root)
+    return jnp.where(any_held[0], held, 0.0), junction.exists
 
 
 def end_energy(approach_speed: Float[Array, ""], model: tuple[Contact, Junction, Float[Array, ""]]) -> Float[Array, ""]:
