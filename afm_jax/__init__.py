@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from afm_jax.contact.contact import Contact
     from afm_jax.contact.junction import Junction, find_junction
     from afm_jax.contact.phases import Phase
+    from afm_jax.contact.time_course import time_course
     from afm_jax.impact.batch import iterate_batch
     from afm_jax.impact.jacobian import map_jacobian
     from afm_jax.impact.law import CollisionDelay, ImpactLaw
@@ -53,6 +54,7 @@ else:
         "next_impact": "afm_jax.impact.poincare",
         "save_scene": "afm_jax.scenefile",
         "single_impact_orbits": "afm_jax.impact.orbits",
+        "time_course": "afm_jax.contact.time_course",
     }
 
     def __getattr__(name):
@@ -88,4 +90,5 @@ __all__ = [
     "next_impact",
     "save_scene",
     "single_impact_orbits",
+    "time_course",
 ]

@@ -20,14 +20,14 @@ def crossed_in_time(contact, speed, inner_nm, mass=1.0):
     def rates(_, state):
         return [state[1], float(static(state[0], state[1])) / mass]
 
-    def leaves(_, state):
-        return state[0] - float(contact.bridge_breaks_nm)
+    def crossing(gap_nm, direction):
+        def event(_, state):
+            return state[0] - gap_nm
 
-    def deep(_, state):
-        return state[0] - inner_nm
+        vars(event).update(terminal=True, direction=direction)
+        return event
 
-    leaves.terminal, leaves.direction = True, 1.0
-    deep.terminal, deep.direction = True, -1.0
+    leaves, deep = crossing(float(contact.bridge_breaks_nm), 1.0), crossing(inner_nm, -1.0)
     start = [float(contact.bridge_forms_nm), -speed]
     path = solve_ivp(rates, (0.0, 40.0), start, method="DOP853", rtol=1e-11, atol=1e-13, events=[leaves, deep])
     assert not path.t_events[1].size, "the tip reached the junction"
@@ -40,7 +40,9 @@ def test_a_sharp_tip_turns_in_the_bridge(speed):
     contact = Contact.paper(tip_radius_nm=5.0)
     result = collide(contact, speed)
     assert int(result.outcome) == CollisionOutcome.TURNED_IN_BRIDGE
-    rebound, time = crossed_in_time(contact, speed, float(find_junction(contact).forms_gap_nm))
+    left = crossed_in_time(contact, speed, float(find_junction(contact).forms_gap_nm))
+    assert left is not None
+    rebound, time = left
     assert float(result.rebound_speed_nm_per_us) == pytest.approx(rebound, rel=1e-8)
     delay = time - float(contact.bridge_forms_nm) / speed - float(contact.bridge_breaks_nm) / rebound
     assert float(result.collision_delay_us) == pytest.approx(delay, abs=1e-7)

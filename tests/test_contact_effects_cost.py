@@ -15,7 +15,7 @@ def operations(effects) -> tuple[float, float]:
     """Return the floating-point operations and the transcendental ones of the compiled program of 64 tips."""
     contact = Contact.paper(effects=effects)
     compiled = _quick.lower(contact, jnp.asarray(1.0), jnp.linspace(12.0, 200.0, 64), SETTING).compile()
-    cost = compiled.cost_analysis()
+    cost = compiled.cost_analysis() or {}
     return cost["flops"], cost.get("transcendentals", 0.0)
 
 

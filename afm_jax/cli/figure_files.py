@@ -4,19 +4,21 @@ from pathlib import Path
 
 from afm_jax import presets
 from afm_jax.cli.out_folder import write_csv
+from afm_jax.plots.contact_figures import draw_contact_figure
 from afm_jax.plots.offset_amplitude import draw_offset_amplitudes
 from afm_jax.plots.stability_regions import draw_stability_chart
 from afm_jax.study import offset_amplitude, stability_regions
+from afm_jax.study.contact_figures import ContactFigure
 from afm_jax.study.figure_statements import adhesion_limit_nm
 from afm_jax.study.offset_amplitude import OffsetAmplitudes
 from afm_jax.study.paper_figures import FigureData
 
 
-def write_figure(number: str, figure: FigureData, folder: Path) -> list[str]:
+def write_figure(number: str, figure: FigureData | ContactFigure, folder: Path) -> list[str]:
     """Write a figure as PNG and CSV into a folder.
 
     Args:
-        number: "2", "3" or "9".
+        number: of the figure in the paper.
         figure: its data.
         folder: exists and can be written to.
 
@@ -24,6 +26,10 @@ def write_figure(number: str, figure: FigureData, folder: Path) -> list[str]:
         The names of the files.
     """
     picture, table = f"figure{number}.png", f"figure{number}.csv"
+    if isinstance(figure, ContactFigure):
+        draw_contact_figure(number, figure, folder / picture)
+        write_csv(folder / table, figure.table(), tuple(figure.columns))
+        return [picture, table]
     data = figure.data
     if isinstance(data, OffsetAmplitudes):
         draw_offset_amplitudes(data, folder / picture, title=_AMPLITUDE_TITLE)

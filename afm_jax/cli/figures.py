@@ -1,4 +1,4 @@
-"""`afm-jax figures --only 2,3,9`: the paper's figures as PNG and CSV, and the paper's words about them checked."""
+"""`afm-jax figures --only 2,3,4`: the paper's figures as PNG and CSV, and the paper's words about them checked."""
 
 import time
 from pathlib import Path
@@ -11,10 +11,11 @@ from afm_jax.cli.out_folder import prepare_folder
 from afm_jax.cli.session import Session, with_session
 
 if TYPE_CHECKING:
+    from afm_jax.study.contact_figures import ContactFigure
     from afm_jax.study.paper_figures import FigureData
 
-AVAILABLE = ("2", "3", "9")
-_LATER = ("4", "5", "6", "7", "8", "10", "11")
+AVAILABLE = ("2", "3", "4", "5", "6", "7", "9")
+_LATER = ("8", "10", "11")
 _DEFAULT_FOLDER = Path("figures")
 _SPOT_CHECKS = 60
 _COARSE_SPOT_CHECKS = 20
@@ -39,7 +40,7 @@ def _chosen(ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[
 @click.command()
 @click.option(
     "--only",
-    metavar="2,3,9",
+    metavar="2,3,4,...",
     default=",".join(AVAILABLE),
     callback=_chosen,
     help="Draw these figures of the paper only (comma list); all that there are if left out.",
@@ -50,9 +51,10 @@ def _chosen(ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[
 def command(session: Session, *, only: tuple[str, ...], coarse: bool, seed: int) -> None:
     """Draw the paper's figures, with their data as CSV (into the folder `figures` without --out).
 
-    Figures 2 and 3: where single-impact orbits are stable, without and with adhesion. Figure 9: amplitude of the
-    (1,1) orbit against the tip-sample offset, below and above resonance. What the paper says of each figure is
-    checked on the data, and random points against long iterations of the impact map.
+    Figures 2 and 3: where single-impact orbits are stable, without and with adhesion. Figure 4: the forces of the
+    liquid bridge; 5: loading and unloading; 6: the impact law of the contact; 7: one impact in time. Figure 9:
+    amplitude of the (1,1) orbit against the tip-sample offset, below and above resonance. What the paper says of each
+    figure is checked on the data, and random points of 2, 3 and 9 against long iterations of the impact map.
     """
     folder = session.out or _DEFAULT_FOLDER
     prepare_folder(folder)
@@ -73,11 +75,13 @@ def command(session: Session, *, only: tuple[str, ...], coarse: bool, seed: int)
         raise NotValid(f"figure {', '.join(wrong)}: a statement or a spot check fails, see the output")
 
 
-def _compute(session: Session, only: tuple[str, ...], *, coarse: bool, seed: int) -> "dict[str, FigureData]":
+def _compute(
+    session: Session, only: tuple[str, ...], *, coarse: bool, seed: int
+) -> "dict[str, FigureData | ContactFigure]":
     """Compute the figures; each one's time goes to standard error."""
     from afm_jax.study import paper_figures  # noqa: PLC0415
 
-    results: dict[str, FigureData] = {}
+    results: dict[str, FigureData | ContactFigure] = {}
     points = _COARSE_SPOT_CHECKS if coarse else _SPOT_CHECKS
     start = time.perf_counter()
 
@@ -94,45 +98,55 @@ def _compute(session: Session, only: tuple[str, ...], *, coarse: bool, seed: int
             adhesive = paper_figures.figure3_chart(coarse=coarse, report=report)
             report("figure 3: statements and spot checks")
             results["3"] = paper_figures.figure3(adhesive, without, seed=seed, points=points)
+    for number in set(only) & {"4", "5", "6", "7"}:
+        from afm_jax.study.contact_figures import CONTACT_FIGURES  # noqa: PLC0415
+
+        report(f"figure {number}: contact")
+        results[number] = CONTACT_FIGURES[number]()
     if "9" in only:
         report("figure 9: amplitudes and spot checks")
         results["9"] = paper_figures.figure9(coarse=coarse, seed=seed, points=points)
     report("drawing")
-    return results
+    return {number: results[number] for number in only}
 
 
-def _payload(number: str, figure: "FigureData", files: list[str]) -> dict[str, Any]:
-    from afm_jax.study.spot_checks import CLEARANCE_NM, STABILITY_MARGIN  # noqa: PLC0415
-
-    checks = figure.spot_checks
-    return {
+def _payload(number: str, figure: "FigureData | ContactFigure", files: list[str]) -> dict[str, Any]:
+    payload = {
         "figure": int(number),
         "files": files,
         **figure.numbers,
         "statements": [
             {"statement": each.statement, "holds": each.holds, **each.numbers} for each in figure.statements
         ],
-        "spot_checks": {
+        "valid": figure.valid,
+    }
+    checks = getattr(figure, "spot_checks", None)
+    if checks is not None:
+        from afm_jax.study.spot_checks import CLEARANCE_NM, STABILITY_MARGIN  # noqa: PLC0415
+
+        payload["spot_checks"] = {
             "checked": checks.checked,
             "excluded": checks.excluded,
             "excluded_share": checks.excluded_share,
             "excluded_within": {"trace_margin": STABILITY_MARGIN, "clearance_nm": CLEARANCE_NM},
             "failures": checks.failures,
-        },
-        "valid": figure.valid,
-    }
+        }
+    return payload
 
 
 def _text(payload: list[dict[str, Any]]) -> list[str]:
     lines = []
     for figure in payload:
         lines.append(f"Figure {figure['figure']}: {', '.join(figure['files'])}")
-        lines.append(f"  stable share of the points: {figure['stable_share']:.3f}")
+        if "stable_share" in figure:
+            lines.append(f"  stable share of the points: {figure['stable_share']:.3f}")
         lines += [
             f"  {'holds' if statement['holds'] else 'FAILS'}: {statement['statement']}"
             for statement in figure["statements"]
         ]
-        checks = figure["spot_checks"]
+        checks = figure.get("spot_checks")
+        if checks is None:
+            continue
         counts = ", ".join(f"{count} {verdict}" for verdict, count in checks["checked"].items())
         lines.append(
             f"  spot checks by long iteration: {counts}; {len(checks['failures'])} failed, "

@@ -15,7 +15,7 @@ COMMANDS = {
     "bench": ("afm_jax.cli.bench", "Measure impacts per second, next to SciPy."),
     "calibrate": ("afm_jax.cli.calibrate", "Fit frequency and quality factor to a free resonance sweep."),
     "collide": ("afm_jax.cli.collide", "Let free tips collide with the sample: rebound, delay, capture, energy."),
-    "figures": ("afm_jax.cli.figures", "Draw the paper's figures 2, 3 and 9, with their statements checked."),
+    "figures": ("afm_jax.cli.figures", "Draw figures 2 to 7 and 9 of the paper, with its statements checked."),
     "fit": ("afm_jax.cli.fit", "Fit the impact law to a table of vibration amplitudes."),
     "fit-law": ("afm_jax.cli.fit_law", "Fit the impact law and the delay law to a simulated contact."),
     "orbits": ("afm_jax.cli.orbits", "Find all single-impact orbits of a scene, and whether they are stable."),

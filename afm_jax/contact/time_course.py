@@ -1,0 +1,192 @@
+"""One impact in time: gap, speed, phase and force along the way of a free tip through the contact.
+
+The speed at a gap follows from the energy, the time from its quadrature (the same equations as in `collide`), at Gauss
+nodes that crowd where the tip is slow; time is a result here, so that the points are not equally spaced.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from afm_jax.contact.bridge import bridge_of
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.forces import jkr
+from afm_jax.contact.junction import Junction, explain_missing_junction, find_junction
+from afm_jax.contact.junction_way import turning_root
+from afm_jax.contact.passage import Way, margin_of, way_through
+from afm_jax.contact.passage_collocation import nodes_along
+from afm_jax.contact.phases import Phase, force_in_phase
+from afm_jax.parameters import as_parameter, check_parameter
+
+_NODES = 64
+_SWEEPS = 12
+_FLIGHT_SHARE = 0.5
+"""Free flight shown before and after contact, as a share of the gap at which the bridge breaks."""
+
+
+class TimeCourse(NamedTuple):
+    """An impact in time; arrays of one length, times increasing.
+
+    A captured tip's course ends where it first stops on its way out.
+    """
+
+    time_us: Float[np.ndarray, " points"]
+    """0 where the bridge forms."""
+    gap_nm: Float[np.ndarray, " points"]
+    velocity_nm_per_us: Float[np.ndarray, " points"]
+    """dD/dt: negative on the way in."""
+    phase: Int[np.ndarray, " points"]
+    """A `Phase`."""
+    force_nn: Float[np.ndarray, " points"]
+    """On the tip; attraction is negative."""
+    captured: bool
+
+
+class _Leg(NamedTuple):
+    """A part of the course: times from its start, and its whole duration; speeds of 0 mark places never reached."""
+
+    time: Float[Array, " nodes"]
+    gap: Float[Array, " nodes"]
+    velocity: Float[Array, " nodes"]
+    duration: Float[Array, ""]
+
+
+def time_course(contact: Contact, approach_speed_nm_per_us: ArrayLike, mass_ng: ArrayLike = 1.0) -> TimeCourse:
+    """Return the time course of one impact of a free tip on a sample at rest.
+
+    Args:
+        contact: the contact, of numbers.
+        approach_speed_nm_per_us: speed far from the sample in nm/us.
+        mass_ng: the tip's mass in ng.
+
+    Raises:
+        ValueError: if speed or mass is not positive, the contact has no junction, or the bridge turns the tip round
+            before the junction forms.
+    """
+    check_parameter("approach_speed_nm_per_us", approach_speed_nm_per_us, "positive")
+    check_parameter("mass_ng", mass_ng, "positive")
+    speed, mass = as_parameter(approach_speed_nm_per_us), as_parameter(mass_ng)
+    junction, legs, energies = _course(contact, speed, mass)
+    if not bool(junction.exists):
+        raise ValueError(f"the contact has no junction: {explain_missing_junction(contact)}")
+    return _joined(
+        contact, junction, float(speed), [jax.tree.map(np.asarray, leg) for leg in legs], np.asarray(energies)
+    )
+
+
+@jax.jit
+def _course(
+    contact: Contact, speed: Float[Array, ""], mass: Float[Array, ""]
+) -> tuple[Junction, list[_Leg], Float[Array, "3"]]:
+    """Return the four legs, and kinetic energies where the junction forms and breaks with the rebound speed."""
+    junction, bridge, solid = find_junction(contact), bridge_of(contact), contact.junction
+    forms, breaks = contact.bridge_forms_nm, jnp.maximum(contact.bridge_breaks_nm, junction.breaks_gap_nm)
+    pull_in, pull_out = (-bridge.force(gap) * gap for gap in (forms, breaks))
+    start = 0.5 * mass * speed * speed
+
+    inward, on = _crossing(
+        way_through(bridge, mass, (forms, junction.forms_gap_nm), start, margin_of(start, pull_in), inward=True)
+    )
+    level = jkr.work(junction.forms_root) + on / solid.energy_scale_aj
+    loading, unloading = _junction_legs(solid, junction, level, mass)
+    off = (level - jkr.work(jkr.FOLD)) * solid.energy_scale_aj
+
+    def way_out(outer: Float[Array, ""], margin: Float[Array, ""]) -> Way:
+        return way_through(bridge, mass, (outer, junction.breaks_gap_nm), off, margin, inward=False)
+
+    def end_at(outer: Float[Array, ""]) -> Float[Array, ""]:
+        return _crossing(way_out(outer, jnp.full_like(start, 1e-3)))[1]
+
+    end = end_at(breaks)
+    # a tip that does not get out stops at the gap to which its energy just suffices
+    stop = jnp.where(end > 0.0, breaks, _largest(lambda gap: end_at(gap) > 0.0, junction.breaks_gap_nm, breaks))
+    outward, left = _crossing(way_out(stop, margin_of(jnp.maximum(end, 0.0), pull_out)))
+    rebound = jnp.where((off > 0.0) & (end > 0.0), jnp.sqrt(2.0 * jnp.maximum(left, 0.0) / mass), 0.0)
+    return junction, [inward, loading, unloading, outward], jnp.stack([on, off, rebound])
+
+
+def _largest(holds: Callable[[Array], Array], low: Float[Array, ""], high: Float[Array, ""]) -> Float[Array, ""]:
+    """Return the largest value up to which a condition holds, by halving."""
+
+    def halve(_, ends):
+        middle = 0.5 * (ends[0] + ends[1])
+        inside = holds(middle)
+        return jnp.where(inside, middle, ends[0]), jnp.where(inside, ends[1], middle)
+
+    return lax.fori_loop(0, 50, halve, (low, high))[0]
+
+
+def _crossing(way: Way) -> tuple[_Leg, Float[Array, ""]]:
+    """Return a crossing of the bridge and the kinetic energy at its end."""
+    points, weights, cumulative = nodes_along(_NODES, way.length)
+    y, gap = way.place(way.length * points)
+    available = way.available_aj(gap)
+    spent = jnp.zeros_like(available)
+    for _ in range(_SWEEPS):
+        spent = way.length * (cumulative @ way.rates(y, gap, available - spent)[0])
+    losses, times = way.rates(y, gap, available - spent)
+    end = way.end(way.length * (weights @ losses), way.length * (weights @ times))
+    kinetic = jnp.maximum(available - spent, 0.0)
+    speed = jnp.where(kinetic > 0.0, jnp.sqrt(jnp.where(kinetic > 0.0, kinetic * way.twice_inverse_mass, 1.0)), 0.0)
+    return _Leg(way.length * (cumulative @ times), gap, -way.sense * speed, end.time_us), end.energy_aj
+
+
+def _junction_legs(
+    solid: jkr.Jkr, junction: Junction, level: Float[Array, ""], mass: Float[Array, ""]
+) -> tuple[_Leg, _Leg]:
+    """Return the ways from the formation of the junction to the turning point, and from there to the fold."""
+    turn = turning_root(level)
+    points, weights, cumulative = nodes_along(_NODES, turn)
+    pace = solid.depth_scale_nm * jnp.sqrt(0.5 * mass / solid.energy_scale_aj)
+    # both ends may be turning points: sin^2 takes the square roots out
+    share, bend = jnp.sin(0.5 * jnp.pi * points) ** 2, 0.5 * jnp.pi * jnp.sin(jnp.pi * points)
+
+    def leg(end: Float[Array, ""]) -> _Leg:
+        s = turn - (turn - end) * share
+        missing = level - jkr.work(s)
+        moving = missing > 0.0
+        root = jnp.sqrt(jnp.where(moving, missing, 1.0))
+        rate = jnp.where(moving, (turn - end) * bend * jkr.depth_slope(s) * pace / root, 0.0)
+        velocity = jnp.where(moving, solid.depth_scale_nm * root / pace, 0.0)
+        gap = junction.shift_nm - solid.depth_scale_nm * jkr.depth(s)
+        return _Leg(cumulative @ rate, gap, velocity, weights @ rate)
+
+    lowest = jnp.full_like(turn, 6.0 ** (1.0 / 6.0))  # of the work: left of it the contact pulls
+    fold = jnp.full_like(turn, jkr.FOLD)
+    breaks = level > jkr.work(fold)
+    stop = lowest + fold - _largest(lambda s: jkr.work(lowest + fold - s) < level, fold, lowest)
+    out = leg(jnp.where(breaks, fold, stop))
+    into = leg(junction.forms_root)
+    # both legs are counted from the turning point; the way in is the way out of the same energy, backwards
+    return _Leg(into.duration - into.time[::-1], into.gap[::-1], -into.velocity[::-1], into.duration), out
+
+
+def _joined(
+    contact: Contact, junction: Junction, speed: float, legs: list[_Leg], energies: Float[np.ndarray, "3"]
+) -> TimeCourse:
+    """Return the legs one after the other, with free flight before and, for a tip that leaves, after them."""
+    forms, breaks = float(contact.bridge_forms_nm), max(float(contact.bridge_breaks_nm), float(junction.breaks_gap_nm))
+    if not energies[0] > 0.0:
+        raise ValueError("the bridge turns the tip round before the junction forms; take a higher speed")
+    flight = _FLIGHT_SHARE * breaks
+    parts = [(Phase.DRY, np.array([-flight / speed, 0.0]), np.array([forms + flight, forms]), np.full(2, -speed))]
+    begin = 0.0
+    _, off, rebound = energies
+    for phase, leg in zip((Phase.BRIDGE, Phase.JUNCTION, Phase.JUNCTION, Phase.BRIDGE), legs, strict=True):
+        if leg is legs[-1] and (off <= 0.0 or not leg.duration > 0.0):
+            break
+        parts.append((phase, begin + np.asarray(leg.time), np.asarray(leg.gap), np.asarray(leg.velocity)))
+        begin += float(leg.duration)
+    captured = not rebound > 0.0
+    if not captured:
+        after = np.array([begin, begin + flight / rebound])
+        parts.append((Phase.DRY, after, np.array([breaks, breaks + flight]), np.full(2, rebound)))
+    time, gap, velocity = (np.concatenate([part[place] for part in parts]) for place in (1, 2, 3))
+    phase = np.concatenate([np.full(part[1].shape, int(part[0])) for part in parts])
+    force = np.asarray(force_in_phase(contact, junction, phase, gap, velocity))
+    return TimeCourse(time, gap, velocity, phase, force, captured)
