@@ -45,9 +45,44 @@ QUICK = {
     "repetitions": 1,
 }
 
+COLLIDE_COLUMNS = (
+    "method",
+    "variable",
+    "setting",
+    "precision",
+    "tolerance",
+    "microseconds_per_impact",
+    "rebound_error",
+    "delay_error_us",
+    "slope_error",
+    "near_capture_error",
+    "evaluations_per_impact",
+    "compile_s",
+    "reason",
+)
+"""What `accuracy.csv` tells of a contestant of `collide`."""
+COLLIDE_FULL = {
+    "tolerances": [1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11],
+    "solvers": ["Tsit5", "Dopri5", "Dopri8", "Kvaerno5"],
+    "accuracies": [1e-5, 1e-6, 1e-9, 1e-11],
+    "steps": [2, 8],
+    "batch": 500,
+    "repetitions": 3,
+    "scipy_speeds": [12.0, 30.0, 100.0],
+}
+COLLIDE_QUICK = {
+    "tolerances": [1e-6],
+    "solvers": ["Dopri8"],
+    "accuracies": [1e-9],
+    "steps": [],
+    "batch": 8,
+    "repetitions": 1,
+    "scipy_speeds": [30.0],
+}
+
 
 @click.command()
-@click.argument("study", default="map", metavar="[map]")
+@click.argument("study", default="map", metavar="[map|collide]")
 @click.option(
     "--wanted-error-us",
     type=click.FloatRange(min=0.0, min_open=True),
@@ -55,17 +90,29 @@ QUICK = {
     show_default=True,
     help="Error of an impact time for which to find the cheapest setting.",
 )
+@click.option(
+    "--accuracy",
+    type=click.FloatRange(min=0.0, min_open=True),
+    default=1e-9,
+    show_default=True,
+    help="For collide: relative error of the rebound speed (a tenth of the delay's in us) to find the cheapest for.",
+)
 @click.option("--quick", is_flag=True, help="Few and small measurements: to see that it works.")
 @with_session
-def command(session: Session, study: str, wanted_error_us: float, *, quick: bool) -> None:
-    """Show the error of impact times against the time they take.
+def command(session: Session, study: str, wanted_error_us: float, accuracy: float, *, quick: bool) -> None:
+    """Show the error of impacts against the time they take: of the impact map, or of `collide` through the contact.
 
-    Root tolerances in float32 and float64, and SciPy's solve_ivp with events, on three scenes: regular, near grazing
-    with chatter, and of order 5. Errors are against 50 digits. With --out accuracy.csv, accuracy.json, accuracy.png.
+    map: root tolerances in float32 and float64, and SciPy's solve_ivp with events, on three scenes: regular, near
+    grazing with chatter, and of order 5; errors are against 50 digits. collide: Diffrax solvers with fixed and adaptive
+    steps, in the gap and in time, values and derivatives, float32 and float64, SciPy beside them; errors are against a
+    quadrature converged to rounding. With --out accuracy.csv, accuracy.json, accuracy.png.
     """
-    if study != "map":
-        raise click.UsageError(f"there is no accuracy study of `{study}`; choose: map")
+    if study not in {"map", "collide"}:
+        raise click.UsageError(f"there is no accuracy study of `{study}`; choose: map, collide")
     session.start_computing()
+    if study == "collide":
+        collide_study(session, accuracy, quick=quick)
+        return
     from afm_jax.cli.strict_json import strict_json  # noqa: PLC0415
     from afm_jax.study.accuracy import cheapest_settings  # noqa: PLC0415
     from afm_jax.study.own_process import run_in_own_process  # noqa: PLC0415
@@ -88,6 +135,51 @@ def command(session: Session, study: str, wanted_error_us: float, *, quick: bool
         f"root tolerance {result['default_root_tolerance_us']:g} us.",
         *(cheapest_sentence(choice, wanted_error_us) for choice in cheapest),
     )
+
+
+def collide_study(session: Session, accuracy: float, *, quick: bool) -> None:
+    """Run and show the accuracy study of `collide`."""
+    from afm_jax.cli.strict_json import strict_json  # noqa: PLC0415
+    from afm_jax.study.contact_accuracy import cheapest_collision  # noqa: PLC0415
+    from afm_jax.study.own_process import run_in_own_process  # noqa: PLC0415
+
+    with session.working("measuring"):
+        task = "afm_jax.study.contact_accuracy:collide_accuracy"
+        result = run_in_own_process(task, COLLIDE_QUICK if quick else COLLIDE_FULL, cores=1)
+    best = cheapest_collision(result["rows"], accuracy)
+    payload = {**result, "accuracy": accuracy, "cheapest": best}
+    session.write_table("accuracy.csv", result["rows"], COLLIDE_COLUMNS)
+    if session.out is not None:
+        from afm_jax.plots.contact_accuracy import collide_accuracy_figure  # noqa: PLC0415
+
+        (session.out / "accuracy.json").write_text(strict_json(payload) + "\n", encoding="utf-8")
+        collide_accuracy_figure(result["rows"]).savefig(session.out / "accuracy.png", dpi=150)
+        session.note(f"wrote {session.out / 'accuracy.json'} and {session.out / 'accuracy.png'}")
+    sentence = (
+        f"No contestant reaches {accuracy:g}."
+        if best is None
+        else f"Cheapest for {accuracy:g}: {best['method']}, {best['setting']}, in the {best['variable']}: "
+        f"{best['microseconds_per_impact']:.3g} us an impact, errors {best['rebound_error']:.1e} and "
+        f"{best['delay_error_us']:.1e} us."
+    )
+    reference = f"Reference: quadrature converged to {result['reference_error']:.0e}."
+    session.emit(payload, collide_table(result["rows"]), reference, sentence)
+
+
+def collide_table(rows: Sequence[dict[str, Any]]) -> "Table":
+    """Return the contestants of `collide` as a table."""
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table(title="Error of a collision against the time it takes, 12 to 200 nm/us (one core)")
+    for heading in ("method", "in", "setting", "precision"):
+        table.add_column(heading)
+    for heading in ("us/impact", "u_out error", "delay error us", "slopes' error", "near capture", "compile s"):
+        table.add_column(heading, justify="right")
+    names = ("microseconds_per_impact", "rebound_error", "delay_error_us", "slope_error", "near_capture_error")
+    for row in rows:
+        cells = [in_digits(row.get(name)) for name in (*names, "compile_s")]
+        table.add_row(row["method"], row["variable"], row["setting"], row["precision"], *cells)
+    return table
 
 
 def accuracy_table(rows: Sequence[dict[str, Any]]) -> "Table":

@@ -32,6 +32,25 @@ COLUMNS = (
 )
 """What `bench.csv` tells of a measurement."""
 AIMED_BATCH = 10_000
+CONTACT = {"batch": AIMED_BATCH, "repetitions": 7, "many": 1_000_000, "scipy_speeds": [12.0, 30.0, 100.0]}
+CONTACT_QUICK = {"batch": 100, "repetitions": 1, "many": 2000, "scipy_speeds": [30.0]}
+CONTACT_COLUMNS = (
+    "what",
+    "batch",
+    "microseconds_per_impact",
+    "median_microseconds_per_impact",
+    "compile_s",
+    "rebound_error",
+    "delay_error_us",
+    "ratio_to_plain",
+    "flops",
+    "instructions",
+    "memory_mib",
+    "results_mib",
+    "peak_process_mib",
+    "evaluations_per_impact",
+)
+"""What `bench_contact.csv` tells of a measurement."""
 
 
 @click.command()
@@ -44,9 +63,10 @@ AIMED_BATCH = 10_000
     metavar="N",
     help="How many tips at once; may be given several times. Default: 1, 100, 10000 and 100000.",
 )
+@click.option("--only", type=click.Choice(["map", "contact"]), help="The impact map alone, or the contact alone.")
 @with_session
-def command(session: Session, batches: tuple[int, ...], *, quick: bool) -> None:
-    """Measure impacts per second of next_impact iterated, on one core and on all.
+def command(session: Session, batches: tuple[int, ...], only: str | None, *, quick: bool) -> None:
+    """Measure impacts per second: of next_impact iterated, on one core and on all, and of collide through the contact.
 
     The same run measures a chaotic scene, derivatives, and SciPy's solve_ivp with events on the same problem. Errors of
     impact times are against 50 digits. Times are the best of several repetitions, compilation apart; the machine should
@@ -63,17 +83,33 @@ def command(session: Session, batches: tuple[int, ...], *, quick: bool) -> None:
     machine = machine_facts(cores)
     if (machine["load_before"] or 0.0) > 0.3 * cores:
         session.note(f"other programs are running (load {machine['load_before']:.1f}): times will be too long")
+    rows: list[dict[str, Any]] = []
+    contact_rows: list[dict[str, Any]] = []
+    if only != "map":
+        with session.working("measuring the contact"):
+            task = "afm_jax.study.contact_benchmark:contact_one_core"
+            contact_rows = run_in_own_process(task, CONTACT_QUICK if quick else CONTACT, cores=1)["rows"]
     with session.working("measuring"):
         alone = {**common, "blocks": blocks, "derivative_batch": 100 if quick else AIMED_BATCH}
-        rows = run_in_own_process("afm_jax.study.benchmark:one_core", alone, cores=1)["rows"]
-        if cores > 1:
+        if only != "contact":
+            rows = run_in_own_process("afm_jax.study.benchmark:one_core", alone, cores=1)["rows"]
+        if cores > 1 and only != "contact":
             rows += run_in_own_process("afm_jax.study.benchmark:all_cores", common, cores=cores)["rows"]
-    payload = {"rows": rows, "aims": aims(rows), "machine": machine}
-    session.write_table("bench.csv", rows, COLUMNS)
+    reached = [] if only == "contact" else aims(rows)
+    if contact_rows:
+        from afm_jax.study.contact_benchmark import aims as contact_aims  # noqa: PLC0415
+
+        reached += [_aim(name, value, at_most=bound) for name, value, bound in contact_aims(contact_rows)]
+    payload = {"rows": rows, "contact_rows": contact_rows, "aims": reached, "machine": machine}
+    if rows:
+        session.write_table("bench.csv", rows, COLUMNS)
+    if contact_rows:
+        session.write_table("bench_contact.csv", contact_rows, CONTACT_COLUMNS)
     if session.out is not None:
         (session.out / "bench.json").write_text(strict_json(payload) + "\n", encoding="utf-8")
         session.note(f"wrote {session.out / 'bench.json'}")
-    session.emit(payload, bench_table(rows), *(aim_sentence(aim) for aim in payload["aims"]))
+    tables = [*([bench_table(rows)] if rows else []), *([contact_table(contact_rows)] if contact_rows else [])]
+    session.emit(payload, *tables, *(aim_sentence(aim) for aim in payload["aims"]))
 
 
 def aims(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -154,3 +190,28 @@ def _error_cell(row: dict[str, Any]) -> str:
         return f"{row['error_us']:.1e} {row['error_kind']}"
     slope = row.get("derivative_relative_error")
     return "-" if slope is None else f"derivative: {slope:.1e} relative"
+
+
+def contact_table(rows: Sequence[dict[str, Any]]) -> "Table":
+    """Return the contact's measurements as a table."""
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table(title="Time of a collision through the contact, 12 to 200 nm/us, one core")
+    table.add_column("what")
+    headings = (
+        "batch",
+        "us/impact",
+        "compile s",
+        "u_out error",
+        "delay error us",
+        "ratio",
+        "operations",
+        "scratch MiB",
+    )
+    for heading in headings:
+        table.add_column(heading, justify="right")
+    names = ("compile_s", "rebound_error", "delay_error_us", "ratio_to_plain", "instructions", "memory_mib")
+    for row in rows:
+        cells = ["-" if row.get(name) is None else f"{row[name]:.3g}" for name in names]
+        table.add_row(row["what"], f"{row['batch']:,}", f"{row['microseconds_per_impact']:.3g}", *cells)
+    return table

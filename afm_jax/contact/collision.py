@@ -1,5 +1,6 @@
 """A free tip through the contact: one tip, one set of parameters; the batch is in `collide`."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import diffrax
@@ -61,8 +62,13 @@ def go_through(
     approach_speed: Float[Array, "..."],
     mass: Float[Array, "..."],
     setting: Setting,
+    crossing: Callable[[Way], Passage] | None = None,
 ) -> Ways:
-    """Return the three parts of one collision, each from the energy that the one before leaves."""
+    """Return the three parts of one collision, each from the energy that the one before leaves.
+
+    `crossing`, if not None, replaces the setting's way of crossing the bridge.
+    """
+    cross = crossing or (lambda way: _pass(way, setting))
     bridge, forces = bridge_of(contact), contact.forces.static
     forms, breaks = contact.bridge_forms_nm, junction.breaks_gap_nm
     outer = jnp.maximum(contact.bridge_breaks_nm, breaks)
@@ -70,7 +76,7 @@ def go_through(
 
     start = 0.5 * mass * approach_speed * approach_speed
     gaps = (forms, junction.forms_gap_nm)
-    inward = _pass(way_through(bridge, mass, gaps, start, margin_of(start, pull_in), inward=True), setting)
+    inward = cross(way_through(bridge, mass, gaps, start, margin_of(start, pull_in), inward=True))
     solid = pass_through_junction(contact.junction, junction, inward.energy_aj, mass, setting.junction_nodes)
 
     def way_out(margin: Float[Array, "..."]) -> Way:
@@ -84,7 +90,7 @@ def go_through(
         end = _pass(trial, setting).energy_aj
     else:
         end = pass_by_collocation(trial, 6, 1).energy_aj
-    outward = _pass(way_out(margin_of(end, pull_out)), setting)
+    outward = cross(way_out(margin_of(end, pull_out)))
 
     # at an end that pulls, a slow tip's drag must be small against the pull for the substitution to hold
     calm_in, calm_out = (

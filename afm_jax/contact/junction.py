@@ -20,7 +20,7 @@ from afm_jax.impact.implicit import implicit_root
 
 SMALLEST_GAP_NM = 0.01
 """The tangency is looked for between this gap and the one at which the bridge forms."""
-_POINTS = 28
+_POINTS = 24
 Tangent = tuple[Bridge, Float[Array, "..."], Float[Array, "..."]]
 """The bridge and the JKR contact's units of load and depth."""
 

@@ -1,0 +1,86 @@
+"""Adaptive Diffrax solves of the bridge crossing, in the gap and in time: contestants of the accuracy study.
+
+In the gap the crossing's own equations (`afm_jax.contact.passage`) are solved with error control. In time gap and
+rate are the state, the phase is frozen, and Diffrax's events end the crossing.
+"""
+
+from typing import Any
+
+import diffrax
+import jax.numpy as jnp
+import optimistix
+from jaxtyping import Array, Float
+
+from afm_jax.contact.passage import Passage, Way
+
+SOLVERS = {
+    "Tsit5": diffrax.Tsit5,
+    "Dopri5": diffrax.Dopri5,
+    "Dopri8": diffrax.Dopri8,
+    "Kvaerno5": diffrax.Kvaerno5,
+}
+_MAX_STEPS = 4096
+_LONGEST_US = 20.0
+
+
+def pass_adaptively(way: Way, solver: str, tolerance: Float[Array, ""]) -> Passage:
+    """Return the passage of one tip in the gap, with step sizes controlled to a tolerance."""
+
+    def field(share: Any, state: Any, args: Any) -> Any:
+        del args
+        y, gap = way.place(way.length * share)
+        loss, time = way.rates(y, gap, way.available_aj(gap) - state[0])
+        return way.length * loss, way.length * time
+
+    nothing = (jnp.zeros_like(way.length), jnp.zeros_like(way.length))
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(field),
+        SOLVERS[solver](),
+        0.0,
+        1.0,
+        None,
+        nothing,
+        stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
+        adjoint=diffrax.ForwardMode(),
+        max_steps=_MAX_STEPS,
+        throw=False,
+    )
+    assert solution.ys is not None  # noqa: S101 (for the type checker: the end is saved)
+    loss, time = (part[-1] for part in solution.ys)
+    return way.end(loss, time)
+
+
+def pass_in_time(way: Way, solver: str, tolerance: Float[Array, ""]) -> Passage:
+    """Return the passage of one tip in time, ended by an event at the far threshold."""
+    bridge, half_mass = way.bridge, 1.0 / way.twice_inverse_mass
+    start, end = way.place(jnp.zeros_like(way.length))[1], way.place(way.length)[1]
+
+    def field(time: Any, state: Any, args: Any) -> Any:
+        del time, args
+        gap, rate = state
+        safe = jnp.maximum(gap, 0.05)
+        return rate, (bridge.force(safe) - bridge.damping(safe) * rate) / (2.0 * half_mass)
+
+    def reached(t: Any, y: Any, args: Any, **extra: Any) -> Any:
+        del t, args, extra
+        return way.sense * (y[0] - end)
+
+    kinetic = way.available_aj(start)
+    rate = -way.sense * jnp.sqrt(jnp.maximum(kinetic, 1e-12) / half_mass)
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(field),
+        SOLVERS[solver](),
+        0.0,
+        _LONGEST_US,
+        None,
+        (start, rate),
+        stepsize_controller=diffrax.PIDController(rtol=tolerance, atol=tolerance),
+        event=diffrax.Event(reached, optimistix.Newton(1e-12, 1e-12)),
+        adjoint=diffrax.ForwardMode(),
+        max_steps=_MAX_STEPS,
+        throw=False,
+    )
+    assert solution.ys is not None  # noqa: S101 (for the type checker: the end is saved)
+    assert solution.ts is not None  # noqa: S101
+    left = half_mass * solution.ys[1][-1] ** 2
+    return Passage(left, solution.ts[-1], way.total_aj - way.end_potential_aj - left)

@@ -1,0 +1,84 @@
+"""The contact's benchmark and accuracy study: their reference, their baseline, their choices."""
+
+import numpy as np
+import pytest
+
+from afm_jax.contact.collide import batch_of
+from afm_jax.contact.contact import Contact
+from afm_jax.plots.contact_accuracy import collide_accuracy_figure
+from afm_jax.study.contact_accuracy import cheapest_collision
+from afm_jax.study.contact_benchmark import REFERENCE, aims, errors_against, speeds_of
+from afm_jax.study.scipy_collision import scipy_collision
+from tests import reference_contact as exact
+
+
+@pytest.fixture(scope="module")
+def reference():
+    return batch_of(Contact.paper(), 1.0, speeds_of(9), REFERENCE)
+
+
+def test_the_reference_is_that_of_mpmath(reference):
+    for place in (0, 4, 8):
+        speed = float(speeds_of(9)[place])
+        expected = exact.collision(exact.ContactParameters(), speed, digits=20)
+        # converged to rounding: energies of 100 aJ, of which the slowest tip keeps 12
+        assert float(reference.rebound_speed_nm_per_us[place]) == pytest.approx(
+            float(expected.rebound_speed_nm_per_us), rel=1e-12
+        )
+        assert float(reference.collision_delay_us[place]) == pytest.approx(float(expected.delay_us), abs=1e-12)
+
+
+def test_scipys_baseline_follows_the_same_tip():
+    found = scipy_collision(Contact.paper(), 30.0, method="DOP853", rtol=1e-9)
+    expected = exact.collision(exact.ContactParameters(), 30, digits=20)
+    assert found.rebound_speed_nm_per_us == pytest.approx(float(expected.rebound_speed_nm_per_us), rel=1e-7)
+    assert found.collision_delay_us == pytest.approx(float(expected.delay_us), abs=1e-7)
+    assert found.evaluations > 100
+    with pytest.raises(ValueError, match="without an event"):
+        scipy_collision(Contact.paper(), 5.0, method="DOP853", rtol=1e-6)
+
+
+def test_errors_are_the_largest_of_each_kind(reference):
+    wrong = reference._replace(
+        rebound_speed_nm_per_us=reference.rebound_speed_nm_per_us * np.linspace(1.0, 1.001, 9),
+        collision_delay_us=reference.collision_delay_us - 2e-5,
+    )
+    rebound, delay = errors_against(wrong, reference)
+    assert rebound == pytest.approx(1e-3, rel=1e-9)
+    assert delay == pytest.approx(2e-5, rel=1e-9)
+
+
+def row(method, time, rebound, delay, precision="float64"):
+    return {
+        "method": method,
+        "variable": "gap",
+        "setting": "",
+        "precision": precision,
+        "microseconds_per_impact": time,
+        "rebound_error": rebound,
+        "delay_error_us": delay,
+        "slope_error": rebound,
+    }
+
+
+def test_the_cheapest_contestant_meets_both_errors():
+    rows = [
+        row("Tsit5, adaptive", 1.0, 1e-5, 1e-9),
+        row("Dopri5, adaptive", 2.0, 1e-7, 2e-5),
+        row("Dopri8, adaptive", 3.0, 1e-7, 9e-6),
+        row("collide, diffrax", 0.5, 1e-7, 1e-7, "float32"),
+        row("SciPy LSODA", None, None, None),
+    ]
+    best = cheapest_collision(rows, 1e-6)
+    assert best is not None
+    assert best["method"] == "Dopri8, adaptive"
+    assert cheapest_collision(rows, 1e-12) is None
+    figure = collide_accuracy_figure(rows)
+    assert [len(axes.lines) for axes in figure.axes] == [4, 4, 4]
+
+
+def test_aims_name_what_was_reached():
+    rows = [{"what": "diffrax, accuracy 1e-06", "microseconds_per_impact": 1.25, "rebound_error": 1e-7}]
+    reached = {name: (value, bound) for name, value, bound in aims(rows)}
+    assert reached["contact, us an impact at 1e-6"] == (1.25, 1.5)
+    assert reached["contact, us an impact at 1e-9"] == (None, 3.0)
