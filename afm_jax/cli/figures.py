@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from afm_jax.study.paper_figures import FigureData
 
 AVAILABLE = ("2", "3", "4", "5", "6", "7", "9")
+_OF_THE_CONTACT = {"4": "forces", "5": "loading and unloading", "6": "impact law", "7": "one impact in time"}
 _LATER = ("8", "10", "11")
 _DEFAULT_FOLDER = Path("figures")
 _SPOT_CHECKS = 60
@@ -98,10 +99,10 @@ def _compute(
             adhesive = paper_figures.figure3_chart(coarse=coarse, report=report)
             report("figure 3: statements and spot checks")
             results["3"] = paper_figures.figure3(adhesive, without, seed=seed, points=points)
-    for number in set(only) & {"4", "5", "6", "7"}:
+    for number in (each for each in only if each in _OF_THE_CONTACT):
         from afm_jax.study.contact_figures import CONTACT_FIGURES  # noqa: PLC0415
 
-        report(f"figure {number}: contact")
+        report(f"figure {number}: {_OF_THE_CONTACT[number]}")
         results[number] = CONTACT_FIGURES[number]()
     if "9" in only:
         report("figure 9: amplitudes and spot checks")
