@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 DARK = "#3b4a5a"
 ACCENT = "#b34700"
 """A dark orange that stands off white, black and DARK for every kind of colour vision."""
+BLUE = "#0072B2"
 GRID = "#9aa5b1"
 _FONT = 11.0
 _DPI = 200
@@ -26,6 +27,12 @@ def label_axes(axes: Axes, *, x: str, y: str) -> None:
     axes.set_xlabel(x, fontsize=_FONT + 1)
     axes.set_ylabel(y, fontsize=_FONT + 1)
     axes.tick_params(labelsize=_FONT)
+
+
+def with_zero_line(axes: Axes) -> None:
+    """Draw a light grid, and a line at 0 of the vertical axis."""
+    axes.axhline(0.0, color=GRID, linewidth=0.8)
+    axes.grid(color=GRID, alpha=0.25)
 
 
 def save(figure: Figure, path: Path) -> None:

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import brentq
+from scipy.optimize import root_scalar
 
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import Junction
@@ -33,15 +33,15 @@ def force_statements(contact: Contact) -> list[Statement]:
     slope that turns there.
     """
     forms = float(contact.bridge_forms_nm)
-    zero = brentq(lambda gap: float(contact.forces(gap)), 0.02, SMALL_GAP_NM)
-    attractive = 1.0 - float(zero) / forms
+    zero = float(root_scalar(lambda gap: float(contact.forces(gap)), bracket=(0.02, SMALL_GAP_NM)).root)
+    attractive = 1.0 - zero / forms
     gaps = np.array([0.5, 1.0, 2.0, 3.0]) * SMALL_GAP_NM
     closest, edge, *farther = stiffness = np.asarray(contact.forces.stiffness(gaps)).tolist()
     return [
         Statement(
             "the static force is attractive over most of its range",
             attractive > 0.9,
-            {"share_of_range": attractive, "repulsive_below_nm": float(zero)},
+            {"share_of_range": attractive, "repulsive_below_nm": zero},
         ),
         Statement(
             "the bridge's stiffness rises steeply below about 0.2 nm",
