@@ -10,8 +10,20 @@ amplitude_nm = 4
 frequency_khz = 180          # or reduced_frequency = omega / 2 Omega
 offset_nm = 0
 offset_rate_nm_per_us = 0
+[platform.second]            # leave out: one frequency; [base] and [force] may have one too
+amplitude_nm = 1
+frequency_khz = 33           # or reduced_frequency
+phase_deg = 0
+[base]                       # leave out: the cantilever's base rests
+amplitude_nm = 0.1
+frequency_khz = 90           # or reduced_frequency
+phase_deg = 0
+[force]                      # leave out: no force on the tip
+amplitude_nn = 0.5
+frequency_khz = 90           # or reduced_frequency
+phase_deg = 0
 [interaction]
-model = "law"                # or "contact"
+model = "law"                # or "contact", or "none": a free cantilever
 r = 0.998
 epsilon = 122                # nm^2/us^2
 viscous_loss = 0             # nm/us
@@ -27,35 +39,28 @@ velocity_nm_per_us = 80
 
 A resolved contact instead of a law: `model = "contact"`, `effects = ["capillary", "structural", "core", "viscous",
 "jkr"]` (all of them if left out) and any of the parameters in `CONTACT_RANGES`; the paper's values if left out.
+With [base] or [force] the platform may rest: without `amplitude_nm` and frequency its phase counts in the drive's.
 """
 
 import os
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import tomli_w
-from jaxtyping import ArrayLike
 
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
-from afm_jax.parameters import check_parameter
-from afm_jax.scenefile_keys import CONTACT_RANGES, KEYS, advise_table
+from afm_jax.scenefile_drives import drive_tables, number_of, numbers_of, read_drives
+from afm_jax.scenefile_keys import CONTACT_RANGES, INNER_TABLES, KEYS, MODELS, TABLES, advise_table
+from afm_jax.scenefile_start import Start, check_start
 from afm_jax.scenefile_table import SceneError, SceneTable, in_words, printable
 
 if TYPE_CHECKING:
     from afm_jax.contact.contact import Contact
 
-
-class Start(NamedTuple):
-    """Where a simulation begins: `phase_deg` of the drive, height above the platform, velocity in the lab."""
-
-    phase_deg: float
-    height_above_platform_nm: float
-    velocity_nm_per_us: float
+__all__ = ["SceneError", "Start", "load_scene", "load_start", "save_scene", "scene_tables"]
 
 
 def load_scene(path: str | os.PathLike[str]) -> Scene:
@@ -68,7 +73,10 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
         SceneError: if the file cannot be read, a table, key, type or value in it is wrong, or its contact has no
             junction; the message names the place and says how to mend it.
     """
-    return _scene_of(_tables(path))
+    tables = _tables(path)
+    scene = _scene_of(tables)
+    _start_of(tables, scene)
+    return scene
 
 
 def load_start(path: str | os.PathLike[str]) -> Start | None:
@@ -78,8 +86,7 @@ def load_start(path: str | os.PathLike[str]) -> Start | None:
         SceneError: if the file is not a valid scene file.
     """
     tables = _tables(path)
-    _scene_of(tables)
-    return _start_of(tables)
+    return _start_of(tables, _scene_of(tables))
 
 
 def save_scene(scene: Scene, path: str | os.PathLike[str], *, start: Start | None = None) -> None:
@@ -89,11 +96,13 @@ def save_scene(scene: Scene, path: str | os.PathLike[str], *, start: Start | Non
 
     Raises:
         OSError: if the file cannot be written.
-        TypeError: if the interaction is neither an impact law nor a contact.
-        ValueError: if the scene is a batch of scenes, or its contact has what the format has no key for.
+        TypeError: if the interaction is neither an impact law nor a contact nor None.
+        ValueError: if the scene is a batch of scenes, its contact or its drives are none that a file can hold, or the
+            start is impossible in it.
     """
     tables = scene_tables(scene)
     if start is not None:
+        check_start(start, scene)
         tables["start"] = {key: float(value) for key, value in start._asdict().items()}
     Path(path).write_bytes(tomli_w.dumps(tables).encode("utf-8"))
 
@@ -102,21 +111,26 @@ def scene_tables(scene: Scene) -> dict[str, dict[str, Any]]:
     """Return a scene as the tables of its file, dicts of numbers; what is absent is left out.
 
     Raises:
-        TypeError: if the interaction is neither an impact law nor a contact.
-        ValueError: if the scene is a batch of scenes, or its contact has what the format has no key for.
+        TypeError: if the interaction is neither an impact law nor a contact nor None.
+        ValueError: if the scene is a batch of scenes, or its contact or its drives are none that a file can hold.
     """
-    law = scene.interaction
     return {
-        "cantilever": _numbers_of(scene.cantilever, "cantilever"),
-        "platform": _numbers_of(scene.platform, "platform"),
-        "interaction": _law_table(law) if isinstance(law, ImpactLaw) else _contact_table(law),
+        "cantilever": numbers_of(scene.cantilever, "cantilever"),
+        **drive_tables(scene),
+        "interaction": _interaction_table(scene.interaction),
     }
 
 
+def _interaction_table(interaction: Any) -> dict[str, Any]:
+    if interaction is None:
+        return {"model": "none"}
+    return _law_table(interaction) if isinstance(interaction, ImpactLaw) else _contact_table(interaction)
+
+
 def _law_table(law: ImpactLaw) -> dict[str, Any]:
-    table = {"model": "law", **_numbers_of(law, "interaction")}
+    table = {"model": "law", **numbers_of(law, "interaction")}
     if law.delay is not None:
-        table["delay"] = _numbers_of(law.delay, "interaction.delay")
+        table["delay"] = numbers_of(law.delay, "interaction.delay")
     return table
 
 
@@ -127,20 +141,8 @@ def _contact_table(contact: Any) -> dict[str, Any]:
 
     if not isinstance(contact, Contact):
         raise TypeError(f"a scene file holds an ImpactLaw or a Contact as interaction, not {type(contact).__name__}")
-    numbers = {key: _number_of(value, key) for key, value in contact_parameters(contact).items()}
+    numbers = {key: number_of(value, key) for key, value in contact_parameters(contact).items()}
     return {"model": "contact", "effects": [name for name in EFFECTS if name in contact.effects], **numbers}
-
-
-def _numbers_of(part: Cantilever | Platform | ImpactLaw | CollisionDelay, table: str) -> dict[str, Any]:
-    values = {key: getattr(part, key, None) for key in KEYS[table] if key != "delay"}
-    return {key: _number_of(value, key) for key, value in values.items() if value is not None}
-
-
-def _number_of(value: ArrayLike, key: str) -> float:
-    number = np.asarray(value)
-    if number.ndim:
-        raise ValueError(f"`{key}` has shape {number.shape}, but a scene file holds one scene: save them one by one")
-    return float(number)
 
 
 def _tables(path: str | os.PathLike[str]) -> dict[str, SceneTable]:
@@ -148,17 +150,20 @@ def _tables(path: str | os.PathLike[str]) -> dict[str, SceneTable]:
     source = os.fspath(path)
     contents = _parsed(source)
     for name, value in contents.items():
-        if name not in ("cantilever", "platform", "interaction", "start"):
+        if name not in TABLES:
             message = advise_table(name, is_table=isinstance(value, dict))
             raise SceneError(f"{printable(source)}: {printable(name)}: {message}")
     tables = {name: _table(source, name, value) for name, value in contents.items()}
     for name in ("cantilever", "platform", "interaction"):
         if name not in tables:
-            raise SceneError(f"{printable(source)}: [{name}] is missing; add it with {', '.join(KEYS[name])}")
+            keys = ", ".join(key for key in KEYS[name] if f"{name}.{key}" not in INNER_TABLES)
+            raise SceneError(f"{printable(source)}: [{name}] is missing; add it with {keys}")
     model = _model_of(tables["interaction"])
     tables["interaction"] = tables["interaction"]._replace(model=model)
-    if model == "law" and "delay" in tables["interaction"].values:
-        tables["interaction.delay"] = _table(source, "interaction.delay", tables["interaction"].values["delay"])
+    for name in INNER_TABLES:
+        outer, _, key = name.partition(".")
+        if outer in tables and key in tables[outer].values and (outer != "interaction" or model == "law"):
+            tables[name] = _table(source, name, tables[outer].values[key])
     for table in tables.values():
         table.check_keys()
     return tables
@@ -192,24 +197,28 @@ def _model_of(table: SceneTable) -> str:
     """Return the model, looked at first: it decides which keys are known."""
     model = table.values.get("model")
     if model is None:
-        table.fail('missing; add model = "law" or model = "contact"', "model")
-    if model not in ("law", "contact"):
-        table.fail('must be "law" or "contact"', "model")
+        table.fail('missing; add model = "law" or model = "contact", or model = "none" for a free cantilever', "model")
+    if model not in MODELS:
+        table.fail('must be "law" or "contact", or "none" for a free cantilever', "model")
     return model
 
 
 def _scene_of(tables: dict[str, SceneTable]) -> Scene:
     table = tables["cantilever"]
-    cantilever_numbers = table.numbers(required=("frequency_khz",), optional=("quality_factor", "mass_ng"))
-    cantilever = table.build(Cantilever, **cantilever_numbers)
-    platform = _platform_of(tables["platform"], cantilever_numbers["frequency_khz"])
+    numbers = table.numbers(required=("frequency_khz",), optional=("quality_factor", "mass_ng"))
+    cantilever = table.build(Cantilever, **numbers)
+    platform, base, force = read_drives(tables, cantilever)
+    return Scene(cantilever, platform, _interaction_of(tables), base, force)
+
+
+def _interaction_of(tables: dict[str, SceneTable]) -> Any:
     table = tables["interaction"]
-    _start_of(tables)
+    if table.model == "none":
+        return None
     if table.model == "contact":
-        return Scene(cantilever, platform, _contact_of(table))
+        return _contact_of(table)
     law = table.numbers(required=("r",), optional=("epsilon", "viscous_loss"))
-    interaction = table.build(ImpactLaw, **law, delay=_delay_of(tables.get("interaction.delay")))
-    return Scene(cantilever, platform, interaction)
+    return table.build(ImpactLaw, **law, delay=_delay_of(tables.get("interaction.delay")))
 
 
 def _contact_of(table: SceneTable) -> "Contact":
@@ -222,31 +231,14 @@ def _contact_of(table: SceneTable) -> "Contact":
     return table.build(make_contact, EFFECTS if effects is None else effects, numbers)
 
 
-def _platform_of(table: SceneTable, free_frequency_khz: float) -> Platform:
-    optional = ("frequency_khz", "reduced_frequency", "offset_nm", "offset_rate_nm_per_us")
-    numbers = table.numbers(required=("amplitude_nm",), optional=optional)
-    reduced = numbers.pop("reduced_frequency", None)
-    if reduced is not None and "frequency_khz" in numbers:
-        table.fail("has both frequency_khz and reduced_frequency; give one of them")
-    if reduced is None and "frequency_khz" not in numbers:
-        table.fail("the drive frequency is missing; add frequency_khz or reduced_frequency")
-    if reduced is not None:
-        table.build(check_parameter, "reduced_frequency", reduced, "positive")
-        # omega / 2 Omega
-        numbers["frequency_khz"] = 2.0 * reduced * free_frequency_khz
-    return table.build(Platform, **numbers)
-
-
 def _delay_of(table: SceneTable | None) -> CollisionDelay | None:
     return None if table is None else table.build(CollisionDelay, **table.numbers(required=KEYS["interaction.delay"]))
 
 
-def _start_of(tables: dict[str, SceneTable]) -> Start | None:
+def _start_of(tables: dict[str, SceneTable], scene: Scene) -> Start | None:
     table = tables.get("start")
     if table is None:
         return None
     start = Start(**table.numbers(required=KEYS["start"]))
-    table.build(check_parameter, "phase_deg", start.phase_deg, "finite")
-    table.build(check_parameter, "height_above_platform_nm", start.height_above_platform_nm, "not negative")
-    table.build(check_parameter, "velocity_nm_per_us", start.velocity_nm_per_us, "finite")
+    table.build(check_start, start, scene)
     return start

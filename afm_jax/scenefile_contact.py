@@ -40,8 +40,7 @@ def make_contact(effects: Sequence[str], parameters: Mapping[str, float]) -> Con
     if math.isinf(parameters.get("core_constant_j_m6", 0.0) * AJ_NM6_PER_J_M6):
         raise ValueError(f"`core_constant_j_m6` is too large: {parameters['core_constant_j_m6']:g}")
     contact = Contact.paper(effects=tuple(effects), **parameters)
-    # one compilation for every choice of effects
-    if not bool(_junction(contact).exists):
+    if not bool(junction_of(contact).exists):
         raise ValueError(f"the contact has no junction: {explain_missing_junction(contact)}")
     return contact
 
@@ -102,4 +101,5 @@ def _core_constant(term: CoreRepulsion) -> Any:
     return constant
 
 
-_junction = eqx.filter_jit(find_junction)
+junction_of = eqx.filter_jit(find_junction)
+"""`find_junction`, with one compilation for every choice of effects."""

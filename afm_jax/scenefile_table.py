@@ -19,7 +19,7 @@ class SceneTable(NamedTuple):
         source: the file's name, as it begins every message.
         name: the table's name, a key of `KEYS`.
         values: what it contains.
-        model: of the scene's interaction, "law" or "contact".
+        model: of the scene's interaction, one of `MODELS`.
     """
 
     source: str

@@ -1,22 +1,24 @@
-"""The moving platform that carries the sample: offset + ramp + cosine."""
+"""The moving platform that carries the sample: offset + ramp + cosine, and a second cosine where there is one."""
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from afm_jax.apparatus.drive import Tone
 from afm_jax.apparatus.trigonometry import sine_cosine
 from afm_jax.parameters import as_argument, as_parameter, check_parameter, readable
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
 
 class Platform(eqx.Module):
-    """A platform at z_p(t) = offset + rate t + amplitude cos(omega t).
+    """A platform at z_p(t) = offset + rate t + amplitude cos(omega t) [+ second].
 
     Args:
         amplitude_nm: drive amplitude (beta in the paper).
         frequency_khz: drive frequency, omega / 2 pi.
         offset_nm: mean height above the tip's rest position (sigma in the paper).
         offset_rate_nm_per_us: slow ramp of the offset.
+        second: a second frequency of the drive, its amplitude in nm; None leaves it out of the program.
 
     Raises:
         ValueError: if the frequency is not positive, the amplitude negative or a value not finite.
@@ -26,6 +28,7 @@ class Platform(eqx.Module):
     frequency_khz: Float[Array, "..."] = eqx.field(converter=as_parameter)
     offset_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.0)
     offset_rate_nm_per_us: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.0)
+    second: Tone | None = None
 
     __repr__ = readable
 
@@ -47,15 +50,36 @@ class Platform(eqx.Module):
 
     @property
     def top_speed_nm_per_us(self) -> Float[Array, "..."]:
-        """Largest speed of the cosine, beta omega, in nm/us."""
+        """Largest speed of the first cosine, beta omega, in nm/us."""
         return self.amplitude_nm * self.angular_frequency
 
+    @property
+    def reach_nm(self) -> Float[Array, "..."]:
+        """Largest distance from the ramped offset in nm; a bound where there are two cosines."""
+        return self.amplitude_nm if self.second is None else self.amplitude_nm + self.second.amplitude
+
+    @property
+    def largest_acceleration_nm_per_us2(self) -> Float[Array, "..."]:
+        """Largest acceleration, beta omega^2, in nm/us^2; a bound where there are two cosines."""
+        first = self.top_speed_nm_per_us * self.angular_frequency
+        return first if self.second is None else first + self.second.amplitude * self.second.angular_frequency**2
+
+    @property
+    def fastest_angular_frequency(self) -> Float[Array, "..."]:
+        """The largest angular frequency of the motion in rad/us."""
+        first = self.angular_frequency
+        return first if self.second is None else jnp.maximum(first, self.second.angular_frequency)
+
     def position_and_velocity(self, time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Return z_p in nm and its rate in nm/us at a time in us, from one sine-cosine pair."""
+        """Return z_p in nm and its rate in nm/us at a time in us, from one sine-cosine pair a frequency."""
         time = as_argument(time_us)
         sine, cosine = sine_cosine(self.angular_frequency * time)
         position = self.offset_nm + self.offset_rate_nm_per_us * time + self.amplitude_nm * cosine
-        return position, self.offset_rate_nm_per_us - self.top_speed_nm_per_us * sine
+        velocity = self.offset_rate_nm_per_us - self.top_speed_nm_per_us * sine
+        if self.second is None:
+            return position, velocity
+        value, rate = self.second.value_and_rate(time)
+        return position + value, velocity + rate
 
     def position(self, time_us: ArrayLike) -> Float[Array, "..."]:
         """Return z_p in nm at a time in us."""
@@ -67,5 +91,10 @@ class Platform(eqx.Module):
 
     def acceleration(self, time_us: ArrayLike) -> Float[Array, "..."]:
         """Return d^2z_p/dt^2 in nm/us^2 at a time in us."""
-        _, cosine = sine_cosine(self.angular_frequency * as_argument(time_us))
-        return -self.top_speed_nm_per_us * self.angular_frequency * cosine
+        time = as_argument(time_us)
+        _, cosine = sine_cosine(self.angular_frequency * time)
+        first = -self.top_speed_nm_per_us * self.angular_frequency * cosine
+        if self.second is None:
+            return first
+        value, _ = self.second.value_and_rate(time)
+        return first - self.second.angular_frequency**2 * value

@@ -79,10 +79,10 @@ def _time_to_turn(start: Float[Array, "..."], turn: Float[Array, "..."], nodes: 
     apart = distance > 0.0
     reach = jnp.where(apart, jnp.sqrt(jnp.where(apart, distance, 1.0)), 0.0)
     s = turn - (reach * points) ** 2
-    return 2.0 * reach * jnp.tensordot(weights, jkr.depth_slope(s) / jnp.sqrt(_mean_slope(turn, s)), axes=1)
+    return 2.0 * reach * jnp.tensordot(weights, jkr.depth_slope(s) / jnp.sqrt(mean_slope(turn, s)), axes=1)
 
 
-def _mean_slope(turn: Float[Array, "..."], s: Float[Array, "..."]) -> Float[Array, "..."]:
+def mean_slope(turn: Float[Array, "..."], s: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return (work(turn) - work(s)) / (turn - s) without cancellation: sums of turn^k s^(n-1-k)."""
     total = jnp.zeros_like(s)
     for degree, factor in ((10, 0.4), (7, -jkr.SLOPE), (4, 1.0)):

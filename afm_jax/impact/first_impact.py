@@ -15,6 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.surface import Surface
 from afm_jax.apparatus.trigonometry import sine_cosine
 from afm_jax.impact.implicit import implicit_root
 from afm_jax.outcome import Outcome
@@ -24,12 +25,24 @@ DEFAULT_ROOT_TOLERANCE_US = 1e-13
 
 
 class Flight(NamedTuple):
-    """A free flight that leaves the platform at `start_us` (us) with the lab velocity `velocity` (nm/us)."""
+    """A free flight that begins at `start_us` (us) with the lab velocity `velocity` (nm/us).
+
+    ``start_gap`` is the gap in nm it begins with, and ``level`` the gap in nm at which it is to end, not above the
+    first. None: both are the platform's surface, from which the tip has just left.
+    """
 
     cantilever: Cantilever
-    platform: Platform
+    platform: Platform | Surface
     start_us: Float[Array, ""]
     velocity: Float[Array, ""]
+    start_gap: Float[Array, ""] | None = None
+    level: Float[Array, ""] | None = None
+
+    @property
+    def position(self) -> Float[Array, ""]:
+        """The tip's height in nm at the start."""
+        height = self.platform.position(self.start_us)
+        return height if self.start_gap is None else height + self.start_gap
 
 
 class FirstImpact(NamedTuple):
@@ -43,16 +56,18 @@ class FirstImpact(NamedTuple):
 
 
 def flight_gap(duration_us: Float[Array, ""], flight: Flight) -> Float[Array, ""]:
-    """Return the gap z - z_p in nm, a duration in us after the start of a flight (eq. 3: its first zero)."""
-    cantilever, platform, start, velocity = flight
-    position, _ = cantilever.propagator(duration_us)(platform.position(start), velocity)
-    return position - platform.position(start + duration_us)
+    """Return the gap z - z_p less the flight's level in nm, a duration in us after its start (eq. 3: its first zero)."""
+    cantilever, platform, start = flight.cantilever, flight.platform, flight.start_us
+    position, _ = cantilever.propagator(duration_us)(flight.position, flight.velocity)
+    gap = position - platform.position(start + duration_us)
+    return gap if flight.level is None else gap - flight.level
 
 
 def first_impact(
     flight: Flight,
     *,
     skip_us: ArrayLike | None = None,
+    latest_us: ArrayLike | None = None,
     max_steps: int = DEFAULT_MAX_STEPS,
     root_tolerance_us: ArrayLike = DEFAULT_ROOT_TOLERANCE_US,
 ) -> FirstImpact:
@@ -61,6 +76,7 @@ def first_impact(
     Args:
         flight: where, when and how fast the tip leaves the platform.
         skip_us: the gap counts from this time (us) after the start on, after a negative collision delay; None: at once.
+        latest_us: the search ends at this time (us) after the start with `Outcome.NO_FURTHER_IMPACT`; None: never.
         max_steps: steps before the search gives up with `Outcome.STEP_LIMIT`.
         root_tolerance_us: the remaining error of the impact time at which the search stops, in us.
 
@@ -69,6 +85,8 @@ def first_impact(
     """
     skip = None if skip_us is None else jnp.asarray(skip_us, flight.velocity.dtype)
     search = _Search.begin(*lax.stop_gradient((flight, skip)))
+    if latest_us is not None:
+        search = search._replace(latest_us=jnp.minimum(search.latest_us, lax.stop_gradient(latest_us)))
     found, ended = search.run(max_steps, jnp.asarray(root_tolerance_us, flight.velocity.dtype))
     hit = ended == Outcome.IMPACT
     root = implicit_root(flight_gap, jnp.where(hit, found, 0.0), flight)
@@ -93,19 +111,22 @@ class _Search(NamedTuple):
     velocity: Float[Array, ""]
     position_sine: Float[Array, ""]  # factor of the sine in z e^(gamma s)
     velocity_sine: Float[Array, ""]
-    platform: Platform
+    platform: Platform | Surface
     start_us: Float[Array, ""]
     skip_us: Float[Array, ""] | None
+    level: Float[Array, ""] | None
     reach: Float[Array, ""]  # highest point the platform can get to; infinite with a rising offset
     latest_us: Float[Array, ""]  # no impact can happen after this duration
     tip_bound: Float[Array, ""]  # bound of |z''|
     gap_bound: Float[Array, ""]  # bound of |g''|
     clearance_speed: Float[Array, ""]  # at the start
+    leaves: Bool[Array, ""]  # the start is above the level, or leaves it
 
     @classmethod
     def begin(cls, flight: Flight, skip_us: Float[Array, ""] | None) -> "_Search":
-        cantilever, platform, start, velocity = flight
-        position, platform_velocity = platform.position_and_velocity(start)
+        cantilever, platform, start, velocity = flight.cantilever, flight.platform, flight.start_us, flight.velocity
+        height, platform_velocity = platform.position_and_velocity(start)
+        position = height if flight.start_gap is None else height + flight.start_gap
         omega, omega_d, gamma = (
             cantilever.angular_frequency,
             cantilever.damped_angular_frequency,
@@ -116,7 +137,12 @@ class _Search(NamedTuple):
         if damped:
             tip_bound = tip_bound * jnp.sqrt(1.0 + (2.0 * gamma / omega) ** 2)
         rate = platform.offset_rate_nm_per_us
-        reach = jnp.where(rate > 0.0, jnp.inf, platform.offset_nm + rate * start + platform.amplitude_nm)
+        highest = platform.offset_nm + rate * start + platform.reach_nm
+        reach = jnp.where(rate > 0.0, jnp.inf, highest if flight.level is None else highest + flight.level)
+        clearance_speed = velocity - platform_velocity
+        leaves = clearance_speed > 0.0
+        if flight.start_gap is not None and flight.level is not None:
+            leaves = (flight.start_gap > flight.level) | ((flight.start_gap == flight.level) & leaves)
         amplitude = jnp.sqrt(position**2 + ((velocity + gamma * position) / omega_d) ** 2)
         return cls(
             angular_frequency=omega_d,
@@ -128,11 +154,13 @@ class _Search(NamedTuple):
             platform=platform,
             start_us=start,
             skip_us=skip_us,
+            level=flight.level,
             reach=reach,
             latest_us=_latest_impact(amplitude, reach, gamma if damped else None, rate),
             tip_bound=tip_bound,
-            gap_bound=tip_bound + platform.top_speed_nm_per_us * platform.angular_frequency,
-            clearance_speed=velocity - platform_velocity,
+            gap_bound=tip_bound + platform.largest_acceleration_nm_per_us2,
+            clearance_speed=clearance_speed,
+            leaves=leaves,
         )
 
     def motion(self, duration: Float[Array, ""]) -> _Motion:
@@ -144,7 +172,10 @@ class _Search(NamedTuple):
             decay = jnp.exp(-self.decay_rate * duration)
             position, velocity = decay * position, decay * velocity
         platform_position, platform_velocity = self.platform.position_and_velocity(self.start_us + duration)
-        return _Motion(position, velocity, position - platform_position, velocity - platform_velocity)
+        gap = position - platform_position
+        return _Motion(
+            position, velocity, gap if self.level is None else gap - self.level, velocity - platform_velocity
+        )
 
     def safe_step(self, duration: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """Return a step in us that cannot pass the first root, and the error of the root it would leave."""
@@ -175,7 +206,7 @@ class _Search(NamedTuple):
             reached = duration + step
             return jnp.where(met, -reached, reached), steps + 1
 
-        leaving = self.clearance_speed > 0.0
+        leaving = self.leaves
         finite = jnp.isfinite(self.gap_bound) & jnp.isfinite(self.start_us) & jnp.isfinite(self.clearance_speed)
         begin, inside = self._first_step()
         begin = jnp.where(finite & leaving & ~inside, begin, -1.0)  # an ended search
@@ -190,6 +221,8 @@ class _Search(NamedTuple):
 
     def _first_step(self) -> tuple[Float[Array, ""], Bool[Array, ""]]:
         """Return a duration in us before which there is no impact, and whether the tip is in the platform there."""
+        if self.level is not None:
+            return jnp.zeros_like(self.clearance_speed), jnp.zeros_like(self.leaves)
         leave = 2.0 * self.clearance_speed / self.gap_bound
         if self.skip_us is None:
             return leave, jnp.zeros_like(leave, dtype=bool)

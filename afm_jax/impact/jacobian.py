@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.scene import Scene, require_sample_drive
 from afm_jax.impact.law import ImpactLaw, impact_law_of
 from afm_jax.impact.poincare import next_impact
 from afm_jax.outcome import Outcome
@@ -194,7 +194,9 @@ def map_jacobian(scene: Scene, time_us: ArrayLike, velocity_nm_per_us: ArrayLike
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
         TypeError: if the scene's interaction is not an impact law.
+        ValueError: if the scene has another drive than one cosine of the platform.
     """
+    require_sample_drive(scene)
     impact = next_impact(scene, time_us, velocity_nm_per_us)
     return _map_jacobian(scene, as_argument(time_us), as_argument(velocity_nm_per_us), impact)
 

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.scene import Scene, require_sample_drive
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.orbit_amplitude import lockin, peak_amplitude
 from afm_jax.impact.orbit_closure import OrbitProblem
@@ -64,7 +64,7 @@ def single_impact_orbits(scene: Scene, order: ArrayLike) -> SingleImpactOrbits:
     """Return every single-impact orbit of an order (eq. 9; damped, with viscous loss and delay).
 
     Args:
-        scene: a scene whose interaction is an `ImpactLaw`, without offset ramp.
+        scene: a scene whose interaction is an `ImpactLaw`, without offset ramp and second frequency.
         order: N, drive periods between impacts; a positive integer, scalar.
 
     Returns:
@@ -74,10 +74,12 @@ def single_impact_orbits(scene: Scene, order: ArrayLike) -> SingleImpactOrbits:
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
         TypeError: if the scene's interaction is not an impact law.
-        ValueError: if the order is not a positive integer, or the platform's offset ramps.
+        ValueError: if the order is not a positive integer, the platform's offset ramps, or the scene has another drive
+            than one cosine of the platform.
     """
     require_float64()
     impact_law_of(scene)
+    require_sample_drive(scene)
     _check_order(order)
     rate = scene.platform.offset_rate_nm_per_us
     if not is_traced(rate) and np.any(np.asarray(rate) != 0.0):

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.scene import Scene, require_sample_drive
 from afm_jax.impact.first_impact import DEFAULT_MAX_STEPS, DEFAULT_ROOT_TOLERANCE_US, Flight, first_impact
 from afm_jax.impact.law import ImpactLaw, impact_law_of
 from afm_jax.outcome import Outcome
@@ -65,6 +65,7 @@ def next_impact(
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
         TypeError: if the scene's interaction is not an impact law.
+        ValueError: if the scene has a drive besides the platform.
 
     >>> import jax
     >>> from afm_jax import Cantilever, ImpactLaw, Platform, Scene
@@ -75,6 +76,7 @@ def next_impact(
     """
     require_float64()
     impact_law_of(scene)
+    require_sample_drive(scene, second_frequency=True)
     dtype = scene.platform.frequency_khz.dtype
     start = (jnp.asarray(time_us, dtype), jnp.asarray(velocity_nm_per_us, dtype))
     return _next_impact(scene, start, jnp.asarray(root_tolerance_us, dtype), max_steps=max_steps)
@@ -106,10 +108,11 @@ def iterate_map(
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
         TypeError: if the scene's interaction is not an impact law.
-        ValueError: if `impacts` is not positive.
+        ValueError: if `impacts` is not positive, or the scene has a drive besides the platform.
     """
     require_float64()
     impact_law_of(scene)
+    require_sample_drive(scene, second_frequency=True)
     if impacts < 1:
         raise ValueError(f"`impacts` must be a positive integer, but is {impacts}")
     dtype = scene.platform.frequency_khz.dtype

@@ -1,0 +1,233 @@
+"""The surface that a free tip sees: the platform, less what the other drives make of the tip without it.
+
+Under a force f(t) and a base motion z_b(t) a free tip has the steady response p(t) = Re sum H(omega) a exp(i(omega t +
+phi)), a = f/m + Omega^2 z_b, H = 1/(Omega^2 - omega^2 + i omega Omega/Q). What is left of it, y = z - p, flies freely,
+and the gap is y - s with the surface s = z_p - p: offset, ramp and cosines once more. So whatever drives a scene,
+every integrator sees a free cantilever over a moving surface.
+"""
+
+from collections.abc import Iterable
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.drive import Tone
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.trigonometry import sine_cosine
+from afm_jax.parameters import as_argument, as_parameter, is_traced, readable
+
+_AT_RESONANCE = 1e-9
+"""Relative distance from the free frequency below which an undamped cantilever has no steady response."""
+
+
+class Wave(eqx.Module):
+    """A wave c cos(omega t) + s sin(omega t).
+
+    Args:
+        cosine: c in nm.
+        sine: s in nm.
+        angular_frequency: omega in rad/us.
+    """
+
+    cosine: Float[Array, "..."] = eqx.field(converter=as_parameter)
+    sine: Float[Array, "..."] = eqx.field(converter=as_parameter)
+    angular_frequency: Float[Array, "..."] = eqx.field(converter=as_parameter)
+
+    __repr__ = readable
+
+    @property
+    def amplitude_nm(self) -> Float[Array, "..."]:
+        """sqrt(c^2 + s^2) in nm, with slope 0 where both vanish."""
+        square = self.cosine**2 + self.sine**2
+        moves = square > 0.0
+        return jnp.where(moves, jnp.sqrt(jnp.where(moves, square, 1.0)), 0.0)
+
+
+class Surface(eqx.Module):
+    """A surface at offset + rate t + a sum of waves; what is asked of a `Platform` can be asked of it.
+
+    Args:
+        offset_nm: mean height at time 0.
+        offset_rate_nm_per_us: slow ramp of the offset.
+        tones: the waves.
+    """
+
+    offset_nm: Float[Array, "..."] = eqx.field(converter=as_parameter)
+    offset_rate_nm_per_us: Float[Array, "..."] = eqx.field(converter=as_parameter)
+    tones: tuple[Wave, ...]
+
+    __repr__ = readable
+
+    @property
+    def reach_nm(self) -> Float[Array, "..."]:
+        """A bound of the distance from the ramped offset in nm; sharp for a single wave."""
+        return self._total(wave.amplitude_nm for wave in self.tones)
+
+    @property
+    def top_speed_nm_per_us(self) -> Float[Array, "..."]:
+        """A bound of the speed against the ramp in nm/us; sharp for a single wave."""
+        return self._total(wave.amplitude_nm * wave.angular_frequency for wave in self.tones)
+
+    @property
+    def largest_acceleration_nm_per_us2(self) -> Float[Array, "..."]:
+        """A bound of the acceleration in nm/us^2; sharp for a single wave."""
+        return self._total(wave.amplitude_nm * wave.angular_frequency**2 for wave in self.tones)
+
+    @property
+    def fastest_angular_frequency(self) -> Float[Array, "..."]:
+        """The largest angular frequency of the motion in rad/us; 0 without waves."""
+        fastest = jnp.zeros_like(self.offset_nm)
+        for wave in self.tones:
+            fastest = jnp.maximum(fastest, wave.angular_frequency)
+        return fastest
+
+    def position_and_velocity(self, time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Return height in nm and velocity in nm/us at a time in us, from one sine-cosine pair a wave."""
+        time = as_argument(time_us)
+        position = self.offset_nm + self.offset_rate_nm_per_us * time
+        velocity = jnp.broadcast_to(self.offset_rate_nm_per_us, position.shape)
+        for wave in self.tones:
+            sine, cosine = sine_cosine(wave.angular_frequency * time)
+            position = position + wave.cosine * cosine + wave.sine * sine
+            velocity = velocity + wave.angular_frequency * (wave.sine * cosine - wave.cosine * sine)
+        return position, velocity
+
+    def position(self, time_us: ArrayLike) -> Float[Array, "..."]:
+        """Return the height in nm at a time in us."""
+        return self.position_and_velocity(time_us)[0]
+
+    def velocity(self, time_us: ArrayLike) -> Float[Array, "..."]:
+        """Return the velocity in nm/us at a time in us."""
+        return self.position_and_velocity(time_us)[1]
+
+    def acceleration(self, time_us: ArrayLike) -> Float[Array, "..."]:
+        """Return the acceleration in nm/us^2 at a time in us."""
+        time = as_argument(time_us)
+        acceleration = jnp.zeros_like(self.offset_nm * time)
+        for wave in self.tones:
+            sine, cosine = sine_cosine(wave.angular_frequency * time)
+            height = wave.cosine * cosine + wave.sine * sine
+            acceleration = acceleration - wave.angular_frequency**2 * height
+        return acceleration
+
+    def _total(self, parts: Iterable[Float[Array, "..."]]) -> Float[Array, "..."]:
+        return sum(parts, start=jnp.zeros_like(self.offset_nm))
+
+
+def surface_of(scene: Scene) -> tuple[Platform | Surface, Surface | None]:
+    """Return the surface that a scene's tip sees, and the tip's steady response to the drives of base and tip.
+
+    Without such drives the surface is the platform itself. Called outside `jit`, it leaves out cosines whose amplitude
+    is 0 and joins those of one frequency.
+
+    Args:
+        scene: any scene.
+
+    Returns:
+        The surface s that the freely moving y = z - p sees: D = y - s; and p, or None where there is no base and no
+        force.
+
+    Raises:
+        ValueError: if an undamped cantilever is driven at its free frequency, where there is no steady response.
+    """
+    if scene.base is None and scene.force is None:
+        return scene.platform, None
+    platform, cantilever = scene.platform, scene.cantilever
+    response: list[Wave] = []
+    if scene.base is not None:
+        per_nm = cantilever.angular_frequency**2
+        response += _responses(cantilever, scene.base.tones, per_nm, "base")
+    if scene.force is not None:
+        response += _responses(cantilever, scene.force.tones, 1.0 / cantilever.mass_ng, "force")
+    motion: list[Wave] = []
+    if not _is_known_zero(platform.amplitude_nm):
+        motion.append(Wave(platform.amplitude_nm, jnp.zeros_like(platform.amplitude_nm), platform.angular_frequency))
+    if platform.second is not None and not _is_known_zero(platform.second.amplitude):
+        motion.append(_wave_of(platform.second))
+    against = [Wave(-wave.cosine, -wave.sine, wave.angular_frequency) for wave in response]
+    surface = Surface(platform.offset_nm, platform.offset_rate_nm_per_us, _joined([*motion, *against]))
+    still = jnp.zeros_like(platform.offset_nm)
+    return surface, Surface(still, still, _joined(response))
+
+
+def check_steady_response(cantilever: Cantilever, tones: tuple[Tone, ...], name: str) -> None:
+    """Check that a cantilever has a steady response to tones, as far as the numbers are known.
+
+    Args:
+        cantilever: the cantilever.
+        tones: what pushes it.
+        name: what the message calls the drive.
+
+    Raises:
+        ValueError: if it is not damped and a tone is within 1e-9 of its free frequency.
+    """
+    free, quality = cantilever.frequency_khz, cantilever.quality_factor
+    for tone in tones:
+        known = not any(is_traced(value) for value in (free, quality, tone.frequency_khz) if value is not None)
+        if not known or _is_known_zero(tone.amplitude):
+            continue
+        undamped = quality is None or np.isinf(np.asarray(quality))
+        distance = np.abs(np.asarray(tone.frequency_khz) - np.asarray(free))
+        if np.any(undamped & (distance < _AT_RESONANCE * np.asarray(free))):
+            raise ValueError(
+                f"`{name}` drives an undamped cantilever at its free frequency, where the vibration grows without "
+                "end: give a quality_factor, or drive it at another frequency"
+            )
+
+
+def _responses(
+    cantilever: Cantilever, tones: tuple[Tone, ...], push_per_amplitude: Float[Array, "..."], name: str
+) -> list[Wave]:
+    """Return the steady responses to tones that push the tip with an acceleration, in nm/us^2 per amplitude."""
+    check_steady_response(cantilever, tones, name)
+    moving = (tone for tone in tones if not _is_known_zero(tone.amplitude))
+    return [_response(cantilever, tone, push_per_amplitude) for tone in moving]
+
+
+def _response(cantilever: Cantilever, tone: Tone, push_per_amplitude: Float[Array, "..."]) -> Wave:
+    """Return Re(H(omega) a exp(i(omega t + phi))) = c cos(omega t) + s sin(omega t).
+
+    With H = (d - i g)/(d^2 + g^2), d = Omega^2 - omega^2 and g = omega Omega/Q: c = Re(a exp(i phi) H) and
+    s = -Im(a exp(i phi) H).
+    """
+    Omega, omega = cantilever.angular_frequency, tone.angular_frequency
+    # as a product: a difference of squares loses digits near resonance
+    d = (Omega - omega) * (Omega + omega)
+    sine, cosine = sine_cosine(tone.phase_rad)
+    push = push_per_amplitude * tone.amplitude
+    if cantilever.quality_factor is None:
+        return Wave(push * cosine / d, -push * sine / d, omega)
+    g = 2.0 * cantilever.decay_rate * omega
+    size = push / (d * d + g * g)
+    return Wave(size * (d * cosine + g * sine), size * (g * cosine - d * sine), omega)
+
+
+def _wave_of(tone: Tone) -> Wave:
+    """Return a cos(omega t + phi) as a cos(phi) cos(omega t) - a sin(phi) sin(omega t)."""
+    sine, cosine = sine_cosine(tone.phase_rad)
+    return Wave(tone.amplitude * cosine, -tone.amplitude * sine, tone.angular_frequency)
+
+
+def _joined(waves: list[Wave]) -> tuple[Wave, ...]:
+    """Return waves with those that are known to have one frequency added up."""
+    joined: list[Wave] = []
+    for wave in waves:
+        for place, other in enumerate(joined):
+            if _is_known_same(wave.angular_frequency, other.angular_frequency):
+                joined[place] = Wave(other.cosine + wave.cosine, other.sine + wave.sine, other.angular_frequency)
+                break
+        else:
+            joined.append(wave)
+    return tuple(joined)
+
+
+def _is_known_zero(amplitude: Float[Array, "..."]) -> bool:
+    return not is_traced(amplitude) and not np.any(np.asarray(amplitude))
+
+
+def _is_known_same(one: Float[Array, "..."], other: Float[Array, "..."]) -> bool:
+    return one is other or (not is_traced(one) and not is_traced(other) and np.array_equal(one, other))

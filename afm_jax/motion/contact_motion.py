@@ -1,0 +1,242 @@
+"""A contact scene in time: closed-form flight to the bridge, through the contact, and so on to the end.
+
+Every tip of a batch goes at its own pace. A round takes each free tip to its next contact, through it if the quick
+way in the gap holds, and gives tips that are still in contact a few trial steps in time; so a batch does not wait for
+the few contacts that turn inside the bridge. All shapes are fixed.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from afm_jax.contact.phases import Phase
+from afm_jax.impact.first_impact import Flight, first_impact
+from afm_jax.motion.contact_crossing import cross
+from afm_jax.motion.contact_settings import DrivenSetting
+from afm_jax.motion.contact_step import Touch, advance, fresh_touch
+from afm_jax.motion.driven import Driven, Place
+from afm_jax.motion.record import ContactKind, MotionOutcome
+from afm_jax.motion.side_by_side import for_the_few, side_by_side
+from afm_jax.outcome import Outcome
+
+_ROUNDS = 8
+"""Rounds between two looks at whether all tips have arrived at the end."""
+_FLIGHT_STEPS = 2000
+
+
+class Row(NamedTuple):
+    """A contact, in the gap and its rate; stored as one vector."""
+
+    kind: Float[Array, "..."]
+    arrival_us: Float[Array, "..."]
+    arrival_gap_nm: Float[Array, "..."]
+    arrival_rate: Float[Array, "..."]
+    departure_us: Float[Array, "..."]
+    departure_gap_nm: Float[Array, "..."]
+    departure_rate: Float[Array, "..."]
+    junctions: Float[Array, "..."]
+    junction_forms_us: Float[Array, "..."]
+    junction_breaks_us: Float[Array, "..."]
+    time_in_junction_us: Float[Array, "..."]
+    deepest_gap_nm: Float[Array, "..."]
+    viscous_loss_aj: Float[Array, "..."]
+
+
+class Tip(NamedTuple):
+    """A tip on its way; scalars of one tip, but for the rows."""
+
+    touch: Touch
+    """Its place and phase, and the contact it is in; the gap of a free tip."""
+    arrival: tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]
+    """Time, gap and rate at which the present contact began."""
+    count: Int[Array, ""]
+    rows: Float[Array, "rows columns"]
+    outcome: Int[Array, ""]
+    done: Bool[Array, ""]
+    rounds: Int[Array, ""]
+
+
+def begin(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, rows: int) -> Tip:
+    """Return a tip at its start: free above the gap where the bridge forms, in the bridge below it."""
+    wet = gap_nm <= driven.forms_nm
+    sane = jnp.isfinite(time_us) & jnp.isfinite(rate) & (gap_nm > driven.junction.forms_gap_nm)
+    outcome = jnp.where(sane, MotionOutcome.FINISHED, MotionOutcome.INVALID_START)
+    outcome = jnp.where(driven.junction.exists, outcome, MotionOutcome.NO_JUNCTION)
+    phase = jnp.where(wet, Phase.BRIDGE, Phase.DRY)
+    zero = jnp.zeros_like(time_us)
+    return Tip(
+        touch=fresh_touch(Place(gap_nm, rate, time_us, zero), phase),
+        arrival=(time_us, gap_nm, rate),
+        count=jnp.zeros_like(phase),
+        rows=jnp.zeros((rows, len(Row._fields)), time_us.dtype),
+        outcome=outcome.astype(jnp.int32),
+        done=outcome != MotionOutcome.FINISHED,
+        rounds=jnp.zeros_like(phase),
+    )
+
+
+def follow(driven: Driven, tip: Tip, until_us: Array, setting: DrivenSetting, *, rounds: int, reverse: bool) -> Tip:
+    """Return a tip at the end of the simulation.
+
+    Args:
+        driven: the equation of motion.
+        tip: the tip at its start.
+        until_us: the end.
+        setting: how finely contacts are resolved.
+        rounds: most rounds.
+        reverse: make it differentiable in reverse mode: all rounds are run, in blocks that are recomputed backwards.
+    """
+    blocks = -(-rounds // _ROUNDS)
+    advance_round = partial(_round, driven, until_us=until_us, setting=setting, reverse=reverse)
+
+    def block(tip, _):
+        return lax.scan(lambda state, _: (advance_round(state), None), tip, None, length=_ROUNDS)
+
+    if reverse:
+        tip, _ = lax.scan(jax.checkpoint(block), tip, None, length=blocks)
+    else:
+        limit = blocks * _ROUNDS
+        tip = lax.while_loop(lambda tip: ~tip.done & (tip.rounds < limit), lambda tip: block(tip, None)[0], tip)
+    outcome = jnp.where(tip.done, tip.outcome, MotionOutcome.STEP_LIMIT)
+    return tip._replace(outcome=outcome.astype(jnp.int32))
+
+
+def _round(driven: Driven, tip: Tip, *, until_us: Array, setting: DrivenSetting, reverse: bool) -> Tip:
+    """Return a tip after one round: flight, quick way through the contact, trial steps for those it does not hold for."""
+    free = (tip.touch.phase == Phase.DRY) & ~tip.done
+    arrived, lost, place = _fly(driven, tip.touch.place, free, until_us)
+    arrival = tuple(
+        jnp.where(arrived, new, old)
+        for new, old in zip((place.time_us, place.x, place.gap_rate), tip.arrival, strict=True)
+    )
+    fresh = fresh_touch(place, jnp.where(arrived, Phase.BRIDGE, Phase.DRY))
+    touch = jax.tree.map(lambda new, old: jnp.where(free, new, old), fresh, tip.touch)
+    touch = _through(driven, touch, arrived, until_us, setting)
+    touch = _step(driven, touch, ~tip.done, until_us, setting, reverse=reverse)
+    over = touch.place.time_us >= until_us
+    left = touch.phase == Phase.DRY
+    touched = arrived | ((tip.touch.phase != Phase.DRY) & ~tip.done)
+    ended = touched & (left | over)
+    room = tip.count < tip.rows.shape[0]
+    row = _row(touch, arrival, held=~left)
+    place_of_row = jnp.where(ended & room, tip.count, tip.rows.shape[0])
+    full = ended & ~room
+    outcome = jnp.where(full, MotionOutcome.CONTACT_LIMIT, tip.outcome)
+    outcome = jnp.where(ended & ~left, MotionOutcome.HELD, outcome)
+    outcome = jnp.where(lost, MotionOutcome.STEP_LIMIT, outcome)
+    outcome = jnp.where(jnp.isfinite(touch.place.x), outcome, MotionOutcome.UNRESOLVED)
+    flown = free & ~arrived
+    return Tip(
+        touch=touch,
+        arrival=arrival,
+        count=tip.count + ended,
+        rows=tip.rows.at[place_of_row].set(row, mode="drop"),
+        outcome=jnp.where(tip.done, tip.outcome, outcome).astype(jnp.int32),
+        done=tip.done | flown | (touched & over) | full | lost | ~jnp.isfinite(touch.place.x),
+        rounds=tip.rounds + 1,
+    )
+
+
+def _fly(driven: Driven, place: Place, free: Array, until_us: Array) -> tuple[Array, Array, Place]:
+    """Return whether a free tip meets the bridge before the end, whether the search gave up, and where the tip then is."""
+    surface, start = driven.surface, place.time_us
+    # tips that are not free start below the level, so that their search ends at once
+    gap = jnp.where(free, place.x, 0.5 * driven.forms_nm)
+    height, speed = surface.position_and_velocity(start)
+    velocity = place.gap_rate + speed
+    flight = Flight(driven.cantilever, surface, start, velocity, gap, driven.forms_nm)
+    found = first_impact(flight, max_steps=_FLIGHT_STEPS, latest_us=until_us - start)
+    arrives = free & (found.outcome == Outcome.IMPACT) & (start + found.duration_us < until_us)
+    lost = free & (found.outcome == Outcome.STEP_LIMIT)
+    duration = jnp.where(arrives, found.duration_us, jnp.where(free, until_us - start, 0.0))
+    position, velocity = driven.cantilever.propagator(duration)(gap + height, velocity)
+    time = start + duration
+    height, speed = surface.position_and_velocity(time)
+    moved = Place(jnp.where(arrives, driven.forms_nm, position - height), velocity - speed, time, jnp.zeros_like(time))
+    return arrives, lost, Place(*(jnp.where(free, new, old) for new, old in zip(moved, place, strict=True)))
+
+
+def _through(driven: Driven, touch: Touch, arrived: Array, until_us: Array, setting: DrivenSetting) -> Touch:
+    """Return the tip beyond its contact where the quick way through it holds, else as it was."""
+    quick = setting.quick
+    if quick is None:
+        return touch
+
+    def crossed(driven, touch, arrived, until_us):
+        crossing = cross(driven, touch.place, quick)
+        holds = arrived & crossing.holds & (crossing.place.time_us < until_us)
+        beyond = Touch(
+            place=crossing.place,
+            phase=jnp.full_like(touch.phase, Phase.DRY),
+            trial=jnp.zeros_like(touch.trial),
+            junctions=jnp.ones_like(touch.junctions),
+            junction_forms_us=crossing.junction_forms_us,
+            junction_breaks_us=crossing.junction_breaks_us,
+            time_in_junction_us=crossing.time_in_junction_us,
+            deepest_gap_nm=crossing.deepest_gap_nm,
+            trials=jnp.zeros_like(touch.trials),
+        )
+        return jax.tree.map(lambda new, old: jnp.where(holds, new, old), beyond, touch)
+
+    def through(driven, touch, arrived, until_us):
+        return lax.cond(jnp.any(arrived), crossed, lambda _, touch, *__: touch, driven, touch, arrived, until_us)
+
+    return side_by_side(through)(driven, touch, arrived, until_us)
+
+
+def _step(
+    driven: Driven, touch: Touch, active: Array, until_us: Array, setting: DrivenSetting, *, reverse: bool
+) -> Touch:
+    """Return a tip in contact after some trial steps; a free one stays as it is."""
+
+    def going(touch, active, until_us):
+        finite = jnp.isfinite(touch.place.x) & jnp.isfinite(touch.place.gap_rate)
+        return active & (touch.phase != Phase.DRY) & (touch.place.time_us < until_us) & finite
+
+    def advanced(driven, touch, moves, until_us):
+        after = advance(driven, touch, until_us, setting.fineness, reverse=reverse)
+        return jax.tree.map(lambda new, old: jnp.where(moves, new, old), after, touch)
+
+    if reverse:
+
+        def once(touch, _):
+            return advanced(driven, touch, going(touch, active, until_us), until_us), None
+
+        return lax.scan(once, touch, None, length=setting.trials)[0]
+
+    def run(driven, touch, active, until_us):
+        def on(state):
+            touch, count = state
+            return jnp.any(going(touch, active, until_us)) & (count < setting.trials)
+
+        def more(state):
+            touch, count = state
+            return advanced(driven, touch, going(touch, active, until_us), until_us), count + 1
+
+        return lax.while_loop(on, more, (touch, 0))[0]
+
+    return for_the_few(run, going, changed=1, common=1)(driven, touch, active, until_us)
+
+
+def _row(touch: Touch, arrival: tuple[Array, Array, Array], *, held: Array) -> Float[Array, " columns"]:
+    place = touch.place
+    row = Row(
+        kind=jnp.where(held, float(ContactKind.HELD), float(ContactKind.IMPACT)),
+        arrival_us=arrival[0],
+        arrival_gap_nm=arrival[1],
+        arrival_rate=arrival[2],
+        departure_us=jnp.where(held, jnp.inf, place.time_us),
+        departure_gap_nm=jnp.where(held, 0.0, place.x),
+        departure_rate=jnp.where(held, 0.0, place.gap_rate),
+        junctions=touch.junctions.astype(place.x.dtype),
+        junction_forms_us=touch.junction_forms_us,
+        junction_breaks_us=touch.junction_breaks_us,
+        time_in_junction_us=touch.time_in_junction_us,
+        deepest_gap_nm=touch.deepest_gap_nm,
+        viscous_loss_aj=place.viscous_loss_aj,
+    )
+    return jnp.stack(row)

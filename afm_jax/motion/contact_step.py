@@ -1,0 +1,221 @@
+"""One trial step of a tip in contact: frozen phase, thresholds met exactly, turning points not passed over.
+
+A trial is one step of Dormand and Prince's method of order 8. A trial that ends within the phase is taken. One that
+passes a threshold, or the end of the simulation, is not: its cubic says where to try again, until a trial ends so close
+to the threshold that a first-order correction of its length lands on it to rounding. Step lengths follow from the place
+alone (no error control), so that results are smooth in every parameter; the correction carries the derivative of the
+time at which the threshold is met.
+"""
+
+from typing import NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from afm_jax.contact.forces import jkr
+from afm_jax.contact.phases import Phase
+from afm_jax.motion.driven import Driven, Place
+from afm_jax.motion.hermite import crossing_share, turning_point
+
+_NEAR = 1e-7
+"""Share of a threshold from which on the first-order correction is exact to rounding."""
+_SHORTEST = 1e-3
+"""Bounds of the share of a failed trial at which the next is tried: this, and 1 less a tenth of it."""
+
+
+class Touch(NamedTuple):
+    """A tip in contact, and what the contact has been so far; arrays of the tips' shape."""
+
+    place: Place
+    phase: Int[Array, "..."]
+    trial: Float[Array, "..."]
+    """Length of the next trial; 0: as the place suggests; negative: ends at a turning point."""
+    junctions: Int[Array, "..."]
+    junction_forms_us: Float[Array, "..."]
+    junction_breaks_us: Float[Array, "..."]
+    time_in_junction_us: Float[Array, "..."]
+    deepest_gap_nm: Float[Array, "..."]
+    trials: Int[Array, "..."]
+
+
+def fresh_touch(place: Place, phase: Int[Array, "..."]) -> Touch:
+    """Return a tip at the beginning of a contact (or a free one, in phase DRY)."""
+    none, zero = jnp.zeros_like(phase, dtype=jnp.int32), jnp.zeros_like(place.x)
+    return Touch(place, phase.astype(jnp.int32), zero, none, zero, zero, zero, place.x, none)
+
+
+class Trial(NamedTuple):
+    """A step that was tried."""
+
+    length: Float[Array, "..."]
+    start: Place
+    start_rates: Place
+    end: Place
+    end_rates: Place
+    low: Float[Array, "..."]
+    """Thresholds of x in this phase: D_on and the breaking gap, or the fold and none."""
+    high: Float[Array, "..."]
+
+
+def advance(driven: Driven, touch: Touch, until_us: Float[Array, "..."], fineness: float, *, reverse: bool) -> Touch:
+    """Return a tip in contact after one trial.
+
+    Args:
+        driven: the equation of motion.
+        touch: the tip; its phase is not DRY.
+        until_us: end of the simulation.
+        fineness: steps per unit of the local pace; larger is more accurate.
+        reverse: whether reverse derivatives must pass through.
+    """
+    trial = _tried(driven, touch, until_us, fineness, reverse=reverse)
+    solid = touch.phase == Phase.JUNCTION
+    early, late, spent = _passed(trial, until_us)
+    retry, again = _where_next(trial, touch.trial < 0.0, until_us)
+    landed = _land(trial, until_us, early, late, spent)
+    hit_low, hit_high = landed.low & ~retry, landed.high & ~retry
+    place = landed.place
+    # a broken junction leaves the tip in the bridge where that still holds, else free
+    wet = driven.junction.breaks_gap_nm < driven.breaks_nm
+    broken = solid & hit_low
+    formed = ~solid & hit_low
+    phase = jnp.where(formed, Phase.JUNCTION, touch.phase)
+    phase = jnp.where(broken, jnp.where(wet, Phase.BRIDGE, Phase.DRY), phase)
+    phase = jnp.where(~solid & hit_high, Phase.DRY, phase).astype(touch.phase.dtype)
+    x = jnp.where(formed, driven.junction.forms_root, place.x)
+    x = jnp.where(broken, driven.junction.breaks_gap_nm, x)
+    place = place._replace(x=x)
+    passed = jnp.where(solid, place.time_us - touch.place.time_us, 0.0)
+    return Touch(
+        place=_pick(retry, touch.place, place),
+        phase=jnp.where(retry, touch.phase, phase),
+        trial=jnp.where(retry, again, 0.0),
+        junctions=touch.junctions + formed,
+        junction_forms_us=jnp.where(formed & (touch.junctions == 0), place.time_us, touch.junction_forms_us),
+        junction_breaks_us=jnp.where(broken, place.time_us, touch.junction_breaks_us),
+        time_in_junction_us=touch.time_in_junction_us + jnp.where(retry, 0.0, passed),
+        deepest_gap_nm=jnp.where(
+            retry, touch.deepest_gap_nm, jnp.minimum(touch.deepest_gap_nm, _deepest(driven, trial, solid))
+        ),
+        trials=touch.trials + 1,
+    )
+
+
+def _tried(driven: Driven, touch: Touch, until_us: Float[Array, "..."], fineness: float, *, reverse: bool) -> Trial:
+    start, solid = touch.place, touch.phase == Phase.JUNCTION
+    low = jnp.where(solid, jkr.FOLD, driven.junction.forms_gap_nm)
+    high = jnp.where(solid, jnp.inf, driven.breaks_nm)
+    rates = driven.rates(start, solid)
+    fixed, slopes = lax.stop_gradient((start, rates))
+    natural = 1.0 / (fineness * lax.stop_gradient(driven.pace(start, solid)))
+    aim = _aimed(fixed, slopes, lax.stop_gradient((low, high)), lax.stop_gradient(until_us))
+    fresh = jnp.where(aim < 1.2 * natural, aim, natural)
+    length = lax.stop_gradient(jnp.where(touch.trial == 0.0, fresh, jnp.abs(touch.trial)))
+    solver = diffrax.Dopri8(scan_kind="bounded" if reverse else "lax")
+
+    # the share of the step is the time of the solver, one for all tips of a batch
+    def field(share, place, args):
+        del share, args
+        return Place(*(length * rate for rate in driven.rates(place, solid)))
+
+    term = diffrax.ODETerm(field)
+    begin, stop = jnp.zeros((), length.dtype), jnp.ones((), length.dtype)
+    memory = solver.init(term, begin, stop, start, None)
+    end, _, _, _, _ = solver.step(term, begin, stop, start, None, memory, made_jump=False)
+    return Trial(length, start, rates, end, driven.rates(end, solid), low, high)
+
+
+def _aimed(place: Place, rates: Place, thresholds: tuple[Array, Array], until_us: Float[Array, "..."]) -> Array:
+    """Return the length after which the place's parabola meets the threshold ahead, or time ends; infinite if never."""
+    low, high = thresholds
+    # x'' along the step: in both phases x' is proportional to the gap's rate, whose slope is known
+    ratio = rates.x / jnp.where(place.gap_rate == 0.0, 1.0, place.gap_rate)
+    bend = 0.5 * ratio * rates.gap_rate
+    ahead = jnp.where(rates.x < 0.0, low, high) - place.x
+    square = rates.x * rates.x + 4.0 * bend * ahead
+    meets = (square > 0.0) & jnp.isfinite(ahead) & (rates.x != 0.0)
+    root = jnp.where(rates.x < 0.0, -1.0, 1.0) * jnp.sqrt(jnp.where(meets, square, 1.0))
+    distance = jnp.where(meets, ahead, 1.0)
+    aim = jnp.where(meets, 2.0 * distance / (rates.x + root), jnp.inf)
+    left = (until_us - place.time_us) / rates.time_us
+    return jnp.minimum(jnp.where(aim > 0.0, aim, jnp.inf), jnp.where(left > 0.0, left, jnp.inf))
+
+
+def _passed(
+    trial: Trial, until_us: Float[Array, "..."]
+) -> tuple[Bool[Array, "..."], Bool[Array, "..."], Bool[Array, "..."]]:
+    """Say whether the trial ends at or beyond the low threshold, the high one, the end of the simulation."""
+    x = trial.end.x
+    # a step shorter than the rounding of the time would never end
+    rounding = 8.0 * jnp.finfo(x.dtype).eps * (1.0 + jnp.abs(until_us))
+    return x <= trial.low, x >= trial.high, trial.end.time_us >= until_us - rounding
+
+
+def _where_next(trial: Trial, at_turn: Bool[Array, "..."], until_us: Float[Array, "..."]) -> tuple[Array, Array]:
+    """Say whether a trial must be repeated, and with which length (negative: to a turning point)."""
+    start, rates, end, slopes = lax.stop_gradient((trial.start, trial.start_rates, trial.end, trial.end_rates))
+    low, high, until = lax.stop_gradient((trial.low, trial.high, until_us))
+    length = trial.length
+    finite = jnp.isfinite(end.x) & jnp.isfinite(end.gap_rate) & jnp.isfinite(slopes.gap_rate)
+    below, above, late = (end.x < low), (end.x > high), end.time_us > until
+
+    def share(level, crossed):
+        level = jnp.where(jnp.isfinite(level), level, 0.0)
+        found = crossing_share(start.x - level, rates.x * length, end.x - level, slopes.x * length)
+        return jnp.where(crossed, found, 1.0)
+
+    # a threshold nearly met needs no other trial
+    beyond_low = below & (low - end.x > _NEAR * low)
+    beyond_high = above & (end.x - high > _NEAR * high)
+    beyond_time = late & (end.time_us - until > _NEAR * length * jnp.maximum(slopes.time_us, 1e-3))
+    in_time = crossing_share(
+        start.time_us - until, rates.time_us * length, end.time_us - until, slopes.time_us * length
+    )
+    shares = jnp.minimum(share(low, beyond_low), share(high, beyond_high))
+    shares = jnp.minimum(shares, jnp.where(beyond_time, in_time, 1.0))
+    missed = beyond_low | beyond_high | beyond_time
+    turns = (rates.x * slopes.x < 0.0) & ~at_turn & ~missed & ~(below | above | late)
+    turn, extremum = turning_point(start.x, rates.x * length, end.x, slopes.x * length)
+    hidden = turns & ((extremum <= low) | (extremum >= high))
+    again = length * jnp.clip(shares, _SHORTEST, 1.0 - 0.1 * _SHORTEST)
+    again = jnp.where(hidden, -length * jnp.clip(turn, _SHORTEST, 1.0 - 0.1 * _SHORTEST), again)
+    # lengths at which rounding decides are taken as they are
+    resolved = length > 1e-15 * (1.0 + jnp.abs(start.time_us))
+    return (missed | hidden | ~finite) & resolved, jnp.where(finite, again, 0.25 * length)
+
+
+class _Landing(NamedTuple):
+    place: Place
+    low: Bool[Array, "..."]
+    high: Bool[Array, "..."]
+
+
+def _land(trial: Trial, until_us: Float[Array, "..."], below: Array, above: Array, late: Array) -> _Landing:
+    """Return the trial's end, moved onto the threshold that it has met."""
+    end, rates = trial.end, trial.end_rates
+    near_low = below | (end.x - trial.low < _NEAR * trial.low) & (end.gap_rate != 0.0) & (rates.x < 0.0)
+    near_high = above | (trial.high - end.x < _NEAR * trial.high) & (rates.x > 0.0)
+    target = jnp.where(near_low, trial.low, jnp.where(near_high, trial.high, end.x))
+    at_threshold = near_low | near_high
+    moving = at_threshold & (rates.x != 0.0)
+    rest = jnp.where(moving, (target - end.x) / jnp.where(moving, rates.x, 1.0), 0.0)
+    ends = late & ~at_threshold
+    rest = jnp.where(ends, (until_us - end.time_us) / rates.time_us, rest)
+    moved = jax.tree.map(lambda value, rate: value + rate * rest, end, rates)
+    place = moved._replace(x=jnp.where(at_threshold, target, moved.x), time_us=jnp.where(ends, until_us, moved.time_us))
+    return _Landing(place, near_low, near_high)
+
+
+def _deepest(driven: Driven, trial: Trial, solid: Bool[Array, "..."]) -> Float[Array, "..."]:
+    """Return the smallest gap of a trial: at its ends, or where its cubic turns."""
+    length = trial.length
+    turns = (trial.start.gap_rate < 0.0) & (trial.end.gap_rate > 0.0)
+    _, extremum = turning_point(trial.start.x, trial.start_rates.x * length, trial.end.x, trial.end_rates.x * length)
+    x = jnp.where(turns, extremum, trial.end.x)
+    return jnp.where(solid, driven.gap_of_root(jnp.where(solid, x, 1.0)), x)
+
+
+def _pick(condition: Bool[Array, "..."], first: Place, second: Place) -> Place:
+    return Place(*(jnp.where(condition, one, other) for one, other in zip(first, second, strict=True)))

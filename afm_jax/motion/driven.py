@@ -1,0 +1,164 @@
+"""Equation of motion of a driven tip in contact (eq. 16), in the gap and its rate, phase by phase.
+
+With D = y - s(t), y the free cantilever's coordinate and s the surface it moves over, eq. 16 reads
+D'' = F(D, D')/m - Omega^2 D - (Omega/Q) D' + q(t), with q = -(s'' + (Omega/Q) s' + Omega^2 s) all that depends on time.
+Within a phase everything is smooth. In the junction s = sqrt(A) of the JKR contact takes the place of the gap, and
+fictitious time that of time, dt = (d Delta/ds) d theta: both stay smooth through the fold where the contact breaks.
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.surface import Surface, Wave
+from afm_jax.apparatus.trigonometry import sine_cosine
+from afm_jax.contact.bridge import Bridge, bridge_of
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.forces import jkr
+from afm_jax.contact.junction import Junction, find_junction
+from afm_jax.contact.phases import Phase
+
+
+class Place(NamedTuple):
+    """Where a tip in contact is; arrays of the tips' shape."""
+
+    x: Float[Array, "..."]
+    """The gap D in nm in the bridge, s = sqrt(A) in the junction."""
+    gap_rate: Float[Array, "..."]
+    """dD/dt in nm/us."""
+    time_us: Float[Array, "..."]
+    viscous_loss_aj: Float[Array, "..."]
+    """Energy that the dissipative forces have taken since the contact began."""
+
+
+class Driven(NamedTuple):
+    """A tip over a moving surface, with everything computed once that does not depend on where it is."""
+
+    cantilever: Cantilever
+    surface: Platform | Surface
+    bridge: Bridge
+    junction: Junction
+    inverse_mass: Float[Array, "..."]
+    forms_nm: Float[Array, "..."]
+    breaks_nm: Float[Array, "..."]
+    load_scale_nn: Float[Array, "..."]
+    depth_scale_nm: Float[Array, "..."]
+    mean_push: tuple[Float[Array, "..."], Float[Array, "..."]]
+    """q(t) of the offset and its ramp, and its rate."""
+    waves: tuple[Wave, ...]
+    """q(t) of the surface's cosines, in nm/us^2."""
+
+    def push(self, time_us: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return q(t) in nm/us^2: what the surface's motion does to the gap."""
+        level, rate = self.mean_push
+        push = level + rate * time_us
+        for wave in self.waves:
+            sine, cosine = sine_cosine(wave.angular_frequency * time_us)
+            push = push + wave.cosine * cosine + wave.sine * sine
+        return push
+
+    def acceleration(
+        self, gap: Float[Array, "..."], rate: Float[Array, "..."], time_us: Float[Array, "..."], force: Array
+    ):
+        """Return D'' in nm/us^2 under a contact force in nN."""
+        return force * self.inverse_mass + self.cantilever.acceleration(gap, rate) + self.push(time_us)
+
+    def gap_of_root(self, s: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return the gap in nm at s = sqrt(A)."""
+        return self.junction.shift_nm - self.depth_scale_nm * jkr.depth(s)
+
+    def gap(self, x: Float[Array, "..."], phase: Int[Array, "..."]) -> Float[Array, "..."]:
+        """Return the gap in nm, from s in the junction."""
+        return jnp.where(phase == Phase.JUNCTION, self.gap_of_root(x), x)
+
+    def rates(self, place: Place, solid: Bool[Array, "..."]) -> Place:
+        """Return the rates of a place per unit of time (bridge) or of fictitious time (junction).
+
+        Trial steps may leave the range of the bridge's forces: they are evaluated no nearer than a third of D_on.
+        """
+        in_bridge = self._bridge_rates(place, jnp.where(solid, self.forms_nm, place.x))
+        in_junction = self._junction_rates(place, jnp.where(solid, place.x, 1.0))
+        return Place(*(jnp.where(solid, inside, wet) for inside, wet in zip(in_junction, in_bridge, strict=True)))
+
+    def _bridge_rates(self, place: Place, gap: Float[Array, "..."]) -> Place:
+        near = jnp.maximum(gap, 0.3 * self.junction.forms_gap_nm)
+        force = self.bridge.force(near)
+        lost = jnp.zeros_like(gap)
+        if not self.bridge.conserves:
+            drag = self.bridge.damping(near) * place.gap_rate
+            force, lost = force - drag, drag * place.gap_rate
+        acceleration = self.acceleration(gap, place.gap_rate, place.time_us, force)
+        return Place(place.gap_rate, acceleration, jnp.ones_like(gap), lost)
+
+    def _junction_rates(self, place: Place, s: Float[Array, "..."]) -> Place:
+        slope = jkr.depth_slope(s)
+        force = self.load_scale_nn * jkr.load(s)
+        acceleration = self.acceleration(self.gap_of_root(s), place.gap_rate, place.time_us, force)
+        return Place(-place.gap_rate / self.depth_scale_nm, slope * acceleration, slope, jnp.zeros_like(s))
+
+    def pace(self, place: Place, solid: Bool[Array, "..."]) -> Float[Array, "..."]:
+        """Return how fast the motion changes, in 1/us (junction: per unit of fictitious time): the inverse of a step.
+
+        The root of the local stiffness over the mass, and the speed over the distance in which the forces change.
+        """
+        near = jnp.maximum(jnp.where(solid, self.forms_nm, place.x), 0.3 * self.junction.forms_gap_nm)
+        stiffness = jnp.abs(self.bridge.stiffness(near)) * self.inverse_mass
+        wet = jnp.sqrt(stiffness + (place.gap_rate / near) ** 2 + self._drive_pace**2)
+        s = jnp.where(solid, place.x, 1.0)
+        cube = s**3
+        curvature = s * s * (cube * (36.0 * cube - 42.0 * jkr.SLOPE) + 12.0)
+        elastic = jnp.abs(curvature) * self.load_scale_nn * self.inverse_mass / self.depth_scale_nm
+        slope = jkr.depth_slope(s)
+        dry = jnp.sqrt(
+            elastic + (2.0 * place.gap_rate / (self.depth_scale_nm * s)) ** 2 + (self._drive_pace * slope) ** 2
+        )
+        return jnp.where(solid, dry, wet)
+
+    @property
+    def _drive_pace(self) -> Float[Array, "..."]:
+        return self.cantilever.angular_frequency + self.surface.fastest_angular_frequency
+
+
+def driven_by(contact: Contact, cantilever: Cantilever, surface: Platform | Surface) -> Driven:
+    """Return the equation of motion of a contact scene."""
+    solid = contact.junction
+    omega, friction = cantilever.angular_frequency, 2.0 * cantilever.decay_rate
+    square = omega * omega
+    # of c cos + s sin: -(z'' + 2 gamma z' + Omega^2 z)
+    waves = tuple(
+        Wave(
+            (wave.angular_frequency**2 - square) * wave.cosine - friction * wave.angular_frequency * wave.sine,
+            (wave.angular_frequency**2 - square) * wave.sine + friction * wave.angular_frequency * wave.cosine,
+            wave.angular_frequency,
+        )
+        for wave in _waves_of(surface)
+    )
+    ramp = surface.offset_rate_nm_per_us
+    return Driven(
+        mean_push=(-square * surface.offset_nm - friction * ramp, -square * ramp),
+        waves=waves,
+        cantilever=cantilever,
+        surface=surface,
+        bridge=bridge_of(contact),
+        junction=find_junction(contact),
+        inverse_mass=1.0 / cantilever.mass_ng,
+        forms_nm=contact.bridge_forms_nm,
+        breaks_nm=contact.bridge_breaks_nm,
+        load_scale_nn=solid.load_scale_nn,
+        depth_scale_nm=solid.depth_scale_nm,
+    )
+
+
+def _waves_of(surface: Platform | Surface) -> tuple[Wave, ...]:
+    if isinstance(surface, Surface):
+        return surface.tones
+    first = Wave(surface.amplitude_nm, jnp.zeros_like(surface.amplitude_nm), surface.angular_frequency)
+    if surface.second is None:
+        return (first,)
+    # a cos(omega t + phi) = a cos(phi) cos(omega t) - a sin(phi) sin(omega t)
+    tone = surface.second
+    sine, cosine = sine_cosine(tone.phase_rad)
+    return first, Wave(tone.amplitude * cosine, -tone.amplitude * sine, tone.angular_frequency)

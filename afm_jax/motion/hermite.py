@@ -1,0 +1,46 @@
+"""Cubics through two points with slopes: where a step meets a threshold, or turns."""
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Float
+
+_STEPS = 8
+
+
+def crossing_share(start: Array, start_slope: Array, end: Array, end_slope: Array) -> Float[Array, "..."]:
+    """Return the share of a step at which its cubic, from one side of 0 to the other, vanishes.
+
+    Args:
+        start: value at the start.
+        start_slope: slope there, times the length of the step.
+        end: value at the end, of the other sign.
+        end_slope: slope there, times the length of the step.
+    """
+    bend = 3.0 * (end - start) - 2.0 * start_slope - end_slope
+    twist = 2.0 * (start - end) + start_slope + end_slope
+    sign = jnp.where(start > 0.0, 1.0, -1.0)
+
+    def narrow(_, bracket):
+        low, high, share = bracket
+        value = start + share * (start_slope + share * (bend + share * twist))
+        slope = start_slope + share * (2.0 * bend + 3.0 * share * twist)
+        before = sign * value > 0.0
+        low, high = jnp.where(before, share, low), jnp.where(before, high, share)
+        newton = share - value / jnp.where(slope == 0.0, 1.0, slope)
+        inside = (newton > low) & (newton < high) & (slope != 0.0)
+        return low, high, jnp.where(inside, newton, 0.5 * (low + high))
+
+    begin = start / jnp.where(start == end, 1.0, start - end)
+    return lax.fori_loop(0, _STEPS, narrow, (jnp.zeros_like(start), jnp.ones_like(start), begin))[2]
+
+
+def turning_point(start: Array, start_slope: Array, end: Array, end_slope: Array) -> tuple[Array, Array]:
+    """Return share and value of the extremum of a step's cubic whose slope changes sign; arguments as above."""
+    bend = 3.0 * (end - start) - 2.0 * start_slope - end_slope
+    twist = 2.0 * (start - end) + start_slope + end_slope
+    # 3 twist x^2 + 2 bend x + start_slope = 0, the root between 0 and 1 in the form that does not cancel
+    root = jnp.sqrt(jnp.maximum(bend * bend - 3.0 * twist * start_slope, 0.0))
+    below = jnp.where(start_slope > 0.0, root, -root) - bend
+    share = start_slope / jnp.where(below == 0.0, 1.0, below)
+    share = jnp.clip(share, 0.0, 1.0)
+    return share, start + share * (start_slope + share * (bend + share * twist))

@@ -1,0 +1,114 @@
+"""What a simulation hands out: its contacts in order, its last state, and how it ended."""
+
+import enum
+from typing import NamedTuple
+
+from jaxtyping import Array, Bool, Float, Int
+
+
+class MotionOutcome(enum.IntEnum):
+    """How a simulation ended."""
+
+    FINISHED = 0
+    HELD = 1
+    CONTACT_LIMIT = 2
+    STEP_LIMIT = 3
+    INVALID_START = 4
+    NO_JUNCTION = 5
+    UNRESOLVED = 6
+
+    @property
+    def sentence(self) -> str:
+        """What happened, in words."""
+        return _SENTENCES[self]
+
+
+_SENTENCES = {
+    MotionOutcome.FINISHED: "The motion was followed to the end of its duration.",
+    MotionOutcome.HELD: "The motion was followed to the end of its duration; the sample holds the tip there.",
+    MotionOutcome.CONTACT_LIMIT: "The motion has more contacts than there is room for: raise max_contacts.",
+    MotionOutcome.STEP_LIMIT: "The search for the next contact ended at its step limit.",
+    MotionOutcome.INVALID_START: "The start is not finite, or inside the sample.",
+    MotionOutcome.NO_JUNCTION: "With these parameters no junction forms: force and stiffness are equal nowhere.",
+    MotionOutcome.UNRESOLVED: "An integration step left the range of the forces; the motion is not trusted beyond.",
+}
+
+
+class ContactKind(enum.IntEnum):
+    """What happened between one arrival at the sample and the departure that follows."""
+
+    NONE = 0
+    """The row is not used."""
+    IMPACT = 1
+    """The tip came and left."""
+    CHATTER = 2
+    """Infinitely many impacts in finite time (r < 1), then rest on the platform until it let the tip go."""
+    HELD = 3
+    """The tip was still held, or within its contact, when the simulation ended; there is no departure."""
+
+
+class State(NamedTuple):
+    """Where the tip is: lab frame, scalars of one scene."""
+
+    time_us: Float[Array, "..."]
+    position_nm: Float[Array, "..."]
+    velocity_nm_per_us: Float[Array, "..."]
+
+
+class ContactDetail(NamedTuple):
+    """What only a resolved contact has; arrays of one row a contact."""
+
+    junctions: Int[Array, "..."]
+    """How often the junction formed."""
+    junction_forms_us: Float[Array, "..."]
+    """When it first formed; 0 where it did not."""
+    junction_breaks_us: Float[Array, "..."]
+    """When it last broke; 0 where it did not."""
+    time_in_junction_us: Float[Array, "..."]
+    deepest_gap_nm: Float[Array, "..."]
+    """Smallest gap, negative where the tip indents the sample."""
+    peak_force_nn: Float[Array, "..."]
+    """Largest repulsive force, at the smallest gap."""
+    bridge_hysteresis_aj: Float[Array, "..."]
+    junction_hysteresis_aj: Float[Array, "..."]
+    viscous_loss_aj: Float[Array, "..."]
+
+
+class Contacts(NamedTuple):
+    """Contacts in order; arrays with a trailing axis of rows, unused rows 0 with kind `ContactKind.NONE`.
+
+    With a law a contact is an impact: it begins where the free flight meets the platform and ends where the next flight
+    starts, the collision delay later. With a resolved contact it begins where the bridge forms and ends where it breaks.
+    """
+
+    kind: Int[Array, "..."]
+    arrival_time_us: Float[Array, "..."]
+    arrival_position_nm: Float[Array, "..."]
+    arrival_velocity_nm_per_us: Float[Array, "..."]
+    approach_speed_nm_per_us: Float[Array, "..."]
+    """Relative to the platform."""
+    departure_time_us: Float[Array, "..."]
+    """Infinite where the tip is held to the end."""
+    departure_position_nm: Float[Array, "..."]
+    departure_velocity_nm_per_us: Float[Array, "..."]
+    rebound_speed_nm_per_us: Float[Array, "..."]
+    """Relative to the platform."""
+    energy_lost_aj: Float[Array, "..."]
+    """What the contact dissipated."""
+    detail: ContactDetail | None = None
+
+
+class Simulation(NamedTuple):
+    """A scene followed in time."""
+
+    start: State
+    contacts: Contacts
+    count: Int[Array, "..."]
+    """Number of contacts, the unfinished one of a held tip included."""
+    final: State
+    phase: Int[Array, "..."]
+    """`Phase` at the end (laws: JUNCTION where the platform holds the tip)."""
+    held: Bool[Array, "..."]
+    """Whether the tip is held at the end."""
+    outcome: Int[Array, "..."]
+    """A `MotionOutcome`."""

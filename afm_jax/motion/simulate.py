@@ -1,0 +1,184 @@
+"""`simulate`: a scene followed in time, whatever its interaction."""
+
+import math
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.surface import Surface, surface_of
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.junction import explain_missing_junction, find_junction
+from afm_jax.impact.law import ImpactLaw
+from afm_jax.motion.contact_motion import Row, begin, follow
+from afm_jax.motion.contact_settings import DrivenSetting, setting_of
+from afm_jax.motion.driven import Driven, driven_by
+from afm_jax.motion.frames import to_gap, to_lab
+from afm_jax.motion.free_motion import follow_free
+from afm_jax.motion.law_motion import follow_law
+from afm_jax.motion.record import ContactDetail, ContactKind, Contacts, MotionOutcome, Simulation, State
+from afm_jax.parameters import is_traced, require_float64
+
+DEFAULT_ACCURACY = 1e-9
+_ROUNDS_PER_CONTACT = 4
+_SPARE_ROUNDS = 64
+
+
+def simulate(
+    scene: Scene,
+    start: State,
+    duration_us: ArrayLike,
+    *,
+    max_contacts: int | None = None,
+    accuracy: float = DEFAULT_ACCURACY,
+    reverse: bool = False,
+    max_rounds: int | None = None,
+) -> Simulation:
+    """Return a scene followed in time from a start.
+
+    Works under `jit`, `vmap` (over scenes and starts; the effects are the same for all) and forward differentiation.
+
+    Args:
+        scene: a scene with an `ImpactLaw`, a `Contact`, or no interaction (a free cantilever).
+        start: time, height and velocity of the tip in the lab, scalars.
+        duration_us: how long to follow it, in us.
+        max_contacts: most contacts (impacts) there is room for, a plain integer that shapes the result; None: enough
+            for the duration, which must then be a number.
+        accuracy: of each resolved contact: relative of the rebound speed, a tenth of it in us of the times.
+        reverse: make it differentiable in reverse mode, in memory that grows with the square root of the length.
+        max_rounds: most rounds; a tip that is held takes one every 60 steps of its oscillation. None: four for every
+            contact and what a held tip needs.
+
+    Returns:
+        A `Simulation`; how it ended is its `outcome`, a `MotionOutcome`.
+
+    Raises:
+        RuntimeError: if JAX is not set to 64-bit floats.
+        TypeError: if the interaction is neither a law nor a contact nor None.
+        ValueError: if the duration is not positive, the contact has no junction, or the start is inside the sample.
+    """
+    require_float64()
+    if not is_traced(duration_us) and not (float(duration_us) > 0.0 and math.isfinite(float(duration_us))):
+        raise ValueError(f"`duration_us` must be a positive number, but is {float(duration_us)!r}")
+    surface, response = surface_of(scene)
+    dtype = scene.cantilever.frequency_khz.dtype
+    begin_at = State(*(jnp.asarray(value, dtype) for value in start))
+    until = begin_at.time_us + jnp.asarray(duration_us, dtype)
+    room = _room(scene, surface, duration_us) if max_contacts is None else max_contacts
+    if scene.interaction is None:
+        return follow_free(scene, surface, response, begin_at, until)
+    if isinstance(scene.interaction, ImpactLaw):
+        return follow_law(scene, surface, response, begin_at, until, max_contacts=room, reverse=reverse)
+    if not isinstance(scene.interaction, Contact):
+        raise TypeError(
+            f"the interaction must be an ImpactLaw, a Contact or None, not {type(scene.interaction).__name__}"
+        )
+    _check_contact(scene, surface, response, begin_at)
+    rounds = max_rounds if max_rounds is not None else _ROUNDS_PER_CONTACT * room + _SPARE_ROUNDS
+    setting = setting_of(accuracy)
+    if reverse:
+        setting = setting._replace(quick=None)
+    return _contact(
+        scene, surface, response, begin_at, until, rows=room, setting=setting, rounds=rounds, reverse=reverse
+    )
+
+
+def _room(scene: Scene, surface: Platform | Surface, duration_us: ArrayLike) -> int:
+    """Return how many contacts a duration may hold: four for every period of the fastest motion."""
+    fastest = jnp.maximum(scene.cantilever.angular_frequency, surface.fastest_angular_frequency)
+    if is_traced(fastest) or is_traced(duration_us):
+        raise ValueError("`max_contacts` must be given where frequencies or the duration are traced")
+    return 16 + math.ceil(4.0 * float(duration_us) * float(jnp.max(fastest)) / (2.0 * math.pi))
+
+
+def _check_contact(scene: Scene, surface: Platform | Surface, response: Surface | None, start: State) -> None:
+    """Check what can be known of a contact scene before it is traced."""
+    leaves = jax.tree.leaves((scene, start))
+    if any(is_traced(leaf) for leaf in leaves):
+        return
+    junction = find_junction(scene.interaction)
+    if not bool(junction.exists):
+        raise ValueError(f"the contact has no junction: {explain_missing_junction(scene.interaction)}")
+    gap = float(to_gap(surface, response, start)[0])
+    if not gap > float(junction.forms_gap_nm):
+        raise ValueError(
+            f"the start is inside the sample: the gap is {gap:.6g} nm, but must be above "
+            f"{float(junction.forms_gap_nm):.6g} nm, where the junction forms; raise `position_nm`"
+        )
+
+
+@partial(jax.jit, static_argnames=("rows", "setting", "rounds", "reverse"))
+def _contact(  # noqa: PLR0913
+    scene: Scene,
+    surface: Platform | Surface,
+    response: Surface | None,
+    start: State,
+    until: Float[Array, ""],
+    *,
+    rows: int,
+    setting: DrivenSetting,
+    rounds: int,
+    reverse: bool,
+) -> Simulation:
+    driven = driven_by(scene.interaction, scene.cantilever, surface)
+    gap, rate = to_gap(surface, response, start)
+    tip = begin(driven, start.time_us, gap, rate, rows)
+    tip = follow(driven, tip, until, setting, rounds=rounds, reverse=reverse)
+    place, phase = tip.touch.place, tip.touch.phase
+    table = Row(*jnp.moveaxis(tip.rows, -1, 0))
+    return Simulation(
+        start=start,
+        contacts=_contacts(table, scene, surface, response, driven),
+        count=jnp.minimum(tip.count, rows),
+        final=to_lab(surface, response, place.time_us, driven.gap(place.x, phase), place.gap_rate),
+        phase=phase,
+        held=tip.outcome == MotionOutcome.HELD,
+        outcome=tip.outcome,
+    )
+
+
+def _contacts(
+    row: Row, scene: Scene, surface: Platform | Surface, response: Surface | None, driven: Driven
+) -> Contacts:
+    """Return the rows as contacts in the lab."""
+    kind = row.kind.astype(jnp.int32)
+    left, used = kind == ContactKind.IMPACT, kind != ContactKind.NONE
+    arrival = to_lab(surface, response, row.arrival_us, row.arrival_gap_nm, row.arrival_rate)
+    when = jnp.where(left, row.departure_us, 0.0)
+    departure = to_lab(surface, response, when, row.departure_gap_nm, row.departure_rate)
+    junction = driven.junction
+    bridge = jnp.where(left, junction.bridge_hysteresis_aj, 0.0)
+    solid = row.junctions * junction.junction_hysteresis_aj
+    shift, contact = junction.shift_nm, scene.interaction
+    touched = row.junctions > 0.0
+    force = jnp.where(touched, contact.junction.force(shift - jnp.where(touched, row.deepest_gap_nm, 0.0)), 0.0)
+
+    def where(condition, value):
+        return jnp.where(condition, value, 0.0)
+
+    return Contacts(
+        kind=kind,
+        arrival_time_us=row.arrival_us,
+        arrival_position_nm=where(used, arrival.position_nm),
+        arrival_velocity_nm_per_us=where(used, arrival.velocity_nm_per_us),
+        approach_speed_nm_per_us=where(used, -row.arrival_rate),
+        departure_time_us=row.departure_us,
+        departure_position_nm=where(left, departure.position_nm),
+        departure_velocity_nm_per_us=where(left, departure.velocity_nm_per_us),
+        rebound_speed_nm_per_us=row.departure_rate,
+        energy_lost_aj=bridge + solid + row.viscous_loss_aj,
+        detail=ContactDetail(
+            junctions=row.junctions.astype(jnp.int32),
+            junction_forms_us=row.junction_forms_us,
+            junction_breaks_us=row.junction_breaks_us,
+            time_in_junction_us=row.time_in_junction_us,
+            deepest_gap_nm=row.deepest_gap_nm,
+            peak_force_nn=jnp.maximum(force, 0.0),
+            bridge_hysteresis_aj=bridge,
+            junction_hysteresis_aj=solid,
+            viscous_loss_aj=row.viscous_loss_aj,
+        ),
+    )

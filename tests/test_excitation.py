@@ -1,0 +1,184 @@
+"""Drives of base, tip and sample: responses and surfaces against SciPy's integration of eq. 16, and their limits."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.drive import Tone
+from afm_jax.apparatus.excitation import BaseDrive, ForceDrive
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.surface import Surface, surface_of
+from tests.driven_scenes import BASE, FORCE, MASS, PER_KHZ, PLATFORM, TIMES, both
+
+OMEGA = PER_KHZ * 90.0
+
+Signal = Callable[[Any], Any]
+
+
+def base_motion(t: Any) -> Any:
+    """Return `BASE` as the definition of a cosine says."""
+    return 0.8 * np.cos(PER_KHZ * 88 * t + np.pi / 6) + 0.3 * np.cos(PER_KHZ * 181 * t - 7 * np.pi / 18)
+
+
+def tip_force(t: Any) -> Any:
+    """Return `FORCE` as the definition of a cosine says."""
+    return 0.6 * np.cos(PER_KHZ * 93 * t + 10 * np.pi / 9) + 0.9 * np.cos(PER_KHZ * 40 * t + np.pi / 18)
+
+
+def nothing(_: Any) -> float:
+    return 0.0
+
+
+def integrate(
+    start: Any, *, quality: float | None, force: Signal = nothing, base: Signal = nothing, contact: Any = None
+) -> Any:
+    """Return z and z' of eq. 16, shape (2, times), in the lab."""
+    stiffness, damping = MASS * OMEGA**2, 0.0 if quality is None else MASS * OMEGA / quality
+
+    def rates(t, state):
+        push = force(t) + stiffness * base(t) + (0.0 if contact is None else contact(t, state))
+        return [state[1], (push - damping * state[1] - stiffness * state[0]) / MASS]
+
+    span = (0.0, float(TIMES[-1]))
+    run = solve_ivp(rates, span, start, method="DOP853", t_eval=TIMES, rtol=1e-13, atol=1e-13, max_step=0.2)
+    return run.y
+
+
+DRIVES = {
+    "base": (BASE, None, {"base": base_motion}),
+    "force": (None, FORCE, {"force": tip_force}),
+    "both": (BASE, FORCE, {"base": base_motion, "force": tip_force}),
+}
+
+
+@pytest.mark.parametrize("quality", [40.0, 2.0, None])
+@pytest.mark.parametrize("drive", DRIVES)
+def test_a_free_tip_is_free_flight_plus_steady_response(drive: str, quality: float | None):
+    base, force, signals = DRIVES[drive]
+    cantilever = Cantilever(90.0, quality, MASS)
+    _, response = surface_of(Scene(cantilever, PLATFORM, None, base, force))
+    assert response is not None
+    steady = both(response)
+    # 1e-13 of 20 nm a step, over some 500 steps; near resonance it adds up
+    np.testing.assert_allclose(integrate(steady[:, 0], quality=quality, **signals), steady, rtol=0, atol=2e-10)
+    z0, v0 = 5.0, -12.0
+    free = np.array([cantilever.propagator(t)(z0 - steady[0, 0], v0 - steady[1, 0]) for t in TIMES]).T
+    np.testing.assert_allclose(integrate([z0, v0], quality=quality, **signals), free + steady, rtol=0, atol=2e-10)
+
+
+def test_a_resonant_force_moves_the_tip_by_q_times_its_rest_and_a_quarter_late():
+    _, response = surface_of(Scene(Cantilever(90.0, 40.0, MASS), PLATFORM, force=ForceDrive(0.5, 90.0)))
+    assert response is not None
+    (wave,) = response.tones
+    # Q f/k, phase -90 degrees; one rounding each, and that of pi
+    np.testing.assert_allclose(wave.sine, 40.0 * 0.5 / (MASS * OMEGA**2), rtol=1e-14)
+    np.testing.assert_allclose(wave.cosine, 0.0, rtol=0, atol=1e-12)
+
+
+def test_a_slow_base_takes_the_tip_along():
+    slow = BaseDrive(2.0, 1e-4, 60.0)
+    _, response = surface_of(Scene(Cantilever(90.0, 40.0), PLATFORM, base=slow))
+    assert response is not None
+    # H Omega^2 - 1 is i omega/(Omega Q) = 3e-8 there
+    np.testing.assert_allclose(both(response), np.array(slow.position_and_velocity(TIMES)), rtol=0, atol=2e-7)
+
+
+def contact(gap: Any) -> Any:
+    """Return a smooth contact force in nN: soft repulsion, some attraction further out."""
+    return 40.0 * np.exp(-gap / 1.5) - 6.0 * np.exp(-((gap - 3.0) ** 2) / 4.0)
+
+
+def test_the_gap_is_that_of_a_free_cantilever_over_the_surface():
+    # the platform's motion as its definition says
+    def height(t):
+        return -1 + 1e-2 * t + 2 * np.cos(PER_KHZ * 180 * t) + 0.7 * np.cos(PER_KHZ * 33 * t + 5 * np.pi / 18)
+
+    start = np.array([6.0, -20.0])
+    lab = integrate(
+        start,
+        quality=40.0,
+        base=base_motion,
+        force=tip_force,
+        contact=lambda t, state: contact(state[0] - height(t)),
+    )
+    surface, response = surface_of(Scene(Cantilever(90.0, 40.0, MASS), PLATFORM, None, BASE, FORCE))
+    assert response is not None
+    steady = both(response)
+    assert isinstance(surface, Surface)
+    waves = [tuple(float(x) for x in (w.cosine, w.sine, w.angular_frequency)) for w in surface.tones]
+
+    def over(t):
+        return -1 + 1e-2 * t + sum(c * np.cos(w * t) + s * np.sin(w * t) for c, s, w in waves)
+
+    moved = integrate(start - steady[:, 0], quality=40.0, contact=lambda t, state: contact(state[0] - over(t)))
+    # 1e-13 a step, and contacts stretch errors by less than 100
+    np.testing.assert_allclose(moved + steady, lab, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(moved - both(surface), lab - both(PLATFORM), rtol=0, atol=1e-9)
+
+
+def test_a_base_drive_is_the_sample_moved_the_other_way_plus_the_inertial_force():
+    # in the base's frame, d = z - z_b: m d'' + (m Omega/Q) d' + k d = F(d - (z_p - z_b)) - m z_b'' - (m Omega/Q) z_b'
+    amplitude, frequency = 0.8, 97.0
+    omega, loss = PER_KHZ * frequency, OMEGA / 40.0
+
+    def base(t):
+        return amplitude * np.cos(omega * t)
+
+    def inertial(t):
+        return MASS * amplitude * omega * (omega * np.cos(omega * t) + loss * np.sin(omega * t))
+
+    start = np.array([4.0, -30.0])
+    shift = np.array([base(0.0), 0.0])
+    lab = integrate(start, quality=40.0, base=base, contact=lambda _, state: contact(state[0] + 1.0))
+    frame = integrate(
+        start - shift,
+        quality=40.0,
+        force=inertial,
+        contact=lambda t, state: contact(state[0] + 1.0 + base(t)),
+    )
+    seen = lab - np.array([base(TIMES), -amplitude * omega * np.sin(omega * TIMES)])
+    # as above
+    np.testing.assert_allclose(frame, seen, rtol=0, atol=1e-9)
+    # and the package says the same of both: one surface, so one gap
+    cantilever, resting = Cantilever(90.0, 40.0, MASS), Platform(0.0, frequency, -1.0)
+    size, late = MASS * amplitude * omega * np.hypot(omega, loss), np.rad2deg(np.arctan2(loss, omega))
+    turned = Platform(0.0, 1.0, -1.0, second=Tone(amplitude, frequency, 180.0))
+    other = Scene(cantilever, turned, force=ForceDrive(size, frequency, -late))
+    one, _ = surface_of(Scene(cantilever, resting, base=BaseDrive(amplitude, frequency)))
+    two, _ = surface_of(other)
+    # a few roundings of 5 nm and 3 nm/us
+    np.testing.assert_allclose(both(one), both(two), rtol=0, atol=1e-13)
+
+
+BAD = [
+    (lambda: Tone(-1.0, 180.0), "`amplitude` must not be negative, but is -1"),
+    (lambda: Tone(1.0, 0.0), "`frequency_khz` must be positive, but is 0"),
+    (lambda: Tone(1.0, 180.0, np.inf), "`phase_deg` must be a finite number, but is inf"),
+    (lambda: BaseDrive(-1.0, 180.0), "`amplitude_nm` must not be negative, but is -1"),
+    (lambda: BaseDrive(1.0, -180.0), "`frequency_khz` must be positive, but is -180"),
+    (lambda: BaseDrive(1.0, 180.0, np.nan), "`phase_deg` must be a finite number, but is nan"),
+    (lambda: ForceDrive(np.inf, 180.0), "`amplitude_nn` must not be negative, but is inf"),
+    (lambda: ForceDrive(1.0, np.nan), "`frequency_khz` must be positive, but is nan"),
+    (lambda: ForceDrive(1.0, 180.0, -np.inf), "`phase_deg` must be a finite number, but is -inf"),
+]
+
+
+@pytest.mark.parametrize(("build", "line"), BAD)
+def test_impossible_values_are_refused_in_one_line(build: Callable[[], Any], line: str):
+    with pytest.raises(ValueError, match="must") as error:
+        build()
+    assert str(error.value) == line
+
+
+def test_signals_are_those_of_their_definition():
+    # a few roundings of numbers of 1
+    np.testing.assert_allclose(BASE.position_and_velocity(TIMES)[0], base_motion(TIMES), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(FORCE.force(TIMES), tip_force(TIMES), rtol=0, atol=1e-14)
+    rate = [float(jax.grad(lambda t: BASE.position_and_velocity(t)[0])(t)) for t in TIMES]
+    np.testing.assert_allclose(BASE.position_and_velocity(TIMES)[1], rate, rtol=0, atol=1e-14)

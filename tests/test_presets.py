@@ -1,0 +1,64 @@
+"""The paper's scenes by name."""
+
+from pathlib import Path
+
+import equinox as eqx
+import pytest
+
+from afm_jax import Contact, ImpactLaw, load_scene, presets, save_scene
+from afm_jax.scenefile import load_start
+
+# from the paper's captions: reduced frequency, drive amplitude, offset at the start; figures 2 and 3 are charts
+CAPTIONS = {
+    "figure2": (1.0, 2.0, -1.0),
+    "figure3": (1.0, 2.0, -1.0),
+    "figure8": (5.277, 4.0, 0.0),
+    "figure9a": (0.97, 0.75, 0.0),
+    "figure9b": (1.03, 0.75, 0.0),
+    "figure10": (0.97, 2.0, -0.5),
+    "figure11": (1.01, 4.0, -2.0),
+}
+RAMPS = {"figure10": (5.0, 5500.0), "figure11": (2.0, 4000.0)}
+
+
+def test_every_preset_has_a_sentence():
+    assert set(presets.PRESETS) == set(CAPTIONS)
+    assert all(line.endswith(".") and len(line) > 40 and line.isprintable() for line in presets.PRESETS.values())
+
+
+@pytest.mark.parametrize("name", CAPTIONS)
+def test_a_preset_is_the_scene_of_its_caption(name: str, tmp_path: Path):
+    scene, (reduced, amplitude, offset) = presets.preset(name), CAPTIONS[name]
+    # the drive is n times twice 90 kHz: one rounding
+    assert float(scene.platform.frequency_khz) == pytest.approx(180.0 * reduced, rel=1e-15)
+    assert [float(scene.platform.amplitude_nm), float(scene.platform.offset_nm)] == [amplitude, offset]
+    ramped = name in RAMPS
+    assert (float(scene.platform.offset_rate_nm_per_us) != 0.0) == ramped
+    if ramped:
+        end, after = RAMPS[name]
+        # two roundings of a few nm
+        assert float(scene.platform.offset_nm + after * scene.platform.offset_rate_nm_per_us) == pytest.approx(
+            end, rel=1e-15
+        )
+        assert f"to {end:g} nm in {after:g} us" in presets.PRESETS[name]
+    resolved = name in ("figure8", "figure10", "figure11")
+    assert isinstance(scene.interaction, Contact if resolved else ImpactLaw)
+    assert (scene.cantilever.quality_factor is not None) == resolved
+    path = tmp_path / "scene.toml"
+    save_scene(scene, path, start=presets.preset_start(name))
+    assert eqx.tree_equal(load_scene(path), scene)
+    assert load_start(path) == presets.preset_start(name)
+
+
+def test_figure_8_starts_as_told():
+    assert presets.preset_start("figure8") == presets.figure8_start(80.0) == (270.0, 5.0, 80.0)
+    assert presets.figure8_start(40.0).velocity_nm_per_us == 40.0
+    assert presets.preset_start("figure10") is None
+
+
+def test_an_unknown_name_is_refused():
+    for call in (presets.preset, presets.preset_start):
+        with pytest.raises(
+            ValueError, match="there is no preset 'figure4'; choose from figure2, figure3, figure8, fig"
+        ):
+            call("figure4")

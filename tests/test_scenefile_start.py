@@ -1,0 +1,97 @@
+"""The start of a scene file: kept exactly, and refused where a tip cannot begin."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, SceneError, load_scene, save_scene
+from afm_jax.scenefile import Start, load_start
+
+HEAD = (
+    "[cantilever]\nfrequency_khz = 90\n[platform]\namplitude_nm = 4\nfrequency_khz = 180\noffset_rate_nm_per_us = 0.5\n"
+)
+INTERACTIONS = {
+    "law": 'model = "law"\nr = 0.9\n',
+    "contact": 'model = "contact"\n',
+    "dry contact": 'model = "contact"\neffects = ["core", "jkr"]\n',
+    "none": 'model = "none"\n',
+}
+# beta omega, with the ramp, where the platform moves up and down fastest: phase 270 and 90 degrees
+UP, DOWN = 0.5 + 4 * 2e-3 * np.pi * 180, 0.5 - 4 * 2e-3 * np.pi * 180
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "scene.toml"
+
+
+def write(path: Path, interaction: str, start: Start) -> None:
+    lines = "".join(f"{key} = {value!r}\n" for key, value in start._asdict().items())
+    path.write_text(f"{HEAD}[interaction]\n{INTERACTIONS[interaction]}[start]\n{lines}", encoding="utf-8")
+
+
+GOOD = [
+    ("law", Start(270.0, 5.0, 80.0)),
+    ("law", Start(270.0, 5.0, -80.0)),
+    ("law", Start(270.0, 0.0, UP + 1e-6)),
+    ("law", Start(90.0, 0.0, DOWN + 1e-6)),
+    ("law", Start(90.0 + 720.0, 0.0, DOWN + 1e-6)),
+    ("contact", Start(270.0, 5.0, 40.0)),
+    ("contact", Start(-90.0, 0.1237, -40.0)),
+    ("none", Start(0.1, -70.3, -1e3)),
+    ("none", Start(0.0, 0.0, 0.0)),
+]
+
+
+@pytest.mark.parametrize(("interaction", "start"), GOOD)
+def test_loop_is_exact(path: Path, interaction: str, start: Start):
+    write(path, interaction, start)
+    assert load_start(path) == start
+    scene = load_scene(path)
+    path.unlink()
+    save_scene(scene, path, start=start)
+    assert load_start(path) == start
+
+
+INSIDE = "must be positive, but is {}: the tip would start inside the sample"
+BAD = [
+    ("law", Start(270.0, -0.5, 80.0), "`height_above_platform_nm` must not be negative, but is -0.5"),
+    ("law", Start(270.0, 0.0, UP - 1e-3), f"`velocity_nm_per_us` must be above the platform's {UP:.6g} where the tip"),
+    (
+        "law",
+        Start(90.0, 0.0, DOWN - 1e-3),
+        f"`velocity_nm_per_us` must be above the platform's {DOWN:.6g} where the tip",
+    ),
+    ("law", Start(0.0, 0.0, 0.5), "`velocity_nm_per_us` must be above the platform's 0.5 where the tip starts on it"),
+    ("contact", Start(270.0, 0.0, 80.0), f"`height_above_platform_nm` {INSIDE.format(0)}"),
+    ("contact", Start(270.0, -5.0, 80.0), f"`height_above_platform_nm` {INSIDE.format(-5)}"),
+    # where the paper's junction forms: 0.12360 nm to five digits
+    ("contact", Start(270.0, 0.1235, 80.0), "`height_above_platform_nm` must be above 0.123598, where"),
+    ("dry contact", Start(270.0, 0.01, 80.0), "`height_above_platform_nm` must be above 0.1"),
+]
+BAD += [
+    (interaction, Start(**(Start(270.0, 5.0, 80.0)._asdict() | {key: value})), f"`{key}` must be a finite number")
+    for interaction in ("law", "contact", "none")
+    for key in Start._fields
+    for value in (float("nan"), float("inf"))
+]
+
+
+@pytest.mark.parametrize(("interaction", "start", "expected"), BAD)
+def test_a_start_that_cannot_be_is_named(path: Path, interaction: str, start: Start, expected: str):
+    write(path, interaction, start)
+    for load in (load_scene, load_start):
+        with pytest.raises(SceneError) as caught:
+            load(path)
+        line = str(caught.value)
+        assert line.isprintable()
+        assert line.startswith(f"{path}: [start] {expected}")
+
+
+def test_a_start_that_cannot_be_is_not_saved(path: Path):
+    platform = Platform(4.0, 180.0)
+    for interaction, said in ((Contact.paper(), "inside the sample"), (ImpactLaw(0.9), "above the platform's 4.52389")):
+        with pytest.raises(ValueError, match=said):
+            save_scene(Scene(Cantilever(90.0), platform, interaction), path, start=Start(270.0, 0.0, 1.0))
+        assert not path.exists()

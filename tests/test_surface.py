@@ -1,0 +1,159 @@
+"""The surface that a tip sees: derivatives, bounds, what it costs, and where there is none."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.drive import Tone
+from afm_jax.apparatus.excitation import BaseDrive, ForceDrive
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.surface import Surface, Wave, surface_of
+from afm_jax.impact.law import ImpactLaw
+from tests.driven_scenes import BASE, FULL, PER_KHZ, PLATFORM, TIMES, both
+
+
+@pytest.mark.parametrize("scene", [Scene(Cantilever(90.0), PLATFORM), FULL], ids=["platform", "surface"])
+@pytest.mark.parametrize("time", [0.3, 17.9])
+def test_velocity_and_acceleration_are_derivatives(scene: Scene, time: float):
+    surface, _ = surface_of(scene)
+    # rounding of lengths of 20 nm
+    assert float(jax.grad(surface.position)(time)) == pytest.approx(float(surface.velocity(time)), abs=1e-12)
+    assert float(jax.grad(surface.velocity)(time)) == pytest.approx(float(surface.acceleration(time)), abs=1e-12)
+
+
+def test_bounds_hold_and_are_sharp_for_one_wave():
+    time = np.linspace(0.0, 3000.0, 200_001)
+    surface, _ = surface_of(FULL)
+    for motion in (surface, PLATFORM, Surface(0.5, -2e-3, (Wave(0.3, -1.1, 0.6),))):
+        position, velocity = (np.asarray(x) for x in motion.position_and_velocity(jnp.asarray(time)))
+        ramp = float(motion.offset_rate_nm_per_us)
+        reach = np.max(np.abs(position - float(motion.offset_nm) - ramp * time))
+        bend = np.max(np.abs(np.asarray(motion.acceleration(jnp.asarray(time)))))
+        assert reach <= float(motion.reach_nm)
+        assert bend <= float(motion.largest_acceleration_nm_per_us2)
+        if isinstance(motion, Surface):
+            assert np.max(np.abs(velocity - ramp)) <= float(motion.top_speed_nm_per_us) * (1 + 1e-12)  # rounding
+    one = Surface(0.5, -2e-3, (Wave(0.3, -1.1, 0.6),))
+    # sqrt(0.3^2 + 1.1^2), and its products with 0.6
+    expected = np.sqrt(1.3) * np.array([1.0, 0.6, 0.36])
+    bounds = [one.reach_nm, one.top_speed_nm_per_us, one.largest_acceleration_nm_per_us2]
+    np.testing.assert_allclose(bounds, expected, rtol=1e-14)
+    # two waves of incommensurate frequencies come close to their bound
+    assert reach > 0.99 * float(one.reach_nm)
+    assert float(PLATFORM.reach_nm) == pytest.approx(2.7, rel=1e-15)
+    assert float(PLATFORM.fastest_angular_frequency) == pytest.approx(PER_KHZ * 180.0, rel=1e-15)
+    assert float(surface.fastest_angular_frequency) == pytest.approx(PER_KHZ * 181.0, rel=1e-15)
+
+
+def test_what_is_not_there_costs_nothing():
+    platform = Platform(2.0, 180.0)
+    assert surface_of(Scene(Cantilever(90.0), platform)) == (platform, None)
+    assert surface_of(Scene(Cantilever(90.0), PLATFORM, ImpactLaw(0.5)))[0] is PLATFORM
+    sines = {
+        "platform": (platform, 1),
+        "second": (PLATFORM, 2),
+        "base over a resting platform": (surface_of(Scene(FULL.cantilever, Platform(0.0, 180.0), base=BASE))[0], 2),
+        "drives of one frequency": (
+            surface_of(Scene(FULL.cantilever, platform, None, BaseDrive(1.0, 180.0), ForceDrive(1.0, 180.0)))[0],
+            1,
+        ),
+        "no amplitude": (surface_of(Scene(FULL.cantilever, platform, force=ForceDrive(0.0, 70.0)))[0], 1),
+    }
+    for name, (motion, count) in sines.items():
+        program = str(jax.make_jaxpr(motion.position_and_velocity)(1.0))
+        assert program.count("name=sine_cosine") == count, name
+
+
+def test_nothing_that_moves_is_left():
+    surface, response = surface_of(Scene(Cantilever(90.0), Platform(0.0, 180.0, 3.0, 0.5), force=ForceDrive(0.0, 70.0)))
+    assert isinstance(surface, Surface)
+    assert response is not None
+    assert surface.tones == response.tones == ()
+    np.testing.assert_array_equal(both(surface), [3.0 + 0.5 * TIMES, np.full(4, 0.5)])
+    np.testing.assert_array_equal(surface.acceleration(jnp.asarray(TIMES)), np.zeros(4))
+    assert [float(surface.reach_nm), float(surface.fastest_angular_frequency)] == [0.0, 0.0]
+
+
+def heights(scene: Scene) -> Any:
+    surface, response = surface_of(scene)
+    assert response is not None
+    return jnp.stack([*surface.position_and_velocity(7.7), *response.position_and_velocity(7.7)])
+
+
+compiled = jax.jit(heights)
+
+
+def test_compiled_batched_and_plain_agree():
+    plain = np.asarray(heights(FULL))
+    scenes = jax.tree.map(lambda leaf: jnp.stack([leaf, 1.01 * leaf]), FULL)
+    batch = jax.jit(jax.vmap(heights))(scenes)
+    # fused multiply and add
+    np.testing.assert_allclose(batch[0], plain, rtol=1e-12)
+    np.testing.assert_allclose(batch[1], heights(jax.tree.map(lambda leaf: 1.01 * leaf, FULL)), rtol=1e-12)
+    single = heights(jax.tree.map(lambda leaf: leaf.astype(jnp.float32), FULL))
+    assert single.dtype == jnp.float32
+    # 6e-8 of phases of 10 rad, near resonance
+    np.testing.assert_allclose(single, plain, rtol=0, atol=1e-3)
+
+
+def test_drives_of_one_frequency_add_up():
+    scene = Scene(
+        Cantilever(90.0, 40.0, 1.7),
+        Platform(2.0, 180.0, 0.0, 0.0, Tone(1.0, 77.0, 20.0)),
+        None,
+        BaseDrive(1.1, 180.0, 30.0, Tone(0.4, 77.0, -50.0)),
+        ForceDrive(0.9, 77.0, 200.0, Tone(0.6, 180.0, 80.0)),
+    )
+    assert [len(motion.tones) for motion in surface_of(scene) if isinstance(motion, Surface)] == [2, 2]
+    # inside a compiled program the frequencies are not known to be the same: every cosine is there, none is joined
+    np.testing.assert_allclose(heights(scene), compiled(scene), rtol=1e-12)
+
+
+def test_every_parameter_has_its_derivative():
+    forward, reverse = jax.jacfwd(compiled)(FULL), jax.jacrev(compiled)(FULL)
+    leaves, structure = jax.tree.flatten(FULL)
+    slopes = zip(jax.tree.leaves(forward), jax.tree.leaves(reverse), strict=True)
+    for place, (slope, backward) in enumerate(slopes):
+        # sums in another order
+        np.testing.assert_allclose(slope, backward, rtol=1e-10, atol=1e-12)
+        step = 1e-4 * max(1.0, abs(float(leaves[place])))
+
+        def moved(by, place=place):
+            values = [leaf + by if here == place else leaf for here, leaf in enumerate(leaves)]
+            return np.asarray(compiled(jax.tree.unflatten(structure, values)))
+
+        near, far = ((moved(h) - moved(-h)) / (2 * h) for h in (step, 2 * step))
+        # fourth order in 1e-2 kHz near resonance (width 2 kHz); rounding of 1e-14 over 1e-4
+        np.testing.assert_allclose(slope, (4 * near - far) / 3, rtol=1e-6, atol=1e-8)
+        assert np.any(np.asarray(slope) != 0.0), f"parameter {place} changes nothing"
+
+
+def test_amplitude_zero_has_a_derivative():
+    def bound(amplitude):
+        return surface_of(Scene(Cantilever(90.0, 40.0), Platform(0.0, 180.0), force=ForceDrive(amplitude, 91.0)))[
+            0
+        ].reach_nm
+
+    assert np.isfinite(float(jax.grad(bound)(0.0)))
+
+
+def test_undamped_at_resonance_is_refused():
+    for quality in (None, np.inf):
+        drives: tuple[dict[str, Any], ...] = (
+            {"base": BaseDrive(1.0, 90.0)},
+            {"force": ForceDrive(1.0, 50.0, 0.0, Tone(1.0, 90.0 + 1e-9))},
+        )
+        for drive in drives:
+            (name,) = drive
+            with pytest.raises(ValueError, match=f"`{name}` drives an undamped cantilever at its free frequency") as it:
+                surface_of(Scene(Cantilever(90.0, quality), PLATFORM, **drive))
+            assert "\n" not in str(it.value)
+    # damped, or a drive that does not move, or the platform at that frequency: all is well
+    surface_of(Scene(Cantilever(90.0, 1e6), PLATFORM, base=BaseDrive(1.0, 90.0)))
+    surface_of(Scene(Cantilever(90.0), PLATFORM, base=BaseDrive(0.0, 90.0)))
+    surface_of(Scene(Cantilever(90.0), Platform(1.0, 90.0), base=BaseDrive(1.0, 91.0)))
