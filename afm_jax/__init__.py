@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from afm_jax.apparatus.cantilever import Cantilever
+    from afm_jax.apparatus.drive import Tone
+    from afm_jax.apparatus.excitation import BaseDrive, ForceDrive
     from afm_jax.apparatus.platform import Platform
     from afm_jax.apparatus.scene import Scene
     from afm_jax.contact.capture import capture_speed
@@ -21,6 +23,9 @@ if TYPE_CHECKING:
     from afm_jax.impact.law import CollisionDelay, ImpactLaw
     from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
     from afm_jax.impact.poincare import NextImpact, iterate_map, next_impact
+    from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
+    from afm_jax.motion.simulate import simulate
+    from afm_jax.motion.trajectory import Trajectory, trajectory
     from afm_jax.outcome import CollisionOutcome, Outcome
     from afm_jax.scenefile import SceneError, load_scene, save_scene
 
@@ -29,20 +34,28 @@ else:
     from afm_jax.lazy_names import import_name
 
     _HOMES = {
+        "BaseDrive": "afm_jax.apparatus.excitation",
         "Cantilever": "afm_jax.apparatus.cantilever",
         "Collision": "afm_jax.contact.collision",
         "CollisionDelay": "afm_jax.impact.law",
         "CollisionOutcome": "afm_jax.outcome",
         "Contact": "afm_jax.contact.contact",
+        "ContactKind": "afm_jax.motion.record",
+        "ForceDrive": "afm_jax.apparatus.excitation",
         "ImpactLaw": "afm_jax.impact.law",
         "Junction": "afm_jax.contact.junction",
+        "MotionOutcome": "afm_jax.motion.record",
         "NextImpact": "afm_jax.impact.poincare",
         "Outcome": "afm_jax.outcome",
         "Phase": "afm_jax.contact.phases",
         "Platform": "afm_jax.apparatus.platform",
         "Scene": "afm_jax.apparatus.scene",
         "SceneError": "afm_jax.scenefile",
+        "Simulation": "afm_jax.motion.record",
         "SingleImpactOrbits": "afm_jax.impact.orbits",
+        "State": "afm_jax.motion.record",
+        "Tone": "afm_jax.apparatus.drive",
+        "Trajectory": "afm_jax.motion.trajectory",
         "__version__": "afm_jax.version",
         "capture_speed": "afm_jax.contact.capture",
         "collide": "afm_jax.contact.collide",
@@ -53,8 +66,10 @@ else:
         "map_jacobian": "afm_jax.impact.jacobian",
         "next_impact": "afm_jax.impact.poincare",
         "save_scene": "afm_jax.scenefile",
+        "simulate": "afm_jax.motion.simulate",
         "single_impact_orbits": "afm_jax.impact.orbits",
         "time_course": "afm_jax.contact.time_course",
+        "trajectory": "afm_jax.motion.trajectory",
     }
 
     def __getattr__(name):
@@ -65,20 +80,28 @@ else:
 
 
 __all__ = [
+    "BaseDrive",
     "Cantilever",
     "Collision",
     "CollisionDelay",
     "CollisionOutcome",
     "Contact",
+    "ContactKind",
+    "ForceDrive",
     "ImpactLaw",
     "Junction",
+    "MotionOutcome",
     "NextImpact",
     "Outcome",
     "Phase",
     "Platform",
     "Scene",
     "SceneError",
+    "Simulation",
     "SingleImpactOrbits",
+    "State",
+    "Tone",
+    "Trajectory",
     "__version__",
     "capture_speed",
     "collide",
@@ -89,6 +112,8 @@ __all__ = [
     "map_jacobian",
     "next_impact",
     "save_scene",
+    "simulate",
     "single_impact_orbits",
     "time_course",
+    "trajectory",
 ]

@@ -77,7 +77,7 @@ MUTATIONS = {
     ),
     "bound of the gap without the platform": Mutation(
         "afm_jax/impact/first_impact.py",
-        "gap_bound=tip_bound + platform.top_speed_nm_per_us * platform.angular_frequency",
+        "gap_bound=tip_bound + platform.largest_acceleration_nm_per_us2",
         "gap_bound=tip_bound",
         GRAZING,
     ),
@@ -86,8 +86,8 @@ MUTATIONS = {
     ),
     "platform that reaches less high": Mutation(
         "afm_jax/impact/first_impact.py",
-        "rate * start + platform.amplitude_nm)",
-        "rate * start - platform.amplitude_nm)",
+        "rate * start + platform.reach_nm",
+        "rate * start - platform.reach_nm",
         GRAZING,
     ),
     "search flies another curve": Mutation(

@@ -104,7 +104,7 @@ def test_command_writes_table_picture_and_one_json_object(tmp_path: Path, monkey
 @pytest.mark.parametrize(
     ("arguments", "line"),
     [
-        (["accuracy", "collide"], "there is no accuracy study of `collide`; choose: map"),
+        (["accuracy", "speed"], "there is no accuracy study of `speed`; choose: map, collide"),
         (["accuracy", "--wanted-error-us", "0"], "0.0 is not in the range"),
     ],
 )

@@ -128,10 +128,13 @@ def test_aims_are_judged_and_not_invented():
 
 def test_command_writes_tables_and_one_json_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(own_process, "run_in_own_process", run_here)
-    result = CliRunner().invoke(main, ["bench", "--quick", "--batch", "2", "--json", "--out", str(tmp_path)])
+    arguments = ["bench", "--only", "map", "--quick", "--batch", "2", "--json", "--out", str(tmp_path)]
+    result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 0, result.stderr
     payload = json.loads(result.stdout)
-    assert {"rows", "aims", "machine"} == set(payload)
+    assert {"rows", "contact_rows", "aims", "machine"} == set(payload)
+    assert payload["contact_rows"] == []
+    assert not (tmp_path / "bench_contact.csv").exists()
     assert json.loads((tmp_path / "bench.json").read_text("utf-8")) == payload
     lines = (tmp_path / "bench.csv").read_text("utf-8").splitlines()
     assert lines[0] == ",".join(COLUMNS)

@@ -44,6 +44,7 @@ def test_forward_and_reverse_agree(forward):
     np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_both_methods_have_the_same_derivatives(forward):
     collocation = np.stack(jax.jit(jax.jacfwd(lambda values: outputs("collocation", values)))(PAPER))
     # each is right to 1e-6 of the derivative itself; where a delay's derivative nearly vanishes, of 1e-2

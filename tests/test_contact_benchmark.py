@@ -1,15 +1,22 @@
 """The contact's benchmark and accuracy study: their reference, their baseline, their choices."""
 
+import csv
+import json
+
 import numpy as np
 import pytest
+from click.testing import CliRunner
 
+from afm_jax.cli.main import main
 from afm_jax.contact.collide import batch_of
 from afm_jax.contact.contact import Contact
 from afm_jax.plots.contact_accuracy import collide_accuracy_figure
+from afm_jax.study import own_process
 from afm_jax.study.contact_accuracy import cheapest_collision
 from afm_jax.study.contact_benchmark import REFERENCE, aims, errors_against, speeds_of
 from afm_jax.study.scipy_collision import scipy_collision
 from tests import reference_contact as exact
+from tests.run_here import run_here
 
 
 @pytest.fixture(scope="module")
@@ -82,3 +89,43 @@ def test_aims_name_what_was_reached():
     reached = {name: (value, bound) for name, value, bound in aims(rows)}
     assert reached["contact, us an impact at 1e-6"] == (1.25, 1.5)
     assert reached["contact, us an impact at 1e-9"] == (None, 3.0)
+
+
+def run_quickly(monkeypatch, folder, *arguments):
+    """Return what a command prints as JSON, its measurement made in this process."""
+    monkeypatch.setattr(own_process, "run_in_own_process", run_here)
+    result = CliRunner().invoke(main, [*arguments, "--quick", "--json", "--out", str(folder)])
+    assert result.exit_code == 0, result.stderr
+    return json.loads(result.stdout)
+
+
+def lines_of(path):
+    with path.open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+@pytest.mark.slow
+def test_accuracy_command_shows_errors_and_the_cheapest(monkeypatch, tmp_path):
+    payload = run_quickly(monkeypatch, tmp_path, "accuracy", "collide")
+    # energies of 100 aJ, of which the slowest tip keeps 12: some roundings
+    assert payload["reference_error"] < 1e-13
+    for row in payload["rows"]:
+        accuracy = row.get("accuracy", 1e-4)
+        assert row["rebound_error"] <= accuracy
+        assert row["delay_error_us"] <= 10.0 * accuracy
+        assert row["slope_error"] is None or row["slope_error"] <= 10.0 * accuracy
+    assert payload["cheapest"]["method"].startswith("collide")
+    assert len(lines_of(tmp_path / "accuracy.csv")) == len(payload["rows"])
+    assert (tmp_path / "accuracy.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_bench_command_measures_the_contact_alone(monkeypatch, tmp_path):
+    payload = run_quickly(monkeypatch, tmp_path, "bench", "--only", "contact")
+    assert payload["rows"] == []
+    assert not (tmp_path / "bench.csv").exists()
+    assert [aim["aim"] for aim in payload["aims"] if aim["reached"] is None] == []
+    errors = [aim for aim in payload["aims"] if "error" in aim["aim"]]
+    assert len(errors) == 2
+    assert all(aim["met"] for aim in errors)
+    assert len(lines_of(tmp_path / "bench_contact.csv")) == len(payload["contact_rows"])

@@ -1,10 +1,12 @@
 """`afm-jax accuracy`: error against time, and the cheapest setting for a wanted error."""
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from afm_jax.cli.accuracy_scene import scene_study
 from afm_jax.cli.session import Session, with_session
 
 if TYPE_CHECKING:
@@ -63,7 +65,7 @@ COLLIDE_COLUMNS = (
 """What `accuracy.csv` tells of a contestant of `collide`."""
 COLLIDE_FULL = {
     "tolerances": [1e-3, 1e-4, 1e-5, 1e-6, 1e-7, 1e-8, 1e-9, 1e-10, 1e-11],
-    "solvers": ["Tsit5", "Dopri5", "Dopri8", "Kvaerno5"],
+    "solvers": {"gap": ["Tsit5", "Dopri5", "Dopri8", "Kvaerno5"], "time": ["Tsit5", "Dopri8"]},
     "accuracies": [1e-5, 1e-6, 1e-9, 1e-11],
     "steps": [2, 8],
     "batch": 500,
@@ -72,7 +74,7 @@ COLLIDE_FULL = {
 }
 COLLIDE_QUICK = {
     "tolerances": [1e-6],
-    "solvers": ["Dopri8"],
+    "solvers": {"gap": ["Dopri8"]},
     "accuracies": [1e-9],
     "steps": [],
     "batch": 8,
@@ -82,7 +84,7 @@ COLLIDE_QUICK = {
 
 
 @click.command()
-@click.argument("study", default="map", metavar="[map|collide]")
+@click.argument("study", default="map", metavar="[map|collide|SCENE.toml]")
 @click.option(
     "--wanted-error-us",
     type=click.FloatRange(min=0.0, min_open=True),
@@ -97,19 +99,33 @@ COLLIDE_QUICK = {
     show_default=True,
     help="For collide: relative error of the rebound speed (a tenth of the delay's in us) to find the cheapest for.",
 )
+@click.option(
+    "--contacts",
+    type=click.IntRange(1, 10_000),
+    default=10,
+    show_default=True,
+    help="For a scene: the arrival of which contact is compared.",
+)
 @click.option("--quick", is_flag=True, help="Few and small measurements: to see that it works.")
 @with_session
-def command(session: Session, study: str, wanted_error_us: float, accuracy: float, *, quick: bool) -> None:
-    """Show the error of impacts against the time they take: of the impact map, or of `collide` through the contact.
+def command(
+    session: Session, study: str, wanted_error_us: float, accuracy: float, *, contacts: int, quick: bool
+) -> None:
+    """Show the error of impacts against the time they take: of the map, of `collide`, or of one scene.
 
     map: root tolerances in float32 and float64, and SciPy's solve_ivp with events, on three scenes: regular, near
     grazing with chatter, and of order 5; errors are against 50 digits. collide: Diffrax solvers with fixed and adaptive
     steps, in the gap and in time, values and derivatives, float32 and float64, SciPy beside them; errors are against a
-    quadrature converged to rounding. With --out accuracy.csv, accuracy.json, accuracy.png.
+    quadrature converged to rounding. SCENE.toml (or a preset's name): settings of the scene's contacts or of its root
+    search against the finest, and the fidelity ladder: what orbit, map and map with delay of the fitted law make of the
+    amplitude. With --out accuracy.csv, accuracy.json, accuracy.png (a scene: ladder.csv too).
     """
-    if study not in {"map", "collide"}:
-        raise click.UsageError(f"there is no accuracy study of `{study}`; choose: map, collide")
     session.start_computing()
+    if study not in {"map", "collide"}:
+        if not is_scene(study):
+            raise click.UsageError(f"there is no accuracy study of `{study}`; choose: map, collide, or a scene file")
+        scene_study(session, study, contacts, quick=quick)
+        return
     if study == "collide":
         collide_study(session, accuracy, quick=quick)
         return
@@ -135,6 +151,15 @@ def command(session: Session, study: str, wanted_error_us: float, accuracy: floa
         f"root tolerance {result['default_root_tolerance_us']:g} us.",
         *(cheapest_sentence(choice, wanted_error_us) for choice in cheapest),
     )
+
+
+def is_scene(name: str) -> bool:
+    """Return whether a name can only be a scene's: a file, a path, or a preset."""
+    if name.endswith(".toml") or Path(name).exists():
+        return True
+    from afm_jax.presets import PRESETS  # noqa: PLC0415
+
+    return name in PRESETS
 
 
 def collide_study(session: Session, accuracy: float, *, quick: bool) -> None:

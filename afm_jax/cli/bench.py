@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from afm_jax.cli.bench_scenes import SCENE_COLUMNS, measure_scenes, scene_tables
 from afm_jax.cli.session import Session, with_session
 
 if TYPE_CHECKING:
@@ -63,53 +64,75 @@ CONTACT_COLUMNS = (
     metavar="N",
     help="How many tips at once; may be given several times. Default: 1, 100, 10000 and 100000.",
 )
-@click.option("--only", type=click.Choice(["map", "contact"]), help="The impact map alone, or the contact alone.")
+@click.option(
+    "--only",
+    type=click.Choice(["map", "contact", "scenes"]),
+    help="The impact map alone, the contact of free tips alone, or driven contacts alone.",
+)
 @with_session
 def command(session: Session, batches: tuple[int, ...], only: str | None, *, quick: bool) -> None:
-    """Measure impacts per second: of next_impact iterated, on one core and on all, and of collide through the contact.
+    """Measure impacts per second: of next_impact iterated, of collide through the contact, and of driven contacts.
 
-    The same run measures a chaotic scene, derivatives, and SciPy's solve_ivp with events on the same problem. Errors of
-    impact times are against 50 digits. Times are the best of several repetitions, compilation apart; the machine should
-    have nothing else to do. With --out bench.csv and bench.json.
+    The impact map is measured on one core and on all. The same run measures a chaotic scene, derivatives, and SciPy's
+    solve_ivp with events on the same problems. Errors of impact times are against 50 digits, those of contacts against
+    finer settings. Times are the best of several repetitions, compilation apart; the machine should have nothing else
+    to do. With --out bench.csv, bench_contact.csv, bench_scenes.csv and bench.json.
     """
     session.start_computing()
     from afm_jax.cli.strict_json import strict_json  # noqa: PLC0415
-    from afm_jax.study.own_process import available_cores, run_in_own_process  # noqa: PLC0415
+    from afm_jax.study.own_process import available_cores  # noqa: PLC0415
 
-    sizes = list(batches) or ([1, 100] if quick else [1, 100, AIMED_BATCH, 100_000])
-    common = {"batches": sizes, "impacts": 20, "repetitions": 2 if quick else 7}
-    blocks = [] if quick else [250, 1000, 2000]
     cores = available_cores()
     machine = machine_facts(cores)
     if (machine["load_before"] or 0.0) > 0.3 * cores:
         session.note(f"other programs are running (load {machine['load_before']:.1f}): times will be too long")
-    rows: list[dict[str, Any]] = []
-    contact_rows: list[dict[str, Any]] = []
-    if only != "map":
-        with session.working("measuring the contact"):
-            task = "afm_jax.study.contact_benchmark:contact_one_core"
-            contact_rows = run_in_own_process(task, CONTACT_QUICK if quick else CONTACT, cores=1)["rows"]
+    payload: dict[str, Any] = {"rows": [], "contact_rows": [], "scene_rows": [], "aims": [], "machine": machine}
+    tables = []
     with session.working("measuring"):
-        alone = {**common, "blocks": blocks, "derivative_batch": 100 if quick else AIMED_BATCH}
-        if only != "contact":
-            rows = run_in_own_process("afm_jax.study.benchmark:one_core", alone, cores=1)["rows"]
-        if cores > 1 and only != "contact":
-            rows += run_in_own_process("afm_jax.study.benchmark:all_cores", common, cores=cores)["rows"]
-    reached = [] if only == "contact" else aims(rows)
-    if contact_rows:
-        from afm_jax.study.contact_benchmark import aims as contact_aims  # noqa: PLC0415
-
-        reached += [_aim(name, value, at_most=bound) for name, value, bound in contact_aims(contact_rows)]
-    payload = {"rows": rows, "contact_rows": contact_rows, "aims": reached, "machine": machine}
-    if rows:
-        session.write_table("bench.csv", rows, COLUMNS)
-    if contact_rows:
-        session.write_table("bench_contact.csv", contact_rows, CONTACT_COLUMNS)
+        if only in {None, "map"}:
+            payload["rows"] = map_rows(batches, cores, quick=quick)
+            payload["aims"] += aims(payload["rows"])
+            tables.append(bench_table(payload["rows"]))
+            session.write_table("bench.csv", payload["rows"], COLUMNS)
+        if only in {None, "contact"}:
+            payload["contact_rows"], reached = contact_rows(quick=quick)
+            payload["aims"] += reached
+            tables.append(contact_table(payload["contact_rows"]))
+            session.write_table("bench_contact.csv", payload["contact_rows"], CONTACT_COLUMNS)
+        if only in {None, "scenes"}:
+            scenes, reached = measure_scenes(quick=quick)
+            payload |= scenes
+            payload["aims"] += [aim_of(name, value, at_most=bound) for name, value, bound in reached]
+            tables += scene_tables(payload["scene_rows"])
+            session.write_table("bench_scenes.csv", payload["scene_rows"], SCENE_COLUMNS)
     if session.out is not None:
         (session.out / "bench.json").write_text(strict_json(payload) + "\n", encoding="utf-8")
         session.note(f"wrote {session.out / 'bench.json'}")
-    tables = [*([bench_table(rows)] if rows else []), *([contact_table(contact_rows)] if contact_rows else [])]
     session.emit(payload, *tables, *(aim_sentence(aim) for aim in payload["aims"]))
+
+
+def map_rows(batches: Sequence[int], cores: int, *, quick: bool) -> list[dict[str, Any]]:
+    """Measure the impact map, on one core and on all."""
+    from afm_jax.study.own_process import run_in_own_process  # noqa: PLC0415
+
+    sizes = list(batches) or ([1, 100] if quick else [1, 100, AIMED_BATCH, 100_000])
+    common = {"batches": sizes, "impacts": 20, "repetitions": 2 if quick else 7}
+    blocks = [] if quick else [250, 1000, 2000]
+    alone = {**common, "blocks": blocks, "derivative_batch": 100 if quick else AIMED_BATCH}
+    rows = run_in_own_process("afm_jax.study.benchmark:one_core", alone, cores=1)["rows"]
+    if cores > 1:
+        rows += run_in_own_process("afm_jax.study.benchmark:all_cores", common, cores=cores)["rows"]
+    return rows
+
+
+def contact_rows(*, quick: bool) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Measure collisions of free tips through the contact; return what was measured and the aims."""
+    from afm_jax.study.contact_benchmark import aims as contact_aims  # noqa: PLC0415
+    from afm_jax.study.own_process import run_in_own_process  # noqa: PLC0415
+
+    task = "afm_jax.study.contact_benchmark:contact_one_core"
+    rows = run_in_own_process(task, CONTACT_QUICK if quick else CONTACT, cores=1)["rows"]
+    return rows, [aim_of(name, value, at_most=bound) for name, value, bound in contact_aims(rows)]
 
 
 def aims(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -121,16 +144,17 @@ def aims(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     plain = next((row for row in rows if row["what"] == "next_impact iterated" and row["batch"] == AIMED_BATCH), {})
     ratios = {row["what"].split()[0]: row["ratio_to_plain"] for row in rows if "ratio_to_plain" in row}
     return [
-        _aim("impacts per second, one core, batch 10000", plain.get("impacts_per_second"), at_least=3e6),
-        _aim("error after 20 impacts, us", plain.get("error_us"), at_most=1e-11),
-        _aim("one forward derivative, plain runs", ratios.get("forward"), at_most=1.5),
-        _aim("full reverse gradient, plain runs", ratios.get("reverse"), at_most=4.0),
+        aim_of("impacts per second, one core, batch 10000", plain.get("impacts_per_second"), at_least=3e6),
+        aim_of("error after 20 impacts, us", plain.get("error_us"), at_most=1e-11),
+        aim_of("one forward derivative, plain runs", ratios.get("forward"), at_most=1.5),
+        aim_of("full reverse gradient, plain runs", ratios.get("reverse"), at_most=4.0),
     ]
 
 
-def _aim(
+def aim_of(
     name: str, reached: float | None, *, at_least: float | None = None, at_most: float | None = None
 ) -> dict[str, Any]:
+    """Return an aim, what was reached (None: not measured) and whether that is enough."""
     met = None
     if reached is not None:
         met = (at_least is None or reached >= at_least) and (at_most is None or reached <= at_most)

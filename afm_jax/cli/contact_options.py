@@ -119,7 +119,8 @@ def _of_scene(path: Path) -> tuple[tuple[str, ...], dict[str, float], float]:
 
     scene = load_scene(path)
     if not isinstance(scene.interaction, Contact):
-        raise ValueError(f'{path}: [interaction] model: must be "contact" here, but is "law"')  # noqa: TRY004
+        model = "none" if scene.interaction is None else "law"
+        raise ValueError(f'{path}: [interaction] model: must be "contact" here, but is "{model}"')  # noqa: TRY004
     numbers = {name: float(value) for name, value in contact_parameters(scene.interaction).items()}
     return scene.interaction.effects, numbers, float(scene.cantilever.mass_ng)
 

@@ -5,16 +5,18 @@ from pathlib import Path
 from afm_jax import presets
 from afm_jax.cli.out_folder import write_csv
 from afm_jax.plots.contact_figures import draw_contact_figure
+from afm_jax.plots.motion_figures import draw_motion_figure
 from afm_jax.plots.offset_amplitude import draw_offset_amplitudes
 from afm_jax.plots.stability_regions import draw_stability_chart
 from afm_jax.study import offset_amplitude, stability_regions
 from afm_jax.study.contact_figures import ContactFigure
 from afm_jax.study.figure_statements import adhesion_limit_nm
+from afm_jax.study.motion_figures import MotionFigure
 from afm_jax.study.offset_amplitude import OffsetAmplitudes
 from afm_jax.study.paper_figures import FigureData
 
 
-def write_figure(number: str, figure: FigureData | ContactFigure, folder: Path) -> list[str]:
+def write_figure(number: str, figure: FigureData | ContactFigure | MotionFigure, folder: Path) -> list[str]:
     """Write a figure as PNG and CSV into a folder.
 
     Args:
@@ -26,8 +28,11 @@ def write_figure(number: str, figure: FigureData | ContactFigure, folder: Path) 
         The names of the files.
     """
     picture, table = f"figure{number}.png", f"figure{number}.csv"
-    if isinstance(figure, ContactFigure):
-        draw_contact_figure(number, figure, folder / picture)
+    if isinstance(figure, (ContactFigure, MotionFigure)):
+        if isinstance(figure, MotionFigure):
+            draw_motion_figure(number, figure, folder / picture)
+        else:
+            draw_contact_figure(number, figure, folder / picture)
         write_csv(folder / table, figure.table(), tuple(figure.columns))
         return [picture, table]
     data = figure.data

@@ -12,11 +12,12 @@ from afm_jax.cli.session import Session, with_session
 
 if TYPE_CHECKING:
     from afm_jax.study.contact_figures import ContactFigure
+    from afm_jax.study.motion_figures import MotionFigure
     from afm_jax.study.paper_figures import FigureData
 
-AVAILABLE = ("2", "3", "4", "5", "6", "7", "9")
+AVAILABLE = ("2", "3", "4", "5", "6", "7", "8", "9", "10", "11")
 _OF_THE_CONTACT = {"4": "forces", "5": "loading and unloading", "6": "impact law", "7": "one impact in time"}
-_LATER = ("8", "10", "11")
+_OF_MOTIONS = {"8": "Poincare section", "10": "rising offset below resonance", "11": "rising offset above resonance"}
 _DEFAULT_FOLDER = Path("figures")
 _SPOT_CHECKS = 60
 _COARSE_SPOT_CHECKS = 20
@@ -27,9 +28,6 @@ def _chosen(ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[
     numbers = {part.strip() for part in text.split(",") if part.strip()}
     have = ", ".join(AVAILABLE)
     for number in sorted(numbers):
-        if number in _LATER:
-            message = f"figure {number} is not in this version; choose from {have}"
-            raise click.BadParameter(message, ctx=ctx, param=parameter)
         if number not in AVAILABLE:
             message = f"there is no figure `{number}` to draw; choose from {have}"
             raise click.BadParameter(message, ctx=ctx, param=parameter)
@@ -46,16 +44,17 @@ def _chosen(ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[
     callback=_chosen,
     help="Draw these figures of the paper only (comma list); all that there are if left out.",
 )
-@click.option("--coarse", is_flag=True, help="A quick look: a sixteenth of the points.")
+@click.option("--coarse", is_flag=True, help="A quick look: fewer points, starts and ramps.")
 @click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the random spot checks.")
 @with_session
 def command(session: Session, *, only: tuple[str, ...], coarse: bool, seed: int) -> None:
     """Draw the paper's figures, with their data as CSV (into the folder `figures` without --out).
 
     Figures 2 and 3: where single-impact orbits are stable, without and with adhesion. Figure 4: the forces of the
-    liquid bridge; 5: loading and unloading; 6: the impact law of the contact; 7: one impact in time. Figure 9:
-    amplitude of the (1,1) orbit against the tip-sample offset, below and above resonance. What the paper says of each
-    figure is checked on the data, and random points of 2, 3 and 9 against long iterations of the impact map.
+    liquid bridge; 5: loading and unloading; 6: the impact law of the contact; 7: one impact in time; 8: Poincare
+    section of the contact in motion. Figure 9: amplitude of the (1,1) orbit against the tip-sample offset, below and
+    above resonance; 10 and 11: the contact in motion under a rising offset. What the paper says of each figure is
+    checked on the data, and random points of 2, 3 and 9 against long iterations of the impact map.
     """
     folder = session.out or _DEFAULT_FOLDER
     prepare_folder(folder)
@@ -78,11 +77,11 @@ def command(session: Session, *, only: tuple[str, ...], coarse: bool, seed: int)
 
 def _compute(
     session: Session, only: tuple[str, ...], *, coarse: bool, seed: int
-) -> "dict[str, FigureData | ContactFigure]":
+) -> "dict[str, FigureData | ContactFigure | MotionFigure]":
     """Compute the figures; each one's time goes to standard error."""
     from afm_jax.study import paper_figures  # noqa: PLC0415
 
-    results: dict[str, FigureData | ContactFigure] = {}
+    results: dict[str, FigureData | ContactFigure | MotionFigure] = {}
     points = _COARSE_SPOT_CHECKS if coarse else _SPOT_CHECKS
     start = time.perf_counter()
 
@@ -104,6 +103,13 @@ def _compute(
 
         report(f"figure {number}: {_OF_THE_CONTACT[number]}")
         results[number] = CONTACT_FIGURES[number]()
+    for number in (each for each in only if each in _OF_MOTIONS):
+        from afm_jax.study.motion_figures import MOTION_FIGURES  # noqa: PLC0415
+
+        report(f"figure {number}: {_OF_MOTIONS[number]}")
+        results[number] = MOTION_FIGURES[number](
+            coarse=coarse, report=lambda what, number=number: report(f"figure {number}: {what}")
+        )
     if "9" in only:
         report("figure 9: amplitudes and spot checks")
         results["9"] = paper_figures.figure9(coarse=coarse, seed=seed, points=points)
@@ -111,7 +117,7 @@ def _compute(
     return {number: results[number] for number in only}
 
 
-def _payload(number: str, figure: "FigureData | ContactFigure", files: list[str]) -> dict[str, Any]:
+def _payload(number: str, figure: "FigureData | ContactFigure | MotionFigure", files: list[str]) -> dict[str, Any]:
     payload = {
         "figure": int(number),
         "files": files,

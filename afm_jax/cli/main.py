@@ -15,10 +15,12 @@ COMMANDS = {
     "bench": ("afm_jax.cli.bench", "Measure impacts per second, next to SciPy."),
     "calibrate": ("afm_jax.cli.calibrate", "Fit frequency and quality factor to a free resonance sweep."),
     "collide": ("afm_jax.cli.collide", "Let free tips collide with the sample: rebound, delay, capture, energy."),
-    "figures": ("afm_jax.cli.figures", "Draw figures 2 to 7 and 9 of the paper, with its statements checked."),
+    "effects": ("afm_jax.cli.effects", "Say what each effect of a scene changes and costs, and which can be left out."),
+    "figures": ("afm_jax.cli.figures", "Draw figures 2 to 11 of the paper, with its statements checked."),
     "fit": ("afm_jax.cli.fit", "Fit the impact law to a table of vibration amplitudes."),
     "fit-law": ("afm_jax.cli.fit_law", "Fit the impact law and the delay law to a simulated contact."),
     "orbits": ("afm_jax.cli.orbits", "Find all single-impact orbits of a scene, and whether they are stable."),
+    "simulate": ("afm_jax.cli.simulate", "Follow a scene in time: contacts, amplitudes, phases, energies."),
     "verify": ("afm_jax.cli.verify", "Compare eqs. 5 to 8 with automatic differentiation and with 50 digits."),
 }
 """For every command the module whose `command` it is, and what the list of commands says of it."""

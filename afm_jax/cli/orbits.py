@@ -74,9 +74,11 @@ def command(session: Session, scene: Path, order: int) -> None:
 
     loaded = load_scene(scene)
     if not isinstance(loaded.interaction, ImpactLaw):
+        absent = loaded.interaction is None
+        advice = "a tip that meets nothing has none" if absent else f"`afm-jax fit-law {scene}` gives a contact's law"
+        model = "none" if absent else "contact"
         raise ValueError(  # noqa: TRY004
-            f'{scene}: [interaction] model: must be "law" here, but is "contact"; `afm-jax fit-law {scene}` gives the '
-            "law of a contact"
+            f'{scene}: [interaction] model: must be "law" here, but is "{model}"; {advice}'
         )
     try:
         with session.working("searching for orbits"):

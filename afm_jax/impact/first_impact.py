@@ -56,7 +56,7 @@ class FirstImpact(NamedTuple):
 
 
 def flight_gap(duration_us: Float[Array, ""], flight: Flight) -> Float[Array, ""]:
-    """Return the gap z - z_p less the flight's level in nm, a duration in us after its start (eq. 3: its first zero)."""
+    """Return the gap z - z_p less the flight's level in nm, a duration after its start (eq. 3: its first zero)."""
     cantilever, platform, start = flight.cantilever, flight.platform, flight.start_us
     position, _ = cantilever.propagator(duration_us)(flight.position, flight.velocity)
     gap = position - platform.position(start + duration_us)
@@ -181,9 +181,9 @@ class _Search(NamedTuple):
         """Return a step in us that cannot pass the first root, and the error of the root it would leave."""
         position, velocity, gap, gap_rate = self.motion(duration)
         # A gap that opens is a true one even where rounding makes it negative: right after a slow departure.
-        step = jnp.where((gap > 0.0) | (gap_rate > 0.0), _time_above(gap, gap_rate, self.gap_bound), 0.0)
+        step = jnp.where((gap > 0.0) | (gap_rate > 0.0), time_above(gap, gap_rate, self.gap_bound), 0.0)
         clearance = position - self.reach
-        clear = jnp.where(clearance > 0.0, _time_above(clearance, velocity, self.tip_bound), 0.0)
+        clear = jnp.where(clearance > 0.0, time_above(clearance, velocity, self.tip_bound), 0.0)
         # Once M h is small against |g'|, the root exists and is at most M h^2/|g'| further on.
         bend = self.gap_bound * step
         error = jnp.where(4.0 * bend <= -gap_rate, bend * step / jnp.maximum(-gap_rate, 1e-30), jnp.inf)
@@ -221,16 +221,16 @@ class _Search(NamedTuple):
 
     def _first_step(self) -> tuple[Float[Array, ""], Bool[Array, ""]]:
         """Return a duration in us before which there is no impact, and whether the tip is in the platform there."""
-        if self.level is not None:
-            return jnp.zeros_like(self.clearance_speed), jnp.zeros_like(self.leaves)
         leave = 2.0 * self.clearance_speed / self.gap_bound
+        if self.level is not None:
+            leave = jnp.zeros_like(leave)
         if self.skip_us is None:
             return leave, jnp.zeros_like(leave, dtype=bool)
         skips = self.skip_us > 0.0
         return jnp.where(skips, self.skip_us, leave), skips & (self.motion(self.skip_us).gap <= 0.0)
 
 
-def _time_above(height: Float[Array, ""], rate: Float[Array, ""], bound: Float[Array, ""]) -> Float[Array, ""]:
+def time_above(height: Float[Array, ""], rate: Float[Array, ""], bound: Float[Array, ""]) -> Float[Array, ""]:
     """Return how long a height above a level stays positive at least, its second derivative within the bound.
 
     (g' + sqrt(g'^2 + 2 M g))/M, for g' <= 0 in the form 2 g/(sqrt(g'^2 + 2 M g) - g') that does not cancel. Counts a

@@ -123,12 +123,37 @@ def iterate_map(
 
 @partial(jax.jit, static_argnames=("max_steps",))
 def _next_impact(scene: Scene, start, tolerance: Float[Array, ""], *, max_steps: int) -> NextImpact:
+    flight = Flight(scene.cantilever, scene.platform, *start)
+    return impact_after(scene, flight, tolerance, max_steps=max_steps)
+
+
+def impact_after(
+    scene: Scene,
+    flight: Flight,
+    tolerance: Float[Array, ""],
+    *,
+    max_steps: int,
+    latest_us: Float[Array, ""] | None = None,
+) -> NextImpact:
+    """Return the impact that ends a flight: `next_impact` without its checks, from any start and over any surface.
+
+    Args:
+        scene: the interaction is an `ImpactLaw`, the platform the surface that the flight is over.
+        flight: the flight; where it begins at gap 0 the tip has just left.
+        tolerance: remaining error of the impact time at which the search stops, in us.
+        max_steps: steps of the search for the impact before it gives up.
+        latest_us: the search ends at this time (us) after the flight's start; None: never.
+    """
     law = impact_law_of(scene)
-    time, velocity = start
-    flight = Flight(scene.cantilever, scene.platform, time, velocity)
-    impact = first_impact(flight, skip_us=_overlap(law, flight), max_steps=max_steps, root_tolerance_us=tolerance)
-    arrival = time + impact.duration_us
-    _, before = scene.cantilever.propagator(impact.duration_us)(scene.platform.position(time), velocity)
+    impact = first_impact(
+        flight,
+        skip_us=_overlap(law, flight),
+        latest_us=latest_us,
+        max_steps=max_steps,
+        root_tolerance_us=tolerance,
+    )
+    arrival = flight.start_us + impact.duration_us
+    _, before = scene.cantilever.propagator(impact.duration_us)(flight.position, flight.velocity)
     hit = impact.outcome == Outcome.IMPACT
     approach = jnp.where(hit, scene.platform.velocity(arrival) - before, 1.0)
     leaving = arrival + law.collision_delay(approach) if law.delay is not None else arrival
@@ -150,7 +175,9 @@ def _overlap(law: ImpactLaw, flight: Flight) -> Float[Array, ""] | None:
         return None
     rebound = flight.velocity - flight.platform.velocity(flight.start_us)
     delay = law.collision_delay(law.approach_speed(jnp.maximum(rebound, 0.0)))
-    return jnp.maximum(-delay, 0.0)
+    overlap = jnp.maximum(-delay, 0.0)
+    # a flight that begins above the surface follows no impact
+    return overlap if flight.start_gap is None else jnp.where(flight.start_gap > 0.0, 0.0, overlap)
 
 
 @partial(jax.jit, static_argnames=("impacts", "max_steps"))

@@ -1,4 +1,4 @@
-"""The quick way through a driven contact: in through the bridge, into the junction, out again, in fixed numbers of steps.
+"""The quick way through a driven contact: through the bridge, the junction and out again, in fixed numbers of steps.
 
 The gap is the variable in the bridge, with time as part of the state, so that thresholds are met without a search; the
 junction is crossed in fictitious time, with one step in the velocity to the turning point and one in s to the fold. It

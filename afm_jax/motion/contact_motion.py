@@ -46,14 +46,22 @@ class Row(NamedTuple):
     viscous_loss_aj: Float[Array, "..."]
 
 
+class Arrival(NamedTuple):
+    """Where a contact began; scalars of one tip."""
+
+    time_us: Float[Array, ""]
+    gap_nm: Float[Array, ""]
+    gap_rate: Float[Array, ""]
+
+
 class Tip(NamedTuple):
     """A tip on its way; scalars of one tip, but for the rows."""
 
     touch: Touch
     """Its place and phase, and the contact it is in; the gap of a free tip."""
-    arrival: tuple[Float[Array, ""], Float[Array, ""], Float[Array, ""]]
-    """Time, gap and rate at which the present contact began."""
-    count: Int[Array, ""]
+    arrival: Arrival
+    """Where the present contact began."""
+    contacts: Int[Array, ""]
     rows: Float[Array, "rows columns"]
     outcome: Int[Array, ""]
     done: Bool[Array, ""]
@@ -70,8 +78,8 @@ def begin(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, rows: int)
     zero = jnp.zeros_like(time_us)
     return Tip(
         touch=fresh_touch(Place(gap_nm, rate, time_us, zero), phase),
-        arrival=(time_us, gap_nm, rate),
-        count=jnp.zeros_like(phase),
+        arrival=Arrival(time_us, gap_nm, rate),
+        contacts=jnp.zeros_like(phase),
         rows=jnp.zeros((rows, len(Row._fields)), time_us.dtype),
         outcome=outcome.astype(jnp.int32),
         done=outcome != MotionOutcome.FINISHED,
@@ -106,13 +114,11 @@ def follow(driven: Driven, tip: Tip, until_us: Array, setting: DrivenSetting, *,
 
 
 def _round(driven: Driven, tip: Tip, *, until_us: Array, setting: DrivenSetting, reverse: bool) -> Tip:
-    """Return a tip after one round: flight, quick way through the contact, trial steps for those it does not hold for."""
+    """Return a tip after one round: flight, the quick way through the contact, trial steps where that does not hold."""
     free = (tip.touch.phase == Phase.DRY) & ~tip.done
     arrived, lost, place = _fly(driven, tip.touch.place, free, until_us)
-    arrival = tuple(
-        jnp.where(arrived, new, old)
-        for new, old in zip((place.time_us, place.x, place.gap_rate), tip.arrival, strict=True)
-    )
+    began = (place.time_us, place.x, place.gap_rate)
+    arrival = Arrival(*(jnp.where(arrived, new, old) for new, old in zip(began, tip.arrival, strict=True)))
     fresh = fresh_touch(place, jnp.where(arrived, Phase.BRIDGE, Phase.DRY))
     touch = jax.tree.map(lambda new, old: jnp.where(free, new, old), fresh, tip.touch)
     touch = _through(driven, touch, arrived, until_us, setting)
@@ -121,9 +127,9 @@ def _round(driven: Driven, tip: Tip, *, until_us: Array, setting: DrivenSetting,
     left = touch.phase == Phase.DRY
     touched = arrived | ((tip.touch.phase != Phase.DRY) & ~tip.done)
     ended = touched & (left | over)
-    room = tip.count < tip.rows.shape[0]
+    room = tip.contacts < tip.rows.shape[0]
     row = _row(touch, arrival, held=~left)
-    place_of_row = jnp.where(ended & room, tip.count, tip.rows.shape[0])
+    place_of_row = jnp.where(ended & room, tip.contacts, tip.rows.shape[0])
     full = ended & ~room
     outcome = jnp.where(full, MotionOutcome.CONTACT_LIMIT, tip.outcome)
     outcome = jnp.where(ended & ~left, MotionOutcome.HELD, outcome)
@@ -133,7 +139,7 @@ def _round(driven: Driven, tip: Tip, *, until_us: Array, setting: DrivenSetting,
     return Tip(
         touch=touch,
         arrival=arrival,
-        count=tip.count + ended,
+        contacts=tip.contacts + ended.astype(tip.contacts.dtype),
         rows=tip.rows.at[place_of_row].set(row, mode="drop"),
         outcome=jnp.where(tip.done, tip.outcome, outcome).astype(jnp.int32),
         done=tip.done | flown | (touched & over) | full | lost | ~jnp.isfinite(touch.place.x),
@@ -142,7 +148,7 @@ def _round(driven: Driven, tip: Tip, *, until_us: Array, setting: DrivenSetting,
 
 
 def _fly(driven: Driven, place: Place, free: Array, until_us: Array) -> tuple[Array, Array, Place]:
-    """Return whether a free tip meets the bridge before the end, whether the search gave up, and where the tip then is."""
+    """Return whether a free tip meets the bridge before the end, whether the search gave up, and where the tip is."""
     surface, start = driven.surface, place.time_us
     # tips that are not free start below the level, so that their search ends at once
     gap = jnp.where(free, place.x, 0.5 * driven.forms_nm)
@@ -222,13 +228,13 @@ def _step(
     return for_the_few(run, going, changed=1, common=1)(driven, touch, active, until_us)
 
 
-def _row(touch: Touch, arrival: tuple[Array, Array, Array], *, held: Array) -> Float[Array, " columns"]:
+def _row(touch: Touch, arrival: Arrival, *, held: Array) -> Float[Array, " columns"]:
     place = touch.place
     row = Row(
         kind=jnp.where(held, float(ContactKind.HELD), float(ContactKind.IMPACT)),
-        arrival_us=arrival[0],
-        arrival_gap_nm=arrival[1],
-        arrival_rate=arrival[2],
+        arrival_us=arrival.time_us,
+        arrival_gap_nm=arrival.gap_nm,
+        arrival_rate=arrival.gap_rate,
         departure_us=jnp.where(held, jnp.inf, place.time_us),
         departure_gap_nm=jnp.where(held, 0.0, place.x),
         departure_rate=jnp.where(held, 0.0, place.gap_rate),

@@ -20,11 +20,15 @@ _NEWTON_STEPS = 6
 
 
 class Steps(NamedTuple):
-    """Steps of contacts in the order of time; NumPy arrays of shape (steps,). A step begins at `place`, in one phase."""
+    """Steps of contacts in the order of time, arrays of shape (steps,); each is of one phase."""
 
-    place: Place
-    phase: np.ndarray
+    begin_us: np.ndarray
     end_us: np.ndarray
+    phase: np.ndarray
+    x: np.ndarray
+    """At the beginning: the gap in nm, s = sqrt(A) in the junction."""
+    rate: np.ndarray
+    """Gap rate in nm/us at the beginning."""
 
 
 def contact_steps(driven: Driven, begin: Place, phase: Int[np.ndarray, " contacts"], until_us: float) -> Steps:
@@ -45,8 +49,8 @@ def contact_steps(driven: Driven, begin: Place, phase: Int[np.ndarray, " contact
         parts.append([column[taken] for column in columns])
     joined = [np.concatenate(columns) for columns in zip(*parts, strict=True)] if parts else [np.zeros(0)] * 6
     order = np.argsort(joined[2], kind="stable")
-    x, rate, time, loss, phases, ends = (column[order] for column in joined)
-    return Steps(Place(x, rate, time, loss), phases.astype(int), ends)
+    x, rate, time, _, phases, ends = (column[order] for column in joined)
+    return Steps(time, ends, phases.astype(int), x, rate)
 
 
 @jax.jit

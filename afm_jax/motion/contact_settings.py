@@ -33,8 +33,8 @@ class DrivenSetting(NamedTuple):
 
 
 SETTINGS = {
-    1e-6: DrivenSetting(QuickSetting(3, 4, 5, 4, 1e-4), 2.2, 60),
-    1e-9: DrivenSetting(QuickSetting(5, 7, 9, 7, 1e-5), 4.5, 120),
+    1e-6: DrivenSetting(QuickSetting(6, 4, 5, 6, 1e-4, "Dopri5"), 2.2, 60),
+    1e-9: DrivenSetting(QuickSetting(5, 7, 9, 7, 1e-5), 5.0, 120),
 }
 """Settings by the accuracy of one contact: relative of the rebound speed, a tenth of it in us of the times."""
 

@@ -92,7 +92,7 @@ def advance(driven: Driven, touch: Touch, until_us: Float[Array, "..."], finenes
         place=_pick(retry, touch.place, place),
         phase=jnp.where(retry, touch.phase, phase),
         trial=jnp.where(retry, again, 0.0),
-        junctions=touch.junctions + formed,
+        junctions=touch.junctions + formed.astype(touch.junctions.dtype),
         junction_forms_us=jnp.where(formed & (touch.junctions == 0), place.time_us, touch.junction_forms_us),
         junction_breaks_us=jnp.where(broken, place.time_us, touch.junction_breaks_us),
         time_in_junction_us=touch.time_in_junction_us + jnp.where(retry, 0.0, passed),
@@ -161,20 +161,16 @@ def _where_next(trial: Trial, at_turn: Bool[Array, "..."], until_us: Float[Array
     finite = jnp.isfinite(end.x) & jnp.isfinite(end.gap_rate) & jnp.isfinite(slopes.gap_rate)
     below, above, late = (end.x < low), (end.x > high), end.time_us > until
 
-    def share(level, crossed):
-        level = jnp.where(jnp.isfinite(level), level, 0.0)
-        found = crossing_share(start.x - level, rates.x * length, end.x - level, slopes.x * length)
-        return jnp.where(crossed, found, 1.0)
-
     # a threshold nearly met needs no other trial
     beyond_low = below & (low - end.x > _NEAR * low)
     beyond_high = above & (end.x - high > _NEAR * high)
     beyond_time = late & (end.time_us - until > _NEAR * length * jnp.maximum(slopes.time_us, 1e-3))
+    level = jnp.where(below, low, jnp.where(above, high, 0.0))
+    in_x = crossing_share(start.x - level, rates.x * length, end.x - level, slopes.x * length)
     in_time = crossing_share(
         start.time_us - until, rates.time_us * length, end.time_us - until, slopes.time_us * length
     )
-    shares = jnp.minimum(share(low, beyond_low), share(high, beyond_high))
-    shares = jnp.minimum(shares, jnp.where(beyond_time, in_time, 1.0))
+    shares = jnp.minimum(jnp.where(beyond_low | beyond_high, in_x, 1.0), jnp.where(beyond_time, in_time, 1.0))
     missed = beyond_low | beyond_high | beyond_time
     turns = (rates.x * slopes.x < 0.0) & ~at_turn & ~missed & ~(below | above | late)
     turn, extremum = turning_point(start.x, rates.x * length, end.x, slopes.x * length)

@@ -25,7 +25,7 @@ def to_lab(
 ) -> State:
     """Return the state in the lab of a gap in nm and its rate in nm/us; arrays of any shape."""
     height, speed = surface.position_and_velocity(time_us)
-    position, velocity = gap_nm + height, gap_rate + speed
+    position, velocity = jnp.asarray(gap_nm) + height, jnp.asarray(gap_rate) + speed
     if response is not None:
         steady, rate = response.position_and_velocity(time_us)
         position, velocity = position + steady, velocity + rate

@@ -39,7 +39,7 @@ def follow_free(
     outcome = jnp.where(sane, MotionOutcome.FINISHED, MotionOutcome.INVALID_START).astype(jnp.int32)
     return Simulation(
         start=start,
-        contacts=Contacts(none.astype(jnp.int32), *(none,) * 9),
+        contacts=Contacts(none.astype(jnp.int32), *[none] * 9, detail=None),
         count=count,
         final=State(until, position, velocity),
         phase=jnp.full_like(count, Phase.DRY),

@@ -1,10 +1,9 @@
 """Cubics through two points with slopes: where a step meets a threshold, or turns."""
 
 import jax.numpy as jnp
-from jax import lax
 from jaxtyping import Array, Float
 
-_STEPS = 8
+_STEPS = 4
 
 
 def crossing_share(start: Array, start_slope: Array, end: Array, end_slope: Array) -> Float[Array, "..."]:
@@ -18,20 +17,13 @@ def crossing_share(start: Array, start_slope: Array, end: Array, end_slope: Arra
     """
     bend = 3.0 * (end - start) - 2.0 * start_slope - end_slope
     twist = 2.0 * (start - end) + start_slope + end_slope
-    sign = jnp.where(start > 0.0, 1.0, -1.0)
-
-    def narrow(_, bracket):
-        low, high, share = bracket
+    share = start / jnp.where(start == end, 1.0, start - end)
+    # written out: a few steps of Newton's method cost less than a loop, and a miss is only tried again
+    for _ in range(_STEPS):
         value = start + share * (start_slope + share * (bend + share * twist))
         slope = start_slope + share * (2.0 * bend + 3.0 * share * twist)
-        before = sign * value > 0.0
-        low, high = jnp.where(before, share, low), jnp.where(before, high, share)
-        newton = share - value / jnp.where(slope == 0.0, 1.0, slope)
-        inside = (newton > low) & (newton < high) & (slope != 0.0)
-        return low, high, jnp.where(inside, newton, 0.5 * (low + high))
-
-    begin = start / jnp.where(start == end, 1.0, start - end)
-    return lax.fori_loop(0, _STEPS, narrow, (jnp.zeros_like(start), jnp.ones_like(start), begin))[2]
+        share = jnp.clip(share - value / jnp.where(slope == 0.0, 1.0, slope), 0.0, 1.0)
+    return share
 
 
 def turning_point(start: Array, start_slope: Array, end: Array, end_slope: Array) -> tuple[Array, Array]:

@@ -3,7 +3,10 @@
 import enum
 from typing import NamedTuple
 
+import equinox as eqx
 from jaxtyping import Array, Bool, Float, Int
+
+from afm_jax.parameters import readable
 
 
 class MotionOutcome(enum.IntEnum):
@@ -77,8 +80,8 @@ class ContactDetail(NamedTuple):
 class Contacts(NamedTuple):
     """Contacts in order; arrays with a trailing axis of rows, unused rows 0 with kind `ContactKind.NONE`.
 
-    With a law a contact is an impact: it begins where the free flight meets the platform and ends where the next flight
-    starts, the collision delay later. With a resolved contact it begins where the bridge forms and ends where it breaks.
+    With a law a contact is an impact: it begins where the free flight meets the platform and ends where the next
+    flight starts, the collision delay later. A resolved contact begins where the bridge forms and ends where it breaks.
     """
 
     kind: Int[Array, "..."]
@@ -98,8 +101,8 @@ class Contacts(NamedTuple):
     detail: ContactDetail | None = None
 
 
-class Simulation(NamedTuple):
-    """A scene followed in time."""
+class Simulation(eqx.Module):
+    """A scene followed in time; under `vmap` every array has the batch as first axis."""
 
     start: State
     contacts: Contacts
@@ -112,3 +115,5 @@ class Simulation(NamedTuple):
     """Whether the tip is held at the end."""
     outcome: Int[Array, "..."]
     """A `MotionOutcome`."""
+
+    __repr__ = readable

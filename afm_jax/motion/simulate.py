@@ -20,7 +20,7 @@ from afm_jax.motion.frames import to_gap, to_lab
 from afm_jax.motion.free_motion import follow_free
 from afm_jax.motion.law_motion import follow_law
 from afm_jax.motion.record import ContactDetail, ContactKind, Contacts, MotionOutcome, Simulation, State
-from afm_jax.parameters import is_traced, require_float64
+from afm_jax.parameters import check_parameter, is_traced, require_float64
 
 DEFAULT_ACCURACY = 1e-9
 _ROUNDS_PER_CONTACT = 4
@@ -61,8 +61,7 @@ def simulate(
         ValueError: if the duration is not positive, the contact has no junction, or the start is inside the sample.
     """
     require_float64()
-    if not is_traced(duration_us) and not (float(duration_us) > 0.0 and math.isfinite(float(duration_us))):
-        raise ValueError(f"`duration_us` must be a positive number, but is {float(duration_us)!r}")
+    check_parameter("duration_us", duration_us, "positive")
     surface, response = surface_of(scene)
     dtype = scene.cantilever.frequency_khz.dtype
     begin_at = State(*(jnp.asarray(value, dtype) for value in start))
@@ -91,7 +90,7 @@ def _room(scene: Scene, surface: Platform | Surface, duration_us: ArrayLike) -> 
     fastest = jnp.maximum(scene.cantilever.angular_frequency, surface.fastest_angular_frequency)
     if is_traced(fastest) or is_traced(duration_us):
         raise ValueError("`max_contacts` must be given where frequencies or the duration are traced")
-    return 16 + math.ceil(4.0 * float(duration_us) * float(jnp.max(fastest)) / (2.0 * math.pi))
+    return 16 + math.ceil(4.0 * float(jnp.max(jnp.asarray(duration_us) * fastest)) / (2.0 * math.pi))
 
 
 def _check_contact(scene: Scene, surface: Platform | Surface, response: Surface | None, start: State) -> None:
@@ -132,7 +131,7 @@ def _contact(  # noqa: PLR0913
     return Simulation(
         start=start,
         contacts=_contacts(table, scene, surface, response, driven),
-        count=jnp.minimum(tip.count, rows),
+        count=jnp.minimum(tip.contacts, rows),
         final=to_lab(surface, response, place.time_us, driven.gap(place.x, phase), place.gap_rate),
         phase=phase,
         held=tip.outcome == MotionOutcome.HELD,

@@ -225,8 +225,8 @@ def _contact_pieces(world: _World, simulation: Simulation, rows: np.ndarray, hig
         np.asarray(part)[rows] for part in (contacts.arrival_position_nm, contacts.arrival_velocity_nm_per_us)
     )
     gap, rate = world.gaps(arrival, position, velocity)
-    begin = Place(gap, rate, arrival, np.zeros(arrival.shape))
+    begin = Place(*(jnp.asarray(part) for part in (gap, rate, arrival, np.zeros(arrival.shape))))
     # to the end of the last step that a wanted time may lie in
     steps = contact_steps(world.driven, begin, np.full(rows.shape, int(Phase.BRIDGE)), high)
-    place = steps.place
-    return list(zip(place.time_us, steps.end_us, steps.phase, place.time_us, place.x, place.gap_rate, strict=True))
+    columns = (steps.begin_us, steps.end_us, steps.phase, steps.begin_us, steps.x, steps.rate)
+    return list(zip(*(column.tolist() for column in columns), strict=True))

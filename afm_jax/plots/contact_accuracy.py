@@ -18,15 +18,19 @@ _COLOURS = {
     "SciPy DOP853": "#D55E00",
     "SciPy LSODA": "#8B3A00",
 }
+_VARIABLES = {"gap": "the gap", "time": "time"}
 _ERRORS = {
     "rebound_error": "largest relative error of the rebound speed",
-    "delay_error_us": "largest error of the delay (us)",
+    "delay_error_us": "largest error of the delay (µs)",
     "slope_error": "largest relative error of its derivatives",
 }
 
 
 def collide_accuracy_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
-    """Return the figure: a panel for each kind of error, a line for each method, variable and precision."""
+    """Return the figure: a panel for each kind of error, a line for each method, variable and precision.
+
+    Errors above 1 (all of the rebound speed, a microsecond) are left out: no more than that they are wrong is known.
+    """
     figure = new_figure(15.0, 5.8)
     panels = figure.subplots(1, len(_ERRORS), sharey=True)
     groups = dict.fromkeys((row["method"], row["variable"], row["precision"]) for row in rows)
@@ -37,7 +41,9 @@ def collide_accuracy_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
                 for row in rows
                 if (row["method"], row["variable"], row["precision"]) == (method, variable, precision)
             ]
-            points = [(row[column], row["microseconds_per_impact"]) for row in chosen if row.get(column)]
+            points = [
+                (row[column], row["microseconds_per_impact"]) for row in chosen if 0.0 < (row.get(column) or 0.0) <= 1.0
+            ]
             if not points:
                 continue
             colour = _COLOURS[method] if method in _COLOURS else _COLOURS[method.split(",")[0]]
@@ -51,12 +57,12 @@ def collide_accuracy_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
                 linewidth=2.0 if own else 1.2,
                 color=colour,
                 alpha=0.5 if precision == "float32" else 1.0,
-                label=f"{method}, in the {variable}" + (", float32" if precision == "float32" else ""),
+                label=f"{method}, in {_VARIABLES[variable]}" + (", float32" if precision == "float32" else ""),
             )
         axes.set(xscale="log", yscale="log")
         axes.invert_xaxis()
         axes.grid(color=GRID, alpha=0.25)
-        label_axes(axes, x=label, y="time of an impact (us), one core" if axes is panels[0] else "")
+        label_axes(axes, x=label, y="time of an impact (µs), one core" if axes is panels[0] else "")
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside right center", fontsize=9)
     return figure

@@ -4,7 +4,8 @@ Runs in a process of its own on one core. Errors are achieved ones, against a qu
 none of the contestants; just above the capture speed, where a tip hardly leaves, they are shown apart.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -28,14 +29,18 @@ Row = dict[str, Any]
 Outputs = dict[str, Float[np.ndarray, " tips"]]
 
 _NEAR_CAPTURE = 1.001
-_FEW = 8
+_FEW = 9
 _VISCOSITY_PA_S = 1.005e-3
+_IMPLICIT = "Kvaerno5"
+_CROSSINGS = {"gap": pass_adaptively, "time": pass_in_time}
+# what is not timed need not run fast: it compiles in two thirds of the time
+_UNHURRIED = {"xla_backend_optimization_level": 0}
 
 
 def collide_accuracy(
     *,
     tolerances: Sequence[float],
-    solvers: Sequence[str],
+    solvers: Mapping[str, Sequence[str]],
     accuracies: Sequence[float],
     steps: Sequence[int],
     batch: int,
@@ -46,7 +51,7 @@ def collide_accuracy(
 
     Args:
         tolerances: of the adaptive solvers and of SciPy.
-        solvers: Diffrax's, adaptive in the gap and in time.
+        solvers: Diffrax's, by the variable they step in (gap, time); those in the gap also with fixed steps.
         accuracies: which of `collide`'s settings to measure.
         steps: numbers of fixed steps a crossing.
         batch: how many speeds, from 12 to 200 nm/us.
@@ -54,41 +59,52 @@ def collide_accuracy(
         scipy_speeds: approach speeds of SciPy's tips.
 
     Returns:
-        `rows` with method, variable (gap, time), setting, precision, microseconds_per_impact, compile_s,
+        `rows` with method, variable (gap, time), setting, precision, microseconds_per_impact (of the batch), compile_s,
         rebound_error and delay_error_us (largest over the batch), slope_error (of d u_out/d u_in and
         d u_out/d viscosity, relative), near_capture_error (rebound at 1.001 times the capture speed, relative);
-        `reference_error`, and `settings`: the accuracies that `collide` offers.
+        `reference_error`: how far the reference is converged.
     """
     bound = float(capture_speed(Contact.paper()))
     speeds = jnp.concatenate([jnp.asarray([_NEAR_CAPTURE * bound]), speeds_of(batch)])
-    reference, coarser = (_outputs(_by_setting(setting), speeds) for setting in (REFERENCE, COARSER_REFERENCE))
-    rows = []
+    reference = _outputs(_by_setting(REFERENCE), speeds)
+    rows = [
+        *_settings(accuracies, speeds, reference, repetitions),
+        *_fixed_steps(solvers["gap"], steps, speeds, reference, repetitions),
+    ]
+    for variable, names in solvers.items():
+        for solver in names:
+            rows += _adaptive((variable, solver), tolerances, speeds, reference, repetitions)
+    # one program tells how far the reference is converged and what SciPy should find
+    every_speed = jnp.concatenate([speeds, jnp.asarray(scipy_speeds)])
+    coarser = batch_of(Contact.paper(), 1.0, every_speed, COARSER_REFERENCE)
+    rebound, delay = (np.asarray(part, float) for part in (coarser.rebound_speed_nm_per_us, coarser.collision_delay_us))
+    tips = slice(1, speeds.size)
+    reference_error = max(
+        np.max(np.abs(rebound[tips] / reference["rebound"][1:] - 1.0)),
+        np.max(np.abs(delay[tips] - reference["delay"][1:])),
+    )
+    rows += _scipy(tolerances, scipy_speeds, (rebound[speeds.size :], delay[speeds.size :]))
+    return {"rows": rows, "reference_error": float(reference_error)}
+
+
+def _settings(accuracies: Sequence[float], speeds: Array, reference: Outputs, repetitions: int) -> Iterator[Row]:
     for method, settings in SETTINGS.items():
         for accuracy in (level for level in settings if level in accuracies):
             # one setting shows what 32 bits leave; more would show the same
             for precision in ("float64", "float32") if accuracy == 1e-6 else ("float64",):
                 name = {"method": f"collide, {method}", "variable": "gap", "setting": f"accuracy {accuracy:g}"}
-                run = _by_setting(settings[accuracy])
-                row = _row(name, run, speeds.astype(precision), reference, repetitions)
-                rows.append(row | {"precision": precision, "accuracy": accuracy})
-    for solver in (name for name in solvers if name != "Kvaerno5"):
+                row = _row(name, _by_setting(settings[accuracy]), speeds.astype(precision), reference, repetitions)
+                yield row | {"precision": precision, "accuracy": accuracy}
+
+
+def _fixed_steps(
+    solvers: Sequence[str], steps: Sequence[int], speeds: Array, reference: Outputs, repetitions: int
+) -> Iterator[Row]:
+    for solver in (name for name in solvers if name != _IMPLICIT):
         for count in steps:
             name = {"method": f"{solver}, fixed steps", "variable": "gap", "setting": f"{count} + {count} steps"}
             setting = Setting("steps", count, count, 16, solver=solver)
-            rows.append(_row(name, _by_setting(setting), speeds, reference, repetitions) | {"precision": "float64"})
-    for variable, crossing in (("gap", pass_adaptively), ("time", pass_in_time)):
-        for solver in (name for name in solvers if variable == "gap" or name != "Kvaerno5"):
-            # an implicit method is two hundred times slower here: a few tips and loose tolerances show it
-            few = solver == "Kvaerno5"
-            chosen = [tolerance for tolerance in tolerances if tolerance >= 1e-5] if few else tolerances
-            tips = {key: part[:_FEW] for key, part in reference.items()} if few else reference
-            if chosen:
-                rows += _adaptive(
-                    crossing, variable, solver, (chosen, speeds[:_FEW] if few else speeds, tips, repetitions)
-                )
-    rows += _scipy(tolerances, scipy_speeds)
-    errors = _errors(coarser, reference)
-    return {"rows": rows, "reference_error": max(errors["rebound_error"], errors["delay_error_us"])}
+            yield _row(name, _by_setting(setting), speeds, reference, repetitions) | {"precision": "float64"}
 
 
 def _by_setting(setting: Setting) -> Callable[[Contact, Array], Collision]:
@@ -100,18 +116,18 @@ def _row(
 ) -> Row:
     progress("accuracy: " + ", ".join(name.values()))
     contact = jax.tree.map(lambda leaf: leaf.astype(speeds.dtype), Contact.paper())
-    compiled = compiled_for(run, contact, speeds)
-    timing, _ = time_compiled(compiled, contact, speeds, repetitions=repetitions)
+    timed = speeds[1:]
+    timing, _ = time_compiled(compiled_for(run, contact, timed), contact, timed, repetitions=repetitions)
     return {
         **name,
-        "microseconds_per_impact": 1e6 * timing.best_s / speeds.shape[0],
+        "microseconds_per_impact": 1e6 * timing.best_s / timed.size,
         "compile_s": timing.compile_s,
         **_errors(_outputs(run, speeds), reference),
     }
 
 
 def _outputs(run: Callable[[Contact, Array], Collision], speeds: Array) -> Outputs:
-    found = jax.jit(lambda at: _values_and_slopes(run, at))(speeds)
+    found = jax.jit(lambda at: _values_and_slopes(run, at), compiler_options=_UNHURRIED)(speeds)
     return {key: np.asarray(part, np.float64) for key, part in found.items()}
 
 
@@ -144,28 +160,44 @@ def _errors(found: Outputs, reference: Outputs) -> Row:
     return {key: float(value) if np.isfinite(value) else None for key, value in values.items()}
 
 
-def _adaptive(crossing: Callable, variable: str, solver: str, measured: tuple[Any, ...]) -> list[Row]:
+def _adaptive(
+    kind: tuple[str, str], tolerances: Sequence[float], speeds: Array, reference: Outputs, repetitions: int
+) -> list[Row]:
     """Measure an adaptive solver; its tolerance is an argument of one program, so that none is compiled twice."""
-    tolerances, speeds, reference, repetitions = measured
+    variable, solver = kind
+    crossing = _CROSSINGS[variable]
+    if solver == _IMPLICIT:
+        # two hundred times slower here: a few tips and loose tolerances show it
+        tolerances = [tolerance for tolerance in tolerances if tolerance >= 1e-5]
+        speeds, reference = speeds[:_FEW], {key: part[:_FEW] for key, part in reference.items()}
+    if not tolerances:
+        return []
+    # of static forces alone: the viscosity, by which slopes are taken, has no part in it
+    place = find_junction(Contact.paper())
 
-    def one(contact, speed, tolerance):
-        junction = find_junction(contact)
+    def one(contact, junction, speed, tolerance):
         mass = jnp.ones_like(speed)
         finest = SETTINGS["diffrax"][1e-11]
         ways = go_through(contact, junction, speed, mass, finest, lambda way: crossing(way, solver, tolerance))
         return collision_of(contact, junction, speed, mass, ways)
 
-    def run(contact, speeds, tolerance):
-        return jax.vmap(one, in_axes=(None, 0, None))(contact, speeds, tolerance)
+    def run(contact, junction, speeds, tolerance):
+        return jax.vmap(one, in_axes=(None, None, 0, None))(contact, junction, speeds, tolerance)
 
     contact = Contact.paper()
-    compiled = compiled_for(run, contact, speeds, jnp.asarray(tolerances[0]))
-    slopes = jax.jit(lambda tolerance: _values_and_slopes(lambda c, u: run(c, u, tolerance), speeds))
+    # one tip that a loose tolerance keeps near capture would hold up all lanes
+    timed = speeds[1:]
+    compiled = compiled_for(run, contact, place, timed, jnp.asarray(tolerances[0]))
+
+    @partial(jax.jit, compiler_options=_UNHURRIED)
+    def slopes(junction, tolerance):
+        return _values_and_slopes(lambda contact, speeds: run(contact, junction, speeds, tolerance), speeds)
+
     rows = []
     for tolerance in tolerances:
         progress(f"accuracy: {solver}, adaptive in the {variable}, {tolerance:g}")
-        timing, _ = time_compiled(compiled, contact, speeds, jnp.asarray(tolerance), repetitions=repetitions)
-        found = {key: np.asarray(part) for key, part in slopes(jnp.asarray(tolerance)).items()}
+        timing, _ = time_compiled(compiled, contact, place, timed, jnp.asarray(tolerance), repetitions=repetitions)
+        found = {key: np.asarray(part) for key, part in slopes(place, jnp.asarray(tolerance)).items()}
         rows.append(
             {
                 "method": f"{solver}, adaptive",
@@ -173,7 +205,7 @@ def _adaptive(crossing: Callable, variable: str, solver: str, measured: tuple[An
                 "setting": f"tolerance {tolerance:g}",
                 "precision": "float64",
                 "tolerance": tolerance,
-                "microseconds_per_impact": 1e6 * timing.best_s / speeds.shape[0],
+                "microseconds_per_impact": 1e6 * timing.best_s / timed.size,
                 "compile_s": timing.compile_s,
                 **_errors(found, reference),
             }
@@ -181,9 +213,9 @@ def _adaptive(crossing: Callable, variable: str, solver: str, measured: tuple[An
     return rows
 
 
-def _scipy(tolerances: Sequence[float], speeds: Sequence[float]) -> list[Row]:
+def _scipy(tolerances: Sequence[float], speeds: Sequence[float], expected: tuple[np.ndarray, np.ndarray]) -> list[Row]:
     contact = Contact.paper()
-    reference = batch_of(contact, 1.0, jnp.asarray(speeds), REFERENCE)
+    expected_rebound, expected_delay = expected
     rows = []
     for method in ("DOP853", "LSODA"):
         for tolerance in tolerances:
@@ -201,8 +233,8 @@ def _scipy(tolerances: Sequence[float], speeds: Sequence[float]) -> list[Row]:
                 row
                 | {
                     "microseconds_per_impact": 1e6 * float(np.mean([run.seconds for run in runs])),
-                    "rebound_error": float(np.max(np.abs(rebound / np.asarray(reference.rebound_speed_nm_per_us) - 1))),
-                    "delay_error_us": float(np.max(np.abs(delay - np.asarray(reference.collision_delay_us)))),
+                    "rebound_error": float(np.max(np.abs(rebound / expected_rebound - 1.0))),
+                    "delay_error_us": float(np.max(np.abs(delay - expected_delay))),
                     "evaluations_per_impact": float(np.mean([run.evaluations for run in runs])),
                 }
             )

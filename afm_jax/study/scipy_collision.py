@@ -3,6 +3,7 @@
 import time
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from scipy.integrate import solve_ivp
 
@@ -16,6 +17,7 @@ from afm_jax.contact.junction import find_junction
 
 _LONGEST_US = 50.0
 """No phase of a tip that leaves lasts as long."""
+_junction_of, _root_of_depth = jax.jit(find_junction), jax.jit(jkr.root_of_depth)
 
 
 class ScipyCollision(NamedTuple):
@@ -60,6 +62,7 @@ def scipy_collision(contact: Contact, approach_speed_nm_per_us: float, *, method
         ValueError: if the tip does not leave or SciPy gives up.
     """
     numbers = _numbers(contact)
+    on = float(_root_of_depth((numbers.shift - numbers.snap_on) / numbers.depth))
     began = time.perf_counter()
     count = 0
 
@@ -82,7 +85,6 @@ def scipy_collision(contact: Contact, approach_speed_nm_per_us: float, *, method
         load = numbers.load * s**3 * (s**3 - np.sqrt(6.0))
         return [-rate / numbers.depth, load * slope, slope]
 
-    on = _root_of_depth((numbers.shift - numbers.snap_on) / numbers.depth)
     first, (_, fast) = phase(in_bridge, [numbers.forms, -approach_speed_nm_per_us], lambda _, y: y[0] - numbers.snap_on)
     _, (_, back, second) = phase(in_junction, [on, fast, 0.0], lambda _, y: y[0] - jkr.FOLD)
     third, (_, rebound) = phase(in_bridge, [numbers.snap_off, back], lambda _, y: y[0] - numbers.breaks)
@@ -92,7 +94,7 @@ def scipy_collision(contact: Contact, approach_speed_nm_per_us: float, *, method
 
 def _numbers(contact: Contact) -> _Numbers:
     terms: dict[type, Any] = {type(term): term for term in contact.forces.terms}
-    junction, solid = find_junction(contact), contact.junction
+    junction, solid = _junction_of(contact), contact.junction
     capillary, structural = terms[Capillary], terms[Structural]
     values = (
         capillary.pull_nn,
@@ -117,7 +119,3 @@ def _bridge_force(numbers: _Numbers, gap: float, rate: float) -> float:
     gap = max(gap, 0.5 * numbers.snap_on)
     static = -numbers.pull / (1.0 + gap / numbers.width) + numbers.structural * np.exp(-gap / numbers.decay)
     return static + numbers.core / gap**8 - numbers.drag * rate / gap
-
-
-def _root_of_depth(depth: float) -> float:
-    return float(jkr.root_of_depth(depth))

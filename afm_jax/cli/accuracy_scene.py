@@ -1,0 +1,180 @@
+"""`afm-jax accuracy SCENE.toml`: error against time of one scene's settings, and of simpler models of it."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+from afm_jax.cli.session import Session
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from afm_jax.apparatus.scene import Scene
+    from afm_jax.motion.record import Simulation, State
+
+COLUMNS = (
+    "way",
+    "setting",
+    "microseconds_per_contact",
+    "arrival_error_us",
+    "peak_error_nm",
+    "compile_s",
+)
+"""What `accuracy.csv` tells of a setting."""
+LADDER_COLUMNS = ("model", "peak_nm", "lowest_peak_nm", "model_error", "seconds", "contacts", "reason")
+"""What `ladder.csv` tells of a model."""
+CONTACT = {"accuracies": [1e-6, 1e-9], "quick": [2, 8], "careful": [2.0, 4.0, 6.0, 8.0], "repetitions": 5}
+CONTACT_QUICK = {"accuracies": [1e-6], "quick": [], "careful": [3.0, 5.0], "repetitions": 1}
+LAW = {"tolerances": [1e-1, 1e-2, 1e-4, 1e-6, 1e-8, 1e-10, 1e-12, 1e-13, 1e-14], "repetitions": 5}
+LAW_QUICK = {"tolerances": [1e-2, 1e-6, 1e-10, 1e-14], "repetitions": 1}
+_WIDER = 1.1
+"""The law is fitted from the slowest to the fastest approach of the scene, wider by this factor at each end."""
+_ABOVE_CAPTURE = 1.02
+
+
+def scene_study(session: Session, name: str, contacts: int, *, quick: bool) -> None:
+    """Run and show the accuracy study of a scene file or a preset."""
+    from afm_jax.cli.strict_json import strict_json  # noqa: PLC0415
+    from afm_jax.contact.contact import Contact  # noqa: PLC0415
+    from afm_jax.study.fidelity_ladder import ladder_duration  # noqa: PLC0415
+    from afm_jax.study.own_process import run_in_own_process  # noqa: PLC0415
+
+    scene, start = scene_and_start(name)
+    resolved = isinstance(scene.interaction, Contact)
+    common = {"scene": name, "start": [float(part) for part in start]}
+    with session.working("measuring (programs are compiled for every setting)"):
+        duration = ladder_duration(scene)
+        law = fitted_law(scene, followed(scene, start, duration, contacts)) if resolved else None
+        task = "scene_accuracy:contact_accuracy" if resolved else "law_scene_accuracy:law_accuracy"
+        settings = (CONTACT_QUICK if quick else CONTACT) if resolved else (LAW_QUICK if quick else LAW)
+        result = run_in_own_process(f"afm_jax.study.{task}", {**common, **settings, "contacts": contacts}, cores=1)
+        rungs = {**common, "law": law, "duration_us": duration, "repetitions": settings["repetitions"]}
+        result |= run_in_own_process("afm_jax.study.fidelity_ladder:fidelity_ladder", rungs, cores=1)
+    payload = {**result, "scene": name, "law": law}
+    session.write_table("accuracy.csv", result["rows"], COLUMNS)
+    session.write_table("ladder.csv", result["ladder"], LADDER_COLUMNS)
+    if session.out is not None:
+        from afm_jax.plots.picture_style import save  # noqa: PLC0415
+        from afm_jax.plots.scene_accuracy import scene_accuracy_figure  # noqa: PLC0415
+
+        (session.out / "accuracy.json").write_text(strict_json(payload) + "\n", encoding="utf-8")
+        save(scene_accuracy_figure(result), session.out / "accuracy.png")
+        session.note(f"wrote {session.out / 'accuracy.json'} and {session.out / 'accuracy.png'}")
+    session.emit(payload, settings_table(result), reference_sentence(result), ladder_table(result), *_reasons(result))
+
+
+def scene_and_start(name: str) -> "tuple[Scene, State]":
+    """Return the scene of a file or a preset, and where its motion begins.
+
+    Raises:
+        ValueError: if the tip never meets anything, or the file is wrong.
+    """
+    from pathlib import Path  # noqa: PLC0415
+
+    from afm_jax.motion.start import default_start, start_of  # noqa: PLC0415
+    from afm_jax.presets import PRESETS, preset_start  # noqa: PLC0415
+    from afm_jax.scenefile import load_start  # noqa: PLC0415
+    from afm_jax.study.scene_accuracy import scene_named  # noqa: PLC0415
+
+    scene = scene_named(name)
+    if scene.interaction is None:
+        raise ValueError(f"{name}: the cantilever is free: its motion is a closed form and has no contacts to measure")
+    told = preset_start(name) if name in PRESETS and not Path(name).exists() else load_start(name)
+    return scene, default_start(scene) if told is None else start_of(scene, told)
+
+
+def followed(scene: "Scene", start: "State", duration_us: float, contacts: int) -> "Simulation":
+    """Return the scene's motion, from which the range of its approach speeds is taken.
+
+    Raises:
+        ValueError: if the tip leaves fewer contacts than are to be compared.
+    """
+    import numpy as np  # noqa: PLC0415
+
+    from afm_jax.motion.record import ContactKind, MotionOutcome  # noqa: PLC0415
+    from afm_jax.motion.simulate import simulate  # noqa: PLC0415
+
+    found = simulate(scene, start, duration_us)
+    left = int(np.sum(np.asarray(found.contacts.kind) == ContactKind.IMPACT))
+    if left < contacts:
+        raise ValueError(
+            f"the tip leaves {left} contacts in {duration_us:.4g} us, but {contacts} are to be compared: lower "
+            f"--contacts, or start elsewhere ({MotionOutcome(int(found.outcome)).sentence})"
+        )
+    return found
+
+
+def fitted_law(scene: "Scene", found: "Simulation") -> dict[str, float]:
+    """Return the paper's law with delay, fitted to the scene's contact over the scene's own range of speeds."""
+    import numpy as np  # noqa: PLC0415
+
+    from afm_jax.contact.capture import capture_speed  # noqa: PLC0415
+    from afm_jax.motion.record import ContactKind  # noqa: PLC0415
+    from fitting.contact_delay import fit_delay  # noqa: PLC0415
+    from fitting.contact_law import fit_law  # noqa: PLC0415
+
+    mass = float(scene.cantilever.mass_ng)
+    left = np.asarray(found.contacts.kind) == ContactKind.IMPACT
+    speeds = np.asarray(found.contacts.approach_speed_nm_per_us)[left]
+    lowest = _ABOVE_CAPTURE * float(capture_speed(scene.interaction, mass))
+    low = max(float(speeds.min()) / _WIDER, lowest)
+    high = max(float(speeds.max()), low) * _WIDER
+    law = fit_law(scene.interaction, speed_range=(low, high), mass_ng=mass)
+    delay = fit_delay(scene.interaction, speed_range=(low, high), mass_ng=mass).delay
+    return {
+        "r": law.r,
+        "epsilon": law.epsilon,
+        "viscous_loss": law.viscous_loss,
+        **{name: float(getattr(delay, name)) for name in ("hertz", "lead_nm", "offset_nm")},
+        "lowest_speed_nm_per_us": low,
+        "highest_speed_nm_per_us": high,
+    }
+
+
+def settings_table(result: Mapping[str, Any]) -> "Table":
+    """Return the settings as a table."""
+    from rich.table import Table  # noqa: PLC0415
+
+    title = f"Error after {result['contacts']} contacts against the time of one (one core, one tip)"
+    table = Table(title=title, title_justify="left")
+    for heading in ("way", "setting"):
+        table.add_column(heading)
+    for heading in ("us/contact", "arrival error us", "peak error nm", "compile s"):
+        table.add_column(heading, justify="right")
+    for row in result["rows"]:
+        table.add_row(row["way"], row["setting"], *(_digits(row.get(name)) for name in COLUMNS[2:]))
+    return table
+
+
+def ladder_table(result: Mapping[str, Any]) -> "Table":
+    """Return the fidelity ladder as a table."""
+    from rich.table import Table  # noqa: PLC0415
+
+    title = f"The same amplitude from simpler models: error against the {result['model_reference']}"
+    table = Table(title=title, title_justify="left")
+    table.add_column("model")
+    for heading in ("peak nm", "lowest peak nm", "error", "seconds", "contacts"):
+        table.add_column(heading, justify="right")
+    for row in result["ladder"]:
+        error = row.get("model_error")
+        heights = [_digits(row[name], 5) for name in ("peak_nm", "lowest_peak_nm")]
+        count = "-" if row["contacts"] is None else str(row["contacts"])
+        table.add_row(row["model"], *heights, "-" if error is None else f"{error:.2%}", _digits(row["seconds"]), count)
+    return table
+
+
+def reference_sentence(result: Mapping[str, Any]) -> str:
+    """Say what the errors are measured against, and how good that is."""
+    peak = result["reference_error_nm"]
+    heights = "" if peak is None else f" and {peak:.1e} nm"
+    return (
+        f"Reference: {result['reference']}; it differs from the second finest by {result['reference_error_us']:.1e} us"
+        f"{heights}. Contact {result['contacts']} arrives at {result['arrival_us']:.9g} us."
+    )
+
+
+def _reasons(result: Mapping[str, Any]) -> Sequence[str]:
+    return [f"{row['model']}: {row['reason']}" for row in result["ladder"] if row.get("reason")]
+
+
+def _digits(value: float | None, digits: int = 3) -> str:
+    return "-" if value is None else f"{value:.{digits}g}"

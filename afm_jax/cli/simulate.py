@@ -1,0 +1,191 @@
+"""`afm-jax simulate SCENE.toml|PRESET`: a scene in time, and what an experiment reads of it."""
+
+import importlib.util
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from afm_jax.cli.failures import NotValid
+from afm_jax.cli.session import Session, with_session
+
+if TYPE_CHECKING:
+    from afm_jax.apparatus.scene import Scene
+    from afm_jax.motion.long_run import LongRun
+    from afm_jax.motion.observables import Observables
+    from afm_jax.motion.record import State
+
+DEFAULT_PERIODS = 2000
+"""Drive periods followed at most where no duration is given."""
+LARGEST_OFFSET_NM = 10_000.0
+"""How far a ramp may take the sample from the tip's rest position, either way."""
+_PIECES_A_LINE = 8
+"""Pieces of a long run between two lines on standard error."""
+_PICTURES = "afm_jax.plots.motion"
+
+
+class Harmonics(click.ParamType):
+    """Positive integers in a comma list."""
+
+    name = "list"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
+        """Return the integers that a text says, without repetitions.
+
+        Raises:
+            click.BadParameter: if one is none, or not from 1 to 1000.
+        """
+        parts = [part.strip() for part in str(value).split(",")]
+        if not all(part.isascii() and part.isdigit() and len(part) < 5 and 1 <= int(part) <= 1000 for part in parts):
+            self.fail(f"must be integers from 1 to 1000 as in 1,2,3, but is {value}", param, ctx)
+        return tuple(dict.fromkeys(int(part) for part in parts))
+
+
+@click.command()
+@click.argument("scene", metavar="SCENE.toml|PRESET")
+@click.option("--duration-us", type=float, metavar="T", help="How long to follow the scene, in us.")
+@click.option("--periods", type=float, metavar="P", help="How long, in periods of the drive.")
+@click.option(
+    "--until-settled",
+    is_flag=True,
+    help=f"End when the motion has settled; at the latest after the duration, or {DEFAULT_PERIODS} drive periods. "
+    "This is what happens without a duration.",
+)
+@click.option(
+    "--harmonics",
+    type=Harmonics(),
+    default="1",
+    show_default=True,
+    metavar="K,...",
+    help="Multiples of the response frequency at which amplitude and phase are read.",
+)
+@click.option(
+    "--accuracy",
+    type=click.FloatRange(min=0.0, min_open=True),
+    default=1e-9,
+    show_default=True,
+    help="Of every resolved contact: relative of the rebound speed.",
+)
+@with_session
+def command(
+    session: Session,
+    *,
+    scene: str,
+    duration_us: float | None,
+    periods: float | None,
+    until_settled: bool,
+    harmonics: tuple[int, ...],
+    accuracy: float,
+) -> None:
+    """Follow a scene in time: contacts, amplitudes, phases, forces, energies.
+
+    SCENE.toml is a scene file, PRESET the name of one of the paper's scenes (figure2, figure8, ...). The start is the
+    file's [start]; without one the tip starts on the single-impact orbit that the law with delay predicts, if there is
+    one. Amplitudes are read over the last response period once the motion has settled, else over the last fifth. With
+    --out contacts.csv, trajectory.csv, simulate.json and pictures. A tip that sticks, or does not settle, is a result;
+    exit code 3 if the simulation broke off.
+    """
+    for name, value in (("--duration-us", duration_us), ("--periods", periods)):
+        if value is not None and not (value > 0.0 and math.isfinite(value)):
+            raise click.UsageError(f"{name} must be a positive number, but is {value:g}")
+    if duration_us is not None and periods is not None:
+        raise click.UsageError("--duration-us and --periods say the same: give one of them")
+    session.start_computing()
+    from afm_jax.motion.drive_period import drive_of  # noqa: PLC0415
+
+    loaded, start = _scene_and_start(scene)
+    period = drive_of(loaded).period_us
+    until_settled = until_settled or (duration_us is None and periods is None)
+    longest = duration_us if duration_us is not None else (periods or DEFAULT_PERIODS) * period
+    try:
+        _check_ramp(loaded, longest)
+        run, seen = _follow(session, loaded, start, longest, until_settled, harmonics, accuracy)
+    except ValueError as error:
+        raise ValueError(f"{scene}: {error}") from error
+    from afm_jax.cli.simulate_output import payload_of, text_of, write_files  # noqa: PLC0415
+
+    settings = {"accuracy": accuracy, "until_settled": until_settled, "longest_us": longest, "pieces": run.pieces}
+    payload = payload_of(loaded, run, seen, settings)
+    if session.out is not None:
+        write_files(session, loaded, run, seen, payload)
+        _draw(session, loaded, run)
+    session.emit(payload, *text_of(payload))
+    if not payload["valid"]:
+        raise NotValid(payload["outcome"])
+
+
+def _scene_and_start(name: str) -> "tuple[Scene, State | None]":
+    """Return the scene that an argument names, and the start that comes with it; None where it is to be chosen."""
+    from afm_jax.motion.start import start_of  # noqa: PLC0415
+    from afm_jax.presets import PRESETS, preset, preset_start  # noqa: PLC0415
+    from afm_jax.scenefile import load_scene, load_start  # noqa: PLC0415
+
+    if name in PRESETS and not Path(name).exists():
+        loaded, start = preset(name), preset_start(name)
+    elif not Path(name).exists() and not name.endswith(".toml") and len(Path(name).parts) == 1:
+        raise ValueError(f"{name}: there is no such file or preset; presets are {', '.join(PRESETS)}")
+    else:
+        loaded, start = load_scene(name), load_start(name)
+    return loaded, None if start is None else start_of(loaded, start)
+
+
+def _check_ramp(scene: "Scene", duration_us: float) -> None:
+    """Check that the ramp of the offset stays where a cantilever can be.
+
+    Raises:
+        ValueError: if it leaves that range.
+    """
+    rate = float(scene.platform.offset_rate_nm_per_us)
+    end = float(scene.platform.offset_nm) + rate * duration_us
+    if rate != 0.0 and not abs(end) <= LARGEST_OFFSET_NM:
+        raise ValueError(
+            f"after {duration_us:.6g} us the ramp of `offset_rate_nm_per_us` = {rate:g} has taken the offset to "
+            f"{end:.6g} nm, out of the range of {LARGEST_OFFSET_NM:g} nm: simulate a shorter time or ramp slower"
+        )
+
+
+def _follow(
+    session: Session,
+    scene: "Scene",
+    start: "State | None",
+    longest_us: float,
+    until_settled: bool,  # noqa: FBT001
+    harmonics: tuple[int, ...],
+    accuracy: float,
+) -> "tuple[LongRun, Observables]":
+    """Return the simulation and what is read of it; progress of long runs goes to standard error."""
+    from afm_jax.motion.long_run import follow_long  # noqa: PLC0415
+    from afm_jax.motion.observables import observe  # noqa: PLC0415
+    from afm_jax.motion.start import default_start  # noqa: PLC0415
+
+    pieces = 0
+
+    def report(time_us: float, contacts: int) -> None:
+        nonlocal pieces
+        pieces += 1
+        if pieces % _PIECES_A_LINE == 0:
+            session.note(f"at {time_us:.6g} us, after {contacts} contacts")
+
+    with session.working("simulating (the first run compiles for some seconds)"):
+        if start is None:
+            start = default_start(scene)
+        run = follow_long(scene, start, longest_us, until_settled=until_settled, accuracy=accuracy, report=report)
+    if int(run.simulation.outcome) == _invalid_start():
+        raise ValueError("the tip cannot start there: the start is not finite, or inside the sample")
+    with session.working("reading amplitudes"):
+        return run, observe(scene, run.simulation, harmonics=harmonics, verdict=run.verdict)
+
+
+def _invalid_start() -> int:
+    from afm_jax.motion.record import MotionOutcome  # noqa: PLC0415
+
+    return int(MotionOutcome.INVALID_START)
+
+
+def _draw(session: Session, scene: "Scene", run: "LongRun") -> None:
+    """Draw pictures, where the module that does is there."""
+    if session.out is None or importlib.util.find_spec(_PICTURES) is None:
+        return
+    for path in importlib.import_module(_PICTURES).draw_motion(scene, run.simulation, session.out):
+        session.note(f"wrote {path}")

@@ -1,0 +1,177 @@
+"""What `afm-jax simulate` hands out: the JSON object, the text, the files."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from afm_jax.apparatus.scene import Scene
+from afm_jax.cli.session import Session
+from afm_jax.cli.strict_json import strict_json
+from afm_jax.contact.phases import Phase
+from afm_jax.motion.long_run import LongRun
+from afm_jax.motion.observables import Harmonic, Observables
+from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation
+from afm_jax.motion.trajectory import nodes, trajectory
+from afm_jax.scenefile import scene_tables
+
+_WHOLE_PERIODS = 50
+"""Drive periods up to which the whole simulation goes into trajectory.csv."""
+_POINTS = 2001
+_AS_THEY_ARE = (
+    "peak_amplitude_nm",
+    "mean_height_nm",
+    "time_in_contact_us",
+    "contact_share",
+    "peak_force_nn",
+    "most_attractive_force_nn",
+    "dissipated_in_contact_aj",
+    "dissipated_per_contact_aj",
+    "dissipated_in_air_aj",
+    "given_by_drives_aj",
+    "stored_aj",
+    "energy_imbalance",
+    "virial_aj",
+    "peak_deflection_nm",
+    "mean_deflection_nm",
+)
+
+
+def payload_of(scene: Scene, run: LongRun, seen: Observables, settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the JSON object of a simulation."""
+    simulation, verdict = run.simulation, run.verdict
+    outcome = MotionOutcome(int(simulation.outcome))
+    final = simulation.final
+    return {
+        "impacts": int(simulation.count),
+        "stuck": verdict.stuck,
+        "settled": verdict.settled,
+        "order": verdict.periods,
+        "contacts_per_response": verdict.contacts,
+        "settled_reason": verdict.reason,
+        "remaining_distance": verdict.remaining,
+        **{name: getattr(seen, name) for name in _AS_THEY_ARE},
+        "lockin_amplitude_nm": seen.lockin_amplitude_nm,
+        "lockin_phase_deg": seen.lockin_phase_deg,
+        "harmonics": [harmonic._asdict() for harmonic in seen.harmonics],
+        "deflection_harmonics": _as_dicts(seen.deflection_harmonics),
+        "window": {**seen.window._asdict(), "contacts": seen.contacts},
+        "null_reasons": _reasons(scene, seen, verdict.stuck),
+        "start": {name: float(value) for name, value in simulation.start._asdict().items()},
+        "final": {
+            **{name: float(value) for name, value in final._asdict().items()},
+            "phase": Phase(int(simulation.phase)).name.lower(),
+        },
+        "outcome": outcome.sentence,
+        "valid": outcome in (MotionOutcome.FINISHED, MotionOutcome.HELD),
+        "scene": scene_tables(scene),
+        "settings": dict(settings),
+    }
+
+
+def _as_dicts(harmonics: tuple[Harmonic, ...] | None) -> list[dict[str, Any]] | None:
+    return None if harmonics is None else [harmonic._asdict() for harmonic in harmonics]
+
+
+def _reasons(scene: Scene, seen: Observables, stuck: bool) -> dict[str, str]:  # noqa: FBT001
+    """Return for every key that is null why."""
+    reasons = {}
+    if seen.settled.periods is None:
+        reasons["order"] = reasons["contacts_per_response"] = seen.settled.reason
+    if seen.settled.remaining is None:
+        reasons["remaining_distance"] = "the tip is held" if stuck else seen.settled.reason
+    if seen.peak_force_nn is None:
+        for name in ("peak_force_nn", "most_attractive_force_nn"):
+            reasons[name] = "only a resolved contact has a force" if scene.interaction is not None else "no contact"
+    if seen.dissipated_per_contact_aj is None:
+        reasons["dissipated_per_contact_aj"] = "no contact begins in the window"
+    if seen.energy_imbalance is None:
+        reasons["energy_imbalance"] = "with an impact law the energy given by the drives closes the balance"
+    if scene.base is None:
+        for name in ("peak_deflection_nm", "mean_deflection_nm", "deflection_harmonics"):
+            reasons[name] = "the base rests: the deflection is the height"
+    return reasons
+
+
+def text_of(payload: Mapping[str, Any]) -> list[str]:
+    """Return a short summary of a simulation, a line each."""
+    final, window = payload["final"], payload["window"]
+    head = "Settled" if payload["settled"] else "Not settled"
+    lines = [
+        f"{payload['impacts']} contacts from {payload['start']['time_us']:.6g} to {final['time_us']:.6g} us.",
+        f"{head}: {payload['settled_reason']}.",
+    ]
+    lines.append(
+        f"Peak amplitude {payload['peak_amplitude_nm']:.6g} nm, mean height {payload['mean_height_nm']:.6g} nm, "
+        f"from {window['from_us']:.6g} to {window['to_us']:.6g} us."
+    )
+    for harmonic in payload["harmonics"]:
+        which = "the response frequency" if harmonic["multiple"] == 1 else f"{harmonic['multiple']} times that"
+        lines.append(f"At {which}: {harmonic['amplitude_nm']:.6g} nm, {harmonic['phase_deg']:.6g} deg.")
+    if payload["peak_deflection_nm"] is not None:
+        first = payload["deflection_harmonics"][0]
+        lines.append(
+            f"Against the moving base: peak deflection {payload['peak_deflection_nm']:.6g} nm; at the response "
+            f"frequency {first['amplitude_nm']:.6g} nm, {first['phase_deg']:.6g} deg."
+        )
+    if payload["peak_force_nn"] is not None:
+        lines.append(
+            f"In contact for {payload['time_in_contact_us']:.4g} us of a response period "
+            f"({100.0 * payload['contact_share']:.3g} %); forces from {payload['most_attractive_force_nn']:.4g} to "
+            f"{payload['peak_force_nn']:.4g} nN."
+        )
+    lines.append(
+        f"Energy of a drive period: {payload['given_by_drives_aj']:.5g} aJ given; "
+        f"{payload['dissipated_in_air_aj']:.5g} taken by air, {payload['dissipated_in_contact_aj']:.5g} by the sample."
+    )
+    lines.append(
+        f"At the end: {final['position_nm']:.6g} nm, {final['velocity_nm_per_us']:.6g} nm/us, {final['phase']}"
+        f"{'; the sample holds the tip' if payload['stuck'] else ''}."
+    )
+    return lines
+
+
+def write_files(session: Session, scene: Scene, run: LongRun, seen: Observables, payload: Mapping[str, Any]) -> None:
+    """Write contacts.csv, trajectory.csv and simulate.json into the `--out` folder."""
+    if session.out is None:
+        return
+    rows, columns = contact_rows(run.simulation)
+    session.write_table("contacts.csv", rows, columns)
+    rows, columns = trajectory_rows(scene, run.simulation, seen)
+    session.write_table("trajectory.csv", rows, columns)
+    path = session.out / "simulate.json"
+    path.write_text(strict_json(payload) + "\n", encoding="utf-8")
+    session.note(f"wrote {path}")
+
+
+def contact_rows(simulation: Simulation) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return all contacts as rows, and their columns; times of what did not happen are None."""
+    contacts = simulation.contacts
+    table = {name: value for name, value in contacts._asdict().items() if name != "detail"}
+    if contacts.detail is not None:
+        table |= contacts.detail._asdict()
+    lists = {name: np.asarray(column)[: int(simulation.count)].tolist() for name, column in table.items()}
+    rows = [dict(zip(lists, values, strict=True)) for values in zip(*lists.values(), strict=True)]
+    for row in rows:
+        kind = row["kind"] = ContactKind(row["kind"]).name.lower()
+        if kind == "held":
+            row.update(dict.fromkeys((name for name in row if name.startswith(("departure", "rebound"))), None))
+        if not row.get("junctions", 1):
+            row.update(junction_forms_us=None, junction_breaks_us=None)
+    return rows, list(lists)
+
+
+def trajectory_rows(scene: Scene, simulation: Simulation, seen: Observables) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return the tip in time: all of a short simulation, else the window of the observables; dense in contacts."""
+    first, last = float(simulation.start.time_us), float(simulation.final.time_us)
+    window = seen.window
+    period = (window.to_us - window.from_us) / max(window.periods * window.responses, 1)
+    short = last - first <= _WHOLE_PERIODS * period
+    begin, end = (first, last) if short else (window.from_us, window.to_us)
+    inner, _ = nodes(scene, simulation, begin, end)
+    path = trajectory(scene, simulation, np.union1d(np.linspace(begin, end, _POINTS), inner))
+    lists = {name: value.tolist() for name, value in path._asdict().items()}
+    rows = [dict(zip(lists, values, strict=True)) for values in zip(*lists.values(), strict=True)]
+    for row in rows:
+        row["phase"] = Phase(row["phase"]).name.lower()
+    return rows, list(lists)

@@ -1,0 +1,123 @@
+"""Where a simulation begins: on an orbit that the impact law predicts, leaving the platform, or where it was told."""
+
+import math
+
+import numpy as np
+
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene
+from afm_jax.contact.capture import capture_speed
+from afm_jax.contact.contact import Contact
+from afm_jax.impact.law import ImpactLaw
+from afm_jax.impact.orbits import single_impact_orbits
+from afm_jax.motion.contact_as_law import law_of_contact
+from afm_jax.motion.drive_period import drive_of
+from afm_jax.motion.record import State
+from afm_jax.parameters import as_parameter
+
+_HIGHEST_ORDER = 200
+_NEWTON_STEPS = 30
+
+
+def default_start(scene: Scene) -> State:
+    """Return where a simulation of a scene begins that was not told.
+
+    Driven by the platform: just after the impact of the single-impact orbit that the scene's law, or the law with delay
+    closest to its contact, has for the order nearest to resonance; the stable one, the fastest if there are several.
+    Without such an orbit: leaving the platform upward at its highest speed, at that speed again or twice the capture
+    speed relative to it. With a drive of base or force the tip starts at rest where that is above the sample, and a
+    free cantilever always does.
+
+    Args:
+        scene: one scene, its numbers known.
+
+    Raises:
+        ValueError: if the scene's contact has no junction.
+        RuntimeError: if JAX is not set to 64-bit floats.
+    """
+    if scene.interaction is None:
+        return state(0.0, 0.0, 0.0)
+    law = scene.interaction
+    if isinstance(law, Contact):
+        law = law_of_contact(law, float(scene.cantilever.mass_ng))
+    sample_alone = scene.base is None and scene.force is None
+    if not sample_alone and -float(scene.platform.position(0.0)) > 2.0 * _clearance(scene) + 1.0:
+        return state(0.0, 0.0, 0.0)
+    periodic = sample_alone and scene.platform.second is None and float(scene.platform.amplitude_nm) > 0.0
+    found = _on_orbit(scene, law) if periodic and law is not None else None
+    return found if found is not None else _leaving(scene)
+
+
+def start_of(scene: Scene, start: tuple[float, float, float]) -> State:
+    """Return the state of a scene file's start, at the first time from 0 on at which the drive has its phase.
+
+    Args:
+        scene: the scene.
+        start: phase of the drive in degrees, height above the platform in nm, velocity in the lab in nm/us (a `Start`).
+    """
+    phase, height, velocity = start
+    time = (phase % 360.0) / 360.0 * drive_of(scene).period_us
+    return state(time, float(scene.platform.position(time)) + height, velocity)
+
+
+def state(time_us: float, position_nm: float, velocity_nm_per_us: float) -> State:
+    """Return a state of plain numbers as one of arrays."""
+    return State(*(as_parameter(float(value)) for value in (time_us, position_nm, velocity_nm_per_us)))
+
+
+def _clearance(scene: Scene) -> float:
+    """Return the gap, in nm, at which a tip that leaves the sample is free."""
+    return float(scene.interaction.bridge_breaks_nm) if isinstance(scene.interaction, Contact) else 0.0
+
+
+def _on_orbit(scene: Scene, law: ImpactLaw) -> State | None:
+    """Return the state just after the impact of the predicted orbit; None without one."""
+    platform, cantilever = scene.platform, scene.cantilever
+    order = max(1, round(float(platform.frequency_khz) / (2.0 * float(cantilever.frequency_khz))))
+    if order > _HIGHEST_ORDER:
+        return None
+    still = Platform(platform.amplitude_nm, platform.frequency_khz, platform.offset_nm)
+    orbits = single_impact_orbits(Scene(cantilever, still, law), float(order))
+    admissible = np.asarray(orbits.exists) & np.asarray(orbits.admissible)
+    stable = admissible & np.asarray(orbits.stable)
+    wanted = stable if stable.any() else admissible
+    if not wanted.any():
+        return None
+    slot = int(np.argmax(np.where(wanted, np.asarray(orbits.approach_speed_nm_per_us), -np.inf)))
+    time = float(orbits.phase_rad[slot]) / float(platform.angular_frequency)
+    velocity = float(orbits.velocity_after_nm_per_us[slot])
+    if not isinstance(scene.interaction, Contact):
+        return state(time, float(platform.position(time)), velocity)
+    return _risen(scene, time, velocity, _clearance(scene))
+
+
+def _risen(scene: Scene, time: float, velocity: float, gap: float) -> State | None:
+    """Return where a flight that leaves the platform first has a gap; None if it does not rise that far."""
+    position = float(scene.platform.position(time))
+    rebound = velocity - float(scene.platform.velocity(time))
+    duration, v = gap / rebound, velocity
+    for _ in range(_NEWTON_STEPS):
+        height, speed = (float(part) for part in scene.platform.position_and_velocity(time + duration))
+        z, v = (float(part) for part in scene.cantilever.propagator(duration)(position, velocity))
+        if not v > speed:
+            return None
+        step = (gap - (z - height)) / (v - speed)
+        duration += step
+        if abs(step) < 1e-13:
+            break
+    # a rounding above the gap at which the bridge breaks
+    return state(time + duration, float(scene.platform.position(time + duration)) + gap, v)
+
+
+def _leaving(scene: Scene) -> State:
+    """Return a tip that leaves the platform upward at its highest speed."""
+    drive = drive_of(scene)
+    time = 0.75 * drive.period_us
+    height, speed = (float(part) for part in scene.platform.position_and_velocity(time))
+    slowest = 0.0
+    if isinstance(scene.interaction, Contact):
+        slowest = float(capture_speed(scene.interaction, float(scene.cantilever.mass_ng)))
+    elif isinstance(scene.interaction, ImpactLaw):
+        slowest = float(scene.interaction.capture_speed_nm_per_us)
+    rebound = max(float(scene.platform.top_speed_nm_per_us), 2.0 * slowest if math.isfinite(slowest) else 0.0)
+    return state(time, height + _clearance(scene), speed + (rebound or drive.angular_frequency))

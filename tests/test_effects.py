@@ -1,0 +1,339 @@
+"""`afm-jax effects`: on scenes where it is known what an effect changes."""
+
+import csv
+import json
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from matplotlib.image import imread
+
+from afm_jax import Cantilever, CollisionDelay, Contact, ImpactLaw, Platform, Scene, load_scene, save_scene
+from afm_jax.apparatus.drive import Tone
+from afm_jax.apparatus.excitation import BaseDrive, ForceDrive
+from afm_jax.cli.main import main
+from afm_jax.cli.share import parse_share
+from afm_jax.impact.orbits import single_impact_orbits
+from afm_jax.motion.start import start_of
+from afm_jax.presets import contact_scene
+from afm_jax.scenefile import load_start
+from afm_jax.study.effects import Change, Reduction, study_effects
+from afm_jax.study.motion_program import Programs
+from afm_jax.study.scene_effects import effects_in
+
+LAW = ImpactLaw(0.998, 100.0, 0.1, CollisionDelay(0.206, 5.64, 0.726))
+DRIVE = Platform(4.0, 181.8)
+START = (270.0, 5.0, 60.0)
+
+
+def law_scene(law: ImpactLaw = LAW, quality_factor: float | None = 40.0) -> Scene:
+    return Scene(Cantilever(90.0, quality_factor), DRIVE, law)
+
+
+def orbit_of(scene: Scene):
+    """Return peak, lock-in amplitude and energy per impact of the scene's stable (1,1) orbit, in closed form."""
+    orbits = single_impact_orbits(scene, 1.0)
+    slot = int(np.argmax(np.asarray(orbits.stable & orbits.admissible)))
+    speeds = orbits.approach_speed_nm_per_us[slot], orbits.rebound_speed_nm_per_us[slot]
+    energy = 0.5 * float(scene.cantilever.mass_ng) * float(speeds[0] ** 2 - speeds[1] ** 2)
+    return np.array([float(orbits.peak_amplitude_nm[slot]), float(orbits.lockin_amplitude_nm[slot]), energy])
+
+
+def by_name(study):
+    return {report.effect.name: report for report in study.effects}
+
+
+def reduction_of(study) -> Reduction:
+    assert study.reduction is not None
+    return study.reduction
+
+
+def size_of(change: Change) -> float:
+    assert change.of_amplitude is not None
+    return change.of_amplitude
+
+
+def amplitudes(change: Change) -> np.ndarray:
+    """Return the changes of peak and lock-in amplitude; NaN for none, which equals nothing."""
+    return np.array([change.peak_amplitude, change.lockin_amplitude], dtype=float)
+
+
+def numbers(change: Change) -> np.ndarray:
+    """Return the changes of peak, lock-in amplitude and energy."""
+    return np.array([*amplitudes(change), change.energy_per_impact], dtype=float)
+
+
+def reason_of(report) -> str:
+    assert report.reason is not None
+    return report.reason
+
+
+@pytest.fixture(scope="module")
+def programs():
+    return Programs()
+
+
+@pytest.fixture(scope="module")
+def law_study(programs):
+    return study_effects(law_scene(), accuracy=0.02, programs=programs)
+
+
+@pytest.mark.parametrize(
+    ("name", "without"),
+    [
+        ("restitution", ImpactLaw(1.0, 100.0, 0.1, LAW.delay)),
+        ("adhesion", ImpactLaw(0.998, 0.0, 0.1, LAW.delay)),
+        ("viscous_loss", ImpactLaw(0.998, 100.0, 0.0, LAW.delay)),
+        ("delay", ImpactLaw(0.998, 100.0, 0.1)),
+    ],
+)
+def test_leaving_an_effect_of_a_law_out_changes_what_the_closed_form_says(law_study, name, without):
+    change = by_name(law_study)[name].change
+    expected = orbit_of(law_scene(without)) / orbit_of(law_scene()) - 1.0
+    # the orbit is closed to 1e-9 of the speed; weakly attracting orbits are then known to some 1e-7
+    found = numbers(change)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("name", ["restitution", "adhesion", "viscous_loss", "delay", "air_damping"])
+def test_the_prediction_is_the_slope_of_the_closed_form(law_study, name):
+    effect = {effect.name: effect for effect in effects_in(law_scene())}[name]
+    assert effect.scaled is not None
+    # central difference: its error of second order is far below what is compared
+    step = 1e-4
+    ends = [orbit_of(effect.scaled(law_scene(), jnp.asarray(s))) for s in (step, -step)]
+    slope = (ends[0] - ends[1]) / (2.0 * step) / orbit_of(law_scene())
+    predicted = by_name(law_study)[name].predicted
+    found = numbers(predicted)
+    np.testing.assert_allclose(found, -slope, rtol=1e-3, atol=1e-6)
+
+
+def test_numbers_of_a_law_cost_nothing(law_study):
+    for name in ("restitution", "adhesion", "viscous_loss"):
+        assert by_name(law_study)[name].cost == law_study.cost
+    delay = by_name(law_study)["delay"].cost
+    assert delay is not None
+    assert delay.program != law_study.cost.program
+
+
+def test_what_a_law_does_not_need_is_known_from_the_closed_form(law_study):
+    reduction = reduction_of(law_study)
+    expected = orbit_of(reduction.scene) / orbit_of(law_scene()) - 1.0
+    np.testing.assert_allclose(amplitudes(reduction.change), expected[:2], rtol=1e-5, atol=1e-7)
+    assert set(reduction.left_out) == {"viscous_loss", "restitution"}
+    assert size_of(reduction.change) < 0.02
+    # adhesion alone changes 1.95 %, which the accuracy would allow; with the others it does not
+    assert size_of(by_name(law_study)["adhesion"].change) < 0.02
+
+
+@pytest.mark.parametrize(("quality_factor", "needed"), [(40.0, True), (1e6, False)])
+def test_air_damping_is_needed_near_resonance_unless_there_is_nearly_none(programs, quality_factor, needed):
+    # lossy impacts, so that the motion settles without air too
+    scene = law_scene(ImpactLaw(0.9, 1.0), quality_factor)
+    study = study_effects(scene, accuracy=0.01, only=["air_damping"], derivatives=False, programs=programs)
+    bare = orbit_of(law_scene(ImpactLaw(0.9, 1.0), None)) / orbit_of(scene) - 1.0
+    change = by_name(study)["air_damping"].change
+    # as above
+    np.testing.assert_allclose(amplitudes(change), bare[:2], rtol=1e-5, atol=1e-7)
+    assert ("air_damping" in reduction_of(study).left_out) is not needed
+
+
+def test_a_free_cantilever_without_air_at_resonance_has_no_steady_response(programs):
+    scene = Scene(Cantilever(90.0, 40.0), Platform(0.0, 90.0, -100.0), None, force=ForceDrive(0.1, 90.0))
+    study = study_effects(scene, accuracy=0.01, derivatives=False, programs=programs)
+    report = by_name(study)
+    assert report["air_damping"].change.peak_amplitude is None
+    assert "free frequency" in reason_of(report["air_damping"])
+    assert report["air_damping"].cost is None
+    assert "only drive" in reason_of(report["force_drive"])
+    # F Q/k
+    expected = 0.1 * 40.0 / float(scene.cantilever.stiffness_n_per_m)
+    assert study.observed.reading is not None
+    np.testing.assert_allclose(study.observed.reading.peak_amplitude_nm, expected, rtol=1e-6)
+    assert reduction_of(study).left_out == ()
+
+
+def test_a_second_frequency_is_compared_over_the_last_fifth(programs):
+    platform = Platform(4.0, 181.8, 0.0, 0.0, Tone(1e-7, 47.0))
+    scene = Scene(Cantilever(90.0, 40.0), platform, LAW)
+    study = study_effects(scene, accuracy=0.01, duration_us=400.0, only=["second_frequency"], programs=programs)
+    report = by_name(study)["second_frequency"]
+    assert study.observed.orbit is None
+    assert 0.0 < size_of(report.change) < 1e-5
+    # so weak a drive acts to first order
+    np.testing.assert_allclose(amplitudes(report.predicted), amplitudes(report.change), rtol=0.01, atol=1e-9)
+    assert reduction_of(study).left_out == ("second_frequency",)
+    assert reduction_of(study).scene.platform.second is None
+
+
+def test_all_effects_are_named():
+    scene = Scene(
+        Cantilever(90.0, 40.0),
+        Platform(4.0, 181.8, 0.0, 1e-3, Tone(1.0, 47.0)),
+        Contact.paper(structural_amplitude_n_per_m=0.0),
+        BaseDrive(0.1, 90.0, 0.0, Tone(0.0, 33.0)),
+        ForceDrive(0.1, 90.0),
+    )
+    effects = {effect.name: effect for effect in effects_in(scene)}
+    assert set(effects) == {
+        *("capillary", "structural", "core", "viscous", "jkr", "air_damping", "ramp"),
+        *("second_frequency", "base_drive", "base_second_frequency", "force_drive"),
+    }
+    assert {name for name, effect in effects.items() if effect.is_zero} == {"structural", "base_second_frequency"}
+    assert {name for name, effect in effects.items() if effect.required} == {"core", "jkr"}
+
+
+@pytest.mark.parametrize("name", ["capillary", "structural", "viscous"])
+def test_a_force_is_proportional_to_its_strength_and_absent_without_it(name):
+    scene = contact_scene(1.01, 4.0, 0.0)
+    effect = {effect.name: effect for effect in effects_in(scene)}[name]
+    assert effect.scaled is not None
+    gap, rate = 0.7, -50.0
+
+    def force(scene: Scene) -> float:
+        return float(scene.interaction.forces(gap, rate))
+
+    own = force(scene) - force(effect.without(scene))
+    # rounding of a sum of forces
+    np.testing.assert_allclose(force(effect.scaled(scene, jnp.asarray(0.5))), force(scene) + 0.5 * own, rtol=1e-12)
+    assert name not in effect.without(scene).interaction.effects
+    assert len(jax.tree.leaves(effect.without(scene))) < len(jax.tree.leaves(scene))
+
+
+def contact_study(programs: Programs, viscosity_pa_s: float):
+    contact = Contact.paper(structural_amplitude_n_per_m=0.0, viscosity_pa_s=viscosity_pa_s)
+    scene = Scene(Cantilever(90.0, 40.0), Platform(4.0, 181.8), contact)
+    return study_effects(
+        scene,
+        start_of(scene, START),
+        accuracy=0.01,
+        only=["structural", "core", "viscous", "jkr"],
+        derivatives=False,
+        programs=programs,
+    )
+
+
+@pytest.fixture(scope="module")
+def thin_liquid(programs):
+    return contact_study(programs, 1e-9)
+
+
+def test_a_force_of_no_strength_changes_nothing_and_is_dropped(thin_liquid):
+    structural = by_name(thin_liquid)["structural"]
+    assert structural.effect.is_zero
+    # two programs for one motion: rounding, and the accuracy of 1e-9 to which the orbit is closed
+    assert size_of(structural.change) < 1e-7
+    assert "structural" in reduction_of(thin_liquid).left_out
+    assert structural.cost is not None
+    assert structural.cost.program.operations < thin_liquid.cost.program.operations
+
+
+def test_a_viscosity_of_a_billionth_is_negligible(thin_liquid):
+    assert size_of(by_name(thin_liquid)["viscous"].change) < 1e-4
+    assert set(reduction_of(thin_liquid).left_out) == {"structural", "viscous"}
+    assert reduction_of(thin_liquid).scene.interaction.effects == ("capillary", "core", "jkr")
+    assert reduction_of(thin_liquid).cost.program.operations < thin_liquid.cost.program.operations
+
+
+def test_ten_times_the_viscosity_of_water_is_not(programs, thin_liquid):
+    del thin_liquid  # its programs are used again
+    study = contact_study(programs, 1e-2)
+    assert size_of(by_name(study)["viscous"].change) > 0.01
+    assert reduction_of(study).left_out == ("structural",)
+
+
+def test_what_a_contact_cannot_do_without_is_required(thin_liquid):
+    for name in ("core", "jkr"):
+        report = by_name(thin_liquid)[name]
+        assert reason_of(report).startswith("required: ")
+        assert report.change.of_amplitude is None
+        assert report.cost is None
+
+
+@pytest.fixture(scope="module")
+def called(tmp_path_factory):
+    """Return the JSON object of the command, and the folder it wrote into."""
+    folder = tmp_path_factory.mktemp("effects")
+    save_scene(law_scene(), folder / "scene.toml")
+    arguments = [
+        "effects",
+        str(folder / "scene.toml"),
+        "--accuracy",
+        "1 %",
+        "--only",
+        "restitution,viscous_loss,adhesion",
+    ]
+    arguments += ["--write", str(folder / "reduced.toml"), "--out", str(folder / "out"), "--json"]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 0, result.stderr
+
+    def refuse(constant: str):
+        raise AssertionError(constant)
+
+    return json.loads(result.stdout, parse_constant=refuse), folder
+
+
+def test_the_reduced_file_loads_and_is_as_accurate_as_wanted(called):
+    payload, folder = called
+    reduced = load_scene(folder / "reduced.toml")
+    change = orbit_of(reduced)[:2] / orbit_of(law_scene())[:2] - 1.0
+    assert payload["not_needed"] == ["viscous_loss", "restitution"]
+    assert float(reduced.interaction.r) == 1.0
+    assert 0.0 < np.abs(change).max() < 0.01
+    start = load_start(folder / "reduced.toml")
+    assert start is not None
+    assert start._asdict() == payload["start"]
+
+
+def test_the_command_writes_what_it_says(called):
+    payload, folder = called
+    with (folder / "out" / "effects.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["name"] for row in rows] == [effect["name"] for effect in payload["effects"]]
+    assert all(
+        float(row["change_peak_amplitude"]) == effect["change"]["peak_amplitude"]
+        for row, effect in zip(rows, payload["effects"], strict=True)
+    )
+    assert np.ptp(imread(folder / "out" / "effects.png")) > 0.5
+    assert json.loads((folder / "out" / "effects.json").read_text(encoding="utf-8")) == payload
+
+
+@pytest.mark.parametrize("accuracy", ["0", "abc", "150%", "-1%", "nan", "1%1"])
+def test_a_bad_accuracy_is_one_line(tmp_path, accuracy):
+    save_scene(law_scene(), tmp_path / "scene.toml")
+    result = CliRunner().invoke(main, ["effects", str(tmp_path / "scene.toml"), f"--accuracy={accuracy}"])
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1
+    assert "accuracy" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--duration-us", "-3"], "--duration-us"),
+        (["--only", "gravity"], "no effect 'gravity'"),
+        (["--write", "no/such/folder/reduced.toml"], "there is no folder"),
+    ],
+)
+def test_a_bad_call_is_one_line(tmp_path, options, said):
+    save_scene(law_scene(), tmp_path / "scene.toml")
+    result = CliRunner().invoke(main, ["effects", str(tmp_path / "scene.toml"), *options])
+    assert result.exit_code == 2
+    assert result.stderr.count("\n") == 1
+    assert said in result.stderr
+
+
+def test_an_unknown_scene_is_one_line():
+    result = CliRunner().invoke(main, ["effects", "figure99"])
+    assert result.exit_code == 2
+    assert result.stderr.count("\n") == 1
+    assert "figure11" in result.stderr
+
+
+@pytest.mark.parametrize("text", ["1%", "0.01", "1 %", " 1% "])
+def test_a_share_can_be_written_in_two_ways(text):
+    assert math.isclose(parse_share(text), 0.01, rel_tol=1e-15)

@@ -1,0 +1,220 @@
+"""Settling and observables, compared with closed forms, with orbits of the impact law, and with made-up sequences."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, single_impact_orbits
+from afm_jax.apparatus.drive import Tone
+from afm_jax.apparatus.excitation import BaseDrive
+from afm_jax.motion.long_run import LongRun, follow_long
+from afm_jax.motion.observables import Observables, observe
+from afm_jax.motion.poincare_section import poincare_section, strobe
+from afm_jax.motion.response_order import find_repetition
+from afm_jax.motion.settled import settled
+from afm_jax.motion.start import default_start, start_of, state
+from afm_jax.presets import contact_scene, figure10_scene, figure11_scene
+
+TABULATED = ImpactLaw(1.0, 113.6, 0.5, CollisionDelay(0.206, 5.64, 0.726))
+# physics.md, full contact, Q = 40: n, beta, sigma, peak height
+PEAKS = [(1.0001, 2.0, 0.0, 65.9), (1.01, 4.0, -2.0, 50.6), (1.01, 4.0, 0.0, 98.6), (1.01, 4.0, 2.0, 149.7)]
+
+
+def law_scene(law: ImpactLaw = TABULATED, reduced: float = 1.01) -> Scene:
+    return Scene(Cantilever(90.0, 40.0), Platform(4.0, 180.0 * reduced), law)
+
+
+def seen_of(scene: Scene, periods: float, start=None) -> tuple[LongRun, Observables]:
+    begin = default_start(scene) if start is None else start
+    run = follow_long(scene, begin, periods * float(scene.platform.period_us))
+    return run, observe(scene, run.simulation, harmonics=(1, 2), verdict=run.verdict)
+
+
+def spiral(m: int, n: int, rate: float, turns: float, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return departures of an (m, n) motion in periods of 2 us, that spirals in by `rate` a repetition."""
+    index = np.arange(count)
+    decay = 0.3 * rate ** (index / m)
+    angle = 2.0 * np.pi * turns * index / m
+    times = 2.0 * n * (index // m) + (2.0 * n / m * 0.9) * (index % m) + 0.1 * decay * np.cos(angle)
+    return times, 50.0 + 7.0 * (index % m) + 10.0 * decay * np.sin(angle)
+
+
+@pytest.mark.parametrize(("m", "n"), [(1, 1), (1, 5), (2, 3), (3, 4)])
+def test_a_repetition_is_found_with_its_smallest_period(m: int, n: int):
+    times, velocities = spiral(m, n, 0.8, 0.13, 90 * m)
+    found = find_repetition(times, velocities, 2.0, tolerance=1e-4)
+    assert found is not None
+    assert (found.contacts, found.periods) == (m, n)
+
+
+def test_a_slow_approach_has_not_arrived():
+    # each repetition moves by 1e-5 of the scale, but 1/(1 - rate) = 1000 of them are to come
+    times, velocities = spiral(1, 1, 0.999, 0.0, 3000)
+    moved = 2.0 * np.pi * abs(times[-1] - times[-2] - 2.0) / 2.0
+    assert moved < 1e-4
+    assert find_repetition(times, velocities, 2.0, tolerance=1e-4) is None
+    found = find_repetition(times, velocities, 2.0, tolerance=1.0)
+    assert found is not None
+    exact = 2.0 * np.pi * (times[-1] - 2.0 * (len(times) - 1)) / 2.0
+    # the series is geometric; the block's maximum is at most six repetitions old
+    np.testing.assert_allclose(found.remaining, exact, rtol=0.01)
+
+
+def test_chaos_does_not_repeat():
+    x = [0.3]
+    for _ in range(2000):
+        x.append(3.9 * x[-1] * (1.0 - x[-1]))
+    times = 2.0 * np.arange(len(x)) + 0.3 * np.array(x)
+    assert find_repetition(times, 40.0 + np.array(x), 2.0, tolerance=1e-4) is None
+
+
+def test_a_law_settles_on_its_orbit():
+    scene = law_scene()
+    orbits = single_impact_orbits(scene, 1)
+    wanted = np.asarray(orbits.admissible) & np.asarray(orbits.stable)
+    assert wanted.sum() == 1
+    slot = int(np.argmax(wanted))
+    velocity, phase = float(orbits.velocity_after_nm_per_us[slot]), float(orbits.phase_rad[slot])
+    time = phase / float(scene.platform.angular_frequency)
+    # a little off the orbit: the motion has to find it
+    run, seen = seen_of(scene, 400.0, state(time, float(scene.platform.position(time)), 1.02 * velocity))
+    assert (run.verdict.settled, run.verdict.contacts, run.verdict.periods) == (True, 1, 1)
+    # the transient has decayed to rounding, which the impact map's times carry as 1e-12 us
+    for name in ("peak_amplitude_nm", "lockin_amplitude_nm", "lockin_phase_deg"):
+        np.testing.assert_allclose(getattr(seen, name), float(getattr(orbits, name)[slot]), rtol=1e-7, err_msg=name)
+    section = poincare_section(scene, run.simulation)
+    np.testing.assert_allclose(section.drive_phase_deg[-1], np.degrees(phase), rtol=1e-7)
+    np.testing.assert_allclose(
+        section.approach_speed_nm_per_us[-1], float(orbits.approach_speed_nm_per_us[slot]), rtol=1e-7
+    )
+    stroboscopic = strobe(scene, run.simulation, phase_deg=90.0)
+    np.testing.assert_allclose(stroboscopic.position_nm[-1], stroboscopic.position_nm[-2], rtol=1e-7)
+
+
+def test_the_platform_gives_what_air_and_impacts_take():
+    # without delay the work of an impact is the platform's speed times the momentum it gives
+    scene = law_scene(ImpactLaw(0.9, 20.0))
+    run, seen = seen_of(scene, 300.0)
+    assert run.verdict.settled
+    rows = run.simulation.contacts
+    last = -1
+    speed = float(scene.platform.velocity(rows.departure_time_us[last]))
+    kick = float(rows.departure_velocity_nm_per_us[last] - rows.arrival_velocity_nm_per_us[last])
+    assert run.verdict.periods == 1
+    # the window is another repetition of a motion settled to rounding; its integrals are exact to 1e-9
+    np.testing.assert_allclose(seen.given_by_drives_aj, speed * kick, rtol=1e-6)
+    np.testing.assert_allclose(
+        seen.given_by_drives_aj, seen.dissipated_in_air_aj + seen.dissipated_in_contact_aj, rtol=1e-6
+    )
+
+
+def test_a_free_cantilever_responds_as_it_must():
+    free, driven, quality, amplitude = 90.0, 85.0, 40.0, 1.3
+    platform = Platform(0.0, driven)
+    scene = Scene(Cantilever(free, quality, 1.7), platform, None, BaseDrive(amplitude, driven, 25.0))
+    run, seen = seen_of(scene, 400.0)
+    assert (run.verdict.settled, run.verdict.contacts, run.verdict.periods) == (True, 0, 1)
+    ratio = driven / free
+    response = amplitude * np.exp(1j * np.radians(25.0)) / (1.0 - ratio**2 + 1j * ratio / quality)
+    deflection = response - amplitude * np.exp(1j * np.radians(25.0))
+    # what is left of the transient after 400 periods is 1e-14; the maximum is found to the square of a grid's step
+    np.testing.assert_allclose(seen.peak_amplitude_nm, abs(response), rtol=1e-8)
+    assert seen.peak_deflection_nm is not None
+    assert seen.deflection_harmonics is not None
+    np.testing.assert_allclose(seen.peak_deflection_nm, abs(deflection), rtol=1e-8)
+    for harmonic, exact in ((seen.harmonics[0], response), (seen.deflection_harmonics[0], deflection)):
+        np.testing.assert_allclose(harmonic.amplitude_nm, abs(exact), rtol=1e-9)
+        np.testing.assert_allclose(harmonic.phase_deg, np.degrees(np.angle(exact)) % 360.0, rtol=1e-9)
+    assert seen.harmonics[1].amplitude_nm < 1e-9 * abs(response)
+    # air takes (m Omega/Q) omega^2 a^2/2 a second
+    mass, omega = 1.7, 2e-3 * np.pi * driven
+    loss = mass * (2e-3 * np.pi * free / quality) * 0.5 * (omega * abs(response)) ** 2 * 2.0 * np.pi / omega
+    np.testing.assert_allclose(seen.dissipated_in_air_aj, loss, rtol=1e-9)
+    np.testing.assert_allclose(seen.given_by_drives_aj, loss, rtol=1e-9)
+
+
+def test_a_vibration_that_dies_away_settles_when_it_has():
+    scene = Scene(Cantilever(90.0, 40.0), Platform(1.0, 180.0), None)
+    short = follow_long(scene, state(0.0, 50.0, 0.0), 100.0)
+    assert not short.verdict.settled
+    assert "transient" in short.verdict.reason
+    # exp(-Omega t/2Q) = 1e-6 after 1955 us, and the velocity scale is the platform's 1.1 nm/us
+    assert follow_long(scene, state(0.0, 50.0, 0.0), 2500.0).verdict.settled
+
+
+def test_nothing_settles_under_a_ramp_or_two_frequencies():
+    ramped = Scene(Cantilever(90.0, 40.0), Platform(4.0, 181.8, 0.0, 1e-3), TABULATED)
+    beating = Scene(Cantilever(90.0, 40.0), Platform(4.0, 181.8, second=Tone(0.1, 33.0)), TABULATED)
+    for scene, why in ((ramped, "ramps"), (beating, "several frequencies")):
+        run, _ = seen_of(scene, 60.0)
+        assert (run.verdict.settled, run.verdict.periods) == (False, None)
+        assert why in run.verdict.reason
+
+
+def test_pieces_are_the_whole():
+    scene = law_scene(ImpactLaw(0.9, 20.0))
+    whole = follow_long(scene, default_start(scene), 400.5 * float(scene.platform.period_us))
+    assert whole.pieces > 1
+    times = np.asarray(whole.simulation.contacts.arrival_time_us)
+    assert np.all(np.diff(times) > 0.5 * float(scene.platform.period_us))
+    assert len(times) == int(whole.simulation.count) == 400
+
+
+def test_a_start_has_the_phase_it_was_told():
+    scene = law_scene()
+    begin = start_of(scene, (450.0, 5.0, 80.0))
+    assert float(begin.time_us) == pytest.approx(0.25 * float(scene.platform.period_us), rel=1e-14)
+    # a quarter of a period after its highest point the platform is at its mean, 0
+    assert [float(begin.position_nm), float(begin.velocity_nm_per_us)] == pytest.approx([5.0, 80.0], rel=1e-12)
+
+
+def test_bad_arguments_are_told():
+    scene = law_scene()
+    simulation = follow_long(scene, default_start(scene), 20.0).simulation
+    with pytest.raises(ValueError, match="`harmonics` must be positive integers, but are"):
+        observe(scene, simulation, harmonics=(0,))
+    with pytest.raises(ValueError, match="`tolerance` must be positive, but is 0"):
+        settled(scene, simulation, tolerance=0.0)
+
+
+@pytest.mark.parametrize(("reduced", "amplitude", "offset", "peak"), PEAKS)
+def test_the_contact_reaches_the_heights_of_the_paper(reduced: float, amplitude: float, offset: float, peak: float):
+    scene = contact_scene(reduced, amplitude, offset)
+    run, seen = seen_of(scene, 300.0)
+    assert (run.verdict.settled, run.verdict.contacts, run.verdict.periods) == (True, 1, 1)
+    # physics.md gives three digits
+    np.testing.assert_allclose(seen.peak_amplitude_nm, peak, rtol=2e-3)
+    # an integral of the drive's work, another of air, and the ledger of the contact: settled to 1e-8, exact to 1e-9
+    assert seen.energy_imbalance is not None
+    assert abs(seen.energy_imbalance) < 1e-6
+    np.testing.assert_allclose(
+        seen.given_by_drives_aj, seen.dissipated_in_air_aj + seen.dissipated_in_contact_aj, rtol=1e-6
+    )
+    assert seen.most_attractive_force_nn is not None
+    # the JKR contact pulls with 3/2 pi w R at most: 141.37 nN for w = 0.3 J/m^2, R = 100 nm
+    np.testing.assert_allclose(seen.most_attractive_force_nn, -1.5 * np.pi * 0.3 * 100.0, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_below_resonance_the_amplitude_falls_until_the_tip_sticks():
+    scene = figure10_scene(offset_nm=-0.5, offset_rate_nm_per_us=1e-3)
+    run = follow_long(scene, default_start(scene), 5500.0)
+    assert run.verdict.stuck
+    speeds = poincare_section(scene, run.simulation).approach_speed_nm_per_us
+    assert 10 < len(speeds) < 1000
+    # slower and slower impacts, down towards the capture speed of 10.9 nm/us
+    thirds = np.array_split(speeds, 3)
+    assert thirds[0].mean() > thirds[1].mean() > thirds[2].mean()
+
+
+@pytest.mark.slow
+def test_above_resonance_the_amplitude_rises():
+    scene = figure11_scene(offset_nm=-2.0, offset_rate_nm_per_us=1e-3)
+    run, seen = seen_of(scene, 4000.0 / float(scene.platform.period_us))
+    assert not run.verdict.stuck
+    speeds = poincare_section(scene, run.simulation).approach_speed_nm_per_us
+    fifths = [part.mean() for part in np.array_split(speeds, 5)]
+    assert all(a < b for a, b in pairwise(fifths))
+    # 149.7 nm at 2 nm; the ramp of 1e-3 nm/us lags by 0.14 nm of offset, 3.5 nm of height
+    assert 140.0 < seen.peak_amplitude_nm < 150.0

@@ -1,0 +1,182 @@
+"""The benchmark of driven scenes: its contacts one by one, its reference, SciPy's baseline, its judgement. No times."""
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from afm_jax.cli.bench_scenes import SCENE_COLUMNS
+from afm_jax.cli.main import main
+from afm_jax.motion.record import ContactKind, MotionOutcome
+from afm_jax.presets import contact_scene
+from afm_jax.study import own_process
+from afm_jax.study.driven_batches import batch_run, bouncing_starts, single_contacts, spread_starts
+from afm_jax.study.scene_benchmark import REFERENCE, aims, contact_errors
+from afm_jax.study.scipy_driven_contact import scipy_driven_contact
+from tests.reference_driven_contact import DrivenContact, follow
+
+SYSTEM = DrivenContact(amplitude_nm=4.0, drive_frequency_khz=180.0 * 5.277)
+
+
+@pytest.fixture(scope="module")
+def scene():
+    return contact_scene(5.277, 4.0, 0.0)
+
+
+@pytest.fixture(scope="module")
+def course():
+    """Contacts of an independent integration to 12 digits; from this start some of the first eight turn."""
+    return follow(SYSTEM, *SYSTEM.start(phase_deg=270.0, height_nm=5.0, velocity_nm_per_us=40.0), contacts=8)
+
+
+@pytest.fixture(scope="module")
+def followed(scene):
+    """A few tips with every contact in time, as the benchmark's reference is."""
+    starts = spread_starts(scene, 6)
+    run = jax.jit(batch_run(REFERENCE, 6))
+    found = run(scene, starts, starts.time_us + 30.0 * scene.platform.period_us)
+    single = single_contacts(scene, found, 6)
+    return starts, found, single, run(scene, single.starts, single.until_us)
+
+
+def test_the_reference_is_that_of_an_independent_integration(followed):
+    starts, found, *_ = followed
+    for tip in (0, 5):
+        state = [float(part[tip]) for part in starts]
+        expected = follow(SYSTEM, *state, contacts=2).contacts
+        for row, contact in enumerate(expected):
+            # two contacts multiply rounding and step errors by less than a thousand
+            assert float(found.contacts.arrival_time_us[tip, row]) == pytest.approx(contact.arrival_time_us, abs=1e-8)
+            assert float(found.contacts.rebound_speed_nm_per_us[tip, row]) == pytest.approx(
+                contact.rebound_speed_nm_per_us, rel=1e-8
+            )
+
+
+def test_a_single_contact_is_that_of_the_motion(followed):
+    _, found, _, alone = followed
+    assert np.all(np.asarray(alone.count) == 1)
+    assert np.all(np.asarray(alone.outcome) == MotionOutcome.FINISHED)
+    times = np.asarray(found.contacts.arrival_time_us)
+    for tip in range(6):
+        arrival = float(alone.contacts.arrival_time_us[tip, 0])
+        place = np.unravel_index(np.argmin(np.abs(times - arrival)), times.shape)
+        # taken up 1e-4 us before it, the contact begins where and as it did: rounding of 30 us
+        assert times[place] == pytest.approx(arrival, abs=1e-12)
+        for column in ("departure_time_us", "rebound_speed_nm_per_us"):
+            expected = float(getattr(found.contacts, column)[place])
+            assert float(getattr(alone.contacts, column)[tip, 0]) == pytest.approx(expected, rel=1e-9)
+
+
+def test_scipys_baseline_follows_straight_and_turning_contacts(scene, course):
+    turning = [contact for contact in course.contacts if contact.junctions != 1]
+    straight = [contact for contact in course.contacts if contact.junctions == 1]
+    assert turning
+    for contact in (straight[0], turning[0]):
+        found = scipy_driven_contact(scene, contact.arrival_time_us, contact.approach_speed_nm_per_us, rtol=1e-9)
+        assert found.junctions == contact.junctions
+        # SciPy's tolerance, times some tens of steps and the slow parts of a turning contact
+        assert found.rebound_speed_nm_per_us == pytest.approx(contact.rebound_speed_nm_per_us, rel=1e-6)
+        assert found.departure_time_us == pytest.approx(contact.departure_time_us, abs=1e-7)
+        assert found.evaluations > 100
+
+
+def test_scipy_says_that_a_tip_is_held():
+    with pytest.raises(ValueError, match=r"it is held|without an event"):
+        scipy_driven_contact(contact_scene(1e-3, 1e-3, 0.0), 0.0, 1.0, rtol=1e-6)
+
+
+def test_errors_are_shown_apart_for_contacts_that_turn(followed):
+    *_, single, alone = followed
+    turning = np.arange(6) < 2
+    wrong = alone._replace(
+        contacts=alone.contacts._replace(
+            rebound_speed_nm_per_us=alone.contacts.rebound_speed_nm_per_us
+            * (1.0 + jnp.where(turning, 1e-3, 1e-6)[:, None]),
+            departure_time_us=alone.contacts.departure_time_us + jnp.linspace(0.0, 1e-5, 6)[:, None],
+        )
+    )
+    row = contact_errors(wrong, alone, single._replace(turning=turning))
+    assert row["turning_share"] == pytest.approx(1.0 / 3.0, rel=1e-12)
+    assert row["different"] == 0
+    assert row["turning_rebound_error_median"] == pytest.approx(1e-3, rel=1e-9)
+    assert row["straight_rebound_error_worst"] == pytest.approx(1e-6, rel=1e-6)
+    assert row["straight_time_error_us_worst"] == pytest.approx(1e-5, rel=1e-6)
+    assert row["turning_time_error_us_worst"] == pytest.approx(2e-6, rel=1e-6)
+    # a contact that does not end has no error: it is counted
+    kind = alone.contacts.kind.at[3, 0].set(int(ContactKind.HELD))
+    lost = wrong._replace(contacts=wrong.contacts._replace(kind=kind))
+    assert contact_errors(lost, alone, single)["different"] == 1
+
+
+def test_starts_are_those_of_tips_that_keep_bouncing(scene):
+    def run(_, starts, until):
+        assert np.all(np.asarray(until > starts.time_us))
+        held = np.asarray(starts.velocity_nm_per_us) > 90.0
+        return SimpleNamespace(outcome=np.where(held, MotionOutcome.HELD, MotionOutcome.FINISHED))
+
+    starts, share = bouncing_starts(scene, run, 20, 10.0)
+    assert starts.velocity_nm_per_us.shape == (20,)
+    assert float(jnp.max(starts.velocity_nm_per_us)) <= 90.0
+    assert len(np.unique(np.asarray(starts.velocity_nm_per_us))) == 20
+    # of 38 to 120 nm/us a share of 30/82
+    assert share == pytest.approx(30.0 / 82.0, abs=0.05)
+
+    def none_left(_scene, _starts, until):
+        return SimpleNamespace(outcome=np.full(until.shape, MotionOutcome.HELD))
+
+    with pytest.raises(ValueError, match="only 0 keep bouncing"):
+        bouncing_starts(scene, none_left, 20, 10.0)
+
+
+ROWS = [
+    {
+        "what": "bouncing tips, accuracy 1e-06",
+        "scene": "n = 5.277",
+        "batch": 1000,
+        "periods": 150,
+        "contacts": 30_000,
+        "microseconds_per_contact": 11.0,
+        "seconds": 0.33,
+        "compile_s": 20.0,
+        "held_share": 0.0,
+        "failed": 0,
+        "turning_share": 0.13,
+        "different": 0,
+        "straight_rebound_error_99": 2e-7,
+        "straight_time_error_us_99": 3e-8,
+        "turning_rebound_error_99": 2e-6,
+        "turning_time_error_us_99": 3e-8,
+    },
+    {"what": "one tip, 1000 drive periods", "scene": "n = 5.277", "periods": 1000, "seconds": 1.5},
+]
+
+
+def test_aims_name_what_was_reached():
+    reached = {name: (value, bound) for name, value, bound in aims(ROWS)}
+    assert reached["driven contact, n = 5.277, us at 1e-6"] == (11.0, 12.0)
+    assert reached["driven contact, n = 5.277, turning, 99 % of rebound errors at 1e-6"] == (2e-6, 1e-6)
+    assert reached["driven contact, n = 5.277, straight, 99 % of time errors, us"][0] == 3e-8
+    assert reached["1000 drive periods, n = 5.277, seconds"] == (1.5, 1.0)
+
+
+def test_command_writes_its_table_and_judges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def measured(task, settings, *, cores):
+        assert (task, cores) == ("afm_jax.study.scene_benchmark:scenes_one_core", 1)
+        assert settings["batch"] == 20
+        return {"rows": ROWS, "reference_error": 1e-11, "reference_error_us": 1e-12}
+
+    monkeypatch.setattr(own_process, "run_in_own_process", measured)
+    result = CliRunner().invoke(main, ["bench", "--only", "scenes", "--quick", "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.stderr
+    assert "13.0%" in result.stdout
+    assert "at most 1 wanted, 1.5 reached, not met" in result.stdout
+    assert (tmp_path / "bench_scenes.csv").read_text("utf-8").splitlines()[0] == ",".join(SCENE_COLUMNS)
+    payload = json.loads((tmp_path / "bench.json").read_text("utf-8"))
+    assert payload["scene_rows"] == ROWS
+    assert payload["scene_reference_error_us"] == 1e-12
+    assert [aim["met"] for aim in payload["aims"]] == [True, True, True, False, True, False]

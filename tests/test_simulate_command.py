@@ -1,0 +1,147 @@
+"""`afm-jax simulate`: its numbers against orbits of the impact law, its files, and its refusals."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, save_scene, single_impact_orbits
+from afm_jax.cli.main import main
+from afm_jax.scenefile import Start
+from tests.fresh_python import python
+
+LAW = Scene(Cantilever(90.0, 40.0), Platform(4.0, 181.8), ImpactLaw(0.9, 20.0))
+KEYS = {"impacts", "stuck", "settled", "order", "peak_amplitude_nm", "lockin_amplitude_nm", "final"}
+
+
+def simulate(*arguments: object) -> Result:
+    return CliRunner().invoke(main, ["simulate", *map(str, arguments)], prog_name="afm-jax")
+
+
+@pytest.fixture
+def law_file(tmp_path: Path) -> Path:
+    path = tmp_path / "law.toml"
+    save_scene(LAW, path)
+    return path
+
+
+def nulls(value: object, name: str = "") -> set[str]:
+    """Return the keys at the top of an answer that are null."""
+    return {key for key, item in value.items() if item is None} if isinstance(value, dict) else {name}
+
+
+def test_without_a_duration_it_ends_when_settled(law_file: Path, tmp_path: Path):
+    result = simulate(law_file, "--json", "--out", tmp_path / "out", "--harmonics", "1,3")
+    assert result.exit_code == 0, result.stderr
+    answer = json.loads(result.stdout)
+    assert answer.keys() >= KEYS
+    assert nulls(answer) == answer["null_reasons"].keys()
+    orbits = single_impact_orbits(LAW, 1)
+    slot = int(np.argmax(np.asarray(orbits.admissible) & np.asarray(orbits.stable)))
+    assert (answer["settled"], answer["stuck"], answer["order"], answer["contacts_per_response"]) == (True, False, 1, 1)
+    # the start is on the orbit, the impact map stays there to rounding
+    for key in ("peak_amplitude_nm", "lockin_amplitude_nm", "lockin_phase_deg"):
+        np.testing.assert_allclose(answer[key], float(getattr(orbits, key)[slot]), rtol=1e-7, err_msg=key)
+    assert [harmonic["multiple"] for harmonic in answer["harmonics"]] == [1, 3]
+    with (tmp_path / "out" / "contacts.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == answer["impacts"]
+    speed = float(orbits.approach_speed_nm_per_us[slot])
+    np.testing.assert_allclose([float(row["approach_speed_nm_per_us"]) for row in rows], speed, rtol=1e-7)
+    with (tmp_path / "out" / "trajectory.csv").open(encoding="utf-8", newline="") as file:
+        heights = [float(row["position_nm"]) for row in csv.DictReader(file)]
+    # 2001 points a period: the highest misses the top by (pi/2001)^2/2 of the curve's scale at most
+    np.testing.assert_allclose(max(heights), answer["peak_amplitude_nm"], rtol=1e-5)
+    assert json.loads((tmp_path / "out" / "simulate.json").read_text()) == answer
+
+
+def test_the_text_says_the_same(law_file: Path):
+    answer = json.loads(simulate(law_file, "--periods", 60.5, "--json").stdout)
+    text = simulate(law_file, "--periods", 60.5).stdout
+    assert f"{answer['impacts']} contacts" in text
+    assert "Settled: the motion repeats: 1 contact in 1 drive period." in text
+    assert f"Peak amplitude {answer['peak_amplitude_nm']:.6g} nm" in text
+    assert answer["impacts"] == 60
+    period = float(LAW.platform.period_us)
+    np.testing.assert_allclose(answer["final"]["time_us"] - answer["start"]["time_us"], 60.5 * period, rtol=1e-12)
+    assert answer["final"]["phase"] == "dry"
+
+
+def test_too_short_to_settle_is_said_and_no_failure(law_file: Path):
+    result = simulate(law_file, "--duration-us", 20, "--json")
+    answer = json.loads(result.stdout)
+    assert (result.exit_code, answer["settled"], answer["order"]) == (0, False, None)
+    assert "no sequence" in answer["settled_reason"]
+    assert "Not settled: " in simulate(law_file, "--duration-us", 20).stdout
+
+
+def test_a_tip_too_slow_sticks(tmp_path: Path):
+    path = tmp_path / "stuck.toml"
+    # 2 nm over the sample at rest: it comes far below the capture speed of 10.9 nm/us
+    scene = Scene(Cantilever(90.0, 40.0), Platform(0.1, 180.0), Contact.paper())
+    save_scene(scene, path, start=Start(0.0, 8.0, -1.0))
+    result = simulate(path, "--periods", 60, "--json")
+    answer = json.loads(result.stdout)
+    assert result.exit_code == 0, result.stderr
+    assert (answer["stuck"], answer["settled"], answer["order"], answer["impacts"]) == (True, True, None, 1)
+    assert answer["final"]["phase"] in ("bridge", "junction")
+    # it rests within the range of the junction: between the deepest static gap and where the junction breaks
+    assert abs(answer["final"]["position_nm"]) < 2.0
+    assert nulls(answer) == answer["null_reasons"].keys()
+
+
+def test_a_preset_has_its_start():
+    result = simulate("figure2", "--periods", 30, "--json")
+    assert result.exit_code == 0, result.stderr
+    answer = json.loads(result.stdout)
+    assert answer["scene"]["platform"]["offset_nm"] == -1.0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--duration-us", "-1"), "--duration-us must be a positive number, but is -1"),
+        (("--duration-us", "nan"), "--duration-us must be a positive number, but is nan"),
+        (("--periods", "0"), "--periods must be a positive number, but is 0"),
+        (("--periods", "3", "--duration-us", "3"), "say the same: give one of them"),
+        (("--harmonics", "1,0"), "must be integers from 1 to 1000 as in 1,2,3, but is 1,0"),
+    ],
+)
+def test_wrong_calls_are_one_line(law_file: Path, arguments: tuple[str, ...], message: str):
+    result = simulate(law_file, *arguments)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert message in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_wrong_scenes_are_one_line(tmp_path: Path):
+    ramp = tmp_path / "ramp.toml"
+    save_scene(Scene(LAW.cantilever, Platform(4.0, 181.8, 0.0, 1.0), LAW.interaction), ramp)
+    inside = tmp_path / "inside.toml"
+    save_scene(LAW, inside, start=Start(0.0, 5.0, 0.0))
+    inside.write_text(inside.read_text().replace("height_above_platform_nm = 5.0", "height_above_platform_nm = -5.0"))
+    cases = {
+        (str(ramp), "--duration-us", "20000"): "out of the range of 10000 nm",
+        (str(inside),): "height_above_platform_nm",
+        ("figure99",): "there is no such file or preset; presets are figure2",
+        (str(tmp_path / "none.toml"),): "none.toml",
+    }
+    for arguments, message in cases.items():
+        result = simulate(*arguments, "--json")
+        assert (result.exit_code, result.stdout) == (2, ""), result.stderr
+        assert message in result.stderr
+        assert len(result.stderr.splitlines()) == 1
+
+
+def test_help_does_without_jax():
+    code = (
+        "import sys\n"
+        "from click.testing import CliRunner\n"
+        "from afm_jax.cli.main import main\n"
+        "result = CliRunner().invoke(main, ['simulate', '--help'])\n"
+        "print(result.exit_code, 'PRESET' in result.output, 'jax' in sys.modules)"
+    )
+    assert python(code) == "0 True False"
