@@ -3,6 +3,7 @@ PYTHON ?= python3
 TABLE ?=
 MODEL ?= law
 OUT ?= report
+PYTEST ?= -m pytest
 
 BIN := .venv/bin
 SETUP := .venv/.installed
@@ -25,7 +26,7 @@ fit: $(SETUP) ## fit the bundled table (or TABLE=..., MODEL=...), print the impa
 	$(BIN)/afm-jax fit $(if $(TABLE),'$(TABLE)',--example) --model $(MODEL) --out $(OUT)
 
 test: $(SETUP) ## the tests (under 10 minutes on two cores)
-	$(BIN)/python -m pytest -n auto --dist loadscope
+	$(BIN)/python $(PYTEST) -n auto --dist loadscope
 
 lint: $(SETUP)
 	$(BIN)/ruff format --check .
@@ -34,14 +35,16 @@ lint: $(SETUP)
 types: $(SETUP)
 	$(BIN)/pyright
 
-coverage: $(SETUP)
-	$(BIN)/python -m coverage run -m pytest -q
+coverage: $(SETUP) ## make test, with the share of lines that it runs (85 % at least)
+	$(BIN)/python -m coverage erase
+	$(MAKE) test PYTEST='-m coverage run -m pytest'
+	$(BIN)/python -m coverage combine --quiet
 	$(BIN)/python -m coverage report --fail-under=85
 
 slow: $(SETUP)
 	$(BIN)/python -m pytest -m slow
 
-check: lint types test coverage slow ## all that CI runs: format, lint, types, tests, coverage, slow tests, notebooks
+check: lint types coverage slow ## all that CI runs: format, lint, types, tests, coverage, slow tests, notebooks
 
 bench: $(SETUP) ## impacts per second, next to SciPy
 	$(BIN)/afm-jax bench --out $(OUT)

@@ -18,7 +18,7 @@ jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parent.parent 
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 
 # The same examples on every run: a failure is then a change of the code. HYPOTHESIS_PROFILE=random rolls new ones.
-hypothesis.settings.register_profile("repeatable", derandomize=True, database=None, print_blob=True)
+hypothesis.settings.register_profile("repeatable", derandomize=True, database=None, print_blob=True, deadline=None)
 hypothesis.settings.register_profile("random", print_blob=True)
 hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
 

@@ -101,7 +101,8 @@ def test_ladder_of_a_law_ends_at_its_own_map(law_file: str):
     assert rows["single-impact orbit with delay"]["model_error"] < 1e-9
     # physics.md: without the delay 208 nm instead of 99
     assert rows["single-impact orbit"]["model_error"] == pytest.approx(208.0 / 99.0 - 1.0, abs=0.03)
-    assert rows["impact map with delay"]["peak_nm"] == pytest.approx(99.0, abs=0.3)
+    # 99.0 there with the tabulated delay; the delay law differs by 0.001 us, which is 1 % of the amplitude at most
+    assert rows["impact map with delay"]["peak_nm"] == pytest.approx(99.0, rel=0.01)
 
 
 def test_ladder_says_why_a_model_has_no_answer(tmp_path: Path):
@@ -113,6 +114,7 @@ def test_ladder_says_why_a_model_has_no_answer(tmp_path: Path):
         assert "orbit" in row["reason"] or "captured" in row["reason"]
 
 
+@pytest.mark.slow
 def test_contact_settings_approach_an_independent_integration(contact_file: str):
     start = scene_and_start(contact_file)[1]
     settings = {"accuracies": [], "quick": [], "careful": [3.0, 5.0], "repetitions": 1}
@@ -132,6 +134,7 @@ def test_contact_settings_approach_an_independent_integration(contact_file: str)
     assert result["peak_nm"] == pytest.approx(course.sample(times)[0].max(), abs=1e-2)
 
 
+@pytest.mark.slow
 def test_law_of_a_scene_is_fitted_over_its_own_speeds(contact_file: str):
     scene, start = scene_and_start(contact_file)
     found = simulate(scene, start, 60.0, max_contacts=20, accuracy=1e-6)

@@ -188,6 +188,7 @@ def test_wrong_calls_are_named():
         collide(Contact.paper(viscosity_pa_s=jnp.full(3, 1e-3)), jnp.array([20.0, 30.0]))
 
 
+@pytest.mark.slow
 def test_the_same_program_serves_other_numbers():
     traces = []
 

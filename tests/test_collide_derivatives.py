@@ -72,6 +72,7 @@ def test_capture_speed_has_derivatives():
         assert float(slope) == pytest.approx(expected, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_gradients_are_finite_whatever_the_outcome():
     speeds = jnp.array([-1.0, 1e-3, 5.0, 10.938450059, 10.9384500597, 1e4])
 

@@ -129,6 +129,7 @@ def test_what_a_law_does_not_need_is_known_from_the_closed_form(law_study):
     assert size_of(by_name(law_study)["adhesion"].change) < 0.02
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("quality_factor", "needed"), [(40.0, True), (1e6, False)])
 def test_air_damping_is_needed_near_resonance_unless_there_is_nearly_none(programs, quality_factor, needed):
     # lossy impacts, so that the motion settles without air too
@@ -156,6 +157,7 @@ def test_a_free_cantilever_without_air_at_resonance_has_no_steady_response(progr
     assert reduction_of(study).left_out == ()
 
 
+@pytest.mark.slow
 def test_a_second_frequency_is_compared_over_the_last_fifth(programs):
     platform = Platform(4.0, 181.8, 0.0, 0.0, Tone(1e-7, 47.0))
     scene = Scene(Cantilever(90.0, 40.0), platform, LAW)
@@ -221,6 +223,7 @@ def thin_liquid(programs):
     return contact_study(programs, 1e-9)
 
 
+@pytest.mark.slow
 def test_a_force_of_no_strength_changes_nothing_and_is_dropped(thin_liquid):
     structural = by_name(thin_liquid)["structural"]
     assert structural.effect.is_zero
@@ -231,6 +234,7 @@ def test_a_force_of_no_strength_changes_nothing_and_is_dropped(thin_liquid):
     assert structural.cost.program.operations < thin_liquid.cost.program.operations
 
 
+@pytest.mark.slow
 def test_a_viscosity_of_a_billionth_is_negligible(thin_liquid):
     assert size_of(by_name(thin_liquid)["viscous"].change) < 1e-4
     assert set(reduction_of(thin_liquid).left_out) == {"structural", "viscous"}
@@ -238,6 +242,7 @@ def test_a_viscosity_of_a_billionth_is_negligible(thin_liquid):
     assert reduction_of(thin_liquid).cost.program.operations < thin_liquid.cost.program.operations
 
 
+@pytest.mark.slow
 def test_ten_times_the_viscosity_of_water_is_not(programs, thin_liquid):
     del thin_liquid  # its programs are used again
     study = contact_study(programs, 1e-2)
@@ -245,6 +250,7 @@ def test_ten_times_the_viscosity_of_water_is_not(programs, thin_liquid):
     assert reduction_of(study).left_out == ("structural",)
 
 
+@pytest.mark.slow
 def test_what_a_contact_cannot_do_without_is_required(thin_liquid):
     for name in ("core", "jkr"):
         report = by_name(thin_liquid)[name]

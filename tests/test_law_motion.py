@@ -316,6 +316,7 @@ def test_derivatives_are_differences(end, at):
         np.testing.assert_allclose(slope, difference, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_reverse_is_forward():
     weights = jnp.array([0.3, -0.7])
     _, forward = value_and_slopes(end_of_a_rest, *AT_REST)

@@ -178,8 +178,8 @@ def test_derivatives_forward_and_reverse():
             Platform(4.0, 180.0 * 5.277, offset),
             Contact.paper(viscosity_pa_s=viscosity),
         )
-        simulation = simulate(scene, State(*start), 12.0, max_contacts=6, reverse=reverse, max_rounds=12)
-        return simulation.contacts.arrival_time_us[3]
+        simulation = simulate(scene, State(*start), 14.0, max_contacts=4, reverse=reverse, max_rounds=8)
+        return simulation.contacts.arrival_time_us[1]
 
     at = jnp.array([0.1, 1.005e-3, 40.0])
     forward = jax.jacfwd(lambda p: last_arrival(p, reverse=False))(at)
@@ -192,7 +192,7 @@ def test_derivatives_forward_and_reverse():
         moved = reference(
             5.277, 4.0, offset, quality_factor=quality, contact=ContactParameters(viscosity_pa_s=viscosity)
         )
-        return follow(moved, *start, until_us=100.0, contacts=4).contacts[3].arrival_time_us
+        return follow(moved, *start, until_us=100.0, contacts=2).contacts[1].arrival_time_us
 
     for place, step in enumerate((1e-4, 1e-6, 1e-2)):
         shift = np.zeros(3)

@@ -97,8 +97,9 @@ def text_of(payload: Mapping[str, Any]) -> list[str]:
     """Return a short summary of a simulation, a line each."""
     final, window = payload["final"], payload["window"]
     head = "Settled" if payload["settled"] else "Not settled"
+    plural = "" if payload["impacts"] == 1 else "s"
     lines = [
-        f"{payload['impacts']} contacts from {payload['start']['time_us']:.6g} to {final['time_us']:.6g} us.",
+        f"{payload['impacts']} contact{plural} from {payload['start']['time_us']:.6g} to {final['time_us']:.6g} us.",
         f"{head}: {payload['settled_reason']}.",
     ]
     lines.append(

@@ -198,7 +198,7 @@ def _land(trial: Trial, until_us: Float[Array, "..."], below: Array, above: Arra
     moving = at_threshold & (rates.x != 0.0)
     rest = jnp.where(moving, (target - end.x) / jnp.where(moving, rates.x, 1.0), 0.0)
     ends = late & ~at_threshold
-    rest = jnp.where(ends, (until_us - end.time_us) / rates.time_us, rest)
+    rest = jnp.where(ends, (until_us - end.time_us) / jnp.where(ends, rates.time_us, 1.0), rest)
     moved = jax.tree.map(lambda value, rate: value + rate * rest, end, rates)
     place = moved._replace(x=jnp.where(at_threshold, target, moved.x), time_us=jnp.where(ends, until_us, moved.time_us))
     return _Landing(place, near_low, near_high)

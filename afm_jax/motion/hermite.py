@@ -31,7 +31,9 @@ def turning_point(start: Array, start_slope: Array, end: Array, end_slope: Array
     bend = 3.0 * (end - start) - 2.0 * start_slope - end_slope
     twist = 2.0 * (start - end) + start_slope + end_slope
     # 3 twist x^2 + 2 bend x + start_slope = 0, the root between 0 and 1 in the form that does not cancel
-    root = jnp.sqrt(jnp.maximum(bend * bend - 3.0 * twist * start_slope, 0.0))
+    square = bend * bend - 3.0 * twist * start_slope
+    real = square > 0.0
+    root = jnp.where(real, jnp.sqrt(jnp.where(real, square, 1.0)), 0.0)
     below = jnp.where(start_slope > 0.0, root, -root) - bend
     share = start_slope / jnp.where(below == 0.0, 1.0, below)
     share = jnp.clip(share, 0.0, 1.0)

@@ -18,6 +18,8 @@ from afm_jax.motion.trajectory import Trajectory, nodes, trajectory
 from afm_jax.motion.window import Window, window_of
 
 _LOADS = 4001
+_COVERED = 1e-6
+"""Share of a window that may be missing from its nodes: rounding."""
 
 
 class Harmonic(NamedTuple):
@@ -98,6 +100,8 @@ def observe(
 
     Raises:
         ValueError: if a harmonic is not a positive integer, or there are none.
+        RuntimeError: if the dense trajectory does not cover the window, its contacts having ended otherwise than the
+            simulation's.
     """
     if not harmonics or any(k != int(k) or k < 1 for k in harmonics):
         raise ValueError(f"`harmonics` must be positive integers, but are {tuple(harmonics)}")
@@ -106,6 +110,7 @@ def observe(
     window = window_of(scene, simulation, verdict, drive)
     begin, end = window.from_us, window.to_us
     times, weights = nodes(scene, simulation, begin, end)
+    _check_covered(float(np.sum(weights)), end - begin)
     path = trajectory(scene, simulation, times)
     ends = trajectory(scene, simulation, np.array([begin, end]))
     energy = energy_balance(scene, simulation, path, weights, ends)
@@ -139,6 +144,15 @@ def observe(
         else _harmonics(deflection, times, weights, window, drive, harmonics),
         mean_deflection_nm=None if deflection is None else float(np.sum(weights * deflection)) / span,
     )
+
+
+def _check_covered(found_us: float, wanted_us: float) -> None:
+    """Check that the nodes of a window cover it: integrals over part of it would be wrong in silence."""
+    if not abs(found_us - wanted_us) <= _COVERED * wanted_us:
+        raise RuntimeError(
+            f"the dense trajectory covers {found_us:.6g} of the {wanted_us:.6g} us of the window: integrated "
+            "once more, a contact ended otherwise than in the simulation, which is not to be trusted there"
+        )
 
 
 def _harmonics(

@@ -6,7 +6,7 @@ here keep the interface of `vmap`: under it, work written for arrays of any shap
 derivatives pass through; reverse ones do not.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
@@ -26,20 +26,28 @@ def side_by_side(work: Callable[..., Any]) -> Callable[..., Any]:
         work: a function of arrays that broadcast against each other; its results have their common shape.
     """
 
-    @custom_vmap
-    def wrapped(*arguments):
-        return work(*arguments)
+    def called(*arguments):
+        leaves, tree = jax.tree.flatten(arguments)
 
-    @wrapped.def_vmap
-    def batched(size, flags, *arguments):
-        flags = tuple(flags)
-        rank = max(leaf.ndim + (not flag) for flag, leaf in _pairs(flags, arguments))
-        shape = _common_shape(size, flags, arguments)
-        aligned = jax.tree.map(lambda flag, leaf: _aligned(leaf, rank) if flag else leaf, flags, arguments)
-        results = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, shape), wrapped(*aligned))
-        return results, jax.tree.map(lambda _: True, results)
+        def of_leaves(*leaves):
+            return work(*jax.tree.unflatten(tree, leaves))
 
-    return wrapped
+        # `custom_vmap` sees flat arrays: its derivatives stumble over a None in a tree. In its rules it must not be
+        # called again: a batch of derivatives at one point comes as a batch without a batched argument.
+        flat = custom_vmap(of_leaves)
+
+        @flat.def_vmap
+        def batched(size, flags, *leaves):
+            if not any(flags):
+                results = of_leaves(*leaves)
+                return results, jax.tree.map(lambda _: False, results)
+            shape, aligned = _lined_up(size, flags, leaves)
+            results = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, shape), of_leaves(*aligned))
+            return results, jax.tree.map(lambda _: True, results)
+
+        return flat(*leaves)
+
+    return called
 
 
 def for_the_few(
@@ -49,7 +57,7 @@ def for_the_few(
 
     Args:
         work: a function of arrays that returns its argument number `changed`, changed where `needed`.
-        needed: says of the same arguments whether a tip needs the work.
+        needed: says of the same arguments, the common ones left out, whether a tip needs the work.
         changed: the number of that argument.
         common: the number of leading arguments that are passed on to `work` alone.
 
@@ -57,25 +65,43 @@ def for_the_few(
         A function like `work`.
     """
 
-    @custom_vmap
-    def wrapped(*arguments):
-        return work(*arguments)
+    def called(*arguments):
+        leaves, tree = jax.tree.flatten(arguments)
+        before = len(jax.tree.leaves(arguments[:changed]))
+        of_changed = slice(before, before + len(jax.tree.leaves(arguments[changed])))
 
-    @wrapped.def_vmap
-    def gathered(size, flags, *arguments):
-        flags = tuple(flags)
-        rank = max(leaf.ndim + (not flag) for flag, leaf in _pairs(flags, arguments))
-        if rank > 1:
-            # a batch of batches: one after the other
-            axes = jax.tree.map(lambda flag: 0 if flag else None, flags)
-            results = _one_by_one(wrapped, size, axes, arguments)
-            return results, jax.tree.map(lambda _: True, results)
-        every = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (size,)), arguments[changed])
-        flags = [*flags]
-        flags[changed] = jax.tree.map(lambda _: True, every)
-        full = [*arguments]
-        full[changed] = every
-        needs = jnp.broadcast_to(needed(*full[common:]), (size,))
+        def of_leaves(*leaves):
+            return tuple(jax.tree.leaves(work(*jax.tree.unflatten(tree, leaves))))
+
+        flat = custom_vmap(of_leaves)
+
+        @flat.def_vmap
+        def gathered(size, flags, *leaves):
+            if not any(flags):
+                results = of_leaves(*leaves)
+                return results, (False,) * len(results)
+            if max(leaf.ndim + (not flag) for flag, leaf in zip(flags, leaves, strict=True)) > 1:
+                # a batch of batches: one after the other
+                results = _one_by_one(of_leaves, size, flags, leaves)
+                return results, (True,) * len(results)
+            results = _few_at_once(of_leaves, lambda *now: needed(*jax.tree.unflatten(tree, now)[common:]), of_changed)(
+                size, flags, leaves
+            )
+            return results, (True,) * len(results)
+
+        return jax.tree.unflatten(jax.tree.structure(arguments[changed]), flat(*leaves))
+
+    return called
+
+
+def _few_at_once(work: Callable[..., Any], needed: Callable[..., Any], changed: slice) -> Callable[..., Any]:
+    """Return how a batch of flat arguments is worked on: those in need, gathered in blocks."""
+
+    def worked(size: int, flags: Sequence[bool], leaves: Sequence[Array]) -> tuple[Array, ...]:
+        marks, full = [*flags], [*leaves]
+        full[changed] = [jnp.broadcast_to(leaf, (size,)) for leaf in full[changed]]
+        marks[changed] = [True] * len(full[changed])
+        needs = jnp.broadcast_to(needed(*full), (size,))
         count, block = jnp.sum(needs), min(_BLOCK, size)
         # those in need first; beyond the last an index that is dropped
         order = jnp.where(jnp.arange(size) < count, jnp.argsort(~needs), size)
@@ -86,40 +112,31 @@ def for_the_few(
             chosen = lax.dynamic_slice(order, (done,), (block,))
             now = [*full]
             now[changed] = values
-            taken = jax.tree.map(
-                lambda flag, leaf: leaf.at[chosen].get(mode="clip") if flag else leaf, tuple(flags), tuple(now)
-            )
+            taken = [leaf.at[chosen].get(mode="clip") if mark else leaf for mark, leaf in zip(marks, now, strict=True)]
             after = work(*taken)
-            values = jax.tree.map(lambda old, new: old.at[chosen].set(new, mode="drop"), values, after)
+            values = tuple(old.at[chosen].set(new, mode="drop") for old, new in zip(values, after, strict=True))
             return done + block, values
 
-        _, values = lax.while_loop(lambda state: state[0] < count, one_block, (jnp.zeros_like(count), every))
-        return values, jax.tree.map(lambda _: True, values)
+        begin = (jnp.zeros_like(count), tuple(full[changed]))
+        return lax.while_loop(lambda state: state[0] < count, one_block, begin)[1]
 
-    return wrapped
+    return worked
 
 
-def _one_by_one(work: Callable[..., Any], size: int, axes: Any, arguments: tuple[Any, ...]) -> Any:
+def _one_by_one(work: Callable[..., Any], size: int, flags: Sequence[bool], leaves: Sequence[Array]) -> Any:
     def one(index):
-        picked = jax.tree.map(
-            lambda axis, leaf: leaf if axis is None else leaf[index],
-            axes,
-            arguments,
-            is_leaf=lambda node: node is None,
-        )
-        return work(*picked)
+        return work(*(leaf[index] if flag else leaf for flag, leaf in zip(flags, leaves, strict=True)))
 
     return lax.map(one, jnp.arange(size))
 
 
-def _pairs(flags: Any, arguments: Any) -> list[tuple[bool, Array]]:
-    return list(zip(jax.tree.leaves(flags), jax.tree.leaves(arguments), strict=True))
-
-
-def _aligned(leaf: Array, rank: int) -> Array:
-    return leaf.reshape(leaf.shape[0], *(1,) * (rank - leaf.ndim), *leaf.shape[1:])
-
-
-def _common_shape(size: int, flags: Any, arguments: Any) -> tuple[int, ...]:
-    inner = jnp.broadcast_shapes(*(leaf.shape[1:] if flag else leaf.shape for flag, leaf in _pairs(flags, arguments)))
-    return (size, *inner)
+def _lined_up(size: int, flags: Sequence[bool], leaves: Sequence[Array]) -> tuple[tuple[int, ...], list[Array]]:
+    """Return the common shape of a batch, and its arrays with the batch as first axis of that shape."""
+    pairs = list(zip(flags, leaves, strict=True))
+    inner = jnp.broadcast_shapes(*(leaf.shape[1:] if flag else leaf.shape for flag, leaf in pairs))
+    rank = 1 + len(inner)
+    aligned = [
+        leaf.reshape(leaf.shape[0], *(1,) * (rank - leaf.ndim), *leaf.shape[1:]) if flag else leaf
+        for flag, leaf in pairs
+    ]
+    return (size, *inner), aligned

@@ -25,6 +25,8 @@ from afm_jax.parameters import check_parameter, is_traced, require_float64
 DEFAULT_ACCURACY = 1e-9
 _ROUNDS_PER_CONTACT = 4
 _SPARE_ROUNDS = 64
+_TRIALS_BACKWARDS = 40
+"""Trial steps of a round when all of them are run and kept for the way back."""
 
 
 def simulate(
@@ -79,7 +81,8 @@ def simulate(
     rounds = max_rounds if max_rounds is not None else _ROUNDS_PER_CONTACT * room + _SPARE_ROUNDS
     setting = setting_of(accuracy)
     if reverse:
-        setting = setting._replace(quick=None)
+        # the quick way tells by NaN that it does not hold, which reverse derivatives would spread
+        setting = setting._replace(quick=None, trials=_TRIALS_BACKWARDS)
     return _contact(
         scene, surface, response, begin_at, until, rows=room, setting=setting, rounds=rounds, reverse=reverse
     )

@@ -12,6 +12,9 @@ from afm_jax.plots.picture_style import BLUE, DARK, GRID, label_axes, new_figure
 _PANELS = 3
 _GAP_SHOWN_NM = 6.0
 _CURVES = 3
+_STROKES = ((GRID, 5.0), (BLUE, 3.2), ("black", 1.4))
+"""Wide below narrow, so that loops that coincide all show."""
+_SIDE = {"bridge breaks": "center", "bridge forms": "center", "junction breaks": "bottom", "junction forms": "top"}
 
 
 def draw_gap(look: Look, path: Path) -> None:
@@ -39,7 +42,7 @@ def draw_gap(look: Look, path: Path) -> None:
     lowest = min(axes.get_ylim()[0] for axes in panels)
     panels[0].set_ylim(lowest, 1.35 * top)
     for name, gap in marks.items():
-        panels[-1].annotate(f" {name}", (1.0, gap), xycoords=("axes fraction", "data"), va="center", fontsize=9)
+        panels[-1].annotate(f" {name}", (1.0, gap), xycoords=("axes fraction", "data"), va=_SIDE[name], fontsize=9)
     handles, labels = panels[0].get_legend_handles_labels()
     if handles:
         panels[0].legend(handles, labels, loc="upper center", fontsize=10, framealpha=1.0)
@@ -70,28 +73,41 @@ def _marks(contact: Contact) -> dict[str, float]:
 
 
 def draw_force_gap(look: Look, path: Path) -> None:
-    """Draw the force against the gap through the last contacts as a PNG file, one loop each."""
-    picture = new_figure(8.0, 5.4)
-    axes = picture.subplots()
+    """Draw the force against the gap through the last contacts as a PNG file: all of it, and the attractive part."""
+    picture = new_figure(12.0, 5.0)
+    whole, part = picture.subplots(1, 2, width_ratios=[1.0, 1.5])
     rows = np.arange(look.arrival_us.size)[-_CURVES:]
-    shades = (GRID, BLUE, "black")[-len(rows) :]
-    for row, colour in zip(rows, shades, strict=True):
-        begin, end = _around(look, int(row))
-        part = look.between(begin, end)
+    least = 0.0
+    for row, (colour, width) in zip(rows, _STROKES[-len(rows) :], strict=True):
+        path_of_row = look.between(*_around(look, int(row)))
         lost = float(np.asarray(look.contacts.energy_lost_aj)[look.used][row])
         label = f"contact {row + 1}: {lost:.1f} aJ lost"
-        axes.plot(part.gap_nm, part.force_nn, color=colour, linewidth=1.6 if colour == "black" else 2.6, label=label)
-    contact = look.scene.interaction
-    low, high = axes.get_ylim()
-    for name, gap in _marks(contact).items():
-        axes.axvline(gap, color=DARK, linewidth=0.9, linestyle=(0, (1, 2)))
-        # each name on the side where there is room
-        side = "right" if name in ("junction forms", "bridge forms") else "left"
-        axes.annotate(name, (gap, low), rotation=90, ha=side, va="bottom", fontsize=9, color=DARK)
-    axes.set_ylim(low, high)
-    with_zero_line(axes)
-    axes.set_xlim(right=_GAP_SHOWN_NM)
-    label_axes(axes, x="gap (nm)", y="force on the tip (nN)")
-    axes.legend(loc="upper right", fontsize=10, framealpha=1.0)
-    axes.set_title("Force against gap: the loops are what each contact costs", fontsize=12, loc="left")
+        least = min(least, float(path_of_row.force_nn.min()))
+        for axes in (whole, part):
+            axes.plot(path_of_row.gap_nm, path_of_row.force_nn, color=colour, linewidth=width, label=label)
+    for name, gap in _marks(look.scene.interaction).items():
+        part.axvline(gap, color=DARK, linewidth=0.9, linestyle=(0, (1, 2)))
+        # two close lines have their names on their outer sides; left of where the junction forms the curve is high
+        side, align = (-2, "right") if name.endswith("forms") else (2, "left")
+        height, end = (0.03, "bottom") if name == "junction forms" else (0.97, "top")
+        part.annotate(
+            name,
+            (gap, height),
+            (side, 0),
+            xycoords=("data", "axes fraction"),
+            textcoords="offset points",
+            rotation=90,
+            ha=align,
+            va=end,
+            fontsize=9,
+            color=DARK,
+        )
+    for axes in (whole, part):
+        with_zero_line(axes)
+        label_axes(axes, x="gap (nm)", y="force on the tip (nN)" if axes is whole else "")
+    whole.set_xlim(right=_GAP_SHOWN_NM)
+    part.set(xlim=(-0.6, _GAP_SHOWN_NM), ylim=(1.1 * least - 5.0, -0.6 * least + 5.0))
+    part.legend(loc="lower right", fontsize=10, framealpha=1.0)
+    whole.set_title("Force against gap", fontsize=12, loc="left")
+    part.set_title("the attractive part, with its loops", fontsize=12, loc="left")
     save(picture, path)

@@ -16,7 +16,7 @@ _MOST_PERIODS = 60
 """Of the drive; each contact in them is integrated once more."""
 _SAMPLES_PER_PERIOD = 32
 _HIGHEST = 8.0
-"""Multiples of the drive frequency, or of the response's where that is lower, that are shown."""
+"""Multiples of the response frequency, or of the impacts' near twice the free one, that are shown at least."""
 _DECADES = 1e-6
 
 
@@ -72,11 +72,15 @@ def draw_spectrum(look: Look, path: Path) -> None:
     picture = new_figure(9.0, 5.0)
     axes = picture.subplots()
     drive = 1e3 / look.drive.period_us
-    top = _HIGHEST * (found.response_khz if found.repeats and found.response_khz < 0.3 * drive else drive)
-    shown = (found.frequency_khz > 0.0) & (found.frequency_khz <= max(top, 1.2 * drive))
+    slow = min(found.response_khz, 2.0 * float(look.scene.cantilever.frequency_khz))
+    top = max(_HIGHEST * slow, 2.2 * drive)
+    shown = (found.frequency_khz > 0.0) & (found.frequency_khz <= top * (1.0 + 1e-9))
     frequency, amplitude = found.frequency_khz[shown], found.amplitude_nm[shown]
     floor = max(float(amplitude.max()) * _DECADES, 1e-12)
-    axes.vlines(frequency, floor, np.maximum(amplitude, floor), color="black", linewidth=1.2, zorder=3)
+    if found.repeats:
+        axes.vlines(frequency, floor, np.maximum(amplitude, floor), color="black", linewidth=1.2, zorder=3)
+    else:
+        axes.plot(frequency, np.maximum(amplitude, floor), color="black", linewidth=1.0, zorder=3)
     axes.set_yscale("log")
     right = float(frequency[-1]) if frequency.size else drive
     for multiple in range(1, int(right / drive + 1e-9) + 1):

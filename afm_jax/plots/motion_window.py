@@ -18,6 +18,8 @@ _CONTACTS_SHOWN = 6
 _PERIODS_SHOWN = 6.0
 """Of the slower of drive and free vibration, where there are no contacts."""
 _POINTS = 3000
+_BESIDE_US = 1e-7
+"""How far before and after a jump its two sides are looked at."""
 _LONGEST_HELD = 4.0
 """Drive periods of a held tip that are shown: it is integrated step by step."""
 
@@ -95,7 +97,18 @@ def look_at(scene: Scene, simulation: Simulation) -> Look:
     times = np.linspace(begin, end, _POINTS)
     if used.any():
         times = np.union1d(times, nodes(scene, simulation, begin, end)[0])
+        edges = _edges(rows, used)
+        edges = edges[(edges > begin + _BESIDE_US) & (edges < end - _BESIDE_US)]
+        times = np.union1d(times, np.concatenate([edges - _BESIDE_US, edges, edges + _BESIDE_US]))
     return Look(scene, simulation, drive, begin, end, trajectory(scene, simulation, times), used)
+
+
+def _edges(rows: Contacts, used: Bool[np.ndarray, " rows"]) -> Float[np.ndarray, " edges"]:
+    """Return when the phase of contact changes: there the force jumps, and the velocity of a law."""
+    columns = [rows.arrival_time_us, rows.departure_time_us]
+    if rows.detail is not None:
+        columns += [rows.detail.junction_forms_us, rows.detail.junction_breaks_us]
+    return np.concatenate([np.asarray(column)[used] for column in columns])
 
 
 def shade_phases(axes: Axes, path: Trajectory, contact: object) -> None:

@@ -68,7 +68,7 @@ def spread_starts(scene: Scene, count: int, *, shift: float = 0.0) -> State:
     """
     time = PHASE_DEG / 360.0 * scene.platform.period_us
     low, high = SPEEDS_NM_PER_US
-    velocity = low + (high - low) * ((jnp.arange(count) + 0.5 + shift) / count % 1.0)
+    velocity = jnp.asarray(low + (high - low) * ((np.arange(count) + 0.5 + shift) / count % 1.0))
     height = scene.platform.position(time) + HEIGHT_NM
     return State(jnp.full(count, time), jnp.full(count, height), velocity)
 

@@ -120,7 +120,7 @@ def _reached(piece: Simulation) -> float:
 
 
 def _joined(scene: Scene, pieces: tuple[Simulation, ...], columns: Float[np.ndarray, "columns contacts"]) -> LongMotion:
-    arrival, _, departure, position, velocity = columns
+    arrival, approach, departure, position, velocity = columns
     last = pieces[-1]
     outcome = MotionOutcome(int(last.outcome))
     full = outcome == MotionOutcome.CONTACT_LIMIT
@@ -134,4 +134,16 @@ def _joined(scene: Scene, pieces: tuple[Simulation, ...], columns: Float[np.ndar
     whole = min(stops.size, departure.size)
     if whole:
         peaks[:whole] = peaks_of_flights(scene, departure[:whole], position[:whole], velocity[:whole], stops[:whole])
-    return LongMotion(scene, pieces, *columns, peaks, end, float(began[0]) if held else None, outcome)
+    return LongMotion(
+        scene=scene,
+        pieces=pieces,
+        arrival_time_us=arrival,
+        approach_speed_nm_per_us=approach,
+        departure_time_us=departure,
+        departure_position_nm=position,
+        departure_velocity_nm_per_us=velocity,
+        peak_height_nm=peaks,
+        end_us=end,
+        held_from_us=float(began[0]) if held else None,
+        outcome=outcome,
+    )

@@ -96,15 +96,15 @@ def scipy_driven_contact(
         return [-rate, slope * drive.acceleration(now, gap, rate, load), slope]
 
     events = [lambda _, y: y[0] - numbers.snap_on, lambda _, y: y[0] - numbers.breaks]
-    on = _root_of_depth((numbers.shift - numbers.snap_on) / numbers.depth)
+    on = float(_root_of_depth((numbers.shift - numbers.snap_on) / numbers.depth))
     now, gap, rate, junctions = arrival_time_us, numbers.forms, -approach_speed_nm_per_us, 0
     for _ in range(_MOST_PHASES):
         met, now, (_, rate) = phase(in_bridge, now, [gap, rate], events)
         if met == 1:
             return ScipyContact(now, float(rate), junctions, time.perf_counter() - began, count)
         junctions += 1
-        _, _, (_, rate, now) = phase(in_junction, 0.0, [on, rate, now], [lambda _, y: y[0] - jkr.FOLD])
-        gap = numbers.snap_off
+        _, _, (_, rate, now) = phase(in_junction, 0.0, [on, float(rate), now], [lambda _, y: y[0] - jkr.FOLD])
+        gap, rate, now = numbers.snap_off, float(rate), float(now)
     raise ValueError(f"the tip that arrives at {arrival_time_us:g} us forms the junction {junctions} times: it is held")
 
 
