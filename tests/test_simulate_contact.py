@@ -10,7 +10,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.contact import EFFECTS, Contact
 from afm_jax.contact.phases import Phase
-from afm_jax.motion.record import ContactKind, MotionOutcome, State
+from afm_jax.motion.record import ContactDetail, ContactKind, MotionOutcome, Simulation, State
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.trajectory import nodes, trajectory
 from afm_jax.presets import contact_scene
@@ -28,6 +28,15 @@ def scene_of(system: DrivenContact, contact: Contact | None = None) -> Scene:
     return Scene(cantilever, platform, Contact.paper() if contact is None else contact)
 
 
+def state(start) -> State:
+    return State(*(jnp.asarray(value, float) for value in start))
+
+
+def detail_of(simulation: Simulation) -> ContactDetail:
+    assert simulation.contacts.detail is not None
+    return simulation.contacts.detail
+
+
 def arrivals(simulation, count):
     return np.asarray(simulation.contacts.arrival_time_us)[:count]
 
@@ -42,10 +51,10 @@ def test_tenth_crossing_agrees_with_an_independent_integration(n, speed, double)
     start = system.start(phase_deg=270, height_nm=5, velocity_nm_per_us=speed)
     course = follow(system, *start, until_us=1000.0, contacts=11)
     times = np.array([contact.arrival_time_us for contact in course.contacts])
-    simulation = simulate(scene_of(system), State(*start), times[-1] - start[0] + 1e-3)
+    simulation = simulate(scene_of(system), state(start), times[-1] - start[0] + 1e-3)
     # 1e-7 us is what is promised of the tenth; the junctions are whole numbers
     np.testing.assert_allclose(arrivals(simulation, 10), times[:10], rtol=0.0, atol=1e-7)
-    detail = simulation.contacts.detail
+    detail = detail_of(simulation)
     formed = np.array([contact.junctions for contact in course.contacts[:10]])
     assert np.array_equal(np.asarray(detail.junctions)[:10], formed)
     assert int((formed > 1).sum()) == double
@@ -74,7 +83,7 @@ def test_other_scenes_agree_too():
         start = system.start(phase_deg=270, height_nm=5, velocity_nm_per_us=90.0)
         course = follow(system, *start, until_us=1000.0, contacts=4)
         times = np.array([one.arrival_time_us for one in course.contacts])
-        simulation = simulate(scene_of(system, contact), State(*start), times[-1] - start[0] + 1e-3)
+        simulation = simulate(scene_of(system, contact), state(start), times[-1] - start[0] + 1e-3)
         # the accuracy of a contact is 1e-10 us, and it grows a little with each
         np.testing.assert_allclose(arrivals(simulation, 4), times, rtol=0.0, atol=2e-8)
 
@@ -83,7 +92,7 @@ def test_a_held_tip_is_followed():
     system = reference(1.01, 0.5)
     start = system.start(phase_deg=0, height_nm=5, velocity_nm_per_us=-8.0)
     course = follow(system, *start, until_us=start[0] + 9.0)
-    simulation = simulate(scene_of(system), State(*start), 9.0)
+    simulation = simulate(scene_of(system), state(start), 9.0)
     assert course.phase == "junction"
     assert int(simulation.outcome) == MotionOutcome.HELD
     assert bool(simulation.held)
@@ -95,7 +104,7 @@ def test_a_held_tip_is_followed():
     np.testing.assert_allclose(
         float(simulation.final.velocity_nm_per_us), course.velocity_nm_per_us, rtol=0.0, atol=3e-3
     )
-    assert int(simulation.contacts.detail.junctions[0]) == course.contacts[0].junctions == 6
+    assert int(detail_of(simulation).junctions[0]) == course.contacts[0].junctions == 6
 
 
 def test_the_end_may_lie_within_a_contact():
@@ -105,7 +114,7 @@ def test_the_end_may_lie_within_a_contact():
     for share in (0.1, 0.35, 0.5, 0.9):
         end = first.arrival_time_us + share * (first.departure_time_us - first.arrival_time_us)
         course = follow(system, *start, until_us=end)
-        simulation = simulate(scene_of(system), State(*start), end - start[0])
+        simulation = simulate(scene_of(system), state(start), end - start[0])
         np.testing.assert_allclose(float(simulation.final.position_nm), course.position_nm, rtol=0.0, atol=1e-7)
         assert Phase(int(simulation.phase)).name.lower() == course.phase
 
@@ -113,7 +122,7 @@ def test_the_end_may_lie_within_a_contact():
 def test_energy_of_a_contact_is_what_the_tip_loses():
     # no air, a resting sample: spring and kinetic energy change in contacts only
     scene = Scene(Cantilever(90.0, mass_ng=1.5), Platform(0.0, 180.0, -2.0), Contact.paper())
-    simulation = simulate(scene, State(0.0, 40.0, 0.0), 60.0)
+    simulation = simulate(scene, state((0.0, 40.0, 0.0)), 60.0)
     rows, count = simulation.contacts, int(simulation.count)
     assert count >= 5
     stiffness = float(scene.cantilever.stiffness_n_per_m)
@@ -134,7 +143,7 @@ def test_dense_output_agrees_with_an_independent_integration():
     start = system.start(phase_deg=270, height_nm=5, velocity_nm_per_us=40.0)
     course = follow(system, *start, until_us=start[0] + 25.0)
     scene = scene_of(system)
-    simulation = simulate(scene, State(*start), 25.0)
+    simulation = simulate(scene, state(start), 25.0)
     times = np.linspace(start[0], start[0] + 25.0, 2000)
     seen = trajectory(scene, simulation, times)
     position, velocity = course.sample(times)
@@ -159,7 +168,7 @@ def test_batches_agree_with_single_scenes():
     columns = State(*(jnp.asarray(column) for column in zip(*starts, strict=True)))
     many = jax.jit(jax.vmap(lambda start: simulate(scene, start, 20.0, max_contacts=24)))(columns)
     for place, start in enumerate(starts):
-        one = simulate(scene, State(*start), 20.0, max_contacts=24)
+        one = simulate(scene, state(start), 20.0, max_contacts=24)
         assert int(one.count) == int(many.count[place])
         # the same steps, summed in another order
         np.testing.assert_allclose(
@@ -178,7 +187,7 @@ def test_derivatives_forward_and_reverse():
             Platform(4.0, 180.0 * 5.277, offset),
             Contact.paper(viscosity_pa_s=viscosity),
         )
-        simulation = simulate(scene, State(*start), 14.0, max_contacts=4, reverse=reverse, max_rounds=8)
+        simulation = simulate(scene, state(start), 14.0, max_contacts=4, reverse=reverse, max_rounds=8)
         return simulation.contacts.arrival_time_us[1]
 
     at = jnp.array([0.1, 1.005e-3, 40.0])
@@ -204,7 +213,7 @@ def test_derivatives_forward_and_reverse():
 
 
 def test_too_little_room_is_an_outcome():
-    simulation = simulate(contact_scene(1.01, 4.0, 0.0), State(0.0, 10.0, 60.0), 200.0, max_contacts=3)
+    simulation = simulate(contact_scene(1.01, 4.0, 0.0), state((0.0, 10.0, 60.0)), 200.0, max_contacts=3)
     assert int(simulation.outcome) == MotionOutcome.CONTACT_LIMIT
     assert int(simulation.count) == 3
 
@@ -212,19 +221,19 @@ def test_too_little_room_is_an_outcome():
 def test_impossible_calls_are_refused():
     scene = contact_scene(1.01, 4.0, 0.0)
     with pytest.raises(ValueError, match="inside the sample"):
-        simulate(scene, State(0.0, 4.05, 60.0), 20.0)
+        simulate(scene, state((0.0, 4.05, 60.0)), 20.0)
     with pytest.raises(ValueError, match="duration_us"):
-        simulate(scene, State(0.0, 10.0, 60.0), 0.0)
+        simulate(scene, state((0.0, 10.0, 60.0)), 0.0)
     with pytest.raises(ValueError, match="accuracy"):
-        simulate(scene, State(0.0, 10.0, 60.0), 20.0, accuracy=1e-15)
+        simulate(scene, state((0.0, 10.0, 60.0)), 20.0, accuracy=1e-15)
     no_junction = Scene(scene.cantilever, scene.platform, Contact.paper(adhesion_energy_j_per_m2=0.05))
     with pytest.raises(ValueError, match="no junction"):
-        simulate(no_junction, State(0.0, 10.0, 60.0), 20.0)
+        simulate(no_junction, state((0.0, 10.0, 60.0)), 20.0)
     many = jax.vmap(
         lambda w: (
             simulate(
                 Scene(scene.cantilever, scene.platform, Contact.paper(adhesion_energy_j_per_m2=w)),
-                State(0.0, 10.0, 60.0),
+                state((0.0, 10.0, 60.0)),
                 5.0,
                 max_contacts=4,
             ).outcome

@@ -40,7 +40,11 @@ def contact_steps(driven: Driven, begin: Place, phase: Int[np.ndarray, " contact
         phase: phase at the beginning.
         until_us: end of the last one at the latest.
     """
-    touch = fresh_touch(Place(*(jnp.asarray(part) for part in begin)), jnp.asarray(phase, jnp.int32))
+    # filled up with tips in no contact to a power of two: few shapes, so that few programs are compiled
+    spare = (1 << max(len(phase) - 1, 0).bit_length()) - len(phase)
+    place = Place(*(jnp.concatenate([jnp.asarray(part), jnp.ones(spare)]) for part in begin))
+    phases = np.concatenate([phase, np.full(spare, int(Phase.DRY))])
+    touch = fresh_touch(place, jnp.asarray(phases, jnp.int32))
     until = jnp.asarray(until_us, touch.place.x.dtype)
     parts = []
     while np.any((np.asarray(touch.phase) != Phase.DRY) & (np.asarray(touch.place.time_us) < until_us)):
@@ -49,8 +53,8 @@ def contact_steps(driven: Driven, begin: Place, phase: Int[np.ndarray, " contact
         parts.append([column[taken] for column in columns])
     joined = [np.concatenate(columns) for columns in zip(*parts, strict=True)] if parts else [np.zeros(0)] * 6
     order = np.argsort(joined[2], kind="stable")
-    x, rate, time, _, phases, ends = (column[order] for column in joined)
-    return Steps(time, ends, phases.astype(int), x, rate)
+    x, rate, time, _, kinds, ends = (column[order] for column in joined)
+    return Steps(time, ends, kinds.astype(int), x, rate)
 
 
 @jax.jit

@@ -110,7 +110,9 @@ class Driven(NamedTuple):
         s = jnp.where(solid, place.x, 1.0)
         cube = s**3
         curvature = s * s * (cube * (36.0 * cube - 42.0 * jkr.SLOPE) + 12.0)
-        elastic = jnp.abs(curvature) * self.load_scale_nn * self.inverse_mass / self.depth_scale_nm
+        # where the curvature vanishes, at s = 1.196, its terms still tell how fast it comes back
+        bent = jnp.maximum(jnp.abs(curvature), 0.3 * s * s * (36.0 * cube * cube + 12.0))
+        elastic = bent * self.load_scale_nn * self.inverse_mass / self.depth_scale_nm
         slope = jkr.depth_slope(s)
         dry = jnp.sqrt(
             elastic + (2.0 * place.gap_rate / (self.depth_scale_nm * s)) ** 2 + (self._drive_pace * slope) ** 2

@@ -82,7 +82,9 @@ def trajectory(scene: Scene, simulation: Simulation, times_us: ArrayLike) -> Tra
         kind = pieces.kind[place]
         for which, fill in ((kind == _FLIGHT, _in_flight), (kind >= 0, _in_contact)):
             if which.any():
-                gap[which], rate[which] = fill(world, pieces, place[which], times[which])
+                count = int(which.sum())
+                found = fill(world, pieces, _padded(place[which]), _padded(times[which]))
+                gap[which], rate[which] = (part[:count] for part in found)
     lab = to_lab(world.surface, world.response, times, gap, rate)
     phase = np.where(kind == _FLIGHT, int(Phase.DRY), np.where(kind == _REST, int(Phase.JUNCTION), kind))
     force = np.zeros(times.shape)
@@ -124,6 +126,12 @@ def nodes(
         times.append((edges[:-1, None] + half * (points + 1.0)).reshape(-1))
         weights.append((half * shares).reshape(-1))
     return np.concatenate(times), np.concatenate(weights)
+
+
+def _padded(values: np.ndarray) -> np.ndarray:
+    """Return values filled up to a power of two with the last: few shapes, so that few programs are compiled."""
+    size = max(64, 1 << (values.size - 1).bit_length())
+    return np.concatenate([values, np.repeat(values[-1:], size - values.size)])
 
 
 class _World(NamedTuple):
@@ -218,7 +226,7 @@ def _contact_pieces(world: _World, simulation: Simulation, rows: np.ndarray, hig
     arrival = np.asarray(contacts.arrival_time_us)[rows]
     if world.driven is None:
         stops = np.minimum(np.asarray(contacts.departure_time_us)[rows], last)
-        return [(begin, end, _REST, begin, 0.0, 0.0) for begin, end in zip(arrival, stops, strict=True)]
+        return [(begin, end, float(_REST), begin, 0.0, 0.0) for begin, end in zip(arrival, stops, strict=True)]
     if not rows.size:
         return []
     position, velocity = (
@@ -229,4 +237,4 @@ def _contact_pieces(world: _World, simulation: Simulation, rows: np.ndarray, hig
     # to the end of the last step that a wanted time may lie in
     steps = contact_steps(world.driven, begin, np.full(rows.shape, int(Phase.BRIDGE)), high)
     columns = (steps.begin_us, steps.end_us, steps.phase, steps.begin_us, steps.x, steps.rate)
-    return list(zip(*(column.tolist() for column in columns), strict=True))
+    return list(zip(*(column.astype(float).tolist() for column in columns), strict=True))

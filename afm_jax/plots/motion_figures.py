@@ -137,7 +137,7 @@ def _trajectory(axes: Axes, ramp: Ramp) -> None:
     time, height = path_of(motion)
     offset = np.array([ramp.offset_at(0.0), ramp.offset_at(1.0)])
     first, rate = offset[0], offset[1] - offset[0]
-    axes.plot(first + rate * time, height, color=BLUE, linewidth=0.3, label="tip")
+    axes.plot(first + rate * time, height, color=BLUE, linewidth=0.3, label="tip in flight")
     reach = float(platform.amplitude_nm)
     ends = np.array([float(motion.pieces[0].start.time_us), motion.end_us])
     middle = first + rate * ends

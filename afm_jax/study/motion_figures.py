@@ -18,7 +18,6 @@ SECTION_POINTS = 1000
 _FALL_RAMPS = ((1e-2, 5.0), (2e-3, 0.6))
 """Rate in nm/us and last offset in nm. A held tip costs a hundred times a bouncing one: the slow ramp ends soon."""
 _RISE_RAMPS = ((1e-2, 2.0), (1e-3, 2.0))
-_COARSE_STARTS = 3
 
 
 @dataclass(frozen=True)
@@ -56,10 +55,10 @@ def figure8(*, coarse: bool = False, report: Report = lambda _: None) -> MotionF
     """Return the Poincare section: broadband stretches of several starts, and the band in which they end.
 
     Args:
-        coarse: only the three starts that are told apart, without the growth of small distances.
+        coarse: leave out the growth of small distances.
         report: told how far it is.
     """
-    courses = survey(SHOWN if coarse else (*SHOWN, *MORE), report=report)
+    courses = survey((*SHOWN, *MORE), report=report)
     growth = None
     if not coarse:
         report("growth of small distances")

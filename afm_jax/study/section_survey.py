@@ -16,6 +16,8 @@ from afm_jax.study.long_motion import CONTACTS_OF_A_PIECE, LongMotion, Report, f
 SHOWN = (40.0, 60.0, 80.0)
 """Starting velocities, in nm/us, that the figure tells apart."""
 MORE = (45.0, 50.0, 55.0, 65.0, 70.0, 75.0, 90.0, 100.0, 110.0)
+"""More starts: how long one stays broadband is a matter of rounding, and so differs between machines; of many it does
+not depend on luck."""
 _UNTIL_US = 8000.0
 _LOCKED_CONTACTS = 50
 _LOCKED_WITHIN = 0.25
