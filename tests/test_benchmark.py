@@ -22,6 +22,7 @@ from afm_jax.study.scipy_baseline import scipy_impacts
 from tests.run_here import run_here
 
 
+@pytest.mark.slow
 def test_one_core_measures_what_it_says():
     rows = one_core(batches=[1, 6], blocks=[4], impacts=4, repetitions=1, derivative_batch=6)["rows"]
     for row in rows:
@@ -132,7 +133,7 @@ def test_command_writes_tables_and_one_json_object(tmp_path: Path, monkeypatch: 
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 0, result.stderr
     payload = json.loads(result.stdout)
-    assert {"rows", "contact_rows", "aims", "machine"} == set(payload)
+    assert {"rows", "contact_rows", "scene_rows", "aims", "machine"} == set(payload)
     assert payload["contact_rows"] == []
     assert not (tmp_path / "bench_contact.csv").exists()
     assert json.loads((tmp_path / "bench.json").read_text("utf-8")) == payload

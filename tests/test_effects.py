@@ -81,6 +81,7 @@ def law_study(programs):
     return study_effects(law_scene(), accuracy=0.02, programs=programs)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "without"),
     [
@@ -98,6 +99,7 @@ def test_leaving_an_effect_of_a_law_out_changes_what_the_closed_form_says(law_st
     np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["restitution", "adhesion", "viscous_loss", "delay", "air_damping"])
 def test_the_prediction_is_the_slope_of_the_closed_form(law_study, name):
     effect = {effect.name: effect for effect in effects_in(law_scene())}[name]
@@ -111,6 +113,7 @@ def test_the_prediction_is_the_slope_of_the_closed_form(law_study, name):
     np.testing.assert_allclose(found, -slope, rtol=1e-3, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_numbers_of_a_law_cost_nothing(law_study):
     for name in ("restitution", "adhesion", "viscous_loss"):
         assert by_name(law_study)[name].cost == law_study.cost
@@ -119,6 +122,7 @@ def test_numbers_of_a_law_cost_nothing(law_study):
     assert delay.program != law_study.cost.program
 
 
+@pytest.mark.slow
 def test_what_a_law_does_not_need_is_known_from_the_closed_form(law_study):
     reduction = reduction_of(law_study)
     expected = orbit_of(reduction.scene) / orbit_of(law_scene()) - 1.0

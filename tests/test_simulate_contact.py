@@ -65,6 +65,7 @@ def test_tenth_crossing_agrees_with_an_independent_integration(n, speed, double)
     np.testing.assert_allclose(np.asarray(detail.viscous_loss_aj)[:10], lost, rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_other_scenes_agree_too():
     cases = [
         (reference(1.3, 2.5, 1.5, quality_factor=None, mass_ng=2.5), Contact.paper()),
@@ -176,6 +177,7 @@ def test_batches_agree_with_single_scenes():
         )
 
 
+@pytest.mark.slow
 def test_derivatives_forward_and_reverse():
     system = reference(5.277, 4.0)
     start = system.start(phase_deg=270, height_nm=5, velocity_nm_per_us=60.0)
