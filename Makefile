@@ -8,7 +8,7 @@ PYTEST ?= -m pytest
 BIN := .venv/bin
 SETUP := .venv/.installed
 
-.PHONY: help setup fit test check lint types coverage slow bench clean
+.PHONY: help setup fit test check lint types coverage slow mutations bench clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -35,16 +35,20 @@ lint: $(SETUP)
 types: $(SETUP)
 	$(BIN)/pyright
 
-coverage: $(SETUP) ## make test, with the share of lines that it runs (85 % at least)
+coverage: $(SETUP) ## make test and the slow tests, with the share of lines that they run (85 % at least)
 	$(BIN)/python -m coverage erase
 	$(MAKE) test PYTEST='-m coverage run -m pytest'
+	$(MAKE) slow PYTEST='-m coverage run -m pytest'
 	$(BIN)/python -m coverage combine --quiet
 	$(BIN)/python -m coverage report --fail-under=85
 
 slow: $(SETUP)
-	$(BIN)/python -m pytest -m slow
+	$(BIN)/python $(PYTEST) -m slow -n auto --dist load --ignore tests/test_mutations.py
 
-check: lint types coverage slow ## all that CI runs: format, lint, types, tests, coverage, slow tests, notebooks
+mutations: $(SETUP)
+	$(BIN)/python -m pytest -m slow tests/test_mutations.py
+
+check: lint types coverage mutations ## all that CI runs: format, lint, types, tests, coverage, slow tests, notebooks
 
 bench: $(SETUP) ## impacts per second, next to SciPy
 	$(BIN)/afm-jax bench --out $(OUT)
