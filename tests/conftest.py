@@ -3,6 +3,7 @@
 import os
 from pathlib import Path
 
+import coverage
 import hypothesis
 import jax
 import pytest
@@ -21,6 +22,15 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 hypothesis.settings.register_profile("repeatable", derandomize=True, database=None, print_blob=True, deadline=None)
 hypothesis.settings.register_profile("random", print_blob=True)
 hypothesis.settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "repeatable"))
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Write down the lines that a worker ran: one that is slow to leave (thousands of programs to free) is killed."""
+    measured = coverage.Coverage.current()
+    if measured is not None and hasattr(session.config, "workerinput"):
+        measured.save()
+
 
 SHARED_DATA = Path(__file__).parent.parent.parent / "shared" / "data"
 
