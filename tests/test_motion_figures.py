@@ -91,6 +91,7 @@ def test_figure_8_is_broadband_then_locks():
     assert not section_statements([end._replace(broadband=0)], end._replace(periods=None), None)[1].holds
     assert not section_statements([end._replace(broadband=300)], end, None)[0].holds
     assert not section_statements([end._replace(periods=None)], end, None)[2].holds
+    assert not section_statements([end._replace(periods=4)], end, None)[2].holds
     assert not any(course.motion.captured for course in courses)
 
 

@@ -15,8 +15,10 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.phases import Phase
 from afm_jax.impact.law import ImpactLaw
+from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start, state
+from afm_jax.plots import motion_spectrum
 from afm_jax.plots.motion import draw_motion
 from afm_jax.plots.motion_spectrum import spectrum_of
 from afm_jax.plots.motion_window import look_at
@@ -24,11 +26,11 @@ from afm_jax.plots.motion_window import look_at
 ALL = ["time_course.png", "spectrum.png", "gap.png", "poincare.png", "force_gap.png"]
 
 
-def check_pictures(files: list[Path]):
+def check_pictures(files: list[Path], *, white: float = 0.3, width: int = 1400):
     for path in files:
         image = matplotlib.image.imread(path)
-        assert image.shape[1] >= 1400
-        assert 0.3 < (image[..., :3].mean(axis=2) > 0.98).mean() < 0.99  # neither empty nor black
+        assert image.shape[1] >= width
+        assert white < (image[..., :3].mean(axis=2) > 0.98).mean() < 0.99  # neither empty nor black
 
 
 @pytest.fixture(scope="module")
@@ -89,3 +91,50 @@ def test_batches_and_empty_simulations_are_refused(bouncing, tmp_path: Path):
         draw_motion(scene, batch, tmp_path)
     with pytest.raises(ValueError, match="nothing to draw"):
         draw_motion(scene, replace(found, final=found.start), tmp_path)
+
+
+@pytest.fixture(scope="module")
+def every_other_period():
+    scene = Scene(Cantilever(90.0, 40.0), Platform(4.0, 363.6), ImpactLaw(0.95, 10.0))
+    return scene, simulate(scene, default_start(scene), 1500.0)
+
+
+def test_the_line_at_half_the_drive_is_that_of_the_orbit(every_other_period):
+    scene, found = every_other_period
+    spectrum = spectrum_of(look_at(scene, found))
+    assert spectrum.repeats
+    assert spectrum.response_khz == pytest.approx(363.6 / 2.0, rel=1e-12)
+    orbits = single_impact_orbits(scene, 2.0)
+    slot = int(np.argmax(np.asarray(orbits.stable & orbits.admissible)))
+    line = int(np.argmin(np.abs(spectrum.frequency_khz - spectrum.response_khz)))
+    # 64 samples a response period: the harmonics of a kink, 1/k^2, are folded onto the first line
+    assert spectrum.amplitude_nm[line] == pytest.approx(float(orbits.lockin_amplitude_nm[slot]), rel=2e-3)
+
+
+def test_subharmonics_of_the_drive_are_marked(every_other_period, monkeypatch: pytest.MonkeyPatch):
+    drawn = []
+    monkeypatch.setattr(motion_spectrum, "save", lambda picture, _: drawn.append(picture))
+    motion_spectrum.draw_spectrum(look_at(*every_other_period), Path())
+    (axes,) = drawn[0].axes
+    labels = [text.get_text() for text in axes.get_legend().get_texts()]
+    assert "subharmonics, drive/2" in labels
+    marks = [float(np.asarray(line.get_xdata())[0]) for line in axes.get_lines() if line.get_linestyle() == ":"]
+    np.testing.assert_allclose(marks, 181.8 * np.arange(1, len(marks) + 1), rtol=1e-12)
+    # up to eight times the response frequency, the last of them on the edge
+    assert len(marks) in (7, 8)
+
+
+def test_a_tip_that_is_held_is_shown_until_soon_after_it_was_caught(tmp_path: Path):
+    scene = presets.contact_scene(1.01, 4.0, 0.0)
+    # 5 nm/us down onto a sample that has just turned: below the capture speed of 10.9 nm/us
+    found = simulate(scene, state(0.0, 9.0, -5.0), 60.0)
+    assert bool(found.held)
+    look = look_at(scene, found)
+    arrival = float(found.contacts.arrival_time_us[int(found.count) - 1])
+    assert arrival < look.to_us < arrival + 45.0
+    assert look.path.phase[-1] == Phase.JUNCTION
+    files = draw_motion(scene, found, tmp_path)
+    expected = [name for name in ALL if look.left or name != "poincare.png"]
+    assert [path.name for path in files] == expected
+    # most of the time course is shaded; the gap of one contact is a narrow picture
+    check_pictures(files, white=0.15, width=1000)

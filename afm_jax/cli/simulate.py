@@ -2,7 +2,6 @@
 
 import importlib.util
 import math
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
@@ -92,9 +91,12 @@ def command(
     if duration_us is not None and periods is not None:
         raise click.UsageError("--duration-us and --periods say the same: give one of them")
     session.start_computing()
+    from afm_jax.cli.scene_argument import scene_and_start  # noqa: PLC0415
     from afm_jax.motion.drive_period import drive_of  # noqa: PLC0415
+    from afm_jax.motion.start import start_of  # noqa: PLC0415
 
-    loaded, start = _scene_and_start(scene)
+    loaded, told = scene_and_start(scene)
+    start = None if told is None else start_of(loaded, told)
     period = drive_of(loaded).period_us
     until_settled = until_settled or (duration_us is None and periods is None)
     longest = duration_us if duration_us is not None else (periods or DEFAULT_PERIODS) * period
@@ -113,21 +115,6 @@ def command(
     session.emit(payload, *text_of(payload))
     if not payload["valid"]:
         raise NotValid(payload["outcome"])
-
-
-def _scene_and_start(name: str) -> "tuple[Scene, State | None]":
-    """Return the scene that an argument names, and the start that comes with it; None where it is to be chosen."""
-    from afm_jax.motion.start import start_of  # noqa: PLC0415
-    from afm_jax.presets import PRESETS, preset, preset_start  # noqa: PLC0415
-    from afm_jax.scenefile import load_scene, load_start  # noqa: PLC0415
-
-    if name in PRESETS and not Path(name).exists():
-        loaded, start = preset(name), preset_start(name)
-    elif not Path(name).exists() and not name.endswith(".toml") and len(Path(name).parts) == 1:
-        raise ValueError(f"{name}: there is no such file or preset; presets are {', '.join(PRESETS)}")
-    else:
-        loaded, start = load_scene(name), load_start(name)
-    return loaded, None if start is None else start_of(loaded, start)
 
 
 def _check_ramp(scene: "Scene", duration_us: float) -> None:

@@ -1,5 +1,6 @@
 """What `afm-jax simulate` hands out: the JSON object, the text, the files."""
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -12,12 +13,14 @@ from afm_jax.contact.phases import Phase
 from afm_jax.motion.long_run import LongRun
 from afm_jax.motion.observables import Harmonic, Observables
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation
-from afm_jax.motion.trajectory import nodes, trajectory
+from afm_jax.motion.trajectory import dense_path
 from afm_jax.scenefile import scene_tables
 
 _WHOLE_PERIODS = 50
 """Drive periods up to which the whole simulation goes into trajectory.csv."""
 _POINTS = 2001
+_MOST_NODES = 100_000
+"""Rows of trajectory.csv within contacts, from which on only every second, third, ... is kept."""
 _AS_THEY_ARE = (
     "peak_amplitude_nm",
     "mean_height_nm",
@@ -169,8 +172,11 @@ def trajectory_rows(scene: Scene, simulation: Simulation, seen: Observables) -> 
     period = (window.to_us - window.from_us) / max(window.periods * window.responses, 1)
     short = last - first <= _WHOLE_PERIODS * period
     begin, end = (first, last) if short else (window.from_us, window.to_us)
-    inner, _ = nodes(scene, simulation, begin, end)
-    path = trajectory(scene, simulation, np.union1d(np.linspace(begin, end, _POINTS), inner))
+    dense = dense_path(scene, simulation, begin, end)
+    inner, _ = dense.nodes(begin, end)
+    # a tip that is held rings through the whole stretch
+    inner = inner[:: math.ceil((inner.size + 1) / _MOST_NODES)]
+    path = dense.at(np.union1d(np.linspace(begin, end, _POINTS), inner))
     lists = {name: value.tolist() for name, value in path._asdict().items()}
     rows = [dict(zip(lists, values, strict=True)) for values in zip(*lists.values(), strict=True)]
     for row in rows:

@@ -14,7 +14,7 @@ from afm_jax.motion.energy_balance import energy_balance
 from afm_jax.motion.peak_height import peak_deflection, peak_height
 from afm_jax.motion.record import ContactKind, Simulation
 from afm_jax.motion.settled import Settled, settled
-from afm_jax.motion.trajectory import Trajectory, nodes, trajectory
+from afm_jax.motion.trajectory import Trajectory, dense_path
 from afm_jax.motion.window import Window, window_of
 
 _LOADS = 4001
@@ -109,10 +109,10 @@ def observe(
     verdict = settled(scene, simulation) if verdict is None else verdict
     window = window_of(scene, simulation, verdict, drive)
     begin, end = window.from_us, window.to_us
-    times, weights = nodes(scene, simulation, begin, end)
+    dense = dense_path(scene, simulation, begin, end)
+    times, weights = dense.nodes(begin, end)
     _check_covered(float(np.sum(weights)), end - begin)
-    path = trajectory(scene, simulation, times)
-    ends = trajectory(scene, simulation, np.array([begin, end]))
+    path, ends = dense.at(times), dense.at(np.array([begin, end]))
     energy = energy_balance(scene, simulation, path, weights, ends)
     span = end - begin
     cycles = span / drive.period_us
@@ -123,7 +123,7 @@ def observe(
     return Observables(
         settled=verdict,
         window=window,
-        peak_amplitude_nm=peak_height(scene, simulation, path, begin, end),
+        peak_amplitude_nm=peak_height(dense, path, begin, end),
         harmonics=_harmonics(path.position_nm, times, weights, window, drive, harmonics),
         mean_height_nm=float(np.sum(weights * path.position_nm)) / span,
         contacts=begun,
@@ -138,7 +138,7 @@ def observe(
         stored_aj=energy.stored_aj / cycles,
         energy_imbalance=energy.imbalance,
         virial_aj=_virial(scene, simulation, path, weights, window),
-        peak_deflection_nm=None if base is None else peak_deflection(scene, simulation, path, begin, end),
+        peak_deflection_nm=None if base is None else peak_deflection(dense, path, begin, end),
         deflection_harmonics=None
         if deflection is None
         else _harmonics(deflection, times, weights, window, drive, harmonics),

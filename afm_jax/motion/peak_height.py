@@ -6,43 +6,43 @@ import numpy as np
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.motion.record import ContactKind, Simulation
-from afm_jax.motion.trajectory import Trajectory, trajectory
+from afm_jax.motion.trajectory import DensePath, Trajectory
 
 _REFINEMENTS = 4
 _POINTS = 33
 
 
-def peak_height(scene: Scene, simulation: Simulation, path: Trajectory, from_us: float, to_us: float) -> float:
+def peak_height(dense: DensePath, path: Trajectory, from_us: float, to_us: float) -> float:
     """Return the largest height above the rest position between two times, in nm.
 
     A tip that only the sample drives flies freely: its highest point in a flight is the first turning point from above,
     or an end. What drives of base or force add, and contacts, are looked at along the path and refined.
 
     Args:
-        scene: the scene.
-        simulation: of one scene.
-        path: trajectory at times in between that resolve contacts and flights, those of `nodes`.
+        dense: the tip between the two times.
+        path: the tip at times in between that resolve contacts and flights, those of `nodes`.
         from_us: beginning.
         to_us: end.
     """
+    scene = dense.scene
     if scene.base is None and scene.force is None:
-        flights = _of_flights(scene, simulation, from_us, to_us)
+        flights = _of_flights(scene, dense.simulation, from_us, to_us)
         # no contact comes as high in most motions: then it need not be looked at more closely
         if path.position_nm.size and flights >= float(path.position_nm.max()):
             return flights
-    return _refined(scene, simulation, _height, path.time_us, (from_us, to_us))
+    return _refined(dense, _height, path.time_us, (from_us, to_us))
 
 
-def peak_deflection(scene: Scene, simulation: Simulation, path: Trajectory, from_us: float, to_us: float) -> float:
+def peak_deflection(dense: DensePath, path: Trajectory, from_us: float, to_us: float) -> float:
     """Return the largest deflection z - z_b of a tip on a moving base between two times, in nm; arguments as above."""
-    base = scene.base
+    base = dense.scene.base
     if base is None:
-        return peak_height(scene, simulation, path, from_us, to_us)
+        return peak_height(dense, path, from_us, to_us)
 
     def deflection(path: Trajectory) -> np.ndarray:
         return path.position_nm - np.asarray(base.position_and_velocity(path.time_us)[0])
 
-    return _refined(scene, simulation, deflection, path.time_us, (from_us, to_us))
+    return _refined(dense, deflection, path.time_us, (from_us, to_us))
 
 
 def _height(path: Trajectory) -> np.ndarray:
@@ -50,8 +50,7 @@ def _height(path: Trajectory) -> np.ndarray:
 
 
 def _refined(
-    scene: Scene,
-    simulation: Simulation,
+    dense: DensePath,
     height: Callable[[Trajectory], np.ndarray],
     times_us: np.ndarray,
     ends_us: tuple[float, float],
@@ -60,7 +59,7 @@ def _refined(
     times = np.unique(np.concatenate([times_us, ends_us]))
     best = -np.inf
     for _ in range(_REFINEMENTS + 1):
-        values = height(trajectory(scene, simulation, times))
+        values = height(dense.at(times))
         best = max(best, float(values.max()))
         top = int(np.argmax(values))
         times = np.linspace(times[max(top - 1, 0)], times[min(top + 1, len(times) - 1)], _POINTS)

@@ -64,7 +64,8 @@ def settled(
     free = _free_of_the_sample(scene, simulation, drive.period_us)
     if free is not None:
         if free <= tolerance:
-            why = "the tip no longer meets the sample, and its transient has decayed"
+            where = "the tip no longer meets the sample" if scene.interaction is not None else "the cantilever is free"
+            why = f"{where}, and its transient has decayed"
             return _settled(why, contacts=0, periods=1, remaining=free)
         return _not(f"the tip does not meet the sample, but its transient is still {free:.1e} of the velocity scale")
     rows = simulation.contacts

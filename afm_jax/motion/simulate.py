@@ -1,6 +1,7 @@
 """`simulate`: a scene followed in time, whatever its interaction."""
 
 import math
+from collections.abc import Callable
 from functools import partial
 
 import jax
@@ -25,6 +26,9 @@ from afm_jax.parameters import check_parameter, is_traced, require_float64
 DEFAULT_ACCURACY = 1e-9
 _ROUNDS_PER_CONTACT = 4
 _SPARE_ROUNDS = 64
+_MORE_ROOM = 4
+_MOST_CONTACTS = 1 << 20
+"""Contacts for which room is made unasked: with a resolved contact 100 MB."""
 _TRIALS_BACKWARDS = 40
 """Trial steps of a round when all of them are run and kept for the way back."""
 
@@ -48,7 +52,8 @@ def simulate(
         start: time, height and velocity of the tip in the lab, scalars.
         duration_us: how long to follow it, in us.
         max_contacts: most contacts (impacts) there is room for, a plain integer that shapes the result; None: enough
-            for the duration, which must then be a number.
+            for the duration, which must then be a number. A motion with more (chatter with r close to 1) is then
+            followed once more with room for them, outside `jit` and `vmap` up to a million.
         accuracy: of each resolved contact: relative of the rebound speed, a tenth of it in us of the times.
         reverse: make it differentiable in reverse mode, in memory that grows with the square root of the length.
         max_rounds: most rounds; a tip that is held takes one every 60 steps of its oscillation. None: four for every
@@ -68,24 +73,45 @@ def simulate(
     dtype = scene.cantilever.frequency_khz.dtype
     begin_at = State(*(jnp.asarray(value, dtype) for value in start))
     until = begin_at.time_us + jnp.asarray(duration_us, dtype)
-    room = _room(scene, surface, duration_us) if max_contacts is None else max_contacts
+    world = (scene, surface, response, begin_at, until)
     if scene.interaction is None:
-        return follow_free(scene, surface, response, begin_at, until)
+        return follow_free(*world)
     if isinstance(scene.interaction, ImpactLaw):
-        return follow_law(scene, surface, response, begin_at, until, max_contacts=room, reverse=reverse)
-    if not isinstance(scene.interaction, Contact):
+
+        def follow(room: int) -> Simulation:
+            return follow_law(*world, max_contacts=room, reverse=reverse)
+
+    elif isinstance(scene.interaction, Contact):
+        _check_contact(scene, surface, response, begin_at)
+        setting = setting_of(accuracy)
+        if reverse:
+            # the quick way tells by NaN that it does not hold, which reverse derivatives would spread
+            setting = setting._replace(quick=None, trials=_TRIALS_BACKWARDS)
+
+        def follow(room: int) -> Simulation:
+            rounds = max_rounds if max_rounds is not None else _ROUNDS_PER_CONTACT * room + _SPARE_ROUNDS
+            return _contact(*world, rows=room, setting=setting, rounds=rounds, reverse=reverse)
+
+    else:
         raise TypeError(
             f"the interaction must be an ImpactLaw, a Contact or None, not {type(scene.interaction).__name__}"
         )
-    _check_contact(scene, surface, response, begin_at)
-    rounds = max_rounds if max_rounds is not None else _ROUNDS_PER_CONTACT * room + _SPARE_ROUNDS
-    setting = setting_of(accuracy)
-    if reverse:
-        # the quick way tells by NaN that it does not hold, which reverse derivatives would spread
-        setting = setting._replace(quick=None, trials=_TRIALS_BACKWARDS)
-    return _contact(
-        scene, surface, response, begin_at, until, rows=room, setting=setting, rounds=rounds, reverse=reverse
-    )
+    if max_contacts is not None:
+        return follow(max_contacts)
+    return _with_room(follow, _room(scene, surface, duration_us))
+
+
+def _with_room(follow: Callable[[int], Simulation], room: int) -> Simulation:
+    """Return a motion with room for all its contacts: as long as there is too little, followed again with more."""
+    found = follow(room)
+    while room < _MOST_CONTACTS and not is_traced(found.outcome) and _is_full(found):
+        room = min(_MORE_ROOM * room, _MOST_CONTACTS)
+        found = follow(room)
+    return found
+
+
+def _is_full(found: Simulation) -> bool:
+    return bool(jnp.any(found.outcome == MotionOutcome.CONTACT_LIMIT))
 
 
 def _room(scene: Scene, surface: Platform | Surface, duration_us: ArrayLike) -> int:

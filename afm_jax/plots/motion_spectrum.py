@@ -60,9 +60,10 @@ def spectrum_of(look: Look) -> Spectrum:
     if look.scene.base is not None:
         deflection = deflection - np.asarray(look.scene.base.position_and_velocity(times)[0])
     weight = np.ones(samples) if repeats else np.hanning(samples + 1)[:-1]
-    lines = np.fft.rfft(deflection * weight) / weight.sum()
-    amplitude = 2.0 * np.abs(lines)
-    amplitude[0] *= 0.5
+    # the window would smear the mean over the lowest lines
+    mean = float(np.sum(weight * deflection) / weight.sum())
+    amplitude = 2.0 * np.abs(np.fft.rfft((deflection - mean) * weight)) / weight.sum()
+    amplitude[0] = abs(mean)
     return Spectrum(1e3 * np.fft.rfftfreq(samples, step), amplitude, 1e3 / response, periods, repeats)
 
 

@@ -11,7 +11,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.phases import Phase
 from afm_jax.motion.drive_period import Drive, drive_of
 from afm_jax.motion.record import ContactKind, Contacts, Simulation
-from afm_jax.motion.trajectory import Trajectory, nodes, trajectory
+from afm_jax.motion.trajectory import Trajectory, dense_path
 from afm_jax.plots.picture_style import ACCENT, BLUE
 
 _CONTACTS_SHOWN = 6
@@ -95,12 +95,13 @@ def look_at(scene: Scene, simulation: Simulation) -> Look:
         begin = min(shown - 0.3 * period, end - 2.0 * period)
     begin = max(begin, first)
     times = np.linspace(begin, end, _POINTS)
+    dense = dense_path(scene, simulation, begin, end)
     if used.any():
-        times = np.union1d(times, nodes(scene, simulation, begin, end)[0])
+        times = np.union1d(times, dense.nodes(begin, end)[0])
         edges = _edges(rows, used)
         edges = edges[(edges > begin + _BESIDE_US) & (edges < end - _BESIDE_US)]
         times = np.union1d(times, np.concatenate([edges - _BESIDE_US, edges, edges + _BESIDE_US]))
-    return Look(scene, simulation, drive, begin, end, trajectory(scene, simulation, times), used)
+    return Look(scene, simulation, drive, begin, end, dense.at(times), used)
 
 
 def _edges(rows: Contacts, used: Bool[np.ndarray, " rows"]) -> Float[np.ndarray, " edges"]:

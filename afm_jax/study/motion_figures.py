@@ -52,7 +52,10 @@ class MotionFigure:
 
 
 def figure8(*, coarse: bool = False, report: Report = lambda _: None) -> MotionFigure:
-    """Return the Poincare section: broadband stretches of several starts, and the band in which they end.
+    """Return the Poincare section: broadband stretches of several starts, and the (1,5) orbit in which they end.
+
+    The paper shows a strange attractor; followed longer, the broadband motion turns out to be transient chaos. How many
+    impacts it lasts is a matter of rounding.
 
     Args:
         coarse: leave out the growth of small distances.

@@ -76,10 +76,16 @@ def _transient(courses: Sequence[Course]) -> Statement:
     """Say what the broadband motion becomes: the paper calls it a strange attractor."""
     ends = {f"{course.velocity_nm_per_us:g}": course.periods for course in courses}
     locked = [course for course in courses if course.periods is not None]
+    lengths = [course.broadband for course in locked]
+    # an unlucky start may outlast the simulation: how long one stays broadband is a matter of rounding
     return Statement(
-        "the broadband motion is a transient (the paper: an attractor): most starts lock to the drive later",
-        len(locked) > 0.5 * len(courses),
-        {"drive_periods_per_impact_at_the_end_from": ends, "locked_share": len(locked) / len(courses)},
+        "the broadband motion is a transient (the paper: an attractor): most starts, or all, lock to the (1,5) orbit",
+        len(locked) > 0.5 * len(courses) and all(course.periods == 5 for course in locked),
+        {
+            "drive_periods_per_impact_at_the_end_from": ends,
+            "locked_share": len(locked) / len(courses),
+            "broadband_impacts_before": [min(lengths), max(lengths)] if lengths else None,
+        },
     )
 
 

@@ -1,0 +1,100 @@
+"""Drives of base and tip over a resolved contact: the base against a sample moved the other way; their effects."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.excitation import BaseDrive, ForceDrive
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene
+from afm_jax.contact.contact import Contact
+from afm_jax.motion.simulate import simulate
+from afm_jax.motion.start import state
+from afm_jax.motion.trajectory import trajectory
+from afm_jax.study.effects import EffectStudy, study_effects
+from afm_jax.study.motion_program import Programs
+
+FREQUENCY_KHZ, QUALITY, OMEGA = 90.0, 40.0, 2e-3 * np.pi * 90.0
+AMPLITUDE_NM, DRIVE_KHZ, OFFSET_NM = 4.0, 181.8, 1.0
+DRIVE = 2e-3 * np.pi * DRIVE_KHZ
+CANTILEVER = Cantilever(FREQUENCY_KHZ, QUALITY)
+START = (4.0, 30.0, 70.0)
+DURATION_US = 60.0
+
+
+@pytest.fixture(scope="module")
+def shaken():
+    """A base that moves as -a cos(omega t), over a sample at rest."""
+    base = BaseDrive(AMPLITUDE_NM, DRIVE_KHZ, 180.0)
+    scene = Scene(CANTILEVER, Platform(0.0, DRIVE_KHZ, OFFSET_NM), Contact.paper(), base)
+    return scene, simulate(scene, state(*START), DURATION_US, max_contacts=24)
+
+
+@pytest.fixture(scope="module")
+def in_the_base_frame():
+    """The same seen from the base: the sample moves as +a cos(omega t), the tip feels -m (z_b'' + Omega/Q z_b')."""
+    loss = OMEGA / QUALITY
+    force = ForceDrive(
+        AMPLITUDE_NM * DRIVE * np.hypot(DRIVE, loss), DRIVE_KHZ, 180.0 - np.degrees(np.arctan(loss / DRIVE))
+    )
+    scene = Scene(CANTILEVER, Platform(AMPLITUDE_NM, DRIVE_KHZ, OFFSET_NM), Contact.paper(), force=force)
+    angle = DRIVE * START[0]
+    height = START[1] + AMPLITUDE_NM * np.cos(angle)
+    velocity = START[2] - AMPLITUDE_NM * DRIVE * np.sin(angle)
+    return scene, simulate(scene, state(START[0], height, velocity), DURATION_US, max_contacts=24)
+
+
+def test_a_base_drive_over_a_contact_is_the_sample_moved_the_other_way(shaken, in_the_base_frame):
+    (_, one), (_, other) = shaken, in_the_base_frame
+    count = int(one.count)
+    assert count == int(other.count) >= 5
+    for name in ("arrival_time_us", "approach_speed_nm_per_us", "rebound_speed_nm_per_us", "energy_lost_aj"):
+        lab, moving = (np.asarray(getattr(run.contacts, name))[:count] for run in (one, other))
+        # one motion, rounded twice: 1e-14, stretched by every contact
+        np.testing.assert_allclose(lab, moving, rtol=1e-9, err_msg=name)
+
+
+def test_the_deflection_is_the_height_in_the_base_frame(shaken, in_the_base_frame):
+    times = np.linspace(START[0], START[0] + DURATION_US, 501)
+    seen, moving = (trajectory(scene, run, times) for scene, run in (shaken, in_the_base_frame))
+    base = -AMPLITUDE_NM * np.cos(DRIVE * times)
+    np.testing.assert_allclose(seen.position_nm - base, moving.position_nm, rtol=0.0, atol=1e-6)
+    np.testing.assert_array_equal(seen.phase, moving.phase)
+
+
+NUDGE = 1e-3
+"""Amplitudes in nm and nN so small that the motion follows them to first order."""
+
+
+def nudged(*, times: float) -> Scene:
+    contact = Contact.paper(structural_amplitude_n_per_m=0.0)
+    platform = Platform(AMPLITUDE_NM, DRIVE_KHZ)
+    weak = times * NUDGE
+    return Scene(CANTILEVER, platform, contact, BaseDrive(weak, DRIVE_KHZ, 40.0), ForceDrive(weak, DRIVE_KHZ, 40.0))
+
+
+def studied(scene: Scene, programs: Programs, **options) -> EffectStudy:
+    only = ["base_drive", "force_drive"]
+    return study_effects(scene, state(*START), accuracy=1e-3, only=only, programs=programs, **options)
+
+
+@pytest.mark.slow
+def test_small_drives_over_a_contact_change_what_their_derivatives_say():
+    programs = Programs()
+    study = studied(nudged(times=1.0), programs)
+    twice = studied(nudged(times=2.0), programs, derivatives=False)
+    for report, double in zip(study.effects, twice.effects, strict=True):
+        change, more, predicted = (
+            np.array([part.peak_amplitude, part.lockin_amplitude], dtype=float)
+            for part in (report.change, double.change, report.predicted)
+        )
+        assert 1e-7 < np.abs(change).max() < 1e-3
+        # first order in drives of 1e-3; orbits are closed to 1e-9
+        np.testing.assert_allclose(predicted, change, rtol=0.02, atol=1e-7)
+        np.testing.assert_allclose(more, 2.0 * change, rtol=0.02, atol=1e-7)
+    assert study.reduction is not None
+    assert set(study.reduction.left_out) == {"base_drive", "force_drive"}
+    assert study.reduction.scene.base is None
+    assert study.reduction.scene.force is None
+    assert bool(jnp.all(study.reduction.scene.platform.amplitude_nm == AMPLITUDE_NM))
