@@ -5,15 +5,15 @@ from scipy.special import chdtrc
 
 from afm_jax.parameters import require_float64
 from afm_jax.version import version_of
-from fitting.calibration_result import Alternative, CalibratedValue, Calibration, Curves
-from fitting.calibration_verdict import IMPROBABLE, Evidence, judge_calibration
 from fitting.intervals import Interval, profile_intervals
 from fitting.residual_patterns import autocorrelation, repeat_of, runs_excess
-from fitting.resonance_model import TERMS, model_at
-from fitting.resonance_start import sum_without_resonance
-from fitting.resonance_sweep import ResonanceSweep
-from fitting.sweep_fit import SweepFit, fit_sweep, kind_of, refit
-from fitting.table_faults import TableError
+from fitting.resonance.calibration_result import Alternative, CalibratedValue, Calibration, Curves
+from fitting.resonance.calibration_verdict import IMPROBABLE, Evidence, judge_calibration
+from fitting.resonance.resonance_model import TERMS, model_at
+from fitting.resonance.resonance_start import sum_without_resonance
+from fitting.resonance.resonance_sweep import ResonanceSweep
+from fitting.resonance.sweep_fit import SweepFit, fit_sweep, kind_of, refit
+from fitting.tables.table_faults import TableError
 
 _PACKAGES = ("afm-jax", "jax", "optax", "numpy")
 

@@ -1,12 +1,17 @@
 """The minimum of chi2: screened, polished from the best starts, and again where the errors are only relative."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from fitting.optimise import BATCH, PLAIN, SOFT, Objective, grid, polish
+from fitting.measurement import ROWS_PER_PROGRAM
+from fitting.optimise import BATCH, PLAIN, SOFT, Objective, polish
+from fitting.starts import starts
 
+_ROUNDS = 4
 _ROUGH, _FINE = 1e-2, 1e-10
 """Estimated distances to the minimum at which the soft and the plain polish stop."""
 
@@ -29,11 +34,57 @@ class Minimum:
 
 
 def minimise(objective: Objective) -> Minimum:
-    """Screen a grid, polish the best points with outliers counting less, then plainly."""
-    points = grid(objective.problem, objective.measurement)
-    best = np.argsort(objective.screen(points), kind="stable")[:BATCH]
-    soft = polish(objective, objective.problem.coordinates(points[best]), SOFT, settled=_ROUGH)
-    return _polished(objective, soft.coordinates, points[best])
+    """Screen starts, polish the best ones with outliers counting less, then plainly.
+
+    With impacts that last the search for orbits is what costs: the screening and the first polish look at a part of the
+    rows, the rest follows orbits once they are known.
+    """
+    points = starts(objective.problem, objective.measurement)
+    scout = _thinned(objective) if objective.problem.lasting else objective
+    best = np.argsort(scout.screen(points), kind="stable")[:BATCH]
+    soft = polish(scout, objective.problem.coordinates(points[best]), SOFT, settled=_ROUGH)
+    if not objective.problem.lasting:
+        return _polished(objective, soft.coordinates, points[best])
+    return settle(objective, _whole(objective, soft.coordinates, points[best]))
+
+
+def _whole(
+    objective: Objective, found: Float[np.ndarray, "starts p"], origins: Float[np.ndarray, "starts p"]
+) -> Minimum:
+    """Return the best of the scouts' ends by all rows, polished with orbits followed from there."""
+    values = objective.problem.values(found)
+    chi2 = objective.screen(values)
+    winner = int(np.argmin(chi2))
+    follower = objective.following(values[winner])
+    softly = polish(follower, found[winner][None], SOFT, settled=_ROUGH)
+    end = polish(follower, softly.coordinates, PLAIN, settled=_FINE)
+    best = objective.problem.values(end.coordinates)[0]
+    return Minimum(end.coordinates[0], origins[winner], np.vstack([best, values]), np.append(end.objective, chi2))
+
+
+def settle(objective: Objective, minimum: Minimum) -> Minimum:
+    """Polish again until the orbits that are found at the minimum are the ones that were followed to it."""
+    for _ in range(_ROUNDS):
+        values = objective.problem.values(minimum.coordinates)
+        follower = objective.following(values)
+        end = polish(follower, minimum.coordinates[None], PLAIN, settled=_FINE)
+        chi2 = float(np.sum(objective.searching().residual(objective.problem.values(end.coordinates)) ** 2))
+        minimum = replace(minimum, coordinates=end.coordinates[0], chi2=np.append(chi2, minimum.chi2[1:]))
+        if abs(chi2 - end.objective[0]) < 1e-6 * (1.0 + chi2):
+            break
+    return minimum
+
+
+def _thinned(objective: Objective) -> Objective:
+    """Return the objective of at most `ROWS_PER_PROGRAM` rows, spread over orders, frequencies and drives."""
+    rows = jax.tree.map(np.asarray, objective.measurement.rows)
+    seen = np.flatnonzero(rows.measured.any(axis=1) | rows.no_orbit)
+    if seen.size <= ROWS_PER_PROGRAM:
+        return objective
+    ranked = seen[np.lexsort((rows.drive_amplitude_nm[seen], rows.drive_frequency_khz[seen], rows.order[seen]))]
+    chosen = ranked[np.linspace(0, ranked.size - 1, ROWS_PER_PROGRAM).round().astype(int)]
+    few = jax.tree.map(lambda column: jnp.asarray(column[chosen]), rows)
+    return Objective(objective.measurement._replace(rows=few), objective.problem, robust=objective.robust)
 
 
 def rescale_errors(objective: Objective, minimum: Minimum, parameters: int) -> tuple[Objective, Minimum, float]:
@@ -57,14 +108,16 @@ def rescale_errors(objective: Objective, minimum: Minimum, parameters: int) -> t
     total = 1.0
     # The constraint on Q makes the minimum depend on the scale a little: three rounds settle it.
     for _ in range(3):
-        residual = objective.residual(objective.problem.values(minimum.coordinates)[None])[0, :-1]
+        residual = objective.amplitude_residuals(objective.problem.values(minimum.coordinates))
         factor = float(np.sqrt(np.sum(residual**2) / freedom))
         if factor == 0.0:
             break
         total *= factor
-        scaled = objective.measurement.rows._replace(error_nm=objective.measurement.rows.error_nm * factor)
-        objective = Objective(objective.measurement._replace(rows=scaled), objective.problem)
-        minimum = _polished(objective, objective.problem.coordinates(minimum.ends), minimum.start)
+        objective = objective.with_rows(error_nm=objective.measurement.rows.error_nm * factor)
+        if objective.problem.lasting:
+            minimum = settle(objective, minimum)
+        else:
+            minimum = _polished(objective, objective.problem.coordinates(minimum.ends), minimum.start)
     return objective, minimum, total
 
 

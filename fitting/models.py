@@ -1,96 +1,77 @@
-"""What can be fitted: models as lists of parameters, and the coordinates the optimiser works in.
-
-The optimiser's coordinate of a loss (1 - r, epsilon, viscous loss) is its square root: the bound 0 becomes an interior,
-smooth minimum of the coordinate, so that a fit that ends at the bound converges like any other and is recognised there.
-"""
+"""What can be fitted: models as lists of parameters, and what a set of values stands for."""
 
 from dataclasses import dataclass
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.impact.law import ImpactLaw
+from afm_jax.contact.contact import EFFECTS
+from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from fitting.parameters import CONTACT, DELAY, NUISANCES, PARAMETERS, Parameter
 
-Numbers = Float[np.ndarray, "..."] | float
-"""Arrays, and the NumPy scalars that come of taking one element of them."""
-
-
-@dataclass(frozen=True)
-class Parameter:
-    """A fit parameter: its unit and what it means in words, and where it may lie.
-
-    ``reference`` and ``sign`` define the coordinate y by value = reference + sign y^2; a sign of 0 means that the
-    coordinate is the logarithm of the value.
-    """
-
-    name: str
-    unit: str
-    meaning: str
-    lowest: float
-    highest: float
-    reference: float = 0.0
-    sign: int = 0
-
-    @property
-    def bound(self) -> float | None:
-        """The value at which the loss vanishes; None for a parameter without such an end."""
-        return self.reference if self.sign else None
-
-    def to_coordinate(self, value: Numbers) -> Numbers:
-        """Return the optimiser's coordinate of a value."""
-        if self.sign:
-            return np.sqrt(np.maximum(self.sign * (value - self.reference), 0.0))
-        return np.log(value)
-
-    def from_coordinate(self, coordinate: Numbers) -> Numbers:
-        """Return the value at a coordinate, kept in the allowed range."""
-        value = self.reference + self.sign * coordinate**2 if self.sign else np.exp(coordinate)
-        return np.clip(value, self.lowest, self.highest)
-
-    def slope(self, coordinate: Numbers) -> Numbers:
-        """Return d value/d coordinate; 0 where the value is held at the end of its range."""
-        value = self.reference + self.sign * coordinate**2 if self.sign else np.exp(coordinate)
-        inside = (value >= self.lowest) & (value <= self.highest)
-        return np.where(inside, 2.0 * self.sign * coordinate if self.sign else value, 0.0)
-
-
-PARAMETERS = {
-    "r": Parameter("r", "", "coefficient of restitution", lowest=0.01, highest=1.0, reference=1.0, sign=-1),
-    "epsilon": Parameter("epsilon", "nm^2/us^2", "adhesion, 2 delta/m", lowest=0.0, highest=1e12, sign=1),
-    "viscous_loss": Parameter("viscous_loss", "nm/us", "loss linear in speed", lowest=0.0, highest=1e6, sign=1),
-    "quality_factor": Parameter("quality_factor", "", "free resonance, constrained", lowest=0.51, highest=1e9),
-}
-
-MODELS = {
+LAWS = {
     "restitution": ("r",),
     "law": ("r", "epsilon"),
     "viscous": ("epsilon", "viscous_loss"),
 }
+DELAY_NAMES = tuple(parameter.name for parameter in DELAY)
+NUISANCE_NAMES = tuple(parameter.name for parameter in NUISANCES)
+CONTACT_NAMES = tuple(parameter.name for parameter in CONTACT)
+CONTACT_DEFAULT = ("relative_humidity", "adhesion_energy_j_per_m2", "viscosity_pa_s", "modulus_gpa")
+"""What the model "contact" fits if nothing else is asked for."""
+MODELS = {**LAWS, **{f"{name}+delay": (*names, *DELAY_NAMES) for name, names in LAWS.items()}, "contact": ()}
+"""Parameters of each model; those of "contact" are chosen."""
 
 
-def law_parameters(model: str) -> tuple[str, ...]:
-    """Return the names of a model's law parameters.
+def model_parameters(model: str, free: tuple[str, ...] | None = None) -> tuple[str, ...]:
+    """Return the names of a model's own parameters, nuisances apart.
+
+    Args:
+        model: a key of `MODELS`.
+        free: for "contact": which of its parameters are fitted; None for `CONTACT_DEFAULT`.
 
     Raises:
-        ValueError: if there is no such model.
+        ValueError: if there is no such model or parameter, or a law's parameters are to be chosen.
     """
     if model not in MODELS:
         raise ValueError(f"`model` must be one of {', '.join(MODELS)}, but is {model!r}")
-    return MODELS[model]
+    if model != "contact":
+        if free is not None:
+            raise ValueError(f"`free` chooses among the contact's parameters; the model {model!r} has none to choose")
+        return MODELS[model]
+    chosen = CONTACT_DEFAULT if free is None else free
+    for name in chosen:
+        if name not in CONTACT_NAMES:
+            raise ValueError(f"`free` must be chosen from {', '.join(CONTACT_NAMES)}, but one is {name!r}")
+    if len(set(chosen)) < len(chosen) or not chosen:
+        raise ValueError("`free` must name at least one parameter, and none twice")
+    return chosen
 
 
 @dataclass(frozen=True)
 class Problem:
-    """What is fitted: the law's parameters and, where the table gives Q with an uncertainty, Q as a nuisance."""
+    """What is fitted: the model's parameters, then nuisances; and which effects a contact has."""
 
     model: str
     names: tuple[str, ...]
+    effects: tuple[str, ...] = EFFECTS
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """The parameters in the order of every vector."""
         return tuple(PARAMETERS[name] for name in self.names)
+
+    @property
+    def lasting(self) -> bool:
+        """Whether impacts take time: a delay, or the contact itself."""
+        return self.model.endswith("+delay") or self.model == "contact"
+
+    @property
+    def own(self) -> tuple[str, ...]:
+        """The names of the model's parameters, without nuisances."""
+        return tuple(name for name in self.names if name not in NUISANCE_NAMES)
 
     def values(self, coordinates: Float[np.ndarray, "... p"]) -> Float[np.ndarray, "... p"]:
         """Return the parameters' values at optimiser coordinates."""
@@ -109,16 +90,27 @@ class Problem:
         columns = zip(self.parameters, np.moveaxis(values, -1, 0), strict=True)
         return np.stack([p.to_coordinate(value) for p, value in columns], axis=-1)
 
+    def known(self, values: Float[Array, " p"]) -> dict[str, Float[Array, ""]]:
+        """Return the parameters by name."""
+        return dict(zip(self.names, values, strict=True))
+
     def law(self, values: Float[Array, " p"]) -> ImpactLaw:
-        """Return the impact law; what the model leaves out is lossless."""
-        known = dict(zip(self.names, values, strict=True))
+        """Return the impact law, with its delay; what the model leaves out is lossless."""
+        known = self.known(values)
         return ImpactLaw(
-            r=known.get("r", 1.0), epsilon=known.get("epsilon", 0.0), viscous_loss=known.get("viscous_loss", 0.0)
+            r=known.get("r", 1.0),
+            epsilon=known.get("epsilon", 0.0),
+            viscous_loss=known.get("viscous_loss", 0.0),
+            delay=CollisionDelay(*(known[name] for name in DELAY_NAMES)) if self.lasting else None,
         )
 
     def cantilever(self, values: Float[Array, " p"], measured: Cantilever) -> Cantilever:
         """Return the cantilever, with its fitted quality factor where that is a nuisance."""
-        if "quality_factor" not in self.names:
+        known = self.known(values)
+        if "quality_factor" not in known:
             return measured
-        quality_factor = values[self.names.index("quality_factor")]
-        return Cantilever(measured.frequency_khz, quality_factor, measured.mass_ng)
+        return Cantilever(measured.frequency_khz, known["quality_factor"], measured.mass_ng)
+
+    def nuisance(self, values: Float[Array, " p"], name: str, neutral: float) -> Float[Array, ""]:
+        """Return a nuisance, or its neutral value where it is not a parameter."""
+        return self.known(values).get(name, jnp.asarray(neutral))

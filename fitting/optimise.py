@@ -5,7 +5,7 @@ with their Jacobian for a handful of parameter sets at once (`forward.linearise`
 and the profile intervals all drive it from outside.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,17 +13,16 @@ import numpy as np
 import optax
 from jaxtyping import Bool, Float
 
-from afm_jax.units import RAD_PER_US_PER_KHZ
-from fitting.forward import Linearised, Measurement, linearise
+from fitting.forward import BATCH, Linearised, linearise
+from fitting.measurement import Measurement
 from fitting.models import Problem
 
-BATCH = 8
-"""Parameter sets that `linearise` takes at once."""
 SOFT = 5.0
 """Residual, in errors, beyond which the screening and the first polish count a row linearly (soft-l1)."""
+ROBUST = 2.0
+"""The same for a fit with robust loss."""
 PLAIN = np.inf
 """The same for plain least squares: no residual gets there."""
-_GRID_PER_PARAMETER = {1: 96, 2: 16}
 _MAX_STEPS = 60
 _LBFGS = optax.lbfgs(learning_rate=1.0, linesearch=None, scale_init_precond=False)
 _init = jax.jit(jax.vmap(_LBFGS.init))
@@ -44,39 +43,60 @@ def soft_square(residual: Float[np.ndarray, "..."], softness: float) -> Float[np
     return 2.0 * square / (1.0 + np.sqrt(1.0 + square / softness**2))
 
 
-def grid(problem: Problem, measurement: Measurement) -> Float[np.ndarray, "points p"]:
-    """Return the values of a coarse grid, logarithmic in every loss; Q stays where it was measured.
-
-    Adhesion and viscous loss are laid out in terms of the drive's speed beta omega, on which capture depends.
-    """
-    rows = measurement.rows
-    drive = RAD_PER_US_PER_KHZ * np.asarray(rows.drive_amplitude_nm) * np.asarray(rows.drive_frequency_khz)
-    slow, fast = float(drive.min()), float(drive.max())
-    laws = [name for name in problem.names if name != "quality_factor"]
-    count = _GRID_PER_PARAMETER[len(laws)]
-    ranges = {
-        "r": 1.0 - np.geomspace(0.7, 1e-4, count),
-        "epsilon": np.geomspace(1e-4 * slow**2, 30.0 * fast**2, count),
-        "viscous_loss": np.geomspace(1e-4 * slow, 10.0 * fast, count),
-        "quality_factor": np.array([float(measurement.quality_factor)]),
-    }
-    mesh = np.meshgrid(*(ranges[name] for name in problem.names), indexing="ij")
-    return np.stack([axis.ravel() for axis in mesh], axis=1)
-
-
 class Objective:
     """The objective of a table and a model in optimiser coordinates, with its gradient, for up to `BATCH` sets."""
 
-    def __init__(self, measurement: Measurement, problem: Problem):
-        """Keep what every evaluation shares."""
-        self.measurement, self.problem = measurement, problem
+    def __init__(
+        self,
+        measurement: Measurement,
+        problem: Problem,
+        *,
+        near: Float[np.ndarray, " rows"] | None = None,
+        robust: bool = False,
+    ):
+        """Keep what every evaluation shares.
+
+        Args:
+            measurement: what predictions are compared with.
+            problem: the model.
+            near: coordinates of the rows' orbits from which they are followed; None: searched for.
+            robust: let outliers count linearly, everywhere: residuals are then such that their squares add up to the
+                soft objective.
+        """
+        self.measurement, self.problem, self.near, self.robust = measurement, problem, near, robust
+
+    def following(self, values: Float[np.ndarray, " p"]) -> "Objective":
+        """Return the same objective with the orbits followed from those at a set of values; only if impacts last."""
+        if not self.problem.lasting:
+            return self
+        found = self.searching().at_values(values[None]).prediction
+        near = np.where(np.asarray(found.orbits)[0] > 0, np.asarray(found.coordinate)[0], np.nan)
+        return Objective(self.measurement, self.problem, near=near, robust=self.robust)
+
+    def searching(self) -> "Objective":
+        """Return the same objective with every orbit searched for."""
+        return Objective(self.measurement, self.problem, robust=self.robust)
+
+    def with_rows(self, **columns: Any) -> "Objective":
+        """Return the same objective with other columns of the rows."""
+        rows = self.measurement.rows._replace(**{name: jnp.asarray(column) for name, column in columns.items()})
+        return Objective(self.measurement._replace(rows=rows), self.problem, near=self.near, robust=self.robust)
 
     def at_values(self, values: Float[np.ndarray, "sets p"]) -> Linearised:
-        """Return the linearised model at parameter values, as NumPy arrays; short batches are filled up."""
-        count = values.shape[0]
-        filled = np.concatenate([values, np.repeat(values[-1:], BATCH - count, axis=0)])
-        result = linearise(jnp.asarray(filled), self.measurement, self.problem)
-        return jax.tree.map(lambda leaf: np.asarray(leaf)[:count], result)
+        """Return the linearised model at parameter values, as NumPy arrays."""
+        batches = [values[i : i + BATCH] for i in range(0, len(values), BATCH)]
+        parts = [linearise(batch, self.measurement, self.problem, self.near) for batch in batches]
+        result: Linearised = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts) if parts[1:] else parts[0]
+        if not self.robust:
+            return result
+        softened, slope = _softened(np.asarray(result.residual))
+        return result._replace(residual=softened, jacobian=np.asarray(result.jacobian) * slope[:, :, None])
+
+    def amplitude_residuals(self, values: Float[np.ndarray, " p"]) -> Float[np.ndarray, "rows 2"]:
+        """Return the residuals of the amplitudes at one set of values, as they are."""
+        plain = Objective(self.measurement, self.problem, near=self.near)
+        rows = self.measurement.rows.order.shape[0]
+        return np.asarray(plain.at_values(values[None]).residual)[0, : 2 * rows].reshape(rows, 2)
 
     def residual(self, values: Float[np.ndarray, "sets p"]) -> Float[np.ndarray, "sets n"]:
         """Return the residuals at parameter values."""
@@ -147,6 +167,15 @@ def polish(objective: Objective, starts: Float[np.ndarray, "starts p"], softness
         state = _choose(accepted, new_state, state)
         step = np.where(kept, _descending(new_step, gradient), step)
     return Polished(starts + np.einsum("spq,sq->sp", scale, z), value, count)
+
+
+def _softened(
+    residual: Float[np.ndarray, "sets n"],
+) -> tuple[Float[np.ndarray, "sets n"], Float[np.ndarray, "sets n"]]:
+    """Return residuals whose squares are the soft squares, and their slope by the plain ones."""
+    root = np.sqrt(1.0 + (residual / ROBUST) ** 2)
+    shrunk = np.sqrt(2.0 / (1.0 + root))
+    return residual * shrunk, np.where(residual == 0.0, 1.0, 1.0 / (root * shrunk))
 
 
 def _lbfgs(

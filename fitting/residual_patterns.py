@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Float
 
-from fitting.sweep_fit import SweepFit
+from fitting.resonance.sweep_fit import SweepFit
 
 _LONGEST = 12
 """Longest repetition looked for, in points."""

@@ -43,24 +43,35 @@ class FittedParameter:
 
 @dataclass(frozen=True)
 class FittedLaw:
-    """The impact law over the speeds that the rows reached, with a pointwise 95 % band (all arrays in nm/us)."""
+    """The impact law over the speeds that the rows reached, with a pointwise 95 % band.
+
+    Speeds in nm/us, the delay in us; it is 0 if impacts are instantaneous.
+    """
 
     approach_speed_nm_per_us: Float[np.ndarray, " points"]
     rebound_speed_nm_per_us: Float[np.ndarray, " points"]
     rebound_low_nm_per_us: Float[np.ndarray, " points"]
     rebound_high_nm_per_us: Float[np.ndarray, " points"]
+    collision_delay_us: Float[np.ndarray, " points"]
+    delay_low_us: Float[np.ndarray, " points"]
+    delay_high_us: Float[np.ndarray, " points"]
 
 
 @dataclass(frozen=True)
 class FittedRows:
     """The rows of the table beside their prediction; NaN where nothing was measured or predicted.
 
-    Amplitudes have shape (rows, 2): peak, lock-in.
+    Amplitudes have shape (rows, 2): peak, lock-in. ``error_nm`` is the measured error with that of the model
+    (``model_error``, relative) added in quadrature; rows ``set_aside`` strain the model too much to be used.
     """
 
     predicted_nm: Float[np.ndarray, "rows 2"]
     measured_nm: Float[np.ndarray, "rows 2"]
     residual: Float[np.ndarray, "rows 2"]
+    error_nm: Float[np.ndarray, "rows 2"]
+    model_error: Float[np.ndarray, " rows"]
+    used: Bool[np.ndarray, " rows"]
+    set_aside: Bool[np.ndarray, " rows"]
     approach_speed_nm_per_us: Float[np.ndarray, " rows"]
     orbits: Int[np.ndarray, " rows"]
     near_fold: Bool[np.ndarray, " rows"]
@@ -74,7 +85,7 @@ class FitResult:
         model: the model's name.
         parameters: by name, the law's first.
         correlations: matrix in the parameters' order; NaN where a variance is unknown.
-        chi2: sum of squared normalised residuals, the constraint on Q included.
+        chi2: sum of squared normalised residuals, constraints included; with a robust fit the soft sum.
         degrees_of_freedom: measured amplitudes plus constraints minus parameters.
         p_value: probability of a larger chi2 if the model is right.
         aic: chi2 + 2 k.

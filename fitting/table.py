@@ -10,7 +10,10 @@ A table is a CSV file in UTF-8: comment lines about the cantilever, a row of col
 ``quality_factor`` may be left out (not known), its error too, and ``mass_ng`` (then 1). The columns ``order`` to
 ``offset_nm`` and one of ``peak_amplitude_nm`` and ``lockin_amplitude_nm`` are needed; ``phase_deg`` may join them. Each
 measured column has a column of standard errors (``..._error_nm``, ``phase_error_deg``). A blank cell in a measured
-column says that this was not measured. Other comments are kept as remarks.
+column says that this was not measured. A column ``no_orbit`` marks by 1 drives on which the tip settled on no steady
+single-impact orbit (it stuck, or moved chaotically): their amplitudes are blank. Comments such as
+``# tip_calibration = 1 +- 0.02``, ``# drive_calibration = 1 +- 0.01`` and ``# offset_origin_nm = 0 +- 0.3`` say what is
+known of the instrument. Other comments are kept as remarks.
 """
 
 from dataclasses import dataclass, field
@@ -19,11 +22,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
-from fitting.table_columns import AMPLITUDES, COLUMN_NAMES, MEASURED, check_column_names
-from fitting.table_comments import fault_in_number, known_key, parse_comments
-from fitting.table_faults import Faults, TableError, printable, quoted
-from fitting.table_file import read_text
-from fitting.table_rows import check_rows, fill_errors, parse_rows, split_cells
+from fitting.tables.table_columns import AMPLITUDES, COLUMN_NAMES, MEASURED, check_column_names
+from fitting.tables.table_comments import CALIBRATION, fault_in_number, known_key, parse_comments
+from fitting.tables.table_faults import Faults, TableError, printable, quoted
+from fitting.tables.table_file import read_text
+from fitting.tables.table_rows import check_rows, fill_errors, parse_rows, split_cells
 
 __all__ = ["AmplitudeTable", "TableError", "read_table", "write_table"]
 
@@ -33,7 +36,7 @@ class AmplitudeTable:
     """Measured amplitudes of (1, N) orbits, one row for each drive; the arrays are read-only NumPy copies.
 
     A measured column is None if the table does not have it, and NaN in the rows where nothing was measured. A value
-    always comes with its standard error, and every row has at least one amplitude.
+    always comes with its standard error, and every row has at least one amplitude or is marked ``no_orbit``.
 
     Attributes:
         order: N, drive periods per impact, shape (rows,), integers.
@@ -47,9 +50,12 @@ class AmplitudeTable:
         lockin_amplitude_error_nm: its standard error.
         phase_deg: phi in z ~ a cos(omega t/N + phi), modulo 360/N, t = 0 when the platform is highest; or None.
         phase_error_deg: its standard error.
+        no_orbit: 1 where the tip settled on no single-impact orbit, else 0, shape (rows,); or None.
         quality_factor: of the free cantilever, or None: not known.
         quality_factor_error: its standard error, or None.
         mass_ng: effective mass of the cantilever.
+        calibration: value and standard error of ``tip_calibration``, ``drive_calibration``, ``offset_origin_nm``, as
+            far as they are uncertain.
         source: path of the file as it was given.
         lines: the line of the file that each row stands in, shape (rows,); 1, 2, 3, ... for a table not from a file.
         remarks: free comments of the file.
@@ -69,9 +75,11 @@ class AmplitudeTable:
     lockin_amplitude_error_nm: Float[np.ndarray, " rows"] | None = None
     phase_deg: Float[np.ndarray, " rows"] | None = None
     phase_error_deg: Float[np.ndarray, " rows"] | None = None
+    no_orbit: Float[np.ndarray, " rows"] | None = None
     quality_factor: float | None = None
     quality_factor_error: float | None = None
     mass_ng: float = 1.0
+    calibration: dict[str, tuple[float, float]] = field(default_factory=dict)
     source: str = "table in memory"
     lines: Int[np.ndarray, " rows"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     remarks: tuple[str, ...] = ()
@@ -204,6 +212,8 @@ def write_table(table: AmplitudeTable, path: str | Path) -> None:
         tail = "" if error is None else f" +- {float(error)!r}"
         lines.append(f"# quality_factor = {float(quality_factor)!r}{tail}")
     lines.append(f"# mass_ng = {float(table.mass_ng)!r}")
+    known = [(name, *table.calibration[name]) for name in CALIBRATION if name in table.calibration]
+    lines += [f"# {name} = {float(value)!r} +- {float(error)!r}" for name, value, error in known]
     lines += [f"# {remark}" for remark in table.remarks]
     columns = {name: getattr(table, name) for name in COLUMN_NAMES if getattr(table, name) is not None}
     lines.append(",".join(columns))

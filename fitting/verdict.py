@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Float
 
 from fitting.checks import Convergence
 from fitting.result import FittedParameter, FittedRows
@@ -10,6 +11,12 @@ from fitting.table import AmplitudeTable
 
 IMPROBABLE = 1e-3
 """Probability of the chi2 below which the model does not explain the table."""
+_TIED = 0.995
+"""Correlation beyond which two parameters are called determined only together."""
+_STATED = 0.003
+"""Relative model error from which rows are named."""
+_OUTLIER = 4.0
+"""Residual in errors from which a row of a robust fit is named."""
 
 
 @dataclass(frozen=True)
@@ -26,6 +33,9 @@ class Evidence:
     autocorrelation: float
     other_minimum: dict[str, float] | None
     error_scale: float | None
+    lasting: bool
+    robust: bool
+    correlations: Float[np.ndarray, "p p"]
 
 
 def judge_fit(evidence: Evidence) -> tuple[list[str], list[str]]:
@@ -39,8 +49,8 @@ def _reasons(evidence: Evidence) -> list[str]:
     undetermined = [name for name, parameter in evidence.parameters.items() if parameter.undetermined]
     if undetermined:
         reasons.append(
-            f"Not identified: the amplitudes do not determine {' and '.join(undetermined)}; measure at other drives, "
-            "orders or offsets too."
+            f"Not identified: the amplitudes do not determine {' and '.join(undetermined)}; "
+            f"{'; '.join(dict.fromkeys(helpful_measurement(name) for name in undetermined))}."
         )
     elif not convergence.converged:
         reasons.append(
@@ -48,28 +58,64 @@ def _reasons(evidence: Evidence) -> list[str]:
             + ("" if convergence.outward else ", and a parameter is held at a bound it would leave")
             + "."
         )
-    missing = np.flatnonzero(evidence.rows.orbits == 0)
+    missing = np.flatnonzero((evidence.rows.orbits == 0) & evidence.rows.used)
     if missing.size:
         reasons.append(f"No stable orbit at the fitted law for {_rows_in_words(evidence.table, missing)}.")
     if evidence.p_value < IMPROBABLE:
         reasons.append(
             f"The model does not explain the data: chi2/dof = {evidence.chi2 / evidence.freedom:.3g} "
-            f"(probability {evidence.p_value:.1g}). The impacts may last too long for an instantaneous law (a "
-            "collision delay decides amplitudes near resonance), the errors may be too small, or the calibration off."
+            f"(probability {evidence.p_value:.1g}). {_why_not_explained(evidence)}"
         )
     if evidence.freedom <= 0:
         reasons.append("As many parameters as amplitudes: the goodness of fit cannot be judged.")
     for name, parameter in evidence.parameters.items():
         explained = not evidence.p_value < IMPROBABLE
         if parameter.interval95 == (None, None) and explained and not undetermined:
-            reasons.append(f"{name} is not identified: {parameter.interval_reason}.")
+            reasons.append(f"{name} is not identified: {parameter.interval_reason}; {helpful_measurement(name)}.")
     return reasons
+
+
+def _why_not_explained(evidence: Evidence) -> str:
+    worst = np.nanmax(np.abs(np.where(np.isfinite(evidence.rows.residual), evidence.rows.residual, 0.0)), axis=1)
+    far = np.argsort(-worst)[: max(1, len(worst) // 20)]
+    rows = _rows_in_words(evidence.table, np.sort(far))
+    if evidence.lasting:
+        return (
+            f"The errors may be too small, the calibration (quality_factor, amplitudes, offsets) off, or some rows not "
+            f"single-impact orbits; farthest off: {rows}."
+        )
+    return (
+        "The impacts may last too long for an instantaneous law (a collision delay decides amplitudes near resonance: "
+        "try the model with +delay), the errors may be too small, or the calibration off."
+    )
+
+
+def helpful_measurement(name: str) -> str:
+    """Return what to measure, or to say, so that a parameter gets determined."""
+    return _HELP.get(name, "measure at other drives, orders or offsets too, or hold it fixed at a known value")
+
+
+_HELP = {
+    "r": "measure fast impacts too: large drives on resonance, and give the quality factor with its error",
+    "epsilon": "measure slow impacts too: small drives, close to where the orbit is lost",
+    "viscous_loss": "measure over a wider range of drives at the same frequency",
+    "delay_hertz": "measure at several orders, detuned to both sides of each resonance",
+    "delay_lead_nm": "measure slow impacts too: small drives, close to where the orbit is lost",
+    "delay_offset_nm": "measure at several offsets and drives",
+    "relative_humidity": "measure slow impacts too, or hold it fixed at the hygrometer's value",
+    "adhesion_energy_j_per_m2": "measure slow impacts too, or hold it or the humidity fixed: both set the hysteresis",
+    "viscosity_pa_s": "measure over a wider range of drives, or hold it fixed at the liquid's known value",
+    "modulus_gpa": "measure at several orders, detuned to both sides of each resonance",
+    "bridge_forms_nm": "hold it fixed: only slow impacts depend on it",
+    "bridge_breaks_nm": "measure slow impacts too: small drives, close to where the orbit is lost",
+}
 
 
 def _warnings(evidence: Evidence) -> list[str]:
     return [
         *_damping_warnings(evidence.table),
         *_parameter_warnings(evidence),
+        *_pair_warnings(evidence),
         *_row_warnings(evidence),
     ]
 
@@ -107,8 +153,36 @@ def _parameter_warnings(evidence: Evidence) -> list[str]:
     return warnings
 
 
+def _pair_warnings(evidence: Evidence) -> list[str]:
+    names = list(evidence.parameters)
+    pairs = [
+        f"{names[i]} and {names[j]} ({evidence.correlations[i, j]:+.3f})"
+        for i in range(len(names))
+        for j in range(i + 1, len(names))
+        if abs(evidence.correlations[i, j]) > _TIED
+    ]
+    if not pairs:
+        return []
+    return [
+        f"Determined only together, hardly apart: {', '.join(pairs)}. The law may be sharp all the same: see its band."
+    ]
+
+
 def _row_warnings(evidence: Evidence) -> list[str]:
     warnings = []
+    aside = np.flatnonzero(evidence.rows.set_aside)
+    if aside.size:
+        warnings.append(
+            "Set aside, because these impacts are too slow for a law of impacts: "
+            f"{_rows_in_words(evidence.table, aside)}."
+        )
+    strained = np.flatnonzero(evidence.rows.used & (evidence.rows.model_error > _STATED))
+    if strained.size:
+        worst = 100.0 * float(evidence.rows.model_error[strained].max())
+        warnings.append(
+            f"A model error of up to {worst:.1f} % was added to the errors of slow impacts: "
+            f"{_rows_in_words(evidence.table, strained)}."
+        )
     several = np.flatnonzero(evidence.rows.orbits > 1)
     if several.size:
         warnings.append(
@@ -123,6 +197,10 @@ def _row_warnings(evidence: Evidence) -> list[str]:
         warnings.append(
             f"Neighbouring residuals are correlated ({evidence.autocorrelation:+.2f}): something systematic is left."
         )
+    if evidence.robust:
+        outliers = np.flatnonzero(np.nanmax(np.abs(np.nan_to_num(evidence.rows.residual)), axis=1) > _OUTLIER)
+        named = f"; outliers: {_rows_in_words(evidence.table, outliers)}" if outliers.size else ""
+        warnings.append(f"Robust loss: chi2 counts outliers linearly, the goodness of fit cannot be judged{named}.")
     if evidence.error_scale is not None:
         warnings.append(
             f"The amplitudes' errors were scaled by {evidence.error_scale:.3g} so that chi2/dof = 1: the goodness of "

@@ -35,7 +35,7 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 SHARED_DATA = Path(__file__).parent.parent.parent / "shared" / "data"
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def contact_table_path() -> Path:
     """The amplitude table of an independent contact simulation; its tests are skipped where it is not at hand."""
     path = SHARED_DATA / "amplitudes_contact.csv"

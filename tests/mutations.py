@@ -16,6 +16,8 @@ JACOBIAN = "tests/test_jacobian.py::test_written_and_automatic_jacobians_have_tw
 ORBIT = f"{ORBITS}[damped]"
 DELAYED_ORBIT = f"{ORBITS}[delayed]"
 FORWARD = "tests/test_forward.py"
+LASTING = "tests/test_lasting_impact.py::"
+LASTING_ORBITS = "tests/test_lasting_orbits.py::"
 INTERVALS = "tests/test_profile_intervals.py"
 FORCES = "tests/test_forces.py::"
 FORMULAS = f"{FORCES}test_forces_of_the_paper_are_their_formulas_in_mpmath"
@@ -166,14 +168,35 @@ MUTATIONS = {
         "(value > 0.0) != rising",
         "tests/test_polynomial_roots.py::test_a_close_pair_is_told_apart",
     ),
+    "air that drives a contact": Mutation(
+        "afm_jax/impact/lasting_impact.py",
+        "gained - (2.0 * AIR)",
+        "gained + (2.0 * AIR)",
+        f"{LASTING}test_air_takes_what_an_integrated_damped_contact_loses",
+    ),
+    "lead that a push lengthens": Mutation(
+        "afm_jax/impact/lasting_impact.py",
+        "longer * tau - share",
+        "longer * tau + share",
+        f"{LASTING}test_a_lead_is_covered_sooner_with_a_push",
+    ),
+    "close pairs of roots stepped over": Mutation(
+        "afm_jax/impact/lasting_search.py",
+        "(bottom * value[at + 1] < 0.0)",
+        "(bottom * value[at + 1] > 0.0)",
+        f"{LASTING_ORBITS}test_a_close_pair_is_found",
+    ),
     "misfit as a sum": Mutation(
         "fitting/forward.py",
-        "prediction.amplitude_nm - every_row.amplitude_nm",
-        "prediction.amplitude_nm + every_row.amplitude_nm",
+        "prediction.amplitude_nm - rows.amplitude_nm",
+        "prediction.amplitude_nm + rows.amplitude_nm",
         FORWARD,
     ),
     "constraint of Q without its error": Mutation(
-        "fitting/forward.py", ".set(1.0 / measurement.quality_factor_error)", ".set(1.0)", FORWARD
+        "fitting/forward.py",
+        "1.0 / np.asarray(measurement.constraint_error)",
+        "1.0 / np.ones_like(measurement.constraint_error)",
+        FORWARD,
     ),
     "intervals of 90 percent": Mutation(
         "fitting/intervals.py", "CHI2_95 = 3.841458820694124", "CHI2_95 = 2.705543454095404", INTERVALS

@@ -15,6 +15,9 @@ from afm_jax.motion.trajectory import trajectory
 from afm_jax.study.effects import EffectStudy, study_effects
 from afm_jax.study.motion_program import Programs
 
+pytestmark = pytest.mark.slow
+"""Each compiles programs of its own for a minute or more."""
+
 FREQUENCY_KHZ, QUALITY, OMEGA = 90.0, 40.0, 2e-3 * np.pi * 90.0
 AMPLITUDE_NM, DRIVE_KHZ, OFFSET_NM = 4.0, 181.8, 1.0
 DRIVE = 2e-3 * np.pi * DRIVE_KHZ

@@ -9,8 +9,8 @@ from scipy.optimize import least_squares
 
 from fitting import fit, read_table
 from fitting.checks import check_minimum, covariance
-from fitting.forward import measurement_of
 from fitting.law_fit import problem_of
+from fitting.measurement import measurement_of
 from fitting.optimise import Objective
 from fitting.result import FitResult
 from fitting.table import AmplitudeTable
@@ -32,7 +32,8 @@ def law(table) -> FitResult:
 
 @pytest.fixture(scope="module")
 def objective(table) -> Objective:
-    return Objective(measurement_of(table), problem_of(table, "law"))
+    problem = problem_of(table, "law")
+    return Objective(measurement_of(table, problem), problem)
 
 
 def differenced(objective: Objective, values: np.ndarray) -> np.ndarray:

@@ -85,7 +85,8 @@ def test_tables_of_the_report_hold_the_fit(reported):
     answer = strictly(result.stdout)
     r, epsilon = (answer["parameters"][name]["value"] for name in ("r", "epsilon"))
     for point in records(folder / "law.csv"):
-        speed, rebound, low, high = (float(number) for number in point.values())
+        speed, rebound, low, high, *delays = (float(number) for number in point.values())
+        assert delays == [0.0, 0.0, 0.0]
         assert rebound == pytest.approx(math.sqrt(r**2 * speed**2 - epsilon), rel=1e-12)
         assert low < rebound < high
     rows = records(folder / "fit_rows.csv")
@@ -165,7 +166,7 @@ def test_scaled_errors_are_said(tmp_path):
         (["no.csv"], "there is no such file"),
         ([], "give a table to fit"),
         (["--example", str(EXAMPLE)], "give a table to fit"),
-        (["--example", "--model", "contact"], "is not one of 'restitution', 'law', 'viscous'"),
+        (["--example", "--model", "hertz"], "is not one of 'restitution', 'law', 'viscous'"),
         (["--example", "--noise", "120%"], "must be a relative error such as 1% or 0.01"),
     ],
 )

@@ -11,8 +11,9 @@ import fitting.forward
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbit_state import SteadyOrbits
 from fitting import fit, read_table
-from fitting.forward import Rows, _branch, _orbit_problem, measurement_of
+from fitting.forward import branch_of, impact_of, orbit_problem
 from fitting.law_fit import problem_of
+from fitting.measurement import Rows, measurement_of
 from fitting.optimise import Objective
 from fitting.table import AmplitudeTable
 from tests.fit_tables import (
@@ -33,7 +34,8 @@ def table() -> AmplitudeTable:
 
 def chi2_beside(table: AmplitudeTable, held: dict[str, float], start: dict[str, float]) -> float:
     """Return SciPy's minimum of chi2 over the other parameters of the law."""
-    objective = Objective(measurement_of(table), problem_of(table, "law"))
+    problem = problem_of(table, "law")
+    objective = Objective(measurement_of(table, problem), problem)
     names = objective.problem.names
 
     def residual(others):
@@ -209,10 +211,11 @@ def test_of_coexisting_orbits_the_measured_one_is_taken(table, monkeypatch, meas
     made_up = SteadyOrbits(jnp.arange(4.0), steady, jnp.zeros(4, dtype=bool), amplitude)
     monkeypatch.setattr(fitting.forward, "steady_orbits", lambda _: made_up)
     error = np.where(np.isnan(measured), np.nan, 1.0)[None]
-    measurement = measurement_of(with_amplitudes(rows(table, slice(0, 1)), np.array([measured]), error))
+    problem, values = problem_of(table, "law"), jnp.array([0.95, 60.0, 40.0])
+    measurement = measurement_of(with_amplitudes(rows(table, slice(0, 1)), np.array([measured]), error), problem)
     row = Rows(*(column[0] for column in measurement.rows))
-    orbit = _orbit_problem(jnp.array([0.95, 60.0, 40.0]), row, measurement, problem_of(table, "law"))
-    branch = _branch(orbit, row)
+    orbit = orbit_problem(values, impact_of(values, measurement, problem), row, measurement, problem)
+    branch = branch_of(orbit, row)
     assert int(branch.coordinate) == slot
     assert int(branch.orbits) == 2
     assert bool(branch.exists)

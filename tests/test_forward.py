@@ -1,10 +1,10 @@
 """Predicted amplitudes of a table's rows and their derivatives, against the reference's orbits."""
 
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fitting.forward import Linearised, linearise, measurement_of
+from fitting.forward import Linearised, linearise
+from fitting.measurement import ROWS_PER_PROGRAM, measurement_of
 from fitting.models import Problem
 from fitting.table import AmplitudeTable
 from tests.reference_examples import scene
@@ -50,7 +50,7 @@ def table() -> AmplitudeTable:
 @pytest.fixture(scope="module")
 def linear() -> Linearised:
     problem = Problem("law", tuple(VALUES))
-    return linearise(jnp.array([list(VALUES.values())]), measurement_of(table()), problem)
+    return linearise(np.array([list(VALUES.values())]), measurement_of(table(), problem), problem)
 
 
 def test_predictions_are_the_orbits_amplitudes(linear):
@@ -67,6 +67,8 @@ def test_residuals_are_misfits_in_errors_and_the_constraint(linear):
     predicted = np.stack([amplitudes(drive, VALUES) for drive in ROWS])
     misfit = np.where(np.isfinite(MEASURED), (predicted - MEASURED) / ERRORS, 0.0)
     residual = np.asarray(linear.residual[0])
+    # two amplitudes of each padded row, a residual for each where no orbit was seen, three constraints
+    assert residual.shape == (3 * ROWS_PER_PROGRAM + 3,)
     np.testing.assert_allclose(residual[: 2 * len(ROWS)].reshape(-1, 2), misfit, rtol=1e-8, atol=1e-10)
     np.testing.assert_array_equal(residual[2 * len(ROWS) : -1], 0.0)
     assert residual[-1] == pytest.approx((38.0 - 40.0) / 4.0, rel=1e-14)

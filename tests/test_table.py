@@ -14,8 +14,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fitting.table import AmplitudeTable, TableError, read_table, write_table
-from fitting.table_columns import COLUMN_NAMES
-from fitting.table_comments import known_key
+from fitting.tables.table_columns import COLUMN_NAMES
+from fitting.tables.table_comments import known_key
 
 NAMES = "order,drive_frequency_khz,drive_amplitude_nm,offset_nm,peak_amplitude_nm,peak_amplitude_error_nm\n"
 TEXT = f"# free_frequency_khz = 90\n{NAMES}1,180,4,0,163.3,1.63\n2,349.2,2,-1,106.67,1.06\n"
@@ -135,6 +135,25 @@ def test_noise_stands_in_for_missing_errors_only(tmp_path: Path):
     np.testing.assert_array_equal(table.lockin_amplitude_error_nm, [17.5, 12.5, np.nan])
 
 
+def test_drives_without_an_orbit_need_no_amplitude(tmp_path: Path):
+    names = NAMES.replace("\n", ",no_orbit\n")
+    rows = "1,180,4,0,163.3,1.63,0\n2,349.2,0.1,-1,,,1\n3,540,2,-1,200,7,\n"
+    table = read_table(write(tmp_path, f"# free_frequency_khz = 90\n{names}{rows}"))
+    np.testing.assert_array_equal(table.no_orbit, [0.0, 1.0, np.nan])
+    np.testing.assert_array_equal(table.peak_amplitude_nm, [163.3, np.nan, 200.0])
+
+
+def test_what_is_known_of_the_instrument_is_kept(tmp_path: Path):
+    known = "# tip_calibration = 1.01 +- 0.02\n# drive_calibration = 1 ± 0.05\n# offset_origin_nm = -0.2 +- 0.3\n"
+    table = read_table(write(tmp_path, known + TEXT))
+    assert table.calibration == {
+        "tip_calibration": (1.01, 0.02),
+        "drive_calibration": (1.0, 0.05),
+        "offset_origin_nm": (-0.2, 0.3),
+    }
+    assert table.remarks == ()
+
+
 def test_arrays_are_read_only_copies():
     order = np.array([1, 2])
     table = small_table(order=order)
@@ -162,10 +181,12 @@ def table_fields(draw: st.DrawFn) -> dict[str, Any]:
         return np.array([cell[0] for cell in cells]), np.array([cell[1] for cell in cells])
 
     kinds = draw(st.sampled_from([("peak_amplitude",), ("lockin_amplitude",), ("peak_amplitude", "lockin_amplitude")]))
-    which = [draw(st.sampled_from([(0,), (1,), (0, 1)] if len(kinds) == 2 else [(0,)])) for _ in range(rows)]
-    columns = {}
+    unseen = [draw(st.sampled_from([0.0, 1.0, np.nan])) for _ in range(rows)] if draw(st.booleans()) else [0.0] * rows
+    present = st.sampled_from([(0,), (1,), (0, 1)] if len(kinds) == 2 else [(0,)])
+    which = [() if mark == 1.0 else draw(present) for mark in unseen]
+    columns = {"no_orbit": np.array(unseen)} if any(unseen) or draw(st.booleans()) else {}
     for index, kind in enumerate(kinds):
-        value, error = measured(POSITIVE, [index in present for present in which])
+        value, error = measured(POSITIVE, [index in there for there in which])
         columns |= {f"{kind}_nm": value, f"{kind}_error_nm": error}
     if draw(st.booleans()):
         columns["phase_deg"], columns["phase_error_deg"] = measured(FINITE, [draw(st.booleans()) for _ in range(rows)])
@@ -179,6 +200,16 @@ def table_fields(draw: st.DrawFn) -> dict[str, Any]:
         "quality_factor": quality_factor,
         "quality_factor_error": None if quality_factor is None else draw(st.none() | POSITIVE),
         "mass_ng": draw(POSITIVE),
+        "calibration": draw(
+            st.fixed_dictionaries(
+                {},
+                optional={
+                    "tip_calibration": st.tuples(POSITIVE, POSITIVE),
+                    "drive_calibration": st.tuples(POSITIVE, POSITIVE),
+                    "offset_origin_nm": st.tuples(FINITE, POSITIVE),
+                },
+            )
+        ),
         "remarks": tuple(draw(st.lists(REMARKS, max_size=3))),
     }
 
@@ -210,7 +241,8 @@ def test_a_hundred_thousand_rows_read_in_seconds(tmp_path: Path):
     rows = 100_000
     random = np.random.default_rng(1)
     columns = {name: random.uniform(1.0, 100.0, rows) for name in COLUMN_NAMES}
-    table = small_table(**(columns | {"order": np.full(rows, 2)}))
+    columns |= {"order": np.full(rows, 2), "no_orbit": np.zeros(rows)}
+    table = small_table(**columns)
     write_table(table, tmp_path / "long.csv")
     start = time.process_time()
     back = read_table(tmp_path / "long.csv")

@@ -5,12 +5,15 @@ from pathlib import Path
 import pytest
 
 from fitting.table import TableError, read_table
-from fitting.table_columns import COLUMN_NAMES
+from fitting.tables.table_columns import COLUMN_NAMES
 from tests.table_texts import KEY, NAMES, ROW, fault_of, message_of
 
 Q = "'# quality_factor = 40 (or 40 +- 2)'"
 NOT_UTF8 = "line 1: is not UTF-8 text; save the table as CSV with the encoding UTF-8"
 ADD_ERRORS = "add the column peak_amplitude_error_nm or give the relative noise (--noise 1%)"
+NEEDS_ERROR = (
+    "needs its standard error; write '# tip_calibration = 1 +- 0.02', or correct the columns and remove this line"
+)
 
 
 @pytest.mark.parametrize(
@@ -118,6 +121,15 @@ def test_units_of_columns(tmp_path: Path, name: str, written: str, unit: str):
         ("mass_kg = 1", "'mass_kg = 1' is no known setting; the key is mass_ng (in ng), as in '# mass_ng = 1'"),
         ("mass_ng = 0", "mass_ng must be finite and above 0, but is 0.0; correct it"),
         ("mass_ng = 1 +- 0.1", "mass_ng takes no such error; write '# mass_ng = 1'"),
+        (
+            "tip_calibration = 1.02",
+            f"tip_calibration {NEEDS_ERROR}",
+        ),
+        ("drive_calibration = 0 +- 0.1", "drive_calibration must be finite and above 0, but is 0.0; correct it"),
+        (
+            "offset_origin_nm = 0 +- 0",
+            "offset_origin_nm has the error 0.0; it must be finite and above 0, or left out",
+        ),
         ("free_frequency_khz = 91", "free_frequency_khz was given in line 1 already; remove one of the two"),
     ],
 )

@@ -8,13 +8,14 @@ import pytest
 
 from fitting import table as table_module
 from fitting.table import AmplitudeTable, TableError
-from fitting.table_faults import Faults
+from fitting.tables.table_faults import Faults
 from tests.table_texts import KEY, NAMES, ROW, fault_of
 
 NOT_NUMBER = "is not a number; write it like 174.6 or 1.746e2, without a unit"
 NOT_MEASURED = "is not a number; leave the cell of a value that was not measured blank"
 NOT_ORDER = "is not a positive whole number; write 1, 2, 3, ..."
 OR_BLANK = "correct it or leave it blank if it was not measured"
+OR_UNSEEN = ", or set no_orbit to 1 if the tip settled on no orbit there"
 AVERAGE = "average the measurements into one row or remove one"
 
 
@@ -74,6 +75,29 @@ def test_cells(tmp_path: Path, row: str, column: str | None, message: str):
     place = "line 4" if column is None else f"line 4, column {column}"
     good = "3,540,4,0,163.3,1.63\n"
     assert fault_of(tmp_path, f"{KEY}{NAMES}{good}{row}\n") == f"{place}: {message}"
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        (
+            "1,180,4,0,,,0",
+            "line 4: the row has no amplitude; fill peak_amplitude_nm in or remove the row" + OR_UNSEEN,
+        ),
+        (
+            "1,180,4,0,163.3,1.63,1",
+            "line 4, column no_orbit: the row has an amplitude; clear it or set no_orbit to 0",
+        ),
+        (
+            "1,180,4,0,163.3,1.63,2",
+            "line 4, column no_orbit: must be 1 (no steady orbit was seen) or 0, but is 2; correct it",
+        ),
+        ("1,180,4,0,163.3,1.63,yes", f"line 4, column no_orbit: 'yes' {NOT_NUMBER}"),
+    ],
+)
+def test_rows_without_an_orbit(tmp_path: Path, row: str, message: str):
+    names = NAMES.replace("\n", ",no_orbit\n")
+    assert fault_of(tmp_path, f"{KEY}{names}3,540,4,0,163.3,1.63,0\n{row}\n") == message
 
 
 @pytest.mark.parametrize("again", [ROW, "+1,180.0,4e0,-0,170,2\n"])
@@ -146,6 +170,10 @@ FIELDS: dict[str, Any] = {
         ),
         ({"quality_factor_error": 2.0}, ": quality_factor_error stands without quality_factor; give both or none"),
         ({"quality_factor": 0.4}, ": quality_factor must be finite and above 0.5, but is 0.4; correct it"),
+        (
+            {"no_orbit": np.array([0.0, 1.0])},
+            ", row 2, column no_orbit: the row has an amplitude; clear it or set no_orbit to 0",
+        ),
         ({"remarks": ("a\nb",)}, r": the remark 'a\nb' would not be read back as one; make it one line of free text"),
         (
             {"remarks": ("mass_ng = 2",)},

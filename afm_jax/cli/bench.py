@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from afm_jax.cli.bench_fits import FIT_COLUMNS, fit_rows, fit_table
 from afm_jax.cli.bench_scenes import SCENE_COLUMNS, measure_scenes, scene_tables
 from afm_jax.cli.session import Session, with_session
 
@@ -66,17 +67,18 @@ CONTACT_COLUMNS = (
 )
 @click.option(
     "--only",
-    type=click.Choice(["map", "contact", "scenes"]),
-    help="The impact map alone, the contact of free tips alone, or driven contacts alone.",
+    type=click.Choice(["map", "contact", "scenes", "fits"]),
+    help="The impact map alone, the contact of free tips alone, driven contacts alone, or fits from the shell alone.",
 )
 @with_session
 def command(session: Session, batches: tuple[int, ...], only: str | None, *, quick: bool) -> None:
-    """Measure impacts per second: of next_impact iterated, of collide through the contact, and of driven contacts.
+    """Measure impacts per second: next_impact iterated, collide through the contact, driven contacts; and fits.
 
     The impact map is measured on one core and on all. The same run measures a chaotic scene, derivatives, and SciPy's
     solve_ivp with events on the same problems. Errors of impact times are against 50 digits, those of contacts against
     finer settings. Times are the best of several repetitions, compilation apart; the machine should have nothing else
-    to do. With --out bench.csv, bench_contact.csv, bench_scenes.csv and bench.json.
+    to do. Fits of 100 rows are timed as commands. With --out bench.csv, bench_contact.csv, bench_scenes.csv,
+    bench_fits.csv and bench.json.
     """
     session.start_computing()
     from afm_jax.cli.strict_json import strict_json  # noqa: PLC0415
@@ -105,6 +107,11 @@ def command(session: Session, batches: tuple[int, ...], only: str | None, *, qui
             payload["aims"] += [aim_of(name, value, at_most=bound) for name, value, bound in reached]
             tables += scene_tables(payload["scene_rows"])
             session.write_table("bench_scenes.csv", payload["scene_rows"], SCENE_COLUMNS)
+        if only in {None, "fits"}:
+            payload["fit_rows"], reached = fit_rows(quick=quick)
+            payload["aims"] += [aim_of(name, value, at_most=bound) for name, value, bound in reached]
+            tables.append(fit_table(payload["fit_rows"]))
+            session.write_table("bench_fits.csv", payload["fit_rows"], FIT_COLUMNS)
     if session.out is not None:
         (session.out / "bench.json").write_text(strict_json(payload) + "\n", encoding="utf-8")
         session.note(f"wrote {session.out / 'bench.json'}")

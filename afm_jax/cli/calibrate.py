@@ -39,8 +39,8 @@ def command(
     """
     session.start_computing()
     from fitting.calibration import calibrate  # noqa: PLC0415
-    from fitting.calibration_report import calibration_summary  # noqa: PLC0415
-    from fitting.resonance_sweep import read_sweep, without_phase  # noqa: PLC0415
+    from fitting.resonance.calibration_report import calibration_summary  # noqa: PLC0415
+    from fitting.resonance.resonance_sweep import read_sweep, without_phase  # noqa: PLC0415
 
     measured = read_sweep(sweep)
     if amplitude_only:
@@ -49,7 +49,7 @@ def command(
         result = calibrate(measured, background=background, noise=noise, scale_errors=scale_errors)
     session.emit(result.to_dict(), calibration_summary(result))
     if session.out is not None:
-        from fitting.calibration_report import write_calibration  # noqa: PLC0415
+        from fitting.resonance.calibration_report import write_calibration  # noqa: PLC0415
 
         for path in write_calibration(result, session.out, session.write_table):
             session.note(f"wrote {path}")

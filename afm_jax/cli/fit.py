@@ -1,35 +1,19 @@
 """`afm-jax fit TABLE.csv`: the impact law from measured vibration amplitudes."""
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from afm_jax.cli.failures import NotValid
+from afm_jax.cli.fit_options import Constraint, Fixed, Names, Noise
 from afm_jax.cli.session import Session, with_session
 
-MODELS = ("restitution", "law", "viscous")
+if TYPE_CHECKING:
+    from fitting.result import FitResult
+    from fitting.table import AmplitudeTable
 
-
-class Noise(click.ParamType):
-    """A relative error: 1% or 0.01."""
-
-    name = "share"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Return the share that a text says.
-
-        Raises:
-            click.BadParameter: if it is no number between 0 and 1.
-        """
-        text = str(value).strip()
-        try:
-            share = float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
-        except ValueError:
-            share = float("nan")
-        if not 0.0 < share < 1.0:
-            self.fail(f"must be a relative error such as 1% or 0.01, but is {value}", param, ctx)
-        return share
+MODELS = ("restitution", "law", "viscous", "restitution+delay", "law+delay", "viscous+delay", "contact")
 
 
 @click.command()
@@ -39,40 +23,142 @@ class Noise(click.ParamType):
     default="law",
     show_default=True,
     type=click.Choice(MODELS),
-    help="restitution: r alone; law: r and epsilon; viscous: epsilon and viscous_loss.",
+    help="restitution: r alone; law: r and epsilon; viscous: epsilon and viscous_loss; each with the collision delay "
+    "(+delay), which amplitudes near resonance need; contact: physical parameters through the resolved contact.",
 )
 @click.option("--noise", type=Noise(), metavar="SHARE", help="Relative error of amplitudes without one, such as 1%.")
 @click.option("--scale-errors", is_flag=True, help="Take the errors as relative: scale them until chi2/dof is 1.")
+@click.option("--robust", is_flag=True, help="Let outliers count linearly from two errors on.")
+@click.option(
+    "--free",
+    type=Names(),
+    metavar="NAME,...",
+    help="contact: the parameters that are fitted; if left out relative_humidity,adhesion_energy_j_per_m2,"
+    "viscosity_pa_s,modulus_gpa.",
+)
+@click.option("--fix", type=Fixed(), multiple=True, metavar="NAME=VALUE", help="contact: a value not the paper's.")
+@click.option(
+    "--constrain",
+    type=Constraint(),
+    multiple=True,
+    metavar="NAME=VALUE+-ERROR",
+    help="What is known beforehand: quality_factor, tip_calibration, drive_calibration, offset_origin_nm, or a "
+    "parameter of the model.",
+)
+@click.option("--no", "left_out", type=Names(), metavar="EFFECT,...", help="contact: effects that it does not have.")
+@click.option("--compare", "comparing", is_flag=True, help="Fit the rival models too and say what the table can tell.")
+@click.option(
+    "--bootstrap",
+    type=click.IntRange(min=50, max=100_000),
+    metavar="SAMPLES",
+    help="Intervals by refitting this many synthetic tables, too.",
+)
+@click.option(
+    "--posterior", is_flag=True, help="Credible intervals, too: by a grid, or NUTS for more than two parameters."
+)
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of everything random.")
 @click.option("--example", is_flag=True, help="Fit the bundled table instead of a file.")
 @with_session
-def command(
-    session: Session, table: Path | None, model: str, noise: float | None, *, scale_errors: bool, example: bool
-) -> None:
+def command(session: Session, table: Path | None, model: str, noise: float | None, **options: Any) -> None:
     """Fit the impact law to a table of vibration amplitudes.
 
     The table is a CSV file: comment lines `# free_frequency_khz = 90`, `# quality_factor = 40 +- 1`, and columns
     order, drive_frequency_khz, drive_amplitude_nm, offset_nm, peak_amplitude_nm and/or lockin_amplitude_nm, each
-    with its ..._error_nm. With --out the report: fit.txt, fit.json, fit.png, fit_rows.csv, law.csv. Exit code 3 if
-    the result is not valid: not converged, not explained by the model, or a parameter not identified.
+    with its ..._error_nm; a column no_orbit marks by 1 drives on which the tip settled on nothing. With --out the
+    report: fit.html, fit.txt, fit.json, fit.png, fit_rows.csv, law.csv. Exit code 3 if the result is not valid: not
+    converged, not explained by the model, or a parameter not identified.
     """
-    if example == (table is not None):
+    if options["example"] == (table is not None):
         raise click.UsageError("give a table to fit, `afm-jax fit TABLE.csv`, or --example for the bundled one")
+    settings = _settings(model, options)
     session.start_computing()
     from fitting.law_fit import fit  # noqa: PLC0415
     from fitting.report import summary  # noqa: PLC0415
     from fitting.table import read_table  # noqa: PLC0415
 
     measured = read_table(_example_path() if table is None else table, noise=noise)
-    with session.working(f"fitting {measured.rows} rows (the first run compiles for some seconds)"):
-        result = fit(measured, model, scale_errors=scale_errors)
-    session.emit(result.to_dict(), summary(result))
+    first = "the first run compiles for half a minute" if "delay" in model or model == "contact" else "some seconds"
+    with session.working(f"fitting {measured.rows} rows, model {model} ({first})"):
+        result = fit(measured, model, **settings)
+    extras = _extras(session, measured, result, settings, options)
+    payload = result.to_dict() | {name: extra.to_dict() for name, extra in extras.items()}
+    session.emit(payload, summary(result), *(_words(name, extra) for name, extra in extras.items()))
     if session.out is not None:
         from fitting.report import write_report  # noqa: PLC0415
 
-        for path in write_report(result, session.out, session.write_table):
+        for path in write_report(result, session.out, session.write_table, **extras):
             session.note(f"wrote {path}")
     if not result.valid:
         raise NotValid(result.reasons[0])
+
+
+def _settings(model: str, options: dict[str, Any]) -> dict[str, Any]:
+    """Return the keywords of `fitting.fit`.
+
+    Raises:
+        click.UsageError: if options of the contact stand with another model.
+    """
+    for option, given in (("--free", options["free"]), ("--fix", options["fix"]), ("--no", options["left_out"])):
+        if given and model != "contact":
+            raise click.UsageError(f"{option} is about the contact's parameters; add --model contact")
+    settings: dict[str, Any] = {
+        "scale_errors": options["scale_errors"],
+        "robust": options["robust"],
+        "constraints": dict(options["constrain"]),
+    }
+    if model == "contact":
+        from afm_jax.cli.contact_options import REMOVABLE  # noqa: PLC0415
+
+        left_out = options["left_out"] or ()
+        for name in left_out:
+            if name not in REMOVABLE:
+                raise click.UsageError(f"--no takes {', '.join(REMOVABLE)}, but one is {name!r}")
+        effects = ("capillary", "structural", "core", "viscous", "jkr")
+        settings["free"], settings["fixed"] = options["free"], dict(options["fix"])
+        settings["effects"] = tuple(name for name in effects if name not in left_out)
+    return settings
+
+
+def _extras(
+    session: Session, table: "AmplitudeTable", result: "FitResult", settings: dict[str, Any], options: dict[str, Any]
+) -> dict[str, Any]:
+    """Return what was asked for besides the fit: a comparison of models, a bootstrap."""
+    extras: dict[str, Any] = {}
+    if options["comparing"]:
+        from fitting.comparison import compare, rivals  # noqa: PLC0415
+
+        models = rivals(result.model)
+        with session.working(f"comparing {', '.join(models)}"):
+            extras["comparison"] = compare(table, models, **settings)
+    if options["bootstrap"] and result.valid:
+        from fitting.sampling.parametric_bootstrap import bootstrap  # noqa: PLC0415
+
+        with session.working(f"fitting {options['bootstrap']} synthetic tables"):
+            extras["bootstrap"] = bootstrap(result, samples=options["bootstrap"], seed=options["seed"])
+    if options["posterior"] and result.valid:
+        from fitting.sampling.posterior_of_fit import posterior  # noqa: PLC0415
+
+        with session.working("sampling the posterior"):
+            extras["posterior"] = posterior(result, seed=options["seed"])
+    return extras
+
+
+def _words(name: str, extra: Any) -> str:
+    """Return a comparison, a bootstrap or a posterior as text."""
+    if name == "comparison":
+        head = f"  {'model':<18}{'chi2/dof':>14}{'AIC':>10}{'BIC':>10}{'law differs':>14}"
+        lines = [
+            f"  {row['model']:<18}{row['chi2']:>10.1f}/{row['degrees_of_freedom']:<3d}{row['aic']:>10.1f}"
+            f"{row['bic']:>10.1f}{100.0 * row['law_change']:>12.2f} %"
+            for row in extra.rows
+        ]
+        return "\n".join(["", "Models on the same rows, best first:", head, *lines, f"  {extra.verdict}"])
+    intervals = {key: found["interval95"] for key, found in extra.to_dict()["parameters"].items()}
+    head = "95 % credible intervals (posterior, flat priors):"
+    if name == "bootstrap":
+        head = f"95 % intervals of {len(extra.samples)} synthetic tables (bootstrap):"
+    lines = [f"  {key:<16} {low:.6g} to {high:.6g}" for key, (low, high) in intervals.items()]
+    return "\n".join(["", head, *lines])
 
 
 def _example_path() -> Path:

@@ -53,6 +53,7 @@ class Junction(NamedTuple):
         return self.bridge_hysteresis_aj + self.junction_hysteresis_aj
 
 
+@jax.jit
 def find_junction(contact: Contact) -> Junction:
     """Return the junction of a contact; differentiable in every parameter, for one set of them.
 

@@ -5,7 +5,7 @@ hold with damping, viscous loss and delay), and `map_jacobian`, which finds the 
 `afm-jax verify` compares all of them with automatic differentiation.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -14,10 +14,27 @@ from jaxtyping import Array, ArrayLike, Float
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, require_sample_drive
-from afm_jax.impact.law import ImpactLaw, impact_law_of
+from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.poincare import next_impact
 from afm_jax.outcome import Outcome
 from afm_jax.parameters import as_argument
+
+
+@runtime_checkable
+class LawWithSlopes(Protocol):
+    """What `impact_jacobian` asks of a law: an `ImpactLaw`, or another law and delay with derivatives."""
+
+    def rebound_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return d u_out/d u_in."""
+        ...
+
+    def delay_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return d tau/d u_in in us^2/nm."""
+        ...
+
+    def collision_delay(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return tau in us."""
+        ...
 
 
 class PaperFlight(NamedTuple):
@@ -151,7 +168,7 @@ def flight_jacobian(
 
 
 def impact_jacobian(
-    law: ImpactLaw, platform: Platform, arrival_us: ArrayLike, velocity_before: ArrayLike
+    law: LawWithSlopes, platform: Platform, arrival_us: ArrayLike, velocity_before: ArrayLike
 ) -> Float[Array, "2 2"]:
     """Return d(t_out, V')/d(t_in, V) of an impact: eq. 7 with viscous loss and collision delay.
 

@@ -46,14 +46,20 @@ def peak_amplitude(cantilever: Cantilever, flight: FlightEnds) -> Float[Array, "
 
 
 def lockin(
-    cantilever: Cantilever, platform: Platform, flight: FlightEnds, order: ArrayLike, *, delayed: bool
+    cantilever: Cantilever,
+    platform: Platform,
+    flight: FlightEnds,
+    order: ArrayLike,
+    *,
+    delayed: bool,
+    indentation: ArrayLike = 0.0,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """Return lock-in amplitude in nm and phase in degrees of an orbit at its response frequency omega/N.
 
     a exp(i phi) = 2/T int z exp(-i omega t/N) dt over one response period T; phi modulo 360/N. The flight's integral
     is closed: with [.] the difference of the ends, I (Omega^2 - nu^2 + i nu Omega/Q) = -[v e] - (i nu + Omega/Q)[z e],
     e = exp(-i nu t). From the flight's end to the next start (a collision delay, if there is one: `delayed`) the tip
-    rides on the platform.
+    rides on the platform, or below it: `indentation` is the time integral of how much, in nm us.
     """
     period = as_argument(order) * platform.period_us
     nu = platform.angular_frequency / order
@@ -70,7 +76,9 @@ def lockin(
     size = jnp.where(size == 0.0, 1.0, size)
     flying = jnp.array([real * source[0] + imaginary * source[1], real * source[1] - imaginary * source[0]]) / size
     if delayed:
-        flying = flying + _platform_integral(platform, nu, end_us, flight.start_us + period)
+        start_us = flight.start_us + period
+        flying = flying + _platform_integral(platform, nu, end_us, start_us)
+        flying = flying - indentation * _turned_back(nu, 0.5 * (end_us + start_us))
     cosine, sine = 2.0 / period * flying
     phase = jnp.rad2deg(jnp.arctan2(sine, cosine)) % (360.0 / as_argument(order))
     return jnp.sqrt(cosine**2 + sine**2), phase

@@ -84,7 +84,7 @@ def closure(coordinate: Float[Array, ""], problem: OrbitProblem) -> Closure:
         return Closure(cosine, sine, flight.closing, flight.regular(platform))
     propagator = cantilever.propagator(order * platform.period_us - speeds.delay)
     turn = platform.angular_frequency * speeds.delay
-    return _delayed(propagator, speeds, platform, (jnp.cos(turn), jnp.sin(turn)))
+    return delayed_closure(propagator, speeds, platform, (jnp.cos(turn), jnp.sin(turn)))
 
 
 def instantaneous_quartic(problem: OrbitProblem) -> Float[Array, " 5"]:
@@ -152,7 +152,7 @@ def _instantaneous(approach, rebound, one, flight: _ReturningFlight, platform: P
     return height - offset, -(approach * flight.after + rebound * flight.before)
 
 
-def _delayed(p: Propagator, speeds: Speeds, platform: Platform, turn) -> Closure:
+def delayed_closure(p: Propagator, speeds: Speeds, platform: Platform, turn) -> Closure:
     """Solve both rows by Cramer's rule, every length over beta and every speed over beta omega."""
     omega, top_speed = platform.angular_frequency, platform.top_speed_nm_per_us
     cos_turn, sin_turn = turn

@@ -1,0 +1,188 @@
+"""The options of `afm-jax design` about what is believed: the cantilever, the law, or a fit of both."""
+
+import functools
+import json
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import click
+
+from afm_jax.cli.number_lists import ValueAndError
+
+if TYPE_CHECKING:
+    from fitting.planning.experiment_belief import Belief
+
+MODELS = (
+    *("restitution", "law", "viscous"),
+    *("restitution+delay", "law+delay", "viscous+delay"),
+    "contact",
+)
+_LAW = {
+    "r": "coefficient of restitution",
+    "epsilon": "adhesion, nm^2/us^2",
+    "viscous_loss": "loss linear in speed, nm/us",
+    "delay_hertz": "Hertz contact time at 1 nm/us, us",
+    "delay_lead_nm": "lead of a slow way out",
+    "delay_offset_nm": "offset of the contact surface, twice",
+}
+_INSTRUMENT = {
+    "quality_factor": ("of the cantilever, such as '40 +- 2'; none: no air damping.", "40 +- 2"),
+    "tip_calibration": ("measured over true amplitude of the tip, such as '1 +- 0.02'.", "1 +- 0.02"),
+    "drive_calibration": ("true over stated amplitude of the platform, such as '1 +- 0.02'.", "1 +- 0.02"),
+    "offset_origin_nm": ("what the offsets lack, such as '0 +- 0.3'; not with a delay.", "0 +- 0.3"),
+}
+_BELONG = ("free_frequency_khz", "mass_ng", "free", "value", *_LAW, *_INSTRUMENT)
+
+
+class BeliefOptions(NamedTuple):
+    """The options as they were given; None where they were not."""
+
+    fit: Path | None
+    measured: Path | None
+    model: str | None
+    uncertainty: float
+    numbers: Mapping[str, Any]
+
+
+class Assignment(click.ParamType):
+    """A parameter's value, as `relative_humidity=0.4`."""
+
+    name = "assignment"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, float]:
+        """Return name and value.
+
+        Raises:
+            click.BadParameter: if it is no name, equals sign and number.
+        """
+        if isinstance(value, tuple):
+            return value
+        name, _, number = str(value).partition("=")
+        try:
+            return name.strip().replace("-", "_"), float(number)
+        except ValueError:
+            self.fail(f"`{value}` is no NAME=NUMBER, such as relative_humidity=0.4", param, ctx)
+
+
+def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command the options of a belief; it gets them as `belief_options`."""
+
+    @functools.wraps(function)
+    def command(
+        *args: Any, fit: Path | None, measured: Path | None, model: str | None, uncertainty: float, **options: Any
+    ) -> Any:
+        numbers = {name: options.pop(name) for name in _BELONG}
+        given = {name: value for name, value in numbers.items() if value not in (None, ())}
+        return function(*args, belief_options=BeliefOptions(fit, measured, model, uncertainty, given), **options)
+
+    # click lists options in the order of the decorators, the last one first
+    for name, (what, _) in list(_INSTRUMENT.items())[::-1]:
+        command = click.option(_option(name), type=ValueAndError(), metavar="X", help=what)(command)
+    for name, what in list(_LAW.items())[::-1]:
+        command = click.option(_option(name), type=float, metavar="X", help=f"{what}; else the paper's.")(command)
+    value = "--value", "value"
+    for decorate in (
+        click.option(
+            *value, type=Assignment(), multiple=True, metavar="NAME=X", help="A contact's parameter; repeatable."
+        ),
+        click.option("--free", metavar="NAMES", help="With contact: its parameters that a fit would determine."),
+        click.option("--mass-ng", type=float, metavar="X", help="Effective mass of the tip; else 1."),
+        click.option("--free-frequency-khz", type=float, metavar="X", help="Resonance of the free cantilever."),
+        click.option("--model", type=click.Choice(MODELS), help="What will be fitted; else law+delay, or the fit's."),
+        click.option(
+            "--measured",
+            type=click.Path(path_type=Path),
+            metavar="CSV",
+            help="An amplitude table to add to: it is fitted first.",
+        ),
+        click.option(
+            "--fit",
+            type=click.Path(path_type=Path),
+            metavar="JSON",
+            help="A fit to add to, as `afm-jax fit --json` writes it.",
+        ),
+    ):
+        command = decorate(command)
+    return command
+
+
+def believed(options: BeliefOptions, noise: float) -> "Belief":
+    """Return the belief that the options describe.
+
+    Args:
+        options: as given.
+        noise: relative error of amplitudes of a measured table that has none of its own.
+
+    Raises:
+        click.UsageError: if they contradict each other, or say nothing of the cantilever.
+        ValueError: if a value is impossible, or a file cannot be read.
+    """
+    if options.fit is not None and options.measured is not None:
+        raise click.UsageError("--fit and --measured both say what is known; give one of them")
+    if options.fit is None and options.measured is None:
+        return _from_values(options)
+    source = "--fit" if options.measured is None else "--measured"
+    for name in options.numbers:
+        if options.measured is None or name != "free":
+            raise click.UsageError(f"{_option(name)} is what {source} says already; leave one of them out")
+    from fitting.planning.experiment_after_fit import belief_of_fit  # noqa: PLC0415
+
+    if options.fit is not None:
+        payload = _read_json(options.fit)
+        belief = belief_of_fit(payload, options.uncertainty)
+        if options.model not in (None, belief.problem.model):
+            raise click.UsageError(f"{options.fit} is a fit of the model {belief.problem.model}, not {options.model}")
+        return belief
+    from fitting.law_fit import fit  # noqa: PLC0415
+    from fitting.table import read_table  # noqa: PLC0415
+
+    table = read_table(options.measured or "", noise=noise)
+    return belief_of_fit(fit(table, options.model or "law+delay", free=_names(options)), options.uncertainty)
+
+
+def _from_values(options: BeliefOptions) -> "Belief":
+    from fitting.models import model_parameters  # noqa: PLC0415
+    from fitting.planning.experiment_belief import believe  # noqa: PLC0415
+
+    numbers, model, free = options.numbers, options.model or "law+delay", _names(options)
+    if "free_frequency_khz" not in numbers:
+        raise click.UsageError("give --free-frequency-khz (and --quality-factor), or --fit or --measured")
+    quality_factor, _ = numbers.get("quality_factor", (None, None))
+    own = model_parameters(model, free)
+    contact = dict(numbers.get("value", ()))
+    values = {name: value for name, value in numbers.items() if name in _LAW}
+    for name, (_, example) in _INSTRUMENT.items():
+        if name != "quality_factor" and name in numbers and numbers[name][1] is None:
+            raise click.UsageError(f"{_option(name)} needs its standard error; write '{example}'")
+    return believe(
+        model,
+        free_frequency_khz=numbers["free_frequency_khz"],
+        quality_factor=quality_factor,
+        mass_ng=numbers.get("mass_ng", 1.0),
+        values=values | {name: value for name, value in contact.items() if name in own},
+        constraints={name: numbers[name] for name in _INSTRUMENT if numbers.get(name, (0, None))[1] is not None},
+        free=free,
+        fixed={name: value for name, value in contact.items() if name not in own},
+        uncertainty=options.uncertainty,
+    )
+
+
+def _names(options: BeliefOptions) -> tuple[str, ...] | None:
+    names = options.numbers.get("free")
+    return None if names is None else tuple(name.strip().replace("-", "_") for name in names.split(","))
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    text = path.read_text(encoding="utf-8")
+    try:
+        payload = json.loads(text)
+    except ValueError as error:
+        raise ValueError(f"{path}: is no JSON ({error}); give what `afm-jax fit --json` writes") from error
+    if not isinstance(payload, dict):
+        raise ValueError(f"{path}: is no saved fit; give what `afm-jax fit --json` writes")  # noqa: TRY004
+    return payload
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"

@@ -1,0 +1,93 @@
+"""Texts of `afm-jax fit`'s options turned into values: shares, `NAME=VALUE`, `NAME=VALUE+-ERROR`, lists of names."""
+
+import math
+import re
+from typing import Any
+
+import click
+
+_PLUS_MINUS = re.compile(r"\+-|\+/-|±")
+
+
+class Noise(click.ParamType):
+    """A relative error: 1% or 0.01."""
+
+    name = "share"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return the share that a text says.
+
+        Raises:
+            click.BadParameter: if it is no number between 0 and 1.
+        """
+        text = str(value).strip()
+        try:
+            share = float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
+        except ValueError:
+            share = float("nan")
+        if not 0.0 < share < 1.0:
+            self.fail(f"must be a relative error such as 1% or 0.01, but is {value}", param, ctx)
+        return share
+
+
+class Fixed(click.ParamType):
+    """A parameter held at a value: NAME=VALUE."""
+
+    name = "value"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, float]:
+        """Return name and value.
+
+        Raises:
+            click.BadParameter: if the text is something else.
+        """
+        name, sign, text = str(value).partition("=")
+        number = _number(text)
+        if not sign or not name.strip() or number is None:
+            self.fail(f"must be NAME=VALUE such as modulus_gpa=80, but is {value}", param, ctx)
+        return name.strip(), number
+
+
+class Constraint(click.ParamType):
+    """What is known of a parameter: NAME=VALUE+-ERROR."""
+
+    name = "constraint"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, tuple[float, float]]:
+        """Return name, value and standard error.
+
+        Raises:
+            click.BadParameter: if the text is something else.
+        """
+        name, sign, text = str(value).partition("=")
+        numbers = [_number(part) for part in _PLUS_MINUS.split(text)]
+        if not sign or not name.strip() or len(numbers) != 2 or numbers[0] is None or numbers[1] is None:
+            self.fail(f"must be NAME=VALUE+-ERROR such as tip_calibration=1+-0.02, but is {value}", param, ctx)
+        return name.strip(), (numbers[0], numbers[1])
+
+
+class Names(click.ParamType):
+    """Names in a comma list."""
+
+    name = "names"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
+        """Return the names.
+
+        Raises:
+            click.BadParameter: if one is blank.
+        """
+        names = tuple(part.strip() for part in str(value).split(","))
+        if not all(names):
+            self.fail(f"must be names separated by commas, but is {value}", param, ctx)
+        return names
+
+
+def _number(text: str) -> float | None:
+    try:
+        number = float(text.strip())
+    except ValueError:
+        return None
+    return number if math.isfinite(number) else None

@@ -1,0 +1,73 @@
+"""`afm-jax invert TABLE.csv`: speeds and delay of every impact from amplitude and phase, without any law."""
+
+from pathlib import Path
+
+import click
+
+from afm_jax.cli.failures import NotValid
+from afm_jax.cli.fit import Noise
+from afm_jax.cli.session import Session, with_session
+
+
+@click.command()
+@click.argument("table", metavar="[TABLE.csv]", required=False, type=click.Path(path_type=Path))
+@click.option("--noise", type=Noise(), metavar="SHARE", help="Relative error of amplitudes without one, such as 1%.")
+@click.option(
+    "--frequency-error",
+    "frequency_error_khz",
+    type=click.FloatRange(min=0.0, min_open=True),
+    metavar="KHZ",
+    help="Standard error of the free frequency; without it, exactly known.",
+)
+@click.option(
+    "--truth",
+    type=click.Path(path_type=Path),
+    metavar="CSV",
+    help="The law if it is known, as `afm-jax collide --out` writes it: compared with the reading on resonance.",
+)
+@click.option("--example", is_flag=True, help="Invert the bundled table instead of a file.")
+@with_session
+def command(
+    session: Session,
+    table: Path | None,
+    noise: float | None,
+    frequency_error_khz: float | None,
+    truth: Path | None,
+    *,
+    example: bool,
+) -> None:
+    """Read approach speed, rebound speed and collision delay off amplitude and phase, row by row, without any law.
+
+    The table is that of `afm-jax fit` with phase_deg and phase_error_deg. The losses are then regressed on both laws
+    (restitution, viscous loss), the delays on the delay law. Rows on resonance are also read as the paper proposes,
+    without their phase. With --out the report: invert.txt, .json, .png, .csv and law.csv. Exit code 3 if the rows
+    determine no law, or none explains them.
+    """
+    if example == (table is not None):
+        raise click.UsageError("give a table to invert, `afm-jax invert TABLE.csv`, or --example for the bundled one")
+    session.start_computing()
+    from fitting.inverse.inversion_report import inversion_summary  # noqa: PLC0415
+    from fitting.inverse.known_law import read_known_law  # noqa: PLC0415
+    from fitting.inversion import invert  # noqa: PLC0415
+    from fitting.table import read_table  # noqa: PLC0415
+
+    measured = read_table(_example_path() if table is None else table, noise=noise)
+    known = None if truth is None else read_known_law(truth)
+    with session.working(f"inverting {measured.rows} rows (the first run compiles for some seconds)"):
+        result = invert(measured, frequency_error_khz=frequency_error_khz, truth=known)
+    session.emit(result.to_dict(), inversion_summary(result))
+    if session.out is not None:
+        from fitting.inverse.inversion_report import write_inversion  # noqa: PLC0415
+
+        for path in write_inversion(result, session.out, session.write_table):
+            session.note(f"wrote {path}")
+    if not result.valid:
+        raise NotValid(result.reasons[0])
+
+
+def _example_path() -> Path:
+    """Return where the bundled table lies, the short way if that is below the working folder."""
+    import fitting.examples  # noqa: PLC0415
+
+    path = Path(fitting.examples.__path__[0]) / "amplitudes_contact.csv"
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path

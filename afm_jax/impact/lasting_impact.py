@@ -1,0 +1,267 @@
+"""An impact that lasts: what the platform's motion and the air do to a law and a delay while the tip is in contact.
+
+A law and a delay are those of a free tip on a sample at rest. On a moving sample, in air, with a spring, small
+corrections follow from the time courses of a Hertz contact and of a leaving tip, without a parameter of their own. With
+the Hertz time tau = a u^(-1/5), the tip's acceleration g relative to the platform at mid contact and its change j,
+G = g tau/u and J = j tau^2/u:
+
+    platform and spring   u_out^2 += (0.4247 J - 0.157 G J + 0.027 J^2) u^2
+    air damping           u_out^2 -= (10/9) (Omega/Q) tau u^2
+    duration              tau_d += (-0.1274 G - 0.0213 J - 0.0234 G^2 + 0.0267 G J) tau
+    lead                  a tip that leaves keeps its energy over a length, which acceleration makes it pass sooner
+
+The numbers are those of the Hertz contact, d'' = (-d)^(3/2) + g + j t for the gap d, fitted over |G|, |J| < 0.35. They
+bring amplitudes from 0.2-0.7 % to about 0.01 % of those of the full contact, to 1 % at twice the capture speed.
+"""
+
+from typing import NamedTuple, Protocol, runtime_checkable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
+from afm_jax.impact.jacobian import LawWithSlopes
+from afm_jax.impact.law import ImpactLaw
+from afm_jax.impact.orbit_closure import Speeds, capture_coordinate, speeds_at
+
+HERTZ = np.array([0.4247, -0.157, 0.027])
+"""Gain of the squared speed, over u^2, by J, G J and J^2."""
+LONGER = np.array([-0.1274, -0.0213, -0.0234, 0.0267])
+"""Lengthening of the contact, over tau, by G, J, G^2 and G J."""
+AIR = 10.0 / 9.0
+"""Twice the integral of the squared speed over a Hertz contact, over tau u^2."""
+INDENTATION = 0.2123
+"""Time integral of the indentation of a Hertz contact, over tau^2 u."""
+BRIDGE_NM = 4.7
+"""Length in nm over which a leaving tip keeps its energy, where nothing says it: the paper's bridge."""
+USUAL_LEAD = 1.3
+"""Lead b of a tip that keeps its energy over a length, over that length: what comes closest for eight contacts."""
+
+
+@runtime_checkable
+class LastingImpact(LawWithSlopes, Protocol):
+    """A law and a delay, as functions of one coordinate that grows with the approach speed."""
+
+    @property
+    def lowest(self) -> Float[Array, ""]:
+        """Coordinate at which the tip is captured, in nm/us."""
+        ...
+
+    @property
+    def reach(self) -> Float[Array, ""]:
+        """Distance from the lowest coordinate over which the law changes its character, in nm/us."""
+        ...
+
+    @property
+    def lead(self) -> Float[Array, ""]:
+        """Length b in nm of the lead b (1/u_out - 1/u_in) that the delay contains."""
+        ...
+
+    @property
+    def length(self) -> Float[Array, ""]:
+        """Length in nm over which a leaving tip keeps its energy: the gap at which the bridge breaks."""
+        ...
+
+    def hertz_time(self, approach_speed: Float[Array, ""]) -> Float[Array, ""]:
+        """Return the time tau in us that a Hertz contact of the same stiffness would take."""
+        ...
+
+    def speeds(self, coordinate: Float[Array, ""]) -> Speeds:
+        """Return approach and rebound speed and the delay at a coordinate."""
+        ...
+
+
+class LawImpact(eqx.Module):
+    """An `ImpactLaw` as a lasting impact; its coordinate Y is that of `orbit_closure`."""
+
+    law: ImpactLaw
+
+    @property
+    def lowest(self) -> Float[Array, ""]:
+        """Y at which the tip is captured."""
+        return capture_coordinate(self.law)
+
+    @property
+    def reach(self) -> Float[Array, ""]:
+        """The same: adhesion counts up to twice the capture speed."""
+        return capture_coordinate(self.law)
+
+    @property
+    def lead(self) -> Float[Array, ""]:
+        """The delay's lead in nm."""
+        return jnp.zeros_like(self.law.r) if self.law.delay is None else self.law.delay.lead_nm
+
+    @property
+    def length(self) -> Float[Array, ""]:
+        """That of the paper's bridge."""
+        return jnp.full_like(self.law.r, BRIDGE_NM)
+
+    def hertz_time(self, approach_speed: Float[Array, ""]) -> Float[Array, ""]:
+        """Return a u^(-1/5) of the delay."""
+        hertz = jnp.zeros_like(self.law.r) if self.law.delay is None else self.law.delay.hertz
+        return hertz * approach_speed**-0.2
+
+    def speeds(self, coordinate: Float[Array, ""]) -> Speeds:
+        """Return approach and rebound speed and the delay at Y."""
+        return speeds_at(coordinate, self.law)
+
+    def rebound_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return d u_out/d u_in of the law."""
+        return self.law.rebound_slope(approach_speed)
+
+    def delay_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return d tau/d u_in of the law."""
+        return self.law.delay_slope(approach_speed)
+
+    def collision_delay(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return the law's delay."""
+        return self.law.collision_delay(approach_speed)
+
+
+class TabulatedImpact(eqx.Module):
+    """The loss u_in^2 - u_out^2 and the delay as Chebyshev series in log(u_in - lowest); the coordinate is u_in.
+
+    From the delay the lead of a slow way out is taken off first, `lead_nm` (1/u_out - 1/u_in): what is left is smooth.
+
+    Attributes:
+        loss: coefficients of the loss in nm^2/us^2, shape (terms,).
+        delay: coefficients of the delay with the lead added, in us, shape (terms,).
+        lowest: speed in nm/us at which the tip is captured (0: none is).
+        start: log of the distance from `lowest` where the table begins.
+        end: and where it ends; beyond, its ends are held.
+        lead_nm: lead that is taken off the delay.
+        early_nm: lead b of the delay law that is closest to the delay.
+        length_nm: gap at which the bridge breaks.
+    """
+
+    loss: Float[Array, " terms"]
+    delay: Float[Array, " terms"]
+    lowest: Float[Array, ""]
+    start: Float[Array, ""]
+    end: Float[Array, ""]
+    lead_nm: Float[Array, ""]
+    early_nm: Float[Array, ""]
+    length_nm: Float[Array, ""]
+
+    @property
+    def reach(self) -> Float[Array, ""]:
+        """The capture speed."""
+        return self.lowest
+
+    def hertz_time(self, approach_speed: Float[Array, ""]) -> Float[Array, ""]:
+        """Return tau at the end of the table, where nothing else is left of the delay, scaled to the speed."""
+        end = self.lowest + jnp.exp(self.end)
+        return jnp.sum(self.delay) * (end / approach_speed) ** 0.2
+
+    @property
+    def lead(self) -> Float[Array, ""]:
+        """The lead b that comes closest to the delay, in nm."""
+        return self.early_nm
+
+    @property
+    def length(self) -> Float[Array, ""]:
+        """Gap at which the bridge breaks."""
+        return self.length_nm
+
+    def speeds(self, coordinate: Float[Array, ""]) -> Speeds:
+        """Return approach and rebound speed and the delay at u_in."""
+        u = coordinate
+        place = self._place(u)
+        square = u * u - chebyshev_sum(self.loss, place)
+        # a captured tip has a crawling rebound: far from any orbit that was measured
+        w = jnp.sqrt(jnp.maximum(square, 1e-6))
+        return Speeds(u, w, chebyshev_sum(self.delay, place) - self.lead_nm * (1.0 / w - 1.0 / u))
+
+    def rebound_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return d u_out/d u_in."""
+        return self._slopes(approach_speed).rebound
+
+    def delay_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return d tau/d u_in in us^2/nm."""
+        return self._slopes(approach_speed).delay
+
+    def collision_delay(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return the delay in us."""
+        return self.speeds(jnp.asarray(approach_speed)).delay
+
+    def _slopes(self, approach_speed: ArrayLike) -> Speeds:
+        u = jnp.asarray(approach_speed)
+        return jax.jvp(self.speeds, (u,), (jnp.ones_like(u),))[1]
+
+    def _place(self, u: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return where a speed lies in the table, -1 to 1."""
+        distance = jnp.log(jnp.maximum(u - self.lowest, jnp.exp(self.start)))
+        return jnp.clip(2.0 * (distance - self.start) / (self.end - self.start) - 1.0, -1.0, 1.0)
+
+
+class Middle(NamedTuple):
+    """The tip relative to the platform at mid contact: acceleration g in nm/us^2 and its change j in nm/us^3."""
+
+    acceleration: Float[Array, ""]
+    change: Float[Array, ""]
+
+
+def middle_of_contact(
+    cantilever: Cantilever,
+    platform: Platform,
+    cosine: Float[Array, ""],
+    sine: Float[Array, ""],
+    delay: Float[Array, ""],
+) -> Middle:
+    """Return the accelerations half a delay before the end of contact.
+
+    Args:
+        cantilever: pulls at the tip by its spring and through the air.
+        platform: moves.
+        cosine: of the drive's phase at the end of contact.
+        sine: of it.
+        delay: time in contact in us.
+    """
+    omega, beta = platform.angular_frequency, platform.amplitude_nm
+    turn = 0.5 * omega * delay
+    c, s = jnp.cos(turn), jnp.sin(turn)
+    cosine, sine = cosine * c + sine * s, sine * c - cosine * s
+    height = platform.offset_nm + beta * cosine
+    velocity, acceleration = -beta * omega * sine, -beta * omega**2 * cosine
+    pull = -(cantilever.angular_frequency**2) * height - 2.0 * cantilever.decay_rate * velocity - acceleration
+    return Middle(pull, -beta * omega**3 * sine)
+
+
+def corrected(free: Speeds, middle: Middle, cantilever: Cantilever, impact: LastingImpact) -> Speeds:
+    """Return rebound speed and delay on a moving platform.
+
+    Args:
+        free: speeds and delay of the free tip on a sample at rest.
+        middle: accelerations at mid contact.
+        cantilever: for the damping of the air.
+        impact: for its Hertz time and its lead.
+    """
+    u, tau = free.approach, impact.hertz_time(free.approach)
+    pull, change = middle.acceleration * tau / u, middle.change * tau**2 / u
+    gained = HERTZ[0] * change + HERTZ[1] * pull * change + HERTZ[2] * change**2
+    gained = gained - (2.0 * AIR) * cantilever.decay_rate * tau
+    square = free.rebound**2 + gained * u**2
+    rebound = jnp.sqrt(jnp.maximum(square, (0.1 * free.rebound) ** 2))
+    longer = LONGER[0] * pull + LONGER[1] * change + LONGER[2] * pull**2 + LONGER[3] * pull * change
+    held = _lag(free.rebound, impact.length, middle.acceleration) - _lag(u, impact.length, middle.acceleration)
+    share = jnp.maximum(impact.lead, 0.0) / (USUAL_LEAD * impact.length)
+    return Speeds(u, rebound, free.delay + longer * tau - share * held)
+
+
+def _lag(speed: Float[Array, ""], length: Float[Array, ""], acceleration: Float[Array, ""]) -> Float[Array, ""]:
+    """Return by how much a length takes longer at constant acceleration than without, in us."""
+    square = speed**2 + 2.0 * acceleration * length
+    end = jnp.sqrt(jnp.maximum(square, (0.1 * speed) ** 2))
+    return 2.0 * length / (end + speed) - length / speed
+
+
+def chebyshev_sum(coefficients: Float[Array, " terms"], place: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the Chebyshev series at places in [-1, 1] by Clenshaw's recurrence."""
+    ahead, further = jnp.zeros_like(place), jnp.zeros_like(place)
+    for k in range(coefficients.shape[0] - 1, 0, -1):
+        ahead, further = coefficients[k] + 2.0 * place * ahead - further, ahead
+    return coefficients[0] + place * ahead - further

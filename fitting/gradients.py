@@ -1,0 +1,202 @@
+"""Derivatives of predicted amplitudes by every parameter, forward or reverse, refused where there are none.
+
+A steady orbit is a root of its closing condition; by the implicit function theorem it moves smoothly with the
+parameters, except at a fold, where it meets another root and ends, and where the tip grazes the platform, at the impact
+or on the way. There, and where there is no steady orbit, the gradient is NaN and a sentence says why.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from afm_jax.contact.contact import EFFECTS
+from afm_jax.impact.first_impact import Flight, flight_gap
+from afm_jax.impact.lasting_closure import LastingProblem
+from afm_jax.impact.lasting_orbits import lasting_amplitudes, lasting_state
+from afm_jax.impact.orbit_closure import OrbitProblem
+from afm_jax.impact.orbit_state import amplitudes, orbit_state
+from afm_jax.impact.poincare import NEAR_GRAZING
+from afm_jax.parameters import require_float64
+from fitting.contact_values import check_contact_values
+from fitting.forward import branch_of, impact_of, orbit_problem
+from fitting.measurement import ROWS_PER_PROGRAM, Measurement, Rows, measurement_of
+from fitting.models import CONTACT_NAMES, NUISANCE_NAMES, Problem, model_parameters
+from fitting.parameters import PARAMETERS
+from fitting.table import AmplitudeTable
+
+_LOOKS = 512
+"""Times at which the gap of a flight is looked at for a graze on the way."""
+_TOUCHING = 1e-3
+"""Smallest gap on the way, in terms of the drive's amplitude, below which a flight counts as grazing."""
+
+NO_ORBIT = "there is no steady single-impact orbit at these values"
+AT_A_FOLD = "the orbit is close to a fold, where it ends and no derivative exists"
+SLOW_GRAZE = "the impact grazes the platform: its approach is slower than a thousandth of the platform's speed"
+GRAZE_ON_THE_WAY = "the flight grazes the platform on the way: a small change makes another impact there"
+
+
+@dataclass(frozen=True)
+class AmplitudeGradients:
+    """Predicted amplitudes of a table's rows, peak and lock-in, and their derivatives.
+
+    Attributes:
+        parameters: names, in the order of the last axis of the gradient.
+        predicted_nm: amplitudes in nm, shape (rows, 2); NaN where there is no orbit.
+        gradient: in nm per unit of each parameter, shape (rows, 2, p); NaN where it is refused.
+        reasons: why a row's gradient is refused, or None.
+    """
+
+    parameters: tuple[str, ...]
+    predicted_nm: Float[np.ndarray, "rows 2"]
+    gradient: Float[np.ndarray, "rows 2 p"]
+    reasons: tuple[str | None, ...]
+
+
+class _Judged(NamedTuple):
+    """Amplitudes and their slopes of every row, and what speaks against the slopes."""
+
+    amplitude_nm: Float[Array, "rows 2"]
+    slope: Float[Array, "rows 2 p"]
+    exists: Bool[Array, " rows"]
+    near_fold: Bool[Array, " rows"]
+    slow: Bool[Array, " rows"]
+    touching: Bool[Array, " rows"]
+
+
+def amplitude_gradients(
+    table: AmplitudeTable,
+    model: str,
+    values: Mapping[str, float],
+    *,
+    mode: str = "forward",
+    fixed: dict[str, float] | None = None,
+    effects: Sequence[str] = EFFECTS,
+) -> AmplitudeGradients:
+    """Return the derivatives of the amplitudes that a model predicts for a table's drives.
+
+    Where several steady orbits coexist, the one closest to the measured amplitudes counts.
+
+    Args:
+        table: the drives, and the amplitudes that tell coexisting orbits apart.
+        model: as for `fit`.
+        values: the model's parameters (for "contact" any of them) and any nuisances, by name: what is not named is the
+            table's.
+        mode: "forward" costs as much as there are parameters, "reverse" as there are amplitudes; same numbers.
+        fixed: for "contact": values of parameters that are not the paper's and not differentiated by.
+        effects: for "contact": the effects there are.
+
+    Raises:
+        ValueError: if there is no such model, mode or parameter, or one is missing or outside its range.
+        RuntimeError: if JAX is not set to 64-bit floats.
+    """
+    require_float64()
+    if mode not in ("forward", "reverse"):
+        raise ValueError(f'`mode` must be "forward" or "reverse", but is {mode!r}')
+    check_contact_values(model, fixed)
+    problem = _problem(model, values, effects)
+    measurement = measurement_of(table, problem, fixed=fixed)
+    point = jnp.asarray([float(values[name]) for name in problem.names])
+    found = _in_blocks(point, measurement, problem, mode)
+    found = jax.tree.map(lambda column: column[: table.rows], found)
+    reasons = tuple(
+        _reason(*row) for row in zip(found.exists, found.near_fold, found.slow, found.touching, strict=True)
+    )
+    refused = np.array([reason is not None for reason in reasons])
+    return AmplitudeGradients(
+        parameters=problem.names,
+        predicted_nm=np.where(found.exists[:, None], found.amplitude_nm, np.nan),
+        gradient=np.where(refused[:, None, None], np.nan, found.slope),
+        reasons=reasons,
+    )
+
+
+def _problem(model: str, values: Mapping[str, float], effects: Sequence[str]) -> Problem:
+    """Return the parameters that are differentiated by, the model's own first."""
+    chosen = tuple(name for name in values if name in CONTACT_NAMES)
+    own = model_parameters(model, chosen if model == "contact" else None)
+    missing = [name for name in own if name not in values]
+    if missing:
+        raise ValueError(f"`values` lacks {' and '.join(missing)}, which the model {model!r} needs; add it")
+    for name, value in values.items():
+        if name not in (*own, *NUISANCE_NAMES):
+            raise ValueError(f"`values` names {name!r}: choose from {', '.join((*own, *NUISANCE_NAMES))}")
+        parameter = PARAMETERS[name]
+        if not parameter.lowest <= value <= parameter.highest:
+            raise ValueError(
+                f"`values`: {name} must lie between {parameter.lowest:g} and {parameter.highest:g}, but is {value!r}"
+            )
+    return Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in values), tuple(effects))
+
+
+def _in_blocks(point: Float[Array, " p"], measurement: Measurement, problem: Problem, mode: str) -> _Judged:
+    """Return all rows, some at a time: one compiled program serves tables of every size."""
+    columns = jax.tree.map(np.asarray, measurement.rows)
+    blocks = []
+    for begin in range(0, columns.order.shape[0], ROWS_PER_PROGRAM):
+        some = jax.tree.map(lambda column, begin=begin: column[begin : begin + ROWS_PER_PROGRAM], columns)
+        block = _judged(point, measurement._replace(rows=some), problem, mode)
+        blocks.append(jax.tree.map(np.asarray, block))
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
+
+
+@partial(jax.jit, static_argnames=("problem", "mode"))
+def _judged(values: Float[Array, " p"], measurement: Measurement, problem: Problem, mode: str) -> _Judged:
+    impact = impact_of(values, measurement, problem)
+    differentiated = jax.jacfwd if mode == "forward" else jax.jacrev
+
+    def one(row: Rows):
+        orbit = orbit_problem(values, impact, row, measurement, problem)
+        branch = lax.stop_gradient(branch_of(orbit, row))
+
+        def predicted(v):
+            return _amplitudes(
+                branch.coordinate, orbit_problem(v, impact_of(v, measurement, problem), row, measurement, problem)
+            ) * problem.nuisance(v, "tip_calibration", 1.0)
+
+        slow, touching = _grazes(branch.coordinate, orbit)
+        slope = differentiated(predicted)(values)
+        return _Judged(predicted(values), slope, branch.exists, branch.near_fold, slow, touching)
+
+    return jax.vmap(one)(measurement.rows)
+
+
+def _amplitudes(coordinate: Float[Array, ""], orbit: OrbitProblem | LastingProblem) -> Float[Array, " 2"]:
+    if isinstance(orbit, LastingProblem):
+        return lasting_amplitudes(coordinate, orbit)[:2]
+    return amplitudes(coordinate, orbit)
+
+
+def _grazes(
+    coordinate: Float[Array, ""], orbit: OrbitProblem | LastingProblem
+) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Say whether the impact is a graze, and whether the flight touches the platform on the way."""
+    state = lasting_state(coordinate, orbit) if isinstance(orbit, LastingProblem) else orbit_state(coordinate, orbit)
+    slow = state.speeds.approach < NEAR_GRAZING * orbit.platform.top_speed_nm_per_us
+    flight = Flight(orbit.cantilever, orbit.platform, state.flight.start_us, state.flight.start_velocity)
+    begin = jnp.maximum(-state.speeds.delay, 0.0)
+    times = begin + (state.flight.duration_us - begin) * jnp.asarray(np.linspace(0.0, 1.0, _LOOKS))
+    gap = jax.vmap(lambda time: flight_gap(time, flight))(times)
+    before, here, after = gap[:-2], gap[1:-1], gap[2:]
+    bend = before - 2.0 * here + after
+    dip = (here <= before) & (here <= after) & (bend > 0.0)
+    # the parabola through three neighbours: between two looks the flight may come closer
+    lowest = here - (after - before) ** 2 / (8.0 * jnp.where(dip, bend, 1.0))
+    return slow, jnp.any(dip & (lowest < _TOUCHING * orbit.platform.amplitude_nm))
+
+
+def _reason(exists: np.bool_, near_fold: np.bool_, slow: np.bool_, touching: np.bool_) -> str | None:
+    """Return why a row has no gradient, None if it has one."""
+    if not exists:
+        return NO_ORBIT
+    if near_fold:
+        return AT_A_FOLD
+    if slow:
+        return SLOW_GRAZE
+    return GRAZE_ON_THE_WAY if touching else None

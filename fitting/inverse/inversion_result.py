@@ -1,0 +1,192 @@
+"""What a direct inversion found, point by point and as laws, and everything that went into it."""
+
+import math
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from fitting.inverse.inversion_resonance import ResonanceReading
+from fitting.table import AmplitudeTable
+
+FORMAT_VERSION = 1
+"""Version of the JSON layout; raised when a key changes its meaning or goes."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class InvertedRows:
+    """The impacts of all rows of a table, as those of a free tip on a sample at rest; NaN where a row has none.
+
+    Attributes:
+        impact: approach speed, rebound speed (nm/us) and collision delay (us), shape (rows, 3).
+        covariance: of the three, from the errors of the row's own numbers, shape (rows, 3, 3).
+        shared: by how much the three move with one standard error of what all rows share, shape (rows, 3, shared).
+        shared_names: what the rows share: "quality_factor", "free_frequency_khz".
+        chi2: of a row's three measured numbers (one degree of freedom); NaN where there are only two.
+        regressed: whether the row enters the laws.
+        note: why a row was not inverted or not regressed; empty where there is nothing to say.
+    """
+
+    impact: Float[np.ndarray, "rows 3"]
+    covariance: Float[np.ndarray, "rows 3 3"]
+    shared: Float[np.ndarray, "rows 3 shared"]
+    shared_names: tuple[str, ...]
+    chi2: Float[np.ndarray, " rows"]
+    regressed: Bool[np.ndarray, " rows"]
+    note: tuple[str, ...]
+
+    @property
+    def inverted(self) -> Bool[np.ndarray, " rows"]:
+        """Which rows were inverted."""
+        return np.asarray(np.isfinite(self.impact).all(axis=1))
+
+    @property
+    def errors(self) -> Float[np.ndarray, "rows 3"]:
+        """Standard errors from the row's own numbers."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+    @property
+    def systematic_errors(self) -> Float[np.ndarray, "rows 3"]:
+        """Standard errors from what all rows share."""
+        return np.sqrt(np.sum(self.shared**2, axis=2))
+
+
+@dataclass(frozen=True)
+class Coefficient:
+    """A coefficient of a regressed law; its standard error holds the systematic one (of Q and frequency)."""
+
+    value: float
+    unit: str
+    standard_error: float | None
+    systematic_error: float | None
+
+
+@dataclass(frozen=True)
+class RegressedLaw:
+    """A law regressed on the rows.
+
+    Attributes:
+        model: "viscous" (u_out^2 = u_in^2 - epsilon - viscous_loss u_in), "restitution" (u_out^2 = r^2 u_in^2 -
+            epsilon, eq. 6) or "delay" (tau = hertz u_in^(-1/5) - lead_nm (1/u_out - 1/u_in) - offset_nm/u_in).
+        parameters: by name.
+        chi2: sum of squared normalised residuals.
+        degrees_of_freedom: rows less coefficients.
+        p_value: probability of a larger chi2 if the law is right.
+        pulls: by how many standard errors Q and frequency are moved, by name.
+        curve: the law at the result's speeds: rebound speed in nm/us (NaN where captured), or the delay in us.
+        curve_error: its standard error.
+    """
+
+    model: str
+    parameters: dict[str, Coefficient]
+    chi2: float
+    degrees_of_freedom: int
+    p_value: float
+    pulls: dict[str, float]
+    curve: Float[np.ndarray, " points"]
+    curve_error: Float[np.ndarray, " points"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inversion:
+    """The outcome of `invert`.
+
+    Attributes:
+        table: what was inverted.
+        rows: point by point.
+        approach_speed_nm_per_us: speeds at which the laws' curves are given, shape (points,).
+        laws: the regressions of the loss, by model; empty where rows do not determine one.
+        delay: the delay law, or None.
+        preferred: the model that chi2 prefers, or None where it does not tell.
+        verdict: the same in words.
+        resonance: the paper's own reading of the rows on resonance.
+        valid: whether rows determine what is asked; `reasons` say why not.
+        reasons: what makes the result invalid.
+        warnings: what a reader should know besides.
+        versions: of the packages that computed it.
+    """
+
+    table: AmplitudeTable
+    rows: InvertedRows
+    approach_speed_nm_per_us: Float[np.ndarray, " points"]
+    laws: dict[str, RegressedLaw]
+    delay: RegressedLaw | None
+    preferred: str | None
+    verdict: str
+    resonance: ResonanceReading
+    valid: bool
+    reasons: list[str]
+    warnings: list[str]
+    versions: dict[str, str]
+
+    def records(self) -> list[dict[str, Any]]:
+        """Return a mapping per row of the table; what is not known is None."""
+        table, rows = self.table, self.rows
+        lines = table.lines if len(table.lines) else np.arange(1, table.rows + 1)
+        errors, systematic = rows.errors, rows.systematic_errors
+        with np.errstate(invalid="ignore", divide="ignore"):
+            correlation = rows.covariance[:, 0, 1] / errors[:, 0] / errors[:, 1]
+        columns: dict[str, Any] = {
+            "line": lines,
+            "order": table.order,
+            "drive_frequency_khz": table.drive_frequency_khz,
+            "drive_amplitude_nm": table.drive_amplitude_nm,
+            "offset_nm": table.offset_nm,
+        }
+        for k, (name, unit) in enumerate(
+            (("approach_speed", "nm_per_us"), ("rebound_speed", "nm_per_us"), ("collision_delay", "us"))
+        ):
+            columns[f"{name}_{unit}"] = rows.impact[:, k]
+            columns[f"{name}_error_{unit}"] = errors[:, k]
+            columns[f"{name}_systematic_{unit}"] = systematic[:, k]
+        columns |= {"speed_correlation": correlation, "chi2": rows.chi2, "regressed": rows.regressed, "note": rows.note}
+        plain = {name: _plain(column) for name, column in columns.items()}
+        return [{name: column[i] for name, column in plain.items()} for i in range(table.rows)]
+
+    def law_records(self) -> list[dict[str, Any]]:
+        """Return the laws' curves, a mapping per speed."""
+        columns: dict[str, Any] = {"approach_speed_nm_per_us": self.approach_speed_nm_per_us}
+        for name, law in self.laws.items():
+            columns[f"rebound_speed_{name}_nm_per_us"] = law.curve
+            columns[f"rebound_speed_{name}_error_nm_per_us"] = law.curve_error
+        if self.delay is not None:
+            columns |= {"collision_delay_us": self.delay.curve, "collision_delay_error_us": self.delay.curve_error}
+        plain = {name: _plain(column) for name, column in columns.items()}
+        return [{name: column[i] for name, column in plain.items()} for i in range(len(self.approach_speed_nm_per_us))]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain lists, numbers and strings; what is not known is None."""
+        law = {name: asdict(found) for name, found in self.laws.items()}
+        curve = self.laws.get(self.preferred or "viscous")
+        law |= {
+            "preferred": self.preferred,
+            "verdict": self.verdict,
+            "approach_speed_nm_per_us": self.approach_speed_nm_per_us,
+            "rebound_speed_nm_per_us": None if curve is None else curve.curve,
+        }
+        found = {
+            "format": "afm-jax invert",
+            "format_version": FORMAT_VERSION,
+            "valid": self.valid,
+            "reasons": self.reasons,
+            "warnings": self.warnings,
+            "rows": self.records(),
+            "law": law,
+            "delay": None if self.delay is None else asdict(self.delay),
+            "resonance": asdict(self.resonance),
+            "input": {name: value for name, value in vars(self.table).items() if value is not None},
+            "versions": self.versions,
+        }
+        return _plain(found)
+
+
+def _plain(value: Any) -> Any:
+    """Return a value without arrays, tuples and numbers that JSON does not have."""
+    if hasattr(value, "tolist"):
+        value = value.tolist()
+    if isinstance(value, dict):
+        return {name: _plain(item) for name, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

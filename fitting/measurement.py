@@ -1,0 +1,110 @@
+"""What a prediction is compared with: a table's rows as arrays, the cantilever, and the Gaussian constraints."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from afm_jax.apparatus.cantilever import Cantilever
+from fitting.models import CONTACT_NAMES, Problem
+from fitting.table import AmplitudeTable
+
+ROWS_PER_PROGRAM = 32
+"""Rows are padded to multiples of this, so that tables of similar size share one compiled program."""
+
+
+class Rows(NamedTuple):
+    """A table as arrays of shape (rows,), and measured values and errors of shape (rows, 2): peak, lock-in.
+
+    What was not measured, and every padded row, has ``measured`` False; its value and error are 1. ``no_orbit``: the
+    drive was tried and no steady orbit seen.
+    """
+
+    order: Float[Array, " rows"]
+    drive_frequency_khz: Float[Array, " rows"]
+    drive_amplitude_nm: Float[Array, " rows"]
+    offset_nm: Float[Array, " rows"]
+    amplitude_nm: Float[Array, "rows 2"]
+    error_nm: Float[Array, "rows 2"]
+    measured: Bool[Array, "rows 2"]
+    no_orbit: Bool[Array, " rows"]
+
+
+class Measurement(NamedTuple):
+    """Everything a prediction is compared with.
+
+    Attributes:
+        rows: the table, padded.
+        cantilever: as the table gives it.
+        constraint_value: what is known of each parameter beforehand, shape (p,).
+        constraint_error: its standard error, infinite where nothing is known.
+        contact: for the model "contact" its parameters that are not fitted, by keyword of `Contact.paper`.
+    """
+
+    rows: Rows
+    cantilever: Cantilever
+    constraint_value: Float[Array, " p"]
+    constraint_error: Float[Array, " p"]
+    contact: dict[str, Float[Array, ""]]
+
+
+def measurement_of(
+    table: AmplitudeTable,
+    problem: Problem,
+    constraints: dict[str, tuple[float, float]] | None = None,
+    fixed: dict[str, float] | None = None,
+) -> Measurement:
+    """Return a table as padded arrays (float64).
+
+    Args:
+        table: the amplitudes.
+        problem: the model; its parameters' order is that of the constraints.
+        constraints: value and standard error of what is known beforehand, by parameter; Q's is the table's.
+        fixed: contact parameters that are not the paper's.
+    """
+    known = dict(constraints or {})
+    if table.quality_factor is not None and table.quality_factor_error is not None:
+        known.setdefault("quality_factor", (table.quality_factor, table.quality_factor_error))
+    pairs = [
+        known.get(name, (parameter.reference, np.inf))
+        for name, parameter in zip(problem.names, problem.parameters, strict=True)
+    ]
+    contact = {name: jnp.asarray(float(value)) for name, value in (fixed or {}).items() if name in CONTACT_NAMES}
+    return Measurement(
+        rows=rows_of(table),
+        cantilever=Cantilever(table.free_frequency_khz, table.quality_factor, table.mass_ng),
+        constraint_value=jnp.asarray([float(value) for value, _ in pairs]),
+        constraint_error=jnp.asarray([float(error) for _, error in pairs]),
+        contact=contact,
+    )
+
+
+def rows_of(table: AmplitudeTable) -> Rows:
+    """Return the rows of a table, padded to a multiple of `ROWS_PER_PROGRAM`."""
+    size = -(-table.rows // ROWS_PER_PROGRAM) * ROWS_PER_PROGRAM
+
+    def padded(column, filler=None):
+        column = np.asarray(column, float)
+        filler = column[-1] if filler is None else filler
+        return np.concatenate([column, np.full(size - column.shape[0], filler)])
+
+    def pair(peak, lockin):
+        columns = [np.full(table.rows, np.nan) if c is None else c for c in (peak, lockin)]
+        return np.stack([padded(column, np.nan) for column in columns], axis=1)
+
+    # NumPy up to here: every JAX operation outside a compiled program would be compiled by itself.
+    amplitude = pair(table.peak_amplitude_nm, table.lockin_amplitude_nm)
+    error = pair(table.peak_amplitude_error_nm, table.lockin_amplitude_error_nm)
+    measured = np.isfinite(amplitude)
+    unseen = np.zeros(table.rows) if table.no_orbit is None else np.nan_to_num(table.no_orbit)
+    return Rows(
+        order=jnp.asarray(padded(table.order)),
+        drive_frequency_khz=jnp.asarray(padded(table.drive_frequency_khz)),
+        drive_amplitude_nm=jnp.asarray(padded(table.drive_amplitude_nm)),
+        offset_nm=jnp.asarray(padded(table.offset_nm)),
+        amplitude_nm=jnp.asarray(np.where(measured, amplitude, 1.0)),
+        error_nm=jnp.asarray(np.where(measured, error, 1.0)),
+        measured=jnp.asarray(measured),
+        no_orbit=jnp.asarray(padded(unseen, 0.0) > 0.0),
+    )

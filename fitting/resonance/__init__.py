@@ -1,0 +1,1 @@
+"""Free resonance sweeps: reading, model, errors, report."""

@@ -1,0 +1,161 @@
+"""A calibration as a person reads it: text for the terminal, files for the drawer (JSON, CSV, PNG)."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fitting.resonance.calibration_result import CalibratedValue, Calibration
+
+POINT_COLUMNS = (
+    "line",
+    "frequency_khz",
+    "measured_amplitude",
+    "fitted_amplitude",
+    "amplitude_misfit",
+    "measured_phase_deg",
+    "fitted_phase_deg",
+    "phase_misfit_deg",
+)
+_BACKGROUNDS = {
+    ("phase", "none"): "z = A L",
+    ("phase", "constant"): "z = A L + B",
+    ("phase", "linear"): "z = A L + B + C x",
+    ("amplitude", "none"): "|z|^2 = a |L|^2",
+    ("amplitude", "floor"): "|z|^2 = a |L|^2 + b",
+    ("amplitude", "constant"): "|z|^2 = a |L|^2 + b + c Re L",
+}
+
+
+def calibration_summary(result: Calibration) -> str:
+    """Return the calibration as text: verdict first, then the values, their comparison, goodness of fit, notes."""
+    what = "amplitude and phase" if result.model == "phase" else "amplitude"
+    verdict = "VALID" if result.valid else "NOT VALID: the numbers below are not a calibration."
+    lines = [
+        f"Free resonance of {result.sweep.source} ({result.sweep.points} points, {what}):",
+        f"  background '{result.background}': {_BACKGROUNDS[result.model, result.background]}",
+        "",
+        verdict,
+        *(f"  - {reason}" for reason in result.reasons),
+        "",
+        f"  {'':<16}{'value':>14}{'std. error':>12}   95 % interval",
+        f"  {_value_line('frequency_khz', result.frequency_khz)}  kHz",
+        f"  {_value_line('quality_factor', result.quality_factor)}",
+        *_comparison_lines(result),
+        "",
+        _goodness_line(result),
+    ]
+    if result.warnings:
+        lines += ["", "Notes:", *(f"  - {warning}" for warning in result.warnings)]
+    if result.valid:
+        lines += ["", "For the top of an amplitude table:", *result.table_comments]
+    return "\n".join(lines)
+
+
+def interval_in_words(value: CalibratedValue) -> str:
+    """Return '1157.9 to 1164.2', or why there is none."""
+    low, high = value.interval95
+    if low is None or high is None:
+        return f"none: {value.interval_reason}"
+    digits = _digits(high - low)
+    return f"{low:.{digits}f} to {high:.{digits}f}"
+
+
+def value_in_words(value: CalibratedValue) -> str:
+    """Return '1161.0 +- 3.2', or the bare value with three digits where its error is not known."""
+    error = value.standard_error
+    if error is None:
+        return f"{value.value:.6g}"
+    digits = _digits(4.0 * error)
+    return f"{value.value:.{digits}f} +- {error:.{digits}f}"
+
+
+def point_records(result: Calibration) -> list[dict[str, Any]]:
+    """Return a mapping per point, with the columns `POINT_COLUMNS`; what was not measured is missing."""
+    sweep, curves = result.sweep, result.curves
+    columns = {
+        "line": sweep.lines,
+        "frequency_khz": sweep.frequency_khz,
+        "measured_amplitude": sweep.amplitude,
+        "fitted_amplitude": curves.amplitude,
+        "amplitude_misfit": curves.amplitude_misfit,
+        "measured_phase_deg": sweep.phase_deg,
+        "fitted_phase_deg": curves.phase_deg,
+        "phase_misfit_deg": curves.phase_misfit_deg,
+    }
+    known = {name: column.tolist() for name, column in columns.items() if column is not None}
+    return [{name: column[i] for name, column in known.items()} for i in range(sweep.points)]
+
+
+def write_calibration(
+    result: Calibration, folder: Path, write_table: Callable[[str, list[dict[str, Any]], tuple[str, ...]], None]
+) -> list[Path]:
+    """Write calibration.txt, calibration.json, calibration.png and calibration_points.csv into a folder.
+
+    Args:
+        result: the calibration.
+        folder: an existing folder; files of these names are replaced.
+        write_table: called with a file name, records and columns for the CSV file.
+
+    Returns:
+        The files written here (the table is `write_table`'s).
+
+    Raises:
+        OSError: if a file cannot be written.
+    """
+    from fitting.resonance.calibration_plot import calibration_figure  # noqa: PLC0415
+
+    text, data, picture = (folder / f"calibration.{ending}" for ending in ("txt", "json", "png"))
+    text.write_text(calibration_summary(result) + "\n", encoding="utf-8")
+    data.write_text(json.dumps(result.to_dict(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    calibration_figure(result).savefig(picture, dpi=150)
+    write_table("calibration_points.csv", point_records(result), POINT_COLUMNS)
+    return [text, data, picture]
+
+
+def _value_line(name: str, value: CalibratedValue) -> str:
+    error = value.standard_error
+    shown = f"{value.value:.6g}" if error is None else f"{value.value:.{_digits(4.0 * error)}f}"
+    return f"{name:<16}{shown:>14}{'-' if error is None else f'{error:.2g}':>12}   {interval_in_words(value)}"
+
+
+def _digits(width: float) -> int:
+    """Return the decimals that show a width to two significant digits."""
+    if not np.isfinite(width) or width <= 0.0:
+        return 6
+    return int(np.clip(1 - np.floor(np.log10(width)), 0, 12))
+
+
+def _comparison_lines(result: Calibration) -> list[str]:
+    lines = []
+    if result.peak_frequency_khz is not None:
+        lower_hz = 1e3 * (result.frequency_khz.value - result.peak_frequency_khz)
+        lines.append(f"  The response without background is largest {lower_hz:.3g} Hz below frequency_khz.")
+    found = result.sweep.instrument
+    if "frequency_khz" in found:
+        difference_hz = 1e3 * (result.frequency_khz.value - found["frequency_khz"])
+        lines.append(f"  The instrument says {found['frequency_khz']:.8g} kHz: this fit {difference_hz:+.3g} Hz.")
+    if "quality_factor" in found:
+        share = 100.0 * (result.quality_factor.value / found["quality_factor"] - 1.0)
+        lines.append(f"  The instrument says Q = {found['quality_factor']:g}: this fit {share:+.2f} %.")
+    for other in result.alternatives:
+        error = "" if other.quality_factor_error is None else f" +- {other.quality_factor_error:.2g}"
+        values = f"{other.frequency_khz:.8g} kHz, Q {other.quality_factor:.6g}{error}"
+        per_freedom = other.chi2 / other.degrees_of_freedom
+        lines.append(f"  background '{other.background}' instead: {values}, chi2/dof {per_freedom:.3g}")
+    return ["", *lines] if lines else []
+
+
+def _goodness_line(result: Calibration) -> str:
+    errors = result.errors
+    probability = f", probability {result.p_value:.2g}" if np.isfinite(result.p_value) else ""
+    unit = f" {result.sweep.amplitude_unit}".rstrip()
+    noise = f"errors ({errors.origin}): amplitude {errors.amplitude:.3g}{unit}"
+    if errors.frequency_jitter_hz is not None:
+        noise += f", drive frequency {errors.frequency_jitter_hz:.2g} Hz"
+    return (
+        f"  chi2/dof = {result.chi2:.1f}/{result.degrees_of_freedom}{probability}; {noise}; "
+        f"neighbouring residuals' correlation {result.residual_autocorrelation:+.2f}"
+    )

@@ -1,0 +1,154 @@
+"""Free resonance sweeps: read them from plain CSV or Nanonis text, check them.
+
+The plain form is a CSV file in UTF-8 with comment lines and a row of column names::
+
+    # driven by the dither piezo, 20 mV
+    frequency_khz,amplitude_nm,phase_deg
+    89.0,0.512,12.4
+
+The frequency stands in ``frequency_khz`` or ``frequency_hz``, the amplitude in ``amplitude_nm`` or ``amplitude`` (any
+unit); ``phase_deg``, ``amplitude_error_nm`` (or ``amplitude_error``) and ``phase_error_deg`` may join them. The Nanonis
+form is recognised by its line ``[DATA]``.
+"""
+
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int, Shaped
+
+from fitting.resonance.sweep_csv import parse_csv
+from fitting.resonance.sweep_nanonis import MARK, parse_nanonis
+from fitting.tables.table_faults import Faults, TableError
+from fitting.tables.table_file import read_text
+
+__all__ = ["ResonanceSweep", "TableError", "read_sweep", "without_phase"]
+
+_COLUMNS = ("frequency_khz", "amplitude", "phase_deg", "amplitude_error", "phase_error_deg")
+_POSITIVE = ("frequency_khz", "amplitude_error", "phase_error_deg")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class ResonanceSweep:
+    """A free resonance sweep, sorted by frequency; the arrays are read-only NumPy copies.
+
+    Attributes:
+        frequency_khz: of the drive, shape (points,); repeated measurements at one frequency are allowed.
+        amplitude: of the response, shape (points,), in ``amplitude_unit``.
+        phase_deg: of the response, z = amplitude cos(omega t + phase), shape (points,), or None.
+        amplitude_error: standard error of the amplitude, shape (points,), or None: not known.
+        phase_error_deg: standard error of the phase; None takes the noise as equal in all directions.
+        amplitude_unit: "nm", or empty where the file does not say.
+        instrument: what the instrument itself found, for comparison: ``frequency_khz``, ``quality_factor``.
+        source: path of the file as it was given.
+        lines: the line of the file that each point stands in, shape (points,).
+        remarks: free comments of the file.
+        reordered: the frequencies did not rise from point to point, so the points were sorted.
+
+    Raises:
+        TableError: if a value is impossible, the lengths differ, or there are errors without what they belong to.
+    """
+
+    frequency_khz: Float[np.ndarray, " points"]
+    amplitude: Float[np.ndarray, " points"]
+    phase_deg: Float[np.ndarray, " points"] | None = None
+    amplitude_error: Float[np.ndarray, " points"] | None = None
+    phase_error_deg: Float[np.ndarray, " points"] | None = None
+    amplitude_unit: str = "nm"
+    instrument: dict[str, float] = field(default_factory=dict)
+    source: str = "sweep in memory"
+    lines: Int[np.ndarray, " points"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    remarks: tuple[str, ...] = ()
+    reordered: bool = field(default=False, init=False)
+
+    def __post_init__(self):
+        faults = Faults(self.source, place="line" if len(self.lines) else "row")
+        columns = {name: getattr(self, name) for name in _COLUMNS if getattr(self, name) is not None}
+        points = np.size(self.frequency_khz)
+        lines = np.array(self.lines if len(self.lines) else np.arange(1, points + 1), dtype=np.int64)
+        arrays = {name: _column(name, values, len(lines), faults) for name, values in columns.items()}
+        _check_pairs(arrays, faults)
+        faults.raise_any()
+        for name, values in arrays.items():
+            _check_numbers(name, values, lines, faults)
+        faults.raise_any()
+        # The sort is stable: repeated measurements at one frequency keep their order.
+        order = np.argsort(arrays["frequency_khz"], kind="stable")
+        falling = np.array_equal(order, np.arange(points)[::-1])
+        rising = np.array_equal(order, np.arange(points))
+        object.__setattr__(self, "reordered", not (rising or falling))
+        for name, values in (arrays | {"lines": lines}).items():
+            ordered = values[order]
+            ordered.setflags(write=False)
+            object.__setattr__(self, name, ordered)
+
+    @property
+    def points(self) -> int:
+        """Number of points."""
+        return len(self.frequency_khz)
+
+
+def _column(name: str, values: Shaped[np.ndarray, "..."], points: int, faults: Faults) -> Float[np.ndarray, "..."]:
+    column = np.array(values, dtype=np.float64)
+    if column.shape != (points,) or points == 0:
+        faults.add(f"has the shape {column.shape}; every column is a list of the same length, at least 1", column=name)
+    return column
+
+
+def _check_pairs(columns: dict[str, Float[np.ndarray, "..."]], faults: Faults) -> None:
+    if "phase_error_deg" in columns and "phase_deg" not in columns:
+        faults.add("stands without phase_deg; add that column or remove this one", column="phase_error_deg")
+    if "phase_error_deg" in columns and "amplitude_error" not in columns:
+        faults.add("the phase has errors but the amplitude has none; add amplitude_error or remove phase_error_deg")
+
+
+def _check_numbers(
+    name: str, values: Float[np.ndarray, " points"], lines: Int[np.ndarray, " points"], faults: Faults
+) -> None:
+    bad, what = ~np.isfinite(values), "must be finite"
+    if name in _POSITIVE:
+        bad, what = bad | (values <= 0.0), "must be finite and above 0"
+    elif name == "amplitude":
+        bad, what = bad | (values < 0.0), "must be finite and not negative"
+    for row in np.flatnonzero(bad):
+        number = repr(float(values[row])).removesuffix(".0")
+        faults.add(f"{what}, but is {number}; correct it or remove the row", line=int(lines[row]), column=name)
+
+
+def read_sweep(path: str | Path) -> ResonanceSweep:
+    """Read a free resonance sweep from plain CSV or Nanonis text and check all of it.
+
+    Args:
+        path: the file; its form is recognised by its content, not by its name.
+
+    Raises:
+        TableError: one line that names the first fault, its place and how to mend it, and the number of other faults.
+    """
+    faults = Faults(str(path))
+    text = read_text(path)
+    lines = list(enumerate(text.split("\n"), start=1))
+    if not text.strip():
+        faults.add("the file holds nothing; add a row of column names and rows of numbers")
+        faults.raise_any()
+    parse = parse_nanonis if any(line.strip() == MARK for _, line in lines) else parse_csv
+    parsed = parse(lines, faults)
+    faults.raise_any()
+    arrays = {name: parsed.columns.get(name) for name in _COLUMNS}
+    frequency, amplitude = arrays.pop("frequency_khz"), arrays.pop("amplitude")
+    if frequency is None or amplitude is None:
+        raise TableError(f"{path}: the frequency or the amplitude is missing; add its column")
+    return ResonanceSweep(
+        frequency_khz=frequency,
+        amplitude=amplitude,
+        **arrays,
+        amplitude_unit=parsed.amplitude_unit,
+        instrument=parsed.instrument,
+        source=str(path),
+        lines=parsed.lines,
+        remarks=parsed.remarks,
+    )
+
+
+def without_phase(sweep: ResonanceSweep) -> ResonanceSweep:
+    """Return a sweep without its phase, to be fitted by the amplitude alone."""
+    return replace(sweep, phase_deg=None, phase_error_deg=None)

@@ -1,0 +1,150 @@
+"""What is believed of the parameters after the data: densities on a grid, or samples with what says they are enough."""
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+HIGHEST_R_HAT = 1.02
+"""Samples with a larger ratio between and within chains do not describe one distribution."""
+FEWEST_EFFECTIVE = 100.0
+"""Independent samples that a 95 % interval needs at least."""
+MOST_DIVERGENCES = 0.01
+"""Share of divergent transitions beyond which part of the posterior may be missing."""
+
+
+@dataclass(frozen=True, eq=False)
+class PosteriorGrid:
+    """The normalised density over one or two parameters; nuisances are integrated out.
+
+    Attributes:
+        names: of the axes.
+        axes: values along each.
+        density: of shape (len(axis), ...), integral 1.
+    """
+
+    names: tuple[str, ...]
+    axes: tuple[Float[np.ndarray, "..."], ...]
+    density: Float[np.ndarray, "..."]
+
+
+@dataclass(frozen=True, eq=False)
+class PosteriorChains:
+    """Samples and their diagnostics, by parameter in the order of the names.
+
+    Attributes:
+        samples: of shape (chains, draws, p), after warming up.
+        r_hat: ratio of the spread of split chains to that within them, 1 if converged.
+        effective_samples: number of independent samples worth as much.
+        divergences: transitions that lost the energy.
+        seed: of the sampler.
+    """
+
+    samples: Float[np.ndarray, "chains draws p"]
+    r_hat: Float[np.ndarray, " p"]
+    effective_samples: Float[np.ndarray, " p"]
+    divergences: int
+    seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """The posterior of a fit's parameters.
+
+    Attributes:
+        method: "grid" or "nuts".
+        log_uniform: parameters with a prior flat in the logarithm of their loss; the others' are flat in their value.
+        mean: by parameter.
+        standard_deviation: by parameter.
+        interval95: equal-tailed credible interval by parameter.
+        converged: whether to believe it; `reasons` say why not.
+        reasons: a sentence each.
+        grid: for "grid".
+        chains: for "nuts".
+    """
+
+    method: Literal["grid", "nuts"]
+    log_uniform: tuple[str, ...]
+    mean: dict[str, float]
+    standard_deviation: dict[str, float]
+    interval95: dict[str, tuple[float, float]]
+    converged: bool
+    reasons: list[str]
+    grid: PosteriorGrid | None = None
+    chains: PosteriorChains | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything but the single samples as plain lists, numbers and strings."""
+        return {
+            "method": self.method,
+            "converged": self.converged,
+            "reasons": self.reasons,
+            "log_uniform": list(self.log_uniform),
+            "parameters": {
+                name: {
+                    "mean": self.mean[name],
+                    "standard_deviation": self.standard_deviation[name],
+                    "interval95": list(self.interval95[name]),
+                }
+                for name in self.mean
+            },
+            "grid": self._grid(),
+            "chains": self._chains(),
+        }
+
+    def _grid(self) -> dict[str, Any] | None:
+        if self.grid is None:
+            return None
+        axes = {name: axis.tolist() for name, axis in zip(self.grid.names, self.grid.axes, strict=True)}
+        return {"axes": axes, "density": self.grid.density.tolist()}
+
+    def _chains(self) -> dict[str, Any] | None:
+        if self.chains is None:
+            return None
+        chains, draws, _ = self.chains.samples.shape
+        return {
+            "chains": chains,
+            "draws": draws,
+            "seed": self.chains.seed,
+            "divergences": self.chains.divergences,
+            "r_hat": dict(zip(self.mean, _finite(self.chains.r_hat), strict=True)),
+            "effective_samples": dict(zip(self.mean, _finite(self.chains.effective_samples), strict=True)),
+        }
+
+
+def posterior_of_chains(chains: PosteriorChains, names: tuple[str, ...], log_uniform: tuple[str, ...]) -> Posterior:
+    """Return means and intervals of samples, and whether the chains agree."""
+    flat = chains.samples.reshape(-1, len(names))
+    low, high = np.quantile(flat, [0.025, 0.975], axis=0)
+    reasons = _complaints(chains, names)
+    return Posterior(
+        method="nuts",
+        log_uniform=log_uniform,
+        mean=dict(zip(names, flat.mean(axis=0).tolist(), strict=True)),
+        standard_deviation=dict(zip(names, flat.std(axis=0, ddof=1).tolist(), strict=True)),
+        interval95={name: (float(a), float(b)) for name, a, b in zip(names, low, high, strict=True)},
+        converged=not reasons,
+        reasons=reasons,
+        chains=chains,
+    )
+
+
+def _complaints(chains: PosteriorChains, names: tuple[str, ...]) -> list[str]:
+    reasons = []
+    for name, r_hat, effective in zip(names, chains.r_hat, chains.effective_samples, strict=True):
+        if not r_hat <= HIGHEST_R_HAT:
+            reasons.append(f"{name}: not converged, R-hat is {r_hat:.3f} (at most {HIGHEST_R_HAT}); draw more samples")
+        elif not effective >= FEWEST_EFFECTIVE:
+            reasons.append(f"{name}: only {effective:.0f} independent samples; draw more")
+    transitions = chains.samples.shape[0] * chains.samples.shape[1]
+    if chains.divergences > MOST_DIVERGENCES * transitions:
+        reasons.append(
+            f"{chains.divergences} of {transitions} transitions diverged: part of the posterior may be missing, such "
+            "as the edge where an orbit is lost"
+        )
+    return reasons
+
+
+def _finite(column: Float[np.ndarray, " p"]) -> list[float | None]:
+    return [float(x) if np.isfinite(x) else None for x in column]

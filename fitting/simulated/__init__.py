@@ -1,0 +1,1 @@
+"""Experiments simulated with the full scene."""

@@ -1,0 +1,248 @@
+"""Settled motions of many drives: every row of a table to be, simulated in time until it repeats, then observed."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene
+from afm_jax.contact.contact import Contact
+from afm_jax.impact.law import ImpactLaw
+from afm_jax.impact.orbits import single_impact_orbits
+from afm_jax.motion.contact_as_law import law_of_contact
+from afm_jax.motion.record import ContactKind, Contacts, MotionOutcome, Simulation, State
+from afm_jax.motion.settled import settled
+from afm_jax.motion.simulate import simulate
+from fitting.simulated.periodic_motion import find_periodic
+from fitting.simulated.simulated_reading import Reading, read_orbits
+
+US_PER_MS = 1e3
+BEFORE_US = 1e-4
+"""How long before its arrival a contact is started: the arrival itself is then part of the motion."""
+BATCH = 16
+"""Rows simulated side by side: one program serves all tables, and its last row keeps few others waiting."""
+RESPONSES = 100
+"""Response periods of one piece; a row that has not settled goes on for another."""
+_CONTACTS = 260
+"""Room for contacts in a piece: motions with more than two a response period are no single-impact orbits."""
+_NOT_PREDICTED = "the law closest to the contact has no stable single-impact orbit there"
+_ROUNDS = 4 * _CONTACTS + 400
+_TOLERANCE = 1e-6
+"""Of what remains to the steady motion, relative: ten times less than the amplitudes are wanted to."""
+
+
+class Drives(NamedTuple):
+    """What is driven in an experiment, one entry a row."""
+
+    order: Int[np.ndarray, " rows"]
+    """N, drive periods per impact."""
+    frequency_khz: Float[np.ndarray, " rows"]
+    amplitude_nm: Float[np.ndarray, " rows"]
+    offset_nm: Float[np.ndarray, " rows"]
+
+
+class SteadyRows(NamedTuple):
+    """What became of the drives."""
+
+    rows: Int[np.ndarray, " steady"]
+    """The numbers of those with a steady (1, N) orbit, ascending."""
+    reading: Reading | None
+    """Of these; None where there are none."""
+    reasons: dict[int, str]
+    """Why the others have none, by number."""
+
+
+class _Verdict(NamedTuple):
+    """What is known of a motion: its last contact if it is the orbit asked for, whether it should go on, and why."""
+
+    reason: str
+    contact: Contacts | None = None
+    open: bool = False
+
+
+Report = Callable[[str], None]
+Follow = Callable[[np.ndarray, np.ndarray, np.ndarray], Simulation]
+"""Of starts of shape (3, n), the numbers of their rows, and durations in us: the simulations."""
+
+
+def steady_rows(
+    interaction: Contact | ImpactLaw,
+    cantilever: Cantilever,
+    drives: Drives,
+    *,
+    accuracy: float,
+    pieces: int,
+    report: Report,
+) -> SteadyRows:
+    """Return what is observed of every drive once its motion is the (1, N) orbit asked for.
+
+    Every row starts in the middle of the flight of the stable orbit that the law with delay closest to the contact
+    predicts, the fastest if there are several.
+
+    Args:
+        interaction: a contact, or a law with or without a collision delay.
+        cantilever: the cantilever.
+        drives: what is driven.
+        accuracy: of each contact, as for `simulate`.
+        pieces: how often a row that has not settled goes on for another hundred response periods.
+        report: told how far it is.
+
+    Raises:
+        ValueError: if the contact has no junction.
+        RuntimeError: if JAX is not set to 64-bit floats.
+    """
+    law = interaction if isinstance(interaction, ImpactLaw) else law_of_contact(interaction, float(cantilever.mass_ng))
+    count = len(drives.order)
+    nothing = np.zeros(0, dtype=int)
+    if law is None:
+        return SteadyRows(nothing, None, dict.fromkeys(range(count), "the contact captures tips of every speed"))
+    follow = _follower(interaction, cantilever, drives, accuracy)
+    starts, predicted = _starts(law, cantilever, drives)
+    reasons = dict.fromkeys(np.flatnonzero(~predicted).tolist(), _NOT_PREDICTED)
+    waiting = np.flatnonzero(predicted)
+    if not waiting.size:
+        return SteadyRows(nothing, None, reasons)
+    report(f"{len(waiting)} of {count} drives have a stable orbit of the closest law; closing in on them")
+    orbits = find_periodic(
+        lambda starts, rows: _ends(follow(starts, rows, _responses(drives, rows, 1))),
+        starts[:, waiting],
+        waiting,
+        angular_frequency=float(cantilever.angular_frequency),
+    )
+    starts[:, waiting] = np.where(orbits.found & orbits.stable, orbits.starts, starts[:, waiting])
+    steady: dict[int, Contacts] = {}
+    for piece in range(pieces):
+        if not waiting.size:
+            break
+        report(f"following {len(waiting)} motions, {RESPONSES} response periods (piece {piece + 1})")
+        found = follow(starts[:, waiting], waiting, _responses(drives, waiting, RESPONSES))
+        left = []
+        for lane, row in enumerate(waiting.tolist()):
+            one = jax.tree.map(lambda part, lane=lane: part[lane], found)
+            verdict = _judged(Scene(cantilever, _platform(drives, row), interaction), one, int(drives.order[row]))
+            reasons[row] = verdict.reason
+            if verdict.contact is not None:
+                steady[row] = verdict.contact
+            elif verdict.open:
+                starts[:, row] = [float(part) for part in one.final]
+                left.append(row)
+        waiting = np.array(left, dtype=int)
+    rows = np.array(sorted(steady), dtype=int)
+    reading = (
+        _read(interaction, cantilever, drives, {row: steady[row] for row in rows.tolist()}, follow) if steady else None
+    )
+    return SteadyRows(rows, reading, {row: reason for row, reason in reasons.items() if row not in steady})
+
+
+def _read(
+    interaction: Contact | ImpactLaw,
+    cantilever: Cantilever,
+    drives: Drives,
+    steady: dict[int, Contacts],
+    follow: Follow,
+) -> Reading:
+    """Return what is read of the last contacts of steady motions."""
+    rows = np.array(list(steady))
+    contacts = jax.tree.map(lambda *parts: np.array(parts), *steady.values())
+    platforms = _platform(drives, rows)
+
+    def on_platform(times: np.ndarray) -> np.ndarray:
+        return np.stack([np.asarray(platforms.position(jnp.asarray(column))) for column in times.T], axis=1)
+
+    def in_contact(times: np.ndarray) -> np.ndarray:
+        # a little before the bridge forms the tip is still free
+        back = cantilever.propagator(-BEFORE_US)
+        place = back(contacts.arrival_position_nm, contacts.arrival_velocity_nm_per_us)
+        starts = np.stack([contacts.arrival_time_us - BEFORE_US, *(np.asarray(part) for part in place)])
+        nodes = times.shape[1]
+        durations = (times - starts[0][:, None]).reshape(-1)
+        found = follow(np.repeat(starts, nodes, axis=1), np.repeat(rows, nodes), durations)
+        return np.asarray(found.final.position_nm).reshape(times.shape)
+
+    heights = in_contact if isinstance(interaction, Contact) else on_platform
+    return read_orbits(cantilever, platforms, drives.order[rows], contacts, heights)
+
+
+def _ends(found: Simulation) -> Float[np.ndarray, "2 rows"]:
+    """Return position and velocity at the end; NaN where it was not reached or the tip is held."""
+    free = np.asarray(found.outcome) == MotionOutcome.FINISHED
+    return np.where(free, np.stack([found.final.position_nm, found.final.velocity_nm_per_us]), np.nan)
+
+
+def _responses(drives: Drives, rows: Int[np.ndarray, " n"], count: int) -> Float[np.ndarray, " n"]:
+    """Return a number of response periods in us."""
+    return count * drives.order[rows] / drives.frequency_khz[rows] * US_PER_MS
+
+
+def _platform(drives: Drives, rows: int | Int[np.ndarray, " n"]) -> Platform:
+    chosen = (drives.amplitude_nm[rows], drives.frequency_khz[rows], drives.offset_nm[rows])
+    # every field an array of the rows' shape, for `vmap`
+    amplitude, frequency, offset = (jnp.asarray(part, float) for part in chosen)
+    return Platform(amplitude, frequency, offset, jnp.zeros(np.shape(rows)))
+
+
+def _starts(law: ImpactLaw, cantilever: Cantilever, drives: Drives) -> tuple[Float[np.ndarray, "3 rows"], np.ndarray]:
+    """Return time, position and velocity halfway through the flight of the predicted orbits, and where there is one."""
+
+    def one(platform, order):
+        orbits = single_impact_orbits(Scene(cantilever, platform, law), order)
+        steady = orbits.exists & orbits.admissible & orbits.stable
+        slot = jnp.argmax(jnp.where(steady, orbits.approach_speed_nm_per_us, -jnp.inf))
+        time = orbits.phase_rad[slot] / platform.angular_frequency
+        half = 0.5 * (order * platform.period_us - orbits.delay_us[slot])
+        place = cantilever.propagator(half)(platform.position(time), orbits.velocity_after_nm_per_us[slot])
+        return jnp.stack([time + half, *place]), steady[slot]
+
+    # one size for all tables, so that one program serves them
+    size = -(-len(drives.order) // BATCH) * BATCH
+    filled = np.minimum(np.arange(size), len(drives.order) - 1).reshape(-1, BATCH)
+    program = jax.jit(jax.vmap(one))
+    parts = [program(_platform(drives, rows), jnp.asarray(drives.order[rows], float)) for rows in filled]
+    starts = np.concatenate([np.asarray(part[0]) for part in parts])[: len(drives.order)].T
+    found = np.concatenate([np.asarray(part[1]) for part in parts])[: len(drives.order)]
+    return np.array(starts), found
+
+
+def _follower(interaction: Contact | ImpactLaw, cantilever: Cantilever, drives: Drives, accuracy: float) -> Follow:
+    """Return the function that follows rows of the drives."""
+
+    @jax.jit
+    def program(interaction, cantilever, platforms, starts, durations):
+        def one(platform, start, duration):
+            scene = Scene(cantilever, platform, interaction)
+            return simulate(scene, start, duration, max_contacts=_CONTACTS, accuracy=accuracy, max_rounds=_ROUNDS)
+
+        return jax.vmap(one)(platforms, starts, durations)
+
+    def block(starts: np.ndarray, rows: np.ndarray, durations: np.ndarray) -> Simulation:
+        lanes = np.resize(np.arange(len(rows)), BATCH)
+        chosen = rows[lanes]
+        begin = State(*(jnp.asarray(part) for part in starts[:, lanes]))
+        found = program(interaction, cantilever, _platform(drives, chosen), begin, jnp.asarray(durations[lanes]))
+        return jax.tree.map(lambda part: np.asarray(part)[: len(rows)], found)
+
+    def follow(starts: np.ndarray, rows: np.ndarray, durations: np.ndarray) -> Simulation:
+        cuts = range(0, len(rows), BATCH)
+        parts = [block(starts[:, i : i + BATCH], rows[i : i + BATCH], durations[i : i + BATCH]) for i in cuts]
+        return jax.tree.map(lambda *pieces: np.concatenate(pieces), *parts)
+
+    return follow
+
+
+def _judged(scene: Scene, found: Simulation, order: int) -> _Verdict:
+    """Return what is known of a motion of one drive."""
+    outcome = MotionOutcome(int(found.outcome))
+    if outcome not in {MotionOutcome.FINISHED, MotionOutcome.HELD}:
+        return _Verdict(outcome.sentence)
+    verdict = settled(scene, found, tolerance=_TOLERANCE)
+    if not verdict.settled:
+        return _Verdict(f"not settled: {verdict.reason}", open=True)
+    if verdict.stuck or (verdict.contacts, verdict.periods) != (1, order):
+        return _Verdict(verdict.reason)
+    last = int(np.flatnonzero(found.contacts.kind == ContactKind.IMPACT)[-1])
+    return _Verdict(verdict.reason, contact=jax.tree.map(lambda part: part[last], found.contacts))

@@ -1,0 +1,1 @@
+"""The parts of an amplitude table: columns, comments, rows, faults."""

@@ -1,0 +1,1 @@
+"""From a deflection in time to response order, amplitudes and phase."""

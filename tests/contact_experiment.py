@@ -1,0 +1,24 @@
+"""The bundled experiment on the paper's contact, made once for all tests that look at it."""
+
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+
+from afm_jax.contact.collide import collide
+from afm_jax.contact.contact import Contact
+from fitting.examples.make_contact_amplitudes import example_experiment
+from fitting.simulated.simulated_experiment import SimulatedExperiment
+
+
+@functools.cache
+def paper_experiment() -> SimulatedExperiment:
+    return example_experiment()
+
+
+def paper_collisions(approach_speeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return rebound speeds and delays of free tips at the paper's contact: no orbit, no platform, no air."""
+    padded = np.resize(approach_speeds, 128)
+    found = collide(Contact.paper(), jnp.asarray(padded))
+    count = len(approach_speeds)
+    return np.asarray(found.rebound_speed_nm_per_us)[:count], np.asarray(found.collision_delay_us)[:count]

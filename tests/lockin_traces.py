@@ -1,0 +1,96 @@
+"""Traces with known amplitudes: bounces in closed form, and trajectories of law scenes."""
+
+import cmath
+import math
+from typing import Any
+
+import numpy as np
+from scipy.signal import lfilter
+
+from afm_jax import Cantilever, ImpactLaw, Platform, Scene, single_impact_orbits
+from afm_jax.motion.long_run import LongRun, follow_long
+from afm_jax.motion.start import state
+from afm_jax.motion.trajectory import trajectory
+from fitting.traces.lockin_settings import TraceSettings
+from fitting.traces.lockin_trace import Trace
+
+FREE_KHZ = 90.0
+OMEGA = 2e-3 * np.pi * FREE_KHZ
+
+
+def bounce(
+    time: np.ndarray, *, order: int, drive_khz: float, peak: float = 70.0, top_us: float = 1.3
+) -> tuple[np.ndarray, complex]:
+    """Return undamped single-impact flights of any order and their exact lock-in value.
+
+    z = A cos Omega s, s the time since the top, repeats with T = 2 pi N/omega; 2/T int z exp(-i k t) dt with k = 2 pi/T
+    is the sum of two sines over (Omega +- k).
+    """
+    period = 1e3 * order / drive_khz
+    since = np.asarray(np.mod(time - top_us + 0.5 * period, period)) - 0.5 * period
+    k = 2.0 * np.pi / period
+    above = math.sin((OMEGA + k) * period / 2.0) / (OMEGA + k)
+    below = math.sin((OMEGA - k) * period / 2.0) / (OMEGA - k)
+    value = 2.0 / period * peak * (above + below) * cmath.exp(-1j * k * top_us)
+    return peak * np.asarray(np.cos(OMEGA * since)), value
+
+
+def trace_of(
+    height: np.ndarray, *, rate: float, drive_khz: float, start_us: float = 0.0, **settings: float | None
+) -> Trace:
+    """Return a trace in memory, with the free frequency and a drive phase of 0 unless told otherwise."""
+    known: dict[str, Any] = {"free_frequency_khz": FREE_KHZ, "drive_phase_deg": 0.0, "drive_amplitude_nm": 4.0}
+    joined = TraceSettings(**(known | {"drive_frequency_khz": drive_khz} | settings))
+    return Trace(deflection_nm=height, start_us=start_us, step_us=1.0 / rate, settings=joined)
+
+
+def noisy_bounce(
+    seed: int, *, periods: float = 60.0, noise: float = 0.7, rate: float = 5.3, order: int = 1, memory: float = 0.0
+) -> tuple[Trace, complex]:
+    """Return a bounce with noise; `memory` is what a sample's noise keeps of the one before."""
+    drive = 181.8 * order
+    time = np.arange(0.0, periods * 1e3 / drive, 1.0 / rate)
+    height, value = bounce(time, order=order, drive_khz=drive)
+    white = np.random.default_rng(seed).standard_normal(time.size)
+    kept = np.asarray(lfilter([np.sqrt(1.0 - memory**2)], [1.0, -memory], white))
+    return trace_of(height + noise * kept, rate=rate, drive_khz=drive), value
+
+
+def law_motion(reduced: float, r: float, *, offset: float = -1.0, amplitude: float = 4.0) -> tuple[Scene, LongRun]:
+    """Return a damped law scene and 600 drive periods of its motion from 5 nm above the platform, upward."""
+    scene = Scene(Cantilever(FREE_KHZ, 40.0), Platform(amplitude, 2.0 * FREE_KHZ * reduced, offset), ImpactLaw(r))
+    period = float(scene.platform.period_us)
+    start = state(0.75 * period, float(scene.platform.position(0.75 * period)) + 5.0, 40.0)
+    return scene, follow_long(scene, start, 600.0 * period)
+
+
+def trace_of_motion(scene: Scene, run: LongRun, *, periods: float, rate: float, noise: float) -> Trace:
+    """Return the end of a motion, sampled, with noise relative to its standard deviation."""
+    end = float(run.simulation.final.time_us)
+    time = np.arange(end - periods * float(scene.platform.period_us), end, 1.0 / rate)
+    height = trajectory(scene, run.simulation, time).position_nm
+    height = height + noise * height.std() * np.random.default_rng(7).standard_normal(time.size)
+    drive = float(scene.platform.frequency_khz)
+    return trace_of(height, rate=rate, drive_khz=drive, start_us=float(time[0]), quality_factor=40.0, offset_nm=-1.0)
+
+
+def orbit_heights(scene: Scene, order: int, time: np.ndarray) -> tuple[np.ndarray, dict[str, float]]:
+    """Return the heights of the scene's stable orbit at given times, and the amplitudes that the package computes."""
+    found = single_impact_orbits(scene, order)
+    good = np.flatnonzero(np.asarray(found.exists & found.admissible & found.stable))
+    assert len(good) == 1
+    names = ("phase_rad", "velocity_after_nm_per_us", "delay_us")
+    names += ("peak_amplitude_nm", "lockin_amplitude_nm", "lockin_phase_deg")
+    row = {name: float(np.asarray(getattr(found, name))[good[0]]) for name in names}
+    drive, rate = float(scene.platform.angular_frequency), float(scene.cantilever.decay_rate)
+    omega = float(scene.cantilever.angular_frequency)
+    damped = np.sqrt(omega**2 - rate**2)
+    mean, beta = float(scene.platform.offset_nm), float(scene.platform.amplitude_nm)
+    period = 2.0 * np.pi * order / drive
+    leaving = row["phase_rad"] / drive
+    begin = mean + beta * np.cos(row["phase_rad"])
+    since = np.mod(time - leaving, period)
+    sine = (row["velocity_after_nm_per_us"] + rate * begin) / damped * np.sin(damped * since)
+    flight = np.exp(-rate * since) * (begin * np.cos(damped * since) + sine)
+    # in contact, for the collision delay, the tip is taken to be on the platform
+    return np.where(since <= period - row["delay_us"], flight, mean + beta * np.cos(drive * time)), row

@@ -1,0 +1,134 @@
+"""Results of fits made by hand, without a fit: every kind that a report must be able to show."""
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from fitting.checks import Convergence
+from fitting.parameters import PARAMETERS
+from fitting.result import FitResult, FittedLaw, FittedParameter, FittedRows
+from fitting.table import AmplitudeTable
+
+VALUES = {
+    "restitution": {"r": 0.93},
+    "law": {"r": 0.987654321, "epsilon": 61.23456789},
+    "viscous": {"epsilon": 0.0, "viscous_loss": 0.58371},
+    "law+delay": {
+        "r": 0.998316817,
+        "epsilon": 108.9187,
+        "delay_hertz": 0.2036519,
+        "delay_lead_nm": -6.14712,
+        "delay_offset_nm": 0.575123,
+    },
+    "contact": {"relative_humidity": 0.479, "viscosity_pa_s": 1.08e-3},
+}
+SPEEDS = np.array([24.0, 40.0, 95.0, 260.0])
+
+
+def made_fit(model: str, *, width: float = 1e-3, table: AmplitudeTable | None = None, **changes: Any) -> FitResult:
+    """Return a valid fit of a model to four rows whose law has a band of a constant relative half-width.
+
+    Args:
+        model: a key of `VALUES`.
+        width: half-width of the bands of rebound speed and delay, relative.
+        table: the table; None for one of four rows.
+        changes: fields of the result to be replaced.
+    """
+    table = made_table() if table is None else table
+    names = VALUES[model]
+    size = len(names)
+    result = FitResult(
+        model=model,
+        parameters={name: made_parameter(name, value) for name, value in names.items()},
+        correlations=np.full((size, size), 0.95) + 0.05 * np.eye(size),
+        chi2=5.0,
+        degrees_of_freedom=6,
+        p_value=0.54,
+        aic=9.0,
+        bic=9.5,
+        valid=True,
+        reasons=[],
+        warnings=[],
+        law=made_law(names, width=width, lasting="+" in model or model == "contact"),
+        rows=made_rows(table),
+        residual_autocorrelation=0.1,
+        convergence=Convergence(True, 1e-6, [1.0] * size, 1e-12, True),  # noqa: FBT003
+        table=table,
+        settings={"model": model, "error_scale": None, "constraints": {"quality_factor": (40.0, 0.4)}},
+        versions={"afm-jax": "0.0"},
+    )
+    return dataclasses.replace(result, **changes)
+
+
+def made_parameter(name: str, value: float, **changes: Any) -> FittedParameter:
+    """Return a parameter with one per cent of error; a loss of zero is at its bound."""
+    bound = value == 0.0
+    error = None if bound else 0.01 * abs(value)
+    interval = (None, 0.3) if bound else (value - 0.02 * abs(value), value + 0.02 * abs(value))
+    parameter = FittedParameter(
+        value=3e-15 if bound else value,
+        unit=PARAMETERS[name].unit,
+        standard_error=error,
+        interval95=interval,
+        interval_reason="lower end: reaches the end of its range, 0" if bound else None,
+        undetermined=False,
+        at_bound=bound,
+        did_not_move=False,
+        constraint=None,
+    )
+    return dataclasses.replace(parameter, **changes)
+
+
+def made_law(values: dict[str, float], *, width: float, lasting: bool) -> FittedLaw:
+    """Return the law of the parameters from 0.8 times the slowest to 1.2 times the fastest row."""
+    u = np.geomspace(0.8 * SPEEDS[0], 1.2 * SPEEDS[-1], 121)
+    w = np.sqrt((values.get("r", 1.0) * u) ** 2 - values.get("viscous_loss", 0.0) * u - values.get("epsilon", 0.0))
+    delay = np.zeros_like(u)
+    if lasting:
+        a, b, d = (values.get(name, 0.1) for name in ("delay_hertz", "delay_lead_nm", "delay_offset_nm"))
+        delay = a * u**-0.2 - b * (1.0 / w - 1.0 / u) - d / u
+    shift = width * np.abs(delay)
+    return FittedLaw(u, w, w * (1.0 - width), w * (1.0 + width), delay, delay - shift, delay + shift)
+
+
+def made_table(rows: int = 4, **changes: Any) -> AmplitudeTable:
+    """Return a table whose last amplitude was read by the lock-in only."""
+    peak = np.linspace(50.0, 180.0, rows)
+    peak[-1] = np.nan
+    lockin = np.linspace(20.0, 80.0, rows)
+    columns: dict[str, Any] = {
+        "order": np.ones(rows, dtype=np.int64),
+        "drive_frequency_khz": np.linspace(170.0, 190.0, rows),
+        "drive_amplitude_nm": np.full(rows, 4.0),
+        "offset_nm": np.full(rows, 1.0 / 3.0),
+        "free_frequency_khz": 90.0,
+        "peak_amplitude_nm": peak,
+        "peak_amplitude_error_nm": 0.01 * peak,
+        "lockin_amplitude_nm": lockin,
+        "lockin_amplitude_error_nm": 0.01 * lockin,
+        "quality_factor": 40.0,
+        "quality_factor_error": 0.4,
+        "remarks": ("measured on a Tuesday",),
+    }
+    return AmplitudeTable(**(columns | changes))
+
+
+def made_rows(table: AmplitudeTable) -> FittedRows:
+    """Return rows that fit to half an error."""
+    assert table.peak_amplitude_nm is not None
+    assert table.lockin_amplitude_nm is not None
+    measured = np.stack([table.peak_amplitude_nm, table.lockin_amplitude_nm], axis=1)
+    error = 0.01 * measured
+    return FittedRows(
+        predicted_nm=measured + 0.5 * error,
+        measured_nm=measured,
+        residual=0.5 * error / error,
+        error_nm=error,
+        model_error=np.zeros(table.rows),
+        used=np.ones(table.rows, dtype=bool),
+        set_aside=np.zeros(table.rows, dtype=bool),
+        approach_speed_nm_per_us=np.resize(SPEEDS, table.rows),
+        orbits=np.ones(table.rows, dtype=np.int64),
+        near_fold=np.zeros(table.rows, dtype=bool),
+    )

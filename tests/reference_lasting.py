@@ -1,0 +1,89 @@
+"""Impacts that last, in NumPy: the closing condition with its corrections, written out over the approach speed.
+
+For an assumed approach speed the law gives rebound speed and delay; air, spring and the platform's motion during the
+contact change both by a little, which needs the phase and therefore a few passes (`afm_jax.impact.lasting_impact`). The
+orbits are where cosine and sine of the phase, from two linear equations, lie on the unit circle.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from tests.brute_force import Floats
+from tests.reference_flight import Parameters, constants, outgoing, propagator
+
+BRIDGE_NM = 4.7
+SPEEDS = 40_000
+
+
+class Impacts(NamedTuple):
+    """Approach and rebound speeds in nm/us and delays in us of corrected impacts, and cosine and sine of the phase."""
+
+    approach: Floats
+    rebound: Floats
+    delay: Floats
+    cosine: Floats
+    sine: Floats
+
+
+def closing_impacts(p: Parameters, order: int, approach: Floats) -> Impacts:
+    """Return what the two linear closing conditions ask of the phase at every approach speed."""
+    assert p.delay is not None
+    k = constants(p, np)
+    hertz, lead, offset = p.delay
+    free = outgoing(k, approach, np)
+    lasting = hertz * approach**-0.2
+    straight = lasting - lead * (1.0 / free - 1.0 / approach) - offset / approach
+    rebound, delay = free, straight
+    for _ in range(3):
+        cosine, sine = _phase(p, order, approach, rebound, delay)
+        # only the direction counts before the orbit is closed
+        middle = np.arctan2(sine, cosine) - k.drive * delay / 2.0
+        height, speed = p.offset_nm + k.amplitude * np.cos(middle), -k.amplitude * k.drive * np.sin(middle)
+        pull = -(k.free**2) * height - 2.0 * k.decay * speed + k.amplitude * k.drive**2 * np.cos(middle)
+        jerk = -k.amplitude * k.drive**3 * np.sin(middle)
+        g, j = pull * lasting / approach, jerk * lasting**2 / approach
+        gain = 0.4247 * j - 0.157 * g * j + 0.027 * j**2 - (20.0 / 9.0) * k.decay * lasting
+        rebound = np.sqrt(np.maximum(free**2 + gain * approach**2, 0.01 * free**2))
+        longer = -0.1274 * g - 0.0213 * j - 0.0234 * g**2 + 0.0267 * g * j
+        held = _later(free, BRIDGE_NM, pull) - _later(approach, BRIDGE_NM, pull)
+        delay = straight + longer * lasting - lead / (1.3 * BRIDGE_NM) * held
+    return Impacts(approach, rebound, delay, *_phase(p, order, approach, rebound, delay))
+
+
+def _later(speed: Floats, way: float, pull: Floats) -> Floats:
+    """Return by how much later a way is covered with a constant acceleration than without."""
+    end = np.sqrt(np.maximum(speed**2 + 2.0 * pull * way, (0.1 * speed) ** 2))
+    return 2.0 * way / (speed + end) - way / speed
+
+
+def _phase(p: Parameters, order: int, approach: Floats, rebound: Floats, delay: Floats) -> tuple[Floats, Floats]:
+    """Solve (z_in, V_in) = propagator (z_out, V_out) for cosine and sine of the phase at which the tip leaves."""
+    k = constants(p, np)
+    flight = np.moveaxis(np.array(propagator(k, order * k.drive_period - delay, np)).reshape(2, 2, -1), -1, 0)
+    turn, zero = k.drive * delay, np.zeros_like(approach)
+    cos, sin = np.cos(turn), np.sin(turn)
+    # (z, V) of the platform at t_out and t_in as matrices that act on (cosine, sine)
+    out = np.broadcast_to(k.amplitude * np.array([[1.0, 0.0], [0.0, -k.drive]]), flight.shape)
+    back = np.array([[cos, sin], [k.drive * sin, -k.drive * cos]])
+    back = k.amplitude * np.moveaxis(back, -1, 0)
+    rest = np.full_like(approach, p.offset_nm)
+    start, end = np.stack([rest, rebound], axis=-1), np.stack([rest + zero, -approach], axis=-1)
+    right = np.einsum("nij,nj->ni", flight, start) - end
+    solved = np.linalg.solve(back - np.einsum("nij,njk->nik", flight, out), right[..., None])[..., 0]
+    return solved[:, 0], solved[:, 1]
+
+
+def closing_speeds(p: Parameters, order: int, slowest: float, fastest: float) -> Floats:
+    """Return the approach speeds of all orbits between two speeds, by a scan that no pair of roots slips through."""
+    speeds = np.linspace(slowest, fastest, SPEEDS)
+    found = closing_impacts(p, order, speeds)
+    value = found.cosine**2 + found.sine**2 - 1.0
+    at = np.flatnonzero(value[:-1] * value[1:] < 0.0)
+    low, high = speeds[at], speeds[at + 1]
+    for _ in range(60):
+        middle = 0.5 * (low + high)
+        impact = closing_impacts(p, order, middle)
+        same = np.sign(impact.cosine**2 + impact.sine**2 - 1.0) == np.sign(value[at])
+        low, high = np.where(same, middle, low), np.where(same, high, middle)
+    return 0.5 * (low + high)

@@ -1,0 +1,152 @@
+"""The bootstrap: synthetic data as they are meant, fitted as tables are, errors as the Fisher information has them."""
+
+import numpy as np
+import pytest
+
+from afm_jax.impact.law import ImpactLaw
+from fitting import bootstrap, fit, read_table
+from fitting.sampling.batch_fit import DataSets, draw_data, fit_data_sets
+from fitting.sampling.refit import compact, objective_of
+from tests.fit_tables import EXAMPLE, rows, simulated, standard_errors_of, values_of, with_amplitudes
+
+pytestmark = pytest.mark.slow
+"""Each compiles programs of its own for a minute or more."""
+
+SAMPLES = 200
+
+
+@pytest.fixture(scope="module")
+def table():
+    example = read_table(EXAMPLE)
+    return simulated(rows(example, np.arange(0, example.rows, 3)), ImpactLaw(0.95, 60.0), seed=3)
+
+
+@pytest.fixture(scope="module")
+def result(table):
+    return fit(table, "law")
+
+
+@pytest.fixture(scope="module")
+def boot(result):
+    return bootstrap(result, SAMPLES, seed=4)
+
+
+def test_the_objective_is_rebuilt_with_the_rows_and_errors_of_the_fit(result):
+    refit = objective_of(result)
+    assert refit.values == pytest.approx(values_of(result), rel=0.0, abs=0.0)
+    # the same program at the same values: rounding of the sum only
+    assert np.sum(refit.objective.residual(refit.values[None]) ** 2) == pytest.approx(result.chi2, rel=1e-12)
+
+
+@pytest.mark.parametrize("options", [{"scale_errors": True}, {"robust": True}])
+def test_scaled_and_robust_fits_are_rebuilt_too(table, options):
+    again = fit(table, "law", **options)
+    refit = objective_of(again)
+    assert np.sum(refit.objective.residual(refit.values[None]) ** 2) == pytest.approx(again.chi2, rel=1e-12)
+
+
+def test_rows_that_say_nothing_are_left_out():
+    refit = objective_of(fit(read_table(EXAMPLE), "law"))
+    used = np.asarray(refit.objective.measurement.rows.measured).copy()
+    assert used.shape == (96, 2)
+    assert compact(refit) is refit
+    used[:50] = False
+    fewer = refit._replace(objective=refit.objective.with_rows(measured=used))
+    kept = compact(fewer).objective
+    assert np.asarray(kept.measurement.rows.order).shape == (32,)
+    chi2, chi2_kept = (np.sum(o.residual(refit.values[None]) ** 2) for o in (fewer.objective, kept))
+    # the same residuals in another order
+    assert chi2_kept == pytest.approx(chi2, rel=1e-12)
+
+
+def test_data_scatter_about_the_fitted_amplitudes_and_constraints(result):
+    refit = objective_of(result)
+    data = draw_data(refit, 4000, np.random.default_rng(1))
+    amplitudes = data.amplitude_nm[:, : result.table.rows]
+    pull = (amplitudes - result.rows.predicted_nm) / result.rows.error_nm
+    # five standard errors of a mean and of a width
+    assert np.abs(pull.mean(axis=0)).max() < 5.0 / np.sqrt(4000)
+    assert np.abs(pull.std(axis=0) - 1.0).max() < 5.0 / np.sqrt(8000)
+    quality_factor = data.constraint_value[:, 2]
+    assert quality_factor.mean() == pytest.approx(values_of(result)[2], abs=5.0 * 0.4 / np.sqrt(4000))
+    assert quality_factor.std() == pytest.approx(0.4, rel=5.0 / np.sqrt(8000))
+
+
+def test_a_data_set_is_fitted_as_its_table_would_be(table, result):
+    refit = objective_of(result)
+    data = draw_data(refit, 3, np.random.default_rng(2))
+    found = fit_data_sets(refit, data)
+    assert found.converged.all()
+    for k in range(3):
+        amplitude = data.amplitude_nm[k, : table.rows]
+        quality_factor = float(data.constraint_value[k, 2])
+        alone = fit(with_amplitudes(table, amplitude, result.rows.error_nm, quality_factor=quality_factor), "law")
+        assert found.chi2[k] == pytest.approx(alone.chi2, abs=1e-5)
+        # both stop within an estimated distance of 1e-6: a thousandth of an error
+        errors = standard_errors_of(alone)
+        assert np.abs((found.values[k] - values_of(alone)) / errors).max() < 2e-3
+        assert np.sqrt(np.diag(found.covariance[k])) == pytest.approx(errors, rel=1e-3)
+
+
+def test_the_tables_own_data_give_the_fit(result):
+    refit = objective_of(result)
+    known = refit.objective.measurement
+    own = DataSets(np.asarray(known.rows.amplitude_nm)[None], np.asarray(known.constraint_value)[None])
+    found = fit_data_sets(refit, own)
+    assert found.chi2[0] == pytest.approx(result.chi2, rel=1e-9)
+
+
+def test_errors_agree_with_the_fisher_information(result, boot):
+    assert boot.failures == 0
+    assert boot.samples.shape == (SAMPLES, 3)
+    # four standard errors of a width: this problem is close to linear
+    tolerance = 4.0 / np.sqrt(2 * SAMPLES)
+    assert list(boot.standard_error.values()) == pytest.approx(standard_errors_of(result), rel=tolerance)
+    for name, parameter in result.parameters.items():
+        error = parameter.standard_error
+        assert error is not None
+        assert abs(boot.bias[name]) < 4.0 * error / np.sqrt(SAMPLES)
+        # a 2.5 % quantile of 200 draws scatters by 0.19 errors
+        assert boot.interval95[name] == pytest.approx(parameter.interval95, abs=4.0 * 0.19 * error)
+    assert boot.correlations == pytest.approx(result.correlations, abs=4.0 / np.sqrt(SAMPLES))
+
+
+def test_basic_intervals_mirror_percentile_ones(boot):
+    for name, value in zip(boot.names, boot.fitted, strict=True):
+        low, high = boot.interval95[name]
+        assert boot.basic_interval95[name] == pytest.approx((2 * value - high, 2 * value - low), rel=1e-12)
+
+
+def test_the_seed_decides(result, boot):
+    again = bootstrap(result, SAMPLES, seed=4)
+    assert np.array_equal(again.samples, boot.samples)
+    assert not np.array_equal(bootstrap(result, SAMPLES, seed=5).samples, boot.samples)
+
+
+def test_a_parameter_at_its_bound_stays_inside():
+    example = read_table(EXAMPLE)
+    lossless = simulated(rows(example, np.arange(0, example.rows, 3)), ImpactLaw(0.95, 0.0), seed=None)
+    refit = objective_of(fit(lossless, "law"))
+    # no noise: the fit is at the truth, no adhesion, within what a thousandth of an error says
+    assert refit.values[1] < 1e-2
+    found = fit_data_sets(refit, draw_data(refit, SAMPLES, np.random.default_rng(6)))
+    assert found.converged.all()
+    epsilon = found.values[:, 1]
+    assert epsilon.min() == 0.0
+    # half of the noise would want it negative; four binomial standard deviations
+    assert abs(np.mean(epsilon < 1e-2) - 0.5) < 4.0 * np.sqrt(0.25 / SAMPLES)
+
+
+def test_wrong_calls_are_refused_in_one_line(table, result):
+    with pytest.raises(ValueError, match="`samples` must be at least 40"):
+        bootstrap(result, 10)
+    wrong = fit(simulated(table, ImpactLaw(0.95, 60.0), seed=3), "restitution")
+    assert not wrong.valid
+    with pytest.raises(ValueError, match="is not valid"):
+        bootstrap(wrong)
+
+
+def test_everything_goes_to_json(boot):
+    plain = boot.to_dict()
+    assert plain["samples"] == SAMPLES
+    assert plain["parameters"]["r"]["interval95"] == list(boot.interval95["r"])

@@ -1,0 +1,115 @@
+"""A thousand simulated experiments a model, fitted at once: 95 % intervals hold the truth 95 times of a hundred.
+
+The truth is the fitted model itself: what is proved is the fit and its errors, not the model. Intervals are Wald's for
+all thousand, and of the instantaneous law profile intervals for two hundred of them.
+"""
+
+import numpy as np
+import pytest
+from scipy.stats import binom, kstest
+
+import fitting.examples
+from afm_jax.impact.law import ImpactLaw
+from fitting import read_table
+from fitting.intervals import profile_intervals
+from fitting.measurement import measurement_of
+from fitting.models import Problem
+from fitting.optimise import Objective
+from fitting.sampling.batch_fit import BatchFit, DataSets, draw_data, fit_data_sets
+from fitting.sampling.refit import Refit
+from fitting.strained import relaxed, strain_of
+from tests.fit_tables import EXAMPLE, rows, simulated
+
+pytestmark = pytest.mark.slow
+
+EXPERIMENTS, PROFILED = 1000, 200
+CONTACT_EXAMPLE = fitting.examples.__path__[0] + "/amplitudes_contact.csv"
+TRUTHS = {
+    "law": {"r": 0.95, "epsilon": 60.0, "quality_factor": 40.0},
+    "viscous+delay": {
+        "epsilon": 113.6,
+        "viscous_loss": 0.5,
+        "delay_hertz": 0.206,
+        "delay_lead_nm": 5.64,
+        "delay_offset_nm": 0.726,
+        "quality_factor": 40.0,
+    },
+    "contact": {"relative_humidity": 0.45, "viscosity_pa_s": 1e-3, "modulus_gpa": 100.0},
+}
+
+
+def experiment(model: str) -> Refit:
+    """Return a model at its truth on the drives of a bundled table, with its errors of 1 %."""
+    if model == "law":
+        example = read_table(EXAMPLE)
+        table = simulated(rows(example, np.arange(0, example.rows, 3)), ImpactLaw(0.95, 60.0), seed=None)
+    else:
+        table = read_table(CONTACT_EXAMPLE)
+    problem = Problem(model, tuple(TRUTHS[model]))
+    values = np.array(list(TRUTHS[model].values()))
+    stated = Objective(measurement_of(table, problem), problem).following(values)
+    # without the rows that a fit would set aside
+    return Refit(relaxed(stated, strain_of(stated, values)), values)
+
+
+@pytest.fixture(scope="module", params=list(TRUTHS))
+def fits(request) -> tuple[Refit, DataSets, BatchFit]:
+    refit = experiment(request.param)
+    exists = np.asarray(refit.objective.at_values(refit.values[None]).prediction.orbits)[0] > 0
+    measured = np.asarray(refit.objective.measurement.rows.measured)
+    assert exists[measured.any(axis=1)].all()
+    data = draw_data(refit, EXPERIMENTS, np.random.default_rng(95))
+    return refit, data, fit_data_sets(refit, data)
+
+
+def test_every_fit_converges(fits):
+    _, _, found = fits
+    assert found.converged.all()
+
+
+def test_wald_intervals_cover_the_truth(fits):
+    refit, _, found = fits
+    errors = np.sqrt(np.einsum("spp->sp", found.covariance))
+    covered = np.mean(np.abs(found.values - refit.values) < 1.959964 * errors, axis=0)
+    named = dict(zip(refit.objective.problem.names, covered.tolist(), strict=True))
+    # four binomial standard deviations
+    assert all(0.922 <= share <= 0.978 for share in named.values()), named
+
+
+def test_pulls_have_mean_0_and_width_1(fits):
+    refit, _, found = fits
+    pull = (found.values - refit.values) / np.sqrt(np.einsum("spp->sp", found.covariance))
+    # four standard errors of a mean and of a width
+    assert np.abs(pull.mean(axis=0)).max() < 4.0 / np.sqrt(EXPERIMENTS), pull.mean(axis=0)
+    assert np.abs(pull.std(axis=0) - 1.0).max() < 4.0 / np.sqrt(2 * EXPERIMENTS), pull.std(axis=0)
+
+
+def test_chi2_is_distributed_as_such(fits):
+    refit, _, found = fits
+    known = refit.objective.measurement
+    data = int(np.asarray(known.rows.measured).sum()) + int(np.isfinite(np.asarray(known.constraint_error)).sum())
+    freedom = data - len(refit.values)
+    # unless by a chance of one in ten thousand
+    assert kstest(found.chi2, "chi2", args=(freedom,)).pvalue > 1e-4
+
+
+def test_profile_intervals_cover_the_truth(fits):
+    refit, data, found = fits
+    if refit.objective.problem.lasting:
+        pytest.skip("two hundred profiles of a lasting model take minutes")
+    objective, names = refit.objective, refit.objective.problem.names
+    covered = np.zeros(len(names), dtype=int)
+    for k in range(PROFILED):
+        measurement = objective.measurement._replace(
+            rows=objective.measurement.rows._replace(amplitude_nm=data.amplitude_nm[k]),
+            constraint_value=data.constraint_value[k],
+        )
+        own = Objective(measurement, objective.problem, near=objective.near)
+        intervals = profile_intervals(own, found.values[k], found.covariance[k], float(found.chi2[k]))
+        for i, interval in enumerate(intervals):
+            low = -np.inf if interval.low is None else interval.low
+            high = np.inf if interval.high is None else interval.high
+            covered[i] += low <= refit.values[i] <= high
+    # once in ten thousand of right intervals would lie outside on either side
+    limits = binom.ppf(1e-4, PROFILED, 0.95), binom.ppf(1.0 - 1e-4, PROFILED, 0.95)
+    assert np.all((limits[0] <= covered) & (covered <= limits[1])), dict(zip(names, covered.tolist(), strict=True))

@@ -1,0 +1,200 @@
+"""Designs on the instantaneous law: information, forecasts and choices against another search for the orbits."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from afm_jax.impact.law import ImpactLaw
+from fitting import believe, design, drive_grid, fit
+from fitting.planning.experiment_after_fit import belief_of_fit
+from fitting.planning.experiment_belief import Belief
+from fitting.planning.experiment_candidates import candidates_of
+from fitting.planning.experiment_result import Design, Forecast
+from fitting.result import FittedParameter
+from fitting.simulated.simulated_motion import Drives
+from fitting.table import AmplitudeTable
+from tests.fit_tables import steady_amplitudes, with_amplitudes
+
+LAW = {"r": 0.95, "epsilon": 60.0}
+QUALITY_FACTOR = (40.0, 0.4)
+NOISE = 0.01
+
+
+def law_belief(**changes) -> Belief:
+    given = {
+        "free_frequency_khz": 90.0,
+        "quality_factor": QUALITY_FACTOR[0],
+        "values": LAW,
+        "constraints": {"quality_factor": QUALITY_FACTOR},
+    }
+    return believe("law", **(given | changes))
+
+
+@pytest.fixture(scope="module")
+def drives() -> Drives:
+    return drive_grid(
+        orders=(1, 2),
+        amplitudes_nm=(2.0, 5.0),
+        offsets_nm=(-1.0, 1.0),
+        detunings=(0.97, 0.99, 1.0, 1.02, 1.05),
+        free_frequency_khz=90.0,
+    )
+
+
+@pytest.fixture(scope="module")
+def of_law(drives) -> Design:
+    return design(law_belief(), drives, points=5, noise=NOISE)
+
+
+def table_of(drives: Drives, amplitude: np.ndarray | None = None) -> AmplitudeTable:
+    """Return a table of drives: of given amplitudes (rows, 2) with 1 % errors, or of 1 nm everywhere."""
+    read = np.ones((len(drives.order), 2)) if amplitude is None else amplitude
+    empty = AmplitudeTable(
+        order=drives.order,
+        drive_frequency_khz=drives.frequency_khz,
+        drive_amplitude_nm=drives.amplitude_nm,
+        offset_nm=drives.offset_nm,
+        free_frequency_khz=90.0,
+        quality_factor=QUALITY_FACTOR[0],
+        quality_factor_error=QUALITY_FACTOR[1],
+        peak_amplitude_nm=read[:, 0],
+        peak_amplitude_error_nm=NOISE * read[:, 0],
+    )
+    return with_amplitudes(empty, read, NOISE * read)
+
+
+POINT = np.array([LAW["r"], LAW["epsilon"], QUALITY_FACTOR[0]])
+
+
+def other_amplitudes(drives: Drives, point: np.ndarray = POINT) -> np.ndarray:
+    """Return the amplitudes of `single_impact_orbits`, the search that the fit does not use, at r, epsilon and Q."""
+    r, epsilon, quality_factor = point.tolist()
+    return steady_amplitudes(table_of(drives), ImpactLaw(r, epsilon), quality_factor)
+
+
+def error_of(forecast: Forecast | FittedParameter) -> float:
+    """Return the standard error, which there must be."""
+    assert forecast.standard_error is not None
+    return forecast.standard_error
+
+
+def test_readings_and_information_are_those_of_other_orbits(of_law, drives):
+    found = of_law.candidates
+    usable = np.flatnonzero(found.usable)
+    assert usable.size > 20
+    exact = other_amplitudes(drives)
+    np.testing.assert_allclose(found.amplitude_nm[usable], exact[usable], rtol=1e-9)
+    slopes = []
+    for step in np.diag(1e-5 * POINT):
+        up, down = (other_amplitudes(drives, POINT + sign * step) for sign in (1.0, -1.0))
+        slopes.append((up - down) / (2.0 * step.sum()))
+    wanted = np.stack(slopes, axis=-1)[usable] / (NOISE * exact[usable])[:, :, None]
+    # central differences with steps of 1e-5: errors of 1e-10 of the third derivative, rounding 1e-9
+    largest = np.abs(wanted).max(axis=(0, 1))
+    np.testing.assert_allclose(found.slope[usable] / largest, wanted / largest, rtol=1e-5, atol=1e-6)
+
+
+def test_forecast_is_the_error_that_a_fit_reports(of_law):
+    # without noise the fit ends at the believed law, where its errors must be the forecast's
+    exact = other_amplitudes(of_law.drives)
+    result = fit(table_of(of_law.drives, exact), "law")
+    for name, forecast in of_law.expected.items():
+        # the fit's own minimum is good to 1e-5 standard errors
+        np.testing.assert_allclose(error_of(result.parameters[name]), error_of(forecast), rtol=1e-4)
+
+
+def determinant(result: Design, chosen: np.ndarray) -> float:
+    """Return the log of the determinant of the covariance of r and epsilon, from the inverse; infinite if singular."""
+    information = result.belief.information + result.candidates.information[chosen].sum(axis=0)
+    return float(np.linalg.slogdet(np.linalg.inv(information)[:2, :2])[1])
+
+
+def test_points_are_better_than_random_ones(of_law):
+    usable = np.flatnonzero(of_law.candidates.usable)
+    random = np.random.default_rng(3)
+    others = [determinant(of_law, random.choice(usable, 5, replace=False)) for _ in range(300)]
+    ours = determinant(of_law, of_law.chosen)
+    assert ours < min(others)
+    # the area of the confidence region goes with the root: the usual choice leaves more than twice as much
+    assert ours < np.median(others) - 2.0 * np.log(2.0)
+
+
+def test_points_are_the_best_of_all_choices(drives):
+    few = Drives(*(column[::3] for column in drives))
+    result = design(law_belief(), few, points=3, noise=NOISE)
+    usable = np.flatnonzero(result.candidates.usable)
+    assert usable.size > 8
+    best = min(determinant(result, np.array(some)) for some in itertools.combinations(usable.tolist(), 3))
+    # the ridge of the criterion, 1e-9, is what may differ
+    np.testing.assert_allclose(determinant(result, result.chosen), best, atol=1e-6)
+
+
+def test_a_choice_for_one_parameter_is_better_for_it(drives, of_law):
+    for name, other in (("r", "epsilon"), ("epsilon", "r")):
+        ours, theirs = (design(law_belief(), drives, points=3, noise=NOISE, interest=(n,)) for n in (name, other))
+        mine, yours = ours.expected[name].standard_error, theirs.expected[name].standard_error
+        assert mine is not None
+        assert yours is None or mine <= yours
+    with pytest.raises(ValueError, match="`interest` names 'viscosity'"):
+        design(law_belief(), drives, interest=("viscosity",))
+    assert of_law.interest == ("r", "epsilon")
+
+
+def test_more_points_never_know_less(of_law):
+    finite = np.where(np.isfinite(of_law.errors), of_law.errors, 1e300)
+    assert np.all(np.diff(finite, axis=0) <= 1e-12 * finite[:-1])
+
+
+def test_information_follows_the_noise(drives, of_law):
+    doubled = candidates_of(law_belief(), drives, noise=2.0 * NOISE)
+    # the instantaneous law has no error of its own: variances are those of the noise
+    np.testing.assert_allclose(4.0 * doubled.information, of_law.candidates.information, rtol=1e-12)
+
+
+def test_one_amplitude_tells_less_than_two(drives, of_law):
+    peak = candidates_of(law_belief(), drives, noise=NOISE, amplitudes="peak")
+    lockin = candidates_of(law_belief(), drives, noise=NOISE, amplitudes="lockin")
+    np.testing.assert_allclose(peak.information + lockin.information, of_law.candidates.information, rtol=1e-12)
+    assert not np.isfinite(peak.error_nm[:, 1]).any()
+
+
+def test_drives_are_left_out_for_a_reason(drives, of_law):
+    # an orbit that other orbits' search does not find, or too large a one, is not planned with
+    exact = other_amplitudes(drives)
+    missing = [why == "no orbit" for why in of_law.candidates.why_not]
+    assert missing == np.isnan(exact[:, 0]).tolist()
+    limited = candidates_of(law_belief(), drives, noise=NOISE, largest_nm=100.0)
+    assert np.nanmax(exact[limited.usable, 0]) <= 100.0
+    assert limited.left_out["too large"] > 0
+    sure, unsure = (
+        candidates_of(law_belief(uncertainty=share), drives, noise=NOISE).usable.sum() for share in (0.01, 0.9)
+    )
+    assert unsure < sure
+    weak = drive_grid(orders=(1,), amplitudes_nm=(1e-3,), frequencies_khz=(175.0, 180.0))
+    nothing = design(law_belief(), weak)
+    assert not nothing.valid
+    assert "No drive can be planned with" in nothing.reasons[0]
+
+
+def test_a_fit_is_added_to(drives, of_law):
+    exact = other_amplitudes(of_law.drives)
+    result = fit(table_of(of_law.drives, exact), "law")
+    belief = belief_of_fit(result)
+    again = design(belief, drives, points=3, noise=NOISE)
+    for name, parameter in result.parameters.items():
+        # a covariance through its correlations and back
+        np.testing.assert_allclose(error_of(again.measured_so_far[name]), error_of(parameter), rtol=1e-6)
+    assert again.candidates.left_out["measured"] == 5
+    assert not {*again.chosen.tolist()} & {*of_law.chosen.tolist()}
+    # as good as both measured at once
+    together = of_law.belief.information + of_law.candidates.information[[*of_law.chosen, *again.chosen]].sum(axis=0)
+    wanted = np.sqrt(np.diag(np.linalg.inv(together)))
+    # the fit ends within 1e-5 standard errors of the believed law
+    np.testing.assert_allclose(again.errors[-1], wanted, rtol=1e-3)
+
+
+def test_an_unsure_cantilever_is_named(drives):
+    loose = design(law_belief(constraints={"quality_factor": (40.0, 8.0)}), drives, points=6)
+    assert any("Most of the error comes from quality_factor" in warning for warning in loose.warnings)
+    assert any("exactly known" in note for note in law_belief(constraints={}).notes)

@@ -1,0 +1,194 @@
+"""`afm-jax design`: what it prints, writes and returns."""
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from afm_jax.cli.main import main
+from fitting import fit, read_table
+from tests.fit_tables import EXAMPLE, rows
+from tests.fresh_python import python
+
+pytestmark = pytest.mark.slow
+"""Each compiles programs of its own for a minute or more."""
+
+FEW = ("--orders", "1,2", "--detuning", "0.98:1.02:0.01", "--drive-nm", "2,5", "--offsets-nm", "-1,1")
+CANTILEVER = ("--free-frequency-khz", 90, "--quality-factor", "40 +- 0.4")
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(main, ["design", *(str(argument) for argument in arguments)])
+
+
+def strictly(text: str) -> Any:
+    """Return the one JSON object of a text; NaN and Infinity, which JSON does not have, are refused."""
+
+    def refuse(constant: str):
+        raise AssertionError(constant)
+
+    return json.loads(text, parse_constant=refuse)
+
+
+@pytest.fixture(scope="module")
+def reported(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("design")
+    return run(*CANTILEVER, *FEW, "--r", 0.99, "--points", 6, "--json", "--out", folder), folder
+
+
+def test_json_holds_the_promised_keys_and_nothing_else_is_printed(reported):
+    result, _ = reported
+    assert result.exit_code == 0, result.stderr
+    answer = strictly(result.stdout)
+    assert answer["valid"] is True
+    assert answer["model"] == "law+delay"
+    assert answer["interest"] == ["r", "epsilon"]
+    assert len(answer["points"]) == 6
+    assert answer["candidates"] + sum(answer["left_out"].values()) == 2 * 5 * 2 * 2
+    for name in answer["interest"]:
+        low, high = answer["expected"][name]["interval95"]
+        assert low < answer["expected"][name]["value"] < high
+        assert answer["measured_so_far"][name]["standard_error"] is None
+        assert answer["measured_so_far"][name]["reason"]
+        errors = [point["standard_errors"][name] for point in answer["points"]]
+        assert errors[-1] == answer["expected"][name]["standard_error"]
+    assert answer["measured_so_far"]["quality_factor"]["standard_error"] == pytest.approx(0.4)
+    assert any("epsilon" in warning and "taken from the paper" in warning for warning in answer["warnings"])
+
+
+def test_report_is_written(reported):
+    result, folder = reported
+    names = {"design.txt", "design.json", "design.png", "to_fill_in.csv", "design.csv", "candidates.csv"}
+    assert names == {path.name for path in folder.iterdir()}
+    answer = strictly(result.stdout)
+    assert strictly((folder / "design.json").read_text(encoding="utf-8")) == answer
+    with (folder / "design.csv").open(encoding="utf-8") as file:
+        points = list(csv.DictReader(file))
+    for point, wanted in zip(points, answer["points"], strict=True):
+        for name, text in point.items():
+            assert float(text) == wanted[name]
+            assert name in {"order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm"} or "expected" in name
+    with (folder / "candidates.csv").open(encoding="utf-8") as file:
+        candidates = list(csv.DictReader(file))
+    assert len(candidates) == 40
+    assert [bool(row["left_out"]) for row in candidates].count(False) == answer["candidates"]
+    assert sorted(int(row["chosen"]) for row in candidates if row["chosen"]) == [1, 2, 3, 4, 5, 6]
+    assert (folder / "design.png").stat().st_size > 20_000
+    assert "95 % interval then" in (folder / "design.txt").read_text(encoding="utf-8")
+
+
+def test_the_table_to_fill_in_is_one_once_filled_in(reported, tmp_path):
+    _, folder = reported
+    points = strictly((folder / "design.json").read_text(encoding="utf-8"))["points"]
+    lines = (folder / "to_fill_in.csv").read_text(encoding="utf-8").splitlines()
+    filled = [line.replace(",,,,", ",100.5,1,45.5,0.5") for line in lines]
+    assert filled != lines
+    path = tmp_path / "measured.csv"
+    path.write_text("\n".join(filled) + "\n", encoding="utf-8")
+    table = read_table(path)
+    assert (table.free_frequency_khz, table.quality_factor, table.quality_factor_error) == (90.0, 40.0, 0.4)
+    assert table.drive_frequency_khz.tolist() == [point["drive_frequency_khz"] for point in points]
+    assert set(table.peak_amplitude_nm.tolist() if table.peak_amplitude_nm is not None else ()) == {100.5}
+
+
+def test_a_saved_fit_is_added_to(tmp_path):
+    example = read_table(EXAMPLE)
+    result = fit(rows(example, slice(0, 20)), "law")
+    path = tmp_path / "fit.json"
+    path.write_text(json.dumps(result.to_dict()), encoding="utf-8")
+    found = run("--fit", path, *FEW, "--for", "epsilon", "--points", 4, "--json")
+    assert found.exit_code == 0, found.stderr
+    answer = strictly(found.stdout)
+    assert answer["model"] == "law"
+    assert answer["interest"] == ["epsilon"]
+    before, after = answer["measured_so_far"]["epsilon"], answer["expected"]["epsilon"]
+    assert before["standard_error"] == pytest.approx(result.parameters["epsilon"].standard_error, rel=1e-6)
+    assert after["standard_error"] < before["standard_error"]
+
+
+def test_a_measured_table_is_fitted_first(tmp_path):
+    lines = EXAMPLE.read_text(encoding="utf-8").splitlines()
+    header = next(number for number, line in enumerate(lines) if line.startswith("order"))
+    path = tmp_path / "table.csv"
+    path.write_text("\n".join(lines[: header + 21]) + "\n", encoding="utf-8")
+    table = read_table(path)
+    frequency, drive = table.drive_frequency_khz[0], table.drive_amplitude_nm[0]
+    offsets = f"{table.offset_nm[0]},{table.offset_nm[0] + 0.125}"
+    grid = ("--orders", table.order[0], "--frequencies-khz", frequency, "--drive-nm", drive, "--offsets-nm", offsets)
+    found = run("--measured", path, "--model", "law", *grid, "--points", 1, "--json")
+    assert found.exit_code == 0, found.stderr
+    answer = strictly(found.stdout)
+    assert answer["belief"]["rows_measured"] == 20
+    assert answer["belief"]["source"] == f"fit of {path}"
+    # what is in the table already is not planned again
+    assert answer["left_out"]["measured"] == 1
+    assert [point["offset_nm"] for point in answer["points"]] == [table.offset_nm[0] + 0.125]
+
+
+def test_nothing_to_measure_is_not_valid():
+    found = run(*CANTILEVER, "--orders", 1, "--detuning", 1, "--drive-nm", 0.001, "--offsets-nm", 0, "--json")
+    assert found.exit_code == 3
+    answer = strictly(found.stdout)
+    assert answer["valid"] is False
+    assert answer["points"] == []
+    assert answer["candidates"] == 0
+    assert answer["left_out"] == {"no orbit": 1}
+    assert "not valid: No drive can be planned with" in found.stderr
+
+
+def test_too_few_points_determine_nothing():
+    found = run(*CANTILEVER, *FEW, "--points", 1, "--json")
+    assert found.exit_code == 3
+    assert strictly(found.stdout)["expected"]["r"]["standard_error"] is None
+    assert "do not determine r and epsilon" in found.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "fault"),
+    [
+        ((), "give --free-frequency-khz"),
+        (("--free-frequency-khz", 90, "--fit", "fit.json"), "leave one of them out"),
+        (("--fit", "a", "--measured", "b"), "give one of them"),
+        ((*CANTILEVER, "--frequencies-khz", 180, "--detuning", 1), "give one"),
+        ((*CANTILEVER, "--offsets-nm", "1;2"), "is not a number"),
+        ((*CANTILEVER, "--orders", "0"), "is no order"),
+        ((*CANTILEVER, "--drive-nm", "-2"), "must hold positive numbers"),
+        ((*CANTILEVER, "--for", "viscosity"), "names 'viscosity'"),
+        ((*CANTILEVER, "--r", 1.5), "r must be between"),
+        ((*CANTILEVER, "--viscous-loss", 0.5), "the model 'law+delay' has"),
+        ((*CANTILEVER, "--offset-origin-nm", "0 +- 1"), "shift the same thing"),
+        ((*CANTILEVER, "--tip-calibration", "1"), "needs its standard error"),
+        ((*CANTILEVER, "--value", "humidity"), "is no NAME=NUMBER"),
+        ((*CANTILEVER, "--largest-nm", -1), "`largest_nm` must be positive"),
+        ((*CANTILEVER, "--frequencies-khz", "100:200:0.01"), "take coarser steps"),
+        (("--fit", "nowhere.json"), "nowhere.json"),
+    ],
+)
+def test_a_wrong_call_is_one_line(arguments, fault):
+    found = run(*arguments)
+    assert found.exit_code == 2, found.output
+    assert fault in found.stderr
+    assert len(found.stderr.splitlines()) == 1
+    assert found.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "fault"), [("{", "is no JSON"), ("[]", "is no saved fit"), ("{}", "this is no saved fit")]
+)
+def test_a_file_that_is_no_fit_is_named(tmp_path: Path, text, fault):
+    path = tmp_path / "fit.json"
+    path.write_text(text, encoding="utf-8")
+    found = run("--fit", path)
+    assert found.exit_code == 2
+    assert fault in found.stderr
+
+
+def test_help_needs_no_jax():
+    code = (
+        "import sys\nfrom afm_jax.cli.main import main\n"
+        "try:\n    main(['design', '--help'])\nexcept SystemExit:\n    pass\nprint('jax' in sys.modules)"
+    )
+    assert python(code).split()[-1] == "False"

@@ -1,0 +1,112 @@
+"""Forecasts that come true: synthetic experiments at the designed points, each fitted, scatter as was forecast."""
+
+import numpy as np
+import pytest
+from scipy.stats import chi2, kstest, norm
+
+from fitting import believe, design, drive_grid
+from fitting.measurement import measurement_of
+from fitting.optimise import BATCH, Objective
+from fitting.planning.experiment_result import Design
+from fitting.table import AmplitudeTable
+
+pytestmark = pytest.mark.slow
+
+EXPERIMENTS = 200
+STEPS = 8
+VALUES = {"r": 0.99, "epsilon": 122.0, "delay_hertz": 0.206, "delay_lead_nm": 5.64, "delay_offset_nm": 0.726}
+
+
+@pytest.fixture(scope="module")
+def designed() -> Design:
+    drives = drive_grid(
+        orders=(1, 2),
+        amplitudes_nm=(2.0, 5.0),
+        offsets_nm=(-1.0, 1.0),
+        detunings=(0.98, 0.99, 1.0, 1.02),
+        free_frequency_khz=90.0,
+    )
+    belief = believe(
+        "law+delay",
+        free_frequency_khz=90.0,
+        quality_factor=40.0,
+        values=VALUES,
+        constraints={"quality_factor": (40.0, 0.4)},
+    )
+    return design(belief, drives, points=14, noise=0.003)
+
+
+def exact_table(result: Design) -> AmplitudeTable:
+    """Return the readings that the belief expects at the points, without noise."""
+    drives, found = result.drives, result.candidates
+    (peak, lockin), (peak_error, lockin_error) = (
+        np.moveaxis(column[result.chosen], 1, 0) for column in (found.amplitude_nm, found.error_nm)
+    )
+    return AmplitudeTable(
+        order=drives.order,
+        drive_frequency_khz=drives.frequency_khz,
+        drive_amplitude_nm=drives.amplitude_nm,
+        offset_nm=drives.offset_nm,
+        free_frequency_khz=90.0,
+        quality_factor=40.0,
+        quality_factor_error=0.4,
+        peak_amplitude_nm=peak,
+        peak_amplitude_error_nm=peak_error,
+        lockin_amplitude_nm=lockin,
+        lockin_amplitude_error_nm=lockin_error,
+    )
+
+
+@pytest.fixture(scope="module")
+def refitted(designed) -> np.ndarray:
+    """The values (experiments, p) that Gauss-Newton steps find for data with noise, Q measured anew each time."""
+    belief, errors = designed.belief, designed.errors[-1]
+    searching = Objective(measurement_of(exact_table(designed), belief.problem), belief.problem)
+    objective = searching.following(belief.values)
+    random = np.random.default_rng(11)
+    answers = []
+    for _ in range(EXPERIMENTS // BATCH):
+        values, step, noise = np.repeat(belief.values[None], BATCH, axis=0), np.zeros(0), np.zeros(0)
+        for count in range(STEPS):
+            linear = objective.at_values(values)
+            jacobian = np.asarray(linear.jacobian) * errors
+            if count == 0:
+                assert np.abs(linear.residual).max() < 1e-9
+                # of each reading and of the constraint; nothing where a padded row has no reading
+                noise = random.normal(size=linear.residual.shape) * jacobian.any(axis=2)
+            pairs = zip(jacobian, noise - linear.residual, strict=True)
+            step = np.array([np.linalg.lstsq(slopes, missing, rcond=None)[0] for slopes, missing in pairs])
+            values = values + errors * step
+        # settled to a hundredth of a standard error
+        assert np.abs(step).max() < 0.01
+        answers.append(values)
+    return np.concatenate(answers)
+
+
+def test_what_is_designed_is_worth_simulating(designed):
+    assert designed.valid
+    assert len(designed.chosen) == 14
+    assert np.isfinite(designed.errors[-1]).all()
+
+
+def test_scatter_is_the_forecast(designed, refitted):
+    ratio = refitted.var(axis=0) / designed.errors[-1] ** 2
+    # once in ten thousand of right forecasts would lie outside on either side
+    low, high = chi2.ppf([1e-4, 1.0 - 1e-4], EXPERIMENTS - 1) / (EXPERIMENTS - 1)
+    assert np.all((low < ratio) & (ratio < high)), dict(zip(designed.belief.problem.names, ratio, strict=True))
+
+
+def test_intervals_hold_the_truth(designed, refitted):
+    pulls = (refitted - designed.belief.values) / designed.errors[-1]
+    covered = np.mean(np.abs(pulls) < norm.ppf(0.975), axis=0)
+    # 95 % +- 1.5 %: four standard deviations
+    assert np.all(np.abs(covered - 0.95) < 0.062), covered
+    # the mean is off by no more than four of its standard errors
+    assert np.all(np.abs(pulls.mean(axis=0)) < 4.0 / np.sqrt(EXPERIMENTS)), pulls.mean(axis=0)
+
+
+def test_joint_scatter_is_the_forecast(designed, refitted):
+    information = designed.belief.information + designed.candidates.information[designed.chosen].sum(axis=0)
+    miss = refitted - designed.belief.values
+    distance = np.einsum("sp,pq,sq->s", miss, information, miss)
+    assert kstest(distance, chi2(len(VALUES) + 1).cdf).pvalue > 1e-3

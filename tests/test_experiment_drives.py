@@ -1,0 +1,96 @@
+"""What can be driven: grids, and the lists of the command line."""
+
+import click
+import numpy as np
+import pytest
+
+from afm_jax.cli.number_lists import Numbers, Orders, ValueAndError, parse_numbers, parse_orders
+from fitting.planning.experiment_drives import drive_grid, same_drives
+
+
+def test_detunings_are_about_each_orders_resonance():
+    drives = drive_grid(
+        orders=(1, 3), amplitudes_nm=(2, 4), offsets_nm=(-1, 1), detunings=(0.97, 1.0), free_frequency_khz=90.0
+    )
+    assert len(drives.order) == 2 * 2 * 2 * 2
+    found = {(int(n), f) for n, f in zip(drives.order, drives.frequency_khz.tolist(), strict=True)}
+    # 2 N f0 times the detuning
+    assert found == {(1, 174.6), (1, 180.0), (3, 523.8), (3, 540.0)}
+
+
+def test_every_combination_is_there_once():
+    drives = drive_grid(orders=(1, 1), amplitudes_nm=(2, 2.0), frequencies_khz=(170, 180, 170))
+    assert sorted(zip(*(column.tolist() for column in drives), strict=True)) == [
+        (1, 170.0, 2.0, 0.0),
+        (1, 180.0, 2.0, 0.0),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("changes", "fault"),
+    [
+        ({"orders": ()}, "`orders` is empty"),
+        ({"orders": (1.5,)}, "whole numbers"),
+        ({"orders": (0,)}, "`orders` must hold positive"),
+        ({"amplitudes_nm": (2.0, -1.0)}, "`amplitudes_nm` must hold positive"),
+        ({"offsets_nm": (float("nan"),)}, "`offsets_nm` must hold finite"),
+        ({"frequencies_khz": None}, "either `frequencies_khz` or `detunings`"),
+        ({"detunings": (1.0,)}, "either `frequencies_khz` or `detunings`"),
+        ({"frequencies_khz": None, "detunings": (1.0,)}, "`free_frequency_khz`"),
+        ({"frequencies_khz": range(1, 30_000)}, "take coarser steps"),
+    ],
+)
+def test_faults_are_named(changes, fault):
+    given = {"orders": (1,), "amplitudes_nm": (2.0,), "frequencies_khz": (180.0,)} | changes
+    with pytest.raises(ValueError, match=fault):
+        drive_grid(**given)
+
+
+def test_measured_drives_are_recognised_up_to_rounding():
+    drives = drive_grid(orders=(1, 2), amplitudes_nm=(0.3,), frequencies_khz=(180.0, 181.0))
+    measured = np.array([[1, 180.0 + 1e-9, 0.1 + 0.2, -0.0]])
+    assert same_drives(drives, measured).tolist() == [True, False, False, False]
+
+
+@pytest.mark.parametrize(
+    ("text", "numbers"),
+    [("-1,0,1", (-1.0, 0.0, 1.0)), ("0.97:1:0.01", (0.97, 0.98, 0.99, 1.0)), ("170:190:8", (170.0, 178.0, 186.0))],
+)
+def test_numbers_are_read(text, numbers):
+    assert parse_numbers(text) == numbers
+
+
+def test_orders_are_read():
+    assert parse_orders("1-3, 2,7") == (1, 2, 3, 7)
+
+
+@pytest.mark.parametrize("text", ["", "a", "1:2", "2:1:1", "1:2:0", "0:1:1e-9", "nan", "1,,2"])
+def test_wrong_numbers_are_refused(text):
+    with pytest.raises(click.BadParameter):
+        Numbers(positive=False).convert(text, None, None)
+
+
+@pytest.mark.parametrize("text", ["", "0", "-1", "1-", "3-1", "1.5", "1-2-3", "1000"])
+def test_wrong_orders_are_refused(text):
+    with pytest.raises(click.BadParameter):
+        Orders().convert(text, None, None)
+
+
+def test_positive_numbers_are_asked_for():
+    with pytest.raises(click.BadParameter, match="positive"):
+        Numbers().convert("1,0", None, None)
+
+
+@pytest.mark.parametrize("text", ["40 +- 2", "40+/-2", "40 ± 2"])
+def test_a_value_has_an_error(text):
+    assert ValueAndError().convert(text, None, None) == (40.0, 2.0)
+
+
+def test_a_value_can_be_exact():
+    assert ValueAndError().convert("40", None, None) == (40.0, None)
+
+
+@pytest.mark.parametrize("text", ["", "40 +- 0", "40 +- -1", "1 +- 2 +- 3", "x"])
+def test_wrong_values_are_refused(text):
+    with pytest.raises(click.BadParameter):
+        ValueAndError().convert(text, None, None)

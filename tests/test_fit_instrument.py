@@ -1,0 +1,157 @@
+"""What a fit makes of the instrument's errors, of outliers and of drives on which no orbit was seen."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from afm_jax.impact.law import ImpactLaw
+from fitting import fit, read_table
+from fitting.result import FitResult
+from fitting.table import AmplitudeTable
+from tests.fit_tables import EXAMPLE, amplitudes_and_errors, rows, simulated, standard_errors_of, values_of
+from tests.fit_tables import with_amplitudes as table_with
+
+pytestmark = pytest.mark.slow
+"""Each compiles programs of its own for a minute or more."""
+
+LAW = ImpactLaw(0.95, 60.0)
+
+
+@pytest.fixture(scope="module")
+def table() -> AmplitudeTable:
+    """Return a made table with noise of 1 %; its Q is known to 1 %."""
+    return simulated(read_table(EXAMPLE), LAW, seed=11)
+
+
+@pytest.fixture(scope="module")
+def plain(table) -> FitResult:
+    return fit(table, model="law")
+
+
+def test_a_wrong_calibration_of_the_tip_is_found(table):
+    amplitude, error = amplitudes_and_errors(table)
+    known = {"tip_calibration": (1.0, 0.05)}
+    off = table_with(table, 1.04 * amplitude, 1.04 * error, calibration=known)
+    blind = fit(dataclasses.replace(off, calibration={}), model="law")
+    assert not blind.valid
+    result = fit(off, model="law")
+    assert result.valid
+    assert list(result.parameters) == ["r", "epsilon", "quality_factor", "tip_calibration"]
+    for name, truth in {"r": 0.95, "epsilon": 60.0, "tip_calibration": 1.04}.items():
+        low, high = result.parameters[name].interval95
+        assert low is not None
+        assert high is not None
+        assert low < truth < high
+    assert result.parameters["tip_calibration"].constraint == (1.0, 0.05)
+    pulls = [(result.parameters["tip_calibration"].value - 1.0) / 0.05]
+    pulls.append((result.parameters["quality_factor"].value - 40.0) / 0.4)
+    chi2 = np.nansum(result.rows.residual**2) + np.sum(np.square(pulls))
+    assert result.chi2 == pytest.approx(chi2, rel=1e-12)
+    assert result.degrees_of_freedom == 2 * table.rows + 2 - 4
+
+
+def test_a_wrong_calibration_of_drive_and_offsets_is_found(table):
+    """The stated drive is 5 % less than the true one, the stated offsets lack 0.3 nm."""
+    stated = dataclasses.replace(
+        table, drive_amplitude_nm=table.drive_amplitude_nm / 1.05, offset_nm=table.offset_nm - 0.3
+    )
+    result = fit(stated, model="law", constraints={"drive_calibration": (1.0, 0.1), "offset_origin_nm": (0.0, 1.0)})
+    assert result.valid
+    truth = {"r": 0.95, "epsilon": 60.0, "drive_calibration": 1.05, "offset_origin_nm": 0.3}
+    for name, value in truth.items():
+        # three errors, of four parameters
+        assert abs(result.parameters[name].value - value) < 3.0 * (result.parameters[name].standard_error or 0.0)
+    assert result.settings["constraints"]["drive_calibration"] == (1.0, 0.1)
+
+
+def test_calibration_widens_the_errors_of_the_law(table, plain):
+    uncertain = fit(table, model="law", constraints={"tip_calibration": (1.0, 0.05)})
+    wider = standard_errors_of(uncertain)[:2] / standard_errors_of(plain)[:2]
+    assert np.all(wider > 1.0)
+    # the threshold tells epsilon whatever the calibration; r is read off the amplitudes
+    assert wider[0] > 1.03
+
+
+@pytest.mark.parametrize(
+    ("constraints", "said"),
+    [
+        ({"tip_calibration": (1.0, 0.0)}, "must be a value and a positive error"),
+        ({"viscous_loss": (1.0, 0.1)}, "is on no parameter: choose from r, epsilon, quality_factor"),
+        ({"tip_calibration": (float("nan"), 0.1)}, "must be a value and a positive error"),
+    ],
+)
+def test_impossible_constraints_are_errors(table, constraints, said):
+    with pytest.raises(ValueError, match=said):
+        fit(table, model="law", constraints=constraints)
+
+
+def test_the_offsets_origin_is_refused_beside_a_delay(table):
+    with pytest.raises(ValueError, match="offset_origin_nm and delay_offset_nm shift the same thing"):
+        fit(table, model="law+delay", constraints={"offset_origin_nm": (0.0, 0.3)})
+    with pytest.raises(ValueError, match="offset_origin_nm and delay_offset_nm shift the same thing"):
+        fit(dataclasses.replace(table, calibration={"offset_origin_nm": (0.0, 0.3)}), model="viscous+delay")
+
+
+def with_unseen(table: AmplitudeTable, drive_nm: float) -> AmplitudeTable:
+    """Return a table with one more row, on which no orbit was seen."""
+    last = rows(table, slice(-1, None))
+    columns = {
+        field.name: np.append(getattr(table, field.name), getattr(last, field.name))
+        for field in dataclasses.fields(table)
+        if isinstance(getattr(table, field.name), np.ndarray) and field.name != "lines"
+    }
+    columns["drive_amplitude_nm"][-1] = drive_nm
+    for name in ("peak_amplitude_nm", "peak_amplitude_error_nm", "lockin_amplitude_nm", "lockin_amplitude_error_nm"):
+        columns[name][-1] = np.nan
+    unseen = np.append(np.zeros(table.rows), 1.0)
+    return dataclasses.replace(table, **columns, no_orbit=unseen, lines=np.arange(1, table.rows + 2))
+
+
+def test_a_drive_too_small_for_an_orbit_agrees_with_the_law(table, plain):
+    result = fit(with_unseen(table, 0.05), model="law")
+    assert result.valid
+    assert result.chi2 == pytest.approx(plain.chi2, rel=1e-9)
+    assert result.degrees_of_freedom == plain.degrees_of_freedom + 1
+    assert np.all(np.abs(values_of(result) - values_of(plain)) < 1e-4 * standard_errors_of(plain))
+    assert np.isnan(result.rows.predicted_nm[-1]).all()
+
+
+def test_an_orbit_that_was_not_seen_counts_three_errors(table, plain):
+    drive = 1.001 * float(table.drive_amplitude_nm[-1])  # another drive than the last row's, as good as the same
+    result = fit(with_unseen(table, drive), model="law")
+    assert result.chi2 == pytest.approx(plain.chi2 + 9.0, rel=1e-6)
+    assert np.all(np.abs(values_of(result) - values_of(plain)) < 1e-3 * standard_errors_of(plain))
+
+
+@pytest.fixture(scope="module")
+def spoilt(table) -> AmplitudeTable:
+    """Return the table with three amplitudes that are far off."""
+    amplitude, error = amplitudes_and_errors(table)
+    amplitude[[5, 30, 60], [0, 1, 0]] *= [1.3, 0.75, 1.5]
+    return table_with(table, amplitude, error)
+
+
+def test_outliers_hardly_move_a_robust_fit_and_are_named(spoilt, plain):
+    robust, pulled = fit(spoilt, model="law", robust=True), fit(spoilt, model="law")
+    shift = np.abs(values_of(robust) - values_of(plain)) / standard_errors_of(plain)
+    assert shift.max() < 1.0
+    assert shift.max() < np.abs(values_of(pulled) - values_of(plain)).max()
+    assert not pulled.valid
+    assert robust.valid
+    assert np.isnan(robust.p_value)
+    (said,) = [warning for warning in robust.warnings if "Robust loss" in warning]
+    named = ", ".join(str(int(spoilt.lines[row])) for row in (5, 30, 60))
+    assert f"outliers: lines {named}" in said
+    assert robust.settings["robust"] is not None
+
+
+def test_robust_residuals_are_reported_as_they_are(spoilt):
+    robust = fit(spoilt, model="law", robust=True)
+    amplitude, error = amplitudes_and_errors(spoilt)
+    residual = (robust.rows.predicted_nm - amplitude) / error
+    np.testing.assert_allclose(robust.rows.residual, residual, rtol=1e-12)
+    pull = (robust.parameters["quality_factor"].value - 40.0) / 0.4
+    every = np.append(residual.ravel(), pull)
+    # 2 s^2 (sqrt(1 + x^2/s^2) - 1) with s = 2
+    assert robust.chi2 == pytest.approx(np.sum(8.0 * (np.sqrt(1.0 + every**2 / 4.0) - 1.0)), rel=1e-9)

@@ -1,0 +1,247 @@
+"""Derivatives of predicted amplitudes: closed forms, fifty digits, extrapolated differences, refusals."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
+from afm_jax.impact.law import ImpactLaw
+from afm_jax.impact.orbit_closure import OrbitProblem
+from fitting import amplitude_gradients
+from fitting.forward import BATCH, linearise
+from fitting.gradients import (
+    AT_A_FOLD,
+    GRAZE_ON_THE_WAY,
+    NO_ORBIT,
+    SLOW_GRAZE,
+    AmplitudeGradients,
+    _grazes,
+    _reason,
+)
+from fitting.measurement import measurement_of
+from fitting.models import Problem
+from fitting.table import AmplitudeTable
+from tests.reference_examples import scene
+from tests.reference_flight import constants, mp, platform, propagator
+from tests.reference_systems import single_impact_orbits
+
+pytestmark = pytest.mark.slow
+"""Each compiles programs of its own for a minute or more."""
+
+DELAYED = {
+    "r": 0.9999,
+    "epsilon": 114.0,
+    "delay_hertz": 0.206,
+    "delay_lead_nm": 5.64,
+    "delay_offset_nm": 0.6,
+    "quality_factor": 40.0,
+    "tip_calibration": 1.1,
+    "drive_calibration": 0.98,
+    "offset_origin_nm": 0.05,
+}
+LAW = {"r": 0.98, "epsilon": 100.0, "quality_factor": 38.0}
+CONTACT = {"relative_humidity": 0.5, "viscosity_pa_s": 1.005e-3, "modulus_gpa": 100.0, "quality_factor": 40.0}
+ROWS = ((1, 181.8, 4.0, -1.0), (1, 185.4, 3.0, 1.0), (2, 363.6, 4.0, 0.0), (1, 177.3, 4.0, 0.0), (3, 531.9, 2.0, 0.5))
+
+
+def table_of(*rows: tuple[int, float, float, float], quality_factor: float | None = 40.0) -> AmplitudeTable:
+    """Return a table of drives with amplitudes that are measured badly: they do not matter where there is one orbit."""
+    order, frequency, amplitude, offset = (np.array(column) for column in zip(*rows, strict=True))
+    return AmplitudeTable(
+        order=order,
+        drive_frequency_khz=frequency.astype(float),
+        drive_amplitude_nm=amplitude.astype(float),
+        offset_nm=offset.astype(float),
+        free_frequency_khz=90.0,
+        quality_factor=quality_factor,
+        peak_amplitude_nm=np.full(len(rows), 100.0),
+        peak_amplitude_error_nm=np.full(len(rows), 50.0),
+    )
+
+
+def extrapolated(table: AmplitudeTable, model: str, values: dict[str, float]) -> np.ndarray:
+    """Return the derivatives from values of the forward model alone: central differences, extrapolated twice."""
+    problem = Problem(model, tuple(values))
+    measurement = measurement_of(table, problem)
+    point = np.array(list(values.values()))
+    columns = []
+    for index, value in enumerate(point):
+        # in thousandths of what it acts on: a length in nm, or itself
+        step = 2e-3 * max(abs(value), 0.5 if problem.names[index].endswith("_nm") else 0.0)
+        shifts = step * np.array([1.0, -1.0, 0.5, -0.5, 0.25, -0.25])
+        sets = np.repeat(point[None], len(shifts), axis=0)
+        sets[:, index] += shifts
+        assert len(shifts) <= BATCH
+        amplitude = np.asarray(linearise(sets, measurement, problem).prediction.amplitude_nm)[:, : table.rows]
+        slopes = [(amplitude[2 * i] - amplitude[2 * i + 1]) / (2.0 * shifts[2 * i]) for i in range(3)]
+        better = [(4.0 * slopes[i + 1] - slopes[i]) / 3.0 for i in range(2)]
+        columns.append((16.0 * better[1] - better[0]) / 15.0)
+    return np.stack(columns, axis=-1)
+
+
+def agree(found: AmplitudeGradients, expected: np.ndarray) -> None:
+    assert found.reasons == (None,) * len(expected)
+    # relative to the largest derivative of its kind: some vanish, and rounding over the step leaves 1e-9
+    scale = np.abs(expected).max(axis=(0, 1))
+    np.testing.assert_allclose(found.gradient / scale, expected / scale, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+@pytest.mark.parametrize("r", [0.5, 0.99])
+def test_on_resonance_it_is_the_closed_form(mode, r):
+    """V' = W (1 + r)/(1 - r), W ~ sqrt(beta^2 - sigma^2), without damping or adhesion: d ln V'/dr = 2/(1 - r^2)."""
+    table = table_of((1, 180.0, 3.0, 1.0), (2, 360.0, 2.0, -0.5), quality_factor=None)
+    values = {"r": r, "tip_calibration": 1.0, "drive_calibration": 1.0, "offset_origin_nm": 0.0}
+    found = amplitude_gradients(table, "restitution", values, mode=mode)
+    assert found.parameters == ("r", "offset_origin_nm", "tip_calibration", "drive_calibration")
+    beta, sigma = table.drive_amplitude_nm, table.offset_nm
+    square = beta**2 - sigma**2
+    peak = 2.0 * table.order * np.sqrt(square) * (1 + r) / (1 - r)
+    relative = np.stack([np.full(2, 2 / (1 - r**2)), -sigma / square, np.ones(2), beta**2 / square], axis=-1)
+    # the closing condition loses 1/(1 - r) of its digits
+    np.testing.assert_allclose(found.predicted_nm[:, 0], peak, rtol=1e-10)
+    np.testing.assert_allclose(found.gradient[:, 0], peak[:, None] * relative, rtol=1e-9)
+    np.testing.assert_allclose(found.gradient[:, 1], found.predicted_nm[:, 1, None] * relative, rtol=1e-9)
+
+
+def fifty_digits(row: tuple[int, float, float, float], values: dict[str, float]):
+    """Return peak and lock-in amplitude of the steady orbit in mpmath."""
+    order, frequency, amplitude, offset = row
+    system = scene(frequency / 180.0, amplitude_nm=amplitude, offset_nm=offset, **values)
+    (orbit,) = [o for o in single_impact_orbits(system, order) if o.stable and o.admissible]
+    k = constants(system)
+    start = orbit.phase_rad / k.drive
+    height, speed = platform(k, start)[0], orbit.velocity_after_nm_per_us
+
+    def motion(t):
+        p11, p12, p21, p22 = propagator(k, t)
+        return p11 * height + p12 * speed, p21 * height + p22 * speed
+
+    period = order * k.drive_period
+    turn = mp.findroot(lambda t: motion(t)[1], k.drive_period / 2 * order)
+    pieces = mp.linspace(0, period, 2 * order + 1)
+    signal = mp.quad(lambda t: motion(t)[0] * mp.expj(-k.drive * t / order), pieces)
+    return mp.matrix([motion(turn)[0], 2 / period * abs(signal)])
+
+
+@pytest.mark.parametrize("row", ROWS[1:3])
+def test_it_agrees_with_differences_of_fifty_digits(row):
+    found = amplitude_gradients(table_of(*ROWS), "law", LAW)
+    index = ROWS.index(row)
+    with mp.workdps(50):
+        for column, name in enumerate(found.parameters):
+            step = mp.mpf(10) ** -12 * LAW[name]
+            ahead, behind = (fifty_digits(row, LAW | {name: LAW[name] + h}) for h in (step, -step))
+            expected = [float(x) for x in (ahead - behind) / (2 * step)]
+            # of 16 digits the nearness to resonance costs a few
+            np.testing.assert_allclose(found.gradient[index, :, column], expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_it_agrees_with_extrapolated_differences_of_a_delayed_law(mode):
+    table = table_of(*ROWS)
+    found = amplitude_gradients(table, "law+delay", DELAYED, mode=mode)
+    ordered = {name: DELAYED[name] for name in found.parameters}
+    agree(found, extrapolated(table, "law+delay", ordered))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mode", ["forward", "reverse"])
+def test_it_agrees_with_extrapolated_differences_of_a_contact(mode):
+    table = table_of(*ROWS)
+    found = amplitude_gradients(table, "contact", CONTACT, mode=mode)
+    agree(found, extrapolated(table, "contact", {name: CONTACT[name] for name in found.parameters}))
+
+
+def test_more_rows_than_a_program_takes_change_nothing():
+    many = tuple((1, 176.0 + 0.2 * i, 4.0, 0.0) for i in range(45))
+    whole, part = (amplitude_gradients(table_of(*rows), "law", LAW) for rows in (many, many[40:]))
+    assert whole.gradient.shape == (45, 2, 3)
+    np.testing.assert_allclose(whole.gradient[40:], part.gradient, rtol=1e-12)  # other lanes, other rounding
+
+
+def test_without_an_orbit_it_says_so():
+    found = amplitude_gradients(table_of(ROWS[0], (1, 181.8, 0.1, 0.0)), "law", LAW)
+    assert found.reasons == (None, NO_ORBIT)
+    assert np.isnan(found.predicted_nm[1]).all()
+    assert np.isnan(found.gradient[1]).all()
+    assert np.isfinite(found.gradient[0]).all()
+
+
+def cut_off(frequency_khz: float) -> float:
+    """Return the smallest drive in nm that keeps an orbit, by bisection."""
+    low, high = 0.2, 4.0
+    for _ in range(7):
+        drives = np.linspace(low, high, 32)
+        found = amplitude_gradients(table_of(*((1, frequency_khz, drive, 0.0) for drive in drives)), "law", LAW)
+        first = int(np.argmax(np.isfinite(found.predicted_nm[:, 0])))
+        low, high = drives[first - 1], drives[first]
+    return high
+
+
+def test_at_a_fold_it_is_refused_and_close_by_it_grows_as_it_must():
+    """Two roots that meet part as the square root of the distance: four times closer, the slope is twice as steep."""
+    last = cut_off(181.8)
+    drives = last * (1.0 + np.array([1e-9, 1e-5, 4e-5, 1e-2]))
+    values = LAW | {"drive_calibration": 1.0}
+    found = amplitude_gradients(table_of(*((1, 181.8, drive, 0.0) for drive in drives)), "law", values)
+    assert found.reasons == (AT_A_FOLD, None, None, None)
+    assert np.isfinite(found.predicted_nm).all()
+    assert np.isnan(found.gradient[0]).all()
+    near, farther = np.abs(found.gradient[1:3, 0, found.parameters.index("drive_calibration")])
+    # the next term is smaller by the root of the distance, 0.6 %, times a number
+    assert near / farther == pytest.approx(2.0, rel=0.05)
+
+
+def test_a_graze_on_the_way_is_refused():
+    row = (1, 125.38983050847457, 1.0, 0.1875)
+    rows = [(*row[:3], row[3] + shift) for shift in (0.0, -0.02, -0.1)]
+    found = amplitude_gradients(table_of(*rows), "restitution", {"r": 0.5})
+    lowest = [lowest_gap_on_the_way(row, 0.5) for row in rows]
+    # the drive's amplitude is 1 nm
+    assert lowest[0] < 1e-3 < lowest[1] < lowest[2]
+    assert found.reasons == (GRAZE_ON_THE_WAY, None, None)
+
+
+def lowest_gap_on_the_way(row: tuple[int, float, float, float], r: float) -> float:
+    """Return the smallest gap between tip and platform in the flight's middle, from the reference's orbit."""
+    order, frequency, amplitude, offset = row
+    system = scene(frequency / 180.0, amplitude_nm=amplitude, offset_nm=offset, r=r, epsilon=0.0)
+    (orbit,) = [o for o in single_impact_orbits(system, order) if o.stable and o.admissible]
+    k = constants(system, np)
+    start = float(orbit.phase_rad) / k.drive
+    times = float(orbit.flight_time_us) * np.linspace(0.0, 1.0, 20001)
+    p11, p12, _, _ = propagator(k, times, np)
+    gap = p11 * platform(k, start, np)[0] + p12 * float(orbit.velocity_after_nm_per_us)
+    gap = gap - platform(k, start + times, np)[0]
+    inside = (gap[1:-1] < gap[:-2]) & (gap[1:-1] < gap[2:])
+    return float(gap[1:-1][inside].min())
+
+
+@pytest.mark.parametrize(("share", "slow"), [(1e-4, True), (1e-2, False)])
+def test_an_impact_of_a_ten_thousandth_of_the_drives_speed_is_a_graze(share, slow):
+    """Looked at directly: orbits with such an impact are unstable, no table leads there."""
+    platform = Platform(4.0, 181.8, 0.0)
+    orbit = OrbitProblem(Cantilever(90.0, 40.0), platform, ImpactLaw(0.5, 0.0), jnp.array(1.0))
+    # without adhesion the approach speed is Y/2r, here Y itself
+    found, _ = _grazes(share * platform.top_speed_nm_per_us, orbit)
+    assert bool(found) is slow
+    said = _reason(np.True_, np.False_, np.bool_(slow), np.False_)
+    assert said == (SLOW_GRAZE if slow else None)
+
+
+@pytest.mark.parametrize(
+    ("model", "values", "mode", "said"),
+    [
+        ("law", {"r": 0.9}, "forward", "`values` lacks epsilon"),
+        ("law", LAW | {"delay_hertz": 0.2}, "forward", "`values` names 'delay_hertz': choose from r, epsilon, quality"),
+        ("law", LAW | {"r": 1.2}, "forward", "`values`: r must lie between 0.01 and 1, but is 1.2"),
+        ("law", LAW, "backward", '`mode` must be "forward" or "reverse", but is \'backward\''),
+        ("jkr", LAW, "forward", "`model` must be one of"),
+        ("contact", {"quality_factor": 40.0}, "forward", "must name at least one parameter"),
+    ],
+)
+def test_impossible_questions_are_errors(model, values, mode, said):
+    with pytest.raises(ValueError, match=said):
+        amplitude_gradients(table_of(*ROWS), model, values, mode=mode)

@@ -1,0 +1,140 @@
+"""`afm-jax invert`: what it prints, writes and returns."""
+
+import csv
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from matplotlib.image import imread
+
+from afm_jax.cli.main import main
+from fitting.examples.make_contact_amplitudes import EXAMPLE
+
+pytestmark = pytest.mark.slow
+"""Each compiles programs of its own for a minute or more."""
+
+TEXT = EXAMPLE.read_text(encoding="utf-8")
+HEAD, *ROWS = [line for line in TEXT.splitlines() if not line.startswith("#")]
+COMMENTS = "# free_frequency_khz = 90\n# quality_factor = 40 +- 0.5\n"
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(main, ["invert", *(str(argument) for argument in arguments)])
+
+
+def strictly(text: str) -> Any:
+    """Return the one JSON object of a text; NaN and Infinity, which JSON does not have, are refused."""
+
+    def refuse(constant: str):
+        raise AssertionError(constant)
+
+    return json.loads(text, parse_constant=refuse)
+
+
+@pytest.fixture(scope="module")
+def reported(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("report")
+    return run("--example", "--json", "--out", folder), folder
+
+
+def test_json_holds_rows_and_laws_near_the_truth(reported):
+    result, _ = reported
+    assert result.exit_code == 0, result.stderr
+    answer = strictly(result.stdout)
+    assert answer["valid"] is True
+    assert len(answer["rows"]) == 57
+    # physics.md: free tips of 40, 60 and 100 nm/us leave with 38.2958, 58.7902 and 99.1735
+    law = answer["law"]
+    u, w = (np.array(law[name]) for name in ("approach_speed_nm_per_us", "rebound_speed_nm_per_us"))
+    found = np.sqrt(np.array([40.0, 60.0, 100.0]) ** 2 - np.interp([40.0, 60.0, 100.0], u, u**2 - w**2))
+    # 0.1 % is what 1 % and 0.1 degree allow
+    np.testing.assert_allclose(found, [38.2958, 58.7902, 99.1735], rtol=1e-3)
+    assert law["preferred"] == "viscous"
+    epsilon = law["viscous"]["parameters"]["epsilon"]
+    assert abs(epsilon["value"] - 113.6) < 3.0 * epsilon["standard_error"]
+    assert 0.0 < epsilon["systematic_error"] < epsilon["standard_error"]
+    row = answer["rows"][0]
+    assert 0.0 < row["approach_speed_error_nm_per_us"] < 0.02 * row["approach_speed_nm_per_us"]
+    assert answer["resonance"]["reference"] == "law"
+
+
+def test_report_is_written(reported):
+    _, folder = reported
+    with (folder / "invert.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == 57
+    slow = [row for row in rows if row["regressed"] == "false"]
+    assert slow
+    assert all("slower than 2.5 sqrt(epsilon)" in row["note"] for row in slow)
+    with (folder / "law.csv").open(encoding="utf-8") as file:
+        law = list(csv.DictReader(file))
+    assert float(law[0]["rebound_speed_viscous_nm_per_us"]) < float(law[0]["approach_speed_nm_per_us"])
+    assert strictly((folder / "invert.json").read_text(encoding="utf-8"))["format"] == "afm-jax invert"
+    text = (folder / "invert.txt").read_text(encoding="utf-8")
+    assert "The rows support a viscous loss" in text
+    assert "phase 3 pi/2" in text
+    # a drawn picture has many shades; an empty one only a few
+    assert len(np.unique(imread(folder / "invert.png"))) > 50
+
+
+def test_reading_on_resonance_is_compared_with_a_truth_from_a_file(tmp_path):
+    resonant = [row.rsplit(",", 2)[0] for row in ROWS if row.split(",")[1] in {"180.0", "360.0"}]
+    path, truth = tmp_path / "table.csv", tmp_path / "truth.csv"
+    path.write_text(COMMENTS + "\n".join([HEAD.rsplit(",", 2)[0], *resonant]) + "\n", encoding="utf-8")
+    # captured tips stay empty, as `collide` writes them
+    lines = ["approach_speed_nm_per_us,rebound_speed_nm_per_us,captured", "10,,true", "15,10.1805,false"]
+    truth.write_text("\n".join([*lines, "200,199.4561,false", "400,399.6,false"]) + "\n", encoding="utf-8")
+    result = run(path, "--truth", truth, "--json")
+    assert result.exit_code == 0, result.stderr
+    answer = strictly(result.stdout)
+    assert answer["law"]["preferred"] is None
+    assert answer["resonance"]["reference"] == "truth"
+    assert all(-0.5 < bias < -0.03 for bias in answer["resonance"]["bias"])
+    assert "Bias of u_out against the truth given" in run(path, "--truth", truth).stdout
+
+
+def test_two_rows_end_with_exit_code_3(tmp_path):
+    path = tmp_path / "table.csv"
+    path.write_text(COMMENTS + "\n".join([HEAD, *ROWS[:2]]) + "\n", encoding="utf-8")
+    result = run(path)
+    assert result.exit_code == 3
+    assert "2 rows do not determine a law" in result.stderr
+    assert "NOT VALID" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("table", "arguments", "said"),
+    [
+        (None, (), "give a table to invert"),
+        ([HEAD.rsplit(",", 2)[0], ROWS[0].rsplit(",", 2)[0]], (), "add the columns phase_deg and phase_error_deg"),
+        ([HEAD, ROWS[0]], ("--frequency-error", "-1"), "frequency-error"),
+        ([HEAD, ROWS[0]], ("--truth", "TABLE"), "there is no column approach_speed_nm_per_us"),
+    ],
+)
+def test_wrong_calls_end_with_one_line_and_exit_code_2(tmp_path, table, arguments, said):
+    path = tmp_path / "table.csv"
+    if table is not None:
+        path.write_text(COMMENTS + "\n".join(table) + "\n", encoding="utf-8")
+    given = [] if table is None else [path]
+    result = run(*given, *(path if argument == "TABLE" else argument for argument in arguments))
+    assert result.exit_code == 2
+    assert said in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("approach_speed_nm_per_us,rebound_speed_nm_per_us\n20,16.6\n", "two or more rebounding tips"),
+        ("approach_speed_nm_per_us,rebound_speed_nm_per_us\n20,16.6\n20,16.7\n", "each speed once"),
+        ("approach_speed_nm_per_us,rebound_speed_nm_per_us\n20,fast\n", "a speed is not a number"),
+    ],
+)
+def test_faulty_truths_are_refused(tmp_path, text, said):
+    path = tmp_path / "truth.csv"
+    path.write_text(text, encoding="utf-8")
+    result = run("--example", "--truth", path)
+    assert result.exit_code == 2
+    assert said in result.stderr

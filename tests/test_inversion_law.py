@@ -1,0 +1,91 @@
+"""The regression of laws on correlated speeds, against a total least squares that fits every point."""
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from fitting.inverse.inversion_law import DELAY_TERMS, LOSS_TERMS, delay, loss, regress
+
+EPSILON, SLOPES = 113.6, {"viscous": 0.5, "restitution": 3e-3}
+
+
+def impacts(model: str, rows: int, seed: int, *, size: float = 1.0):
+    """Return impacts that follow a law, with correlated noise, and their covariances."""
+    generator = np.random.default_rng(seed)
+    u = np.geomspace(30.0, 300.0, rows)
+    lost = EPSILON + SLOPES[model] * (u if model == "viscous" else u * u)
+    w = np.sqrt(u * u - lost)
+    tau = 0.2 * u**-0.2 - 5.6 * (1.0 / w - 1.0 / u) - 0.6 / u
+    # a common error of both speeds, and a small one of their difference
+    roots = size * np.array([[[0.007 * s, 0.0, 0.0], [0.0072 * s, 0.02, 0.0], [0.0, 2e-4, 5e-4]] for s in u])
+    noise = np.einsum("nij,nj->ni", roots, generator.normal(size=(rows, 3)))
+    return np.stack([u, w, tau], axis=1) + noise, np.einsum("nij,nkj->nik", roots, roots)
+
+
+@pytest.mark.parametrize("model", ["viscous", "restitution"])
+def test_laws_agree_with_a_fit_of_every_point(model):
+    x, covariance = impacts(model, 25, 5)
+    found = regress(loss, LOSS_TERMS[model], x, covariance, np.zeros((25, 3, 0)))
+    whiten = np.linalg.inv(np.linalg.cholesky(covariance[:, :2, :2]))
+
+    def residual(parameters):
+        u = parameters[2:]
+        lost = parameters[0] + parameters[1] * (u if model == "viscous" else u * u)
+        apart = x[:, :2] - np.stack([u, np.sqrt(u * u - lost)], axis=1)
+        return np.einsum("nij,nj->ni", whiten, apart).ravel()
+
+    start = np.concatenate([[EPSILON, SLOPES[model]], x[:, 0]])
+    every = least_squares(residual, start, x_scale=np.abs(start), xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    covariance_of_every = np.linalg.inv(every.jac.T @ every.jac)[:2, :2]
+    # both minimise the same sum up to second order in errors of 1 %
+    error = np.sqrt(np.diag(covariance_of_every))
+    np.testing.assert_allclose((found.value - every.x[:2]) / error, 0.0, atol=0.1)
+    np.testing.assert_allclose(np.sqrt(np.diag(found.covariance)), error, rtol=0.05)
+    assert found.chi2 == pytest.approx(2.0 * every.cost, rel=0.02)
+
+
+@pytest.mark.parametrize("model", ["viscous", "restitution"])
+def test_values_without_noise_are_exact(model):
+    true, _ = impacts(model, 12, 1, size=0.0)
+    _, covariance = impacts(model, 12, 1)
+    found = regress(loss, LOSS_TERMS[model], true, covariance, np.zeros((12, 3, 0)))
+    # rounding, times the condition of the terms
+    np.testing.assert_allclose(found.value, [EPSILON, SLOPES[model]], rtol=1e-8)
+    assert found.chi2 < 1e-12
+    found = regress(delay, DELAY_TERMS, true, covariance, np.zeros((12, 3, 0)))
+    np.testing.assert_allclose(found.value, [0.2, 5.6, 0.6], rtol=1e-8)
+
+
+def test_errors_of_repeated_experiments_are_those_stated():
+    found = [
+        regress(loss, LOSS_TERMS["viscous"], *impacts("viscous", 25, seed), np.zeros((25, 3, 0))) for seed in range(300)
+    ]
+    pulls = np.array([(one.value - [EPSILON, 0.5]) / np.sqrt(np.diag(one.covariance)) for one in found])
+    # the standard deviation of 300 pulls is known to 4 %
+    np.testing.assert_allclose(pulls.std(axis=0), 1.0, atol=0.16)
+    np.testing.assert_allclose(pulls.mean(axis=0), 0.0, atol=0.25)
+    assert np.mean([one.chi2 for one in found]) == pytest.approx(23.0, rel=0.06)
+
+
+def test_what_all_rows_share_is_found_and_widens_the_errors():
+    x, covariance = impacts("viscous", 40, 2, size=0.02)
+    shared = np.stack([np.zeros(40), 1e-3 * x[:, 0], np.zeros(40)], axis=1)[:, :, None]
+    # measured with the shared quantity off by 1.5 standard errors: taken back, the rows follow the law
+    found = regress(loss, LOSS_TERMS["viscous"], x - 1.5 * shared[:, :, 0], covariance, shared)
+    assert found.pulls[0] == pytest.approx(1.5, abs=0.1)
+    # three standard errors of the small noise
+    np.testing.assert_allclose(found.value, [EPSILON, 0.5], rtol=0.02)
+    assert np.all(np.diag(found.covariance) > np.diag(found.random_covariance))
+
+
+def test_rows_of_one_speed_leave_errors_infinite():
+    x, covariance = impacts("viscous", 5, 1)
+    same, errors = np.repeat(x[:1], 5, axis=0), np.repeat(covariance[:1], 5, axis=0)
+    found = regress(loss, LOSS_TERMS["viscous"], same, errors, np.zeros((5, 3, 0)))
+    assert np.all(np.isinf(found.covariance))
+
+
+def test_too_few_rows_are_an_error():
+    x, covariance = impacts("viscous", 1, 1)
+    with pytest.raises(ValueError, match="1 rows cannot determine 2 coefficients"):
+        regress(loss, LOSS_TERMS["viscous"], x, covariance, np.zeros((1, 3, 0)))

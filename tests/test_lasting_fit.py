@@ -1,0 +1,143 @@
+"""Fits of impacts that last: tables of the full contact, made by this program and by another one."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import afm_jax as afm
+from fitting import fit, read_table
+from fitting.examples.make_contact_amplitudes import EXAMPLE, example_drives
+from fitting.law_fit import problem_of
+from fitting.measurement import measurement_of
+from fitting.optimise import Objective
+from fitting.result import FitResult
+from fitting.simulated.simulated_experiment import simulate_experiment
+from fitting.strained import relaxed, strain_of
+from fitting.table import AmplitudeTable
+from tests.contact_experiment import paper_collisions, paper_experiment
+
+PAPER = {"adhesion_energy_j_per_m2": 0.3, "relative_humidity": 0.5, "viscosity_pa_s": 1.005e-3, "modulus_gpa": 100.0}
+SLOWEST, FASTEST = 30.0, 200.0
+
+
+def law_error(result: FitResult) -> float:
+    """Return the worst relative error of the fitted rebound speed against free tips at the paper's contact."""
+    return worst_error(result, lambda speeds: paper_collisions(speeds)[0])
+
+
+def worst_error(result: FitResult, rebound) -> float:
+    speeds = result.law.approach_speed_nm_per_us
+    wanted = (speeds >= SLOWEST) & (speeds <= FASTEST)
+    assert wanted.sum() > 30
+    return float(np.abs(result.law.rebound_speed_nm_per_us[wanted] / rebound(speeds[wanted]) - 1.0).max())
+
+
+def per_degree(result: FitResult) -> float:
+    return result.chi2 / result.degrees_of_freedom
+
+
+@pytest.fixture(scope="module")
+def shared(contact_table_path) -> AmplitudeTable:
+    return read_table(contact_table_path)
+
+
+@pytest.fixture(scope="module")
+def viscous(shared) -> FitResult:
+    return fit(shared, model="viscous+delay")
+
+
+def amplitude_chi2(table: AmplitudeTable) -> tuple[np.ndarray, Any]:
+    """Return the paper's contact's squared residuals (rows, 2), model errors added, and which rows are used."""
+    problem = problem_of(table, "contact")
+    known = PAPER | {"quality_factor": 40.0}
+    values = np.array([known[name] for name in problem.names])
+    stated = Objective(measurement_of(table, problem), problem)
+    objective = relaxed(stated, strain_of(stated, values))
+    used = np.all(np.asarray(objective.measurement.rows.measured)[: table.rows], axis=1)
+    return objective.amplitude_residuals(values)[: table.rows] ** 2, used
+
+
+def test_the_papers_contact_predicts_the_tables_of_two_programs(shared):
+    for table, aside in ((shared, 3), (read_table(EXAMPLE), 3)):
+        square, used = amplitude_chi2(table)
+        assert np.sum(~used) <= aside
+        count = 2.0 * used.sum()
+        # chi2 of as many amplitudes has this width; 1 % of noise, nothing fitted
+        assert abs(square[used].sum() - count) < 4.0 * np.sqrt(2.0 * count)
+
+
+def test_viscous_law_and_delay_read_the_contact_off_the_shared_table(viscous):
+    assert viscous.valid
+    assert law_error(viscous) < 0.0035
+    assert 0.75 < per_degree(viscous) < 1.3
+    low, high = viscous.parameters["epsilon"].interval95
+    assert low is not None
+    assert high is not None
+    # twice the hysteresis over the mass
+    assert low < 2.0 * 55.75 < high
+    speeds = viscous.law.approach_speed_nm_per_us
+    inside = (speeds > SLOWEST) & (speeds < FASTEST)
+    delay = paper_collisions(speeds[inside])[1]
+    # the law of the delay fits to 1 ns
+    np.testing.assert_allclose(viscous.law.collision_delay_us[inside], delay, rtol=0, atol=2e-3)
+
+
+def test_rows_set_aside_are_named(viscous, shared):
+    aside = np.flatnonzero(viscous.rows.set_aside)
+    assert aside.size >= 1
+    (said,) = [warning for warning in viscous.warnings if warning.startswith("Set aside")]
+    for row in aside:
+        assert str(int(shared.lines[row])) in said
+    assert not np.any(viscous.rows.used & viscous.rows.set_aside)
+    assert np.isnan(viscous.rows.residual[aside]).all()
+    assert np.isfinite(viscous.rows.measured_nm[aside]).all()
+    slowest = np.nanmin(viscous.rows.approach_speed_nm_per_us[viscous.rows.used])
+    assert np.nanmax(viscous.rows.approach_speed_nm_per_us[aside]) < 3.0 * slowest
+    used = np.isfinite(viscous.rows.residual).sum()
+    assert viscous.degrees_of_freedom == used - len(viscous.parameters)
+
+
+@pytest.mark.slow
+def test_restitution_and_adhesion_with_delay_come_close(shared):
+    result = fit(shared, model="law+delay")
+    assert law_error(result) < 0.009
+
+
+@pytest.mark.slow
+def test_the_contact_is_read_off_the_shared_table(shared):
+    result = fit(shared, model="contact")
+    assert law_error(result) < 0.0035
+    assert 0.75 < per_degree(result) < 1.3
+    for name, truth in PAPER.items():
+        parameter = result.parameters[name]
+        assert abs(parameter.value - truth) < 4.0 * (parameter.standard_error or 0.0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("model", ["viscous+delay", "contact"])
+def test_without_noise_the_law_is_sharp(model):
+    result = fit(paper_experiment().exact, model=model)
+    assert law_error(result) < 0.0012
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("changes", "quality_factor"), [({"relative_humidity": 0.35}, 40.0), ({"modulus_gpa": 50.0}, 40.0), ({}, 150.0)]
+)
+def test_other_contacts_without_noise(changes, quality_factor):
+    contact = afm.Contact.paper(**changes)
+    made = simulate_experiment(contact, afm.Cantilever(90.0, quality_factor), example_drives())
+    result = fit(made.exact, model="viscous+delay")
+    assert worst_error(result, lambda speeds: afm.collide(contact, speeds).rebound_speed_nm_per_us) < 0.0012
+
+
+@pytest.mark.slow
+def test_contact_parameters_that_do_the_same_are_said_to(shared):
+    """Humidity, temperature and molar volume act through the Kelvin length alone."""
+    free = ("relative_humidity", "temperature_k", "modulus_gpa")
+    result = fit(shared, model="contact", free=free)
+    said = " ".join([*result.reasons, *result.warnings])
+    assert "Not identified" in said or "Determined only together" in said or "is not identified" in said
+    assert "relative_humidity" in said
+    assert "temperature_k" in said

@@ -1,0 +1,144 @@
+"""Orbits of impacts that last: limits, a dense scan in NumPy, close pairs, and following from one to the next."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import afm_jax as afm
+from afm_jax.impact.lasting_closure import LastingProblem
+from afm_jax.impact.lasting_impact import LawImpact
+from afm_jax.impact.lasting_orbits import lasting_amplitudes, lasting_state, near_fold, steady_lasting_orbits
+from afm_jax.impact.lasting_search import find_lasting_roots, follow_lasting_root
+from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from tests.reference_examples import DELAY, scene
+from tests.reference_lasting import closing_impacts, closing_speeds
+from tests.reference_systems import Parameters
+
+DRIVES = [(1, 0.97, 4.0, -1.0), (1, 1.01, 4.0, 1.0), (2, 2.0, 6.0, 0.0), (3, 3.03, 8.0, -0.5), (4, 3.9, 8.0, 1.0)]
+find = jax.jit(find_lasting_roots)
+steady = jax.jit(steady_lasting_orbits)
+follow = jax.jit(follow_lasting_root)
+
+
+def problem_of(p: Parameters, order: int, *, delay: CollisionDelay | None = None) -> LastingProblem:
+    """Return the package's problem of a reference's system."""
+    law = ImpactLaw(p.r, p.epsilon, p.viscous_loss, CollisionDelay(*p.delay) if p.delay else delay)
+    platform = afm.Platform(p.amplitude_nm, p.drive_frequency_khz, p.offset_nm)
+    cantilever = afm.Cantilever(p.frequency_khz, p.quality_factor)
+    return LastingProblem(cantilever, platform, LawImpact(law), jnp.asarray(float(order)))
+
+
+def delayed(order: int, reduced: float, amplitude_nm: float, offset_nm: float) -> tuple[Parameters, int]:
+    law = {"r": 0.9999, "epsilon": 114.0, "viscous_loss": 0.48, "delay": DELAY}
+    return scene(reduced, amplitude_nm=amplitude_nm, offset_nm=offset_nm, **law), order
+
+
+def speeds_found(problem: LastingProblem) -> np.ndarray:
+    """Return the approach speeds of all roots, ascending."""
+    roots = find(problem)
+    speeds = jax.vmap(problem.impact.speeds)(roots.coordinate).approach
+    return np.sort(np.asarray(speeds)[np.asarray(roots.found)])
+
+
+@pytest.mark.parametrize(("order", "reduced", "amplitude_nm", "offset_nm"), DRIVES)
+@pytest.mark.parametrize("law", [(0.9, 60.0, 0.0), (0.95, 0.0, 0.0), (1.0, 60.0, 2.0)])
+def test_without_a_duration_they_are_the_instantaneous_laws(order, reduced, amplitude_nm, offset_nm, law):
+    r, epsilon, viscous_loss = law
+    p = scene(reduced, amplitude_nm=amplitude_nm, offset_nm=offset_nm, r=r, epsilon=epsilon, viscous_loss=viscous_loss)
+    found = steady(problem_of(p, order, delay=CollisionDelay(0.0, 0.0, 0.0)))
+    platform = afm.Platform(amplitude_nm, p.drive_frequency_khz, offset_nm)
+    instantaneous = afm.Scene(afm.Cantilever(90.0, 40.0), platform, ImpactLaw(*law))
+    orbits = afm.single_impact_orbits(instantaneous, order)
+    there = np.asarray(orbits.stable & orbits.admissible)
+    expected = np.stack([orbits.peak_amplitude_nm, orbits.lockin_amplitude_nm], axis=-1)[there]
+    # the closing conditions are written differently: rounding near resonance
+    np.testing.assert_allclose(np.asarray(found.amplitude_nm)[np.asarray(found.steady)], expected, rtol=1e-9)
+
+
+def test_the_drives_of_the_limit_have_orbits():
+    """Without this the test above could compare nothing with nothing."""
+    laws = [(0.9, 60.0, 0.0), (0.95, 0.0, 0.0), (1.0, 60.0, 2.0)]
+    counts = []
+    for order, reduced, amplitude_nm, offset_nm in DRIVES:
+        for r, epsilon, loss in laws:
+            p = scene(reduced, amplitude_nm=amplitude_nm, offset_nm=offset_nm, r=r, epsilon=epsilon, viscous_loss=loss)
+            counts.append(int(jnp.sum(steady(problem_of(p, order, delay=CollisionDelay(0.0, 0.0, 0.0))).steady)))
+    assert np.mean(counts) > 0.5
+
+
+@pytest.mark.parametrize("drive", DRIVES)
+def test_roots_are_those_of_a_dense_scan(drive):
+    p, order = delayed(*drive)
+    # slower ones are about to be captured: no law holds there, and the search leaves some out
+    slowest, fastest = 14.0, 3000.0
+    expected = closing_speeds(p, order, slowest, fastest)
+    found = speeds_found(problem_of(p, order))
+    found = found[(found > slowest) & (found < fastest)]
+    np.testing.assert_allclose(found, expected, rtol=1e-9)
+    assert len(expected) >= 1
+
+
+def test_state_is_the_phase_and_the_impact_of_the_dense_scan():
+    p, order = delayed(*DRIVES[0])
+    problem = problem_of(p, order)
+    orbits = steady(problem)
+    (slot,) = np.flatnonzero(orbits.steady)
+    state = lasting_state(orbits.coordinate[slot], problem)
+    impact = closing_impacts(p, order, np.asarray(state.speeds.approach)[None])
+    assert float(state.speeds.rebound) == pytest.approx(impact.rebound[0], rel=1e-9)
+    assert float(state.speeds.delay) == pytest.approx(impact.delay[0], rel=1e-8)
+    leaving = np.arctan2(impact.sine[0], impact.cosine[0]) / float(problem.platform.angular_frequency)
+    period = float(problem.platform.period_us)
+    assert float(state.flight.start_us) % period == pytest.approx(leaving % period, rel=1e-8)
+    peak, lockin, _ = lasting_amplitudes(orbits.coordinate[slot], problem)
+    # the same program, once batched
+    np.testing.assert_allclose(orbits.amplitude_nm[slot], [peak, lockin], rtol=1e-12)
+
+
+@pytest.mark.parametrize(("order", "reduced", "low", "high"), [(2, 1.96, 1.0, 1.4142), (1, 0.97, 2.0, 2.8284)])
+def test_a_close_pair_is_found(order, reduced, low, high):
+    """The drive is lowered until two roots are about to meet: between neighbours of the search's own scan."""
+    slowest, fastest = 14.0, 3000.0
+    for _ in range(14):
+        middle = 0.5 * (low + high)
+        if len(closing_speeds(delayed(order, reduced, middle, 0.0)[0], order, slowest, fastest)) == 2:
+            high = middle
+        else:
+            low = middle
+    p, _ = delayed(order, reduced, high, 0.0)
+    first, second = closing_speeds(p, order, slowest, fastest)
+    # the search has 70 points to the decade, 3 % apart
+    assert second / first < 1.03
+    found = speeds_found(problem_of(p, order))
+    found = found[(found > slowest) & (found < fastest)]
+    # close to a fold a root is known to the rounding over the distance of the two
+    np.testing.assert_allclose(found, [first, second], rtol=1e-9)
+    # without the second look at turning points nothing would be there
+    assert len(found) == 2
+
+
+@pytest.mark.parametrize("drive", DRIVES[:3])
+def test_following_leads_to_the_root_that_a_search_finds(drive):
+    p, order = delayed(*drive)
+    begin = steady(problem_of(p, order))
+    (slot,) = np.flatnonzero(begin.steady)
+    moved = problem_of(dataclasses.replace(p, epsilon=118.0, quality_factor=39.0), order)
+    followed = follow(begin.coordinate[slot], moved)
+    assert bool(followed.found)
+    roots = find(moved)
+    coordinates = np.asarray(roots.coordinate)[np.asarray(roots.found)]
+    nearest = coordinates[np.argmin(np.abs(coordinates - float(followed.coordinate)))]
+    assert float(followed.coordinate) == pytest.approx(nearest, rel=1e-10)
+    assert float(followed.coordinate) != pytest.approx(float(begin.coordinate[slot]), rel=1e-4)
+    assert not bool(near_fold(followed.coordinate, moved))
+
+
+def test_following_says_where_there_is_nothing():
+    p, order = delayed(*DRIVES[0])
+    begin = steady(problem_of(p, order))
+    (slot,) = np.flatnonzero(begin.steady)
+    # a tenth of the drive: nothing leaves the sample
+    assert not bool(follow(begin.coordinate[slot], problem_of(dataclasses.replace(p, amplitude_nm=0.1), order)).found)

@@ -1,0 +1,241 @@
+"""Readings of traces, compared with closed forms, orbits of the law, and the scatter over seeds of the noise."""
+
+import numpy as np
+import pytest
+
+from fitting import TableError, Trace, lockin
+from fitting.traces.lockin_harmonics import fit_harmonics
+from fitting.traces.lockin_result import LockinResult
+from fitting.traces.lockin_settings import TraceSettings
+from fitting.traces.lockin_verdict import Kind
+from tests.lockin_traces import (
+    bounce,
+    law_motion,
+    noisy_bounce,
+    orbit_heights,
+    trace_of,
+    trace_of_motion,
+)
+from tests.package_scenes import bouncing
+
+SEEDS = 40
+
+
+def phase_apart(result: LockinResult, wanted_deg: float) -> float:
+    """Return the phase's difference from the one wanted, modulo 360/N, in degrees."""
+    assert result.phase_deg is not None
+    assert result.order is not None
+    turn = 360.0 / result.order
+    return float(np.mod(result.phase_deg - wanted_deg + turn / 2.0, turn) - turn / 2.0)
+
+
+def test_harmonics_are_those_of_least_squares():
+    rng = np.random.default_rng(3)
+    angle = np.sort(rng.uniform(0.0, 40.0, 300))
+    height = rng.standard_normal(300)
+    design = np.stack([np.exp(1j * k * angle) for k in range(-5, 6)], axis=1)
+    wanted = np.linalg.lstsq(design, height + 0j, rcond=None)[0]
+    found = fit_harmonics(angle, height, 5)
+    # well-conditioned normal equations of 300 numbers of order 1
+    np.testing.assert_allclose(found.coefficients, wanted[5:], rtol=0.0, atol=1e-12)
+    np.testing.assert_allclose(found(angle), (design @ wanted).real, rtol=0.0, atol=1e-11)
+    weights = found.first_weights(angle)
+    np.testing.assert_allclose(weights @ height, wanted[6], rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("order", [1, 2, 5])
+@pytest.mark.parametrize("rate", [7.31, 50.0])
+def test_a_bounce_in_closed_form(order: int, rate: float):
+    drive = 181.8 * order
+    time = 3.7 + np.arange(0.0, 200.0 * 1e3 / drive, 1.0 / rate)
+    height, value = bounce(time, order=order, drive_khz=drive)
+    result = lockin(trace_of(height, rate=rate, drive_khz=drive, start_us=3.7))
+    assert result.steady, result.verdict
+    assert (result.order, result.impacts_per_period, result.kind) == (order, 1, Kind.STEADY)
+    # a quartic around the top of a cosine misses 3e-5
+    assert result.peak_amplitude_nm == pytest.approx(70.0, rel=3e-5)
+    # the kink's harmonics beyond the fitted ones, falling as 1/k^2
+    assert result.lockin_amplitude_nm == pytest.approx(abs(value), rel=1e-4)
+    assert phase_apart(result, float(np.degrees(np.angle(value)))) == pytest.approx(0.0, abs=0.01)
+
+
+@pytest.mark.parametrize(("reduced", "order"), [(1.01, 1), (2.02, 2), (5.1, 5)])
+def test_orbits_of_the_law_with_damping_and_delay(reduced: float, order: int):
+    scene = bouncing(reduced)
+    drive = float(scene.platform.frequency_khz)
+    time = np.arange(0.0, 120.0 * 1e3 / drive, 1.0 / 9.1)
+    height, row = orbit_heights(scene, order, time)
+    noise = 0.2 * np.random.default_rng(order).standard_normal(time.size)
+    trace = trace_of(height + noise, rate=9.1, drive_khz=drive, quality_factor=40.0, offset_nm=-1.0)
+    result = lockin(trace)
+    assert result.steady, result.verdict
+    assert result.order == order
+    for name in ("peak_amplitude_nm", "lockin_amplitude_nm"):
+        error = getattr(result, name.replace("_nm", "_error_nm"))
+        # four standard errors, which are below 0.1 %
+        assert abs(getattr(result, name) - row[name]) < 4.0 * error
+        assert error < 1e-3 * row[name]
+    assert result.phase_error_deg is not None
+    assert abs(phase_apart(result, row["lockin_phase_deg"])) < 4.0 * result.phase_error_deg
+    assert result.noise_nm == pytest.approx(0.2, rel=0.1)
+
+
+@pytest.mark.parametrize(("periods", "memory"), [(8.0, 0.0), (40.0, 0.7)])
+def test_errors_are_the_scatter_over_seeds(periods: float, memory: float):
+    pulls = []
+    for seed in range(SEEDS):
+        trace, value = noisy_bounce(seed, periods=periods, memory=memory)
+        result = lockin(trace)
+        assert result.steady, result.verdict
+        truths = ((result.peak_amplitude_nm, 70.0, result.peak_amplitude_error_nm),)
+        truths += ((result.lockin_amplitude_nm, abs(value), result.lockin_amplitude_error_nm),)
+        truths += ((phase_apart(result, float(np.degrees(np.angle(value)))), 0.0, result.phase_error_deg),)
+        pulls.append([(found - truth) / error for found, truth, error in truths])  # type: ignore[operator]
+    spread = np.std(pulls, axis=0)
+    # 40 seeds give the scatter to 11 %; errors from few periods scatter themselves, and sampling adds to them
+    assert np.all(spread > 0.7)
+    assert np.all(spread < 1.3)
+    # four standard errors of a mean
+    assert np.all(np.abs(np.mean(pulls, axis=0)) < 4.0 / np.sqrt(SEEDS))
+
+
+@pytest.mark.parametrize(
+    ("reduced", "r", "kind", "impacts", "order"),
+    [
+        (1.7, 0.6, Kind.STEADY, 1, 2),
+        (1.3, 0.6, Kind.PERIOD_MULTIPLIED, 2, 2),
+        (4.3, 0.6, Kind.PERIOD_MULTIPLIED, 2, 8),
+        (1.7, 0.9, Kind.SEVERAL_IMPACTS, 8, 12),
+        (1.3, 0.9, Kind.NOT_PERIODIC, None, None),
+        (3.5, 0.6, Kind.NOT_PERIODIC, None, None),
+    ],
+)
+def test_motions_of_the_law_are_told_apart(
+    reduced: float, r: float, kind: Kind, impacts: int | None, order: int | None
+):
+    scene, run = law_motion(reduced, r)
+    # the simulation's own verdict, from its impacts
+    assert (run.verdict.contacts, run.verdict.periods) == (impacts, order)
+    result = lockin(trace_of_motion(scene, run, periods=150.0, rate=20.0, noise=0.02))
+    assert (result.kind, result.impacts_per_period, result.order) == (kind, impacts, order), result.verdict
+    assert result.steady == (kind is Kind.STEADY)
+    assert (result.peak_amplitude_nm is None) == (kind is Kind.NOT_PERIODIC)
+
+
+def made(shape: str, time: np.ndarray, drive: float) -> np.ndarray:
+    """Return heights of a motion that is no steady orbit."""
+    height, _ = bounce(time, order=1, drive_khz=drive)
+    return {
+        "stuck": 4.0 * np.cos(2e-3 * np.pi * drive * time) - 1.0,
+        "small sine": 0.4 * np.cos(2e-3 * np.pi * drive * time),
+        "nothing": 0.0 * time,
+        "growing": height * (1.0 + 0.05 * time / time[-1]),
+        "lifted": height + 2.0 * time / time[-1],
+        "alternating": height * (1.0 + 0.01 * (-1.0) ** np.floor((time - 1.3) * drive / 1e3 + 0.5)),
+    }[shape]
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind"),
+    [
+        ("stuck", Kind.STUCK),
+        ("small sine", Kind.NO_IMPACT),
+        ("nothing", Kind.NO_RESPONSE),
+        ("growing", Kind.DRIFTING),
+        ("lifted", Kind.DRIFTING),
+        ("alternating", Kind.PERIOD_MULTIPLIED),
+    ],
+)
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_what_is_no_steady_orbit_is_flagged(shape: str, kind: Kind, noise: float):
+    time = np.arange(0.0, 800.0, 0.1)
+    height = made(shape, time, 181.8) + noise * np.random.default_rng(1).standard_normal(time.size)
+    result = lockin(trace_of(height, rate=10.0, drive_khz=181.8))
+    assert result.kind is kind, result.verdict
+    assert not result.steady
+
+
+@pytest.mark.parametrize("share", [2e-4, 1e-2])
+def test_a_wrong_drive_frequency_is_named(share: float):
+    time = np.arange(0.0, 800.0, 0.1)
+    height, _ = bounce(time, order=1, drive_khz=181.8)
+    noisy = height + 0.3 * np.random.default_rng(1).standard_normal(time.size)
+    result = lockin(trace_of(noisy, rate=10.0, drive_khz=181.8 * (1.0 + share)))
+    assert result.kind is Kind.DRIFTING
+    seen = float(result.verdict.partition("seems to be ")[2].split()[0])
+    # the phase over 145 periods fixes the frequency to 1e-5
+    assert seen == pytest.approx(181.8, rel=2e-5)
+
+
+def test_impacts_are_counted_without_the_free_frequency_too():
+    trace, _ = noisy_bounce(0, order=3)
+    blind = lockin(trace_of(trace.deflection_nm, rate=5.3, drive_khz=545.4, free_frequency_khz=None))
+    assert (blind.steady, blind.impacts_per_period, blind.free_frequency_origin) == (True, 1, "trace")
+    # the bending at the top: a second derivative of noisy samples
+    assert blind.free_frequency_khz == pytest.approx(90.0, rel=0.02)
+
+
+@pytest.mark.parametrize("per_period", [27.5, 9.0 + 1.0 / 3.0, 13.0, 6.2])
+@pytest.mark.parametrize("noise", [0.0, 0.5])
+def test_sampling_in_step_with_several_drive_periods_makes_no_subharmonics(per_period: float, noise: float):
+    rate = 0.1818 * per_period
+    time = np.arange(int(60 * per_period)) / rate
+    height, _ = bounce(time, order=1, drive_khz=181.8)
+    height = height + noise * np.random.default_rng(2).standard_normal(time.size)
+    result = lockin(trace_of(height, rate=rate, drive_khz=181.8))
+    assert (result.kind, result.order) == (Kind.STEADY, 1), result.verdict
+
+
+def test_few_phases_in_step_with_the_drive_are_stated_as_an_error():
+    time = np.arange(0.0, 40.0 * 1e3 / 181.8 - 1e-9, 1e3 / 181.8 / 8.0)
+    height, value = bounce(time, order=1, drive_khz=181.8)
+    result = lockin(trace_of(height, rate=8.0 * 0.1818, drive_khz=181.8))
+    assert result.steady
+    assert result.lockin_amplitude_nm is not None
+    assert result.lockin_amplitude_error_nm is not None
+    off = abs(result.lockin_amplitude_nm - abs(value))
+    # aliasing is a bias: the stated error covers it, and is not ten times too large
+    assert 0.05 * result.lockin_amplitude_error_nm < off < result.lockin_amplitude_error_nm
+    assert any("distinct phases" in warning for warning in result.warnings)
+
+
+def test_the_reference_column_and_the_drive_phase_shift_the_phase():
+    time = np.arange(0.0, 400.0, 0.1)
+    height, value = bounce(time, order=2, drive_khz=363.6)
+    wanted = float(np.degrees(np.angle(value))) - 50.0 / 2.0
+    optional = lockin(trace_of(height, rate=10.0, drive_khz=363.6, drive_phase_deg=50.0))
+    assert optional.phase_reference == "drive_phase_deg"
+    noise = 0.1 * np.random.default_rng(4).standard_normal(time.size)
+    platform = -1.0 + 4.0 * np.cos(2e-3 * np.pi * 363.6 * time + np.deg2rad(50.0)) + noise
+    settings = TraceSettings(drive_frequency_khz=363.6)
+    column = Trace(
+        deflection_nm=height, start_us=0.0, step_us=0.1, settings=settings, platform=platform, platform_in_nm=True
+    )
+    seen = lockin(column)
+    assert seen.phase_reference == "column"
+    assert seen.phase_error_deg is not None
+    assert optional.phase_error_deg is not None
+    # noise of the reference: 0.1 sqrt(2/4000)/4 rad, halved by the order, beside what the deflection's sampling leaves
+    added = np.sqrt(seen.phase_error_deg**2 - optional.phase_error_deg**2)
+    assert added == pytest.approx(np.degrees(0.1 * np.sqrt(2.0 / 4000.0) / 4.0) / 2.0, rel=0.1)
+    assert abs(phase_apart(seen, wanted)) < 4.0 * seen.phase_error_deg
+    assert phase_apart(optional, wanted) == pytest.approx(0.0, abs=0.01)
+    assert (seen.drive_amplitude_nm, seen.offset_nm) == (pytest.approx(4.0, rel=0.01), pytest.approx(-1.0, rel=0.01))
+    slipping = Trace(
+        deflection_nm=height,
+        start_us=0.0,
+        step_us=0.1,
+        settings=settings,
+        platform=np.cos(2e-3 * np.pi * 364.0 * time),
+    )
+    with pytest.raises(TableError, match=r"it has 364\.0.* kHz, but drive_frequency_khz is 363\.6"):
+        lockin(slipping)
+
+
+def test_an_expected_order():
+    trace, _ = noisy_bounce(0, order=2)
+    assert lockin(trace, order=2).steady
+    other = lockin(trace, order=1)
+    assert (other.kind, other.steady) == (Kind.OTHER_ORDER, False)
+    with pytest.raises(TableError, match="too short for two response periods of order 40"):
+        lockin(trace, order=40)

@@ -1,0 +1,154 @@
+"""`afm-jax lockin`: what it prints, writes and returns."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from matplotlib.image import imread
+
+from afm_jax.cli.main import main
+from fitting import read_table
+from tests.lockin_traces import bounce
+
+COMMENTS = "# free_frequency_khz = 90\n# quality_factor = 40 +- 2\n# drive_amplitude_nm = 4\n# offset_nm = -1\n"
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(main, ["lockin", *(str(argument) for argument in arguments)])
+
+
+def strictly(text: str) -> Any:
+    """Return the one JSON object of a text; NaN and Infinity, which JSON does not have, are refused."""
+
+    def refuse(constant: str):
+        raise AssertionError(constant)
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def written(path: Path, *, order: int, wobble: float = 0.0, comments: str = COMMENTS) -> tuple[Path, complex]:
+    """Write a noisy bounce whose alternate periods differ by `wobble`; return its path and lock-in value."""
+    drive = 181.8 * order
+    time = np.arange(0.0, 80.0 * 1e3 / 181.8, 0.1)
+    height, value = bounce(time, order=order, drive_khz=drive)
+    height = height * (1.0 + wobble * (-1.0) ** np.floor((time - 1.3) * 0.1818 + 0.5))
+    height = height + 0.3 * np.random.default_rng(order).standard_normal(time.size)
+    platform = -1.0 + 4.0 * np.cos(2e-3 * np.pi * drive * time)
+    head = f"{comments}# drive_frequency_khz = {drive!r}\ntime_us,deflection_nm,platform_nm\n"
+    rows = (f"{t:.1f},{z:.6f},{p:.6f}" for t, z, p in zip(time, height, platform, strict=True))
+    path.write_text(head + "\n".join(rows) + "\n", encoding="utf-8")
+    return path, value
+
+
+@pytest.fixture(scope="module")
+def reported(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("traces")
+    first, one = written(folder / "first.csv", order=1)
+    third, three = written(folder / "third.csv", order=3)
+    doubled, _ = written(folder / "doubled.csv", order=1, wobble=0.02)
+    out = folder / "out"
+    return run(third, doubled, first, "--json", "--out", out), out, {"first": one, "third": three}
+
+
+def test_json_of_several_traces(reported):
+    result, _, values = reported
+    assert result.exit_code == 3
+    answer = strictly(result.stdout)
+    assert answer["steady"] == 2
+    assert answer["table_reason"] is None
+    third, doubled, first = answer["traces"]
+    assert [trace["order"] for trace in (first, third)] == [1, 3]
+    assert (doubled["steady"], doubled["kind"], doubled["impacts_per_period"]) == (False, "period_multiplied", 2)
+    for trace, name in ((first, "first"), (third, "third")):
+        assert trace["steady"] is True
+        assert trace["source"].endswith(f"{name}.csv")
+        assert trace["impacts_per_period"] == 1
+        error = trace["lockin_amplitude_error_nm"]
+        assert abs(trace["lockin_amplitude_nm"] - abs(values[name])) < 4.0 * error
+        assert abs(trace["peak_amplitude_nm"] - 70.0) < 4.0 * trace["peak_amplitude_error_nm"]
+        assert trace["phase_reference"] == "column"
+
+
+def test_flagged_traces_are_named_on_standard_error(reported):
+    result, _, _ = reported
+    last = result.stderr.strip().splitlines()[-1]
+    assert last.startswith("afm-jax: not valid: ")
+    assert "doubled.csv: a (2,2) orbit: the period of a (1,1) orbit doubled" in last
+
+
+def test_the_table_is_one_that_the_fitter_reads(reported):
+    result, out, values = reported
+    table = read_table(out / "amplitudes.csv")
+    assert table.order.tolist() == [1, 3]
+    assert (table.free_frequency_khz, table.quality_factor, table.quality_factor_error) == (90.0, 40.0, 2.0)
+    np.testing.assert_array_equal(table.drive_frequency_khz, [181.8, 181.8 * 3])
+    np.testing.assert_array_equal(table.drive_amplitude_nm, 4.0)
+    np.testing.assert_array_equal(table.offset_nm, -1.0)
+    assert table.lockin_amplitude_nm is not None
+    assert table.lockin_amplitude_error_nm is not None
+    wanted = [abs(values["first"]), abs(values["third"])]
+    assert np.all(np.abs(table.lockin_amplitude_nm - wanted) < 4.0 * table.lockin_amplitude_error_nm)
+    assert table.phase_deg is not None
+    read = {trace["order"]: trace["phase_deg"] for trace in strictly(result.stdout)["traces"] if trace["steady"]}
+    np.testing.assert_array_equal(table.phase_deg, [read[1], read[3]])
+
+
+def test_pictures_show_periods_and_spectrum(reported):
+    result, out, _ = reported
+    names = {"lockin.json", "amplitudes.csv", "lockin_first.png", "lockin_third.png", "lockin_doubled.png"}
+    assert {path.name for path in out.iterdir()} == names
+    assert strictly((out / "lockin.json").read_text(encoding="utf-8")) == strictly(result.stdout)
+    pixels = imread(out / "lockin_third.png")[..., :3]
+    _, width, _ = pixels.shape
+    black = np.all(pixels < 0.05, axis=2)
+    orange = np.all(np.abs(pixels - np.array([0xB3, 0x47, 0x00]) / 255.0) < 0.05, axis=2)
+    # the mean waveform on the left, the spectrum's line on the right
+    assert orange[:, : width // 2].sum() > 500
+    assert black[:, width // 2 :].sum() > 2000
+
+
+def test_text_says_the_verdict_first(tmp_path):
+    path, _ = written(tmp_path / "first.csv", order=1)
+    result = run(path)
+    assert result.exit_code == 0, result.stderr
+    assert result.stdout.startswith(f"{path}: STEADY: a steady (1,1) orbit")
+    assert "lock-in amplitude" in result.stdout
+
+
+def test_a_table_needs_what_the_fitter_needs(tmp_path):
+    path, _ = written(tmp_path / "bare.csv", order=1, comments="")
+    result = run(path, "--out", tmp_path / "out")
+    assert result.exit_code == 0
+    assert "no amplitudes.csv" in result.stderr
+    assert "free_frequency_khz is not known" in result.stderr
+    assert not (tmp_path / "out" / "amplitudes.csv").exists()
+    # drive and offset come from the platform's column
+    assert run(path, "--out", tmp_path / "out", "--free-frequency-khz", 90).exit_code == 0
+    table = read_table(tmp_path / "out" / "amplitudes.csv")
+    assert table.drive_amplitude_nm[0] == pytest.approx(4.0, rel=1e-6)
+    assert table.offset_nm[0] == pytest.approx(-1.0, rel=1e-6)
+    twice = run(path, path, "--free-frequency-khz", 90, "--json")
+    assert "repeats row 1" in strictly(twice.stdout)["table_reason"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--drive-frequency-khz", "-3"], "drive_frequency_khz must be finite and above 0"),
+        (["--drive-frequency-khz", "4000"], "samples per drive period, but 4 are needed"),
+        (["--group", "scan"], "is no HDF5 file and has no groups"),
+        (["--order", "0"], "0 is not in the range 1<=x<=16"),
+        (["--sampling-rate-mhz", "5"], "remove one"),
+        (["--drive-frequency-khz", "190"], "the reference column"),
+    ],
+)
+def test_wrong_calls_end_with_one_line_and_exit_code_2(tmp_path, arguments, said):
+    path, _ = written(tmp_path / "first.csv", order=1)
+    result = run(path, *arguments)
+    assert result.exit_code == 2
+    assert result.stdout == ""
+    assert len(result.stderr.strip().splitlines()) == 1
+    assert said in result.stderr

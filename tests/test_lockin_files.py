@@ -1,0 +1,179 @@
+"""Traces from files: CSV and HDF5, settings in them and beside them, and what is wrong with them."""
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fitting import TableError, read_trace
+from fitting.traces.lockin_settings import TraceSettings
+from fitting.traces.lockin_trace import Trace
+from tests.lockin_traces import bounce
+
+DRIVE = 181.8
+COMMENTS = "# drive_frequency_khz = 181.8\n# quality_factor = 40 +- 2\n# Tuesday's tip\n"
+
+
+def samples(count: int = 300, rate: float = 10.0) -> tuple[np.ndarray, np.ndarray]:
+    time = 2.0 + np.arange(count) / rate
+    return time, bounce(time, order=1, drive_khz=DRIVE)[0]
+
+
+def csv_text(columns: dict[str, np.ndarray], comments: str = COMMENTS) -> str:
+    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    return comments + "\n".join([",".join(columns), *(",".join(map(repr, row)) for row in rows)]) + "\n"
+
+
+def saved(folder: Path, text: str, name: str = "trace.csv") -> Path:
+    path = folder / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_a_csv_file_is_read_back(tmp_path: Path):
+    time, height = samples()
+    platform = 4.0 * np.cos(time)
+    columns = {"time_us": time, "note": np.zeros(300), "deflection_nm": height, "platform_nm": platform}
+    trace = read_trace(saved(tmp_path, csv_text(columns)))
+    np.testing.assert_array_equal(trace.deflection_nm, height)
+    np.testing.assert_array_equal(trace.platform, platform)
+    assert trace.platform_in_nm
+    assert trace.start_us == time[0]
+    # rounding of the printed times
+    assert trace.step_us == pytest.approx(0.1, rel=1e-12)
+    assert (trace.settings.quality_factor, trace.settings.quality_factor_error) == (40.0, 2.0)
+    assert trace.remarks == ("Tuesday's tip",)
+    assert trace.drive_periods == pytest.approx(300 * 0.1 * 0.1818, rel=1e-12)
+
+
+def test_options_stand_in_front_of_comments(tmp_path: Path):
+    _, height = samples()
+    path = saved(tmp_path, csv_text({"position_nm": height}, COMMENTS + "# sampling_rate_mhz = 10\n"))
+    assert read_trace(path).step_us == 0.1
+    trace = read_trace(path, sampling_rate_mhz=20.0, drive_frequency_khz=150.0, quality_factor=30.0, rest_nm=2.0)
+    assert (trace.start_us, trace.step_us, trace.drive_frequency_khz) == (0.0, 0.05, 150.0)
+    # an error of another quality factor says nothing of this one
+    assert (trace.settings.quality_factor, trace.settings.quality_factor_error) == (30.0, None)
+    np.testing.assert_array_equal(trace.height_nm, height - 2.0)
+    with pytest.raises(TypeError, match="there is no setting `drive_khz`"):
+        read_trace(path, drive_khz=1.0)
+
+
+def test_printed_times_may_be_rounded(tmp_path: Path):
+    time = np.round(np.arange(300) * 0.0937, 2)
+    trace = read_trace(saved(tmp_path, csv_text({"time_us": time, "deflection_nm": samples()[1]})))
+    # 0.005 us over 299 steps
+    assert trace.step_us == pytest.approx(0.0937, rel=4e-4)
+
+
+@pytest.mark.parametrize("group", [None, "scan/forward"])
+def test_an_hdf5_file_says_the_same_as_a_csv_file(tmp_path: Path, group: str | None):
+    h5py = pytest.importorskip("h5py")
+    time, height = samples()
+    text = csv_text({"time_us": time, "deflection_nm": height}, "# drive_frequency_khz = 181.8\n# offset_nm = -1\n")
+    wanted = read_trace(saved(tmp_path, text))
+    path = tmp_path / "trace.bin"
+    with h5py.File(path, "w") as file:
+        place = file if group is None else file.create_group(group)
+        file.attrs["drive_frequency_khz"] = 181.8
+        file.attrs["operator"] = "E. Rutherford"
+        place["time_us"] = time
+        place["deflection_nm"] = height.astype(np.float32)
+        place["deflection_nm"].attrs["offset_nm"] = -1
+        place["image"] = np.zeros((3, 3))
+    trace = read_trace(path, group=group)
+    assert trace.settings == wanted.settings
+    assert (trace.start_us, trace.step_us) == (wanted.start_us, wanted.step_us)
+    np.testing.assert_array_equal(trace.deflection_nm, height.astype(np.float32).astype(np.float64))
+
+
+@pytest.mark.parametrize(
+    ("group", "said"),
+    [
+        (None, "there is no data set deflection_nm here; name its group: --group scan"),
+        ("scam", "there is no group 'scam'; the groups are scan"),
+        ("scan", "column deflection_nm: the data set has shape (2, 3)"),
+    ],
+)
+def test_faults_of_hdf5_files(tmp_path: Path, group: str | None, said: str):
+    h5py = pytest.importorskip("h5py")
+    path = tmp_path / "trace.h5"
+    with h5py.File(path, "w") as file:
+        file.create_group("scan")["deflection_nm"] = np.zeros((2, 3))
+    with pytest.raises(TableError) as caught:
+        read_trace(path, group=group, drive_frequency_khz=1.0, sampling_rate_mhz=1.0)
+    assert said in str(caught.value)
+    damaged = tmp_path / "damaged.h5"
+    damaged.write_bytes(path.read_bytes()[:100])
+    with pytest.raises(TableError, match="cannot be read as HDF5"):
+        read_trace(damaged)
+
+
+def test_hdf5_without_its_package_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    path = tmp_path / "trace.h5"
+    path.write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(TableError, match="needs the package h5py; install it with: pip install h5py"):
+        read_trace(path)
+
+
+def with_time(time: np.ndarray, comments: str = "# drive_frequency_khz = 181.8\n") -> str:
+    return csv_text({"time_us": time, "deflection_nm": np.sin(time)}, comments)
+
+
+GOOD = np.arange(200) * 0.1
+ROWS = "time_us,deflection_nm\n0,1\n0.1,{}\n0.2,3\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("", "there are no samples"),
+        ("# drive_frequency_khz = 180\n", "there are no samples"),
+        ("time_us,deflection_nm\n", "line 1: there are column names but no rows below them"),
+        ("0,1\n1,2\n", "the first row holds numbers; put a row of column names above it"),
+        ("time_us,height\n0,1\n", "line 1: the column deflection_nm is missing (there are 'time_us', 'height')"),
+        ("time_us,deflection\n0,1\n", "unknown column 'deflection'; did you mean deflection_nm?"),
+        ("time_s,deflection_nm\n0,1\n", "unknown column 'time_s'; did you mean time_us?"),
+        ("deflection_nm,position_nm\n0,1\n", "column position_nm: says again what another column says"),
+        (ROWS.format("x"), "line 3, column deflection_nm: 'x' is not a number"),
+        (ROWS.format("nan"), "line 3, column deflection_nm"),
+        (ROWS.format("1e999"), "line 3, column deflection_nm: must be finite"),
+        (ROWS.format("1,2"), "line 3: there are 3 cells for 2 columns"),
+        (ROWS.format(""), "line 3, column deflection_nm: is blank"),
+        ("deflection_nm\n1\n2\n", "the sampling rate is missing"),
+        (with_time(GOOD, ""), "the drive frequency is missing"),
+        (with_time(np.delete(GOOD, 77)), "line 80, column time_us: the time steps are not equal: 0.2 us here"),
+        (with_time(GOOD[::-1]), "column time_us: the time steps are not equal"),
+        (
+            with_time(GOOD, "# drive_frequency_khz = 2600\n"),
+            "there are 3.85 samples per drive period, but 4 are needed",
+        ),
+        (with_time(GOOD[:100]), "the trace spans 1.82 drive periods, too short for two response periods"),
+        (with_time(GOOD, "# drive_frequency_khz = 181.8\n# sampling_rate_mhz = 5\n"), "remove one"),
+        (with_time(GOOD, "# drive_frequency_khz = 0\n"), "drive_frequency_khz must be finite and above 0, but is 0.0"),
+        (with_time(GOOD, "# drive_frequency_khz = 181,8\n"), "write the decimal comma as a point"),
+        (with_time(GOOD, "# drive_frequency_hz = 181800\n"), "the key is drive_frequency_khz"),
+        (with_time(GOOD, "# offset_nm = 1\n# offset_nm = 2\n"), "line 2: offset_nm is given a second time"),
+        (with_time(GOOD, "# offset_nm = 1 +- 2\n"), "offset_nm takes no such error"),
+    ],
+)
+def test_faults_are_one_line(tmp_path: Path, text: str, said: str):
+    path = saved(tmp_path, text)
+    with pytest.raises(TableError) as caught:
+        read_trace(path)
+    message = str(caught.value)
+    assert message.startswith(str(path))
+    assert said in message
+    assert "\n" not in message
+
+
+def test_a_trace_in_memory_is_checked_too():
+    with pytest.raises(TableError, match=r"sample 3, column deflection_nm: must be finite"):
+        Trace(
+            deflection_nm=np.array([0.0, 1.0, np.nan]),
+            start_us=0.0,
+            step_us=0.1,
+            settings=TraceSettings(drive_frequency_khz=DRIVE),
+        )

@@ -1,0 +1,215 @@
+"""The posterior against quadrature of another program's amplitudes and importance sampling; NUTS against the grid."""
+
+import dataclasses
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from afm_jax.impact.law import ImpactLaw
+from fitting import fit, posterior, read_table
+from fitting.models import Problem
+from fitting.sampling.posterior_grid import grid_posterior
+from fitting.sampling.posterior_nuts import log_density_of
+from fitting.sampling.posterior_result import PosteriorChains, posterior_of_chains
+from fitting.sampling.posterior_space import space_around
+from fitting.sampling.refit import objective_of, standard_covariance
+from tests.fit_tables import EXAMPLE, amplitudes_and_errors, rows, simulated, standard_errors_of, values_of
+from tests.fit_tables import steady_amplitudes as amplitudes_of
+
+pytestmark = pytest.mark.slow
+"""Each compiles programs of its own for a minute or more."""
+
+EVERY_FOURTH = slice(0, None, 4)
+
+
+@pytest.fixture(scope="module")
+def exact_q():
+    """A table of a law without adhesion, its quality factor exactly known."""
+    example = read_table(EXAMPLE)
+    table = simulated(rows(example, EVERY_FOURTH), ImpactLaw(0.95, 0.0), seed=8)
+    return dataclasses.replace(table, quality_factor=40.0, quality_factor_error=None)
+
+
+@pytest.fixture(scope="module")
+def law():
+    example = read_table(EXAMPLE)
+    return fit(simulated(rows(example, EVERY_FOURTH), ImpactLaw(0.95, 60.0), seed=8), "law")
+
+
+@pytest.fixture(scope="module")
+def law_grid(law):
+    return posterior(law)
+
+
+def test_one_parameter_agrees_with_quadrature(exact_q):
+    result = fit(exact_q, "restitution")
+    found = posterior(result)
+    amplitude, error = amplitudes_and_errors(exact_q)
+
+    def density(r):
+        predicted = amplitudes_of(exact_q, ImpactLaw(r, 0.0))
+        return np.exp(-0.5 * (np.sum(((predicted - amplitude) / error) ** 2) - result.chi2))
+
+    sigma = result.parameters["r"].standard_error
+    assert sigma is not None
+    middle = result.parameters["r"].value
+    ends = middle - 7.0 * sigma, middle + 7.0 * sigma
+    total = quad(density, *ends, epsrel=1e-8)[0]
+    mean = quad(lambda r: r * density(r), *ends, epsrel=1e-8)[0] / total
+    variance = quad(lambda r: (r - mean) ** 2 * density(r), *ends, epsrel=1e-8)[0] / total
+    # a trapezoidal sum with four points a standard deviation is exact for what is nearly Gaussian
+    assert found.mean["r"] == pytest.approx(mean, abs=1e-4 * sigma)
+    assert found.standard_deviation["r"] == pytest.approx(np.sqrt(variance), rel=1e-4)
+    for end, share in zip(found.interval95["r"], (0.025, 0.975), strict=True):
+        # monotone cubic interpolation of the density between the points
+        assert quad(density, ends[0], end, epsrel=1e-8)[0] / total == pytest.approx(share, abs=3e-4)
+
+
+def test_a_loss_that_vanishes_has_a_one_sided_density(exact_q):
+    result = fit(exact_q, "law")
+    found = posterior(result)
+    assert found.grid is not None
+    assert found.grid.axes[1][0] == 0.0
+    assert found.interval95["epsilon"][0] > 0.0
+    assert found.mean["epsilon"] > 0.0
+    with pytest.raises(ValueError, match="epsilon may be at its bound"):
+        posterior(result, log_uniform=["epsilon"])
+
+
+def test_the_density_is_normalised_and_close_to_the_fisher_information(law, law_grid):
+    grid = law_grid.grid
+    inner = np.trapezoid(grid.density, grid.axes[1], axis=1)
+    assert np.trapezoid(inner, grid.axes[0]) == pytest.approx(1.0, rel=1e-12)
+    deviations = [law_grid.standard_deviation[name] for name in law.parameters]
+    # the problem is nearly linear: 1 % of noise
+    assert deviations == pytest.approx(standard_errors_of(law), rel=0.03)
+    # flat priors: the profile interval and the credible one say nearly the same
+    for name, parameter in law.parameters.items():
+        assert law_grid.interval95[name] == pytest.approx(parameter.interval95, abs=0.1 * parameter.standard_error)
+
+
+def test_nuisances_integrated_out_agree_with_importance_sampling(law, law_grid):
+    refit = objective_of(law)
+    mean, deviation = importance_sampling(refit, 4000)
+    for k, name in enumerate(law.parameters):
+        # 4000 draws: a mean to 0.016 deviations, a width to 1.1 %; four times that
+        assert law_grid.mean[name] == pytest.approx(mean[k], abs=0.065 * deviation[k])
+        assert law_grid.standard_deviation[name] == pytest.approx(deviation[k], rel=0.045)
+
+
+def importance_sampling(refit, draws: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return mean and standard deviation of the posterior by weighting draws of a wider Gaussian."""
+    cholesky = np.linalg.cholesky(1.3 * standard_covariance(refit))
+    z = np.random.default_rng(12).normal(size=(draws, len(refit.values)))
+    values = refit.values + z @ cholesky.T
+    chi2 = np.sum(refit.objective.residual(values) ** 2, axis=1)
+    log_weight = -0.5 * chi2 + 0.5 * np.sum(z**2, axis=1)
+    weight = np.exp(log_weight - log_weight.max())
+    weight /= weight.sum()
+    assert 1.0 / np.sum(weight**2) > 0.5 * draws
+    mean = weight @ values
+    return mean, np.sqrt(weight @ (values - mean) ** 2)
+
+
+def test_a_prior_flat_in_the_logarithm_shifts_the_mean_by_what_it_must(law, law_grid):
+    found = grid_posterior(objective_of(law), ("epsilon",))
+    deviation, mean = law_grid.standard_deviation["epsilon"], law_grid.mean["epsilon"]
+    # a Gaussian times 1/x: the mean moves by -variance/mean to first order, the next one being its square
+    shift = -(deviation**2) / mean
+    assert found.mean["epsilon"] - mean == pytest.approx(shift, rel=0.05)
+
+
+@pytest.fixture(scope="module")
+def space(law):
+    refit = objective_of(law)
+    return space_around(refit.objective.problem, refit.values, standard_covariance(refit), ())
+
+
+def test_the_samplers_density_is_the_objectives(law, space):
+    refit = objective_of(law)
+    log_density = log_density_of(refit, space)
+    here, there = np.array([0.3, -0.4, 0.2]), np.array([-0.6, 0.5, 0.1])
+    values, priors = zip(*(space.values_and_log_prior(jnp.asarray(z)) for z in (here, there)), strict=True)
+    chi2 = np.sum(refit.objective.residual(np.array(values)) ** 2, axis=1)
+    expected = -0.5 * (chi2[0] - chi2[1]) + float(priors[0] - priors[1])
+    found = float(log_density(jnp.asarray(here)) - log_density(jnp.asarray(there)))
+    # the same sums in another order
+    assert found == pytest.approx(expected, rel=1e-9)
+
+
+def test_the_prior_is_the_derivative_of_the_values(space):
+    z, step = np.array([0.3, -0.4, 0.2]), 1e-5
+    shifts = step * np.eye(3)
+    moved = [
+        [np.asarray(space.values_and_log_prior(jnp.asarray(z + sign * e))[0]) for e in shifts] for sign in (1.0, -1.0)
+    ]
+    jacobian = (np.array(moved[0]) - np.array(moved[1])) / (2.0 * step)
+    _, log_prior = space.values_and_log_prior(jnp.asarray(z))
+    # up to the constant determinant of axes and errors; central differences to 1e-10
+    constant = np.linalg.slogdet(space.axes)[1] + np.sum(np.log(space.errors))
+    assert np.linalg.slogdet(jacobian)[1] - constant == pytest.approx(float(log_prior), abs=1e-6)
+
+
+def test_the_space_starts_at_the_fit_with_steps_of_its_errors(law, space):
+    origin, _ = space.values_and_log_prior(jnp.zeros(3))
+    assert np.asarray(origin) == pytest.approx(values_of(law), rel=1e-12)
+    z = 0.01 * np.random.default_rng(3).normal(size=(400, 3))
+    values = np.array([space.values_and_log_prior(jnp.asarray(point))[0] for point in z])
+    scatter = np.corrcoef(values.T)
+    # 400 draws of a correlation: 0.05 each
+    assert scatter == pytest.approx(law.correlations, abs=0.2)
+
+
+def test_chains_that_disagree_are_not_believed():
+    random = np.random.default_rng(1)
+    samples = random.normal(size=(4, 100, 1))
+    fine = PosteriorChains(samples, np.array([1.001]), np.array([380.0]), 0, 0)
+    assert posterior_of_chains(fine, ("r",), ()).converged
+    for bad in (
+        dataclasses.replace(fine, r_hat=np.array([1.05])),
+        dataclasses.replace(fine, r_hat=np.array([np.nan])),
+        dataclasses.replace(fine, effective_samples=np.array([20.0])),
+        dataclasses.replace(fine, divergences=20),
+    ):
+        found = posterior_of_chains(bad, ("r",), ())
+        assert not found.converged
+        assert len(found.reasons) == 1
+
+
+def test_wrong_calls_are_refused_in_one_line(law, monkeypatch):
+    with pytest.raises(ValueError, match="`log_uniform` must name losses"):
+        posterior(law, log_uniform=["quality_factor"])
+    with pytest.raises(ValueError, match="`samples` must be at least"):
+        posterior(law, method="nuts", samples=10)
+    refit = objective_of(law)
+    refit.objective.problem = Problem("viscous+delay", ("epsilon", "viscous_loss", "delay_hertz"))
+    with pytest.raises(ValueError, match="a grid takes one or two parameters"):
+        grid_posterior(refit)
+    monkeypatch.setitem(sys.modules, "blackjax", None)
+    with pytest.raises(ImportError, match="pip install blackjax"):
+        posterior(law, method="nuts")
+
+
+def test_everything_goes_to_json(law_grid):
+    plain = law_grid.to_dict()
+    assert plain["method"] == "grid"
+    assert plain["parameters"]["epsilon"]["mean"] == law_grid.mean["epsilon"]
+    assert len(plain["grid"]["axes"]["r"]) == len(plain["grid"]["density"])
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_nuts_agrees_with_the_grid(law, law_grid):
+    pytest.importorskip("blackjax", reason="NUTS needs blackjax")
+    found = posterior(law, method="nuts", samples=500)
+    assert found.converged, found.reasons
+    assert found.chains is not None
+    for k, name in enumerate(law.parameters):
+        # four standard errors of a mean and of a width of this many independent samples
+        count = found.chains.effective_samples[k]
+        deviation = law_grid.standard_deviation[name]
+        assert found.mean[name] == pytest.approx(law_grid.mean[name], abs=4.0 * deviation / np.sqrt(count))
+        assert found.standard_deviation[name] == pytest.approx(deviation, rel=4.0 / np.sqrt(2.0 * count))

@@ -1,0 +1,301 @@
+"""The HTML report: valid, self-contained, honest on its first screen, complete below."""
+
+import base64
+import dataclasses
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from matplotlib.figure import Figure
+
+from afm_jax.cli.main import main
+from fitting.report import summary, write_report
+from fitting.reporting.report_band import band_width
+from fitting.reporting.report_html import fit_page
+from fitting.reporting.report_html_opening import goodness_in_words
+from fitting.reporting.report_plot import fit_figure, law_figure
+from fitting.result import FitResult
+from tests.html_pages import first_screen, formulas, read_page, section_of, table_of, words_of
+from tests.made_fits import SPEEDS, VALUES, made_fit, made_parameter, made_table
+
+
+@dataclasses.dataclass(frozen=True)
+class Models:
+    """A comparison as `fitting` makes them: rows and a verdict."""
+
+    rows: list[dict[str, Any]]
+    verdict: str
+
+
+@dataclasses.dataclass(frozen=True)
+class Samples:
+    """A bootstrap or posterior: whatever `to_dict` says."""
+
+    found: dict[str, Any]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what was found."""
+        return self.found
+
+
+PIXEL = base64.b64decode(
+    "iVBORw0KGgoAAAANSUhEUgAAAAEAAAABCAYAAAAfFcSJAAAADUlEQVR42mNkYPhfDwAChwGA60e6kgAAAABJRU5ErkJggg=="
+)
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Pages without their pictures' points, which take seconds to draw; the figures are made all the same."""
+    monkeypatch.setattr(Figure, "savefig", lambda _figure, file, **_options: file.write(PIXEL))
+
+
+def not_valid(model: str) -> FitResult:
+    """Return a fit that explains nothing: no errors, no band."""
+    fit = made_fit(model, valid=False, reasons=["The model does not explain the data: a < b."], p_value=0.0, chi2=9e4)
+    unknown = {"standard_error": None, "interval95": (None, None), "interval_reason": "the model does not explain"}
+    blank = np.full_like(fit.law.approach_speed_nm_per_us, np.nan)
+    bands = ("rebound_low_nm_per_us", "rebound_high_nm_per_us", "delay_low_us", "delay_high_us")
+    return dataclasses.replace(
+        fit,
+        parameters={name: made_parameter(name, value, **unknown) for name, value in VALUES[model].items()},
+        law=dataclasses.replace(fit.law, **dict.fromkeys(bands, blank)),
+        correlations=np.full_like(fit.correlations, np.nan),
+    )
+
+
+def with_odd_rows() -> FitResult:
+    """Return a fit whose rows are each odd in another way."""
+    blank = np.array([50.0, 90.0, 140.0, np.nan])
+    lockin = 0.4 * blank
+    table = made_table(
+        peak_amplitude_nm=blank,
+        peak_amplitude_error_nm=0.01 * blank,
+        lockin_amplitude_nm=lockin,
+        lockin_amplitude_error_nm=0.01 * lockin,
+        no_orbit=np.array([0.0, 0.0, 0.0, 1.0]),
+    )
+    fit = made_fit("law+delay", table=table)
+    rows = dataclasses.replace(
+        fit.rows,
+        set_aside=np.array([True, False, False, False]),
+        used=np.array([False, True, True, False]),
+        residual=np.array([[np.nan, np.nan], [4.5, 0.1], [0.2, -0.3], [np.nan, np.nan]]),
+        orbits=np.array([1, 2, 0, 1]),
+        near_fold=np.array([False, True, False, False]),
+        approach_speed_nm_per_us=np.array([9.0, 40.0, np.nan, 95.0]),
+    )
+    return dataclasses.replace(fit, rows=rows)
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("model", VALUES)
+@pytest.mark.parametrize("valid", [True, False])
+def test_every_kind_of_fit_is_a_valid_page(model, valid):
+    fit = made_fit(model) if valid else not_valid(model)
+    root = read_page(fit_page(fit))
+    seen = first_screen(root)
+    assert ("NOT VALID" in seen) is not valid
+    assert ("You can believe it" in seen) is valid
+    assert valid or "a < b" in seen
+    assert ("no band can be given" in seen) is not valid
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("model", [name for name in VALUES if name != "contact"])
+@pytest.mark.parametrize("width", [1e-3, 1e-6])
+def test_the_printed_formula_is_the_law(model, width):
+    fit = made_fit(model, width=width)
+    (left, right), *later = (formula.split(" = ") for formula in formulas(read_page(fit_page(fit))))
+    law = fit.law
+    inside = (law.approach_speed_nm_per_us >= SPEEDS[0]) & (law.approach_speed_nm_per_us <= SPEEDS[-1])
+    names = {"u_in": law.approach_speed_nm_per_us[inside]}
+    rebound = eval(right, {}, names)  # noqa: S307 - the text that the page shows
+    names["u_out"] = np.sqrt(rebound) if left == "u_out**(2)" else rebound
+    # it promises a tenth of the band's half-width
+    np.testing.assert_allclose(names["u_out"], law.rebound_speed_nm_per_us[inside], rtol=0.1001 * width)
+    assert len(later) == model.endswith("+delay")
+    for name, delay in later:
+        assert name == "tau"
+        # the formula's own rebound speed goes in: another tenth of its band
+        np.testing.assert_allclose(eval(delay, {}, names), law.collision_delay_us[inside], rtol=0.1001 * width)  # noqa: S307
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_without_a_measurement_the_formula_has_no_numbers():
+    assert formulas(read_page(fit_page(not_valid("law")))) == ["u_out**(2) = (r u_in)**(2) - ε"]
+
+
+def test_width_of_the_band_is_the_worst_over_the_measured_speeds():
+    fit = made_fit("law")
+    law = fit.law
+    # a band that widens with speed: 1 % at the slowest row, 10 % at the fastest, more beyond
+    share = np.interp(np.log(law.approach_speed_nm_per_us), np.log(SPEEDS[[0, -1]]), [0.01, 0.1])
+    share[-5:] = 0.5
+    law = dataclasses.replace(law, rebound_high_nm_per_us=law.rebound_speed_nm_per_us * (1.0 + share))
+    width = band_width(dataclasses.replace(fit, law=law))
+    assert width is not None
+    # the fastest row lies between two points of the law, over which the share rises by a hundredth of itself
+    assert width.worst == pytest.approx(0.1, rel=1e-2)
+    assert (width.slowest_nm_per_us, width.fastest_nm_per_us) == (SPEEDS[0], SPEEDS[-1])
+    assert width.worst_at_nm_per_us == SPEEDS[-1]
+    assert "known to 10 % or better (95 % band, widest at 260 nm/us)" in summary(dataclasses.replace(fit, law=law))
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_rows_that_were_not_used_do_not_count_as_measured_speeds():
+    width = band_width(with_odd_rows())
+    assert width is not None
+    assert (width.slowest_nm_per_us, width.fastest_nm_per_us) == (40.0, 40.0)
+    nothing = with_odd_rows()
+    unused = dataclasses.replace(nothing.rows, used=np.zeros(4, dtype=bool))
+    nothing = dataclasses.replace(nothing, rows=unused)
+    assert band_width(nothing) is None
+    assert "measured at no speed" in first_screen(read_page(fit_page(nothing)))
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"p_value": 0.0}, "much farther from the law than their errors allow (probability below 1e-300)"),
+        ({"p_value": 0.012}, "by chance it would be so large in 1.2 % of experiments"),
+        ({"p_value": 0.54}, "scatter about the law as their errors say"),
+        ({"p_value": 0.99999}, "the stated errors look too large"),
+        ({"p_value": np.nan, "degrees_of_freedom": 0}, "as many parameters as amplitudes"),
+        ({"p_value": np.nan, "settings": {"error_scale": 2.0}}, "the errors were scaled to make it 1"),
+        ({"p_value": np.nan}, "outliers count less in it"),
+    ],
+)
+def test_probability_is_said_in_words(changes, said):
+    assert said in goodness_in_words(made_fit("law", **changes))
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_every_text_is_shown_as_it_is_and_does_nothing():
+    hostile = '<script>alert("1")</script> & <img src=x onerror=y> \x0b\x7f'
+    table = made_table(remarks=(hostile,), source="strange\udc80 <b>.csv")
+    fit = made_fit("law", table=table, warnings=[hostile], settings={hostile: hostile}, versions={"a": hostile})
+    root = read_page(fit_page(fit))
+    shown = '<script>alert("1")</script> & <img src=x onerror=y> \ufffd\ufffd'
+    # the remark, the warning, the setting's name and value, the version
+    assert words_of(root).count(shown) == 5
+    assert "strange\ufffd <b>.csv" in first_screen(root)
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_every_input_is_in_the_page():
+    fit = made_fit("law")
+    root = read_page(fit_page(fit))
+    head, *cells = table_of(root, "The table's rows")
+    for name, column in zip(head, zip(*cells, strict=True), strict=True):
+        given = getattr(fit.table, "lines" if name == "line" else name)
+        read = [float(cell) if cell else np.nan for cell in column]
+        # the page shows 15 digits
+        np.testing.assert_allclose(read, given, rtol=1e-14)
+    assert {"peak_amplitude_nm", "lockin_amplitude_error_nm", "offset_nm"} <= set(head)
+    assert dict(table_of(root, "What the table says"))["quality_factor"] == "40 ± 0.4"
+    assert "measured on a Tuesday" in words_of(root)
+    assert dict(table_of(root, "Options"))["constraints"] == "quality_factor: 40, 0.4"
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_odd_rows_are_marked_and_say_why():
+    root = read_page(fit_page(with_odd_rows()))
+    remarks = [row[-1] for row in table_of(root, "Amplitudes in nm")[1:]]
+    assert remarks[0].startswith("set aside: this impact is too slow")
+    assert remarks[1] == "2 stable orbits, the closest taken; close to a fold; more than 3 errors off"
+    assert remarks[2] == "no stable orbit at the fitted law"
+    assert remarks[3] == "nothing steady seen, though an orbit is predicted"
+    assert sum(row.attrib.get("class") == "marked" for row in root.iter("tr")) == 4
+    plain = read_page(fit_page(made_fit("law")))
+    assert not any(row.attrib.get("class") == "marked" for row in plain.iter("tr"))
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_long_table_stays_a_page_and_says_what_is_missing():
+    page = fit_page(made_fit("law", table=made_table(3000)))
+    # leaves room for three pictures of 150 kB
+    assert len(page.encode()) < 1_500_000
+    said = words_of(read_page(page))
+    assert "The first 1500 of 3000 rows; all of them are in fit_rows.csv" in said
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_other_models_and_samples_are_shown():
+    rows = [
+        {"model": "law", "chi2": 5.0, "degrees_of_freedom": 6, "aic": 9.0, "delta_aic": 0.0, "law_change": 0.0},
+        {
+            "model": "viscous",
+            "chi2": 7.25,
+            "degrees_of_freedom": 6,
+            "aic": 11.25,
+            "delta_aic": 2.25,
+            "law_change": 0.01,
+        },
+    ]
+    found = {
+        "seed": 1234,
+        "standard_error": {"r": 0.0125, "epsilon": 2.5},
+        "parameters": {"r": {"interval95": [0.9, 0.99]}, "epsilon": {"interval95": [50.0, 70.0]}},
+        "grid": {"axes": {"r": [0.1] * 50, "epsilon": [0.1] * 50}, "density": [[0.1, 0.2]] * 50},
+    }
+    chains = {"chains": {"seed": 77, "r_hat": {"r": 1.31, "epsilon": None}}, "grid": None, "converged": False}
+    models = Models(rows, "The data do not tell r < 1 from viscous loss.")
+    page = fit_page(made_fit("law"), comparison=models, bootstrap=Samples(found), posterior=Samples(chains))
+    root = read_page(page)
+    assert models.verdict in first_screen(root)
+    assert [row[1] for row in table_of(root, "Models of")] == ["chi2", "5", "7.25"]
+    ours, others = section_of(root, "bootstrap"), section_of(root, "posterior")
+    assert table_of(ours, "By parameter") == [
+        ["parameter", "standard error", "95 % interval"],
+        ["r", "0.0125", "0.9 to 0.99"],
+        ["epsilon", "2.5", "50 to 70"],
+    ]
+    assert table_of(others, "By parameter")[1:] == [["r", "1.31"], ["epsilon", "-"]]
+    # the samples themselves are no reading matter, the seeds are
+    assert table_of(ours, "Besides")[1:] == [["seed", "1234"]]
+    assert dict(table_of(others, "Besides"))["chains seed"] == "77"
+    assert "Not converged" in words_of(others)
+    assert "Not converged" not in words_of(ours)
+
+
+def test_text_names_only_strong_correlations_of_many_parameters():
+    fit = made_fit("law+delay")
+    weak = fit.correlations.copy()
+    weak[0, 1] = weak[1, 0] = 0.5
+    said = summary(dataclasses.replace(fit, correlations=weak))
+    assert "correlations beyond 0.9: r, delay_hertz: +0.950" in said
+    assert "r, epsilon" not in said
+    few = summary(made_fit("law", correlations=np.array([[1.0, 0.5], [0.5, 1.0]])))
+    assert "correlations: r, epsilon: +0.500" in few
+
+
+def test_pictures_show_the_delay_and_the_rows_set_aside():
+    figure = fit_figure(with_odd_rows())
+    labels = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    for label in ("measured, set aside", "no stable orbit predicted", "no orbit seen, one predicted"):
+        assert label in labels
+    fit = made_fit("law+delay")
+    axes = law_figure(fit).axes
+    assert [panel.get_ylabel() for panel in axes][-1] == "collision delay (ns)"
+    curves = [line.get_ydata() for line in axes[-1].lines]
+    assert any(np.array_equal(curve, 1e3 * fit.law.collision_delay_us) for curve in curves)
+    assert len(law_figure(made_fit("law")).axes) == 2
+
+
+def test_report_is_written_with_its_page(tmp_path):
+    tables = {}
+    written = write_report(made_fit("law"), tmp_path, lambda name, *rest: tables.update({name: rest}))
+    assert [path.name for path in written] == ["fit.html", "fit.txt", "fit.json", "fit.png"]
+    assert all(0 < path.stat().st_size < 2_000_000 for path in written)
+    assert sum(1 for _ in read_page(written[0].read_text(encoding="utf-8")).iter("img")) == 3
+    assert set(tables) == {"fit_rows.csv", "law.csv"}
+
+
+def test_command_writes_the_page_of_the_bundled_table(tmp_path):
+    result = CliRunner().invoke(main, ["fit", "--example", "--out", str(tmp_path)])
+    assert result.exit_code == 0
+    seen = first_screen(read_page((tmp_path / "fit.html").read_text(encoding="utf-8")))
+    # made with r 0.95 and epsilon 60 (its own comments say so)
+    assert "0.9492 to 0.9508" in seen
+    assert "VALID" in seen.splitlines()

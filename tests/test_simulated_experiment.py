@@ -1,0 +1,136 @@
+"""Simulated experiments: tables of the full contact, and of a law whose orbits are known in closed form."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene
+from afm_jax.contact.contact import Contact
+from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from afm_jax.impact.orbits import single_impact_orbits
+from fitting.examples.make_contact_amplitudes import EXAMPLE
+from fitting.simulated.simulated_experiment import drives_of, simulate_experiment, with_noise
+from fitting.table import read_table
+from tests.contact_experiment import paper_experiment
+
+pytestmark = pytest.mark.slow
+"""Each compiles programs of its own for a minute or more."""
+
+MEASURED = ("peak_amplitude_nm", "lockin_amplitude_nm", "phase_deg")
+ROWS = ((1, 177.3, 4.0, 1.0), (1, 180.0, 4.0, 0.0), (2, 349.2, 4.0, -1.0), (3, 545.4, 4.0, 0.0))
+LAW = ImpactLaw(0.97, 60.0, 0.3, CollisionDelay(0.2, 5.6, 0.6))
+
+
+@pytest.fixture(scope="module")
+def of_a_law():
+    return simulate_experiment(LAW, Cantilever(90.0, 40.0), drives_of(ROWS), phase_noise_deg=0.1)
+
+
+@pytest.mark.slow
+def test_bundled_table_is_what_its_script_makes():
+    bundled, made = read_table(EXAMPLE), paper_experiment().table
+    assert bundled.rows == made.rows == 57
+    assert bundled.quality_factor_error == 0.5
+    for name in (*MEASURED, "order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm"):
+        # six digits are written, and another machine may round the last of them the other way
+        np.testing.assert_allclose(getattr(bundled, name), getattr(made, name), rtol=2e-5)
+
+
+@pytest.mark.slow
+def test_drives_without_an_orbit_are_named():
+    left_out = paper_experiment().left_out
+    assert len(left_out) == 3
+    assert any(sentence.startswith("order 2, 349.2 kHz, 2 nm, offset 1 nm: ") for sentence in left_out)
+
+
+@pytest.mark.slow
+def test_contact_amplitudes_agree_with_an_independent_program(contact_table_path):
+    other = read_table(contact_table_path)
+    # as many rows as are simulated side by side, of every order
+    chosen = np.arange(2, other.rows, 6)[:16]
+    drives = drives_of(
+        [
+            (int(order), float(frequency), float(amplitude), float(offset))
+            for order, frequency, amplitude, offset in zip(
+                other.order[chosen],
+                other.drive_frequency_khz[chosen],
+                other.drive_amplitude_nm[chosen],
+                other.offset_nm[chosen],
+                strict=True,
+            )
+        ]
+    )
+    found = simulate_experiment(Contact.paper(), Cantilever(90.0, 40.0), drives)
+    assert found.left_out == ()
+    for name in ("peak_amplitude", "lockin_amplitude"):
+        error = getattr(other, f"{name}_error_nm")[chosen]
+        apart = (getattr(other, f"{name}_nm")[chosen] - getattr(found.exact, f"{name}_nm")) / error
+        # chi2 of 16 numbers with 1 % noise: 99.9 % lie below 39; a bias of 1 % would add 16
+        assert 4.0 < np.sum(apart**2) < 39.0
+        # a mean of 16 normal numbers has the standard deviation 1/4
+        assert abs(np.mean(apart)) < 0.9
+
+
+def test_amplitudes_of_a_law_are_those_of_its_orbits_in_closed_form(of_a_law):
+    exact = of_a_law.exact
+    assert of_a_law.left_out == ()
+    for i, (order, frequency, amplitude, offset) in enumerate(ROWS):
+        orbits = single_impact_orbits(
+            Scene(Cantilever(90.0, 40.0), Platform(amplitude, frequency, offset), LAW), float(order)
+        )
+        slot = int(np.argmax(np.asarray(orbits.stable & orbits.admissible)))
+        expected = (orbits.peak_amplitude_nm, orbits.lockin_amplitude_nm, orbits.lockin_phase_deg)
+        for name, value in zip(MEASURED, expected, strict=True):
+            # motions are followed to 1e-9 and settle to 1e-6
+            np.testing.assert_allclose(getattr(exact, name)[i], float(value[slot]), rtol=1e-6)
+
+
+def test_noise_has_the_size_that_the_table_states(of_a_law):
+    exact = of_a_law.exact
+    draws = np.random.default_rng(3).normal(size=(500, 3, exact.rows))
+    noisy = [with_noise(exact, draw) for draw in draws]
+    for name, error in zip(
+        MEASURED, ("peak_amplitude_error_nm", "lockin_amplitude_error_nm", "phase_error_deg"), strict=True
+    ):
+        apart = np.array([getattr(table, name) for table in noisy]) - getattr(exact, name)
+        # of 500 draws the standard deviation is known to 3 %; rounding to six digits adds nothing
+        np.testing.assert_allclose(apart.std(axis=0), getattr(exact, error), rtol=0.15)
+
+
+def test_another_seed_gives_other_noise_on_the_same_amplitudes(of_a_law):
+    other = simulate_experiment(LAW, Cantilever(90.0, 40.0), drives_of(ROWS[:2]), phase_noise_deg=0.1, seed=1)
+    for name in MEASURED:
+        # the same program on the same rows, beside others
+        np.testing.assert_allclose(getattr(other.exact, name), getattr(of_a_law.exact, name)[:2], rtol=1e-9)
+        assert not np.any(getattr(other.table, name) == getattr(of_a_law.table, name)[:2])
+
+
+def test_an_experiment_without_any_orbit_is_an_error_that_says_so():
+    # far off every resonance and slower than capture
+    with pytest.raises(ValueError, match="no drive has a steady single-impact orbit"):
+        simulate_experiment(LAW, Cantilever(90.0, 40.0), drives_of([(1, 250.0, 0.2, 0.0)]))
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"noise": 1.5}, "`noise` must be between 0 and 1"),
+        ({"phase_noise_deg": 0.0}, "`phase_noise_deg` must be between 0 and 90"),
+        ({"drives": drives_of([])}, "at least one drive"),
+        ({"drives": drives_of([(0, 180.0, 2.0, 0.0)])}, "orders of 1 or more"),
+        ({"drives": drives_of([(1, 180.0, -2.0, 0.0)])}, "positive frequencies and amplitudes"),
+    ],
+)
+def test_impossible_experiments_are_refused(changed, said):
+    wanted = {"drives": drives_of(ROWS), "noise": 0.01, "phase_noise_deg": 0.1} | changed
+    with pytest.raises(ValueError, match=said):
+        simulate_experiment(LAW, Cantilever(90.0, 40.0), **wanted)
+
+
+def test_noise_needs_both_amplitudes(of_a_law):
+    lacking = dataclasses.replace(of_a_law.exact, lockin_amplitude_nm=None, lockin_amplitude_error_nm=None)
+    with pytest.raises(ValueError, match="has no lockin_amplitude_nm"):
+        with_noise(lacking, np.zeros((3, lacking.rows)))
