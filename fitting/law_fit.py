@@ -15,7 +15,7 @@ from fitting.checks import Convergence, at_bound, check_minimum, covariance
 from fitting.contact_values import check_contact_values
 from fitting.intervals import Interval, profile_intervals
 from fitting.law_band import law_with_band
-from fitting.measurement import measurement_of
+from fitting.measurement import constraints_of, measurement_of
 from fitting.minimum import Minimum, minimise, rescale_errors, settle
 from fitting.models import NUISANCE_NAMES, Problem, model_parameters
 from fitting.optimise import BATCH, ROBUST, SOFT, Objective
@@ -127,16 +127,6 @@ def summarise(table: AmplitudeTable, found: Found) -> FitResult:
     return _Summary(found.objective, table, found.minimum, found.strain, found.settings).result()
 
 
-def constraints_of(
-    table: AmplitudeTable, constraints: dict[str, tuple[float, float]] | None
-) -> dict[str, tuple[float, float]]:
-    """Return everything that is known beforehand: what the table says, and what the caller adds or says instead."""
-    known = dict(table.calibration)
-    if table.quality_factor is not None and table.quality_factor_error is not None:
-        known["quality_factor"] = table.quality_factor, table.quality_factor_error
-    return known | dict(constraints or {})
-
-
 def problem_of(
     table: AmplitudeTable,
     model: str,
@@ -203,7 +193,7 @@ class _Summary:
         self.convergence: Convergence = check_minimum(self.objective, minimum.coordinates, self.free)
         linear = self.searching.at_values(self.values[None])
         self.residual = np.asarray(linear.residual)[0]
-        self.amplitude_residual = self.searching.amplitude_residuals(self.values)
+        self.amplitude_residual = self.searching.misfit(linear)
         self.prediction = linear.prediction
         self.chi2 = float(np.sum(self.residual**2))
         self.constraints = settings["constraints"]
@@ -353,4 +343,4 @@ def _autocorrelation(residual: Float[np.ndarray, "rows 2"]) -> float:
     return float(np.sum(before[both] * after[both]) / both.sum() / (total / np.isfinite(residual).sum()))
 
 
-__all__ = ["FitResult", "constraints_of", "find_fit", "fit", "problem_of", "summarise"]
+__all__ = ["FitResult", "find_fit", "fit", "problem_of", "summarise"]

@@ -11,7 +11,7 @@ from fitting.models import CONTACT_NAMES, Problem
 from fitting.table import AmplitudeTable
 
 ROWS_PER_PROGRAM = 32
-"""Rows are padded to multiples of this, so that tables of similar size share one compiled program."""
+"""Rows are padded to multiples of this, so that programs by rows (gradients, a scout's fit) have few shapes."""
 
 
 class Rows(NamedTuple):
@@ -49,6 +49,16 @@ class Measurement(NamedTuple):
     contact: dict[str, Float[Array, ""]]
 
 
+def constraints_of(
+    table: AmplitudeTable, constraints: dict[str, tuple[float, float]] | None
+) -> dict[str, tuple[float, float]]:
+    """Return everything that is known beforehand: what the table says, and what the caller adds or says instead."""
+    known = dict(table.calibration)
+    if table.quality_factor is not None and table.quality_factor_error is not None:
+        known["quality_factor"] = table.quality_factor, table.quality_factor_error
+    return known | dict(constraints or {})
+
+
 def measurement_of(
     table: AmplitudeTable,
     problem: Problem,
@@ -60,12 +70,10 @@ def measurement_of(
     Args:
         table: the amplitudes.
         problem: the model; its parameters' order is that of the constraints.
-        constraints: value and standard error of what is known beforehand, by parameter; Q's is the table's.
+        constraints: value and standard error of what is known beforehand, by parameter; else the table says.
         fixed: contact parameters that are not the paper's.
     """
-    known = dict(constraints or {})
-    if table.quality_factor is not None and table.quality_factor_error is not None:
-        known.setdefault("quality_factor", (table.quality_factor, table.quality_factor_error))
+    known = constraints_of(table, constraints)
     pairs = [
         known.get(name, (parameter.reference, np.inf))
         for name, parameter in zip(problem.names, problem.parameters, strict=True)

@@ -94,9 +94,13 @@ class Objective:
 
     def amplitude_residuals(self, values: Float[np.ndarray, " p"]) -> Float[np.ndarray, "rows 2"]:
         """Return the residuals of the amplitudes at one set of values, as they are."""
-        plain = Objective(self.measurement, self.problem, near=self.near)
-        rows = self.measurement.rows.order.shape[0]
-        return np.asarray(plain.at_values(values[None]).residual)[0, : 2 * rows].reshape(rows, 2)
+        return self.misfit(self.at_values(values[None]))
+
+    def misfit(self, linear: Linearised) -> Float[np.ndarray, "rows 2"]:
+        """Return the plain residuals of the amplitudes that the first set of a linearised model predicts."""
+        rows = self.measurement.rows
+        apart = np.asarray(linear.prediction.amplitude_nm)[0] - np.asarray(rows.amplitude_nm)
+        return np.where(np.asarray(rows.measured), apart / np.asarray(rows.error_nm), 0.0)
 
     def residual(self, values: Float[np.ndarray, "sets p"]) -> Float[np.ndarray, "sets n"]:
         """Return the residuals at parameter values."""

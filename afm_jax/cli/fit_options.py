@@ -1,12 +1,12 @@
 """Texts of `afm-jax fit`'s options turned into values: shares, `NAME=VALUE`, `NAME=VALUE+-ERROR`, lists of names."""
 
 import math
-import re
 from typing import Any
 
 import click
 
-_PLUS_MINUS = re.compile(r"\+-|\+/-|±")
+from afm_jax.cli.number_lists import parse_around_plus_minus, parse_number
+from afm_jax.cli.share import parse_share
 
 
 class Noise(click.ParamType):
@@ -20,14 +20,10 @@ class Noise(click.ParamType):
         Raises:
             click.BadParameter: if it is no number between 0 and 1.
         """
-        text = str(value).strip()
         try:
-            share = float(text.removesuffix("%")) / (100.0 if text.endswith("%") else 1.0)
+            return parse_share(str(value))
         except ValueError:
-            share = float("nan")
-        if not 0.0 < share < 1.0:
             self.fail(f"must be a relative error such as 1% or 0.01, but is {value}", param, ctx)
-        return share
 
 
 class Fixed(click.ParamType):
@@ -42,8 +38,11 @@ class Fixed(click.ParamType):
             click.BadParameter: if the text is something else.
         """
         name, sign, text = str(value).partition("=")
-        number = _number(text)
-        if not sign or not name.strip() or number is None:
+        try:
+            number = parse_number(text)
+        except ValueError:
+            sign, number = "", math.nan
+        if not sign or not name.strip():
             self.fail(f"must be NAME=VALUE such as modulus_gpa=80, but is {value}", param, ctx)
         return name.strip(), number
 
@@ -62,8 +61,11 @@ class Constraint(click.ParamType):
             click.BadParameter: if the text is something else.
         """
         name, sign, text = str(value).partition("=")
-        numbers = [_number(part) for part in _PLUS_MINUS.split(text)]
-        if not sign or not name.strip() or len(numbers) != 2 or numbers[0] is None or numbers[1] is None:
+        try:
+            numbers = parse_around_plus_minus(text)
+        except ValueError:
+            numbers = []
+        if not sign or not name.strip() or len(numbers) != 2:
             self.fail(f"must be NAME=VALUE+-ERROR such as tip_calibration=1+-0.02, but is {value}", param, ctx)
         return name.strip(), (numbers[0], numbers[1])
 
@@ -83,11 +85,3 @@ class Names(click.ParamType):
         if not all(names):
             self.fail(f"must be names separated by commas, but is {value}", param, ctx)
         return names
-
-
-def _number(text: str) -> float | None:
-    try:
-        number = float(text.strip())
-    except ValueError:
-        return None
-    return number if math.isfinite(number) else None

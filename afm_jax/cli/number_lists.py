@@ -68,9 +68,8 @@ class ValueAndError(click.ParamType):
         """
         if isinstance(value, tuple):
             return value
-        parts = str(value).replace("±", "+-").replace("+/-", "+-").split("+-")
         try:
-            numbers = [_number(part) for part in parts]
+            numbers = parse_around_plus_minus(str(value))
         except ValueError as error:
             self.fail(f"{error}; write 40 or '40 +- 2'", param, ctx)
         if len(numbers) > 2 or (len(numbers) == 2 and numbers[1] <= 0.0):
@@ -91,7 +90,7 @@ def parse_numbers(text: str) -> tuple[float, ...]:
         raise ValueError("names no number")
     numbers: list[float] = []
     for part in text.split(","):
-        numbers += _range(part) if ":" in part else [_number(part)]
+        numbers += _range(part) if ":" in part else [parse_number(part)]
         if len(numbers) > _MOST:
             raise ValueError(f"names more than {_MOST} numbers")
     return tuple(numbers)
@@ -122,7 +121,7 @@ def _range(part: str) -> list[float]:
     ends = part.split(":")
     if len(ends) != 3:
         raise ValueError(f"`{part.strip()}` is no range")
-    start, stop, step = (_number(end) for end in ends)
+    start, stop, step = (parse_number(end) for end in ends)
     if step <= 0.0 or stop < start:
         raise ValueError(f"`{part.strip()}` does not rise")
     # a hair more than the quotient, so that rounding does not cost the stop
@@ -133,7 +132,24 @@ def _range(part: str) -> list[float]:
     return [float(f"{start + step * index:.12g}") for index in range(math.floor(steps) + 1)]
 
 
-def _number(text: str) -> float:
+def parse_around_plus_minus(text: str) -> list[float]:
+    """Return the numbers that a text has around +-, +/- or ±.
+
+    >>> parse_around_plus_minus("40 +- 2")
+    [40.0, 2.0]
+
+    Raises:
+        ValueError: if one of them is no finite number.
+    """
+    return [parse_number(part) for part in text.replace("±", "+-").replace("+/-", "+-").split("+-")]
+
+
+def parse_number(text: str) -> float:
+    """Return the number that a text says.
+
+    Raises:
+        ValueError: if it is no finite number.
+    """
     try:
         number = float(text)
     except ValueError:

@@ -7,16 +7,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.impact.implicit import implicit_root
-from afm_jax.impact.jacobian import flight_jacobian, impact_jacobian
 from afm_jax.impact.lasting_closure import LastingProblem, lasting_closure, lasting_residual
 from afm_jax.impact.lasting_impact import INDENTATION
-from afm_jax.impact.lasting_search import LastingRoots, find_lasting_roots, regular
+from afm_jax.impact.lasting_search import find_lasting_roots, regular
 from afm_jax.impact.orbit_amplitude import FlightEnds, lockin, peak_amplitude
 from afm_jax.impact.orbit_closure import Speeds
-from afm_jax.impact.orbit_state import NEAR_DOUBLE
-from afm_jax.outcome import Outcome
+from afm_jax.impact.orbit_state import NEAR_DOUBLE, contracts, ends_at_its_own_impact, trace_and_determinant
 
 _ARRIVAL_TOLERANCE = 1e-6
 """How far (in drive periods) the first impact found may lie before the orbit's own."""
@@ -84,29 +81,12 @@ def _judged(root, found, state: LastingState, problem: LastingProblem) -> tuple[
     Stability is that of the delayed map; what the corrections change in it is of their own order.
     """
     cantilever, platform, impact, _ = problem
-    start, velocity = state.flight.start_us, state.flight.start_velocity
-    arrival = start + state.flight.duration_us
-    jacobian = impact_jacobian(impact, platform, arrival, state.flight.end_velocity) @ flight_jacobian(
-        cantilever, platform, start, velocity, arrival
-    )
-    trace = jacobian[0, 0] + jacobian[1, 1]
-    determinant = jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]
-    stable = (jnp.abs(trace) < jnp.abs(1.0 + determinant)) & (jnp.abs(determinant) <= 1.0)
+    trace, determinant = trace_and_determinant(impact, cantilever, platform, state.flight)
     found = found & regular(root, problem)
-    return found & stable & _admissible(found, state, problem), found & near_fold(root, problem)
-
-
-def _admissible(found, state: LastingState, problem: LastingProblem) -> Bool[Array, ""]:
-    """Say whether the first impact of the flight is the orbit's own; the flight counts from max(t_in, t_out) on."""
-    velocity = jnp.where(found, state.flight.start_velocity, -jnp.inf)
+    # the flight counts from max(t_in, t_out) on
     skip = jnp.maximum(-state.speeds.delay, 0.0)
-    flight = Flight(problem.cantilever, problem.platform, state.flight.start_us, velocity)
-    first = first_impact(flight, skip_us=skip)
-    duration = state.flight.duration_us
-    hit = (first.outcome == Outcome.IMPACT) & (
-        first.duration_us >= duration - _ARRIVAL_TOLERANCE * problem.platform.period_us
-    )
-    return (duration > 0.0) & (hit | (first.outcome == Outcome.NO_FURTHER_IMPACT))
+    admissible = ends_at_its_own_impact(cantilever, platform, state.flight, found, skip, _ARRIVAL_TOLERANCE)
+    return found & contracts(trace, determinant) & admissible, found & near_fold(root, problem)
 
 
 @jax.jit
@@ -123,6 +103,3 @@ def _observed(state: LastingState, problem: LastingProblem) -> Float[Array, " 3"
         indentation=INDENTATION * state.speeds.approach * tau**2,
     )
     return jnp.stack([peak, length, phase])
-
-
-__all__ = ["LastingOrbits", "LastingRoots", "LastingState", "lasting_amplitudes", "steady_lasting_orbits"]

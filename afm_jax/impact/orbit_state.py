@@ -7,9 +7,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
 from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.impact.implicit import implicit_root
-from afm_jax.impact.jacobian import flight_jacobian, impact_jacobian
+from afm_jax.impact.jacobian import LawWithSlopes, flight_jacobian, impact_jacobian
 from afm_jax.impact.orbit_amplitude import FlightEnds, lockin, peak_amplitude
 from afm_jax.impact.orbit_closure import OrbitProblem, Speeds, closing_residual, closure, speeds_at
 from afm_jax.impact.orbit_search import find_roots
@@ -67,18 +69,13 @@ def orbit_state(coordinate: Float[Array, ""], problem: OrbitProblem) -> OrbitSta
 def judge(coordinate: Float[Array, ""], found: Bool[Array, ""], state: OrbitState, problem: OrbitProblem) -> Verdict:
     """Return whether an orbit is admissible, stable (eq. 8 and its generalisation) and close to a fold."""
     cantilever, platform, law, _ = problem
-    start, velocity = state.flight.start_us, state.flight.start_velocity
-    arrival = start + state.flight.duration_us
-    jacobian = impact_jacobian(law, platform, arrival, state.flight.end_velocity) @ flight_jacobian(
-        cantilever, platform, start, velocity, arrival
-    )
-    trace = jacobian[0, 0] + jacobian[1, 1]
-    determinant = jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]
+    trace, determinant = trace_and_determinant(law, cantilever, platform, state.flight)
+    skip = None if law.delay is None else jnp.maximum(-state.speeds.delay, 0.0)
     # How fast the closing condition changes with the logarithm of Y.
     _, slope = jax.jvp(lambda y: closing_residual(y, problem), (coordinate,), (coordinate,))
     return Verdict(
-        admissible=found & _admissible(problem, found, state),
-        stable=found & (jnp.abs(trace) < jnp.abs(1.0 + determinant)) & (jnp.abs(determinant) <= 1.0),
+        admissible=found & ends_at_its_own_impact(cantilever, platform, state.flight, found, skip, _ARRIVAL_TOLERANCE),
+        stable=found & contracts(trace, determinant),
         near_double=found & (jnp.abs(slope) < NEAR_DOUBLE),
         trace=trace,
         determinant=determinant,
@@ -111,15 +108,45 @@ def _amplitudes_of(state: OrbitState, problem: OrbitProblem) -> Float[Array, " 2
     return jnp.stack([peak, length])
 
 
-def _admissible(problem: OrbitProblem, found: Bool[Array, ""], state: OrbitState) -> Bool[Array, ""]:
-    """Say whether the first impact of the flight is the orbit's own; the flight counts from max(t_in, t_out) on."""
-    skip = None if problem.law.delay is None else jnp.maximum(-state.speeds.delay, 0.0)
-    # An empty slot does not leave the platform, so that its search ends at once.
-    velocity = jnp.where(found, state.flight.start_velocity, -jnp.inf)
-    first = first_impact(Flight(problem.cantilever, problem.platform, state.flight.start_us, velocity), skip_us=skip)
-    duration = state.flight.duration_us
-    hit = (first.outcome == Outcome.IMPACT) & (
-        first.duration_us >= duration - _ARRIVAL_TOLERANCE * problem.platform.period_us
+def trace_and_determinant(
+    law: LawWithSlopes, cantilever: Cantilever, platform: Platform, flight: FlightEnds
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return T and D of the impact map on an orbit (eq. 8 and its generalisation)."""
+    arrival = flight.start_us + flight.duration_us
+    jacobian = impact_jacobian(law, platform, arrival, flight.end_velocity) @ flight_jacobian(
+        cantilever, platform, flight.start_us, flight.start_velocity, arrival
     )
+    trace = jacobian[0, 0] + jacobian[1, 1]
+    return trace, jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]
+
+
+def contracts(trace: Float[Array, ""], determinant: Float[Array, ""]) -> Bool[Array, ""]:
+    """Say whether a map of this trace and determinant is stable."""
+    return (jnp.abs(trace) < jnp.abs(1.0 + determinant)) & (jnp.abs(determinant) <= 1.0)
+
+
+def ends_at_its_own_impact(
+    cantilever: Cantilever,
+    platform: Platform,
+    flight: FlightEnds,
+    found: Bool[Array, ""],
+    skip_us: Float[Array, ""] | None,
+    tolerance: float,
+) -> Bool[Array, ""]:
+    """Say whether the first impact of the flight is the orbit's own: the flight never passes through the platform.
+
+    Args:
+        cantilever: of the free flight.
+        platform: that it must not meet before its end.
+        flight: from impact to impact.
+        found: whether there is an orbit at all.
+        skip_us: time after the start at which the flight begins to count, max(t_in, t_out); None: at once.
+        tolerance: how far (in drive periods) the first impact may lie before the flight's end, by rounding.
+    """
+    # An empty slot does not leave the platform, so that its search ends at once.
+    velocity = jnp.where(found, flight.start_velocity, -jnp.inf)
+    first = first_impact(Flight(cantilever, platform, flight.start_us, velocity), skip_us=skip_us)
+    duration = flight.duration_us
+    hit = (first.outcome == Outcome.IMPACT) & (first.duration_us >= duration - tolerance * platform.period_us)
     # Rounding can lift the end of the flight off the platform where the impact is a graze.
     return (duration > 0.0) & (hit | (first.outcome == Outcome.NO_FURTHER_IMPACT))

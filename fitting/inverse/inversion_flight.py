@@ -16,16 +16,13 @@ from jaxtyping import Array, Bool, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
+from afm_jax.impact.lasting_impact import AIR, HERTZ, INDENTATION, LONGER
 from afm_jax.impact.orbit_amplitude import FlightEnds, lockin, peak_amplitude
 
-AIR = 10.0 / 9.0
-"""Twice the integral of the squared speed over a Hertz contact, over tau u^2."""
-JERK = 0.4247
+_JERK = float(HERTZ[0])
 """By how much a constant jerk j of the sample lowers the squared rebound speed, over j tau^2 u."""
-ACCELERATION = 0.1274
+_ACCELERATION = -float(LONGER[0])
 """By how much a constant pull g shortens a Hertz contact, over g tau^2/u."""
-INDENTATION = 0.2123
-"""Time integral of the indentation of a Hertz contact, over tau^2 u."""
 _HALF_SINE = 0.42441318157838753
 """4/(3 pi): lock-in amplitude of half sines at their own frequency, over their height."""
 _ARRIVAL_STEPS = 8
@@ -127,11 +124,11 @@ def impact_of(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> I
 
     def lasted(_, free_delay):
         tau = jnp.maximum(free_delay, 0.0)
-        return delay + ACCELERATION * pull * tau**2 / approach
+        return delay + _ACCELERATION * pull * tau**2 / approach
 
     free_delay = lax.fori_loop(0, 3, lasted, delay)
     tau = jnp.maximum(delay, 0.0)
-    lost = (2.0 * AIR) * cantilever.decay_rate * tau * approach**2 + JERK * jerk * tau**2 * approach
+    lost = (2.0 * AIR) * cantilever.decay_rate * tau * approach**2 + _JERK * jerk * tau**2 * approach
     square = jnp.where(rebound > 0.0, rebound**2, 0.0) + lost
     free_rebound = jnp.sqrt(jnp.where(square > 0.0, square, 1.0))
     return Impact(approach, jnp.where((square > 0.0) & (rebound > 0.0), free_rebound, jnp.nan), free_delay)
