@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.parameters import require_float64
-from fitting.law_fit import Found, find_fit, summarise
+from fitting.fit_summary import Found, summarise
+from fitting.law_fit import find_fit
 from fitting.minimum import settle
 from fitting.models import LAWS
 from fitting.result import FitResult

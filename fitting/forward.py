@@ -1,6 +1,5 @@
 """From parameters to predicted amplitudes: each row's steady single-impact orbit, on the branch that was measured."""
 
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -9,17 +8,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from afm_jax.apparatus.platform import Platform
-from afm_jax.contact.contact import Contact
 from afm_jax.impact.lasting_closure import LastingProblem
 from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact
-from afm_jax.impact.lasting_orbits import lasting_amplitudes, near_fold, steady_lasting_orbits
-from afm_jax.impact.lasting_search import follow_lasting_root
+from afm_jax.impact.lasting_orbits import lasting_amplitudes
 from afm_jax.impact.orbit_closure import OrbitProblem, speeds_at
-from afm_jax.impact.orbit_state import amplitudes, steady_orbits
-from fitting.contact_table import tabulated
+from afm_jax.impact.orbit_state import amplitudes
+from afm_jax.stored_program import stored
 from fitting.measurement import Measurement, Rows
 from fitting.models import Problem
+from fitting.row_orbits import Branch, branch_near, branch_of, followed, impact_of, orbit_problem
 
 BATCH = 8
 """Sets of parameters that `linearise` takes at once."""
@@ -56,15 +53,6 @@ class Linearised(NamedTuple):
     prediction: Prediction
 
 
-class _Branch(NamedTuple):
-    """The orbit that a row is taken to be on: its coordinate, whether there is one, and how many there are."""
-
-    coordinate: Float[Array, ""]
-    exists: Bool[Array, ""]
-    orbits: Int[Array, ""]
-    near_fold: Bool[Array, ""]
-
-
 def linearise(
     values: Float[np.ndarray, "sets p"],
     measurement: Measurement,
@@ -73,28 +61,33 @@ def linearise(
 ) -> Linearised:
     """Return residuals, their Jacobian (forward mode through the implicit roots) and predictions for several sets.
 
-    Pairs of a set and a row are taken `LANES` at a time: one compiled program serves tables of every size.
+    Three programs share the work, so that each is compiled once and run only where it is needed: what an impact does at
+    every set, where the orbits are, and the amplitudes with their slopes there. Pairs of a set and a row are taken
+    `LANES` at a time: the same programs serve tables of every size.
 
     Args:
         values: the parameters' values, at most `BATCH` sets.
         measurement: what they are compared with.
         problem: the model.
-        near: coordinates of the rows' orbits at parameters close by: roots are followed from there instead of searched
-            for, which takes a hundredth of the time and says nothing of admissible and stable. Impacts that last only.
+        near: coordinates of the orbits at parameters close by, NaN where there is none, for each row or for each set
+            and row: orbits are followed from there instead of searched for, which takes a tenth of the time and says
+            nothing of admissible and stable. Impacts that last only.
     """
     values = np.asarray(values)
     sets, count = values.shape
     rows = measurement.rows.order.shape[0]
     filled = np.concatenate([values, np.repeat(values[-1:], BATCH - sets, axis=0)])
+    impacts = impacts_of(filled, measurement, problem)
     columns = jax.tree.map(np.asarray, measurement.rows)
+    known = None if near is None else np.broadcast_to(np.asarray(near), (sets, rows)).ravel()
     blocks = []
     for begin in range(0, sets * rows, LANES):
         # the last block is filled up with the last pair
         lane = np.minimum(np.arange(begin, begin + LANES), sets * rows - 1)
-        some = jax.tree.map(lambda column, row=lane % rows: column[row], columns)
-        start = None if near is None else np.asarray(near)[lane % rows]
-        block = linearise_pairs(filled, lane // rows, measurement._replace(rows=some), problem, start)
-        blocks.append(jax.tree.map(np.asarray, block))
+        some = measurement._replace(rows=jax.tree.map(lambda column, row=lane % rows: column[row], columns))
+        index = lane // rows
+        branch = branch_near(known[lane]) if known is not None else located(filled, impacts, index, some, problem)
+        blocks.append(jax.tree.map(np.asarray, linearise_pairs(filled, impacts, index, some, problem, branch)))
     whole: _Block = jax.tree.map(
         lambda *parts: np.concatenate(parts)[: sets * rows].reshape(sets, rows, *parts[0].shape[1:]), *blocks
     )
@@ -119,33 +112,64 @@ class _Block(NamedTuple):
     prediction: Prediction
 
 
-@partial(jax.jit, static_argnames=("problem",))
-def linearise_pairs(
+class _Impacts(NamedTuple):
+    """What an impact does at each set of values, and its derivatives by each parameter along a second axis."""
+
+    impact: LawImpact | TabulatedImpact
+    slopes: LawImpact | TabulatedImpact
+
+
+@stored(static="problem")
+def impacts_of(values: Float[Array, "sets p"], measurement: Measurement, problem: Problem) -> _Impacts:
+    """Return the law, or the table of the contact, of several sets of values."""
+    return _Impacts(*jax.vmap(lambda v: _impact_and_slopes(v, measurement, problem))(values))
+
+
+@stored(static="problem")
+def located(
     values: Float[Array, "sets p"],
+    impacts: _Impacts,
     index: Int[Array, " lanes"],
     measurement: Measurement,
     problem: Problem,
-    near: Float[Array, " lanes"] | None,
+) -> Branch:
+    """Return the orbit that each pair of a row and the set that its index names is on."""
+
+    def one(point: Float[Array, " p"], impact, row: Rows) -> Branch:
+        return branch_of(orbit_problem(point, impact, row, measurement, problem), row)
+
+    points, impact = jax.tree.map(lambda leaf: leaf[index], (values, impacts.impact))
+    return jax.vmap(one)(points, impact, measurement.rows)
+
+
+@stored(static="problem")
+def linearise_pairs(
+    values: Float[Array, "sets p"],
+    impacts: _Impacts,
+    index: Int[Array, " lanes"],
+    measurement: Measurement,
+    problem: Problem,
+    branch: Branch,
 ) -> _Block:
-    """Return the pairs of a row and the set of values that its index names."""
-    impacts, slopes = jax.vmap(lambda v: _impact_and_slopes(v, measurement, problem))(values)
+    """Return misfits and slopes of pairs of a row and the set of values that its index names, on given orbits."""
 
     # One vmap over all pairs, not two nested ones: tracing costs as much as a fit otherwise.
-    def one(point: Float[Array, " p"], impact, slope, row: Rows, start):
+    def one(point: Float[Array, " p"], impact, slope, row: Rows, known: Branch):
         orbit = orbit_problem(point, impact, row, measurement, problem)
-        branch = branch_of(orbit, row) if start is None else _followed(orbit, start)
+        branch = followed(orbit, known) if isinstance(orbit, LastingProblem) else known
 
         def predict(v, impact):
             return _prediction(branch, v, orbit_problem(v, impact, row, measurement, problem), problem)
 
-        # The search stays outside the differentiation: a program that compiles in half the time.
-        predicted = predict(point, impact)
-        along = jax.vmap(lambda e, turn: jax.jvp(predict, (point, impact), (e, turn))[1].amplitude_nm, out_axes=-1)
-        return along(jnp.eye(point.shape[0]), slope), predicted
+        def along(e, turn):
+            predicted, change = jax.jvp(predict, (point, impact), (e, turn))
+            return change.amplitude_nm, predicted
 
-    points, impacts, slopes = jax.tree.map(lambda leaf: leaf[index], (values, impacts, slopes))
+        return jax.vmap(along, out_axes=(-1, None))(jnp.eye(point.shape[0]), slope)
+
+    points, impact, slopes = jax.tree.map(lambda leaf: leaf[index], (values, *impacts))
     rows = measurement.rows
-    slope, prediction = jax.vmap(one)(points, impacts, slopes, rows, near)
+    slope, prediction = jax.vmap(one)(points, impact, slopes, rows, branch)
     # far from any law (a start of the search) a root can be no motion at all: no orbit there
     sound = jnp.isfinite(prediction.amplitude_nm).all(axis=1) & jnp.isfinite(slope).all(axis=(1, 2))
     slope = jnp.where(sound[:, None, None], slope, 0.0)
@@ -162,15 +186,6 @@ def linearise_pairs(
     )
 
 
-def impact_of(values: Float[Array, " p"], measurement: Measurement, problem: Problem) -> LawImpact | TabulatedImpact:
-    """Return what an impact does at a set of values: the model's law, or the table of its contact."""
-    if problem.model != "contact":
-        return LawImpact(problem.law(values))
-    chosen = {name: value for name, value in problem.known(values).items() if name in problem.own}
-    contact = Contact.paper(effects=problem.effects, **(measurement.contact | chosen))
-    return tabulated(contact, measurement.cantilever.mass_ng)
-
-
 def _impact_and_slopes(values: Float[Array, " p"], measurement: Measurement, problem: Problem) -> tuple[Any, Any]:
     """Return the impact, and its derivatives by each parameter along a first axis."""
 
@@ -181,60 +196,8 @@ def _impact_and_slopes(values: Float[Array, " p"], measurement: Measurement, pro
     return impact_of(values, measurement, problem), jax.vmap(lambda e: turned(e)[1])(jnp.eye(values.shape[0]))
 
 
-def orbit_problem(
-    values: Float[Array, " p"],
-    impact: LawImpact | TabulatedImpact,
-    row: Rows,
-    measurement: Measurement,
-    problem: Problem,
-) -> OrbitProblem | LastingProblem:
-    """Return the orbit's scene of one row at a set of values, for the impact that these stand for."""
-    cantilever = problem.cantilever(values, measurement.cantilever)
-    platform = Platform(
-        row.drive_amplitude_nm * problem.nuisance(values, "drive_calibration", 1.0),
-        row.drive_frequency_khz,
-        row.offset_nm + problem.nuisance(values, "offset_origin_nm", 0.0),
-    )
-    if isinstance(impact, LawImpact) and not problem.lasting:
-        return OrbitProblem(cantilever, platform, impact.law, row.order)
-    return LastingProblem(cantilever, platform, impact, row.order)
-
-
-def branch_of(orbit: OrbitProblem | LastingProblem, row: Rows) -> _Branch:
-    """Choose among a row's steady orbits; no derivatives.
-
-    There can be several: the one that explains the measured amplitudes best counts. A row without any is predicted as
-    0, which misses the measurement by all of it: a fixed penalty.
-    """
-    roots = steady_lasting_orbits(orbit) if isinstance(orbit, LastingProblem) else steady_orbits(orbit)
-    misfit = jnp.where(row.measured, (roots.amplitude_nm - row.amplitude_nm) / row.error_nm, 0.0)
-    slot = jnp.argmin(jnp.where(roots.steady, jnp.sum(misfit**2, axis=1), jnp.inf))
-    return _Branch(
-        coordinate=roots.coordinate[slot],
-        exists=roots.steady[slot],
-        orbits=jnp.sum(roots.steady, dtype=jnp.int32),
-        near_fold=roots.steady[slot] & roots.near_double[slot],
-    )
-
-
-def _followed(orbit: OrbitProblem | LastingProblem, start: Float[Array, ""]) -> _Branch:
-    """Follow a row's orbit from its coordinate at other parameters; NaN: there was none."""
-    if not isinstance(orbit, LastingProblem):
-        raise TypeError("instantaneous impacts are searched for every time: that costs no more")
-    there = jnp.isfinite(start)
-    harmless = orbit.impact.lowest + 2.0 * jnp.maximum(orbit.platform.top_speed_nm_per_us, orbit.impact.reach)
-    root = follow_lasting_root(jnp.where(there, start, harmless), orbit)
-    exists = there & root.found
-    return _Branch(
-        coordinate=jnp.where(exists, root.coordinate, harmless),
-        exists=exists,
-        orbits=exists.astype(jnp.int32),
-        near_fold=exists & near_fold(root.coordinate, orbit),
-    )
-
-
 def _prediction(
-    branch: _Branch, values: Float[Array, " p"], orbit: OrbitProblem | LastingProblem, problem: Problem
+    branch: Branch, values: Float[Array, " p"], orbit: OrbitProblem | LastingProblem, problem: Problem
 ) -> Prediction:
     if isinstance(orbit, LastingProblem):
         amplitude = lasting_amplitudes(branch.coordinate, orbit)[:2]

@@ -25,10 +25,10 @@ from afm_jax.impact.orbit_state import amplitudes, orbit_state
 from afm_jax.impact.poincare import NEAR_GRAZING
 from afm_jax.parameters import require_float64
 from fitting.contact_values import check_contact_values
-from fitting.forward import branch_of, impact_of, orbit_problem
 from fitting.measurement import ROWS_PER_PROGRAM, Measurement, Rows, measurement_of
 from fitting.models import CONTACT_NAMES, NUISANCE_NAMES, Problem, model_parameters
 from fitting.parameters import PARAMETERS
+from fitting.row_orbits import branch_of, impact_of, orbit_problem
 from fitting.table import AmplitudeTable
 
 _LOOKS = 512

@@ -32,7 +32,7 @@ class _Side:
 
     index: int
     direction: float
-    others: Float[np.ndarray, " p"]  # optimiser coordinates; the profiled one is not used
+    others: Float[np.ndarray, " p"]  # places (`_Places`); the profiled one is not used
     inside: float = 0.0  # distance in errors that lies inside the interval
     outside: float = np.inf
     trial: float = _FIRST_TRIAL
@@ -98,12 +98,12 @@ def _advance(objective: Objective, sides: list[_Side], values, errors, chi2: flo
 
 
 def _followers(objective: Objective, values, covariance, index: int, direction: float) -> Float[np.ndarray, " p"]:
-    """Return where the other parameters go, to first order, when one moves to its first trial (coordinates)."""
+    """Return where the other parameters go, to first order, when one moves to its first trial (places)."""
     variance = covariance[index, index]
     shift = direction * _FIRST_TRIAL * covariance[:, index] / np.sqrt(variance) if variance > 0.0 else 0.0
     parameters = objective.problem.parameters
     guess = np.clip(values + shift, [p.lowest for p in parameters], [p.highest for p in parameters])
-    return objective.problem.coordinates(np.where(np.isfinite(guess), guess, values))
+    return _Places(objective).of_values(np.where(np.isfinite(guess), guess, values))
 
 
 def _target(side: _Side, objective: Objective, values, errors) -> float:
@@ -112,47 +112,73 @@ def _target(side: _Side, objective: Objective, values, errors) -> float:
     return float(np.clip(target, parameter.lowest, parameter.highest))
 
 
+class _Places:
+    """Where the minimisation over the other parameters moves: a loss by its value, the others by their coordinates.
+
+    The coordinate of a loss is a root, in which a loss of 0 never grows again: there its derivative vanishes. By value
+    it lies between bounds, at which it is held as long as chi2 falls outward.
+    """
+
+    def __init__(self, objective: Objective):
+        self.objective, parameters = objective, objective.problem.parameters
+        self.by_value = np.array([parameter.sign != 0 for parameter in parameters])
+        self.lowest = np.array([p.lowest if p.sign else -np.inf for p in parameters])
+        self.highest = np.array([p.highest if p.sign else np.inf for p in parameters])
+
+    def of_values(self, values: Float[np.ndarray, "... p"]) -> Float[np.ndarray, "... p"]:
+        return np.where(self.by_value, values, self.objective.problem.coordinates(values))
+
+    def linearise(self, places: Float[np.ndarray, "sets p"]) -> tuple[Float[np.ndarray, "..."], ...]:
+        """Return chi2, the residuals and their Jacobian by the places."""
+        problem = self.objective.problem
+        columns = zip(problem.parameters, np.moveaxis(places, -1, 0), strict=True)
+        coordinates = np.stack([p.to_coordinate(place) if p.sign else place for p, place in columns], axis=-1)
+        known, slopes = problem.values_and_slopes(coordinates)
+        result = self.objective.at_values(np.where(self.by_value, places, known))
+        residual, jacobian = np.asarray(result.residual), np.asarray(result.jacobian)
+        return np.sum(residual**2, axis=1), residual, jacobian * np.where(self.by_value, 1.0, slopes)[:, None, :]
+
+    def moved(self, places, residual, jacobian, free, damping) -> Float[np.ndarray, " p"]:
+        """Return the places after a damped Gauss-Newton step, the held ones and those without effect unchanged."""
+        gradient = jacobian.T @ residual
+        outward = ((places <= self.lowest) & (gradient >= 0.0)) | ((places >= self.highest) & (gradient <= 0.0))
+        normal = jacobian.T @ jacobian
+        diagonal = np.diag(normal).copy()
+        held = ~free | (diagonal == 0.0) | outward
+        normal[held, :] = normal[:, held] = 0.0
+        normal[np.diag_indices_from(normal)] = np.where(held, 1.0, diagonal * (1.0 + damping))
+        step = np.where(held, 0.0, -np.linalg.solve(normal, np.where(held, 0.0, gradient)))
+        return np.clip(places + step, self.lowest, self.highest)
+
+
 def _minimise_others(objective: Objective, sides: list[_Side], targets):
     """Minimise chi2 over the parameters that are not profiled, by damped Gauss-Newton steps, on all sides at once."""
-    problem = objective.problem
-    y = np.array([side.others for side in sides])
+    places = _Places(objective)
+    z = np.array([side.others for side in sides])
     index = np.array([side.index for side in sides])
-    rows = np.arange(len(sides))
-    free = np.ones_like(y, dtype=bool)
-    free[rows, index] = False
-
-    def evaluate(coordinates):
-        held = coordinates.copy()
-        held[rows, index] = [
-            problem.parameters[k].to_coordinate(np.asarray(t)) for k, t in zip(index, targets, strict=True)
-        ]
-        residual, jacobian = objective.linearise(held)
-        return np.sum(residual**2, axis=1), residual, jacobian * free[:, None, :]
-
-    chi2, residual, jacobian = evaluate(y)
+    lanes = np.arange(len(sides))
+    free = np.ones_like(z, dtype=bool)
+    free[lanes, index] = False
+    parameters = objective.problem.parameters
+    z[lanes, index] = [
+        t if parameters[k].sign else parameters[k].to_coordinate(np.asarray(t))
+        for k, t in zip(index, targets, strict=True)
+    ]
+    chi2, residual, jacobian = places.linearise(z)
     damping = np.full(len(sides), 1e-6)
-    for _ in range(_INNER_STEPS if y.shape[1] > 1 else 0):
-        step = np.array([_step(*lane) for lane in zip(residual, jacobian, free, damping, strict=True)])
-        new_chi2, new_residual, new_jacobian = evaluate(y + step)
+    for _ in range(_INNER_STEPS if z.shape[1] > 1 else 0):
+        trial = np.array([places.moved(*lane) for lane in zip(z, residual, jacobian, free, damping, strict=True)])
+        new_chi2, new_residual, new_jacobian = places.linearise(trial)
         better = new_chi2 <= chi2
         gain = np.where(better, chi2 - new_chi2, 0.0)
-        y = np.where(better[:, None], y + step, y)
+        z = np.where(better[:, None], trial, z)
         residual = np.where(better[:, None], new_residual, residual)
         jacobian = np.where(better[:, None, None], new_jacobian, jacobian)
         chi2 = np.where(better, new_chi2, chi2)
         damping = np.where(better, 0.1 * damping, np.maximum(30.0 * damping, 1e-4))
         if np.all((gain < 1e-4) & (better | (damping > 1e6))):
             break
-    return chi2, y
-
-
-def _step(residual, jacobian, free, damping) -> Float[np.ndarray, " p"]:
-    """Return a damped Gauss-Newton step; the profiled parameter and directions without effect stay."""
-    normal = jacobian.T @ jacobian
-    diagonal = np.diag(normal).copy()
-    held = ~free | (diagonal == 0.0)
-    normal[np.diag_indices_from(normal)] = np.where(held, 1.0, diagonal * (1.0 + damping))
-    return np.where(held, 0.0, -np.linalg.solve(normal, jacobian.T @ residual))
+    return chi2, z
 
 
 def _interval(sides: list[_Side], index: int) -> Interval:

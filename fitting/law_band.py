@@ -8,10 +8,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from afm_jax.impact.lasting_impact import LawImpact
-from fitting.forward import impact_of
 from fitting.measurement import Measurement
 from fitting.models import Problem
 from fitting.result import FittedLaw
+from fitting.row_orbits import impact_of
 
 _POINTS = 121
 _TWO_SIDED_95 = 1.959963984540054

@@ -12,6 +12,7 @@ from fitting.optimise import BATCH, PLAIN, SOFT, Objective, polish
 from fitting.starts import starts
 
 _ROUNDS = 4
+_STEPS_PER_SEARCH = 15
 _ROUGH, _FINE = 1e-2, 1e-10
 """Estimated distances to the minimum at which the soft and the plain polish stop."""
 
@@ -42,10 +43,18 @@ def minimise(objective: Objective) -> Minimum:
     points = starts(objective.problem, objective.measurement)
     scout = _thinned(objective) if objective.problem.lasting else objective
     best = np.argsort(scout.screen(points), kind="stable")[:BATCH]
-    soft = polish(scout, objective.problem.coordinates(points[best]), SOFT, settled=_ROUGH)
+    first = objective.problem.coordinates(points[best])
     if not objective.problem.lasting:
-        return _polished(objective, soft.coordinates, points[best])
-    return settle(objective, _whole(objective, soft.coordinates, points[best]))
+        return _polished(objective, polish(scout, first, SOFT, settled=_ROUGH).coordinates, points[best])
+    return settle(objective, _whole(objective, _scouted(scout, first), points[best]))
+
+
+def _scouted(scout: Objective, coordinates: Float[np.ndarray, "starts p"]) -> Float[np.ndarray, "starts p"]:
+    """Polish every start softly: orbits are followed, and searched for again now and then, for they come and go."""
+    for _ in range(_ROUNDS):
+        follower = scout.following_each(scout.problem.values(coordinates))
+        coordinates = polish(follower, coordinates, SOFT, settled=_ROUGH, most=_STEPS_PER_SEARCH).coordinates
+    return coordinates
 
 
 def _whole(

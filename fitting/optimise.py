@@ -51,7 +51,7 @@ class Objective:
         measurement: Measurement,
         problem: Problem,
         *,
-        near: Float[np.ndarray, " rows"] | None = None,
+        near: Float[np.ndarray, " rows"] | Float[np.ndarray, "sets rows"] | None = None,
         robust: bool = False,
     ):
         """Keep what every evaluation shares.
@@ -59,7 +59,8 @@ class Objective:
         Args:
             measurement: what predictions are compared with.
             problem: the model.
-            near: coordinates of the rows' orbits from which they are followed; None: searched for.
+            near: coordinates of the rows' orbits from which they are followed, the same for every set of values or
+                each set's own; None: searched for.
             robust: let outliers count linearly, everywhere: residuals are then such that their squares add up to the
                 soft objective.
         """
@@ -67,10 +68,17 @@ class Objective:
 
     def following(self, values: Float[np.ndarray, " p"]) -> "Objective":
         """Return the same objective with the orbits followed from those at a set of values; only if impacts last."""
+        follower = self.following_each(values[None])
+        if follower.near is None:
+            return self
+        return Objective(self.measurement, self.problem, near=follower.near[0], robust=self.robust)
+
+    def following_each(self, values: Float[np.ndarray, "sets p"]) -> "Objective":
+        """Return the same objective for as many sets of values, each set's orbits followed from those at its values."""
         if not self.problem.lasting:
             return self
-        found = self.searching().at_values(values[None]).prediction
-        near = np.where(np.asarray(found.orbits)[0] > 0, np.asarray(found.coordinate)[0], np.nan)
+        found = self.searching().at_values(values).prediction
+        near = np.where(np.asarray(found.orbits) > 0, np.asarray(found.coordinate), np.nan)
         return Objective(self.measurement, self.problem, near=near, robust=self.robust)
 
     def searching(self) -> "Objective":
@@ -138,7 +146,14 @@ class Objective:
         return axes / np.sqrt(np.maximum(curvature, 1e-8 * largest))[:, None, :]
 
 
-def polish(objective: Objective, starts: Float[np.ndarray, "starts p"], softness: float, *, settled: float) -> Polished:
+def polish(
+    objective: Objective,
+    starts: Float[np.ndarray, "starts p"],
+    softness: float,
+    *,
+    settled: float,
+    most: int = _MAX_STEPS,
+) -> Polished:
     """Minimise from every start at once by optax's L-BFGS, steps halved until they descend (Armijo).
 
     Args:
@@ -146,6 +161,7 @@ def polish(objective: Objective, starts: Float[np.ndarray, "starts p"], softness
         starts: optimiser coordinates, at most `BATCH` of them.
         softness: residual in errors beyond which rows count linearly; `PLAIN` for least squares.
         settled: estimated distance of the objective to its minimum at which a start is done.
+        most: steps at most.
     """
     scale = objective.scale(starts)
 
@@ -159,7 +175,7 @@ def polish(objective: Objective, starts: Float[np.ndarray, "starts p"], softness
     step, state = _lbfgs(gradient, None, z)
     step, share = _descending(step, gradient), np.ones(len(z))
     count = 0
-    while count < _MAX_STEPS and np.any((_squared(gradient) > settled) & (share > 1e-9)):
+    while count < most and np.any((_squared(gradient) > settled) & (share > 1e-9)):
         count += 1
         trial = z + share[:, None] * step
         new_value, new_gradient = evaluate(trial)

@@ -4,7 +4,6 @@ import inspect
 
 import numpy as np
 from jaxtyping import Float
-from scipy.stats import qmc
 
 from afm_jax.contact.contact import Contact
 from afm_jax.units import RAD_PER_US_PER_KHZ
@@ -30,6 +29,9 @@ def starts(problem: Problem, measurement: Measurement) -> Float[np.ndarray, "poi
         mesh = np.meshgrid(*(ranges[name](np.linspace(0.0, 1.0, count)) for name in own), indexing="ij")
         columns = {name: axis.ravel() for name, axis in zip(own, mesh, strict=True)}
     else:
+        # takes a second to import
+        from scipy.stats import qmc  # noqa: PLC0415
+
         places = qmc.Sobol(len(own), scramble=False).random_base2(_SPREAD_BITS) + 0.5**_SPREAD_BITS / 2.0
         columns = {name: ranges[name](place) for name, place in zip(own, places.T, strict=True)}
     count = len(columns[own[0]])

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fitting.forward import Linearised, impact_of
+from fitting.forward import Linearised
 from fitting.optimise import Objective
+from fitting.row_orbits import impact_of
 
 BASE, GROWTH, SLOW = 0.0005, 0.012, 0.016
 """Relative model error of fast impacts, its growth with s^3, and its value at 1.5 times the capture speed."""

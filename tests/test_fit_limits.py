@@ -11,10 +11,10 @@ import fitting.forward
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbit_state import SteadyOrbits
 from fitting import fit, read_table
-from fitting.forward import branch_of, impact_of, orbit_problem
 from fitting.law_fit import problem_of
 from fitting.measurement import Rows, measurement_of
 from fitting.optimise import Objective
+from fitting.row_orbits import branch_of, impact_of, orbit_problem
 from fitting.table import AmplitudeTable
 from tests.fit_tables import (
     EXAMPLE,

@@ -1,7 +1,10 @@
 """Profile intervals of a linear model, where they are known in closed form."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
+from scipy.optimize import brentq
 
 from fitting.intervals import profile_intervals
 from fitting.models import Problem
@@ -18,13 +21,15 @@ class LinearObjective(Objective):
         self.problem = Problem("law", ("r", "epsilon"))
         self.design, self.centre = design, centre
 
-    def linearise(self, coordinates):
-        """Return residuals and their Jacobian by the coordinates."""
-        values, slopes = self.problem.values_and_slopes(coordinates)
+    def at_values(self, values):
+        """Return residuals and their Jacobian by the values."""
         residual = (values - self.centre) @ self.design.T
-        constant = np.full((len(values), 1), 1.5)
-        jacobian = self.design[None] * slopes[:, None, :]
-        return np.hstack([residual, constant]), np.concatenate([jacobian, np.zeros((len(values), 1, 2))], axis=1)
+        jacobian = np.broadcast_to(self.design, (len(values), 2, 2))
+        nothing = np.zeros((len(values), 1))
+        return SimpleNamespace(
+            residual=np.hstack([residual, nothing + 1.5]),
+            jacobian=np.concatenate([jacobian, np.zeros((len(values), 1, 2))], axis=1),
+        )
 
 
 def intervals_of(errors: tuple[float, float], correlation: float, centre: np.ndarray):
@@ -61,3 +66,33 @@ def test_parameters_that_the_data_do_not_determine_have_no_interval():
     assert (first.low, first.high) == (None, None)
     assert first.reason == "the data do not determine this parameter"
     assert second.high == pytest.approx(120.0 + QUANTILE, abs=1e-3)
+
+
+@pytest.mark.parametrize("correlation", [0.9, -0.9])
+def test_a_loss_that_vanishes_at_the_minimum_grows_again_where_it_has_to(correlation):
+    # without its bound epsilon would be negative: the minimum lies at 0, and leaves it on one side of r
+    errors, free_minimum = np.array([0.01, 3.0]), np.array([0.8, -2.0])
+    scaled = np.array([[1.0, correlation], [correlation, 1.0]])
+    covariance = scaled * np.outer(errors, errors)
+    fisher = np.linalg.inv(covariance)
+
+    def chi2(r):
+        """Return the minimum over epsilon >= 0, which a parabola has in closed form."""
+        apart = r - free_minimum[0]
+        epsilon = max(free_minimum[1] - fisher[0, 1] / fisher[1, 1] * apart, 0.0)
+        shift = np.array([apart, epsilon - free_minimum[1]])
+        return shift @ fisher @ shift
+
+    best_r = free_minimum[0] + fisher[0, 1] / fisher[0, 0] * free_minimum[1]
+    minimum = chi2(best_r)
+    objective = LinearObjective(np.linalg.cholesky(fisher).T, free_minimum)
+    found, loss = profile_intervals(objective, np.array([best_r, 0.0]), covariance, minimum + 1.5**2)
+
+    def beyond(r):
+        return chi2(r) - minimum - QUANTILE**2
+
+    # within 1e-3 of the rise of chi2, 5e-4 of the distance
+    assert found.low == pytest.approx(brentq(beyond, best_r - 0.1, best_r), abs=2e-5)
+    assert found.high == pytest.approx(brentq(beyond, best_r, best_r + 0.1), abs=2e-5)
+    assert loss.low is None
+    assert loss.high is not None

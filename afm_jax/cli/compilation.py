@@ -1,7 +1,8 @@
 """JAX for the command line: 64-bit floats, and compiled programs kept from one call to the next.
 
-A short command is mostly compilation. JAX keys its cache by program and version, but not by all that a processor can
-do, and a home folder may be shared by different machines: so every kind of processor has a folder of its own.
+A short command is mostly compilation and tracing. JAX keys its cache by program and version, but not by all that a
+processor can do, and a home folder may be shared by different machines: so every kind of processor has a folder of its
+own.
 """
 
 import hashlib
@@ -14,17 +15,22 @@ from pathlib import Path
 
 import jax
 
+from afm_jax.stored_program import keep_programs
+
 
 def start_jax() -> None:
     """Switch 64-bit floats on and, unless the user has set one, the compilation cache in the user's cache folder."""
     jax.config.update("jax_enable_x64", True)  # noqa: FBT003
     names = ("jax_enable_compilation_cache", "jax_compilation_cache_dir")
     enabled, chosen_by_user = (getattr(jax.config, name) for name in names)
+    if enabled and chosen_by_user is not None and chosen_by_user == os.environ.get("JAX_COMPILATION_CACHE_DIR"):
+        keep_programs(Path(chosen_by_user) / "traced")
     if not enabled or chosen_by_user is not None:
         return
     folder = user_cache_folder() / f"jax-{jax.__version__}-{processor_key()}"
     if not _is_writable(folder):
         return
+    keep_programs(folder / "traced")
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)

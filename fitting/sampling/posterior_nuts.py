@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fitting.forward import linearise_pairs
+from fitting.forward import impacts_of, linearise_pairs, located
 from fitting.optimise import ROBUST
+from fitting.row_orbits import branch_near
 from fitting.sampling.posterior_result import Posterior, PosteriorChains, posterior_of_chains
 from fitting.sampling.posterior_space import Space, space_around
 from fitting.sampling.refit import Refit, standard_covariance
@@ -72,7 +73,9 @@ def log_density_of(refit: Refit, space: Space):
     robust = refit.objective.robust
 
     def evaluate(values: Float[Array, " p"]) -> tuple[Float[Array, ""], Float[Array, " p"]]:
-        block = linearise_pairs(values[None], lanes, measurement, problem, near)
+        impacts = impacts_of(values[None], measurement, problem)
+        branch = located(values[None], impacts, lanes, measurement, problem) if near is None else branch_near(near)
+        block = linearise_pairs(values[None], impacts, lanes, measurement, problem, branch)
         pull = (values - measurement.constraint_value) / measurement.constraint_error
         residual = jnp.concatenate([block.misfit.ravel(), block.unseen, pull])
         half, weight = _half_loss(residual, robust=robust)

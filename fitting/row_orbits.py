@@ -1,0 +1,92 @@
+"""The orbit that a row of a table is taken to be on: its scene, and which of its steady motions was measured."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from afm_jax.apparatus.platform import Platform
+from afm_jax.contact.contact import Contact
+from afm_jax.impact.lasting_closure import LastingProblem
+from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact
+from afm_jax.impact.lasting_orbits import near_fold, steady_lasting_orbits
+from afm_jax.impact.lasting_search import follow_lasting_root
+from afm_jax.impact.orbit_closure import OrbitProblem
+from afm_jax.impact.orbit_state import steady_orbits
+from fitting.contact_table import tabulated
+from fitting.measurement import Measurement, Rows
+from fitting.models import Problem
+
+
+class Branch(NamedTuple):
+    """The orbit that a row is taken to be on: its coordinate, whether there is one, and how many there are."""
+
+    coordinate: Float[Array, ""]
+    exists: Bool[Array, ""]
+    orbits: Int[Array, ""]
+    near_fold: Bool[Array, ""]
+
+
+def impact_of(values: Float[Array, " p"], measurement: Measurement, problem: Problem) -> LawImpact | TabulatedImpact:
+    """Return what an impact does at a set of values: the model's law, or the table of its contact."""
+    if problem.model != "contact":
+        return LawImpact(problem.law(values))
+    chosen = {name: value for name, value in problem.known(values).items() if name in problem.own}
+    contact = Contact.paper(effects=problem.effects, **(measurement.contact | chosen))
+    return tabulated(contact, measurement.cantilever.mass_ng)
+
+
+def orbit_problem(
+    values: Float[Array, " p"],
+    impact: LawImpact | TabulatedImpact,
+    row: Rows,
+    measurement: Measurement,
+    problem: Problem,
+) -> OrbitProblem | LastingProblem:
+    """Return the orbit's scene of one row at a set of values, for the impact that these stand for."""
+    cantilever = problem.cantilever(values, measurement.cantilever)
+    platform = Platform(
+        row.drive_amplitude_nm * problem.nuisance(values, "drive_calibration", 1.0),
+        row.drive_frequency_khz,
+        row.offset_nm + problem.nuisance(values, "offset_origin_nm", 0.0),
+    )
+    if isinstance(impact, LawImpact) and not problem.lasting:
+        return OrbitProblem(cantilever, platform, impact.law, row.order)
+    return LastingProblem(cantilever, platform, impact, row.order)
+
+
+def branch_of(orbit: OrbitProblem | LastingProblem, row: Rows) -> Branch:
+    """Choose among a row's steady orbits; no derivatives.
+
+    There can be several: the one that explains the measured amplitudes best counts. A row without any is predicted as
+    0, which misses the measurement by all of it: a fixed penalty.
+    """
+    roots = steady_lasting_orbits(orbit) if isinstance(orbit, LastingProblem) else steady_orbits(orbit)
+    misfit = jnp.where(row.measured, (roots.amplitude_nm - row.amplitude_nm) / row.error_nm, 0.0)
+    slot = jnp.argmin(jnp.where(roots.steady, jnp.sum(misfit**2, axis=1), jnp.inf))
+    return Branch(
+        coordinate=roots.coordinate[slot],
+        exists=roots.steady[slot],
+        orbits=jnp.sum(roots.steady, dtype=jnp.int32),
+        near_fold=roots.steady[slot] & roots.near_double[slot],
+    )
+
+
+def followed(orbit: LastingProblem, known: Branch) -> Branch:
+    """Follow a row's orbit from where it is known to be: exact where it was found, close at other parameters."""
+    harmless = orbit.impact.lowest + 2.0 * jnp.maximum(orbit.platform.top_speed_nm_per_us, orbit.impact.reach)
+    root = follow_lasting_root(jnp.where(known.exists, known.coordinate, harmless), orbit)
+    exists = known.exists & root.found
+    return Branch(
+        coordinate=jnp.where(exists, root.coordinate, harmless),
+        exists=exists,
+        orbits=jnp.where(exists, known.orbits, 0),
+        near_fold=exists & near_fold(root.coordinate, orbit),
+    )
+
+
+def branch_near(coordinate: Float[np.ndarray, " lanes"] | Float[Array, " lanes"]) -> Branch:
+    """Return orbits that are taken to be near coordinates; NaN: there is none."""
+    there = jnp.isfinite(coordinate)
+    return Branch(jnp.asarray(coordinate), there, there.astype(jnp.int32), jnp.zeros_like(there))
