@@ -57,7 +57,7 @@ def linearise(
     values: Float[np.ndarray, "sets p"],
     measurement: Measurement,
     problem: Problem,
-    near: Float[np.ndarray, " rows"] | None = None,
+    near: Float[np.ndarray, " rows"] | Float[np.ndarray, "sets rows"] | None = None,
 ) -> Linearised:
     """Return residuals, their Jacobian (forward mode through the implicit roots) and predictions for several sets.
 

@@ -92,13 +92,19 @@ class Objective:
 
     def at_values(self, values: Float[np.ndarray, "sets p"]) -> Linearised:
         """Return the linearised model at parameter values, as NumPy arrays."""
-        batches = [values[i : i + BATCH] for i in range(0, len(values), BATCH)]
-        parts = [linearise(batch, self.measurement, self.problem, self.near) for batch in batches]
+        parts = [
+            linearise(values[i : i + BATCH], self.measurement, self.problem, self._near(slice(i, i + BATCH)))
+            for i in range(0, len(values), BATCH)
+        ]
         result: Linearised = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts) if parts[1:] else parts[0]
         if not self.robust:
             return result
         softened, slope = _softened(np.asarray(result.residual))
         return result._replace(residual=softened, jacobian=np.asarray(result.jacobian) * slope[:, :, None])
+
+    def _near(self, sets: slice) -> Float[np.ndarray, "..."] | None:
+        """Return where the orbits of some of the sets are followed from."""
+        return self.near[sets] if self.near is not None and self.near.ndim > 1 else self.near
 
     def amplitude_residuals(self, values: Float[np.ndarray, " p"]) -> Float[np.ndarray, "rows 2"]:
         """Return the residuals of the amplitudes at one set of values, as they are."""

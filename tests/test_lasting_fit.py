@@ -58,6 +58,7 @@ def amplitude_chi2(table: AmplitudeTable) -> tuple[np.ndarray, Any]:
     return objective.amplitude_residuals(values)[: table.rows] ** 2, used
 
 
+@pytest.mark.slow
 def test_the_papers_contact_predicts_the_tables_of_two_programs(shared):
     for table, aside in ((shared, 3), (read_table(EXAMPLE), 3)):
         square, used = amplitude_chi2(table)
@@ -96,6 +97,20 @@ def test_rows_set_aside_are_named(viscous, shared):
     assert np.nanmax(viscous.rows.approach_speed_nm_per_us[aside]) < 3.0 * slowest
     used = np.isfinite(viscous.rows.residual).sum()
     assert viscous.degrees_of_freedom == used - len(viscous.parameters)
+
+
+def test_followed_orbits_are_those_that_a_search_finds(viscous, shared):
+    problem = problem_of(shared, "viscous+delay")
+    found = np.array([viscous.parameters[name].value for name in problem.names])
+    # more sets than one program takes, each with orbits of its own
+    values = found * np.linspace(0.97, 1.03, 11)[:, None]
+    objective = Objective(measurement_of(shared, problem), problem)
+    searched = objective.at_values(values)
+    followed = objective.following_each(values).at_values(values)
+    np.testing.assert_allclose(followed.residual, searched.residual, rtol=1e-9, atol=1e-9)
+    # from orbits a hundredth away the same are reached
+    nearby = objective.following_each(values * 1.003).at_values(values)
+    np.testing.assert_allclose(nearby.residual, searched.residual, rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.slow
