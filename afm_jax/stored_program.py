@@ -28,56 +28,59 @@ from jax.core import Tracer
 _KEPT = 4
 """Versions of the sources whose programs are kept."""
 _CONFIGURATION = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_precision", "jax_debug_nans")
+_ARRAYS = (np.ndarray, np.generic, jax.Array)
+_OURS = {"afm_jax", "fitting", "builtins", "collections"}
 _PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax", "numpy")
 
 
 class StoredProgram:
-    """A jitted function of positional arguments whose traced programs outlive the process."""
+    """A jitted function whose traced programs outlive the process."""
 
-    def __init__(self, function: Callable[..., Any], static: str | None = None):
+    def __init__(self, function: Callable[..., Any], *static: str):
         """Wrap a function.
 
         Args:
             function: of arrays and trees of them, and returning them.
-            static: the name of one argument that shapes the program: hashable, with a `repr` that says all of it.
+            static: names of the arguments that shape the program: hashable, with a `repr` that says all of them.
         """
         functools.update_wrapper(self, function)
-        names = list(inspect.signature(function).parameters)
-        self._function = function
-        self._static = None if static is None else names.index(static)
-        self._plain = jax.jit(function, static_argnums=self._static)
+        self._function, self._static = function, static
+        self._signature = inspect.signature(function)
+        self._plain = jax.jit(function, static_argnames=static)
         self._programs: dict[Any, Callable[..., Any] | None] = {}
 
-    def __call__(self, *arguments: Any) -> Any:
+    def __call__(self, *arguments: Any, **named: Any) -> Any:
         """Return the function's value."""
         folder = _folder()
-        static, dynamic = self._split(arguments)
-        leaves, tree = jax.tree.flatten(dynamic)
-        if folder is None or not all(isinstance(leaf, (np.ndarray, np.generic, jax.Array)) for leaf in leaves):
-            return self._plain(*arguments)
-        if any(isinstance(leaf, Tracer) for leaf in leaves):
-            return self._plain(*arguments)
+        if folder is None:
+            return self._plain(*arguments, **named)
+        bound = self._signature.bind(*arguments, **named)
+        bound.apply_defaults()
+        static = tuple((name, bound.arguments.pop(name)) for name in self._static)
+        leaves, tree = jax.tree.flatten(dict(bound.arguments))
+        if any(isinstance(leaf, Tracer) or not isinstance(leaf, _ARRAYS) for leaf in leaves):
+            return self._plain(*arguments, **named)
         shapes = tuple((leaf.shape, str(leaf.dtype), bool(getattr(leaf, "weak_type", False))) for leaf in leaves)
         key = (static, tree, shapes, *(getattr(jax.config, name) for name in _CONFIGURATION))
         if key not in self._programs:
             self._programs[key] = self._program(folder, static, tree, shapes)
         program = self._programs[key]
-        return self._plain(*arguments) if program is None else program(leaves)
+        return self._plain(*arguments, **named) if program is None else program(leaves)
 
-    def trace(self, *arguments: Any) -> Any:
-        """Return the traced function, as `jax.jit` does."""
-        return self._plain.trace(*arguments)
+    def lower(self, *arguments: Any, **named: Any) -> Any:
+        """Return the lowered function, as `jax.jit` does."""
+        return self._plain.lower(*arguments, **named)
 
-    def _split(self, arguments: tuple[Any, ...]) -> tuple[Any, tuple[Any, ...]]:
-        if self._static is None:
-            return None, arguments
-        return arguments[self._static], arguments[: self._static] + arguments[self._static + 1 :]
+    def _cache_size(self) -> int:
+        """Return how many programs were compiled where none is kept, as `jax.jit` does."""
+        return self._plain._cache_size()  # noqa: SLF001  # pyright: ignore[reportAttributeAccessIssue]
 
     def _program(self, folder: Path, static: Any, tree: Any, shapes: tuple[Any, ...]) -> Callable[..., Any] | None:
         """Return the program from its file, or a new one, which is written down; None: it has no name to keep it by."""
         described = f"{static!r} {tree}"
-        if " at 0x" in described:
-            # an object without a description of its own: its file would never be found again
+        # objects without a description of their own would never be found again; what other people's classes compute is
+        # not in the sources that are looked at
+        if " at 0x" in described or not _is_ours(tree):
             return None
         configuration = [getattr(jax.config, name) for name in _CONFIGURATION]
         text = f"{described} {shapes} {configuration} {jax.devices()}"
@@ -95,10 +98,9 @@ class StoredProgram:
         structures: list[Any] = []
 
         def flat(leaves):
-            dynamic = list(jax.tree.unflatten(tree, leaves))
-            if self._static is not None:
-                dynamic.insert(self._static, static)
-            results, structure = jax.tree.flatten(self._function(*dynamic))
+            bound = self._signature.bind_partial()
+            bound.arguments |= dict(static) | jax.tree.unflatten(tree, leaves)
+            results, structure = jax.tree.flatten(self._function(*bound.args, **bound.kwargs))
             structures.append(structure)
             return results
 
@@ -120,9 +122,16 @@ class _Kept(NamedTuple):
     skeleton: Any
 
 
-def stored(*, static: str | None = None) -> Callable[[Callable[..., Any]], StoredProgram]:
+def stored(*static: str) -> Callable[[Callable[..., Any]], StoredProgram]:
     """Return a decorator that makes a function a `StoredProgram`; `static` as there."""
-    return lambda function: StoredProgram(function, static)
+    return lambda function: StoredProgram(function, *static)
+
+
+def _is_ours(tree: Any) -> bool:
+    """Say whether a tree consists of containers and of classes of these packages."""
+    node = tree.node_data()
+    kind = type(None) if node is None else node[0]
+    return kind.__module__.partition(".")[0] in _OURS and all(_is_ours(child) for child in tree.children())
 
 
 def keep_programs(folder: Path | None) -> None:

@@ -119,13 +119,13 @@ class _Impacts(NamedTuple):
     slopes: LawImpact | TabulatedImpact
 
 
-@stored(static="problem")
+@stored("problem")
 def impacts_of(values: Float[Array, "sets p"], measurement: Measurement, problem: Problem) -> _Impacts:
     """Return the law, or the table of the contact, of several sets of values."""
     return _Impacts(*jax.vmap(lambda v: _impact_and_slopes(v, measurement, problem))(values))
 
 
-@stored(static="problem")
+@stored("problem")
 def located(
     values: Float[Array, "sets p"],
     impacts: _Impacts,
@@ -142,7 +142,7 @@ def located(
     return jax.vmap(one)(points, impact, measurement.rows)
 
 
-@stored(static="problem")
+@stored("problem")
 def linearise_pairs(
     values: Float[Array, "sets p"],
     impacts: _Impacts,

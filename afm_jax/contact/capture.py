@@ -14,6 +14,7 @@ from afm_jax.contact.junction import Junction, explain_missing_junction, find_ju
 from afm_jax.contact.turned import turn_in_bridge
 from afm_jax.impact.implicit import implicit_root
 from afm_jax.parameters import as_parameter, check_parameter, is_traced
+from afm_jax.stored_program import stored
 
 _POINTS = 64
 _ROUNDS = 9
@@ -40,7 +41,7 @@ def capture_speed(contact: Contact, mass_ng: ArrayLike = 1.0) -> Float[Array, ""
     return speed
 
 
-@jax.jit
+@stored()
 def _capture_speed(contact: Contact, mass: Float[Array, ""]) -> tuple[Array, Array]:
     junction = find_junction(contact)
     fixed = lax.stop_gradient((contact, junction, mass))

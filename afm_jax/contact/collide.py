@@ -1,7 +1,6 @@
 """Batches of collisions: many speeds, or many contacts, in blocks of flat memory."""
 
 from collections.abc import Callable
-from functools import partial
 from typing import Any
 
 import jax
@@ -17,6 +16,7 @@ from afm_jax.contact.junction import Junction, explain_missing_junction, find_ju
 from afm_jax.contact.turned import Turn, turn_in_bridge
 from afm_jax.outcome import CollisionOutcome
 from afm_jax.parameters import as_parameter, check_parameter, is_traced
+from afm_jax.stored_program import stored
 
 BLOCK = 512
 """Tips computed side by side: few enough to stay in the processor's cache."""
@@ -84,7 +84,7 @@ def _complain(contact: Contact, result: Collision) -> None:
         raise ValueError(f"the contact has no junction: {explain_missing_junction(contact)}")
 
 
-@partial(jax.jit, static_argnames="setting")
+@stored("setting")
 def _quick(
     contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."], setting: Setting
 ) -> tuple[Collision, Bool[Array, "..."]]:
@@ -103,7 +103,7 @@ def _quick(
     return _in_blocks(one, contact, mass, speeds)
 
 
-@jax.jit
+@stored()
 def _careful(contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."]) -> Collision:
     """Return the collisions of a batch in many steps, turning points in the bridge included."""
 

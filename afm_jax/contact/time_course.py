@@ -22,6 +22,7 @@ from afm_jax.contact.passage import Way, margin_of, way_through
 from afm_jax.contact.passage_collocation import nodes_along
 from afm_jax.contact.phases import Phase, force_in_phase
 from afm_jax.parameters import as_parameter, check_parameter
+from afm_jax.stored_program import stored
 
 _NODES = 64
 _SWEEPS = 12
@@ -79,7 +80,7 @@ def time_course(contact: Contact, approach_speed_nm_per_us: ArrayLike, mass_ng: 
     )
 
 
-@jax.jit
+@stored()
 def _course(
     contact: Contact, speed: Float[Array, ""], mass: Float[Array, ""]
 ) -> tuple[Junction, list[_Leg], Float[Array, "3"]]:
