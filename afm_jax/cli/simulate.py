@@ -1,6 +1,5 @@
 """`afm-jax simulate SCENE.toml|PRESET`: a scene in time, and what an experiment reads of it."""
 
-import importlib.util
 import math
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +20,6 @@ LARGEST_OFFSET_NM = 10_000.0
 """How far a ramp may take the sample from the tip's rest position, either way."""
 _PIECES_A_LINE = 8
 """Pieces of a long run between two lines on standard error."""
-_PICTURES = "afm_jax.plots.motion"
 
 
 class Harmonics(click.ParamType):
@@ -171,8 +169,10 @@ def _invalid_start() -> int:
 
 
 def _draw(session: Session, scene: "Scene", run: "LongRun") -> None:
-    """Draw pictures, where the module that does is there."""
-    if session.out is None or importlib.util.find_spec(_PICTURES) is None:
+    """Draw the pictures of a simulation."""
+    if session.out is None:
         return
-    for path in importlib.import_module(_PICTURES).draw_motion(scene, run.simulation, session.out):
+    from afm_jax.plots.motion import draw_motion  # noqa: PLC0415
+
+    for path in draw_motion(scene, run.simulation, session.out):
         session.note(f"wrote {path}")

@@ -9,15 +9,21 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.surface import Surface
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.junction import Junction
 from afm_jax.contact.phases import Phase, force_in_phase
 from afm_jax.motion.contact_path import places_at
 from afm_jax.motion.driven import Place
 from afm_jax.motion.frames import to_lab
 from afm_jax.motion.motion_pieces import FLIGHT, REST, Pieces, World, pieces_between
-from afm_jax.motion.record import Simulation
+from afm_jax.motion.record import Simulation, State
+from afm_jax.stored_program import stored
 
 _NODES_PER_STEP = 8
 _NODES_PER_PANEL = 16
@@ -56,23 +62,25 @@ class DensePath(NamedTuple):
         """
         wanted = np.asarray(times_us, float)
         _check(self.simulation, wanted)
-        times, world, pieces = wanted.reshape(-1), self.world, self.pieces
-        gap, rate, kind = np.zeros(times.shape), np.zeros(times.shape), np.full(times.shape, FLIGHT)
-        if times.size:
-            place = np.clip(np.searchsorted(pieces.begin_us, times, side="right") - 1, 0, None)
-            kind = pieces.kind[place]
-            for which, fill in ((kind == FLIGHT, _in_flight), (kind >= 0, _in_contact)):
-                if which.any():
-                    count = int(which.sum())
-                    found = fill(world, pieces, _padded(place[which]), _padded(times[which]))
-                    gap[which], rate[which] = (part[:count] for part in found)
-        lab = to_lab(world.surface, world.response, times, gap, rate)
+        if not wanted.size:
+            return Trajectory(wanted, *(np.zeros(wanted.shape, kind) for kind in (float,) * 4 + (int, float)))
+        times, world, pieces = _padded(wanted.reshape(-1)), self.world, self.pieces
+        place = np.clip(np.searchsorted(pieces.begin_us, times, side="right") - 1, 0, None)
+        kind = pieces.kind[place]
+        flown = _flown(world.cantilever, world.surface, *(part[place] for part in _starts(pieces)), times)
+        gap, rate = (np.where(kind == FLIGHT, np.asarray(part), 0.0) for part in flown)
+        touching = kind >= 0
+        if touching.any():
+            count = int(touching.sum())
+            found = _in_contact(world, pieces, _padded(place[touching]), _padded(times[touching]))
+            gap[touching], rate[touching] = (part[:count] for part in found)
         phase = np.where(kind == FLIGHT, int(Phase.DRY), np.where(kind == REST, int(Phase.JUNCTION), kind))
+        lab = _in_lab(world.surface, world.response, times, gap, rate)
         force = np.zeros(times.shape)
         if world.driven is not None:
-            force = np.asarray(force_in_phase(self.scene.interaction, world.driven.junction, phase, gap, rate))
+            force = _force(self.scene.interaction, world.driven.junction, phase, gap, rate)
         parts = (lab.position_nm, lab.velocity_nm_per_us, gap, rate, phase, force)
-        return Trajectory(wanted, *(np.asarray(part).reshape(wanted.shape) for part in parts))
+        return Trajectory(wanted, *(np.asarray(part)[: wanted.size].reshape(wanted.shape) for part in parts))
 
     def nodes(self, from_us: float, to_us: float) -> tuple[Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]:
         """Return times and weights in us between two times of the stretch, as `nodes` does."""
@@ -154,14 +162,47 @@ def _padded(values: np.ndarray) -> np.ndarray:
     return np.concatenate([values, np.repeat(values[-1:], size - values.size)])
 
 
-def _in_flight(world: World, pieces: Pieces, place: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return gap and gap rate at times within flights."""
-    origin = pieces.origin_us[place]
-    height, speed = world.surface.position_and_velocity(origin)
-    move = world.cantilever.propagator(times - origin)
-    position, velocity = move(pieces.x[place] + height, pieces.rate[place] + speed)
-    height, speed = world.surface.position_and_velocity(times)
-    return np.asarray(position - height), np.asarray(velocity - speed)
+def _starts(pieces: Pieces) -> tuple[np.ndarray, ...]:
+    """Return where flights begin: gap, gap rate and time."""
+    return pieces.x, pieces.rate, pieces.origin_us
+
+
+@stored()
+def _flown(
+    cantilever: Cantilever,
+    surface: Platform | Surface,
+    gap: Float[Array, " times"],
+    rate: Float[Array, " times"],
+    origin_us: Float[Array, " times"],
+    times_us: Float[Array, " times"],
+) -> tuple[Float[Array, " times"], Float[Array, " times"]]:
+    """Return gap and gap rate at times of flights that begin with a gap and a rate."""
+    height, speed = surface.position_and_velocity(origin_us)
+    position, velocity = cantilever.propagator(times_us - origin_us)(gap + height, rate + speed)
+    height, speed = surface.position_and_velocity(times_us)
+    return position - height, velocity - speed
+
+
+@stored()
+def _in_lab(
+    surface: Platform | Surface,
+    response: Surface | None,
+    times_us: Float[Array, " times"],
+    gap: Float[Array, " times"],
+    rate: Float[Array, " times"],
+) -> State:
+    return to_lab(surface, response, times_us, gap, rate)
+
+
+@stored()
+def _force(
+    contact: Contact,
+    junction: Junction,
+    phase: Int[Array, " times"],
+    gap: Float[Array, " times"],
+    rate: Float[Array, " times"],
+) -> Float[Array, " times"]:
+    return force_in_phase(contact, junction, phase, gap, rate)
 
 
 def _in_contact(world: World, pieces: Pieces, place: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
