@@ -1,226 +1,95 @@
-"""The quick way through a driven contact: through the bridge, the junction and out again, in fixed numbers of steps.
+"""The quick way through a driven contact: in through the bridge, through the junction, and out again, leg by leg.
 
-The gap is the variable in the bridge, with time as part of the state, so that thresholds are met without a search; the
-junction is crossed in fictitious time, with one step in the velocity to the turning point and one in s to the fold. It
-holds for a tip that goes straight in, forms the junction once and leaves straight. Where it does not (the tip turns in
-the bridge, or is slow somewhere), speeds become NaN or the embedded error estimates large: `holds` says so, and the
-caller goes the way in time.
+The gap is the variable in the bridge, s = sqrt(A) in the junction, so that thresholds are met without a search, and the
+speed follows from the energy: the static forces, which vary most, need no integration. A leg holds for a tip that goes
+straight on. One that turns in the bridge, or is slow somewhere, stays where the last leg that held has left it. It goes
+on from there in time, until it is where a leg begins again.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
-
-import diffrax
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool
 
-from afm_jax.contact.forces import jkr
-from afm_jax.contact.junction_way import mean_slope, turning_root
-from afm_jax.contact.passage import margin_of
-from afm_jax.contact.passage_collocation import nodes_along
-from afm_jax.contact.passage_steps import GRADING
-from afm_jax.motion.contact_settings import QuickSetting
+from afm_jax.contact.phases import Phase
+from afm_jax.motion.contact_bridge_leg import go_in, go_out
+from afm_jax.motion.contact_junction_leg import go_through_junction
+from afm_jax.motion.contact_leg import Leg
+from afm_jax.motion.contact_pace import junction_pace
+from afm_jax.motion.contact_settings import DrivenSetting, QuickSetting
+from afm_jax.motion.contact_step import Touch
 from afm_jax.motion.driven import Driven, Place
 
-_NODES = 6
-"""Gauss nodes of the estimate of how long the junction lasts."""
 
-
-class Crossing(NamedTuple):
-    """A contact crossed; arrays of the tips' shape."""
-
-    place: Place
-    """Where the bridge breaks."""
-    junction_forms_us: Float[Array, "..."]
-    junction_breaks_us: Float[Array, "..."]
-    time_in_junction_us: Float[Array, "..."]
-    deepest_gap_nm: Float[Array, "..."]
-    holds: Bool[Array, "..."]
-
-
-def cross(driven: Driven, place: Place, setting: QuickSetting) -> Crossing:
+def cross(driven: Driven, place: Place, setting: QuickSetting) -> Leg:
     """Return a tip beyond the contact that it has just begun.
 
     Args:
         driven: the equation of motion.
         place: where the bridge forms; the gap closes.
-        setting: numbers of steps.
+        setting: how finely.
     """
-    junction = driven.junction
-    square, time, loss_in, error_in = _bridge(
-        driven,
-        (driven.forms_nm, junction.forms_gap_nm),
-        place.gap_rate**2,
-        place.time_us,
-        setting.inward,
-        setting.solver,
-        inward=True,
-    )
-    solid, deepest, error = _junction(driven, jnp.sqrt(square), time, setting)
-    square_out, left, loss_out, error_out = _bridge(
-        driven,
-        (driven.breaks_nm, junction.breaks_gap_nm),
-        solid.gap_rate**2,
-        solid.time_us,
-        setting.outward,
-        setting.solver,
-        inward=False,
-    )
-    rate = jnp.sqrt(square_out)
-    loss = place.viscous_loss_aj + loss_in + loss_out
-    error = error_in + error + error_out
-    straight = (place.gap_rate < 0.0) & (solid.gap_rate > 0.0) & (junction.breaks_gap_nm < driven.breaks_nm)
-    return Crossing(
-        place=Place(driven.breaks_nm + jnp.zeros_like(rate), rate, left, loss),
-        junction_forms_us=time,
-        junction_breaks_us=solid.time_us,
-        time_in_junction_us=solid.time_us - time,
-        deepest_gap_nm=deepest,
-        holds=straight & jnp.isfinite(rate) & jnp.isfinite(left) & (error < setting.tolerance),
-    )
+    inward = go_in(driven, place, setting)
+    solid = go_through_junction(driven, inward.place, setting)
+    outward = go_out(driven, solid.place, setting)
+    return outward._replace(deepest_gap_nm=solid.deepest_gap_nm, holds=inward.holds & solid.holds & outward.holds)
 
 
-def _bridge(
-    driven: Driven, gaps: tuple[Array, Array], square: Array, time: Array, steps: int, solver: str, *, inward: bool
-) -> tuple[Array, Array, Array, Array]:
-    """Return squared gap rate, time, viscous loss and estimated relative error after a crossing of the bridge.
+def at_junction(driven: Driven, touch: Touch) -> Bool[Array, "..."]:
+    """Say whether a tip has just formed the junction, so that the quick way may go on from there."""
+    return (touch.phase == Phase.JUNCTION) & (touch.place.x == driven.junction.forms_root) & (touch.trial == 0.0)
 
-    With E = D'^2/2 + U(D)/m + Omega^2 D^2/2, dE/dD = q(t) - (Omega/Q + c(D)/m) D': of the forces only the dissipative
-    ones and the drive are integrated. D = outer exp(b - y^2) takes the square root out of a slow tip's way out.
+
+def go_quickly(
+    driven: Driven, touch: Touch, arrived: Array, active: Array, until_us: Array, setting: DrivenSetting
+) -> Touch:
+    """Return a tip as far on its way through the contact as legs hold that end before a time.
+
+    Args:
+        driven: the equation of motion.
+        touch: the tip.
+        arrived: it has just begun the contact.
+        active: it moves.
+        until_us: the time.
+        setting: how finely.
     """
-    outer, inner = gaps
-    bridge, cantilever = driven.bridge, driven.cantilever
-    stiffness = cantilever.angular_frequency**2
+    quick = setting.quick
+    if quick is None:
+        raise ValueError("`setting` has no quick way")
 
-    def level(gap):
-        return 2.0 * driven.inverse_mass * bridge.potential(gap) + stiffness * gap * gap
+    def taken(leg, wanted):
+        return wanted & leg.holds & (leg.place.time_us < until_us)
 
-    start, end = (outer, inner) if inward else (inner, outer)
-    total = square + level(start)
-    pull = -2.0 * driven.inverse_mass * bridge.force(outer) * outer
-    at_outer = square if inward else total - level(end) + 2.0 * driven.push(time) * (outer - inner)
-    margin = lax.stop_gradient(margin_of(jnp.maximum(at_outer, 0.01 * pull), jnp.maximum(pull, 1e-30)))
-    at_outer, at_inner = jnp.sqrt(margin), jnp.sqrt(margin + jnp.log(outer / inner))
-    begin, sense = (at_outer, 1.0) if inward else (at_inner, -1.0)
-    length, scale = at_inner - at_outer, outer * jnp.exp(margin)
-
-    def field(share, state):
-        gain, moment, _ = state
-        y = begin + sense * length * share
-        gap = scale * jnp.exp(-y * y)
-        speed = jnp.sqrt(total + gain - level(gap))
-        path = 2.0 * length * y * gap
-        pushed = -2.0 * sense * path * driven.push(moment)
-        drag = 2.0 * path * speed
-        lost = path * speed * bridge.damping(gap) if not bridge.conserves else jnp.zeros_like(gap)
-        slowed = 2.0 * driven.inverse_mass * lost + drag * 2.0 * cantilever.decay_rate
-        return pushed - slowed, path / speed, lost
-
-    shares = np.linspace(0.0, 1.0, steps + 1)
-    if inward:
-        shares = 1.0 - (1.0 - shares) ** GRADING
-    ends = jnp.asarray(np.stack([shares[:-1], shares[1:]], axis=1), total.dtype)
-    zero = jnp.zeros_like(total)
-    (gain, after, lost), error = _in_steps(field, (zero, time, zero), ends, solver)
-    leaving = total + gain - level(end)
-    speed = jnp.sqrt(leaving)
-    return leaving, after, lost, error[0] / leaving + error[1] * speed / inner
-
-
-def _junction(driven: Driven, speed: Array, time: Array, setting: QuickSetting) -> tuple[Place, Array, Array]:
-    """Return the place where the junction breaks, the smallest gap in it, and the estimated relative error."""
-    scale, junction = driven.depth_scale_nm, driven.junction
-    unit = 2.0 * driven.load_scale_nn * scale * driven.inverse_mass
-    pace = scale / jnp.sqrt(unit)
-    begin = junction.forms_root + jnp.zeros_like(speed)
-
-    def rates(s, rate, moment):
-        slope = jkr.depth_slope(s)
-        force = driven.load_scale_nn * jkr.load(s)
-        return -rate / scale, slope * driven.acceleration(driven.gap_of_root(s), rate, moment, force), slope
-
-    def in_theta(share, state, length):
-        del share
-        return tuple(length * rate for rate in rates(*state))
-
-    def to_rest(share, state, first):
-        s, moment = state
-        rate = first * (1.0 - share)
-        ds, dv, dt = rates(s, rate, moment)
-        return -first * ds / dv, -first * dt / dv
-
-    def to_fold(share, state, first):
-        rate, moment = state
-        s = first + share * (jkr.FOLD - first)
-        ds, dv, dt = rates(s, rate, moment)
-        return (jkr.FOLD - first) * dv / ds, (jkr.FOLD - first) * dt / ds
-
-    def even(steps):
-        # the last step, in another variable, is as long as the others
-        shares = np.arange(steps + 1) / (steps + 1.0)
-        return jnp.asarray(np.stack([shares[:-1], shares[1:]], axis=1), speed.dtype)
-
-    turn = turning_root(jkr.work(begin) + speed * speed / unit)
-    length = lax.stop_gradient(pace * _theta_to_turn(begin, turn))
-    state, error = _in_steps(
-        lambda share, now: in_theta(share, now, length),
-        (begin, -speed, time),
-        even(setting.pressing),
-        setting.junction_solver,
+    leg = go_in(driven, touch.place, quick)
+    formed = taken(leg, arrived)
+    touch = _moved(touch, leg, formed, Phase.JUNCTION)
+    touch = touch._replace(
+        junctions=touch.junctions + formed.astype(touch.junctions.dtype),
+        junction_forms_us=jnp.where(formed, touch.place.time_us, touch.junction_forms_us),
     )
-    s, rate, moment = state
-    once = jnp.asarray([[0.0, 1.0]], speed.dtype)
-    (turn, moment), error_turn = _in_steps(
-        lambda share, now: to_rest(share, now, rate), (s, moment), once, setting.junction_solver
+    leg = go_through_junction(driven, touch.place, quick)
+    wet = driven.junction.breaks_gap_nm < driven.breaks_nm
+    waits = at_junction(driven, touch) & active
+    broken = taken(leg, waits & wet)
+    # one for which it does not hold is told how far to go in time, and waits no longer
+    there = lax.stop_gradient(touch.place._replace(x=driven.junction.forms_root))
+    step = lax.stop_gradient(1.0 / (setting.fineness * junction_pace(driven, there)))
+    touch = touch._replace(trial=jnp.where(waits & ~broken, step, touch.trial))
+    passed = touch.time_in_junction_us + leg.place.time_us - touch.place.time_us
+    touch = _moved(touch, leg, broken, Phase.BRIDGE)
+    touch = touch._replace(
+        junction_breaks_us=jnp.where(broken, touch.place.time_us, touch.junction_breaks_us),
+        time_in_junction_us=jnp.where(broken, passed, touch.time_in_junction_us),
     )
-    length = lax.stop_gradient(pace * _theta_to_turn(jnp.full_like(turn, jkr.FOLD), turn))
-    zero = jnp.zeros_like(rate)
-    state, error_out = _in_steps(
-        lambda share, now: in_theta(share, now, length),
-        (turn, zero, moment),
-        even(setting.releasing),
-        setting.junction_solver,
+    leg = go_out(driven, touch.place, quick)
+    return _moved(touch, leg, taken(leg, broken), Phase.DRY)
+
+
+def _moved(touch: Touch, leg: Leg, moves: Array, phase: Phase) -> Touch:
+    """Return a tip at the end of a leg, where it takes it."""
+    return touch._replace(
+        place=jax.tree.map(lambda new, old: jnp.where(moves, new, old), leg.place, touch.place),
+        phase=jnp.where(moves, phase, touch.phase).astype(touch.phase.dtype),
+        trial=jnp.where(moves, 0.0, touch.trial),
+        deepest_gap_nm=jnp.where(moves, jnp.minimum(touch.deepest_gap_nm, leg.deepest_gap_nm), touch.deepest_gap_nm),
     )
-    last, rate, moment = state
-    (rate, moment), error_fold = _in_steps(
-        lambda share, now: to_fold(share, now, last), (rate, moment), once, setting.junction_solver
-    )
-    of_root = (error[0] + error_turn[0] + error_out[0]) / turn
-    of_speed = (error[1] + error_out[1] + error_fold[0]) / rate
-    place = Place(jnp.full_like(turn, jkr.FOLD), rate, moment, zero)
-    return place, driven.gap_of_root(turn), of_root + of_speed
-
-
-def _theta_to_turn(start: Array, turn: Array) -> Float[Array, "..."]:
-    """Return the integral of ds / sqrt(work(turn) - work(s)) from s = start to the turning point: an estimate."""
-    points, weights, _ = nodes_along(_NODES, turn)
-    reach = jnp.sqrt(turn - start)
-    s = turn - (reach * points) ** 2
-    return 2.0 * reach * jnp.tensordot(weights, 1.0 / jnp.sqrt(mean_slope(turn, s)), axes=1)
-
-
-def _in_steps(
-    field: Callable, begin: tuple[Array, ...], ends: Float[Array, "steps 2"], solver_name: str
-) -> tuple[tuple, tuple]:
-    """Return the state after steps of Dormand and Prince's method of order 8, and the sum of its error estimates."""
-    solver = getattr(diffrax, solver_name)(scan_kind="lax")
-
-    def rates(share, state, args):
-        del args
-        return field(share, state)
-
-    term = diffrax.ODETerm(rates)
-
-    def step(carried, span):
-        state, memory, errors = carried
-        after, estimate, _, memory, _ = solver.step(term, span[0], span[1], state, None, memory, made_jump=False)
-        errors = jax.tree.map(lambda total, more: total + jnp.abs(lax.stop_gradient(more)), errors, estimate)
-        return (after, memory, errors), None
-
-    memory = solver.init(term, ends[0, 0], ends[0, 1], begin, None)
-    none = jax.tree.map(jnp.zeros_like, begin)
-    (state, _, errors), _ = lax.scan(step, (begin, memory, none), ends)
-    return state, errors

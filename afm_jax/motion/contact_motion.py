@@ -1,8 +1,8 @@
 """A contact scene in time: closed-form flight to the bridge, through the contact, and so on to the end.
 
-Every tip of a batch goes at its own pace. A round takes each free tip to its next contact, through it if the quick
-way in the gap holds, and gives tips that are still in contact a few trial steps in time; so a batch does not wait for
-the few contacts that turn inside the bridge. All shapes are fixed.
+Every tip of a batch goes at its own pace. A round takes each free tip to its next contact, as far through it as the
+quick way leg by leg holds, and tips that are still in contact some trial steps in time, until they are where the quick
+way may go on; so a batch does not wait for the few contacts that turn inside the bridge. All shapes are fixed.
 """
 
 from functools import partial
@@ -15,17 +15,21 @@ from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.contact.phases import Phase
 from afm_jax.impact.first_impact import Flight, first_impact
-from afm_jax.motion.contact_crossing import cross
+from afm_jax.motion.contact_crossing import at_junction, go_quickly
 from afm_jax.motion.contact_settings import DrivenSetting
 from afm_jax.motion.contact_step import Touch, advance, fresh_touch
 from afm_jax.motion.driven import Driven, Place
 from afm_jax.motion.record import ContactKind, MotionOutcome
-from afm_jax.motion.side_by_side import for_the_few, side_by_side
+from afm_jax.motion.side_by_side import for_the_few
 from afm_jax.outcome import Outcome
 
 _ROUNDS = 8
 """Rounds between two looks at whether all tips have arrived at the end."""
 _FLIGHT_STEPS = 2000
+_LEGS_AT_ONCE, _TRIALS_AT_ONCE = 256, 64
+"""Tips of a batch that go the quick way together, and that try steps in time together."""
+_TRIALS = 4
+"""Trial steps between two looks at which tips of a batch need more."""
 
 
 class Row(NamedTuple):
@@ -121,7 +125,7 @@ def _round(driven: Driven, tip: Tip, *, until_us: Array, setting: DrivenSetting,
     arrival = Arrival(*(jnp.where(arrived, new, old) for new, old in zip(began, tip.arrival, strict=True)))
     fresh = fresh_touch(place, jnp.where(arrived, Phase.BRIDGE, Phase.DRY))
     touch = jax.tree.map(lambda new, old: jnp.where(free, new, old), fresh, tip.touch)
-    touch = _through(driven, touch, arrived, until_us, setting)
+    touch = _through(driven, touch, arrived, ~tip.done, until_us, setting)
     touch = _step(driven, touch, ~tip.done, until_us, setting, reverse=reverse)
     over = touch.place.time_us >= until_us
     left = touch.phase == Phase.DRY
@@ -166,45 +170,40 @@ def _fly(driven: Driven, place: Place, free: Array, until_us: Array) -> tuple[Ar
     return arrives, lost, Place(*(jnp.where(free, new, old) for new, old in zip(moved, place, strict=True)))
 
 
-def _through(driven: Driven, touch: Touch, arrived: Array, until_us: Array, setting: DrivenSetting) -> Touch:
-    """Return the tip beyond its contact where the quick way through it holds, else as it was."""
-    quick = setting.quick
-    if quick is None:
+def _through(
+    driven: Driven, touch: Touch, arrived: Array, active: Array, until_us: Array, setting: DrivenSetting
+) -> Touch:
+    """Return the tip as far through its contact as the quick way holds."""
+    if setting.quick is None:
         return touch
 
-    def crossed(driven, touch, arrived, until_us):
-        crossing = cross(driven, touch.place, quick)
-        holds = arrived & crossing.holds & (crossing.place.time_us < until_us)
-        beyond = Touch(
-            place=crossing.place,
-            phase=jnp.full_like(touch.phase, Phase.DRY),
-            trial=jnp.zeros_like(touch.trial),
-            junctions=jnp.ones_like(touch.junctions),
-            junction_forms_us=crossing.junction_forms_us,
-            junction_breaks_us=crossing.junction_breaks_us,
-            time_in_junction_us=crossing.time_in_junction_us,
-            deepest_gap_nm=crossing.deepest_gap_nm,
-            trials=jnp.zeros_like(touch.trials),
-        )
-        return jax.tree.map(lambda new, old: jnp.where(holds, new, old), beyond, touch)
+    def needed(driven, touch, arrived, active, until_us):
+        del until_us
+        return arrived | (active & at_junction(driven, touch))
 
-    def through(driven, touch, arrived, until_us):
-        return lax.cond(jnp.any(arrived), crossed, lambda _, touch, *__: touch, driven, touch, arrived, until_us)
+    def through(driven, touch, arrived, active, until_us):
+        return go_quickly(driven, touch, arrived, active, until_us, setting)
 
-    return side_by_side(through)(driven, touch, arrived, until_us)
+    one_pass = for_the_few(through, needed, changed=1, passes=1, block=_LEGS_AT_ONCE)
+    return one_pass(driven, touch, arrived, active, until_us)
 
 
 def _step(
     driven: Driven, touch: Touch, active: Array, until_us: Array, setting: DrivenSetting, *, reverse: bool
 ) -> Touch:
-    """Return a tip in contact after some trial steps; a free one stays as it is."""
+    """Return a tip in contact after some trial steps, or where the quick way may go on; a free one stays as it is."""
 
     def going(touch, active, until_us):
         finite = jnp.isfinite(touch.place.x) & jnp.isfinite(touch.place.gap_rate)
         return active & (touch.phase != Phase.DRY) & (touch.place.time_us < until_us) & finite
 
+    def waits_not(driven, touch, active, until_us):
+        # a tip that has just formed the junction waits for the quick way; one for which that did not hold does not
+        moves = going(touch, active, until_us)
+        return moves if setting.quick is None else moves & ~at_junction(driven, touch)
+
     def advanced(driven, touch, moves, until_us):
-        after = advance(driven, touch, until_us, setting.fineness, reverse=reverse)
+        after = advance(driven, touch, until_us, setting.fineness)
         return jax.tree.map(lambda new, old: jnp.where(moves, new, old), after, touch)
 
     if reverse:
@@ -217,15 +216,16 @@ def _step(
     def run(driven, touch, active, until_us):
         def on(state):
             touch, count = state
-            return jnp.any(going(touch, active, until_us)) & (count < setting.trials)
+            return jnp.any(waits_not(driven, touch, active, until_us)) & (count < _TRIALS)
 
         def more(state):
             touch, count = state
-            return advanced(driven, touch, going(touch, active, until_us), until_us), count + 1
+            return advanced(driven, touch, waits_not(driven, touch, active, until_us), until_us), count + 1
 
         return lax.while_loop(on, more, (touch, 0))[0]
 
-    return for_the_few(run, going, changed=1, common=1)(driven, touch, active, until_us)
+    passes = -(-setting.trials // _TRIALS)
+    return for_the_few(run, waits_not, changed=1, passes=passes, block=_TRIALS_AT_ONCE)(driven, touch, active, until_us)
 
 
 def _row(touch: Touch, arrival: Arrival, *, held: Array) -> Float[Array, " columns"]:

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +11,8 @@ from jaxtyping import Array, Float, Int
 from afm_jax.contact.phases import Phase
 from afm_jax.motion.contact_step import Touch, advance, fresh_touch
 from afm_jax.motion.driven import Driven, Place
+from afm_jax.motion.eighth_order import eighth_order_step
+from afm_jax.stored_program import stored
 
 _BLOCK = 128
 """Trials computed in one call."""
@@ -57,11 +58,11 @@ def contact_steps(driven: Driven, begin: Place, phase: Int[np.ndarray, " contact
     return Steps(time, ends, kinds.astype(int), x, rate)
 
 
-@jax.jit
+@stored()
 def _some_trials(driven: Driven, touch: Touch, until: Float[Array, ""]) -> tuple[Touch, tuple]:
     def once(touch, _):
         going = (touch.phase != Phase.DRY) & (touch.place.time_us < until)
-        after = advance(driven, touch, until, _FINENESS, reverse=False)
+        after = advance(driven, touch, until, _FINENESS)
         taken = going & (after.trial == 0.0)
         kept = jax.tree.map(lambda new, old: jnp.where(going, new, old), after, touch)
         return kept, (taken, *touch.place, touch.phase, after.place.time_us)
@@ -69,7 +70,7 @@ def _some_trials(driven: Driven, touch: Touch, until: Float[Array, ""]) -> tuple
     return lax.scan(once, touch, None, length=_BLOCK)
 
 
-@jax.jit
+@stored()
 def places_at(
     driven: Driven, start: Place, phase: Int[Array, " times"], time_us: Float[Array, " times"]
 ) -> tuple[Float[Array, " times"], Float[Array, " times"]]:
@@ -82,17 +83,9 @@ def places_at(
         time_us: the times.
     """
     solid = phase == Phase.JUNCTION
-    solver = diffrax.Dopri8(scan_kind="lax")
 
     def stepped(length):
-        def field(share, place, args):
-            del share, args
-            return Place(*(length * rate for rate in driven.rates(place, solid)))
-
-        term = diffrax.ODETerm(field)
-        zero, one = jnp.zeros((), length.dtype), jnp.ones((), length.dtype)
-        memory = solver.init(term, zero, one, start, None)
-        return solver.step(term, zero, one, start, None, memory, made_jump=False)[0]
+        return eighth_order_step(lambda place: driven.rates(place, solid), start, length)
 
     # in the junction the variable is fictitious time: its value at a time is a root
     rate = driven.rates(start, solid).time_us

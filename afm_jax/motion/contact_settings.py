@@ -4,11 +4,12 @@ from typing import NamedTuple
 
 
 class QuickSetting(NamedTuple):
-    """Numbers of Runge-Kutta steps of the quick way through a contact; hashable, for it shapes the program.
+    """How finely the quick way through a contact is resolved; hashable, for it shapes the program.
 
-    Every bridge crossing takes `inward` or `outward` steps in the gap, the junction `pressing` steps in fictitious time
-    and one in the velocity to its turning point, then `releasing` steps and one in s to the fold. Contacts whose
-    embedded error estimate exceeds `tolerance` (relative, of energies and speeds) go the careful way in time.
+    Every leg of the way has its number of Gauss nodes: `inward` through the bridge, `pressing` to the turning point of
+    the junction, `releasing` from there to the fold, `outward` through the bridge. Each is computed in so many sweeps.
+    Contacts whose last sweep still changes a kinetic energy by more than `tolerance` (relative), or whose last Legendre
+    coefficients are more than `tail` (relative, of the durations), go the careful way in time.
     """
 
     inward: int
@@ -16,14 +17,15 @@ class QuickSetting(NamedTuple):
     releasing: int
     outward: int
     tolerance: float
-    solver: str = "Dopri8"
-    junction_solver: str = "Dopri8"
+    sweeps: int = 10
+    junction_sweeps: int = 6
+    tail: float = 0.1
 
 
 class DrivenSetting(NamedTuple):
     """How driven contacts are resolved; hashable, for it shapes the program.
 
-    `quick` is the way in the gap, or None to go through every contact in time; `fineness` the steps per unit of the
+    `quick` is the way leg by leg, or None to go through every contact in time; `fineness` the steps per unit of the
     local pace of the way in time; `trials` the trial steps that a tip in contact may take in one round.
     """
 
@@ -33,8 +35,8 @@ class DrivenSetting(NamedTuple):
 
 
 SETTINGS = {
-    1e-6: DrivenSetting(QuickSetting(6, 4, 5, 6, 1e-4, "Dopri5"), 2.2, 60),
-    1e-9: DrivenSetting(QuickSetting(5, 7, 9, 7, 1e-5), 5.0, 120),
+    1e-6: DrivenSetting(QuickSetting(12, 8, 10, 12, 1e-6, 6, 4, 3e-3), 2.4, 60),
+    1e-9: DrivenSetting(QuickSetting(18, 13, 15, 16, 1e-9, 10, 7, 2e-4), 5.0, 120),
 }
 """Settings by the accuracy of one contact: relative of the rebound speed, a tenth of it in us of the times."""
 

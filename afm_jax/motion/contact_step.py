@@ -9,7 +9,6 @@ time at which the threshold is met.
 
 from typing import NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
 from jax import lax
@@ -17,7 +16,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.contact.forces import jkr
 from afm_jax.contact.phases import Phase
+from afm_jax.motion.contact_pace import bridge_pace, junction_pace
 from afm_jax.motion.driven import Driven, Place
+from afm_jax.motion.eighth_order import eighth_order_step
 from afm_jax.motion.hermite import crossing_share, turning_point
 
 _NEAR = 1e-7
@@ -60,7 +61,7 @@ class Trial(NamedTuple):
     high: Float[Array, "..."]
 
 
-def advance(driven: Driven, touch: Touch, until_us: Float[Array, "..."], fineness: float, *, reverse: bool) -> Touch:
+def advance(driven: Driven, touch: Touch, until_us: Float[Array, "..."], fineness: float) -> Touch:
     """Return a tip in contact after one trial.
 
     Args:
@@ -68,9 +69,8 @@ def advance(driven: Driven, touch: Touch, until_us: Float[Array, "..."], finenes
         touch: the tip; its phase is not DRY.
         until_us: end of the simulation.
         fineness: steps per unit of the local pace; larger is more accurate.
-        reverse: whether reverse derivatives must pass through.
     """
-    trial = _tried(driven, touch, until_us, fineness, reverse=reverse)
+    trial = _tried(driven, touch, until_us, fineness)
     solid = touch.phase == Phase.JUNCTION
     early, late, spent = _passed(trial, until_us)
     retry, again = _where_next(trial, touch.trial < 0.0, until_us)
@@ -103,28 +103,26 @@ def advance(driven: Driven, touch: Touch, until_us: Float[Array, "..."], finenes
     )
 
 
-def _tried(driven: Driven, touch: Touch, until_us: Float[Array, "..."], fineness: float, *, reverse: bool) -> Trial:
+def _tried(driven: Driven, touch: Touch, until_us: Float[Array, "..."], fineness: float) -> Trial:
     start, solid = touch.place, touch.phase == Phase.JUNCTION
     low = jnp.where(solid, jkr.FOLD, driven.junction.forms_gap_nm)
     high = jnp.where(solid, jnp.inf, driven.breaks_nm)
     rates = driven.rates(start, solid)
     fixed, slopes = lax.stop_gradient((start, rates))
-    natural = 1.0 / (fineness * lax.stop_gradient(driven.pace(start, solid)))
+    natural = 1.0 / (fineness * _pace(driven, fixed, slopes, solid))
     aim = _aimed(fixed, slopes, lax.stop_gradient((low, high)), lax.stop_gradient(until_us))
     fresh = jnp.where(aim < 1.2 * natural, aim, natural)
     length = lax.stop_gradient(jnp.where(touch.trial == 0.0, fresh, jnp.abs(touch.trial)))
-    solver = diffrax.Dopri8(scan_kind="bounded" if reverse else "lax")
-
-    # the share of the step is the time of the solver, one for all tips of a batch
-    def field(share, place, args):
-        del share, args
-        return Place(*(length * rate for rate in driven.rates(place, solid)))
-
-    term = diffrax.ODETerm(field)
-    begin, stop = jnp.zeros((), length.dtype), jnp.ones((), length.dtype)
-    memory = solver.init(term, begin, stop, start, None)
-    end, _, _, _, _ = solver.step(term, begin, stop, start, None, memory, made_jump=False)
+    end = eighth_order_step(lambda place: driven.rates(place, solid), start, length)
     return Trial(length, start, rates, end, driven.rates(end, solid), low, high)
+
+
+def _pace(driven: Driven, place: Place, rates: Place, solid: Bool[Array, "..."]) -> Float[Array, "..."]:
+    place = lax.stop_gradient(place)
+    in_bridge = place._replace(x=jnp.where(solid, driven.forms_nm, place.x))
+    in_junction = place._replace(x=jnp.where(solid, place.x, 1.0))
+    wet = bridge_pace(driven, in_bridge, rates.gap_rate)
+    return lax.stop_gradient(jnp.where(solid, junction_pace(driven, in_junction), wet))
 
 
 def _aimed(place: Place, rates: Place, thresholds: tuple[Array, Array], until_us: Float[Array, "..."]) -> Array:

@@ -14,6 +14,7 @@ import numpy as np
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.phases import Phase
+from afm_jax.motion.drive_period import drive_of
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
 from afm_jax.motion.settled import Settled, is_stuck, settled
 from afm_jax.motion.simulate import DEFAULT_ACCURACY, simulate
@@ -22,6 +23,9 @@ _PIECE_PERIODS = 256
 """Periods of the fastest motion in a piece."""
 _ROOM = 1040
 """Contacts in a piece: four for every period, as `simulate` reckons."""
+_HELD_LONG_ENOUGH = 12.0
+"""Drive periods (and free periods) for which a tip that is held is followed, where the end is left open: reading what
+it does takes longer than following it."""
 _GOES_ON = (MotionOutcome.FINISHED, MotionOutcome.HELD, MotionOutcome.CONTACT_LIMIT)
 
 
@@ -55,7 +59,8 @@ def follow_long(
         scene: one scene, its numbers known.
         start: the tip at the start.
         duration_us: the longest duration.
-        until_settled: end with the piece in which the motion has settled, or the sample has come to hold the tip.
+        until_settled: end with the piece in which the motion has settled, or some periods after the sample has come to
+            hold the tip.
         accuracy: of `simulate`.
         report: called after every piece with the time reached in us and the number of contacts so far.
 
@@ -77,11 +82,16 @@ def follow_long(
         pieces += 1
         joined = _joined(start, [*done, _rows(piece, int(piece.count))], piece)
         last = length == left and piece.outcome != MotionOutcome.CONTACT_LIMIT
+        stuck = int(piece.outcome) in _GOES_ON and is_stuck(scene, joined)
+        if until_settled and stuck:
+            length = min(length, _end_of_held(scene, piece) - float(state.time_us))
+            rows = piece.contacts.kind.shape[0]
+            piece = simulate(scene, state, length, max_contacts=rows, accuracy=accuracy)
+            joined = _joined(start, [*done, _rows(piece, int(piece.count))], piece)
         if report is not None:
             report(float(piece.final.time_us), len(joined.contacts.kind))
         if last or int(piece.outcome) not in _GOES_ON:
             return LongRun(joined, settled(scene, joined), pieces)
-        stuck = is_stuck(scene, joined)
         if until_settled:
             verdict = settled(scene, joined)
             if verdict.settled or stuck:
@@ -93,6 +103,13 @@ def follow_long(
             continue
         done.append(_rows(piece, cut.contacts))
         state, stretch = cut.state, 1.0
+
+
+def _end_of_held(scene: Scene, piece: Simulation) -> float:
+    """Return the time in us until which a tip that the sample holds is followed."""
+    since = float(np.asarray(piece.contacts.arrival_time_us)[int(piece.count) - 1])
+    free_period = 2.0 * math.pi / float(scene.cantilever.angular_frequency)
+    return since + _HELD_LONG_ENOUGH * max(drive_of(scene).period_us, free_period)
 
 
 def _cut(piece: Simulation) -> _Cut | None:

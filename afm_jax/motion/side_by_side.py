@@ -1,13 +1,13 @@
-"""Batches of tips as an axis of every array, rather than a batch of programs.
+"""Work that only a few tips of a batch need, gathered into small batches of their own.
 
-One Runge-Kutta step of a thousand tips costs half as much when its state has an axis of a thousand as when a thousand
-steps are batched by `vmap`; and what only a few tips need can be gathered into a small batch of its own. The functions
-here keep the interface of `vmap`: under it, work written for arrays of any shape sees the whole batch at once. Forward
-derivatives pass through; reverse ones do not.
+One Runge-Kutta step of a thousand tips costs half as much when its arrays have an axis of a thousand as when a thousand
+steps are batched by `vmap`; and most tips of a batch do not need it at a time. The function here keeps the interface of
+`vmap`: under it, work written for arrays of any shape sees the tips that need it side by side. Forward derivatives pass
+through; reverse ones do not.
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,51 +15,19 @@ from jax import lax
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array
 
-_BLOCK = 64
-"""Tips of a gathered batch."""
-
-
-def side_by_side(work: Callable[..., Any]) -> Callable[..., Any]:
-    """Return elementwise `work` in a form that `vmap` calls once, with the batch as first axis of its arrays.
-
-    Args:
-        work: a function of arrays that broadcast against each other; its results have their common shape.
-    """
-
-    def called(*arguments):
-        leaves, tree = jax.tree.flatten(arguments)
-
-        def of_leaves(*leaves):
-            return work(*jax.tree.unflatten(tree, leaves))
-
-        # `custom_vmap` sees flat arrays: its derivatives stumble over a None in a tree. In its rules it must not be
-        # called again: a batch of derivatives at one point comes as a batch without a batched argument.
-        flat = custom_vmap(of_leaves)
-
-        @flat.def_vmap
-        def batched(size, flags, *leaves):
-            if not any(flags):
-                results = of_leaves(*leaves)
-                return results, jax.tree.map(lambda _: False, results)
-            shape, aligned = _lined_up(size, flags, leaves)
-            results = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, shape), of_leaves(*aligned))
-            return results, jax.tree.map(lambda _: True, results)
-
-        return flat(*leaves)
-
-    return called
-
 
 def for_the_few(
-    work: Callable[..., Any], needed: Callable[..., Any], *, changed: int, common: int
+    work: Callable[..., Any], needed: Callable[..., Any], *, changed: int, passes: int, block: int
 ) -> Callable[..., Any]:
-    """Return elementwise `work` in a form that costs a batch what the tips that need it cost.
+    """Return elementwise `work`, done again and again where `needed`; a batch costs what the tips in need cost.
 
     Args:
         work: a function of arrays that returns its argument number `changed`, changed where `needed`.
-        needed: says of the same arguments, the common ones left out, whether a tip needs the work.
+        needed: says of the same arguments whether a tip needs the work.
         changed: the number of that argument.
-        common: the number of leading arguments that are passed on to `work` alone.
+        passes: how often at most the work is done. Tips that need it are gathered anew for every pass, so that those
+            that need it often do not keep the others waiting.
+        block: tips of a gathered batch: few where the work is long and its end uncertain, more where it is short.
 
     Returns:
         A function like `work`.
@@ -68,75 +36,99 @@ def for_the_few(
     def called(*arguments):
         leaves, tree = jax.tree.flatten(arguments)
         before = len(jax.tree.leaves(arguments[:changed]))
-        of_changed = slice(before, before + len(jax.tree.leaves(arguments[changed])))
-
-        def of_leaves(*leaves):
-            return tuple(jax.tree.leaves(work(*jax.tree.unflatten(tree, leaves))))
-
-        flat = custom_vmap(of_leaves)
-
-        @flat.def_vmap
-        def gathered(size, flags, *leaves):
-            if not any(flags):
-                results = of_leaves(*leaves)
-                return results, (False,) * len(results)
-            if max(leaf.ndim + (not flag) for flag, leaf in zip(flags, leaves, strict=True)) > 1:
-                # a batch of batches: one after the other
-                results = _one_by_one(of_leaves, size, flags, leaves)
-                return results, (True,) * len(results)
-            results = _few_at_once(of_leaves, lambda *now: needed(*jax.tree.unflatten(tree, now)[common:]), of_changed)(
-                size, flags, leaves
-            )
-            return results, (True,) * len(results)
-
+        few = _Few(
+            work=lambda *leaves: tuple(jax.tree.leaves(work(*jax.tree.unflatten(tree, leaves)))),
+            needed=lambda *leaves: needed(*jax.tree.unflatten(tree, leaves)),
+            changed=slice(before, before + len(jax.tree.leaves(arguments[changed]))),
+            passes=passes,
+            block=block,
+        )
+        # `custom_vmap` sees flat arrays: its derivatives stumble over a None in a tree. In its rule it must not be
+        # called again: a batch of derivatives at one point comes as a batch without a batched argument.
+        flat = custom_vmap(few.of_one)
+        flat.def_vmap(few.of_batch)
         return jax.tree.unflatten(jax.tree.structure(arguments[changed]), flat(*leaves))
 
     return called
 
 
-def _few_at_once(work: Callable[..., Any], needed: Callable[..., Any], changed: slice) -> Callable[..., Any]:
-    """Return how a batch of flat arguments is worked on: those in need, gathered in blocks."""
+class _Few(NamedTuple):
+    """Work on flat arguments, and how it is done on a batch."""
 
-    def worked(size: int, flags: Sequence[bool], leaves: Sequence[Array]) -> tuple[Array, ...]:
-        marks, full = [*flags], [*leaves]
-        full[changed] = [jnp.broadcast_to(leaf, (size,)) for leaf in full[changed]]
-        marks[changed] = [True] * len(full[changed])
-        needs = jnp.broadcast_to(needed(*full), (size,))
-        count, block = jnp.sum(needs), min(_BLOCK, size)
-        # those in need first; beyond the last an index that is dropped
-        order = jnp.where(jnp.arange(size) < count, jnp.argsort(~needs), size)
-        order = jnp.concatenate([order, jnp.full((block,), size)])
+    work: Callable[..., tuple[Array, ...]]
+    needed: Callable[..., Array]
+    changed: slice
+    passes: int
+    block: int
 
-        def one_block(state):
-            done, values = state
-            chosen = lax.dynamic_slice(order, (done,), (block,))
-            now = [*full]
-            now[changed] = values
-            taken = [leaf.at[chosen].get(mode="clip") if mark else leaf for mark, leaf in zip(marks, now, strict=True)]
-            after = work(*taken)
-            values = tuple(old.at[chosen].set(new, mode="drop") for old, new in zip(values, after, strict=True))
-            return done + block, values
+    def of_one(self, *leaves: Array) -> tuple[Array, ...]:
+        """Return the changed arguments of one tip."""
 
-        begin = (jnp.zeros_like(count), tuple(full[changed]))
-        return lax.while_loop(lambda state: state[0] < count, one_block, begin)[1]
+        def needs(state):
+            return jnp.any(self.needed(*self._with(leaves, state[1]))) & (state[0] < self.passes)
 
-    return worked
+        def one_pass(state):
+            return state[0] + 1, self.work(*self._with(leaves, state[1]))
+
+        return lax.while_loop(needs, one_pass, (0, tuple(leaves[self.changed])))[1]
+
+    def of_batch(self, size: int, flags: Sequence[bool], *leaves: Array) -> tuple[tuple[Array, ...], Any]:
+        """Return the changed arguments of a batch and that they are batched: the rule of `custom_vmap`."""
+        if not any(flags):
+            results = self.of_one(*leaves)
+            return results, (False,) * len(results)
+        if max(leaf.ndim + (not flag) for flag, leaf in zip(flags, leaves, strict=True)) > 1:
+            # a batch of batches: one after the other
+            results = self._one_by_one(size, flags, leaves)
+        else:
+            results = self._in_blocks(size, flags, leaves)
+        return results, (True,) * len(results)
+
+    def _with(self, leaves: Sequence[Array], values: Sequence[Array]) -> list[Array]:
+        now = [*leaves]
+        now[self.changed] = values
+        return now
+
+    def _one_by_one(self, size: int, flags: Sequence[bool], leaves: Sequence[Array]) -> tuple[Array, ...]:
+        def one(index):
+            return self.of_one(*(leaf[index] if flag else leaf for flag, leaf in zip(flags, leaves, strict=True)))
+
+        return lax.map(one, jnp.arange(size))
+
+    def _in_blocks(self, size: int, flags: Sequence[bool], leaves: Sequence[Array]) -> tuple[Array, ...]:
+        """Return the changed arguments of a batch: those in need, gathered in blocks, pass after pass."""
+        values = tuple(jnp.broadcast_to(leaf, (size,)) for leaf in leaves[self.changed])
+        marks = [*flags]
+        marks[self.changed] = [True] * len(values)
+        block = min(self.block, size)
+
+        def needing(values):
+            return jnp.broadcast_to(self.needed(*self._with(leaves, values)), (size,))
+
+        def one_pass(state):
+            number, values, needs = state
+            order, count = _those_first(needs, block)
+
+            def one_block(state):
+                done, values = state
+                chosen = lax.dynamic_slice(order, (done,), (block,))
+                pairs = zip(marks, self._with(leaves, values), strict=True)
+                after = self.work(*(leaf.at[chosen].get(mode="clip") if mark else leaf for mark, leaf in pairs))
+                values = tuple(old.at[chosen].set(new, mode="drop") for old, new in zip(values, after, strict=True))
+                return done + block, values
+
+            values = lax.while_loop(lambda state: state[0] < count, one_block, (jnp.zeros_like(count), values))[1]
+            return number + 1, values, needing(values)
+
+        def on(state):
+            return jnp.any(state[2]) & (state[0] < self.passes)
+
+        return lax.while_loop(on, one_pass, (0, values, needing(values)))[1]
 
 
-def _one_by_one(work: Callable[..., Any], size: int, flags: Sequence[bool], leaves: Sequence[Array]) -> Any:
-    def one(index):
-        return work(*(leaf[index] if flag else leaf for flag, leaf in zip(flags, leaves, strict=True)))
-
-    return lax.map(one, jnp.arange(size))
-
-
-def _lined_up(size: int, flags: Sequence[bool], leaves: Sequence[Array]) -> tuple[tuple[int, ...], list[Array]]:
-    """Return the common shape of a batch, and its arrays with the batch as first axis of that shape."""
-    pairs = list(zip(flags, leaves, strict=True))
-    inner = jnp.broadcast_shapes(*(leaf.shape[1:] if flag else leaf.shape for flag, leaf in pairs))
-    rank = 1 + len(inner)
-    aligned = [
-        leaf.reshape(leaf.shape[0], *(1,) * (rank - leaf.ndim), *leaf.shape[1:]) if flag else leaf
-        for flag, leaf in pairs
-    ]
-    return (size, *inner), aligned
+def _those_first(needs: Array, block: int) -> tuple[Array, Array]:
+    """Return the numbers of those in need, behind them as many that are none, and how many they are."""
+    size = needs.shape[0]
+    place = jnp.where(needs, jnp.cumsum(needs) - 1, size + block)
+    order = jnp.full(size + block, size).at[place].set(jnp.arange(size), mode="drop")
+    return order, jnp.sum(needs)

@@ -1,0 +1,122 @@
+"""The quick way through driven contacts, leg by leg, and work on a few tips of a batch, against independent ones."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from afm_jax.motion.contact_bridge_leg import go_in
+from afm_jax.motion.contact_crossing import cross
+from afm_jax.motion.contact_settings import SETTINGS, QuickSetting, setting_of
+from afm_jax.motion.driven import Place, driven_by
+from afm_jax.motion.eighth_order import eighth_order_step
+from afm_jax.motion.side_by_side import for_the_few
+from afm_jax.presets import contact_scene
+from tests.reference_driven_contact import DrivenContact, follow
+
+SYSTEM = DrivenContact(amplitude_nm=4.0, drive_frequency_khz=180.0 * 5.277)
+
+
+@pytest.fixture(scope="module")
+def contacts():
+    """Contacts of an independent integration to 12 digits: straight ones, and some that form the junction twice."""
+    start = SYSTEM.start(phase_deg=270.0, height_nm=5.0, velocity_nm_per_us=60.0)
+    return follow(SYSTEM, *start, contacts=16).contacts
+
+
+def crossed(contacts, setting: QuickSetting):
+    scene = contact_scene(5.277, 4.0, 0.0)
+    driven = driven_by(scene.interaction, scene.cantilever, scene.platform)
+    time = jnp.asarray([contact.arrival_time_us for contact in contacts])
+    speed = jnp.asarray([contact.approach_speed_nm_per_us for contact in contacts])
+    place = Place(jnp.full_like(time, driven.forms_nm), -speed, time, jnp.zeros_like(time))
+    return jax.jit(cross, static_argnums=2)(driven, place, setting)
+
+
+def column(contacts, name: str) -> np.ndarray:
+    return np.array([getattr(contact, name) for contact in contacts])
+
+
+# errors allowed: of the rebound speed (relative) what the setting promises, of times in us a tenth of it
+@pytest.mark.parametrize("accuracy", sorted(SETTINGS))
+def test_straight_contacts_are_those_of_an_independent_integration(contacts, accuracy):
+    quick = setting_of(accuracy).quick
+    assert quick is not None
+    leg = crossed(contacts, quick)
+    holds = np.asarray(leg.holds)
+    assert holds.sum() >= 8
+    # what holds formed the junction once
+    assert (column(contacts, "junctions")[holds] == 1).all()
+    assert not holds[column(contacts, "junctions") != 1].any()
+    assert (column(contacts, "junctions") != 1).any()
+    rebound, left = column(contacts, "rebound_speed_nm_per_us"), column(contacts, "departure_time_us")
+    np.testing.assert_allclose(np.asarray(leg.place.gap_rate)[holds], rebound[holds], rtol=accuracy)
+    np.testing.assert_allclose(np.asarray(leg.place.time_us)[holds], left[holds], rtol=0.0, atol=0.1 * accuracy)
+    lost = column(contacts, "viscous_loss_aj")
+    # the loss is a small part of the energy, and no more accurate than that
+    np.testing.assert_allclose(np.asarray(leg.place.viscous_loss_aj)[holds], lost[holds], rtol=10.0 * accuracy)
+    deepest = column(contacts, "deepest_gap_nm")
+    # where the speed is 0 an error of it counts twice; the reference reads the turning point from its steps
+    np.testing.assert_allclose(np.asarray(leg.deepest_gap_nm)[holds], deepest[holds], rtol=0.0, atol=1e-5)
+
+
+def test_nodes_and_sweeps_converge(contacts):
+    rebound = column(contacts, "rebound_speed_nm_per_us")
+    errors = []
+    for more in (0, 3, 6):
+        leg = crossed(contacts, QuickSetting(7 + more, 5 + more, 6 + more, 7 + more, 1e-2, 3 + more, 2 + more, 0.1))
+        straight = column(contacts, "junctions") == 1
+        held = np.asarray(leg.holds) & straight
+        errors.append(np.median(np.abs(np.asarray(leg.place.gap_rate) / rebound - 1.0)[held]))
+    # geometric: every three nodes and sweeps win more than a digit and a half, down to the reference's own digits
+    assert errors[1] < 0.03 * errors[0]
+    assert errors[2] < max(0.03 * errors[1], 1e-12)
+
+
+def test_a_leg_says_where_it_does_not_hold():
+    scene = contact_scene(5.277, 4.0, 0.0)
+    driven = driven_by(scene.interaction, scene.cantilever, scene.platform)
+    quick = setting_of(1e-6).quick
+    assert quick is not None
+    # a platform that falls away as fast as the tip comes, one that rises: the first tips turn in the bridge
+    rates = jnp.asarray([-0.1, -1.0, 20.0, jnp.nan, -60.0])
+    time = jnp.full_like(rates, 0.5 * float(scene.platform.period_us))
+    leg = go_in(driven, Place(jnp.full_like(rates, 3.5), rates, time, jnp.zeros_like(rates)), quick)
+    assert np.asarray(leg.holds).tolist() == [False, False, False, False, True]
+
+
+def test_a_step_is_of_order_eight():
+    # x'' = 2 x^3, of which x = 1/(1 + t) is a solution
+    def rates(place):
+        return Place(place.gap_rate, 2.0 * place.x**3, jnp.ones_like(place.x), jnp.zeros_like(place.x))
+
+    errors = []
+    for count in (6, 12):
+        place = Place(*(jnp.asarray(value) for value in (1.0, -1.0, 0.0, 0.0)))
+        for _ in range(count):
+            place = eighth_order_step(rates, place, jnp.asarray(1.5 / count))
+        errors.append(abs(float(place.x) * 2.5 - 1.0))
+        assert float(place.time_us) == pytest.approx(1.5, rel=1e-14)
+    slope = np.log(errors[0] / errors[1]) / np.log(2.0)
+    # steps of a quarter and an eighth of the time scale leave some of the next order
+    assert slope == pytest.approx(8.0, abs=0.5)
+
+
+@pytest.mark.parametrize("block", [3, 64])
+def test_the_few_get_what_each_would_alone(block):
+    # halved until below the limit of its own: Collatz-like work of a very uneven number of passes
+    def halved(value, limit):
+        return jnp.where(value > limit, 0.5 * value, value)
+
+    few = for_the_few(halved, lambda value, limit: value > limit, changed=0, passes=9, block=block)
+    values, limit = jnp.linspace(0.5, 900.0, 40), jnp.asarray(1.0)
+    together = jax.vmap(few, in_axes=(0, None))(values, limit)
+    alone = jnp.stack([few(value, limit) for value in values])
+    times = np.clip(np.ceil(np.log2(np.asarray(values))), 0, 9)
+    # powers of two are exact
+    np.testing.assert_array_equal(np.asarray(together), np.asarray(values) * 0.5**times)
+    np.testing.assert_array_equal(np.asarray(alone), np.asarray(together))
+    slopes = jax.vmap(partial(jax.jvp, few))((values, jnp.full_like(values, 1.0)), (jnp.ones(40), jnp.zeros(40)))[1]
+    np.testing.assert_array_equal(np.asarray(slopes), 0.5**times)
