@@ -14,6 +14,7 @@ LEVELS = {
     "units": 0,
     "version": 0,
     "lazy_names": 0,
+    "stored_program": 0,
     "outcome": 0,
     "parameters": 1,
     "apparatus": 2,

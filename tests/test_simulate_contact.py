@@ -65,6 +65,22 @@ def test_tenth_crossing_agrees_with_an_independent_integration(n, speed, double)
     np.testing.assert_allclose(np.asarray(detail.viscous_loss_aj)[:10], lost, rtol=1e-5)
 
 
+@pytest.mark.parametrize(("n", "speed"), [(1.01, 150.0), (5.277, 60.0)])
+def test_diffrax_in_time_goes_the_same_way(n, speed):
+    system = reference(n, 4.0)
+    start = system.start(phase_deg=270, height_nm=5, velocity_nm_per_us=speed)
+    times = [contact.arrival_time_us for contact in follow(system, *start, until_us=1000.0, contacts=5).contacts]
+    found = simulate(scene_of(system), state(start), times[-1] - start[0] + 1e-3, method="diffrax")
+    np.testing.assert_allclose(arrivals(found, 4), times[:4], rtol=0.0, atol=1e-8)
+
+
+def test_an_unknown_method_is_refused():
+    system = reference(1.01, 4.0)
+    start = system.start(phase_deg=270, height_nm=5, velocity_nm_per_us=150.0)
+    with pytest.raises(ValueError, match="`method` must be one of collocation, diffrax, but is 'euler'"):
+        simulate(scene_of(system), state(start), 10.0, method="euler")
+
+
 @pytest.mark.slow
 def test_other_scenes_agree_too():
     cases = [

@@ -203,7 +203,7 @@ def _step(
         return moves if setting.quick is None else moves & ~at_junction(driven, touch)
 
     def advanced(driven, touch, moves, until_us):
-        after = advance(driven, touch, until_us, setting.fineness)
+        after = advance(driven, touch, until_us, setting.fineness, setting.method)
         return jax.tree.map(lambda new, old: jnp.where(moves, new, old), after, touch)
 
     if reverse:

@@ -26,12 +26,14 @@ class DrivenSetting(NamedTuple):
     """How driven contacts are resolved; hashable, for it shapes the program.
 
     `quick` is the way leg by leg, or None to go through every contact in time; `fineness` the steps per unit of the
-    local pace of the way in time; `trials` the trial steps that a tip in contact may take in one round.
+    local pace of the way in time; `trials` the trial steps that a tip in contact may take in one round; `method`
+    "diffrax" takes the steps in time by Diffrax's solver.
     """
 
     quick: QuickSetting | None
     fineness: float
     trials: int
+    method: str = "collocation"
 
 
 SETTINGS = {
@@ -41,13 +43,20 @@ SETTINGS = {
 """Settings by the accuracy of one contact: relative of the rebound speed, a tenth of it in us of the times."""
 
 
-def setting_of(accuracy: float) -> DrivenSetting:
-    """Return the cheapest setting that reaches an accuracy.
+METHODS = ("collocation", "diffrax")
+"""Ways through a contact: leg by leg with steps in time where that does not hold, or Diffrax's steps in time alone."""
+
+
+def setting_of(accuracy: float, method: str = "collocation") -> DrivenSetting:
+    """Return the cheapest setting of a method that reaches an accuracy.
 
     Raises:
-        ValueError: if none does.
+        ValueError: if none does, or there is no such method.
     """
+    if method not in METHODS:
+        raise ValueError(f"`method` must be one of {', '.join(METHODS)}, but is {method!r}")
     reached = [level for level in SETTINGS if level <= accuracy * (1.0 + 1e-9)]
     if not reached:
         raise ValueError(f"`accuracy` must be at least {min(SETTINGS):g}, but is {accuracy!r}")
-    return SETTINGS[max(reached)]
+    setting = SETTINGS[max(reached)]
+    return setting if method == "collocation" else setting._replace(quick=None, method=method)

@@ -7,6 +7,7 @@ alone (no error control), so that results are smooth in every parameter; the cor
 time at which the threshold is met.
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -18,7 +19,7 @@ from afm_jax.contact.forces import jkr
 from afm_jax.contact.phases import Phase
 from afm_jax.motion.contact_pace import bridge_pace, junction_pace
 from afm_jax.motion.driven import Driven, Place
-from afm_jax.motion.eighth_order import eighth_order_step
+from afm_jax.motion.eighth_order import diffrax_step, eighth_order_step
 from afm_jax.motion.hermite import crossing_share, turning_point
 
 _NEAR = 1e-7
@@ -61,7 +62,9 @@ class Trial(NamedTuple):
     high: Float[Array, "..."]
 
 
-def advance(driven: Driven, touch: Touch, until_us: Float[Array, "..."], fineness: float) -> Touch:
+def advance(
+    driven: Driven, touch: Touch, until_us: Float[Array, "..."], fineness: float, method: str = "collocation"
+) -> Touch:
     """Return a tip in contact after one trial.
 
     Args:
@@ -69,8 +72,9 @@ def advance(driven: Driven, touch: Touch, until_us: Float[Array, "..."], finenes
         touch: the tip; its phase is not DRY.
         until_us: end of the simulation.
         fineness: steps per unit of the local pace; larger is more accurate.
+        method: "diffrax" for steps by Diffrax's solver, else leaner ones with the same coefficients.
     """
-    trial = _tried(driven, touch, until_us, fineness)
+    trial = _tried(driven, touch, until_us, fineness, diffrax_step if method == "diffrax" else eighth_order_step)
     solid = touch.phase == Phase.JUNCTION
     early, late, spent = _passed(trial, until_us)
     retry, again = _where_next(trial, touch.trial < 0.0, until_us)
@@ -103,7 +107,9 @@ def advance(driven: Driven, touch: Touch, until_us: Float[Array, "..."], finenes
     )
 
 
-def _tried(driven: Driven, touch: Touch, until_us: Float[Array, "..."], fineness: float) -> Trial:
+def _tried(
+    driven: Driven, touch: Touch, until_us: Float[Array, "..."], fineness: float, step: Callable[..., Place]
+) -> Trial:
     start, solid = touch.place, touch.phase == Phase.JUNCTION
     low = jnp.where(solid, jkr.FOLD, driven.junction.forms_gap_nm)
     high = jnp.where(solid, jnp.inf, driven.breaks_nm)
@@ -113,7 +119,7 @@ def _tried(driven: Driven, touch: Touch, until_us: Float[Array, "..."], fineness
     aim = _aimed(fixed, slopes, lax.stop_gradient((low, high)), lax.stop_gradient(until_us))
     fresh = jnp.where(aim < 1.2 * natural, aim, natural)
     length = lax.stop_gradient(jnp.where(touch.trial == 0.0, fresh, jnp.abs(touch.trial)))
-    end = eighth_order_step(lambda place: driven.rates(place, solid), start, length)
+    end = step(lambda place: driven.rates(place, solid), start, length)
     return Trial(length, start, rates, end, driven.rates(end, solid), low, high)
 
 

@@ -99,30 +99,6 @@ class Driven(NamedTuple):
         acceleration = self.acceleration(self.gap_of_root(s), place.gap_rate, place.time_us, force)
         return Place(-place.gap_rate / self.depth_scale_nm, slope * acceleration, slope, jnp.zeros_like(s))
 
-    def pace(self, place: Place, solid: Bool[Array, "..."]) -> Float[Array, "..."]:
-        """Return how fast the motion changes, in 1/us (junction: per unit of fictitious time): the inverse of a step.
-
-        The root of the local stiffness over the mass, and the speed over the distance in which the forces change.
-        """
-        near = jnp.maximum(jnp.where(solid, self.forms_nm, place.x), 0.3 * self.junction.forms_gap_nm)
-        stiffness = jnp.abs(self.bridge.stiffness(near)) * self.inverse_mass
-        wet = jnp.sqrt(stiffness + (place.gap_rate / near) ** 2 + self._drive_pace**2)
-        s = jnp.where(solid, place.x, 1.0)
-        cube = s**3
-        curvature = s * s * (cube * (36.0 * cube - 42.0 * jkr.SLOPE) + 12.0)
-        # where the curvature vanishes, at s = 1.196, its terms still tell how fast it comes back
-        bent = jnp.maximum(jnp.abs(curvature), 0.3 * s * s * (36.0 * cube * cube + 12.0))
-        elastic = bent * self.load_scale_nn * self.inverse_mass / self.depth_scale_nm
-        slope = jkr.depth_slope(s)
-        dry = jnp.sqrt(
-            elastic + (2.0 * place.gap_rate / (self.depth_scale_nm * s)) ** 2 + (self._drive_pace * slope) ** 2
-        )
-        return jnp.where(solid, dry, wet)
-
-    @property
-    def _drive_pace(self) -> Float[Array, "..."]:
-        return self.cantilever.angular_frequency + self.surface.fastest_angular_frequency
-
 
 def driven_by(contact: Contact, cantilever: Cantilever, surface: Platform | Surface) -> Driven:
     """Return the equation of motion of a contact scene."""

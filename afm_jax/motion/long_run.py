@@ -51,6 +51,7 @@ def follow_long(
     *,
     until_settled: bool = False,
     accuracy: float = DEFAULT_ACCURACY,
+    method: str = "collocation",
     report: Callable[[float, int], None] | None = None,
 ) -> LongRun:
     """Return a scene followed for a duration, or until it has settled if that is earlier.
@@ -62,6 +63,7 @@ def follow_long(
         until_settled: end with the piece in which the motion has settled, or some periods after the sample has come to
             hold the tip.
         accuracy: of `simulate`.
+        method: of `simulate`.
         report: called after every piece with the time reached in us and the number of contacts so far.
 
     Raises:
@@ -78,7 +80,7 @@ def follow_long(
         # what is left is followed with the piece before, if it is next to nothing
         length = stretch * piece_us if left > stretch * piece_us * 1.001 else left
         room = None if stretch > 1.0 else _ROOM
-        piece = simulate(scene, state, length, max_contacts=room, accuracy=accuracy)
+        piece = simulate(scene, state, length, max_contacts=room, accuracy=accuracy, method=method)
         pieces += 1
         joined = _joined(start, [*done, _rows(piece, int(piece.count))], piece)
         last = length == left and piece.outcome != MotionOutcome.CONTACT_LIMIT
@@ -86,7 +88,7 @@ def follow_long(
         if until_settled and stuck:
             length = min(length, _end_of_held(scene, piece) - float(state.time_us))
             rows = piece.contacts.kind.shape[0]
-            piece = simulate(scene, state, length, max_contacts=rows, accuracy=accuracy)
+            piece = simulate(scene, state, length, max_contacts=rows, accuracy=accuracy, method=method)
             joined = _joined(start, [*done, _rows(piece, int(piece.count))], piece)
         if report is not None:
             report(float(piece.final.time_us), len(joined.contacts.kind))

@@ -33,13 +33,14 @@ _TRIALS_BACKWARDS = 40
 """Trial steps of a round when all of them are run and kept for the way back."""
 
 
-def simulate(
+def simulate(  # noqa: PLR0913
     scene: Scene,
     start: State,
     duration_us: ArrayLike,
     *,
     max_contacts: int | None = None,
     accuracy: float = DEFAULT_ACCURACY,
+    method: str = "collocation",
     reverse: bool = False,
     max_rounds: int | None = None,
 ) -> Simulation:
@@ -55,6 +56,8 @@ def simulate(
             for the duration, which must then be a number. A motion with more (chatter with r close to 1) is then
             followed once more with room for them, outside `jit` and `vmap` up to a million.
         accuracy: of each resolved contact: relative of the rebound speed, a tenth of it in us of the times.
+        method: the way through a resolved contact: "collocation" (leg by leg, and in time where a tip turns in the
+            bridge or is held) or "diffrax" (in time throughout, by Diffrax's Dopri8; some ten times slower).
         reverse: make it differentiable in reverse mode, in memory that grows with the square root of the length.
         max_rounds: most rounds; a tip that is held takes one every 60 steps of its oscillation. None: four for every
             contact and what a held tip needs.
@@ -65,7 +68,8 @@ def simulate(
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
         TypeError: if the interaction is neither a law nor a contact nor None.
-        ValueError: if the duration is not positive, the contact has no junction, or the start is inside the sample.
+        ValueError: if the duration is not positive, the contact has no junction, the start is inside the sample, or
+            there is no such method or accuracy.
     """
     require_float64()
     check_parameter("duration_us", duration_us, "positive")
@@ -83,7 +87,7 @@ def simulate(
 
     elif isinstance(scene.interaction, Contact):
         _check_contact(scene, surface, response, begin_at)
-        setting = setting_of(accuracy)
+        setting = setting_of(accuracy, method)
         if reverse:
             # the quick way tells by NaN that it does not hold, which reverse derivatives would spread
             setting = setting._replace(quick=None, trials=_TRIALS_BACKWARDS)

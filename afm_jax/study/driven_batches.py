@@ -24,7 +24,7 @@ _BEFORE_US = 1e-4
 _BEYOND_US = 0.1
 """How long after its departure it is stopped: less than a tip needs to come back, more than any error."""
 _PASSES = 40
-_FINE = QuickSetting(8, 10, 12, 10, tolerance=1e-2)
+_FINE = QuickSetting(20, 16, 18, 18, 1e-4, 12, 8, 1e-2)
 """Tells contacts that go straight through from those that turn in the bridge."""
 
 

@@ -48,9 +48,18 @@ def scene_named(name: str) -> Scene:
 
 
 def quick_setting(level: int) -> DrivenSetting:
-    """Return the quick way through contacts with a number of steps, from 2; the careful way beside it is as fine."""
-    steps = QuickSetting(level, level + 1, level + 2, level + 1, tolerance=10.0 ** (-level - 1))
-    return DrivenSetting(steps, 0.8 + 0.7 * level, 60 + 20 * level)
+    """Return the quick way through contacts of a level, from 2: more nodes, and a careful way as fine beside it."""
+    nodes = QuickSetting(
+        inward=2 * level + 4,
+        pressing=level + 3,
+        releasing=level + 5,
+        outward=2 * level + 4,
+        tolerance=10.0 ** (-level - 2),
+        sweeps=level + 3,
+        junction_sweeps=level + 1,
+        tail=3e-3,
+    )
+    return DrivenSetting(nodes, 0.8 + 0.7 * level, 60 + 20 * level)
 
 
 def settings_of(
@@ -63,7 +72,7 @@ def settings_of(
         quick: levels of `quick_setting`.
         careful: steps per unit of the local pace, every contact followed in time.
     """
-    named = {f"{level} steps": ("quick", quick_setting(level)) for level in quick}
+    named = {f"level {level}": ("quick", quick_setting(level)) for level in quick}
     named |= {
         f"accuracy {accuracy:g}": ("quick", setting) for accuracy, setting in SETTINGS.items() if accuracy in accuracies
     }
