@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from fitting.lost_rows import lost_rows, recovered
 from fitting.measurement import ROWS_PER_PROGRAM
 from fitting.optimise import BATCH, PLAIN, SOFT, Objective, polish
 from fitting.starts import starts
@@ -46,7 +47,13 @@ def minimise(objective: Objective) -> Minimum:
     first = objective.problem.coordinates(points[best])
     if not objective.problem.lasting:
         return _polished(objective, polish(scout, first, SOFT, settled=_ROUGH).coordinates, points[best])
-    return settle(objective, _whole(objective, _scouted(scout, first), points[best]))
+    found = settle(objective, _whole(objective, _scouted(scout, first), points[best]))
+    lost = lost_rows(objective, objective.problem.values(found.coordinates))
+    back = recovered(objective, found.coordinates, lost) if lost.any() else None
+    if back is None:
+        return found
+    other = settle(objective, replace(found, coordinates=back))
+    return other if other.chi2[0] < found.chi2[0] else found
 
 
 def _scouted(scout: Objective, coordinates: Float[np.ndarray, "starts p"]) -> Float[np.ndarray, "starts p"]:

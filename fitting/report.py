@@ -52,7 +52,7 @@ LAW_COLUMNS = (
 def summary(result: FitResult) -> str:
     """Return the fit as text: verdict first, then the law, then goodness of fit and warnings."""
     lines = [
-        f"Impact law of {result.table.source} ({result.table.rows} rows), model {result.model}:",
+        f"Impact law of {result.table.source} ({rows_in_words(result.table.rows)}), model {result.model}:",
         *(f"  {formula}" for formula in formulas(result.model)),
         "",
         "VALID" if result.valid else "NOT VALID: the numbers below are not a measurement of the law.",
@@ -68,6 +68,11 @@ def summary(result: FitResult) -> str:
     if result.warnings:
         lines += ["", "Notes:", *(f"  - {warning}" for warning in result.warnings)]
     return "\n".join(lines)
+
+
+def rows_in_words(count: int) -> str:
+    """Return '1 row' or '82 rows'."""
+    return f"{count} row" if count == 1 else f"{count} rows"
 
 
 def formulas(model: str) -> list[str]:

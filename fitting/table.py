@@ -57,7 +57,8 @@ class AmplitudeTable:
         calibration: value and standard error of ``tip_calibration``, ``drive_calibration``, ``offset_origin_nm``, as
             far as they are uncertain.
         source: path of the file as it was given.
-        lines: the line of the file that each row stands in, shape (rows,); 1, 2, 3, ... for a table not from a file.
+        lines: the line of the file that each row stands in, shape (rows,); 1, 2, 3, ... for a table not from a file, or
+            if as many are not given.
         remarks: free comments of the file.
 
     Raises:
@@ -81,13 +82,15 @@ class AmplitudeTable:
     mass_ng: float = 1.0
     calibration: dict[str, tuple[float, float]] = field(default_factory=dict)
     source: str = "table in memory"
-    lines: Int[np.ndarray, " rows"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    lines: Int[np.ndarray, " lines"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     remarks: tuple[str, ...] = ()
 
     def __post_init__(self):
-        faults = Faults(self.source, place="line" if len(self.lines) else "row")
+        # Lines of another number are those of the table that this one was made from (`dataclasses.replace`).
+        own = len(self.lines) == np.size(self.order)
+        faults = Faults(self.source, place="line" if own else "row")
         columns = {name: getattr(self, name) for name in COLUMN_NAMES if getattr(self, name) is not None}
-        lines = self.lines if len(self.lines) else np.arange(1, np.size(self.order) + 1)
+        lines = self.lines if own else np.arange(1, np.size(self.order) + 1)
         columns = {name: _column(name, values, len(lines), faults) for name, values in columns.items()}
         _check_pairs(columns, faults)
         _check_header(self, faults)

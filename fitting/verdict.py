@@ -78,15 +78,17 @@ def _reasons(evidence: Evidence) -> list[str]:
 def _why_not_explained(evidence: Evidence) -> str:
     worst = np.nanmax(np.abs(np.where(np.isfinite(evidence.rows.residual), evidence.rows.residual, 0.0)), axis=1)
     far = np.argsort(-worst)[: max(1, len(worst) // 20)]
-    rows = _rows_in_words(evidence.table, np.sort(far))
+    rows, names = _rows_in_words(evidence.table, np.sort(far)), evidence.parameters
+    tail = f"farthest off: {rows} (if only a few are wrong: --robust)."
     if evidence.lasting:
+        other = "The loss may depend on the speed otherwise (try viscous+delay), the" if "r" in names else "The"
         return (
-            f"The errors may be too small, the calibration (quality_factor, amplitudes, offsets) off, or some rows not "
-            f"single-impact orbits; farthest off: {rows}."
+            f"{other} errors may be too small, the calibration (quality_factor, amplitudes, offsets) off, or some rows "
+            f"not single-impact orbits; {tail}"
         )
     return (
         "The impacts may last too long for an instantaneous law (a collision delay decides amplitudes near resonance: "
-        "try the model with +delay), the errors may be too small, or the calibration off."
+        f"try the model with +delay), the errors may be too small, or the calibration off; {tail}"
     )
 
 
@@ -113,14 +115,17 @@ _HELP = {
 
 def _warnings(evidence: Evidence) -> list[str]:
     return [
-        *_damping_warnings(evidence.table),
+        *_damping_warnings(evidence),
         *_parameter_warnings(evidence),
         *_pair_warnings(evidence),
         *_row_warnings(evidence),
     ]
 
 
-def _damping_warnings(table: AmplitudeTable) -> list[str]:
+def _damping_warnings(evidence: Evidence) -> list[str]:
+    table = evidence.table
+    if "quality_factor" in evidence.parameters:
+        return []
     if table.quality_factor is None:
         message = (
             "The table gives no quality_factor: air damping is left out, and what it takes is counted as impact loss. "
@@ -141,7 +146,8 @@ def _parameter_warnings(evidence: Evidence) -> list[str]:
     warnings = []
     for name, parameter in evidence.parameters.items():
         low, high = parameter.interval95
-        if parameter.at_bound:
+        # Where the model does not explain the data, a bound is only where the misfit pushed the parameter.
+        if parameter.at_bound and not evidence.p_value < IMPROBABLE:
             limit = f"< {high:.4g}" if high is not None else f"> {low:.6g}" if low is not None else None
             reading = f": read it as a limit, {name} {limit} (95 %)" if limit else ""
             warnings.append(f"{name} is at its bound, {parameter.value:.3g}{reading}.")
@@ -182,6 +188,14 @@ def _row_warnings(evidence: Evidence) -> list[str]:
         warnings.append(
             f"A model error of up to {worst:.1f} % was added to the errors of slow impacts: "
             f"{_rows_in_words(evidence.table, strained)}."
+        )
+    unseen = np.zeros(evidence.table.rows) if evidence.table.no_orbit is None else evidence.table.no_orbit
+    contradicted = np.flatnonzero((unseen > 0) & (evidence.rows.orbits > 0))
+    if contradicted.size:
+        warnings.append(
+            f"No orbit was seen, though the fitted model has a steady one, for "
+            f"{_rows_in_words(evidence.table, contradicted)}: the tip may have settled on another motion; start it "
+            "otherwise, or remove the row."
         )
     several = np.flatnonzero(evidence.rows.orbits > 1)
     if several.size:

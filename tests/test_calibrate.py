@@ -307,3 +307,10 @@ def test_the_measured_sweep(real_sweep):
     assert alone.quality_factor.value == pytest.approx(1218.84, abs=0.1)
     assert alone.quality_factor.standard_error == pytest.approx(1.21, abs=0.02)
     assert not calibrate(real_sweep, background="none", compare=False).valid
+
+
+def test_a_frequency_in_hz_under_the_name_of_khz_is_pointed_out():
+    sweep = synthetic_sweep(noise=1e-3, phase=False)
+    assert not any("are in Hz" in warning for warning in calibrate(sweep).warnings)
+    wrong = replace(sweep, frequency_khz=1e3 * sweep.frequency_khz)
+    assert any("name their column frequency_hz" in warning for warning in calibrate(wrong).warnings)

@@ -9,6 +9,7 @@ from typing import Any
 import pytest
 from click.testing import CliRunner
 
+from afm_jax.cli.fit import _settings
 from afm_jax.cli.main import main
 from tests.fit_tables import EXAMPLE
 
@@ -168,6 +169,9 @@ def test_scaled_errors_are_said(tmp_path):
         (["--example", str(EXAMPLE)], "give a table to fit"),
         (["--example", "--model", "hertz"], "is not one of 'restitution', 'law', 'viscous'"),
         (["--example", "--noise", "120%"], "must be a relative error such as 1% or 0.01"),
+        (["--example", "--model", "contact", "--free", "modulus_gpa", "--fix", "modulus_gpa=90"], "both fitted"),
+        (["--example", "--model", "contact", "--free", "viscosity_pa_s", "--no", "viscous"], "changes nothing without"),
+        (["--example", "--model", "contact", "--fix", "viscosity_pa_s=1e-3", "--no", "viscous"], "changes nothing"),
     ],
 )
 def test_wrong_calls_end_with_one_line_and_exit_code_2(arguments, said):
@@ -176,3 +180,18 @@ def test_wrong_calls_end_with_one_line_and_exit_code_2(arguments, said):
     assert result.stdout == ""
     assert len(result.stderr.strip().splitlines()) == 1
     assert said in result.stderr
+
+
+def test_a_contact_without_an_effect_is_not_fitted_by_its_parameters():
+    options = {"scale_errors": False, "robust": False, "constrain": (), "free": None}
+    settings = _settings("contact", options | {"left_out": ("viscous",), "fix": (("modulus_gpa", 90.0),)})
+    assert settings["free"] == ("relative_humidity", "adhesion_energy_j_per_m2")
+    assert settings["effects"] == ("capillary", "structural", "core", "jkr")
+
+
+def test_what_an_invalid_fit_leaves_out_is_said(tmp_path):
+    result = run(shortened(tmp_path / "one.csv", 1, without_errors=False), "--bootstrap", "50", "--posterior")
+    assert result.exit_code == 3
+    assert "(1 row)" in result.stdout
+    assert "no bootstrap: the fit is not valid" in result.stderr
+    assert "no posterior: the fit is not valid" in result.stderr

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-import fitting.forward
+import fitting.row_orbits
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbit_state import SteadyOrbits
 from fitting import fit, read_table
@@ -209,7 +209,7 @@ def test_of_coexisting_orbits_the_measured_one_is_taken(table, monkeypatch, meas
     amplitude = jnp.array([[100.0, 40.0], [60.0, 26.0], [60.0, 25.0], [61.0, 40.0]])
     steady = jnp.array([True, False, True, False])
     made_up = SteadyOrbits(jnp.arange(4.0), steady, jnp.zeros(4, dtype=bool), amplitude)
-    monkeypatch.setattr(fitting.forward, "steady_orbits", lambda _: made_up)
+    monkeypatch.setattr(fitting.row_orbits, "steady_orbits", lambda _: made_up)
     error = np.where(np.isnan(measured), np.nan, 1.0)[None]
     problem, values = problem_of(table, "law"), jnp.array([0.95, 60.0, 40.0])
     measurement = measurement_of(with_amplitudes(rows(table, slice(0, 1)), np.array([measured]), error), problem)

@@ -111,6 +111,7 @@ def test_two_rows_end_with_exit_code_3(tmp_path):
         ([HEAD.rsplit(",", 2)[0], ROWS[0].rsplit(",", 2)[0]], (), "add the columns phase_deg and phase_error_deg"),
         ([HEAD, ROWS[0]], ("--frequency-error", "-1"), "frequency-error"),
         ([HEAD, ROWS[0]], ("--truth", "TABLE"), "there is no column approach_speed_nm_per_us"),
+        ([HEAD, ROWS[0]], ("--law", "TABLE"), "is no JSON; give the fit.json"),
     ],
 )
 def test_wrong_calls_end_with_one_line_and_exit_code_2(tmp_path, table, arguments, said):
@@ -122,6 +123,44 @@ def test_wrong_calls_end_with_one_line_and_exit_code_2(tmp_path, table, argument
     assert result.exit_code == 2
     assert said in result.stderr
     assert len(result.stderr.strip().splitlines()) == 1
+
+
+def on_resonance(path):
+    """Write the bundled rows on resonance without their phase."""
+    columns = HEAD.split(",")[:8]
+    lines = [",".join(row.split(",")[:8]) for row in ROWS if row.split(",")[:2] == ["1", "180.0"]]
+    path.write_text(COMMENTS + "\n".join([",".join(columns), *lines]) + "\n", encoding="utf-8")
+    return path
+
+
+def test_a_reading_whose_phase_is_assumed_is_not_called_valid(tmp_path):
+    result = run(on_resonance(tmp_path / "table.csv"), "--out", tmp_path)
+    assert result.exit_code == 0, result.stderr
+    assert "READ ON AN ASSUMPTION" in result.stdout
+    assert "VALID" not in result.stdout
+    # one panel: without a phase there is no delay
+    height, width, _ = imread(tmp_path / "invert.png").shape
+    assert width < 1.5 * height
+
+
+def test_a_fitted_law_is_drawn_over_the_rows(tmp_path):
+    speeds = np.geomspace(20.0, 700.0, 50)
+    law = {
+        "approach_speed_nm_per_us": speeds.tolist(),
+        "rebound_speed_nm_per_us": (0.99 * speeds).tolist(),
+        "collision_delay_us": [None, *[0.07] * 49],
+    }
+    path = tmp_path / "fit.json"
+    pictures = []
+    for drawn in ((), ("--law", path)):
+        path.write_text(json.dumps({"format": "afm-jax fit", "valid": True, "model": "law+delay", "law": law}))
+        assert run(on_resonance(tmp_path / "table.csv"), "--out", tmp_path, *drawn).exit_code == 0
+        pictures.append(imread(tmp_path / "invert.png"))
+    assert np.sum(np.any(pictures[0] != pictures[1], axis=2)) > 500
+    path.write_text(json.dumps({"format": "afm-jax fit", "valid": False, "model": "law+delay", "law": law}))
+    refused = run(tmp_path / "table.csv", "--law", path)
+    assert refused.exit_code == 2
+    assert "the fit is not valid" in refused.stderr
 
 
 @pytest.mark.parametrize(

@@ -132,6 +132,21 @@ def test_a_table_needs_what_the_fitter_needs(tmp_path):
     assert table.offset_nm[0] == pytest.approx(-1.0, rel=1e-6)
     twice = run(path, path, "--free-frequency-khz", 90, "--json")
     assert "repeats row 1" in strictly(twice.stdout)["table_reason"]
+    again, _ = written(tmp_path / "again.csv", order=1, comments="")
+    reason = strictly(run(path, again, "--free-frequency-khz", 90, "--json").stdout)["table_reason"]
+    assert reason.startswith(f"{again}: repeats the drive of {path}")
+
+
+def test_a_deflection_with_the_wrong_sign_is_named(tmp_path):
+    path, _ = written(tmp_path / "turned.csv", order=1)
+    lines = path.read_text(encoding="utf-8").splitlines()
+    start = lines.index("time_us,deflection_nm,platform_nm") + 1
+    turned = [f"{time},{-float(height)},{platform}" for time, height, platform in (x.split(",") for x in lines[start:])]
+    path.write_text("\n".join([*lines[:start], *turned]) + "\n", encoding="utf-8")
+    result = run(path, "--json")
+    assert result.exit_code == 3
+    assert strictly(result.stdout)["traces"][0]["kind"] == "upside_down"
+    assert "multiply it by -1" in result.stderr
 
 
 @pytest.mark.parametrize(

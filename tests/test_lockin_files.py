@@ -92,7 +92,7 @@ def test_an_hdf5_file_says_the_same_as_a_csv_file(tmp_path: Path, group: str | N
     ("group", "said"),
     [
         (None, "there is no data set deflection_nm here; name its group: --group scan"),
-        ("scam", "there is no group 'scam'; the groups are scan"),
+        ("scam", "there is no group 'scam'; those with deflection_nm are scan"),
         ("scan", "column deflection_nm: the data set has shape (2, 3)"),
     ],
 )
@@ -108,6 +108,17 @@ def test_faults_of_hdf5_files(tmp_path: Path, group: str | None, said: str):
     damaged.write_bytes(path.read_bytes()[:100])
     with pytest.raises(TableError, match="cannot be read as HDF5"):
         read_trace(damaged)
+
+
+def test_groups_inside_groups_are_named(tmp_path: Path):
+    h5py = pytest.importorskip("h5py")
+    path = tmp_path / "nested.h5"
+    with h5py.File(path, "w") as file:
+        file.create_group("notes")
+        for name in ("scan/forward", "scan/backward"):
+            file.create_group(name)["deflection_nm"] = np.zeros(300)
+    with pytest.raises(TableError, match=r"--group scan/backward \(there are scan/backward, scan/forward\)"):
+        read_trace(path, drive_frequency_khz=1.0, sampling_rate_mhz=1.0)
 
 
 def test_hdf5_without_its_package_says_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):

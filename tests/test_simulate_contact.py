@@ -74,6 +74,24 @@ def test_diffrax_in_time_goes_the_same_way(n, speed):
     np.testing.assert_allclose(arrivals(found, 4), times[:4], rtol=0.0, atol=1e-8)
 
 
+def test_derivatives_of_a_batch_are_slopes_of_diffrax_in_time():
+    system = reference(5.277, 4.0)
+    begin = [state(system.start(phase_deg=270, height_nm=5, velocity_nm_per_us=speed)) for speed in (40.0, 60.0, 80.0)]
+    speeds = jnp.asarray([float(one.velocity_nm_per_us) for one in begin])
+
+    def arrivals_of(speed, method):
+        start = State(begin[0].time_us, begin[0].position_nm, speed)
+        return simulate(scene_of(system), start, 40.0, max_contacts=6, method=method).contacts.arrival_time_us[:4]
+
+    def slope(speed):
+        return jax.jvp(lambda v: arrivals_of(v, "collocation"), (speed,), (jnp.ones_like(speed),))[1]
+
+    step = 1e-5
+    apart = jax.jit(jax.vmap(lambda v: arrivals_of(v + step, "diffrax") - arrivals_of(v - step, "diffrax")))(speeds)
+    # central differences lose half the digits, and each contact makes their error larger
+    np.testing.assert_allclose(jax.jit(jax.vmap(slope))(speeds), apart / (2.0 * step), rtol=1e-4, atol=1e-5)
+
+
 def test_an_unknown_method_is_refused():
     system = reference(1.01, 4.0)
     start = system.start(phase_deg=270, height_nm=5, velocity_nm_per_us=150.0)

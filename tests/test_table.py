@@ -21,6 +21,12 @@ NAMES = "order,drive_frequency_khz,drive_amplitude_nm,offset_nm,peak_amplitude_n
 TEXT = f"# free_frequency_khz = 90\n{NAMES}1,180,4,0,163.3,1.63\n2,349.2,2,-1,106.67,1.06\n"
 
 
+FEW = """order,drive_frequency_khz,drive_amplitude_nm,offset_nm,peak_amplitude_nm,peak_amplitude_error_nm
+1,180,4,0,163.3,1.63
+2,349.2,2,-1,106.67,1.06
+"""
+
+
 def write(folder: Path, text: str | bytes) -> Path:
     path = folder / "table.csv"
     path.write_bytes(text.encode() if isinstance(text, str) else text)
@@ -152,6 +158,15 @@ def test_what_is_known_of_the_instrument_is_kept(tmp_path: Path):
         "offset_origin_nm": (-0.2, 0.3),
     }
     assert table.remarks == ()
+
+
+def test_replaced_columns_may_have_another_length(tmp_path: Path):
+    read = read_table(write(tmp_path, "# free_frequency_khz = 90\n" + FEW))
+    names = ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")
+    names += ("peak_amplitude_nm", "peak_amplitude_error_nm")
+    first = dataclasses.replace(read, **{name: getattr(read, name)[:1] for name in names})
+    assert read.lines.tolist() == [3, 4]
+    assert first.lines.tolist() == [1]
 
 
 def test_arrays_are_read_only_copies():

@@ -31,7 +31,7 @@ PARAMETERS = {
 REMOVABLE = ("viscous", "structural", "capillary")
 _REQUIRED = ("core", "jkr")
 _LIQUID = ("relative_humidity", "temperature_k", "surface_tension_n_per_m", "molar_volume_cm3_per_mol")
-_SERVES = {
+SERVES = {
     "viscosity_pa_s": ("viscous",),
     **dict.fromkeys(("structural_amplitude_n_per_m", "structural_decay_nm", "structural_offset_nm"), ("structural",)),
     **dict.fromkeys(_LIQUID, ("capillary", "structural")),
@@ -102,7 +102,7 @@ def chosen_contact(options: ContactOptions) -> ChosenContact:
         effects, parameters, mass = _of_scene(options.scene)
     effects = tuple(name for name in effects if name not in options.left_out)
     for name in options.parameters:
-        serves = _SERVES.get(name, effects)
+        serves = SERVES.get(name, effects)
         if not set(serves) & set(effects):
             raise click.UsageError(f"{_option(name)} changes nothing without the effect {' or '.join(serves)}")
     contact = make_contact(effects, {**parameters, **options.parameters})

@@ -69,7 +69,8 @@ def command(session: Session, table: Path | None, model: str, noise: float | Non
     converged, not explained by the model, or a parameter not identified.
     """
     if options["example"] == (table is not None):
-        raise click.UsageError("give a table to fit, `afm-jax fit TABLE.csv`, or --example for the bundled one")
+        both = "not both: " if options["example"] else ""
+        raise click.UsageError(f"{both}give a table to fit, `afm-jax fit TABLE.csv`, or --example for the bundled one")
     settings = _settings(model, options)
     session.start_computing()
     from fitting.law_fit import fit  # noqa: PLC0415
@@ -107,16 +108,50 @@ def _settings(model: str, options: dict[str, Any]) -> dict[str, Any]:
         "constraints": dict(options["constrain"]),
     }
     if model == "contact":
-        from afm_jax.cli.contact_options import REMOVABLE  # noqa: PLC0415
-
-        left_out = options["left_out"] or ()
-        for name in left_out:
-            if name not in REMOVABLE:
-                raise click.UsageError(f"--no takes {', '.join(REMOVABLE)}, but one is {name!r}")
-        effects = ("capillary", "structural", "core", "viscous", "jkr")
-        settings["free"], settings["fixed"] = options["free"], dict(options["fix"])
-        settings["effects"] = tuple(name for name in effects if name not in left_out)
+        effects = _effects(options["left_out"] or ())
+        settings["fixed"], settings["effects"] = dict(options["fix"]), effects
+        _check_contact_options(options["free"] or (), settings["fixed"], effects)
+        settings["free"] = options["free"] or _usual_parameters(settings["fixed"], effects)
     return settings
+
+
+def _effects(left_out: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the contact's effects without those left out."""
+    from afm_jax.cli.contact_options import REMOVABLE  # noqa: PLC0415
+
+    for name in left_out:
+        if name not in REMOVABLE:
+            raise click.UsageError(f"--no takes {', '.join(REMOVABLE)}, but one is {name!r}")
+    return tuple(name for name in ("capillary", "structural", "core", "viscous", "jkr") if name not in left_out)
+
+
+def _usual_parameters(fixed: dict[str, float], effects: tuple[str, ...]) -> tuple[str, ...]:
+    """Return which parameters are fitted if the call names none: the usual ones that are neither fixed nor idle."""
+    from afm_jax.cli.contact_options import SERVES  # noqa: PLC0415
+    from fitting.models import CONTACT_DEFAULT  # noqa: PLC0415
+
+    chosen = [name for name in CONTACT_DEFAULT if name not in fixed and set(SERVES.get(name, effects)) & set(effects)]
+    if not chosen:
+        raise click.UsageError("--fix holds every parameter that is usually fitted; name others to fit with --free")
+    return tuple(chosen)
+
+
+def _check_contact_options(free: tuple[str, ...], fixed: dict[str, float], effects: tuple[str, ...]) -> None:
+    """Check that no parameter is fitted and held fixed at once, and that each is of use.
+
+    Raises:
+        click.UsageError: if one is not.
+    """
+    from afm_jax.cli.contact_options import SERVES  # noqa: PLC0415
+
+    for name in free:
+        if name in fixed:
+            raise click.UsageError(f"{name} is both fitted (--free) and held fixed (--fix); remove it from one")
+    for option, names in (("--free", free), ("--fix", tuple(fixed))):
+        for name in names:
+            serves = SERVES.get(name, effects)
+            if not set(serves) & set(effects):
+                raise click.UsageError(f"{option} {name} changes nothing without the effect {' or '.join(serves)}")
 
 
 def _extras(
@@ -130,6 +165,9 @@ def _extras(
         models = rivals(result.model)
         with session.working(f"comparing {', '.join(models)}"):
             extras["comparison"] = compare(table, models, **settings)
+    for name in ("bootstrap", "posterior"):
+        if options[name] and not result.valid:
+            session.note(f"no {name}: the fit is not valid")
     if options["bootstrap"] and result.valid:
         from fitting.sampling.parametric_bootstrap import bootstrap  # noqa: PLC0415
 

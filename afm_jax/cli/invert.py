@@ -25,6 +25,12 @@ from afm_jax.cli.session import Session, with_session
     metavar="CSV",
     help="The law if it is known, as `afm-jax collide --out` writes it: compared with the reading on resonance.",
 )
+@click.option(
+    "--law",
+    type=click.Path(path_type=Path),
+    metavar="JSON",
+    help="A fit of the same drives, as `afm-jax fit --out` writes it (fit.json): drawn over the rows.",
+)
 @click.option("--example", is_flag=True, help="Invert the bundled table instead of a file.")
 @with_session
 def command(
@@ -33,6 +39,7 @@ def command(
     noise: float | None,
     frequency_error_khz: float | None,
     truth: Path | None,
+    law: Path | None,
     *,
     example: bool,
 ) -> None:
@@ -46,6 +53,7 @@ def command(
     if example == (table is not None):
         raise click.UsageError("give a table to invert, `afm-jax invert TABLE.csv`, or --example for the bundled one")
     session.start_computing()
+    from fitting.inverse.fitted_law import read_fitted_law  # noqa: PLC0415
     from fitting.inverse.inversion_report import inversion_summary  # noqa: PLC0415
     from fitting.inverse.known_law import read_known_law  # noqa: PLC0415
     from fitting.inversion import invert  # noqa: PLC0415
@@ -53,13 +61,14 @@ def command(
 
     measured = read_table(_example_path() if table is None else table, noise=noise)
     known = None if truth is None else read_known_law(truth)
+    fitted = None if law is None else read_fitted_law(law)
     with session.working(f"inverting {measured.rows} rows (the first run compiles for some seconds)"):
         result = invert(measured, frequency_error_khz=frequency_error_khz, truth=known)
     session.emit(result.to_dict(), inversion_summary(result))
     if session.out is not None:
         from fitting.inverse.inversion_report import write_inversion  # noqa: PLC0415
 
-        for path in write_inversion(result, session.out, session.write_table):
+        for path in write_inversion(result, session.out, session.write_table, fitted=fitted):
             session.note(f"wrote {path}")
     if not result.valid:
         raise NotValid(result.reasons[0])

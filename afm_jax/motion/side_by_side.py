@@ -11,8 +11,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jax.custom_batching import custom_vmap
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
 
@@ -39,15 +41,11 @@ def for_the_few(
         few = _Few(
             work=lambda *leaves: tuple(jax.tree.leaves(work(*jax.tree.unflatten(tree, leaves)))),
             needed=lambda *leaves: needed(*jax.tree.unflatten(tree, leaves)),
-            changed=slice(before, before + len(jax.tree.leaves(arguments[changed]))),
+            changed=tuple(range(before, before + len(jax.tree.leaves(arguments[changed])))),
             passes=passes,
             block=block,
         )
-        # `custom_vmap` sees flat arrays: its derivatives stumble over a None in a tree. In its rule it must not be
-        # called again: a batch of derivatives at one point comes as a batch without a batched argument.
-        flat = custom_vmap(few.of_one)
-        flat.def_vmap(few.of_batch)
-        return jax.tree.unflatten(jax.tree.structure(arguments[changed]), flat(*leaves))
+        return jax.tree.unflatten(jax.tree.structure(arguments[changed]), few.done(*leaves))
 
     return called
 
@@ -57,9 +55,59 @@ class _Few(NamedTuple):
 
     work: Callable[..., tuple[Array, ...]]
     needed: Callable[..., Array]
-    changed: slice
+    changed: tuple[int, ...]
     passes: int
     block: int
+
+    def done(self, *leaves: Array) -> tuple[Array, ...]:
+        """Return the changed arguments, with derivatives and under `vmap`.
+
+        A derivative is work on values and tangents together: `custom_vmap` sees it as more arguments, for its own
+        derivatives do not work where a value is batched and its tangent is not.
+        """
+
+        @jax.custom_jvp
+        def flat(*leaves):
+            # `custom_vmap` sees flat arrays, and in its rule it must not be called again
+            one = custom_vmap(self.of_one)
+            one.def_vmap(self.of_batch)
+            return one(*leaves)
+
+        def derivative(primals, tangents):
+            known = [index for index, tangent in enumerate(tangents) if not isinstance(tangent, SymbolicZero)]
+            moved = [index for index in self.changed if jnp.issubdtype(primals[index].dtype, jnp.floating)]
+            varied = sorted({*known, *moved})
+            given = [tangents[i] if i in known else jnp.zeros_like(primals[i]) for i in varied]
+            results = self._with_tangents(len(primals), varied, moved).done(*primals, *given)
+            values, slopes = results[: len(self.changed)], dict(zip(moved, results[len(self.changed) :], strict=True))
+            none = [np.zeros(value.shape, jax.dtypes.float0) for value in values]
+            return values, tuple(slopes.get(index, zero) for index, zero in zip(self.changed, none, strict=True))
+
+        flat.defjvp(derivative, symbolic_zeros=True)
+        return flat(*leaves)
+
+    def _with_tangents(self, count: int, varied: list[int], moved: list[int]) -> "_Few":
+        """Return the same work on `count` values and, behind them, the tangents of those that vary."""
+
+        def work(*leaves):
+            values, given = leaves[:count], leaves[count:]
+
+            def of_varied(*parts):
+                now = [*values]
+                for index, part in zip(varied, parts, strict=True):
+                    now[index] = part
+                return self.work(*now)
+
+            after, slopes = jax.jvp(of_varied, tuple(values[index] for index in varied), given)
+            return *after, *(slopes[self.changed.index(index)] for index in moved)
+
+        return _Few(
+            work=work,
+            needed=lambda *leaves: self.needed(*leaves[:count]),
+            changed=(*self.changed, *(count + varied.index(index) for index in moved)),
+            passes=self.passes,
+            block=self.block,
+        )
 
     def of_one(self, *leaves: Array) -> tuple[Array, ...]:
         """Return the changed arguments of one tip."""
@@ -70,7 +118,7 @@ class _Few(NamedTuple):
         def one_pass(state):
             return state[0] + 1, self.work(*self._with(leaves, state[1]))
 
-        return lax.while_loop(needs, one_pass, (0, tuple(leaves[self.changed])))[1]
+        return lax.while_loop(needs, one_pass, (0, tuple(leaves[i] for i in self.changed)))[1]
 
     def of_batch(self, size: int, flags: Sequence[bool], *leaves: Array) -> tuple[tuple[Array, ...], Any]:
         """Return the changed arguments of a batch and that they are batched: the rule of `custom_vmap`."""
@@ -86,7 +134,8 @@ class _Few(NamedTuple):
 
     def _with(self, leaves: Sequence[Array], values: Sequence[Array]) -> list[Array]:
         now = [*leaves]
-        now[self.changed] = values
+        for index, value in zip(self.changed, values, strict=True):
+            now[index] = value
         return now
 
     def _one_by_one(self, size: int, flags: Sequence[bool], leaves: Sequence[Array]) -> tuple[Array, ...]:
@@ -97,9 +146,8 @@ class _Few(NamedTuple):
 
     def _in_blocks(self, size: int, flags: Sequence[bool], leaves: Sequence[Array]) -> tuple[Array, ...]:
         """Return the changed arguments of a batch: those in need, gathered in blocks, pass after pass."""
-        values = tuple(jnp.broadcast_to(leaf, (size,)) for leaf in leaves[self.changed])
-        marks = [*flags]
-        marks[self.changed] = [True] * len(values)
+        values = tuple(jnp.broadcast_to(leaves[index], (size,)) for index in self.changed)
+        marks = [flag or index in self.changed for index, flag in enumerate(flags)]
         block = min(self.block, size)
 
         def needing(values):

@@ -19,6 +19,8 @@ MORE = (45.0, 50.0, 55.0, 65.0, 70.0, 75.0, 90.0, 100.0, 110.0)
 """More starts: how long one stays broadband is a matter of rounding, and so differs between machines; of many it does
 not depend on luck."""
 _UNTIL_US = 8000.0
+_RESTED_CONTACTS = 200
+"""Contacts after locking in which a motion comes close to its orbit."""
 _LOCKED_CONTACTS = 50
 _LOCKED_WITHIN = 0.25
 """Of a drive period: how far flights may be off whole periods."""
@@ -64,11 +66,17 @@ def survey(
             scene,
             start_of(scene, presets.figure8_start(velocity)),
             until_us,
-            enough=lambda times: locked_from(times, period)[1] is not None,
+            enough=lambda times: _has_come_to_rest(times, period),
             report=lambda what, velocity=velocity: report(f"from {velocity:g} nm/us: {what}"),
         )
         courses.append(Course(velocity, motion, *locked_from(motion.departure_time_us, period)))
     return courses
+
+
+def _has_come_to_rest(times_us: Float[np.ndarray, " contacts"], period_us: float) -> bool:
+    """Say whether a motion has been locked for so long that its orbit is seen."""
+    before, periods = locked_from(times_us, period_us)
+    return periods is not None and times_us.size - before >= _RESTED_CONTACTS
 
 
 def locked_from(times_us: Float[np.ndarray, " contacts"], period_us: float) -> tuple[int, int | None]:

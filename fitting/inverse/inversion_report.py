@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from fitting.inverse.fitted_law import FittedLaw
 from fitting.inverse.inversion_result import Coefficient, Inversion, RegressedLaw
 
 ROW_COLUMNS = (
@@ -52,7 +53,7 @@ def inversion_summary(result: Inversion) -> str:
     inverted = int(result.rows.inverted.sum())
     lines = [
         f"Direct inversion of {result.table.source}: {inverted} of {result.table.rows} rows",
-        "VALID" if result.valid else "NOT VALID: the numbers below determine no law.",
+        _heading(result),
         *(f"  - {reason}" for reason in result.reasons),
         "",
     ]
@@ -67,13 +68,24 @@ def inversion_summary(result: Inversion) -> str:
     return "\n".join(lines)
 
 
-def write_inversion(result: Inversion, folder: Path, write_table: Table) -> list[Path]:
+def _heading(result: Inversion) -> str:
+    if not result.valid:
+        return "NOT VALID: the numbers below determine no law."
+    if result.rows.inverted.any():
+        return "VALID"
+    return "READ ON AN ASSUMPTION: the phase was not measured but assumed, so that the numbers below are no law."
+
+
+def write_inversion(
+    result: Inversion, folder: Path, write_table: Table, *, fitted: FittedLaw | None = None
+) -> list[Path]:
     """Write invert.txt, invert.json, invert.png, invert.csv and law.csv into a folder.
 
     Args:
         result: the inversion.
         folder: an existing folder; files of these names are replaced.
         write_table: called with a file name, records and columns for the CSV files.
+        fitted: a law that a fit found, drawn over the rows.
 
     Returns:
         The files written here (the tables are `write_table`'s).
@@ -86,7 +98,7 @@ def write_inversion(result: Inversion, folder: Path, write_table: Table) -> list
     text, data, picture = (folder / f"invert.{ending}" for ending in ("txt", "json", "png"))
     text.write_text(inversion_summary(result) + "\n", encoding="utf-8")
     data.write_text(json.dumps(result.to_dict(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    inversion_figure(result).savefig(picture, dpi=150)
+    inversion_figure(result, fitted=fitted).savefig(picture, dpi=150)
     write_table("invert.csv", result.records(), ROW_COLUMNS)
     write_table("law.csv", result.law_records(), LAW_COLUMNS)
     return [text, data, picture]

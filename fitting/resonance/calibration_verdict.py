@@ -16,6 +16,10 @@ _SYSTEMATIC = 0.5
 """Correlation of neighbouring residuals beyond which the standard errors mean nothing."""
 
 
+_FAST_KHZ = 2e4
+"""The fastest cantilevers resonate at a few MHz."""
+
+
 @dataclass(frozen=True)
 class Evidence:
     """All that the verdict looks at."""
@@ -96,6 +100,11 @@ def _range_reasons(evidence: Evidence) -> list[str]:
 
 def _warnings(evidence: Evidence) -> list[str]:
     sweep, fit, warnings = evidence.sweep, evidence.fit, []
+    if evidence.frequency.value > _FAST_KHZ:
+        warnings.append(
+            f"A resonance of {evidence.frequency.value:.6g} kHz is beyond any cantilever's: if the frequencies "
+            "are in Hz, name their column frequency_hz."
+        )
     if sweep.reordered:
         warnings.append("The frequencies did not rise from point to point: the points were sorted.")
     if fit.reverse:

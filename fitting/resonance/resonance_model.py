@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from fitting.forward import Linearised, Prediction
 from fitting.models import Problem
 from fitting.optimise import BATCH, Objective
 from fitting.parameters import Numbers, Parameter
@@ -167,11 +168,8 @@ class SweepObjective(Objective):
         """Keep what every evaluation shares."""
         self.points, self.kind, self.problem = points, kind, problem
 
-    def linearise(
-        self, coordinates: Float[np.ndarray, "sets p"]
-    ) -> tuple[Float[np.ndarray, "sets n"], Float[np.ndarray, "sets n p"]]:
-        """Return residuals and their Jacobian by the coordinates, in batches that share one compilation."""
-        values, slopes = self.problem.values_and_slopes(coordinates)
+    def at_values(self, values: Float[np.ndarray, "sets p"]) -> Linearised:
+        """Return residuals and their Jacobian by the values, in batches that share one compilation; of rows nothing."""
         count = len(values)
         filled = np.concatenate([values, np.repeat(values[-1:], -count % BATCH, axis=0)])
         parts = [
@@ -179,11 +177,8 @@ class SweepObjective(Objective):
             for first in range(0, len(filled), BATCH)
         ]
         residual, jacobian = (np.concatenate([np.asarray(part) for part in side]) for side in zip(*parts, strict=True))
-        return residual[:count], jacobian[:count] * slopes[:, None, :]
-
-    def residual(self, values: Float[np.ndarray, "sets p"]) -> Float[np.ndarray, "sets n"]:
-        """Return the residuals at parameter values."""
-        return self.linearise(self.problem.coordinates(values))[0]
+        no_rows = Prediction(*(jnp.zeros(0) for _ in Prediction._fields))
+        return Linearised(residual[:count], jacobian[:count], no_rows)
 
     def with_errors(
         self,

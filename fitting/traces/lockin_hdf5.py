@@ -50,13 +50,16 @@ def _h5py(faults: Faults) -> Any:
 def _read(h5py: Any, file: Any, group: str | None, faults: Faults) -> ParsedTrace:
     place = file if group is None else file.get(group)
     if not isinstance(place, h5py.Group):
-        groups = [name for name, item in file.items() if isinstance(item, h5py.Group)]
-        faults.add(f"there is no group {quoted(str(group))}; the groups are {', '.join(groups) or 'none'}")
+        groups = _groups_with_deflection(h5py, file)
+        faults.add(
+            f"there is no group {quoted(str(group))}; those with deflection_nm are {', '.join(groups) or 'none'}"
+        )
         faults.raise_any()
     names = [name for name, item in place.items() if isinstance(item, h5py.Dataset)]
-    inner = [name for name, item in place.items() if isinstance(item, h5py.Group)]
+    inner = _groups_with_deflection(h5py, place)
     if not any(ATTRIBUTES.get(name) == "deflection_nm" for name in names) and inner:
-        faults.add(f"there is no data set deflection_nm here; name its group: --group {inner[0]} ({', '.join(inner)})")
+        choice = f" (there are {', '.join(inner)})" if inner[1:] else ""
+        faults.add(f"there is no data set deflection_nm here; name its group: --group {inner[0]}{choice}")
         faults.raise_any()
     wanted = wanted_columns(names, faults)
     faults.raise_any()
@@ -67,6 +70,18 @@ def _read(h5py: Any, file: Any, group: str | None, faults: Faults) -> ParsedTrac
         if ATTRIBUTES[name] == "deflection_nm":
             attributes |= dict(place[name].attrs)
     return ParsedTrace(columns, settings_of_attributes(attributes, faults), "platform_nm" in wanted)
+
+
+def _groups_with_deflection(h5py: Any, place: Any) -> list[str]:
+    """Return the names, from the file on, of all groups below a place that hold a deflection."""
+    found: list[str] = []
+
+    def visit(_: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset) and ATTRIBUTES.get(item.name.rsplit("/", 1)[1]) == "deflection_nm":
+            found.append(item.parent.name.strip("/"))
+
+    place.visititems(visit)
+    return [name for name in dict.fromkeys(found) if name]
 
 
 def _column(name: str, dataset: Any, faults: Faults) -> np.ndarray:

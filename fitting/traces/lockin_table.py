@@ -30,6 +30,7 @@ def table_of(results: Sequence[LockinResult]) -> AmplitudeTable:
         _check_known(result)
     shared = _cantilever(steady)
     steady.sort(key=lambda result: (result.order or 0, result.trace.drive_frequency_khz))
+    _check_no_repetition(steady)
     phases = np.array([_or_nan(r.phase_deg if r.phase_reference != "time zero" else None) for r in steady])
     known = np.isfinite(phases)
     errors = np.where(known, [_or_nan(r.phase_error_deg) for r in steady], np.nan)
@@ -64,6 +65,19 @@ def _check_known(result: LockinResult) -> None:
             mend = f"give --{name.replace('_', '-')} or a comment '# {name} = 1'"
             raise TableError(
                 f"{result.trace.source}: {name} is not known, so that it cannot enter the amplitude table; {mend}"
+            )
+
+
+def _check_no_repetition(steady: Sequence[LockinResult]) -> None:
+    first: dict[tuple[float | None, ...], str] = {}
+    for result in steady:
+        frequency = round(result.trace.drive_frequency_khz, 9)
+        drive = (result.order, frequency, result.drive_amplitude_nm, result.offset_nm)
+        other = first.setdefault(drive, result.trace.source)
+        if other != result.trace.source:
+            raise TableError(
+                f"{result.trace.source}: repeats the drive of {other} (same order, frequency, amplitude and offset), "
+                "and a table has one row for each; leave one of the two out"
             )
 
 

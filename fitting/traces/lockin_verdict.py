@@ -24,6 +24,8 @@ _SINE = 0.05
 _FOLLOWS = (0.5, 1.5)
 """Amplitude of a tip held by the sample, of the drive's."""
 _SEEN = 5.0
+_BELOW = 0.5
+"""Height over depth below which a deflection is upside down: an undamped flight from a depth d rises to d again."""
 
 
 class Kind(enum.StrEnum):
@@ -39,6 +41,7 @@ class Kind(enum.StrEnum):
     STUCK = "stuck"
     NO_RESPONSE = "no_response"
     OTHER_ORDER = "other_order"
+    UPSIDE_DOWN = "upside_down"
 
 
 class Verdict(NamedTuple):
@@ -62,7 +65,8 @@ class Evidence(NamedTuple):
 
 def judge(evidence: Evidence) -> Verdict:
     """Return what a trace shows: the first of the findings below that applies."""
-    for finding in (_without_flight, _not_repeating, _drifting, _not_counted, _not_one_impact, _of_other_order):
+    first = (_without_flight, _not_repeating, _upside_down, _drifting)
+    for finding in (*first, _not_counted, _not_one_impact, _of_other_order):
         verdict = finding(evidence)
         if verdict is not None:
             return verdict
@@ -131,6 +135,15 @@ def _not_repeating(evidence: Evidence) -> Verdict | None:
         return Verdict(Kind.NOT_PERIODIC, f"{what}, or too much noise: {left:.0%} of the motion is not explained")
     differ = f"response periods differ by {share:.1%} of the motion beyond the noise"
     return Verdict(Kind.NOT_PERIODIC, f"chaotic, or of a longer period: {what}; {differ}")
+
+
+def _upside_down(evidence: Evidence) -> Verdict | None:
+    """Find a tip that is farther below its rest position than above: a sample from below lets it fly upward only."""
+    low, high = np.percentile(evidence.folded.height, (1.0, 99.0))
+    if low >= 0.0 or abs(high) > _BELOW * abs(low):
+        return None
+    what = f"the deflection lies between {low:.4g} and {high:.4g} nm, but a bouncing tip flies above its rest position"
+    return Verdict(Kind.UPSIDE_DOWN, f"{what}: multiply it by -1, or give what it reads at rest (--rest-nm)")
 
 
 def _drifting(evidence: Evidence) -> Verdict | None:
