@@ -1,11 +1,12 @@
 """Profile intervals of a linear model, where they are known in closed form."""
 
-from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from fitting.forward import Linearised
 from fitting.intervals import profile_intervals
 from fitting.models import Problem
 from fitting.optimise import Objective
@@ -26,7 +27,9 @@ class LinearObjective(Objective):
         residual = (values - self.centre) @ self.design.T
         jacobian = np.broadcast_to(self.design, (len(values), 2, 2))
         nothing = np.zeros((len(values), 1))
-        return SimpleNamespace(
+        nowhere: Any = None
+        return Linearised(
+            prediction=nowhere,
             residual=np.hstack([residual, nothing + 1.5]),
             jacobian=np.concatenate([jacobian, np.zeros((len(values), 1, 2))], axis=1),
         )
@@ -86,7 +89,7 @@ def test_a_loss_that_vanishes_at_the_minimum_grows_again_where_it_has_to(correla
     best_r = free_minimum[0] + fisher[0, 1] / fisher[0, 0] * free_minimum[1]
     minimum = chi2(best_r)
     objective = LinearObjective(np.linalg.cholesky(fisher).T, free_minimum)
-    found, loss = profile_intervals(objective, np.array([best_r, 0.0]), covariance, minimum + 1.5**2)
+    found, loss = profile_intervals(objective, np.array([best_r, 0.0]), covariance, float(minimum) + 1.5**2)
 
     def beyond(r):
         return chi2(r) - minimum - QUANTILE**2

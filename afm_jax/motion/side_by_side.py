@@ -58,6 +58,9 @@ class _Few(NamedTuple):
     changed: tuple[int, ...]
     passes: int
     block: int
+    values: int = 0
+    """Of arguments that are values and, behind them, tangents: how many are values; 0 where all are."""
+    value_results: int = 0
 
     def done(self, *leaves: Array) -> tuple[Array, ...]:
         """Return the changed arguments, with derivatives and under `vmap`.
@@ -98,7 +101,10 @@ class _Few(NamedTuple):
                     now[index] = part
                 return self.work(*now)
 
-            after, slopes = jax.jvp(of_varied, tuple(values[index] for index in varied), given)
+            # a batch may have a value for each tip and one tangent for all, or the other way round
+            pairs = [jnp.broadcast_arrays(values[i], tangent) for i, tangent in zip(varied, given, strict=True)]
+            points, directions = (tuple(column) for column in zip(*pairs, strict=True))
+            after, slopes = jax.jvp(of_varied, points, directions)
             return *after, *(slopes[self.changed.index(index)] for index in moved)
 
         return _Few(
@@ -107,6 +113,8 @@ class _Few(NamedTuple):
             changed=(*self.changed, *(count + varied.index(index) for index in moved)),
             passes=self.passes,
             block=self.block,
+            values=count,
+            value_results=len(self.changed),
         )
 
     def of_one(self, *leaves: Array) -> tuple[Array, ...]:
@@ -130,7 +138,10 @@ class _Few(NamedTuple):
             results = self._one_by_one(size, flags, leaves)
         else:
             results = self._in_blocks(size, flags, leaves)
-        return results, (True,) * len(results)
+        # values that do not differ stay one, whatever the tangents: several derivatives at one point
+        same = self.value_results if not any(flags[: self.values]) else 0
+        results = *(result[0] for result in results[:same]), *results[same:]
+        return results, (False,) * same + (True,) * (len(results) - same)
 
     def _with(self, leaves: Sequence[Array], values: Sequence[Array]) -> list[Array]:
         now = [*leaves]
