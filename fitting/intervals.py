@@ -35,6 +35,8 @@ class _Side:
     others: Float[np.ndarray, " p"]  # places (`_Places`); the profiled one is not used
     inside: float = 0.0  # distance in errors that lies inside the interval
     outside: float = np.inf
+    inside_root: float = 0.0  # root of the rise of chi2 there
+    outside_root: float = np.inf
     trial: float = _FIRST_TRIAL
     end: float | None = None
     reason: str | None = None
@@ -79,18 +81,24 @@ def _advance(objective: Objective, sides: list[_Side], values, errors, chi2: flo
         end = parameter.lowest if side.direction < 0 else parameter.highest
         distance = abs(target - values[side.index]) / errors[side.index]
         above = value - chi2
+        root = float(np.sqrt(max(above, 0.0)))
         if above < rise:
+            side.inside_root = root if distance >= side.inside else side.inside_root
             side.inside, side.others = max(side.inside, distance), coordinates
             if target == end:
                 side.reason = f"reaches the end of its range, {end:g}"
             elif distance >= _FARTHEST:
                 side.reason = "the data set no limit on this side"
         else:
+            side.outside_root = root if distance <= side.outside else side.outside_root
             side.outside = min(side.outside, distance)
         if side.outside - side.inside < 1e-5 * max(side.outside, 1e-300) or abs(above - rise) < 1e-3 * rise:
             side.end = float(target)
-        # sqrt(chi2 - minimum) is close to proportional to the distance.
+        # sqrt(chi2 - minimum) is close to a straight line, which has a kink where another parameter meets its bound
         guess = distance * np.sqrt(rise / above) if above > 1e-6 * rise else 2.0 * distance
+        if np.isfinite(side.outside):
+            share = (np.sqrt(rise) - side.inside_root) / (side.outside_root - side.inside_root)
+            guess = side.inside + share * (side.outside - side.inside)
         safe = side.inside + 0.5 * (side.outside - side.inside) if np.isfinite(side.outside) else 3.0 * distance
         margin = 1e-3 * (side.outside - side.inside) if np.isfinite(side.outside) else 0.0
         inside = side.inside + margin < guess < side.outside - margin

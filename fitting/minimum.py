@@ -60,7 +60,10 @@ def _scouted(scout: Objective, coordinates: Float[np.ndarray, "starts p"]) -> Fl
     """Polish every start softly: orbits are followed, and searched for again now and then, for they come and go."""
     for _ in range(_ROUNDS):
         follower = scout.following_each(scout.problem.values(coordinates))
-        coordinates = polish(follower, coordinates, SOFT, settled=_ROUGH, most=_STEPS_PER_SEARCH).coordinates
+        end = polish(follower, coordinates, SOFT, settled=_ROUGH, most=_STEPS_PER_SEARCH)
+        coordinates = end.coordinates
+        if end.steps == 0:
+            break
     return coordinates
 
 

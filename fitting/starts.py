@@ -11,8 +11,8 @@ from fitting.measurement import Measurement
 from fitting.models import CONTACT_NAMES, NUISANCE_NAMES, Problem
 
 _GRID_PER_PARAMETER = {1: 96, 2: 16}
-_SPREAD_BITS = 7
-"""2 to this power: points of a low-discrepancy sequence, where a grid would have too many."""
+_SPREAD_POINTS = 64
+"""Points of a low-discrepancy sequence, where a grid would have too many."""
 _CONTACT_FACTOR = 3.0
 """Contact parameters are tried within this factor of the paper's value."""
 
@@ -29,14 +29,21 @@ def starts(problem: Problem, measurement: Measurement) -> Float[np.ndarray, "poi
         mesh = np.meshgrid(*(ranges[name](np.linspace(0.0, 1.0, count)) for name in own), indexing="ij")
         columns = {name: axis.ravel() for name, axis in zip(own, mesh, strict=True)}
     else:
-        # takes a second to import
-        from scipy.stats import qmc  # noqa: PLC0415
-
-        places = qmc.Sobol(len(own), scramble=False).random_base2(_SPREAD_BITS) + 0.5**_SPREAD_BITS / 2.0
+        places = _spread(_SPREAD_POINTS, len(own))
         columns = {name: ranges[name](place) for name, place in zip(own, places.T, strict=True)}
     count = len(columns[own[0]])
     known = dict(zip(problem.names, np.asarray(measurement.constraint_value).tolist(), strict=True))
     return np.stack([columns.get(name, np.full(count, known[name])) for name in problem.names], axis=1)
+
+
+def _spread(count: int, dimensions: int) -> Float[np.ndarray, "count dimensions"]:
+    """Return the additive recurrence of Kronecker whose steps are powers of the generalised golden ratio (Roberts)."""
+    ratio = 2.0
+    for _ in range(60):
+        # x^(d+1) = x + 1
+        ratio = (1.0 + ratio) ** (1.0 / (dimensions + 1))
+    steps = ratio ** -np.arange(1.0, dimensions + 1.0)
+    return np.mod(0.5 + np.outer(np.arange(1, count + 1), steps), 1.0)
 
 
 def _ranges(measurement: Measurement):
