@@ -149,6 +149,6 @@ def unstrained_minimum(stated: Objective) -> tuple[Objective, Minimum, Strain]:
         same = np.array_equal(again.set_aside, strain.set_aside)
         close = np.allclose(again.model_error, strain.model_error, rtol=0.02)
         if same and close:
-            break
+            return objective, minimum, strain
         objective, strain = relaxed(stated, again), again
     return objective, settle(objective, minimum), strain

@@ -24,6 +24,7 @@ ROBUST = 2.0
 PLAIN = np.inf
 """The same for plain least squares: no residual gets there."""
 _MAX_STEPS = 60
+_SEARCHES_KEPT = 4
 _LBFGS = optax.lbfgs(learning_rate=1.0, linesearch=None, scale_init_precond=False)
 _init = jax.jit(jax.vmap(_LBFGS.init))
 _update = jax.jit(jax.vmap(_LBFGS.update))
@@ -53,6 +54,7 @@ class Objective:
         *,
         near: Float[np.ndarray, " rows"] | Float[np.ndarray, "sets rows"] | None = None,
         robust: bool = False,
+        searched: dict[bytes, Linearised] | None = None,
     ):
         """Keep what every evaluation shares.
 
@@ -63,15 +65,18 @@ class Objective:
                 each set's own; None: searched for.
             robust: let outliers count linearly, everywhere: residuals are then such that their squares add up to the
                 soft objective.
+            searched: what searches at single sets of values have found, for objectives of the same rows: the same set
+                is asked for again and again.
         """
         self.measurement, self.problem, self.near, self.robust = measurement, problem, near, robust
+        self.searched: dict[bytes, Linearised] = {} if searched is None else searched
 
     def following(self, values: Float[np.ndarray, " p"]) -> "Objective":
         """Return the same objective with the orbits followed from those at a set of values; only if impacts last."""
         follower = self.following_each(values[None])
         if follower.near is None:
             return self
-        return Objective(self.measurement, self.problem, near=follower.near[0], robust=self.robust)
+        return self._with_orbits(follower.near[0])
 
     def following_each(self, values: Float[np.ndarray, "sets p"]) -> "Objective":
         """Return the same objective for as many sets of values, each set's orbits followed from those at its values."""
@@ -79,11 +84,14 @@ class Objective:
             return self
         found = self.searching().at_values(values).prediction
         near = np.where(np.asarray(found.orbits) > 0, np.asarray(found.coordinate), np.nan)
-        return Objective(self.measurement, self.problem, near=near, robust=self.robust)
+        return self._with_orbits(near)
 
     def searching(self) -> "Objective":
         """Return the same objective with every orbit searched for."""
-        return Objective(self.measurement, self.problem, robust=self.robust)
+        return self._with_orbits(None)
+
+    def _with_orbits(self, near: Float[np.ndarray, "..."] | None) -> "Objective":
+        return Objective(self.measurement, self.problem, near=near, robust=self.robust, searched=self.searched)
 
     def with_rows(self, **columns: Any) -> "Objective":
         """Return the same objective with other columns of the rows."""
@@ -92,6 +100,21 @@ class Objective:
 
     def at_values(self, values: Float[np.ndarray, "sets p"]) -> Linearised:
         """Return the linearised model at parameter values, as NumPy arrays."""
+        if self.near is None and len(values) == 1:
+            return self._searched_at(values)
+        return self._linearised(values)
+
+    def _searched_at(self, values: Float[np.ndarray, "1 p"]) -> Linearised:
+        """Return what a search at one set of values finds, or has found lately."""
+        key = values.tobytes()
+        if key not in self.searched:
+            found = self._linearised(values)
+            while len(self.searched) >= _SEARCHES_KEPT:
+                del self.searched[next(iter(self.searched))]
+            self.searched[key] = found
+        return self.searched[key]
+
+    def _linearised(self, values: Float[np.ndarray, "sets p"]) -> Linearised:
         parts = [
             linearise(values[i : i + BATCH], self.measurement, self.problem, self._near(slice(i, i + BATCH)))
             for i in range(0, len(values), BATCH)

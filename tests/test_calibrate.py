@@ -147,6 +147,7 @@ def profile_end(residual, best, index: int, step: float) -> float:
     return best.x[index] + shift
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("phase", "given"), [(True, True), (False, False)])
 def test_intervals_cover_the_truth(phase, given):
     count, pulls, inside = 100 if phase else 60, [], 0

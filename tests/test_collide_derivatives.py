@@ -20,6 +20,8 @@ NAMES = (
     "bridge_forms_nm",
     "bridge_breaks_nm",
 )
+pytestmark = pytest.mark.slow
+
 SPEEDS = (13.0, 60.0)
 
 

@@ -197,6 +197,7 @@ def test_a_table_is_the_contacts_collisions(name):
     np.testing.assert_allclose(found.delay, truth.collision_delay_us, rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_a_tables_derivatives_are_those_of_collisions():
     """By viscosity, at speeds off the table's nodes: central differences of `collide`."""
     speeds, usual = np.array([17.0, 33.0, 90.0]), 1.005e-3

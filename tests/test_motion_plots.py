@@ -124,6 +124,7 @@ def test_subharmonics_of_the_drive_are_marked(every_other_period, monkeypatch: p
     assert len(marks) in (7, 8)
 
 
+@pytest.mark.slow
 def test_a_tip_that_is_held_is_shown_until_soon_after_it_was_caught(tmp_path: Path):
     scene = presets.contact_scene(1.01, 4.0, 0.0)
     # 5 nm/us down onto a sample that has just turned: below the capture speed of 10.9 nm/us

@@ -18,7 +18,12 @@ from afm_jax.presets import contact_scene, figure10_scene, figure11_scene
 
 TABULATED = ImpactLaw(1.0, 113.6, 0.5, CollisionDelay(0.206, 5.64, 0.726))
 # physics.md, full contact, Q = 40: n, beta, sigma, peak height
-PEAKS = [(1.0001, 2.0, 0.0, 65.9), (1.01, 4.0, -2.0, 50.6), (1.01, 4.0, 0.0, 98.6), (1.01, 4.0, 2.0, 149.7)]
+PEAKS = [
+    pytest.param(1.0001, 2.0, 0.0, 65.9, marks=pytest.mark.slow),
+    (1.01, 4.0, -2.0, 50.6),
+    (1.01, 4.0, 0.0, 98.6),
+    (1.01, 4.0, 2.0, 149.7),
+]
 
 
 def law_scene(law: ImpactLaw = TABULATED, reduced: float = 1.01) -> Scene:

@@ -19,6 +19,8 @@ from tests.reference_systems import Parameters, capture_speed, constants
 from tests.reference_systems import single_impact_orbits as exact_orbits
 from tests.test_map_derivatives import NAMES, leaf_of
 
+pytestmark = pytest.mark.slow
+
 P = scene(1.02, r=0.98, epsilon=100.0, viscous_loss=0.4, delay=DELAY)
 FIELDS = ("peak_amplitude_nm", "lockin_amplitude_nm", "lockin_phase_deg", "velocity_after_nm_per_us", "trace")
 
