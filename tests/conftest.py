@@ -1,5 +1,6 @@
 """What all tests share: 64-bit floats, strict promotion, and annotations that are checked at run time."""
 
+import gc
 import os
 from pathlib import Path
 
@@ -17,6 +18,10 @@ jax.config.update("jax_numpy_dtype_promotion", "strict")
 # Compilation is what a JAX test costs; a second run finds it done.
 jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parent.parent / ".pytest_cache" / "jax"))
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
+
+# Tracing makes many short-lived objects beside the many that live as long as their programs: looking through all of
+# these again and again costs more than it frees.
+gc.set_threshold(50_000, 20, 50)
 
 # The same examples on every run: a failure is then a change of the code. HYPOTHESIS_PROFILE=random rolls new ones.
 hypothesis.settings.register_profile("repeatable", derandomize=True, database=None, print_blob=True, deadline=None)
