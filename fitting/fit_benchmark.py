@@ -43,7 +43,8 @@ def time_fits(models: Sequence[str], *, rows: int) -> list[dict[str, Any]]:
         place = Path(folder)
         write_table(made_table(rows), place / "amplitudes.csv")
         for model in models:
-            environment = os.environ | {"JAX_COMPILATION_CACHE_DIR": str(place / "cache")}
+            environment = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+            environment["XDG_CACHE_HOME"] = str(place / "cache" / model)
             command = [
                 sys.executable,
                 "-m",
