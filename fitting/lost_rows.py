@@ -4,16 +4,13 @@ Where a law has no orbit on a row that was measured, chi2 is a plateau there: no
 orbit lies. The laws around the minimum are asked for these rows alone, and the minimisation goes on from the best ones.
 """
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fitting.optimise import BATCH, PLAIN, SOFT, Objective, polish
+from fitting.optimise import BATCH, FINE, PLAIN, ROUGH, SOFT, Objective, polish
 
 _STEPS = (0.01, 0.03, 0.1, 0.3)
 """How far around a minimum laws are tried, in the optimiser's coordinates; those of losses relative to themselves."""
-_ROUGH, _FINE = 1e-2, 1e-10
 
 
 def lost_rows(objective: Objective, values: Float[np.ndarray, " p"]) -> Bool[np.ndarray, " rows"]:
@@ -38,17 +35,18 @@ def recovered(
         lost: rows without orbit there.
     """
     around = _around(objective, coordinates)
-    rows = jax.tree.map(lambda column: jnp.asarray(np.asarray(column)[lost]), objective.measurement.rows)
-    few = Objective(objective.measurement._replace(rows=rows), objective.problem, robust=objective.robust)
-    found = np.asarray(few.at_values(objective.problem.values(around)).prediction.orbits) > 0
+    found = (
+        np.asarray(objective.searching().of_rows(lost).at_values(objective.problem.values(around)).prediction.orbits)
+        > 0
+    )
     if not found.any():
         return None
     # the closest ones come first
     best = around[np.argsort(-found.sum(axis=1), kind="stable")[:BATCH]]
     follower = objective.following_each(objective.problem.values(best))
-    ends = polish(follower, best, SOFT, settled=_ROUGH).coordinates
+    ends = polish(follower, best, SOFT, settled=ROUGH).coordinates
     follower = objective.following_each(objective.problem.values(ends))
-    ends = polish(follower, ends, PLAIN, settled=_FINE).coordinates
+    ends = polish(follower, ends, PLAIN, settled=FINE).coordinates
     chi2 = np.sum(objective.searching().residual(objective.problem.values(ends)) ** 2, axis=1)
     return ends[int(np.argmin(chi2))]
 

@@ -3,19 +3,16 @@
 from dataclasses import dataclass, replace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from fitting.lost_rows import lost_rows, recovered
 from fitting.measurement import ROWS_PER_PROGRAM
-from fitting.optimise import BATCH, PLAIN, SOFT, Objective, polish
+from fitting.optimise import BATCH, FINE, PLAIN, ROUGH, SOFT, Objective, polish
 from fitting.starts import starts
 
 _ROUNDS = 4
 _STEPS_PER_SEARCH = 15
-_ROUGH, _FINE = 1e-2, 1e-10
-"""Estimated distances to the minimum at which the soft and the plain polish stop."""
 
 
 @dataclass(frozen=True)
@@ -46,7 +43,7 @@ def minimise(objective: Objective) -> Minimum:
     best = np.argsort(scout.screen(points), kind="stable")[:BATCH]
     first = objective.problem.coordinates(points[best])
     if not objective.problem.lasting:
-        return _polished(objective, polish(scout, first, SOFT, settled=_ROUGH).coordinates, points[best])
+        return _polished(objective, polish(scout, first, SOFT, settled=ROUGH).coordinates, points[best])
     found = settle(objective, _whole(objective, _scouted(scout, first), points[best]))
     lost = lost_rows(objective, objective.problem.values(found.coordinates))
     back = recovered(objective, found.coordinates, lost) if lost.any() else None
@@ -60,7 +57,7 @@ def _scouted(scout: Objective, coordinates: Float[np.ndarray, "starts p"]) -> Fl
     """Polish every start softly: orbits are followed, and searched for again now and then, for they come and go."""
     for _ in range(_ROUNDS):
         follower = scout.following_each(scout.problem.values(coordinates))
-        end = polish(follower, coordinates, SOFT, settled=_ROUGH, most=_STEPS_PER_SEARCH)
+        end = polish(follower, coordinates, SOFT, settled=ROUGH, most=_STEPS_PER_SEARCH)
         coordinates = end.coordinates
         if end.steps == 0:
             break
@@ -75,8 +72,8 @@ def _whole(
     chi2 = objective.screen(values)
     winner = int(np.argmin(chi2))
     follower = objective.following(values[winner])
-    softly = polish(follower, found[winner][None], SOFT, settled=_ROUGH)
-    end = polish(follower, softly.coordinates, PLAIN, settled=_FINE)
+    softly = polish(follower, found[winner][None], SOFT, settled=ROUGH)
+    end = polish(follower, softly.coordinates, PLAIN, settled=FINE)
     best = objective.problem.values(end.coordinates)[0]
     return Minimum(end.coordinates[0], origins[winner], np.vstack([best, values]), np.append(end.objective, chi2))
 
@@ -86,7 +83,7 @@ def settle(objective: Objective, minimum: Minimum) -> Minimum:
     for _ in range(_ROUNDS):
         values = objective.problem.values(minimum.coordinates)
         follower = objective.following(values)
-        end = polish(follower, minimum.coordinates[None], PLAIN, settled=_FINE)
+        end = polish(follower, minimum.coordinates[None], PLAIN, settled=FINE)
         chi2 = float(np.sum(objective.searching().residual(objective.problem.values(end.coordinates)) ** 2))
         minimum = replace(minimum, coordinates=end.coordinates[0], chi2=np.append(chi2, minimum.chi2[1:]))
         if abs(chi2 - end.objective[0]) < 1e-6 * (1.0 + chi2):
@@ -102,8 +99,7 @@ def _thinned(objective: Objective) -> Objective:
         return objective
     ranked = seen[np.lexsort((rows.drive_amplitude_nm[seen], rows.drive_frequency_khz[seen], rows.order[seen]))]
     chosen = ranked[np.linspace(0, ranked.size - 1, ROWS_PER_PROGRAM).round().astype(int)]
-    few = jax.tree.map(lambda column: jnp.asarray(column[chosen]), rows)
-    return Objective(objective.measurement._replace(rows=few), objective.problem, robust=objective.robust)
+    return objective.of_rows(chosen)
 
 
 def rescale_errors(objective: Objective, minimum: Minimum, parameters: int) -> tuple[Objective, Minimum, float]:
@@ -144,7 +140,7 @@ def _polished(
     objective: Objective, starts: Float[np.ndarray, "starts p"], origins: Float[np.ndarray, "..."]
 ) -> Minimum:
     """Polish plainly and keep the best; `origins` are the starts' grid points, or the one that is already known."""
-    final = polish(objective, starts, PLAIN, settled=_FINE)
+    final = polish(objective, starts, PLAIN, settled=FINE)
     winner = int(np.argmin(final.objective))
     start = origins if origins.ndim == 1 else origins[winner]
     return Minimum(final.coordinates[winner], start, objective.problem.values(final.coordinates), final.objective)

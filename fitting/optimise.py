@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from fitting.forward import BATCH, Linearised, linearise
 from fitting.measurement import Measurement
@@ -23,6 +23,8 @@ ROBUST = 2.0
 """The same for a fit with robust loss."""
 PLAIN = np.inf
 """The same for plain least squares: no residual gets there."""
+ROUGH, FINE = 1e-2, 1e-10
+"""Estimated distances to the minimum at which a soft and a plain polish stop."""
 _MAX_STEPS = 60
 _SEARCHES_KEPT = 4
 _LBFGS = optax.lbfgs(learning_rate=1.0, linesearch=None, scale_init_precond=False)
@@ -97,6 +99,12 @@ class Objective:
         """Return the same objective with other columns of the rows."""
         rows = self.measurement.rows._replace(**{name: jnp.asarray(column) for name, column in columns.items()})
         return Objective(self.measurement._replace(rows=rows), self.problem, near=self.near, robust=self.robust)
+
+    def of_rows(self, chosen: Int[np.ndarray, " chosen"] | Bool[np.ndarray, " rows"]) -> "Objective":
+        """Return the same objective of some of the rows, with their orbits followed if they were."""
+        rows = jax.tree.map(lambda column: jnp.asarray(np.asarray(column)[chosen]), self.measurement.rows)
+        near = None if self.near is None else np.asarray(self.near)[..., chosen]
+        return Objective(self.measurement._replace(rows=rows), self.problem, near=near, robust=self.robust)
 
     def at_values(self, values: Float[np.ndarray, "sets p"]) -> Linearised:
         """Return the linearised model at parameter values, as NumPy arrays."""

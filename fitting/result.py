@@ -1,12 +1,12 @@
 """What a fit found, and everything that went into it."""
 
-import math
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from afm_jax.strict_json import plain
 from fitting.checks import Convergence
 from fitting.table import AmplitudeTable
 
@@ -130,31 +130,18 @@ class FitResult:
             "valid": self.valid,
             "reasons": self.reasons,
             "warnings": self.warnings,
-            "parameters": {name: _plain(asdict(value)) for name, value in self.parameters.items()},
-            "correlations": {"names": list(self.parameters), "matrix": _plain(self.correlations)},
-            "chi2": _plain(self.chi2),
+            "parameters": {name: plain(asdict(value)) for name, value in self.parameters.items()},
+            "correlations": {"names": list(self.parameters), "matrix": plain(self.correlations)},
+            "chi2": plain(self.chi2),
             "degrees_of_freedom": self.degrees_of_freedom,
-            "p_value": _plain(self.p_value),
-            "aic": _plain(self.aic),
-            "bic": _plain(self.bic),
-            "residual_autocorrelation": _plain(self.residual_autocorrelation),
-            "law": {name: _plain(column) for name, column in vars(self.law).items()},
-            "rows": {name: _plain(column) for name, column in vars(self.rows).items()},
-            "convergence": _plain(asdict(self.convergence)),
-            "input": _plain(vars(self.table)),
-            "settings": _plain(self.settings),
+            "p_value": plain(self.p_value),
+            "aic": plain(self.aic),
+            "bic": plain(self.bic),
+            "residual_autocorrelation": plain(self.residual_autocorrelation),
+            "law": {name: plain(column) for name, column in vars(self.law).items()},
+            "rows": {name: plain(column) for name, column in vars(self.rows).items()},
+            "convergence": plain(asdict(self.convergence)),
+            "input": plain(vars(self.table)),
+            "settings": plain(self.settings),
             "versions": self.versions,
         }
-
-
-def _plain(value: Any) -> Any:
-    """Return a value without arrays, tuples and numbers that JSON does not have."""
-    if isinstance(value, dict):
-        return {name: _plain(item) for name, item in value.items()}
-    if isinstance(value, (list, tuple, np.ndarray)):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.generic):
-        return _plain(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -1,9 +1,7 @@
 """`afm-jax calibrate`: what it prints, writes and returns."""
 
 import csv
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,19 +12,11 @@ from afm_jax.cli.main import main
 from fitting import read_table
 from fitting.resonance.resonance_sweep import ResonanceSweep
 from tests.resonance_sweeps import FREQUENCY_KHZ, QUALITY_FACTOR, synthetic_sweep
+from tests.strict_reading import strictly
 
 
 def run(*arguments: object):
     return CliRunner().invoke(main, ["calibrate", *(str(argument) for argument in arguments)])
-
-
-def strictly(text: str) -> Any:
-    """Return the one JSON object of a text; NaN and Infinity, which JSON does not have, are refused."""
-
-    def refuse(constant: str):
-        raise AssertionError(constant)
-
-    return json.loads(text, parse_constant=refuse)
 
 
 def saved(sweep: ResonanceSweep, path: Path) -> Path:

@@ -17,7 +17,8 @@ from click.testing import CliRunner, Result
 
 import afm_jax
 import fitting
-from afm_jax.cli import main, strict_json
+from afm_jax import strict_json
+from afm_jax.cli import main
 from afm_jax.cli.failures import NotValid
 from afm_jax.cli.session import Session, with_session
 from tests.fresh_python import python

@@ -18,6 +18,7 @@ from afm_jax.cli.main import main
 from afm_jax.cli.speeds import parse_speeds
 from afm_jax.study.collisions import default_speeds
 from tests.reference_contact import ContactParameters, capture_speed, collision, junction
+from tests.strict_reading import strictly
 
 EFFECTS = ("capillary", "structural", "core", "jkr")
 SPEEDS = (12.0, 15.0, 20.0, 200.0)
@@ -31,11 +32,7 @@ def answer(*arguments: object) -> dict[str, Any]:
     """Return the JSON object of a successful call; NaN and Infinity, which JSON does not have, are refused."""
     result = run(*arguments, "--json")
     assert result.exit_code == 0, result.stderr
-
-    def refuse(constant: str):
-        raise AssertionError(constant)
-
-    return json.loads(result.stdout, parse_constant=refuse)
+    return strictly(result.stdout)
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 import csv
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 from click.testing import CliRunner
@@ -12,6 +11,7 @@ from afm_jax.cli.main import main
 from fitting import fit, read_table
 from tests.fit_tables import EXAMPLE, rows
 from tests.fresh_python import python
+from tests.strict_reading import strictly
 
 pytestmark = pytest.mark.slow
 """Each compiles programs of its own for a minute or more."""
@@ -22,15 +22,6 @@ CANTILEVER = ("--free-frequency-khz", 90, "--quality-factor", "40 +- 0.4")
 
 def run(*arguments: object):
     return CliRunner().invoke(main, ["design", *(str(argument) for argument in arguments)])
-
-
-def strictly(text: str) -> Any:
-    """Return the one JSON object of a text; NaN and Infinity, which JSON does not have, are refused."""
-
-    def refuse(constant: str):
-        raise AssertionError(constant)
-
-    return json.loads(text, parse_constant=refuse)
 
 
 @pytest.fixture(scope="module")

@@ -1,10 +1,8 @@
 """`afm-jax fit`: what it prints, writes and returns."""
 
 import csv
-import json
 import math
 from pathlib import Path
-from typing import Any
 
 import pytest
 from click.testing import CliRunner
@@ -12,19 +10,11 @@ from click.testing import CliRunner
 from afm_jax.cli.fit import _settings
 from afm_jax.cli.main import main
 from tests.fit_tables import EXAMPLE
+from tests.strict_reading import strictly
 
 
 def run(*arguments: object):
     return CliRunner().invoke(main, ["fit", *(str(argument) for argument in arguments)])
-
-
-def strictly(text: str) -> Any:
-    """Return the one JSON object of a text; NaN and Infinity, which JSON does not have, are refused."""
-
-    def refuse(constant: str):
-        raise AssertionError(constant)
-
-    return json.loads(text, parse_constant=refuse)
 
 
 def records(path: Path) -> list[dict[str, str]]:

@@ -15,6 +15,7 @@ LEVELS = {
     "version": 0,
     "lazy_names": 0,
     "stored_program": 0,
+    "strict_json": 0,
     "outcome": 0,
     "parameters": 1,
     "apparatus": 2,

@@ -2,7 +2,6 @@
 
 import csv
 import json
-from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +10,7 @@ from matplotlib.image import imread
 
 from afm_jax.cli.main import main
 from fitting.examples.make_contact_amplitudes import EXAMPLE
+from tests.strict_reading import strictly
 
 pytestmark = pytest.mark.slow
 """Each compiles programs of its own for a minute or more."""
@@ -22,15 +22,6 @@ COMMENTS = "# free_frequency_khz = 90\n# quality_factor = 40 +- 0.5\n"
 
 def run(*arguments: object):
     return CliRunner().invoke(main, ["invert", *(str(argument) for argument in arguments)])
-
-
-def strictly(text: str) -> Any:
-    """Return the one JSON object of a text; NaN and Infinity, which JSON does not have, are refused."""
-
-    def refuse(constant: str):
-        raise AssertionError(constant)
-
-    return json.loads(text, parse_constant=refuse)
 
 
 @pytest.fixture(scope="module")

@@ -1,8 +1,6 @@
 """`afm-jax lockin`: what it prints, writes and returns."""
 
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,21 +10,13 @@ from matplotlib.image import imread
 from afm_jax.cli.main import main
 from fitting import read_table
 from tests.lockin_traces import bounce
+from tests.strict_reading import strictly
 
 COMMENTS = "# free_frequency_khz = 90\n# quality_factor = 40 +- 2\n# drive_amplitude_nm = 4\n# offset_nm = -1\n"
 
 
 def run(*arguments: object):
     return CliRunner().invoke(main, ["lockin", *(str(argument) for argument in arguments)])
-
-
-def strictly(text: str) -> Any:
-    """Return the one JSON object of a text; NaN and Infinity, which JSON does not have, are refused."""
-
-    def refuse(constant: str):
-        raise AssertionError(constant)
-
-    return json.loads(text, parse_constant=refuse)
 
 
 def written(path: Path, *, order: int, wobble: float = 0.0, comments: str = COMMENTS) -> tuple[Path, complex]:

@@ -129,7 +129,7 @@ def command(
     if study == "collide":
         collide_study(session, accuracy, quick=quick)
         return
-    from afm_jax.cli.strict_json import strict_json  # noqa: PLC0415
+    from afm_jax.strict_json import strict_json  # noqa: PLC0415
     from afm_jax.study.accuracy import cheapest_settings  # noqa: PLC0415
     from afm_jax.study.own_process import run_in_own_process  # noqa: PLC0415
 
@@ -164,7 +164,7 @@ def is_scene(name: str) -> bool:
 
 def collide_study(session: Session, accuracy: float, *, quick: bool) -> None:
     """Run and show the accuracy study of `collide`."""
-    from afm_jax.cli.strict_json import strict_json  # noqa: PLC0415
+    from afm_jax.strict_json import strict_json  # noqa: PLC0415
     from afm_jax.study.contact_accuracy import cheapest_collision  # noqa: PLC0415
     from afm_jax.study.own_process import run_in_own_process  # noqa: PLC0415
 

@@ -33,8 +33,8 @@ _ABOVE_CAPTURE = 1.02
 
 def scene_study(session: Session, name: str, contacts: int, *, quick: bool) -> None:
     """Run and show the accuracy study of a scene file or a preset."""
-    from afm_jax.cli.strict_json import strict_json  # noqa: PLC0415
     from afm_jax.contact.contact import Contact  # noqa: PLC0415
+    from afm_jax.strict_json import strict_json  # noqa: PLC0415
     from afm_jax.study.fidelity_ladder import ladder_duration  # noqa: PLC0415
     from afm_jax.study.own_process import run_in_own_process  # noqa: PLC0415
 

@@ -81,7 +81,7 @@ def command(session: Session, batches: tuple[int, ...], only: str | None, *, qui
     bench_fits.csv and bench.json.
     """
     session.start_computing()
-    from afm_jax.cli.strict_json import strict_json  # noqa: PLC0415
+    from afm_jax.strict_json import strict_json  # noqa: PLC0415
     from afm_jax.study.own_process import available_cores  # noqa: PLC0415
 
     cores = available_cores()

@@ -87,8 +87,8 @@ def command(
     }
     session.write_table("collide.csv", rows, COLUMNS)
     if session.out is not None:
-        from afm_jax.cli.strict_json import strict_json  # noqa: PLC0415
         from afm_jax.plots.collisions import draw_collisions  # noqa: PLC0415
+        from afm_jax.strict_json import strict_json  # noqa: PLC0415
 
         (session.out / "collide.json").write_text(strict_json(payload) + "\n", encoding="utf-8")
         title = f"Collisions of a free tip of {mass:g} ng: {', '.join(description['effects'])}"

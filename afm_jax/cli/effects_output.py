@@ -7,9 +7,9 @@ from typing import Any
 from rich.table import Table
 
 from afm_jax.cli.session import Session
-from afm_jax.cli.strict_json import strict_json
 from afm_jax.scenefile import scene_tables
 from afm_jax.scenefile_start import Start
+from afm_jax.strict_json import strict_json
 from afm_jax.study.effects import Cost, EffectReport, EffectStudy, Reduction
 
 CHANGES = ("peak_amplitude", "lockin_amplitude", "lockin_phase_deg", "energy_per_impact")

@@ -126,7 +126,7 @@ def command(
     session.write_table("fit_law.csv", *law_rows(laws))
     session.write_table("fit_delay.csv", _delay_rows(delay), DELAY_COLUMNS)
     if session.out is not None:
-        from afm_jax.cli.strict_json import strict_json  # noqa: PLC0415
+        from afm_jax.strict_json import strict_json  # noqa: PLC0415
         from fitting.contact_law_plot import draw_contact_law  # noqa: PLC0415
 
         (session.out / "fit_law.json").write_text(strict_json(payload) + "\n", encoding="utf-8")

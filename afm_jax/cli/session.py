@@ -20,7 +20,7 @@ from typing import Any
 import click
 
 from afm_jax.cli.out_folder import prepare_folder, write_csv
-from afm_jax.cli.strict_json import strict_json
+from afm_jax.strict_json import strict_json
 
 _WIDTH_OF_A_PIPE = 160
 """Columns of text that nobody looks at in a terminal; wide enough that no table is cut."""

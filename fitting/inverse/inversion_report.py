@@ -1,6 +1,5 @@
 """A direct inversion as a person reads it: text for the terminal, files for the drawer (JSON, CSV, PNG)."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -94,14 +93,13 @@ def write_inversion(
         OSError: if a file cannot be written.
     """
     from fitting.inverse.inversion_plot import inversion_figure  # noqa: PLC0415
+    from fitting.reporting.report_files import write_report_files  # noqa: PLC0415
 
-    text, data, picture = (folder / f"invert.{ending}" for ending in ("txt", "json", "png"))
-    text.write_text(inversion_summary(result) + "\n", encoding="utf-8")
-    data.write_text(json.dumps(result.to_dict(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    inversion_figure(result, fitted=fitted).savefig(picture, dpi=150)
+    text, data, picture = inversion_summary(result), result.to_dict(), inversion_figure(result, fitted=fitted)
+    written = write_report_files(folder, "invert", text=text, data=data, picture=picture)
     write_table("invert.csv", result.records(), ROW_COLUMNS)
     write_table("law.csv", result.law_records(), LAW_COLUMNS)
-    return [text, data, picture]
+    return written
 
 
 def _law_lines(law: RegressedLaw) -> list[str]:

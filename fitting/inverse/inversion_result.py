@@ -1,12 +1,12 @@
 """What a direct inversion found, point by point and as laws, and everything that went into it."""
 
-import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from afm_jax.strict_json import plain
 from fitting.inverse.inversion_resonance import ResonanceReading
 from fitting.table import AmplitudeTable
 
@@ -141,8 +141,8 @@ class Inversion:
             columns[f"{name}_error_{unit}"] = errors[:, k]
             columns[f"{name}_systematic_{unit}"] = systematic[:, k]
         columns |= {"speed_correlation": correlation, "chi2": rows.chi2, "regressed": rows.regressed, "note": rows.note}
-        plain = {name: _plain(column) for name, column in columns.items()}
-        return [{name: column[i] for name, column in plain.items()} for i in range(table.rows)]
+        flat = {name: plain(column) for name, column in columns.items()}
+        return [{name: column[i] for name, column in flat.items()} for i in range(table.rows)]
 
     def law_records(self) -> list[dict[str, Any]]:
         """Return the laws' curves, a mapping per speed."""
@@ -152,8 +152,8 @@ class Inversion:
             columns[f"rebound_speed_{name}_error_nm_per_us"] = law.curve_error
         if self.delay is not None:
             columns |= {"collision_delay_us": self.delay.curve, "collision_delay_error_us": self.delay.curve_error}
-        plain = {name: _plain(column) for name, column in columns.items()}
-        return [{name: column[i] for name, column in plain.items()} for i in range(len(self.approach_speed_nm_per_us))]
+        flat = {name: plain(column) for name, column in columns.items()}
+        return [{name: column[i] for name, column in flat.items()} for i in range(len(self.approach_speed_nm_per_us))]
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain lists, numbers and strings; what is not known is None."""
@@ -178,15 +178,4 @@ class Inversion:
             "input": {name: value for name, value in vars(self.table).items() if value is not None},
             "versions": self.versions,
         }
-        return _plain(found)
-
-
-def _plain(value: Any) -> Any:
-    """Return a value without arrays, tuples and numbers that JSON does not have."""
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, dict):
-        return {name: _plain(item) for name, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        return plain(found)

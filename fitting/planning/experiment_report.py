@@ -1,6 +1,5 @@
 """A design as a person reads it: text for the terminal, files to take to the instrument (JSON, CSV, PNG)."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -62,16 +61,15 @@ def write_design(result: Design, folder: Path, write_table: Table) -> list[Path]
         OSError: if a file cannot be written.
     """
     from fitting.planning.experiment_plot import design_figure  # noqa: PLC0415
+    from fitting.reporting.report_files import write_report_files  # noqa: PLC0415
 
-    text, data, picture = (folder / f"design.{ending}" for ending in ("txt", "json", "png"))
     blank = folder / "to_fill_in.csv"
-    text.write_text(design_summary(result) + "\n", encoding="utf-8")
-    data.write_text(json.dumps(result.to_dict(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    design_figure(result).savefig(picture, dpi=150)
+    text, data, picture = design_summary(result), result.to_dict(), design_figure(result)
+    written = write_report_files(folder, "design", text=text, data=data, picture=picture)
     blank.write_text(table_to_fill_in(result), encoding="utf-8", newline="\n")
     write_table("design.csv", result.points(), POINT_COLUMNS)
     write_table("candidates.csv", result.all_candidates(), CANDIDATE_COLUMNS)
-    return [text, data, picture, blank]
+    return [*written, blank]
 
 
 def table_to_fill_in(result: Design) -> str:

@@ -1,6 +1,5 @@
 """A calibration as a person reads it: text for the terminal, files for the drawer (JSON, CSV, PNG)."""
 
-import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -105,14 +104,13 @@ def write_calibration(
     Raises:
         OSError: if a file cannot be written.
     """
+    from fitting.reporting.report_files import write_report_files  # noqa: PLC0415
     from fitting.resonance.calibration_plot import calibration_figure  # noqa: PLC0415
 
-    text, data, picture = (folder / f"calibration.{ending}" for ending in ("txt", "json", "png"))
-    text.write_text(calibration_summary(result) + "\n", encoding="utf-8")
-    data.write_text(json.dumps(result.to_dict(), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    calibration_figure(result).savefig(picture, dpi=150)
+    text, data, picture = calibration_summary(result), result.to_dict(), calibration_figure(result)
+    written = write_report_files(folder, "calibration", text=text, data=data, picture=picture)
     write_table("calibration_points.csv", point_records(result), POINT_COLUMNS)
-    return [text, data, picture]
+    return written
 
 
 def _value_line(name: str, value: CalibratedValue) -> str:

@@ -1,12 +1,12 @@
 """What a calibration found, and everything that went into it."""
 
-import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.strict_json import plain
 from fitting.checks import Convergence
 from fitting.resonance.resonance_sweep import ResonanceSweep
 
@@ -159,15 +159,4 @@ class Calibration:
         own["table_comments"] = self.table_comments if self.valid else []
         own["instrument"] = self.sweep.instrument
         own["input"] = vars(self.sweep)
-        return {"format": "afm-jax calibrate", "format_version": FORMAT_VERSION} | _plain(own)
-
-
-def _plain(value: Any) -> Any:
-    """Return a value without arrays, tuples and numbers that JSON does not have."""
-    if hasattr(value, "tolist"):
-        value = value.tolist()
-    if isinstance(value, dict):
-        return {name: _plain(item) for name, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+        return {"format": "afm-jax calibrate", "format_version": FORMAT_VERSION} | plain(own)

@@ -2,7 +2,6 @@
 
 from typing import NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -68,10 +67,7 @@ def compact(refit: Refit) -> Refit:
     # the rest of the new size is filled with rows that say nothing either
     silent = np.setdiff1d(np.arange(np.asarray(rows.order).shape[0]), telling)
     chosen = np.concatenate([telling, silent[: size - telling.size]])
-    few = type(rows)(*(jnp.asarray(np.asarray(column)[chosen]) for column in rows))
-    near = None if objective.near is None else np.asarray(objective.near)[chosen]
-    measurement = objective.measurement._replace(rows=few)
-    return Refit(Objective(measurement, objective.problem, near=near, robust=objective.robust), refit.values)
+    return Refit(objective.of_rows(chosen), refit.values)
 
 
 def standard_covariance(refit: Refit) -> Float[np.ndarray, "p p"]:
