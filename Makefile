@@ -8,7 +8,7 @@ PYTEST ?= -m pytest
 BIN := .venv/bin
 SETUP := .venv/.installed
 
-.PHONY: help setup fit test check lint types coverage slow mutations bench clean
+.PHONY: help setup fit test check thorough lint types coverage slow mutations bench clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -35,20 +35,22 @@ lint: $(SETUP)
 types: $(SETUP)
 	$(BIN)/pyright
 
-coverage: $(SETUP) ## make test and the slow tests, with the share of lines that they run (85 % at least)
+coverage: $(SETUP) ## make test and make slow with the share of lines that they run (85 % at least)
 	$(BIN)/python -m coverage erase
 	$(MAKE) test PYTEST='-m coverage run -m pytest'
 	$(MAKE) slow PYTEST='-m coverage run -m pytest'
 	$(BIN)/python -m coverage combine --quiet
 	$(BIN)/python -m coverage report --fail-under=85
 
-slow: $(SETUP)
+slow: $(SETUP) ## the slow tests: long iterations, references, notebooks
 	$(BIN)/python $(PYTEST) -m slow -n auto --dist load --ignore tests/test_mutations.py
 
-mutations: $(SETUP)
+mutations: $(SETUP) ## wrong formulas, one edit each: a named test must notice
 	$(BIN)/python -m pytest -m slow tests/test_mutations.py
 
-check: lint types coverage mutations ## all that CI runs: format, lint, types, tests, coverage, slow tests, notebooks
+check: lint types test slow ## all that CI runs: format, lint, types, tests, slow tests, notebooks
+
+thorough: lint types coverage mutations ## all of make check with the share of lines it runs, then the mutations
 
 bench: $(SETUP) ## impacts per second, next to SciPy
 	$(BIN)/afm-jax bench --out $(OUT)
