@@ -1,6 +1,6 @@
 """What a minimum amounts to: errors, intervals, checks, and a verdict on whether to believe it."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from fitting.optimise import Objective
 from fitting.result import FitResult, FittedParameter, FittedRows
 from fitting.strained import Strain
 from fitting.table import AmplitudeTable
-from fitting.verdict import IMPROBABLE, Evidence, judge_fit
+from fitting.verdict import Evidence, judge_fit, misfits
 
 _PACKAGES = ("afm-jax", "jax", "optax", "numpy")
 
@@ -66,21 +66,11 @@ class _Summary:
         p_value = float(chdtrc(self.freedom, self.chi2)) if judged else float("nan")
         errors = np.sqrt(np.diag(self.covariance))
         moved = ~self.free | ~np.isfinite(errors) | (np.abs(self.values - self.minimum.start) > 1e-3 * errors)
-        if p_value < IMPROBABLE:
-            # Errors that assume the model would be confident numbers about a law that is not there.
-            intervals = [Interval(None, None, "the model does not explain the data")] * len(errors)
-            parameters = self._parameters(np.full_like(errors, np.inf), intervals, moved)
-        elif not np.all(np.isfinite(errors)):
-            # With one parameter adrift there is no minimum to follow for the others.
-            intervals = [Interval(None, None, "the data do not determine the parameters")] * len(errors)
-            parameters = self._parameters(errors, intervals, moved)
-        else:
-            intervals = profile_intervals(self.objective, self.values, self.covariance, self.chi2)
-            parameters = self._parameters(errors, intervals, moved)
+        unknown = np.full_like(errors, np.inf)
         rows = self._rows()
         evidence = Evidence(
             table=self.table,
-            parameters=parameters,
+            parameters=self._parameters(unknown, "the model does not explain the data", moved),
             convergence=self.convergence,
             rows=rows,
             chi2=self.chi2,
@@ -93,11 +83,16 @@ class _Summary:
             robust=self.searching.robust,
             correlations=_correlations(self.covariance),
         )
+        # Errors that assume the model would be confident numbers about a law that is not there.
+        explained = not misfits(evidence)
+        shown_covariance = self.covariance if explained else np.full_like(self.covariance, np.inf)
+        if explained:
+            evidence = replace(evidence, parameters=self._explained_parameters(errors, moved))
         reasons, warnings = judge_fit(evidence)
         return FitResult(
             model=self.problem.model,
-            parameters=parameters,
-            correlations=_correlations(self._shown_covariance(p_value)),
+            parameters=evidence.parameters,
+            correlations=_correlations(shown_covariance),
             chi2=self.chi2,
             degrees_of_freedom=self.freedom,
             p_value=evidence.p_value,
@@ -110,7 +105,7 @@ class _Summary:
                 self.problem,
                 self.objective.measurement,
                 self.values,
-                self._shown_covariance(p_value),
+                shown_covariance,
                 np.where(rows.used, rows.approach_speed_nm_per_us, np.nan),
             ),
             rows=rows,
@@ -121,13 +116,22 @@ class _Summary:
             versions={name: version_of(name) for name in _PACKAGES},
         )
 
-    def _shown_covariance(self, p_value: float) -> Float[np.ndarray, "p p"]:
-        """Return the covariance, infinite where the model does not explain the data."""
-        return np.full_like(self.covariance, np.inf) if p_value < IMPROBABLE else self.covariance
+    def _explained_parameters(
+        self, errors: Float[np.ndarray, " p"], moved: Bool[np.ndarray, " p"]
+    ) -> dict[str, FittedParameter]:
+        """Return the parameters with their errors and, where all are determined, their intervals."""
+        if not np.all(np.isfinite(errors)):
+            # With one parameter adrift there is no minimum to follow for the others.
+            return self._parameters(errors, "the data do not determine the parameters", moved)
+        intervals = profile_intervals(self.objective, self.values, self.covariance, self.chi2)
+        return self._parameters(errors, intervals, moved)
 
     def _parameters(
-        self, errors: Float[np.ndarray, " p"], intervals: list[Interval], moved: Bool[np.ndarray, " p"]
+        self, errors: Float[np.ndarray, " p"], intervals: list[Interval] | str, moved: Bool[np.ndarray, " p"]
     ) -> dict[str, FittedParameter]:
+        """Return the parameters with errors and intervals; for these a text says why there are none."""
+        if isinstance(intervals, str):
+            intervals = [Interval(None, None, intervals)] * len(errors)
         return {
             parameter.name: FittedParameter(
                 value=float(self.values[i]),
@@ -165,16 +169,21 @@ class _Summary:
             near_fold=prediction.near_fold[0][:count],
         )
 
-    def _other_minimum(self, errors: Float[np.ndarray, " p"]) -> dict[str, float] | None:
-        """Return the values of another minimum that the data hardly tell from the best one, if there is one."""
+    def _other_minimum(self, errors: Float[np.ndarray, " p"]) -> tuple[dict[str, float], float] | None:
+        """Return values and chi2 of another minimum that the data hardly tell from the best one, if there is one."""
         values, chi2 = self.minimum.ends, self.minimum.chi2
         known = np.where(np.isfinite(errors) & (errors > 0.0), errors, np.inf)
         apart = np.max(np.abs(values - self.values) / known, axis=1) > 5.0
-        rival = apart & (chi2 < self.chi2 + 4.0)
-        if not rival.any():
+        if not apart.any():
             return None
-        index = int(np.argmin(np.where(rival, chi2, np.inf)))
-        return dict(zip(self.problem.names, values[index].tolist(), strict=True))
+        index = int(np.argmin(np.where(apart, chi2, np.inf)))
+        found = float(chi2[index])
+        if self.problem.lasting:
+            # it was found with the errors as stated and outliers counting less
+            found = float(np.sum(self.searching.residual(values[index : index + 1]) ** 2))
+        if not found < self.chi2 + 4.0:
+            return None
+        return dict(zip(self.problem.names, values[index].tolist(), strict=True)), found
 
 
 def _correlations(covariance_matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:

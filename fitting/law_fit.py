@@ -38,7 +38,8 @@ def fit(  # noqa: PLR0913
         model: "restitution" (r), "law" (r, epsilon; eq. 6) or "viscous" (epsilon, viscous_loss), each instantaneous or
             with "+delay", the collision delay; or "contact", physical parameters through the resolved contact.
         scale_errors: take the amplitudes' errors as relative only and scale them until chi2 equals its degrees of
-            freedom (the error of Q stays); goodness of fit can then not be judged, and the result says so.
+            freedom (the error of Q stays); the result is valid only if the scale is believable and what is left of the
+            amplitudes random (see `verdict`).
         free: for "contact": the parameters that are fitted, by keyword of `Contact.paper`; None: relative humidity,
             adhesion energy, viscosity and modulus.
         fixed: for "contact": values of parameters that are not the paper's.
@@ -46,7 +47,8 @@ def fit(  # noqa: PLR0913
             `tip_calibration`, `drive_calibration`, `offset_origin_nm`), which then is fitted along, or one of the
             model's parameters.
         effects: for "contact": the effects there are.
-        robust: let outliers count linearly from two errors on.
+        robust: let outliers count linearly from two errors on; the result is valid only if they are few and the other
+            amplitudes are explained.
 
     Returns:
         Values, errors, intervals, goodness of fit and a verdict; see `FitResult`.

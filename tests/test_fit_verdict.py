@@ -5,8 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from fitting import fit, read_table
+from fitting.examples.make_contact_amplitudes import EXAMPLE as CONTACT_TABLE
 from fitting.table import AmplitudeTable
-from fitting.verdict import Evidence, judge_fit
+from fitting.verdict import Evidence, correlation_excess, judge_fit
+from tests.fit_tables import EXAMPLE, amplitudes_and_errors, with_amplitudes
 from tests.made_fits import made_fit, made_parameter, made_table
 
 
@@ -83,3 +86,103 @@ def test_a_quality_factor_that_is_fitted_along_is_not_called_exact():
     for parameters, said in ((exact.parameters, True), (along, False)):
         given = dataclasses.replace(exact, parameters=parameters, correlations=np.eye(len(parameters)))
         assert any("is taken as exact" in warning for warning in judge_fit(given)[1]) is said
+
+
+def with_residuals(given: Evidence, residual: np.ndarray, **changes) -> Evidence:
+    rows = dataclasses.replace(given.rows, residual=residual)
+    return dataclasses.replace(given, rows=rows, **changes)
+
+
+@pytest.mark.parametrize("options", [{"robust": True}, {"scale_errors": True}, {"robust": True, "scale_errors": True}])
+def test_no_option_makes_a_law_without_delay_a_measurement_of_a_contact(options):
+    """The contact's r is 0.998; the best instantaneous law has 0.76 and most rows far off."""
+    result = fit(read_table(CONTACT_TABLE), model="law", **options)
+    assert not result.valid
+    (reason,) = [text for text in result.reasons if text.startswith("The model does not explain the data: ")]
+    assert "try the model with +delay" in reason
+    assert "neighbouring residuals in the table's order are correlated" in reason
+    assert "--robust" not in " ".join(result.reasons + result.warnings)
+    if "scale_errors" in options:
+        assert "errors would have to be 54" in reason
+    else:
+        assert "55 of 57 rows are off by more than 4 errors" in reason
+    assert all(parameter.standard_error is None for parameter in result.parameters.values())
+    assert all(parameter.interval95 == (None, None) for parameter in result.parameters.values())
+    assert np.isnan(result.law.rebound_high_nm_per_us).all()
+
+
+@pytest.mark.parametrize(
+    ("model", "options", "said"),
+    [
+        ("restitution", {"robust": True}, "14 of 82 rows are off by more than 4 errors"),
+        ("restitution", {"scale_errors": True}, "residuals over the approach speed are correlated"),
+        ("viscous", {"robust": True}, "without outliers chi2/dof = "),
+        ("viscous", {"scale_errors": True}, "contradicts what is known beforehand, in standard errors: quality_factor"),
+    ],
+)
+def test_a_law_that_the_amplitudes_are_not_made_by_stays_invalid_with_every_option(model, options, said):
+    result = fit(read_table(EXAMPLE), model=model, **options)
+    assert not result.valid
+    assert said in result.reasons[0]
+
+
+@pytest.mark.parametrize("options", [{"robust": True}, {"scale_errors": True}])
+def test_the_right_law_stays_valid_with_outliers_and_with_misstated_errors(options):
+    table = read_table(EXAMPLE)
+    amplitude, error = amplitudes_and_errors(table)
+    if "robust" in options:
+        amplitude[[5, 20, 30, 60], [0, 0, 1, 0]] *= [1.3, 1.08, 0.75, 1.5]
+    else:
+        error = 0.4 * error
+    result = fit(with_amplitudes(table, amplitude, error), model="law", **options)
+    assert result.valid
+    for name, truth in {"r": 0.95, "epsilon": 60.0}.items():
+        low, high = result.parameters[name].interval95
+        assert low is not None
+        assert high is not None
+        assert low < truth < high
+
+
+def test_correlated_residuals_invalidate_though_chi2_is_as_it_should_be():
+    table = made_table(80)
+    given = evidence("law", table)
+    wave = np.sqrt(2.0) * np.sin(np.linspace(0.0, 12.0, table.rows))
+    waved = with_residuals(given, np.stack([wave, wave], axis=1))
+    (reason,) = judge_fit(waved)[0]
+    assert "neighbouring residuals in the table's order are correlated" in reason
+    assert "--robust" not in reason
+    # the same far within the errors is of no consequence
+    assert not judge_fit(with_residuals(given, 0.1 * np.stack([wave, wave], axis=1)))[0]
+    scattered = np.random.default_rng(3).permutation(waved.rows.residual)
+    assert not judge_fit(with_residuals(given, scattered))[0]
+
+
+def test_independent_residuals_are_seldom_called_correlated():
+    """Unit variance, whether the two amplitudes of a row go together, some are missing, or there are outliers."""
+    generator = np.random.default_rng(5)
+    excess = []
+    for i in range(2000):
+        row = generator.normal(size=(40, 1)) if i % 2 else 0.0
+        residual = row + generator.normal(size=(40, 2))
+        residual[generator.random((40, 2)) < 0.1] = np.nan
+        residual[generator.integers(40)] = 300.0
+        excess.append(correlation_excess(residual))
+    # mean and variance of 2000 numbers of a standard distribution, to four of their own errors
+    assert abs(np.mean(excess)) < 4.0 / np.sqrt(2000)
+    assert np.var(excess) == pytest.approx(1.0, abs=4.0 * np.sqrt(2.0 / 2000))
+
+
+@pytest.mark.parametrize(("share", "advised"), [(0.2, True), (0.8, False)])
+def test_robust_loss_is_advised_only_where_the_rest_is_explained(share, advised):
+    table = made_table(40)
+    given = evidence("law", table, p_value=0.0, chi2=9e4)
+    generator = np.random.default_rng(1)
+    residual = np.where(generator.random((40, 1)) < share, 30.0, 0.5) * generator.choice([-1.0, 1.0], size=(40, 2))
+    (reason,) = judge_fit(with_residuals(given, residual))[0]
+    assert ("if only a few are wrong: --robust" in reason) is advised
+
+
+def test_another_minimum_is_named_with_its_chi2():
+    given = evidence("law", made_table(), other_minimum=({"r": 0.9, "epsilon": 12.0}, 7.25))
+    said = "Another minimum explains the data about as well (chi2 7.2, here 5.0): r = 0.9, epsilon = 12."
+    assert said in judge_fit(given)[1]

@@ -27,8 +27,12 @@ MODELS = ("restitution", "law", "viscous", "restitution+delay", "law+delay", "vi
     "(+delay), which amplitudes near resonance need; contact: physical parameters through the resolved contact.",
 )
 @click.option("--noise", type=Noise(), metavar="SHARE", help="Relative error of amplitudes without one, such as 1%.")
-@click.option("--scale-errors", is_flag=True, help="Take the errors as relative: scale them until chi2/dof is 1.")
-@click.option("--robust", is_flag=True, help="Let outliers count linearly from two errors on.")
+@click.option(
+    "--scale-errors",
+    is_flag=True,
+    help="Take the errors as relative: scale them, by 3 at most, until chi2/dof is 1.",
+)
+@click.option("--robust", is_flag=True, help="Let outliers, one row in ten at most, count linearly from two errors on.")
 @click.option(
     "--free",
     type=Names(),

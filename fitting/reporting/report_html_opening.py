@@ -86,10 +86,12 @@ def _belief(result: FitResult) -> str:
         return "Do not take these numbers for a measurement of the law, because:"
     limited = any(parameter.at_bound or None in parameter.interval95 for parameter in result.parameters.values())
     determined = "determined or limited" if limited else "determined"
-    explained = "the law explains the amplitudes within their errors" if np.isfinite(result.p_value) else None
-    grounds = ["the fit converged", *([explained] if explained else []), f"every parameter is {determined} by the data"]
-    words = f"You can believe it: {', '.join(grounds[:-1])}, and {grounds[-1]}"
-    words += "." if explained else "; whether the law explains the amplitudes cannot be judged."
+    explained = "the law explains the amplitudes within their errors"
+    if result.settings.get("error_scale") is not None:
+        explained = "the law explains the amplitudes within errors of a believable size"
+    elif result.settings.get("robust") is not None:
+        explained = "the law explains the amplitudes within their errors but for a few outliers"
+    words = f"You can believe it: the fit converged, {explained}, and every parameter is {determined} by the data."
     width = band_width(result)
     if width is not None:
         words += (
