@@ -23,6 +23,7 @@ class Convergence:
         hessian_eigenvalues: of chi2/2 in units of standard errors: about 1 each at a well-behaved minimum.
         estimated_distance: by how much chi2 lies above its minimum, g H^-1 g.
         outward: at a bound, chi2 falls towards the outside (or there is no such parameter).
+        reason: why there is nothing to check, None if there is.
     """
 
     converged: bool
@@ -30,6 +31,7 @@ class Convergence:
     hessian_eigenvalues: list[float]
     estimated_distance: float
     outward: bool
+    reason: str | None = None
 
 
 def covariance(
@@ -66,20 +68,36 @@ def check_minimum(
         return Convergence(outward, 0.0, [], 0.0, outward)
     _, jacobian = objective.linearise(coordinates[None])
     fisher = jacobian[0][:, free].T @ jacobian[0][:, free]
+    if not np.all(np.isfinite(fisher)):
+        return _adrift([], outward=outward, reason="the slopes of the residuals are not finite where the search ended")
     curvature, axes = np.linalg.eigh(fisher)
-    if not np.all(np.isfinite(fisher)) or curvature[0] <= 1e-14 * curvature[-1]:
-        return Convergence(False, float("inf"), curvature.tolist(), float("inf"), outward)  # noqa: FBT003
+    if curvature[0] <= 1e-14 * curvature[-1]:
+        return _adrift(curvature.tolist(), outward=outward)
     scale = axes / np.sqrt(curvature)
     steps = np.zeros((2 * count + 1, len(coordinates)))
     steps[1 : count + 1, free], steps[count + 1 :, free] = _STEP * scale.T, -_STEP * scale.T
     _, gradient = objective.value_and_gradient(coordinates + steps, PLAIN)
     slope = gradient[:, free] @ scale / 2.0
     hessian = (slope[1 : count + 1] - slope[count + 1 :]) / (2.0 * _STEP)
+    if not np.all(np.isfinite(hessian)) or not np.all(np.isfinite(slope[0])):
+        return _adrift([], outward=outward, reason="chi2 has no finite curvature where the search ended")
     hessian = 0.5 * (hessian + hessian.T)
     eigenvalues = np.linalg.eigvalsh(hessian)
     distance = float(slope[0] @ np.linalg.solve(hessian, slope[0])) if eigenvalues[0] > 0 else float("inf")
     converged = bool(eigenvalues[0] > 0 and distance < _ENOUGH and outward)
     return Convergence(converged, float(np.abs(2.0 * slope[0]).max()), eigenvalues.tolist(), distance, outward)
+
+
+def _adrift(eigenvalues: list[float], *, outward: bool, reason: str | None = None) -> Convergence:
+    """Return the state of a point that is no minimum, at an unknown distance from one."""
+    return Convergence(
+        converged=False,
+        gradient=float("inf"),
+        hessian_eigenvalues=eigenvalues,
+        estimated_distance=float("inf"),
+        outward=outward,
+        reason=reason,
+    )
 
 
 def at_bound(objective: Objective, values: Float[np.ndarray, " p"]) -> Bool[np.ndarray, " p"]:

@@ -1,8 +1,8 @@
 """Models compared on the same table: information criteria, and in plain words what the measurement can tell."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
 from jaxtyping import Float
@@ -11,11 +11,12 @@ from afm_jax.parameters import require_float64
 from fitting.fit_summary import Found, summarise
 from fitting.law_fit import find_fit
 from fitting.minimum import settle
-from fitting.models import LAWS
+from fitting.models import LAWS, model_parameters
 from fitting.result import FitResult
 from fitting.strained import Strain, relaxed
 from fitting.table import AmplitudeTable
 
+_T = TypeVar("_T")
 _EVEN, _LEANS, _PLAIN = 2.0, 6.0, 10.0
 """Differences of AIC up to which models are even, one is favoured, and one is clearly favoured."""
 _MEANING = {
@@ -35,15 +36,17 @@ class Comparison:
             largest relative difference of its rebound speed to the best one's over the measured speeds.
         verdict: what the measurement tells, a sentence or two.
         results: the fit of every model, by name.
+        failed: of every model that could not be fitted, why.
     """
 
     rows: list[dict[str, Any]]
     verdict: str
     results: dict[str, FitResult]
+    failed: dict[str, str] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return rows and verdict, without the fits."""
-        return {"rows": self.rows, "verdict": self.verdict}
+        """Return rows, verdict and failures, without the fits."""
+        return {"rows": self.rows, "verdict": self.verdict, "failed": self.failed}
 
 
 def rivals(model: str) -> tuple[str, ...]:
@@ -63,7 +66,8 @@ def compare(
 ) -> Comparison:
     """Fit several models to one table and compare them on the same rows with the same errors.
 
-    A row that one model sets aside is set aside for all, and every row has the largest of the models' own errors.
+    A row that one model sets aside is set aside for all, and every row has the largest of the models' own errors. A
+    model that cannot be fitted is left out, and the comparison says so.
 
     Args:
         table: the amplitudes.
@@ -72,27 +76,61 @@ def compare(
         options: as of `fit`; `free`, `fixed` and `effects` go to the model "contact" only.
 
     Raises:
-        ValueError: as `fit`, and if fewer than two different models are named.
+        ValueError: if fewer than two different models are named, or one of them there is not; as `fit`, if no model can
+            be fitted.
     """
     require_float64()
     if len(set(models)) < 2:
         raise ValueError("comparing needs at least two different models")
-    found = {}
-    for model in dict.fromkeys(models):
+    for model in models:
+        free = _options_of(model, options).get("free")
+        model_parameters(model, None if free is None else tuple(free))
+
+    def fitted(model: str) -> tuple[Found, FitResult]:
         if report is not None:
             report(model)
-        found[model] = find_fit(table, model, **_options_of(model, options))
-    results = {model: summarise(table, one) for model, one in found.items()}
-    errors = np.max([one.strain.model_error for one in found.values()], axis=0)
-    aside = np.any([one.strain.set_aside for one in found.values()], axis=0)
-    rows = [_row(model, one, Strain(errors, aside), results[model]) for model, one in found.items()]
-    best = min(rows, key=lambda row: row["aic"])
-    reference = results[best["model"]]
+        found = find_fit(table, model, **_options_of(model, options))
+        return found, _finite(summarise(table, found))
+
+    fits, failed = _attempted(fitted, dict.fromkeys(models))
+    errors = np.max([one.strain.model_error for one, _ in fits.values()], axis=0)
+    aside = np.any([one.strain.set_aside for one, _ in fits.values()], axis=0)
+    judged, lost = _attempted(lambda model: _row(model, *fits[model], Strain(errors, aside)), fits)
+    results = {model: fits[model][1] for model in judged}
+    rows = sorted(judged.values(), key=lambda row: row["aic"])
     for row in rows:
-        row["delta_aic"] = row["aic"] - best["aic"]
-        row["law_change"] = _law_change(results[row["model"]], reference)
-    rows.sort(key=lambda row: row["aic"])
-    return Comparison(rows, _verdict(rows), results)
+        row["delta_aic"] = row["aic"] - rows[0]["aic"]
+        row["law_change"] = _law_change(results[row["model"]], results[rows[0]["model"]])
+    return Comparison(rows, _verdict(rows, failed | lost), results, failed | lost)
+
+
+def _attempted(attempt: Callable[[str], _T], models: Iterable[str]) -> tuple[dict[str, _T], dict[str, str]]:
+    """Return what is made of every model, and why it is not of others.
+
+    Raises:
+        Exception: of the first one, if there is none that anything is made of.
+    """
+    made: dict[str, _T] = {}
+    failures: dict[str, Exception] = {}
+    for model in models:
+        try:
+            made[model] = attempt(model)
+        except (ValueError, ArithmeticError, RuntimeError) as error:
+            failures[model] = error
+    if not made:
+        raise next(iter(failures.values()))
+    return made, {model: str(error) or type(error).__name__ for model, error in failures.items()}
+
+
+def _finite(result: FitResult) -> FitResult:
+    """Return a fit that can be compared.
+
+    Raises:
+        FloatingPointError: if its chi2 is not a finite number.
+    """
+    if not np.isfinite(result.chi2):
+        raise FloatingPointError("chi2 is not finite")
+    return result
 
 
 def _options_of(model: str, options: dict[str, Any]) -> dict[str, Any]:
@@ -100,7 +138,7 @@ def _options_of(model: str, options: dict[str, Any]) -> dict[str, Any]:
     return {name: value for name, value in options.items() if model == "contact" or name not in only_contact}
 
 
-def _row(model: str, found: Found, common: Strain, result: FitResult) -> dict[str, Any]:
+def _row(model: str, found: Found, result: FitResult, common: Strain) -> dict[str, Any]:
     stated, minimum = found.stated, found.minimum
     objective = relaxed(stated, common)
     if stated.problem.lasting:
@@ -141,9 +179,16 @@ def _measured(result: FitResult) -> Float[np.ndarray, " rows"]:
     return known if known.size else np.array([0.0, np.inf])
 
 
-def _verdict(rows: list[dict[str, Any]]) -> str:
-    """Return what the differences of AIC say of the two best models, and whether the best one is any good."""
-    best, second = rows[0], rows[1]
+def _verdict(rows: list[dict[str, Any]], failed: dict[str, str]) -> str:
+    """Return what the differences of AIC say of the two best models, whether the best one is any good, what failed."""
+    said = _said_of(*rows[:2]) if rows[1:] else f"There is nothing to compare {_meaning(rows[0]['model'])} with."
+    if not rows[0]["valid"]:
+        said += f" But the fit of {rows[0]['model']} is not valid itself."
+    return said + "".join(f" The fit of {model} failed: {reason.rstrip('.')}." for model, reason in failed.items())
+
+
+def _said_of(best: dict[str, Any], second: dict[str, Any]) -> str:
+    """Return what the difference of AIC says of the two best models."""
     gap = second["delta_aic"]
     first, other = (_meaning(row["model"]) for row in (best, second))
     change = 100.0 * second["law_change"]
@@ -156,10 +201,7 @@ def _verdict(rows: list[dict[str, Any]]) -> str:
         said = f"The measurement favours {first} over {other} (AIC lower by {gap:.1f})"
     else:
         said = f"The measurement tells plainly: {first}, not {other} (AIC lower by {gap:.0f})"
-    tail = f"; {apart}." if apart else "."
-    if not best["valid"]:
-        tail += f" But the fit of {best['model']} is not valid itself."
-    return said + tail
+    return f"{said}; {apart}." if apart else f"{said}."
 
 
 def _meaning(model: str) -> str:

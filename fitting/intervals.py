@@ -81,6 +81,9 @@ def _advance(objective: Objective, sides: list[_Side], values, errors, chi2: flo
         end = parameter.lowest if side.direction < 0 else parameter.highest
         distance = abs(target - values[side.index]) / errors[side.index]
         above = value - chi2
+        if not np.isfinite(above):
+            side.reason = "chi2 is not finite on this side"
+            continue
         root = float(np.sqrt(max(above, 0.0)))
         if above < rise:
             side.inside_root = root if distance >= side.inside else side.inside_root
@@ -153,6 +156,8 @@ class _Places:
         normal = jacobian.T @ jacobian
         diagonal = np.diag(normal).copy()
         held = ~free | (diagonal == 0.0) | outward
+        if not np.all(np.isfinite(normal)):
+            return places
         normal[held, :] = normal[:, held] = 0.0
         normal[np.diag_indices_from(normal)] = np.where(held, 1.0, diagonal * (1.0 + damping))
         step = np.where(held, 0.0, -np.linalg.solve(normal, np.where(held, 0.0, gradient)))

@@ -7,7 +7,7 @@ orbit lies. The laws around the minimum are asked for these rows alone, and the 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fitting.optimise import BATCH, FINE, PLAIN, ROUGH, SOFT, Objective, polish
+from fitting.optimise import BATCH, FINE, PLAIN, ROUGH, SOFT, Objective, lowest, polish
 
 _STEPS = (0.01, 0.03, 0.1, 0.3)
 """How far around a minimum laws are tried, in the optimiser's coordinates; those of losses relative to themselves."""
@@ -48,7 +48,7 @@ def recovered(
     follower = objective.following_each(objective.problem.values(ends))
     ends = polish(follower, ends, PLAIN, settled=FINE).coordinates
     chi2 = np.sum(objective.searching().residual(objective.problem.values(ends)) ** 2, axis=1)
-    return ends[int(np.argmin(chi2))]
+    return ends[lowest(chi2)]
 
 
 def _around(objective: Objective, coordinates: Float[np.ndarray, " p"]) -> Float[np.ndarray, "sets p"]:

@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from fitting.lost_rows import lost_rows, recovered
 from fitting.measurement import ROWS_PER_PROGRAM
-from fitting.optimise import BATCH, FINE, PLAIN, ROUGH, SOFT, Objective, polish
+from fitting.optimise import BATCH, FINE, PLAIN, ROUGH, SOFT, Objective, lowest, polish
 from fitting.starts import starts
 
 _ROUNDS = 4
@@ -70,7 +70,7 @@ def _whole(
     """Return the best of the scouts' ends by all rows, polished with orbits followed from there."""
     values = objective.problem.values(found)
     chi2 = objective.screen(values)
-    winner = int(np.argmin(chi2))
+    winner = lowest(chi2)
     follower = objective.following(values[winner])
     softly = polish(follower, found[winner][None], SOFT, settled=ROUGH)
     end = polish(follower, softly.coordinates, PLAIN, settled=FINE)
@@ -141,6 +141,6 @@ def _polished(
 ) -> Minimum:
     """Polish plainly and keep the best; `origins` are the starts' grid points, or the one that is already known."""
     final = polish(objective, starts, PLAIN, settled=FINE)
-    winner = int(np.argmin(final.objective))
+    winner = lowest(final.objective)
     start = origins if origins.ndim == 1 else origins[winner]
     return Minimum(final.coordinates[winner], start, objective.problem.values(final.coordinates), final.objective)

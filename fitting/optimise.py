@@ -46,6 +46,11 @@ def soft_square(residual: Float[np.ndarray, "..."], softness: float) -> Float[np
     return 2.0 * square / (1.0 + np.sqrt(1.0 + square / softness**2))
 
 
+def lowest(objective: Float[np.ndarray, " points"]) -> int:
+    """Return where an objective is smallest; one that is not a number is larger than any other."""
+    return int(np.argmin(np.where(np.isnan(objective), np.inf, objective)))
+
+
 class Objective:
     """The objective of a table and a model in optimiser coordinates, with its gradient, for up to `BATCH` sets."""
 
@@ -175,10 +180,13 @@ class Objective:
     def scale(self, coordinates: Float[np.ndarray, "sets p"]) -> Float[np.ndarray, "sets p p"]:
         """Return matrices whose columns are steps of about one standard error each (Gauss-Newton).
 
-        A direction that changes nothing at this point gets at most a large step, not an infinite one.
+        A direction that changes nothing at this point gets at most a large step, not an infinite one; where the slopes
+        are not finite, steps are coordinates.
         """
         _, jacobian = self.linearise(coordinates)
-        curvature, axes = np.linalg.eigh(np.einsum("snp,snq->spq", jacobian, jacobian))
+        fisher = np.einsum("snp,snq->spq", jacobian, jacobian)
+        sound = np.isfinite(fisher).all(axis=(1, 2), keepdims=True)
+        curvature, axes = np.linalg.eigh(np.where(sound, fisher, np.eye(fisher.shape[1])))
         largest = np.maximum(curvature[:, -1:], 1e-12)
         return axes / np.sqrt(np.maximum(curvature, 1e-8 * largest))[:, None, :]
 

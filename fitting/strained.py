@@ -53,7 +53,9 @@ def strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
     exists = np.asarray(prediction.orbits)[0] > 0
     speeds = jax.vmap(impact.speeds)(jnp.asarray(np.asarray(prediction.coordinate)[0]))
     approach, rebound = np.asarray(speeds.approach), np.asarray(speeds.rebound)
-    capture = float(impact.speeds(impact.lowest * (1.0 + 1e-9)).approach)
+    # without adhesion nothing is captured, and no impact is slow
+    lowest = float(impact.lowest)
+    capture = float(impact.speeds(jnp.asarray(lowest * (1.0 + 1e-9))).approach) if lowest > 0.0 else 0.0
     share = 2.0 * np.pi * np.asarray(rows.drive_frequency_khz) * 1e-3 * float(impact.length) / np.maximum(rebound, 1e-6)
     slow = (share > LONGEST) | (approach < NEAREST * capture)
     near = np.minimum(1.5 * capture / np.maximum(approach, 1e-6), 1.5 / NEAREST)

@@ -65,7 +65,9 @@ def _reasons(evidence: Evidence) -> list[str]:
     reasons = []
     convergence = evidence.convergence
     undetermined = [name for name, parameter in evidence.parameters.items() if parameter.undetermined]
-    if undetermined:
+    if convergence.reason is not None:
+        reasons.append(f"Not converged: {convergence.reason}.")
+    elif undetermined:
         reasons.append(
             f"Not identified: the amplitudes do not determine {' and '.join(undetermined)}; "
             f"{'; '.join(dict.fromkeys(helpful_measurement(name) for name in undetermined))}."

@@ -1,6 +1,7 @@
 """The frame of the command line: what is imported when, what goes to which stream, and how a command ends."""
 
 import json
+import math
 import os
 import signal
 import subprocess
@@ -131,6 +132,31 @@ def test_failures_end_in_one_line_and_a_code(trial: Callable[..., Result], error
     # click ends the line on which a terminal shows ^C
     assert result.stderr.strip("\n").splitlines()[0].startswith(f"afm-jax: {line}")
     assert len(result.stderr.strip("\n").splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("fault", "named"),
+    [
+        (lambda: np.linalg.inv(np.zeros((2, 2))), "LinAlgError: Singular matrix"),
+        (lambda: np.linalg.cholesky(np.eye(2)[0]), "LinAlgError: 1-dimensional array given"),
+        (lambda: np.stack([np.zeros(2), np.zeros(3)]), "ValueError: all input arrays must have the same shape"),
+        (lambda: math.exp(1e3), "OverflowError: math range error"),
+        (lambda: 1 / 0, "ZeroDivisionError: division by zero"),
+        (lambda: (_ for _ in ()).throw(FloatingPointError("chi2 is not finite")), "FloatingPointError: chi2"),
+        (lambda: (_ for _ in ()).throw(MemoryError()), "(MemoryError)"),
+    ],
+)
+def test_inner_failures_are_not_the_users_fault(
+    trial: Callable[..., Result], monkeypatch: pytest.MonkeyPatch, fault: Callable[[], object], named: str
+):
+    result = trial(lambda _: fault())
+    assert result.exit_code == 1
+    line = one_line(result)
+    assert line.startswith("the program failed, which is not the input's fault")
+    assert named in line
+    assert "AFM_JAX_TRACEBACK=1 shows where" in line
+    monkeypatch.setenv("AFM_JAX_TRACEBACK", "1")
+    assert type(trial(lambda _: fault()).exception).__name__ in line
 
 
 def test_a_mistake_in_the_program_is_not_hidden(trial: Callable[..., Result]):

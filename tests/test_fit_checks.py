@@ -7,14 +7,17 @@ import pytest
 from scipy.linalg import eigh
 from scipy.optimize import least_squares
 
+from afm_jax.strict_json import strict_json
 from fitting import fit, read_table
 from fitting.checks import check_minimum, covariance
-from fitting.law_fit import problem_of
+from fitting.fit_summary import summarise
+from fitting.law_fit import find_fit, problem_of
 from fitting.measurement import measurement_of
-from fitting.optimise import Objective
+from fitting.optimise import FINE, PLAIN, Objective, polish
 from fitting.result import FitResult
 from fitting.table import AmplitudeTable
 from tests.fit_tables import EXAMPLE, standard_errors_of, values_of
+from tests.strict_reading import strictly
 
 FREE = np.ones(3, dtype=bool)
 STEPS = np.array([1e-6, 1e-2, 1e-3])  # of r, epsilon and Q: hundredths of a standard error and less
@@ -83,6 +86,46 @@ def test_away_from_the_minimum_the_checks_say_so(law, objective):
     # chi2 falls by this much on the way back; the estimate is exact for a parabola
     above = np.sum(objective.residual(moved[None]) ** 2) - law.chi2
     assert away.estimated_distance == pytest.approx(above, rel=0.02)
+
+
+class _Spoilt(Objective):
+    """An objective whose residuals or slopes are not finite, everywhere or at every place but one."""
+
+    def __init__(self, sound: Objective, number: float, spared: np.ndarray | None = None):
+        super().__init__(sound.measurement, sound.problem)
+        self.number, self.spared = number, spared
+
+    def at_values(self, values):
+        found = super().at_values(values)
+        spoilt = np.ones(len(values), dtype=bool) if self.spared is None else np.any(values != self.spared, axis=1)
+        jacobian = np.where(spoilt[:, None, None], self.number, found.jacobian)
+        return found._replace(jacobian=jacobian)
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_numbers_that_are_not_finite_are_an_outcome(law, objective, number):
+    values = values_of(law)
+    point = objective.problem.coordinates(values)
+    with np.errstate(over="ignore", invalid="ignore"):
+        nowhere = check_minimum(_Spoilt(objective, number), point, FREE)
+        around = check_minimum(_Spoilt(objective, number, objective.problem.values(point)), point, FREE)
+        end = polish(_Spoilt(objective, number), point[None], PLAIN, settled=FINE)
+        assert np.all(covariance(_Spoilt(objective, number), values, FREE) == np.inf)
+    assert not nowhere.converged
+    assert nowhere.reason == "the slopes of the residuals are not finite where the search ended"
+    assert not around.converged
+    assert around.reason == "chi2 has no finite curvature where the search ended"
+    np.testing.assert_array_equal(end.coordinates, point[None])
+
+
+def test_a_fit_whose_slopes_are_not_finite_is_not_valid_and_says_why(table, law, objective):
+    found = find_fit(table, "law")
+    spoilt = dataclasses.replace(found, objective=_Spoilt(objective, np.nan))
+    result = summarise(table, spoilt)
+    assert not result.valid
+    assert result.reasons[0].startswith("Not converged: the slopes of the residuals are not finite")
+    assert strictly(strict_json(result.to_dict()))["convergence"]["reason"] == result.convergence.reason
+    assert result.chi2 == pytest.approx(law.chi2)
 
 
 def test_a_bound_that_chi2_pushes_inward_from_is_no_minimum(objective):

@@ -47,6 +47,14 @@ def viscous(shared) -> FitResult:
     return fit(shared, model="viscous+delay")
 
 
+def test_a_law_that_captures_nothing_has_a_finite_model_error(shared):
+    problem = problem_of(shared, "viscous+delay")
+    stated = Objective(measurement_of(shared, problem), problem)
+    values = {"epsilon": 0.0, "viscous_loss": 0.0, "delay_hertz": 0.2, "delay_lead_nm": 6.0, "delay_offset_nm": 0.5}
+    strain = strain_of(stated, np.array([values.get(name, 40.0) for name in problem.names]))
+    assert np.all(np.isfinite(strain.model_error))
+
+
 def amplitude_chi2(table: AmplitudeTable) -> tuple[np.ndarray, Any]:
     """Return the paper's contact's squared residuals (rows, 2), model errors added, and which rows are used."""
     problem = problem_of(table, "contact")

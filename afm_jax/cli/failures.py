@@ -1,18 +1,37 @@
 """How a command ends: exit codes, and one line on standard error for whatever went wrong.
 
-0: done. 1: nobody reads the output any more (closed pipe). 2: the call or the data are wrong. 3: ran, but the result
-is not valid. 130: interrupted.
+0: done. 1: the program failed, or nobody reads the output any more (closed pipe). 2: the call or the data are wrong.
+3: ran, but the result is not valid. 130: interrupted.
 """
 
+import os
 from collections.abc import Callable
 
 import click
 
 _OWN_PACKAGES = ("afm_jax", "fitting")
+_NUMERICAL_PACKAGES = frozenset(
+    {"blackjax", "diffrax", "equinox", "jax", "jaxlib", "lineax", "numpy", "optax", "optimistix", "scipy"}
+)
+_TRACEBACK = "AFM_JAX_TRACEBACK"
+"""Environment variable that, if set, lets a failure of the program pass through with its traceback."""
 
 
 class NotValid(Exception):  # noqa: N818
     """The command ran and has printed its output, but the result is not valid; the message says why."""
+
+
+_FORESEEN = (
+    NotValid,
+    click.Abort,
+    click.ClickException,
+    ModuleNotFoundError,
+    OSError,
+    ValueError,
+    ArithmeticError,
+    MemoryError,
+    RuntimeError,
+)
 
 
 def exit_code_of(run: Callable[[], object]) -> int:
@@ -22,13 +41,13 @@ def exit_code_of(run: Callable[[], object]) -> int:
         run: the command line without arguments; what it returns matters only if it is an exit code.
 
     Raises:
-        Exception: what the user cannot mend, a mistake in this program, passes through with its traceback.
+        Exception: a mistake in this program that no one foresaw passes through with its traceback.
     """
     try:
         code = run()
-    except (NotValid, click.Abort, click.ClickException, ModuleNotFoundError, OSError, ValueError) as error:
+    except _FORESEEN as error:
         line, code = _verdict(error)
-        if not line:
+        if not line or (code == 1 and os.environ.get(_TRACEBACK)):
             raise
         click.echo(f"afm-jax: {' '.join(line.split())}", err=True)
     return code if isinstance(code, int) else 0
@@ -49,8 +68,28 @@ def _verdict(error: Exception) -> tuple[str, int]:
             where = f"{error.filename}: " if error.filename else ""
             return f"{where}{error.strerror or error}", 2
         case _:
-            # ValueError, thus also TableError, SceneError and the checks of the objects: the data are wrong
-            return str(error) or type(error).__name__, 2
+            return _wrong_values(error)
+
+
+def _wrong_values(error: Exception) -> tuple[str, int]:
+    """Return the same for values that were refused, by a check of the input or by what computes with them."""
+    name = type(error).__name__
+    if isinstance(error, ValueError) and not _is_inner(error):
+        # thus also TableError, SceneError and the checks of the objects: the data are wrong
+        return str(error) or name, 2
+    what = f"{name}: {error}" if str(error) else name
+    return f"the program failed, which is not the input's fault ({what}); {_TRACEBACK}=1 shows where", 1
+
+
+def _is_inner(error: ValueError) -> bool:
+    """Say whether a computation failed, not a check: NumPy calls a factorisation that fails a ValueError too."""
+    if any(kind.__name__ == "LinAlgError" for kind in type(error).__mro__):
+        return True
+    place = error.__traceback__
+    while place is not None and place.tb_next is not None:
+        place = place.tb_next
+    module = "" if place is None else str(place.tb_frame.f_globals.get("__name__", ""))
+    return module.partition(".")[0] in _NUMERICAL_PACKAGES
 
 
 def _called_wrongly(error: click.ClickException) -> str:

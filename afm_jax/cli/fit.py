@@ -85,7 +85,7 @@ def command(session: Session, table: Path | None, model: str, noise: float | Non
     first = "the first run compiles for half a minute" if "delay" in model or model == "contact" else "some seconds"
     with session.working(f"fitting {measured.rows} rows, model {model} ({first})"):
         result = fit(measured, model, **settings)
-    extras = _extras(session, measured, result, settings, options)
+    extras, failure = _extras(session, measured, result, settings, options)
     payload = result.to_dict() | {name: extra.to_dict() for name, extra in extras.items()}
     session.emit(payload, summary(result), *(_words(name, extra) for name, extra in extras.items()))
     if session.out is not None:
@@ -93,6 +93,8 @@ def command(session: Session, table: Path | None, model: str, noise: float | Non
 
         for path in write_report(result, session.out, session.write_table, **extras):
             session.note(f"wrote {path}")
+    if failure is not None:
+        raise failure
     if not result.valid:
         raise NotValid(result.reasons[0])
 
@@ -160,29 +162,44 @@ def _check_contact_options(free: tuple[str, ...], fixed: dict[str, float], effec
 
 def _extras(
     session: Session, table: "AmplitudeTable", result: "FitResult", settings: dict[str, Any], options: dict[str, Any]
-) -> dict[str, Any]:
-    """Return what was asked for besides the fit: a comparison of models, a bootstrap."""
+) -> tuple[dict[str, Any], Exception | None]:
+    """Return what was asked for besides the fit, as far as it came, and what ended it: the fit itself stands."""
     extras: dict[str, Any] = {}
-    if options["comparing"]:
-        from fitting.comparison import compare, rivals  # noqa: PLC0415
-
-        models = rivals(result.model)
-        with session.working(f"comparing {', '.join(models)}"):
-            extras["comparison"] = compare(table, models, **settings)
     for name in ("bootstrap", "posterior"):
         if options[name] and not result.valid:
             session.note(f"no {name}: the fit is not valid")
-    if options["bootstrap"] and result.valid:
-        from fitting.sampling.parametric_bootstrap import bootstrap  # noqa: PLC0415
+    try:
+        if options["comparing"]:
+            extras["comparison"] = _comparison(session, table, result.model, settings)
+        if options["bootstrap"] and result.valid:
+            extras["bootstrap"] = _bootstrap(session, result, options["bootstrap"], options["seed"])
+        if options["posterior"] and result.valid:
+            extras["posterior"] = _posterior(session, result, options["seed"])
+    except Exception as error:  # noqa: BLE001
+        return extras, error
+    return extras, None
 
-        with session.working(f"fitting {options['bootstrap']} synthetic tables"):
-            extras["bootstrap"] = bootstrap(result, samples=options["bootstrap"], seed=options["seed"])
-    if options["posterior"] and result.valid:
-        from fitting.sampling.posterior_of_fit import posterior  # noqa: PLC0415
 
-        with session.working("sampling the posterior"):
-            extras["posterior"] = posterior(result, seed=options["seed"])
-    return extras
+def _comparison(session: Session, table: "AmplitudeTable", model: str, settings: dict[str, Any]) -> Any:
+    from fitting.comparison import compare, rivals  # noqa: PLC0415
+
+    models = rivals(model)
+    with session.working(f"comparing {', '.join(models)}"):
+        return compare(table, models, **settings)
+
+
+def _bootstrap(session: Session, result: "FitResult", samples: int, seed: int) -> Any:
+    from fitting.sampling.parametric_bootstrap import bootstrap  # noqa: PLC0415
+
+    with session.working(f"fitting {samples} synthetic tables"):
+        return bootstrap(result, samples=samples, seed=seed)
+
+
+def _posterior(session: Session, result: "FitResult", seed: int) -> Any:
+    from fitting.sampling.posterior_of_fit import posterior  # noqa: PLC0415
+
+    with session.working("sampling the posterior"):
+        return posterior(result, seed=seed)
 
 
 def _words(name: str, extra: Any) -> str:
@@ -194,6 +211,7 @@ def _words(name: str, extra: Any) -> str:
             f"{row['bic']:>10.1f}{100.0 * row['law_change']:>12.2f} %"
             for row in extra.rows
         ]
+        lines += [f"  {model:<18} failed: {reason}" for model, reason in extra.failed.items()]
         return "\n".join(["", "Models on the same rows, best first:", head, *lines, f"  {extra.verdict}"])
     intervals = {key: found["interval95"] for key, found in extra.to_dict()["parameters"].items()}
     head = "95 % credible intervals (posterior, flat priors):"

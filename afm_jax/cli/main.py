@@ -79,7 +79,8 @@ class LazyGroup(click.Group):
     cls=LazyGroup,
     invoke_without_command=True,
     context_settings={"help_option_names": ["-h", "--help"]},
-    epilog="Exit codes: 0 done; 2 the call or the data are wrong; 3 ran, but the result is not valid.",
+    epilog="Exit codes: 0 done; 1 the program failed; 2 the call or the data are wrong; 3 ran, but the result is not "
+    "valid.",
 )
 @click.option("--version", is_flag=True, help="Show the version and exit.")
 @click.pass_context

@@ -135,6 +135,8 @@ def regress(
 def _solution(design: Float[np.ndarray, "n p"], right: Float[np.ndarray, " n"]) -> Float[np.ndarray, " p"]:
     """Return the least-squares solution, terms of very different size brought to one."""
     size = _norm(design)
+    if not np.all(np.isfinite(design / size)) or not np.all(np.isfinite(right)):
+        return np.full_like(size, np.nan)
     return np.linalg.lstsq(design / size, right, rcond=None)[0] / size
 
 
@@ -148,7 +150,7 @@ def _inverse(design: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "p p"]:
     """Return the inverse of the normal matrix; infinite where the rows do not tell the terms apart."""
     size = _norm(design)
     scaled = design / size
-    if np.linalg.matrix_rank(scaled, tol=1e-9) < len(size):
+    if not np.all(np.isfinite(scaled)) or np.linalg.matrix_rank(scaled, tol=1e-9) < len(size):
         return np.full((len(size), len(size)), np.inf)
     return np.linalg.inv(scaled.T @ scaled) / np.outer(size, size)
 

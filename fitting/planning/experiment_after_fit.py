@@ -62,6 +62,8 @@ def _information(found: Mapping[str, Any], correlations: Sequence[Sequence[float
     information = np.zeros((len(error), len(error)))
     places = np.ix_(known, known)
     weight = np.where(known, 1.0 / np.where(known, error, 1.0), 0.0)
+    if known.any() and (not np.all(np.isfinite(matrix[places])) or np.linalg.eigvalsh(matrix[places])[0] <= 0.0):
+        raise ValueError("the saved fit's correlations contradict each other; fit the table again")
     # Errors far apart in size: invert the correlations, which have none.
     information[places] = np.linalg.inv(matrix[places]) * np.outer(weight, weight)[places] if known.any() else 0.0
     for i, entry in enumerate(found.values()):

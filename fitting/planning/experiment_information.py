@@ -59,6 +59,8 @@ def criterion_of(
 
 def standard_errors(information: Float[np.ndarray, "p p"]) -> Float[np.ndarray, " p"]:
     """Return the standard error of every parameter, the others unknown; infinite where it is not determined."""
+    if not np.all(np.isfinite(information)):
+        return np.full(len(information), np.inf)
     scale = np.sqrt(np.diag(information))
     safe = np.where(scale > 0.0, scale, 1.0)
     curvature, axes = np.linalg.eigh(information / np.outer(safe, safe))

@@ -53,7 +53,9 @@ def _reasons(evidence: Evidence) -> list[str]:
     per_freedom = fit.chi2 / fit.freedom
     if evidence.chi2_without - fit.chi2 < _PEAK * max(per_freedom, 1e-300):
         reasons.append("No resonance stands out of the sweep: a parabola explains it about as well.")
-    if not np.all(np.isfinite(fit.covariance)):
+    if fit.convergence.reason is not None:
+        reasons.append(f"Not converged: {fit.convergence.reason}.")
+    elif not np.all(np.isfinite(fit.covariance)):
         reasons.append(
             "Not identified: the sweep does not determine frequency, quality factor and background together."
         )

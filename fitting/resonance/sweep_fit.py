@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.checks import Convergence, check_minimum
-from fitting.optimise import PLAIN, polish
+from fitting.optimise import PLAIN, lowest, polish
 from fitting.resonance.calibration_errors import SMALLEST, first_errors, with_estimated_errors
 from fitting.resonance.calibration_result import PointErrors
 from fitting.resonance.resonance_model import LINEAR_NAMES, TERMS, SweepObjective, SweepProblem, points_of
@@ -128,7 +128,7 @@ def refit(fit: SweepFit, sweep: ResonanceSweep, background: str) -> SweepFit:
 
 def _polished(objective: SweepObjective, starting: Float[np.ndarray, "starts p"]) -> Float[np.ndarray, " p"]:
     result = polish(objective, starting, PLAIN, settled=_SETTLED)
-    return result.coordinates[int(np.argmin(result.objective))]
+    return result.coordinates[lowest(result.objective)]
 
 
 def _misfit(objective: SweepObjective, coordinates: Float[np.ndarray, " p"], data: int) -> float:

@@ -179,6 +179,8 @@ def _inverse(normal: Float[np.ndarray, "sets p p"]) -> Float[np.ndarray, "sets p
     unit = np.where(scale > 0.0, scale, 1.0)
     outer = unit[:, :, None] * unit[:, None, :]
     scaled = normal / outer
-    regular = np.linalg.eigvalsh(scaled)[:, 0] > 1e-12
+    finite = np.all(np.isfinite(scaled), axis=(1, 2))
+    safe = np.where(finite[:, None, None], scaled, np.eye(scaled.shape[1]))
+    regular = np.logical_and(finite, np.linalg.eigvalsh(safe)[:, 0] > 1e-12)
     safe = np.where(regular[:, None, None], scaled, np.eye(scaled.shape[1]))
     return np.where(regular[:, None, None], np.linalg.inv(safe) / outer, np.inf)

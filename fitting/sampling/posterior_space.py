@@ -61,12 +61,18 @@ def space_around(
         values: of the fit.
         covariance: its, finite.
         log_uniform: parameters whose prior is flat in the logarithm of their loss.
+
+    Raises:
+        ValueError: if the data hardly tell parameters apart.
     """
     errors = np.sqrt(np.diag(covariance))
     pairs = list(zip(problem.parameters, values, errors, strict=True))
     middle = np.array([_coordinate(p, value, error) for p, value, error in pairs])
     slope = np.array([_slope(p, value, error) for p, value, error in pairs])
-    axes = np.linalg.cholesky(covariance / np.outer(slope, slope))
+    scaled = covariance / np.outer(slope, slope)
+    if not np.all(np.isfinite(scaled)) or np.linalg.eigvalsh(scaled)[0] <= 0.0:
+        raise ValueError(f"the data hardly tell {', '.join(problem.names)} apart: hold one fixed, or constrain it")
+    axes = np.linalg.cholesky(scaled)
     return Space(problem, log_uniform, errors, middle, axes)
 
 

@@ -1,0 +1,138 @@
+"""Models compared on one table: information criteria, and what becomes of a rival that cannot be fitted."""
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from afm_jax.cli.main import main
+from fitting import comparison, read_table
+from fitting.comparison import compare
+from fitting.law_fit import find_fit
+from tests.fit_tables import EXAMPLE
+from tests.strict_reading import strictly
+
+MODELS = ("law", "restitution", "viscous")
+
+
+@pytest.fixture
+def failing(monkeypatch: pytest.MonkeyPatch):
+    """Let the fit of one model end in an error."""
+
+    def let(model: str, error: Exception):
+        def find(table, name, **options):
+            if name == model:
+                raise error
+            return find_fit(table, name, **options)
+
+        monkeypatch.setattr(comparison, "find_fit", find)
+
+    return let
+
+
+@pytest.fixture(scope="module")
+def table():
+    return read_table(EXAMPLE)
+
+
+@pytest.fixture(scope="module")
+def compared(table):
+    return compare(table, MODELS)
+
+
+def test_models_are_compared_by_their_information(compared):
+    assert compared.failed == {}
+    rows = {row["model"]: row for row in compared.rows}
+    assert set(rows) == set(MODELS)
+    for model, row in rows.items():
+        count = len(compared.results[model].parameters)
+        # 164 amplitudes and the constraint on Q
+        assert row["degrees_of_freedom"] == 165 - count
+        assert row["aic"] == pytest.approx(row["chi2"] + 2.0 * count)
+        assert row["bic"] == pytest.approx(row["chi2"] + count * math.log(165))
+    assert [row["aic"] for row in compared.rows] == sorted(row["aic"] for row in compared.rows)
+    # the table is made of the law r = 0.95, epsilon = 200
+    assert compared.rows[0]["model"] == "law"
+    assert "tells plainly: law: a restitution with adhesion" in compared.verdict
+
+
+@pytest.mark.parametrize(
+    ("error", "said"),
+    [
+        (np.linalg.LinAlgError("Eigenvalues did not converge"), "Eigenvalues did not converge"),
+        (OverflowError("math range error"), "math range error"),
+        (FloatingPointError(), "FloatingPointError"),
+        (ValueError("the constraint on 'r' is on no parameter"), "the constraint on 'r' is on no parameter"),
+        (RuntimeError("XLA ran out of memory."), "XLA ran out of memory."),
+    ],
+)
+def test_a_rival_that_fails_is_reported_beside_those_that_stand(table, compared, failing, error, said):
+    failing("viscous", error)
+    found = compare(table, MODELS)
+    assert found.failed == {"viscous": said}
+    assert f"The fit of viscous failed: {said.rstrip('.')}." in found.verdict
+    without = [row for row in compared.rows if row["model"] != "viscous"]
+    assert [row["model"] for row in found.rows] == [row["model"] for row in without]
+    assert found.rows[0]["chi2"] == pytest.approx(without[0]["chi2"])
+    assert found.to_dict()["failed"] == found.failed
+
+
+def test_a_model_alone_is_compared_with_nothing(table, failing):
+    failing("viscous", OverflowError("math range error"))
+    found = compare(table, ("law", "viscous"))
+    assert [row["model"] for row in found.rows] == ["law"]
+    assert found.verdict.startswith("There is nothing to compare law: a restitution with adhesion (r, epsilon) with.")
+
+
+def test_a_constraint_that_only_one_model_has_leaves_the_others_out(table):
+    found = compare(table, ("law", "viscous"), constraints={"r": (0.95, 0.01), "quality_factor": (40.0, 0.4)})
+    assert list(found.results) == ["law"]
+    assert "the constraint on 'r' is on no parameter" in found.failed["viscous"]
+
+
+def test_a_wrong_call_is_no_failed_rival(table):
+    with pytest.raises(ValueError, match="at least two different models"):
+        compare(table, ("law", "law"))
+    with pytest.raises(ValueError, match="`model` must be one of"):
+        compare(table, ("law", "lwa"))
+    with pytest.raises(ValueError, match="the constraint on 'rr' is on no parameter"):
+        compare(table, ("law", "viscous"), constraints={"rr": (1.0, 0.1)})
+
+
+def test_the_command_says_which_rival_failed(failing):
+    failing("viscous", np.linalg.LinAlgError("Eigenvalues did not converge"))
+    done = CliRunner().invoke(main, ["fit", str(EXAMPLE), "--compare"])
+    assert done.exit_code == 0
+    assert "viscous            failed: Eigenvalues did not converge" in done.stdout
+    done = CliRunner().invoke(main, ["fit", str(EXAMPLE), "--compare", "--json"])
+    answer = strictly(done.stdout)
+    assert answer["valid"] is True
+    assert answer["comparison"]["failed"] == {"viscous": "Eigenvalues did not converge"}
+
+
+def test_the_fit_stands_if_all_that_was_asked_for_besides_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    def fail(*_, **__):
+        raise OverflowError("math range error")
+
+    monkeypatch.setattr(comparison, "compare", fail)
+    done = CliRunner().invoke(main, ["fit", str(EXAMPLE), "--compare", "--json", "--out", str(tmp_path)])
+    assert done.exit_code == 1
+    assert strictly(done.stdout)["valid"] is True
+    assert "OverflowError: math range error" in done.stderr.splitlines()[-1]
+    assert (tmp_path / "fit.json").exists()
+
+
+@pytest.mark.slow  # two programs of fits with a delay to compile
+@pytest.mark.parametrize("model", ["restitution+delay", "viscous+delay"])
+def test_a_law_without_adhesion_is_a_rival_like_any_other(contact_table_path: Path, model: str):
+    done = CliRunner().invoke(main, ["fit", str(contact_table_path), "--model", model, "--compare", "--json"])
+    answer = strictly(done.stdout)
+    assert answer["model"] == model
+    assert answer["comparison"]["failed"] == {}
+    found = {row["model"]: row for row in answer["comparison"]["rows"]}
+    assert set(found) == {"restitution+delay", "law+delay", "viscous+delay"}
+    # the resolved contact, whose loss grows with speed and which holds slow tips: restitution alone is far off
+    assert found["restitution+delay"]["chi2"] > 10.0 * found["viscous+delay"]["chi2"]
+    assert done.exit_code == (3 if model == "restitution+delay" else 0)
