@@ -4,10 +4,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from afm_jax.contact.accuracy_settings import setting_of
 from afm_jax.contact.collide import batch_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import Junction, find_junction
+from afm_jax.contact.settings import setting_of
 from afm_jax.impact.lasting_impact import USUAL_LEAD, TabulatedImpact
 
 NODES = 32

@@ -227,22 +227,22 @@ MUTATIONS = {
         "afm_jax/contact/junction.py", "(6.0 * cube - 3.0 * math", "(6.0 * cube - 1.5 * math", JUNCTION
     ),
     "dissipation left out of the time": Mutation(
-        "afm_jax/contact/passage_steps.py", "way.available_aj(gap) - state[0])", "way.available_aj(gap))", COLLISIONS
+        "afm_jax/contact/bridge_leg.py", "at.available_aj - state[0])", "at.available_aj)", COLLISIONS
     ),
     "energy lost where it is gained": Mutation(
-        "afm_jax/contact/passage.py",
-        "- self.end_potential_aj - dissipated",
-        "- self.end_potential_aj + dissipated",
+        "afm_jax/contact/bridge_leg.py",
+        "- self.end_potential_aj - spent",
+        "- self.end_potential_aj + spent",
         COLLISIONS,
     ),
     "collocation that sweeps from the end": Mutation(
-        "afm_jax/contact/passage_collocation.py",
+        "afm_jax/contact/leg.py",
         "integrals[:, 0] = roots + 1.0",
         "integrals[:, 0] = 1.0 - roots",
         COLLOCATION,
     ),
     "time in the junction counted once": Mutation(
-        "afm_jax/contact/junction_way.py", "pace * (2.0 * inside + outside)", "pace * (inside + outside)", COLLISIONS
+        "afm_jax/contact/junction_leg.py", "2.0 * inside + outside", "inside + outside", COLLISIONS
     ),
     "delay counted from where the bridge forms, both ways": Mutation(
         "afm_jax/contact/collision.py",
@@ -257,7 +257,7 @@ MUTATIONS = {
         COLLISIONS,
     ),
     "turning point on the wrong side of the well": Mutation(
-        "afm_jax/contact/turned.py",
+        "afm_jax/contact/bridge_leg.py",
         "> jnp.argmin(potential)",
         "< jnp.argmin(potential)",
         "tests/test_collide_hard_cases.py::test_a_sharp_tip_turns_in_the_bridge[3.0]",

@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from afm_jax.contact.accuracy_settings import SETTINGS
 from afm_jax.contact.collide import _quick
 from afm_jax.contact.contact import EFFECTS, Contact
+from afm_jax.contact.settings import SETTINGS
 
 SETTING = SETTINGS["diffrax"][1e-9]
 

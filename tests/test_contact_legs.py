@@ -7,11 +7,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from afm_jax.motion.contact_bridge_leg import go_in
+from afm_jax.contact.bridge_leg import driven_way, go_in, pass_in_steps, sweep
+from afm_jax.contact.collide import collide
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.driven import Place, driven_by, free_tip
+from afm_jax.contact.junction import find_junction
+from afm_jax.contact.phases import Phase
+from afm_jax.contact.settings import DRIVEN_SETTINGS, METHODS, QuickSetting, driven_setting_of
+from afm_jax.contact.step import advance, eighth_order_step, fresh_touch
 from afm_jax.motion.contact_crossing import cross
-from afm_jax.motion.contact_settings import SETTINGS, QuickSetting, setting_of
-from afm_jax.motion.driven import Place, driven_by
-from afm_jax.motion.eighth_order import eighth_order_step
 from afm_jax.motion.side_by_side import for_the_few
 from afm_jax.presets import contact_scene
 from tests.reference_driven_contact import DrivenContact, follow
@@ -40,9 +44,9 @@ def column(contacts, name: str) -> np.ndarray:
 
 
 # errors allowed: of the rebound speed (relative) what the setting promises, of times in us a tenth of it
-@pytest.mark.parametrize("accuracy", sorted(SETTINGS))
+@pytest.mark.parametrize("accuracy", sorted(DRIVEN_SETTINGS))
 def test_straight_contacts_are_those_of_an_independent_integration(contacts, accuracy):
-    quick = setting_of(accuracy).quick
+    quick = driven_setting_of(accuracy).quick
     assert quick is not None
     leg = crossed(contacts, quick)
     holds = np.asarray(leg.holds)
@@ -78,13 +82,77 @@ def test_nodes_and_sweeps_converge(contacts):
 def test_a_leg_says_where_it_does_not_hold():
     scene = contact_scene(5.277, 4.0, 0.0)
     driven = driven_by(scene.interaction, scene.cantilever, scene.platform)
-    quick = setting_of(1e-6).quick
+    quick = driven_setting_of(1e-6).quick
     assert quick is not None
     # a platform that falls away as fast as the tip comes, one that rises: the first tips turn in the bridge
     rates = jnp.asarray([-0.1, -1.0, 20.0, jnp.nan, -60.0])
     time = jnp.full_like(rates, 0.5 * float(scene.platform.period_us))
     leg = go_in(driven, Place(jnp.full_like(rates, 3.5), rates, time, jnp.zeros_like(rates)), quick)
     assert np.asarray(leg.holds).tolist() == [False, False, False, False, True]
+
+
+@pytest.fixture(scope="module")
+def free():
+    """Free tips where the bridge forms, and what `collide` says of them."""
+    contact, speeds = Contact.paper(), jnp.asarray([12.5, 15.0, 22.0, 45.0, 120.0, 200.0])
+    tip = free_tip(contact, find_junction(contact), jnp.asarray(1.0))
+    place = Place(jnp.full_like(speeds, tip.forms_nm), -speeds, jnp.zeros_like(speeds), jnp.zeros_like(speeds))
+    return tip, place, collide(contact, speeds, accuracy=1e-11)
+
+
+def assert_leaves(place: Place, expected):
+    """Compare with a collision: 1e-9 of the speed, 1e-10 us of the time, as driven contacts promise."""
+    np.testing.assert_allclose(place.gap_rate, expected.rebound_speed_nm_per_us, rtol=1e-9)
+    np.testing.assert_allclose(place.time_us, expected.time_in_contact_us, rtol=0.0, atol=1e-10)
+    np.testing.assert_allclose(place.viscous_loss_aj, expected.viscous_loss_aj, rtol=1e-9)
+
+
+def test_the_legs_of_driven_contacts_take_a_free_tip_where_collide_does(free):
+    tip, place, expected = free
+    leg = jax.jit(cross, static_argnums=2)(tip, place, QuickSetting(24, 18, 30, 24, 1e-9, 12, 2, 1e-2))
+    assert np.asarray(leg.holds).all()
+    assert_leaves(leg.place, expected)
+    np.testing.assert_allclose(leg.deepest_gap_nm, expected.deepest_gap_nm, rtol=1e-12)
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_steps_in_time_take_a_free_tip_where_collide_does(free, method):
+    tip, place, expected = free
+
+    @jax.jit
+    def through(place):
+        def more(touch):
+            after = advance(tip, touch, jnp.asarray(100.0), 6.0, method)
+            inside = touch.phase != Phase.DRY
+            return jax.tree.map(lambda new, old: jnp.where(inside, new, old), after, touch)
+
+        touch = fresh_touch(place, jnp.full(place.x.shape, Phase.BRIDGE))
+        return jax.lax.while_loop(lambda touch: jnp.any(touch.phase != Phase.DRY), more, touch)
+
+    touch = through(place)
+    assert_leaves(touch.place, expected)
+    np.testing.assert_allclose(touch.time_in_junction_us, expected.time_in_junction_us, rtol=0.0, atol=1e-10)
+
+
+@pytest.mark.parametrize("inward", [True, False])
+def test_both_integrators_take_a_driven_tip_through_the_bridge(inward):
+    scene = contact_scene(5.277, 4.0, 0.0)
+    driven = driven_by(scene.interaction, scene.cantilever, scene.platform)
+    rates = jnp.asarray([40.0, 60.0, 200.0]) * (-1.0 if inward else 1.0)
+    time = jnp.asarray([0.1, 0.3, 0.8]) * scene.platform.period_us
+    gaps = driven.forms_nm if inward else driven.breaks_nm, driven.junction.forms_gap_nm
+    place = Place(jnp.zeros_like(rates), rates, time, jnp.zeros_like(rates))
+
+    @jax.jit
+    def both(place):
+        way = driven_way(driven, gaps, place, inward=inward)
+        return pass_in_steps(way, 40), sweep(way, 30, 25).passage
+
+    for stepped, swept in zip(*both(place), strict=True):
+        np.testing.assert_allclose(stepped, swept, rtol=1e-10)
+    # the drive counts: a free tip ends elsewhere
+    alone = sweep(driven_way(driven._replace(drive=None), gaps, place, inward=inward), 30, 25).passage
+    assert (np.abs(np.asarray(alone.energy_aj) / np.asarray(both(place)[1].energy_aj) - 1.0) > 1e-3).all()
 
 
 def test_a_step_is_of_order_eight():

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
-from afm_jax.contact.accuracy_settings import CAREFUL
+from afm_jax.contact.bridge_leg import turn_in_bridge
 from afm_jax.contact.collision import go_through
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import Junction, explain_missing_junction, find_junction
-from afm_jax.contact.turned import turn_in_bridge
+from afm_jax.contact.settings import CAREFUL
 from afm_jax.impact.implicit import implicit_root
 from afm_jax.parameters import as_parameter, check_parameter, is_traced
 from afm_jax.stored_program import stored

@@ -9,11 +9,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from afm_jax.contact.accuracy_settings import CAREFUL, Setting, setting_of
+from afm_jax.contact.bridge_leg import Turn, turn_in_bridge
 from afm_jax.contact.collision import Collision, collision_of, collision_of_turn, go_through
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import Junction, explain_missing_junction, find_junction
-from afm_jax.contact.turned import Turn, turn_in_bridge
+from afm_jax.contact.settings import CAREFUL, Setting, setting_of
 from afm_jax.outcome import CollisionOutcome
 from afm_jax.parameters import as_parameter, check_parameter, is_traced
 from afm_jax.stored_program import stored

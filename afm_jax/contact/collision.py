@@ -3,19 +3,15 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
-import diffrax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from afm_jax.contact.accuracy_settings import Setting
-from afm_jax.contact.bridge import bridge_of
+from afm_jax.contact.bridge_leg import Passage, Turn, Way, margin_of, pass_bridge, pass_by_collocation, way_through
 from afm_jax.contact.contact import Contact
+from afm_jax.contact.driven import free_tip
 from afm_jax.contact.junction import Junction
-from afm_jax.contact.junction_way import JunctionWay, pass_through_junction
-from afm_jax.contact.passage import Passage, Way, margin_of, way_through
-from afm_jax.contact.passage_collocation import pass_by_collocation
-from afm_jax.contact.passage_steps import pass_in_steps
-from afm_jax.contact.turned import Turn
+from afm_jax.contact.junction_leg import JunctionWay, pass_through_junction
+from afm_jax.contact.settings import Setting
 from afm_jax.outcome import CollisionOutcome
 
 
@@ -68,33 +64,33 @@ def go_through(
 
     `crossing`, if not None, replaces the setting's way of crossing the bridge.
     """
-    cross = crossing or (lambda way: _pass(way, setting))
-    bridge, forces = bridge_of(contact), contact.forces.static
+    cross = crossing or (lambda way: pass_bridge(way, setting))
+    tip, forces = free_tip(contact, junction, mass), contact.forces.static
     forms, breaks = contact.bridge_forms_nm, junction.breaks_gap_nm
     outer = jnp.maximum(contact.bridge_breaks_nm, breaks)
     pull_in, pull_out = (-forces(gap) * gap for gap in (forms, outer))
 
     start = 0.5 * mass * approach_speed * approach_speed
     gaps = (forms, junction.forms_gap_nm)
-    inward = cross(way_through(bridge, mass, gaps, start, margin_of(start, pull_in), inward=True))
-    solid = pass_through_junction(contact.junction, junction, inward.energy_aj, mass, setting.junction_nodes)
+    inward = cross(way_through(tip, gaps, start, margin_of(start, pull_in), inward=True))
+    solid = pass_through_junction(tip, inward.energy_aj, setting.junction_nodes)
 
     def way_out(margin: Float[Array, "..."]) -> Way:
-        return way_through(bridge, mass, (outer, breaks), solid.energy_aj, margin, inward=False)
+        return way_through(tip, (outer, breaks), solid.energy_aj, margin, inward=False)
 
     # a short first pass tells how fast the tip is at the end, and so which variable takes the square root out
     trial = way_out(jnp.full_like(start, 1e-3))
-    if bridge.conserves:
+    if trial.quiet:
         end = trial.total_aj - trial.end_potential_aj
     elif setting.careful:
-        end = _pass(trial, setting).energy_aj
+        end = pass_bridge(trial, setting).energy_aj
     else:
         end = pass_by_collocation(trial, 6, 1).energy_aj
     outward = cross(way_out(margin_of(end, pull_out)))
 
     # at an end that pulls, a slow tip's drag must be small against the pull for the substitution to hold
     calm_in, calm_out = (
-        (pull <= 0.0) | (bridge.damping(gap) * gap * jnp.sqrt(2.0 * jnp.maximum(pull, 0.0) / mass) <= 0.1 * pull)
+        (pull <= 0.0) | (tip.bridge.damping(gap) * gap * jnp.sqrt(2.0 * jnp.maximum(pull, 0.0) / mass) <= 0.1 * pull)
         for gap, pull in ((forms, pull_in), (outer, pull_out))
     )
     # Few steps are enough where dissipation is small against the energies along the way and no repulsion almost stops
@@ -103,15 +99,6 @@ def go_through(
     easy_in = (inward.dissipated_aj < 0.2 * reach) & (inward.energy_aj > 0.1 * start) & calm_in
     easy_out = (outward.dissipated_aj < 0.2 * solid.energy_aj) & calm_out
     return Ways(inward, solid, outward, outer, easy_in & (easy_out | (solid.energy_aj <= 0.0)))
-
-
-def _pass(way: Way, setting: Setting) -> Passage:
-    size = setting.inward if way.inward else setting.outward
-    if way.bridge.conserves:
-        return pass_by_collocation(way, max(size, setting.junction_nodes), 0)
-    if setting.rule == "collocation":
-        return pass_by_collocation(way, size, setting.sweeps)
-    return pass_in_steps(way, size, getattr(diffrax, setting.solver)(scan_kind="bounded"))
 
 
 def collision_of(

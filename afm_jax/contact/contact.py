@@ -7,9 +7,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.contact.forces.capillary import Capillary
 from afm_jax.contact.forces.core_repulsion import CoreRepulsion
-from afm_jax.contact.forces.dmt import Dmt
 from afm_jax.contact.forces.force import Force, ForceSum, terms_of
-from afm_jax.contact.forces.hertz import Hertz
 from afm_jax.contact.forces.jkr import Jkr
 from afm_jax.contact.forces.liquid import Liquid
 from afm_jax.contact.forces.structural import Structural
@@ -42,8 +40,7 @@ class Contact(eqx.Module):
         bridge_breaks_nm: gap at which a leaving tip breaks it, in nm.
 
     Raises:
-        ValueError: if a gap is not positive, the bridge breaks at a smaller gap than it forms, or one of its forces is
-            an elastic contact itself (Hertz, DMT).
+        ValueError: if a gap is not positive, or the bridge breaks at a smaller gap than it forms.
 
     >>> Contact(forces=Capillary() + CoreRepulsion(), junction=Jkr()).effects
     ('capillary', 'core', 'jkr')
@@ -65,12 +62,6 @@ class Contact(eqx.Module):
                 "`bridge_breaks_nm` must not be smaller than `bridge_forms_nm`: a bridge that breaks before it forms "
                 "would give energy away"
             )
-        for term in self.forces.terms:
-            if isinstance(term, Hertz | Dmt):
-                raise ValueError(  # noqa: TRY004
-                    f"`forces` must not hold {type(term).__name__}: it is an elastic contact itself, and the junction "
-                    "is JKR's; leave it out"
-                )
 
     @classmethod
     def paper(  # noqa: PLR0913

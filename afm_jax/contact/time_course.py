@@ -1,7 +1,7 @@
 """One impact in time: gap, speed, phase and force along the way of a free tip through the contact.
 
-The speed at a gap follows from the energy, the time from its quadrature (the same equations as in `collide`), at Gauss
-nodes that crowd where the tip is slow; time is a result here, so that the points are not equally spaced.
+The legs of `collide`, read at their Gauss nodes, which crowd where the tip is slow; time is a result here, so that the
+points are not equally spaced.
 """
 
 from collections.abc import Callable
@@ -13,13 +13,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from afm_jax.contact.bridge import bridge_of
+from afm_jax.contact.bridge_leg import Way, margin_of, sweep, way_through
 from afm_jax.contact.contact import Contact
+from afm_jax.contact.driven import Driven, free_tip
 from afm_jax.contact.forces import jkr
 from afm_jax.contact.junction import Junction, explain_missing_junction, find_junction
-from afm_jax.contact.junction_way import turning_root
-from afm_jax.contact.passage import Way, margin_of, way_through
-from afm_jax.contact.passage_collocation import nodes_along
+from afm_jax.contact.junction_leg import stretch_in_junction, turning_root
 from afm_jax.contact.phases import Phase, force_in_phase
 from afm_jax.parameters import as_parameter, check_parameter
 from afm_jax.stored_program import stored
@@ -85,20 +84,21 @@ def _course(
     contact: Contact, speed: Float[Array, ""], mass: Float[Array, ""]
 ) -> tuple[Junction, list[_Leg], Float[Array, "3"]]:
     """Return the four legs, and kinetic energies where the junction forms and breaks with the rebound speed."""
-    junction, bridge, solid = find_junction(contact), bridge_of(contact), contact.junction
+    junction = find_junction(contact)
+    tip, solid = free_tip(contact, junction, mass), contact.junction
     forms, breaks = contact.bridge_forms_nm, jnp.maximum(contact.bridge_breaks_nm, junction.breaks_gap_nm)
-    pull_in, pull_out = (-bridge.force(gap) * gap for gap in (forms, breaks))
+    pull_in, pull_out = (-tip.bridge.force(gap) * gap for gap in (forms, breaks))
     start = 0.5 * mass * speed * speed
 
     inward, on = _crossing(
-        way_through(bridge, mass, (forms, junction.forms_gap_nm), start, margin_of(start, pull_in), inward=True)
+        way_through(tip, (forms, junction.forms_gap_nm), start, margin_of(start, pull_in), inward=True)
     )
     level = jkr.work(junction.forms_root) + on / solid.energy_scale_aj
-    loading, unloading = _junction_legs(solid, junction, level, mass)
+    loading, unloading = _junction_legs(tip, level)
     off = (level - jkr.work(jkr.FOLD)) * solid.energy_scale_aj
 
     def way_out(outer: Float[Array, ""], margin: Float[Array, ""]) -> Way:
-        return way_through(bridge, mass, (outer, junction.breaks_gap_nm), off, margin, inward=False)
+        return way_through(tip, (outer, junction.breaks_gap_nm), off, margin, inward=False)
 
     def end_at(outer: Float[Array, ""]) -> Float[Array, ""]:
         return _crossing(way_out(outer, jnp.full_like(start, 1e-3)))[1]
@@ -124,47 +124,25 @@ def _largest(holds: Callable[[Array], Array], low: Float[Array, ""], high: Float
 
 def _crossing(way: Way) -> tuple[_Leg, Float[Array, ""]]:
     """Return a crossing of the bridge and the kinetic energy at its end."""
-    points, weights, cumulative = nodes_along(_NODES, way.length)
-    y, gap = way.place(way.length * points)
-    available = way.available_aj(gap)
-    spent = jnp.zeros_like(available)
-    for _ in range(_SWEEPS):
-        spent = way.length * (cumulative @ way.rates(y, gap, available - spent)[0])
-    losses, times = way.rates(y, gap, available - spent)
-    end = way.end(way.length * (weights @ losses), way.length * (weights @ times))
-    kinetic = jnp.maximum(available - spent, 0.0)
-    speed = jnp.where(kinetic > 0.0, jnp.sqrt(jnp.where(kinetic > 0.0, kinetic * way.twice_inverse_mass, 1.0)), 0.0)
-    return _Leg(way.length * (cumulative @ times), gap, -way.sense * speed, end.time_us), end.energy_aj
+    swept = sweep(way, _NODES, _SWEEPS)
+    end = swept.passage
+    return _Leg(swept.lasted_us, swept.at.gap_nm, -way.sense * swept.speed, end.time_us), end.energy_aj
 
 
-def _junction_legs(
-    solid: jkr.Jkr, junction: Junction, level: Float[Array, ""], mass: Float[Array, ""]
-) -> tuple[_Leg, _Leg]:
+def _junction_legs(tip: Driven, level: Float[Array, ""]) -> tuple[_Leg, _Leg]:
     """Return the ways from the formation of the junction to the turning point, and from there to the fold."""
     turn = turning_root(level)
-    points, weights, cumulative = nodes_along(_NODES, turn)
-    pace = solid.depth_scale_nm * jnp.sqrt(0.5 * mass / solid.energy_scale_aj)
-    # both ends may be turning points: sin^2 takes the square roots out
-    share, bend = jnp.sin(0.5 * jnp.pi * points) ** 2, 0.5 * jnp.pi * jnp.sin(jnp.pi * points)
-
-    def leg(end: Float[Array, ""]) -> _Leg:
-        s = turn - (turn - end) * share
-        missing = level - jkr.work(s)
-        moving = missing > 0.0
-        root = jnp.sqrt(jnp.where(moving, missing, 1.0))
-        rate = jnp.where(moving, (turn - end) * bend * jkr.depth_slope(s) * pace / root, 0.0)
-        velocity = jnp.where(moving, solid.depth_scale_nm * root / pace, 0.0)
-        gap = junction.shift_nm - solid.depth_scale_nm * jkr.depth(s)
-        return _Leg(cumulative @ rate, gap, velocity, weights @ rate)
-
     lowest = jnp.full_like(turn, 6.0 ** (1.0 / 6.0))  # of the work: left of it the contact pulls
     fold = jnp.full_like(turn, jkr.FOLD)
     breaks = level > jkr.work(fold)
     stop = lowest + fold - _largest(lambda s: jkr.work(lowest + fold - s) < level, fold, lowest)
-    out = leg(jnp.where(breaks, fold, stop))
-    into = leg(junction.forms_root)
-    # both legs are counted from the turning point; the way in is the way out of the same energy, backwards
-    return _Leg(into.duration - into.time[::-1], into.gap[::-1], -into.velocity[::-1], into.duration), out
+    out = stretch_in_junction(tip, level, turn, jnp.where(breaks, fold, stop), _NODES)
+    into = stretch_in_junction(tip, level, turn, tip.junction.forms_root, _NODES)
+    # the way in is the way out of the same energy, backwards
+    return (
+        _Leg(into.duration_us - into.time_us[::-1], into.gap_nm[::-1], -into.speed[::-1], into.duration_us),
+        _Leg(out.time_us, out.gap_nm, out.speed, out.duration_us),
+    )
 
 
 def _joined(

@@ -11,14 +11,13 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool
 
+from afm_jax.contact.bridge_leg import go_in, go_out
+from afm_jax.contact.driven import Driven, Place
+from afm_jax.contact.junction_leg import go_through_junction
+from afm_jax.contact.leg import Leg
 from afm_jax.contact.phases import Phase
-from afm_jax.motion.contact_bridge_leg import go_in, go_out
-from afm_jax.motion.contact_junction_leg import go_through_junction
-from afm_jax.motion.contact_leg import Leg
-from afm_jax.motion.contact_pace import junction_pace
-from afm_jax.motion.contact_settings import DrivenSetting, QuickSetting
-from afm_jax.motion.contact_step import Touch
-from afm_jax.motion.driven import Driven, Place
+from afm_jax.contact.settings import DrivenSetting, QuickSetting
+from afm_jax.contact.step import Touch, junction_pace
 
 
 def cross(driven: Driven, place: Place, setting: QuickSetting) -> Leg:

@@ -13,12 +13,12 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from afm_jax.contact.driven import Driven, Place
 from afm_jax.contact.phases import Phase
+from afm_jax.contact.settings import DrivenSetting
+from afm_jax.contact.step import Touch, advance, fresh_touch
 from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.motion.contact_crossing import at_junction, go_quickly
-from afm_jax.motion.contact_settings import DrivenSetting
-from afm_jax.motion.contact_step import Touch, advance, fresh_touch
-from afm_jax.motion.driven import Driven, Place
 from afm_jax.motion.record import ContactKind, MotionOutcome
 from afm_jax.motion.side_by_side import for_the_few
 from afm_jax.outcome import Outcome

@@ -8,10 +8,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from afm_jax.contact.driven import Driven, Place
 from afm_jax.contact.phases import Phase
-from afm_jax.motion.contact_step import Touch, advance, fresh_touch
-from afm_jax.motion.driven import Driven, Place
-from afm_jax.motion.eighth_order import eighth_order_step
+from afm_jax.contact.step import Touch, advance, eighth_order_step, fresh_touch
 from afm_jax.stored_program import stored
 
 _BLOCK = 128

@@ -10,9 +10,9 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.contact.contact import Contact
+from afm_jax.contact.driven import Driven, Place, driven_by
 from afm_jax.contact.phases import Phase
 from afm_jax.motion.contact_path import contact_steps
-from afm_jax.motion.driven import Driven, Place, driven_by
 from afm_jax.motion.frames import to_gap
 from afm_jax.motion.record import ContactKind, Simulation, State
 

@@ -11,11 +11,11 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.contact.contact import Contact
+from afm_jax.contact.driven import Driven, driven_by
 from afm_jax.contact.junction import explain_missing_junction, find_junction
+from afm_jax.contact.settings import DrivenSetting, driven_setting_of
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.motion.contact_motion import Row, begin, follow
-from afm_jax.motion.contact_settings import DrivenSetting, setting_of
-from afm_jax.motion.driven import Driven, driven_by
 from afm_jax.motion.frames import to_gap, to_lab
 from afm_jax.motion.free_motion import follow_free
 from afm_jax.motion.law_motion import follow_law
@@ -87,7 +87,7 @@ def simulate(  # noqa: PLR0913
 
     elif isinstance(scene.interaction, Contact):
         _check_contact(scene, surface, response, begin_at)
-        setting = setting_of(accuracy, method)
+        setting = driven_setting_of(accuracy, method)
         if reverse:
             # the quick way tells by NaN that it does not hold, which reverse derivatives would spread
             setting = setting._replace(quick=None, trials=_TRIALS_BACKWARDS)

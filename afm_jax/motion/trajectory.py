@@ -16,10 +16,10 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface
 from afm_jax.contact.contact import Contact
+from afm_jax.contact.driven import Place
 from afm_jax.contact.junction import Junction
 from afm_jax.contact.phases import Phase, force_in_phase
 from afm_jax.motion.contact_path import places_at
-from afm_jax.motion.driven import Place
 from afm_jax.motion.frames import to_lab
 from afm_jax.motion.motion_pieces import FLIGHT, REST, Pieces, World, pieces_between
 from afm_jax.motion.record import Simulation, State

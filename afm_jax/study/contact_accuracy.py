@@ -13,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from afm_jax.contact.accuracy_settings import SETTINGS, Setting
 from afm_jax.contact.capture import capture_speed
 from afm_jax.contact.collide import batch_of
 from afm_jax.contact.collision import Collision, collision_of, go_through
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import find_junction
+from afm_jax.contact.settings import SETTINGS, Setting
 from afm_jax.study.adaptive_crossing import pass_adaptively, pass_in_time
 from afm_jax.study.contact_benchmark import COARSER_REFERENCE, REFERENCE, speeds_of
 from afm_jax.study.own_process import progress

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from afm_jax.contact.accuracy_settings import SETTINGS, Setting
 from afm_jax.contact.collide import batch_of, collide
 from afm_jax.contact.collision import Collision
 from afm_jax.contact.contact import EFFECTS, Contact
+from afm_jax.contact.settings import SETTINGS, Setting
 from afm_jax.study.own_process import progress
 from afm_jax.study.scipy_collision import scipy_collision
 from afm_jax.study.timing import compiled_for, time_compiled

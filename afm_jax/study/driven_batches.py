@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Array
 
 from afm_jax.apparatus.scene import Scene
+from afm_jax.contact.driven import Place, driven_by
+from afm_jax.contact.settings import DrivenSetting, QuickSetting
 from afm_jax.motion.contact_crossing import cross
-from afm_jax.motion.contact_settings import DrivenSetting, QuickSetting
-from afm_jax.motion.driven import Place, driven_by
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
 from afm_jax.motion.simulate import _contact
 

@@ -15,7 +15,7 @@ from jaxtyping import Array
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import surface_of
-from afm_jax.motion.contact_settings import SETTINGS, DrivenSetting, QuickSetting
+from afm_jax.contact.settings import DRIVEN_SETTINGS, DrivenSetting, QuickSetting
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
 from afm_jax.motion.simulate import _contact
 from afm_jax.presets import PRESETS, preset
@@ -74,7 +74,9 @@ def settings_of(
     """
     named = {f"level {level}": ("quick", quick_setting(level)) for level in quick}
     named |= {
-        f"accuracy {accuracy:g}": ("quick", setting) for accuracy, setting in SETTINGS.items() if accuracy in accuracies
+        f"accuracy {accuracy:g}": ("quick", setting)
+        for accuracy, setting in DRIVEN_SETTINGS.items()
+        if accuracy in accuracies
     }
     careful_ones = {f"fineness {fine:g}": ("careful", DrivenSetting(None, fine, _TRIALS)) for fine in careful}
     return named | careful_ones

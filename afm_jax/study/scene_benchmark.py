@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array
 
 from afm_jax.apparatus.scene import Scene
-from afm_jax.motion.contact_settings import SETTINGS, DrivenSetting
+from afm_jax.contact.settings import DRIVEN_SETTINGS, DrivenSetting
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
 from afm_jax.motion.simulate import simulate
 from afm_jax.presets import contact_scene
@@ -42,7 +42,7 @@ def scenes_one_core(
     repetitions: int,
     long_periods: int,
     scipy_contacts: int,
-    accuracies: Sequence[float] = tuple(SETTINGS),
+    accuracies: Sequence[float] = tuple(DRIVEN_SETTINGS),
 ) -> dict[str, Any]:
     """Measure everything of the benchmark of driven scenes; to be run in a process of its own.
 
@@ -63,7 +63,7 @@ def scenes_one_core(
     first = contact_scene(LOW_ORDER, DRIVE_AMPLITUDE_NM, 0.0)
     arguments = (first, spread_starts(first, batch), jnp.zeros(batch))
     runs = {}
-    for name, setting in [*((accuracy, SETTINGS[accuracy]) for accuracy in accuracies), *_REFERENCES.items()]:
+    for name, setting in [*((accuracy, DRIVEN_SETTINGS[accuracy]) for accuracy in accuracies), *_REFERENCES.items()]:
         progress(f"bench: scenes, compiling {name}")
         runs[name] = compiled_for(batch_run(setting, rows), *arguments)
     table, own = [], []

@@ -5,9 +5,7 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from afm_jax.contact.forces.capillary import Capillary
     from afm_jax.contact.forces.core_repulsion import CoreRepulsion
-    from afm_jax.contact.forces.dmt import Dmt
     from afm_jax.contact.forces.force import DissipativeForce, ForceSum, StaticForce
-    from afm_jax.contact.forces.hertz import Hertz
     from afm_jax.contact.forces.jkr import Jkr
     from afm_jax.contact.forces.liquid import Liquid
     from afm_jax.contact.forces.structural import Structural
@@ -20,9 +18,7 @@ else:
         "Capillary": "afm_jax.contact.forces.capillary",
         "CoreRepulsion": "afm_jax.contact.forces.core_repulsion",
         "DissipativeForce": "afm_jax.contact.forces.force",
-        "Dmt": "afm_jax.contact.forces.dmt",
         "ForceSum": "afm_jax.contact.forces.force",
-        "Hertz": "afm_jax.contact.forces.hertz",
         "Jkr": "afm_jax.contact.forces.jkr",
         "Liquid": "afm_jax.contact.forces.liquid",
         "StaticForce": "afm_jax.contact.forces.force",
@@ -42,9 +38,7 @@ __all__ = [
     "Capillary",
     "CoreRepulsion",
     "DissipativeForce",
-    "Dmt",
     "ForceSum",
-    "Hertz",
     "Jkr",
     "Liquid",
     "StaticForce",

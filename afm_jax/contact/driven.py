@@ -1,9 +1,10 @@
-"""Equation of motion of a driven tip in contact (eq. 16), in the gap and its rate, phase by phase.
+"""Equation of motion of a tip in contact (eq. 16), in the gap and its rate, phase by phase.
 
 With D = y - s(t), y the free cantilever's coordinate and s the surface it moves over, eq. 16 reads
 D'' = F(D, D')/m - Omega^2 D - (Omega/Q) D' + q(t), with q = -(s'' + (Omega/Q) s' + Omega^2 s) all that depends on time.
 Within a phase everything is smooth. In the junction s = sqrt(A) of the JKR contact takes the place of the gap, and
 fictitious time that of time, dt = (d Delta/ds) d theta: both stay smooth through the fold where the contact breaks.
+A free tip is one without Omega and q; its program has neither.
 """
 
 from typing import NamedTuple
@@ -34,18 +35,11 @@ class Place(NamedTuple):
     """Energy that the dissipative forces have taken since the contact began."""
 
 
-class Driven(NamedTuple):
-    """A tip over a moving surface, with everything computed once that does not depend on where it is."""
+class Drive(NamedTuple):
+    """What acts on the gap beside the contact: spring, air, and the motion of the surface."""
 
     cantilever: Cantilever
     surface: Platform | Surface
-    bridge: Bridge
-    junction: Junction
-    inverse_mass: Float[Array, "..."]
-    forms_nm: Float[Array, "..."]
-    breaks_nm: Float[Array, "..."]
-    load_scale_nn: Float[Array, "..."]
-    depth_scale_nm: Float[Array, "..."]
     mean_push: tuple[Float[Array, "..."], Float[Array, "..."]]
     """q(t) of the offset and its ramp, and its rate."""
     waves: tuple[Wave, ...]
@@ -60,11 +54,49 @@ class Driven(NamedTuple):
             push = push + wave.cosine * cosine + wave.sine * sine
         return push
 
+
+class Driven(NamedTuple):
+    """A tip in contact, with everything computed once that does not depend on where it is."""
+
+    bridge: Bridge
+    junction: Junction
+    mass_ng: Float[Array, "..."]
+    inverse_mass: Float[Array, "..."]
+    forms_nm: Float[Array, "..."]
+    breaks_nm: Float[Array, "..."]
+    load_scale_nn: Float[Array, "..."]
+    depth_scale_nm: Float[Array, "..."]
+    drive: Drive | None
+    """None: a free tip over a sample at rest."""
+
+    @property
+    def cantilever(self) -> Cantilever:
+        """The cantilever of a tip that has one."""
+        return self._driven_by().cantilever
+
+    @property
+    def surface(self) -> Platform | Surface:
+        """The surface that a driven tip moves over."""
+        return self._driven_by().surface
+
+    def _driven_by(self) -> Drive:
+        if self.drive is None:
+            raise TypeError("a free tip has neither cantilever nor surface")
+        return self.drive
+
     def acceleration(
         self, gap: Float[Array, "..."], rate: Float[Array, "..."], time_us: Float[Array, "..."], force: Array
     ):
         """Return D'' in nm/us^2 under a contact force in nN."""
-        return force * self.inverse_mass + self.cantilever.acceleration(gap, rate) + self.push(time_us)
+        if self.drive is None:
+            return force * self.inverse_mass
+        return force * self.inverse_mass + self.drive.cantilever.acceleration(gap, rate) + self.drive.push(time_us)
+
+    def potential(self, gap: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return the potential energy in aJ at a gap in nm in the bridge, that of the spring included."""
+        if self.drive is None:
+            return self.bridge.potential(gap)
+        return self.bridge.potential(gap) + 0.5 * self.drive.cantilever.stiffness_n_per_m * gap * gap
 
     def gap_of_root(self, s: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return the gap in nm at s = sqrt(A)."""
@@ -102,7 +134,6 @@ class Driven(NamedTuple):
 
 def driven_by(contact: Contact, cantilever: Cantilever, surface: Platform | Surface) -> Driven:
     """Return the equation of motion of a contact scene."""
-    solid = contact.junction
     omega, friction = cantilever.angular_frequency, 2.0 * cantilever.decay_rate
     square = omega * omega
     # of c cos + s sin: -(z'' + 2 gamma z' + Omega^2 z)
@@ -115,18 +146,24 @@ def driven_by(contact: Contact, cantilever: Cantilever, surface: Platform | Surf
         for wave in _waves_of(surface)
     )
     ramp = surface.offset_rate_nm_per_us
+    mean_push = (-square * surface.offset_nm - friction * ramp, -square * ramp)
+    free = free_tip(contact, find_junction(contact), cantilever.mass_ng)
+    return free._replace(drive=Drive(cantilever, surface, mean_push, waves))
+
+
+def free_tip(contact: Contact, junction: Junction, mass_ng: Float[Array, "..."]) -> Driven:
+    """Return the equation of motion of a free tip that meets a sample at rest."""
+    solid = contact.junction
     return Driven(
-        mean_push=(-square * surface.offset_nm - friction * ramp, -square * ramp),
-        waves=waves,
-        cantilever=cantilever,
-        surface=surface,
         bridge=bridge_of(contact),
-        junction=find_junction(contact),
-        inverse_mass=1.0 / cantilever.mass_ng,
+        junction=junction,
+        mass_ng=mass_ng,
+        inverse_mass=1.0 / mass_ng,
         forms_nm=contact.bridge_forms_nm,
         breaks_nm=contact.bridge_breaks_nm,
         load_scale_nn=solid.load_scale_nn,
         depth_scale_nm=solid.depth_scale_nm,
+        drive=None,
     )
 
 

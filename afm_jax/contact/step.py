@@ -1,31 +1,35 @@
-"""One trial step of a tip in contact: frozen phase, thresholds met exactly, turning points not passed over.
+"""Steps in time of a tip in contact: frozen phase, thresholds met exactly, turning points not passed over.
 
-A trial is one step of Dormand and Prince's method of order 8. A trial that ends within the phase is taken. One that
-passes a threshold, or the end of the simulation, is not: its cubic says where to try again, until a trial ends so close
-to the threshold that a first-order correction of its length lands on it to rounding. Step lengths follow from the place
-alone (no error control), so that results are smooth in every parameter; the correction carries the derivative of the
-time at which the threshold is met.
+A trial is one step of Dormand and Prince's method of order 8, Diffrax's own or a leaner one with the same coefficients.
+A trial that ends within the phase is taken. One that passes a threshold, or the end of the simulation, is not: its
+cubic says where to try again, until a trial ends so close to the threshold that a first-order correction of its length
+lands on it to rounding. Step lengths follow from the place alone (no error control), so that results are smooth in
+every parameter; the correction carries the derivative of the time at which the threshold is met.
 """
 
 from collections.abc import Callable
+from functools import cache
 from typing import NamedTuple
 
+import diffrax
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from afm_jax.contact.driven import Driven, Place
 from afm_jax.contact.forces import jkr
 from afm_jax.contact.phases import Phase
-from afm_jax.motion.contact_pace import bridge_pace, junction_pace
-from afm_jax.motion.driven import Driven, Place
-from afm_jax.motion.eighth_order import diffrax_step, eighth_order_step
-from afm_jax.motion.hermite import crossing_share, turning_point
 
 _NEAR = 1e-7
 """Share of a threshold from which on the first-order correction is exact to rounding."""
 _SHORTEST = 1e-3
 """Bounds of the share of a failed trial at which the next is tried: this, and 1 less a tenth of it."""
+_SHARE = 0.4
+"""Share of the gap where the junction forms: there the core's force varies in a fraction of the gap, 1 - this."""
+_FROM_REST = 0.5
+_CUBIC_STEPS = 4
 
 
 class Touch(NamedTuple):
@@ -170,14 +174,14 @@ def _where_next(trial: Trial, at_turn: Bool[Array, "..."], until_us: Float[Array
     beyond_high = above & (end.x - high > _NEAR * high)
     beyond_time = late & (end.time_us - until > _NEAR * length * jnp.maximum(slopes.time_us, 1e-3))
     level = jnp.where(below, low, jnp.where(above, high, 0.0))
-    in_x = crossing_share(start.x - level, rates.x * length, end.x - level, slopes.x * length)
-    in_time = crossing_share(
+    in_x = _crossing_share(start.x - level, rates.x * length, end.x - level, slopes.x * length)
+    in_time = _crossing_share(
         start.time_us - until, rates.time_us * length, end.time_us - until, slopes.time_us * length
     )
     shares = jnp.minimum(jnp.where(beyond_low | beyond_high, in_x, 1.0), jnp.where(beyond_time, in_time, 1.0))
     missed = beyond_low | beyond_high | beyond_time
     turns = (rates.x * slopes.x < 0.0) & ~at_turn & ~missed & ~(below | above | late)
-    turn, extremum = turning_point(start.x, rates.x * length, end.x, slopes.x * length)
+    turn, extremum = _turning_point(start.x, rates.x * length, end.x, slopes.x * length)
     hidden = turns & ((extremum <= low) | (extremum >= high))
     again = length * jnp.clip(shares, _SHORTEST, 1.0 - 0.1 * _SHORTEST)
     again = jnp.where(hidden, -length * jnp.clip(turn, _SHORTEST, 1.0 - 0.1 * _SHORTEST), again)
@@ -212,10 +216,129 @@ def _deepest(driven: Driven, trial: Trial, solid: Bool[Array, "..."]) -> Float[A
     """Return the smallest gap of a trial: at its ends, or where its cubic turns."""
     length = trial.length
     turns = (trial.start.gap_rate < 0.0) & (trial.end.gap_rate > 0.0)
-    _, extremum = turning_point(trial.start.x, trial.start_rates.x * length, trial.end.x, trial.end_rates.x * length)
+    _, extremum = _turning_point(trial.start.x, trial.start_rates.x * length, trial.end.x, trial.end_rates.x * length)
     x = jnp.where(turns, extremum, trial.end.x)
     return jnp.where(solid, driven.gap_of_root(jnp.where(solid, x, 1.0)), x)
 
 
 def _pick(condition: Bool[Array, "..."], first: Place, second: Place) -> Place:
     return Place(*(jnp.where(condition, one, other) for one, other in zip(first, second, strict=True)))
+
+
+def bridge_pace(driven: Driven, place: Place, acceleration: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the pace of a tip in the bridge in 1/us: the inverse of a step.
+
+    The root of the local stiffness over the mass, the speed over the distance in which the forces change, the root of
+    the acceleration over it, and the frequencies of cantilever and drive, in squares.
+
+    Args:
+        driven: the equation of motion.
+        place: where the tip is.
+        acceleration: of the gap there, in nm/us^2.
+    """
+    nearest = driven.junction.forms_gap_nm
+    gap = jnp.maximum(place.x, 0.3 * nearest)
+    stiffness = jnp.abs(driven.bridge.stiffness(gap)) * driven.inverse_mass
+    distance = jnp.maximum(gap - _SHARE * nearest, 0.3 * nearest)
+    moving = (place.gap_rate / distance) ** 2 + _FROM_REST * jnp.abs(acceleration) / distance
+    return jnp.sqrt(stiffness + moving + _drive_pace(driven) ** 2)
+
+
+def junction_pace(driven: Driven, place: Place) -> Float[Array, "..."]:
+    """Return the pace of a tip in the junction per unit of fictitious time, from the same three."""
+    s = place.x
+    cube = s**3
+    curvature = s * s * (cube * (36.0 * cube - 42.0 * jkr.SLOPE) + 12.0)
+    # where the curvature vanishes, at s = 1.196, its terms still tell how fast it comes back
+    bent = jnp.maximum(jnp.abs(curvature), 0.3 * s * s * (36.0 * cube * cube + 12.0))
+    elastic = bent * driven.load_scale_nn * driven.inverse_mass / driven.depth_scale_nm
+    passing = 3.0 * place.gap_rate / (driven.depth_scale_nm * s)
+    return 0.8 * jnp.sqrt(elastic + passing**2 + (_drive_pace(driven) * jkr.depth_slope(s)) ** 2)
+
+
+def _drive_pace(driven: Driven) -> Array:
+    if driven.drive is None:
+        return jnp.zeros_like(driven.inverse_mass)
+    return driven.cantilever.angular_frequency + driven.surface.fastest_angular_frequency
+
+
+def eighth_order_step(rates: Callable[[Place], Place], begin: Place, length: Float[Array, "..."]) -> Place:
+    """Return the place after a step, without an error estimate.
+
+    The stages are one small loop over one array, which costs less than half of a general solver's step and hardly
+    grows with the number of tips up to a few dozen.
+
+    Args:
+        rates: rates of a place, which do not depend on time but by the place.
+        begin: the place at the beginning; arrays of one shape.
+        length: of the step.
+    """
+    rows, weights = (jnp.asarray(part, begin.x.dtype) for part in _coefficients())
+    start = jnp.stack(begin)
+
+    def stage(number, slopes):
+        row = lax.dynamic_index_in_dim(rows, number, keepdims=False)
+        place = start + length * jnp.tensordot(row, slopes, axes=1)
+        return slopes.at[number].set(jnp.stack(rates(Place(*place))))
+
+    slopes = lax.fori_loop(0, len(weights), stage, jnp.zeros((len(weights), *start.shape), start.dtype))
+    return Place(*(start + length * jnp.tensordot(weights, slopes, axes=1)))
+
+
+def diffrax_step(rates: Callable[[Place], Place], begin: Place, length: Float[Array, "..."]) -> Place:
+    """Return the place after a step of Diffrax's own solver; arguments as of `eighth_order_step`."""
+    solver = diffrax.Dopri8(scan_kind="lax")
+
+    def field(share, place, args):
+        del share, args
+        return Place(*(length * rate for rate in rates(place)))
+
+    term = diffrax.ODETerm(field)
+    zero, one = jnp.zeros((), begin.x.dtype), jnp.ones((), begin.x.dtype)
+    memory = solver.init(term, zero, one, begin, None)
+    return solver.step(term, zero, one, begin, None, memory, made_jump=False)[0]
+
+
+@cache
+def _coefficients() -> tuple[np.ndarray, np.ndarray]:
+    """Return the matrix of the stages, and the weights; the tableau's last stage is the next step's first."""
+    tableau = diffrax.Dopri8.tableau
+    weights = np.asarray(tableau.b_sol)[:-1]
+    rows = np.zeros((len(weights), len(weights)))
+    for number, row in enumerate(tableau.a_lower[:-1]):
+        rows[number + 1, : number + 1] = row
+    return rows, weights
+
+
+def _crossing_share(start: Array, start_slope: Array, end: Array, end_slope: Array) -> Float[Array, "..."]:
+    """Return the share of a step at which its cubic (values and slopes at both ends) vanishes, between two signs.
+
+    Args:
+        start: value at the start.
+        start_slope: slope there, times the length of the step.
+        end: value at the end, of the other sign.
+        end_slope: slope there, times the length of the step.
+    """
+    bend = 3.0 * (end - start) - 2.0 * start_slope - end_slope
+    twist = 2.0 * (start - end) + start_slope + end_slope
+    share = start / jnp.where(start == end, 1.0, start - end)
+    # written out: a few steps of Newton's method cost less than a loop, and a miss is only tried again
+    for _ in range(_CUBIC_STEPS):
+        value = start + share * (start_slope + share * (bend + share * twist))
+        slope = start_slope + share * (2.0 * bend + 3.0 * share * twist)
+        share = jnp.clip(share - value / jnp.where(slope == 0.0, 1.0, slope), 0.0, 1.0)
+    return share
+
+
+def _turning_point(start: Array, start_slope: Array, end: Array, end_slope: Array) -> tuple[Array, Array]:
+    """Return share and value of the extremum of a step's cubic whose slope changes sign; arguments as above."""
+    bend = 3.0 * (end - start) - 2.0 * start_slope - end_slope
+    twist = 2.0 * (start - end) + start_slope + end_slope
+    # 3 twist x^2 + 2 bend x + start_slope = 0, the root between 0 and 1 in the form that does not cancel
+    square = bend * bend - 3.0 * twist * start_slope
+    real = square > 0.0
+    root = jnp.where(real, jnp.sqrt(jnp.where(real, square, 1.0)), 0.0)
+    below = jnp.where(start_slope > 0.0, root, -root) - bend
+    share = start_slope / jnp.where(below == 0.0, 1.0, below)
+    share = jnp.clip(share, 0.0, 1.0)
+    return share, start + share * (start_slope + share * (bend + share * twist))

@@ -1,0 +1,467 @@
+"""The way through the liquid bridge, with the gap as independent variable: of free tips and of driven ones.
+
+Where the bridge is crossed monotonically the gap D can replace time. With the kinetic energy K = m w^2/2, w the gap's
+rate, and the potential U of the static forces and the spring, K + U + S is the energy at the start. The static forces,
+which vary most, thereby leave the equation, and only what is spent is integrated,
+
+    dS/dD = (damping(D) + m Omega/Q) w - m q(t),    dt/dD = 1/w,
+
+q the push of the surface's motion (`Drive`). A free tip has neither Omega nor q. The gap is a function of the share of
+the way that takes the square roots out of w at its ends (`Exit`, `Turning`). Two integrators follow the share: sweeps
+over Gauss nodes (speeds from what is spent, times from the speeds, what is spent from both), and Diffrax's steps.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.driven import Driven, Place, free_tip
+from afm_jax.contact.junction import Junction
+from afm_jax.contact.leg import Leg, gauss_nodes, nodes_along, settled
+from afm_jax.contact.settings import QuickSetting, Setting
+
+_NEAREST = 1e-14
+"""Lower bound of b: at 0 speed and square root would vanish together."""
+GRADING = 1.6
+"""Steps towards the inner end shrink on the way in, where the core repulsion rises as the 8th power."""
+_SLOWEST = 0.01
+"""Share of K at the start below which no sweep lets it fall; a driven tip that gets slower is not for the quick way."""
+_WRITTEN_OUT = 5
+"""So many sweeps are written out in the program; more are a loop."""
+_TURN_NODES, _TURN_SWEEPS = 48, 12
+_TURN_ROUNDS = 2
+_SCAN = 256
+
+
+class Exit(NamedTuple):
+    """D = scale exp(-y^2), y linear in the share: takes the square root out where the tip is slow at the outer end.
+
+    The scale is exp(b) times the outer gap; b is the distance in ln D of the turning point that a slow tip would have
+    beyond that end, at most 1.
+    """
+
+    scale_nm: Float[Array, "..."]
+    start_y: Float[Array, "..."]
+    length: Float[Array, "..."]
+    sense: float
+
+    def at(self, share: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Return the gap, and the path |dD| per share."""
+        y = self.start_y + self.sense * (self.length * share)
+        gap = self.scale_nm * jnp.exp(-y * y)
+        return gap, 2.0 * self.length * y * gap
+
+
+class Turning(NamedTuple):
+    """ln D from start to end as sin^2(pi share/2): takes the square roots out of the speed at both ends."""
+
+    start_nm: Float[Array, "..."]
+    end_nm: Float[Array, "..."]
+
+    def at(self, share: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Return the gap, and the path |dD| per share."""
+        width = jnp.log(self.end_nm / self.start_nm)
+        gap = self.start_nm * jnp.exp(width * jnp.sin(0.5 * jnp.pi * share) ** 2)
+        return gap, jnp.abs(width) * 0.5 * jnp.pi * jnp.sin(jnp.pi * share) * gap
+
+
+class Passage(NamedTuple):
+    """What a way through the bridge ends with."""
+
+    energy_aj: Float[Array, "..."]
+    """Kinetic energy at the end, signed: negative by what is missing where the tip does not get there."""
+    time_us: Float[Array, "..."]
+    """Time taken; meaningless where the energy is not positive."""
+    dissipated_aj: Float[Array, "..."]
+    """Energy that the dissipative forces took."""
+
+
+class Along(NamedTuple):
+    """Places along a way."""
+
+    gap_nm: Float[Array, "..."]
+    path_nm: Float[Array, "..."]
+    """Per share of the way."""
+    drag: Float[Array, "..."]
+    """Path times damping."""
+    available_aj: Float[Array, "..."]
+    """The kinetic energy if nothing had been spent."""
+
+
+class Way(NamedTuple):
+    """A way through the bridge; made by `way_through`."""
+
+    tip: Driven
+    sense: float
+    """+1 on the way in, -1 on the way out."""
+    begin_us: Float[Array, "..."]
+    total_aj: Float[Array, "..."]
+    """Energy at the start, kinetic and potential."""
+    end_potential_aj: Float[Array, "..."]
+    course: Exit | Turning
+    slowest_aj: Float[Array, "..."] | None = None
+    """Kinetic energies below count as this much; None: a tip without any has stopped, and nothing goes on."""
+
+    @property
+    def inward(self) -> bool:
+        """Whether the tip approaches."""
+        return self.sense > 0.0
+
+    @property
+    def quiet(self) -> bool:
+        """Whether nothing is spent along the way."""
+        return self.tip.drive is None and self.tip.bridge.conserves
+
+    def along(self, share: Float[Array, "..."]) -> Along:
+        """Return the places at shares of the way."""
+        gap, path = self.course.at(share)
+        drag = jnp.zeros_like(path) if self.tip.bridge.conserves else path * self.tip.bridge.damping(gap)
+        return Along(gap, path, drag, self.total_aj - self.tip.potential(gap))
+
+    def pace(
+        self, path: Float[Array, "..."], kinetic: Float[Array, "..."]
+    ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Return the speed, and the time per share; both 0 where the tip is stopped."""
+        twice_inverse_mass = 2.0 * self.tip.inverse_mass
+        if self.slowest_aj is not None:
+            speed = jnp.sqrt(twice_inverse_mass * jnp.maximum(kinetic, self.slowest_aj))
+            return speed, path / speed
+        moving = kinetic > 0.0
+        speed = jnp.sqrt(jnp.where(moving, kinetic * twice_inverse_mass, 1.0))
+        return jnp.where(moving, speed, 0.0), jnp.where(moving, path / speed, 0.0)
+
+    def spending(self, at: Along, speed: Float[Array, "..."], lasted_us: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return the kinetic energy spent per share, at times since the start."""
+        drive, lost = self.tip.drive, at.drag * speed
+        if drive is None:
+            return lost
+        friction, push = 2.0 * drive.cantilever.decay_rate, drive.push(self.begin_us + lasted_us)
+        return lost + self.tip.mass_ng * at.path_nm * (friction * speed + self.sense * push)
+
+    def end(
+        self, spent: Float[Array, "..."], time: Float[Array, "..."], dissipated: Float[Array, "..."] | None = None
+    ) -> Passage:
+        """Return the passage that spends so much and takes so long; what is spent is dissipated, if not said."""
+        return Passage(self.total_aj - self.end_potential_aj - spent, time, spent if dissipated is None else dissipated)
+
+
+def way_through(
+    tip: Driven,
+    gaps_nm: tuple[Float[Array, "..."], Float[Array, "..."]],
+    start_energy_aj: Float[Array, "..."],
+    margin: Float[Array, "..."],
+    *,
+    inward: bool,
+    begin_us: Float[Array, "..."] | float = 0.0,
+) -> Way:
+    """Return a way through the bridge.
+
+    Args:
+        tip: the tip.
+        gaps_nm: the outer and the inner gap, whatever the direction.
+        start_energy_aj: kinetic energy at the start.
+        margin: b, how far beyond the outer end the speed would vanish, in ln D.
+        inward: whether the tip goes from the outer to the inner gap.
+        begin_us: time at the start.
+    """
+    outer, inner = gaps_nm
+    at_outer, at_inner = jnp.sqrt(margin), jnp.sqrt(margin + jnp.log(outer / inner))
+    potentials = tip.potential(outer), tip.potential(inner)
+    start, end = potentials if inward else potentials[::-1]
+    sense = 1.0 if inward else -1.0
+    course = Exit(outer * jnp.exp(margin), at_outer if inward else at_inner, at_inner - at_outer, sense)
+    total = start_energy_aj + start
+    return Way(tip, sense, jnp.asarray(begin_us, total.dtype), total, end, course)
+
+
+def margin_of(energy: Float[Array, "..."], pull: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return b for a kinetic energy at the outer end: energy over pull times gap there, between 0 and 1."""
+    near = energy < pull
+    return jnp.where(near, jnp.maximum(energy, _NEAREST * pull) / jnp.where(near, pull, 1.0), 1.0)
+
+
+class Swept(NamedTuple):
+    """A way by sweeps: its end, and what it is at the Gauss nodes; of these what nobody reads is not computed."""
+
+    passage: Passage
+    at: Along
+    kinetic_aj: Float[Array, "nodes ..."]
+    speed: Float[Array, "nodes ..."]
+    pace: Float[Array, "nodes ..."]
+    """Time per share."""
+    lasted_us: Float[Array, "nodes ..."]
+    """Time from the start."""
+    change_aj: Float[Array, "nodes ..."]
+    """Of what is spent, in the last sweep."""
+    end_change_aj: Float[Array, "..."]
+    """The same at the end."""
+
+
+def sweep(way: Way, nodes: int, sweeps: int) -> Swept:
+    """Return a way from the values at Gauss nodes, improved in sweeps.
+
+    Args:
+        way: the way.
+        nodes: number of Gauss nodes.
+        sweeps: how often what is spent is recomputed from the speeds that it leaves.
+    """
+    points, weights, cumulative = nodes_along(nodes, way.total_aj)
+    at, drive = way.along(points), way.tip.drive
+
+    def again(_, state):
+        spent, _, _ = state
+        speed, pace = way.pace(at.path_nm, at.available_aj - spent)
+        spending = way.spending(at, speed, jnp.tensordot(cumulative, pace, axes=1))
+        return jnp.tensordot(cumulative, spending, axes=1), spent, spending
+
+    guess = jnp.zeros_like(at.available_aj)
+    if drive is not None:
+        # a push that stays as it is
+        start_nm = way.course.at(jnp.zeros_like(way.total_aj))[0]
+        guess = guess - way.tip.mass_ng * drive.push(way.begin_us) * (at.gap_nm - start_nm)
+    spent, before, spending = _repeated(again, (guess, guess, guess), 0 if way.quiet else sweeps)
+    kinetic = at.available_aj - spent
+    speed, pace = way.pace(at.path_nm, kinetic)
+    lost = at.drag * speed
+    ends = [jnp.tensordot(weights, part, axes=1) for part in (lost, pace, spending)]
+    return Swept(
+        # the push at the nodes costs more than another sweep's digits of the end are worth
+        passage=way.end(ends[0], ends[1]) if drive is None else way.end(ends[2], ends[1], ends[0]),
+        at=at,
+        kinetic_aj=kinetic,
+        speed=speed,
+        pace=pace,
+        lasted_us=jnp.tensordot(cumulative, pace, axes=1),
+        change_aj=jnp.abs(spent - before),
+        end_change_aj=jnp.abs(ends[0] - ends[2]),
+    )
+
+
+def _repeated(step: Callable[[Any, Any], Any], state: Any, count: int) -> Any:
+    if count > _WRITTEN_OUT:
+        return lax.fori_loop(0, count, step, state)
+    for number in range(count):
+        state = step(number, state)
+    return state
+
+
+def pass_by_collocation(way: Way, nodes: int, sweeps: int) -> Passage:
+    """Return the passage by sweeps over Gauss nodes; where nothing is spent, by one quadrature of the time."""
+    if not way.quiet:
+        return sweep(way, nodes, sweeps).passage
+    points, weights, _ = gauss_nodes(nodes)
+
+    # the nodes in a loop of one small body
+    def add(total, node):
+        at = way.along(node[0])
+        return total + node[1] * way.pace(at.path_nm, at.available_aj)[1], None
+
+    nothing = jnp.zeros_like(way.total_aj)
+    pairs = jnp.asarray(np.stack([points, weights], axis=1), nothing.dtype)
+    return way.end(nothing, lax.scan(add, nothing, pairs)[0])
+
+
+def pass_in_steps(way: Way, steps: int, solver: diffrax.AbstractERK | None = None) -> Passage:
+    """Return the passage after a fixed number of Diffrax's Runge-Kutta steps; differentiable forward and reverse.
+
+    Args:
+        way: the way.
+        steps: number of steps.
+        solver: a Diffrax solver; Dopri8 if None. Its `scan_kind` must be "bounded" to be differentiable both ways.
+    """
+    chosen = diffrax.Dopri8(scan_kind="bounded") if solver is None else solver
+    term = diffrax.ODETerm(lambda share, state, _: way_rates(way, share, state))
+
+    # The share of the way is the time of the solver, one for all tips: a batch is an axis of the state, which costs
+    # less than a batch of solvers.
+    def step(carried, ends):
+        state, memory = carried
+        after, _, _, memory, _ = chosen.step(term, ends[0], ends[1], state, None, memory, made_jump=False)
+        return (after, memory), None
+
+    fractions = np.linspace(0.0, 1.0, steps + 1)
+    if way.inward:
+        fractions = 1.0 - (1.0 - fractions) ** GRADING
+    begin = nothing_spent(way)
+    ends = jnp.asarray(np.stack([fractions[:-1], fractions[1:]], axis=1), begin[0].dtype)
+    memory = chosen.init(term, ends[0, 0], ends[0, 1], begin, None)
+    (state, _), _ = lax.scan(step, (begin, memory), ends)
+    return way.end(*state)
+
+
+def nothing_spent(way: Way) -> tuple[Float[Array, "..."], ...]:
+    """Return the state of `way_rates` at the start of a way."""
+    return (jnp.zeros_like(way.total_aj),) * (2 if way.tip.drive is None else 3)
+
+
+def way_rates(way: Way, share: Any, state: tuple[Float[Array, "..."], ...]) -> tuple[Float[Array, "..."], ...]:
+    """Return the rates per share of a state of kinetic energy spent, time, and (of a driven tip) energy dissipated."""
+    at = way.along(share)
+    speed, pace = way.pace(at.path_nm, at.available_aj - state[0])
+    spending = way.spending(at, speed, state[1])
+    return (spending, pace) if way.tip.drive is None else (spending, pace, at.drag * speed)
+
+
+def pass_bridge(way: Way, setting: Setting) -> Passage:
+    """Return the passage by the integrator of a setting."""
+    size = setting.inward if way.inward else setting.outward
+    if way.quiet:
+        return pass_by_collocation(way, max(size, setting.junction_nodes), 0)
+    if setting.rule == "collocation":
+        return pass_by_collocation(way, size, setting.sweeps)
+    return pass_in_steps(way, size, getattr(diffrax, setting.solver)(scan_kind="bounded"))
+
+
+def go_in(driven: Driven, place: Place, setting: QuickSetting) -> Leg:
+    """Return a tip where the junction forms, from a place in the bridge with the gap closing; x is s at the end."""
+    gaps = place.x, driven.junction.forms_gap_nm
+    leg = _cross(driven, gaps, place, setting, setting.inward, inward=True)
+    root = driven.junction.forms_root + jnp.zeros_like(place.x)
+    return leg._replace(place=leg.place._replace(x=root), holds=leg.holds & (place.gap_rate < 0.0))
+
+
+def go_out(driven: Driven, place: Place, setting: QuickSetting) -> Leg:
+    """Return a tip where the bridge breaks, from where the junction has broken with the gap opening."""
+    gaps = driven.breaks_nm, driven.junction.breaks_gap_nm
+    leg = _cross(driven, gaps, place, setting, setting.outward, inward=False)
+    return leg._replace(holds=leg.holds & (place.gap_rate > 0.0) & (gaps[1] < gaps[0]))
+
+
+def driven_way(driven: Driven, gaps: tuple[Array, Array], place: Place, *, inward: bool) -> Way:
+    """Return the way of a tip from a place at the outer (`inward`) or at the inner one of two gaps."""
+    outer, inner = gaps
+    start = 0.5 * driven.mass_ng * place.gap_rate**2
+    at_outer = start
+    if not inward:
+        at_outer = start + driven.potential(inner) - driven.potential(outer)
+        if driven.drive is not None:
+            at_outer = at_outer + driven.mass_ng * driven.drive.push(place.time_us) * (outer - inner)
+    pull = -driven.bridge.force(outer) * outer
+    margin = lax.stop_gradient(margin_of(jnp.maximum(at_outer, 0.01 * pull), jnp.maximum(pull, 1e-30)))
+    return way_through(driven, gaps, start, margin, inward=inward, begin_us=place.time_us)
+
+
+def _cross(
+    driven: Driven, gaps: tuple[Array, Array], place: Place, setting: QuickSetting, nodes: int, *, inward: bool
+) -> Leg:
+    slowest = _SLOWEST * 0.5 * driven.mass_ng * place.gap_rate**2
+    way = driven_way(driven, gaps, place, inward=inward)._replace(slowest_aj=slowest)
+    swept = sweep(way, nodes, setting.sweeps)
+    end = swept.passage
+    leaving = jnp.sqrt(2.0 * driven.inverse_mass * end.energy_aj)
+    holds = settled(swept.change_aj / swept.kinetic_aj, swept.pace, end.time_us, setting)
+    return Leg(
+        place=Place(
+            x=(gaps[1] if inward else gaps[0]) + jnp.zeros_like(leaving),
+            gap_rate=-leaving if inward else leaving,
+            time_us=place.time_us + end.time_us,
+            viscous_loss_aj=place.viscous_loss_aj + end.dissipated_aj,
+        ),
+        deepest_gap_nm=gaps[1] + jnp.zeros_like(leaving),
+        holds=holds & jnp.all(swept.kinetic_aj > slowest, axis=0) & (leaving > 0.0),
+    )
+
+
+class Turn(NamedTuple):
+    """What an impact ends with that the bridge turns round before the junction forms: its repulsion stops a slow tip.
+
+    The turning gap is where the energy that is left equals the potential.
+    """
+
+    turns: Bool[Array, "..."]
+    """Whether the tip turns before it reaches the gap where the junction forms."""
+    gap_nm: Float[Array, "..."]
+    energy_aj: Float[Array, "..."]
+    """Kinetic energy where the bridge breaks, signed."""
+    dissipated_aj: Float[Array, "..."]
+    time_us: Float[Array, "..."]
+    """From the formation of the bridge to its breaking."""
+    settled: Bool[Array, "..."]
+    """Whether the sweeps for the dissipated energy settled."""
+
+
+def turn_in_bridge(
+    contact: Contact,
+    junction: Junction,
+    approach_speed: Float[Array, "..."],
+    mass: Float[Array, "..."],
+    spent: Float[Array, "..."],
+) -> Turn:
+    """Return the impact of a free tip that turns in the bridge.
+
+    Args:
+        contact: the contact.
+        junction: where the tip would form it.
+        approach_speed: in nm/us.
+        mass: in ng.
+        spent: energy dissipated on the way in, estimated, in aJ.
+    """
+    tip = free_tip(contact, junction, mass)
+    total = 0.5 * mass * approach_speed**2 + tip.potential(tip.forms_nm)
+    gap, turns = _turning_gap(tip, total - spent)
+    for _ in range(_TURN_ROUNDS):
+        gap, turns = _turning_gap(tip, total - _to_or_from(tip, (tip.forms_nm, gap), total)[0].dissipated_aj)
+    inward, settled_in = _to_or_from(tip, (tip.forms_nm, gap), total)
+    outward, settled_out = _to_or_from(tip, (gap, tip.breaks_nm), tip.potential(gap))
+    return Turn(
+        turns=turns,
+        gap_nm=gap,
+        energy_aj=outward.energy_aj,
+        dissipated_aj=inward.dissipated_aj + outward.dissipated_aj,
+        time_us=inward.time_us + outward.time_us,
+        settled=settled_in & settled_out,
+    )
+
+
+def _to_or_from(
+    tip: Driven, gaps: tuple[Float[Array, "..."], Float[Array, "..."]], level: Float[Array, "..."]
+) -> tuple[Passage, Bool[Array, "..."]]:
+    """Return the passage between two gaps one of which is the turning point, and whether its sweeps settled.
+
+    Args:
+        tip: a free tip.
+        gaps: where it starts and where it ends.
+        level: its energy at the start, kinetic and potential.
+    """
+    way = Way(tip, 1.0, jnp.zeros_like(level), level, tip.potential(gaps[1]), Turning(*gaps))
+    swept = sweep(way, _TURN_NODES, _TURN_SWEEPS)
+    lost = swept.passage.dissipated_aj
+    return swept.passage, swept.end_change_aj <= 1e-9 * (jnp.abs(level) + jnp.abs(lost)) + 1e-12
+
+
+def _turning_gap(tip: Driven, level: Float[Array, "..."]) -> tuple[Float[Array, "..."], Bool[Array, "..."]]:
+    """Return the largest gap at which the potential rises to a level, and whether there is one."""
+    outer, inner = tip.forms_nm, tip.junction.forms_gap_nm
+    fixed, known = lax.stop_gradient((tip, level))
+
+    def missing(log_gap, model=fixed, value=known):
+        return model.potential(jnp.exp(log_gap)) - value
+
+    points = lax.stop_gradient(
+        jnp.log(outer) + jnp.log(inner / outer) * jnp.linspace(0.0, 1.0, _SCAN, dtype=level.dtype)
+    )
+    potential = fixed.potential(jnp.exp(points))
+    # only repulsion stops a tip, so that it turns closer to the sample than where the potential is least
+    beyond = jnp.arange(_SCAN) > jnp.argmin(potential)
+    stopped = beyond & (potential >= known)
+    first = jnp.maximum(jnp.argmax(stopped), 1)
+
+    def halve(_, ends):
+        middle = 0.5 * (ends[0] + ends[1])
+        inside = missing(middle) >= 0.0
+        return jnp.where(inside, ends[0], middle), jnp.where(inside, middle, ends[1])
+
+    _, point = lax.fori_loop(0, 60, halve, (points[first - 1], points[first]))
+    # two Newton steps carry first and second derivatives
+    for _ in range(2):
+        slope = jax.grad(lambda at: missing(at, tip, level))(point)
+        steep = slope != 0.0
+        point = point - jnp.where(steep, missing(point, tip, level) / jnp.where(steep, slope, 1.0), 0.0)
+    return jnp.exp(point), stopped.any()

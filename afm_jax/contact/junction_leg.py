@@ -1,0 +1,264 @@
+"""The way through the junction, to its turning point and from there to the fold where it breaks: free tips and driven.
+
+In s = sqrt(A) the JKR potential is a polynomial and the fold, where the contact breaks, is smooth. With s = turn - y^2,
+w^2 = y^2 (unit mean(work') + 2 scale mean(depth') g), where mean(f') is the mean slope from s to the turning point and
+g the mean over that depth of what accelerates the gap beside the contact: drive, spring and air. Both square roots at
+the turning point are thereby gone. The means of g, which varies little, are improved in sweeps.
+
+For a free tip g = 0 and the junction conserves energy: the turning point is a root of the polynomial, and the times are
+quadratures. A free tip that hardly gets away is slow at the fold; from there s = s_fold + sigma sinh(q).
+"""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from afm_jax.contact.driven import Driven, Place
+from afm_jax.contact.forces import jkr
+from afm_jax.contact.leg import Leg, mean_matrix, nodes_along, settled
+from afm_jax.contact.settings import QuickSetting
+
+
+class JunctionWay(NamedTuple):
+    """What the way of a free tip through the junction ends with."""
+
+    energy_aj: Float[Array, "..."]
+    """Kinetic energy where the junction breaks, signed: negative by what is missing where it does not break."""
+    time_us: Float[Array, "..."]
+    """Time in the junction; meaningless where the energy is not positive."""
+    deepest_gap_nm: Float[Array, "..."]
+    """Gap at the turning point, negative where the tip indents the sample."""
+
+
+def pass_through_junction(tip: Driven, energy_aj: Float[Array, "..."], nodes: int) -> JunctionWay:
+    """Return the way of a free tip from the formation of the junction to its breaking.
+
+    Args:
+        tip: the tip.
+        energy_aj: kinetic energy where it forms, in aJ.
+        nodes: number of Gauss nodes of each quadrature.
+    """
+    form, unit = tip.junction.forms_root, tip.load_scale_nn * tip.depth_scale_nm
+    level = jkr.work(form) + jnp.maximum(energy_aj, 0.0) / unit
+    turn = turning_root(level)
+    leaving = energy_aj + unit * (jkr.work(form) - jkr.work(jkr.FOLD))
+    points, weights, _ = nodes_along(nodes, turn)
+    inside = jnp.tensordot(weights, _Half(tip, form).along(turn, points).pace, axes=1)
+    outside = _time_to_fold(form, jnp.maximum(leaving, 0.0) / unit, nodes) * tip.depth_scale_nm / _speed_scale(tip)
+    return JunctionWay(leaving, 2.0 * inside + outside, tip.gap_of_root(turn))
+
+
+class Stretch(NamedTuple):
+    """A stretch of the way of a free tip through the junction at Gauss nodes, counted from the turning point."""
+
+    time_us: Float[Array, " nodes"]
+    gap_nm: Float[Array, " nodes"]
+    speed: Float[Array, " nodes"]
+    duration_us: Float[Array, ""]
+
+
+def stretch_in_junction(
+    tip: Driven, level: Float[Array, ""], turn: Float[Array, ""], end: Float[Array, ""], nodes: int
+) -> Stretch:
+    """Return the stretch between the turning point and another point, which may be one too.
+
+    Args:
+        tip: a free tip.
+        level: its energy in the unit of the normalised work.
+        turn: s at the turning point.
+        end: s at the other end.
+        nodes: number of Gauss nodes.
+    """
+    points, weights, cumulative = nodes_along(nodes, turn)
+    # both ends may be turning points: sin^2 takes the square roots out
+    share, bend = jnp.sin(0.5 * jnp.pi * points) ** 2, 0.5 * jnp.pi * jnp.sin(jnp.pi * points)
+    s = turn - (turn - end) * share
+    missing = level - jkr.work(s)
+    moving = missing > 0.0
+    speed = _speed_scale(tip) * jnp.sqrt(jnp.where(moving, missing, 1.0))
+    path = tip.depth_scale_nm * (turn - end) * bend * jkr.depth_slope(s)
+    pace = jnp.where(moving, path / speed, 0.0)
+    return Stretch(cumulative @ pace, tip.gap_of_root(s), jnp.where(moving, speed, 0.0), weights @ pace)
+
+
+def go_through_junction(driven: Driven, place: Place, setting: QuickSetting) -> Leg:
+    """Return a tip where the junction has broken, from where it has formed with the gap closing; x is the gap."""
+    form = driven.junction.forms_root + jnp.zeros_like(place.x)
+    fold = jnp.full_like(form, jkr.FOLD)
+    level = jkr.work(form) + place.gap_rate**2 / _unit(driven)
+    turn = turning_root(level)
+    others = driven.acceleration(driven.gap_of_root(form), place.gap_rate, place.time_us, jnp.zeros_like(turn))
+    for _ in range(2):
+        turn = _turn_under(driven, form, level, others, turn)
+    inward = _swept(_Half(driven, form, pressing=True), level, place.time_us, (turn, others), setting)
+    turn, at_turn = inward.turn, inward.time_us
+    others = driven.acceleration(driven.gap_of_root(turn), jnp.zeros_like(turn), at_turn, jnp.zeros_like(turn))
+    outward = _swept(_Half(driven, fold, pressing=False), level, at_turn, (turn, others), setting)
+    work, depth = (of(turn) - of(fold) for of in (jkr.work, jkr.depth))
+    leaving = jnp.sqrt(_unit(driven) * work + 2.0 * driven.depth_scale_nm * outward.mean * depth)
+    return Leg(
+        place=Place(
+            x=driven.junction.breaks_gap_nm + jnp.zeros_like(turn),
+            gap_rate=leaving,
+            time_us=outward.time_us,
+            viscous_loss_aj=place.viscous_loss_aj,
+        ),
+        deepest_gap_nm=driven.gap_of_root(turn),
+        holds=inward.holds & outward.holds & (leaving > 0.0) & (place.gap_rate < 0.0),
+    )
+
+
+def turning_root(level: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the largest s at which the normalised work is `level`, by Newton's method from above.
+
+    The work is convex to the right of its minimum at s = 6^(1/6), so that Newton's steps from above never pass the
+    root. The last two carry the derivatives (two: first and second are right).
+    """
+    fixed = lax.stop_gradient(level)
+    far = (2.5 * jnp.maximum(fixed, 0.0)) ** 0.1
+    root = jnp.cbrt(far**3 + 3.4)
+    for _ in range(7):
+        root = _newton(root, fixed)
+    return _newton(_newton(lax.stop_gradient(root), level), level)
+
+
+def _newton(root: Float[Array, "..."], level: Float[Array, "..."]) -> Float[Array, "..."]:
+    slope = jkr.load(root) * jkr.depth_slope(root)
+    uphill = slope > 0.0
+    return root - jnp.where(uphill, (jkr.work(root) - level) / jnp.where(uphill, slope, 1.0), 0.0)
+
+
+def _unit(driven: Driven) -> Array:
+    """Return twice the unit of the junction's energy over the mass: w^2 is that times the normalised energy."""
+    return 2.0 * driven.load_scale_nn * driven.depth_scale_nm * driven.inverse_mass
+
+
+def _speed_scale(driven: Driven) -> Array:
+    return jnp.sqrt(_unit(driven))
+
+
+class _Along(NamedTuple):
+    """Places between the turning point and the other end of a half."""
+
+    s: Array
+    y: Array
+    over_y: Array
+    """The speed over y."""
+    slope: Array
+    """Of the depth."""
+    pace: Array
+    """Time per share of the half."""
+
+
+class _Half(NamedTuple):
+    """The way from where the junction forms to the turning point (`pressing`), or from there to the fold."""
+
+    driven: Driven
+    end: Array
+    """s at the end that is not the turning point."""
+    pressing: bool = True
+
+    def along(self, turn: Array, points: Array, means: Array | None = None) -> _Along:
+        """Return the places at nodes of y, with means of g, or without any."""
+        apart = turn > self.end
+        reach = jnp.where(apart, jnp.sqrt(jnp.where(apart, turn - self.end, 1.0)), 0.0)
+        twice = 2.0 * self.driven.depth_scale_nm
+        y = reach * points
+        s = turn - y * y
+        square = _unit(self.driven) * _mean_work_slope(turn, s)
+        if means is not None:
+            square = square + twice * _mean_depth_slope(turn, s) * means
+        over_y, slope = jnp.sqrt(square), jkr.depth_slope(s)
+        return _Along(s, y, over_y, slope, twice * reach * slope / over_y)
+
+
+class _Swept(NamedTuple):
+    """A half of the way through the junction, swept."""
+
+    turn: Float[Array, "..."]
+    time_us: Float[Array, "..."]
+    mean: Float[Array, "..."]
+    """The mean of g over all of the depth."""
+    holds: Bool[Array, "..."]
+
+
+def _swept(half: _Half, level: Array, begin_us: Array, guess: tuple[Array, Array], setting: QuickSetting) -> _Swept:
+    """Return a half under a drive.
+
+    Args:
+        half: the half.
+        level: the energy in the unit of the normalised work where the junction forms.
+        begin_us: time at the start.
+        guess: s at the turning point, to be improved on the way to it, and the mean of g.
+        setting: numbers of nodes and sweeps, and what is allowed.
+    """
+    driven, twice = half.driven, 2.0 * half.driven.depth_scale_nm
+    nodes = setting.pressing if half.pressing else setting.releasing
+    turn, mean = guess
+    points, weights, cumulative = nodes_along(nodes, turn)
+    averages = jnp.asarray(mean_matrix(nodes), turn.dtype)
+    passing = weights - cumulative if half.pressing else cumulative
+
+    def sweep(_, swept):
+        turn, means, _, _ = swept
+        at = half.along(turn, points, means)
+        moment = begin_us + jnp.tensordot(passing, at.pace, axes=1)
+        rate = -at.y * at.over_y if half.pressing else at.y * at.over_y
+        others = driven.acceleration(driven.gap_of_root(at.s), rate, moment, jnp.zeros_like(rate))
+        # in the mean over the depth every node counts by its slope
+        total = jnp.tensordot(averages, others * at.slope, axes=1)
+        mean = total[-1] / _mean_depth_slope(turn, half.end)
+        after = _turn_under(driven, half.end, level, mean, turn) if half.pressing else turn
+        return after, total[:-1] / _mean_depth_slope(turn, at.s), means, mean
+
+    begin = mean + jnp.zeros_like(points)
+    turn, means, before, mean = lax.fori_loop(0, setting.junction_sweeps, sweep, (turn, begin, begin, mean))
+    at = half.along(turn, points, means)
+    duration = jnp.tensordot(weights, at.pace, axes=1)
+    change = jnp.abs((means - before) * twice * _mean_depth_slope(turn, at.s)) / at.over_y**2
+    return _Swept(turn, begin_us + duration, mean, settled(change, at.pace, duration, setting))
+
+
+def _turn_under(driven: Driven, form: Array, level: Array, mean: Array, turn: Array) -> Array:
+    """Return the turning point, improved by a step of Newton's method, under a mean of the other forces."""
+    unit, twice = _unit(driven), 2.0 * driven.depth_scale_nm
+    excess = unit * (jkr.work(turn) - level) + twice * mean * (jkr.depth(turn) - jkr.depth(form))
+    return turn - excess / (jkr.depth_slope(turn) * (unit * jkr.load(turn) + twice * mean))
+
+
+def _mean_work_slope(turn: Float[Array, "..."], s: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return (work(turn) - work(s)) / (turn - s) without cancellation: sums of turn^k s^(n-1-k)."""
+    total = jnp.zeros_like(s)
+    for degree, factor in ((10, 0.4), (7, -jkr.SLOPE), (4, 1.0)):
+        powers, power = jnp.ones_like(s), jnp.ones_like(s)
+        for _ in range(degree - 1):
+            power = power * s
+            powers = powers * turn + power
+        total = total + factor * powers
+    return total
+
+
+def _mean_depth_slope(turn: Array, s: Array) -> Array:
+    """Return (depth(turn) - depth(s)) / (turn - s)."""
+    return (turn + s) * (turn * turn + s * s) - jkr.SLOPE
+
+
+def _time_to_fold(start: Float[Array, "..."], leaving: Float[Array, "..."], nodes: int) -> Float[Array, "..."]:
+    """Return the integral of dDelta / sqrt(leaving + work(fold) - work) from the fold to s = start."""
+    points, weights, _ = nodes_along(nodes, leaving)
+    # work(fold) - work(s) is _CURVATURE (s - fold)^2 to leading order
+    width = jnp.sqrt(jnp.maximum(leaving, 1e-12) / _CURVATURE)
+    reach = jnp.arcsinh((start - jkr.FOLD) / width)
+    # sinh and cosh from one exponential: the library's own are ten times slower
+    grown = jnp.exp(reach * points)
+    s = jkr.FOLD + 0.5 * width * (grown - 1.0 / grown)
+    kinetic = leaving + (jkr.work(jkr.FOLD) - jkr.work(s))
+    moving = kinetic > 0.0
+    pace = jkr.depth_slope(s) * 0.5 * width * (grown + 1.0 / grown) / jnp.sqrt(jnp.where(moving, kinetic, 1.0))
+    return reach * jnp.tensordot(weights, jnp.where(moving, pace, 0.0), axes=1)
+
+
+# work' = P Delta' and Delta'(fold) = 0, so that work''(fold) = P(fold) Delta''(fold) = P(fold) 12 fold^2
+_CURVATURE = -6.0 * (jkr.FOLD**6 - 6.0**0.5 * jkr.FOLD**3) * jkr.FOLD**2

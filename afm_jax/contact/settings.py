@@ -1,0 +1,126 @@
+"""How many nodes, sweeps and steps a wanted accuracy of a contact needs: of free collisions and of driven contacts.
+
+Measured by `afm-jax accuracy collide` and `afm-jax bench --only scenes`.
+"""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+METHODS = ("collocation", "diffrax")
+"""How contacts are integrated: by sweeps over Gauss nodes, or in steps of Diffrax's solvers.
+
+Free collisions take the steps in the gap, driven ones, which may turn anywhere, in time.
+"""
+
+
+class Setting(NamedTuple):
+    """The numbers of steps and nodes of one collision; hashable, for it shapes the program.
+
+    `rule` is "steps" (a Diffrax solver with fixed steps) or "collocation" (`sweeps` Picard sweeps at `inward` and
+    `outward` Gauss nodes). Without dissipation both are one quadrature. `careful`: the short first pass of the way out
+    takes as many steps as the way itself.
+    """
+
+    rule: str
+    inward: int
+    outward: int
+    junction_nodes: int
+    sweeps: int = 0
+    solver: str = "Dopri8"
+    careful: bool = False
+
+
+SETTINGS = {
+    "diffrax": {
+        1e-5: Setting("steps", 2, 2, 8, solver="Dopri5"),
+        1e-6: Setting("steps", 3, 3, 8, solver="Dopri5"),
+        1e-9: Setting("steps", 3, 3, 12),
+        1e-11: Setting("steps", 7, 8, 16),
+    },
+    "collocation": {
+        1e-6: Setting("collocation", 6, 6, 8, sweeps=2),
+        1e-9: Setting("collocation", 10, 10, 12, sweeps=3),
+        1e-11: Setting("collocation", 13, 13, 16, sweeps=5),
+    },
+}
+"""For each method the settings of free collisions by the accuracy that they reach.
+
+Accuracy a means an error of the rebound speed below a (relative) and of the delay below 10 a us, measured with the
+paper's contact from 1.1 times the capture speed to 200 nm/us (`afm-jax accuracy collide`).
+"""
+
+CAREFUL = Setting("steps", 256, 256, 40, careful=True)
+"""For impacts that the quick setting does not resolve: strong dissipation, or a turning point close to the junction."""
+
+
+def setting_of(method: str, accuracy: float) -> Setting:
+    """Return the cheapest setting of free collisions by a method that reaches an accuracy.
+
+    Raises:
+        ValueError: if there is no such method, or none of its settings is as accurate.
+    """
+    if method not in SETTINGS:
+        raise ValueError(f"`method` must be one of {', '.join(SETTINGS)}, but is {method!r}")
+    return SETTINGS[method][_level(SETTINGS[method], accuracy, f" with {method}")]
+
+
+class QuickSetting(NamedTuple):
+    """How finely the quick way through a driven contact is resolved; hashable, for it shapes the program.
+
+    Every leg of the way has its number of Gauss nodes: `inward` through the bridge, `pressing` to the turning point of
+    the junction, `releasing` from there to the fold, `outward` through the bridge. Each is computed in so many sweeps.
+    Contacts whose last sweep still changes a kinetic energy by more than `tolerance` (relative), or whose last Legendre
+    coefficients are more than `tail` (relative, of the durations), go the careful way in time.
+    """
+
+    inward: int
+    pressing: int
+    releasing: int
+    outward: int
+    tolerance: float
+    sweeps: int = 10
+    junction_sweeps: int = 6
+    tail: float = 0.1
+
+
+class DrivenSetting(NamedTuple):
+    """How driven contacts are resolved; hashable, for it shapes the program.
+
+    `quick` is the way leg by leg, or None to go through every contact in time; `fineness` the steps per unit of the
+    local pace of the way in time; `trials` the trial steps that a tip in contact may take in one round; `method`
+    "diffrax" takes the steps in time by Diffrax's solver.
+    """
+
+    quick: QuickSetting | None
+    fineness: float
+    trials: int
+    method: str = "collocation"
+
+
+DRIVEN_SETTINGS = {
+    1e-6: DrivenSetting(QuickSetting(12, 8, 10, 12, 1e-6, 6, 4, 3e-3), 2.4, 60),
+    1e-9: DrivenSetting(QuickSetting(18, 13, 15, 16, 1e-9, 10, 7, 2e-4), 5.0, 120),
+}
+"""Settings by the accuracy of one driven contact: relative of the rebound speed, a tenth of it in us of the times."""
+
+
+def driven_setting_of(accuracy: float, method: str = "collocation") -> DrivenSetting:
+    """Return the cheapest setting of driven contacts by a method that reaches an accuracy.
+
+    With "collocation" they go leg by leg, and in time where that does not hold; with "diffrax" in time alone.
+
+    Raises:
+        ValueError: if none does, or there is no such method.
+    """
+    if method not in METHODS:
+        raise ValueError(f"`method` must be one of {', '.join(METHODS)}, but is {method!r}")
+    setting = DRIVEN_SETTINGS[_level(DRIVEN_SETTINGS, accuracy)]
+    return setting if method == "collocation" else setting._replace(quick=None, method=method)
+
+
+def _level(settings: Mapping[float, Any], accuracy: float, by: str = "") -> float:
+    """Return the coarsest accuracy of settings that is fine enough."""
+    reached = [level for level in settings if level <= accuracy * (1.0 + 1e-9)]
+    if not reached:
+        raise ValueError(f"`accuracy` must be at least {min(settings):g}{by}, but is {accuracy!r}")
+    return max(reached)
