@@ -60,7 +60,15 @@ from afm_jax.scenefile_table import SceneError, SceneTable, in_words, printable
 if TYPE_CHECKING:
     from afm_jax.contact.contact import Contact
 
-__all__ = ["SceneError", "Start", "load_scene", "load_start", "save_scene", "scene_tables"]
+__all__ = [
+    "SceneError",
+    "Start",
+    "load_scene",
+    "load_scene_and_start",
+    "load_start",
+    "save_scene",
+    "scene_tables",
+]
 
 
 def load_scene(path: str | os.PathLike[str]) -> Scene:
@@ -73,10 +81,7 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
         SceneError: if the file cannot be read, a table, key, type or value in it is wrong, or its contact has no
             junction; the message names the place and says how to mend it.
     """
-    tables = _tables(path)
-    scene = _scene_of(tables)
-    _start_of(tables, scene)
-    return scene
+    return load_scene_and_start(path)[0]
 
 
 def load_start(path: str | os.PathLike[str]) -> Start | None:
@@ -85,8 +90,14 @@ def load_start(path: str | os.PathLike[str]) -> Start | None:
     Raises:
         SceneError: if the file is not a valid scene file.
     """
+    return load_scene_and_start(path)[1]
+
+
+def load_scene_and_start(path: str | os.PathLike[str]) -> tuple[Scene, Start | None]:
+    """Return what `load_scene` and `load_start` return, from one reading of the file."""
     tables = _tables(path)
-    return _start_of(tables, _scene_of(tables))
+    scene = _scene_of(tables)
+    return scene, _start_of(tables, scene)
 
 
 def save_scene(scene: Scene, path: str | os.PathLike[str], *, start: Start | None = None) -> None:

@@ -1,10 +1,12 @@
-"""Where a simulation begins: the start of a scene file, and whether it is possible in its scene."""
+"""Where a simulation begins: the start of a scene file, whether it is possible in its scene, and that of a state."""
 
 from typing import NamedTuple
 
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.law import ImpactLaw
+from afm_jax.motion.drive_period import drive_of
+from afm_jax.motion.record import State
 from afm_jax.parameters import check_parameter
 
 
@@ -61,3 +63,16 @@ def _check_leaves(start: Start, platform: Platform) -> None:
             f"`velocity_nm_per_us` must be above the platform's {moving:.6g} where the tip starts on it, but is "
             f"{start.velocity_nm_per_us:.6g}: start faster or higher"
         )
+
+
+def as_in_file(scene: Scene, state: State) -> Start:
+    """Return the start from which `start_of` makes a state again, within the drive's first period.
+
+    Args:
+        scene: one scene.
+        state: time, height and velocity in the lab.
+    """
+    time = float(state.time_us)
+    phase = 360.0 * (time / drive_of(scene).period_us)
+    height = float(state.position_nm) - float(scene.platform.position(time))
+    return Start(phase % 360.0, height, float(state.velocity_nm_per_us))

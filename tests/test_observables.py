@@ -8,11 +8,9 @@ import pytest
 from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, single_impact_orbits
 from afm_jax.apparatus.drive import Tone
 from afm_jax.apparatus.excitation import BaseDrive
-from afm_jax.motion.long_run import LongRun, follow_long
 from afm_jax.motion.observables import Observables, observe
 from afm_jax.motion.poincare_section import poincare_section, strobe
-from afm_jax.motion.response_order import find_repetition
-from afm_jax.motion.settled import settled
+from afm_jax.motion.settle import LongRun, close_periods, find_repetition, follow_long, settled
 from afm_jax.motion.start import default_start, start_of, state
 from afm_jax.presets import contact_scene, figure10_scene, figure11_scene
 
@@ -72,6 +70,29 @@ def test_chaos_does_not_repeat():
         x.append(3.9 * x[-1] * (1.0 - x[-1]))
     times = 2.0 * np.arange(len(x)) + 0.3 * np.array(x)
     assert find_repetition(times, 40.0 + np.array(x), 2.0, tolerance=1e-4) is None
+
+
+def test_newton_closes_a_map_and_knows_its_slopes():
+    slopes = np.array([[0.3, -0.2], [0.4, 0.5]])
+    fixed = np.array([[3.0], [40.0]])
+
+    def ends(starts: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        moved = slopes @ (starts[1:] - fixed) + fixed
+        moved[0] += 1e-3 * (starts[1] - fixed[0]) ** 2
+        # the second one has no end; the third one stands still wherever it is: I - M is singular
+        return np.where(rows == 1, np.nan, np.where(rows == 2, starts[1:], moved))
+
+    starts = np.array([[0.7] * 4, [3.2, 3.2, 3.2, 9.0], [41.0, 41.0, 41.0, 41.0]])
+    found = close_periods(ends, starts, np.array([0, 1, 2, 3]), angular_frequency=0.5, reach=0.05)
+    # the fourth has to go too far
+    assert not found.closed[[1, 3]].any()
+    assert found.closed[0]
+    assert not found.contraction[1] < np.inf
+    assert not found.closed[2] or found.contraction[2] == pytest.approx(1.0, rel=1e-9)
+    np.testing.assert_allclose(found.starts[:, 0], [0.7, 3.0, 40.0], rtol=1e-9)
+    # central differences of a quadratic are exact but for rounding, 1e-16 over 1e-5
+    np.testing.assert_allclose(found.slopes[0], slopes, atol=1e-10)
+    np.testing.assert_allclose(found.contraction[0], np.sqrt(np.linalg.det(slopes)), rtol=1e-9)
 
 
 def test_a_law_settles_on_its_orbit():

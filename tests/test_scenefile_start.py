@@ -1,11 +1,13 @@
 """The start of a scene file: kept exactly, and refused where a tip cannot begin."""
 
+import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, SceneError, load_scene, save_scene
+from afm_jax.cli.scene_argument import scene_and_start
 from afm_jax.scenefile import Start, load_start
 
 HEAD = (
@@ -95,3 +97,18 @@ def test_a_start_that_cannot_be_is_not_saved(path: Path):
         with pytest.raises(ValueError, match=said):
             save_scene(Scene(Cantilever(90.0), platform, interaction), path, start=Start(270.0, 0.0, 1.0))
         assert not path.exists()
+
+
+def test_the_commands_read_a_file_once(path: Path, monkeypatch: pytest.MonkeyPatch):
+    write(path, "law", Start(270.0, 5.0, 80.0))
+    read = []
+
+    def parsed(source: str) -> dict:
+        read.append(source)
+        return tomllib.loads(Path(source).read_text(encoding="utf-8"))
+
+    monkeypatch.setattr("afm_jax.scenefile._parsed", parsed)
+    scene, start = scene_and_start(str(path))
+    assert read == [str(path)]
+    assert float(scene.platform.amplitude_nm) == 4.0
+    assert start == Start(270.0, 5.0, 80.0)

@@ -68,17 +68,12 @@ def scene_and_start(name: str) -> "tuple[Scene, State]":
     Raises:
         ValueError: if the tip never meets anything, or the file is wrong.
     """
-    from pathlib import Path  # noqa: PLC0415
-
+    from afm_jax.cli.scene_argument import scene_and_start as scene_and_told  # noqa: PLC0415
     from afm_jax.motion.start import default_start, start_of  # noqa: PLC0415
-    from afm_jax.presets import PRESETS, preset_start  # noqa: PLC0415
-    from afm_jax.scenefile import load_start  # noqa: PLC0415
-    from afm_jax.study.scene_accuracy import scene_named  # noqa: PLC0415
 
-    scene = scene_named(name)
+    scene, told = scene_and_told(name)
     if scene.interaction is None:
         raise ValueError(f"{name}: the cantilever is free: its motion is a closed form and has no contacts to measure")
-    told = preset_start(name) if name in PRESETS and not Path(name).exists() else load_start(name)
     return scene, default_start(scene) if told is None else start_of(scene, told)
 
 

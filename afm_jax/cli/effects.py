@@ -72,8 +72,8 @@ def _studied(
     """Return the study of a scene, and the start it was made from; what is being done goes to standard error."""
     from afm_jax.cli.scene_argument import scene_and_start  # noqa: PLC0415
     from afm_jax.motion.start import default_start, start_of  # noqa: PLC0415
+    from afm_jax.scenefile_start import as_in_file  # noqa: PLC0415
     from afm_jax.study.effects import study_effects  # noqa: PLC0415
-    from afm_jax.study.start_in_file import as_in_file  # noqa: PLC0415
 
     scene, start = scene_and_start(name)
     with session.working("simulating with and without each effect (every program compiles for some seconds)"):

@@ -18,10 +18,10 @@ def scene_and_start(name: str) -> "tuple[Scene, Start | None]":
         ValueError: if there is neither such a file nor such a preset, or the file is no valid scene file.
     """
     from afm_jax.presets import PRESETS, preset, preset_start  # noqa: PLC0415
-    from afm_jax.scenefile import load_scene, load_start  # noqa: PLC0415
+    from afm_jax.scenefile import load_scene_and_start  # noqa: PLC0415
 
     if Path(name).exists() or name.endswith(".toml") or len(Path(name).parts) > 1:
-        return load_scene(name), load_start(name)
+        return load_scene_and_start(name)
     if name not in PRESETS:
         raise ValueError(f"{name}: there is no such file or preset; presets are {', '.join(PRESETS)}")
     return preset(name), preset_start(name)

@@ -13,9 +13,9 @@ METHODS = ("collocation", "diffrax")
 
 if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
-    from afm_jax.motion.long_run import LongRun
     from afm_jax.motion.observables import Observables
     from afm_jax.motion.record import State
+    from afm_jax.motion.settle import LongRun
 
 DEFAULT_PERIODS = 2000
 """Drive periods followed at most where no duration is given."""
@@ -157,8 +157,8 @@ def _follow(
     settings: dict[str, Any],
 ) -> "tuple[LongRun, Observables]":
     """Return the simulation and what is read of it; progress of long runs goes to standard error."""
-    from afm_jax.motion.long_run import follow_long  # noqa: PLC0415
     from afm_jax.motion.observables import observe  # noqa: PLC0415
+    from afm_jax.motion.settle import follow_long  # noqa: PLC0415
     from afm_jax.motion.start import default_start  # noqa: PLC0415
 
     pieces = 0

@@ -9,9 +9,9 @@ import numpy as np
 from afm_jax.apparatus.scene import Scene
 from afm_jax.cli.session import Session
 from afm_jax.contact.phases import Phase
-from afm_jax.motion.long_run import LongRun
 from afm_jax.motion.observables import Harmonic, Observables
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation
+from afm_jax.motion.settle import LongRun
 from afm_jax.motion.trajectory import dense_path
 from afm_jax.scenefile import scene_tables
 from afm_jax.strict_json import strict_json

@@ -58,35 +58,79 @@ class World(NamedTuple):
         return np.asarray(gap), np.asarray(rate)
 
 
+class Flights(NamedTuple):
+    """The free flights of a simulation, in closed form, in order; arrays of shape (flights,)."""
+
+    begin_us: np.ndarray
+    end_us: np.ndarray
+    origin_us: np.ndarray
+    """Time at which the tip has the gap and the rate that follow: the departure, or the start."""
+    gap_nm: np.ndarray
+    rate: np.ndarray
+
+    def middle_of_longest(self, among: np.ndarray) -> float:
+        """Return the middle in us of the longest flight among some; there must be one."""
+        longest = int(np.argmax(np.where(among, self.end_us - self.begin_us, -np.inf)))
+        return 0.5 * float(self.begin_us[longest] + self.end_us[longest])
+
+
+def flights_of(scene: Scene, simulation: Simulation) -> Flights:
+    """Return all flights of a simulation of one scene."""
+    return _flights(*surface_of(scene), simulation)
+
+
+def _flights(surface: Platform | Surface, response: Surface | None, simulation: Simulation) -> Flights:
+    rows = simulation.contacts
+    used = np.asarray(rows.kind) != ContactKind.NONE
+    arrival = np.asarray(rows.arrival_time_us)[used]
+    start = [np.asarray(part, float).reshape(1) for part in simulation.start]
+    departures = (rows.departure_time_us, rows.departure_position_nm, rows.departure_velocity_nm_per_us)
+    origin, position, velocity = (
+        np.concatenate([first, np.asarray(column)[used]]) for first, column in zip(start, departures, strict=True)
+    )
+    left = np.isfinite(origin)
+    state = State(*(jnp.asarray(part) for part in (np.where(left, origin, 0.0), position, velocity)))
+    gap, rate = (np.asarray(part) for part in to_gap(surface, response, state))
+    # a negative delay lets a flight begin before the last one has ended: the earlier one is kept to its end
+    begin = np.maximum(origin, np.concatenate([start[0], arrival]))
+    end = np.append(arrival, float(simulation.final.time_us))
+    here = left & (end > begin)
+    return Flights(begin[here], end[here], origin[here], gap[here], rate[here])
+
+
+def fly(scene: Scene, flights: Flights, times_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return heights in nm and velocities in nm/us in the lab along flights, at times of shape (times, flights)."""
+    surface, response = surface_of(scene)
+    height, speed = (np.asarray(part) for part in surface.position_and_velocity(jnp.asarray(flights.origin_us)))
+    move = scene.cantilever.propagator(jnp.asarray(times_us - flights.origin_us))
+    position, velocity = move(jnp.asarray(flights.gap_nm + height), jnp.asarray(flights.rate + speed))
+    if response is not None:
+        steady, rate = response.position_and_velocity(jnp.asarray(times_us))
+        position, velocity = position + steady, velocity + rate
+    return np.asarray(position), np.asarray(velocity)
+
+
+def state_at(scene: Scene, simulation: Simulation, time_us: float) -> State | None:
+    """Return the tip in flight at a time, or None where it is in contact or outside the simulation."""
+    flights = flights_of(scene, simulation)
+    here = np.flatnonzero((flights.begin_us <= time_us) & (time_us <= flights.end_us))
+    if not here.size:
+        return None
+    position, velocity = fly(scene, Flights(*(part[here[:1]] for part in flights)), np.array([[time_us]]))
+    return State(*(jnp.asarray(part) for part in (time_us, position[0, 0], velocity[0, 0])))
+
+
 def pieces_between(world: World, simulation: Simulation, low: float, high: float) -> Pieces:
     """Return the pieces that cover the times from `low` to `high`."""
     rows, last = simulation.contacts, float(simulation.final.time_us)
-    used = np.flatnonzero(np.asarray(rows.kind) != ContactKind.NONE)
-    arrival, departure, position, velocity = (
-        np.asarray(column)[used]
-        for column in (
-            rows.arrival_time_us,
-            rows.departure_time_us,
-            rows.departure_position_nm,
-            rows.departure_velocity_nm_per_us,
-        )
-    )
-    left = np.isfinite(departure)
-    gap, rate = world.gaps(np.where(left, departure, 0.0), position, velocity)
-    origin, place = float(simulation.start.time_us), tuple(float(part) for part in world.gaps(*simulation.start))
-    shown, flights, touched = origin, [], []
-    for row, (arrives, departs) in enumerate(zip(arrival, departure, strict=True)):
-        flights.append((shown, arrives, FLIGHT, origin, *place))
-        stops = min(departs, last)
-        if stops >= low and arrives <= high and stops > arrives:
-            touched.append(row)
-        origin, place = departs, (gap[row], rate[row])
-        # a negative delay lets a flight begin before the last one has ended: the earlier one is kept to its end
-        shown = max(arrives, departs)
-    if origin < last:
-        flights.append((shown, last, FLIGHT, origin, *place))
-    near = [piece for piece in flights if piece[1] >= low and piece[0] <= high and piece[1] > piece[0]]
-    columns = np.array(near + _contact_pieces(world, simulation, used[touched], min(high, last))).reshape(-1, 6)
+    flown = _flights(world.surface, world.response, simulation)
+    near = (flown.end_us >= low) & (flown.begin_us <= high)
+    flights = (flown.begin_us, flown.end_us, np.full(near.shape, float(FLIGHT)), *flown[2:])
+    arrival = np.asarray(rows.arrival_time_us)
+    stops = np.minimum(np.asarray(rows.departure_time_us), last)
+    touched = (np.asarray(rows.kind) != ContactKind.NONE) & (stops >= low) & (arrival <= high) & (stops > arrival)
+    contacts = _contact_pieces(world, simulation, np.flatnonzero(touched), min(high, last))
+    columns = np.concatenate([np.stack(flights, axis=1)[near], np.reshape(contacts, (-1, 6))])
     begin, end, kind, origins, x, rates = columns[np.argsort(columns[:, 0], kind="stable")].T
     return Pieces(begin, end, kind.astype(int), origins, x, rates)
 

@@ -13,9 +13,8 @@ from afm_jax.motion.drive_period import Drive, drive_of
 from afm_jax.motion.energy_balance import energy_balance
 from afm_jax.motion.peak_height import peak_deflection, peak_height
 from afm_jax.motion.record import ContactKind, Simulation
-from afm_jax.motion.settled import Settled, settled
+from afm_jax.motion.settle import Settled, Window, settled, window_of
 from afm_jax.motion.trajectory import Trajectory, dense_path
-from afm_jax.motion.window import Window, window_of
 
 _LOADS = 4001
 _COVERED = 1e-6

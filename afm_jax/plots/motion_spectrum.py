@@ -6,9 +6,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.motion.settled import settled
+from afm_jax.motion.settle import settled, window_of
 from afm_jax.motion.trajectory import trajectory
-from afm_jax.motion.window import window_of
 from afm_jax.plots.motion_window import Look
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save
 

@@ -14,8 +14,9 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import find_junction
-from afm_jax.motion.frames import to_gap, to_lab
-from afm_jax.motion.record import ContactKind, Simulation, State
+from afm_jax.motion.frames import to_lab
+from afm_jax.motion.motion_pieces import Flights, flights_of, fly
+from afm_jax.motion.record import ContactKind, Simulation
 
 _PANELS = 8
 _POINTS, _WEIGHTS = np.polynomial.legendre.leggauss(16)
@@ -36,16 +37,6 @@ class Reading(NamedTuple):
     impacts: int
 
 
-class _Flights(NamedTuple):
-    """Closed-form flights: shown from `begin` to `end`, each through a state at `origin`."""
-
-    begin: np.ndarray
-    end: np.ndarray
-    origin: np.ndarray
-    gap: np.ndarray
-    rate: np.ndarray
-
-
 def read_motion(
     scene: Scene, simulation: Simulation, from_us: float, to_us: float, *, angular_frequency: float
 ) -> Reading:
@@ -58,13 +49,13 @@ def read_motion(
         to_us: its end.
         angular_frequency: of the lock-in, in rad/us.
     """
-    flights = _flights(scene, simulation)
-    begin, end = np.clip(flights.begin, from_us, to_us), np.clip(flights.end, from_us, to_us)
+    flights = flights_of(scene, simulation)
+    begin, end = np.clip(flights.begin_us, from_us, to_us), np.clip(flights.end_us, from_us, to_us)
     edges = begin + (end - begin) * np.linspace(0.0, 1.0, _PANELS + 1)[:, None]
     half = 0.5 * np.diff(edges, axis=0)
     times = edges[:-1, None] + half[:, None] * (_POINTS[:, None] + 1.0)
     weights = half[:, None] * _WEIGHTS[:, None]
-    count = flights.begin.size
+    count = flights.begin_us.size
     times, weights = times.reshape(-1, count), weights.reshape(-1, count)
     heights = _heights(scene, flights, times)
     turn = np.sum(weights * heights * np.exp(-1j * angular_frequency * times))
@@ -84,73 +75,11 @@ def read_motion(
     )
 
 
-def state_at(scene: Scene, simulation: Simulation, time_us: float) -> State | None:
-    """Return the tip in flight at a time, or None where it is in contact or outside the simulation."""
-    flights = _flights(scene, simulation)
-    here = np.flatnonzero((flights.begin <= time_us) & (time_us <= flights.end))
-    if not here.size:
-        return None
-    one = _Flights(*(part[here[:1]] for part in flights))
-    position, velocity = _fly(scene, one, np.array([[time_us]]))
-    return State(jnp.asarray(time_us), jnp.asarray(position[0, 0]), jnp.asarray(velocity[0, 0]))
+def _heights(scene: Scene, flights: Flights, times: np.ndarray) -> np.ndarray:
+    return fly(scene, flights, times)[0] if flights.begin_us.size else np.zeros(times.shape)
 
 
-def longest_flight_middle_us(scene: Scene, simulation: Simulation, *, last: int = 12) -> float | None:
-    """Return the middle of the longest of the last flights; None while the tip is held."""
-    flights = _flights(scene, simulation)
-    if not flights.begin.size:
-        return None
-    length = (flights.end - flights.begin)[-last:]
-    which = flights.begin.size - length.size + int(np.argmax(length))
-    return float(0.5 * (flights.begin[which] + flights.end[which]))
-
-
-def _flights(scene: Scene, simulation: Simulation) -> _Flights:
-    """Return all flights of a simulation."""
-    rows = simulation.contacts
-    used = np.flatnonzero(np.asarray(rows.kind) != ContactKind.NONE)
-    arrival, departure, position, velocity = (
-        np.asarray(column)[used]
-        for column in (
-            rows.arrival_time_us,
-            rows.departure_time_us,
-            rows.departure_position_nm,
-            rows.departure_velocity_nm_per_us,
-        )
-    )
-    start = [float(part) for part in simulation.start]
-    origin = np.concatenate([start[:1], departure])
-    end = np.concatenate([arrival, [float(simulation.final.time_us)]])
-    # a negative delay lets a flight begin before the last one has ended: the earlier one is kept to its end
-    begin = np.maximum(origin, np.concatenate([start[:1], arrival]))
-    here = np.isfinite(origin)
-    state = State(
-        jnp.asarray(np.where(here, origin, 0.0)),
-        jnp.asarray(np.concatenate([start[1:2], position])),
-        jnp.asarray(np.concatenate([start[2:], velocity])),
-    )
-    gap, rate = (np.asarray(part) for part in to_gap(*surface_of(scene), state))
-    here &= end > begin
-    return _Flights(begin[here], end[here], origin[here], gap[here], rate[here])
-
-
-def _fly(scene: Scene, flights: _Flights, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return heights and velocities in the lab at times of shape (times, flights)."""
-    surface, response = surface_of(scene)
-    height, speed = (np.asarray(part) for part in surface.position_and_velocity(jnp.asarray(flights.origin)))
-    move = scene.cantilever.propagator(jnp.asarray(times - flights.origin))
-    position, velocity = move(jnp.asarray(flights.gap + height), jnp.asarray(flights.rate + speed))
-    if response is not None:
-        steady, rate = response.position_and_velocity(jnp.asarray(times))
-        position, velocity = position + steady, velocity + rate
-    return np.asarray(position), np.asarray(velocity)
-
-
-def _heights(scene: Scene, flights: _Flights, times: np.ndarray) -> np.ndarray:
-    return _fly(scene, flights, times)[0] if flights.begin.size else np.zeros(times.shape)
-
-
-def _peak(scene: Scene, flights: _Flights, times: np.ndarray, heights: np.ndarray) -> float:
+def _peak(scene: Scene, flights: Flights, times: np.ndarray, heights: np.ndarray) -> float:
     """Return the largest height, by the parabola through the three highest points of the highest flight."""
     if not heights.size:
         return float("nan")
@@ -163,7 +92,7 @@ def _peak(scene: Scene, flights: _Flights, times: np.ndarray, heights: np.ndarra
     if curve[0] >= 0.0:
         return top
     vertex = t[1] - 0.5 * curve[1] / curve[0]
-    one = _Flights(*(part[flight : flight + 1] for part in flights))
+    one = Flights(*(part[flight : flight + 1] for part in flights))
     return float(_heights(scene, one, np.array([[vertex]]))[0, 0])
 
 

@@ -41,7 +41,7 @@ class Programs:
     def run_with_tangent(
         self, scene: Scene, start: State, duration_us: float, scene_rate: Scene, start_rate: State
     ) -> tuple[Simulation, Simulation]:
-        """Return a scene followed for a duration, and the motion's derivative along a change of scene and start."""
+        """Return a scene followed for a duration, and its derivative, to the same end, along a change of both."""
         arguments = (scene, *_arrays(start, duration_us), scene_rate, _arrays(start_rate, 0.0)[0])
         return self._program(simulated_with_tangent, arguments)(*arguments)
 
@@ -78,10 +78,13 @@ def simulated(scene: Scene, start: State, duration_us: Any) -> Simulation:
 def simulated_with_tangent(
     scene: Scene, start: State, duration_us: Any, scene_rate: Scene, start_rate: State
 ) -> tuple[Simulation, Simulation]:
-    """Return `simulated` and its derivative in forward mode; integers have zeros."""
-    motion, rate = jax.jvp(
-        lambda scene, start: simulated(scene, start, duration_us), (scene, start), (scene_rate, start_rate)
-    )
+    """Return `simulated` and its derivative in forward mode, its end staying where it is; integers have zeros."""
+    end = jnp.asarray(start.time_us) + duration_us
+
+    def to_the_end(scene: Scene, start: State) -> Simulation:
+        return simulated(scene, start, end - start.time_us)
+
+    motion, rate = jax.jvp(to_the_end, (scene, start), (scene_rate, start_rate))
     # the tangents of integers carry no numbers
     real = jax.tree.map(
         lambda value, slope: slope if slope.dtype == value.dtype else jnp.zeros_like(value), motion, rate

@@ -1,5 +1,6 @@
 """A scene as the effects study sees it: followed from one start, read in one way, with and without an effect."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -9,12 +10,24 @@ import numpy as np
 from afm_jax.apparatus.scene import Scene
 from afm_jax.motion.drive_period import Drive, drive_of
 from afm_jax.motion.record import Simulation, State
+from afm_jax.motion.settle import (
+    Orbit,
+    Piece,
+    follow_in_pieces,
+    follow_to_orbit,
+    joined,
+    joined_motions,
+    last_fifth,
+    place_after,
+    why_impossible,
+    why_over,
+)
 from afm_jax.study.flight_reading import Reading, read_motion
 from afm_jax.study.motion_program import Programs
 from afm_jax.study.scene_effects import Scaled
-from afm_jax.study.steady_motion import Orbit, settle
-from afm_jax.study.window_motion import follow_to, window_of_last_fifth
 
+_PIECE_PERIODS = 50.0
+"""Drive periods simulated at a time where nothing settles."""
 _STEP = 1e-4
 """Change of strength over which a reading is differenced along the motion's derivative; its square is the error."""
 
@@ -28,6 +41,13 @@ class View(NamedTuple):
     settles: bool
     """Whether steady orbits are compared, else the last fifth of the duration."""
 
+    @property
+    def window(self) -> tuple[float, float]:
+        """Beginning and end, in us, of what is compared where nothing settles."""
+        first = float(self.start.time_us)
+        found = last_fifth(first, first + self.duration_us, self.drive)
+        return found.from_us, found.to_us
+
 
 class Observed(NamedTuple):
     """What a scene shows; without a reading the reason says why."""
@@ -38,24 +58,42 @@ class Observed(NamedTuple):
     orbit: Orbit | None
     begin_us: float
     """Where the motion that was read begins."""
+    pieces: tuple[Piece, ...] = ()
+    """The motion that was read, where nothing settles."""
 
 
 def observe_scene(programs: Programs, scene: Scene, view: View) -> Observed:
     """Return what a scene shows in a view."""
     if not view.settles:
-        window = window_of_last_fifth(view.start, view.drive, view.duration_us)
-        reason, motion, _ = follow_to(programs, scene, view.start, window)
-        if motion is None:
-            return Observed(scene, None, reason, None, float(view.start.time_us))
-        reading = read_motion(scene, motion, *window, angular_frequency=view.drive.angular_frequency)
-        return Observed(scene, reading, None, None, window[0])
+        return _observe_last_fifth(programs, scene, view)
     own = drive_of(scene)
     if own.aperiodic is not None:
         return Observed(scene, None, own.aperiodic, None, 0.0)
-    orbit, reason, _ = settle(programs, scene, view.start, view.duration_us)
+    orbit, reason = follow_to_orbit(scene, view.start, view.duration_us, partial(programs.run, scene))
     if orbit is None:
         return Observed(scene, None, reason, None, float(view.start.time_us))
     return Observed(scene, _read_orbit(scene, orbit.motion, orbit, view), None, orbit, float(orbit.start.time_us))
+
+
+def _observe_last_fifth(programs: Programs, scene: Scene, view: View) -> Observed:
+    """Return what a scene shows at the end of the view's duration."""
+    first = float(view.start.time_us)
+    reason, pieces, run = why_impossible(scene), [], partial(programs.run, scene)
+    if reason is None:
+        piece_us = _PIECE_PERIODS * drive_of(scene).period_us
+        for piece in follow_in_pieces(scene, view.start, first + view.duration_us, run, piece_us=piece_us):
+            reason = why_over(piece)
+            if reason is not None:
+                break
+            pieces = [*(done for done in pieces if done.goes_on), piece]
+    if reason is not None:
+        return Observed(scene, None, reason, None, first)
+    reading = _read_window(scene, joined(pieces), view)
+    return Observed(scene, reading, None, None, view.window[0], tuple(pieces))
+
+
+def _read_window(scene: Scene, motion: Simulation, view: View) -> Reading:
+    return read_motion(scene, motion, *view.window, angular_frequency=view.drive.angular_frequency)
 
 
 def _read_orbit(scene: Scene, motion: Simulation, orbit: Orbit, view: View) -> Reading:
@@ -82,16 +120,13 @@ def slope_of_reading(programs: Programs, observed: Observed, view: View, scaled:
     """
     scene, orbit = observed.scene, observed.orbit
     _, rate = jax.jvp(lambda s: scaled(scene, s), (jnp.zeros(()),), (jnp.ones(()),))
+    still = State(*(jnp.zeros(()) for _ in range(3)))
     if orbit is None:
-        window = window_of_last_fifth(view.start, view.drive, view.duration_us)
-        _, motion, change = follow_to(programs, scene, view.start, window, rate)
-        if motion is None or change is None:
-            return None
+        motion, change = _with_tangent(programs, observed, rate, still)
 
         def read(scene: Scene, motion: Simulation) -> Reading:
-            return read_motion(scene, motion, *window, angular_frequency=view.drive.angular_frequency)
+            return _read_window(scene, motion, view)
     else:
-        still = State(*(jnp.zeros(()) for _ in range(3)))
         _, direct = programs.run_with_tangent(scene, orbit.start, orbit.period_us, rate, still)
         push = np.array([float(direct.final.position_nm), float(direct.final.velocity_nm_per_us)])
         move = np.linalg.solve(np.eye(2) - orbit.monodromy, push)
@@ -107,6 +142,18 @@ def slope_of_reading(programs: Programs, observed: Observed, view: View, scaled:
     slope = Reading(*slopes, impacts=0)._replace(lockin_phase_deg=turned / (2.0 * _STEP))
     finite = all(np.isfinite(part) for part in slope[:3])
     return slope if finite else None
+
+
+def _with_tangent(programs: Programs, observed: Observed, rate: Scene, slope: State) -> tuple[Simulation, Simulation]:
+    """Return the motion of a scene, followed once more piece by piece, and its derivative along a change."""
+    motions, changes = [], []
+    for piece in observed.pieces:
+        motion, change = programs.run_with_tangent(observed.scene, piece.motion.start, piece.length_us, rate, slope)
+        slope = place_after(change, piece.row)
+        motions.append(motion)
+        changes.append(change)
+    counts = [*(piece.contacts for piece in observed.pieces[:-1]), int(motions[-1].count)]
+    return joined_motions(motions, counts), joined_motions(changes, counts)
 
 
 def _slope(more: float | None, less: float | None) -> Any:

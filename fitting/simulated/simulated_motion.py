@@ -16,9 +16,8 @@ from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.contact_as_law import law_of_contact
 from afm_jax.motion.record import ContactKind, Contacts, MotionOutcome, Simulation, State
-from afm_jax.motion.settled import settled
+from afm_jax.motion.settle import close_periods, ends_in_flight, place_after, settled, where_to_go_on
 from afm_jax.motion.simulate import simulate
-from fitting.simulated.periodic_motion import find_periodic
 from fitting.simulated.simulated_reading import Reading, read_orbits
 
 US_PER_MS = 1e3
@@ -32,6 +31,8 @@ _CONTACTS = 260
 """Room for contacts in a piece: motions with more than two a response period are no single-impact orbits."""
 _NOT_PREDICTED = "the law closest to the contact has no stable single-impact orbit there"
 _ROUNDS = 4 * _CONTACTS + 400
+_STABLE = 0.9999
+"""Largest modulus of a multiplier that counts as stable, being known to 1e-4."""
 _TOLERANCE = 1e-6
 """Of what remains to the steady motion, relative: ten times less than the amplitudes are wanted to."""
 
@@ -58,11 +59,11 @@ class SteadyRows(NamedTuple):
 
 
 class _Verdict(NamedTuple):
-    """What is known of a motion: its last contact if it is the orbit asked for, whether it should go on, and why."""
+    """What is known of a motion: its last contact if it is the orbit asked for, from where it goes on, and why."""
 
     reason: str
     contact: Contacts | None = None
-    open: bool = False
+    goes_on: State | None = None
 
 
 Report = Callable[[str], None]
@@ -108,13 +109,13 @@ def steady_rows(
     if not waiting.size:
         return SteadyRows(nothing, None, reasons)
     report(f"{len(waiting)} of {count} drives have a stable orbit of the closest law; closing in on them")
-    orbits = find_periodic(
-        lambda starts, rows: _ends(follow(starts, rows, _responses(drives, rows, 1))),
+    orbits = close_periods(
+        lambda starts, rows: ends_in_flight(follow(starts, rows, _responses(drives, rows, 1))),
         starts[:, waiting],
         waiting,
         angular_frequency=float(cantilever.angular_frequency),
     )
-    starts[:, waiting] = np.where(orbits.found & orbits.stable, orbits.starts, starts[:, waiting])
+    starts[:, waiting] = np.where(orbits.closed & (orbits.contraction < _STABLE), orbits.starts, starts[:, waiting])
     steady: dict[int, Contacts] = {}
     for piece in range(pieces):
         if not waiting.size:
@@ -128,8 +129,8 @@ def steady_rows(
             reasons[row] = verdict.reason
             if verdict.contact is not None:
                 steady[row] = verdict.contact
-            elif verdict.open:
-                starts[:, row] = [float(part) for part in one.final]
+            elif verdict.goes_on is not None:
+                starts[:, row] = [float(part) for part in verdict.goes_on]
                 left.append(row)
         waiting = np.array(left, dtype=int)
     rows = np.array(sorted(steady), dtype=int)
@@ -166,12 +167,6 @@ def _read(
 
     heights = in_contact if isinstance(interaction, Contact) else on_platform
     return read_orbits(cantilever, platforms, drives.order[rows], contacts, heights)
-
-
-def _ends(found: Simulation) -> Float[np.ndarray, "2 rows"]:
-    """Return position and velocity at the end; NaN where it was not reached or the tip is held."""
-    free = np.asarray(found.outcome) == MotionOutcome.FINISHED
-    return np.where(free, np.stack([found.final.position_nm, found.final.velocity_nm_per_us]), np.nan)
 
 
 def _responses(drives: Drives, rows: Int[np.ndarray, " n"], count: int) -> Float[np.ndarray, " n"]:
@@ -241,7 +236,8 @@ def _judged(scene: Scene, found: Simulation, order: int) -> _Verdict:
         return _Verdict(outcome.sentence)
     verdict = settled(scene, found, tolerance=_TOLERANCE)
     if not verdict.settled:
-        return _Verdict(f"not settled: {verdict.reason}", open=True)
+        row, goes_on = where_to_go_on(found)
+        return _Verdict(f"not settled: {verdict.reason}", goes_on=place_after(found, row) if goes_on else None)
     if verdict.stuck or (verdict.contacts, verdict.periods) != (1, order):
         return _Verdict(verdict.reason)
     last = int(np.flatnonzero(found.contacts.kind == ContactKind.IMPACT)[-1])
