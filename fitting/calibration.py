@@ -13,7 +13,7 @@ from fitting.resonance.resonance_model import TERMS, model_at
 from fitting.resonance.resonance_start import sum_without_resonance
 from fitting.resonance.resonance_sweep import ResonanceSweep
 from fitting.resonance.sweep_fit import SweepFit, fit_sweep, kind_of, refit
-from fitting.tables.table_faults import TableError
+from fitting.tables.csv_text import TableError
 
 _PACKAGES = ("afm-jax", "jax", "optax", "numpy")
 

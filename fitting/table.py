@@ -22,11 +22,27 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
-from fitting.tables.table_columns import AMPLITUDES, COLUMN_NAMES, MEASURED, check_column_names
+from fitting.tables.csv_text import (
+    Faults,
+    TableError,
+    check_not_empty,
+    named_rows,
+    parse_rows,
+    printable,
+    quoted,
+    read_text,
+    split_lines,
+)
 from fitting.tables.table_comments import CALIBRATION, fault_in_number, known_key, parse_comments
-from fitting.tables.table_faults import Faults, TableError, printable, quoted
-from fitting.tables.table_file import read_text
-from fitting.tables.table_rows import check_rows, fill_errors, parse_rows, split_cells
+from fitting.tables.table_rows import (
+    AMPLITUDES,
+    COLUMN_NAMES,
+    MEASURED,
+    TABLE,
+    check_error_columns,
+    check_rows,
+    fill_errors,
+)
 
 __all__ = ["AmplitudeTable", "TableError", "read_table", "write_table"]
 
@@ -152,51 +168,21 @@ def read_table(path: str | Path, noise: float | None = None) -> AmplitudeTable:
     if noise is not None and not 0.0 < noise < 1.0:
         faults.add(f"the relative noise must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
         faults.raise_any()
-    comments, rows = _split_lines(read_text(path))
-    if not rows:
-        what = "only comments" if comments else "nothing"
-        faults.add(f"the file holds {what}; add a row of column names and rows of numbers")
-        faults.raise_any()
+    comments, rows = split_lines(read_text(path))
+    check_not_empty(comments, rows, faults)
     header = parse_comments(comments, faults)
-    names_line, names_text = rows.pop(0)
-    _check_delimiter(names_text, line=names_line, faults=faults)
-    names = split_cells(names_text)
     found = faults.count
-    check_column_names(names, line=names_line, faults=faults, noise=noise)
-    if not rows and faults.count == found:
-        faults.add("there are column names but no rows below them; add a row for each drive", line=names_line)
+    head, rows = named_rows(rows, TABLE, faults)
+    check_error_columns(head, faults, noise)
     if faults.count > found:
         # With a wrong name the cells below it cannot be judged.
         faults.raise_any()
-    columns, unreadable, lines = parse_rows(rows, names, faults)
+    columns, unreadable, lines = parse_rows(rows, head.names, TABLE, faults)
     fill_errors(columns, unreadable, noise)
     check_rows(columns, lines, faults, unreadable)
     faults.raise_any()
     arrays = {name: columns.get(name) for name in COLUMN_NAMES} | {"order": columns["order"].astype(np.int64)}
     return AmplitudeTable(**arrays, **vars(header), source=str(path), lines=lines)
-
-
-def _split_lines(text: str) -> tuple[list[tuple[int, str]], list[tuple[int, str]]]:
-    """Return comments (without their number sign) and other lines, each with its line number, without blank ones."""
-    comments, rows = [], []
-    for number, line in enumerate(text.split("\n"), start=1):
-        stripped = line.strip(" \t")
-        if stripped.startswith("#"):
-            comments.append((number, stripped[1:].strip()))
-        elif stripped.strip(",; \t"):
-            rows.append((number, line))
-    return [comment for comment in comments if comment[1]], rows
-
-
-def _check_delimiter(names: str, *, line: int, faults: Faults) -> None:
-    """Raise at once where the columns are not separated by commas: every other message would mislead."""
-    if "," in names:
-        return
-    for sign, word in ((";", "semicolons"), ("\t", "tabs"), (" ", "spaces")):
-        if sign in names.strip():
-            only = Faults(faults.source)
-            only.add(f"the columns are separated by {word}; separate them by commas, decimals by points", line=line)
-            only.raise_any()
 
 
 def write_table(table: AmplitudeTable, path: str | Path) -> None:

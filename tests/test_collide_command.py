@@ -15,7 +15,7 @@ from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, save_scene
 from afm_jax.cli.collide import COLUMNS
 from afm_jax.cli.contact_options import PARAMETERS
 from afm_jax.cli.main import main
-from afm_jax.cli.speeds import parse_speeds
+from afm_jax.cli.number_lists import parse_numbers
 from afm_jax.study.collisions import default_speeds
 from tests.reference_contact import ContactParameters, capture_speed, collision, junction
 from tests.strict_reading import strictly
@@ -163,13 +163,13 @@ def test_default_speeds_begin_above_the_capture_speed():
     ],
 )
 def test_speeds_are_read(text: str, speeds: tuple[float, ...]):
-    assert parse_speeds(text) == speeds
+    assert parse_numbers(text) == speeds
 
 
 def test_a_range_holds_its_stop_in_spite_of_rounding():
     # 0.1 is no binary number: eighty steps of it reach 20 only nearly
-    assert len(parse_speeds("12:20:0.1")) == 81
-    assert len(parse_speeds("0.1:0.3:0.1")) == 3
+    assert len(parse_numbers("12:20:0.1")) == 81
+    assert len(parse_numbers("0.1:0.3:0.1")) == 3
 
 
 def test_that_all_are_captured_is_a_result():

@@ -15,7 +15,7 @@ from afm_jax import Cantilever, CollisionDelay, Contact, ImpactLaw, Platform, Sc
 from afm_jax.apparatus.drive import Tone
 from afm_jax.apparatus.excitation import BaseDrive, ForceDrive
 from afm_jax.cli.main import main
-from afm_jax.cli.share import parse_share
+from afm_jax.cli.number_lists import parse_share
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.start import start_of
 from afm_jax.presets import contact_scene

@@ -160,6 +160,12 @@ def test_a_fitted_law_is_drawn_over_the_rows(tmp_path):
         ("approach_speed_nm_per_us,rebound_speed_nm_per_us\n20,16.6\n", "two or more rebounding tips"),
         ("approach_speed_nm_per_us,rebound_speed_nm_per_us\n20,16.6\n20,16.7\n", "each speed once"),
         ("approach_speed_nm_per_us,rebound_speed_nm_per_us\n20,fast\n", "a speed is not a number"),
+        (
+            "# a law\napproach_speed_nm_per_us,rebound_speed_nm_per_us\n20,16\n30,fast\n",
+            "line 4: a speed is not a number",
+        ),
+        ("approach_speed_nm_per_us,rebound_speed_nm_per_us\n20,16\n30\n", "line 3: there are 1 cells for 2 columns"),
+        ("", "there is no column approach_speed_nm_per_us"),
     ],
 )
 def test_faulty_truths_are_refused(tmp_path, text, said):

@@ -14,8 +14,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fitting.table import AmplitudeTable, TableError, read_table, write_table
-from fitting.tables.table_columns import COLUMN_NAMES
 from fitting.tables.table_comments import known_key
+from fitting.tables.table_rows import COLUMN_NAMES
 
 NAMES = "order,drive_frequency_khz,drive_amplitude_nm,offset_nm,peak_amplitude_nm,peak_amplitude_error_nm\n"
 TEXT = f"# free_frequency_khz = 90\n{NAMES}1,180,4,0,163.3,1.63\n2,349.2,2,-1,106.67,1.06\n"

@@ -1,11 +1,12 @@
 """Faults of a table's file, comments and column names: one line that says what, where and how to mend it."""
 
+import time
 from pathlib import Path
 
 import pytest
 
 from fitting.table import TableError, read_table
-from fitting.tables.table_columns import COLUMN_NAMES
+from fitting.tables.table_rows import COLUMN_NAMES
 from tests.table_texts import KEY, NAMES, ROW, fault_of, message_of
 
 Q = "'# quality_factor = 40 (or 40 +- 2)'"
@@ -146,3 +147,12 @@ def test_the_free_frequency_is_needed(tmp_path: Path):
     assert fault_of(tmp_path, "# free_frequency_mhz = 0.09\n" + NAMES + ROW) == other_unit
     with_unit = f"line 1: free_frequency_khz has '90 kHz' where a number must stand; write {example}, without the unit"
     assert fault_of(tmp_path, "# free_frequency_khz = 90 kHz\n" + NAMES + ROW) == with_unit
+
+
+def test_a_flood_of_unknown_columns_is_refused_at_once(tmp_path: Path):
+    # comparing every name with the known ones took 0.4 ms each, and looking for it among those before it grew as well
+    names = ",".join(f"a_rather_long_column_name_{i}" for i in range(20_000))
+    start = time.perf_counter()
+    message = fault_of(tmp_path, f"{KEY}{names}\n{','.join('1' * 20_000)}\n")
+    assert time.perf_counter() - start < 5.0
+    assert message.startswith("line 2: unknown column 'a_rather_long_column_name_0'")

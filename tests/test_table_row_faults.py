@@ -8,7 +8,7 @@ import pytest
 
 from fitting import table as table_module
 from fitting.table import AmplitudeTable, TableError
-from fitting.tables.table_faults import Faults
+from fitting.tables.csv_text import Faults
 from tests.table_texts import KEY, NAMES, ROW, fault_of
 
 NOT_NUMBER = "is not a number; write it like 174.6 or 1.746e2, without a unit"

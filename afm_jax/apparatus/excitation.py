@@ -32,15 +32,12 @@ class BaseDrive(eqx.Module):
     __repr__ = readable
 
     def __check_init__(self):
-        check_parameter("amplitude_nm", self.amplitude_nm, "not negative")
-        check_parameter("frequency_khz", self.frequency_khz, "positive")
-        check_parameter("phase_deg", self.phase_deg, "finite")
+        _check(self, "amplitude_nm")
 
     @property
     def tones(self) -> tuple[Tone, ...]:
         """The motion's cosines, amplitudes in nm."""
-        first = Tone(self.amplitude_nm, self.frequency_khz, self.phase_deg)
-        return (first,) if self.second is None else (first, self.second)
+        return _tones(self, self.amplitude_nm)
 
     def position_and_velocity(self, time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Return z_b in nm and its rate in nm/us at a time in us."""
@@ -68,19 +65,28 @@ class ForceDrive(eqx.Module):
     __repr__ = readable
 
     def __check_init__(self):
-        check_parameter("amplitude_nn", self.amplitude_nn, "not negative")
-        check_parameter("frequency_khz", self.frequency_khz, "positive")
-        check_parameter("phase_deg", self.phase_deg, "finite")
+        _check(self, "amplitude_nn")
 
     @property
     def tones(self) -> tuple[Tone, ...]:
         """The force's cosines, amplitudes in nN."""
-        first = Tone(self.amplitude_nn, self.frequency_khz, self.phase_deg)
-        return (first,) if self.second is None else (first, self.second)
+        return _tones(self, self.amplitude_nn)
 
     def force(self, time_us: ArrayLike) -> Float[Array, "..."]:
         """Return f in nN at a time in us."""
         return _sum_of_tones(self.tones, time_us)[0]
+
+
+def _check(drive: BaseDrive | ForceDrive, amplitude: str) -> None:
+    """Check the parameters of a drive whose amplitude has this name."""
+    check_parameter(amplitude, getattr(drive, amplitude), "not negative")
+    check_parameter("frequency_khz", drive.frequency_khz, "positive")
+    check_parameter("phase_deg", drive.phase_deg, "finite")
+
+
+def _tones(drive: BaseDrive | ForceDrive, amplitude: Float[Array, "..."]) -> tuple[Tone, ...]:
+    first = Tone(amplitude, drive.frequency_khz, drive.phase_deg)
+    return (first,) if drive.second is None else (first, drive.second)
 
 
 def _sum_of_tones(tones: tuple[Tone, ...], time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:

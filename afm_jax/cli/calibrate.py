@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from afm_jax.cli.failures import NotValid
-from afm_jax.cli.fit import Noise
+from afm_jax.cli.number_lists import Share
 from afm_jax.cli.session import Session, with_session
 
 BACKGROUNDS = ("none", "floor", "constant", "linear")
@@ -22,7 +22,10 @@ BACKGROUNDS = ("none", "floor", "constant", "linear")
 )
 @click.option("--amplitude-only", is_flag=True, help="Leave the phase of the sweep aside.")
 @click.option(
-    "--noise", type=Noise(), metavar="SHARE", help="Error of every point as a share of the largest amplitude."
+    "--noise",
+    type=Share("a relative error"),
+    metavar="SHARE",
+    help="Error of every point as a share of the largest amplitude.",
 )
 @click.option("--scale-errors", is_flag=True, help="Take given errors as relative: scale them until chi2/dof is 1.")
 @with_session

@@ -6,8 +6,8 @@ import click
 
 from afm_jax.cli.contact_options import ContactOptions, chosen_contact, with_contact_options
 from afm_jax.cli.failures import NotValid
+from afm_jax.cli.number_lists import Numbers
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.speeds import Speeds
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -34,7 +34,7 @@ _SHOWN = 40
 @with_contact_options
 @click.option(
     "--speeds",
-    type=Speeds(),
+    type=Numbers("speed", example="12,15,20"),
     metavar="LIST",
     help="Approach speeds in nm/us: 12,15,20 or start:stop:step as 12:200:10 (with the stop where it fits), or both. "
     "Left out: 20 speeds from 1.1 times the capture speed to 200.",

@@ -4,8 +4,7 @@ import click
 
 from afm_jax.cli.design_belief import BeliefOptions, believed, with_belief_options
 from afm_jax.cli.failures import NotValid
-from afm_jax.cli.fit import Noise
-from afm_jax.cli.number_lists import Numbers, Orders
+from afm_jax.cli.number_lists import Numbers, Orders, Share
 from afm_jax.cli.session import Session, with_session
 
 
@@ -37,7 +36,12 @@ from afm_jax.cli.session import Session, with_session
     help="Smallest joint region, or sum of variances.",
 )
 @click.option(
-    "--noise", type=Noise(), default="1%", show_default=True, metavar="SHARE", help="Relative error of an amplitude."
+    "--noise",
+    type=Share("a relative error"),
+    default="1%",
+    show_default=True,
+    metavar="SHARE",
+    help="Relative error of an amplitude.",
 )
 @click.option(
     "--amplitudes",
@@ -48,7 +52,7 @@ from afm_jax.cli.session import Session, with_session
 )
 @click.option(
     "--uncertainty",
-    type=Noise(),
+    type=Share("a relative error"),
     default="10%",
     show_default=True,
     metavar="SHARE",

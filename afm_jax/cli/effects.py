@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 
 import click
 
+from afm_jax.cli.number_lists import Share
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.share import Share
 
 if TYPE_CHECKING:
     from afm_jax.scenefile_start import Start

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from afm_jax.cli.failures import NotValid
-from afm_jax.cli.fit_options import Constraint, Fixed, Names, Noise
+from afm_jax.cli.fit_options import Constraint, Fixed, Names
+from afm_jax.cli.number_lists import Share
 from afm_jax.cli.session import Session, with_session
 
 if TYPE_CHECKING:
@@ -26,7 +27,12 @@ MODELS = ("restitution", "law", "viscous", "restitution+delay", "law+delay", "vi
     help="restitution: r alone; law: r and epsilon; viscous: epsilon and viscous_loss; each with the collision delay "
     "(+delay), which amplitudes near resonance need; contact: physical parameters through the resolved contact.",
 )
-@click.option("--noise", type=Noise(), metavar="SHARE", help="Relative error of amplitudes without one, such as 1%.")
+@click.option(
+    "--noise",
+    type=Share("a relative error"),
+    metavar="SHARE",
+    help="Relative error of amplitudes without one, such as 1%.",
+)
 @click.option(
     "--scale-errors",
     is_flag=True,

@@ -7,8 +7,8 @@ import click
 
 from afm_jax.cli.contact_options import ContactOptions, chosen_contact, with_contact_options
 from afm_jax.cli.failures import NotValid
+from afm_jax.cli.number_lists import Ends
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.speeds import parse_speed_range
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -42,36 +42,17 @@ DELAY_COLUMNS = (
 _SHOWN = 9
 
 
-class SpeedRange(click.ParamType):
-    """Two speeds, low:high."""
-
-    name = "range"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
-        """Return the two speeds.
-
-        Raises:
-            click.BadParameter: if it is no rising pair of positive numbers.
-        """
-        if isinstance(value, tuple):
-            return value
-        try:
-            return parse_speed_range(str(value))
-        except ValueError as error:
-            self.fail(f"{error}; write low:high, as 12:150", param, ctx)
-
-
 @click.command()
 @with_contact_options
 @click.option(
     "--speed-range",
-    type=SpeedRange(),
+    type=Ends(),
     metavar="LOW:HIGH",
     help="Approach speeds of the fit in nm/us. Left out: 1.5 times the capture speed to 250.",
 )
 @click.option(
     "--delay-range",
-    type=SpeedRange(),
+    type=Ends(),
     metavar="LOW:HIGH",
     help="The same for the delay law. Left out: 1.37 times the capture speed to 700.",
 )

@@ -1,4 +1,4 @@
-"""Texts of `afm-jax fit`'s options turned into values: shares, `NAME=VALUE`, `NAME=VALUE+-ERROR`, lists of names."""
+"""Texts of `afm-jax fit`'s options turned into values: `NAME=VALUE`, `NAME=VALUE+-ERROR`, lists of names."""
 
 import math
 from typing import Any
@@ -6,24 +6,6 @@ from typing import Any
 import click
 
 from afm_jax.cli.number_lists import parse_around_plus_minus, parse_number
-from afm_jax.cli.share import parse_share
-
-
-class Noise(click.ParamType):
-    """A relative error: 1% or 0.01."""
-
-    name = "share"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
-        """Return the share that a text says.
-
-        Raises:
-            click.BadParameter: if it is no number between 0 and 1.
-        """
-        try:
-            return parse_share(str(value))
-        except ValueError:
-            self.fail(f"must be a relative error such as 1% or 0.01, but is {value}", param, ctx)
 
 
 class Fixed(click.ParamType):

@@ -5,13 +5,18 @@ from pathlib import Path
 import click
 
 from afm_jax.cli.failures import NotValid
-from afm_jax.cli.fit import Noise
+from afm_jax.cli.number_lists import Share
 from afm_jax.cli.session import Session, with_session
 
 
 @click.command()
 @click.argument("table", metavar="[TABLE.csv]", required=False, type=click.Path(path_type=Path))
-@click.option("--noise", type=Noise(), metavar="SHARE", help="Relative error of amplitudes without one, such as 1%.")
+@click.option(
+    "--noise",
+    type=Share("a relative error"),
+    metavar="SHARE",
+    help="Relative error of amplitudes without one, such as 1%.",
+)
 @click.option(
     "--frequency-error",
     "frequency_error_khz",

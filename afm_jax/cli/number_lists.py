@@ -1,11 +1,11 @@
-"""Lists on the command line: numbers and ranges, whole numbers, and values with their errors."""
+"""Numbers on the command line: lists and ranges of them, whole numbers, shares, and values with their errors."""
 
 import math
 from typing import Any
 
 import click
 
-_MOST = 100_000
+_MOST = 1_000_000
 
 
 class Numbers(click.ParamType):
@@ -13,9 +13,9 @@ class Numbers(click.ParamType):
 
     name = "numbers"
 
-    def __init__(self, *, positive: bool = True):
-        """Say whether the numbers must be positive."""
-        self.positive = positive
+    def __init__(self, what: str = "number", *, positive: bool = True, example: str = "1,2,5"):
+        """Say what the numbers are, one of them in a word, and whether they must be positive."""
+        self.what, self.positive, self.example = what, positive, example
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
         """Return the numbers that a text says, in its order.
@@ -26,12 +26,9 @@ class Numbers(click.ParamType):
         if isinstance(value, tuple):
             return value
         try:
-            numbers = parse_numbers(str(value))
+            return parse_numbers(str(value), self.what, positive=self.positive)
         except ValueError as error:
-            self.fail(f"{error}; write 1,2,5 or start:stop:step", param, ctx)
-        if self.positive and min(numbers) <= 0.0:
-            self.fail(f"must hold positive numbers, but one is {min(numbers):g}", param, ctx)
-        return numbers
+            self.fail(f"{error}; write {self.example} or start:stop:step", param, ctx)
 
 
 class Orders(click.ParamType):
@@ -51,6 +48,46 @@ class Orders(click.ParamType):
             return parse_orders(str(value))
         except ValueError as error:
             self.fail(f"{error}; write 1,2 or 1-4", param, ctx)
+
+
+class Ends(click.ParamType):
+    """Two positive numbers, low:high."""
+
+    name = "range"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
+        """Return the two numbers.
+
+        Raises:
+            click.BadParameter: if it is no rising pair of positive numbers.
+        """
+        if isinstance(value, tuple):
+            return value
+        try:
+            return parse_ends(str(value))
+        except ValueError as error:
+            self.fail(f"{error}; write low:high, as 12:150", param, ctx)
+
+
+class Share(click.ParamType):
+    """A share between 0 and 100 %, neither of the two: `1%`, `1 %` or `0.01`."""
+
+    name = "share"
+
+    def __init__(self, what: str = "a share"):
+        """Say what it is a share of, in a few words of the message."""
+        self.what = what
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return the share that a text says, as a number between 0 and 1.
+
+        Raises:
+            click.BadParameter: if it is none.
+        """
+        try:
+            return parse_share(str(value))
+        except ValueError:
+            self.fail(f"must be {self.what} such as 1% or 0.01, above 0 and below 100 %, but is {value}", param, ctx)
 
 
 class ValueAndError(click.ParamType):
@@ -77,23 +114,46 @@ class ValueAndError(click.ParamType):
         return numbers[0], numbers[1] if len(numbers) == 2 else None
 
 
-def parse_numbers(text: str) -> tuple[float, ...]:
+def parse_numbers(text: str, what: str = "number", *, positive: bool = False) -> tuple[float, ...]:
     """Return the numbers that a text lists.
 
     >>> parse_numbers("-1,0,2:3:0.5")
     (-1.0, 0.0, 2.0, 2.5, 3.0)
 
+    Args:
+        text: a comma list; each part a number or a range start:stop:step.
+        what: one of the numbers, in a word of the messages.
+        positive: whether they must be positive.
+
     Raises:
-        ValueError: if it lists none, or a part is no finite number or no rising range.
+        ValueError: if it lists none, or a part is no such number or no rising range.
     """
     if not text.strip():
-        raise ValueError("names no number")
+        raise ValueError(f"names no {what}")
     numbers: list[float] = []
     for part in text.split(","):
-        numbers += _range(part) if ":" in part else [parse_number(part)]
+        numbers += _range(part, what, positive=positive) if ":" in part else [_number(part, what, positive=positive)]
         if len(numbers) > _MOST:
-            raise ValueError(f"names more than {_MOST} numbers")
+            raise ValueError(f"names more than {_MOST} {what}s")
     return tuple(numbers)
+
+
+def parse_ends(text: str) -> tuple[float, float]:
+    """Return the two numbers of `low:high`.
+
+    >>> parse_ends("12:150")
+    (12.0, 150.0)
+
+    Raises:
+        ValueError: if it is no rising pair of positive numbers.
+    """
+    ends = text.split(":")
+    if len(ends) != 2:
+        raise ValueError(f"`{text.strip()}` is no range")
+    low, high = (_number(end, what, positive=True) for end, what in zip(ends, ("lower end", "upper end"), strict=True))
+    if high <= low:
+        raise ValueError(f"`{text.strip()}` does not rise")
+    return low, high
 
 
 def parse_orders(text: str) -> tuple[int, ...]:
@@ -117,19 +177,30 @@ def parse_orders(text: str) -> tuple[int, ...]:
     return tuple(dict.fromkeys(orders))
 
 
-def _range(part: str) -> list[float]:
+def _range(part: str, what: str, *, positive: bool) -> list[float]:
     ends = part.split(":")
     if len(ends) != 3:
         raise ValueError(f"`{part.strip()}` is no range")
-    start, stop, step = (parse_number(end) for end in ends)
-    if step <= 0.0 or stop < start:
-        raise ValueError(f"`{part.strip()}` does not rise")
+    start, stop = (_number(end, name, positive=positive) for end, name in zip(ends[:2], ("start", "stop"), strict=True))
+    step = _number(ends[2], "step", positive=True)
+    if stop < start:
+        raise ValueError(f"`{part.strip()}` ends below its start")
     # a hair more than the quotient, so that rounding does not cost the stop
     steps = (stop - start) / step * (1.0 + 1e-12) + 1e-9
     if steps > _MOST:
-        raise ValueError(f"`{part.strip()}` has more than {_MOST} numbers")
+        raise ValueError(f"`{part.strip()}` has more than {_MOST} {what}s")
     # rounded to what was meant: 0.97 + 3 * 0.01 is 1
     return [float(f"{start + step * index:.12g}") for index in range(math.floor(steps) + 1)]
+
+
+def _number(text: str, what: str, *, positive: bool) -> float:
+    try:
+        number = parse_number(text)
+    except ValueError:
+        number = math.nan
+    if not (number > 0.0 if positive else math.isfinite(number)):
+        raise ValueError(f"the {what} `{text.strip()}` is not a {'positive ' if positive else ''}number")
+    return number
 
 
 def parse_around_plus_minus(text: str) -> list[float]:
@@ -157,3 +228,19 @@ def parse_number(text: str) -> float:
     if not math.isfinite(number):
         raise ValueError(f"`{text.strip()}` is not a number")
     return number
+
+
+def parse_share(text: str) -> float:
+    """Return the share that a text says.
+
+    >>> parse_share("1 %"), parse_share("0.01")
+    (0.01, 0.01)
+
+    Raises:
+        ValueError: if it is no number, or not between 0 and 100 %.
+    """
+    number, percent, rest = text.strip().partition("%")
+    share = parse_number(number) / (100.0 if percent else 1.0)
+    if rest or not 0.0 < share < 1.0:
+        raise ValueError(f"`{text.strip()}` is no share")
+    return share

@@ -48,14 +48,3 @@ def force_in_phase(
     solid = contact.junction.force(junction.shift_nm - gap)
     here = jnp.asarray(phase)
     return jnp.where(here == Phase.DRY, dry, jnp.where(here == Phase.BRIDGE, bridge, solid))
-
-
-def potential_in_phase(
-    contact: Contact, junction: Junction, phase: ArrayLike, gap_nm: ArrayLike
-) -> Float[Array, "..."]:
-    """Return the potential energy in aJ in a phase at a gap in nm; each phase has its own zero."""
-    gap = as_argument(gap_nm)
-    bridge = contact.forces.potential(jnp.where(gap > 0.0, gap, 1.0))
-    solid = contact.junction.potential(junction.shift_nm - gap)
-    here = jnp.asarray(phase)
-    return jnp.where(here == Phase.DRY, jnp.zeros_like(gap), jnp.where(here == Phase.BRIDGE, bridge, solid))

@@ -12,7 +12,6 @@ from afm_jax.impact.lasting_closure import LastingProblem, lasting_closure, last
 
 _CROSSINGS, _TURNS = 6, 2
 """Changes of sign that are followed, and extrema without one that are looked at for a pair of roots."""
-SLOTS = _CROSSINGS + 2 * _TURNS
 SCAN_POINTS = 512
 """Coordinates scanned, some 70 to the decade."""
 _LOWEST, _HIGHEST = 1e-3, 1e4
@@ -75,7 +74,7 @@ def regular(coordinate: Float[Array, ""], problem: LastingProblem) -> Bool[Array
 
 
 def _brackets(grid, value, brief, problem: LastingProblem, harmless) -> tuple[Array, Array, Array, Array]:
-    """Return ends and values of `SLOTS` intervals, last those of pairs that the grid stepped over; empty ones: 0."""
+    """Return ends and values of intervals, last those of pairs that the grid stepped over; empty ones: 0."""
     crossing = (value[:-1] * value[1:] < 0.0) & brief[:-1] & brief[1:]
     # the fastest ones, if there are too many: close to capture the law itself ends
     at = crossing.shape[0] - 1 - jnp.nonzero(crossing[::-1], size=_CROSSINGS, fill_value=0)[0]

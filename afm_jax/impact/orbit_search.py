@@ -7,7 +7,6 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbit_closure import (
     OrbitProblem,
     capture_coordinate,
@@ -18,8 +17,7 @@ from afm_jax.impact.orbit_closure import (
 )
 from afm_jax.impact.polynomial_roots import real_roots
 
-SLOTS_INSTANTANEOUS = 4
-SLOTS_DELAYED = 16
+_SLOTS = 16
 SCAN_POINTS = 8192
 """Coordinates at which the delayed closing condition is scanned: some 500 to the decade of approach speed."""
 _BISECTIONS = 60
@@ -34,11 +32,6 @@ class OrbitRoots(NamedTuple):
     coordinate: Float[Array, " slots"]
     found: Bool[Array, " slots"]
     complete: Bool[Array, ""]
-
-
-def slots_of(law: ImpactLaw) -> int:
-    """Return how many orbits a result has room for: 4 is all there can be without a delay."""
-    return SLOTS_INSTANTANEOUS if law.delay is None else SLOTS_DELAYED
 
 
 def find_roots(problem: OrbitProblem) -> OrbitRoots:
@@ -90,11 +83,11 @@ def _scanned_roots(problem: OrbitProblem) -> OrbitRoots:
     delay = jax.vmap(lambda y: speeds_at(y, problem.law).delay)(ends[0])
     brief = jnp.abs(delay) < problem.platform.period_us
     bracket = (values[0] * values[1] < 0.0) & brief
-    chosen = jnp.nonzero(bracket, size=SLOTS_DELAYED, fill_value=0)[0]
+    chosen = jnp.nonzero(bracket, size=_SLOTS, fill_value=0)[0]
     count = jnp.sum(bracket)
-    found = jnp.arange(SLOTS_DELAYED) < count
+    found = jnp.arange(_SLOTS) < count
     root = _bisect(lambda y: residual(y, problem), ends[0][chosen], ends[1][chosen], values[0][chosen])
-    return OrbitRoots(root, found, count <= SLOTS_DELAYED)
+    return OrbitRoots(root, found, count <= _SLOTS)
 
 
 def _scan_grid(problem: OrbitProblem) -> Float[Array, " points"]:

@@ -7,8 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from fitting.tables.table_faults import TableError, printable
-from fitting.tables.table_file import read_text
+from fitting.tables.csv_text import TableError, printable, read_text
 
 _COLUMNS = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us")
 

@@ -10,7 +10,7 @@ from fitting.reporting.report_html_elements import Markup, breakable, bullets, e
 from fitting.reporting.report_html_tables import MOST_ROWS, left_out
 from fitting.result import FitResult
 from fitting.table import AmplitudeTable
-from fitting.tables.table_columns import COLUMN_NAMES
+from fitting.tables.table_rows import COLUMN_NAMES
 
 
 def input_section(measured: AmplitudeTable) -> Markup:

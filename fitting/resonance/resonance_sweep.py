@@ -19,8 +19,7 @@ from jaxtyping import Float, Int, Shaped
 
 from fitting.resonance.sweep_csv import parse_csv
 from fitting.resonance.sweep_nanonis import MARK, parse_nanonis
-from fitting.tables.table_faults import Faults, TableError
-from fitting.tables.table_file import read_text
+from fitting.tables.csv_text import Faults, TableError, read_text
 
 __all__ = ["ResonanceSweep", "TableError", "read_sweep", "without_phase"]
 
@@ -126,12 +125,8 @@ def read_sweep(path: str | Path) -> ResonanceSweep:
     """
     faults = Faults(str(path))
     text = read_text(path)
-    lines = list(enumerate(text.split("\n"), start=1))
-    if not text.strip():
-        faults.add("the file holds nothing; add a row of column names and rows of numbers")
-        faults.raise_any()
-    parse = parse_nanonis if any(line.strip() == MARK for _, line in lines) else parse_csv
-    parsed = parse(lines, faults)
+    parse = parse_nanonis if any(line.strip() == MARK for line in text.split("\n")) else parse_csv
+    parsed = parse(text, faults)
     faults.raise_any()
     arrays = {name: parsed.columns.get(name) for name in _COLUMNS}
     frequency, amplitude = arrays.pop("frequency_khz"), arrays.pop("amplitude")

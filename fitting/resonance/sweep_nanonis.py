@@ -4,10 +4,8 @@ The columns read are ``Frequency Shift (Hz)`` with ``Center Frequency (Hz)`` (or
 and, where it is there, ``Phase (deg)``; others are passed over.
 """
 
-from fitting.resonance.sweep_csv import HZ_PER_KHZ
-from fitting.resonance.sweep_rows import NumberedLines, ParsedSweep, parse_cells
-from fitting.tables.table_columns import NUMBER
-from fitting.tables.table_faults import Faults
+from fitting.resonance.sweep_csv import HZ_PER_KHZ, SWEEP, ParsedSweep
+from fitting.tables.csv_text import NUMBER, Faults, parse_cells
 
 MARK = "[DATA]"
 """The line above the block of data."""
@@ -19,20 +17,21 @@ _FOUND = {"f_res (Hz)": ("frequency_khz", 1.0 / HZ_PER_KHZ), "Q": ("quality_fact
 _REMARKS = ("Experiment", "Date", "User", "Comment01")
 
 
-def parse_nanonis(lines: NumberedLines, faults: Faults) -> ParsedSweep:
-    """Read the lines of a Nanonis text file.
+def parse_nanonis(text: str, faults: Faults) -> ParsedSweep:
+    """Read the text of a Nanonis file.
 
     Args:
-        lines: all of them, numbered; one of them is `MARK`.
+        text: all of it; one of its lines is `MARK`.
         faults: where faults are noted; with any, the result is not to be used.
 
     Raises:
         TableError: at once where a column is missing: the cells cannot be judged then.
     """
-    start = next(position for position, (_, text) in enumerate(lines) if text.strip() == MARK)
-    header = [_cells(text) for _, text in lines[:start]]
+    lines = list(enumerate(text.split("\n"), start=1))
+    start = next(position for position, (_, line) in enumerate(lines) if line.strip() == MARK)
+    header = [_cells(line) for _, line in lines[:start]]
     settings = {cells[0]: cells[1] for cells in header if len(cells) > 1 and cells[1]}
-    rows = [(line, _cells(text)) for line, text in lines[start + 1 :] if text.strip()]
+    rows = [(number, _cells(line)) for number, line in lines[start + 1 :] if line.strip()]
     if not rows:
         faults.add(f"there is nothing below {MARK}; export the sweep again", line=lines[start][0])
         faults.raise_any()
@@ -47,7 +46,7 @@ def parse_nanonis(lines: NumberedLines, faults: Faults) -> ParsedSweep:
         faults.add("there are column names but no rows below them; export the sweep again", line=names_line)
     faults.raise_any()
     wanted += [PHASE] if PHASE in names else []
-    columns, numbers = parse_cells(rows, names, wanted, faults)
+    columns, _, numbers = parse_cells(rows, names, wanted, SWEEP, faults)
     frequency_hz = columns[SHIFT] + columns[CENTRE] if by_shift else columns[FREQUENCY]
     attributes = {"frequency_khz": frequency_hz / HZ_PER_KHZ, "amplitude": columns[AMPLITUDE] * NM_PER_M}
     if PHASE in columns:

@@ -38,11 +38,6 @@ def drives_of(rows: Sequence[tuple[int, float, float, float]]) -> Drives:
     return Drives(columns[0].astype(np.int64), *columns[1:])
 
 
-def drives_of_table(table: AmplitudeTable) -> Drives:
-    """Return the drives of a table."""
-    return Drives(table.order, table.drive_frequency_khz, table.drive_amplitude_nm, table.offset_nm)
-
-
 def simulate_experiment(  # noqa: PLR0913
     interaction: Contact | ImpactLaw,
     cantilever: Cantilever,

@@ -3,8 +3,7 @@
 import re
 from dataclasses import dataclass
 
-from fitting.tables.table_columns import DECIMAL_COMMA, NUMBER, nearest_name
-from fitting.tables.table_faults import Faults, quoted
+from fitting.tables.csv_text import DECIMAL_COMMA, NUMBER, Faults, nearest_name, quoted
 
 EXAMPLES = {
     "free_frequency_khz": "# free_frequency_khz = 90",

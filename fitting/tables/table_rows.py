@@ -1,85 +1,57 @@
-"""The rows of an amplitude table: from text to columns of numbers, and the checks that every table must pass."""
-
-import contextlib
-import csv
+"""The columns of an amplitude table, and the checks that every table must pass."""
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from fitting.tables.table_columns import AMPLITUDES, COLUMNS, DECIMAL_COMMA, MEASURED, NUMBER, REQUIRED, Column
-from fitting.tables.table_faults import Faults, quoted
+from fitting.tables.csv_text import Column, Columns, Faults, Form, Head, Masks
 
-Columns = dict[str, Float[np.ndarray, " rows"]]
-Masks = dict[str, Bool[np.ndarray, " rows"]]
+COLUMNS = (
+    Column("order", needed="order", required=True, integer=True),
+    Column("drive_frequency_khz", "kHz", needed="drive frequency", required=True),
+    Column("drive_amplitude_nm", "nm", needed="drive amplitude", required=True),
+    Column("offset_nm", "nm", needed="offset", required=True, positive=False),
+    Column("peak_amplitude_nm", "nm", needed="amplitude", error="peak_amplitude_error_nm", amplitude=True),
+    Column("peak_amplitude_error_nm", "nm"),
+    Column("lockin_amplitude_nm", "nm", needed="amplitude", error="lockin_amplitude_error_nm", amplitude=True),
+    Column("lockin_amplitude_error_nm", "nm"),
+    Column("phase_deg", "degrees", error="phase_error_deg", positive=False),
+    Column("phase_error_deg", "degrees"),
+    Column("no_orbit", positive=False, flag=True),
+)
+TABLE = Form(
+    COLUMNS,
+    "drive",
+    blanks=True,
+    fewer="fill in the others",
+    more="remove the others; a decimal comma must be a point",
+    number="write it like 174.6 or 1.746e2, without a unit",
+)
+COLUMN_NAMES = TABLE.names
+REQUIRED = tuple(column for column in COLUMNS if column.required)
+MEASURED = tuple(column for column in COLUMNS if column.error is not None)
+AMPLITUDES = tuple(column for column in COLUMNS if column.amplitude)
 
 
-def split_cells(text: str) -> list[str]:
-    """Return the cells of one line, without the spaces and quotation marks around them."""
-    # The csv module is needed for quotation marks only, and costs more than the rest of the reading.
-    cells = next(csv.reader([text], skipinitialspace=True)) if '"' in text else text.split(",")
-    return [cell.strip() for cell in cells]
-
-
-def parse_rows(
-    rows: list[tuple[int, str]], names: list[str], faults: Faults
-) -> tuple[Columns, Masks, Int[np.ndarray, " rows"]]:
-    """Turn lines of text into columns of numbers.
+def check_error_columns(head: Head, faults: Faults, noise: float | None) -> None:
+    """Note measured columns without their errors, and errors without what they belong to.
 
     Args:
-        rows: line number and text of each row.
-        names: the column names, checked before.
+        head: the column names.
         faults: where the faults are noted.
-
-    Returns:
-        Per column name the numbers (NaN where a cell is blank or unreadable) and the mask of the unreadable cells; and
-        the line number of each row.
+        noise: relative noise for amplitudes without an error column, or None.
     """
-    lines, table = [], []
-    for line, text in rows:
-        cells = split_cells(text)
-        if text.count('"') % 2:
-            faults.add("a quotation mark is not closed; close or remove it", line=line)
-        elif len(cells) != len(names):
-            fewer = len(cells) < len(names)
-            hint = "fill in the others" if fewer else "remove the others; a decimal comma must be a point"
-            faults.add(f"there are {len(cells)} cells for {len(names)} columns; {hint}", line=line)
-        else:
-            lines.append(line)
-            table.append(cells)
-    columns, unreadable = {}, {}
-    texts = zip(*table, strict=True) if table else [()] * len(names)
-    for name, column_texts in zip(names, texts, strict=True):
-        columns[name], unreadable[name] = _parse_column(name, column_texts, lines, faults)
-    return columns, unreadable, np.array(lines, dtype=np.int64)
-
-
-def _parse_column(
-    name: str, texts: tuple[str, ...], lines: list[int], faults: Faults
-) -> tuple[Float[np.ndarray, " rows"], Bool[np.ndarray, " rows"]]:
-    numbers = np.full(len(texts), np.nan)
-    unreadable = np.zeros(len(texts), dtype=bool)
-    column = next(column for column in COLUMNS if column.name == name)
-    if set("".join(texts)) <= set("0123456789+-" if column.integer else "0123456789+-.eE"):
-        # Written in these signs, what float() takes is what NUMBER describes, and it takes it much faster.
-        with contextlib.suppress(ValueError):
-            return np.array([float(text or "nan") for text in texts], dtype=np.float64), unreadable
-    for row, text in enumerate(texts):
-        if NUMBER.fullmatch(text) and not (column.integer and set(text) & set(".eE")):
-            numbers[row] = float(text)
-        elif text:
-            unreadable[row] = True
-            faults.add(_unreadable(text, column), line=lines[row], column=name)
-    return numbers, unreadable
-
-
-def _unreadable(text: str, column: Column) -> str:
-    if DECIMAL_COMMA.fullmatch(text):
-        return f"{quoted(text)} has a decimal comma; write a point"
-    if column.integer:
-        return f"{quoted(text)} is not a positive whole number; write 1, 2, 3, ..."
-    if not column.required and text.lower().lstrip("+-") in {"nan", "inf", "infinity", "na", "n/a", "none", "null", ""}:
-        return f"{quoted(text)} is not a number; leave the cell of a value that was not measured blank"
-    return f"{quoted(text)} is not a number; write it like 174.6 or 1.746e2, without a unit"
+    for column in MEASURED:
+        error, line = str(column.error), head.line
+        if error in head.present and column.name not in head.present:
+            message = f"stands without {column.name}; add that column or remove this one"
+            faults.add(message, line=line, column=error)
+        if column.name not in head.present or error in head.present:
+            continue
+        if not column.amplitude:
+            faults.add(f"has no errors; add the column {error}", line=line, column=column.name)
+        elif noise is None:
+            hint = f"add the column {error} or give the relative noise (--noise 1%)"
+            faults.add(f"has no errors; {hint}", line=line, column=column.name)
 
 
 def fill_errors(columns: Columns, unreadable: Masks, noise: float | None) -> None:

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fitting.tables.table_faults import Faults, quoted
+from fitting.tables.csv_text import Faults, quoted
 from fitting.traces.lockin_csv import ATTRIBUTES, ParsedTrace, wanted_columns
 from fitting.traces.lockin_settings import settings_of_attributes
 

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save
-from fitting.tables.table_faults import printable
+from fitting.tables.csv_text import printable
 from fitting.traces.lockin_result import LockinResult
 
 _FLAGGED = "#B00020"

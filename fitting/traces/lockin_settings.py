@@ -4,9 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from fitting.tables.table_columns import DECIMAL_COMMA, NUMBER, nearest_name
+from fitting.tables.csv_text import DECIMAL_COMMA, NUMBER, Faults, nearest_name, quoted
 from fitting.tables.table_comments import KEY_AND_VALUE, LOWEST_QUALITY_FACTOR, PLUS_MINUS, SHORT_NAMES
-from fitting.tables.table_faults import Faults, quoted
 
 LOWEST: dict[str, float] = {
     "sampling_rate_mhz": 0.0,

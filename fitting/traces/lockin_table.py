@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from fitting.table import AmplitudeTable
-from fitting.tables.table_faults import TableError
+from fitting.tables.csv_text import TableError
 from fitting.traces.lockin_result import LockinResult
 
 _SHARED = ("free_frequency_khz", "quality_factor", "quality_factor_error", "mass_ng")

@@ -20,8 +20,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from fitting.tables.table_faults import Faults, TableError
-from fitting.tables.table_file import read_text
+from fitting.tables.csv_text import Faults, TableError, read_text
 from fitting.traces.lockin_csv import ParsedTrace, parse_csv
 from fitting.traces.lockin_hdf5 import SIGNATURE, parse_hdf5
 from fitting.traces.lockin_settings import TraceSettings, joined_settings
@@ -157,7 +156,7 @@ def read_trace(path: str | Path, *, group: str | None = None, **settings: float 
     else:
         if group is not None:
             faults.add("is no HDF5 file and has no groups; leave the group out")
-        parsed = parse_csv(list(enumerate(read_text(path).split("\n"), start=1)), faults)
+        parsed = parse_csv(read_text(path), faults)
     joined = joined_settings(parsed.settings, settings, faults)
     faults.raise_any()
     start, step = _clock(parsed, joined, faults)

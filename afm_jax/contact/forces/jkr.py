@@ -129,10 +129,5 @@ class Jkr(eqx.Module):
         """Return the potential energy in aJ at a depth in nm, 0 where the contact radius would vanish."""
         return self.energy_scale_aj * work(self._root(depth_nm))
 
-    def contact_radius_nm(self, depth_nm: ArrayLike) -> Float[Array, "..."]:
-        """Return the contact radius a in nm at a depth in nm."""
-        scale = jnp.cbrt(jnp.pi * self.adhesion_energy_j_per_m2 * self.tip_radius_nm**2 / self.modulus_gpa)
-        return scale * self._root(depth_nm) ** 2
-
     def _root(self, depth_nm: ArrayLike) -> Float[Array, "..."]:
         return root_of_depth(as_argument(depth_nm) / self.depth_scale_nm)

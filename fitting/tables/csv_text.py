@@ -1,0 +1,487 @@
+"""CSV files: from bytes to columns of numbers by a specification of the columns, every fault one line with its place.
+
+A file is UTF-8 text: comment lines that begin with a number sign, a row of column names, a row of cells for each thing
+that was measured. What the columns are a `Form` says; tables of amplitudes, resonance sweeps, time traces and laws are
+read by the same functions.
+"""
+
+import contextlib
+import csv
+import difflib
+import re
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
+"""A number as a file writes it; stricter than ``float``, which also takes "nan", "inf" and "1_000"."""
+DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?", re.ASCII)
+_SUGGESTIONS = 20
+"""How many unknown column names are compared with the known ones; it takes some milliseconds each."""
+
+NumberedLines = list[tuple[int, str]]
+"""Lines of a file, each with its number."""
+NumberedCells = list[tuple[int, list[str]]]
+"""Their cells."""
+Columns = dict[str, Float[np.ndarray, " rows"]]
+Masks = dict[str, Bool[np.ndarray, " rows"]]
+
+
+class TableError(ValueError):
+    """A file or table that cannot be used; the message is one line: what, where, how to mend it."""
+
+
+@dataclass
+class Faults:
+    """Keeps the fault that comes first in the file and counts the others.
+
+    Attributes:
+        source: the table's name, as it begins every message.
+        place: what a row's number is called, "line" for a file and "row" for a table in memory.
+        count: how many faults were noted.
+    """
+
+    source: str
+    place: str = "line"
+    count: int = field(default=0, init=False)
+    _first: tuple[int, str] | None = field(default=None, init=False)
+
+    def add(self, message: str, *, line: int = 0, column: str | None = None) -> None:
+        """Note a fault.
+
+        Args:
+            message: what is wrong and how to mend it, without the place.
+            line: number of the line (or row) it is in; 0 stands for the table as a whole and comes first.
+            column: name of the column it is in.
+        """
+        self.count += 1
+        if self._first is not None and self._first[0] <= line:
+            return
+        place = printable(self.source)
+        if line:
+            place += f", {self.place} {line}"
+        if column is not None:
+            place += f", column {column}"
+        self._first = (line, f"{place}: {message}")
+
+    def raise_any(self) -> None:
+        """Raise the first fault, if there is one.
+
+        Raises:
+            TableError: with the first fault and the number of the others.
+        """
+        if self._first is None:
+            return
+        message = self._first[1]
+        if self.count > 1:
+            message += f" (and {self.count - 1} more fault{'s' if self.count > 2 else ''})"
+        raise TableError(message)
+
+
+def printable(text: str) -> str:
+    """Return a text that fits on one line of a message: escaped where it holds line breaks or control characters."""
+    return text if text.isprintable() else repr(text)
+
+
+def quoted(text: str) -> str:
+    """Return a piece of the file for a message: in quotation marks, escaped, and cut after 40 characters."""
+    return repr(text if len(text) <= 40 else text[:40] + "...")
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column that a form of file may have.
+
+    Attributes:
+        name: its name in the file.
+        unit: its unit in words of a message; empty for a plain number, or where the name says enough.
+        meaning: what its numbers become; empty: the name. Two columns of one meaning say the same.
+        needed: what it gives, in a word, if every file needs a column that gives it; else empty.
+        positive: whether its numbers must be above zero.
+        integer: whether its numbers must be whole.
+        required: whether every row needs it.
+        error: the name of the column that holds its standard errors, for a measured column.
+        amplitude: whether it is a measured amplitude: each row needs one, and a relative noise applies to it.
+        flag: whether its numbers are 0 or 1.
+    """
+
+    name: str
+    unit: str = ""
+    meaning: str = ""
+    needed: str = ""
+    positive: bool = True
+    integer: bool = False
+    required: bool = False
+    error: str | None = None
+    amplitude: bool = False
+    flag: bool = False
+
+    @property
+    def says(self) -> str:
+        """What its numbers become."""
+        return self.meaning or self.name
+
+
+@dataclass(frozen=True)
+class Form:
+    """A form of file: its columns, and the words that its messages need.
+
+    Attributes:
+        columns: the columns it may have.
+        row: what a row is measured at: a drive, a point, a sample.
+        open: whether columns of other names are left alone, not refused.
+        blanks: whether cells may be blank (NaN); else every cell is needed.
+        example: a row of column names to show, where the row above the numbers is the whole head.
+        separators: what to add where columns are not separated by commas.
+        fewer: what to do with a row of too few cells.
+        more: and with one of too many.
+        number: how a number is written.
+    """
+
+    columns: tuple[Column, ...]
+    row: str
+    open: bool = False
+    blanks: bool = False
+    example: str = ""
+    separators: str = ""
+    fewer: str = "fill the row up"
+    more: str = "a decimal comma must be a point"
+    number: str = "write it like 90.25 or 9.025e1, or remove the row"
+
+    def column(self, name: str) -> Column | None:
+        """Return the column of a name, None if there is none."""
+        return next((column for column in self.columns if column.name == name), None)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The columns' names."""
+        return tuple(column.name for column in self.columns)
+
+
+@dataclass(frozen=True)
+class Head:
+    """The row of column names of a file.
+
+    Attributes:
+        names: the cells.
+        line: where it stands.
+        present: the columns, and what they become, that are there or that a misspelt name was meant to be.
+    """
+
+    names: list[str]
+    line: int
+    present: set[str]
+
+
+def read_text(path: str | Path) -> str:
+    """Return the text of a UTF-8 file, with or without a byte order mark, with every line end as a newline.
+
+    Args:
+        path: the file.
+
+    Raises:
+        TableError: if there is no such file, it cannot be read or is not UTF-8 text.
+    """
+    name = printable(str(path))
+    try:
+        data = Path(path).read_bytes()
+    except FileNotFoundError:
+        raise TableError(f"{name}: there is no such file; check the path") from None
+    except IsADirectoryError:
+        raise TableError(f"{name}: is a folder; give the path of a CSV file") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise TableError(f"{name}: cannot be read ({reason}); check the path and its permissions") from error
+    data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
+    try:
+        text = data.decode("utf-8-sig")
+        # UTF-16 of plain English is valid UTF-8 with a zero byte in front of every letter.
+        start = text.find("\0")
+    except UnicodeDecodeError as error:
+        text, start = data[: error.start].decode("utf-8", errors="replace"), error.start
+    if start >= 0:
+        line = text.count("\n", 0, start) + 1
+        raise TableError(f"{name}, line {line}: is not UTF-8 text; save the table as CSV with the encoding UTF-8")
+    return text
+
+
+def split_lines(text: str) -> tuple[NumberedLines, NumberedLines]:
+    """Return comments (without their number sign, stripped) and other lines of a text, numbered, without blank ones."""
+    comments, rows = [], []
+    for number, line in enumerate(text.split("\n"), start=1):
+        stripped = line.strip(" \t")
+        if stripped.startswith("#"):
+            comments.append((number, stripped[1:].strip()))
+        elif stripped.strip(",; \t"):
+            rows.append((number, line))
+    return [comment for comment in comments if comment[1]], rows
+
+
+def split_cells(text: str) -> list[str]:
+    """Return the cells of one line, without the spaces and quotation marks around them."""
+    # The csv module is needed for quotation marks only, and costs more than the rest of the reading.
+    cells = next(csv.reader([text], skipinitialspace=True)) if '"' in text else text.split(",")
+    return [cell.strip() for cell in cells]
+
+
+def named_rows(rows: NumberedLines, form: Form, faults: Faults) -> tuple[Head, NumberedLines]:
+    """Return the column names of a file and the rows below, after noting every fault of the names.
+
+    Args:
+        rows: the lines that are no comments, at least one.
+        form: what the file is to be.
+        faults: where faults are noted.
+
+    Raises:
+        TableError: at once where the columns are not separated by commas: every other message would mislead.
+    """
+    line, text = rows[0]
+    _check_delimiter(text, form, line=line, faults=faults)
+    names, found = split_cells(text), faults.count
+    present = check_names(names, form, line=line, faults=faults)
+    if not rows[1:] and faults.count == found:
+        message = f"there are column names but no rows below them; add a row for each {form.row}"
+        faults.add(message, line=line)
+    return Head(names, line, present), rows[1:]
+
+
+def check_not_empty(comments: NumberedLines, rows: NumberedLines, faults: Faults) -> None:
+    """Raise at once where a file has no row at all.
+
+    Raises:
+        TableError: if there is none.
+    """
+    if not rows:
+        what = "only comments" if comments else "nothing"
+        faults.add(f"the file holds {what}; add a row of column names and rows of numbers")
+        faults.raise_any()
+
+
+def _check_delimiter(names: str, form: Form, *, line: int, faults: Faults) -> None:
+    if "," in names:
+        return
+    for sign, word in ((";", "semicolons"), ("\t", "tabs"), (" ", "spaces")):
+        if sign in names.strip():
+            only = Faults(faults.source)
+            advice = f"separate them by commas, decimals by points{form.separators}"
+            only.add(f"the columns are separated by {word}; {advice}", line=line)
+            only.raise_any()
+
+
+def check_names(names: list[str], form: Form, *, line: int = 0, faults: Faults) -> set[str]:
+    """Note every fault of column names (or of the names of data sets); return what `Head` calls present."""
+    if any(NUMBER.fullmatch(name) for name in names):
+        missing = (
+            f"a row of column names above it: {form.example}" if form.example else "the row of column names above it"
+        )
+        faults.add(f"the first row holds numbers; put {missing}", line=line)
+        return set()
+    first: dict[str, int] = {}
+    present: set[str] = set()
+    unknown = []
+    for position, name in enumerate(names, start=1):
+        column = form.column(name)
+        if column is None:
+            unknown.append((position, name))
+        elif name in first:
+            faults.add(f"is there twice, as columns {first[name]} and {position}; remove one", line=line, column=name)
+        elif column.says in present:
+            faults.add("says again what another column says; remove one", line=line, column=name)
+        else:
+            present |= {column.says, name}
+        first.setdefault(name, position)
+    # A name that was only misspelt is reported; that its column is then missing is not a second fault.
+    meant = _check_unknown(unknown, form, present, line=line, faults=faults)
+    _check_missing(names, form, present | meant, line=line, faults=faults)
+    return present | meant
+
+
+def _check_unknown(
+    unknown: list[tuple[int, str]], form: Form, present: set[str], *, line: int, faults: Faults
+) -> set[str]:
+    """Note names that no column has; return what those were meant to be that are only misspelt."""
+    meant: set[str] = set()
+    complete = not _missing(form, present)
+    for count, (position, name) in enumerate(unknown):
+        suggestion = form.column(nearest_name(name, form.names) or "") if name and count < _SUGGESTIONS else None
+        if form.open and (suggestion is None or suggestion.says in present):
+            continue
+        if not name:
+            faults.add(f"column {position} has no name; name it or remove its comma", line=line)
+            continue
+        faults.add(_unknown_column(name, suggestion, form, complete=complete), line=line)
+        if suggestion is not None:
+            meant |= {suggestion.says, suggestion.name}
+    return meant
+
+
+def _unknown_column(name: str, suggestion: Column | None, form: Form, *, complete: bool) -> str:
+    if suggestion is None:
+        # where a column is missing this may be it
+        advice = "remove it, " if complete else ""
+        return f"unknown column {quoted(name)}; {advice}the columns are {', '.join(form.names)}"
+    plain, known = plain_name(name), suggestion.name
+    if suggestion.unit and plain != known and _has_unit(known) and without_unit(plain) == without_unit(known) != plain:
+        return f"unknown unit in column {quoted(name)}; convert it and name it {known}{_in_unit(suggestion)}"
+    return f"unknown column {quoted(name)}; did you mean {known}{_in_unit(suggestion)}?"
+
+
+def _check_missing(names: list[str], form: Form, present: set[str], *, line: int, faults: Faults) -> None:
+    for what, columns in _missing(form, present).items():
+        if len(columns) > 1:
+            message = f"there is no {what} column; add {' or '.join(column.name for column in columns)}"
+        else:
+            there = f" (there are {', '.join(quoted(name) for name in names[:6])})" if form.open and any(names) else ""
+            other = " or rename the one that holds it" if form.open else ""
+            message = f"the column {columns[0].name}{_in_unit(columns[0])} is missing{there}; add it{other}"
+        faults.add(message, line=line)
+
+
+def _missing(form: Form, present: set[str]) -> dict[str, list[Column]]:
+    """Return the columns of which one would give what is needed and not present."""
+    givers: dict[str, list[Column]] = {}
+    for column in form.columns:
+        if column.needed:
+            givers.setdefault(column.needed, []).append(column)
+    return {
+        what: columns
+        for what, columns in givers.items()
+        if not any(present & {column.says, column.error} for column in columns)
+    }
+
+
+def _in_unit(column: Column) -> str:
+    return f" (in {column.unit})" if column.unit else ""
+
+
+def plain_name(text: str) -> str:
+    """Return a name in a table's spelling: lower case, words joined by underscores, no brackets around units."""
+    return "_".join(re.findall(r"\w+", text.lower().replace("_", " ")))
+
+
+def without_unit(name: str) -> str:
+    """Return a name without its last word, where that may be a unit: one of five letters at most."""
+    stem, _, unit = name.rpartition("_")
+    return stem if stem and len(unit) <= 5 else name
+
+
+def _has_unit(name: str) -> bool:
+    return name.rpartition("_")[2] in {"khz", "nm", "deg", "ng"}
+
+
+def nearest_name(text: str, known: Iterable[str], *, cutoff: float = 0.75) -> str | None:
+    """Return the known name that a misspelt one or one with another unit was meant to be, or None.
+
+    Args:
+        text: the name as it stands in the file.
+        known: the right names; their unit is the last word.
+        cutoff: similarity (0 to 1, as difflib counts it) that a misspelling must reach.
+    """
+    known = list(known)
+    name = plain_name(text)
+    for candidate in known:
+        if name in {candidate, without_unit(candidate)}:
+            return candidate
+    for candidate in known:
+        if _has_unit(candidate) and without_unit(name) == without_unit(candidate):
+            return candidate
+    return next(iter(difflib.get_close_matches(name, known, n=1, cutoff=cutoff)), None)
+
+
+def parse_rows(
+    rows: NumberedLines, names: list[str], form: Form, faults: Faults
+) -> tuple[Columns, Masks, Int[np.ndarray, " rows"]]:
+    """Turn lines of text into columns of numbers; arguments and result as of `parse_cells`, all columns of the form."""
+    wanted = [name for name in names if form.column(name) is not None]
+    block = _plain_block(rows, names, wanted, form)
+    if block is not None:
+        lines = np.array([line for line, _ in rows], dtype=np.int64)
+        return block, {name: np.zeros(len(lines), dtype=bool) for name in wanted}, lines
+    cells = []
+    for line, text in rows:
+        if text.count('"') % 2:
+            faults.add("a quotation mark is not closed; close or remove it", line=line)
+        else:
+            cells.append((line, split_cells(text)))
+    return parse_cells(cells, names, wanted, form, faults)
+
+
+def parse_cells(
+    rows: NumberedCells, names: list[str], wanted: Sequence[str], form: Form, faults: Faults
+) -> tuple[Columns, Masks, Int[np.ndarray, " rows"]]:
+    """Turn rows of cells into columns of numbers.
+
+    Args:
+        rows: line number and stripped cells of each row.
+        names: the names of the file's columns, checked before.
+        wanted: those that are read; the others may hold anything.
+        form: what the file is.
+        faults: where the faults are noted.
+
+    Returns:
+        Per wanted name the numbers (NaN where a cell is blank or unreadable) and the mask of the unreadable cells; and
+        the line number of each row.
+    """
+    lines, table = [], []
+    for line, cells in rows:
+        if len(cells) == len(names):
+            lines.append(line)
+            table.append(cells)
+        else:
+            hint = form.fewer if len(cells) < len(names) else form.more
+            faults.add(f"there are {len(cells)} cells for {len(names)} columns; {hint}", line=line)
+    columns, unreadable = {}, {}
+    for name in wanted:
+        position = names.index(name)
+        texts = [cells[position] for cells in table]
+        column = form.column(name) or Column(name)
+        columns[name], unreadable[name] = _parse_column(column, texts, lines, form, faults)
+    return columns, unreadable, np.array(lines, dtype=np.int64)
+
+
+def _plain_block(rows: NumberedLines, names: list[str], wanted: list[str], form: Form) -> Columns | None:
+    """Return the wanted columns of a file of nothing but finite numbers at once, None where it holds something else."""
+    if not rows or any((form.column(name) or Column(name)).integer for name in wanted):
+        return None
+    if any('"' in text or text.count(",") != len(names) - 1 for _, text in rows):
+        return None
+    positions = [names.index(name) for name in wanted]
+    with contextlib.suppress(ValueError):
+        block = np.loadtxt([text for _, text in rows], delimiter=",", usecols=positions, ndmin=2, comments=None)
+        if np.all(np.isfinite(block)):
+            return {name: block[:, position].copy() for position, name in enumerate(wanted)}
+    return None
+
+
+def _parse_column(
+    column: Column, texts: list[str], lines: list[int], form: Form, faults: Faults
+) -> tuple[Float[np.ndarray, " rows"], Bool[np.ndarray, " rows"]]:
+    numbers = np.full(len(texts), np.nan)
+    unreadable = np.zeros(len(texts), dtype=bool)
+    if form.blanks and set("".join(texts)) <= set("0123456789+-" if column.integer else "0123456789+-.eE"):
+        # Written in these signs, what float() takes is what NUMBER describes, and it takes it much faster.
+        with contextlib.suppress(ValueError):
+            return np.array([float(text or "nan") for text in texts], dtype=np.float64), unreadable
+    for row, text in enumerate(texts):
+        if NUMBER.fullmatch(text) and not (column.integer and set(text) & set(".eE")):
+            numbers[row] = float(text)
+        elif text or not form.blanks:
+            unreadable[row] = True
+            faults.add(_unreadable(text, column, form), line=lines[row], column=column.name)
+    return numbers, unreadable
+
+
+def _unreadable(text: str, column: Column, form: Form) -> str:
+    if not text:
+        return f"is blank; every {form.row} needs it: fill it in or remove the row"
+    if DECIMAL_COMMA.fullmatch(text):
+        return f"{quoted(text)} has a decimal comma; write a point"
+    if column.integer:
+        return f"{quoted(text)} is not a positive whole number; write 1, 2, 3, ..."
+    absent = text.lower().lstrip("+-") in {"nan", "inf", "infinity", "na", "n/a", "none", "null", ""}
+    if form.blanks and not column.required and absent:
+        return f"{quoted(text)} is not a number; leave the cell of a value that was not measured blank"
+    return f"{quoted(text)} is not a number; {form.number}"
