@@ -5,6 +5,13 @@ MODEL ?= law
 OUT ?= report
 PYTEST ?= -m pytest
 
+# Compilation is most of what the tests cost. XLA's older kernel emitter halves it and more in the same arithmetic; no
+# optimisation at all pays for programs that run for milliseconds, a little for those of the slow tests. `pytest` by
+# itself, `make mutations`, the notebooks and tests/test_as_compiled_for_users.py compile as users do. (An XLA that does
+# not know one of these flags any more says so and stops: leave it out then.)
+COMPILED_AT_ONCE := --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0
+COMPILED_SOON := --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1
+
 BIN := .venv/bin
 SETUP := .venv/.installed
 
@@ -26,7 +33,7 @@ fit: $(SETUP) ## fit the bundled table (or TABLE=..., MODEL=...), print the impa
 	$(BIN)/afm-jax fit $(if $(TABLE),'$(TABLE)',--example) --model $(MODEL) --out $(OUT)
 
 test: $(SETUP) ## the tests (under 10 minutes on two cores)
-	$(BIN)/python $(PYTEST) -n auto --dist loadscope
+	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_AT_ONCE)" $(BIN)/python $(PYTEST) -n auto --dist worksteal
 
 lint: $(SETUP)
 	$(BIN)/ruff format --check .
@@ -43,7 +50,7 @@ coverage: $(SETUP) ## make test and make slow with the share of lines that they 
 	$(BIN)/python -m coverage report --fail-under=85
 
 slow: $(SETUP) ## the slow tests: long iterations, references, notebooks
-	$(BIN)/python $(PYTEST) -m slow -n auto --dist load --ignore tests/test_mutations.py
+	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_SOON)" $(BIN)/python $(PYTEST) -m slow -n auto --dist worksteal --ignore tests/test_mutations.py
 
 mutations: $(SETUP) ## wrong formulas, one edit each: a named test must notice
 	$(BIN)/python -m pytest -m slow tests/test_mutations.py

@@ -13,16 +13,15 @@ import pytest
 from tests.mutations import MUTATIONS, Mutation
 
 ROOT = Path(__file__).parent.parent
+PACKAGES = ("afm_jax", "fitting")
 AT_ONCE = 2
 TIME_LIMIT_S = 300
 UNCHANGED = "unchanged"
 
-pytestmark = pytest.mark.slow
-
 
 def copy_of_the_packages(folder: Path, cache: Path) -> Path:
     """Copy what the tests need; compiled programs are kept in a folder that all copies share."""
-    for name in ("afm_jax", "fitting", "tests"):
+    for name in (*PACKAGES, "tests"):
         shutil.copytree(ROOT / name, folder / name, ignore=shutil.ignore_patterns("__pycache__"))
     shutil.copy(ROOT / "pyproject.toml", folder)
     (folder / ".pytest_cache").symlink_to(cache, target_is_directory=True)
@@ -43,17 +42,29 @@ def run(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def run_tests(folder: Path, tests: list[str]) -> subprocess.CompletedProcess[str]:
-    # -x ends at the first red test; a fixed seed keeps hypothesis from looking elsewhere in each run.
-    return run(folder, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", "--hypothesis-seed=0", *tests)
+    # -x ends at the first red test, a fixed seed keeps hypothesis from looking elsewhere in each run
+    options = ("-x", "-q", "-p", "no:cacheprovider", "--hypothesis-seed=0", "-m", "slow or not slow")
+    return run(folder, "-m", "pytest", *options, *tests)
 
 
 def mutate(folder: Path, name: str, mutation: Mutation) -> None:
-    """Apply an edit; its text must stand in the file exactly once."""
-    path = folder / mutation.file
-    text = path.read_text()
-    count = text.count(mutation.before)
-    assert count == 1, f"mutation {name!r}: {mutation.before!r} stands {count} times in {mutation.file}, not once"
-    path.write_text(text.replace(mutation.before, mutation.after))
+    """Apply an edit."""
+    path = place_of(folder, name, mutation)
+    path.write_text(path.read_text().replace(mutation.before, mutation.after))
+
+
+def place_of(folder: Path, name: str, mutation: Mutation) -> Path:
+    """Return the file of the packages in which an edit's text stands, exactly once."""
+    files = [path for package in PACKAGES for path in (folder / package).rglob("*.py")]
+    places = {path: count for path in files if (count := path.read_text().count(mutation.before))}
+    found = {str(path.relative_to(folder)): count for path, count in places.items()}
+    assert sum(places.values()) == 1, f"mutation {name!r}: {mutation.before!r} stands in {found}, not once"
+    return next(iter(places))
+
+
+def test_every_wrong_formula_has_its_place():
+    for name, mutation in MUTATIONS.items():
+        place_of(ROOT, name, mutation)
 
 
 @pytest.fixture(scope="module")
@@ -82,6 +93,7 @@ def outcome(
         yield lambda name: unchanged if name == UNCHANGED else jobs[name].result()
 
 
+@pytest.mark.slow
 def test_the_copy_is_what_runs(tmp_path: Path):
     (tmp_path / "cache").mkdir()
     folder = copy_of_the_packages(tmp_path / "copy", tmp_path / "cache")
@@ -92,11 +104,13 @@ def test_the_copy_is_what_runs(tmp_path: Path):
         assert Path(path) == folder / name / "__init__.py"
 
 
+@pytest.mark.slow
 def test_the_unchanged_copy_is_green(outcome):
     done = outcome(UNCHANGED)
     assert done.returncode == 0, done.stdout[-4000:]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MUTATIONS)
 def test_a_wrong_formula_turns_a_test_red(outcome, name: str):
     done = outcome(name)

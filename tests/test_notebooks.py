@@ -24,7 +24,9 @@ def test_stored_without_outputs_and_ending_with_an_assertion(path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_runs(path, tmp_path):
+def test_runs(path, tmp_path, monkeypatch):
+    # compiled as for users
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
     with warnings.catch_warnings():
         # Jupyter's own: event loops and transports, nothing of the notebook's.
         warnings.simplefilter("ignore")
