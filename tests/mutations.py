@@ -186,13 +186,13 @@ MUTATIONS = {
         "(6.0 * cube - 3.0 * math", "(6.0 * cube - 1.5 * math", JUNCTION
     ),
     "dissipation left out of the time": Mutation(
-        "(length * share)\n        loss, time = way.rates(y, gap, way.available_aj(gap) - state[0])",
-        "(length * share)\n        loss, time = way.rates(y, gap, way.available_aj(gap))",
+        "at.available_aj - state[0])",
+        "at.available_aj)",
         COLLISIONS,
     ),
     "energy lost where it is gained": Mutation(
-        "- self.end_potential_aj - dissipated",
-        "- self.end_potential_aj + dissipated",
+        "- self.end_potential_aj - spent",
+        "- self.end_potential_aj + spent",
         COLLISIONS,
     ),
     "collocation that sweeps from the end": Mutation(
@@ -200,9 +200,7 @@ MUTATIONS = {
         "integrals[:, 0] = 1.0 - roots",
         COLLOCATION,
     ),
-    "time in the junction counted once": Mutation(
-        "pace * (2.0 * inside + outside)", "pace * (inside + outside)", COLLISIONS
-    ),
+    "time in the junction counted once": Mutation("2.0 * inside + outside", "inside + outside", COLLISIONS),
     "delay counted from where the bridge forms, both ways": Mutation(
         "approach_speed + ways.outer_gap_nm",
         "approach_speed + contact.bridge_forms_nm",
