@@ -245,13 +245,13 @@ MUTATIONS = {
         "afm_jax/contact/junction_leg.py", "2.0 * inside + outside", "inside + outside", COLLISIONS
     ),
     "delay counted from where the bridge forms, both ways": Mutation(
-        "afm_jax/contact/collision.py",
+        "afm_jax/contact/collide.py",
         "approach_speed + ways.outer_gap_nm",
         "approach_speed + contact.bridge_forms_nm",
         COLLISIONS,
     ),
     "bridge that breaks where it formed": Mutation(
-        "afm_jax/contact/collision.py",
+        "afm_jax/contact/collide.py",
         "outer = jnp.maximum(contact.bridge_breaks_nm, breaks)",
         "outer = jnp.maximum(contact.bridge_forms_nm, breaks)",
         COLLISIONS,
