@@ -11,9 +11,7 @@ if TYPE_CHECKING:
     from afm_jax.apparatus.excitation import BaseDrive, ForceDrive
     from afm_jax.apparatus.platform import Platform
     from afm_jax.apparatus.scene import Scene
-    from afm_jax.contact.capture import capture_speed
-    from afm_jax.contact.collide import collide
-    from afm_jax.contact.collision import Collision
+    from afm_jax.contact.collide import Collision, capture_speed, collide
     from afm_jax.contact.contact import Contact
     from afm_jax.contact.junction import Junction, find_junction
     from afm_jax.contact.phases import Phase
@@ -36,7 +34,7 @@ else:
     _HOMES = {
         "BaseDrive": "afm_jax.apparatus.excitation",
         "Cantilever": "afm_jax.apparatus.cantilever",
-        "Collision": "afm_jax.contact.collision",
+        "Collision": "afm_jax.contact.collide",
         "CollisionDelay": "afm_jax.impact.law",
         "CollisionOutcome": "afm_jax.outcome",
         "Contact": "afm_jax.contact.contact",
@@ -57,7 +55,7 @@ else:
         "Tone": "afm_jax.apparatus.drive",
         "Trajectory": "afm_jax.motion.trajectory",
         "__version__": "afm_jax.version",
-        "capture_speed": "afm_jax.contact.capture",
+        "capture_speed": "afm_jax.contact.collide",
         "collide": "afm_jax.contact.collide",
         "find_junction": "afm_jax.contact.junction",
         "iterate_batch": "afm_jax.impact.batch",

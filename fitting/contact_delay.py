@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.contact.capture import capture_speed
+from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
 from afm_jax.impact.law import CollisionDelay
 from afm_jax.parameters import require_float64

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import OptimizeResult, least_squares, nnls
 
-from afm_jax.contact.capture import capture_speed
+from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.parameters import require_float64

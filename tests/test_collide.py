@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from afm_jax.contact.capture import capture_speed
-from afm_jax.contact.collide import BLOCK, collide
+from afm_jax.contact.collide import BLOCK, capture_speed, collide
 from afm_jax.contact.contact import Contact
 from afm_jax.outcome import CollisionOutcome
 from tests import reference_contact as exact

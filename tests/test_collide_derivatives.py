@@ -5,8 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from afm_jax.contact.capture import capture_speed
-from afm_jax.contact.collide import collide
+from afm_jax.contact.collide import capture_speed, collide
 from afm_jax.contact.contact import Contact
 from tests import reference_contact as exact
 

@@ -102,7 +102,7 @@ def fitted_law(scene: "Scene", found: "Simulation") -> dict[str, float]:
     """Return the paper's law with delay, fitted to the scene's contact over the scene's own range of speeds."""
     import numpy as np  # noqa: PLC0415
 
-    from afm_jax.contact.capture import capture_speed  # noqa: PLC0415
+    from afm_jax.contact.collide import capture_speed  # noqa: PLC0415
     from afm_jax.motion.record import ContactKind  # noqa: PLC0415
     from fitting.contact_delay import fit_delay  # noqa: PLC0415
     from fitting.contact_law import fit_law  # noqa: PLC0415

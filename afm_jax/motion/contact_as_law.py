@@ -3,8 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from afm_jax.contact.capture import capture_speed
-from afm_jax.contact.collide import collide
+from afm_jax.contact.collide import capture_speed, collide
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import find_junction
 from afm_jax.impact.law import CollisionDelay, ImpactLaw

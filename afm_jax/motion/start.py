@@ -6,7 +6,7 @@ import numpy as np
 
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
-from afm_jax.contact.capture import capture_speed
+from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits

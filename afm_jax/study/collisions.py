@@ -8,8 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.contact.capture import capture_speed
-from afm_jax.contact.collide import BLOCK, collide
+from afm_jax.contact.collide import BLOCK, capture_speed, collide
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import find_junction
 from afm_jax.outcome import CollisionOutcome

@@ -13,9 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from afm_jax.contact.capture import capture_speed
-from afm_jax.contact.collide import batch_of
-from afm_jax.contact.collision import Collision, collision_of, go_through
+from afm_jax.contact.collide import Collision, batch_of, capture_speed, collision_of, go_through
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import find_junction
 from afm_jax.contact.settings import SETTINGS, Setting

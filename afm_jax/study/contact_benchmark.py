@@ -10,8 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from afm_jax.contact.collide import batch_of, collide
-from afm_jax.contact.collision import Collision
+from afm_jax.contact.collide import Collision, batch_of, collide
 from afm_jax.contact.contact import EFFECTS, Contact
 from afm_jax.contact.settings import SETTINGS, Setting
 from afm_jax.study.own_process import progress

@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.optimize import least_squares
 
-from afm_jax.contact.capture import capture_speed
-from afm_jax.contact.collide import collide
+from afm_jax.contact.collide import capture_speed, collide
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.forces.capillary import Capillary
 from afm_jax.contact.forces.core_repulsion import CoreRepulsion
