@@ -154,7 +154,7 @@ MUTATIONS = {
         "tests/test_orbits.py::test_a_ramp_has_no_orbit",
     ),
     "trace bound with 1 - D": Mutation(
-        "afm_jax/impact/orbit_state.py", "jnp.abs(1.0 + determinant)", "jnp.abs(1.0 - determinant)", ORBIT
+        "afm_jax/impact/orbits.py", "jnp.abs(1.0 + determinant)", "jnp.abs(1.0 - determinant)", ORBIT
     ),
     "peak without damping": Mutation(
         "afm_jax/impact/orbit_amplitude.py", "fall = cantilever.decay_rate * flight.start_velocity + ", "fall = ", ORBIT
@@ -176,12 +176,12 @@ MUTATIONS = {
     ),
     "lead that a push lengthens": Mutation(
         "afm_jax/impact/lasting_impact.py",
-        "longer * tau - share",
-        "longer * tau + share",
+        "longer - share",
+        "longer + share",
         f"{LASTING}test_a_lead_is_covered_sooner_with_a_push",
     ),
     "close pairs of roots stepped over": Mutation(
-        "afm_jax/impact/lasting_search.py",
+        "afm_jax/impact/orbit_search.py",
         "(bottom * value[at + 1] < 0.0)",
         "(bottom * value[at + 1] > 0.0)",
         f"{LASTING_ORBITS}test_a_close_pair_is_found",
