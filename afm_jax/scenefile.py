@@ -31,6 +31,7 @@ viscous_loss = 0             # nm/us
 hertz = 0.206
 lead_nm = 5.64
 offset_nm = 0.726
+corrections = true           # false: nothing acts on the tip while the impact lasts
 [start]                      # leave out: the simulation chooses
 phase_deg = 270
 height_above_platform_nm = 5
@@ -142,6 +143,8 @@ def _law_table(law: ImpactLaw) -> dict[str, Any]:
     table = {"model": "law", **numbers_of(law, "interaction")}
     if law.delay is not None:
         table["delay"] = numbers_of(law.delay, "interaction.delay")
+        if not law.delay.corrections:
+            table["delay"]["corrections"] = False
     return table
 
 
@@ -243,7 +246,10 @@ def _contact_of(table: SceneTable) -> "Contact":
 
 
 def _delay_of(table: SceneTable | None) -> CollisionDelay | None:
-    return None if table is None else table.build(CollisionDelay, **table.numbers(required=KEYS["interaction.delay"]))
+    if table is None:
+        return None
+    numbers = table.numbers(required=tuple(key for key in KEYS["interaction.delay"] if key != "corrections"))
+    return table.build(CollisionDelay, **numbers, corrections=table.truth("corrections", usual=True))
 
 
 def _start_of(tables: dict[str, SceneTable], scene: Scene) -> Start | None:

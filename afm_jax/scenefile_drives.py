@@ -56,7 +56,7 @@ def drive_tables(scene: Scene) -> dict[str, dict[str, Any]]:
 
 
 def numbers_of(part: eqx.Module, table: str) -> dict[str, Any]:
-    """Return the numbers of a part of a scene under the keys of its table; what is absent is left out.
+    """Return the numbers of a part of a scene under the keys of its table; what is absent or no number is left out.
 
     Raises:
         ValueError: if one is no single number.
@@ -65,7 +65,7 @@ def numbers_of(part: eqx.Module, table: str) -> dict[str, Any]:
     return {
         key: number_of(value, key)
         for key, value in values.items()
-        if value is not None and not isinstance(value, eqx.Module)
+        if value is not None and not isinstance(value, (eqx.Module, bool))
     }
 
 

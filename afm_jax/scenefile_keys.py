@@ -33,7 +33,7 @@ KEYS = {
     "force": (*_FORCE, "second"),
     "force.second": _FORCE,
     "interaction": ("model", "r", "epsilon", "viscous_loss", "delay"),
-    "interaction.delay": ("hertz", "lead_nm", "offset_nm"),
+    "interaction.delay": ("hertz", "lead_nm", "offset_nm", "corrections"),
     "start": ("phase_deg", "height_above_platform_nm", "velocity_nm_per_us"),
 }
 """For every table of a scene file the keys it may have; those of the interaction are an impact law's."""

@@ -69,6 +69,17 @@ class SceneTable(NamedTuple):
                 self.fail(f"must be a list of texts, but one entry is {in_words(entry)}", key)
         return value
 
+    def truth(self, key: str, *, usual: bool) -> bool:
+        """Return whether the table has true under a key; the usual answer if the key is left out.
+
+        Raises:
+            SceneError: if there is something else than true or false.
+        """
+        value = self.values.get(key, usual)
+        if not isinstance(value, bool):
+            self.fail(f"must be true or false, but is {in_words(value)}", key)
+        return value
+
     def build(self, kind: Callable[..., Built], *arguments: Any, **parameters: Any) -> Built:
         """Return `kind(*arguments, **parameters)`; what that finds wrong becomes an error of this table.
 

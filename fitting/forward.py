@@ -8,11 +8,9 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from afm_jax.impact.lasting_closure import LastingProblem
 from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact
-from afm_jax.impact.lasting_orbits import lasting_amplitudes
-from afm_jax.impact.orbit_closure import OrbitProblem, speeds_at
-from afm_jax.impact.orbit_state import amplitudes
+from afm_jax.impact.orbit_closure import OrbitProblem
+from afm_jax.impact.orbits import amplitudes
 from afm_jax.stored_program import stored
 from fitting.measurement import Measurement, Rows
 from fitting.models import Problem
@@ -156,7 +154,7 @@ def linearise_pairs(
     # One vmap over all pairs, not two nested ones: tracing costs as much as a fit otherwise.
     def one(point: Float[Array, " p"], impact, slope, row: Rows, known: Branch):
         orbit = orbit_problem(point, impact, row, measurement, problem)
-        branch = followed(orbit, known) if isinstance(orbit, LastingProblem) else known
+        branch = followed(orbit, known) if orbit.impact.lasts else known
 
         def predict(v, impact):
             return _prediction(branch, v, orbit_problem(v, impact, row, measurement, problem), problem)
@@ -196,15 +194,9 @@ def _impact_and_slopes(values: Float[Array, " p"], measurement: Measurement, pro
     return impact_of(values, measurement, problem), jax.vmap(lambda e: turned(e)[1])(jnp.eye(values.shape[0]))
 
 
-def _prediction(
-    branch: Branch, values: Float[Array, " p"], orbit: OrbitProblem | LastingProblem, problem: Problem
-) -> Prediction:
-    if isinstance(orbit, LastingProblem):
-        amplitude = lasting_amplitudes(branch.coordinate, orbit)[:2]
-        speed = orbit.impact.speeds(branch.coordinate).approach
-    else:
-        amplitude = amplitudes(branch.coordinate, orbit)
-        speed = speeds_at(branch.coordinate, orbit.law).approach
+def _prediction(branch: Branch, values: Float[Array, " p"], orbit: OrbitProblem, problem: Problem) -> Prediction:
+    amplitude = amplitudes(branch.coordinate, orbit)[:2]
+    speed = orbit.impact.speeds(branch.coordinate).approach
     return Prediction(
         amplitude_nm=jnp.where(
             branch.exists, amplitude * problem.nuisance(values, "tip_calibration", 1.0), jnp.zeros_like(amplitude)

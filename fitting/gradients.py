@@ -18,10 +18,8 @@ from jaxtyping import Array, Bool, Float
 
 from afm_jax.contact.contact import EFFECTS
 from afm_jax.impact.first_impact import Flight, flight_gap
-from afm_jax.impact.lasting_closure import LastingProblem
-from afm_jax.impact.lasting_orbits import lasting_amplitudes, lasting_state
 from afm_jax.impact.orbit_closure import OrbitProblem
-from afm_jax.impact.orbit_state import amplitudes, orbit_state
+from afm_jax.impact.orbits import amplitudes, orbit_state
 from afm_jax.impact.poincare import NEAR_GRAZING
 from afm_jax.parameters import require_float64
 from fitting.contact_values import check_contact_values
@@ -156,9 +154,8 @@ def _judged(values: Float[Array, " p"], measurement: Measurement, problem: Probl
         branch = lax.stop_gradient(branch_of(orbit, row))
 
         def predicted(v):
-            return _amplitudes(
-                branch.coordinate, orbit_problem(v, impact_of(v, measurement, problem), row, measurement, problem)
-            ) * problem.nuisance(v, "tip_calibration", 1.0)
+            orbit = orbit_problem(v, impact_of(v, measurement, problem), row, measurement, problem)
+            return amplitudes(branch.coordinate, orbit)[:2] * problem.nuisance(v, "tip_calibration", 1.0)
 
         slow, touching = _grazes(branch.coordinate, orbit)
         slope = differentiated(predicted)(values)
@@ -167,17 +164,9 @@ def _judged(values: Float[Array, " p"], measurement: Measurement, problem: Probl
     return jax.vmap(one)(measurement.rows)
 
 
-def _amplitudes(coordinate: Float[Array, ""], orbit: OrbitProblem | LastingProblem) -> Float[Array, " 2"]:
-    if isinstance(orbit, LastingProblem):
-        return lasting_amplitudes(coordinate, orbit)[:2]
-    return amplitudes(coordinate, orbit)
-
-
-def _grazes(
-    coordinate: Float[Array, ""], orbit: OrbitProblem | LastingProblem
-) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+def _grazes(coordinate: Float[Array, ""], orbit: OrbitProblem) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
     """Say whether the impact is a graze, and whether the flight touches the platform on the way."""
-    state = lasting_state(coordinate, orbit) if isinstance(orbit, LastingProblem) else orbit_state(coordinate, orbit)
+    state = orbit_state(coordinate, orbit)
     slow = state.speeds.approach < NEAR_GRAZING * orbit.platform.top_speed_nm_per_us
     flight = Flight(orbit.cantilever, orbit.platform, state.flight.start_us, state.flight.start_velocity)
     begin = jnp.maximum(-state.speeds.delay, 0.0)

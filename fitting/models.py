@@ -97,11 +97,15 @@ class Problem:
     def law(self, values: Float[Array, " p"]) -> ImpactLaw:
         """Return the impact law, with its delay; what the model leaves out is lossless."""
         known = self.known(values)
+        delay = None
+        if self.lasting:
+            hertz, lead_nm, offset_nm = (known[name] for name in DELAY_NAMES)
+            delay = CollisionDelay(hertz, lead_nm, offset_nm)
         return ImpactLaw(
             r=known.get("r", 1.0),
             epsilon=known.get("epsilon", 0.0),
             viscous_loss=known.get("viscous_loss", 0.0),
-            delay=CollisionDelay(*(known[name] for name in DELAY_NAMES)) if self.lasting else None,
+            delay=delay,
         )
 
     def cantilever(self, values: Float[Array, " p"], measured: Cantilever) -> Cantilever:

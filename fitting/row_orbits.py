@@ -8,12 +8,10 @@ from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.apparatus.platform import Platform
 from afm_jax.contact.contact import Contact
-from afm_jax.impact.lasting_closure import LastingProblem
 from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact
-from afm_jax.impact.lasting_orbits import near_fold, steady_lasting_orbits
-from afm_jax.impact.lasting_search import follow_lasting_root
 from afm_jax.impact.orbit_closure import OrbitProblem
-from afm_jax.impact.orbit_state import steady_orbits
+from afm_jax.impact.orbit_search import follow_root, harmless_coordinate
+from afm_jax.impact.orbits import near_fold, steady_orbits
 from fitting.contact_table import tabulated
 from fitting.measurement import Measurement, Rows
 from fitting.models import Problem
@@ -43,7 +41,7 @@ def orbit_problem(
     row: Rows,
     measurement: Measurement,
     problem: Problem,
-) -> OrbitProblem | LastingProblem:
+) -> OrbitProblem:
     """Return the orbit's scene of one row at a set of values, for the impact that these stand for."""
     cantilever = problem.cantilever(values, measurement.cantilever)
     platform = Platform(
@@ -51,18 +49,16 @@ def orbit_problem(
         row.drive_frequency_khz,
         row.offset_nm + problem.nuisance(values, "offset_origin_nm", 0.0),
     )
-    if isinstance(impact, LawImpact) and not problem.lasting:
-        return OrbitProblem(cantilever, platform, impact.law, row.order)
-    return LastingProblem(cantilever, platform, impact, row.order)
+    return OrbitProblem(cantilever, platform, impact, row.order)
 
 
-def branch_of(orbit: OrbitProblem | LastingProblem, row: Rows) -> Branch:
+def branch_of(orbit: OrbitProblem, row: Rows) -> Branch:
     """Choose among a row's steady orbits; no derivatives.
 
     There can be several: the one that explains the measured amplitudes best counts. A row without any is predicted as
     0, which misses the measurement by all of it: a fixed penalty.
     """
-    roots = steady_lasting_orbits(orbit) if isinstance(orbit, LastingProblem) else steady_orbits(orbit)
+    roots = steady_orbits(orbit)
     misfit = jnp.where(row.measured, (roots.amplitude_nm - row.amplitude_nm) / row.error_nm, 0.0)
     slot = jnp.argmin(jnp.where(roots.steady, jnp.sum(misfit**2, axis=1), jnp.inf))
     return Branch(
@@ -73,16 +69,16 @@ def branch_of(orbit: OrbitProblem | LastingProblem, row: Rows) -> Branch:
     )
 
 
-def followed(orbit: LastingProblem, known: Branch) -> Branch:
+def followed(orbit: OrbitProblem, known: Branch) -> Branch:
     """Follow a row's orbit from where it is known to be: exact where it was found, close at other parameters."""
-    harmless = orbit.impact.lowest + 2.0 * jnp.maximum(orbit.platform.top_speed_nm_per_us, orbit.impact.reach)
-    root = follow_lasting_root(jnp.where(known.exists, known.coordinate, harmless), orbit)
-    exists = known.exists & root.found
+    harmless = harmless_coordinate(orbit)
+    root, found = follow_root(jnp.where(known.exists, known.coordinate, harmless), orbit)
+    exists = known.exists & found
     return Branch(
-        coordinate=jnp.where(exists, root.coordinate, harmless),
+        coordinate=jnp.where(exists, root, harmless),
         exists=exists,
         orbits=jnp.where(exists, known.orbits, 0),
-        near_fold=exists & near_fold(root.coordinate, orbit),
+        near_fold=exists & near_fold(root, orbit),
     )
 
 

@@ -136,7 +136,7 @@ MUTATIONS = {
     ),
     "trace bound with 1 - D": Mutation("jnp.abs(1.0 + determinant)", "jnp.abs(1.0 - determinant)", ORBIT),
     "peak without damping": Mutation("fall = cantilever.decay_rate * flight.start_velocity + ", "fall = ", ORBIT),
-    "lock-in with half its amplitude": Mutation("cosine, sine = 2.0 / period", "cosine, sine = 1.0 / period", ORBIT),
+    "lock-in with half its amplitude": Mutation("2.0 / period * flying", "1.0 / period * flying", ORBIT),
     "bracket that keeps the wrong half": Mutation(
         "(value > 0.0) == rising",
         "(value > 0.0) != rising",
@@ -148,8 +148,8 @@ MUTATIONS = {
         f"{LASTING}test_air_takes_what_an_integrated_damped_contact_loses",
     ),
     "lead that a push lengthens": Mutation(
-        "longer * tau - share",
-        "longer * tau + share",
+        "longer - share",
+        "longer + share",
         f"{LASTING}test_a_lead_is_covered_sooner_with_a_push",
     ),
     "close pairs of roots stepped over": Mutation(

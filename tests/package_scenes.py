@@ -22,7 +22,7 @@ LANES = 512
 
 def scene_of(p: Parameters, *, offset_rate_nm_per_us: float = 0.0) -> Scene:
     """Return the package's scene for the reference's parameters."""
-    delay = None if p.delay is None else CollisionDelay(*p.delay)
+    delay = None if p.delay is None else CollisionDelay(*p.delay, corrections=False)
     return Scene(
         Cantilever(p.frequency_khz, p.quality_factor),
         Platform(p.amplitude_nm, p.drive_frequency_khz, p.offset_nm, offset_rate_nm_per_us),

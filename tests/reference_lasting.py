@@ -35,7 +35,7 @@ def closing_impacts(p: Parameters, order: int, approach: Floats) -> Impacts:
     lasting = hertz * approach**-0.2
     straight = lasting - lead * (1.0 / free - 1.0 / approach) - offset / approach
     rebound, delay = free, straight
-    for _ in range(3):
+    for _ in range(12):
         cosine, sine = _phase(p, order, approach, rebound, delay)
         # only the direction counts before the orbit is closed
         middle = np.arctan2(sine, cosine) - k.drive * delay / 2.0

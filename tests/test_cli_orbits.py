@@ -20,7 +20,7 @@ KEYS = {*COLUMNS}
 
 def saved(p: Parameters, path: Path, *, offset_rate: float = 0.0) -> str:
     """Write a reference's parameters as a scene file and return its path."""
-    delay = None if p.delay is None else CollisionDelay(*p.delay)
+    delay = None if p.delay is None else CollisionDelay(*p.delay, corrections=False)
     law = ImpactLaw(p.r, p.epsilon, p.viscous_loss, delay)
     platform = Platform(p.amplitude_nm, p.drive_frequency_khz, p.offset_nm, offset_rate)
     save_scene(Scene(Cantilever(p.frequency_khz, p.quality_factor), platform, law), path)

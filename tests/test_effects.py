@@ -4,6 +4,7 @@ import csv
 import json
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,7 +25,7 @@ from afm_jax.study.effects import Change, Reduction, study_effects
 from afm_jax.study.motion_program import Programs
 from afm_jax.study.scene_effects import effects_in
 
-LAW = ImpactLaw(0.998, 100.0, 0.1, CollisionDelay(0.206, 5.64, 0.726))
+LAW = ImpactLaw(0.998, 100.0, 0.1, CollisionDelay(0.206, 5.64, 0.726, corrections=False))
 DRIVE = Platform(4.0, 181.8)
 START = (270.0, 5.0, 60.0)
 
@@ -69,6 +70,33 @@ def numbers(change: Change) -> np.ndarray:
 def reason_of(report) -> str:
     assert report.reason is not None
     return report.reason
+
+
+LASTING = ImpactLaw(0.998, 100.0, 0.1, CollisionDelay(0.206, 5.64, 0.726))
+
+
+def test_what_happens_while_an_impact_lasts_is_an_effect_of_its_delay():
+    scene = law_scene(LASTING)
+    known = {effect.name: effect for effect in effects_in(scene)}
+    effect = known["delay_corrections"]
+    assert not effect.is_zero
+    assert effect.required is None
+    assert eqx.tree_equal(effect.without(scene), law_scene())
+    assert "delay_corrections" not in [other.name for other in effects_in(law_scene())]
+    instantaneous = known["delay"].without(scene)
+    assert eqx.tree_equal(effect.without(instantaneous), instantaneous)
+
+
+@pytest.mark.slow
+def test_leaving_the_corrections_out_changes_what_the_closed_form_says(programs, tmp_path):
+    scene = law_scene(LASTING)
+    study = study_effects(scene, accuracy=0.02, only=["delay_corrections"], derivatives=False, programs=programs)
+    expected = orbit_of(law_scene()) / orbit_of(scene) - 1.0
+    # 0.2-0.7 % is what the corrections are there for
+    assert 1e-3 < np.abs(expected[:2]).max() < 1e-2
+    np.testing.assert_allclose(numbers(by_name(study)["delay_corrections"].change), expected, rtol=1e-5, atol=1e-7)
+    save_scene(reduction_of(study).scene, tmp_path / "reduced.toml")
+    assert eqx.tree_equal(load_scene(tmp_path / "reduced.toml"), law_scene())
 
 
 @pytest.fixture(scope="module")

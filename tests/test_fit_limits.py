@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 
 import fitting.row_orbits
 from afm_jax.impact.law import ImpactLaw
-from afm_jax.impact.orbit_state import SteadyOrbits
+from afm_jax.impact.orbits import SteadyOrbits
 from fitting import fit, read_table
 from fitting.law_fit import problem_of
 from fitting.measurement import Rows, measurement_of

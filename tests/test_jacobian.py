@@ -23,7 +23,7 @@ STARTS = [(4.0, 60.0), (0.7, 35.0), (2.2, 120.0)]
 
 
 def scene_of(p: Parameters) -> Scene:
-    delay = None if p.delay is None else CollisionDelay(*p.delay)
+    delay = None if p.delay is None else CollisionDelay(*p.delay, corrections=False)
     return Scene(
         Cantilever(p.frequency_khz, p.quality_factor),
         Platform(p.amplitude_nm, p.drive_frequency_khz, p.offset_nm),

@@ -8,27 +8,27 @@ import numpy as np
 import pytest
 
 import afm_jax as afm
-from afm_jax.impact.lasting_closure import LastingProblem
 from afm_jax.impact.lasting_impact import LawImpact
-from afm_jax.impact.lasting_orbits import lasting_amplitudes, lasting_state, near_fold, steady_lasting_orbits
-from afm_jax.impact.lasting_search import find_lasting_roots, follow_lasting_root
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from afm_jax.impact.orbit_closure import OrbitProblem
+from afm_jax.impact.orbit_search import COARSE, find_roots, follow_root
+from afm_jax.impact.orbits import amplitudes, near_fold, orbit_state, steady_orbits
 from tests.reference_examples import DELAY, scene
 from tests.reference_lasting import closing_impacts, closing_speeds
 from tests.reference_systems import Parameters
 
 DRIVES = [(1, 0.97, 4.0, -1.0), (1, 1.01, 4.0, 1.0), (2, 2.0, 6.0, 0.0), (3, 3.03, 8.0, -0.5), (4, 3.9, 8.0, 1.0)]
-find = jax.jit(find_lasting_roots)
-steady = jax.jit(steady_lasting_orbits)
-follow = jax.jit(follow_lasting_root)
+find = jax.jit(lambda problem: find_roots(problem, COARSE))
+steady = jax.jit(steady_orbits)
+follow = jax.jit(follow_root)
 
 
-def problem_of(p: Parameters, order: int, *, delay: CollisionDelay | None = None) -> LastingProblem:
+def problem_of(p: Parameters, order: int, *, delay: CollisionDelay | None = None) -> OrbitProblem:
     """Return the package's problem of a reference's system."""
     law = ImpactLaw(p.r, p.epsilon, p.viscous_loss, CollisionDelay(*p.delay) if p.delay else delay)
     platform = afm.Platform(p.amplitude_nm, p.drive_frequency_khz, p.offset_nm)
     cantilever = afm.Cantilever(p.frequency_khz, p.quality_factor)
-    return LastingProblem(cantilever, platform, LawImpact(law), jnp.asarray(float(order)))
+    return OrbitProblem(cantilever, platform, LawImpact(law), jnp.asarray(float(order)))
 
 
 def delayed(order: int, reduced: float, amplitude_nm: float, offset_nm: float) -> tuple[Parameters, int]:
@@ -36,7 +36,7 @@ def delayed(order: int, reduced: float, amplitude_nm: float, offset_nm: float) -
     return scene(reduced, amplitude_nm=amplitude_nm, offset_nm=offset_nm, **law), order
 
 
-def speeds_found(problem: LastingProblem) -> np.ndarray:
+def speeds_found(problem: OrbitProblem) -> np.ndarray:
     """Return the approach speeds of all roots, ascending."""
     roots = find(problem)
     speeds = jax.vmap(problem.impact.speeds)(roots.coordinate).approach
@@ -86,14 +86,14 @@ def test_state_is_the_phase_and_the_impact_of_the_dense_scan():
     problem = problem_of(p, order)
     orbits = steady(problem)
     (slot,) = np.flatnonzero(orbits.steady)
-    state = lasting_state(orbits.coordinate[slot], problem)
+    state = orbit_state(orbits.coordinate[slot], problem)
     impact = closing_impacts(p, order, np.asarray(state.speeds.approach)[None])
     assert float(state.speeds.rebound) == pytest.approx(impact.rebound[0], rel=1e-9)
     assert float(state.speeds.delay) == pytest.approx(impact.delay[0], rel=1e-8)
     leaving = np.arctan2(impact.sine[0], impact.cosine[0]) / float(problem.platform.angular_frequency)
     period = float(problem.platform.period_us)
     assert float(state.flight.start_us) % period == pytest.approx(leaving % period, rel=1e-8)
-    peak, lockin, _ = lasting_amplitudes(orbits.coordinate[slot], problem)
+    peak, lockin, _ = amplitudes(orbits.coordinate[slot], problem)
     # the same program, once batched
     np.testing.assert_allclose(orbits.amplitude_nm[slot], [peak, lockin], rtol=1e-12)
 
@@ -126,14 +126,14 @@ def test_following_leads_to_the_root_that_a_search_finds(drive):
     begin = steady(problem_of(p, order))
     (slot,) = np.flatnonzero(begin.steady)
     moved = problem_of(dataclasses.replace(p, epsilon=118.0, quality_factor=39.0), order)
-    followed = follow(begin.coordinate[slot], moved)
-    assert bool(followed.found)
+    followed, found = follow(begin.coordinate[slot], moved)
+    assert bool(found)
     roots = find(moved)
     coordinates = np.asarray(roots.coordinate)[np.asarray(roots.found)]
-    nearest = coordinates[np.argmin(np.abs(coordinates - float(followed.coordinate)))]
-    assert float(followed.coordinate) == pytest.approx(nearest, rel=1e-10)
-    assert float(followed.coordinate) != pytest.approx(float(begin.coordinate[slot]), rel=1e-4)
-    assert not bool(near_fold(followed.coordinate, moved))
+    nearest = coordinates[np.argmin(np.abs(coordinates - float(followed)))]
+    assert float(followed) == pytest.approx(nearest, rel=1e-10)
+    assert float(followed) != pytest.approx(float(begin.coordinate[slot]), rel=1e-4)
+    assert not bool(near_fold(followed, moved))
 
 
 def test_following_says_where_there_is_nothing():
@@ -141,4 +141,5 @@ def test_following_says_where_there_is_nothing():
     begin = steady(problem_of(p, order))
     (slot,) = np.flatnonzero(begin.steady)
     # a tenth of the drive: nothing leaves the sample
-    assert not bool(follow(begin.coordinate[slot], problem_of(dataclasses.replace(p, amplitude_nm=0.1), order)).found)
+    _, found = follow(begin.coordinate[slot], problem_of(dataclasses.replace(p, amplitude_nm=0.1), order))
+    assert not bool(found)

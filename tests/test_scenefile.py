@@ -54,6 +54,16 @@ def test_reads_every_key(written):
     assert eqx.tree_equal(scene, Scene(Cantilever(90.0, 40.0, 1.5), Platform(4.0, 181.8, -1.0, 1e-3), law))
 
 
+@pytest.mark.parametrize(
+    ("line", "corrected"), [("", True), ("corrections = true\n", True), ("corrections = false\n", False)]
+)
+def test_a_delay_has_its_corrections_unless_they_are_left_out(written, tmp_path, line, corrected):
+    scene = load_scene(written(CANTILEVER + PLATFORM + LAW + DELAY + line))
+    assert scene.interaction.delay.corrections is corrected
+    save_scene(scene, tmp_path / "again.toml")
+    assert load_scene(tmp_path / "again.toml").interaction.delay.corrections is corrected
+
+
 def test_what_is_left_out_is_absent(written):
     scene = load_scene(written(CANTILEVER + PLATFORM + LAW))
     assert eqx.tree_equal(scene, Scene(Cantilever(90.0), Platform(4.0, 181.8), ImpactLaw(r=0.998)))
@@ -94,7 +104,7 @@ scenes = st.builds(
         st.floats(min_value=0.0, max_value=1.0, exclude_min=True, allow_subnormal=False),
         not_negative,
         not_negative,
-        st.none() | st.builds(CollisionDelay, finite, finite, finite),
+        st.none() | st.builds(CollisionDelay, finite, finite, finite, st.booleans()),
     ),
 )
 
@@ -215,6 +225,11 @@ def test_a_wrong_line_is_named(written, table: str, line: str, expected: str):
         ),
         ("hertz = 0.206", "hertz = inf", "[interaction.delay] `hertz` must be a finite number, but is inf"),
         ("hertz = 0.206", "", "[interaction.delay] hertz: missing; add it"),
+        (
+            "hertz = 0.206",
+            "hertz = 1\ncorrections = 0",
+            "[interaction.delay] corrections: must be true or false, but is a number",
+        ),
         (
             "height_above_platform_nm = 5",
             "height_above_platform_nm = -5",

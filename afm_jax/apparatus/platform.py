@@ -98,3 +98,13 @@ class Platform(eqx.Module):
             return first
         value, _ = self.second.value_and_rate(time)
         return first - self.second.angular_frequency**2 * value
+
+    def jerk(self, time_us: ArrayLike) -> Float[Array, "..."]:
+        """Return d^3z_p/dt^3 in nm/us^3 at a time in us."""
+        time = as_argument(time_us)
+        sine, _ = sine_cosine(self.angular_frequency * time)
+        first = self.top_speed_nm_per_us * self.angular_frequency**2 * sine
+        if self.second is None:
+            return first
+        _, rate = self.second.value_and_rate(time)
+        return first - self.second.angular_frequency**2 * rate

@@ -114,6 +114,16 @@ class Surface(eqx.Module):
             acceleration = acceleration - wave.angular_frequency**2 * height
         return acceleration
 
+    def jerk(self, time_us: ArrayLike) -> Float[Array, "..."]:
+        """Return the rate of the acceleration in nm/us^3 at a time in us."""
+        time = as_argument(time_us)
+        jerk = jnp.zeros_like(self.offset_nm * time)
+        for wave in self.tones:
+            sine, cosine = sine_cosine(wave.angular_frequency * time)
+            rate = wave.angular_frequency * (wave.sine * cosine - wave.cosine * sine)
+            jerk = jerk - wave.angular_frequency**2 * rate
+        return jerk
+
     def _total(self, parts: Iterable[Float[Array, "..."]]) -> Float[Array, "..."]:
         return sum(parts, start=jnp.zeros_like(self.offset_nm))
 

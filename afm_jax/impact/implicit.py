@@ -17,6 +17,7 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float
 
 _implicit_root = Primitive("implicit_root")
+_PAIR = 2
 
 
 def implicit_root(
@@ -34,7 +35,15 @@ def implicit_root(
         points have none, and the caller flags them.
     """
     leaves, structure = jax.tree.flatten(parameters)
-    return _implicit_root.bind(root, *leaves, residual=residual, structure=structure)
+    return _implicit_root.bind(root, *leaves, residual=residual, structure=structure, pair=False)
+
+
+def implicit_pair(
+    residual: Callable[[Float[Array, " 2"], Any], Float[Array, " 2"]], root: Float[Array, " 2"], parameters: Any
+) -> Float[Array, " 2"]:
+    """Attach the implicit derivative to a root of two equations in two unknowns; as `implicit_root` otherwise."""
+    leaves, structure = jax.tree.flatten(parameters)
+    return _implicit_root.bind(root, *leaves, residual=residual, structure=structure, pair=True)
 
 
 class _Mapped(NamedTuple):
@@ -52,26 +61,26 @@ class _Mapped(NamedTuple):
 
 
 @_implicit_root.def_impl
-def _evaluate(root, *leaves, residual, structure):
-    del leaves, residual, structure
+def _evaluate(root, *leaves, residual, structure, pair):
+    del leaves, residual, structure, pair
     return root
 
 
 @_implicit_root.def_abstract_eval
-def _shape(root, *leaves, residual, structure):
-    del leaves, residual, structure
+def _shape(root, *leaves, residual, structure, pair):
+    del leaves, residual, structure, pair
     return root
 
 
-def _lower(context, root, *leaves, residual, structure):
-    del context, leaves, residual, structure
+def _lower(context, root, *leaves, residual, structure, pair):
+    del context, leaves, residual, structure, pair
     return [root]
 
 
-def _differentiate(primals, tangents, *, residual, structure):
+def _differentiate(primals, tangents, *, residual, structure, pair):
     """Differentiate: dx = -(df/dp dp) / (df/dx) at the root, summed over the parameters that move."""
     root, *leaves = primals
-    x = _implicit_root.bind(root, *leaves, residual=residual, structure=structure)
+    x = _implicit_root.bind(root, *leaves, residual=residual, structure=structure, pair=pair)
     rates = {place: rate for place, rate in enumerate(tangents[1:]) if not isinstance(rate, ad.Zero)}
     if not rates:
         return x, jnp.zeros_like(x)
@@ -80,13 +89,29 @@ def _differentiate(primals, tangents, *, residual, structure):
         return residual(value, jax.tree.unflatten(structure, [moved.get(i, leaf) for i, leaf in enumerate(leaves)]))
 
     moving = {place: leaves[place] for place in rates}
-    _, slope = jax.jvp(lambda value: at(value, moving), (x,), (jnp.ones_like(x),))
     _, shift = jax.jvp(lambda moved: at(x, moved), (moving,), (rates,))
+
+    def along(direction):
+        return jax.jvp(lambda value: at(value, moving), (x,), (direction,))[1]
+
+    if pair:
+        axes = (jnp.broadcast_to(row, x.shape) for row in jnp.eye(_PAIR, dtype=x.dtype))
+        return x, -solved_pair([along(axis) for axis in axes], shift)
+    slope = along(jnp.ones_like(x))
     regular = slope != 0.0
     return x, jnp.where(regular, -shift / jnp.where(regular, slope, 1.0), 0.0)
 
 
-def _map_over_batch(arguments, axes, *, residual, structure):
+def solved_pair(columns: list[Float[Array, "... 2"]], right: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
+    """Return the solution of two linear equations, given the matrix's columns; 0 where the matrix is singular."""
+    (a, c), (b, d), (first, second) = (jnp.moveaxis(part, -1, 0) for part in (*columns, right))
+    determinant = a * d - b * c
+    regular = determinant != 0.0
+    solution = jnp.stack([d * first - b * second, a * second - c * first], axis=-1)
+    return jnp.where(regular[..., None], solution / jnp.where(regular, determinant, 1.0)[..., None], 0.0)
+
+
+def _map_over_batch(arguments, axes, *, residual, structure, pair):
     size = next(argument.shape[axis] for argument, axis in zip(arguments, axes, strict=True) if axis is not None)
     root, *leaves = (
         argument if axis is None else jnp.moveaxis(argument, axis, 0)
@@ -95,7 +120,7 @@ def _map_over_batch(arguments, axes, *, residual, structure):
     if axes[0] is None:
         root = jnp.broadcast_to(root, (size, *root.shape))
     mapped = _Mapped(residual, structure, tuple(None if axis is None else 0 for axis in axes[1:]))
-    return _implicit_root.bind(root, *leaves, residual=mapped, structure=structure), 0
+    return _implicit_root.bind(root, *leaves, residual=mapped, structure=structure, pair=pair), 0
 
 
 mlir.register_lowering(_implicit_root, _lower)

@@ -2,10 +2,11 @@
 
 Two layers: formulas of scalars (the paper's eqs. 5, 7 and 8 as printed, and `flight_jacobian`, `impact_jacobian` that
 hold with damping, viscous loss and delay), and `map_jacobian`, which finds the next impact of a scene and chains them.
-`afm-jax verify` compares all of them with automatic differentiation.
+`afm-jax verify` compares all of them with automatic differentiation. An impact that lasts, the delay with its
+corrections, has no written formula: its Jacobian is that of automatic differentiation, exact as well.
 """
 
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -14,27 +15,11 @@ from jaxtyping import Array, ArrayLike, Float
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, require_sample_drive
-from afm_jax.impact.law import impact_law_of
+from afm_jax.impact.lasting_impact import Impact, LawImpact, speeds_of_impact
+from afm_jax.impact.law import ImpactLaw, impact_law_of
 from afm_jax.impact.poincare import next_impact
 from afm_jax.outcome import Outcome
 from afm_jax.parameters import as_argument
-
-
-@runtime_checkable
-class LawWithSlopes(Protocol):
-    """What `impact_jacobian` asks of a law: an `ImpactLaw`, or another law and delay with derivatives."""
-
-    def rebound_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return d u_out/d u_in."""
-        ...
-
-    def delay_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return d tau/d u_in in us^2/nm."""
-        ...
-
-    def collision_delay(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return tau in us."""
-        ...
 
 
 class PaperFlight(NamedTuple):
@@ -168,9 +153,9 @@ def flight_jacobian(
 
 
 def impact_jacobian(
-    law: LawWithSlopes, platform: Platform, arrival_us: ArrayLike, velocity_before: ArrayLike
+    law: ImpactLaw, platform: Platform, arrival_us: ArrayLike, velocity_before: ArrayLike
 ) -> Float[Array, "2 2"]:
-    """Return d(t_out, V')/d(t_in, V) of an impact: eq. 7 with viscous loss and collision delay.
+    """Return d(t_out, V')/d(t_in, V) of an impact: eq. 7 with viscous loss and collision delay, without corrections.
 
     With u = v_p(t_in) - V, slope f' = d u_out/du and t_out = t_in + tau(u): dt_out = (1 + tau' a_p,in) dt_in - tau' dV
     and dV' = a_p,out dt_out + f' (a_p,in dt_in - dV).
@@ -194,6 +179,25 @@ def impact_jacobian(
             [acceleration_out * time_by_time + slope * acceleration_in, -acceleration_out * delay_slope - slope],
         ]
     )
+
+
+def contact_jacobian(
+    impact: Impact, cantilever: Cantilever, platform: Platform, arrival_us: Array, velocity_before: Array
+) -> Float[Array, "2 2"]:
+    """Return d(t_out, V')/d(t_in, V) of any impact: the written one, or of one that lasts the automatic one.
+
+    Arguments as for `impact_jacobian`; ``cantilever`` pulls at the tip while the impact lasts.
+    """
+    if isinstance(impact, LawImpact) and not impact.lasts:
+        return impact_jacobian(impact.law, platform, arrival_us, velocity_before)
+
+    def through(arriving: Float[Array, " 2"]) -> Float[Array, " 2"]:
+        arrival, before = arriving
+        speeds = speeds_of_impact(impact, platform.velocity(arrival) - before, arrival, cantilever, platform)
+        leaving = arrival + speeds.delay
+        return jnp.stack([leaving, platform.velocity(leaving) + speeds.rebound])
+
+    return jax.jacfwd(through)(jnp.stack([arrival_us, velocity_before]))
 
 
 def map_jacobian(scene: Scene, time_us: ArrayLike, velocity_nm_per_us: ArrayLike) -> Float[Array, "2 2"]:
@@ -224,5 +228,5 @@ def _map_jacobian(scene: Scene, time, velocity, impact) -> Float[Array, "2 2"]:
     arrival = jnp.where(leaves, impact.arrival_time_us, time)
     before = jnp.where(leaves, impact.velocity_before_nm_per_us, 0.0)
     flight = flight_jacobian(scene.cantilever, scene.platform, time, velocity, arrival)
-    law = impact_jacobian(impact_law_of(scene), scene.platform, arrival, before)
+    law = contact_jacobian(LawImpact(impact_law_of(scene)), scene.cantilever, scene.platform, arrival, before)
     return jnp.where(leaves, law @ flight, jnp.nan)

@@ -17,16 +17,15 @@ bring amplitudes from 0.2-0.7 % to about 0.01 % of those of the full contact, to
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jax import lax
+from jaxtyping import Array, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
-from afm_jax.impact.jacobian import LawWithSlopes
-from afm_jax.impact.law import ImpactLaw
-from afm_jax.impact.orbit_closure import Speeds, capture_coordinate, speeds_at
+from afm_jax.apparatus.surface import Surface
+from afm_jax.impact.law import ImpactLaw, Speeds, capture_coordinate, speeds_at
 
 HERTZ = np.array([0.4247, -0.157, 0.027])
 """Gain of the squared speed, over u^2, by J, G J and J^2."""
@@ -41,10 +40,26 @@ BRIDGE_NM = 4.7
 USUAL_LEAD = 1.3
 """Lead b of a tip that keeps its energy over a length, over that length: what comes closest for eight contacts."""
 
+PASSES = 4
+"""From the delay to mid contact and back."""
+
 
 @runtime_checkable
-class LastingImpact(LawWithSlopes, Protocol):
-    """A law and a delay, as functions of one coordinate that grows with the approach speed."""
+class Impact(Protocol):
+    """What an impact does to the tip, as functions of one coordinate that grows with the approach speed.
+
+    Instantaneous, delayed, or lasting: delayed, with the corrections of what happens to the tip meanwhile.
+    """
+
+    @property
+    def delayed(self) -> bool:
+        """Whether the next flight begins at another time than the last one ends."""
+        ...
+
+    @property
+    def lasts(self) -> bool:
+        """Whether platform, spring and air act during the contact."""
+        ...
 
     @property
     def lowest(self) -> Float[Array, ""]:
@@ -66,19 +81,33 @@ class LastingImpact(LawWithSlopes, Protocol):
         """Length in nm over which a leaving tip keeps its energy: the gap at which the bridge breaks."""
         ...
 
-    def hertz_time(self, approach_speed: Float[Array, ""]) -> Float[Array, ""]:
+    def hertz_time(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return the time tau in us that a Hertz contact of the same stiffness would take."""
         ...
 
     def speeds(self, coordinate: Float[Array, ""]) -> Speeds:
-        """Return approach and rebound speed and the delay at a coordinate."""
+        """Return speeds and delay at a coordinate, of a free tip on a sample at rest."""
+        ...
+
+    def at_approach(self, approach_speed: Float[Array, ""]) -> Speeds:
+        """Return the same at an approach speed; a captured tip has no rebound and no delay."""
         ...
 
 
 class LawImpact(eqx.Module):
-    """An `ImpactLaw` as a lasting impact; its coordinate Y is that of `orbit_closure`."""
+    """An `ImpactLaw` as an impact; its coordinate is the Y of `speeds_at`."""
 
     law: ImpactLaw
+
+    @property
+    def delayed(self) -> bool:
+        """Whether the law has a delay."""
+        return self.law.delay is not None
+
+    @property
+    def lasts(self) -> bool:
+        """Whether the delay has its corrections."""
+        return self.law.lasts
 
     @property
     def lowest(self) -> Float[Array, ""]:
@@ -100,7 +129,7 @@ class LawImpact(eqx.Module):
         """That of the paper's bridge."""
         return jnp.full_like(self.law.r, BRIDGE_NM)
 
-    def hertz_time(self, approach_speed: Float[Array, ""]) -> Float[Array, ""]:
+    def hertz_time(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return a u^(-1/5) of the delay."""
         hertz = jnp.zeros_like(self.law.r) if self.law.delay is None else self.law.delay.hertz
         return hertz * approach_speed**-0.2
@@ -109,17 +138,9 @@ class LawImpact(eqx.Module):
         """Return approach and rebound speed and the delay at Y."""
         return speeds_at(coordinate, self.law)
 
-    def rebound_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return d u_out/d u_in of the law."""
-        return self.law.rebound_slope(approach_speed)
-
-    def delay_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return d tau/d u_in of the law."""
-        return self.law.delay_slope(approach_speed)
-
-    def collision_delay(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return the law's delay."""
-        return self.law.collision_delay(approach_speed)
+    def at_approach(self, approach_speed: Float[Array, ""]) -> Speeds:
+        """Return what the law says of an approach speed."""
+        return Speeds(approach_speed, self.law.rebound_speed(approach_speed), self.law.collision_delay(approach_speed))
 
 
 class TabulatedImpact(eqx.Module):
@@ -148,11 +169,21 @@ class TabulatedImpact(eqx.Module):
     length_nm: Float[Array, ""]
 
     @property
+    def delayed(self) -> bool:
+        """It takes time."""
+        return True
+
+    @property
+    def lasts(self) -> bool:
+        """And the tip is not alone meanwhile."""
+        return True
+
+    @property
     def reach(self) -> Float[Array, ""]:
         """The capture speed."""
         return self.lowest
 
-    def hertz_time(self, approach_speed: Float[Array, ""]) -> Float[Array, ""]:
+    def hertz_time(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return tau at the end of the table, where nothing else is left of the delay, scaled to the speed."""
         end = self.lowest + jnp.exp(self.end)
         return jnp.sum(self.delay) * (end / approach_speed) ** 0.2
@@ -176,21 +207,9 @@ class TabulatedImpact(eqx.Module):
         w = jnp.sqrt(jnp.maximum(square, 1e-6))
         return Speeds(u, w, chebyshev_sum(self.delay, place) - self.lead_nm * (1.0 / w - 1.0 / u))
 
-    def rebound_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return d u_out/d u_in."""
-        return self._slopes(approach_speed).rebound
-
-    def delay_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return d tau/d u_in in us^2/nm."""
-        return self._slopes(approach_speed).delay
-
-    def collision_delay(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return the delay in us."""
-        return self.speeds(jnp.asarray(approach_speed)).delay
-
-    def _slopes(self, approach_speed: ArrayLike) -> Speeds:
-        u = jnp.asarray(approach_speed)
-        return jax.jvp(self.speeds, (u,), (jnp.ones_like(u),))[1]
+    def at_approach(self, approach_speed: Float[Array, ""]) -> Speeds:
+        """Return what the table says of an approach speed."""
+        return self.speeds(approach_speed)
 
     def _place(self, u: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return where a speed lies in the table, -1 to 1."""
@@ -205,33 +224,33 @@ class Middle(NamedTuple):
     change: Float[Array, ""]
 
 
-def middle_of_contact(
-    cantilever: Cantilever,
-    platform: Platform,
-    cosine: Float[Array, ""],
-    sine: Float[Array, ""],
-    delay: Float[Array, ""],
-) -> Middle:
-    """Return the accelerations half a delay before the end of contact.
+def middle_of_contact(cantilever: Cantilever, surface: Platform | Surface, time_us: Float[Array, ""]) -> Middle:
+    """Return the accelerations at mid contact.
 
     Args:
         cantilever: pulls at the tip by its spring and through the air.
-        platform: moves.
-        cosine: of the drive's phase at the end of contact.
-        sine: of it.
-        delay: time in contact in us.
+        surface: moves.
+        time_us: half a delay before the end of contact.
     """
-    omega, beta = platform.angular_frequency, platform.amplitude_nm
-    turn = 0.5 * omega * delay
-    c, s = jnp.cos(turn), jnp.sin(turn)
-    cosine, sine = cosine * c + sine * s, sine * c - cosine * s
-    height = platform.offset_nm + beta * cosine
-    velocity, acceleration = -beta * omega * sine, -beta * omega**2 * cosine
-    pull = -(cantilever.angular_frequency**2) * height - 2.0 * cantilever.decay_rate * velocity - acceleration
-    return Middle(pull, -beta * omega**3 * sine)
+    height, velocity = surface.position_and_velocity(time_us)
+    pull = cantilever.acceleration(height, velocity) - surface.acceleration(time_us)
+    return Middle(pull, -surface.jerk(time_us))
 
 
-def corrected(free: Speeds, middle: Middle, cantilever: Cantilever, impact: LastingImpact) -> Speeds:
+def gained_and_longer(
+    approach_speed: Float[Array, ""], tau: Float[Array, ""], middle: Middle, cantilever: Cantilever
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return what a Hertz contact of a duration tau gains in squared speed, nm^2/us^2, and in duration, us."""
+    pull, change = middle.acceleration * tau / approach_speed, middle.change * tau**2 / approach_speed
+    by_change, by_both, by_square = HERTZ.tolist()
+    gained = by_change * change + by_both * pull * change + by_square * change**2
+    gained = gained - (2.0 * AIR) * cantilever.decay_rate * tau
+    by_pull, by_change, by_square, by_both = LONGER.tolist()
+    longer = by_pull * pull + by_change * change + by_square * pull**2 + by_both * pull * change
+    return gained * approach_speed**2, longer * tau
+
+
+def corrected(free: Speeds, middle: Middle, cantilever: Cantilever, impact: Impact) -> Speeds:
     """Return rebound speed and delay on a moving platform.
 
     Args:
@@ -240,16 +259,96 @@ def corrected(free: Speeds, middle: Middle, cantilever: Cantilever, impact: Last
         cantilever: for the damping of the air.
         impact: for its Hertz time and its lead.
     """
-    u, tau = free.approach, impact.hertz_time(free.approach)
-    pull, change = middle.acceleration * tau / u, middle.change * tau**2 / u
-    gained = HERTZ[0] * change + HERTZ[1] * pull * change + HERTZ[2] * change**2
-    gained = gained - (2.0 * AIR) * cantilever.decay_rate * tau
-    square = free.rebound**2 + gained * u**2
-    rebound = jnp.sqrt(jnp.maximum(square, (0.1 * free.rebound) ** 2))
-    longer = LONGER[0] * pull + LONGER[1] * change + LONGER[2] * pull**2 + LONGER[3] * pull * change
-    held = _lag(free.rebound, impact.length, middle.acceleration) - _lag(u, impact.length, middle.acceleration)
+    u, w = free.approach, free.rebound
+    gained, longer = gained_and_longer(u, impact.hertz_time(u), middle, cantilever)
+    rebound = jnp.sqrt(jnp.maximum(w**2 + gained, (0.1 * w) ** 2))
+    held = _lag(w, impact.length, middle.acceleration) - _lag(u, impact.length, middle.acceleration)
     share = jnp.maximum(impact.lead, 0.0) / (USUAL_LEAD * impact.length)
-    return Speeds(u, rebound, free.delay + longer * tau - share * held)
+    return Speeds(u, rebound, free.delay + longer - share * held)
+
+
+def speeds_of_impact(
+    impact: Impact,
+    approach_speed: Float[Array, ""],
+    arrival_us: Float[Array, ""],
+    cantilever: Cantilever,
+    surface: Platform | Surface,
+) -> Speeds:
+    """Return what an impact makes of a tip that arrives: the one answer of map, orbits, simulation and fit.
+
+    Args:
+        impact: instantaneous, delayed or lasting.
+        approach_speed: u_in in nm/us, positive.
+        arrival_us: when the free flight reaches the surface.
+        cantilever: pulls at the tip meanwhile.
+        surface: what it meets, moving.
+    """
+    free = impact.at_approach(approach_speed)
+    if not impact.lasts:
+        return free
+    leaves = free.rebound > 0.0
+    safe = Speeds(*(jnp.where(leaves, part, usual) for part, usual in zip(free, (1.0, 1.0, 0.0), strict=True)))
+    found = lasting(safe, impact, arrival_us, cantilever, surface)
+    return Speeds(approach_speed, *(jnp.where(leaves, part, 0.0) for part in found[1:]))
+
+
+def lasting(
+    free: Speeds,
+    impact: Impact,
+    arrival_us: Float[Array, ""],
+    cantilever: Cantilever,
+    surface: Platform | Surface,
+) -> Speeds:
+    """Return rebound speed and delay of an impact that lasts, from its arrival on.
+
+    Mid contact is half a delay later, and the delay one that has its corrections: a few passes, each of which leaves a
+    hundredth of the change or less.
+
+    Args:
+        free: speeds and delay of the free tip on a sample at rest; the tip leaves.
+        impact: for its Hertz time and its lead.
+        arrival_us: when the free flight reaches the surface.
+        cantilever: pulls at the tip by its spring and through the air.
+        surface: moves.
+    """
+
+    def correct(_, speeds: Speeds) -> Speeds:
+        middle = middle_of_contact(cantilever, surface, arrival_us + 0.5 * speeds.delay)
+        return corrected(free, middle, cantilever, impact)
+
+    # a loop, because the program is compiled for every use of it
+    return lax.fori_loop(0, PASSES, correct, free)
+
+
+def delay_before(
+    impact: LawImpact,
+    rebound_speed: Float[Array, ""],
+    leaving_us: Float[Array, ""],
+    cantilever: Cantilever,
+    surface: Platform | Surface,
+) -> Float[Array, ""]:
+    """Return the delay of the impact that a tip leaves with a rebound speed in nm/us: the map read backwards, in us.
+
+    Arguments as above; ``leaving_us`` is the end of contact. A tip that does not leave has none.
+    """
+    law = impact.law
+    leaves = rebound_speed > 0.0
+    rebound = jnp.where(leaves, rebound_speed, 1.0)
+
+    def of_free(free_rebound: Float[Array, ""]) -> Speeds:
+        approach = law.approach_speed(free_rebound)
+        return Speeds(approach, free_rebound, impact.at_approach(approach).delay)
+
+    def improve(_, state: Speeds) -> Speeds:
+        free = of_free(state.rebound)
+        middle = middle_of_contact(cantilever, surface, leaving_us - 0.5 * state.delay)
+        found = corrected(free, middle, cantilever, impact)
+        square = free.rebound**2 + rebound**2 - found.rebound**2
+        return Speeds(free.approach, jnp.sqrt(jnp.maximum(square, (0.1 * rebound) ** 2)), found.delay)
+
+    begin = of_free(rebound)
+    found = lax.fori_loop(0, PASSES, improve, begin) if impact.lasts else begin
+    return jnp.where(leaves, found.delay, 0.0)
 
 
 def _lag(speed: Float[Array, ""], length: Float[Array, ""], acceleration: Float[Array, ""]) -> Float[Array, ""]:

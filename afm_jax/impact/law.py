@@ -4,6 +4,8 @@ The squared rebound speed of eq. 6, with the viscous loss that the liquid bridge
 u_out^2 = r^2 u_in^2 - c u_in - epsilon. All speeds are relative to the platform and positive.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
@@ -20,6 +22,14 @@ def squared_rebound_speed(
     return (as_argument(r) * u) ** 2 - viscous_loss * u - epsilon
 
 
+class Speeds(NamedTuple):
+    """Approach and rebound speed in nm/us, collision delay in us."""
+
+    approach: Float[Array, "..."]
+    rebound: Float[Array, "..."]
+    delay: Float[Array, "..."]
+
+
 class CollisionDelay(eqx.Module):
     """Time between the crossings of gap 0 by the extrapolated paths in and out: a u^(-1/5) - b (1/w - 1/u) - d/u.
 
@@ -27,18 +37,24 @@ class CollisionDelay(eqx.Module):
         hertz: a, the Hertz contact time at 1 nm/us, in us (nm/us)^(1/5).
         lead_nm: b, by which a slower way out arrives early, in nm.
         offset_nm: d, offset of the contact surface from gap 0 (twice), in nm.
+        corrections: whether the moving platform, the spring and the air act on the tip while it is in contact
+            (`afm_jax.impact.lasting_impact`); False: every impact is that of a free tip on a sample at rest.
 
     Raises:
         ValueError: if a value is not finite.
+        TypeError: if `corrections` is no truth value.
     """
 
     hertz: Float[Array, "..."] = eqx.field(converter=as_parameter)
     lead_nm: Float[Array, "..."] = eqx.field(converter=as_parameter)
     offset_nm: Float[Array, "..."] = eqx.field(converter=as_parameter)
+    corrections: bool = eqx.field(static=True, default=True)
 
     __repr__ = readable
 
     def __check_init__(self):
+        if not isinstance(self.corrections, bool):
+            raise TypeError(f"`corrections` must be True or False, but is {self.corrections!r}")
         check_parameter("hertz", self.hertz, "finite")
         check_parameter("lead_nm", self.lead_nm, "finite")
         check_parameter("offset_nm", self.offset_nm, "finite")
@@ -59,6 +75,9 @@ class CollisionDelay(eqx.Module):
 
 class ImpactLaw(eqx.Module):
     """The impact law of eq. 6 with viscous loss and collision delay; eq. 1 is `epsilon=0`.
+
+    Its methods tell the impact of a free tip on a sample at rest; a delay with corrections adds to it what happens
+    while the impact lasts (`afm_jax.impact.lasting_impact`).
 
     Args:
         r: coefficient of restitution, in (0, 1].
@@ -90,6 +109,11 @@ class ImpactLaw(eqx.Module):
     def captures(self, approach_speed: ArrayLike) -> Bool[Array, "..."]:
         """Say whether the tip stays at an approach speed in nm/us: the root's argument is not positive."""
         return squared_rebound_speed(approach_speed, self.r, self.epsilon, self.viscous_loss) <= 0.0
+
+    @property
+    def lasts(self) -> bool:
+        """Whether impacts last: a delay, with the corrections of what happens meanwhile."""
+        return self.delay is not None and self.delay.corrections
 
     @property
     def capture_speed_nm_per_us(self) -> Float[Array, "..."]:
@@ -155,3 +179,23 @@ def impact_law_of(scene: Scene) -> ImpactLaw:
             f"the impact map needs a scene whose interaction is an ImpactLaw, not {type(scene.interaction).__name__}"
         )
     return scene.interaction
+
+
+def capture_coordinate(law: ImpactLaw) -> Float[Array, ""]:
+    """Return q in nm/us: the coordinate Y of `speeds_at` at which the tip is captured."""
+    square = law.epsilon + (law.viscous_loss / (2.0 * law.r)) ** 2
+    positive = square > 0.0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
+
+
+def speeds_at(coordinate: Float[Array, ""], law: ImpactLaw) -> Speeds:
+    """Return the speeds and the delay at a coordinate Y > q in nm/us, in which the law is smooth up to capture.
+
+    u = c/2r^2 + (Y + q^2/Y)/2r, w = (Y - q^2/Y)/2, q^2 = epsilon + c^2/4r^2.
+    """
+    square = law.epsilon + (law.viscous_loss / (2.0 * law.r)) ** 2
+    middle = law.viscous_loss / (2.0 * law.r**2)
+    approach = middle + (coordinate + square / coordinate) / (2.0 * law.r)
+    rebound = 0.5 * (coordinate - square / coordinate)
+    delay = jnp.zeros_like(approach) if law.delay is None else law.delay(approach, rebound)
+    return Speeds(approach, rebound, delay)

@@ -5,21 +5,29 @@ assumed approach speed u the law gives the rebound speed w and the delay tau, an
 duration N T - tau ends where the next one begins are *linear* in a = cos(omega t_out), b = sin(omega t_out). Every root
 of a^2 + b^2 = 1 is an orbit. Both signs of eq. 9's root are among them, and nothing else, because w > 0 throughout.
 
-In place of u stands a coordinate Y >= q in which the law is smooth up to capture: u = c/2r^2 + (Y + q^2/Y)/2r,
-w = (Y - q^2/Y)/2, q^2 = epsilon + c^2/4r^2. Without a delay the condition is then a quartic in Y.
+In place of u stands a coordinate of the impact in which the law is smooth up to capture (`speeds_at`). Without a delay
+the condition is then a quartic in it. Where the impact lasts, speeds and delay need the phase: three passes alternate
+between the two, close enough to find every orbit, and Newton's method closes the map itself from there.
 """
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from afm_jax.apparatus.cantilever import Cantilever, Propagator
 from afm_jax.apparatus.platform import Platform
-from afm_jax.impact.law import ImpactLaw
+from afm_jax.impact.implicit import solved_pair
+from afm_jax.impact.lasting_impact import Impact, LawImpact, corrected, lasting, middle_of_contact
+from afm_jax.impact.law import ImpactLaw, Speeds
 
 _REGULAR = 1e-12
 """Relative size below which a determinant is taken for the rounding of 0."""
+_PASSES = 3
+_LONGEST_STEP = 0.3
+"""Of Newton's method: share of the distance from capture, and rad."""
 
 
 class OrbitProblem(NamedTuple):
@@ -27,12 +35,12 @@ class OrbitProblem(NamedTuple):
 
     cantilever: Cantilever
     platform: Platform
-    law: ImpactLaw
+    impact: Impact
     order: Float[Array, ""]
 
 
-class Closure(NamedTuple):
-    """The linear system at one Y: a = cosine/determinant, b = sine/determinant of the phase just after impact.
+class System(NamedTuple):
+    """The linear system for given speeds: a = cosine/determinant, b = sine/determinant of the phase just after impact.
 
     All three in units of the drive (lengths over beta, speeds over beta omega), numbers. ``regular`` is False where the
     flight returns every state (a whole number of free periods): the determinant is 0 then but for rounding.
@@ -43,53 +51,107 @@ class Closure(NamedTuple):
     determinant: Float[Array, ""]
     regular: Bool[Array, ""]
 
-
-class Speeds(NamedTuple):
-    """Approach and rebound speed in nm/us, collision delay in us."""
-
-    approach: Float[Array, ""]
-    rebound: Float[Array, ""]
-    delay: Float[Array, ""]
-
-
-def capture_coordinate(law: ImpactLaw) -> Float[Array, ""]:
-    """Return q in nm/us: the Y at which the tip is captured."""
-    square = law.epsilon + (law.viscous_loss / (2.0 * law.r)) ** 2
-    positive = square > 0.0
-    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
+    @property
+    def phase(self) -> Float[Array, ""]:
+        """The drive's phase in rad just after impact; 0 where it is not determined."""
+        safe = jnp.where(self.regular, self.determinant, 1.0)
+        cosine = jnp.where(self.regular, self.cosine / safe, 1.0)
+        return jnp.arctan2(jnp.where(self.regular, self.sine / safe, 0.0), cosine)
 
 
-def speeds_at(coordinate: Float[Array, ""], law: ImpactLaw) -> Speeds:
-    """Return the speeds and the delay of the impact at a coordinate Y > q, in nm/us."""
-    square = law.epsilon + (law.viscous_loss / (2.0 * law.r)) ** 2
-    middle = law.viscous_loss / (2.0 * law.r**2)
-    approach = middle + (coordinate + square / coordinate) / (2.0 * law.r)
-    rebound = 0.5 * (coordinate - square / coordinate)
-    delay = jnp.zeros_like(approach) if law.delay is None else law.delay(approach, rebound)
-    return Speeds(approach, rebound, delay)
+class Closure(NamedTuple):
+    """The impact at a coordinate, and the linear system it leads to."""
+
+    speeds: Speeds
+    system: System
 
 
+@jax.jit
 def closure(coordinate: Float[Array, ""], problem: OrbitProblem) -> Closure:
-    """Return the linear system for the phase of the orbit whose impact has coordinate Y.
+    """Return the linear system for the phase of the orbit whose impact has a coordinate.
 
     Rows: z_in = p11 z_out + p12 V_out and V_in = p21 z_out + p22 V_out, with z_out = sigma + beta a,
     V_out = w - beta omega b, z_in = sigma + beta (a C + b S), V_in = -u - beta omega (b C - a S); C, S of omega tau.
     """
-    cantilever, platform, law, order = problem
-    speeds = speeds_at(coordinate, law)
-    if law.delay is None:
+    cantilever, platform, impact, order = problem
+    free = impact.speeds(coordinate)
+    if not impact.delayed:
         flight = _returning_flight(cantilever, order * platform.period_us)
         top_speed = platform.top_speed_nm_per_us
-        cosine, sine = _instantaneous(speeds.approach / top_speed, speeds.rebound / top_speed, 1.0, flight, platform)
-        return Closure(cosine, sine, flight.closing, flight.regular(platform))
-    propagator = cantilever.propagator(order * platform.period_us - speeds.delay)
-    turn = platform.angular_frequency * speeds.delay
-    return delayed_closure(propagator, speeds, platform, (jnp.cos(turn), jnp.sin(turn)))
+        cosine, sine = _instantaneous(free.approach / top_speed, free.rebound / top_speed, 1.0, flight, platform)
+        return Closure(free, System(cosine, sine, flight.closing, flight.regular(platform)))
+    if not impact.lasts:
+        return Closure(free, _delayed(free, problem))
+
+    def correct(_, speeds: Speeds) -> Speeds:
+        system = _delayed(speeds, problem)
+        # the direction of the phase, whether or not this is an orbit already
+        cosine, sine = system.cosine * system.determinant, system.sine * system.determinant
+        somewhere = (cosine != 0.0) | (sine != 0.0)
+        phase = jnp.arctan2(sine, jnp.where(somewhere, cosine, 1.0))
+        middle = middle_of_contact(cantilever, platform, phase / platform.angular_frequency - 0.5 * speeds.delay)
+        return corrected(free, middle, cantilever, impact)
+
+    # a loop, because the program is compiled for every use of it
+    speeds = lax.fori_loop(0, _PASSES, correct, free)
+    return Closure(speeds, _delayed(speeds, problem))
+
+
+class Place(NamedTuple):
+    """An orbit: the coordinate of its impact in nm/us, and the drive's phase in rad when the tip arrives."""
+
+    coordinate: Float[Array, ""]
+    phase: Float[Array, ""]
+
+
+def place_near(coordinate: Float[Array, ""], problem: OrbitProblem) -> Place:
+    """Return about where the orbit of an impact that lasts is, given a coordinate close to a root."""
+    speeds, system = closure(coordinate, problem)
+    return Place(coordinate, system.phase - problem.platform.angular_frequency * speeds.delay)
+
+
+def speeds_at_place(place: Place, problem: OrbitProblem) -> Speeds:
+    """Return what the impact is at a place: that of the map."""
+    cantilever, platform, impact, _ = problem
+    return lasting(
+        impact.speeds(place.coordinate), impact, place.phase / platform.angular_frequency, cantilever, platform
+    )
+
+
+@jax.jit
+def map_gaps(unknowns: Float[Array, " 2"], problem: OrbitProblem) -> Float[Array, " 2"]:
+    """Return by how much one turn of the map misses its start: height over beta, velocity over beta omega."""
+    cantilever, platform, _, order = problem
+    place = Place(*unknowns)
+    arrival = place.phase / platform.angular_frequency
+    speeds = speeds_at_place(place, problem)
+    height, speed = platform.position_and_velocity(arrival + speeds.delay)
+    flight = cantilever.propagator(order * platform.period_us - speeds.delay)
+    position, velocity = flight(height, speed + speeds.rebound)
+    height, speed = platform.position_and_velocity(arrival)
+    missing = (velocity - speed + speeds.approach) / platform.top_speed_nm_per_us
+    return jnp.stack([(position - height) / platform.amplitude_nm, missing])
+
+
+def close_map(place: Place, problem: OrbitProblem, steps: int) -> Float[Array, " 2"]:
+    """Return coordinate and phase after steps of Newton's method towards the orbit of the map."""
+
+    def improve(_, unknowns):
+        def along(direction):
+            return jax.jvp(lambda x: map_gaps(x, problem), (unknowns,), (direction,))
+
+        (value, by_coordinate), (_, by_phase) = (along(axis) for axis in jnp.eye(2, dtype=unknowns.dtype))
+        longest = jnp.stack([unknowns[0] - problem.impact.lowest, jnp.ones_like(unknowns[1])]) * _LONGEST_STEP
+        step = -solved_pair([by_coordinate, by_phase], value)
+        return unknowns + jnp.clip(step, -longest, longest)
+
+    return lax.fori_loop(0, steps, improve, jnp.stack(place))
 
 
 def instantaneous_quartic(problem: OrbitProblem) -> Float[Array, " 5"]:
     """Return Y^2 (cosine^2 + sine^2 - determinant^2) without a delay: a quartic in Y/(beta omega)."""
-    cantilever, platform, law, order = problem
+    cantilever, platform, _, order = problem
+    law = _law_of(problem)
     flight = _returning_flight(cantilever, order * platform.period_us)
     top_speed = platform.top_speed_nm_per_us
     square = (law.epsilon + (law.viscous_loss / (2.0 * law.r)) ** 2) / top_speed**2
@@ -101,9 +163,15 @@ def instantaneous_quartic(problem: OrbitProblem) -> Float[Array, " 5"]:
     return quartic.at[2].add(-(flight.closing**2))
 
 
+def _law_of(problem: OrbitProblem) -> ImpactLaw:
+    assert isinstance(problem.impact, LawImpact)  # all that takes no time  # noqa: S101
+    return problem.impact.law
+
+
+@jax.jit
 def closing_residual(coordinate: Float[Array, ""], problem: OrbitProblem) -> Float[Array, ""]:
     """Return a^2 + b^2 - 1 times the squared determinant, relative to the sum of its terms: 0 on an orbit."""
-    cosine, sine, determinant, _ = closure(coordinate, problem)
+    cosine, sine, determinant, _ = closure(coordinate, problem).system
     total = cosine**2 + sine**2 + determinant**2
     return (cosine**2 + sine**2 - determinant**2) / total
 
@@ -152,10 +220,13 @@ def _instantaneous(approach, rebound, one, flight: _ReturningFlight, platform: P
     return height - offset, -(approach * flight.after + rebound * flight.before)
 
 
-def delayed_closure(p: Propagator, speeds: Speeds, platform: Platform, turn) -> Closure:
+def _delayed(speeds: Speeds, problem: OrbitProblem) -> System:
     """Solve both rows by Cramer's rule, every length over beta and every speed over beta omega."""
+    cantilever, platform, _, order = problem
+    p: Propagator = cantilever.propagator(order * platform.period_us - speeds.delay)
+    turn = platform.angular_frequency * speeds.delay
+    cos_turn, sin_turn = jnp.cos(turn), jnp.sin(turn)
     omega, top_speed = platform.angular_frequency, platform.top_speed_nm_per_us
-    cos_turn, sin_turn = turn
     sigma = platform.offset_nm / platform.amplitude_nm
     approach, rebound = speeds.approach / top_speed, speeds.rebound / top_speed
     p12, p21 = p.position_per_velocity * omega, p.velocity_per_position / omega
@@ -165,7 +236,7 @@ def delayed_closure(p: Propagator, speeds: Speeds, platform: Platform, turn) -> 
     right2 = approach + p21 * sigma + p.velocity_per_velocity * rebound
     determinant = m11 * m22 - m12 * m21
     # Here the determinant is of second order in the distance to a whole number of free periods, its rounding of zeroth.
-    return Closure(
+    return System(
         cosine=right1 * m22 - right2 * m12,
         sine=m11 * right2 - m21 * right1,
         determinant=determinant,

@@ -1,26 +1,59 @@
-"""Where the orbits are: every root of the closing condition, without and with a collision delay."""
+"""Where the orbits are: every root of the closing condition.
+
+Two finders. Without a delay the condition is a quartic, of which no root can be missed. With one it is scanned: every
+change of sign between neighbours of the scan, and every pair of roots that it stepped over, seen by the extremum
+between them.
+"""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from afm_jax.impact.orbit_closure import (
     OrbitProblem,
-    capture_coordinate,
+    close_map,
     closing_residual,
     closure,
     instantaneous_quartic,
-    speeds_at,
+    map_gaps,
+    place_near,
 )
 from afm_jax.impact.polynomial_roots import real_roots
 
-_SLOTS = 16
-SCAN_POINTS = 8192
-"""Coordinates at which the delayed closing condition is scanned: some 500 to the decade of approach speed."""
-_BISECTIONS = 60
+_LEAVING = 0.4
+"""Share of the drive's period that a leaving tip may take to lose its energy: beyond, no law of impacts holds."""
+_REGULA_FALSI = 20
+_SECTIONS = 16
+_GOLDEN = 0.6180339887498949
+_NEWTON = 5
+_CLOSED = 1e-9
+"""By how much a turn of the map may miss its start, in units of the drive: near a fold rounding leaves as much."""
+
+
+class Scan(NamedTuple):
+    """How closely the closing condition is looked at."""
+
+    points: int
+    """Coordinates, at equal ratios of their distance from capture."""
+    lowest: float
+    """Distance from capture at which they begin, in terms of the drive's speed or the capture coordinate."""
+    highest: float
+    crossings: int
+    """Changes of sign that are followed."""
+    turns: int
+    """Extrema without one that are looked at for a pair of roots."""
+    slots: int
+    """Roots there is room for."""
+
+
+FINE = Scan(8192, 1e-7, 1e5, crossings=16, turns=6, slots=16)
+"""Some 680 points to the decade: for whoever asks for all orbits."""
+COARSE = Scan(512, 1e-3, 1e4, crossings=6, turns=2, slots=10)
+"""Some 70 to the decade: for fits, which search a hundred thousand times."""
 
 
 class OrbitRoots(NamedTuple):
@@ -34,27 +67,46 @@ class OrbitRoots(NamedTuple):
     complete: Bool[Array, ""]
 
 
-def find_roots(problem: OrbitProblem) -> OrbitRoots:
-    """Return all coordinates of orbits, ascending in approach speed, without derivatives; harmless ones elsewhere."""
+def find_roots(problem: OrbitProblem, scan: Scan = FINE) -> OrbitRoots:
+    """Return all coordinates of orbits, ascending in approach speed, without derivatives; harmless ones elsewhere.
+
+    Args:
+        problem: what orbits are of.
+        scan: how closely is looked where there is a delay; without one there are 4 slots.
+    """
     problem = lax.stop_gradient(problem)
     driven = (problem.platform.amplitude_nm > 0.0) & (problem.platform.offset_rate_nm_per_us == 0.0)
-    search = _quartic_roots if problem.law.delay is None else _scanned_roots
-    coordinate, found, complete = search(problem)
-    safe = jnp.where(found, coordinate, empty_coordinate(problem))
-    regular = jax.vmap(closure, in_axes=(0, None))(safe, problem).regular
-    return OrbitRoots(safe, found & driven & regular, complete)
+    coordinate, found, complete = _scanned_roots(problem, scan) if problem.impact.delayed else _quartic_roots(problem)
+    safe = jnp.where(found, coordinate, harmless_coordinate(problem))
+    found = found & driven & jax.vmap(closure, in_axes=(0, None))(safe, problem).system.regular
+    if problem.impact.lasts:
+        closed, settled = jax.vmap(_closed, in_axes=(0, None))(safe, problem)
+        found = found & settled
+        safe = jnp.where(found, closed, safe)
+    return OrbitRoots(safe, found, complete)
 
 
-def empty_coordinate(problem: OrbitProblem) -> Float[Array, ""]:
+def follow_root(near: Float[Array, ""], problem: OrbitProblem) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    """Return the root of a lasting impact's orbit close to a coordinate, and whether there is one nearby."""
+    return _closed(near, lax.stop_gradient(problem))
+
+
+def harmless_coordinate(problem: OrbitProblem) -> Float[Array, ""]:
     """Return a coordinate for slots without a root: some speed well above capture, harmless to compute with."""
-    return 2.0 * problem.platform.top_speed_nm_per_us + 2.0 * jnp.sqrt(problem.law.epsilon + 1.0)
+    return problem.impact.lowest + 2.0 * _scale(problem) + 2.0
+
+
+def _closed(near: Float[Array, ""], problem: OrbitProblem) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    """Return the coordinate at which the map closes, close to one, and whether it does."""
+    unknowns = close_map(place_near(near, problem), problem, _NEWTON)
+    return unknowns[0], jnp.all(jnp.abs(map_gaps(unknowns, problem)) < _CLOSED)
 
 
 def _quartic_roots(problem: OrbitProblem) -> OrbitRoots:
     """Solve (Y cosine)^2 + (Y sine)^2 = (Y determinant)^2, a quartic in Y over beta omega."""
     quartic = instantaneous_quartic(problem)
     scale = problem.platform.top_speed_nm_per_us
-    low = capture_coordinate(problem.law) / scale
+    low = problem.impact.lowest / scale
     # Cauchy's bound; a quartic without leading term (no loss at exact resonance) has a root at infinity, not here.
     top = jnp.max(jnp.abs(quartic))
     leading = jnp.maximum(jnp.abs(quartic[0]), 1e-15 * top)
@@ -63,48 +115,103 @@ def _quartic_roots(problem: OrbitProblem) -> OrbitRoots:
     return OrbitRoots(roots * scale, found & (roots > low), jnp.array(True))  # noqa: FBT003
 
 
-def _scanned_roots(problem: OrbitProblem) -> OrbitRoots:
-    """Scan the delayed closing condition, split intervals that hold an extremum, bisect every bracket.
+def _scale(problem: OrbitProblem) -> Float[Array, ""]:
+    return jnp.maximum(problem.platform.top_speed_nm_per_us, problem.impact.reach)
 
-    A delay as long as a drive period is no brief impact any more (the lead grows without bound towards capture): such
-    coordinates are left out.
-    """
-    grid = _scan_grid(problem)
+
+def _scanned_roots(problem: OrbitProblem, scan: Scan) -> OrbitRoots:
+    """Scan the closing condition from just above capture to speeds that no orbit reaches; narrow every bracket."""
+    grid = problem.impact.lowest + jnp.asarray(np.geomspace(scan.lowest, scan.highest, scan.points)) * _scale(problem)
     residual = jax.vmap(closing_residual, in_axes=(0, None))
-    value, slope = jax.vmap(jax.value_and_grad(closing_residual), in_axes=(0, None))(grid, problem)
-    left, right = grid[:-1], grid[1:]
-    # Two close roots leave no sign change but an extremum between: the secant of the slopes says where.
-    bends = (value[:-1] * slope[:-1] < 0.0) & (value[1:] * slope[1:] > 0.0)
-    share = slope[:-1] / jnp.where(slope[:-1] != slope[1:], slope[:-1] - slope[1:], 1.0)
-    middle = left + (right - left) * jnp.where(bends, jnp.clip(share, 0.01, 0.99), 0.5)
-    inner = residual(middle, problem)
-    ends = jnp.stack([left, middle], 1).ravel(), jnp.stack([middle, right], 1).ravel()
-    values = jnp.stack([value[:-1], inner], 1).ravel(), jnp.stack([inner, value[1:]], 1).ravel()
-    delay = jax.vmap(lambda y: speeds_at(y, problem.law).delay)(ends[0])
-    brief = jnp.abs(delay) < problem.platform.period_us
-    bracket = (values[0] * values[1] < 0.0) & brief
-    chosen = jnp.nonzero(bracket, size=_SLOTS, fill_value=0)[0]
-    count = jnp.sum(bracket)
-    found = jnp.arange(_SLOTS) < count
-    root = _bisect(lambda y: residual(y, problem), ends[0][chosen], ends[1][chosen], values[0][chosen])
-    return OrbitRoots(root, found, count <= _SLOTS)
+    value = residual(grid, problem)
+    brief = jax.vmap(_brief, in_axes=(0, None))(grid, problem)
+    left, right, low, high, count = _brackets(grid, value, brief, problem, scan)
+    root = _regula_falsi(lambda x: residual(x, problem), left, right, low, high)
+    found = low * high < 0.0
+    order = jnp.argsort(jnp.where(found, root, jnp.inf))[: scan.slots]
+    return OrbitRoots(root[order], found[order], (count <= scan.crossings) & (jnp.sum(found) <= scan.slots))
 
 
-def _scan_grid(problem: OrbitProblem) -> Float[Array, " points"]:
-    """Return coordinates from just above capture to speeds that no orbit reaches, dense in the logarithm of Y - q."""
-    scale = problem.platform.top_speed_nm_per_us
-    low = capture_coordinate(problem.law)
-    spread = jnp.geomspace(1e-7, 1e5, SCAN_POINTS)
-    # From q on in steps of the drive's speed, and of q itself where q is the smaller one.
-    return low + spread * jnp.maximum(scale, low)
+def _brief(coordinate: Float[Array, ""], problem: OrbitProblem) -> Bool[Array, ""]:
+    """Say whether an impact is over soon: the lead grows without bound towards capture.
+
+    One that lasts must end within half a drive period, and the tip have lost its energy by then.
+    """
+    speeds, period = problem.impact.speeds(coordinate), problem.platform.period_us
+    if not problem.impact.lasts:
+        return jnp.abs(speeds.delay) < period
+    return (jnp.abs(speeds.delay) < 0.5 * period) & (problem.impact.length / speeds.rebound < _LEAVING * period)
 
 
-def _bisect(residual, left, right, value_left) -> Float[Array, " slots"]:
-    def halve(_, ends):
+def _brackets(grid, value, brief, problem: OrbitProblem, scan: Scan) -> tuple[Array, Array, Array, Array, Array]:
+    """Return ends and values of intervals, last those of pairs that the grid stepped over, and the changes of sign.
+
+    An empty interval has values 0.
+    """
+    crossing = (value[:-1] * value[1:] < 0.0) & brief[:-1] & brief[1:]
+    count = jnp.sum(crossing)
+    # the fastest ones, if there are too many: close to capture the law itself ends
+    at = crossing.shape[0] - 1 - jnp.nonzero(crossing[::-1], size=scan.crossings, fill_value=0)[0]
+    real = jnp.arange(scan.crossings) < count
+    harmless = harmless_coordinate(problem)
+    parts = [_kept(real, harmless, grid[at], grid[at + 1], value[at], value[at + 1])]
+    # three neighbours of one sign, the middle one closest to zero: the extremum may lie beyond
+    size = jnp.abs(value)
+    same = (value[:-2] * value[1:-1] > 0.0) & (value[1:-1] * value[2:] > 0.0)
+    dip = same & (size[1:-1] <= size[:-2]) & (size[1:-1] <= size[2:]) & brief[1:-1]
+    at, real = _lowest_of(jnp.where(dip, size[1:-1], jnp.inf), scan.turns)
+    turn, bottom = _extremum(at, grid, value, problem)
+    real = real & (bottom * value[at + 1] < 0.0)
+    parts.append(_kept(real, harmless, grid[at], turn, value[at], bottom))
+    parts.append(_kept(real, harmless, turn, grid[at + 2], bottom, value[at + 2]))
+    left, right, low, high = (jnp.concatenate(columns) for columns in zip(*parts, strict=True))
+    return left, right, low, high, count
+
+
+def _lowest_of(size: Float[Array, " n"], count: int) -> tuple[Array, Array]:
+    """Return where the smallest numbers are, and which of them are finite."""
+    at, real = [], []
+    for _ in range(count):
+        place = jnp.argmin(size)
+        at.append(place)
+        real.append(jnp.isfinite(size[place]))
+        size = size.at[place].set(jnp.inf)
+    return jnp.stack(at), jnp.stack(real)
+
+
+def _kept(real, harmless, left, right, low, high) -> tuple[Array, Array, Array, Array]:
+    """Return an interval where it is one, else an empty one at a harmless coordinate."""
+    ends = jnp.where(real, left, harmless), jnp.where(real, right, harmless)
+    return *ends, jnp.where(real, low, 0.0), jnp.where(real, high, 0.0)
+
+
+def _extremum(at, grid, value, problem: OrbitProblem) -> tuple[Array, Array]:
+    """Return where the residual is closest to zero, or beyond, between a grid point and the one after next."""
+    sign = jnp.sign(value[at + 1])
+
+    height = jax.vmap(lambda x, sign: sign * closing_residual(x, problem))
+
+    def narrow(_, ends):
+        # golden section, both inner points at once
         a, b = ends
-        middle = 0.5 * (a + b)
-        same = residual(middle) * value_left > 0.0
-        return jnp.where(same, middle, a), jnp.where(same, b, middle)
+        points = jnp.stack([b - _GOLDEN * (b - a), a + _GOLDEN * (b - a)])
+        first, second = height(points.ravel(), jnp.tile(sign, 2)).reshape(2, -1)
+        return jnp.where(first < second, a, points[0]), jnp.where(first < second, points[1], b)
 
-    a, b = lax.fori_loop(0, _BISECTIONS, halve, (left, right))
-    return 0.5 * (a + b)
+    a, b = lax.fori_loop(0, _SECTIONS, narrow, (grid[at], grid[at + 2]))
+    middle = 0.5 * (a + b)
+    return middle, sign * height(middle, sign)
+
+
+def _regula_falsi(residual, left, right, low, high) -> Float[Array, " slots"]:
+    """Return the root of every bracket by the Illinois method: the newer end stays, the other one loses weight."""
+
+    def narrow(_, ends):
+        a, b, fa, fb = ends
+        gap = fb - fa
+        x = jnp.where(gap == 0.0, a, (a * fb - b * fa) / jnp.where(gap == 0.0, 1.0, gap))
+        fx = residual(x)
+        passed = fx * fa < 0.0
+        return x, jnp.where(passed, a, b), fx, jnp.where(passed, fa, 0.5 * fb)
+
+    return lax.fori_loop(0, _REGULA_FALSI, narrow, (left, right, low, high))[0]

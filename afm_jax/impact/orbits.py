@@ -1,19 +1,48 @@
-"""Single-impact orbits: one impact in N drive periods (eq. 9); admissible, stable, and what one measures of them."""
+"""Single-impact orbits: one impact in N drive periods (eq. 9); admissible, stable, and what one measures of them.
+
+One machinery for impacts of every kind: roots of the closing condition, the motion at a root, whether it can be and
+whether it lasts, and what one measures of it.
+"""
+
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, require_sample_drive
-from afm_jax.impact.law import impact_law_of
-from afm_jax.impact.orbit_amplitude import lockin, peak_amplitude
-from afm_jax.impact.orbit_closure import OrbitProblem
-from afm_jax.impact.orbit_search import find_roots
-from afm_jax.impact.orbit_state import judge, orbit_state
+from afm_jax.impact.first_impact import Flight, first_impact
+from afm_jax.impact.implicit import implicit_pair, implicit_root
+from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
+from afm_jax.impact.lasting_impact import INDENTATION, Impact, LawImpact
+from afm_jax.impact.law import Speeds, impact_law_of
+from afm_jax.impact.orbit_amplitude import FlightEnds, lockin, peak_amplitude
+from afm_jax.impact.orbit_closure import (
+    OrbitProblem,
+    Place,
+    close_map,
+    closing_residual,
+    closure,
+    map_gaps,
+    place_near,
+    speeds_at_place,
+)
+from afm_jax.impact.orbit_search import COARSE, find_roots
+from afm_jax.outcome import Outcome
 from afm_jax.parameters import is_traced, readable, require_float64
 from afm_jax.stored_program import stored
+
+NEAR_DOUBLE = 1e-3
+"""Slope of the closing condition per relative change of speed below which a root counts as near-double (a fold)."""
+_ARRIVAL_TOLERANCE = 1e-7
+"""How far (in drive periods) the first impact found may lie before the orbit's own, by rounding."""
+_NEWTON = 3
+"""Steps that close the map from a root that is known but for rounding."""
 
 
 class SingleImpactOrbits(eqx.Module):
@@ -31,8 +60,8 @@ class SingleImpactOrbits(eqx.Module):
         velocity_after_nm_per_us: tip velocity V' in the lab just after impact.
         velocity_before_nm_per_us: tip velocity V just before.
         approach_speed_nm_per_us: u_in relative to the platform.
-        rebound_speed_nm_per_us: u_out relative to the platform.
-        delay_us: collision delay.
+        rebound_speed_nm_per_us: u_out relative to the platform, as it is on the moving platform.
+        delay_us: collision delay, likewise.
         peak_amplitude_nm: largest height above the rest position.
         lockin_amplitude_nm: amplitude at the response frequency omega/N.
         lockin_phase_deg: its phase, modulo 360/N; t = 0 when the platform is highest.
@@ -98,7 +127,7 @@ def _check_order(order: ArrayLike) -> None:
 
 @stored()
 def _single_impact_orbits(scene: Scene, order: Float[Array, ""]) -> SingleImpactOrbits:
-    problem = OrbitProblem(scene.cantilever, scene.platform, impact_law_of(scene), order)
+    problem = OrbitProblem(scene.cantilever, scene.platform, LawImpact(impact_law_of(scene)), order)
     roots = find_roots(problem)
     orbits = jax.vmap(_orbit, in_axes=(0, 0, None))(roots.coordinate, roots.found, problem)
     return eqx.tree_at(lambda result: result.complete, orbits, roots.complete)
@@ -109,9 +138,7 @@ def _orbit(coordinate: Float[Array, ""], found: Bool[Array, ""], problem: OrbitP
     state = orbit_state(coordinate, problem)
     verdict = judge(coordinate, found, state, problem)
     flight, speeds = state.flight, state.speeds
-    amplitude, angle = lockin(
-        problem.cantilever, problem.platform, flight, problem.order, delayed=problem.law.delay is not None
-    )
+    peak, amplitude, angle = _observed(state, problem)
 
     def known(value):
         return jnp.where(found, value, jnp.nan)
@@ -127,10 +154,154 @@ def _orbit(coordinate: Float[Array, ""], found: Bool[Array, ""], problem: OrbitP
         approach_speed_nm_per_us=known(speeds.approach),
         rebound_speed_nm_per_us=known(speeds.rebound),
         delay_us=known(speeds.delay),
-        peak_amplitude_nm=known(peak_amplitude(problem.cantilever, flight)),
+        peak_amplitude_nm=known(peak),
         lockin_amplitude_nm=known(amplitude),
         lockin_phase_deg=known(angle),
         trace=known(verdict.trace),
         determinant=known(verdict.determinant),
         complete=found,
     )
+
+
+class OrbitState(NamedTuple):
+    """The motion at one root: drive phase in rad just after impact, speeds and delay, and the flight's ends."""
+
+    phase: Float[Array, ""]
+    speeds: Speeds
+    flight: FlightEnds
+
+
+class Verdict(NamedTuple):
+    """What a root is good for: see `SingleImpactOrbits`."""
+
+    admissible: Bool[Array, ""]
+    stable: Bool[Array, ""]
+    near_double: Bool[Array, ""]
+    trace: Float[Array, ""]
+    determinant: Float[Array, ""]
+
+
+class SteadyOrbits(NamedTuple):
+    """The roots of a problem, which of them are steady (admissible and stable), peak and lock-in amplitude in nm."""
+
+    coordinate: Float[Array, " slots"]
+    steady: Bool[Array, " slots"]
+    near_double: Bool[Array, " slots"]
+    amplitude_nm: Float[Array, "slots 2"]
+
+
+@jax.jit
+def orbit_state(coordinate: Float[Array, ""], problem: OrbitProblem) -> OrbitState:
+    """Return the motion at a root, with the root's derivatives (implicit function theorem)."""
+    cantilever, platform, impact, order = problem
+    if impact.lasts:
+        known = lax.stop_gradient((coordinate, problem))
+        unknowns = close_map(place_near(*known), known[1], _NEWTON)
+        place = Place(*implicit_pair(map_gaps, unknowns, problem))
+        speeds = speeds_at_place(place, problem)
+        phase = place.phase + platform.angular_frequency * speeds.delay
+    else:
+        speeds, system = closure(implicit_root(closing_residual, coordinate, problem), problem)
+        phase = system.phase
+    phase = phase % (2.0 * jnp.pi)
+    start = phase / platform.angular_frequency
+    duration = order * platform.period_us - speeds.delay
+    position, platform_velocity = platform.position_and_velocity(start)
+    velocity = platform_velocity + speeds.rebound
+    end_position, end_velocity = cantilever.propagator(duration)(position, velocity)
+    return OrbitState(phase, speeds, FlightEnds(start, duration, position, velocity, end_position, end_velocity))
+
+
+def judge(coordinate: Float[Array, ""], found: Bool[Array, ""], state: OrbitState, problem: OrbitProblem) -> Verdict:
+    """Return whether an orbit is admissible, stable (eq. 8 and its generalisation) and close to a fold."""
+    cantilever, platform, impact, _ = problem
+    trace, determinant = trace_and_determinant(impact, cantilever, platform, state.flight)
+    # the flight counts from max(t_in, t_out) on
+    skip = jnp.maximum(-state.speeds.delay, 0.0) if impact.delayed else None
+    return Verdict(
+        admissible=found & ends_at_its_own_impact(cantilever, platform, state.flight, found, skip),
+        stable=found & contracts(trace, determinant),
+        near_double=found & near_fold(coordinate, problem),
+        trace=trace,
+        determinant=determinant,
+    )
+
+
+def near_fold(coordinate: Float[Array, ""], problem: OrbitProblem) -> Bool[Array, ""]:
+    """Say whether the closing condition hardly changes with the logarithm of the coordinate at a root."""
+    _, slope = jax.jvp(lambda y: closing_residual(y, problem), (coordinate,), (coordinate,))
+    return jnp.abs(slope) < NEAR_DOUBLE
+
+
+def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
+    """Return the roots that are steady motions, without derivatives: what an experiment can settle on.
+
+    A delayed closing condition is scanned coarsely: orbits close to each other or to capture may be missed.
+    """
+    problem = lax.stop_gradient(problem)
+    roots = find_roots(problem, COARSE)
+
+    def one(root, found):
+        state = orbit_state(root, problem)
+        verdict = judge(root, found, state, problem)
+        return verdict.admissible & verdict.stable, verdict.near_double, _observed(state, problem)[:2]
+
+    return SteadyOrbits(roots.coordinate, *jax.vmap(one)(roots.coordinate, roots.found))
+
+
+def amplitudes(coordinate: Float[Array, ""], problem: OrbitProblem) -> Float[Array, " 3"]:
+    """Return peak and lock-in amplitude in nm and the phase in degrees of the orbit at a root, differentiable."""
+    return _observed(orbit_state(coordinate, problem), problem)
+
+
+@jax.jit
+def _observed(state: OrbitState, problem: OrbitProblem) -> Float[Array, " 3"]:
+    cantilever, platform, impact, order = problem
+    depth = 0.0
+    if impact.lasts:
+        # in contact the tip is below the platform's rest surface by the indentation
+        depth = INDENTATION * state.speeds.approach * impact.hertz_time(state.speeds.approach) ** 2
+    length, phase = lockin(cantilever, platform, state.flight, order, delayed=impact.delayed, indentation=depth)
+    return jnp.stack([peak_amplitude(cantilever, state.flight), length, phase])
+
+
+def trace_and_determinant(
+    impact: Impact, cantilever: Cantilever, platform: Platform, flight: FlightEnds
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return T and D of the impact map on an orbit (eq. 8 and its generalisation)."""
+    arrival = flight.start_us + flight.duration_us
+    jacobian = contact_jacobian(impact, cantilever, platform, arrival, flight.end_velocity) @ flight_jacobian(
+        cantilever, platform, flight.start_us, flight.start_velocity, arrival
+    )
+    trace = jacobian[0, 0] + jacobian[1, 1]
+    return trace, jacobian[0, 0] * jacobian[1, 1] - jacobian[0, 1] * jacobian[1, 0]
+
+
+def contracts(trace: Float[Array, ""], determinant: Float[Array, ""]) -> Bool[Array, ""]:
+    """Say whether a map of this trace and determinant is stable."""
+    return (jnp.abs(trace) < jnp.abs(1.0 + determinant)) & (jnp.abs(determinant) <= 1.0)
+
+
+def ends_at_its_own_impact(
+    cantilever: Cantilever,
+    platform: Platform,
+    flight: FlightEnds,
+    found: Bool[Array, ""],
+    skip_us: Float[Array, ""] | None,
+) -> Bool[Array, ""]:
+    """Say whether the first impact of the flight is the orbit's own: the flight never passes through the platform.
+
+    Args:
+        cantilever: of the free flight.
+        platform: that it must not meet before its end.
+        flight: from impact to impact.
+        found: whether there is an orbit at all.
+        skip_us: time after the start at which the flight begins to count, max(t_in, t_out); None: at once.
+    """
+    # An empty slot does not leave the platform, so that its search ends at once.
+    velocity = jnp.where(found, flight.start_velocity, -jnp.inf)
+    first = first_impact(Flight(cantilever, platform, flight.start_us, velocity), skip_us=skip_us)
+    duration = flight.duration_us
+    hit = (first.outcome == Outcome.IMPACT) & (first.duration_us >= duration - _ARRIVAL_TOLERANCE * platform.period_us)
+    # Rounding can lift the end of the flight off the platform where the impact is a graze.
+    return (duration > 0.0) & (hit | (first.outcome == Outcome.NO_FURTHER_IMPACT))

@@ -10,7 +10,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from afm_jax.apparatus.scene import Scene, require_sample_drive
 from afm_jax.impact.first_impact import DEFAULT_MAX_STEPS, DEFAULT_ROOT_TOLERANCE_US, Flight, first_impact
-from afm_jax.impact.law import ImpactLaw, impact_law_of
+from afm_jax.impact.lasting_impact import LawImpact, delay_before, speeds_of_impact
+from afm_jax.impact.law import impact_law_of
 from afm_jax.outcome import Outcome
 from afm_jax.parameters import readable, require_float64
 
@@ -22,8 +23,8 @@ class NextImpact(eqx.Module):
     """The impact that follows a start, one tip and one time; batches by `vmap`.
 
     Attributes:
-        time_us: when the next flight starts: the impact, plus the collision delay if the law has one. Infinite where
-            there is no further impact within the search.
+        time_us: when the next flight starts: the impact, plus the collision delay if the law has one, corrected for
+            what happens while the impact lasts. Infinite where there is no further impact within the search.
         arrival_time_us: when the free flight reaches gap 0; equal to `time_us` without a delay.
         velocity_before_nm_per_us: tip velocity in the lab just before; NaN where there is no impact (see `outcome`).
         velocity_after_nm_per_us: tip velocity in the lab just after; the platform's where the tip is captured, NaN
@@ -147,7 +148,7 @@ def impact_after(
     law = impact_law_of(scene)
     impact = first_impact(
         flight,
-        skip_us=_overlap(law, flight),
+        skip_us=_overlap(LawImpact(law), flight),
         latest_us=latest_us,
         max_steps=max_steps,
         root_tolerance_us=tolerance,
@@ -156,8 +157,9 @@ def impact_after(
     _, before = scene.cantilever.propagator(impact.duration_us)(flight.position, flight.velocity)
     hit = impact.outcome == Outcome.IMPACT
     approach = jnp.where(hit, scene.platform.velocity(arrival) - before, 1.0)
-    leaving = arrival + law.collision_delay(approach) if law.delay is not None else arrival
-    after = scene.platform.velocity(leaving) + law.rebound_speed(approach)
+    impact_speeds = speeds_of_impact(LawImpact(law), approach, arrival, scene.cantilever, scene.platform)
+    leaving = arrival + impact_speeds.delay if law.delay is not None else arrival
+    after = scene.platform.velocity(leaving) + impact_speeds.rebound
     captured = hit & law.captures(approach)
     return NextImpact(
         time_us=jnp.where(hit, leaving, jnp.inf),
@@ -169,12 +171,12 @@ def impact_after(
     )
 
 
-def _overlap(law: ImpactLaw, flight: Flight) -> Float[Array, ""] | None:
+def _overlap(impact: LawImpact, flight: Flight) -> Float[Array, ""] | None:
     """Return how long a flight that a negative delay let begin early overlaps the last one, in us after its start."""
-    if law.delay is None:
+    if not impact.delayed:
         return None
     rebound = flight.velocity - flight.platform.velocity(flight.start_us)
-    delay = law.collision_delay(law.approach_speed(jnp.maximum(rebound, 0.0)))
+    delay = delay_before(impact, rebound, flight.start_us, flight.cantilever, flight.platform)
     overlap = jnp.maximum(-delay, 0.0)
     # a flight that begins above the surface follows no impact
     return overlap if flight.start_gap is None else jnp.where(flight.start_gap > 0.0, 0.0, overlap)

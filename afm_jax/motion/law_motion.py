@@ -181,8 +181,12 @@ def _through(seen: Scene, impact: NextImpact, arrived: Array, until: Array) -> t
     arrival = jnp.where(arrived, impact.arrival_time_us, until)
     before = jnp.where(arrived, impact.velocity_before_nm_per_us, 0.0)
     approach = jnp.where(arrived, bed.surface.velocity(arrival) - before, 1.0)
-    rebound = law.rebound_speed(approach)
     captured = arrived & (impact.outcome == Outcome.CAPTURED)
+    rebound = law.rebound_speed(approach)
+    if law.lasts:
+        departs = arrived & ~captured
+        time, after = (jnp.where(departs, part, 0.0) for part in (impact.time_us, impact.velocity_after_nm_per_us))
+        rebound = jnp.where(departs, after - bed.surface.velocity(time), 0.0)
     chatters, lasts = chatter(bed, law, arrival, rebound)
     chatters = chatters & arrived & ~captured
     rests = captured | chatters

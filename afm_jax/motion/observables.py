@@ -1,7 +1,8 @@
 """What an experiment reads of a simulated motion: amplitudes, phases, times, forces, energies."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.contact import Contact
 from afm_jax.motion.drive_period import Drive, drive_of
 from afm_jax.motion.energy_balance import energy_balance
+from afm_jax.motion.impact_integral import impact_integral
 from afm_jax.motion.peak_height import peak_deflection, peak_height
 from afm_jax.motion.record import ContactKind, Simulation
 from afm_jax.motion.settle import Settled, Window, settled, window_of
@@ -112,6 +114,7 @@ def observe(
     times, weights = dense.nodes(begin, end)
     _check_covered(float(np.sum(weights)), end - begin)
     path, ends = dense.at(times), dense.at(np.array([begin, end]))
+    beyond = partial(impact_integral, scene, simulation, begin, end)
     energy = energy_balance(scene, simulation, path, weights, ends)
     span = end - begin
     cycles = span / drive.period_us
@@ -123,8 +126,8 @@ def observe(
         settled=verdict,
         window=window,
         peak_amplitude_nm=peak_height(dense, path, begin, end),
-        harmonics=_harmonics(path.position_nm, times, weights, window, drive, harmonics),
-        mean_height_nm=float(np.sum(weights * path.position_nm)) / span,
+        harmonics=_harmonics(path.position_nm, times, weights, window, drive, harmonics, beyond),
+        mean_height_nm=(float(np.sum(weights * path.position_nm)) + beyond(0.0).real) / span,
         contacts=begun,
         time_in_contact_us=touched / cycles * window.periods,
         contact_share=touched / span,
@@ -140,8 +143,10 @@ def observe(
         peak_deflection_nm=None if base is None else peak_deflection(dense, path, begin, end),
         deflection_harmonics=None
         if deflection is None
-        else _harmonics(deflection, times, weights, window, drive, harmonics),
-        mean_deflection_nm=None if deflection is None else float(np.sum(weights * deflection)) / span,
+        else _harmonics(deflection, times, weights, window, drive, harmonics, beyond),
+        mean_deflection_nm=None
+        if deflection is None
+        else (float(np.sum(weights * deflection)) + beyond(0.0).real) / span,
     )
 
 
@@ -161,12 +166,14 @@ def _harmonics(
     window: Window,
     drive: Drive,
     multiples: Sequence[int],
+    beyond: Callable[[float], complex],
 ) -> tuple[Harmonic, ...]:
-    """Return amplitudes and phases over a window."""
+    """Return amplitudes and phases over a window; ``beyond`` is what impacts add at an angular frequency."""
     found = []
     for k in multiples:
-        angle = k * drive.angular_frequency / window.periods * times
-        value = 2.0 / (window.to_us - window.from_us) * np.sum(weights * height * np.exp(-1j * angle))
+        nu = k * drive.angular_frequency / window.periods
+        integral = np.sum(weights * height * np.exp(-1j * nu * times)) + beyond(nu)
+        value = 2.0 / (window.to_us - window.from_us) * integral
         turn = 360.0 * math.gcd(int(k), window.periods) / window.periods
         found.append(Harmonic(int(k), float(abs(value)), float(np.degrees(np.angle(value)) % turn)))
     return tuple(found)

@@ -15,6 +15,7 @@ from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import find_junction
 from afm_jax.motion.frames import to_lab
+from afm_jax.motion.impact_integral import impact_integral
 from afm_jax.motion.motion_pieces import Flights, flights_of, fly
 from afm_jax.motion.record import ContactKind, Simulation
 
@@ -61,6 +62,7 @@ def read_motion(
     turn = np.sum(weights * heights * np.exp(-1j * angular_frequency * times))
     contact_times, contact_weights, contact_heights = _contact_points(scene, simulation, from_us, to_us)
     turn += np.sum(contact_weights * contact_heights * np.exp(-1j * angular_frequency * contact_times))
+    turn += impact_integral(scene, simulation, from_us, to_us, angular_frequency)
     turn *= 2.0 / (to_us - from_us)
     rows = simulation.contacts
     arrival = np.asarray(rows.arrival_time_us)

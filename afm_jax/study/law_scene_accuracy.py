@@ -10,6 +10,7 @@ from jaxtyping import Array
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.first_impact import Flight, first_impact
+from afm_jax.impact.lasting_impact import LawImpact, speeds_of_impact
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.poincare import NextImpact, iterate_map
 from afm_jax.motion.record import State
@@ -102,8 +103,9 @@ def first_departure(scene: Scene, start: State) -> tuple[Array, Array]:
     approach = platform.velocity(arrival) - before
     if bool(law.captures(approach)):
         raise ValueError("from its start the tip is captured at its first impact")
-    leaves = arrival + law.collision_delay(approach) if law.delay is not None else arrival
-    return leaves, platform.velocity(leaves) + law.rebound_speed(approach)
+    impact = speeds_of_impact(LawImpact(law), approach, arrival, scene.cantilever, platform)
+    leaves = arrival + impact.delay
+    return leaves, platform.velocity(leaves) + impact.rebound
 
 
 def map_peaks(scene: Scene, begin: tuple[Array, Array], found: NextImpact) -> np.ndarray:

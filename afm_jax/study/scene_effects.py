@@ -13,7 +13,7 @@ from afm_jax.contact.forces.capillary import Capillary
 from afm_jax.contact.forces.core_repulsion import CoreRepulsion
 from afm_jax.contact.forces.structural import Structural
 from afm_jax.contact.forces.viscous import Viscous
-from afm_jax.impact.law import ImpactLaw
+from afm_jax.impact.law import CollisionDelay, ImpactLaw
 
 Scaled = Callable[[Scene, Float[Array, ""]], Scene]
 
@@ -165,6 +165,8 @@ def _of_law(scene: Scene, law: ImpactLaw) -> Iterator[SceneEffect]:
     )
     if law.delay is not None:
         yield _delay(scene)
+    if law.lasts:
+        yield _corrections(law)
 
 
 def _r(scene: Scene) -> Any:
@@ -184,6 +186,30 @@ def _delay(scene: Scene) -> SceneEffect:
         required=None,
         without=lambda scene: eqx.tree_at(lambda scene: scene.interaction.delay, scene, None),
         scaled=lambda scene, s: eqx.tree_at(parts, scene, replace_fn=lambda number: number * (1.0 + s)),
+    )
+
+
+def _corrections(law: ImpactLaw) -> SceneEffect:
+    def where(scene: Scene) -> Any:
+        return scene.interaction.delay
+
+    def without(scene: Scene) -> Scene:
+        delay = where(scene)
+        if delay is None:
+            return scene
+        bare = CollisionDelay(delay.hertz, delay.lead_nm, delay.offset_nm, corrections=False)
+        return eqx.tree_at(where, scene, bare)
+
+    delay = law.delay
+    assert delay is not None  # only a delay has corrections  # noqa: S101
+    return SceneEffect(
+        "delay_corrections",
+        "what moving sample, spring and air change while an impact lasts",
+        "",
+        is_zero=bool(delay.hertz == 0.0) and not bool(delay.lead_nm > 0.0),
+        required=None,
+        without=without,
+        scaled=None,
     )
 
 

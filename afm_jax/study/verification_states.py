@@ -63,7 +63,9 @@ def random_states(random: np.random.Generator, count: int, kind: Kind) -> States
     velocity = logarithmic(random, 0.05, 300.0, count) - amplitude * drive * np.sin(drive * time)
     touching = _touching(random, (frequency, quality, amplitude, drive, time))
     offset, velocity = (np.where(family == 2, new, old) for new, old in zip(touching, (offset, velocity), strict=True))
-    delay = CollisionDelay(*(scale * random.uniform(0.0, 1.5, count) for scale in (0.206, 5.64, 0.726)))
+    delay = CollisionDelay(
+        *(scale * random.uniform(0.0, 1.5, count) for scale in (0.206, 5.64, 0.726)), corrections=False
+    )
     law = ImpactLaw(
         r=random.uniform(0.3, 1.0, count),
         epsilon=np.zeros(count),

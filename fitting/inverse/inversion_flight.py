@@ -16,13 +16,9 @@ from jaxtyping import Array, Bool, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
-from afm_jax.impact.lasting_impact import AIR, HERTZ, INDENTATION, LONGER
+from afm_jax.impact.lasting_impact import INDENTATION, gained_and_longer, middle_of_contact
 from afm_jax.impact.orbit_amplitude import FlightEnds, lockin, peak_amplitude
 
-_JERK = float(HERTZ[0])
-"""By how much a constant jerk j of the sample lowers the squared rebound speed, over j tau^2 u."""
-_ACCELERATION = -float(LONGER[0])
-"""By how much a constant pull g shortens a Hertz contact, over g tau^2/u."""
 _HALF_SINE = 0.42441318157838753
 """4/(3 pi): lock-in amplitude of half sines at their own frequency, over their height."""
 _ARRIVAL_STEPS = 8
@@ -108,28 +104,22 @@ def readings(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> Fl
 def impact_of(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> Impact:
     """Return the impact between a flight and the next, brought to that of a free tip on a sample at rest.
 
-    What air, the platform's jerk j and the relative acceleration g do during a Hertz contact of the duration tau is
-    taken back: u_out^2 += (10/9) (Omega/Q) tau u^2 + 0.425 j tau^2 u and tau += 0.127 g tau^2/u, with
-    g = -Omega^2 z_p - (Omega/Q) v_p - a_p at mid contact.
+    What air, spring and the platform's motion do during a Hertz contact is taken back (`gained_and_longer`): its
+    duration is the delay, for want of a law that tells lead and offset apart.
     """
     platform = row.platform
     end = flight.start_us + flight.duration_us
     approach = platform.velocity(end) - flight.end_velocity
     rebound = flight.start_velocity - platform.velocity(flight.start_us)
     delay = row.order * platform.period_us - flight.duration_us
-    middle = flight.start_us - 0.5 * delay
-    height, speed = platform.position_and_velocity(middle)
-    pull = cantilever.acceleration(height, speed) - platform.acceleration(middle)
-    jerk = -(platform.angular_frequency**2) * speed
+    middle = middle_of_contact(cantilever, platform, flight.start_us - 0.5 * delay)
 
-    def lasted(_, free_delay):
-        tau = jnp.maximum(free_delay, 0.0)
-        return delay + _ACCELERATION * pull * tau**2 / approach
+    def taken_back(free_delay):
+        return gained_and_longer(approach, jnp.maximum(free_delay, 0.0), middle, cantilever)
 
-    free_delay = lax.fori_loop(0, 3, lasted, delay)
-    tau = jnp.maximum(delay, 0.0)
-    lost = (2.0 * AIR) * cantilever.decay_rate * tau * approach**2 + _JERK * jerk * tau**2 * approach
-    square = jnp.where(rebound > 0.0, rebound**2, 0.0) + lost
+    free_delay = lax.fori_loop(0, 3, lambda _, free_delay: delay - taken_back(free_delay)[1], delay)
+    gained, _ = taken_back(free_delay)
+    square = jnp.where(rebound > 0.0, rebound**2, 0.0) - gained
     free_rebound = jnp.sqrt(jnp.where(square > 0.0, square, 1.0))
     return Impact(approach, jnp.where((square > 0.0) & (rebound > 0.0), free_rebound, jnp.nan), free_delay)
 

@@ -15,6 +15,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.contact_as_law import law_of_contact
+from afm_jax.motion.impact_integral import indentation_of
 from afm_jax.motion.record import ContactKind, Contacts, MotionOutcome, Simulation, State
 from afm_jax.motion.settle import close_periods, ends_in_flight, place_after, settled, where_to_go_on
 from afm_jax.motion.simulate import simulate
@@ -166,7 +167,10 @@ def _read(
         return np.asarray(found.final.position_nm).reshape(times.shape)
 
     heights = in_contact if isinstance(interaction, Contact) else on_platform
-    return read_orbits(cantilever, platforms, drives.order[rows], contacts, heights)
+    depth = np.zeros(len(rows))
+    if isinstance(interaction, ImpactLaw):
+        depth = indentation_of(interaction, contacts.approach_speed_nm_per_us)
+    return read_orbits(cantilever, platforms, drives.order[rows], contacts, heights, depth)
 
 
 def _responses(drives: Drives, rows: Int[np.ndarray, " n"], count: int) -> Float[np.ndarray, " n"]:

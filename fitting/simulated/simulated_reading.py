@@ -37,6 +37,7 @@ def read_orbits(
     orders: Int[np.ndarray, " rows"],
     contact: Contacts,
     heights: Heights,
+    depth: Float[np.ndarray, " rows"],
 ) -> Reading:
     """Return peak, lock-in amplitude and phase of single-impact orbits.
 
@@ -48,6 +49,7 @@ def read_orbits(
         orders: N of each row.
         contact: one contact of each row, arrays of shape (rows,).
         heights: the tip's heights at times in contact.
+        depth: by how much the tip is lower in contact, its integral over time in nm us.
     """
     period = orders * np.asarray(platforms.period_us)
     nu = 2.0 * np.pi / period
@@ -64,6 +66,7 @@ def read_orbits(
     times, weights = _nodes(contact)
     height = heights(times)
     inside = np.sum(weights * height * np.exp(-1j * nu[:, None] * times), axis=1)
+    inside = inside - depth * np.exp(-1j * nu * 0.5 * (arrival + departure))
     value = 2.0 / period * (_flight_integral(cantilever, flight, nu) + inside)
     top = jax.jit(jax.vmap(lambda one: peak_amplitude(cantilever, one)))(flight)
     peak = np.maximum(np.asarray(top), height.max(axis=1))
