@@ -13,7 +13,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import Junction, explain_missing_junction, find_junction
 from afm_jax.contact.turned import turn_in_bridge
 from afm_jax.impact.implicit import implicit_root
-from afm_jax.parameters import as_parameter, check_parameter, is_traced
+from afm_jax.parameters import as_parameter, check_parameter, is_traced, refuse_float32
 from afm_jax.stored_program import stored
 
 _POINTS = 64
@@ -31,8 +31,10 @@ def capture_speed(contact: Contact, mass_ng: ArrayLike = 1.0) -> Float[Array, ""
         contact: the contact, of numbers.
         mass_ng: the tip's mass in ng.
 
+        RuntimeError: if the contact was built before JAX was set to the 64-bit floats that it now computes in.
     Raises:
         ValueError: if the contact has no junction, or the mass is not positive.
+    refuse_float32(contact)
     """
     check_parameter("mass_ng", mass_ng, "positive")
     speed, exists = _capture_speed(contact, as_parameter(mass_ng))

@@ -15,7 +15,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import Junction, explain_missing_junction, find_junction
 from afm_jax.contact.turned import Turn, turn_in_bridge
 from afm_jax.outcome import CollisionOutcome
-from afm_jax.parameters import as_parameter, check_parameter, is_traced
+from afm_jax.parameters import as_parameter, check_parameter, is_traced, refuse_float32
 from afm_jax.stored_program import stored
 
 BLOCK = 512
@@ -46,6 +46,7 @@ def collide(
         A `Collision` with arrays of the speeds' shape.
 
     Raises:
+        RuntimeError: if the contact was built before JAX was set to the 64-bit floats that it now computes in.
         ValueError: if the contact has no junction, the mass is not positive, shapes do not fit, or there is no such
             method or accuracy. Speeds that are not positive and finite are outcomes, not errors.
 
@@ -55,6 +56,7 @@ def collide(
     16.6251
     """
     setting = setting_of(method, accuracy)
+    refuse_float32(contact)
     check_parameter("mass_ng", mass_ng, "positive")
     speeds = as_parameter(approach_speed_nm_per_us)
     mass = jnp.asarray(mass_ng, speeds.dtype)
