@@ -4,7 +4,11 @@ Values are checked only while they are concrete; inside ``jit``, ``grad`` or ``v
 check is skipped, because a compiled program cannot raise.
 """
 
+import contextlib
 import dataclasses
+from collections.abc import Iterator
+from contextvars import ContextVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -89,13 +93,56 @@ def _number(value: object) -> str:
     return repr(value)
 
 
-def require_float64() -> None:
-    """Check that JAX computes in 64 bits.
+def require_float64(*models: Any) -> None:
+    """Check that JAX computes in 64 bits, and that models do: scenes, contacts, results of simulations.
+
+    Args:
+        models: trees of arrays; traced ones too.
 
     Raises:
-        RuntimeError: if it does not; results in 32 bits are not trustworthy by default.
+        RuntimeError: if JAX does not, or an array was made before it was told to; results in 32 bits are not
+            trustworthy by default.
     """
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError(
             "afm_jax needs 64-bit floats: add `jax.config.update('jax_enable_x64', True)` before the first computation"
         )
+    refuse_float32(*models)
+
+
+def refuse_float32(*models: Any) -> None:
+    """Check that models hold 64-bit floats, where JAX computes in them.
+
+    Raises:
+        RuntimeError: if one was made before JAX was told to, or of narrower numbers.
+    """
+    if not jax.config.read("jax_enable_x64") or _float32_allowed.get():
+        return
+    for model in models:
+        if any(map(_is_narrow, jax.tree.leaves(model))):
+            places = jax.tree_util.tree_leaves_with_path(model)
+            narrow = next(jax.tree_util.keystr(path) for path, leaf in places if _is_narrow(leaf))
+            raise RuntimeError(
+                f"{type(model).__name__}{narrow} is a 32-bit float: build the {type(model).__name__.lower()} after "
+                "`jax.config.update('jax_enable_x64', True)`, from 64-bit numbers"
+            )
+
+
+@contextlib.contextmanager
+def float32_allowed() -> Iterator[None]:
+    """Let models of 32-bit floats pass in this block: for measurements of what is left in them."""
+    token = _float32_allowed.set(True)
+    try:
+        yield
+    finally:
+        _float32_allowed.reset(token)
+
+
+_float32_allowed = ContextVar("_float32_allowed", default=False)
+
+
+def _is_narrow(leaf: Any) -> bool:
+    return isinstance(leaf, jax.Array | np.ndarray | np.generic) and leaf.dtype in _NARROW
+
+
+_NARROW = {jnp.dtype(name) for name in ("float16", "bfloat16", "float32")}

@@ -77,11 +77,11 @@ def fit_delay(
         points: number of speeds, at least 3.
 
     Raises:
-        RuntimeError: if JAX does not compute in 64 bits.
+        RuntimeError: if JAX does not compute in 64 bits, or did not when the contact was built.
         ValueError: if the contact has no junction, a tip of the range is captured, or the range or the number of points
             is not possible.
     """
-    require_float64()
+    require_float64(contact)
     if points < 3:
         raise ValueError(f"`points` must be at least the number of parameters, 3, but is {points}")
     low, high = range_above_capture(speed_range, float(capture_speed(contact, mass_ng)), LOWEST_SPEED, TOP_SPEED)

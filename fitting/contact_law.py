@@ -133,7 +133,7 @@ def fit_law(
         points: number of speeds, uniform over the range.
 
     Raises:
-        RuntimeError: if JAX does not compute in 64 bits.
+        RuntimeError: if JAX does not compute in 64 bits, or did not when the contact was built.
         ValueError: if the contact has no junction, a tip of the range is captured, or there is no such model, range,
             number of points or kind of residuals.
 
@@ -143,7 +143,7 @@ def fit_law(
     >>> round(law.epsilon, 1), round(law.viscous_loss, 1)
     (113.6, 0.5)
     """
-    require_float64()
+    require_float64(contact)
     if model not in FREE:
         raise ValueError(f"`model` must be one of {', '.join(FREE)}, but is {model!r}")
     if residuals not in RESIDUALS:

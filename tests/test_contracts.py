@@ -11,12 +11,25 @@ import pytest
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
+from afm_jax.contact.capture import capture_speed
+from afm_jax.contact.collide import collide
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.time_course import time_course
 from afm_jax.impact import orbits as orbits_module
 from afm_jax.impact import poincare
+from afm_jax.impact.batch import iterate_batch
 from afm_jax.impact.jacobian import map_jacobian
 from afm_jax.impact.law import CollisionDelay, ImpactLaw, impact_law_of
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.impact.poincare import iterate_map, next_impact
+from afm_jax.motion.simulate import simulate
+from afm_jax.motion.start import state
+from afm_jax.parameters import float32_allowed
+from afm_jax.study.collisions import collisions
+from afm_jax.study.effects import study_effects
+from fitting.contact_delay import fit_delay
+from fitting.contact_law import fit_law
+from fitting.simulated.simulated_experiment import drives_of, simulate_experiment
 from tests.package_scenes import bouncing, next_impacts, repeated, stacked
 
 TIME, VELOCITY = 4.0, 60.0
@@ -111,10 +124,15 @@ def test_jvp_vjp_and_differences_agree(function: Callable[[Scene], Any]):
     np.testing.assert_allclose(rate, (4 * near - far) / 3, rtol=1e-6, atol=1e-7 * scale)
 
 
+def narrow(scene: Any) -> Any:
+    return jax.tree.map(lambda leaf: leaf.astype(jnp.float32), scene)
+
+
 @pytest.mark.parametrize("function", OBJECTS[:6])
 def test_single_precision_goes_as_far_as_it_can(function: Callable[[Scene], Any]):
     double = np.asarray(function(SCENES[0]))
-    single = np.asarray(function(jax.tree.map(lambda leaf: leaf.astype(jnp.float32), SCENES[0])))
+    with float32_allowed():
+        single = np.asarray(function(narrow(SCENES[0])))
     assert single.dtype == np.float32
     assert np.all(np.isfinite(single))
     # 6e-8 of phases of 10 rad and lengths of 100 nm, stretched by up to three impacts.
@@ -197,6 +215,50 @@ def test_a_large_batch_of_impacts_equals_small_ones():
 def test_entry_points_ask_for_64_bits(call: Callable[[Scene], Any]):
     with jax.enable_x64(False), pytest.raises(RuntimeError, match="jax_enable_x64', True") as error:  # noqa: FBT003
         call(bouncing())
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda scene: next_impact(scene, TIME, VELOCITY),
+        lambda scene: iterate_map(scene, TIME, VELOCITY, 2),
+        lambda scene: iterate_batch(scene, np.array([TIME]), np.array([VELOCITY]), 2),
+        lambda scene: map_jacobian(scene, TIME, VELOCITY),
+        lambda scene: single_impact_orbits(scene, 1),
+        lambda scene: simulate(scene, state(0.0, 100.0, 0.0), 10.0),
+        study_effects,
+        jax.jit(lambda scene: next_impact(scene, TIME, VELOCITY)),
+    ],
+)
+def test_a_scene_built_before_64_bits_were_asked_for_is_refused(call: Callable[[Scene], Any]):
+    with jax.enable_x64(False):  # noqa: FBT003
+        early = bouncing()
+    for scene in (early, Scene(SCENES[0].cantilever, early.platform, SCENES[0].interaction)):
+        with pytest.raises(RuntimeError, match=r"build the scene after .*jax_enable_x64', True") as error:
+            call(scene)
+        assert "\n" not in str(error.value)
+    assert str(error.value).startswith("Scene.platform.amplitude_nm is a 32-bit float")
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        lambda contact: collide(contact, 20.0),
+        capture_speed,
+        lambda contact: time_course(contact, 20.0),
+        collisions,
+        fit_law,
+        fit_delay,
+        lambda contact: simulate_experiment(contact, Cantilever(90.0, 40.0), drives_of([(1, 180.0, 4.0, 0.0)])),
+        lambda contact: simulate(Scene(Cantilever(90.0), Platform(1.0, 180.0), contact), state(0.0, 100.0, 0.0), 10.0),
+    ],
+)
+def test_a_contact_built_before_64_bits_were_asked_for_is_refused(call: Callable[[Contact], Any]):
+    with jax.enable_x64(False):  # noqa: FBT003
+        early = Contact.paper()
+    with pytest.raises(RuntimeError, match=r"is a 32-bit float: build the (contact|scene) after") as error:
+        call(early)
     assert "\n" not in str(error.value)
 
 

@@ -27,7 +27,7 @@ from afm_jax.contact.junction_leg import JunctionWay, pass_through_junction
 from afm_jax.contact.settings import CAREFUL, Setting, setting_of
 from afm_jax.impact.implicit import implicit_root
 from afm_jax.outcome import CollisionOutcome
-from afm_jax.parameters import as_parameter, check_parameter, is_traced
+from afm_jax.parameters import as_parameter, check_parameter, is_traced, refuse_float32
 from afm_jax.stored_program import stored
 
 BLOCK = 512
@@ -85,6 +85,7 @@ def collide(
         A `Collision` with arrays of the speeds' shape.
 
     Raises:
+        RuntimeError: if the contact was built before JAX was set to the 64-bit floats that it now computes in.
         ValueError: if the contact has no junction, the mass is not positive, shapes do not fit, or there is no such
             method or accuracy. Speeds that are not positive and finite are outcomes, not errors.
 
@@ -94,6 +95,7 @@ def collide(
     16.6251
     """
     setting = setting_of(method, accuracy)
+    refuse_float32(contact)
     check_parameter("mass_ng", mass_ng, "positive")
     speeds = as_parameter(approach_speed_nm_per_us)
     mass = jnp.asarray(mass_ng, speeds.dtype)
@@ -247,8 +249,10 @@ def capture_speed(contact: Contact, mass_ng: ArrayLike = 1.0) -> Float[Array, ""
         mass_ng: the tip's mass in ng.
 
     Raises:
+        RuntimeError: if the contact was built before JAX was set to the 64-bit floats that it now computes in.
         ValueError: if the contact has no junction, or the mass is not positive.
     """
+    refuse_float32(contact)
     check_parameter("mass_ng", mass_ng, "positive")
     speed, exists = _capture_speed(contact, as_parameter(mass_ng))
     if not is_traced(exists) and not bool(exists):

@@ -47,11 +47,11 @@ def iterate_batch(
         A `NextImpact` of shape (batch, impacts), differentiable in scene and starts.
 
     Raises:
-        RuntimeError: if JAX is not set to 64-bit floats.
+        RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
         TypeError: if the scene's interaction is not an impact law.
         ValueError: if shapes do not fit together, or `impacts` or `block` is not positive.
     """
-    require_float64()
+    require_float64(scene)
     impact_law_of(scene)
     dtype = scene.platform.frequency_khz.dtype
     times, velocities = jnp.asarray(time_us, dtype), jnp.asarray(velocity_nm_per_us, dtype)

@@ -102,12 +102,12 @@ def single_impact_orbits(scene: Scene, order: ArrayLike) -> SingleImpactOrbits:
         they are all roots of a quartic; with one, all that a scan of 8192 speeds brackets, close pairs included.
 
     Raises:
-        RuntimeError: if JAX is not set to 64-bit floats.
+        RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
         TypeError: if the scene's interaction is not an impact law.
         ValueError: if the order is not a positive integer, the platform's offset ramps, or the scene has another drive
             than one cosine of the platform.
     """
-    require_float64()
+    require_float64(scene)
     impact_law_of(scene)
     require_sample_drive(scene)
     _check_order(order)

@@ -64,7 +64,7 @@ def next_impact(
         The impact, differentiable in everything: forward, reverse, to any order (implicit function theorem).
 
     Raises:
-        RuntimeError: if JAX is not set to 64-bit floats.
+        RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
         TypeError: if the scene's interaction is not an impact law.
         ValueError: if the scene has a drive besides the platform.
 
@@ -75,7 +75,7 @@ def next_impact(
     ...     print(round(float(next_impact(scene, 4.0, 6.0).time_us), 6))
     9.646489
     """
-    require_float64()
+    require_float64(scene)
     impact_law_of(scene)
     require_sample_drive(scene, second_frequency=True)
     dtype = scene.platform.frequency_khz.dtype
@@ -107,11 +107,11 @@ def iterate_map(
         impact) the rows say `Outcome.NOT_REACHED`.
 
     Raises:
-        RuntimeError: if JAX is not set to 64-bit floats.
+        RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
         TypeError: if the scene's interaction is not an impact law.
         ValueError: if `impacts` is not positive, or the scene has a drive besides the platform.
     """
-    require_float64()
+    require_float64(scene)
     impact_law_of(scene)
     require_sample_drive(scene, second_frequency=True)
     if impacts < 1:

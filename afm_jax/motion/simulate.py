@@ -66,12 +66,12 @@ def simulate(  # noqa: PLR0913
         A `Simulation`; how it ended is its `outcome`, a `MotionOutcome`.
 
     Raises:
-        RuntimeError: if JAX is not set to 64-bit floats.
+        RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
         TypeError: if the interaction is neither a law nor a contact nor None.
         ValueError: if the duration is not positive, the contact has no junction, the start is inside the sample, or
             there is no such method or accuracy.
     """
-    require_float64()
+    require_float64(scene)
     check_parameter("duration_us", duration_us, "positive")
     surface, response = surface_of(scene)
     dtype = scene.cantilever.frequency_khz.dtype

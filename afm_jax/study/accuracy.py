@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from afm_jax.impact.batch import iterate_batch
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US
 from afm_jax.outcome import Outcome
+from afm_jax.parameters import float32_allowed
 from afm_jax.study.benchmark_scenes import (
     BenchmarkScene,
     Starts,
@@ -122,7 +123,8 @@ def _map_rows(
     def run(scene, starts, tolerance):
         return iterate_batch(scene, starts.time_us, starts.velocity_nm_per_us, impacts, root_tolerance_us=tolerance)
 
-    compiled = compiled_for(run, scene, starts, dtype(tolerances[0]))
+    with float32_allowed():
+        compiled = compiled_for(run, scene, starts, dtype(tolerances[0]))
     rows = []
     for tolerance in tolerances:
         timing, result = time_compiled(compiled, scene, starts, dtype(tolerance), repetitions=repetitions)

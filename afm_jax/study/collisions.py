@@ -58,10 +58,10 @@ def collisions(
         method: as in `collide`.
 
     Raises:
-        RuntimeError: if JAX does not compute in 64 bits.
+        RuntimeError: if JAX does not compute in 64 bits, or did not when the contact was built.
         ValueError: if the contact has no junction, or a setting is not possible.
     """
-    require_float64()
+    require_float64(contact)
     capture = float(capture_speed(contact, mass_ng))
     chosen = default_speeds(capture) if speeds is None else np.asarray(speeds, dtype=float)
     junction = _junction(contact)

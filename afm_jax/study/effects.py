@@ -8,6 +8,7 @@ from afm_jax.motion.drive_period import drive_of
 from afm_jax.motion.record import State
 from afm_jax.motion.settle import why_impossible
 from afm_jax.motion.start import default_start
+from afm_jax.parameters import require_float64
 from afm_jax.study.flight_reading import Reading
 from afm_jax.study.motion_program import Operations, Programs
 from afm_jax.study.observed_scene import Observed, View, observe_scene, slope_of_reading
@@ -105,9 +106,11 @@ def study_effects(  # noqa: PLR0913
         progress: is told what is being done.
 
     Raises:
+        RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
         ValueError: if the scene itself has no motion to compare with, an effect of `only` is not in the scene, or the
             accuracy or the duration is not positive.
     """
+    require_float64(scene)
     _check(accuracy, duration_us)
     programs = Programs() if programs is None else programs
     known = effects_in(scene)

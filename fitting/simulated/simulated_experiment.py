@@ -10,6 +10,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.contact.contact import Contact
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
+from afm_jax.parameters import require_float64
 from fitting.simulated.simulated_motion import Drives, Report, steady_rows
 from fitting.table import AmplitudeTable
 
@@ -75,8 +76,9 @@ def simulate_experiment(  # noqa: PLR0913
     Raises:
         ValueError: if the noise is not between 0 and 1, an order is no positive integer, the contact has no junction,
             or no drive has a steady (1, N) orbit.
-        RuntimeError: if JAX is not set to 64-bit floats.
+        RuntimeError: if JAX is not set to 64-bit floats, or was not when the contact, law or cantilever was built.
     """
+    require_float64(interaction, cantilever)
     _check(drives, noise, phase_noise_deg)
     found = steady_rows(interaction, cantilever, drives, accuracy=accuracy, pieces=pieces, report=report)
     kept = found.rows
