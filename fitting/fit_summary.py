@@ -14,7 +14,7 @@ from fitting.law_band import law_with_band
 from fitting.minimum import Minimum
 from fitting.optimise import Objective
 from fitting.result import FitResult, FittedParameter, FittedRows
-from fitting.strained import Strain
+from fitting.strained import Strain, untabulated
 from fitting.table import AmplitudeTable
 from fitting.verdict import IMPROBABLE, Evidence, judge_fit
 
@@ -78,6 +78,8 @@ class _Summary:
             intervals = profile_intervals(self.objective, self.values, self.covariance, self.chi2)
             parameters = self._parameters(errors, intervals, moved)
         rows = self._rows()
+        used_speeds = np.where(rows.used, rows.approach_speed_nm_per_us, np.nan)
+        missed = untabulated(self.objective, self.values, used_speeds)
         evidence = Evidence(
             table=self.table,
             parameters=parameters,
@@ -92,6 +94,7 @@ class _Summary:
             lasting=self.problem.lasting,
             robust=self.searching.robust,
             correlations=_correlations(self.covariance),
+            untabulated=tuple(np.flatnonzero(missed).tolist()),
         )
         reasons, warnings = judge_fit(evidence)
         return FitResult(
@@ -111,7 +114,7 @@ class _Summary:
                 self.objective.measurement,
                 self.values,
                 self._shown_covariance(p_value),
-                np.where(rows.used, rows.approach_speed_nm_per_us, np.nan),
+                used_speeds,
             ),
             rows=rows,
             residual_autocorrelation=evidence.autocorrelation,
