@@ -14,7 +14,7 @@ from fitting.law_band import law_with_band
 from fitting.minimum import Minimum
 from fitting.optimise import Objective
 from fitting.result import FitResult, FittedParameter, FittedRows
-from fitting.strained import Strain
+from fitting.strained import Strain, untabulated
 from fitting.table import AmplitudeTable
 from fitting.verdict import Evidence, judge_fit, misfits
 
@@ -68,6 +68,8 @@ class _Summary:
         moved = ~self.free | ~np.isfinite(errors) | (np.abs(self.values - self.minimum.start) > 1e-3 * errors)
         unknown = np.full_like(errors, np.inf)
         rows = self._rows()
+        used_speeds = np.where(rows.used, rows.approach_speed_nm_per_us, np.nan)
+        missed = untabulated(self.objective, self.values, used_speeds)
         evidence = Evidence(
             table=self.table,
             parameters=self._parameters(unknown, "the model does not explain the data", moved),
@@ -82,6 +84,7 @@ class _Summary:
             lasting=self.problem.lasting,
             robust=self.searching.robust,
             correlations=_correlations(self.covariance),
+            untabulated=tuple(np.flatnonzero(missed).tolist()),
         )
         # Errors that assume the model would be confident numbers about a law that is not there.
         explained = not misfits(evidence)
@@ -106,7 +109,7 @@ class _Summary:
                 self.objective.measurement,
                 self.values,
                 shown_covariance,
-                np.where(rows.used, rows.approach_speed_nm_per_us, np.nan),
+                used_speeds,
             ),
             rows=rows,
             residual_autocorrelation=evidence.autocorrelation,

@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from afm_jax.impact.lasting_impact import LawImpact
+from fitting.contact_table import DELAY_ERROR_US, SPEED_ERROR
 from fitting.forward import Linearised
 from fitting.optimise import Objective
 from fitting.row_orbits import impact_of
@@ -63,6 +65,18 @@ def strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
     if "delay_offset_nm" in objective.problem.names:
         error = np.hypot(error, DELAY_US * _sensitivity(objective, linear, approach))
     return Strain(np.where(exists, error, BASE), exists & slow)
+
+
+def untabulated(
+    objective: Objective, values: Float[np.ndarray, " p"], approach: Float[np.ndarray, " rows"]
+) -> Bool[np.ndarray, " rows"]:
+    """Say at which approach speeds the table of a contact misses its accuracy; nowhere for a law, nor at NaN."""
+    impact = impact_of(jnp.asarray(values), objective.measurement, objective.problem)
+    if isinstance(impact, LawImpact):
+        return np.zeros(approach.shape, dtype=bool)
+    speed, delay = impact.errors(jnp.asarray(approach))
+    held = (np.asarray(speed) <= SPEED_ERROR) & (np.asarray(delay) <= DELAY_ERROR_US)
+    return np.isfinite(approach) & ~held
 
 
 def _sensitivity(

@@ -54,6 +54,8 @@ class Evidence:
     lasting: bool
     robust: bool
     correlations: Float[np.ndarray, "p p"]
+    untabulated: tuple[int, ...] = ()
+    """Rows whose impacts the table of a contact does not hold to its accuracy."""
 
 
 def judge_fit(evidence: Evidence) -> tuple[list[str], list[str]]:
@@ -81,6 +83,12 @@ def _reasons(evidence: Evidence) -> list[str]:
     missing = np.flatnonzero((evidence.rows.orbits == 0) & evidence.rows.used)
     if missing.size:
         reasons.append(f"No stable orbit at the fitted law for {_rows_in_words(evidence.table, missing)}.")
+    if evidence.untabulated:
+        where = _rows_in_words(evidence.table, np.array(evidence.untabulated))
+        reasons.append(
+            f"The table of the fitted contact's impacts misses its accuracy for {where}: the contact's numbers are too "
+            "extreme; hold some of them fixed."
+        )
     misfit = misfits(evidence)
     if misfit:
         reasons.append(f"The model does not explain the data: {'; '.join(misfit)}. {_why_not_explained(evidence)}")

@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from afm_jax.contact.capture import capture_speed
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
-from afm_jax.contact.capture import capture_speed
 from afm_jax.contact.collide import collide
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.time_course import time_course

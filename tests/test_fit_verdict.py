@@ -33,6 +33,17 @@ def evidence(model: str, table: AmplitudeTable, **changes) -> Evidence:
     return dataclasses.replace(known, **changes)
 
 
+def test_a_contact_whose_table_is_not_reached_is_refused():
+    given = evidence("law+delay", made_table())
+    assert not any("table" in reason for reason in judge_fit(given)[0])
+    reasons, _ = judge_fit(dataclasses.replace(given, untabulated=(0, 2)))
+    lines = f"lines {given.table.lines[0]}, {given.table.lines[2]}"
+    assert any(
+        reason.startswith(f"The table of the fitted contact's impacts misses its accuracy for {lines}:")
+        for reason in reasons
+    )
+
+
 def test_a_row_without_an_orbit_where_the_model_has_one_is_named():
     table = made_table()
     unseen = np.zeros(table.rows)

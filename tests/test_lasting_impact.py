@@ -4,10 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from afm_jax.contact.capture import capture_speed
 from scipy.integrate import solve_ivp
 from scipy.special import beta
 
 import afm_jax as afm
+from afm_jax.contact.junction import find_junction
 from afm_jax.impact.lasting_impact import (
     AIR,
     BRIDGE_NM,
@@ -21,7 +23,7 @@ from afm_jax.impact.lasting_impact import (
     middle_of_contact,
 )
 from afm_jax.impact.law import CollisionDelay, ImpactLaw, Speeds
-from fitting.contact_table import tabulated
+from fitting.contact_table import DELAY_ERROR_US, SPEED_ERROR, tabulated
 
 DEEPEST = 1.25**0.4
 """Of d'' = -d^(3/2) from d = 0 at speed 1: 1/2 = (2/5) d^(5/2)."""
@@ -192,6 +194,74 @@ def test_a_table_is_the_contacts_collisions(name):
     assert not np.any(truth.captured)
     np.testing.assert_allclose(found.rebound, truth.rebound_speed_nm_per_us, rtol=1e-7)
     np.testing.assert_allclose(found.delay, truth.collision_delay_us, rtol=0, atol=1e-7)
+
+
+WET = {"relative_humidity": 0.8, "adhesion_energy_j_per_m2": 0.15, "viscosity_pa_s": 1.005e-2}
+
+
+def random_contact(rng: np.random.Generator) -> dict[str, float]:
+    """Return numbers of a contact between dry and wet, soft and hard; one in ten without drag."""
+    drag = 0.0 if rng.random() < 0.1 else 10.0 ** rng.uniform(-1.0, 1.0)
+    return {
+        "relative_humidity": rng.uniform(0.2, 0.9),
+        "adhesion_energy_j_per_m2": rng.uniform(0.1, 0.6),
+        "viscosity_pa_s": drag * 1.005e-3,
+        "modulus_gpa": 10.0 ** rng.uniform(1.0, 2.5),
+    }
+
+
+def check_against_collisions(numbers: dict[str, float]) -> bool:
+    """Compare a table with collisions over all of it; False if the contact has no junction, and the table says so."""
+    contact = afm.Contact.paper(**numbers)
+    table = tabulated(contact, jnp.array(1.0))
+    lowest = float(table.lowest)
+    if not bool(find_junction(contact).exists):
+        assert lowest > 1e5
+        return False
+    # closer to capture the collisions themselves are off by more
+    speeds = np.geomspace(1.03 * lowest, float(table.highest), 32)
+    truth = afm.collide(contact, speeds)
+    found, (share, late) = every_speed(table, jnp.asarray(speeds))
+    assert not np.any(truth.captured)
+    np.testing.assert_allclose(found.rebound, truth.rebound_speed_nm_per_us, rtol=SPEED_ERROR)
+    np.testing.assert_allclose(found.delay, truth.collision_delay_us, rtol=0, atol=DELAY_ERROR_US)
+    assert np.all(np.asarray(share) < SPEED_ERROR), numbers
+    assert np.all(np.asarray(late) < DELAY_ERROR_US), numbers
+    return True
+
+
+@jax.jit
+def every_speed(table, speeds):
+    return jax.vmap(table.speeds)(speeds), jax.vmap(table.errors)(speeds)
+
+
+def test_random_contacts_are_tabulated_from_capture_on():
+    rng = np.random.default_rng(11)
+    assert sum(check_against_collisions(random_contact(rng)) for _ in range(12)) >= 10
+    assert check_against_collisions(WET)
+
+
+@pytest.mark.slow
+def test_a_thousand_random_contacts_are_tabulated_from_capture_on():
+    rng = np.random.default_rng(12)
+    assert sum(check_against_collisions(random_contact(rng)) for _ in range(1000)) >= 950
+
+
+@pytest.mark.parametrize("numbers", [{}, WET, {"modulus_gpa": 10.0, "adhesion_energy_j_per_m2": 0.6}])
+def test_a_table_begins_at_the_capture_speed(numbers):
+    contact = afm.Contact.paper(**numbers)
+    table = tabulated(contact, jnp.array(1.0))
+    expected = float(capture_speed(contact))
+    assert float(table.lowest) == pytest.approx(expected, rel=1e-9)
+
+
+def test_a_contact_too_extreme_for_its_table_is_known():
+    """Drag takes thirty times the capture energy: what the table says of itself is as bad as it is."""
+    contact = afm.Contact.paper(viscosity_pa_s=3.0)
+    table = tabulated(contact, jnp.array(0.2))
+    share, late = table.errors(2.0 * table.lowest)
+    assert float(share) > SPEED_ERROR or float(late) > DELAY_ERROR_US or float(table.lowest) > 1e5
+    assert np.isinf(float(tabulated(afm.Contact.paper(), jnp.array(1.0)).errors(jnp.array(5.0))[0]))
 
 
 @pytest.mark.slow

@@ -1,5 +1,7 @@
 """The liquid bridge as its crossings need it: potential and damping, with everything computed once that can be."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -13,12 +15,14 @@ class Bridge(eqx.Module):
     """The forces of a bridge, reduced to their coefficients.
 
     A force's parameters enter thousands of evaluations of its potential; what depends on them alone is computed here.
+    ``backwards``: time runs backwards, so that drag gives the energy that it takes.
     """
 
     static_kinds: tuple[type[StaticForce], ...] = eqx.field(static=True)
     static: tuple[tuple[Float[Array, "..."], ...], ...]
     dissipative_kinds: tuple[type[DissipativeForce], ...] = eqx.field(static=True)
     dissipative: tuple[tuple[Float[Array, "..."], ...], ...]
+    backwards: bool = eqx.field(static=True, default=False)
 
     @property
     def conserves(self) -> bool:
@@ -41,7 +45,12 @@ class Bridge(eqx.Module):
     def damping(self, gap: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return the damping of all dissipative forces in nN us/nm at a gap in nm."""
         terms = zip(self.dissipative_kinds, self.dissipative, strict=True)
-        return sum((kind.damping_of(parts, gap) for kind, parts in terms), start=jnp.zeros_like(gap))
+        total = sum((kind.damping_of(parts, gap) for kind, parts in terms), start=jnp.zeros_like(gap))
+        return -total if self.backwards else total
+
+    def reversed(self) -> "Bridge":
+        """Return the bridge for a motion that is followed against time."""
+        return replace(self, backwards=not self.backwards)
 
 
 def bridge_of(contact: Contact) -> Bridge:

@@ -20,7 +20,7 @@ from afm_jax.contact.forces import jkr
 from afm_jax.contact.junction import Junction, explain_missing_junction, find_junction
 from afm_jax.contact.junction_leg import stretch_in_junction, turning_root
 from afm_jax.contact.phases import Phase, force_in_phase
-from afm_jax.parameters import as_parameter, check_parameter, refuse_float32
+from afm_jax.parameters import as_parameter, check_parameter
 from afm_jax.stored_program import stored
 
 _NODES = 64
@@ -65,6 +65,7 @@ def time_course(contact: Contact, approach_speed_nm_per_us: ArrayLike, mass_ng: 
         mass_ng: the tip's mass in ng.
 
         RuntimeError: if the contact was built before JAX was set to the 64-bit floats that it now computes in.
+
     Raises:
         ValueError: if speed or mass is not positive, the contact has no junction, or the bridge turns the tip round
             before the junction forms.

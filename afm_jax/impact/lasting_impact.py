@@ -42,6 +42,8 @@ USUAL_LEAD = 1.3
 
 PASSES = 4
 """From the delay to mid contact and back."""
+NEAREST = 1.01
+"""Approach speed in terms of the capture speed from which on a table's error is known."""
 
 
 @runtime_checkable
@@ -144,29 +146,41 @@ class LawImpact(eqx.Module):
 
 
 class TabulatedImpact(eqx.Module):
-    """The loss u_in^2 - u_out^2 and the delay as Chebyshev series in log(u_in - lowest); the coordinate is u_in.
+    """The loss u_in^2 - u_out^2 and the time in contact of free collisions as series; the coordinate is u_in.
 
-    From the delay the lead of a slow way out is taken off first, `lead_nm` (1/u_out - 1/u_in): what is left is smooth.
+    Both are smooth functions of the rebound speed down to 0, and so of v = sqrt(u_in^2 - lowest^2): Chebyshev series
+    in asinh(v/scale), which is v itself at capture and its logarithm far from it. The delay is the time in contact less
+    what the straight paths take, outer/u_out + inner/u_in, and so as singular at capture as it is.
 
     Attributes:
         loss: coefficients of the loss in nm^2/us^2, shape (terms,).
-        delay: coefficients of the delay with the lead added, in us, shape (terms,).
-        lowest: speed in nm/us at which the tip is captured (0: none is).
-        start: log of the distance from `lowest` where the table begins.
-        end: and where it ends; beyond, its ends are held.
-        lead_nm: lead that is taken off the delay.
+        time: coefficients of the time in contact in us, shape (terms,).
+        lowest: speed in nm/us at which the tip is captured.
+        scale: v in nm/us from which on the variable is a logarithm.
+        end: asinh(v/scale) where the table ends; beyond, loss and delay are held.
+        inner_nm: gap at which contact begins.
+        outer_nm: gap at which contact ends.
+        hertz: Hertz time at 1 nm/us, in us (nm/us)^0.2: that of the table's end, where nothing else is left.
         early_nm: lead b of the delay law that is closest to the delay.
         length_nm: gap at which the bridge breaks.
+        loss_error: estimated error of the series for the loss, in nm^2/us^2.
+        speed_error: estimated error of the approach speeds that it goes through, as a share.
+        time_error: estimated error of the time in us.
     """
 
     loss: Float[Array, " terms"]
-    delay: Float[Array, " terms"]
+    time: Float[Array, " terms"]
     lowest: Float[Array, ""]
-    start: Float[Array, ""]
+    scale: Float[Array, ""]
     end: Float[Array, ""]
-    lead_nm: Float[Array, ""]
+    inner_nm: Float[Array, ""]
+    outer_nm: Float[Array, ""]
+    hertz: Float[Array, ""]
     early_nm: Float[Array, ""]
     length_nm: Float[Array, ""]
+    loss_error: Float[Array, ""]
+    speed_error: Float[Array, ""]
+    time_error: Float[Array, ""]
 
     @property
     def delayed(self) -> bool:
@@ -183,10 +197,14 @@ class TabulatedImpact(eqx.Module):
         """The capture speed."""
         return self.lowest
 
+    @property
+    def highest(self) -> Float[Array, ""]:
+        """Approach speed in nm/us where the table ends."""
+        return jnp.sqrt(self.lowest**2 + (self.scale * jnp.sinh(self.end)) ** 2)
+
     def hertz_time(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return tau at the end of the table, where nothing else is left of the delay, scaled to the speed."""
-        end = self.lowest + jnp.exp(self.end)
-        return jnp.sum(self.delay) * (end / approach_speed) ** 0.2
+        """Return the Hertz time at a speed."""
+        return self.hertz * approach_speed**-0.2
 
     @property
     def lead(self) -> Float[Array, ""]:
@@ -202,10 +220,21 @@ class TabulatedImpact(eqx.Module):
         """Return approach and rebound speed and the delay at u_in."""
         u = coordinate
         place = self._place(u)
-        square = u * u - chebyshev_sum(self.loss, place)
-        # a captured tip has a crawling rebound: far from any orbit that was measured
-        w = jnp.sqrt(jnp.maximum(square, 1e-6))
-        return Speeds(u, w, chebyshev_sum(self.delay, place) - self.lead_nm * (1.0 / w - 1.0 / u))
+        loss = chebyshev_sum(self.loss, place)
+        inside = jnp.minimum(u, self.highest)
+        straight = self.outer_nm / _rebound(inside, loss) + self.inner_nm / inside
+        return Speeds(u, _rebound(u, loss), chebyshev_sum(self.time, place) - straight)
+
+    def errors(self, approach_speed: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Return the estimated errors of the rebound speed, as a share of it, and of the delay in us.
+
+        Infinite outside the table: up to 1 % above capture, and beyond its end.
+        """
+        w = self.speeds(approach_speed).rebound
+        share = (0.5 * self.loss_error + self.speed_error * approach_speed**2) / w**2
+        inside = (approach_speed > NEAREST * self.lowest) & (approach_speed <= self.highest)
+        late = self.time_error + self.outer_nm * share / w
+        return jnp.where(inside, share, jnp.inf), jnp.where(inside, late, jnp.inf)
 
     def at_approach(self, approach_speed: Float[Array, ""]) -> Speeds:
         """Return what the table says of an approach speed."""
@@ -213,8 +242,20 @@ class TabulatedImpact(eqx.Module):
 
     def _place(self, u: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return where a speed lies in the table, -1 to 1."""
-        distance = jnp.log(jnp.maximum(u - self.lowest, jnp.exp(self.start)))
-        return jnp.clip(2.0 * (distance - self.start) / (self.end - self.start) - 1.0, -1.0, 1.0)
+        free = u > self.lowest
+        square = jnp.where(free, u * u - self.lowest**2, 1.0)
+        far = jnp.where(free, stretched(jnp.sqrt(square) / self.scale), 0.0)
+        return jnp.minimum(2.0 * far / self.end - 1.0, 1.0)
+
+
+def stretched(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return asinh(x) for x >= 0, to the rounding of 1; the library's own costs more."""
+    return jnp.log(x + jnp.sqrt(x * x + 1.0))
+
+
+def _rebound(u: Float[Array, "..."], loss: Float[Array, "..."]) -> Float[Array, "..."]:
+    # a captured tip has a crawling rebound: far from any orbit that was measured
+    return jnp.sqrt(jnp.maximum(u * u - loss, 1e-6))
 
 
 class Middle(NamedTuple):
