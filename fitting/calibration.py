@@ -8,7 +8,7 @@ from afm_jax.version import version_of
 from fitting.intervals import Interval, profile_intervals
 from fitting.residual_patterns import autocorrelation, repeat_of, runs_excess
 from fitting.resonance.calibration_result import Alternative, CalibratedValue, Calibration, Curves
-from fitting.resonance.calibration_verdict import IMPROBABLE, Evidence, judge_calibration
+from fitting.resonance.calibration_verdict import IMPROBABLE, SweepEvidence, judge_calibration
 from fitting.resonance.resonance_model import TERMS, model_at
 from fitting.resonance.resonance_start import sum_without_resonance
 from fitting.resonance.resonance_sweep import ResonanceSweep
@@ -107,7 +107,7 @@ def _summary(sweep: ResonanceSweep, fit: SweepFit, background: str, alternatives
     explained = not p_value < IMPROBABLE
     frequency, quality_factor = _calibrated(fit, explained=explained)
     kind, curves = fit.objective.kind, _curves(sweep, fit)
-    evidence = Evidence(
+    evidence = SweepEvidence(
         sweep=sweep,
         fit=fit,
         frequency=frequency,

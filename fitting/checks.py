@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from fitting.fisher import covariance_of
 from fitting.optimise import PLAIN, Objective
 
 _STEP = 0.02
@@ -42,11 +43,11 @@ def covariance(
     A parameter at its bound is held there; its own variance is the one it would have if it were free.
     """
     jacobian = np.asarray(objective.at_values(values[None]).jacobian)[0]
-    full = _inverse(jacobian.T @ jacobian)
+    full = covariance_of(jacobian.T @ jacobian)
     if free.all():
         return full
     result = np.zeros_like(full)
-    result[np.ix_(free, free)] = _inverse(jacobian[:, free].T @ jacobian[:, free])
+    result[np.ix_(free, free)] = covariance_of(jacobian[:, free].T @ jacobian[:, free])
     held = np.flatnonzero(~free)
     result[held, held] = full[held, held]
     return result
@@ -103,7 +104,7 @@ def _adrift(eigenvalues: list[float], *, outward: bool, reason: str | None = Non
 def at_bound(objective: Objective, values: Float[np.ndarray, " p"]) -> Bool[np.ndarray, " p"]:
     """Say which losses vanish within a hundredth of what the data could resolve."""
     jacobian = np.asarray(objective.at_values(values[None]).jacobian)[0]
-    resolution = np.sqrt(np.diag(_inverse(jacobian.T @ jacobian)))
+    resolution = np.sqrt(np.diag(covariance_of(jacobian.T @ jacobian)))
     ends = [np.inf if p.bound is None else p.bound for p in objective.problem.parameters]
     return np.abs(values - np.array(ends)) < 0.01 * np.where(np.isfinite(resolution), resolution, 0.0)
 
@@ -116,17 +117,3 @@ def _pushes_outward(objective: Objective, coordinates, free) -> bool:
     slope = np.asarray(result.jacobian)[0].T @ np.asarray(result.residual)[0]
     inward = np.array([p.sign for p in objective.problem.parameters])
     return bool(np.all((slope * inward)[~free] >= 0.0))
-
-
-def _inverse(fisher: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
-    """Return the inverse of a Fisher matrix; rows and columns of parameters that it does not determine are infinite."""
-    if not np.all(np.isfinite(fisher)):
-        return np.full_like(fisher, np.inf)
-    scale = np.sqrt(np.diag(fisher))
-    safe = np.where(scale > 0.0, scale, 1.0)
-    curvature, axes = np.linalg.eigh(fisher / np.outer(safe, safe))
-    flat = curvature < 1e-12
-    undetermined = np.any(np.abs(axes[:, flat]) > 1e-6, axis=1)
-    inverse = (axes / np.where(flat, np.inf, curvature)) @ axes.T / np.outer(safe, safe)
-    inverse[undetermined, :] = inverse[:, undetermined] = np.inf
-    return inverse

@@ -3,14 +3,17 @@
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from fitting.least_squares import Box, Searches, descended
 from fitting.optimise import Objective
 
 CHI2_95 = 3.841458820694124
 """95 % quantile of chi2 with one degree of freedom."""
 _OUTER_STEPS = 30
 _INNER_STEPS = 25
+_SETTLED = 1e-6
+"""Estimated distance of chi2 to its minimum over the others at which these have arrived."""
 _FARTHEST = 100.0
 """Distance in standard errors at which a search gives up: the data do not determine the parameter on that side."""
 _FIRST_TRIAL = float(np.sqrt(CHI2_95))
@@ -139,7 +142,7 @@ class _Places:
     def of_values(self, values: Float[np.ndarray, "... p"]) -> Float[np.ndarray, "... p"]:
         return np.where(self.by_value, values, self.objective.problem.coordinates(values))
 
-    def linearise(self, places: Float[np.ndarray, "sets p"]) -> tuple[Float[np.ndarray, "..."], ...]:
+    def look(self, places: Float[np.ndarray, "sets p"], some: Int[np.ndarray, " sets"]) -> Searches:  # noqa: ARG002
         """Return chi2, the residuals and their Jacobian by the places."""
         problem = self.objective.problem
         columns = zip(problem.parameters, np.moveaxis(places, -1, 0), strict=True)
@@ -147,51 +150,26 @@ class _Places:
         known, slopes = problem.values_and_slopes(coordinates)
         result = self.objective.at_values(np.where(self.by_value, places, known))
         residual, jacobian = np.asarray(result.residual), np.asarray(result.jacobian)
-        return np.sum(residual**2, axis=1), residual, jacobian * np.where(self.by_value, 1.0, slopes)[:, None, :]
-
-    def moved(self, places, residual, jacobian, free, damping) -> Float[np.ndarray, " p"]:
-        """Return the places after a damped Gauss-Newton step, the held ones and those without effect unchanged."""
-        gradient = jacobian.T @ residual
-        outward = ((places <= self.lowest) & (gradient >= 0.0)) | ((places >= self.highest) & (gradient <= 0.0))
-        normal = jacobian.T @ jacobian
-        diagonal = np.diag(normal).copy()
-        held = ~free | (diagonal == 0.0) | outward
-        if not np.all(np.isfinite(normal)):
-            return places
-        normal[held, :] = normal[:, held] = 0.0
-        normal[np.diag_indices_from(normal)] = np.where(held, 1.0, diagonal * (1.0 + damping))
-        step = np.where(held, 0.0, -np.linalg.solve(normal, np.where(held, 0.0, gradient)))
-        return np.clip(places + step, self.lowest, self.highest)
+        jacobian = jacobian * np.where(self.by_value, 1.0, slopes)[:, None, :]
+        return Searches(places, residual, jacobian, np.sum(residual**2, axis=1))
 
 
 def _minimise_others(objective: Objective, sides: list[_Side], targets):
-    """Minimise chi2 over the parameters that are not profiled, by damped Gauss-Newton steps, on all sides at once."""
+    """Minimise chi2 over the parameters that are not profiled, on all sides at once."""
     places = _Places(objective)
     z = np.array([side.others for side in sides])
     index = np.array([side.index for side in sides])
     lanes = np.arange(len(sides))
-    free = np.ones_like(z, dtype=bool)
-    free[lanes, index] = False
+    fixed = np.zeros_like(z, dtype=bool)
+    fixed[lanes, index] = True
     parameters = objective.problem.parameters
     z[lanes, index] = [
         t if parameters[k].sign else parameters[k].to_coordinate(np.asarray(t))
         for k, t in zip(index, targets, strict=True)
     ]
-    chi2, residual, jacobian = places.linearise(z)
-    damping = np.full(len(sides), 1e-6)
-    for _ in range(_INNER_STEPS if z.shape[1] > 1 else 0):
-        trial = np.array([places.moved(*lane) for lane in zip(z, residual, jacobian, free, damping, strict=True)])
-        new_chi2, new_residual, new_jacobian = places.linearise(trial)
-        better = new_chi2 <= chi2
-        gain = np.where(better, chi2 - new_chi2, 0.0)
-        z = np.where(better[:, None], trial, z)
-        residual = np.where(better[:, None], new_residual, residual)
-        jacobian = np.where(better[:, None, None], new_jacobian, jacobian)
-        chi2 = np.where(better, new_chi2, chi2)
-        damping = np.where(better, 0.1 * damping, np.maximum(30.0 * damping, 1e-4))
-        if np.all((gain < 1e-4) & (better | (damping > 1e6))):
-            break
-    return chi2, z
+    box = Box(places.lowest, places.highest, fixed)
+    end = descended(places.look, places.look(z, lanes), box, settled=_SETTLED, most=_INNER_STEPS)
+    return end.chi2, end.place
 
 
 def _interval(sides: list[_Side], index: int) -> Interval:

@@ -20,12 +20,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Float, Int
 
 from fitting.tables.csv_text import (
     Faults,
     TableError,
     check_not_empty,
+    column_of,
     named_rows,
     parse_rows,
     printable,
@@ -107,7 +108,7 @@ class AmplitudeTable:
         faults = Faults(self.source, place="line" if own else "row")
         columns = {name: getattr(self, name) for name in COLUMN_NAMES if getattr(self, name) is not None}
         lines = self.lines if own else np.arange(1, np.size(self.order) + 1)
-        columns = {name: _column(name, values, len(lines), faults) for name, values in columns.items()}
+        columns = {name: column_of(name, values, len(lines), faults) for name, values in columns.items()}
         _check_pairs(columns, faults)
         _check_header(self, faults)
         faults.raise_any()
@@ -122,13 +123,6 @@ class AmplitudeTable:
     def rows(self) -> int:
         """Number of rows."""
         return len(self.order)
-
-
-def _column(name: str, values: Shaped[np.ndarray, "..."], rows: int, faults: Faults) -> Float[np.ndarray, "..."]:
-    column = np.array(values, dtype=np.float64)
-    if column.shape != (rows,) or rows == 0:
-        faults.add(f"has the shape {column.shape}; every column is a list of the same length, at least 1", column=name)
-    return column
 
 
 def _check_pairs(columns: dict[str, Float[np.ndarray, "..."]], faults: Faults) -> None:

@@ -7,7 +7,7 @@ from fitting import TableError, Trace, lockin
 from fitting.traces.lockin_harmonics import fit_harmonics
 from fitting.traces.lockin_result import LockinResult
 from fitting.traces.lockin_settings import TraceSettings
-from fitting.traces.lockin_verdict import Kind
+from fitting.traces.lockin_verdict import TraceKind
 from tests.lockin_traces import (
     bounce,
     law_motion,
@@ -51,7 +51,7 @@ def test_a_bounce_in_closed_form(order: int, rate: float):
     height, value = bounce(time, order=order, drive_khz=drive)
     result = lockin(trace_of(height, rate=rate, drive_khz=drive, start_us=3.7))
     assert result.steady, result.verdict
-    assert (result.order, result.impacts_per_period, result.kind) == (order, 1, Kind.STEADY)
+    assert (result.order, result.impacts_per_period, result.kind) == (order, 1, TraceKind.STEADY)
     # a quartic around the top of a cosine misses 3e-5
     assert result.peak_amplitude_nm == pytest.approx(70.0, rel=3e-5)
     # the kink's harmonics beyond the fitted ones, falling as 1/k^2
@@ -102,24 +102,24 @@ def test_errors_are_the_scatter_over_seeds(periods: float, memory: float):
 @pytest.mark.parametrize(
     ("reduced", "r", "kind", "impacts", "order"),
     [
-        (1.7, 0.6, Kind.STEADY, 1, 2),
-        (1.3, 0.6, Kind.PERIOD_MULTIPLIED, 2, 2),
-        (4.3, 0.6, Kind.PERIOD_MULTIPLIED, 2, 8),
-        (1.7, 0.9, Kind.SEVERAL_IMPACTS, 8, 12),
-        (1.3, 0.9, Kind.NOT_PERIODIC, None, None),
-        (3.5, 0.6, Kind.NOT_PERIODIC, None, None),
+        (1.7, 0.6, TraceKind.STEADY, 1, 2),
+        (1.3, 0.6, TraceKind.PERIOD_MULTIPLIED, 2, 2),
+        (4.3, 0.6, TraceKind.PERIOD_MULTIPLIED, 2, 8),
+        (1.7, 0.9, TraceKind.SEVERAL_IMPACTS, 8, 12),
+        (1.3, 0.9, TraceKind.NOT_PERIODIC, None, None),
+        (3.5, 0.6, TraceKind.NOT_PERIODIC, None, None),
     ],
 )
 def test_motions_of_the_law_are_told_apart(
-    reduced: float, r: float, kind: Kind, impacts: int | None, order: int | None
+    reduced: float, r: float, kind: TraceKind, impacts: int | None, order: int | None
 ):
     scene, run = law_motion(reduced, r)
     # the simulation's own verdict, from its impacts
     assert (run.verdict.contacts, run.verdict.periods) == (impacts, order)
     result = lockin(trace_of_motion(scene, run, periods=150.0, rate=20.0, noise=0.02))
     assert (result.kind, result.impacts_per_period, result.order) == (kind, impacts, order), result.verdict
-    assert result.steady == (kind is Kind.STEADY)
-    assert (result.peak_amplitude_nm is None) == (kind is Kind.NOT_PERIODIC)
+    assert result.steady == (kind is TraceKind.STEADY)
+    assert (result.peak_amplitude_nm is None) == (kind is TraceKind.NOT_PERIODIC)
 
 
 def made(shape: str, time: np.ndarray, drive: float) -> np.ndarray:
@@ -138,16 +138,16 @@ def made(shape: str, time: np.ndarray, drive: float) -> np.ndarray:
 @pytest.mark.parametrize(
     ("shape", "kind"),
     [
-        ("stuck", Kind.STUCK),
-        ("small sine", Kind.NO_IMPACT),
-        ("nothing", Kind.NO_RESPONSE),
-        ("growing", Kind.DRIFTING),
-        ("lifted", Kind.DRIFTING),
-        ("alternating", Kind.PERIOD_MULTIPLIED),
+        ("stuck", TraceKind.STUCK),
+        ("small sine", TraceKind.NO_IMPACT),
+        ("nothing", TraceKind.NO_RESPONSE),
+        ("growing", TraceKind.DRIFTING),
+        ("lifted", TraceKind.DRIFTING),
+        ("alternating", TraceKind.PERIOD_MULTIPLIED),
     ],
 )
 @pytest.mark.parametrize("noise", [0.0, 0.3])
-def test_what_is_no_steady_orbit_is_flagged(shape: str, kind: Kind, noise: float):
+def test_what_is_no_steady_orbit_is_flagged(shape: str, kind: TraceKind, noise: float):
     time = np.arange(0.0, 800.0, 0.1)
     height = made(shape, time, 181.8) + noise * np.random.default_rng(1).standard_normal(time.size)
     result = lockin(trace_of(height, rate=10.0, drive_khz=181.8))
@@ -161,7 +161,7 @@ def test_a_wrong_drive_frequency_is_named(share: float):
     height, _ = bounce(time, order=1, drive_khz=181.8)
     noisy = height + 0.3 * np.random.default_rng(1).standard_normal(time.size)
     result = lockin(trace_of(noisy, rate=10.0, drive_khz=181.8 * (1.0 + share)))
-    assert result.kind is Kind.DRIFTING
+    assert result.kind is TraceKind.DRIFTING
     seen = float(result.verdict.partition("seems to be ")[2].split()[0])
     # the phase over 145 periods fixes the frequency to 1e-5
     assert seen == pytest.approx(181.8, rel=2e-5)
@@ -183,7 +183,7 @@ def test_sampling_in_step_with_several_drive_periods_makes_no_subharmonics(per_p
     height, _ = bounce(time, order=1, drive_khz=181.8)
     height = height + noise * np.random.default_rng(2).standard_normal(time.size)
     result = lockin(trace_of(height, rate=rate, drive_khz=181.8))
-    assert (result.kind, result.order) == (Kind.STEADY, 1), result.verdict
+    assert (result.kind, result.order) == (TraceKind.STEADY, 1), result.verdict
 
 
 def test_few_phases_in_step_with_the_drive_are_stated_as_an_error():
@@ -236,6 +236,6 @@ def test_an_expected_order():
     trace, _ = noisy_bounce(0, order=2)
     assert lockin(trace, order=2).steady
     other = lockin(trace, order=1)
-    assert (other.kind, other.steady) == (Kind.OTHER_ORDER, False)
+    assert (other.kind, other.steady) == (TraceKind.OTHER_ORDER, False)
     with pytest.raises(TableError, match="too short for two response periods of order 40"):
         lockin(trace, order=40)

@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fitting import table as table_module
 from fitting.table import AmplitudeTable, TableError
-from fitting.tables.csv_text import Faults
+from fitting.tables.csv_text import Faults, column_of
 from tests.table_texts import KEY, NAMES, ROW, fault_of
 
 NOT_NUMBER = "is not a number; write it like 174.6 or 1.746e2, without a unit"
@@ -194,9 +193,9 @@ def test_a_table_in_memory_keeps_the_same_rules(change: dict[str, Any], message:
 
 def test_columns_of_a_table_in_memory_have_one_length():
     faults = Faults("here")
-    table_module._column("offset_nm", np.zeros(2), 2, faults)
+    column_of("offset_nm", np.zeros(2), 2, faults)
     faults.raise_any()
-    table_module._column("offset_nm", np.zeros(3), 2, faults)
+    column_of("offset_nm", np.zeros(3), 2, faults)
     with pytest.raises(TableError) as caught:
         faults.raise_any()
     assert str(caught.value) == (

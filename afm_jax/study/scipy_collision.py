@@ -29,7 +29,7 @@ class ScipyCollision(NamedTuple):
     evaluations: int
 
 
-class _Numbers(NamedTuple):
+class _ContactNumbers(NamedTuple):
     """The paper's contact as Python floats: SciPy calls the force thousands of times."""
 
     pull: float
@@ -92,7 +92,7 @@ def scipy_collision(contact: Contact, approach_speed_nm_per_us: float, *, method
     return ScipyCollision(float(rebound), float(delay), time.perf_counter() - began, count)
 
 
-def _numbers(contact: Contact) -> _Numbers:
+def _numbers(contact: Contact) -> _ContactNumbers:
     terms: dict[type, Any] = {type(term): term for term in contact.forces.terms}
     junction, solid = _junction_of(contact), contact.junction
     capillary, structural = terms[Capillary], terms[Structural]
@@ -111,10 +111,10 @@ def _numbers(contact: Contact) -> _Numbers:
         junction.breaks_gap_nm,
         contact.bridge_breaks_nm,
     )
-    return _Numbers(*(float(value) for value in values))
+    return _ContactNumbers(*(float(value) for value in values))
 
 
-def _bridge_force(numbers: _Numbers, gap: float, rate: float) -> float:
+def _bridge_force(numbers: _ContactNumbers, gap: float, rate: float) -> float:
     # a trial step may overshoot the junction; the forces have no value at contact
     gap = max(gap, 0.5 * numbers.snap_on)
     static = -numbers.pull / (1.0 + gap / numbers.width) + numbers.structural * np.exp(-gap / numbers.decay)

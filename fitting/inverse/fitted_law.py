@@ -12,7 +12,7 @@ from fitting.tables.csv_text import TableError, printable, read_text
 _COLUMNS = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us")
 
 
-class FittedLaw(NamedTuple):
+class SavedLaw(NamedTuple):
     """A law at some approach speeds: rebound speed in nm/us and delay in us, each of shape (points,)."""
 
     model: str
@@ -21,7 +21,7 @@ class FittedLaw(NamedTuple):
     collision_delay_us: Float[np.ndarray, " points"]
 
 
-def read_fitted_law(path: str | Path) -> FittedLaw:
+def read_fitted_law(path: str | Path) -> SavedLaw:
     """Read the law of a fit.
 
     Args:
@@ -42,7 +42,7 @@ def read_fitted_law(path: str | Path) -> FittedLaw:
     columns = [_numbers(found["law"].get(column)) for column in _COLUMNS]
     if any(column.shape != columns[0].shape or column.size < 2 for column in columns):
         raise TableError(f"{name}: its law lacks {', '.join(_COLUMNS)}; fit again with this version")
-    return FittedLaw(str(found.get("model")), *columns)
+    return SavedLaw(str(found.get("model")), *columns)
 
 
 def _numbers(cells: Any) -> Float[np.ndarray, " points"]:

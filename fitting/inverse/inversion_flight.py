@@ -132,7 +132,7 @@ def _residual(unknowns: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantil
     return jnp.where(jnp.isfinite(row.error), apart / row.error, 0.0)
 
 
-class _Place(NamedTuple):
+class _SearchPlace(NamedTuple):
     """A place of the search, with all that is computed there."""
 
     unknowns: Float[Array, " 2"]
@@ -141,17 +141,17 @@ class _Place(NamedTuple):
     slopes: Float[Array, "3 2"]
 
 
-def _look(unknowns: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantilever) -> _Place:
+def _look(unknowns: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantilever) -> _SearchPlace:
     def twice(unknowns):
         residual = _residual(unknowns, row, cantilever)
         return residual, residual
 
     slopes, residual = jax.jacfwd(twice, has_aux=True)(unknowns)
     chi2 = jnp.sum(residual**2)
-    return _Place(unknowns, jnp.where(jnp.isfinite(chi2), chi2, jnp.inf), residual, slopes)
+    return _SearchPlace(unknowns, jnp.where(jnp.isfinite(chi2), chi2, jnp.inf), residual, slopes)
 
 
-def _search(start: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantilever) -> _Place:
+def _search(start: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantilever) -> _SearchPlace:
     """Return where Levenberg and Marquardt's method ends."""
 
     def step(_, state):
@@ -166,7 +166,7 @@ def _search(start: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantilever)
         return kept, jnp.where(better, 0.1 * damping, jnp.minimum(10.0 * damping, 1e8))
 
     # without slopes the first step goes nowhere and looks around: the program holds one look only
-    blind = _Place(start, jnp.asarray(jnp.inf), jnp.zeros(3), jnp.zeros((3, 2)))
+    blind = _SearchPlace(start, jnp.asarray(jnp.inf), jnp.zeros(3), jnp.zeros((3, 2)))
     return lax.fori_loop(0, _ITERATIONS, step, (blind, jnp.asarray(1e-3)))[0]
 
 

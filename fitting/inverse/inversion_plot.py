@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, with_zero_line
-from fitting.inverse.fitted_law import FittedLaw
+from fitting.inverse.fitted_law import SavedLaw
 from fitting.inverse.inversion_result import Inversion
 
 _STYLES = {"viscous": (BLUE, "-", r"$\epsilon$, $c$"), "restitution": (ACCENT, "--", r"$r$, $\epsilon$")}
@@ -16,7 +16,7 @@ _INVALID = "#B00020"
 _SMALL = 9
 
 
-def inversion_figure(result: Inversion, *, fitted: FittedLaw | None = None) -> Figure:
+def inversion_figure(result: Inversion, *, fitted: SavedLaw | None = None) -> Figure:
     """Return the figure: loss u_in - u_out on the left, collision delay on the right, both against u_in.
 
     Args:
@@ -38,7 +38,7 @@ def inversion_figure(result: Inversion, *, fitted: FittedLaw | None = None) -> F
     return figure
 
 
-def _draw_loss(axes: Axes, result: Inversion, fitted: FittedLaw | None) -> None:
+def _draw_loss(axes: Axes, result: Inversion, fitted: SavedLaw | None) -> None:
     rows, speeds = result.rows, result.approach_speed_nm_per_us
     for name, law in result.laws.items():
         colour, dashes, symbols = _STYLES[name]
@@ -59,7 +59,7 @@ def _draw_loss(axes: Axes, result: Inversion, fitted: FittedLaw | None) -> None:
     axes.set_yscale("log")
 
 
-def _curve_of_fit(axes: Axes, result: Inversion, fitted: FittedLaw, values: np.ndarray) -> None:
+def _curve_of_fit(axes: Axes, result: Inversion, fitted: SavedLaw, values: np.ndarray) -> None:
     """Draw what a fit found, over the speeds of the rows."""
     speeds = np.concatenate([result.rows.impact[:, 0], result.resonance.approach_speed_nm_per_us])
     known = np.isfinite(values) & (fitted.approach_speed_nm_per_us >= 0.9 * np.nanmin(speeds))
@@ -76,7 +76,7 @@ def _curve_of_fit(axes: Axes, result: Inversion, fitted: FittedLaw, values: np.n
     )
 
 
-def _draw_delay(axes: Axes, result: Inversion, fitted: FittedLaw | None) -> None:
+def _draw_delay(axes: Axes, result: Inversion, fitted: SavedLaw | None) -> None:
     law, speeds = result.delay, result.approach_speed_nm_per_us
     if law is not None:
         curve, band = _NS_PER_US * law.curve, _NS_PER_US * law.curve_error

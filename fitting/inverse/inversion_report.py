@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from fitting.inverse.fitted_law import FittedLaw
+from fitting.inverse.fitted_law import SavedLaw
 from fitting.inverse.inversion_result import Coefficient, Inversion, RegressedLaw
 
 ROW_COLUMNS = (
@@ -76,7 +76,7 @@ def _heading(result: Inversion) -> str:
 
 
 def write_inversion(
-    result: Inversion, folder: Path, write_table: Table, *, fitted: FittedLaw | None = None
+    result: Inversion, folder: Path, write_table: Table, *, fitted: SavedLaw | None = None
 ) -> list[Path]:
     """Write invert.txt, invert.json, invert.png, invert.csv and law.csv into a folder.
 

@@ -5,12 +5,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from fitting.fisher import covariance_of
+
 CRITERIA = ("D", "A")
 _RIDGE = 1e-9
 """Information added to every parameter, relative to that of all candidates together, while points are chosen: with it
 the first points, which alone determine nothing, can be compared."""
-_FLAT = 1e-12
-"""Eigenvalue of the scaled information below which a direction counts as not determined."""
 
 
 class Criterion(NamedTuple):
@@ -59,12 +59,4 @@ def criterion_of(
 
 def standard_errors(information: Float[np.ndarray, "p p"]) -> Float[np.ndarray, " p"]:
     """Return the standard error of every parameter, the others unknown; infinite where it is not determined."""
-    if not np.all(np.isfinite(information)):
-        return np.full(len(information), np.inf)
-    scale = np.sqrt(np.diag(information))
-    safe = np.where(scale > 0.0, scale, 1.0)
-    curvature, axes = np.linalg.eigh(information / np.outer(safe, safe))
-    flat = curvature < _FLAT
-    undetermined = np.any(np.abs(axes[:, flat]) > 1e-6, axis=1)
-    variance = np.sum(axes**2 / np.where(flat, np.inf, curvature), axis=1) / safe**2
-    return np.where(undetermined, np.inf, np.sqrt(variance))
+    return np.sqrt(np.diag(covariance_of(information)))

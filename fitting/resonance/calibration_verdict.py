@@ -21,7 +21,7 @@ _FAST_KHZ = 2e4
 
 
 @dataclass(frozen=True)
-class Evidence:
+class SweepEvidence:
     """All that the verdict looks at."""
 
     sweep: ResonanceSweep
@@ -36,19 +36,19 @@ class Evidence:
     alternatives: list[Alternative]
 
 
-def judge_calibration(evidence: Evidence) -> tuple[list[str], list[str]]:
+def judge_calibration(evidence: SweepEvidence) -> tuple[list[str], list[str]]:
     """Return what makes a calibration invalid, and its warnings; each a sentence."""
     return _reasons(evidence), _warnings(evidence)
 
 
-def half_widths(evidence: Evidence) -> tuple[float, float]:
+def half_widths(evidence: SweepEvidence) -> tuple[float, float]:
     """Return how many half-widths f0/2Q the sweep reaches below and above the resonance."""
     frequency, half = evidence.frequency.value, evidence.frequency.value / evidence.quality_factor.value / 2.0
     measured = evidence.sweep.frequency_khz
     return float((frequency - measured[0]) / half), float((measured[-1] - frequency) / half)
 
 
-def _reasons(evidence: Evidence) -> list[str]:
+def _reasons(evidence: SweepEvidence) -> list[str]:
     fit, reasons = evidence.fit, []
     per_freedom = fit.chi2 / fit.freedom
     if evidence.chi2_without - fit.chi2 < _PEAK * max(per_freedom, 1e-300):
@@ -80,7 +80,7 @@ def _reasons(evidence: Evidence) -> list[str]:
     return reasons
 
 
-def _range_reasons(evidence: Evidence) -> list[str]:
+def _range_reasons(evidence: SweepEvidence) -> list[str]:
     """Say where the sweep does not hold the resonance: outside, at the edge, or between two points."""
     below, above = half_widths(evidence)
     frequency = evidence.frequency.value
@@ -100,7 +100,7 @@ def _range_reasons(evidence: Evidence) -> list[str]:
     return []
 
 
-def _warnings(evidence: Evidence) -> list[str]:
+def _warnings(evidence: SweepEvidence) -> list[str]:
     sweep, fit, warnings = evidence.sweep, evidence.fit, []
     if evidence.frequency.value > _FAST_KHZ:
         warnings.append(
@@ -125,7 +125,7 @@ def _warnings(evidence: Evidence) -> list[str]:
     return warnings + _residual_warnings(evidence) + _background_warnings(evidence)
 
 
-def _residual_warnings(evidence: Evidence) -> list[str]:
+def _residual_warnings(evidence: SweepEvidence) -> list[str]:
     correlation, warnings = evidence.autocorrelation, []
     if 3.0 / np.sqrt(evidence.fit.data) < correlation <= _SYSTEMATIC:
         factor = np.sqrt((1.0 + correlation) / (1.0 - correlation))
@@ -148,7 +148,7 @@ def _residual_warnings(evidence: Evidence) -> list[str]:
     return warnings
 
 
-def _background_warnings(evidence: Evidence) -> list[str]:
+def _background_warnings(evidence: SweepEvidence) -> list[str]:
     """Name the background that describes the sweep better than the one chosen, and what it would make of Q."""
     own = evidence.fit.chi2 + 2.0 * len(evidence.fit.values)
     better = [other for other in evidence.alternatives if other.aic < own - 10.0]

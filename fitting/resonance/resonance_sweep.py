@@ -15,11 +15,11 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int, Shaped
+from jaxtyping import Float, Int
 
 from fitting.resonance.sweep_csv import parse_csv
 from fitting.resonance.sweep_nanonis import MARK, parse_nanonis
-from fitting.tables.csv_text import Faults, TableError, read_text
+from fitting.tables.csv_text import Faults, TableError, column_of, read_text
 
 __all__ = ["ResonanceSweep", "TableError", "read_sweep", "without_phase"]
 
@@ -65,7 +65,7 @@ class ResonanceSweep:
         columns = {name: getattr(self, name) for name in _COLUMNS if getattr(self, name) is not None}
         points = np.size(self.frequency_khz)
         lines = np.array(self.lines if len(self.lines) else np.arange(1, points + 1), dtype=np.int64)
-        arrays = {name: _column(name, values, len(lines), faults) for name, values in columns.items()}
+        arrays = {name: column_of(name, values, len(lines), faults) for name, values in columns.items()}
         _check_pairs(arrays, faults)
         faults.raise_any()
         for name, values in arrays.items():
@@ -85,13 +85,6 @@ class ResonanceSweep:
     def points(self) -> int:
         """Number of points."""
         return len(self.frequency_khz)
-
-
-def _column(name: str, values: Shaped[np.ndarray, "..."], points: int, faults: Faults) -> Float[np.ndarray, "..."]:
-    column = np.array(values, dtype=np.float64)
-    if column.shape != (points,) or points == 0:
-        faults.add(f"has the shape {column.shape}; every column is a list of the same length, at least 1", column=name)
-    return column
 
 
 def _check_pairs(columns: dict[str, Float[np.ndarray, "..."]], faults: Faults) -> None:

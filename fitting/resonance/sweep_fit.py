@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.checks import Convergence, check_minimum
+from fitting.fisher import whole_covariance_of
 from fitting.optimise import PLAIN, lowest, polish
 from fitting.resonance.calibration_errors import SMALLEST, first_errors, with_estimated_errors
 from fitting.resonance.calibration_result import PointErrors
@@ -141,18 +142,7 @@ def _finished(objective: SweepObjective, coordinates, errors: PointErrors, *, re
     residual, jacobian = objective.linearise(coordinates[None])
     values, slopes = objective.problem.values_and_slopes(coordinates)
     convergence = check_minimum(objective, coordinates, np.ones(len(values), dtype=bool))
-    covariance = _inverse(jacobian[0].T @ jacobian[0])
+    covariance = whole_covariance_of(jacobian[0].T @ jacobian[0])
     if np.all(np.isfinite(covariance)):
         covariance = covariance * np.outer(slopes, slopes)
     return SweepFit(objective, coordinates, values, residual[0], covariance, convergence, errors, reverse, data)
-
-
-def _inverse(fisher: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
-    """Return the inverse of a Fisher matrix; all infinite where it determines not every direction."""
-    scale = np.sqrt(np.diag(fisher))
-    if not np.all(np.isfinite(fisher)) or np.any(scale == 0.0):
-        return np.full_like(fisher, np.inf)
-    curvature, axes = np.linalg.eigh(fisher / np.outer(scale, scale))
-    if curvature[0] < 1e-12:
-        return np.full_like(fisher, np.inf)
-    return (axes / curvature) @ axes.T / np.outer(scale, scale)

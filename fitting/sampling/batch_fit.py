@@ -8,16 +8,16 @@ values, the first linearisation serves all of them too.
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
+from fitting.fisher import whole_covariance_of
+from fitting.least_squares import Box, Searches, descended, distance
 from fitting.optimise import PLAIN, ROBUST, Objective, soft_square
 from fitting.sampling.refit import Refit
 
 _STEPS = 40
 _SETTLED = 1e-6
 """Estimated distance of chi2 to its minimum at which a data set is done: values within a thousandth of an error."""
-_FIRST_DAMPING = 1e-6
-_LARGEST_DAMPING = 1e8
 
 
 class DataSets(NamedTuple):
@@ -41,15 +41,6 @@ class BatchFit(NamedTuple):
     chi2: Float[np.ndarray, " sets"]
     covariance: Float[np.ndarray, "sets p p"]
     converged: Bool[np.ndarray, " sets"]
-
-
-class _State(NamedTuple):
-    """Where the fits are: values, residuals of their own data, the Jacobian by the values, and chi2."""
-
-    values: Float[np.ndarray, "sets p"]
-    residual: Float[np.ndarray, "sets n"]
-    jacobian: Float[np.ndarray, "sets n p"]
-    chi2: Float[np.ndarray, " sets"]
 
 
 def draw_data(refit: Refit, sets: int, random: np.random.Generator) -> DataSets:
@@ -84,26 +75,26 @@ def fit_data_sets(refit: Refit, data: DataSets) -> BatchFit:
     Returns:
         The fits. A parameter at an end of its range is held there while chi2 falls towards the outside.
     """
-    sets = data.amplitude_nm.shape[0]
-    shift = _shifts(refit.objective, data)
+    objective, sets = refit.objective, data.amplitude_nm.shape[0]
+    shift = _shifts(objective, data)
     start = np.broadcast_to(refit.values, (1, refit.values.size))
-    one = _plain(refit.objective).at_values(start)
+    one = _plain(objective).at_values(start)
     shared = np.broadcast_to(np.asarray(one.residual), shift.shape), np.asarray(one.jacobian)
-    state = _state(refit.objective, np.repeat(start, sets, axis=0), shared[0] + shift, np.repeat(shared[1], sets, 0))
-    damping = np.full(sets, _FIRST_DAMPING)
-    for _ in range(_STEPS):
-        active = np.flatnonzero((_distance(refit.objective, state) > _SETTLED) & (damping < _LARGEST_DAMPING))
-        if not active.size:
-            break
-        some = _State(*(leaf[active] for leaf in state))
-        trial = some.values + _step(refit.objective, some, damping[active])
-        found = _evaluate(refit.objective, _inside(refit.objective, trial), shift[active])
-        better = found.chi2 <= some.chi2
-        for leaf, new in zip(state, found, strict=True):
-            leaf[active[better]] = new[better]
-        damping[active] = np.where(better, 0.1 * damping[active], np.maximum(30.0 * damping[active], 1e-3))
-    normal = np.einsum("snp,snq->spq", state.jacobian, state.jacobian)
-    return BatchFit(state.values, state.chi2, _inverse(normal), _distance(refit.objective, state) <= _SETTLED)
+    start = _searches(objective, np.repeat(start, sets, axis=0), shared[0] + shift, np.repeat(shared[1], sets, 0))
+
+    def look(values: Float[np.ndarray, "some p"], some: Int[np.ndarray, " some"]) -> Searches:
+        found = _plain(objective).at_values(values)
+        return _searches(objective, values, np.asarray(found.residual) + shift[some], np.asarray(found.jacobian))
+
+    parameters = objective.problem.parameters
+    box = Box(
+        np.array([p.lowest for p in parameters]),
+        np.array([p.highest for p in parameters]),
+        np.zeros((sets, len(parameters)), dtype=bool),
+    )
+    end = descended(look, start, box, settled=_SETTLED, most=_STEPS)
+    normal = np.einsum("snp,snq->spq", end.jacobian, end.jacobian)
+    return BatchFit(end.place, end.chi2, whole_covariance_of(normal), distance(end, box) <= _SETTLED)
 
 
 def _shifts(objective: Objective, data: DataSets) -> Float[np.ndarray, "sets n"]:
@@ -121,13 +112,8 @@ def _plain(objective: Objective) -> Objective:
     return Objective(objective.measurement, objective.problem, near=objective.near)
 
 
-def _evaluate(objective: Objective, values: Float[np.ndarray, "sets p"], shift: Float[np.ndarray, "sets n"]) -> _State:
-    found = _plain(objective).at_values(values)
-    return _state(objective, values, np.asarray(found.residual) + shift, np.asarray(found.jacobian))
-
-
-def _state(objective: Objective, values, residual, jacobian) -> _State:
-    """Return the state with the loss applied: residuals whose squares add up to it."""
+def _searches(objective: Objective, values, residual, jacobian) -> Searches:
+    """Return the searches with the loss applied: residuals whose squares add up to it."""
     square = soft_square(residual, ROBUST if objective.robust else PLAIN)
     if objective.robust:
         soft = np.copysign(np.sqrt(square), residual)
@@ -135,52 +121,4 @@ def _state(objective: Objective, values, residual, jacobian) -> _State:
         root = np.sqrt(1.0 + (residual / ROBUST) ** 2)
         slope = np.where(residual == 0.0, 1.0, residual / (root * safe))
         residual, jacobian = soft, jacobian * slope[:, :, None]
-    return _State(np.array(values), np.array(residual), np.array(jacobian), square.sum(axis=1))
-
-
-def _inside(objective: Objective, values: Float[np.ndarray, "sets p"]) -> Float[np.ndarray, "sets p"]:
-    parameters = objective.problem.parameters
-    return np.clip(values, [p.lowest for p in parameters], [p.highest for p in parameters])
-
-
-def _held(objective: Objective, state: _State) -> Bool[np.ndarray, "sets p"]:
-    """Say which parameters sit at an end of their range while chi2 falls towards the outside, or change nothing."""
-    parameters = objective.problem.parameters
-    slope = np.einsum("snp,sn->sp", state.jacobian, state.residual)
-    low = (state.values <= np.array([p.lowest for p in parameters])) & (slope > 0.0)
-    high = (state.values >= np.array([p.highest for p in parameters])) & (slope < 0.0)
-    return low | high | ~np.any(state.jacobian, axis=1)
-
-
-def _step(objective: Objective, state: _State, damping: Float[np.ndarray, " sets"]) -> Float[np.ndarray, "sets p"]:
-    """Return damped Gauss-Newton steps, in units in which every parameter has the curvature 1."""
-    held = _held(objective, state)
-    jacobian = state.jacobian * ~held[:, None, :]
-    scale = np.linalg.norm(jacobian, axis=1)
-    unit = np.where(held, 1.0, scale)
-    scaled = jacobian / unit[:, None, :]
-    normal = np.einsum("snp,snq->spq", scaled, scaled)
-    # a held parameter's own curvature is 1 instead of 0: its step is then 0
-    normal += (damping[:, None] + held)[:, :, None] * np.eye(unit.shape[1])
-    gradient = np.einsum("snp,sn->sp", scaled, state.residual)
-    return -np.linalg.solve(normal, gradient[:, :, None])[:, :, 0] / unit
-
-
-def _distance(objective: Objective, state: _State) -> Float[np.ndarray, " sets"]:
-    """Return the estimated distance of chi2 to its minimum, g H^-1 g, H = J^T J."""
-    gradient = np.einsum("snp,sn->sp", state.jacobian, state.residual) * ~_held(objective, state)
-    step = _step(objective, state, np.full(len(state.chi2), 1e-12))
-    return -np.einsum("sp,sp->s", gradient, step)
-
-
-def _inverse(normal: Float[np.ndarray, "sets p p"]) -> Float[np.ndarray, "sets p p"]:
-    """Return the inverse of Fisher matrices; infinite where one is singular."""
-    scale = np.sqrt(np.einsum("spp->sp", normal))
-    unit = np.where(scale > 0.0, scale, 1.0)
-    outer = unit[:, :, None] * unit[:, None, :]
-    scaled = normal / outer
-    finite = np.all(np.isfinite(scaled), axis=(1, 2))
-    safe = np.where(finite[:, None, None], scaled, np.eye(scaled.shape[1]))
-    regular = np.logical_and(finite, np.linalg.eigvalsh(safe)[:, 0] > 1e-12)
-    safe = np.where(regular[:, None, None], scaled, np.eye(scaled.shape[1]))
-    return np.where(regular[:, None, None], np.linalg.inv(safe) / outer, np.inf)
+    return Searches(values, residual, jacobian, square.sum(axis=1))

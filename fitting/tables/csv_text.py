@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
 NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 """A number as a file writes it; stricter than ``float``, which also takes "nan", "inf" and "1_000"."""
@@ -485,3 +485,11 @@ def _unreadable(text: str, column: Column, form: Form) -> str:
     if form.blanks and not column.required and absent:
         return f"{quoted(text)} is not a number; leave the cell of a value that was not measured blank"
     return f"{quoted(text)} is not a number; {form.number}"
+
+
+def column_of(name: str, values: Shaped[np.ndarray, "..."], rows: int, faults: Faults) -> Float[np.ndarray, "..."]:
+    """Return a copy of a column of a table in memory, after noting another length than that of the table."""
+    column = np.array(values, dtype=np.float64)
+    if column.shape != (rows,) or rows == 0:
+        faults.add(f"has the shape {column.shape}; every column is a list of the same length, at least 1", column=name)
+    return column

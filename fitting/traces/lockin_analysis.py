@@ -12,10 +12,10 @@ from fitting.traces.lockin_reference import Reference, find_reference
 from fitting.traces.lockin_result import LockinResult
 from fitting.traces.lockin_steadiness import Steadiness, look_at_periods
 from fitting.traces.lockin_trace import TableError, Trace
-from fitting.traces.lockin_verdict import Evidence, Kind, is_flightless, judge
+from fitting.traces.lockin_verdict import TraceEvidence, TraceKind, is_flightless, judge
 
-_UNREPEATED = (Kind.NOT_PERIODIC, Kind.NO_RESPONSE)
-_UNCOUNTED = (*_UNREPEATED, Kind.DRIFTING)
+_UNREPEATED = (TraceKind.NOT_PERIODIC, TraceKind.NO_RESPONSE)
+_UNCOUNTED = (*_UNREPEATED, TraceKind.DRIFTING)
 _OTHER_FREQUENCY = 0.1
 """Share by which the bending at the top may contradict the given free frequency."""
 _ENOUGH_PERIODS = 4
@@ -49,12 +49,12 @@ def lockin(trace: Trace, *, order: int | None = None) -> LockinResult:
     impacts = _impacts(trace, folded, peak, frequency)
     periods = look_at_periods(folded, peak)
     count = 0 if impacts is None else impacts.impacts or 0
-    verdict = judge(Evidence(trace.settings, search, folded, peak, periods, impacts, order))
+    verdict = judge(TraceEvidence(trace.settings, search, folded, peak, periods, impacts, order))
     readings = _Readings(folded, peak, reference)
     repeats = verdict.kind not in _UNREPEATED
     phase, phase_error = readings.phase()
     return LockinResult(
-        steady=verdict.kind is Kind.STEADY,
+        steady=verdict.kind is TraceKind.STEADY,
         kind=verdict.kind,
         verdict=verdict.sentence,
         order=search.order if repeats else None,

@@ -7,7 +7,7 @@ from typing import Any
 from fitting.traces.lockin_fold import Fold
 from fitting.traces.lockin_order import OrderSearch
 from fitting.traces.lockin_trace import Trace
-from fitting.traces.lockin_verdict import Kind
+from fitting.traces.lockin_verdict import TraceKind
 
 FORMAT_VERSION = 1
 """Version of the JSON layout; raised when a key changes its meaning or goes."""
@@ -45,7 +45,7 @@ class LockinResult:
     """
 
     steady: bool
-    kind: Kind
+    kind: TraceKind
     verdict: str
     order: int | None
     impacts_per_period: int | None

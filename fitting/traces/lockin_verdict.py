@@ -28,7 +28,7 @@ _BELOW = 0.5
 """Height over depth below which a deflection is upside down: an undamped flight from a depth d rises to d again."""
 
 
-class Kind(enum.StrEnum):
+class TraceKind(enum.StrEnum):
     """What a trace shows."""
 
     STEADY = "steady"
@@ -44,14 +44,14 @@ class Kind(enum.StrEnum):
     UPSIDE_DOWN = "upside_down"
 
 
-class Verdict(NamedTuple):
+class TraceVerdict(NamedTuple):
     """Kind and sentence."""
 
-    kind: Kind
+    kind: TraceKind
     sentence: str
 
 
-class Evidence(NamedTuple):
+class TraceEvidence(NamedTuple):
     """All that the verdict looks at; `impacts` is None where counting makes no sense."""
 
     settings: TraceSettings
@@ -63,7 +63,7 @@ class Evidence(NamedTuple):
     order: int | None
 
 
-def judge(evidence: Evidence) -> Verdict:
+def judge(evidence: TraceEvidence) -> TraceVerdict:
     """Return what a trace shows: the first of the findings below that applies."""
     first = (_without_flight, _not_repeating, _upside_down, _drifting)
     for finding in (*first, _not_counted, _not_one_impact, _of_other_order):
@@ -72,10 +72,10 @@ def judge(evidence: Evidence) -> Verdict:
             return verdict
     folded = evidence.folded
     what = f"a steady ({_impacts(evidence)},{folded.order}) orbit over {folded.cycles} response periods"
-    return Verdict(Kind.STEADY, what)
+    return TraceVerdict(TraceKind.STEADY, what)
 
 
-def is_flightless(folded: Fold, settings: TraceSettings) -> Verdict | None:
+def is_flightless(folded: Fold, settings: TraceSettings) -> TraceVerdict | None:
     """Return the verdict on a trace without response or without free flights; None where there are flights.
 
     Args:
@@ -89,7 +89,7 @@ def is_flightless(folded: Fold, settings: TraceSettings) -> Verdict | None:
     if lines.max() <= _SEEN * error * np.sqrt(1.0 + np.log(len(lines))):
         # numbers and units as in the JSON
         size = f"no line of the response exceeds {_SEEN * error:.3g} nm (noise {folded.noise_nm:.3g} nm a sample)"
-        return Verdict(Kind.NO_RESPONSE, f"no response at the drive frequency or its subharmonics: {size}")
+        return TraceVerdict(TraceKind.NO_RESPONSE, f"no response at the drive frequency or its subharmonics: {size}")
     if drive >= len(lines):
         return None
     # only what stands out of the noise is distortion
@@ -100,20 +100,24 @@ def is_flightless(folded: Fold, settings: TraceSettings) -> Verdict | None:
     amplitude, given = float(lines[drive]), settings.drive_amplitude_nm
     sine = f"a sine of {amplitude:.4g} nm at the drive frequency without impacts"
     if given is None:
-        return Verdict(Kind.STUCK, f"{sine}: the tip is held and moves with the platform, or nothing touches it")
+        return TraceVerdict(
+            TraceKind.STUCK, f"{sine}: the tip is held and moves with the platform, or nothing touches it"
+        )
     if _FOLLOWS[0] * given <= amplitude <= _FOLLOWS[1] * given:
-        return Verdict(Kind.STUCK, f"{sine}, whose amplitude is {given:.4g} nm: the tip is stuck to the platform")
-    return Verdict(Kind.NO_IMPACT, f"{sine}, whose amplitude is {given:.4g} nm: no free flight, no impact")
+        return TraceVerdict(
+            TraceKind.STUCK, f"{sine}, whose amplitude is {given:.4g} nm: the tip is stuck to the platform"
+        )
+    return TraceVerdict(TraceKind.NO_IMPACT, f"{sine}, whose amplitude is {given:.4g} nm: no free flight, no impact")
 
 
-def _without_flight(evidence: Evidence) -> Verdict | None:
+def _without_flight(evidence: TraceEvidence) -> TraceVerdict | None:
     verdict = is_flightless(evidence.folded, evidence.settings)
     # a sine, or nothing, fitted to what does not repeat means nothing
     scattered = evidence.steadiness.excess > _BROADBAND
     return None if scattered else verdict
 
 
-def _not_repeating(evidence: Evidence) -> Verdict | None:
+def _not_repeating(evidence: TraceEvidence) -> TraceVerdict | None:
     folded, periods, search = evidence.folded, evidence.steadiness, evidence.search
     left = folded.noise_nm / max(folded.spread_nm, 1e-300)
     missed = float(search.misfit_nm[folded.order - 1]) / max(search.spread_nm, 1e-300)
@@ -125,66 +129,74 @@ def _not_repeating(evidence: Evidence) -> Verdict | None:
         seen = frequency * (1.0 + periods.phase_step_deg / 360.0)
         instead = f"the drive frequency seems to be {seen:.7g} kHz, not {frequency:g} kHz (or the sampling rate is off)"
         runs = f"the phase runs by {periods.phase_step_deg:+.3g} degrees per response period"
-        return Verdict(Kind.DRIFTING, f"{runs}: {instead}")
+        return TraceVerdict(TraceKind.DRIFTING, f"{runs}: {instead}")
     share = max(periods.excess, 0.0 if coloured else left)
     if coloured and periods.trend_share > _SLOW:
-        return Verdict(Kind.DRIFTING, f"a transient or a drift: the response changes by {share:.1%} over the trace")
+        return TraceVerdict(
+            TraceKind.DRIFTING, f"a transient or a drift: the response changes by {share:.1%} over the trace"
+        )
     longest = len(search.misfit_nm)
     what = f"no repetition within {longest} drive period{'s' if longest > 1 else ''}"
     if not coloured:
-        return Verdict(Kind.NOT_PERIODIC, f"{what}, or too much noise: {left:.0%} of the motion is not explained")
+        return TraceVerdict(
+            TraceKind.NOT_PERIODIC, f"{what}, or too much noise: {left:.0%} of the motion is not explained"
+        )
     differ = f"response periods differ by {share:.1%} of the motion beyond the noise"
-    return Verdict(Kind.NOT_PERIODIC, f"chaotic, or of a longer period: {what}; {differ}")
+    return TraceVerdict(TraceKind.NOT_PERIODIC, f"chaotic, or of a longer period: {what}; {differ}")
 
 
-def _upside_down(evidence: Evidence) -> Verdict | None:
+def _upside_down(evidence: TraceEvidence) -> TraceVerdict | None:
     """Find a tip that is farther below its rest position than above: a sample from below lets it fly upward only."""
     low, high = np.percentile(evidence.folded.height, (1.0, 99.0))
     if low >= 0.0 or abs(high) > _BELOW * abs(low):
         return None
     what = f"the deflection lies between {low:.4g} and {high:.4g} nm, but a bouncing tip flies above its rest position"
-    return Verdict(Kind.UPSIDE_DOWN, f"{what}: multiply it by -1, or give what it reads at rest (--rest-nm)")
+    return TraceVerdict(TraceKind.UPSIDE_DOWN, f"{what}: multiply it by -1, or give what it reads at rest (--rest-nm)")
 
 
-def _drifting(evidence: Evidence) -> Verdict | None:
+def _drifting(evidence: TraceEvidence) -> TraceVerdict | None:
     periods = evidence.steadiness
     if max(periods.lockin_drift, periods.peak_drift) <= _DRIFT:
         return None
     what = f"lock-in value by {periods.lockin_drift:.2%}, peak by {periods.peak_drift:.2%}"
-    return Verdict(Kind.DRIFTING, f"a transient or a drift: over the trace the {what} (steady below {_DRIFT:.0%})")
+    return TraceVerdict(
+        TraceKind.DRIFTING, f"a transient or a drift: over the trace the {what} (steady below {_DRIFT:.0%})"
+    )
 
 
-def _of_other_order(evidence: Evidence) -> Verdict | None:
+def _of_other_order(evidence: TraceEvidence) -> TraceVerdict | None:
     order, wanted = evidence.folded.order, evidence.order
     if wanted is None or order == wanted:
         return None
-    return Verdict(Kind.OTHER_ORDER, f"repeats after {order} drive periods, not after {wanted} as asked for")
+    return TraceVerdict(TraceKind.OTHER_ORDER, f"repeats after {order} drive periods, not after {wanted} as asked for")
 
 
-def _not_counted(evidence: Evidence) -> Verdict | None:
+def _not_counted(evidence: TraceEvidence) -> TraceVerdict | None:
     order, count = evidence.folded.order, evidence.impacts
     # one drive period cannot hold a doubled one
     if order == 1 or (count is not None and count.impacts is not None):
         return None
     why = "the free frequency is not known" if count is None else str(count.reason)
     what = f"repeats after {order} drive periods, but whether with one impact cannot be said: {why}"
-    return Verdict(Kind.NOT_COUNTED, what)
+    return TraceVerdict(TraceKind.NOT_COUNTED, what)
 
 
-def _not_one_impact(evidence: Evidence) -> Verdict | None:
+def _not_one_impact(evidence: TraceEvidence) -> TraceVerdict | None:
     order, count = evidence.folded.order, evidence.impacts
     if count is None or count.impacts is None or count.impacts == 1:
         return None
     name = f"a ({count.impacts},{order}) orbit"
     if count.impacts == 0:
-        return Verdict(Kind.NO_IMPACT, f"repeats after {order} drive periods without a jump of the velocity: no impact")
+        return TraceVerdict(
+            TraceKind.NO_IMPACT, f"repeats after {order} drive periods without a jump of the velocity: no impact"
+        )
     if order % count.impacts == 0:
         single = order // count.impacts
         factor = {2: "doubled", 3: "tripled"}.get(count.impacts, f"{count.impacts} times as long")
-        return Verdict(Kind.PERIOD_MULTIPLIED, f"{name}: the period of a (1,{single}) orbit {factor}")
-    return Verdict(Kind.SEVERAL_IMPACTS, f"{name}: {count.impacts} impacts in {order} drive periods")
+        return TraceVerdict(TraceKind.PERIOD_MULTIPLIED, f"{name}: the period of a (1,{single}) orbit {factor}")
+    return TraceVerdict(TraceKind.SEVERAL_IMPACTS, f"{name}: {count.impacts} impacts in {order} drive periods")
 
 
-def _impacts(evidence: Evidence) -> str:
+def _impacts(evidence: TraceEvidence) -> str:
     count = evidence.impacts
     return "1" if count is None or count.impacts is None else str(count.impacts)
