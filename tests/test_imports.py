@@ -17,6 +17,7 @@ LEVELS = {
     "stored_program": 0,
     "strict_json": 0,
     "outcome": 0,
+    "words": 0,
     "parameters": 1,
     "apparatus": 2,
     "impact": 3,

@@ -7,14 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from matplotlib.figure import Figure
 
 from afm_jax.cli.main import main
-from fitting.report import summary, write_report
-from fitting.reporting.report_band import band_width
-from fitting.reporting.report_html import fit_page
-from fitting.reporting.report_html_opening import goodness_in_words
-from fitting.reporting.report_plot import fit_figure, law_figure
+from fitting.reporting.html import fit_page
+from fitting.reporting.plots import law_figure, rows_figure, speed_figure
+from fitting.reporting.report import summary, write_report
+from fitting.reporting.words import band_width, goodness_in_words
 from fitting.result import FitResult
 from tests.html_pages import first_screen, formulas, read_page, section_of, table_of, words_of
 from tests.made_fits import SPEEDS, VALUES, made_fit, made_parameter, made_table
@@ -44,10 +42,9 @@ PIXEL = base64.b64decode(
 )
 
 
-@pytest.fixture
-def undrawn(monkeypatch):
-    """Pages without their pictures' points, which take seconds to draw; the figures are made all the same."""
-    monkeypatch.setattr(Figure, "savefig", lambda _figure, file, **_options: file.write(PIXEL))
+def page_of(fit: FitResult, **extras: Any) -> str:
+    """Return the page of a fit without its pictures' points, which take seconds to draw."""
+    return fit_page(fit, [PIXEL] * 3, **extras)
 
 
 def not_valid(model: str) -> FitResult:
@@ -88,12 +85,12 @@ def with_odd_rows() -> FitResult:
     return dataclasses.replace(fit, rows=rows)
 
 
-@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("model", VALUES)
 @pytest.mark.parametrize("valid", [True, False])
 def test_every_kind_of_fit_is_a_valid_page(model, valid):
     fit = made_fit(model) if valid else not_valid(model)
-    root = read_page(fit_page(fit))
+    root = read_page(page_of(fit))
+    assert all(figure(fit).axes for figure in (rows_figure, law_figure, speed_figure))
     seen = first_screen(root)
     assert ("NOT VALID" in seen) is not valid
     assert ("You can believe it" in seen) is valid
@@ -101,12 +98,11 @@ def test_every_kind_of_fit_is_a_valid_page(model, valid):
     assert ("no band can be given" in seen) is not valid
 
 
-@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("model", [name for name in VALUES if name != "contact"])
 @pytest.mark.parametrize("width", [1e-3, 1e-6])
 def test_the_printed_formula_is_the_law(model, width):
     fit = made_fit(model, width=width)
-    (left, right), *later = (formula.split(" = ") for formula in formulas(read_page(fit_page(fit))))
+    (left, right), *later = (formula.split(" = ") for formula in formulas(read_page(page_of(fit))))
     law = fit.law
     inside = (law.approach_speed_nm_per_us >= SPEEDS[0]) & (law.approach_speed_nm_per_us <= SPEEDS[-1])
     names = {"u_in": law.approach_speed_nm_per_us[inside]}
@@ -121,9 +117,8 @@ def test_the_printed_formula_is_the_law(model, width):
         np.testing.assert_allclose(eval(delay, {}, names), law.collision_delay_us[inside], rtol=0.1001 * width)  # noqa: S307
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_without_a_measurement_the_formula_has_no_numbers():
-    assert formulas(read_page(fit_page(not_valid("law")))) == ["u_out**(2) = (r u_in)**(2) - ε"]
+    assert formulas(read_page(page_of(not_valid("law")))) == ["u_out**(2) = (r u_in)**(2) - ε"]
 
 
 def test_width_of_the_band_is_the_worst_over_the_measured_speeds():
@@ -142,7 +137,6 @@ def test_width_of_the_band_is_the_worst_over_the_measured_speeds():
     assert "known to 10 % or better (95 % band, widest at 260 nm/us)" in summary(dataclasses.replace(fit, law=law))
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_rows_that_were_not_used_do_not_count_as_measured_speeds():
     width = band_width(with_odd_rows())
     assert width is not None
@@ -151,7 +145,8 @@ def test_rows_that_were_not_used_do_not_count_as_measured_speeds():
     unused = dataclasses.replace(nothing.rows, used=np.zeros(4, dtype=bool))
     nothing = dataclasses.replace(nothing, rows=unused)
     assert band_width(nothing) is None
-    assert "measured at no speed" in first_screen(read_page(fit_page(nothing)))
+    assert all(figure(nothing).axes for figure in (rows_figure, law_figure, speed_figure))
+    assert "measured at no speed" in first_screen(read_page(page_of(nothing)))
 
 
 @pytest.mark.parametrize(
@@ -170,22 +165,20 @@ def test_probability_is_said_in_words(changes, said):
     assert said in goodness_in_words(made_fit("law", **changes))
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_every_text_is_shown_as_it_is_and_does_nothing():
     hostile = '<script>alert("1")</script> & <img src=x onerror=y> \x0b\x7f'
     table = made_table(remarks=(hostile,), source="strange\udc80 <b>.csv")
     fit = made_fit("law", table=table, warnings=[hostile], settings={hostile: hostile}, versions={"a": hostile})
-    root = read_page(fit_page(fit))
+    root = read_page(page_of(fit))
     shown = '<script>alert("1")</script> & <img src=x onerror=y> \ufffd\ufffd'
     # the remark, the warning, the setting's name and value, the version
     assert words_of(root).count(shown) == 5
     assert "strange\ufffd <b>.csv" in first_screen(root)
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_every_input_is_in_the_page():
     fit = made_fit("law")
-    root = read_page(fit_page(fit))
+    root = read_page(page_of(fit))
     head, *cells = table_of(root, "The table's rows")
     for name, column in zip(head, zip(*cells, strict=True), strict=True):
         given = getattr(fit.table, "lines" if name == "line" else name)
@@ -198,29 +191,26 @@ def test_every_input_is_in_the_page():
     assert dict(table_of(root, "Options"))["constraints"] == "quality_factor: 40, 0.4"
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_odd_rows_are_marked_and_say_why():
-    root = read_page(fit_page(with_odd_rows()))
+    root = read_page(page_of(with_odd_rows()))
     remarks = [row[-1] for row in table_of(root, "Amplitudes in nm")[1:]]
     assert remarks[0].startswith("set aside: this impact is too slow")
     assert remarks[1] == "2 stable orbits, the closest taken; close to a fold; more than 3 errors off"
     assert remarks[2] == "no stable orbit at the fitted law"
     assert remarks[3] == "nothing steady seen, though an orbit is predicted"
     assert sum(row.attrib.get("class") == "marked" for row in root.iter("tr")) == 4
-    plain = read_page(fit_page(made_fit("law")))
+    plain = read_page(page_of(made_fit("law")))
     assert not any(row.attrib.get("class") == "marked" for row in plain.iter("tr"))
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_a_long_table_stays_a_page_and_says_what_is_missing():
-    page = fit_page(made_fit("law", table=made_table(3000)))
+    page = page_of(made_fit("law", table=made_table(3000)))
     # leaves room for three pictures of 150 kB
     assert len(page.encode()) < 1_500_000
     said = words_of(read_page(page))
     assert "The first 1500 of 3000 rows; all of them are in fit_rows.csv" in said
 
 
-@pytest.mark.usefixtures("undrawn")
 def test_other_models_and_samples_are_shown():
     rows = [
         {"model": "law", "chi2": 5.0, "degrees_of_freedom": 6, "aic": 9.0, "delta_aic": 0.0, "law_change": 0.0},
@@ -241,7 +231,7 @@ def test_other_models_and_samples_are_shown():
     }
     chains = {"chains": {"seed": 77, "r_hat": {"r": 1.31, "epsilon": None}}, "grid": None, "converged": False}
     models = Models(rows, "The data do not tell r < 1 from viscous loss.")
-    page = fit_page(made_fit("law"), comparison=models, bootstrap=Samples(found), posterior=Samples(chains))
+    page = page_of(made_fit("law"), comparison=models, bootstrap=Samples(found), posterior=Samples(chains))
     root = read_page(page)
     assert models.verdict in first_screen(root)
     assert [row[1] for row in table_of(root, "Models of")] == ["chi2", "5", "7.25"]
@@ -271,7 +261,7 @@ def test_text_names_only_strong_correlations_of_many_parameters():
 
 
 def test_pictures_show_the_delay_and_the_rows_set_aside():
-    figure = fit_figure(with_odd_rows())
+    figure = rows_figure(with_odd_rows())
     labels = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
     for label in ("measured, set aside", "no stable orbit predicted", "no orbit seen, one predicted"):
         assert label in labels

@@ -84,7 +84,7 @@ def command(session: Session, table: Path | None, model: str, noise: float | Non
     settings = _settings(model, options)
     session.start_computing()
     from fitting.law_fit import fit  # noqa: PLC0415
-    from fitting.report import summary  # noqa: PLC0415
+    from fitting.reporting.report import summary  # noqa: PLC0415
     from fitting.table import read_table  # noqa: PLC0415
 
     measured = read_table(_example_path() if table is None else table, noise=noise)
@@ -95,7 +95,7 @@ def command(session: Session, table: Path | None, model: str, noise: float | Non
     payload = result.to_dict() | {name: extra.to_dict() for name, extra in extras.items()}
     session.emit(payload, summary(result), *(_words(name, extra) for name, extra in extras.items()))
     if session.out is not None:
-        from fitting.report import write_report  # noqa: PLC0415
+        from fitting.reporting.report import write_report  # noqa: PLC0415
 
         for path in write_report(result, session.out, session.write_table, **extras):
             session.note(f"wrote {path}")

@@ -1,5 +1,6 @@
 """What all pictures share: size, fonts, resolution, without a display and without touching matplotlib's own state."""
 
+import io
 from pathlib import Path
 
 from matplotlib.axes import Axes
@@ -38,3 +39,10 @@ def with_zero_line(axes: Axes) -> None:
 def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG."""
     figure.savefig(path, dpi=_DPI, format="png")
+
+
+def png_of(figure: Figure, dpi: float = 150.0) -> bytes:
+    """Return a figure as a PNG file."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=dpi)
+    return buffer.getvalue()

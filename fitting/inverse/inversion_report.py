@@ -92,10 +92,11 @@ def write_inversion(
     Raises:
         OSError: if a file cannot be written.
     """
+    from afm_jax.plots.picture_style import png_of  # noqa: PLC0415
     from fitting.inverse.inversion_plot import inversion_figure  # noqa: PLC0415
-    from fitting.reporting.report_files import write_report_files  # noqa: PLC0415
+    from fitting.reporting.report import write_report_files  # noqa: PLC0415
 
-    text, data, picture = inversion_summary(result), result.to_dict(), inversion_figure(result, fitted=fitted)
+    text, data, picture = inversion_summary(result), result.to_dict(), png_of(inversion_figure(result, fitted=fitted))
     written = write_report_files(folder, "invert", text=text, data=data, picture=picture)
     write_table("invert.csv", result.records(), ROW_COLUMNS)
     write_table("law.csv", result.law_records(), LAW_COLUMNS)

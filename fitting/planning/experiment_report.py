@@ -60,11 +60,12 @@ def write_design(result: Design, folder: Path, write_table: Table) -> list[Path]
     Raises:
         OSError: if a file cannot be written.
     """
+    from afm_jax.plots.picture_style import png_of  # noqa: PLC0415
     from fitting.planning.experiment_plot import design_figure  # noqa: PLC0415
-    from fitting.reporting.report_files import write_report_files  # noqa: PLC0415
+    from fitting.reporting.report import write_report_files  # noqa: PLC0415
 
     blank = folder / "to_fill_in.csv"
-    text, data, picture = design_summary(result), result.to_dict(), design_figure(result)
+    text, data, picture = design_summary(result), result.to_dict(), png_of(design_figure(result))
     written = write_report_files(folder, "design", text=text, data=data, picture=picture)
     blank.write_text(table_to_fill_in(result), encoding="utf-8", newline="\n")
     write_table("design.csv", result.points(), POINT_COLUMNS)

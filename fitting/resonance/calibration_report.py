@@ -104,10 +104,11 @@ def write_calibration(
     Raises:
         OSError: if a file cannot be written.
     """
-    from fitting.reporting.report_files import write_report_files  # noqa: PLC0415
+    from afm_jax.plots.picture_style import png_of  # noqa: PLC0415
+    from fitting.reporting.report import write_report_files  # noqa: PLC0415
     from fitting.resonance.calibration_plot import calibration_figure  # noqa: PLC0415
 
-    text, data, picture = calibration_summary(result), result.to_dict(), calibration_figure(result)
+    text, data, picture = calibration_summary(result), result.to_dict(), png_of(calibration_figure(result))
     written = write_report_files(folder, "calibration", text=text, data=data, picture=picture)
     write_table("calibration_points.csv", point_records(result), POINT_COLUMNS)
     return written

@@ -1,0 +1,124 @@
+"""Numbers and tables as a person reads them: the digits that an error warrants, a dash where nothing is known."""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+
+def decimals(width: float, *, unknown: int = 4) -> int:
+    """Return the decimals that show a width, or an error, to two significant digits; at most twelve.
+
+    Args:
+        width: what must show.
+        unknown: the decimals where there is no width.
+
+    >>> decimals(0.034), decimals(34.0)
+    (3, 0)
+    """
+    if not math.isfinite(width) or width <= 0.0:
+        return unknown
+    return min(max(1 - math.floor(math.log10(width)), 0), 12)
+
+
+def value_alone(value: float, error: float | None, *, unknown: str = ".3g") -> str:
+    """Return a value with the digits that its error warrants; the error stands elsewhere.
+
+    Args:
+        value: the value.
+        error: its standard error, or None.
+        unknown: how a value without an error is written.
+
+    >>> value_alone(40.1234, 0.4), value_alone(40.1234, None)
+    ('40.1', '40.1')
+    """
+    # the 95 % interval is about four standard errors wide
+    return f"{value:{unknown}}" if error is None else f"{value:.{decimals(4.0 * error)}f}"
+
+
+def with_error(value: float | None, error: float | None) -> str:
+    """Return a value and its error with two digits of the error.
+
+    >>> with_error(40.1234, 0.41), with_error(40.1, None)
+    ('40.12 +- 0.41', 'not known')
+    """
+    if value is None or error is None:
+        return "not known"
+    digits = decimals(error)
+    return f"{value:.{digits}f} +- {error:.{digits}f}"
+
+
+def interval(low: float, high: float) -> str:
+    """Return an interval with two digits of its width.
+
+    >>> interval(0.94921, 0.95083)
+    '0.9492 to 0.9508'
+    """
+    digits = decimals(high - low)
+    return f"{low:.{digits}f} to {high:.{digits}f}"
+
+
+def known(value: float | None, form: str = ".3g") -> str:
+    """Return a number in a format, a dash where there is none.
+
+    >>> known(0.12345), known(None), known(float("nan"), "+.2f")
+    ('0.123', '-', '-')
+    """
+    return "-" if value is None or math.isnan(value) else f"{value:{form}}"
+
+
+def percent(share: float) -> str:
+    """Return a share in per cent with two significant digits.
+
+    >>> percent(0.0031)
+    '0.31 %'
+    """
+    return f"{float(f'{100.0 * share:.2g}'):g} %"
+
+
+def plain_words(value: Any) -> str:
+    """Return a plain value as text: numbers short, lists joined, mappings as 'name: value'.
+
+    >>> plain_words({"seed": 3, "ends": [0.1, None], "scaled": False})
+    'seed: 3; ends: 0.1, none; scaled: no'
+    """
+    if value is None:
+        return "none"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    if isinstance(value, Mapping):
+        return "; ".join(f"{name}: {plain_words(item)}" for name, item in value.items()) or "none"
+    if isinstance(value, Iterable) and not isinstance(value, str):
+        return ", ".join(plain_words(item) for item in value) or "none"
+    return str(value)
+
+
+def text_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, words: Sequence[int] = (0,)) -> list[str]:
+    """Return lines of a table, indented, columns as wide as what is in them.
+
+    Args:
+        head: the columns' names.
+        rows: a cell for each column.
+        words: the columns that hold words, set to the left; numbers are set to the right.
+
+    >>> text_table(["", "value"], [["r", "0.95"], ["epsilon", "60"]])
+    ['           value', '  r         0.95', '  epsilon     60']
+    """
+    lines = [list(head), *map(list, rows)]
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    sides = ["<" if k in words else ">" for k in range(len(widths))]
+    return [
+        "  "
+        + "  ".join(f"{cell:{side}{width}}" for cell, side, width in zip(line, sides, widths, strict=True)).rstrip()
+        for line in lines
+    ]
+
+
+def bullets(title: str, items: Sequence[str]) -> list[str]:
+    """Return lines of a list below its title, an empty line before it; nothing if there are no items.
+
+    >>> bullets("Notes:", ["one"])
+    ['', 'Notes:', '  - one']
+    """
+    return ["", title, *(f"  - {item}" for item in items)] if items else []
