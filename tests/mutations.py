@@ -207,8 +207,8 @@ MUTATIONS = {
         COLLISIONS,
     ),
     "bridge that breaks where it formed": Mutation(
-        "outer = jnp.maximum(contact.bridge_breaks_nm, breaks)",
-        "outer = jnp.maximum(contact.bridge_forms_nm, breaks)",
+        "outer = jnp.maximum(contact.bridge_breaks_nm, breaks)\n    pull_in",
+        "outer = jnp.maximum(contact.bridge_forms_nm, breaks)\n    pull_in",
         COLLISIONS,
     ),
     "turning point on the wrong side of the well": Mutation(
