@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from afm_jax.apparatus.excitation import BaseDrive, ForceDrive
     from afm_jax.apparatus.platform import Platform
     from afm_jax.apparatus.scene import Scene
+    from afm_jax.compilation_cache import use_cache
     from afm_jax.contact.capture import capture_speed
     from afm_jax.contact.collide import collide
     from afm_jax.contact.collision import Collision
@@ -70,6 +71,7 @@ else:
         "single_impact_orbits": "afm_jax.impact.orbits",
         "time_course": "afm_jax.contact.time_course",
         "trajectory": "afm_jax.motion.trajectory",
+        "use_cache": "afm_jax.compilation_cache",
     }
 
     def __getattr__(name):
@@ -116,4 +118,5 @@ __all__ = [
     "single_impact_orbits",
     "time_course",
     "trajectory",
+    "use_cache",
 ]

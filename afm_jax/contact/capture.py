@@ -14,7 +14,6 @@ from afm_jax.contact.junction import Junction, explain_missing_junction, find_ju
 from afm_jax.contact.turned import turn_in_bridge
 from afm_jax.impact.implicit import implicit_root
 from afm_jax.parameters import as_parameter, check_parameter, is_traced, refuse_float32
-from afm_jax.stored_program import stored
 
 _POINTS = 64
 _ROUNDS = 9
@@ -31,11 +30,11 @@ def capture_speed(contact: Contact, mass_ng: ArrayLike = 1.0) -> Float[Array, ""
         contact: the contact, of numbers.
         mass_ng: the tip's mass in ng.
 
-        RuntimeError: if the contact was built before JAX was set to the 64-bit floats that it now computes in.
     Raises:
+        RuntimeError: if the contact was built before JAX was set to the 64-bit floats that it now computes in.
         ValueError: if the contact has no junction, or the mass is not positive.
-    refuse_float32(contact)
     """
+    refuse_float32(contact)
     check_parameter("mass_ng", mass_ng, "positive")
     speed, exists = _capture_speed(contact, as_parameter(mass_ng))
     if not is_traced(exists) and not bool(exists):
@@ -43,7 +42,7 @@ def capture_speed(contact: Contact, mass_ng: ArrayLike = 1.0) -> Float[Array, ""
     return speed
 
 
-@stored()
+@jax.jit
 def _capture_speed(contact: Contact, mass: Float[Array, ""]) -> tuple[Array, Array]:
     junction = find_junction(contact)
     fixed = lax.stop_gradient((contact, junction, mass))

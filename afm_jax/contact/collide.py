@@ -1,6 +1,7 @@
 """Batches of collisions: many speeds, or many contacts, in blocks of flat memory."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -16,7 +17,6 @@ from afm_jax.contact.junction import Junction, explain_missing_junction, find_ju
 from afm_jax.contact.turned import Turn, turn_in_bridge
 from afm_jax.outcome import CollisionOutcome
 from afm_jax.parameters import as_parameter, check_parameter, is_traced, refuse_float32
-from afm_jax.stored_program import stored
 
 BLOCK = 512
 """Tips computed side by side: few enough to stay in the processor's cache."""
@@ -86,7 +86,7 @@ def _complain(contact: Contact, result: Collision) -> None:
         raise ValueError(f"the contact has no junction: {explain_missing_junction(contact)}")
 
 
-@stored("setting")
+@partial(jax.jit, static_argnames="setting")
 def _quick(
     contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."], setting: Setting
 ) -> tuple[Collision, Bool[Array, "..."]]:
@@ -105,7 +105,7 @@ def _quick(
     return _in_blocks(one, contact, mass, speeds)
 
 
-@stored()
+@jax.jit
 def _careful(contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."]) -> Collision:
     """Return the collisions of a batch in many steps, turning points in the bridge included."""
 

@@ -13,7 +13,6 @@ from afm_jax.impact.orbit_closure import OrbitProblem
 from afm_jax.impact.orbit_search import find_roots
 from afm_jax.impact.orbit_state import judge, orbit_state
 from afm_jax.parameters import is_traced, readable, require_float64
-from afm_jax.stored_program import stored
 
 
 class SingleImpactOrbits(eqx.Module):
@@ -96,7 +95,7 @@ def _check_order(order: ArrayLike) -> None:
         raise ValueError(f"`order` must be a positive integer, but is {order}")
 
 
-@stored()
+@jax.jit
 def _single_impact_orbits(scene: Scene, order: Float[Array, ""]) -> SingleImpactOrbits:
     problem = OrbitProblem(scene.cantilever, scene.platform, impact_law_of(scene), order)
     roots = find_roots(problem)
