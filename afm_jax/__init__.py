@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from afm_jax.apparatus.excitation import BaseDrive, ForceDrive
     from afm_jax.apparatus.platform import Platform
     from afm_jax.apparatus.scene import Scene
+    from afm_jax.compilation_cache import use_cache
     from afm_jax.contact.collide import Collision, capture_speed, collide
     from afm_jax.contact.contact import Contact
     from afm_jax.contact.junction import Junction, find_junction
@@ -68,6 +69,7 @@ else:
         "single_impact_orbits": "afm_jax.impact.orbits",
         "time_course": "afm_jax.contact.time_course",
         "trajectory": "afm_jax.motion.trajectory",
+        "use_cache": "afm_jax.compilation_cache",
     }
 
     def __getattr__(name):
@@ -114,4 +116,5 @@ __all__ = [
     "single_impact_orbits",
     "time_course",
     "trajectory",
+    "use_cache",
 ]

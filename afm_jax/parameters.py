@@ -142,7 +142,7 @@ _float32_allowed = ContextVar("_float32_allowed", default=False)
 
 
 def _is_narrow(leaf: Any) -> bool:
-    return isinstance(leaf, jax.Array | np.ndarray | np.generic) and leaf.dtype in _NARROW
+    return getattr(leaf, "dtype", None) in _NARROW
 
 
 _NARROW = {jnp.dtype(name) for name in ("float16", "bfloat16", "float32")}

@@ -1,5 +1,6 @@
 """From parameters to predicted amplitudes: each row's steady single-impact orbit, on the branch that was measured."""
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -11,7 +12,6 @@ from jaxtyping import Array, Bool, Float, Int
 from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact
 from afm_jax.impact.orbit_closure import OrbitProblem
 from afm_jax.impact.orbits import amplitudes
-from afm_jax.stored_program import stored
 from fitting.measurement import Measurement, Rows
 from fitting.models import Problem
 from fitting.row_orbits import Branch, branch_near, branch_of, followed, impact_of, orbit_problem
@@ -117,13 +117,13 @@ class _Impacts(NamedTuple):
     slopes: LawImpact | TabulatedImpact
 
 
-@stored("problem")
+@partial(jax.jit, static_argnames="problem")
 def impacts_of(values: Float[Array, "sets p"], measurement: Measurement, problem: Problem) -> _Impacts:
     """Return the law, or the table of the contact, of several sets of values."""
     return _Impacts(*jax.vmap(lambda v: _impact_and_slopes(v, measurement, problem))(values))
 
 
-@stored("problem")
+@partial(jax.jit, static_argnames="problem")
 def located(
     values: Float[Array, "sets p"],
     impacts: _Impacts,
@@ -140,7 +140,7 @@ def located(
     return jax.vmap(one)(points, impact, measurement.rows)
 
 
-@stored("problem")
+@partial(jax.jit, static_argnames="problem")
 def linearise_pairs(
     values: Float[Array, "sets p"],
     impacts: _Impacts,

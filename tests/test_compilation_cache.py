@@ -1,15 +1,17 @@
-"""The command line's start of JAX: 64-bit floats, and compiled programs kept in the user's cache folder."""
+"""Compiled programs kept in the user's cache folder: by commands and sessions, only where nobody else can write."""
 
+import json
+import os
 import sys
 from pathlib import Path
 
 import pytest
 
-from afm_jax.cli import compilation
-from tests.fresh_python import python
+from afm_jax.compilation_cache import make_private, processor_key, silence_xla, user_cache_folder
+from tests.fresh_python import outputs, python
 
 START = (
-    "from afm_jax.cli.compilation import start_jax\nstart_jax()\nimport jax\n"
+    "from afm_jax.cli.compilation import start_jax\nstart_jax(print if 'TOLD' in os.environ else len)\nimport jax\n"
     "jax.jit(lambda x: x + 1)(1.0)\n"
     "print(jax.config.read('jax_enable_x64'), jax.config.values['jax_compilation_cache_dir'])"
 )
@@ -18,8 +20,7 @@ WITHOUT = {"JAX_COMPILATION_CACHE_DIR", "JAX_ENABLE_COMPILATION_CACHE"}
 
 def start(**environment: str) -> list[str]:
     """Return what a fresh program says of 64-bit floats and of the compilation cache's folder."""
-    code = f"import os\n[os.environ.pop(name, None) for name in {WITHOUT - set(environment)}]\n{START}"
-    return python(code, **environment).split(maxsplit=1)
+    return python(f"import os\n{START}", **(dict.fromkeys(WITHOUT) | environment)).split(maxsplit=1)
 
 
 @pytest.mark.skipif(sys.platform in {"win32", "darwin"}, reason="the cache folder is chosen by another variable")
@@ -27,8 +28,10 @@ def test_compiled_programs_are_kept_in_the_users_cache(tmp_path: Path):
     x64, folder = start(XDG_CACHE_HOME=str(tmp_path))
     assert x64 == "True"
     assert Path(folder).parent == tmp_path / "afm-jax"
-    assert compilation.processor_key() in folder
+    assert processor_key() in folder
     assert list(Path(folder).glob("jit_*"))
+    # machine code that will be run: for this user alone
+    assert {path.stat().st_mode & 0o777 for path in (Path(folder), Path(folder).parent)} == {0o700}
 
 
 def test_the_users_own_cache_settings_stand(tmp_path: Path):
@@ -61,4 +64,105 @@ def test_cache_folder_follows_the_platform(
         monkeypatch.delenv(name, raising=False)
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
-    assert compilation.user_cache_folder() == Path(expected.replace("HOME", str(Path.home())))
+    assert user_cache_folder() == Path(expected.replace("HOME", str(Path.home())))
+
+
+linux = pytest.mark.skipif(sys.platform in {"win32", "darwin"}, reason="the cache folder is chosen by another variable")
+
+
+@linux
+@pytest.mark.parametrize("mode", [0o777, 0o770, 0o1777])
+def test_a_folder_that_others_may_write_to_is_not_used(tmp_path: Path, mode: int):
+    (tmp_path / "afm-jax").mkdir()
+    (tmp_path / "afm-jax").chmod(mode)
+    *said, where = python(
+        f"import os\n{START}", TOLD="1", XDG_CACHE_HOME=str(tmp_path), **dict.fromkeys(WITHOUT)
+    ).split("\n")
+    assert where == "True None"
+    assert said == [
+        f"compiled programs: not kept ({tmp_path}/afm-jax: others may write to the folder; `chmod go-w` mends it)"
+    ]
+    assert not list((tmp_path / "afm-jax").glob("*/*"))
+
+
+def test_a_folder_of_somebody_else_is_not_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    make_private(tmp_path / "cache" / "own")
+    monkeypatch.setattr("os.geteuid", lambda: tmp_path.stat().st_uid + 1)
+    with pytest.raises(PermissionError, match="belongs to another user") as error:
+        make_private(tmp_path / "cache" / "own")
+    assert error.value.filename == str(tmp_path / "cache")
+
+
+@linux
+def test_traced_programs_of_a_folder_that_others_may_write_to_are_not_read(tmp_path: Path):
+    surroundings = {"XDG_CACHE_HOME": str(tmp_path), **dict.fromkeys(WITHOUT)}
+    folder = Path(python(f"import os\n{START}", **surroundings).split()[1])
+    (folder / "traced").mkdir()
+    (folder / "traced").chmod(0o777)
+    code = "import sys\nsys.argv = ['afm-jax', 'fit', 'none.csv', '--verbose']\nimport afm_jax.__main__"
+    _, said = outputs(code, surroundings, (2,))
+    assert f"traced programs are not kept: {folder}/traced: others may write to the folder" in said
+
+
+@linux
+def test_a_damaged_entry_is_compiled_anew_once_and_said(tmp_path: Path):
+    code = f"import os\n{START}"
+    surroundings = {"XDG_CACHE_HOME": str(tmp_path), "TOLD": "1", **dict.fromkeys(WITHOUT)}
+    assert python(code, **surroundings).count("rejected") == 0
+    (entry,) = (tmp_path / "afm-jax").glob("*/jit__lambda*-cache")
+    whole = entry.read_bytes()
+    entry.write_bytes(whole[: len(whole) // 2])
+    printed, complaints = outputs(code, surroundings)
+    assert printed.count("jit__lambda was rejected and is compiled anew") == 1
+    assert "Warning" not in complaints
+    assert len(entry.read_bytes()) > len(whole) // 2
+    assert python(code, **surroundings).count("rejected") == 0
+
+
+@linux
+def test_a_python_session_shares_the_cache_of_the_commands(tmp_path: Path):
+    code = (
+        "import warnings\nwarnings.simplefilter('error')\n"
+        "import afm_jax\nprint(afm_jax.use_cache())\nimport jax\njax.jit(lambda x: x + 1)(1.0)\n"
+        "print(afm_jax.use_cache() == afm_jax.use_cache(), jax.config.read('jax_enable_x64'))"
+    )
+    folder, same = python(code, XDG_CACHE_HOME=str(tmp_path), **dict.fromkeys(WITHOUT)).splitlines()
+    assert same == "True False"
+    assert list(Path(folder).glob("jit_*"))
+    assert start(XDG_CACHE_HOME=str(tmp_path))[1] == folder
+    (tmp_path / "afm-jax").chmod(0o777)
+    code = "import warnings\nwarnings.simplefilter('always')\nimport afm_jax\nprint(afm_jax.use_cache())"
+    printed, said = outputs(code, {"XDG_CACHE_HOME": str(tmp_path), **dict.fromkeys(WITHOUT)})
+    assert printed == "None"
+    assert "compiled programs are not kept" in said
+
+
+@pytest.mark.parametrize(("before", "after"), [(None, "3"), ("1", "3"), ("0", "0"), ("2", "2")])
+def test_messages_of_xla_are_what_the_user_asked_for(monkeypatch: pytest.MonkeyPatch, before: str | None, after: str):
+    # 1 is what JAX sets where nobody has asked for anything
+    monkeypatch.delenv("TF_CPP_MIN_LOG_LEVEL", raising=False)
+    if before is not None:
+        monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", before)
+    silence_xla()
+    assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == after
+
+
+DOCTOR = "import sys\nsys.argv = ['afm-jax', 'doctor', '--json', *sys.argv[1:]]\nimport afm_jax.__main__"
+
+
+@linux
+def test_doctor_says_whether_the_cache_works(tmp_path: Path):
+    surroundings = {"XDG_CACHE_HOME": str(tmp_path), **dict.fromkeys(WITHOUT)}
+    printed, said = outputs(DOCTOR, surroundings)
+    told = json.loads(printed)
+    assert (told["format"], told["format_version"]) == ("afm-jax doctor", 1)
+    assert told["cache"]["works"] is True
+    assert told["cache"]["first_s"] > 0.0
+    assert told["float_bits"] == 64
+    assert told["versions"]["jaxlib"] in told["cache"]["folder"]
+    assert told["microseconds_per_impact"] > 0.0
+    assert said == ""
+    (tmp_path / "afm-jax").chmod(0o777)
+    printed, said = outputs(DOCTOR, surroundings, (3,))
+    assert json.loads(printed)["cache"]["works"] is False
+    assert "others may write to the folder" in said

@@ -1,72 +1,66 @@
-"""JAX for the command line: 64-bit floats, and compiled programs kept from one call to the next.
+"""JAX for the command line: 64-bit floats, and compiled programs kept from one call to the next."""
 
-A short command is mostly compilation and tracing. JAX keys its cache by program and version, but not by all that a
-processor can do, and a home folder may be shared by different machines: so every kind of processor has a folder of its
-own.
-"""
-
-import hashlib
-import os
-import platform
-import sys
-import tempfile
+import re
 import warnings
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import jax
+from jax import monitoring
 
-from afm_jax.stored_program import keep_programs
+from afm_jax.compilation_cache import Cache, open_cache
+
+_DAMAGED = re.compile(r"Error reading persistent compilation cache entry for '([\w.<>-]+)': (.*)", re.DOTALL)
+_UNWRITTEN = "Error writing persistent compilation cache entry"
 
 
-def start_jax() -> None:
-    """Switch 64-bit floats on and, unless the user has set one, the compilation cache in the user's cache folder."""
+def start_jax(tell: Callable[[str], None]) -> Cache:
+    """Switch 64-bit floats on, and the compilation cache unless the user has decided otherwise.
+
+    Args:
+        tell: takes what only those want to know who ask.
+    """
     jax.config.update("jax_enable_x64", True)  # noqa: FBT003
-    names = ("jax_enable_compilation_cache", "jax_compilation_cache_dir")
-    enabled, chosen_by_user = (getattr(jax.config, name) for name in names)
-    if enabled and chosen_by_user is not None and chosen_by_user == os.environ.get("JAX_COMPILATION_CACHE_DIR"):
-        keep_programs(Path(chosen_by_user) / "traced")
-    if not enabled or chosen_by_user is not None:
-        return
-    folder = user_cache_folder() / f"jax-{jax.__version__}-{processor_key()}"
-    if not _is_writable(folder):
-        return
-    keep_programs(folder / "traced")
-    jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    # A full disk or a damaged entry costs a compilation, nothing else.
-    warnings.filterwarnings("ignore", message="Error (reading|writing) persistent compilation cache entry")
+    cache = open_cache()
+    tell(f"compiled programs: {cache.folder or 'not kept'} ({cache.reason})")
+    if cache.folder is not None:
+        # A full disk costs a compilation, nothing else.
+        warnings.filterwarnings("ignore", message=_UNWRITTEN)
+        _replace_damaged(cache.folder, tell)
+    return cache
 
 
-def user_cache_folder() -> Path:
-    """Return where this platform keeps what a user's programs can do without, in a folder named afm-jax."""
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA")
-        return Path(base) / "afm-jax" / "cache" if base else Path.home() / "AppData" / "Local" / "afm-jax" / "cache"
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "afm-jax"
-    base = os.environ.get("XDG_CACHE_HOME", "")
-    # The specification says that a relative path there is to be ignored.
-    return (Path(base) if Path(base).is_absolute() else Path.home() / ".cache") / "afm-jax"
+def count_programs() -> dict[str, int]:
+    """Return how many programs the cache was asked for and had, from now on: a mapping that keeps being updated."""
+    names = {"compile_requests_use_cache": "asked", "cache_hits": "read"}
+    counts = dict.fromkeys(names.values(), 0)
+
+    def count(event: str, **_: Any) -> None:
+        name = names.get(event.rpartition("/")[2])
+        if name is not None:
+            counts[name] += 1
+
+    monitoring.register_event_listener(count)
+    return counts
 
 
-def processor_key() -> str:
-    """Return a short name of this kind of processor: equal where compiled programs are interchangeable."""
-    kind = [platform.system(), platform.machine(), platform.processor()]
-    try:
-        with Path("/proc/cpuinfo").open(encoding="utf-8", errors="replace") as file:
-            # the first processor is enough, and large machines list hundreds
-            lines = file.read(1 << 14).partition("\n\n")[0].splitlines()
-    except OSError:
-        lines = []
-    kind += [line for line in lines if line.startswith(("model name", "CPU part", "flags", "Features", "isa"))]
-    return hashlib.sha256("\n".join(kind).encode()).hexdigest()[:12]
+def _replace_damaged(folder: Path, tell: Callable[[str], None]) -> None:
+    """Let entries that cannot be read make room: JAX compiles anew, but never writes over an entry."""
+    shown, told = warnings.showwarning, False
 
+    def show(message: Warning | str, *where: Any, **more: Any) -> None:
+        nonlocal told
+        found = _DAMAGED.match(str(message))
+        if found is None:
+            shown(message, *where, **more)
+            return
+        # the message names the program, not its entry: those of the same name are compiled anew as well
+        for path in folder.glob(f"{found[1]}-*-cache"):
+            path.unlink(missing_ok=True)
+        if not told:
+            tell(f"the compilation cache's {found[1]} was rejected and is compiled anew: {' '.join(found[2].split())}")
+        told = True
 
-def _is_writable(folder: Path) -> bool:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return True
-    except OSError:
-        return False
+    warnings.filterwarnings("always", message="Error reading persistent compilation cache entry")
+    warnings.showwarning = show

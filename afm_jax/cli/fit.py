@@ -82,7 +82,7 @@ def command(session: Session, table: Path | None, model: str, noise: float | Non
         both = "not both: " if options["example"] else ""
         raise click.UsageError(f"{both}give a table to fit, `afm-jax fit TABLE.csv`, or --example for the bundled one")
     settings = _settings(model, options)
-    session.start_computing()
+    session.start_computing(*(f"fitting.forward:{name}" for name in ("impacts_of", "located", "linearise_pairs")))
     from fitting.law_fit import fit  # noqa: PLC0415
     from fitting.reporting.report import summary  # noqa: PLC0415
     from fitting.table import read_table  # noqa: PLC0415

@@ -16,6 +16,7 @@ COMMANDS = {
     "calibrate": ("afm_jax.cli.calibrate", "Fit frequency and quality factor to a free resonance sweep."),
     "collide": ("afm_jax.cli.collide", "Let free tips collide with the sample: rebound, delay, capture, energy."),
     "design": ("afm_jax.cli.design", "Choose the drives to measure next, and forecast what they will determine."),
+    "doctor": ("afm_jax.cli.doctor", "Say what is installed, how JAX computes, and whether its cache works."),
     "effects": ("afm_jax.cli.effects", "Say what each effect of a scene changes and costs, and which can be left out."),
     "figures": ("afm_jax.cli.figures", "Draw figures 2 to 11 of the paper, with its statements checked."),
     "fit": ("afm_jax.cli.fit", "Fit the impact law to a table of vibration amplitudes."),

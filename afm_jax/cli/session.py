@@ -1,4 +1,4 @@
-"""What every command shares: `--json`, `--out`, messages on standard error, and the start of a computation.
+"""What every command shares: `--json`, `--out`, `--verbose`, messages on standard error, and how computing starts.
 
 >>> import click
 >>> from afm_jax.cli.session import Session, with_session
@@ -15,12 +15,16 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from afm_jax.cli.out_folder import prepare_folder, write_csv
+from afm_jax.compilation_cache import cache_folder, make_private, silence_xla
 from afm_jax.strict_json import strict_json
+
+if TYPE_CHECKING:
+    from afm_jax.compilation_cache import Cache
 
 _WIDTH_OF_A_PIPE = 160
 """Columns of text that nobody looks at in a terminal; wide enough that no table is cut."""
@@ -33,16 +37,41 @@ class Session:
     Attributes:
         json: write one JSON object to standard output, and nothing else there.
         out: folder for tables and pictures, made already; None if none was asked for.
+        verbose: say on standard error what goes on behind: the cache, what is compiled.
     """
 
     json: bool
     out: Path | None
+    verbose: bool = False
 
-    def start_computing(self) -> None:
-        """Start JAX with 64-bit floats and its compilation cache; call it before importing the physics."""
-        from afm_jax.cli.compilation import start_jax  # noqa: PLC0415
+    def start_computing(self, *programs: str) -> "Cache":
+        """Start JAX with 64-bit floats and its compilation cache; call it before importing the physics.
 
-        start_jax()
+        Args:
+            programs: jitted functions whose traces are kept as well, "module:function" (see `keep_programs`).
+        """
+        # before JAX is loaded
+        silence_xla()
+        from afm_jax.cli.compilation import count_programs, start_jax  # noqa: PLC0415
+
+        cache = start_jax(self.tell)
+        if self.verbose:
+            counts = count_programs()
+            click.get_current_context().call_on_close(lambda: self.tell(_counted(**counts)))
+        if programs and cache.folder is not None and cache.folder == cache_folder():
+            from afm_jax.cli.programs import keep_programs  # noqa: PLC0415
+
+            try:
+                make_private(cache.folder / "traced")
+                keep_programs(programs, cache.folder / "traced", self.tell)
+            except OSError as error:
+                self.tell(f"traced programs are not kept: {error.filename}: {error.strerror}")
+        return cache
+
+    def tell(self, message: str) -> None:
+        """Write a message to standard error, if such messages were asked for."""
+        if self.verbose:
+            self.note(message)
 
     def note(self, message: str) -> None:
         """Write a message to standard error."""
@@ -84,7 +113,7 @@ class Session:
 
 
 def with_session(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a command `--json` and `--out`, and pass it a `Session` as first argument."""
+    """Give a command `--json`, `--out` and `--verbose`, and pass it a `Session` as first argument."""
 
     @click.option("--json", "as_json", is_flag=True, help="Write one JSON object to standard output, nothing else.")
     @click.option(
@@ -94,9 +123,10 @@ def with_session(function: Callable[..., Any]) -> Callable[..., Any]:
         callback=_prepared,
         help="Write tables (CSV) and pictures (PNG) into this folder.",
     )
+    @click.option("--verbose", is_flag=True, help="Say on standard error what is kept, read and compiled, and where.")
     @functools.wraps(function)
-    def command(*args: Any, as_json: bool, out: Path | None, **options: Any) -> Any:
-        return function(Session(as_json, out), *args, **options)
+    def command(*args: Any, as_json: bool, out: Path | None, verbose: bool, **options: Any) -> Any:
+        return function(Session(as_json, out, verbose), *args, **options)
 
     return command
 
@@ -112,6 +142,10 @@ def _prepared(ctx: click.Context, parameter: click.Parameter, folder: Path | Non
             f"{folder}: cannot write there ({error.strerror}); choose another folder", ctx=ctx, param=parameter
         ) from error
     return folder
+
+
+def _counted(asked: int, read: int) -> str:
+    return f"{read} compiled programs were read, {asked - read} were compiled"
 
 
 def _console(*, stderr: bool) -> Any:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -28,7 +29,6 @@ from afm_jax.contact.settings import CAREFUL, Setting, setting_of
 from afm_jax.impact.implicit import implicit_root
 from afm_jax.outcome import CollisionOutcome
 from afm_jax.parameters import as_parameter, check_parameter, is_traced, refuse_float32
-from afm_jax.stored_program import stored
 
 BLOCK = 512
 """Tips computed side by side: few enough to stay in the processor's cache."""
@@ -125,7 +125,7 @@ def _complain(contact: Contact, result: Collision) -> None:
         raise ValueError(f"the contact has no junction: {explain_missing_junction(contact)}")
 
 
-@stored("setting")
+@partial(jax.jit, static_argnames="setting")
 def _quick(
     contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."], setting: Setting
 ) -> tuple[Collision, Bool[Array, "..."]]:
@@ -144,7 +144,7 @@ def _quick(
     return _in_blocks(one, contact, mass, speeds)
 
 
-@stored()
+@jax.jit
 def _careful(contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."]) -> Collision:
     """Return the collisions of a batch in many steps, turning points in the bridge included."""
 
@@ -260,7 +260,7 @@ def capture_speed(contact: Contact, mass_ng: ArrayLike = 1.0) -> Float[Array, ""
     return speed
 
 
-@stored()
+@jax.jit
 def _capture_speed(contact: Contact, mass: Float[Array, ""]) -> tuple[Array, Array]:
     junction = find_junction(contact)
     fixed = lax.stop_gradient((contact, junction, mass))

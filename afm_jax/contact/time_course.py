@@ -20,8 +20,7 @@ from afm_jax.contact.forces import jkr
 from afm_jax.contact.junction import Junction, explain_missing_junction, find_junction
 from afm_jax.contact.junction_leg import stretch_in_junction, turning_root
 from afm_jax.contact.phases import Phase, force_in_phase
-from afm_jax.parameters import as_parameter, check_parameter
-from afm_jax.stored_program import stored
+from afm_jax.parameters import as_parameter, check_parameter, refuse_float32
 
 _NODES = 64
 _SWEEPS = 12
@@ -64,13 +63,12 @@ def time_course(contact: Contact, approach_speed_nm_per_us: ArrayLike, mass_ng: 
         approach_speed_nm_per_us: speed far from the sample in nm/us.
         mass_ng: the tip's mass in ng.
 
-        RuntimeError: if the contact was built before JAX was set to the 64-bit floats that it now computes in.
-
     Raises:
+        RuntimeError: if the contact was built before JAX was set to the 64-bit floats that it now computes in.
         ValueError: if speed or mass is not positive, the contact has no junction, or the bridge turns the tip round
             before the junction forms.
-    refuse_float32(contact)
     """
+    refuse_float32(contact)
     check_parameter("approach_speed_nm_per_us", approach_speed_nm_per_us, "positive")
     check_parameter("mass_ng", mass_ng, "positive")
     speed, mass = as_parameter(approach_speed_nm_per_us), as_parameter(mass_ng)
@@ -82,7 +80,7 @@ def time_course(contact: Contact, approach_speed_nm_per_us: ArrayLike, mass_ng: 
     )
 
 
-@stored()
+@jax.jit
 def _course(
     contact: Contact, speed: Float[Array, ""], mass: Float[Array, ""]
 ) -> tuple[Junction, list[_Leg], Float[Array, "3"]]:

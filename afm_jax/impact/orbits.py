@@ -35,7 +35,6 @@ from afm_jax.impact.orbit_closure import (
 from afm_jax.impact.orbit_search import COARSE, find_roots
 from afm_jax.outcome import Outcome
 from afm_jax.parameters import is_traced, readable, require_float64
-from afm_jax.stored_program import stored
 
 NEAR_DOUBLE = 1e-3
 """Slope of the closing condition per relative change of speed below which a root counts as near-double (a fold)."""
@@ -125,7 +124,7 @@ def _check_order(order: ArrayLike) -> None:
         raise ValueError(f"`order` must be a positive integer, but is {order}")
 
 
-@stored()
+@jax.jit
 def _single_impact_orbits(scene: Scene, order: Float[Array, ""]) -> SingleImpactOrbits:
     problem = OrbitProblem(scene.cantilever, scene.platform, LawImpact(impact_law_of(scene)), order)
     roots = find_roots(problem)

@@ -11,7 +11,6 @@ from jaxtyping import Array, Float, Int
 from afm_jax.contact.driven import Driven, Place
 from afm_jax.contact.phases import Phase
 from afm_jax.contact.step import Touch, advance, eighth_order_step, fresh_touch
-from afm_jax.stored_program import stored
 
 _BLOCK = 128
 """Trials computed in one call."""
@@ -57,7 +56,7 @@ def contact_steps(driven: Driven, begin: Place, phase: Int[np.ndarray, " contact
     return Steps(time, ends, kinds.astype(int), x, rate)
 
 
-@stored()
+@jax.jit
 def _some_trials(driven: Driven, touch: Touch, until: Float[Array, ""]) -> tuple[Touch, tuple]:
     def once(touch, _):
         going = (touch.phase != Phase.DRY) & (touch.place.time_us < until)
@@ -69,7 +68,7 @@ def _some_trials(driven: Driven, touch: Touch, until: Float[Array, ""]) -> tuple
     return lax.scan(once, touch, None, length=_BLOCK)
 
 
-@stored()
+@jax.jit
 def places_at(
     driven: Driven, start: Place, phase: Int[Array, " times"], time_us: Float[Array, " times"]
 ) -> tuple[Float[Array, " times"], Float[Array, " times"]]:

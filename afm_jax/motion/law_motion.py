@@ -4,6 +4,7 @@ Every round takes a tip from the beginning of a flight through its next impact t
 the rest between them included, and writes one row. All shapes are fixed; a batch goes on until its last tip is done.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -23,7 +24,6 @@ from afm_jax.motion.frames import to_gap, to_lab
 from afm_jax.motion.law_rest import Bed, chatter, first_release, take_off
 from afm_jax.motion.record import ContactKind, Contacts, MotionOutcome, Simulation, State
 from afm_jax.outcome import Outcome
-from afm_jax.stored_program import stored
 
 _ROUNDS = 8
 """Rounds between two looks at whether all tips have arrived at the end."""
@@ -62,7 +62,7 @@ class Tip(NamedTuple):
     rounds: Int[Array, ""]
 
 
-@stored("max_contacts", "reverse")
+@partial(jax.jit, static_argnames=("max_contacts", "reverse"))
 def follow_law(
     scene: Scene,
     surface: Platform | Surface,

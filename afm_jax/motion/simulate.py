@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +22,6 @@ from afm_jax.motion.free_motion import follow_free
 from afm_jax.motion.law_motion import follow_law
 from afm_jax.motion.record import ContactDetail, ContactKind, Contacts, MotionOutcome, Simulation, State
 from afm_jax.parameters import check_parameter, is_traced, require_float64
-from afm_jax.stored_program import stored
 
 DEFAULT_ACCURACY = 1e-9
 _ROUNDS_PER_CONTACT = 4
@@ -142,7 +142,7 @@ def _check_contact(scene: Scene, surface: Platform | Surface, response: Surface 
         )
 
 
-@stored("rows", "setting", "rounds", "reverse")
+@partial(jax.jit, static_argnames=("rows", "setting", "rounds", "reverse"))
 def _contact(  # noqa: PLR0913
     scene: Scene,
     surface: Platform | Surface,

@@ -7,6 +7,7 @@ more, step by step, and a place inside a step is one step of order 8 from its be
 import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
@@ -23,7 +24,6 @@ from afm_jax.motion.contact_path import places_at
 from afm_jax.motion.frames import to_lab
 from afm_jax.motion.motion_pieces import FLIGHT, REST, Pieces, World, pieces_between
 from afm_jax.motion.record import Simulation, State
-from afm_jax.stored_program import stored
 
 _NODES_PER_STEP = 8
 _NODES_PER_PANEL = 16
@@ -167,7 +167,7 @@ def _starts(pieces: Pieces) -> tuple[np.ndarray, ...]:
     return pieces.x, pieces.rate, pieces.origin_us
 
 
-@stored()
+@jax.jit
 def _flown(
     cantilever: Cantilever,
     surface: Platform | Surface,
@@ -183,7 +183,7 @@ def _flown(
     return position - height, velocity - speed
 
 
-@stored()
+@jax.jit
 def _in_lab(
     surface: Platform | Surface,
     response: Surface | None,
@@ -194,7 +194,7 @@ def _in_lab(
     return to_lab(surface, response, times_us, gap, rate)
 
 
-@stored()
+@jax.jit
 def _force(
     contact: Contact,
     junction: Junction,

@@ -1,0 +1,147 @@
+"""`afm-jax doctor`: what is installed, how JAX computes here, and whether compiled programs are found again."""
+
+import json
+import math
+import os
+import platform
+import subprocess
+import sys
+import time
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+
+from afm_jax.cli.failures import NotValid
+from afm_jax.cli.session import Session, with_session
+from afm_jax.compilation_cache import silence_xla
+
+_PACKAGES = ("afm-jax", "jax", "jaxlib", "numpy", "scipy", "equinox", "diffrax", "optimistix", "flatbuffers")
+_PROBE = "small_program_of_the_doctor"
+_IMPACTS = 20
+_TIPS = 1000
+
+
+@click.command()
+@with_session
+def command(session: Session) -> None:
+    """Say what is installed, how JAX computes, and whether its compilation cache works.
+
+    A small program is compiled by two fresh processes: the second should find it in the cache. Exit code 3 if it does
+    not, or if the cache's folder cannot be used; every command then compiles anew, which takes up to a minute.
+    """
+    cache = session.start_computing()
+    import jax  # noqa: PLC0415
+
+    first, again = None, None
+    if cache.folder is not None:
+        for entry in cache.folder.glob(f"jit_{_PROBE}-*"):
+            entry.unlink()
+        first, again = try_cache(cache.folder), try_cache(cache.folder)
+    works = again is not None and again.found
+    complaint = cache.reason if cache.refused else None
+    if cache.folder is not None and not works:
+        complaint = f"{cache.folder}: a program that one process compiled was not found by the next"
+    payload = {
+        "format": "afm-jax doctor",
+        "format_version": 1,
+        "versions": {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES},
+        "platform": platform.platform(),
+        "processors": os.cpu_count(),
+        "devices": [{"platform": device.platform, "kind": device.device_kind} for device in jax.devices()],
+        "float_bits": jax.numpy.zeros(()).dtype.itemsize * 8,
+        "cache": {
+            "folder": None if cache.folder is None else str(cache.folder),
+            "reason": cache.reason,
+            "works": works,
+            "first_s": None if first is None else first.seconds,
+            "again_s": None if again is None else again.seconds,
+        },
+        "microseconds_per_impact": time_impacts(),
+    }
+    session.emit(payload, *_lines(payload))
+    if complaint is not None:
+        raise NotValid(f"the compilation cache does not work: {complaint}")
+
+
+class Trial(NamedTuple):
+    """A small program in a process of its own: whether it was in the cache, and how long it took to be ready."""
+
+    found: bool
+    seconds: float
+
+
+def try_cache(folder: Path) -> Trial:
+    """Compile a small program in a new process, whose cache is in a folder."""
+    done = subprocess.run(
+        [sys.executable, "-m", "afm_jax.cli.doctor"],
+        env={**os.environ, "JAX_COMPILATION_CACHE_DIR": str(folder)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return Trial(*json.loads(done.stdout)) if done.returncode == 0 else Trial(found=False, seconds=math.nan)
+
+
+def time_impacts() -> float:
+    """Return microseconds that an impact of many tips takes, the best of three times."""
+    import jax  # noqa: PLC0415
+
+    from afm_jax.impact.batch import iterate_batch  # noqa: PLC0415
+    from afm_jax.presets import preset  # noqa: PLC0415
+
+    scene = preset("figure2")
+    times, speeds = jax.numpy.linspace(0.0, 5.0, _TIPS), jax.numpy.linspace(50.0, 100.0, _TIPS)
+    seconds = []
+    for _ in range(4):
+        begin = time.perf_counter()
+        jax.block_until_ready(iterate_batch(scene, times, speeds, _IMPACTS))
+        seconds.append(time.perf_counter() - begin)
+    return 1e6 * min(seconds[1:]) / (_IMPACTS * _TIPS)
+
+
+def _version(name: str) -> str | None:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def _lines(payload: dict[str, Any]) -> list[str]:
+    cache = payload["cache"]
+    devices = ", ".join(f"{device['platform']} ({device['kind']})" for device in payload["devices"])
+    found = f"works: ready after {cache['first_s']} s the first time, {cache['again_s']} s again"
+    state = found if cache["works"] else "does not work" if cache["folder"] else "none"
+    return [
+        ", ".join(f"{name} {number or 'missing'}" for name, number in payload["versions"].items()),
+        f"Platform: {payload['platform']}, {payload['processors']} processors; JAX devices: {devices}",
+        f"Floats: {payload['float_bits']} bits",
+        f"Compilation cache: {cache['folder'] or 'no folder'} ({cache['reason']}); {state}",
+        f"Time of an impact: {payload['microseconds_per_impact']:.2g} us ({_TIPS} tips side by side)",
+    ]
+
+
+def main() -> None:
+    """Make a small program ready; print whether the cache had it, and how long it took in s."""
+    silence_xla()
+    from afm_jax.cli.compilation import count_programs, start_jax  # noqa: PLC0415
+
+    start_jax(lambda _: None)
+    import jax  # noqa: PLC0415
+
+    def program(x: jax.Array) -> jax.Array:
+        return jax.numpy.linalg.eigh(jax.numpy.sin(x * x[:, None]))[0]
+
+    program.__name__ = _PROBE
+    # a chosen cache keeps slow programs only
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    value = jax.block_until_ready(jax.numpy.linspace(0.0, 1.0, 50))
+    counts, begin = count_programs(), time.perf_counter()
+    jax.block_until_ready(jax.jit(program)(value))
+    click.echo(json.dumps([counts["read"] == 1, round(time.perf_counter() - begin, 3)]))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,100 @@
+"""Traced programs beside JAX's compilation cache: what that has compiled it finds only after tracing anew.
+
+Commands name the few that gain more than a second by being kept traced (`jax.export`, its own serialisation) as well. A
+file is found by all that a trace depends on: loaded sources, versions, configuration, devices, shapes and structure.
+Results are modules and named tuples of arrays; arguments that are no arrays have a `repr` that says all of them.
+"""
+
+import hashlib
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+from jax import export
+from jax.core import Tracer
+
+_CONFIGURATION = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_precision", "jax_debug_nans")
+_PACKAGES = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "lineax")
+
+
+def keep_programs(names: Sequence[str], folder: Path, tell: Callable[[str], None]) -> None:
+    """Let traced programs of jitted functions, "module:function" each, outlive the process, as files in a folder."""
+    for module, function in (name.split(":") for name in names):
+        setattr(import_module(module), function, _keeping(getattr(sys.modules[module], function), folder, tell))
+
+
+def _keeping(jitted: Any, folder: Path, tell: Callable[[str], None]) -> Callable[..., Any]:
+    programs: dict[Any, tuple[Any, Any]] = {}
+
+    def kept(*arguments: Any, **named: Any) -> Any:
+        dynamic, static = eqx.partition((arguments, named), lambda leaf: hasattr(leaf, "dtype"))
+        arrays, tree = jax.tree.flatten(dynamic)
+        if any(isinstance(leaf, Tracer) for leaf in arrays):
+            return jitted(*arguments, **named)
+
+        def flat(arrays: list[Any]) -> list[Any]:
+            positional, by_name = eqx.combine(jax.tree.unflatten(tree, arrays), static)
+            return jax.tree.leaves(jitted(*positional, **by_name))
+
+        def trace() -> tuple[Any, Any]:
+            return export.export(jax.jit(flat))(arrays), _structure(jax.eval_shape(jitted, *arguments, **named))
+
+        call = (tree, jax.tree.structure(static), *jax.tree.leaves(static), *map(jax.typeof, arrays))
+        if call not in programs:
+            programs[call] = _program(folder / f"{jitted.__name__}-{_digest(call)}.program", trace, tell)
+        return _filled(programs[call][1], iter(programs[call][0](arrays)))
+
+    return kept
+
+
+def _digest(call: Any) -> str:
+    settings = [getattr(jax.config, option) for option in _CONFIGURATION]
+    said = f"{call} {settings} {jax.devices()} {[version(name) for name in _PACKAGES]}".encode()
+    ours = sorted(name for name in sys.modules if name.startswith(("afm_jax.", "fitting.")))
+    files = (getattr(sys.modules[name], "__file__", None) for name in ours)
+    sources = b"".join(Path(file).read_bytes() for file in files if file)
+    return hashlib.sha256(said + sources).hexdigest()[:32]
+
+
+def _program(path: Path, trace: Callable[[], tuple[Any, Any]], tell: Callable[[str], None]) -> tuple[Any, Any]:
+    """Return program and structure of its result from a file, where both are behind their digest, or traced anew."""
+    kept = path.read_bytes() if path.exists() else b""
+    if kept[:32] == hashlib.sha256(kept[32:]).digest():
+        structure, _, text = kept[32:].partition(b"\n")
+        return jax.jit(export.deserialize(bytearray(text)).call), json.loads(structure)
+    program, structure = trace()
+    text = json.dumps(structure).encode() + b"\n" + program.serialize()
+    try:
+        fresh = path.with_suffix(f".{os.getpid()}")
+        fresh.write_bytes(hashlib.sha256(text).digest() + text)
+        fresh.replace(path)
+        tell(f"{path.name} was {'damaged' if kept else 'not there'}: traced and written")
+    except OSError as error:
+        tell(f"{path.name} cannot be written: {error.strerror}")
+    return jax.jit(program.call), structure
+
+
+def _structure(value: Any) -> Any:
+    if value is None or isinstance(value, jax.ShapeDtypeStruct):
+        return None if value is None else 0
+    parts = getattr(value, "_asdict", lambda: vars(value))()
+    return [type(value).__module__, type(value).__name__, {name: _structure(part) for name, part in parts.items()}]
+
+
+def _filled(structure: Any, leaves: Iterator[Any]) -> Any:
+    if not isinstance(structure, list):
+        return None if structure is None else next(leaves)
+    kind = getattr(sys.modules[structure[0]], structure[1])
+    parts = {name: _filled(part, leaves) for name, part in structure[2].items()}
+    if issubclass(kind, tuple):
+        return kind(**parts)
+    made = object.__new__(kind)  # without its checks, which are for what users write
+    vars(made).update(parts)
+    return made

@@ -1,0 +1,127 @@
+"""JAX's compilation cache in the user's own folder: what commands, Python sessions and notebooks compile is kept.
+
+JAX keys its cache by program and version, but not by all that a processor can do, and a home folder may be shared by
+different machines: so every version of jaxlib and every kind of processor has a folder of its own. What lies there is
+machine code that will be run: a folder that somebody else owns or may write to is not used.
+"""
+
+import errno
+import hashlib
+import os
+import platform
+import sys
+import tempfile
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+
+class Cache(NamedTuple):
+    """Where compiled programs are kept."""
+
+    folder: Path | None
+    """None: nowhere."""
+    reason: str
+    """Who chose the folder, or why there is none."""
+    refused: bool = False
+    """Whether there is none because its folder cannot be trusted or written to."""
+
+
+def use_cache() -> Path | None:
+    """Keep what JAX compiles from one Python session to the next, in the folder that the `afm-jax` commands use.
+
+    To be called before the first computation, best before JAX is imported: on processors with AVX-512 XLA writes an
+    error to standard error for every program that it reads, which can be switched off only then. A cache that was
+    chosen before (`JAX_COMPILATION_CACHE_DIR`) or switched off (`JAX_ENABLE_COMPILATION_CACHE`) stays as it is.
+
+    Returns:
+        The folder; None where nothing is kept, with a warning if that is because the folder cannot be used.
+    """
+    silence_xla()
+    cache = open_cache()
+    if cache.refused:
+        warnings.warn(f"compiled programs are not kept: {cache.reason}", stacklevel=2)
+    return cache.folder
+
+
+def silence_xla() -> None:
+    """Keep XLA's messages off standard error, in programs started from here too, unless the user asked for them.
+
+    Its errors about "prefer-no-gather" (openxla/xla issue 44565) take tuning for a feature of the processor. It looks
+    when jaxlib is loaded, later calls change nothing.
+    """
+    # JAX itself sets 1, and so do sessions that have imported it for the programs they start
+    if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1":
+        os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
+
+
+def open_cache() -> Cache:
+    """Switch JAX's compilation cache on in the user's cache folder, unless the user has decided otherwise."""
+    import jax  # noqa: PLC0415  # packages are imported without it
+
+    enabled, chosen = (
+        getattr(jax.config, name) for name in ("jax_enable_compilation_cache", "jax_compilation_cache_dir")
+    )
+    if not enabled:
+        return Cache(None, "the compilation cache is switched off (jax_enable_compilation_cache)")
+    folder = cache_folder()
+    if chosen is not None and chosen != str(folder):
+        return Cache(Path(chosen), "chosen by jax_compilation_cache_dir")
+    try:
+        make_private(folder)
+    except OSError as error:
+        return Cache(None, f"{error.filename or folder}: {error.strerror or error}", refused=True)
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    return Cache(folder, "the user's cache folder")
+
+
+def cache_folder() -> Path:
+    """Return where programs that this jaxlib compiles on this kind of processor are kept."""
+    from jaxlib.version import __version__ as version  # noqa: PLC0415
+
+    return user_cache_folder() / f"jaxlib-{version}-{processor_key()}"
+
+
+def user_cache_folder() -> Path:
+    """Return where this platform keeps what a user's programs can do without, in a folder named afm-jax."""
+    if sys.platform == "win32":
+        base = os.environ.get("LOCALAPPDATA")
+        return Path(base) / "afm-jax" / "cache" if base else Path.home() / "AppData" / "Local" / "afm-jax" / "cache"
+    if sys.platform == "darwin":
+        return Path.home() / "Library" / "Caches" / "afm-jax"
+    base = os.environ.get("XDG_CACHE_HOME", "")
+    # The specification says that a relative path there is to be ignored.
+    return (Path(base) if Path(base).is_absolute() else Path.home() / ".cache") / "afm-jax"
+
+
+def processor_key() -> str:
+    """Return a short name of this kind of processor: equal where compiled programs are interchangeable."""
+    kind = [platform.system(), platform.machine(), platform.processor()]
+    try:
+        with Path("/proc/cpuinfo").open(encoding="utf-8", errors="replace") as file:
+            # the first processor is enough, and large machines list hundreds
+            lines = file.read(1 << 14).partition("\n\n")[0].splitlines()
+    except OSError:
+        lines = []
+    kind += [line for line in lines if line.startswith(("model name", "CPU part", "flags", "Features", "isa"))]
+    return hashlib.sha256("\n".join(kind).encode()).hexdigest()[:12]
+
+
+def make_private(folder: Path) -> None:
+    """Make a folder, and those above it that are missing, for this user alone; check it and the one above it.
+
+    Raises:
+        OSError: if it cannot be made or written to, belongs to somebody else, or others may write to it.
+    """
+    for path in reversed([path for path in (folder, *folder.parents) if not path.exists()]):
+        path.mkdir(mode=0o700, exist_ok=True)
+    for path in (folder.parent, folder) if os.name == "posix" else ():
+        found = path.stat()
+        if found.st_uid != os.geteuid():
+            raise PermissionError(errno.EPERM, "the folder belongs to another user", str(path))
+        if found.st_mode & 0o022:
+            raise PermissionError(errno.EPERM, "others may write to the folder; `chmod go-w` mends it", str(path))
+    with tempfile.TemporaryFile(dir=folder):
+        pass
