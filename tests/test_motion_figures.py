@@ -11,9 +11,10 @@ from click.testing import CliRunner
 
 from afm_jax import presets
 from afm_jax.cli.main import main
+from afm_jax.motion.observe import departures
+from afm_jax.motion.settle import follow_long
 from afm_jax.motion.start import default_start
 from afm_jax.study import motion_figures
-from afm_jax.study.long_motion import follow_long, path_of
 from afm_jax.study.motion_statements import rise_statements, section_statements, sticking_statements
 from afm_jax.study.section_survey import Growth, locked_from, survey, tangent_growth
 from afm_jax.study.slow_ramps import slow_ramps
@@ -26,26 +27,25 @@ def rising():
 
 @pytest.fixture(scope="module")
 def sticking():
-    return slow_ramps(presets.figure10_scene, ((1e-2, 1.3),))
+    # to 0.3 nm, three free periods, beyond where it sticks: only then it counts as held
+    return slow_ramps(presets.figure10_scene, ((1e-2, 1.6),))
 
 
 def holds(statements) -> list[bool]:
     return [statement.holds for statement in statements]
 
 
-def test_pieces_join_to_one_motion(monkeypatch: pytest.MonkeyPatch):
+def test_pieces_join_to_one_motion():
     scene = presets.contact_scene(1.01, 4.0, 0.0)
     start = default_start(scene)
-    monkeypatch.setattr("afm_jax.study.long_motion.CONTACTS_OF_A_PIECE", 20)
-    pieces = follow_long(scene, start, 300.0)
-    monkeypatch.setattr("afm_jax.study.long_motion.CONTACTS_OF_A_PIECE", 400)
-    whole = follow_long(scene, start, 300.0)
-    assert len(pieces.pieces) >= 3
-    assert len(whole.pieces) == 1
+    runs = [follow_long(scene, start, 300.0 - float(start.time_us), piece_contacts=count) for count in (20, 400)]
+    assert runs[0].pieces >= 3
+    assert runs[1].pieces == 1
+    pieces, whole = (departures(scene, run.simulation) for run in runs)
     # a stable orbit: the same contacts, counted once, each to the accuracy of 1e-9
     np.testing.assert_allclose(pieces.departure_time_us, whole.departure_time_us, rtol=1e-9)
     np.testing.assert_allclose(pieces.peak_height_nm[:-1], whole.peak_height_nm[:-1], rtol=1e-7)
-    times, heights = path_of(whole)
+    times, heights = whole.path()
     assert np.all(np.diff(times) >= 0.0)
     # 24 points a flight miss its top by up to (pi/46)^2/2
     assert heights.max() == pytest.approx(np.nanmax(whole.peak_height_nm), rel=3e-3)
@@ -105,7 +105,8 @@ def test_tangents_grow_as_neighbours_part():
 
     ends = []
     for velocity in (80.0, 80.0 + 1e-7):
-        motion = follow_long(scene, start_of(scene, presets.figure8_start(velocity)), 60.0)
+        run = follow_long(scene, start_of(scene, presets.figure8_start(velocity)), 60.0, piece_contacts=400)
+        motion = departures(scene, run.simulation)
         ends.append(motion.departure_time_us[:8] * float(scene.platform.angular_frequency))
     parted = np.abs(ends[1] - ends[0])
     mean = np.log(parted[7] / parted[0]) / 7.0

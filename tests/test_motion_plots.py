@@ -18,10 +18,7 @@ from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start, state
-from afm_jax.plots import motion_spectrum
-from afm_jax.plots.motion import draw_motion
-from afm_jax.plots.motion_spectrum import spectrum_of
-from afm_jax.plots.motion_window import look_at
+from afm_jax.plots.motion import draw_motion, draw_spectrum, look_at, spectrum_of
 
 ALL = ["time_course.png", "spectrum.png", "gap.png", "poincare.png", "force_gap.png"]
 
@@ -113,8 +110,8 @@ def test_the_line_at_half_the_drive_is_that_of_the_orbit(every_other_period):
 
 def test_subharmonics_of_the_drive_are_marked(every_other_period, monkeypatch: pytest.MonkeyPatch):
     drawn = []
-    monkeypatch.setattr(motion_spectrum, "save", lambda picture, _: drawn.append(picture))
-    motion_spectrum.draw_spectrum(look_at(*every_other_period), Path())
+    monkeypatch.setattr("afm_jax.plots.motion.save", lambda picture, _: drawn.append(picture))
+    draw_spectrum(look_at(*every_other_period), Path())
     (axes,) = drawn[0].axes
     labels = [text.get_text() for text in axes.get_legend().get_texts()]
     assert "subharmonics, drive/2" in labels

@@ -8,9 +8,9 @@ import pytest
 from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, single_impact_orbits
 from afm_jax.apparatus.drive import Tone
 from afm_jax.apparatus.excitation import BaseDrive
-from afm_jax.motion.observables import Observables, observe
-from afm_jax.motion.poincare_section import poincare_section, strobe
-from afm_jax.motion.settle import LongRun, close_periods, find_repetition, follow_long, settled
+from afm_jax.motion.drive_period import drive_of
+from afm_jax.motion.observe import Observables, observe, poincare_section, strobe
+from afm_jax.motion.settle import LongRun, close_periods, find_repetition, follow_long, last_fifth, settled
 from afm_jax.motion.start import default_start, start_of, state
 from afm_jax.presets import contact_scene, figure10_scene, figure11_scene
 
@@ -70,6 +70,15 @@ def test_chaos_does_not_repeat():
         x.append(3.9 * x[-1] * (1.0 - x[-1]))
     times = 2.0 * np.arange(len(x)) + 0.3 * np.array(x)
     assert find_repetition(times, 40.0 + np.array(x), 2.0, tolerance=1e-4) is None
+
+
+def test_the_last_fifth_has_whole_periods():
+    drive = drive_of(law_scene())
+    for periods, whole in ((400.0, 80), (60.0, 12), (3.0, 1)):
+        window = last_fifth(0.0, periods * drive.period_us, drive)
+        assert window.responses == whole
+        np.testing.assert_allclose(window.from_us, (periods - whole) * drive.period_us, rtol=1e-12)
+    assert last_fifth(0.0, 2.0, drive) == (1.6, 2.0, 1, 0)
 
 
 def test_newton_closes_a_map_and_knows_its_slopes():

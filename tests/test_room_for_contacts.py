@@ -51,3 +51,11 @@ def test_room_that_was_told_is_not_exceeded():
     found = simulate(SCENE, state(0.0, START_NM, 0.0), 100.0, max_contacts=38)
     assert int(found.outcome) == MotionOutcome.CONTACT_LIMIT
     assert int(found.count) == found.contacts.kind.shape[0] == 38
+
+
+def test_durations_share_a_program(bounced):
+    shorter = simulate(SCENE, state(0.0, START_NM, 0.0), 97.0)
+    room = shorter.contacts.kind.shape[0]
+    assert room == bounced.contacts.kind.shape[0]
+    # a power of two
+    assert room & (room - 1) == 0

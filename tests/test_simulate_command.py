@@ -10,6 +10,7 @@ from click.testing import CliRunner, Result
 
 from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, save_scene, single_impact_orbits
 from afm_jax.cli.main import main
+from afm_jax.motion.motion_pieces import pieces_between
 from afm_jax.scenefile import Start
 from tests.fresh_python import python
 
@@ -33,9 +34,15 @@ def nulls(value: object, name: str = "") -> set[str]:
     return {key for key, item in value.items() if item is None} if isinstance(value, dict) else {name}
 
 
-def test_without_a_duration_it_ends_when_settled(law_file: Path, tmp_path: Path):
+def test_without_a_duration_it_ends_when_settled(law_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    worked_out = []
+    monkeypatch.setattr(
+        "afm_jax.motion.trajectory.pieces_between", lambda *where: worked_out.append(where) or pieces_between(*where)
+    )
     result = simulate(law_file, "--json", "--out", tmp_path / "out", "--harmonics", "1,3")
     assert result.exit_code == 0, result.stderr
+    # observables, files and pictures look at one path
+    assert len(worked_out) == 1
     answer = json.loads(result.stdout)
     assert answer.keys() >= KEYS
     assert nulls(answer) == answer["null_reasons"].keys()

@@ -13,9 +13,9 @@ METHODS = ("collocation", "diffrax")
 
 if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
-    from afm_jax.motion.observables import Observables
     from afm_jax.motion.record import State
     from afm_jax.motion.settle import LongRun
+    from afm_jax.motion.trajectory import DensePath
 
 DEFAULT_PERIODS = 2000
 """Drive periods followed at most where no duration is given."""
@@ -102,6 +102,7 @@ def command(  # noqa: PLR0913
     session.start_computing()
     from afm_jax.cli.scene_argument import scene_and_start  # noqa: PLC0415
     from afm_jax.motion.drive_period import drive_of  # noqa: PLC0415
+    from afm_jax.motion.observe import observe  # noqa: PLC0415
     from afm_jax.motion.start import start_of  # noqa: PLC0415
 
     loaded, told = scene_and_start(scene)
@@ -112,7 +113,10 @@ def command(  # noqa: PLR0913
     settings = {"accuracy": accuracy, "method": method, "until_settled": until_settled}
     try:
         _check_ramp(loaded, longest)
-        run, seen = _follow(session, loaded, start, longest, harmonics, settings)
+        run = _follow(session, loaded, start, longest, settings)
+        with session.working("reading amplitudes"):
+            dense = _dense(loaded, run, to_files=session.out is not None)
+            seen = observe(loaded, run.simulation, harmonics=harmonics, verdict=run.verdict, dense=dense)
     except ValueError as error:
         raise ValueError(f"{scene}: {error}") from error
     from afm_jax.cli.simulate_output import payload_of, text_of, write_files  # noqa: PLC0415
@@ -126,8 +130,8 @@ def command(  # noqa: PLR0913
     }
     payload = payload_of(loaded, run, seen, settings)
     if session.out is not None:
-        write_files(session, loaded, run, seen, payload)
-        _draw(session, loaded, run)
+        write_files(session, run, seen, dense, payload)
+        _draw(session, loaded, run, dense)
     session.emit(payload, *text_of(payload))
     if not payload["valid"]:
         raise NotValid(payload["outcome"])
@@ -153,11 +157,9 @@ def _follow(
     scene: "Scene",
     start: "State | None",
     longest_us: float,
-    harmonics: tuple[int, ...],
     settings: dict[str, Any],
-) -> "tuple[LongRun, Observables]":
-    """Return the simulation and what is read of it; progress of long runs goes to standard error."""
-    from afm_jax.motion.observables import observe  # noqa: PLC0415
+) -> "LongRun":
+    """Return the simulation; progress of long runs goes to standard error."""
     from afm_jax.motion.settle import follow_long  # noqa: PLC0415
     from afm_jax.motion.start import default_start  # noqa: PLC0415
 
@@ -175,8 +177,24 @@ def _follow(
         run = follow_long(scene, start, longest_us, report=report, **settings)
     if int(run.simulation.outcome) == _invalid_start():
         raise ValueError("the tip cannot start there: the start is not finite, or inside the sample")
-    with session.working("reading amplitudes"):
-        return run, observe(scene, run.simulation, harmonics=harmonics, verdict=run.verdict)
+    return run
+
+
+def _dense(scene: "Scene", run: "LongRun", *, to_files: bool) -> "DensePath":
+    """Return the tip over all that is read, written and drawn of it: its contacts are integrated once more, once."""
+    from afm_jax.motion.settle import window_of  # noqa: PLC0415
+    from afm_jax.motion.trajectory import dense_path  # noqa: PLC0415
+
+    window = window_of(scene, run.simulation, run.verdict)
+    stretches = [(window.from_us, window.to_us)]
+    if to_files:
+        from afm_jax.cli.simulate_output import stretch_written  # noqa: PLC0415
+        from afm_jax.plots.motion import stretch_drawn  # noqa: PLC0415
+
+        stretches.append(stretch_written(run.simulation, window))
+        stretches.append(stretch_drawn(scene, run.simulation, run.verdict))
+    begin, end = zip(*stretches, strict=True)
+    return dense_path(scene, run.simulation, min(begin), max(end))
 
 
 def _invalid_start() -> int:
@@ -185,11 +203,11 @@ def _invalid_start() -> int:
     return int(MotionOutcome.INVALID_START)
 
 
-def _draw(session: Session, scene: "Scene", run: "LongRun") -> None:
+def _draw(session: Session, scene: "Scene", run: "LongRun", dense: "DensePath") -> None:
     """Draw the pictures of a simulation."""
     if session.out is None:
         return
     from afm_jax.plots.motion import draw_motion  # noqa: PLC0415
 
-    for path in draw_motion(scene, run.simulation, session.out):
+    for path in draw_motion(scene, run.simulation, session.out, verdict=run.verdict, dense=dense):
         session.note(f"wrote {path}")

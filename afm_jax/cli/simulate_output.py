@@ -9,10 +9,10 @@ import numpy as np
 from afm_jax.apparatus.scene import Scene
 from afm_jax.cli.session import Session
 from afm_jax.contact.phases import Phase
-from afm_jax.motion.observables import Harmonic, Observables
+from afm_jax.motion.observe import Harmonic, Observables
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation
-from afm_jax.motion.settle import LongRun
-from afm_jax.motion.trajectory import dense_path
+from afm_jax.motion.settle import LongRun, Window
+from afm_jax.motion.trajectory import DensePath
 from afm_jax.scenefile import scene_tables
 from afm_jax.strict_json import strict_json
 
@@ -135,13 +135,15 @@ def text_of(payload: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def write_files(session: Session, scene: Scene, run: LongRun, seen: Observables, payload: Mapping[str, Any]) -> None:
+def write_files(
+    session: Session, run: LongRun, seen: Observables, dense: DensePath, payload: Mapping[str, Any]
+) -> None:
     """Write contacts.csv, trajectory.csv and simulate.json into the `--out` folder."""
     if session.out is None:
         return
     rows, columns = contact_rows(run.simulation)
     session.write_table("contacts.csv", rows, columns)
-    rows, columns = trajectory_rows(scene, run.simulation, seen)
+    rows, columns = trajectory_rows(dense, *stretch_written(run.simulation, seen.window))
     session.write_table("trajectory.csv", rows, columns)
     path = session.out / "simulate.json"
     path.write_text(strict_json(payload) + "\n", encoding="utf-8")
@@ -165,14 +167,16 @@ def contact_rows(simulation: Simulation) -> tuple[list[dict[str, Any]], list[str
     return rows, list(lists)
 
 
-def trajectory_rows(scene: Scene, simulation: Simulation, seen: Observables) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return the tip in time: all of a short simulation, else the window of the observables; dense in contacts."""
+def stretch_written(simulation: Simulation, window: Window) -> tuple[float, float]:
+    """Return from when to when, in us, the tip is written down: a short simulation, else the window of observables."""
     first, last = float(simulation.start.time_us), float(simulation.final.time_us)
-    window = seen.window
     period = (window.to_us - window.from_us) / max(window.periods * window.responses, 1)
     short = last - first <= _WHOLE_PERIODS * period
-    begin, end = (first, last) if short else (window.from_us, window.to_us)
-    dense = dense_path(scene, simulation, begin, end)
+    return (first, last) if short else (window.from_us, window.to_us)
+
+
+def trajectory_rows(dense: DensePath, begin: float, end: float) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return the tip between two times in us as rows, and their columns; dense in contacts."""
     inner, _ = dense.nodes(begin, end)
     # a tip that is held rings through the whole stretch
     inner = inner[:: math.ceil((inner.size + 1) / _MOST_NODES)]

@@ -1,5 +1,11 @@
-"""A simulation in pieces that follow each other: flights, steps of contacts, rests on the surface of a law."""
+"""A simulation in pieces that follow each other: flights, steps of contacts, rests on the surface of a law.
 
+Instead of its steps a contact may have the straight lines between the points that a simulation keeps of it: bridge
+formed, junction formed, deepest, junction broken, bridge broken. Short against the drive period, it then costs no
+second integration, and whatever is read of it is a smooth function of the simulation's numbers.
+"""
+
+from itertools import pairwise
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -11,12 +17,13 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Driven, Place, driven_by
+from afm_jax.contact.junction import find_junction
 from afm_jax.contact.phases import Phase
 from afm_jax.motion.contact_path import contact_steps
 from afm_jax.motion.frames import to_gap
 from afm_jax.motion.record import ContactKind, Simulation, State
 
-FLIGHT, REST = -1, -2
+FLIGHT, REST, STRAIGHT = -1, -2, -3
 
 
 class Pieces(NamedTuple):
@@ -25,7 +32,7 @@ class Pieces(NamedTuple):
     begin_us: np.ndarray
     end_us: np.ndarray
     kind: np.ndarray
-    """`FLIGHT`, `REST`, or the phase of a step of a contact."""
+    """`FLIGHT`, `REST`, `STRAIGHT`, or the phase of a step of a contact."""
     origin_us: np.ndarray
     """Time at which the tip has the place that follows."""
     x: np.ndarray
@@ -40,15 +47,22 @@ class World(NamedTuple):
     surface: Platform | Surface
     response: Surface | None
     driven: Driven | None
-    """None for a law, or without an interaction."""
+    """None for a law, without an interaction, and where contacts are not integrated once more."""
+    kept_gaps: tuple[float, ...] | None = None
+    """Where they are not: gaps in nm at which the bridge forms, the junction forms and breaks, the bridge breaks."""
 
     @classmethod
-    def of(cls, scene: Scene) -> "World":
-        """Return what is the same at all times of a scene."""
+    def of(cls, scene: Scene, *, integrated: bool = True) -> "World":
+        """Return what is the same at all times of a scene, its contacts integrated once more or straight."""
         surface, response = surface_of(scene)
-        resolved = isinstance(scene.interaction, Contact)
-        driven = driven_by(scene.interaction, scene.cantilever, surface) if resolved else None
-        return cls(scene.cantilever, surface, response, driven)
+        contact = scene.interaction
+        if not isinstance(contact, Contact):
+            return cls(scene.cantilever, surface, response, None)
+        if integrated:
+            return cls(scene.cantilever, surface, response, driven_by(contact, scene.cantilever, surface))
+        junction = find_junction(contact)
+        gaps = (contact.bridge_forms_nm, junction.forms_gap_nm, junction.breaks_gap_nm, contact.bridge_breaks_nm)
+        return cls(scene.cantilever, surface, response, None, tuple(float(gap) for gap in gaps))
 
     def gaps(self, times: Any, positions: Any, velocities: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return gaps and their rates of places in the lab."""
@@ -136,11 +150,15 @@ def pieces_between(world: World, simulation: Simulation, low: float, high: float
 
 
 def _contact_pieces(world: World, simulation: Simulation, rows: np.ndarray, high: float) -> list[tuple[float, ...]]:
-    """Return the pieces of some contacts: their steps, or rests on the surface of a law."""
+    """Return the pieces of some contacts: their steps, their straight lines, or rests on the surface of a law."""
     contacts, last = simulation.contacts, float(simulation.final.time_us)
     arrival = np.asarray(contacts.arrival_time_us)[rows]
+    stops = np.minimum(np.asarray(contacts.departure_time_us)[rows], last)
+    if world.kept_gaps is not None:
+        ends = zip(rows.tolist(), stops.tolist(), strict=True)
+        corners = [_corners(simulation, row, end, world.kept_gaps) for row, end in ends]
+        return [piece for each in corners for piece in _straight_pieces(each)]
     if world.driven is None:
-        stops = np.minimum(np.asarray(contacts.departure_time_us)[rows], last)
         return [(begin, end, float(REST), begin, 0.0, 0.0) for begin, end in zip(arrival, stops, strict=True)]
     if not rows.size:
         return []
@@ -153,3 +171,26 @@ def _contact_pieces(world: World, simulation: Simulation, rows: np.ndarray, high
     steps = contact_steps(world.driven, begin, np.full(rows.shape, int(Phase.BRIDGE)), high)
     columns = (steps.begin_us, steps.end_us, steps.phase, steps.begin_us, steps.x, steps.rate)
     return list(zip(*(column.astype(float).tolist() for column in columns), strict=True))
+
+
+def _corners(simulation: Simulation, row: int, stops_us: float, gaps: tuple[float, ...]) -> list[tuple[float, float]]:
+    """Return the times and gaps that a simulation keeps of a contact."""
+    rows = simulation.contacts
+    detail, arrival = rows.detail, float(rows.arrival_time_us[row])
+    assert detail is not None  # contacts that are resolved have details  # noqa: S101
+    bridge_forms, junction_forms, junction_breaks, bridge_breaks = gaps
+    deepest, forms, breaks = (
+        float(column[row]) for column in (detail.deepest_gap_nm, detail.junction_forms_us, detail.junction_breaks_us)
+    )
+    middle = [(0.5 * (arrival + stops_us), deepest)]
+    if int(detail.junctions[row]) and arrival < forms < breaks < stops_us:
+        middle = [(forms, junction_forms), (0.5 * (forms + breaks), deepest), (breaks, junction_breaks)]
+    return [(arrival, bridge_forms), *middle, (stops_us, bridge_breaks)]
+
+
+def _straight_pieces(corners: list[tuple[float, float]]) -> list[tuple[float, ...]]:
+    return [
+        (begin, end, float(STRAIGHT), begin, gap, (next_gap - gap) / (end - begin))
+        for (begin, gap), (end, next_gap) in pairwise(corners)
+        if end > begin
+    ]

@@ -39,6 +39,9 @@ _PIECE_PERIODS = 256
 """Periods of the fastest motion in a piece."""
 _ROOM = 1040
 """Contacts in a piece: four for every period, as `simulate` reckons."""
+_ROUNDS = 20_000
+"""Of a piece that ends with its contacts: a held tip takes a round every 60 steps of its oscillation; a free one does
+not come near this many."""
 _LITTLE = 1.001
 """What is left is followed with the piece before, if it is next to nothing."""
 _HELD_LONG_ENOUGH = 12.0
@@ -412,17 +415,19 @@ def why_over(piece: Piece) -> str | None:
     return f"the sample captures the tip (at {held_since(piece.motion):.4g} us)" if piece.stuck else None
 
 
-def follow_long(
+def follow_long(  # noqa: PLR0913
     scene: Scene,
     start: State,
     duration_us: float,
     *,
     until_settled: bool = False,
+    enough: Callable[[Simulation], bool] = lambda _: False,
+    piece_contacts: int | None = None,
     accuracy: float = DEFAULT_ACCURACY,
     method: str = "collocation",
     report: Callable[[float, int], None] | None = None,
 ) -> LongRun:
-    """Return a scene followed for a duration, or until it has settled if that is earlier.
+    """Return a scene followed for a duration, or until it has settled or is enough if that is earlier.
 
     Args:
         scene: one scene, its numbers known.
@@ -430,6 +435,8 @@ def follow_long(
         duration_us: the longest duration.
         until_settled: end with the piece in which the motion has settled, or some periods after the sample has come to
             hold the tip.
+        enough: asked after every piece of the motion so far: whether to stop.
+        piece_contacts: contacts of a piece; None: what some periods of the fastest motion have room for.
         accuracy: of `simulate`.
         method: of `simulate`.
         report: called after every piece with the time reached in us and the number of contacts so far.
@@ -439,18 +446,19 @@ def follow_long(
     """
     surface, _ = surface_of(scene)
     fastest = max(float(scene.cantilever.angular_frequency), float(surface.fastest_angular_frequency))
-    piece_us = _PIECE_PERIODS * 2.0 * math.pi / fastest
+    piece_us = _PIECE_PERIODS * 2.0 * math.pi / fastest if piece_contacts is None else math.inf
 
     def run(state: State, length_us: float) -> Simulation:
-        room = _ROOM if length_us <= piece_us * _LITTLE else None
-        return simulate(scene, state, length_us, max_contacts=room, accuracy=accuracy, method=method)
+        room = (piece_contacts or _ROOM) if length_us <= piece_us * _LITTLE else None
+        rounds = None if piece_contacts is None else _ROUNDS
+        return simulate(scene, state, length_us, max_contacts=room, accuracy=accuracy, method=method, max_rounds=rounds)
 
     count, pieces, whole, verdict = 0, [], None, None
     for found in follow_in_pieces(scene, start, float(start.time_us) + duration_us, run, piece_us=piece_us):
         piece = found
         if until_settled and found.stuck:
-            enough = _end_of_held(scene, found.motion) - float(found.motion.start.time_us)
-            piece = found._replace(motion=run(found.motion.start, min(found.length_us, enough)))
+            shown_us = _end_of_held(scene, found.motion) - float(found.motion.start.time_us)
+            piece = found._replace(motion=run(found.motion.start, min(found.length_us, shown_us)))
         count, pieces = count + 1, [*(done for done in pieces if done.goes_on), piece]
         whole = joined(pieces)
         if report is not None:
@@ -459,6 +467,9 @@ def follow_long(
             verdict = settled(scene, whole)
             if verdict.settled or piece.stuck:
                 break
+        if enough(whole):
+            verdict = None
+            break
     assert whole is not None  # there is one piece at least  # noqa: S101
     return LongRun(whole, settled(scene, whole) if verdict is None else verdict, count)
 

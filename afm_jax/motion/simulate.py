@@ -26,6 +26,7 @@ from afm_jax.parameters import check_parameter, is_traced, require_float64
 DEFAULT_ACCURACY = 1e-9
 _ROUNDS_PER_CONTACT = 4
 _SPARE_ROUNDS = 64
+_CONTACTS_PER_PERIOD = 4.0
 _MORE_ROOM = 4
 _MOST_CONTACTS = 1 << 20
 """Contacts for which room is made unasked: with a resolved contact 100 MB."""
@@ -119,11 +120,15 @@ def _is_full(found: Simulation) -> bool:
 
 
 def _room(scene: Scene, surface: Platform | Surface, duration_us: ArrayLike) -> int:
-    """Return how many contacts a duration may hold: four for every period of the fastest motion."""
+    """Return how many contacts a duration may hold: four for every period of the fastest motion.
+
+    Filled up to a power of two: few sizes, so that a program serves many durations.
+    """
     fastest = jnp.maximum(scene.cantilever.angular_frequency, surface.fastest_angular_frequency)
     if is_traced(fastest) or is_traced(duration_us):
         raise ValueError("`max_contacts` must be given where frequencies or the duration are traced")
-    return 16 + math.ceil(4.0 * float(jnp.max(jnp.asarray(duration_us) * fastest)) / (2.0 * math.pi))
+    periods = float(jnp.max(jnp.asarray(duration_us) * fastest)) / (2.0 * math.pi)
+    return 1 << (15 + math.ceil(_CONTACTS_PER_PERIOD * periods)).bit_length()
 
 
 def _check_contact(scene: Scene, surface: Platform | Surface, response: Surface | None, start: State) -> None:

@@ -1,7 +1,8 @@
 """Dense output: where the tip is at any time of a simulation, worked out on request.
 
 A simulation keeps its contacts. Between them the flight is a closed form; the contacts asked for are integrated once
-more, step by step, and a place inside a step is one step of order 8 from its beginning.
+more, step by step, and a place inside a step is one step of order 8 from its beginning. Where contacts need not be
+known so well they may be straight between the points that the simulation keeps of them.
 """
 
 import math
@@ -22,7 +23,7 @@ from afm_jax.contact.junction import Junction
 from afm_jax.contact.phases import Phase, force_in_phase
 from afm_jax.motion.contact_path import places_at
 from afm_jax.motion.frames import to_lab
-from afm_jax.motion.motion_pieces import FLIGHT, REST, Pieces, World, pieces_between
+from afm_jax.motion.motion_pieces import FLIGHT, REST, STRAIGHT, Pieces, World, pieces_between
 from afm_jax.motion.record import Simulation, State
 
 _NODES_PER_STEP = 8
@@ -47,7 +48,7 @@ class Trajectory(NamedTuple):
 
 
 class DensePath(NamedTuple):
-    """The tip over a stretch of time, its contacts integrated once more, once for all times that are asked for."""
+    """The tip over a stretch of time, its contacts worked out once for all times that are asked for."""
 
     scene: Scene
     simulation: Simulation
@@ -69,12 +70,16 @@ class DensePath(NamedTuple):
         kind = pieces.kind[place]
         flown = _flown(world.cantilever, world.surface, *(part[place] for part in _starts(pieces)), times)
         gap, rate = (np.where(kind == FLIGHT, np.asarray(part), 0.0) for part in flown)
+        straight = kind == STRAIGHT
+        line = pieces.x[place] + pieces.rate[place] * (times - pieces.origin_us[place])
+        gap, rate = np.where(straight, line, gap), np.where(straight, pieces.rate[place], rate)
         touching = kind >= 0
         if touching.any():
             count = int(touching.sum())
             found = _in_contact(world, pieces, _padded(place[touching]), _padded(times[touching]))
             gap[touching], rate[touching] = (part[:count] for part in found)
         phase = np.where(kind == FLIGHT, int(Phase.DRY), np.where(kind == REST, int(Phase.JUNCTION), kind))
+        phase = np.where(straight, int(Phase.BRIDGE), phase)
         lab = _in_lab(world.surface, world.response, times, gap, rate)
         force = np.zeros(times.shape)
         if world.driven is not None:
@@ -101,7 +106,9 @@ class DensePath(NamedTuple):
         return np.concatenate(times), np.concatenate(weights)
 
 
-def dense_path(scene: Scene, simulation: Simulation, from_us: float, to_us: float) -> DensePath:
+def dense_path(
+    scene: Scene, simulation: Simulation, from_us: float, to_us: float, *, integrated: bool = True
+) -> DensePath:
     """Return the tip over a stretch of time, to be asked for times and nodes as often as wanted.
 
     A tip that is held is integrated from the beginning of its contact: a second time would cost as much again.
@@ -111,12 +118,14 @@ def dense_path(scene: Scene, simulation: Simulation, from_us: float, to_us: floa
         simulation: of one scene, not of a batch.
         from_us: beginning of the stretch.
         to_us: its end.
+        integrated: integrate contacts once more; else they are straight between the points that the simulation keeps
+            of them, and have no force.
 
     Raises:
         ValueError: if a time lies outside the simulation, or the simulation is a batch.
     """
     _check(simulation, np.array([from_us, to_us]))
-    world = World.of(scene)
+    world = World.of(scene, integrated=integrated)
     return DensePath(scene, simulation, world, pieces_between(world, simulation, from_us, to_us))
 
 

@@ -1,18 +1,64 @@
 """Pictures of a simulated motion: its course in time, its contacts, its Poincare section and its spectrum."""
 
 from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from matplotlib.axes import Axes
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.contact import Contact
-from afm_jax.motion.record import Simulation
-from afm_jax.plots.motion_contacts import draw_force_gap, draw_gap
-from afm_jax.plots.motion_course import draw_course
-from afm_jax.plots.motion_section import draw_section
-from afm_jax.plots.motion_spectrum import draw_spectrum
-from afm_jax.plots.motion_window import look_at
+from afm_jax.contact.junction import find_junction
+from afm_jax.contact.phases import Phase
+from afm_jax.motion.drive_period import Drive, drive_of
+from afm_jax.motion.observe import peaks_between_contacts, poincare_section
+from afm_jax.motion.record import ContactKind, Contacts, Simulation
+from afm_jax.motion.settle import Settled, settled, window_of
+from afm_jax.motion.trajectory import DensePath, Trajectory, dense_path
+from afm_jax.plots.picture_style import (
+    ACCENT,
+    BLUE,
+    DARK,
+    GRID,
+    label_axes,
+    new_figure,
+    save,
+    with_zero_line,
+)
+
+_CONTACTS_SHOWN = 6
+_PERIODS_SHOWN = 6.0
+"""Of the slower of drive and free vibration, where there are no contacts."""
+_POINTS = 3000
+_BESIDE_US = 1e-7
+"""How far before and after a jump its two sides are looked at."""
+_LONGEST_HELD = 4.0
+"""Drive periods of a held tip that are shown: it is integrated step by step."""
+_MANY = 12
+"""Contacts from which on the peaks of all flights are shown besides."""
+_GAP_PANELS = 3
+_GAP_SHOWN_NM = 6.0
+_CURVES = 3
+_STROKES = ((GRID, 5.0), (BLUE, 3.2), ("black", 1.4))
+"""Wide below narrow, so that loops that coincide all show."""
+_SIDE = {"bridge breaks": "center", "bridge forms": "center", "junction breaks": "bottom", "junction forms": "top"}
+_MOST_PERIODS = 60
+"""Of the drive; each contact in them is integrated once more."""
+_SAMPLES_PER_PERIOD = 32
+_HIGHEST = 8.0
+"""Multiples of the response frequency, or of the impacts' near twice the free one, that are shown at least."""
+_DECADES = 1e-6
 
 
-def draw_motion(scene: Scene, simulation: Simulation, folder: Path) -> list[Path]:
+def draw_motion(
+    scene: Scene,
+    simulation: Simulation,
+    folder: Path,
+    *,
+    verdict: Settled | None = None,
+    dense: DensePath | None = None,
+) -> list[Path]:
     """Draw what there is to see of a motion, as PNG files.
 
     Always the time course and the spectrum; with contacts the gap and the Poincare section, and of resolved contacts
@@ -22,6 +68,8 @@ def draw_motion(scene: Scene, simulation: Simulation, folder: Path) -> list[Path
         scene: the scene that was simulated.
         simulation: of one scene, not of a batch.
         folder: exists and can be written to.
+        verdict: what `settled` said, if it is known already.
+        dense: the tip over all that is drawn (`stretch_drawn`), if it is known already.
 
     Returns:
         The files, in the order above.
@@ -29,7 +77,7 @@ def draw_motion(scene: Scene, simulation: Simulation, folder: Path) -> list[Path
     Raises:
         ValueError: if the simulation is a batch, or did not get beyond its start.
     """
-    look = look_at(scene, simulation)
+    look = look_at(scene, simulation, verdict=verdict, dense=dense)
     drawings = {"time_course": draw_course, "spectrum": draw_spectrum}
     if look.touched:
         drawings |= {"gap": draw_gap}
@@ -41,3 +89,418 @@ def draw_motion(scene: Scene, simulation: Simulation, folder: Path) -> list[Path
         draw(look, path)
         files.append(path)
     return files
+
+
+class Responses(NamedTuple):
+    """The last response periods of a motion, whole ones where it is long enough."""
+
+    repeats: bool
+    response_us: float
+    """N drive periods; one where nothing repeats."""
+    periods: int
+    """Response periods in the stretch."""
+    from_us: float
+    to_us: float
+
+
+def _responses_shown(scene: Scene, simulation: Simulation, verdict: Settled, to_us: float) -> Responses:
+    """Return the response periods that the spectrum is made of, of a tip that is held until `to_us`."""
+    drive = drive_of(scene)
+    repeats = verdict.settled and not verdict.stuck
+    response = (verdict.periods or 1) * drive.period_us if repeats else drive.period_us
+    first, last = float(simulation.start.time_us), float(simulation.final.time_us)
+    if repeats:
+        last = window_of(scene, simulation, verdict, drive).to_us
+    elif verdict.stuck:
+        last = to_us
+    # only what has settled repeats: the last fifth at most
+    room = (last - first) * (0.2 if repeats and verdict.contacts else 0.8)
+    periods = int(np.clip(room / response, 1, max(1, _MOST_PERIODS // (verdict.periods or 1))))
+    return Responses(repeats, response, periods, last - min(periods * response, last - first), last)
+
+
+class Look(NamedTuple):
+    """A simulation and the stretch of it that is shown."""
+
+    scene: Scene
+    simulation: Simulation
+    drive: Drive
+    responses: Responses
+    """What the spectrum is made of."""
+    from_us: float
+    to_us: float
+    dense: DensePath
+    """Over the stretch and the responses."""
+    path: Trajectory
+    """Over the stretch, fine enough for its contacts."""
+    used: Bool[np.ndarray, " rows"]
+    """Which rows of the table of contacts are contacts."""
+
+    @property
+    def contacts(self) -> Contacts:
+        """The table of contacts."""
+        return self.simulation.contacts
+
+    def between(self, from_us: float, to_us: float) -> Trajectory:
+        """Return the part of the path between two times."""
+        inside = (self.path.time_us >= from_us) & (self.path.time_us <= to_us)
+        return Trajectory(*(column[inside] for column in self.path))
+
+    @property
+    def touched(self) -> bool:
+        """Whether the tip ever met the sample."""
+        return bool(self.used.any())
+
+    @property
+    def left(self) -> bool:
+        """Whether the tip ever left it again."""
+        return bool(np.isfinite(self.departure_us).any())
+
+    @property
+    def arrival_us(self) -> Float[np.ndarray, " contacts"]:
+        """When each contact began."""
+        return np.asarray(self.contacts.arrival_time_us)[self.used]
+
+    @property
+    def departure_us(self) -> Float[np.ndarray, " contacts"]:
+        """When each contact ended; infinite where it did not."""
+        return np.asarray(self.contacts.departure_time_us)[self.used]
+
+
+def look_at(
+    scene: Scene, simulation: Simulation, *, verdict: Settled | None = None, dense: DensePath | None = None
+) -> Look:
+    """Return the last contacts of a motion, or its last periods, ready to be drawn.
+
+    Args:
+        scene: the scene that was simulated.
+        simulation: of one scene.
+        verdict: what `settled` said, if it is known already.
+        dense: the tip over all that is drawn (`stretch_drawn`), if it is known already.
+
+    Raises:
+        ValueError: if the simulation is a batch, or did not get beyond its start.
+    """
+    begin, end = _course_shown(scene, simulation)
+    verdict = settled(scene, simulation) if verdict is None else verdict
+    responses = _responses_shown(scene, simulation, verdict, end)
+    if dense is None:
+        dense = dense_path(scene, simulation, *_both((begin, end), responses))
+    rows = simulation.contacts
+    used = np.asarray(rows.kind) != ContactKind.NONE
+    times = np.linspace(begin, end, _POINTS)
+    if used.any():
+        times = np.union1d(times, dense.nodes(begin, end)[0])
+        edges = _edges(rows, used)
+        edges = edges[(edges > begin + _BESIDE_US) & (edges < end - _BESIDE_US)]
+        times = np.union1d(times, np.concatenate([edges - _BESIDE_US, edges, edges + _BESIDE_US]))
+    return Look(scene, simulation, drive_of(scene), responses, begin, end, dense, dense.at(times), used)
+
+
+def stretch_drawn(scene: Scene, simulation: Simulation, verdict: Settled) -> tuple[float, float]:
+    """Return beginning and end, in us, of all that is drawn of a motion: what has to be known of its contacts.
+
+    Args:
+        scene: the scene that was simulated.
+        simulation: of one scene.
+        verdict: what `settled` said.
+
+    Raises:
+        ValueError: if the simulation is a batch, or did not get beyond its start.
+    """
+    course = _course_shown(scene, simulation)
+    return _both(course, _responses_shown(scene, simulation, verdict, course[1]))
+
+
+def _both(course: tuple[float, float], responses: Responses) -> tuple[float, float]:
+    return min(course[0], responses.from_us), max(course[1], responses.to_us)
+
+
+def _course_shown(scene: Scene, simulation: Simulation) -> tuple[float, float]:
+    """Return beginning and end, in us, of the last contacts of a motion, or of its last periods."""
+    if np.ndim(simulation.count):
+        raise ValueError("a picture is of one simulation: pick one of the batch")
+    first, last = float(simulation.start.time_us), float(simulation.final.time_us)
+    if not last > first:
+        raise ValueError("the simulation did not get beyond its start: there is nothing to draw")
+    drive, rows = drive_of(scene), simulation.contacts
+    used = np.asarray(rows.kind) != ContactKind.NONE
+    arrival, departure = np.asarray(rows.arrival_time_us)[used], np.asarray(rows.departure_time_us)[used]
+    period = max(drive.period_us, 1e3 / float(scene.cantilever.frequency_khz))
+    end, begin = last, last - _PERIODS_SHOWN * period
+    if used.any():
+        if not np.isfinite(departure[-1]):
+            end = min(last, float(arrival[-1]) + _LONGEST_HELD * period)
+        shown = float(arrival[-min(_CONTACTS_SHOWN, arrival.size)])
+        begin = min(shown - 0.3 * period, end - 2.0 * period)
+    return max(begin, first), end
+
+
+def _edges(rows: Contacts, used: Bool[np.ndarray, " rows"]) -> Float[np.ndarray, " edges"]:
+    """Return when the phase of contact changes: there the force jumps, and the velocity of a law."""
+    columns = [rows.arrival_time_us, rows.departure_time_us]
+    if rows.detail is not None:
+        columns += [rows.detail.junction_forms_us, rows.detail.junction_breaks_us]
+    return np.concatenate([np.asarray(column)[used] for column in columns])
+
+
+def shade_phases(axes: Axes, path: Trajectory, contact: object) -> None:
+    """Shade where the tip is in the bridge or in the junction, or held by the platform of a law."""
+    resolved = isinstance(contact, Contact)
+    names = {Phase.BRIDGE: "liquid bridge", Phase.JUNCTION: "solid junction" if resolved else "held by the platform"}
+    for phase, colour in ((Phase.BRIDGE, BLUE), (Phase.JUNCTION, ACCENT)):
+        inside = path.phase == phase
+        edges = np.diff(np.concatenate([[0], inside.astype(int), [0]]))
+        label: str | None = names[phase]
+        for begin, stop in zip(np.flatnonzero(edges > 0), np.flatnonzero(edges < 0), strict=True):
+            right = path.time_us[min(stop, path.time_us.size - 1)]
+            axes.axvspan(path.time_us[begin], right, color=colour, alpha=0.18, linewidth=0, label=label)
+            label = None
+
+
+def draw_course(look: Look, path: Path) -> None:
+    """Draw the time course as a PNG file."""
+    overview = int(look.used.sum()) >= _MANY
+    picture = new_figure(9.0, 7.0 if overview else 4.6)
+    axes = picture.subplots(1 + overview, 1, squeeze=False)[:, 0]
+    _course(axes[0], look)
+    if overview:
+        _peaks(axes[1], look)
+    save(picture, path)
+
+
+def _course(axes: Axes, look: Look) -> None:
+    time = look.path.time_us
+    axes.plot(time, look.path.position_nm, color="black", linewidth=1.6, label="tip")
+    if look.scene.interaction is not None:
+        platform = np.asarray(look.scene.platform.position(time))
+        axes.plot(time, platform, color=ACCENT, linewidth=1.4, label="platform")
+    if look.scene.base is not None:
+        base = np.asarray(look.scene.base.position_and_velocity(time)[0])
+        axes.plot(time, base, "--", color=BLUE, linewidth=1.2, label="base")
+    shade_phases(axes, look.path, look.scene.interaction)
+    with_zero_line(axes)
+    axes.set_xlim(look.from_us, look.to_us)
+    # room for the legend above the curves
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.22 * (high - low))
+    label_axes(axes, x="time (µs)", y="height (nm)")
+    axes.legend(loc="upper right", fontsize=10, ncols=5, framealpha=1.0)
+    axes.set_title(_title(look), fontsize=12, loc="left")
+
+
+def _title(look: Look) -> str:
+    if not look.touched:
+        what = "the tip never meets the sample" if look.scene.interaction is not None else "a free cantilever"
+        return f"Last periods; {what}"
+    held = bool(look.simulation.held) and not np.isfinite(look.departure_us[-1])
+    return f"The last contacts of {int(look.used.sum())}" + (", the tip held in the last one" if held else "")
+
+
+def _peaks(axes: Axes, look: Look) -> None:
+    """Draw the peak after each contact over the whole motion, and mark the stretch above."""
+    peaks = peaks_between_contacts(look.scene, look.simulation)
+    kind = np.asarray(look.contacts.kind)[look.used]
+    time = look.arrival_us[: peaks.size]
+    left = kind[: peaks.size] != ContactKind.HELD
+    axes.plot(time[left], peaks[left], ".", color=BLUE, markersize=4.0)
+    axes.axvspan(look.from_us, look.to_us, color=GRID, alpha=0.4, linewidth=0, label="shown above")
+    with_zero_line(axes)
+    what = "contact" if isinstance(look.scene.interaction, Contact) else "impact"
+    label_axes(axes, x="time (µs)", y=f"peak after each {what} (nm)")
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, high + 0.15 * (high - low))
+    axes.legend(loc="upper right", fontsize=10, framealpha=1.0)
+
+
+def draw_gap(look: Look, path: Path) -> None:
+    """Draw the gap around the last contacts as a PNG file, a panel each, with the gaps at which the phase changes."""
+    rows = np.arange(look.arrival_us.size)[-_GAP_PANELS:]
+    picture = new_figure(4.0 * len(rows) + 1.0, 4.4)
+    panels = picture.subplots(1, len(rows), squeeze=False, sharey=True)[0]
+    contact = look.scene.interaction
+    marks = _marks(contact) if isinstance(contact, Contact) else {}
+    top = 0.0
+    for axes, row in zip(panels, rows, strict=True):
+        begin, end = _around(look, int(row))
+        part = look.between(begin, end)
+        since = part._replace(time_us=part.time_us - look.arrival_us[row])
+        axes.plot(since.time_us, since.gap_nm, color="black", linewidth=1.8)
+        shade_phases(axes, since, contact)
+        for gap in marks.values():
+            axes.axhline(gap, color=DARK, linewidth=0.9, linestyle=(0, (1, 2)))
+        with_zero_line(axes)
+        axes.set_xlim(since.time_us[0], since.time_us[-1])
+        label_axes(axes, x=f"time after {look.arrival_us[row]:.2f} µs (µs)", y="")
+        axes.set_title(f"contact {row + 1} of {look.arrival_us.size}", fontsize=11, loc="left")
+        top = max(top, float(since.gap_nm.max()))
+    panels[0].set_ylabel("gap (nm)", fontsize=12)
+    lowest = min(axes.get_ylim()[0] for axes in panels)
+    panels[0].set_ylim(lowest, 1.35 * top)
+    for name, gap in marks.items():
+        panels[-1].annotate(f" {name}", (1.0, gap), xycoords=("axes fraction", "data"), va=_SIDE[name], fontsize=9)
+    handles, labels = panels[0].get_legend_handles_labels()
+    if handles:
+        panels[0].legend(handles, labels, loc="upper center", fontsize=10, framealpha=1.0)
+    save(picture, path)
+
+
+def _around(look: Look, row: int) -> tuple[float, float]:
+    """Return the times between which a contact is shown: from and to a gap of a few nm."""
+    arrival, departure = look.arrival_us[row], look.departure_us[row]
+    approach = max(float(np.asarray(look.contacts.approach_speed_nm_per_us)[look.used][row]), 1.0)
+    lead = min(_GAP_SHOWN_NM / approach, 0.25 * look.drive.period_us)
+    resolved = isinstance(look.scene.interaction, Contact)
+    lead = 0.4 * lead if resolved else lead
+    end = departure if np.isfinite(departure) else arrival + look.drive.period_us
+    first, last = float(look.simulation.start.time_us), float(look.simulation.final.time_us)
+    return max(first, min(arrival, end) - lead), min(last, max(arrival, end) + lead)
+
+
+def _marks(contact: Contact) -> dict[str, float]:
+    """Return the gaps at which the phase of a contact changes, the inner two only where they can be told apart."""
+    junction = find_junction(contact)
+    return {
+        "bridge breaks": float(contact.bridge_breaks_nm),
+        "bridge forms": float(contact.bridge_forms_nm),
+        "junction breaks": float(junction.breaks_gap_nm),
+        "junction forms": float(junction.forms_gap_nm),
+    }
+
+
+def draw_force_gap(look: Look, path: Path) -> None:
+    """Draw the force against the gap through the last contacts as a PNG file: all of it, and the attractive part."""
+    picture = new_figure(12.0, 5.0)
+    whole, part = picture.subplots(1, 2, width_ratios=[1.0, 1.5])
+    rows = np.arange(look.arrival_us.size)[-_CURVES:]
+    least = 0.0
+    for row, (colour, width) in zip(rows, _STROKES[-len(rows) :], strict=True):
+        path_of_row = look.between(*_around(look, int(row)))
+        lost = float(np.asarray(look.contacts.energy_lost_aj)[look.used][row])
+        label = f"contact {row + 1}: {lost:.1f} aJ lost"
+        least = min(least, float(path_of_row.force_nn.min()))
+        for axes in (whole, part):
+            axes.plot(path_of_row.gap_nm, path_of_row.force_nn, color=colour, linewidth=width, label=label)
+    for name, gap in _marks(look.scene.interaction).items():
+        part.axvline(gap, color=DARK, linewidth=0.9, linestyle=(0, (1, 2)))
+        # two close lines have their names on their outer sides; left of where the junction forms the curve is high
+        side, align = (-2, "right") if name.endswith("forms") else (2, "left")
+        height, end = (0.03, "bottom") if name == "junction forms" else (0.97, "top")
+        part.annotate(
+            name,
+            (gap, height),
+            (side, 0),
+            xycoords=("data", "axes fraction"),
+            textcoords="offset points",
+            rotation=90,
+            ha=align,
+            va=end,
+            fontsize=9,
+            color=DARK,
+        )
+    for axes in (whole, part):
+        with_zero_line(axes)
+        label_axes(axes, x="gap (nm)", y="force on the tip (nN)" if axes is whole else "")
+    whole.set_xlim(right=_GAP_SHOWN_NM)
+    part.set(xlim=(-0.6, _GAP_SHOWN_NM), ylim=(1.1 * least - 5.0, -0.6 * least + 5.0))
+    part.legend(loc="lower right", fontsize=10, framealpha=1.0)
+    whole.set_title("Force against gap", fontsize=12, loc="left")
+    part.set_title("the attractive part, with its loops", fontsize=12, loc="left")
+    save(picture, path)
+
+
+def draw_section(look: Look, path: Path) -> None:
+    """Draw the section as a PNG file, the order in time as a shade."""
+    section = poincare_section(look.scene, look.simulation)
+    picture = new_figure(7.5, 5.4)
+    axes = picture.subplots()
+    phase, velocity = section.drive_phase_deg, section.departure_velocity_nm_per_us
+    size = 30 if phase.size < 100 else 8
+    axes.plot(phase[-1], velocity[-1], "o", color="black", markersize=11, fillstyle="none", label="the last one")
+    shades = axes.scatter(phase, velocity, c=np.arange(1, phase.size + 1), s=size, cmap="viridis_r", zorder=3)
+    bar = picture.colorbar(shades, ax=axes)
+    bar.set_label("contact", fontsize=11)
+    label_axes(axes, x="phase of the drive at departure (degrees)", y="departure velocity (nm/µs)")
+    axes.set(xlim=(0.0, 360.0), xticks=range(0, 361, 60))
+    axes.grid(color=GRID, alpha=0.25)
+    if velocity.min() < 0.0 < velocity.max():
+        with_zero_line(axes)
+    axes.legend(loc="best", fontsize=10, framealpha=1.0)
+    axes.set_title(f"Poincaré section, {phase.size} departures", fontsize=12, loc="left")
+    save(picture, path)
+
+
+class Spectrum(NamedTuple):
+    """Amplitudes of the waves that a deflection is made of."""
+
+    frequency_khz: Float[np.ndarray, " lines"]
+    amplitude_nm: Float[np.ndarray, " lines"]
+    response_khz: float
+    """Drive frequency over N; the drive's own where nothing repeats."""
+    periods: int
+    """Response periods in the stretch."""
+    repeats: bool
+
+
+def spectrum_of(look: Look) -> Spectrum:
+    """Return the spectrum over the last whole response periods, from equally spaced samples.
+
+    The samples end with the last whole response period, so that a motion that repeats has lines without skirts; one
+    that does not is weighted with a Hann window.
+
+    Args:
+        look: the motion.
+    """
+    shown = look.responses
+    samples = shown.periods * _SAMPLES_PER_PERIOD * max(1, round(shown.response_us / look.drive.period_us))
+    step = (shown.to_us - shown.from_us) / samples
+    times = shown.from_us + step * np.arange(samples)
+    path = look.dense.at(times)
+    deflection = path.position_nm
+    if look.scene.base is not None:
+        deflection = deflection - np.asarray(look.scene.base.position_and_velocity(times)[0])
+    weight = np.ones(samples) if shown.repeats else np.hanning(samples + 1)[:-1]
+    # the window would smear the mean over the lowest lines
+    mean = float(np.sum(weight * deflection) / weight.sum())
+    amplitude = 2.0 * np.abs(np.fft.rfft((deflection - mean) * weight)) / weight.sum()
+    amplitude[0] = abs(mean)
+    return Spectrum(
+        1e3 * np.fft.rfftfreq(samples, step), amplitude, 1e3 / shown.response_us, shown.periods, shown.repeats
+    )
+
+
+def draw_spectrum(look: Look, path: Path) -> None:
+    """Draw the spectrum as a PNG file."""
+    found = spectrum_of(look)
+    picture = new_figure(9.0, 5.0)
+    axes = picture.subplots()
+    drive = 1e3 / look.drive.period_us
+    slow = min(found.response_khz, 2.0 * float(look.scene.cantilever.frequency_khz))
+    top = max(_HIGHEST * slow, 2.2 * drive)
+    shown = (found.frequency_khz > 0.0) & (found.frequency_khz <= top * (1.0 + 1e-9))
+    frequency, amplitude = found.frequency_khz[shown], found.amplitude_nm[shown]
+    floor = max(float(amplitude.max()) * _DECADES, 1e-12)
+    if found.repeats:
+        axes.vlines(frequency, floor, np.maximum(amplitude, floor), color="black", linewidth=1.2, zorder=3)
+    else:
+        axes.plot(frequency, np.maximum(amplitude, floor), color="black", linewidth=1.0, zorder=3)
+    axes.set_yscale("log")
+    right = float(frequency[-1]) if frequency.size else drive
+    for multiple in range(1, int(right / drive + 1e-9) + 1):
+        label = "drive and its harmonics" if multiple == 1 else None
+        axes.axvline(multiple * drive, color=ACCENT, linewidth=5.0, alpha=0.30, label=label)
+    if found.repeats and found.response_khz < 0.99 * drive:
+        label = f"subharmonics, drive/{round(drive / found.response_khz)}"
+        for multiple in range(1, int(right / found.response_khz + 1e-9) + 1):
+            axes.axvline(multiple * found.response_khz, color=BLUE, linewidth=1.0, linestyle=":", label=label)
+            label = None
+    free = float(look.scene.cantilever.frequency_khz)
+    if free <= right:
+        axes.axvline(free, color=DARK, linewidth=1.4, linestyle="--", label="free frequency")
+    axes.set(xlim=(0.0, 1.02 * right), ylim=(floor, float(amplitude.max()) * 30.0))
+    label_axes(axes, x="frequency (kHz)", y="amplitude (nm)")
+    axes.grid(color=GRID, alpha=0.25)
+    axes.legend(loc="upper right", fontsize=10, ncols=3, framealpha=1.0)
+    kind = f"{found.periods} response periods" if found.repeats else f"{found.periods} drive periods, nothing repeats"
+    axes.set_title(f"Spectrum of the deflection ({kind})", fontsize=12, loc="left")
+    save(picture, path)

@@ -6,7 +6,6 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save, with_zero_line
-from afm_jax.study.long_motion import path_of
 from afm_jax.study.motion_figures import SECTION_POINTS, MotionFigure
 from afm_jax.study.section_survey import SHOWN, Course
 from afm_jax.study.slow_ramps import Ramp
@@ -134,12 +133,12 @@ def _ramps(number: str, figure: MotionFigure, path: Path) -> None:
 def _trajectory(axes: Axes, ramp: Ramp) -> None:
     """Draw the tip against the offset; a tip that is held rides on the platform."""
     motion, platform = ramp.motion, ramp.motion.scene.platform
-    time, height = path_of(motion)
+    time, height = motion.path()
     offset = np.array([ramp.offset_at(0.0), ramp.offset_at(1.0)])
     first, rate = offset[0], offset[1] - offset[0]
     axes.plot(first + rate * time, height, color=BLUE, linewidth=0.3, label="tip in flight")
     reach = float(platform.amplitude_nm)
-    ends = np.array([float(motion.pieces[0].start.time_us), motion.end_us])
+    ends = np.array([motion.begin_us, motion.end_us])
     middle = first + rate * ends
     axes.fill_between(middle, middle - reach, middle + reach, color=ACCENT, alpha=0.45, linewidth=0, label="platform")
     if motion.held_from_us is not None:

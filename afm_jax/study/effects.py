@@ -5,11 +5,11 @@ from typing import NamedTuple
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.motion.drive_period import drive_of
+from afm_jax.motion.observe import Reading
 from afm_jax.motion.record import State
 from afm_jax.motion.settle import why_impossible
 from afm_jax.motion.start import default_start
 from afm_jax.parameters import require_float64
-from afm_jax.study.flight_reading import Reading
 from afm_jax.study.motion_program import Operations, Programs
 from afm_jax.study.observed_scene import Observed, View, observe_scene, slope_of_reading
 from afm_jax.study.scene_effects import SceneEffect, effects_in

@@ -19,10 +19,11 @@ from afm_jax.contact.contact import Contact
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.impact.poincare import iterate_map
-from afm_jax.motion.record import MotionOutcome, Simulation, State
+from afm_jax.motion.observe import peaks_between_contacts
+from afm_jax.motion.record import MotionOutcome, State
+from afm_jax.motion.settle import is_stuck
 from afm_jax.motion.simulate import simulate
 from afm_jax.outcome import Outcome
-from afm_jax.study.flight_peaks import peaks_between_contacts
 from afm_jax.study.law_scene_accuracy import first_departure, map_peaks
 from afm_jax.study.own_process import progress
 from afm_jax.study.scene_accuracy import scene_named
@@ -153,19 +154,12 @@ def _map(scene: Scene, start: State, contacts: int, duration_us: float) -> Calla
 def _full(scene: Scene, start: State, duration_us: float) -> Callable[[], tuple[float, float, int]]:
     def rung() -> tuple[float, float, int]:
         found = jax.block_until_ready(simulate(scene, start, duration_us))
-        if int(found.outcome) != MotionOutcome.FINISHED and not _just_arrived(scene, found):
+        cut = int(found.outcome) == MotionOutcome.HELD and not is_stuck(scene, found)
+        if int(found.outcome) != MotionOutcome.FINISHED and not cut:
             raise _NoAnswer(f"after {int(found.count)} contacts: {MotionOutcome(int(found.outcome)).sentence}")
         return *_last(peaks_between_contacts(scene, found)), int(found.count)
 
     return rung
-
-
-def _just_arrived(scene: Scene, found: Simulation) -> bool:
-    """Return whether a motion ends within a contact that began less than a drive period before: that is no held tip."""
-    if int(found.outcome) != MotionOutcome.HELD:
-        return False
-    arrival = float(found.contacts.arrival_time_us[int(found.count) - 1])
-    return float(found.final.time_us) - arrival < float(scene.platform.period_us)
 
 
 def _last(peaks: np.ndarray) -> tuple[float, float]:

@@ -13,9 +13,9 @@ from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.impact.lasting_impact import LawImpact, speeds_of_impact
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.poincare import NextImpact, iterate_map
+from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import State
 from afm_jax.outcome import Outcome
-from afm_jax.study.flight_peaks import peaks_of_flights
 from afm_jax.study.own_process import progress
 from afm_jax.study.scene_accuracy import Course, errors_of, scene_named
 from afm_jax.study.timing import compiled_for, time_compiled

@@ -9,10 +9,9 @@ from jaxtyping import Float
 
 from afm_jax import presets
 from afm_jax.study.figure_statements import Statement
-from afm_jax.study.long_motion import Report
 from afm_jax.study.motion_statements import rise_statements, section_statements, sticking_statements
 from afm_jax.study.section_survey import MORE, SHOWN, Course, Growth, survey, tangent_growth
-from afm_jax.study.slow_ramps import Ramp, slow_ramps
+from afm_jax.study.slow_ramps import Ramp, Report, slow_ramps
 
 SECTION_POINTS = 1000
 _FALL_RAMPS = ((1e-2, 5.0), (2e-3, 0.6))

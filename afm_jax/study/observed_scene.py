@@ -9,6 +9,7 @@ import numpy as np
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.motion.drive_period import Drive, drive_of
+from afm_jax.motion.observe import Reading, read_window
 from afm_jax.motion.record import Simulation, State
 from afm_jax.motion.settle import (
     Orbit,
@@ -22,7 +23,7 @@ from afm_jax.motion.settle import (
     why_impossible,
     why_over,
 )
-from afm_jax.study.flight_reading import Reading, read_motion
+from afm_jax.motion.trajectory import dense_path
 from afm_jax.study.motion_program import Programs
 from afm_jax.study.scene_effects import Scaled
 
@@ -93,14 +94,20 @@ def _observe_last_fifth(programs: Programs, scene: Scene, view: View) -> Observe
 
 
 def _read_window(scene: Scene, motion: Simulation, view: View) -> Reading:
-    return read_motion(scene, motion, *view.window, angular_frequency=view.drive.angular_frequency)
+    return _read(scene, motion, view.window, view.drive.angular_frequency)
 
 
 def _read_orbit(scene: Scene, motion: Simulation, orbit: Orbit, view: View) -> Reading:
     """Return the reading of one response period; the window stays where it is while the scene changes."""
     begin = float(orbit.start.time_us)
     frequency = view.drive.angular_frequency / orbit.periods
-    return read_motion(scene, motion, begin, begin + orbit.period_us, angular_frequency=frequency)
+    return _read(scene, motion, (begin, begin + orbit.period_us), frequency)
+
+
+def _read(scene: Scene, motion: Simulation, window: tuple[float, float], angular_frequency: float) -> Reading:
+    """Return a reading; contacts, short against the period, are not integrated once more for every scene."""
+    dense = dense_path(scene, motion, *window, integrated=False)
+    return read_window(dense, *window, angular_frequency=angular_frequency)
 
 
 def slope_of_reading(programs: Programs, observed: Observed, view: View, scaled: Scaled) -> Reading | None:

@@ -16,12 +16,12 @@ from jaxtyping import Array
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.settings import DRIVEN_SETTINGS, DrivenSetting, QuickSetting
+from afm_jax.motion.observe import peaks_between_contacts
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
 from afm_jax.motion.simulate import _contact
 from afm_jax.presets import PRESETS, preset
 from afm_jax.scenefile import load_scene
 from afm_jax.study.driven_batches import ROUNDS
-from afm_jax.study.flight_peaks import peaks_between_contacts
 from afm_jax.study.own_process import progress
 from afm_jax.study.timing import Compiled, compiled_for, time_compiled
 

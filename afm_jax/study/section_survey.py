@@ -8,10 +8,12 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax import presets
-from afm_jax.motion.record import ContactKind, State
+from afm_jax.motion.observe import Departures, departures
+from afm_jax.motion.record import ContactKind, Simulation, State
+from afm_jax.motion.settle import follow_long
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import start_of
-from afm_jax.study.long_motion import CONTACTS_OF_A_PIECE, LongMotion, Report, follow_long
+from afm_jax.study.slow_ramps import CONTACTS_OF_A_PIECE, Report, told_of_progress
 
 SHOWN = (40.0, 60.0, 80.0)
 """Starting velocities, in nm/us, that the figure tells apart."""
@@ -31,7 +33,7 @@ class Course(NamedTuple):
 
     velocity_nm_per_us: float
     """Of the start."""
-    motion: LongMotion
+    motion: Departures
     broadband: int
     """Contacts before the motion locks; all where it does not."""
     periods: int | None
@@ -62,19 +64,24 @@ def survey(
     period = float(scene.platform.period_us)
     courses = []
     for velocity in velocities:
-        motion = follow_long(
+        start = start_of(scene, presets.figure8_start(velocity))
+        run = follow_long(
             scene,
-            start_of(scene, presets.figure8_start(velocity)),
-            until_us,
-            enough=lambda times: _has_come_to_rest(times, period),
-            report=lambda what, velocity=velocity: report(f"from {velocity:g} nm/us: {what}"),
+            start,
+            until_us - float(start.time_us),
+            enough=lambda motion: _has_come_to_rest(motion, period),
+            piece_contacts=CONTACTS_OF_A_PIECE,
+            report=told_of_progress(report, f"from {velocity:g} nm/us", until_us),
         )
+        motion = departures(scene, run.simulation)
         courses.append(Course(velocity, motion, *locked_from(motion.departure_time_us, period)))
     return courses
 
 
-def _has_come_to_rest(times_us: Float[np.ndarray, " contacts"], period_us: float) -> bool:
+def _has_come_to_rest(motion: Simulation, period_us: float) -> bool:
     """Say whether a motion has been locked for so long that its orbit is seen."""
+    rows = motion.contacts
+    times_us = np.asarray(rows.departure_time_us)[np.asarray(rows.kind) == ContactKind.IMPACT]
     before, periods = locked_from(times_us, period_us)
     return periods is not None and times_us.size - before >= _RESTED_CONTACTS
 

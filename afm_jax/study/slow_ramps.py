@@ -12,19 +12,24 @@ from jaxtyping import Float
 from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.contact_as_law import law_of_contact
+from afm_jax.motion.observe import Departures, departures
 from afm_jax.motion.record import State
+from afm_jax.motion.settle import follow_long
 from afm_jax.motion.start import default_start
-from afm_jax.study.long_motion import LongMotion, Report, follow_long
 
+CONTACTS_OF_A_PIECE = 400
 _SETTLING_PERIODS = 250.0
 """Drive periods at the first offset; hundreds of us, several decay times of a free vibration (141 us)."""
+
+
+Report = Callable[[str], object]
 
 
 class Ramp(NamedTuple):
     """A motion whose offset rises steadily."""
 
     rate_nm_per_us: float
-    motion: LongMotion
+    motion: Departures
     offset_nm: Float[np.ndarray, " contacts"]
     """Of the platform, at each departure."""
     law_peak_nm: Float[np.ndarray, " contacts"]
@@ -52,12 +57,8 @@ def slow_ramps(
     still = scene_of()
     period, first = float(still.platform.period_us), float(still.platform.offset_nm)
     begin = default_start(still)
-    settled = follow_long(
-        still,
-        begin,
-        float(begin.time_us) + _SETTLING_PERIODS * period,
-        report=lambda what: report(f"settling at {first:g} nm: {what}"),
-    )
+    until = float(begin.time_us) + _SETTLING_PERIODS * period
+    settled = _followed(still, begin, until, report, f"settling at {first:g} nm")
     # the drive does not change under a shift by whole periods
     time = float(settled.departure_time_us[-1])
     start = State(
@@ -74,12 +75,31 @@ def slow_ramps(
     for rate, last in ramps:
         scene = scene_of(first - rate * float(start.time_us), rate)
         until = float(start.time_us) + (last - first) / rate
-        motion = follow_long(
-            scene, start, until, report=lambda what, rate=rate: report(f"ramp of {rate:g} nm/us: {what}")
-        )
+        motion = _followed(scene, start, until, report, f"ramp of {rate:g} nm/us")
         offset = first + rate * (motion.departure_time_us - float(start.time_us))
         found.append(Ramp(rate, motion, offset, law_peaks(still, offset)))
     return float(settled.peak_height_nm[np.isfinite(settled.peak_height_nm)][-1]), found
+
+
+def _followed(scene: Scene, start: State, until_us: float, report: Report, what: str) -> Departures:
+    """Return a motion followed to a time."""
+    run = follow_long(
+        scene,
+        start,
+        until_us - float(start.time_us),
+        piece_contacts=CONTACTS_OF_A_PIECE,
+        report=told_of_progress(report, what, until_us),
+    )
+    return departures(scene, run.simulation)
+
+
+def told_of_progress(report: Report, what: str, until_us: float) -> Callable[[float, int], None]:
+    """Return a report of time and contacts that says in words how far a motion is."""
+
+    def told(time_us: float, contacts: int) -> None:
+        _ = report(f"{what}: {contacts} contacts, {100.0 * min(1.0, time_us / until_us):.0f} % of the time")
+
+    return told
 
 
 def law_peaks(scene: Scene, offset_nm: Float[np.ndarray, " offsets"]) -> Float[np.ndarray, " offsets"]:
