@@ -18,9 +18,9 @@ IMPACTS = 3
 @pytest.mark.parametrize(("batch", "block"), [(1, 500), (7, 3), (7, 7), (8, 4)])
 def test_blocks_change_nothing(batch: int, block: int):
     scene = regular_scene().scene
-    starts = scattered_starts(scene, batch)
-    rows = iterate_batch(scene, starts.time_us, starts.velocity_nm_per_us, IMPACTS, block=block)
-    alone = [iterate_map(scene, *start, IMPACTS) for start in zip(*starts, strict=True)]
+    time, velocity = (np.asarray(part)[:batch] for part in scattered_starts(scene, 8))
+    rows = iterate_batch(scene, time, velocity, IMPACTS, block=block)
+    alone = [iterate_map(scene, *start, IMPACTS) for start in zip(time, velocity, strict=True)]
     for name in ("time_us", "velocity_after_nm_per_us", "velocity_before_nm_per_us", "outcome", "near_grazing"):
         expected = np.stack([np.asarray(getattr(one, name)) for one in alone])
         # the same operations in another order of fused multiplications: a few roundings, grown by three impacts
@@ -47,14 +47,14 @@ def test_forward_and_reverse_derivatives_agree_with_50_digits():
         return iterate_batch(varied, starts.time_us, starts.velocity_nm_per_us, IMPACTS, block=2).time_us
 
     r = impact_law_of(scene).r
-    found = np.asarray(times(r))
+    found = np.asarray(jax.jit(times)(r))
     exact = [
         derivatives_by_r(scene, (float(time), float(speed)), lane)
         for time, speed, lane in zip(*starts, found, strict=True)
     ]
     for derivative in (jax.jacfwd, jax.jacrev):
         # three impacts lose at most three digits of sixteen
-        np.testing.assert_allclose(np.asarray(derivative(times)(r)), np.array(exact), rtol=1e-12, atol=1e-13)
+        np.testing.assert_allclose(np.asarray(jax.jit(derivative(times))(r)), np.array(exact), rtol=1e-12, atol=1e-13)
 
 
 def test_hessian_agrees_with_differences_of_the_gradient():
@@ -65,12 +65,12 @@ def test_hessian_agrees_with_differences_of_the_gradient():
         varied = eqx.tree_at(lambda one: one.interaction.r, scene, values[0])
         return iterate_batch(varied, values[1:2], values[2:], 2).time_us[0, -1]
 
-    point, step = jnp.array([0.5, 0.3, 6.0]), 1e-5
+    point, step = np.array([0.5, 0.3, 6.0]), 1e-5
     gradient = jax.jit(jax.grad(last))
-    moves = step * jnp.eye(3)
-    rows = [(gradient(point + move) - gradient(point - move)) / (2.0 * step) for move in moves]
+    moves = step * np.eye(3)
+    rows = [np.asarray(gradient(point + move) - gradient(point - move)) / (2.0 * step) for move in moves]
     # a central difference with this step leaves step^2 = 1e-10 of the third derivative, and 1e-15/step = 1e-10
-    np.testing.assert_allclose(np.asarray(jax.hessian(last)(point)), np.stack(rows), rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(np.asarray(jax.jit(jax.hessian(last))(point)), np.stack(rows), rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize(

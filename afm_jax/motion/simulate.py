@@ -30,6 +30,8 @@ _CONTACTS_PER_PERIOD = 4.0
 _MORE_ROOM = 4
 _MOST_CONTACTS = 1 << 20
 """Contacts for which room is made unasked: with a resolved contact 100 MB."""
+_LEAST_ROOM = 64
+"""Rows made unasked are a power of two from here on: few shapes, so that few programs are compiled."""
 _TRIALS_BACKWARDS = 40
 """Trial steps of a round when all of them are run and kept for the way back."""
 
@@ -53,9 +55,9 @@ def simulate(  # noqa: PLR0913
         scene: a scene with an `ImpactLaw`, a `Contact`, or no interaction (a free cantilever).
         start: time, height and velocity of the tip in the lab, scalars.
         duration_us: how long to follow it, in us.
-        max_contacts: most contacts (impacts) there is room for, a plain integer that shapes the result; None: enough
-            for the duration, which must then be a number. A motion with more (chatter with r close to 1) is then
-            followed once more with room for them, outside `jit` and `vmap` up to a million.
+        max_contacts: most contacts (impacts) there is room for, a plain integer that shapes the result; None: a power
+            of two, enough for the duration, which must then be a number. A motion with more (chatter with r close to 1)
+            is then followed once more with room for them, outside `jit` and `vmap` up to a million.
         accuracy: of each resolved contact: relative of the rebound speed, a tenth of it in us of the times.
         method: the way through a resolved contact: "collocation" (leg by leg, and in time where a tip turns in the
             bridge or is held) or "diffrax" (in time throughout, by Diffrax's Dopri8; some ten times slower).
@@ -103,7 +105,9 @@ def simulate(  # noqa: PLR0913
         )
     if max_contacts is not None:
         return follow(max_contacts)
-    return _with_room(follow, _room(scene, surface, duration_us))
+    room = _room(scene, surface, duration_us)
+    # in reverse mode every round is run, needed or not
+    return _with_room(follow, room if reverse else max(_LEAST_ROOM, 1 << (room - 1).bit_length()))
 
 
 def _with_room(follow: Callable[[int], Simulation], room: int) -> Simulation:

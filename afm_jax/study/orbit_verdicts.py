@@ -7,14 +7,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.orbits import single_impact_orbits
 
 BLOCK = 1000
-"""Scenes computed together: few enough for the cache, many enough to fill the vector units."""
+"""Scenes computed together: few enough for the cache, many enough to fill the vector units; one program."""
 
 
 class OrbitVerdicts(NamedTuple):
@@ -51,11 +50,24 @@ def orbit_verdicts(
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
     """
+    blocks, count = _blocks(scenes), jax.tree.leaves(scenes)[0].shape[0]
     rows = []
     for order in range(first_order, last_order + 1):
         report(order)
-        rows.append([np.asarray(column) for column in _one_order(scenes, jnp.asarray(float(order)))])
+        found = [_one_order(block, jnp.asarray(float(order))) for block in blocks]
+        rows.append([np.concatenate(column)[:count] for column in zip(*found, strict=True)])
     return OrbitVerdicts(*(np.stack(column) for column in zip(*rows, strict=True)))
+
+
+def _blocks(scenes: Scene) -> list[Scene]:
+    """Return a batch of scenes in blocks of one length, the last of them filled up."""
+
+    def cut(leaf: Array) -> Float[np.ndarray, "blocks lanes"]:
+        values = np.asarray(leaf)
+        return np.pad(values, (0, -len(values) % BLOCK), mode="edge").reshape(-1, BLOCK)
+
+    cut_up = jax.tree.map(cut, scenes)
+    return [jax.tree.map(lambda leaf, one=one: leaf[one], cut_up) for one in range(len(jax.tree.leaves(cut_up)[0]))]
 
 
 @eqx.filter_jit
@@ -67,5 +79,4 @@ def _one_order(scenes: Scene, order: Float[Array, ""]) -> tuple[Array, Array, Ar
         highest = jnp.max(jnp.where(steady, orbits.peak_amplitude_nm, -jnp.inf))
         return jnp.any(steady), jnp.any(admissible), jnp.where(jnp.any(steady), highest, jnp.nan)
 
-    count = jax.tree.leaves(scenes)[0].shape[0]
-    return lax.map(one, scenes, batch_size=min(BLOCK, count))
+    return jax.vmap(one)(scenes)
