@@ -104,9 +104,8 @@ class Place(NamedTuple):
     phase: Float[Array, ""]
 
 
-def place_near(coordinate: Float[Array, ""], problem: OrbitProblem) -> Place:
-    """Return about where the orbit of an impact that lasts is, given a coordinate close to a root."""
-    speeds, system = closure(coordinate, problem)
+def place_of(coordinate: Float[Array, ""], speeds: Speeds, system: System, problem: OrbitProblem) -> Place:
+    """Return about where the orbit of an impact that lasts is, given the closure at a coordinate close to a root."""
     return Place(coordinate, system.phase - problem.platform.angular_frequency * speeds.delay)
 
 
@@ -136,13 +135,14 @@ def map_gaps(unknowns: Float[Array, " 2"], problem: OrbitProblem) -> Float[Array
 def close_map(place: Place, problem: OrbitProblem, steps: int) -> Float[Array, " 2"]:
     """Return coordinate and phase after steps of Newton's method towards the orbit of the map."""
 
-    def improve(_, unknowns):
-        def along(direction):
-            return jax.jvp(lambda x: map_gaps(x, problem), (unknowns,), (direction,))
+    def twice(unknowns):
+        value = map_gaps(unknowns, problem)
+        return value, value
 
-        (value, by_coordinate), (_, by_phase) = (along(axis) for axis in jnp.eye(2, dtype=unknowns.dtype))
+    def improve(_, unknowns):
+        slopes, value = jax.jacfwd(twice, has_aux=True)(unknowns)
         longest = jnp.stack([unknowns[0] - problem.impact.lowest, jnp.ones_like(unknowns[1])]) * _LONGEST_STEP
-        step = -solved_pair([by_coordinate, by_phase], value)
+        step = -solved_pair([slopes[:, 0], slopes[:, 1]], value)
         return unknowns + jnp.clip(step, -longest, longest)
 
     return lax.fori_loop(0, steps, improve, jnp.stack(place))

@@ -20,7 +20,7 @@ from afm_jax.impact.orbit_closure import (
     closure,
     instantaneous_quartic,
     map_gaps,
-    place_near,
+    place_of,
 )
 from afm_jax.impact.polynomial_roots import real_roots
 
@@ -78,17 +78,18 @@ def find_roots(problem: OrbitProblem, scan: Scan = FINE) -> OrbitRoots:
     driven = (problem.platform.amplitude_nm > 0.0) & (problem.platform.offset_rate_nm_per_us == 0.0)
     coordinate, found, complete = _scanned_roots(problem, scan) if problem.impact.delayed else _quartic_roots(problem)
     safe = jnp.where(found, coordinate, harmless_coordinate(problem))
-    found = found & driven & jax.vmap(closure, in_axes=(0, None))(safe, problem).system.regular
-    if problem.impact.lasts:
-        closed, settled = jax.vmap(_closed, in_axes=(0, None))(safe, problem)
-        found = found & settled
-        safe = jnp.where(found, closed, safe)
-    return OrbitRoots(safe, found, complete)
+    closed, there = jax.vmap(follow_root if problem.impact.lasts else _regular, in_axes=(0, None))(safe, problem)
+    found = found & driven & there
+    return OrbitRoots(jnp.where(found, closed, safe), found, complete)
 
 
+@jax.jit
 def follow_root(near: Float[Array, ""], problem: OrbitProblem) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-    """Return the root of a lasting impact's orbit close to a coordinate, and whether there is one nearby."""
-    return _closed(near, lax.stop_gradient(problem))
+    """Return where the map of a lasting impact closes, close to a coordinate, and whether it does."""
+    problem = lax.stop_gradient(problem)
+    speeds, system = closure(near, problem)
+    unknowns = close_map(place_of(near, speeds, system, problem), problem, _NEWTON)
+    return unknowns[0], system.regular & jnp.all(jnp.abs(map_gaps(unknowns, problem)) < _CLOSED)
 
 
 def harmless_coordinate(problem: OrbitProblem) -> Float[Array, ""]:
@@ -96,10 +97,9 @@ def harmless_coordinate(problem: OrbitProblem) -> Float[Array, ""]:
     return problem.impact.lowest + 2.0 * _scale(problem) + 2.0
 
 
-def _closed(near: Float[Array, ""], problem: OrbitProblem) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-    """Return the coordinate at which the map closes, close to one, and whether it does."""
-    unknowns = close_map(place_near(near, problem), problem, _NEWTON)
-    return unknowns[0], jnp.all(jnp.abs(map_gaps(unknowns, problem)) < _CLOSED)
+def _regular(coordinate: Float[Array, ""], problem: OrbitProblem) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+    """Return a coordinate, and whether the phase is determined there."""
+    return coordinate, closure(coordinate, problem).system.regular
 
 
 def _quartic_roots(problem: OrbitProblem) -> OrbitRoots:

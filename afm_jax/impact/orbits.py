@@ -29,7 +29,7 @@ from afm_jax.impact.orbit_closure import (
     closing_residual,
     closure,
     map_gaps,
-    place_near,
+    place_of,
     speeds_at_place,
 )
 from afm_jax.impact.orbit_search import COARSE, find_roots
@@ -194,8 +194,8 @@ def orbit_state(coordinate: Float[Array, ""], problem: OrbitProblem) -> OrbitSta
     """Return the motion at a root, with the root's derivatives (implicit function theorem)."""
     cantilever, platform, impact, order = problem
     if impact.lasts:
-        known = lax.stop_gradient((coordinate, problem))
-        unknowns = close_map(place_near(*known), known[1], _NEWTON)
+        near, known = lax.stop_gradient((coordinate, problem))
+        unknowns = close_map(place_of(near, *closure(near, known), known), known, _NEWTON)
         place = Place(*implicit_pair(map_gaps, unknowns, problem))
         speeds = speeds_at_place(place, problem)
         phase = place.phase + platform.angular_frequency * speeds.delay
