@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, SupportsFloat
 
 
 def decimals(width: float, *, unknown: int = 4) -> int:
@@ -57,7 +57,7 @@ def interval(low: float, high: float) -> str:
     return f"{low:.{digits}f} to {high:.{digits}f}"
 
 
-def known(value: float | None, form: str = ".3g") -> str:
+def known(value: SupportsFloat | None, form: str = ".3g") -> str:
     """Return a number in a format, a dash where there is none.
 
     >>> known(0.12345), known(None), known(float("nan"), "+.2f")

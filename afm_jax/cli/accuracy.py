@@ -8,6 +8,7 @@ import click
 
 from afm_jax.cli.accuracy_scene import scene_study
 from afm_jax.cli.session import Session, with_session
+from afm_jax.words import known
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -202,7 +203,7 @@ def collide_table(rows: Sequence[dict[str, Any]]) -> "Table":
         table.add_column(heading, justify="right")
     names = ("microseconds_per_impact", "rebound_error", "delay_error_us", "slope_error", "near_capture_error")
     for row in rows:
-        cells = [in_digits(row.get(name)) for name in (*names, "compile_s")]
+        cells = [known(row.get(name)) for name in (*names, "compile_s")]
         table.add_row(row["method"], row["variable"], row["setting"], row["precision"], *cells)
     return table
 
@@ -219,7 +220,7 @@ def accuracy_table(rows: Sequence[dict[str, Any]]) -> "Table":
         table.add_column(heading, justify="right")
     names = ("tolerance", "microseconds_per_impact", "error_us", "median_error_us", "sequence_error_us")
     for row in rows:
-        cells = [in_digits(row.get(name)) for name in (*names, "near_grazing_error_us")]
+        cells = [known(row.get(name)) for name in (*names, "near_grazing_error_us")]
         table.add_row(row["scene"], row["method"], *cells)
     return table
 
@@ -233,8 +234,3 @@ def cheapest_sentence(choice: dict[str, Any], wanted_error_us: float) -> str:
         f"Cheapest for {wanted_error_us:g} us {where}: {choice['method']}, root tolerance {choice['tolerance']:g} us "
         f"({choice['microseconds_per_impact']:.3g} us an impact, error {choice['error_us']:.1e} us)."
     )
-
-
-def in_digits(value: float | None) -> str:
-    """Return a number with three digits, a dash where there is none."""
-    return "-" if value is None else f"{value:.3g}"

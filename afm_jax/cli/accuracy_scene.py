@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from afm_jax.cli.session import Session
+from afm_jax.words import known
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -136,7 +137,7 @@ def settings_table(result: Mapping[str, Any]) -> "Table":
     for heading in ("us/contact", "arrival error us", "peak error nm", "compile s"):
         table.add_column(heading, justify="right")
     for row in result["rows"]:
-        table.add_row(row["way"], row["setting"], *(_digits(row.get(name)) for name in COLUMNS[2:]))
+        table.add_row(row["way"], row["setting"], *(known(row.get(name)) for name in COLUMNS[2:]))
     return table
 
 
@@ -151,9 +152,9 @@ def ladder_table(result: Mapping[str, Any]) -> "Table":
         table.add_column(heading, justify="right")
     for row in result["ladder"]:
         error = row.get("model_error")
-        heights = [_digits(row[name], 5) for name in ("peak_nm", "lowest_peak_nm")]
+        heights = [known(row[name], ".5g") for name in ("peak_nm", "lowest_peak_nm")]
         count = "-" if row["contacts"] is None else str(row["contacts"])
-        table.add_row(row["model"], *heights, "-" if error is None else f"{error:.2%}", _digits(row["seconds"]), count)
+        table.add_row(row["model"], *heights, "-" if error is None else f"{error:.2%}", known(row["seconds"]), count)
     return table
 
 
@@ -169,7 +170,3 @@ def reference_sentence(result: Mapping[str, Any]) -> str:
 
 def _reasons(result: Mapping[str, Any]) -> Sequence[str]:
     return [f"{row['model']}: {row['reason']}" for row in result["ladder"] if row.get("reason")]
-
-
-def _digits(value: float | None, digits: int = 3) -> str:
-    return "-" if value is None else f"{value:.{digits}g}"

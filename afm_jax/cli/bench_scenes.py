@@ -3,6 +3,8 @@
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from afm_jax.words import known
+
 if TYPE_CHECKING:
     from rich.table import Table
 
@@ -73,7 +75,7 @@ def scene_tables(rows: Sequence[Mapping[str, Any]]) -> list["Table"]:
         times.add_column(heading, justify="right")
     for row in rows:
         shares = ["-" if row.get(name) is None else f"{row[name]:.1%}" for name in ("turning_share", "held_share")]
-        numbers = [_digits(row.get(name)) for name in ("microseconds_per_contact", "seconds", "compile_s")]
+        numbers = [known(row.get(name)) for name in ("microseconds_per_contact", "seconds", "compile_s")]
         counts = [str(row.get(name, "-")) for name in ("batch", "periods", "contacts")]
         times.add_row(row["what"], row["scene"], *counts, *numbers, *shares, str(row.get("failed", "-")))
     errors = Table(title="Error of one contact, from the same arrival: median, 99 %, worst")
@@ -92,7 +94,3 @@ def scene_tables(rows: Sequence[Mapping[str, Any]]) -> list["Table"]:
 def _spread(row: Mapping[str, Any], name: str) -> str:
     values = [row.get(f"{name}_{share}") for share in ("median", "99", "worst")]
     return "  ".join(f"{value:.1e}" for value in values if value is not None)
-
-
-def _digits(value: float | None) -> str:
-    return "-" if value is None else f"{value:.3g}"

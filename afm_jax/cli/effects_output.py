@@ -11,6 +11,7 @@ from afm_jax.scenefile import scene_tables
 from afm_jax.scenefile_start import Start
 from afm_jax.strict_json import strict_json
 from afm_jax.study.effects import Cost, EffectReport, EffectStudy, Reduction
+from afm_jax.words import known
 
 CHANGES = ("peak_amplitude", "lockin_amplitude", "lockin_phase_deg", "energy_per_impact")
 """What is compared; all but the phase relative to the full scene."""
@@ -124,13 +125,13 @@ def text_of(payload: Mapping[str, Any]) -> list[Any]:
             effect["name"],
             _percent(change["peak_amplitude"]),
             _percent(change["lockin_amplitude"]),
-            _number(change["lockin_phase_deg"], ".3g"),
+            known(change["lockin_phase_deg"], ".3g"),
             _percent(change["energy_per_impact"]),
             _percent(predicted["peak_amplitude"]),
             _percent(predicted["lockin_amplitude"]),
-            _number(effect["time_us_per_period"], ".4g"),
-            _number(effect["saved_time_us_per_period"], ".3g"),
-            _number(effect["saved_operations"], ".0f"),
+            known(effect["time_us_per_period"], ".4g"),
+            known(effect["saved_time_us_per_period"], ".3g"),
+            known(effect["saved_operations"], ".0f"),
             _remark(effect),
         )
     return [_of_full(payload), table, *_sentences(payload)]
@@ -147,7 +148,7 @@ def _of_full(payload: Mapping[str, Any]) -> str:
     return (
         f"Full scene: {motion}; peak {full['peak_amplitude_nm']:.5g} nm, lock-in {full['lockin_amplitude_nm']:.5g} nm "
         f"at {full['lockin_phase_deg']:.4g} deg{f', {lost:.4g} aJ lost per impact' if lost is not None else ''}; "
-        f"{_number(full['time_us_per_period'], '.4g')} us of processor time per drive period, "
+        f"{known(full['time_us_per_period'], '.4g')} us of processor time per drive period, "
         f"{full['operations']:.0f} operations."
     )
 
@@ -176,13 +177,9 @@ def _sentences(payload: Mapping[str, Any]) -> Iterator[str]:
     yield (
         f"For amplitudes to {wanted} these are not needed: {', '.join(left_out)}. Without all of them the peak changes "
         f"by {_percent(joint['peak_amplitude'])}, the lock-in amplitude by {_percent(joint['lockin_amplitude'])}; "
-        f"{_number(payload['reduced']['time_us_per_period'], '.4g')} us per drive period."
+        f"{known(payload['reduced']['time_us_per_period'], '.4g')} us per drive period."
     )
 
 
 def _percent(share: float | None) -> str:
     return "-" if share is None else f"{100.0 * share:+.3g} %"
-
-
-def _number(value: float | None, form: str) -> str:
-    return "-" if value is None else format(value, form)

@@ -9,6 +9,7 @@ from afm_jax.cli.failures import NotValid
 from afm_jax.cli.fit_options import Constraint, Fixed, Names
 from afm_jax.cli.number_lists import Share
 from afm_jax.cli.session import Session, with_session
+from afm_jax.words import text_table
 
 if TYPE_CHECKING:
     from fitting.result import FitResult
@@ -211,19 +212,27 @@ def _posterior(session: Session, result: "FitResult", seed: int) -> Any:
 def _words(name: str, extra: Any) -> str:
     """Return a comparison, a bootstrap or a posterior as text."""
     if name == "comparison":
-        head = f"  {'model':<18}{'chi2/dof':>14}{'AIC':>10}{'BIC':>10}{'law differs':>14}"
-        lines = [
-            f"  {row['model']:<18}{row['chi2']:>10.1f}/{row['degrees_of_freedom']:<3d}{row['aic']:>10.1f}"
-            f"{row['bic']:>10.1f}{100.0 * row['law_change']:>12.2f} %"
+        cells = [
+            [
+                row["model"],
+                f"{row['chi2']:.1f}/{row['degrees_of_freedom']}",
+                f"{row['aic']:.1f}",
+                f"{row['bic']:.1f}",
+                f"{100.0 * row['law_change']:.2f} %",
+            ]
             for row in extra.rows
         ]
+        lines = text_table(["model", "chi2/dof", "AIC", "BIC", "law differs"], cells)
         lines += [f"  {model:<18} failed: {reason}" for model, reason in extra.failed.items()]
-        return "\n".join(["", "Models on the same rows, best first:", head, *lines, f"  {extra.verdict}"])
+        return "
+".join(["", "Models on the same rows, best first:", *lines, f"  {extra.verdict}"])
     intervals = {key: found["interval95"] for key, found in extra.to_dict()["parameters"].items()}
     head = "95 % credible intervals (posterior, flat priors):"
     if name == "bootstrap":
         head = f"95 % intervals of {len(extra.samples)} synthetic tables (bootstrap):"
-    lines = [f"  {key:<16} {low:.6g} to {high:.6g}" for key, (low, high) in intervals.items()]
+    lines = text_table(
+        ["parameter", "from", "to"], [[key, *(f"{e:.6g}" for e in ends)] for key, ends in intervals.items()]
+    )
     return "\n".join(["", head, *lines])
 
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from afm_jax.words import bullets, text_table, with_error
 from fitting.inverse.fitted_law import SavedLaw
 from fitting.inverse.inversion_result import Coefficient, Inversion, RegressedLaw
 
@@ -62,8 +63,7 @@ def inversion_summary(result: Inversion) -> str:
             lines += _law_lines(law)
         lines += ["", *_row_lines(result)]
     lines += _resonance_lines(result)
-    if result.warnings:
-        lines += ["", "Notes:", *(f"  - {warning}" for warning in result.warnings)]
+    lines += bullets("Notes:", result.warnings)
     return "\n".join(lines)
 
 
@@ -115,9 +115,9 @@ def _law_lines(law: RegressedLaw) -> list[str]:
 
 
 def _coefficient(found: Coefficient) -> str:
-    text = f"{found.value:12.6g}"
+    text = f"{found.value:.6g}"
     if found.standard_error is not None:
-        text += f" +- {found.standard_error:.2g}"
+        text = with_error(found.value, found.standard_error)
     if found.systematic_error is not None:
         text += f" (of it systematic {found.systematic_error:.2g})"
     return f"{text} {found.unit}".rstrip()
@@ -126,23 +126,23 @@ def _coefficient(found: Coefficient) -> str:
 def _row_lines(result: Inversion) -> list[str]:
     """Return the rows as a table, speeds in nm/us, delays in ns."""
     rows, records = result.rows, result.records()
-    head = f"  {'line':>4} {'N':>2} {'kHz':>9} {'nm':>6} {'u_in':>9} {'+-':>7} {'u_out':>9} {'+-':>7}"
-    lines = [f"{head} {'tau ns':>8} {'+-':>6}  loss u_in - u_out"]
-    errors = rows.errors
+    head = ["line", "N", "kHz", "nm", "u_in", "+-", "u_out", "+-", "tau ns", "+-", "loss u_in - u_out"]
+    cells = []
     for i, row in enumerate(records):
-        start = (
-            f"  {row['line']:>4} {row['order']:>2} {row['drive_frequency_khz']:>9.7g} {row['drive_amplitude_nm']:>6.4g}"
-        )
+        note = row["note"] or ""
+        start = [f"{row['line']}", f"{row['order']}", f"{row['drive_frequency_khz']:.7g}"]
+        start.append(f"{row['drive_amplitude_nm']:.4g}")
         if not rows.inverted[i]:
-            lines.append(f"{start}  {row['note']}")
+            cells.append([*start, *[""] * 6, note])
             continue
         u, w, tau = rows.impact[i]
-        du, dw, dtau = errors[i]
+        du, dw, dtau = rows.errors[i]
         covariance = rows.covariance[i]
         lost = np.sqrt(max(covariance[0, 0] + covariance[1, 1] - 2.0 * covariance[0, 1], 0.0))
-        text = f" {u:>9.3f} {du:>7.3f} {w:>9.3f} {dw:>7.3f}"
-        text += f" {NS_PER_US * tau:>8.2f} {NS_PER_US * dtau:>6.2f}  {u - w:7.3f} +- {lost:.3f}"
-        lines.append(start + text + (f"  ({row['note']})" if row["note"] else ""))
+        loss = f"{u - w:.3f} +- {lost:.3f}" + (f"  ({note})" if note else "")
+        delay = [f"{NS_PER_US * tau:.2f}", f"{NS_PER_US * dtau:.2f}"]
+        cells.append([*start, f"{u:.3f}", f"{du:.3f}", f"{w:.3f}", f"{dw:.3f}", *delay, loss])
+    lines = text_table(head, cells, words=(10,))
     if rows.shared_names:
         names = " and ".join(rows.shared_names)
         lines.append(
@@ -156,25 +156,23 @@ def _resonance_lines(result: Inversion) -> list[str]:
     if not len(reading.row):
         return []
     table = result.table
-    lines = [
-        "",
-        f"The paper's reading assumes: {reading.assumption}.",
-        f"  {'line':>4} {'u_in':>9} {'u_out':>9} {'+-':>7}   bias",
+    speeds = (reading.approach_speed_nm_per_us, reading.rebound_speed_nm_per_us, reading.speed_error_nm_per_us)
+    cells = [
+        [
+            f"{table.lines[row]}",
+            *(f"{speed:.3f}" for speed in found),
+            "not known" if np.isnan(bias) else f"{100.0 * bias:+.1f} %",
+        ]
+        for row, bias, *found in zip(reading.row, reading.bias, *speeds, strict=True)
     ]
-    numbers = table.lines if len(table.lines) else np.arange(1, table.rows + 1)
-    for row, u, w, error, bias in zip(
-        reading.row,
-        reading.approach_speed_nm_per_us,
-        reading.rebound_speed_nm_per_us,
-        reading.speed_error_nm_per_us,
-        reading.bias,
-        strict=True,
-    ):
-        shown = f"{100.0 * bias:+.1f} %" if np.isfinite(bias) else "not known"
-        lines.append(f"  {numbers[row]:>4} {u:>9.3f} {w:>9.3f} {error:>7.3f}   {shown}")
     against = {
         "truth": "Bias of u_out against the truth given, at the same approach speed.",
         "law": "Bias of u_out against the law regressed above, at the same approach speed.",
         "none": "The bias is not known: air damping and the collision delay are left out of this reading.",
     }
-    return [*lines, f"  {against[reading.reference]}"]
+    return [
+        "",
+        f"The paper's reading assumes: {reading.assumption}.",
+        *text_table(["line", "u_in", "u_out", "+-", "bias"], cells, words=()),
+        f"  {against[reading.reference]}",
+    ]

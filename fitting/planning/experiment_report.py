@@ -4,6 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from afm_jax.words import bullets, interval, known, text_table, value_alone
 from fitting.models import NUISANCE_NAMES
 from fitting.planning.experiment_candidates import LEFT_OUT
 from fitting.planning.experiment_result import Design, Forecast
@@ -38,8 +39,7 @@ def design_summary(result: Design) -> str:
         lines += ["", *_point_lines(result), "", *_forecast_lines(result)]
     left_out = [f"  {number} left out: {LEFT_OUT[name]}" for name, number in result.candidates.left_out.items()]
     lines += ["", f"  {count} of {len(result.candidates.why_not)} drives can be planned with.", *left_out]
-    if result.warnings:
-        lines += ["", "Notes:", *(f"  - {warning}" for warning in result.warnings)]
+    lines += bullets("Notes:", result.warnings)
     return "\n".join(lines)
 
 
@@ -91,32 +91,40 @@ def table_to_fill_in(result: Design) -> str:
 
 def _point_lines(result: Design) -> list[str]:
     shown = result.interest[:4]
-    head = f"  {'N':>2} {'kHz':>10} {'nm':>7} {'offset':>7} {'peak nm':>15} {'lock-in nm':>15} {'u_in':>6}"
-    lines = [head + "".join(f"{_short(name):>16}" for name in shown)]
-    for point in result.points():
-        cells = f"  {point['order']:>2} {point['drive_frequency_khz']:>10.8g} {point['drive_amplitude_nm']:>7.5g}"
-        cells += f" {point['offset_nm']:>7.4g} {_reading(point, 'peak'):>15} {_reading(point, 'lockin'):>15}"
-        cells += f" {point['expected_approach_speed_nm_per_us']:>6.1f}"
-        errors = point["standard_errors"]
-        lines.append(cells + "".join(f"{_error(errors[name]):>16}" for name in shown))
+    head = ["N", "kHz", "nm", "offset", "peak nm", "lock-in nm", "u_in", *(f"+- {name}"[:15] for name in shown)]
+    rows = [
+        [
+            f"{point['order']}",
+            f"{point['drive_frequency_khz']:.8g}",
+            f"{point['drive_amplitude_nm']:.5g}",
+            f"{point['offset_nm']:.4g}",
+            _reading(point, "peak"),
+            _reading(point, "lockin"),
+            f"{point['expected_approach_speed_nm_per_us']:.1f}",
+            *(known(point["standard_errors"][name], ".2g") for name in shown),
+        ]
+        for point in result.points()
+    ]
     return [
-        *lines,
+        *text_table(head, rows, words=()),
         "  u_in in nm/us; +- columns: standard errors expected once this point and those above are measured",
     ]
 
 
 def _forecast_lines(result: Design) -> list[str]:
-    lines = [f"  {'':<28}{'believed':>11}{'+- now':>11}{'+- then':>11}   95 % interval then"]
+    head = ["", "believed", "+- now", "+- then", "95 % interval then"]
     now, then = result.measured_so_far, result.expected
-    for name in result.belief.problem.names:
-        mark = "*" if name in result.interest else " "
-        cells = f"  {mark} {name:<26}{then[name].value:>11.6g}{_error(now[name].standard_error):>11}"
-        lines.append(f"{cells}{_error(then[name].standard_error):>11}   {_interval(then[name])}")
-    return [*lines, "  * what the points are chosen for"]
-
-
-def _short(name: str) -> str:
-    return f"+- {name}"[:15]
+    rows = [
+        [
+            f"{'*' if name in result.interest else ' '} {name}",
+            value_alone(then[name].value, then[name].standard_error, unknown=".6g"),
+            known(now[name].standard_error, ".2g"),
+            known(then[name].standard_error, ".2g"),
+            _interval(then[name]),
+        ]
+        for name in result.belief.problem.names
+    ]
+    return [*text_table(head, rows, words=(0, 4)), "  * what the points are chosen for"]
 
 
 def _reading(point: dict[str, Any], kind: str) -> str:
@@ -126,10 +134,6 @@ def _reading(point: dict[str, Any], kind: str) -> str:
     return f"{value:.1f} +- {point[f'expected_{kind}_amplitude_error_nm']:.1f}"
 
 
-def _error(error: float | None) -> str:
-    return "-" if error is None else f"{error:.2g}"
-
-
 def _interval(forecast: Forecast) -> str:
     low, high = forecast.interval95
-    return "none" if low is None or high is None else f"{low:.6g} to {high:.6g} {forecast.unit}".rstrip()
+    return "none" if low is None or high is None else f"{interval(low, high)} {forecast.unit}".rstrip()

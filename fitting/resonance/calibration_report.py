@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from afm_jax.words import bullets, interval, known, text_table, value_alone, with_error
 from fitting.resonance.calibration_result import CalibratedValue, Calibration
 
 POINT_COLUMNS = (
@@ -31,6 +32,10 @@ _BACKGROUNDS = {
 def calibration_summary(result: Calibration) -> str:
     """Return the calibration as text: verdict first, then the values, their comparison, goodness of fit, notes."""
     what = "amplitude and phase" if result.model == "phase" else "amplitude"
+    values = [
+        _value_cells("frequency_khz", result.frequency_khz, "  kHz"),
+        _value_cells("quality_factor", result.quality_factor, ""),
+    ]
     verdict = "VALID" if result.valid else "NOT VALID: the numbers below are not a calibration."
     lines = [
         f"Free resonance of {result.sweep.source} ({result.sweep.points} points, {what}):",
@@ -39,36 +44,21 @@ def calibration_summary(result: Calibration) -> str:
         verdict,
         *(f"  - {reason}" for reason in result.reasons),
         "",
-        f"  {'':<16}{'value':>14}{'std. error':>12}   95 % interval",
-        f"  {_value_line('frequency_khz', result.frequency_khz)}  kHz",
-        f"  {_value_line('quality_factor', result.quality_factor)}",
+        *text_table(["", "value", "std. error", "95 % interval"], values, words=(0, 3)),
         *_comparison_lines(result),
         "",
         _goodness_line(result),
     ]
-    if result.warnings:
-        lines += ["", "Notes:", *(f"  - {warning}" for warning in result.warnings)]
+    lines += bullets("Notes:", result.warnings)
     if result.valid:
         lines += ["", "For the top of an amplitude table:", *result.table_comments]
     return "\n".join(lines)
 
 
-def interval_in_words(value: CalibratedValue) -> str:
-    """Return '1157.9 to 1164.2', or why there is none."""
-    low, high = value.interval95
-    if low is None or high is None:
-        return f"none: {value.interval_reason}"
-    digits = _digits(high - low)
-    return f"{low:.{digits}f} to {high:.{digits}f}"
-
-
 def value_in_words(value: CalibratedValue) -> str:
-    """Return '1161.0 +- 3.2', or the bare value with three digits where its error is not known."""
+    """Return '1161.0 +- 3.2', or the bare value with six digits where its error is not known."""
     error = value.standard_error
-    if error is None:
-        return f"{value.value:.6g}"
-    digits = _digits(4.0 * error)
-    return f"{value.value:.{digits}f} +- {error:.{digits}f}"
+    return f"{value.value:.6g}" if error is None else with_error(value.value, error)
 
 
 def point_records(result: Calibration) -> list[dict[str, Any]]:
@@ -114,17 +104,11 @@ def write_calibration(
     return written
 
 
-def _value_line(name: str, value: CalibratedValue) -> str:
-    error = value.standard_error
-    shown = f"{value.value:.6g}" if error is None else f"{value.value:.{_digits(4.0 * error)}f}"
-    return f"{name:<16}{shown:>14}{'-' if error is None else f'{error:.2g}':>12}   {interval_in_words(value)}"
-
-
-def _digits(width: float) -> int:
-    """Return the decimals that show a width to two significant digits."""
-    if not np.isfinite(width) or width <= 0.0:
-        return 6
-    return int(np.clip(1 - np.floor(np.log10(width)), 0, 12))
+def _value_cells(name: str, value: CalibratedValue, unit: str) -> list[str]:
+    low, high = value.interval95
+    inside = f"none: {value.interval_reason}" if low is None or high is None else interval(low, high)
+    shown = value_alone(value.value, value.standard_error, unknown=".6g")
+    return [name, shown, known(value.standard_error, ".2g"), f"{inside}{unit}"]
 
 
 def _comparison_lines(result: Calibration) -> list[str]:

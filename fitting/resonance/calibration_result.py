@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.strict_json import plain
+from afm_jax.words import decimals, with_error
 from fitting.checks import Convergence
 from fitting.resonance.resonance_sweep import ResonanceSweep
 
@@ -141,12 +142,12 @@ class Calibration:
         error = self.quality_factor.standard_error
         if not self.valid or error is None:
             raise ValueError(f"{self.sweep.source}: the calibration is not valid; its values must not enter a table")
-        digits = int(np.clip(1 - np.floor(np.log10(error)), 0, 12))
         frequency_error = self.frequency_khz.standard_error or 0.0
-        places = int(np.clip(2 - np.floor(np.log10(max(frequency_error, 1e-12))), 3, 12))
+        # three digits of the error: it enters every amplitude of a table
+        places = max(decimals(0.1 * frequency_error, unknown=12), 3)
         return [
             f"# free_frequency_khz = {self.frequency_khz.value:.{places}f}",
-            f"# quality_factor = {self.quality_factor.value:.{digits}f} +- {error:.{digits}f}",
+            f"# quality_factor = {with_error(self.quality_factor.value, error)}",
         ]
 
     def to_dict(self) -> dict[str, Any]:

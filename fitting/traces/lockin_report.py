@@ -1,11 +1,11 @@
 """Readings of traces as a person reads them: text for the terminal, files for the drawer (JSON, CSV, PNG)."""
 
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from afm_jax.words import with_error
 from fitting.table import AmplitudeTable, write_table
 from fitting.traces.lockin_result import FORMAT_VERSION, LockinResult
 
@@ -40,7 +40,7 @@ def lockin_summary(result: LockinResult) -> str:
             ("lock-in amplitude", result.lockin_amplitude_nm, result.lockin_amplitude_error_nm, "nm"),
             ("phase", result.phase_deg, result.phase_error_deg, f"degrees, modulo {360.0 / (result.order or 1):g}"),
         )
-        lines += [f"  {name:<18}{_with_error(value, error)} {unit}" for name, value, error, unit in values]
+        lines += [f"  {name:<18}{with_error(value, error)} {unit}" for name, value, error, unit in values]
     if result.free_frequency_khz is not None and result.free_frequency_origin == "trace":
         frequency = f"{result.free_frequency_khz:.4g} kHz"
         lines.append(f"  {'free frequency':<18}{frequency} (from the bending at the top, for counting impacts only)")
@@ -89,10 +89,3 @@ def _picture_names(results: Sequence[LockinResult]) -> list[str]:
             name, number = f"lockin_{stem}_{number}.png", number + 1
         names.append(name)
     return names
-
-
-def _with_error(value: float | None, error: float | None) -> str:
-    if value is None or error is None:
-        return "not known"
-    digits = min(max(1 - math.floor(math.log10(error)), 0), 9)
-    return f"{value:.{digits}f} +- {error:.{digits}f}"
