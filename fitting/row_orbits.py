@@ -8,13 +8,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.apparatus.platform import Platform
 from afm_jax.contact.contact import Contact
+from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.impact.lasting_closure import LastingProblem
 from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact
 from afm_jax.impact.lasting_orbits import near_fold, steady_lasting_orbits
 from afm_jax.impact.lasting_search import follow_lasting_root
 from afm_jax.impact.orbit_closure import OrbitProblem
 from afm_jax.impact.orbit_state import steady_orbits
-from fitting.contact_table import tabulated
 from fitting.measurement import Measurement, Rows
 from fitting.models import Problem
 
