@@ -6,10 +6,9 @@ Names are imported when they are first used: `import fitting` is cheap and does 
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from afm_jax.contact.law_of_contact import ContactDelay, ContactLaw, fit_delay, fit_law
     from fitting.calibration import calibrate
     from fitting.comparison import Comparison, compare
-    from fitting.contact_delay import ContactDelay, fit_delay
-    from fitting.contact_law import ContactLaw, fit_law
     from fitting.experiment import design
     from fitting.gradients import AmplitudeGradients, amplitude_gradients
     from fitting.inverse.inversion_result import Inversion
@@ -39,8 +38,8 @@ else:
         "Bootstrap": "fitting.sampling.parametric_bootstrap",
         "Calibration": "fitting.resonance.calibration_result",
         "Comparison": "fitting.comparison",
-        "ContactDelay": "fitting.contact_delay",
-        "ContactLaw": "fitting.contact_law",
+        "ContactDelay": "afm_jax.contact.law_of_contact",
+        "ContactLaw": "afm_jax.contact.law_of_contact",
         "Design": "fitting.planning.experiment_result",
         "FitResult": "fitting.result",
         "LockinResult": "fitting.traces.lockin_result",
@@ -58,8 +57,8 @@ else:
         "design": "fitting.experiment",
         "drive_grid": "fitting.planning.experiment_drives",
         "fit": "fitting.law_fit",
-        "fit_delay": "fitting.contact_delay",
-        "fit_law": "fitting.contact_law",
+        "fit_delay": "afm_jax.contact.law_of_contact",
+        "fit_law": "afm_jax.contact.law_of_contact",
         "lockin": "fitting.traces.lockin_analysis",
         "invert": "fitting.inversion",
         "posterior": "fitting.sampling.posterior_of_fit",

@@ -5,9 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
+from afm_jax.contact.law_of_contact import ContactDelay, ContactLaw
 from afm_jax.plots.picture_style import DARK, GRID, label_axes, new_figure, save
-from fitting.contact_delay import ContactDelay
-from fitting.contact_law import ContactLaw
 
 # Okabe and Ito's colours, distinguishable with every kind of colour vision.
 _COLOURS = {"law": "#D55E00", "viscous": "#0072B2", "full": "#009E73"}

@@ -8,11 +8,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.apparatus.platform import Platform
 from afm_jax.contact.contact import Contact
+from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact
 from afm_jax.impact.orbit_closure import OrbitProblem
 from afm_jax.impact.orbit_search import follow_root, harmless_coordinate
 from afm_jax.impact.orbits import near_fold, steady_orbits
-from fitting.contact_table import tabulated
 from fitting.measurement import Measurement, Rows
 from fitting.models import Problem
 

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from afm_jax.contact.law_of_contact import DELAY_ERROR_US, SPEED_ERROR
 from afm_jax.impact.lasting_impact import LawImpact
-from fitting.contact_table import DELAY_ERROR_US, SPEED_ERROR
 from fitting.forward import Linearised
 from fitting.optimise import Objective
 from fitting.row_orbits import impact_of

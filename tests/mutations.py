@@ -220,7 +220,7 @@ MUTATIONS = {
         "air = 2.0 * float(cantilever.decay_rate)", "air = float(cantilever.decay_rate)", RESPONSE
     ),
     "lock-in of a motion with half its height": Mutation(
-        "2.0 / (window.to_us - window.from_us)", "1.0 / (window.to_us - window.from_us)", RESPONSE
+        "2.0 / (ends_us[1] - ends_us[0])", "1.0 / (ends_us[1] - ends_us[0])", RESPONSE
     ),
     "an approach that is taken to be over": Mutation(
         "now * rate / (1.0 - rate)", "now * rate / (1.0 + rate)", f"{OBSERVED}test_a_slow_approach_has_not_arrived"

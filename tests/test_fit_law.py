@@ -12,8 +12,8 @@ from scipy.optimize import minimize
 
 from afm_jax import Contact, ImpactLaw, find_junction
 from afm_jax.cli.main import main
+from afm_jax.contact.law_of_contact import closest_law
 from fitting import ContactLaw, fit_delay, fit_law
-from fitting.contact_law import closest_law
 from tests.reference_contact import ContactParameters, collision
 
 PAPER = Contact.paper()

@@ -1,5 +1,7 @@
 """What a contact that lasts does to an impact: its numbers from integrals and integrations of a Hertz contact."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -10,6 +12,7 @@ from scipy.special import beta
 
 import afm_jax as afm
 from afm_jax.contact.junction import find_junction
+from afm_jax.contact.law_of_contact import DELAY_ERROR_US, SPEED_ERROR, tabulated
 from afm_jax.impact.lasting_impact import (
     AIR,
     BRIDGE_NM,
@@ -23,7 +26,6 @@ from afm_jax.impact.lasting_impact import (
     middle_of_contact,
 )
 from afm_jax.impact.law import CollisionDelay, ImpactLaw, Speeds
-from fitting.contact_table import DELAY_ERROR_US, SPEED_ERROR, tabulated
 
 DEEPEST = 1.25**0.4
 """Of d'' = -d^(3/2) from d = 0 at speed 1: 1/2 = (2/5) d^(5/2)."""
@@ -196,10 +198,10 @@ def test_a_table_is_the_contacts_collisions(name):
     np.testing.assert_allclose(found.delay, truth.collision_delay_us, rtol=0, atol=1e-7)
 
 
-WET = {"relative_humidity": 0.8, "adhesion_energy_j_per_m2": 0.15, "viscosity_pa_s": 1.005e-2}
+WET: dict[str, Any] = {"relative_humidity": 0.8, "adhesion_energy_j_per_m2": 0.15, "viscosity_pa_s": 1.005e-2}
 
 
-def random_contact(rng: np.random.Generator) -> dict[str, float]:
+def random_contact(rng: np.random.Generator) -> dict[str, Any]:
     """Return numbers of a contact between dry and wet, soft and hard; one in ten without drag."""
     drag = 0.0 if rng.random() < 0.1 else 10.0 ** rng.uniform(-1.0, 1.0)
     return {
@@ -210,7 +212,7 @@ def random_contact(rng: np.random.Generator) -> dict[str, float]:
     }
 
 
-def check_against_collisions(numbers: dict[str, float]) -> bool:
+def check_against_collisions(numbers: dict[str, Any]) -> bool:
     """Compare a table with collisions over all of it; False if the contact has no junction, and the table says so."""
     contact = afm.Contact.paper(**numbers)
     table = tabulated(contact, jnp.array(1.0))

@@ -104,9 +104,8 @@ def fitted_law(scene: "Scene", found: "Simulation") -> dict[str, float]:
     import numpy as np  # noqa: PLC0415
 
     from afm_jax.contact.collide import capture_speed  # noqa: PLC0415
+    from afm_jax.contact.law_of_contact import fit_delay, fit_law  # noqa: PLC0415
     from afm_jax.motion.record import ContactKind  # noqa: PLC0415
-    from fitting.contact_delay import fit_delay  # noqa: PLC0415
-    from fitting.contact_law import fit_law  # noqa: PLC0415
 
     mass = float(scene.cantilever.mass_ng)
     left = np.asarray(found.contacts.kind) == ContactKind.IMPACT

@@ -224,8 +224,7 @@ def _words(name: str, extra: Any) -> str:
         ]
         lines = text_table(["model", "chi2/dof", "AIC", "BIC", "law differs"], cells)
         lines += [f"  {model:<18} failed: {reason}" for model, reason in extra.failed.items()]
-        return "
-".join(["", "Models on the same rows, best first:", *lines, f"  {extra.verdict}"])
+        return "\n".join(["", "Models on the same rows, best first:", *lines, f"  {extra.verdict}"])
     intervals = {key: found["interval95"] for key, found in extra.to_dict()["parameters"].items()}
     head = "95 % credible intervals (posterior, flat priors):"
     if name == "bootstrap":

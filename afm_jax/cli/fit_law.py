@@ -13,8 +13,7 @@ from afm_jax.cli.session import Session, with_session
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from fitting.contact_delay import ContactDelay
-    from fitting.contact_law import ContactLaw
+    from afm_jax.contact.law_of_contact import ContactDelay, ContactLaw
 
 MODEL_KEYS = (
     "model",
@@ -84,8 +83,11 @@ def command(
     With --out fit_law.csv, fit_delay.csv, fit_law.json, fit_law.png.
     """
     session.start_computing()
-    from fitting.contact_delay import fit_delay  # noqa: PLC0415
-    from fitting.contact_law import FREE, fit_law  # noqa: PLC0415
+    from afm_jax.contact.law_of_contact import (  # noqa: PLC0415
+        FREE,
+        fit_delay,
+        fit_law,
+    )
 
     contact, mass, description = chosen_contact(contact_options)
     with session.working("fitting (the first run compiles for some seconds)"):

@@ -112,6 +112,25 @@ def collide(
     return jax.tree.map(lambda part: part.reshape(speeds.shape), result)
 
 
+def collide_in_blocks(
+    contact: Contact,
+    speeds: Float[np.ndarray, " n"],
+    mass_ng: float = 1.0,
+    *,
+    accuracy: float = 1e-9,
+    method: str = "diffrax",
+) -> dict[str, np.ndarray]:
+    """Return the fields of `Collision` of many speeds, filled up to whole blocks so that one program serves all.
+
+    Raises:
+        ValueError: as `collide`.
+    """
+    size = BLOCK * -(-len(speeds) // BLOCK)
+    filled = np.concatenate([speeds, np.full(size - len(speeds), speeds[-1])])
+    found = collide(contact, filled, mass_ng, accuracy=accuracy, method=method)
+    return {name: np.asarray(part)[: len(speeds)] for name, part in found._asdict().items()}
+
+
 def batch_of(contact: Contact, mass_ng: ArrayLike, speeds: Float[Array, " tips"], setting: Setting) -> Collision:
     """Return a batch by one setting, without a second look at what its few steps do not resolve: for measurements."""
     return _quick(contact, jnp.asarray(mass_ng, speeds.dtype), speeds, setting)[0]

@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.contact.collide import BLOCK, capture_speed, collide
+from afm_jax.contact.collide import capture_speed, collide_in_blocks
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import find_junction
 from afm_jax.outcome import CollisionOutcome
@@ -83,25 +83,6 @@ def default_speeds(capture_speed_nm_per_us: float) -> Float[np.ndarray, " n"]:
     low = 1.1 * capture_speed_nm_per_us if known else 10.0
     speeds = np.geomspace(low, max(_TOP_SPEED, 10.0 * low), _POINTS)
     return np.array([float(f"{speed:.4g}") for speed in speeds])
-
-
-def collide_in_blocks(
-    contact: Contact,
-    speeds: Float[np.ndarray, " n"],
-    mass_ng: float = 1.0,
-    *,
-    accuracy: float = 1e-9,
-    method: str = "diffrax",
-) -> dict[str, np.ndarray]:
-    """Return the fields of `Collision` of many speeds, filled up to whole blocks so that one program serves all.
-
-    Raises:
-        ValueError: as `collide`.
-    """
-    size = BLOCK * -(-len(speeds) // BLOCK)
-    filled = np.concatenate([speeds, np.full(size - len(speeds), speeds[-1])])
-    found = collide(contact, filled, mass_ng, accuracy=accuracy, method=method)
-    return {name: np.asarray(part)[: len(speeds)] for name, part in found._asdict().items()}
 
 
 _junction = eqx.filter_jit(find_junction)

@@ -1,12 +1,10 @@
 """The data of the paper's figures 4 to 7, on the contact of section IV, with what it says of them checked."""
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import least_squares
 
 from afm_jax.contact.collide import capture_speed, collide
 from afm_jax.contact.contact import Contact
@@ -14,7 +12,9 @@ from afm_jax.contact.forces.capillary import Capillary
 from afm_jax.contact.forces.core_repulsion import CoreRepulsion
 from afm_jax.contact.forces.structural import Structural
 from afm_jax.contact.junction import find_junction
+from afm_jax.contact.law_of_contact import closest_law
 from afm_jax.contact.time_course import TimeCourse, time_course
+from afm_jax.impact.law import ImpactLaw
 from afm_jax.study.contact_statements import (
     PAPER,
     course_statements,
@@ -127,57 +127,36 @@ def figure6() -> ContactFigure:
     rebound = np.asarray(collide(contact, speeds).rebound_speed_nm_per_us)
     even = np.linspace(*FIT_RANGE, 512)
     simulated = np.asarray(collide(contact, even).rebound_speed_nm_per_us)
-    r, epsilon = _fitted(eq6, (0.998, 120.0), even, simulated)
-    linear_epsilon, loss = _fitted(linear_law, (114.0, 0.5), even, simulated)
+    eq6, _ = closest_law(even, simulated, "law", "absolute")
+    linear, _ = closest_law(even, simulated, "viscous", "absolute")
 
-    def worst(law: np.ndarray) -> float:
-        return float(np.max(np.abs(law - simulated)))
+    def worst(law: ImpactLaw) -> float:
+        return float(np.max(np.abs(np.asarray(law.rebound_speed(even)) - simulated)))
 
-    error = worst(eq6(r, epsilon, even))
+    error = worst(eq6)
     numbers: dict[str, Any] = {
         "capture_speed_nm_per_us": capture,
-        "r": r,
-        "epsilon": epsilon,
-        "adhesive_energy_aj": 0.5 * epsilon,
+        "r": float(eq6.r),
+        "epsilon": float(eq6.epsilon),
+        "adhesive_energy_aj": 0.5 * float(eq6.epsilon),
         "fitted_between_nm_per_us": list(FIT_RANGE),
         "worst_error_nm_per_us": error,
         "worst_error_of_top_speed": error / FIT_RANGE[1],
-        "worst_error_of_top_speed_with_the_papers_parameters": worst(eq6(PAPER["r"], PAPER["epsilon"], even))
+        "worst_error_of_top_speed_with_the_papers_parameters": worst(ImpactLaw(PAPER["r"], PAPER["epsilon"]))
         / FIT_RANGE[1],
         "linear_loss": {
-            "epsilon": linear_epsilon,
-            "viscous_loss": loss,
-            "worst_error_nm_per_us": worst(linear_law(linear_epsilon, loss, even)),
+            "epsilon": float(linear.epsilon),
+            "viscous_loss": float(linear.viscous_loss),
+            "worst_error_nm_per_us": worst(linear),
         },
     }
     columns = {
         "approach_speed_nm_per_us": speeds,
         "rebound_speed_nm_per_us": rebound,
-        "law_nm_per_us": eq6(r, epsilon, speeds),
-        "linear_loss_nm_per_us": linear_law(linear_epsilon, loss, speeds),
+        "law_nm_per_us": np.asarray(eq6.rebound_speed(speeds)),
+        "linear_loss_nm_per_us": np.asarray(linear.rebound_speed(speeds)),
     }
     return ContactFigure(columns, numbers, law_statements(numbers))
-
-
-def eq6(r: float, epsilon: float, speeds: np.ndarray) -> np.ndarray:
-    """Return the rebound speeds of eq. 6; 0 where the tip is captured."""
-    return np.sqrt(np.maximum(r**2 * speeds**2 - epsilon, 0.0))
-
-
-def linear_law(epsilon: float, viscous_loss: float, speeds: np.ndarray) -> np.ndarray:
-    """Return the rebound speeds of a loss that is linear in the approach speed; 0 where the tip is captured."""
-    return np.sqrt(np.maximum(speeds**2 - viscous_loss * speeds - epsilon, 0.0))
-
-
-def _fitted(
-    law: Callable[[float, float, np.ndarray], np.ndarray],
-    start: tuple[float, float],
-    speeds: np.ndarray,
-    rebound: np.ndarray,
-) -> tuple[float, float]:
-    """Return the two parameters of a law by least squares of absolute residuals."""
-    found = least_squares(lambda p: law(p[0], p[1], speeds) - rebound, start, x_scale=np.abs(start))
-    return float(found.x[0]), float(found.x[1])
 
 
 def figure7() -> ContactFigure:

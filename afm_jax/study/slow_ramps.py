@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.apparatus.scene import Scene
+from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.impact.orbits import single_impact_orbits
-from afm_jax.motion.contact_as_law import law_of_contact
 from afm_jax.motion.observe import Departures, departures
 from afm_jax.motion.record import State
 from afm_jax.motion.settle import follow_long

@@ -12,9 +12,9 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.contact import Contact
+from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
-from afm_jax.motion.contact_as_law import law_of_contact
 from afm_jax.motion.impact_integral import indentation_of
 from afm_jax.motion.record import ContactKind, Contacts, MotionOutcome, Simulation, State
 from afm_jax.motion.settle import close_periods, ends_in_flight, place_after, settled, where_to_go_on

@@ -1,0 +1,555 @@
+"""The law that a contact amounts to: rebound speed and delay of its free collisions, in parameters and in tables.
+
+From what becomes of free tips four things are made: the impact law closest to their rebound speeds (`fit_law`), the
+delay law closest to their delays (`fit_delay`), both roughly and at once where a guess will do (`law_of_contact`), and
+a table of both that is as exact as the collisions themselves (`tabulated`).
+
+The delay is what the straight paths in and out, extrapolated to gap 0, leave between them; the difference of two times:
+
+    lag   the time that the tip spends in the solid junction: what its finite stiffness needs to turn the tip round;
+    lead  what the straight paths take from the bridge's formation to gap 0 and from there to the end of contact, less
+          the time that the tip needs for these ways outside the junction: it is pulled in, and on the way out still
+          has the energy that hysteresis takes only later.
+
+For the table a collision is followed against time, from the speed with which the tip leaves to the one with which it
+came: there is no capture that way, and the speed and the time in contact are smooth functions of the rebound speed down
+to 0. The capture speed is where a rebound speed of 0 comes from.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+from scipy.optimize import OptimizeResult, least_squares, nnls
+
+from afm_jax.contact.bridge import Bridge, bridge_of
+from afm_jax.contact.bridge_leg import margin_of, pass_by_collocation, way_through
+from afm_jax.contact.collide import capture_speed, collide, collide_in_blocks
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.driven import free_tip
+from afm_jax.contact.forces import jkr
+from afm_jax.contact.junction import Junction, find_junction
+from afm_jax.contact.junction_leg import pass_through_junction
+from afm_jax.impact.lasting_impact import TabulatedImpact, stretched
+from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from afm_jax.parameters import require_float64
+
+FREE = {"law": ("r", "epsilon"), "viscous": ("epsilon", "viscous_loss"), "full": ("r", "epsilon", "viscous_loss")}
+"""For every model the parameters that are fitted; the others are r = 1 and no viscous loss."""
+RESIDUALS = ("relative", "absolute")
+LAW_SPEEDS = 1.5, 250.0
+"""The range of `fit_law` if none is given: from this multiple of the capture speed to this speed in nm/us."""
+DELAY_SPEEDS = 1.37, 700.0
+"""The same of `fit_delay`: for the paper's contact 15 to 700 nm/us."""
+_NAMES = ("r", "epsilon", "viscous_loss")
+_TOLERANCE = 1e-14
+
+_GUESSES = 12
+_GUESS_SPEEDS = 1.4, 500.0
+"""The same of `law_of_contact`."""
+_SLOWEST_GUESS = 5.0
+"""Its lowest speed, in nm/us, where no speed is captured."""
+
+TERMS = 32
+"""Terms of the series: measured on random contacts, 24 leave errors of 1e-5, 40 gain nothing."""
+FARTHEST = 400.0
+"""Rebound speed where the table ends, in terms of the speed that hysteresis takes."""
+SPEED_ERROR, DELAY_ERROR_US = 1e-7, 1e-6
+"""Relative error of the rebound speed, and error of the delay, beyond which a table does not count."""
+
+
+class _Rule(NamedTuple):
+    """Gauss nodes and sweeps of a way through the bridge, and Gauss nodes of the junction."""
+
+    nodes: int
+    sweeps: int
+    junction: int
+
+
+_USUAL, _FINER = _Rule(13, 6, 16), _Rule(26, 12, 32)
+_COMPARED = slice(0, None, 6)
+"""The nodes at which the usual rule is compared with the finer one."""
+_BARRIER_GAPS = 24
+_LEAD_SPEEDS = np.geomspace(2.0, 30.0, 8)
+_PLACES = 0.5 - 0.5 * np.cos(np.pi * np.arange(TERMS) / (TERMS - 1))
+
+
+@dataclass(frozen=True)
+class ContactLaw:
+    """A law fitted to a contact, and how far it is off.
+
+    Attributes:
+        model: a key of `FREE`.
+        residuals: what was made small, "relative" (u_fit/u_out - 1) or "absolute" (u_fit - u_out).
+        law: the fitted law, without a delay.
+        converged: whether the search ended at a minimum.
+        approach_speed_nm_per_us: the speeds, uniform over the range, shape (n,).
+        rebound_speed_nm_per_us: of the contact.
+        fitted_speed_nm_per_us: of the law.
+        contact_capture_speed_nm_per_us: capture speed of the contact; the law has its own.
+        mass_ng: of the tip.
+    """
+
+    model: str
+    residuals: str
+    law: ImpactLaw
+    converged: bool
+    approach_speed_nm_per_us: Float[np.ndarray, " n"]
+    rebound_speed_nm_per_us: Float[np.ndarray, " n"]
+    fitted_speed_nm_per_us: Float[np.ndarray, " n"]
+    contact_capture_speed_nm_per_us: float
+    mass_ng: float
+
+    @property
+    def r(self) -> float:
+        """Coefficient of restitution."""
+        return float(self.law.r)
+
+    @property
+    def epsilon(self) -> float:
+        """Loss by adhesion in nm^2/us^2."""
+        return float(self.law.epsilon)
+
+    @property
+    def viscous_loss(self) -> float:
+        """Loss linear in speed, in nm/us."""
+        return float(self.law.viscous_loss)
+
+    @property
+    def capture_speed_nm_per_us(self) -> float:
+        """Capture speed of the law."""
+        return float(self.law.capture_speed_nm_per_us)
+
+    @property
+    def speed_range(self) -> tuple[float, float]:
+        """Lowest and highest approach speed, in nm/us."""
+        return float(self.approach_speed_nm_per_us[0]), float(self.approach_speed_nm_per_us[-1])
+
+    @property
+    def error_nm_per_us(self) -> Float[np.ndarray, " n"]:
+        """Fitted less simulated rebound speed."""
+        return self.fitted_speed_nm_per_us - self.rebound_speed_nm_per_us
+
+    @property
+    def relative_error(self) -> Float[np.ndarray, " n"]:
+        """Error as a share of the rebound speed."""
+        return self.error_nm_per_us / self.rebound_speed_nm_per_us
+
+    @property
+    def worst_relative_error(self) -> float:
+        """Largest error as a share of the rebound speed."""
+        return float(np.abs(self.relative_error).max())
+
+    @property
+    def worst_error_nm_per_us(self) -> float:
+        """Largest error in nm/us."""
+        return float(np.abs(self.error_nm_per_us).max())
+
+    @property
+    def worst_share_of_top_speed(self) -> float:
+        """Largest error as a share of the highest approach speed."""
+        return self.worst_error_nm_per_us / self.speed_range[1]
+
+    @property
+    def rms_relative_error(self) -> float:
+        """Root of the mean square of the relative errors."""
+        return float(np.sqrt(np.mean(self.relative_error**2)))
+
+    @property
+    def rms_error_nm_per_us(self) -> float:
+        """Root of the mean square of the errors in nm/us."""
+        return float(np.sqrt(np.mean(self.error_nm_per_us**2)))
+
+
+def fit_law(
+    contact: Contact,
+    *,
+    speed_range: tuple[float, float] | None = None,
+    model: str = "law",
+    residuals: str = "relative",
+    mass_ng: float = 1.0,
+    points: int = 512,
+) -> ContactLaw:
+    """Return the impact law that is closest to a contact's rebound speeds.
+
+    Args:
+        contact: the contact, of numbers.
+        speed_range: lowest and highest approach speed in nm/us; None: from 1.5 times the capture speed to 250 nm/us.
+        model: "law" (r and epsilon, eq. 6), "viscous" (epsilon and a loss linear in speed) or "full" (all three).
+        residuals: "relative" or "absolute".
+        mass_ng: the tip's mass in ng.
+        points: number of speeds, uniform over the range.
+
+    Raises:
+        RuntimeError: if JAX does not compute in 64 bits, or did not when the contact was built.
+        ValueError: if the contact has no junction, a tip of the range is captured, or there is no such model, range,
+            number of points or kind of residuals.
+
+    >>> import jax
+    >>> with jax.enable_x64(True):
+    ...     law = fit_law(Contact.paper(), model="viscous")
+    >>> round(law.epsilon, 1), round(law.viscous_loss, 1)
+    (113.6, 0.5)
+    """
+    require_float64(contact)
+    if model not in FREE:
+        raise ValueError(f"`model` must be one of {', '.join(FREE)}, but is {model!r}")
+    if residuals not in RESIDUALS:
+        raise ValueError(f"`residuals` must be one of {', '.join(RESIDUALS)}, but is {residuals!r}")
+    if points < len(FREE[model]):
+        raise ValueError(f"`points` must be at least the number of parameters, {len(FREE[model])}, but is {points}")
+    capture = float(capture_speed(contact, mass_ng))
+    low, high = range_above_capture(speed_range, capture, *LAW_SPEEDS)
+    approach = np.linspace(low, high, points)
+    rebound = rebounds(contact, approach, mass_ng)["rebound_speed_nm_per_us"]
+    law, converged = closest_law(approach, rebound, model, residuals)
+    return ContactLaw(
+        model=model,
+        residuals=residuals,
+        law=law,
+        converged=converged,
+        approach_speed_nm_per_us=approach,
+        rebound_speed_nm_per_us=rebound,
+        fitted_speed_nm_per_us=np.asarray(law.rebound_speed(approach)),
+        contact_capture_speed_nm_per_us=capture,
+        mass_ng=mass_ng,
+    )
+
+
+def closest_law(
+    approach: Float[np.ndarray, " n"], rebound: Float[np.ndarray, " n"], model: str, residuals: str
+) -> tuple[ImpactLaw, bool]:
+    """Return the law with the least sum of squared residuals, and whether the search converged.
+
+    Args:
+        approach: u_in in nm/us.
+        rebound: u_out in nm/us, positive.
+        model: a key of `FREE`.
+        residuals: one of `RESIDUALS`.
+    """
+    free = np.array([name in FREE[model] for name in _NAMES])
+    # u_out^2 = u_in^2 - (1 - r^2) u_in^2 - epsilon - c u_in; the scales make the parameters of order one
+    scales = np.array([1e-2, approach[0] ** 2, approach[0] * 1e-1])[free]
+    losses = np.stack([approach**2, np.ones_like(approach), approach], axis=1)[:, free] * scales
+    weights = 1.0 / rebound if residuals == "relative" else np.ones_like(rebound)
+
+    def fitted(parameters: Float[np.ndarray, " p"]) -> Float[np.ndarray, " n"]:
+        # a law that captures a tip of the range has the smallest speed instead: far from any minimum
+        return np.sqrt(np.maximum(approach**2 - losses @ parameters, 1e-12))
+
+    def residual(parameters: Float[np.ndarray, " p"]) -> Float[np.ndarray, " n"]:
+        return (fitted(parameters) - rebound) * weights
+
+    def slopes(parameters: Float[np.ndarray, " p"]) -> Float[np.ndarray, "n p"]:
+        return -0.5 * losses * (weights / fitted(parameters))[:, None]
+
+    # to first order the residual is that of the squares over 2 u_out
+    linear = weights / (2.0 * rebound)
+    start, _ = nnls(losses * linear[:, None], (approach**2 - rebound**2) * linear)
+    found: OptimizeResult = least_squares(
+        residual,
+        start,
+        slopes,  # pyright: ignore[reportArgumentType]
+        bounds=(0.0, np.inf),
+        method="dogbox",
+        xtol=_TOLERANCE,
+        ftol=_TOLERANCE,
+        gtol=1e-12,
+    )
+    values = np.zeros(3)
+    values[free] = found.x * scales
+    loss, epsilon, viscous_loss = values.tolist()
+    return ImpactLaw(r=math.sqrt(max(1.0 - loss, 1e-12)), epsilon=epsilon, viscous_loss=viscous_loss), found.status > 0
+
+
+def rebounds(contact: Contact, speeds: Float[np.ndarray, " n"], mass_ng: float) -> dict[str, np.ndarray]:
+    """Return the fields of `Collision` for tips that all leave.
+
+    Raises:
+        ValueError: if one is captured, or not resolved.
+    """
+    found = collide_in_blocks(contact, speeds, mass_ng)
+    stays = np.flatnonzero(~(found["rebound_speed_nm_per_us"] > 0.0))
+    if stays.size:
+        raise ValueError(
+            f"`speed_range` must hold rebounding tips only, but the one of {speeds[stays[-1]]:.6g} nm/us does not leave"
+        )
+    return found
+
+
+def range_above_capture(
+    speed_range: tuple[float, float] | None, capture: float, lowest: float, top: float
+) -> tuple[float, float]:
+    """Return a range of approach speeds in nm/us, checked.
+
+    Args:
+        speed_range: lowest and highest speed; None: from `lowest` times the capture speed to `top`.
+        capture: capture speed in nm/us.
+        lowest: multiple of the capture speed.
+        top: in nm/us.
+
+    Raises:
+        ValueError: if the range does not rise, or does not begin above the capture speed.
+    """
+    if math.isinf(capture):
+        raise ValueError("the contact captures tips of every speed that was tried: there is no law to fit")
+    # a contact that captures no tip still needs a positive speed
+    low, high = (max(lowest * capture, 1e-3 * top), top) if speed_range is None else speed_range
+    if not 0.0 < low < high < math.inf:
+        advice = "" if speed_range else f" (the capture speed is {capture:.4g} nm/us); give a range"
+        raise ValueError(f"`speed_range` must rise between two positive speeds, but is {low:.6g} to {high:.6g}{advice}")
+    if low <= capture:
+        raise ValueError(
+            f"`speed_range` must begin above the capture speed of {capture:.6g} nm/us, but does at {low:g}"
+        )
+    return float(low), float(high)
+
+
+@dataclass(frozen=True)
+class ContactDelay:
+    """The delay of a contact against the approach speed, and the law fitted to it; times in us, shapes (n,).
+
+    Attributes:
+        delay: the fitted law.
+        approach_speed_nm_per_us: the speeds, at equal ratios.
+        rebound_speed_nm_per_us: of the contact.
+        delay_us: of the contact, lag less lead.
+        lag_us: time in the solid junction.
+        lead_us: by how much the ways outside the junction are shorter in time than the straight paths to gap 0.
+        fitted_us: delay of the law at the contact's speeds.
+    """
+
+    delay: CollisionDelay
+    approach_speed_nm_per_us: Float[np.ndarray, " n"]
+    rebound_speed_nm_per_us: Float[np.ndarray, " n"]
+    delay_us: Float[np.ndarray, " n"]
+    lag_us: Float[np.ndarray, " n"]
+    lead_us: Float[np.ndarray, " n"]
+    fitted_us: Float[np.ndarray, " n"]
+
+    @property
+    def speed_range(self) -> tuple[float, float]:
+        """Lowest and highest approach speed, in nm/us."""
+        return float(self.approach_speed_nm_per_us[0]), float(self.approach_speed_nm_per_us[-1])
+
+    @property
+    def rms_us(self) -> float:
+        """Root of the mean square of the fit's errors."""
+        return float(np.sqrt(np.mean((self.fitted_us - self.delay_us) ** 2)))
+
+    @property
+    def worst_us(self) -> float:
+        """Largest error of the fit."""
+        return float(np.abs(self.fitted_us - self.delay_us).max())
+
+
+def fit_delay(
+    contact: Contact, *, speed_range: tuple[float, float] | None = None, mass_ng: float = 1.0, points: int = 512
+) -> ContactDelay:
+    """Return a contact's delay, and the delay law a u^(-1/5) - b (1/w - 1/u) - d/u that is closest to it.
+
+    The law is linear in its parameters: plain linear least squares of the delay in us, with u and w, the approach and
+    the rebound speed, of the contact. The speeds are at equal ratios, so that each doubling of the speed counts alike.
+
+    Args:
+        contact: the contact, of numbers.
+        speed_range: lowest and highest approach speed in nm/us; None: from 1.37 times the capture speed to 700 nm/us.
+        mass_ng: the tip's mass in ng.
+        points: number of speeds, at least 3.
+
+    Raises:
+        RuntimeError: if JAX does not compute in 64 bits, or did not when the contact was built.
+        ValueError: if the contact has no junction, a tip of the range is captured, or the range or the number of points
+            is not possible.
+    """
+    require_float64(contact)
+    if points < 3:
+        raise ValueError(f"`points` must be at least the number of parameters, 3, but is {points}")
+    low, high = range_above_capture(speed_range, float(capture_speed(contact, mass_ng)), *DELAY_SPEEDS)
+    found = rebounds(contact, np.geomspace(low, high, points), mass_ng)
+    names = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us", "time_in_junction_us")
+    approach, rebound, delay, lag = (found[name] for name in names)
+    law, fitted = closest_delay(approach, rebound, delay)
+    return ContactDelay(
+        delay=law,
+        approach_speed_nm_per_us=approach,
+        rebound_speed_nm_per_us=rebound,
+        delay_us=delay,
+        lag_us=lag,
+        lead_us=lag - delay,
+        fitted_us=fitted,
+    )
+
+
+def closest_delay(
+    approach: Float[np.ndarray, " n"], rebound: Float[np.ndarray, " n"], delay: Float[np.ndarray, " n"]
+) -> tuple[CollisionDelay, Float[np.ndarray, " n"]]:
+    """Return the delay law with the least sum of squared residuals, and its delays at the same speeds.
+
+    Args:
+        approach: u_in in nm/us.
+        rebound: u_out in nm/us, positive.
+        delay: in us.
+    """
+    terms = np.stack(_delay_terms(approach, rebound), axis=1)
+    values, *_ = np.linalg.lstsq(terms, delay, rcond=None)
+    return CollisionDelay(*values.tolist()), terms @ values
+
+
+def _delay_terms(u: Any, w: Any) -> tuple[Any, Any, Any]:
+    """Return what Hertz time, lead and offset of the delay law are multiplied with."""
+    return u**-0.2, 1.0 / u - 1.0 / w, -1.0 / u
+
+
+def law_of_contact(contact: Contact, mass_ng: float) -> ImpactLaw | None:
+    """Return the law u_out^2 = u_in^2 - c u_in - epsilon, with delay, of a contact; None if every tip is captured.
+
+    Epsilon is the hysteresis, 2 E/m; c and the delay's three parameters are linear least squares to twelve collisions.
+
+    Args:
+        contact: the contact, of numbers.
+        mass_ng: the tip's mass in ng.
+
+    Raises:
+        ValueError: if the contact has no junction.
+    """
+    slowest = float(capture_speed(contact, mass_ng))
+    if not np.isfinite(slowest):
+        return None
+    low = max(_GUESS_SPEEDS[0] * slowest, _SLOWEST_GUESS)
+    u = np.geomspace(low, max(_GUESS_SPEEDS[1], 4.0 * low), _GUESSES)
+    # a guess needs no more digits
+    found = collide(contact, jnp.asarray(u), mass_ng, accuracy=1e-6)
+    w, delay = np.asarray(found.rebound_speed_nm_per_us), np.asarray(found.collision_delay_us)
+    free = ~np.asarray(found.captured) & (w > 0.0)
+    if np.count_nonzero(free) <= 3:
+        return None
+    u, w, delay = u[free], w[free], delay[free]
+    epsilon = 2.0 * float(find_junction(contact).hysteresis_aj) / mass_ng
+    # relative residuals of u_out^2, so that fast tips do not count alone
+    lost = (u * u - w * w - epsilon) / u
+    viscous = max(float(np.mean(lost)), 0.0)
+    return ImpactLaw(1.0, max(epsilon, 0.0), viscous, closest_delay(u, w, delay)[0])
+
+
+class Trace(NamedTuple):
+    """Where a rebound comes from, and how long it takes: nm/us and us."""
+
+    approach_speed: Float[Array, "..."]
+    time: Float[Array, "..."]
+
+
+@jax.jit
+def tabulated(contact: Contact, mass_ng: Float[Array, ""]) -> TabulatedImpact:
+    """Return the table of a contact's free collisions, differentiable in every parameter.
+
+    Without a junction, or where collisions cannot be followed back, the table is of nothing: its lowest speed is one
+    that no orbit reaches.
+
+    Args:
+        contact: the contact, of numbers.
+        mass_ng: the tip's mass in ng.
+    """
+    junction, bridge = find_junction(contact), bridge_of(contact)
+    outer = jnp.maximum(contact.bridge_breaks_nm, junction.breaks_gap_nm)
+    taken = jnp.maximum(junction.hysteresis_aj, 1e-6)
+    pulled = bridge.potential(outer) - bridge.potential(junction.breaks_gap_nm)
+    scale = jnp.sqrt(2.0 * jnp.maximum(pulled, 0.25 * taken) / mass_ng)
+    highest = FARTHEST * jnp.sqrt(2.0 * taken / mass_ng)
+    excess = scale * jnp.sinh(stretched(highest / scale) * jnp.asarray(_PLACES))
+    # the root of 0 has no derivative
+    left = 0.5 * mass_ng * excess**2 + _barrier(contact, bridge, junction, outer)
+
+    def back(energies, rule):
+        return jax.vmap(lambda energy: _traced_back(contact, junction, mass_ng, energy, rule))(energies)
+
+    u, time = back(left, _USUAL)
+    finer = lax.stop_gradient(back(lax.stop_gradient(left[_COMPARED]), _FINER))
+    lowest = u[0]
+    # through values at places that the loss has shifted a little
+    far = stretched(jnp.sqrt(jnp.maximum(u[1:] ** 2 - lowest**2, 1e-12)) / scale)
+    place = jnp.concatenate([-jnp.ones(1), 2.0 * far / far[-1] - 1.0])
+    loss, time_terms = jnp.linalg.solve(_polynomials(place), jnp.stack([u * u - 2.0 * left / mass_ng, time], axis=1)).T
+    sound = junction.exists & jnp.all(jnp.diff(u) > 0.0) & jnp.all(jnp.isfinite(loss) & jnp.isfinite(time_terms))
+    delay = time[-1] - outer / jnp.sqrt(2.0 * left[-1] / mass_ng) - contact.bridge_forms_nm / u[-1]
+    table = TabulatedImpact(
+        loss=loss,
+        time=time_terms,
+        lowest=jnp.where(sound, lowest, 1e6),
+        scale=scale,
+        end=far[-1],
+        inner_nm=contact.bridge_forms_nm,
+        outer_nm=outer,
+        hertz=delay * u[-1] ** 0.2,
+        early_nm=jnp.zeros(()),
+        length_nm=contact.bridge_breaks_nm,
+        loss_error=_tail(loss),
+        speed_error=jnp.max(jnp.abs(finer.approach_speed / u[_COMPARED] - 1.0)),
+        time_error=_tail(time_terms) + jnp.max(jnp.abs(finer.time - time[_COMPARED])),
+    )
+    return replace(table, early_nm=_lead(table))
+
+
+def _traced_back(
+    contact: Contact, junction: Junction, mass: Float[Array, ""], left: Float[Array, ""], rule: _Rule
+) -> Trace:
+    """Return where a tip comes from that leaves with an energy: out, junction and in, each followed against time."""
+    tip = free_tip(contact, junction, mass)
+    tip = tip._replace(bridge=tip.bridge.reversed())
+    bridge, solid = tip.bridge, contact.junction
+    forms, breaks = contact.bridge_forms_nm, junction.breaks_gap_nm
+    outer = jnp.maximum(contact.bridge_breaks_nm, breaks)
+    margin = margin_of(left, bridge.force(outer) * -outer)
+    out = pass_by_collocation(way_through(tip, (outer, breaks), left, margin, inward=True), rule.nodes, rule.sweeps)
+    elastic = solid.energy_scale_aj * (jkr.work(jkr.FOLD) - jkr.work(junction.forms_root))
+    formed = out.energy_aj + elastic
+    inside = pass_through_junction(tip, formed, rule.junction)
+    came = formed + bridge.potential(junction.forms_gap_nm) - bridge.potential(forms)
+    margin = margin_of(jnp.maximum(came, 0.0), bridge.force(forms) * -forms)
+    back = pass_by_collocation(
+        way_through(tip, (forms, junction.forms_gap_nm), formed, margin, inward=False), rule.nodes, rule.sweeps
+    )
+    approach = jnp.sqrt(2.0 * jnp.maximum(back.energy_aj, 1e-12) / mass)
+    return Trace(approach, out.time_us + inside.time_us + back.time_us)
+
+
+def _barrier(contact: Contact, bridge: Bridge, junction: Junction, outer: Float[Array, ""]) -> Float[Array, ""]:
+    """Return the energy in aJ that a tip must leave with to have passed every barrier: 0 if the end is the highest.
+
+    Drag, which a barrier spares the tip, is left out: with a barrier the table begins a little above capture.
+    """
+    share = jnp.asarray(np.linspace(0.0, 1.0, _BARRIER_GAPS))
+    on, breaks = junction.forms_gap_nm, junction.breaks_gap_nm
+    out = bridge.potential(breaks * (outer / breaks) ** share) - bridge.potential(outer)
+    # the junction's fold stands as high as the bridge where it breaks; what it takes, the tip had before
+    elastic = contact.junction.energy_scale_aj * (jkr.work(jkr.FOLD) - jkr.work(junction.forms_root))
+    inward = bridge.potential(on * (contact.bridge_forms_nm / on) ** share) - bridge.potential(on)
+    before = inward - elastic + bridge.potential(breaks) - bridge.potential(outer)
+    return jnp.maximum(jnp.maximum(out.max(), before.max()), 0.0)
+
+
+def _lead(table: TabulatedImpact) -> Float[Array, ""]:
+    """Return b of the delay law a u^(-1/5) - b (1/w - 1/u) - d/u closest from 2 to 30 times the capture speed."""
+    u, w, delay = jax.vmap(table.speeds)(table.lowest * jnp.asarray(_LEAD_SPEEDS))
+    terms = jnp.stack(_delay_terms(u, w), axis=1)
+    scale = jnp.sqrt(jnp.sum(terms**2, axis=0))
+    terms = terms / scale
+    return jnp.linalg.solve(terms.T @ terms, terms.T @ delay)[1] / scale[1]
+
+
+def _polynomials(place: Float[Array, " n"]) -> Float[Array, "n n"]:
+    """Return Chebyshev's polynomials of all degrees at places in [-1, 1]."""
+    rows = [jnp.ones_like(place), place]
+    for _ in range(TERMS - 2):
+        rows.append(2.0 * place * rows[-1] - rows[-2])
+    return jnp.stack(rows, axis=1)
+
+
+def _tail(terms: Float[Array, " terms"]) -> Float[Array, ""]:
+    """Return what the last terms add at most, which is more than what is missing beyond them."""
+    return jnp.sum(jnp.abs(terms[-3:]))
