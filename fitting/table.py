@@ -27,14 +27,16 @@ from fitting.tables.csv_text import (
     TableError,
     check_not_empty,
     column_of,
+    fault_in_number,
     named_rows,
     parse_rows,
     printable,
     quoted,
     read_text,
+    setting_in,
     split_lines,
 )
-from fitting.tables.table_comments import CALIBRATION, fault_in_number, known_key, parse_comments
+from fitting.tables.table_comments import CALIBRATION, SETTINGS, parse_comments
 from fitting.tables.table_rows import (
     AMPLITUDES,
     COLUMN_NAMES,
@@ -137,13 +139,18 @@ def _check_pairs(columns: dict[str, Float[np.ndarray, "..."]], faults: Faults) -
 def _check_header(table: AmplitudeTable, faults: Faults) -> None:
     for key, error in (("free_frequency_khz", None), ("quality_factor", table.quality_factor_error), ("mass_ng", None)):
         value = getattr(table, key)
-        fault = None if value is None else fault_in_number(key, value, error)
+        fault = None if value is None else fault_in_number(SETTINGS[key], value, error)
         if fault is not None:
             faults.add(f"{key} {fault}")
     if table.quality_factor is None and table.quality_factor_error is not None:
         faults.add("quality_factor_error stands without quality_factor; give both or none")
     for remark in table.remarks:
-        if known_key(remark) is not None or remark != remark.strip() or not remark or set(remark) & set("\r\n\0"):
+        if (
+            setting_in(remark, SETTINGS) is not None
+            or remark != remark.strip()
+            or not remark
+            or set(remark) & set("\r\n\0")
+        ):
             faults.add(f"the remark {quoted(remark)} would not be read back as one; make it one line of free text")
 
 

@@ -128,6 +128,15 @@ def space(law):
     return space_around(refit.objective.problem, refit.values, standard_covariance(refit), ())
 
 
+@pytest.mark.parametrize("tie", [1.0, np.nan])
+def test_parameters_that_are_one_have_no_space(law, tie):
+    refit = objective_of(law)
+    values, error = refit.values, 0.01 * refit.values
+    tied = tie * np.outer(error, error)
+    with pytest.raises(ValueError, match="hardly tell r, epsilon, quality_factor apart"):
+        space_around(refit.objective.problem, values, tied, ())
+
+
 def test_the_samplers_density_is_the_objectives(law, space):
     refit = objective_of(law)
     log_density = log_density_of(refit, space)

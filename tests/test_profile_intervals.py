@@ -99,3 +99,24 @@ def test_a_loss_that_vanishes_at_the_minimum_grows_again_where_it_has_to(correla
     assert found.high == pytest.approx(brentq(beyond, best_r, best_r + 0.1), abs=2e-5)
     assert loss.low is None
     assert loss.high is not None
+
+
+@pytest.mark.parametrize("number", [np.nan, np.inf])
+def test_a_side_where_chi2_is_not_finite_is_open_and_the_others_are_not(number):
+    class Torn(LinearObjective):
+        def at_values(self, values):
+            found = super().at_values(values)
+            beyond = values[:, 0] > self.centre[0]
+            return found._replace(
+                residual=np.where(beyond[:, None], number, found.residual),
+                jacobian=np.where(beyond[:, None, None], number, found.jacobian),
+            )
+
+    centre = np.array([0.8, 120.0])
+    with np.errstate(invalid="ignore"):
+        first, second = profile_intervals(Torn(np.diag([100.0, 0.3]), centre), centre, np.diag([1e-4, 9.0]), 1.5**2)
+    assert first.high is None
+    assert first.reason == "upper end: chi2 is not finite on this side"
+    assert first.low == pytest.approx(0.8 - QUANTILE * 0.01, abs=1e-5)
+    assert second.low is not None
+    assert second.high is not None

@@ -21,7 +21,7 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
         uncertainty: how far values may be off, relative, where the fit does not say.
 
     Raises:
-        ValueError: if the mapping is no fit.
+        ValueError: if the mapping is no fit, or its correlations are impossible.
     """
     payload = result.to_dict() if isinstance(result, FitResult) else result
     _check_payload(payload)
@@ -62,7 +62,7 @@ def _information(found: Mapping[str, Any], correlations: Sequence[Sequence[float
     information = np.zeros((len(error), len(error)))
     places = np.ix_(known, known)
     weight = np.where(known, 1.0 / np.where(known, error, 1.0), 0.0)
-    if known.any() and (not np.all(np.isfinite(matrix[places])) or np.linalg.eigvalsh(matrix[places])[0] <= 0.0):
+    if known.any() and (not np.all(np.isfinite(matrix[places])) or np.linalg.eigvalsh(matrix[places])[0] < 1e-14):
         raise ValueError("the saved fit's correlations contradict each other; fit the table again")
     # Errors far apart in size: invert the correlations, which have none.
     information[places] = np.linalg.inv(matrix[places]) * np.outer(weight, weight)[places] if known.any() else 0.0

@@ -70,7 +70,7 @@ def space_around(
     middle = np.array([_coordinate(p, value, error) for p, value, error in pairs])
     slope = np.array([_slope(p, value, error) for p, value, error in pairs])
     scaled = covariance / np.outer(slope, slope)
-    if not np.all(np.isfinite(scaled)) or np.linalg.eigvalsh(scaled)[0] <= 0.0:
+    if not np.all(np.isfinite(scaled)) or np.linalg.eigvalsh(scaled / np.trace(scaled))[0] < 1e-15:
         raise ValueError(f"the data hardly tell {', '.join(problem.names)} apart: hold one fixed, or constrain it")
     axes = np.linalg.cholesky(scaled)
     return Space(problem, log_uniform, errors, middle, axes)

@@ -9,9 +9,10 @@ import contextlib
 import csv
 import difflib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -19,6 +20,16 @@ from jaxtyping import Bool, Float, Int, Shaped
 NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 """A number as a file writes it; stricter than ``float``, which also takes "nan", "inf" and "1_000"."""
 DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?", re.ASCII)
+# A colon makes a key only in front of a number: "Measured: Tuesday" is a remark.
+_KEY_AND_VALUE = re.compile(r"\s*(?P<key>[^=:]+?)\s*(?:(?P<sign>=)|:(?=\s*[-+.\d]))(?P<value>.*)", re.DOTALL)
+_PLUS_MINUS = re.compile(r"\+-|\+/-|±")
+_SHORT_NAMES = {
+    "q": "quality_factor",
+    "q_factor": "quality_factor",
+    "f0": "free_frequency_khz",
+    "f_0": "free_frequency_khz",
+}
+"""What people call a key, too far from its name for a comparison of letters."""
 _SUGGESTIONS = 20
 """How many unknown column names are compared with the known ones; it takes some milliseconds each."""
 
@@ -162,6 +173,34 @@ class Form:
 
 
 @dataclass(frozen=True)
+class Setting:
+    """A number that a comment line can set, `# key = value` or `# key = value +- error`.
+
+    Attributes:
+        key: its name.
+        example: how its value may be written, for messages.
+        unit: its unit in words of a message, where the name might be taken for another one.
+        lowest: what it must lie above.
+        error: whether a standard error stands behind it: "never", "maybe" or "always".
+    """
+
+    key: str
+    example: str = "1"
+    unit: str = ""
+    lowest: float = 0.0
+    error: Literal["never", "maybe", "always"] = "never"
+
+    @property
+    def line(self) -> str:
+        """A line that sets it."""
+        return f"# {self.key} = {self.example}"
+
+
+Settings = Mapping[str, Setting]
+"""Settings by their key."""
+
+
+@dataclass(frozen=True)
 class Head:
     """The row of column names of a file.
 
@@ -218,6 +257,66 @@ def split_lines(text: str) -> tuple[NumberedLines, NumberedLines]:
         elif stripped.strip(",; \t"):
             rows.append((number, line))
     return [comment for comment in comments if comment[1]], rows
+
+
+def setting_in(text: str, settings: Settings) -> Setting | None:
+    """Return the setting that a comment makes or was meant to make, or None for a free remark.
+
+    Args:
+        text: the comment without its number sign.
+        settings: those there are.
+    """
+    match = _KEY_AND_VALUE.fullmatch(text)
+    if match is None or len(match["key"].split()) > 4:
+        return None
+    return settings.get(_SHORT_NAMES.get(match["key"].lower()) or nearest_name(match["key"], settings) or "")
+
+
+def parse_setting(setting: Setting, text: str, *, line: int, faults: Faults) -> tuple[float, float | None] | None:
+    """Return the value and its error of a comment that makes a setting, or None after noting a fault.
+
+    Args:
+        setting: from `setting_in`.
+        text: the comment without its number sign.
+        line: where it stands.
+        faults: where faults are noted.
+    """
+    match, key = _KEY_AND_VALUE.fullmatch(text), setting.key
+    if match is None or match["key"] != key or match["sign"] is None:
+        unit = f" (in {setting.unit})" if setting.unit else ""
+        faults.add(f"{quoted(text)} is no known setting; the key is {key}{unit}, as in '{setting.line}'", line=line)
+        return None
+    # Spreadsheets fill every line up with commas.
+    cells = [cell.strip() for cell in _PLUS_MINUS.split(match["value"].rstrip(",; \t"))]
+    fault = _fault_in_cells(setting, cells)
+    if fault is not None:
+        faults.add(f"{key} {fault}", line=line)
+        return None
+    return float(cells[0]), float(cells[1]) if len(cells) > 1 else None
+
+
+def _fault_in_cells(setting: Setting, cells: list[str]) -> str | None:
+    """Return what is wrong with the value (and its error) of a setting, or None."""
+    for cell in cells:
+        if DECIMAL_COMMA.fullmatch(cell):
+            return f"is {quoted(cell)}; write the decimal comma as a point"
+        if not NUMBER.fullmatch(cell):
+            return f"has {quoted(cell)} where a number must stand; write '{setting.line}', without the unit"
+    if len(cells) > 2 or (len(cells) == 2 and setting.error == "never"):
+        return f"takes no such error; write '{setting.line}'"
+    if len(cells) == 1 and setting.error == "always":
+        return f"needs its standard error; write '{setting.line}', or correct the columns and remove this line"
+    return fault_in_number(setting, *map(float, cells))
+
+
+def fault_in_number(setting: Setting, value: float, error: float | None = None) -> str | None:
+    """Return what is wrong with a setting's number or its standard error, both in the unit of its key, or None."""
+    if not setting.lowest < value < float("inf"):
+        above = "" if setting.lowest == float("-inf") else f" and above {setting.lowest:g}"
+        return f"must be finite{above}, but is {value!r}; correct it"
+    if error is not None and not 0.0 < error < float("inf"):
+        return f"has the error {error!r}; it must be finite and above 0, or left out"
+    return None
 
 
 def split_cells(text: str) -> list[str]:

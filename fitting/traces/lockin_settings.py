@@ -4,24 +4,25 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from fitting.tables.csv_text import DECIMAL_COMMA, NUMBER, Faults, nearest_name, quoted
-from fitting.tables.table_comments import KEY_AND_VALUE, LOWEST_QUALITY_FACTOR, PLUS_MINUS, SHORT_NAMES
+from fitting.tables.csv_text import Faults, Setting, fault_in_number, parse_setting, quoted, setting_in
+from fitting.tables.table_comments import LOWEST_QUALITY_FACTOR
 
-LOWEST: dict[str, float] = {
-    "sampling_rate_mhz": 0.0,
-    "drive_frequency_khz": 0.0,
-    "drive_amplitude_nm": 0.0,
-    "offset_nm": float("-inf"),
-    "drive_phase_deg": float("-inf"),
-    "free_frequency_khz": 0.0,
-    "quality_factor": LOWEST_QUALITY_FACTOR,
-    "quality_factor_error": 0.0,
-    "mass_ng": 0.0,
-    "rest_nm": float("-inf"),
+_ANY = float("-inf")
+SETTINGS = {
+    setting.key: setting
+    for setting in (
+        Setting("sampling_rate_mhz", "50"),
+        Setting("drive_frequency_khz", "180"),
+        Setting("drive_amplitude_nm"),
+        Setting("offset_nm", lowest=_ANY),
+        Setting("drive_phase_deg", lowest=_ANY),
+        Setting("free_frequency_khz"),
+        Setting("quality_factor", "40 (or 40 +- 2)", lowest=LOWEST_QUALITY_FACTOR, error="maybe"),
+        Setting("quality_factor_error"),
+        Setting("mass_ng"),
+        Setting("rest_nm", lowest=_ANY),
+    )
 }
-"""The settings, and what each must lie above."""
-
-_EXAMPLES = {"sampling_rate_mhz": "50", "drive_frequency_khz": "180", "quality_factor": "40 (or 40 +- 2)"}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -63,40 +64,16 @@ def settings_of_comments(comments: list[tuple[int, str]], faults: Faults) -> tup
     found: dict[str, float] = {}
     remarks = []
     for line, text in comments:
-        key = _meant(text)
-        if key is None:
+        setting = setting_in(text, SETTINGS)
+        if setting is None:
             remarks.append(text)
-        elif key in found:
-            faults.add(f"{key} is given a second time; remove one of the two", line=line)
+        elif setting.key in found:
+            faults.add(f"{setting.key} is given a second time; remove one of the two", line=line)
         else:
-            found |= _setting(key, text, line=line, faults=faults)
+            numbers = parse_setting(setting, text, line=line, faults=faults) or ()
+            names = (setting.key, f"{setting.key}_error")
+            found |= {name: number for name, number in zip(names, numbers, strict=False) if number is not None}
     return found, tuple(remarks)
-
-
-def _meant(text: str) -> str | None:
-    match = KEY_AND_VALUE.fullmatch(text)
-    if match is None or len(match["key"].split()) > 4:
-        return None
-    return SHORT_NAMES.get(match["key"].lower()) or nearest_name(match["key"], LOWEST)
-
-
-def _setting(key: str, text: str, *, line: int, faults: Faults) -> dict[str, float]:
-    match = KEY_AND_VALUE.fullmatch(text)
-    example = f"# {key} = {_EXAMPLES.get(key, '1')}"
-    if match is None or match["key"] != key or match["sign"] is None:
-        faults.add(f"{quoted(text)} is no known setting; the key is {key}, as in '{example}'", line=line)
-        return {}
-    cells = [cell.strip() for cell in PLUS_MINUS.split(match["value"].rstrip(",; \t"))]
-    for cell in cells:
-        if not NUMBER.fullmatch(cell):
-            advice = "write the decimal comma as a point" if DECIMAL_COMMA.fullmatch(cell) else f"write '{example}'"
-            faults.add(f"{key} has {quoted(cell)} where a number must stand; {advice}, without the unit", line=line)
-            return {}
-    if len(cells) > (2 if key == "quality_factor" else 1):
-        faults.add(f"{key} takes no such error; write '{example}'", line=line)
-        return {}
-    names = (key, f"{key}_error")
-    return {name: _checked(name, float(cell), faults, line=line) for name, cell in zip(names, cells, strict=False)}
 
 
 def settings_of_attributes(attributes: Mapping[str, Any], faults: Faults) -> dict[str, float]:
@@ -107,7 +84,7 @@ def settings_of_attributes(attributes: Mapping[str, Any], faults: Faults) -> dic
         faults: where a value that is no number is noted.
     """
     found = {}
-    for name in LOWEST:
+    for name in SETTINGS:
         if name in attributes:
             try:
                 found[name] = _checked(name, float(attributes[name]), faults)
@@ -129,8 +106,8 @@ def joined_settings(found: Mapping[str, float], given: Mapping[str, float | None
     """
     stated = {name: float(value) for name, value in given.items() if value is not None}
     for name, value in stated.items():
-        if name not in LOWEST:
-            raise TypeError(f"there is no setting `{name}`; the settings are {', '.join(LOWEST)}")
+        if name not in SETTINGS:
+            raise TypeError(f"there is no setting `{name}`; the settings are {', '.join(SETTINGS)}")
         _checked(name, value, faults)
     # the error of a quality factor belongs to the value that it was stated with
     if "quality_factor" in stated:
@@ -138,9 +115,8 @@ def joined_settings(found: Mapping[str, float], given: Mapping[str, float | None
     return TraceSettings(**(dict(found) | stated))
 
 
-def _checked(name: str, value: float, faults: Faults, *, line: int = 0) -> float:
-    lowest = LOWEST[name]
-    if not lowest < value < float("inf"):
-        above = "" if lowest == float("-inf") else f" and above {lowest:g}"
-        faults.add(f"{name} must be finite{above}, but is {value!r}; correct it", line=line)
+def _checked(name: str, value: float, faults: Faults) -> float:
+    fault = fault_in_number(SETTINGS[name], value)
+    if fault is not None:
+        faults.add(f"{name} {fault}")
     return value
