@@ -4,10 +4,9 @@ from typing import Any
 
 import jax
 import numpy as np
-from afm_jax.contact.collision import Collision
 from numpy.typing import ArrayLike
 
-from afm_jax.contact.collide import collide
+from afm_jax.contact.collide import Collision, collide
 from afm_jax.contact.contact import Contact
 
 TOGETHER = 8

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from afm_jax.contact.capture import capture_speed
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
-from afm_jax.contact.collide import collide
+from afm_jax.contact.collide import capture_speed, collide
 from afm_jax.contact.contact import Contact
+from afm_jax.contact.law_of_contact import fit_delay, fit_law
 from afm_jax.contact.time_course import time_course
 from afm_jax.impact import orbits as orbits_module
 from afm_jax.impact import poincare
@@ -27,8 +27,6 @@ from afm_jax.motion.start import state
 from afm_jax.parameters import float32_allowed
 from afm_jax.study.collisions import collisions
 from afm_jax.study.effects import study_effects
-from fitting.contact_delay import fit_delay
-from fitting.contact_law import fit_law
 from fitting.simulated.simulated_experiment import drives_of, simulate_experiment
 from tests.package_scenes import bouncing, next_impacts, repeated, stacked
 

@@ -6,11 +6,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from afm_jax.contact.capture import capture_speed
 from scipy.integrate import solve_ivp
 from scipy.special import beta
 
 import afm_jax as afm
+from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.junction import find_junction
 from afm_jax.contact.law_of_contact import DELAY_ERROR_US, SPEED_ERROR, tabulated
 from afm_jax.impact.lasting_impact import (
