@@ -17,6 +17,8 @@ from afm_jax.presets import contact_scene
 from tests.reference_contact_forces import ContactParameters
 from tests.reference_driven_contact import DrivenContact, follow
 
+ROOM = 64  # what short motions are given unasked: the same programs
+
 
 def reference(n: float, beta: float, offset: float = 0.0, **others) -> DrivenContact:
     return DrivenContact(amplitude_nm=beta, drive_frequency_khz=180.0 * n, offset_nm=offset, **others)
@@ -201,9 +203,9 @@ def test_batches_agree_with_single_scenes():
     system = reference(5.277, 4.0)
     starts = [system.start(phase_deg=270, height_nm=5, velocity_nm_per_us=speed) for speed in speeds]
     columns = State(*(jnp.asarray(column) for column in zip(*starts, strict=True)))
-    many = jax.jit(jax.vmap(lambda start: simulate(scene, start, 20.0, max_contacts=24)))(columns)
+    many = jax.jit(jax.vmap(lambda start: simulate(scene, start, 20.0, max_contacts=ROOM)))(columns)
     for place, start in enumerate(starts):
-        one = simulate(scene, state(start), 20.0, max_contacts=24)
+        one = simulate(scene, state(start), 20.0, max_contacts=ROOM)
         assert int(one.count) == int(many.count[place])
         # the same steps, summed in another order
         np.testing.assert_allclose(
@@ -249,9 +251,9 @@ def test_derivatives_forward_and_reverse():
 
 
 def test_too_little_room_is_an_outcome():
-    simulation = simulate(contact_scene(1.01, 4.0, 0.0), state((0.0, 10.0, 60.0)), 200.0, max_contacts=3)
+    simulation = simulate(contact_scene(1.01, 4.0, 0.0), state((0.0, 10.0, 60.0)), 600.0, max_contacts=ROOM)
     assert int(simulation.outcome) == MotionOutcome.CONTACT_LIMIT
-    assert int(simulation.count) == 3
+    assert int(simulation.count) == ROOM
 
 
 def test_impossible_calls_are_refused():
