@@ -58,12 +58,12 @@ def interval(low: float, high: float) -> str:
 
 
 def known(value: SupportsFloat | None, form: str = ".3g") -> str:
-    """Return a number in a format, a dash where there is none.
+    """Return a number in a format, a dash where there is none or it is not finite.
 
     >>> known(0.12345), known(None), known(float("nan"), "+.2f")
     ('0.123', '-', '-')
     """
-    return "-" if value is None or math.isnan(value) else f"{value:{form}}"
+    return "-" if value is None or not math.isfinite(value) else f"{value:{form}}"
 
 
 def percent(share: float) -> str:

@@ -152,8 +152,8 @@ def ladder_table(result: Mapping[str, Any]) -> "Table":
     for row in result["ladder"]:
         error = row.get("model_error")
         heights = [known(row[name], ".5g") for name in ("peak_nm", "lowest_peak_nm")]
-        count = "-" if row["contacts"] is None else str(row["contacts"])
-        table.add_row(row["model"], *heights, "-" if error is None else f"{error:.2%}", known(row["seconds"]), count)
+        count = known(row["contacts"], "d")
+        table.add_row(row["model"], *heights, known(error, ".2%"), known(row["seconds"]), count)
     return table
 
 

@@ -11,6 +11,7 @@ import click
 from afm_jax.cli.bench_fits import FIT_COLUMNS, fit_rows, fit_table
 from afm_jax.cli.bench_scenes import SCENE_COLUMNS, measure_scenes, scene_tables
 from afm_jax.cli.session import Session, with_session
+from afm_jax.words import known
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -209,8 +210,8 @@ def bench_table(rows: Sequence[dict[str, Any]]) -> "Table":
             f"{row['microseconds_per_impact']:.3g}",
             f"{row['median_microseconds_per_impact']:.3g}",
             f"{row['impacts_per_second']:,.0f}",
-            "-" if compile_s is None else f"{compile_s:.1f}",
-            "-" if ratio is None else f"{ratio:.2f}",
+            known(compile_s, ".1f"),
+            known(ratio, ".2f"),
             _error_cell(row),
         )
     return table
@@ -243,6 +244,6 @@ def contact_table(rows: Sequence[dict[str, Any]]) -> "Table":
         table.add_column(heading, justify="right")
     names = ("compile_s", "rebound_error", "delay_error_us", "ratio_to_plain", "instructions", "memory_mib")
     for row in rows:
-        cells = ["-" if row.get(name) is None else f"{row[name]:.3g}" for name in names]
+        cells = [known(row.get(name)) for name in names]
         table.add_row(row["what"], f"{row['batch']:,}", f"{row['microseconds_per_impact']:.3g}", *cells)
     return table

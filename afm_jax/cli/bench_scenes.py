@@ -74,7 +74,7 @@ def scene_tables(rows: Sequence[Mapping[str, Any]]) -> list["Table"]:
     for heading in ("batch", "periods", "contacts", "us/contact", "seconds", "compile s", "turning", "held", "failed"):
         times.add_column(heading, justify="right")
     for row in rows:
-        shares = ["-" if row.get(name) is None else f"{row[name]:.1%}" for name in ("turning_share", "held_share")]
+        shares = [known(row.get(name), ".1%") for name in ("turning_share", "held_share")]
         numbers = [known(row.get(name)) for name in ("microseconds_per_contact", "seconds", "compile_s")]
         counts = [str(row.get(name, "-")) for name in ("batch", "periods", "contacts")]
         times.add_row(row["what"], row["scene"], *counts, *numbers, *shares, str(row.get("failed", "-")))

@@ -8,6 +8,7 @@ from afm_jax.cli.contact_options import ContactOptions, chosen_contact, with_con
 from afm_jax.cli.failures import NotValid
 from afm_jax.cli.number_lists import Numbers
 from afm_jax.cli.session import Session, with_session
+from afm_jax.words import known
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -112,7 +113,7 @@ def collision_table(rows: list[dict[str, Any]]) -> "Table":
     names = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us", "time_in_junction_us")
     names += ("deepest_gap_nm", "bridge_hysteresis_aj", "junction_hysteresis_aj", "viscous_loss_aj")
     for row in rows[:_SHOWN]:
-        table.add_row(*("-" if row[name] is None else f"{row[name]:.6g}" for name in names), row["outcome_name"])
+        table.add_row(*(known(row[name], ".6g") for name in names), row["outcome_name"])
     return table
 
 

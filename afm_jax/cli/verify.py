@@ -7,6 +7,7 @@ import click
 
 from afm_jax.cli.failures import NotValid
 from afm_jax.cli.session import Session, with_session
+from afm_jax.words import known
 
 if TYPE_CHECKING:
     from afm_jax.study.verification import Check
@@ -70,7 +71,7 @@ def _table(checks: list["Check"]) -> Any:
     for title in ("equation", "against", "where", "points", "worst rel. difference", "in eps x condition", "passed"):
         table.add_column(title, justify="right" if title in {"points", "worst rel. difference"} else "left")
     for check in checks:
-        worst = "-" if check.max_relative_difference is None else f"{check.max_relative_difference:.1e}"
+        worst = known(check.max_relative_difference, ".1e")
         scaled = "" if check.against == "autodiff" or check.judged is None else f"{check.judged:.2g}"
         passed = {True: "yes", False: "NO", None: "not compared"}[check.passed]
         table.add_row(check.equation, check.against, check.where, str(check.points), worst, scaled, passed)
