@@ -195,8 +195,8 @@ def _impact_and_slopes(values: Float[Array, " p"], measurement: Measurement, pro
 
 
 def _prediction(branch: Branch, values: Float[Array, " p"], orbit: OrbitProblem, problem: Problem) -> Prediction:
-    amplitude = amplitudes(branch.coordinate, orbit)[:2]
-    speed = orbit.impact.speeds(branch.coordinate).approach
+    amplitude = amplitudes(branch.place, orbit)[:2]
+    speed = orbit.impact.speeds(branch.place.coordinate).approach
     return Prediction(
         amplitude_nm=jnp.where(
             branch.exists, amplitude * problem.nuisance(values, "tip_calibration", 1.0), jnp.zeros_like(amplitude)
@@ -204,5 +204,5 @@ def _prediction(branch: Branch, values: Float[Array, " p"], orbit: OrbitProblem,
         orbits=branch.orbits,
         near_fold=branch.near_fold,
         approach_speed_nm_per_us=lax.stop_gradient(speed),
-        coordinate=branch.coordinate,
+        coordinate=branch.place.coordinate,
     )

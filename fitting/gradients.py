@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from afm_jax.contact.contact import EFFECTS
 from afm_jax.impact.first_impact import Flight, flight_gap
-from afm_jax.impact.orbit_closure import OrbitProblem
+from afm_jax.impact.orbit_closure import OrbitProblem, Place
 from afm_jax.impact.orbits import amplitudes, orbit_state
 from afm_jax.impact.poincare import NEAR_GRAZING
 from afm_jax.parameters import require_float64
@@ -155,18 +155,18 @@ def _judged(values: Float[Array, " p"], measurement: Measurement, problem: Probl
 
         def predicted(v):
             orbit = orbit_problem(v, impact_of(v, measurement, problem), row, measurement, problem)
-            return amplitudes(branch.coordinate, orbit)[:2] * problem.nuisance(v, "tip_calibration", 1.0)
+            return amplitudes(branch.place, orbit)[:2] * problem.nuisance(v, "tip_calibration", 1.0)
 
-        slow, touching = _grazes(branch.coordinate, orbit)
+        slow, touching = _grazes(branch.place, orbit)
         slope = differentiated(predicted)(values)
         return _Judged(predicted(values), slope, branch.exists, branch.near_fold, slow, touching)
 
     return jax.vmap(one)(measurement.rows)
 
 
-def _grazes(coordinate: Float[Array, ""], orbit: OrbitProblem) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+def _grazes(place: Place, orbit: OrbitProblem) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
     """Say whether the impact is a graze, and whether the flight touches the platform on the way."""
-    state = orbit_state(coordinate, orbit)
+    state = orbit_state(place, orbit)
     slow = state.speeds.approach < NEAR_GRAZING * orbit.platform.top_speed_nm_per_us
     flight = Flight(orbit.cantilever, orbit.platform, state.flight.start_us, state.flight.start_velocity)
     begin = jnp.maximum(-state.speeds.delay, 0.0)

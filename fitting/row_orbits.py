@@ -10,7 +10,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact
-from afm_jax.impact.orbit_closure import OrbitProblem
+from afm_jax.impact.orbit_closure import OrbitProblem, Place
 from afm_jax.impact.orbit_search import follow_root, harmless_coordinate
 from afm_jax.impact.orbits import near_fold, steady_orbits
 from fitting.measurement import Measurement, Rows
@@ -18,9 +18,9 @@ from fitting.models import Problem
 
 
 class Branch(NamedTuple):
-    """The orbit that a row is taken to be on: its coordinate, whether there is one, and how many there are."""
+    """The orbit that a row is taken to be on: where, whether there is one, and how many there are."""
 
-    coordinate: Float[Array, ""]
+    place: Place
     exists: Bool[Array, ""]
     orbits: Int[Array, ""]
     near_fold: Bool[Array, ""]
@@ -62,7 +62,7 @@ def branch_of(orbit: OrbitProblem, row: Rows) -> Branch:
     misfit = jnp.where(row.measured, (roots.amplitude_nm - row.amplitude_nm) / row.error_nm, 0.0)
     slot = jnp.argmin(jnp.where(roots.steady, jnp.sum(misfit**2, axis=1), jnp.inf))
     return Branch(
-        coordinate=roots.coordinate[slot],
+        place=Place(roots.place.coordinate[slot], roots.place.phase[slot]),
         exists=roots.steady[slot],
         orbits=jnp.sum(roots.steady, dtype=jnp.int32),
         near_fold=roots.steady[slot] & roots.near_double[slot],
@@ -72,17 +72,18 @@ def branch_of(orbit: OrbitProblem, row: Rows) -> Branch:
 def followed(orbit: OrbitProblem, known: Branch) -> Branch:
     """Follow a row's orbit from where it is known to be: exact where it was found, close at other parameters."""
     harmless = harmless_coordinate(orbit)
-    root, found = follow_root(jnp.where(known.exists, known.coordinate, harmless), orbit)
+    root, found = follow_root(jnp.where(known.exists, known.place.coordinate, harmless), orbit)
     exists = known.exists & found
     return Branch(
-        coordinate=jnp.where(exists, root, harmless),
+        place=Place(jnp.where(exists, root.coordinate, harmless), root.phase),
         exists=exists,
         orbits=jnp.where(exists, known.orbits, 0),
-        near_fold=exists & near_fold(root, orbit),
+        near_fold=exists & near_fold(root.coordinate, orbit),
     )
 
 
 def branch_near(coordinate: Float[np.ndarray, " lanes"] | Float[Array, " lanes"]) -> Branch:
     """Return orbits that are taken to be near coordinates; NaN: there is none."""
     there = jnp.isfinite(coordinate)
-    return Branch(jnp.asarray(coordinate), there, there.astype(jnp.int32), jnp.zeros_like(there))
+    near = jnp.asarray(coordinate)
+    return Branch(Place(near, jnp.zeros_like(near)), there, there.astype(jnp.int32), jnp.zeros_like(there))

@@ -9,6 +9,7 @@ from scipy.optimize import least_squares
 
 import fitting.row_orbits
 from afm_jax.impact.law import ImpactLaw
+from afm_jax.impact.orbit_closure import Place
 from afm_jax.impact.orbits import SteadyOrbits
 from fitting import fit, read_table
 from fitting.law_fit import problem_of
@@ -208,7 +209,7 @@ def test_of_coexisting_orbits_the_measured_one_is_taken(table, monkeypatch, meas
     """Made-up orbits: without a delay no drive of 140,000 random ones had two stable ones."""
     amplitude = jnp.array([[100.0, 40.0], [60.0, 26.0], [60.0, 25.0], [61.0, 40.0]])
     steady = jnp.array([True, False, True, False])
-    made_up = SteadyOrbits(jnp.arange(4.0), steady, jnp.zeros(4, dtype=bool), amplitude)
+    made_up = SteadyOrbits(Place(jnp.arange(4.0), jnp.zeros(4)), steady, jnp.zeros(4, dtype=bool), amplitude)
     monkeypatch.setattr(fitting.row_orbits, "steady_orbits", lambda _: made_up)
     error = np.where(np.isnan(measured), np.nan, 1.0)[None]
     problem, values = problem_of(table, "law"), jnp.array([0.95, 60.0, 40.0])
@@ -216,6 +217,6 @@ def test_of_coexisting_orbits_the_measured_one_is_taken(table, monkeypatch, meas
     row = Rows(*(column[0] for column in measurement.rows))
     orbit = orbit_problem(values, impact_of(values, measurement, problem), row, measurement, problem)
     branch = branch_of(orbit, row)
-    assert int(branch.coordinate) == slot
+    assert int(branch.place.coordinate) == slot
     assert int(branch.orbits) == 2
     assert bool(branch.exists)

@@ -10,9 +10,9 @@ import pytest
 import afm_jax as afm
 from afm_jax.impact.lasting_impact import LawImpact
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
-from afm_jax.impact.orbit_closure import OrbitProblem
+from afm_jax.impact.orbit_closure import OrbitProblem, Place
 from afm_jax.impact.orbit_search import COARSE, find_roots, follow_root
-from afm_jax.impact.orbits import amplitudes, near_fold, orbit_state, steady_orbits
+from afm_jax.impact.orbits import SteadyOrbits, amplitudes, near_fold, orbit_state, steady_orbits
 from tests.reference_examples import DELAY, scene
 from tests.reference_lasting import closing_impacts, closing_speeds
 from tests.reference_systems import Parameters
@@ -36,10 +36,15 @@ def delayed(order: int, reduced: float, amplitude_nm: float, offset_nm: float) -
     return scene(reduced, amplitude_nm=amplitude_nm, offset_nm=offset_nm, **law), order
 
 
+def place_in(orbits: SteadyOrbits, slot: np.intp) -> Place:
+    """Return the place of one orbit."""
+    return Place(orbits.place.coordinate[slot], orbits.place.phase[slot])
+
+
 def speeds_found(problem: OrbitProblem) -> np.ndarray:
     """Return the approach speeds of all roots, ascending."""
     roots = find(problem)
-    speeds = jax.vmap(problem.impact.speeds)(roots.coordinate).approach
+    speeds = jax.vmap(problem.impact.speeds)(roots.place.coordinate).approach
     return np.sort(np.asarray(speeds)[np.asarray(roots.found)])
 
 
@@ -86,14 +91,14 @@ def test_state_is_the_phase_and_the_impact_of_the_dense_scan():
     problem = problem_of(p, order)
     orbits = steady(problem)
     (slot,) = np.flatnonzero(orbits.steady)
-    state = orbit_state(orbits.coordinate[slot], problem)
+    state = orbit_state(place_in(orbits, slot), problem)
     impact = closing_impacts(p, order, np.asarray(state.speeds.approach)[None])
     assert float(state.speeds.rebound) == pytest.approx(impact.rebound[0], rel=1e-9)
     assert float(state.speeds.delay) == pytest.approx(impact.delay[0], rel=1e-8)
     leaving = np.arctan2(impact.sine[0], impact.cosine[0]) / float(problem.platform.angular_frequency)
     period = float(problem.platform.period_us)
     assert float(state.flight.start_us) % period == pytest.approx(leaving % period, rel=1e-8)
-    peak, lockin, _ = amplitudes(orbits.coordinate[slot], problem)
+    peak, lockin, _ = amplitudes(place_in(orbits, slot), problem)
     # the same program, once batched
     np.testing.assert_allclose(orbits.amplitude_nm[slot], [peak, lockin], rtol=1e-12)
 
@@ -126,14 +131,14 @@ def test_following_leads_to_the_root_that_a_search_finds(drive):
     begin = steady(problem_of(p, order))
     (slot,) = np.flatnonzero(begin.steady)
     moved = problem_of(dataclasses.replace(p, epsilon=118.0, quality_factor=39.0), order)
-    followed, found = follow(begin.coordinate[slot], moved)
+    followed, found = follow(begin.place.coordinate[slot], moved)
     assert bool(found)
     roots = find(moved)
-    coordinates = np.asarray(roots.coordinate)[np.asarray(roots.found)]
-    nearest = coordinates[np.argmin(np.abs(coordinates - float(followed)))]
-    assert float(followed) == pytest.approx(nearest, rel=1e-10)
-    assert float(followed) != pytest.approx(float(begin.coordinate[slot]), rel=1e-4)
-    assert not bool(near_fold(followed, moved))
+    coordinates = np.asarray(roots.place.coordinate)[np.asarray(roots.found)]
+    nearest = coordinates[np.argmin(np.abs(coordinates - float(followed.coordinate)))]
+    assert float(followed.coordinate) == pytest.approx(nearest, rel=1e-10)
+    assert float(followed.coordinate) != pytest.approx(float(begin.place.coordinate[slot]), rel=1e-4)
+    assert not bool(near_fold(followed.coordinate, moved))
 
 
 def test_following_says_where_there_is_nothing():
@@ -141,5 +146,5 @@ def test_following_says_where_there_is_nothing():
     begin = steady(problem_of(p, order))
     (slot,) = np.flatnonzero(begin.steady)
     # a tenth of the drive: nothing leaves the sample
-    _, found = follow(begin.coordinate[slot], problem_of(dataclasses.replace(p, amplitude_nm=0.1), order))
+    _, found = follow(begin.place.coordinate[slot], problem_of(dataclasses.replace(p, amplitude_nm=0.1), order))
     assert not bool(found)

@@ -105,7 +105,7 @@ class Place(NamedTuple):
 
 
 def place_of(coordinate: Float[Array, ""], speeds: Speeds, system: System, problem: OrbitProblem) -> Place:
-    """Return about where the orbit of an impact that lasts is, given the closure at a coordinate close to a root."""
+    """Return where an orbit is, given the closure at its coordinate; about, where the impact lasts."""
     return Place(coordinate, system.phase - problem.platform.angular_frequency * speeds.delay)
 
 

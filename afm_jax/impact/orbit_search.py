@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from afm_jax.impact.orbit_closure import (
     OrbitProblem,
+    Place,
     close_map,
     closing_residual,
     closure,
@@ -59,16 +60,16 @@ COARSE = Scan(512, 1e-3, 1e4, crossings=6, turns=2, slots=10)
 class OrbitRoots(NamedTuple):
     """Roots of the closing condition.
 
-    ``coordinate`` in nm/us and ``found``, one a slot; ``complete``: there were no more roots than slots.
+    ``place`` and ``found``, one a slot; ``complete``: there were no more roots than slots.
     """
 
-    coordinate: Float[Array, " slots"]
+    place: Place
     found: Bool[Array, " slots"]
     complete: Bool[Array, ""]
 
 
 def find_roots(problem: OrbitProblem, scan: Scan = FINE) -> OrbitRoots:
-    """Return all coordinates of orbits, ascending in approach speed, without derivatives; harmless ones elsewhere.
+    """Return all places of orbits, ascending in approach speed, without derivatives; harmless ones elsewhere.
 
     Args:
         problem: what orbits are of.
@@ -78,18 +79,18 @@ def find_roots(problem: OrbitProblem, scan: Scan = FINE) -> OrbitRoots:
     driven = (problem.platform.amplitude_nm > 0.0) & (problem.platform.offset_rate_nm_per_us == 0.0)
     coordinate, found, complete = _scanned_roots(problem, scan) if problem.impact.delayed else _quartic_roots(problem)
     safe = jnp.where(found, coordinate, harmless_coordinate(problem))
-    closed, there = jax.vmap(follow_root if problem.impact.lasts else _regular, in_axes=(0, None))(safe, problem)
+    place, there = jax.vmap(follow_root if problem.impact.lasts else _regular, in_axes=(0, None))(safe, problem)
     found = found & driven & there
-    return OrbitRoots(jnp.where(found, closed, safe), found, complete)
+    return OrbitRoots(Place(jnp.where(found, place.coordinate, safe), place.phase), found, complete)
 
 
 @jax.jit
-def follow_root(near: Float[Array, ""], problem: OrbitProblem) -> tuple[Float[Array, ""], Bool[Array, ""]]:
+def follow_root(near: Float[Array, ""], problem: OrbitProblem) -> tuple[Place, Bool[Array, ""]]:
     """Return where the map of a lasting impact closes, close to a coordinate, and whether it does."""
     problem = lax.stop_gradient(problem)
     speeds, system = closure(near, problem)
     unknowns = close_map(place_of(near, speeds, system, problem), problem, _NEWTON)
-    return unknowns[0], system.regular & jnp.all(jnp.abs(map_gaps(unknowns, problem)) < _CLOSED)
+    return Place(*unknowns), system.regular & jnp.all(jnp.abs(map_gaps(unknowns, problem)) < _CLOSED)
 
 
 def harmless_coordinate(problem: OrbitProblem) -> Float[Array, ""]:
@@ -97,12 +98,21 @@ def harmless_coordinate(problem: OrbitProblem) -> Float[Array, ""]:
     return problem.impact.lowest + 2.0 * _scale(problem) + 2.0
 
 
-def _regular(coordinate: Float[Array, ""], problem: OrbitProblem) -> tuple[Float[Array, ""], Bool[Array, ""]]:
-    """Return a coordinate, and whether the phase is determined there."""
-    return coordinate, closure(coordinate, problem).system.regular
+def _regular(coordinate: Float[Array, ""], problem: OrbitProblem) -> tuple[Place, Bool[Array, ""]]:
+    """Return the place at a root, and whether the phase is determined there."""
+    speeds, system = closure(coordinate, problem)
+    return place_of(coordinate, speeds, system, problem), system.regular
 
 
-def _quartic_roots(problem: OrbitProblem) -> OrbitRoots:
+class _Coordinates(NamedTuple):
+    """Roots of the scalar condition: coordinates, which of them are some, and whether those are all."""
+
+    coordinate: Float[Array, " slots"]
+    found: Bool[Array, " slots"]
+    complete: Bool[Array, ""]
+
+
+def _quartic_roots(problem: OrbitProblem) -> _Coordinates:
     """Solve (Y cosine)^2 + (Y sine)^2 = (Y determinant)^2, a quartic in Y over beta omega."""
     quartic = instantaneous_quartic(problem)
     scale = problem.platform.top_speed_nm_per_us
@@ -112,14 +122,14 @@ def _quartic_roots(problem: OrbitProblem) -> OrbitRoots:
     leading = jnp.maximum(jnp.abs(quartic[0]), 1e-15 * top)
     high = jnp.maximum(1.0 + top / jnp.where(leading > 0.0, leading, 1.0), 2.0 * low + 1.0)
     roots, found = real_roots(quartic, low, high)
-    return OrbitRoots(roots * scale, found & (roots > low), jnp.array(True))  # noqa: FBT003
+    return _Coordinates(roots * scale, found & (roots > low), jnp.array(True))  # noqa: FBT003
 
 
 def _scale(problem: OrbitProblem) -> Float[Array, ""]:
     return jnp.maximum(problem.platform.top_speed_nm_per_us, problem.impact.reach)
 
 
-def _scanned_roots(problem: OrbitProblem, scan: Scan) -> OrbitRoots:
+def _scanned_roots(problem: OrbitProblem, scan: Scan) -> _Coordinates:
     """Scan the closing condition from just above capture to speeds that no orbit reaches; narrow every bracket."""
     grid = problem.impact.lowest + jnp.asarray(np.geomspace(scan.lowest, scan.highest, scan.points)) * _scale(problem)
     residual = jax.vmap(closing_residual, in_axes=(0, None))
@@ -129,7 +139,7 @@ def _scanned_roots(problem: OrbitProblem, scan: Scan) -> OrbitRoots:
     root = _regula_falsi(lambda x: residual(x, problem), left, right, low, high)
     found = low * high < 0.0
     order = jnp.argsort(jnp.where(found, root, jnp.inf))[: scan.slots]
-    return OrbitRoots(root[order], found[order], (count <= scan.crossings) & (jnp.sum(found) <= scan.slots))
+    return _Coordinates(root[order], found[order], (count <= scan.crossings) & (jnp.sum(found) <= scan.slots))
 
 
 def _brief(coordinate: Float[Array, ""], problem: OrbitProblem) -> Bool[Array, ""]:

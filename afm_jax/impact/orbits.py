@@ -25,11 +25,9 @@ from afm_jax.impact.orbit_amplitude import FlightEnds, lockin, peak_amplitude
 from afm_jax.impact.orbit_closure import (
     OrbitProblem,
     Place,
-    close_map,
     closing_residual,
     closure,
     map_gaps,
-    place_of,
     speeds_at_place,
 )
 from afm_jax.impact.orbit_search import COARSE, find_roots
@@ -40,8 +38,6 @@ NEAR_DOUBLE = 1e-3
 """Slope of the closing condition per relative change of speed below which a root counts as near-double (a fold)."""
 _ARRIVAL_TOLERANCE = 1e-7
 """How far (in drive periods) the first impact found may lie before the orbit's own, by rounding."""
-_NEWTON = 3
-"""Steps that close the map from a root that is known but for rounding."""
 
 
 class SingleImpactOrbits(eqx.Module):
@@ -128,14 +124,14 @@ def _check_order(order: ArrayLike) -> None:
 def _single_impact_orbits(scene: Scene, order: Float[Array, ""]) -> SingleImpactOrbits:
     problem = OrbitProblem(scene.cantilever, scene.platform, LawImpact(impact_law_of(scene)), order)
     roots = find_roots(problem)
-    orbits = jax.vmap(_orbit, in_axes=(0, 0, None))(roots.coordinate, roots.found, problem)
+    orbits = jax.vmap(_orbit, in_axes=(0, 0, None))(roots.place, roots.found, problem)
     return eqx.tree_at(lambda result: result.complete, orbits, roots.complete)
 
 
-def _orbit(coordinate: Float[Array, ""], found: Bool[Array, ""], problem: OrbitProblem) -> SingleImpactOrbits:
+def _orbit(place: Place, found: Bool[Array, ""], problem: OrbitProblem) -> SingleImpactOrbits:
     """Return what there is to know about one root; NaN where there is none."""
-    state = orbit_state(coordinate, problem)
-    verdict = judge(coordinate, found, state, problem)
+    state = orbit_state(place, problem)
+    verdict = judge(place, found, state, problem)
     flight, speeds = state.flight, state.speeds
     peak, amplitude, angle = _observed(state, problem)
 
@@ -183,24 +179,22 @@ class Verdict(NamedTuple):
 class SteadyOrbits(NamedTuple):
     """The roots of a problem, which of them are steady (admissible and stable), peak and lock-in amplitude in nm."""
 
-    coordinate: Float[Array, " slots"]
+    place: Place
     steady: Bool[Array, " slots"]
     near_double: Bool[Array, " slots"]
     amplitude_nm: Float[Array, "slots 2"]
 
 
 @jax.jit
-def orbit_state(coordinate: Float[Array, ""], problem: OrbitProblem) -> OrbitState:
+def orbit_state(place: Place, problem: OrbitProblem) -> OrbitState:
     """Return the motion at a root, with the root's derivatives (implicit function theorem)."""
     cantilever, platform, impact, order = problem
     if impact.lasts:
-        near, known = lax.stop_gradient((coordinate, problem))
-        unknowns = close_map(place_of(near, *closure(near, known), known), known, _NEWTON)
-        place = Place(*implicit_pair(map_gaps, unknowns, problem))
+        place = Place(*implicit_pair(map_gaps, jnp.stack(place), problem))
         speeds = speeds_at_place(place, problem)
         phase = place.phase + platform.angular_frequency * speeds.delay
     else:
-        speeds, system = closure(implicit_root(closing_residual, coordinate, problem), problem)
+        speeds, system = closure(implicit_root(closing_residual, place.coordinate, problem), problem)
         phase = system.phase
     phase = phase % (2.0 * jnp.pi)
     start = phase / platform.angular_frequency
@@ -211,7 +205,7 @@ def orbit_state(coordinate: Float[Array, ""], problem: OrbitProblem) -> OrbitSta
     return OrbitState(phase, speeds, FlightEnds(start, duration, position, velocity, end_position, end_velocity))
 
 
-def judge(coordinate: Float[Array, ""], found: Bool[Array, ""], state: OrbitState, problem: OrbitProblem) -> Verdict:
+def judge(place: Place, found: Bool[Array, ""], state: OrbitState, problem: OrbitProblem) -> Verdict:
     """Return whether an orbit is admissible, stable (eq. 8 and its generalisation) and close to a fold."""
     cantilever, platform, impact, _ = problem
     trace, determinant = trace_and_determinant(impact, cantilever, platform, state.flight)
@@ -220,7 +214,7 @@ def judge(coordinate: Float[Array, ""], found: Bool[Array, ""], state: OrbitStat
     return Verdict(
         admissible=found & ends_at_its_own_impact(cantilever, platform, state.flight, found, skip),
         stable=found & contracts(trace, determinant),
-        near_double=found & near_fold(coordinate, problem),
+        near_double=found & near_fold(place.coordinate, problem),
         trace=trace,
         determinant=determinant,
     )
@@ -240,17 +234,17 @@ def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
     problem = lax.stop_gradient(problem)
     roots = find_roots(problem, COARSE)
 
-    def one(root, found):
-        state = orbit_state(root, problem)
-        verdict = judge(root, found, state, problem)
+    def one(place, found):
+        state = orbit_state(place, problem)
+        verdict = judge(place, found, state, problem)
         return verdict.admissible & verdict.stable, verdict.near_double, _observed(state, problem)[:2]
 
-    return SteadyOrbits(roots.coordinate, *jax.vmap(one)(roots.coordinate, roots.found))
+    return SteadyOrbits(roots.place, *jax.vmap(one)(roots.place, roots.found))
 
 
-def amplitudes(coordinate: Float[Array, ""], problem: OrbitProblem) -> Float[Array, " 3"]:
+def amplitudes(place: Place, problem: OrbitProblem) -> Float[Array, " 3"]:
     """Return peak and lock-in amplitude in nm and the phase in degrees of the orbit at a root, differentiable."""
-    return _observed(orbit_state(coordinate, problem), problem)
+    return _observed(orbit_state(place, problem), problem)
 
 
 @jax.jit
