@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from afm_jax.motion.observables import observe
 
 from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, simulate, single_impact_orbits
 from afm_jax.impact.jacobian import map_jacobian
 from afm_jax.impact.poincare import iterate_map, next_impact
 from afm_jax.motion.drive_period import drive_of
+from afm_jax.motion.observe import observe
 from afm_jax.motion.record import MotionOutcome, State
 from fitting.forward import BATCH, linearise
 from fitting.measurement import measurement_of

@@ -92,7 +92,7 @@ def _interaction(scene: Scene) -> Any:
 
 
 def _law_of(values: Mapping[str, float]) -> ImpactLaw:
-    delay = CollisionDelay(*(values[name] for name in ("hertz", "lead_nm", "offset_nm")))
+    delay = CollisionDelay(values["hertz"], values["lead_nm"], values["offset_nm"])
     return ImpactLaw(values["r"], values["epsilon"], values["viscous_loss"], delay)
 
 

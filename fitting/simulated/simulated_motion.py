@@ -15,15 +15,12 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
-from afm_jax.motion.impact_integral import indentation_of
-from afm_jax.motion.record import ContactKind, Contacts, MotionOutcome, Simulation, State
+from afm_jax.motion.observe import observe
+from afm_jax.motion.record import MotionOutcome, Simulation, State
 from afm_jax.motion.settle import close_periods, ends_in_flight, place_after, settled, where_to_go_on
 from afm_jax.motion.simulate import simulate
-from fitting.simulated.simulated_reading import Reading, read_orbits
 
 US_PER_MS = 1e3
-BEFORE_US = 1e-4
-"""How long before its arrival a contact is started: the arrival itself is then part of the motion."""
 BATCH = 16
 """Rows simulated side by side: one program serves all tables, and its last row keeps few others waiting."""
 RESPONSES = 100
@@ -48,6 +45,15 @@ class Drives(NamedTuple):
     offset_nm: Float[np.ndarray, " rows"]
 
 
+class Reading(NamedTuple):
+    """What is read of single-impact orbits, one entry a row."""
+
+    peak_amplitude_nm: Float[np.ndarray, " rows"]
+    lockin_amplitude_nm: Float[np.ndarray, " rows"]
+    lockin_phase_deg: Float[np.ndarray, " rows"]
+    """In [0, 360/N)."""
+
+
 class SteadyRows(NamedTuple):
     """What became of the drives."""
 
@@ -60,10 +66,11 @@ class SteadyRows(NamedTuple):
 
 
 class _Verdict(NamedTuple):
-    """What is known of a motion: its last contact if it is the orbit asked for, from where it goes on, and why."""
+    """What is known of a motion: what is read of it if it is the orbit asked for, from where it goes on, and why."""
 
     reason: str
-    contact: Contacts | None = None
+    seen: tuple[float, float, float] | None = None
+    """Peak, lock-in amplitude and phase, as in a `Reading`."""
     goes_on: State | None = None
 
 
@@ -117,7 +124,7 @@ def steady_rows(
         angular_frequency=float(cantilever.angular_frequency),
     )
     starts[:, waiting] = np.where(orbits.closed & (orbits.contraction < _STABLE), orbits.starts, starts[:, waiting])
-    steady: dict[int, Contacts] = {}
+    steady: dict[int, tuple[float, float, float]] = {}
     for piece in range(pieces):
         if not waiting.size:
             break
@@ -128,49 +135,15 @@ def steady_rows(
             one = jax.tree.map(lambda part, lane=lane: part[lane], found)
             verdict = _judged(Scene(cantilever, _platform(drives, row), interaction), one, int(drives.order[row]))
             reasons[row] = verdict.reason
-            if verdict.contact is not None:
-                steady[row] = verdict.contact
+            if verdict.seen is not None:
+                steady[row] = verdict.seen
             elif verdict.goes_on is not None:
                 starts[:, row] = [float(part) for part in verdict.goes_on]
                 left.append(row)
         waiting = np.array(left, dtype=int)
     rows = np.array(sorted(steady), dtype=int)
-    reading = (
-        _read(interaction, cantilever, drives, {row: steady[row] for row in rows.tolist()}, follow) if steady else None
-    )
+    reading = Reading(*(np.array([steady[row] for row in rows.tolist()]).T)) if steady else None
     return SteadyRows(rows, reading, {row: reason for row, reason in reasons.items() if row not in steady})
-
-
-def _read(
-    interaction: Contact | ImpactLaw,
-    cantilever: Cantilever,
-    drives: Drives,
-    steady: dict[int, Contacts],
-    follow: Follow,
-) -> Reading:
-    """Return what is read of the last contacts of steady motions."""
-    rows = np.array(list(steady))
-    contacts = jax.tree.map(lambda *parts: np.array(parts), *steady.values())
-    platforms = _platform(drives, rows)
-
-    def on_platform(times: np.ndarray) -> np.ndarray:
-        return np.stack([np.asarray(platforms.position(jnp.asarray(column))) for column in times.T], axis=1)
-
-    def in_contact(times: np.ndarray) -> np.ndarray:
-        # a little before the bridge forms the tip is still free
-        back = cantilever.propagator(-BEFORE_US)
-        place = back(contacts.arrival_position_nm, contacts.arrival_velocity_nm_per_us)
-        starts = np.stack([contacts.arrival_time_us - BEFORE_US, *(np.asarray(part) for part in place)])
-        nodes = times.shape[1]
-        durations = (times - starts[0][:, None]).reshape(-1)
-        found = follow(np.repeat(starts, nodes, axis=1), np.repeat(rows, nodes), durations)
-        return np.asarray(found.final.position_nm).reshape(times.shape)
-
-    heights = in_contact if isinstance(interaction, Contact) else on_platform
-    depth = np.zeros(len(rows))
-    if isinstance(interaction, ImpactLaw):
-        depth = indentation_of(interaction, contacts.approach_speed_nm_per_us)
-    return read_orbits(cantilever, platforms, drives.order[rows], contacts, heights, depth)
 
 
 def _responses(drives: Drives, rows: Int[np.ndarray, " n"], count: int) -> Float[np.ndarray, " n"]:
@@ -244,5 +217,5 @@ def _judged(scene: Scene, found: Simulation, order: int) -> _Verdict:
         return _Verdict(f"not settled: {verdict.reason}", goes_on=place_after(found, row) if goes_on else None)
     if verdict.stuck or (verdict.contacts, verdict.periods) != (1, order):
         return _Verdict(verdict.reason)
-    last = int(np.flatnonzero(found.contacts.kind == ContactKind.IMPACT)[-1])
-    return _Verdict(verdict.reason, contact=jax.tree.map(lambda part: part[last], found.contacts))
+    seen = observe(scene, found, verdict=verdict)
+    return _Verdict(verdict.reason, seen=(seen.peak_amplitude_nm, seen.lockin_amplitude_nm, seen.lockin_phase_deg))
