@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from afm_jax.apparatus.cantilever import Cantilever
-    from afm_jax.apparatus.drive import Tone
-    from afm_jax.apparatus.excitation import BaseDrive, ForceDrive
+    from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
     from afm_jax.apparatus.platform import Platform
     from afm_jax.apparatus.scene import Scene
     from afm_jax.compilation_cache import use_cache
@@ -17,54 +16,53 @@ if TYPE_CHECKING:
     from afm_jax.contact.junction import Junction, find_junction
     from afm_jax.contact.phases import Phase
     from afm_jax.contact.time_course import time_course
-    from afm_jax.impact.batch import iterate_batch
     from afm_jax.impact.jacobian import map_jacobian
     from afm_jax.impact.law import CollisionDelay, ImpactLaw
+    from afm_jax.impact.map import NextImpact, iterate_batch, iterate_map, next_impact
     from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
-    from afm_jax.impact.poincare import NextImpact, iterate_map, next_impact
     from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
     from afm_jax.motion.simulate import simulate
     from afm_jax.motion.trajectory import Trajectory, trajectory
-    from afm_jax.outcome import CollisionOutcome, Outcome
-    from afm_jax.scenefile import SceneError, load_scene, save_scene
+    from afm_jax.outcomes import CollisionOutcome, Outcome
+    from afm_jax.scenefile.scenefile import SceneError, load_scene, save_scene
 
     __version__: str
 else:
     from afm_jax.lazy_names import import_name
 
     _HOMES = {
-        "BaseDrive": "afm_jax.apparatus.excitation",
+        "BaseDrive": "afm_jax.apparatus.drives",
         "Cantilever": "afm_jax.apparatus.cantilever",
         "Collision": "afm_jax.contact.collide",
         "CollisionDelay": "afm_jax.impact.law",
-        "CollisionOutcome": "afm_jax.outcome",
+        "CollisionOutcome": "afm_jax.outcomes",
         "Contact": "afm_jax.contact.contact",
         "ContactKind": "afm_jax.motion.record",
-        "ForceDrive": "afm_jax.apparatus.excitation",
+        "ForceDrive": "afm_jax.apparatus.drives",
         "ImpactLaw": "afm_jax.impact.law",
         "Junction": "afm_jax.contact.junction",
         "MotionOutcome": "afm_jax.motion.record",
-        "NextImpact": "afm_jax.impact.poincare",
-        "Outcome": "afm_jax.outcome",
+        "NextImpact": "afm_jax.impact.map",
+        "Outcome": "afm_jax.outcomes",
         "Phase": "afm_jax.contact.phases",
         "Platform": "afm_jax.apparatus.platform",
         "Scene": "afm_jax.apparatus.scene",
-        "SceneError": "afm_jax.scenefile",
+        "SceneError": "afm_jax.scenefile.scenefile",
         "Simulation": "afm_jax.motion.record",
         "SingleImpactOrbits": "afm_jax.impact.orbits",
         "State": "afm_jax.motion.record",
-        "Tone": "afm_jax.apparatus.drive",
+        "Tone": "afm_jax.apparatus.drives",
         "Trajectory": "afm_jax.motion.trajectory",
         "__version__": "afm_jax.version",
         "capture_speed": "afm_jax.contact.collide",
         "collide": "afm_jax.contact.collide",
         "find_junction": "afm_jax.contact.junction",
-        "iterate_batch": "afm_jax.impact.batch",
-        "iterate_map": "afm_jax.impact.poincare",
-        "load_scene": "afm_jax.scenefile",
+        "iterate_batch": "afm_jax.impact.map",
+        "iterate_map": "afm_jax.impact.map",
+        "load_scene": "afm_jax.scenefile.scenefile",
         "map_jacobian": "afm_jax.impact.jacobian",
-        "next_impact": "afm_jax.impact.poincare",
-        "save_scene": "afm_jax.scenefile",
+        "next_impact": "afm_jax.impact.map",
+        "save_scene": "afm_jax.scenefile.scenefile",
         "simulate": "afm_jax.motion.simulate",
         "single_impact_orbits": "afm_jax.impact.orbits",
         "time_course": "afm_jax.contact.time_course",

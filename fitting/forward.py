@@ -1,5 +1,16 @@
-"""From parameters to predicted amplitudes: each row's steady single-impact orbit, on the branch that was measured."""
+"""From parameters to predicted amplitudes: each row's steady single-impact orbit, on the branch that was measured.
 
+The orbit that a row of a table is taken to be on: its scene, and which of its steady motions was measured.
+
+Derivatives of predicted amplitudes by every parameter, forward or reverse, refused where there are none.
+
+A steady orbit is a root of its closing condition; by the implicit function theorem it moves smoothly with the
+parameters, except at a fold, where it meets another root and ends, and where the tip grazes the platform, at the impact
+or on the way. There, and where there is no steady orbit, the gradient is NaN and a sentence says why.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -9,12 +20,102 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from afm_jax.apparatus.platform import Platform
+from afm_jax.checks import require_float64
+from afm_jax.contact.contact import EFFECTS, Contact
+from afm_jax.contact.law_of_contact import tabulated
+from afm_jax.impact.closure import OrbitProblem, Place
+from afm_jax.impact.first_impact import Flight, flight_gap
 from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact
-from afm_jax.impact.orbit_closure import OrbitProblem
-from afm_jax.impact.orbits import amplitudes
-from fitting.measurement import Measurement, Rows
-from fitting.models import Problem
-from fitting.row_orbits import Branch, branch_near, branch_of, followed, impact_of, orbit_problem
+from afm_jax.impact.map import NEAR_GRAZING
+from afm_jax.impact.orbits import amplitudes, near_fold, orbit_state, steady_orbits
+from afm_jax.impact.roots import follow_root, harmless_coordinate
+from fitting.models import (
+    CONTACT_NAMES,
+    NUISANCE_NAMES,
+    PARAMETERS,
+    ROWS_PER_PROGRAM,
+    Measurement,
+    Problem,
+    Rows,
+    check_contact_values,
+    measurement_of,
+    model_parameters,
+)
+from fitting.tables.table import AmplitudeTable
+
+
+class Branch(NamedTuple):
+    """The orbit that a row is taken to be on: where, whether there is one, and how many there are."""
+
+    place: Place
+    exists: Bool[Array, ""]
+    orbits: Int[Array, ""]
+    near_fold: Bool[Array, ""]
+
+
+def impact_of(values: Float[Array, " p"], measurement: Measurement, problem: Problem) -> LawImpact | TabulatedImpact:
+    """Return what an impact does at a set of values: the model's law, or the table of its contact."""
+    if problem.model != "contact":
+        return LawImpact(problem.law(values))
+    chosen = {name: value for name, value in problem.known(values).items() if name in problem.own}
+    contact = Contact.paper(effects=problem.effects, **(measurement.contact | chosen))
+    return tabulated(contact, measurement.cantilever.mass_ng)
+
+
+def orbit_problem(
+    values: Float[Array, " p"],
+    impact: LawImpact | TabulatedImpact,
+    row: Rows,
+    measurement: Measurement,
+    problem: Problem,
+) -> OrbitProblem:
+    """Return the orbit's scene of one row at a set of values, for the impact that these stand for."""
+    cantilever = problem.cantilever(values, measurement.cantilever)
+    platform = Platform(
+        row.drive_amplitude_nm * problem.nuisance(values, "drive_calibration", 1.0),
+        row.drive_frequency_khz,
+        row.offset_nm + problem.nuisance(values, "offset_origin_nm", 0.0),
+    )
+    return OrbitProblem(cantilever, platform, impact, row.order)
+
+
+def branch_of(orbit: OrbitProblem, row: Rows) -> Branch:
+    """Choose among a row's steady orbits; no derivatives.
+
+    There can be several: the one that explains the measured amplitudes best counts. A row without any is predicted as
+    0, which misses the measurement by all of it: a fixed penalty.
+    """
+    roots = steady_orbits(orbit)
+    misfit = jnp.where(row.measured, (roots.amplitude_nm - row.amplitude_nm) / row.error_nm, 0.0)
+    slot = jnp.argmin(jnp.where(roots.steady, jnp.sum(misfit**2, axis=1), jnp.inf))
+    return Branch(
+        place=Place(roots.place.coordinate[slot], roots.place.phase[slot]),
+        exists=roots.steady[slot],
+        orbits=jnp.sum(roots.steady, dtype=jnp.int32),
+        near_fold=roots.steady[slot] & roots.near_double[slot],
+    )
+
+
+def followed(orbit: OrbitProblem, known: Branch) -> Branch:
+    """Follow a row's orbit from where it is known to be: exact where it was found, close at other parameters."""
+    harmless = harmless_coordinate(orbit)
+    root, found = follow_root(jnp.where(known.exists, known.place.coordinate, harmless), orbit)
+    exists = known.exists & found
+    return Branch(
+        place=Place(jnp.where(exists, root.coordinate, harmless), root.phase),
+        exists=exists,
+        orbits=jnp.where(exists, known.orbits, 0),
+        near_fold=exists & near_fold(root.coordinate, orbit),
+    )
+
+
+def branch_near(coordinate: Float[np.ndarray, " lanes"] | Float[Array, " lanes"]) -> Branch:
+    """Return orbits that are taken to be near coordinates; NaN: there is none."""
+    there = jnp.isfinite(coordinate)
+    near = jnp.asarray(coordinate)
+    return Branch(Place(near, jnp.zeros_like(near)), there, there.astype(jnp.int32), jnp.zeros_like(there))
+
 
 BATCH = 8
 """Sets of parameters that `linearise` takes at once."""
@@ -206,3 +307,165 @@ def _prediction(branch: Branch, values: Float[Array, " p"], orbit: OrbitProblem,
         approach_speed_nm_per_us=lax.stop_gradient(speed),
         coordinate=branch.place.coordinate,
     )
+
+
+_LOOKS = 512
+"""Times at which the gap of a flight is looked at for a graze on the way."""
+_TOUCHING = 1e-3
+"""Smallest gap on the way, in terms of the drive's amplitude, below which a flight counts as grazing."""
+
+NO_ORBIT = "there is no steady single-impact orbit at these values"
+AT_A_FOLD = "the orbit is close to a fold, where it ends and no derivative exists"
+SLOW_GRAZE = "the impact grazes the platform: its approach is slower than a thousandth of the platform's speed"
+GRAZE_ON_THE_WAY = "the flight grazes the platform on the way: a small change makes another impact there"
+
+
+@dataclass(frozen=True)
+class AmplitudeGradients:
+    """Predicted amplitudes of a table's rows, peak and lock-in, and their derivatives.
+
+    Attributes:
+        parameters: names, in the order of the last axis of the gradient.
+        predicted_nm: amplitudes in nm, shape (rows, 2); NaN where there is no orbit.
+        gradient: in nm per unit of each parameter, shape (rows, 2, p); NaN where it is refused.
+        reasons: why a row's gradient is refused, or None.
+    """
+
+    parameters: tuple[str, ...]
+    predicted_nm: Float[np.ndarray, "rows 2"]
+    gradient: Float[np.ndarray, "rows 2 p"]
+    reasons: tuple[str | None, ...]
+
+
+class _Judged(NamedTuple):
+    """Amplitudes and their slopes of every row, and what speaks against the slopes."""
+
+    amplitude_nm: Float[Array, "rows 2"]
+    slope: Float[Array, "rows 2 p"]
+    exists: Bool[Array, " rows"]
+    near_fold: Bool[Array, " rows"]
+    slow: Bool[Array, " rows"]
+    touching: Bool[Array, " rows"]
+
+
+def amplitude_gradients(
+    table: AmplitudeTable,
+    model: str,
+    values: Mapping[str, float],
+    *,
+    mode: str = "forward",
+    fixed: dict[str, float] | None = None,
+    effects: Sequence[str] = EFFECTS,
+) -> AmplitudeGradients:
+    """Return the derivatives of the amplitudes that a model predicts for a table's drives.
+
+    Where several steady orbits coexist, the one closest to the measured amplitudes counts.
+
+    Args:
+        table: the drives, and the amplitudes that tell coexisting orbits apart.
+        model: as for `fit`.
+        values: the model's parameters (for "contact" any of them) and any nuisances, by name: what is not named is the
+            table's.
+        mode: "forward" costs as much as there are parameters, "reverse" as there are amplitudes; same numbers.
+        fixed: for "contact": values of parameters that are not the paper's and not differentiated by.
+        effects: for "contact": the effects there are.
+
+    Raises:
+        ValueError: if there is no such model, mode or parameter, or one is missing or outside its range.
+        RuntimeError: if JAX is not set to 64-bit floats.
+    """
+    require_float64()
+    if mode not in ("forward", "reverse"):
+        raise ValueError(f'`mode` must be "forward" or "reverse", but is {mode!r}')
+    check_contact_values(model, fixed)
+    problem = _problem(model, values, effects)
+    measurement = measurement_of(table, problem, fixed=fixed)
+    point = jnp.asarray([float(values[name]) for name in problem.names])
+    found = _in_blocks(point, measurement, problem, mode)
+    found = jax.tree.map(lambda column: column[: table.rows], found)
+    reasons = tuple(
+        _reason(*row) for row in zip(found.exists, found.near_fold, found.slow, found.touching, strict=True)
+    )
+    refused = np.array([reason is not None for reason in reasons])
+    return AmplitudeGradients(
+        parameters=problem.names,
+        predicted_nm=np.where(found.exists[:, None], found.amplitude_nm, np.nan),
+        gradient=np.where(refused[:, None, None], np.nan, found.slope),
+        reasons=reasons,
+    )
+
+
+def _problem(model: str, values: Mapping[str, float], effects: Sequence[str]) -> Problem:
+    """Return the parameters that are differentiated by, the model's own first."""
+    chosen = tuple(name for name in values if name in CONTACT_NAMES)
+    own = model_parameters(model, chosen if model == "contact" else None)
+    missing = [name for name in own if name not in values]
+    if missing:
+        raise ValueError(f"`values` lacks {' and '.join(missing)}, which the model {model!r} needs; add it")
+    for name, value in values.items():
+        if name not in (*own, *NUISANCE_NAMES):
+            raise ValueError(f"`values` names {name!r}: choose from {', '.join((*own, *NUISANCE_NAMES))}")
+        parameter = PARAMETERS[name]
+        if not parameter.lowest <= value <= parameter.highest:
+            raise ValueError(
+                f"`values`: {name} must lie between {parameter.lowest:g} and {parameter.highest:g}, but is {value!r}"
+            )
+    return Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in values), tuple(effects))
+
+
+def _in_blocks(point: Float[Array, " p"], measurement: Measurement, problem: Problem, mode: str) -> _Judged:
+    """Return all rows, some at a time: one compiled program serves tables of every size."""
+    columns = jax.tree.map(np.asarray, measurement.rows)
+    blocks = []
+    for begin in range(0, columns.order.shape[0], ROWS_PER_PROGRAM):
+        some = jax.tree.map(lambda column, begin=begin: column[begin : begin + ROWS_PER_PROGRAM], columns)
+        block = _judged(point, measurement._replace(rows=some), problem, mode)
+        blocks.append(jax.tree.map(np.asarray, block))
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
+
+
+@partial(jax.jit, static_argnames=("problem", "mode"))
+def _judged(values: Float[Array, " p"], measurement: Measurement, problem: Problem, mode: str) -> _Judged:
+    impact = impact_of(values, measurement, problem)
+    differentiated = jax.jacfwd if mode == "forward" else jax.jacrev
+
+    def one(row: Rows):
+        orbit = orbit_problem(values, impact, row, measurement, problem)
+        branch = lax.stop_gradient(branch_of(orbit, row))
+
+        def predicted(v):
+            orbit = orbit_problem(v, impact_of(v, measurement, problem), row, measurement, problem)
+            return amplitudes(branch.place, orbit)[:2] * problem.nuisance(v, "tip_calibration", 1.0)
+
+        slow, touching = _grazes(branch.place, orbit)
+        slope = differentiated(predicted)(values)
+        return _Judged(predicted(values), slope, branch.exists, branch.near_fold, slow, touching)
+
+    return jax.vmap(one)(measurement.rows)
+
+
+def _grazes(place: Place, orbit: OrbitProblem) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+    """Say whether the impact is a graze, and whether the flight touches the platform on the way."""
+    state = orbit_state(place, orbit)
+    slow = state.speeds.approach < NEAR_GRAZING * orbit.platform.top_speed_nm_per_us
+    flight = Flight(orbit.cantilever, orbit.platform, state.flight.start_us, state.flight.start_velocity)
+    begin = jnp.maximum(-state.speeds.delay, 0.0)
+    times = begin + (state.flight.duration_us - begin) * jnp.asarray(np.linspace(0.0, 1.0, _LOOKS))
+    gap = jax.vmap(lambda time: flight_gap(time, flight))(times)
+    before, here, after = gap[:-2], gap[1:-1], gap[2:]
+    bend = before - 2.0 * here + after
+    dip = (here <= before) & (here <= after) & (bend > 0.0)
+    # the parabola through three neighbours: between two looks the flight may come closer
+    lowest = here - (after - before) ** 2 / (8.0 * jnp.where(dip, bend, 1.0))
+    return slow, jnp.any(dip & (lowest < _TOUCHING * orbit.platform.amplitude_nm))
+
+
+def _reason(exists: np.bool_, near_fold: np.bool_, slow: np.bool_, touching: np.bool_) -> str | None:
+    """Return why a row has no gradient, None if it has one."""
+    if not exists:
+        return NO_ORBIT
+    if near_fold:
+        return AT_A_FOLD
+    if slow:
+        return SLOW_GRAZE
+    return GRAZE_ON_THE_WAY if touching else None

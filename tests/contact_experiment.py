@@ -8,7 +8,7 @@ import numpy as np
 from afm_jax.contact.collide import collide
 from afm_jax.contact.contact import Contact
 from fitting.examples.make_contact_amplitudes import example_experiment
-from fitting.simulated.simulated_experiment import SimulatedExperiment
+from fitting.simulated.experiment import SimulatedExperiment
 
 
 @functools.cache

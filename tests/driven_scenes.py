@@ -6,8 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.drive import Tone
-from afm_jax.apparatus.excitation import BaseDrive, ForceDrive
+from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface

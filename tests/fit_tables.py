@@ -14,8 +14,8 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
-from fitting.result import FitResult
-from fitting.table import AmplitudeTable
+from fitting.fits.result import FitResult
+from fitting.tables.table import AmplitudeTable
 
 EXAMPLE = Path(fitting.examples.__path__[0]) / "amplitudes_law.csv"
 NOISE = 0.01

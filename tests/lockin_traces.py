@@ -11,8 +11,7 @@ from afm_jax import Cantilever, ImpactLaw, Platform, Scene, single_impact_orbits
 from afm_jax.motion.settle import LongRun, follow_long
 from afm_jax.motion.start import state
 from afm_jax.motion.trajectory import trajectory
-from fitting.traces.lockin_settings import TraceSettings
-from fitting.traces.lockin_trace import Trace
+from fitting.traces.trace import Trace, TraceSettings
 
 FREE_KHZ = 90.0
 OMEGA = 2e-3 * np.pi * FREE_KHZ

@@ -5,10 +5,10 @@ from typing import Any
 
 import numpy as np
 
-from fitting.checks import Convergence
-from fitting.parameters import PARAMETERS
-from fitting.result import FitResult, FittedLaw, FittedParameter, FittedRows
-from fitting.table import AmplitudeTable
+from fitting.fits.intervals import Convergence
+from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows
+from fitting.models import PARAMETERS
+from fitting.tables.table import AmplitudeTable
 
 VALUES = {
     "restitution": {"r": 0.93},

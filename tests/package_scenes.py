@@ -11,7 +11,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
-from afm_jax.impact.poincare import next_impact
+from afm_jax.impact.map import next_impact
 from tests.brute_force import Flights
 from tests.reference_examples import DELAY
 from tests.reference_systems import Parameters

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fitting.resonance.resonance_sweep import ResonanceSweep
+from fitting.calibration.sweep import ResonanceSweep
 
 FREQUENCY_KHZ, QUALITY_FACTOR = 90.0, 400.0
 

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from fitting.table import TableError, read_table
+from fitting.tables.table import TableError, read_table
 
 KEY = "# free_frequency_khz = 90\n"
 NAMES = "order,drive_frequency_khz,drive_amplitude_nm,offset_nm,peak_amplitude_nm,peak_amplitude_error_nm\n"

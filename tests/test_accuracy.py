@@ -6,11 +6,11 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from afm_jax.accuracy.impacts import cheapest_settings, map_accuracy
+from afm_jax.bench import timing as own_process
 from afm_jax.cli.accuracy import COLUMNS
 from afm_jax.cli.main import main
 from afm_jax.plots.accuracy import accuracy_figure
-from afm_jax.study import own_process
-from afm_jax.study.accuracy import cheapest_settings, map_accuracy
 from tests.run_here import run_here
 
 

@@ -8,20 +8,17 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene
-from afm_jax.apparatus.excitation import BaseDrive
+from afm_jax.accuracy.scenes import contact_accuracy, fidelity_ladder, law_accuracy
+from afm_jax.apparatus.drives import BaseDrive
+from afm_jax.bench import timing as own_process
 from afm_jax.cli.accuracy_scene import COLUMNS, LADDER_COLUMNS, fitted_law, scene_and_start
 from afm_jax.cli.main import main
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import State
 from afm_jax.motion.simulate import simulate
-from afm_jax.presets import contact_scene
-from afm_jax.scenefile import save_scene
-from afm_jax.scenefile_start import Start
-from afm_jax.study import own_process
-from afm_jax.study.fidelity_ladder import fidelity_ladder
-from afm_jax.study.law_scene_accuracy import law_accuracy
-from afm_jax.study.scene_accuracy import contact_accuracy
+from afm_jax.scenefile.presets import contact_scene
+from afm_jax.scenefile.scenefile import Start, save_scene
 from tests.reference_driven_contact import DrivenContact, follow
 from tests.run_here import run_here
 

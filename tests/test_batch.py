@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from afm_jax import Scene, iterate_map
-from afm_jax.impact.batch import iterate_batch
+from afm_jax.bench.problems import regular_scene, scattered_starts
 from afm_jax.impact.law import impact_law_of
-from afm_jax.study.benchmark_scenes import regular_scene, scattered_starts
-from afm_jax.study.exact_impacts import derivatives_by_r
+from afm_jax.impact.map import iterate_batch
+from afm_jax.verify.fifty_digits import derivatives_by_r
 
 IMPACTS = 3
 

@@ -10,15 +10,14 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax import NextImpact, iterate_map
+from afm_jax.bench import timing as own_process
+from afm_jax.bench.impacts import all_cores, lane_states, one_core, sequence_errors, single_errors
+from afm_jax.bench.problems import chaotic_scene, regular_scene, settled_starts
+from afm_jax.bench.scipy_impacts import scipy_impacts
+from afm_jax.bench.timing import run_in_own_process
 from afm_jax.cli.bench import AIMED_BATCH, COLUMNS, aim_sentence, aims
 from afm_jax.cli.main import main
-from afm_jax.study import own_process
-from afm_jax.study.benchmark import all_cores, one_core
-from afm_jax.study.benchmark_scenes import chaotic_scene, regular_scene, settled_starts
-from afm_jax.study.exact_impacts import ExactMap, reference_error
-from afm_jax.study.impact_errors import lane_states, sequence_errors, single_errors
-from afm_jax.study.own_process import run_in_own_process
-from afm_jax.study.scipy_baseline import scipy_impacts
+from afm_jax.verify.fifty_digits import ExactMap, reference_error
 from tests.run_here import run_here
 
 
@@ -55,19 +54,19 @@ def test_batches_that_no_number_of_devices_divides_still_run():
 
 def test_all_cores_really_are_several():
     settings = {"batches": [3, 4], "impacts": 2, "repetitions": 1}
-    rows = run_in_own_process("afm_jax.study.benchmark:all_cores", settings, cores=2)["rows"]
+    rows = run_in_own_process("afm_jax.bench.impacts:all_cores", settings, cores=2)["rows"]
     assert [(row["batch"], row["cores"]) for row in rows] == [(3, 1), (4, 2)]
     assert all(row["error_us"] < 1e-11 for row in rows)
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system cannot pin a process")
 def test_one_core_really_is_one():
-    assert run_in_own_process("afm_jax.study.own_process:available_cores", {}, cores=1) == 1
+    assert run_in_own_process("afm_jax.bench.timing:available_cores", {}, cores=1) == 1
 
 
 def test_a_process_that_fails_is_an_error():
     with pytest.raises(ValueError, match="ended with exit code 1"):
-        run_in_own_process("afm_jax.study.own_process:no_such_function", {}, cores=1)
+        run_in_own_process("afm_jax.bench.timing:no_such_function", {}, cores=1)
 
 
 def test_the_error_is_that_of_the_times():

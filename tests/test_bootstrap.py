@@ -5,8 +5,7 @@ import pytest
 
 from afm_jax.impact.law import ImpactLaw
 from fitting import bootstrap, fit, read_table
-from fitting.sampling.batch_fit import DataSets, draw_data, fit_data_sets
-from fitting.sampling.refit import compact, objective_of
+from fitting.sampling.bootstrap import DataSets, compact, draw_data, fit_data_sets, objective_of
 from tests.fit_tables import EXAMPLE, rows, simulated, standard_errors_of, values_of, with_amplitudes
 
 pytestmark = pytest.mark.slow

@@ -10,7 +10,7 @@ from matplotlib.image import imread
 
 from afm_jax.cli.main import main
 from fitting import read_table
-from fitting.resonance.resonance_sweep import ResonanceSweep
+from fitting.calibration.sweep import ResonanceSweep
 from tests.resonance_sweeps import FREQUENCY_KHZ, QUALITY_FACTOR, synthetic_sweep
 from tests.strict_reading import strictly
 

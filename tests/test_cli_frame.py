@@ -20,7 +20,7 @@ import afm_jax
 import fitting
 from afm_jax import strict_json
 from afm_jax.cli import main
-from afm_jax.cli.failures import NotValid
+from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from tests.fresh_python import python
 

@@ -7,7 +7,7 @@ import pytest
 
 from afm_jax.contact.collide import BLOCK, capture_speed, collide
 from afm_jax.contact.contact import Contact
-from afm_jax.outcome import CollisionOutcome
+from afm_jax.outcomes import CollisionOutcome
 from tests import reference_contact as exact
 from tests.collisions_of_eight import collide_in_eights
 

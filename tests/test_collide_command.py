@@ -15,8 +15,8 @@ from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, save_scene
 from afm_jax.cli.collide import COLUMNS
 from afm_jax.cli.contact_options import PARAMETERS
 from afm_jax.cli.main import main
-from afm_jax.cli.number_lists import parse_numbers
-from afm_jax.study.collisions import default_speeds
+from afm_jax.cli.values import parse_numbers
+from afm_jax.contact.collide import default_speeds
 from tests.reference_contact import ContactParameters, capture_speed, collision, junction
 from tests.strict_reading import strictly
 

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from afm_jax.contact.collide import collide
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import find_junction
-from afm_jax.outcome import CollisionOutcome
+from afm_jax.outcomes import CollisionOutcome
 from tests import reference_contact as exact
 from tests.collisions_of_eight import collide_in_eights
 

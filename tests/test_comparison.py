@@ -8,9 +8,10 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax.cli.main import main
-from fitting import comparison, read_table
-from fitting.comparison import compare
-from fitting.law_fit import find_fit
+from fitting import read_table
+from fitting.fits import comparison
+from fitting.fits.comparison import compare
+from fitting.fits.fit import find_fit
 from tests.fit_tables import EXAMPLE
 from tests.strict_reading import strictly
 

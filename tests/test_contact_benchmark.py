@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from afm_jax.accuracy.collisions import cheapest_collision
+from afm_jax.bench import timing as own_process
+from afm_jax.bench.collisions import REFERENCE, aims, errors_against, speeds_of
+from afm_jax.bench.scipy_contacts import scipy_collision
 from afm_jax.cli.main import main
 from afm_jax.contact.collide import batch_of
 from afm_jax.contact.contact import Contact
-from afm_jax.plots.contact_accuracy import collide_accuracy_figure
-from afm_jax.study import own_process
-from afm_jax.study.contact_accuracy import cheapest_collision
-from afm_jax.study.contact_benchmark import REFERENCE, aims, errors_against, speeds_of
-from afm_jax.study.scipy_collision import scipy_collision
+from afm_jax.plots.accuracy import collide_accuracy_figure
 from tests import reference_contact as exact
 from tests.run_here import run_here
 

@@ -15,9 +15,8 @@ from afm_jax.contact.junction import find_junction
 from afm_jax.contact.phases import Phase
 from afm_jax.contact.settings import DRIVEN_SETTINGS, METHODS, QuickSetting, driven_setting_of
 from afm_jax.contact.step import advance, eighth_order_step, fresh_touch
-from afm_jax.motion.contact_crossing import cross
-from afm_jax.motion.side_by_side import for_the_few
-from afm_jax.presets import contact_scene
+from afm_jax.motion.contact_motion import cross, for_the_few
+from afm_jax.scenefile.presets import contact_scene
 from tests.reference_driven_contact import DrivenContact, follow
 
 SYSTEM = DrivenContact(amplitude_nm=4.0, drive_frequency_khz=180.0 * 5.277)

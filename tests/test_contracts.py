@@ -11,23 +11,21 @@ import pytest
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
-from afm_jax.contact.collide import capture_speed, collide
+from afm_jax.checks import float32_allowed
+from afm_jax.contact.collide import capture_speed, collide, collisions
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import fit_delay, fit_law
 from afm_jax.contact.time_course import time_course
+from afm_jax.effects.study import study_effects
+from afm_jax.impact import map as poincare
 from afm_jax.impact import orbits as orbits_module
-from afm_jax.impact import poincare
-from afm_jax.impact.batch import iterate_batch
 from afm_jax.impact.jacobian import map_jacobian
 from afm_jax.impact.law import CollisionDelay, ImpactLaw, impact_law_of
+from afm_jax.impact.map import iterate_batch, iterate_map, next_impact
 from afm_jax.impact.orbits import single_impact_orbits
-from afm_jax.impact.poincare import iterate_map, next_impact
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import state
-from afm_jax.parameters import float32_allowed
-from afm_jax.study.collisions import collisions
-from afm_jax.study.effects import study_effects
-from fitting.simulated.simulated_experiment import drives_of, simulate_experiment
+from fitting.simulated.experiment import drives_of, simulate_experiment
 from tests.package_scenes import bouncing, next_impacts, repeated, stacked
 
 TIME, VELOCITY = 4.0, 60.0

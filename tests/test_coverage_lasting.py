@@ -11,13 +11,11 @@ from scipy.stats import binom, kstest
 import fitting.examples
 from afm_jax.impact.law import ImpactLaw
 from fitting import read_table
-from fitting.intervals import profile_intervals
-from fitting.measurement import measurement_of
-from fitting.models import Problem
-from fitting.optimise import Objective
-from fitting.sampling.batch_fit import BatchFit, DataSets, draw_data, fit_data_sets
-from fitting.sampling.refit import Refit
-from fitting.strained import relaxed, strain_of
+from fitting.fits.intervals import profile_intervals
+from fitting.fits.minimum import relaxed, strain_of
+from fitting.fits.objective import Objective
+from fitting.models import Problem, measurement_of
+from fitting.sampling.bootstrap import BatchFit, DataSets, Refit, draw_data, fit_data_sets
 from tests.fit_tables import EXAMPLE, rows, simulated
 
 pytestmark = pytest.mark.slow

@@ -7,13 +7,12 @@ import pytest
 
 from afm_jax.impact.law import ImpactLaw
 from fitting import believe, design, drive_grid, fit
-from fitting.planning.experiment_after_fit import belief_of_fit
-from fitting.planning.experiment_belief import Belief
-from fitting.planning.experiment_candidates import candidates_of
-from fitting.planning.experiment_result import Design, Forecast
-from fitting.result import FittedParameter
-from fitting.simulated.simulated_motion import Drives
-from fitting.table import AmplitudeTable
+from fitting.experiments.belief import Belief, belief_of_fit
+from fitting.experiments.candidates import candidates_of
+from fitting.experiments.result import Design, Forecast
+from fitting.fits.result import FittedParameter
+from fitting.simulated.experiment import Drives
+from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import steady_amplitudes, with_amplitudes
 
 LAW = {"r": 0.95, "epsilon": 60.0}

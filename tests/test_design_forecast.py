@@ -5,10 +5,10 @@ import pytest
 from scipy.stats import chi2, kstest, norm
 
 from fitting import believe, design, drive_grid
-from fitting.measurement import measurement_of
-from fitting.optimise import BATCH, Objective
-from fitting.planning.experiment_result import Design
-from fitting.table import AmplitudeTable
+from fitting.experiments.result import Design
+from fitting.fits.objective import BATCH, Objective
+from fitting.models import measurement_of
+from fitting.tables.table import AmplitudeTable
 
 pytestmark = pytest.mark.slow
 

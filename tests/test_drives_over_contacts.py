@@ -5,15 +5,14 @@ import numpy as np
 import pytest
 
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.excitation import BaseDrive, ForceDrive
+from afm_jax.apparatus.drives import BaseDrive, ForceDrive
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.contact import Contact
+from afm_jax.effects.study import EffectStudy, Programs, study_effects
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import state
 from afm_jax.motion.trajectory import trajectory
-from afm_jax.study.effects import EffectStudy, study_effects
-from afm_jax.study.motion_program import Programs
 
 pytestmark = pytest.mark.slow
 """Each compiles programs of its own for a minute or more."""

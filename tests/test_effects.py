@@ -13,17 +13,15 @@ from click.testing import CliRunner
 from matplotlib.image import imread
 
 from afm_jax import Cantilever, CollisionDelay, Contact, ImpactLaw, Platform, Scene, load_scene, save_scene
-from afm_jax.apparatus.drive import Tone
-from afm_jax.apparatus.excitation import BaseDrive, ForceDrive
+from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
 from afm_jax.cli.main import main
-from afm_jax.cli.number_lists import parse_share
+from afm_jax.cli.values import parse_share
+from afm_jax.effects.scene_effects import effects_in
+from afm_jax.effects.study import Change, Programs, Reduction, study_effects
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.start import start_of
-from afm_jax.presets import contact_scene
-from afm_jax.scenefile import load_start
-from afm_jax.study.effects import Change, Reduction, study_effects
-from afm_jax.study.motion_program import Programs
-from afm_jax.study.scene_effects import effects_in
+from afm_jax.scenefile.presets import contact_scene
+from afm_jax.scenefile.scenefile import load_start
 
 LAW = ImpactLaw(0.998, 100.0, 0.1, CollisionDelay(0.206, 5.64, 0.726, corrections=False))
 DRIVE = Platform(4.0, 181.8)

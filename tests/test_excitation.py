@@ -9,8 +9,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.drive import Tone
-from afm_jax.apparatus.excitation import BaseDrive, ForceDrive
+from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface, surface_of

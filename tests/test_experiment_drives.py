@@ -4,8 +4,8 @@ import click
 import numpy as np
 import pytest
 
-from afm_jax.cli.number_lists import Numbers, Orders, ValueAndError, parse_numbers, parse_orders
-from fitting.planning.experiment_drives import drive_grid, same_drives
+from afm_jax.cli.values import Numbers, Orders, ValueAndError, parse_numbers, parse_orders
+from fitting.experiments.candidates import drive_grid, same_drives
 
 
 def test_detunings_are_about_each_orders_resonance():

@@ -5,8 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from fitting.planning.experiment_information import criterion_of, standard_errors
-from fitting.planning.experiment_selection import choose_points
+from fitting.experiments.design import choose_points, criterion_of, standard_errors
 
 
 def informations(design: np.ndarray) -> np.ndarray:

@@ -10,20 +10,27 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
-from afm_jax import presets
 from afm_jax.cli.main import main
-from afm_jax.study import paper_figures
-from afm_jax.study.figure_statements import (
+from afm_jax.dynamics.charts import (
+    OrbitVerdicts,
+    StabilityChart,
+    batch_of_scenes,
+    offset_amplitudes,
+    orbit_verdicts,
+    share_above,
+    stability_chart,
+)
+from afm_jax.paper import charts as paper_figures
+from afm_jax.paper.charts import (
+    SpotChecks,
     adhesion_limit_nm,
     amplitude_slope,
     low_orders_vanish,
+    spot_check,
     tails_lean,
     tongues_at_resonance,
 )
-from afm_jax.study.offset_amplitude import offset_amplitudes
-from afm_jax.study.orbit_verdicts import OrbitVerdicts, orbit_verdicts
-from afm_jax.study.spot_checks import SpotChecks, spot_check
-from afm_jax.study.stability_regions import StabilityChart, batch_of_scenes, share_above, stability_chart
+from afm_jax.scenefile import presets
 from tests.fresh_python import python
 from tests.reference_flight import Parameters
 from tests.reference_orbits import single_impact_orbits

@@ -9,7 +9,7 @@ from scipy.optimize import brentq
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.impact.first_impact import Flight, first_impact, flight_gap
-from afm_jax.outcome import Outcome
+from afm_jax.outcomes import Outcome
 from tests import brute_force
 from tests.brute_force import Flights
 from tests.flight_families import FAMILIES, random_flights

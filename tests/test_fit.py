@@ -7,11 +7,11 @@ from scipy.stats import chi2
 
 from fitting import fit, read_table
 from fitting.examples.make_amplitudes import TRUTH, example_table
-from fitting.law_fit import problem_of
-from fitting.measurement import measurement_of
-from fitting.optimise import Objective
-from fitting.result import FitResult
-from fitting.table import AmplitudeTable
+from fitting.fits.fit import problem_of
+from fitting.fits.objective import Objective
+from fitting.fits.result import FitResult
+from fitting.models import measurement_of
+from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import EXAMPLE, amplitudes_and_errors, rows, values_of, with_amplitudes
 from tests.reference_systems import Parameters, single_impact_orbits
 

@@ -9,13 +9,12 @@ from scipy.optimize import least_squares
 
 from afm_jax.strict_json import strict_json
 from fitting import fit, read_table
-from fitting.checks import check_minimum, covariance
-from fitting.fit_summary import summarise
-from fitting.law_fit import find_fit, problem_of
-from fitting.measurement import measurement_of
-from fitting.optimise import FINE, PLAIN, Objective, polish
-from fitting.result import FitResult
-from fitting.table import AmplitudeTable
+from fitting.fits.fit import find_fit, problem_of, summarise
+from fitting.fits.intervals import check_minimum, covariance
+from fitting.fits.objective import FINE, PLAIN, Objective, polish
+from fitting.fits.result import FitResult
+from fitting.models import measurement_of
+from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import EXAMPLE, standard_errors_of, values_of
 from tests.strict_reading import strictly
 

@@ -9,8 +9,8 @@ from scipy.stats import binom, kstest
 
 from afm_jax.impact.law import ImpactLaw
 from fitting import fit, read_table
-from fitting.result import FitResult
-from fitting.table import AmplitudeTable
+from fitting.fits.result import FitResult
+from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import EXAMPLE, NOISE, amplitudes_and_errors, rows, simulated, with_amplitudes
 
 pytestmark = pytest.mark.slow

@@ -7,8 +7,8 @@ import pytest
 
 from afm_jax.impact.law import ImpactLaw
 from fitting import fit, read_table
-from fitting.result import FitResult
-from fitting.table import AmplitudeTable
+from fitting.fits.result import FitResult
+from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import EXAMPLE, amplitudes_and_errors, rows, simulated, standard_errors_of, values_of
 from tests.fit_tables import with_amplitudes as table_with
 

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-import fitting.row_orbits
+import fitting.forward
+from afm_jax.impact.closure import Place
 from afm_jax.impact.law import ImpactLaw
-from afm_jax.impact.orbit_closure import Place
 from afm_jax.impact.orbits import SteadyOrbits
 from fitting import fit, read_table
-from fitting.law_fit import problem_of
-from fitting.measurement import Rows, measurement_of
-from fitting.optimise import Objective
-from fitting.row_orbits import branch_of, impact_of, orbit_problem
-from fitting.table import AmplitudeTable
+from fitting.fits.fit import problem_of
+from fitting.fits.objective import Objective
+from fitting.forward import branch_of, impact_of, orbit_problem
+from fitting.models import Rows, measurement_of
+from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import (
     EXAMPLE,
     amplitudes_and_errors,
@@ -210,7 +210,7 @@ def test_of_coexisting_orbits_the_measured_one_is_taken(table, monkeypatch, meas
     amplitude = jnp.array([[100.0, 40.0], [60.0, 26.0], [60.0, 25.0], [61.0, 40.0]])
     steady = jnp.array([True, False, True, False])
     made_up = SteadyOrbits(Place(jnp.arange(4.0), jnp.zeros(4)), steady, jnp.zeros(4, dtype=bool), amplitude)
-    monkeypatch.setattr(fitting.row_orbits, "steady_orbits", lambda _: made_up)
+    monkeypatch.setattr(fitting.forward, "steady_orbits", lambda _: made_up)
     error = np.where(np.isnan(measured), np.nan, 1.0)[None]
     problem, values = problem_of(table, "law"), jnp.array([0.95, 60.0, 40.0])
     measurement = measurement_of(with_amplitudes(rows(table, slice(0, 1)), np.array([measured]), error), problem)

@@ -7,8 +7,8 @@ import pytest
 
 from fitting import fit, read_table
 from fitting.examples.make_contact_amplitudes import EXAMPLE as CONTACT_TABLE
-from fitting.table import AmplitudeTable
-from fitting.verdict import Evidence, correlation_excess, judge_fit
+from fitting.fits.verdict import Evidence, correlation_excess, judge_fit
+from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import EXAMPLE, amplitudes_and_errors, with_amplitudes
 from tests.made_fits import made_fit, made_parameter, made_table
 

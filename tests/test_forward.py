@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from fitting.forward import Linearised, linearise
-from fitting.measurement import ROWS_PER_PROGRAM, measurement_of
-from fitting.models import Problem
-from fitting.table import AmplitudeTable
+from fitting.models import ROWS_PER_PROGRAM, Problem, measurement_of
+from fitting.tables.table import AmplitudeTable
 from tests.reference_examples import scene
 from tests.reference_systems import Parameters, single_impact_orbits
 

@@ -6,23 +6,23 @@ import pytest
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
+from afm_jax.impact.closure import OrbitProblem, Place
 from afm_jax.impact.lasting_impact import LawImpact
 from afm_jax.impact.law import ImpactLaw
-from afm_jax.impact.orbit_closure import OrbitProblem, Place
 from fitting import amplitude_gradients
-from fitting.forward import BATCH, linearise
-from fitting.gradients import (
+from fitting.forward import (
     AT_A_FOLD,
+    BATCH,
     GRAZE_ON_THE_WAY,
     NO_ORBIT,
     SLOW_GRAZE,
     AmplitudeGradients,
     _grazes,
     _reason,
+    linearise,
 )
-from fitting.measurement import measurement_of
-from fitting.models import Problem
-from fitting.table import AmplitudeTable
+from fitting.models import Problem, measurement_of
+from fitting.tables.table import AmplitudeTable
 from tests.reference_examples import scene
 from tests.reference_flight import constants, mp, platform, propagator
 from tests.reference_systems import single_impact_orbits

@@ -14,26 +14,41 @@ LEVELS = {
     "units": 0,
     "version": 0,
     "lazy_names": 0,
-    "compilation_cache": 0,
     "strict_json": 0,
-    "outcome": 0,
     "words": 0,
-    "parameters": 1,
+    "outcomes": 0,
+    "checks": 1,
+    "compilation_cache": 0,
     "apparatus": 2,
     "impact": 3,
     "contact": 4,
     "motion": 5,
+    "dynamics": 6,
     "scenefile": 6,
-    "scenefile_contact": 6,
-    "scenefile_drives": 6,
-    "scenefile_keys": 6,
-    "scenefile_start": 6,
-    "scenefile_table": 6,
-    "presets": 6,
-    "study": 7,
-    "plots": 8,
-    "cli": 9,
-    "__main__": 10,
+    "effects": 7,
+    "verify": 7,
+    "bench": 8,
+    "accuracy": 9,
+    "paper": 9,
+    "plots": 10,
+    "cli": 11,
+    "__main__": 12,
+}
+# The same for fitting: what a fit needs, the fit, what is made of it.
+FITTING_LEVELS = {
+    "tables": 0,
+    "traces": 1,
+    "models": 1,
+    "simulated": 1,
+    "forward": 2,
+    "fits": 3,
+    "sampling": 4,
+    "report": 5,
+    "calibration": 6,
+    "inversion": 6,
+    "experiments": 6,
+    "benchmark": 7,
+    "examples": 7,
 }
 LIBRARY = sorted(path.relative_to(ROOT) for name in ("afm_jax", "fitting") for path in (ROOT / name).rglob("*.py"))
 
@@ -57,8 +72,9 @@ def room(name: str) -> str:
 
 def test_every_module_is_in_a_known_room():
     assert len(LIBRARY) > 30
-    rooms = {path.with_suffix("").parts[1] for path in LIBRARY if path.parts[0] == "afm_jax"}
-    assert rooms - {"__init__"} <= set(LEVELS)
+    for package, levels in (("afm_jax", LEVELS), ("fitting", FITTING_LEVELS)):
+        rooms = {path.with_suffix("").parts[1] for path in LIBRARY if path.parts[0] == package}
+        assert rooms - {"__init__"} == set(levels), package
 
 
 @pytest.mark.parametrize("path", [path for path in LIBRARY if path.parts[0] == "afm_jax"], ids=str)
@@ -72,17 +88,54 @@ def test_imports_point_up_the_list(path: Path):
             assert LEVELS[room(name)] <= LEVELS[here], f"{path} imports {name}, which lies below it"
 
 
+@pytest.mark.parametrize("path", [path for path in LIBRARY if path.parts[0] == "fitting"], ids=str)
+def test_imports_of_fitting_point_one_way(path: Path):
+    here = path.with_suffix("").parts[1]
+    for name in imported(path):
+        there = room(name)
+        if name.split(".")[0] == "fitting" and here != "__init__" and there in FITTING_LEVELS:
+            assert FITTING_LEVELS[there] <= FITTING_LEVELS[here], f"{path} imports {name}, which lies below it"
+            equal = there != here and FITTING_LEVELS[there] == FITTING_LEVELS[here]
+            assert not equal, f"{path} imports {name}: rooms side by side know nothing of each other"
+
+
+def test_files_import_each_other_in_no_circle():
+    modules = {".".join(path.with_suffix("").parts): path for path in LIBRARY if path.name != "__init__.py"}
+    needs = {name: set(imported(path)) & set(modules) for name, path in modules.items()}
+    while needs:
+        free = {name for name, needed in needs.items() if not needed & set(needs)}
+        assert free, f"these files import each other in circles: {sorted(needs)}"
+        needs = {name: needed for name, needed in needs.items() if name not in free}
+
+
 def test_the_tests_of_the_imports_see_what_they_must():
-    names = set(imported(Path("afm_jax/impact/poincare.py")))
+    names = set(imported(Path("afm_jax/impact/map.py")))
     assert "afm_jax.impact.first_impact" in names
     assert room("afm_jax.impact.first_impact") == "impact"
-    assert LEVELS["apparatus"] < LEVELS["impact"] < LEVELS["study"] < LEVELS["plots"] < LEVELS["cli"]
+    assert LEVELS["apparatus"] < LEVELS["impact"] < LEVELS["effects"] < LEVELS["plots"] < LEVELS["cli"]
 
 
 def test_packages_start_without_jax():
     # Names are taken when they are used; then JAX is there.
     code = "import sys, afm_jax, fitting; print('jax' in sys.modules); afm_jax.Cantilever; print('jax' in sys.modules)"
     assert python(code).split() == ["False", "True"]
+
+
+def test_no_module_takes_the_place_of_a_public_function():
+    # `import fitting.calibration.sweep` puts the name `calibration` into `fitting`: were a folder called `calibrate`,
+    # the function of that name would be gone.
+    code = (
+        "import importlib, pkgutil, afm_jax, fitting\n"
+        "for package in (afm_jax, fitting):\n"
+        "    for module in pkgutil.walk_packages(package.__path__, package.__name__ + '.'):\n"
+        "        if not module.name.endswith('__main__'):\n"
+        "            importlib.import_module(module.name)\n"
+        "    print([name for name in package.__all__ if type(getattr(package, name)).__name__ == 'module'])\n"
+        "result = fitting.fit.__name__, fitting.calibrate.__name__, fitting.lockin.__name__, fitting.invert.__name__\n"
+        "print(*result, fitting.design.__name__, afm_jax.simulate.__name__, afm_jax.collide.__name__)"
+    )
+    lines = python(code).splitlines()
+    assert lines == ["[]", "[]", "fit calibrate lockin invert design simulate collide"]
 
 
 def changes_of_configuration(path: Path) -> list[int]:

@@ -11,10 +11,10 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
-from fitting.inverse.inversion_flight import invert_rows
-from fitting.inversion import invert
-from fitting.simulated.simulated_experiment import with_noise
-from fitting.table import AmplitudeTable, TableError
+from fitting.inversion.flight import invert_rows
+from fitting.inversion.invert import invert
+from fitting.simulated.experiment import with_noise
+from fitting.tables.table import AmplitudeTable, TableError
 from tests.contact_experiment import paper_collisions, paper_experiment
 
 pytestmark = pytest.mark.slow

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from fitting.inverse.inversion_law import DELAY_TERMS, LOSS_TERMS, delay, loss, regress
+from fitting.inversion.regression import DELAY_TERMS, LOSS_TERMS, delay, loss, regress
 
 EPSILON, SLOPES = 113.6, {"viscous": 0.5, "restitution": 3e-3}
 

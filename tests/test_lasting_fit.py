@@ -8,13 +8,13 @@ import pytest
 import afm_jax as afm
 from fitting import fit, read_table
 from fitting.examples.make_contact_amplitudes import EXAMPLE, example_drives
-from fitting.law_fit import problem_of
-from fitting.measurement import measurement_of
-from fitting.optimise import Objective
-from fitting.result import FitResult
-from fitting.simulated.simulated_experiment import simulate_experiment
-from fitting.strained import relaxed, strain_of
-from fitting.table import AmplitudeTable
+from fitting.fits.fit import problem_of
+from fitting.fits.minimum import relaxed, strain_of
+from fitting.fits.objective import Objective
+from fitting.fits.result import FitResult
+from fitting.models import measurement_of
+from fitting.simulated.experiment import simulate_experiment
+from fitting.tables.table import AmplitudeTable
 from tests.contact_experiment import paper_collisions, paper_experiment
 
 PAPER = {"adhesion_energy_j_per_m2": 0.3, "relative_humidity": 0.5, "viscosity_pa_s": 1.005e-3, "modulus_gpa": 100.0}

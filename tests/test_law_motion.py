@@ -9,16 +9,15 @@ import pytest
 from scipy.integrate import quad
 
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.drive import Tone
-from afm_jax.apparatus.excitation import BaseDrive, ForceDrive
+from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.phases import Phase
 from afm_jax.impact.law import ImpactLaw
-from afm_jax.impact.poincare import iterate_map
+from afm_jax.impact.map import iterate_map
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
 from afm_jax.motion.simulate import simulate
-from afm_jax.outcome import Outcome
+from afm_jax.outcomes import Outcome
 from tests.package_scenes import bouncing
 from tests.reference_law_motion import Cosines, LawCourse, LawSystem, follow
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from fitting.fisher import covariance_of, whole_covariance_of
-from fitting.least_squares import Box, Searches, descended, distance
+from fitting.fits.least_squares import Box, Searches, covariance_of, descended, distance, whole_covariance_of
 
 TIME = np.linspace(0.0, 3.0, 20)
 TRUTHS = np.array([[2.0, 1.3, 0.5], [1.0, 0.4, -0.2], [3.0, 2.0, 0.9], [0.5, 0.7, 1.5]])

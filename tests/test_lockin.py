@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from fitting import TableError, Trace, lockin
-from fitting.traces.lockin_harmonics import fit_harmonics
-from fitting.traces.lockin_result import LockinResult
-from fitting.traces.lockin_settings import TraceSettings
-from fitting.traces.lockin_verdict import TraceKind
+from fitting.traces.fold import fit_harmonics
+from fitting.traces.lockin import LockinResult
+from fitting.traces.trace import TraceSettings
+from fitting.traces.verdict import TraceKind
 from tests.lockin_traces import (
     bounce,
     law_motion,

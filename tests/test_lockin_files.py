@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from fitting import TableError, read_trace
-from fitting.traces.lockin_settings import TraceSettings
-from fitting.traces.lockin_trace import Trace
+from fitting.traces.trace import Trace, TraceSettings
 from tests.lockin_traces import bounce
 
 DRIVE = 181.8

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from afm_jax.impact.poincare import iterate_map, next_impact
-from afm_jax.outcome import Outcome
+from afm_jax.impact.map import iterate_map, next_impact
+from afm_jax.outcomes import Outcome
 from tests.package_scenes import bouncing, scene_of, stacked
 from tests.reference_examples import DELAY, scene
 from tests.reference_flight import mp

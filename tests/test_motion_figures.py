@@ -9,15 +9,22 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from afm_jax import presets
 from afm_jax.cli.main import main
 from afm_jax.motion.observe import departures
 from afm_jax.motion.settle import follow_long
 from afm_jax.motion.start import default_start
-from afm_jax.study import motion_figures
-from afm_jax.study.motion_statements import rise_statements, section_statements, sticking_statements
-from afm_jax.study.section_survey import Growth, locked_from, survey, tangent_growth
-from afm_jax.study.slow_ramps import slow_ramps
+from afm_jax.paper import motion_figures
+from afm_jax.paper.motion_figures import (
+    Growth,
+    locked_from,
+    rise_statements,
+    section_statements,
+    slow_ramps,
+    sticking_statements,
+    survey,
+    tangent_growth,
+)
+from afm_jax.scenefile import presets
 
 
 @pytest.fixture(scope="module")

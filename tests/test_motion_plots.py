@@ -8,9 +8,8 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from afm_jax import presets
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.excitation import BaseDrive
+from afm_jax.apparatus.drives import BaseDrive
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.phases import Phase
@@ -19,6 +18,7 @@ from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start, state
 from afm_jax.plots.motion import draw_motion, draw_spectrum, look_at, spectrum_of
+from afm_jax.scenefile import presets
 
 ALL = ["time_course.png", "spectrum.png", "gap.png", "poincare.png", "force_gap.png"]
 

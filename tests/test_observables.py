@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, single_impact_orbits
-from afm_jax.apparatus.drive import Tone
-from afm_jax.apparatus.excitation import BaseDrive
-from afm_jax.motion.drive_period import drive_of
+from afm_jax.apparatus.drives import BaseDrive, Tone
+from afm_jax.apparatus.scene import drive_of
 from afm_jax.motion.observe import Observables, observe, poincare_section, strobe
 from afm_jax.motion.settle import LongRun, close_periods, find_repetition, follow_long, last_fifth, settled
 from afm_jax.motion.start import default_start, start_of, state
-from afm_jax.presets import contact_scene, figure10_scene, figure11_scene
+from afm_jax.scenefile.presets import contact_scene, figure10_scene, figure11_scene
 
 TABULATED = ImpactLaw(1.0, 113.6, 0.5, CollisionDelay(0.206, 5.64, 0.726))
 # physics.md, full contact, Q = 40: n, beta, sigma, peak height

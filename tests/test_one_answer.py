@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 
 from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, simulate, single_impact_orbits
+from afm_jax.apparatus.scene import drive_of
 from afm_jax.impact.jacobian import map_jacobian
-from afm_jax.impact.poincare import iterate_map, next_impact
-from afm_jax.motion.drive_period import drive_of
+from afm_jax.impact.map import iterate_map, next_impact
 from afm_jax.motion.observe import observe
 from afm_jax.motion.record import MotionOutcome, State
 from fitting.forward import BATCH, linearise
-from fitting.measurement import measurement_of
-from fitting.models import DELAY_NAMES, Problem
-from fitting.table import AmplitudeTable
+from fitting.models import DELAY_NAMES, Problem, measurement_of
+from fitting.tables.table import AmplitudeTable
 
 LAWS, DRIVES = BATCH, 25
 SCENES = LAWS * DRIVES

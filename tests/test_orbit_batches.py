@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from afm_jax.apparatus.scene import Scene
+from afm_jax.impact.map import iterate_map
 from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
-from afm_jax.impact.poincare import iterate_map
-from afm_jax.outcome import Outcome
+from afm_jax.outcomes import Outcome
 from tests.package_scenes import bouncing, stacked
 
 NUMBERS = (

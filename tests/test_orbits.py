@@ -10,9 +10,9 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.law import ImpactLaw
+from afm_jax.impact.map import next_impact
 from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
-from afm_jax.impact.poincare import next_impact
-from afm_jax.outcome import Outcome
+from afm_jax.outcomes import Outcome
 from tests import reference_systems as reference
 from tests.package_scenes import bouncing, scene_of
 from tests.reference_examples import DELAY, SCENES, scene

@@ -5,7 +5,7 @@ import pytest
 
 from afm_jax.impact.law import ImpactLaw
 from fitting import fit, read_table
-from fitting.sampling.refit import objective_of
+from fitting.sampling.bootstrap import objective_of
 from tests.fit_tables import EXAMPLE, rows, simulated, standard_errors_of, values_of
 
 NAMES = ("r", "epsilon", "quality_factor")

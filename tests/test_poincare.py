@@ -10,8 +10,8 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.law import ImpactLaw, impact_law_of
-from afm_jax.impact.poincare import NEAR_GRAZING, iterate_map, next_impact
-from afm_jax.outcome import Outcome
+from afm_jax.impact.map import NEAR_GRAZING, iterate_map, next_impact
+from afm_jax.outcomes import Outcome
 from tests import brute_force
 from tests import reference_systems as reference
 from tests.flight_families import random_flights

@@ -11,11 +11,10 @@ from scipy.integrate import quad
 from afm_jax.impact.law import ImpactLaw
 from fitting import fit, posterior, read_table
 from fitting.models import Problem
-from fitting.sampling.posterior_grid import grid_posterior
-from fitting.sampling.posterior_nuts import log_density_of
+from fitting.sampling.bootstrap import objective_of, standard_covariance
+from fitting.sampling.nuts import log_density_of, space_around
+from fitting.sampling.posterior import grid_posterior
 from fitting.sampling.posterior_result import PosteriorChains, posterior_of_chains
-from fitting.sampling.posterior_space import space_around
-from fitting.sampling.refit import objective_of, standard_covariance
 from tests.fit_tables import EXAMPLE, amplitudes_and_errors, rows, simulated, standard_errors_of, values_of
 from tests.fit_tables import steady_amplitudes as amplitudes_of
 

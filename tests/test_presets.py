@@ -5,8 +5,9 @@ from pathlib import Path
 import equinox as eqx
 import pytest
 
-from afm_jax import Contact, ImpactLaw, load_scene, presets, save_scene
-from afm_jax.scenefile import load_start
+from afm_jax import Contact, ImpactLaw, load_scene, save_scene
+from afm_jax.scenefile import presets
+from afm_jax.scenefile.scenefile import load_start
 
 # from the paper's captions: reduced frequency, drive amplitude, offset at the start; figures 2 and 3 are charts
 CAPTIONS = {

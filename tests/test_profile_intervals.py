@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
+from fitting.fits.intervals import profile_intervals
+from fitting.fits.objective import Objective
 from fitting.forward import Linearised
-from fitting.intervals import profile_intervals
 from fitting.models import Problem
-from fitting.optimise import Objective
 
 QUANTILE = 1.959963984540054  # 97.5 % of a normal distribution: its square is the 95 % of chi2
 

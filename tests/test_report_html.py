@@ -9,11 +9,11 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax.cli.main import main
-from fitting.reporting.html import fit_page
-from fitting.reporting.plots import law_figure, rows_figure, speed_figure
-from fitting.reporting.report import summary, write_report
-from fitting.reporting.words import band_width, goodness_in_words
-from fitting.result import FitResult
+from fitting.fits.result import FitResult
+from fitting.report.html import fit_page
+from fitting.report.plots import law_figure, rows_figure, speed_figure
+from fitting.report.report import summary, write_report
+from fitting.report.words import band_width, goodness_in_words
 from tests.html_pages import first_screen, formulas, read_page, section_of, table_of, words_of
 from tests.made_fits import SPEEDS, VALUES, made_fit, made_parameter, made_table
 

@@ -9,14 +9,13 @@ import pytest
 from scipy.optimize import brentq
 
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.drive import Tone
-from afm_jax.apparatus.excitation import BaseDrive, ForceDrive
+from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, require_sample_drive
 from afm_jax.impact.jacobian import map_jacobian
 from afm_jax.impact.law import ImpactLaw
+from afm_jax.impact.map import iterate_map, next_impact
 from afm_jax.impact.orbits import single_impact_orbits
-from afm_jax.impact.poincare import iterate_map, next_impact
 
 OMEGA, FIRST, SECOND = (2e-3 * np.pi * frequency for frequency in (90.0, 180.0, 431.0))
 

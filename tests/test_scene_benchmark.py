@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from afm_jax.cli.bench_scenes import SCENE_COLUMNS
+from afm_jax.bench import timing as own_process
+from afm_jax.bench.problems import batch_run, bouncing_starts, single_contacts, spread_starts
+from afm_jax.bench.scenes import REFERENCE, aims, contact_errors
+from afm_jax.bench.scipy_contacts import scipy_driven_contact
+from afm_jax.cli.bench import SCENE_COLUMNS
 from afm_jax.cli.main import main
 from afm_jax.motion.record import ContactKind, MotionOutcome
-from afm_jax.presets import contact_scene
-from afm_jax.study import own_process
-from afm_jax.study.driven_batches import batch_run, bouncing_starts, single_contacts, spread_starts
-from afm_jax.study.scene_benchmark import REFERENCE, aims, contact_errors
-from afm_jax.study.scipy_driven_contact import scipy_driven_contact
+from afm_jax.scenefile.presets import contact_scene
 from tests.reference_driven_contact import DrivenContact, follow
 
 SYSTEM = DrivenContact(amplitude_nm=4.0, drive_frequency_khz=180.0 * 5.277)
@@ -171,7 +171,7 @@ def test_aims_name_what_was_reached():
 
 def test_command_writes_its_table_and_judges(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def measured(task, settings, *, cores):
-        assert (task, cores) == ("afm_jax.study.scene_benchmark:scenes_one_core", 1)
+        assert (task, cores) == ("afm_jax.bench.scenes:scenes_one_core", 1)
         assert settings["batch"] == 20
         return {"rows": ROWS, "reference_error": 1e-11, "reference_error_us": 1e-12}
 

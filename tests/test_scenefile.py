@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, SceneError, load_scene, save_scene
-from afm_jax.scenefile import Start, load_start
+from afm_jax.scenefile.scenefile import Start, load_start
 
 CANTILEVER = "[cantilever]\nfrequency_khz = 90\n"
 PLATFORM = "[platform]\namplitude_nm = 4\nfrequency_khz = 181.8\n"

@@ -13,10 +13,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from afm_jax import Cantilever, Contact, Platform, Scene, SceneError, load_scene, presets, save_scene
+from afm_jax import Cantilever, Contact, Platform, Scene, SceneError, load_scene, save_scene
 from afm_jax.contact.contact import EFFECTS
 from afm_jax.contact.forces import Capillary, CoreRepulsion, Jkr, VanDerWaals
-from afm_jax.scenefile_keys import CONTACT_RANGES
+from afm_jax.scenefile import presets
+from afm_jax.scenefile.tables import CONTACT_RANGES
 from tests.fresh_python import python
 
 HEAD = "[cantilever]\nfrequency_khz = 90\n[platform]\namplitude_nm = 4\nfrequency_khz = 181.8\n[interaction]\n"
@@ -188,7 +189,7 @@ def test_a_wrong_line_is_named(path: Path, line: str, expected: str):
 def test_scenes_with_a_law_do_without_the_contact(path: Path):
     path.write_text(f'{HEAD}model = "law"\nr = 0.9\n', encoding="utf-8")
     code = (
-        "import sys; from afm_jax.scenefile import load_scene, save_scene\n"
+        "import sys; from afm_jax.scenefile.scenefile import load_scene, save_scene\n"
         f"save_scene(load_scene({str(path)!r}), {str(path)!r})\n"
         "print([name for name in sys.modules if name.startswith(('afm_jax.contact', 'diffrax', 'scipy.optimize'))])"
     )

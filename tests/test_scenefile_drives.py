@@ -13,8 +13,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, SceneError, load_scene, save_scene
-from afm_jax.apparatus.drive import Tone
-from afm_jax.apparatus.excitation import BaseDrive, ForceDrive
+from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
 
 CANTILEVER = "[cantilever]\nfrequency_khz = 90\nquality_factor = 40\n"
 PLATFORM = "[platform]\namplitude_nm = 4\nfrequency_khz = 181.8\n"

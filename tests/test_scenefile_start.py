@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, SceneError, load_scene, save_scene
-from afm_jax.cli.scene_argument import scene_and_start
-from afm_jax.scenefile import Start, load_start
+from afm_jax.cli.values import scene_and_start
+from afm_jax.scenefile.scenefile import Start, load_start
 
 HEAD = (
     "[cantilever]\nfrequency_khz = 90\n[platform]\namplitude_nm = 4\nfrequency_khz = 180\noffset_rate_nm_per_us = 0.5\n"
@@ -107,7 +107,7 @@ def test_the_commands_read_a_file_once(path: Path, monkeypatch: pytest.MonkeyPat
         read.append(source)
         return tomllib.loads(Path(source).read_text(encoding="utf-8"))
 
-    monkeypatch.setattr("afm_jax.scenefile._parsed", parsed)
+    monkeypatch.setattr("afm_jax.scenefile.scenefile._parsed", parsed)
     scene, start = scene_and_start(str(path))
     assert read == [str(path)]
     assert float(scene.platform.amplitude_nm) == 4.0

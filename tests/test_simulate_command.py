@@ -10,8 +10,8 @@ from click.testing import CliRunner, Result
 
 from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, save_scene, single_impact_orbits
 from afm_jax.cli.main import main
-from afm_jax.motion.motion_pieces import pieces_between
-from afm_jax.scenefile import Start
+from afm_jax.motion.trajectory import pieces_between
+from afm_jax.scenefile.scenefile import Start
 from tests.fresh_python import python
 
 LAW = Scene(Cantilever(90.0, 40.0), Platform(4.0, 181.8), ImpactLaw(0.9, 20.0))

@@ -13,7 +13,7 @@ from afm_jax.contact.phases import Phase
 from afm_jax.motion.record import ContactDetail, ContactKind, MotionOutcome, Simulation, State
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.trajectory import nodes, trajectory
-from afm_jax.presets import contact_scene
+from afm_jax.scenefile.presets import contact_scene
 from tests.reference_contact_forces import ContactParameters
 from tests.reference_driven_contact import DrivenContact, follow
 

@@ -12,8 +12,8 @@ from afm_jax.contact.contact import Contact
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
 from fitting.examples.make_contact_amplitudes import EXAMPLE
-from fitting.simulated.simulated_experiment import drives_of, simulate_experiment, with_noise
-from fitting.table import read_table
+from fitting.simulated.experiment import drives_of, simulate_experiment, with_noise
+from fitting.tables.table import read_table
 from tests.contact_experiment import paper_experiment
 
 pytestmark = pytest.mark.slow

@@ -13,10 +13,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fitting.table import AmplitudeTable, TableError, read_table, write_table
 from fitting.tables.csv_text import setting_in
-from fitting.tables.table_comments import SETTINGS
-from fitting.tables.table_rows import COLUMN_NAMES
+from fitting.tables.table import COLUMN_NAMES, SETTINGS, AmplitudeTable, TableError, read_table, write_table
 
 NAMES = "order,drive_frequency_khz,drive_amplitude_nm,offset_nm,peak_amplitude_nm,peak_amplitude_error_nm\n"
 TEXT = f"# free_frequency_khz = 90\n{NAMES}1,180,4,0,163.3,1.63\n2,349.2,2,-1,106.67,1.06\n"
@@ -268,5 +266,5 @@ def test_a_hundred_thousand_rows_read_in_seconds(tmp_path: Path):
 
 
 def test_reading_does_not_load_jax():
-    code = "import sys, fitting.table; sys.exit('jax' in sys.modules)"
+    code = "import sys, fitting.tables.table; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

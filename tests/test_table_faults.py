@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fitting.table import TableError, read_table
-from fitting.tables.table_rows import COLUMN_NAMES
+from fitting.tables.table import COLUMN_NAMES, TableError, read_table
 from tests.table_texts import KEY, NAMES, ROW, fault_of, message_of
 
 Q = "'# quality_factor = 40 (or 40 +- 2)'"

@@ -10,14 +10,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from afm_jax.cli.failures import NotValid
+from afm_jax.cli.main import NotValid
 from afm_jax.cli.verify import command
 from afm_jax.impact import jacobian as formulas
-from afm_jax.study import verification
-from afm_jax.study.high_precision import exact_impact
-from afm_jax.study.verification_orbits import draw_orbits
-from afm_jax.study.verification_samples import draw_sample
-from afm_jax.study.verification_states import DAMPED, DELAYED, PAPER
+from afm_jax.verify import checks as verification
+from afm_jax.verify.checks import draw_orbits
+from afm_jax.verify.fifty_digits import exact_impact
+from afm_jax.verify.samples import DAMPED, DELAYED, PAPER, draw_sample
 from tests.reference_examples import SCENES
 from tests.reference_flight import Parameters, mp
 from tests.reference_systems import differenced_jacobian, iterate

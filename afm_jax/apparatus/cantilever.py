@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.apparatus.trigonometry import sine_cosine
-from afm_jax.parameters import as_argument, as_optional_parameter, as_parameter, check_parameter, readable
+from afm_jax.checks import as_argument, as_optional_parameter, as_parameter, check_parameter, readable
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
 

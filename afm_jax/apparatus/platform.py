@@ -4,9 +4,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from afm_jax.apparatus.drive import Tone
+from afm_jax.apparatus.drives import Tone
 from afm_jax.apparatus.trigonometry import sine_cosine
-from afm_jax.parameters import as_argument, as_parameter, check_parameter, readable
+from afm_jax.checks import as_argument, as_parameter, check_parameter, readable
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
 

@@ -1,13 +1,17 @@
-"""A scene: a cantilever, a moving platform, what happens when they meet, and what drives the tip besides."""
+"""A scene: a cantilever, a moving platform, what happens when they meet, and what drives the tip besides.
 
-from typing import Any
+The period that a scene is driven with, and whether there is only one.
+"""
+
+import math
+from typing import Any, NamedTuple
 
 import equinox as eqx
 
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.excitation import BaseDrive, ForceDrive
+from afm_jax.apparatus.drives import BaseDrive, ForceDrive
 from afm_jax.apparatus.platform import Platform
-from afm_jax.parameters import readable
+from afm_jax.checks import readable
 
 
 class Scene(eqx.Module):
@@ -51,3 +55,40 @@ def require_sample_drive(scene: Scene, *, second_frequency: bool = False) -> Non
         return
     known = "the platform's motion" if second_frequency else "one cosine of the platform"
     raise ValueError(f"the scene has {drive}, but only {known} is allowed here: leave it out, or simulate the scene")
+
+
+_SAME = 1e-12
+"""Relative distance below which two frequencies are one."""
+
+
+class Drive(NamedTuple):
+    """What the phases of a motion count in."""
+
+    period_us: float
+    angular_frequency: float
+    """In rad/us."""
+    aperiodic: str | None
+    """Why no motion can repeat under this drive; None where it can."""
+
+
+def drive_of(scene: Scene) -> Drive:
+    """Return a scene's drive: the frequency of what moves, the platform's where several things do or nothing does.
+
+    Args:
+        scene: one scene, its numbers known.
+    """
+    moving = []
+    platform = scene.platform
+    if float(platform.amplitude_nm) != 0.0:
+        moving.append(float(platform.angular_frequency))
+    tones = () if platform.second is None else (platform.second,)
+    for part in (scene.base, scene.force):
+        tones += () if part is None else part.tones
+    moving += [float(tone.angular_frequency) for tone in tones if float(tone.amplitude) != 0.0]
+    omega = moving[0] if moving else float(platform.angular_frequency)
+    aperiodic = None
+    if any(abs(other - omega) > _SAME * omega for other in moving):
+        aperiodic = "the drive has several frequencies, so that no period of the drive repeats"
+    elif float(platform.offset_rate_nm_per_us) != 0.0:
+        aperiodic = "the offset ramps, so that no period of the drive repeats"
+    return Drive(2.0 * math.pi / omega, omega, aperiodic)

@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.drive import Tone
+from afm_jax.apparatus.drives import Tone
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.trigonometry import sine_cosine
-from afm_jax.parameters import as_argument, as_parameter, is_traced, readable
+from afm_jax.checks import as_argument, as_parameter, is_traced, readable
 
 _AT_RESONANCE = 1e-9
 """Relative distance from the free frequency below which an undamped cantilever has no steady response."""

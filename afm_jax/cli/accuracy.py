@@ -130,12 +130,12 @@ def command(
     if study == "collide":
         collide_study(session, accuracy, quick=quick)
         return
+    from afm_jax.accuracy.impacts import cheapest_settings  # noqa: PLC0415
+    from afm_jax.bench.timing import run_in_own_process  # noqa: PLC0415
     from afm_jax.strict_json import strict_json  # noqa: PLC0415
-    from afm_jax.study.accuracy import cheapest_settings  # noqa: PLC0415
-    from afm_jax.study.own_process import run_in_own_process  # noqa: PLC0415
 
     with session.working("measuring"):
-        result = run_in_own_process("afm_jax.study.accuracy:map_accuracy", QUICK if quick else FULL, cores=1)
+        result = run_in_own_process("afm_jax.accuracy.impacts:map_accuracy", QUICK if quick else FULL, cores=1)
     cheapest = cheapest_settings(result["rows"], wanted_error_us)
     payload = {**result, "wanted_error_us": wanted_error_us, "cheapest": cheapest}
     session.write_table("accuracy.csv", result["rows"], COLUMNS)
@@ -158,25 +158,25 @@ def is_scene(name: str) -> bool:
     """Return whether a name can only be a scene's: a file, a path, or a preset."""
     if name.endswith(".toml") or Path(name).exists():
         return True
-    from afm_jax.presets import PRESETS  # noqa: PLC0415
+    from afm_jax.scenefile.presets import PRESETS  # noqa: PLC0415
 
     return name in PRESETS
 
 
 def collide_study(session: Session, accuracy: float, *, quick: bool) -> None:
     """Run and show the accuracy study of `collide`."""
+    from afm_jax.accuracy.collisions import cheapest_collision  # noqa: PLC0415
+    from afm_jax.bench.timing import run_in_own_process  # noqa: PLC0415
     from afm_jax.strict_json import strict_json  # noqa: PLC0415
-    from afm_jax.study.contact_accuracy import cheapest_collision  # noqa: PLC0415
-    from afm_jax.study.own_process import run_in_own_process  # noqa: PLC0415
 
     with session.working("measuring"):
-        task = "afm_jax.study.contact_accuracy:collide_accuracy"
+        task = "afm_jax.accuracy.collisions:collide_accuracy"
         result = run_in_own_process(task, COLLIDE_QUICK if quick else COLLIDE_FULL, cores=1)
     best = cheapest_collision(result["rows"], accuracy)
     payload = {**result, "accuracy": accuracy, "cheapest": best}
     session.write_table("accuracy.csv", result["rows"], COLLIDE_COLUMNS)
     if session.out is not None:
-        from afm_jax.plots.contact_accuracy import collide_accuracy_figure  # noqa: PLC0415
+        from afm_jax.plots.accuracy import collide_accuracy_figure  # noqa: PLC0415
 
         (session.out / "accuracy.json").write_text(strict_json(payload) + "\n", encoding="utf-8")
         collide_accuracy_figure(result["rows"]).savefig(session.out / "accuracy.png", dpi=150)

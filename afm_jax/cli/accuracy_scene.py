@@ -34,10 +34,10 @@ _ABOVE_CAPTURE = 1.02
 
 def scene_study(session: Session, name: str, contacts: int, *, quick: bool) -> None:
     """Run and show the accuracy study of a scene file or a preset."""
+    from afm_jax.accuracy.scenes import ladder_duration  # noqa: PLC0415
+    from afm_jax.bench.timing import run_in_own_process  # noqa: PLC0415
     from afm_jax.contact.contact import Contact  # noqa: PLC0415
     from afm_jax.strict_json import strict_json  # noqa: PLC0415
-    from afm_jax.study.fidelity_ladder import ladder_duration  # noqa: PLC0415
-    from afm_jax.study.own_process import run_in_own_process  # noqa: PLC0415
 
     scene, start = scene_and_start(name)
     resolved = isinstance(scene.interaction, Contact)
@@ -49,13 +49,13 @@ def scene_study(session: Session, name: str, contacts: int, *, quick: bool) -> N
         settings = (CONTACT_QUICK if quick else CONTACT) if resolved else (LAW_QUICK if quick else LAW)
         result = run_in_own_process(f"afm_jax.study.{task}", {**common, **settings, "contacts": contacts}, cores=1)
         rungs = {**common, "law": law, "duration_us": duration, "repetitions": settings["repetitions"]}
-        result |= run_in_own_process("afm_jax.study.fidelity_ladder:fidelity_ladder", rungs, cores=1)
+        result |= run_in_own_process("afm_jax.accuracy.scenes:fidelity_ladder", rungs, cores=1)
     payload = {**result, "scene": name, "law": law}
     session.write_table("accuracy.csv", result["rows"], COLUMNS)
     session.write_table("ladder.csv", result["ladder"], LADDER_COLUMNS)
     if session.out is not None:
+        from afm_jax.plots.accuracy import scene_accuracy_figure  # noqa: PLC0415
         from afm_jax.plots.picture_style import save  # noqa: PLC0415
-        from afm_jax.plots.scene_accuracy import scene_accuracy_figure  # noqa: PLC0415
 
         (session.out / "accuracy.json").write_text(strict_json(payload) + "\n", encoding="utf-8")
         save(scene_accuracy_figure(result), session.out / "accuracy.png")
@@ -69,7 +69,7 @@ def scene_and_start(name: str) -> "tuple[Scene, State]":
     Raises:
         ValueError: if the tip never meets anything, or the file is wrong.
     """
-    from afm_jax.cli.scene_argument import scene_and_start as scene_and_told  # noqa: PLC0415
+    from afm_jax.cli.values import scene_and_start as scene_and_told  # noqa: PLC0415
     from afm_jax.motion.start import default_start, start_of  # noqa: PLC0415
 
     scene, told = scene_and_told(name)

@@ -1,20 +1,142 @@
-"""`afm-jax bench`: impacts per second, next to SciPy."""
+"""`afm-jax bench`: impacts per second, next to SciPy.
+
+`afm-jax bench --only fits`: how long a fit takes from the shell, the first time and with a warm cache.
+
+What `afm-jax bench` measures and tells of driven scenes.
+"""
 
 import os
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.cli.bench_fits import FIT_COLUMNS, fit_rows, fit_table
-from afm_jax.cli.bench_scenes import SCENE_COLUMNS, measure_scenes, scene_tables
 from afm_jax.cli.session import Session, with_session
 from afm_jax.words import known
 
 if TYPE_CHECKING:
     from rich.table import Table
+
+
+FIT_COLUMNS = ("model", "rows", "first_s", "warm_s", "valid", "chi2", "degrees_of_freedom")
+"""What `bench_fits.csv` tells of a fit."""
+_MODELS = ("law", "law+delay", "viscous+delay", "contact")
+_BOUNDS = {"law+delay": 10.0, "viscous+delay": 10.0, "contact": 60.0}
+
+
+def fit_rows(*, quick: bool) -> tuple[list[dict[str, Any]], list[tuple[str, float | None, float]]]:
+    """Time fits of a table of 100 rows; return what was measured, and the aims with their bounds in seconds."""
+    from fitting.benchmark import time_fits  # noqa: PLC0415
+
+    rows = time_fits(("law",) if quick else _MODELS, rows=20 if quick else 100)
+    found = {row["model"]: row["warm_s"] for row in rows}
+    return rows, [
+        (f"s, fit of 100 rows, {model}, warm cache", found.get(model), bound) for model, bound in _BOUNDS.items()
+    ]
+
+
+def fit_table(rows: Sequence[dict[str, Any]]) -> "Table":
+    """Return the measurements as a table for the terminal."""
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table(title="fits from the shell", title_justify="left")
+    for name in ("model", "rows", "first time, s", "warm cache, s", "chi2/dof"):
+        table.add_column(name, justify="left" if name == "model" else "right")
+    for row in rows:
+        goodness = f"{row['chi2']:.1f}/{row['degrees_of_freedom']}"
+        table.add_row(row["model"], str(row["rows"]), f"{row['first_s']:.1f}", f"{row['warm_s']:.1f}", goodness)
+    return table
+
+
+PERIODS = {"1.01": 30, "5.277": 150}
+"""Drive periods of the batches by reduced frequency: about 30 contacts of a tip in both."""
+SCENES = {
+    "batch": 1000,
+    "periods": PERIODS,
+    "rows": 64,
+    "repetitions": 5,
+    "long_periods": 1000,
+    "scipy_contacts": 8,
+}
+SCENES_QUICK = {
+    "batch": 20,
+    "periods": {"5.277": 30},
+    "rows": 16,
+    "repetitions": 1,
+    "long_periods": 0,
+    "scipy_contacts": 2,
+    "accuracies": [1e-6],
+}
+_PARTS = ("straight", "turning")
+_ERRORS = ("rebound_error", "time_error_us")
+SCENE_COLUMNS = (
+    "what",
+    "scene",
+    "batch",
+    "periods",
+    "contacts",
+    "microseconds_per_contact",
+    "median_microseconds_per_contact",
+    "seconds",
+    "compile_s",
+    "turning_share",
+    "held_share",
+    "failed",
+    "different",
+    *(f"{part}_{error}_{share}" for part in _PARTS for error in _ERRORS for share in ("median", "99", "worst")),
+    "evaluations_per_contact",
+)
+"""What `bench_scenes.csv` tells of a measurement."""
+
+
+def measure_scenes(*, quick: bool) -> tuple[dict[str, Any], list[tuple[str, float | None, float]]]:
+    """Measure driven scenes; return what the command tells of them, and the aims: name, reached, largest allowed."""
+    from afm_jax.bench.scenes import aims  # noqa: PLC0415
+    from afm_jax.bench.timing import run_in_own_process  # noqa: PLC0415
+
+    task = "afm_jax.bench.scenes:scenes_one_core"
+    found = run_in_own_process(task, SCENES_QUICK if quick else SCENES, cores=1)
+    told = {
+        "scene_rows": found["rows"],
+        "scene_reference_error": found["reference_error"],
+        "scene_reference_error_us": found["reference_error_us"],
+    }
+    return told, aims(found["rows"])
+
+
+def scene_tables(rows: Sequence[Mapping[str, Any]]) -> list["Table"]:
+    """Return the measurements of driven scenes as two tables: times, and errors of one contact each."""
+    from rich.table import Table  # noqa: PLC0415
+
+    times = Table(title="Time of a driven contact, the flight to it included; one core")
+    for heading in ("what", "scene"):
+        times.add_column(heading)
+    for heading in ("batch", "periods", "contacts", "us/contact", "seconds", "compile s", "turning", "held", "failed"):
+        times.add_column(heading, justify="right")
+    for row in rows:
+        shares = [known(row.get(name), ".1%") for name in ("turning_share", "held_share")]
+        numbers = [known(row.get(name)) for name in ("microseconds_per_contact", "seconds", "compile_s")]
+        counts = [str(row.get(name, "-")) for name in ("batch", "periods", "contacts")]
+        times.add_row(row["what"], row["scene"], *counts, *numbers, *shares, str(row.get("failed", "-")))
+    errors = Table(title="Error of one contact, from the same arrival: median, 99 %, worst")
+    for heading in ("what", "scene", "contacts"):
+        errors.add_column(heading)
+    for heading in ("rebound (relative)", "departure time us", "ends otherwise"):
+        errors.add_column(heading, justify="right")
+    for row in rows:
+        for part in _PARTS:
+            cells = [_spread(row, f"{part}_{error}") for error in _ERRORS]
+            if any(cells):
+                errors.add_row(row["what"], row["scene"], part, *cells, str(row.get("different", "-")))
+    return [times, errors]
+
+
+def _spread(row: Mapping[str, Any], name: str) -> str:
+    values = [row.get(f"{name}_{share}") for share in ("median", "99", "worst")]
+    return "  ".join(f"{value:.1e}" for value in values if value is not None)
+
 
 COLUMNS = (
     "what",
@@ -82,8 +204,8 @@ def command(session: Session, batches: tuple[int, ...], only: str | None, *, qui
     bench_fits.csv and bench.json.
     """
     session.start_computing()
+    from afm_jax.bench.timing import available_cores  # noqa: PLC0415
     from afm_jax.strict_json import strict_json  # noqa: PLC0415
-    from afm_jax.study.own_process import available_cores  # noqa: PLC0415
 
     cores = available_cores()
     machine = machine_facts(cores)
@@ -121,24 +243,24 @@ def command(session: Session, batches: tuple[int, ...], only: str | None, *, qui
 
 def map_rows(batches: Sequence[int], cores: int, *, quick: bool) -> list[dict[str, Any]]:
     """Measure the impact map, on one core and on all."""
-    from afm_jax.study.own_process import run_in_own_process  # noqa: PLC0415
+    from afm_jax.bench.timing import run_in_own_process  # noqa: PLC0415
 
     sizes = list(batches) or ([1, 100] if quick else [1, 100, AIMED_BATCH, 100_000])
     common = {"batches": sizes, "impacts": 20, "repetitions": 2 if quick else 7}
     blocks = [] if quick else [250, 1000, 2000]
     alone = {**common, "blocks": blocks, "derivative_batch": 100 if quick else AIMED_BATCH}
-    rows = run_in_own_process("afm_jax.study.benchmark:one_core", alone, cores=1)["rows"]
+    rows = run_in_own_process("afm_jax.bench.impacts:one_core", alone, cores=1)["rows"]
     if cores > 1:
-        rows += run_in_own_process("afm_jax.study.benchmark:all_cores", common, cores=cores)["rows"]
+        rows += run_in_own_process("afm_jax.bench.impacts:all_cores", common, cores=cores)["rows"]
     return rows
 
 
 def contact_rows(*, quick: bool) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Measure collisions of free tips through the contact; return what was measured and the aims."""
-    from afm_jax.study.contact_benchmark import aims as contact_aims  # noqa: PLC0415
-    from afm_jax.study.own_process import run_in_own_process  # noqa: PLC0415
+    from afm_jax.bench.collisions import aims as contact_aims  # noqa: PLC0415
+    from afm_jax.bench.timing import run_in_own_process  # noqa: PLC0415
 
-    task = "afm_jax.study.contact_benchmark:contact_one_core"
+    task = "afm_jax.bench.collisions:contact_one_core"
     rows = run_in_own_process(task, CONTACT_QUICK if quick else CONTACT, cores=1)["rows"]
     return rows, [aim_of(name, value, at_most=bound) for name, value, bound in contact_aims(rows)]
 

@@ -4,9 +4,9 @@ from pathlib import Path
 
 import click
 
-from afm_jax.cli.failures import NotValid
-from afm_jax.cli.number_lists import Share
+from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.values import Share
 
 BACKGROUNDS = ("none", "floor", "constant", "linear")
 
@@ -41,9 +41,9 @@ def command(
     is not valid: no resonance, at the edge, not converged, or not explained by the model.
     """
     session.start_computing()
-    from fitting.calibration import calibrate  # noqa: PLC0415
-    from fitting.resonance.calibration_report import calibration_summary  # noqa: PLC0415
-    from fitting.resonance.resonance_sweep import read_sweep, without_phase  # noqa: PLC0415
+    from fitting.calibration.calibrate import calibrate  # noqa: PLC0415
+    from fitting.calibration.report import calibration_summary  # noqa: PLC0415
+    from fitting.calibration.sweep import read_sweep, without_phase  # noqa: PLC0415
 
     measured = read_sweep(sweep)
     if amplitude_only:
@@ -52,7 +52,7 @@ def command(
         result = calibrate(measured, background=background, noise=noise, scale_errors=scale_errors)
     session.emit(result.to_dict(), calibration_summary(result))
     if session.out is not None:
-        from fitting.resonance.calibration_report import write_calibration  # noqa: PLC0415
+        from fitting.calibration.report import write_calibration  # noqa: PLC0415
 
         for path in write_calibration(result, session.out, session.write_table):
             session.note(f"wrote {path}")

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from afm_jax.cli.contact_options import ContactOptions, chosen_contact, with_contact_options
-from afm_jax.cli.failures import NotValid
-from afm_jax.cli.number_lists import Numbers
+from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.values import Numbers
 from afm_jax.words import known
 
 if TYPE_CHECKING:
@@ -71,7 +71,7 @@ def command(
     integration does not resolve one.
     """
     session.start_computing()
-    from afm_jax.study.collisions import collisions  # noqa: PLC0415
+    from afm_jax.contact.collide import collisions  # noqa: PLC0415
 
     contact, mass, description = chosen_contact(contact_options)
     with session.working("colliding (the first run compiles for some seconds)"):

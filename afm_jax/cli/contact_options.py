@@ -86,10 +86,10 @@ def chosen_contact(options: ContactOptions) -> ChosenContact:
         click.UsageError: if an effect that is needed is left out, or a parameter is given of one that is absent.
         ValueError: if a value is impossible, the scene has no contact, or the contact no junction.
     """
+    from afm_jax.checks import check_parameter  # noqa: PLC0415
     from afm_jax.contact.contact import EFFECTS, REQUIRED_EFFECTS  # noqa: PLC0415
-    from afm_jax.parameters import check_parameter  # noqa: PLC0415
-    from afm_jax.scenefile_contact import contact_parameters, make_contact  # noqa: PLC0415
-    from afm_jax.scenefile_keys import CONTACT_RANGES  # noqa: PLC0415
+    from afm_jax.scenefile.contact import contact_parameters, make_contact  # noqa: PLC0415
+    from afm_jax.scenefile.tables import CONTACT_RANGES  # noqa: PLC0415
 
     for name in options.left_out:
         if name in REQUIRED_EFFECTS:
@@ -114,8 +114,8 @@ def chosen_contact(options: ContactOptions) -> ChosenContact:
 def _of_scene(path: Path) -> tuple[tuple[str, ...], dict[str, float], float]:
     """Return effects, parameters and mass of a scene file."""
     from afm_jax.contact.contact import Contact  # noqa: PLC0415
-    from afm_jax.scenefile import load_scene  # noqa: PLC0415
-    from afm_jax.scenefile_contact import contact_parameters  # noqa: PLC0415
+    from afm_jax.scenefile.contact import contact_parameters  # noqa: PLC0415
+    from afm_jax.scenefile.scenefile import load_scene  # noqa: PLC0415
 
     scene = load_scene(path)
     if not isinstance(scene.interaction, Contact):

@@ -3,9 +3,9 @@
 import click
 
 from afm_jax.cli.design_belief import BeliefOptions, believed, with_belief_options
-from afm_jax.cli.failures import NotValid
-from afm_jax.cli.number_lists import Numbers, Orders, Share
+from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.values import Numbers, Orders, Share
 
 
 @click.command()
@@ -87,9 +87,9 @@ def command(  # noqa: PLR0913
     if frequencies_khz is not None and detuning is not None:
         raise click.UsageError("--frequencies-khz and --detuning both say what the drive frequency can be; give one")
     session.start_computing()
-    from fitting.experiment import design  # noqa: PLC0415
-    from fitting.planning.experiment_drives import drive_grid  # noqa: PLC0415
-    from fitting.planning.experiment_report import design_summary, write_design  # noqa: PLC0415
+    from fitting.experiments.candidates import drive_grid  # noqa: PLC0415
+    from fitting.experiments.design import design  # noqa: PLC0415
+    from fitting.experiments.report import design_summary, write_design  # noqa: PLC0415
 
     with session.working("forecasting (the first run compiles for some seconds)"):
         belief = believed(belief_options, noise)

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from afm_jax.cli.number_lists import ValueAndError
+from afm_jax.cli.values import ValueAndError
 
 if TYPE_CHECKING:
-    from fitting.planning.experiment_belief import Belief
+    from fitting.experiments.belief import Belief
 
 MODELS = (
     *("restitution", "law", "viscous"),
@@ -126,7 +126,7 @@ def believed(options: BeliefOptions, noise: float) -> "Belief":
     for name in options.numbers:
         if options.measured is None or name != "free":
             raise click.UsageError(f"{_option(name)} is what {source} says already; leave one of them out")
-    from fitting.planning.experiment_after_fit import belief_of_fit  # noqa: PLC0415
+    from fitting.experiments.belief import belief_of_fit  # noqa: PLC0415
 
     if options.fit is not None:
         payload = _read_json(options.fit)
@@ -134,16 +134,16 @@ def believed(options: BeliefOptions, noise: float) -> "Belief":
         if options.model not in (None, belief.problem.model):
             raise click.UsageError(f"{options.fit} is a fit of the model {belief.problem.model}, not {options.model}")
         return belief
-    from fitting.law_fit import fit  # noqa: PLC0415
-    from fitting.table import read_table  # noqa: PLC0415
+    from fitting.fits.fit import fit  # noqa: PLC0415
+    from fitting.tables.table import read_table  # noqa: PLC0415
 
     table = read_table(options.measured or "", noise=noise)
     return belief_of_fit(fit(table, options.model or "law+delay", free=_names(options)), options.uncertainty)
 
 
 def _from_values(options: BeliefOptions) -> "Belief":
+    from fitting.experiments.belief import believe  # noqa: PLC0415
     from fitting.models import model_parameters  # noqa: PLC0415
-    from fitting.planning.experiment_belief import believe  # noqa: PLC0415
 
     numbers, model, free = options.numbers, options.model or "law+delay", _names(options)
     if "free_frequency_khz" not in numbers:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import click
 
-from afm_jax.cli.failures import NotValid
+from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.compilation_cache import silence_xla
 
@@ -88,8 +88,8 @@ def time_impacts() -> float:
     """Return microseconds that an impact of many tips takes, the best of three times."""
     import jax  # noqa: PLC0415
 
-    from afm_jax.impact.batch import iterate_batch  # noqa: PLC0415
-    from afm_jax.presets import preset  # noqa: PLC0415
+    from afm_jax.impact.map import iterate_batch  # noqa: PLC0415
+    from afm_jax.scenefile.presets import preset  # noqa: PLC0415
 
     scene = preset("figure2")
     times, speeds = jax.numpy.linspace(0.0, 5.0, _TIPS), jax.numpy.linspace(50.0, 100.0, _TIPS)

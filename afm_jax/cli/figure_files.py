@@ -2,18 +2,16 @@
 
 from pathlib import Path
 
-from afm_jax import presets
-from afm_jax.cli.out_folder import write_csv
-from afm_jax.plots.contact_figures import draw_contact_figure
-from afm_jax.plots.motion_figures import draw_motion_figure
-from afm_jax.plots.offset_amplitude import draw_offset_amplitudes
-from afm_jax.plots.stability_regions import draw_stability_chart
-from afm_jax.study import offset_amplitude, stability_regions
-from afm_jax.study.contact_figures import ContactFigure
-from afm_jax.study.figure_statements import adhesion_limit_nm
-from afm_jax.study.motion_figures import MotionFigure
-from afm_jax.study.offset_amplitude import OffsetAmplitudes
-from afm_jax.study.paper_figures import FigureData
+from afm_jax.cli.session import write_csv
+from afm_jax.dynamics import charts as offset_amplitude
+from afm_jax.dynamics import charts as stability_regions
+from afm_jax.dynamics.charts import OffsetAmplitudes
+from afm_jax.paper.charts import FigureData, adhesion_limit_nm
+from afm_jax.paper.contact_figures import ContactFigure
+from afm_jax.paper.motion_figures import MotionFigure
+from afm_jax.plots.charts import draw_offset_amplitudes, draw_stability_chart
+from afm_jax.plots.paper import draw_contact_figure, draw_motion_figure
+from afm_jax.scenefile import presets
 
 
 def write_figure(number: str, figure: FigureData | ContactFigure | MotionFigure, folder: Path) -> list[str]:

@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.cli.failures import NotValid
-from afm_jax.cli.out_folder import prepare_folder
-from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.main import NotValid
+from afm_jax.cli.session import Session, prepare_folder, with_session
 
 if TYPE_CHECKING:
-    from afm_jax.study.contact_figures import ContactFigure
-    from afm_jax.study.motion_figures import MotionFigure
-    from afm_jax.study.paper_figures import FigureData
+    from afm_jax.paper.charts import FigureData
+    from afm_jax.paper.contact_figures import ContactFigure
+    from afm_jax.paper.motion_figures import MotionFigure
 
 AVAILABLE = ("2", "3", "4", "5", "6", "7", "8", "9", "10", "11")
 _OF_THE_CONTACT = {"4": "forces", "5": "loading and unloading", "6": "impact law", "7": "one impact in time"}
@@ -79,7 +78,7 @@ def _compute(
     session: Session, only: tuple[str, ...], *, coarse: bool, seed: int
 ) -> "dict[str, FigureData | ContactFigure | MotionFigure]":
     """Compute the figures; each one's time goes to standard error."""
-    from afm_jax.study import paper_figures  # noqa: PLC0415
+    from afm_jax.paper import charts as paper_figures  # noqa: PLC0415
 
     results: dict[str, FigureData | ContactFigure | MotionFigure] = {}
     points = _COARSE_SPOT_CHECKS if coarse else _SPOT_CHECKS
@@ -99,12 +98,12 @@ def _compute(
             report("figure 3: statements and spot checks")
             results["3"] = paper_figures.figure3(adhesive, without, seed=seed, points=points)
     for number in (each for each in only if each in _OF_THE_CONTACT):
-        from afm_jax.study.contact_figures import CONTACT_FIGURES  # noqa: PLC0415
+        from afm_jax.paper.contact_figures import CONTACT_FIGURES  # noqa: PLC0415
 
         report(f"figure {number}: {_OF_THE_CONTACT[number]}")
         results[number] = CONTACT_FIGURES[number]()
     for number in (each for each in only if each in _OF_MOTIONS):
-        from afm_jax.study.motion_figures import MOTION_FIGURES  # noqa: PLC0415
+        from afm_jax.paper.motion_figures import MOTION_FIGURES  # noqa: PLC0415
 
         report(f"figure {number}: {_OF_MOTIONS[number]}")
         results[number] = MOTION_FIGURES[number](
@@ -129,7 +128,7 @@ def _payload(number: str, figure: "FigureData | ContactFigure | MotionFigure", f
     }
     checks = getattr(figure, "spot_checks", None)
     if checks is not None:
-        from afm_jax.study.spot_checks import CLEARANCE_NM, STABILITY_MARGIN  # noqa: PLC0415
+        from afm_jax.paper.charts import CLEARANCE_NM, STABILITY_MARGIN  # noqa: PLC0415
 
         payload["spot_checks"] = {
             "checked": checks.checked,

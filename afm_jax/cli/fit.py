@@ -1,19 +1,84 @@
-"""`afm-jax fit TABLE.csv`: the impact law from measured vibration amplitudes."""
+"""`afm-jax fit TABLE.csv`: the impact law from measured vibration amplitudes.
 
+Texts of `afm-jax fit`'s options turned into values: `NAME=VALUE`, `NAME=VALUE+-ERROR`, lists of names.
+"""
+
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.cli.failures import NotValid
-from afm_jax.cli.fit_options import Constraint, Fixed, Names
-from afm_jax.cli.number_lists import Share
+from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.values import Share, parse_around_plus_minus, parse_number
 from afm_jax.words import text_table
 
 if TYPE_CHECKING:
-    from fitting.result import FitResult
-    from fitting.table import AmplitudeTable
+    from fitting.fits.result import FitResult
+    from fitting.tables.table import AmplitudeTable
+
+
+class Fixed(click.ParamType):
+    """A parameter held at a value: NAME=VALUE."""
+
+    name = "value"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, float]:
+        """Return name and value.
+
+        Raises:
+            click.BadParameter: if the text is something else.
+        """
+        name, sign, text = str(value).partition("=")
+        try:
+            number = parse_number(text)
+        except ValueError:
+            sign, number = "", math.nan
+        if not sign or not name.strip():
+            self.fail(f"must be NAME=VALUE such as modulus_gpa=80, but is {value}", param, ctx)
+        return name.strip(), number
+
+
+class Constraint(click.ParamType):
+    """What is known of a parameter: NAME=VALUE+-ERROR."""
+
+    name = "constraint"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, tuple[float, float]]:
+        """Return name, value and standard error.
+
+        Raises:
+            click.BadParameter: if the text is something else.
+        """
+        name, sign, text = str(value).partition("=")
+        try:
+            numbers = parse_around_plus_minus(text)
+        except ValueError:
+            numbers = []
+        if not sign or not name.strip() or len(numbers) != 2:
+            self.fail(f"must be NAME=VALUE+-ERROR such as tip_calibration=1+-0.02, but is {value}", param, ctx)
+        return name.strip(), (numbers[0], numbers[1])
+
+
+class Names(click.ParamType):
+    """Names in a comma list."""
+
+    name = "names"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
+        """Return the names.
+
+        Raises:
+            click.BadParameter: if one is blank.
+        """
+        names = tuple(part.strip() for part in str(value).split(","))
+        if not all(names):
+            self.fail(f"must be names separated by commas, but is {value}", param, ctx)
+        return names
+
 
 MODELS = ("restitution", "law", "viscous", "restitution+delay", "law+delay", "viscous+delay", "contact")
 
@@ -84,9 +149,9 @@ def command(session: Session, table: Path | None, model: str, noise: float | Non
         raise click.UsageError(f"{both}give a table to fit, `afm-jax fit TABLE.csv`, or --example for the bundled one")
     settings = _settings(model, options)
     session.start_computing(*(f"fitting.forward:{name}" for name in ("impacts_of", "located", "linearise_pairs")))
-    from fitting.law_fit import fit  # noqa: PLC0415
-    from fitting.reporting.report import summary  # noqa: PLC0415
-    from fitting.table import read_table  # noqa: PLC0415
+    from fitting.fits.fit import fit  # noqa: PLC0415
+    from fitting.report.report import summary  # noqa: PLC0415
+    from fitting.tables.table import read_table  # noqa: PLC0415
 
     measured = read_table(_example_path() if table is None else table, noise=noise)
     first = "the first run compiles for half a minute" if "delay" in model or model == "contact" else "some seconds"
@@ -96,7 +161,7 @@ def command(session: Session, table: Path | None, model: str, noise: float | Non
     payload = result.to_dict() | {name: extra.to_dict() for name, extra in extras.items()}
     session.emit(payload, summary(result), *(_words(name, extra) for name, extra in extras.items()))
     if session.out is not None:
-        from fitting.reporting.report import write_report  # noqa: PLC0415
+        from fitting.report.report import write_report  # noqa: PLC0415
 
         for path in write_report(result, session.out, session.write_table, **extras):
             session.note(f"wrote {path}")
@@ -188,7 +253,7 @@ def _extras(
 
 
 def _comparison(session: Session, table: "AmplitudeTable", model: str, settings: dict[str, Any]) -> Any:
-    from fitting.comparison import compare, rivals  # noqa: PLC0415
+    from fitting.fits.comparison import compare, rivals  # noqa: PLC0415
 
     models = rivals(model)
     with session.working(f"comparing {', '.join(models)}"):
@@ -196,14 +261,14 @@ def _comparison(session: Session, table: "AmplitudeTable", model: str, settings:
 
 
 def _bootstrap(session: Session, result: "FitResult", samples: int, seed: int) -> Any:
-    from fitting.sampling.parametric_bootstrap import bootstrap  # noqa: PLC0415
+    from fitting.sampling.bootstrap import bootstrap  # noqa: PLC0415
 
     with session.working(f"fitting {samples} synthetic tables"):
         return bootstrap(result, samples=samples, seed=seed)
 
 
 def _posterior(session: Session, result: "FitResult", seed: int) -> Any:
-    from fitting.sampling.posterior_of_fit import posterior  # noqa: PLC0415
+    from fitting.sampling.posterior import posterior  # noqa: PLC0415
 
     with session.working("sampling the posterior"):
         return posterior(result, seed=seed)

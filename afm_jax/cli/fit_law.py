@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from afm_jax.cli.contact_options import ContactOptions, chosen_contact, with_contact_options
-from afm_jax.cli.failures import NotValid
-from afm_jax.cli.number_lists import Ends
+from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.values import Ends
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -110,7 +110,7 @@ def command(
     session.write_table("fit_delay.csv", _delay_rows(delay), DELAY_COLUMNS)
     if session.out is not None:
         from afm_jax.strict_json import strict_json  # noqa: PLC0415
-        from fitting.contact_law_plot import draw_contact_law  # noqa: PLC0415
+        from fitting.report.contact_law_plot import draw_contact_law  # noqa: PLC0415
 
         (session.out / "fit_law.json").write_text(strict_json(payload) + "\n", encoding="utf-8")
         draw_contact_law(laws, delay, session.out / "fit_law.png")

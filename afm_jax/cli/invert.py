@@ -4,9 +4,9 @@ from pathlib import Path
 
 import click
 
-from afm_jax.cli.failures import NotValid
-from afm_jax.cli.number_lists import Share
+from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.values import Share
 
 
 @click.command()
@@ -58,11 +58,13 @@ def command(
     if example == (table is not None):
         raise click.UsageError("give a table to invert, `afm-jax invert TABLE.csv`, or --example for the bundled one")
     session.start_computing()
-    from fitting.inverse.fitted_law import read_fitted_law  # noqa: PLC0415
-    from fitting.inverse.inversion_report import inversion_summary  # noqa: PLC0415
-    from fitting.inverse.known_law import read_known_law  # noqa: PLC0415
-    from fitting.inversion import invert  # noqa: PLC0415
-    from fitting.table import read_table  # noqa: PLC0415
+    from fitting.inversion.invert import invert  # noqa: PLC0415
+    from fitting.inversion.regression import (  # noqa: PLC0415
+        read_fitted_law,
+        read_known_law,
+    )
+    from fitting.inversion.report import inversion_summary  # noqa: PLC0415
+    from fitting.tables.table import read_table  # noqa: PLC0415
 
     measured = read_table(_example_path() if table is None else table, noise=noise)
     known = None if truth is None else read_known_law(truth)
@@ -71,7 +73,7 @@ def command(
         result = invert(measured, frequency_error_khz=frequency_error_khz, truth=known)
     session.emit(result.to_dict(), inversion_summary(result))
     if session.out is not None:
-        from fitting.inverse.inversion_report import write_inversion  # noqa: PLC0415
+        from fitting.inversion.report import write_inversion  # noqa: PLC0415
 
         for path in write_inversion(result, session.out, session.write_table, fitted=fitted):
             session.note(f"wrote {path}")

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from afm_jax.cli.failures import NotValid
+from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 
 _SETTINGS = (
@@ -49,10 +49,12 @@ def command(
     picture of every trace, lockin.json, and amplitudes.csv for `afm-jax fit` with the steady ones. Exit code 3 if a
     trace is flagged.
     """
-    from fitting.traces.lockin_analysis import lockin  # noqa: PLC0415
-    from fitting.traces.lockin_report import lockin_payload, lockin_summary, write_lockin  # noqa: PLC0415
-    from fitting.traces.lockin_table import table_of  # noqa: PLC0415
-    from fitting.traces.lockin_trace import TableError, read_trace  # noqa: PLC0415
+    from fitting.traces.lockin import (  # noqa: PLC0415
+        lockin,
+        table_of,
+    )
+    from fitting.traces.report import lockin_payload, lockin_summary, write_lockin  # noqa: PLC0415
+    from fitting.traces.trace import TableError, read_trace  # noqa: PLC0415
 
     # all are read first: a fault in the last should not come after minutes of work on the others
     read = [read_trace(path, group=group, **settings) for path in traces]

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.cli.failures import NotValid
+from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def command(session: Session, scene: Path, order: int) -> None:
     session.start_computing()
     from afm_jax.impact.law import ImpactLaw  # noqa: PLC0415
     from afm_jax.impact.orbits import single_impact_orbits  # noqa: PLC0415
-    from afm_jax.scenefile import load_scene, scene_tables  # noqa: PLC0415
+    from afm_jax.scenefile.scenefile import load_scene, scene_tables  # noqa: PLC0415
 
     loaded = load_scene(scene)
     if not isinstance(loaded.interaction, ImpactLaw):

@@ -7,10 +7,15 @@
 ... def command(session: Session) -> None:
 ...     session.start_computing()  # only then import JAX and what needs it
 ...     session.emit({"answer": 42}, "The answer is 42.")
+
+The `--out` folder: made and tried out before the computation, and the tables in it.
 """
 
+import csv
 import functools
+import math
 import sys
+import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -19,12 +24,40 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.cli.out_folder import prepare_folder, write_csv
 from afm_jax.compilation_cache import cache_folder, make_private, silence_xla
 from afm_jax.strict_json import strict_json
 
 if TYPE_CHECKING:
     from afm_jax.compilation_cache import Cache
+
+
+def prepare_folder(folder: Path) -> None:
+    """Make a folder, with those above it, and check that a file can be written there.
+
+    Raises:
+        OSError: if it cannot be made or written to.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryFile(dir=folder):
+        pass
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> None:
+    """Write rows as CSV; numbers with all their digits, true and false in words, what is unknown as an empty cell."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows([_cell(row.get(column)) for column in columns] for row in rows)
+
+
+def _cell(value: Any) -> Any:
+    plain = value.tolist() if hasattr(value, "tolist") else value
+    if isinstance(plain, bool):
+        return "true" if plain else "false"
+    if plain is None or (isinstance(plain, float) and not math.isfinite(plain)):
+        return ""
+    return plain
+
 
 _WIDTH_OF_A_PIPE = 160
 """Columns of text that nobody looks at in a terminal; wide enough that no table is cut."""

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.cli.failures import NotValid
+from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 
 METHODS = ("collocation", "diffrax")
@@ -100,8 +100,8 @@ def command(  # noqa: PLR0913
     if duration_us is not None and periods is not None:
         raise click.UsageError("--duration-us and --periods say the same: give one of them")
     session.start_computing()
-    from afm_jax.cli.scene_argument import scene_and_start  # noqa: PLC0415
-    from afm_jax.motion.drive_period import drive_of  # noqa: PLC0415
+    from afm_jax.apparatus.scene import drive_of  # noqa: PLC0415
+    from afm_jax.cli.values import scene_and_start  # noqa: PLC0415
     from afm_jax.motion.observe import observe  # noqa: PLC0415
     from afm_jax.motion.start import start_of  # noqa: PLC0415
 

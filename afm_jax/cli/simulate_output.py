@@ -13,7 +13,7 @@ from afm_jax.motion.observe import Harmonic, Observables
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation
 from afm_jax.motion.settle import LongRun, Window
 from afm_jax.motion.trajectory import DensePath
-from afm_jax.scenefile import scene_tables
+from afm_jax.scenefile.scenefile import scene_tables
 from afm_jax.strict_json import strict_json
 
 _WHOLE_PERIODS = 50

@@ -5,12 +5,12 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.cli.failures import NotValid
+from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.words import known
 
 if TYPE_CHECKING:
-    from afm_jax.study.verification import Check
+    from afm_jax.verify.checks import Check
 
 _COLUMNS = (
     "equation",
@@ -47,7 +47,7 @@ def command(session: Session, *, states: int, seed: int, exact_states: int) -> N
     one is too large.
     """
     session.start_computing()
-    from afm_jax.study.verification import verify  # noqa: PLC0415
+    from afm_jax.verify.checks import verify  # noqa: PLC0415
 
     with session.working("comparing"):
         checks = verify(states=states, seed=seed, exact_states=exact_states)

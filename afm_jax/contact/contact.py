@@ -5,14 +5,11 @@ from collections.abc import Sequence
 import equinox as eqx
 from jaxtyping import Array, ArrayLike, Float
 
-from afm_jax.contact.forces.capillary import Capillary
-from afm_jax.contact.forces.core_repulsion import CoreRepulsion
+from afm_jax.checks import as_parameter, check_parameter, is_traced, readable
 from afm_jax.contact.forces.force import Force, ForceSum, terms_of
 from afm_jax.contact.forces.jkr import Jkr
-from afm_jax.contact.forces.liquid import Liquid
-from afm_jax.contact.forces.structural import Structural
-from afm_jax.contact.forces.viscous import Viscous
-from afm_jax.parameters import as_parameter, check_parameter, is_traced, readable
+from afm_jax.contact.forces.liquid import Capillary, Liquid, Structural, Viscous
+from afm_jax.contact.forces.solid import CoreRepulsion
 from afm_jax.units import AJ_NM6_PER_J_M6
 
 EFFECTS = ("capillary", "structural", "core", "viscous", "jkr")

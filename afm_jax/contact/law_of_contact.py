@@ -27,6 +27,7 @@ from jax import lax
 from jaxtyping import Array, Float
 from scipy.optimize import OptimizeResult, least_squares, nnls
 
+from afm_jax.checks import require_float64
 from afm_jax.contact.bridge import Bridge, bridge_of
 from afm_jax.contact.bridge_leg import margin_of, pass_by_collocation, way_through
 from afm_jax.contact.collide import capture_speed, collide, collide_in_blocks
@@ -37,7 +38,6 @@ from afm_jax.contact.junction import Junction, find_junction
 from afm_jax.contact.junction_leg import pass_through_junction
 from afm_jax.impact.lasting_impact import TabulatedImpact, stretched
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
-from afm_jax.parameters import require_float64
 
 FREE = {"law": ("r", "epsilon"), "viscous": ("epsilon", "viscous_loss"), "full": ("r", "epsilon", "viscous_loss")}
 """For every model the parameters that are fitted; the others are r = 1 and no viscous loss."""

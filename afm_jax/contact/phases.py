@@ -10,9 +10,9 @@ import enum
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from afm_jax.checks import as_argument
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import Junction
-from afm_jax.parameters import as_argument
 
 
 class Phase(enum.IntEnum):

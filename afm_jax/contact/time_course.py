@@ -13,6 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from afm_jax.checks import as_parameter, check_parameter, refuse_float32
 from afm_jax.contact.bridge_leg import Way, margin_of, sweep, way_through
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Driven, free_tip
@@ -20,7 +21,6 @@ from afm_jax.contact.forces import jkr
 from afm_jax.contact.junction import Junction, explain_missing_junction, find_junction
 from afm_jax.contact.junction_leg import stretch_in_junction, turning_root
 from afm_jax.contact.phases import Phase, force_in_phase
-from afm_jax.parameters import as_parameter, check_parameter, refuse_float32
 
 _NODES = 64
 _SWEEPS = 12

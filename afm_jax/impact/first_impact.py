@@ -18,7 +18,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import Surface
 from afm_jax.apparatus.trigonometry import sine_cosine
 from afm_jax.impact.implicit import implicit_root
-from afm_jax.outcome import Outcome
+from afm_jax.outcomes import Outcome
 
 DEFAULT_MAX_STEPS = 2000
 DEFAULT_ROOT_TOLERANCE_US = 1e-13

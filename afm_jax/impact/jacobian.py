@@ -15,11 +15,11 @@ from jaxtyping import Array, ArrayLike, Float
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, require_sample_drive
+from afm_jax.checks import as_argument
 from afm_jax.impact.lasting_impact import Impact, LawImpact, speeds_of_impact
 from afm_jax.impact.law import ImpactLaw, impact_law_of
-from afm_jax.impact.poincare import next_impact
-from afm_jax.outcome import Outcome
-from afm_jax.parameters import as_argument
+from afm_jax.impact.map import next_impact
+from afm_jax.outcomes import Outcome
 
 
 class PaperFlight(NamedTuple):

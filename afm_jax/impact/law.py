@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from afm_jax.apparatus.scene import Scene
-from afm_jax.parameters import as_argument, as_parameter, check_parameter, readable
+from afm_jax.checks import as_argument, as_parameter, check_parameter, readable
 
 
 def squared_rebound_speed(

@@ -16,13 +16,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, require_sample_drive
-from afm_jax.impact.first_impact import Flight, first_impact
-from afm_jax.impact.implicit import implicit_pair, implicit_root
-from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
-from afm_jax.impact.lasting_impact import INDENTATION, Impact, LawImpact
-from afm_jax.impact.law import Speeds, impact_law_of
-from afm_jax.impact.orbit_amplitude import FlightEnds, lockin, peak_amplitude
-from afm_jax.impact.orbit_closure import (
+from afm_jax.checks import is_traced, readable, require_float64
+from afm_jax.impact.amplitude import FlightEnds, lockin, peak_amplitude
+from afm_jax.impact.closure import (
     OrbitProblem,
     Place,
     closing_residual,
@@ -30,9 +26,13 @@ from afm_jax.impact.orbit_closure import (
     map_gaps,
     speeds_at_place,
 )
-from afm_jax.impact.orbit_search import COARSE, find_roots
-from afm_jax.outcome import Outcome
-from afm_jax.parameters import is_traced, readable, require_float64
+from afm_jax.impact.first_impact import Flight, first_impact
+from afm_jax.impact.implicit import implicit_pair, implicit_root
+from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
+from afm_jax.impact.lasting_impact import INDENTATION, Impact, LawImpact
+from afm_jax.impact.law import Speeds, impact_law_of
+from afm_jax.impact.roots import COARSE, find_roots
+from afm_jax.outcomes import Outcome
 
 NEAR_DOUBLE = 1e-3
 """Slope of the closing condition per relative change of speed below which a root counts as near-double (a fold)."""

@@ -1,12 +1,18 @@
-"""What a simulation hands out: its contacts in order, its last state, and how it ended."""
+"""What a simulation hands out: its contacts in order, its last state, and how it ended.
+
+Between the lab and the gap: heights and velocities of the tip against the surface that it sees.
+"""
 
 import enum
 from typing import NamedTuple
 
 import equinox as eqx
-from jaxtyping import Array, Bool, Float, Int
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from afm_jax.parameters import readable
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.surface import Surface
+from afm_jax.checks import readable
 
 
 class MotionOutcome(enum.IntEnum):
@@ -117,3 +123,27 @@ class Simulation(eqx.Module):
     """A `MotionOutcome`."""
 
     __repr__ = readable
+
+
+def to_gap(
+    surface: Platform | Surface, response: Surface | None, state: State
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Return gap in nm and gap rate in nm/us of a state in the lab; arrays of any shape."""
+    height, speed = surface.position_and_velocity(state.time_us)
+    position, velocity = jnp.asarray(state.position_nm), jnp.asarray(state.velocity_nm_per_us)
+    if response is not None:
+        steady, rate = response.position_and_velocity(state.time_us)
+        position, velocity = position - steady, velocity - rate
+    return position - height, velocity - speed
+
+
+def to_lab(
+    surface: Platform | Surface, response: Surface | None, time_us: ArrayLike, gap_nm: ArrayLike, gap_rate: ArrayLike
+) -> State:
+    """Return the state in the lab of a gap in nm and its rate in nm/us; arrays of any shape."""
+    height, speed = surface.position_and_velocity(time_us)
+    position, velocity = jnp.asarray(gap_nm) + height, jnp.asarray(gap_rate) + speed
+    if response is not None:
+        steady, rate = response.position_and_velocity(time_us)
+        position, velocity = position + steady, velocity + rate
+    return State(jnp.asarray(time_us), position, velocity)

@@ -14,16 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.scene import Drive, Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import explain_missing_junction, find_junction
 from afm_jax.contact.phases import Phase
-from afm_jax.motion.drive_period import Drive, drive_of
-from afm_jax.motion.frames import to_gap
-from afm_jax.motion.motion_pieces import flights_of, state_at
-from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
+from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State, to_gap
 from afm_jax.motion.simulate import DEFAULT_ACCURACY, simulate
+from afm_jax.motion.trajectory import flights_of, state_at
 
 DEFAULT_TOLERANCE = 1e-4
 HELD_PERIODS = 3.0

@@ -11,17 +11,15 @@ from jaxtyping import Array, ArrayLike, Float
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface, surface_of
+from afm_jax.checks import check_parameter, is_traced, require_float64
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Driven, driven_by
 from afm_jax.contact.junction import explain_missing_junction, find_junction
 from afm_jax.contact.settings import DrivenSetting, driven_setting_of
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.motion.contact_motion import Row, begin, follow
-from afm_jax.motion.frames import to_gap, to_lab
-from afm_jax.motion.free_motion import follow_free
-from afm_jax.motion.law_motion import follow_law
-from afm_jax.motion.record import ContactDetail, ContactKind, Contacts, MotionOutcome, Simulation, State
-from afm_jax.parameters import check_parameter, is_traced, require_float64
+from afm_jax.motion.law_motion import follow_free, follow_law
+from afm_jax.motion.record import ContactDetail, ContactKind, Contacts, MotionOutcome, Simulation, State, to_gap, to_lab
 
 DEFAULT_ACCURACY = 1e-9
 _ROUNDS_PER_CONTACT = 4

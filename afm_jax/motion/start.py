@@ -5,15 +5,14 @@ import math
 import numpy as np
 
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.scene import Scene, drive_of
+from afm_jax.checks import as_parameter
 from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
-from afm_jax.motion.drive_period import drive_of
 from afm_jax.motion.record import State
-from afm_jax.parameters import as_parameter
 
 _HIGHEST_ORDER = 200
 _NEWTON_STEPS = 30

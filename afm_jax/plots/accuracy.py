@@ -1,10 +1,17 @@
-"""The picture of an accuracy study: time of an impact against its achieved error."""
+"""The picture of an accuracy study: time of an impact against its achieved error.
+
+The picture of the accuracy study of collisions: time of an impact against its achieved error.
+
+The picture of a scene's accuracy study: time against error of its settings, and of ever fuller models.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure
 
 # Okabe and Ito's colours, distinguishable with every kind of colour vision.
 _STYLES = {
@@ -18,7 +25,7 @@ def accuracy_figure(rows: Sequence[Mapping[str, Any]], wanted_error_us: float) -
     """Return the figure: one panel a scene, both axes logarithmic; numbers beside points are tolerances in us.
 
     Args:
-        rows: of `afm_jax.study.accuracy.map_accuracy`.
+        rows: of `afm_jax.accuracy.impacts.map_accuracy`.
         wanted_error_us: marked by a line.
     """
     scenes = list(dict.fromkeys(row["scene"] for row in rows))
@@ -63,3 +70,135 @@ def _name_tolerances(axes: Axes, points: Sequence[Mapping[str, Any]], colour: st
             ha="left",
             rotation=25,
         )
+
+
+# Okabe and Ito's colours, distinguishable with every kind of colour vision.
+_COLOURS = {
+    "collide, diffrax": "#0072B2",
+    "collide, collocation": "#009E73",
+    "Tsit5": "#E69F00",
+    "Dopri5": "#CC79A7",
+    "Dopri8": "#000000",
+    "Kvaerno5": "#999999",
+    "SciPy DOP853": "#D55E00",
+    "SciPy LSODA": "#8B3A00",
+}
+_VARIABLES = {"gap": "the gap", "time": "time"}
+_ERRORS = {
+    "rebound_error": "largest relative error of the rebound speed",
+    "delay_error_us": "largest error of the delay (µs)",
+    "slope_error": "largest relative error of its derivatives",
+}
+
+
+def collide_accuracy_figure(rows: Sequence[Mapping[str, Any]]) -> Figure:
+    """Return the figure: a panel for each kind of error, a line for each method, variable and precision.
+
+    Errors above 1 (all of the rebound speed, a microsecond) are left out: no more than that they are wrong is known.
+    """
+    figure = new_figure(15.0, 5.8)
+    panels = figure.subplots(1, len(_ERRORS), sharey=True)
+    groups = dict.fromkeys((row["method"], row["variable"], row["precision"]) for row in rows)
+    for axes, (column, label) in zip(panels, _ERRORS.items(), strict=True):
+        for method, variable, precision in groups:
+            chosen = [
+                row
+                for row in rows
+                if (row["method"], row["variable"], row["precision"]) == (method, variable, precision)
+            ]
+            points = [
+                (row[column], row["microseconds_per_impact"]) for row in chosen if 0.0 < (row.get(column) or 0.0) <= 1.0
+            ]
+            if not points:
+                continue
+            colour = _COLOURS[method] if method in _COLOURS else _COLOURS[method.split(",")[0]]
+            own = method.startswith("collide")
+            style = ":" if variable == "time" else "--" if "fixed" in method else "-"
+            axes.plot(
+                *zip(*points, strict=True),
+                style,
+                marker="s" if precision == "float32" else "o",
+                markersize=7 if own else 4,
+                linewidth=2.0 if own else 1.2,
+                color=colour,
+                alpha=0.5 if precision == "float32" else 1.0,
+                label=f"{method}, in {_VARIABLES[variable]}" + (", float32" if precision == "float32" else ""),
+            )
+        axes.set(xscale="log", yscale="log")
+        axes.invert_xaxis()
+        axes.grid(color=GRID, alpha=0.25)
+        label_axes(axes, x=label, y="time of an impact (µs), one core" if axes is panels[0] else "")
+    handles, labels = panels[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside right center", fontsize=9)
+    return figure
+
+
+_WAYS = {"quick": (BLUE, "o"), "careful": (ACCENT, "s"), "map": (BLUE, "o")}
+_SMALLEST = 1e-17
+"""Errors of exactly 0 have no place on a logarithmic axis; they are left out."""
+
+
+def scene_accuracy_figure(result: Mapping[str, Any]) -> Figure:
+    """Return the figure: errors of the last arrival and of the peak for every setting, and the fidelity ladder.
+
+    Args:
+        result: of `contact_accuracy` or `law_accuracy`, with the `ladder` and `model_reference` of `fidelity_ladder`.
+    """
+    figure = new_figure(16.0, 5.4)
+    first, second, third = figure.subplots(1, 3)
+    contacts, rows = result["contacts"], result["rows"]
+    _settings(first, rows, "arrival_error_us", result["reference_error_us"])
+    label_axes(
+        first, x=f"error of the arrival of contact {contacts} (us)", y="time of a contact (us), one core, one tip"
+    )
+    _settings(second, rows, "peak_error_nm", result["reference_error_nm"])
+    label_axes(second, x="error of the largest height (nm)", y="")
+    _ladder(third, result["ladder"])
+    label_axes(third, x=f"error of the amplitude against the {result['model_reference']} (relative)", y="time (s)")
+    handles, labels = first.get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
+    return figure
+
+
+def _settings(axes: Axes, rows: Sequence[Mapping[str, Any]], column: str, own: float | None) -> None:
+    axes.set(xscale="log", yscale="log")
+    for way in dict.fromkeys(row["way"] for row in rows):
+        points = [row for row in rows if row["way"] == way and (row.get(column) or 0.0) > _SMALLEST]
+        colour, marker = _WAYS[way]
+        at = [(row[column], row["microseconds_per_contact"]) for row in points]
+        if at:
+            axes.plot(*zip(*at, strict=True), marker, color=colour, label=way)
+        for number, (row, place) in enumerate(zip(points, at, strict=True)):
+            _name(axes, row["setting"], place, colour, above=number % 2 == 0)
+    if own:
+        axes.axvline(own, color=DARK, linestyle=":", linewidth=1.2, label="error of the reference")
+    axes.margins(0.25)
+    axes.grid(color=GRID, alpha=0.25)
+
+
+def _ladder(axes: Axes, ladder: Sequence[Mapping[str, Any]]) -> None:
+    axes.set(xscale="log", yscale="log")
+    known = [row for row in ladder if (row.get("model_error") or 0.0) > _SMALLEST]
+    for number, row in enumerate(known):
+        place = (row["model_error"], row["seconds"])
+        axes.plot(*place, "D", color=BLUE if "delay" in row["model"] else ACCENT)
+        _name(axes, row["model"], place, DARK, above=number % 2 == 0)
+    true = ladder[-1]
+    if true["seconds"] is not None:
+        axes.axhline(true["seconds"], color=DARK, linestyle=":", linewidth=1.2)
+        axes.text(0.02, true["seconds"], true["model"], transform=axes.get_yaxis_transform(), va="bottom", fontsize=9)
+    axes.margins(0.35)
+    axes.grid(color=GRID, alpha=0.25)
+
+
+def _name(axes: Axes, text: str, place: tuple[float, float], colour: str, *, above: bool) -> None:
+    axes.annotate(
+        text,
+        place,
+        xytext=(0, 8 if above else -8),
+        textcoords="offset points",
+        ha="center",
+        va="bottom" if above else "top",
+        fontsize=8,
+        color=colour,
+    )

@@ -15,7 +15,7 @@ def draw_collisions(
     """Draw rebound speed above and delay below, with u_out = u_in, the capture speed, and captured tips on the axis.
 
     Args:
-        rows: of `afm_jax.study.collisions.Collisions`.
+        rows: of `afm_jax.contact.collide.Collisions`.
         capture_speed_nm_per_us: drawn as a line; None: there is none.
         path: PNG file.
         title: of the picture.

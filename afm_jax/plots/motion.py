@@ -7,11 +7,10 @@ import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 
-from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.scene import Drive, Scene, drive_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import find_junction
 from afm_jax.contact.phases import Phase
-from afm_jax.motion.drive_period import Drive, drive_of
 from afm_jax.motion.observe import peaks_between_contacts, poincare_section
 from afm_jax.motion.record import ContactKind, Contacts, Simulation
 from afm_jax.motion.settle import Settled, settled, window_of

@@ -21,7 +21,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
-from fitting.table import AmplitudeTable, write_table
+from fitting.tables.table import AmplitudeTable, write_table
 
 TRUTH = {"r": 0.95, "epsilon": 60.0}
 FREE_FREQUENCY_KHZ = 90.0

@@ -16,9 +16,8 @@ import jax
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.contact.contact import Contact
-from fitting.simulated.simulated_experiment import SimulatedExperiment, drives_of, simulate_experiment
-from fitting.simulated.simulated_motion import Drives, Report
-from fitting.table import write_table
+from fitting.simulated.experiment import Drives, Report, SimulatedExperiment, drives_of, simulate_experiment
+from fitting.tables.table import write_table
 
 FREE_FREQUENCY_KHZ = 90.0
 QUALITY_FACTOR = 40.0

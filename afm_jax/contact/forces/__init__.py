@@ -3,28 +3,24 @@
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from afm_jax.contact.forces.capillary import Capillary
-    from afm_jax.contact.forces.core_repulsion import CoreRepulsion
     from afm_jax.contact.forces.force import DissipativeForce, ForceSum, StaticForce
     from afm_jax.contact.forces.jkr import Jkr
-    from afm_jax.contact.forces.liquid import Liquid
-    from afm_jax.contact.forces.structural import Structural
-    from afm_jax.contact.forces.van_der_waals import VanDerWaals
-    from afm_jax.contact.forces.viscous import Viscous
+    from afm_jax.contact.forces.liquid import Capillary, Liquid, Structural, Viscous
+    from afm_jax.contact.forces.solid import CoreRepulsion, VanDerWaals
 else:
     from afm_jax.lazy_names import import_name
 
     _HOMES = {
-        "Capillary": "afm_jax.contact.forces.capillary",
-        "CoreRepulsion": "afm_jax.contact.forces.core_repulsion",
+        "Capillary": "afm_jax.contact.forces.liquid",
+        "CoreRepulsion": "afm_jax.contact.forces.solid",
         "DissipativeForce": "afm_jax.contact.forces.force",
         "ForceSum": "afm_jax.contact.forces.force",
         "Jkr": "afm_jax.contact.forces.jkr",
         "Liquid": "afm_jax.contact.forces.liquid",
         "StaticForce": "afm_jax.contact.forces.force",
-        "Structural": "afm_jax.contact.forces.structural",
-        "VanDerWaals": "afm_jax.contact.forces.van_der_waals",
-        "Viscous": "afm_jax.contact.forces.viscous",
+        "Structural": "afm_jax.contact.forces.liquid",
+        "VanDerWaals": "afm_jax.contact.forces.solid",
+        "Viscous": "afm_jax.contact.forces.liquid",
     }
 
     def __getattr__(name):

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from afm_jax.parameters import as_argument, readable
+from afm_jax.checks import as_argument, readable
 
 
 class Force(eqx.Module):

@@ -11,7 +11,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from afm_jax.parameters import as_argument, as_parameter, check_parameter, readable
+from afm_jax.checks import as_argument, as_parameter, check_parameter, readable
 
 SLOPE = 2.0 * math.sqrt(6.0) / 3.0
 """The linear coefficient of the depth: Delta = s^4 - SLOPE s."""

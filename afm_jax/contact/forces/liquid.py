@@ -1,12 +1,20 @@
-"""The liquid of the bridge, and its radius of curvature in equilibrium with the humid air (eq. 11)."""
+"""The liquid of the bridge, and its radius of curvature in equilibrium with the humid air (eq. 11).
+
+The capillary attraction of a liquid bridge (eq. 10).
+
+The structural repulsion of a confined liquid, averaged over its oscillations (eq. 13).
+
+The viscous force of a liquid bridge that is squeezed or stretched (eq. 12).
+"""
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
-from afm_jax.parameters import as_parameter, check_parameter, is_traced, readable
-from afm_jax.units import GAS_CONSTANT_J_PER_MOL_K, NM_PER_CM3_PER_M2
+from afm_jax.checks import as_argument, as_parameter, check_parameter, is_traced, readable
+from afm_jax.contact.forces.force import DissipativeForce, StaticForce
+from afm_jax.units import GAS_CONSTANT_J_PER_MOL_K, NM_PER_CM3_PER_M2, NN_US_PER_NM2_PER_PA_S
 
 
 class Liquid(eqx.Module):
@@ -58,3 +66,122 @@ def check_meniscus(tip_radius_nm: Float[Array, "..."], liquid: Liquid) -> None:
         f"`relative_humidity` {humidity:g} gives a Kelvin radius of {length:.4g} nm, more than the tip radius of "
         f"{radius:g} nm: no meniscus fits under the tip; lower the humidity or take a larger `tip_radius_nm`"
     )
+
+
+class Capillary(StaticForce):
+    """F = -4 pi R gamma_l / (1 + D/2 r_K), eq. 10.
+
+    Args:
+        tip_radius_nm: R in nm.
+        liquid: gives gamma_l and r_K.
+
+    Raises:
+        ValueError: if the radius is not positive, or below the Kelvin radius (no such meniscus).
+    """
+
+    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=100.0)
+    liquid: Liquid = eqx.field(default_factory=Liquid)
+
+    def __check_init__(self):
+        check_parameter("tip_radius_nm", self.tip_radius_nm, "positive")
+        check_meniscus(self.tip_radius_nm, self.liquid)
+
+    @property
+    def pull_nn(self) -> Float[Array, "..."]:
+        """The attraction at gap 0, 4 pi R gamma_l, in nN."""
+        return 4.0 * jnp.pi * self.tip_radius_nm * self.liquid.surface_tension_n_per_m
+
+    def __call__(self, gap_nm: ArrayLike, gap_rate_nm_per_us: ArrayLike = 0.0) -> Float[Array, "..."]:
+        """Return the force in nN at a gap in nm; the rate does not matter."""
+        del gap_rate_nm_per_us
+        return -self.pull_nn / (1.0 + as_argument(gap_nm) / (2.0 * self.liquid.kelvin_radius_nm))
+
+    def coefficients(self) -> tuple[Float[Array, "..."], ...]:
+        """Return 8 pi R gamma_l r_K and 1/(2 r_K)."""
+        length = 2.0 * self.liquid.kelvin_radius_nm
+        return self.pull_nn * length, 1.0 / length
+
+    @staticmethod
+    def potential_of(coefficients: tuple[Float[Array, "..."], ...], gap: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return 8 pi R gamma_l r_K ln(1 + D/2 r_K) in aJ; 0 at contact."""
+        energy, rate = coefficients
+        return energy * jnp.log(1.0 + gap * rate)
+
+
+class Structural(StaticForce):
+    """F = A_0 tau exp(-(D - delta)/tau) (1 - exp(-a^2/(2 R tau))), a = R sin(arccos(1 - 2 r_K/R)), eq. 13.
+
+    Args:
+        amplitude_n_per_m: A_0 in N/m.
+        decay_nm: tau in nm.
+        offset_nm: delta in nm.
+        tip_radius_nm: R in nm.
+        liquid: gives r_K.
+
+    Raises:
+        ValueError: if a value is outside its range, or the Kelvin radius exceeds the tip's (no such meniscus).
+    """
+
+    amplitude_n_per_m: Float[Array, "..."] = eqx.field(converter=as_parameter, default=40.0)
+    decay_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.6)
+    offset_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.6)
+    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=100.0)
+    liquid: Liquid = eqx.field(default_factory=Liquid)
+
+    def __check_init__(self):
+        check_parameter("amplitude_n_per_m", self.amplitude_n_per_m, "not negative")
+        check_parameter("decay_nm", self.decay_nm, "positive")
+        check_parameter("offset_nm", self.offset_nm, "finite")
+        check_parameter("tip_radius_nm", self.tip_radius_nm, "positive")
+        check_meniscus(self.tip_radius_nm, self.liquid)
+
+    @property
+    def strength_nn(self) -> Float[Array, "..."]:
+        """The force at gap 0, in nN: A_0 tau exp(delta/tau) times the share of the meniscus."""
+        # a^2 = R^2 (1 - (1 - 2 r_K/R)^2) = 4 r_K (R - r_K)
+        kelvin = self.liquid.kelvin_radius_nm
+        share = -jnp.expm1(-2.0 * kelvin * (1.0 - kelvin / self.tip_radius_nm) / self.decay_nm)
+        return self.amplitude_n_per_m * self.decay_nm * jnp.exp(self.offset_nm / self.decay_nm) * share
+
+    def __call__(self, gap_nm: ArrayLike, gap_rate_nm_per_us: ArrayLike = 0.0) -> Float[Array, "..."]:
+        """Return the force in nN at a gap in nm; the rate does not matter."""
+        del gap_rate_nm_per_us
+        return self.strength_nn * jnp.exp(-as_argument(gap_nm) / self.decay_nm)
+
+    def coefficients(self) -> tuple[Float[Array, "..."], ...]:
+        """Return tau times the force at gap 0, and -1/tau."""
+        return self.decay_nm * self.strength_nn, -1.0 / self.decay_nm
+
+    @staticmethod
+    def potential_of(coefficients: tuple[Float[Array, "..."], ...], gap: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return tau F in aJ; 0 far away."""
+        energy, rate = coefficients
+        return energy * jnp.exp(gap * rate)
+
+
+class Viscous(DissipativeForce):
+    """F = -(3 pi/2) eta R^2 (dD/dt) / D, eq. 12.
+
+    Args:
+        viscosity_pa_s: eta in Pa s.
+        tip_radius_nm: R in nm.
+
+    Raises:
+        ValueError: if the viscosity is negative or the radius not positive.
+    """
+
+    viscosity_pa_s: Float[Array, "..."] = eqx.field(converter=as_parameter, default=1.005e-3)
+    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=100.0)
+
+    def __check_init__(self):
+        check_parameter("viscosity_pa_s", self.viscosity_pa_s, "not negative")
+        check_parameter("tip_radius_nm", self.tip_radius_nm, "positive")
+
+    def coefficients(self) -> tuple[Float[Array, "..."], ...]:
+        """Return (3 pi/2) eta R^2 in nN us."""
+        return (1.5 * jnp.pi * self.viscosity_pa_s * NN_US_PER_NM2_PER_PA_S * self.tip_radius_nm**2,)
+
+    @staticmethod
+    def damping_of(coefficients: tuple[Float[Array, "..."], ...], gap: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return (3 pi/2) eta R^2 / D in nN us/nm."""
+        return coefficients[0] / gap

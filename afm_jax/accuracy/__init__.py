@@ -1,0 +1,1 @@
+"""What a digit costs: error against computing time of impacts, collisions and scenes."""

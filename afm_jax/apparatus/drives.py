@@ -1,0 +1,141 @@
+"""One cosine of a drive: what a platform, a base or a force does at one frequency.
+
+What drives the tip besides the sample: the cantilever's base that moves, or a force on the tip.
+
+With both, eq. 16 reads m z'' + (m Omega/Q) z' + k z = F(D, D') + f(t) + k z_b(t): the base acts through the spring,
+the air damps the motion in the lab. What a detector sees of a tip on a moving base is the deflection z - z_b.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from afm_jax.apparatus.trigonometry import sine_cosine
+from afm_jax.checks import as_argument, as_parameter, check_parameter, readable
+from afm_jax.units import RAD_PER_US_PER_KHZ
+
+
+class Tone(eqx.Module):
+    """A cosine amplitude cos(omega t + phase); what it is the amplitude of, its use says.
+
+    Args:
+        amplitude: in nm of a motion, in nN of a force.
+        frequency_khz: omega / 2 pi.
+        phase_deg: phase at time 0.
+
+    Raises:
+        ValueError: if the frequency is not positive, the amplitude negative or the phase not finite.
+    """
+
+    amplitude: Float[Array, "..."] = eqx.field(converter=as_parameter)
+    frequency_khz: Float[Array, "..."] = eqx.field(converter=as_parameter)
+    phase_deg: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.0)
+
+    __repr__ = readable
+
+    def __check_init__(self):
+        check_parameter("amplitude", self.amplitude, "not negative")
+        check_parameter("frequency_khz", self.frequency_khz, "positive")
+        check_parameter("phase_deg", self.phase_deg, "finite")
+
+    @property
+    def angular_frequency(self) -> Float[Array, "..."]:
+        """Omega of the tone in rad/us."""
+        return RAD_PER_US_PER_KHZ * self.frequency_khz
+
+    @property
+    def phase_rad(self) -> Float[Array, "..."]:
+        """Phase at time 0 in rad."""
+        return jnp.deg2rad(self.phase_deg)
+
+    def value_and_rate(self, time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Return the cosine at a time in us, in the amplitude's unit, and its rate per us."""
+        sine, cosine = sine_cosine(self.angular_frequency * as_argument(time_us) + self.phase_rad)
+        return self.amplitude * cosine, -self.amplitude * self.angular_frequency * sine
+
+
+class BaseDrive(eqx.Module):
+    """A base of the cantilever that moves as z_b(t) = amplitude cos(omega t + phase) [+ second].
+
+    Args:
+        amplitude_nm: amplitude of the motion.
+        frequency_khz: omega / 2 pi.
+        phase_deg: phase at time 0, when a platform's own cosine is highest.
+        second: a second frequency, its amplitude in nm; None leaves it out of the program.
+
+    Raises:
+        ValueError: if the frequency is not positive, the amplitude negative or the phase not finite.
+    """
+
+    amplitude_nm: Float[Array, "..."] = eqx.field(converter=as_parameter)
+    frequency_khz: Float[Array, "..."] = eqx.field(converter=as_parameter)
+    phase_deg: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.0)
+    second: Tone | None = None
+
+    __repr__ = readable
+
+    def __check_init__(self):
+        _check(self, "amplitude_nm")
+
+    @property
+    def tones(self) -> tuple[Tone, ...]:
+        """The motion's cosines, amplitudes in nm."""
+        return _tones(self, self.amplitude_nm)
+
+    def position_and_velocity(self, time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Return z_b in nm and its rate in nm/us at a time in us."""
+        return _sum_of_tones(self.tones, time_us)
+
+
+class ForceDrive(eqx.Module):
+    """A force on the tip of f(t) = amplitude cos(omega t + phase) [+ second], upward where positive.
+
+    Args:
+        amplitude_nn: amplitude in nN.
+        frequency_khz: omega / 2 pi.
+        phase_deg: phase at time 0, when a platform's own cosine is highest.
+        second: a second frequency, its amplitude in nN; None leaves it out of the program.
+
+    Raises:
+        ValueError: if the frequency is not positive, the amplitude negative or the phase not finite.
+    """
+
+    amplitude_nn: Float[Array, "..."] = eqx.field(converter=as_parameter)
+    frequency_khz: Float[Array, "..."] = eqx.field(converter=as_parameter)
+    phase_deg: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.0)
+    second: Tone | None = None
+
+    __repr__ = readable
+
+    def __check_init__(self):
+        _check(self, "amplitude_nn")
+
+    @property
+    def tones(self) -> tuple[Tone, ...]:
+        """The force's cosines, amplitudes in nN."""
+        return _tones(self, self.amplitude_nn)
+
+    def force(self, time_us: ArrayLike) -> Float[Array, "..."]:
+        """Return f in nN at a time in us."""
+        return _sum_of_tones(self.tones, time_us)[0]
+
+
+def _check(drive: BaseDrive | ForceDrive, amplitude: str) -> None:
+    """Check the parameters of a drive whose amplitude has this name."""
+    check_parameter(amplitude, getattr(drive, amplitude), "not negative")
+    check_parameter("frequency_khz", drive.frequency_khz, "positive")
+    check_parameter("phase_deg", drive.phase_deg, "finite")
+
+
+def _tones(drive: BaseDrive | ForceDrive, amplitude: Float[Array, "..."]) -> tuple[Tone, ...]:
+    first = Tone(amplitude, drive.frequency_khz, drive.phase_deg)
+    return (first,) if drive.second is None else (first, drive.second)
+
+
+def _sum_of_tones(tones: tuple[Tone, ...], time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    time = as_argument(time_us)
+    value, rate = tones[0].value_and_rate(time)
+    for tone in tones[1:]:
+        more, faster = tone.value_and_rate(time)
+        value, rate = value + more, rate + faster
+    return value, rate

@@ -1,0 +1,1 @@
+"""Timings on fixed problems, SciPy beside them."""

@@ -1,0 +1,204 @@
+"""Collisions per second through the contact: settings, parameters per tip, derivatives, effects, SciPy."""
+
+import resource
+import sys
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from afm_jax.bench.scipy_contacts import scipy_collision
+from afm_jax.bench.timing import compiled_for, progress, time_compiled
+from afm_jax.contact.collide import Collision, batch_of, collide
+from afm_jax.contact.contact import EFFECTS, Contact
+from afm_jax.contact.settings import SETTINGS, Setting
+
+Row = dict[str, Any]
+
+SPEEDS_NM_PER_US = (12.0, 200.0)
+REFERENCE = Setting("collocation", 40, 40, 48, sweeps=14)
+"""Converged to rounding; the tests compare it with 20 digits to 1e-12."""
+COARSER_REFERENCE = Setting("collocation", 32, 32, 40, sweeps=12)
+
+
+def speeds_of(batch: int) -> Float[Array, " batch"]:
+    """Return the benchmark's approach speeds in nm/us."""
+    return jnp.linspace(*SPEEDS_NM_PER_US, batch)
+
+
+def errors_against(result: Collision, reference: Collision) -> tuple[float, float]:
+    """Return the largest relative error of the rebound speed and the largest error of the delay in us."""
+    rebound = np.asarray(result.rebound_speed_nm_per_us, float) / np.asarray(reference.rebound_speed_nm_per_us) - 1.0
+    delay = np.asarray(result.collision_delay_us, float) - np.asarray(reference.collision_delay_us)
+    return float(np.max(np.abs(rebound))), float(np.max(np.abs(delay)))
+
+
+def contact_one_core(*, batch: int, repetitions: int, many: int, scipy_speeds: Sequence[float]) -> dict[str, Any]:
+    """Measure everything of the contact benchmark; to be run in a process of its own.
+
+    Args:
+        batch: how many speeds at once.
+        repetitions: of each measurement.
+        many: how many speeds in the one large call.
+        scipy_speeds: approach speeds of SciPy's tips.
+
+    Returns:
+        `rows` with what, batch, microseconds_per_impact, compile_s, rebound_error (relative), delay_error_us,
+        ratio_to_plain, flops, instructions, memory_mib; `reference_error`.
+    """
+    contact, speeds = Contact.paper(), speeds_of(batch)
+    reference, coarser = (batch_of(contact, 1.0, speeds, setting) for setting in (REFERENCE, COARSER_REFERENCE))
+    rows = []
+    for method, settings in SETTINGS.items():
+        for accuracy in settings:
+            name = f"{method}, accuracy {accuracy:g}"
+            row, result = _timed(name, _runner(method, accuracy), (contact, speeds), repetitions)
+            rebound, delay = errors_against(result, reference)
+            rows.append(row | {"rebound_error": rebound, "delay_error_us": delay})
+    plain = {row["what"]: row["microseconds_per_impact"] for row in rows}
+    for accuracy in (1e-6, 1e-9):
+        base = plain[f"diffrax, accuracy {accuracy:g}"]
+        rows += [
+            row | {"ratio_to_plain": row["microseconds_per_impact"] / base}
+            for row in _variants(accuracy, speeds, repetitions)
+        ]
+    rows += _effects(speeds, repetitions)
+    rows.append(_many(many))
+    rows += _scipy(contact, scipy_speeds)
+    return {"rows": rows, "reference_error": max(errors_against(coarser, reference))}
+
+
+def _runner(method: str, accuracy: float) -> Callable[[Contact, Array], Collision]:
+    setting = SETTINGS[method][accuracy]
+    return lambda contact, speeds: batch_of(contact, 1.0, speeds, setting)
+
+
+def _timed(what: str, function: Callable[..., Any], arguments: tuple[Any, ...], repetitions: int) -> tuple[Row, Any]:
+    progress(f"bench: contact, {what}")
+    compiled = compiled_for(function, *arguments)
+    timing, result = time_compiled(compiled, *arguments, repetitions=repetitions)
+    batch = arguments[-1].shape[0]
+    row = {
+        "what": what,
+        "batch": batch,
+        "microseconds_per_impact": 1e6 * timing.best_s / batch,
+        "median_microseconds_per_impact": 1e6 * timing.median_s / batch,
+        "compile_s": timing.compile_s,
+    }
+    return row, result
+
+
+def _variants(accuracy: float, speeds: Float[Array, " batch"], repetitions: int) -> list[Row]:
+    """Measure parameters that differ from tip to tip, and derivatives."""
+    run = _runner("diffrax", accuracy)
+    contact = Contact.paper()
+    share = jnp.linspace(0.8, 1.2, speeds.shape[0])
+    varied = Contact.paper(
+        relative_humidity=0.5 * share, viscosity_pa_s=1.005e-3 * share, adhesion_energy_j_per_m2=0.3 * share[::-1]
+    )
+
+    def outputs(contact, speeds):
+        result = run(contact, speeds)
+        return result.rebound_speed_nm_per_us, result.collision_delay_us
+
+    def forward(contact, speeds):
+        return jax.jvp(lambda moved: outputs(moved, speeds), (contact,), (jax.tree.map(jnp.ones_like, contact),))[1]
+
+    def reverse(contact, speeds):
+        return jax.grad(lambda *at: sum(jnp.sum(part) for part in outputs(*at)), argnums=(0, 1))(contact, speeds)
+
+    # 5 nm/us faster: dry or sticky contacts among them capture a little above 12
+    cases: dict[str, tuple[Callable[..., Any], tuple[Any, Any]]] = {
+        "parameters of each tip its own": (outputs, (varied, speeds + 5.0)),
+        "one forward derivative": (forward, (contact, speeds)),
+        "reverse gradient by all parameters and speeds": (reverse, (contact, speeds)),
+    }
+    return [
+        _timed(f"{what}, accuracy {accuracy:g}", function, arguments, repetitions)[0]
+        for what, (function, arguments) in cases.items()
+    ]
+
+
+def _effects(speeds: Float[Array, " batch"], repetitions: int) -> list[Row]:
+    """Measure contacts without one of their effects: time, and size of the compiled program."""
+    rows = []
+    for missing in (None, "structural", "viscous"):
+        contact = Contact.paper(effects=tuple(name for name in EFFECTS if name != missing))
+        run = _runner("diffrax", 1e-9)
+        row, _ = _timed("all effects" if missing is None else f"without {missing}", run, (contact, speeds), repetitions)
+        compiled = jax.jit(run).lower(contact, speeds[:64]).compile()
+        cost = compiled.cost_analysis() or {}
+        text = compiled.as_text() or ""
+        rows.append(row | {"flops": cost.get("flops"), "instructions": text.count(" = ")})
+    return rows
+
+
+def _many(count: int) -> Row:
+    """Measure one large call, and how much memory it takes beyond its arguments and results."""
+    contact, speeds = Contact.paper(), speeds_of(count)
+    run = compiled_for(_runner("diffrax", 1e-9), contact, speeds)
+    scratch = getattr(run.run, "memory_analysis", lambda: None)()
+    timing, result = time_compiled(run, contact, speeds, repetitions=1)
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (2**20 if sys.platform == "darwin" else 2**10)
+    return {
+        "what": "one call with many speeds, accuracy 1e-09",
+        "batch": count,
+        "microseconds_per_impact": 1e6 * timing.best_s / count,
+        "compile_s": timing.compile_s,
+        "memory_mib": scratch.temp_size_in_bytes / 2**20 if scratch is not None else None,
+        "results_mib": sum(part.nbytes for part in result) / 2**20,
+        "peak_process_mib": peak,
+    }
+
+
+def _scipy(contact: Contact, speeds: Sequence[float]) -> list[Row]:
+    reference = collide(contact, jnp.asarray(speeds), accuracy=1e-11)
+    rows = []
+    for method, rtol in (("DOP853", 1e-6), ("DOP853", 1e-9), ("LSODA", 1e-9)):
+        progress(f"bench: contact, SciPy {method} {rtol:g}")
+        runs = [scipy_collision(contact, speed, method=method, rtol=rtol) for speed in speeds]
+        found = np.array([run[:2] for run in runs])
+        rows.append(
+            {
+                "what": f"SciPy {method} with events, rtol {rtol:g}",
+                "batch": 1,
+                "microseconds_per_impact": 1e6 * float(np.mean([run.seconds for run in runs])),
+                "evaluations_per_impact": float(np.mean([run.evaluations for run in runs])),
+                "rebound_error": float(np.max(np.abs(found[:, 0] / np.asarray(reference.rebound_speed_nm_per_us) - 1))),
+                "delay_error_us": float(np.max(np.abs(found[:, 1] - np.asarray(reference.collision_delay_us)))),
+            }
+        )
+    return rows
+
+
+def aims(rows: Sequence[Row]) -> list[tuple[str, float | None, float]]:
+    """Return what was aimed at: name, reached (None if not measured), largest allowed."""
+    by_name = {row["what"]: row for row in rows}
+
+    def of(what: str, column: str) -> float | None:
+        return by_name.get(what, {}).get(column)
+
+    return [
+        ("contact, us an impact at 1e-6", of("diffrax, accuracy 1e-06", "microseconds_per_impact"), 1.5),
+        ("contact, error of u_out at the 1e-6 setting", of("diffrax, accuracy 1e-06", "rebound_error"), 1e-6),
+        ("contact, us an impact at 1e-9", of("diffrax, accuracy 1e-09", "microseconds_per_impact"), 3.0),
+        ("contact, error of u_out at the 1e-9 setting", of("diffrax, accuracy 1e-09", "rebound_error"), 1e-9),
+        (
+            "contact, own parameters, plain runs",
+            of("parameters of each tip its own, accuracy 1e-09", "ratio_to_plain"),
+            2.0,
+        ),
+        (
+            "contact, forward derivative, plain runs",
+            of("one forward derivative, accuracy 1e-09", "ratio_to_plain"),
+            3.0,
+        ),
+        (
+            "contact, reverse gradient, plain runs",
+            of("reverse gradient by all parameters and speeds, accuracy 1e-09", "ratio_to_plain"),
+            6.0,
+        ),
+    ]

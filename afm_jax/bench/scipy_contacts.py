@@ -1,0 +1,279 @@
+"""SciPy's `solve_ivp` with events on one collision, phase by phase in time: the baseline of the contact benchmark.
+
+SciPy's `solve_ivp` with events through one driven contact, phase by phase in time: the baseline of the benchmark.
+"""
+
+import math
+import time
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from scipy.integrate import solve_ivp
+
+from afm_jax.apparatus.scene import Scene
+from afm_jax.bench.problems import SingleContacts
+from afm_jax.bench.timing import progress
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.forces import jkr
+from afm_jax.contact.forces.liquid import Capillary, Structural, Viscous
+from afm_jax.contact.forces.solid import CoreRepulsion
+from afm_jax.contact.junction import find_junction
+from afm_jax.motion.record import ContactKind, Simulation
+
+_LONGEST_US = 50.0
+"""No phase of a tip that leaves lasts as long."""
+_junction_of, _root_of_depth = jax.jit(find_junction), jax.jit(jkr.root_of_depth)
+
+
+class ScipyCollision(NamedTuple):
+    """What SciPy finds, and what that took."""
+
+    rebound_speed_nm_per_us: float
+    collision_delay_us: float
+    seconds: float
+    evaluations: int
+
+
+class _ContactNumbers(NamedTuple):
+    """The paper's contact as Python floats: SciPy calls the force thousands of times."""
+
+    pull: float
+    width: float
+    structural: float
+    decay: float
+    core: float
+    drag: float
+    load: float
+    depth: float
+    shift: float
+    forms: float
+    snap_on: float
+    snap_off: float
+    breaks: float
+
+
+def scipy_collision(contact: Contact, approach_speed_nm_per_us: float, *, method: str, rtol: float) -> ScipyCollision:
+    """Follow one tip of 1 ng through the paper's forces in time.
+
+    The junction is followed in s = sqrt(A), in which the fold is no singularity of the force.
+
+    Args:
+        contact: the paper's contact, all effects present.
+        approach_speed_nm_per_us: fast enough for the tip to leave.
+        method: of `solve_ivp`.
+        rtol: relative tolerance; the absolute one is a thousandth of it.
+
+    Raises:
+        ValueError: if the tip does not leave or SciPy gives up.
+    """
+    numbers = _numbers(contact)
+    on = float(_root_of_depth((numbers.shift - numbers.snap_on) / numbers.depth))
+    began = time.perf_counter()
+    count = 0
+
+    def phase(rates: Any, state: list[float], event: Any) -> tuple[float, np.ndarray]:
+        nonlocal count
+        vars(event)["terminal"] = True
+        path = solve_ivp(rates, (0.0, _LONGEST_US), state, method=method, rtol=rtol, atol=1e-3 * rtol, events=event)
+        count += path.nfev
+        if path.status != 1:
+            raise ValueError(f"at {approach_speed_nm_per_us:g} nm/us SciPy ended without an event: {path.message}")
+        return float(path.t_events[0][0]), path.y_events[0][0]
+
+    def in_bridge(_: float, state: np.ndarray) -> list[float]:
+        return [state[1], _bridge_force(numbers, state[0], state[1])]
+
+    def in_junction(_: float, state: np.ndarray) -> list[float]:
+        # state: s, dD/dt, in the time t' with dt = -Delta'(s) dt': smooth through the fold
+        s, rate = state[0], state[1]
+        slope = 4.0 * s**3 - jkr.SLOPE
+        load = numbers.load * s**3 * (s**3 - np.sqrt(6.0))
+        return [-rate / numbers.depth, load * slope, slope]
+
+    first, (_, fast) = phase(in_bridge, [numbers.forms, -approach_speed_nm_per_us], lambda _, y: y[0] - numbers.snap_on)
+    _, (_, back, second) = phase(in_junction, [on, fast, 0.0], lambda _, y: y[0] - jkr.FOLD)
+    third, (_, rebound) = phase(in_bridge, [numbers.snap_off, back], lambda _, y: y[0] - numbers.breaks)
+    delay = first + second + third - numbers.forms / approach_speed_nm_per_us - numbers.breaks / rebound
+    return ScipyCollision(float(rebound), float(delay), time.perf_counter() - began, count)
+
+
+def _numbers(contact: Contact) -> _ContactNumbers:
+    terms: dict[type, Any] = {type(term): term for term in contact.forces.terms}
+    junction, solid = _junction_of(contact), contact.junction
+    capillary, structural = terms[Capillary], terms[Structural]
+    values = (
+        capillary.pull_nn,
+        2.0 * capillary.liquid.kelvin_radius_nm,
+        structural.strength_nn,
+        structural.decay_nm,
+        terms[CoreRepulsion](1.0),
+        terms[Viscous].coefficients()[0],
+        solid.load_scale_nn,
+        solid.depth_scale_nm,
+        junction.shift_nm,
+        contact.bridge_forms_nm,
+        junction.forms_gap_nm,
+        junction.breaks_gap_nm,
+        contact.bridge_breaks_nm,
+    )
+    return _ContactNumbers(*(float(value) for value in values))
+
+
+def _bridge_force(numbers: _ContactNumbers, gap: float, rate: float) -> float:
+    # a trial step may overshoot the junction; the forces have no value at contact
+    gap = max(gap, 0.5 * numbers.snap_on)
+    static = -numbers.pull / (1.0 + gap / numbers.width) + numbers.structural * np.exp(-gap / numbers.decay)
+    return static + numbers.core / gap**8 - numbers.drag * rate / gap
+
+
+_LONGEST_CONTACT_US = 50.0
+"""No phase of a tip that leaves lasts as long."""
+_MOST_PHASES = 100
+
+
+class ScipyContact(NamedTuple):
+    """What SciPy finds, and what that took."""
+
+    departure_time_us: float
+    rebound_speed_nm_per_us: float
+    junctions: int
+    seconds: float
+    evaluations: int
+
+
+class _Drive(NamedTuple):
+    """Cantilever and platform as Python floats."""
+
+    stiffness: float
+    friction: float
+    amplitude: float
+    omega: float
+    offset: float
+    rate: float
+    inverse_mass: float
+
+    def acceleration(self, time_us: float, gap: float, rate: float, force: float) -> float:
+        """Return the gap's acceleration in nm/us^2 under a contact force in nN (eq. 16)."""
+        cosine, sine = math.cos(self.omega * time_us), math.sin(self.omega * time_us)
+        height = self.offset + self.rate * time_us + self.amplitude * cosine
+        speed = self.rate - self.amplitude * self.omega * sine
+        pull = self.stiffness * (gap + height) + self.friction * (rate + speed)
+        return force * self.inverse_mass - pull + self.amplitude * self.omega**2 * cosine
+
+
+def scipy_driven_contact(
+    scene: Scene, arrival_time_us: float, approach_speed_nm_per_us: float, *, rtol: float, method: str = "DOP853"
+) -> ScipyContact:
+    """Follow one tip from the bridge's formation to its end, with as many turns and junctions as it takes.
+
+    The junction is followed in s = sqrt(A), in which the fold is no singularity of the force. The flight before the
+    contact is not part of it.
+
+    Args:
+        scene: driven by one cosine of its platform, with the paper's contact, all effects present.
+        arrival_time_us: when the bridge forms.
+        approach_speed_nm_per_us: relative to the platform.
+        rtol: relative tolerance; the absolute one is a thousandth of it.
+        method: of `solve_ivp`.
+
+    Raises:
+        ValueError: if the tip does not leave or SciPy gives up.
+    """
+    numbers, drive = _numbers(scene.interaction), _drive_of(scene)
+    began = time.perf_counter()
+    count = 0
+
+    def phase(rates: Any, start_us: float, state: list[float], events: list[Any]) -> tuple[int, float, Any]:
+        nonlocal count
+        for event in events:
+            vars(event)["terminal"] = True
+        span = (start_us, start_us + _LONGEST_CONTACT_US)
+        path = solve_ivp(rates, span, state, method=method, rtol=rtol, atol=1e-3 * rtol, events=events)
+        count += path.nfev
+        if path.status != 1:
+            raise ValueError(f"at {arrival_time_us:g} us SciPy ended without an event: {path.message}")
+        met = next(place for place, times in enumerate(path.t_events) if len(times))
+        return met, float(path.t_events[met][0]), path.y_events[met][0]
+
+    def in_bridge(now: float, state: np.ndarray) -> list[float]:
+        force = _bridge_force(numbers, state[0], state[1])
+        return [state[1], drive.acceleration(now, state[0], state[1], force)]
+
+    def in_junction(_: float, state: np.ndarray) -> list[float]:
+        # state: s, dD/dt, t, in the fictitious time theta with dt = Delta'(s) dtheta: smooth through the fold
+        s, rate, now = state
+        slope = numbers.depth * (4.0 * s**3 - jkr.SLOPE)
+        gap = numbers.shift - numbers.depth * (s**4 - jkr.SLOPE * s)
+        load = numbers.load * s**3 * (s**3 - math.sqrt(6.0))
+        return [-rate, slope * drive.acceleration(now, gap, rate, load), slope]
+
+    events = [lambda _, y: y[0] - numbers.snap_on, lambda _, y: y[0] - numbers.breaks]
+    on = float(_root_of_depth((numbers.shift - numbers.snap_on) / numbers.depth))
+    now, gap, rate, junctions = arrival_time_us, numbers.forms, -approach_speed_nm_per_us, 0
+    for _ in range(_MOST_PHASES):
+        met, now, (_, rate) = phase(in_bridge, now, [gap, rate], events)
+        if met == 1:
+            return ScipyContact(now, float(rate), junctions, time.perf_counter() - began, count)
+        junctions += 1
+        _, _, (_, rate, now) = phase(in_junction, 0.0, [on, float(rate), now], [lambda _, y: y[0] - jkr.FOLD])
+        gap, rate, now = numbers.snap_off, float(rate), float(now)
+    raise ValueError(f"the tip that arrives at {arrival_time_us:g} us forms the junction {junctions} times: it is held")
+
+
+def scipy_rows(
+    name: str, scene: Scene, reference: Simulation, single: SingleContacts, count: int
+) -> list[dict[str, Any]]:
+    """Measure SciPy on a few single contacts, flights not included; half of them turn where some do.
+
+    Args:
+        name: what the scene is called in the rows.
+        scene: the scene.
+        reference: the contacts, each the first of its tip.
+        single: the same contacts, and which of them turn.
+        count: how many to follow.
+    """
+    contacts = reference.contacts
+    ended = np.asarray(contacts.kind)[:, 0] == ContactKind.IMPACT
+    groups = [np.flatnonzero(ended & ~single.turning), np.flatnonzero(ended & single.turning)]
+    half = count // 2 if groups[1].size else 0
+    tips = [*groups[0][: count - half], *groups[1][:half]]
+    rows = []
+    for rtol in (1e-6, 1e-9) if tips else ():
+        progress(f"bench: scenes, {name}, SciPy DOP853 {rtol:g}")
+        columns = (contacts.arrival_time_us, contacts.approach_speed_nm_per_us)
+        began = [tuple(float(column[tip, 0]) for column in columns) for tip in tips]
+        runs = [scipy_driven_contact(scene, *state, rtol=rtol) for state in began]
+        expected = [
+            np.asarray(column)[tips, 0] for column in (contacts.rebound_speed_nm_per_us, contacts.departure_time_us)
+        ]
+        rebound = np.abs(np.array([run.rebound_speed_nm_per_us for run in runs]) / expected[0] - 1.0)
+        left = np.abs(np.array([run.departure_time_us for run in runs]) - expected[1])
+        row: dict[str, Any] = {
+            "what": f"SciPy DOP853 with events, the contact alone, rtol {rtol:g}",
+            "scene": name,
+            "batch": 1,
+            "contacts": len(runs),
+            "microseconds_per_contact": 1e6 * float(np.median([run.seconds for run in runs])),
+            "evaluations_per_contact": float(np.mean([run.evaluations for run in runs])),
+        }
+        for part, chosen in (("straight", slice(0, count - half)), ("turning", slice(count - half, None))):
+            if rebound[chosen].size:
+                row[f"{part}_rebound_error_worst"] = float(rebound[chosen].max())
+                row[f"{part}_time_error_us_worst"] = float(left[chosen].max())
+        rows.append(row)
+    return rows
+
+
+def _drive_of(scene: Scene) -> _Drive:
+    cantilever, platform = scene.cantilever, scene.platform
+    values = (
+        cantilever.angular_frequency**2,
+        2.0 * cantilever.decay_rate,
+        platform.amplitude_nm,
+        platform.angular_frequency,
+        platform.offset_nm,
+        platform.offset_rate_nm_per_us,
+        1.0 / cantilever.mass_ng,
+    )
+    return _Drive(*(float(value) for value in values))

@@ -1,0 +1,274 @@
+"""Numbers on the command line: lists and ranges of them, whole numbers, shares, and values with their errors.
+
+The argument SCENE.toml|PRESET: a scene file, or one of the paper's scenes by its name.
+"""
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+if TYPE_CHECKING:
+    from afm_jax.apparatus.scene import Scene
+    from afm_jax.scenefile.scenefile import Start
+
+
+_MOST = 1_000_000
+
+
+class Numbers(click.ParamType):
+    """A comma list of numbers; each part a number or a range start:stop:step that holds the stop if it fits."""
+
+    name = "numbers"
+
+    def __init__(self, what: str = "number", *, positive: bool = True, example: str = "1,2,5"):
+        """Say what the numbers are, one of them in a word, and whether they must be positive."""
+        self.what, self.positive, self.example = what, positive, example
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, ...]:
+        """Return the numbers that a text says, in its order.
+
+        Raises:
+            click.BadParameter: if a part is no such number or range, or there is none.
+        """
+        if isinstance(value, tuple):
+            return value
+        try:
+            return parse_numbers(str(value), self.what, positive=self.positive)
+        except ValueError as error:
+            self.fail(f"{error}; write {self.example} or start:stop:step", param, ctx)
+
+
+class Orders(click.ParamType):
+    """A comma list of whole numbers and ranges of them, as `1-3,5`."""
+
+    name = "orders"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
+        """Return the orders that a text says.
+
+        Raises:
+            click.BadParameter: if a part is no positive whole number or range, or there is none.
+        """
+        if isinstance(value, tuple):
+            return value
+        try:
+            return parse_orders(str(value))
+        except ValueError as error:
+            self.fail(f"{error}; write 1,2 or 1-4", param, ctx)
+
+
+class Ends(click.ParamType):
+    """Two positive numbers, low:high."""
+
+    name = "range"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[float, float]:
+        """Return the two numbers.
+
+        Raises:
+            click.BadParameter: if it is no rising pair of positive numbers.
+        """
+        if isinstance(value, tuple):
+            return value
+        try:
+            return parse_ends(str(value))
+        except ValueError as error:
+            self.fail(f"{error}; write low:high, as 12:150", param, ctx)
+
+
+class Share(click.ParamType):
+    """A share between 0 and 100 %, neither of the two: `1%`, `1 %` or `0.01`."""
+
+    name = "share"
+
+    def __init__(self, what: str = "a share"):
+        """Say what it is a share of, in a few words of the message."""
+        self.what = what
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return the share that a text says, as a number between 0 and 1.
+
+        Raises:
+            click.BadParameter: if it is none.
+        """
+        try:
+            return parse_share(str(value))
+        except ValueError:
+            self.fail(f"must be {self.what} such as 1% or 0.01, above 0 and below 100 %, but is {value}", param, ctx)
+
+
+class ValueAndError(click.ParamType):
+    """A value with its standard error, as `40 +- 2`; without an error it is exact."""
+
+    name = "value"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[float, float | None]:
+        """Return the value and its error, None if exact.
+
+        Raises:
+            click.BadParameter: if it is no number, or the error is not positive.
+        """
+        if isinstance(value, tuple):
+            return value
+        try:
+            numbers = parse_around_plus_minus(str(value))
+        except ValueError as error:
+            self.fail(f"{error}; write 40 or '40 +- 2'", param, ctx)
+        if len(numbers) > 2 or (len(numbers) == 2 and numbers[1] <= 0.0):
+            self.fail(f"`{value}` is no value with a positive error; write '40 +- 2'", param, ctx)
+        return numbers[0], numbers[1] if len(numbers) == 2 else None
+
+
+def parse_numbers(text: str, what: str = "number", *, positive: bool = False) -> tuple[float, ...]:
+    """Return the numbers that a text lists.
+
+    >>> parse_numbers("-1,0,2:3:0.5")
+    (-1.0, 0.0, 2.0, 2.5, 3.0)
+
+    Args:
+        text: a comma list; each part a number or a range start:stop:step.
+        what: one of the numbers, in a word of the messages.
+        positive: whether they must be positive.
+
+    Raises:
+        ValueError: if it lists none, or a part is no such number or no rising range.
+    """
+    if not text.strip():
+        raise ValueError(f"names no {what}")
+    numbers: list[float] = []
+    for part in text.split(","):
+        numbers += _range(part, what, positive=positive) if ":" in part else [_number(part, what, positive=positive)]
+        if len(numbers) > _MOST:
+            raise ValueError(f"names more than {_MOST} {what}s")
+    return tuple(numbers)
+
+
+def parse_ends(text: str) -> tuple[float, float]:
+    """Return the two numbers of `low:high`.
+
+    >>> parse_ends("12:150")
+    (12.0, 150.0)
+
+    Raises:
+        ValueError: if it is no rising pair of positive numbers.
+    """
+    ends = text.split(":")
+    if len(ends) != 2:
+        raise ValueError(f"`{text.strip()}` is no range")
+    low, high = (_number(end, what, positive=True) for end, what in zip(ends, ("lower end", "upper end"), strict=True))
+    if high <= low:
+        raise ValueError(f"`{text.strip()}` does not rise")
+    return low, high
+
+
+def parse_orders(text: str) -> tuple[int, ...]:
+    """Return the whole numbers that a text lists.
+
+    >>> parse_orders("1-3,5")
+    (1, 2, 3, 5)
+
+    Raises:
+        ValueError: if a part is no positive whole number or rising range.
+    """
+    orders: list[int] = []
+    for part in text.split(","):
+        ends = [end.strip() for end in part.split("-")]
+        if len(ends) > 2 or not all(end.isascii() and end.isdigit() and 0 < len(end) < 4 for end in ends):
+            raise ValueError(f"`{part.strip()}` is no order")
+        low, high = int(ends[0]), int(ends[-1])
+        if low < 1 or high < low:
+            raise ValueError(f"`{part.strip()}` is no order")
+        orders += range(low, high + 1)
+    return tuple(dict.fromkeys(orders))
+
+
+def _range(part: str, what: str, *, positive: bool) -> list[float]:
+    ends = part.split(":")
+    if len(ends) != 3:
+        raise ValueError(f"`{part.strip()}` is no range")
+    start, stop = (_number(end, name, positive=positive) for end, name in zip(ends[:2], ("start", "stop"), strict=True))
+    step = _number(ends[2], "step", positive=True)
+    if stop < start:
+        raise ValueError(f"`{part.strip()}` ends below its start")
+    # a hair more than the quotient, so that rounding does not cost the stop
+    steps = (stop - start) / step * (1.0 + 1e-12) + 1e-9
+    if steps > _MOST:
+        raise ValueError(f"`{part.strip()}` has more than {_MOST} {what}s")
+    # rounded to what was meant: 0.97 + 3 * 0.01 is 1
+    return [float(f"{start + step * index:.12g}") for index in range(math.floor(steps) + 1)]
+
+
+def _number(text: str, what: str, *, positive: bool) -> float:
+    try:
+        number = parse_number(text)
+    except ValueError:
+        number = math.nan
+    if not (number > 0.0 if positive else math.isfinite(number)):
+        raise ValueError(f"the {what} `{text.strip()}` is not a {'positive ' if positive else ''}number")
+    return number
+
+
+def parse_around_plus_minus(text: str) -> list[float]:
+    """Return the numbers that a text has around +-, +/- or ±.
+
+    >>> parse_around_plus_minus("40 +- 2")
+    [40.0, 2.0]
+
+    Raises:
+        ValueError: if one of them is no finite number.
+    """
+    return [parse_number(part) for part in text.replace("±", "+-").replace("+/-", "+-").split("+-")]
+
+
+def parse_number(text: str) -> float:
+    """Return the number that a text says.
+
+    Raises:
+        ValueError: if it is no finite number.
+    """
+    try:
+        number = float(text)
+    except ValueError:
+        number = math.nan
+    if not math.isfinite(number):
+        raise ValueError(f"`{text.strip()}` is not a number")
+    return number
+
+
+def parse_share(text: str) -> float:
+    """Return the share that a text says.
+
+    >>> parse_share("1 %"), parse_share("0.01")
+    (0.01, 0.01)
+
+    Raises:
+        ValueError: if it is no number, or not between 0 and 100 %.
+    """
+    number, percent, rest = text.strip().partition("%")
+    share = parse_number(number) / (100.0 if percent else 1.0)
+    if rest or not 0.0 < share < 1.0:
+        raise ValueError(f"`{text.strip()}` is no share")
+    return share
+
+
+def scene_and_start(name: str) -> "tuple[Scene, Start | None]":
+    """Return the scene that an argument names, and the start that comes with it; None where it is to be chosen.
+
+    Args:
+        name: a path, or a name of `afm_jax.scenefile.presets.PRESETS` where there is no file of that name.
+
+    Raises:
+        ValueError: if there is neither such a file nor such a preset, or the file is no valid scene file.
+    """
+    from afm_jax.scenefile.presets import PRESETS, preset, preset_start  # noqa: PLC0415
+    from afm_jax.scenefile.scenefile import load_scene_and_start  # noqa: PLC0415
+
+    if Path(name).exists() or name.endswith(".toml") or len(Path(name).parts) > 1:
+        return load_scene_and_start(name)
+    if name not in PRESETS:
+        raise ValueError(f"{name}: there is no such file or preset; presets are {', '.join(PRESETS)}")
+    return preset(name), preset_start(name)

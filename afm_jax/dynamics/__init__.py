@@ -1,0 +1,1 @@
+"""Which orbits there are and which last, over planes and lines of parameters."""

@@ -1,0 +1,312 @@
+"""Where the orbits are: every root of the closing condition.
+
+Two finders. Without a delay the condition is a quartic, of which no root can be missed. With one it is scanned: every
+change of sign between neighbours of the scan, and every pair of roots that it stepped over, seen by the extremum
+between them.
+
+All real roots of a polynomial in an interval, none missed: between critical points a polynomial is monotone.
+
+The critical points are the roots of the derivative, found the same way, down to the quadratic with its formula.
+Vectorises over `vmap`; no eigenvalues of companion matrices, which need a CPU and lose half the digits at double roots.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from afm_jax.impact.closure import (
+    OrbitProblem,
+    Place,
+    close_map,
+    closing_residual,
+    closure,
+    instantaneous_quartic,
+    map_gaps,
+    place_of,
+)
+
+_MAX_STEPS = 200  # Newton needs about 10; bisection alone over the widest interval about 100
+_SETTLED = 1e-12  # the last relative step; Newton has squared it by then
+
+
+def real_roots(
+    coefficients: Float[Array, " n"], low: Float[Array, ""], high: Float[Array, ""]
+) -> tuple[Float[Array, " m"], Bool[Array, " m"]]:
+    """Return the real roots in [low, high] and which of them exist.
+
+    Args:
+        coefficients: highest power first, degree n - 1 >= 2; leading zeros are fine.
+        low: lower end.
+        high: upper end, not below `low`.
+
+    Returns:
+        m = n - 1 slots in ascending order: the root, or the slot's upper knot where it holds none; and the mask.
+    """
+    if coefficients.shape[0] == 3:
+        return _quadratic_roots(coefficients, low, high)
+    inner, _ = real_roots(_derivative(coefficients), low, high)
+    knots = jnp.concatenate([low[None], inner, high[None]])
+    return _monotone_roots(coefficients, knots[:-1], knots[1:])
+
+
+def evaluate(coefficients: Float[Array, " n"], x: Float[Array, " m"]) -> Float[Array, " m"]:
+    """Return the polynomial's values (Horner)."""
+    value = jnp.full_like(x, coefficients[0])
+    for index in range(1, coefficients.shape[0]):
+        value = value * x + coefficients[index]
+    return value
+
+
+def _derivative(coefficients: Float[Array, " n"]) -> Float[Array, " m"]:
+    return coefficients[:-1] * jnp.arange(coefficients.shape[0] - 1, 0, -1, dtype=coefficients.dtype)
+
+
+def _quadratic_roots(coefficients: Float[Array, " 3"], low, high):
+    """The formula without cancellation: the larger root by it, the other one by the product of both."""
+    a, b, c = coefficients
+    discriminant = b * b - 4.0 * a * c
+    real = discriminant >= 0.0
+    half = -0.5 * (b + jnp.where(b < 0.0, -1.0, 1.0) * jnp.sqrt(jnp.where(real, discriminant, 0.0)))
+    first = jnp.where(a != 0.0, half / jnp.where(a != 0.0, a, 1.0), high)
+    second = jnp.where(half != 0.0, c / jnp.where(half != 0.0, half, 1.0), first)
+    roots = jnp.sort(jnp.where(real, jnp.stack([first, second]), high))
+    exists = real & (roots >= low) & (roots <= high)
+    return jnp.clip(roots, low, high), exists & ((a != 0.0) | (roots == second))
+
+
+def _monotone_roots(coefficients, left: Float[Array, " m"], right: Float[Array, " m"]):
+    """Newton's method kept inside a shrinking bracket, on every interval at once."""
+    derivative = _derivative(coefficients)
+    value_left, value_right = evaluate(coefficients, left), evaluate(coefficients, right)
+    # A root on a knot belongs to the interval on its left; one on `low` itself to the first interval.
+    first = jnp.arange(left.shape[0]) == 0
+    found = (value_left * value_right < 0.0) | ((value_right == 0.0) & (left < right)) | (first & (value_left == 0.0))
+    rising = value_right > value_left
+
+    def unsettled(state):
+        step, _, _, x, move = state
+        return (step < _MAX_STEPS) & jnp.any(jnp.abs(move) > _SETTLED * jnp.abs(x))
+
+    def narrow(state):
+        step, a, b, x, move = state
+        value, slope = evaluate(coefficients, x), evaluate(derivative, x)
+        beyond = (value > 0.0) == rising
+        a, b = jnp.where(beyond, a, x), jnp.where(beyond, x, b)
+        newton = -value / jnp.where(slope != 0.0, slope, 1.0)
+        # Bisect where Newton would leave the bracket or shrinks its steps by less than half.
+        slow = jnp.abs(2.0 * value) > jnp.abs(move * slope)
+        trusted = (x + newton > a) & (x + newton < b) & ~slow & (slope != 0.0)
+        move = jnp.where(trusted, newton, 0.5 * (a + b) - x)
+        move = jnp.where(found & (value != 0.0), move, 0.0)
+        return step + 1, a, b, x + move, move
+
+    width = jnp.where(found, right - left, 0.0)
+    _, _, _, root, _ = lax.while_loop(unsettled, narrow, (0, left, right, 0.5 * (left + right), width))
+    root = jnp.where(first & (value_left == 0.0), left, jnp.where(value_right == 0.0, right, root))
+    return jnp.where(found, root, right), found
+
+
+_LEAVING = 0.4
+"""Share of the drive's period that a leaving tip may take to lose its energy: beyond, no law of impacts holds."""
+_REGULA_FALSI = 20
+_SECTIONS = 16
+_GOLDEN = 0.6180339887498949
+_NEWTON = 5
+_CLOSED = 1e-9
+"""By how much a turn of the map may miss its start, in units of the drive: near a fold rounding leaves as much."""
+
+
+class Scan(NamedTuple):
+    """How closely the closing condition is looked at."""
+
+    points: int
+    """Coordinates, at equal ratios of their distance from capture."""
+    lowest: float
+    """Distance from capture at which they begin, in terms of the drive's speed or the capture coordinate."""
+    highest: float
+    crossings: int
+    """Changes of sign that are followed."""
+    turns: int
+    """Extrema without one that are looked at for a pair of roots."""
+    slots: int
+    """Roots there is room for."""
+
+
+FINE = Scan(8192, 1e-7, 1e5, crossings=16, turns=6, slots=16)
+"""Some 680 points to the decade: for whoever asks for all orbits."""
+COARSE = Scan(512, 1e-3, 1e4, crossings=6, turns=2, slots=10)
+"""Some 70 to the decade: for fits, which search a hundred thousand times."""
+
+
+class OrbitRoots(NamedTuple):
+    """Roots of the closing condition.
+
+    ``place`` and ``found``, one a slot; ``complete``: there were no more roots than slots.
+    """
+
+    place: Place
+    found: Bool[Array, " slots"]
+    complete: Bool[Array, ""]
+
+
+def find_roots(problem: OrbitProblem, scan: Scan = FINE) -> OrbitRoots:
+    """Return all places of orbits, ascending in approach speed, without derivatives; harmless ones elsewhere.
+
+    Args:
+        problem: what orbits are of.
+        scan: how closely is looked where there is a delay; without one there are 4 slots.
+    """
+    problem = lax.stop_gradient(problem)
+    driven = (problem.platform.amplitude_nm > 0.0) & (problem.platform.offset_rate_nm_per_us == 0.0)
+    coordinate, found, complete = _scanned_roots(problem, scan) if problem.impact.delayed else _quartic_roots(problem)
+    safe = jnp.where(found, coordinate, harmless_coordinate(problem))
+    place, there = jax.vmap(follow_root if problem.impact.lasts else _regular, in_axes=(0, None))(safe, problem)
+    found = found & driven & there
+    return OrbitRoots(Place(jnp.where(found, place.coordinate, safe), place.phase), found, complete)
+
+
+@jax.jit
+def follow_root(near: Float[Array, ""], problem: OrbitProblem) -> tuple[Place, Bool[Array, ""]]:
+    """Return where the map of a lasting impact closes, close to a coordinate, and whether it does."""
+    problem = lax.stop_gradient(problem)
+    speeds, system = closure(near, problem)
+    unknowns = close_map(place_of(near, speeds, system, problem), problem, _NEWTON)
+    return Place(*unknowns), system.regular & jnp.all(jnp.abs(map_gaps(unknowns, problem)) < _CLOSED)
+
+
+def harmless_coordinate(problem: OrbitProblem) -> Float[Array, ""]:
+    """Return a coordinate for slots without a root: some speed well above capture, harmless to compute with."""
+    return problem.impact.lowest + 2.0 * _scale(problem) + 2.0
+
+
+def _regular(coordinate: Float[Array, ""], problem: OrbitProblem) -> tuple[Place, Bool[Array, ""]]:
+    """Return the place at a root, and whether the phase is determined there."""
+    speeds, system = closure(coordinate, problem)
+    return place_of(coordinate, speeds, system, problem), system.regular
+
+
+class _Coordinates(NamedTuple):
+    """Roots of the scalar condition: coordinates, which of them are some, and whether those are all."""
+
+    coordinate: Float[Array, " slots"]
+    found: Bool[Array, " slots"]
+    complete: Bool[Array, ""]
+
+
+def _quartic_roots(problem: OrbitProblem) -> _Coordinates:
+    """Solve (Y cosine)^2 + (Y sine)^2 = (Y determinant)^2, a quartic in Y over beta omega."""
+    quartic = instantaneous_quartic(problem)
+    scale = problem.platform.top_speed_nm_per_us
+    low = problem.impact.lowest / scale
+    # Cauchy's bound; a quartic without leading term (no loss at exact resonance) has a root at infinity, not here.
+    top = jnp.max(jnp.abs(quartic))
+    leading = jnp.maximum(jnp.abs(quartic[0]), 1e-15 * top)
+    high = jnp.maximum(1.0 + top / jnp.where(leading > 0.0, leading, 1.0), 2.0 * low + 1.0)
+    roots, found = real_roots(quartic, low, high)
+    return _Coordinates(roots * scale, found & (roots > low), jnp.array(True))  # noqa: FBT003
+
+
+def _scale(problem: OrbitProblem) -> Float[Array, ""]:
+    return jnp.maximum(problem.platform.top_speed_nm_per_us, problem.impact.reach)
+
+
+def _scanned_roots(problem: OrbitProblem, scan: Scan) -> _Coordinates:
+    """Scan the closing condition from just above capture to speeds that no orbit reaches; narrow every bracket."""
+    grid = problem.impact.lowest + jnp.asarray(np.geomspace(scan.lowest, scan.highest, scan.points)) * _scale(problem)
+    residual = jax.vmap(closing_residual, in_axes=(0, None))
+    value = residual(grid, problem)
+    brief = jax.vmap(_brief, in_axes=(0, None))(grid, problem)
+    left, right, low, high, count = _brackets(grid, value, brief, problem, scan)
+    root = _regula_falsi(lambda x: residual(x, problem), left, right, low, high)
+    found = low * high < 0.0
+    order = jnp.argsort(jnp.where(found, root, jnp.inf))[: scan.slots]
+    return _Coordinates(root[order], found[order], (count <= scan.crossings) & (jnp.sum(found) <= scan.slots))
+
+
+def _brief(coordinate: Float[Array, ""], problem: OrbitProblem) -> Bool[Array, ""]:
+    """Say whether an impact is over soon: the lead grows without bound towards capture.
+
+    One that lasts must end within half a drive period, and the tip have lost its energy by then.
+    """
+    speeds, period = problem.impact.speeds(coordinate), problem.platform.period_us
+    if not problem.impact.lasts:
+        return jnp.abs(speeds.delay) < period
+    return (jnp.abs(speeds.delay) < 0.5 * period) & (problem.impact.length / speeds.rebound < _LEAVING * period)
+
+
+def _brackets(grid, value, brief, problem: OrbitProblem, scan: Scan) -> tuple[Array, Array, Array, Array, Array]:
+    """Return ends and values of intervals, last those of pairs that the grid stepped over, and the changes of sign.
+
+    An empty interval has values 0.
+    """
+    crossing = (value[:-1] * value[1:] < 0.0) & brief[:-1] & brief[1:]
+    count = jnp.sum(crossing)
+    # the fastest ones, if there are too many: close to capture the law itself ends
+    at = crossing.shape[0] - 1 - jnp.nonzero(crossing[::-1], size=scan.crossings, fill_value=0)[0]
+    real = jnp.arange(scan.crossings) < count
+    harmless = harmless_coordinate(problem)
+    parts = [_kept(real, harmless, grid[at], grid[at + 1], value[at], value[at + 1])]
+    # three neighbours of one sign, the middle one closest to zero: the extremum may lie beyond
+    size = jnp.abs(value)
+    same = (value[:-2] * value[1:-1] > 0.0) & (value[1:-1] * value[2:] > 0.0)
+    dip = same & (size[1:-1] <= size[:-2]) & (size[1:-1] <= size[2:]) & brief[1:-1]
+    at, real = _lowest_of(jnp.where(dip, size[1:-1], jnp.inf), scan.turns)
+    turn, bottom = _extremum(at, grid, value, problem)
+    real = real & (bottom * value[at + 1] < 0.0)
+    parts.append(_kept(real, harmless, grid[at], turn, value[at], bottom))
+    parts.append(_kept(real, harmless, turn, grid[at + 2], bottom, value[at + 2]))
+    left, right, low, high = (jnp.concatenate(columns) for columns in zip(*parts, strict=True))
+    return left, right, low, high, count
+
+
+def _lowest_of(size: Float[Array, " n"], count: int) -> tuple[Array, Array]:
+    """Return where the smallest numbers are, and which of them are finite."""
+    at, real = [], []
+    for _ in range(count):
+        place = jnp.argmin(size)
+        at.append(place)
+        real.append(jnp.isfinite(size[place]))
+        size = size.at[place].set(jnp.inf)
+    return jnp.stack(at), jnp.stack(real)
+
+
+def _kept(real, harmless, left, right, low, high) -> tuple[Array, Array, Array, Array]:
+    """Return an interval where it is one, else an empty one at a harmless coordinate."""
+    ends = jnp.where(real, left, harmless), jnp.where(real, right, harmless)
+    return *ends, jnp.where(real, low, 0.0), jnp.where(real, high, 0.0)
+
+
+def _extremum(at, grid, value, problem: OrbitProblem) -> tuple[Array, Array]:
+    """Return where the residual is closest to zero, or beyond, between a grid point and the one after next."""
+    sign = jnp.sign(value[at + 1])
+
+    height = jax.vmap(lambda x, sign: sign * closing_residual(x, problem))
+
+    def narrow(_, ends):
+        # golden section, both inner points at once
+        a, b = ends
+        points = jnp.stack([b - _GOLDEN * (b - a), a + _GOLDEN * (b - a)])
+        first, second = height(points.ravel(), jnp.tile(sign, 2)).reshape(2, -1)
+        return jnp.where(first < second, a, points[0]), jnp.where(first < second, points[1], b)
+
+    a, b = lax.fori_loop(0, _SECTIONS, narrow, (grid[at], grid[at + 2]))
+    middle = 0.5 * (a + b)
+    return middle, sign * height(middle, sign)
+
+
+def _regula_falsi(residual, left, right, low, high) -> Float[Array, " slots"]:
+    """Return the root of every bracket by the Illinois method: the newer end stays, the other one loses weight."""
+
+    def narrow(_, ends):
+        a, b, fa, fb = ends
+        gap = fb - fa
+        x = jnp.where(gap == 0.0, a, (a * fb - b * fa) / jnp.where(gap == 0.0, 1.0, gap))
+        fx = residual(x)
+        passed = fx * fa < 0.0
+        return x, jnp.where(passed, a, b), fx, jnp.where(passed, fa, 0.5 * fb)
+
+    return lax.fori_loop(0, _REGULA_FALSI, narrow, (left, right, low, high))[0]

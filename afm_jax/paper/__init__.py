@@ -1,0 +1,1 @@
+"""The paper's figures, with what it says of them checked on their data."""

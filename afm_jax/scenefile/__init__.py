@@ -1,0 +1,1 @@
+"""Scenes as TOML files, and the paper's by name."""

@@ -1,0 +1,103 @@
+"""The contact of a scene file: its parameters by name, what they may be, and the contact that they make."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+
+from afm_jax.checks import check_parameter
+from afm_jax.contact.contact import EFFECTS, Contact
+from afm_jax.contact.forces.force import Force
+from afm_jax.contact.forces.liquid import Capillary, Structural, Viscous
+from afm_jax.contact.forces.solid import CoreRepulsion
+from afm_jax.contact.junction import explain_missing_junction, find_junction
+from afm_jax.scenefile.tables import CONTACT_RANGES
+from afm_jax.units import AJ_NM6_PER_J_M6
+
+_KINDS = {"capillary": Capillary, "structural": Structural, "core": CoreRepulsion, "viscous": Viscous}
+
+
+def make_contact(effects: Sequence[str], parameters: Mapping[str, float]) -> Contact:
+    """Return the contact of chosen effects with some of the paper's parameters changed.
+
+    Parameters of an effect that is left out are checked, and then have no meaning: an effect can be left out without
+    rewriting the rest.
+
+    Args:
+        effects: names of `EFFECTS`.
+        parameters: keyword arguments of `Contact.paper`.
+
+    Raises:
+        ValueError: if an effect is unknown or a required one missing, a value outside its range, or the contact has no
+            junction; says which and why.
+    """
+    for name, value in parameters.items():
+        check_parameter(name, value, CONTACT_RANGES[name])
+    if math.isinf(parameters.get("core_constant_j_m6", 0.0) * AJ_NM6_PER_J_M6):
+        raise ValueError(f"`core_constant_j_m6` is too large: {parameters['core_constant_j_m6']:g}")
+    contact = Contact.paper(effects=tuple(effects), **parameters)
+    if not bool(junction_of(contact).exists):
+        raise ValueError(f"the contact has no junction: {explain_missing_junction(contact)}")
+    return contact
+
+
+def contact_parameters(contact: Contact) -> dict[str, Any]:
+    """Return the parameters with which `Contact.paper` makes a contact again, by name.
+
+    Those of effects that it does not have are left out.
+
+    Raises:
+        ValueError: if it holds something that a scene file has no key for: another force, the same one twice, or
+            different radii or liquids in its forces.
+    """
+    known = [_KINDS.get(name) for name in contact.effects[:-1]]
+    if None in known or len(set(known)) < len(known):
+        raise ValueError(
+            f"a scene file holds each of {', '.join(EFFECTS)} once, but the contact has {', '.join(contact.effects)}"
+        )
+    values: dict[str, Any] = {
+        "adhesion_energy_j_per_m2": contact.junction.adhesion_energy_j_per_m2,
+        "modulus_gpa": contact.junction.modulus_gpa,
+        "tip_radius_nm": contact.junction.tip_radius_nm,
+        "bridge_forms_nm": contact.bridge_forms_nm,
+        "bridge_breaks_nm": contact.bridge_breaks_nm,
+    }
+    for term in contact.forces.terms:
+        for name, value in _own_parameters(term).items():
+            if name in values and not np.array_equal(values[name], value):
+                raise ValueError(f"a scene file has one `{name}`, but the contact's forces have different ones")
+            values[name] = value
+    return {name: values[name] for name in CONTACT_RANGES if name in values}
+
+
+def _own_parameters(term: Force) -> dict[str, Any]:
+    """Return the parameters of one force by their names in a scene file."""
+    match term:
+        case Capillary():
+            return {"tip_radius_nm": term.tip_radius_nm, **vars(term.liquid)}
+        case Structural():
+            own = ("amplitude_n_per_m", "decay_nm", "offset_nm")
+            named = {f"structural_{name}": getattr(term, name) for name in own}
+            return {**named, "tip_radius_nm": term.tip_radius_nm, **vars(term.liquid)}
+        case CoreRepulsion():
+            return {"core_constant_j_m6": _core_constant(term), "tip_radius_nm": term.tip_radius_nm}
+        case _:
+            return vars(term)
+
+
+def _core_constant(term: CoreRepulsion) -> Any:
+    """Return B in J m^6 such that its product with the unit is the stored number again, to the last digit."""
+    stored = np.asarray(term.constant_aj_nm6)
+    # in 64 bits: 1e-78 has no place in 32
+    constant = stored.astype(float) / AJ_NM6_PER_J_M6
+    below, above = np.nextafter(constant, 0.0), np.nextafter(constant, np.inf)
+    for nearby in (below, above, np.nextafter(below, 0.0), np.nextafter(above, np.inf)):
+        exact = (constant * AJ_NM6_PER_J_M6).astype(stored.dtype) == stored
+        constant = np.where(exact, constant, nearby)
+    return constant
+
+
+junction_of = eqx.filter_jit(find_junction)
+"""`find_junction`, with one compilation for every choice of effects."""

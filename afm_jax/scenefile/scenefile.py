@@ -1,0 +1,493 @@
+"""Scenes as TOML files, in and out; the loop is exact.
+
+```toml
+[cantilever]
+frequency_khz = 90
+quality_factor = 40          # leave out: no air damping
+mass_ng = 1
+[platform]
+amplitude_nm = 4
+frequency_khz = 180          # or reduced_frequency = omega / 2 Omega
+offset_nm = 0
+offset_rate_nm_per_us = 0
+[platform.second]            # leave out: one frequency; [base] and [force] may have one too
+amplitude_nm = 1
+frequency_khz = 33           # or reduced_frequency
+phase_deg = 0
+[base]                       # leave out: the cantilever's base rests
+amplitude_nm = 0.1
+frequency_khz = 90           # or reduced_frequency
+phase_deg = 0
+[force]                      # leave out: no force on the tip
+amplitude_nn = 0.5
+frequency_khz = 90           # or reduced_frequency
+phase_deg = 0
+[interaction]
+model = "law"                # or "contact", or "none": a free cantilever
+r = 0.998
+epsilon = 122                # nm^2/us^2
+viscous_loss = 0             # nm/us
+[interaction.delay]          # leave out: instantaneous impacts
+hertz = 0.206
+lead_nm = 5.64
+offset_nm = 0.726
+corrections = true           # false: nothing acts on the tip while the impact lasts
+[start]                      # leave out: the simulation chooses
+phase_deg = 270
+height_above_platform_nm = 5
+velocity_nm_per_us = 80
+```
+
+A resolved contact instead of a law: `model = "contact"`, `effects = ["capillary", "structural", "core", "viscous",
+"jkr"]` (all of them if left out) and any of the parameters in `CONTACT_RANGES`; the paper's values if left out.
+With [base] or [force] the platform may rest: without `amplitude_nm` and frequency its phase counts in the drive's.
+
+The drives of a scene file: the platform, the base and the force on the tip, each with a second frequency or not.
+
+Where a simulation begins: the start of a scene file, whether it is possible in its scene, and that of a state.
+"""
+
+import os
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+
+import equinox as eqx
+import numpy as np
+import tomli_w
+from jaxtyping import ArrayLike
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene, drive_of
+from afm_jax.apparatus.surface import check_steady_response
+from afm_jax.checks import check_parameter
+from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from afm_jax.motion.record import State
+from afm_jax.scenefile.tables import (
+    CONTACT_RANGES,
+    INNER_TABLES,
+    KEYS,
+    MODELS,
+    TABLES,
+    SceneError,
+    SceneTable,
+    advise_table,
+    in_words,
+    printable,
+)
+
+if TYPE_CHECKING:
+    from afm_jax.contact.contact import Contact
+
+
+Excited = TypeVar("Excited", BaseDrive, ForceDrive)
+Driven = TypeVar("Driven", Platform, BaseDrive, ForceDrive)
+
+_SAME_FREQUENCY = 1e-12
+"""Relative distance of two frequencies that only rounding makes different."""
+
+
+def read_drives(
+    tables: Mapping[str, SceneTable], cantilever: Cantilever
+) -> tuple[Platform, BaseDrive | None, ForceDrive | None]:
+    """Return what drives a scene.
+
+    Args:
+        tables: the tables of the file, their keys checked.
+        cantilever: gives the unit of reduced frequencies, and may have no steady response to a drive.
+
+    Raises:
+        SceneError: if a value is missing, of a wrong type or impossible.
+    """
+    base = _excitation_of(tables, "base", BaseDrive, cantilever)
+    force = _excitation_of(tables, "force", ForceDrive, cantilever)
+    return _platform_of(tables, cantilever, base or force), base, force
+
+
+def drive_tables(scene: Scene) -> dict[str, dict[str, Any]]:
+    """Return the tables of a scene's drives; what is absent is left out.
+
+    Raises:
+        ValueError: if the scene is a batch of scenes, a second frequency is equal to the first, or an undamped
+            cantilever is driven at its free frequency.
+    """
+    drives = {"platform": scene.platform, "base": scene.base, "force": scene.force}
+    for name, drive in drives.items():
+        if isinstance(drive, BaseDrive | ForceDrive):
+            check_steady_response(scene.cantilever, drive.tones, name)
+    return {name: _table_of(name, drive) for name, drive in drives.items() if drive is not None}
+
+
+def numbers_of(part: eqx.Module, table: str) -> dict[str, Any]:
+    """Return the numbers of a part of a scene under the keys of its table; what is absent or no number is left out.
+
+    Raises:
+        ValueError: if one is no single number.
+    """
+    values = {key: getattr(part, key, None) for key in KEYS[table]}
+    return {
+        key: number_of(value, key)
+        for key, value in values.items()
+        if value is not None and not isinstance(value, (eqx.Module, bool))
+    }
+
+
+def number_of(value: ArrayLike, key: str) -> float:
+    """Return a parameter as a number.
+
+    Raises:
+        ValueError: if it is an array of numbers.
+    """
+    number = np.asarray(value)
+    if number.ndim:
+        raise ValueError(f"`{key}` has shape {number.shape}, but a scene file holds one scene: save them one by one")
+    return float(number)
+
+
+def _platform_of(
+    tables: Mapping[str, SceneTable], cantilever: Cantilever, excitation: BaseDrive | ForceDrive | None
+) -> Platform:
+    """Return the platform; a resting one under another drive takes that drive's frequency if it has none of its own."""
+    table = tables["platform"]
+    may_rest = excitation is not None and "platform.second" not in tables
+    needed = () if may_rest else ("amplitude_nm",)
+    optional = ("amplitude_nm", "frequency_khz", "reduced_frequency", "offset_nm", "offset_rate_nm_per_us")
+    numbers = {"amplitude_nm": 0.0} | table.numbers(required=needed, optional=optional)
+    own_frequency = "frequency_khz" in numbers or "reduced_frequency" in numbers
+    if excitation is not None and may_rest and numbers["amplitude_nm"] == 0.0 and not own_frequency:
+        return table.build(Platform, **numbers, frequency_khz=excitation.frequency_khz)
+    platform = table.build(Platform, **_with_frequency(table, numbers, cantilever))
+    return _with_second(tables, "platform", platform, cantilever)
+
+
+def _excitation_of(
+    tables: Mapping[str, SceneTable], name: str, kind: type[Excited], cantilever: Cantilever
+) -> Excited | None:
+    table = tables.get(name)
+    if table is None:
+        return None
+    numbers = table.numbers(required=(_amplitude(name),), optional=("frequency_khz", "reduced_frequency", "phase_deg"))
+    drive = table.build(kind, **_with_frequency(table, numbers, cantilever))
+    drive = _with_second(tables, name, drive, cantilever)
+    table.build(check_steady_response, cantilever, drive.tones, name)
+    return drive
+
+
+def _with_second(tables: Mapping[str, SceneTable], name: str, drive: Driven, cantilever: Cantilever) -> Driven:
+    """Return a drive with the second frequency that its file gives it, if any."""
+    table = tables.get(f"{name}.second")
+    if table is None:
+        return drive
+    key = _amplitude(name)
+    numbers = table.numbers(required=(key,), optional=("frequency_khz", "reduced_frequency", "phase_deg"))
+    table.build(check_parameter, key, numbers[key], "not negative")
+    numbers = _with_frequency(table, numbers, cantilever)
+    second = table.build(Tone, numbers.pop(key), **numbers)
+    if _same_frequency(drive, second):
+        table.fail(f"has the frequency of [{name}]; add the two up to one cosine and leave this table out")
+    return eqx.tree_at(lambda drive: drive.second, drive, second, is_leaf=lambda leaf: leaf is None)
+
+
+def _with_frequency(table: SceneTable, numbers: dict[str, float], cantilever: Cantilever) -> dict[str, float]:
+    """Return a drive's numbers with `frequency_khz`, whichever way the table gives it."""
+    reduced = numbers.get("reduced_frequency")
+    if reduced is not None and "frequency_khz" in numbers:
+        table.fail("has both frequency_khz and reduced_frequency; give one of them")
+    if reduced is None and "frequency_khz" not in numbers:
+        table.fail("the drive frequency is missing; add frequency_khz or reduced_frequency")
+    if reduced is None:
+        return numbers
+    table.build(check_parameter, "reduced_frequency", reduced, "positive")
+    others = {key: value for key, value in numbers.items() if key != "reduced_frequency"}
+    # omega / 2 Omega
+    return {**others, "frequency_khz": 2.0 * reduced * float(cantilever.frequency_khz)}
+
+
+def _table_of(name: str, drive: Platform | BaseDrive | ForceDrive) -> dict[str, Any]:
+    table = numbers_of(drive, name)
+    second = drive.second
+    if second is None:
+        return table
+    if _same_frequency(drive, second):
+        raise ValueError(f"the second frequency of `{name}` is that of the first: add the two up to one cosine")
+    amplitude = {_amplitude(name): number_of(second.amplitude, _amplitude(name))}
+    return {**table, "second": {**amplitude, **numbers_of(second, f"{name}.second")}}
+
+
+def _same_frequency(drive: Platform | BaseDrive | ForceDrive, second: Tone) -> bool:
+    return bool(np.all(np.isclose(drive.frequency_khz, second.frequency_khz, rtol=_SAME_FREQUENCY, atol=0.0)))
+
+
+def _amplitude(name: str) -> str:
+    return "amplitude_nn" if name == "force" else "amplitude_nm"
+
+
+class Start(NamedTuple):
+    """Where a simulation begins: `phase_deg` of the drive, height above the platform, velocity in the lab."""
+
+    phase_deg: float
+    height_above_platform_nm: float
+    velocity_nm_per_us: float
+
+
+def check_start(start: Start, scene: Scene) -> None:
+    """Check that a tip can begin at a start: outside the sample, and not on its way into it from its surface.
+
+    Args:
+        start: the start.
+        scene: one scene, its numbers known.
+
+    Raises:
+        ValueError: if it cannot; says why.
+    """
+    height = start.height_above_platform_nm
+    check_parameter("phase_deg", start.phase_deg, "finite")
+    check_parameter("velocity_nm_per_us", start.velocity_nm_per_us, "finite")
+    check_parameter("height_above_platform_nm", height, "finite")
+    if scene.interaction is None:
+        return
+    if isinstance(scene.interaction, ImpactLaw):
+        check_parameter("height_above_platform_nm", height, "not negative")
+        if height == 0.0:
+            _check_leaves(start, scene.platform)
+        return
+    # only here, so that scenes with a law do without the contact's modules
+    from afm_jax.scenefile.contact import junction_of  # noqa: PLC0415
+
+    if height <= 0.0:
+        raise ValueError(
+            f"`height_above_platform_nm` must be positive, but is {height:g}: the tip would start inside the sample"
+        )
+    junction = junction_of(scene.interaction)
+    forms = float(junction.forms_gap_nm)
+    if bool(junction.exists) and height <= forms:
+        raise ValueError(
+            f"`height_above_platform_nm` must be above {forms:.6g}, where the solid junction forms, but is {height:g}"
+        )
+
+
+def _check_leaves(start: Start, platform: Platform) -> None:
+    """Check that a tip on the platform moves away from it."""
+    time_us = start.phase_deg / 360.0 * float(platform.period_us)
+    moving = float(platform.velocity(time_us))
+    if start.velocity_nm_per_us <= moving:
+        raise ValueError(
+            f"`velocity_nm_per_us` must be above the platform's {moving:.6g} where the tip starts on it, but is "
+            f"{start.velocity_nm_per_us:.6g}: start faster or higher"
+        )
+
+
+def as_in_file(scene: Scene, state: State) -> Start:
+    """Return the start from which `start_of` makes a state again, within the drive's first period.
+
+    Args:
+        scene: one scene.
+        state: time, height and velocity in the lab.
+    """
+    time = float(state.time_us)
+    phase = 360.0 * (time / drive_of(scene).period_us)
+    height = float(state.position_nm) - float(scene.platform.position(time))
+    return Start(phase % 360.0, height, float(state.velocity_nm_per_us))
+
+
+__all__ = [
+    "SceneError",
+    "Start",
+    "load_scene",
+    "load_scene_and_start",
+    "load_start",
+    "save_scene",
+    "scene_tables",
+]
+
+
+def load_scene(path: str | os.PathLike[str]) -> Scene:
+    """Return the scene that a TOML file describes.
+
+    Args:
+        path: the file.
+
+    Raises:
+        SceneError: if the file cannot be read, a table, key, type or value in it is wrong, or its contact has no
+            junction; the message names the place and says how to mend it.
+    """
+    return load_scene_and_start(path)[0]
+
+
+def load_start(path: str | os.PathLike[str]) -> Start | None:
+    """Return the start that a scene file asks for, or None where it leaves the choice to the simulation.
+
+    Raises:
+        SceneError: if the file is not a valid scene file.
+    """
+    return load_scene_and_start(path)[1]
+
+
+def load_scene_and_start(path: str | os.PathLike[str]) -> tuple[Scene, Start | None]:
+    """Return what `load_scene` and `load_start` return, from one reading of the file."""
+    tables = _tables(path)
+    scene = _scene_of(tables)
+    return scene, _start_of(tables, scene)
+
+
+def save_scene(scene: Scene, path: str | os.PathLike[str], *, start: Start | None = None) -> None:
+    """Write a scene, and a start if there is one, to a TOML file from which `load_scene` returns an equal scene.
+
+    The file names a contact's effects in the paper's order, whatever the order of its forces.
+
+    Raises:
+        OSError: if the file cannot be written.
+        TypeError: if the interaction is neither an impact law nor a contact nor None.
+        ValueError: if the scene is a batch of scenes, its contact or its drives are none that a file can hold, or the
+            start is impossible in it.
+    """
+    tables = scene_tables(scene)
+    if start is not None:
+        check_start(start, scene)
+        tables["start"] = {key: float(value) for key, value in start._asdict().items()}
+    Path(path).write_bytes(tomli_w.dumps(tables).encode("utf-8"))
+
+
+def scene_tables(scene: Scene) -> dict[str, dict[str, Any]]:
+    """Return a scene as the tables of its file, dicts of numbers; what is absent is left out.
+
+    Raises:
+        TypeError: if the interaction is neither an impact law nor a contact nor None.
+        ValueError: if the scene is a batch of scenes, or its contact or its drives are none that a file can hold.
+    """
+    return {
+        "cantilever": numbers_of(scene.cantilever, "cantilever"),
+        **drive_tables(scene),
+        "interaction": _interaction_table(scene.interaction),
+    }
+
+
+def _interaction_table(interaction: Any) -> dict[str, Any]:
+    if interaction is None:
+        return {"model": "none"}
+    return _law_table(interaction) if isinstance(interaction, ImpactLaw) else _contact_table(interaction)
+
+
+def _law_table(law: ImpactLaw) -> dict[str, Any]:
+    table = {"model": "law", **numbers_of(law, "interaction")}
+    if law.delay is not None:
+        table["delay"] = numbers_of(law.delay, "interaction.delay")
+        if not law.delay.corrections:
+            table["delay"]["corrections"] = False
+    return table
+
+
+def _contact_table(contact: Any) -> dict[str, Any]:
+    # only here, so that scenes with a law do without the contact's modules
+    from afm_jax.contact.contact import EFFECTS, Contact  # noqa: PLC0415
+    from afm_jax.scenefile.contact import contact_parameters  # noqa: PLC0415
+
+    if not isinstance(contact, Contact):
+        raise TypeError(f"a scene file holds an ImpactLaw or a Contact as interaction, not {type(contact).__name__}")
+    numbers = {key: number_of(value, key) for key, value in contact_parameters(contact).items()}
+    return {"model": "contact", "effects": [name for name in EFFECTS if name in contact.effects], **numbers}
+
+
+def _tables(path: str | os.PathLike[str]) -> dict[str, SceneTable]:
+    """Read a file and check the names of its tables and keys."""
+    source = os.fspath(path)
+    contents = _parsed(source)
+    for name, value in contents.items():
+        if name not in TABLES:
+            message = advise_table(name, is_table=isinstance(value, dict))
+            raise SceneError(f"{printable(source)}: {printable(name)}: {message}")
+    tables = {name: _table(source, name, value) for name, value in contents.items()}
+    for name in ("cantilever", "platform", "interaction"):
+        if name not in tables:
+            keys = ", ".join(key for key in KEYS[name] if f"{name}.{key}" not in INNER_TABLES)
+            raise SceneError(f"{printable(source)}: [{name}] is missing; add it with {keys}")
+    model = _model_of(tables["interaction"])
+    tables["interaction"] = tables["interaction"]._replace(model=model)
+    for name in INNER_TABLES:
+        outer, _, key = name.partition(".")
+        if outer in tables and key in tables[outer].values and (outer != "interaction" or model == "law"):
+            tables[name] = _table(source, name, tables[outer].values[key])
+    for table in tables.values():
+        table.check_keys()
+    return tables
+
+
+def _parsed(source: str) -> dict[str, Any]:
+    where = printable(source)
+    try:
+        # a byte order mark, as some editors write, is no part of the text
+        text = Path(source).read_bytes().decode("utf-8-sig")
+    except FileNotFoundError as error:
+        raise SceneError(f"{where}: there is no such file") from error
+    except OSError as error:
+        raise SceneError(f"{where}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        raise SceneError(f"{where}: line {line} is not UTF-8 text; save the file as UTF-8") from error
+    try:
+        return tomllib.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise SceneError(f"{where}: not TOML: {' '.join(str(error).split())}") from error
+
+
+def _table(source: str, name: str, value: Any) -> SceneTable:
+    if not isinstance(value, dict):
+        raise SceneError(f"{printable(source)}: {name} must be a table, [{name}], but is {in_words(value)}")
+    return SceneTable(source, name, value)
+
+
+def _model_of(table: SceneTable) -> str:
+    """Return the model, looked at first: it decides which keys are known."""
+    model = table.values.get("model")
+    if model is None:
+        table.fail('missing; add model = "law" or model = "contact", or model = "none" for a free cantilever', "model")
+    if model not in MODELS:
+        table.fail('must be "law" or "contact", or "none" for a free cantilever', "model")
+    return model
+
+
+def _scene_of(tables: dict[str, SceneTable]) -> Scene:
+    table = tables["cantilever"]
+    numbers = table.numbers(required=("frequency_khz",), optional=("quality_factor", "mass_ng"))
+    cantilever = table.build(Cantilever, **numbers)
+    platform, base, force = read_drives(tables, cantilever)
+    return Scene(cantilever, platform, _interaction_of(tables), base, force)
+
+
+def _interaction_of(tables: dict[str, SceneTable]) -> Any:
+    table = tables["interaction"]
+    if table.model == "none":
+        return None
+    if table.model == "contact":
+        return _contact_of(table)
+    law = table.numbers(required=("r",), optional=("epsilon", "viscous_loss"))
+    return table.build(ImpactLaw, **law, delay=_delay_of(tables.get("interaction.delay")))
+
+
+def _contact_of(table: SceneTable) -> "Contact":
+    # only here, so that scenes with a law do without the contact's modules
+    from afm_jax.contact.contact import EFFECTS  # noqa: PLC0415
+    from afm_jax.scenefile.contact import make_contact  # noqa: PLC0415
+
+    effects = table.texts("effects")
+    numbers = table.numbers(optional=tuple(CONTACT_RANGES))
+    return table.build(make_contact, EFFECTS if effects is None else effects, numbers)
+
+
+def _delay_of(table: SceneTable | None) -> CollisionDelay | None:
+    if table is None:
+        return None
+    numbers = table.numbers(required=tuple(key for key in KEYS["interaction.delay"] if key != "corrections"))
+    return table.build(CollisionDelay, **numbers, corrections=table.truth("corrections", usual=True))
+
+
+def _start_of(tables: dict[str, SceneTable], scene: Scene) -> Start | None:
+    table = tables.get("start")
+    if table is None:
+        return None
+    start = Start(**table.numbers(required=KEYS["start"]))
+    table.build(check_start, start, scene)
+    return start

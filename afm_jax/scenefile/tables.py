@@ -1,0 +1,266 @@
+"""The keys of a scene file, and what to advise where somebody wrote another one.
+
+One table of a scene file: its keys and types are checked, and every error says file, table and key.
+"""
+
+import difflib
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, NoReturn, TypeVar
+
+CONTACT_RANGES = {
+    "relative_humidity": "between 0 and 1",
+    "temperature_k": "positive",
+    "surface_tension_n_per_m": "positive",
+    "molar_volume_cm3_per_mol": "positive",
+    "viscosity_pa_s": "not negative",
+    "tip_radius_nm": "positive",
+    "structural_amplitude_n_per_m": "not negative",
+    "structural_decay_nm": "positive",
+    "structural_offset_nm": "finite",
+    "core_constant_j_m6": "positive",
+    "adhesion_energy_j_per_m2": "positive",
+    "modulus_gpa": "positive",
+    "bridge_forms_nm": "positive",
+    "bridge_breaks_nm": "positive",
+}
+"""The parameters of a contact, and which values `afm_jax.checks.check_parameter` lets pass."""
+
+_FREQUENCY = ("frequency_khz", "reduced_frequency")
+_MOTION = ("amplitude_nm", *_FREQUENCY, "phase_deg")
+_FORCE = ("amplitude_nn", *_FREQUENCY, "phase_deg")
+
+KEYS = {
+    "cantilever": ("frequency_khz", "quality_factor", "mass_ng"),
+    "platform": ("amplitude_nm", *_FREQUENCY, "offset_nm", "offset_rate_nm_per_us", "second"),
+    "platform.second": _MOTION,
+    "base": (*_MOTION, "second"),
+    "base.second": _MOTION,
+    "force": (*_FORCE, "second"),
+    "force.second": _FORCE,
+    "interaction": ("model", "r", "epsilon", "viscous_loss", "delay"),
+    "interaction.delay": ("hertz", "lead_nm", "offset_nm", "corrections"),
+    "start": ("phase_deg", "height_above_platform_nm", "velocity_nm_per_us"),
+}
+"""For every table of a scene file the keys it may have; those of the interaction are an impact law's."""
+
+TABLES = tuple(name for name in KEYS if "." not in name)
+"""The tables at the top of a file."""
+
+INNER_TABLES = tuple(name for name in KEYS if "." in name)
+"""The tables inside others."""
+
+CONTACT_KEYS = ("model", "effects", *CONTACT_RANGES)
+"""The keys of the interaction where its model is a contact."""
+
+MODELS = ("law", "contact", "none")
+"""The models of an interaction; "none": a free cantilever."""
+
+_UNITS = ("_nm_per_us", "_khz", "_n_per_m", "_nm", "_nn", "_ng", "_deg")
+_UNITS += ("_j_per_m2", "_cm3_per_mol", "_pa_s", "_j_m6", "_gpa", "_k")
+
+
+def keys_of(table: str, model: str) -> tuple[str, ...]:
+    """Return the keys that a table may have in a scene whose interaction is of one of the `MODELS`."""
+    if table != "interaction" or model == "law":
+        return KEYS[table]
+    return CONTACT_KEYS if model == "contact" else ("model",)
+
+
+def advise_key(table: str, key: str, model: str = "law") -> str:
+    """Return what is wrong with a key that its table does not have, and the one to use instead.
+
+    >>> advise_key("platform", "frequency_hz")
+    'unknown key; use frequency_khz'
+    >>> advise_key("cantilever", "frequency")
+    'the unit is missing; use frequency_khz'
+    >>> advise_key("platform", "quality_factor")
+    'unknown key; it belongs in [cantilever]'
+    >>> advise_key("force", "amplitude_nm")
+    'unknown key; use amplitude_nn'
+    >>> advise_key("interaction", "viscosity_pa_s", "law")
+    'unknown key of a law; it belongs to model = "contact"'
+
+    Args:
+        table: a name of `KEYS`.
+        key: what the file has there.
+        model: of the scene's interaction, one of `MODELS`.
+    """
+    keys = keys_of(table, model)
+    allowed = {name.casefold(): name for name in keys}
+    plain = key.casefold()
+    stems = {_stem(name): name for name in keys}
+    if plain in stems and plain not in allowed:
+        return f"the unit is missing; use {stems[plain]}"
+    known = allowed.get(plain, stems.get(_stem(plain)))
+    if known is not None:
+        return f"unknown key; use {known}"
+    others = [other for other in MODELS if other != model and plain in keys_of("interaction", other)]
+    if table == "interaction" and others:
+        whose = "a free cantilever" if model == "none" else f"a {model}"
+        return f'unknown key of {whose}; it belongs to model = "{others[0]}"'
+    owners = _owners(plain)
+    if owners:
+        return f"unknown key; it belongs in {' or '.join(owners)}"
+    same_quantity = [stem for stem in stems if plain.startswith(f"{stem}_")]
+    if same_quantity:
+        return f"unknown key; use {stems[max(same_quantity, key=len)]}"
+    nearest = difflib.get_close_matches(plain, allowed, n=1)
+    return f"unknown key; use {nearest[0]}" if nearest else f"unknown key; use one of {', '.join(keys)}"
+
+
+def advise_table(name: str, *, is_table: bool) -> str:
+    """Return what is wrong with a name at the top of a file, which is none of its tables.
+
+    >>> advise_table("cantilver", is_table=True)
+    'unknown table; use [cantilever]'
+
+    Args:
+        name: what the file has there.
+        is_table: whether it is a table there, or a key outside any table.
+    """
+    plain = name.casefold()
+    if not is_table:
+        tables = _owners(plain) or [f"[{table}]" for table in TABLES]
+        return f"stands outside any table; write it below {' or '.join(tables)}"
+    inner = [table.rpartition(".")[2] for table in INNER_TABLES]
+    nearest = difflib.get_close_matches(plain, [*TABLES, *inner], n=1)
+    if nearest:
+        meant = [f"[{table}]" for table in KEYS if table.rpartition(".")[2] == nearest[0]]
+        return f"unknown table; use {' or '.join(meant)}"
+    return f"unknown table; use {', '.join(f'[{table}]' for table in TABLES)}"
+
+
+def _owners(key: str) -> list[str]:
+    """Return the tables that have a key, in brackets, but for second frequencies, which have the keys of the first."""
+    return [f"[{table}]" for table, keys in KEYS.items() if key in keys and not table.endswith(".second")]
+
+
+def _stem(name: str) -> str:
+    """Return a key without its unit."""
+    return next((name.removesuffix(unit) for unit in _UNITS if name.endswith(unit)), name)
+
+
+Built = TypeVar("Built")
+
+
+class SceneError(ValueError):
+    """A scene file that cannot be used; the message is one line: what, where, how to mend it."""
+
+
+class SceneTable(NamedTuple):
+    """A table as it was read.
+
+    Attributes:
+        source: the file's name, as it begins every message.
+        name: the table's name, a key of `KEYS`.
+        values: what it contains.
+        model: of the scene's interaction, one of `MODELS`.
+    """
+
+    source: str
+    name: str
+    values: Mapping[str, Any]
+    model: str = "law"
+
+    def fail(self, message: str, key: str | None = None) -> NoReturn:
+        """Raise a `SceneError` that names the file, this table and the key."""
+        where = f"{printable(self.source)}: [{self.name}] "
+        raise SceneError(f"{where}{message}" if key is None else f"{where}{printable(key)}: {message}")
+
+    def check_keys(self) -> None:
+        """Check that the table has no unknown keys.
+
+        Raises:
+            SceneError: at the first unknown key, with the one to use instead.
+        """
+        for key in self.values:
+            if key not in keys_of(self.name, self.model):
+                self.fail(advise_key(self.name, key, self.model), key)
+
+    def numbers(self, *, required: tuple[str, ...] = (), optional: tuple[str, ...] = ()) -> dict[str, float]:
+        """Return the numbers that the table has under these keys.
+
+        Raises:
+            SceneError: if a required one is missing or one is not a number.
+        """
+        for key in required:
+            if key not in self.values:
+                self.fail("missing; add it", key)
+        return {key: self._number(key) for key in (*required, *optional) if key in self.values}
+
+    def texts(self, key: str) -> list[str] | None:
+        """Return the list of texts that the table has under a key; None if the key is left out.
+
+        Raises:
+            SceneError: if there is something else.
+        """
+        value = self.values.get(key)
+        if value is None:
+            return None
+        if not isinstance(value, list):
+            self.fail(f'must be a list of texts, ["..."], but is {in_words(value)}', key)
+        for entry in value:
+            if not isinstance(entry, str):
+                self.fail(f"must be a list of texts, but one entry is {in_words(entry)}", key)
+        return value
+
+    def truth(self, key: str, *, usual: bool) -> bool:
+        """Return whether the table has true under a key; the usual answer if the key is left out.
+
+        Raises:
+            SceneError: if there is something else than true or false.
+        """
+        value = self.values.get(key, usual)
+        if not isinstance(value, bool):
+            self.fail(f"must be true or false, but is {in_words(value)}", key)
+        return value
+
+    def build(self, kind: Callable[..., Built], *arguments: Any, **parameters: Any) -> Built:
+        """Return `kind(*arguments, **parameters)`; what that finds wrong becomes an error of this table.
+
+        Raises:
+            SceneError: if it raises a ValueError.
+        """
+        try:
+            return kind(*arguments, **parameters)
+        except ValueError as error:
+            self.fail(str(error))
+
+    def _number(self, key: str) -> float:
+        value = self.values[key]
+        if isinstance(value, bool) or not isinstance(value, (int, float)):
+            self.fail(f"must be a number, but is {in_words(value)}", key)
+        try:
+            return float(value)
+        except OverflowError:
+            self.fail("is too large a number", key)
+
+
+def in_words(value: Any) -> str:
+    """Return what a value in a TOML file is, short enough for a message."""
+    match value:
+        case bool():
+            return "true" if value else "false"
+        case str():
+            return f"the text {value!r}; leave out the quotes" if _looks_like_a_number(value) else "a text"
+        case list():
+            return "a list"
+        case dict():
+            return "a table"
+        case int() | float():
+            return "a number"
+        case _:
+            return "a date or time"
+
+
+def printable(text: str) -> str:
+    """Return a text that fits on one line of a message: escaped where it holds line breaks or control characters."""
+    return text if text.isprintable() else repr(text)
+
+
+def _looks_like_a_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return len(text) < 40

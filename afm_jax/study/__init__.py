@@ -1,1 +1,0 @@
-"""Questions about scenes: verification, accuracy against time, benchmarks, stability regions."""

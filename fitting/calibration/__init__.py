@@ -1,0 +1,1 @@
+"""Frequency and quality factor of a free cantilever from a resonance sweep."""

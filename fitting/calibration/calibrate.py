@@ -1,0 +1,189 @@
+"""Free resonance calibration: natural frequency and quality factor of a cantilever from a sweep."""
+
+import numpy as np
+from scipy.special import chdtrc
+
+from afm_jax.checks import require_float64
+from afm_jax.version import version_of
+from fitting.calibration.model import TERMS, SweepFit, fit_sweep, kind_of, model_at, refit, sum_without_resonance
+from fitting.calibration.result import Alternative, CalibratedValue, Calibration, Curves
+from fitting.calibration.sweep import ResonanceSweep
+from fitting.calibration.verdict import (
+    IMPROBABLE,
+    SweepEvidence,
+    autocorrelation,
+    judge_calibration,
+    repeat_of,
+    runs_excess,
+)
+from fitting.fits.intervals import Interval, profile_intervals
+from fitting.tables.csv_text import TableError
+
+_PACKAGES = ("afm-jax", "jax", "optax", "numpy")
+
+
+def calibrate(
+    sweep: ResonanceSweep,
+    *,
+    background: str = "constant",
+    noise: float | None = None,
+    scale_errors: bool = False,
+    compare: bool = True,
+) -> Calibration:
+    """Fit frequency and quality factor of the free cantilever to a resonance sweep.
+
+    The frequency is the undamped natural one, Omega/2 pi of m z'' + (m Omega/Q) z' + k z = F cos(omega t); a base
+    that moves by d cos(omega t) is the force F = k d. The amplitude is largest a little lower, at
+    f0 sqrt(1 - 1/2Q^2), and a background moves the measured maximum further.
+
+    Args:
+        sweep: from `read_sweep`; its phase is used where it is there.
+        background: what is added to the response. With phase: "none", "constant" or "linear" (both complex). Amplitude
+            only: "none", "floor" (in quadrature) or "constant" (in quadrature and interfering).
+        noise: standard error of every point as a share of the largest amplitude, for a sweep without errors of its own.
+            Without either the errors are estimated from the misfit, and goodness of fit cannot be judged.
+        scale_errors: scale given errors such that chi2 equals its degrees of freedom.
+        compare: fit the other backgrounds too, for comparison.
+
+    Returns:
+        Values, errors, intervals, goodness of fit and a verdict; see `Calibration`.
+
+    Raises:
+        ValueError: if an option is impossible.
+        TableError: if the sweep has too few points for the model, or its amplitude is the same everywhere.
+        RuntimeError: if JAX is not set to 64-bit floats.
+    """
+    require_float64()
+    kind = kind_of(sweep)
+    _check_options(kind, background, noise)
+    _check_sweep(sweep, kind, background)
+    fit = fit_sweep(sweep, background, noise, scale_errors=scale_errors)
+    others = [name for name in TERMS[kind] if compare and name != background and _enough_points(sweep, kind, name)]
+    alternatives = [_alternative(refit(fit, sweep, name), name) for name in others]
+    return _summary(sweep, fit, background, alternatives)
+
+
+def _check_options(kind: str, background: str, noise: float | None) -> None:
+    if background not in TERMS[kind]:
+        what = "with" if kind == "phase" else "without"
+        raise ValueError(f"the background of a sweep {what} phase is {', '.join(TERMS[kind])}, but not {background!r}")
+    if noise is not None and not 0.0 < noise < 1.0:
+        raise ValueError(f"the relative noise must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
+
+
+def _enough_points(sweep: ResonanceSweep, kind: str, background: str) -> bool:
+    """Say whether a sweep has more numbers than the model has parameters, at enough frequencies."""
+    parameters = TERMS[kind][background] + 2
+    # A frequency gives one number or, with phase, two; one frequency more than needed leaves something to judge by.
+    needed = parameters // 2 + 1 if kind == "phase" else parameters + 1
+    return len(np.unique(sweep.frequency_khz)) >= needed
+
+
+def _check_sweep(sweep: ResonanceSweep, kind: str, background: str) -> None:
+    if not _enough_points(sweep, kind, background):
+        raise TableError(
+            f"{sweep.source}: {len(np.unique(sweep.frequency_khz))} frequencies are too few for the "
+            f"{TERMS[kind][background] + 2} parameters of the background '{background}'; measure at more"
+        )
+    turning = sweep.phase_deg is not None and np.ptp(sweep.phase_deg) > 0.0 and sweep.amplitude[0] > 0.0
+    if np.ptp(sweep.amplitude) == 0.0 and not turning:
+        value = f"{sweep.amplitude[0]:g} {sweep.amplitude_unit}".strip()
+        raise TableError(f"{sweep.source}: the amplitude is {value} at every frequency; sweep across a resonance")
+
+
+def _alternative(fit: SweepFit, background: str) -> Alternative:
+    variance = float(fit.covariance[1, 1])
+    return Alternative(
+        background=background,
+        frequency_khz=float(fit.values[0]),
+        quality_factor=float(fit.values[1]),
+        quality_factor_error=float(np.sqrt(variance)) if np.isfinite(variance) else None,
+        chi2=fit.chi2,
+        degrees_of_freedom=fit.freedom,
+        aic=fit.chi2 + 2.0 * len(fit.values),
+        residual_autocorrelation=autocorrelation(fit, 1),
+    )
+
+
+def _summary(sweep: ResonanceSweep, fit: SweepFit, background: str, alternatives: list[Alternative]) -> Calibration:
+    judged = fit.errors.origin != "estimated" and fit.errors.scale is None
+    p_value = float(chdtrc(fit.freedom, fit.chi2)) if judged else float("nan")
+    explained = not p_value < IMPROBABLE
+    frequency, quality_factor = _calibrated(fit, explained=explained)
+    kind, curves = fit.objective.kind, _curves(sweep, fit)
+    evidence = SweepEvidence(
+        sweep=sweep,
+        fit=fit,
+        frequency=frequency,
+        quality_factor=quality_factor,
+        p_value=p_value,
+        autocorrelation=autocorrelation(fit, 1),
+        repeat=repeat_of(fit),
+        runs_excess=runs_excess(fit, curves.amplitude_misfit),
+        chi2_without=sum_without_resonance(fit.objective.points, sweep.points, kind),
+        alternatives=alternatives,
+    )
+    reasons, warnings = judge_calibration(evidence)
+    errors = np.sqrt(np.diag(fit.covariance)[:2])
+    known = explained and bool(np.all(np.isfinite(errors)))
+    linear = fit.values[2:]
+    height = np.hypot(linear[0], linear[1]) if kind == "phase" else np.sqrt(max(linear[0], 0.0))
+    below_peak = 1.0 - 0.5 / quality_factor.value**2
+    return Calibration(
+        frequency_khz=frequency,
+        quality_factor=quality_factor,
+        peak_frequency_khz=frequency.value * float(np.sqrt(below_peak)) if below_peak > 0.0 else None,
+        peak_amplitude=float(height * sweep.amplitude.max()),
+        correlation=float(fit.covariance[0, 1] / errors[0] / errors[1]) if known else None,
+        model=kind,
+        background=background,
+        background_values=dict(zip(fit.objective.problem.names[2:], linear.tolist(), strict=True)),
+        phase_reversed=fit.reverse,
+        chi2=fit.chi2,
+        degrees_of_freedom=fit.freedom,
+        p_value=p_value,
+        errors=fit.errors,
+        residual_autocorrelation=evidence.autocorrelation,
+        residual_repeat=evidence.repeat,
+        runs_excess=evidence.runs_excess,
+        convergence=fit.convergence,
+        alternatives=alternatives,
+        curves=curves,
+        valid=not reasons,
+        reasons=reasons,
+        warnings=warnings,
+        sweep=sweep,
+        versions={name: version_of(name) for name in _PACKAGES},
+    )
+
+
+def _calibrated(fit: SweepFit, *, explained: bool) -> list[CalibratedValue]:
+    """Return frequency and quality factor with errors, or without where there is nothing to base them on."""
+    errors = np.sqrt(np.diag(fit.covariance)[:2])
+    if not explained:
+        reason = "the model does not explain the sweep"
+        return [CalibratedValue(float(value), None, (None, None), reason) for value in fit.values[:2]]
+    if not np.all(np.isfinite(errors)):
+        reason = "the sweep does not determine the parameters"
+        return [CalibratedValue(float(value), None, (None, None), reason) for value in fit.values[:2]]
+    # The linear parameters need no interval of their own: an infinite variance leaves them out.
+    profiled = fit.covariance.copy()
+    nuisances = np.arange(2, len(profiled))
+    profiled[nuisances, nuisances] = np.inf
+    intervals: list[Interval] = profile_intervals(fit.objective, fit.values, profiled, fit.chi2)
+    return [
+        CalibratedValue(float(value), float(error), (interval.low, interval.high), interval.reason)
+        for value, error, interval in zip(fit.values[:2], errors, intervals[:2], strict=True)
+    ]
+
+
+def _curves(sweep: ResonanceSweep, fit: SweepFit) -> Curves:
+    used = sweep.points
+    model = np.asarray(model_at(fit.values, fit.objective.points, fit.objective.kind))[:used]
+    amplitude = np.abs(model) * sweep.amplitude.max()
+    if sweep.phase_deg is None:
+        return Curves(amplitude, amplitude - sweep.amplitude, None, None)
+    between = np.rad2deg(np.angle(model * np.conj(np.asarray(fit.objective.points.measured)[:used])))
+    misfit = -between if fit.reverse else between
+    # Adding the misfit keeps the turns of the measured phase.
+    return Curves(amplitude, amplitude - sweep.amplitude, sweep.phase_deg + misfit, misfit)

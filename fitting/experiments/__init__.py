@@ -1,0 +1,1 @@
+"""Which drives to measure next, and what they will tell."""

@@ -1,0 +1,272 @@
+"""What is believed before an experiment is designed: parameter values, and what measurements so far say of them.
+
+The belief that a fit leaves: its values, its covariance, and the drives that were measured.
+"""
+
+import inspect
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from afm_jax.contact.contact import EFFECTS, Contact
+from fitting.fits.result import FitResult
+from fitting.models import (
+    CONTACT_NAMES,
+    NUISANCE_NAMES,
+    PARAMETERS,
+    Parameter,
+    Problem,
+    check_contact_values,
+    model_parameters,
+)
+
+_DELAY = {"delay_hertz": 0.206, "delay_lead_nm": 5.64, "delay_offset_nm": 0.726}
+_STARTING_LAWS = {
+    "restitution": {"r": 0.998},
+    "law": {"r": 0.998, "epsilon": 122.0},
+    "viscous": {"epsilon": 113.6, "viscous_loss": 0.5},
+}
+"""Laws of the paper's contact: a belief to begin with where nothing was measured."""
+UNCERTAINTY = 0.1
+"""How far a belief is off, relative, where no measurement says."""
+DRAW_SEED = 1997
+EXACT_QUALITY_FACTOR = (
+    "The quality factor is taken as exactly known, which makes every forecast too good: give it with its error, such "
+    "as '40 +- 2'."
+)
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Belief:
+    """What is believed of cantilever and law, and how sure that is.
+
+    Attributes:
+        problem: the model, its parameters and the uncertain quantities of the instrument.
+        values: believed values in the problem's order.
+        information: Fisher information of everything known so far, shape (p, p): measurements and constraints; 0 in a
+            direction of which nothing is known.
+        free_frequency_khz: of the cantilever.
+        quality_factor: of the cantilever; None: no air damping.
+        mass_ng: of the cantilever.
+        fixed: contact parameters that are not fitted and not the paper's.
+        uncertainty: how far values may be off, relative, where `information` does not say: an orbit that is not there
+            for some of these values is not planned with.
+        constraints: value and standard error of what is known apart from the measured drives; part of `information`.
+        measured: drives that were measured already, rows of order, frequency, amplitude, offset.
+        source: where the belief comes from, in words.
+        notes: what a reader of the design should know of it; a sentence each.
+    """
+
+    problem: Problem
+    values: Float[np.ndarray, " p"]
+    information: Float[np.ndarray, "p p"]
+    free_frequency_khz: float
+    quality_factor: float | None
+    mass_ng: float = 1.0
+    fixed: dict[str, float] = field(default_factory=dict)
+    uncertainty: float = UNCERTAINTY
+    constraints: dict[str, tuple[float, float]] = field(default_factory=dict)
+    measured: Float[np.ndarray, "rows 4"] = field(default_factory=lambda: np.zeros((0, 4)))
+    source: str = "values given"
+    notes: tuple[str, ...] = ()
+
+    def draws(self, count: int) -> Float[np.ndarray, "count p"]:
+        """Return values that are as likely as the belief is uncertain, the believed ones first; seeded."""
+        sizes = np.array([size_of(p, v) for p, v in zip(self.problem.parameters, self.values, strict=True)])
+        spread = self.uncertainty * sizes
+        # In units of the spread: the information then has eigenvalues of at least 1.
+        scaled = spread[:, None] * self.information * spread + np.eye(len(spread))
+        curvature, axes = np.linalg.eigh(scaled)
+        normal = np.random.default_rng(DRAW_SEED).normal(size=(count, len(spread)))
+        normal[0] = 0.0
+        values = self.values + spread * ((normal / np.sqrt(curvature)) @ axes.T)
+        ends = [(p.lowest, p.highest) for p in self.problem.parameters]
+        return np.clip(values, *np.array(ends).T)
+
+
+def size_of(parameter: Parameter, value: float) -> float:
+    """Return what a relative error of a parameter refers to: the loss (1 - r for r), else the value; never 0."""
+    size = abs(value - parameter.reference) if parameter.sign else abs(value)
+    return size or parameter.width or 1.0
+
+
+def believe(  # noqa: PLR0913
+    model: str = "law+delay",
+    *,
+    free_frequency_khz: float,
+    quality_factor: float | None = None,
+    mass_ng: float = 1.0,
+    values: Mapping[str, float] | None = None,
+    constraints: Mapping[str, tuple[float, float]] | None = None,
+    free: Sequence[str] | None = None,
+    fixed: Mapping[str, float] | None = None,
+    effects: Sequence[str] = EFFECTS,
+    uncertainty: float = UNCERTAINTY,
+) -> Belief:
+    """Return a belief made of values, before anything was measured.
+
+    Args:
+        model: a model of `fitting.fit`.
+        free_frequency_khz: of the cantilever.
+        quality_factor: of the cantilever; None: no air damping.
+        mass_ng: of the cantilever.
+        values: of the model's parameters; those not given are the paper's contact's.
+        constraints: value and standard error of what the instrument leaves uncertain: `quality_factor`,
+            `tip_calibration`, `drive_calibration`, `offset_origin_nm`; or of a parameter of the model.
+        free: for "contact": the parameters that are fitted.
+        fixed: for "contact": values of the others that are not the paper's.
+        effects: for "contact": the effects there are.
+        uncertainty: how far the values may be off, relative (0.1 stands for 10 %).
+
+    Raises:
+        ValueError: if a name or value is impossible.
+    """
+    own = model_parameters(model, None if free is None else tuple(free))
+    known = {name: (float(value), float(error)) for name, (value, error) in (constraints or {}).items()}
+    check_contact_values(model, dict(fixed or {}))
+    _check_constraints(model, own, known)
+    given = dict(values or {})
+    for name in given:
+        if name not in own:
+            raise ValueError(f"`values` names {name!r}, but the model {model!r} has {', '.join(own)}")
+    if not 0.0 < uncertainty < 1.0:
+        raise ValueError(f"`uncertainty` must be between 0 and 1, but is {uncertainty!r}; write 0.1 for 10 %")
+    problem = Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in known), tuple(effects))
+    assumed = [name for name in own if name not in given and name not in known]
+    start = _starting_values(model, own) | {name: value for name, (value, _) in known.items()} | given
+    return Belief(
+        problem=problem,
+        values=checked_values(problem, start),
+        information=np.diag([known[name][1] ** -2.0 if name in known else 0.0 for name in problem.names]),
+        free_frequency_khz=float(free_frequency_khz),
+        quality_factor=None if quality_factor is None else float(quality_factor),
+        mass_ng=float(mass_ng),
+        fixed=dict(fixed or {}),
+        uncertainty=uncertainty,
+        constraints=known,
+        source="values given" if not assumed else "values assumed",
+        notes=_assumptions(assumed, quality_factor, known),
+    )
+
+
+def _check_constraints(model: str, own: tuple[str, ...], known: Mapping[str, tuple[float, float]]) -> None:
+    for name, (value, error) in known.items():
+        if name not in (*own, *NUISANCE_NAMES):
+            choice = ", ".join((*own, *NUISANCE_NAMES))
+            raise ValueError(f"`constraints` names {name!r}, which is none of {choice}")
+        if not (np.isfinite(value) and 0.0 < error < np.inf):
+            raise ValueError(f"the constraint on {name} must be a value and a positive error, not {value} +- {error}")
+    if "offset_origin_nm" in known and model.endswith("+delay"):
+        raise ValueError(
+            "offset_origin_nm and delay_offset_nm shift the same thing: with a delay leave the error of the offsets' "
+            "origin out, or take the model 'contact'"
+        )
+
+
+def checked_values(problem: Problem, values: Mapping[str, float]) -> Float[np.ndarray, " p"]:
+    """Return values in the problem's order.
+
+    Raises:
+        ValueError: if one is outside of what its parameter can be.
+    """
+    for parameter in problem.parameters:
+        value = values[parameter.name]
+        if not np.isfinite(value) or not parameter.lowest <= value <= parameter.highest:
+            raise ValueError(
+                f"{parameter.name} must be between {parameter.lowest:g} and {parameter.highest:g}, but is {value!r}"
+            )
+    return np.array([float(values[name]) for name in problem.names])
+
+
+def _starting_values(model: str, own: tuple[str, ...]) -> dict[str, float]:
+    if model != "contact":
+        return _STARTING_LAWS[model.removesuffix("+delay")] | _DELAY
+    papers = inspect.signature(Contact.paper).parameters
+    return {name: float(papers[name].default) for name in CONTACT_NAMES if name in own and name in papers}
+
+
+def _assumptions(
+    assumed: list[str], quality_factor: float | None, known: Mapping[str, tuple[float, float]]
+) -> tuple[str, ...]:
+    notes = []
+    if assumed:
+        notes.append(
+            f"Not given, and taken from the paper's contact: {', '.join(assumed)}. The forecast is as good as these "
+            "values; design again from a first fit."
+        )
+    if quality_factor is not None and "quality_factor" not in known:
+        notes.append(EXACT_QUALITY_FACTOR)
+    return tuple(notes)
+
+
+def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNCERTAINTY) -> Belief:
+    """Return the belief that a fit leaves: its values, its covariance, and the drives that it used.
+
+    Args:
+        result: from `fitting.fit`, or its JSON (`afm-jax fit --json`) as a mapping.
+        uncertainty: how far values may be off, relative, where the fit does not say.
+
+    Raises:
+        ValueError: if the mapping is no fit, or its correlations are impossible.
+    """
+    payload = result.to_dict() if isinstance(result, FitResult) else result
+    _check_payload(payload)
+    found, table, settings = payload["parameters"], payload["input"], payload.get("settings") or {}
+    problem = Problem(payload["model"], tuple(found), tuple(settings.get("effects") or EFFECTS))
+    columns = ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")
+    notes = []
+    if not payload["valid"]:
+        reason = " ".join(payload.get("reasons") or ["no reason given."])
+        notes.append(f"The fit that the design rests on is not valid: {reason}")
+    if table.get("quality_factor") is not None and "quality_factor" not in found:
+        notes.append(EXACT_QUALITY_FACTOR)
+    return Belief(
+        problem=problem,
+        values=checked_values(problem, {name: entry["value"] for name, entry in found.items()}),
+        information=_information(found, payload["correlations"]["matrix"]),
+        free_frequency_khz=float(table["free_frequency_khz"]),
+        quality_factor=table.get("quality_factor"),
+        mass_ng=float(table.get("mass_ng", 1.0)),
+        fixed=dict(settings.get("fixed") or {}),
+        uncertainty=uncertainty,
+        constraints={
+            name: (float(entry["constraint"][0]), float(entry["constraint"][1]))
+            for name, entry in found.items()
+            if entry.get("constraint")
+        },
+        measured=np.array([table[name] for name in columns], float).T,
+        source=f"fit of {table.get('source', 'a table')}",
+        notes=tuple(notes),
+    )
+
+
+def _information(found: Mapping[str, Any], correlations: Sequence[Sequence[float | None]]) -> Float[np.ndarray, "p p"]:
+    """Return the Fisher information of a fit: of what it determined, and the constraints on what it did not."""
+    matrix = np.array([[np.nan if c is None else c for c in row] for row in correlations], float)
+    error = np.array([np.nan if e["standard_error"] is None else e["standard_error"] for e in found.values()], float)
+    known = np.isfinite(error) & np.isfinite(np.diag(matrix)) & (error > 0.0)
+    information = np.zeros((len(error), len(error)))
+    places = np.ix_(known, known)
+    weight = np.where(known, 1.0 / np.where(known, error, 1.0), 0.0)
+    if known.any() and (not np.all(np.isfinite(matrix[places])) or np.linalg.eigvalsh(matrix[places])[0] < 1e-14):
+        raise ValueError("the saved fit's correlations contradict each other; fit the table again")
+    # Errors far apart in size: invert the correlations, which have none.
+    information[places] = np.linalg.inv(matrix[places]) * np.outer(weight, weight)[places] if known.any() else 0.0
+    for i, entry in enumerate(found.values()):
+        if not known[i] and entry.get("constraint"):
+            information[i, i] = float(entry["constraint"][1]) ** -2.0
+    return information
+
+
+def _check_payload(payload: Mapping[str, Any]) -> None:
+    if payload.get("format") != "afm-jax fit":
+        raise ValueError("this is no saved fit; give the JSON that `afm-jax fit TABLE.csv --json` or --out writes")
+    for key in ("model", "parameters", "correlations", "input", "valid"):
+        if key not in payload:
+            raise ValueError(f"the saved fit lacks {key!r}; write it again with `afm-jax fit TABLE.csv --json`")
+    for name in payload["parameters"]:
+        if name not in PARAMETERS:
+            raise ValueError(f"the saved fit has the unknown parameter {name!r}; fit the table again")

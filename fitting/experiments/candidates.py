@@ -1,0 +1,217 @@
+"""Candidates of an experiment: what a measurement at each drive would read, and what it would say of the law.
+
+What can be driven: the grid of drives among which an experiment is designed.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Shaped
+
+from fitting.experiments.belief import Belief
+from fitting.fits.minimum import strain_of
+from fitting.fits.objective import BATCH, Objective
+from fitting.models import Measurement, measurement_of
+from fitting.simulated.experiment import Drives
+from fitting.tables.table import AmplitudeTable
+
+MOST = 20_000
+"""Drives that a design looks at: some minutes of computing."""
+Numbers = Sequence[int | float] | Shaped[np.ndarray, " n"]
+
+
+def drive_grid(
+    *,
+    orders: Numbers,
+    amplitudes_nm: Numbers,
+    offsets_nm: Numbers = (0.0,),
+    frequencies_khz: Numbers | None = None,
+    detunings: Numbers | None = None,
+    free_frequency_khz: float | None = None,
+) -> Drives:
+    """Return every combination of what can be driven, each once.
+
+    Args:
+        orders: N, drive periods per impact.
+        amplitudes_nm: of the platform.
+        offsets_nm: mean heights of the platform above the tip's rest position.
+        frequencies_khz: of the drive, the same for every order; or
+        detunings: drive frequencies as multiples of each order's resonance 2 N f0, with
+        free_frequency_khz: f0.
+
+    Raises:
+        ValueError: if a list is empty or a number impossible, not exactly one of both kinds of frequency is given, or
+            there are too many combinations.
+    """
+    _check_list("orders", orders, positive=True)
+    if any(order != int(order) for order in orders):
+        raise ValueError(f"`orders` must hold whole numbers, but is {list(orders)}")
+    _check_list("amplitudes_nm", amplitudes_nm, positive=True)
+    _check_list("offsets_nm", offsets_nm, positive=False)
+    if (frequencies_khz is None) == (detunings is None):
+        raise ValueError("give either `frequencies_khz` or `detunings`, what the drive frequency can be")
+    for name, numbers in (("frequencies_khz", frequencies_khz), ("detunings", detunings)):
+        if numbers is not None:
+            _check_list(name, numbers, positive=True)
+    rows = [
+        (order, frequency, amplitude, offset)
+        for order in map(int, orders)
+        for frequency in _frequencies(order, frequencies_khz, detunings, free_frequency_khz)
+        for amplitude in amplitudes_nm
+        for offset in offsets_nm
+    ]
+    rows = list(dict.fromkeys((order, *map(float, rest)) for order, *rest in rows))
+    if len(rows) > MOST:
+        raise ValueError(f"these are {len(rows)} drives, more than the {MOST} a design looks at; take coarser steps")
+    columns = np.array(rows, float).T
+    return Drives(columns[0].astype(np.int64), *columns[1:])
+
+
+def same_drives(drives: Drives, others: Float[np.ndarray, "others 4"]) -> np.ndarray:
+    """Say which drives are among others, given as rows of order, frequency, amplitude and offset."""
+    known = {_key(row) for row in others.tolist()}
+    return np.array([_key(row) in known for row in zip(*(column.tolist() for column in drives), strict=True)])
+
+
+def _key(row: Sequence[int | float]) -> tuple[float, ...]:
+    """Return a drive as rounding cannot change it: an instrument sets nothing to twelve digits."""
+    return tuple(float(f"{number:.9g}") + 0.0 for number in row)
+
+
+def _frequencies(
+    order: int,
+    frequencies_khz: Numbers | None,
+    detunings: Numbers | None,
+    free_frequency_khz: float | None,
+) -> list[float]:
+    if detunings is None:
+        return [] if frequencies_khz is None else [float(frequency) for frequency in frequencies_khz]
+    if free_frequency_khz is None:
+        raise ValueError("`detunings` need `free_frequency_khz`, the cantilever's resonance")
+    # Rounded to what an instrument is told: a thousandth of a hertz.
+    return [round(2.0 * order * free_frequency_khz * detuning, 6) for detuning in detunings]
+
+
+def _check_list(name: str, numbers: Numbers, *, positive: bool) -> None:
+    if len(numbers) == 0:
+        raise ValueError(f"`{name}` is empty; give at least one number")
+    for number in numbers:
+        if not np.isfinite(number) or (positive and number <= 0.0):
+            raise ValueError(f"`{name}` must hold {'positive' if positive else 'finite'} numbers, but one is {number}")
+
+
+AMPLITUDES = ("both", "peak", "lockin")
+USABLE = ""
+LEFT_OUT = {
+    "measured": "already measured",
+    "no orbit": "no steady single-impact orbit",
+    "several orbits": "several steady orbits: which one is seen depends on the start",
+    "fold": "near a fold, where the orbit ends and has no derivative",
+    "unsure": "no single steady orbit for some of the values that the belief allows",
+    "too large": "amplitudes above what the instrument takes",
+    "strained": "impacts too slow for the model: a fit sets such rows aside",
+}
+"""Why a drive is no candidate, in words."""
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """Drives, what is expected of each, and which of them can be planned with.
+
+    Attributes:
+        drives: all that can be driven.
+        why_not: a key of `LEFT_OUT` for each drive; empty for those that can be planned with.
+        amplitude_nm: expected peak and lock-in amplitude, shape (rows, 2).
+        error_nm: standard errors of their measurement, the model's own error included; infinite where not measured.
+        approach_speed_nm_per_us: expected.
+        slope: d amplitude/d parameter in units of the error, shape (rows, 2, p); 0 where not usable.
+    """
+
+    drives: Drives
+    why_not: tuple[str, ...]
+    amplitude_nm: Float[np.ndarray, "rows 2"]
+    error_nm: Float[np.ndarray, "rows 2"]
+    approach_speed_nm_per_us: Float[np.ndarray, " rows"]
+    slope: Float[np.ndarray, "rows 2 p"]
+
+    @property
+    def usable(self) -> Bool[np.ndarray, " rows"]:
+        """Which drives can be planned with."""
+        return np.array([reason == USABLE for reason in self.why_not], dtype=bool)
+
+    @property
+    def information(self) -> Float[np.ndarray, "rows p p"]:
+        """The Fisher information of a measurement at each drive."""
+        return np.einsum("nap,naq->npq", self.slope, self.slope)
+
+    @property
+    def left_out(self) -> dict[str, int]:
+        """How many drives are left out for each reason."""
+        return {name: self.why_not.count(name) for name in LEFT_OUT if name in self.why_not}
+
+
+def candidates_of(
+    belief: Belief, drives: Drives, *, noise: float, amplitudes: str = "both", largest_nm: float = np.inf
+) -> Candidates:
+    """Return what a measurement at every drive would say, by derivatives of the predicted amplitudes.
+
+    Args:
+        belief: the law and the instrument; orbits must be there for values as uncertain as it is.
+        drives: what can be driven.
+        noise: standard error of an amplitude relative to it.
+        amplitudes: what is read: "peak", "lockin" or "both".
+        largest_nm: peak amplitude that the instrument takes.
+    """
+    objective = Objective(_measurement(belief, drives, amplitudes), belief.problem)
+    linear = objective.at_values(belief.draws(BATCH))
+    strain = strain_of(objective, belief.values)
+    count = len(drives.order)
+    prediction = linear.prediction
+    amplitude = np.asarray(prediction.amplitude_nm)[0, :count]
+    read = np.array([amplitudes != "lockin", amplitudes != "peak"])
+    error = np.where(read, np.hypot(noise, strain.model_error[:count, None]) * amplitude, np.inf)
+    raw = np.asarray(linear.jacobian)[0, : 2 * count].reshape(count, 2, -1)
+    orbits = np.asarray(prediction.orbits)[:, :count]
+    fold = np.asarray(prediction.near_fold)[:, :count]
+    holds = {
+        "measured": same_drives(drives, belief.measured),
+        "no orbit": orbits[0] == 0,
+        "several orbits": orbits[0] > 1,
+        "fold": fold[0] | ~np.isfinite(raw).all(axis=(1, 2)),
+        "unsure": np.any((orbits != 1) | fold, axis=0),
+        "too large": amplitude[:, 0] > largest_nm,
+        "strained": strain.set_aside[:count],
+    }
+    why_not = tuple(next((name for name in LEFT_OUT if holds[name][row]), USABLE) for row in range(count))
+    usable = np.array([reason == USABLE for reason in why_not])
+    safe = np.where(usable[:, None] & np.isfinite(error), error, np.inf)
+    return Candidates(
+        drives=drives,
+        why_not=why_not,
+        amplitude_nm=amplitude,
+        error_nm=error,
+        approach_speed_nm_per_us=np.asarray(prediction.approach_speed_nm_per_us)[0, :count],
+        slope=np.where(usable[:, None, None], raw, 0.0) / safe[:, :, None],
+    )
+
+
+def _measurement(belief: Belief, drives: Drives, amplitudes: str) -> Measurement:
+    """Return the drives as a measurement of 1 nm with an error of 1 nm: its Jacobian is that of the amplitudes."""
+    one = np.ones(len(drives.order))
+    peak, lockin = (one if amplitudes in ("both", name) else None for name in ("peak", "lockin"))
+    table = AmplitudeTable(
+        order=drives.order,
+        drive_frequency_khz=drives.frequency_khz,
+        drive_amplitude_nm=drives.amplitude_nm,
+        offset_nm=drives.offset_nm,
+        free_frequency_khz=belief.free_frequency_khz,
+        quality_factor=belief.quality_factor,
+        mass_ng=belief.mass_ng,
+        source="the drives",
+        peak_amplitude_nm=peak,
+        peak_amplitude_error_nm=peak,
+        lockin_amplitude_nm=lockin,
+        lockin_amplitude_error_nm=lockin,
+    )
+    return measurement_of(table, belief.problem, fixed=belief.fixed)

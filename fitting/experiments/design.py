@@ -1,0 +1,345 @@
+"""The design of an experiment: which drives to measure next, so that the law is known best.
+
+What measurements say of parameters: Fisher information, its inverse, and how good a set of measurements is by it.
+
+Choosing points: greedily, then exchanged one by one until no exchange helps (Fedorov), then in the best order.
+
+Whether to follow a design, in words: what makes it pointless, and what would help more than its points.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from afm_jax.checks import require_float64
+from afm_jax.version import version_of
+from fitting.experiments.belief import Belief, belief_of_fit, size_of
+from fitting.experiments.candidates import AMPLITUDES, LEFT_OUT, Candidates, candidates_of
+from fitting.experiments.result import Design
+from fitting.fits.least_squares import covariance_of
+from fitting.fits.result import FitResult
+from fitting.models import DELAY_NAMES, NUISANCE_NAMES
+from fitting.simulated.experiment import Drives
+
+CRITERIA = ("D", "A")
+_RIDGE = 1e-9
+"""Information added to every parameter, relative to that of all candidates together, while points are chosen: with it
+the first points, which alone determine nothing, can be compared."""
+
+
+class Criterion(NamedTuple):
+    """How good an information matrix is for the parameters that matter; more is better.
+
+    D: log det of the information about them, the others marginalised, log det F - log det F_nuisances. A: minus the sum
+    of their variances, each in units of the parameter's size squared.
+    """
+
+    kind: str
+    matters: Bool[np.ndarray, " p"]
+    size: Float[np.ndarray, " p"]
+    ridge: Float[np.ndarray, " p"]
+
+    def __call__(self, information: Float[np.ndarray, "n p p"]) -> Float[np.ndarray, " n"]:
+        """Return the score of every information matrix."""
+        unit = 1.0 / np.sqrt(self.ridge / _RIDGE)
+        scaled = unit[:, None] * information * unit + _RIDGE * np.eye(len(unit))
+        if self.kind == "A":
+            variance = np.diagonal(np.linalg.inv(scaled), axis1=1, axis2=2) * unit**2
+            return -np.sum((variance / self.size**2)[:, self.matters], axis=1)
+        nuisances = np.flatnonzero(~self.matters)
+        whole = np.linalg.slogdet(scaled)[1]
+        if nuisances.size == 0:
+            return whole
+        return whole - np.linalg.slogdet(scaled[:, nuisances[:, None], nuisances])[1]
+
+
+def criterion_of(
+    kind: str,
+    matters: Bool[np.ndarray, " p"],
+    size: Float[np.ndarray, " p"],
+    largest: Float[np.ndarray, "p p"],
+) -> Criterion:
+    """Return the criterion for choosing among candidates.
+
+    Args:
+        kind: "D" or "A".
+        matters: which parameters are to be known well.
+        size: of every parameter, what a relative error refers to.
+        largest: information of all candidates and all that is known, together: it sets the scale of the ridge.
+    """
+    strength = np.diag(largest)
+    return Criterion(kind, matters, size, _RIDGE * np.where(strength > 0.0, strength, size**-2.0))
+
+
+def standard_errors(information: Float[np.ndarray, "p p"]) -> Float[np.ndarray, " p"]:
+    """Return the standard error of every parameter, the others unknown; infinite where it is not determined."""
+    return np.sqrt(np.diag(covariance_of(information)))
+
+
+_ROUNDS = 50
+_BETTER = 1e-9
+"""Gain below which an exchange is rounding."""
+
+
+def choose_points(
+    prior: Float[np.ndarray, "p p"], each: Float[np.ndarray, "n p p"], points: int, criterion: Criterion
+) -> Int[np.ndarray, " points"]:
+    """Return the numbers of the chosen candidates, each once, in the order in which they help most.
+
+    Args:
+        prior: information of what is known already.
+        each: information of a measurement at every candidate.
+        points: how many to choose; at most n are.
+        criterion: what makes an information matrix good.
+    """
+    points = min(points, len(each))
+    if points == 0:
+        return np.zeros(0, dtype=np.int64)
+    chosen = _greedy(prior, each, np.arange(len(each)), points, criterion)
+    chosen = _exchanged(prior, each, chosen, criterion)
+    return np.array(_greedy(prior, each, np.sort(chosen), points, criterion), dtype=np.int64)
+
+
+def _greedy(
+    prior: Float[np.ndarray, "p p"],
+    each: Float[np.ndarray, "n p p"],
+    among: Int[np.ndarray, " k"],
+    points: int,
+    criterion: Criterion,
+) -> list[int]:
+    """Return candidates taken one after another, each the best addition to those before."""
+    left, chosen, information = among.tolist(), [], prior
+    for _ in range(points):
+        best = left.pop(int(np.argmax(criterion(information + each[left]))))
+        chosen.append(best)
+        information = information + each[best]
+    return chosen
+
+
+def _exchanged(
+    prior: Float[np.ndarray, "p p"], each: Float[np.ndarray, "n p p"], chosen: list[int], criterion: Criterion
+) -> list[int]:
+    """Return a choice that no exchange of one of its points makes better."""
+    chosen = list(chosen)
+    for _ in range(_ROUNDS):
+        before = chosen.copy()
+        for place in range(len(chosen)):
+            others = [point for point in chosen if point != chosen[place]]
+            score = criterion(prior + each[others].sum(axis=0) + each)
+            current = score[chosen[place]]
+            score[others] = -np.inf
+            best = int(np.argmax(score))
+            if score[best] > current + _BETTER * abs(current):
+                chosen[place] = best
+        if chosen == before:
+            break
+    return chosen
+
+
+_MOSTLY = 0.7
+"""Share of a standard error that is left if a quantity of the instrument were exactly known, below which that quantity
+is most of the variance."""
+_ROUGH = 0.5
+"""Standard error relative to a loss beyond which a linear forecast of it is rough."""
+
+
+def judge_design(
+    belief: Belief,
+    candidates: Candidates,
+    chosen: Int[np.ndarray, " points"],
+    steps: Float[np.ndarray, "steps p p"],
+    wanted: tuple[str, ...],
+    points: int,
+) -> tuple[list[str], list[str]]:
+    """Return what makes a design invalid, and its warnings; each a sentence.
+
+    Args:
+        belief: what it rests on.
+        candidates: among which was chosen.
+        chosen: their numbers.
+        steps: information so far and after each point.
+        wanted: the parameters that matter.
+        points: how many were asked for.
+    """
+    names = belief.problem.names
+    errors = dict(zip(names, standard_errors(steps[-1]).tolist(), strict=True))
+    unknown = [name for name in wanted if not np.isfinite(errors[name])]
+    if not len(chosen):
+        counts = [f"{LEFT_OUT[name]}: {count}" for name, count in candidates.left_out.items()]
+        return [f"No drive can be planned with ({'; '.join(counts)}); try others."], list(belief.notes)
+    reasons = []
+    if unknown:
+        reasons.append(
+            f"The chosen points do not determine {' and '.join(unknown)}: choose more points, or drives at more "
+            "frequencies, amplitudes, orders or offsets."
+        )
+    warnings = list(belief.notes)
+    if len(chosen) < points:
+        warnings.append(f"Only {len(chosen)} of the {points} points asked for can be planned with: all are chosen.")
+    warnings += _dominated(belief, steps[-1], errors, wanted)
+    for name in wanted:
+        index = names.index(name)
+        size = size_of(belief.problem.parameters[index], float(belief.values[index]))
+        if np.isfinite(errors[name]) and errors[name] > _ROUGH * size:
+            what = "1 - r" if name == "r" else name
+            warnings.append(
+                f"The forecast for {name} is rough: its error is {errors[name] / size:.0%} of {what} itself. Expect a "
+                "one-sided limit rather than a value."
+            )
+    warnings += _edges(candidates, chosen)
+    return reasons, warnings
+
+
+def _dominated(
+    belief: Belief, information: Float[np.ndarray, "p p"], errors: dict[str, float], wanted: tuple[str, ...]
+) -> list[str]:
+    """Name the quantities of the instrument whose uncertainty is most of the error of a parameter that matters."""
+    names = belief.problem.names
+    warnings = []
+    for nuisance in (name for name in names if name in NUISANCE_NAMES and name not in wanted):
+        rest = [i for i, name in enumerate(names) if name != nuisance]
+        without = dict(
+            zip((names[i] for i in rest), standard_errors(information[np.ix_(rest, rest)]).tolist(), strict=True)
+        )
+        led = [n for n in wanted if np.isfinite(errors[n]) and without[n] < _MOSTLY * errors[n]]
+        if led:
+            gains = " and ".join(f"{name} to {without[name]:.2g} instead of {errors[name]:.2g}" for name in led)
+            warnings.append(
+                f"Most of the error comes from {nuisance}: if that were exactly known, these points would determine "
+                f"{gains}. Measure it better before adding points."
+            )
+    return warnings
+
+
+def _edges(candidates: Candidates, chosen: Int[np.ndarray, " points"]) -> list[str]:
+    """Say where most points lie at the end of what can be driven: a wider range may then be better."""
+    drives, usable = candidates.drives, candidates.usable
+    warnings = []
+    for column, what in ((drives.amplitude_nm, "drive amplitude"), (drives.offset_nm, "offset")):
+        for end, word in ((column.min(), "smallest"), (column.max(), "largest")):
+            share = float(np.mean(column[chosen] == end))
+            if len(np.unique(column[usable])) > 1 and share > 0.5 and len(chosen) > 1:
+                warnings.append(
+                    f"{share:.0%} of the points are at the {word} {what}, {end:g} nm: a wider range may be better."
+                )
+    return warnings
+
+
+_PACKAGES = ("afm-jax", "jax", "numpy")
+
+
+def design(  # noqa: PLR0913
+    belief: Belief | FitResult,
+    drives: Drives,
+    *,
+    points: int = 8,
+    noise: float = 0.01,
+    interest: Sequence[str] | None = None,
+    criterion: str = "D",
+    amplitudes: str = "both",
+    largest_nm: float | None = None,
+) -> Design:
+    """Choose the drives to measure next, and forecast how well the parameters will then be known.
+
+    The forecast is the Fisher information: derivatives of the predicted amplitudes by every parameter at the believed
+    values, by automatic differentiation through the orbits. Every drive is chosen once. A drive is left out where the
+    belief has no steady single-impact orbit, or several, or is not sure of it, and where a fit would set its row aside.
+
+    Args:
+        belief: from `believe`, or a fit whose measurements are to be added to.
+        drives: what can be driven, from `drive_grid`.
+        points: how many to choose.
+        noise: standard error of an amplitude relative to it (0.01 stands for 1 %).
+        interest: the parameters to be known well, all others being unknown too; None: those of the law.
+        criterion: "D": the smallest volume of their joint confidence region; "A": the smallest sum of their variances,
+            each relative to the parameter (to the loss 1 - r for r).
+        amplitudes: what is read of each point: "peak", "lockin" or "both".
+        largest_nm: peak amplitude that the instrument takes; None: any.
+
+    Returns:
+        The points in the order of their use, with expected readings and errors; see `Design`.
+
+    Raises:
+        ValueError: if an option is impossible.
+        RuntimeError: if JAX is not set to 64-bit floats.
+    """
+    require_float64()
+    believed = belief_of_fit(belief) if isinstance(belief, FitResult) else belief
+    wanted = _interest(believed, interest)
+    _check_options(points, noise, criterion, amplitudes, largest_nm)
+    largest = np.inf if largest_nm is None else float(largest_nm)
+    candidates = candidates_of(believed, drives, noise=noise, amplitudes=amplitudes, largest_nm=largest)
+    measure = _criterion(believed, candidates, wanted, criterion)
+    usable, each = np.flatnonzero(candidates.usable), candidates.information
+    chosen = usable[choose_points(believed.information, each[usable], points, measure)]
+    steps = believed.information + np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each[chosen], axis=0)])
+    reasons, warnings = judge_design(believed, candidates, chosen, steps, wanted, points)
+    return Design(
+        belief=believed,
+        interest=wanted,
+        criterion=criterion,
+        noise=float(noise),
+        candidates=candidates,
+        chosen=chosen,
+        errors=np.array([standard_errors(information) for information in steps]),
+        gain=_gain(measure, steps[-1], candidates),
+        valid=not reasons,
+        reasons=reasons,
+        warnings=warnings,
+        settings={
+            "points": points,
+            "noise": noise,
+            "interest": list(wanted),
+            "criterion": criterion,
+            "amplitudes": amplitudes,
+            "largest_nm": largest_nm,
+            "uncertainty": believed.uncertainty,
+            "drives": len(drives.order),
+        },
+        versions={name: version_of(name) for name in _PACKAGES},
+    )
+
+
+def _interest(belief: Belief, interest: Sequence[str] | None) -> tuple[str, ...]:
+    """Return the parameters that matter: those asked for, or the law's without its delay."""
+    problem = belief.problem
+    if interest is None:
+        return tuple(name for name in problem.own if name not in DELAY_NAMES)
+    for name in interest:
+        if name not in problem.names:
+            raise ValueError(f"`interest` names {name!r}, but the design has {', '.join(problem.names)}")
+    if not interest or len(set(interest)) < len(interest):
+        raise ValueError("`interest` must name at least one parameter, and none twice")
+    return tuple(interest)
+
+
+def _check_options(points: int, noise: float, criterion: str, amplitudes: str, largest_nm: float | None) -> None:
+    if points < 1:
+        raise ValueError(f"`points` must be at least 1, but is {points}")
+    if not 0.0 < noise < 1.0:
+        raise ValueError(f"`noise` must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
+    if criterion not in CRITERIA:
+        raise ValueError(f"`criterion` must be one of {', '.join(CRITERIA)}, but is {criterion!r}")
+    if amplitudes not in AMPLITUDES:
+        raise ValueError(f"`amplitudes` must be one of {', '.join(AMPLITUDES)}, but is {amplitudes!r}")
+    if largest_nm is not None and not largest_nm > 0.0:
+        raise ValueError(f"`largest_nm` must be positive, but is {largest_nm!r}")
+
+
+def _criterion(belief: Belief, candidates: Candidates, wanted: tuple[str, ...], kind: str) -> Criterion:
+    problem = belief.problem
+    return criterion_of(
+        kind,
+        matters=np.array([name in wanted for name in problem.names]),
+        size=np.array([size_of(p, v) for p, v in zip(problem.parameters, belief.values.tolist(), strict=True)]),
+        largest=belief.information + candidates.information.sum(axis=0),
+    )
+
+
+def _gain(criterion: Criterion, reached: Float[np.ndarray, "p p"], candidates: Candidates) -> Float[np.ndarray, " n"]:
+    """Return what one more measurement at each candidate would add to what was reached."""
+    before, after = criterion(reached[None]), criterion(reached + candidates.information)
+    gain = after - before if criterion.kind == "D" else 1.0 - after / before
+    return np.where(candidates.usable, gain, np.nan)

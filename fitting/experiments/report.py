@@ -1,0 +1,232 @@
+"""A design as a person reads it: text for the terminal, files to take to the instrument (JSON, CSV, PNG).
+
+The picture of a design: errors against the number of points, and what each drive would add.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from afm_jax.plots.picture_style import ACCENT, BLUE, GRID, label_axes, new_figure
+from afm_jax.words import bullets, interval, known, text_table, value_alone
+from fitting.experiments.belief import size_of
+from fitting.experiments.candidates import LEFT_OUT
+from fitting.experiments.result import Design, Forecast
+from fitting.models import NUISANCE_NAMES
+
+POINT_COLUMNS = (
+    "order",
+    "drive_frequency_khz",
+    "drive_amplitude_nm",
+    "offset_nm",
+    "expected_peak_amplitude_nm",
+    "expected_peak_amplitude_error_nm",
+    "expected_lockin_amplitude_nm",
+    "expected_lockin_amplitude_error_nm",
+    "expected_approach_speed_nm_per_us",
+)
+CANDIDATE_COLUMNS = (*POINT_COLUMNS, "chosen", "gain", "left_out")
+_CRITERIA = {"D": "D-optimal: smallest joint confidence region of", "A": "A-optimal: smallest sum of variances of"}
+Table = Callable[[str, list[dict[str, Any]], tuple[str, ...]], None]
+
+
+def design_summary(result: Design) -> str:
+    """Return the design as text: verdict, the points, what they will determine, notes."""
+    belief, count = result.belief, int(result.candidates.usable.sum())
+    lines = [
+        f"{len(result.chosen)} points to measure next, of {count} candidates ({belief.problem.model}, {belief.source})",
+        f"  {_CRITERIA[result.criterion]} {', '.join(result.interest)}; {100.0 * result.noise:g} % noise",
+        "",
+        "VALID" if result.valid else "NOT VALID: do not follow this design.",
+        *(f"  - {reason}" for reason in result.reasons),
+    ]
+    if len(result.chosen):
+        lines += ["", *_point_lines(result), "", *_forecast_lines(result)]
+    left_out = [f"  {number} left out: {LEFT_OUT[name]}" for name, number in result.candidates.left_out.items()]
+    lines += ["", f"  {count} of {len(result.candidates.why_not)} drives can be planned with.", *left_out]
+    lines += bullets("Notes:", result.warnings)
+    return "\n".join(lines)
+
+
+def write_design(result: Design, folder: Path, write_table: Table) -> list[Path]:
+    """Write design.txt, design.json, design.png, to_fill_in.csv, design.csv and candidates.csv into a folder.
+
+    to_fill_in.csv is an amplitude table of the points whose measured columns are empty: with the readings in them,
+    `afm-jax fit` takes it.
+
+    Args:
+        result: the design.
+        folder: an existing folder; files of these names are replaced.
+        write_table: called with a file name, records and columns for design.csv and candidates.csv.
+
+    Returns:
+        The files written here (the tables are `write_table`'s).
+
+    Raises:
+        OSError: if a file cannot be written.
+    """
+    from afm_jax.plots.picture_style import png_of  # noqa: PLC0415
+    from fitting.report.report import write_report_files  # noqa: PLC0415
+
+    blank = folder / "to_fill_in.csv"
+    text, data, picture = design_summary(result), result.to_dict(), png_of(design_figure(result))
+    written = write_report_files(folder, "design", text=text, data=data, picture=picture)
+    blank.write_text(table_to_fill_in(result), encoding="utf-8", newline="\n")
+    write_table("design.csv", result.points(), POINT_COLUMNS)
+    write_table("candidates.csv", result.all_candidates(), CANDIDATE_COLUMNS)
+    return [*written, blank]
+
+
+def table_to_fill_in(result: Design) -> str:
+    """Return an amplitude table of the points, the measured columns empty."""
+    belief, known = result.belief, result.belief.constraints
+    lines = [f"# free_frequency_khz = {belief.free_frequency_khz!r}", f"# mass_ng = {belief.mass_ng!r}"]
+    if belief.quality_factor is not None and "quality_factor" not in known:
+        lines.append(f"# quality_factor = {belief.quality_factor!r}")
+    instrument = [(name, *known[name]) for name in NUISANCE_NAMES if name in known]
+    lines += [f"# {name} = {value!r} +- {error!r}" for name, value, error in instrument]
+    read = [kind for kind in ("peak", "lockin") if result.settings["amplitudes"] in ("both", kind)]
+    columns = [f"{kind}_amplitude_nm,{kind}_amplitude_error_nm" for kind in read]
+    lines.append(",".join([*POINT_COLUMNS[:4], *columns]))
+    cells = "," * (2 * len(read))
+    lines += [",".join(repr(point[name]) for name in POINT_COLUMNS[:4]) + cells for point in result.points()]
+    return "\n".join(lines) + "\n"
+
+
+def _point_lines(result: Design) -> list[str]:
+    shown = result.interest[:4]
+    head = ["N", "kHz", "nm", "offset", "peak nm", "lock-in nm", "u_in", *(f"+- {name}"[:15] for name in shown)]
+    rows = [
+        [
+            f"{point['order']}",
+            f"{point['drive_frequency_khz']:.8g}",
+            f"{point['drive_amplitude_nm']:.5g}",
+            f"{point['offset_nm']:.4g}",
+            _reading(point, "peak"),
+            _reading(point, "lockin"),
+            f"{point['expected_approach_speed_nm_per_us']:.1f}",
+            *(known(point["standard_errors"][name], ".2g") for name in shown),
+        ]
+        for point in result.points()
+    ]
+    return [
+        *text_table(head, rows, words=()),
+        "  u_in in nm/us; +- columns: standard errors expected once this point and those above are measured",
+    ]
+
+
+def _forecast_lines(result: Design) -> list[str]:
+    head = ["", "believed", "+- now", "+- then", "95 % interval then"]
+    now, then = result.measured_so_far, result.expected
+    rows = [
+        [
+            f"{'*' if name in result.interest else ' '} {name}",
+            value_alone(then[name].value, then[name].standard_error, unknown=".6g"),
+            known(now[name].standard_error, ".2g"),
+            known(then[name].standard_error, ".2g"),
+            _interval(then[name]),
+        ]
+        for name in result.belief.problem.names
+    ]
+    return [*text_table(head, rows, words=(0, 4)), "  * what the points are chosen for"]
+
+
+def _reading(point: dict[str, Any], kind: str) -> str:
+    value = point.get(f"expected_{kind}_amplitude_nm")
+    if value is None:
+        return "-"
+    return f"{value:.1f} +- {point[f'expected_{kind}_amplitude_error_nm']:.1f}"
+
+
+def _interval(forecast: Forecast) -> str:
+    low, high = forecast.interval95
+    return "none" if low is None or high is None else f"{interval(low, high)} {forecast.unit}".rstrip()
+
+
+_COLOURS = (ACCENT, BLUE, "#009E73", "#CC79A7", "#D55E00", "#56B4E9")
+_MAP = "viridis_r"
+_INVALID = "#B00020"
+_SMALL = 9
+_MOST_ORDERS = 6
+_DASHES = ("--", ":", "-.")
+_UNKNOWN_PERCENT = 2e3
+
+
+def design_figure(result: Design) -> Figure:
+    """Return the figure: forecast errors on the left, a map of the gain per order (the first six) on the right."""
+    orders = np.unique(result.candidates.drives.order)[:_MOST_ORDERS]
+    figure = new_figure(12.0, 5.6)
+    left, right = np.asarray(figure.subfigures(1, 2, width_ratios=(1.0, 1.4)), dtype=object)
+    _draw_errors(left.subplots(), result)
+    rows = 1 if len(orders) == 1 else 2
+    panels = right.subplots(rows, -(-len(orders) // rows), squeeze=False).ravel()
+    gain = result.gain[np.isfinite(result.gain)]
+    scale = Normalize(0.0, float(gain.max()) if gain.size and gain.max() > 0.0 else 1.0)
+    for axes, order in zip(panels, orders, strict=False):
+        _draw_map(axes, result, int(order), scale)
+    for axes in panels[len(orders) :]:
+        axes.set_axis_off()
+    right.colorbar(ScalarMappable(scale, _MAP), ax=list(panels), shrink=0.8).set_label("gain of one more measurement")
+    title = f"{len(result.chosen)} points for {', '.join(result.interest)} ({result.belief.problem.model})"
+    figure.suptitle(title if result.valid else f"NOT VALID: {title}", color="black" if result.valid else _INVALID)
+    return figure
+
+
+def _draw_errors(axes: Axes, result: Design) -> None:
+    """Draw every parameter's standard error, relative to its size, against the number of points."""
+    count = np.arange(len(result.errors))
+    colours, dashes = iter(_COLOURS * len(result.interest)), iter(_DASHES * len(result.errors.T))
+    for parameter, value, errors in zip(
+        result.belief.problem.parameters, result.belief.values.tolist(), result.errors.T, strict=True
+    ):
+        share = 100.0 * np.where(np.isfinite(errors), errors, np.nan) / size_of(parameter, value)
+        if not np.isfinite(share).any():
+            continue
+        label = "1 - r" if parameter.name == "r" else parameter.name
+        if parameter.name in result.interest:
+            axes.plot(count, share, "o-", color=next(colours), lw=2.0, ms=5, label=label, zorder=3)
+        else:
+            axes.plot(count, share, linestyle=next(dashes), marker=".", color=GRID, lw=1.2, label=label)
+    axes.set_yscale("log")
+    # beyond that a parameter is as good as unknown
+    axes.set_ylim(top=min(axes.get_ylim()[1], _UNKNOWN_PERCENT))
+    axes.grid(color=GRID, alpha=0.25)
+    label_axes(axes, x="points measured", y="expected standard error (%)")
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=_SMALL, loc="best")
+
+
+def _draw_map(axes: Axes, result: Design, order: int, scale: Normalize) -> None:
+    """Draw the gain over frequency and drive amplitude, the best of the offsets, with the chosen points."""
+    drives, usable = result.candidates.drives, result.candidates.usable
+    here = drives.order == order
+    places = np.stack([drives.frequency_khz, drives.amplitude_nm], axis=1)
+    open_places = {tuple(place) for place in places[here & usable].tolist()}
+    lost = [place for place in places[here & ~usable].tolist() if tuple(place) not in open_places]
+    axes.plot(*np.array(lost).reshape(-1, 2).T, "x", color=GRID, ms=3)
+    # the highest gain is drawn last
+    rows = np.flatnonzero(here & usable)
+    rows = rows[np.argsort(result.gain[rows], kind="stable")]
+    axes.scatter(*places[rows].T, c=result.gain[rows], cmap=_MAP, norm=scale, s=26, marker="s", linewidths=0)
+    numbers: dict[tuple[float, float], list[str]] = {}
+    for number, row in enumerate(result.chosen.tolist(), start=1):
+        if drives.order[row] == order:
+            x, y = places[row].tolist()
+            numbers.setdefault((x, y), []).append(str(number))
+    for place, labels in numbers.items():
+        axes.plot(*place, "o", ms=11, mfc="none", mec=ACCENT, mew=1.5)
+        axes.annotate(",".join(labels), place, (5, 6), textcoords="offset points", fontsize=8, color=ACCENT)
+    axes.set_title(f"order {order}", fontsize=_SMALL)
+    label_axes(axes, x="drive (kHz)", y="drive (nm)")
+    axes.xaxis.label.set_fontsize(_SMALL)
+    axes.yaxis.label.set_fontsize(_SMALL)
+    axes.tick_params(labelsize=8)
+    axes.margins(0.08, 0.15)

@@ -1,0 +1,1 @@
+"""The fit of an impact law: screen, polish, check, intervals, verdict, comparison."""

@@ -1,0 +1,209 @@
+"""Models compared on the same table: information criteria, and in plain words what the measurement can tell."""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from afm_jax.checks import require_float64
+from fitting.fits.fit import Found, find_fit, summarise
+from fitting.fits.minimum import Strain, relaxed, settle
+from fitting.fits.result import FitResult
+from fitting.models import LAWS, model_parameters
+from fitting.tables.table import AmplitudeTable
+
+_T = TypeVar("_T")
+_EVEN, _LEANS, _PLAIN = 2.0, 6.0, 10.0
+"""Differences of AIC up to which models are even, one is favoured, and one is clearly favoured."""
+_MEANING = {
+    "restitution": "a restitution without adhesion (r)",
+    "law": "a restitution with adhesion (r, epsilon)",
+    "viscous": "a loss linear in speed with adhesion (epsilon, viscous_loss)",
+    "contact": "the resolved contact",
+}
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Models of one table, the best one first.
+
+    Attributes:
+        rows: for each model its name, chi2, degrees_of_freedom, aic, bic, delta_aic (to the best), and law_change, the
+            largest relative difference of its rebound speed to the best one's over the measured speeds.
+        verdict: what the measurement tells, a sentence or two.
+        results: the fit of every model, by name.
+        failed: of every model that could not be fitted, why.
+    """
+
+    rows: list[dict[str, Any]]
+    verdict: str
+    results: dict[str, FitResult]
+    failed: dict[str, str] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return rows, verdict and failures, without the fits."""
+        return {"rows": self.rows, "verdict": self.verdict, "failed": self.failed}
+
+
+def rivals(model: str) -> tuple[str, ...]:
+    """Return the models that a model is usually compared with, itself first."""
+    if model == "contact":
+        return ("contact", "viscous+delay", "law+delay")
+    ending = "+delay" if model.endswith("+delay") else ""
+    return (model, *(f"{law}{ending}" for law in LAWS if f"{law}{ending}" != model))
+
+
+def compare(
+    table: AmplitudeTable,
+    models: Sequence[str] = ("law+delay", "viscous+delay"),
+    *,
+    report: Callable[[str], None] | None = None,
+    **options: Any,
+) -> Comparison:
+    """Fit several models to one table and compare them on the same rows with the same errors.
+
+    A row that one model sets aside is set aside for all, and every row has the largest of the models' own errors. A
+    model that cannot be fitted is left out, and the comparison says so.
+
+    Args:
+        table: the amplitudes.
+        models: names of models.
+        report: called with each model's name before it is fitted.
+        options: as of `fit`; `free`, `fixed` and `effects` go to the model "contact" only.
+
+    Raises:
+        ValueError: if fewer than two different models are named, or one of them there is not; as `fit`, if no model can
+            be fitted.
+    """
+    require_float64()
+    if len(set(models)) < 2:
+        raise ValueError("comparing needs at least two different models")
+    for model in models:
+        free = _options_of(model, options).get("free")
+        model_parameters(model, None if free is None else tuple(free))
+
+    def fitted(model: str) -> tuple[Found, FitResult]:
+        if report is not None:
+            report(model)
+        found = find_fit(table, model, **_options_of(model, options))
+        return found, _finite(summarise(table, found))
+
+    fits, failed = _attempted(fitted, dict.fromkeys(models))
+    errors = np.max([one.strain.model_error for one, _ in fits.values()], axis=0)
+    aside = np.any([one.strain.set_aside for one, _ in fits.values()], axis=0)
+    judged, lost = _attempted(lambda model: _row(model, *fits[model], Strain(errors, aside)), fits)
+    results = {model: fits[model][1] for model in judged}
+    rows = sorted(judged.values(), key=lambda row: row["aic"])
+    for row in rows:
+        row["delta_aic"] = row["aic"] - rows[0]["aic"]
+        row["law_change"] = _law_change(results[row["model"]], results[rows[0]["model"]])
+    return Comparison(rows, _verdict(rows, failed | lost), results, failed | lost)
+
+
+def _attempted(attempt: Callable[[str], _T], models: Iterable[str]) -> tuple[dict[str, _T], dict[str, str]]:
+    """Return what is made of every model, and why it is not of others.
+
+    Raises:
+        Exception: of the first one, if there is none that anything is made of.
+    """
+    made: dict[str, _T] = {}
+    failures: dict[str, Exception] = {}
+    for model in models:
+        try:
+            made[model] = attempt(model)
+        except (ValueError, ArithmeticError, RuntimeError) as error:
+            failures[model] = error
+    if not made:
+        raise next(iter(failures.values()))
+    return made, {model: str(error) or type(error).__name__ for model, error in failures.items()}
+
+
+def _finite(result: FitResult) -> FitResult:
+    """Return a fit that can be compared.
+
+    Raises:
+        FloatingPointError: if its chi2 is not a finite number.
+    """
+    if not np.isfinite(result.chi2):
+        raise FloatingPointError("chi2 is not finite")
+    return result
+
+
+def _options_of(model: str, options: dict[str, Any]) -> dict[str, Any]:
+    only_contact = {"free", "fixed", "effects"}
+    return {name: value for name, value in options.items() if model == "contact" or name not in only_contact}
+
+
+def _row(model: str, found: Found, result: FitResult, common: Strain) -> dict[str, Any]:
+    stated, minimum = found.stated, found.minimum
+    objective = relaxed(stated, common)
+    if stated.problem.lasting:
+        minimum = settle(objective, minimum)
+    values = stated.problem.values(minimum.coordinates)
+    chi2 = float(np.sum(objective.residual(values[None]) ** 2))
+    used = int(np.asarray(objective.measurement.rows.measured).sum())
+    data = used + int(np.asarray(objective.measurement.rows.no_orbit).sum()) + len(result.settings["constraints"])
+    count = len(values)
+    return {
+        "model": model,
+        "chi2": chi2,
+        "degrees_of_freedom": data - count,
+        "aic": chi2 + 2.0 * count,
+        "bic": chi2 + count * float(np.log(data)),
+        "valid": result.valid,
+    }
+
+
+def _law_change(result: FitResult, reference: FitResult) -> float:
+    """Return the largest relative difference of two laws over the speeds that the reference measured."""
+    law, other = reference.law, result.law
+    inside = (law.approach_speed_nm_per_us >= other.approach_speed_nm_per_us[0]) & (
+        law.approach_speed_nm_per_us <= other.approach_speed_nm_per_us[-1]
+    )
+    measured = _measured(reference)
+    inside &= (law.approach_speed_nm_per_us >= measured.min()) & (law.approach_speed_nm_per_us <= measured.max())
+    speeds = law.approach_speed_nm_per_us[inside]
+    if not speeds.size:
+        return float("nan")
+    theirs = np.interp(speeds, other.approach_speed_nm_per_us, other.rebound_speed_nm_per_us)
+    return float(np.max(np.abs(theirs / law.rebound_speed_nm_per_us[inside] - 1.0)))
+
+
+def _measured(result: FitResult) -> Float[np.ndarray, " rows"]:
+    speeds = result.rows.approach_speed_nm_per_us
+    known = speeds[result.rows.used & np.isfinite(speeds)]
+    return known if known.size else np.array([0.0, np.inf])
+
+
+def _verdict(rows: list[dict[str, Any]], failed: dict[str, str]) -> str:
+    """Return what the differences of AIC say of the two best models, whether the best one is any good, what failed."""
+    said = _said_of(*rows[:2]) if rows[1:] else f"There is nothing to compare {_meaning(rows[0]['model'])} with."
+    if not rows[0]["valid"]:
+        said += f" But the fit of {rows[0]['model']} is not valid itself."
+    return said + "".join(f" The fit of {model} failed: {reason.rstrip('.')}." for model, reason in failed.items())
+
+
+def _said_of(best: dict[str, Any], second: dict[str, Any]) -> str:
+    """Return what the difference of AIC says of the two best models."""
+    gap = second["delta_aic"]
+    first, other = (_meaning(row["model"]) for row in (best, second))
+    change = 100.0 * second["law_change"]
+    apart = f"their laws differ by at most {change:.2g} % over the measured speeds" if np.isfinite(change) else ""
+    if gap < _EVEN:
+        said = f"The measurement does not tell {first} from {other} (AIC differs by {gap:.1f})"
+    elif gap < _LEANS:
+        said = f"The measurement leans to {first} over {other} (AIC lower by {gap:.1f}), not conclusively"
+    elif gap < _PLAIN:
+        said = f"The measurement favours {first} over {other} (AIC lower by {gap:.1f})"
+    else:
+        said = f"The measurement tells plainly: {first}, not {other} (AIC lower by {gap:.0f})"
+    return f"{said}; {apart}." if apart else f"{said}."
+
+
+def _meaning(model: str) -> str:
+    return f"{model}: {_MEANING[model.removesuffix('+delay')]}"
+
+
+__all__ = ["Comparison", "compare", "rivals"]

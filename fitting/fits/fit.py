@@ -1,0 +1,430 @@
+"""The fit: screen, polish, check, and say what was found and whether to believe it.
+
+The fitted impact law over the speeds that were measured, with the band that its parameters' errors leave.
+
+What a minimum amounts to: errors, intervals, checks, and a verdict on whether to believe it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+from scipy.special import chdtrc
+
+from afm_jax.checks import require_float64
+from afm_jax.contact.contact import EFFECTS
+from afm_jax.impact.lasting_impact import LawImpact
+from afm_jax.version import version_of
+from fitting.fits.intervals import Convergence, Interval, at_bound, check_minimum, covariance, profile_intervals
+from fitting.fits.minimum import Minimum, Strain, minimise, relaxed, rescale_errors, settle, strain_of, untabulated
+from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective
+from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows
+from fitting.fits.verdict import Evidence, judge_fit, misfits
+from fitting.forward import impact_of
+from fitting.models import (
+    NUISANCE_NAMES,
+    Measurement,
+    Problem,
+    check_contact_values,
+    constraints_of,
+    measurement_of,
+    model_parameters,
+)
+from fitting.tables.table import AmplitudeTable
+
+_POINTS = 121
+_TWO_SIDED_95 = 1.959963984540054
+
+
+def law_with_band(
+    problem: Problem,
+    measurement: Measurement,
+    values: Float[np.ndarray, " p"],
+    covariance: Float[np.ndarray, "p p"],
+    approach_speeds: Float[np.ndarray, " rows"],
+) -> FittedLaw:
+    """Return the law from 0.8 times the slowest to 1.2 times the fastest approach, with its linearised 95 % band.
+
+    Args:
+        problem: the model.
+        measurement: gives the contact's fixed parameters.
+        values: fitted values.
+        covariance: of the values; infinite entries give an open band (NaN).
+        approach_speeds: of the rows' orbits in nm/us, NaN where a row has none.
+    """
+    known = approach_speeds[np.isfinite(approach_speeds)]
+    slow, fast = (0.8 * known.min(), 1.2 * known.max()) if known.size else (1.0, 100.0)
+    speeds = np.geomspace(slow, fast, _POINTS)
+    law, slope = law_and_slope(jnp.asarray(values), jnp.asarray(speeds), measurement, problem)
+    rebound, delay = np.asarray(law)
+    if np.all(np.isfinite(covariance)):
+        width = _TWO_SIDED_95 * np.sqrt(np.einsum("lnp,pq,lnq->ln", np.asarray(slope), covariance, np.asarray(slope)))
+    else:
+        width = np.full((2, _POINTS), np.nan)
+    return FittedLaw(
+        approach_speed_nm_per_us=speeds,
+        rebound_speed_nm_per_us=rebound,
+        rebound_low_nm_per_us=np.maximum(rebound - width[0], 0.0),
+        rebound_high_nm_per_us=rebound + width[0],
+        collision_delay_us=delay,
+        delay_low_us=delay - width[1],
+        delay_high_us=delay + width[1],
+    )
+
+
+@partial(jax.jit, static_argnames=("problem",))
+def law_and_slope(
+    values: Float[Array, " p"], speeds: Float[Array, " n"], measurement: Measurement, problem: Problem
+) -> tuple[Float[Array, "2 n"], Float[Array, "2 n p"]]:
+    """Return rebound speeds and delays at approach speeds, and their derivatives by the parameters."""
+
+    def law(v):
+        impact = impact_of(v, measurement, problem)
+        if isinstance(impact, LawImpact):
+            return jnp.stack([impact.law.rebound_speed(speeds), impact.law.collision_delay(speeds)])
+        found = jax.vmap(impact.speeds)(speeds)
+        # below the table the contact captures
+        free = speeds > impact.lowest
+        return jnp.stack([jnp.where(free, found.rebound, 0.0), jnp.where(free, found.delay, 0.0)])
+
+    return law(values), jax.jacfwd(law)(values)
+
+
+_PACKAGES = ("afm-jax", "jax", "optax", "numpy")
+
+
+@dataclass(frozen=True)
+class Found:
+    """A minimum before it is summarised: the objective with the errors as stated and as used, and the settings."""
+
+    stated: Objective
+    objective: Objective
+    minimum: Minimum
+    strain: Strain
+    settings: dict[str, Any]
+
+
+def summarise(table: AmplitudeTable, found: Found) -> FitResult:
+    """Return errors, intervals, checks and verdict of a minimum."""
+    return _Summary(found.objective, table, found.minimum, found.strain, found.settings).result()
+
+
+class _Summary:
+    """Turns a minimum into a `FitResult`: errors, intervals, checks, verdict."""
+
+    def __init__(
+        self, objective: Objective, table: AmplitudeTable, minimum: Minimum, strain: Strain, settings: dict[str, Any]
+    ):
+        self.searching, self.table, self.minimum, self.strain = objective, table, minimum, strain
+        self.settings, self.problem = settings, objective.problem
+        self.values = self.problem.values(minimum.coordinates)
+        # orbits are followed from here on: only their places change a little
+        self.objective = objective.following(self.values)
+        self.free = ~at_bound(self.objective, self.values)
+        self.convergence: Convergence = check_minimum(self.objective, minimum.coordinates, self.free)
+        linear = self.searching.at_values(self.values[None])
+        self.residual = np.asarray(linear.residual)[0]
+        self.amplitude_residual = self.searching.misfit(linear)
+        self.prediction = linear.prediction
+        self.chi2 = float(np.sum(self.residual**2))
+        self.constraints = settings["constraints"]
+        used = int(np.asarray(objective.measurement.rows.measured).sum())
+        self.data = used + int(np.asarray(objective.measurement.rows.no_orbit).sum()) + len(self.constraints)
+        self.freedom = self.data - len(self.values)
+        self.covariance = covariance(self.objective, self.values, self.free)
+
+    def result(self) -> FitResult:
+        judged = self.freedom > 0 and self.settings["error_scale"] is None and not self.searching.robust
+        p_value = float(chdtrc(self.freedom, self.chi2)) if judged else float("nan")
+        errors = np.sqrt(np.diag(self.covariance))
+        moved = ~self.free | ~np.isfinite(errors) | (np.abs(self.values - self.minimum.start) > 1e-3 * errors)
+        unknown = np.full_like(errors, np.inf)
+        rows = self._rows()
+        used_speeds = np.where(rows.used, rows.approach_speed_nm_per_us, np.nan)
+        missed = untabulated(self.objective, self.values, used_speeds)
+        evidence = Evidence(
+            table=self.table,
+            parameters=self._parameters(unknown, "the model does not explain the data", moved),
+            convergence=self.convergence,
+            rows=rows,
+            chi2=self.chi2,
+            freedom=self.freedom,
+            p_value=p_value,
+            autocorrelation=_autocorrelation(rows.residual),
+            other_minimum=self._other_minimum(errors),
+            error_scale=self.settings["error_scale"],
+            lasting=self.problem.lasting,
+            robust=self.searching.robust,
+            correlations=_correlations(self.covariance),
+            untabulated=tuple(np.flatnonzero(missed).tolist()),
+        )
+        # Errors that assume the model would be confident numbers about a law that is not there.
+        explained = not misfits(evidence)
+        shown_covariance = self.covariance if explained else np.full_like(self.covariance, np.inf)
+        if explained:
+            evidence = replace(evidence, parameters=self._explained_parameters(errors, moved))
+        reasons, warnings = judge_fit(evidence)
+        return FitResult(
+            model=self.problem.model,
+            parameters=evidence.parameters,
+            correlations=_correlations(shown_covariance),
+            chi2=self.chi2,
+            degrees_of_freedom=self.freedom,
+            p_value=evidence.p_value,
+            aic=self.chi2 + 2.0 * len(self.values),
+            bic=self.chi2 + len(self.values) * float(np.log(self.data)),
+            valid=not reasons,
+            reasons=reasons,
+            warnings=warnings,
+            law=law_with_band(
+                self.problem,
+                self.objective.measurement,
+                self.values,
+                shown_covariance,
+                used_speeds,
+            ),
+            rows=rows,
+            residual_autocorrelation=evidence.autocorrelation,
+            convergence=self.convergence,
+            table=self.table,
+            settings=self.settings,
+            versions={name: version_of(name) for name in _PACKAGES},
+        )
+
+    def _explained_parameters(
+        self, errors: Float[np.ndarray, " p"], moved: Bool[np.ndarray, " p"]
+    ) -> dict[str, FittedParameter]:
+        """Return the parameters with their errors and, where all are determined, their intervals."""
+        if not np.all(np.isfinite(errors)):
+            # With one parameter adrift there is no minimum to follow for the others.
+            return self._parameters(errors, "the data do not determine the parameters", moved)
+        intervals = profile_intervals(self.objective, self.values, self.covariance, self.chi2)
+        return self._parameters(errors, intervals, moved)
+
+    def _parameters(
+        self, errors: Float[np.ndarray, " p"], intervals: list[Interval] | str, moved: Bool[np.ndarray, " p"]
+    ) -> dict[str, FittedParameter]:
+        """Return the parameters with errors and intervals; for these a text says why there are none."""
+        if isinstance(intervals, str):
+            intervals = [Interval(None, None, intervals)] * len(errors)
+        return {
+            parameter.name: FittedParameter(
+                value=float(self.values[i]),
+                unit=parameter.unit,
+                standard_error=float(errors[i]) if self.free[i] and np.isfinite(errors[i]) else None,
+                interval95=(intervals[i].low, intervals[i].high),
+                interval_reason=intervals[i].reason,
+                undetermined=not np.isfinite(self.covariance[i, i]),
+                at_bound=not bool(self.free[i]),
+                did_not_move=not bool(moved[i]) and parameter.name not in self.constraints,
+                constraint=self.constraints.get(parameter.name),
+            )
+            for i, parameter in enumerate(self.problem.parameters)
+        }
+
+    def _rows(self) -> FittedRows:
+        count = self.table.rows
+        rows = self.searching.measurement.rows
+        used = np.asarray(rows.measured)[:count]
+        prediction: Any = self.prediction
+        exists = prediction.orbits[0][:count] > 0
+        predicted = np.where(exists[:, None], prediction.amplitude_nm[0][:count], np.nan)
+        amplitude, error = np.asarray(rows.amplitude_nm)[:count], np.asarray(rows.error_nm)[:count]
+        measured = used | (self.strain.set_aside[:count, None] & np.isfinite(_amplitudes(self.table)))
+        return FittedRows(
+            predicted_nm=predicted,
+            measured_nm=np.where(measured, amplitude, np.nan),
+            residual=np.where(used, self.amplitude_residual[:count], np.nan),
+            error_nm=np.where(used, error, np.nan),
+            model_error=self.strain.model_error[:count],
+            used=np.any(used, axis=1, keepdims=False).astype(bool),
+            set_aside=self.strain.set_aside[:count],
+            approach_speed_nm_per_us=np.where(exists, prediction.approach_speed_nm_per_us[0][:count], np.nan),
+            orbits=prediction.orbits[0][:count],
+            near_fold=prediction.near_fold[0][:count],
+        )
+
+    def _other_minimum(self, errors: Float[np.ndarray, " p"]) -> tuple[dict[str, float], float] | None:
+        """Return values and chi2 of another minimum that the data hardly tell from the best one, if there is one."""
+        values, chi2 = self.minimum.ends, self.minimum.chi2
+        known = np.where(np.isfinite(errors) & (errors > 0.0), errors, np.inf)
+        apart = np.max(np.abs(values - self.values) / known, axis=1) > 5.0
+        if not apart.any():
+            return None
+        index = int(np.argmin(np.where(apart, chi2, np.inf)))
+        found = float(chi2[index])
+        if self.problem.lasting:
+            # it was found with the errors as stated and outliers counting less
+            found = float(np.sum(self.searching.residual(values[index : index + 1]) ** 2))
+        if not found < self.chi2 + 4.0:
+            return None
+        return dict(zip(self.problem.names, values[index].tolist(), strict=True)), found
+
+
+def _correlations(covariance_matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
+    error = np.sqrt(np.diag(covariance_matrix))
+    known = np.isfinite(error) & (error > 0.0)
+    safe = np.where(known, error, 1.0)
+    matrix = np.where(np.isfinite(covariance_matrix), covariance_matrix, 0.0) / np.outer(safe, safe)
+    return np.where(np.outer(known, known), matrix, np.nan)
+
+
+def _amplitudes(table: AmplitudeTable) -> Float[np.ndarray, "rows 2"]:
+    """Return peak and lock-in amplitude of the table, NaN where not measured."""
+    blank = np.full(table.rows, np.nan)
+    columns = table.peak_amplitude_nm, table.lockin_amplitude_nm
+    return np.stack([blank if column is None else column for column in columns], axis=1)
+
+
+def _autocorrelation(residual: Float[np.ndarray, "rows 2"]) -> float:
+    """Return the lag-1 correlation of residuals of neighbouring rows, both amplitudes together; NaN for few rows."""
+    before, after = residual[:-1], residual[1:]
+    both = np.isfinite(before) & np.isfinite(after)
+    total = np.nansum(residual**2)
+    if both.sum() < 8 or total == 0.0:
+        return float("nan")
+    return float(np.sum(before[both] * after[both]) / both.sum() / (total / np.isfinite(residual).sum()))
+
+
+_STRAIN_ROUNDS = 3
+
+
+def fit(  # noqa: PLR0913
+    table: AmplitudeTable,
+    model: str = "law",
+    *,
+    scale_errors: bool = False,
+    free: Sequence[str] | None = None,
+    fixed: dict[str, float] | None = None,
+    constraints: dict[str, tuple[float, float]] | None = None,
+    effects: Sequence[str] = EFFECTS,
+    robust: bool = False,
+) -> FitResult:
+    """Fit an impact law to measured amplitudes of single-impact orbits.
+
+    Args:
+        table: from `read_table`; what it gives with an error (Q, calibrations) is a nuisance with that constraint.
+        model: "restitution" (r), "law" (r, epsilon; eq. 6) or "viscous" (epsilon, viscous_loss), each instantaneous or
+            with "+delay", the collision delay; or "contact", physical parameters through the resolved contact.
+        scale_errors: take the amplitudes' errors as relative only and scale them until chi2 equals its degrees of
+            freedom (the error of Q stays); the result is valid only if the scale is believable and what is left of the
+            amplitudes random (see `verdict`).
+        free: for "contact": the parameters that are fitted, by keyword of `Contact.paper`; None: relative humidity,
+            adhesion energy, viscosity and modulus.
+        fixed: for "contact": values of parameters that are not the paper's.
+        constraints: value and standard error of what else is known, by parameter: a nuisance (`quality_factor`,
+            `tip_calibration`, `drive_calibration`, `offset_origin_nm`), which then is fitted along, or one of the
+            model's parameters.
+        effects: for "contact": the effects there are.
+        robust: let outliers count linearly from two errors on; the result is valid only if they are few and the other
+            amplitudes are explained.
+
+    Returns:
+        Values, errors, intervals, goodness of fit and a verdict; see `FitResult`.
+
+    Raises:
+        ValueError: if there is no such model or parameter, a constraint is impossible or degenerate with the model, or
+            there are fewer measured amplitudes than parameters.
+        RuntimeError: if JAX is not set to 64-bit floats.
+    """
+    options: dict[str, Any] = {"free": free, "fixed": fixed, "constraints": constraints, "effects": effects}
+    found = find_fit(table, model, scale_errors=scale_errors, robust=robust, **options)
+    return summarise(table, found)
+
+
+def find_fit(  # noqa: PLR0913
+    table: AmplitudeTable,
+    model: str,
+    *,
+    scale_errors: bool = False,
+    free: Sequence[str] | None = None,
+    fixed: dict[str, float] | None = None,
+    constraints: dict[str, tuple[float, float]] | None = None,
+    effects: Sequence[str] = EFFECTS,
+    robust: bool = False,
+) -> Found:
+    """Return the minimum of a fit; arguments and errors as of `fit`."""
+    require_float64()
+    known = constraints_of(table, constraints)
+    problem = problem_of(table, model, free=free, constraints=known, effects=effects)
+    check_contact_values(model, fixed)
+    measurement = measurement_of(table, problem, known, fixed)
+    amplitudes = int(np.asarray(measurement.rows.measured).sum())
+    if amplitudes < len(problem.own):
+        raise ValueError(
+            f"{table.source}: {amplitudes} measured amplitude(s) cannot determine the {len(problem.own)} "
+            f"parameters of the model {model!r}; measure at other drives, orders or offsets too"
+        )
+    stated = Objective(measurement, problem, robust=robust)
+    objective, minimum, strain = unstrained_minimum(stated)
+    scale = None
+    if scale_errors:
+        objective, minimum, scale = rescale_errors(objective, minimum, len(problem.own))
+    settings = {
+        "model": model,
+        "error_scale": scale,
+        "starts": BATCH,
+        "soft": SOFT,
+        "robust": ROBUST if robust else None,
+        "constraints": known,
+        "free": list(problem.own),
+        "fixed": fixed or {},
+        "effects": list(effects) if model == "contact" else None,
+    }
+    return Found(stated, objective, minimum, strain, settings)
+
+
+def problem_of(
+    table: AmplitudeTable,
+    model: str,
+    *,
+    free: Sequence[str] | None = None,
+    constraints: dict[str, tuple[float, float]] | None = None,
+    effects: Sequence[str] = EFFECTS,
+) -> Problem:
+    """Return what is fitted for a table: the model's parameters, and the nuisances that are constrained.
+
+    Raises:
+        ValueError: if there is no such model or parameter, or a constraint is impossible.
+    """
+    own = model_parameters(model, None if free is None else tuple(free))
+    known = constraints_of(table, constraints)
+    for name, (value, error) in known.items():
+        if name not in (*own, *NUISANCE_NAMES):
+            raise ValueError(
+                f"the constraint on {name!r} is on no parameter: choose from {', '.join((*own, *NUISANCE_NAMES))}"
+            )
+        if not (np.isfinite(value) and 0.0 < error < np.inf):
+            raise ValueError(
+                f"the constraint on {name} must be a value and a positive error, but is {value} +- {error}"
+            )
+    if "offset_origin_nm" in known and model.endswith("+delay"):
+        raise ValueError(
+            "offset_origin_nm and delay_offset_nm shift the same thing: with a delay leave the constraint on "
+            "offset_origin_nm out (delay_offset_nm takes it up), or fit the model 'contact'"
+        )
+    nuisances = tuple(name for name in NUISANCE_NAMES if name in known)
+    return Problem(model, own + nuisances, tuple(effects))
+
+
+def unstrained_minimum(stated: Objective) -> tuple[Objective, Minimum, Strain]:
+    """Return the minimum with the model's own error in the weights and strained rows set aside, until both settle."""
+    minimum = minimise(stated)
+    strain = strain_of(stated, stated.problem.values(minimum.coordinates))
+    if not stated.problem.lasting:
+        return stated, minimum, strain
+    objective = relaxed(stated, strain)
+    for _ in range(_STRAIN_ROUNDS):
+        minimum = settle(objective, minimum)
+        again = strain_of(stated, stated.problem.values(minimum.coordinates))
+        same = np.array_equal(again.set_aside, strain.set_aside)
+        close = np.allclose(again.model_error, strain.model_error, rtol=0.02)
+        if same and close:
+            return objective, minimum, strain
+        objective, strain = relaxed(stated, again), again
+    return objective, settle(objective, minimum), strain

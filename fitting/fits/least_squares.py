@@ -1,0 +1,121 @@
+"""Damped Gauss-Newton steps (Levenberg, Marquardt), for several searches side by side and between bounds.
+
+The covariance that a Fisher matrix stands for.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+_FIRST_DAMPING, _LARGEST_DAMPING = 1e-6, 1e8
+
+
+class Searches(NamedTuple):
+    """Where several searches are: places, residuals, their Jacobian by the places, and the sums of their squares."""
+
+    place: Float[np.ndarray, "sets p"]
+    residual: Float[np.ndarray, "sets n"]
+    jacobian: Float[np.ndarray, "sets n p"]
+    chi2: Float[np.ndarray, " sets"]
+
+
+Look = Callable[[Float[np.ndarray, "some p"], Int[np.ndarray, " some"]], Searches]
+"""Of places and the searches that they belong to: what is there."""
+
+
+class Box(NamedTuple):
+    """Where searches may go: between bounds (infinite: none), and which parameters of each search stay as they are."""
+
+    lowest: Float[np.ndarray, " p"]
+    highest: Float[np.ndarray, " p"]
+    fixed: Bool[np.ndarray, "sets p"]
+
+    def of(self, some: Int[np.ndarray, " some"]) -> "Box":
+        """Return the box of some of the searches."""
+        return self._replace(fixed=self.fixed[some])
+
+
+def descended(look: Look, start: Searches, box: Box, *, settled: float, most: int) -> Searches:
+    """Return where searches end that go down from their starts, each as long as it has not arrived.
+
+    Args:
+        look: evaluates places of some of the searches.
+        start: of every search.
+        box: where they may go; a parameter at a bound stays there while the sum falls towards the outside.
+        settled: estimated distance of the sum of squares to its minimum at which a search has arrived.
+        most: steps at most.
+    """
+    state = Searches(*(np.array(leaf) for leaf in start))
+    damping = np.full(len(state.chi2), _FIRST_DAMPING)
+    for _ in range(most):
+        active = np.flatnonzero((distance(state, box) > settled) & (damping < _LARGEST_DAMPING))
+        if not active.size:
+            break
+        some = Searches(*(leaf[active] for leaf in state))
+        trial = some.place + _step(some, box.of(active), damping[active])
+        found = look(np.clip(trial, box.lowest, box.highest), active)
+        better = found.chi2 <= some.chi2
+        for leaf, new in zip(state, found, strict=True):
+            leaf[active[better]] = new[better]
+        damping[active] = np.where(better, 0.1 * damping[active], np.maximum(30.0 * damping[active], 1e-3))
+    return state
+
+
+def distance(state: Searches, box: Box) -> Float[np.ndarray, " sets"]:
+    """Return the estimated distance of the sum of squares to its minimum, g H^-1 g, H = J^T J; NaN where not finite."""
+    gradient = np.einsum("snp,sn->sp", state.jacobian, state.residual) * ~_held(state, box)
+    step = _step(state, box, np.full(len(state.chi2), 1e-12))
+    return -np.einsum("sp,sp->s", gradient, step)
+
+
+def _held(state: Searches, box: Box) -> Bool[np.ndarray, "sets p"]:
+    """Say which parameters stay: fixed ones, those at a bound that the sum falls beyond, and those without effect."""
+    slope = np.einsum("snp,sn->sp", state.jacobian, state.residual)
+    low, high = (state.place <= box.lowest) & (slope > 0.0), (state.place >= box.highest) & (slope < 0.0)
+    return box.fixed | low | high | ~np.any(state.jacobian, axis=1)
+
+
+def _step(state: Searches, box: Box, damping: Float[np.ndarray, " sets"]) -> Float[np.ndarray, "sets p"]:
+    """Return damped Gauss-Newton steps, in units in which every parameter has the curvature 1; NaN if not finite."""
+    held = _held(state, box)
+    jacobian = np.where(held[:, None, :], 0.0, state.jacobian)
+    unit = np.where(held, 1.0, np.linalg.norm(jacobian, axis=1))
+    scaled = jacobian / unit[:, None, :]
+    normal = np.einsum("snp,snq->spq", scaled, scaled)
+    # a held parameter's own curvature is 1 instead of 0: its step is then 0
+    normal += (damping[:, None] + held)[:, :, None] * np.eye(unit.shape[1])
+    gradient = np.einsum("snp,sn->sp", scaled, state.residual)
+    sound = np.all(np.isfinite(normal), axis=(1, 2))
+    safe = np.where(sound[:, None, None], normal, np.eye(unit.shape[1]))
+    step = -np.linalg.solve(safe, gradient[:, :, None])[:, :, 0] / unit
+    return np.where(sound[:, None], step, np.nan)
+
+
+_FLAT = 1e-12
+"""Curvature, where every parameter's own is 1, below which a direction is not determined."""
+
+
+def covariance_of(fisher: Float[np.ndarray, "... p p"]) -> Float[np.ndarray, "... p p"]:
+    """Return the inverse of Fisher matrices; rows and columns of parameters that one does not determine are infinite.
+
+    Where a matrix is not finite, all of its inverse is infinite.
+    """
+    finite = np.isfinite(fisher).all(axis=(-2, -1), keepdims=True)
+    sound = np.where(finite, fisher, 0.0)
+    scale = np.sqrt(np.diagonal(sound, axis1=-2, axis2=-1))
+    safe = np.where(scale > 0.0, scale, 1.0)
+    unit = safe[..., :, None] * safe[..., None, :]
+    # parameters may be of very different size
+    curvature, axes = np.linalg.eigh(sound / unit)
+    flat = curvature < _FLAT
+    undetermined = np.any((np.abs(axes) > 1e-6) & flat[..., None, :], axis=-1)
+    inverse = (axes / np.where(flat, np.inf, curvature)[..., None, :]) @ np.swapaxes(axes, -2, -1) / unit
+    return np.where(undetermined[..., :, None] | undetermined[..., None, :] | ~finite, np.inf, inverse)
+
+
+def whole_covariance_of(fisher: Float[np.ndarray, "... p p"]) -> Float[np.ndarray, "... p p"]:
+    """Return the inverse of Fisher matrices; all infinite where one determines not every parameter."""
+    inverse = covariance_of(fisher)
+    return np.where(np.isfinite(inverse).all(axis=(-2, -1), keepdims=True), inverse, np.inf)

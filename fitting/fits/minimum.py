@@ -1,0 +1,384 @@
+"""The minimum of chi2: screened, polished from the best starts, and again where the errors are only relative.
+
+Where a fit starts: a coarse grid over what a model's parameters can be.
+
+Minima at which measured orbits have got lost: a way back to laws that have them.
+
+Where a law has no orbit on a row that was measured, chi2 is a plateau there: nothing tells a minimisation which way the
+orbit lies. The laws around the minimum are asked for these rows alone, and the minimisation goes on from the best ones.
+
+Rows that strain the event-driven picture: how far a law of impacts is off there, and which are set aside.
+
+What is left out grows with the share of the drive's cycle that a leaving tip takes to lose its energy, s = omega L/w
+(L: the length over which it does, w: its rebound speed). The error of the amplitude was measured on eight full contacts
+(other humidities, adhesion, viscosity, modulus, quality factor, frequency, mass): it stays below about half of what is
+taken, 0.05 % + 1.2 % s^3 + 1.6 % (1.5 u_c/u)^6 with the approach speed u and the capture speed u_c.
+The three-parameter delay law is right to 0.15 ns, which counts where the delay alone fixes the amplitude.
+"""
+
+import inspect
+from dataclasses import dataclass, replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.law_of_contact import DELAY_ERROR_US, SPEED_ERROR
+from afm_jax.impact.lasting_impact import LawImpact
+from afm_jax.units import RAD_PER_US_PER_KHZ
+from fitting.fits.objective import BATCH, FINE, PLAIN, ROUGH, SOFT, Objective, lowest, polish
+from fitting.forward import Linearised, impact_of
+from fitting.models import CONTACT_NAMES, NUISANCE_NAMES, ROWS_PER_PROGRAM, Measurement, Problem
+
+_GRID_PER_PARAMETER = {1: 96, 2: 16}
+_SPREAD_POINTS = 64
+"""Points of a low-discrepancy sequence, where a grid would have too many."""
+_CONTACT_FACTOR = 3.0
+"""Contact parameters are tried within this factor of the paper's value."""
+
+
+def starts(problem: Problem, measurement: Measurement) -> Float[np.ndarray, "points p"]:
+    """Return the values to start from, logarithmic in every loss; nuisances stay where they were measured.
+
+    Adhesion and viscous loss are laid out in terms of the drive's speed beta omega, on which capture depends.
+    """
+    own = [name for name in problem.names if name not in NUISANCE_NAMES]
+    ranges = _ranges(measurement)
+    if len(own) in _GRID_PER_PARAMETER and not problem.lasting:
+        count = _GRID_PER_PARAMETER[len(own)]
+        mesh = np.meshgrid(*(ranges[name](np.linspace(0.0, 1.0, count)) for name in own), indexing="ij")
+        columns = {name: axis.ravel() for name, axis in zip(own, mesh, strict=True)}
+    else:
+        places = _spread(_SPREAD_POINTS, len(own))
+        columns = {name: ranges[name](place) for name, place in zip(own, places.T, strict=True)}
+    count = len(columns[own[0]])
+    known = dict(zip(problem.names, np.asarray(measurement.constraint_value).tolist(), strict=True))
+    return np.stack([columns.get(name, np.full(count, known[name])) for name in problem.names], axis=1)
+
+
+def _spread(count: int, dimensions: int) -> Float[np.ndarray, "count dimensions"]:
+    """Return the additive recurrence of Kronecker whose steps are powers of the generalised golden ratio (Roberts)."""
+    ratio = 2.0
+    for _ in range(60):
+        # x^(d+1) = x + 1
+        ratio = (1.0 + ratio) ** (1.0 / (dimensions + 1))
+    steps = ratio ** -np.arange(1.0, dimensions + 1.0)
+    return np.mod(0.5 + np.outer(np.arange(1, count + 1), steps), 1.0)
+
+
+def _ranges(measurement: Measurement):
+    """Return by name what a place between 0 and 1 stands for."""
+    rows = measurement.rows
+    drive = RAD_PER_US_PER_KHZ * np.asarray(rows.drive_amplitude_nm) * np.asarray(rows.drive_frequency_khz)
+    slow, fast = float(drive.min()), float(drive.max())
+    mass = float(np.asarray(measurement.cantilever.mass_ng))
+
+    def between(low, high):
+        return lambda place: low * (high / low) ** np.asarray(place)
+
+    # the Hertz time grows with mass^0.4; a factor of 5 around the paper's tip
+    hertz = 0.2 * mass**0.4
+    losses = {
+        "r": lambda place: 1.0 - between(0.7, 1e-4)(place),
+        "epsilon": between(1e-4 * slow**2, 30.0 * fast**2),
+        "viscous_loss": between(1e-4 * slow, 10.0 * fast),
+        "delay_hertz": between(hertz / 5.0, hertz * 5.0),
+        "delay_lead_nm": lambda place: 10.0 * np.asarray(place),
+        "delay_offset_nm": lambda place: 2.0 * np.asarray(place) - 0.5,
+    }
+    return losses | {name: _around(name) for name in CONTACT_NAMES}
+
+
+def _around(name: str):
+    usual = _usual(name)
+    if name == "relative_humidity":
+        return lambda place: 0.1 + 0.8 * np.asarray(place)
+    if usual <= 0.0 or name == "structural_offset_nm":
+        return lambda place: usual + 0.4 * (np.asarray(place) - 0.5)
+    factor = (
+        1.3 if name in {"temperature_k", "surface_tension_n_per_m", "molar_volume_cm3_per_mol"} else _CONTACT_FACTOR
+    )
+    return lambda place: usual * factor ** (2.0 * np.asarray(place) - 1.0)
+
+
+def _usual(name: str) -> float:
+    """Return the paper's value of a contact parameter."""
+    return float(inspect.signature(Contact.paper).parameters[name].default)
+
+
+_STEPS = (0.01, 0.03, 0.1, 0.3)
+"""How far around a minimum laws are tried, in the optimiser's coordinates; those of losses relative to themselves."""
+
+
+def lost_rows(objective: Objective, values: Float[np.ndarray, " p"]) -> Bool[np.ndarray, " rows"]:
+    """Say on which rows something was measured that the law has no orbit for.
+
+    Args:
+        objective: its orbits are searched for.
+        values: of the law.
+    """
+    measured = np.asarray(objective.measurement.rows.measured).any(axis=1)
+    return measured & (np.asarray(objective.searching().at_values(values[None]).prediction.orbits)[0] == 0)
+
+
+def recovered(
+    objective: Objective, coordinates: Float[np.ndarray, " p"], lost: Bool[np.ndarray, " rows"]
+) -> Float[np.ndarray, " p"] | None:
+    """Return a minimum from which fewer orbits are missing, None if the laws around have no more of them.
+
+    Args:
+        objective: of all rows.
+        coordinates: the minimum.
+        lost: rows without orbit there.
+    """
+    around = _beside(objective, coordinates)
+    found = (
+        np.asarray(objective.searching().of_rows(lost).at_values(objective.problem.values(around)).prediction.orbits)
+        > 0
+    )
+    if not found.any():
+        return None
+    # the closest ones come first
+    best = around[np.argsort(-found.sum(axis=1), kind="stable")[:BATCH]]
+    follower = objective.following_each(objective.problem.values(best))
+    ends = polish(follower, best, SOFT, settled=ROUGH).coordinates
+    follower = objective.following_each(objective.problem.values(ends))
+    ends = polish(follower, ends, PLAIN, settled=FINE).coordinates
+    chi2 = np.sum(objective.searching().residual(objective.problem.values(ends)) ** 2, axis=1)
+    return ends[lowest(chi2)]
+
+
+def _beside(objective: Objective, coordinates: Float[np.ndarray, " p"]) -> Float[np.ndarray, "sets p"]:
+    """Return coordinates to either side of a point along every parameter of the law, close ones first."""
+    problem = objective.problem
+    sets = []
+    for step in _STEPS:
+        for index, parameter in enumerate(problem.parameters[: len(problem.own)]):
+            for side in (-step, step):
+                moved = coordinates.copy()
+                moved[index] += side * (coordinates[index] if parameter.sign else 1.0)
+                sets.append(moved)
+    return np.array(sets)
+
+
+_ROUNDS = 4
+_STEPS_PER_SEARCH = 15
+
+
+@dataclass(frozen=True)
+class Minimum:
+    """The best of several polished starts.
+
+    Attributes:
+        coordinates: of the best one, shape (p,).
+        start: the grid point it came from, parameter values, shape (p,).
+        ends: where every start ended, parameter values, shape (starts, p).
+        chi2: there, shape (starts,).
+    """
+
+    coordinates: Float[np.ndarray, " p"]
+    start: Float[np.ndarray, " p"]
+    ends: Float[np.ndarray, "starts p"]
+    chi2: Float[np.ndarray, " starts"]
+
+
+def minimise(objective: Objective) -> Minimum:
+    """Screen starts, polish the best ones with outliers counting less, then plainly.
+
+    With impacts that last the search for orbits is what costs: the screening and the first polish look at a part of the
+    rows, the rest follows orbits once they are known.
+    """
+    points = starts(objective.problem, objective.measurement)
+    scout = _thinned(objective) if objective.problem.lasting else objective
+    best = np.argsort(scout.screen(points), kind="stable")[:BATCH]
+    first = objective.problem.coordinates(points[best])
+    if not objective.problem.lasting:
+        return _polished(objective, polish(scout, first, SOFT, settled=ROUGH).coordinates, points[best])
+    found = settle(objective, _whole(objective, _scouted(scout, first), points[best]))
+    lost = lost_rows(objective, objective.problem.values(found.coordinates))
+    back = recovered(objective, found.coordinates, lost) if lost.any() else None
+    if back is None:
+        return found
+    other = settle(objective, replace(found, coordinates=back))
+    return other if other.chi2[0] < found.chi2[0] else found
+
+
+def _scouted(scout: Objective, coordinates: Float[np.ndarray, "starts p"]) -> Float[np.ndarray, "starts p"]:
+    """Polish every start softly: orbits are followed, and searched for again now and then, for they come and go."""
+    for _ in range(_ROUNDS):
+        follower = scout.following_each(scout.problem.values(coordinates))
+        end = polish(follower, coordinates, SOFT, settled=ROUGH, most=_STEPS_PER_SEARCH)
+        coordinates = end.coordinates
+        if end.steps == 0:
+            break
+    return coordinates
+
+
+def _whole(
+    objective: Objective, found: Float[np.ndarray, "starts p"], origins: Float[np.ndarray, "starts p"]
+) -> Minimum:
+    """Return the best of the scouts' ends by all rows, polished with orbits followed from there."""
+    values = objective.problem.values(found)
+    chi2 = objective.screen(values)
+    winner = lowest(chi2)
+    follower = objective.following(values[winner])
+    softly = polish(follower, found[winner][None], SOFT, settled=ROUGH)
+    end = polish(follower, softly.coordinates, PLAIN, settled=FINE)
+    best = objective.problem.values(end.coordinates)[0]
+    return Minimum(end.coordinates[0], origins[winner], np.vstack([best, values]), np.append(end.objective, chi2))
+
+
+def settle(objective: Objective, minimum: Minimum) -> Minimum:
+    """Polish again until the orbits that are found at the minimum are the ones that were followed to it."""
+    for _ in range(_ROUNDS):
+        values = objective.problem.values(minimum.coordinates)
+        follower = objective.following(values)
+        end = polish(follower, minimum.coordinates[None], PLAIN, settled=FINE)
+        chi2 = float(np.sum(objective.searching().residual(objective.problem.values(end.coordinates)) ** 2))
+        minimum = replace(minimum, coordinates=end.coordinates[0], chi2=np.append(chi2, minimum.chi2[1:]))
+        if abs(chi2 - end.objective[0]) < 1e-6 * (1.0 + chi2):
+            break
+    return minimum
+
+
+def _thinned(objective: Objective) -> Objective:
+    """Return the objective of at most `ROWS_PER_PROGRAM` rows, spread over orders, frequencies and drives."""
+    rows = jax.tree.map(np.asarray, objective.measurement.rows)
+    seen = np.flatnonzero(rows.measured.any(axis=1) | rows.no_orbit)
+    if seen.size <= ROWS_PER_PROGRAM:
+        return objective
+    ranked = seen[np.lexsort((rows.drive_amplitude_nm[seen], rows.drive_frequency_khz[seen], rows.order[seen]))]
+    chosen = ranked[np.linspace(0, ranked.size - 1, ROWS_PER_PROGRAM).round().astype(int)]
+    return objective.of_rows(chosen)
+
+
+def rescale_errors(objective: Objective, minimum: Minimum, parameters: int) -> tuple[Objective, Minimum, float]:
+    """Scale the amplitudes' errors until their chi2 equals its degrees of freedom; the constraint on Q stays.
+
+    Args:
+        objective: with the errors as given.
+        minimum: of it.
+        parameters: how many parameters the amplitudes determine.
+
+    Returns:
+        The objective with scaled errors, its minimum, and the factor.
+
+    Raises:
+        ValueError: if there are no degrees of freedom to take the scale from.
+    """
+    rows = objective.measurement.rows
+    freedom = int(np.asarray(rows.measured).sum()) - parameters
+    if freedom < 1:
+        raise ValueError("scaling the errors needs more amplitudes than parameters; give their errors instead")
+    total = 1.0
+    # The constraint on Q makes the minimum depend on the scale a little: three rounds settle it.
+    for _ in range(3):
+        residual = objective.amplitude_residuals(objective.problem.values(minimum.coordinates))
+        factor = float(np.sqrt(np.sum(residual**2) / freedom))
+        if factor == 0.0:
+            break
+        total *= factor
+        objective = objective.with_rows(error_nm=objective.measurement.rows.error_nm * factor)
+        if objective.problem.lasting:
+            minimum = settle(objective, minimum)
+        else:
+            minimum = _polished(objective, objective.problem.coordinates(minimum.ends), minimum.start)
+    return objective, minimum, total
+
+
+def _polished(
+    objective: Objective, starts: Float[np.ndarray, "starts p"], origins: Float[np.ndarray, "..."]
+) -> Minimum:
+    """Polish plainly and keep the best; `origins` are the starts' grid points, or the one that is already known."""
+    final = polish(objective, starts, PLAIN, settled=FINE)
+    winner = lowest(final.objective)
+    start = origins if origins.ndim == 1 else origins[winner]
+    return Minimum(final.coordinates[winner], start, objective.problem.values(final.coordinates), final.objective)
+
+
+BASE, GROWTH, SLOW = 0.0005, 0.012, 0.016
+"""Relative model error of fast impacts, its growth with s^3, and its value at 1.5 times the capture speed."""
+DELAY_US = 1.5e-4
+"""Error of the delay law in us."""
+LONGEST = 1.4
+"""s beyond which a row is set aside."""
+NEAREST = 1.35
+"""Approach speed in terms of the capture speed below which a row is set aside."""
+
+
+@dataclass(frozen=True)
+class Strain:
+    """How far a model's picture holds for each row.
+
+    Attributes:
+        model_error: relative error of the amplitude that the picture itself has, shape (rows,).
+        set_aside: rows that are not used, shape (rows,).
+    """
+
+    model_error: Float[np.ndarray, " rows"]
+    set_aside: Bool[np.ndarray, " rows"]
+
+
+def strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
+    """Return the strain of every row (padded) at a set of values; none where impacts are instantaneous."""
+    rows = objective.measurement.rows
+    count = rows.order.shape[0]
+    if not objective.problem.lasting:
+        return Strain(np.zeros(count), np.zeros(count, dtype=bool))
+    impact = impact_of(jnp.asarray(values), objective.measurement, objective.problem)
+    linear = objective.at_values(values[None])
+    prediction = linear.prediction
+    exists = np.asarray(prediction.orbits)[0] > 0
+    speeds = jax.vmap(impact.speeds)(jnp.asarray(np.asarray(prediction.coordinate)[0]))
+    approach, rebound = np.asarray(speeds.approach), np.asarray(speeds.rebound)
+    # without adhesion nothing is captured, and no impact is slow
+    lowest = float(impact.lowest)
+    capture = float(impact.speeds(jnp.asarray(lowest * (1.0 + 1e-9))).approach) if lowest > 0.0 else 0.0
+    share = 2.0 * np.pi * np.asarray(rows.drive_frequency_khz) * 1e-3 * float(impact.length) / np.maximum(rebound, 1e-6)
+    slow = (share > LONGEST) | (approach < NEAREST * capture)
+    near = np.minimum(1.5 * capture / np.maximum(approach, 1e-6), 1.5 / NEAREST)
+    error = BASE + GROWTH * np.minimum(share, LONGEST) ** 3 + SLOW * near**6
+    if "delay_offset_nm" in objective.problem.names:
+        error = np.hypot(error, DELAY_US * _sensitivity(objective, linear, approach))
+    return Strain(np.where(exists, error, BASE), exists & slow)
+
+
+def untabulated(
+    objective: Objective, values: Float[np.ndarray, " p"], approach: Float[np.ndarray, " rows"]
+) -> Bool[np.ndarray, " rows"]:
+    """Say at which approach speeds the table of a contact misses its accuracy; nowhere for a law, nor at NaN."""
+    impact = impact_of(jnp.asarray(values), objective.measurement, objective.problem)
+    if isinstance(impact, LawImpact):
+        return np.zeros(approach.shape, dtype=bool)
+    speed, delay = impact.errors(jnp.asarray(approach))
+    held = (np.asarray(speed) <= SPEED_ERROR) & (np.asarray(delay) <= DELAY_ERROR_US)
+    return np.isfinite(approach) & ~held
+
+
+def _sensitivity(
+    objective: Objective, linear: Linearised, approach: Float[np.ndarray, " rows"]
+) -> Float[np.ndarray, " rows"]:
+    """Return by how much the amplitude changes with the delay, relative to itself, in 1/us."""
+    count = approach.shape[0]
+    offset = objective.problem.names.index("delay_offset_nm")
+    slope = linear.jacobian[0, : 2 * count, offset].reshape(count, 2) * np.asarray(objective.measurement.rows.error_nm)
+    amplitude = np.asarray(linear.prediction.amplitude_nm)[0]
+    # the offset d shortens the delay by d/u
+    relative = np.abs(slope) / np.where(amplitude > 0.0, amplitude, 1.0)
+    return approach * np.where(amplitude > 0.0, relative, 0.0).max(axis=1)
+
+
+def relaxed(objective: Objective, strain: Strain) -> Objective:
+    """Return the objective with the model's error added to the measured one, without the rows set aside.
+
+    Args:
+        objective: with the errors as measured.
+        strain: of its rows.
+    """
+    rows = objective.measurement.rows
+    amplitude, error = np.asarray(rows.amplitude_nm), np.asarray(rows.error_nm)
+    total = np.hypot(error, strain.model_error[:, None] * amplitude)
+    used = np.asarray(rows.measured) & ~strain.set_aside[:, None]
+    return objective.with_rows(error_nm=np.where(used, total, 1.0), measured=used)

@@ -1,0 +1,147 @@
+"""What a fit found, and everything that went into it."""
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from afm_jax.strict_json import plain
+from fitting.fits.intervals import Convergence
+from fitting.tables.table import AmplitudeTable
+
+FORMAT_VERSION = 1
+"""Version of the JSON layout; raised when a key changes its meaning or goes."""
+
+
+@dataclass(frozen=True)
+class FittedParameter:
+    """One parameter of a fit.
+
+    Attributes:
+        value: in the unit beside it.
+        unit: the unit, empty for a number.
+        standard_error: Wald's, from the Fisher information; None where the data do not determine it or at a bound.
+        interval95: profile-likelihood interval; an end is None where it is open.
+        interval_reason: why an end is open; None if none is.
+        undetermined: the data do not determine it, not even to first order.
+        at_bound: the loss vanishes within the resolution of the data.
+        did_not_move: the optimiser left the parameter where it started.
+        constraint: (value, standard error) that the table gives for it, or None.
+    """
+
+    value: float
+    unit: str
+    standard_error: float | None
+    interval95: tuple[float | None, float | None]
+    interval_reason: str | None
+    undetermined: bool
+    at_bound: bool
+    did_not_move: bool
+    constraint: tuple[float, float] | None
+
+
+@dataclass(frozen=True)
+class FittedLaw:
+    """The impact law over the speeds that the rows reached, with a pointwise 95 % band.
+
+    Speeds in nm/us, the delay in us; it is 0 if impacts are instantaneous.
+    """
+
+    approach_speed_nm_per_us: Float[np.ndarray, " points"]
+    rebound_speed_nm_per_us: Float[np.ndarray, " points"]
+    rebound_low_nm_per_us: Float[np.ndarray, " points"]
+    rebound_high_nm_per_us: Float[np.ndarray, " points"]
+    collision_delay_us: Float[np.ndarray, " points"]
+    delay_low_us: Float[np.ndarray, " points"]
+    delay_high_us: Float[np.ndarray, " points"]
+
+
+@dataclass(frozen=True)
+class FittedRows:
+    """The rows of the table beside their prediction; NaN where nothing was measured or predicted.
+
+    Amplitudes have shape (rows, 2): peak, lock-in. ``error_nm`` is the measured error with that of the model
+    (``model_error``, relative) added in quadrature; rows ``set_aside`` strain the model too much to be used.
+    """
+
+    predicted_nm: Float[np.ndarray, "rows 2"]
+    measured_nm: Float[np.ndarray, "rows 2"]
+    residual: Float[np.ndarray, "rows 2"]
+    error_nm: Float[np.ndarray, "rows 2"]
+    model_error: Float[np.ndarray, " rows"]
+    used: Bool[np.ndarray, " rows"]
+    set_aside: Bool[np.ndarray, " rows"]
+    approach_speed_nm_per_us: Float[np.ndarray, " rows"]
+    orbits: Int[np.ndarray, " rows"]
+    near_fold: Bool[np.ndarray, " rows"]
+
+
+@dataclass(frozen=True)
+class FitResult:
+    """The outcome of `fit`; attributes are named like the keys of its JSON.
+
+    Attributes:
+        model: the model's name.
+        parameters: by name, the law's first.
+        correlations: matrix in the parameters' order; NaN where a variance is unknown.
+        chi2: sum of squared normalised residuals, constraints included; with a robust fit the soft sum.
+        degrees_of_freedom: measured amplitudes plus constraints minus parameters.
+        p_value: probability of a larger chi2 if the model is right.
+        aic: chi2 + 2 k.
+        bic: chi2 + k log(n).
+        valid: converged, explained and determined; `reasons` say why not.
+        reasons: what makes the result invalid.
+        warnings: what a reader should know besides.
+        law: the fitted impact law with its band.
+        rows: measured and predicted amplitudes.
+        residual_autocorrelation: lag-1 correlation of neighbouring rows' residuals.
+        convergence: what the checks of the minimum found.
+        table: the table that was fitted.
+        settings: every option of the fit.
+        versions: of the packages that computed it.
+    """
+
+    model: str
+    parameters: dict[str, FittedParameter]
+    correlations: Float[np.ndarray, "p p"]
+    chi2: float
+    degrees_of_freedom: int
+    p_value: float
+    aic: float
+    bic: float
+    valid: bool
+    reasons: list[str]
+    warnings: list[str]
+    law: FittedLaw
+    rows: FittedRows
+    residual_autocorrelation: float
+    convergence: Convergence
+    table: AmplitudeTable
+    settings: dict[str, Any] = field(default_factory=dict)
+    versions: dict[str, str] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain lists, numbers and strings; what is not known is None."""
+        return {
+            "format": "afm-jax fit",
+            "format_version": FORMAT_VERSION,
+            "model": self.model,
+            "valid": self.valid,
+            "reasons": self.reasons,
+            "warnings": self.warnings,
+            "parameters": {name: plain(asdict(value)) for name, value in self.parameters.items()},
+            "correlations": {"names": list(self.parameters), "matrix": plain(self.correlations)},
+            "chi2": plain(self.chi2),
+            "degrees_of_freedom": self.degrees_of_freedom,
+            "p_value": plain(self.p_value),
+            "aic": plain(self.aic),
+            "bic": plain(self.bic),
+            "residual_autocorrelation": plain(self.residual_autocorrelation),
+            "law": {name: plain(column) for name, column in vars(self.law).items()},
+            "rows": {name: plain(column) for name, column in vars(self.rows).items()},
+            "convergence": plain(asdict(self.convergence)),
+            "input": plain(vars(self.table)),
+            "settings": plain(self.settings),
+            "versions": self.versions,
+        }

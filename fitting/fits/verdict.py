@@ -1,0 +1,364 @@
+"""Whether to believe a fit, in words: what makes it invalid, and what a reader should know besides.
+
+A fit is valid only if what is left of the amplitudes passes an absolute test, whatever the options:
+chi2 by its probability; with a robust loss the share of outliers, and chi2 without them by its probability; with scaled
+errors the scale, and what is known of the parameters; always that neighbouring residuals are not correlated, neither in
+the table's order (a drift, a sweep the model does not follow) nor over the approach speed (a wrong law).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.special import chdtrc
+
+from fitting.fits.intervals import Convergence
+from fitting.fits.result import FittedParameter, FittedRows
+from fitting.tables.table import AmplitudeTable
+
+IMPROBABLE = 1e-3
+"""Probability of the chi2 below which the model does not explain the table."""
+_TIED = 0.995
+"""Correlation beyond which two parameters are called determined only together."""
+_STATED = 0.003
+"""Relative model error from which rows are named."""
+_OUTLIER = 4.0
+"""Residual in errors from which a row is an outlier."""
+MOST_OUTLIERS = 0.1
+"""Share of rows that a robust fit may call outliers (one row it always may): more are a wrong model, not mishaps."""
+LARGEST_SCALE = 3.0
+"""Scale of the errors that is believed: a spread given for that of a mean, a 3 sigma limit for 1 sigma. Errors that
+would have to be larger are no matter of scale, and have to be stated nearer to the truth."""
+_CORRELATED = 4.0
+"""Correlation of neighbouring residuals, in standard deviations of those of independent ones, from which they are
+taken to be correlated: by chance in one fit of ten thousand."""
+_NEGLIGIBLE = 0.3
+"""Root mean square of the residuals, in errors, below which their pattern is of no consequence."""
+_FEWEST_NEIGHBOURS = 8
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """All that the verdict looks at; ``other_minimum`` are the values of another minimum and its chi2."""
+
+    table: AmplitudeTable
+    parameters: dict[str, FittedParameter]
+    convergence: Convergence
+    rows: FittedRows
+    chi2: float
+    freedom: int
+    p_value: float
+    autocorrelation: float
+    other_minimum: tuple[dict[str, float], float] | None
+    error_scale: float | None
+    lasting: bool
+    robust: bool
+    correlations: Float[np.ndarray, "p p"]
+    untabulated: tuple[int, ...] = ()
+    """Rows whose impacts the table of a contact does not hold to its accuracy."""
+
+
+def judge_fit(evidence: Evidence) -> tuple[list[str], list[str]]:
+    """Return what makes a fit invalid, and its warnings; each a sentence."""
+    return _reasons(evidence), _warnings(evidence)
+
+
+def _reasons(evidence: Evidence) -> list[str]:
+    reasons = []
+    convergence = evidence.convergence
+    undetermined = [name for name, parameter in evidence.parameters.items() if parameter.undetermined]
+    if convergence.reason is not None:
+        reasons.append(f"Not converged: {convergence.reason}.")
+    elif undetermined:
+        reasons.append(
+            f"Not identified: the amplitudes do not determine {' and '.join(undetermined)}; "
+            f"{'; '.join(dict.fromkeys(helpful_measurement(name) for name in undetermined))}."
+        )
+    elif not convergence.converged:
+        reasons.append(
+            f"Not converged: chi2 lies an estimated {convergence.estimated_distance:.2g} above its minimum"
+            + ("" if convergence.outward else ", and a parameter is held at a bound it would leave")
+            + "."
+        )
+    missing = np.flatnonzero((evidence.rows.orbits == 0) & evidence.rows.used)
+    if missing.size:
+        reasons.append(f"No stable orbit at the fitted law for {_rows_in_words(evidence.table, missing)}.")
+    if evidence.untabulated:
+        where = _rows_in_words(evidence.table, np.array(evidence.untabulated))
+        reasons.append(
+            f"The table of the fitted contact's impacts misses its accuracy for {where}: the contact's numbers are too "
+            "extreme; hold some of them fixed."
+        )
+    misfit = misfits(evidence)
+    if misfit:
+        reasons.append(f"The model does not explain the data: {'; '.join(misfit)}. {_why_not_explained(evidence)}")
+    if evidence.freedom <= 0:
+        reasons.append("As many parameters as amplitudes: the goodness of fit cannot be judged.")
+    for name, parameter in evidence.parameters.items():
+        if parameter.interval95 == (None, None) and not misfit and not undetermined:
+            reasons.append(f"{name} is not identified: {parameter.interval_reason}; {helpful_measurement(name)}.")
+    return reasons
+
+
+def misfits(evidence: Evidence) -> list[str]:
+    """Return the grounds on which the model does not explain the amplitudes, each a clause; none if it does.
+
+    The parameters' errors and intervals are not looked at.
+    """
+    found = []
+    if evidence.p_value < IMPROBABLE:
+        found.append(f"chi2/dof = {evidence.chi2 / evidence.freedom:.3g} (probability {evidence.p_value:.1g})")
+    if evidence.robust:
+        found += _robust_misfits(evidence)
+    if evidence.error_scale is not None:
+        found += _scaled_misfits(evidence)
+    return found + [
+        f"neighbouring residuals {where} are correlated ({excess:+.1f} standard deviations)"
+        for where, excess in _correlations(evidence)
+    ]
+
+
+def _robust_misfits(evidence: Evidence) -> list[str]:
+    outliers = _outliers(evidence)
+    count, used = int(outliers.sum()), int(evidence.rows.used.sum())
+    if count > max(1.0, MOST_OUTLIERS * used):
+        bound = f"robust loss is for outliers in at most one row of {1.0 / MOST_OUTLIERS:g}"
+        return [f"{count} of {used} rows are off by more than {_OUTLIER:g} errors, and {bound}"]
+    chi2, freedom, p_value = _without_outliers(evidence)
+    if p_value < IMPROBABLE:
+        return [f"without outliers chi2/dof = {chi2 / freedom:.3g} (probability {p_value:.1g})"]
+    return []
+
+
+def _scaled_misfits(evidence: Evidence) -> list[str]:
+    found = []
+    scale, pulls = evidence.error_scale or 1.0, _pulls(evidence)
+    if scale > LARGEST_SCALE:
+        found.append(
+            f"the amplitudes' errors would have to be {scale:.3g} times those stated, and more than "
+            f"{LARGEST_SCALE:g} is a misfit, not a matter of scale (if the errors are no more than weights, state them "
+            "to within that)"
+        )
+    if pulls and chdtrc(len(pulls), sum(pull**2 for pull in pulls.values())) < IMPROBABLE:
+        moved = ", ".join(f"{name} by {pull:+.1f}" for name, pull in pulls.items())
+        found.append(f"it contradicts what is known beforehand, in standard errors: {moved}")
+    return found
+
+
+def _pulls(evidence: Evidence) -> dict[str, float]:
+    """Return how far each parameter is from what is known of it, in standard errors of that."""
+    known = {name: (p.value, *p.constraint) for name, p in evidence.parameters.items() if p.constraint is not None}
+    return {name: (value - given) / error for name, (value, given, error) in known.items()}
+
+
+def _without_outliers(evidence: Evidence) -> tuple[float, int, float]:
+    """Return chi2 of the amplitudes that are no outliers and of what is known, its freedom and its probability."""
+    residual, pulls = evidence.rows.residual, _pulls(evidence)
+    inside = residual[np.abs(residual) <= _OUTLIER]
+    freedom = inside.size + len(pulls) - len(evidence.parameters)
+    chi2 = float(np.sum(inside**2) + sum(pull**2 for pull in pulls.values()))
+    return chi2, freedom, float(chdtrc(freedom, chi2)) if freedom > 0 else float("nan")
+
+
+def _outliers(evidence: Evidence) -> Bool[np.ndarray, " rows"]:
+    return np.any(np.abs(np.nan_to_num(evidence.rows.residual)) > _OUTLIER, axis=1)
+
+
+def _correlations(evidence: Evidence) -> list[tuple[str, float]]:
+    """Return in which order of the rows neighbouring residuals are correlated, and how much."""
+    rows = evidence.rows
+    known = np.flatnonzero(np.isfinite(rows.residual).any(axis=1) & (rows.orbits > 0))
+    speed = rows.approach_speed_nm_per_us[known]
+    orders = {"in the table's order": known, "over the approach speed": known[np.argsort(speed, kind="stable")]}
+    found = [(where, correlation_excess(rows.residual[order])) for where, order in orders.items()]
+    return [(where, excess) for where, excess in found if abs(excess) > _CORRELATED]
+
+
+def correlation_excess(residual: Float[np.ndarray, "rows 2"]) -> float:
+    """Return by how many standard deviations the residuals of neighbouring rows are correlated.
+
+    The scalar products of neighbouring rows are added up. If rows are independent and as likely positive as negative,
+    the sum is 0 on average, and its variance the number of neighbours times the mean squared product of two rows of the
+    table: both amplitudes of a row may go together. Outliers count as much as the smallest of them.
+
+    Args:
+        residual: of both amplitudes in errors, row after row; NaN where nothing was measured.
+    """
+    bounded = np.clip(np.nan_to_num(residual), -_OUTLIER, _OUTLIER)
+    count = len(bounded)
+    if count <= _FEWEST_NEIGHBOURS or np.sum(bounded**2) < _NEGLIGIBLE**2 * np.isfinite(residual).sum():
+        return 0.0
+    own = np.sum(bounded**2, axis=1)
+    # over all pairs, the squared products add up to the squares of this small matrix
+    others = np.sum((bounded.T @ bounded) ** 2) - np.sum(own**2)
+    if others <= 1e-9 * np.sum(own) ** 2:
+        return 0.0
+    return float(np.sum(bounded[1:] * bounded[:-1]) / np.sqrt(others / count))
+
+
+def _why_not_explained(evidence: Evidence) -> str:
+    worst = np.nanmax(np.abs(np.where(np.isfinite(evidence.rows.residual), evidence.rows.residual, 0.0)), axis=1)
+    far = np.argsort(-worst)[: max(1, len(worst) // 20)]
+    names = evidence.parameters
+    tail = f"farthest off: {_rows_in_words(evidence.table, np.sort(far))}"
+    # counting outliers less helps where the others are well explained: not if most are off, or off together
+    few = 2 * _outliers(evidence).sum() <= evidence.rows.used.sum()
+    if few and not evidence.robust and not _correlations(evidence):
+        tail += " (if only a few are wrong: --robust)"
+    if evidence.lasting:
+        other = "The loss may depend on the speed otherwise (try viscous+delay), the" if "r" in names else "The"
+        return (
+            f"{other} errors may be too small, the calibration (quality_factor, amplitudes, offsets) off, or some rows "
+            f"not single-impact orbits; {tail}."
+        )
+    return (
+        "The impacts may last too long for an instantaneous law (a collision delay decides amplitudes near resonance: "
+        f"try the model with +delay), the errors may be too small, or the calibration off; {tail}."
+    )
+
+
+def helpful_measurement(name: str) -> str:
+    """Return what to measure, or to say, so that a parameter gets determined."""
+    return _HELP.get(name, "measure at other drives, orders or offsets too, or hold it fixed at a known value")
+
+
+_HELP = {
+    "r": "measure fast impacts too: large drives on resonance, and give the quality factor with its error",
+    "epsilon": "measure slow impacts too: small drives, close to where the orbit is lost",
+    "viscous_loss": "measure over a wider range of drives at the same frequency",
+    "delay_hertz": "measure at several orders, detuned to both sides of each resonance",
+    "delay_lead_nm": "measure slow impacts too: small drives, close to where the orbit is lost",
+    "delay_offset_nm": "measure at several offsets and drives",
+    "relative_humidity": "measure slow impacts too, or hold it fixed at the hygrometer's value",
+    "adhesion_energy_j_per_m2": "measure slow impacts too, or hold it or the humidity fixed: both set the hysteresis",
+    "viscosity_pa_s": "measure over a wider range of drives, or hold it fixed at the liquid's known value",
+    "modulus_gpa": "measure at several orders, detuned to both sides of each resonance",
+    "bridge_forms_nm": "hold it fixed: only slow impacts depend on it",
+    "bridge_breaks_nm": "measure slow impacts too: small drives, close to where the orbit is lost",
+}
+
+
+def _warnings(evidence: Evidence) -> list[str]:
+    return [
+        *_damping_warnings(evidence),
+        *_parameter_warnings(evidence),
+        *_pair_warnings(evidence),
+        *_row_warnings(evidence),
+    ]
+
+
+def _damping_warnings(evidence: Evidence) -> list[str]:
+    table = evidence.table
+    if "quality_factor" in evidence.parameters:
+        return []
+    if table.quality_factor is None:
+        message = (
+            "The table gives no quality_factor: air damping is left out, and what it takes is counted as impact loss. "
+            "Add a line like `# quality_factor = 40 +- 1`."
+        )
+        return [message]
+    if table.quality_factor_error is None:
+        known = f"quality_factor = {table.quality_factor:g}"
+        message = (
+            f"{known} is taken as exact. Amplitudes tell the impact's loss from the air's only as well as Q is known: "
+            f"`# {known} +- 1` lets the intervals show it."
+        )
+        return [message]
+    return []
+
+
+def _parameter_warnings(evidence: Evidence) -> list[str]:
+    warnings = []
+    explained = not misfits(evidence)
+    for name, parameter in evidence.parameters.items():
+        low, high = parameter.interval95
+        # Where the model does not explain the data, a bound is only where the misfit pushed the parameter.
+        if parameter.at_bound and explained:
+            limit = f"< {high:.4g}" if high is not None else f"> {low:.6g}" if low is not None else None
+            reading = f": read it as a limit, {name} {limit} (95 %)" if limit else ""
+            warnings.append(f"{name} is at its bound, {parameter.value:.3g}{reading}.")
+        if parameter.did_not_move:
+            warnings.append(f"{name} did not move from the grid point it started at.")
+    if evidence.other_minimum is not None:
+        found, chi2 = evidence.other_minimum
+        values = ", ".join(f"{name} = {value:.5g}" for name, value in found.items())
+        warnings.append(
+            f"Another minimum explains the data about as well (chi2 {chi2:.1f}, here {evidence.chi2:.1f}): {values}."
+        )
+    return warnings
+
+
+def _pair_warnings(evidence: Evidence) -> list[str]:
+    names = list(evidence.parameters)
+    pairs = [
+        f"{names[i]} and {names[j]} ({evidence.correlations[i, j]:+.3f})"
+        for i in range(len(names))
+        for j in range(i + 1, len(names))
+        if abs(evidence.correlations[i, j]) > _TIED
+    ]
+    if not pairs:
+        return []
+    return [
+        f"Determined only together, hardly apart: {', '.join(pairs)}. The law may be sharp all the same: see its band."
+    ]
+
+
+def _row_warnings(evidence: Evidence) -> list[str]:
+    warnings = []
+    aside = np.flatnonzero(evidence.rows.set_aside)
+    if aside.size:
+        warnings.append(
+            "Set aside, because these impacts are too slow for a law of impacts: "
+            f"{_rows_in_words(evidence.table, aside)}."
+        )
+    strained = np.flatnonzero(evidence.rows.used & (evidence.rows.model_error > _STATED))
+    if strained.size:
+        worst = 100.0 * float(evidence.rows.model_error[strained].max())
+        warnings.append(
+            f"A model error of up to {worst:.1f} % was added to the errors of slow impacts: "
+            f"{_rows_in_words(evidence.table, strained)}."
+        )
+    unseen = np.zeros(evidence.table.rows) if evidence.table.no_orbit is None else evidence.table.no_orbit
+    contradicted = np.flatnonzero((unseen > 0) & (evidence.rows.orbits > 0))
+    if contradicted.size:
+        warnings.append(
+            f"No orbit was seen, though the fitted model has a steady one, for "
+            f"{_rows_in_words(evidence.table, contradicted)}: the tip may have settled on another motion; start it "
+            "otherwise, or remove the row."
+        )
+    several = np.flatnonzero(evidence.rows.orbits > 1)
+    if several.size:
+        warnings.append(
+            f"Several stable orbits coexist for {_rows_in_words(evidence.table, several)}: the one closest to the "
+            "measurement was taken."
+        )
+    folds = np.flatnonzero(evidence.rows.near_fold)
+    if folds.size:
+        warnings.append(f"Close to a fold, where errors are not linear: {_rows_in_words(evidence.table, folds)}.")
+    pairs = max(int(np.isfinite(evidence.rows.residual).sum()) - 2, 1)
+    if abs(evidence.autocorrelation) > 3.0 / np.sqrt(pairs) and not _correlations(evidence):
+        warnings.append(
+            f"Neighbouring residuals are correlated ({evidence.autocorrelation:+.2f}): something systematic is left."
+        )
+    if evidence.robust:
+        outliers = np.flatnonzero(_outliers(evidence))
+        named = f"; outliers: {_rows_in_words(evidence.table, outliers)}" if outliers.size else ""
+        chi2, freedom, p_value = _without_outliers(evidence)
+        goodness = f"{chi2:.1f}/{freedom}" + (f" (probability {p_value:.2g})" if freedom > 0 else "")
+        warnings.append(f"Robust loss: chi2 counts outliers linearly; without them chi2/dof = {goodness}{named}.")
+    if evidence.error_scale is not None:
+        warnings.append(
+            f"The amplitudes' errors were scaled by {evidence.error_scale:.3g} so that chi2/dof = 1: whether they are "
+            f"of the right size cannot be judged, only that the scale is believable (at most {LARGEST_SCALE:g}) and "
+            "that residuals are random."
+        )
+    elif evidence.p_value > 1.0 - 1e-6:
+        warnings.append("The errors look too large: chi2 is improbably small.")
+    return warnings
+
+
+def _rows_in_words(table: AmplitudeTable, rows: np.ndarray) -> str:
+    """Return 'line 7' or 'lines 7, 9, 12 and 3 more' of the table's file."""
+    numbers = [str(int(table.lines[i])) if len(table.lines) else str(int(i) + 1) for i in rows]
+    shown = ", ".join(numbers[:6]) + (f" and {len(numbers) - 6} more" if len(numbers) > 6 else "")
+    return f"{'line' if len(numbers) == 1 else 'lines'} {shown}"

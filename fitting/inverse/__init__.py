@@ -1,1 +1,0 @@
-"""Speeds and delay of each impact from amplitude and phase, without a law."""

@@ -1,0 +1,217 @@
+"""From amplitudes and phase of a single-impact orbit to its flight, and from the flight to the impact: no law needed.
+
+The response's amplitude and phase say when the tip leaves the platform and how fast; the rest is free flight, until it
+meets the platform again. Where three numbers are measured (peak, lock-in amplitude, phase) the two unknowns are their
+least squares.
+"""
+
+from functools import partial
+from itertools import product
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
+from afm_jax.impact.amplitude import FlightEnds, lockin, peak_amplitude
+from afm_jax.impact.lasting_impact import INDENTATION, gained_and_longer, middle_of_contact
+
+_HALF_SINE = 0.42441318157838753
+"""4/(3 pi): lock-in amplitude of half sines at their own frequency, over their height."""
+_ARRIVAL_STEPS = 8
+_ITERATIONS = 30
+_LONGEST_MOVE = 0.3
+_ARRIVED = 1e-6
+"""Squared distance to the minimum, in standard errors, at which the search has arrived."""
+_ANGLES, _SPEEDS = (-0.9, -0.45, 0.0, 0.45, 0.9), (-0.15, 0.0, 0.15)
+"""Starts of the search: angle of the response in rad, and logarithm of the velocity, beside a half sine's."""
+
+
+class MeasuredRow(NamedTuple):
+    """One row: its drive, and peak, lock-in amplitude and phase (nm, nm, degrees) with errors; arrays of one row."""
+
+    platform: Platform
+    order: Float[Array, ""]
+    value: Float[Array, " 3"]
+    error: Float[Array, " 3"]
+    """Infinite where nothing was measured."""
+
+
+class Impact(NamedTuple):
+    """The impact at the ends of a flight, as that of a free tip on a sample at rest: scalars."""
+
+    approach_speed: Float[Array, ""]
+    rebound_speed: Float[Array, ""]
+    delay_us: Float[Array, ""]
+
+
+class Inverted(NamedTuple):
+    """A row inverted; `impact` by the two unknowns has the covariance J C J^T."""
+
+    impact: Impact
+    covariance: Float[Array, "3 3"]
+    """Of approach speed, rebound speed and delay."""
+    flight: FlightEnds
+    chi2: Float[Array, ""]
+    """Of the measured numbers; 0 where there are only two."""
+    converged: Bool[Array, ""]
+
+
+def flight_of(unknowns: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantilever) -> FlightEnds:
+    """Return the flight that leaves the platform with unknowns: the start's phase nu t + phi, log of the velocity.
+
+    Its end is where it meets the platform about a response period later, by Newton's method.
+    """
+    nu = row.platform.angular_frequency / row.order
+    start = (unknowns[0] - jnp.deg2rad(row.value[2])) / nu
+    velocity = jnp.exp(unknowns[1])
+    position = row.platform.position(start)
+
+    def ends(duration):
+        z, v = cantilever.propagator(duration)(position, velocity)
+        height, speed = row.platform.position_and_velocity(start + duration)
+        return z, v, z - height, v - speed
+
+    def step(_, duration):
+        _, _, gap, rate = ends(duration)
+        # the tip must be closing in: a step is no longer than a tenth of the response period
+        move = jnp.where(rate < 0.0, -gap / jnp.where(rate < 0.0, rate, 1.0), 0.0)
+        return duration + jnp.clip(move, -0.1 * period, 0.1 * period)
+
+    period = row.order * row.platform.period_us
+    found = lax.stop_gradient(lax.fori_loop(0, _ARRIVAL_STEPS, step, period))
+    _, _, gap, rate = ends(found)
+    # one more step carries the derivative of the root
+    duration = found - gap / lax.stop_gradient(rate)
+    end_position, end_velocity, _, _ = ends(duration)
+    return FlightEnds(start, duration, position, velocity, end_position, end_velocity)
+
+
+def readings(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> Float[Array, " 3"]:
+    """Return peak and lock-in amplitude in nm and the phase in degrees that a flight makes."""
+    platform = row.platform
+    end = flight.start_us + flight.duration_us
+    tau = jnp.maximum(row.order * platform.period_us - flight.duration_us, 0.0)
+    # in contact the tip is below the platform's rest surface by the indentation
+    depth = INDENTATION * (platform.velocity(end) - flight.end_velocity) * tau**2
+    amplitude, phase = lockin(cantilever, platform, flight, row.order, delayed=True, indentation=depth)
+    return jnp.stack([peak_amplitude(cantilever, flight), amplitude, phase])
+
+
+def impact_of(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> Impact:
+    """Return the impact between a flight and the next, brought to that of a free tip on a sample at rest.
+
+    What air, spring and the platform's motion do during a Hertz contact is taken back (`gained_and_longer`): its
+    duration is the delay, for want of a law that tells lead and offset apart.
+    """
+    platform = row.platform
+    end = flight.start_us + flight.duration_us
+    approach = platform.velocity(end) - flight.end_velocity
+    rebound = flight.start_velocity - platform.velocity(flight.start_us)
+    delay = row.order * platform.period_us - flight.duration_us
+    middle = middle_of_contact(cantilever, platform, flight.start_us - 0.5 * delay)
+
+    def taken_back(free_delay):
+        return gained_and_longer(approach, jnp.maximum(free_delay, 0.0), middle, cantilever)
+
+    free_delay = lax.fori_loop(0, 3, lambda _, free_delay: delay - taken_back(free_delay)[1], delay)
+    gained, _ = taken_back(free_delay)
+    square = jnp.where(rebound > 0.0, rebound**2, 0.0) - gained
+    free_rebound = jnp.sqrt(jnp.where(square > 0.0, square, 1.0))
+    return Impact(approach, jnp.where((square > 0.0) & (rebound > 0.0), free_rebound, jnp.nan), free_delay)
+
+
+def _residual(unknowns: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantilever) -> Float[Array, " 3"]:
+    apart = readings(flight_of(unknowns, row, cantilever), row, cantilever) - row.value
+    # the phase is known modulo a drive period
+    turn = 360.0 / row.order
+    apart = apart.at[2].set((apart[2] + 0.5 * turn) % turn - 0.5 * turn)
+    return jnp.where(jnp.isfinite(row.error), apart / row.error, 0.0)
+
+
+class _SearchPlace(NamedTuple):
+    """A place of the search, with all that is computed there."""
+
+    unknowns: Float[Array, " 2"]
+    chi2: Float[Array, ""]
+    residual: Float[Array, " 3"]
+    slopes: Float[Array, "3 2"]
+
+
+def _look(unknowns: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantilever) -> _SearchPlace:
+    def twice(unknowns):
+        residual = _residual(unknowns, row, cantilever)
+        return residual, residual
+
+    slopes, residual = jax.jacfwd(twice, has_aux=True)(unknowns)
+    chi2 = jnp.sum(residual**2)
+    return _SearchPlace(unknowns, jnp.where(jnp.isfinite(chi2), chi2, jnp.inf), residual, slopes)
+
+
+def _search(start: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantilever) -> _SearchPlace:
+    """Return where Levenberg and Marquardt's method ends."""
+
+    def step(_, state):
+        place, damping = state
+        normal = place.slopes.T @ place.slopes
+        normal = normal + damping * jnp.diag(jnp.diag(normal))
+        move = -_solve(normal, place.slopes.T @ place.residual)
+        move = jnp.where(jnp.all(jnp.isfinite(move)), jnp.clip(move, -_LONGEST_MOVE, _LONGEST_MOVE), 0.0)
+        trial = _look(place.unknowns + move, row, cantilever)
+        better = trial.chi2 <= place.chi2
+        kept = jax.tree.map(lambda new, old: jnp.where(better, new, old), trial, place)
+        return kept, jnp.where(better, 0.1 * damping, jnp.minimum(10.0 * damping, 1e8))
+
+    # without slopes the first step goes nowhere and looks around: the program holds one look only
+    blind = _SearchPlace(start, jnp.asarray(jnp.inf), jnp.zeros(3), jnp.zeros((3, 2)))
+    return lax.fori_loop(0, _ITERATIONS, step, (blind, jnp.asarray(1e-3)))[0]
+
+
+def _solve(matrix: Float[Array, "2 2"], right: Float[Array, "2 ..."]) -> Float[Array, "2 ..."]:
+    """Return the solution of two equations; not finite where there is none."""
+    (a, b), (c, d) = matrix
+    inverse = jnp.stack([jnp.stack([d, -b]), jnp.stack([-c, a])]) / (a * d - b * c)
+    return inverse @ right
+
+
+@jax.jit
+@partial(jax.vmap, in_axes=(0, None))
+def invert_rows(row: MeasuredRow, cantilever: Cantilever) -> Inverted:
+    """Return the flights and impacts of rows with a phase and at least one amplitude.
+
+    Args:
+        row: arrays with a leading axis of rows.
+        cantilever: its frequency and Q, exactly known.
+    """
+    height = jnp.where(jnp.isfinite(row.error[0]), row.value[0], row.value[1] / _HALF_SINE)
+    # half sines z = a |sin(nu (t - t_out)/2)| have the phase nu t_out + phi = pi
+    middle = jnp.stack([jnp.asarray(jnp.pi), jnp.log(cantilever.angular_frequency * height)])
+    starts = middle + jnp.asarray(tuple(product(_ANGLES, _SPEEDS)))
+
+    def one(start):
+        place = _search(start, row, cantilever)
+
+        def impact(unknowns):
+            flight = flight_of(unknowns, row, cantilever)
+            found = impact_of(flight, row, cantilever)
+            return jnp.stack(found), (found, flight)
+
+        slopes, (found, flight) = jax.jacfwd(impact, has_aux=True)(place.unknowns)
+        normal = place.slopes.T @ place.slopes
+        covariance = slopes @ _solve(normal, slopes.T)
+        # distance to the minimum in standard errors, squared
+        rest = place.slopes.T @ place.residual
+        left = rest @ _solve(normal, rest)
+        good = (found.approach_speed > 0.0) & (found.rebound_speed > 0.0)
+        good = good & (left < _ARRIVED) & jnp.all(jnp.isfinite(covariance))
+        return Inverted(found, covariance, flight, place.chi2, good)
+
+    ends = jax.vmap(one)(starts)
+    # of equally good ones that with the shortest contact
+    response = row.order * row.platform.period_us
+    score = ends.chi2 + 1e-3 * (ends.impact.delay_us / response) ** 2
+    best = jnp.argmin(jnp.where(ends.converged, score, jnp.inf))
+    return jax.tree.map(lambda part: part[best], ends)

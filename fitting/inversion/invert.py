@@ -1,0 +1,229 @@
+"""Direct inversion: amplitude and phase of each row give the speeds of its impact and the collision delay, no law."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
+from afm_jax.checks import require_float64
+from afm_jax.version import version_of
+from fitting.inversion.flight import Inverted, MeasuredRow, invert_rows
+from fitting.inversion.regression import Laws, regressed_laws
+from fitting.inversion.result import Inversion, InvertedRows, RegressedLaw, on_resonance, read_on_resonance
+from fitting.tables.table import AmplitudeTable, TableError
+
+_BLOCK = 64
+"""Rows come filled up to a multiple of this, so that one program serves most tables."""
+_IMPROBABLE = 1e-3
+_OUTLIER = 16.0
+"""chi2 of one degree of freedom (4 standard errors) above which a row contradicts itself."""
+_PACKAGES = ("afm-jax", "jax", "numpy")
+
+Law = tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]
+
+
+class _Instrument(NamedTuple):
+    """What all rows share."""
+
+    free_frequency_khz: float
+    quality_factor: float | None
+    tip_calibration: float = 1.0
+    drive_calibration: float = 1.0
+    offset_origin_nm: float = 0.0
+
+
+class _Shared(NamedTuple):
+    """An instrument, and others each one standard error of one quantity away."""
+
+    instrument: _Instrument
+    moved: dict[str, _Instrument]
+
+
+def invert(table: AmplitudeTable, *, frequency_error_khz: float | None = None, truth: Law | None = None) -> Inversion:
+    """Return approach speed, rebound speed and collision delay of every row with a phase, and the laws they follow.
+
+    A row's amplitude and phase fix the flight between two impacts; no impact law is assumed. What the platform's
+    motion and the air do during the contact is taken back by parameter-free corrections (see `inversion_flight`), so
+    that the speeds are those of a free tip on a sample at rest. Rows on resonance are also read as the paper proposes.
+
+    Args:
+        table: from `read_table`; a table without phases must have rows on resonance.
+        frequency_error_khz: standard error of the free frequency; None: exactly known.
+        truth: approach and rebound speeds in nm/us, ascending, where the law is known: what the reading on resonance
+            is compared with.
+
+    Returns:
+        Rows with errors, regressed laws and a verdict; see `Inversion`.
+
+    Raises:
+        TableError: if the table has no phase and no row on resonance.
+        ValueError: if the frequency's error is not positive.
+        RuntimeError: if JAX is not set to 64-bit floats.
+    """
+    require_float64()
+    if frequency_error_khz is not None and not 0.0 < frequency_error_khz < table.free_frequency_khz:
+        raise ValueError(f"`frequency_error_khz` must be positive, but is {frequency_error_khz!r}")
+    with_phase = _with_phase(table)
+    if not with_phase.any() and not on_resonance(table).any():
+        raise TableError(
+            f"{table.source}: no row has a phase, and none is on resonance (2 N times the free frequency), where the "
+            "phase could be assumed; add the columns phase_deg and phase_error_deg, or use `afm-jax fit`"
+        )
+    rows = _inverted_rows(table, _shared(table, frequency_error_khz))
+    laws = regressed_laws(rows)
+    law, reference = _reference(truth, laws)
+    reasons, warnings = _judged(table, laws)
+    return Inversion(
+        table=table,
+        rows=laws.rows,
+        approach_speed_nm_per_us=laws.speeds,
+        laws=laws.laws,
+        delay=laws.delay,
+        preferred=laws.preferred,
+        verdict=laws.verdict,
+        resonance=read_on_resonance(table, law=law, reference=reference),
+        valid=not reasons,
+        reasons=reasons,
+        warnings=warnings,
+        versions={name: version_of(name) for name in _PACKAGES},
+    )
+
+
+def _with_phase(table: AmplitudeTable) -> np.ndarray:
+    """Return which rows have a phase and an amplitude."""
+    known = np.isfinite(_numbers(table)[1])
+    return known[:, 2] & known[:, :2].any(axis=1)
+
+
+def _shared(table: AmplitudeTable, frequency_error_khz: float | None) -> _Shared:
+    known = {name: value for name, (value, _) in table.calibration.items()}
+    errors = {name: error for name, (_, error) in table.calibration.items()}
+    instrument = _Instrument(float(table.free_frequency_khz), table.quality_factor, **known)
+    errors = {"quality_factor": table.quality_factor_error, "free_frequency_khz": frequency_error_khz} | errors
+    moved = {
+        name: instrument._replace(**{name: getattr(instrument, name) + error})
+        for name, error in errors.items()
+        if error
+    }
+    return _Shared(instrument, moved)
+
+
+def _inverted_rows(table: AmplitudeTable, shared: _Shared) -> InvertedRows:
+    with_phase = _with_phase(table)
+    count = table.rows
+    impact, covariance = np.full((count, 3), np.nan), np.full((count, 3, 3), np.nan)
+    moved, chi2 = np.full((count, 3, len(shared.moved)), np.nan), np.full(count, np.nan)
+    note = ["" if there else "no phase with an amplitude: nothing to invert" for there in with_phase]
+    chosen = np.flatnonzero(with_phase)
+    if chosen.size:
+        found = _at(table, chosen, shared.instrument)
+        good = chosen[found.converged]
+        impact[good] = np.stack(found.impact, axis=1)[found.converged]
+        covariance[good] = found.covariance[found.converged]
+        three = np.isfinite(_numbers(table)[1][chosen]).all(axis=1)
+        chi2[chosen] = np.where(three & found.converged, found.chi2, np.nan)
+        for k, instrument in enumerate(shared.moved.values()):
+            other = _at(table, chosen, instrument)
+            moved[good, :, k] = np.stack(other.impact, axis=1)[found.converged] - impact[good]
+        for row in np.setdiff1d(chosen, good):
+            note[row] = "no flight between two impacts has this amplitude and phase"
+        for row in chosen[np.nan_to_num(chi2[chosen]) > _OUTLIER]:
+            note[row] = f"amplitudes and phase contradict each other (chi2 {chi2[row]:.3g} of one degree of freedom)"
+    return InvertedRows(
+        impact=impact,
+        covariance=covariance,
+        shared=moved,
+        shared_names=tuple(shared.moved),
+        chi2=chi2,
+        regressed=np.asarray(np.isfinite(impact).all(axis=1) & np.isfinite(moved).all(axis=(1, 2))),
+        note=tuple(note),
+    )
+
+
+def _numbers(table: AmplitudeTable) -> tuple[Float[np.ndarray, "rows 3"], Float[np.ndarray, "rows 3"]]:
+    """Return peak, lock-in amplitude and phase, and their errors, infinite where nothing was measured."""
+    blank = np.full(table.rows, np.nan)
+    names = ("peak_amplitude_nm", "lockin_amplitude_nm", "phase_deg")
+    errors = ("peak_amplitude_error_nm", "lockin_amplitude_error_nm", "phase_error_deg")
+    value, error = (
+        np.stack([blank if getattr(table, name) is None else getattr(table, name) for name in part], axis=1)
+        for part in (names, errors)
+    )
+    there = np.isfinite(value) & np.isfinite(error)
+    return np.where(there, value, 1.0), np.where(there, error, np.inf)
+
+
+def _at(table: AmplitudeTable, chosen: np.ndarray, instrument: _Instrument) -> Inverted:
+    """Return some rows inverted with an instrument."""
+    value, error = _numbers(table)
+    per_nm = np.array([instrument.tip_calibration, instrument.tip_calibration, 1.0])
+    fill = np.resize(chosen, -(-chosen.size // _BLOCK) * _BLOCK)
+    # every field an array of the rows' shape, for `vmap`
+    amplitude, frequency, offset = (
+        instrument.drive_calibration * table.drive_amplitude_nm,
+        table.drive_frequency_khz,
+        instrument.offset_origin_nm + table.offset_nm,
+    )
+    drive = (jnp.asarray(part[fill]) for part in (amplitude, frequency, offset))
+    platform = Platform(*drive, offset_rate_nm_per_us=jnp.zeros(fill.size))
+    rows = MeasuredRow(
+        platform,
+        jnp.asarray(table.order[fill], float),
+        jnp.asarray((value / per_nm)[fill]),
+        jnp.asarray((error / per_nm)[fill]),
+    )
+    cantilever = Cantilever(instrument.free_frequency_khz, instrument.quality_factor, table.mass_ng)
+    return jax.tree.map(lambda part: np.asarray(part)[: chosen.size], invert_rows(rows, cantilever))
+
+
+def _reference(truth: Law | None, laws: Laws) -> tuple[Law | None, str]:
+    """Return what the reading on resonance is compared with, and its name."""
+    if truth is not None:
+        return truth, "truth"
+    best = laws.laws.get(laws.preferred or "viscous")
+    if best is None:
+        return None, "none"
+    known = np.isfinite(best.curve)
+    return (laws.speeds[known], best.curve[known]), "law"
+
+
+def _is_measured(law: RegressedLaw) -> bool:
+    """Say whether a coefficient of a law differs from no loss by more than two standard errors."""
+    for name, found in law.parameters.items():
+        apart = 1.0 - found.value if name == "r" else found.value
+        if found.standard_error is not None and abs(apart) > 2.0 * found.standard_error:
+            return True
+    return False
+
+
+def _judged(table: AmplitudeTable, laws: Laws) -> tuple[list[str], list[str]]:
+    """Return what makes a result invalid, and what a reader should know besides."""
+    rows, reasons, warnings = laws.rows, [], []
+    phases = _with_phase(table)
+    if phases.any() and not rows.inverted.any():
+        reasons.append("no row could be inverted: check the phases' sign and zero (t = 0 when the platform is highest)")
+    elif phases.any() and not laws.laws:
+        reasons.append(
+            f"{int(rows.regressed.sum())} rows do not determine a law of two coefficients: measure at more drives"
+        )
+    elif laws.laws and max(law.p_value for law in laws.laws.values() if law.p_value == law.p_value) < _IMPROBABLE:
+        reasons.append("neither law explains the rows: check the errors, Q, and the calibration of tip and drive")
+    elif laws.laws and not any(_is_measured(law) for law in laws.laws.values()):
+        reasons.append("the rows determine no coefficient of either law to two standard errors: measure more finely")
+    if not phases.any():
+        warnings.append("the table has no phase: only the paper's reading on resonance, whose phase is assumed")
+    if table.quality_factor is None:
+        warnings.append("Q is not known: the flight is taken as undamped, so air damping counts as loss on impact")
+    elif table.quality_factor_error is None:
+        warnings.append("Q comes without an error: its uncertainty is not in the errors here")
+    lost = int((phases & ~rows.inverted).sum())
+    if lost and rows.inverted.any():
+        warnings.append(f"{lost} rows could not be inverted (see their notes)")
+    outliers = int(np.sum(np.nan_to_num(rows.chi2) > _OUTLIER))
+    if outliers:
+        warnings.append(f"{outliers} rows contradict themselves by more than 4 standard errors (see their notes)")
+    return reasons, warnings

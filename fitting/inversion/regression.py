@@ -1,0 +1,412 @@
+"""The laws that inverted rows follow, and which of them chi2 prefers.
+
+Laws regressed on inverted impacts: the loss u_in^2 - u_out^2 on (1, u) and on (1, u^2), and the delay law.
+
+Both speeds and the delay of a row come from the same few numbers, so that their errors are strongly correlated; each
+residual is weighted by the variance that the row's whole covariance gives it (total least squares to first order). What
+all rows share, an error of Q or of the free frequency, is a nuisance with its known uncertainty.
+
+The law that a fit found, read back from the JSON of `afm-jax fit`, to be drawn over rows inverted without it.
+
+A law that is known otherwise, from a CSV file such as `afm-jax collide --out` writes.
+"""
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.special import chdtrc
+
+from fitting.inversion.result import Coefficient, InvertedRows, RegressedLaw
+from fitting.tables.csv_text import (
+    Column,
+    Faults,
+    Form,
+    TableError,
+    parse_rows,
+    printable,
+    read_text,
+    split_cells,
+    split_lines,
+)
+
+_PASSES = 25
+_STEP = 1e-30
+"""Of complex differentiation, which has no rounding."""
+
+Formula = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
+"""Of approach speed, rebound speed and delay; works on complex numbers."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Regression:
+    """A target regressed on terms; all arrays of the terms' number.
+
+    Attributes:
+        value: coefficients.
+        covariance: of the coefficients, what the rows share included.
+        random_covariance: with what the rows share exactly known.
+        pulls: by how many standard errors each shared quantity is moved.
+        chi2: sum of squared residuals over their variances, pulls included.
+        degrees_of_freedom: rows less terms.
+        residual: normalised, shape (rows,).
+    """
+
+    value: Float[np.ndarray, " p"]
+    covariance: Float[np.ndarray, "p p"]
+    random_covariance: Float[np.ndarray, "p p"]
+    pulls: Float[np.ndarray, " shared"]
+    chi2: float
+    degrees_of_freedom: int
+    residual: Float[np.ndarray, " rows"]
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a larger chi2 if the law is right; NaN without degrees of freedom."""
+        return float(chdtrc(self.degrees_of_freedom, self.chi2)) if self.degrees_of_freedom > 0 else float("nan")
+
+
+def loss(u: np.ndarray, w: np.ndarray, _: np.ndarray) -> np.ndarray:
+    """Return u_in^2 - u_out^2 in nm^2/us^2."""
+    return u * u - w * w
+
+
+def one(u: np.ndarray, _w: np.ndarray, _tau: np.ndarray) -> np.ndarray:
+    """Return 1."""
+    return np.ones_like(u)
+
+
+LOSS_TERMS: dict[str, tuple[Formula, ...]] = {
+    "viscous": (one, lambda u, _w, _tau: u),
+    "restitution": (one, lambda u, _w, _tau: u * u),
+}
+"""Of u_in^2 - u_out^2 = epsilon + c u_in, and = epsilon + (1 - r^2) u_in^2 (eq. 6)."""
+DELAY_TERMS: tuple[Formula, ...] = (
+    lambda u, _w, _tau: u**-0.2,
+    lambda u, w, _tau: 1.0 / u - 1.0 / w,
+    lambda u, _w, _tau: -1.0 / u,
+)
+"""Of the delay law a u^(-1/5) - b (1/u_out - 1/u_in) - d/u_in."""
+
+
+def delay(_u: np.ndarray, _w: np.ndarray, tau: np.ndarray) -> np.ndarray:
+    """Return the delay in us."""
+    return tau
+
+
+def regress(
+    target: Formula,
+    terms: tuple[Formula, ...],
+    impacts: Float[np.ndarray, "rows 3"],
+    covariances: Float[np.ndarray, "rows 3 3"],
+    shared: Float[np.ndarray, "rows 3 shared"],
+) -> Regression:
+    """Return a target regressed on terms, both functions of quantities with correlated errors.
+
+    Args:
+        target: what is to be explained.
+        terms: what it is a linear combination of.
+        impacts: approach speed, rebound speed and delay of each row.
+        covariances: of each row's three quantities.
+        shared: by how much they move with one standard error of each quantity that all rows share.
+
+    Raises:
+        ValueError: if there are fewer rows than terms.
+    """
+    rows, count, extra = len(impacts), len(terms), shared.shape[2]
+    if rows < count:
+        raise ValueError(f"{rows} rows cannot determine {count} coefficients; measure more")
+    goal, goal_slopes = _with_slopes(target, impacts)
+    basis, basis_slopes = (
+        np.stack(part, axis=1) for part in zip(*(_with_slopes(t, impacts) for t in terms), strict=True)
+    )
+
+    def linear(value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the linear least-squares problem with the variances at some coefficients."""
+        # by how much the residual moves with each quantity of the row
+        slopes = goal_slopes - np.einsum("p,npk->nk", value, basis_slopes)
+        weight = 1.0 / np.sqrt(np.einsum("nk,nkl,nl->n", slopes, covariances, slopes))
+        moved = np.einsum("nk,nks->ns", slopes, shared)
+        constraints = np.hstack([np.zeros((extra, count)), np.eye(extra)])
+        design = np.vstack([np.hstack([basis, -moved]) * weight[:, None], constraints])
+        return design, np.concatenate([goal * weight, np.zeros(extra)])
+
+    design, right = linear(np.zeros(count))
+    found = _solution(design, right)
+    for _ in range(_PASSES):
+        design, right = linear(found[:count])
+        found, last = _solution(design, right), found
+        if np.allclose(found, last, rtol=1e-12, atol=0.0):
+            break
+    residual = right - design @ found
+    return Regression(
+        value=found[:count],
+        covariance=_inverse(design)[:count, :count],
+        random_covariance=_inverse(design[:rows, :count]),
+        pulls=found[count:],
+        chi2=float(residual @ residual),
+        degrees_of_freedom=rows - count,
+        residual=residual[:rows],
+    )
+
+
+def _solution(design: Float[np.ndarray, "n p"], right: Float[np.ndarray, " n"]) -> Float[np.ndarray, " p"]:
+    """Return the least-squares solution, terms of very different size brought to one."""
+    size = _norm(design)
+    if not np.all(np.isfinite(design / size)) or not np.all(np.isfinite(right)):
+        return np.full_like(size, np.nan)
+    return np.linalg.lstsq(design / size, right, rcond=None)[0] / size
+
+
+def _norm(design: Float[np.ndarray, "n p"]) -> Float[np.ndarray, " p"]:
+    """Return the columns' lengths, 1 for a column of zeros."""
+    length = np.linalg.norm(design, axis=0)
+    return np.where(length > 0.0, length, 1.0)
+
+
+def _inverse(design: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "p p"]:
+    """Return the inverse of the normal matrix; infinite where the rows do not tell the terms apart."""
+    size = _norm(design)
+    scaled = design / size
+    if not np.all(np.isfinite(scaled)) or np.linalg.matrix_rank(scaled, tol=1e-9) < len(size):
+        return np.full((len(size), len(size)), np.inf)
+    return np.linalg.inv(scaled.T @ scaled) / np.outer(size, size)
+
+
+def _with_slopes(formula: Formula, impacts: Float[np.ndarray, "rows 3"]) -> tuple[np.ndarray, np.ndarray]:
+    """Return a formula's values, and its slopes by the three quantities, shape (rows, 3)."""
+    slopes = [np.imag(formula(*(impacts + 1j * _STEP * np.eye(3)[k]).T)) / _STEP for k in range(3)]
+    return np.real(formula(*impacts.T)), np.stack(slopes, axis=1)
+
+
+_SLOW = 2.5
+"""Rows below this multiple of sqrt(epsilon) are set aside: there the contact is no short event any more."""
+_POINTS = 120
+_DECIDED = 6.0
+"""Difference of chi2 from which a law with as many coefficients is called better."""
+_IMPROBABLE = 1e-3
+_UNITS = {
+    "epsilon": "nm^2/us^2",
+    "viscous_loss": "nm/us",
+    "r": "",
+    "hertz": "us (nm/us)^(1/5)",
+    "lead_nm": "nm",
+    "offset_nm": "nm",
+}
+_NAMES = {
+    "viscous": ("epsilon", "viscous_loss"),
+    "restitution": ("epsilon", "r"),
+    "delay": ("hertz", "lead_nm", "offset_nm"),
+}
+_PLAIN = {"viscous": "a viscous loss, linear in the speed", "restitution": "a coefficient of restitution"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Laws:
+    """The regressions, with the rows marked that entered them, and the speeds of the curves."""
+
+    rows: InvertedRows
+    speeds: Float[np.ndarray, " points"]
+    laws: dict[str, RegressedLaw]
+    delay: RegressedLaw | None
+    preferred: str | None
+    verdict: str
+
+
+def regressed_laws(rows: InvertedRows) -> Laws:
+    """Return the laws regressed on rows: both of the loss, and the delay's.
+
+    Rows slower than 2.5 sqrt(epsilon), epsilon from a first regression, are set aside and named.
+
+    Args:
+        rows: inverted rows; those with `regressed` off are left out.
+    """
+    rows = _without_slow(rows)
+    used = rows.regressed
+    impacts = rows.impact[used]
+    if used.sum() < 3:
+        verdict = "no law is regressed: it takes three rows with amplitude and phase"
+        return Laws(rows=rows, speeds=np.zeros(0), laws={}, delay=None, preferred=None, verdict=verdict)
+    speeds = np.geomspace(impacts[:, 0].min(), impacts[:, 0].max(), _POINTS)
+    found = {model: _regression(rows, loss, terms) for model, terms in LOSS_TERMS.items()}
+    if not all(np.all(np.isfinite(one.covariance)) for one in found.values()):
+        verdict = "no law is regressed: the rows have one approach speed"
+        return Laws(rows=rows, speeds=speeds, laws={}, delay=None, preferred=None, verdict=verdict)
+    laws = {model: _loss_law(model, found[model], rows.shared_names, speeds) for model in found}
+    preferred, verdict = _verdict(laws)
+    rebound = laws[preferred or "viscous"].curve
+    delays = None
+    if used.sum() > len(DELAY_TERMS):
+        regression = _regression(rows, delay, DELAY_TERMS)
+        if np.all(np.isfinite(regression.covariance)):
+            delays = _delay_law(regression, rows.shared_names, speeds, rebound)
+    return Laws(rows=rows, speeds=speeds, laws=laws, delay=delays, preferred=preferred, verdict=verdict)
+
+
+def _regression(rows: InvertedRows, target: Formula, terms: tuple[Formula, ...]) -> Regression:
+    used = rows.regressed
+    return regress(target, terms, rows.impact[used], rows.covariance[used], rows.shared[used])
+
+
+def _without_slow(rows: InvertedRows) -> InvertedRows:
+    """Return the rows with slow ones set aside, where enough are left."""
+    if rows.regressed.sum() < 4:
+        return rows
+    epsilon = float(_regression(rows, loss, LOSS_TERMS["viscous"]).value[0])
+    limit = _SLOW * np.sqrt(max(epsilon, 0.0))
+    slow = rows.regressed & (rows.impact[:, 0] < limit)
+    kept = rows.regressed & ~slow
+    if kept.sum() < 3:
+        return rows
+    reason = f"not in the laws: slower than 2.5 sqrt(epsilon) = {limit:.3g} nm/us, where an impact is no short event"
+    note = tuple(
+        "; ".join(filter(None, (old, reason))) if out else old for old, out in zip(rows.note, slow, strict=True)
+    )
+    return replace(rows, regressed=kept, note=note)
+
+
+def _loss_law(
+    model: str, found: Regression, shared: tuple[str, ...], speeds: Float[np.ndarray, " points"]
+) -> RegressedLaw:
+    basis = np.stack([term(speeds, speeds, speeds) for term in LOSS_TERMS[model]], axis=1)
+    square = speeds**2 - basis @ found.value
+    free = square > 0.0
+    curve = np.sqrt(np.where(free, square, np.nan))
+    spread = np.sqrt(np.einsum("np,pq,nq->n", basis, found.covariance, basis))
+    value, total, random = found.value.copy(), np.diag(found.covariance).copy(), np.diag(found.random_covariance).copy()
+    if model == "restitution":
+        # the coefficient is 1 - r^2
+        r = float(np.sqrt(max(1.0 - value[1], 1e-12)))
+        value[1] = r
+        total[1], random[1] = total[1] / (4.0 * r * r), random[1] / (4.0 * r * r)
+    return _law(model, found, (value, total, random), shared, (curve, spread / (2.0 * curve)))
+
+
+def _delay_law(
+    found: Regression,
+    shared: tuple[str, ...],
+    speeds: Float[np.ndarray, " points"],
+    rebound: Float[np.ndarray, " points"],
+) -> RegressedLaw:
+    basis = np.stack([term(speeds, rebound, speeds) for term in DELAY_TERMS], axis=1)
+    spread = np.sqrt(np.einsum("np,pq,nq->n", basis, found.covariance, basis))
+    values = (found.value, np.diag(found.covariance), np.diag(found.random_covariance))
+    return _law("delay", found, values, shared, (basis @ found.value, spread))
+
+
+def _law(
+    model: str,
+    found: Regression,
+    values: tuple[np.ndarray, np.ndarray, np.ndarray],
+    shared: tuple[str, ...],
+    curve: tuple[np.ndarray, np.ndarray],
+) -> RegressedLaw:
+    parameters = {
+        name: Coefficient(
+            value=float(value),
+            unit=_UNITS[name],
+            standard_error=float(np.sqrt(total)),
+            systematic_error=float(np.sqrt(max(total - random, 0.0))) if shared else None,
+        )
+        for name, value, total, random in zip(_NAMES[model], *values, strict=True)
+    }
+    return RegressedLaw(
+        model=model,
+        parameters=parameters,
+        chi2=found.chi2,
+        degrees_of_freedom=found.degrees_of_freedom,
+        p_value=found.p_value,
+        pulls=dict(zip(shared, found.pulls.tolist(), strict=True)),
+        curve=curve[0],
+        curve_error=curve[1],
+    )
+
+
+def _verdict(laws: dict[str, RegressedLaw]) -> tuple[str | None, str]:
+    """Return the model that chi2 prefers, None where it does not tell, and the same in words."""
+    best, other = sorted(laws.values(), key=lambda law: law.chi2)
+    numbers = f"chi2 {best.chi2:.1f} against {other.chi2:.1f}, {best.degrees_of_freedom} degrees of freedom each"
+    if other.chi2 - best.chi2 < _DECIDED:
+        return None, f"the rows do not tell restitution from viscous loss ({numbers})"
+    verdict = f"the rows support {_PLAIN[best.model]}, rather than {_PLAIN[other.model]} ({numbers})"
+    if best.p_value < _IMPROBABLE:
+        verdict += "; but neither law explains them"
+    return best.model, verdict
+
+
+_COLUMNS = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us")
+
+
+class SavedLaw(NamedTuple):
+    """A law at some approach speeds: rebound speed in nm/us and delay in us, each of shape (points,)."""
+
+    model: str
+    approach_speed_nm_per_us: Float[np.ndarray, " points"]
+    rebound_speed_nm_per_us: Float[np.ndarray, " points"]
+    collision_delay_us: Float[np.ndarray, " points"]
+
+
+def read_fitted_law(path: str | Path) -> SavedLaw:
+    """Read the law of a fit.
+
+    Args:
+        path: what `afm-jax fit --json` prints, or the fit.json of its report.
+
+    Raises:
+        TableError: if the file cannot be read, is no fit, or the fit is not valid.
+    """
+    name = printable(str(path))
+    try:
+        found = json.loads(read_text(path))
+    except json.JSONDecodeError as error:
+        raise TableError(f"{name}, line {error.lineno}: is no JSON; give the fit.json of `afm-jax fit --out`") from None
+    if not isinstance(found, dict) or found.get("format") != "afm-jax fit" or not isinstance(found.get("law"), dict):
+        raise TableError(f"{name}: is no fit; give the fit.json of `afm-jax fit --out`")
+    if not found.get("valid"):
+        raise TableError(f"{name}: the fit is not valid, so that its law means nothing; give a valid one")
+    columns = [_numbers(found["law"].get(column)) for column in _COLUMNS]
+    if any(column.shape != columns[0].shape or column.size < 2 for column in columns):
+        raise TableError(f"{name}: its law lacks {', '.join(_COLUMNS)}; fit again with this version")
+    return SavedLaw(str(found.get("model")), *columns)
+
+
+def _numbers(cells: Any) -> Float[np.ndarray, " points"]:
+    """Return a list of numbers as an array, NaN for null; an empty one for anything else."""
+    if not isinstance(cells, list) or any(not isinstance(cell, (int, float, type(None))) for cell in cells):
+        return np.zeros(0)
+    return np.array([np.nan if cell is None else float(cell) for cell in cells], dtype=np.float64)
+
+
+_KNOWN_COLUMNS = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us")
+_LAW = Form(tuple(Column(name) for name in _KNOWN_COLUMNS), "speed", open=True, blanks=True)
+
+
+def read_known_law(path: str | Path) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
+    """Return approach and rebound speeds in nm/us, ascending; rows of captured tips are left out.
+
+    Args:
+        path: a CSV file with at least the columns approach_speed_nm_per_us and rebound_speed_nm_per_us.
+
+    Raises:
+        TableError: if the file cannot be read, lacks a column or holds no two rebounding tips.
+    """
+    name = printable(str(path))
+    _, rows = split_lines(read_text(path))
+    names = split_cells(rows[0][1]) if rows else []
+    for column in _KNOWN_COLUMNS:
+        if column not in names:
+            raise TableError(f"{name}: there is no column {column}; give a CSV file as `afm-jax collide --out` writes")
+    columns, unreadable, lines = parse_rows(rows[1:], names, _LAW, faults := Faults(str(path)))
+    for row in np.flatnonzero(np.any(list(unreadable.values()), axis=0)):
+        raise TableError(f"{name}, line {lines[row]}: a speed is not a number; correct it")
+    faults.raise_any()
+    pairs = np.stack([columns[column] for column in _KNOWN_COLUMNS], axis=1)
+    pairs = pairs[np.all(np.isfinite(pairs) & (pairs > 0.0), axis=1)]
+    found = np.unique(pairs, axis=0)
+    if len(np.unique(found[:, 0])) < 2 or len(np.unique(found[:, 0])) < len(found):
+        raise TableError(f"{name}: there must be two or more rebounding tips, each speed once; give more speeds")
+    return found[:, 0], found[:, 1]

@@ -1,0 +1,295 @@
+"""A direct inversion as a person reads it: text for the terminal, files for the drawer (JSON, CSV, PNG).
+
+The picture of a direct inversion: the loss and the delay point by point, over the laws regressed on them.
+"""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, with_zero_line
+from afm_jax.words import bullets, text_table, with_error
+from fitting.inversion.regression import SavedLaw
+from fitting.inversion.result import Coefficient, Inversion, RegressedLaw
+
+ROW_COLUMNS = (
+    "line",
+    "order",
+    "drive_frequency_khz",
+    "drive_amplitude_nm",
+    "offset_nm",
+    "approach_speed_nm_per_us",
+    "approach_speed_error_nm_per_us",
+    "approach_speed_systematic_nm_per_us",
+    "rebound_speed_nm_per_us",
+    "rebound_speed_error_nm_per_us",
+    "rebound_speed_systematic_nm_per_us",
+    "collision_delay_us",
+    "collision_delay_error_us",
+    "collision_delay_systematic_us",
+    "speed_correlation",
+    "chi2",
+    "regressed",
+    "note",
+)
+LAW_COLUMNS = (
+    "approach_speed_nm_per_us",
+    "rebound_speed_viscous_nm_per_us",
+    "rebound_speed_viscous_error_nm_per_us",
+    "rebound_speed_restitution_nm_per_us",
+    "rebound_speed_restitution_error_nm_per_us",
+    "collision_delay_us",
+    "collision_delay_error_us",
+)
+_FORMULAS = {
+    "viscous": "u_out^2 = u_in^2 - epsilon - viscous_loss u_in",
+    "restitution": "u_out^2 = r^2 u_in^2 - epsilon  (eq. 6)",
+    "delay": "tau = hertz u_in^(-1/5) - lead_nm (1/u_out - 1/u_in) - offset_nm/u_in",
+}
+NS_PER_US = 1e3
+Table = Callable[[str, list[dict[str, Any]], tuple[str, ...]], None]
+
+
+def inversion_summary(result: Inversion) -> str:
+    """Return the inversion as text: verdict, laws, the rows, the paper's reading on resonance, notes."""
+    inverted = int(result.rows.inverted.sum())
+    lines = [
+        f"Direct inversion of {result.table.source}: {inverted} of {result.table.rows} rows",
+        _heading(result),
+        *(f"  - {reason}" for reason in result.reasons),
+        "",
+    ]
+    if inverted:
+        lines += [f"{result.verdict[0].upper()}{result.verdict[1:]}.", ""]
+        for law in (*result.laws.values(), *([result.delay] if result.delay else [])):
+            lines += _law_lines(law)
+        lines += ["", *_row_lines(result)]
+    lines += _resonance_lines(result)
+    lines += bullets("Notes:", result.warnings)
+    return "\n".join(lines)
+
+
+def _heading(result: Inversion) -> str:
+    if not result.valid:
+        return "NOT VALID: the numbers below determine no law."
+    if result.rows.inverted.any():
+        return "VALID"
+    return "READ ON AN ASSUMPTION: the phase was not measured but assumed, so that the numbers below are no law."
+
+
+def write_inversion(
+    result: Inversion, folder: Path, write_table: Table, *, fitted: SavedLaw | None = None
+) -> list[Path]:
+    """Write invert.txt, invert.json, invert.png, invert.csv and law.csv into a folder.
+
+    Args:
+        result: the inversion.
+        folder: an existing folder; files of these names are replaced.
+        write_table: called with a file name, records and columns for the CSV files.
+        fitted: a law that a fit found, drawn over the rows.
+
+    Returns:
+        The files written here (the tables are `write_table`'s).
+
+    Raises:
+        OSError: if a file cannot be written.
+    """
+    from afm_jax.plots.picture_style import png_of  # noqa: PLC0415
+    from fitting.report.report import write_report_files  # noqa: PLC0415
+
+    text, data, picture = inversion_summary(result), result.to_dict(), png_of(inversion_figure(result, fitted=fitted))
+    written = write_report_files(folder, "invert", text=text, data=data, picture=picture)
+    write_table("invert.csv", result.records(), ROW_COLUMNS)
+    write_table("law.csv", result.law_records(), LAW_COLUMNS)
+    return written
+
+
+def _law_lines(law: RegressedLaw) -> list[str]:
+    freedom = law.degrees_of_freedom
+    probability = f", probability {law.p_value:.2g}" if np.isfinite(law.p_value) else ""
+    lines = [f"  {law.model}: {_FORMULAS[law.model]}", f"    chi2/dof = {law.chi2:.1f}/{freedom}{probability}"]
+    lines += [f"    {name:<13}{_coefficient(found)}" for name, found in law.parameters.items()]
+    moved = [f"{name} by {pull:+.2f}" for name, pull in law.pulls.items()]
+    if moved:
+        lines.append(f"    in its standard errors the regression moves {', '.join(moved)}")
+    return lines
+
+
+def _coefficient(found: Coefficient) -> str:
+    text = f"{found.value:.6g}"
+    if found.standard_error is not None:
+        text = with_error(found.value, found.standard_error)
+    if found.systematic_error is not None:
+        text += f" (of it systematic {found.systematic_error:.2g})"
+    return f"{text} {found.unit}".rstrip()
+
+
+def _row_lines(result: Inversion) -> list[str]:
+    """Return the rows as a table, speeds in nm/us, delays in ns."""
+    rows, records = result.rows, result.records()
+    head = ["line", "N", "kHz", "nm", "u_in", "+-", "u_out", "+-", "tau ns", "+-", "loss u_in - u_out"]
+    cells = []
+    for i, row in enumerate(records):
+        note = row["note"] or ""
+        start = [f"{row['line']}", f"{row['order']}", f"{row['drive_frequency_khz']:.7g}"]
+        start.append(f"{row['drive_amplitude_nm']:.4g}")
+        if not rows.inverted[i]:
+            cells.append([*start, *[""] * 6, note])
+            continue
+        u, w, tau = rows.impact[i]
+        du, dw, dtau = rows.errors[i]
+        covariance = rows.covariance[i]
+        lost = np.sqrt(max(covariance[0, 0] + covariance[1, 1] - 2.0 * covariance[0, 1], 0.0))
+        loss = f"{u - w:.3f} +- {lost:.3f}" + (f"  ({note})" if note else "")
+        delay = [f"{NS_PER_US * tau:.2f}", f"{NS_PER_US * dtau:.2f}"]
+        cells.append([*start, f"{u:.3f}", f"{du:.3f}", f"{w:.3f}", f"{dw:.3f}", *delay, loss])
+    lines = text_table(head, cells, words=(10,))
+    if rows.shared_names:
+        names = " and ".join(rows.shared_names)
+        lines.append(
+            f"  Errors are those of each row; the systematic ones, of {names}, stand in invert.csv and --json."
+        )
+    return lines
+
+
+def _resonance_lines(result: Inversion) -> list[str]:
+    reading = result.resonance
+    if not len(reading.row):
+        return []
+    table = result.table
+    speeds = (reading.approach_speed_nm_per_us, reading.rebound_speed_nm_per_us, reading.speed_error_nm_per_us)
+    cells = [
+        [
+            f"{table.lines[row]}",
+            *(f"{speed:.3f}" for speed in found),
+            "not known" if np.isnan(bias) else f"{100.0 * bias:+.1f} %",
+        ]
+        for row, bias, *found in zip(reading.row, reading.bias, *speeds, strict=True)
+    ]
+    against = {
+        "truth": "Bias of u_out against the truth given, at the same approach speed.",
+        "law": "Bias of u_out against the law regressed above, at the same approach speed.",
+        "none": "The bias is not known: air damping and the collision delay are left out of this reading.",
+    }
+    return [
+        "",
+        f"The paper's reading assumes: {reading.assumption}.",
+        *text_table(["line", "u_in", "u_out", "+-", "bias"], cells, words=()),
+        f"  {against[reading.reference]}",
+    ]
+
+
+_STYLES = {"viscous": (BLUE, "-", r"$\epsilon$, $c$"), "restitution": (ACCENT, "--", r"$r$, $\epsilon$")}
+_NS_PER_US = 1e3
+_INVALID = "#B00020"
+_SMALL = 9
+
+
+def inversion_figure(result: Inversion, *, fitted: SavedLaw | None = None) -> Figure:
+    """Return the figure: loss u_in - u_out on the left, collision delay on the right, both against u_in.
+
+    Args:
+        result: the inversion; without any phase there is no delay to draw.
+        fitted: a law that a fit found, drawn over the rows.
+    """
+    inverted = bool(result.rows.inverted.any())
+    figure = new_figure(11.0 if inverted else 6.5, 5.0)
+    axes = figure.subplots(1, 2 if inverted else 1, squeeze=False)[0]
+    _draw_loss(axes[0], result, fitted)
+    if inverted:
+        _draw_delay(axes[1], result, fitted)
+    title = result.verdict if inverted else "the paper's reading on resonance: phase assumed, bias "
+    if not inverted:
+        title += "not known" if result.resonance.reference == "none" else "in invert.txt"
+    figure.suptitle(
+        title if result.valid else f"NOT VALID: {title}", color="black" if result.valid else _INVALID, fontsize=10
+    )
+    return figure
+
+
+def _draw_loss(axes: Axes, result: Inversion, fitted: SavedLaw | None) -> None:
+    rows, speeds = result.rows, result.approach_speed_nm_per_us
+    for name, law in result.laws.items():
+        colour, dashes, symbols = _STYLES[name]
+        label = f"{symbols}: $\\chi^2$ {law.chi2:.1f}/{law.degrees_of_freedom}"
+        lost = speeds - law.curve
+        axes.plot(speeds, lost, dashes, color=colour, lw=1.6, label=label)
+        axes.fill_between(speeds, lost - law.curve_error, lost + law.curve_error, color=colour, alpha=0.15, lw=0)
+    if fitted is not None:
+        _curve_of_fit(axes, result, fitted, fitted.approach_speed_nm_per_us - fitted.rebound_speed_nm_per_us)
+    c = rows.covariance
+    error = np.sqrt(np.maximum(c[:, 0, 0] + c[:, 1, 1] - 2.0 * c[:, 0, 1], 0.0))
+    _points(axes, result, rows.impact[:, 0] - rows.impact[:, 1], error)
+    reading = result.resonance
+    if len(reading.row):
+        lost = reading.approach_speed_nm_per_us - reading.rebound_speed_nm_per_us
+        axes.plot(reading.approach_speed_nm_per_us, lost, "x", ms=5, color=GRID, label="on resonance (paper)")
+    _speed_axis(axes, r"loss  $u_{in} - u_{out}$ (nm/µs)", legend="upper left")
+    axes.set_yscale("log")
+
+
+def _curve_of_fit(axes: Axes, result: Inversion, fitted: SavedLaw, values: np.ndarray) -> None:
+    """Draw what a fit found, over the speeds of the rows."""
+    speeds = np.concatenate([result.rows.impact[:, 0], result.resonance.approach_speed_nm_per_us])
+    known = np.isfinite(values) & (fitted.approach_speed_nm_per_us >= 0.9 * np.nanmin(speeds))
+    known &= fitted.approach_speed_nm_per_us <= 1.1 * np.nanmax(speeds)
+    curve = values[known]
+    axes.plot(
+        fitted.approach_speed_nm_per_us[known],
+        curve,
+        ":",
+        color="black",
+        lw=1.8,
+        zorder=3,
+        label=f"fit, {fitted.model}",
+    )
+
+
+def _draw_delay(axes: Axes, result: Inversion, fitted: SavedLaw | None) -> None:
+    law, speeds = result.delay, result.approach_speed_nm_per_us
+    if law is not None:
+        curve, band = _NS_PER_US * law.curve, _NS_PER_US * law.curve_error
+        label = f"delay law: $\\chi^2$ {law.chi2:.1f}/{law.degrees_of_freedom}"
+        axes.plot(speeds, curve, color=BLUE, lw=1.6, label=label)
+        axes.fill_between(speeds, curve - band, curve + band, color=BLUE, alpha=0.15, lw=0)
+    if fitted is not None:
+        _curve_of_fit(axes, result, fitted, _NS_PER_US * fitted.collision_delay_us)
+    _points(axes, result, _NS_PER_US * result.rows.impact[:, 2], _NS_PER_US * result.rows.errors[:, 2])
+    with_zero_line(axes)
+    _speed_axis(axes, r"collision delay  $\tau$ (ns)", legend="lower right")
+
+
+def _points(axes: Axes, result: Inversion, values: np.ndarray, errors: np.ndarray) -> None:
+    rows = result.rows
+    for chosen, face, label in (
+        (rows.inverted & rows.regressed, DARK, "rows"),
+        (rows.inverted & ~rows.regressed, "none", "rows set aside"),
+    ):
+        if chosen.any():
+            axes.errorbar(
+                rows.impact[chosen, 0],
+                values[chosen],
+                errors[chosen],
+                fmt="o",
+                ms=3.5,
+                lw=0.8,
+                color=DARK,
+                mfc=face,
+                label=label,
+            )
+
+
+def _speed_axis(axes: Axes, y: str, *, legend: Literal["upper left", "lower right"]) -> None:
+    axes.set_xscale("log")
+    low, high = axes.get_xlim()
+    ticks = [tick for tick in (5, 10, 20, 50, 100, 200, 500, 1000, 2000) if low <= tick <= high]
+    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    axes.set_xticks([], minor=True)
+    label_axes(axes, x=r"approach speed  $u_{in}$ (nm/µs)", y=y)
+    axes.grid(color=GRID, alpha=0.25)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=_SMALL, loc=legend)

@@ -1,1 +1,0 @@
-"""Which measurements to make next."""

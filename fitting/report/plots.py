@@ -1,0 +1,253 @@
+"""The pictures of a fit: measured and predicted amplitudes, residuals, and the law with its band."""
+
+import io
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.image import imread, imsave
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+from afm_jax.plots.picture_style import png_of
+from fitting.fits.result import FitResult
+from fitting.report.words import has_delay
+
+# Okabe and Ito's colours, distinguishable with every kind of colour vision.
+COLOURS = ("#0072B2", "#D55E00")
+ALARM = "#B00020"
+SMALL = 8
+_WIDTH_INCHES, _DPI = 10.0, 120.0
+_KINDS = ("peak", "lock-in")
+_ASIDE = "#999999"
+_ROW_AXIS = "row (by order N, drive frequency, drive amplitude)"
+_MUCH = 5.0
+"""How much the loss must change to be drawn on a logarithmic axis."""
+_APPROACH = "approach speed (nm/µs)"
+
+
+def fit_pictures(result: FitResult) -> list[bytes]:
+    """Return the pictures of the rows, the law, and the residuals over the speed as PNG files of equal width."""
+    return [png_of(figure, _DPI) for figure in (rows_figure(result), law_figure(result), speed_figure(result))]
+
+
+def one_below_the_other(pictures: Sequence[bytes]) -> bytes:
+    """Return PNG files of equal width as one."""
+    buffer = io.BytesIO()
+    stacked = np.concatenate([imread(io.BytesIO(picture)) for picture in pictures])
+    imsave(buffer, stacked, format="png", dpi=_DPI)
+    return buffer.getvalue()
+
+
+def rows_figure(result: FitResult) -> Figure:
+    """Return the figure of the rows: amplitudes above, residuals below."""
+    figure = Figure(figsize=(_WIDTH_INCHES, 6.4), layout="constrained")
+    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1.0))
+    draw_amplitudes(above, result)
+    draw_residuals(below, result)
+    handles, labels = above.get_legend_handles_labels()
+    figure.legend(handles, labels, fontsize=SMALL, ncols=4, loc="outside lower center")
+    goodness = f"chi²/dof = {result.chi2:.4g}/{result.degrees_of_freedom}"
+    title = f"Impact law from {result.table.rows} rows, model {result.model}, {goodness}"
+    colour = "black" if result.valid else ALARM
+    figure.suptitle(title if result.valid else f"NOT VALID    {title}", color=colour, fontsize=12)
+    return figure
+
+
+def law_figure(result: FitResult) -> Figure:
+    """Return the figure of the law: rebound speed, energy lost, and the delay where impacts last."""
+    draw = [draw_law, draw_losses, *([draw_delay] if has_delay(result) else [])]
+    figure = Figure(figsize=(_WIDTH_INCHES, 3.6), layout="constrained")
+    for panel, axes in zip(draw, figure.subplots(1, len(draw)), strict=True):
+        panel(axes, result)
+    return figure
+
+
+def speed_figure(result: FitResult) -> Figure:
+    """Return the figure of the residuals against the approach speed."""
+    figure = Figure(figsize=(_WIDTH_INCHES, 3.0), layout="constrained")
+    draw_residuals_by_speed(figure.subplots(), result)
+    return figure
+
+
+def draw_amplitudes(axes: Axes, result: FitResult) -> None:
+    """Draw each row's measured amplitudes with their prediction; rows set aside or without an orbit are marked."""
+    ranking, breaks = _row_axis(result)
+    places = np.arange(len(ranking))
+    aside = result.rows.set_aside[ranking]
+    drawn = False
+    for kind in range(2):
+        measured = result.rows.measured_nm[ranking, kind]
+        if not np.isfinite(measured).any():
+            continue
+        predicted = result.rows.predicted_nm[ranking, kind]
+        fitted = np.where(aside, np.nan, measured)
+        axes.plot(places, fitted, "o", ms=4, mfc="none", color=COLOURS[kind], label=f"{_KINDS[kind]}, measured")
+        axes.plot(places, predicted, "_", ms=8, mew=1.6, color=COLOURS[kind], label=f"{_KINDS[kind]}, predicted")
+        if (aside & np.isfinite(measured)).any():
+            label = None if drawn else "measured, set aside"
+            axes.plot(places[aside], measured[aside], "x", ms=6, mew=1.4, color=_ASIDE, label=label)
+            drawn = True
+    _mark_missing(axes, result, ranking)
+    _mark_orders(axes, result.table.order[ranking], breaks)
+    axes.set_yscale("log")
+    axes.set_ylabel("amplitude (nm)")
+    axes.tick_params(labelbottom=False)
+
+
+def draw_residuals(axes: Axes, result: FitResult) -> None:
+    """Draw the normalised residuals row by row."""
+    ranking, breaks = _row_axis(result)
+    places = np.arange(len(ranking))
+    _draw_expected(axes)
+    for kind in range(2):
+        axes.plot(places, result.rows.residual[ranking, kind], "o", ms=3, color=COLOURS[kind])
+    for place in breaks:
+        axes.axvline(place - 0.5, color="0.7", lw=0.8)
+    axes.set_ylabel("residual (errors)")
+    axes.set_xlabel(_ROW_AXIS)
+
+
+def draw_residuals_by_speed(axes: Axes, result: FitResult) -> None:
+    """Draw the normalised residuals against the approach speed: what is left of a wrong law shows here."""
+    _draw_expected(axes)
+    speed = result.rows.approach_speed_nm_per_us
+    for kind in range(2):
+        residual = result.rows.residual[:, kind]
+        if np.isfinite(residual).any():
+            axes.plot(speed, residual, "o", ms=3.5, color=COLOURS[kind], label=_KINDS[kind])
+    if (np.isfinite(speed) & np.isfinite(result.rows.residual).any(axis=1)).any():
+        log_speed_axis(axes)
+        axes.legend(fontsize=SMALL, loc="upper left", bbox_to_anchor=(1.0, 1.0))
+    axes.set_ylabel("residual (errors)")
+    axes.set_xlabel(_APPROACH)
+
+
+def log_speed_axis(axes: Axes) -> None:
+    """Make an axis of speeds logarithmic, with plain numbers at it."""
+    axes.set_xscale("log")
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _draw_expected(axes: Axes) -> None:
+    axes.axhspan(-2, 2, color="0.92", zorder=0)
+    axes.axhline(0, color="0.5", lw=0.8)
+
+
+def _row_axis(result: FitResult) -> tuple[np.ndarray, list[int]]:
+    """Return positions of the rows, sorted by order, frequency and drive, and where a new order begins."""
+    table = result.table
+    ranking = np.lexsort((table.drive_amplitude_nm, table.drive_frequency_khz, table.order))
+    orders = table.order[ranking]
+    return ranking, [int(i) for i in np.flatnonzero(np.diff(orders)) + 1]
+
+
+def _mark_missing(axes: Axes, result: FitResult, ranking: np.ndarray) -> None:
+    """Mark the rows for which the law has no stable orbit, and those that were seen without one."""
+    seen = np.zeros(len(ranking), dtype=bool) if result.table.no_orbit is None else result.table.no_orbit[ranking] > 0
+    missing = result.rows.orbits[ranking] == 0
+    for rows, colour, label in (
+        (missing & ~seen, ALARM, "no stable orbit predicted"),
+        (seen & missing, _ASIDE, "no orbit, as predicted"),
+        (seen & ~missing, "black", "no orbit seen, one predicted"),
+    ):
+        for count, place in enumerate(np.flatnonzero(rows).tolist()):
+            axes.axvline(place, color=colour, lw=0.8, ls=":", label=None if count else label)
+
+
+def _mark_orders(axes: Axes, orders: np.ndarray, breaks: list[int]) -> None:
+    """Separate the orders N by lines and name them at the top."""
+    for place in breaks:
+        axes.axvline(place - 0.5, color="0.7", lw=0.8)
+    for begin, end in zip([0, *breaks], [*breaks, len(orders)], strict=True):
+        axes.annotate(
+            f"N = {orders[begin]}",
+            ((begin + end - 1) / 2, 1.0),
+            xycoords=("data", "axes fraction"),
+            xytext=(0, 3),
+            textcoords="offset points",
+            ha="center",
+            fontsize=SMALL,
+        )
+
+
+def draw_law(axes: Axes, result: FitResult) -> None:
+    """Draw the rebound speed over the approach speed, with the speeds that the rows reached."""
+    law = result.law
+    speed = law.approach_speed_nm_per_us
+    if np.isfinite(law.rebound_high_nm_per_us).any():
+        low, high = law.rebound_low_nm_per_us, law.rebound_high_nm_per_us
+        axes.fill_between(speed, low, high, color=COLOURS[0], alpha=0.3, lw=0, label="95 % band")
+    name = "fitted law" if result.valid else "fit, not a measurement"
+    axes.plot(speed, law.rebound_speed_nm_per_us, color=COLOURS[0], label=name)
+    axes.plot(speed, speed, color="0.6", ls="--", lw=0.9, label="no loss")
+    _mark_speeds(axes, result, label="rows' approach speeds")
+    axes.set_ylabel("rebound speed (nm/µs)")
+    axes.set_xlabel(_APPROACH)
+    axes.set_xlim(left=0)
+    axes.set_ylim(bottom=0)
+    axes.legend(fontsize=SMALL, loc="upper left")
+
+
+def draw_losses(axes: Axes, result: FitResult) -> None:
+    """Draw the share of its energy that the tip loses, where the laws differ visibly."""
+    law = result.law
+    speed = law.approach_speed_nm_per_us
+    lost, least, most = (
+        100.0 * (1.0 - (column / speed) ** 2)
+        for column in (law.rebound_speed_nm_per_us, law.rebound_high_nm_per_us, law.rebound_low_nm_per_us)
+    )
+    axes.fill_between(speed, least, most, color=COLOURS[0], alpha=0.3, lw=0)
+    axes.plot(speed, lost, color=COLOURS[0])
+    _mark_speeds(axes, result)
+    log_speed_axis(axes)
+    axes.set_xlabel(_APPROACH)
+    axes.set_ylabel("energy lost (%)")
+    if lost.min() > 0.0 and lost.max() > _MUCH * lost.min():
+        axes.set_yscale("log")
+        axes.set_ylim(0.4 * lost.min(), 2.0 * lost.max())
+        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        return
+    top = float(np.max(np.where(np.isfinite(most), most, lost)))
+    axes.set_ylim(0, min(1.15 * top, 105.0) if top > 0.0 else 1.0)
+
+
+def draw_delay(axes: Axes, result: FitResult) -> None:
+    """Draw the collision delay, which is zero where impacts are instantaneous."""
+    law = result.law
+    speed = law.approach_speed_nm_per_us
+    axes.axhline(0, color="0.6", ls="--", lw=0.9)
+    axes.fill_between(speed, 1e3 * law.delay_low_us, 1e3 * law.delay_high_us, color=COLOURS[0], alpha=0.3, lw=0)
+    axes.plot(speed, 1e3 * law.collision_delay_us, color=COLOURS[0])
+    _mark_speeds(axes, result)
+    log_speed_axis(axes)
+    axes.set_xlabel(_APPROACH)
+    axes.set_ylabel("collision delay (ns)")
+    _frame_measured(axes, result)
+
+
+def _mark_speeds(axes: Axes, result: FitResult, label: str | None = None) -> None:
+    """Mark on the lower edge the speeds of the rows that were used."""
+    reached = result.rows.approach_speed_nm_per_us[result.rows.used]
+    reached = reached[np.isfinite(reached)]
+    edge = axes.get_xaxis_transform()
+    axes.plot(reached, np.full_like(reached, 0.02), "|", color="black", ms=6, mew=0.7, transform=edge, label=label)
+
+
+def _frame_measured(axes: Axes, result: FitResult) -> None:
+    """Let the measured speeds decide the height: below them the delay may fall steeply."""
+    law, rows = result.law, result.rows
+    reached = rows.approach_speed_nm_per_us[rows.used & np.isfinite(rows.approach_speed_nm_per_us)]
+    if not reached.size:
+        return
+    inside = (law.approach_speed_nm_per_us >= reached.min()) & (law.approach_speed_nm_per_us <= reached.max())
+    columns = np.concatenate(
+        [column[inside] for column in (law.collision_delay_us, law.delay_low_us, law.delay_high_us)]
+    )
+    columns = 1e3 * columns[np.isfinite(columns)]
+    if columns.size:
+        low, high = min(float(columns.min()), 0.0), max(float(columns.max()), 0.0)
+        margin = 0.12 * (high - low) or 1.0
+        axes.set_ylim(low - margin, high + margin)

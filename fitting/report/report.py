@@ -1,0 +1,183 @@
+"""A fit as a person reads it: text for the terminal, files for the drawer (HTML, JSON, CSV, PNG)."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from afm_jax.words import bullets, known, text_table
+from fitting.fits.result import FitResult, FittedParameter
+from fitting.report.words import (
+    Comparison,
+    Sampled,
+    band_in_words,
+    formulas,
+    interval_in_words,
+    rows_in_words,
+    value_in_words,
+)
+
+_MANY_PARAMETERS = 3
+_WORTH_SAYING = 0.9
+"""With more parameters than that, the text names only correlations beyond this magnitude."""
+ROW_COLUMNS = (
+    "line",
+    "order",
+    "drive_frequency_khz",
+    "drive_amplitude_nm",
+    "offset_nm",
+    "measured_peak_amplitude_nm",
+    "predicted_peak_amplitude_nm",
+    "peak_residual",
+    "measured_lockin_amplitude_nm",
+    "predicted_lockin_amplitude_nm",
+    "lockin_residual",
+    "approach_speed_nm_per_us",
+    "stable_orbits",
+    "model_error",
+    "used",
+    "set_aside",
+)
+LAW_COLUMNS = (
+    "approach_speed_nm_per_us",
+    "rebound_speed_nm_per_us",
+    "rebound_low_nm_per_us",
+    "rebound_high_nm_per_us",
+    "collision_delay_us",
+    "delay_low_us",
+    "delay_high_us",
+)
+
+
+def summary(result: FitResult) -> str:
+    """Return the fit as text: verdict first, then the law, then goodness of fit and warnings."""
+    head = ["parameter", "value", "std. error", "95 % interval"]
+    parameters = [_parameter_cells(name, parameter) for name, parameter in result.parameters.items()]
+    lines = [
+        f"Impact law of {result.table.source} ({rows_in_words(result.table.rows)}), model {result.model}:",
+        *(f"  {formula}" for formula in formulas(result.model)),
+        "",
+        "VALID" if result.valid else "NOT VALID: the numbers below are not a measurement of the law.",
+        *(f"  - {reason}" for reason in result.reasons),
+        "",
+        *text_table(head, parameters, words=(0, 3)),
+        "",
+        f"  {band_in_words(result)}",
+        _goodness_line(result),
+        *_correlation_lines(result),
+        *bullets("Notes:", result.warnings),
+    ]
+    return "\n".join(lines)
+
+
+def _parameter_cells(name: str, parameter: FittedParameter) -> list[str]:
+    unit = f"  {parameter.unit}" if parameter.unit else ""
+    given = "" if parameter.constraint is None else "  (given: {:g} +- {:g})".format(*parameter.constraint)
+    tail = f"{interval_in_words(parameter)}{unit}{given}"
+    return [name, value_in_words(parameter), known(parameter.standard_error, ".2g"), tail]
+
+
+def _goodness_line(result: FitResult) -> str:
+    probability = f", probability {result.p_value:.2g}" if np.isfinite(result.p_value) else ""
+    goodness = f"chi2/dof = {result.chi2:.1f}/{result.degrees_of_freedom}{probability}"
+    return f"  {goodness}, AIC {result.aic:.1f}, BIC {result.bic:.1f}"
+
+
+def _correlation_lines(result: FitResult) -> list[str]:
+    names = list(result.parameters)
+    least = _WORTH_SAYING if len(names) > _MANY_PARAMETERS else 0.0
+    pairs = [
+        f"{names[i]}, {names[j]}: {result.correlations[i, j]:+.3f}"
+        for i in range(len(names))
+        for j in range(i + 1, len(names))
+        if abs(result.correlations[i, j]) >= least
+    ]
+    title = f"correlations beyond {_WORTH_SAYING:g}" if least else "correlations"
+    return [f"  {title}: {'; '.join(pairs)}"] if pairs else []
+
+
+def row_records(result: FitResult) -> list[dict[str, Any]]:
+    """Return a mapping per row of the table, with the columns `ROW_COLUMNS`."""
+    table, rows = result.table, result.rows
+    columns = (
+        table.lines,
+        table.order,
+        table.drive_frequency_khz,
+        table.drive_amplitude_nm,
+        table.offset_nm,
+        *(column[:, kind] for kind in range(2) for column in (rows.measured_nm, rows.predicted_nm, rows.residual)),
+        rows.approach_speed_nm_per_us,
+        rows.orbits,
+        rows.model_error,
+        rows.used,
+        rows.set_aside,
+    )
+    return [dict(zip(ROW_COLUMNS, cells, strict=True)) for cells in zip(*(c.tolist() for c in columns), strict=True)]
+
+
+def law_records(result: FitResult) -> list[dict[str, float]]:
+    """Return the law's points, with the columns `LAW_COLUMNS`."""
+    columns = [getattr(result.law, name).tolist() for name in LAW_COLUMNS]
+    return [dict(zip(LAW_COLUMNS, point, strict=True)) for point in zip(*columns, strict=True)]
+
+
+def write_report(
+    result: FitResult,
+    folder: Path,
+    write_table: Callable[[str, list[dict[str, Any]], tuple[str, ...]], None],
+    *,
+    comparison: Comparison | None = None,
+    bootstrap: Sampled | None = None,
+    posterior: Sampled | None = None,
+) -> list[Path]:
+    """Write fit.html, fit.txt, fit.json, fit.png and the tables fit_rows.csv and law.csv into a folder.
+
+    Args:
+        result: the fit.
+        folder: an existing folder; files of these names are replaced.
+        write_table: called with a file name, records and columns for each CSV file.
+        comparison: other models of the same table, for fit.html.
+        bootstrap: intervals from synthetic data sets, for fit.html.
+        posterior: credible intervals, for fit.html.
+
+    Returns:
+        The files written here (the tables are `write_table`'s).
+
+    Raises:
+        OSError: if a file cannot be written.
+    """
+    from fitting.report.html import fit_page  # noqa: PLC0415
+    from fitting.report.plots import fit_pictures, one_below_the_other  # noqa: PLC0415
+
+    pictures = fit_pictures(result)
+    page = folder / "fit.html"
+    markup = fit_page(result, pictures, comparison=comparison, bootstrap=bootstrap, posterior=posterior)
+    page.write_text(markup, encoding="utf-8", newline="\n")
+    picture = one_below_the_other(pictures)
+    others = write_report_files(folder, "fit", text=summary(result), data=result.to_dict(), picture=picture)
+    write_table("fit_rows.csv", row_records(result), ROW_COLUMNS)
+    write_table("law.csv", law_records(result), LAW_COLUMNS)
+    return [page, *others]
+
+
+def write_report_files(folder: Path, name: str, *, text: str, data: dict[str, Any], picture: bytes) -> list[Path]:
+    """Write name.txt, name.json and name.png into a folder and return their paths.
+
+    Args:
+        folder: an existing folder; files of these names are replaced.
+        name: of the files.
+        text: the summary.
+        data: everything, as JSON has it.
+        picture: a PNG file.
+
+    Raises:
+        OSError: if a file cannot be written.
+    """
+    paths = [folder / f"{name}.{ending}" for ending in ("txt", "json", "png")]
+    # a path that is no valid text must not cost the report
+    paths[0].write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
+    paths[1].write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    paths[2].write_bytes(picture)
+    return paths

@@ -1,0 +1,295 @@
+"""A fit in words: how sure the law is, its formula with the digits that count, whether to believe it."""
+
+from dataclasses import dataclass
+from typing import Any, Protocol, runtime_checkable
+
+import numpy as np
+from jaxtyping import Float
+
+from afm_jax.words import decimals, interval, percent, value_alone
+from fitting.fits.result import FitResult, FittedParameter
+from fitting.fits.verdict import IMPROBABLE
+
+SHARE_OF_BAND = 0.1
+"""How far the rounded formula may be off, in half-widths of the 95 % band."""
+_MOST_EXTRA = 8
+_UNLIKELY = 0.05
+_ROUND = (1.0, 2.0, 3.0, 5.0, 7.0)
+_DELAY = "tau = delay_hertz u_in^(-1/5) - delay_lead_nm (1/u_out - 1/u_in) - delay_offset_nm/u_in"
+_LAWS = {
+    "restitution": "u_out = r u_in",
+    "law": "u_out^2 = r^2 u_in^2 - epsilon",
+    "viscous": "u_out^2 = u_in^2 - viscous_loss u_in - epsilon",
+}
+
+
+@runtime_checkable
+class Comparison(Protocol):
+    """Several models fitted to the same table.
+
+    `rows` has a mapping for each model: model, chi2, degrees_of_freedom, aic, bic, delta_aic, law_change, and whatever
+    else; `verdict` says in words which one the data prefer.
+    """
+
+    @property
+    def rows(self) -> list[dict[str, Any]]:
+        """One mapping for each model."""
+        ...
+
+    @property
+    def verdict(self) -> str:
+        """What the comparison says, in words."""
+        ...
+
+
+@runtime_checkable
+class Sampled(Protocol):
+    """A bootstrap or a posterior: anything that says what it found as plain numbers, lists and mappings."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything; what is a mapping by parameter becomes a table."""
+        ...
+
+
+def rows_in_words(count: int) -> str:
+    """Return '1 row' or '82 rows'."""
+    return f"{count} row" if count == 1 else f"{count} rows"
+
+
+def formulas(model: str) -> list[str]:
+    """Return the model's law in formulas."""
+    if model == "contact":
+        return ["the law and the delay of the resolved contact (meniscus and JKR junction), by its parameters:"]
+    law = _LAWS[model.removesuffix("+delay")]
+    return [law, _DELAY] if model.endswith("+delay") else [law]
+
+
+def has_delay(result: FitResult) -> bool:
+    """Say whether the model's impacts last."""
+    return bool(np.any(result.law.collision_delay_us != 0.0))
+
+
+def interval_in_words(parameter: FittedParameter) -> str:
+    """Return '0.9492 to 0.9508', a one-sided limit, or why there is none."""
+    low, high = parameter.interval95
+    if low is not None and high is not None:
+        return interval(low, high)
+    if high is not None:
+        return f"< {high:.4g} ({parameter.interval_reason})"
+    if low is not None:
+        return f"> {low:.6g} ({parameter.interval_reason})"
+    return f"none: {parameter.interval_reason}"
+
+
+def value_in_words(parameter: FittedParameter) -> str:
+    """Return the value with the digits that its error warrants; three where it has none."""
+    return value_alone(parameter.value, parameter.standard_error)
+
+
+def remarks_on(parameter: FittedParameter) -> str:
+    """Return what is odd about a parameter."""
+    said = (
+        (parameter.undetermined, "not determined by the data"),
+        (parameter.at_bound, "at its bound"),
+        (parameter.did_not_move, "did not move from its start"),
+    )
+    return "; ".join(words for holds, words in said if holds)
+
+
+@dataclass(frozen=True)
+class BandWidth:
+    """The band of the rebound speed over the approach speeds of the rows that were used.
+
+    Attributes:
+        slowest_nm_per_us: the slowest approach of a used row.
+        fastest_nm_per_us: the fastest one.
+        worst: largest half-width of the 95 % band there, relative to the rebound speed; NaN if there is no band.
+        worst_at_nm_per_us: the approach speed it is found at; NaN likewise.
+    """
+
+    slowest_nm_per_us: float
+    fastest_nm_per_us: float
+    worst: float
+    worst_at_nm_per_us: float
+
+
+def band_width(result: FitResult) -> BandWidth | None:
+    """Return the worst relative half-width of the law's band over the measured speeds; None if no row has a speed.
+
+    The band is known at the law's points; between them it is interpolated, at the slowest and fastest row.
+    """
+    reached = result.rows.approach_speed_nm_per_us[result.rows.used]
+    reached = reached[np.isfinite(reached)]
+    if not reached.size:
+        return None
+    slowest, fastest = float(reached.min()), float(reached.max())
+    law = result.law
+    inside = (law.approach_speed_nm_per_us > slowest) & (law.approach_speed_nm_per_us < fastest)
+    speeds = np.concatenate(([slowest], law.approach_speed_nm_per_us[inside], [fastest]))
+    rebound, high = (
+        np.interp(speeds, law.approach_speed_nm_per_us, column)
+        for column in (law.rebound_speed_nm_per_us, law.rebound_high_nm_per_us)
+    )
+    # the lower edge is cut at zero, the upper one never
+    known = np.isfinite(high) & (rebound > 0.0)
+    if not known.any():
+        return BandWidth(slowest, fastest, float("nan"), float("nan"))
+    share = (high[known] - rebound[known]) / rebound[known]
+    worst = int(np.argmax(share))
+    return BandWidth(slowest, fastest, float(share[worst]), float(speeds[known][worst]))
+
+
+def band_in_words(result: FitResult) -> str:
+    """Return how well the law is known over the measured speeds, or why that cannot be said; a sentence."""
+    width = band_width(result)
+    if width is None:
+        return "No row reached a steady orbit: the law was measured at no speed."
+    slowest, fastest = f"{width.slowest_nm_per_us:.3g}", f"{width.fastest_nm_per_us:.3g}"
+    where = f"Over the measured approach speeds, {slowest} to {fastest} nm/us,"
+    if slowest == fastest:
+        where = f"At the one measured approach speed, {slowest} nm/us,"
+    if not np.isfinite(width.worst):
+        cause = "the parameters' errors are not known" if result.valid else "the fit is not valid"
+        return f"{where} no band can be given: {cause}."
+    return (
+        f"{where} the rebound speed is known to {percent(width.worst)} or better "
+        f"(95 % band, widest at {width.worst_at_nm_per_us:.3g} nm/us)."
+    )
+
+
+def belief_in_words(result: FitResult) -> str:
+    """Return whether to believe the fit, on which grounds, and over which speeds."""
+    if not result.valid:
+        return "Do not take these numbers for a measurement of the law, because:"
+    limited = any(parameter.at_bound or None in parameter.interval95 for parameter in result.parameters.values())
+    determined = "determined or limited" if limited else "determined"
+    explained = "the law explains the amplitudes within their errors"
+    if result.settings.get("error_scale") is not None:
+        explained = "the law explains the amplitudes within errors of a believable size"
+    elif result.settings.get("robust") is not None:
+        explained = "the law explains the amplitudes within their errors but for a few outliers"
+    words = f"You can believe it: the fit converged, {explained}, and every parameter is {determined} by the data."
+    width = band_width(result)
+    if width is not None:
+        words += (
+            f" It was measured from {width.slowest_nm_per_us:.3g} to {width.fastest_nm_per_us:.3g} nm/µs; "
+            "beyond, it is an extrapolation."
+        )
+    count = len(result.warnings)
+    return words + (f" Read the {count} note{'s' if count > 1 else ''} below first." if count else "")
+
+
+def goodness_in_words(result: FitResult) -> str:
+    """Return chi2 with what its probability means."""
+    goodness = f"chi2/dof = {result.chi2:.1f}/{result.degrees_of_freedom}"
+    if result.degrees_of_freedom > 0:
+        goodness += f" = {result.chi2 / result.degrees_of_freedom:.4g}"
+    p = result.p_value
+    if not np.isfinite(p):
+        return f"{goodness}: whether the law fits cannot be judged by it, {_why_not_judged(result)}."
+    if p < IMPROBABLE:
+        chance = f"{p:.1g}" if p > 0.0 else "below 1e-300"
+        return (
+            f"{goodness}: the amplitudes lie much farther from the law than their errors allow (probability {chance})."
+        )
+    if p < _UNLIKELY:
+        return f"{goodness}: rather large, by chance it would be so large in {100.0 * p:.2g} % of experiments."
+    if p > 1.0 - IMPROBABLE:
+        return f"{goodness}: improbably small, the stated errors look too large."
+    return (
+        f"{goodness}: the amplitudes scatter about the law as their errors say (by chance chi2 would be larger in "
+        f"{100.0 * p:.2g} % of experiments)."
+    )
+
+
+def _why_not_judged(result: FitResult) -> str:
+    if result.degrees_of_freedom <= 0:
+        return "there are as many parameters as amplitudes"
+    if result.settings.get("error_scale") is not None:
+        return "the errors were scaled to make it 1"
+    return "outliers count less in it"
+
+
+def rounded_values(result: FitResult) -> dict[str, str]:
+    """Return the parameters in digits; the formula with them is within a tenth of the band where the law was measured.
+
+    Errors of correlated parameters are larger than those of the law: rounded to their own errors, the parameters could
+    give a curve outside the band.
+
+    Args:
+        result: a fit of a law, not of a contact.
+    """
+    texts = {}
+    for extra in range(_MOST_EXTRA):
+        texts = {name: f"{p.value:.{_own_decimals(p) + extra}f}" for name, p in result.parameters.items()}
+        if _close_enough(result, {name: float(text) for name, text in texts.items()}):
+            break
+    return texts
+
+
+def _own_decimals(parameter: FittedParameter) -> int:
+    """Return the decimals that a value's error warrants, three significant digits where there is none."""
+    if parameter.at_bound:
+        # a loss at its bound is 0 or 1, not 3e-15
+        return 0
+    error = parameter.standard_error
+    return decimals(0.1 * abs(parameter.value) if error is None else 4.0 * error)
+
+
+def _close_enough(result: FitResult, values: dict[str, float]) -> bool:
+    law = result.law
+    width = band_width(result)
+    if width is None:
+        return True
+    speed = law.approach_speed_nm_per_us
+    measured = (speed >= width.slowest_nm_per_us) & (speed <= width.fastest_nm_per_us)
+    rebound, delay = _formula(values, speed[measured])
+    pairs = (
+        (rebound, law.rebound_speed_nm_per_us[measured], law.rebound_high_nm_per_us[measured]),
+        (delay, law.collision_delay_us[measured], law.delay_high_us[measured]),
+    )
+    return not any(np.any(np.abs(found - exact) > SHARE_OF_BAND * (high - exact)) for found, exact, high in pairs)
+
+
+def _formula(
+    values: dict[str, float], approach_speed_nm_per_us: Float[np.ndarray, " n"]
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return rebound speed in nm/us and delay in us as the formulas of the page say; zero where the tip is captured."""
+    u = approach_speed_nm_per_us
+    square = (values.get("r", 1.0) * u) ** 2 - values.get("viscous_loss", 0.0) * u - values.get("epsilon", 0.0)
+    free = square > 0.0
+    w = np.sqrt(np.where(free, square, 1.0))
+    lead, offset = values.get("delay_lead_nm", 0.0), values.get("delay_offset_nm", 0.0)
+    delay = values.get("delay_hertz", 0.0) * u**-0.2 - lead * (1.0 / w - 1.0 / u) - offset / u
+    return np.where(free, w, 0.0), np.where(free, delay, 0.0)
+
+
+def law_points(result: FitResult) -> list[list[str]]:
+    """Return a row for each round speed among the measured ones, a table of the law to read off.
+
+    Each holds approach speed, rebound speed, its band and the energy lost in per cent; where impacts last, also the
+    delay in ns and its band.
+    """
+    width = band_width(result)
+    if width is None:
+        return []
+    speeds = np.array([digit * 10.0**power for power in range(-3, 7) for digit in _ROUND])
+    speeds = speeds[(speeds >= width.slowest_nm_per_us) & (speeds <= width.fastest_nm_per_us)]
+    law = result.law
+    names = ("rebound_speed_nm_per_us", "rebound_low_nm_per_us", "rebound_high_nm_per_us")
+    names += ("collision_delay_us", "delay_low_us", "delay_high_us")
+    columns = [np.interp(speeds, law.approach_speed_nm_per_us, getattr(law, name)) for name in names]
+    rows = []
+    for speed, rebound, low, high, delay, early, late in zip(speeds, *columns, strict=True):
+        lost, most, least = (100.0 * (1.0 - (value / speed) ** 2) for value in (rebound, low, high))
+        row = [f"{speed:g}", *_with_band(rebound, low, high), _with_band(lost, least, most)[0]]
+        rows.append(row + (_with_band(1e3 * delay, 1e3 * early, 1e3 * late) if has_delay(result) else []))
+    return rows
+
+
+def _with_band(value: float, low: float, high: float) -> list[str]:
+    """Return a value and its band with the digits that the band warrants, six at most."""
+    if not (np.isfinite(low) and np.isfinite(high)):
+        return [f"{value:.4g}", "-"]
+    digits = min(decimals(high - low, unknown=6), 6)
+    return [f"{value:.{digits}f}", f"{low:.{digits}f} to {high:.{digits}f}"]

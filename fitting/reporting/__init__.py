@@ -1,1 +1,0 @@
-"""A fit as a page, a picture, a text."""

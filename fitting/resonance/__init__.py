@@ -1,1 +1,0 @@
-"""Free resonance sweeps: reading, model, errors, report."""

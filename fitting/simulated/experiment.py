@@ -1,0 +1,368 @@
+"""Simulated experiments: an amplitude table as an instrument would read it off the full scene.
+
+Settled motions of many drives: every row of a table to be, simulated in time until it repeats, then observed.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene
+from afm_jax.checks import require_float64
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.law_of_contact import law_of_contact
+from afm_jax.impact.law import ImpactLaw
+from afm_jax.impact.orbits import single_impact_orbits
+from afm_jax.motion.observe import observe
+from afm_jax.motion.record import MotionOutcome, Simulation, State
+from afm_jax.motion.settle import close_periods, ends_in_flight, place_after, settled, where_to_go_on
+from afm_jax.motion.simulate import DEFAULT_ACCURACY, simulate
+from fitting.tables.table import AmplitudeTable
+
+US_PER_MS = 1e3
+BATCH = 16
+"""Rows simulated side by side: one program serves all tables, and its last row keeps few others waiting."""
+RESPONSES = 100
+"""Response periods of one piece; a row that has not settled goes on for another."""
+_CONTACTS = 260
+"""Room for contacts in a piece: motions with more than two a response period are no single-impact orbits."""
+_NOT_PREDICTED = "the law closest to the contact has no stable single-impact orbit there"
+_ROUNDS = 4 * _CONTACTS + 400
+_STABLE = 0.9999
+"""Largest modulus of a multiplier that counts as stable, being known to 1e-4."""
+_TOLERANCE = 1e-6
+"""Of what remains to the steady motion, relative: ten times less than the amplitudes are wanted to."""
+
+
+class Drives(NamedTuple):
+    """What is driven in an experiment, one entry a row."""
+
+    order: Int[np.ndarray, " rows"]
+    """N, drive periods per impact."""
+    frequency_khz: Float[np.ndarray, " rows"]
+    amplitude_nm: Float[np.ndarray, " rows"]
+    offset_nm: Float[np.ndarray, " rows"]
+
+
+class Reading(NamedTuple):
+    """What is read of single-impact orbits, one entry a row."""
+
+    peak_amplitude_nm: Float[np.ndarray, " rows"]
+    lockin_amplitude_nm: Float[np.ndarray, " rows"]
+    lockin_phase_deg: Float[np.ndarray, " rows"]
+    """In [0, 360/N)."""
+
+
+class SteadyRows(NamedTuple):
+    """What became of the drives."""
+
+    rows: Int[np.ndarray, " steady"]
+    """The numbers of those with a steady (1, N) orbit, ascending."""
+    reading: Reading | None
+    """Of these; None where there are none."""
+    reasons: dict[int, str]
+    """Why the others have none, by number."""
+
+
+class _Verdict(NamedTuple):
+    """What is known of a motion: what is read of it if it is the orbit asked for, from where it goes on, and why."""
+
+    reason: str
+    seen: tuple[float, float, float] | None = None
+    """Peak, lock-in amplitude and phase, as in a `Reading`."""
+    goes_on: State | None = None
+
+
+Report = Callable[[str], None]
+Follow = Callable[[np.ndarray, np.ndarray, np.ndarray], Simulation]
+"""Of starts of shape (3, n), the numbers of their rows, and durations in us: the simulations."""
+
+
+def steady_rows(
+    interaction: Contact | ImpactLaw,
+    cantilever: Cantilever,
+    drives: Drives,
+    *,
+    accuracy: float,
+    pieces: int,
+    report: Report,
+) -> SteadyRows:
+    """Return what is observed of every drive once its motion is the (1, N) orbit asked for.
+
+    Every row starts in the middle of the flight of the stable orbit that the law with delay closest to the contact
+    predicts, the fastest if there are several.
+
+    Args:
+        interaction: a contact, or a law with or without a collision delay.
+        cantilever: the cantilever.
+        drives: what is driven.
+        accuracy: of each contact, as for `simulate`.
+        pieces: how often a row that has not settled goes on for another hundred response periods.
+        report: told how far it is.
+
+    Raises:
+        ValueError: if the contact has no junction.
+        RuntimeError: if JAX is not set to 64-bit floats.
+    """
+    law = interaction if isinstance(interaction, ImpactLaw) else law_of_contact(interaction, float(cantilever.mass_ng))
+    count = len(drives.order)
+    nothing = np.zeros(0, dtype=int)
+    if law is None:
+        return SteadyRows(nothing, None, dict.fromkeys(range(count), "the contact captures tips of every speed"))
+    follow = _follower(interaction, cantilever, drives, accuracy)
+    starts, predicted = _starts(law, cantilever, drives)
+    reasons = dict.fromkeys(np.flatnonzero(~predicted).tolist(), _NOT_PREDICTED)
+    waiting = np.flatnonzero(predicted)
+    if not waiting.size:
+        return SteadyRows(nothing, None, reasons)
+    report(f"{len(waiting)} of {count} drives have a stable orbit of the closest law; closing in on them")
+    orbits = close_periods(
+        lambda starts, rows: ends_in_flight(follow(starts, rows, _responses(drives, rows, 1))),
+        starts[:, waiting],
+        waiting,
+        angular_frequency=float(cantilever.angular_frequency),
+    )
+    starts[:, waiting] = np.where(orbits.closed & (orbits.contraction < _STABLE), orbits.starts, starts[:, waiting])
+    steady: dict[int, tuple[float, float, float]] = {}
+    for piece in range(pieces):
+        if not waiting.size:
+            break
+        report(f"following {len(waiting)} motions, {RESPONSES} response periods (piece {piece + 1})")
+        found = follow(starts[:, waiting], waiting, _responses(drives, waiting, RESPONSES))
+        left = []
+        for lane, row in enumerate(waiting.tolist()):
+            one = jax.tree.map(lambda part, lane=lane: part[lane], found)
+            verdict = _judged(Scene(cantilever, _platform(drives, row), interaction), one, int(drives.order[row]))
+            reasons[row] = verdict.reason
+            if verdict.seen is not None:
+                steady[row] = verdict.seen
+            elif verdict.goes_on is not None:
+                starts[:, row] = [float(part) for part in verdict.goes_on]
+                left.append(row)
+        waiting = np.array(left, dtype=int)
+    rows = np.array(sorted(steady), dtype=int)
+    reading = Reading(*(np.array([steady[row] for row in rows.tolist()]).T)) if steady else None
+    return SteadyRows(rows, reading, {row: reason for row, reason in reasons.items() if row not in steady})
+
+
+def _responses(drives: Drives, rows: Int[np.ndarray, " n"], count: int) -> Float[np.ndarray, " n"]:
+    """Return a number of response periods in us."""
+    return count * drives.order[rows] / drives.frequency_khz[rows] * US_PER_MS
+
+
+def _platform(drives: Drives, rows: int | Int[np.ndarray, " n"]) -> Platform:
+    chosen = (drives.amplitude_nm[rows], drives.frequency_khz[rows], drives.offset_nm[rows])
+    # every field an array of the rows' shape, for `vmap`
+    amplitude, frequency, offset = (jnp.asarray(part, float) for part in chosen)
+    return Platform(amplitude, frequency, offset, jnp.zeros(np.shape(rows)))
+
+
+def _starts(law: ImpactLaw, cantilever: Cantilever, drives: Drives) -> tuple[Float[np.ndarray, "3 rows"], np.ndarray]:
+    """Return time, position and velocity halfway through the flight of the predicted orbits, and where there is one."""
+
+    def one(platform, order):
+        orbits = single_impact_orbits(Scene(cantilever, platform, law), order)
+        steady = orbits.exists & orbits.admissible & orbits.stable
+        slot = jnp.argmax(jnp.where(steady, orbits.approach_speed_nm_per_us, -jnp.inf))
+        time = orbits.phase_rad[slot] / platform.angular_frequency
+        half = 0.5 * (order * platform.period_us - orbits.delay_us[slot])
+        place = cantilever.propagator(half)(platform.position(time), orbits.velocity_after_nm_per_us[slot])
+        return jnp.stack([time + half, *place]), steady[slot]
+
+    # one size for all tables, so that one program serves them
+    size = -(-len(drives.order) // BATCH) * BATCH
+    filled = np.minimum(np.arange(size), len(drives.order) - 1).reshape(-1, BATCH)
+    program = jax.jit(jax.vmap(one))
+    parts = [program(_platform(drives, rows), jnp.asarray(drives.order[rows], float)) for rows in filled]
+    starts = np.concatenate([np.asarray(part[0]) for part in parts])[: len(drives.order)].T
+    found = np.concatenate([np.asarray(part[1]) for part in parts])[: len(drives.order)]
+    return np.array(starts), found
+
+
+def _follower(interaction: Contact | ImpactLaw, cantilever: Cantilever, drives: Drives, accuracy: float) -> Follow:
+    """Return the function that follows rows of the drives."""
+
+    @jax.jit
+    def program(interaction, cantilever, platforms, starts, durations):
+        def one(platform, start, duration):
+            scene = Scene(cantilever, platform, interaction)
+            return simulate(scene, start, duration, max_contacts=_CONTACTS, accuracy=accuracy, max_rounds=_ROUNDS)
+
+        return jax.vmap(one)(platforms, starts, durations)
+
+    def block(starts: np.ndarray, rows: np.ndarray, durations: np.ndarray) -> Simulation:
+        lanes = np.resize(np.arange(len(rows)), BATCH)
+        chosen = rows[lanes]
+        begin = State(*(jnp.asarray(part) for part in starts[:, lanes]))
+        found = program(interaction, cantilever, _platform(drives, chosen), begin, jnp.asarray(durations[lanes]))
+        return jax.tree.map(lambda part: np.asarray(part)[: len(rows)], found)
+
+    def follow(starts: np.ndarray, rows: np.ndarray, durations: np.ndarray) -> Simulation:
+        cuts = range(0, len(rows), BATCH)
+        parts = [block(starts[:, i : i + BATCH], rows[i : i + BATCH], durations[i : i + BATCH]) for i in cuts]
+        return jax.tree.map(lambda *pieces: np.concatenate(pieces), *parts)
+
+    return follow
+
+
+def _judged(scene: Scene, found: Simulation, order: int) -> _Verdict:
+    """Return what is known of a motion of one drive."""
+    outcome = MotionOutcome(int(found.outcome))
+    if outcome not in {MotionOutcome.FINISHED, MotionOutcome.HELD}:
+        return _Verdict(outcome.sentence)
+    verdict = settled(scene, found, tolerance=_TOLERANCE)
+    if not verdict.settled:
+        row, goes_on = where_to_go_on(found)
+        return _Verdict(f"not settled: {verdict.reason}", goes_on=place_after(found, row) if goes_on else None)
+    if verdict.stuck or (verdict.contacts, verdict.periods) != (1, order):
+        return _Verdict(verdict.reason)
+    seen = observe(scene, found, verdict=verdict)
+    return _Verdict(verdict.reason, seen=(seen.peak_amplitude_nm, seen.lockin_amplitude_nm, seen.lockin_phase_deg))
+
+
+PIECES = 40
+"""Most pieces of a hundred response periods that a motion may take to settle."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulatedExperiment:
+    """A simulated amplitude table, and what was behind it.
+
+    Attributes:
+        table: with noise, as an instrument gives it.
+        exact: the same rows and errors without noise.
+        left_out: a sentence for every drive that is not in the table: no steady (1, N) orbit, and why.
+    """
+
+    table: AmplitudeTable
+    exact: AmplitudeTable
+    left_out: tuple[str, ...]
+
+
+def drives_of(rows: Sequence[tuple[int, float, float, float]]) -> Drives:
+    """Return drives from rows of order, frequency in kHz, amplitude in nm and offset in nm."""
+    columns = np.array(rows, float).reshape(-1, 4).T
+    return Drives(columns[0].astype(np.int64), *columns[1:])
+
+
+def simulate_experiment(  # noqa: PLR0913
+    interaction: Contact | ImpactLaw,
+    cantilever: Cantilever,
+    drives: Drives,
+    *,
+    noise: float = 0.01,
+    phase_noise_deg: float | None = None,
+    seed: int = 0,
+    quality_factor_error: float | None = None,
+    accuracy: float = DEFAULT_ACCURACY,
+    pieces: int = PIECES,
+    remarks: tuple[str, ...] = (),
+    report: Report = lambda _: None,
+) -> SimulatedExperiment:
+    """Return the amplitudes that an experiment on a scene would read, with noise.
+
+    Every drive is simulated in time until it repeats to 1e-6, and observed over one response period.
+
+    Args:
+        interaction: a contact, or a law with or without a collision delay.
+        cantilever: the cantilever; its Q enters the table as the known value.
+        drives: what is driven, see `drives_of`.
+        noise: standard error of peak and lock-in amplitude as a share of each, drawn independently.
+        phase_noise_deg: standard error of the phase in degrees; None: the table has no phase.
+        seed: of the noise.
+        quality_factor_error: uncertainty of Q that the table states; None: none.
+        accuracy: of each contact, as for `simulate`.
+        pieces: most pieces of a hundred response periods that a motion may take to settle.
+        remarks: comments for the table.
+        report: told how far it is.
+
+    Returns:
+        The table with and without noise, and what was left out.
+
+    Raises:
+        ValueError: if the noise is not between 0 and 1, an order is no positive integer, the contact has no junction,
+            or no drive has a steady (1, N) orbit.
+        RuntimeError: if JAX is not set to 64-bit floats, or was not when the contact, law or cantilever was built.
+    """
+    require_float64(interaction, cantilever)
+    _check(drives, noise, phase_noise_deg)
+    found = steady_rows(interaction, cantilever, drives, accuracy=accuracy, pieces=pieces, report=report)
+    kept = found.rows
+    left_out = tuple(
+        f"order {drives.order[i]}, {drives.frequency_khz[i]:g} kHz, {drives.amplitude_nm[i]:g} nm, "
+        f"offset {drives.offset_nm[i]:g} nm: {reason}"
+        for i, reason in sorted(found.reasons.items())
+    )
+    if found.reading is None:
+        raise ValueError(f"no drive has a steady single-impact orbit (the first: {left_out[0]})")
+    peak, lockin, degrees = found.reading
+    phase = None if phase_noise_deg is None else degrees
+    known = cantilever.quality_factor
+    exact = AmplitudeTable(
+        order=drives.order[kept],
+        drive_frequency_khz=drives.frequency_khz[kept],
+        drive_amplitude_nm=drives.amplitude_nm[kept],
+        offset_nm=drives.offset_nm[kept],
+        free_frequency_khz=float(cantilever.frequency_khz),
+        quality_factor=None if known is None else float(known),
+        quality_factor_error=quality_factor_error,
+        mass_ng=float(cantilever.mass_ng),
+        peak_amplitude_nm=peak,
+        peak_amplitude_error_nm=noise * peak,
+        lockin_amplitude_nm=lockin,
+        lockin_amplitude_error_nm=noise * lockin,
+        phase_deg=phase,
+        phase_error_deg=None if phase is None else np.full(phase.shape, phase_noise_deg),
+        remarks=remarks,
+    )
+    # drawn for every drive, so that one that is left out does not change the noise of the others
+    draws = np.random.default_rng(seed).normal(size=(3, len(drives.order)))[:, kept]
+    return SimulatedExperiment(table=with_noise(exact, draws), exact=exact, left_out=left_out)
+
+
+def with_noise(exact: AmplitudeTable, draws: Float[np.ndarray, "3 rows"]) -> AmplitudeTable:
+    """Return a table with its errors times standard normal draws added, rounded to six digits as an instrument prints.
+
+    Args:
+        exact: noise-free amplitudes with their errors.
+        draws: of peak, lock-in amplitude and phase.
+
+    Raises:
+        ValueError: if the table has no amplitude of one kind.
+    """
+    columns = {}
+    for name, error, draw in (
+        ("peak_amplitude_nm", "peak_amplitude_error_nm", draws[0]),
+        ("lockin_amplitude_nm", "lockin_amplitude_error_nm", draws[1]),
+    ):
+        value, spread = getattr(exact, name), getattr(exact, error)
+        if value is None:
+            raise ValueError(f"{exact.source}: the table has no {name}; noise is added to peak and lock-in amplitude")
+        columns[name] = _rounded(value + spread * draw)
+        columns[error] = _rounded(spread)
+    if exact.phase_deg is not None:
+        measured = exact.phase_deg + np.asarray(exact.phase_error_deg) * draws[2]
+        columns["phase_deg"] = np.round(measured % (360.0 / exact.order), 6)
+    return replace(exact, **columns)
+
+
+def _rounded(values: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
+    return np.array([float(f"{value:.6g}") for value in values])
+
+
+def _check(drives: Drives, noise: float, phase_noise_deg: float | None) -> None:
+    if not 0.0 < noise < 1.0:
+        raise ValueError(f"`noise` must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
+    if phase_noise_deg is not None and not 0.0 < phase_noise_deg < 90.0:
+        raise ValueError(f"`phase_noise_deg` must be between 0 and 90, but is {phase_noise_deg!r}")
+    if not len(drives.order) or np.any(np.asarray(drives.order) < 1):
+        raise ValueError("`drives` must hold at least one drive, and orders of 1 or more")
+    if np.any(np.asarray(drives.frequency_khz) <= 0.0) or np.any(np.asarray(drives.amplitude_nm) <= 0.0):
+        raise ValueError("`drives` must have positive frequencies and amplitudes")

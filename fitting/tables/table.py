@@ -1,0 +1,438 @@
+"""Amplitude tables: read them from CSV, check them, write them.
+
+A table is a CSV file in UTF-8: comment lines about the cantilever, a row of column names, a row for each drive::
+
+    # free_frequency_khz = 90
+    # quality_factor = 40 +- 2
+    order,drive_frequency_khz,drive_amplitude_nm,offset_nm,peak_amplitude_nm,peak_amplitude_error_nm
+    1,180,4,0,163.3,1.63
+
+``quality_factor`` may be left out (not known), its error too, and ``mass_ng`` (then 1). The columns ``order`` to
+``offset_nm`` and one of ``peak_amplitude_nm`` and ``lockin_amplitude_nm`` are needed; ``phase_deg`` may join them. Each
+measured column has a column of standard errors (``..._error_nm``, ``phase_error_deg``). A blank cell in a measured
+column says that this was not measured. A column ``no_orbit`` marks by 1 drives on which the tip settled on no steady
+single-impact orbit (it stuck, or moved chaotically): their amplitudes are blank. Comments such as
+``# tip_calibration = 1 +- 0.02``, ``# drive_calibration = 1 +- 0.01`` and ``# offset_origin_nm = 0 +- 0.3`` say what is
+known of the instrument. Other comments are kept as remarks.
+
+The comment lines of an amplitude table: what `# key = value` says about the cantilever, and free remarks.
+
+The columns of an amplitude table, and the checks that every table must pass.
+"""
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from fitting.tables.csv_text import (
+    Column,
+    Columns,
+    Faults,
+    Form,
+    Head,
+    Masks,
+    Setting,
+    TableError,
+    check_not_empty,
+    column_of,
+    fault_in_number,
+    named_rows,
+    parse_rows,
+    parse_setting,
+    printable,
+    quoted,
+    read_text,
+    setting_in,
+    split_lines,
+)
+
+# An overdamped cantilever does not vibrate.
+LOWEST_QUALITY_FACTOR = 0.5
+SETTINGS = {
+    setting.key: setting
+    for setting in (
+        Setting("free_frequency_khz", "90", unit="kHz"),
+        Setting("quality_factor", "40 (or 40 +- 2)", lowest=LOWEST_QUALITY_FACTOR, error="maybe"),
+        Setting("mass_ng", unit="ng"),
+        Setting("tip_calibration", "1 +- 0.02", error="always"),
+        Setting("drive_calibration", "1 +- 0.02", error="always"),
+        Setting("offset_origin_nm", "0 +- 0.3", lowest=float("-inf"), error="always"),
+    )
+}
+CALIBRATION = tuple(key for key, setting in SETTINGS.items() if setting.error == "always")
+"""Keys that must have an error: without one there is nothing uncertain about them."""
+
+
+@dataclass(frozen=True)
+class Header:
+    """What the comment lines say; the names and units are those of ``AmplitudeTable``."""
+
+    free_frequency_khz: float
+    quality_factor: float | None
+    quality_factor_error: float | None
+    mass_ng: float
+    calibration: dict[str, tuple[float, float]]
+    remarks: tuple[str, ...]
+
+
+def parse_comments(comments: list[tuple[int, str]], faults: Faults) -> Header:
+    """Read the comment lines of a table.
+
+    Args:
+        comments: line number and text (without the number sign, stripped) of each.
+        faults: where the faults are noted; with any, the result is not to be used.
+    """
+    numbers: dict[str, tuple[float, float | None]] = {}
+    seen: dict[str, int] = {}
+    remarks: list[str] = []
+    for line, text in comments:
+        setting = setting_in(text, SETTINGS)
+        if setting is None:
+            remarks.append(text)
+        elif setting.key in seen:
+            faults.add(f"{setting.key} was given in line {seen[setting.key]} already; remove one of the two", line=line)
+        else:
+            seen[setting.key] = line
+            numbers[setting.key] = parse_setting(setting, text, line=line, faults=faults) or (float("nan"), None)
+    if "free_frequency_khz" not in seen:
+        example = SETTINGS["free_frequency_khz"].line
+        faults.add(f"the free frequency is missing; add a line such as '{example}' above the column names")
+    quality_factor, quality_factor_error = numbers.get("quality_factor", (None, None))
+    return Header(
+        free_frequency_khz=numbers.get("free_frequency_khz", (float("nan"), None))[0],
+        quality_factor=quality_factor,
+        quality_factor_error=quality_factor_error,
+        mass_ng=numbers.get("mass_ng", (1.0, None))[0],
+        calibration={key: (numbers[key][0], numbers[key][1] or 0.0) for key in CALIBRATION if key in numbers},
+        remarks=tuple(remarks),
+    )
+
+
+COLUMNS = (
+    Column("order", needed="order", required=True, integer=True),
+    Column("drive_frequency_khz", "kHz", needed="drive frequency", required=True),
+    Column("drive_amplitude_nm", "nm", needed="drive amplitude", required=True),
+    Column("offset_nm", "nm", needed="offset", required=True, positive=False),
+    Column("peak_amplitude_nm", "nm", needed="amplitude", error="peak_amplitude_error_nm", amplitude=True),
+    Column("peak_amplitude_error_nm", "nm"),
+    Column("lockin_amplitude_nm", "nm", needed="amplitude", error="lockin_amplitude_error_nm", amplitude=True),
+    Column("lockin_amplitude_error_nm", "nm"),
+    Column("phase_deg", "degrees", error="phase_error_deg", positive=False),
+    Column("phase_error_deg", "degrees"),
+    Column("no_orbit", positive=False, flag=True),
+)
+TABLE = Form(
+    COLUMNS,
+    "drive",
+    blanks=True,
+    fewer="fill in the others",
+    more="remove the others; a decimal comma must be a point",
+    number="write it like 174.6 or 1.746e2, without a unit",
+)
+COLUMN_NAMES = TABLE.names
+REQUIRED = tuple(column for column in COLUMNS if column.required)
+MEASURED = tuple(column for column in COLUMNS if column.error is not None)
+AMPLITUDES = tuple(column for column in COLUMNS if column.amplitude)
+
+
+def check_error_columns(head: Head, faults: Faults, noise: float | None) -> None:
+    """Note measured columns without their errors, and errors without what they belong to.
+
+    Args:
+        head: the column names.
+        faults: where the faults are noted.
+        noise: relative noise for amplitudes without an error column, or None.
+    """
+    for column in MEASURED:
+        error, line = str(column.error), head.line
+        if error in head.present and column.name not in head.present:
+            message = f"stands without {column.name}; add that column or remove this one"
+            faults.add(message, line=line, column=error)
+        if column.name not in head.present or error in head.present:
+            continue
+        if not column.amplitude:
+            faults.add(f"has no errors; add the column {error}", line=line, column=column.name)
+        elif noise is None:
+            hint = f"add the column {error} or give the relative noise (--noise 1%)"
+            faults.add(f"has no errors; {hint}", line=line, column=column.name)
+
+
+def fill_errors(columns: Columns, unreadable: Masks, noise: float | None) -> None:
+    """Set the errors that amplitudes lack to the relative noise times the amplitude.
+
+    Args:
+        columns: the table's columns, changed in place.
+        unreadable: masks of cells whose fault is noted elsewhere, changed in place: errors of impossible amplitudes.
+        noise: relative noise, for example 0.01; None leaves the columns as they are.
+    """
+    if noise is None:
+        return
+    for column in AMPLITUDES:
+        if column.name in columns:
+            values, error = columns[column.name], str(column.error)
+            errors = columns.get(error, np.full(len(values), np.nan))
+            possible = np.isfinite(values) & (values > 0.0)
+            columns[error] = np.where(np.isnan(errors) & possible, noise * values, errors)
+            value_is_bad = ~possible & (~np.isnan(values) | unreadable[column.name])
+            unreadable[error] = unreadable.get(error, np.zeros(len(values), dtype=bool)) | value_is_bad
+
+
+def check_rows(
+    columns: Columns, lines: Int[np.ndarray, " rows"], faults: Faults, unreadable: Masks | None = None
+) -> None:
+    """Check the numbers of a table and note every fault.
+
+    Args:
+        columns: the columns by name, NaN where nothing was measured.
+        lines: the number of each row's line, for the messages.
+        faults: where the faults are noted.
+        unreadable: masks of cells whose fault has been noted already.
+    """
+    rows = len(lines)
+    known_bad = {name: np.zeros(rows, dtype=bool) for name in columns} | (unreadable or {})
+    for column in COLUMNS:
+        if column.name in columns:
+            # A cell with an impossible number is not to be blamed a second time for what depends on it.
+            known_bad[column.name] |= _check_numbers(column, columns[column.name], lines, faults)
+    for column in REQUIRED:
+        for row in np.flatnonzero(np.isnan(columns[column.name]) & ~known_bad[column.name]):
+            faults.add("is blank; every row needs it", line=int(lines[row]), column=column.name)
+    blank = {name: np.isnan(values) & ~known_bad[name] for name, values in columns.items()}
+    unseen = columns.get("no_orbit", np.zeros(rows)) == 1.0
+    _check_measured(blank, unseen, lines, faults)
+    _check_duplicates(columns, lines, faults)
+
+
+def _check_numbers(
+    column: Column, values: Float[np.ndarray, " rows"], lines: Int[np.ndarray, " rows"], faults: Faults
+) -> Bool[np.ndarray, " rows"]:
+    bad = np.isinf(values)
+    what = "must be finite"
+    if column.positive:
+        bad |= values <= 0.0
+        what = "must be finite and above 0"
+    if column.integer:
+        # Larger numbers would not survive the way through 64-bit floats.
+        bad |= (values != np.floor(values)) | (values >= 2**53)
+        bad &= ~np.isnan(values)
+        what = "must be a positive whole number (1, 2, 3, ...)"
+    if column.flag:
+        bad |= ~np.isnan(values) & (values != 0.0) & (values != 1.0)
+        what = "must be 1 (no steady orbit was seen) or 0"
+    for row in np.flatnonzero(bad):
+        number = repr(float(values[row])).removesuffix(".0")
+        faults.add(f"{what}, but is {number}; correct it{_or_blank(column)}", line=int(lines[row]), column=column.name)
+    return bad
+
+
+def _or_blank(column: Column) -> str:
+    return " or leave it blank if it was not measured" if column.error is not None else ""
+
+
+def _check_measured(
+    blank: Masks, unseen: Bool[np.ndarray, " rows"], lines: Int[np.ndarray, " rows"], faults: Faults
+) -> None:
+    """Note values without error, errors without value, and rows without an amplitude that are not marked `no_orbit`."""
+    for column in MEASURED:
+        if column.name not in blank or column.error not in blank:
+            continue
+        mend = f"fill {column.error} in" + (" or give the relative noise (--noise 1%)" if column.amplitude else "")
+        for row in np.flatnonzero(blank[column.error] & ~blank[column.name]):
+            faults.add(f"the value has no error; {mend}", line=int(lines[row]), column=column.name)
+        for row in np.flatnonzero(blank[column.name] & ~blank[column.error]):
+            message = f"the error has no value; fill {column.name} in or clear this cell"
+            faults.add(message, line=int(lines[row]), column=column.error)
+    present = [column.name for column in AMPLITUDES if column.name in blank]
+    if present:
+        # An error without its value has been noted already.
+        empty = [blank[name] for column in AMPLITUDES for name in (column.name, column.error) if name in blank]
+        for row in np.flatnonzero(np.all(empty, axis=0) & ~unseen):
+            message = f"the row has no amplitude; fill {' or '.join(present)} in or remove the row"
+            message += ", or set no_orbit to 1 if the tip settled on no orbit there" if "no_orbit" in blank else ""
+            faults.add(message, line=int(lines[row]))
+        for row in np.flatnonzero(~np.all(empty, axis=0) & unseen):
+            message = "the row has an amplitude; clear it or set no_orbit to 0"
+            faults.add(message, line=int(lines[row]), column="no_orbit")
+
+
+def _check_duplicates(columns: Columns, lines: Int[np.ndarray, " rows"], faults: Faults) -> None:
+    keys = np.stack([columns[column.name] for column in REQUIRED])
+    # The sort is stable: of rows with equal keys the earlier one stays first.
+    order = np.lexsort(keys)
+    same = np.all(keys[:, order[1:]] == keys[:, order[:-1]], axis=0)
+    for position in np.flatnonzero(same):
+        first, second = int(lines[order[position]]), int(lines[order[position + 1]])
+        what = f"repeats {faults.place} {first} (same order, drive frequency, drive amplitude and offset)"
+        faults.add(f"{what}; average the measurements into one row or remove one", line=second)
+
+
+__all__ = ["AmplitudeTable", "TableError", "read_table", "write_table"]
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class AmplitudeTable:
+    """Measured amplitudes of (1, N) orbits, one row for each drive; the arrays are read-only NumPy copies.
+
+    A measured column is None if the table does not have it, and NaN in the rows where nothing was measured. A value
+    always comes with its standard error, and every row has at least one amplitude or is marked ``no_orbit``.
+
+    Attributes:
+        order: N, drive periods per impact, shape (rows,), integers.
+        drive_frequency_khz: frequency of the platform, shape (rows,).
+        drive_amplitude_nm: amplitude of the platform, shape (rows,).
+        offset_nm: mean height of the platform above the tip's rest position, shape (rows,).
+        free_frequency_khz: resonance frequency of the free cantilever.
+        peak_amplitude_nm: largest height of the tip above its rest position, shape (rows,), or None.
+        peak_amplitude_error_nm: its standard error.
+        lockin_amplitude_nm: 2/T |integral of z exp(-i omega t/N)| over whole response periods, shape (rows,), or None.
+        lockin_amplitude_error_nm: its standard error.
+        phase_deg: phi in z ~ a cos(omega t/N + phi), modulo 360/N, t = 0 when the platform is highest; or None.
+        phase_error_deg: its standard error.
+        no_orbit: 1 where the tip settled on no single-impact orbit, else 0, shape (rows,); or None.
+        quality_factor: of the free cantilever, or None: not known.
+        quality_factor_error: its standard error, or None.
+        mass_ng: effective mass of the cantilever.
+        calibration: value and standard error of ``tip_calibration``, ``drive_calibration``, ``offset_origin_nm``, as
+            far as they are uncertain.
+        source: path of the file as it was given.
+        lines: the line of the file that each row stands in, shape (rows,); 1, 2, 3, ... for a table not from a file, or
+            if as many are not given.
+        remarks: free comments of the file.
+
+    Raises:
+        TableError: if a value is impossible, an error is missing, a row repeats another or the lengths differ.
+    """
+
+    order: Int[np.ndarray, " rows"]
+    drive_frequency_khz: Float[np.ndarray, " rows"]
+    drive_amplitude_nm: Float[np.ndarray, " rows"]
+    offset_nm: Float[np.ndarray, " rows"]
+    free_frequency_khz: float
+    peak_amplitude_nm: Float[np.ndarray, " rows"] | None = None
+    peak_amplitude_error_nm: Float[np.ndarray, " rows"] | None = None
+    lockin_amplitude_nm: Float[np.ndarray, " rows"] | None = None
+    lockin_amplitude_error_nm: Float[np.ndarray, " rows"] | None = None
+    phase_deg: Float[np.ndarray, " rows"] | None = None
+    phase_error_deg: Float[np.ndarray, " rows"] | None = None
+    no_orbit: Float[np.ndarray, " rows"] | None = None
+    quality_factor: float | None = None
+    quality_factor_error: float | None = None
+    mass_ng: float = 1.0
+    calibration: dict[str, tuple[float, float]] = field(default_factory=dict)
+    source: str = "table in memory"
+    lines: Int[np.ndarray, " lines"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    remarks: tuple[str, ...] = ()
+
+    def __post_init__(self):
+        # Lines of another number are those of the table that this one was made from (`dataclasses.replace`).
+        own = len(self.lines) == np.size(self.order)
+        faults = Faults(self.source, place="line" if own else "row")
+        columns = {name: getattr(self, name) for name in COLUMN_NAMES if getattr(self, name) is not None}
+        lines = self.lines if own else np.arange(1, np.size(self.order) + 1)
+        columns = {name: column_of(name, values, len(lines), faults) for name, values in columns.items()}
+        _check_pairs(columns, faults)
+        _check_header(self, faults)
+        faults.raise_any()
+        check_rows(columns, np.asarray(lines), faults)
+        faults.raise_any()
+        columns["order"] = columns["order"].astype(np.int64)
+        for name, values in (columns | {"lines": np.array(lines, dtype=np.int64)}).items():
+            values.setflags(write=False)
+            object.__setattr__(self, name, values)
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return len(self.order)
+
+
+def _check_pairs(columns: dict[str, Float[np.ndarray, "..."]], faults: Faults) -> None:
+    """Note a measured column without its errors, errors without their column, and a table without amplitudes."""
+    for column in MEASURED:
+        if (column.name in columns) != (column.error in columns):
+            faults.add(f"{column.name} and {column.error} come together; give both or none")
+    if not any(column.name in columns for column in AMPLITUDES):
+        faults.add(f"there is no amplitude; give {' or '.join(column.name for column in AMPLITUDES)}")
+
+
+def _check_header(table: AmplitudeTable, faults: Faults) -> None:
+    for key, error in (("free_frequency_khz", None), ("quality_factor", table.quality_factor_error), ("mass_ng", None)):
+        value = getattr(table, key)
+        fault = None if value is None else fault_in_number(SETTINGS[key], value, error)
+        if fault is not None:
+            faults.add(f"{key} {fault}")
+    if table.quality_factor is None and table.quality_factor_error is not None:
+        faults.add("quality_factor_error stands without quality_factor; give both or none")
+    for remark in table.remarks:
+        if (
+            setting_in(remark, SETTINGS) is not None
+            or remark != remark.strip()
+            or not remark
+            or set(remark) & set("\r\n\0")
+        ):
+            faults.add(f"the remark {quoted(remark)} would not be read back as one; make it one line of free text")
+
+
+def read_table(path: str | Path, noise: float | None = None) -> AmplitudeTable:
+    """Read an amplitude table from a CSV file and check all of it.
+
+    Args:
+        path: the file, in the format described at the top of this module.
+        noise: standard error of an amplitude relative to the amplitude (0.01 stands for 1 %), for amplitudes without
+            an error of their own; those with one keep it.
+
+    Raises:
+        TableError: one line that names the first fault, its place and how to mend it, and the number of other faults.
+    """
+    faults = Faults(str(path))
+    if noise is not None and not 0.0 < noise < 1.0:
+        faults.add(f"the relative noise must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
+        faults.raise_any()
+    comments, rows = split_lines(read_text(path))
+    check_not_empty(comments, rows, faults)
+    header = parse_comments(comments, faults)
+    found = faults.count
+    head, rows = named_rows(rows, TABLE, faults)
+    check_error_columns(head, faults, noise)
+    if faults.count > found:
+        # With a wrong name the cells below it cannot be judged.
+        faults.raise_any()
+    columns, unreadable, lines = parse_rows(rows, head.names, TABLE, faults)
+    fill_errors(columns, unreadable, noise)
+    check_rows(columns, lines, faults, unreadable)
+    faults.raise_any()
+    arrays = {name: columns.get(name) for name in COLUMN_NAMES} | {"order": columns["order"].astype(np.int64)}
+    return AmplitudeTable(**arrays, **vars(header), source=str(path), lines=lines)
+
+
+def write_table(table: AmplitudeTable, path: str | Path) -> None:
+    """Write an amplitude table as a CSV file that ``read_table`` reads back without loss.
+
+    Args:
+        table: the table.
+        path: the file; one that exists is replaced.
+
+    Raises:
+        TableError: if the file cannot be written.
+    """
+    quality_factor, error = table.quality_factor, table.quality_factor_error
+    lines = [f"# free_frequency_khz = {float(table.free_frequency_khz)!r}"]
+    if quality_factor is not None:
+        tail = "" if error is None else f" +- {float(error)!r}"
+        lines.append(f"# quality_factor = {float(quality_factor)!r}{tail}")
+    lines.append(f"# mass_ng = {float(table.mass_ng)!r}")
+    known = [(name, *table.calibration[name]) for name in CALIBRATION if name in table.calibration]
+    lines += [f"# {name} = {float(value)!r} +- {float(error)!r}" for name, value, error in known]
+    lines += [f"# {remark}" for remark in table.remarks]
+    columns = {name: getattr(table, name) for name in COLUMN_NAMES if getattr(table, name) is not None}
+    lines.append(",".join(columns))
+    # tolist gives Python numbers, whose repr is the shortest text that reads back as the same number.
+    cells = [["" if value != value else repr(value) for value in column.tolist()] for column in columns.values()]  # noqa: PLR0124
+    lines += [",".join(row) for row in zip(*cells, strict=True)]
+    try:
+        Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+    except (OSError, UnicodeEncodeError) as error_met:
+        reason = getattr(error_met, "strerror", None) or str(error_met)
+        raise TableError(f"{printable(str(path))}: cannot be written ({reason}); choose another path") from error_met
