@@ -22,8 +22,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.apparatus.platform import Platform
 from afm_jax.checks import require_float64
-from afm_jax.contact.contact import EFFECTS, Contact
+from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
+from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.closure import OrbitProblem, Place
 from afm_jax.impact.first_impact import Flight, flight_gap
 from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.contact.contact import EFFECTS
+from afm_jax.contact.parameters import CONTACT_PARAMETERS, EFFECTS
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from fitting.tables.table import AmplitudeTable
 
@@ -32,7 +32,8 @@ class Parameter:
     """A fit parameter: its unit and what it means in words, and where it may lie.
 
     With a ``sign`` the coordinate y is that of value = reference + sign y^2 (a loss); with a ``width`` that of
-    value = reference + width y (any sign); else the coordinate is the logarithm of the value.
+    value = reference + width y (any sign); else the coordinate is the logarithm of the value. The ``advice`` says
+    what to measure so that the amplitudes determine it.
     """
 
     name: str
@@ -43,6 +44,7 @@ class Parameter:
     reference: float = 0.0
     sign: int = 0
     width: float = 0.0
+    advice: str = ""
 
     @property
     def bound(self) -> float | None:
@@ -76,17 +78,52 @@ class Parameter:
         return np.exp(coordinate)
 
 
+_SLOW = "measure slow impacts too: small drives, close to where the orbit is lost"
+
 LAW = (
-    Parameter("r", "", "coefficient of restitution", lowest=0.01, highest=1.0, reference=1.0, sign=-1),
-    Parameter("epsilon", "nm^2/us^2", "adhesion, 2 delta/m", lowest=0.0, highest=1e12, sign=1),
-    Parameter("viscous_loss", "nm/us", "loss linear in speed", lowest=0.0, highest=1e6, sign=1),
+    Parameter(
+        "r",
+        "",
+        "coefficient of restitution",
+        lowest=0.01,
+        highest=1.0,
+        reference=1.0,
+        sign=-1,
+        advice="measure fast impacts too: large drives on resonance, and give the quality factor with its error",
+    ),
+    Parameter("epsilon", "nm^2/us^2", "adhesion, 2 delta/m", lowest=0.0, highest=1e12, sign=1, advice=_SLOW),
+    Parameter(
+        "viscous_loss",
+        "nm/us",
+        "loss linear in speed",
+        lowest=0.0,
+        highest=1e6,
+        sign=1,
+        advice="measure over a wider range of drives at the same frequency",
+    ),
 )
 """What an impact law is made of."""
 
 DELAY = (
-    Parameter("delay_hertz", "us (nm/us)^0.2", "Hertz contact time at 1 nm/us", lowest=0.0, highest=1e3, sign=1),
-    Parameter("delay_lead_nm", "nm", "lead of a slow way out", lowest=-300.0, highest=300.0, width=5.0),
-    Parameter("delay_offset_nm", "nm", "offset of the contact surface, twice", lowest=-100.0, highest=100.0, width=1.0),
+    Parameter(
+        "delay_hertz",
+        "us (nm/us)^0.2",
+        "Hertz contact time at 1 nm/us",
+        lowest=0.0,
+        highest=1e3,
+        sign=1,
+        advice="measure at several orders, detuned to both sides of each resonance",
+    ),
+    Parameter("delay_lead_nm", "nm", "lead of a slow way out", lowest=-300.0, highest=300.0, width=5.0, advice=_SLOW),
+    Parameter(
+        "delay_offset_nm",
+        "nm",
+        "offset of the contact surface, twice",
+        lowest=-100.0,
+        highest=100.0,
+        width=1.0,
+        advice="measure at several offsets and drives",
+    ),
 )
 """What a collision delay is made of."""
 
@@ -98,21 +135,16 @@ NUISANCES = (
 )
 """What the instrument adds; each has a Gaussian constraint."""
 
-CONTACT = (
-    Parameter("relative_humidity", "", "p/p_s", lowest=0.02, highest=0.99),
-    Parameter("adhesion_energy_j_per_m2", "J/m^2", "JKR adhesion w", lowest=0.02, highest=5.0),
-    Parameter("viscosity_pa_s", "Pa s", "of the liquid", lowest=1e-6, highest=1.0),
-    Parameter("modulus_gpa", "GPa", "reduced modulus K", lowest=1.0, highest=2e3),
-    Parameter("bridge_forms_nm", "nm", "gap at which the bridge forms", lowest=0.5, highest=50.0),
-    Parameter("bridge_breaks_nm", "nm", "gap at which the bridge breaks", lowest=0.5, highest=50.0),
-    Parameter("tip_radius_nm", "nm", "R", lowest=1.0, highest=1e4),
-    Parameter("surface_tension_n_per_m", "N/m", "of the liquid", lowest=1e-3, highest=1.0),
-    Parameter("molar_volume_cm3_per_mol", "cm^3/mol", "of the liquid", lowest=1.0, highest=1e3),
-    Parameter("temperature_k", "K", "temperature", lowest=100.0, highest=1e3),
-    Parameter("structural_amplitude_n_per_m", "N/m", "A_0 of the structural force", lowest=1e-3, highest=1e4),
-    Parameter("structural_decay_nm", "nm", "tau of the structural force", lowest=0.05, highest=10.0),
-    Parameter("structural_offset_nm", "nm", "delta of the structural force", lowest=-5.0, highest=5.0, width=0.2),
-    Parameter("core_constant_j_m6", "J m^6", "B of the core repulsion", lowest=1e-82, highest=1e-74),
+CONTACT = tuple(
+    Parameter(
+        known.name,
+        known.unit,
+        known.meaning,
+        *known.fitted,
+        width=known.width,
+        advice=known.advice,
+    )
+    for known in CONTACT_PARAMETERS
 )
 """The parameters of `Contact.paper`, by its keywords."""
 

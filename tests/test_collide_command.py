@@ -13,10 +13,10 @@ from matplotlib.image import imread
 
 from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, save_scene
 from afm_jax.cli.collide import COLUMNS
-from afm_jax.cli.contact_options import PARAMETERS
 from afm_jax.cli.main import main
 from afm_jax.cli.values import parse_numbers
 from afm_jax.contact.collide import default_speeds
+from afm_jax.contact.parameters import PAPER
 from tests.reference_contact import ContactParameters, capture_speed, collision, junction
 from tests.strict_reading import strictly
 
@@ -137,9 +137,12 @@ def test_options_and_scenes_reach_the_contact(tmp_path: Path):
 
 def test_help_names_the_papers_values():
     keywords = inspect.signature(Contact.paper).parameters
-    assert {name: float(value) for name, (_, value) in PARAMETERS.items()} == {
-        name: keyword.default for name, keyword in keywords.items() if name != "effects"
-    }
+    assert {name: keyword.default for name, keyword in keywords.items() if name != "effects"} == PAPER
+    # wrapped to a width, and indented
+    text = " ".join(CliRunner().invoke(main, ["collide", "--help"]).output.split())
+    for name, value in PAPER.items():
+        said = text.partition(f"--{name.replace('_', '-')} X ")[2].partition("paper: ")[2].partition(". ")[0]
+        assert float(said) == value, name
 
 
 def test_default_speeds_begin_above_the_capture_speed():

@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import pytest
 
 from afm_jax.contact.collide import _quick
-from afm_jax.contact.contact import EFFECTS, Contact
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.parameters import EFFECTS
 from afm_jax.contact.settings import SETTINGS
 
 SETTING = SETTINGS["diffrax"][1e-9]

@@ -14,10 +14,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from afm_jax import Cantilever, Contact, Platform, Scene, SceneError, load_scene, save_scene
-from afm_jax.contact.contact import EFFECTS
 from afm_jax.contact.forces import Capillary, CoreRepulsion, Jkr, VanDerWaals
+from afm_jax.contact.parameters import CONTACT_RANGES, EFFECTS
 from afm_jax.scenefile import presets
-from afm_jax.scenefile.tables import CONTACT_RANGES
 from tests.fresh_python import python
 
 HEAD = "[cantilever]\nfrequency_khz = 90\n[platform]\namplitude_nm = 4\nfrequency_khz = 181.8\n[interaction]\n"

@@ -13,7 +13,8 @@ from jaxtyping import Array, Float
 from afm_jax.bench.scipy_contacts import scipy_collision
 from afm_jax.bench.timing import compiled_for, progress, time_compiled
 from afm_jax.contact.collide import Collision, batch_of, collide
-from afm_jax.contact.contact import EFFECTS, Contact
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.parameters import EFFECTS
 from afm_jax.contact.settings import SETTINGS, Setting
 
 Row = dict[str, Any]

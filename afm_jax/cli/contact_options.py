@@ -7,36 +7,18 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from afm_jax.contact.parameters import (
+    CONTACT_PARAMETERS,
+    CONTACT_RANGES,
+    EFFECTS,
+    PAPER,
+    REMOVABLE_EFFECTS,
+    REQUIRED_EFFECTS,
+    idle_without,
+)
+
 if TYPE_CHECKING:
     from afm_jax.contact.contact import Contact
-
-PARAMETERS = {
-    "relative_humidity": ("p/p_s of the vapour", "0.5"),
-    "temperature_k": ("temperature", "293.15"),
-    "surface_tension_n_per_m": ("of the liquid", "0.0728"),
-    "molar_volume_cm3_per_mol": ("of the liquid", "18.0795"),
-    "viscosity_pa_s": ("of the liquid", "0.001005"),
-    "tip_radius_nm": ("R", "100"),
-    "structural_amplitude_n_per_m": ("A_0 of the structural force", "40"),
-    "structural_decay_nm": ("tau of the structural force", "0.6"),
-    "structural_offset_nm": ("delta of the structural force", "0.6"),
-    "core_constant_j_m6": ("B of the core repulsion", "1e-78"),
-    "adhesion_energy_j_per_m2": ("w of the JKR contact", "0.3"),
-    "modulus_gpa": ("reduced modulus K of the JKR contact", "100"),
-    "bridge_forms_nm": ("gap at which the bridge forms", "3.5"),
-    "bridge_breaks_nm": ("gap at which it breaks", "4.7"),
-}
-"""For every parameter of a contact what it is, and the paper's value."""
-
-REMOVABLE = ("viscous", "structural", "capillary")
-_REQUIRED = ("core", "jkr")
-_LIQUID = ("relative_humidity", "temperature_k", "surface_tension_n_per_m", "molar_volume_cm3_per_mol")
-SERVES = {
-    "viscosity_pa_s": ("viscous",),
-    **dict.fromkeys(("structural_amplitude_n_per_m", "structural_decay_nm", "structural_offset_nm"), ("structural",)),
-    **dict.fromkeys(_LIQUID, ("capillary", "structural")),
-}
-"""The effects of which a parameter needs one to mean anything; the others are always of use."""
 
 
 class ChosenContact(NamedTuple):
@@ -61,20 +43,21 @@ def with_contact_options(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(function)
     def command(*args: Any, scene: Path | None, mass_ng: float | None, **options: Any) -> Any:
-        parameters = {name: value for name in PARAMETERS if (value := options.pop(name)) is not None}
-        left_out = tuple(name for name in (*REMOVABLE, *_REQUIRED) if options.pop(f"no_{name}"))
+        parameters = {name: value for name in PAPER if (value := options.pop(name)) is not None}
+        left_out = tuple(name for name in (*REMOVABLE_EFFECTS, *REQUIRED_EFFECTS) if options.pop(f"no_{name}"))
         chosen = ContactOptions(scene, parameters, left_out, mass_ng)
         return function(*args, contact_options=chosen, **options)
 
     # click lists options in the order of the decorators, the last one first
-    for name in _REQUIRED[::-1]:
+    for name in list(REQUIRED_EFFECTS)[::-1]:
         command = click.option(f"--no-{name}", is_flag=True, help="Not possible; says why.")(command)
-    for name in REMOVABLE[::-1]:
+    for name in REMOVABLE_EFFECTS[::-1]:
         command = click.option(f"--no-{name}", is_flag=True, help=f"Leave the {name} force out.")(command)
     mass = click.option("--mass-ng", type=float, metavar="X", help="Effective mass of the tip; the scene's, or 1.")
     command = mass(command)
-    for name, (what, value) in list(PARAMETERS.items())[::-1]:
-        command = click.option(_option(name), type=float, metavar="X", help=f"{what}; paper: {value}.")(command)
+    for parameter in CONTACT_PARAMETERS[::-1]:
+        text = f"{parameter.meaning}; paper: {parameter.default:g}."
+        command = click.option(_option(parameter.name), type=float, metavar="X", help=text)(command)
     argument = click.argument("scene", metavar="[SCENE.toml]", required=False, type=click.Path(path_type=Path))
     return argument(command)
 
@@ -87,9 +70,7 @@ def chosen_contact(options: ContactOptions) -> ChosenContact:
         ValueError: if a value is impossible, the scene has no contact, or the contact no junction.
     """
     from afm_jax.checks import check_parameter  # noqa: PLC0415
-    from afm_jax.contact.contact import EFFECTS, REQUIRED_EFFECTS  # noqa: PLC0415
     from afm_jax.scenefile.contact import contact_parameters, make_contact  # noqa: PLC0415
-    from afm_jax.scenefile.tables import CONTACT_RANGES  # noqa: PLC0415
 
     for name in options.left_out:
         if name in REQUIRED_EFFECTS:
@@ -102,9 +83,9 @@ def chosen_contact(options: ContactOptions) -> ChosenContact:
         effects, parameters, mass = _of_scene(options.scene)
     effects = tuple(name for name in effects if name not in options.left_out)
     for name in options.parameters:
-        serves = SERVES.get(name, effects)
-        if not set(serves) & set(effects):
-            raise click.UsageError(f"{_option(name)} changes nothing without the effect {' or '.join(serves)}")
+        missing = idle_without(name, effects)
+        if missing:
+            raise click.UsageError(f"{_option(name)} changes nothing without the effect {' or '.join(missing)}")
     contact = make_contact(effects, {**parameters, **options.parameters})
     mass = mass if options.mass_ng is None else options.mass_ng
     numbers = {name: float(value) for name, value in contact_parameters(contact).items()}

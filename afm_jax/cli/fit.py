@@ -12,6 +12,7 @@ import click
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import Share, parse_around_plus_minus, parse_number
+from afm_jax.contact.parameters import EFFECTS, REMOVABLE_EFFECTS, idle_without
 from afm_jax.words import text_table
 
 if TYPE_CHECKING:
@@ -195,20 +196,17 @@ def _settings(model: str, options: dict[str, Any]) -> dict[str, Any]:
 
 def _effects(left_out: tuple[str, ...]) -> tuple[str, ...]:
     """Return the contact's effects without those left out."""
-    from afm_jax.cli.contact_options import REMOVABLE  # noqa: PLC0415
-
     for name in left_out:
-        if name not in REMOVABLE:
-            raise click.UsageError(f"--no takes {', '.join(REMOVABLE)}, but one is {name!r}")
-    return tuple(name for name in ("capillary", "structural", "core", "viscous", "jkr") if name not in left_out)
+        if name not in REMOVABLE_EFFECTS:
+            raise click.UsageError(f"--no takes {', '.join(REMOVABLE_EFFECTS)}, but one is {name!r}")
+    return tuple(name for name in EFFECTS if name not in left_out)
 
 
 def _usual_parameters(fixed: dict[str, float], effects: tuple[str, ...]) -> tuple[str, ...]:
     """Return which parameters are fitted if the call names none: the usual ones that are neither fixed nor idle."""
-    from afm_jax.cli.contact_options import SERVES  # noqa: PLC0415
     from fitting.models import CONTACT_DEFAULT  # noqa: PLC0415
 
-    chosen = [name for name in CONTACT_DEFAULT if name not in fixed and set(SERVES.get(name, effects)) & set(effects)]
+    chosen = [name for name in CONTACT_DEFAULT if name not in fixed and not idle_without(name, effects)]
     if not chosen:
         raise click.UsageError("--fix holds every parameter that is usually fitted; name others to fit with --free")
     return tuple(chosen)
@@ -220,16 +218,14 @@ def _check_contact_options(free: tuple[str, ...], fixed: dict[str, float], effec
     Raises:
         click.UsageError: if one is not.
     """
-    from afm_jax.cli.contact_options import SERVES  # noqa: PLC0415
-
     for name in free:
         if name in fixed:
             raise click.UsageError(f"{name} is both fitted (--free) and held fixed (--fix); remove it from one")
     for option, names in (("--free", free), ("--fix", tuple(fixed))):
         for name in names:
-            serves = SERVES.get(name, effects)
-            if not set(serves) & set(effects):
-                raise click.UsageError(f"{option} {name} changes nothing without the effect {' or '.join(serves)}")
+            missing = idle_without(name, effects)
+            if missing:
+                raise click.UsageError(f"{option} {name} changes nothing without the effect {' or '.join(missing)}")
 
 
 def _extras(

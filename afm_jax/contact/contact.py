@@ -10,16 +10,8 @@ from afm_jax.contact.forces.force import Force, ForceSum, terms_of
 from afm_jax.contact.forces.jkr import Jkr
 from afm_jax.contact.forces.liquid import Capillary, Liquid, Structural, Viscous
 from afm_jax.contact.forces.solid import CoreRepulsion
+from afm_jax.contact.parameters import EFFECTS, PAPER, REQUIRED_EFFECTS
 from afm_jax.units import AJ_NM6_PER_J_M6
-
-EFFECTS = ("capillary", "structural", "core", "viscous", "jkr")
-"""The effects of the paper's contact, by the names of scene files and options."""
-
-REQUIRED_EFFECTS = {
-    "core": "without the core repulsion the bridge never gets as stiff as the JKR contact, so that no junction forms",
-    "jkr": "the JKR contact is the solid junction itself: without it the tip would fall through the sample",
-}
-"""The effects that a contact cannot do without, and why."""
 
 
 def _flat(forces: Force | Sequence[Force]) -> ForceSum:
@@ -45,8 +37,8 @@ class Contact(eqx.Module):
 
     forces: ForceSum = eqx.field(converter=_flat)
     junction: Jkr = eqx.field(default_factory=Jkr)
-    bridge_forms_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=3.5)
-    bridge_breaks_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=4.7)
+    bridge_forms_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=PAPER["bridge_forms_nm"])
+    bridge_breaks_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=PAPER["bridge_breaks_nm"])
 
     __repr__ = readable
 
@@ -65,20 +57,20 @@ class Contact(eqx.Module):
         cls,
         *,
         effects: Sequence[str] = EFFECTS,
-        relative_humidity: ArrayLike = 0.5,
-        temperature_k: ArrayLike = 293.15,
-        surface_tension_n_per_m: ArrayLike = 0.0728,
-        molar_volume_cm3_per_mol: ArrayLike = 18.0795,
-        viscosity_pa_s: ArrayLike = 1.005e-3,
-        tip_radius_nm: ArrayLike = 100.0,
-        structural_amplitude_n_per_m: ArrayLike = 40.0,
-        structural_decay_nm: ArrayLike = 0.6,
-        structural_offset_nm: ArrayLike = 0.6,
-        core_constant_j_m6: ArrayLike = 1e-78,
-        adhesion_energy_j_per_m2: ArrayLike = 0.3,
-        modulus_gpa: ArrayLike = 100.0,
-        bridge_forms_nm: ArrayLike = 3.5,
-        bridge_breaks_nm: ArrayLike = 4.7,
+        relative_humidity: ArrayLike = PAPER["relative_humidity"],
+        temperature_k: ArrayLike = PAPER["temperature_k"],
+        surface_tension_n_per_m: ArrayLike = PAPER["surface_tension_n_per_m"],
+        molar_volume_cm3_per_mol: ArrayLike = PAPER["molar_volume_cm3_per_mol"],
+        viscosity_pa_s: ArrayLike = PAPER["viscosity_pa_s"],
+        tip_radius_nm: ArrayLike = PAPER["tip_radius_nm"],
+        structural_amplitude_n_per_m: ArrayLike = PAPER["structural_amplitude_n_per_m"],
+        structural_decay_nm: ArrayLike = PAPER["structural_decay_nm"],
+        structural_offset_nm: ArrayLike = PAPER["structural_offset_nm"],
+        core_constant_j_m6: ArrayLike = PAPER["core_constant_j_m6"],
+        adhesion_energy_j_per_m2: ArrayLike = PAPER["adhesion_energy_j_per_m2"],
+        modulus_gpa: ArrayLike = PAPER["modulus_gpa"],
+        bridge_forms_nm: ArrayLike = PAPER["bridge_forms_nm"],
+        bridge_breaks_nm: ArrayLike = PAPER["bridge_breaks_nm"],
     ) -> "Contact":
         """Return the contact of section IV; every value can be changed by its keyword, every effect left out.
 
@@ -126,7 +118,10 @@ class Contact(eqx.Module):
         return (*(_NAMES.get(type(term), type(term).__name__) for term in self.forces.terms), "jkr")
 
 
-_NAMES = {Capillary: "capillary", Structural: "structural", CoreRepulsion: "core", Viscous: "viscous"}
+FORCES = {"capillary": Capillary, "structural": Structural, "core": CoreRepulsion, "viscous": Viscous}
+"""The force behind each effect."""
+
+_NAMES = {force: name for name, force in FORCES.items()}
 
 
 def check_effects(effects: Sequence[str]) -> None:

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from afm_jax.apparatus.scene import Scene
-from afm_jax.contact.contact import REQUIRED_EFFECTS, Contact
+from afm_jax.contact.contact import Contact
 from afm_jax.contact.forces.liquid import Capillary, Structural, Viscous
 from afm_jax.contact.forces.solid import CoreRepulsion
+from afm_jax.contact.parameters import REQUIRED_EFFECTS
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 
 Scaled = Callable[[Scene, Float[Array, ""]], Scene]

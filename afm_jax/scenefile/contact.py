@@ -8,15 +8,13 @@ import equinox as eqx
 import numpy as np
 
 from afm_jax.checks import check_parameter
-from afm_jax.contact.contact import EFFECTS, Contact
+from afm_jax.contact.contact import FORCES, Contact
 from afm_jax.contact.forces.force import Force
-from afm_jax.contact.forces.liquid import Capillary, Structural, Viscous
+from afm_jax.contact.forces.liquid import Liquid
 from afm_jax.contact.forces.solid import CoreRepulsion
 from afm_jax.contact.junction import explain_missing_junction, find_junction
-from afm_jax.scenefile.tables import CONTACT_RANGES
+from afm_jax.contact.parameters import CONTACT_RANGES, EFFECTS
 from afm_jax.units import AJ_NM6_PER_J_M6
-
-_KINDS = {"capillary": Capillary, "structural": Structural, "core": CoreRepulsion, "viscous": Viscous}
 
 
 def make_contact(effects: Sequence[str], parameters: Mapping[str, float]) -> Contact:
@@ -52,7 +50,7 @@ def contact_parameters(contact: Contact) -> dict[str, Any]:
         ValueError: if it holds something that a scene file has no key for: another force, the same one twice, or
             different radii or liquids in its forces.
     """
-    known = [_KINDS.get(name) for name in contact.effects[:-1]]
+    known = [FORCES.get(name) for name in contact.effects[:-1]]
     if None in known or len(set(known)) < len(known):
         raise ValueError(
             f"a scene file holds each of {', '.join(EFFECTS)} once, but the contact has {', '.join(contact.effects)}"
@@ -73,18 +71,17 @@ def contact_parameters(contact: Contact) -> dict[str, Any]:
 
 
 def _own_parameters(term: Force) -> dict[str, Any]:
-    """Return the parameters of one force by their names in a scene file."""
-    match term:
-        case Capillary():
-            return {"tip_radius_nm": term.tip_radius_nm, **vars(term.liquid)}
-        case Structural():
-            own = ("amplitude_n_per_m", "decay_nm", "offset_nm")
-            named = {f"structural_{name}": getattr(term, name) for name in own}
-            return {**named, "tip_radius_nm": term.tip_radius_nm, **vars(term.liquid)}
-        case CoreRepulsion():
-            return {"core_constant_j_m6": _core_constant(term), "tip_radius_nm": term.tip_radius_nm}
-        case _:
-            return vars(term)
+    """Return the parameters of one force by their names in a scene file: a field's, or the effect's and the field's."""
+    effect = next(name for name, kind in FORCES.items() if isinstance(term, kind))
+    values: dict[str, Any] = {}
+    for field, value in vars(term).items():
+        if isinstance(value, Liquid):
+            values |= vars(value)
+        elif isinstance(term, CoreRepulsion) and field == "constant_aj_nm6":
+            values["core_constant_j_m6"] = _core_constant(term)
+        else:
+            values[field if field in CONTACT_RANGES else f"{effect}_{field}"] = value
+    return values
 
 
 def _core_constant(term: CoreRepulsion) -> Any:

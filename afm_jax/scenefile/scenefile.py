@@ -39,7 +39,7 @@ velocity_nm_per_us = 80
 ```
 
 A resolved contact instead of a law: `model = "contact"`, `effects = ["capillary", "structural", "core", "viscous",
-"jkr"]` (all of them if left out) and any of the parameters in `CONTACT_RANGES`; the paper's values if left out.
+"jkr"]` (all of them if left out) and any of the parameters of `Contact.paper`; the paper's values if left out.
 With [base] or [force] the platform may rest: without `amplitude_nm` and frequency its phase counts in the drive's.
 
 The drives of a scene file: the platform, the base and the force on the tip, each with a second frequency or not.
@@ -67,9 +67,9 @@ from afm_jax.checks import check_parameter
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.motion.record import State
 from afm_jax.scenefile.tables import (
-    CONTACT_RANGES,
     INNER_TABLES,
     KEYS,
+    LAW_NUMBERS,
     MODELS,
     TABLES,
     SceneError,
@@ -382,7 +382,8 @@ def _law_table(law: ImpactLaw) -> dict[str, Any]:
 
 def _contact_table(contact: Any) -> dict[str, Any]:
     # only here, so that scenes with a law do without the contact's modules
-    from afm_jax.contact.contact import EFFECTS, Contact  # noqa: PLC0415
+    from afm_jax.contact.contact import Contact  # noqa: PLC0415
+    from afm_jax.contact.parameters import EFFECTS  # noqa: PLC0415
     from afm_jax.scenefile.contact import contact_parameters  # noqa: PLC0415
 
     if not isinstance(contact, Contact):
@@ -463,17 +464,17 @@ def _interaction_of(tables: dict[str, SceneTable]) -> Any:
         return None
     if table.model == "contact":
         return _contact_of(table)
-    law = table.numbers(required=("r",), optional=("epsilon", "viscous_loss"))
+    law = table.numbers(required=("r",), optional=LAW_NUMBERS)
     return table.build(ImpactLaw, **law, delay=_delay_of(tables.get("interaction.delay")))
 
 
 def _contact_of(table: SceneTable) -> "Contact":
     # only here, so that scenes with a law do without the contact's modules
-    from afm_jax.contact.contact import EFFECTS  # noqa: PLC0415
+    from afm_jax.contact.parameters import EFFECTS, PAPER  # noqa: PLC0415
     from afm_jax.scenefile.contact import make_contact  # noqa: PLC0415
 
     effects = table.texts("effects")
-    numbers = table.numbers(optional=tuple(CONTACT_RANGES))
+    numbers = table.numbers(optional=tuple(PAPER))
     return table.build(make_contact, EFFECTS if effects is None else effects, numbers)
 
 

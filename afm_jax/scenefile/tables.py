@@ -7,24 +7,6 @@ import difflib
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, NoReturn, TypeVar
 
-CONTACT_RANGES = {
-    "relative_humidity": "between 0 and 1",
-    "temperature_k": "positive",
-    "surface_tension_n_per_m": "positive",
-    "molar_volume_cm3_per_mol": "positive",
-    "viscosity_pa_s": "not negative",
-    "tip_radius_nm": "positive",
-    "structural_amplitude_n_per_m": "not negative",
-    "structural_decay_nm": "positive",
-    "structural_offset_nm": "finite",
-    "core_constant_j_m6": "positive",
-    "adhesion_energy_j_per_m2": "positive",
-    "modulus_gpa": "positive",
-    "bridge_forms_nm": "positive",
-    "bridge_breaks_nm": "positive",
-}
-"""The parameters of a contact, and which values `afm_jax.checks.check_parameter` lets pass."""
-
 _FREQUENCY = ("frequency_khz", "reduced_frequency")
 _MOTION = ("amplitude_nm", *_FREQUENCY, "phase_deg")
 _FORCE = ("amplitude_nn", *_FREQUENCY, "phase_deg")
@@ -43,14 +25,14 @@ KEYS = {
 }
 """For every table of a scene file the keys it may have; those of the interaction are an impact law's."""
 
+LAW_NUMBERS = tuple(key for key in KEYS["interaction"] if key not in ("model", "r", "delay"))
+"""The parameters of an impact law that a file may leave out."""
+
 TABLES = tuple(name for name in KEYS if "." not in name)
 """The tables at the top of a file."""
 
 INNER_TABLES = tuple(name for name in KEYS if "." in name)
 """The tables inside others."""
-
-CONTACT_KEYS = ("model", "effects", *CONTACT_RANGES)
-"""The keys of the interaction where its model is a contact."""
 
 MODELS = ("law", "contact", "none")
 """The models of an interaction; "none": a free cantilever."""
@@ -63,7 +45,12 @@ def keys_of(table: str, model: str) -> tuple[str, ...]:
     """Return the keys that a table may have in a scene whose interaction is of one of the `MODELS`."""
     if table != "interaction" or model == "law":
         return KEYS[table]
-    return CONTACT_KEYS if model == "contact" else ("model",)
+    if model != "contact":
+        return ("model",)
+    # only here, so that scenes with a law do without the contact's modules
+    from afm_jax.contact.parameters import PAPER  # noqa: PLC0415
+
+    return ("model", "effects", *PAPER)
 
 
 def advise_key(table: str, key: str, model: str = "law") -> str:

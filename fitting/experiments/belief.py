@@ -3,7 +3,6 @@
 The belief that a fit leaves: its values, its covariance, and the drives that were measured.
 """
 
-import inspect
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,7 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.contact.contact import EFFECTS, Contact
+from afm_jax.contact.parameters import EFFECTS, PAPER
 from fitting.fits.result import FitResult
 from fitting.models import (
     CONTACT_NAMES,
@@ -184,8 +183,7 @@ def checked_values(problem: Problem, values: Mapping[str, float]) -> Float[np.nd
 def _starting_values(model: str, own: tuple[str, ...]) -> dict[str, float]:
     if model != "contact":
         return _STARTING_LAWS[model.removesuffix("+delay")] | _DELAY
-    papers = inspect.signature(Contact.paper).parameters
-    return {name: float(papers[name].default) for name in CONTACT_NAMES if name in own and name in papers}
+    return {name: PAPER[name] for name in CONTACT_NAMES if name in own}
 
 
 def _assumptions(

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from scipy.special import chdtrc
 
 from afm_jax.checks import require_float64
-from afm_jax.contact.contact import EFFECTS
+from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.lasting_impact import LawImpact
 from afm_jax.version import version_of
 from fitting.fits.intervals import Convergence, Interval, at_bound, check_minimum, covariance, profile_intervals

@@ -16,7 +16,6 @@ taken, 0.05 % + 1.2 % s^3 + 1.6 % (1.5 u_c/u)^6 with the approach speed u and th
 The three-parameter delay law is right to 0.15 ns, which counts where the delay alone fixes the amplitude.
 """
 
-import inspect
 from dataclasses import dataclass, replace
 
 import jax
@@ -24,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import DELAY_ERROR_US, SPEED_ERROR
+from afm_jax.contact.parameters import CONTACT_PARAMETER
 from afm_jax.impact.lasting_impact import LawImpact
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.fits.objective import BATCH, FINE, PLAIN, ROUGH, SOFT, Objective, lowest, polish
@@ -35,8 +34,6 @@ from fitting.models import CONTACT_NAMES, NUISANCE_NAMES, ROWS_PER_PROGRAM, Meas
 _GRID_PER_PARAMETER = {1: 96, 2: 16}
 _SPREAD_POINTS = 64
 """Points of a low-discrepancy sequence, where a grid would have too many."""
-_CONTACT_FACTOR = 3.0
-"""Contact parameters are tried within this factor of the paper's value."""
 
 
 def starts(problem: Problem, measurement: Measurement) -> Float[np.ndarray, "points p"]:
@@ -92,20 +89,12 @@ def _ranges(measurement: Measurement):
 
 
 def _around(name: str):
-    usual = _usual(name)
+    known = CONTACT_PARAMETER[name]
     if name == "relative_humidity":
         return lambda place: 0.1 + 0.8 * np.asarray(place)
-    if usual <= 0.0 or name == "structural_offset_nm":
-        return lambda place: usual + 0.4 * (np.asarray(place) - 0.5)
-    factor = (
-        1.3 if name in {"temperature_k", "surface_tension_n_per_m", "molar_volume_cm3_per_mol"} else _CONTACT_FACTOR
-    )
-    return lambda place: usual * factor ** (2.0 * np.asarray(place) - 1.0)
-
-
-def _usual(name: str) -> float:
-    """Return the paper's value of a contact parameter."""
-    return float(inspect.signature(Contact.paper).parameters[name].default)
+    if known.width:
+        return lambda place: known.default + 2.0 * known.width * (np.asarray(place) - 0.5)
+    return lambda place: known.default * known.spread ** (2.0 * np.asarray(place) - 1.0)
 
 
 _STEPS = (0.01, 0.03, 0.1, 0.3)

@@ -14,6 +14,7 @@ from scipy.special import chdtrc
 
 from fitting.fits.intervals import Convergence
 from fitting.fits.result import FittedParameter, FittedRows
+from fitting.models import PARAMETERS
 from fitting.tables.table import AmplitudeTable
 
 IMPROBABLE = 1e-3
@@ -219,23 +220,8 @@ def _why_not_explained(evidence: Evidence) -> str:
 
 def helpful_measurement(name: str) -> str:
     """Return what to measure, or to say, so that a parameter gets determined."""
-    return _HELP.get(name, "measure at other drives, orders or offsets too, or hold it fixed at a known value")
-
-
-_HELP = {
-    "r": "measure fast impacts too: large drives on resonance, and give the quality factor with its error",
-    "epsilon": "measure slow impacts too: small drives, close to where the orbit is lost",
-    "viscous_loss": "measure over a wider range of drives at the same frequency",
-    "delay_hertz": "measure at several orders, detuned to both sides of each resonance",
-    "delay_lead_nm": "measure slow impacts too: small drives, close to where the orbit is lost",
-    "delay_offset_nm": "measure at several offsets and drives",
-    "relative_humidity": "measure slow impacts too, or hold it fixed at the hygrometer's value",
-    "adhesion_energy_j_per_m2": "measure slow impacts too, or hold it or the humidity fixed: both set the hysteresis",
-    "viscosity_pa_s": "measure over a wider range of drives, or hold it fixed at the liquid's known value",
-    "modulus_gpa": "measure at several orders, detuned to both sides of each resonance",
-    "bridge_forms_nm": "hold it fixed: only slow impacts depend on it",
-    "bridge_breaks_nm": "measure slow impacts too: small drives, close to where the orbit is lost",
-}
+    known = PARAMETERS[name].advice if name in PARAMETERS else ""
+    return known or "measure at other drives, orders or offsets too, or hold it fixed at a known value"
 
 
 def _warnings(evidence: Evidence) -> list[str]:

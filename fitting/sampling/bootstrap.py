@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from afm_jax.checks import require_float64
-from afm_jax.contact.contact import EFFECTS
+from afm_jax.contact.parameters import EFFECTS
 from fitting.fits.intervals import at_bound, covariance
 from fitting.fits.least_squares import Box, Searches, descended, distance, whole_covariance_of
 from fitting.fits.objective import PLAIN, ROBUST, Objective, soft_square

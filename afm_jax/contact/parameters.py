@@ -1,0 +1,184 @@
+"""The parameters of a contact and its effects, written once: scene files, options, fits and reports take theirs here.
+
+Without JAX, so that `--help` needs none.
+"""
+
+from dataclasses import dataclass
+
+EFFECTS = ("capillary", "structural", "core", "viscous", "jkr")
+"""The effects of the paper's contact, by the names of scene files and options."""
+
+REQUIRED_EFFECTS = {
+    "core": "without the core repulsion the bridge never gets as stiff as the JKR contact, so that no junction forms",
+    "jkr": "the JKR contact is the solid junction itself: without it the tip would fall through the sample",
+}
+"""The effects that a contact cannot do without, and why."""
+
+REMOVABLE_EFFECTS = tuple(name for name in EFFECTS[::-1] if name not in REQUIRED_EFFECTS)
+"""The effects that it can do without."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ContactParameter:
+    """A parameter of a contact: a keyword of `Contact.paper`, a key of scene files, an option, a fit parameter.
+
+    Attributes:
+        name: with its unit, as in scene files.
+        unit: in words.
+        default: the paper's value.
+        allowed: which values `afm_jax.checks.check_parameter` lets pass.
+        meaning: what it is, in a line.
+        fitted: the range of values that a fit may take.
+        width: of a parameter of any sign, the scale on which a fit varies it; 0: varied by factors.
+        spread: the factor to either side of the paper's value within which fits start.
+        serves: the effects of which it needs one to mean anything; none: it is always of use.
+        advice: what to measure so that a fit determines it, if there is more to say than of any.
+    """
+
+    name: str
+    unit: str
+    default: float
+    allowed: str = "positive"
+    meaning: str
+    fitted: tuple[float, float]
+    width: float = 0.0
+    spread: float = 3.0
+    serves: tuple[str, ...] = ()
+    advice: str = ""
+
+
+_LIQUID = ("capillary", "structural")
+
+CONTACT_PARAMETERS = (
+    ContactParameter(
+        name="relative_humidity",
+        unit="",
+        default=0.5,
+        allowed="between 0 and 1",
+        meaning="p/p_s of the vapour",
+        fitted=(0.02, 0.99),
+        serves=_LIQUID,
+        advice="measure slow impacts too, or hold it fixed at the hygrometer's value",
+    ),
+    ContactParameter(
+        name="temperature_k",
+        unit="K",
+        default=293.15,
+        meaning="temperature",
+        fitted=(100.0, 1e3),
+        spread=1.3,
+        serves=_LIQUID,
+    ),
+    ContactParameter(
+        name="surface_tension_n_per_m",
+        unit="N/m",
+        default=0.0728,
+        meaning="of the liquid",
+        fitted=(1e-3, 1.0),
+        spread=1.3,
+        serves=_LIQUID,
+    ),
+    ContactParameter(
+        name="molar_volume_cm3_per_mol",
+        unit="cm^3/mol",
+        default=18.0795,
+        meaning="of the liquid",
+        fitted=(1.0, 1e3),
+        spread=1.3,
+        serves=_LIQUID,
+    ),
+    ContactParameter(
+        name="viscosity_pa_s",
+        unit="Pa s",
+        default=1.005e-3,
+        allowed="not negative",
+        meaning="of the liquid",
+        fitted=(1e-6, 1.0),
+        serves=("viscous",),
+        advice="measure over a wider range of drives, or hold it fixed at the liquid's known value",
+    ),
+    ContactParameter(name="tip_radius_nm", unit="nm", default=100.0, meaning="R", fitted=(1.0, 1e4)),
+    ContactParameter(
+        name="structural_amplitude_n_per_m",
+        unit="N/m",
+        default=40.0,
+        allowed="not negative",
+        meaning="A_0 of the structural force",
+        fitted=(1e-3, 1e4),
+        serves=("structural",),
+    ),
+    ContactParameter(
+        name="structural_decay_nm",
+        unit="nm",
+        default=0.6,
+        meaning="tau of the structural force",
+        fitted=(0.05, 10.0),
+        serves=("structural",),
+    ),
+    ContactParameter(
+        name="structural_offset_nm",
+        unit="nm",
+        default=0.6,
+        allowed="finite",
+        meaning="delta of the structural force",
+        fitted=(-5.0, 5.0),
+        width=0.2,
+        serves=("structural",),
+    ),
+    ContactParameter(
+        name="core_constant_j_m6",
+        unit="J m^6",
+        default=1e-78,
+        meaning="B of the core repulsion",
+        fitted=(1e-82, 1e-74),
+    ),
+    ContactParameter(
+        name="adhesion_energy_j_per_m2",
+        unit="J/m^2",
+        default=0.3,
+        meaning="w of the JKR contact",
+        fitted=(0.02, 5.0),
+        advice="measure slow impacts too, or hold it or the humidity fixed: both set the hysteresis",
+    ),
+    ContactParameter(
+        name="modulus_gpa",
+        unit="GPa",
+        default=100.0,
+        meaning="reduced modulus K of the JKR contact",
+        fitted=(1.0, 2e3),
+        advice="measure at several orders, detuned to both sides of each resonance",
+    ),
+    ContactParameter(
+        name="bridge_forms_nm",
+        unit="nm",
+        default=3.5,
+        meaning="gap at which the bridge forms",
+        fitted=(0.5, 50.0),
+        advice="hold it fixed: only slow impacts depend on it",
+    ),
+    ContactParameter(
+        name="bridge_breaks_nm",
+        unit="nm",
+        default=4.7,
+        meaning="gap at which the bridge breaks",
+        fitted=(0.5, 50.0),
+        advice="measure slow impacts too: small drives, close to where the orbit is lost",
+    ),
+)
+"""All of them, in the order of scene files and help texts."""
+
+CONTACT_PARAMETER = {parameter.name: parameter for parameter in CONTACT_PARAMETERS}
+"""The same by name."""
+
+PAPER = {parameter.name: parameter.default for parameter in CONTACT_PARAMETERS}
+"""The paper's value of each."""
+
+
+CONTACT_RANGES = {parameter.name: parameter.allowed for parameter in CONTACT_PARAMETERS}
+"""Which values of each `afm_jax.checks.check_parameter` lets pass."""
+
+
+def idle_without(name: str, effects: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the effects that a parameter lacks to mean anything; none if it is of use with those given."""
+    serves = CONTACT_PARAMETER[name].serves if name in CONTACT_PARAMETER else ()
+    return () if not serves or set(serves) & set(effects) else serves
