@@ -25,7 +25,7 @@ from afm_jax.checks import require_float64
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.impact.closure import OrbitProblem, Place
+from afm_jax.impact.closure import OrbitPlace, OrbitProblem
 from afm_jax.impact.first_impact import Flight, flight_gap
 from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact
 from afm_jax.impact.map import NEAR_GRAZING
@@ -49,7 +49,7 @@ from fitting.tables.table import AmplitudeTable
 class Branch(NamedTuple):
     """The orbit that a row is taken to be on: where, whether there is one, and how many there are."""
 
-    place: Place
+    place: OrbitPlace
     exists: Bool[Array, ""]
     orbits: Int[Array, ""]
     near_fold: Bool[Array, ""]
@@ -91,7 +91,7 @@ def branch_of(orbit: OrbitProblem, row: Rows) -> Branch:
     misfit = jnp.where(row.measured, (roots.amplitude_nm - row.amplitude_nm) / row.error_nm, 0.0)
     slot = jnp.argmin(jnp.where(roots.steady, jnp.sum(misfit**2, axis=1), jnp.inf))
     return Branch(
-        place=Place(roots.place.coordinate[slot], roots.place.phase[slot]),
+        place=OrbitPlace(roots.place.coordinate[slot], roots.place.phase[slot]),
         exists=roots.steady[slot],
         orbits=jnp.sum(roots.steady, dtype=jnp.int32),
         near_fold=roots.steady[slot] & roots.near_double[slot],
@@ -104,7 +104,7 @@ def followed(orbit: OrbitProblem, known: Branch) -> Branch:
     root, found = follow_root(jnp.where(known.exists, known.place.coordinate, harmless), orbit)
     exists = known.exists & found
     return Branch(
-        place=Place(jnp.where(exists, root.coordinate, harmless), root.phase),
+        place=OrbitPlace(jnp.where(exists, root.coordinate, harmless), root.phase),
         exists=exists,
         orbits=jnp.where(exists, known.orbits, 0),
         near_fold=exists & near_fold(root.coordinate, orbit),
@@ -115,7 +115,7 @@ def branch_near(coordinate: Float[np.ndarray, " lanes"] | Float[Array, " lanes"]
     """Return orbits that are taken to be near coordinates; NaN: there is none."""
     there = jnp.isfinite(coordinate)
     near = jnp.asarray(coordinate)
-    return Branch(Place(near, jnp.zeros_like(near)), there, there.astype(jnp.int32), jnp.zeros_like(there))
+    return Branch(OrbitPlace(near, jnp.zeros_like(near)), there, there.astype(jnp.int32), jnp.zeros_like(there))
 
 
 BATCH = 8
@@ -445,7 +445,7 @@ def _judged(values: Float[Array, " p"], measurement: Measurement, problem: Probl
     return jax.vmap(one)(measurement.rows)
 
 
-def _grazes(place: Place, orbit: OrbitProblem) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
+def _grazes(place: OrbitPlace, orbit: OrbitProblem) -> tuple[Bool[Array, ""], Bool[Array, ""]]:
     """Say whether the impact is a graze, and whether the flight touches the platform on the way."""
     state = orbit_state(place, orbit)
     slow = state.speeds.approach < NEAR_GRAZING * orbit.platform.top_speed_nm_per_us

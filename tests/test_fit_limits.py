@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import least_squares
 
 import fitting.forward
-from afm_jax.impact.closure import Place
+from afm_jax.impact.closure import OrbitPlace
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import SteadyOrbits
 from fitting import fit, read_table
@@ -209,7 +209,7 @@ def test_of_coexisting_orbits_the_measured_one_is_taken(table, monkeypatch, meas
     """Made-up orbits: without a delay no drive of 140,000 random ones had two stable ones."""
     amplitude = jnp.array([[100.0, 40.0], [60.0, 26.0], [60.0, 25.0], [61.0, 40.0]])
     steady = jnp.array([True, False, True, False])
-    made_up = SteadyOrbits(Place(jnp.arange(4.0), jnp.zeros(4)), steady, jnp.zeros(4, dtype=bool), amplitude)
+    made_up = SteadyOrbits(OrbitPlace(jnp.arange(4.0), jnp.zeros(4)), steady, jnp.zeros(4, dtype=bool), amplitude)
     monkeypatch.setattr(fitting.forward, "steady_orbits", lambda _: made_up)
     error = np.where(np.isnan(measured), np.nan, 1.0)[None]
     problem, values = problem_of(table, "law"), jnp.array([0.95, 60.0, 40.0])

@@ -108,6 +108,15 @@ def test_files_import_each_other_in_no_circle():
         needs = {name: needed for name, needed in needs.items() if name not in free}
 
 
+def test_no_two_classes_have_one_name():
+    found: dict[str, list[str]] = {}
+    for path in LIBRARY:
+        for node in ast.parse((ROOT / path).read_text()).body:
+            if isinstance(node, ast.ClassDef):
+                found.setdefault(node.name, []).append(str(path))
+    assert not {name: paths for name, paths in found.items() if len(paths) > 1}
+
+
 def test_the_tests_of_the_imports_see_what_they_must():
     names = set(imported(Path("afm_jax/impact/map.py")))
     assert "afm_jax.impact.first_impact" in names

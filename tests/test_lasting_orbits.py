@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import afm_jax as afm
-from afm_jax.impact.closure import OrbitProblem, Place
+from afm_jax.impact.closure import OrbitPlace, OrbitProblem
 from afm_jax.impact.lasting_impact import LawImpact
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.impact.orbits import SteadyOrbits, amplitudes, near_fold, orbit_state, steady_orbits
@@ -36,9 +36,9 @@ def delayed(order: int, reduced: float, amplitude_nm: float, offset_nm: float) -
     return scene(reduced, amplitude_nm=amplitude_nm, offset_nm=offset_nm, **law), order
 
 
-def place_in(orbits: SteadyOrbits, slot: np.intp) -> Place:
+def place_in(orbits: SteadyOrbits, slot: np.intp) -> OrbitPlace:
     """Return the place of one orbit."""
-    return Place(orbits.place.coordinate[slot], orbits.place.phase[slot])
+    return OrbitPlace(orbits.place.coordinate[slot], orbits.place.phase[slot])
 
 
 def speeds_found(problem: OrbitProblem) -> np.ndarray:

@@ -49,7 +49,7 @@ _TRIALS = 240
 _BEYOND_US = 1e-3
 
 
-class Course(NamedTuple):
+class FollowedCourse(NamedTuple):
     """What a setting is judged by."""
 
     arrival_us: float
@@ -129,7 +129,7 @@ def contact_accuracy(
     world = (loaded, *surface_of(loaded), begin)
     named = settings_of(accuracies, quick, careful)
     *_, finest = named
-    courses: dict[str, Course] = {}
+    courses: dict[str, FollowedCourse] = {}
     until = jnp.asarray(np.inf)
     # the finest first: it says where to stop
     for name in (finest, *(key for key in named if key != finest)):
@@ -174,14 +174,14 @@ def _departure(found: Simulation, contacts: int) -> Array:
     return found.contacts.departure_time_us[contacts - 1]
 
 
-def _course(compiled: Compiled, arguments: tuple[Any, ...], contacts: int, repetitions: int) -> Course:
+def _course(compiled: Compiled, arguments: tuple[Any, ...], contacts: int, repetitions: int) -> FollowedCourse:
     timing, found = time_compiled(compiled, *arguments, repetitions=repetitions)
     peaks = peaks_between_contacts(arguments[0], found)
     arrival = float(found.contacts.arrival_time_us[contacts - 1])
-    return Course(arrival, float(peaks.max()) if peaks.size else None, timing.best_s, timing.compile_s)
+    return FollowedCourse(arrival, float(peaks.max()) if peaks.size else None, timing.best_s, timing.compile_s)
 
 
-def errors_of(course: Course, reference: Course) -> dict[str, float | None]:
+def errors_of(course: FollowedCourse, reference: FollowedCourse) -> dict[str, float | None]:
     """Return the errors of a course against the reference: of the last arrival in us, and of the peak in nm."""
     peak = None if course.peak_nm is None or reference.peak_nm is None else abs(course.peak_nm - reference.peak_nm)
     return {"arrival_error_us": abs(course.arrival_us - reference.arrival_us), "peak_error_nm": peak}
@@ -221,7 +221,7 @@ def law_accuracy(
             raise ValueError(f"the motion has only {reached + 1} of {contacts} impacts: {reason}")
         peaks = map_peaks(loaded, begin, found)
         arrival = float(found.arrival_time_us[-1])
-        courses.append(Course(arrival, float(peaks.max()), timing.best_s, timing.compile_s))
+        courses.append(FollowedCourse(arrival, float(peaks.max()), timing.best_s, timing.compile_s))
     finest = courses[-1]
     rows = [
         {

@@ -61,7 +61,7 @@ _SAME = 1e-12
 """Relative distance below which two frequencies are one."""
 
 
-class Drive(NamedTuple):
+class DrivePeriod(NamedTuple):
     """What the phases of a motion count in."""
 
     period_us: float
@@ -71,7 +71,7 @@ class Drive(NamedTuple):
     """Why no motion can repeat under this drive; None where it can."""
 
 
-def drive_of(scene: Scene) -> Drive:
+def drive_of(scene: Scene) -> DrivePeriod:
     """Return a scene's drive: the frequency of what moves, the platform's where several things do or nothing does.
 
     Args:
@@ -91,4 +91,4 @@ def drive_of(scene: Scene) -> Drive:
         aperiodic = "the drive has several frequencies, so that no period of the drive repeats"
     elif float(platform.offset_rate_nm_per_us) != 0.0:
         aperiodic = "the offset ramps, so that no period of the drive repeats"
-    return Drive(2.0 * math.pi / omega, omega, aperiodic)
+    return DrivePeriod(2.0 * math.pi / omega, omega, aperiodic)

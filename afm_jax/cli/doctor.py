@@ -65,14 +65,14 @@ def command(session: Session) -> None:
         raise NotValid(f"the compilation cache does not work: {complaint}")
 
 
-class Trial(NamedTuple):
+class CacheTrial(NamedTuple):
     """A small program in a process of its own: whether it was in the cache, and how long it took to be ready."""
 
     found: bool
     seconds: float
 
 
-def try_cache(folder: Path) -> Trial:
+def try_cache(folder: Path) -> CacheTrial:
     """Compile a small program in a new process, whose cache is in a folder."""
     done = subprocess.run(
         [sys.executable, "-m", "afm_jax.cli.doctor"],
@@ -81,7 +81,7 @@ def try_cache(folder: Path) -> Trial:
         text=True,
         check=False,
     )
-    return Trial(*json.loads(done.stdout)) if done.returncode == 0 else Trial(found=False, seconds=math.nan)
+    return CacheTrial(*json.loads(done.stdout)) if done.returncode == 0 else CacheTrial(found=False, seconds=math.nan)
 
 
 def time_impacts() -> float:

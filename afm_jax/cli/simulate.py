@@ -25,7 +25,7 @@ _PIECES_A_LINE = 8
 """Pieces of a long run between two lines on standard error."""
 
 
-class Harmonics(click.ParamType):
+class Multiples(click.ParamType):
     """Positive integers in a comma list."""
 
     name = "list"
@@ -54,7 +54,7 @@ class Harmonics(click.ParamType):
 )
 @click.option(
     "--harmonics",
-    type=Harmonics(),
+    type=Multiples(),
     default="1",
     show_default=True,
     metavar="K,...",

@@ -437,7 +437,7 @@ def law_of_contact(contact: Contact, mass_ng: float) -> ImpactLaw | None:
     return ImpactLaw(1.0, max(epsilon, 0.0), viscous, closest_delay(u, w, delay)[0])
 
 
-class Trace(NamedTuple):
+class TracedBack(NamedTuple):
     """Where a rebound comes from, and how long it takes: nm/us and us."""
 
     approach_speed: Float[Array, "..."]
@@ -497,7 +497,7 @@ def tabulated(contact: Contact, mass_ng: Float[Array, ""]) -> TabulatedImpact:
 
 def _traced_back(
     contact: Contact, junction: Junction, mass: Float[Array, ""], left: Float[Array, ""], rule: _Rule
-) -> Trace:
+) -> TracedBack:
     """Return where a tip comes from that leaves with an energy: out, junction and in, each followed against time."""
     tip = free_tip(contact, junction, mass)
     tip = tip._replace(bridge=tip.bridge.reversed())
@@ -515,7 +515,7 @@ def _traced_back(
         way_through(tip, (forms, junction.forms_gap_nm), formed, margin, inward=False), rule.nodes, rule.sweeps
     )
     approach = jnp.sqrt(2.0 * jnp.maximum(back.energy_aj, 1e-12) / mass)
-    return Trace(approach, out.time_us + inside.time_us + back.time_us)
+    return TracedBack(approach, out.time_us + inside.time_us + back.time_us)
 
 
 def _barrier(contact: Contact, bridge: Bridge, junction: Junction, outer: Float[Array, ""]) -> Float[Array, ""]:

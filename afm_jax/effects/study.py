@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.stages import Compiled
 
-from afm_jax.apparatus.scene import Drive, Scene, drive_of
+from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.checks import require_float64
 from afm_jax.effects.scene_effects import Scaled, SceneEffect, effects_in
 from afm_jax.motion.observe import Reading, read_window
@@ -139,7 +139,7 @@ class View(NamedTuple):
 
     start: State
     duration_us: float
-    drive: Drive
+    drive: DrivePeriod
     settles: bool
     """Whether steady orbits are compared, else the last fifth of the duration."""
 

@@ -39,7 +39,7 @@ class OrbitProblem(NamedTuple):
     order: Float[Array, ""]
 
 
-class System(NamedTuple):
+class ClosingSystem(NamedTuple):
     """The linear system for given speeds: a = cosine/determinant, b = sine/determinant of the phase just after impact.
 
     All three in units of the drive (lengths over beta, speeds over beta omega), numbers. ``regular`` is False where the
@@ -63,7 +63,7 @@ class Closure(NamedTuple):
     """The impact at a coordinate, and the linear system it leads to."""
 
     speeds: Speeds
-    system: System
+    system: ClosingSystem
 
 
 @jax.jit
@@ -79,7 +79,7 @@ def closure(coordinate: Float[Array, ""], problem: OrbitProblem) -> Closure:
         flight = _returning_flight(cantilever, order * platform.period_us)
         top_speed = platform.top_speed_nm_per_us
         cosine, sine = _instantaneous(free.approach / top_speed, free.rebound / top_speed, 1.0, flight, platform)
-        return Closure(free, System(cosine, sine, flight.closing, flight.regular(platform)))
+        return Closure(free, ClosingSystem(cosine, sine, flight.closing, flight.regular(platform)))
     if not impact.lasts:
         return Closure(free, _delayed(free, problem))
 
@@ -97,19 +97,19 @@ def closure(coordinate: Float[Array, ""], problem: OrbitProblem) -> Closure:
     return Closure(speeds, _delayed(speeds, problem))
 
 
-class Place(NamedTuple):
+class OrbitPlace(NamedTuple):
     """An orbit: the coordinate of its impact in nm/us, and the drive's phase in rad when the tip arrives."""
 
     coordinate: Float[Array, ""]
     phase: Float[Array, ""]
 
 
-def place_of(coordinate: Float[Array, ""], speeds: Speeds, system: System, problem: OrbitProblem) -> Place:
+def place_of(coordinate: Float[Array, ""], speeds: Speeds, system: ClosingSystem, problem: OrbitProblem) -> OrbitPlace:
     """Return where an orbit is, given the closure at its coordinate; about, where the impact lasts."""
-    return Place(coordinate, system.phase - problem.platform.angular_frequency * speeds.delay)
+    return OrbitPlace(coordinate, system.phase - problem.platform.angular_frequency * speeds.delay)
 
 
-def speeds_at_place(place: Place, problem: OrbitProblem) -> Speeds:
+def speeds_at_place(place: OrbitPlace, problem: OrbitProblem) -> Speeds:
     """Return what the impact is at a place: that of the map."""
     cantilever, platform, impact, _ = problem
     return lasting(
@@ -121,7 +121,7 @@ def speeds_at_place(place: Place, problem: OrbitProblem) -> Speeds:
 def map_gaps(unknowns: Float[Array, " 2"], problem: OrbitProblem) -> Float[Array, " 2"]:
     """Return by how much one turn of the map misses its start: height over beta, velocity over beta omega."""
     cantilever, platform, _, order = problem
-    place = Place(*unknowns)
+    place = OrbitPlace(*unknowns)
     arrival = place.phase / platform.angular_frequency
     speeds = speeds_at_place(place, problem)
     height, speed = platform.position_and_velocity(arrival + speeds.delay)
@@ -132,7 +132,7 @@ def map_gaps(unknowns: Float[Array, " 2"], problem: OrbitProblem) -> Float[Array
     return jnp.stack([(position - height) / platform.amplitude_nm, missing])
 
 
-def close_map(place: Place, problem: OrbitProblem, steps: int) -> Float[Array, " 2"]:
+def close_map(place: OrbitPlace, problem: OrbitProblem, steps: int) -> Float[Array, " 2"]:
     """Return coordinate and phase after steps of Newton's method towards the orbit of the map."""
 
     def twice(unknowns):
@@ -220,7 +220,7 @@ def _instantaneous(approach, rebound, one, flight: _ReturningFlight, platform: P
     return height - offset, -(approach * flight.after + rebound * flight.before)
 
 
-def _delayed(speeds: Speeds, problem: OrbitProblem) -> System:
+def _delayed(speeds: Speeds, problem: OrbitProblem) -> ClosingSystem:
     """Solve both rows by Cramer's rule, every length over beta and every speed over beta omega."""
     cantilever, platform, _, order = problem
     p: Propagator = cantilever.propagator(order * platform.period_us - speeds.delay)
@@ -236,7 +236,7 @@ def _delayed(speeds: Speeds, problem: OrbitProblem) -> System:
     right2 = approach + p21 * sigma + p.velocity_per_velocity * rebound
     determinant = m11 * m22 - m12 * m21
     # Here the determinant is of second order in the distance to a whole number of free periods, its rounding of zeroth.
-    return System(
+    return ClosingSystem(
         cosine=right1 * m22 - right2 * m12,
         sine=m11 * right2 - m21 * right1,
         determinant=determinant,

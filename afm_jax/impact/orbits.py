@@ -19,8 +19,8 @@ from afm_jax.apparatus.scene import Scene, require_sample_drive
 from afm_jax.checks import is_traced, readable, require_float64
 from afm_jax.impact.amplitude import FlightEnds, lockin, peak_amplitude
 from afm_jax.impact.closure import (
+    OrbitPlace,
     OrbitProblem,
-    Place,
     closing_residual,
     closure,
     map_gaps,
@@ -128,7 +128,7 @@ def _single_impact_orbits(scene: Scene, order: Float[Array, ""]) -> SingleImpact
     return eqx.tree_at(lambda result: result.complete, orbits, roots.complete)
 
 
-def _orbit(place: Place, found: Bool[Array, ""], problem: OrbitProblem) -> SingleImpactOrbits:
+def _orbit(place: OrbitPlace, found: Bool[Array, ""], problem: OrbitProblem) -> SingleImpactOrbits:
     """Return what there is to know about one root; NaN where there is none."""
     state = orbit_state(place, problem)
     verdict = judge(place, found, state, problem)
@@ -179,18 +179,18 @@ class Verdict(NamedTuple):
 class SteadyOrbits(NamedTuple):
     """The roots of a problem, which of them are steady (admissible and stable), peak and lock-in amplitude in nm."""
 
-    place: Place
+    place: OrbitPlace
     steady: Bool[Array, " slots"]
     near_double: Bool[Array, " slots"]
     amplitude_nm: Float[Array, "slots 2"]
 
 
 @jax.jit
-def orbit_state(place: Place, problem: OrbitProblem) -> OrbitState:
+def orbit_state(place: OrbitPlace, problem: OrbitProblem) -> OrbitState:
     """Return the motion at a root, with the root's derivatives (implicit function theorem)."""
     cantilever, platform, impact, order = problem
     if impact.lasts:
-        place = Place(*implicit_pair(map_gaps, jnp.stack(place), problem))
+        place = OrbitPlace(*implicit_pair(map_gaps, jnp.stack(place), problem))
         speeds = speeds_at_place(place, problem)
         phase = place.phase + platform.angular_frequency * speeds.delay
     else:
@@ -205,7 +205,7 @@ def orbit_state(place: Place, problem: OrbitProblem) -> OrbitState:
     return OrbitState(phase, speeds, FlightEnds(start, duration, position, velocity, end_position, end_velocity))
 
 
-def judge(place: Place, found: Bool[Array, ""], state: OrbitState, problem: OrbitProblem) -> Verdict:
+def judge(place: OrbitPlace, found: Bool[Array, ""], state: OrbitState, problem: OrbitProblem) -> Verdict:
     """Return whether an orbit is admissible, stable (eq. 8 and its generalisation) and close to a fold."""
     cantilever, platform, impact, _ = problem
     trace, determinant = trace_and_determinant(impact, cantilever, platform, state.flight)
@@ -242,7 +242,7 @@ def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
     return SteadyOrbits(roots.place, *jax.vmap(one)(roots.place, roots.found))
 
 
-def amplitudes(place: Place, problem: OrbitProblem) -> Float[Array, " 3"]:
+def amplitudes(place: OrbitPlace, problem: OrbitProblem) -> Float[Array, " 3"]:
     """Return peak and lock-in amplitude in nm and the phase in degrees of the orbit at a root, differentiable."""
     return _observed(orbit_state(place, problem), problem)
 

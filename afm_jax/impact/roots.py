@@ -19,8 +19,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from afm_jax.impact.closure import (
+    OrbitPlace,
     OrbitProblem,
-    Place,
     close_map,
     closing_residual,
     closure,
@@ -148,7 +148,7 @@ class OrbitRoots(NamedTuple):
     ``place`` and ``found``, one a slot; ``complete``: there were no more roots than slots.
     """
 
-    place: Place
+    place: OrbitPlace
     found: Bool[Array, " slots"]
     complete: Bool[Array, ""]
 
@@ -166,16 +166,16 @@ def find_roots(problem: OrbitProblem, scan: Scan = FINE) -> OrbitRoots:
     safe = jnp.where(found, coordinate, harmless_coordinate(problem))
     place, there = jax.vmap(follow_root if problem.impact.lasts else _regular, in_axes=(0, None))(safe, problem)
     found = found & driven & there
-    return OrbitRoots(Place(jnp.where(found, place.coordinate, safe), place.phase), found, complete)
+    return OrbitRoots(OrbitPlace(jnp.where(found, place.coordinate, safe), place.phase), found, complete)
 
 
 @jax.jit
-def follow_root(near: Float[Array, ""], problem: OrbitProblem) -> tuple[Place, Bool[Array, ""]]:
+def follow_root(near: Float[Array, ""], problem: OrbitProblem) -> tuple[OrbitPlace, Bool[Array, ""]]:
     """Return where the map of a lasting impact closes, close to a coordinate, and whether it does."""
     problem = lax.stop_gradient(problem)
     speeds, system = closure(near, problem)
     unknowns = close_map(place_of(near, speeds, system, problem), problem, _NEWTON)
-    return Place(*unknowns), system.regular & jnp.all(jnp.abs(map_gaps(unknowns, problem)) < _CLOSED)
+    return OrbitPlace(*unknowns), system.regular & jnp.all(jnp.abs(map_gaps(unknowns, problem)) < _CLOSED)
 
 
 def harmless_coordinate(problem: OrbitProblem) -> Float[Array, ""]:
@@ -183,7 +183,7 @@ def harmless_coordinate(problem: OrbitProblem) -> Float[Array, ""]:
     return problem.impact.lowest + 2.0 * _scale(problem) + 2.0
 
 
-def _regular(coordinate: Float[Array, ""], problem: OrbitProblem) -> tuple[Place, Bool[Array, ""]]:
+def _regular(coordinate: Float[Array, ""], problem: OrbitProblem) -> tuple[OrbitPlace, Bool[Array, ""]]:
     """Return the place at a root, and whether the phase is determined there."""
     speeds, system = closure(coordinate, problem)
     return place_of(coordinate, speeds, system, problem), system.regular

@@ -301,7 +301,7 @@ _TRIALS = 4
 """Trial steps between two looks at which tips of a batch need more."""
 
 
-class Row(NamedTuple):
+class ContactRow(NamedTuple):
     """A contact, in the gap and its rate; stored as one vector."""
 
     kind: Float[Array, "..."]
@@ -327,7 +327,7 @@ class Arrival(NamedTuple):
     gap_rate: Float[Array, ""]
 
 
-class Tip(NamedTuple):
+class ContactTip(NamedTuple):
     """A tip on its way; scalars of one tip, but for the rows."""
 
     touch: Touch
@@ -341,7 +341,7 @@ class Tip(NamedTuple):
     rounds: Int[Array, ""]
 
 
-def begin(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, rows: int) -> Tip:
+def begin(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, rows: int) -> ContactTip:
     """Return a tip at its start: free above the gap where the bridge forms, in the bridge below it."""
     wet = gap_nm <= driven.forms_nm
     sane = jnp.isfinite(time_us) & jnp.isfinite(rate) & (gap_nm > driven.junction.forms_gap_nm)
@@ -349,18 +349,20 @@ def begin(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, rows: int)
     outcome = jnp.where(driven.junction.exists, outcome, MotionOutcome.NO_JUNCTION)
     phase = jnp.where(wet, Phase.BRIDGE, Phase.DRY)
     zero = jnp.zeros_like(time_us)
-    return Tip(
+    return ContactTip(
         touch=fresh_touch(Place(gap_nm, rate, time_us, zero), phase),
         arrival=Arrival(time_us, gap_nm, rate),
         contacts=jnp.zeros_like(phase),
-        rows=jnp.zeros((rows, len(Row._fields)), time_us.dtype),
+        rows=jnp.zeros((rows, len(ContactRow._fields)), time_us.dtype),
         outcome=outcome.astype(jnp.int32),
         done=outcome != MotionOutcome.FINISHED,
         rounds=jnp.zeros_like(phase),
     )
 
 
-def follow(driven: Driven, tip: Tip, until_us: Array, setting: DrivenSetting, *, rounds: int, reverse: bool) -> Tip:
+def follow(
+    driven: Driven, tip: ContactTip, until_us: Array, setting: DrivenSetting, *, rounds: int, reverse: bool
+) -> ContactTip:
     """Return a tip at the end of the simulation.
 
     Args:
@@ -386,7 +388,7 @@ def follow(driven: Driven, tip: Tip, until_us: Array, setting: DrivenSetting, *,
     return tip._replace(outcome=outcome.astype(jnp.int32))
 
 
-def _round(driven: Driven, tip: Tip, *, until_us: Array, setting: DrivenSetting, reverse: bool) -> Tip:
+def _round(driven: Driven, tip: ContactTip, *, until_us: Array, setting: DrivenSetting, reverse: bool) -> ContactTip:
     """Return a tip after one round: flight, the quick way through the contact, trial steps where that does not hold."""
     free = (tip.touch.phase == Phase.DRY) & ~tip.done
     arrived, lost, place = _fly(driven, tip.touch.place, free, until_us)
@@ -409,7 +411,7 @@ def _round(driven: Driven, tip: Tip, *, until_us: Array, setting: DrivenSetting,
     outcome = jnp.where(lost, MotionOutcome.STEP_LIMIT, outcome)
     outcome = jnp.where(jnp.isfinite(touch.place.x), outcome, MotionOutcome.UNRESOLVED)
     flown = free & ~arrived
-    return Tip(
+    return ContactTip(
         touch=touch,
         arrival=arrival,
         contacts=tip.contacts + ended.astype(tip.contacts.dtype),
@@ -499,7 +501,7 @@ def _step(
 
 def _row(touch: Touch, arrival: Arrival, *, held: Array) -> Float[Array, " columns"]:
     place = touch.place
-    row = Row(
+    row = ContactRow(
         kind=jnp.where(held, float(ContactKind.HELD), float(ContactKind.IMPACT)),
         arrival_us=arrival.time_us,
         arrival_gap_nm=arrival.gap_nm,

@@ -197,7 +197,7 @@ _ON_SURFACE_NM = 1e-9
 """Depth up to which a start that leaves is taken to lie on the surface: rounding of lab coordinates."""
 
 
-class Row(NamedTuple):
+class LawRow(NamedTuple):
     """An impact, relative to the surface; stored as one vector."""
 
     kind: Float[Array, "..."]
@@ -207,7 +207,7 @@ class Row(NamedTuple):
     rebound: Float[Array, "..."]
 
 
-class Leg(NamedTuple):
+class LawLeg(NamedTuple):
     """The beginning of a flight: time in us, gap in nm, velocity in nm/us of the freely moving y = z - response."""
 
     time_us: Float[Array, ""]
@@ -215,10 +215,10 @@ class Leg(NamedTuple):
     velocity: Float[Array, ""]
 
 
-class Tip(NamedTuple):
+class LawTip(NamedTuple):
     """A tip on its way; scalars of one tip, but for the rows."""
 
-    leg: Leg
+    leg: LawLeg
     used: Int[Array, ""]
     rows: Float[Array, "rows columns"]
     outcome: Int[Array, ""]
@@ -263,10 +263,10 @@ def follow_law(
     touches = (gap < 0.0) & (gap > -_ON_SURFACE_NM)
     gap = gap + lax.stop_gradient(jnp.where(touches, -gap, 0.0))
     none = jnp.zeros((), jnp.int32)
-    tip = Tip(
-        leg=Leg(start.time_us, gap, rate + surface.velocity(start.time_us)),
+    tip = LawTip(
+        leg=LawLeg(start.time_us, gap, rate + surface.velocity(start.time_us)),
         used=none,
-        rows=jnp.zeros((max_contacts, len(Row._fields)), gap.dtype),
+        rows=jnp.zeros((max_contacts, len(LawRow._fields)), gap.dtype),
         outcome=none + jnp.int32(MotionOutcome.FINISHED),
         done=jnp.zeros((), bool),
         rounds=none,
@@ -275,7 +275,7 @@ def follow_law(
     held = tip.outcome == MotionOutcome.HELD
     return Simulation(
         start=start,
-        contacts=_contacts(scene, surface, response, Row(*jnp.moveaxis(tip.rows, -1, 0))),
+        contacts=_contacts(scene, surface, response, LawRow(*jnp.moveaxis(tip.rows, -1, 0))),
         count=tip.used,
         final=_final(seen, response, tip, until),
         phase=jnp.where(held, jnp.int32(Phase.JUNCTION), jnp.int32(Phase.DRY)),
@@ -284,7 +284,7 @@ def follow_law(
     )
 
 
-def _to_the_end(seen: Scene, tip: Tip, until: Array, *, rounds: int, reverse: bool) -> Tip:
+def _to_the_end(seen: Scene, tip: LawTip, until: Array, *, rounds: int, reverse: bool) -> LawTip:
     """Return a tip after as many rounds as it needs."""
     blocks = -(-rounds // _ROUNDS)
 
@@ -297,7 +297,7 @@ def _to_the_end(seen: Scene, tip: Tip, until: Array, *, rounds: int, reverse: bo
     return lax.while_loop(lambda tip: ~tip.done & (tip.rounds < limit), lambda tip: block(tip, None)[0], tip)
 
 
-def _round(seen: Scene, tip: Tip, until: Array) -> Tip:
+def _round(seen: Scene, tip: LawTip, until: Array) -> LawTip:
     """Return a tip after its next impact, or as it was where there is none."""
     leg, surface = tip.leg, seen.platform
     # a tip that is done does not leave the surface, so that its search ends at once
@@ -326,7 +326,7 @@ def _round(seen: Scene, tip: Tip, until: Array) -> Tip:
     goes_on = arrived & ~held & ~full & ~lost
     written = arrived & room & ~lost
     place = jnp.where(written, tip.used, tip.rows.shape[0])
-    return Tip(
+    return LawTip(
         leg=jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), beyond, leg),
         used=jnp.where(written, tip.used + 1, tip.used),
         rows=tip.rows.at[place].set(jnp.stack(row), mode="drop"),
@@ -336,7 +336,7 @@ def _round(seen: Scene, tip: Tip, until: Array) -> Tip:
     )
 
 
-def _through(seen: Scene, impact: NextImpact, arrived: Array, until: Array) -> tuple[Row, Leg, Array]:
+def _through(seen: Scene, impact: NextImpact, arrived: Array, until: Array) -> tuple[LawRow, LawLeg, Array]:
     """Return the row of an impact and the beginning of the next flight; where there is none, numbers without meaning.
 
     The third: whether the search for the end of a rest gave up.
@@ -356,12 +356,12 @@ def _through(seen: Scene, impact: NextImpact, arrived: Array, until: Array) -> t
     rests = captured | chatters
     resting = jnp.minimum(arrival + jnp.where(chatters, lasts, 0.0), until)
     release = first_release(bed, jnp.where(rests & (law.epsilon == 0.0), resting, until), until)
-    away = Leg(*take_off(bed, release.time_us, until))
+    away = LawLeg(*take_off(bed, release.time_us, until))
     leaving = jnp.where(arrived, impact.time_us, until)
-    next_leg = Leg(leaving, jnp.zeros_like(leaving), jnp.where(arrived, impact.velocity_after_nm_per_us, 0.0))
+    next_leg = LawLeg(leaving, jnp.zeros_like(leaving), jnp.where(arrived, impact.velocity_after_nm_per_us, 0.0))
     left = jnp.where(rests, release.happens, leaving < until)
     kind = jnp.where(chatters, float(ContactKind.CHATTER), float(ContactKind.IMPACT))
-    row = Row(
+    row = LawRow(
         kind=jnp.where(left, kind, float(ContactKind.HELD)),
         arrival_us=arrival,
         approach=approach,
@@ -378,7 +378,7 @@ def _failure(ended: Array, rounds: Array) -> Array:
     return jnp.where(ended == Outcome.INVALID_START, start, other)
 
 
-def _final(seen: Scene, response: Surface | None, tip: Tip, until: Array) -> State:
+def _final(seen: Scene, response: Surface | None, tip: LawTip, until: Array) -> State:
     """Return the last state in the lab."""
     leg, surface = tip.leg, seen.platform
     held = tip.outcome == MotionOutcome.HELD
@@ -389,7 +389,7 @@ def _final(seen: Scene, response: Surface | None, tip: Tip, until: Array) -> Sta
     return to_lab(surface, response, time, jnp.where(held, 0.0, gap), jnp.where(held, 0.0, rate))
 
 
-def _contacts(scene: Scene, surface: Platform | Surface, response: Surface | None, row: Row) -> Contacts:
+def _contacts(scene: Scene, surface: Platform | Surface, response: Surface | None, row: LawRow) -> Contacts:
     """Return the rows as contacts in the lab."""
     kind = row.kind.astype(jnp.int32)
     used = kind != ContactKind.NONE

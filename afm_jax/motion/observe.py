@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from afm_jax.apparatus.scene import Drive, Scene, drive_of
+from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.contact import Contact
 from afm_jax.impact.amplitude import FlightEnds, peak_amplitude
@@ -150,7 +150,7 @@ def observe(
     simulation: Simulation,
     *,
     harmonics: Sequence[int] = (1,),
-    drive: Drive | None = None,
+    drive: DrivePeriod | None = None,
     verdict: Settled | None = None,
     dense: DensePath | None = None,
 ) -> Observables:
@@ -233,7 +233,7 @@ def _harmonics(
     times: Float[np.ndarray, " times"],
     weights: Float[np.ndarray, " times"],
     window: Window,
-    drive: Drive,
+    drive: DrivePeriod,
     multiples: Sequence[int],
 ) -> tuple[Harmonic, ...]:
     """Return amplitudes and phases over a window."""

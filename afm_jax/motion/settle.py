@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from afm_jax.apparatus.scene import Drive, Scene, drive_of
+from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import explain_missing_junction, find_junction
@@ -250,7 +250,7 @@ class Window(NamedTuple):
     """Whole response periods in the stretch; 0 where it is shorter than one."""
 
 
-def window_of(scene: Scene, simulation: Simulation, verdict: Settled, drive: Drive | None = None) -> Window:
+def window_of(scene: Scene, simulation: Simulation, verdict: Settled, drive: DrivePeriod | None = None) -> Window:
     """Return the last response period of a settled motion, else whole response periods in the last fifth.
 
     The end is moved into a flight where there is one, so that no contact is cut in a motion that repeats.
@@ -271,7 +271,7 @@ def window_of(scene: Scene, simulation: Simulation, verdict: Settled, drive: Dri
     return last_fifth(first, last, drive, periods)
 
 
-def last_fifth(first_us: float, last_us: float, drive: Drive, periods: int = 1) -> Window:
+def last_fifth(first_us: float, last_us: float, drive: DrivePeriod, periods: int = 1) -> Window:
     """Return whole response periods in the last fifth of a time; one if it is too short for that, if there is one.
 
     Args:

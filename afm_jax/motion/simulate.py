@@ -17,7 +17,7 @@ from afm_jax.contact.driven import Driven, driven_by
 from afm_jax.contact.junction import explain_missing_junction, find_junction
 from afm_jax.contact.settings import DrivenSetting, driven_setting_of
 from afm_jax.impact.law import ImpactLaw
-from afm_jax.motion.contact_motion import Row, begin, follow
+from afm_jax.motion.contact_motion import ContactRow, begin, follow
 from afm_jax.motion.law_motion import follow_free, follow_law
 from afm_jax.motion.record import ContactDetail, ContactKind, Contacts, MotionOutcome, Simulation, State, to_gap, to_lab
 
@@ -167,7 +167,7 @@ def _contact(  # noqa: PLR0913
     tip = begin(driven, start.time_us, gap, rate, rows)
     tip = follow(driven, tip, until, setting, rounds=rounds, reverse=reverse)
     place, phase = tip.touch.place, tip.touch.phase
-    table = Row(*jnp.moveaxis(tip.rows, -1, 0))
+    table = ContactRow(*jnp.moveaxis(tip.rows, -1, 0))
     return Simulation(
         start=start,
         contacts=_contacts(table, scene, surface, response, driven),
@@ -180,7 +180,7 @@ def _contact(  # noqa: PLR0913
 
 
 def _contacts(
-    row: Row, scene: Scene, surface: Platform | Surface, response: Surface | None, driven: Driven
+    row: ContactRow, scene: Scene, surface: Platform | Surface, response: Surface | None, driven: Driven
 ) -> Contacts:
     """Return the rows as contacts in the lab."""
     kind = row.kind.astype(jnp.int32)

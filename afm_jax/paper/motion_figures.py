@@ -149,7 +149,7 @@ _LOCKED_WITHIN = 0.25
 """Of a drive period: how far flights may be off whole periods."""
 
 
-class Course(NamedTuple):
+class RampCourse(NamedTuple):
     """The motion from one start."""
 
     velocity_nm_per_us: float
@@ -173,7 +173,7 @@ class Growth(NamedTuple):
 
 def survey(
     velocities: tuple[float, ...], *, until_us: float = _UNTIL_US, report: Report = lambda _: None
-) -> list[Course]:
+) -> list[RampCourse]:
     """Follow figure 8's scene from several starts, each until it locks.
 
     Args:
@@ -195,7 +195,7 @@ def survey(
             report=told_of_progress(report, f"from {velocity:g} nm/us", until_us),
         )
         motion = departures(scene, run.simulation)
-        courses.append(Course(velocity, motion, *locked_from(motion.departure_time_us, period)))
+        courses.append(RampCourse(velocity, motion, *locked_from(motion.departure_time_us, period)))
     return courses
 
 
@@ -228,7 +228,7 @@ def locked_from(times_us: Float[np.ndarray, " contacts"], period_us: float) -> t
     return first, periods
 
 
-def tangent_growth(course: Course) -> Growth:
+def tangent_growth(course: RampCourse) -> Growth:
     """Return how a small change of the start grows along the broadband part of a motion, by forward differentiation.
 
     The tangent is carried through one piece of the simulation; its size at a departure is taken from the phase of the
@@ -265,7 +265,7 @@ BAND_NM = 39.0
 RISE_NM = (51.0, 150.0)
 
 
-def section_statements(courses: Sequence[Course], attractor: Course, growth: Growth | None) -> list[Statement]:
+def section_statements(courses: Sequence[RampCourse], attractor: RampCourse, growth: Growth | None) -> list[Statement]:
     """Figure 8: a long broadband motion without capture, and the band in which it ends.
 
     Args:
@@ -304,7 +304,7 @@ def section_statements(courses: Sequence[Course], attractor: Course, growth: Gro
     return statements
 
 
-def _band(course: Course) -> Statement:
+def _band(course: RampCourse) -> Statement:
     end = course.motion.peak_height_nm[course.broadband :]
     end = end[np.isfinite(end)]
     last = end[-min(50, end.size) :]
@@ -322,7 +322,7 @@ def _band(course: Course) -> Statement:
     )
 
 
-def _transient(courses: Sequence[Course]) -> Statement:
+def _transient(courses: Sequence[RampCourse]) -> Statement:
     """Say what the broadband motion becomes: the paper calls it a strange attractor."""
     ends = {f"{course.velocity_nm_per_us:g}": course.periods for course in courses}
     locked = [course for course in courses if course.periods is not None]
@@ -450,7 +450,7 @@ class MotionFigure:
     columns: Mapping[str, Float[np.ndarray, " contacts"]]
     numbers: dict[str, Any]
     statements: list[Statement]
-    courses: tuple[Course, ...] = ()
+    courses: tuple[RampCourse, ...] = ()
     growth: Growth | None = None
     ramps: tuple[Ramp, ...] = ()
 
@@ -512,8 +512,8 @@ def figure11(*, coarse: bool = False, report: Report = lambda _: None) -> Motion
     return _ramp_figure(settled, ramps, rise_statements(settled, ramps))
 
 
-def _section_columns(courses: list[Course]) -> dict[str, Float[np.ndarray, " contacts"]]:
-    def joined(of: Callable[[Course], np.ndarray]) -> np.ndarray:
+def _section_columns(courses: list[RampCourse]) -> dict[str, Float[np.ndarray, " contacts"]]:
+    def joined(of: Callable[[RampCourse], np.ndarray]) -> np.ndarray:
         return np.concatenate([of(course) for course in courses])
 
     return {

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 
-from afm_jax.apparatus.scene import Drive, Scene, drive_of
+from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import find_junction
 from afm_jax.contact.phases import Phase
@@ -123,7 +123,7 @@ class Look(NamedTuple):
 
     scene: Scene
     simulation: Simulation
-    drive: Drive
+    drive: DrivePeriod
     responses: Responses
     """What the spectrum is made of."""
     from_us: float

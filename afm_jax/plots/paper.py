@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 
 from afm_jax.contact.phases import Phase
 from afm_jax.paper.contact_figures import FIT_RANGE, PAPER, SMALL_GAP_NM, ContactFigure
-from afm_jax.paper.motion_figures import SECTION_POINTS, SHOWN, Course, MotionFigure, Ramp
+from afm_jax.paper.motion_figures import SECTION_POINTS, SHOWN, MotionFigure, Ramp, RampCourse
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save, with_zero_line
 
 
@@ -285,7 +285,7 @@ def _section(figure: MotionFigure, path: Path) -> None:
     save(picture, path)
 
 
-def _shown(figure: MotionFigure) -> list[Course]:
+def _shown(figure: MotionFigure) -> list[RampCourse]:
     return [course for course in figure.courses if course.velocity_nm_per_us in _COLOURS]
 
 
@@ -308,7 +308,7 @@ def _broadband(axes: Axes, figure: MotionFigure) -> None:
     axes.set_title(f"Broadband: {SECTION_POINTS - max(left, 0)} impacts before locking", fontsize=11, loc="left")
 
 
-def _stretch(axes: Axes, course: Course, most: int, colour: str, label: str | None) -> int:
+def _stretch(axes: Axes, course: RampCourse, most: int, colour: str, label: str | None) -> int:
     count = min(course.broadband, max(most, 0))
     phase, velocity = course.motion.drive_phase_deg, course.motion.departure_velocity_nm_per_us
     behind = 1 if colour == GRID else 2
@@ -316,7 +316,7 @@ def _stretch(axes: Axes, course: Course, most: int, colour: str, label: str | No
     return count
 
 
-def _band(axes: Axes, course: Course) -> None:
+def _band(axes: Axes, course: RampCourse) -> None:
     """Draw the end of a motion, its order in time as a shade."""
     after = slice(course.broadband, None)
     phase, velocity = course.motion.drive_phase_deg[after], course.motion.departure_velocity_nm_per_us[after]

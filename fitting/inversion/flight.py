@@ -40,7 +40,7 @@ class MeasuredRow(NamedTuple):
     """Infinite where nothing was measured."""
 
 
-class Impact(NamedTuple):
+class FlightEnd(NamedTuple):
     """The impact at the ends of a flight, as that of a free tip on a sample at rest: scalars."""
 
     approach_speed: Float[Array, ""]
@@ -51,7 +51,7 @@ class Impact(NamedTuple):
 class Inverted(NamedTuple):
     """A row inverted; `impact` by the two unknowns has the covariance J C J^T."""
 
-    impact: Impact
+    impact: FlightEnd
     covariance: Float[Array, "3 3"]
     """Of approach speed, rebound speed and delay."""
     flight: FlightEnds
@@ -101,7 +101,7 @@ def readings(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> Fl
     return jnp.stack([peak_amplitude(cantilever, flight), amplitude, phase])
 
 
-def impact_of(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> Impact:
+def impact_of(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> FlightEnd:
     """Return the impact between a flight and the next, brought to that of a free tip on a sample at rest.
 
     What air, spring and the platform's motion do during a Hertz contact is taken back (`gained_and_longer`): its
@@ -121,7 +121,7 @@ def impact_of(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> I
     gained, _ = taken_back(free_delay)
     square = jnp.where(rebound > 0.0, rebound**2, 0.0) - gained
     free_rebound = jnp.sqrt(jnp.where(square > 0.0, square, 1.0))
-    return Impact(approach, jnp.where((square > 0.0) & (rebound > 0.0), free_rebound, jnp.nan), free_delay)
+    return FlightEnd(approach, jnp.where((square > 0.0) & (rebound > 0.0), free_rebound, jnp.nan), free_delay)
 
 
 def _residual(unknowns: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantilever) -> Float[Array, " 3"]:

@@ -20,7 +20,7 @@ from fitting.fits.result import FitResult, FittedRows
 from fitting.models import NUISANCE_NAMES, PARAMETERS
 from fitting.report.words import (
     SHARE_OF_BAND,
-    Comparison,
+    ComparedModels,
     Sampled,
     band_in_words,
     belief_in_words,
@@ -88,7 +88,7 @@ def fit_page(
     result: FitResult,
     pictures: Sequence[bytes],
     *,
-    comparison: Comparison | None = None,
+    comparison: ComparedModels | None = None,
     bootstrap: Sampled | None = None,
     posterior: Sampled | None = None,
 ) -> str:
@@ -228,7 +228,7 @@ def _correlations(result: FitResult) -> Table:
     return Table(f"Beyond {_TIED:g} in magnitude in bold; - where a variance is not known", ["", *names], rows)
 
 
-def _compared(comparison: Comparison) -> Table:
+def _compared(comparison: ComparedModels) -> Table:
     others = dict.fromkeys(name for row in comparison.rows for name in row if name not in _COMPARED)
     names = [*(name for name in _COMPARED if any(name in row for row in comparison.rows)), *others]
     rows = [[plain_words(row.get(name)) for name in names] for row in comparison.rows]

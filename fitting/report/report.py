@@ -10,7 +10,7 @@ import numpy as np
 from afm_jax.words import bullets, known, text_table
 from fitting.fits.result import FitResult, FittedParameter
 from fitting.report.words import (
-    Comparison,
+    ComparedModels,
     Sampled,
     band_in_words,
     formulas,
@@ -128,7 +128,7 @@ def write_report(
     folder: Path,
     write_table: Callable[[str, list[dict[str, Any]], tuple[str, ...]], None],
     *,
-    comparison: Comparison | None = None,
+    comparison: ComparedModels | None = None,
     bootstrap: Sampled | None = None,
     posterior: Sampled | None = None,
 ) -> list[Path]:

@@ -24,7 +24,7 @@ _LAWS = {
 
 
 @runtime_checkable
-class Comparison(Protocol):
+class ComparedModels(Protocol):
     """Several models fitted to the same table.
 
     `rows` has a mapping for each model: model, chi2, degrees_of_freedom, aic, bic, delta_aic, law_change, and whatever

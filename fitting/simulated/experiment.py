@@ -51,7 +51,7 @@ class Drives(NamedTuple):
     offset_nm: Float[np.ndarray, " rows"]
 
 
-class Reading(NamedTuple):
+class RowReadings(NamedTuple):
     """What is read of single-impact orbits, one entry a row."""
 
     peak_amplitude_nm: Float[np.ndarray, " rows"]
@@ -65,7 +65,7 @@ class SteadyRows(NamedTuple):
 
     rows: Int[np.ndarray, " steady"]
     """The numbers of those with a steady (1, N) orbit, ascending."""
-    reading: Reading | None
+    reading: RowReadings | None
     """Of these; None where there are none."""
     reasons: dict[int, str]
     """Why the others have none, by number."""
@@ -76,7 +76,7 @@ class _Verdict(NamedTuple):
 
     reason: str
     seen: tuple[float, float, float] | None = None
-    """Peak, lock-in amplitude and phase, as in a `Reading`."""
+    """Peak, lock-in amplitude and phase, as in a `RowReadings`."""
     goes_on: State | None = None
 
 
@@ -148,7 +148,7 @@ def steady_rows(
                 left.append(row)
         waiting = np.array(left, dtype=int)
     rows = np.array(sorted(steady), dtype=int)
-    reading = Reading(*(np.array([steady[row] for row in rows.tolist()]).T)) if steady else None
+    reading = RowReadings(*(np.array([steady[row] for row in rows.tolist()]).T)) if steady else None
     return SteadyRows(rows, reading, {row: reason for row, reason in reasons.items() if row not in steady})
 
 

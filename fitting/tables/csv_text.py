@@ -173,7 +173,7 @@ class Form:
 
 
 @dataclass(frozen=True)
-class Setting:
+class FileSetting:
     """A number that a comment line can set, `# key = value` or `# key = value +- error`.
 
     Attributes:
@@ -196,7 +196,7 @@ class Setting:
         return f"# {self.key} = {self.example}"
 
 
-Settings = Mapping[str, Setting]
+Settings = Mapping[str, FileSetting]
 """Settings by their key."""
 
 
@@ -259,7 +259,7 @@ def split_lines(text: str) -> tuple[NumberedLines, NumberedLines]:
     return [comment for comment in comments if comment[1]], rows
 
 
-def setting_in(text: str, settings: Settings) -> Setting | None:
+def setting_in(text: str, settings: Settings) -> FileSetting | None:
     """Return the setting that a comment makes or was meant to make, or None for a free remark.
 
     Args:
@@ -272,7 +272,7 @@ def setting_in(text: str, settings: Settings) -> Setting | None:
     return settings.get(_SHORT_NAMES.get(match["key"].lower()) or nearest_name(match["key"], settings) or "")
 
 
-def parse_setting(setting: Setting, text: str, *, line: int, faults: Faults) -> tuple[float, float | None] | None:
+def parse_setting(setting: FileSetting, text: str, *, line: int, faults: Faults) -> tuple[float, float | None] | None:
     """Return the value and its error of a comment that makes a setting, or None after noting a fault.
 
     Args:
@@ -295,7 +295,7 @@ def parse_setting(setting: Setting, text: str, *, line: int, faults: Faults) -> 
     return float(cells[0]), float(cells[1]) if len(cells) > 1 else None
 
 
-def _fault_in_cells(setting: Setting, cells: list[str]) -> str | None:
+def _fault_in_cells(setting: FileSetting, cells: list[str]) -> str | None:
     """Return what is wrong with the value (and its error) of a setting, or None."""
     for cell in cells:
         if DECIMAL_COMMA.fullmatch(cell):
@@ -309,7 +309,7 @@ def _fault_in_cells(setting: Setting, cells: list[str]) -> str | None:
     return fault_in_number(setting, *map(float, cells))
 
 
-def fault_in_number(setting: Setting, value: float, error: float | None = None) -> str | None:
+def fault_in_number(setting: FileSetting, value: float, error: float | None = None) -> str | None:
     """Return what is wrong with a setting's number or its standard error, both in the unit of its key, or None."""
     if not setting.lowest < value < float("inf"):
         above = "" if setting.lowest == float("-inf") else f" and above {setting.lowest:g}"

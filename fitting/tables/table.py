@@ -30,10 +30,10 @@ from fitting.tables.csv_text import (
     Column,
     Columns,
     Faults,
+    FileSetting,
     Form,
     Head,
     Masks,
-    Setting,
     TableError,
     check_not_empty,
     column_of,
@@ -53,12 +53,12 @@ LOWEST_QUALITY_FACTOR = 0.5
 SETTINGS = {
     setting.key: setting
     for setting in (
-        Setting("free_frequency_khz", "90", unit="kHz"),
-        Setting("quality_factor", "40 (or 40 +- 2)", lowest=LOWEST_QUALITY_FACTOR, error="maybe"),
-        Setting("mass_ng", unit="ng"),
-        Setting("tip_calibration", "1 +- 0.02", error="always"),
-        Setting("drive_calibration", "1 +- 0.02", error="always"),
-        Setting("offset_origin_nm", "0 +- 0.3", lowest=float("-inf"), error="always"),
+        FileSetting("free_frequency_khz", "90", unit="kHz"),
+        FileSetting("quality_factor", "40 (or 40 +- 2)", lowest=LOWEST_QUALITY_FACTOR, error="maybe"),
+        FileSetting("mass_ng", unit="ng"),
+        FileSetting("tip_calibration", "1 +- 0.02", error="always"),
+        FileSetting("drive_calibration", "1 +- 0.02", error="always"),
+        FileSetting("offset_origin_nm", "0 +- 0.3", lowest=float("-inf"), error="always"),
     )
 }
 CALIBRATION = tuple(key for key, setting in SETTINGS.items() if setting.error == "always")

@@ -32,8 +32,8 @@ from jaxtyping import Float
 from fitting.tables.csv_text import (
     Column,
     Faults,
+    FileSetting,
     Form,
-    Setting,
     TableError,
     check_names,
     fault_in_number,
@@ -51,16 +51,16 @@ _ANY = float("-inf")
 SETTINGS = {
     setting.key: setting
     for setting in (
-        Setting("sampling_rate_mhz", "50"),
-        Setting("drive_frequency_khz", "180"),
-        Setting("drive_amplitude_nm"),
-        Setting("offset_nm", lowest=_ANY),
-        Setting("drive_phase_deg", lowest=_ANY),
-        Setting("free_frequency_khz"),
-        Setting("quality_factor", "40 (or 40 +- 2)", lowest=LOWEST_QUALITY_FACTOR, error="maybe"),
-        Setting("quality_factor_error"),
-        Setting("mass_ng"),
-        Setting("rest_nm", lowest=_ANY),
+        FileSetting("sampling_rate_mhz", "50"),
+        FileSetting("drive_frequency_khz", "180"),
+        FileSetting("drive_amplitude_nm"),
+        FileSetting("offset_nm", lowest=_ANY),
+        FileSetting("drive_phase_deg", lowest=_ANY),
+        FileSetting("free_frequency_khz"),
+        FileSetting("quality_factor", "40 (or 40 +- 2)", lowest=LOWEST_QUALITY_FACTOR, error="maybe"),
+        FileSetting("quality_factor_error"),
+        FileSetting("mass_ng"),
+        FileSetting("rest_nm", lowest=_ANY),
     )
 }
 
