@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     from afm_jax.compilation_cache import use_cache
     from afm_jax.contact.collide import Collision, capture_speed, collide
     from afm_jax.contact.contact import Contact
-    from afm_jax.contact.junction import Junction, find_junction
-    from afm_jax.contact.phases import Phase
+    from afm_jax.contact.junction import Junction, Phase, find_junction
     from afm_jax.contact.time_course import time_course
     from afm_jax.impact.jacobian import map_jacobian
     from afm_jax.impact.law import CollisionDelay, ImpactLaw
@@ -44,7 +43,7 @@ else:
         "MotionOutcome": "afm_jax.motion.record",
         "NextImpact": "afm_jax.impact.map",
         "Outcome": "afm_jax.outcomes",
-        "Phase": "afm_jax.contact.phases",
+        "Phase": "afm_jax.contact.junction",
         "Platform": "afm_jax.apparatus.platform",
         "Scene": "afm_jax.apparatus.scene",
         "SceneError": "afm_jax.scenefile.scenefile",

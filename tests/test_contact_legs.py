@@ -11,8 +11,7 @@ from afm_jax.contact.bridge_leg import driven_way, go_in, pass_in_steps, sweep
 from afm_jax.contact.collide import collide
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Place, driven_by, free_tip
-from afm_jax.contact.junction import find_junction
-from afm_jax.contact.phases import Phase
+from afm_jax.contact.junction import Phase, find_junction
 from afm_jax.contact.settings import DRIVEN_SETTINGS, METHODS, QuickSetting, driven_setting_of
 from afm_jax.contact.step import advance, eighth_order_step, fresh_touch
 from afm_jax.motion.contact_motion import cross, for_the_few

@@ -12,7 +12,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.drives import BaseDrive
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
-from afm_jax.contact.phases import Phase
+from afm_jax.contact.junction import Phase
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.simulate import simulate

@@ -9,8 +9,8 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.contact import Contact
+from afm_jax.contact.junction import Phase
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.contact.phases import Phase
 from afm_jax.motion.record import ContactDetail, ContactKind, MotionOutcome, Simulation, State
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.trajectory import nodes, trajectory

@@ -6,8 +6,7 @@ from scipy.integrate import solve_ivp
 
 from afm_jax.contact.collide import collide
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.junction import find_junction
-from afm_jax.contact.phases import Phase, next_phase
+from afm_jax.contact.junction import Phase, find_junction, next_phase
 from afm_jax.contact.time_course import time_course
 from tests.reference_contact_forces import ContactParameters, constants, mp, static_force, viscous_force
 

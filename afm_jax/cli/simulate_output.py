@@ -8,7 +8,7 @@ import numpy as np
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.cli.session import Session
-from afm_jax.contact.phases import Phase
+from afm_jax.contact.junction import Phase
 from afm_jax.motion.observe import Harmonic, Observables
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation
 from afm_jax.motion.settle import LongRun, Window

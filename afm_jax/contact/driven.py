@@ -16,11 +16,9 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import Surface, Wave
 from afm_jax.apparatus.trigonometry import sine_cosine
-from afm_jax.contact.bridge import Bridge, bridge_of
-from afm_jax.contact.contact import Contact
+from afm_jax.contact.contact import Bridge, Contact, bridge_of
 from afm_jax.contact.forces import jkr
-from afm_jax.contact.junction import Junction, find_junction
-from afm_jax.contact.phases import Phase
+from afm_jax.contact.junction import Junction, Phase, find_junction
 
 
 class Place(NamedTuple):

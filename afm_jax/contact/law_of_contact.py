@@ -28,10 +28,9 @@ from jaxtyping import Array, Float
 from scipy.optimize import OptimizeResult, least_squares, nnls
 
 from afm_jax.checks import require_float64
-from afm_jax.contact.bridge import Bridge, bridge_of
 from afm_jax.contact.bridge_leg import margin_of, pass_by_collocation, way_through
 from afm_jax.contact.collide import capture_speed, collide, collide_in_blocks
-from afm_jax.contact.contact import Contact
+from afm_jax.contact.contact import Bridge, Contact, bridge_of
 from afm_jax.contact.driven import free_tip
 from afm_jax.contact.forces import jkr
 from afm_jax.contact.junction import Junction, find_junction

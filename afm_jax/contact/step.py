@@ -20,7 +20,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.contact.driven import Driven, Place
 from afm_jax.contact.forces import jkr
-from afm_jax.contact.phases import Phase
+from afm_jax.contact.junction import Phase
 
 _NEAR = 1e-7
 """Share of a threshold from which on the first-order correction is exact to rounding."""

@@ -18,9 +18,8 @@ from afm_jax.contact.bridge_leg import Way, margin_of, sweep, way_through
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Driven, free_tip
 from afm_jax.contact.forces import jkr
-from afm_jax.contact.junction import Junction, explain_missing_junction, find_junction
+from afm_jax.contact.junction import Junction, Phase, explain_missing_junction, find_junction, force_in_phase
 from afm_jax.contact.junction_leg import stretch_in_junction, turning_root
-from afm_jax.contact.phases import Phase, force_in_phase
 
 _NODES = 64
 _SWEEPS = 12

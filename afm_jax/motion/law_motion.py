@@ -26,7 +26,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface
-from afm_jax.contact.phases import Phase
+from afm_jax.contact.junction import Phase
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, Flight, time_above
 from afm_jax.impact.implicit import implicit_root
 from afm_jax.impact.law import ImpactLaw, impact_law_of

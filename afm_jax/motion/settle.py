@@ -17,8 +17,7 @@ from jaxtyping import Bool, Float, Int
 from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.junction import explain_missing_junction, find_junction
-from afm_jax.contact.phases import Phase
+from afm_jax.contact.junction import Phase, explain_missing_junction, find_junction
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State, to_gap
 from afm_jax.motion.simulate import DEFAULT_ACCURACY, simulate
 from afm_jax.motion.trajectory import flights_of, state_at

@@ -29,8 +29,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Driven, Place, driven_by
-from afm_jax.contact.junction import Junction, find_junction
-from afm_jax.contact.phases import Phase, force_in_phase
+from afm_jax.contact.junction import Junction, Phase, find_junction, force_in_phase
 from afm_jax.contact.step import Touch, advance, eighth_order_step, fresh_touch
 from afm_jax.motion.record import ContactKind, Simulation, State, to_gap, to_lab
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 
-from afm_jax.contact.phases import Phase
+from afm_jax.contact.junction import Phase
 from afm_jax.paper.contact_figures import FIT_RANGE, PAPER, SMALL_GAP_NM, ContactFigure
 from afm_jax.paper.motion_figures import SECTION_POINTS, SHOWN, MotionFigure, Ramp, RampCourse
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save, with_zero_line
