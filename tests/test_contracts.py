@@ -139,7 +139,7 @@ def built_in_many_ways() -> list[tuple[Scene, Any, Any]]:
     """Return scenes of one structure, their numbers given as Python, NumPy and JAX numbers, with a start."""
     ways = []
     for number in (float, int, np.float64, np.asarray, jnp.asarray, lambda x: jnp.asarray(float(x))):
-        delay = CollisionDelay(number(1), number(6), number(2))
+        delay = CollisionDelay(number(1), number(6), number(2), corrections=False)
         law = ImpactLaw(r=number(1), epsilon=number(100), viscous_loss=number(1), delay=delay)
         ways.append(
             (Scene(Cantilever(number(90), number(40)), Platform(number(4), number(181), number(-1)), law), 4, 60)

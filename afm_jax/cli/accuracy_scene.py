@@ -45,9 +45,11 @@ def scene_study(session: Session, name: str, contacts: int, *, quick: bool) -> N
     with session.working("measuring (programs are compiled for every setting)"):
         duration = ladder_duration(scene)
         law = fitted_law(scene, followed(scene, start, duration, contacts)) if resolved else None
-        task = "scene_accuracy:contact_accuracy" if resolved else "law_scene_accuracy:law_accuracy"
+        task = "contact_accuracy" if resolved else "law_accuracy"
         settings = (CONTACT_QUICK if quick else CONTACT) if resolved else (LAW_QUICK if quick else LAW)
-        result = run_in_own_process(f"afm_jax.study.{task}", {**common, **settings, "contacts": contacts}, cores=1)
+        result = run_in_own_process(
+            f"afm_jax.accuracy.scenes:{task}", {**common, **settings, "contacts": contacts}, cores=1
+        )
         rungs = {**common, "law": law, "duration_us": duration, "repetitions": settings["repetitions"]}
         result |= run_in_own_process("afm_jax.accuracy.scenes:fidelity_ladder", rungs, cores=1)
     payload = {**result, "scene": name, "law": law}

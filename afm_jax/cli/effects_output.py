@@ -1,0 +1,184 @@
+"""What `afm-jax effects` hands out: the JSON object, the text, the files."""
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from rich.table import Table
+
+from afm_jax.cli.session import Session
+from afm_jax.effects.study import Cost, EffectReport, EffectStudy, Reduction
+from afm_jax.scenefile.scenefile import Start, scene_tables
+from afm_jax.strict_json import strict_json
+from afm_jax.words import known
+
+CHANGES = ("peak_amplitude", "lockin_amplitude", "lockin_phase_deg", "energy_per_impact")
+"""What is compared; all but the phase relative to the full scene."""
+COSTS = ("time_us_per_period", "operations", "transcendentals")
+COLUMNS = (
+    "name",
+    "description",
+    "strength",
+    "required",
+    "zero_strength",
+    "needed",
+    *(f"change_{name}" for name in CHANGES),
+    *(f"predicted_{name}" for name in CHANGES),
+    *COSTS,
+    *(f"saved_{name}" for name in COSTS),
+    "reason",
+    "predicted_reason",
+)
+"""The columns of effects.csv, and the keys of an effect in the JSON object but for the nested ones."""
+
+
+def payload_of(study: EffectStudy, start: Start, *, written: Path | None) -> dict[str, Any]:
+    """Return the JSON object of a study."""
+    reading, orbit = study.observed.reading, study.observed.orbit
+    assert reading is not None  # a study has one  # noqa: S101
+    left_out = () if study.reduction is None else study.reduction.left_out
+    return {
+        "scene": scene_tables(study.scene),
+        "start": start._asdict(),
+        "duration_us": study.view.duration_us,
+        "compared": "steady orbits" if orbit is not None else "last fifth of the duration",
+        "full": {
+            **reading._asdict(),
+            "drive_periods": None if orbit is None else orbit.periods,
+            "contraction": None if orbit is None else orbit.contraction,
+            **_cost(study.cost),
+        },
+        "effects": [_effect(report, study.cost, left_out) for report in study.effects],
+        **_reduction(study.reduction, written),
+    }
+
+
+def _effect(report: EffectReport, full: Cost, left_out: tuple[str, ...]) -> dict[str, Any]:
+    effect = report.effect
+    cost, whole = _cost(report.cost), _cost(full)
+    return {
+        "name": effect.name,
+        "description": effect.sentence,
+        "strength": effect.strength or None,
+        "required": effect.required is not None,
+        "zero_strength": effect.is_zero,
+        "needed": effect.name not in left_out,
+        "change": report.change._asdict(),
+        "reason": report.reason,
+        "predicted": report.predicted._asdict(),
+        "predicted_reason": report.predicted_reason,
+        **cost,
+        **{f"saved_{name}": _difference(whole[name], cost[name]) for name in COSTS},
+    }
+
+
+def _cost(cost: Cost | None) -> dict[str, float | None]:
+    if cost is None:
+        return dict.fromkeys(COSTS)
+    return dict(zip(COSTS, (cost.time_us, *cost.program), strict=True))
+
+
+def _difference(one: float | None, other: float | None) -> float | None:
+    return None if one is None or other is None else one - other
+
+
+def _reduction(reduction: Reduction | None, written: Path | None) -> dict[str, Any]:
+    if reduction is None:
+        return {"accuracy": None, "not_needed": [], "joint_change": None, "reduced": None}
+    return {
+        "accuracy": reduction.accuracy,
+        "not_needed": list(reduction.left_out),
+        "joint_change": reduction.change._asdict(),
+        "reduced": {"scene": scene_tables(reduction.scene), "file": written, **_cost(reduction.cost)},
+    }
+
+
+def write_files(session: Session, payload: Mapping[str, Any]) -> None:
+    """Write effects.csv, effects.json and effects.png into the session's folder."""
+    from afm_jax.plots.effects import draw_effects  # noqa: PLC0415
+
+    folder = session.out
+    if folder is None:
+        return
+    session.write_table("effects.csv", [_flat(effect) for effect in payload["effects"]], COLUMNS)
+    (folder / "effects.json").write_text(strict_json(payload) + "\n", encoding="utf-8")
+    draw_effects(payload["effects"], payload["full"], payload["accuracy"], folder / "effects.png")
+    session.note(f"wrote {folder / 'effects.json'} and {folder / 'effects.png'}")
+
+
+def _flat(effect: Mapping[str, Any]) -> dict[str, Any]:
+    nested = {f"{kind}_{name}": effect[kind][name] for kind in ("change", "predicted") for name in CHANGES}
+    return {**{name: value for name, value in effect.items() if name not in ("change", "predicted")}, **nested}
+
+
+def text_of(payload: Mapping[str, Any]) -> list[Any]:
+    """Return a table and sentences to print."""
+    table = Table(title="Without the effect", title_justify="left")
+    headings = ("effect", "peak\nchange", "lock-in\nchange", "phase\ndeg", "loss/impact\nchange")
+    headings += ("predicted\npeak", "predicted\nlock-in", "time\nus/period", "saved", "operations\nsaved", "")
+    for place, heading in enumerate(headings):
+        table.add_column(heading, justify="left" if place in (0, len(headings) - 1) else "right")
+    for effect in payload["effects"]:
+        change, predicted = effect["change"], effect["predicted"]
+        table.add_row(
+            effect["name"],
+            _percent(change["peak_amplitude"]),
+            _percent(change["lockin_amplitude"]),
+            known(change["lockin_phase_deg"], ".3g"),
+            _percent(change["energy_per_impact"]),
+            _percent(predicted["peak_amplitude"]),
+            _percent(predicted["lockin_amplitude"]),
+            known(effect["time_us_per_period"], ".4g"),
+            known(effect["saved_time_us_per_period"], ".3g"),
+            known(effect["saved_operations"], ".0f"),
+            _remark(effect),
+        )
+    return [_of_full(payload), table, *_sentences(payload)]
+
+
+def _of_full(payload: Mapping[str, Any]) -> str:
+    full = payload["full"]
+    motion = (
+        f"steady orbit, {full['impacts']} impact(s) in {full['drive_periods']} drive period(s)"
+        if full["drive_periods"] is not None
+        else f"no steady orbit, {full['impacts']} impacts in the {payload['compared']}"
+    )
+    lost = full["energy_per_impact_aj"]
+    return (
+        f"Full scene: {motion}; peak {full['peak_amplitude_nm']:.5g} nm, lock-in {full['lockin_amplitude_nm']:.5g} nm "
+        f"at {full['lockin_phase_deg']:.4g} deg{f', {lost:.4g} aJ lost per impact' if lost is not None else ''}; "
+        f"{known(full['time_us_per_period'], '.4g')} us of processor time per drive period, "
+        f"{full['operations']:.0f} operations."
+    )
+
+
+def _remark(effect: Mapping[str, Any]) -> str:
+    if effect["required"]:
+        return "required"
+    if effect["zero_strength"]:
+        return "without effect: its strength is zero"
+    if effect["change"]["peak_amplitude"] is None:
+        return "no steady motion"
+    return "" if effect["needed"] else "not needed"
+
+
+def _sentences(payload: Mapping[str, Any]) -> Iterator[str]:
+    for effect in payload["effects"]:
+        if effect["reason"] is not None:
+            yield f"{effect['name']}: {'' if effect['required'] else 'without it: '}{effect['reason']}."
+    if payload["accuracy"] is None:
+        return
+    wanted, left_out = f"{100.0 * payload['accuracy']:g} %", payload["not_needed"]
+    if not left_out:
+        yield f"For amplitudes to {wanted} every effect that can be left out is needed."
+        return
+    joint = payload["joint_change"]
+    yield (
+        f"For amplitudes to {wanted} these are not needed: {', '.join(left_out)}. Without all of them the peak changes "
+        f"by {_percent(joint['peak_amplitude'])}, the lock-in amplitude by {_percent(joint['lockin_amplitude'])}; "
+        f"{known(payload['reduced']['time_us_per_period'], '.4g')} us per drive period."
+    )
+
+
+def _percent(share: float | None) -> str:
+    return "-" if share is None else f"{100.0 * share:+.3g} %"
