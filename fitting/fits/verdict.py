@@ -161,8 +161,9 @@ def _without_outliers(evidence: Evidence) -> tuple[float, int, float]:
     return chi2, freedom, float(chdtrc(freedom, chi2)) if freedom > 0 else float("nan")
 
 
-def _outliers(evidence: Evidence) -> Bool[np.ndarray, " rows"]:
-    return np.any(np.abs(np.nan_to_num(evidence.rows.residual)) > _OUTLIER, axis=1)
+def _outliers(evidence: Evidence, scale: float = 1.0) -> Bool[np.ndarray, " rows"]:
+    """Return which rows are far off; ``scale``: of the errors that residuals are in, over those that count here."""
+    return np.any(scale * np.abs(np.nan_to_num(evidence.rows.residual)) > _OUTLIER, axis=1)
 
 
 def _correlations(evidence: Evidence) -> list[tuple[str, float]]:
@@ -203,7 +204,7 @@ def _why_not_explained(evidence: Evidence) -> str:
     names = evidence.parameters
     tail = f"farthest off: {_rows_in_words(evidence.table, np.sort(far))}"
     # counting outliers less helps where the others are well explained: not if most are off, or off together
-    few = 2 * _outliers(evidence).sum() <= evidence.rows.used.sum()
+    few = 2 * _outliers(evidence, evidence.error_scale or 1.0).sum() <= evidence.rows.used.sum()
     if few and not evidence.robust and not _correlations(evidence):
         tail += " (if only a few are wrong: --robust)"
     if evidence.lasting:
