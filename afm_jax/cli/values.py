@@ -207,6 +207,8 @@ def _number(text: str, what: str, *, positive: bool) -> float:
         number = parse_number(text)
     except ValueError:
         number = math.nan
+    if positive and what == "number" and not math.isnan(number) and not number > 0.0:
+        raise ValueError(f"must hold positive numbers, but one is {number:g}")
     if not (number > 0.0 if positive else math.isfinite(number)):
         raise ValueError(f"the {what} `{text.strip()}` is not a {'positive ' if positive else ''}number")
     return number

@@ -42,6 +42,7 @@ USUAL_LEAD = 1.3
 
 PASSES = 4
 """From the delay to mid contact and back."""
+_ROUNDING = 1e-12
 NEAREST = 1.01
 """Approach speed in terms of the capture speed from which on a table's error is known."""
 
@@ -216,7 +217,7 @@ class TabulatedImpact(eqx.Module):
         """Gap at which the bridge breaks."""
         return self.length_nm
 
-    def speeds(self, coordinate: Float[Array, ""]) -> Speeds:
+    def speeds(self, coordinate: Float[Array, "..."]) -> Speeds:
         """Return approach and rebound speed and the delay at u_in."""
         u = coordinate
         place = self._place(u)
@@ -232,7 +233,7 @@ class TabulatedImpact(eqx.Module):
         """
         w = self.speeds(approach_speed).rebound
         share = (0.5 * self.loss_error + self.speed_error * approach_speed**2) / w**2
-        inside = (approach_speed > NEAREST * self.lowest) & (approach_speed <= self.highest)
+        inside = (approach_speed > NEAREST * self.lowest) & (approach_speed <= (1.0 + _ROUNDING) * self.highest)
         late = self.time_error + self.outer_nm * share / w
         return jnp.where(inside, share, jnp.inf), jnp.where(inside, late, jnp.inf)
 
@@ -279,15 +280,27 @@ def middle_of_contact(cantilever: Cantilever, surface: Platform | Surface, time_
 
 
 def gained_and_longer(
-    approach_speed: Float[Array, ""], tau: Float[Array, ""], middle: Middle, cantilever: Cantilever
+    approach_speed: Float[Array, ""],
+    tau: Float[Array, ""],
+    middle: Middle,
+    cantilever: Cantilever,
+    *,
+    leading: bool = False,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return what a Hertz contact of a duration tau gains in squared speed, nm^2/us^2, and in duration, us."""
+    """Return what a Hertz contact of a duration tau gains in squared speed, nm^2/us^2, and in duration, us.
+
+    ``leading``: the terms of first order alone, for whoever knows tau only roughly.
+    """
     pull, change = middle.acceleration * tau / approach_speed, middle.change * tau**2 / approach_speed
     by_change, by_both, by_square = HERTZ.tolist()
-    gained = by_change * change + by_both * pull * change + by_square * change**2
+    gained = by_change * change
+    if not leading:
+        gained = gained + by_both * pull * change + by_square * change**2
     gained = gained - (2.0 * AIR) * cantilever.decay_rate * tau
     by_pull, by_change, by_square, by_both = LONGER.tolist()
-    longer = by_pull * pull + by_change * change + by_square * pull**2 + by_both * pull * change
+    longer = by_pull * pull
+    if not leading:
+        longer = longer + by_change * change + by_square * pull**2 + by_both * pull * change
     return gained * approach_speed**2, longer * tau
 
 

@@ -105,7 +105,8 @@ def impact_of(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> F
     """Return the impact between a flight and the next, brought to that of a free tip on a sample at rest.
 
     What air, spring and the platform's motion do during a Hertz contact is taken back (`gained_and_longer`): its
-    duration is the delay, for want of a law that tells lead and offset apart.
+    duration is the delay, for want of a law that tells lead and offset apart, which is good enough for the terms of
+    first order.
     """
     platform = row.platform
     end = flight.start_us + flight.duration_us
@@ -114,11 +115,11 @@ def impact_of(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> F
     delay = row.order * platform.period_us - flight.duration_us
     middle = middle_of_contact(cantilever, platform, flight.start_us - 0.5 * delay)
 
-    def taken_back(free_delay):
-        return gained_and_longer(approach, jnp.maximum(free_delay, 0.0), middle, cantilever)
+    def taken_back(tau):
+        return gained_and_longer(approach, jnp.maximum(tau, 0.0), middle, cantilever, leading=True)
 
     free_delay = lax.fori_loop(0, 3, lambda _, free_delay: delay - taken_back(free_delay)[1], delay)
-    gained, _ = taken_back(free_delay)
+    gained, _ = taken_back(delay)
     square = jnp.where(rebound > 0.0, rebound**2, 0.0) - gained
     free_rebound = jnp.sqrt(jnp.where(square > 0.0, square, 1.0))
     return FlightEnd(approach, jnp.where((square > 0.0) & (rebound > 0.0), free_rebound, jnp.nan), free_delay)
