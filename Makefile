@@ -11,6 +11,8 @@ PYTEST ?= -m pytest
 # not know one of these flags any more says so and stops: leave it out then.)
 COMPILED_AT_ONCE := --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0
 COMPILED_SOON := --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1
+# Tests of the last digits, which the order of roundings decides.
+SHARP := tests/test_polynomial_roots.py tests/test_verification.py
 
 BIN := .venv/bin
 SETUP := .venv/.installed
@@ -32,8 +34,9 @@ $(SETUP): pyproject.toml
 fit: $(SETUP) ## fit the bundled table (or TABLE=..., MODEL=...), print the impact law, write OUT=report/
 	$(BIN)/afm-jax fit $(if $(TABLE),'$(TABLE)',--example) --model $(MODEL) --out $(OUT)
 
-test: $(SETUP) ## the tests (under 10 minutes on two cores)
-	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_AT_ONCE)" $(BIN)/python $(PYTEST) -n auto --dist worksteal
+test: $(SETUP) ## the tests (under 7 minutes on two cores)
+	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_AT_ONCE)" $(BIN)/python $(PYTEST) -n auto --dist worksteal $(SHARP:%=--ignore %)
+	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_SOON)" $(BIN)/python $(PYTEST) -n auto $(SHARP)
 
 lint: $(SETUP)
 	$(BIN)/ruff format --check .
