@@ -25,6 +25,7 @@ class Inner(eqx.Module):
 
     doubled: Array
     nothing: Array | None = None
+    sure: bool = eqx.field(static=True, default=True)
 
 
 class Outer(NamedTuple):
@@ -66,6 +67,15 @@ def arguments(count: int = 3, epsilon: float = 0.0):
 
 def files(folder: Path) -> list[Path]:
     return sorted(folder.rglob("*.program"))
+
+
+def test_what_is_no_array_of_a_result_is_kept_too(folder):
+    for _ in range(2):
+        found = anew(folder)(*arguments())
+        assert found.inner.sure is True
+        assert found.inner.nothing is None
+        assert found.law.delay is None
+    assert TRACED == [2.0]
 
 
 def test_the_next_process_traces_nothing(folder):

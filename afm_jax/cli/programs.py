@@ -82,15 +82,15 @@ def _program(path: Path, trace: Callable[[], tuple[Any, Any]], tell: Callable[[s
 
 
 def _structure(value: Any) -> Any:
-    if value is None or isinstance(value, jax.ShapeDtypeStruct):
-        return None if value is None else 0
+    if not hasattr(value, "_asdict") and not isinstance(value, eqx.Module):
+        return 0 if isinstance(value, jax.ShapeDtypeStruct) else {"static": value}
     parts = getattr(value, "_asdict", lambda: vars(value))()
     return [type(value).__module__, type(value).__name__, {name: _structure(part) for name, part in parts.items()}]
 
 
 def _filled(structure: Any, leaves: Iterator[Any]) -> Any:
     if not isinstance(structure, list):
-        return None if structure is None else next(leaves)
+        return structure["static"] if isinstance(structure, dict) else next(leaves)
     kind = getattr(sys.modules[structure[0]], structure[1])
     parts = {name: _filled(part, leaves) for name, part in structure[2].items()}
     if issubclass(kind, tuple):
