@@ -83,8 +83,6 @@ class Session:
         Args:
             programs: jitted functions whose traces are kept as well, "module:function" (see `keep_programs`).
         """
-        # before JAX is loaded
-        silence_xla()
         from afm_jax.cli.compilation import count_programs, start_jax  # noqa: PLC0415
 
         cache = start_jax(self.tell)
@@ -159,6 +157,8 @@ def with_session(function: Callable[..., Any]) -> Callable[..., Any]:
     @click.option("--verbose", is_flag=True, help="Say on standard error what is kept, read and compiled, and where.")
     @functools.wraps(function)
     def command(*args: Any, as_json: bool, out: Path | None, verbose: bool, **options: Any) -> Any:
+        # before anything loads JAX: checks of options may
+        silence_xla()
         return function(Session(as_json, out, verbose), *args, **options)
 
     return command
