@@ -11,7 +11,7 @@ from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene
 from afm_jax.accuracy.scenes import contact_accuracy, fidelity_ladder, law_accuracy
 from afm_jax.apparatus.drives import BaseDrive
 from afm_jax.bench import timing as own_process
-from afm_jax.cli.accuracy_scene import COLUMNS, LADDER_COLUMNS, fitted_law, scene_and_start
+from afm_jax.cli.accuracy_scene import COLUMNS, LADDER_COLUMNS, fitted_law, scene_to_study
 from afm_jax.cli.main import main
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.observe import peaks_of_flights
@@ -67,7 +67,7 @@ def test_highest_points_are_those_of_the_closed_form():
 
 
 def test_root_tolerances_bound_the_error_of_an_impact(law_file: str):
-    scene, start = scene_and_start(law_file)
+    scene, start = scene_to_study(law_file)
     settings = {"contacts": 6, "tolerances": [1e-3, 1e-8, 1e-13, 1e-14], "repetitions": 1}
     result = law_accuracy(scene=law_file, start=numbers(start), **settings)
     assert [row["setting"] for row in result["rows"]][1] == "root tolerance 1e-08 us"
@@ -84,7 +84,7 @@ def test_root_tolerances_bound_the_error_of_an_impact(law_file: str):
 
 
 def test_ladder_of_a_law_ends_at_its_own_map(law_file: str):
-    _, start = scene_and_start(law_file)
+    _, start = scene_to_study(law_file)
     result = fidelity_ladder(scene=law_file, start=numbers(start), duration_us=800.0, law=None, repetitions=1)
     rows = {row["model"]: row for row in result["ladder"]}
     assert list(rows) == [
@@ -113,7 +113,7 @@ def test_ladder_says_why_a_model_has_no_answer(tmp_path: Path):
 
 @pytest.mark.slow
 def test_contact_settings_approach_an_independent_integration(contact_file: str):
-    start = scene_and_start(contact_file)[1]
+    start = scene_to_study(contact_file)[1]
     settings = {"accuracies": [], "quick": [], "careful": [3.0, 5.0], "repetitions": 1}
     result = contact_accuracy(scene=contact_file, start=numbers(start), contacts=4, **settings)
     system = DrivenContact(amplitude_nm=4.0, drive_frequency_khz=181.8)
@@ -133,7 +133,7 @@ def test_contact_settings_approach_an_independent_integration(contact_file: str)
 
 @pytest.mark.slow
 def test_law_of_a_scene_is_fitted_over_its_own_speeds(contact_file: str):
-    scene, start = scene_and_start(contact_file)
+    scene, start = scene_to_study(contact_file)
     found = simulate(scene, start, 60.0, max_contacts=20, accuracy=1e-6)
     law = fitted_law(scene, found)
     speeds = np.asarray(found.contacts.approach_speed_nm_per_us)[: int(found.count)]

@@ -127,8 +127,6 @@ def _bridge_force(numbers: _ContactNumbers, gap: float, rate: float) -> float:
     return static + numbers.core / gap**8 - numbers.drag * rate / gap
 
 
-_LONGEST_CONTACT_US = 50.0
-"""No phase of a tip that leaves lasts as long."""
 _MOST_PHASES = 100
 
 
@@ -188,7 +186,7 @@ def scipy_driven_contact(
         nonlocal count
         for event in events:
             vars(event)["terminal"] = True
-        span = (start_us, start_us + _LONGEST_CONTACT_US)
+        span = (start_us, start_us + _LONGEST_US)
         path = solve_ivp(rates, span, state, method=method, rtol=rtol, atol=1e-3 * rtol, events=events)
         count += path.nfev
         if path.status != 1:

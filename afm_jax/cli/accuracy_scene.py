@@ -39,7 +39,7 @@ def scene_study(session: Session, name: str, contacts: int, *, quick: bool) -> N
     from afm_jax.contact.contact import Contact  # noqa: PLC0415
     from afm_jax.strict_json import strict_json  # noqa: PLC0415
 
-    scene, start = scene_and_start(name)
+    scene, start = scene_to_study(name)
     resolved = isinstance(scene.interaction, Contact)
     common = {"scene": name, "start": [float(part) for part in start]}
     with session.working("measuring (programs are compiled for every setting)"):
@@ -65,16 +65,16 @@ def scene_study(session: Session, name: str, contacts: int, *, quick: bool) -> N
     session.emit(payload, settings_table(result), reference_sentence(result), ladder_table(result), *_reasons(result))
 
 
-def scene_and_start(name: str) -> "tuple[Scene, State]":
+def scene_to_study(name: str) -> "tuple[Scene, State]":
     """Return the scene of a file or a preset, and where its motion begins.
 
     Raises:
         ValueError: if the tip never meets anything, or the file is wrong.
     """
-    from afm_jax.cli.values import scene_and_start as scene_and_told  # noqa: PLC0415
+    from afm_jax.cli.values import scene_and_start  # noqa: PLC0415
     from afm_jax.motion.start import default_start, start_of  # noqa: PLC0415
 
-    scene, told = scene_and_told(name)
+    scene, told = scene_and_start(name)
     if scene.interaction is None:
         raise ValueError(f"{name}: the cantilever is free: its motion is a closed form and has no contacts to measure")
     return scene, default_start(scene) if told is None else start_of(scene, told)

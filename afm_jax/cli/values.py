@@ -37,7 +37,8 @@ class Numbers(click.ParamType):
         try:
             return parse_numbers(str(value), self.what, positive=self.positive)
         except ValueError as error:
-            self.fail(f"{error}; write {self.example} or start:stop:step", param, ctx)
+            wanted = "must hold positive numbers: " if self.positive else ""
+            self.fail(f"{wanted}{error}; write {self.example} or start:stop:step", param, ctx)
 
 
 class Orders(click.ParamType):
@@ -207,8 +208,6 @@ def _number(text: str, what: str, *, positive: bool) -> float:
         number = parse_number(text)
     except ValueError:
         number = math.nan
-    if positive and what == "number" and not math.isnan(number) and not number > 0.0:
-        raise ValueError(f"must hold positive numbers, but one is {number:g}")
     if not (number > 0.0 if positive else math.isfinite(number)):
         raise ValueError(f"the {what} `{text.strip()}` is not a {'positive ' if positive else ''}number")
     return number

@@ -224,9 +224,6 @@ def _real(value: Number) -> float:
     return float("nan") if value.imag else float(value.real)
 
 
-ExactNumber = Any  # mpmath makes its types at run time
-
-
 class ExactMap:
     """One scene's impact map with 50 digits.
 
@@ -266,7 +263,7 @@ class ExactMap:
                 errors.append(abs(float(exact[0] - self._mp.mpf(float(time)))))
         return np.array(errors)
 
-    def times_of_sequence(self, start: Sequence[float], guesses: NDArray[np.float64]) -> list[ExactNumber]:
+    def times_of_sequence(self, start: Sequence[float], guesses: NDArray[np.float64]) -> list[Number]:
         """Return the exact times of a sequence of impacts next to guessed ones, as mpmath numbers."""
         with self._mp.workdps(self._digits):
             state, times = self._state(start), []
@@ -281,10 +278,10 @@ class ExactMap:
             exact = self.times_of_sequence(start, found)
             return max(abs(float(t - self._mp.mpf(float(f)))) for t, f in zip(exact, found, strict=True))
 
-    def _state(self, start: Sequence[float] | NDArray[np.float64]) -> tuple[ExactNumber, ExactNumber]:
+    def _state(self, start: Sequence[float] | NDArray[np.float64]) -> tuple[Number, Number]:
         return self._mp.mpf(float(start[0])), self._mp.mpf(float(start[1]))
 
-    def _next(self, state: tuple[ExactNumber, ExactNumber], guess: ExactNumber) -> tuple[ExactNumber, ExactNumber]:
+    def _next(self, state: tuple[Number, Number], guess: Number) -> tuple[Number, Number]:
         mp, s = self._mp, self._system
         t1, velocity = state
         height = platform(mp, s, t1)[0]
