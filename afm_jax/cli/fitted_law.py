@@ -34,6 +34,7 @@ def with_fitted_law(scene: "Scene", path: Path) -> "tuple[Scene, UncertainParame
         ValueError: if the file is no valid fit of a law, or the fit does not say how sure its parameters are.
     """
     import equinox as eqx  # noqa: PLC0415
+    import jax.numpy as jnp  # noqa: PLC0415
     import numpy as np  # noqa: PLC0415
 
     from afm_jax.dynamics.bands import UncertainParameters  # noqa: PLC0415
@@ -49,7 +50,8 @@ def with_fitted_law(scene: "Scene", path: Path) -> "tuple[Scene, UncertainParame
     problem, found = belief.problem, payload["parameters"]
     if problem.model == "contact":
         raise ValueError(f"{path}: is a fit of a contact, which has no law; fit --model viscous+delay")
-    law = problem.law(np.array([found[name]["value"] for name in problem.names]))
+    everything = jnp.asarray([found[name]["value"] for name in problem.names])
+    law = problem.law(everything)
     names = [name for name in problem.names if name in _PATHS]
     unsure = [name for name in names if not found[name]["standard_error"]]
     if unsure:
@@ -62,7 +64,6 @@ def with_fitted_law(scene: "Scene", path: Path) -> "tuple[Scene, UncertainParame
     values = np.array([found[name]["value"] for name in names], float)
     made = eqx.tree_at(lambda parts: parts.interaction, scene, law, is_leaf=lambda part: part is None)
     if "quality_factor" in names:
-        fitted = problem.cantilever(np.array([found[n]["value"] for n in problem.names]), scene.cantilever)
-        made = eqx.tree_at(lambda parts: parts.cantilever, made, fitted)
+        made = eqx.tree_at(lambda parts: parts.cantilever, made, problem.cantilever(everything, scene.cantilever))
     known = UncertainParameters(tuple(_PATHS[n] for n in names), values, correlations * np.outer(errors, errors))
     return made, known
