@@ -109,6 +109,8 @@ class SpecialPoint(NamedTuple):
     parameter: float
     branch: int
     """Number of the branch that it lies on."""
+    position: float
+    """Where on it, in points: 2.5 is between the third and the fourth."""
     admissible: bool
     """Whether the map flies the orbit (at a grazing and a capture: on one side)."""
     unknowns: Float[np.ndarray, " n"]
@@ -209,6 +211,8 @@ def continue_orbits(
         for number, (way, branch) in enumerate(zip(ways, branches, strict=True))
         for point in _special_points(way, branch, number, frame, equations)
     )
+    # the point behind a capture at the beginning goes
+    special = tuple(one._replace(position=one.position - (ways[one.branch].ends[0] == "capture")) for one in special)
     branches = tuple(map(_before_capture, branches))
     curves = ()
     if second is not None:
@@ -525,7 +529,7 @@ def _orbits_in_range(
     family, found, rejected = scene_family(scene, given.path), [], 0
     for share in shares:
         there = family(given.low + (given.high - given.low) * share)
-        if impacts == 1:
+        if impacts == 1 and scene.base is None and scene.force is None and scene.platform.second is None:
             loops, passed = _single_impact_loops(there, order)
             rejected += passed
         else:
@@ -601,7 +605,7 @@ def _special_points(way: _Way, branch: Branch, number: int, frame: Frame, equati
         flown = bool(beside.any()) if test in (_GRAZING, _CAPTURE) else bool(own.admissible)
         kind = _kind_of(test, step, frame, equations)
         parameter = low + width * float(step.point[-1])
-        special.append(SpecialPoint(kind, parameter, number, flown, step.point[:-1], own, test))
+        special.append(SpecialPoint(kind, parameter, number, place, flown, step.point[:-1], own, test))
     return special
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 
 from afm_jax.dynamics.bands import WITHIN_95
-from afm_jax.dynamics.continuation import Branch, Continuation
+from afm_jax.dynamics.continuation import Branch, Continuation, SpecialPoint
 from afm_jax.impact.orbits import contracts
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save
 
@@ -61,7 +61,7 @@ def draw_continuation(
     axes = figure.subplots()
     labels: set[str] = set()
     for number, branch in enumerate(found.branches):
-        _draw_branch(axes, branch, labels)
+        _draw_branch(axes, branch, [one for one in found.special if one.branch == number], labels)
         if bands is not None:
             _draw_band(axes, branch, bands[number])
     for index, point in enumerate(found.special):
@@ -98,17 +98,25 @@ def _once(label: str, labels: set[str]) -> str | None:
     return label
 
 
-def _draw_branch(axes: Axes, branch: Branch, labels: set[str]) -> None:
+def _draw_branch(axes: Axes, branch: Branch, special: Sequence[SpecialPoint], labels: set[str]) -> None:
+    """Draw a branch, through its special points, where the style of the line changes."""
     stable = np.asarray(contracts(branch.reading.trace, branch.reading.determinant))
     state = np.where(branch.reading.admissible, np.where(stable, 2, 1), 0)
+    place = np.array([*range(len(state)), *(one.position for one in special)])
+    rank = np.argsort(place, kind="stable")
+    x = np.array([*branch.parameter, *(one.parameter for one in special)])[rank]
+    y = np.array([*branch.reading.peak_amplitude_nm, *(float(one.reading.peak_amplitude_nm) for one in special)])[rank]
+    # a line from or to a special point is in the state of its other end
+    known = np.array([*state, *[-1] * len(special)])[rank]
+    left, right = known[:-1], known[1:]
+    lines = np.where(left < 0, right, np.where(right < 0, left, np.minimum(left, right)))
     styles = ((":", GRID, "passes through the sample"), ("--", BLUE, "unstable"), ("-", BLUE, "stable"))
-    height = branch.reading.peak_amplitude_nm
     begin = 0
-    for end in [*(np.flatnonzero(np.diff(state)) + 1).tolist(), len(state)]:
-        line, colour, name = styles[int(state[begin])]
-        # to the first point of the next piece, so that there is no gap
-        piece = slice(begin, end + 1)
-        axes.plot(branch.parameter[piece], height[piece], line, color=colour, linewidth=1.8, label=_once(name, labels))
+    for end in [*(np.flatnonzero(np.diff(lines)) + 1).tolist(), len(lines)]:
+        if lines[begin] >= 0:
+            line, colour, name = styles[int(lines[begin])]
+            piece = slice(begin, end + 1)
+            axes.plot(x[piece], y[piece], line, color=colour, linewidth=1.8, label=_once(name, labels))
         begin = end
 
 
