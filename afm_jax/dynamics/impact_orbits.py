@@ -33,7 +33,6 @@ from afm_jax.dynamics.impact_loop import (
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, Flight
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.map import impact_after
-from afm_jax.impact.orbits import contracts
 from afm_jax.motion.law_motion import Bed, first_release, take_off
 from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import ContactKind, to_lab
@@ -79,7 +78,9 @@ class ManyImpactOrbits(NamedTuple):
     stable: Bool[np.ndarray, " orbits"]
 
 
-def multipliers_of(trace: Float[np.ndarray, "..."], determinant: Float[np.ndarray, "..."]) -> np.ndarray:
+def multipliers_of(
+    trace: Float[np.ndarray, "*orbits"], determinant: Float[np.ndarray, "*orbits"]
+) -> Complex[np.ndarray, "*orbits 2"]:
     """Return the two eigenvalues of a 2 x 2 map, the larger modulus first, shape (..., 2)."""
     half = 0.5 * np.asarray(trace, float)
     determinant = np.asarray(determinant, float)
@@ -88,6 +89,11 @@ def multipliers_of(trace: Float[np.ndarray, "..."], determinant: Float[np.ndarra
     # the smaller one from the product: as a difference it cancels
     small = np.where(np.imag(root) != 0.0, np.conj(large), determinant / np.where(large == 0.0, 1.0, large))
     return np.stack([large, small], axis=-1)
+
+
+def is_stable(multipliers: Complex[np.ndarray, "*orbits 2"]) -> Bool[np.ndarray, "*orbits"]:
+    """Say whether multipliers, the larger first, lie inside the unit circle."""
+    return np.asarray(np.abs(multipliers[..., 0]) < 1.0)
 
 
 def many_impact_orbits(scene: Scene, order: int, impacts: int, *, starts: int = DEFAULT_STARTS) -> ManyImpactOrbits:
@@ -128,8 +134,8 @@ def many_impact_orbits(scene: Scene, order: int, impacts: int, *, starts: int = 
     chosen = rank[keep[rank]]
     reading = jax.tree.map(lambda leaf: leaf[chosen], reading)
     absolute = loops[chosen] * np.repeat([1.0, float(scale)], impacts)
-    stable = np.asarray(contracts(jnp.asarray(reading.trace), jnp.asarray(reading.determinant)))
-    return ManyImpactOrbits(absolute, reading, multipliers_of(reading.trace, reading.determinant), stable)
+    multipliers = multipliers_of(reading.trace, reading.determinant)
+    return ManyImpactOrbits(absolute, reading, multipliers, is_stable(multipliers))
 
 
 @partial(jax.jit, static_argnames=("driven", "samples"))
@@ -291,7 +297,7 @@ def sticking_orbit(scene: Scene, *, longest: int = 64) -> StickingOrbit | str:
         return "with adhesion or a delay a tip that comes to rest stays"
     surface, response = surface_of(scene)
     bed = Bed(scene.cantilever, surface)
-    times = period * jnp.arange(256) / 256.0
+    times = period * jnp.arange(256.0) / 256.0
     push = np.asarray(jax.vmap(bed.push)(times))
     if push.min() >= 0.0 or push.max() <= 0.0:
         return f"the surface {'never lets go' if push.min() >= 0.0 else 'never presses'} a tip that rests on it"

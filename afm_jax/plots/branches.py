@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from afm_jax.dynamics.bands import WITHIN_95
 from afm_jax.dynamics.continuation import Branch, Continuation, SpecialPoint
-from afm_jax.impact.orbits import contracts
+from afm_jax.dynamics.impact_orbits import is_stable, multipliers_of
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save
 
 _MARKS = {
@@ -100,7 +100,7 @@ def _once(label: str, labels: set[str]) -> str | None:
 
 def _draw_branch(axes: Axes, branch: Branch, special: Sequence[SpecialPoint], labels: set[str]) -> None:
     """Draw a branch, through its special points, where the style of the line changes."""
-    stable = np.asarray(contracts(branch.reading.trace, branch.reading.determinant))
+    stable = is_stable(multipliers_of(np.asarray(branch.reading.trace), np.asarray(branch.reading.determinant)))
     state = np.where(branch.reading.admissible, np.where(stable, 2, 1), 0)
     place = np.array([*range(len(state)), *(one.position for one in special)])
     rank = np.argsort(place, kind="stable")
