@@ -51,6 +51,8 @@ _SHARE = 0.7
 """Longest step towards capture, of the distance from it."""
 _CLOSED = 1e-11
 """Largest distance from closing, of the loop's speeds: 1e-12, and what heights of many periods lose by rounding."""
+_GRAZES = 1e-8
+"""Coordinate above capture, over the drive's speed, up to which an impact is none."""
 _SAME = 1e-7
 """Relative distance below which two loops are one."""
 _FASTEST = 100.0
@@ -175,7 +177,9 @@ def _search(scene: Scene, order: Array, starts: Array, *, impacts: int, driven: 
     guesses = jnp.where(usable[:, None], guesses[near], 1.0)
     found = jax.vmap(lambda guess: closed_loop(guess, top_speed, loop))(guesses)
     missing = jax.vmap(lambda unknowns: jnp.max(jnp.abs(closing_gaps(unknowns, top_speed, loop))))(found)
-    return found, top_speed, usable & (missing < _CLOSED)
+    # a free motion that touches the surface is no orbit of impacts
+    leaves = jnp.min(found[:, impacts:], axis=1) > loop.impact.lowest / top_speed + _GRAZES
+    return found, top_speed, usable & (missing < _CLOSED) & leaves
 
 
 def _walks(seen: Scene, loop: ImpactLoop, starts: Array, length: int) -> tuple[Array, Array]:
@@ -272,7 +276,7 @@ class StickingOrbit(NamedTuple):
     release_phase_rad: float
     """Drive phase at which the surface lets the tip go; of the first rest."""
     rest_us: float
-    """Time at rest in a response period."""
+    """From the last impact followed to the release, in a response period."""
     impacts: int
     """Impacts followed one by one; those summed up as chatter not counted."""
     peak_amplitude_nm: float
