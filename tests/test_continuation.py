@@ -7,6 +7,8 @@ the grazing of a resting and of a driven tip.
 import json
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
@@ -16,6 +18,8 @@ from afm_jax import Cantilever, CollisionDelay, ForceDrive, ImpactLaw, Platform,
 from afm_jax.cli.main import main
 from afm_jax.dynamics.bands import UncertainParameters, drawn_points, special_errors
 from afm_jax.dynamics.continuation import Continuation, continue_orbits
+from afm_jax.impact.closure import OrbitProblem, closing_residual
+from afm_jax.impact.lasting_impact import LawImpact
 from afm_jax.plots.branches import draw_continuation, draw_curves
 from afm_jax.scenefile.parameter_paths import ParameterRange
 
@@ -192,14 +196,51 @@ def test_multipliers_cross_the_circle_at_a_torus_point():
     assert np.abs(np.linalg.eigvals(np.array(columns).T)) == pytest.approx([1.0, 1.0], abs=1e-6)
 
 
+def flattest(problem: OrbitProblem) -> tuple[float, float]:
+    """Return value and slope of the closing condition of single-impact orbits at its flattest inflection near 0.
+
+    The condition is one equation for the logarithm of the coordinate; all three vanish where three orbits are one.
+    """
+
+    def residual(size: jax.Array) -> jax.Array:
+        return closing_residual(jnp.exp(size), problem)
+
+    slope, lowest = jax.grad(residual), problem.impact.lowest
+    sizes = jnp.linspace(jnp.log(1.02 * lowest), jnp.log(30.0 * lowest), 20001)
+    flat = jnp.abs(jax.vmap(residual)(sizes)) + jnp.abs(jax.vmap(slope)(sizes))
+    place, bend = float(sizes[int(jnp.argmin(flat))]), jax.jit(jax.grad(slope))
+    root = float(brentq(lambda size: float(bend(jnp.asarray(size))), place - 0.02, place + 0.02, xtol=1e-14))
+    return float(residual(jnp.asarray(root))), float(slope(jnp.asarray(root)))
+
+
+@pytest.mark.slow
+def test_cusps_are_triple_roots_and_curves_meet_in_the_same_points():
+    delayed = ImpactLaw(1.0, 114.6, 0.4994, CollisionDelay(0.20256, 6.458, 0.5634, corrections=False))
+    many = Scene(Cantilever(90.0, 40.0), Platform(2.0, 720.0, 1.0), delayed)
+    second = ParameterRange("platform.amplitude_nm", 2.0, 3.0)
+    found = continue_orbits(many, 4, ParameterRange("platform.reduced_frequency", 3.75, 4.1), second=second)
+    curves = {curve.kind: curve for curve in found.curves}
+    cusps = [one for one in curves["fold"].meetings if one.kind == "cusp"]
+    assert len(cusps) == 2
+    for one in cusps:
+        platform = Platform(one.second, 180.0 * one.parameter, 1.0)
+        value, slope = flattest(OrbitProblem(many.cantilever, platform, LawImpact(delayed), jnp.asarray(4.0)))
+        assert abs(value) < 1e-9
+        assert abs(slope) < 1e-8
+
+    def met(kind: str, name: str) -> tuple[float, float]:
+        (one,) = [one for one in curves[kind].meetings if one.kind == name]
+        return one.parameter, one.second
+
+    assert met("fold", "fold_grazing") == pytest.approx(met("grazing", "grazing_fold"), abs=1e-8)
+
+
 @pytest.mark.slow
 def test_errors_of_special_points_are_those_of_draws():
-    sure = scene(4.0, 1.01, 0.95, 60.0)
-    damped = Scene(Cantilever(90.0, 40.0), sure.platform, sure.interaction)
-    found = continue_orbits(damped, 1, ParameterRange("platform.amplitude_nm", 0.5, 6.0))
-    errors, correlations = np.array([4e-4, 0.93, 0.4]), np.array([[1, 0.2, -0.94], [0.2, 1, 0.0], [-0.94, 0.0, 1]])
-    paths = ("interaction.r", "interaction.epsilon", "cantilever.quality_factor")
-    known = UncertainParameters(paths, np.array([0.95, 60.0, 40.0]), correlations * np.outer(errors, errors))
+    found = continue_orbits(scene(4.0, 1.01, 0.95, 60.0), 1, ParameterRange("platform.amplitude_nm", 0.5, 6.0))
+    errors, correlations = np.array([4e-4, 0.93]), np.array([[1.0, 0.2], [0.2, 1.0]])
+    covariance = correlations * np.outer(errors, errors)
+    known = UncertainParameters(("interaction.r", "interaction.epsilon"), np.array([0.95, 60.0]), covariance)
     expected = special_errors(found, known)
     for point, error in zip(found.special, expected, strict=True):
         drawn = drawn_points(found, point, known, number=500, seed=3)
@@ -210,17 +251,6 @@ def test_errors_of_special_points_are_those_of_draws():
         assert [low, high] == pytest.approx(
             [point.parameter - 1.96 * error, point.parameter + 1.96 * error], abs=0.4 * error
         )
-    # capture in closed form: u from eq. 6 alone, undamped it would be the test above; here by differences of roots
-    bound = np.array([0.95, 60.0, 40.0])
-
-    def captured(values: np.ndarray) -> float:
-        moved = Scene(Cantilever(90.0, values[2]), damped.platform, ImpactLaw(values[0], values[1]))
-        again = continue_orbits(moved, 1, found.range)
-        return only(again, "capture")[0]
-
-    slopes = [(captured(bound + row) - captured(bound - row)) / (2.0 * row.sum()) for row in np.diag(0.1 * errors)]
-    index = [point.kind for point in found.special].index("capture")
-    assert expected[index] == pytest.approx(np.sqrt(np.array(slopes) @ known.covariance @ slopes), rel=1e-4)
 
 
 @pytest.mark.slow
@@ -265,6 +295,64 @@ def test_the_command_tells_what_python_finds(doubled: Continuation, tmp_path: Pa
     assert {file.name for file in (tmp_path / "out").iterdir()} == names
 
 
+def fit_file(path: Path, **changes: object) -> str:
+    """Write what `afm-jax fit --out` writes, as far as it is read, and return the path."""
+    errors, rows = (
+        {"r": (0.95, 4e-4), "epsilon": (60.0, 0.93)},
+        {key: [1.0] for key in ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")},
+    )
+    payload = {
+        "format": "afm-jax fit",
+        "model": "law",
+        "valid": True,
+        "parameters": {name: {"value": one, "standard_error": error} for name, (one, error) in errors.items()},
+        "correlations": {"names": list(errors), "matrix": [[1.0, 0.2], [0.2, 1.0]]},
+        "input": {"free_frequency_khz": 90.0, "quality_factor": None, **rows},
+    }
+    path.write_text(json.dumps(payload | changes), encoding="utf-8")
+    return str(path)
+
+
+@pytest.mark.slow
+def test_the_law_of_a_fit_gives_intervals(tmp_path: Path):
+    path = saved(tmp_path / "scene.toml", scene(4.0, 1.01, 0.5))
+    arguments = (path, "--order", "1", "--parameter", "platform.amplitude_nm=0.5:6", "--json")
+    result = run(*arguments, "--law", fit_file(tmp_path / "fit.json"), "--out", str(tmp_path / "out"))
+    assert result.exit_code == 0, result.stderr
+    answer = json.loads(result.stdout)
+    captured = next(point for point in answer["special"] if point["kind"] == "capture")
+    # undamped, closed: beta^2 = (u cot/2 Omega - sigma)^2 + (u/2 omega)^2 with u = sqrt(epsilon)/r
+    omega = 2.02 * FREE
+
+    def amplitude(r: float, epsilon: float) -> float:
+        speed = np.sqrt(epsilon) / r
+        return float(np.hypot(0.5 * speed / FREE / np.tan(FREE * np.pi / omega) + 1.0, 0.5 * speed / omega))
+
+    assert captured["parameter"] == pytest.approx(amplitude(0.95, 60.0), abs=1e-8)
+    by_r = (amplitude(0.9501, 60.0) - amplitude(0.9499, 60.0)) / 2e-4
+    by_epsilon = (amplitude(0.95, 60.01) - amplitude(0.95, 59.99)) / 0.02
+    one, other = by_r * 4e-4, by_epsilon * 0.93
+    error = np.sqrt(one**2 + other**2 + 0.4 * one * other)
+    assert captured["parameter_error"] == pytest.approx(error, rel=1e-5)
+    assert np.diff(captured["interval95"]) == pytest.approx([3.92 * error], rel=1e-4)
+    assert all(point["peak_amplitude_error_nm"] > 0.0 for point in answer["points"])
+
+
+@pytest.mark.slow
+def test_a_fit_that_says_nothing_is_refused(tmp_path: Path):
+    path = saved(tmp_path / "scene.toml", scene(4.0, 1.01, 0.5))
+    arguments = (path, "--order", "1", "--parameter", "platform.amplitude_nm=0.5:6", "--law")
+    unsure = {"r": {"value": 0.95, "standard_error": None}, "epsilon": {"value": 60.0, "standard_error": 1.0}}
+    for changes, said in (
+        ({"valid": False}, "the fit is not valid"),
+        ({"format": "other"}, "this is no saved fit"),
+        ({"parameters": unsure, "correlations": {"matrix": [[None, None], [None, 1.0]]}}, "no standard error of r"),
+    ):
+        result = run(*arguments, fit_file(tmp_path / "fit.json", **changes))
+        assert (result.exit_code, len(result.stderr.splitlines())) == (2, 1), result.stderr
+        assert said in result.stderr
+
+
 @pytest.mark.slow
 def test_nothing_in_the_range_ends_with_3_and_says_why(tmp_path: Path):
     path = saved(tmp_path / "scene.toml", scene(0.1, epsilon=5.0))
@@ -283,7 +371,9 @@ def test_nothing_in_the_range_ends_with_3_and_says_why(tmp_path: Path):
         (("--parameter", "interaction.r=0.5:0.9", "--impacts", "65"), "--impacts"),
         (("--parameter", "interaction.r=0.5:0.9", "--second", "interaction.epsilon=1:2"), "the scene's own value, 0"),
         (("--parameter", "interaction.r=0.5:0.9", "--picture", "branch.gif"), "must end in .pdf, .svg or .png"),
-        (("--parameter", "interaction.r=0.5:0.9", "--law", "scene.toml"), "scene.toml"),
+        pytest.param(
+            ("--parameter", "interaction.r=0.5:0.9", "--law", "scene.toml"), "scene.toml", marks=pytest.mark.slow
+        ),
     ],
 )
 def test_wrong_requests_are_one_line(arguments: tuple[str, ...], said: str, tmp_path: Path, monkeypatch):
