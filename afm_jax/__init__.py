@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from afm_jax.contact.contact import Contact
     from afm_jax.contact.junction import Junction, Phase, find_junction
     from afm_jax.contact.time_course import time_course
+    from afm_jax.dynamics.exponents import lyapunov_spectrum
     from afm_jax.impact.jacobian import map_jacobian
     from afm_jax.impact.law import CollisionDelay, ImpactLaw
     from afm_jax.impact.map import NextImpact, iterate_batch, iterate_map, next_impact
@@ -59,6 +60,7 @@ else:
         "iterate_batch": "afm_jax.impact.map",
         "iterate_map": "afm_jax.impact.map",
         "load_scene": "afm_jax.scenefile.scenefile",
+        "lyapunov_spectrum": "afm_jax.dynamics.exponents",
         "map_jacobian": "afm_jax.impact.jacobian",
         "next_impact": "afm_jax.impact.map",
         "save_scene": "afm_jax.scenefile.scenefile",
@@ -106,6 +108,7 @@ __all__ = [
     "iterate_batch",
     "iterate_map",
     "load_scene",
+    "lyapunov_spectrum",
     "map_jacobian",
     "next_impact",
     "save_scene",
