@@ -124,7 +124,7 @@ def command(session: Session, scene: Path, order: int, impacts: int | None) -> N
         raise NotValid(reason)
 
 
-def refuse_other_than_law(scene: "Scene", path: Path) -> None:
+def refuse_other_than_law(scene: "Scene", path: str | Path) -> None:
     """Check that a scene's interaction is a law.
 
     Raises:

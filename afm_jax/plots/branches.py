@@ -8,8 +8,9 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 
 from afm_jax.dynamics.bands import WITHIN_95
-from afm_jax.dynamics.continuation import Branch, Continuation, SpecialPoint
+from afm_jax.dynamics.continuation import OrbitBranch, Continuation, SpecialPoint
 from afm_jax.dynamics.impact_orbits import is_stable, multipliers_of
+from afm_jax.plots.dynamics import label_of
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save
 
 _MARKS = {
@@ -20,26 +21,6 @@ _MARKS = {
     "capture": ("v", DARK),
 }
 """Shape and colour of each kind: either tells them apart (colours of Okabe and Ito)."""
-_NAMES = {
-    "platform.reduced_frequency": r"reduced drive frequency  $n = \omega/2\Omega$",
-    "platform.frequency_khz": r"drive frequency  $\omega/2\pi$ (kHz)",
-    "platform.amplitude_nm": r"drive amplitude  $\beta$ (nm)",
-    "platform.offset_nm": r"tip-sample offset  $\sigma$ (nm)",
-    "interaction.r": r"restitution  $r$",
-    "interaction.epsilon": r"adhesion  $\epsilon$ (nm$^2$/µs$^2$)",
-    "interaction.viscous_loss": "viscous loss (nm/µs)",
-    "cantilever.quality_factor": r"quality factor  $Q$",
-}
-_UNITS = {"nm": "nm", "khz": "kHz", "nn": "nN", "deg": "deg", "ng": "ng"}
-
-
-def axis_name(path: str) -> str:
-    """Return what an axis of a parameter is called, with its unit."""
-    if path in _NAMES:
-        return _NAMES[path]
-    words = path.replace(".", " ").split("_")
-    unit = _UNITS.get(words[-1])
-    return " ".join(words) if unit is None else f"{' '.join(words[:-1])} ({unit})"
 
 
 def draw_continuation(
@@ -82,7 +63,7 @@ def draw_continuation(
             zorder=4,
             label=_once(point.kind.replace("_", " "), labels),
         )
-    label_axes(axes, x=axis_name(found.range.path), y="peak amplitude (nm)")
+    label_axes(axes, x=label_of(found.range.path), y="peak amplitude (nm)")
     axes.set_title(f"({found.impacts}, {found.order}) orbits", fontsize=12, loc="left")
     axes.grid(color=GRID, alpha=0.25)
     axes.margins(x=0.02)
@@ -98,7 +79,7 @@ def _once(label: str, labels: set[str]) -> str | None:
     return label
 
 
-def _draw_branch(axes: Axes, branch: Branch, special: Sequence[SpecialPoint], labels: set[str]) -> None:
+def _draw_branch(axes: Axes, branch: OrbitBranch, special: Sequence[SpecialPoint], labels: set[str]) -> None:
     """Draw a branch, through its special points, where the style of the line changes."""
     stable = is_stable(multipliers_of(np.asarray(branch.reading.trace), np.asarray(branch.reading.determinant)))
     state = np.where(branch.reading.admissible, np.where(stable, 2, 1), 0)
@@ -120,7 +101,7 @@ def _draw_branch(axes: Axes, branch: Branch, special: Sequence[SpecialPoint], la
         begin = end
 
 
-def _draw_band(axes: Axes, branch: Branch, error: Float[np.ndarray, " points"]) -> None:
+def _draw_band(axes: Axes, branch: OrbitBranch, error: Float[np.ndarray, " points"]) -> None:
     """Shade where the amplitude may lie; not where a fold is so near that a held parameter says nothing."""
     height = branch.reading.peak_amplitude_nm
     half = WITHIN_95 * error
@@ -160,7 +141,7 @@ def draw_curves(found: Continuation, path: Path) -> None:
             marker = "*" if one.kind == "cusp" else "X"
             name = "cusp" if one.kind == "cusp" else "meeting"
             axes.plot(one.parameter, one.second, marker, color="black", markersize=9, label=_once(name, labels))
-    label_axes(axes, x=axis_name(found.range.path), y=axis_name(found.second.path))
+    label_axes(axes, x=label_of(found.range.path), y=label_of(found.second.path))
     axes.set_title(f"({found.impacts}, {found.order}) orbits", fontsize=12, loc="left")
     axes.grid(color=GRID, alpha=0.25)
     axes.set(xlim=(found.range.low, found.range.high), ylim=(found.second.low, found.second.high))
