@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from afm_jax.dynamics.bands import UncertainParameters
-    from afm_jax.dynamics.continuation import OrbitBranch, Continuation, SpecialCurve
+    from afm_jax.dynamics.continuation import Continuation, OrbitBranch, SpecialCurve
 
 POINT_COLUMNS = (
     "branch",

@@ -15,10 +15,10 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from afm_jax.dynamics.continuation import (
-    OrbitBranch,
     Continuation,
     Equations,
     Frame,
+    OrbitBranch,
     SpecialPoint,
     equations_at,
     loop_at,

@@ -8,7 +8,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 
 from afm_jax.dynamics.bands import WITHIN_95
-from afm_jax.dynamics.continuation import OrbitBranch, Continuation, SpecialPoint
+from afm_jax.dynamics.continuation import Continuation, OrbitBranch, SpecialPoint
 from afm_jax.dynamics.impact_orbits import is_stable, multipliers_of
 from afm_jax.plots.dynamics import label_of
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save
