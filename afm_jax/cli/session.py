@@ -60,6 +60,15 @@ def _cell(value: Any) -> Any:
     return plain
 
 
+def _cells(column: Any) -> Any:
+    """Return the cells of a column, many at a time."""
+    if not hasattr(column, "dtype") or column.dtype.kind not in "fb":
+        return (_cell(value) for value in column)
+    if column.dtype.kind == "b":
+        return ("true" if value else "false" for value in column.tolist())
+    return (value if math.isfinite(value) else "" for value in column.tolist())
+
+
 _SECONDS_BETWEEN_NOTES = 2.0
 _WIDTH_OF_A_PIPE = 160
 """Columns of text that nobody looks at in a terminal; wide enough that no table is cut."""
@@ -156,20 +165,19 @@ class Session:
             write_csv(self.out / name, rows, columns)
             self.note(f"wrote {self.out / name}")
 
-    def write_columns(self, name: str, columns: Mapping[str, Sequence[Any]]) -> None:
+    def write_columns(self, name: str, columns: Mapping[str, Any]) -> None:
         """Write a long table as CSV into the `--out` folder, if there is one, and say so.
 
         Args:
             name: file name.
-            columns: lists of plain values of one length, in order; what is not finite stays empty.
+            columns: lists or arrays of one length, in order; what is not finite stays empty.
         """
         if self.out is None:
             return
         with (self.out / name).open("w", encoding="utf-8", newline="") as file:
             writer = csv.writer(file, lineterminator="\n")
             writer.writerow(columns)
-            plain = ([_cell(value) for value in column] for column in columns.values())
-            writer.writerows(zip(*plain, strict=True))
+            writer.writerows(zip(*map(_cells, columns.values()), strict=True))
         self.note(f"wrote {self.out / name}")
 
 

@@ -147,12 +147,19 @@ def lyapunov_spectrum(
     if isinstance(scene.interaction, Contact):
         found = _exponents_of_contacts(scenes, tips, impacts=impacts, transient=transient, accuracy=accuracy)
     else:
-
-        def work(lanes: tuple[Scene, Tips]) -> Lyapunov:
-            return _exponents_of_block(*lanes, impacts=impacts, transient=transient)
-
-        found = in_blocks(work, (scenes, tips), report=report)
+        found = exponents_of_law(scenes, tips, impacts=impacts, transient=transient, report=report)
     return jax.tree.map(lambda part: part[0], found) if single else found
+
+
+def exponents_of_law(
+    scenes: Scene, tips: Tips, *, impacts: int, transient: int, report: Report | None = None
+) -> Lyapunov:
+    """Return the exponents of motions in a batch of law scenes; arguments as for `lyapunov_spectrum`."""
+
+    def work(lanes: tuple[Scene, Tips]) -> Lyapunov:
+        return _exponents_of_block(*lanes, impacts=impacts, transient=transient)
+
+    return in_blocks(work, (scenes, tips), report=report)
 
 
 def _exponents_of_contacts(scenes: Scene, tips: Tips, *, impacts: int, transient: int, accuracy: float) -> Lyapunov:

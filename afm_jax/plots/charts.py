@@ -42,7 +42,7 @@ def draw_stability_chart(
     stable = chart.any_stable
     lost = np.zeros_like(stable) if compared_with is None else compared_with.any_stable & ~stable
     shade = np.where(stable, 2, np.where(lost, 1, 0))
-    edges = _edges(chart.x_values), _edges(chart.y_values)
+    edges = cell_edges(chart.x_values), cell_edges(chart.y_values)
     colours = ListedColormap([DARK, _LOST, "white"])
     axes.pcolormesh(*edges, shade, cmap=colours, vmin=0, vmax=2, rasterized=True)
     axes.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
@@ -86,7 +86,7 @@ def _add_frequency_axis(axes: Axes) -> None:
     top.tick_params(labelsize=10)
 
 
-def _edges(centres: Float[np.ndarray, " cells"]) -> Float[np.ndarray, " edges"]:
+def cell_edges(centres: Float[np.ndarray, " cells"]) -> Float[np.ndarray, " edges"]:
     """Return the borders of evenly spaced cells."""
     half = 0.5 * (centres[1] - centres[0])
     return np.append(centres - half, centres[-1] + half)

@@ -6,10 +6,15 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.colors import BoundaryNorm, ListedColormap
 
 from afm_jax.dynamics.bifurcations import Sweep
+from afm_jax.dynamics.charts import StabilityChart
+from afm_jax.plots.charts import cell_edges
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save, with_zero_line
 
+KINDS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#8c6bb1", "#a6761d", "#999999")
+"""Colours that stand apart for every kind of colour vision (Okabe and Ito's, and three more)."""
 _LABELS = {
     "platform.reduced_frequency": r"reduced drive frequency  $n = \omega/2\Omega$",
     "platform.amplitude_nm": r"drive amplitude  $\beta$ (nm)",
@@ -102,4 +107,38 @@ def draw_bifurcations(path: str, sweeps: Sequence[Sweep], target: Path) -> None:
     legend = figure.legend(handles, labels, loc="outside upper center", ncols=2, fontsize=11, frameon=False)
     for handle in legend.get_lines():
         handle.set(markersize=10.0, alpha=1.0)
+    save(figure, target)
+
+
+def draw_chart(x: str, y: str, chart: StabilityChart, target: Path) -> None:
+    """Draw a chart of stable single-impact orbits: the lowest stable order, and how stable its orbit is.
+
+    Args:
+        x: path of the parameter of the columns.
+        y: of the rows.
+        chart: the chart.
+        target: PNG, PDF or SVG file.
+    """
+    figure = new_figure(12.0, 5.2)
+    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
+    edges = cell_edges(chart.x_values), cell_edges(chart.y_values)
+    lowest, stable = chart.lowest_stable_order, chart.stable
+    orders = [order for order in range(1, chart.orders + 1) if (lowest == order).any()] or [1]
+    colours = ListedColormap([KINDS[(order - 1) % len(KINDS)] for order in range(1, orders[-1] + 1)])
+    norm = BoundaryNorm(np.arange(0.5, orders[-1] + 1.0), colours.N)
+    shown = np.where(lowest > 0, lowest, np.nan)
+    mesh = left.pcolormesh(*edges, shown, cmap=colours, norm=norm, rasterized=True)
+    bar = figure.colorbar(mesh, ax=left, ticks=orders)
+    bar.ax.set_yticklabels([f"(1,{order})" for order in orders])
+    several = (stable.sum(axis=0) > 1).astype(float)
+    if several.any() and not several.all():
+        left.contour(chart.x_values, chart.y_values, several, levels=[0.5], colors="black", linewidths=0.6)
+    left.set_title("lowest stable order (black line: several coexist)", fontsize=12)
+    sizes = chart.verdicts.largest_multiplier.reshape(stable.shape)
+    lowest_size = np.take_along_axis(sizes, np.maximum(lowest - 1, 0)[None], axis=0)[0]
+    mesh = right.pcolormesh(*edges, lowest_size, cmap="cividis", vmin=0.0, vmax=1.0, rasterized=True)
+    figure.colorbar(mesh, ax=right, label="size of its larger multiplier")
+    right.set_title("how stable", fontsize=12)
+    label_axes(left, x=label_of(x), y=label_of(y))
+    label_axes(right, x=label_of(x), y="")
     save(figure, target)
