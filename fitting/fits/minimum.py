@@ -303,10 +303,12 @@ class Strain:
 
     Attributes:
         model_error: relative error of the amplitude that the picture itself has, shape (rows,).
+        slow_error: the part of it that slow impacts have, without that of the delay law.
         set_aside: rows that are not used, shape (rows,).
     """
 
     model_error: Float[np.ndarray, " rows"]
+    slow_error: Float[np.ndarray, " rows"]
     set_aside: Bool[np.ndarray, " rows"]
 
 
@@ -315,7 +317,7 @@ def strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
     rows = objective.measurement.rows
     count = rows.order.shape[0]
     if not objective.problem.lasting:
-        return Strain(np.zeros(count), np.zeros(count, dtype=bool))
+        return Strain(np.zeros(count), np.zeros(count), np.zeros(count, dtype=bool))
     impact = impact_of(jnp.asarray(values), objective.measurement, objective.problem)
     linear = objective.at_values(values[None])
     prediction = linear.prediction
@@ -328,10 +330,11 @@ def strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
     share = 2.0 * np.pi * np.asarray(rows.drive_frequency_khz) * 1e-3 * float(impact.length) / np.maximum(rebound, 1e-6)
     slow = (share > LONGEST) | (approach < NEAREST * capture)
     near = np.minimum(1.5 * capture / np.maximum(approach, 1e-6), 1.5 / NEAREST)
-    error = BASE + GROWTH * np.minimum(share, LONGEST) ** 3 + SLOW * near**6
+    slow_error = BASE + GROWTH * np.minimum(share, LONGEST) ** 3 + SLOW * near**6
+    error = slow_error
     if "delay_offset_nm" in objective.problem.names:
         error = np.hypot(error, DELAY_US * _sensitivity(objective, linear, approach))
-    return Strain(np.where(exists, error, BASE), exists & slow)
+    return Strain(np.where(exists, error, BASE), np.where(exists, slow_error, BASE), exists & slow)
 
 
 def untabulated(
