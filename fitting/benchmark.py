@@ -13,17 +13,10 @@ from typing import Any
 import numpy as np
 
 from fitting.fits.objective import Objective
-from fitting.models import Problem, measurement_of, model_parameters
+from fitting.models import Problem, measurement_of
+from fitting.parameters import model_parameters, paper_values
 from fitting.tables.table import AmplitudeTable, write_table
 
-_PAPER = {
-    "epsilon": 113.6,
-    "viscous_loss": 0.5,
-    "delay_hertz": 0.2033,
-    "delay_lead_nm": 6.8,
-    "delay_offset_nm": 0.58,
-}
-"""Law and delay of the paper's contact, which "contact" fits as well."""
 _NOISE = 0.01
 
 
@@ -71,7 +64,7 @@ def time_fits(models: Sequence[str], *, rows: int) -> list[dict[str, Any]]:
 def made_table(rows: int, *, seed: int = 0) -> AmplitudeTable:
     """Return a table of orders 1 to 4 around resonance with the paper's law and delay, 1 % noise and Q = 40 +- 1."""
     problem = Problem("viscous+delay", model_parameters("viscous+delay"))
-    values = np.array([_PAPER[name] for name in problem.names])
+    values = np.array([paper_values("viscous+delay")[name] for name in problem.names])
     place = np.arange(4 * rows)
     order = place % 4 + 1
     drive: dict[str, Any] = {

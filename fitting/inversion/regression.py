@@ -22,6 +22,7 @@ from jaxtyping import Float
 from scipy.special import chdtrc
 
 from fitting.inversion.result import Coefficient, InvertedRows, RegressedLaw
+from fitting.parameters import DELAY_NAMES, PARAMETERS
 from fitting.tables.csv_text import (
     Column,
     Faults,
@@ -189,18 +190,10 @@ _POINTS = 120
 _DECIDED = 6.0
 """Difference of chi2 from which a law with as many coefficients is called better."""
 _IMPROBABLE = 1e-3
-_UNITS = {
-    "epsilon": "nm^2/us^2",
-    "viscous_loss": "nm/us",
-    "r": "",
-    "hertz": "us (nm/us)^(1/5)",
-    "lead_nm": "nm",
-    "offset_nm": "nm",
-}
 _NAMES = {
     "viscous": ("epsilon", "viscous_loss"),
     "restitution": ("epsilon", "r"),
-    "delay": ("hertz", "lead_nm", "offset_nm"),
+    "delay": DELAY_NAMES,
 }
 _PLAIN = {"viscous": "a viscous loss, linear in the speed", "restitution": "a coefficient of restitution"}
 
@@ -306,9 +299,9 @@ def _law(
     curve: tuple[np.ndarray, np.ndarray],
 ) -> RegressedLaw:
     parameters = {
-        name: Coefficient(
+        name.removeprefix("delay_"): Coefficient(
             value=float(value),
-            unit=_UNITS[name],
+            unit=PARAMETERS[name].unit,
             standard_error=float(np.sqrt(total)),
             systematic_error=float(np.sqrt(max(total - random, 0.0))) if shared else None,
         )
@@ -381,7 +374,7 @@ def _numbers(cells: Any) -> Float[np.ndarray, " points"]:
     return np.array([np.nan if cell is None else float(cell) for cell in cells], dtype=np.float64)
 
 
-_KNOWN_COLUMNS = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us")
+_KNOWN_COLUMNS = _COLUMNS[:2]
 _LAW = Form(tuple(Column(name) for name in _KNOWN_COLUMNS), "speed", open=True, blanks=True)
 
 
