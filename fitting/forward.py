@@ -240,7 +240,7 @@ def impact_slopes(
         leaf[(slice(None), 0, *(0,) * (leaf.ndim - 2))] = turn
         turned = impacts._replace(slopes=eqx.tree_at(where, still, leaf))
         block = _in_lanes(filled, 1, turned, measurement, problem, near)
-        return block.slope[0, :, :, 0], block.prediction.approach_speed_nm_per_us[0]
+        return np.asarray(block.slope)[0, :, :, 0], np.asarray(block.prediction.approach_speed_nm_per_us)[0]
 
     if isinstance(impacts.impact, TabulatedImpact):
         return ImpactSlopes(along(lambda i: i.loss, -1.0)[0], along(lambda i: i.time, 1.0)[0])

@@ -7,6 +7,7 @@ correction of the fitted models goes into it. It takes minutes, so tables are ke
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -32,7 +33,7 @@ class ContactTruth:
     """A contact and its instrument; what its impacts do is known from its own table."""
 
     number: int
-    parameters: dict[str, float]
+    parameters: dict[str, Any]
     frequency_khz: float
     quality_factor: float
 

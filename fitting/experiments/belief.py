@@ -5,6 +5,7 @@ The belief that a fit leaves: its values, its covariance, and the drives that we
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from fitting.models import Problem
 from fitting.parameters import (
     NUISANCE_NAMES,
     PARAMETERS,
+    SHAPE_NAMES,
     Parameter,
     check_contact_values,
     model_parameters,
@@ -199,7 +201,11 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
     """
     payload = result.to_dict() if isinstance(result, FitResult) else result
     _check_payload(payload)
-    found, table, settings = payload["parameters"], payload["input"], payload.get("settings") or {}
+    table, settings = payload["input"], payload.get("settings") or {}
+    # the shapes of loss and delay are known beforehand, not to be determined: what they do to the others stays
+    kept = [name not in SHAPE_NAMES for name in payload["parameters"]]
+    found = dict(compress(payload["parameters"].items(), kept))
+    matrix = [list(compress(row, kept)) for row in compress(payload["correlations"]["matrix"], kept)]
     problem = Problem(payload["model"], tuple(found), tuple(settings.get("effects") or EFFECTS))
     columns = ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")
     notes = []
@@ -211,7 +217,7 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
     return Belief(
         problem=problem,
         values=checked_values(problem, {name: entry["value"] for name, entry in found.items()}),
-        information=_information(found, payload["correlations"]["matrix"]),
+        information=_information(found, matrix),
         free_frequency_khz=float(table["free_frequency_khz"]),
         quality_factor=table.get("quality_factor"),
         mass_ng=float(table.get("mass_ng", 1.0)),

@@ -20,14 +20,23 @@ from afm_jax.checks import require_float64
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.lasting_impact import LawImpact
 from afm_jax.version import version_of
-from fitting.fits.intervals import Convergence, Interval, at_bound, check_minimum, covariance, profile_intervals
+from fitting.fits.intervals import (
+    Convergence,
+    Interval,
+    at_bound,
+    check_minimum,
+    covariance,
+    profile_intervals,
+    within_range,
+)
 from fitting.fits.minimum import Minimum, Strain, minimise, relaxed, rescale_errors, settle, strain_of, untabulated
 from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective
 from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows
-from fitting.fits.verdict import Evidence, judge_fit, misfits
+from fitting.fits.unmodelled import Step, Unmodelled, law_after, rows_of_fit, step_of
+from fitting.fits.verdict import ASSUMED_ERROR_OF_Q, Evidence, judge_fit, misfits
 from fitting.forward import impact_of
 from fitting.models import Measurement, Problem, constraints_of, measurement_of
-from fitting.parameters import NUISANCE_NAMES, check_contact_values, model_parameters
+from fitting.parameters import NUISANCE_NAMES, PARAMETERS, check_contact_values, model_parameters
 from fitting.tables.table import AmplitudeTable
 
 _POINTS = 121
@@ -38,8 +47,9 @@ def law_with_band(
     problem: Problem,
     measurement: Measurement,
     values: Float[np.ndarray, " p"],
-    covariance: Float[np.ndarray, "p p"],
+    covariance: Float[np.ndarray, "k k"],
     approach_speeds: Float[np.ndarray, " rows"],
+    after: tuple[Step, Unmodelled] | None = None,
 ) -> FittedLaw:
     """Return the law from 0.8 times the slowest to 1.2 times the fastest approach, with its linearised 95 % band.
 
@@ -47,18 +57,23 @@ def law_with_band(
         problem: the model.
         measurement: gives the contact's fixed parameters.
         values: fitted values.
-        covariance: of the values; infinite entries give an open band (NaN).
+        covariance: of the values, or of those after the step; infinite entries give an open band (NaN).
         approach_speeds: of the rows' orbits in nm/us, NaN where a row has none.
+        after: the step from these values with what the model leaves out; None: the model is taken at its word.
     """
-    known = approach_speeds[np.isfinite(approach_speeds)]
-    slow, fast = (0.8 * known.min(), 1.2 * known.max()) if known.size else (1.0, 100.0)
-    speeds = np.geomspace(slow, fast, _POINTS)
-    law, slope = law_and_slope(jnp.asarray(values), jnp.asarray(speeds), measurement, problem)
-    rebound, delay = np.asarray(law)
-    if np.all(np.isfinite(covariance)):
-        width = _TWO_SIDED_95 * np.sqrt(np.einsum("lnp,pq,lnq->ln", np.asarray(slope), covariance, np.asarray(slope)))
+    slow, fast = speed_range(approach_speeds)
+    speeds = np.geomspace(0.8 * slow, 1.2 * fast, _POINTS)
+    found = law_and_slope(jnp.asarray(values), jnp.asarray(speeds), measurement, problem)
+    law, slope = np.asarray(found[0]), np.asarray(found[1])
+    if after is not None:
+        (rebound, delay), error = law_after(*after, speeds, law, slope)
     else:
-        width = np.full((2, _POINTS), np.nan)
+        (rebound, delay), error = law, np.zeros((2, _POINTS))
+    if not np.all(np.isfinite(covariance)):
+        error = np.full((2, _POINTS), np.nan)
+    elif after is None:
+        error = np.sqrt(np.einsum("lnp,pq,lnq->ln", slope, covariance, slope))
+    width = _TWO_SIDED_95 * error
     return FittedLaw(
         approach_speed_nm_per_us=speeds,
         rebound_speed_nm_per_us=rebound,
@@ -68,6 +83,12 @@ def law_with_band(
         delay_low_us=delay - width[1],
         delay_high_us=delay + width[1],
     )
+
+
+def speed_range(approach_speeds: Float[np.ndarray, " rows"]) -> tuple[float, float]:
+    """Return slowest and fastest of the known speeds; 1.25 and 83 nm/us where there is none."""
+    known = approach_speeds[np.isfinite(approach_speeds)]
+    return (float(known.min()), float(known.max())) if known.size else (1.25, 250.0 / 3.0)
 
 
 @partial(jax.jit, static_argnames=("problem",))
@@ -104,17 +125,20 @@ class Found:
 
 def summarise(table: AmplitudeTable, found: Found) -> FitResult:
     """Return errors, intervals, checks and verdict of a minimum."""
-    return _Summary(found.objective, table, found.minimum, found.strain, found.settings).result()
+    return _Summary(table, found).result()
 
 
 class _Summary:
-    """Turns a minimum into a `FitResult`: errors, intervals, checks, verdict."""
+    """Turns a minimum into a `FitResult`: the step with what the model leaves out, errors, intervals, checks, verdict.
 
-    def __init__(
-        self, objective: Objective, table: AmplitudeTable, minimum: Minimum, strain: Strain, settings: dict[str, Any]
-    ):
-        self.searching, self.table, self.minimum, self.strain = objective, table, minimum, strain
-        self.settings, self.problem = settings, objective.problem
+    ``values``, ``covariance``, ``free`` and ``minimum_chi2`` are those of the minimum; ``ends``, ``spread`` and
+    ``chi2``, of the ``parameters``, those after the step.
+    """
+
+    def __init__(self, table: AmplitudeTable, found: Found):
+        objective, minimum = found.objective, found.minimum
+        self.searching, self.table, self.minimum, self.strain = objective, table, minimum, found.strain
+        self.settings, self.problem, self.stated = found.settings, objective.problem, found.stated
         self.values = self.problem.values(minimum.coordinates)
         # orbits are followed from here on: only their places change a little
         self.objective = objective.following(self.values)
@@ -124,22 +148,56 @@ class _Summary:
         self.residual = np.asarray(linear.residual)[0]
         self.amplitude_residual = self.searching.misfit(linear)
         self.prediction = linear.prediction
-        self.chi2 = float(np.sum(self.residual**2))
-        self.constraints = settings["constraints"]
+        self.minimum_chi2 = float(np.sum(self.residual**2))
+        self.constraints = dict(self.settings["constraints"])
         used = int(np.asarray(objective.measurement.rows.measured).sum())
         self.data = used + int(np.asarray(objective.measurement.rows.no_orbit).sum()) + len(self.constraints)
         self.freedom = self.data - len(self.values)
         self.covariance = covariance(self.objective, self.values, self.free)
+        self.rows = self._rows()
+        self.used_speeds = np.where(self.rows.used, self.rows.approach_speed_nm_per_us, np.nan)
+        self.names, self.ends, self.spread = self.problem.names, self.values, self.covariance
+        self.chi2 = self.minimum_chi2
+        self.after = self._step()
+        if self.after is not None:
+            self._take(*self.after)
+
+    def _step(self) -> tuple[Step, Unmodelled] | None:
+        """Return the step with what the model leaves out; None for impacts that take no time, or without slopes."""
+        if not self.problem.lasting or not np.isfinite(self.used_speeds).any():
+            return None
+        scale = self.settings["error_scale"] or 1.0
+        rows = rows_of_fit(self.stated, self.objective, self.values, self.strain, scale)
+        if not all(np.isfinite(part).all() for part in (rows.residual, rows.jacobian, *rows.slopes)):
+            return None
+        values = dict(zip(self.problem.names, self.values.tolist(), strict=True))
+        left_out = Unmodelled(self.problem, values, speed_range(self.used_speeds))
+        return step_of(rows, left_out, self.free), left_out
+
+    def _take(self, step: Step, left_out: Unmodelled) -> None:
+        """Go on with values, errors and residuals after the step."""
+        self.names, self.ends, self.spread = step.names, step.values, step.covariance
+        self.constraints |= left_out.priors
+        if not self.searching.robust:
+            self.chi2 = step.chi2
+        count, error = self.table.rows, np.asarray(self.searching.measurement.rows.error_nm)
+        residual = step.residual[:count]
+        predicted = self.rows.predicted_nm + error[:count] * (residual - self.amplitude_residual[:count])
+        used = np.isfinite(self.rows.residual)
+        self.rows = replace(
+            self.rows,
+            residual=np.where(used, residual, np.nan),
+            predicted_nm=np.where(used, predicted, self.rows.predicted_nm),
+        )
 
     def result(self) -> FitResult:
         judged = self.freedom > 0 and self.settings["error_scale"] is None and not self.searching.robust
         p_value = float(chdtrc(self.freedom, self.chi2)) if judged else float("nan")
         errors = np.sqrt(np.diag(self.covariance))
         moved = ~self.free | ~np.isfinite(errors) | (np.abs(self.values - self.minimum.start) > 1e-3 * errors)
-        unknown = np.full_like(errors, np.inf)
-        rows = self._rows()
-        used_speeds = np.where(rows.used, rows.approach_speed_nm_per_us, np.nan)
-        missed = untabulated(self.objective, self.values, used_speeds)
+        moved = np.append(moved, np.ones(len(self.names) - len(moved), dtype=bool))
+        unknown, rows = np.full(len(self.names), np.inf), self.rows
+        missed = untabulated(self.objective, self.values, self.used_speeds)
         evidence = Evidence(
             table=self.table,
             parameters=self._parameters(unknown, "the model does not explain the data", moved),
@@ -153,14 +211,14 @@ class _Summary:
             error_scale=self.settings["error_scale"],
             lasting=self.problem.lasting,
             robust=self.searching.robust,
-            correlations=_correlations(self.covariance),
+            correlations=_correlations(self.spread),
             untabulated=tuple(np.flatnonzero(missed).tolist()),
         )
         # Errors that assume the model would be confident numbers about a law that is not there.
         explained = not misfits(evidence)
-        shown_covariance = self.covariance if explained else np.full_like(self.covariance, np.inf)
+        shown_covariance = self.spread if explained else np.full_like(self.spread, np.inf)
         if explained:
-            evidence = replace(evidence, parameters=self._explained_parameters(errors, moved))
+            evidence = replace(evidence, parameters=self._explained_parameters(moved))
         reasons, warnings = judge_fit(evidence)
         return FitResult(
             model=self.problem.model,
@@ -179,7 +237,8 @@ class _Summary:
                 self.objective.measurement,
                 self.values,
                 shown_covariance,
-                used_speeds,
+                self.used_speeds,
+                self.after,
             ),
             rows=rows,
             residual_autocorrelation=evidence.autocorrelation,
@@ -189,35 +248,52 @@ class _Summary:
             versions={name: version_of(name) for name in _PACKAGES},
         )
 
-    def _explained_parameters(
-        self, errors: Float[np.ndarray, " p"], moved: Bool[np.ndarray, " p"]
-    ) -> dict[str, FittedParameter]:
+    def _explained_parameters(self, moved: Bool[np.ndarray, " k"]) -> dict[str, FittedParameter]:
         """Return the parameters with their errors and, where all are determined, their intervals."""
-        if not np.all(np.isfinite(errors)):
+        errors = np.sqrt(np.diag(self.spread))
+        if not np.all(np.isfinite(errors)) or not np.all(np.isfinite(self.covariance)):
             # With one parameter adrift there is no minimum to follow for the others.
             return self._parameters(errors, "the data do not determine the parameters", moved)
-        intervals = profile_intervals(self.objective, self.values, self.covariance, self.chi2)
+        intervals = profile_intervals(self.objective, self.values, self.covariance, self.minimum_chi2)
+        if self.after is not None:
+            intervals = self._widened(intervals, errors)
         return self._parameters(errors, intervals, moved)
 
+    def _widened(self, profiles: list[Interval], errors: Float[np.ndarray, " k"]) -> list[Interval]:
+        """Return profile intervals that have moved with their values and grown with their errors; of shapes, Wald's."""
+        intervals = []
+        before = np.sqrt(np.diag(self.covariance))
+        for i, name in enumerate(self.names):
+            if i < len(profiles):
+                ends, reason = (profiles[i].low, profiles[i].high), profiles[i].reason
+                growth = errors[i] / before[i] if before[i] > 0.0 else 1.0
+                low, high = (None if e is None else self.ends[i] + growth * (e - self.values[i]) for e in ends)
+            else:
+                reason, reach = None, _TWO_SIDED_95 * errors[i]
+                low, high = self.ends[i] - reach, self.ends[i] + reach
+            intervals.append(within_range(PARAMETERS[name], Interval(low, high, reason)))
+        return intervals
+
     def _parameters(
-        self, errors: Float[np.ndarray, " p"], intervals: list[Interval] | str, moved: Bool[np.ndarray, " p"]
+        self, errors: Float[np.ndarray, " k"], intervals: list[Interval] | str, moved: Bool[np.ndarray, " k"]
     ) -> dict[str, FittedParameter]:
         """Return the parameters with errors and intervals; for these a text says why there are none."""
         if isinstance(intervals, str):
             intervals = [Interval(None, None, intervals)] * len(errors)
+        free = np.append(self.free, np.ones(len(errors) - len(self.free), dtype=bool))
         return {
             parameter.name: FittedParameter(
-                value=float(self.values[i]),
+                value=float(self.ends[i]),
                 unit=parameter.unit,
-                standard_error=float(errors[i]) if self.free[i] and np.isfinite(errors[i]) else None,
+                standard_error=float(errors[i]) if free[i] and np.isfinite(errors[i]) else None,
                 interval95=(intervals[i].low, intervals[i].high),
                 interval_reason=intervals[i].reason,
-                undetermined=not np.isfinite(self.covariance[i, i]),
-                at_bound=not bool(self.free[i]),
+                undetermined=not np.isfinite(self.spread[i, i]),
+                at_bound=not bool(free[i]),
                 did_not_move=not bool(moved[i]) and parameter.name not in self.constraints,
                 constraint=self.constraints.get(parameter.name),
             )
-            for i, parameter in enumerate(self.problem.parameters)
+            for i, parameter in enumerate(PARAMETERS[name] for name in self.names)
         }
 
     def _rows(self) -> FittedRows:
@@ -254,8 +330,10 @@ class _Summary:
         if self.problem.lasting:
             # it was found with the errors as stated and outliers counting less
             found = float(np.sum(self.searching.residual(values[index : index + 1]) ** 2))
-        if not found < self.chi2 + 4.0:
+        if not found < self.minimum_chi2 + 4.0:
             return None
+        # what the model leaves out has lowered the one, and would have lowered the other
+        found += self.chi2 - self.minimum_chi2
         return dict(zip(self.problem.names, values[index].tolist(), strict=True)), found
 
 
@@ -301,7 +379,8 @@ def fit(  # noqa: PLR0913
     """Fit an impact law to measured amplitudes of single-impact orbits.
 
     Args:
-        table: from `read_table`; what it gives with an error (Q, calibrations) is a nuisance with that constraint.
+        table: from `read_table`; what it gives with an error (Q, calibrations) is a nuisance with that constraint. A Q
+            without error is taken to be known to 2 % where impacts last, and exactly by the instantaneous laws.
         model: "restitution" (r), "law" (r, epsilon; eq. 6) or "viscous" (epsilon, viscous_loss), each instantaneous or
             with "+delay", the collision delay; or "contact", physical parameters through the resolved contact.
         scale_errors: take the amplitudes' errors as relative only and scale them until chi2 equals its degrees of
@@ -344,6 +423,8 @@ def find_fit(  # noqa: PLR0913
     """Return the minimum of a fit; arguments and errors as of `fit`."""
     require_float64()
     known = constraints_of(table, constraints)
+    if table.quality_factor is not None and (model.endswith("+delay") or model == "contact"):
+        known = {"quality_factor": (table.quality_factor, ASSUMED_ERROR_OF_Q * table.quality_factor)} | known
     problem = problem_of(table, model, free=free, constraints=known, effects=effects)
     check_contact_values(model, fixed)
     measurement = measurement_of(table, problem, known, fixed)

@@ -57,7 +57,7 @@ def summary(result: FitResult) -> str:
     parameters = [_parameter_cells(name, parameter) for name, parameter in result.parameters.items()]
     lines = [
         f"Impact law of {result.table.source} ({rows_in_words(result.table.rows)}), model {result.model}:",
-        *(f"  {formula}" for formula in formulas(result.model)),
+        *(f"  {formula}" for formula in formulas(result)),
         "",
         "VALID" if result.valid else "NOT VALID: the numbers below are not a measurement of the law.",
         *(f"  - {reason}" for reason in result.reasons),

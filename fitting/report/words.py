@@ -9,7 +9,7 @@ from jaxtyping import Float
 from afm_jax.words import decimals, interval, percent, value_alone
 from fitting.fits.result import FitResult, FittedParameter
 from fitting.fits.verdict import IMPROBABLE
-from fitting.parameters import DELAY_LAW, LAWS
+from fitting.parameters import DELAY_LAW, DELAY_SHAPE, LAWS, LOSS_SHAPE, SHAPE_NAMES
 
 SHARE_OF_BAND = 0.1
 """How far the rounded formula may be off, in half-widths of the 95 % band."""
@@ -51,12 +51,15 @@ def rows_in_words(count: int) -> str:
     return f"{count} row" if count == 1 else f"{count} rows"
 
 
-def formulas(model: str) -> list[str]:
-    """Return the model's law in formulas."""
+def formulas(result: FitResult) -> list[str]:
+    """Return the fitted law in formulas."""
+    model = result.model
     if model == "contact":
         return ["the law and the delay of the resolved contact (meniscus and JKR junction), by its parameters:"]
-    law = LAWS[model.removesuffix("+delay")].formula
-    return [law, DELAY_LAW.formula] if model.endswith("+delay") else [law]
+    law, lasting = LAWS[model.removesuffix("+delay")], model.endswith("+delay")
+    shaped = any(name in result.parameters for name in SHAPE_NAMES)
+    used = [law, DELAY_LAW] if lasting else [law]
+    return [(shaped and one.shaped) or one.formula for one in used]
 
 
 def has_delay(result: FitResult) -> bool:
@@ -206,7 +209,7 @@ def _why_not_judged(result: FitResult) -> str:
 
 
 def rounded_values(result: FitResult) -> dict[str, str]:
-    """Return the parameters in digits; the formula with them is within a tenth of the band where the law was measured.
+    """Return the parameters in digits; rounding moves the formula by at most a tenth of the band where it was measured.
 
     Errors of correlated parameters are larger than those of the law: rounded to their own errors, the parameters could
     give a curve outside the band.
@@ -238,12 +241,14 @@ def _close_enough(result: FitResult, values: dict[str, float]) -> bool:
         return True
     speed = law.approach_speed_nm_per_us
     measured = (speed >= width.slowest_nm_per_us) & (speed <= width.fastest_nm_per_us)
-    rebound, delay = _formula(values, speed[measured])
-    pairs = (
-        (rebound, law.rebound_speed_nm_per_us[measured], law.rebound_high_nm_per_us[measured]),
-        (delay, law.collision_delay_us[measured], law.delay_high_us[measured]),
+    rounded = _formula(values, speed[measured])
+    exact = _formula({name: p.value for name, p in result.parameters.items()}, speed[measured])
+    bands = (
+        law.rebound_high_nm_per_us - law.rebound_speed_nm_per_us,
+        law.delay_high_us - law.collision_delay_us,
     )
-    return not any(np.any(np.abs(found - exact) > SHARE_OF_BAND * (high - exact)) for found, exact, high in pairs)
+    trios = zip(rounded, exact, bands, strict=True)
+    return not any(np.any(np.abs(one - other) > SHARE_OF_BAND * band[measured]) for one, other, band in trios)
 
 
 def _formula(
@@ -251,11 +256,13 @@ def _formula(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return rebound speed in nm/us and delay in us as the formulas of the page say; zero where the tip is captured."""
     u = approach_speed_nm_per_us
-    square = (values.get("r", 1.0) * u) ** 2 - values.get("viscous_loss", 0.0) * u - values.get("epsilon", 0.0)
+    raised = np.sqrt(u**2 + values.get(LOSS_SHAPE, 0.0))
+    square = (values.get("r", 1.0) * u) ** 2 - values.get("viscous_loss", 0.0) * raised - values.get("epsilon", 0.0)
     free = square > 0.0
     w = np.sqrt(np.where(free, square, 1.0))
     lead, offset = values.get("delay_lead_nm", 0.0), values.get("delay_offset_nm", 0.0)
     delay = values.get("delay_hertz", 0.0) * u**-0.2 - lead * (1.0 / w - 1.0 / u) - offset / u
+    delay += values.get(DELAY_SHAPE, 0.0) * (1.0 / w**2 - 1.0 / u**2)
     return np.where(free, w, 0.0), np.where(free, delay, 0.0)
 
 
