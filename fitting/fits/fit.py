@@ -5,7 +5,7 @@ The fitted impact law over the speeds that were measured, with the band that its
 What a minimum amounts to: errors, intervals, checks, and a verdict on whether to believe it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -29,10 +29,20 @@ from fitting.fits.intervals import (
     profile_intervals,
     within_range,
 )
+from fitting.fits.loss import Loss, energy_lost, equivalent, interval_of
 from fitting.fits.minimum import Minimum, Strain, minimise, relaxed, rescale_errors, settle, strain_of, untabulated
 from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective
 from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows
-from fitting.fits.unmodelled import Step, Unmodelled, law_after, rows_of_fit, step_of
+from fitting.fits.unmodelled import (
+    LawAfter,
+    LawBefore,
+    Step,
+    Unmodelled,
+    law_after,
+    root_of,
+    rows_of_fit,
+    step_of,
+)
 from fitting.fits.verdict import ASSUMED_ERROR_OF_Q, Evidence, judge_fit, misfits
 from fitting.forward import impact_of
 from fitting.models import Measurement, Problem, constraints_of, measurement_of
@@ -63,17 +73,9 @@ def law_with_band(
     """
     slow, fast = speed_range(approach_speeds)
     speeds = np.geomspace(0.8 * slow, 1.2 * fast, _POINTS)
-    found = law_and_slope(jnp.asarray(values), jnp.asarray(speeds), measurement, problem)
-    law, slope = np.asarray(found[0]), np.asarray(found[1])
-    if after is not None:
-        (rebound, delay), error = law_after(*after, speeds, law, slope)
-    else:
-        (rebound, delay), error = law, np.zeros((2, _POINTS))
-    if not np.all(np.isfinite(covariance)):
-        error = np.full((2, _POINTS), np.nan)
-    elif after is None:
-        error = np.sqrt(np.einsum("lnp,pq,lnq->ln", slope, covariance, slope))
-    width = _TWO_SIDED_95 * error
+    found = law_at(problem, measurement, values, covariance, speeds, after)
+    rebound, delay = found.law
+    width = _TWO_SIDED_95 * np.linalg.norm(found.factor, axis=2)
     return FittedLaw(
         approach_speed_nm_per_us=speeds,
         rebound_speed_nm_per_us=rebound,
@@ -82,6 +84,65 @@ def law_with_band(
         collision_delay_us=delay,
         delay_low_us=delay - width[1],
         delay_high_us=delay + width[1],
+    )
+
+
+def law_at(
+    problem: Problem,
+    measurement: Measurement,
+    values: Float[np.ndarray, " p"],
+    covariance: Float[np.ndarray, "k k"],
+    speeds: Float[np.ndarray, " n"],
+    after: tuple[Step, Unmodelled] | None = None,
+) -> LawAfter:
+    """Return the law at approach speeds in nm/us; the other arguments as of `law_with_band`."""
+    law, slope = jax.tree.map(np.asarray, law_and_slope(jnp.asarray(values), jnp.asarray(speeds), measurement, problem))
+    count = speeds.size
+    before = LawBefore(law[:, :count], slope[:, :count], float(law[0, count]), slope[0, count])
+    if not np.all(np.isfinite(covariance)) or after is None:
+        root = root_of(covariance)[: slope.shape[2]]
+        found = LawAfter(before.law, before.slope @ root, before.capture, before.capture_slope @ root)
+        if after is None:
+            return found
+        unknown = [np.full_like(found.factor, np.nan), np.full_like(found.capture_factor, np.nan)]
+        moved = law_after(*after, speeds, before)
+        return LawAfter(moved.law, unknown[0], moved.capture, unknown[1])
+    return law_after(*after, speeds, before)
+
+
+def loss_of(
+    found: Callable[[Float[np.ndarray, " n"]], LawAfter],
+    measured: tuple[float, float],
+    asked: tuple[float, float] | None,
+    mass_ng: float,
+) -> Loss:
+    """Return what impacts take: energies at measured speeds, the paper's laws over these and over those asked for.
+
+    Args:
+        found: the law at approach speeds in nm/us.
+        measured: slowest and fastest approach in nm/us.
+        asked: the same of another range; None: no other.
+        mass_ng: of the tip.
+    """
+    three = np.geomspace(*measured, 3)
+    # two digits, and within what was measured
+    three = np.clip([float(f"{speed:.2g}") for speed in three], *measured)
+    there = found(np.resize(three, _POINTS))
+    error = np.linalg.norm(there.factor[0], axis=1)
+    energies = [
+        energy_lost(float(u), float(w), float(e), mass_ng)
+        for u, w, e in zip(three, there.law[0, :3], error[:3], strict=True)
+    ]
+    laws = []
+    for ends in (measured, asked):
+        if ends is not None and ends[0] < ends[1]:
+            speeds = np.linspace(*ends, _POINTS)
+            law = found(speeds)
+            laws.append(equivalent(speeds, law.law[0], law.factor[0], mass_ng))
+    return Loss(
+        energies=tuple(dict.fromkeys(energies)),
+        equivalents=tuple(law for law in laws if law is not None),
+        capture_speed_nm_per_us=interval_of(there.capture, float(np.linalg.norm(there.capture_factor)), lowest=0.0),
     )
 
 
@@ -94,17 +155,23 @@ def speed_range(approach_speeds: Float[np.ndarray, " rows"]) -> tuple[float, flo
 @partial(jax.jit, static_argnames=("problem",))
 def law_and_slope(
     values: Float[Array, " p"], speeds: Float[Array, " n"], measurement: Measurement, problem: Problem
-) -> tuple[Float[Array, "2 n"], Float[Array, "2 n p"]]:
-    """Return rebound speeds and delays at approach speeds, and their derivatives by the parameters."""
+) -> tuple[Float[Array, "2 n+1"], Float[Array, "2 n+1 p"]]:
+    """Return rebound speeds and delays at approach speeds, and their derivatives by the parameters.
+
+    The last column is that of the capture speed, twice.
+    """
 
     def law(v):
         impact = impact_of(v, measurement, problem)
         if isinstance(impact, LawImpact):
-            return jnp.stack([impact.law.rebound_speed(speeds), impact.law.collision_delay(speeds)])
+            capture = jnp.full((2, 1), impact.law.capture_speed_nm_per_us)
+            found = jnp.stack([impact.law.rebound_speed(speeds), impact.law.collision_delay(speeds)])
+            return jnp.concatenate([found, capture], axis=1)
         found = jax.vmap(impact.speeds)(speeds)
         # below the table the contact captures
         free = speeds > impact.lowest
-        return jnp.stack([jnp.where(free, found.rebound, 0.0), jnp.where(free, found.delay, 0.0)])
+        there = jnp.stack([jnp.where(free, found.rebound, 0.0), jnp.where(free, found.delay, 0.0)])
+        return jnp.concatenate([there, jnp.full((2, 1), impact.lowest)], axis=1)
 
     return law(values), jax.jacfwd(law)(values)
 
@@ -240,6 +307,7 @@ class _Summary:
                 self.used_speeds,
                 self.after,
             ),
+            loss=self._loss(shown_covariance),
             rows=rows,
             residual_autocorrelation=evidence.autocorrelation,
             convergence=self.convergence,
@@ -247,6 +315,18 @@ class _Summary:
             settings=self.settings,
             versions={name: version_of(name) for name in _PACKAGES},
         )
+
+    def _loss(self, shown: Float[np.ndarray, "k k"]) -> Loss | None:
+        """Return what impacts take; None where no row has a speed."""
+        if not np.isfinite(self.used_speeds).any():
+            return None
+        measurement = self.objective.measurement
+
+        def found(speeds: Float[np.ndarray, " n"]) -> LawAfter:
+            return law_at(self.problem, measurement, self.values, shown, speeds, self.after)
+
+        asked = self.settings.get("speeds")
+        return loss_of(found, speed_range(self.used_speeds), asked, float(measurement.cantilever.mass_ng))
 
     def _explained_parameters(self, moved: Bool[np.ndarray, " k"]) -> dict[str, FittedParameter]:
         """Return the parameters with their errors and, where all are determined, their intervals."""
@@ -375,6 +455,7 @@ def fit(  # noqa: PLR0913
     constraints: dict[str, tuple[float, float]] | None = None,
     effects: Sequence[str] = EFFECTS,
     robust: bool = False,
+    speeds: tuple[float, float] | None = None,
 ) -> FitResult:
     """Fit an impact law to measured amplitudes of single-impact orbits.
 
@@ -395,6 +476,8 @@ def fit(  # noqa: PLR0913
         effects: for "contact": the effects there are.
         robust: let outliers count linearly from two errors on; the result is valid only if they are few and the other
             amplitudes are explained.
+        speeds: slowest and fastest approach in nm/us over which the closest law of the paper is given, besides that
+            over the measured speeds.
 
     Returns:
         Values, errors, intervals, goodness of fit and a verdict; see `FitResult`.
@@ -405,6 +488,9 @@ def fit(  # noqa: PLR0913
         RuntimeError: if JAX is not set to 64-bit floats.
     """
     options: dict[str, Any] = {"free": free, "fixed": fixed, "constraints": constraints, "effects": effects}
+    if speeds is not None and not 0.0 < speeds[0] < speeds[1] < np.inf:
+        raise ValueError(f"`speeds` must be a rising pair of positive numbers in nm/us, but is {speeds!r}")
+    options["speeds"] = speeds
     found = find_fit(table, model, scale_errors=scale_errors, robust=robust, **options)
     return summarise(table, found)
 
@@ -419,6 +505,7 @@ def find_fit(  # noqa: PLR0913
     constraints: dict[str, tuple[float, float]] | None = None,
     effects: Sequence[str] = EFFECTS,
     robust: bool = False,
+    speeds: tuple[float, float] | None = None,
 ) -> Found:
     """Return the minimum of a fit; arguments and errors as of `fit`."""
     require_float64()
@@ -449,6 +536,7 @@ def find_fit(  # noqa: PLR0913
         "free": list(problem.own),
         "fixed": fixed or {},
         "effects": list(effects) if model == "contact" else None,
+        "speeds": speeds,
     }
     return Found(stated, objective, minimum, strain, settings)
 

@@ -333,25 +333,39 @@ def rows_of_fit(
     )
 
 
-def law_after(
-    step: Step,
-    left_out: Unmodelled,
-    speeds: Float[np.ndarray, " n"],
-    law: Float[np.ndarray, "2 n"],
-    slope: Float[np.ndarray, "2 n p"],
-) -> tuple[Float[np.ndarray, "2 n"], Float[np.ndarray, "2 n"]]:
-    """Return rebound speeds and delays after the step, and their standard errors.
+class LawAfter(NamedTuple):
+    """Rebound speeds in nm/us and delays in us, capture speed, and how they change with unknowns of unit variance."""
+
+    law: Float[np.ndarray, "2 n"]
+    factor: Float[np.ndarray, "2 n m"]
+    capture: float
+    capture_factor: Float[np.ndarray, " m"]
+
+
+class LawBefore(NamedTuple):
+    """The fitted law at approach speeds in nm/us, with its derivatives by the parameters.
+
+    Rebound speeds in nm/us and delays in us, and the capture speed in nm/us.
+    """
+
+    law: Float[np.ndarray, "2 n"]
+    slope: Float[np.ndarray, "2 n p"]
+    capture: float
+    capture_slope: Float[np.ndarray, " p"]
+
+
+def law_after(step: Step, left_out: Unmodelled, speeds: Float[np.ndarray, " n"], before: LawBefore) -> LawAfter:
+    """Return the law after the step.
 
     Args:
         step: the step.
         left_out: by the fitted model.
         speeds: approach speeds in nm/us.
-        law: the fitted model's rebound speeds in nm/us and delays in us there.
-        slope: their derivatives by its parameters.
+        before: the fitted law there.
     """
+    law, slope = before.law, before.slope
     leaves = law[0] > 0.0
     w = np.where(leaves, law[0], 1.0)
-    columns = left_out.columns(speeds, w)
     # what changes the speed changes the delay along with it
     lead = left_out.values.get("delay_lead_nm", 0.0) / (2.0 * w**3)
 
@@ -361,17 +375,48 @@ def law_after(
         along = (slice(None), *(None,) * (square.ndim - 1))
         return np.stack([square / (2.0 * w)[along], late + lead[along] * square])
 
-    known, by_unknown = seen(columns.known), seen(columns.unknown)
-    by_value = np.concatenate([slope, seen(columns.shape)], axis=2)
-    if "viscous_loss" in step.names:
-        by_value[:, :, step.names.index("viscous_loss")] += seen(columns.drag)
-    count = by_unknown.shape[2]
-    found = law + known + by_value @ step.change + by_unknown @ step.unknown[:count]
+    columns = left_out.columns(speeds, w)
+    found, factor = _moved(step, slope, Columns(*(seen(part) for part in columns)))
+    found = np.where(leaves, law + found, law)
     found[0] = np.maximum(found[0], 0.0)
-    found = np.where(leaves, found, law)
-    if not np.all(np.isfinite(step.covariance)):
-        return found, np.full_like(found, np.nan)
-    total = by_value + by_unknown @ step.follow[:count]
-    variance = np.einsum("lnk,kj,lnj->ln", total, step.covariance, total)
-    variance += np.einsum("lnk,kj,lnj->ln", by_unknown, step.unknown_covariance[:count, :count], by_unknown)
-    return found, np.where(leaves, np.sqrt(np.maximum(variance, 0.0)), 0.0)
+    # where the squared rebound speed vanishes
+    edge = left_out.columns(np.array([before.capture]), np.zeros(1)) if before.capture > 0.0 else columns
+    rising = 2.0 * left_out.values.get("r", 1.0) ** 2 * before.capture - left_out.values.get("viscous_loss", 0.0)
+    at_capture = Columns(*(-part[:1, :1] / max(rising, 1e-9) for part in edge))
+    shift, capture_factor = _moved(step, before.capture_slope[None, None], at_capture)
+    return LawAfter(
+        law=found,
+        factor=np.where(leaves[:, None], factor, 0.0),
+        capture=max(before.capture + float(shift[0, 0]), 0.0),
+        capture_factor=capture_factor[0, 0],
+    )
+
+
+def _moved(
+    step: Step, slope: Float[np.ndarray, "k n p"], columns: Columns
+) -> tuple[Float[np.ndarray, "k n"], Float[np.ndarray, "k n m"]]:
+    """Return by how much quantities move in the step, and how they change with unknowns of unit variance.
+
+    Args:
+        step: the step.
+        slope: of the quantities by the model's parameters.
+        columns: changes of the quantities with what is left out.
+    """
+    by_value = np.concatenate([slope, columns.shape], axis=2)
+    if "viscous_loss" in step.names:
+        by_value[:, :, step.names.index("viscous_loss")] += columns.drag
+    count = columns.unknown.shape[2]
+    moved = columns.known + by_value @ step.change + columns.unknown @ step.unknown[:count]
+    total = by_value + columns.unknown @ step.follow[:count]
+    own = columns.unknown @ root_of(step.unknown_covariance[:count, :count])
+    return moved, np.concatenate([total @ root_of(step.covariance), own], axis=2)
+
+
+def root_of(covariance: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
+    """Return a matrix whose product with its transpose is the covariance; NaN where that is not finite."""
+    if not np.all(np.isfinite(covariance)):
+        return np.full_like(covariance, np.nan)
+    error = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    safe = np.where(error > 0.0, error, 1.0)
+    variance, axes = np.linalg.eigh(covariance / np.outer(safe, safe))
+    return error[:, None] * axes * np.sqrt(np.maximum(variance, 0.0))

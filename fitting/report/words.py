@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.words import decimals, interval, percent, value_alone
+from fitting.fits.loss import WithInterval
 from fitting.fits.result import FitResult, FittedParameter
 from fitting.fits.verdict import IMPROBABLE
 from fitting.parameters import DELAY_LAW, DELAY_SHAPE, LAWS, LOSS_SHAPE, SHAPE_NAMES
@@ -15,6 +16,8 @@ SHARE_OF_BAND = 0.1
 """How far the rounded formula may be off, in half-widths of the 95 % band."""
 _MOST_EXTRA = 8
 _UNLIKELY = 0.05
+_EXACT = 1e-8
+"""Relative distance below which two laws are the same."""
 _ROUND = (1.0, 2.0, 3.0, 5.0, 7.0)
 
 
@@ -49,6 +52,42 @@ class Sampled(Protocol):
 def rows_in_words(count: int) -> str:
     """Return '1 row' or '82 rows'."""
     return f"{count} row" if count == 1 else f"{count} rows"
+
+
+def known_in_words(known: WithInterval, unit: str = "") -> str:
+    """Return '58.9 aJ (58.2 to 59.6)', the digits as the interval warrants them."""
+    value, (low, high) = known.value, known.interval95
+    tail = f" {unit}" if unit else ""
+    if low is None or high is None:
+        return f"{value:.4g}{tail}"
+    digits = min(decimals(high - low, unknown=6), 8)
+    return f"{value:.{digits}f}{tail} ({low:.{digits}f} to {high:.{digits}f})"
+
+
+def losses_in_words(result: FitResult) -> list[list[str]]:
+    """Return what an impact takes, row by row: what, and how much with its 95 % interval.
+
+    The energy at three speeds, the closest law of the paper over each range of speeds, and the capture speed.
+    """
+    loss = result.loss
+    if loss is None:
+        return []
+    rows = [
+        [
+            f"energy lost at {one.approach_speed_nm_per_us:.3g} nm/us",
+            f"{known_in_words(one.energy_aj, 'aJ')}, {known_in_words(one.energy_ev, 'eV')}",
+        ]
+        for one in loss.energies
+    ]
+    for one in loss.equivalents:
+        over = f"as eq. 6 over {one.slowest_nm_per_us:.3g} to {one.fastest_nm_per_us:.3g} nm/us"
+        off = f", off by at most {percent(one.worst_error)} of u_out" if one.worst_error > _EXACT else ""
+        rows += [
+            [f"{over}: r", f"{known_in_words(one.r)}{off}"],
+            [f"{over}: epsilon", known_in_words(one.epsilon_nm2_per_us2, "nm^2/us^2")],
+            [f"{over}: delta", f"{known_in_words(one.delta_aj, 'aJ')}, {known_in_words(one.delta_ev, 'eV')}"],
+        ]
+    return [*rows, ["captured below (extrapolated)", known_in_words(loss.capture_speed_nm_per_us, "nm/us")]]
 
 
 def formulas(result: FitResult) -> list[str]:
