@@ -112,6 +112,15 @@ def test_a_quality_factor_that_is_pulled_is_named_and_then_not_believed(value, n
     assert any(said in reason for reason in reasons) is refused
 
 
+@pytest.mark.parametrize(
+    ("share", "said"), [(0.1, "errors may be too small"), (0.4, "Impacts last up to 40 % of a drive")]
+)
+def test_an_impact_that_lasts_long_is_not_laid_to_the_errors(share, said):
+    given = dataclasses.replace(evidence("law+delay", made_table()), p_value=1e-9, contact_share=share)
+    (reason,) = [text for text in judge_fit(given)[0] if "does not explain" in text]
+    assert said in reason
+
+
 def test_an_error_of_the_quality_factor_that_was_assumed_is_said():
     table = dataclasses.replace(made_table(), quality_factor=40.0, quality_factor_error=None)
     given = evidence("law+delay", table)

@@ -224,7 +224,7 @@ class _Summary:
         self.rows = self._rows()
         self.used_speeds = np.where(self.rows.used, self.rows.approach_speed_nm_per_us, np.nan)
         self.names, self.ends, self.spread = self.problem.names, self.values, self.covariance
-        self.chi2 = self.minimum_chi2
+        self.chi2, self.contact_share = self.minimum_chi2, 0.0
         self.after = self._step()
         if self.after is not None:
             self._take(*self.after)
@@ -237,6 +237,10 @@ class _Summary:
         rows = rows_of_fit(self.stated, self.objective, self.values, self.strain, scale)
         if not all(np.isfinite(part).all() for part in (rows.residual, rows.jacobian, *rows.slopes)):
             return None
+        used = np.flatnonzero(np.isfinite(self.used_speeds))
+        # of the Hertz time, in us and kHz
+        shares = 1e-3 * rows.hertz_time[used] * self.table.drive_frequency_khz[used]
+        self.contact_share = float(shares.max())
         values = dict(zip(self.problem.names, self.values.tolist(), strict=True))
         left_out = Unmodelled(self.problem, values, speed_range(self.used_speeds))
         return step_of(rows, left_out, self.free), left_out
@@ -280,6 +284,7 @@ class _Summary:
             robust=self.searching.robust,
             correlations=_correlations(self.spread),
             untabulated=tuple(np.flatnonzero(missed).tolist()),
+            contact_share=self.contact_share,
         )
         # Errors that assume the model would be confident numbers about a law that is not there.
         explained = not misfits(evidence)

@@ -32,7 +32,7 @@ from fitting.parameters import DELAY_SHAPE, LOSS_SHAPE, PARAMETERS
 
 LOSS_SPEED_SQUARED = 110.0, 60.0
 """q in nm^2/us^2 and its standard error: free fits of the laws of contacts give 96 to 125, a wet one 234."""
-_LOSS_SHARE = 0.05
+_LOSS_SHARE = 0.07
 """Standard deviation of the smooth part of the loss, relative."""
 _MISSING_SHARE = 0.3
 """That of a term that the model lacks, over the loss at the middle of the speeds."""

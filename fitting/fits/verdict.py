@@ -36,6 +36,8 @@ taken to be correlated: by chance in one fit of ten thousand."""
 _NEGLIGIBLE = 0.3
 """Root mean square of the residuals, in errors, below which their pattern is of no consequence."""
 _FEWEST_NEIGHBOURS = 8
+_LONG_CONTACT = 0.2
+"""Share of the drive's period in contact from which a misfit is laid to it: the corrections are fitted up to there."""
 ASSUMED_ERROR_OF_Q = 0.02
 """Relative standard error of a quality factor that is given without one."""
 _PULLED, _TORN = 2.0, 3.0
@@ -61,6 +63,8 @@ class Evidence:
     correlations: Float[np.ndarray, "p p"]
     untabulated: tuple[int, ...] = ()
     """Rows whose impacts the table of a contact does not hold to its accuracy."""
+    contact_share: float = 0.0
+    """Largest share of a drive's period that the tip is in contact."""
 
 
 def judge_fit(evidence: Evidence) -> tuple[list[str], list[str]]:
@@ -237,6 +241,11 @@ def _why_not_explained(evidence: Evidence) -> str:
     few = 2 * _outliers(evidence, evidence.error_scale or 1.0).sum() <= evidence.rows.used.sum()
     if few and not evidence.robust and not _correlations(evidence):
         tail += " (if only a few are wrong: --robust)"
+    if evidence.contact_share > _LONG_CONTACT:
+        return (
+            f"Impacts last up to {100.0 * evidence.contact_share:.0f} % of a drive period: too long to be impacts of a "
+            f"platform that hardly moves meanwhile; measure at lower frequencies, or at lower orders; {tail}."
+        )
     if evidence.lasting:
         other = "The loss may depend on the speed otherwise (try viscous+delay), the" if "r" in names else "The"
         return (
