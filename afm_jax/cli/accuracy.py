@@ -71,7 +71,7 @@ COLLIDE_FULL = {
     "steps": [2, 8],
     "batch": 500,
     "repetitions": 3,
-    "scipy_speeds": [12.0, 30.0, 100.0],
+    "integrators": [["DOP853", "LSODA"], [12.0, 30.0, 100.0]],
 }
 COLLIDE_QUICK = {
     "tolerances": [1e-6],
@@ -80,7 +80,7 @@ COLLIDE_QUICK = {
     "steps": [],
     "batch": 8,
     "repetitions": 1,
-    "scipy_speeds": [30.0],
+    "integrators": [["DOP853", "LSODA"], [30.0]],
 }
 
 
