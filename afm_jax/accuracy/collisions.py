@@ -197,11 +197,11 @@ def _row(
 
 
 def _outputs(run: Callable[[Contact, Array], Collision], speeds: Array) -> Outputs:
-    found = jax.jit(lambda at: _values_and_slopes(run, at), compiler_options=_UNHURRIED)(speeds)
+    found = jax.jit(lambda at: values_and_slopes(run, at), compiler_options=_UNHURRIED)(speeds)
     return {key: np.asarray(part, np.float64) for key, part in found.items()}
 
 
-def _values_and_slopes(run: Callable[[Contact, Array], Collision], speeds: Array) -> dict[str, Array]:
+def values_and_slopes(run: Callable[[Contact, Array], Collision], speeds: Array) -> dict[str, Array]:
     """Return rebound speeds, delays, and slopes of the rebound speed by speed and by viscosity."""
     dtype = speeds.dtype
 
@@ -261,7 +261,7 @@ def _adaptive(
 
     @partial(jax.jit, compiler_options=_UNHURRIED)
     def slopes(junction, tolerance):
-        return _values_and_slopes(lambda contact, speeds: run(contact, junction, speeds, tolerance), speeds)
+        return values_and_slopes(lambda contact, speeds: run(contact, junction, speeds, tolerance), speeds)
 
     rows = []
     for tolerance in tolerances:
