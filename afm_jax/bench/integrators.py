@@ -65,7 +65,9 @@ def integrate_to_event(
         return _cvode(rates, span, state, events, integrator, direction)
     for event in events:
         vars(event).update(terminal=True, direction=direction)
-    path = solve_ivp(rates, span, state, events=list(events), **integrator._asdict())
+    # a trial step of a loose tolerance may go beyond all numbers; it is then rejected
+    with np.errstate(all="ignore"):
+        path = solve_ivp(rates, span, state, events=list(events), **integrator._asdict())
     if path.status != 1:
         raise ValueError(f"SciPy ended without an event: {path.message}")
     met = next(place for place, times in enumerate(path.t_events) if len(times))

@@ -223,15 +223,17 @@ def overview_figure(rows: Sequence[Mapping[str, Any]], references: Mapping[str, 
         rows: as `afm_jax.accuracy.overview` returns them.
         references: likewise; the error of a reference is a dotted line.
     """
-    figure = new_figure(16.0, 10.0)
+    figure = new_figure(16.0, 11.0)
     panels = figure.subplots(2, -(-len(references) // 2), squeeze=False).ravel()
     for axes, (problem, told) in zip(panels, references.items(), strict=False):
         _overview_panel(axes, [row for row in rows if row["problem"] == problem])
         if told["reference_error"] > _SMALLEST:
-            axes.axvline(told["reference_error"], color=DARK, linestyle=":", linewidth=1.2, label="of the reference")
+            axes.axvline(
+                told["reference_error"], color=DARK, linestyle=":", linewidth=1.2, label="error of the reference"
+            )
         axes.set_title(problem)
-        label_axes(axes, x=f"error of the {told['error_of']}", y="time (µs), one core")
-        axes.legend(fontsize=8, loc="best", framealpha=0.7)
+        label_axes(axes, x=f"error of the {told['error_of'].replace('(us)', '(µs)')}", y="time (µs), one core")
+        axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2, frameon=False)
     for axes in panels[len(references) :]:
         axes.set_visible(False)
     return figure
