@@ -15,7 +15,7 @@ from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, ne
 from afm_jax.words import bullets, text_table, with_error
 from fitting.inversion.regression import SavedLaw
 from fitting.inversion.result import Coefficient, Inversion, RegressedLaw
-from fitting.parameters import DELAY_LAW, LAWS
+from fitting.parameters import LAWS
 
 ROW_COLUMNS = (
     "line",
@@ -49,7 +49,7 @@ LAW_COLUMNS = (
 _FORMULAS = {
     "viscous": LAWS["viscous"].formula,
     "restitution": f"{LAWS['law'].formula}  (eq. 6)",
-    "delay": DELAY_LAW.formula.replace("delay_", ""),
+    "delay": "tau = hertz u_in^(-1/5) - lead_nm (1/u_out - 1/u_in) - offset_nm/u_in",
 }
 NS_PER_US = 1e3
 Table = Callable[[str, list[dict[str, Any]], tuple[str, ...]], None]
