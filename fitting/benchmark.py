@@ -17,17 +17,10 @@ from afm_jax.accuracy.overview import overview_row
 from afm_jax.bench.timing import progress
 from fitting.fits.least_squares import Box, Searches, descended
 from fitting.fits.objective import PLAIN, Objective, polish
-from fitting.models import Problem, measurement_of, model_parameters
+from fitting.models import Problem, measurement_of
+from fitting.parameters import model_parameters, paper_values
 from fitting.tables.table import AmplitudeTable, write_table
 
-_PAPER = {
-    "epsilon": 113.6,
-    "viscous_loss": 0.5,
-    "delay_hertz": 0.2033,
-    "delay_lead_nm": 6.8,
-    "delay_offset_nm": 0.58,
-}
-"""Law and delay of the paper's contact, which "contact" fits as well."""
 _NOISE = 0.01
 _OFF = 0.03
 """How far parameters are off where searches start, in turns up and down."""
@@ -93,7 +86,7 @@ def minimum_accuracy(
         `rows` and `references` as in `afm_jax.accuracy.overview`; the error is the largest relative one of a parameter.
     """
     problem = Problem("viscous+delay", model_parameters("viscous+delay"))
-    truth = np.array([_PAPER[name] for name in problem.names])
+    truth = np.array([paper_values("viscous+delay")[name] for name in problem.names])
     start = problem.coordinates(truth[None] * (1.0 + _OFF * (-1.0) ** np.arange(truth.size)))
     table = made_table(rows, noise=0.0)
     objective = Objective(measurement_of(table, problem), problem).following(problem.values(start)[0])
@@ -152,7 +145,7 @@ def made_table(rows: int, *, seed: int = 0, noise: float = _NOISE) -> AmplitudeT
         noise: relative; the errors that the table states are 1 % whatever it is.
     """
     problem = Problem("viscous+delay", model_parameters("viscous+delay"))
-    values = np.array([_PAPER[name] for name in problem.names])
+    values = np.array([paper_values("viscous+delay")[name] for name in problem.names])
     place = np.arange(4 * rows)
     order = place % 4 + 1
     drive: dict[str, Any] = {

@@ -31,18 +31,8 @@ from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact
 from afm_jax.impact.map import NEAR_GRAZING
 from afm_jax.impact.orbits import amplitudes, near_fold, orbit_state, steady_orbits
 from afm_jax.impact.roots import follow_root, harmless_coordinate
-from fitting.models import (
-    CONTACT_NAMES,
-    NUISANCE_NAMES,
-    PARAMETERS,
-    ROWS_PER_PROGRAM,
-    Measurement,
-    Problem,
-    Rows,
-    check_contact_values,
-    measurement_of,
-    model_parameters,
-)
+from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem, Rows, measurement_of
+from fitting.parameters import CONTACT_NAMES, NUISANCE_NAMES, PARAMETERS, check_contact_values, model_parameters
 from fitting.tables.table import AmplitudeTable
 
 

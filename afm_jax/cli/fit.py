@@ -14,6 +14,7 @@ from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import Share, parse_around_plus_minus, parse_number
 from afm_jax.contact.parameters import EFFECTS, REMOVABLE_EFFECTS, idle_without
 from afm_jax.words import text_table
+from fitting.parameters import CONTACT_DEFAULT, DELAY_LAW, LAWS, MODELS, NUISANCE_NAMES
 
 if TYPE_CHECKING:
     from fitting.fits.result import FitResult
@@ -81,9 +82,6 @@ class Names(click.ParamType):
         return names
 
 
-MODELS = ("restitution", "law", "viscous", "restitution+delay", "law+delay", "viscous+delay", "contact")
-
-
 @click.command()
 @click.argument("table", metavar="[TABLE.csv]", required=False, type=click.Path(path_type=Path))
 @click.option(
@@ -91,8 +89,8 @@ MODELS = ("restitution", "law", "viscous", "restitution+delay", "law+delay", "vi
     default="law",
     show_default=True,
     type=click.Choice(MODELS),
-    help="restitution: r alone; law: r and epsilon; viscous: epsilon and viscous_loss; each with the collision delay "
-    "(+delay), which amplitudes near resonance need; contact: physical parameters through the resolved contact.",
+    help="; ".join(f"{name}: {law.meaning}" for name, law in LAWS.items())
+    + f"; each with {DELAY_LAW.meaning} (+delay); contact: physical parameters through the resolved contact.",
 )
 @click.option(
     "--noise",
@@ -110,8 +108,7 @@ MODELS = ("restitution", "law", "viscous", "restitution+delay", "law+delay", "vi
     "--free",
     type=Names(),
     metavar="NAME,...",
-    help="contact: the parameters that are fitted; if left out relative_humidity,adhesion_energy_j_per_m2,"
-    "viscosity_pa_s,modulus_gpa.",
+    help=f"contact: the parameters that are fitted; if left out {','.join(CONTACT_DEFAULT)}.",
 )
 @click.option("--fix", type=Fixed(), multiple=True, metavar="NAME=VALUE", help="contact: a value not the paper's.")
 @click.option(
@@ -119,8 +116,7 @@ MODELS = ("restitution", "law", "viscous", "restitution+delay", "law+delay", "vi
     type=Constraint(),
     multiple=True,
     metavar="NAME=VALUE+-ERROR",
-    help="What is known beforehand: quality_factor, tip_calibration, drive_calibration, offset_origin_nm, or a "
-    "parameter of the model.",
+    help=f"What is known beforehand: {', '.join(NUISANCE_NAMES)}, or a parameter of the model.",
 )
 @click.option("--no", "left_out", type=Names(), metavar="EFFECT,...", help="contact: effects that it does not have.")
 @click.option("--compare", "comparing", is_flag=True, help="Fit the rival models too and say what the table can tell.")
@@ -204,8 +200,6 @@ def _effects(left_out: tuple[str, ...]) -> tuple[str, ...]:
 
 def _usual_parameters(fixed: dict[str, float], effects: tuple[str, ...]) -> tuple[str, ...]:
     """Return which parameters are fitted if the call names none: the usual ones that are neither fixed nor idle."""
-    from fitting.models import CONTACT_DEFAULT  # noqa: PLC0415
-
     chosen = [name for name in CONTACT_DEFAULT if name not in fixed and not idle_without(name, effects)]
     if not chosen:
         raise click.UsageError("--fix holds every parameter that is usually fitted; name others to fit with --free")

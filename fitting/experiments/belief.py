@@ -10,25 +10,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.contact.parameters import EFFECTS, PAPER
+from afm_jax.contact.parameters import EFFECTS
 from fitting.fits.result import FitResult
-from fitting.models import (
-    CONTACT_NAMES,
+from fitting.models import Problem
+from fitting.parameters import (
     NUISANCE_NAMES,
     PARAMETERS,
     Parameter,
-    Problem,
     check_contact_values,
     model_parameters,
+    paper_values,
 )
 
-_DELAY = {"delay_hertz": 0.206, "delay_lead_nm": 5.64, "delay_offset_nm": 0.726}
-_STARTING_LAWS = {
-    "restitution": {"r": 0.998},
-    "law": {"r": 0.998, "epsilon": 122.0},
-    "viscous": {"epsilon": 113.6, "viscous_loss": 0.5},
-}
-"""Laws of the paper's contact: a belief to begin with where nothing was measured."""
 UNCERTAINTY = 0.1
 """How far a belief is off, relative, where no measurement says."""
 DRAW_SEED = 1997
@@ -135,7 +128,7 @@ def believe(  # noqa: PLR0913
         raise ValueError(f"`uncertainty` must be between 0 and 1, but is {uncertainty!r}; write 0.1 for 10 %")
     problem = Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in known), tuple(effects))
     assumed = [name for name in own if name not in given and name not in known]
-    start = _starting_values(model, own) | {name: value for name, (value, _) in known.items()} | given
+    start = paper_values(model) | {name: value for name, (value, _) in known.items()} | given
     return Belief(
         problem=problem,
         values=checked_values(problem, start),
@@ -178,12 +171,6 @@ def checked_values(problem: Problem, values: Mapping[str, float]) -> Float[np.nd
                 f"{parameter.name} must be between {parameter.lowest:g} and {parameter.highest:g}, but is {value!r}"
             )
     return np.array([float(values[name]) for name in problem.names])
-
-
-def _starting_values(model: str, own: tuple[str, ...]) -> dict[str, float]:
-    if model != "contact":
-        return _STARTING_LAWS[model.removesuffix("+delay")] | _DELAY
-    return {name: PAPER[name] for name in CONTACT_NAMES if name in own}
 
 
 def _assumptions(

@@ -11,18 +11,12 @@ from afm_jax.checks import require_float64
 from fitting.fits.fit import Found, find_fit, summarise
 from fitting.fits.minimum import Strain, relaxed, settle
 from fitting.fits.result import FitResult
-from fitting.models import LAWS, model_parameters
+from fitting.parameters import LAWS, model_parameters
 from fitting.tables.table import AmplitudeTable
 
 _T = TypeVar("_T")
 _EVEN, _LEANS, _PLAIN = 2.0, 6.0, 10.0
 """Differences of AIC up to which models are even, one is favoured, and one is clearly favoured."""
-_MEANING = {
-    "restitution": "a restitution without adhesion (r)",
-    "law": "a restitution with adhesion (r, epsilon)",
-    "viscous": "a loss linear in speed with adhesion (epsilon, viscous_loss)",
-    "contact": "the resolved contact",
-}
 
 
 @dataclass(frozen=True)
@@ -203,7 +197,8 @@ def _said_of(best: dict[str, Any], second: dict[str, Any]) -> str:
 
 
 def _meaning(model: str) -> str:
-    return f"{model}: {_MEANING[model.removesuffix('+delay')]}"
+    law = LAWS.get(model.removesuffix("+delay"))
+    return f"{model}: {law.meaning if law else 'the resolved contact'}"
 
 
 __all__ = ["Comparison", "compare", "rivals"]

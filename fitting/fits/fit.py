@@ -26,15 +26,8 @@ from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective
 from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows
 from fitting.fits.verdict import Evidence, judge_fit, misfits
 from fitting.forward import impact_of
-from fitting.models import (
-    NUISANCE_NAMES,
-    Measurement,
-    Problem,
-    check_contact_values,
-    constraints_of,
-    measurement_of,
-    model_parameters,
-)
+from fitting.models import Measurement, Problem, constraints_of, measurement_of
+from fitting.parameters import NUISANCE_NAMES, check_contact_values, model_parameters
 from fitting.tables.table import AmplitudeTable
 
 _POINTS = 121

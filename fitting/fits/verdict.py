@@ -14,7 +14,7 @@ from scipy.special import chdtrc
 
 from fitting.fits.intervals import Convergence
 from fitting.fits.result import FittedParameter, FittedRows
-from fitting.models import PARAMETERS
+from fitting.parameters import PARAMETERS
 from fitting.tables.table import AmplitudeTable
 
 IMPROBABLE = 1e-3

@@ -15,6 +15,7 @@ from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, ne
 from afm_jax.words import bullets, text_table, with_error
 from fitting.inversion.regression import SavedLaw
 from fitting.inversion.result import Coefficient, Inversion, RegressedLaw
+from fitting.parameters import LAWS
 
 ROW_COLUMNS = (
     "line",
@@ -46,8 +47,8 @@ LAW_COLUMNS = (
     "collision_delay_error_us",
 )
 _FORMULAS = {
-    "viscous": "u_out^2 = u_in^2 - epsilon - viscous_loss u_in",
-    "restitution": "u_out^2 = r^2 u_in^2 - epsilon  (eq. 6)",
+    "viscous": LAWS["viscous"].formula,
+    "restitution": f"{LAWS['law'].formula}  (eq. 6)",
     "delay": "tau = hertz u_in^(-1/5) - lead_nm (1/u_out - 1/u_in) - offset_nm/u_in",
 }
 NS_PER_US = 1e3

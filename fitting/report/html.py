@@ -17,7 +17,7 @@ from markupsafe import Markup
 
 from afm_jax.words import known, plain_words
 from fitting.fits.result import FitResult, FittedRows
-from fitting.models import NUISANCE_NAMES, PARAMETERS
+from fitting.parameters import NUISANCE_NAMES, PARAMETERS
 from fitting.report.words import (
     SHARE_OF_BAND,
     ComparedModels,
@@ -43,7 +43,6 @@ _LONGEST = 12
 """Lists longer than that are samples, not findings."""
 _NON_CHARACTERS = "".join(chr(plane << 16 | low) for plane in range(17) for low in (0xFFFE, 0xFFFF))
 _FORBIDDEN = re.compile(rf"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\ufdd0-\ufdef{_NON_CHARACTERS}]")
-_SYMBOLS = {"epsilon": "ε", "viscous_loss": "c", "delay_hertz": "a", "delay_lead_nm": "b", "delay_offset_nm": "d"}
 _APPROACH = Markup("u<sub>in</sub> (nm/µs)")
 _COMPARED = {
     "model": "model",
@@ -101,7 +100,7 @@ def fit_page(
         bootstrap: intervals from synthetic data sets, or None.
         posterior: credible intervals, or None.
     """
-    numbers = {name: _SYMBOLS.get(name, name) for name in result.parameters}
+    numbers = {name: PARAMETERS[name].symbol or name for name in result.parameters}
     if result.valid and result.model != "contact":
         numbers = rounded_values(result)
     samples = {"Bootstrap": bootstrap, "Posterior": posterior}

@@ -9,18 +9,13 @@ from jaxtyping import Float
 from afm_jax.words import decimals, interval, percent, value_alone
 from fitting.fits.result import FitResult, FittedParameter
 from fitting.fits.verdict import IMPROBABLE
+from fitting.parameters import DELAY_LAW, LAWS
 
 SHARE_OF_BAND = 0.1
 """How far the rounded formula may be off, in half-widths of the 95 % band."""
 _MOST_EXTRA = 8
 _UNLIKELY = 0.05
 _ROUND = (1.0, 2.0, 3.0, 5.0, 7.0)
-_DELAY = "tau = delay_hertz u_in^(-1/5) - delay_lead_nm (1/u_out - 1/u_in) - delay_offset_nm/u_in"
-_LAWS = {
-    "restitution": "u_out = r u_in",
-    "law": "u_out^2 = r^2 u_in^2 - epsilon",
-    "viscous": "u_out^2 = u_in^2 - viscous_loss u_in - epsilon",
-}
 
 
 @runtime_checkable
@@ -60,8 +55,8 @@ def formulas(model: str) -> list[str]:
     """Return the model's law in formulas."""
     if model == "contact":
         return ["the law and the delay of the resolved contact (meniscus and JKR junction), by its parameters:"]
-    law = _LAWS[model.removesuffix("+delay")]
-    return [law, _DELAY] if model.endswith("+delay") else [law]
+    law = LAWS[model.removesuffix("+delay")].formula
+    return [law, DELAY_LAW.formula] if model.endswith("+delay") else [law]
 
 
 def has_delay(result: FitResult) -> bool:
