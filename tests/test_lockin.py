@@ -52,8 +52,8 @@ def test_a_bounce_in_closed_form(order: int, rate: float):
     result = lockin(trace_of(height, rate=rate, drive_khz=drive, start_us=3.7))
     assert result.steady, result.verdict
     assert (result.order, result.impacts_per_period, result.kind) == (order, 1, TraceKind.STEADY)
-    # a quartic around the top of a cosine misses 3e-5
-    assert result.peak_amplitude_nm == pytest.approx(70.0, rel=3e-5)
+    # a sextic around the top of a cosine misses 3e-7
+    assert result.peak_amplitude_nm == pytest.approx(70.0, rel=3e-7)
     # the kink's harmonics beyond the fitted ones, falling as 1/k^2
     assert result.lockin_amplitude_nm == pytest.approx(abs(value), rel=1e-4)
     assert phase_apart(result, float(np.degrees(np.angle(value)))) == pytest.approx(0.0, abs=0.01)
@@ -153,6 +153,33 @@ def test_what_is_no_steady_orbit_is_flagged(shape: str, kind: TraceKind, noise: 
     result = lockin(trace_of(height, rate=10.0, drive_khz=181.8))
     assert result.kind is kind, result.verdict
     assert not result.steady
+
+
+@pytest.mark.parametrize("height", [0.0, 3.0, 0.1, -1e-300])
+def test_a_constant_deflection_is_no_response(height: float):
+    result = lockin(trace_of(np.full(2000, height), rate=10.0, drive_khz=181.8))
+    assert result.kind is TraceKind.NO_RESPONSE
+    assert result.scatter == 0.0
+    assert f"{height:.4g} nm throughout" in result.verdict
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+@pytest.mark.parametrize("quality", [5.0, 40.0, 300.0])
+def test_a_tip_that_rings_down_freely_is_told_with_its_quality_factor(quality: float, noise: float):
+    time = np.arange(0.0, 400.0, 0.1)
+    omega = 2e-3 * np.pi * 90.0
+    tip = 50.0 * np.exp(-0.5 * omega / quality * time) * np.cos(omega * np.sqrt(1.0 - 0.25 / quality**2) * time)
+    driven = 1.5 * np.cos(2e-3 * np.pi * 181.8 * time + 0.3)
+    height = tip + driven + noise * np.random.default_rng(2).standard_normal(time.size)
+    result = lockin(trace_of(height, rate=10.0, drive_khz=181.8))
+    assert result.kind is TraceKind.RINGING
+    assert result.peak_amplitude_nm is None
+    frequency, found = (
+        float(result.verdict.split(before)[1].split()[0].strip(",")) for before in ("vibration of ", "Q = ")
+    )
+    assert frequency == pytest.approx(90.0, rel=1e-3)
+    # three digits are printed
+    assert found == pytest.approx(quality, rel=0.02)
 
 
 @pytest.mark.parametrize("share", [2e-4, 1e-2])
