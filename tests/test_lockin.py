@@ -5,7 +5,7 @@ import pytest
 
 from fitting import TableError, Trace, lockin
 from fitting.traces.fold import fit_harmonics
-from fitting.traces.lockin import LockinResult
+from fitting.traces.lockin import LockinResult, table_of
 from fitting.traces.trace import TraceSettings
 from fitting.traces.verdict import TraceKind
 from tests.lockin_traces import (
@@ -266,3 +266,32 @@ def test_an_expected_order():
     assert (other.kind, other.steady) == (TraceKind.OTHER_ORDER, False)
     with pytest.raises(TableError, match="too short for two response periods of order 40"):
         lockin(trace, order=40)
+
+
+def test_traces_of_one_drive_are_one_row():
+    time = np.arange(0.0, 200.0, 0.1)
+    shape, value = bounce(time, order=1, drive_khz=181.8)
+
+    def read(seed: int, *, size: float = 1.0, drive: float = 181.8) -> LockinResult:
+        height = shape if drive == 181.8 else bounce(time, order=1, drive_khz=drive)[0]
+        height = size * height + 0.3 * np.random.default_rng(seed).standard_normal(time.size)
+        return lockin(trace_of(height, rate=10.0, drive_khz=drive, offset_nm=-1.0))
+
+    one, two, other, far = read(1), read(2), read(3, drive=183.0), read(4, size=1.2)
+    table = table_of([one, two, one, other])
+    assert table.drive_frequency_khz.tolist() == [181.8, 183.0]
+    assert any("of one drive: one row, their mean" in remark for remark in table.remarks)
+    assert table.lockin_amplitude_nm is not None
+    assert table.lockin_amplitude_error_nm is not None
+    assert table.phase_deg is not None
+    amplitudes = [result.lockin_amplitude_nm for result in (one, two)]
+    assert min(amplitudes) < table.lockin_amplitude_nm[0] < max(amplitudes)
+    assert abs(table.lockin_amplitude_nm[0] - abs(value)) < 4.0 * table.lockin_amplitude_error_nm[0]
+    assert one.phase_deg is not None
+    assert table.phase_deg[0] == pytest.approx(one.phase_deg, abs=0.1)
+    # two orbits of one drive: neither is the row
+    table = table_of([one, far, other])
+    assert table.drive_frequency_khz.tolist() == [183.0]
+    assert any("contradict each other" in remark for remark in table.remarks)
+    with pytest.raises(TableError, match=r"there is no row: .* contradict each other"):
+        table_of([one, far])

@@ -122,34 +122,6 @@ def test_a_table_needs_what_the_fitter_needs(tmp_path):
     assert table.offset_nm[0] == pytest.approx(-1.0, rel=1e-6)
 
 
-def test_traces_of_one_drive_are_one_row(tmp_path):
-    paths = [tmp_path / f"{name}.csv" for name in ("one", "two", "other", "far")]
-    drive, time = 181.8, np.arange(0.0, 80.0 * 1e3 / 181.8, 0.1)
-    height, value = bounce(time, order=1, drive_khz=drive)
-    for seed, (path, size) in enumerate(zip(paths, (1.0, 1.0, 1.0, 1.2), strict=True)):
-        noisy = size * height + 0.3 * np.random.default_rng(seed).standard_normal(time.size)
-        khz = 183.0 if path.stem == "other" else drive
-        shape = noisy if khz == drive else bounce(time, order=1, drive_khz=khz)[0]
-        head = f"{COMMENTS}# drive_frequency_khz = {khz!r}\n# drive_phase_deg = 0\ntime_us,deflection_nm\n"
-        rows = "\n".join(f"{t:.1f},{z:.6f}" for t, z in zip(time, shape, strict=True))
-        path.write_text(f"{head}{rows}\n", encoding="utf-8")
-    one, two, other, far = paths
-    result = run(one, two, one, other, "--out", tmp_path / "out")
-    assert result.exit_code == 0
-    assert f"{one}, {two} are of one drive: one row, their mean" in result.stderr
-    table = read_table(tmp_path / "out" / "amplitudes.csv")
-    assert table.drive_frequency_khz.tolist() == [drive, 183.0]
-    assert table.lockin_amplitude_nm is not None
-    assert table.lockin_amplitude_error_nm is not None
-    assert abs(table.lockin_amplitude_nm[0] - abs(value)) < 4.0 * table.lockin_amplitude_error_nm[0]
-    # two orbits of one drive: neither is the row
-    result = run(one, far, other, "--out", tmp_path / "out")
-    assert "contradict each other" in result.stderr
-    assert read_table(tmp_path / "out" / "amplitudes.csv").drive_frequency_khz.tolist() == [183.0]
-    reason = strictly(run(one, far, "--json").stdout)["table_reason"]
-    assert reason.startswith("amplitudes.csv: there is no row")
-
-
 def test_a_deflection_with_the_wrong_sign_is_named(tmp_path):
     path, _ = written(tmp_path / "turned.csv", order=1)
     lines = path.read_text(encoding="utf-8").splitlines()

@@ -312,12 +312,12 @@ def table_of(results: Sequence[LockinResult]) -> AmplitudeTable:
     for result in steady:
         _check_known(result)
     shared = _cantilever(steady)
-    drives: dict[tuple[float, ...], dict[str, _Row]] = {}
+    drives: dict[tuple[float, ...], dict[_Row, str]] = {}
     for result in steady:
         row = _row_of(result)
         same = drives.setdefault((row.order, round(row.drive_frequency_khz, 9), *row[2:4]), {})
-        # a file that is given twice is one measurement
-        same.setdefault(result.trace.source, row)
+        # a trace that is given twice is one measurement
+        same.setdefault(row, result.trace.source)
     remarks: list[str] = []
     joined = [_joined(same, remarks) for _, same in sorted(drives.items(), key=lambda item: item[0])]
     rows = [row for row in joined if row is not None]
@@ -353,9 +353,14 @@ def _row_of(result: LockinResult) -> _Row:
     )
 
 
-def _joined(same: dict[str, _Row], remarks: list[str]) -> _Row | None:
-    """Return the mean of readings of one drive, by file; None where they contradict each other."""
-    first, *others = rows = list(same.values())
+def _joined(same: dict[_Row, str], remarks: list[str]) -> _Row | None:
+    """Return the mean of readings of one drive; None where they contradict each other.
+
+    Args:
+        same: the rows, and the file of each.
+        remarks: takes what is to be said of it.
+    """
+    first, *others = rows = list(same)
     if not others:
         return first
     means: dict[str, float] = {}
@@ -371,7 +376,7 @@ def _joined(same: dict[str, _Row], remarks: list[str]) -> _Row | None:
         mean = float(np.average(apart, weights=error**-2.0))
         pulls.extend(np.abs(apart - mean) / error)
         means |= {name: float(np.mod(base + mean, turn)), error_name: float(error.min())}
-    names = ", ".join(same)
+    names = ", ".join(same.values())
     if max(pulls) > _AGREE:
         remarks.append(
             f"{names} are of one drive and contradict each other by {max(pulls):.2g} standard errors: left out"
