@@ -46,7 +46,8 @@ SETTINGS = {
 """For each method the settings of free collisions by the accuracy that they reach.
 
 Accuracy a means an error of the rebound speed below a (relative) and of the delay below 10 a us, measured with the
-paper's contact from 1.1 times the capture speed to 200 nm/us (`afm-jax accuracy collide`).
+paper's contact from 1.1 times the capture speed to 200 nm/us (`afm-jax accuracy collide`). Slower tips are computed
+with `CAREFUL`, which leaves what the rounding of their speeds does: 1e-16 over their distance from capture, relative.
 """
 
 CAREFUL = Setting("steps", 256, 256, 40, careful=True)
