@@ -100,7 +100,7 @@ class Problem:
         known = self.known(values)
         delay = None
         if self.lasting:
-            parts: dict[str, Any] = {p.name.removeprefix("delay_"): known[p.name] for p in DELAY}
+            parts: dict[str, Any] = {p.name.removeprefix("delay_"): known.get(p.name, p.reference) for p in DELAY}
             delay = CollisionDelay(**parts)
         return ImpactLaw(**{p.name: known.get(p.name, p.reference) for p in LAW}, delay=delay)
 

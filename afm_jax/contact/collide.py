@@ -38,6 +38,8 @@ BLOCK = 512
 """Tips computed side by side: few enough to stay in the processor's cache."""
 _CAPTURE_POINTS = 64
 _CAPTURE_ROUNDS = 9
+_NEAR_CAPTURE = (-0.02, 0.2)
+"""Energy at the end, of that at the start, between which a tip is close to capture: below 1.1 times that speed."""
 
 
 class Collision(NamedTuple):
@@ -375,7 +377,10 @@ def go_through(
     reach = jnp.minimum(start + jnp.maximum(pull_in, 0.0), inward.energy_aj)
     easy_in = (inward.dissipated_aj < 0.2 * reach) & (inward.energy_aj > 0.1 * start) & calm_in
     easy_out = (outward.dissipated_aj < 0.2 * solid.energy_aj) & calm_out
-    return Ways(inward, solid, outward, outer, easy_in & (easy_out | (solid.energy_aj <= 0.0)))
+    # what is left of the energy at the end has the error of all of it: close to capture that is many times its own
+    left = jnp.where(solid.energy_aj > 0.0, outward.energy_aj, solid.energy_aj)
+    clear = (left > _NEAR_CAPTURE[1] * start) | (left < _NEAR_CAPTURE[0] * start)
+    return Ways(inward, solid, outward, outer, easy_in & clear & (easy_out | (solid.energy_aj <= 0.0)))
 
 
 def collision_of(
