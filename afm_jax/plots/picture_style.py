@@ -37,8 +37,8 @@ def with_zero_line(axes: Axes) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PDF, SVG or PNG, by the file's suffix."""
-    figure.savefig(path, dpi=_DPI, format=path.suffix[1:])
+    """Write a figure in the format of its file's suffix: PNG, PDF or SVG."""
+    figure.savefig(path, dpi=_DPI, format=path.suffix.removeprefix("."))
 
 
 def png_of(figure: Figure, dpi: float = 150.0) -> bytes:
