@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from afm_jax.dynamics.basins import basins_of_attraction
     from afm_jax.dynamics.bifurcations import bifurcation_diagram
     from afm_jax.dynamics.charts import stability_chart
+    from afm_jax.dynamics.continuation import continue_orbits
     from afm_jax.dynamics.exponents import lyapunov_spectrum
+    from afm_jax.dynamics.impact_orbits import many_impact_orbits
     from afm_jax.impact.jacobian import map_jacobian
     from afm_jax.impact.law import CollisionDelay, ImpactLaw
     from afm_jax.impact.map import NextImpact, iterate_batch, iterate_map, next_impact
@@ -62,11 +64,13 @@ else:
         "bifurcation_diagram": "afm_jax.dynamics.bifurcations",
         "capture_speed": "afm_jax.contact.collide",
         "collide": "afm_jax.contact.collide",
+        "continue_orbits": "afm_jax.dynamics.continuation",
         "find_junction": "afm_jax.contact.junction",
         "iterate_batch": "afm_jax.impact.map",
         "iterate_map": "afm_jax.impact.map",
         "load_scene": "afm_jax.scenefile.scenefile",
         "lyapunov_spectrum": "afm_jax.dynamics.exponents",
+        "many_impact_orbits": "afm_jax.dynamics.impact_orbits",
         "map_jacobian": "afm_jax.impact.jacobian",
         "next_impact": "afm_jax.impact.map",
         "save_scene": "afm_jax.scenefile.scenefile",
@@ -114,11 +118,13 @@ __all__ = [
     "bifurcation_diagram",
     "capture_speed",
     "collide",
+    "continue_orbits",
     "find_junction",
     "iterate_batch",
     "iterate_map",
     "load_scene",
     "lyapunov_spectrum",
+    "many_impact_orbits",
     "map_jacobian",
     "next_impact",
     "save_scene",

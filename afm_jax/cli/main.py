@@ -124,6 +124,7 @@ COMMANDS = {
     "calibrate": ("afm_jax.cli.calibrate", "Fit frequency and quality factor to a free resonance sweep."),
     "chart": ("afm_jax.cli.chart", "Chart which single-impact orbits are stable over two parameters."),
     "collide": ("afm_jax.cli.collide", "Let free tips collide with the sample: rebound, delay, capture, energy."),
+    "continue": ("afm_jax.cli.continue_orbits", "Follow orbits and their special points through parameters."),
     "design": ("afm_jax.cli.design", "Choose the drives to measure next, and forecast what they will determine."),
     "doctor": ("afm_jax.cli.doctor", "Say what is installed, how JAX computes, and whether its cache works."),
     "effects": ("afm_jax.cli.effects", "Say what each effect of a scene changes and costs, and which can be left out."),
@@ -133,7 +134,7 @@ COMMANDS = {
     "invert": ("afm_jax.cli.invert", "Read speeds and delay of every impact off amplitude and phase, without a law."),
     "lockin": ("afm_jax.cli.lockin", "Read response order, amplitudes and phase off time traces of the deflection."),
     "lyapunov": ("afm_jax.cli.lyapunov", "Compute Lyapunov exponents of a motion, or along a parameter."),
-    "orbits": ("afm_jax.cli.orbits", "Find all single-impact orbits of a scene, and whether they are stable."),
+    "orbits": ("afm_jax.cli.orbits", "Find the orbits of a scene, of one impact or more, and whether they are stable."),
     "simulate": ("afm_jax.cli.simulate", "Follow a scene in time: contacts, amplitudes, phases, energies."),
     "verify": ("afm_jax.cli.verify", "Compare eqs. 5 to 8 with automatic differentiation and with 50 digits."),
 }

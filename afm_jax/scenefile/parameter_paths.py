@@ -165,7 +165,7 @@ def scene_family(scene: Scene, *paths: str) -> Callable[..., Scene]:
         # the cantilever first: reduced frequencies are in its unit
         for path in sorted(given, key=lambda path: not path.startswith("cantilever")):
             if path not in of_contact:
-                made = _with_number(made, path, given[path])
+                made = with_number(made, path, given[path])
         if contact is not None:
             made = eqx.tree_at(lambda part: part.interaction, made, contact(*(given[path] for path in of_contact)))
         return made
@@ -202,7 +202,7 @@ def _contact_family(scene: Scene, names: tuple[str, ...]) -> Callable[..., objec
     return lambda *values: Contact.paper(effects=effects, **(numbers | dict(zip(names, values, strict=True))))
 
 
-def _with_number(scene: Scene, path: str, value: ArrayLike) -> Scene:
+def with_number(scene: Scene, path: str, value: ArrayLike) -> Scene:
     """Return a scene with one number of cantilever, drives or law replaced."""
     *parts, key = path.split(".")
     number = jnp.asarray(value, scene.platform.frequency_khz.dtype)
