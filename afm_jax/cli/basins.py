@@ -3,7 +3,6 @@
 from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
 
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
@@ -53,6 +52,8 @@ def command(
     a picture. Exit code 3 if starts could not be followed.
     """
     session.start_computing()
+    import numpy as np  # noqa: PLC0415
+
     from afm_jax.dynamics.basins import basins_of_attraction  # noqa: PLC0415
     from afm_jax.dynamics.verdicts import MotionKind  # noqa: PLC0415
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
@@ -111,6 +112,8 @@ def command(
 
 
 def _write(session: Session, found: "Basins") -> None:
+    import numpy as np  # noqa: PLC0415
+
     names = np.array([attractor.name for attractor in found.attractors])
     phase, speed = np.meshgrid(found.phase_rad, found.rebound_speed_nm_per_us)
     session.write_columns(
