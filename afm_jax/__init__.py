@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from afm_jax.contact.contact import Contact
     from afm_jax.contact.junction import Junction, Phase, find_junction
     from afm_jax.contact.time_course import time_course
+    from afm_jax.dynamics.basins import basins_of_attraction
+    from afm_jax.dynamics.bifurcations import bifurcation_diagram
+    from afm_jax.dynamics.charts import stability_chart
     from afm_jax.dynamics.continuation import continue_orbits
     from afm_jax.dynamics.exponents import lyapunov_spectrum
     from afm_jax.dynamics.impact_orbits import many_impact_orbits
@@ -26,6 +29,7 @@ if TYPE_CHECKING:
     from afm_jax.motion.simulate import simulate
     from afm_jax.motion.trajectory import Trajectory, trajectory
     from afm_jax.outcomes import CollisionOutcome, Outcome
+    from afm_jax.scenefile.parameter_paths import scene_family
     from afm_jax.scenefile.scenefile import SceneError, load_scene, save_scene
 
     __version__: str
@@ -56,6 +60,8 @@ else:
         "Tone": "afm_jax.apparatus.drives",
         "Trajectory": "afm_jax.motion.trajectory",
         "__version__": "afm_jax.version",
+        "basins_of_attraction": "afm_jax.dynamics.basins",
+        "bifurcation_diagram": "afm_jax.dynamics.bifurcations",
         "capture_speed": "afm_jax.contact.collide",
         "collide": "afm_jax.contact.collide",
         "continue_orbits": "afm_jax.dynamics.continuation",
@@ -68,8 +74,10 @@ else:
         "map_jacobian": "afm_jax.impact.jacobian",
         "next_impact": "afm_jax.impact.map",
         "save_scene": "afm_jax.scenefile.scenefile",
+        "scene_family": "afm_jax.scenefile.parameter_paths",
         "simulate": "afm_jax.motion.simulate",
         "single_impact_orbits": "afm_jax.impact.orbits",
+        "stability_chart": "afm_jax.dynamics.charts",
         "time_course": "afm_jax.contact.time_course",
         "trajectory": "afm_jax.motion.trajectory",
         "use_cache": "afm_jax.compilation_cache",
@@ -106,6 +114,8 @@ __all__ = [
     "Tone",
     "Trajectory",
     "__version__",
+    "basins_of_attraction",
+    "bifurcation_diagram",
     "capture_speed",
     "collide",
     "continue_orbits",
@@ -118,8 +128,10 @@ __all__ = [
     "map_jacobian",
     "next_impact",
     "save_scene",
+    "scene_family",
     "simulate",
     "single_impact_orbits",
+    "stability_chart",
     "time_course",
     "trajectory",
     "use_cache",

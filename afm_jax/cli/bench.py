@@ -50,6 +50,35 @@ def fit_table(rows: Sequence[dict[str, Any]]) -> "Table":
     return table
 
 
+DYNAMICS = {"values": 10_000, "impacts": 2000, "side": 1000, "orders": 8, "grid": 1000, "by_scipy": 100}
+DYNAMICS_QUICK = {"values": 20, "impacts": 200, "side": 20, "orders": 2, "grid": 20, "by_scipy": 10}
+DYNAMICS_COLUMNS = ("what", "work", "seconds", "processor_seconds", "first_s", "beside", "beside_seconds", "ratio")
+"""What `bench_dynamics.csv` tells of a measurement."""
+
+
+def measure_dynamics(cores: int, *, quick: bool) -> tuple[list[dict[str, Any]], list[tuple[str, float | None, float]]]:
+    """Measure charts, diagrams, exponents and basins; return the rows, and the aims with their bounds in seconds."""
+    from afm_jax.bench.dynamics import aims as dynamics_aims  # noqa: PLC0415
+    from afm_jax.bench.timing import run_in_own_process  # noqa: PLC0415
+
+    task = "afm_jax.bench.dynamics:dynamics_rows"
+    rows = run_in_own_process(task, DYNAMICS_QUICK if quick else DYNAMICS, cores=cores)["rows"]
+    return rows, dynamics_aims(rows, whole=not quick)
+
+
+def dynamics_table(rows: Sequence[dict[str, Any]]) -> "Table":
+    """Return the measurements as a table for the terminal."""
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table(title="charts, diagrams, exponents, basins; all cores", title_justify="left")
+    for name in ("what", "work", "s", "processor s", "first time, s", "beside, s", "times as fast"):
+        table.add_column(name, justify="left" if name in {"what", "work"} else "right")
+    for row in rows:
+        numbers = [known(row[name]) for name in ("seconds", "processor_seconds", "first_s", "beside_seconds", "ratio")]
+        table.add_row(row["what"], row["work"], *numbers)
+    return table
+
+
 PERIODS = {"1.01": 30, "5.277": 150}
 """Drive periods of the batches by reduced frequency: about 30 contacts of a tip in both."""
 SCENES = {
@@ -190,8 +219,8 @@ CONTACT_COLUMNS = (
 )
 @click.option(
     "--only",
-    type=click.Choice(["map", "contact", "scenes", "fits"]),
-    help="The impact map alone, the contact of free tips alone, driven contacts alone, or fits from the shell alone.",
+    type=click.Choice(["map", "contact", "scenes", "dynamics", "fits"]),
+    help="The impact map alone, the contact of free tips, driven contacts, charts and basins, or fits from the shell.",
 )
 @with_session
 def command(session: Session, batches: tuple[int, ...], only: str | None, *, quick: bool) -> None:
@@ -201,7 +230,7 @@ def command(session: Session, batches: tuple[int, ...], only: str | None, *, qui
     solve_ivp with events on the same problems. Errors of impact times are against 50 digits, those of contacts against
     finer settings. Times are the best of several repetitions, compilation apart; the machine should have nothing else
     to do. Fits of 100 rows are timed as commands. With --out bench.csv, bench_contact.csv, bench_scenes.csv,
-    bench_fits.csv and bench.json.
+    bench_dynamics.csv, bench_fits.csv and bench.json.
     """
     session.start_computing()
     from afm_jax.bench.timing import available_cores  # noqa: PLC0415
@@ -230,6 +259,11 @@ def command(session: Session, batches: tuple[int, ...], only: str | None, *, qui
             payload["aims"] += [aim_of(name, value, at_most=bound) for name, value, bound in reached]
             tables += scene_tables(payload["scene_rows"])
             session.write_table("bench_scenes.csv", payload["scene_rows"], SCENE_COLUMNS)
+        if only in {None, "dynamics"}:
+            payload["dynamics_rows"], reached = measure_dynamics(cores, quick=quick)
+            payload["aims"] += [aim_of(name, value, at_most=bound) for name, value, bound in reached]
+            tables.append(dynamics_table(payload["dynamics_rows"]))
+            session.write_table("bench_dynamics.csv", payload["dynamics_rows"], DYNAMICS_COLUMNS)
         if only in {None, "fits"}:
             payload["fit_rows"], reached = fit_rows(quick=quick)
             payload["aims"] += [aim_of(name, value, at_most=bound) for name, value, bound in reached]

@@ -4,7 +4,6 @@ from collections import Counter
 from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
 
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
@@ -38,6 +37,8 @@ def command(
     if no motion went on anywhere.
     """
     session.start_computing()
+    import numpy as np  # noqa: PLC0415
+
     from afm_jax.dynamics.bifurcations import bifurcation_diagram  # noqa: PLC0415
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
@@ -75,6 +76,8 @@ def command(
 
 
 def _payload(sweep: "Sweep") -> dict[str, Any]:
+    import numpy as np  # noqa: PLC0415
+
     return {
         "direction": "up" if sweep.upward else "down",
         "complete": sweep.complete,
@@ -96,6 +99,8 @@ def _summary(sweep: "Sweep") -> str:
 
 
 def _write(session: Session, path: str, sweeps: "list[Sweep]") -> None:
+    import numpy as np  # noqa: PLC0415
+
     rows: dict[str, list[Any]] = {name: [] for name in ("direction", path, "verdict", "restarted")}
     impacts: dict[str, list[Any]] = {name: [] for name in ("direction", path, *POINTS)}
     strobe: dict[str, list[Any]] = {name: [] for name in ("direction", path, "height_nm")}
@@ -115,5 +120,7 @@ def _write(session: Session, path: str, sweeps: "list[Sweep]") -> None:
 
 
 def _extend(table: dict[str, list[Any]], *columns: Any) -> None:
+    import numpy as np  # noqa: PLC0415
+
     for name, column in zip(table, columns, strict=True):
         table[name] += column.tolist() if isinstance(column, np.ndarray) else column

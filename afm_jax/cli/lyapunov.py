@@ -3,13 +3,14 @@
 from typing import TYPE_CHECKING, Any
 
 import click
-import numpy as np
 
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import PictureFormat, ranges_of, scene_and_start
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from afm_jax.dynamics.exponents import Lyapunov
 
 COLUMNS = (
@@ -41,6 +42,8 @@ def command(session: Session, *, scene: str, impacts: int, transient: int, param
     lyapunov.csv, and with --parameter a picture. Exit code 3 where the motion ends before enough impacts.
     """
     session.start_computing()
+    import numpy as np  # noqa: PLC0415
+
     from afm_jax.dynamics.exponents import exponent_verdicts, lyapunov_spectrum  # noqa: PLC0415
     from afm_jax.motion.start import start_of  # noqa: PLC0415
     from afm_jax.scenefile.parameter_paths import scene_batch  # noqa: PLC0415
@@ -88,6 +91,7 @@ def command(session: Session, *, scene: str, impacts: int, transient: int, param
 
 def _as_batch(found: "Lyapunov") -> "Lyapunov":
     import jax  # noqa: PLC0415
+    import numpy as np  # noqa: PLC0415
 
     return jax.tree.map(lambda part: np.asarray(part)[None], found)
 
@@ -123,7 +127,7 @@ def _rows(found: "Lyapunov", verdicts: list[str]) -> list[dict[str, Any]]:
 
 
 def _text(found: "Lyapunov", verdict: str) -> list[str]:
-    def pair(values: np.ndarray, errors: np.ndarray) -> str:
+    def pair(values: "np.ndarray", errors: "np.ndarray") -> str:
         return ", ".join(f"{value:.6g} +- {error:.1e}" for value, error in zip(values, errors, strict=True))
 
     lines = [
@@ -137,6 +141,8 @@ def _text(found: "Lyapunov", verdict: str) -> list[str]:
 
 
 def _summary(found: "Lyapunov", what: str) -> str:
+    import numpy as np  # noqa: PLC0415
+
     larger, error = found.exponents_per_impact[:, 0], found.exponents_per_impact_error[:, 0]
     from afm_jax.dynamics.exponents import CHAOTIC_ERRORS  # noqa: PLC0415
 

@@ -118,6 +118,7 @@ def _missing_package(error: ModuleNotFoundError) -> str:
 
 COMMANDS = {
     "accuracy": ("afm_jax.cli.accuracy", "Show error against time, and the cheapest setting for a wanted accuracy."),
+    "basins": ("afm_jax.cli.basins", "Find which start of a scene ends where."),
     "bench": ("afm_jax.cli.bench", "Measure impacts per second, next to SciPy."),
     "bifurcation": ("afm_jax.cli.bifurcation", "Sweep a parameter and record what the tip comes to."),
     "calibrate": ("afm_jax.cli.calibrate", "Fit frequency and quality factor to a free resonance sweep."),

@@ -114,7 +114,7 @@ def bifurcation_diagram(
     return _sweep_of(jax.tree.map(jnp.asarray, scenes), swept, ordered, upward=upward, complete=complete)
 
 
-class _Swept(NamedTuple):
+class _SweptRows(NamedTuple):
     """Of every value, arrays with a leading axis of values."""
 
     end: Tips
@@ -132,7 +132,7 @@ class _Sweeper:
         self.stretch = -(-self.count // _LANES)
         self.lanes = -(-self.count // self.stretch)
 
-    def run(self, report: Report | None) -> tuple[_Swept, bool]:
+    def run(self, report: Report | None) -> tuple[_SweptRows, bool]:
         """Return the sweep of all values, and whether nothing was left to be swept again."""
         every = np.arange(self.lanes)
         starts = self._hurried()
@@ -161,7 +161,7 @@ class _Sweeper:
         """Return the numbers of the values of stretches; the last stretch ends with its last value again and again."""
         return np.minimum(lanes[:, None] * self.stretch + np.arange(self.stretch), self.count - 1)
 
-    def _joined(self, parts: list[_Swept]) -> _Swept:
+    def _joined(self, parts: list[_SweptRows]) -> _SweptRows:
         def join(*columns: np.ndarray) -> np.ndarray:
             return np.stack(columns, axis=1).reshape(self.lanes * self.stretch, *columns[0].shape[1:])[: self.count]
 
@@ -170,7 +170,7 @@ class _Sweeper:
     def _at(self, numbers: np.ndarray) -> Scene:
         return jax.tree.map(lambda leaf: jnp.asarray(leaf[numbers]), self.scenes)
 
-    def _sweep(self, lanes: np.ndarray, tips: Tips, restarted: np.ndarray, report: Report | None) -> list[_Swept]:
+    def _sweep(self, lanes: np.ndarray, tips: Tips, restarted: np.ndarray, report: Report | None) -> list[_SweptRows]:
         """Return what comes out at the first, second, ... value of stretches."""
         numbers, parts = self._numbers(lanes), []
         for place in range(self.stretch):
@@ -181,13 +181,15 @@ class _Sweeper:
                 report(min((place + 1) * len(lanes), self.count), self.count)
         return parts
 
-    def _carried(self, before: _Swept, rows, old: np.ndarray, lanes: np.ndarray, place: int = 0) -> tuple[Tips, Any]:
+    def _carried(
+        self, before: _SweptRows, rows, old: np.ndarray, lanes: np.ndarray, place: int = 0
+    ) -> tuple[Tips, Any]:
         """Return tips of one value at the next one, and which begin anew."""
         end = jax.tree.map(lambda part: part[rows], before.end)
         tips = carried(self._at(old), self._at(self._numbers(lanes)[:, place]), end)
         return jax.tree.map(np.asarray, tips), end.outcome != Outcome.IMPACT
 
-    def _follow(self, numbers: np.ndarray, tips: Tips, restarted: np.ndarray) -> _Swept:
+    def _follow(self, numbers: np.ndarray, tips: Tips, restarted: np.ndarray) -> _SweptRows:
         """Return what tips come to, one at each value."""
 
         def work(lanes: tuple[Scene, Tips]) -> tuple[Tips, Record]:
@@ -196,7 +198,7 @@ class _Sweeper:
         scenes = self._at(numbers)
         end, record = in_blocks(work, (scenes, tips))
         period = np.asarray(scenes.platform.period_us)
-        return _Swept(end, restarted, record, verdicts_of(record, end.outcome, period, tolerance=_SETTLED))
+        return _SweptRows(end, restarted, record, verdicts_of(record, end.outcome, period, tolerance=_SETTLED))
 
     def _hurried(self) -> Tips:
         """Return the tips that one gets at the first values of all stretches in a sweep of those alone."""
@@ -266,7 +268,7 @@ def carried(before: Scene, after: Scene, tips: Tips) -> Tips:
     return jax.tree.map(lambda old, new: jnp.where(going, old, new), kept, fresh)
 
 
-def _same(one: _Swept, other: _Swept) -> Bool[np.ndarray, " lanes"]:
+def _same(one: _SweptRows, other: _SweptRows) -> Bool[np.ndarray, " lanes"]:
     """Say which motions are the same: of one kind, and orbits through the same points."""
     a, b = one.verdicts, other.verdicts
     same = (a.kind == b.kind) & (a.impacts == b.impacts) & (a.periods == b.periods)
@@ -278,7 +280,7 @@ def _same(one: _Swept, other: _Swept) -> Bool[np.ndarray, " lanes"]:
 
 
 def _sweep_of(
-    scenes: Scene, swept: _Swept, values: Float[np.ndarray, " values"], *, upward: bool, complete: bool
+    scenes: Scene, swept: _SweptRows, values: Float[np.ndarray, " values"], *, upward: bool, complete: bool
 ) -> Sweep:
     record, verdicts = swept.record, swept.verdicts
     period = np.asarray(scenes.platform.period_us)

@@ -20,9 +20,9 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.contact_sequence import departure_jacobians, follow_contacts
 from afm_jax.dynamics.iteration import (
+    MapStep,
     Record,
     Report,
-    Step,
     Tips,
     advance,
     batch_and_tips,
@@ -271,7 +271,7 @@ def _recorded(scenes: Scene, tips: Tips) -> tuple[Tips, tuple[Record, Array, Arr
     return lax.scan(one, tips, length=RECORDED)
 
 
-def _jacobian(scenes: Scene, step: Step) -> tuple[tuple[Array, Array, Array, Array], Array, Array]:
+def _jacobian(scenes: Scene, step: MapStep) -> tuple[tuple[Array, Array, Array, Array], Array, Array]:
     """Return the map's Jacobian in drive phase and velocity over beta omega, its determinant, and whether it has one.
 
     The determinant of a flight is known: -exp(-Omega T/Q) u_out/u_in, with the speeds at its start and end.

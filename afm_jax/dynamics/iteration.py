@@ -63,7 +63,7 @@ class Tips(NamedTuple):
     """An `Outcome`: IMPACT while the motion goes on, else how it ended."""
 
 
-class Step(NamedTuple):
+class MapStep(NamedTuple):
     """One step of the map, arrays of one lane a tip; numbers without meaning where a tip had ended before."""
 
     start: Tips
@@ -74,7 +74,7 @@ class Step(NamedTuple):
     end: Tips
 
 
-def advance(scenes: Scene, tips: Tips) -> Step:
+def advance(scenes: Scene, tips: Tips) -> MapStep:
     """Return the next impacts of a block of tips, and where their flights after them begin.
 
     Args:
@@ -107,7 +107,7 @@ def advance(scenes: Scene, tips: Tips) -> Step:
         velocity_nm_per_us=jnp.where(goes_on, velocity, tips.velocity_nm_per_us),
         outcome=jnp.where(going, outcome, tips.outcome).astype(tips.outcome.dtype),
     )
-    return Step(tips, impact, rested, end)
+    return MapStep(tips, impact, rested, end)
 
 
 def _one_impact(scene: Scene, tip: Tips, *, max_steps: int) -> NextImpact:
@@ -196,7 +196,7 @@ def recorded(scenes: Scene, tips: Tips, *, impacts: int) -> tuple[Tips, Record]:
     return lax.scan(one, tips, length=impacts)
 
 
-def record_of(scenes: Scene, step: Step) -> Record:
+def record_of(scenes: Scene, step: MapStep) -> Record:
     """Return what is kept of a step, arrays of one lane a tip."""
     impact, end = step.impact, step.end
     landed = (step.start.outcome == Outcome.IMPACT) & (end.outcome == Outcome.IMPACT)

@@ -29,13 +29,15 @@ from afm_jax.impact.closure import (
 from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.impact.implicit import implicit_pair, implicit_root
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
-from afm_jax.impact.lasting_impact import INDENTATION, Impact, LawImpact
+from afm_jax.impact.lasting_impact import INDENTATION, Impact, LawImpact, crawls
 from afm_jax.impact.law import Speeds, impact_law_of
 from afm_jax.impact.roots import COARSE, find_roots
 from afm_jax.outcomes import Outcome
 
 NEAR_DOUBLE = 1e-3
 """Slope of the closing condition per relative change of speed below which a root counts as near-double (a fold)."""
+_NEARBY = 1e-5
+"""How far from a root its slope is looked at, in terms of its distance from capture."""
 _ARRIVAL_TOLERANCE = 1e-7
 """How far (in drive periods) the first impact found may lie before the orbit's own, by rounding."""
 
@@ -211,8 +213,11 @@ def judge(place: OrbitPlace, found: Bool[Array, ""], state: OrbitState, problem:
     trace, determinant = trace_and_determinant(impact, cantilever, platform, state.flight)
     # the flight counts from max(t_in, t_out) on
     skip = jnp.maximum(-state.speeds.delay, 0.0) if impact.delayed else None
+    flies = found & ends_at_its_own_impact(cantilever, platform, state.flight, found, skip)
+    if isinstance(impact, LawImpact) and impact.delayed:
+        flies = flies & ~crawls(impact, impact.at_approach(state.speeds.approach), cantilever)
     return Verdict(
-        admissible=found & ends_at_its_own_impact(cantilever, platform, state.flight, found, skip),
+        admissible=flies,
         stable=found & contracts(trace, determinant),
         near_double=found & near_fold(place.coordinate, problem),
         trace=trace,
@@ -222,8 +227,11 @@ def judge(place: OrbitPlace, found: Bool[Array, ""], state: OrbitState, problem:
 
 def near_fold(coordinate: Float[Array, ""], problem: OrbitProblem) -> Bool[Array, ""]:
     """Say whether the closing condition hardly changes with the logarithm of the coordinate at a root."""
-    _, slope = jax.jvp(lambda y: closing_residual(y, problem), (coordinate,), (coordinate,))
-    return jnp.abs(slope) < NEAR_DOUBLE
+    # a difference, right to nine digits: the derivative's program is twice as large; not beyond capture
+    step = _NEARBY * (coordinate - problem.impact.lowest)
+    ends = coordinate + step * jnp.array([-1.0, 1.0])
+    low, high = jax.vmap(closing_residual, in_axes=(0, None))(ends, problem)
+    return jnp.abs((high - low) * coordinate) < 2.0 * step * NEAR_DOUBLE
 
 
 def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:

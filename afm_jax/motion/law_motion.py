@@ -194,7 +194,8 @@ _ROUNDS = 8
 _FLIGHT_STEPS = 1_000_000
 """Steps of the search of one flight: as many as it takes, a flight that never lands needs some every period."""
 _ON_SURFACE_NM = 1e-9
-"""Depth up to which a start that leaves is taken to lie on the surface: rounding of lab coordinates."""
+"""Depth up to which a start is taken to lie on the surface: rounding of lab coordinates. Times the fastest angular
+frequency: speed against the surface up to which it is at rest there."""
 
 
 class LawRow(NamedTuple):
@@ -249,7 +250,8 @@ def follow_law(
         scene: its interaction is an `ImpactLaw`.
         surface: what the free tip sees (`surface_of`).
         response: the steady response to drives of base and tip, or None.
-        start: the tip at the start, in the lab, above the surface; on it, it must leave.
+        start: the tip at the start, in the lab, above the surface, or on it: leaving it, or at rest, which counts as
+            an impact at speed 0.
         until: time of the end in us.
         max_contacts: rows for contacts.
         reverse: make it differentiable in reverse mode: all rounds are run, in blocks that are recomputed backwards.
@@ -312,6 +314,7 @@ def _round(seen: Scene, tip: LawTip, until: Array) -> LawTip:
     )
     tolerance = jnp.asarray(DEFAULT_ROOT_TOLERANCE_US, until.dtype)
     impact = impact_after(seen, flight, tolerance, max_steps=_FLIGHT_STEPS, latest_us=until - leg.time_us)
+    impact = _or_rest(seen, tip, impact)
     ended = impact.outcome
     landed = (ended == Outcome.IMPACT) | (ended == Outcome.CAPTURED)
     arrived = ~tip.done & landed & (impact.arrival_time_us < until)
@@ -334,6 +337,19 @@ def _round(seen: Scene, tip: LawTip, until: Array) -> LawTip:
         done=tip.done | ~goes_on,
         rounds=tip.rounds + 1,
     )
+
+
+def _or_rest(seen: Scene, tip: LawTip, impact: NextImpact) -> NextImpact:
+    """Return the capture that a tip at rest on the surface at its start has had, or the impact that was found."""
+    leg, surface = tip.leg, seen.platform
+    speed = surface.velocity(leg.time_us)
+    rate = jnp.abs(leg.velocity - speed)
+    slow = rate <= _ON_SURFACE_NM * Bed(seen.cantilever, surface).fastest
+    rests = (tip.rounds == 0) & (leg.gap_nm == 0.0) & slow
+    captured = NextImpact(
+        leg.time_us, leg.time_us, speed, speed, jnp.full_like(impact.outcome, Outcome.CAPTURED), rests
+    )
+    return jax.tree.map(lambda one, other: jnp.where(rests, one, other), captured, impact)
 
 
 def through_impact(seen: Scene, impact: NextImpact, arrived: Array, until: Array) -> tuple[LawRow, LawLeg, Array]:

@@ -36,9 +36,6 @@ _PIECE_PERIODS = 256
 """Periods of the fastest motion in a piece."""
 _ROOM = 1040
 """Contacts in a piece: four for every period, as `simulate` reckons."""
-_ROUNDS = 20_000
-"""Of a piece that ends with its contacts: a held tip takes a round every 60 steps of its oscillation; a free one does
-not come near this many."""
 _LITTLE = 1.001
 """What is left is followed with the piece before, if it is next to nothing."""
 _HELD_LONG_ENOUGH = 12.0
@@ -484,8 +481,7 @@ def follow_long(  # noqa: PLR0913
 
     def run(state: State, length_us: float) -> Simulation:
         room = (piece_contacts or _ROOM) if length_us <= piece_us * _LITTLE else None
-        rounds = None if piece_contacts is None else _ROUNDS
-        return simulate(scene, state, length_us, max_contacts=room, accuracy=accuracy, method=method, max_rounds=rounds)
+        return simulate(scene, state, length_us, max_contacts=room, accuracy=accuracy, method=method)
 
     count, pieces, whole, verdict = 0, [], None, None
     for found in follow_in_pieces(scene, start, float(start.time_us) + duration_us, run, piece_us=piece_us):

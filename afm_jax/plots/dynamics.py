@@ -7,7 +7,9 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.patches import Patch
 
+from afm_jax.dynamics.basins import Basins
 from afm_jax.dynamics.bifurcations import Sweep
 from afm_jax.dynamics.charts import StabilityChart
 from afm_jax.plots.charts import cell_edges
@@ -141,4 +143,29 @@ def draw_chart(x: str, y: str, chart: StabilityChart, target: Path) -> None:
     right.set_title("how stable", fontsize=12)
     label_axes(left, x=label_of(x), y=label_of(y))
     label_axes(right, x=label_of(x), y="")
+    save(figure, target)
+
+
+def draw_basins(basins: Basins, target: Path) -> None:
+    """Draw which start ends where, and the points of the orbits.
+
+    Args:
+        basins: what is shown.
+        target: PNG, PDF or SVG file.
+    """
+    figure = new_figure(8.4, 6.0)
+    axes: Axes = figure.subplots()
+    number = min(len(basins.attractors), len(KINDS))
+    degrees = np.degrees(basins.phase_rad)
+    edges = cell_edges(degrees), cell_edges(basins.rebound_speed_nm_per_us)
+    shown = np.minimum(basins.attractor, number - 1)
+    axes.pcolormesh(*edges, shown, cmap=ListedColormap(KINDS[:number]), vmin=-0.5, vmax=number - 0.5, rasterized=True)
+    handles = [
+        Patch(color=KINDS[index], label=f"{attractor.name}: {100.0 * share:.3g} %")
+        for index, (attractor, share) in enumerate(zip(basins.attractors, basins.share, strict=True))
+        if index < number
+    ]
+    axes.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]], xticks=range(0, 361, 90))
+    label_axes(axes, x="drive phase at the start (deg)", y=r"rebound speed at the start (nm/$\mu$s)")
+    figure.legend(handles=handles, loc="outside upper center", ncols=4, fontsize=11, frameon=False)
     save(figure, target)

@@ -1,0 +1,175 @@
+"""Bifurcation diagrams, charts and basins against plain loops over the map, single tips and closed forms."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import afm_jax as afm
+from afm_jax.bench.dynamics import orbits_by_numpy
+from afm_jax.cli.main import main
+from afm_jax.dynamics.basins import basins_of_attraction, boundary_dimension
+from afm_jax.dynamics.bifurcations import bifurcation_diagram
+from afm_jax.dynamics.charts import stability_chart
+from afm_jax.scenefile.parameter_paths import scene_family
+
+FREQUENCY = "platform.reduced_frequency"
+
+
+def law_scene(reduced: float, r: float = 0.8) -> afm.Scene:
+    return afm.Scene(afm.Cantilever(90.0), afm.Platform(2.0, 180.0 * reduced, -1.0), afm.ImpactLaw(r))
+
+
+def repeats_after(velocities: np.ndarray, longest: int = 6) -> np.ndarray:
+    """Return after how many impacts the last velocities of each row repeat; 0 where they do not."""
+    found = np.zeros(len(velocities), int)
+    for m in range(longest, 0, -1):
+        same = np.abs(velocities[:, -m:] - velocities[:, -2 * m : -m]).max(axis=1) < 1e-7
+        found[same] = m
+    return found
+
+
+def swept_by_one_tip(values: np.ndarray, impacts: int) -> np.ndarray:
+    """Return m at each value of the frequency, by one tip that keeps phase and rebound speed; values in its order."""
+    phase, rebound, found = 1.5 * np.pi, None, []
+    for value in values:
+        scene = law_scene(value)
+        omega = float(scene.platform.angular_frequency)
+        rebound = float(scene.platform.top_speed_nm_per_us) if rebound is None else rebound
+        time = np.array([phase / omega])
+        rows = afm.iterate_batch(scene, time, np.asarray(scene.platform.velocity(time)) + rebound, impacts)
+        found.append(repeats_after(np.asarray(rows.velocity_after_nm_per_us))[0])
+        last = float(rows.time_us[0, -1])
+        phase = omega * last % (2.0 * np.pi)
+        rebound = float(rows.velocity_after_nm_per_us[0, -1] - scene.platform.velocity(last))
+    return np.array(found)
+
+
+@pytest.mark.slow
+def test_sweeps_in_lanes_are_those_of_one_tip_and_show_hysteresis():
+    values = np.linspace(1.54, 1.62, 17)
+    up, down = (
+        bifurcation_diagram(law_scene(1.5), FREQUENCY, values, upward=way, impacts=600) for way in (True, False)
+    )
+    assert up.complete
+    assert down.complete
+    np.testing.assert_array_equal(up.verdicts.impacts, swept_by_one_tip(values, 600))
+    np.testing.assert_array_equal(down.verdicts.impacts, swept_by_one_tip(values[::-1], 600)[::-1])
+    assert np.any(up.verdicts.impacts != down.verdicts.impacts)
+    for sweep in (up, down):
+        m, n = sweep.verdicts.impacts, sweep.verdicts.periods
+        orbit = m > 0
+        assert np.array_equal(np.isfinite(sweep.phase_rad).sum(axis=1)[orbit], m[orbit])
+        # the platform's height at the impact is its height at the phase
+        np.testing.assert_allclose(sweep.height_nm, -1.0 + 2.0 * np.cos(sweep.phase_rad), rtol=0, atol=1e-9)
+        # in N periods the platform is highest N times
+        assert np.array_equal(np.isfinite(sweep.strobe_height_nm).sum(axis=1)[orbit], n[orbit])
+
+
+@pytest.mark.slow
+def test_a_chart_is_the_orbits_one_by_one_at_resonance_too():
+    x, y = np.linspace(0.5, 2.5, 9), np.array([0.4, 1.0, 3.0])
+    chart = stability_chart(
+        scene_family(law_scene(1.0), FREQUENCY, "platform.amplitude_nm"), x_values=x, y_values=y, last_order=2
+    )
+    assert {1.0, 2.0} <= set(x)
+    verdicts = chart.verdicts
+    for point, (n, beta) in enumerate(zip(*chart.points(), strict=True)):
+        scene = afm.Scene(afm.Cantilever(90.0), afm.Platform(beta, 180.0 * n, -1.0), afm.ImpactLaw(0.8))
+        for order in (1, 2):
+            orbits = afm.single_impact_orbits(scene, order)
+            admissible = np.asarray(orbits.exists & orbits.admissible)
+            stable = admissible & np.asarray(orbits.stable)
+            assert verdicts.admissible[order - 1, point] == admissible.any()
+            assert verdicts.stable[order - 1, point] == stable.any()
+            if stable.any():
+                slot = int(np.argmax(np.where(stable, orbits.peak_amplitude_nm, -1.0)))
+                sizes = np.abs(np.roots([1.0, -float(orbits.trace[slot]), float(orbits.determinant[slot])]))
+                assert verdicts.largest_multiplier[order - 1, point] == pytest.approx(sizes.max(), abs=1e-7)
+                assert verdicts.peak_amplitude_nm[order - 1, point] == pytest.approx(
+                    float(orbits.peak_amplitude_nm[slot])
+                )
+
+
+@pytest.mark.slow
+def test_a_chart_is_that_of_plain_numpy_at_random_points():
+    scene = law_scene(1.0)
+    generator = np.random.default_rng(3)
+    x, y = np.sort(generator.uniform(0.52, 4.4, 30)), np.sort(generator.uniform(0.1, 10.0, 30))
+    plane = scene_family(scene, FREQUENCY, "platform.amplitude_nm")
+    verdicts = stability_chart(plane, x_values=x, y_values=y, last_order=4).verdicts
+    free, differ = float(scene.cantilever.angular_frequency), 0
+    for point, (n, beta) in enumerate((n, beta) for beta in y for n in x):
+        for order in (1, 2, 3, 4):
+            orbits = orbits_by_numpy(free, 2.0 * n * free, beta, -1.0, 0.8, order)
+            admissible = [stable for _, above, stable in orbits if above]
+            # a flight seen at 254 points passes through the platform unseen where it dips in for shorter only
+            if verdicts.admissible[order - 1, point] != bool(admissible):
+                assert admissible
+                differ += 1
+            else:
+                assert verdicts.stable[order - 1, point] == any(admissible), (n, beta, order)
+    assert differ < 0.01 * verdicts.admissible.size
+
+
+@pytest.mark.slow
+def test_shares_of_basins_are_those_of_random_starts():
+    scene = law_scene(1.57)
+    found = basins_of_attraction(scene, columns=100, rows=100, speeds_nm_per_us=(0.0, 15.0))
+    assert {attractor.name for attractor in found.attractors} == {"(3,4)", "(2,4)"}
+    generator, starts = np.random.default_rng(7), 2000
+    time = generator.uniform(0.0, float(scene.platform.period_us), starts)
+    velocity = np.asarray(scene.platform.velocity(time)) + generator.uniform(0.0, 15.0, starts)
+    rows = afm.iterate_batch(scene, time, velocity, 400)
+    m = repeats_after(np.asarray(rows.velocity_after_nm_per_us))
+    for attractor, share, error in zip(found.attractors, found.share, found.share_error, strict=True):
+        other = np.mean(m == attractor.impacts)
+        assert abs(share - other) < 4.0 * np.hypot(error, np.sqrt(other * (1.0 - other) / starts))
+    assert 1.0 < found.boundary_dimension < 2.0
+
+
+def test_the_dimension_of_a_line_is_1_and_of_noise_2():
+    columns, rows = np.meshgrid(np.arange(512), np.arange(512))
+    line = (columns + 0.37 * rows > 350).astype(int)
+    assert boundary_dimension(line)[0] == pytest.approx(1.0, abs=0.02)
+    noise = np.random.default_rng(1).integers(0, 2, (512, 512))
+    assert boundary_dimension(noise)[0] == pytest.approx(2.0, abs=0.02)
+    assert np.isnan(boundary_dimension(np.zeros((512, 512), int))[0])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["bifurcation", "{scene}", "--parameter", "interaction.rr=0.5:0.9:10"], "did you mean interaction.r"),
+        (["chart", "{scene}", "--x", "platform.amplitude_nm=1:2:3", "--y", "interaction.r=0.5:2:3"], "`r` must be in"),
+        (["basins", "{scene}", "--grid", "1000"], "COLUMNSxROWS"),
+        (["basins", "{scene}", "--grid", "9999x9999"], "COLUMNSxROWS"),
+        (["bifurcation", "{scene}", "--parameter", "platform.amplitude_nm=3:2:10"], "the range is empty"),
+    ],
+)
+def test_bad_requests_end_in_one_line(tmp_path: Path, arguments: list[str], words: str):
+    file = tmp_path / "scene.toml"
+    afm.save_scene(law_scene(1.0), file)
+    run = CliRunner().invoke(main, [text.format(scene=file) for text in arguments])
+    assert run.exit_code == 2
+    assert words in run.stderr
+    assert run.stderr.strip().count("\n") == 0
+
+
+@pytest.mark.slow
+def test_commands_write_tables_and_pictures(tmp_path: Path):
+    file = tmp_path / "scene.toml"
+    afm.save_scene(law_scene(1.57), file)
+    calls = {
+        "bifurcation": ["--parameter", f"{FREQUENCY}=1.55:1.6:6", "--impacts", "600", "--both", "--picture", "svg"],
+        "chart": ["--x", f"{FREQUENCY}=0.5:2.5:9", "--y", "platform.amplitude_nm=1:3:3", "--orders", "2"],
+        "basins": ["--grid", "100x100", "--picture", "pdf"],
+    }
+    for name, options in calls.items():
+        run = CliRunner().invoke(main, [name, str(file), *options, "--json", "--out", str(tmp_path / name)])
+        assert run.exit_code == 0, run.stderr
+        assert json.loads(run.stdout)
+        assert (tmp_path / name / f"{name}.csv").stat().st_size > 100
+        assert list((tmp_path / name).glob(f"{name}.[ps][dnv][fg]"))
