@@ -7,6 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from afm_jax.whole_files import write_whole
+
 DARK = "#3b4a5a"
 ACCENT = "#b34700"
 """A dark orange that stands off white, black and DARK for every kind of colour vision."""
@@ -38,7 +40,7 @@ def with_zero_line(axes: Axes) -> None:
 
 def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG."""
-    figure.savefig(path, dpi=_DPI, format="png")
+    write_whole(path, png_of(figure, _DPI))
 
 
 def png_of(figure: Figure, dpi: float = 150.0) -> bytes:
