@@ -210,14 +210,14 @@ def check_rows(
 def _check_numbers(
     column: Column, values: Float[np.ndarray, " rows"], lines: Int[np.ndarray, " rows"], faults: Faults
 ) -> Bool[np.ndarray, " rows"]:
-    large = np.isfinite(values) & (np.abs(values) > LARGEST)
+    # a whole number only has to survive the way through 64-bit floats
+    large = np.isfinite(values) & (np.abs(values) > (np.inf if column.integer else LARGEST))
     bad = np.isinf(values) | large
     what = "must be finite"
     if column.positive:
         bad |= values <= 0.0
         what = "must be finite and above 0"
     if column.integer:
-        # Larger numbers would not survive the way through 64-bit floats.
         bad |= (values != np.floor(values)) | (values >= 2**53)
         bad &= ~np.isnan(values)
         what = "must be a positive whole number (1, 2, 3, ...)"
@@ -226,7 +226,7 @@ def _check_numbers(
         what = "must be 1 (no steady orbit was seen) or 0"
     for row in np.flatnonzero(bad):
         number = repr(float(values[row])).removesuffix(".0")
-        must = f"must be at most {LARGEST:g} in size" if large[row] and not column.integer else what
+        must = f"must be at most {LARGEST:g} in size" if large[row] else what
         faults.add(f"{must}, but is {number}; correct it{_or_blank(column)}", line=int(lines[row]), column=column.name)
     return bad
 
