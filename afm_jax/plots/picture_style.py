@@ -15,7 +15,7 @@ ACCENT = "#b34700"
 BLUE = "#0072B2"
 GRID = "#9aa5b1"
 _FONT = 11.0
-_DPI = 200
+_DPI = 200.0
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
