@@ -13,6 +13,7 @@ The `--out` folder: made and tried out before the computation, and the tables in
 
 import csv
 import functools
+import io
 import math
 import sys
 import tempfile
@@ -27,6 +28,8 @@ import click
 
 from afm_jax.compilation_cache import cache_folder, make_private, silence_xla
 from afm_jax.strict_json import strict_json
+from afm_jax.whole_files import write_whole
+from afm_jax.words import shown
 
 if TYPE_CHECKING:
     from afm_jax.compilation_cache import Cache
@@ -45,10 +48,11 @@ def prepare_folder(folder: Path) -> None:
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> None:
     """Write rows as CSV; numbers with all their digits, true and false in words, what is unknown as an empty cell."""
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows([_cell(row.get(column)) for column in columns] for row in rows)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows([_cell(row.get(column)) for column in columns] for row in rows)
+    write_whole(path, text.getvalue())
 
 
 def _cell(value: Any) -> Any:
@@ -70,6 +74,20 @@ def _cells(column: Any) -> Any:
 
 
 _SECONDS_BETWEEN_NOTES = 2.0
+
+
+def labelled(payload: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a result with what it is, `format` and `format_version`, first; one that says so itself as it is."""
+    if "format" in payload:
+        return dict(payload)
+    return {"format": f"afm-jax {click.get_current_context().info_name}", "format_version": 1, **payload}
+
+
+def write_json(path: Path, payload: Mapping[str, Any]) -> None:
+    """Write a result as a JSON file, whole or not at all."""
+    write_whole(path, strict_json(labelled(payload)) + "\n")
+
+
 _WIDTH_OF_A_PIPE = 160
 """Columns of text that nobody looks at in a terminal; wide enough that no table is cut."""
 
@@ -117,7 +135,7 @@ class Session:
 
     def note(self, message: str) -> None:
         """Write a message to standard error."""
-        _console(stderr=True).print(message, markup=False, highlight=False, soft_wrap=True)
+        _console(stderr=True).print(shown(message), markup=False, highlight=False, soft_wrap=True)
 
     def progress(self, what: str) -> Callable[[int, int], None]:
         """Return what tells on standard error how much is done, every two seconds at most."""
@@ -133,7 +151,7 @@ class Session:
 
     def working(self, what: str) -> AbstractContextManager[object]:
         """Show on standard error what is being done, for as long as it takes, if that is a terminal."""
-        return _console(stderr=True).status(what)
+        return _console(stderr=True).status(shown(what))
 
     def emit(self, payload: Mapping[str, Any], *text: Any) -> None:
         """Write the result to standard output: the JSON object if asked for, else the text.
@@ -143,12 +161,12 @@ class Session:
             text: strings and rich tables, one below the other; strings are printed as they are.
         """
         if self.json:
-            click.echo(strict_json(payload))
+            click.echo(strict_json(labelled(payload)))
             return
         console = _console(stderr=False)
         for part in text:
             if isinstance(part, str):
-                console.print(part, markup=False, highlight=False, soft_wrap=True)
+                console.print(shown(part), markup=False, highlight=False, soft_wrap=True)
             else:
                 console.print(part)
         sys.stdout.flush()
