@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.bifurcations import follow
+from afm_jax.dynamics.bifurcations import follow, settled_below
 from afm_jax.dynamics.exponents import CHAOTIC_ERRORS, exponents_of_law
 from afm_jax.dynamics.iteration import (
     LANES,
@@ -36,7 +36,6 @@ from afm_jax.outcomes import Outcome
 _SAMPLE = 2048
 _LONG = 1000
 """Impacts after which a sample is looked at."""
-_SETTLED = 1e-6
 _SAME = 1e-3
 """Distance below which points are those of one orbit."""
 _RADII = (0.3, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.0)
@@ -182,7 +181,7 @@ class _Finder:
 
         end, record = in_blocks(work, tips, report=report)
         period = np.full(len(end.time_us), 2.0 * np.pi / self.omega)
-        verdicts = verdicts_of(record, end.outcome, period, tolerance=_SETTLED)
+        verdicts = verdicts_of(record, end.outcome, period, tolerance=settled_below(self.scene))
         label = np.empty(len(period), int)
         for lane in range(len(period)):
             m = int(verdicts.impacts[lane])

@@ -39,8 +39,8 @@ _HURRIED = 100
 """Impacts at each value of the first, hurried sweep."""
 _PASSES = 40
 """Times at most that stretches are swept again."""
-_SETTLED = 1e-6
-"""Estimated distance from an orbit below which a motion is on it."""
+_SETTLED, _SETTLED_CONTACT = 1e-6, 1e-4
+"""Estimated distance from an orbit below which a motion is on it, with laws and with resolved contacts."""
 _SAME = 1e-4
 """Of the largest speed: points of orbits closer than this are the same."""
 
@@ -198,7 +198,9 @@ class _Sweeper:
         scenes = self._at(numbers)
         end, record = in_blocks(work, (scenes, tips))
         period = np.asarray(scenes.platform.period_us)
-        return _SweptRows(end, restarted, record, verdicts_of(record, end.outcome, period, tolerance=_SETTLED))
+        return _SweptRows(
+            end, restarted, record, verdicts_of(record, end.outcome, period, tolerance=settled_below(scenes))
+        )
 
     def _hurried(self) -> Tips:
         """Return the tips that one gets at the first values of all stretches in a sweep of those alone."""
@@ -232,6 +234,11 @@ def follow(scenes: Scene, tips: Tips, *, skip: int, record: int, accuracy: float
         return follow_contacts(scenes, tips, skip=skip, record=record, accuracy=accuracy)
     tips, rows = recorded(scenes, skipped(scenes, tips, impacts=skip), impacts=record)
     return tips, Record(*(np.asarray(part).T for part in rows))
+
+
+def settled_below(scenes: Scene) -> float:
+    """Return the estimated distance from an orbit below which a motion is on it."""
+    return _SETTLED_CONTACT if isinstance(scenes.interaction, Contact) else _SETTLED
 
 
 @jax.jit

@@ -27,7 +27,7 @@ from afm_jax.impact.roots import OrbitRoots, find_roots
 
 _BLOCK = 2048
 """Scenes gone through together."""
-_LANES = 512
+_LANES = 1024
 """Roots, and orbits, computed together: few enough for the cache, many enough to fill the vector units."""
 
 
