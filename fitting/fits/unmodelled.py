@@ -379,17 +379,17 @@ def law_after(step: Step, left_out: Unmodelled, speeds: Float[np.ndarray, " n"],
     found, factor = _moved(step, slope, Columns(*(seen(part) for part in columns)))
     found = np.where(leaves, law + found, law)
     found[0] = np.maximum(found[0], 0.0)
+    whole = LawAfter(found, np.where(leaves[:, None], factor, 0.0), before.capture, np.full(factor.shape[2], np.nan))
+    if not before.capture > 0.0:
+        # without adhesion nothing is captured: what is left out cannot be told from there
+        return whole
     # where the squared rebound speed vanishes
-    edge = left_out.columns(np.array([before.capture]), np.zeros(1)) if before.capture > 0.0 else columns
+    edge = left_out.columns(np.array([before.capture]), np.zeros(1))
     rising = 2.0 * left_out.values.get("r", 1.0) ** 2 * before.capture - left_out.values.get("viscous_loss", 0.0)
     at_capture = Columns(*(-part[:1, :1] / max(rising, 1e-9) for part in edge))
     shift, capture_factor = _moved(step, before.capture_slope[None, None], at_capture)
-    return LawAfter(
-        law=found,
-        factor=np.where(leaves[:, None], factor, 0.0),
-        capture=max(before.capture + float(shift[0, 0]), 0.0),
-        capture_factor=capture_factor[0, 0],
-    )
+    capture = max(before.capture + float(shift[0, 0]), 0.0)
+    return whole._replace(capture=capture, capture_factor=capture_factor[0, 0])
 
 
 def _moved(
