@@ -8,6 +8,7 @@ import click
 
 from afm_jax.cli.accuracy_scene import scene_study
 from afm_jax.cli.session import Session, with_session
+from afm_jax.whole_files import write_whole
 from afm_jax.words import known
 
 if TYPE_CHECKING:
@@ -188,9 +189,10 @@ def command(
     session.write_table("accuracy.csv", result["rows"], COLUMNS)
     if session.out is not None:
         from afm_jax.plots.accuracy import accuracy_figure  # noqa: PLC0415
+        from afm_jax.plots.picture_style import png_of  # noqa: PLC0415
 
-        (session.out / "accuracy.json").write_text(strict_json(payload) + "\n", encoding="utf-8")
-        accuracy_figure(result["rows"], wanted_error_us).savefig(session.out / "accuracy.png", dpi=150)
+        write_whole(session.out / "accuracy.json", strict_json(payload) + "\n")
+        write_whole(session.out / "accuracy.png", png_of(accuracy_figure(result["rows"], wanted_error_us)))
         session.note(f"wrote {session.out / 'accuracy.json'} and {session.out / 'accuracy.png'}")
     session.emit(
         payload,
@@ -269,9 +271,10 @@ def collide_study(session: Session, accuracy: float, *, quick: bool) -> None:
     session.write_table("accuracy.csv", result["rows"], COLLIDE_COLUMNS)
     if session.out is not None:
         from afm_jax.plots.accuracy import collide_accuracy_figure  # noqa: PLC0415
+        from afm_jax.plots.picture_style import png_of  # noqa: PLC0415
 
-        (session.out / "accuracy.json").write_text(strict_json(payload) + "\n", encoding="utf-8")
-        collide_accuracy_figure(result["rows"]).savefig(session.out / "accuracy.png", dpi=150)
+        write_whole(session.out / "accuracy.json", strict_json(payload) + "\n")
+        write_whole(session.out / "accuracy.png", png_of(collide_accuracy_figure(result["rows"])))
         session.note(f"wrote {session.out / 'accuracy.json'} and {session.out / 'accuracy.png'}")
     sentence = (
         f"No contestant reaches {accuracy:g}."

@@ -8,12 +8,13 @@ import click
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.orbits import IMPACT_COLUMNS, PositiveInteger, impact_rows, orbit_facts, refuse_other_than_law
 from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.values import PictureFormat, ranges_of, scene_and_start
 
 if TYPE_CHECKING:
     from rich.table import Table
 
     from afm_jax.dynamics.bands import UncertainParameters
-    from afm_jax.dynamics.continuation import Branch, Continuation, SpecialCurve
+    from afm_jax.dynamics.continuation import Continuation, OrbitBranch, SpecialCurve
 
 POINT_COLUMNS = (
     "branch",
@@ -50,7 +51,7 @@ _ENDS = {
 
 
 @click.command(name="continue")
-@click.argument("scene", metavar="SCENE.toml", type=click.Path(path_type=Path))
+@click.argument("scene", metavar="SCENE.toml|PRESET")
 @click.option("--order", metavar="N", required=True, type=PositiveInteger(), help="Drive periods of the orbit.")
 @click.option(
     "--impacts",
@@ -73,66 +74,44 @@ _ENDS = {
     metavar="JSON",
     help="A fit (fit.json of `afm-jax fit --out`): its law in place of the scene's, its errors as bands.",
 )
-@click.option(
-    "--picture",
-    type=click.Path(path_type=Path),
-    metavar="FILE",
-    help="Also draw the branches into this file: .pdf, .svg or .png.",
-)
+@click.option("--picture", type=PictureFormat(), default="png", show_default=True, help="png, pdf or svg.")
 @with_session
 def command(  # noqa: PLR0913
     session: Session,
-    scene: Path,
+    scene: str,
     *,
     order: int,
     impacts: int,
     parameter: str,
     second: str | None,
     law: Path | None,
-    picture: Path | None,
+    picture: str,
 ) -> None:
     """Follow the (m, N) orbits of a scene through a parameter, round folds, by pseudo-arclength.
 
     Folds, period doublings, torus points, grazings and captures are located to rounding; with --second they are
     followed as curves in two parameters, with cusps and meetings. With --law every special point has a 95 % interval.
-    With --out tables and a picture. Exit code 3 if there is no admissible orbit in the range.
+    With --out tables and pictures. Exit code 3 if there is no admissible orbit in the range.
     """
-    if picture is not None:
-        check_picture(picture)
     session.start_computing()
     from afm_jax.cli.fitted_law import with_fitted_law  # noqa: PLC0415
     from afm_jax.dynamics.continuation import continue_orbits  # noqa: PLC0415
-    from afm_jax.scenefile.parameter_paths import parse_range  # noqa: PLC0415
-    from afm_jax.scenefile.scenefile import load_scene  # noqa: PLC0415
 
-    loaded = load_scene(scene)
+    loaded, _ = scene_and_start(scene)
     known = None
     if law is not None:
         loaded, known = with_fitted_law(loaded, law)
     refuse_other_than_law(loaded, scene)
-    first = parse_range(parameter, counted=False)
-    other = None if second is None else parse_range(second, counted=False)
+    first, *others = ranges_of(scene, loaded, [parameter, *([] if second is None else [second])], counted=False)
     try:
         with session.working("following orbits (the first run compiles for some seconds)"):
-            found = continue_orbits(loaded, order, first, impacts=impacts, second=other)
+            found = continue_orbits(loaded, order, first, impacts=impacts, second=others[0] if others else None)
     except ValueError as error:
         raise ValueError(f"{scene}: {error}") from error
     _finish(session, found, known, picture)
 
 
-def check_picture(path: Path) -> None:
-    """Check that a picture can be written to a path.
-
-    Raises:
-        click.UsageError: if its suffix is none that pictures have, or its folder does not exist.
-    """
-    if path.suffix not in (".pdf", ".svg", ".png"):
-        raise click.UsageError(f"--picture {path}: must end in .pdf, .svg or .png")
-    if not path.absolute().parent.is_dir():
-        raise click.UsageError(f"--picture {path}: there is no folder {path.parent}")
-
-
-def _finish(session: Session, found: "Continuation", known: "UncertainParameters | None", picture: Path | None) -> None:
+def _finish(session: Session, found: "Continuation", known: "UncertainParameters | None", picture: str) -> None:
     from afm_jax.dynamics.bands import WITHIN_95, amplitude_errors, special_errors  # noqa: PLC0415
 
     bands = None if known is None else [amplitude_errors(found, branch, known) for branch in found.branches]
@@ -176,20 +155,19 @@ def _finish(session: Session, found: "Continuation", known: "UncertainParameters
         "reason": reason,
     }
     session.emit(payload, *_text(found, special, curves))
-    if session.out is not None or picture is not None:
+    if session.out is not None:
         from afm_jax.plots.branches import draw_continuation, draw_curves  # noqa: PLC0415
 
-        for path in [*([] if session.out is None else [session.out / "branches.png"]), *([picture] if picture else [])]:
-            draw_continuation(found, path, bands=bands, errors=errors)
-            session.note(f"wrote {path}")
-        if session.out is not None and found.curves:
-            draw_curves(found, session.out / "curves.png")
-            session.note(f"wrote {session.out / 'curves.png'}")
+        draw_continuation(found, session.out / f"branches.{picture}", bands=bands, errors=errors)
+        session.note(f"wrote {session.out / f'branches.{picture}'}")
+        if found.curves:
+            draw_curves(found, session.out / f"curves.{picture}")
+            session.note(f"wrote {session.out / f'curves.{picture}'}")
     if reason is not None:
         raise NotValid(reason)
 
 
-def point_rows(number: int, branch: "Branch", band: Any = None) -> list[dict[str, Any]]:
+def point_rows(number: int, branch: "OrbitBranch", band: Any = None) -> list[dict[str, Any]]:
     """Return the points of a branch as plain mappings, with the first impact's numbers and all impacts."""
     import numpy as np  # noqa: PLC0415
 

@@ -17,8 +17,8 @@ from afm_jax.words import text_table
 from fitting.parameters import CONTACT_DEFAULT, DELAY_LAW, LAWS, MODELS, NUISANCE_NAMES
 
 if TYPE_CHECKING:
+    from fitting.fits.fit import Found
     from fitting.fits.result import FitResult
-    from fitting.tables.table import AmplitudeTable
 
 
 class Fixed(click.ParamType):
@@ -152,15 +152,16 @@ def command(session: Session, table: Path | None, model: str, noise: float | Non
         raise click.UsageError(f"{both}give a table to fit, `afm-jax fit TABLE.csv`, or --example for the bundled one")
     settings = _settings(model, options)
     session.start_computing(*(f"fitting.forward:{name}" for name in ("impacts_of", "located", "linearise_pairs")))
-    from fitting.fits.fit import fit  # noqa: PLC0415
+    from fitting.fits.fit import find_fit, summarise  # noqa: PLC0415
     from fitting.report.report import summary  # noqa: PLC0415
     from fitting.tables.table import read_table  # noqa: PLC0415
 
     measured = read_table(_example_path() if table is None else table, noise=noise)
     first = "the first run compiles for half a minute" if "delay" in model or model == "contact" else "some seconds"
     with session.working(f"fitting {measured.rows} rows, model {model} ({first})"):
-        result = fit(measured, model, **settings)
-    extras, failure = _extras(session, measured, result, settings, options)
+        found = find_fit(measured, model, **settings)
+        result = summarise(measured, found)
+    extras, failure = _extras(session, found, result, settings, options)
     payload = result.to_dict() | {name: extra.to_dict() for name, extra in extras.items()}
     session.emit(payload, summary(result), *(_words(name, extra) for name, extra in extras.items()))
     if session.out is not None:
@@ -230,7 +231,7 @@ def _check_contact_options(free: tuple[str, ...], fixed: dict[str, float], effec
 
 
 def _extras(
-    session: Session, table: "AmplitudeTable", result: "FitResult", settings: dict[str, Any], options: dict[str, Any]
+    session: Session, found: "Found", result: "FitResult", settings: dict[str, Any], options: dict[str, Any]
 ) -> tuple[dict[str, Any], Exception | None]:
     """Return what was asked for besides the fit, as far as it came, and what ended it: the fit itself stands."""
     extras: dict[str, Any] = {}
@@ -239,7 +240,7 @@ def _extras(
             session.note(f"no {name}: the fit is not valid")
     try:
         if options["comparing"]:
-            extras["comparison"] = _comparison(session, table, result.model, settings)
+            extras["comparison"] = _comparison(session, found, result, settings)
         if options["bootstrap"] and result.valid:
             extras["bootstrap"] = _bootstrap(session, result, options["bootstrap"], options["seed"])
         if options["posterior"] and result.valid:
@@ -249,12 +250,12 @@ def _extras(
     return extras, None
 
 
-def _comparison(session: Session, table: "AmplitudeTable", model: str, settings: dict[str, Any]) -> Any:
+def _comparison(session: Session, found: "Found", result: "FitResult", settings: dict[str, Any]) -> Any:
     from fitting.fits.comparison import compare, rivals  # noqa: PLC0415
 
-    models = rivals(model)
+    models = rivals(result.model)
     with session.working(f"comparing {', '.join(models)}"):
-        return compare(table, models, **settings)
+        return compare(result.table, models, known={result.model: (found, result)}, **settings)
 
 
 def _bootstrap(session: Session, result: "FitResult", samples: int, seed: int) -> Any:

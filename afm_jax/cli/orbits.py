@@ -124,7 +124,7 @@ def command(session: Session, scene: Path, order: int, impacts: int | None) -> N
         raise NotValid(reason)
 
 
-def refuse_other_than_law(scene: "Scene", path: Path) -> None:
+def refuse_other_than_law(scene: "Scene", path: str | Path) -> None:
     """Check that a scene's interaction is a law.
 
     Raises:
@@ -200,7 +200,7 @@ def orbit_facts(reading: "LoopReading", index: int) -> dict[str, Any]:
     """Return what is told of one orbit of several impacts: the first one's numbers, and all in `impacts`."""
     import numpy as np  # noqa: PLC0415
 
-    from afm_jax.dynamics.impact_orbits import multipliers_of  # noqa: PLC0415
+    from afm_jax.dynamics.impact_orbits import is_stable, multipliers_of  # noqa: PLC0415
 
     trace, determinant = float(reading.trace[index]), float(reading.determinant[index])
     multipliers = multipliers_of(np.asarray(trace), np.asarray(determinant))
@@ -213,7 +213,7 @@ def orbit_facts(reading: "LoopReading", index: int) -> dict[str, Any]:
         "trace": trace,
         "determinant": determinant,
         "multipliers": [[float(one.real), float(one.imag)] for one in multipliers],
-        "stable": bool(abs(multipliers[0]) < 1.0),
+        "stable": bool(is_stable(multipliers)),
         "admissible": bool(reading.admissible[index]),
         "impacts": impacts,
     }

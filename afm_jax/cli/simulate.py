@@ -13,14 +13,16 @@ METHODS = ("collocation", "diffrax")
 
 if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
-    from afm_jax.motion.record import State
     from afm_jax.motion.settle import LongRun
     from afm_jax.motion.trajectory import DensePath
+    from afm_jax.scenefile.scenefile import Start
 
 DEFAULT_PERIODS = 2000
 """Drive periods followed at most where no duration is given."""
 LARGEST_OFFSET_NM = 10_000.0
 """How far a ramp may take the sample from the tip's rest position, either way."""
+MOST_OSCILLATIONS = 1e7
+"""Of the free tip: some minutes of computing."""
 _PIECES_A_LINE = 8
 """Pieces of a long run between two lines on standard error."""
 
@@ -103,17 +105,16 @@ def command(  # noqa: PLR0913
     from afm_jax.apparatus.scene import drive_of  # noqa: PLC0415
     from afm_jax.cli.values import scene_and_start  # noqa: PLC0415
     from afm_jax.motion.observe import observe  # noqa: PLC0415
-    from afm_jax.motion.start import start_of  # noqa: PLC0415
 
     loaded, told = scene_and_start(scene)
-    start = None if told is None else start_of(loaded, told)
     period = drive_of(loaded).period_us
     until_settled = until_settled or (duration_us is None and periods is None)
     longest = duration_us if duration_us is not None else (periods or DEFAULT_PERIODS) * period
     settings = {"accuracy": accuracy, "method": method, "until_settled": until_settled}
     try:
         _check_ramp(loaded, longest)
-        run = _follow(session, loaded, start, longest, settings)
+        _check_length(loaded, longest)
+        run = _follow(session, loaded, told, longest, settings)
         with session.working("reading amplitudes"):
             dense = _dense(loaded, run, to_files=session.out is not None)
             seen = observe(loaded, run.simulation, harmonics=harmonics, verdict=run.verdict, dense=dense)
@@ -152,16 +153,30 @@ def _check_ramp(scene: "Scene", duration_us: float) -> None:
         )
 
 
+def _check_length(scene: "Scene", duration_us: float) -> None:
+    """Check that a duration can be followed.
+
+    Raises:
+        ValueError: if the tip would oscillate too often in it.
+    """
+    oscillations = float(scene.cantilever.frequency_khz) * 1e-3 * duration_us
+    if not oscillations <= MOST_OSCILLATIONS:
+        raise ValueError(
+            f"in {duration_us:.6g} us the tip would oscillate {oscillations:.3g} times, more than the "
+            f"{MOST_OSCILLATIONS:g} that can be followed: give a shorter --duration-us or fewer --periods"
+        )
+
+
 def _follow(
     session: Session,
     scene: "Scene",
-    start: "State | None",
+    told: "Start | None",
     longest_us: float,
     settings: dict[str, Any],
 ) -> "LongRun":
     """Return the simulation; progress of long runs goes to standard error."""
     from afm_jax.motion.settle import follow_long  # noqa: PLC0415
-    from afm_jax.motion.start import default_start  # noqa: PLC0415
+    from afm_jax.motion.start import start_of  # noqa: PLC0415
 
     pieces = 0
 
@@ -172,9 +187,7 @@ def _follow(
             session.note(f"at {time_us:.6g} us, after {contacts} contacts")
 
     with session.working("simulating (the first run compiles for some seconds)"):
-        if start is None:
-            start = default_start(scene)
-        run = follow_long(scene, start, longest_us, report=report, **settings)
+        run = follow_long(scene, start_of(scene, told), longest_us, report=report, **settings)
     if int(run.simulation.outcome) == _invalid_start():
         raise ValueError("the tip cannot start there: the start is not finite, or inside the sample")
     return run

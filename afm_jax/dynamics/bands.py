@@ -15,10 +15,10 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from afm_jax.dynamics.continuation import (
-    Branch,
     Continuation,
     Equations,
     Frame,
+    OrbitBranch,
     SpecialPoint,
     equations_at,
     loop_at,
@@ -81,7 +81,9 @@ def drawn_points(
     return np.where(np.asarray(arrived), value, np.nan)
 
 
-def amplitude_errors(found: Continuation, branch: Branch, known: UncertainParameters) -> Float[np.ndarray, " points"]:
+def amplitude_errors(
+    found: Continuation, branch: OrbitBranch, known: UncertainParameters
+) -> Float[np.ndarray, " points"]:
     """Return the standard error of the peak amplitude in nm at each point of a branch, the parameter held.
 
     It grows without bound towards a fold, where the orbit of a held parameter ceases to exist.

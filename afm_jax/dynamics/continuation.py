@@ -109,6 +109,8 @@ class SpecialPoint(NamedTuple):
     parameter: float
     branch: int
     """Number of the branch that it lies on."""
+    position: float
+    """Where on it, in points: 2.5 is between the third and the fourth."""
     admissible: bool
     """Whether the map flies the orbit (at a grazing and a capture: on one side)."""
     unknowns: Float[np.ndarray, " n"]
@@ -117,7 +119,7 @@ class SpecialPoint(NamedTuple):
     """Number of the test function that vanishes."""
 
 
-class Branch(NamedTuple):
+class OrbitBranch(NamedTuple):
     """An orbit followed through the range, both ways from where it was found."""
 
     parameter: Float[np.ndarray, " points"]
@@ -153,7 +155,7 @@ class Continuation(NamedTuple):
     impacts: int
     range: ParameterRange
     second: ParameterRange | None
-    branches: tuple[Branch, ...]
+    branches: tuple[OrbitBranch, ...]
     special: tuple[SpecialPoint, ...]
     curves: tuple[SpecialCurve, ...]
     rejected: int
@@ -209,6 +211,8 @@ def continue_orbits(
         for number, (way, branch) in enumerate(zip(ways, branches, strict=True))
         for point in _special_points(way, branch, number, frame, equations)
     )
+    # the point behind a capture at the beginning goes
+    special = tuple(one._replace(position=one.position - (ways[one.branch].ends[0] == "capture")) for one in special)
     branches = tuple(map(_before_capture, branches))
     curves = ()
     if second is not None:
@@ -331,7 +335,7 @@ def _solve(frame: Frame, guess: np.ndarray, row: np.ndarray, equations: Equation
 # Curves.
 
 
-class _Leg(NamedTuple):
+class _CurveLeg(NamedTuple):
     """One step of a curve: from a point to another; the guess for the second, and across what it was found."""
 
     begin: _Step
@@ -350,8 +354,8 @@ class _Way(NamedTuple):
     """A curve as it was followed from a point on it: backwards, and ahead."""
 
     first: _Step
-    behind: list[_Leg]
-    ahead: list[_Leg]
+    behind: list[_CurveLeg]
+    ahead: list[_CurveLeg]
     ends: tuple[str, str]
 
     @property
@@ -364,7 +368,7 @@ class _Way(NamedTuple):
         """The same as an array."""
         return np.stack([step.point for step in self.steps])
 
-    def places(self) -> Iterator[tuple[_Leg, Callable[[float], float]]]:
+    def places(self) -> Iterator[tuple[_CurveLeg, Callable[[float], float]]]:
         """Give the legs, each with the function from a share of it to a place between the points."""
         count = len(self.behind)
         for index, leg in enumerate(self.behind):
@@ -387,7 +391,7 @@ def _both_ways(start: np.ndarray, frame: Frame, equations: Equations) -> _Way | 
     return _Way(first, behind, ahead, (why_behind, why_ahead)) if ahead or behind else None
 
 
-def _follow(first: _Step, tangent: np.ndarray, frame: Frame, equations: Equations) -> tuple[list[_Leg], str]:
+def _follow(first: _Step, tangent: np.ndarray, frame: Frame, equations: Equations) -> tuple[list[_CurveLeg], str]:
     """Return the legs of a curve from a point in a direction, and why they end."""
     parameters = len(equations.paths)
     here, legs, length = first._replace(tangent=tangent), [], FIRST_STEP
@@ -404,7 +408,7 @@ def _follow(first: _Step, tangent: np.ndarray, frame: Frame, equations: Equation
         if np.any(shares < 0.0) or np.any(shares > 1.0):
             last = _at_the_border(here, found, frame, equations, parameters)
             return (legs if last is None else [*legs, last]), "range"
-        legs.append(_Leg(here, found, guess, here.tangent))
+        legs.append(_CurveLeg(here, found, guess, here.tangent))
         over = _why_over(found, shorter, equations)
         if over is not None:
             return (legs if over == "capture" else legs[:-1]), over
@@ -454,7 +458,7 @@ def _is_next(found: _Step, guess: np.ndarray, length: float, here: _Step) -> boo
     return bool(np.linalg.norm(found.point - guess) < _OFF * length and here.tangent @ found.tangent > _STRAIGHT)
 
 
-def _closes(legs: list[_Leg], first: _Step, tangent: np.ndarray, length: float) -> bool:
+def _closes(legs: list[_CurveLeg], first: _Step, tangent: np.ndarray, length: float) -> bool:
     """Say whether a curve has come back to its beginning; whole turns of the phases count as none."""
     count = (len(first.point) - 1) // 2
     apart = legs[-1].end.point - first.point
@@ -462,7 +466,7 @@ def _closes(legs: list[_Leg], first: _Step, tangent: np.ndarray, length: float) 
     return bool(np.linalg.norm(apart) < length and legs[-1].end.tangent @ tangent > 0.9)
 
 
-def _at_the_border(here: _Step, beyond: _Step, frame: Frame, equations: Equations, parameters: int) -> _Leg | None:
+def _at_the_border(here: _Step, beyond: _Step, frame: Frame, equations: Equations, parameters: int) -> _CurveLeg | None:
     """Return the leg to where a curve leaves the range of a parameter; None where it cannot be found."""
     old, new = here.point[-parameters:], beyond.point[-parameters:]
     border = np.clip(new, 0.0, 1.0)
@@ -478,7 +482,7 @@ def _at_the_border(here: _Step, beyond: _Step, frame: Frame, equations: Equation
         return None
     if found.tangent @ here.tangent < 0.0:
         found = _turned(found)
-    return _Leg(here, found, guess, row)
+    return _CurveLeg(here, found, guess, row)
 
 
 def _lies_on(point: np.ndarray, way: _Way, frame: Frame, equations: Equations) -> bool:
@@ -525,7 +529,7 @@ def _orbits_in_range(
     family, found, rejected = scene_family(scene, given.path), [], 0
     for share in shares:
         there = family(given.low + (given.high - given.low) * share)
-        if impacts == 1:
+        if impacts == 1 and scene.base is None and scene.force is None and scene.platform.second is None:
             loops, passed = _single_impact_loops(there, order)
             rejected += passed
         else:
@@ -565,16 +569,16 @@ def read_points(points: Float[np.ndarray, "points n"], frame: Frame, equations: 
     return jax.tree.map(lambda *parts: np.concatenate([np.asarray(part) for part in parts])[: len(points)], *read)
 
 
-def _branch(way: _Way, frame: Frame, equations: Equations) -> Branch:
+def _branch(way: _Way, frame: Frame, equations: Equations) -> OrbitBranch:
     points = way.points
     value = float(frame.low[0]) + float(frame.width[0]) * points[:, -1]
-    return Branch(value, points[:, :-1], read_points(points, frame, equations), way.ends)
+    return OrbitBranch(value, points[:, :-1], read_points(points, frame, equations), way.ends)
 
 
-def _before_capture(branch: Branch) -> Branch:
+def _before_capture(branch: OrbitBranch) -> OrbitBranch:
     """Return a branch without the point after its end by capture, where there is no orbit."""
     inside = slice(int(branch.ends[0] == "capture"), len(branch.parameter) - int(branch.ends[1] == "capture"))
-    return Branch(
+    return OrbitBranch(
         branch.parameter[inside],
         branch.unknowns[inside],
         jax.tree.map(lambda part: part[inside], branch.reading),
@@ -582,7 +586,9 @@ def _before_capture(branch: Branch) -> Branch:
     )
 
 
-def _special_points(way: _Way, branch: Branch, number: int, frame: Frame, equations: Equations) -> list[SpecialPoint]:
+def _special_points(
+    way: _Way, branch: OrbitBranch, number: int, frame: Frame, equations: Equations
+) -> list[SpecialPoint]:
     found = []
     for leg, place in way.places():
         for test in range(len(KINDS)):
@@ -601,7 +607,7 @@ def _special_points(way: _Way, branch: Branch, number: int, frame: Frame, equati
         flown = bool(beside.any()) if test in (_GRAZING, _CAPTURE) else bool(own.admissible)
         kind = _kind_of(test, step, frame, equations)
         parameter = low + width * float(step.point[-1])
-        special.append(SpecialPoint(kind, parameter, number, flown, step.point[:-1], own, test))
+        special.append(SpecialPoint(kind, parameter, number, place, flown, step.point[:-1], own, test))
     return special
 
 
@@ -630,7 +636,7 @@ def _test_function(test: int, equations: Equations) -> Callable[[_Step], float]:
 
 
 def _root_on(
-    leg: _Leg, test: Callable[[_Step], float], frame: Frame, equations: Equations
+    leg: _CurveLeg, test: Callable[[_Step], float], frame: Frame, equations: Equations
 ) -> tuple[float, _Step] | None:
     """Return where on a leg a test function is 0, as a share of it, and the point there; None where it is nowhere."""
     if not test(leg.begin) * test(leg.end) < 0.0:
@@ -701,7 +707,7 @@ def _special_curve(kind: str, way: _Way, frame: Frame, equations: Equations) -> 
     return SpecialCurve(kind, values[:, 0], values[:, 1], admissible, tuple(meetings), way.ends)
 
 
-def _cusp_function(leg: _Leg, frame: Frame, equations: Equations) -> Callable[[_Step], float]:
+def _cusp_function(leg: _CurveLeg, frame: Frame, equations: Equations) -> Callable[[_Step], float]:
     """Return the test function of cusps: how the fold bends, its sign kept along the leg."""
     _, towards = (np.asarray(part) for part in _bend_of_fold(frame, jnp.asarray(leg.begin.point), equations))
 

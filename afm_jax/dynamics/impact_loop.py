@@ -201,7 +201,7 @@ def nearest_approach(
         return position - level, speed - rate, bend
 
     step = (lasts - first) / samples
-    after = first[:, None] + step[:, None] * jnp.arange(samples + 1)
+    after = first[:, None] + step[:, None] * jnp.arange(samples + 1.0)
     gap, _, _ = motion(begin[:, None], height[:, None], velocity[:, None], after)
     left, middle, right = gap[:, :-2], gap[:, 1:-1], gap[:, 2:]
     lowest = (middle <= left) & (middle <= right)
@@ -270,7 +270,7 @@ def _highest_of(loop: ImpactLoop, impacts: Impacts | None, samples: int) -> Floa
         return position + response.position(start + after)
 
     begin, rest, velocity, lasts = flights
-    after = (lasts / samples)[:, None] * jnp.arange(samples + 1)
+    after = (lasts / samples)[:, None] * jnp.arange(samples + 1.0)
     seen = height(begin[:, None], rest[:, None], velocity[:, None], after)
     place = jnp.argmax(seen)
     flight = place // (samples + 1)

@@ -33,7 +33,6 @@ from afm_jax.dynamics.impact_loop import (
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, Flight
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.map import impact_after
-from afm_jax.impact.orbits import contracts
 from afm_jax.motion.law_motion import Bed, first_release, take_off
 from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import ContactKind, to_lab
@@ -52,6 +51,8 @@ _SHARE = 0.7
 """Longest step towards capture, of the distance from it."""
 _CLOSED = 1e-11
 """Largest distance from closing, of the loop's speeds: 1e-12, and what heights of many periods lose by rounding."""
+_GRAZES = 1e-8
+"""Coordinate above capture, over the drive's speed, up to which an impact is none."""
 _SAME = 1e-7
 """Relative distance below which two loops are one."""
 _FASTEST = 100.0
@@ -79,7 +80,9 @@ class ManyImpactOrbits(NamedTuple):
     stable: Bool[np.ndarray, " orbits"]
 
 
-def multipliers_of(trace: Float[np.ndarray, "..."], determinant: Float[np.ndarray, "..."]) -> np.ndarray:
+def multipliers_of(
+    trace: Float[np.ndarray, "*orbits"], determinant: Float[np.ndarray, "*orbits"]
+) -> Complex[np.ndarray, "*orbits 2"]:
     """Return the two eigenvalues of a 2 x 2 map, the larger modulus first, shape (..., 2)."""
     half = 0.5 * np.asarray(trace, float)
     determinant = np.asarray(determinant, float)
@@ -88,6 +91,11 @@ def multipliers_of(trace: Float[np.ndarray, "..."], determinant: Float[np.ndarra
     # the smaller one from the product: as a difference it cancels
     small = np.where(np.imag(root) != 0.0, np.conj(large), determinant / np.where(large == 0.0, 1.0, large))
     return np.stack([large, small], axis=-1)
+
+
+def is_stable(multipliers: Complex[np.ndarray, "*orbits 2"]) -> Bool[np.ndarray, "*orbits"]:
+    """Say whether multipliers, the larger first, lie inside the unit circle."""
+    return np.asarray(np.abs(multipliers[..., 0]) < 1.0)
 
 
 def many_impact_orbits(scene: Scene, order: int, impacts: int, *, starts: int = DEFAULT_STARTS) -> ManyImpactOrbits:
@@ -128,8 +136,8 @@ def many_impact_orbits(scene: Scene, order: int, impacts: int, *, starts: int = 
     chosen = rank[keep[rank]]
     reading = jax.tree.map(lambda leaf: leaf[chosen], reading)
     absolute = loops[chosen] * np.repeat([1.0, float(scale)], impacts)
-    stable = np.asarray(contracts(jnp.asarray(reading.trace), jnp.asarray(reading.determinant)))
-    return ManyImpactOrbits(absolute, reading, multipliers_of(reading.trace, reading.determinant), stable)
+    multipliers = multipliers_of(reading.trace, reading.determinant)
+    return ManyImpactOrbits(absolute, reading, multipliers, is_stable(multipliers))
 
 
 @partial(jax.jit, static_argnames=("driven", "samples"))
@@ -169,7 +177,9 @@ def _search(scene: Scene, order: Array, starts: Array, *, impacts: int, driven: 
     guesses = jnp.where(usable[:, None], guesses[near], 1.0)
     found = jax.vmap(lambda guess: closed_loop(guess, top_speed, loop))(guesses)
     missing = jax.vmap(lambda unknowns: jnp.max(jnp.abs(closing_gaps(unknowns, top_speed, loop))))(found)
-    return found, top_speed, usable & (missing < _CLOSED)
+    # a free motion that touches the surface is no orbit of impacts
+    leaves = jnp.min(found[:, impacts:], axis=1) > loop.impact.lowest / top_speed + _GRAZES
+    return found, top_speed, usable & (missing < _CLOSED) & leaves
 
 
 def _walks(seen: Scene, loop: ImpactLoop, starts: Array, length: int) -> tuple[Array, Array]:
@@ -266,7 +276,7 @@ class StickingOrbit(NamedTuple):
     release_phase_rad: float
     """Drive phase at which the surface lets the tip go; of the first rest."""
     rest_us: float
-    """Time at rest in a response period."""
+    """From the last impact followed to the release, in a response period."""
     impacts: int
     """Impacts followed one by one; those summed up as chatter not counted."""
     peak_amplitude_nm: float
@@ -291,7 +301,7 @@ def sticking_orbit(scene: Scene, *, longest: int = 64) -> StickingOrbit | str:
         return "with adhesion or a delay a tip that comes to rest stays"
     surface, response = surface_of(scene)
     bed = Bed(scene.cantilever, surface)
-    times = period * jnp.arange(256) / 256.0
+    times = period * jnp.arange(256.0) / 256.0
     push = np.asarray(jax.vmap(bed.push)(times))
     if push.min() >= 0.0 or push.max() <= 0.0:
         return f"the surface {'never lets go' if push.min() >= 0.0 else 'never presses'} a tip that rests on it"

@@ -8,8 +8,9 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 
 from afm_jax.dynamics.bands import WITHIN_95
-from afm_jax.dynamics.continuation import Branch, Continuation
-from afm_jax.impact.orbits import contracts
+from afm_jax.dynamics.continuation import Continuation, OrbitBranch, SpecialPoint
+from afm_jax.dynamics.impact_orbits import is_stable, multipliers_of
+from afm_jax.plots.dynamics import label_of
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save
 
 _MARKS = {
@@ -20,26 +21,6 @@ _MARKS = {
     "capture": ("v", DARK),
 }
 """Shape and colour of each kind: either tells them apart (colours of Okabe and Ito)."""
-_NAMES = {
-    "platform.reduced_frequency": r"reduced drive frequency  $n = \omega/2\Omega$",
-    "platform.frequency_khz": r"drive frequency  $\omega/2\pi$ (kHz)",
-    "platform.amplitude_nm": r"drive amplitude  $\beta$ (nm)",
-    "platform.offset_nm": r"tip-sample offset  $\sigma$ (nm)",
-    "interaction.r": r"restitution  $r$",
-    "interaction.epsilon": r"adhesion  $\epsilon$ (nm$^2$/µs$^2$)",
-    "interaction.viscous_loss": "viscous loss (nm/µs)",
-    "cantilever.quality_factor": r"quality factor  $Q$",
-}
-_UNITS = {"nm": "nm", "khz": "kHz", "nn": "nN", "deg": "deg", "ng": "ng"}
-
-
-def axis_name(path: str) -> str:
-    """Return what an axis of a parameter is called, with its unit."""
-    if path in _NAMES:
-        return _NAMES[path]
-    words = path.replace(".", " ").split("_")
-    unit = _UNITS.get(words[-1])
-    return " ".join(words) if unit is None else f"{' '.join(words[:-1])} ({unit})"
 
 
 def draw_continuation(
@@ -61,7 +42,7 @@ def draw_continuation(
     axes = figure.subplots()
     labels: set[str] = set()
     for number, branch in enumerate(found.branches):
-        _draw_branch(axes, branch, labels)
+        _draw_branch(axes, branch, [one for one in found.special if one.branch == number], labels)
         if bands is not None:
             _draw_band(axes, branch, bands[number])
     for index, point in enumerate(found.special):
@@ -82,7 +63,7 @@ def draw_continuation(
             zorder=4,
             label=_once(point.kind.replace("_", " "), labels),
         )
-    label_axes(axes, x=axis_name(found.range.path), y="peak amplitude (nm)")
+    label_axes(axes, x=label_of(found.range.path), y="peak amplitude (nm)")
     axes.set_title(f"({found.impacts}, {found.order}) orbits", fontsize=12, loc="left")
     axes.grid(color=GRID, alpha=0.25)
     axes.margins(x=0.02)
@@ -98,21 +79,29 @@ def _once(label: str, labels: set[str]) -> str | None:
     return label
 
 
-def _draw_branch(axes: Axes, branch: Branch, labels: set[str]) -> None:
-    stable = np.asarray(contracts(branch.reading.trace, branch.reading.determinant))
+def _draw_branch(axes: Axes, branch: OrbitBranch, special: Sequence[SpecialPoint], labels: set[str]) -> None:
+    """Draw a branch, through its special points, where the style of the line changes."""
+    stable = is_stable(multipliers_of(np.asarray(branch.reading.trace), np.asarray(branch.reading.determinant)))
     state = np.where(branch.reading.admissible, np.where(stable, 2, 1), 0)
+    place = np.array([*range(len(state)), *(one.position for one in special)])
+    rank = np.argsort(place, kind="stable")
+    x = np.array([*branch.parameter, *(one.parameter for one in special)])[rank]
+    y = np.array([*branch.reading.peak_amplitude_nm, *(float(one.reading.peak_amplitude_nm) for one in special)])[rank]
+    # a line from or to a special point is in the state of its other end
+    known = np.array([*state, *[-1] * len(special)])[rank]
+    left, right = known[:-1], known[1:]
+    lines = np.where(left < 0, right, np.where(right < 0, left, np.minimum(left, right)))
     styles = ((":", GRID, "passes through the sample"), ("--", BLUE, "unstable"), ("-", BLUE, "stable"))
-    height = branch.reading.peak_amplitude_nm
     begin = 0
-    for end in [*(np.flatnonzero(np.diff(state)) + 1).tolist(), len(state)]:
-        line, colour, name = styles[int(state[begin])]
-        # to the first point of the next piece, so that there is no gap
-        piece = slice(begin, end + 1)
-        axes.plot(branch.parameter[piece], height[piece], line, color=colour, linewidth=1.8, label=_once(name, labels))
+    for end in [*(np.flatnonzero(np.diff(lines)) + 1).tolist(), len(lines)]:
+        if lines[begin] >= 0:
+            line, colour, name = styles[int(lines[begin])]
+            piece = slice(begin, end + 1)
+            axes.plot(x[piece], y[piece], line, color=colour, linewidth=1.8, label=_once(name, labels))
         begin = end
 
 
-def _draw_band(axes: Axes, branch: Branch, error: Float[np.ndarray, " points"]) -> None:
+def _draw_band(axes: Axes, branch: OrbitBranch, error: Float[np.ndarray, " points"]) -> None:
     """Shade where the amplitude may lie; not where a fold is so near that a held parameter says nothing."""
     height = branch.reading.peak_amplitude_nm
     half = WITHIN_95 * error
@@ -152,7 +141,7 @@ def draw_curves(found: Continuation, path: Path) -> None:
             marker = "*" if one.kind == "cusp" else "X"
             name = "cusp" if one.kind == "cusp" else "meeting"
             axes.plot(one.parameter, one.second, marker, color="black", markersize=9, label=_once(name, labels))
-    label_axes(axes, x=axis_name(found.range.path), y=axis_name(found.second.path))
+    label_axes(axes, x=label_of(found.range.path), y=label_of(found.second.path))
     axes.set_title(f"({found.impacts}, {found.order}) orbits", fontsize=12, loc="left")
     axes.grid(color=GRID, alpha=0.25)
     axes.set(xlim=(found.range.low, found.range.high), ylim=(found.second.low, found.second.high))

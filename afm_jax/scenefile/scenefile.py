@@ -78,6 +78,7 @@ from afm_jax.scenefile.tables import (
     in_words,
     printable,
 )
+from afm_jax.whole_files import write_whole
 
 if TYPE_CHECKING:
     from afm_jax.contact.contact import Contact
@@ -363,7 +364,7 @@ def save_scene(scene: Scene, path: str | os.PathLike[str], *, start: Start | Non
     if start is not None:
         check_start(start, scene)
         tables["start"] = {key: float(value) for key, value in start._asdict().items()}
-    Path(path).write_bytes(tomli_w.dumps(tables).encode("utf-8"))
+    write_whole(path, tomli_w.dumps(tables))
 
 
 def scene_tables(scene: Scene) -> dict[str, dict[str, Any]]:

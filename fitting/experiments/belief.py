@@ -67,8 +67,13 @@ class Belief:
     source: str = "values given"
     notes: tuple[str, ...] = ()
 
-    def draws(self, count: int) -> Float[np.ndarray, "count p"]:
-        """Return values that are as likely as the belief is uncertain, the believed ones first; seeded."""
+    def draws(self, count: int, *, least: float = 0.0) -> Float[np.ndarray, "count p"]:
+        """Return values that are as likely as the belief is uncertain, the believed ones first; seeded.
+
+        Args:
+            count: how many.
+            least: the uncertainty, relative to the parameters' sizes, that is left to any combination of them.
+        """
         sizes = np.array([size_of(p, v) for p, v in zip(self.problem.parameters, self.values, strict=True)])
         spread = self.uncertainty * sizes
         # In units of the spread: the information then has eigenvalues of at least 1.
@@ -76,7 +81,8 @@ class Belief:
         curvature, axes = np.linalg.eigh(scaled)
         normal = np.random.default_rng(DRAW_SEED).normal(size=(count, len(spread)))
         normal[0] = 0.0
-        values = self.values + spread * ((normal / np.sqrt(curvature)) @ axes.T)
+        width = np.maximum(1.0 / np.sqrt(curvature), least / self.uncertainty)
+        values = self.values + spread * ((normal * width) @ axes.T)
         ends = [(p.lowest, p.highest) for p in self.problem.parameters]
         return np.clip(values, *np.array(ends).T)
 

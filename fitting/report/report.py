@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from afm_jax.whole_files import write_whole
 from afm_jax.words import bullets, known, text_table
 from fitting.fits.result import FitResult, FittedParameter
 from fitting.report.words import (
@@ -161,7 +162,7 @@ def write_report(
     pictures = fit_pictures(result)
     page = folder / "fit.html"
     markup = fit_page(result, pictures, comparison=comparison, bootstrap=bootstrap, posterior=posterior)
-    page.write_text(markup, encoding="utf-8", newline="\n")
+    write_whole(page, markup)
     picture = one_below_the_other(pictures)
     others = write_report_files(folder, "fit", text=summary(result), data=result.to_dict(), picture=picture)
     write_table("fit_rows.csv", row_records(result), ROW_COLUMNS)
@@ -183,8 +184,7 @@ def write_report_files(folder: Path, name: str, *, text: str, data: dict[str, An
         OSError: if a file cannot be written.
     """
     paths = [folder / f"{name}.{ending}" for ending in ("txt", "json", "png")]
-    # a path that is no valid text must not cost the report
-    paths[0].write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
-    paths[1].write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    paths[2].write_bytes(picture)
+    write_whole(paths[0], text + "\n")
+    write_whole(paths[1], json.dumps(data, indent=1, allow_nan=False) + "\n")
+    write_whole(paths[2], picture)
     return paths
