@@ -160,7 +160,7 @@ def _stacked(square: list, late: list, count: int) -> Float[np.ndarray, "2 n m"]
     return found
 
 
-class Step(NamedTuple):
+class LinearStep(NamedTuple):
     """The fit after the step.
 
     Attributes:
@@ -186,7 +186,7 @@ class Step(NamedTuple):
     follow: Float[np.ndarray, "m k"]
 
 
-def step_of(rows: StepRows, left_out: Unmodelled, free: Bool[np.ndarray, " p"]) -> Step:
+def step_of(rows: StepRows, left_out: Unmodelled, free: Bool[np.ndarray, " p"]) -> LinearStep:
     """Return where one linear step leads from a fit, with all that is left out.
 
     Args:
@@ -234,7 +234,7 @@ def step_of(rows: StepRows, left_out: Unmodelled, free: Bool[np.ndarray, " p"]) 
     factor = cho_factor(variance, lower=True)
     gain = unknown.T @ cho_solve(factor, np.eye(2 * count))
     likely = -gain @ left[: 2 * count]
-    return Step(
+    return LinearStep(
         names=(*names, *priors),
         values=begin + change,
         change=change,
@@ -354,7 +354,7 @@ class LawBefore(NamedTuple):
     capture_slope: Float[np.ndarray, " p"]
 
 
-def law_after(step: Step, left_out: Unmodelled, speeds: Float[np.ndarray, " n"], before: LawBefore) -> LawAfter:
+def law_after(step: LinearStep, left_out: Unmodelled, speeds: Float[np.ndarray, " n"], before: LawBefore) -> LawAfter:
     """Return the law after the step.
 
     Args:
@@ -393,7 +393,7 @@ def law_after(step: Step, left_out: Unmodelled, speeds: Float[np.ndarray, " n"],
 
 
 def _moved(
-    step: Step, slope: Float[np.ndarray, "k n p"], columns: Columns
+    step: LinearStep, slope: Float[np.ndarray, "k n p"], columns: Columns
 ) -> tuple[Float[np.ndarray, "k n"], Float[np.ndarray, "k n m"]]:
     """Return by how much quantities move in the step, and how they change with unknowns of unit variance.
 
