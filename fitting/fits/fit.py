@@ -36,7 +36,7 @@ from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRow
 from fitting.fits.unmodelled import (
     LawAfter,
     LawBefore,
-    Step,
+    LinearStep,
     Unmodelled,
     law_after,
     root_of,
@@ -59,7 +59,7 @@ def law_with_band(
     values: Float[np.ndarray, " p"],
     covariance: Float[np.ndarray, "k k"],
     approach_speeds: Float[np.ndarray, " rows"],
-    after: tuple[Step, Unmodelled] | None = None,
+    after: tuple[LinearStep, Unmodelled] | None = None,
 ) -> FittedLaw:
     """Return the law from 0.8 times the slowest to 1.2 times the fastest approach, with its linearised 95 % band.
 
@@ -93,7 +93,7 @@ def law_at(
     values: Float[np.ndarray, " p"],
     covariance: Float[np.ndarray, "k k"],
     speeds: Float[np.ndarray, " n"],
-    after: tuple[Step, Unmodelled] | None = None,
+    after: tuple[LinearStep, Unmodelled] | None = None,
 ) -> LawAfter:
     """Return the law at approach speeds in nm/us; the other arguments as of `law_with_band`."""
     law, slope = jax.tree.map(np.asarray, law_and_slope(jnp.asarray(values), jnp.asarray(speeds), measurement, problem))
@@ -229,7 +229,7 @@ class _Summary:
         if self.after is not None:
             self._take(*self.after)
 
-    def _step(self) -> tuple[Step, Unmodelled] | None:
+    def _step(self) -> tuple[LinearStep, Unmodelled] | None:
         """Return the step with what the model leaves out; None for impacts that take no time, or without slopes."""
         if not self.problem.lasting or not np.isfinite(self.used_speeds).any():
             return None
@@ -245,7 +245,7 @@ class _Summary:
         left_out = Unmodelled(self.problem, values, speed_range(self.used_speeds))
         return step_of(rows, left_out, self.free), left_out
 
-    def _take(self, step: Step, left_out: Unmodelled) -> None:
+    def _take(self, step: LinearStep, left_out: Unmodelled) -> None:
         """Go on with values, errors and residuals after the step."""
         self.names, self.ends, self.spread = step.names, step.values, step.covariance
         self.constraints |= left_out.priors
