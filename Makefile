@@ -17,7 +17,7 @@ SHARP := tests/test_polynomial_roots.py tests/test_verification.py
 BIN := .venv/bin
 SETUP := .venv/.installed
 
-.PHONY: help setup fit test check thorough lint types coverage slow mutations bench clean
+.PHONY: help setup fit test check thorough lint types coverage slow mutations bands bench clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -58,9 +58,12 @@ slow: $(SETUP) ## the slow tests: long iterations, references, notebooks
 mutations: $(SETUP) ## wrong formulas, one edit each: a named test must notice
 	$(BIN)/python -m pytest -m slow tests/test_mutations.py
 
+bands: $(SETUP) ## do the 95 % bands hold the laws of ten random contacts? (twenty minutes; the truths are kept in /tmp)
+	$(BIN)/python -m tests.coverage_of_bands
+
 check: lint types test slow ## all that CI runs: format, lint, types, tests, slow tests, notebooks
 
-thorough: lint types coverage mutations ## all of make check with the share of lines it runs, then the mutations
+thorough: lint types coverage mutations bands ## all of make check with the share of lines it runs, the mutations, the bands
 
 bench: $(SETUP) ## impacts per second, next to SciPy
 	$(BIN)/afm-jax bench --out $(OUT)

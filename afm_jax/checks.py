@@ -54,20 +54,23 @@ def check_parameter(name: str, value: ArrayLike | None, allowed: str) -> None:
             "between 0 and 1" (neither of the two).
 
     Raises:
-        ValueError: if a value is not finite or not in the allowed range.
+        ValueError: if a value is not finite, not in the allowed range, or beyond 1e30.
     """
     if value is None or is_traced(value):
         return
     number = np.asarray(value)
     # An infinite quality factor is a meaningful limit; every other infinity is a mistake.
-    finite = ~np.isnan(number) if allowed == "above 0.5" else np.isfinite(number)
+    finite = ~np.isnan(number) if allowed == "above 0.5" else np.abs(number) <= _LARGEST
     good = finite & _RANGES[allowed](number)
     if not np.all(good):
         offender = float(number[~good].flat[0]) if number.ndim else float(number)
         must = {"finite": "be a finite number", "not negative": "not be negative"}.get(allowed, f"be {allowed}")
+        if np.isfinite(offender) and abs(offender) > _LARGEST:
+            must = f"be at most {_LARGEST:g} in size, so that its powers stay numbers"
         raise ValueError(f"`{name}` must {must}, but is {offender:g}")
 
 
+_LARGEST = 1e30
 _RANGES = {
     "finite": lambda number: np.full(number.shape, fill_value=True),
     "positive": lambda number: number > 0,

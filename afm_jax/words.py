@@ -122,3 +122,14 @@ def bullets(title: str, items: Sequence[str]) -> list[str]:
     ['', 'Notes:', '  - one']
     """
     return ["", title, *(f"  - {item}" for item in items)] if items else []
+
+
+def shown(text: str) -> str:
+    r"""Return a text as a terminal may have it: control characters, as file names may hold them, are escaped.
+
+    >>> print(shown("a\x1b[31m.csv"))
+    a\x1b[31m.csv
+    """
+    if text.isprintable():
+        return text
+    return "".join(sign if sign.isprintable() or sign in "\n\t" else repr(sign)[1:-1] for sign in text)

@@ -165,6 +165,26 @@ NUISANCES = (
 )
 """What the instrument adds; each has a Gaussian constraint."""
 
+SHAPES = (
+    Parameter(
+        name="loss_speed_squared_nm2_per_us2",
+        unit="nm^2/us^2",
+        meaning="square of the speed by which a bridge's pull raises that of the drag",
+        lowest=0.0,
+        highest=1e6,
+        symbol="q",
+    ),
+    Parameter(
+        name="delay_square_nm2_per_us",
+        unit="nm^2/us",
+        meaning="second term of the lead of a slow way out",
+        lowest=-1e6,
+        highest=1e6,
+        symbol="f",
+    ),
+)
+"""What decides the shape of loss and delay of a model that has both, beside its parameters; each has a prior."""
+
 CONTACT = tuple(
     Parameter(
         name=known.name,
@@ -181,7 +201,7 @@ CONTACT = tuple(
 )
 """The parameters of `Contact.paper`, by its keywords."""
 
-PARAMETERS = {parameter.name: parameter for parameter in (*LAW, *DELAY, *NUISANCES, *CONTACT)}
+PARAMETERS = {parameter.name: parameter for parameter in (*LAW, *DELAY, *SHAPES, *NUISANCES, *CONTACT)}
 """All of them by name."""
 
 
@@ -192,11 +212,13 @@ class LawFormula:
     Attributes:
         paper: its parameters, with their values for the paper's contact: what is believed where nothing was measured.
         formula: of rebound speed or delay.
+        shaped: the same with the numbers of `SHAPES`, which a fit with a delay has besides.
         meaning: what it says, in a line.
     """
 
     paper: dict[str, float]
     formula: str
+    shaped: str = ""
     meaning: str
 
 
@@ -212,15 +234,19 @@ LAWS = {
     "viscous": LawFormula(
         paper={"epsilon": 113.6, "viscous_loss": 0.5},
         formula="u_out^2 = u_in^2 - viscous_loss u_in - epsilon",
+        shaped="u_out^2 = u_in^2 - viscous_loss sqrt(u_in^2 + loss_speed_squared_nm2_per_us2) - epsilon",
         meaning="a loss linear in speed with adhesion (epsilon, viscous_loss)",
     ),
 }
 DELAY_LAW = LawFormula(
     paper={"delay_hertz": 0.206, "delay_lead_nm": 5.64, "delay_offset_nm": 0.726},
     formula="tau = delay_hertz u_in^(-1/5) - delay_lead_nm (1/u_out - 1/u_in) - delay_offset_nm/u_in",
+    shaped="tau = delay_hertz u_in^(-1/5) - delay_lead_nm (1/u_out - 1/u_in) - delay_offset_nm/u_in "
+    "+ delay_square_nm2_per_us (1/u_out^2 - 1/u_in^2)",
     meaning="the collision delay, which amplitudes near resonance need",
 )
 DELAY_NAMES = tuple(DELAY_LAW.paper)
+LOSS_SHAPE, DELAY_SHAPE = SHAPE_NAMES = tuple(parameter.name for parameter in SHAPES)
 NUISANCE_NAMES = tuple(parameter.name for parameter in NUISANCES)
 CONTACT_NAMES = tuple(parameter.name for parameter in CONTACT)
 CONTACT_DEFAULT = ("relative_humidity", "adhesion_energy_j_per_m2", "viscosity_pa_s", "modulus_gpa")

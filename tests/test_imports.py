@@ -15,6 +15,7 @@ LEVELS = {
     "version": 0,
     "lazy_names": 0,
     "strict_json": 0,
+    "whole_files": 0,
     "words": 0,
     "outcomes": 0,
     "checks": 1,

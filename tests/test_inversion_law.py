@@ -1,10 +1,22 @@
 """The regression of laws on correlated speeds, against a total least squares that fits every point."""
 
+import json
+
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from fitting.inversion.regression import DELAY_TERMS, LOSS_TERMS, delay, loss, regress
+from fitting.inversion.regression import (
+    DELAY_TERMS,
+    LOSS_TERMS,
+    compare_law,
+    delay,
+    loss,
+    read_fitted_law,
+    regress,
+)
+from fitting.inversion.result import InvertedRows, read_on_resonance
+from fitting.tables.table import TableError, read_table
 
 EPSILON, SLOPES = 113.6, {"viscous": 0.5, "restitution": 3e-3}
 
@@ -89,3 +101,52 @@ def test_too_few_rows_are_an_error():
     x, covariance = impacts("viscous", 1, 1)
     with pytest.raises(ValueError, match="1 rows cannot determine 2 coefficients"):
         regress(loss, LOSS_TERMS["viscous"], x, covariance, np.zeros((1, 3, 0)))
+
+
+def beside(path, *, speeds: tuple[float, float], epsilon, drives=None):
+    """Return rows of the viscous law, 30 to 300 nm/us, beside a fit.json of a law that was fitted over some speeds."""
+    table = read_table("fitting/examples/amplitudes_contact.csv")
+    x, covariance = impacts("viscous", 57, 3)
+    rows = InvertedRows(
+        impact=x,
+        covariance=covariance,
+        shared=np.zeros((57, 3, 0)),
+        shared_names=(),
+        chi2=np.ones(57),
+        regressed=np.ones(57, bool),
+        note=("",) * 57,
+    )
+    u = np.linspace(speeds[0], speeds[1], 50)
+    law = {
+        "approach_speed_nm_per_us": u.tolist(),
+        "rebound_speed_nm_per_us": np.sqrt(u * u - epsilon - 0.5 * u).tolist(),
+        "collision_delay_us": [0.0] * 50,
+    }
+    columns = ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")
+    fitted_to = {"source": "other.csv"} | {name: getattr(table, name).tolist() for name in columns} | (drives or {})
+    fit = {"format": "afm-jax fit", "valid": True, "model": "viscous", "law": law, "input": fitted_to}
+    path.write_text(json.dumps(fit), encoding="utf-8")
+    reading = read_on_resonance(table, law=None, reference="none")
+    return compare_law(read_fitted_law(path), table, rows, reading)
+
+
+def test_a_law_of_the_same_drives_agrees_with_their_rows(tmp_path):
+    found = beside(tmp_path / "fit.json", speeds=(20.0, 400.0), epsilon=EPSILON)
+    assert found.same_drives
+    assert found.agrees
+    # of a normal deviate 0.67; the median of 57 is known to 0.1
+    assert found.typical_pull == pytest.approx(0.67, abs=0.4)
+    assert "viscous fitted to other.csv over 20 to 400 nm/us; the losses of the 57 rows" in found.statement
+
+
+def test_a_law_of_other_impacts_is_stated_to_be_far_from_the_rows(tmp_path):
+    found = beside(tmp_path / "fit.json", speeds=(20.0, 100.0), epsilon=10.0, drives={"offset_nm": [1.0] * 57})
+    assert not found.same_drives
+    assert not found.agrees
+    assert 20 < found.rows_compared < 40
+    assert "other drives than these" in found.statement
+
+
+def test_a_law_of_other_speeds_is_refused(tmp_path):
+    with pytest.raises(TableError, match=r"over 400 to 900 nm/us says nothing about .*come at 30.* to .* nm/us; give"):
+        beside(tmp_path / "fit.json", speeds=(400.0, 900.0), epsilon=EPSILON)

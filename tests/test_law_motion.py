@@ -227,6 +227,34 @@ def test_a_tip_that_the_platform_never_presses_leaves_at_once():
     assert np.all(np.asarray(contacts.rebound_speed_nm_per_us) == 0.0)
 
 
+@pytest.mark.parametrize(
+    ("system", "time"),
+    [
+        # at the top of a fast platform, which leaves the tip behind at once
+        (LawSystem(Cosines(0.0, 0.0, ((4.0, 181.8, 0.0),)), 0.9, quality_factor=40.0), 0.0),
+        # pressed by a slow one, which lets it go near its lowest point
+        (PRESSING, 0.0),
+    ],
+    ids=["let go at once", "rides"],
+)
+def test_a_start_at_rest_on_the_platform_rides_until_it_lets_go(system, time):
+    start = (time, system.platform.derivative(0, time), system.platform.derivative(1, time))
+    result = simulated(scene_of(system), start, 60.0)
+    release = system.release(time, time + 60.0)
+    assert float(result.contacts.departure_time_us[0]) == pytest.approx(release, abs=1e-11)
+    assert float(result.contacts.arrival_time_us[0]) == time
+    assert float(result.contacts.energy_lost_aj[0]) == 0.0
+    let_go = (release, system.platform.derivative(0, release), system.platform.derivative(1, release))
+    course = follow(system, *let_go, time + 60.0)
+    assert len(course.rows) > 1
+    for row, exact in enumerate(course.rows[:2], start=1):
+        # SciPy's 1e-13 nm in a flight that begins with gap ~ t^2 or t^3
+        assert float(result.contacts.arrival_time_us[row]) == pytest.approx(exact[0], abs=1e-8)
+    sticky = simulated(scene_of(LawSystem(system.platform, 0.9, 40.0, quality_factor=40.0)), start, 60.0)
+    assert int(sticky.outcome) == MotionOutcome.HELD
+    assert int(sticky.count) == 1
+
+
 def test_a_platform_that_stays_where_the_tip_rests_holds_it():
     # N = 0 throughout: no push, no pull
     scene = Scene(Cantilever(90.0, 40.0), Platform(0.0, 180.0), ImpactLaw(r=0.5, viscous_loss=0.5))

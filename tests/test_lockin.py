@@ -5,7 +5,7 @@ import pytest
 
 from fitting import TableError, Trace, lockin
 from fitting.traces.fold import fit_harmonics
-from fitting.traces.lockin import LockinResult
+from fitting.traces.lockin import LockinResult, table_of
 from fitting.traces.trace import TraceSettings
 from fitting.traces.verdict import TraceKind
 from tests.lockin_traces import (
@@ -52,8 +52,8 @@ def test_a_bounce_in_closed_form(order: int, rate: float):
     result = lockin(trace_of(height, rate=rate, drive_khz=drive, start_us=3.7))
     assert result.steady, result.verdict
     assert (result.order, result.impacts_per_period, result.kind) == (order, 1, TraceKind.STEADY)
-    # a quartic around the top of a cosine misses 3e-5
-    assert result.peak_amplitude_nm == pytest.approx(70.0, rel=3e-5)
+    # a sextic around the top of a cosine misses 3e-7
+    assert result.peak_amplitude_nm == pytest.approx(70.0, rel=3e-7)
     # the kink's harmonics beyond the fitted ones, falling as 1/k^2
     assert result.lockin_amplitude_nm == pytest.approx(abs(value), rel=1e-4)
     assert phase_apart(result, float(np.degrees(np.angle(value)))) == pytest.approx(0.0, abs=0.01)
@@ -155,6 +155,33 @@ def test_what_is_no_steady_orbit_is_flagged(shape: str, kind: TraceKind, noise: 
     assert not result.steady
 
 
+@pytest.mark.parametrize("height", [0.0, 3.0, 0.1, -1e-300])
+def test_a_constant_deflection_is_no_response(height: float):
+    result = lockin(trace_of(np.full(2000, height), rate=10.0, drive_khz=181.8))
+    assert result.kind is TraceKind.NO_RESPONSE
+    assert result.scatter == 0.0
+    assert f"{height:.4g} nm throughout" in result.verdict
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+@pytest.mark.parametrize("quality", [5.0, 40.0, 300.0])
+def test_a_tip_that_rings_down_freely_is_told_with_its_quality_factor(quality: float, noise: float):
+    time = np.arange(0.0, 400.0, 0.1)
+    omega = 2e-3 * np.pi * 90.0
+    tip = 50.0 * np.exp(-0.5 * omega / quality * time) * np.cos(omega * np.sqrt(1.0 - 0.25 / quality**2) * time)
+    driven = 1.5 * np.cos(2e-3 * np.pi * 181.8 * time + 0.3)
+    height = tip + driven + noise * np.random.default_rng(2).standard_normal(time.size)
+    result = lockin(trace_of(height, rate=10.0, drive_khz=181.8))
+    assert result.kind is TraceKind.RINGING
+    assert result.peak_amplitude_nm is None
+    frequency, found = (
+        float(result.verdict.split(before)[1].split()[0].strip(",")) for before in ("vibration of ", "Q = ")
+    )
+    assert frequency == pytest.approx(90.0, rel=1e-3)
+    # three digits are printed
+    assert found == pytest.approx(quality, rel=0.02)
+
+
 @pytest.mark.parametrize("share", [2e-4, 1e-2])
 def test_a_wrong_drive_frequency_is_named(share: float):
     time = np.arange(0.0, 800.0, 0.1)
@@ -239,3 +266,32 @@ def test_an_expected_order():
     assert (other.kind, other.steady) == (TraceKind.OTHER_ORDER, False)
     with pytest.raises(TableError, match="too short for two response periods of order 40"):
         lockin(trace, order=40)
+
+
+def test_traces_of_one_drive_are_one_row():
+    time = np.arange(0.0, 200.0, 0.1)
+    shape, value = bounce(time, order=1, drive_khz=181.8)
+
+    def read(seed: int, *, size: float = 1.0, drive: float = 181.8) -> LockinResult:
+        height = shape if drive == 181.8 else bounce(time, order=1, drive_khz=drive)[0]
+        height = size * height + 0.3 * np.random.default_rng(seed).standard_normal(time.size)
+        return lockin(trace_of(height, rate=10.0, drive_khz=drive, offset_nm=-1.0))
+
+    one, two, other, far = read(1), read(2), read(3, drive=183.0), read(4, size=1.2)
+    table = table_of([one, two, one, other])
+    assert table.drive_frequency_khz.tolist() == [181.8, 183.0]
+    assert any("of one drive: one row, their mean" in remark for remark in table.remarks)
+    assert table.lockin_amplitude_nm is not None
+    assert table.lockin_amplitude_error_nm is not None
+    assert table.phase_deg is not None
+    amplitudes = [result.lockin_amplitude_nm for result in (one, two)]
+    assert min(amplitudes) < table.lockin_amplitude_nm[0] < max(amplitudes)
+    assert abs(table.lockin_amplitude_nm[0] - abs(value)) < 4.0 * table.lockin_amplitude_error_nm[0]
+    assert one.phase_deg is not None
+    assert table.phase_deg[0] == pytest.approx(one.phase_deg, abs=0.1)
+    # two orbits of one drive: neither is the row
+    table = table_of([one, far, other])
+    assert table.drive_frequency_khz.tolist() == [183.0]
+    assert any("contradict each other" in remark for remark in table.remarks)
+    with pytest.raises(TableError, match=r"there is no row: .* contradict each other"):
+        table_of([one, far])

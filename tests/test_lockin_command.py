@@ -120,11 +120,6 @@ def test_a_table_needs_what_the_fitter_needs(tmp_path):
     table = read_table(tmp_path / "out" / "amplitudes.csv")
     assert table.drive_amplitude_nm[0] == pytest.approx(4.0, rel=1e-6)
     assert table.offset_nm[0] == pytest.approx(-1.0, rel=1e-6)
-    twice = run(path, path, "--free-frequency-khz", 90, "--json")
-    assert "repeats row 1" in strictly(twice.stdout)["table_reason"]
-    again, _ = written(tmp_path / "again.csv", order=1, comments="")
-    reason = strictly(run(path, again, "--free-frequency-khz", 90, "--json").stdout)["table_reason"]
-    assert reason.startswith(f"{again}: repeats the drive of {path}")
 
 
 def test_a_deflection_with_the_wrong_sign_is_named(tmp_path):

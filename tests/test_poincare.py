@@ -1,10 +1,13 @@
 """The impact map: against 50 digits, its limits and symmetries, and how a sequence of impacts ends."""
 
+from typing import Any
+
 import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.optimize import brentq
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
@@ -194,6 +197,23 @@ def test_every_end_of_a_flight_is_said():
         assert np.isinf(impact.time_us) == (not landed)
         assert np.isnan(impact.velocity_before_nm_per_us) == (not landed)
         assert np.isnan(impact.velocity_after_nm_per_us) == (not landed)
+
+
+def test_a_tip_that_would_leave_a_quarter_period_early_is_captured():
+    # at rest on the platform's top the tip meets it with the speed it left with, hardly above the capture speed
+    made = bouncing(epsilon=100.0, viscous_loss=0.0, r=1.0, quality_factor=None, offset_nm=0.0, amplitude_nm=0.0)
+    lead, quarter = made.interaction.delay.lead_nm, 1e3 / 90.0 / 4.0
+    # b (1/w - 1/u) is a quarter of the free period at
+    bound: Any = brentq(lambda w: float(lead) * (1.0 / w - 1.0 / np.hypot(w, 10.0)) - quarter, 0.1, 9.0, xtol=1e-14)
+    assert 0.5 < bound < 3.0
+    for share, outcome in [(1e-8, Outcome.CAPTURED), (0.9999, Outcome.CAPTURED), (1.0001, Outcome.IMPACT)]:
+        impact = next_impact(made, 0.0, float(np.hypot(share * bound, 10.0)))
+        assert Outcome(int(impact.outcome)) is outcome
+        # half a free period after it left; the delay is no longer than the lead allows
+        assert 0.0 <= float(impact.arrival_time_us - impact.time_us) * (outcome is Outcome.IMPACT) < quarter
+        if outcome is Outcome.CAPTURED:
+            assert float(impact.velocity_after_nm_per_us) == 0.0
+            assert float(impact.time_us) == float(impact.arrival_time_us)
 
 
 @pytest.mark.parametrize("delayed", [False, True])

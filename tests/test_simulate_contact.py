@@ -251,6 +251,16 @@ def test_derivatives_forward_and_reverse():
         np.testing.assert_allclose(float(forward[place]), slope, rtol=1e-5, atol=1e-9)
 
 
+@pytest.mark.slow
+def test_a_tip_that_is_held_for_long_is_followed_to_the_end():
+    # held for five periods of a slow cantilever, 5,000 oscillations in the junction: room for 64 contacts is enough
+    scene = Scene(Cantilever(5.0, 40.0), Platform(4.0, 10.1), Contact.paper(modulus_gpa=70.0))
+    simulation = simulate(scene, state((0.0, 10.0, -8.0)), 1000.0)
+    assert MotionOutcome(int(simulation.outcome)) == MotionOutcome.HELD
+    assert float(simulation.final.time_us) == 1000.0
+    assert int(simulation.count) == 1
+
+
 def test_too_little_room_is_an_outcome():
     simulation = simulate(contact_scene(1.01, 4.0, 0.0), state((0.0, 10.0, 60.0)), 600.0, max_contacts=ROOM)
     assert int(simulation.outcome) == MotionOutcome.CONTACT_LIMIT

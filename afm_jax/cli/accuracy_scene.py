@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from afm_jax.cli.session import Session
+from afm_jax.whole_files import write_whole
 from afm_jax.words import known
 
 if TYPE_CHECKING:
@@ -59,7 +60,7 @@ def scene_study(session: Session, name: str, contacts: int, *, quick: bool) -> N
         from afm_jax.plots.accuracy import scene_accuracy_figure  # noqa: PLC0415
         from afm_jax.plots.picture_style import save  # noqa: PLC0415
 
-        (session.out / "accuracy.json").write_text(strict_json(payload) + "\n", encoding="utf-8")
+        write_whole(session.out / "accuracy.json", strict_json(payload) + "\n")
         save(scene_accuracy_figure(result), session.out / "accuracy.png")
         session.note(f"wrote {session.out / 'accuracy.json'} and {session.out / 'accuracy.png'}")
     session.emit(payload, settings_table(result), reference_sentence(result), ladder_table(result), *_reasons(result))

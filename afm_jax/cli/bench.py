@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from afm_jax.cli.session import Session, with_session
+from afm_jax.whole_files import write_whole
 from afm_jax.words import known
 
 if TYPE_CHECKING:
@@ -236,7 +237,7 @@ def command(session: Session, batches: tuple[int, ...], only: str | None, *, qui
             tables.append(fit_table(payload["fit_rows"]))
             session.write_table("bench_fits.csv", payload["fit_rows"], FIT_COLUMNS)
     if session.out is not None:
-        (session.out / "bench.json").write_text(strict_json(payload) + "\n", encoding="utf-8")
+        write_whole(session.out / "bench.json", strict_json(payload) + "\n")
         session.note(f"wrote {session.out / 'bench.json'}")
     session.emit(payload, *tables, *(aim_sentence(aim) for aim in payload["aims"]))
 

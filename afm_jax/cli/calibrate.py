@@ -15,10 +15,9 @@ BACKGROUNDS = ("none", "floor", "constant", "linear")
 @click.argument("sweep", metavar="SWEEP", type=click.Path(path_type=Path))
 @click.option(
     "--background",
-    default="constant",
-    show_default=True,
     type=click.Choice(BACKGROUNDS),
-    help="What is added to the response: with phase none, constant or linear; without none, floor or constant.",
+    help="What is added to the response: with phase none, constant or linear; without none, floor or constant. "
+    "Without this option constant, or what Akaike's criterion prefers clearly.",
 )
 @click.option("--amplitude-only", is_flag=True, help="Leave the phase of the sweep aside.")
 @click.option(
@@ -30,7 +29,13 @@ BACKGROUNDS = ("none", "floor", "constant", "linear")
 @click.option("--scale-errors", is_flag=True, help="Take given errors as relative: scale them until chi2/dof is 1.")
 @with_session
 def command(
-    session: Session, sweep: Path, background: str, noise: float | None, *, amplitude_only: bool, scale_errors: bool
+    session: Session,
+    sweep: Path,
+    background: str | None,
+    noise: float | None,
+    *,
+    amplitude_only: bool,
+    scale_errors: bool,
 ) -> None:
     """Fit frequency and quality factor to a free resonance sweep.
 

@@ -8,6 +8,7 @@ from afm_jax.cli.contact_options import ContactOptions, chosen_contact, with_con
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import Numbers
+from afm_jax.whole_files import write_whole
 from afm_jax.words import known
 
 if TYPE_CHECKING:
@@ -91,7 +92,7 @@ def command(
         from afm_jax.plots.collisions import draw_collisions  # noqa: PLC0415
         from afm_jax.strict_json import strict_json  # noqa: PLC0415
 
-        (session.out / "collide.json").write_text(strict_json(payload) + "\n", encoding="utf-8")
+        write_whole(session.out / "collide.json", strict_json(payload) + "\n")
         title = f"Collisions of a free tip of {mass:g} ng: {', '.join(description['effects'])}"
         draw_collisions(rows, result.capture_speed_nm_per_us, session.out / "collide.png", title=title)
         session.note(f"wrote {session.out / 'collide.json'} and {session.out / 'collide.png'}")

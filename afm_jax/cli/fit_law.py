@@ -9,6 +9,7 @@ from afm_jax.cli.contact_options import ContactOptions, chosen_contact, with_con
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import Ends
+from afm_jax.whole_files import write_whole
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -112,7 +113,7 @@ def command(
         from afm_jax.strict_json import strict_json  # noqa: PLC0415
         from fitting.report.contact_law_plot import draw_contact_law  # noqa: PLC0415
 
-        (session.out / "fit_law.json").write_text(strict_json(payload) + "\n", encoding="utf-8")
+        write_whole(session.out / "fit_law.json", strict_json(payload) + "\n")
         draw_contact_law(laws, delay, session.out / "fit_law.png")
         session.note(f"wrote {session.out / 'fit_law.json'} and {session.out / 'fit_law.png'}")
     session.emit(payload, law_table(laws), *law_sentences(laws), "", delay_table(delay), *delay_sentences(delay))

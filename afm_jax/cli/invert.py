@@ -34,7 +34,7 @@ from afm_jax.cli.values import Share
     "--law",
     type=click.Path(path_type=Path),
     metavar="JSON",
-    help="A fit of the same drives, as `afm-jax fit --out` writes it (fit.json): drawn over the rows.",
+    help="A fit, as `afm-jax fit --out` writes it (fit.json), to draw over the rows; one of other speeds is refused.",
 )
 @click.option("--example", is_flag=True, help="Invert the bundled table instead of a file.")
 @with_session
@@ -70,12 +70,12 @@ def command(
     known = None if truth is None else read_known_law(truth)
     fitted = None if law is None else read_fitted_law(law)
     with session.working(f"inverting {measured.rows} rows (the first run compiles for some seconds)"):
-        result = invert(measured, frequency_error_khz=frequency_error_khz, truth=known)
+        result = invert(measured, frequency_error_khz=frequency_error_khz, truth=known, fitted=fitted)
     session.emit(result.to_dict(), inversion_summary(result))
     if session.out is not None:
         from fitting.inversion.report import write_inversion  # noqa: PLC0415
 
-        for path in write_inversion(result, session.out, session.write_table, fitted=fitted):
+        for path in write_inversion(result, session.out, session.write_table):
             session.note(f"wrote {path}")
     if not result.valid:
         raise NotValid(result.reasons[0])

@@ -45,9 +45,9 @@ def command(
     TRACE is CSV or HDF5 with the columns deflection_nm (the tip's height), time_us (or a sampling rate) and, as
     reference of the phase, platform_nm or drive. Every setting below may stand in the file instead, as a comment
     `# drive_frequency_khz = 180` or an HDF5 attribute; options hold for all traces. Orbits that are not steady with
-    one impact are flagged: several impacts, period doubled, chaotic, drifting, stuck, no response. With --out a
-    picture of every trace, lockin.json, and amplitudes.csv for `afm-jax fit` with the steady ones. Exit code 3 if a
-    trace is flagged.
+    one impact are flagged: several impacts, period doubled, chaotic, drifting, ringing, stuck, no response. With --out
+    a picture of every trace, lockin.json, and amplitudes.csv for `afm-jax fit` with the steady ones; traces of one
+    drive give one row, their mean. Exit code 3 if a trace is flagged.
     """
     from fitting.traces.lockin import (  # noqa: PLC0415
         lockin,
@@ -73,6 +73,8 @@ def command(
             session.note(f"wrote {path}")
         if fault is not None:
             session.note(f"no amplitudes.csv: {fault}")
+    for remark in () if table is None else table.remarks[1:]:
+        session.note(remark)
     flagged = [result for result in results if not result.steady]
     for result in flagged[1:]:
         session.note(f"flagged: {result.trace.source}: {result.verdict}")

@@ -8,12 +8,18 @@ How a command ends: exit codes, and one line on standard error for whatever went
 
 import difflib
 import os
+import signal
+import socket
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Any
 
 import click
+
+from afm_jax.words import shown
 
 _OWN_PACKAGES = ("afm_jax", "fitting")
 _NUMERICAL_PACKAGES = frozenset(
@@ -55,7 +61,7 @@ def exit_code_of(run: Callable[[], object]) -> int:
         line, code = _verdict(error)
         if not line or (code == 1 and os.environ.get(_TRACEBACK)):
             raise
-        click.echo(f"afm-jax: {' '.join(line.split())}", err=True)
+        click.echo(shown(f"afm-jax: {' '.join(line.split())}"), err=True)
     return code if isinstance(code, int) else 0
 
 
@@ -116,11 +122,56 @@ def _missing_package(error: ModuleNotFoundError) -> str:
     return f"the Python package `{package}` is missing; install it with: pip install {package}"
 
 
+def _check_streams() -> None:
+    """Check that there is a standard output; messages to a standard error that is closed go nowhere.
+
+    Raises:
+        click.ClickException: if there is none.
+    """
+    if sys.stderr is None:
+        sys.stderr = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 (as long as the program runs)
+    if sys.stdout is None:
+        raise click.ClickException("standard output is closed; send it to a file or to /dev/null instead")
+
+
+_GRACE_S = 1.0
+"""For the usual way out of an interrupt, before the program ends without it."""
+
+
+def _end_when_interrupted() -> threading.Event:
+    """Make sure that an interrupt ends the program; return what tells that it ends by itself.
+
+    Python raises an interrupt in the main thread, where native code can hold it for a long compilation, and callbacks
+    of JAX's garbage collection can lose it. A thread is told of the signal at once, whatever the main thread does. What
+    is written is written whole, so that nothing is left half done.
+    """
+    ended = threading.Event()
+    if threading.current_thread() is not threading.main_thread():
+        return ended
+    heard, told = socket.socketpair()
+    told.settimeout(0.0)
+    signal.set_wakeup_fd(told.fileno(), warn_on_full_buffer=False)
+
+    def wait() -> None:
+        while signal.SIGINT not in heard.recv(64):
+            pass
+        if not ended.wait(_GRACE_S):
+            click.echo("afm-jax: interrupted", err=True)
+            os._exit(130)
+        told.close()
+
+    threading.Thread(target=wait, daemon=True).start()
+    return ended
+
+
 COMMANDS = {
     "accuracy": ("afm_jax.cli.accuracy", "Show error against time, and the cheapest setting for a wanted accuracy."),
     "bench": ("afm_jax.cli.bench", "Measure impacts per second, next to SciPy."),
+    "bifurcation": ("afm_jax.cli.bifurcation", "Sweep a parameter and record what the tip comes to."),
     "calibrate": ("afm_jax.cli.calibrate", "Fit frequency and quality factor to a free resonance sweep."),
+    "chart": ("afm_jax.cli.chart", "Chart which single-impact orbits are stable over two parameters."),
     "collide": ("afm_jax.cli.collide", "Let free tips collide with the sample: rebound, delay, capture, energy."),
+    "continue": ("afm_jax.cli.continue_orbits", "Follow orbits and their special points through parameters."),
     "design": ("afm_jax.cli.design", "Choose the drives to measure next, and forecast what they will determine."),
     "doctor": ("afm_jax.cli.doctor", "Say what is installed, how JAX computes, and whether its cache works."),
     "effects": ("afm_jax.cli.effects", "Say what each effect of a scene changes and costs, and which can be left out."),
@@ -129,7 +180,8 @@ COMMANDS = {
     "fit-law": ("afm_jax.cli.fit_law", "Fit the impact law and the delay law to a simulated contact."),
     "invert": ("afm_jax.cli.invert", "Read speeds and delay of every impact off amplitude and phase, without a law."),
     "lockin": ("afm_jax.cli.lockin", "Read response order, amplitudes and phase off time traces of the deflection."),
-    "orbits": ("afm_jax.cli.orbits", "Find all single-impact orbits of a scene, and whether they are stable."),
+    "lyapunov": ("afm_jax.cli.lyapunov", "Compute Lyapunov exponents of a motion, or along a parameter."),
+    "orbits": ("afm_jax.cli.orbits", "Find the orbits of a scene, of one impact or more, and whether they are stable."),
     "simulate": ("afm_jax.cli.simulate", "Follow a scene in time: contacts, amplitudes, phases, energies."),
     "verify": ("afm_jax.cli.verify", "Compare eqs. 5 to 8 with automatic differentiation and with 50 digits."),
 }
@@ -177,9 +229,17 @@ class LazyGroup(click.Group):
         """Run the command line; unless `standalone_mode` is off, end the program with its exit code."""
 
         def run() -> Any:
+            if standalone_mode:
+                _check_streams()
             return click.Group.main(self, args, prog_name, complete_var, standalone_mode=False, **extra)
 
-        return sys.exit(exit_code_of(run)) if standalone_mode else run()
+        if not standalone_mode:
+            return run()
+        # a program that calls this one keeps its own signals
+        ended = _end_when_interrupted() if args is None else threading.Event()
+        code = exit_code_of(run)
+        ended.set()
+        return sys.exit(code)
 
 
 @click.group(

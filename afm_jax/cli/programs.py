@@ -7,7 +7,6 @@ Results are modules and tuples of arrays; arguments that are no arrays have a `r
 
 import hashlib
 import json
-import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from importlib import import_module
@@ -19,6 +18,8 @@ import equinox as eqx
 import jax
 from jax import export
 from jax.core import Tracer
+
+from afm_jax.whole_files import write_whole
 
 _CONFIGURATION = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_precision", "jax_debug_nans")
 _SOON = {"xla_cpu_use_fusion_emitters": False}
@@ -74,9 +75,7 @@ def _program(path: Path, trace: Callable[[], tuple[Any, Any]], tell: Callable[[s
     program, structure = trace()
     text = json.dumps(structure).encode() + b"\n" + program.serialize()
     try:
-        fresh = path.with_suffix(f".{os.getpid()}")
-        fresh.write_bytes(hashlib.sha256(text).digest() + text)
-        fresh.replace(path)
+        write_whole(path, hashlib.sha256(text).digest() + text)
         tell(f"{path.name} was {'damaged' if kept else 'not there'}: traced and written")
     except OSError as error:
         tell(f"{path.name} cannot be written: {error.strerror}")

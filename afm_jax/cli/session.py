@@ -13,9 +13,11 @@ The `--out` folder: made and tried out before the computation, and the tables in
 
 import csv
 import functools
+import io
 import math
 import sys
 import tempfile
+import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
@@ -26,6 +28,8 @@ import click
 
 from afm_jax.compilation_cache import cache_folder, make_private, silence_xla
 from afm_jax.strict_json import strict_json
+from afm_jax.whole_files import write_whole
+from afm_jax.words import shown
 
 if TYPE_CHECKING:
     from afm_jax.compilation_cache import Cache
@@ -44,10 +48,11 @@ def prepare_folder(folder: Path) -> None:
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> None:
     """Write rows as CSV; numbers with all their digits, true and false in words, what is unknown as an empty cell."""
-    with path.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.writer(file, lineterminator="\n")
-        writer.writerow(columns)
-        writer.writerows([_cell(row.get(column)) for column in columns] for row in rows)
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(columns)
+    writer.writerows([_cell(row.get(column)) for column in columns] for row in rows)
+    write_whole(path, text.getvalue())
 
 
 def _cell(value: Any) -> Any:
@@ -59,6 +64,16 @@ def _cell(value: Any) -> Any:
     return plain
 
 
+def _cells(column: Any) -> Any:
+    """Return the cells of a column, many at a time."""
+    if not hasattr(column, "dtype") or column.dtype.kind not in "fb":
+        return (_cell(value) for value in column)
+    if column.dtype.kind == "b":
+        return ("true" if value else "false" for value in column.tolist())
+    return (value if math.isfinite(value) else "" for value in column.tolist())
+
+
+_SECONDS_BETWEEN_NOTES = 2.0
 _WIDTH_OF_A_PIPE = 160
 """Columns of text that nobody looks at in a terminal; wide enough that no table is cut."""
 
@@ -106,11 +121,23 @@ class Session:
 
     def note(self, message: str) -> None:
         """Write a message to standard error."""
-        _console(stderr=True).print(message, markup=False, highlight=False, soft_wrap=True)
+        _console(stderr=True).print(shown(message), markup=False, highlight=False, soft_wrap=True)
+
+    def progress(self, what: str) -> Callable[[int, int], None]:
+        """Return what tells on standard error how much is done, every two seconds at most."""
+        last = time.monotonic()
+
+        def report(done: int, total: int) -> None:
+            nonlocal last
+            if time.monotonic() - last > _SECONDS_BETWEEN_NOTES:
+                last = time.monotonic()
+                self.note(f"{done} of {total} {what}")
+
+        return report
 
     def working(self, what: str) -> AbstractContextManager[object]:
         """Show on standard error what is being done, for as long as it takes, if that is a terminal."""
-        return _console(stderr=True).status(what)
+        return _console(stderr=True).status(shown(what))
 
     def emit(self, payload: Mapping[str, Any], *text: Any) -> None:
         """Write the result to standard output: the JSON object if asked for, else the text.
@@ -125,7 +152,7 @@ class Session:
         console = _console(stderr=False)
         for part in text:
             if isinstance(part, str):
-                console.print(part, markup=False, highlight=False, soft_wrap=True)
+                console.print(shown(part), markup=False, highlight=False, soft_wrap=True)
             else:
                 console.print(part)
         sys.stdout.flush()
@@ -141,6 +168,21 @@ class Session:
         if self.out is not None:
             write_csv(self.out / name, rows, columns)
             self.note(f"wrote {self.out / name}")
+
+    def write_columns(self, name: str, columns: Mapping[str, Any]) -> None:
+        """Write a long table as CSV into the `--out` folder, if there is one, and say so.
+
+        Args:
+            name: file name.
+            columns: lists or arrays of one length, in order; what is not finite stays empty.
+        """
+        if self.out is None:
+            return
+        with (self.out / name).open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerow(columns)
+            writer.writerows(zip(*map(_cells, columns.values()), strict=True))
+        self.note(f"wrote {self.out / name}")
 
 
 def with_session(function: Callable[..., Any]) -> Callable[..., Any]:

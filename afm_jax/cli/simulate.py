@@ -21,6 +21,8 @@ DEFAULT_PERIODS = 2000
 """Drive periods followed at most where no duration is given."""
 LARGEST_OFFSET_NM = 10_000.0
 """How far a ramp may take the sample from the tip's rest position, either way."""
+MOST_OSCILLATIONS = 1e7
+"""Of the free tip: some minutes of computing."""
 _PIECES_A_LINE = 8
 """Pieces of a long run between two lines on standard error."""
 
@@ -111,6 +113,7 @@ def command(  # noqa: PLR0913
     settings = {"accuracy": accuracy, "method": method, "until_settled": until_settled}
     try:
         _check_ramp(loaded, longest)
+        _check_length(loaded, longest)
         run = _follow(session, loaded, told, longest, settings)
         with session.working("reading amplitudes"):
             dense = _dense(loaded, run, to_files=session.out is not None)
@@ -147,6 +150,20 @@ def _check_ramp(scene: "Scene", duration_us: float) -> None:
         raise ValueError(
             f"after {duration_us:.6g} us the ramp of `offset_rate_nm_per_us` = {rate:g} has taken the offset to "
             f"{end:.6g} nm, out of the range of {LARGEST_OFFSET_NM:g} nm: simulate a shorter time or ramp slower"
+        )
+
+
+def _check_length(scene: "Scene", duration_us: float) -> None:
+    """Check that a duration can be followed.
+
+    Raises:
+        ValueError: if the tip would oscillate too often in it.
+    """
+    oscillations = float(scene.cantilever.frequency_khz) * 1e-3 * duration_us
+    if not oscillations <= MOST_OSCILLATIONS:
+        raise ValueError(
+            f"in {duration_us:.6g} us the tip would oscillate {oscillations:.3g} times, more than the "
+            f"{MOST_OSCILLATIONS:g} that can be followed: give a shorter --duration-us or fewer --periods"
         )
 
 

@@ -15,6 +15,7 @@ from afm_jax.motion.settle import LongRun, Window
 from afm_jax.motion.trajectory import DensePath
 from afm_jax.scenefile.scenefile import scene_tables
 from afm_jax.strict_json import strict_json
+from afm_jax.whole_files import write_whole
 
 _WHOLE_PERIODS = 50
 """Drive periods up to which the whole simulation goes into trajectory.csv."""
@@ -146,7 +147,7 @@ def write_files(
     rows, columns = trajectory_rows(dense, *stretch_written(run.simulation, seen.window))
     session.write_table("trajectory.csv", rows, columns)
     path = session.out / "simulate.json"
-    path.write_text(strict_json(payload) + "\n", encoding="utf-8")
+    write_whole(path, strict_json(payload) + "\n")
     session.note(f"wrote {path}")
 
 

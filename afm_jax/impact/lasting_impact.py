@@ -20,7 +20,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
@@ -344,6 +344,22 @@ def speeds_of_impact(
     safe = Speeds(*(jnp.where(leaves, part, usual) for part, usual in zip(free, (1.0, 1.0, 0.0), strict=True)))
     found = lasting(safe, impact, arrival_us, cantilever, surface)
     return Speeds(approach_speed, *(jnp.where(leaves, part, 0.0) for part in found[1:]))
+
+
+def crawls(impact: Impact, speeds: Speeds, cantilever: Cantilever) -> Bool[Array, "..."]:
+    """Say whether a free tip's rebound is so slow that the tip stays: a bound on it that follows from the delay.
+
+    The delay takes the way out as straight from gap 0, before the tip is there: by b (1/u_out - 1/u_in), without limit
+    towards capture. Over a quarter of the free period no flight is straight; a tip that would need it does not come out
+    of the bridge before the spring and the platform decide.
+
+    Args:
+        impact: for its lead b.
+        speeds: of the free tip on a sample at rest; the tip leaves.
+        cantilever: for its period.
+    """
+    early = jnp.maximum(impact.lead, 0.0) * (speeds.approach - speeds.rebound)
+    return early > 0.5 * jnp.pi / cantilever.angular_frequency * speeds.approach * speeds.rebound
 
 
 def lasting(

@@ -17,7 +17,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from afm_jax.apparatus.scene import Scene, require_sample_drive
 from afm_jax.checks import readable, require_float64
 from afm_jax.impact.first_impact import DEFAULT_MAX_STEPS, DEFAULT_ROOT_TOLERANCE_US, Flight, first_impact
-from afm_jax.impact.lasting_impact import LawImpact, delay_before, speeds_of_impact
+from afm_jax.impact.lasting_impact import LawImpact, crawls, delay_before, speeds_of_impact
 from afm_jax.impact.law import impact_law_of
 from afm_jax.outcomes import Outcome
 
@@ -164,9 +164,15 @@ def impact_after(
     hit = impact.outcome == Outcome.IMPACT
     approach = jnp.where(hit, scene.platform.velocity(arrival) - before, 1.0)
     impact_speeds = speeds_of_impact(LawImpact(law), approach, arrival, scene.cantilever, scene.platform)
+    captured = hit & law.captures(approach)
+    if law.delay is not None:
+        free = LawImpact(law).at_approach(approach)
+        captured = captured | (hit & crawls(LawImpact(law), free, scene.cantilever))
+        impact_speeds = impact_speeds._replace(
+            rebound=jnp.where(captured, 0.0, impact_speeds.rebound), delay=jnp.where(captured, 0.0, impact_speeds.delay)
+        )
     leaving = arrival + impact_speeds.delay if law.delay is not None else arrival
     after = scene.platform.velocity(leaving) + impact_speeds.rebound
-    captured = hit & law.captures(approach)
     return NextImpact(
         time_us=jnp.where(hit, leaving, jnp.inf),
         arrival_time_us=jnp.where(hit, arrival, jnp.inf),

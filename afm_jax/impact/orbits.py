@@ -29,7 +29,7 @@ from afm_jax.impact.closure import (
 from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.impact.implicit import implicit_pair, implicit_root
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
-from afm_jax.impact.lasting_impact import INDENTATION, Impact, LawImpact
+from afm_jax.impact.lasting_impact import INDENTATION, Impact, LawImpact, crawls
 from afm_jax.impact.law import Speeds, impact_law_of
 from afm_jax.impact.roots import COARSE, find_roots
 from afm_jax.outcomes import Outcome
@@ -213,8 +213,11 @@ def judge(place: OrbitPlace, found: Bool[Array, ""], state: OrbitState, problem:
     trace, determinant = trace_and_determinant(impact, cantilever, platform, state.flight)
     # the flight counts from max(t_in, t_out) on
     skip = jnp.maximum(-state.speeds.delay, 0.0) if impact.delayed else None
+    flies = found & ends_at_its_own_impact(cantilever, platform, state.flight, found, skip)
+    if isinstance(impact, LawImpact) and impact.delayed:
+        flies = flies & ~crawls(impact, impact.at_approach(state.speeds.approach), cantilever)
     return Verdict(
-        admissible=found & ends_at_its_own_impact(cantilever, platform, state.flight, found, skip),
+        admissible=flies,
         stable=found & contracts(trace, determinant),
         near_double=found & near_fold(place.coordinate, problem),
         trace=trace,

@@ -34,7 +34,7 @@ from afm_jax.impact.map import NextImpact, impact_after
 from afm_jax.motion.record import ContactKind, Contacts, MotionOutcome, Simulation, State, to_gap, to_lab
 from afm_jax.outcomes import Outcome
 
-_CONSTANT_PUSH = 1e-5
+CONSTANT_PUSH = 1e-5
 """Largest relative change of the push during the rest of a series of impacts that is summed up."""
 _SHORTEST_PULL = 1e-6
 """Phase (rad of the fastest motion) below which a pull is too short to let go: the gap would stay below 1e-18 beta."""
@@ -179,7 +179,7 @@ def chatter(
     converges = (push > 0.0) & (loss > 0.0) & (law.epsilon == 0.0)
     lasts = 2.0 * rebound / jnp.where(converges, push * loss, 1.0)
     change = lasts * jnp.maximum(bed.fastest * push, jnp.abs(rate))
-    short = converges & (change < _CONSTANT_PUSH * push)
+    short = converges & (change < CONSTANT_PUSH * push)
     if law.delay is not None:
         short = jnp.zeros_like(short)
     return short, jnp.where(short, lasts, 0.0)
@@ -194,7 +194,8 @@ _ROUNDS = 8
 _FLIGHT_STEPS = 1_000_000
 """Steps of the search of one flight: as many as it takes, a flight that never lands needs some every period."""
 _ON_SURFACE_NM = 1e-9
-"""Depth up to which a start that leaves is taken to lie on the surface: rounding of lab coordinates."""
+"""Depth up to which a start is taken to lie on the surface: rounding of lab coordinates. Times the fastest angular
+frequency: speed against the surface up to which it is at rest there."""
 
 
 class LawRow(NamedTuple):
@@ -249,7 +250,8 @@ def follow_law(
         scene: its interaction is an `ImpactLaw`.
         surface: what the free tip sees (`surface_of`).
         response: the steady response to drives of base and tip, or None.
-        start: the tip at the start, in the lab, above the surface; on it, it must leave.
+        start: the tip at the start, in the lab, above the surface, or on it: leaving it, or at rest, which counts as
+            an impact at speed 0.
         until: time of the end in us.
         max_contacts: rows for contacts.
         reverse: make it differentiable in reverse mode: all rounds are run, in blocks that are recomputed backwards.
@@ -312,11 +314,12 @@ def _round(seen: Scene, tip: LawTip, until: Array) -> LawTip:
     )
     tolerance = jnp.asarray(DEFAULT_ROOT_TOLERANCE_US, until.dtype)
     impact = impact_after(seen, flight, tolerance, max_steps=_FLIGHT_STEPS, latest_us=until - leg.time_us)
+    impact = _or_rest(seen, tip, impact)
     ended = impact.outcome
     landed = (ended == Outcome.IMPACT) | (ended == Outcome.CAPTURED)
     arrived = ~tip.done & landed & (impact.arrival_time_us < until)
     failed = ~tip.done & ~landed & (ended != Outcome.NO_FURTHER_IMPACT)
-    row, beyond, lost = _through(seen, impact, arrived, until)
+    row, beyond, lost = through_impact(seen, impact, arrived, until)
     room = tip.used < tip.rows.shape[0]
     held, full = arrived & (row.kind == ContactKind.HELD), arrived & ~room
     outcome = jnp.where(held, MotionOutcome.HELD, MotionOutcome.FINISHED)
@@ -336,10 +339,29 @@ def _round(seen: Scene, tip: LawTip, until: Array) -> LawTip:
     )
 
 
-def _through(seen: Scene, impact: NextImpact, arrived: Array, until: Array) -> tuple[LawRow, LawLeg, Array]:
+def _or_rest(seen: Scene, tip: LawTip, impact: NextImpact) -> NextImpact:
+    """Return the capture that a tip at rest on the surface at its start has had, or the impact that was found."""
+    leg, surface = tip.leg, seen.platform
+    speed = surface.velocity(leg.time_us)
+    rate = jnp.abs(leg.velocity - speed)
+    slow = rate <= _ON_SURFACE_NM * Bed(seen.cantilever, surface).fastest
+    rests = (tip.rounds == 0) & (leg.gap_nm == 0.0) & slow
+    captured = NextImpact(
+        leg.time_us, leg.time_us, speed, speed, jnp.full_like(impact.outcome, Outcome.CAPTURED), rests
+    )
+    return jax.tree.map(lambda one, other: jnp.where(rests, one, other), captured, impact)
+
+
+def through_impact(seen: Scene, impact: NextImpact, arrived: Array, until: Array) -> tuple[LawRow, LawLeg, Array]:
     """Return the row of an impact and the beginning of the next flight; where there is none, numbers without meaning.
 
     The third: whether the search for the end of a rest gave up.
+
+    Args:
+        seen: a scene with a law, the platform the surface that its tip sees.
+        impact: the impact.
+        arrived: whether there is one, before the end.
+        until: the end in us: a tip that rests then is held.
     """
     law, bed = impact_law_of(seen), Bed(seen.cantilever, seen.platform)
     arrival = jnp.where(arrived, impact.arrival_time_us, until)

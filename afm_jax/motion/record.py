@@ -36,7 +36,7 @@ _SENTENCES = {
     MotionOutcome.FINISHED: "The motion was followed to the end of its duration.",
     MotionOutcome.HELD: "The motion was followed to the end of its duration; the sample holds the tip there.",
     MotionOutcome.CONTACT_LIMIT: "The motion has more contacts than there is room for: raise max_contacts.",
-    MotionOutcome.STEP_LIMIT: "The search for the next contact ended at its step limit.",
+    MotionOutcome.STEP_LIMIT: "The motion took more steps than it was given (max_rounds), or a search did not end.",
     MotionOutcome.INVALID_START: "The start is not finite, or inside the sample.",
     MotionOutcome.NO_JUNCTION: "With these parameters no junction forms: force and stiffness are equal nowhere.",
     MotionOutcome.UNRESOLVED: "An integration step left the range of the forces; the motion is not trusted beyond.",

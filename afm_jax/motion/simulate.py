@@ -26,6 +26,8 @@ from afm_jax.motion.record import ContactDetail, ContactKind, Contacts, MotionOu
 DEFAULT_ACCURACY = 1e-9
 _ROUNDS_PER_CONTACT = 4
 _SPARE_ROUNDS = 64
+_HELD_ROUNDS_PER_CONTACT, _LEAST_HELD_ROUNDS = 256, 1 << 16
+"""Far more rounds than any motion takes that comes to an end: for every contact there is room for, and at least."""
 _CONTACTS_PER_PERIOD = 4.0
 _MORE_ROOM = 4
 _MOST_CONTACTS = 1 << 20
@@ -62,8 +64,8 @@ def simulate(  # noqa: PLR0913
         method: the way through a resolved contact: "collocation" (leg by leg, and in time where a tip turns in the
             bridge or is held) or "diffrax" (in time throughout, by Diffrax's Dopri8; some ten times slower).
         reverse: make it differentiable in reverse mode, in memory that grows with the square root of the length.
-        max_rounds: most rounds; a tip that is held takes one every 60 steps of its oscillation. None: four for every
-            contact and what a held tip needs.
+        max_rounds: most rounds; a tip that is held takes one every 60 steps of its oscillation. None: as many as it
+            takes, four for every contact in reverse mode, where all of them are run.
 
     Returns:
         A `Simulation`; how it ended is its `outcome`, a `MotionOutcome`.
@@ -96,7 +98,7 @@ def simulate(  # noqa: PLR0913
             setting = setting._replace(quick=None, trials=_TRIALS_BACKWARDS)
 
         def follow(room: int) -> Simulation:
-            rounds = max_rounds if max_rounds is not None else _ROUNDS_PER_CONTACT * room + _SPARE_ROUNDS
+            rounds = max_rounds if max_rounds is not None else _rounds(room, reverse=reverse)
             return _contact(*world, rows=room, setting=setting, rounds=rounds, reverse=reverse)
 
     else:
@@ -133,6 +135,13 @@ ad.deflinear2(_forwards, _refuse)
 def _only_forwards(part: Array) -> Array:
     """Return a part of a result that is traced so that it refuses reverse mode."""
     return _forwards.bind(part) if is_traced(part) and jnp.issubdtype(part.dtype, jnp.floating) else part
+
+
+def _rounds(room: int, *, reverse: bool) -> int:
+    """Return the most rounds of a motion with room for some contacts."""
+    if reverse:
+        return _ROUNDS_PER_CONTACT * room + _SPARE_ROUNDS
+    return max(_HELD_ROUNDS_PER_CONTACT * room, _LEAST_HELD_ROUNDS)
 
 
 def _with_room(follow: Callable[[int], Simulation], room: int) -> Simulation:

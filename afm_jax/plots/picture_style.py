@@ -7,13 +7,15 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from afm_jax.whole_files import write_whole
+
 DARK = "#3b4a5a"
 ACCENT = "#b34700"
 """A dark orange that stands off white, black and DARK for every kind of colour vision."""
 BLUE = "#0072B2"
 GRID = "#9aa5b1"
 _FONT = 11.0
-_DPI = 200
+_DPI = 200.0
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
@@ -37,12 +39,16 @@ def with_zero_line(axes: Axes) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG."""
-    figure.savefig(path, dpi=_DPI, format="png")
+    """Write a figure, whole or not at all, in the format of its file's suffix: PNG, PDF or SVG."""
+    write_whole(path, _bytes_of(figure, path.suffix.removeprefix("."), _DPI))
 
 
 def png_of(figure: Figure, dpi: float = 150.0) -> bytes:
     """Return a figure as a PNG file."""
+    return _bytes_of(figure, "png", dpi)
+
+
+def _bytes_of(figure: Figure, suffix: str, dpi: float) -> bytes:
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi)
+    figure.savefig(buffer, format=suffix, dpi=dpi)
     return buffer.getvalue()

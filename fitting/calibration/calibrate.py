@@ -12,7 +12,9 @@ from fitting.calibration.verdict import (
     IMPROBABLE,
     SweepEvidence,
     autocorrelation,
+    inflation_of,
     judge_calibration,
+    preferred,
     repeat_of,
     runs_excess,
 )
@@ -25,7 +27,7 @@ _PACKAGES = ("afm-jax", "jax", "optax", "numpy")
 def calibrate(
     sweep: ResonanceSweep,
     *,
-    background: str = "constant",
+    background: str | None = None,
     noise: float | None = None,
     scale_errors: bool = False,
     compare: bool = True,
@@ -39,7 +41,8 @@ def calibrate(
     Args:
         sweep: from `read_sweep`; its phase is used where it is there.
         background: what is added to the response. With phase: "none", "constant" or "linear" (both complex). Amplitude
-            only: "none", "floor" (in quadrature) or "constant" (in quadrature and interfering).
+            only: "none", "floor" (in quadrature) or "constant" (in quadrature and interfering). None: constant, or the
+            one that Akaike's criterion prefers clearly (if the others are compared).
         noise: standard error of every point as a share of the largest amplitude, for a sweep without errors of its own.
             Without either the errors are estimated from the misfit, and goodness of fit cannot be judged.
         scale_errors: scale given errors such that chi2 equals its degrees of freedom.
@@ -55,12 +58,23 @@ def calibrate(
     """
     require_float64()
     kind = kind_of(sweep)
-    _check_options(kind, background, noise)
-    _check_sweep(sweep, kind, background)
-    fit = fit_sweep(sweep, background, noise, scale_errors=scale_errors)
-    others = [name for name in TERMS[kind] if compare and name != background and _enough_points(sweep, kind, name)]
-    alternatives = [_alternative(refit(fit, sweep, name), name) for name in others]
-    return _summary(sweep, fit, background, alternatives)
+    first = "constant" if background is None else background
+    _check_options(kind, first, noise)
+    _check_sweep(sweep, kind, first)
+    fit = fit_sweep(sweep, first, noise, scale_errors=scale_errors)
+    alternatives = _alternatives(sweep, fit, first) if compare else []
+    chosen = first if background is not None else preferred(fit, first, alternatives)
+    if chosen != first:
+        fit = fit_sweep(sweep, chosen, noise, scale_errors=scale_errors)
+        alternatives = _alternatives(sweep, fit, chosen)
+    return _summary(sweep, fit, chosen, alternatives)
+
+
+def _alternatives(sweep: ResonanceSweep, fit: SweepFit, background: str) -> list[Alternative]:
+    """Return the same sweep with the same errors in front of all other backgrounds that it has points for."""
+    kind = fit.objective.kind
+    others = [name for name in TERMS[kind] if name != background and _enough_points(sweep, kind, name)]
+    return [_alternative(refit(fit, sweep, name), name) for name in others]
 
 
 def _check_options(kind: str, background: str, noise: float | None) -> None:
@@ -159,7 +173,8 @@ def _summary(sweep: ResonanceSweep, fit: SweepFit, background: str, alternatives
 
 def _calibrated(fit: SweepFit, *, explained: bool) -> list[CalibratedValue]:
     """Return frequency and quality factor with errors, or without where there is nothing to base them on."""
-    errors = np.sqrt(np.diag(fit.covariance)[:2])
+    wider = inflation_of(fit)
+    errors = np.sqrt(np.diag(fit.covariance)[:2]) * wider
     if not explained:
         reason = "the model does not explain the sweep"
         return [CalibratedValue(float(value), None, (None, None), reason) for value in fit.values[:2]]
@@ -172,9 +187,18 @@ def _calibrated(fit: SweepFit, *, explained: bool) -> list[CalibratedValue]:
     profiled[nuisances, nuisances] = np.inf
     intervals: list[Interval] = profile_intervals(fit.objective, fit.values, profiled, fit.chi2)
     return [
-        CalibratedValue(float(value), float(error), (interval.low, interval.high), interval.reason)
-        for value, error, interval in zip(fit.values[:2], errors, intervals[:2], strict=True)
+        CalibratedValue(
+            float(value),
+            float(error),
+            (_farther(interval.low, value, factor), _farther(interval.high, value, factor)),
+            interval.reason,
+        )
+        for value, error, interval, factor in zip(fit.values[:2], errors, intervals[:2], wider, strict=True)
     ]
+
+
+def _farther(end: float | None, value: float, factor: float) -> float | None:
+    return None if end is None else float(value + factor * (end - value))
 
 
 def _curves(sweep: ResonanceSweep, fit: SweepFit) -> Curves:

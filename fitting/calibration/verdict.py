@@ -16,6 +16,9 @@ IMPROBABLE = 1e-3
 """Probability of the chi2 below which the model does not explain the sweep."""
 _PEAK = 30.0
 """Fall of chi2 per unit of chi2/dof that four more parameters practically never bring about by chance."""
+_CLEARLY = 10.0
+"""Difference of Akaike's criterion from which on a background is better."""
+_WIDER = 1.1
 _SYSTEMATIC = 0.5
 """Correlation of neighbouring residuals beyond which the standard errors mean nothing."""
 
@@ -132,10 +135,15 @@ def _warnings(evidence: SweepEvidence) -> list[str]:
 def _residual_warnings(evidence: SweepEvidence) -> list[str]:
     correlation, warnings = evidence.autocorrelation, []
     if 3.0 / np.sqrt(evidence.fit.data) < correlation <= _SYSTEMATIC:
-        factor = np.sqrt((1.0 + correlation) / (1.0 - correlation))
         warnings.append(
             f"Neighbouring residuals are correlated ({correlation:+.2f}): something systematic is left, or a filter "
-            f"joins neighbouring points; the standard errors may be too small by a factor of {factor:.2g}."
+            "joins neighbouring points."
+        )
+    wider = inflation_of(evidence.fit).tolist()
+    if max(wider) > _WIDER:
+        warnings.append(
+            f"The residuals' correlation widens the errors of frequency_khz {wider[0]:.2g} and of quality_factor "
+            f"{wider[1]:.2g} times; that is in what is stated."
         )
     if evidence.repeat is not None:
         lag, strength = evidence.repeat
@@ -152,13 +160,51 @@ def _residual_warnings(evidence: SweepEvidence) -> list[str]:
     return warnings
 
 
+def preferred(fit: SweepFit, background: str, alternatives: list[Alternative]) -> str:
+    """Return the background that describes a sweep clearly better than the one it was fitted with, or that one."""
+    best = _better(fit, alternatives)
+    return background if best is None else best.background
+
+
+def _better(fit: SweepFit, alternatives: list[Alternative]) -> Alternative | None:
+    best = min(alternatives, key=lambda other: other.aic, default=None)
+    return best if best is not None and best.aic < fit.chi2 + 2.0 * len(fit.values) - _CLEARLY else None
+
+
+def inflation_of(fit: SweepFit) -> Float[np.ndarray, "2"]:
+    """Return by how much the residuals' correlation widens the errors of frequency and quality factor, 1 at least.
+
+    The covariance of the scores J^T r over the sweep, neighbours included with Bartlett's weights up to the root of the
+    number of points (Newey and West), takes the place of the one of independent residuals.
+
+    Args:
+        fit: at its minimum.
+    """
+    residual, jacobian = fit.objective.linearise(fit.coordinates[None])
+    blocks, used = 2 if fit.objective.kind == "phase" else 1, fit.points
+    each = np.einsum("n,np->np", residual[0], jacobian[0]).reshape(blocks, -1, jacobian.shape[2])
+    score = each[:, :used].sum(axis=0)
+    plain = each[:, :used].reshape(-1, each.shape[2])
+    independent = plain.T @ plain
+    long_run = score.T @ score
+    reach = int(np.sqrt(used))
+    for lag in range(1, reach + 1):
+        together = score[lag:].T @ score[:-lag]
+        long_run = long_run + (1.0 - lag / (reach + 1.0)) * (together + together.T)
+    information = jacobian[0].T @ jacobian[0]
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    inverse = scale[:, None] * np.linalg.pinv(scale[:, None] * information * scale) * scale
+    wide, narrow = (np.diag(inverse @ middle @ inverse)[:2] for middle in (long_run, independent))
+    known = (narrow > 0.0) & (wide > narrow)
+    return np.where(known, np.sqrt(np.where(known, wide, 1.0) / np.where(known, narrow, 1.0)), 1.0)
+
+
 def _background_warnings(evidence: SweepEvidence) -> list[str]:
     """Name the background that describes the sweep better than the one chosen, and what it would make of Q."""
     own = evidence.fit.chi2 + 2.0 * len(evidence.fit.values)
-    better = [other for other in evidence.alternatives if other.aic < own - 10.0]
-    if not better:
+    best = _better(evidence.fit, evidence.alternatives)
+    if best is None:
         return []
-    best = min(better, key=lambda other: other.aic)
     message = (
         f"The background '{best.background}' describes the sweep better (AIC lower by {own - best.aic:.0f}) and gives "
         f"{best.frequency_khz:.7g} kHz and Q = {best.quality_factor:.5g}: choose it with "

@@ -5,6 +5,7 @@ The belief that a fit leaves: its values, its covariance, and the drives that we
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import compress
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,7 @@ from fitting.models import Problem
 from fitting.parameters import (
     NUISANCE_NAMES,
     PARAMETERS,
+    SHAPE_NAMES,
     Parameter,
     check_contact_values,
     model_parameters,
@@ -65,8 +67,13 @@ class Belief:
     source: str = "values given"
     notes: tuple[str, ...] = ()
 
-    def draws(self, count: int) -> Float[np.ndarray, "count p"]:
-        """Return values that are as likely as the belief is uncertain, the believed ones first; seeded."""
+    def draws(self, count: int, *, least: float = 0.0) -> Float[np.ndarray, "count p"]:
+        """Return values that are as likely as the belief is uncertain, the believed ones first; seeded.
+
+        Args:
+            count: how many.
+            least: the uncertainty, relative to the parameters' sizes, that is left to any combination of them.
+        """
         sizes = np.array([size_of(p, v) for p, v in zip(self.problem.parameters, self.values, strict=True)])
         spread = self.uncertainty * sizes
         # In units of the spread: the information then has eigenvalues of at least 1.
@@ -74,7 +81,8 @@ class Belief:
         curvature, axes = np.linalg.eigh(scaled)
         normal = np.random.default_rng(DRAW_SEED).normal(size=(count, len(spread)))
         normal[0] = 0.0
-        values = self.values + spread * ((normal / np.sqrt(curvature)) @ axes.T)
+        width = np.maximum(1.0 / np.sqrt(curvature), least / self.uncertainty)
+        values = self.values + spread * ((normal * width) @ axes.T)
         ends = [(p.lowest, p.highest) for p in self.problem.parameters]
         return np.clip(values, *np.array(ends).T)
 
@@ -199,7 +207,11 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
     """
     payload = result.to_dict() if isinstance(result, FitResult) else result
     _check_payload(payload)
-    found, table, settings = payload["parameters"], payload["input"], payload.get("settings") or {}
+    table, settings = payload["input"], payload.get("settings") or {}
+    # the shapes of loss and delay are known beforehand, not to be determined: what they do to the others stays
+    kept = [name not in SHAPE_NAMES for name in payload["parameters"]]
+    found = dict(compress(payload["parameters"].items(), kept))
+    matrix = [list(compress(row, kept)) for row in compress(payload["correlations"]["matrix"], kept)]
     problem = Problem(payload["model"], tuple(found), tuple(settings.get("effects") or EFFECTS))
     columns = ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")
     notes = []
@@ -211,7 +223,7 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
     return Belief(
         problem=problem,
         values=checked_values(problem, {name: entry["value"] for name, entry in found.items()}),
-        information=_information(found, payload["correlations"]["matrix"]),
+        information=_information(found, matrix),
         free_frequency_khz=float(table["free_frequency_khz"]),
         quality_factor=table.get("quality_factor"),
         mass_ng=float(table.get("mass_ng", 1.0)),

@@ -18,6 +18,9 @@ from fitting.tables.table import AmplitudeTable
 
 MOST = 20_000
 """Drives that a design looks at: some minutes of computing."""
+MARGIN = 0.05
+"""Uncertainty of every parameter, relative to its size (the loss, for r), that an orbit must bear however well the law
+seems to be known: a law is none of a real contact to better than that where its orbits end."""
 Numbers = Sequence[int | float] | Shaped[np.ndarray, " n"]
 
 
@@ -108,7 +111,7 @@ LEFT_OUT = {
     "no orbit": "no steady single-impact orbit",
     "several orbits": "several steady orbits: which one is seen depends on the start",
     "fold": "near a fold, where the orbit ends and has no derivative",
-    "unsure": "no single steady orbit for some of the values that the belief allows",
+    "unsure": "no single steady orbit for some of the values that the belief, or a law's own misfit, allows",
     "too large": "amplitudes above what the instrument takes",
     "strained": "impacts too slow for the model: a fit sets such rows aside",
 }
@@ -164,7 +167,7 @@ def candidates_of(
         largest_nm: peak amplitude that the instrument takes.
     """
     objective = Objective(_measurement(belief, drives, amplitudes), belief.problem)
-    linear = objective.at_values(belief.draws(BATCH))
+    linear = objective.at_values(belief.draws(BATCH, least=MARGIN))
     strain = strain_of(objective, belief.values)
     count = len(drives.order)
     prediction = linear.prediction

@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from afm_jax.plots.picture_style import ACCENT, BLUE, GRID, label_axes, new_figure
+from afm_jax.whole_files import write_whole
 from afm_jax.words import bullets, interval, known, text_table, value_alone
 from fitting.experiments.belief import size_of
 from fitting.experiments.candidates import LEFT_OUT
@@ -78,7 +79,7 @@ def write_design(result: Design, folder: Path, write_table: Table) -> list[Path]
     blank = folder / "to_fill_in.csv"
     text, data, picture = design_summary(result), result.to_dict(), png_of(design_figure(result))
     written = write_report_files(folder, "design", text=text, data=data, picture=picture)
-    blank.write_text(table_to_fill_in(result), encoding="utf-8", newline="\n")
+    write_whole(blank, table_to_fill_in(result))
     write_table("design.csv", result.points(), POINT_COLUMNS)
     write_table("candidates.csv", result.all_candidates(), CANDIDATE_COLUMNS)
     return [*written, blank]

@@ -279,6 +279,9 @@ LONGEST = 1.4
 """s beyond which a row is set aside."""
 NEAREST = 1.35
 """Approach speed in terms of the capture speed below which a row is set aside."""
+_CRAWLING, _MOST_LOST = 2.5, 0.05
+"""The same for rows that the law has no steady orbit for, their speed told from the amplitude; and their share at most:
+that close to where orbits end, a hair of the law decides whether there is one."""
 
 
 @dataclass(frozen=True)
@@ -287,10 +290,12 @@ class Strain:
 
     Attributes:
         model_error: relative error of the amplitude that the picture itself has, shape (rows,).
+        slow_error: the part of it that slow impacts have, without that of the delay law.
         set_aside: rows that are not used, shape (rows,).
     """
 
     model_error: Float[np.ndarray, " rows"]
+    slow_error: Float[np.ndarray, " rows"]
     set_aside: Bool[np.ndarray, " rows"]
 
 
@@ -299,7 +304,7 @@ def strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
     rows = objective.measurement.rows
     count = rows.order.shape[0]
     if not objective.problem.lasting:
-        return Strain(np.zeros(count), np.zeros(count, dtype=bool))
+        return Strain(np.zeros(count), np.zeros(count), np.zeros(count, dtype=bool))
     impact = impact_of(jnp.asarray(values), objective.measurement, objective.problem)
     linear = objective.at_values(values[None])
     prediction = linear.prediction
@@ -311,11 +316,24 @@ def strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
     capture = float(impact.speeds(jnp.asarray(lowest * (1.0 + 1e-9))).approach) if lowest > 0.0 else 0.0
     share = 2.0 * np.pi * np.asarray(rows.drive_frequency_khz) * 1e-3 * float(impact.length) / np.maximum(rebound, 1e-6)
     slow = (share > LONGEST) | (approach < NEAREST * capture)
+    slow = np.where(exists, slow, _lost_slowly(objective, exists, _CRAWLING * capture))
     near = np.minimum(1.5 * capture / np.maximum(approach, 1e-6), 1.5 / NEAREST)
-    error = BASE + GROWTH * np.minimum(share, LONGEST) ** 3 + SLOW * near**6
+    slow_error = BASE + GROWTH * np.minimum(share, LONGEST) ** 3 + SLOW * near**6
+    error = slow_error
     if "delay_offset_nm" in objective.problem.names:
         error = np.hypot(error, DELAY_US * _sensitivity(objective, linear, approach))
-    return Strain(np.where(exists, error, BASE), exists & slow)
+    return Strain(np.where(exists, error, BASE), np.where(exists, slow_error, BASE), slow)
+
+
+def _lost_slowly(objective: Objective, exists: Bool[np.ndarray, " rows"], slowest: float) -> Bool[np.ndarray, " rows"]:
+    """Say which measured rows without an orbit have amplitudes of slow impacts; none if there are many of them."""
+    rows = jax.tree.map(np.asarray, objective.measurement.rows)
+    measured = rows.measured.any(axis=1)
+    # a tip that comes free of the platform reaches about its speed over its angular frequency; the lock-in reads half
+    height = np.max(np.where(rows.measured, rows.amplitude_nm * np.array([1.0, 2.0]), 0.0), axis=1)
+    speed = height * float(objective.measurement.cantilever.angular_frequency)
+    lost = measured & ~exists & (speed < slowest)
+    return lost if lost.sum() <= _MOST_LOST * measured.sum() else np.zeros_like(lost)
 
 
 def untabulated(

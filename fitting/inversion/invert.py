@@ -12,8 +12,8 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.checks import require_float64
 from afm_jax.version import version_of
 from fitting.inversion.flight import Inverted, MeasuredRow, invert_rows
-from fitting.inversion.regression import Laws, regressed_laws
-from fitting.inversion.result import Inversion, InvertedRows, RegressedLaw, on_resonance, read_on_resonance
+from fitting.inversion.regression import Laws, compare_law, regressed_laws
+from fitting.inversion.result import Inversion, InvertedRows, RegressedLaw, SavedLaw, on_resonance, read_on_resonance
 from fitting.tables.table import AmplitudeTable, TableError
 
 _BLOCK = 64
@@ -43,7 +43,13 @@ class _Shared(NamedTuple):
     moved: dict[str, _Instrument]
 
 
-def invert(table: AmplitudeTable, *, frequency_error_khz: float | None = None, truth: Law | None = None) -> Inversion:
+def invert(
+    table: AmplitudeTable,
+    *,
+    frequency_error_khz: float | None = None,
+    truth: Law | None = None,
+    fitted: SavedLaw | None = None,
+) -> Inversion:
     """Return approach speed, rebound speed and collision delay of every row with a phase, and the laws they follow.
 
     A row's amplitude and phase fix the flight between two impacts; no impact law is assumed. What the platform's
@@ -55,12 +61,13 @@ def invert(table: AmplitudeTable, *, frequency_error_khz: float | None = None, t
         frequency_error_khz: standard error of the free frequency; None: exactly known.
         truth: approach and rebound speeds in nm/us, ascending, where the law is known: what the reading on resonance
             is compared with.
+        fitted: a law from `read_fitted_law`, to be set beside the rows.
 
     Returns:
         Rows with errors, regressed laws and a verdict; see `Inversion`.
 
     Raises:
-        TableError: if the table has no phase and no row on resonance.
+        TableError: if the table has no phase and no row on resonance, or the fitted law holds at other speeds.
         ValueError: if the frequency's error is not positive.
         RuntimeError: if JAX is not set to 64-bit floats.
     """
@@ -76,7 +83,12 @@ def invert(table: AmplitudeTable, *, frequency_error_khz: float | None = None, t
     rows = _inverted_rows(table, _shared(table, frequency_error_khz))
     laws = regressed_laws(rows)
     law, reference = _reference(truth, laws)
+    resonance = read_on_resonance(table, law=law, reference=reference)
     reasons, warnings = _judged(table, laws)
+    compared = None if fitted is None else compare_law(fitted, table, laws.rows, resonance)
+    if compared is not None:
+        against = "" if compared.agrees else ": it is not the law of these impacts"
+        warnings.append(f"{compared.statement}{against}")
     return Inversion(
         table=table,
         rows=laws.rows,
@@ -85,7 +97,8 @@ def invert(table: AmplitudeTable, *, frequency_error_khz: float | None = None, t
         delay=laws.delay,
         preferred=laws.preferred,
         verdict=laws.verdict,
-        resonance=read_on_resonance(table, law=law, reference=reference),
+        resonance=resonance,
+        fitted=compared,
         valid=not reasons,
         reasons=reasons,
         warnings=warnings,

@@ -15,13 +15,20 @@ import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtrc
 
-from fitting.inversion.result import Coefficient, InvertedRows, RegressedLaw
+from fitting.inversion.result import (
+    Coefficient,
+    ComparedLaw,
+    InvertedRows,
+    RegressedLaw,
+    ResonanceReading,
+    SavedLaw,
+)
 from fitting.parameters import PARAMETERS
 from fitting.tables.csv_text import (
     Column,
@@ -34,6 +41,7 @@ from fitting.tables.csv_text import (
     split_cells,
     split_lines,
 )
+from fitting.tables.table import AmplitudeTable
 
 _PASSES = 25
 _STEP = 1e-30
@@ -327,15 +335,7 @@ def _verdict(laws: dict[str, RegressedLaw]) -> tuple[str | None, str]:
 
 
 _COLUMNS = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us")
-
-
-class SavedLaw(NamedTuple):
-    """A law at some approach speeds: rebound speed in nm/us and delay in us, each of shape (points,)."""
-
-    model: str
-    approach_speed_nm_per_us: Float[np.ndarray, " points"]
-    rebound_speed_nm_per_us: Float[np.ndarray, " points"]
-    collision_delay_us: Float[np.ndarray, " points"]
+DRIVE_COLUMNS = ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")
 
 
 def read_fitted_law(path: str | Path) -> SavedLaw:
@@ -359,7 +359,56 @@ def read_fitted_law(path: str | Path) -> SavedLaw:
     columns = [_numbers(found["law"].get(column)) for column in _COLUMNS]
     if any(column.shape != columns[0].shape or column.size < 2 for column in columns):
         raise TableError(f"{name}: its law lacks {', '.join(_COLUMNS)}; fit again with this version")
-    return SavedLaw(str(found.get("model")), *columns)
+    given = found.get("input")
+    given = given if isinstance(given, dict) else {}
+    drives = [_numbers(given.get(column)) for column in DRIVE_COLUMNS]
+    same_length = len({column.size for column in drives}) == 1
+    return SavedLaw(
+        str(found.get("model")),
+        columns[0],
+        columns[1],
+        columns[2],
+        source=printable(str(given.get("source", ""))),
+        drives=np.stack(drives) if same_length else np.zeros((len(drives), 0)),
+    )
+
+
+def compare_law(fitted: SavedLaw, table: AmplitudeTable, rows: InvertedRows, reading: ResonanceReading) -> ComparedLaw:
+    """Return what a law that was fitted elsewhere has to do with inverted rows.
+
+    Args:
+        fitted: the law.
+        table: what was inverted.
+        rows: its rows.
+        reading: the paper's reading of it, for a table without phases.
+
+    Raises:
+        TableError: if the law was fitted over none of the rows' approach speeds.
+    """
+    u, w, _ = rows.impact[rows.inverted].T
+    reached = u if u.size else reading.approach_speed_nm_per_us
+    known = np.isfinite(fitted.rebound_speed_nm_per_us)
+    speeds, rebounds = fitted.approach_speed_nm_per_us[known], fitted.rebound_speed_nm_per_us[known]
+    if not speeds.size or not np.any((reached >= speeds[0]) & (reached <= speeds[-1])):
+        raise TableError(
+            f"the law {fitted.described} says nothing about {table.source}, whose impacts come at "
+            f"{np.min(reached):.4g} to {np.max(reached):.4g} nm/us; give a fit of these drives"
+        )
+    inside = (u >= speeds[0]) & (u <= speeds[-1])
+    # the loss is all but linear in the speed
+    lost = np.interp(u, speeds, speeds**2 - rebounds**2)
+    apart = w**2 - u**2 + lost
+    slope = np.stack([-2.0 * u, 2.0 * w], axis=1)
+    variance = np.einsum("ni,nij,nj->n", slope, rows.covariance[rows.inverted][:, :2, :2], slope)
+    variance += np.sum(np.einsum("ni,nis->ns", slope, rows.shared[rows.inverted][:, :2]) ** 2, axis=1)
+    pulls = np.abs(apart[inside]) / np.sqrt(variance[inside])
+    here = np.stack([np.asarray(getattr(table, column), float) for column in DRIVE_COLUMNS])
+    return ComparedLaw(
+        law=fitted,
+        same_drives=fitted.drives.shape == here.shape and bool(np.all(fitted.drives == here)),
+        rows_compared=int(inside.sum()),
+        typical_pull=float(np.median(pulls)) if pulls.size else None,
+    )
 
 
 def _numbers(cells: Any) -> Float[np.ndarray, " points"]:

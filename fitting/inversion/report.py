@@ -13,8 +13,7 @@ from matplotlib.figure import Figure
 
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, with_zero_line
 from afm_jax.words import bullets, text_table, with_error
-from fitting.inversion.regression import SavedLaw
-from fitting.inversion.result import Coefficient, Inversion, RegressedLaw
+from fitting.inversion.result import Coefficient, Inversion, RegressedLaw, SavedLaw
 from fitting.parameters import LAWS
 
 ROW_COLUMNS = (
@@ -82,16 +81,13 @@ def _heading(result: Inversion) -> str:
     return "READ ON AN ASSUMPTION: the phase was not measured but assumed, so that the numbers below are no law."
 
 
-def write_inversion(
-    result: Inversion, folder: Path, write_table: Table, *, fitted: SavedLaw | None = None
-) -> list[Path]:
+def write_inversion(result: Inversion, folder: Path, write_table: Table) -> list[Path]:
     """Write invert.txt, invert.json, invert.png, invert.csv and law.csv into a folder.
 
     Args:
         result: the inversion.
         folder: an existing folder; files of these names are replaced.
         write_table: called with a file name, records and columns for the CSV files.
-        fitted: a law that a fit found, drawn over the rows.
 
     Returns:
         The files written here (the tables are `write_table`'s).
@@ -102,7 +98,7 @@ def write_inversion(
     from afm_jax.plots.picture_style import png_of  # noqa: PLC0415
     from fitting.report.report import write_report_files  # noqa: PLC0415
 
-    text, data, picture = inversion_summary(result), result.to_dict(), png_of(inversion_figure(result, fitted=fitted))
+    text, data, picture = inversion_summary(result), result.to_dict(), png_of(inversion_figure(result))
     written = write_report_files(folder, "invert", text=text, data=data, picture=picture)
     write_table("invert.csv", result.records(), ROW_COLUMNS)
     write_table("law.csv", result.law_records(), LAW_COLUMNS)
@@ -190,19 +186,18 @@ _INVALID = "#B00020"
 _SMALL = 9
 
 
-def inversion_figure(result: Inversion, *, fitted: SavedLaw | None = None) -> Figure:
+def inversion_figure(result: Inversion) -> Figure:
     """Return the figure: loss u_in - u_out on the left, collision delay on the right, both against u_in.
 
     Args:
         result: the inversion; without any phase there is no delay to draw.
-        fitted: a law that a fit found, drawn over the rows.
     """
     inverted = bool(result.rows.inverted.any())
     figure = new_figure(11.0 if inverted else 6.5, 5.0)
     axes = figure.subplots(1, 2 if inverted else 1, squeeze=False)[0]
-    _draw_loss(axes[0], result, fitted)
+    _draw_loss(axes[0], result)
     if inverted:
-        _draw_delay(axes[1], result, fitted)
+        _draw_delay(axes[1], result)
     title = result.verdict if inverted else "the paper's reading on resonance: phase assumed, bias "
     if not inverted:
         title += "not known" if result.resonance.reference == "none" else "in invert.txt"
@@ -212,7 +207,7 @@ def inversion_figure(result: Inversion, *, fitted: SavedLaw | None = None) -> Fi
     return figure
 
 
-def _draw_loss(axes: Axes, result: Inversion, fitted: SavedLaw | None) -> None:
+def _draw_loss(axes: Axes, result: Inversion) -> None:
     rows, speeds = result.rows, result.approach_speed_nm_per_us
     for name, law in result.laws.items():
         colour, dashes, symbols = _STYLES[name]
@@ -220,7 +215,8 @@ def _draw_loss(axes: Axes, result: Inversion, fitted: SavedLaw | None) -> None:
         lost = speeds - law.curve
         axes.plot(speeds, lost, dashes, color=colour, lw=1.6, label=label)
         axes.fill_between(speeds, lost - law.curve_error, lost + law.curve_error, color=colour, alpha=0.15, lw=0)
-    if fitted is not None:
+    if result.fitted is not None:
+        fitted = result.fitted.law
         _curve_of_fit(axes, result, fitted, fitted.approach_speed_nm_per_us - fitted.rebound_speed_nm_per_us)
     c = rows.covariance
     error = np.sqrt(np.maximum(c[:, 0, 0] + c[:, 1, 1] - 2.0 * c[:, 0, 1], 0.0))
@@ -250,14 +246,15 @@ def _curve_of_fit(axes: Axes, result: Inversion, fitted: SavedLaw, values: np.nd
     )
 
 
-def _draw_delay(axes: Axes, result: Inversion, fitted: SavedLaw | None) -> None:
+def _draw_delay(axes: Axes, result: Inversion) -> None:
     law, speeds = result.delay, result.approach_speed_nm_per_us
     if law is not None:
         curve, band = _NS_PER_US * law.curve, _NS_PER_US * law.curve_error
         label = f"delay law: $\\chi^2$ {law.chi2:.1f}/{law.degrees_of_freedom}"
         axes.plot(speeds, curve, color=BLUE, lw=1.6, label=label)
         axes.fill_between(speeds, curve - band, curve + band, color=BLUE, alpha=0.15, lw=0)
-    if fitted is not None:
+    if result.fitted is not None:
+        fitted = result.fitted.law
         _curve_of_fit(axes, result, fitted, _NS_PER_US * fitted.collision_delay_us)
     _points(axes, result, _NS_PER_US * result.rows.impact[:, 2], _NS_PER_US * result.rows.errors[:, 2])
     with_zero_line(axes)

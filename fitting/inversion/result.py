@@ -11,7 +11,7 @@ Air damping and the collision delay are left out, and the offset; with them the 
 """
 
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -104,6 +104,8 @@ def read_on_resonance(
     )
 
 
+_APART = 3.0
+"""Standard errors that losses may be from a fitted law in the median (0.67 expected) before it counts as another's."""
 FORMAT_VERSION = 1
 """Version of the JSON layout; raised when a key changes its meaning or goes."""
 
@@ -182,6 +184,72 @@ class RegressedLaw:
     curve_error: Float[np.ndarray, " points"]
 
 
+class SavedLaw(NamedTuple):
+    """A fitted law read back: rebound speed in nm/us and delay in us at approach speeds, and what it was fitted to.
+
+    ``drives`` are order, drive frequency (kHz), drive amplitude and offset (nm) of the fitted rows, of shape (4, rows).
+    """
+
+    model: str
+    approach_speed_nm_per_us: Float[np.ndarray, " points"]
+    rebound_speed_nm_per_us: Float[np.ndarray, " points"]
+    collision_delay_us: Float[np.ndarray, " points"]
+    source: str
+    drives: Float[np.ndarray, "4 rows"]
+
+    @property
+    def described(self) -> str:
+        """What was fitted to what, over which speeds."""
+        known = self.approach_speed_nm_per_us[np.isfinite(self.rebound_speed_nm_per_us)]
+        over = f"over {known.min():.4g} to {known.max():.4g} nm/us" if known.size else "over no speed"
+        return f"{self.model} fitted to {self.source or 'a table without a name'} {over}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparedLaw:
+    """A law that was fitted elsewhere, beside inverted rows.
+
+    Attributes:
+        law: the law.
+        same_drives: whether it was fitted to these very drives.
+        rows_compared: inverted rows within the speeds that it was fitted over.
+        typical_pull: median distance of their loss from the law's, in standard errors; None without such rows.
+    """
+
+    law: SavedLaw
+    same_drives: bool
+    rows_compared: int
+    typical_pull: float | None
+
+    @property
+    def agrees(self) -> bool:
+        """Whether rows and law are apart by no more than noise explains."""
+        return self.typical_pull is None or self.typical_pull <= _APART
+
+    @property
+    def statement(self) -> str:
+        """What a reader should know of the law beside the rows."""
+        drives = "" if self.same_drives else ", other drives than these"
+        far = ""
+        if self.typical_pull is not None:
+            far = (
+                f"; the losses of the {self.rows_compared} rows within these speeds are {self.typical_pull:.2g} "
+                "standard errors from it in the median"
+            )
+        return f"the law beside the rows is {self.law.described}{drives}{far}"
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return what the JSON says of it."""
+        return {
+            "model": self.law.model,
+            "source": self.law.source,
+            "same_drives": self.same_drives,
+            "rows_compared": self.rows_compared,
+            "median_distance_in_errors": self.typical_pull,
+            "agrees": self.agrees,
+        }
+
+
 @dataclass(frozen=True, kw_only=True)
 class Inversion:
     """The outcome of `invert`.
@@ -195,6 +263,7 @@ class Inversion:
         preferred: the model that chi2 prefers, or None where it does not tell.
         verdict: the same in words.
         resonance: the paper's own reading of the rows on resonance.
+        fitted: a law that was fitted elsewhere, if one was given.
         valid: whether rows determine what is asked; `reasons` say why not.
         reasons: what makes the result invalid.
         warnings: what a reader should know besides.
@@ -209,6 +278,7 @@ class Inversion:
     preferred: str | None
     verdict: str
     resonance: ResonanceReading
+    fitted: ComparedLaw | None
     valid: bool
     reasons: list[str]
     warnings: list[str]
@@ -269,6 +339,7 @@ class Inversion:
             "law": law,
             "delay": None if self.delay is None else asdict(self.delay),
             "resonance": asdict(self.resonance),
+            "fitted_law": None if self.fitted is None else self.fitted.to_dict(),
             "input": {name: value for name, value in vars(self.table).items() if value is not None},
             "versions": self.versions,
         }

@@ -28,6 +28,7 @@ from fitting.report.words import (
     has_delay,
     interval_in_words,
     law_points,
+    losses_in_words,
     remarks_on,
     rounded_values,
     value_in_words,
@@ -125,6 +126,7 @@ def fit_page(
         compared=None if comparison is None else _compared(comparison),
         pictures=_pictures(result, pictures),
         points=_points(result),
+        losses=_losses(result),
         parameters=_parameters(result),
         goodness=_goodness(result),
         correlations=_correlations(result),
@@ -173,11 +175,20 @@ def _pictures(result: FitResult, files: Sequence[bytes]) -> list[dict[str, str]]
         "Amplitudes of each row, measured and predicted; below, how far apart they are in standard errors.",
         law if result.valid else f"{law} Not a measurement: see the verdict.",
         "What is left of each amplitude over the approach speed, in standard errors: a wrong law leaves a curve here.",
-    )
+        "The energy that an impact takes over the approach speed, with its 95 % band; dashed, the closest paper's law.",
+    )[: len(files)]
     return [
         {"source": f"data:image/png;base64,{base64.b64encode(file).decode('ascii')}", "shows": words}
         for file, words in zip(files, shows, strict=True)
     ]
+
+
+def _losses(result: FitResult) -> Table | None:
+    rows = losses_in_words(result)
+    if not (result.valid and rows):
+        return None
+    cells = [[_in_signs(cell) for cell in row] for row in rows]
+    return Table("What an impact takes", ["quantity", "value (95 % interval)"], cells, words=("value (95 % interval)",))
 
 
 def _points(result: FitResult) -> Table | None:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from afm_jax.whole_files import write_whole
 from afm_jax.words import bullets, known, text_table
 from fitting.fits.result import FitResult, FittedParameter
 from fitting.report.words import (
@@ -15,6 +16,7 @@ from fitting.report.words import (
     band_in_words,
     formulas,
     interval_in_words,
+    losses_in_words,
     rows_in_words,
     value_in_words,
 )
@@ -57,7 +59,7 @@ def summary(result: FitResult) -> str:
     parameters = [_parameter_cells(name, parameter) for name, parameter in result.parameters.items()]
     lines = [
         f"Impact law of {result.table.source} ({rows_in_words(result.table.rows)}), model {result.model}:",
-        *(f"  {formula}" for formula in formulas(result.model)),
+        *(f"  {formula}" for formula in formulas(result)),
         "",
         "VALID" if result.valid else "NOT VALID: the numbers below are not a measurement of the law.",
         *(f"  - {reason}" for reason in result.reasons),
@@ -67,6 +69,7 @@ def summary(result: FitResult) -> str:
         f"  {band_in_words(result)}",
         _goodness_line(result),
         *_correlation_lines(result),
+        *_loss_lines(result),
         *bullets("Notes:", result.warnings),
     ]
     return "\n".join(lines)
@@ -83,6 +86,11 @@ def _goodness_line(result: FitResult) -> str:
     probability = f", probability {result.p_value:.2g}" if np.isfinite(result.p_value) else ""
     goodness = f"chi2/dof = {result.chi2:.1f}/{result.degrees_of_freedom}{probability}"
     return f"  {goodness}, AIC {result.aic:.1f}, BIC {result.bic:.1f}"
+
+
+def _loss_lines(result: FitResult) -> list[str]:
+    rows = losses_in_words(result) if result.valid else []
+    return ["", *text_table(["what an impact takes", "95 % interval"], rows, words=(0, 1))] if rows else []
 
 
 def _correlation_lines(result: FitResult) -> list[str]:
@@ -154,7 +162,7 @@ def write_report(
     pictures = fit_pictures(result)
     page = folder / "fit.html"
     markup = fit_page(result, pictures, comparison=comparison, bootstrap=bootstrap, posterior=posterior)
-    page.write_text(markup, encoding="utf-8", newline="\n")
+    write_whole(page, markup)
     picture = one_below_the_other(pictures)
     others = write_report_files(folder, "fit", text=summary(result), data=result.to_dict(), picture=picture)
     write_table("fit_rows.csv", row_records(result), ROW_COLUMNS)
@@ -176,8 +184,7 @@ def write_report_files(folder: Path, name: str, *, text: str, data: dict[str, An
         OSError: if a file cannot be written.
     """
     paths = [folder / f"{name}.{ending}" for ending in ("txt", "json", "png")]
-    # a path that is no valid text must not cost the report
-    paths[0].write_text(text + "\n", encoding="utf-8", errors="backslashreplace")
-    paths[1].write_text(json.dumps(data, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    paths[2].write_bytes(picture)
+    write_whole(paths[0], text + "\n")
+    write_whole(paths[1], json.dumps(data, indent=1, allow_nan=False) + "\n")
+    write_whole(paths[2], picture)
     return paths

@@ -92,6 +92,10 @@ class Faults:
         raise TableError(message)
 
 
+LARGEST = 1e9
+"""Size of any number in a table: a length of a metre, a frequency of a terahertz."""
+
+
 def printable(text: str) -> str:
     """Return a text that fits on one line of a message: escaped where it holds line breaks or control characters."""
     return text if text.isprintable() else repr(text)
@@ -314,6 +318,8 @@ def fault_in_number(setting: FileSetting, value: float, error: float | None = No
     if not setting.lowest < value < float("inf"):
         above = "" if setting.lowest == float("-inf") else f" and above {setting.lowest:g}"
         return f"must be finite{above}, but is {value!r}; correct it"
+    if abs(value) > LARGEST:
+        return f"must be at most {LARGEST:g} in size, but is {value!r}; correct it"
     if error is not None and not 0.0 < error < float("inf"):
         return f"has the error {error!r}; it must be finite and above 0, or left out"
     return None

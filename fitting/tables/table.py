@@ -26,7 +26,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from afm_jax.whole_files import write_whole
 from fitting.tables.csv_text import (
+    LARGEST,
     Column,
     Columns,
     Faults,
@@ -208,13 +210,14 @@ def check_rows(
 def _check_numbers(
     column: Column, values: Float[np.ndarray, " rows"], lines: Int[np.ndarray, " rows"], faults: Faults
 ) -> Bool[np.ndarray, " rows"]:
-    bad = np.isinf(values)
+    # a whole number only has to survive the way through 64-bit floats
+    large = np.isfinite(values) & (np.abs(values) > (np.inf if column.integer else LARGEST))
+    bad = np.isinf(values) | large
     what = "must be finite"
     if column.positive:
         bad |= values <= 0.0
         what = "must be finite and above 0"
     if column.integer:
-        # Larger numbers would not survive the way through 64-bit floats.
         bad |= (values != np.floor(values)) | (values >= 2**53)
         bad &= ~np.isnan(values)
         what = "must be a positive whole number (1, 2, 3, ...)"
@@ -223,7 +226,8 @@ def _check_numbers(
         what = "must be 1 (no steady orbit was seen) or 0"
     for row in np.flatnonzero(bad):
         number = repr(float(values[row])).removesuffix(".0")
-        faults.add(f"{what}, but is {number}; correct it{_or_blank(column)}", line=int(lines[row]), column=column.name)
+        must = f"must be at most {LARGEST:g} in size" if large[row] else what
+        faults.add(f"{must}, but is {number}; correct it{_or_blank(column)}", line=int(lines[row]), column=column.name)
     return bad
 
 
@@ -432,7 +436,6 @@ def write_table(table: AmplitudeTable, path: str | Path) -> None:
     cells = [["" if value != value else repr(value) for value in column.tolist()] for column in columns.values()]  # noqa: PLR0124
     lines += [",".join(row) for row in zip(*cells, strict=True)]
     try:
-        Path(path).write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
-    except (OSError, UnicodeEncodeError) as error_met:
-        reason = getattr(error_met, "strerror", None) or str(error_met)
-        raise TableError(f"{printable(str(path))}: cannot be written ({reason}); choose another path") from error_met
+        write_whole(path, "\n".join(lines) + "\n")
+    except OSError as error_met:
+        raise TableError(f"{printable(str(path))}: {error_met.strerror}; choose another path") from error_met

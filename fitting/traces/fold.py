@@ -106,6 +106,7 @@ def _polynomial(coefficients: Complex[np.ndarray, " k"], angle: Float[np.ndarray
     return total
 
 
+_ROUNDING = 1e-12
 SCATTER_PERIODS = 12
 """With fewer response periods their scatter says less of the noise than all samples' together."""
 
@@ -150,6 +151,11 @@ class Fold:
     def spread_nm(self) -> float:
         """Standard deviation of the heights."""
         return float(np.std(self.height))
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether the heights differ by no more than rounding."""
+        return self.spread_nm <= _ROUNDING * float(np.max(np.abs(self.height)))
 
     def per_cycle(self, values: Complex[np.ndarray, " samples"]) -> Complex[np.ndarray, " cycles"]:
         """Return the sums of complex values over each response period."""
@@ -250,7 +256,7 @@ def find_order(trace: Trace) -> OrderSearch:
     Args:
         trace: at least two drive periods of it.
     """
-    turns, height = _shortened(trace)
+    turns, height = shortened(trace)
     spread = float(np.std(height))
     most = min(HIGHEST_ORDER, int(trace.drive_periods / 2.0 + 1e-9))
     band = _harmonics_per_period(turns, most)
@@ -261,7 +267,7 @@ def find_order(trace: Trace) -> OrderSearch:
     return OrderSearch(order, np.sqrt(squares), spread)
 
 
-def _shortened(trace: Trace) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+def shortened(trace: Trace) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return drive phases (in turns) and heights, averaged over neighbours and cut where there are too many."""
     per_period = trace.drive_period_us / trace.step_us
     join = max(1, int(per_period / _SAMPLES_PER_PERIOD))

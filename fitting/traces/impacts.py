@@ -3,14 +3,18 @@
 The peak height of a folded trace: a polynomial through the samples around the top, or a parabola through few.
 
 Whether a trace repeats: what its response periods do beyond the noise, and whether they drift.
+
+Whether a trace that does not is a tip that rings down freely.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from scipy.optimize import least_squares
 
-from fitting.traces.fold import Fold
+from fitting.traces.fold import Fold, shortened
+from fitting.traces.trace import Trace
 
 _WINDOWS = (0.03, 0.1)
 """Of the free period: length of the two stretches whose flights are compared; the short one where noise allows."""
@@ -140,12 +144,13 @@ def _tops(jump: Float[np.ndarray, " bins"], across: int) -> list[int]:
 
 _GRID = 2048
 _TOP = 0.6
-"""Share of the peak above which a flight is fitted: a cosine's first 53 degrees, of which a quartic misses 3e-5."""
-_QUARTIC_MISSES = 3e-5
+"""Share of the peak above which a flight is fitted: a cosine's first 53 degrees."""
+_MISSES = {4: 3e-5, 6: 3e-7}
+"""What polynomials miss of the top of that cosine, by their degree."""
 _REACH = 0.35
 """Of the response period: longest stretch to each side of the top."""
-_ENOUGH = 10
-"""Distinct phases for a quartic; with fewer a parabola through the nearest three."""
+_ENOUGH = {4: 10, 6: 14}
+"""Distinct phases for polynomials by their degree; with fewer a parabola through the nearest three."""
 
 
 class Peak(NamedTuple):
@@ -183,8 +188,11 @@ def find_peak(folded: Fold) -> Peak:
     before, after = (_reach(np.roll(shape, -top), direction) for direction in (-1, 1))
     offset = np.mod(folded.angle / (2.0 * np.pi) - turns[top] + 0.5, 1.0) - 0.5
     inside = (offset >= -before) & (offset <= after)
-    if _distinct(offset[inside], folded.resolution) >= _ENOUGH:
-        return _vertex(folded, turns[top], offset, inside, 4)
+    phases = _distinct(offset[inside], folded.resolution)
+    peaks = [_vertex(folded, turns[top], offset, inside, degree) for degree in _MISSES if phases >= _ENOUGH[degree]]
+    if peaks:
+        # a higher degree misses less and follows the noise more
+        return min(peaks, key=lambda peak: float(np.hypot(peak.error_nm, peak.sampling_error_nm)))
     # of phases 1/resolution apart three lie within 1.5 of these steps, wherever the top is
     return _vertex(folded, turns[top], offset, np.abs(offset) <= 1.500001 / folded.resolution, 2)
 
@@ -220,7 +228,7 @@ def _vertex(folded: Fold, top: float, offset: Float[np.ndarray, " samples"], ins
     frequency = 1e3 * np.sqrt(-bend_us / height) / (2.0 * np.pi) if bend_us < 0.0 < height else None
     spacing = folded.period_us / folded.resolution
     # at its top cos between three points h apart is off by at most h^4/45, between four by less than h^4/20
-    off = _QUARTIC_MISSES * abs(height) if degree > 2 else bend_us**2 / max(abs(height), 1e-300) * spacing**4 / 20.0
+    off = _MISSES[degree] * abs(height) if degree > 2 else bend_us**2 / max(abs(height), 1e-300) * spacing**4 / 20.0
     place = float(np.mod(top + at * scale, 1.0))
     return Peak(height, folded.error_of(weights), float(off), place, weights, frequency)
 
@@ -286,7 +294,7 @@ def _excess(folded: Fold) -> float:
     # the scatter of J periods' lines is itself uncertain by 1/sqrt(J (N + 1))
     sure = 1.0 + 4.0 / np.sqrt(folded.cycles * (folded.order + 1))
     beyond = total - expected
-    return float(np.sqrt(beyond) / max(folded.spread_nm, 1e-300)) if total > expected * sure else 0.0
+    return float(np.sqrt(beyond) / folded.spread_nm) if total > expected * sure and not folded.is_constant else 0.0
 
 
 def _trend(values: np.ndarray, index: Float[np.ndarray, " cycles"]) -> tuple[float, float]:
@@ -320,3 +328,59 @@ def _running_phase(folded: Fold) -> float | None:
         12.0
     )
     return float(np.degrees(slope)) if runs else None
+
+
+_UNEXPLAINED = 0.05
+"""Share of the standard deviation that a free vibration may leave beyond white noise."""
+_OTHER = 0.1
+"""Share by which a free vibration may differ from the given free frequency."""
+_QUALITIES = (2.0, 5.0, 15.0, 50.0, 200.0, 1e3, 1e5)
+"""Where the search for a decay begins."""
+_STEADY = 1e5
+"""Quality factor from which on no decay is seen."""
+
+
+class Ringing(NamedTuple):
+    """A free vibration, a exp(-Omega t/2Q) cos(Omega' t + phi), beside what the drive moves without an impact."""
+
+    frequency_khz: float
+    quality_factor: float
+    """Infinite where no decay is seen."""
+
+
+def find_ringing(trace: Trace) -> Ringing | None:
+    """Return the free vibration that a trace is, beside a sine of the drive's frequency; None if it is something else.
+
+    Amplitudes and phases follow by linear least squares from frequency and decay, which are searched from the spectrum.
+
+    Args:
+        trace: any samples.
+    """
+    turns, height = shortened(trace)
+    time = turns * trace.drive_period_us
+    since, span = time - time[0], float(time[-1] - time[0])
+    driven = np.stack([np.ones_like(turns), np.cos(2.0 * np.pi * turns), np.sin(2.0 * np.pi * turns)], axis=1)
+
+    def left(shape: Float[np.ndarray, " 2"]) -> Float[np.ndarray, " n"]:
+        omega, decay = shape
+        fade = np.exp(-abs(decay) * since)
+        design = np.column_stack([driven, fade * np.cos(omega * since), fade * np.sin(omega * since)])
+        return height - design @ np.linalg.lstsq(design, height, rcond=None)[0]
+
+    rest = height - driven @ np.linalg.lstsq(driven, height, rcond=None)[0]
+    spectrum = np.abs(np.fft.rfft(rest, 4 * len(rest)))
+    omega = 2.0 * np.pi * max(int(np.argmax(spectrum)), 1) / (4 * len(rest) * float(since[1]))
+    starts = [np.array([omega, 0.5 * omega / quality]) for quality in _QUALITIES]
+    start = min(starts, key=lambda shape: float(np.sum(left(shape) ** 2)))
+    best = least_squares(left, start, x_scale=np.array([1.0 / span, 1.0 / span]), max_nfev=40)
+    omega, decay = float(best.x[0]), abs(float(best.x[1]))
+    third = np.median(np.abs(np.diff(height, 3))) / 0.6745 / np.sqrt(20.0)
+    missed = 2.0 * best.cost / len(height) - float(third) ** 2
+    if missed > (_UNEXPLAINED * float(np.std(height))) ** 2:
+        return None
+    given = trace.settings.free_frequency_khz
+    frequency = 1e3 * np.hypot(omega, decay) / (2.0 * np.pi)
+    if given is not None and abs(frequency / given - 1.0) > _OTHER:
+        return None
+    quality = 0.5 * np.hypot(omega, decay) / max(decay, 1e-300)
+    return Ringing(float(frequency), float(quality) if quality < _STEADY else float("inf"))

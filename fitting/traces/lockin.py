@@ -14,7 +14,15 @@ import numpy as np
 
 from fitting.tables.table import AmplitudeTable
 from fitting.traces.fold import Fold, OrderSearch, Reference, find_order, find_reference, fold, sampling_error_nm
-from fitting.traces.impacts import ImpactCount, Peak, Steadiness, count_impacts, find_peak, look_at_periods
+from fitting.traces.impacts import (
+    ImpactCount,
+    Peak,
+    Steadiness,
+    count_impacts,
+    find_peak,
+    find_ringing,
+    look_at_periods,
+)
 from fitting.traces.trace import TableError, Trace
 from fitting.traces.verdict import TraceEvidence, TraceKind, is_flightless, judge
 
@@ -96,7 +104,7 @@ class LockinResult:
         return {"source": trace.source} | plain
 
 
-_UNREPEATED = (TraceKind.NOT_PERIODIC, TraceKind.NO_RESPONSE)
+_UNREPEATED = (TraceKind.NOT_PERIODIC, TraceKind.NO_RESPONSE, TraceKind.RINGING)
 _UNCOUNTED = (*_UNREPEATED, TraceKind.DRIFTING)
 _OTHER_FREQUENCY = 0.1
 """Share by which the bending at the top may contradict the given free frequency."""
@@ -131,7 +139,8 @@ def lockin(trace: Trace, *, order: int | None = None) -> LockinResult:
     impacts = _impacts(trace, folded, peak, frequency)
     periods = look_at_periods(folded, peak)
     count = 0 if impacts is None else impacts.impacts or 0
-    verdict = judge(TraceEvidence(trace.settings, search, folded, peak, periods, impacts, order))
+    ringing = find_ringing(trace) if periods.excess > 0.0 or periods.lockin_drift > 0.0 else None
+    verdict = judge(TraceEvidence(trace.settings, search, folded, peak, periods, impacts, order, ringing))
     readings = _Readings(folded, peak, reference)
     repeats = verdict.kind not in _UNREPEATED
     phase, phase_error = readings.phase()
@@ -263,17 +272,39 @@ def _warnings(
 _SHARED = ("free_frequency_khz", "quality_factor", "quality_factor_error", "mass_ng")
 
 
-def table_of(results: Sequence[LockinResult]) -> AmplitudeTable:
-    """Return the table of the steady readings, a row each, in the order of drive frequency within each order.
+class _Row(NamedTuple):
+    """A row of the amplitude table; NaN where something is not known."""
 
-    The phase is left out where its reference was taken for granted.
+    order: int
+    drive_frequency_khz: float
+    drive_amplitude_nm: float
+    offset_nm: float
+    peak_amplitude_nm: float
+    peak_amplitude_error_nm: float
+    lockin_amplitude_nm: float
+    lockin_amplitude_error_nm: float
+    phase_deg: float
+    phase_error_deg: float
+
+
+_READ = (("peak_amplitude_nm", "peak_amplitude_error_nm"), ("lockin_amplitude_nm", "lockin_amplitude_error_nm"))
+_AGREE = 4.0
+"""Standard errors by which readings of one drive may differ from their mean."""
+
+
+def table_of(results: Sequence[LockinResult]) -> AmplitudeTable:
+    """Return the table of the steady readings, a row for each drive, in the order of drive frequency and order.
+
+    The phase is left out where its reference was taken for granted. Several readings of one drive are averaged, with
+    the error of the best one, as errors of sampling do not average; where they contradict each other, as on two orbits
+    of one drive, all of them are left out. Both is said in the table's remarks.
 
     Args:
         results: of traces of one cantilever; those that are not steady are left out.
 
     Raises:
-        TableError: if none is steady, drive amplitude, offset or free frequency of one is not known, the cantilevers
-            differ, or two traces have the same order, drive and offset.
+        TableError: if there is no row, drive amplitude, offset or free frequency of one is not known, or the
+            cantilevers differ.
     """
     steady = [result for result in results if result.steady]
     if not steady:
@@ -281,29 +312,82 @@ def table_of(results: Sequence[LockinResult]) -> AmplitudeTable:
     for result in steady:
         _check_known(result)
     shared = _cantilever(steady)
-    steady.sort(key=lambda result: (result.order or 0, result.trace.drive_frequency_khz))
-    _check_no_repetition(steady)
-    phases = np.array([_or_nan(r.phase_deg if r.phase_reference != "time zero" else None) for r in steady])
-    known = np.isfinite(phases)
-    errors = np.where(known, [_or_nan(r.phase_error_deg) for r in steady], np.nan)
+    drives: dict[tuple[float, ...], dict[_Row, str]] = {}
+    for result in steady:
+        row = _row_of(result)
+        same = drives.setdefault((row.order, round(row.drive_frequency_khz, 9), *row[2:4]), {})
+        # a trace that is given twice is one measurement
+        same.setdefault(row, result.trace.source)
+    remarks: list[str] = []
+    joined = [_joined(same, remarks) for _, same in sorted(drives.items(), key=lambda item: item[0])]
+    rows = [row for row in joined if row is not None]
+    if not rows:
+        raise TableError(f"amplitudes.csv: there is no row: {'; '.join(remarks)}")
+    columns: dict[str, Any] = {
+        name: np.array(list(column)) for name, column in zip(_Row._fields, np.array(rows, dtype=object).T, strict=True)
+    }
+    if not np.isfinite(columns["phase_deg"]).any():
+        columns |= {"phase_deg": None, "phase_error_deg": None}
     return AmplitudeTable(
-        order=np.array([r.order or 0 for r in steady], dtype=np.int64),
-        drive_frequency_khz=np.array([r.trace.drive_frequency_khz for r in steady]),
-        drive_amplitude_nm=np.array([_or_nan(r.drive_amplitude_nm) for r in steady]),
-        offset_nm=np.array([_or_nan(r.offset_nm) for r in steady]),
-        peak_amplitude_nm=np.array([_or_nan(r.peak_amplitude_nm) for r in steady]),
-        peak_amplitude_error_nm=np.array([_or_nan(r.peak_amplitude_error_nm) for r in steady]),
-        lockin_amplitude_nm=np.array([_or_nan(r.lockin_amplitude_nm) for r in steady]),
-        lockin_amplitude_error_nm=np.array([_or_nan(r.lockin_amplitude_error_nm) for r in steady]),
-        phase_deg=phases if known.any() else None,
-        phase_error_deg=errors if known.any() else None,
+        **columns,
         free_frequency_khz=_or_nan(shared["free_frequency_khz"]),
         quality_factor=shared["quality_factor"],
         quality_factor_error=shared["quality_factor_error"],
         mass_ng=1.0 if shared["mass_ng"] is None else shared["mass_ng"],
         source="amplitudes.csv",
-        remarks=("read from time traces by afm-jax lockin",),
+        remarks=("read from time traces by afm-jax lockin", *remarks),
     )
+
+
+def _row_of(result: LockinResult) -> _Row:
+    read = {name: _or_nan(getattr(result, name)) for names in _READ for name in names}
+    phase = result.phase_deg if result.phase_reference != "time zero" else None
+    return _Row(
+        order=result.order or 0,
+        drive_frequency_khz=result.trace.drive_frequency_khz,
+        drive_amplitude_nm=_or_nan(result.drive_amplitude_nm),
+        offset_nm=_or_nan(result.offset_nm),
+        phase_deg=_or_nan(phase),
+        phase_error_deg=_or_nan(None if phase is None else result.phase_error_deg),
+        **read,
+    )
+
+
+def _joined(same: dict[_Row, str], remarks: list[str]) -> _Row | None:
+    """Return the mean of readings of one drive; None where they contradict each other.
+
+    Args:
+        same: the rows, and the file of each.
+        remarks: takes what is to be said of it.
+    """
+    first, *others = rows = list(same)
+    if not others:
+        return first
+    means: dict[str, float] = {}
+    pulls = [0.0]
+    for name, error_name in (*_READ, ("phase_deg", "phase_error_deg")):
+        turn = 360.0 / first.order if name == "phase_deg" else np.inf
+        known = [row for row in rows if np.isfinite(getattr(row, name))]
+        if not known:
+            continue
+        base = getattr(known[0], name)
+        apart = np.array([_wrapped(getattr(row, name) - base, turn) for row in known])
+        error = np.array([getattr(row, error_name) for row in known])
+        mean = float(np.average(apart, weights=error**-2.0))
+        pulls.extend(np.abs(apart - mean) / error)
+        means |= {name: float(np.mod(base + mean, turn)), error_name: float(error.min())}
+    names = ", ".join(same.values())
+    if max(pulls) > _AGREE:
+        remarks.append(
+            f"{names} are of one drive and contradict each other by {max(pulls):.2g} standard errors: left out"
+        )
+        return None
+    remarks.append(f"{names} are of one drive: one row, their mean")
+    return first._replace(**means)
+
+
+def _wrapped(value: float, turn: float) -> float:
+    return value - turn * round(value / turn) if np.isfinite(turn) else value
 
 
 def _or_nan(value: float | None) -> float:
@@ -317,19 +401,6 @@ def _check_known(result: LockinResult) -> None:
             mend = f"give --{name.replace('_', '-')} or a comment '# {name} = 1'"
             raise TableError(
                 f"{result.trace.source}: {name} is not known, so that it cannot enter the amplitude table; {mend}"
-            )
-
-
-def _check_no_repetition(steady: Sequence[LockinResult]) -> None:
-    first: dict[tuple[float | None, ...], str] = {}
-    for result in steady:
-        frequency = round(result.trace.drive_frequency_khz, 9)
-        drive = (result.order, frequency, result.drive_amplitude_nm, result.offset_nm)
-        other = first.setdefault(drive, result.trace.source)
-        if other != result.trace.source:
-            raise TableError(
-                f"{result.trace.source}: repeats the drive of {other} (same order, frequency, amplitude and offset), "
-                "and a table has one row for each; leave one of the two out"
             )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save
+from afm_jax.whole_files import write_whole
 from afm_jax.words import with_error
 from fitting.tables.csv_text import printable
 from fitting.tables.table import AmplitudeTable, write_table
@@ -74,7 +75,7 @@ def write_lockin(
     """
     data = folder / "lockin.json"
     text = json.dumps(lockin_payload(results, table_fault), indent=1, allow_nan=False)
-    data.write_text(text + "\n", encoding="utf-8")
+    write_whole(data, text + "\n")
     written = [data]
     for name, result in zip(_picture_names(results), results, strict=True):
         draw_lockin(result, folder / name)

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from fitting.traces.fold import Fold, OrderSearch
-from fitting.traces.impacts import ImpactCount, Peak, Steadiness
+from fitting.traces.impacts import ImpactCount, Peak, Ringing, Steadiness
 from fitting.traces.trace import TraceSettings
 
 _BROADBAND = 0.03
@@ -37,6 +37,7 @@ class TraceKind(enum.StrEnum):
     DRIFTING = "drifting"
     STUCK = "stuck"
     NO_RESPONSE = "no_response"
+    RINGING = "ringing"
     OTHER_ORDER = "other_order"
     UPSIDE_DOWN = "upside_down"
 
@@ -58,11 +59,12 @@ class TraceEvidence(NamedTuple):
     steadiness: Steadiness
     impacts: ImpactCount | None
     order: int | None
+    ringing: Ringing | None = None
 
 
 def judge(evidence: TraceEvidence) -> TraceVerdict:
     """Return what a trace shows: the first of the findings below that applies."""
-    first = (_without_flight, _not_repeating, _upside_down, _drifting)
+    first = (_constant, _without_flight, _ringing, _not_repeating, _upside_down, _drifting)
     for finding in (*first, _not_counted, _not_one_impact, _of_other_order):
         verdict = finding(evidence)
         if verdict is not None:
@@ -105,6 +107,22 @@ def is_flightless(folded: Fold, settings: TraceSettings) -> TraceVerdict | None:
             TraceKind.STUCK, f"{sine}, whose amplitude is {given:.4g} nm: the tip is stuck to the platform"
         )
     return TraceVerdict(TraceKind.NO_IMPACT, f"{sine}, whose amplitude is {given:.4g} nm: no free flight, no impact")
+
+
+def _constant(evidence: TraceEvidence) -> TraceVerdict | None:
+    if not evidence.folded.is_constant:
+        return None
+    height = float(evidence.folded.height[0])
+    return TraceVerdict(TraceKind.NO_RESPONSE, f"no response: the deflection is {height:.4g} nm throughout")
+
+
+def _ringing(evidence: TraceEvidence) -> TraceVerdict | None:
+    found = evidence.ringing
+    if found is None:
+        return None
+    fades = "without a decay" if np.isinf(found.quality_factor) else f"decaying with Q = {found.quality_factor:.3g}"
+    what = f"a free vibration of {found.frequency_khz:.5g} kHz {fades}, beside the drive's frequency"
+    return TraceVerdict(TraceKind.RINGING, f"{what}: the tip rings, nothing touches it")
 
 
 def _without_flight(evidence: TraceEvidence) -> TraceVerdict | None:

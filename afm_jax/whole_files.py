@@ -1,0 +1,39 @@
+"""Files that appear whole or not at all: what every command writes goes through here."""
+
+import os
+import secrets
+from pathlib import Path
+
+
+def write_whole(path: str | os.PathLike[str], content: str | bytes) -> None:
+    """Write a file whole or not at all: beside its place, and then there in one step; one that was there is replaced.
+
+    A device or a pipe is written to as it is.
+
+    Args:
+        path: of the file.
+        content: bytes, or a text to be encoded as UTF-8; what no encoding has, as in names of files, is escaped.
+
+    Raises:
+        OSError: naming the file, if it cannot be written; what was there before is still there.
+    """
+    place = Path(path)
+    data = content if isinstance(content, bytes) else content.encode("utf-8", errors="backslashreplace")
+    # through links: the file that is meant is replaced, not the link to it
+    target = Path(os.path.realpath(place))
+    try:
+        if target.exists() and not target.is_file():
+            target.write_bytes(data)
+            return
+        fresh = target.with_name(f".{target.name[:100]}.{secrets.token_hex(4)}.part")
+        try:
+            with fresh.open("xb") as file:
+                file.write(data)
+                file.flush()
+                os.fsync(file.fileno())
+            fresh.replace(target)
+        except BaseException:
+            fresh.unlink(missing_ok=True)
+            raise
+    except OSError as error:
+        raise OSError(error.errno, f"cannot be written ({error.strerror})", str(place)) from error

@@ -1,0 +1,155 @@
+"""What hard use broke once: full disks, closed streams, hostile names, interrupts, numbers out of all proportion."""
+
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from afm_jax.apparatus.platform import Platform
+from afm_jax.cli.main import main
+from afm_jax.whole_files import write_whole
+from fitting.tables.table import TableError, read_table
+from tests.test_imports import LIBRARY, ROOT
+
+LAW = "[cantilever]\nfrequency_khz = 90\nquality_factor = 40\n[platform]\namplitude_nm = {}\nreduced_frequency = {}\n"
+LAW += "[interaction]\nmodel = 'law'\nr = 0.95\nepsilon = 60\n"
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def test_a_file_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch):
+    path = tmp_path / "fit.txt"
+    write_whole(path, "first\n")
+    write_whole(path, "sécond\n")
+    assert path.read_bytes() == "sécond\n".encode()
+
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match=r"cannot be written \(No space left on device\).*fit\.txt"):
+        write_whole(path, "third\n")
+    assert path.read_bytes() == "sécond\n".encode()
+    assert [file.name for file in tmp_path.iterdir()] == ["fit.txt"]
+
+
+def test_new_files_have_the_modes_of_others_and_links_are_followed(tmp_path):
+    path, link, other = tmp_path / "a", tmp_path / "link", tmp_path / "other"
+    write_whole(path, b"a")
+    other.touch()
+    assert path.stat().st_mode == other.stat().st_mode
+    link.symlink_to(path)
+    write_whole(link, b"b")
+    assert link.is_symlink()
+    assert path.read_bytes() == b"b"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+def test_a_full_device_is_named():
+    with pytest.raises(OSError, match="/dev/full"):
+        write_whole("/dev/full", "x")
+
+
+def test_nothing_writes_files_another_way():
+    other = re.compile(r"\.write_text\(|\.write_bytes\(|\.savefig\((?!buffer)|open\([^)]*[\"']w")
+    found = {str(path) for path in LIBRARY if other.search((ROOT / path).read_text(encoding="utf-8"))}
+    # the writer itself, and a standard error that is closed
+    assert found == {"afm_jax/whole_files.py", "afm_jax/cli/main.py"}
+
+
+def test_names_cannot_command_the_terminal(tmp_path):
+    path = tmp_path / "a\x1b[31m\x07b.csv"
+    path.write_text("order\n1\n", encoding="utf-8")
+    for command in ("fit", "lockin"):
+        result = run(command, path)
+        assert result.exit_code == 2
+        assert "a\\x1b[31m\\x07b.csv" in result.stderr
+        assert "\x1b" not in result.output
+    assert "\x1b" not in run("fit", tmp_path / "none\x1b.csv").output
+
+
+def test_a_closed_standard_output_is_said():
+    call = f"exec {sys.executable} -m afm_jax --version "
+    closed, silent = (
+        subprocess.run(call + end, shell=True, cwd=ROOT, capture_output=True, text=True, check=False)  # noqa: S602
+        for end in (">&-", "2>&-")
+    )
+    assert closed.returncode == 2
+    assert closed.stderr == "afm-jax: standard output is closed; send it to a file or to /dev/null instead\n"
+    assert (silent.returncode, silent.stdout[:8]) == (0, "afm-jax ")
+
+
+DEAF = """
+import sys, time, types
+import click
+from afm_jax.cli.main import COMMANDS, main
+@click.command()
+def command():
+    ready = False
+    while True:
+        try:
+            if not ready:
+                ready = True
+                print("ready", flush=True)
+            time.sleep(0.02)
+        except KeyboardInterrupt:
+            pass
+sys.modules["deaf"] = types.SimpleNamespace(command=command)
+COMMANDS["deaf"] = ("deaf", "")
+sys.argv[1:] = ["deaf"]
+main()
+"""
+
+
+def test_an_interrupt_that_is_swallowed_ends_the_program_all_the_same():
+    with subprocess.Popen(
+        [sys.executable, "-c", DEAF], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(signal.SIGINT)
+        _, said = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert said == "afm-jax: interrupted\n"
+
+
+def test_numbers_whose_squares_are_none_are_refused(tmp_path):
+    scene = tmp_path / "scene.toml"
+    for amplitude in ("1e155", "1e308"):
+        scene.write_text(LAW.format(amplitude, 1.01), encoding="utf-8")
+        result = run("orbits", scene, "--order", 1)
+        assert result.exit_code == 2
+        assert "`amplitude_nm` must be at most 1e+30 in size" in result.stderr
+    with pytest.raises(ValueError, match=r"at most 1e\+30"):
+        Platform(amplitude_nm=np.array([1.0, 1e40]), frequency_khz=180.0)
+
+
+def test_a_duration_without_end_is_refused(tmp_path):
+    scene = tmp_path / "scene.toml"
+    scene.write_text(LAW.format(4, 1e-12), encoding="utf-8")
+    result = run("simulate", scene)
+    assert result.exit_code == 2
+    assert "the tip would oscillate 1e+15 times" in result.stderr
+
+
+def test_tables_out_of_all_proportion_are_refused_at_once(tmp_path):
+    wide, large = tmp_path / "wide.csv", tmp_path / "large.csv"
+    head = "# free_frequency_khz = 90\n"
+    wide.write_text(f"{head}{','.join(f'x{i}' for i in range(100_000))}\n{'1,' * 99_999}1\n", encoding="utf-8")
+    with pytest.raises(TableError, match=r"unknown column 'x0'.*more faults"):
+        read_table(wide)
+    columns = "order,drive_frequency_khz,drive_amplitude_nm,offset_nm,peak_amplitude_nm,peak_amplitude_error_nm"
+    large.write_text(f"{head}{columns}\n1,180,4,0,1e308,1\n", encoding="utf-8")
+    with pytest.raises(TableError, match=r"peak_amplitude_nm: must be at most 1e\+09 in size, but is 1e\+308"):
+        read_table(large)
+    large.write_text(f"{head.replace('90', '1e300')}{columns}\n1,180,4,0,100,1\n", encoding="utf-8")
+    with pytest.raises(TableError, match=r"free_frequency_khz must be at most 1e\+09"):
+        read_table(large)
