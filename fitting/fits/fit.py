@@ -493,10 +493,7 @@ def fit(  # noqa: PLR0913
         RuntimeError: if JAX is not set to 64-bit floats.
     """
     options: dict[str, Any] = {"free": free, "fixed": fixed, "constraints": constraints, "effects": effects}
-    if speeds is not None and not 0.0 < speeds[0] < speeds[1] < np.inf:
-        raise ValueError(f"`speeds` must be a rising pair of positive numbers in nm/us, but is {speeds!r}")
-    options["speeds"] = speeds
-    found = find_fit(table, model, scale_errors=scale_errors, robust=robust, **options)
+    found = find_fit(table, model, scale_errors=scale_errors, robust=robust, speeds=speeds, **options)
     return summarise(table, found)
 
 
@@ -514,6 +511,8 @@ def find_fit(  # noqa: PLR0913
 ) -> Found:
     """Return the minimum of a fit; arguments and errors as of `fit`."""
     require_float64()
+    if speeds is not None and not 0.0 < speeds[0] < speeds[1] < np.inf:
+        raise ValueError(f"`speeds` must be a rising pair of positive numbers in nm/us, but is {speeds!r}")
     known = constraints_of(table, constraints)
     if table.quality_factor is not None and (model.endswith("+delay") or model == "contact"):
         known = {"quality_factor": (table.quality_factor, ASSUMED_ERROR_OF_Q * table.quality_factor)} | known
