@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from afm_jax.contact.contact import Contact
     from afm_jax.contact.junction import Junction, Phase, find_junction
     from afm_jax.contact.time_course import time_course
+    from afm_jax.dynamics.continuation import continue_orbits
+    from afm_jax.dynamics.exponents import lyapunov_spectrum
+    from afm_jax.dynamics.impact_orbits import many_impact_orbits
     from afm_jax.impact.jacobian import map_jacobian
     from afm_jax.impact.law import CollisionDelay, ImpactLaw
     from afm_jax.impact.map import NextImpact, iterate_batch, iterate_map, next_impact
@@ -55,10 +58,13 @@ else:
         "__version__": "afm_jax.version",
         "capture_speed": "afm_jax.contact.collide",
         "collide": "afm_jax.contact.collide",
+        "continue_orbits": "afm_jax.dynamics.continuation",
         "find_junction": "afm_jax.contact.junction",
         "iterate_batch": "afm_jax.impact.map",
         "iterate_map": "afm_jax.impact.map",
         "load_scene": "afm_jax.scenefile.scenefile",
+        "lyapunov_spectrum": "afm_jax.dynamics.exponents",
+        "many_impact_orbits": "afm_jax.dynamics.impact_orbits",
         "map_jacobian": "afm_jax.impact.jacobian",
         "next_impact": "afm_jax.impact.map",
         "save_scene": "afm_jax.scenefile.scenefile",
@@ -102,10 +108,13 @@ __all__ = [
     "__version__",
     "capture_speed",
     "collide",
+    "continue_orbits",
     "find_junction",
     "iterate_batch",
     "iterate_map",
     "load_scene",
+    "lyapunov_spectrum",
+    "many_impact_orbits",
     "map_jacobian",
     "next_impact",
     "save_scene",

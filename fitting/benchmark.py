@@ -1,4 +1,4 @@
-"""How long fits take from the shell: whole commands, with an empty and with a warm compilation cache."""
+"""How long fits take from the shell, with an empty and with a warm cache, and what each digit of a minimum costs."""
 
 import json
 import os
@@ -6,25 +6,25 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.optimize import least_squares
 
-from fitting.fits.objective import Objective
-from fitting.models import Problem, measurement_of, model_parameters
+from afm_jax.accuracy.overview import overview_row
+from afm_jax.bench.timing import progress
+from fitting.fits.least_squares import Box, Searches, descended
+from fitting.fits.objective import PLAIN, Objective, polish
+from fitting.models import Problem, measurement_of
+from fitting.parameters import model_parameters, paper_values
 from fitting.tables.table import AmplitudeTable, write_table
 
-_PAPER = {
-    "epsilon": 113.6,
-    "viscous_loss": 0.5,
-    "delay_hertz": 0.2033,
-    "delay_lead_nm": 6.8,
-    "delay_offset_nm": 0.58,
-}
-"""Law and delay of the paper's contact, which "contact" fits as well."""
 _NOISE = 0.01
+_OFF = 0.03
+"""How far parameters are off where searches start, in turns up and down."""
+_MOST = 300
 
 
 def time_fits(models: Sequence[str], *, rows: int) -> list[dict[str, Any]]:
@@ -68,10 +68,84 @@ def time_fits(models: Sequence[str], *, rows: int) -> list[dict[str, Any]]:
     return measured
 
 
-def made_table(rows: int, *, seed: int = 0) -> AmplitudeTable:
-    """Return a table of orders 1 to 4 around resonance with the paper's law and delay, 1 % noise and Q = 40 +- 1."""
+def minimum_accuracy(
+    *, rows: int, settled: Sequence[float], tolerances: Sequence[float], repetitions: int
+) -> dict[str, Any]:
+    """Measure searches for the minimum of chi2, from one start, on a table without noise: the truth is known.
+
+    The loss and the delay of the paper's contact are looked for (model "viscous+delay"); all searches share one
+    compiled forward model.
+
+    Args:
+        rows: rows of the table.
+        settled: estimated distances of chi2 to its minimum at which our own searches stop.
+        tolerances: xtol, ftol and gtol of SciPy's `least_squares`.
+        repetitions: of each time measurement.
+
+    Returns:
+        `rows` and `references` as in `afm_jax.accuracy.overview`; the error is the largest relative one of a parameter.
+    """
     problem = Problem("viscous+delay", model_parameters("viscous+delay"))
-    values = np.array([_PAPER[name] for name in problem.names])
+    truth = np.array([paper_values("viscous+delay")[name] for name in problem.names])
+    start = problem.coordinates(truth[None] * (1.0 + _OFF * (-1.0) ** np.arange(truth.size)))
+    table = made_table(rows, noise=0.0)
+    objective = Objective(measurement_of(table, problem), problem).following(problem.values(start)[0])
+
+    def look(places: np.ndarray, _: np.ndarray) -> Searches:
+        residual, jacobian = objective.linearise(places)
+        return Searches(places, residual, jacobian, (residual**2).sum(axis=1))
+
+    def marquardt(stop: float) -> np.ndarray:
+        free = Box(np.full(truth.size, -np.inf), np.full(truth.size, np.inf), np.zeros(start.shape, bool))
+        return descended(look, look(start, np.arange(1)), free, settled=stop, most=_MOST).place
+
+    def lbfgs(stop: float) -> np.ndarray:
+        return polish(objective, start, PLAIN, settled=stop, most=_MOST).coordinates
+
+    def scipy(stop: float, jacobian: Any) -> np.ndarray:
+        def residual(place: np.ndarray) -> np.ndarray:
+            return objective.linearise(place[None])[0][0]
+
+        return least_squares(residual, start[0], jac=jacobian, xtol=stop, ftol=stop, gtol=stop, method="lm").x[None]
+
+    def slopes(place: np.ndarray) -> np.ndarray:
+        return objective.linearise(place[None])[1][0]
+
+    searches: list[tuple[str, Callable[[float], np.ndarray], Sequence[float]]] = [
+        ("Levenberg-Marquardt", marquardt, settled),
+        ("optax L-BFGS", lbfgs, settled),
+        ("SciPy least_squares, our Jacobian", lambda stop: scipy(stop, slopes), tolerances),
+        ("SciPy least_squares, differences", lambda stop: scipy(stop, "2-point"), tolerances),
+    ]
+    measured = []
+    for method, search, stops in searches:
+        progress(f"accuracy: fits, {method}")
+        for stop in stops:
+            found, seconds = problem.values(search(stop))[0], []
+            for _ in range(repetitions):
+                begin = time.perf_counter()
+                search(stop)
+                seconds.append(time.perf_counter() - begin)
+            error = float(np.max(np.abs(found / truth - 1.0)))
+            measured.append(overview_row("fits", method, f"tolerance {stop:g}", 1e6 * min(seconds), error))
+    reference = {
+        "error_of": "worst parameter, relative",
+        "reference": "the law that made the table",
+        "reference_error": 0.0,
+    }
+    return {"rows": measured, "references": {"fits": reference}}
+
+
+def made_table(rows: int, *, seed: int = 0, noise: float = _NOISE) -> AmplitudeTable:
+    """Return a table of orders 1 to 4 around resonance with the paper's law and delay and Q = 40 +- 1.
+
+    Args:
+        rows: how many.
+        seed: of the noise.
+        noise: relative; the errors that the table states are 1 % whatever it is.
+    """
+    problem = Problem("viscous+delay", model_parameters("viscous+delay"))
+    values = np.array([paper_values("viscous+delay")[name] for name in problem.names])
     place = np.arange(4 * rows)
     order = place % 4 + 1
     drive: dict[str, Any] = {
@@ -88,7 +162,7 @@ def made_table(rows: int, *, seed: int = 0) -> AmplitudeTable:
     chosen = np.flatnonzero(good[: 4 * rows])
     chosen = chosen[np.linspace(0, chosen.size - 1, rows).round().astype(int)]
     exact = np.asarray(found.amplitude_nm)[0][chosen]
-    noisy = exact * (1.0 + _NOISE * np.random.default_rng(seed).standard_normal(exact.shape))
+    noisy = exact * (1.0 + noise * np.random.default_rng(seed).standard_normal(exact.shape))
     kept = {name: column[chosen] for name, column in drive.items()}
     return AmplitudeTable(**kept, **cantilever, quality_factor_error=1.0, **_columns(noisy))
 

@@ -9,11 +9,12 @@ parameters, except at a fold, where it meets another root and ends, and where th
 or on the way. There, and where there is no steady orbit, the gradient is NaN and a sentence says why.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,18 +32,8 @@ from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact
 from afm_jax.impact.map import NEAR_GRAZING
 from afm_jax.impact.orbits import amplitudes, near_fold, orbit_state, steady_orbits
 from afm_jax.impact.roots import follow_root, harmless_coordinate
-from fitting.models import (
-    CONTACT_NAMES,
-    NUISANCE_NAMES,
-    PARAMETERS,
-    ROWS_PER_PROGRAM,
-    Measurement,
-    Problem,
-    Rows,
-    check_contact_values,
-    measurement_of,
-    model_parameters,
-)
+from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem, Rows, measurement_of
+from fitting.parameters import CONTACT_NAMES, NUISANCE_NAMES, PARAMETERS, check_contact_values, model_parameters
 from fitting.tables.table import AmplitudeTable
 
 
@@ -130,7 +121,7 @@ class Prediction(NamedTuple):
     """Predicted amplitudes of shape (rows, 2), 0 where there is no orbit; the rest has shape (rows,).
 
     ``orbits`` counts the stable admissible orbits (where roots are followed: whether there is one); ``coordinate``,
-    ``near_fold`` and ``approach_speed_nm_per_us`` are those of the chosen one.
+    ``near_fold``, ``approach_speed_nm_per_us`` and the drive's phase at arrival are those of the chosen one.
     """
 
     amplitude_nm: Float[Array, "rows 2"]
@@ -138,6 +129,7 @@ class Prediction(NamedTuple):
     near_fold: Bool[Array, " rows"]
     approach_speed_nm_per_us: Float[Array, " rows"]
     coordinate: Float[Array, " rows"]
+    arrival_rad: Float[Array, " rows"]
 
 
 class Linearised(NamedTuple):
@@ -178,19 +170,7 @@ def linearise(
     rows = measurement.rows.order.shape[0]
     filled = np.concatenate([values, np.repeat(values[-1:], BATCH - sets, axis=0)])
     impacts = impacts_of(filled, measurement, problem)
-    columns = jax.tree.map(np.asarray, measurement.rows)
-    known = None if near is None else np.broadcast_to(np.asarray(near), (sets, rows)).ravel()
-    blocks = []
-    for begin in range(0, sets * rows, LANES):
-        # the last block is filled up with the last pair
-        lane = np.minimum(np.arange(begin, begin + LANES), sets * rows - 1)
-        some = measurement._replace(rows=jax.tree.map(lambda column, row=lane % rows: column[row], columns))
-        index = lane // rows
-        branch = branch_near(known[lane]) if known is not None else located(filled, impacts, index, some, problem)
-        blocks.append(jax.tree.map(np.asarray, linearise_pairs(filled, impacts, index, some, problem, branch)))
-    whole: _Block = jax.tree.map(
-        lambda *parts: np.concatenate(parts)[: sets * rows].reshape(sets, rows, *parts[0].shape[1:]), *blocks
-    )
+    whole = _in_lanes(filled, sets, impacts, measurement, problem, near)
     misfit, unseen = np.asarray(whole.misfit).reshape(sets, -1), np.asarray(whole.unseen)
     strength = 1.0 / np.asarray(measurement.constraint_error)
     constraint = (values - np.asarray(measurement.constraint_value)) * strength
@@ -201,6 +181,75 @@ def linearise(
         jacobian=np.concatenate([flat, np.zeros((sets, rows, count)), pulls], axis=1),
         prediction=whole.prediction,
     )
+
+
+def _in_lanes(
+    filled: Float[np.ndarray, "batch p"],
+    sets: int,
+    impacts: "_Impacts",
+    measurement: Measurement,
+    problem: Problem,
+    near: Float[np.ndarray, "..."] | None,
+) -> "_Block":
+    """Return what `linearise_pairs` finds, as arrays of shape (sets, rows, ...)."""
+    rows = measurement.rows.order.shape[0]
+    columns = jax.tree.map(np.asarray, measurement.rows)
+    known = None if near is None else np.broadcast_to(np.asarray(near), (sets, rows)).ravel()
+    blocks = []
+    for begin in range(0, sets * rows, LANES):
+        # the last block is filled up with the last pair
+        lane = np.minimum(np.arange(begin, begin + LANES), sets * rows - 1)
+        some = measurement._replace(rows=jax.tree.map(lambda column, row=lane % rows: column[row], columns))
+        index = lane // rows
+        branch = branch_near(known[lane]) if known is not None else located(filled, impacts, index, some, problem)
+        blocks.append(jax.tree.map(np.asarray, linearise_pairs(filled, impacts, index, some, problem, branch)))
+    return jax.tree.map(
+        lambda *parts: np.concatenate(parts)[: sets * rows].reshape(sets, rows, *parts[0].shape[1:]), *blocks
+    )
+
+
+class ImpactSlopes(NamedTuple):
+    """How the residuals of the rows change with what their impacts do, shape (rows, 2): peak, lock-in.
+
+    By the squared rebound speed in nm^2/us^2, the delay changing with the speed as its law says, and by the delay in
+    us; 0 where nothing was measured, and where impacts are instantaneous.
+    """
+
+    by_square: Float[np.ndarray, "rows 2"]
+    by_delay: Float[np.ndarray, "rows 2"]
+
+
+def impact_slopes(
+    values: Float[np.ndarray, " p"],
+    measurement: Measurement,
+    problem: Problem,
+    near: Float[np.ndarray, " rows"] | None = None,
+) -> ImpactSlopes:
+    """Return how the residuals change with each row's impact, by the program of `linearise`; arguments as there.
+
+    The derivatives are those along a direction in which the impact itself is changed, put where those by the first
+    parameter would be.
+    """
+    filled = np.repeat(np.asarray(values)[None], BATCH, axis=0)
+    impacts = impacts_of(filled, measurement, problem)
+    still = jax.tree.map(lambda leaf: np.zeros(leaf.shape), impacts.slopes)
+
+    def along(where: Callable[[Any], Any], turn: float) -> tuple[np.ndarray, np.ndarray]:
+        leaf = np.array(where(still))
+        # tables have a series: its constant term
+        leaf[(slice(None), 0, *(0,) * (leaf.ndim - 2))] = turn
+        turned = impacts._replace(slopes=eqx.tree_at(where, still, leaf))
+        block = _in_lanes(filled, 1, turned, measurement, problem, near)
+        return np.asarray(block.slope)[0, :, :, 0], np.asarray(block.prediction.approach_speed_nm_per_us)[0]
+
+    if isinstance(impacts.impact, TabulatedImpact):
+        return ImpactSlopes(along(lambda i: i.loss, -1.0)[0], along(lambda i: i.time, 1.0)[0])
+    by_square, _ = along(lambda i: i.law.epsilon, -1.0)
+    if not impacts.impact.delayed:
+        return ImpactSlopes(by_square, np.zeros_like(by_square))
+    by_offset, speed = along(lambda i: i.law.delay.offset_nm, -1.0)
+    # the offset d shortens the delay by d/u
+    return ImpactSlopes(by_square, speed[:, None] * by_offset)
 
 
 class _Block(NamedTuple):
@@ -307,6 +356,7 @@ def _prediction(branch: Branch, values: Float[Array, " p"], orbit: OrbitProblem,
         near_fold=branch.near_fold,
         approach_speed_nm_per_us=lax.stop_gradient(speed),
         coordinate=branch.place.coordinate,
+        arrival_rad=branch.place.phase,
     )
 
 

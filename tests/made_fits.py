@@ -7,7 +7,7 @@ import numpy as np
 
 from fitting.fits.intervals import Convergence
 from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows
-from fitting.models import PARAMETERS
+from fitting.parameters import PARAMETERS
 from fitting.tables.table import AmplitudeTable
 
 VALUES = {

@@ -7,8 +7,9 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax.accuracy.impacts import cheapest_settings, map_accuracy
+from afm_jax.accuracy.overview import cheapest, impacts, orbits, overview_row
 from afm_jax.bench import timing as own_process
-from afm_jax.cli.accuracy import COLUMNS
+from afm_jax.cli.accuracy import COLUMNS, OVERVIEW_FULL
 from afm_jax.cli.main import main
 from afm_jax.plots.accuracy import accuracy_figure
 from tests.run_here import run_here
@@ -98,6 +99,60 @@ def test_command_writes_table_picture_and_one_json_object(tmp_path: Path, monkey
     assert {"rows", "cheapest", "wanted_error_us", "reference_error_us", "default_root_tolerance_us"} == set(payload)
     assert json.loads((tmp_path / "accuracy.json").read_text("utf-8")) == payload
     assert (tmp_path / "accuracy.csv").read_text("utf-8").splitlines()[0] == ",".join(COLUMNS)
+    assert (tmp_path / "accuracy.png").read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_every_integrator_comes_to_the_same_impacts_and_orbit():
+    """All solve one problem: at a tight tolerance each is right, by 50 digits, which are none of them."""
+    rivals = {"SciPy DOP853", "SciPy LSODA", "SUNDIALS CVODE Adams"}
+    few = {"tolerances": [1e-9], "integrators": ["DOP853", "LSODA", "CVODE Adams"], "batch": 10, "repetitions": 1}
+    found = impacts(root_tolerances_us=[1e-13], impacts=3, **few)
+    assert {row["method"] for row in found["rows"] if not row["own"]} == rivals | {"Diffrax Dopri8 with Event"}
+    for row in found["rows"]:
+        limit = 1e-13 if row["method"] == "next_impact float64" else 1e-3 if "float32" in row["method"] else 1e-6
+        assert row["error"] < limit, row
+    closed = orbits(**few)
+    assert {row["method"] for row in closed["rows"]} == {
+        "single_impact_orbits",
+        *(f"{one}, shooting" for one in rivals),
+    }
+    for row in closed["rows"]:
+        assert row["error"] < (1e-13 if row["own"] else 1e-6), row
+
+
+def test_the_cheapest_way_to_an_error_here_and_elsewhere():
+    rows = [
+        overview_row("orbits", "single_impact_orbits", "one", 5.0, 1e-14),
+        overview_row("orbits", "SciPy DOP853, shooting", "loose", 1.0, 1e-4),
+        overview_row("orbits", "SciPy DOP853, shooting", "tight", 9.0, 1e-10),
+        overview_row("orbits", "SciPy Radau, shooting", "gave up", 0.1, float("nan")),
+    ]
+    assert [
+        (row["wanted_error"], row["own"], row["other"], row["other_microseconds"])
+        for row in cheapest(rows, [1e-3, 1e-9])
+    ] == [
+        (1e-3, "single_impact_orbits, one", "SciPy DOP853, shooting, loose", 1.0),
+        (1e-9, "single_impact_orbits, one", "SciPy DOP853, shooting, tight", 9.0),
+    ]
+    assert cheapest(rows, [1e-15])[0]["own"] is None
+
+
+def test_overview_draws_a_panel_a_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def measured(task: str, settings: dict, *, cores: int) -> dict:
+        del settings, cores
+        problem = task.split(":")[1]
+        told = {"error_of": "time (us)", "reference": "50 digits", "reference_error": 1e-9}
+        rows = [overview_row(problem, "ours", "a", 1.0, 1e-8), overview_row(problem, "SciPy LSODA", "b", 9.0, 0.0)]
+        return {"rows": rows, "references": {problem: told}}
+
+    monkeypatch.setattr(own_process, "run_in_own_process", measured)
+    result = CliRunner().invoke(main, ["accuracy", "--json", "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.stderr
+    payload = json.loads(result.stdout)
+    assert set(payload["references"]) == {task.split(":")[1] for task in OVERVIEW_FULL}
+    assert {row["own"] for row in payload["cheapest"]} == {None, "ours, a"}  # an error of 1e-8 is not one of 1e-9
+    assert json.loads((tmp_path / "accuracy.json").read_text("utf-8")) == payload
     assert (tmp_path / "accuracy.png").read_bytes().startswith(b"\x89PNG")
 
 

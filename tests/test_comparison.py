@@ -11,7 +11,7 @@ from afm_jax.cli.main import main
 from fitting import read_table
 from fitting.fits import comparison
 from fitting.fits.comparison import compare
-from fitting.fits.fit import find_fit
+from fitting.fits.fit import find_fit, summarise
 from tests.fit_tables import EXAMPLE
 from tests.strict_reading import strictly
 
@@ -57,6 +57,14 @@ def test_models_are_compared_by_their_information(compared):
     # the table is made of the law r = 0.95, epsilon = 200
     assert compared.rows[0]["model"] == "law"
     assert "tells plainly: law: a restitution with adhesion" in compared.verdict
+
+
+def test_a_model_that_is_fitted_already_is_not_fitted_again(table, compared, failing):
+    found = find_fit(table, "law")
+    failing("law", RuntimeError("fitted again"))
+    again = compare(table, MODELS, known={"law": (found, summarise(table, found))})
+    assert not again.failed
+    assert again.rows == compared.rows
 
 
 @pytest.mark.parametrize(

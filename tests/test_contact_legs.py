@@ -42,7 +42,7 @@ def column(contacts, name: str) -> np.ndarray:
 
 
 # errors allowed: of the rebound speed (relative) what the setting promises, of times in us a tenth of it
-@pytest.mark.parametrize("accuracy", sorted(DRIVEN_SETTINGS))
+@pytest.mark.parametrize("accuracy", [1e-6, 1e-9, pytest.param(min(DRIVEN_SETTINGS), marks=pytest.mark.slow)])
 def test_straight_contacts_are_those_of_an_independent_integration(contacts, accuracy):
     quick = driven_setting_of(accuracy).quick
     assert quick is not None

@@ -150,14 +150,14 @@ def test_statements_hold_and_can_fail(figure2: StabilityChart, figure3: Stabilit
     frequency, amplitude = paper_figures.chart_grid(coarse=True)
     positive = stability_chart(
         lambda n, beta: presets.stability_scene(n, beta, 1.0, 0.0),
-        reduced_frequency=frequency,
-        drive_amplitude_nm=amplitude,
+        x_values=frequency,
+        y_values=amplitude,
         last_order=8,
     )
     assert tails_lean(figure2, positive).holds
     assert not tails_lean(positive, figure2).holds
     assert tongues_at_resonance(figure2).holds
-    assert not tongues_at_resonance(replace(figure2, reduced_frequency=frequency + 0.5)).holds
+    assert not tongues_at_resonance(replace(figure2, x_values=frequency + 0.5)).holds
     assert low_orders_vanish(figure2, figure3).holds
     assert not low_orders_vanish(figure2, figure2).holds
     assert not low_orders_vanish(figure3, figure2).holds
@@ -179,10 +179,8 @@ def test_amplitude_slopes_hold_and_can_fail():
 
 
 def test_share_above_tells_missing_orders(figure2: StabilityChart):
-    frequency, amplitude = figure2.reduced_frequency, figure2.drive_amplitude_nm
-    short = stability_chart(
-        presets.figure2_scene, reduced_frequency=frequency, drive_amplitude_nm=amplitude, last_order=5
-    )
+    frequency, amplitude = figure2.x_values, figure2.y_values
+    short = stability_chart(presets.figure2_scene, x_values=frequency, y_values=amplitude, last_order=5)
     # independent sum: what the complete chart has of order 6 alone
     sixth = (figure2.lowest_stable_order == 6)[::2, ::2]
     assert share_above(short, last_order=6, stride=2) == pytest.approx(sixth.mean(), abs=1e-12)

@@ -100,6 +100,35 @@ def test_a_quality_factor_that_is_fitted_along_is_not_called_exact():
         assert any("is taken as exact" in warning for warning in judge_fit(given)[1]) is said
 
 
+@pytest.mark.parametrize(
+    ("value", "named", "refused"), [(40.7, False, False), (41.0, True, False), (41.3, False, True)]
+)
+def test_a_quality_factor_that_is_pulled_is_named_and_then_not_believed(value, named, refused):
+    given = evidence("law", made_table())
+    along = given.parameters | {"quality_factor": made_parameter("quality_factor", value, constraint=(40.0, 0.4))}
+    reasons, warnings = judge_fit(dataclasses.replace(given, parameters=along, correlations=np.eye(len(along))))
+    said = f"quality_factor = {value:g} is {(value - 40.0) / 0.4:.1f} standard errors from the given 40 +- 0.4"
+    assert any(warning.startswith(said) for warning in warnings) is named
+    assert any(said in reason for reason in reasons) is refused
+
+
+@pytest.mark.parametrize(
+    ("share", "said"), [(0.1, "errors may be too small"), (0.4, "Impacts last up to 40 % of a drive")]
+)
+def test_an_impact_that_lasts_long_is_not_laid_to_the_errors(share, said):
+    given = dataclasses.replace(evidence("law+delay", made_table()), p_value=1e-9, contact_share=share)
+    (reason,) = [text for text in judge_fit(given)[0] if "does not explain" in text]
+    assert said in reason
+
+
+def test_an_error_of_the_quality_factor_that_was_assumed_is_said():
+    table = dataclasses.replace(made_table(), quality_factor=40.0, quality_factor_error=None)
+    given = evidence("law+delay", table)
+    along = given.parameters | {"quality_factor": made_parameter("quality_factor", 40.2, constraint=(40.0, 0.8))}
+    _, warnings = judge_fit(dataclasses.replace(given, parameters=along, correlations=np.eye(len(along))))
+    assert any("given without an error: 2 % was assumed (40 +- 0.8)" in warning for warning in warnings)
+
+
 def with_residuals(given: Evidence, residual: np.ndarray, **changes) -> Evidence:
     rows = dataclasses.replace(given.rows, residual=residual)
     return dataclasses.replace(given, rows=rows, **changes)

@@ -37,6 +37,7 @@ LEVELS = {
 }
 # The same for fitting: what a fit needs, the fit, what is made of it.
 FITTING_LEVELS = {
+    "parameters": 0,
     "tables": 0,
     "traces": 1,
     "models": 1,

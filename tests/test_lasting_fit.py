@@ -104,7 +104,8 @@ def test_rows_set_aside_are_named(viscous, shared):
     slowest = np.nanmin(viscous.rows.approach_speed_nm_per_us[viscous.rows.used])
     assert np.nanmax(viscous.rows.approach_speed_nm_per_us[aside]) < 3.0 * slowest
     used = np.isfinite(viscous.rows.residual).sum()
-    assert viscous.degrees_of_freedom == used - len(viscous.parameters)
+    given = sum(parameter.constraint is not None for parameter in viscous.parameters.values())
+    assert viscous.degrees_of_freedom == used + given - len(viscous.parameters)
 
 
 def test_followed_orbits_are_those_that_a_search_finds(viscous, shared):

@@ -14,7 +14,8 @@ from afm_jax.impact.map import iterate_map, next_impact
 from afm_jax.motion.observe import observe
 from afm_jax.motion.record import MotionOutcome, State
 from fitting.forward import BATCH, linearise
-from fitting.models import DELAY_NAMES, Problem, measurement_of
+from fitting.models import Problem, measurement_of
+from fitting.parameters import DELAY_NAMES
 from fitting.tables.table import AmplitudeTable
 
 LAWS, DRIVES = BATCH, 25

@@ -146,7 +146,7 @@ def test_a_kill_at_any_time_leaves_no_half_file(tmp_path):
             text = path.read_text(encoding="utf-8")
             assert text == text[:1] * 3_000_000
             found.add(text[:1])
-    assert len(found) > 2
+    assert len(found) > 1
     assert all(rest.name.startswith(".fit.json.") for rest in tmp_path.iterdir() if rest != path)
 
 

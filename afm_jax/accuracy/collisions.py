@@ -21,6 +21,7 @@ import optimistix
 from jaxtyping import Array, Float
 
 from afm_jax.bench.collisions import COARSER_REFERENCE, REFERENCE, speeds_of
+from afm_jax.bench.integrators import title
 from afm_jax.bench.scipy_contacts import scipy_collision
 from afm_jax.bench.timing import compiled_for, progress, time_compiled
 from afm_jax.contact.bridge_leg import Passage, Way, nothing_spent, way_rates
@@ -114,18 +115,18 @@ def collide_accuracy(
     steps: Sequence[int],
     batch: int,
     repetitions: int,
-    scipy_speeds: Sequence[float],
+    integrators: tuple[Sequence[str], Sequence[float]],
 ) -> dict[str, Any]:
     """Measure error and time of collisions.
 
     Args:
-        tolerances: of the adaptive solvers and of SciPy.
+        tolerances: of the adaptive solvers and of the integrators.
         solvers: Diffrax's, by the variable they step in (gap, time); those in the gap also with fixed steps.
         accuracies: which of `collide`'s settings to measure.
         steps: numbers of fixed steps a crossing.
         batch: how many speeds, from 12 to 200 nm/us.
         repetitions: of each time measurement.
-        scipy_speeds: approach speeds of SciPy's tips.
+        integrators: methods of general-purpose ones to compare with (see `Integrator`), approach speeds of their tips.
 
     Returns:
         `rows` with method, variable (gap, time), setting, precision, microseconds_per_impact (of the batch), compile_s,
@@ -144,7 +145,7 @@ def collide_accuracy(
         for solver in names:
             rows += _adaptive((variable, solver), tolerances, speeds, reference, repetitions)
     # one program tells how far the reference is converged and what SciPy should find
-    every_speed = jnp.concatenate([speeds, jnp.asarray(scipy_speeds)])
+    every_speed = jnp.concatenate([speeds, jnp.asarray(integrators[1])])
     coarser = batch_of(Contact.paper(), 1.0, every_speed, COARSER_REFERENCE)
     rebound, delay = (np.asarray(part, float) for part in (coarser.rebound_speed_nm_per_us, coarser.collision_delay_us))
     tips = slice(1, speeds.size)
@@ -152,7 +153,7 @@ def collide_accuracy(
         np.max(np.abs(rebound[tips] / reference["rebound"][1:] - 1.0)),
         np.max(np.abs(delay[tips] - reference["delay"][1:])),
     )
-    rows += _scipy(tolerances, scipy_speeds, (rebound[speeds.size :], delay[speeds.size :]))
+    rows += _integrators(*integrators, tolerances, (rebound[speeds.size :], delay[speeds.size :]))
     return {"rows": rows, "reference_error": float(reference_error)}
 
 
@@ -196,11 +197,11 @@ def _row(
 
 
 def _outputs(run: Callable[[Contact, Array], Collision], speeds: Array) -> Outputs:
-    found = jax.jit(lambda at: _values_and_slopes(run, at), compiler_options=_UNHURRIED)(speeds)
+    found = jax.jit(lambda at: values_and_slopes(run, at), compiler_options=_UNHURRIED)(speeds)
     return {key: np.asarray(part, np.float64) for key, part in found.items()}
 
 
-def _values_and_slopes(run: Callable[[Contact, Array], Collision], speeds: Array) -> dict[str, Array]:
+def values_and_slopes(run: Callable[[Contact, Array], Collision], speeds: Array) -> dict[str, Array]:
     """Return rebound speeds, delays, and slopes of the rebound speed by speed and by viscosity."""
     dtype = speeds.dtype
 
@@ -260,7 +261,7 @@ def _adaptive(
 
     @partial(jax.jit, compiler_options=_UNHURRIED)
     def slopes(junction, tolerance):
-        return _values_and_slopes(lambda contact, speeds: run(contact, junction, speeds, tolerance), speeds)
+        return values_and_slopes(lambda contact, speeds: run(contact, junction, speeds, tolerance), speeds)
 
     rows = []
     for tolerance in tolerances:
@@ -282,18 +283,23 @@ def _adaptive(
     return rows
 
 
-def _scipy(tolerances: Sequence[float], speeds: Sequence[float], expected: tuple[np.ndarray, np.ndarray]) -> list[Row]:
+def _integrators(
+    methods: Sequence[str],
+    speeds: Sequence[float],
+    tolerances: Sequence[float],
+    expected: tuple[np.ndarray, np.ndarray],
+) -> list[Row]:
     contact = Contact.paper()
     expected_rebound, expected_delay = expected
     rows = []
-    for method in ("DOP853", "LSODA"):
+    for method in methods:
         for tolerance in tolerances:
-            progress(f"accuracy: SciPy {method}, {tolerance:g}")
-            name = {"method": f"SciPy {method}", "variable": "time", "setting": f"tolerance {tolerance:g}"}
+            progress(f"accuracy: {title(method)}, {tolerance:g}")
+            name = {"method": title(method), "variable": "time", "setting": f"tolerance {tolerance:g}"}
             row = {**name, "precision": "float64", "tolerance": tolerance, "slope_error": None}
             try:
                 runs = [scipy_collision(contact, speed, method=method, rtol=tolerance) for speed in speeds]
-            except ValueError as failure:
+            except (ValueError, ModuleNotFoundError) as failure:
                 rows.append(row | {"microseconds_per_impact": None, "rebound_error": None, "reason": str(failure)})
                 continue
             rebound = np.array([run.rebound_speed_nm_per_us for run in runs])

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afm_jax.bench.impacts import ImpactErrors, lane_states, sequence_errors, single_errors
+from afm_jax.bench.integrators import title
 from afm_jax.bench.problems import (
     BenchmarkScene,
     Starts,
@@ -65,12 +66,12 @@ def map_accuracy(
     rows: list[Row] = []
     doubts = []
     for case in (regular_scene(), grazing_scene(), high_order_scene()):
-        starts = _slow_ones_first(case, settled_starts(case.scene, batch), impacts, lanes)
+        starts = slow_ones_first(case, settled_starts(case.scene, batch), impacts, lanes)
         for precision in ("float64", "float32"):
             progress(f"accuracy: {case.name} scene, {precision}")
-            rows += _map_rows(case, starts, precision, root_tolerances_us, (impacts, lanes, repetitions))
+            rows += map_rows(case, starts, precision, root_tolerances_us, (impacts, lanes, repetitions))
         progress(f"accuracy: {case.name} scene, SciPy")
-        rows += [_scipy_row(case, starts, tolerance, impacts) for tolerance in scipy_tolerances]
+        rows += [integrator_row(case, starts, tolerance, impacts) for tolerance in scipy_tolerances]
         if not case.chaotic:
             doubts.append(_reference_error(case, starts, impacts))
     return {
@@ -111,9 +112,10 @@ def _fastest(scene: str, rows: Sequence[Row], wanted_error_us: float) -> Row:
     return {"scene": scene, **{name: None if best is None else best[name] for name in names}}
 
 
-def _map_rows(
+def map_rows(
     case: BenchmarkScene, starts: Starts, precision: str, tolerances: Sequence[float], sizes: tuple[int, int, int]
 ) -> list[Row]:
+    """Measure the map at every root tolerance; sizes: impacts, lanes and repetitions as `map_accuracy`'s."""
     impacts, lanes, repetitions = sizes
     scene = cast(case.scene, precision)
     starts = jax.tree.map(lambda part: part.astype(precision), starts)
@@ -156,12 +158,13 @@ def _error_columns(errors: ImpactErrors) -> Row:
     }
 
 
-def _scipy_row(case: BenchmarkScene, starts: Starts, tolerance: float, impacts: int) -> Row:
-    row: Row = {"scene": case.name, "method": "SciPy DOP853", "tolerance": tolerance}
+def integrator_row(case: BenchmarkScene, starts: Starts, tolerance: float, impacts: int, method: str = "DOP853") -> Row:
+    """Measure a general-purpose integrator on the first tip: columns as `map_accuracy`'s."""
+    row: Row = {"scene": case.name, "method": title(method), "tolerance": tolerance}
     start = (float(starts.time_us[0]), float(starts.velocity_nm_per_us[0]))
     try:
-        run = scipy_impacts(case.scene, start, impacts, tolerance=tolerance)
-    except ValueError as failure:
+        run = scipy_impacts(case.scene, start, impacts, tolerance=tolerance, method=method)
+    except (ValueError, ModuleNotFoundError) as failure:
         return row | {"microseconds_per_impact": None, "error_us": None, "reason": str(failure)}
     single = BenchmarkScene(case.name, case.scene, chaotic=True)
     errors = sequence_errors(single, run.states)
@@ -180,7 +183,7 @@ def _missed(case: BenchmarkScene, states: NDArray[np.float64]) -> int:
     return int(np.sum(np.asarray(before.time_us[:, 0]) < states[1:, 0] - _MISSED_BY_US))
 
 
-def _slow_ones_first(case: BenchmarkScene, starts: Starts, impacts: int, lanes: int) -> Starts:
+def slow_ones_first(case: BenchmarkScene, starts: Starts, impacts: int, lanes: int) -> Starts:
     """Return the starts with those first whose error is measured: from a median tip to the slowest of 200."""
     rows = iterate_batch(case.scene, starts.time_us, starts.velocity_nm_per_us, impacts)
     approach = case.scene.platform.velocity(rows.time_us) - rows.velocity_before_nm_per_us

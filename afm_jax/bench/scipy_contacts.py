@@ -1,17 +1,19 @@
-"""SciPy's `solve_ivp` with events on one collision, phase by phase in time: the baseline of the contact benchmark.
+"""General-purpose integrators with events on one collision and one driven contact, phase by phase in time.
 
-SciPy's `solve_ivp` with events through one driven contact, phase by phase in time: the baseline of the benchmark.
+SciPy's and SUNDIALS', the baselines of the contact benchmarks.
 """
 
 import math
 import time
+from collections.abc import Sequence
+from itertools import product
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from scipy.integrate import solve_ivp
 
 from afm_jax.apparatus.scene import Scene
+from afm_jax.bench.integrators import Integrator, integrate_to_event, title
 from afm_jax.bench.problems import SingleContacts
 from afm_jax.bench.timing import progress
 from afm_jax.contact.contact import Contact
@@ -61,7 +63,7 @@ def scipy_collision(contact: Contact, approach_speed_nm_per_us: float, *, method
     Args:
         contact: the paper's contact, all effects present.
         approach_speed_nm_per_us: fast enough for the tip to leave.
-        method: of `solve_ivp`.
+        method: see `Integrator`.
         rtol: relative tolerance; the absolute one is a thousandth of it.
 
     Raises:
@@ -74,12 +76,9 @@ def scipy_collision(contact: Contact, approach_speed_nm_per_us: float, *, method
 
     def phase(rates: Any, state: list[float], event: Any) -> tuple[float, np.ndarray]:
         nonlocal count
-        vars(event)["terminal"] = True
-        path = solve_ivp(rates, (0.0, _LONGEST_US), state, method=method, rtol=rtol, atol=1e-3 * rtol, events=event)
-        count += path.nfev
-        if path.status != 1:
-            raise ValueError(f"at {approach_speed_nm_per_us:g} nm/us SciPy ended without an event: {path.message}")
-        return float(path.t_events[0][0]), path.y_events[0][0]
+        met = integrate_to_event(rates, (0.0, _LONGEST_US), state, [event], Integrator(method, rtol, 1e-3 * rtol))
+        count += met.evaluations
+        return met.time, met.state
 
     def in_bridge(_: float, state: np.ndarray) -> list[float]:
         return [state[1], _bridge_force(numbers, state[0], state[1])]
@@ -173,7 +172,7 @@ def scipy_driven_contact(
         arrival_time_us: when the bridge forms.
         approach_speed_nm_per_us: relative to the platform.
         rtol: relative tolerance; the absolute one is a thousandth of it.
-        method: of `solve_ivp`.
+        method: see `Integrator`.
 
     Raises:
         ValueError: if the tip does not leave or SciPy gives up.
@@ -184,15 +183,10 @@ def scipy_driven_contact(
 
     def phase(rates: Any, start_us: float, state: list[float], events: list[Any]) -> tuple[int, float, Any]:
         nonlocal count
-        for event in events:
-            vars(event)["terminal"] = True
         span = (start_us, start_us + _LONGEST_US)
-        path = solve_ivp(rates, span, state, method=method, rtol=rtol, atol=1e-3 * rtol, events=events)
-        count += path.nfev
-        if path.status != 1:
-            raise ValueError(f"at {arrival_time_us:g} us SciPy ended without an event: {path.message}")
-        met = next(place for place, times in enumerate(path.t_events) if len(times))
-        return met, float(path.t_events[met][0]), path.y_events[met][0]
+        met = integrate_to_event(rates, span, state, events, Integrator(method, rtol, 1e-3 * rtol))
+        count += met.evaluations
+        return met.event, met.time, met.state
 
     def in_bridge(now: float, state: np.ndarray) -> list[float]:
         force = _bridge_force(numbers, state[0], state[1])
@@ -220,9 +214,16 @@ def scipy_driven_contact(
 
 
 def scipy_rows(
-    name: str, scene: Scene, reference: Simulation, single: SingleContacts, count: int
+    name: str,
+    scene: Scene,
+    reference: Simulation,
+    single: SingleContacts,
+    count: int,
+    *,
+    methods: Sequence[str] = ("DOP853",),
+    tolerances: Sequence[float] = (1e-6, 1e-9),
 ) -> list[dict[str, Any]]:
-    """Measure SciPy on a few single contacts, flights not included; half of them turn where some do.
+    """Measure integrators on a few single contacts, flights not included; half of them turn where some do.
 
     Args:
         name: what the scene is called in the rows.
@@ -230,6 +231,8 @@ def scipy_rows(
         reference: the contacts, each the first of its tip.
         single: the same contacts, and which of them turn.
         count: how many to follow.
+        methods: see `Integrator`.
+        tolerances: relative ones.
     """
     contacts = reference.contacts
     ended = np.asarray(contacts.kind)[:, 0] == ContactKind.IMPACT
@@ -237,18 +240,18 @@ def scipy_rows(
     half = count // 2 if groups[1].size else 0
     tips = [*groups[0][: count - half], *groups[1][:half]]
     rows = []
-    for rtol in (1e-6, 1e-9) if tips else ():
-        progress(f"bench: scenes, {name}, SciPy DOP853 {rtol:g}")
+    for method, rtol in product(methods, tolerances) if tips else ():
+        progress(f"bench: scenes, {name}, {title(method)} {rtol:g}")
         columns = (contacts.arrival_time_us, contacts.approach_speed_nm_per_us)
         began = [tuple(float(column[tip, 0]) for column in columns) for tip in tips]
-        runs = [scipy_driven_contact(scene, *state, rtol=rtol) for state in began]
+        runs = [scipy_driven_contact(scene, *state, rtol=rtol, method=method) for state in began]
         expected = [
             np.asarray(column)[tips, 0] for column in (contacts.rebound_speed_nm_per_us, contacts.departure_time_us)
         ]
         rebound = np.abs(np.array([run.rebound_speed_nm_per_us for run in runs]) / expected[0] - 1.0)
         left = np.abs(np.array([run.departure_time_us for run in runs]) - expected[1])
         row: dict[str, Any] = {
-            "what": f"SciPy DOP853 with events, the contact alone, rtol {rtol:g}",
+            "what": f"{title(method)} with events, the contact alone, rtol {rtol:g}",
             "scene": name,
             "batch": 1,
             "contacts": len(runs),

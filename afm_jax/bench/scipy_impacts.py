@@ -1,4 +1,4 @@
-"""The same problem with SciPy's general-purpose integrator: `solve_ivp` with an event, restarted after every impact."""
+"""The same problem with general-purpose integrators, SciPy's or SUNDIALS': an event, restarted after every impact."""
 
 import math
 import time
@@ -6,18 +6,18 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.integrate import solve_ivp
 
 from afm_jax.apparatus.scene import Scene
+from afm_jax.bench.integrators import Integrator, integrate_to_event
 from afm_jax.impact.law import impact_law_of
 
 _STEPS_A_PERIOD = 3
-"""At least so many: SciPy sees an event by its signs at the ends of a step, and longer ones would miss impacts."""
+"""At least so many: an event is seen by its signs at the ends of a step, and longer ones would miss impacts."""
 _LONGEST_FLIGHT_PERIODS = 50
 
 
 class ScipyRun(NamedTuple):
-    """Impacts by SciPy.
+    """Impacts by a general-purpose integrator.
 
     ``states``: time in us and velocity after, shape (impacts + 1, 2), the start first; ``seconds``: time taken;
     ``evaluations``: of the equation of motion, over all impacts.
@@ -38,7 +38,7 @@ def scipy_impacts(
         start: time in us and velocity just after an impact.
         impacts: how many.
         tolerance: relative and absolute tolerance, the latter in nm and nm/us.
-        method: one of `solve_ivp`'s.
+        method: see `Integrator`.
 
     Raises:
         ValueError: if the tip is captured or meets no platform within 50 drive periods.
@@ -91,23 +91,18 @@ def _next(k: _Constants, start: tuple[float, float], tolerance: float, method: s
         # the start itself is no event, whatever rounding makes of its gap of 0
         return state[0] - k.offset - k.amplitude * math.cos(k.drive * t) if t > t1 else 1.0
 
-    gap.__dict__.update(terminal=True, direction=-1.0)
-    flight = solve_ivp(
+    flight = integrate_to_event(
         motion,
         (t1, t1 + _LONGEST_FLIGHT_PERIODS * period),
         (k.offset + k.amplitude * math.cos(k.drive * t1), velocity),
-        method=method,
-        events=gap,
-        rtol=tolerance,
-        atol=tolerance,
-        max_step=period / _STEPS_A_PERIOD,
+        [gap],
+        Integrator(method, tolerance, tolerance, period / _STEPS_A_PERIOD),
+        direction=-1.0,
     )
-    if flight.status != 1:
-        raise ValueError(f"SciPy found no impact within {_LONGEST_FLIGHT_PERIODS} drive periods after {t1:g} us")
-    arrival = float(flight.t_events[0][0])
+    arrival = flight.time
     platform_velocity = -k.amplitude * k.drive * math.sin(k.drive * arrival)
-    approach = platform_velocity - float(flight.y_events[0][0][1])
+    approach = platform_velocity - float(flight.state[1])
     square = (k.r * approach) ** 2 - k.viscous_loss * approach - k.epsilon
     if approach <= 0.0 or square <= 0.0:
         raise ValueError(f"the platform captures the tip at {arrival:g} us")
-    return (arrival, platform_velocity + math.sqrt(square)), flight.nfev
+    return (arrival, platform_velocity + math.sqrt(square)), flight.evaluations

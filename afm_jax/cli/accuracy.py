@@ -72,7 +72,7 @@ COLLIDE_FULL = {
     "steps": [2, 8],
     "batch": 500,
     "repetitions": 3,
-    "scipy_speeds": [12.0, 30.0, 100.0],
+    "integrators": [["DOP853", "LSODA"], [12.0, 30.0, 100.0]],
 }
 COLLIDE_QUICK = {
     "tolerances": [1e-6],
@@ -81,12 +81,53 @@ COLLIDE_QUICK = {
     "steps": [],
     "batch": 8,
     "repetitions": 1,
-    "scipy_speeds": [30.0],
+    "integrators": [["DOP853", "LSODA"], [30.0]],
 }
+
+_INTEGRATORS = ["DOP853", "LSODA", "Radau", "CVODE Adams"]
+_LEVELS = {"accuracies": [1e-3, 1e-5, 1e-6, 1e-9, 1e-11], "integrators": _INTEGRATORS, "repetitions": 3}
+_STEPS_DOWN = [1e-4, 1e-6, 1e-8, 1e-10, 1e-12]
+OVERVIEW_FULL = {
+    "afm_jax.accuracy.overview:impacts": {
+        "root_tolerances_us": [1e-1, 1e-2, 1e-4, 1e-8, 1e-13],
+        "tolerances": _STEPS_DOWN,
+        "integrators": _INTEGRATORS,
+        "batch": 2000,
+        "impacts": 10,
+        "repetitions": 3,
+    },
+    "afm_jax.accuracy.overview:collisions": _LEVELS
+    | {"tolerances": _STEPS_DOWN, "speeds": [12.0, 30.0, 100.0], "batch": 200},
+    "afm_jax.accuracy.overview:driven_contacts": _LEVELS | {"tolerances": _STEPS_DOWN, "contacts": 6, "batch": 200},
+    "afm_jax.accuracy.overview:orbits": {
+        "tolerances": _STEPS_DOWN,
+        "integrators": _INTEGRATORS,
+        "batch": 1000,
+        "repetitions": 3,
+    },
+    "fitting.benchmark:minimum_accuracy": {
+        "rows": 60,
+        "settled": [1e0, 1e-3, 1e-6, 1e-10, 1e-16, 1e-22],
+        "tolerances": [1e-2, 1e-4, 1e-8, 1e-12, 1e-15],
+        "repetitions": 3,
+    },
+}
+"""The studies of the overview, each run in a process of its own, and their settings."""
+_FEW = {"tolerances": [1e-8], "integrators": ["DOP853"], "repetitions": 1}
+OVERVIEW_QUICK = {
+    "afm_jax.accuracy.overview:impacts": _FEW | {"root_tolerances_us": [1e-1, 1e-13], "batch": 20, "impacts": 3},
+    "afm_jax.accuracy.overview:collisions": _FEW | {"accuracies": [1e-9], "speeds": [30.0], "batch": 8},
+    "afm_jax.accuracy.overview:driven_contacts": _FEW | {"accuracies": [1e-6], "contacts": 1, "batch": 4},
+    "afm_jax.accuracy.overview:orbits": _FEW | {"batch": 10},
+    "fitting.benchmark:minimum_accuracy": {"rows": 20, "settled": [1e-10], "tolerances": [1e-8], "repetitions": 1},
+}
+OVERVIEW_COLUMNS = ("problem", "method", "setting", "microseconds", "error", "reason")
+"""What `accuracy.csv` tells of a method."""
+WANTED = [1e-3, 1e-6, 1e-9, 1e-11]
 
 
 @click.command()
-@click.argument("study", default="map", metavar="[map|collide|SCENE.toml]")
+@click.argument("study", required=False, metavar="[map|collide|SCENE.toml]")
 @click.option(
     "--wanted-error-us",
     type=click.FloatRange(min=0.0, min_open=True),
@@ -111,9 +152,12 @@ COLLIDE_QUICK = {
 @click.option("--quick", is_flag=True, help="Few and small measurements: to see that it works.")
 @with_session
 def command(
-    session: Session, study: str, wanted_error_us: float, accuracy: float, *, contacts: int, quick: bool
+    session: Session, study: str | None, wanted_error_us: float, accuracy: float, *, contacts: int, quick: bool
 ) -> None:
-    """Show the error of impacts against the time they take: of the map, of `collide`, or of one scene.
+    """Show errors against the time they take: of everything in one overview, the map, `collide`, or one scene.
+
+    Without an argument: impacts, collisions, driven contacts, orbits, fits and gradients, and general-purpose
+    integrators of SciPy, Diffrax and SUNDIALS (extra `sundials`) beside them; some minutes.
 
     map: root tolerances in float32 and float64, and SciPy's solve_ivp with events, on three scenes: regular, near
     grazing with chatter, and of order 5; errors are against 50 digits. collide: Diffrax solvers with fixed and adaptive
@@ -123,6 +167,9 @@ def command(
     amplitude. With --out accuracy.csv, accuracy.json, accuracy.png (a scene: ladder.csv too).
     """
     session.start_computing()
+    if study is None:
+        overview_study(session, quick=quick)
+        return
     if study not in {"map", "collide"}:
         if not is_scene(study):
             raise click.UsageError(f"there is no accuracy study of `{study}`; choose: map, collide, or a scene file")
@@ -154,6 +201,51 @@ def command(
         f"root tolerance {result['default_root_tolerance_us']:g} us.",
         *(cheapest_sentence(choice, wanted_error_us) for choice in cheapest),
     )
+
+
+def overview_study(session: Session, *, quick: bool) -> None:
+    """Run and show what each digit costs in everything."""
+    from afm_jax.accuracy.overview import cheapest  # noqa: PLC0415
+    from afm_jax.bench.timing import run_in_own_process  # noqa: PLC0415
+    from afm_jax.strict_json import strict_json  # noqa: PLC0415
+
+    rows: list[dict[str, Any]] = []
+    references: dict[str, dict[str, Any]] = {}
+    with session.working("measuring (some minutes)"):
+        for task, settings in (OVERVIEW_QUICK if quick else OVERVIEW_FULL).items():
+            found = run_in_own_process(task, settings, cores=1)
+            rows, references = rows + found["rows"], references | found["references"]
+    choices = cheapest(rows, WANTED)
+    payload = {"rows": rows, "references": references, "cheapest": choices}
+    session.write_table("accuracy.csv", rows, OVERVIEW_COLUMNS)
+    if session.out is not None:
+        from afm_jax.plots.accuracy import overview_figure  # noqa: PLC0415
+        from afm_jax.plots.picture_style import save  # noqa: PLC0415
+
+        write_whole(session.out / "accuracy.json", strict_json(payload) + "\n")
+        save(overview_figure(rows, references), session.out / "accuracy.png")
+        session.note(f"wrote {session.out / 'accuracy.json'} and {session.out / 'accuracy.png'}")
+    told = [
+        f"{problem}: error of the {known['error_of']}, against {known['reference']}, itself known to "
+        f"{known['reference_error']:.0e}"
+        for problem, known in references.items()
+    ]
+    session.emit(payload, overview_table(choices), *told)
+
+
+def overview_table(choices: Sequence[dict[str, Any]]) -> "Table":
+    """Return what each wanted error costs, here and elsewhere."""
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table(title="The fastest way to a wanted error (one core)", title_justify="left")
+    for heading in ("problem", "error", "here", "us", "others", "us"):
+        table.add_column(heading, justify="right" if heading in {"error", "us"} else "left")
+    for row in choices:
+        cells = [row["problem"], f"{row['wanted_error']:g}"]
+        for who in ("own", "other"):
+            cells += [row[who] or "none", known(row[f"{who}_microseconds"])]
+        table.add_row(*cells)
+    return table
 
 
 def is_scene(name: str) -> bool:

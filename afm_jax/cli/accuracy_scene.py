@@ -73,12 +73,12 @@ def scene_to_study(name: str) -> "tuple[Scene, State]":
         ValueError: if the tip never meets anything, or the file is wrong.
     """
     from afm_jax.cli.values import scene_and_start  # noqa: PLC0415
-    from afm_jax.motion.start import default_start, start_of  # noqa: PLC0415
+    from afm_jax.motion.start import start_of  # noqa: PLC0415
 
     scene, told = scene_and_start(name)
     if scene.interaction is None:
         raise ValueError(f"{name}: the cantilever is free: its motion is a closed form and has no contacts to measure")
-    return scene, default_start(scene) if told is None else start_of(scene, told)
+    return scene, start_of(scene, told)
 
 
 def followed(scene: "Scene", start: "State", duration_us: float, contacts: int) -> "Simulation":

@@ -9,30 +9,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from afm_jax.cli.values import ValueAndError
+from fitting.parameters import DELAY, LAW, MODELS, NUISANCE_NAMES, NUISANCES, PARAMETERS, model_parameters
 
 if TYPE_CHECKING:
     from fitting.experiments.belief import Belief
 
-MODELS = (
-    *("restitution", "law", "viscous"),
-    *("restitution+delay", "law+delay", "viscous+delay"),
-    "contact",
-)
-_LAW = {
-    "r": "coefficient of restitution",
-    "epsilon": "adhesion, nm^2/us^2",
-    "viscous_loss": "loss linear in speed, nm/us",
-    "delay_hertz": "Hertz contact time at 1 nm/us, us",
-    "delay_lead_nm": "lead of a slow way out",
-    "delay_offset_nm": "offset of the contact surface, twice",
-}
-_INSTRUMENT = {
-    "quality_factor": ("of the cantilever, such as '40 +- 2'; none: no air damping.", "40 +- 2"),
-    "tip_calibration": ("measured over true amplitude of the tip, such as '1 +- 0.02'.", "1 +- 0.02"),
-    "drive_calibration": ("true over stated amplitude of the platform, such as '1 +- 0.02'.", "1 +- 0.02"),
-    "offset_origin_nm": ("what the offsets lack, such as '0 +- 0.3'; not with a delay.", "0 +- 0.3"),
-}
-_BELONG = ("free_frequency_khz", "mass_ng", "free", "value", *_LAW, *_INSTRUMENT)
+_LAW = tuple(parameter.name for parameter in (*LAW, *DELAY))
+_REMARKS = {"quality_factor": "; none: no air damping", "offset_origin_nm": "; not with a delay"}
+_BELONG = ("free_frequency_khz", "mass_ng", "free", "value", *_LAW, *NUISANCE_NAMES)
 
 
 class BeliefOptions(NamedTuple):
@@ -77,9 +61,11 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
         return function(*args, belief_options=BeliefOptions(fit, measured, model, uncertainty, given), **options)
 
     # click lists options in the order of the decorators, the last one first
-    for name, (what, _) in list(_INSTRUMENT.items())[::-1]:
-        command = click.option(_option(name), type=ValueAndError(), metavar="X", help=what)(command)
-    for name, what in list(_LAW.items())[::-1]:
+    for nuisance in NUISANCES[::-1]:
+        what = f"{nuisance.meaning}, such as '{nuisance.example}'{_REMARKS.get(nuisance.name, '')}."
+        command = click.option(_option(nuisance.name), type=ValueAndError(), metavar="X", help=what)(command)
+    for name in _LAW[::-1]:
+        what = ", ".join(filter(None, (PARAMETERS[name].meaning, PARAMETERS[name].unit)))
         command = click.option(_option(name), type=float, metavar="X", help=f"{what}; else the paper's.")(command)
     value = "--value", "value"
     for decorate in (
@@ -143,7 +129,6 @@ def believed(options: BeliefOptions, noise: float) -> "Belief":
 
 def _from_values(options: BeliefOptions) -> "Belief":
     from fitting.experiments.belief import believe  # noqa: PLC0415
-    from fitting.models import model_parameters  # noqa: PLC0415
 
     numbers, model, free = options.numbers, options.model or "law+delay", _names(options)
     if "free_frequency_khz" not in numbers:
@@ -152,16 +137,16 @@ def _from_values(options: BeliefOptions) -> "Belief":
     own = model_parameters(model, free)
     contact = dict(numbers.get("value", ()))
     values = {name: value for name, value in numbers.items() if name in _LAW}
-    for name, (_, example) in _INSTRUMENT.items():
+    for name in NUISANCE_NAMES:
         if name != "quality_factor" and name in numbers and numbers[name][1] is None:
-            raise click.UsageError(f"{_option(name)} needs its standard error; write '{example}'")
+            raise click.UsageError(f"{_option(name)} needs its standard error; write '{PARAMETERS[name].example}'")
     return believe(
         model,
         free_frequency_khz=numbers["free_frequency_khz"],
         quality_factor=quality_factor,
         mass_ng=numbers.get("mass_ng", 1.0),
         values=values | {name: value for name, value in contact.items() if name in own},
-        constraints={name: numbers[name] for name in _INSTRUMENT if numbers.get(name, (0, None))[1] is not None},
+        constraints={name: numbers[name] for name in NUISANCE_NAMES if numbers.get(name, (0, None))[1] is not None},
         free=free,
         fixed={name: value for name, value in contact.items() if name not in own},
         uncertainty=options.uncertainty,

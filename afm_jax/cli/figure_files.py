@@ -43,7 +43,7 @@ def write_figure(number: str, figure: FigureData | ContactFigure | MotionFigure,
             folder / picture,
             title=_CHART_TITLES[number],
             compared_with=figure.compared_with,
-            limit_nm=adhesion_limit_nm(data.reduced_frequency) if number == "3" else None,
+            limit_nm=adhesion_limit_nm(data.x_values) if number == "3" else None,
         )
         columns = stability_regions.TABLE_COLUMNS
     write_csv(folder / table, data.table(), columns)

@@ -11,13 +11,14 @@ import click
 
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import Share, parse_around_plus_minus, parse_number
+from afm_jax.cli.values import Ends, Share, parse_around_plus_minus, parse_number
 from afm_jax.contact.parameters import EFFECTS, REMOVABLE_EFFECTS, idle_without
 from afm_jax.words import text_table
+from fitting.parameters import CONTACT_DEFAULT, DELAY_LAW, LAWS, MODELS, NUISANCE_NAMES
 
 if TYPE_CHECKING:
+    from fitting.fits.fit import Found
     from fitting.fits.result import FitResult
-    from fitting.tables.table import AmplitudeTable
 
 
 class Fixed(click.ParamType):
@@ -81,9 +82,6 @@ class Names(click.ParamType):
         return names
 
 
-MODELS = ("restitution", "law", "viscous", "restitution+delay", "law+delay", "viscous+delay", "contact")
-
-
 @click.command()
 @click.argument("table", metavar="[TABLE.csv]", required=False, type=click.Path(path_type=Path))
 @click.option(
@@ -91,8 +89,8 @@ MODELS = ("restitution", "law", "viscous", "restitution+delay", "law+delay", "vi
     default="law",
     show_default=True,
     type=click.Choice(MODELS),
-    help="restitution: r alone; law: r and epsilon; viscous: epsilon and viscous_loss; each with the collision delay "
-    "(+delay), which amplitudes near resonance need; contact: physical parameters through the resolved contact.",
+    help="; ".join(f"{name}: {law.meaning}" for name, law in LAWS.items())
+    + f"; each with {DELAY_LAW.meaning} (+delay); contact: physical parameters through the resolved contact.",
 )
 @click.option(
     "--noise",
@@ -110,8 +108,7 @@ MODELS = ("restitution", "law", "viscous", "restitution+delay", "law+delay", "vi
     "--free",
     type=Names(),
     metavar="NAME,...",
-    help="contact: the parameters that are fitted; if left out relative_humidity,adhesion_energy_j_per_m2,"
-    "viscosity_pa_s,modulus_gpa.",
+    help=f"contact: the parameters that are fitted; if left out {','.join(CONTACT_DEFAULT)}.",
 )
 @click.option("--fix", type=Fixed(), multiple=True, metavar="NAME=VALUE", help="contact: a value not the paper's.")
 @click.option(
@@ -119,8 +116,13 @@ MODELS = ("restitution", "law", "viscous", "restitution+delay", "law+delay", "vi
     type=Constraint(),
     multiple=True,
     metavar="NAME=VALUE+-ERROR",
-    help="What is known beforehand: quality_factor, tip_calibration, drive_calibration, offset_origin_nm, or a "
-    "parameter of the model.",
+    help=f"What is known beforehand: {', '.join(NUISANCE_NAMES)}, or a parameter of the model.",
+)
+@click.option(
+    "--speeds",
+    type=Ends(),
+    metavar="LOW:HIGH",
+    help="Give the closest r and epsilon of eq. 6 over these approach speeds in nm/us, too.",
 )
 @click.option("--no", "left_out", type=Names(), metavar="EFFECT,...", help="contact: effects that it does not have.")
 @click.option("--compare", "comparing", is_flag=True, help="Fit the rival models too and say what the table can tell.")
@@ -150,15 +152,16 @@ def command(session: Session, table: Path | None, model: str, noise: float | Non
         raise click.UsageError(f"{both}give a table to fit, `afm-jax fit TABLE.csv`, or --example for the bundled one")
     settings = _settings(model, options)
     session.start_computing(*(f"fitting.forward:{name}" for name in ("impacts_of", "located", "linearise_pairs")))
-    from fitting.fits.fit import fit  # noqa: PLC0415
+    from fitting.fits.fit import find_fit, summarise  # noqa: PLC0415
     from fitting.report.report import summary  # noqa: PLC0415
     from fitting.tables.table import read_table  # noqa: PLC0415
 
     measured = read_table(_example_path() if table is None else table, noise=noise)
     first = "the first run compiles for half a minute" if "delay" in model or model == "contact" else "some seconds"
     with session.working(f"fitting {measured.rows} rows, model {model} ({first})"):
-        result = fit(measured, model, **settings)
-    extras, failure = _extras(session, measured, result, settings, options)
+        found = find_fit(measured, model, **settings)
+        result = summarise(measured, found)
+    extras, failure = _extras(session, found, result, settings, options)
     payload = result.to_dict() | {name: extra.to_dict() for name, extra in extras.items()}
     session.emit(payload, summary(result), *(_words(name, extra) for name, extra in extras.items()))
     if session.out is not None:
@@ -184,6 +187,7 @@ def _settings(model: str, options: dict[str, Any]) -> dict[str, Any]:
     settings: dict[str, Any] = {
         "scale_errors": options["scale_errors"],
         "robust": options["robust"],
+        "speeds": options.get("speeds"),
         "constraints": dict(options["constrain"]),
     }
     if model == "contact":
@@ -204,8 +208,6 @@ def _effects(left_out: tuple[str, ...]) -> tuple[str, ...]:
 
 def _usual_parameters(fixed: dict[str, float], effects: tuple[str, ...]) -> tuple[str, ...]:
     """Return which parameters are fitted if the call names none: the usual ones that are neither fixed nor idle."""
-    from fitting.models import CONTACT_DEFAULT  # noqa: PLC0415
-
     chosen = [name for name in CONTACT_DEFAULT if name not in fixed and not idle_without(name, effects)]
     if not chosen:
         raise click.UsageError("--fix holds every parameter that is usually fitted; name others to fit with --free")
@@ -229,7 +231,7 @@ def _check_contact_options(free: tuple[str, ...], fixed: dict[str, float], effec
 
 
 def _extras(
-    session: Session, table: "AmplitudeTable", result: "FitResult", settings: dict[str, Any], options: dict[str, Any]
+    session: Session, found: "Found", result: "FitResult", settings: dict[str, Any], options: dict[str, Any]
 ) -> tuple[dict[str, Any], Exception | None]:
     """Return what was asked for besides the fit, as far as it came, and what ended it: the fit itself stands."""
     extras: dict[str, Any] = {}
@@ -238,7 +240,7 @@ def _extras(
             session.note(f"no {name}: the fit is not valid")
     try:
         if options["comparing"]:
-            extras["comparison"] = _comparison(session, table, result.model, settings)
+            extras["comparison"] = _comparison(session, found, result, settings)
         if options["bootstrap"] and result.valid:
             extras["bootstrap"] = _bootstrap(session, result, options["bootstrap"], options["seed"])
         if options["posterior"] and result.valid:
@@ -248,12 +250,12 @@ def _extras(
     return extras, None
 
 
-def _comparison(session: Session, table: "AmplitudeTable", model: str, settings: dict[str, Any]) -> Any:
+def _comparison(session: Session, found: "Found", result: "FitResult", settings: dict[str, Any]) -> Any:
     from fitting.fits.comparison import compare, rivals  # noqa: PLC0415
 
-    models = rivals(model)
+    models = rivals(result.model)
     with session.working(f"comparing {', '.join(models)}"):
-        return compare(table, models, **settings)
+        return compare(result.table, models, known={result.model: (found, result)}, **settings)
 
 
 def _bootstrap(session: Session, result: "FitResult", samples: int, seed: int) -> Any:

@@ -167,8 +167,11 @@ def _end_when_interrupted() -> threading.Event:
 COMMANDS = {
     "accuracy": ("afm_jax.cli.accuracy", "Show error against time, and the cheapest setting for a wanted accuracy."),
     "bench": ("afm_jax.cli.bench", "Measure impacts per second, next to SciPy."),
+    "bifurcation": ("afm_jax.cli.bifurcation", "Sweep a parameter and record what the tip comes to."),
     "calibrate": ("afm_jax.cli.calibrate", "Fit frequency and quality factor to a free resonance sweep."),
+    "chart": ("afm_jax.cli.chart", "Chart which single-impact orbits are stable over two parameters."),
     "collide": ("afm_jax.cli.collide", "Let free tips collide with the sample: rebound, delay, capture, energy."),
+    "continue": ("afm_jax.cli.continue_orbits", "Follow orbits and their special points through parameters."),
     "design": ("afm_jax.cli.design", "Choose the drives to measure next, and forecast what they will determine."),
     "doctor": ("afm_jax.cli.doctor", "Say what is installed, how JAX computes, and whether its cache works."),
     "effects": ("afm_jax.cli.effects", "Say what each effect of a scene changes and costs, and which can be left out."),
@@ -177,7 +180,8 @@ COMMANDS = {
     "fit-law": ("afm_jax.cli.fit_law", "Fit the impact law and the delay law to a simulated contact."),
     "invert": ("afm_jax.cli.invert", "Read speeds and delay of every impact off amplitude and phase, without a law."),
     "lockin": ("afm_jax.cli.lockin", "Read response order, amplitudes and phase off time traces of the deflection."),
-    "orbits": ("afm_jax.cli.orbits", "Find all single-impact orbits of a scene, and whether they are stable."),
+    "lyapunov": ("afm_jax.cli.lyapunov", "Compute Lyapunov exponents of a motion, or along a parameter."),
+    "orbits": ("afm_jax.cli.orbits", "Find the orbits of a scene, of one impact or more, and whether they are stable."),
     "simulate": ("afm_jax.cli.simulate", "Follow a scene in time: contacts, amplitudes, phases, energies."),
     "verify": ("afm_jax.cli.verify", "Compare eqs. 5 to 8 with automatic differentiation and with 50 digits."),
 }

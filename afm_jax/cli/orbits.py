@@ -1,4 +1,4 @@
-"""`afm-jax orbits SCENE.toml --order N`: all single-impact orbits of a scene."""
+"""`afm-jax orbits SCENE.toml --order N [--impacts m]`: the orbits of a scene."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from afm_jax.apparatus.scene import Scene
+    from afm_jax.dynamics.impact_loop import LoopReading
     from afm_jax.impact.orbits import SingleImpactOrbits
 
 COLUMNS = (
@@ -32,6 +33,20 @@ COLUMNS = (
     "near_double",
 )
 """What is told of an orbit: attributes of `SingleImpactOrbits`."""
+
+
+IMPACT_COLUMNS = (
+    "phase_rad",
+    "velocity_after_nm_per_us",
+    "velocity_before_nm_per_us",
+    "approach_speed_nm_per_us",
+    "rebound_speed_nm_per_us",
+    "delay_us",
+)
+"""What is told of each impact: attributes of `LoopReading`."""
+
+MANY_COLUMNS = (*IMPACT_COLUMNS, "peak_amplitude_nm", "trace", "determinant", "stable", "admissible")
+"""What is told of an orbit of several impacts, of its impacts the first."""
 
 
 class PositiveInteger(click.ParamType):
@@ -60,26 +75,29 @@ class PositiveInteger(click.ParamType):
     type=PositiveInteger(),
     help="Drive periods between two impacts, a positive integer.",
 )
+@click.option(
+    "--impacts",
+    metavar="M",
+    type=PositiveInteger(),
+    help="Impacts in these periods, found by a search from many starts; without it, all single-impact orbits.",
+)
 @with_session
-def command(session: Session, scene: Path, order: int) -> None:
-    """Find all single-impact orbits of a scene.
+def command(session: Session, scene: Path, order: int, impacts: int | None) -> None:
+    """Find all single-impact orbits of a scene, or with --impacts orbits of several impacts.
 
     Of every orbit: impact phase and velocities, peak and lock-in amplitude, whether it is stable, and whether it is
     admissible (its flight stays above the platform). With --out a table orbits.csv. Exit code 3 if none is admissible.
+    With --impacts every impact is told, the hardest first, and the orbit with a rest on the sample if there is one.
     """
     session.start_computing()
-    from afm_jax.impact.law import ImpactLaw  # noqa: PLC0415
     from afm_jax.impact.orbits import single_impact_orbits  # noqa: PLC0415
     from afm_jax.scenefile.scenefile import load_scene, scene_tables  # noqa: PLC0415
 
     loaded = load_scene(scene)
-    if not isinstance(loaded.interaction, ImpactLaw):
-        absent = loaded.interaction is None
-        advice = "a tip that meets nothing has none" if absent else f"`afm-jax fit-law {scene}` gives a contact's law"
-        model = "none" if absent else "contact"
-        raise ValueError(  # noqa: TRY004
-            f'{scene}: [interaction] model: must be "law" here, but is "{model}"; {advice}'
-        )
+    refuse_other_than_law(loaded, scene)
+    if impacts is not None:
+        _many(session, loaded, scene, order, impacts)
+        return
     try:
         with session.working("searching for orbits"):
             found = single_impact_orbits(loaded, order)
@@ -106,6 +124,124 @@ def command(session: Session, scene: Path, order: int) -> None:
         raise NotValid(reason)
 
 
+def refuse_other_than_law(scene: "Scene", path: str | Path) -> None:
+    """Check that a scene's interaction is a law.
+
+    Raises:
+        ValueError: if not; says what gives one.
+    """
+    from afm_jax.impact.law import ImpactLaw  # noqa: PLC0415
+
+    if isinstance(scene.interaction, ImpactLaw):
+        return
+    absent = scene.interaction is None
+    advice = "a tip that meets nothing has none" if absent else f"`afm-jax fit-law {path}` gives a contact's law"
+    raise ValueError(
+        f'{path}: [interaction] model: must be "law" here, but is "{"none" if absent else "contact"}"; {advice}'
+    )
+
+
+def _many(session: Session, scene: "Scene", path: Path, order: int, impacts: int) -> None:
+    """Tell the orbits of several impacts."""
+    from afm_jax.dynamics.impact_orbits import many_impact_orbits, sticking_orbit  # noqa: PLC0415
+    from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
+
+    try:
+        with session.working("searching for orbits (the first run compiles for some seconds)"):
+            found = many_impact_orbits(scene, order, impacts)
+            resting = sticking_orbit(scene)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+    orbits = [orbit_facts(found.reading, index) for index in range(len(found.stable))]
+    rests = None if isinstance(resting, str) else resting._asdict()
+    reason = None
+    if not orbits and (rests is None or rests["order"] != order):
+        reason = why_none(scene, order, rejected=0, impacts=impacts)
+    session.write_table("orbits.csv", [{**orbit, **orbit["impacts"][0]} for orbit in orbits], MANY_COLUMNS)
+    rows = [{"orbit": k, **impact} for k, orbit in enumerate(orbits) for impact in orbit["impacts"]]
+    session.write_table("impacts.csv", rows, ("orbit", *IMPACT_COLUMNS))
+    payload = {
+        "format": "afm-jax orbits",
+        "format_version": 1,
+        "order": order,
+        "impacts": impacts,
+        "scene": scene_tables(scene),
+        "orbits": orbits,
+        "sticking": rests,
+        "sticking_reason": resting if isinstance(resting, str) else None,
+        "reason": reason,
+    }
+    title = (
+        f"Orbits with {impacts} impact{'s' if impacts > 1 else ''} in {order} drive period{'s' if order > 1 else ''}"
+    )
+    words = f"No orbit with a rest: {resting}." if isinstance(resting, str) else _resting_words(payload["sticking"])
+    session.emit(payload, many_table(orbits, title=title), words)
+    if reason is not None:
+        raise NotValid(reason)
+
+
+def _resting_words(rests: Mapping[str, Any]) -> str:
+    return (
+        f"Orbit with a rest on the sample: it repeats after {rests['order']} drive periods, peak "
+        f"{rests['peak_amplitude_nm']:.6g} nm; the sample lets go at a drive phase of {rests['release_phase_rad']:.6g} "
+        f"rad, {rests['impacts']} impacts were followed one by one, the rest of them and the rest take "
+        f"{rests['rest_us']:.4g} us. Its multipliers are 0."
+    )
+
+
+def impact_rows(reading: "LoopReading", index: int | None = None) -> list[dict[str, float]]:
+    """Return what is told of each impact of an orbit; of one of many, or of the only one."""
+    columns = {name: getattr(reading, name) for name in IMPACT_COLUMNS}
+    own = {name: (part if index is None else part[index]).tolist() for name, part in columns.items()}
+    return [dict(zip(own, values, strict=True)) for values in zip(*own.values(), strict=True)]
+
+
+def orbit_facts(reading: "LoopReading", index: int) -> dict[str, Any]:
+    """Return what is told of one orbit of several impacts: the first one's numbers, and all in `impacts`."""
+    import numpy as np  # noqa: PLC0415
+
+    from afm_jax.dynamics.impact_orbits import is_stable, multipliers_of  # noqa: PLC0415
+
+    trace, determinant = float(reading.trace[index]), float(reading.determinant[index])
+    multipliers = multipliers_of(np.asarray(trace), np.asarray(determinant))
+    impacts = impact_rows(reading, index)
+    first = impacts[0] if impacts else dict.fromkeys(IMPACT_COLUMNS)
+    return {
+        "phase_rad": first["phase_rad"],
+        "velocity_after_nm_per_us": first["velocity_after_nm_per_us"],
+        "peak_amplitude_nm": float(reading.peak_amplitude_nm[index]),
+        "trace": trace,
+        "determinant": determinant,
+        "multipliers": [[float(one.real), float(one.imag)] for one in multipliers],
+        "stable": bool(is_stable(multipliers)),
+        "admissible": bool(reading.admissible[index]),
+        "impacts": impacts,
+    }
+
+
+def many_table(orbits: Sequence[Mapping[str, Any]], *, title: str) -> "Table":
+    """Return orbits of several impacts as a table to print, a line an impact."""
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table(title=title, title_justify="left")
+    for column in ("orbit", "phase\nrad", "velocity after\nnm/us", "approach\nnm/us", "rebound\nnm/us", "delay\nus"):
+        table.add_column(column, justify="right")
+    for column in ("peak\nnm", "multipliers", "stable"):
+        table.add_column(column, justify="right")
+    shown = ("phase_rad", "velocity_after_nm_per_us", "approach_speed_nm_per_us", "rebound_speed_nm_per_us", "delay_us")
+    for number, orbit in enumerate(orbits):
+        sizes = ", ".join(f"{complex(*one):.4g}" if one[1] else f"{one[0]:.4g}" for one in orbit["multipliers"])
+        for place, impact in enumerate(orbit["impacts"]):
+            whole = (f"{orbit['peak_amplitude_nm']:.6g}", sizes, "yes" if orbit["stable"] else "no")
+            first = place == 0
+            table.add_row(
+                str(number) if first else "",
+                *(f"{impact[name]:.6g}" for name in shown),
+                *(whole if first else ("",) * 3),
+            )
+    return table
+
+
 def orbit_rows(found: "SingleImpactOrbits") -> list[dict[str, Any]]:
     """Return the orbits that exist as one dict of plain numbers each, by rising approach speed."""
     columns = {name: getattr(found, name).tolist() for name in COLUMNS}
@@ -113,14 +249,20 @@ def orbit_rows(found: "SingleImpactOrbits") -> list[dict[str, Any]]:
     return [{name: values[slot] for name, values in columns.items()} for slot in slots]
 
 
-def why_none(scene: "Scene", order: int, *, rejected: int) -> str:
+def why_none(scene: "Scene", order: int, *, rejected: int, impacts: int = 1) -> str:
     """Return a sentence on why a scene has no admissible orbit of an order, and what to try.
 
     Args:
         scene: a scene with an impact law.
         order: N, drive periods between impacts.
         rejected: how many orbits would close if the tip could pass through the platform.
+        impacts: m, impacts in an orbit.
     """
+    if impacts > 1:
+        return (
+            f"the search found no orbit of {impacts} impacts in {order} drive periods; `afm-jax orbits --order` and "
+            "`afm-jax continue` say where orbits of one impact double their period"
+        )
     reduced = float(scene.platform.frequency_khz) / (2.0 * float(scene.cantilever.frequency_khz))
     nearest = max(1, round(reduced))
     what = (

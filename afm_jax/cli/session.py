@@ -17,7 +17,8 @@ import io
 import math
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,10 +48,14 @@ def prepare_folder(folder: Path) -> None:
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> None:
     """Write rows as CSV; numbers with all their digits, true and false in words, what is unknown as an empty cell."""
+    _write_rows(path, columns, ([_cell(row.get(column)) for column in columns] for row in rows))
+
+
+def _write_rows(path: Path, head: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows([_cell(row.get(column)) for column in columns] for row in rows)
+    writer.writerow(head)
+    writer.writerows(rows)
     write_whole(path, text.getvalue())
 
 
@@ -63,6 +68,16 @@ def _cell(value: Any) -> Any:
     return plain
 
 
+def _cells(column: Any) -> Any:
+    """Return the cells of a column, many at a time."""
+    if not hasattr(column, "dtype") or column.dtype.kind not in "fb":
+        return (_cell(value) for value in column)
+    if column.dtype.kind == "b":
+        return ("true" if value else "false" for value in column.tolist())
+    return (value if math.isfinite(value) else "" for value in column.tolist())
+
+
+_SECONDS_BETWEEN_NOTES = 2.0
 _WIDTH_OF_A_PIPE = 160
 """Columns of text that nobody looks at in a terminal; wide enough that no table is cut."""
 
@@ -112,6 +127,18 @@ class Session:
         """Write a message to standard error."""
         _console(stderr=True).print(shown(message), markup=False, highlight=False, soft_wrap=True)
 
+    def progress(self, what: str) -> Callable[[int, int], None]:
+        """Return what tells on standard error how much is done, every two seconds at most."""
+        last = time.monotonic()
+
+        def report(done: int, total: int) -> None:
+            nonlocal last
+            if time.monotonic() - last > _SECONDS_BETWEEN_NOTES:
+                last = time.monotonic()
+                self.note(f"{done} of {total} {what}")
+
+        return report
+
     def working(self, what: str) -> AbstractContextManager[object]:
         """Show on standard error what is being done, for as long as it takes, if that is a terminal."""
         return _console(stderr=True).status(shown(what))
@@ -145,6 +172,18 @@ class Session:
         if self.out is not None:
             write_csv(self.out / name, rows, columns)
             self.note(f"wrote {self.out / name}")
+
+    def write_columns(self, name: str, columns: Mapping[str, Any]) -> None:
+        """Write a long table as CSV into the `--out` folder, if there is one, and say so.
+
+        Args:
+            name: file name.
+            columns: lists or arrays of one length, in order; what is not finite stays empty.
+        """
+        if self.out is None:
+            return
+        _write_rows(self.out / name, columns, zip(*map(_cells, columns.values()), strict=True))
+        self.note(f"wrote {self.out / name}")
 
 
 def with_session(function: Callable[..., Any]) -> Callable[..., Any]:

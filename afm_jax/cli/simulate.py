@@ -13,9 +13,9 @@ METHODS = ("collocation", "diffrax")
 
 if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
-    from afm_jax.motion.record import State
     from afm_jax.motion.settle import LongRun
     from afm_jax.motion.trajectory import DensePath
+    from afm_jax.scenefile.scenefile import Start
 
 DEFAULT_PERIODS = 2000
 """Drive periods followed at most where no duration is given."""
@@ -105,10 +105,8 @@ def command(  # noqa: PLR0913
     from afm_jax.apparatus.scene import drive_of  # noqa: PLC0415
     from afm_jax.cli.values import scene_and_start  # noqa: PLC0415
     from afm_jax.motion.observe import observe  # noqa: PLC0415
-    from afm_jax.motion.start import start_of  # noqa: PLC0415
 
     loaded, told = scene_and_start(scene)
-    start = None if told is None else start_of(loaded, told)
     period = drive_of(loaded).period_us
     until_settled = until_settled or (duration_us is None and periods is None)
     longest = duration_us if duration_us is not None else (periods or DEFAULT_PERIODS) * period
@@ -116,7 +114,7 @@ def command(  # noqa: PLR0913
     try:
         _check_ramp(loaded, longest)
         _check_length(loaded, longest)
-        run = _follow(session, loaded, start, longest, settings)
+        run = _follow(session, loaded, told, longest, settings)
         with session.working("reading amplitudes"):
             dense = _dense(loaded, run, to_files=session.out is not None)
             seen = observe(loaded, run.simulation, harmonics=harmonics, verdict=run.verdict, dense=dense)
@@ -172,13 +170,13 @@ def _check_length(scene: "Scene", duration_us: float) -> None:
 def _follow(
     session: Session,
     scene: "Scene",
-    start: "State | None",
+    told: "Start | None",
     longest_us: float,
     settings: dict[str, Any],
 ) -> "LongRun":
     """Return the simulation; progress of long runs goes to standard error."""
     from afm_jax.motion.settle import follow_long  # noqa: PLC0415
-    from afm_jax.motion.start import default_start  # noqa: PLC0415
+    from afm_jax.motion.start import start_of  # noqa: PLC0415
 
     pieces = 0
 
@@ -189,9 +187,7 @@ def _follow(
             session.note(f"at {time_us:.6g} us, after {contacts} contacts")
 
     with session.working("simulating (the first run compiles for some seconds)"):
-        if start is None:
-            start = default_start(scene)
-        run = follow_long(scene, start, longest_us, report=report, **settings)
+        run = follow_long(scene, start_of(scene, told), longest_us, report=report, **settings)
     if int(run.simulation.outcome) == _invalid_start():
         raise ValueError("the tip cannot start there: the start is not finite, or inside the sample")
     return run

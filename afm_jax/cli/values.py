@@ -4,6 +4,7 @@ The argument SCENE.toml|PRESET: a scene file, or one of the paper's scenes by it
 """
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ import click
 
 if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
+    from afm_jax.scenefile.parameter_paths import ParameterRange
     from afm_jax.scenefile.scenefile import Start
 
 
@@ -122,6 +124,23 @@ class ValueAndError(click.ParamType):
         if len(numbers) > 2 or (len(numbers) == 2 and numbers[1] <= 0.0):
             self.fail(f"`{value}` is no value with a positive error; write '40 +- 2'", param, ctx)
         return numbers[0], numbers[1] if len(numbers) == 2 else None
+
+
+class PictureFormat(click.ParamType):
+    """The suffix of a picture: png, pdf or svg."""
+
+    name = "format"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> str:
+        """Return the suffix without its dot.
+
+        Raises:
+            click.BadParameter: if it is another one.
+        """
+        suffix = str(value).lower().removeprefix(".")
+        if suffix not in ("png", "pdf", "svg"):
+            self.fail(f"must be png, pdf or svg, but is {value}", param, ctx)
+        return suffix
 
 
 def parse_numbers(text: str, what: str = "number", *, positive: bool = False) -> tuple[float, ...]:
@@ -273,3 +292,25 @@ def scene_and_start(name: str) -> "tuple[Scene, Start | None]":
     if name not in PRESETS:
         raise ValueError(f"{name}: there is no such file or preset; presets are {', '.join(PRESETS)}")
     return preset(name), preset_start(name)
+
+
+def ranges_of(name: str, scene: "Scene", texts: Sequence[str], *, counted: bool) -> "list[ParameterRange]":
+    """Return the ranges of a scene's parameters that options give.
+
+    Args:
+        name: of the scene, for messages.
+        scene: the scene.
+        texts: PARAMETER=low:high:count, or without count.
+        counted: whether with count.
+
+    Raises:
+        ValueError: if one is no range, or the scene lacks a parameter or cannot be at an end.
+    """
+    from afm_jax.scenefile.parameter_paths import check_ranges, parse_range  # noqa: PLC0415
+
+    ranges = [parse_range(text, counted=counted) for text in texts]
+    try:
+        check_ranges(scene, *ranges)
+    except ValueError as error:
+        raise ValueError(f"{name}: {error}") from error
+    return ranges

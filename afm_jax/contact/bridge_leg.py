@@ -50,7 +50,7 @@ class Exit(NamedTuple):
     scale_nm: Float[Array, "..."]
     start_y: Float[Array, "..."]
     length: Float[Array, "..."]
-    sense: float
+    sense: float | Float[Array, ""]
 
     def at(self, share: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Return the gap, and the path |dD| per share."""
@@ -99,7 +99,7 @@ class Way(NamedTuple):
     """A way through the bridge; made by `way_through`."""
 
     tip: Driven
-    sense: float
+    sense: float | Float[Array, ""]
     """+1 on the way in, -1 on the way out."""
     begin_us: Float[Array, "..."]
     total_aj: Float[Array, "..."]
@@ -110,7 +110,7 @@ class Way(NamedTuple):
     """Kinetic energies below count as this much; None: a tip without any has stopped, and nothing goes on."""
 
     @property
-    def inward(self) -> bool:
+    def inward(self) -> bool | Bool[Array, ""]:
         """Whether the tip approaches."""
         return self.sense > 0.0
 
@@ -158,7 +158,7 @@ def way_through(
     start_energy_aj: Float[Array, "..."],
     margin: Float[Array, "..."],
     *,
-    inward: bool,
+    inward: bool | Bool[Array, ""],
     begin_us: Float[Array, "..."] | float = 0.0,
 ) -> Way:
     """Return a way through the bridge.
@@ -174,11 +174,18 @@ def way_through(
     outer, inner = gaps_nm
     at_outer, at_inner = jnp.sqrt(margin), jnp.sqrt(margin + jnp.log(outer / inner))
     potentials = tip.potential(outer), tip.potential(inner)
-    start, end = potentials if inward else potentials[::-1]
-    sense = 1.0 if inward else -1.0
-    course = Exit(outer * jnp.exp(margin), at_outer if inward else at_inner, at_inner - at_outer, sense)
+    start, end = _either(potentials, potentials[::-1], inward=inward)
+    sense = _either(1.0, -1.0, inward=inward)
+    course = Exit(outer * jnp.exp(margin), _either(at_outer, at_inner, inward=inward), at_inner - at_outer, sense)
     total = start_energy_aj + start
     return Way(tip, sense, jnp.asarray(begin_us, total.dtype), total, end, course)
+
+
+def _either(one: Any, other: Any, *, inward: bool | Bool[Array, ""]) -> Any:
+    """Return what belongs to a direction, which a program may know only when it runs."""
+    if not isinstance(inward, jax.Array):
+        return one if inward else other
+    return jax.tree.map(lambda a, b: jnp.where(inward, a, b), one, other)
 
 
 def margin_of(energy: Float[Array, "..."], pull: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -286,11 +293,10 @@ def pass_in_steps(way: Way, steps: int, solver: diffrax.AbstractERK | None = Non
         after, _, _, memory, _ = chosen.step(term, ends[0], ends[1], state, None, memory, made_jump=False)
         return (after, memory), None
 
-    fractions = np.linspace(0.0, 1.0, steps + 1)
-    if way.inward:
-        fractions = 1.0 - (1.0 - fractions) ** GRADING
+    even = np.linspace(0.0, 1.0, steps + 1)
+    fractions = _either(1.0 - (1.0 - even) ** GRADING, even, inward=way.inward)
     begin = nothing_spent(way)
-    ends = jnp.asarray(np.stack([fractions[:-1], fractions[1:]], axis=1), begin[0].dtype)
+    ends = jnp.stack([fractions[:-1], fractions[1:]], axis=1).astype(begin[0].dtype)
     memory = chosen.init(term, ends[0, 0], ends[0, 1], begin, None)
     (state, _), _ = lax.scan(step, (begin, memory), ends)
     return way.end(*state)
@@ -311,7 +317,7 @@ def way_rates(way: Way, share: Any, state: tuple[Float[Array, "..."], ...]) -> t
 
 def pass_bridge(way: Way, setting: Setting) -> Passage:
     """Return the passage by the integrator of a setting."""
-    size = setting.inward if way.inward else setting.outward
+    size = setting.inward if setting.careful or way.inward else setting.outward
     if way.quiet:
         return pass_by_collocation(way, max(size, setting.junction_nodes), 0)
     if setting.rule == "collocation":
@@ -405,18 +411,28 @@ def turn_in_bridge(
     """
     tip = free_tip(contact, junction, mass)
     total = 0.5 * mass * approach_speed**2 + tip.potential(tip.forms_nm)
-    gap, turns = _turning_gap(tip, total - spent)
-    for _ in range(_TURN_ROUNDS):
-        gap, turns = _turning_gap(tip, total - _to_or_from(tip, (tip.forms_nm, gap), total)[0].dissipated_aj)
-    inward, settled_in = _to_or_from(tip, (tip.forms_nm, gap), total)
-    outward, settled_out = _to_or_from(tip, (gap, tip.breaks_nm), tip.potential(gap))
+
+    def leg(before, goes_in):
+        # in as often as the gap needs to settle, then out from the last one: in a loop, for copies take long to compile
+        gap, _, inward, _ = before
+        next_gap, turns = _turning_gap(tip, total - inward.dissipated_aj)
+        gap = jnp.where(goes_in, next_gap, gap)
+        ends = jnp.where(goes_in, tip.forms_nm, gap), jnp.where(goes_in, gap, tip.breaks_nm)
+        level = jnp.where(goes_in, total, tip.potential(gap))
+        passage, settles = _to_or_from(tip, ends, level)
+        return (gap, jnp.where(goes_in, turns, before[1]), passage, inward), settles
+
+    nothing = jnp.zeros_like(total)
+    begin = Passage(nothing, nothing, spent + nothing)
+    first = (nothing + tip.forms_nm, nothing > 0.0, begin, begin)
+    (gap, turns, outward, inward), settles = lax.scan(leg, first, jnp.arange(_TURN_ROUNDS + 2) <= _TURN_ROUNDS)
     return Turn(
         turns=turns,
         gap_nm=gap,
         energy_aj=outward.energy_aj,
         dissipated_aj=inward.dissipated_aj + outward.dissipated_aj,
         time_us=inward.time_us + outward.time_us,
-        settled=settled_in & settled_out,
+        settled=settles[-2] & settles[-1],
     )
 
 
@@ -459,9 +475,11 @@ def _turning_gap(tip: Driven, level: Float[Array, "..."]) -> tuple[Float[Array, 
         return jnp.where(inside, ends[0], middle), jnp.where(inside, middle, ends[1])
 
     _, point = lax.fori_loop(0, 60, halve, (points[first - 1], points[first]))
-    # two Newton steps carry first and second derivatives
-    for _ in range(2):
-        slope = jax.grad(lambda at: missing(at, tip, level))(point)
+
+    def improve(point, _):
+        value, slope = jax.jvp(lambda at: missing(at, tip, level), (point,), (jnp.ones_like(point),))
         steep = slope != 0.0
-        point = point - jnp.where(steep, missing(point, tip, level) / jnp.where(steep, slope, 1.0), 0.0)
-    return jnp.exp(point), stopped.any()
+        return point - jnp.where(steep, value / jnp.where(steep, slope, 1.0), 0.0), None
+
+    # two Newton steps carry first and second derivatives
+    return jnp.exp(lax.scan(improve, point, length=2)[0]), stopped.any()

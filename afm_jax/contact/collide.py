@@ -27,7 +27,7 @@ from afm_jax.contact.bridge_leg import (
     way_through,
 )
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.driven import free_tip
+from afm_jax.contact.driven import Driven, free_tip
 from afm_jax.contact.junction import Junction, explain_missing_junction, find_junction
 from afm_jax.contact.junction_leg import JunctionWay, pass_through_junction
 from afm_jax.contact.settings import CAREFUL, Setting, setting_of
@@ -112,8 +112,8 @@ def collide(
             )
     # one axis of tips inside, the speeds' own shape outside
     contact, mass = jax.tree.map(lambda leaf: leaf.ravel() if leaf.ndim else leaf, (contact, mass))
-    quick, resolved = _quick(contact, mass, speeds.ravel(), setting)
-    result = _resolve(contact, mass, speeds.ravel(), quick, resolved)
+    quick, resolved, place = _quick(contact, mass, speeds.ravel(), setting)
+    result = _resolve((contact, place), mass, speeds.ravel(), quick, resolved)
     _complain(contact, result)
     return jax.tree.map(lambda part: part.reshape(speeds.shape), result)
 
@@ -153,8 +153,8 @@ def _complain(contact: Contact, result: Collision) -> None:
 @partial(jax.jit, static_argnames="setting")
 def _quick(
     contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."], setting: Setting
-) -> tuple[Collision, Bool[Array, "..."]]:
-    """Return the collisions of a batch in few steps, and which of them these resolve."""
+) -> tuple[Collision, Bool[Array, "..."], Junction]:
+    """Return the collisions of a batch in few steps, which of them these resolve, and the contacts' junctions."""
     leaves = jax.tree.leaves(contact)
     shared = None if any(leaf.ndim for leaf in leaves) else find_junction(contact)
 
@@ -164,17 +164,22 @@ def _quick(
         safe = jnp.where(valid, speed, 1.0)
         ways = go_through(contact, place, safe, mass, setting)
         found = collision_of(contact, place, safe, mass, ways)
-        return _judged(found, speed, place.exists, valid), ways.resolved | ~valid | ~place.exists
+        resolved = ways.resolved | ~valid | ~place.exists
+        return _judged(found, speed, place.exists, valid), resolved, place if shared is None else None
 
-    return _in_blocks(one, contact, mass, speeds)
+    found, resolved, own = _in_blocks(one, contact, mass, speeds)
+    return found, resolved, own if shared is None else shared
+
+
+_Joined = tuple[Contact, Junction]
 
 
 @jax.jit
-def _careful(contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."]) -> Collision:
+def _careful(joined: _Joined, mass: Float[Array, "..."], speeds: Float[Array, "..."]) -> Collision:
     """Return the collisions of a batch in many steps, turning points in the bridge included."""
 
-    def one(contact, mass, speed):
-        place = _junctions(contact)
+    def one(joined, mass, speed):
+        contact, place = joined
         valid = (speed > 0.0) & jnp.isfinite(speed)
         safe = jnp.where(valid, speed, 1.0)
         ways = go_through(contact, place, safe, mass, CAREFUL)
@@ -184,9 +189,9 @@ def _careful(contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "
         turns = turn.turns & (ways.inward.energy_aj <= 0.0)
         found = jax.tree.map(lambda a, b: jnp.where(turns, a, b), turned, through)
         finite = jnp.isfinite(found.end_energy_aj) & jnp.isfinite(found.viscous_loss_aj) & (turn.settled | ~turns)
-        return _judged(found, speed, place.exists, valid, finite), finite
+        return _judged(found, speed, place.exists, valid, finite)
 
-    return _in_blocks(one, contact, mass, speeds)[0]
+    return _in_blocks(one, joined, mass, speeds)
 
 
 def _axes(tree: Any) -> Any:
@@ -217,7 +222,9 @@ def _judged(found: Collision, speed: Array, exists: Array, valid: Array, finite:
     return cleared._replace(approach_speed_nm_per_us=speed, outcome=outcome)
 
 
-def _in_blocks(one: Callable, contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."]) -> Any:
+def _in_blocks(
+    one: Callable, contact: Contact | _Joined, mass: Float[Array, "..."], speeds: Float[Array, "..."]
+) -> Any:
     """Map a collision over a batch, in blocks that stay in the processor's cache: memory does not grow with it."""
     leaves, structure = jax.tree.flatten((contact, mass))
     varied = [leaf.ndim > 0 for leaf in leaves]
@@ -240,7 +247,7 @@ def _in_blocks(one: Callable, contact: Contact, mass: Float[Array, "..."], speed
 
 
 def _resolve(
-    contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."], quick: Collision, resolved: Array
+    joined: _Joined, mass: Float[Array, "..."], speeds: Float[Array, "..."], quick: Collision, resolved: Array
 ) -> Collision:
     """Return the quick collisions, with those that few steps do not resolve computed again in many.
 
@@ -248,7 +255,7 @@ def _resolve(
     """
     if is_traced(resolved):
         # recomputed in reverse mode: what many steps leave behind would not fit into memory
-        careful = jax.checkpoint(lambda: _careful(contact, mass, speeds))
+        careful = jax.checkpoint(lambda: _careful(joined, mass, speeds))
         again = lax.cond(jnp.all(resolved), lambda: quick, careful)
         return jax.tree.map(lambda fast, slow: jnp.where(resolved, fast, slow), quick, again)
     open_tips = np.flatnonzero(~np.asarray(resolved))
@@ -256,8 +263,8 @@ def _resolve(
         return quick
     # sizes are rounded up to powers of two, so that few programs serve all batches
     chosen = np.resize(open_tips, 1 << int(np.ceil(np.log2(open_tips.size))))
-    own_contact, own_mass = jax.tree.map(lambda leaf: leaf[chosen] if leaf.ndim else leaf, (contact, mass))
-    slow = _careful(own_contact, own_mass, speeds[chosen])
+    own, own_mass = jax.tree.map(lambda leaf: leaf[chosen] if leaf.ndim else leaf, (joined, mass))
+    slow = _careful(own, own_mass, speeds[chosen])
     count = open_tips.size
     return jax.tree.map(lambda fast, careful: fast.at[open_tips].set(careful[:count]), quick, slow)
 
@@ -350,22 +357,11 @@ def go_through(
     pull_in, pull_out = (-forces(gap) * gap for gap in (forms, outer))
 
     start = 0.5 * mass * approach_speed * approach_speed
-    gaps = (forms, junction.forms_gap_nm)
-    inward = cross(way_through(tip, gaps, start, margin_of(start, pull_in), inward=True))
-    solid = pass_through_junction(tip, inward.energy_aj, setting.junction_nodes)
-
-    def way_out(margin: Float[Array, "..."]) -> Way:
-        return way_through(tip, (outer, breaks), solid.energy_aj, margin, inward=False)
-
-    # a short first pass tells how fast the tip is at the end, and so which variable takes the square root out
-    trial = way_out(jnp.full_like(start, 1e-3))
-    if trial.quiet:
-        end = trial.total_aj - trial.end_potential_aj
-    elif setting.careful:
-        end = pass_bridge(trial, setting).energy_aj
+    crossings = _Crossings((forms, junction.forms_gap_nm), (outer, breaks), pull_in, pull_out)
+    if setting.careful and crossing is None and not tip.bridge.conserves:
+        inward, solid, outward = _in_a_loop(tip, start, crossings, setting)
     else:
-        end = pass_by_collocation(trial, 6, 1).energy_aj
-    outward = cross(way_out(margin_of(end, pull_out)))
+        inward, solid, outward = _one_by_one(tip, start, crossings, setting, cross)
 
     # at an end that pulls, a slow tip's drag must be small against the pull for the substitution to hold
     calm_in, calm_out = (
@@ -381,6 +377,53 @@ def go_through(
     left = jnp.where(solid.energy_aj > 0.0, outward.energy_aj, solid.energy_aj)
     clear = (left > _NEAR_CAPTURE[1] * start) | (left < _NEAR_CAPTURE[0] * start)
     return Ways(inward, solid, outward, outer, easy_in & clear & (easy_out | (solid.energy_aj <= 0.0)))
+
+
+class _Crossings(NamedTuple):
+    """Where the bridge is crossed in and out: outer and inner gap in nm; pull times gap at the outer one."""
+
+    gaps_in: tuple[Float[Array, "..."], Float[Array, "..."]]
+    gaps_out: tuple[Float[Array, "..."], Float[Array, "..."]]
+    pull_in: Float[Array, "..."]
+    pull_out: Float[Array, "..."]
+
+
+_Parts = tuple[Passage, JunctionWay, Passage]
+_TRIAL_MARGIN = 1e-3
+"""Of a first pass on the way out, which tells how fast the tip is at the end: so which variable takes the root out."""
+
+
+def _one_by_one(
+    tip: Driven, start: Float[Array, "..."], at: _Crossings, setting: Setting, cross: Callable[[Way], Passage]
+) -> _Parts:
+    """Return the way in, through the junction and out, after a short first pass of the way out."""
+    inward = cross(way_through(tip, at.gaps_in, start, margin_of(start, at.pull_in), inward=True))
+    solid = pass_through_junction(tip, inward.energy_aj, setting.junction_nodes)
+
+    def way_out(margin: Float[Array, "..."]) -> Way:
+        return way_through(tip, at.gaps_out, solid.energy_aj, margin, inward=False)
+
+    trial = way_out(jnp.full_like(start, _TRIAL_MARGIN))
+    end = trial.total_aj - trial.end_potential_aj if trial.quiet else pass_by_collocation(trial, 6, 1).energy_aj
+    return inward, solid, cross(way_out(margin_of(end, at.pull_out)))
+
+
+def _in_a_loop(tip: Driven, start: Float[Array, "..."], at: _Crossings, setting: Setting) -> _Parts:
+    """Return the same with a first pass as long as the way: one program in a loop, for each takes long to compile."""
+
+    def leg(before, number):
+        came_in, last = before
+        goes_in, first_out = number == 0, number == 1
+        solid = pass_through_junction(tip, came_in, setting.junction_nodes)
+        gaps = jax.tree.map(lambda a, b: jnp.where(goes_in, a, b), at.gaps_in, at.gaps_out)
+        margin = jnp.where(first_out, _TRIAL_MARGIN, margin_of(last, jnp.where(goes_in, at.pull_in, at.pull_out)))
+        energy = jnp.where(goes_in, start, solid.energy_aj)
+        passage = pass_bridge(way_through(tip, gaps, energy, margin, inward=goes_in), setting)
+        return (jnp.where(goes_in, passage.energy_aj, came_in), passage.energy_aj), (passage, solid)
+
+    _, (passages, solids) = lax.scan(leg, (start, start), jnp.arange(3))
+    inward, outward = (jax.tree.map(lambda part, k=k: part[k], passages) for k in (0, 2))
+    return inward, jax.tree.map(lambda part: part[2], solids), outward
 
 
 def collision_of(

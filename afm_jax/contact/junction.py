@@ -18,7 +18,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from afm_jax.checks import as_argument
 from afm_jax.contact.contact import Bridge, Contact, bridge_of
@@ -193,17 +193,6 @@ class Phase(enum.IntEnum):
     DRY = 0
     BRIDGE = 1
     JUNCTION = 2
-
-
-def next_phase(contact: Contact, junction: Junction, phase: ArrayLike, gap_nm: ArrayLike) -> Int[Array, "..."]:
-    """Return the phase that follows from a phase once the gap, in nm, has moved; itself if no threshold was crossed."""
-    here, gap = jnp.asarray(phase), as_argument(gap_nm)
-    from_dry = jnp.where(gap <= contact.bridge_forms_nm, Phase.BRIDGE, Phase.DRY)
-    within = jnp.where(gap >= contact.bridge_breaks_nm, Phase.DRY, Phase.BRIDGE)
-    from_bridge = jnp.where(gap <= junction.forms_gap_nm, Phase.JUNCTION, within)
-    from_junction = jnp.where(gap >= junction.breaks_gap_nm, within, Phase.JUNCTION)
-    moved = jnp.where(here == Phase.DRY, from_dry, jnp.where(here == Phase.BRIDGE, from_bridge, from_junction))
-    return moved.astype(jnp.int32)
 
 
 def force_in_phase(

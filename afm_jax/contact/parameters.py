@@ -29,8 +29,10 @@ class ContactParameter:
         allowed: which values `afm_jax.checks.check_parameter` lets pass.
         meaning: what it is, in a line.
         fitted: the range of values that a fit may take.
-        width: of a parameter of any sign, the scale on which a fit varies it; 0: varied by factors.
+        width: of a parameter of any sign, the scale on which a fit varies it, and how far to either side of the paper's
+            value fits start; 0: varied by factors.
         spread: the factor to either side of the paper's value within which fits start.
+        evenly: the range within which fits start, evenly; None: as ``width`` or ``spread`` say.
         serves: the effects of which it needs one to mean anything; none: it is always of use.
         advice: what to measure so that a fit determines it, if there is more to say than of any.
     """
@@ -43,8 +45,16 @@ class ContactParameter:
     fitted: tuple[float, float]
     width: float = 0.0
     spread: float = 3.0
+    evenly: tuple[float, float] | None = None
     serves: tuple[str, ...] = ()
     advice: str = ""
+
+    @property
+    def starts(self) -> tuple[float, float]:
+        """The range within which fits start."""
+        if self.width:
+            return self.default - self.width, self.default + self.width
+        return self.evenly or (self.default / self.spread, self.default * self.spread)
 
 
 _LIQUID = ("capillary", "structural")
@@ -57,6 +67,7 @@ CONTACT_PARAMETERS = (
         allowed="between 0 and 1",
         meaning="p/p_s of the vapour",
         fitted=(0.02, 0.99),
+        evenly=(0.1, 0.9),
         serves=_LIQUID,
         advice="measure slow impacts too, or hold it fixed at the hygrometer's value",
     ),

@@ -101,6 +101,7 @@ class DrivenSetting(NamedTuple):
 DRIVEN_SETTINGS = {
     1e-6: DrivenSetting(QuickSetting(12, 8, 10, 12, 1e-6, 6, 4, 3e-3), 2.4, 60),
     1e-9: DrivenSetting(QuickSetting(18, 13, 15, 16, 1e-9, 10, 7, 2e-4), 5.0, 120),
+    1e-11: DrivenSetting(QuickSetting(22, 16, 18, 20, 1e-11, 12, 9, 1e-5), 7.0, 180),
 }
 """Settings by the accuracy of one driven contact: relative of the rebound speed, a tenth of it in us of the times."""
 

@@ -13,25 +13,36 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.apparatus.scene import Scene
-from afm_jax.impact.orbits import single_impact_orbits
+from afm_jax.dynamics.iteration import Report, in_blocks, require_drive
+from afm_jax.impact.amplitude import peak_amplitude
+from afm_jax.impact.closure import OrbitPlace, OrbitProblem
+from afm_jax.impact.lasting_impact import LawImpact
+from afm_jax.impact.law import impact_law_of
+from afm_jax.impact.orbits import judge, orbit_state
+from afm_jax.impact.roots import OrbitRoots, find_roots
 
-BLOCK = 1000
-"""Scenes computed together: few enough for the cache, many enough to fill the vector units; one program."""
+_BLOCK = 2048
+"""Scenes gone through together."""
+_LANES = 512
+"""Roots, and orbits, computed together: few enough for the cache, many enough to fill the vector units."""
 
 
 class OrbitVerdicts(NamedTuple):
-    """What there is at each scene, one row an order 1, 2, ..., one column a scene (NumPy arrays).
+    """What there is at each scene, one row an order, one column a scene (NumPy arrays).
 
     ``stable``: an orbit that is admissible and stable. ``admissible``: an admissible orbit, stable or not.
     ``peak_amplitude_nm``: of the stable one (the highest, if there are several); NaN where there is none.
+    ``largest_multiplier``: how stable that one is: the size of the larger multiplier of the linearised map.
     """
 
     stable: Bool[np.ndarray, "orders scenes"]
     admissible: Bool[np.ndarray, "orders scenes"]
     peak_amplitude_nm: Float[np.ndarray, "orders scenes"]
+    largest_multiplier: Float[np.ndarray, "orders scenes"]
 
     def any_stable(self) -> Bool[np.ndarray, " scenes"]:
         """Return where an orbit of any order is stable."""
@@ -43,49 +54,86 @@ class OrbitVerdicts(NamedTuple):
 
 
 def orbit_verdicts(
-    scenes: Scene, *, first_order: int = 1, last_order: int, report: Callable[[int], object] = lambda _: None
+    scenes: Scene, *, first_order: int = 1, last_order: int, report: Report | None = None
 ) -> OrbitVerdicts:
     """Find the single-impact orbits of many scenes for a range of orders.
 
+    Roots are searched for at all scenes; only where there is one its orbit is looked at.
+
     Args:
-        scenes: a batch of scenes: every parameter has shape (scenes,).
+        scenes: a batch of scenes with a law: every parameter has shape (scenes,).
         first_order: lowest order N.
         last_order: highest order N.
-        report: called with each order before it is computed.
+        report: told how many of how many scenes are done.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
     """
-    blocks, count = _blocks(scenes), jax.tree.leaves(scenes)[0].shape[0]
-    rows = []
-    for order in range(first_order, last_order + 1):
-        report(order)
-        found = [_one_order(block, jnp.asarray(float(order))) for block in blocks]
-        rows.append([np.concatenate(column)[:count] for column in zip(*found, strict=True)])
-    return OrbitVerdicts(*(np.stack(column) for column in zip(*rows, strict=True)))
+    require_drive(scenes)
+    orders = np.arange(first_order, last_order + 1, dtype=float)
+    block = _BLOCK if not impact_law_of(scenes).delay else _LANES
+
+    def work(part: Scene) -> OrbitVerdicts:
+        return _verdicts_of_block(part, orders)
+
+    found = in_blocks(work, scenes, block=block, report=report)
+    return OrbitVerdicts(*(column.T for column in found))
 
 
-def _blocks(scenes: Scene) -> list[Scene]:
-    """Return a batch of scenes in blocks of one length, the last of them filled up."""
+def _verdicts_of_block(scenes: Scene, orders: Float[np.ndarray, " orders"]) -> OrbitVerdicts:
+    """Return the verdicts on a block of scenes, the axis of scenes first."""
+    count = len(scenes.platform.frequency_khz)
+    stable, admissible = np.zeros((2, count, len(orders)), bool)
+    peak, multiplier = np.full((2, count, len(orders)), np.nan)
+    plain = jax.tree.map(np.asarray, scenes)
+    for column, order in enumerate(orders):
+        roots = jax.tree.map(np.asarray, _roots_of_block(scenes, jnp.asarray(order)))
+        scene, slot = np.nonzero(roots.found)
+        rows = [np.zeros((4, 0))]
+        for first in range(0, len(scene), _LANES):
+            some = slice(first, first + _LANES)
+            at, slots = (np.pad(part[some], (0, _LANES - len(part[some])), mode="edge") for part in (scene, slot))
+            place = jax.tree.map(lambda part, at=at, slots=slots: jnp.asarray(part[at, slots]), roots.place)
+            own = jax.tree.map(lambda leaf, at=at: jnp.asarray(leaf[at]), plain)
+            rows.append(np.asarray(_judged(place, own, jnp.asarray(order)))[:, : len(scene[some])])
+        may_be, steady, height, size = np.concatenate(rows, axis=1)
+        admissible[scene[may_be > 0.0], column] = True
+        # the highest last: of several values for one place the last one stays
+        chosen = np.flatnonzero(steady)[np.argsort(height[steady > 0.0])]
+        stable[scene[chosen], column] = True
+        peak[scene[chosen], column], multiplier[scene[chosen], column] = height[chosen], size[chosen]
+    return OrbitVerdicts(stable, admissible, peak, multiplier)
 
-    def cut(leaf: Array) -> Float[np.ndarray, "blocks lanes"]:
-        values = np.asarray(leaf)
-        return np.pad(values, (0, -len(values) % BLOCK), mode="edge").reshape(-1, BLOCK)
 
-    cut_up = jax.tree.map(cut, scenes)
-    return [jax.tree.map(lambda leaf, one=one: leaf[one], cut_up) for one in range(len(jax.tree.leaves(cut_up)[0]))]
+@jax.jit
+def _roots_of_block(scenes: Scene, order: Float[Array, ""]) -> OrbitRoots:
+    def one(scene: Scene) -> OrbitRoots:
+        return find_roots(OrbitProblem(scene.cantilever, scene.platform, LawImpact(impact_law_of(scene)), order))
+
+    # cut into what the cache holds; the loops of a piece wait for its own slowest lane only
+    pieces = jax.tree.map(lambda leaf: leaf.reshape(-1, min(_LANES, leaf.shape[0])), scenes)
+    found = lax.map(jax.vmap(one), pieces)
+    return jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), found)
 
 
-@eqx.filter_jit
-def _one_order(scenes: Scene, order: Float[Array, ""]) -> tuple[Array, Array, Array]:
-    def one(scene: Scene) -> tuple[Array, Array, Array]:
-        orbits = single_impact_orbits(scene, order)
-        admissible = orbits.exists & orbits.admissible
-        steady = admissible & orbits.stable
-        highest = jnp.max(jnp.where(steady, orbits.peak_amplitude_nm, -jnp.inf))
-        return jnp.any(steady), jnp.any(admissible), jnp.where(jnp.any(steady), highest, jnp.nan)
+@jax.jit
+def _judged(place: OrbitPlace, scenes: Scene, order: Float[Array, ""]) -> Float[Array, "4 lanes"]:
+    """Return of orbits whether they are admissible, whether stable too, peak amplitude and largest multiplier."""
 
-    return jax.vmap(one)(scenes)
+    def one(place: OrbitPlace, scene: Scene) -> Float[Array, " 4"]:
+        problem = OrbitProblem(scene.cantilever, scene.platform, LawImpact(impact_law_of(scene)), order)
+        state = orbit_state(place, problem)
+        verdict = judge(place, jnp.ones((), bool), state, problem)
+        half, determinant = 0.5 * jnp.abs(verdict.trace), verdict.determinant
+        inside = half**2 - determinant
+        real = inside > 0.0
+        # a pair on a circle has the root of the determinant for its size
+        size = jnp.where(real, half + jnp.sqrt(jnp.where(real, inside, 1.0)), jnp.sqrt(jnp.abs(determinant)))
+        steady = verdict.admissible & verdict.stable
+        height = peak_amplitude(scene.cantilever, state.flight)
+        return jnp.stack([verdict.admissible.astype(size.dtype), steady.astype(size.dtype), height, size])
+
+    return jax.vmap(one)(place, scenes).T
 
 
 TABLE_COLUMNS = (
@@ -100,18 +148,18 @@ TABLE_COLUMNS = (
 
 @dataclass(frozen=True)
 class StabilityChart:
-    """A chart of stable admissible single-impact orbits.
+    """A chart of stable admissible single-impact orbits over two parameters.
 
     Attributes:
-        scene_of: the scene at a reduced frequency and a drive amplitude in nm.
-        reduced_frequency: n = omega/2 Omega of the columns, ascending.
-        drive_amplitude_nm: beta of the rows, ascending.
+        scene_of: the scene at the two parameters' values.
+        x_values: of the columns, ascending; in the paper's figures n = omega/2 Omega.
+        y_values: of the rows, ascending; in the paper's figures beta in nm.
         verdicts: orders 1, 2, ... by points; the points are the rows one after the other.
     """
 
     scene_of: Callable[..., Scene]
-    reduced_frequency: Float[np.ndarray, " columns"]
-    drive_amplitude_nm: Float[np.ndarray, " rows"]
+    x_values: Float[np.ndarray, " columns"]
+    y_values: Float[np.ndarray, " rows"]
     verdicts: OrbitVerdicts
 
     @property
@@ -142,7 +190,7 @@ class StabilityChart:
 
     def points(self) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
         """Return reduced frequency and drive amplitude of every point, in the order of the verdicts."""
-        frequency, amplitude = np.meshgrid(self.reduced_frequency, self.drive_amplitude_nm)
+        frequency, amplitude = np.meshgrid(self.x_values, self.y_values)
         return frequency.ravel(), amplitude.ravel()
 
     def tongue(self, order: int) -> Bool[np.ndarray, "rows columns"]:
@@ -150,7 +198,7 @@ class StabilityChart:
 
         Longer flights, past the platform without a touch, are possible too: islands apart from the tongue.
         """
-        return self.stable[order - 1] & (self.reduced_frequency > 0.5 * order)
+        return self.stable[order - 1] & (self.x_values > 0.5 * order)
 
     def table(self) -> list[dict[str, object]]:
         """Return one row a point: where it is, its lowest stable order and that orbit's peak amplitude."""
@@ -161,39 +209,42 @@ class StabilityChart:
         return [dict(zip(TABLE_COLUMNS, row, strict=True)) for row in rows]
 
     def _plane(self, rows: np.ndarray) -> np.ndarray:
-        return rows.reshape(len(rows), len(self.drive_amplitude_nm), len(self.reduced_frequency))
+        return rows.reshape(len(rows), len(self.y_values), len(self.x_values))
 
 
 def stability_chart(
     scene_of: Callable[..., Scene],
     *,
-    reduced_frequency: Float[np.ndarray, " columns"],
-    drive_amplitude_nm: Float[np.ndarray, " rows"],
+    x_values: Float[np.ndarray, " columns"],
+    y_values: Float[np.ndarray, " rows"],
     last_order: int,
-    report: Callable[[int], object] = lambda _: None,
+    report: Report | None = None,
 ) -> StabilityChart:
-    """Compute a stability chart.
+    """Return which single-impact orbits exist, are stable and coexist over two parameters of a scene with a law.
 
     Args:
-        scene_of: the scene at a reduced frequency and a drive amplitude in nm; it must allow `vmap`.
-        reduced_frequency: n of the columns, ascending.
-        drive_amplitude_nm: beta of the rows in nm, ascending.
+        scene_of: the scene at the two parameters' values; it must allow `vmap` (`parameter_paths.scene_family`).
+        x_values: of the first parameter, ascending: the chart's columns.
+        y_values: of the second, ascending: its rows.
         last_order: highest order N that is looked for.
-        report: called with each order before it is computed.
+        report: told how many of how many points are done.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
+        TypeError: if the scenes' interaction is not an impact law.
+        ValueError: if the scenes do not repeat with one drive period, or there is no order to look for.
     """
-    frequency, amplitude = np.meshgrid(reduced_frequency, drive_amplitude_nm)
-    verdicts = orbit_verdicts(
-        batch_of_scenes(scene_of, frequency.ravel(), amplitude.ravel()), last_order=last_order, report=report
-    )
-    return StabilityChart(scene_of, reduced_frequency, drive_amplitude_nm, verdicts)
+    if last_order < 1:
+        raise ValueError(f"`last_order` must be 1 or more, but is {last_order}")
+    x, y = (np.asarray(values, float) for values in (x_values, y_values))
+    columns = (column.ravel() for column in np.meshgrid(x, y))
+    verdicts = orbit_verdicts(batch_of_scenes(scene_of, *columns), last_order=last_order, report=report)
+    return StabilityChart(scene_of, x, y, verdicts)
 
 
 def batch_of_scenes(scene_of: Callable[..., Scene], *columns: np.ndarray) -> Scene:
     """Return one scene a row of some columns of arguments, as a batch."""
-    return eqx.filter_vmap(scene_of)(*(jnp.asarray(column, float) for column in columns))
+    return eqx.filter_jit(eqx.filter_vmap(scene_of))(*(jnp.asarray(column, float) for column in columns))
 
 
 def share_above(chart: StabilityChart, *, last_order: int, stride: int) -> float:
@@ -204,7 +255,7 @@ def share_above(chart: StabilityChart, *, last_order: int, stride: int) -> float
         last_order: highest order that is tried.
         stride: every so manieth row and column is tried.
     """
-    columns, rows = chart.reduced_frequency[::stride], chart.drive_amplitude_nm[::stride]
+    columns, rows = chart.x_values[::stride], chart.y_values[::stride]
     frequency, amplitude = np.meshgrid(columns, rows)
     scenes = batch_of_scenes(chart.scene_of, frequency.ravel(), amplitude.ravel())
     higher = orbit_verdicts(scenes, first_order=chart.orders + 1, last_order=last_order).any_stable()

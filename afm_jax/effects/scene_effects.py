@@ -1,9 +1,11 @@
 """The effects that a scene names: how strong each is, the scene without it, and the scene with it a little stronger."""
 
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -12,7 +14,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.forces.liquid import Capillary, Structural, Viscous
 from afm_jax.contact.forces.solid import CoreRepulsion
 from afm_jax.contact.parameters import REQUIRED_EFFECTS
-from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from afm_jax.impact.law import ImpactLaw
 
 Scaled = Callable[[Scene, Float[Array, ""]], Scene]
 
@@ -174,8 +176,7 @@ def _r(scene: Scene) -> Any:
 
 def _delay(scene: Scene) -> SceneEffect:
     def parts(scene: Scene) -> list[Any]:
-        delay = scene.interaction.delay
-        return [delay.hertz, delay.lead_nm, delay.offset_nm]
+        return jax.tree.leaves(scene.interaction.delay)
 
     return SceneEffect(
         "delay",
@@ -196,8 +197,7 @@ def _corrections(law: ImpactLaw) -> SceneEffect:
         delay = where(scene)
         if delay is None:
             return scene
-        bare = CollisionDelay(delay.hertz, delay.lead_nm, delay.offset_nm, corrections=False)
-        return eqx.tree_at(where, scene, bare)
+        return eqx.tree_at(where, scene, replace(delay, corrections=False))
 
     delay = law.delay
     assert delay is not None  # only a delay has corrections  # noqa: S101

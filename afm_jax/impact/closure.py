@@ -132,20 +132,23 @@ def map_gaps(unknowns: Float[Array, " 2"], problem: OrbitProblem) -> Float[Array
     return jnp.stack([(position - height) / platform.amplitude_nm, missing])
 
 
-def close_map(place: OrbitPlace, problem: OrbitProblem, steps: int) -> Float[Array, " 2"]:
-    """Return coordinate and phase after steps of Newton's method towards the orbit of the map."""
+def close_map(place: OrbitPlace, problem: OrbitProblem, steps: int) -> tuple[Float[Array, " 2"], Float[Array, " 2"]]:
+    """Return coordinate and phase after steps of Newton's method towards the orbit of the map, and its gaps there."""
 
     def twice(unknowns):
         value = map_gaps(unknowns, problem)
         return value, value
 
-    def improve(_, unknowns):
+    def improve(_, state):
+        unknowns = state[0]
         slopes, value = jax.jacfwd(twice, has_aux=True)(unknowns)
         longest = jnp.stack([unknowns[0] - problem.impact.lowest, jnp.ones_like(unknowns[1])]) * _LONGEST_STEP
         step = -solved_pair([slopes[:, 0], slopes[:, 1]], value)
-        return unknowns + jnp.clip(step, -longest, longest)
+        return unknowns + jnp.clip(step, -longest, longest), unknowns, value
 
-    return lax.fori_loop(0, steps, improve, jnp.stack(place))
+    # once more for the gaps at the end, because the map is compiled for every use of it
+    first = jnp.stack(place)
+    return lax.fori_loop(0, steps + 1, improve, (first, first, jnp.zeros_like(first)))[1:]
 
 
 def instantaneous_quartic(problem: OrbitProblem) -> Float[Array, " 5"]:

@@ -95,8 +95,8 @@ def _differentiate(primals, tangents, *, residual, structure, pair):
         return jax.jvp(lambda value: at(value, moving), (x,), (direction,))[1]
 
     if pair:
-        axes = (jnp.broadcast_to(row, x.shape) for row in jnp.eye(_PAIR, dtype=x.dtype))
-        return x, -solved_pair([along(axis) for axis in axes], shift)
+        axes = [jnp.broadcast_to(row, x.shape) for row in jnp.eye(_PAIR, dtype=x.dtype)]
+        return x, -solved_pair(list(jax.vmap(along)(jnp.stack(axes))), shift)
     slope = along(jnp.ones_like(x))
     regular = slope != 0.0
     return x, jnp.where(regular, -shift / jnp.where(regular, slope, 1.0), 0.0)

@@ -15,6 +15,7 @@ from jaxtyping import Array, ArrayLike, Float
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, require_sample_drive
+from afm_jax.apparatus.surface import Surface
 from afm_jax.checks import as_argument
 from afm_jax.impact.lasting_impact import Impact, LawImpact, speeds_of_impact
 from afm_jax.impact.law import ImpactLaw, impact_law_of
@@ -122,7 +123,7 @@ def paper_flight(
 
 
 def flight_jacobian(
-    cantilever: Cantilever, platform: Platform, start_us: ArrayLike, velocity: ArrayLike, impact_us: ArrayLike
+    cantilever: Cantilever, platform: Platform | Surface, start_us: ArrayLike, velocity: ArrayLike, impact_us: ArrayLike
 ) -> Float[Array, "2 2"]:
     """Return d(t2, V2)/d(t1, V1') of a free flight, damped or not: eq. 5 with the damped propagator p.
 
@@ -153,7 +154,7 @@ def flight_jacobian(
 
 
 def impact_jacobian(
-    law: ImpactLaw, platform: Platform, arrival_us: ArrayLike, velocity_before: ArrayLike
+    law: ImpactLaw, platform: Platform | Surface, arrival_us: ArrayLike, velocity_before: ArrayLike
 ) -> Float[Array, "2 2"]:
     """Return d(t_out, V')/d(t_in, V) of an impact: eq. 7 with viscous loss and collision delay, without corrections.
 
@@ -182,7 +183,7 @@ def impact_jacobian(
 
 
 def contact_jacobian(
-    impact: Impact, cantilever: Cantilever, platform: Platform, arrival_us: Array, velocity_before: Array
+    impact: Impact, cantilever: Cantilever, platform: Platform | Surface, arrival_us: Array, velocity_before: Array
 ) -> Float[Array, "2 2"]:
     """Return d(t_out, V')/d(t_in, V) of any impact: the written one, or of one that lasts the automatic one.
 

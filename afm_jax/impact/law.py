@@ -195,7 +195,9 @@ def speeds_at(coordinate: Float[Array, ""], law: ImpactLaw) -> Speeds:
     """
     square = law.epsilon + (law.viscous_loss / (2.0 * law.r)) ** 2
     middle = law.viscous_loss / (2.0 * law.r**2)
-    approach = middle + (coordinate + square / coordinate) / (2.0 * law.r)
-    rebound = 0.5 * (coordinate - square / coordinate)
+    # without a loss besides r the tip is captured at Y = 0, where the quotient is 0
+    kept = square / jnp.where(coordinate == 0.0, 1.0, coordinate)
+    approach = middle + (coordinate + kept) / (2.0 * law.r)
+    rebound = 0.5 * (coordinate - kept)
     delay = jnp.zeros_like(approach) if law.delay is None else law.delay(approach, rebound)
     return Speeds(approach, rebound, delay)

@@ -36,6 +36,8 @@ from afm_jax.outcomes import Outcome
 
 NEAR_DOUBLE = 1e-3
 """Slope of the closing condition per relative change of speed below which a root counts as near-double (a fold)."""
+_NEARBY = 1e-5
+"""How far from a root its slope is looked at, in terms of its distance from capture."""
 _ARRIVAL_TOLERANCE = 1e-7
 """How far (in drive periods) the first impact found may lie before the orbit's own, by rounding."""
 
@@ -225,8 +227,11 @@ def judge(place: OrbitPlace, found: Bool[Array, ""], state: OrbitState, problem:
 
 def near_fold(coordinate: Float[Array, ""], problem: OrbitProblem) -> Bool[Array, ""]:
     """Say whether the closing condition hardly changes with the logarithm of the coordinate at a root."""
-    _, slope = jax.jvp(lambda y: closing_residual(y, problem), (coordinate,), (coordinate,))
-    return jnp.abs(slope) < NEAR_DOUBLE
+    # a difference, right to nine digits: the derivative's program is twice as large; not beyond capture
+    step = _NEARBY * (coordinate - problem.impact.lowest)
+    ends = coordinate + step * jnp.array([-1.0, 1.0])
+    low, high = jax.vmap(closing_residual, in_axes=(0, None))(ends, problem)
+    return jnp.abs((high - low) * coordinate) < 2.0 * step * NEAR_DOUBLE
 
 
 def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:

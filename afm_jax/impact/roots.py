@@ -25,7 +25,6 @@ from afm_jax.impact.closure import (
     closing_residual,
     closure,
     instantaneous_quartic,
-    map_gaps,
     place_of,
 )
 
@@ -174,8 +173,8 @@ def follow_root(near: Float[Array, ""], problem: OrbitProblem) -> tuple[OrbitPla
     """Return where the map of a lasting impact closes, close to a coordinate, and whether it does."""
     problem = lax.stop_gradient(problem)
     speeds, system = closure(near, problem)
-    unknowns = close_map(place_of(near, speeds, system, problem), problem, _NEWTON)
-    return OrbitPlace(*unknowns), system.regular & jnp.all(jnp.abs(map_gaps(unknowns, problem)) < _CLOSED)
+    unknowns, gaps = close_map(place_of(near, speeds, system, problem), problem, _NEWTON)
+    return OrbitPlace(*unknowns), system.regular & jnp.all(jnp.abs(gaps) < _CLOSED)
 
 
 def harmless_coordinate(problem: OrbitProblem) -> Float[Array, ""]:
@@ -217,14 +216,13 @@ def _scale(problem: OrbitProblem) -> Float[Array, ""]:
 def _scanned_roots(problem: OrbitProblem, scan: Scan) -> _Coordinates:
     """Scan the closing condition from just above capture to speeds that no orbit reaches; narrow every bracket."""
     grid = problem.impact.lowest + jnp.asarray(np.geomspace(scan.lowest, scan.highest, scan.points)) * _scale(problem)
-    residual = jax.vmap(closing_residual, in_axes=(0, None))
-    value = residual(grid, problem)
+    value = jax.vmap(closing_residual, in_axes=(0, None))(grid, problem)
     brief = jax.vmap(_brief, in_axes=(0, None))(grid, problem)
-    left, right, low, high, count = _brackets(grid, value, brief, problem, scan)
-    root = _regula_falsi(lambda x: residual(x, problem), left, right, low, high)
-    found = low * high < 0.0
+    crossing = (value[:-1] * value[1:] < 0.0) & brief[:-1] & brief[1:]
+    root, found = _narrowed(_crossings(crossing, grid, value, scan), _dips(brief, grid, value, scan), problem)
     order = jnp.argsort(jnp.where(found, root, jnp.inf))[: scan.slots]
-    return _Coordinates(root[order], found[order], (count <= scan.crossings) & (jnp.sum(found) <= scan.slots))
+    few = (jnp.sum(crossing) <= scan.crossings) & (jnp.sum(found) <= scan.slots)
+    return _Coordinates(root[order], found[order], few)
 
 
 def _brief(coordinate: Float[Array, ""], problem: OrbitProblem) -> Bool[Array, ""]:
@@ -238,29 +236,44 @@ def _brief(coordinate: Float[Array, ""], problem: OrbitProblem) -> Bool[Array, "
     return (jnp.abs(speeds.delay) < 0.5 * period) & (problem.impact.length / speeds.rebound < _LEAVING * period)
 
 
-def _brackets(grid, value, brief, problem: OrbitProblem, scan: Scan) -> tuple[Array, Array, Array, Array, Array]:
-    """Return ends and values of intervals, last those of pairs that the grid stepped over, and the changes of sign.
+class _Brackets(NamedTuple):
+    """Ends of intervals and the residuals there; which of them are some."""
 
-    An empty interval has values 0.
-    """
-    crossing = (value[:-1] * value[1:] < 0.0) & brief[:-1] & brief[1:]
-    count = jnp.sum(crossing)
-    # the fastest ones, if there are too many: close to capture the law itself ends
+    left: Float[Array, " n"]
+    right: Float[Array, " n"]
+    low: Float[Array, " n"]
+    high: Float[Array, " n"]
+    real: Bool[Array, " n"]
+
+    def kept(self, harmless: Float[Array, ""]) -> "_Brackets":
+        """Return them with the others empty: values 0, at a harmless coordinate."""
+        left, right = (jnp.where(self.real, end, harmless) for end in self[:2])
+        low, high = (jnp.where(self.real, end, 0.0) for end in self[2:4])
+        return _Brackets(left, right, low, high, self.real)
+
+
+class _Dips(NamedTuple):
+    """Three neighbours of one sign each, the middle one closest to zero: the extremum may lie beyond."""
+
+    ends: _Brackets
+    middle: Float[Array, " n"]
+    """The residual there."""
+
+
+def _crossings(crossing: Bool[Array, " intervals"], grid, value, scan: Scan) -> _Brackets:
+    """Return the changes of sign, the fastest ones if there are too many: close to capture the law itself ends."""
     at = crossing.shape[0] - 1 - jnp.nonzero(crossing[::-1], size=scan.crossings, fill_value=0)[0]
-    real = jnp.arange(scan.crossings) < count
-    harmless = harmless_coordinate(problem)
-    parts = [_kept(real, harmless, grid[at], grid[at + 1], value[at], value[at + 1])]
-    # three neighbours of one sign, the middle one closest to zero: the extremum may lie beyond
+    real = jnp.arange(scan.crossings) < jnp.sum(crossing)
+    return _Brackets(grid[at], grid[at + 1], value[at], value[at + 1], real)
+
+
+def _dips(brief: Bool[Array, " points"], grid, value, scan: Scan) -> _Dips:
+    """Return where the scan may have stepped over a pair of roots."""
     size = jnp.abs(value)
     same = (value[:-2] * value[1:-1] > 0.0) & (value[1:-1] * value[2:] > 0.0)
     dip = same & (size[1:-1] <= size[:-2]) & (size[1:-1] <= size[2:]) & brief[1:-1]
     at, real = _lowest_of(jnp.where(dip, size[1:-1], jnp.inf), scan.turns)
-    turn, bottom = _extremum(at, grid, value, problem)
-    real = real & (bottom * value[at + 1] < 0.0)
-    parts.append(_kept(real, harmless, grid[at], turn, value[at], bottom))
-    parts.append(_kept(real, harmless, turn, grid[at + 2], bottom, value[at + 2]))
-    left, right, low, high = (jnp.concatenate(columns) for columns in zip(*parts, strict=True))
-    return left, right, low, high, count
+    return _Dips(_Brackets(grid[at], grid[at + 2], value[at], value[at + 2], real), value[at + 1])
 
 
 def _lowest_of(size: Float[Array, " n"], count: int) -> tuple[Array, Array]:
@@ -274,39 +287,58 @@ def _lowest_of(size: Float[Array, " n"], count: int) -> tuple[Array, Array]:
     return jnp.stack(at), jnp.stack(real)
 
 
-def _kept(real, harmless, left, right, low, high) -> tuple[Array, Array, Array, Array]:
-    """Return an interval where it is one, else an empty one at a harmless coordinate."""
-    ends = jnp.where(real, left, harmless), jnp.where(real, right, harmless)
-    return *ends, jnp.where(real, low, 0.0), jnp.where(real, high, 0.0)
+def _narrowed(crossings: _Brackets, dips: _Dips, problem: OrbitProblem) -> tuple[Array, Array]:
+    """Return the root of every bracket, and which there are: of changes of sign, then left and right in every dip.
 
+    Changes of sign are narrowed by the Illinois method: the newer end stays, the other one loses weight. In a dip a
+    golden section goes to the extremum first, with both inner points at once in the places of the two roots to either
+    side of it. All in one loop, because the residual is compiled for every use of it.
+    """
+    residual = jax.vmap(closing_residual, in_axes=(0, None))
+    harmless = harmless_coordinate(problem)
+    count, turns = crossings.left.shape[0], dips.middle.shape[0]
+    sign = jnp.sign(dips.middle)
+    waits = jnp.arange(count + 2 * turns) >= count
 
-def _extremum(at, grid, value, problem: OrbitProblem) -> tuple[Array, Array]:
-    """Return where the residual is closest to zero, or beyond, between a grid point and the one after next."""
-    sign = jnp.sign(value[at + 1])
+    def pairs(middle, bottom) -> _Brackets:
+        """Return the brackets to either side of the extrema."""
+        (left, right, low, high, real), across = dips.ends, bottom * dips.middle < 0.0
+        columns = ((left, middle), (middle, right), (low, bottom), (bottom, high), (real & across, real & across))
+        return _Brackets(*(jnp.concatenate(column) for column in columns)).kept(harmless)
 
-    height = jax.vmap(lambda x, sign: sign * closing_residual(x, problem))
-
-    def narrow(_, ends):
-        # golden section, both inner points at once
-        a, b = ends
+    def narrow(step, state):
+        brackets, (a, b) = state
         points = jnp.stack([b - _GOLDEN * (b - a), a + _GOLDEN * (b - a)])
-        first, second = height(points.ravel(), jnp.tile(sign, 2)).reshape(2, -1)
-        return jnp.where(first < second, a, points[0]), jnp.where(first < second, points[1], b)
+        points = jnp.where(step < _SECTIONS, points, 0.5 * (a + b))
+        gap = brackets.high - brackets.low
+        chord = brackets.left * brackets.high - brackets.right * brackets.low
+        x = jnp.where(gap == 0.0, brackets.left, chord / jnp.where(gap == 0.0, 1.0, gap))
+        x = jnp.where(waits & (step <= _SECTIONS), jnp.pad(points.ravel(), (count, 0)), x)
+        value = residual(x, problem)
+        first, second = value[count:].reshape(2, -1) * sign
+        inner = jnp.where(first < second, a, points[0]), jnp.where(first < second, points[1], b)
+        passed = value * brackets.low < 0.0
+        closer = _Brackets(
+            x,
+            jnp.where(passed, brackets.left, brackets.right),
+            value,
+            jnp.where(passed, brackets.low, 0.5 * brackets.high),
+            brackets.real,
+        )
+        either = jax.tree.map(
+            lambda head, tail: jnp.concatenate([head[:count], tail]), brackets, pairs(points[0], value[count:][:turns])
+        )
+        begun = jnp.where(waits, step > _SECTIONS, step < _REGULA_FALSI)
+        brackets = jax.tree.map(
+            lambda new, found, old: jnp.where(begun, new, jnp.where(step == _SECTIONS, found, old)),
+            closer,
+            either,
+            brackets,
+        )
+        return brackets, inner
 
-    a, b = lax.fori_loop(0, _SECTIONS, narrow, (grid[at], grid[at + 2]))
-    middle = 0.5 * (a + b)
-    return middle, sign * height(middle, sign)
-
-
-def _regula_falsi(residual, left, right, low, high) -> Float[Array, " slots"]:
-    """Return the root of every bracket by the Illinois method: the newer end stays, the other one loses weight."""
-
-    def narrow(_, ends):
-        a, b, fa, fb = ends
-        gap = fb - fa
-        x = jnp.where(gap == 0.0, a, (a * fb - b * fa) / jnp.where(gap == 0.0, 1.0, gap))
-        fx = residual(x)
-        passed = fx * fa < 0.0
-        return x, jnp.where(passed, a, b), fx, jnp.where(passed, fa, 0.5 * fb)
-
-    return lax.fori_loop(0, _REGULA_FALSI, narrow, (left, right, low, high))[0]
+    empty = jax.tree.map(lambda part: jnp.zeros((2 * turns,), part.dtype), dips.ends).kept(harmless)
+    begin = jax.tree.map(lambda head, tail: jnp.concatenate([head, tail]), crossings.kept(harmless), empty)
+    steps = _SECTIONS + 1 + _REGULA_FALSI
+    brackets, _ = lax.fori_loop(0, steps, narrow, (begin, (dips.ends.left, dips.ends.right)))
+    return brackets.left, brackets.real

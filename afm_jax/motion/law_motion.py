@@ -34,7 +34,7 @@ from afm_jax.impact.map import NextImpact, impact_after
 from afm_jax.motion.record import ContactKind, Contacts, MotionOutcome, Simulation, State, to_gap, to_lab
 from afm_jax.outcomes import Outcome
 
-_CONSTANT_PUSH = 1e-5
+CONSTANT_PUSH = 1e-5
 """Largest relative change of the push during the rest of a series of impacts that is summed up."""
 _SHORTEST_PULL = 1e-6
 """Phase (rad of the fastest motion) below which a pull is too short to let go: the gap would stay below 1e-18 beta."""
@@ -179,7 +179,7 @@ def chatter(
     converges = (push > 0.0) & (loss > 0.0) & (law.epsilon == 0.0)
     lasts = 2.0 * rebound / jnp.where(converges, push * loss, 1.0)
     change = lasts * jnp.maximum(bed.fastest * push, jnp.abs(rate))
-    short = converges & (change < _CONSTANT_PUSH * push)
+    short = converges & (change < CONSTANT_PUSH * push)
     if law.delay is not None:
         short = jnp.zeros_like(short)
     return short, jnp.where(short, lasts, 0.0)
@@ -319,7 +319,7 @@ def _round(seen: Scene, tip: LawTip, until: Array) -> LawTip:
     landed = (ended == Outcome.IMPACT) | (ended == Outcome.CAPTURED)
     arrived = ~tip.done & landed & (impact.arrival_time_us < until)
     failed = ~tip.done & ~landed & (ended != Outcome.NO_FURTHER_IMPACT)
-    row, beyond, lost = _through(seen, impact, arrived, until)
+    row, beyond, lost = through_impact(seen, impact, arrived, until)
     room = tip.used < tip.rows.shape[0]
     held, full = arrived & (row.kind == ContactKind.HELD), arrived & ~room
     outcome = jnp.where(held, MotionOutcome.HELD, MotionOutcome.FINISHED)
@@ -352,10 +352,16 @@ def _or_rest(seen: Scene, tip: LawTip, impact: NextImpact) -> NextImpact:
     return jax.tree.map(lambda one, other: jnp.where(rests, one, other), captured, impact)
 
 
-def _through(seen: Scene, impact: NextImpact, arrived: Array, until: Array) -> tuple[LawRow, LawLeg, Array]:
+def through_impact(seen: Scene, impact: NextImpact, arrived: Array, until: Array) -> tuple[LawRow, LawLeg, Array]:
     """Return the row of an impact and the beginning of the next flight; where there is none, numbers without meaning.
 
     The third: whether the search for the end of a rest gave up.
+
+    Args:
+        seen: a scene with a law, the platform the surface that its tip sees.
+        impact: the impact.
+        arrived: whether there is one, before the end.
+        until: the end in us: a tip that rests then is held.
     """
     law, bed = impact_law_of(seen), Bed(seen.cantilever, seen.platform)
     arrival = jnp.where(arrived, impact.arrival_time_us, until)

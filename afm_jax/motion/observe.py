@@ -27,7 +27,7 @@ from afm_jax.impact.lasting_impact import INDENTATION, LawImpact
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State, to_gap
 from afm_jax.motion.settle import Settled, Window, held_since, is_stuck, settled, window_of
-from afm_jax.motion.trajectory import DensePath, Trajectory, dense_path, flights_of, fly, trajectory
+from afm_jax.motion.trajectory import DensePath, Trajectory, dense_path, flights_of, fly
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 
@@ -551,14 +551,6 @@ class Section(NamedTuple):
     approach_speed_nm_per_us: Float[np.ndarray, " contacts"]
 
 
-class Strobe(NamedTuple):
-    """The tip once every drive period; arrays of shape (periods,)."""
-
-    time_us: Float[np.ndarray, " periods"]
-    position_nm: Float[np.ndarray, " periods"]
-    velocity_nm_per_us: Float[np.ndarray, " periods"]
-
-
 def poincare_section(scene: Scene, simulation: Simulation) -> Section:
     """Return phase of the drive and velocity at every departure, and how fast the tip had come.
 
@@ -575,24 +567,6 @@ def poincare_section(scene: Scene, simulation: Simulation) -> Section:
         departure_velocity_nm_per_us=np.asarray(rows.departure_velocity_nm_per_us)[left],
         approach_speed_nm_per_us=np.asarray(rows.approach_speed_nm_per_us)[left],
     )
-
-
-def strobe(scene: Scene, simulation: Simulation, *, phase_deg: float = 0.0, from_us: float | None = None) -> Strobe:
-    """Return the tip whenever the drive has a phase.
-
-    Args:
-        scene: the scene that was simulated.
-        simulation: of one scene.
-        phase_deg: the phase of the drive.
-        from_us: where to begin; the simulation's start if None.
-    """
-    period = drive_of(scene).period_us
-    first = float(simulation.start.time_us) if from_us is None else from_us
-    lowest = int(np.ceil(first / period - phase_deg / 360.0))
-    highest = int(np.floor(float(simulation.final.time_us) / period - phase_deg / 360.0))
-    times = (np.arange(lowest, highest + 1) + phase_deg / 360.0) * period
-    path = trajectory(scene, simulation, times)
-    return Strobe(times, path.position_nm, path.velocity_nm_per_us)
 
 
 class Departures(NamedTuple):

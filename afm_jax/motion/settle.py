@@ -93,35 +93,72 @@ def find_repetition(
         tolerance: largest remaining distance that counts as none.
         longest: largest m to try.
     """
+    turns = np.asarray(times_us)[None] / period_us
+    found = find_repetitions(turns, np.asarray(velocities)[None], tolerance=tolerance, longest=longest)
+    if not found.contacts[0]:
+        return None
+    return Repetition(int(found.contacts[0]), int(found.periods[0]), float(found.remaining[0]))
+
+
+class Repetitions(NamedTuple):
+    """`Repetition` of many sequences, arrays of one lane a sequence; ``contacts`` 0 where nothing repeats."""
+
+    contacts: Int[np.ndarray, " lanes"]
+    periods: Int[np.ndarray, " lanes"]
+    remaining: Float[np.ndarray, " lanes"]
+
+
+def find_repetitions(
+    turns: Float[np.ndarray, "lanes contacts"],
+    velocities: Float[np.ndarray, "lanes contacts"],
+    *,
+    tolerance: float,
+    longest: int = LONGEST,
+    repeated: int = _REPETITIONS,
+) -> Repetitions:
+    """Return the shortest repetition of each of many sequences, as `find_repetition` does.
+
+    Args:
+        turns: times of the departures in drive periods.
+        velocities: as there; a sequence with NaN in its end repeats nothing.
+        tolerance: as there.
+        longest: as there.
+        repeated: repetitions in each of the two blocks that are compared.
+    """
+    lanes, count = turns.shape
+    found = Repetitions(np.zeros(lanes, int), np.zeros(lanes, int), np.full(lanes, np.inf))
+    left = np.arange(lanes)
     for contacts in range(1, longest + 1):
-        block = _REPETITIONS * contacts
-        if len(times_us) < 2 * block + contacts:
+        block = repeated * contacts
+        if count < 2 * block + contacts or not left.size:
             break
-        last = slice(len(times_us) - 2 * block - contacts, None)
-        steps = _steps(times_us[last], velocities[last], contacts, period_us)
-        if steps is None:
-            continue
-        periods, distance = steps
-        before, now = float(distance[:block].max()), float(distance[block:].max())
-        rate = (now / before) ** (1.0 / _REPETITIONS) if before > 0.0 else 0.0
-        remaining = now if now <= _ROUNDING else (now * rate / (1.0 - rate) if rate < 1.0 else np.inf)
-        if max(now, remaining) <= tolerance:
-            return Repetition(contacts, periods, float(remaining))
-    return None
+        last = slice(count - 2 * block - contacts, None)
+        periods, distance = _steps(turns[left, last], velocities[left, last], contacts)
+        before, now = distance[:, :block].max(axis=1), distance[:, block:].max(axis=1)
+        # where something is infinite nothing repeats; a distance of 0 before is one that has arrived
+        near = np.isfinite(now) & np.isfinite(before)
+        rate = (np.where(near, now, 1.0) / np.where(near & (before > 0.0), before, np.inf)) ** (1.0 / repeated)
+        slowly = np.where(rate < 1.0, rate / np.where(rate < 1.0, 1.0 - rate, 1.0), np.inf)
+        remaining = np.where(now <= _ROUNDING, now, np.where(near, now, 1.0) * slowly)
+        repeats = near & (np.maximum(now, remaining) <= tolerance)
+        chosen = left[repeats]
+        found.contacts[chosen], found.periods[chosen] = contacts, periods[repeats]
+        found.remaining[chosen] = remaining[repeats]
+        left = left[~repeats]
+    return found
 
 
 def _steps(
-    times: np.ndarray, velocities: np.ndarray, contacts: int, period: float
-) -> tuple[int, Float[np.ndarray, " steps"]] | None:
-    """Return N and the distances between departures m contacts apart; None where their N differ or are 0."""
-    apart = (times[contacts:] - times[:-contacts]) / period
+    turns: np.ndarray, velocities: np.ndarray, contacts: int
+) -> tuple[Float[np.ndarray, " lanes"], Float[np.ndarray, "lanes steps"]]:
+    """Return N and the distances between departures m contacts apart; infinite where their N differ or are 0."""
+    apart = turns[:, contacts:] - turns[:, :-contacts]
     periods = np.round(apart)
-    if periods[-1] < 1 or np.any(periods != periods[-1]):
-        return None
-    scale = max(float(np.abs(velocities).max()), np.finfo(float).tiny)
+    same = (periods[:, -1] >= 1) & (periods == periods[:, -1:]).all(axis=1)
+    scale = np.maximum(np.abs(velocities).max(axis=1, keepdims=True), np.finfo(float).tiny)
     angle = 2.0 * np.pi * np.abs(apart - periods)
-    speed = np.abs(velocities[contacts:] - velocities[:-contacts]) / scale
-    return int(periods[-1]), np.maximum(angle, speed)
+    speed = np.abs(velocities[:, contacts:] - velocities[:, :-contacts]) / scale
+    return np.where(same, periods[:, -1], 0.0), np.where(same[:, None], np.maximum(angle, speed), np.inf)
 
 
 class Settled(NamedTuple):

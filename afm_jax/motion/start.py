@@ -47,13 +47,16 @@ def default_start(scene: Scene) -> State:
     return found if found is not None else _leaving(scene)
 
 
-def start_of(scene: Scene, start: tuple[float, float, float]) -> State:
+def start_of(scene: Scene, start: tuple[float, float, float] | None) -> State:
     """Return the state of a scene file's start, at the first time from 0 on at which the drive has its phase.
 
     Args:
         scene: the scene.
-        start: phase of the drive in degrees, height above the platform in nm, velocity in the lab in nm/us (a `Start`).
+        start: phase of the drive in degrees, height above the platform in nm, velocity in the lab in nm/us (a `Start`);
+            None: `default_start`.
     """
+    if start is None:
+        return default_start(scene)
     phase, height, velocity = start
     time = (phase % 360.0) / 360.0 * drive_of(scene).period_us
     return state(time, float(scene.platform.position(time)) + height, velocity)

@@ -49,20 +49,20 @@ class Statement:
 
 def complete_orders(chart: StabilityChart) -> list[int]:
     """Return the orders whose tongue lies within the chart with half an order to spare."""
-    return [n for n in range(1, chart.orders + 1) if n + 0.5 < chart.reduced_frequency[-1]]
+    return [n for n in range(1, chart.orders + 1) if n + 0.5 < chart.x_values[-1]]
 
 
 def tongues_at_resonance(chart: StabilityChart) -> Statement:
     """Figures 2 and 3: at the highest drive amplitude the orders are stable around omega = 2 N Omega."""
     edges, inside = {}, []
     for order in complete_orders(chart):
-        row = chart.reduced_frequency[chart.tongue(order)[-1]]
+        row = chart.x_values[chart.tongue(order)[-1]]
         edges[order] = [float(row.min()), float(row.max())] if len(row) else None
         inside.append(len(row) > 0 and row.min() < order < row.max() and row.max() - row.min() < 1.0)
     return Statement(
         "tongues of stable orbits lie around omega = 2 N Omega",
         bool(inside) and all(inside),
-        {"drive_amplitude_nm": float(chart.drive_amplitude_nm[-1]), "reduced_frequency_of_order": edges},
+        {"drive_amplitude_nm": float(chart.y_values[-1]), "reduced_frequency_of_order": edges},
     )
 
 
@@ -74,7 +74,7 @@ def tail_shift(chart: StabilityChart, order: int) -> float:
     rows, columns = np.nonzero(chart.tongue(order))
     if not len(rows):
         return float("nan")
-    frequency = chart.reduced_frequency[columns]
+    frequency = chart.x_values[columns]
     low = rows <= rows.min() + 0.1 * (rows.max() - rows.min())
     return float(frequency[low].mean() - frequency[rows == rows.max()].mean())
 
@@ -102,18 +102,18 @@ def adhesion_limit_nm(reduced_frequency: Float[np.ndarray, " n"]) -> Float[np.nd
 
 def low_orders_vanish(without: StabilityChart, adhesive: StabilityChart) -> Statement:
     """Figure 3: adhesion takes away the low orders at low drive, and little else; the charts share their grid."""
-    low = without.drive_amplitude_nm[:, None] < LOW_DRIVE_NM
+    low = without.y_values[:, None] < LOW_DRIVE_NM
     orders = complete_orders(without)
     lost, onset = {}, {}
     for order in orders:
         before, after = without.tongue(order), adhesive.tongue(order)
         lost[order] = float((before & ~after & low).sum() / max(1, (before & low).sum()))
         rows = np.nonzero(after.any(axis=1))[0]
-        onset[order] = float(without.drive_amplitude_nm[rows[0]]) if len(rows) else None
+        onset[order] = float(without.y_values[rows[0]]) if len(rows) else None
     shares = [lost[order] for order in orders]
-    high = without.any_stable & (without.drive_amplitude_nm[:, None] > 2.0 * LOW_DRIVE_NM)
+    high = without.any_stable & (without.y_values[:, None] > 2.0 * LOW_DRIVE_NM)
     kept = float((high & adhesive.any_stable).sum() / max(1, high.sum()))
-    forbidden = without.drive_amplitude_nm[:, None] < adhesion_limit_nm(without.reduced_frequency)
+    forbidden = without.y_values[:, None] < adhesion_limit_nm(without.x_values)
     below = int((adhesive.any_stable & forbidden).sum())
     holds = bool(shares) and shares[0] > 0.9 and all(np.diff(shares) < 0) and below == 0 and kept > 0.9
     numbers = {
@@ -414,13 +414,16 @@ def figure9(*, coarse: bool, seed: int, points: int) -> FigureData:
 def _chart(
     scene_of: Callable[..., Scene], name: str, *, coarse: bool, report: Callable[[str], object] = lambda _: None
 ) -> StabilityChart:
-    def progress(order: int) -> None:
-        report(f"{name}: order {order} of {LAST_ORDER}")
+    told = 0
+
+    def progress(done: int, total: int) -> None:
+        nonlocal told
+        if done - told >= 0.1 * total:
+            told = done
+            report(f"{name}: {done} of {total} points")
 
     frequency, amplitude = chart_grid(coarse=coarse)
-    return stability_chart(
-        scene_of, reduced_frequency=frequency, drive_amplitude_nm=amplitude, last_order=LAST_ORDER, report=progress
-    )
+    return stability_chart(scene_of, x_values=frequency, y_values=amplitude, last_order=LAST_ORDER, report=progress)
 
 
 def _positive_offset_scene(reduced_frequency: ArrayLike, drive_amplitude_nm: ArrayLike) -> Scene:

@@ -202,3 +202,62 @@ def _name(axes: Axes, text: str, place: tuple[float, float], colour: str, *, abo
         fontsize=8,
         color=colour,
     )
+
+
+_OVERVIEW = {
+    "SciPy DOP853": ("#D55E00", "^"),
+    "SciPy LSODA": ("#CC79A7", "v"),
+    "SciPy Radau": ("#8B3A00", "<"),
+    "SUNDIALS CVODE Adams": ("#E69F00", ">"),
+    "Diffrax": ("#000000", "s"),
+    "SciPy least_squares, our": ("#D55E00", "^"),
+    "SciPy least_squares, diff": ("#CC79A7", "v"),
+}
+_OWN = (("#0072B2", "o"), ("#009E73", "D"), ("#56B4E9", "o"))
+
+
+def overview_figure(rows: Sequence[Mapping[str, Any]], references: Mapping[str, Mapping[str, Any]]) -> Figure:
+    """Return the figure: a panel a problem, error to the left smaller; our own methods are drawn thick.
+
+    Args:
+        rows: as `afm_jax.accuracy.overview` returns them.
+        references: likewise; the error of a reference is a dotted line.
+    """
+    figure = new_figure(16.0, 11.0)
+    panels = figure.subplots(2, -(-len(references) // 2), squeeze=False).ravel()
+    for axes, (problem, told) in zip(panels, references.items(), strict=False):
+        _overview_panel(axes, [row for row in rows if row["problem"] == problem])
+        if told["reference_error"] > _SMALLEST:
+            axes.axvline(
+                told["reference_error"], color=DARK, linestyle=":", linewidth=1.2, label="error of the reference"
+            )
+        axes.set_title(problem)
+        label_axes(axes, x=f"error of the {told['error_of'].replace('(us)', '(µs)')}", y="time (µs), one core")
+        axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2, frameon=False)
+    for axes in panels[len(references) :]:
+        axes.set_visible(False)
+    return figure
+
+
+def _overview_panel(axes: Axes, rows: Sequence[Mapping[str, Any]]) -> None:
+    axes.set(xscale="log", yscale="log")
+    own = iter(_OWN)
+    for method in dict.fromkeys(row["method"] for row in rows):
+        mine = [row for row in rows if row["method"] == method]
+        # an error of 1 or more is no more than wrong; one of 0 is below rounding
+        points = [
+            (max(row["error"], _SMALLEST), row["microseconds"])
+            for row in mine
+            if row["error"] is not None and row["error"] < 1.0
+        ]
+        if not points:
+            continue
+        is_own = bool(mine[0]["own"])
+        colour, marker = (
+            next(own, _OWN[-1])
+            if is_own
+            else next((style for name, style in _OVERVIEW.items() if method.startswith(name)), (DARK, "x"))
+        )
+        width, size = (2.2, 7) if is_own else (1.1, 4)
+        axes.plot(*zip(*sorted(points), strict=True), color=colour, marker=marker, lw=width, ms=size, label=method)
+    axes.grid(color=GRID, alpha=0.25)

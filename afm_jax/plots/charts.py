@@ -42,7 +42,7 @@ def draw_stability_chart(
     stable = chart.any_stable
     lost = np.zeros_like(stable) if compared_with is None else compared_with.any_stable & ~stable
     shade = np.where(stable, 2, np.where(lost, 1, 0))
-    edges = _edges(chart.reduced_frequency), _edges(chart.drive_amplitude_nm)
+    edges = cell_edges(chart.x_values), cell_edges(chart.y_values)
     colours = ListedColormap([DARK, _LOST, "white"])
     axes.pcolormesh(*edges, shade, cmap=colours, vmin=0, vmax=2, rasterized=True)
     axes.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
@@ -52,7 +52,7 @@ def draw_stability_chart(
         _label_order(axes, chart, order)
     if limit_nm is not None:
         label = r"$\beta\omega = \sqrt{(1-r^2)\,\epsilon}\,/\,2r$: no orbit below"
-        axes.plot(chart.reduced_frequency, limit_nm, color=ACCENT, linewidth=2.0, label=label)
+        axes.plot(chart.x_values, limit_nm, color=ACCENT, linewidth=2.0, label=label)
     if compared_with is not None:
         axes.plot([], [], color=_LOST, linewidth=8.0, label=r"lost against $\epsilon = 0$")
     figure.legend(loc="outside lower center", ncols=3, fontsize=11, frameon=False)
@@ -64,13 +64,13 @@ def draw_stability_chart(
 
 def _label_order(axes: Axes, chart: StabilityChart, order: int) -> None:
     """Write the order into its tongue, if there is one at three fifths of the height."""
-    row = int(0.6 * len(chart.drive_amplitude_nm))
-    columns = chart.reduced_frequency[chart.tongue(order)[row]] if order <= chart.orders else []
+    row = int(0.6 * len(chart.y_values))
+    columns = chart.x_values[chart.tongue(order)[row]] if order <= chart.orders else []
     if len(columns):
         middle = 0.5 * (columns[0] + columns[-1])
         axes.text(
             middle,
-            chart.drive_amplitude_nm[row],
+            chart.y_values[row],
             f"(1,{order})",
             ha="center",
             va="center",
@@ -86,7 +86,7 @@ def _add_frequency_axis(axes: Axes) -> None:
     top.tick_params(labelsize=10)
 
 
-def _edges(centres: Float[np.ndarray, " cells"]) -> Float[np.ndarray, " edges"]:
+def cell_edges(centres: Float[np.ndarray, " cells"]) -> Float[np.ndarray, " edges"]:
     """Return the borders of evenly spaced cells."""
     half = 0.5 * (centres[1] - centres[0])
     return np.append(centres - half, centres[-1] + half)

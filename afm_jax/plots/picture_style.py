@@ -39,12 +39,16 @@ def with_zero_line(axes: Axes) -> None:
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write a figure as PNG."""
-    write_whole(path, png_of(figure, _DPI))
+    """Write a figure, whole or not at all, in the format of its file's suffix: PNG, PDF or SVG."""
+    write_whole(path, _bytes_of(figure, path.suffix.removeprefix("."), _DPI))
 
 
 def png_of(figure: Figure, dpi: float = 150.0) -> bytes:
     """Return a figure as a PNG file."""
+    return _bytes_of(figure, "png", dpi)
+
+
+def _bytes_of(figure: Figure, suffix: str, dpi: float) -> bytes:
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=dpi)
+    figure.savefig(buffer, format=suffix, dpi=dpi)
     return buffer.getvalue()

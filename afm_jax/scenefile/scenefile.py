@@ -301,6 +301,7 @@ __all__ = [
     "load_scene_and_start",
     "load_start",
     "save_scene",
+    "scene_of_tables",
     "scene_tables",
 ]
 
@@ -329,9 +330,23 @@ def load_start(path: str | os.PathLike[str]) -> Start | None:
 
 def load_scene_and_start(path: str | os.PathLike[str]) -> tuple[Scene, Start | None]:
     """Return what `load_scene` and `load_start` return, from one reading of the file."""
-    tables = _tables(path)
+    source = os.fspath(path)
+    tables = _checked(_parsed(source), source)
     scene = _scene_of(tables)
     return scene, _start_of(tables, scene)
+
+
+def scene_of_tables(contents: Mapping[str, Any], source: str) -> Scene:
+    """Return the scene of tables as a file holds them and `scene_tables` returns them.
+
+    Args:
+        contents: the tables.
+        source: what the messages call their origin.
+
+    Raises:
+        SceneError: as `load_scene`.
+    """
+    return _scene_of(_checked(contents, source))
 
 
 def save_scene(scene: Scene, path: str | os.PathLike[str], *, start: Start | None = None) -> None:
@@ -393,10 +408,8 @@ def _contact_table(contact: Any) -> dict[str, Any]:
     return {"model": "contact", "effects": [name for name in EFFECTS if name in contact.effects], **numbers}
 
 
-def _tables(path: str | os.PathLike[str]) -> dict[str, SceneTable]:
-    """Read a file and check the names of its tables and keys."""
-    source = os.fspath(path)
-    contents = _parsed(source)
+def _checked(contents: Mapping[str, Any], source: str) -> dict[str, SceneTable]:
+    """Check the names of tables and of their keys."""
     for name, value in contents.items():
         if name not in TABLES:
             message = advise_table(name, is_table=isinstance(value, dict))

@@ -90,19 +90,29 @@ def exact_orbit(mp: Any, row: dict[str, Any], order: int, guess: tuple[float, fl
     """
     with mp.workdps(DIGITS + _GUARD_DIGITS):
         s = system_of(mp, row)
-        half = s.Omega * order * mp.pi / s.omega
-
-        def closes(phase: Number, after: Number) -> Number:
-            return (s.sigma + s.beta * mp.cos(phase)) * s.Omega * mp.sin(half) - after * mp.cos(half)
-
-        def rebounds(phase: Number, after: Number) -> Number:
-            speed = -s.beta * s.omega * mp.sin(phase)
-            return (after - speed) ** 2 - s.r**2 * (after + speed) ** 2 + s.epsilon
-
-        start = mp.mpf(guess[0]), mp.mpf(guess[1])
-        phase, after = mp.findroot([closes, rebounds], start, tol=mp.mpf(10) ** (-2 * DIGITS))
-        trace = _eq8_trace(mp, s, (phase, after), 2 * half)
+        trace = _eq8_trace(mp, s, _orbit_state(mp, s, order, guess), 2 * s.Omega * order * mp.pi / s.omega)
         return float(s.r**2), float(trace)
+
+
+def exact_orbit_state(mp: Any, scene: Scene, order: int, guess: tuple[float, float]) -> tuple[Number, Number]:
+    """Return the phase in rad and V' in nm/us of the exact (1, N) orbit of a scene; see `exact_orbit`."""
+    with mp.workdps(DIGITS + _GUARD_DIGITS):
+        return _orbit_state(mp, system_of(mp, _plain_row(scene)), order, guess)
+
+
+def _orbit_state(mp: Any, s: System, order: int, guess: tuple[float, float]) -> tuple[Number, Number]:
+    half = s.Omega * order * mp.pi / s.omega
+
+    def closes(phase: Number, after: Number) -> Number:
+        return (s.sigma + s.beta * mp.cos(phase)) * s.Omega * mp.sin(half) - after * mp.cos(half)
+
+    def rebounds(phase: Number, after: Number) -> Number:
+        speed = -s.beta * s.omega * mp.sin(phase)
+        return (after - speed) ** 2 - s.r**2 * (after + speed) ** 2 + s.epsilon
+
+    start = mp.mpf(guess[0]), mp.mpf(guess[1])
+    phase, after = mp.findroot([closes, rebounds], start, tol=mp.mpf(10) ** (-2 * DIGITS))
+    return phase, after
 
 
 def _eq8_trace(mp: Any, s: System, orbit: tuple[Number, Number], turn: Number) -> Number:

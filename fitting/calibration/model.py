@@ -35,7 +35,8 @@ from fitting.fits.intervals import Convergence, check_minimum
 from fitting.fits.least_squares import whole_covariance_of
 from fitting.fits.objective import BATCH, PLAIN, Objective, lowest, polish
 from fitting.forward import Linearised, Prediction
-from fitting.models import Numbers, Parameter, Problem
+from fitting.models import Problem
+from fitting.parameters import Parameter
 
 TERMS = {
     "phase": {"none": 2, "constant": 4, "linear": 6},
@@ -84,25 +85,6 @@ class Points(NamedTuple):
 
 
 @dataclass(frozen=True)
-class LinearParameter(Parameter):
-    """A parameter whose coordinate is (value - reference)/scale."""
-
-    scale: float = 1.0
-
-    def to_coordinate(self, value: Numbers) -> Numbers:
-        """Return the optimiser's coordinate of a value."""
-        return (value - self.reference) / self.scale
-
-    def from_coordinate(self, coordinate: Numbers) -> Numbers:
-        """Return the value at a coordinate."""
-        return self.reference + self.scale * coordinate
-
-    def slope(self, coordinate: Numbers) -> Numbers:
-        """Return d value/d coordinate."""
-        return np.full_like(coordinate, self.scale)
-
-
-@dataclass(frozen=True)
 class SweepProblem(Problem):
     """What is fitted to a sweep: frequency, quality factor and linear parameters; `model` is the background.
 
@@ -118,11 +100,17 @@ class SweepProblem(Problem):
     def parameters(self) -> tuple[Parameter, ...]:
         """The parameters in the order of every vector."""
         far = 1e12
-        frequency = LinearParameter(
-            "frequency_khz", "kHz", "natural frequency", 0.0, far, self.reference_khz, scale=self.width_khz
+        frequency = Parameter(
+            name="frequency_khz",
+            unit="kHz",
+            lowest=0.0,
+            highest=far,
+            reference=self.reference_khz,
+            width=self.width_khz,
         )
-        quality_factor = Parameter("quality_factor", "", "quality factor", lowest=0.5, highest=1e9)
-        return (frequency, quality_factor, *(LinearParameter(name, "", "", -far, far) for name in self.names[2:]))
+        quality_factor = Parameter(name="quality_factor", lowest=0.5, highest=far)
+        others = (Parameter(name=name, lowest=-far, highest=far, width=1.0) for name in self.names[2:])
+        return (frequency, quality_factor, *others)
 
 
 @partial(jax.jit, static_argnames="kind")

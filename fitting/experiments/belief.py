@@ -5,30 +5,25 @@ The belief that a fit leaves: its values, its covariance, and the drives that we
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import compress
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.contact.parameters import EFFECTS, PAPER
+from afm_jax.contact.parameters import EFFECTS
 from fitting.fits.result import FitResult
-from fitting.models import (
-    CONTACT_NAMES,
+from fitting.models import Problem
+from fitting.parameters import (
     NUISANCE_NAMES,
     PARAMETERS,
+    SHAPE_NAMES,
     Parameter,
-    Problem,
     check_contact_values,
     model_parameters,
+    paper_values,
 )
 
-_DELAY = {"delay_hertz": 0.206, "delay_lead_nm": 5.64, "delay_offset_nm": 0.726}
-_STARTING_LAWS = {
-    "restitution": {"r": 0.998},
-    "law": {"r": 0.998, "epsilon": 122.0},
-    "viscous": {"epsilon": 113.6, "viscous_loss": 0.5},
-}
-"""Laws of the paper's contact: a belief to begin with where nothing was measured."""
 UNCERTAINTY = 0.1
 """How far a belief is off, relative, where no measurement says."""
 DRAW_SEED = 1997
@@ -141,7 +136,7 @@ def believe(  # noqa: PLR0913
         raise ValueError(f"`uncertainty` must be between 0 and 1, but is {uncertainty!r}; write 0.1 for 10 %")
     problem = Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in known), tuple(effects))
     assumed = [name for name in own if name not in given and name not in known]
-    start = _starting_values(model, own) | {name: value for name, (value, _) in known.items()} | given
+    start = paper_values(model) | {name: value for name, (value, _) in known.items()} | given
     return Belief(
         problem=problem,
         values=checked_values(problem, start),
@@ -186,12 +181,6 @@ def checked_values(problem: Problem, values: Mapping[str, float]) -> Float[np.nd
     return np.array([float(values[name]) for name in problem.names])
 
 
-def _starting_values(model: str, own: tuple[str, ...]) -> dict[str, float]:
-    if model != "contact":
-        return _STARTING_LAWS[model.removesuffix("+delay")] | _DELAY
-    return {name: PAPER[name] for name in CONTACT_NAMES if name in own}
-
-
 def _assumptions(
     assumed: list[str], quality_factor: float | None, known: Mapping[str, tuple[float, float]]
 ) -> tuple[str, ...]:
@@ -218,7 +207,11 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
     """
     payload = result.to_dict() if isinstance(result, FitResult) else result
     _check_payload(payload)
-    found, table, settings = payload["parameters"], payload["input"], payload.get("settings") or {}
+    table, settings = payload["input"], payload.get("settings") or {}
+    # the shapes of loss and delay are known beforehand, not to be determined: what they do to the others stays
+    kept = [name not in SHAPE_NAMES for name in payload["parameters"]]
+    found = dict(compress(payload["parameters"].items(), kept))
+    matrix = [list(compress(row, kept)) for row in compress(payload["correlations"]["matrix"], kept)]
     problem = Problem(payload["model"], tuple(found), tuple(settings.get("effects") or EFFECTS))
     columns = ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")
     notes = []
@@ -230,7 +223,7 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
     return Belief(
         problem=problem,
         values=checked_values(problem, {name: entry["value"] for name, entry in found.items()}),
-        information=_information(found, payload["correlations"]["matrix"]),
+        information=_information(found, matrix),
         free_frequency_khz=float(table["free_frequency_khz"]),
         quality_factor=table.get("quality_factor"),
         mass_ng=float(table.get("mass_ng", 1.0)),

@@ -20,7 +20,7 @@ from fitting.experiments.candidates import AMPLITUDES, LEFT_OUT, Candidates, can
 from fitting.experiments.result import Design
 from fitting.fits.least_squares import covariance_of
 from fitting.fits.result import FitResult
-from fitting.models import DELAY_NAMES, NUISANCE_NAMES
+from fitting.parameters import DELAY_NAMES, NUISANCE_NAMES
 from fitting.simulated.experiment import Drives
 
 CRITERIA = ("D", "A")

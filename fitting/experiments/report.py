@@ -20,7 +20,7 @@ from afm_jax.words import bullets, interval, known, text_table, value_alone
 from fitting.experiments.belief import size_of
 from fitting.experiments.candidates import LEFT_OUT
 from fitting.experiments.result import Design, Forecast
-from fitting.models import NUISANCE_NAMES
+from fitting.parameters import NUISANCE_NAMES
 
 POINT_COLUMNS = (
     "order",

@@ -8,7 +8,7 @@ from jaxtyping import Float, Int
 
 from fitting.experiments.belief import Belief
 from fitting.experiments.candidates import LEFT_OUT, Candidates
-from fitting.models import Parameter
+from fitting.parameters import Parameter
 from fitting.simulated.experiment import Drives
 
 FORMAT_VERSION = 1

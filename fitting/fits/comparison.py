@@ -1,6 +1,6 @@
 """Models compared on the same table: information criteria, and in plain words what the measurement can tell."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
@@ -11,18 +11,12 @@ from afm_jax.checks import require_float64
 from fitting.fits.fit import Found, find_fit, summarise
 from fitting.fits.minimum import Strain, relaxed, settle
 from fitting.fits.result import FitResult
-from fitting.models import LAWS, model_parameters
+from fitting.parameters import LAWS, model_parameters
 from fitting.tables.table import AmplitudeTable
 
 _T = TypeVar("_T")
 _EVEN, _LEANS, _PLAIN = 2.0, 6.0, 10.0
 """Differences of AIC up to which models are even, one is favoured, and one is clearly favoured."""
-_MEANING = {
-    "restitution": "a restitution without adhesion (r)",
-    "law": "a restitution with adhesion (r, epsilon)",
-    "viscous": "a loss linear in speed with adhesion (epsilon, viscous_loss)",
-    "contact": "the resolved contact",
-}
 
 
 @dataclass(frozen=True)
@@ -60,6 +54,7 @@ def compare(
     models: Sequence[str] = ("law+delay", "viscous+delay"),
     *,
     report: Callable[[str], None] | None = None,
+    known: Mapping[str, tuple[Found, FitResult]] | None = None,
     **options: Any,
 ) -> Comparison:
     """Fit several models to one table and compare them on the same rows with the same errors.
@@ -71,6 +66,7 @@ def compare(
         table: the amplitudes.
         models: names of models.
         report: called with each model's name before it is fitted.
+        known: minimum and summary of models that were fitted to the table with the same options already.
         options: as of `fit`; `free`, `fixed` and `effects` go to the model "contact" only.
 
     Raises:
@@ -85,6 +81,8 @@ def compare(
         model_parameters(model, None if free is None else tuple(free))
 
     def fitted(model: str) -> tuple[Found, FitResult]:
+        if known is not None and model in known:
+            return known[model][0], _finite(known[model][1])
         if report is not None:
             report(model)
         found = find_fit(table, model, **_options_of(model, options))
@@ -93,7 +91,7 @@ def compare(
     fits, failed = _attempted(fitted, dict.fromkeys(models))
     errors = np.max([one.strain.model_error for one, _ in fits.values()], axis=0)
     aside = np.any([one.strain.set_aside for one, _ in fits.values()], axis=0)
-    judged, lost = _attempted(lambda model: _row(model, *fits[model], Strain(errors, aside)), fits)
+    judged, lost = _attempted(lambda model: _row(model, *fits[model], Strain(errors, errors, aside)), fits)
     results = {model: fits[model][1] for model in judged}
     rows = sorted(judged.values(), key=lambda row: row["aic"])
     for row in rows:
@@ -203,7 +201,8 @@ def _said_of(best: dict[str, Any], second: dict[str, Any]) -> str:
 
 
 def _meaning(model: str) -> str:
-    return f"{model}: {_MEANING[model.removesuffix('+delay')]}"
+    law = LAWS.get(model.removesuffix("+delay"))
+    return f"{model}: {law.meaning if law else 'the resolved contact'}"
 
 
 __all__ = ["Comparison", "compare", "rivals"]

@@ -5,7 +5,7 @@ The fitted impact law over the speeds that were measured, with the band that its
 What a minimum amounts to: errors, intervals, checks, and a verdict on whether to believe it.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
@@ -20,21 +20,33 @@ from afm_jax.checks import require_float64
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.lasting_impact import LawImpact
 from afm_jax.version import version_of
-from fitting.fits.intervals import Convergence, Interval, at_bound, check_minimum, covariance, profile_intervals
+from fitting.fits.intervals import (
+    Convergence,
+    Interval,
+    at_bound,
+    check_minimum,
+    covariance,
+    profile_intervals,
+    within_range,
+)
+from fitting.fits.loss import Loss, energy_lost, equivalent, interval_of
 from fitting.fits.minimum import Minimum, Strain, minimise, relaxed, rescale_errors, settle, strain_of, untabulated
 from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective
 from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows
-from fitting.fits.verdict import Evidence, judge_fit, misfits
-from fitting.forward import impact_of
-from fitting.models import (
-    NUISANCE_NAMES,
-    Measurement,
-    Problem,
-    check_contact_values,
-    constraints_of,
-    measurement_of,
-    model_parameters,
+from fitting.fits.unmodelled import (
+    LawAfter,
+    LawBefore,
+    Step,
+    Unmodelled,
+    law_after,
+    root_of,
+    rows_of_fit,
+    step_of,
 )
+from fitting.fits.verdict import ASSUMED_ERROR_OF_Q, Evidence, judge_fit, misfits
+from fitting.forward import impact_of
+from fitting.models import Measurement, Problem, constraints_of, measurement_of
+from fitting.parameters import NUISANCE_NAMES, PARAMETERS, check_contact_values, model_parameters
 from fitting.tables.table import AmplitudeTable
 
 _POINTS = 121
@@ -45,8 +57,9 @@ def law_with_band(
     problem: Problem,
     measurement: Measurement,
     values: Float[np.ndarray, " p"],
-    covariance: Float[np.ndarray, "p p"],
+    covariance: Float[np.ndarray, "k k"],
     approach_speeds: Float[np.ndarray, " rows"],
+    after: tuple[Step, Unmodelled] | None = None,
 ) -> FittedLaw:
     """Return the law from 0.8 times the slowest to 1.2 times the fastest approach, with its linearised 95 % band.
 
@@ -54,18 +67,15 @@ def law_with_band(
         problem: the model.
         measurement: gives the contact's fixed parameters.
         values: fitted values.
-        covariance: of the values; infinite entries give an open band (NaN).
+        covariance: of the values, or of those after the step; infinite entries give an open band (NaN).
         approach_speeds: of the rows' orbits in nm/us, NaN where a row has none.
+        after: the step from these values with what the model leaves out; None: the model is taken at its word.
     """
-    known = approach_speeds[np.isfinite(approach_speeds)]
-    slow, fast = (0.8 * known.min(), 1.2 * known.max()) if known.size else (1.0, 100.0)
-    speeds = np.geomspace(slow, fast, _POINTS)
-    law, slope = law_and_slope(jnp.asarray(values), jnp.asarray(speeds), measurement, problem)
-    rebound, delay = np.asarray(law)
-    if np.all(np.isfinite(covariance)):
-        width = _TWO_SIDED_95 * np.sqrt(np.einsum("lnp,pq,lnq->ln", np.asarray(slope), covariance, np.asarray(slope)))
-    else:
-        width = np.full((2, _POINTS), np.nan)
+    slow, fast = speed_range(approach_speeds)
+    speeds = np.geomspace(0.8 * slow, 1.2 * fast, _POINTS)
+    found = law_at(problem, measurement, values, covariance, speeds, after)
+    rebound, delay = found.law
+    width = _TWO_SIDED_95 * np.linalg.norm(found.factor, axis=2)
     return FittedLaw(
         approach_speed_nm_per_us=speeds,
         rebound_speed_nm_per_us=rebound,
@@ -77,20 +87,91 @@ def law_with_band(
     )
 
 
+def law_at(
+    problem: Problem,
+    measurement: Measurement,
+    values: Float[np.ndarray, " p"],
+    covariance: Float[np.ndarray, "k k"],
+    speeds: Float[np.ndarray, " n"],
+    after: tuple[Step, Unmodelled] | None = None,
+) -> LawAfter:
+    """Return the law at approach speeds in nm/us; the other arguments as of `law_with_band`."""
+    law, slope = jax.tree.map(np.asarray, law_and_slope(jnp.asarray(values), jnp.asarray(speeds), measurement, problem))
+    count = speeds.size
+    before = LawBefore(law[:, :count], slope[:, :count], float(law[0, count]), slope[0, count])
+    if not np.all(np.isfinite(covariance)) or after is None:
+        root = root_of(covariance)[: slope.shape[2]]
+        found = LawAfter(before.law, before.slope @ root, before.capture, before.capture_slope @ root)
+        if after is None:
+            return found
+        unknown = [np.full_like(found.factor, np.nan), np.full_like(found.capture_factor, np.nan)]
+        moved = law_after(*after, speeds, before)
+        return LawAfter(moved.law, unknown[0], moved.capture, unknown[1])
+    return law_after(*after, speeds, before)
+
+
+def loss_of(
+    found: Callable[[Float[np.ndarray, " n"]], LawAfter],
+    measured: tuple[float, float],
+    asked: tuple[float, float] | None,
+    mass_ng: float,
+) -> Loss:
+    """Return what impacts take: energies at measured speeds, the paper's laws over these and over those asked for.
+
+    Args:
+        found: the law at approach speeds in nm/us.
+        measured: slowest and fastest approach in nm/us.
+        asked: the same of another range; None: no other.
+        mass_ng: of the tip.
+    """
+    three = np.geomspace(*measured, 3)
+    # two digits, and within what was measured
+    three = np.clip([float(f"{speed:.2g}") for speed in three], *measured)
+    there = found(np.resize(three, _POINTS))
+    error = np.linalg.norm(there.factor[0], axis=1)
+    energies = [
+        energy_lost(float(u), float(w), float(e), mass_ng)
+        for u, w, e in zip(three, there.law[0, :3], error[:3], strict=True)
+    ]
+    laws = []
+    for ends in (measured, asked):
+        if ends is not None and ends[0] < ends[1]:
+            speeds = np.linspace(*ends, _POINTS)
+            law = found(speeds)
+            laws.append(equivalent(speeds, law.law[0], law.factor[0], mass_ng))
+    return Loss(
+        energies=tuple(dict.fromkeys(energies)),
+        equivalents=tuple(law for law in laws if law is not None),
+        capture_speed_nm_per_us=interval_of(there.capture, float(np.linalg.norm(there.capture_factor)), lowest=0.0),
+    )
+
+
+def speed_range(approach_speeds: Float[np.ndarray, " rows"]) -> tuple[float, float]:
+    """Return slowest and fastest of the known speeds; 1.25 and 83 nm/us where there is none."""
+    known = approach_speeds[np.isfinite(approach_speeds)]
+    return (float(known.min()), float(known.max())) if known.size else (1.25, 250.0 / 3.0)
+
+
 @partial(jax.jit, static_argnames=("problem",))
 def law_and_slope(
     values: Float[Array, " p"], speeds: Float[Array, " n"], measurement: Measurement, problem: Problem
-) -> tuple[Float[Array, "2 n"], Float[Array, "2 n p"]]:
-    """Return rebound speeds and delays at approach speeds, and their derivatives by the parameters."""
+) -> tuple[Float[Array, "2 n+1"], Float[Array, "2 n+1 p"]]:
+    """Return rebound speeds and delays at approach speeds, and their derivatives by the parameters.
+
+    The last column is that of the capture speed, twice.
+    """
 
     def law(v):
         impact = impact_of(v, measurement, problem)
         if isinstance(impact, LawImpact):
-            return jnp.stack([impact.law.rebound_speed(speeds), impact.law.collision_delay(speeds)])
+            capture = jnp.full((2, 1), impact.law.capture_speed_nm_per_us)
+            found = jnp.stack([impact.law.rebound_speed(speeds), impact.law.collision_delay(speeds)])
+            return jnp.concatenate([found, capture], axis=1)
         found = jax.vmap(impact.speeds)(speeds)
         # below the table the contact captures
         free = speeds > impact.lowest
-        return jnp.stack([jnp.where(free, found.rebound, 0.0), jnp.where(free, found.delay, 0.0)])
+        there = jnp.stack([jnp.where(free, found.rebound, 0.0), jnp.where(free, found.delay, 0.0)])
+        return jnp.concatenate([there, jnp.full((2, 1), impact.lowest)], axis=1)
 
     return law(values), jax.jacfwd(law)(values)
 
@@ -111,17 +192,20 @@ class Found:
 
 def summarise(table: AmplitudeTable, found: Found) -> FitResult:
     """Return errors, intervals, checks and verdict of a minimum."""
-    return _Summary(found.objective, table, found.minimum, found.strain, found.settings).result()
+    return _Summary(table, found).result()
 
 
 class _Summary:
-    """Turns a minimum into a `FitResult`: errors, intervals, checks, verdict."""
+    """Turns a minimum into a `FitResult`: the step with what the model leaves out, errors, intervals, checks, verdict.
 
-    def __init__(
-        self, objective: Objective, table: AmplitudeTable, minimum: Minimum, strain: Strain, settings: dict[str, Any]
-    ):
-        self.searching, self.table, self.minimum, self.strain = objective, table, minimum, strain
-        self.settings, self.problem = settings, objective.problem
+    ``values``, ``covariance``, ``free`` and ``minimum_chi2`` are those of the minimum; ``ends``, ``spread`` and
+    ``chi2``, of the ``parameters``, those after the step.
+    """
+
+    def __init__(self, table: AmplitudeTable, found: Found):
+        objective, minimum = found.objective, found.minimum
+        self.searching, self.table, self.minimum, self.strain = objective, table, minimum, found.strain
+        self.settings, self.problem, self.stated = found.settings, objective.problem, found.stated
         self.values = self.problem.values(minimum.coordinates)
         # orbits are followed from here on: only their places change a little
         self.objective = objective.following(self.values)
@@ -131,22 +215,60 @@ class _Summary:
         self.residual = np.asarray(linear.residual)[0]
         self.amplitude_residual = self.searching.misfit(linear)
         self.prediction = linear.prediction
-        self.chi2 = float(np.sum(self.residual**2))
-        self.constraints = settings["constraints"]
+        self.minimum_chi2 = float(np.sum(self.residual**2))
+        self.constraints = dict(self.settings["constraints"])
         used = int(np.asarray(objective.measurement.rows.measured).sum())
         self.data = used + int(np.asarray(objective.measurement.rows.no_orbit).sum()) + len(self.constraints)
         self.freedom = self.data - len(self.values)
         self.covariance = covariance(self.objective, self.values, self.free)
+        self.rows = self._rows()
+        self.used_speeds = np.where(self.rows.used, self.rows.approach_speed_nm_per_us, np.nan)
+        self.names, self.ends, self.spread = self.problem.names, self.values, self.covariance
+        self.chi2, self.contact_share = self.minimum_chi2, 0.0
+        self.after = self._step()
+        if self.after is not None:
+            self._take(*self.after)
+
+    def _step(self) -> tuple[Step, Unmodelled] | None:
+        """Return the step with what the model leaves out; None for impacts that take no time, or without slopes."""
+        if not self.problem.lasting or not np.isfinite(self.used_speeds).any():
+            return None
+        scale = self.settings["error_scale"] or 1.0
+        rows = rows_of_fit(self.stated, self.objective, self.values, self.strain, scale)
+        if not all(np.isfinite(part).all() for part in (rows.residual, rows.jacobian, *rows.slopes)):
+            return None
+        used = np.flatnonzero(np.isfinite(self.used_speeds))
+        # of the Hertz time, in us and kHz
+        shares = 1e-3 * rows.hertz_time[used] * self.table.drive_frequency_khz[used]
+        self.contact_share = float(shares.max())
+        values = dict(zip(self.problem.names, self.values.tolist(), strict=True))
+        left_out = Unmodelled(self.problem, values, speed_range(self.used_speeds))
+        return step_of(rows, left_out, self.free), left_out
+
+    def _take(self, step: Step, left_out: Unmodelled) -> None:
+        """Go on with values, errors and residuals after the step."""
+        self.names, self.ends, self.spread = step.names, step.values, step.covariance
+        self.constraints |= left_out.priors
+        if not self.searching.robust:
+            self.chi2 = step.chi2
+        count, error = self.table.rows, np.asarray(self.searching.measurement.rows.error_nm)
+        residual = step.residual[:count]
+        predicted = self.rows.predicted_nm + error[:count] * (residual - self.amplitude_residual[:count])
+        used = np.isfinite(self.rows.residual)
+        self.rows = replace(
+            self.rows,
+            residual=np.where(used, residual, np.nan),
+            predicted_nm=np.where(used, predicted, self.rows.predicted_nm),
+        )
 
     def result(self) -> FitResult:
         judged = self.freedom > 0 and self.settings["error_scale"] is None and not self.searching.robust
         p_value = float(chdtrc(self.freedom, self.chi2)) if judged else float("nan")
         errors = np.sqrt(np.diag(self.covariance))
         moved = ~self.free | ~np.isfinite(errors) | (np.abs(self.values - self.minimum.start) > 1e-3 * errors)
-        unknown = np.full_like(errors, np.inf)
-        rows = self._rows()
-        used_speeds = np.where(rows.used, rows.approach_speed_nm_per_us, np.nan)
-        missed = untabulated(self.objective, self.values, used_speeds)
+        moved = np.append(moved, np.ones(len(self.names) - len(moved), dtype=bool))
+        unknown, rows = np.full(len(self.names), np.inf), self.rows
+        missed = untabulated(self.objective, self.values, self.used_speeds)
         evidence = Evidence(
             table=self.table,
             parameters=self._parameters(unknown, "the model does not explain the data", moved),
@@ -160,14 +282,15 @@ class _Summary:
             error_scale=self.settings["error_scale"],
             lasting=self.problem.lasting,
             robust=self.searching.robust,
-            correlations=_correlations(self.covariance),
+            correlations=_correlations(self.spread),
             untabulated=tuple(np.flatnonzero(missed).tolist()),
+            contact_share=self.contact_share,
         )
         # Errors that assume the model would be confident numbers about a law that is not there.
         explained = not misfits(evidence)
-        shown_covariance = self.covariance if explained else np.full_like(self.covariance, np.inf)
+        shown_covariance = self.spread if explained else np.full_like(self.spread, np.inf)
         if explained:
-            evidence = replace(evidence, parameters=self._explained_parameters(errors, moved))
+            evidence = replace(evidence, parameters=self._explained_parameters(moved))
         reasons, warnings = judge_fit(evidence)
         return FitResult(
             model=self.problem.model,
@@ -186,8 +309,10 @@ class _Summary:
                 self.objective.measurement,
                 self.values,
                 shown_covariance,
-                used_speeds,
+                self.used_speeds,
+                self.after,
             ),
+            loss=self._loss(shown_covariance),
             rows=rows,
             residual_autocorrelation=evidence.autocorrelation,
             convergence=self.convergence,
@@ -196,35 +321,64 @@ class _Summary:
             versions={name: version_of(name) for name in _PACKAGES},
         )
 
-    def _explained_parameters(
-        self, errors: Float[np.ndarray, " p"], moved: Bool[np.ndarray, " p"]
-    ) -> dict[str, FittedParameter]:
+    def _loss(self, shown: Float[np.ndarray, "k k"]) -> Loss | None:
+        """Return what impacts take; None where no row has a speed."""
+        if not np.isfinite(self.used_speeds).any():
+            return None
+        measurement = self.objective.measurement
+
+        def found(speeds: Float[np.ndarray, " n"]) -> LawAfter:
+            return law_at(self.problem, measurement, self.values, shown, speeds, self.after)
+
+        asked = self.settings.get("speeds")
+        return loss_of(found, speed_range(self.used_speeds), asked, float(measurement.cantilever.mass_ng))
+
+    def _explained_parameters(self, moved: Bool[np.ndarray, " k"]) -> dict[str, FittedParameter]:
         """Return the parameters with their errors and, where all are determined, their intervals."""
-        if not np.all(np.isfinite(errors)):
+        errors = np.sqrt(np.diag(self.spread))
+        if not np.all(np.isfinite(errors)) or not np.all(np.isfinite(self.covariance)):
             # With one parameter adrift there is no minimum to follow for the others.
             return self._parameters(errors, "the data do not determine the parameters", moved)
-        intervals = profile_intervals(self.objective, self.values, self.covariance, self.chi2)
+        intervals = profile_intervals(self.objective, self.values, self.covariance, self.minimum_chi2)
+        if self.after is not None:
+            intervals = self._widened(intervals, errors)
         return self._parameters(errors, intervals, moved)
 
+    def _widened(self, profiles: list[Interval], errors: Float[np.ndarray, " k"]) -> list[Interval]:
+        """Return profile intervals that have moved with their values and grown with their errors; of shapes, Wald's."""
+        intervals = []
+        before = np.sqrt(np.diag(self.covariance))
+        for i, name in enumerate(self.names):
+            if i < len(profiles):
+                ends, reason = (profiles[i].low, profiles[i].high), profiles[i].reason
+                growth = errors[i] / before[i] if before[i] > 0.0 else 1.0
+                low, high = (None if e is None else self.ends[i] + growth * (e - self.values[i]) for e in ends)
+            else:
+                reason, reach = None, _TWO_SIDED_95 * errors[i]
+                low, high = self.ends[i] - reach, self.ends[i] + reach
+            intervals.append(within_range(PARAMETERS[name], Interval(low, high, reason)))
+        return intervals
+
     def _parameters(
-        self, errors: Float[np.ndarray, " p"], intervals: list[Interval] | str, moved: Bool[np.ndarray, " p"]
+        self, errors: Float[np.ndarray, " k"], intervals: list[Interval] | str, moved: Bool[np.ndarray, " k"]
     ) -> dict[str, FittedParameter]:
         """Return the parameters with errors and intervals; for these a text says why there are none."""
         if isinstance(intervals, str):
             intervals = [Interval(None, None, intervals)] * len(errors)
+        free = np.append(self.free, np.ones(len(errors) - len(self.free), dtype=bool))
         return {
             parameter.name: FittedParameter(
-                value=float(self.values[i]),
+                value=float(self.ends[i]),
                 unit=parameter.unit,
-                standard_error=float(errors[i]) if self.free[i] and np.isfinite(errors[i]) else None,
+                standard_error=float(errors[i]) if free[i] and np.isfinite(errors[i]) else None,
                 interval95=(intervals[i].low, intervals[i].high),
                 interval_reason=intervals[i].reason,
-                undetermined=not np.isfinite(self.covariance[i, i]),
-                at_bound=not bool(self.free[i]),
+                undetermined=not np.isfinite(self.spread[i, i]),
+                at_bound=not bool(free[i]),
                 did_not_move=not bool(moved[i]) and parameter.name not in self.constraints,
                 constraint=self.constraints.get(parameter.name),
             )
-            for i, parameter in enumerate(self.problem.parameters)
+            for i, parameter in enumerate(PARAMETERS[name] for name in self.names)
         }
 
     def _rows(self) -> FittedRows:
@@ -261,8 +415,10 @@ class _Summary:
         if self.problem.lasting:
             # it was found with the errors as stated and outliers counting less
             found = float(np.sum(self.searching.residual(values[index : index + 1]) ** 2))
-        if not found < self.chi2 + 4.0:
+        if not found < self.minimum_chi2 + 4.0:
             return None
+        # what the model leaves out has lowered the one, and would have lowered the other
+        found += self.chi2 - self.minimum_chi2
         return dict(zip(self.problem.names, values[index].tolist(), strict=True)), found
 
 
@@ -304,11 +460,13 @@ def fit(  # noqa: PLR0913
     constraints: dict[str, tuple[float, float]] | None = None,
     effects: Sequence[str] = EFFECTS,
     robust: bool = False,
+    speeds: tuple[float, float] | None = None,
 ) -> FitResult:
     """Fit an impact law to measured amplitudes of single-impact orbits.
 
     Args:
-        table: from `read_table`; what it gives with an error (Q, calibrations) is a nuisance with that constraint.
+        table: from `read_table`; what it gives with an error (Q, calibrations) is a nuisance with that constraint. A Q
+            without error is taken to be known to 2 % where impacts last, and exactly by the instantaneous laws.
         model: "restitution" (r), "law" (r, epsilon; eq. 6) or "viscous" (epsilon, viscous_loss), each instantaneous or
             with "+delay", the collision delay; or "contact", physical parameters through the resolved contact.
         scale_errors: take the amplitudes' errors as relative only and scale them until chi2 equals its degrees of
@@ -323,6 +481,8 @@ def fit(  # noqa: PLR0913
         effects: for "contact": the effects there are.
         robust: let outliers count linearly from two errors on; the result is valid only if they are few and the other
             amplitudes are explained.
+        speeds: slowest and fastest approach in nm/us over which the closest law of the paper is given, besides that
+            over the measured speeds.
 
     Returns:
         Values, errors, intervals, goodness of fit and a verdict; see `FitResult`.
@@ -333,6 +493,9 @@ def fit(  # noqa: PLR0913
         RuntimeError: if JAX is not set to 64-bit floats.
     """
     options: dict[str, Any] = {"free": free, "fixed": fixed, "constraints": constraints, "effects": effects}
+    if speeds is not None and not 0.0 < speeds[0] < speeds[1] < np.inf:
+        raise ValueError(f"`speeds` must be a rising pair of positive numbers in nm/us, but is {speeds!r}")
+    options["speeds"] = speeds
     found = find_fit(table, model, scale_errors=scale_errors, robust=robust, **options)
     return summarise(table, found)
 
@@ -347,10 +510,13 @@ def find_fit(  # noqa: PLR0913
     constraints: dict[str, tuple[float, float]] | None = None,
     effects: Sequence[str] = EFFECTS,
     robust: bool = False,
+    speeds: tuple[float, float] | None = None,
 ) -> Found:
     """Return the minimum of a fit; arguments and errors as of `fit`."""
     require_float64()
     known = constraints_of(table, constraints)
+    if table.quality_factor is not None and (model.endswith("+delay") or model == "contact"):
+        known = {"quality_factor": (table.quality_factor, ASSUMED_ERROR_OF_Q * table.quality_factor)} | known
     problem = problem_of(table, model, free=free, constraints=known, effects=effects)
     check_contact_values(model, fixed)
     measurement = measurement_of(table, problem, known, fixed)
@@ -375,6 +541,7 @@ def find_fit(  # noqa: PLR0913
         "free": list(problem.own),
         "fixed": fixed or {},
         "effects": list(effects) if model == "contact" else None,
+        "speeds": speeds,
     }
     return Found(stated, objective, minimum, strain, settings)
 

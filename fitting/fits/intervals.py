@@ -10,6 +10,8 @@ from jaxtyping import Bool, Float, Int
 
 from fitting.fits.least_squares import Box, Searches, covariance_of, descended
 from fitting.fits.objective import PLAIN, Objective
+from fitting.models import coordinate_of
+from fitting.parameters import Parameter
 
 CHI2_95 = 3.841458820694124
 """95 % quantile of chi2 with one degree of freedom."""
@@ -149,7 +151,7 @@ class _Places:
         """Return chi2, the residuals and their Jacobian by the places."""
         problem = self.objective.problem
         columns = zip(problem.parameters, np.moveaxis(places, -1, 0), strict=True)
-        coordinates = np.stack([p.to_coordinate(place) if p.sign else place for p, place in columns], axis=-1)
+        coordinates = np.stack([coordinate_of(p, place) if p.sign else place for p, place in columns], axis=-1)
         known, slopes = problem.values_and_slopes(coordinates)
         result = self.objective.at_values(np.where(self.by_value, places, known))
         residual, jacobian = np.asarray(result.residual), np.asarray(result.jacobian)
@@ -167,12 +169,23 @@ def _minimise_others(objective: Objective, sides: list[_Side], targets):
     fixed[lanes, index] = True
     parameters = objective.problem.parameters
     z[lanes, index] = [
-        t if parameters[k].sign else parameters[k].to_coordinate(np.asarray(t))
+        t if parameters[k].sign else coordinate_of(parameters[k], np.asarray(t))
         for k, t in zip(index, targets, strict=True)
     ]
     box = Box(places.lowest, places.highest, fixed)
     end = descended(places.look, places.look(z, lanes), box, settled=_SETTLED, most=_INNER_STEPS)
     return end.chi2, end.place
+
+
+def within_range(parameter: Parameter, interval: Interval) -> Interval:
+    """Return an interval whose ends beyond the parameter's range are open."""
+    ends, reasons = [interval.low, interval.high], [interval.reason] if interval.reason else []
+    for i, (name, last, beyond) in enumerate((("lower", parameter.lowest, -1), ("upper", parameter.highest, 1))):
+        end = ends[i]
+        if end is not None and beyond * (end - last) > 0.0:
+            ends[i] = None
+            reasons.append(f"{name} end: reaches the end of its range, {last:g}")
+    return Interval(ends[0], ends[1], "; ".join(reasons) or None)
 
 
 def _interval(sides: list[_Side], index: int) -> Interval:

@@ -26,11 +26,15 @@ Look = Callable[[Float[np.ndarray, "some p"], Int[np.ndarray, " some"]], Searche
 
 
 class Box(NamedTuple):
-    """Where searches may go: between bounds (infinite: none), and which parameters of each search stay as they are."""
+    """Where searches may go: between bounds (infinite: none), which parameters of each search stay, and how far a step.
+
+    ``longest`` is the most by which a parameter changes at once.
+    """
 
     lowest: Float[np.ndarray, " p"]
     highest: Float[np.ndarray, " p"]
     fixed: Bool[np.ndarray, "sets p"]
+    longest: float = np.inf
 
     def of(self, some: Int[np.ndarray, " some"]) -> "Box":
         """Return the box of some of the searches."""
@@ -54,7 +58,8 @@ def descended(look: Look, start: Searches, box: Box, *, settled: float, most: in
         if not active.size:
             break
         some = Searches(*(leaf[active] for leaf in state))
-        trial = some.place + _step(some, box.of(active), damping[active])
+        step = _step(some, box.of(active), damping[active])
+        trial = some.place + np.clip(step, -box.longest, box.longest)
         found = look(np.clip(trial, box.lowest, box.highest), active)
         better = found.chi2 <= some.chi2
         for leaf, new in zip(state, found, strict=True):

@@ -24,12 +24,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from afm_jax.contact.law_of_contact import DELAY_ERROR_US, SPEED_ERROR
-from afm_jax.contact.parameters import CONTACT_PARAMETER
 from afm_jax.impact.lasting_impact import LawImpact
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.fits.objective import BATCH, FINE, PLAIN, ROUGH, SOFT, Objective, lowest, polish
 from fitting.forward import Linearised, impact_of
-from fitting.models import CONTACT_NAMES, NUISANCE_NAMES, ROWS_PER_PROGRAM, Measurement, Problem
+from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem
+from fitting.parameters import PARAMETERS, Parameter
 
 _GRID_PER_PARAMETER = {1: 96, 2: 16}
 _SPREAD_POINTS = 64
@@ -37,19 +37,22 @@ _SPREAD_POINTS = 64
 
 
 def starts(problem: Problem, measurement: Measurement) -> Float[np.ndarray, "points p"]:
-    """Return the values to start from, logarithmic in every loss; nuisances stay where they were measured.
+    """Return the values to start from, a grid or a sequence over the `starts` of the model's parameters.
 
-    Adhesion and viscous loss are laid out in terms of the drive's speed beta omega, on which capture depends.
+    Nuisances stay where they were measured.
     """
-    own = [name for name in problem.names if name not in NUISANCE_NAMES]
-    ranges = _ranges(measurement)
+    own = problem.own
+
+    def started(name: str, place: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        return _range(PARAMETERS[name], measurement, place)
+
     if len(own) in _GRID_PER_PARAMETER and not problem.lasting:
         count = _GRID_PER_PARAMETER[len(own)]
-        mesh = np.meshgrid(*(ranges[name](np.linspace(0.0, 1.0, count)) for name in own), indexing="ij")
+        mesh = np.meshgrid(*(started(name, np.linspace(0.0, 1.0, count)) for name in own), indexing="ij")
         columns = {name: axis.ravel() for name, axis in zip(own, mesh, strict=True)}
     else:
         places = _spread(_SPREAD_POINTS, len(own))
-        columns = {name: ranges[name](place) for name, place in zip(own, places.T, strict=True)}
+        columns = {name: started(name, place) for name, place in zip(own, places.T, strict=True)}
     count = len(columns[own[0]])
     known = dict(zip(problem.names, np.asarray(measurement.constraint_value).tolist(), strict=True))
     return np.stack([columns.get(name, np.full(count, known[name])) for name in problem.names], axis=1)
@@ -65,36 +68,17 @@ def _spread(count: int, dimensions: int) -> Float[np.ndarray, "count dimensions"
     return np.mod(0.5 + np.outer(np.arange(1, count + 1), steps), 1.0)
 
 
-def _ranges(measurement: Measurement):
-    """Return by name what a place between 0 and 1 stands for."""
+def _range(parameter: Parameter, measurement: Measurement, place: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return the values that places between 0 and 1 of a parameter's starting range stand for."""
     rows = measurement.rows
     drive = RAD_PER_US_PER_KHZ * np.asarray(rows.drive_amplitude_nm) * np.asarray(rows.drive_frequency_khz)
-    slow, fast = float(drive.min()), float(drive.max())
-    mass = float(np.asarray(measurement.cantilever.mass_ng))
-
-    def between(low, high):
-        return lambda place: low * (high / low) ** np.asarray(place)
-
-    # the Hertz time grows with mass^0.4; a factor of 5 around the paper's tip
-    hertz = 0.2 * mass**0.4
-    losses = {
-        "r": lambda place: 1.0 - between(0.7, 1e-4)(place),
-        "epsilon": between(1e-4 * slow**2, 30.0 * fast**2),
-        "viscous_loss": between(1e-4 * slow, 10.0 * fast),
-        "delay_hertz": between(hertz / 5.0, hertz * 5.0),
-        "delay_lead_nm": lambda place: 10.0 * np.asarray(place),
-        "delay_offset_nm": lambda place: 2.0 * np.asarray(place) - 0.5,
-    }
-    return losses | {name: _around(name) for name in CONTACT_NAMES}
-
-
-def _around(name: str):
-    known = CONTACT_PARAMETER[name]
-    if name == "relative_humidity":
-        return lambda place: 0.1 + 0.8 * np.asarray(place)
-    if known.width:
-        return lambda place: known.default + 2.0 * known.width * (np.asarray(place) - 0.5)
-    return lambda place: known.default * known.spread ** (2.0 * np.asarray(place) - 1.0)
+    scale = np.array([drive.min(), drive.max()]) ** parameter.drive_power
+    scale *= float(np.asarray(measurement.cantilever.mass_ng)) ** parameter.mass_power
+    low, high = np.array(parameter.starts) * scale
+    if parameter.width or parameter.even:
+        return low + (high - low) * place
+    start = low * (high / low) ** place
+    return parameter.reference + parameter.sign * start if parameter.sign else start
 
 
 _STEPS = (0.01, 0.03, 0.1, 0.3)
@@ -295,6 +279,9 @@ LONGEST = 1.4
 """s beyond which a row is set aside."""
 NEAREST = 1.35
 """Approach speed in terms of the capture speed below which a row is set aside."""
+_CRAWLING, _MOST_LOST = 2.5, 0.05
+"""The same for rows that the law has no steady orbit for, their speed told from the amplitude; and their share at most:
+that close to where orbits end, a hair of the law decides whether there is one."""
 
 
 @dataclass(frozen=True)
@@ -303,10 +290,12 @@ class Strain:
 
     Attributes:
         model_error: relative error of the amplitude that the picture itself has, shape (rows,).
+        slow_error: the part of it that slow impacts have, without that of the delay law.
         set_aside: rows that are not used, shape (rows,).
     """
 
     model_error: Float[np.ndarray, " rows"]
+    slow_error: Float[np.ndarray, " rows"]
     set_aside: Bool[np.ndarray, " rows"]
 
 
@@ -315,7 +304,7 @@ def strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
     rows = objective.measurement.rows
     count = rows.order.shape[0]
     if not objective.problem.lasting:
-        return Strain(np.zeros(count), np.zeros(count, dtype=bool))
+        return Strain(np.zeros(count), np.zeros(count), np.zeros(count, dtype=bool))
     impact = impact_of(jnp.asarray(values), objective.measurement, objective.problem)
     linear = objective.at_values(values[None])
     prediction = linear.prediction
@@ -327,11 +316,24 @@ def strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
     capture = float(impact.speeds(jnp.asarray(lowest * (1.0 + 1e-9))).approach) if lowest > 0.0 else 0.0
     share = 2.0 * np.pi * np.asarray(rows.drive_frequency_khz) * 1e-3 * float(impact.length) / np.maximum(rebound, 1e-6)
     slow = (share > LONGEST) | (approach < NEAREST * capture)
+    slow = np.where(exists, slow, _lost_slowly(objective, exists, _CRAWLING * capture))
     near = np.minimum(1.5 * capture / np.maximum(approach, 1e-6), 1.5 / NEAREST)
-    error = BASE + GROWTH * np.minimum(share, LONGEST) ** 3 + SLOW * near**6
+    slow_error = BASE + GROWTH * np.minimum(share, LONGEST) ** 3 + SLOW * near**6
+    error = slow_error
     if "delay_offset_nm" in objective.problem.names:
         error = np.hypot(error, DELAY_US * _sensitivity(objective, linear, approach))
-    return Strain(np.where(exists, error, BASE), exists & slow)
+    return Strain(np.where(exists, error, BASE), np.where(exists, slow_error, BASE), slow)
+
+
+def _lost_slowly(objective: Objective, exists: Bool[np.ndarray, " rows"], slowest: float) -> Bool[np.ndarray, " rows"]:
+    """Say which measured rows without an orbit have amplitudes of slow impacts; none if there are many of them."""
+    rows = jax.tree.map(np.asarray, objective.measurement.rows)
+    measured = rows.measured.any(axis=1)
+    # a tip that comes free of the platform reaches about its speed over its angular frequency; the lock-in reads half
+    height = np.max(np.where(rows.measured, rows.amplitude_nm * np.array([1.0, 2.0]), 0.0), axis=1)
+    speed = height * float(objective.measurement.cantilever.angular_frequency)
+    lost = measured & ~exists & (speed < slowest)
+    return lost if lost.sum() <= _MOST_LOST * measured.sum() else np.zeros_like(lost)
 
 
 def untabulated(

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from afm_jax.strict_json import plain
 from fitting.fits.intervals import Convergence
+from fitting.fits.loss import Loss
 from fitting.tables.table import AmplitudeTable
 
 FORMAT_VERSION = 1
@@ -94,6 +95,7 @@ class FitResult:
         reasons: what makes the result invalid.
         warnings: what a reader should know besides.
         law: the fitted impact law with its band.
+        loss: what an impact takes: energies, the paper's r and delta, the capture speed; None if no speed was reached.
         rows: measured and predicted amplitudes.
         residual_autocorrelation: lag-1 correlation of neighbouring rows' residuals.
         convergence: what the checks of the minimum found.
@@ -120,6 +122,7 @@ class FitResult:
     table: AmplitudeTable
     settings: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
+    loss: Loss | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain lists, numbers and strings; what is not known is None."""
@@ -139,6 +142,7 @@ class FitResult:
             "bic": plain(self.bic),
             "residual_autocorrelation": plain(self.residual_autocorrelation),
             "law": {name: plain(column) for name, column in vars(self.law).items()},
+            "loss": None if self.loss is None else plain(asdict(self.loss)),
             "rows": {name: plain(column) for name, column in vars(self.rows).items()},
             "convergence": plain(asdict(self.convergence)),
             "input": plain(vars(self.table)),

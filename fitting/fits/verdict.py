@@ -14,7 +14,7 @@ from scipy.special import chdtrc
 
 from fitting.fits.intervals import Convergence
 from fitting.fits.result import FittedParameter, FittedRows
-from fitting.models import PARAMETERS
+from fitting.parameters import PARAMETERS, SHAPE_NAMES
 from fitting.tables.table import AmplitudeTable
 
 IMPROBABLE = 1e-3
@@ -36,6 +36,12 @@ taken to be correlated: by chance in one fit of ten thousand."""
 _NEGLIGIBLE = 0.3
 """Root mean square of the residuals, in errors, below which their pattern is of no consequence."""
 _FEWEST_NEIGHBOURS = 8
+_LONG_CONTACT = 0.2
+"""Share of the drive's period in contact from which a misfit is laid to it: the corrections are fitted up to there."""
+ASSUMED_ERROR_OF_Q = 0.02
+"""Relative standard error of a quality factor that is given without one."""
+_PULLED, _TORN = 2.0, 3.0
+"""Distance from what is known of a quantity, in its standard errors, from which it is named, and not believed."""
 
 
 @dataclass(frozen=True)
@@ -57,6 +63,8 @@ class Evidence:
     correlations: Float[np.ndarray, "p p"]
     untabulated: tuple[int, ...] = ()
     """Rows whose impacts the table of a contact does not hold to its accuracy."""
+    contact_share: float = 0.0
+    """Largest share of a drive's period that the tip is in contact."""
 
 
 def judge_fit(evidence: Evidence) -> tuple[list[str], list[str]]:
@@ -93,12 +101,27 @@ def _reasons(evidence: Evidence) -> list[str]:
     misfit = misfits(evidence)
     if misfit:
         reasons.append(f"The model does not explain the data: {'; '.join(misfit)}. {_why_not_explained(evidence)}")
+    reasons += _contradictions(evidence)
     if evidence.freedom <= 0:
         reasons.append("As many parameters as amplitudes: the goodness of fit cannot be judged.")
     for name, parameter in evidence.parameters.items():
         if parameter.interval95 == (None, None) and not misfit and not undetermined:
             reasons.append(f"{name} is not identified: {parameter.interval_reason}; {helpful_measurement(name)}.")
     return reasons
+
+
+def _contradictions(evidence: Evidence) -> list[str]:
+    """Return what says that the amplitudes contradict what was measured otherwise."""
+    torn = [_pull_in_words(evidence, name, pull) for name, pull in _pulls(evidence).items() if abs(pull) > _TORN]
+    if not torn:
+        return []
+    said = "; ".join(torn)
+    return [
+        (
+            f"The amplitudes contradict what is known beforehand: {said}. "
+            "Either that is wrong, or the model makes up for what it lacks."
+        )
+    ]
 
 
 def misfits(evidence: Evidence) -> list[str]:
@@ -147,16 +170,27 @@ def _scaled_misfits(evidence: Evidence) -> list[str]:
 
 
 def _pulls(evidence: Evidence) -> dict[str, float]:
-    """Return how far each parameter is from what is known of it, in standard errors of that."""
-    known = {name: (p.value, *p.constraint) for name, p in evidence.parameters.items() if p.constraint is not None}
+    """Return how far each parameter is from what was measured of it, in standard errors of that."""
+    known = {
+        name: (p.value, *p.constraint)
+        for name, p in evidence.parameters.items()
+        if p.constraint is not None and name not in SHAPE_NAMES
+    }
     return {name: (value - given) / error for name, (value, given, error) in known.items()}
+
+
+def _pull_in_words(evidence: Evidence, name: str, pull: float) -> str:
+    parameter = evidence.parameters[name]
+    given, error = parameter.constraint or (float("nan"), float("nan"))
+    return f"{name} = {parameter.value:.5g} is {abs(pull):.1f} standard errors from the given {given:g} +- {error:.2g}"
 
 
 def _without_outliers(evidence: Evidence) -> tuple[float, int, float]:
     """Return chi2 of the amplitudes that are no outliers and of what is known, its freedom and its probability."""
     residual, pulls = evidence.rows.residual, _pulls(evidence)
     inside = residual[np.abs(residual) <= _OUTLIER]
-    freedom = inside.size + len(pulls) - len(evidence.parameters)
+    # the shapes are known as well as they are determined: neither data nor free
+    freedom = inside.size + len(pulls) - sum(name not in SHAPE_NAMES for name in evidence.parameters)
     chi2 = float(np.sum(inside**2) + sum(pull**2 for pull in pulls.values()))
     return chi2, freedom, float(chdtrc(freedom, chi2)) if freedom > 0 else float("nan")
 
@@ -207,6 +241,11 @@ def _why_not_explained(evidence: Evidence) -> str:
     few = 2 * _outliers(evidence, evidence.error_scale or 1.0).sum() <= evidence.rows.used.sum()
     if few and not evidence.robust and not _correlations(evidence):
         tail += " (if only a few are wrong: --robust)"
+    if evidence.contact_share > _LONG_CONTACT:
+        return (
+            f"Impacts last up to {100.0 * evidence.contact_share:.0f} % of a drive period: too long to be impacts of a "
+            f"platform that hardly moves meanwhile; measure at lower frequencies, or at lower orders; {tail}."
+        )
     if evidence.lasting:
         other = "The loss may depend on the speed otherwise (try viscous+delay), the" if "r" in names else "The"
         return (
@@ -236,8 +275,17 @@ def _warnings(evidence: Evidence) -> list[str]:
 
 def _damping_warnings(evidence: Evidence) -> list[str]:
     table = evidence.table
-    if "quality_factor" in evidence.parameters:
-        return []
+    along = evidence.parameters.get("quality_factor")
+    if along is not None:
+        assumed = (table.quality_factor or 0.0, ASSUMED_ERROR_OF_Q * (table.quality_factor or 0.0))
+        if table.quality_factor_error is not None or along.constraint != assumed:
+            return []
+        given, error = assumed
+        message = (
+            f"quality_factor = {given:g} is given without an error: {100.0 * ASSUMED_ERROR_OF_Q:g} % was assumed "
+            f"({given:g} +- {error:.3g}). The loss hangs on it: state it, like `# quality_factor = {given:g} +- 1`."
+        )
+        return [message]
     if table.quality_factor is None:
         message = (
             "The table gives no quality_factor: air damping is left out, and what it takes is counted as impact loss. "
@@ -257,6 +305,9 @@ def _damping_warnings(evidence: Evidence) -> list[str]:
 def _parameter_warnings(evidence: Evidence) -> list[str]:
     warnings = []
     explained = not misfits(evidence)
+    for name, pull in _pulls(evidence).items():
+        if _PULLED < abs(pull) <= _TORN:
+            warnings.append(f"{_pull_in_words(evidence, name, pull)}: check it, the loss hangs on it.")
     for name, parameter in evidence.parameters.items():
         low, high = parameter.interval95
         # Where the model does not explain the data, a bound is only where the misfit pushed the parameter.

@@ -11,21 +11,24 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.impact.amplitude import FlightEnds, lockin, peak_amplitude
 from afm_jax.impact.lasting_impact import INDENTATION, gained_and_longer, middle_of_contact
+from fitting.fits.least_squares import Box, Searches, descended
 
 _HALF_SINE = 0.42441318157838753
 """4/(3 pi): lock-in amplitude of half sines at their own frequency, over their height."""
 _ARRIVAL_STEPS = 8
 _ITERATIONS = 30
 _LONGEST_MOVE = 0.3
+_SETTLED = 1e-24
 _ARRIVED = 1e-6
-"""Squared distance to the minimum, in standard errors, at which the search has arrived."""
+"""Squared distance to the minimum, in standard errors, at which a search stops, and up to which its end counts."""
 _ANGLES, _SPEEDS = (-0.9, -0.45, 0.0, 0.45, 0.9), (-0.15, 0.0, 0.15)
 """Starts of the search: angle of the response in rad, and logarithm of the velocity, beside a half sine's."""
 
@@ -133,42 +136,37 @@ def _residual(unknowns: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantil
     return jnp.where(jnp.isfinite(row.error), apart / row.error, 0.0)
 
 
-class _SearchPlace(NamedTuple):
-    """A place of the search, with all that is computed there."""
+@jax.jit
+@partial(jax.vmap, in_axes=(0, 0, None))
+def _look(
+    unknowns: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantilever
+) -> tuple[Float[Array, " 3"], Float[Array, "3 2"]]:
+    """Return the residuals of a place and their derivatives by the unknowns."""
 
-    unknowns: Float[Array, " 2"]
-    chi2: Float[Array, ""]
-    residual: Float[Array, " 3"]
-    slopes: Float[Array, "3 2"]
-
-
-def _look(unknowns: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantilever) -> _SearchPlace:
     def twice(unknowns):
         residual = _residual(unknowns, row, cantilever)
         return residual, residual
 
     slopes, residual = jax.jacfwd(twice, has_aux=True)(unknowns)
-    chi2 = jnp.sum(residual**2)
-    return _SearchPlace(unknowns, jnp.where(jnp.isfinite(chi2), chi2, jnp.inf), residual, slopes)
+    return residual, slopes
 
 
-def _search(start: Float[Array, " 2"], row: MeasuredRow, cantilever: Cantilever) -> _SearchPlace:
-    """Return where Levenberg and Marquardt's method ends."""
+def _searched(
+    starts: Float[np.ndarray, "searches 2"], rows: MeasuredRow, cantilever: Cantilever
+) -> Float[np.ndarray, "searches 2"]:
+    """Return where searches end that start from places, each of its own row."""
+    kept = np.array(starts)
 
-    def step(_, state):
-        place, damping = state
-        normal = place.slopes.T @ place.slopes
-        normal = normal + damping * jnp.diag(jnp.diag(normal))
-        move = -_solve(normal, place.slopes.T @ place.residual)
-        move = jnp.where(jnp.all(jnp.isfinite(move)), jnp.clip(move, -_LONGEST_MOVE, _LONGEST_MOVE), 0.0)
-        trial = _look(place.unknowns + move, row, cantilever)
-        better = trial.chi2 <= place.chi2
-        kept = jax.tree.map(lambda new, old: jnp.where(better, new, old), trial, place)
-        return kept, jnp.where(better, 0.1 * damping, jnp.minimum(10.0 * damping, 1e8))
+    def look(places: Float[np.ndarray, "some 2"], some: Int[np.ndarray, " some"]) -> Searches:
+        # all places at once, so that one program serves: what the others have is known already
+        kept[some] = places
+        residual, slopes = (np.asarray(part)[some] for part in _look(kept, rows, cantilever))
+        chi2 = np.sum(residual**2, axis=1)
+        return Searches(places, residual, slopes, np.where(np.isfinite(chi2), chi2, np.inf))
 
-    # without slopes the first step goes nowhere and looks around: the program holds one look only
-    blind = _SearchPlace(start, jnp.asarray(jnp.inf), jnp.zeros(3), jnp.zeros((3, 2)))
-    return lax.fori_loop(0, _ITERATIONS, step, (blind, jnp.asarray(1e-3)))[0]
+    free = Box(np.full(2, -np.inf), np.full(2, np.inf), np.zeros(starts.shape, dtype=bool), _LONGEST_MOVE)
+    first = look(starts, np.arange(len(starts)))
+    return descended(look, first, free, settled=_SETTLED, most=_ITERATIONS).place
 
 
 def _solve(matrix: Float[Array, "2 2"], right: Float[Array, "2 ..."]) -> Float[Array, "2 ..."]:
@@ -178,39 +176,45 @@ def _solve(matrix: Float[Array, "2 2"], right: Float[Array, "2 ..."]) -> Float[A
     return inverse @ right
 
 
-@jax.jit
-@partial(jax.vmap, in_axes=(0, None))
-def invert_rows(row: MeasuredRow, cantilever: Cantilever) -> Inverted:
+def invert_rows(rows: MeasuredRow, cantilever: Cantilever) -> Inverted:
     """Return the flights and impacts of rows with a phase and at least one amplitude.
 
     Args:
-        row: arrays with a leading axis of rows.
+        rows: arrays with a leading axis of rows.
         cantilever: its frequency and Q, exactly known.
     """
-    height = jnp.where(jnp.isfinite(row.error[0]), row.value[0], row.value[1] / _HALF_SINE)
+    beside = np.array(list(product(_ANGLES, _SPEEDS)))
+    height = np.where(np.isfinite(rows.error[:, 0]), rows.value[:, 0], rows.value[:, 1] / _HALF_SINE)
     # half sines z = a |sin(nu (t - t_out)/2)| have the phase nu t_out + phi = pi
-    middle = jnp.stack([jnp.asarray(jnp.pi), jnp.log(cantilever.angular_frequency * height)])
-    starts = middle + jnp.asarray(tuple(product(_ANGLES, _SPEEDS)))
+    middle = np.stack([np.full_like(height, np.pi), np.log(np.asarray(cantilever.angular_frequency) * height)], axis=1)
+    starts = (middle[:, None] + beside).reshape(-1, 2)
+    each = jax.tree.map(lambda part: np.repeat(np.asarray(part), len(beside), axis=0), rows)
+    return _best_ends(_searched(starts, each, cantilever).reshape(-1, len(beside), 2), rows, cantilever)
 
-    def one(start):
-        place = _search(start, row, cantilever)
 
+@jax.jit
+@partial(jax.vmap, in_axes=(0, 0, None))
+def _best_ends(places: Float[Array, "starts 2"], row: MeasuredRow, cantilever: Cantilever) -> Inverted:
+    """Return what the best of a row's searches has found."""
+
+    def one(place):
         def impact(unknowns):
             flight = flight_of(unknowns, row, cantilever)
             found = impact_of(flight, row, cantilever)
-            return jnp.stack(found), (found, flight)
+            residual = _residual(unknowns, row, cantilever)
+            return (jnp.stack(found), residual), (found, flight, residual)
 
-        slopes, (found, flight) = jax.jacfwd(impact, has_aux=True)(place.unknowns)
-        normal = place.slopes.T @ place.slopes
+        (slopes, residual_slopes), (found, flight, residual) = jax.jacfwd(impact, has_aux=True)(place)
+        normal = residual_slopes.T @ residual_slopes
         covariance = slopes @ _solve(normal, slopes.T)
         # distance to the minimum in standard errors, squared
-        rest = place.slopes.T @ place.residual
+        rest = residual_slopes.T @ residual
         left = rest @ _solve(normal, rest)
         good = (found.approach_speed > 0.0) & (found.rebound_speed > 0.0)
         good = good & (left < _ARRIVED) & jnp.all(jnp.isfinite(covariance))
-        return Inverted(found, covariance, flight, place.chi2, good)
+        return Inverted(found, covariance, flight, jnp.sum(residual**2), good)
 
-    ends = jax.vmap(one)(starts)
+    ends = jax.vmap(one)(places)
     # of equally good ones that with the shortest contact
     response = row.order * row.platform.period_us
     score = ends.chi2 + 1e-3 * (ends.impact.delay_us / response) ** 2

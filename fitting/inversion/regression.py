@@ -12,7 +12,7 @@ A law that is known otherwise, from a CSV file such as `afm-jax collide --out` w
 """
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from fitting.inversion.result import (
     ResonanceReading,
     SavedLaw,
 )
+from fitting.parameters import PARAMETERS
 from fitting.tables.csv_text import (
     Column,
     Faults,
@@ -88,16 +89,16 @@ def one(u: np.ndarray, _w: np.ndarray, _tau: np.ndarray) -> np.ndarray:
     return np.ones_like(u)
 
 
-LOSS_TERMS: dict[str, tuple[Formula, ...]] = {
-    "viscous": (one, lambda u, _w, _tau: u),
-    "restitution": (one, lambda u, _w, _tau: u * u),
+LOSS_TERMS: dict[str, dict[str, Formula]] = {
+    "viscous": {"epsilon": one, "viscous_loss": lambda u, _w, _tau: u},
+    "restitution": {"epsilon": one, "r": lambda u, _w, _tau: u * u},
 }
-"""Of u_in^2 - u_out^2 = epsilon + c u_in, and = epsilon + (1 - r^2) u_in^2 (eq. 6)."""
-DELAY_TERMS: tuple[Formula, ...] = (
-    lambda u, _w, _tau: u**-0.2,
-    lambda u, w, _tau: 1.0 / u - 1.0 / w,
-    lambda u, _w, _tau: -1.0 / u,
-)
+"""By parameter: of u_in^2 - u_out^2 = epsilon + c u_in, and = epsilon + (1 - r^2) u_in^2 (eq. 6)."""
+DELAY_TERMS: dict[str, Formula] = {
+    "delay_hertz": lambda u, _w, _tau: u**-0.2,
+    "delay_lead_nm": lambda u, w, _tau: 1.0 / u - 1.0 / w,
+    "delay_offset_nm": lambda u, _w, _tau: -1.0 / u,
+}
 """Of the delay law a u^(-1/5) - b (1/u_out - 1/u_in) - d/u_in."""
 
 
@@ -108,7 +109,7 @@ def delay(_u: np.ndarray, _w: np.ndarray, tau: np.ndarray) -> np.ndarray:
 
 def regress(
     target: Formula,
-    terms: tuple[Formula, ...],
+    terms: Mapping[str, Formula],
     impacts: Float[np.ndarray, "rows 3"],
     covariances: Float[np.ndarray, "rows 3 3"],
     shared: Float[np.ndarray, "rows 3 shared"],
@@ -117,7 +118,7 @@ def regress(
 
     Args:
         target: what is to be explained.
-        terms: what it is a linear combination of.
+        terms: what it is a linear combination of, by coefficient.
         impacts: approach speed, rebound speed and delay of each row.
         covariances: of each row's three quantities.
         shared: by how much they move with one standard error of each quantity that all rows share.
@@ -130,7 +131,7 @@ def regress(
         raise ValueError(f"{rows} rows cannot determine {count} coefficients; measure more")
     goal, goal_slopes = _with_slopes(target, impacts)
     basis, basis_slopes = (
-        np.stack(part, axis=1) for part in zip(*(_with_slopes(t, impacts) for t in terms), strict=True)
+        np.stack(part, axis=1) for part in zip(*(_with_slopes(t, impacts) for t in terms.values()), strict=True)
     )
 
     def linear(value: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -197,19 +198,6 @@ _POINTS = 120
 _DECIDED = 6.0
 """Difference of chi2 from which a law with as many coefficients is called better."""
 _IMPROBABLE = 1e-3
-_UNITS = {
-    "epsilon": "nm^2/us^2",
-    "viscous_loss": "nm/us",
-    "r": "",
-    "hertz": "us (nm/us)^(1/5)",
-    "lead_nm": "nm",
-    "offset_nm": "nm",
-}
-_NAMES = {
-    "viscous": ("epsilon", "viscous_loss"),
-    "restitution": ("epsilon", "r"),
-    "delay": ("hertz", "lead_nm", "offset_nm"),
-}
 _PLAIN = {"viscous": "a viscous loss, linear in the speed", "restitution": "a coefficient of restitution"}
 
 
@@ -255,7 +243,7 @@ def regressed_laws(rows: InvertedRows) -> Laws:
     return Laws(rows=rows, speeds=speeds, laws=laws, delay=delays, preferred=preferred, verdict=verdict)
 
 
-def _regression(rows: InvertedRows, target: Formula, terms: tuple[Formula, ...]) -> Regression:
+def _regression(rows: InvertedRows, target: Formula, terms: Mapping[str, Formula]) -> Regression:
     used = rows.regressed
     return regress(target, terms, rows.impact[used], rows.covariance[used], rows.shared[used])
 
@@ -280,7 +268,7 @@ def _without_slow(rows: InvertedRows) -> InvertedRows:
 def _loss_law(
     model: str, found: Regression, shared: tuple[str, ...], speeds: Float[np.ndarray, " points"]
 ) -> RegressedLaw:
-    basis = np.stack([term(speeds, speeds, speeds) for term in LOSS_TERMS[model]], axis=1)
+    basis = np.stack([term(speeds, speeds, speeds) for term in LOSS_TERMS[model].values()], axis=1)
     square = speeds**2 - basis @ found.value
     free = square > 0.0
     curve = np.sqrt(np.where(free, square, np.nan))
@@ -300,7 +288,7 @@ def _delay_law(
     speeds: Float[np.ndarray, " points"],
     rebound: Float[np.ndarray, " points"],
 ) -> RegressedLaw:
-    basis = np.stack([term(speeds, rebound, speeds) for term in DELAY_TERMS], axis=1)
+    basis = np.stack([term(speeds, rebound, speeds) for term in DELAY_TERMS.values()], axis=1)
     spread = np.sqrt(np.einsum("np,pq,nq->n", basis, found.covariance, basis))
     values = (found.value, np.diag(found.covariance), np.diag(found.random_covariance))
     return _law("delay", found, values, shared, (basis @ found.value, spread))
@@ -314,13 +302,13 @@ def _law(
     curve: tuple[np.ndarray, np.ndarray],
 ) -> RegressedLaw:
     parameters = {
-        name: Coefficient(
+        name.removeprefix("delay_"): Coefficient(
             value=float(value),
-            unit=_UNITS[name],
+            unit=PARAMETERS[name].unit,
             standard_error=float(np.sqrt(total)),
             systematic_error=float(np.sqrt(max(total - random, 0.0))) if shared else None,
         )
-        for name, value, total, random in zip(_NAMES[model], *values, strict=True)
+        for name, value, total, random in zip(LOSS_TERMS.get(model, DELAY_TERMS), *values, strict=True)
     }
     return RegressedLaw(
         model=model,
@@ -430,7 +418,7 @@ def _numbers(cells: Any) -> Float[np.ndarray, " points"]:
     return np.array([np.nan if cell is None else float(cell) for cell in cells], dtype=np.float64)
 
 
-_KNOWN_COLUMNS = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us")
+_KNOWN_COLUMNS = _COLUMNS[:2]
 _LAW = Form(tuple(Column(name) for name in _KNOWN_COLUMNS), "speed", open=True, blanks=True)
 
 

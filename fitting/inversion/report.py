@@ -14,6 +14,7 @@ from matplotlib.figure import Figure
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, with_zero_line
 from afm_jax.words import bullets, text_table, with_error
 from fitting.inversion.result import Coefficient, Inversion, RegressedLaw, SavedLaw
+from fitting.parameters import LAWS
 
 ROW_COLUMNS = (
     "line",
@@ -45,8 +46,8 @@ LAW_COLUMNS = (
     "collision_delay_error_us",
 )
 _FORMULAS = {
-    "viscous": "u_out^2 = u_in^2 - epsilon - viscous_loss u_in",
-    "restitution": "u_out^2 = r^2 u_in^2 - epsilon  (eq. 6)",
+    "viscous": LAWS["viscous"].formula,
+    "restitution": f"{LAWS['law'].formula}  (eq. 6)",
     "delay": "tau = hertz u_in^(-1/5) - lead_nm (1/u_out - 1/u_in) - offset_nm/u_in",
 }
 NS_PER_US = 1e3

@@ -17,7 +17,7 @@ from markupsafe import Markup
 
 from afm_jax.words import known, plain_words
 from fitting.fits.result import FitResult, FittedRows
-from fitting.models import NUISANCE_NAMES, PARAMETERS
+from fitting.parameters import NUISANCE_NAMES, PARAMETERS
 from fitting.report.words import (
     SHARE_OF_BAND,
     ComparedModels,
@@ -28,6 +28,7 @@ from fitting.report.words import (
     has_delay,
     interval_in_words,
     law_points,
+    losses_in_words,
     remarks_on,
     rounded_values,
     value_in_words,
@@ -43,7 +44,6 @@ _LONGEST = 12
 """Lists longer than that are samples, not findings."""
 _NON_CHARACTERS = "".join(chr(plane << 16 | low) for plane in range(17) for low in (0xFFFE, 0xFFFF))
 _FORBIDDEN = re.compile(rf"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\ufdd0-\ufdef{_NON_CHARACTERS}]")
-_SYMBOLS = {"epsilon": "ε", "viscous_loss": "c", "delay_hertz": "a", "delay_lead_nm": "b", "delay_offset_nm": "d"}
 _APPROACH = Markup("u<sub>in</sub> (nm/µs)")
 _COMPARED = {
     "model": "model",
@@ -101,7 +101,7 @@ def fit_page(
         bootstrap: intervals from synthetic data sets, or None.
         posterior: credible intervals, or None.
     """
-    numbers = {name: _SYMBOLS.get(name, name) for name in result.parameters}
+    numbers = {name: PARAMETERS[name].symbol or name for name in result.parameters}
     if result.valid and result.model != "contact":
         numbers = rounded_values(result)
     samples = {"Bootstrap": bootstrap, "Posterior": posterior}
@@ -126,6 +126,7 @@ def fit_page(
         compared=None if comparison is None else _compared(comparison),
         pictures=_pictures(result, pictures),
         points=_points(result),
+        losses=_losses(result),
         parameters=_parameters(result),
         goodness=_goodness(result),
         correlations=_correlations(result),
@@ -174,11 +175,20 @@ def _pictures(result: FitResult, files: Sequence[bytes]) -> list[dict[str, str]]
         "Amplitudes of each row, measured and predicted; below, how far apart they are in standard errors.",
         law if result.valid else f"{law} Not a measurement: see the verdict.",
         "What is left of each amplitude over the approach speed, in standard errors: a wrong law leaves a curve here.",
-    )
+        "The energy that an impact takes over the approach speed, with its 95 % band; dashed, the closest paper's law.",
+    )[: len(files)]
     return [
         {"source": f"data:image/png;base64,{base64.b64encode(file).decode('ascii')}", "shows": words}
         for file, words in zip(files, shows, strict=True)
     ]
+
+
+def _losses(result: FitResult) -> Table | None:
+    rows = losses_in_words(result)
+    if not (result.valid and rows):
+        return None
+    cells = [[_in_signs(cell) for cell in row] for row in rows]
+    return Table("What an impact takes", ["quantity", "value (95 % interval)"], cells, words=("value (95 % interval)",))
 
 
 def _points(result: FitResult) -> Table | None:

@@ -10,6 +10,7 @@ from matplotlib.image import imread, imsave
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from afm_jax.plots.picture_style import png_of
+from fitting.fits.loss import EV_PER_AJ, Loss
 from fitting.fits.result import FitResult
 from fitting.report.words import has_delay
 
@@ -27,8 +28,14 @@ _APPROACH = "approach speed (nm/µs)"
 
 
 def fit_pictures(result: FitResult) -> list[bytes]:
-    """Return the pictures of the rows, the law, and the residuals over the speed as PNG files of equal width."""
-    return [png_of(figure, _DPI) for figure in (rows_figure(result), law_figure(result), speed_figure(result))]
+    """Return the pictures of the rows, the law, the residuals over the speed and the energy lost, of equal width (PNG).
+
+    Without speeds there is no energy.
+    """
+    figures = [rows_figure(result), law_figure(result), speed_figure(result)]
+    if result.loss is not None:
+        figures.append(energy_figure(result, result.loss))
+    return [png_of(figure, _DPI) for figure in figures]
 
 
 def one_below_the_other(pictures: Sequence[bytes]) -> bytes:
@@ -67,6 +74,41 @@ def speed_figure(result: FitResult) -> Figure:
     """Return the figure of the residuals against the approach speed."""
     figure = Figure(figsize=(_WIDTH_INCHES, 3.0), layout="constrained")
     draw_residuals_by_speed(figure.subplots(), result)
+    return figure
+
+
+def energy_figure(result: FitResult, loss: Loss) -> Figure:
+    """Return the figure of the energy that an impact takes over the measured speeds, beside the paper's laws."""
+    figure = Figure(figsize=(_WIDTH_INCHES, 3.4), layout="constrained")
+    axes = figure.subplots()
+    law, half = result.law, 0.5 * result.table.mass_ng
+    speed = law.approach_speed_nm_per_us
+    columns = (law.rebound_speed_nm_per_us, law.rebound_high_nm_per_us, law.rebound_low_nm_per_us)
+    lost, least, most = (half * (speed**2 - column**2) for column in columns)
+    if np.isfinite(least).any():
+        axes.fill_between(speed, least, most, color=COLOURS[0], alpha=0.3, lw=0, label="95 % band")
+    axes.plot(speed, lost, color=COLOURS[0], label="fitted law" if result.valid else "fit, not a measurement")
+    for one, style in zip(loss.equivalents, ("--", ":"), strict=False):
+        inside = (speed >= one.slowest_nm_per_us) & (speed <= one.fastest_nm_per_us)
+        square = (1.0 - one.r.value**2) * speed**2 + one.epsilon_nm2_per_us2.value
+        over = f"{one.slowest_nm_per_us:.3g} to {one.fastest_nm_per_us:.3g} nm/µs"
+        label = f"closest law of the paper over {over}"
+        axes.plot(speed[inside], half * square[inside], color=COLOURS[1], ls=style, label=label)
+    known = [(one.approach_speed_nm_per_us, one.energy_aj.value, *one.energy_aj.interval95) for one in loss.energies]
+    for u, energy, low, high in known:
+        reach = None if low is None or high is None else [[energy - low], [high - energy]]
+        axes.errorbar([u], [energy], yerr=reach, fmt="o", color="black", ms=3.5, capsize=3)
+    _mark_speeds(axes, result)
+    log_speed_axis(axes)
+    top = max(1.4 * max(max(energy, high or 0.0) for _, energy, _, high in known), 1e-12)
+    axes.set_ylim(0.0, top)
+    axes.set_xlabel(_APPROACH)
+    axes.set_ylabel("energy lost in an impact (aJ)")
+    volts = axes.secondary_yaxis(
+        "right", functions=(lambda x: np.multiply(x, EV_PER_AJ), lambda x: np.divide(x, EV_PER_AJ))
+    )
+    volts.set_ylabel("(eV)")
+    axes.legend(fontsize=SMALL, loc="upper left")
     return figure
 
 

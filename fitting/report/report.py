@@ -16,6 +16,7 @@ from fitting.report.words import (
     band_in_words,
     formulas,
     interval_in_words,
+    losses_in_words,
     rows_in_words,
     value_in_words,
 )
@@ -58,7 +59,7 @@ def summary(result: FitResult) -> str:
     parameters = [_parameter_cells(name, parameter) for name, parameter in result.parameters.items()]
     lines = [
         f"Impact law of {result.table.source} ({rows_in_words(result.table.rows)}), model {result.model}:",
-        *(f"  {formula}" for formula in formulas(result.model)),
+        *(f"  {formula}" for formula in formulas(result)),
         "",
         "VALID" if result.valid else "NOT VALID: the numbers below are not a measurement of the law.",
         *(f"  - {reason}" for reason in result.reasons),
@@ -68,6 +69,7 @@ def summary(result: FitResult) -> str:
         f"  {band_in_words(result)}",
         _goodness_line(result),
         *_correlation_lines(result),
+        *_loss_lines(result),
         *bullets("Notes:", result.warnings),
     ]
     return "\n".join(lines)
@@ -84,6 +86,11 @@ def _goodness_line(result: FitResult) -> str:
     probability = f", probability {result.p_value:.2g}" if np.isfinite(result.p_value) else ""
     goodness = f"chi2/dof = {result.chi2:.1f}/{result.degrees_of_freedom}{probability}"
     return f"  {goodness}, AIC {result.aic:.1f}, BIC {result.bic:.1f}"
+
+
+def _loss_lines(result: FitResult) -> list[str]:
+    rows = losses_in_words(result) if result.valid else []
+    return ["", *text_table(["what an impact takes", "95 % interval"], rows, words=(0, 1))] if rows else []
 
 
 def _correlation_lines(result: FitResult) -> list[str]:

@@ -7,20 +7,18 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.words import decimals, interval, percent, value_alone
+from fitting.fits.loss import WithInterval
 from fitting.fits.result import FitResult, FittedParameter
 from fitting.fits.verdict import IMPROBABLE
+from fitting.parameters import DELAY_LAW, DELAY_SHAPE, LAWS, LOSS_SHAPE, SHAPE_NAMES
 
 SHARE_OF_BAND = 0.1
 """How far the rounded formula may be off, in half-widths of the 95 % band."""
 _MOST_EXTRA = 8
 _UNLIKELY = 0.05
+_EXACT = 1e-8
+"""Relative distance below which two laws are the same."""
 _ROUND = (1.0, 2.0, 3.0, 5.0, 7.0)
-_DELAY = "tau = delay_hertz u_in^(-1/5) - delay_lead_nm (1/u_out - 1/u_in) - delay_offset_nm/u_in"
-_LAWS = {
-    "restitution": "u_out = r u_in",
-    "law": "u_out^2 = r^2 u_in^2 - epsilon",
-    "viscous": "u_out^2 = u_in^2 - viscous_loss u_in - epsilon",
-}
 
 
 @runtime_checkable
@@ -56,12 +54,51 @@ def rows_in_words(count: int) -> str:
     return f"{count} row" if count == 1 else f"{count} rows"
 
 
-def formulas(model: str) -> list[str]:
-    """Return the model's law in formulas."""
+def known_in_words(known: WithInterval, unit: str = "") -> str:
+    """Return '58.9 aJ (58.2 to 59.6)', the digits as the interval warrants them."""
+    value, (low, high) = known.value, known.interval95
+    tail = f" {unit}" if unit else ""
+    if low is None or high is None:
+        return f"{value:.4g}{tail}"
+    digits = min(decimals(high - low, unknown=6), 8)
+    return f"{value:.{digits}f}{tail} ({low:.{digits}f} to {high:.{digits}f})"
+
+
+def losses_in_words(result: FitResult) -> list[list[str]]:
+    """Return what an impact takes, row by row: what, and how much with its 95 % interval.
+
+    The energy at three speeds, the closest law of the paper over each range of speeds, and the capture speed.
+    """
+    loss = result.loss
+    if loss is None:
+        return []
+    rows = [
+        [
+            f"energy lost at {one.approach_speed_nm_per_us:.3g} nm/us",
+            f"{known_in_words(one.energy_aj, 'aJ')}, {known_in_words(one.energy_ev, 'eV')}",
+        ]
+        for one in loss.energies
+    ]
+    for one in loss.equivalents:
+        over = f"as eq. 6 over {one.slowest_nm_per_us:.3g} to {one.fastest_nm_per_us:.3g} nm/us"
+        off = f", off by at most {percent(one.worst_error)} of u_out" if one.worst_error > _EXACT else ""
+        rows += [
+            [f"{over}: r", f"{known_in_words(one.r)}{off}"],
+            [f"{over}: epsilon", known_in_words(one.epsilon_nm2_per_us2, "nm^2/us^2")],
+            [f"{over}: delta", f"{known_in_words(one.delta_aj, 'aJ')}, {known_in_words(one.delta_ev, 'eV')}"],
+        ]
+    return [*rows, ["captured below (extrapolated)", known_in_words(loss.capture_speed_nm_per_us, "nm/us")]]
+
+
+def formulas(result: FitResult) -> list[str]:
+    """Return the fitted law in formulas."""
+    model = result.model
     if model == "contact":
         return ["the law and the delay of the resolved contact (meniscus and JKR junction), by its parameters:"]
-    law = _LAWS[model.removesuffix("+delay")]
-    return [law, _DELAY] if model.endswith("+delay") else [law]
+    law, lasting = LAWS[model.removesuffix("+delay")], model.endswith("+delay")
+    shaped = any(name in result.parameters for name in SHAPE_NAMES)
+    used = [law, DELAY_LAW] if lasting else [law]
+    return [(shaped and one.shaped) or one.formula for one in used]
 
 
 def has_delay(result: FitResult) -> bool:
@@ -211,7 +248,7 @@ def _why_not_judged(result: FitResult) -> str:
 
 
 def rounded_values(result: FitResult) -> dict[str, str]:
-    """Return the parameters in digits; the formula with them is within a tenth of the band where the law was measured.
+    """Return the parameters in digits; rounding moves the formula by at most a tenth of the band where it was measured.
 
     Errors of correlated parameters are larger than those of the law: rounded to their own errors, the parameters could
     give a curve outside the band.
@@ -243,12 +280,14 @@ def _close_enough(result: FitResult, values: dict[str, float]) -> bool:
         return True
     speed = law.approach_speed_nm_per_us
     measured = (speed >= width.slowest_nm_per_us) & (speed <= width.fastest_nm_per_us)
-    rebound, delay = _formula(values, speed[measured])
-    pairs = (
-        (rebound, law.rebound_speed_nm_per_us[measured], law.rebound_high_nm_per_us[measured]),
-        (delay, law.collision_delay_us[measured], law.delay_high_us[measured]),
+    rounded = _formula(values, speed[measured])
+    exact = _formula({name: p.value for name, p in result.parameters.items()}, speed[measured])
+    bands = (
+        law.rebound_high_nm_per_us - law.rebound_speed_nm_per_us,
+        law.delay_high_us - law.collision_delay_us,
     )
-    return not any(np.any(np.abs(found - exact) > SHARE_OF_BAND * (high - exact)) for found, exact, high in pairs)
+    trios = zip(rounded, exact, bands, strict=True)
+    return not any(np.any(np.abs(one - other) > SHARE_OF_BAND * band[measured]) for one, other, band in trios)
 
 
 def _formula(
@@ -256,11 +295,13 @@ def _formula(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return rebound speed in nm/us and delay in us as the formulas of the page say; zero where the tip is captured."""
     u = approach_speed_nm_per_us
-    square = (values.get("r", 1.0) * u) ** 2 - values.get("viscous_loss", 0.0) * u - values.get("epsilon", 0.0)
+    raised = np.sqrt(u**2 + values.get(LOSS_SHAPE, 0.0))
+    square = (values.get("r", 1.0) * u) ** 2 - values.get("viscous_loss", 0.0) * raised - values.get("epsilon", 0.0)
     free = square > 0.0
     w = np.sqrt(np.where(free, square, 1.0))
     lead, offset = values.get("delay_lead_nm", 0.0), values.get("delay_offset_nm", 0.0)
     delay = values.get("delay_hertz", 0.0) * u**-0.2 - lead * (1.0 / w - 1.0 / u) - offset / u
+    delay += values.get(DELAY_SHAPE, 0.0) * (1.0 / w**2 - 1.0 / u**2)
     return np.where(free, w, 0.0), np.where(free, delay, 0.0)
 
 

@@ -22,6 +22,7 @@ from fitting.fits.least_squares import Box, Searches, descended, distance, whole
 from fitting.fits.objective import PLAIN, ROBUST, Objective, soft_square
 from fitting.fits.result import FitResult
 from fitting.models import ROWS_PER_PROGRAM, Problem, measurement_of
+from fitting.parameters import SHAPE_NAMES
 
 
 class Refit(NamedTuple):
@@ -45,9 +46,10 @@ def objective_of(result: FitResult) -> Refit:
     require_float64()
     settings = result.settings
     effects = EFFECTS if settings["effects"] is None else tuple(settings["effects"])
-    problem = Problem(result.model, tuple(result.parameters), effects)
+    names = tuple(name for name in result.parameters if name not in SHAPE_NAMES)
+    problem = Problem(result.model, names, effects)
     measurement = measurement_of(result.table, problem, settings["constraints"], settings["fixed"])
-    values = np.array([parameter.value for parameter in result.parameters.values()])
+    values = np.array([result.parameters[name].value for name in names])
     stated = Objective(measurement, problem, robust=settings["robust"] is not None)
     size = np.asarray(measurement.rows.order).shape[0]
     error = np.full((size, 2), np.nan)
@@ -312,7 +314,7 @@ def bootstrap(result: FitResult, samples: int = 400, *, seed: int = 0) -> Bootst
             f"only {len(kept)} of {samples} synthetic data sets could be fitted: the data hardly determine the "
             "parameters; fit a model with fewer of them, or constrain some"
         )
-    return Bootstrap(tuple(result.parameters), refit.values, kept, samples - len(kept), seed)
+    return Bootstrap(refit.objective.problem.names, refit.values, kept, samples - len(kept), seed)
 
 
 def require_valid(result: FitResult) -> None:

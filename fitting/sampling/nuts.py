@@ -16,7 +16,8 @@ from jaxtyping import Array, Float
 
 from fitting.fits.objective import ROBUST
 from fitting.forward import branch_near, impacts_of, linearise_pairs, located
-from fitting.models import Parameter, Problem
+from fitting.models import Problem
+from fitting.parameters import Parameter
 from fitting.sampling.bootstrap import Refit, standard_covariance
 from fitting.sampling.posterior_result import Posterior, PosteriorChains, posterior_of_chains
 

@@ -1,0 +1,119 @@
+"""`afm-jax bifurcation SCENE.toml --parameter P=a:b:n`: what motions come to along a parameter, swept up and down."""
+
+from collections import Counter
+from typing import TYPE_CHECKING, Any
+
+import click
+import numpy as np
+
+from afm_jax.cli.main import NotValid
+from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.values import PictureFormat, ranges_of, scene_and_start
+
+if TYPE_CHECKING:
+    from afm_jax.dynamics.bifurcations import Sweep
+
+POINTS = ("phase_rad", "approach_speed_nm_per_us", "velocity_after_nm_per_us", "platform_height_nm")
+_LISTED = 6
+"""Kinds of motion named in the summary."""
+
+
+@click.command()
+@click.argument("scene", metavar="SCENE.toml|PRESET")
+@click.option("--parameter", metavar="P=a:b:n", required=True, help="A parameter of the scene file and its values.")
+@click.option("--both", is_flag=True, help="Sweep up and then down, so that hysteresis shows.")
+@click.option("--down", is_flag=True, help="Sweep down instead of up.")
+@click.option("--impacts", type=click.IntRange(200), default=2000, show_default=True, help="At every value.")
+@click.option("--picture", type=PictureFormat(), default="png", show_default=True, help="png, pdf or svg.")
+@with_session
+def command(
+    session: Session, *, scene: str, parameter: str, both: bool, down: bool, impacts: int, picture: str
+) -> None:
+    """Sweep a parameter and record what the tip comes to at each of its values.
+
+    The tip is carried from value to value with its drive phase and rebound speed; one that the platform holds, or that
+    flies away, begins anew at the next value. Of each value the verdict is told, (m,N): m impacts in N drive periods,
+    irregular, stuck or free; and the last impacts are. With --out bifurcation.csv (a row a value), impacts.csv (a row
+    an impact; of an orbit each once), strobe.csv (heights whenever the platform is highest) and a picture. Exit code 3
+    if no motion went on anywhere.
+    """
+    session.start_computing()
+    from afm_jax.dynamics.bifurcations import bifurcation_diagram  # noqa: PLC0415
+    from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
+
+    loaded, _ = scene_and_start(scene)
+    (swept,) = ranges_of(scene, loaded, [parameter], counted=True)
+    directions = [True, False] if both else [not down]
+    sweeps = []
+    try:
+        for upward in directions:
+            with session.working("sweeping up" if upward else "sweeping down"):
+                told = session.progress("values up" if upward else "values down")
+                sweeps.append(
+                    bifurcation_diagram(loaded, swept.path, swept.values, upward=upward, impacts=impacts, report=told)
+                )
+    except ValueError as error:
+        raise ValueError(f"{scene}: {error}") from error
+    if not all(sweep.complete for sweep in sweeps):
+        session.note("some stretches were not followed to the end of a branch: sweep fewer values, or a smaller range")
+    if session.out is not None:
+        _write(session, swept.path, sweeps)
+        from afm_jax.plots.dynamics import draw_bifurcations  # noqa: PLC0415
+
+        target = session.out / f"bifurcation.{picture}"
+        draw_bifurcations(swept.path, sweeps, target)
+        session.note(f"wrote {target}")
+    payload = {
+        "parameter": swept.path,
+        "scene": scene_tables(loaded),
+        "impacts_each": impacts,
+        "sweeps": [_payload(sweep) for sweep in sweeps],
+    }
+    session.emit(payload, *(_summary(sweep) for sweep in sweeps))
+    if not any(np.isfinite(sweep.phase_rad).any() for sweep in sweeps):
+        raise NotValid("no motion went on at any value: the tip sticks or flies away; try a larger drive amplitude")
+
+
+def _payload(sweep: "Sweep") -> dict[str, Any]:
+    return {
+        "direction": "up" if sweep.upward else "down",
+        "complete": sweep.complete,
+        "values": sweep.values,
+        "verdicts": sweep.verdicts.names(),
+        "impacts": sweep.verdicts.impacts,
+        "periods": sweep.verdicts.periods,
+        "restarted": sweep.restarted,
+        "phase_rad": [row[np.isfinite(row)] for row in sweep.phase_rad],
+        "platform_height_nm": [row[np.isfinite(row)] for row in sweep.height_nm],
+    }
+
+
+def _summary(sweep: "Sweep") -> str:
+    counts = Counter(sweep.verdicts.names()).most_common()
+    words = ", ".join(f"{name} at {count}" for name, count in counts[:_LISTED])
+    rest = sum(count for _, count in counts[_LISTED:])
+    return f"swept {'up' if sweep.upward else 'down'}: {words}" + (f", others at {rest}" if rest else "")
+
+
+def _write(session: Session, path: str, sweeps: "list[Sweep]") -> None:
+    rows: dict[str, list[Any]] = {name: [] for name in ("direction", path, "verdict", "restarted")}
+    impacts: dict[str, list[Any]] = {name: [] for name in ("direction", path, *POINTS)}
+    strobe: dict[str, list[Any]] = {name: [] for name in ("direction", path, "height_nm")}
+    for sweep in sweeps:
+        word = "up" if sweep.upward else "down"
+        _extend(rows, [word] * len(sweep.values), sweep.values, sweep.verdicts.names(), sweep.restarted)
+        there = np.isfinite(sweep.phase_rad)
+        points = (sweep.phase_rad, sweep.approach_nm_per_us, sweep.velocity_after_nm_per_us, sweep.height_nm)
+        at = np.repeat(sweep.values, there.sum(axis=1))
+        _extend(impacts, [word] * len(at), at, *(part[there] for part in points))
+        seen = np.isfinite(sweep.strobe_height_nm)
+        at = np.repeat(sweep.values, seen.sum(axis=1))
+        _extend(strobe, [word] * len(at), at, sweep.strobe_height_nm[seen])
+    session.write_columns("bifurcation.csv", rows)
+    session.write_columns("impacts.csv", impacts)
+    session.write_columns("strobe.csv", strobe)
+
+
+def _extend(table: dict[str, list[Any]], *columns: Any) -> None:
+    for name, column in zip(table, columns, strict=True):
+        table[name] += column.tolist() if isinstance(column, np.ndarray) else column

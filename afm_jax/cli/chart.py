@@ -1,0 +1,126 @@
+"""`afm-jax chart SCENE.toml --x P=a:b:n --y P=a:b:n --orders 8`: which single-impact orbits there are, over a plane."""
+
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from afm_jax.cli.main import NotValid
+from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.values import PictureFormat, ranges_of, scene_and_start
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from afm_jax.dynamics.charts import StabilityChart
+    from afm_jax.scenefile.parameter_paths import ParameterRange
+
+_MOST_POINTS = 4_000_000
+
+
+@click.command()
+@click.argument("scene", metavar="SCENE.toml|PRESET")
+@click.option("--x", metavar="P=a:b:n", required=True, help="A parameter of the scene file: the chart's columns.")
+@click.option("--y", metavar="P=a:b:n", required=True, help="Another one: its rows.")
+@click.option("--orders", type=click.IntRange(1, 100), default=8, show_default=True, help="Highest order N.")
+@click.option(
+    "--zarr", is_flag=True, help="Write the table as chart.zarr instead of chart.csv; needs the package zarr."
+)
+@click.option("--picture", type=PictureFormat(), default="png", show_default=True, help="png, pdf or svg.")
+@with_session
+def command(session: Session, *, scene: str, x: str, y: str, orders: int, zarr: bool, picture: str) -> None:
+    """Chart over two parameters of a law scene which single-impact orbits exist, are stable and coexist.
+
+    Of every point and order: whether an orbit is admissible, whether one is stable, and of the stable one (the highest,
+    if there are several) the peak amplitude and the size of the larger multiplier. With --out a table (chart.csv or
+    chart.zarr) and a picture. Exit code 3 if there is no admissible orbit at all.
+    """
+    if zarr:
+        # said before the computation, not after it
+        import zarr as _  # noqa: PLC0415  # pyright: ignore[reportMissingImports]
+    session.start_computing()
+    from afm_jax.dynamics.charts import stability_chart  # noqa: PLC0415
+    from afm_jax.scenefile.parameter_paths import scene_family  # noqa: PLC0415
+    from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
+
+    loaded, _ = scene_and_start(scene)
+    across, up = ranges = ranges_of(scene, loaded, [x, y], counted=True)
+    if len(across.values) * len(up.values) > _MOST_POINTS:
+        raise ValueError(f"{across} and {up} are more than {_MOST_POINTS} points: chart fewer")
+    try:
+        with session.working("searching for orbits (the first run compiles for some seconds)"):
+            chart = stability_chart(
+                scene_family(loaded, across.path, up.path),
+                x_values=across.values,
+                y_values=up.values,
+                last_order=orders,
+                report=session.progress("points"),
+            )
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{scene}: {error}") from error
+    if session.out is not None:
+        _write(session, chart, across, up, zarr=zarr)
+        from afm_jax.plots.dynamics import draw_chart  # noqa: PLC0415
+
+        target: Path = session.out / f"chart.{picture}"
+        draw_chart(across.path, up.path, chart, target)
+        session.note(f"wrote {target}")
+    verdicts = chart.verdicts
+    several = verdicts.stable.sum(axis=0) > 1
+    payload: dict[str, Any] = {
+        "scene": scene_tables(loaded),
+        "x": {"parameter": across.path, "low": across.low, "high": across.high, "number": across.number},
+        "y": {"parameter": up.path, "low": up.low, "high": up.high, "number": up.number},
+        "orders": list(range(1, orders + 1)),
+        "points": int(several.size),
+        "admissible_share": verdicts.admissible.mean(axis=1),
+        "stable_share": verdicts.stable.mean(axis=1),
+        "any_stable_share": float(verdicts.any_stable().mean()),
+        "several_stable_share": float(several.mean()),
+    }
+    reason = None if verdicts.admissible.any() else _why_none(ranges, orders)
+    lines = [
+        f"order {order}: stable at {100.0 * stable:.4g} % of the points, admissible at {100.0 * admissible:.4g} %"
+        for order, stable, admissible in zip(
+            payload["orders"], payload["stable_share"], payload["admissible_share"], strict=True
+        )
+    ]
+    lines.append(f"several orders are stable at {100.0 * payload['several_stable_share']:.4g} % of the points")
+    session.emit(payload | {"reason": reason}, *lines)
+    if reason is not None:
+        raise NotValid(reason)
+
+
+def _why_none(ranges: "list[ParameterRange]", orders: int) -> str:
+    return (
+        f"no single-impact orbit of an order up to {orders} is admissible over {ranges[0]} and {ranges[1]}: "
+        "try larger drive amplitudes, or more orders"
+    )
+
+
+def _write(
+    session: Session, chart: "StabilityChart", across: "ParameterRange", up: "ParameterRange", *, zarr: bool
+) -> None:
+    """Write a row a point, or arrays over orders, rows and columns."""
+    verdicts = chart.verdicts
+    parts = {
+        "admissible": verdicts.admissible,
+        "stable": verdicts.stable,
+        "peak_amplitude_nm": verdicts.peak_amplitude_nm,
+        "largest_multiplier": verdicts.largest_multiplier,
+    }
+    if zarr:
+        import zarr as store  # noqa: PLC0415  # pyright: ignore[reportMissingImports]
+
+        assert session.out is not None  # asked before  # noqa: S101
+        group = store.open_group(str(session.out / "chart.zarr"), mode="w")
+        for name, part in parts.items():
+            group[name] = part.reshape(-1, len(chart.y_values), len(chart.x_values))
+        group["x"], group["y"] = chart.x_values, chart.y_values
+        group.attrs["x"], group.attrs["y"] = across.path, up.path
+        session.note(f"wrote {session.out / 'chart.zarr'}")
+        return
+    x, y = chart.points()
+    columns: dict[str, Any] = {across.path: x, up.path: y, "lowest_stable_order": chart.lowest_stable_order.ravel()}
+    for order in range(chart.orders):
+        columns |= {f"{name}_{order + 1}": part[order] for name, part in parts.items()}
+    session.write_columns("chart.csv", columns)

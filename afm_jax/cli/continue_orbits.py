@@ -1,0 +1,259 @@
+"""`afm-jax continue SCENE.toml --order N --parameter P=a:b`: orbits followed through one parameter, or two."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from afm_jax.cli.main import NotValid
+from afm_jax.cli.orbits import IMPACT_COLUMNS, PositiveInteger, impact_rows, orbit_facts, refuse_other_than_law
+from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.values import PictureFormat, ranges_of, scene_and_start
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from afm_jax.dynamics.bands import UncertainParameters
+    from afm_jax.dynamics.continuation import Continuation, OrbitBranch, SpecialCurve
+
+POINT_COLUMNS = (
+    "branch",
+    "parameter",
+    "phase_rad",
+    "velocity_after_nm_per_us",
+    "peak_amplitude_nm",
+    "peak_amplitude_error_nm",
+    "trace",
+    "determinant",
+    "stable",
+    "admissible",
+)
+SPECIAL_COLUMNS = (
+    "kind",
+    "parameter",
+    "parameter_error",
+    "interval95_low",
+    "interval95_high",
+    "branch",
+    "peak_amplitude_nm",
+    "admissible",
+)
+CURVE_COLUMNS = ("curve", "kind", "parameter", "second", "admissible")
+_ENDS = {
+    "range": "the end of the range",
+    "capture": "capture: an impact comes too slowly to leave again",
+    "delay": "close to capture, where the law's delay is longer than half a drive period",
+    "shorter": "where it becomes an orbit of fewer impacts",
+    "closed": "where it began: it is closed",
+    "lost": "a point that it could not be followed beyond",
+    "too long": "the most points that are followed",
+}
+
+
+@click.command(name="continue")
+@click.argument("scene", metavar="SCENE.toml|PRESET")
+@click.option("--order", metavar="N", required=True, type=PositiveInteger(), help="Drive periods of the orbit.")
+@click.option(
+    "--impacts",
+    metavar="M",
+    default=1,
+    show_default=True,
+    type=click.IntRange(0, 64),
+    help="Impacts in them; 0: the tip meets nothing.",
+)
+@click.option(
+    "--parameter",
+    metavar="P=A:B",
+    required=True,
+    help="A parameter of the scene file and its range, such as platform.reduced_frequency=0.9:1.1.",
+)
+@click.option("--second", metavar="P=A:B", help="Another one: the special points are followed as curves in both.")
+@click.option(
+    "--law",
+    type=click.Path(path_type=Path),
+    metavar="JSON",
+    help="A fit (fit.json of `afm-jax fit --out`): its law in place of the scene's, its errors as bands.",
+)
+@click.option("--picture", type=PictureFormat(), default="png", show_default=True, help="png, pdf or svg.")
+@with_session
+def command(  # noqa: PLR0913
+    session: Session,
+    scene: str,
+    *,
+    order: int,
+    impacts: int,
+    parameter: str,
+    second: str | None,
+    law: Path | None,
+    picture: str,
+) -> None:
+    """Follow the (m, N) orbits of a scene through a parameter, round folds, by pseudo-arclength.
+
+    Folds, period doublings, torus points, grazings and captures are located to rounding; with --second they are
+    followed as curves in two parameters, with cusps and meetings. With --law every special point has a 95 % interval.
+    With --out tables and pictures. Exit code 3 if there is no admissible orbit in the range.
+    """
+    session.start_computing()
+    from afm_jax.cli.fitted_law import with_fitted_law  # noqa: PLC0415
+    from afm_jax.dynamics.continuation import continue_orbits  # noqa: PLC0415
+
+    loaded, _ = scene_and_start(scene)
+    known = None
+    if law is not None:
+        loaded, known = with_fitted_law(loaded, law)
+    refuse_other_than_law(loaded, scene)
+    first, *others = ranges_of(scene, loaded, [parameter, *([] if second is None else [second])], counted=False)
+    try:
+        with session.working("following orbits (the first run compiles for some seconds)"):
+            found = continue_orbits(loaded, order, first, impacts=impacts, second=others[0] if others else None)
+    except ValueError as error:
+        raise ValueError(f"{scene}: {error}") from error
+    _finish(session, found, known, picture)
+
+
+def _finish(session: Session, found: "Continuation", known: "UncertainParameters | None", picture: str) -> None:
+    from afm_jax.dynamics.bands import WITHIN_95, amplitude_errors, special_errors  # noqa: PLC0415
+
+    bands = None if known is None else [amplitude_errors(found, branch, known) for branch in found.branches]
+    errors = None if known is None else special_errors(found, known)
+    points = [
+        row
+        for number, branch in enumerate(found.branches)
+        for row in point_rows(number, branch, None if bands is None else bands[number])
+    ]
+    special = []
+    for index, point in enumerate(found.special):
+        row = {
+            "kind": point.kind,
+            "parameter": point.parameter,
+            "branch": point.branch,
+            "peak_amplitude_nm": float(point.reading.peak_amplitude_nm),
+            "admissible": point.admissible,
+            "impacts": impact_rows(point.reading),
+        }
+        if errors is not None:
+            half = WITHIN_95 * float(errors[index])
+            row["parameter_error"] = float(errors[index])
+            row["interval95"] = [point.parameter - half, point.parameter + half]
+        special.append(row)
+    curves = [_curve(curve) for curve in found.curves]
+    reason = None if any(point["admissible"] for point in points) else _why_none(found)
+    _write(session, found, points, special, curves)
+    payload = {
+        "format": "afm-jax continue",
+        "format_version": 1,
+        "order": found.order,
+        "impacts": found.impacts,
+        "parameter": found.range.path,
+        "range": [found.range.low, found.range.high],
+        "second": None if found.second is None else found.second.path,
+        "points": points,
+        "special": special,
+        "curves": curves,
+        "branches": [{"points": len(one.parameter), "ends": list(one.ends)} for one in found.branches],
+        "law_parameters": None if known is None else list(known.paths),
+        "reason": reason,
+    }
+    session.emit(payload, *_text(found, special, curves))
+    if session.out is not None:
+        from afm_jax.plots.branches import draw_continuation, draw_curves  # noqa: PLC0415
+
+        draw_continuation(found, session.out / f"branches.{picture}", bands=bands, errors=errors)
+        session.note(f"wrote {session.out / f'branches.{picture}'}")
+        if found.curves:
+            draw_curves(found, session.out / f"curves.{picture}")
+            session.note(f"wrote {session.out / f'curves.{picture}'}")
+    if reason is not None:
+        raise NotValid(reason)
+
+
+def point_rows(number: int, branch: "OrbitBranch", band: Any = None) -> list[dict[str, Any]]:
+    """Return the points of a branch as plain mappings, with the first impact's numbers and all impacts."""
+    import numpy as np  # noqa: PLC0415
+
+    rows = []
+    for index, value in enumerate(branch.parameter.tolist()):
+        row = {"branch": number, "parameter": value, **orbit_facts(branch.reading, index)}
+        if band is not None:
+            row["peak_amplitude_error_nm"] = float(band[index]) if np.isfinite(band[index]) else None
+        rows.append(row)
+    return rows
+
+
+def _curve(curve: "SpecialCurve") -> dict[str, Any]:
+    return {
+        "kind": curve.kind,
+        "parameter": curve.parameter.tolist(),
+        "second": curve.second.tolist(),
+        "admissible": curve.admissible.tolist(),
+        "meetings": [one._asdict() for one in curve.meetings],
+        "ends": list(curve.ends),
+    }
+
+
+def _write(
+    session: Session,
+    found: "Continuation",
+    points: list[dict[str, Any]],
+    special: list[dict[str, Any]],
+    curves: list[dict[str, Any]],
+) -> None:
+    session.write_table("branches.csv", points, POINT_COLUMNS)
+    if found.impacts > 1:
+        rows = [{"point": k, **impact} for k, point in enumerate(points) for impact in point["impacts"]]
+        session.write_table("impacts.csv", rows, ("point", *IMPACT_COLUMNS))
+    flat = [
+        {**row, **dict(zip(("interval95_low", "interval95_high"), row.get("interval95", ()), strict=False))}
+        for row in special
+    ]
+    session.write_table("special.csv", flat, SPECIAL_COLUMNS)
+    if found.second is not None:
+        rows = [
+            {"curve": k, "kind": curve["kind"], "parameter": p, "second": q, "admissible": flown}
+            for k, curve in enumerate(curves)
+            for p, q, flown in zip(curve["parameter"], curve["second"], curve["admissible"], strict=True)
+        ]
+        session.write_table("curves.csv", rows, CURVE_COLUMNS)
+
+
+def _why_none(found: "Continuation") -> str:
+    what = f"orbit of {found.impacts} impact{'s' if found.impacts != 1 else ''} in {found.order} drive periods"
+    if found.impacts == 0:
+        return f"the tip meets the sample at every value of {found.range}; try --impacts 1"
+    if found.rejected:
+        return f"in every {what} with {found.range} the tip would have to pass through the platform; try another order"
+    return f"no {what} was found with {found.range}; try another order or range"
+
+
+def _text(found: "Continuation", special: list[dict[str, Any]], curves: list[dict[str, Any]]) -> "list[str | Table]":
+    from rich.table import Table  # noqa: PLC0415
+
+    what = f"({found.impacts}, {found.order}) orbits with {found.range}"
+    lines: list[str | Table] = [what if found.branches else f"No {what}"]
+    for number, branch in enumerate(found.branches):
+        low, high = branch.parameter.min(), branch.parameter.max()
+        ends = " and ".join(dict.fromkeys(_ENDS[end] for end in branch.ends))
+        lines.append(f"  branch {number}: {len(branch.parameter)} points from {low:.6g} to {high:.6g}; ends at {ends}")
+    if special:
+        table = Table(title="Special points", title_justify="left")
+        for column in ("kind", found.range.path, "95 % interval", "peak\nnm", "branch", "admissible"):
+            table.add_column(column, justify="left" if column in ("kind", "admissible") else "right")
+        for row in special:
+            interval = row.get("interval95")
+            table.add_row(
+                row["kind"].replace("_", " "),
+                f"{row['parameter']:.9g}",
+                "" if interval is None else f"{interval[0]:.5g} to {interval[1]:.5g}",
+                f"{row['peak_amplitude_nm']:.5g}",
+                str(row["branch"]),
+                "yes" if row["admissible"] else "no",
+            )
+        lines.append(table)
+    for curve in curves:
+        ends = [f"({p:.5g}, {q:.5g})" for p, q in zip(curve["parameter"], curve["second"], strict=True)]
+        lines.append(f"  curve of {curve['kind'].replace('_', ' ')} from {ends[0]} to {ends[-1]}")
+        lines += [
+            f"    {one['kind'].replace('_', ' ')} at ({one['parameter']:.6g}, {one['second']:.6g})"
+            for one in curve["meetings"]
+        ]
+    return lines

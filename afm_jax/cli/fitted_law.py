@@ -1,0 +1,69 @@
+"""`--law fit.json`: a scene with the law that a fit found, and what the fit says of its errors."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from afm_jax.apparatus.scene import Scene
+    from afm_jax.dynamics.bands import UncertainParameters
+
+_PATHS = {
+    "r": "interaction.r",
+    "epsilon": "interaction.epsilon",
+    "viscous_loss": "interaction.viscous_loss",
+    "delay_hertz": "interaction.delay.hertz",
+    "delay_lead_nm": "interaction.delay.lead_nm",
+    "delay_offset_nm": "interaction.delay.offset_nm",
+    "quality_factor": "cantilever.quality_factor",
+}
+"""Where in a scene file the parameters of a fit stand; what else a fit may have belongs to its instrument."""
+
+
+def with_fitted_law(scene: "Scene", path: Path) -> "tuple[Scene, UncertainParameters]":
+    """Return a scene with the law of a fit in place of its own, and the fit's values with their covariance.
+
+    The quality factor is that of the fit where it was fitted along. What the fit found of its instrument (calibrations,
+    origin of offsets) belongs to the table, not to the scene; its uncertainty is in the covariance.
+
+    Args:
+        scene: whose cantilever and drives are kept.
+        path: the fit.json that `afm-jax fit --out` writes.
+
+    Raises:
+        ValueError: if the file is no valid fit of a law, or the fit does not say how sure its parameters are.
+    """
+    import equinox as eqx  # noqa: PLC0415
+    import jax.numpy as jnp  # noqa: PLC0415
+    import numpy as np  # noqa: PLC0415
+
+    from afm_jax.dynamics.bands import UncertainParameters  # noqa: PLC0415
+    from fitting.experiments.belief import belief_of_fit  # noqa: PLC0415
+
+    try:
+        payload = json.loads(path.read_text(encoding="utf-8"))
+        belief = belief_of_fit(payload)
+    except (ValueError, AttributeError, TypeError) as error:
+        raise ValueError(f"{path}: {error}; give the fit.json of `afm-jax fit --out`") from error
+    if not payload["valid"]:
+        raise ValueError(f"{path}: the fit is not valid, so that its law means nothing; give a valid one")
+    problem, found = belief.problem, payload["parameters"]
+    if problem.model == "contact":
+        raise ValueError(f"{path}: is a fit of a contact, which has no law; fit --model viscous+delay")
+    everything = jnp.asarray([found[name]["value"] for name in problem.names])
+    law = problem.law(everything)
+    names = [name for name in problem.names if name in _PATHS]
+    unsure = [name for name in names if not found[name]["standard_error"]]
+    if unsure:
+        raise ValueError(f"{path}: the fit says no standard error of {', '.join(unsure)}; there are no bands without")
+    if "quality_factor" in names and scene.cantilever.quality_factor is None:
+        raise ValueError(f"{path}: has a quality_factor, but the scene's [cantilever] has none: give it there")
+    places = [problem.names.index(name) for name in names]
+    errors = np.array([found[name]["standard_error"] for name in names], float)
+    correlations = np.array(payload["correlations"]["matrix"], float)[np.ix_(places, places)]
+    values = np.array([found[name]["value"] for name in names], float)
+    made = eqx.tree_at(lambda parts: parts.interaction, scene, law, is_leaf=lambda part: part is None)
+    if "quality_factor" in names:
+        made = eqx.tree_at(lambda parts: parts.cantilever, made, problem.cantilever(everything, scene.cantilever))
+    known = UncertainParameters(tuple(_PATHS[n] for n in names), values, correlations * np.outer(errors, errors))
+    return made, known

@@ -1,0 +1,172 @@
+"""What the errors of a scene's parameters make of its orbits: special points and branches with their errors.
+
+A special point obeys G(x, p; a) = 0, the closing conditions and its test function, for parameters a that are known up
+to a covariance C. By the implicit function theorem it moves by d(x, p)/da = -(dG/d(x, p))^-1 dG/da, and the parameter
+where it lies has the variance (dp/da) C (dp/da)^T. Draws from C, each with its own root, say whether that is enough.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from afm_jax.dynamics.continuation import (
+    Continuation,
+    Equations,
+    Frame,
+    OrbitBranch,
+    SpecialPoint,
+    equations_at,
+    loop_at,
+)
+from afm_jax.dynamics.impact_loop import closing_gaps, highest_point
+
+WITHIN_95 = 1.959963984540054
+"""Half width of a 95 % interval in standard errors."""
+_NEWTON_STEPS = 20
+_ARRIVED = 1e-9
+_BLOCK = 64
+
+
+class UncertainParameters(NamedTuple):
+    """Parameters of a scene that are known with errors, by their paths; values and covariance in the file's units."""
+
+    paths: tuple[str, ...]
+    values: Float[np.ndarray, " parameters"]
+    covariance: Float[np.ndarray, "parameters parameters"]
+
+    def without(self, path: str) -> "UncertainParameters":
+        """Return the others, with the path's own value taken as given: it is the one that is varied."""
+        keep = np.array([own != path for own in self.paths])
+        paths = tuple(own for own in self.paths if own != path)
+        return UncertainParameters(paths, self.values[keep], self.covariance[np.ix_(keep, keep)])
+
+    def draws(self, number: int, seed: int = 0) -> Float[np.ndarray, "draws parameters"]:
+        """Return values drawn from the normal distribution of this covariance."""
+        return np.random.default_rng(seed).multivariate_normal(self.values, self.covariance, size=number)
+
+
+def special_errors(found: Continuation, known: UncertainParameters) -> Float[np.ndarray, " special"]:
+    """Return the standard error of the parameter at each special point.
+
+    Args:
+        found: of the scene with the known parameters' values.
+        known: those parameters; if the one that was followed is among them, its own error does not count.
+    """
+    known = known.without(found.range.path)
+    return np.array([_error(_sensitivity(found, point, known), known) for point in found.special])
+
+
+def drawn_points(
+    found: Continuation, point: SpecialPoint, known: UncertainParameters, *, number: int = 500, seed: int = 0
+) -> Float[np.ndarray, " draws"]:
+    """Return where a special point lies for each draw of the parameters; NaN where there is none near.
+
+    Args:
+        found: of the scene with the known parameters' values.
+        point: one of its special points.
+        known: what is drawn.
+        number: of draws.
+        seed: of the random numbers.
+    """
+    known = known.without(found.range.path)
+    frame, equations, start = _problem(found, point, known)
+    slope = _slopes_by_known(frame, jnp.asarray(start), equations)
+    roots, arrived = _roots(frame, jnp.asarray(start), slope, jnp.asarray(known.draws(number, seed)), equations)
+    value = found.range.low + (found.range.high - found.range.low) * np.asarray(roots)
+    return np.where(np.asarray(arrived), value, np.nan)
+
+
+def amplitude_errors(
+    found: Continuation, branch: OrbitBranch, known: UncertainParameters
+) -> Float[np.ndarray, " points"]:
+    """Return the standard error of the peak amplitude in nm at each point of a branch, the parameter held.
+
+    It grows without bound towards a fold, where the orbit of a held parameter ceases to exist.
+    """
+    known = known.without(found.range.path)
+    frame, equations = _wide(found, known, None)
+    share = (branch.parameter - found.range.low) / (found.range.high - found.range.low)
+    points = np.column_stack([branch.unknowns, share, np.tile(known.values, (len(share), 1))])
+    blocks = -(-len(points) // _BLOCK)
+    padded = np.concatenate([points, np.repeat(points[-1:], blocks * _BLOCK - len(points), axis=0)])
+    slopes = [_amplitude_slopes(frame, jnp.asarray(part), equations) for part in np.split(padded, blocks)]
+    slope = np.concatenate([np.asarray(part) for part in slopes])[: len(points)]
+    return np.sqrt(np.einsum("ni,ij,nj->n", slope, known.covariance, slope))
+
+
+def _wide(found: Continuation, known: UncertainParameters, test: int | None) -> tuple[Frame, Equations]:
+    """Return the same problem with the known parameters behind the followed one, each as it is."""
+    zero, one = jnp.zeros(len(known.paths)), jnp.ones(len(known.paths))
+    low, width = found.frame.low[:1], found.frame.width[:1]
+    frame = found.frame._replace(low=jnp.concatenate([low, zero]), width=jnp.concatenate([width, one]))
+    return frame, found.equations._replace(paths=(found.range.path, *known.paths), kind=test)
+
+
+def _problem(
+    found: Continuation, point: SpecialPoint, known: UncertainParameters
+) -> tuple[Frame, Equations, Float[np.ndarray, " n"]]:
+    frame, equations = _wide(found, known, point.test)
+    share = (point.parameter - found.range.low) / (found.range.high - found.range.low)
+    return frame, equations, np.concatenate([point.unknowns, [share], known.values])
+
+
+def _sensitivity(found: Continuation, point: SpecialPoint, known: UncertainParameters) -> Float[np.ndarray, " p"]:
+    """Return dp/da."""
+    frame, equations, start = _problem(found, point, known)
+    slope = np.asarray(_slopes_by_known(frame, jnp.asarray(start), equations))[-1]
+    return slope * (found.range.high - found.range.low)
+
+
+def _error(slope: np.ndarray, known: UncertainParameters) -> float:
+    return float(np.sqrt(slope @ known.covariance @ slope))
+
+
+@partial(jax.jit, static_argnames=("equations",))
+def _slopes_by_known(frame: Frame, point: Array, equations: Equations) -> Float[Array, "n known"]:
+    slopes = jax.jacfwd(lambda all_: equations_at(all_, frame, equations))(point)
+    own = slopes.shape[0]
+    return -jnp.linalg.solve(slopes[:, :own], slopes[:, own:])
+
+
+@partial(jax.jit, static_argnames=("equations",))
+def _roots(frame: Frame, point: Array, slope: Array, drawn: Array, equations: Equations) -> tuple[Array, Array]:
+    own = point.shape[0] - drawn.shape[1]
+
+    def one(values):
+        def gaps(unknowns):
+            return equations_at(jnp.concatenate([unknowns, values]), frame, equations)
+
+        def improve(_, state):
+            unknowns, _ = state
+            move = jnp.linalg.solve(jax.jacfwd(gaps)(unknowns), gaps(unknowns))
+            return unknowns - move, jnp.max(jnp.abs(move))
+
+        begin = point[:own] + slope @ (values - point[own:])
+        unknowns, moved = lax.fori_loop(0, _NEWTON_STEPS, improve, (begin, jnp.asarray(jnp.inf)))
+        return unknowns[-1], moved < _ARRIVED
+
+    return jax.vmap(one)(drawn)
+
+
+@partial(jax.jit, static_argnames=("equations",))
+def _amplitude_slopes(frame: Frame, points: Array, equations: Equations) -> Float[Array, "points known"]:
+    known = len(equations.paths) - 1
+
+    def one(point):
+        count = point.shape[0] - 1 - known
+        shares = point[count:]
+
+        def at(unknowns, values):
+            loop = loop_at(jnp.concatenate([shares[:1], values]), frame, equations)
+            gaps = closing_gaps(unknowns, frame.scale, loop)
+            return gaps, highest_point(unknowns, frame.scale, loop, equations.samples)
+
+        (by_own, by_known), (top_by_own, top_by_known) = jax.jacfwd(at, argnums=(0, 1))(point[:count], shares[1:])
+        return top_by_known - top_by_own @ jnp.linalg.solve(by_own, by_known)
+
+    return jax.vmap(one)(points)

@@ -1,0 +1,364 @@
+"""Basins of attraction: which start ends where, and how rough the boundaries between basins are.
+
+A sample of starts is followed for long; what it comes to are the attractors. Around each point of each orbit the
+largest radius is sought from within which all of a ring and a disc of tips come back. Then every start is followed
+until it is within such a radius, is held, or flies away, and drops out; what is left in the end is followed on and told
+apart like the sample. Distances are in drive phase (rad) and velocity over beta omega.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from afm_jax.apparatus.scene import Scene
+from afm_jax.contact.contact import Contact
+from afm_jax.dynamics.bifurcations import follow
+from afm_jax.dynamics.exponents import CHAOTIC_ERRORS, exponents_of_law
+from afm_jax.dynamics.iteration import (
+    LANES,
+    Record,
+    Report,
+    Tips,
+    advance,
+    in_blocks,
+    leaving_tips,
+    require_drive,
+    tips_at,
+)
+from afm_jax.dynamics.verdicts import RECORDED, MotionKind, verdicts_of
+from afm_jax.outcomes import Outcome
+
+_SAMPLE = 2048
+_LONG = 1000
+"""Impacts after which a sample is looked at."""
+_SETTLED = 1e-6
+_SAME = 1e-3
+"""Distance below which points are those of one orbit."""
+_RADII = (0.3, 0.2, 0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.0)
+_AROUND = 24
+_BACK = 300
+"""Impacts after which a tip near an orbit must be on it."""
+_POINTS = 64
+_ROUNDS = (8, 8, 8, 8, 16, 16, 32, 64, 128, 256, 512)
+"""Impacts between two looks at which starts have arrived."""
+_PART = 8 * LANES
+_LEFT = 20_000
+"""Starts at most that are told apart one by one in the end."""
+_NARROWEST = 16
+"""Cells at least that the widest pair of the uncertainty exponent fits into the picture."""
+
+
+class Attractor(NamedTuple):
+    """What starts come to.
+
+    ``phase_rad`` and ``velocity_nm_per_us``: of an orbit, just after each of its impacts; else empty.
+    """
+
+    name: str
+    kind: int
+    """A `MotionKind`."""
+    impacts: int
+    periods: int
+    phase_rad: Float[np.ndarray, " impacts"]
+    velocity_nm_per_us: Float[np.ndarray, " impacts"]
+
+
+class Basins(NamedTuple):
+    """Which start ends where.
+
+    Attributes:
+        phase_rad: drive phase of the columns' starts.
+        rebound_speed_nm_per_us: speed off the platform of the rows' starts; at the gap where the bridge breaks, if the
+            scene has a contact.
+        attractors: by falling share.
+        attractor: the number of each start's attractor, (rows, columns).
+        share: of each attractor.
+        share_error: its standard error, as of random starts.
+        boundary_dimension: by the uncertainty exponent; NaN with one attractor.
+        boundary_dimension_error: its standard error.
+    """
+
+    phase_rad: Float[np.ndarray, " columns"]
+    rebound_speed_nm_per_us: Float[np.ndarray, " rows"]
+    attractors: list[Attractor]
+    attractor: Int[np.ndarray, "rows columns"]
+    share: Float[np.ndarray, " attractors"]
+    share_error: Float[np.ndarray, " attractors"]
+    boundary_dimension: float
+    boundary_dimension_error: float
+
+
+def basins_of_attraction(
+    scene: Scene,
+    *,
+    columns: int = 300,
+    rows: int = 300,
+    speeds_nm_per_us: tuple[float, float] | None = None,
+    report: Report | None = None,
+) -> Basins:
+    """Return which start, in drive phase and rebound speed, ends where.
+
+    Args:
+        scene: one scene with a law or a contact, driven by one cosine of its platform.
+        columns: phases, over the whole drive period.
+        rows: rebound speeds.
+        speeds_nm_per_us: their range; None: from 0 to four times the platform's top speed, or the capture speed.
+        report: told how many of how many starts have arrived.
+
+    Raises:
+        RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
+        ValueError: if the scene does not repeat with one drive period, or there is no such grid.
+    """
+    require_drive(scene)
+    if scene.platform.frequency_khz.ndim or columns < 2 or rows < 2:
+        raise ValueError("basins are those of one scene, on a grid of 2 x 2 starts or more")
+    if speeds_nm_per_us is None:
+        one = jax.tree.map(lambda leaf: leaf[None], scene)
+        usual = leaving_tips(one)
+        speeds_nm_per_us = (0.0, 4.0 * float((usual.velocity_nm_per_us - one.platform.velocity(usual.time_us))[0]))
+    low, high = speeds_nm_per_us
+    if not 0.0 <= low < high:
+        raise ValueError(f"`speeds_nm_per_us` must rise from 0 or more, but is {speeds_nm_per_us}")
+    phase = 2.0 * np.pi * (np.arange(columns) + 0.5) / columns
+    speed = low + (high - low) * (np.arange(rows) + 0.5) / rows
+    finder = _Finder(scene)
+    grid = np.meshgrid(phase, speed)
+    starts = finder.tips(*(part.ravel() for part in grid))
+    if isinstance(scene.interaction, Contact):
+        label = finder.told_apart(starts, report)
+    else:
+        finder.look_around(high, low)
+        label = finder.arrived(starts, report)
+    count = np.bincount(label, minlength=len(finder.attractors))
+    order = [number for number in np.argsort(-count, kind="stable") if count[number]]
+    place = np.full(len(count), -1)
+    place[order] = np.arange(len(order))
+    label = place[label].reshape(rows, columns)
+    share = count[order] / label.size
+    dimension, error = boundary_dimension(label)
+    return Basins(
+        phase_rad=phase,
+        rebound_speed_nm_per_us=speed,
+        attractors=_with_names([finder.attractors[number] for number in order]),
+        attractor=label,
+        share=share,
+        share_error=np.sqrt(share * (1.0 - share) / label.size),
+        boundary_dimension=dimension,
+        boundary_dimension_error=error,
+    )
+
+
+class _Finder:
+    """The attractors of one scene that have been found so far, and how starts are matched with them."""
+
+    def __init__(self, scene: Scene):
+        self.scene = scene
+        self.attractors: list[Attractor] = []
+        self.radius: list[float] = []
+        self.omega, self.top = float(scene.platform.angular_frequency), float(scene.platform.top_speed_nm_per_us)
+
+    def scenes(self, count: int) -> Scene:
+        return jax.tree.map(lambda leaf: jnp.full(count, leaf), self.scene)
+
+    def tips(self, phase: np.ndarray, speed: np.ndarray) -> Tips:
+        """Return tips that leave at drive phases with rebound speeds."""
+        scenes = self.scenes(len(phase))
+        time = jnp.asarray(phase / self.omega)
+        tips = tips_at(scenes, time, scenes.platform.velocity(time) + speed)
+        if isinstance(self.scene.interaction, Contact):
+            tips = tips._replace(gap_nm=scenes.interaction.bridge_breaks_nm)
+        return jax.tree.map(np.asarray, tips)
+
+    def told_apart(self, tips: Tips, report: Report | None = None) -> Int[np.ndarray, " lanes"]:
+        """Return the attractors of motions after a long time; new ones are added to those known."""
+
+        def work(some: Tips) -> tuple[Tips, Record]:
+            return follow(self.scenes(len(some.time_us)), some, skip=_LONG, record=RECORDED, accuracy=1e-6)
+
+        end, record = in_blocks(work, tips, report=report)
+        period = np.full(len(end.time_us), 2.0 * np.pi / self.omega)
+        verdicts = verdicts_of(record, end.outcome, period, tolerance=_SETTLED)
+        label = np.empty(len(period), int)
+        for lane in range(len(period)):
+            m = int(verdicts.impacts[lane])
+            phase = self.omega * record.departure_us[lane, -m:] if m else np.zeros(0)
+            velocity = record.velocity_after_nm_per_us[lane, -m:] if m else np.zeros(0)
+            kind = int(verdicts.kind[lane]), m, int(verdicts.periods[lane])
+            label[lane] = self._known(kind, phase, velocity)
+        return label
+
+    def _known(self, kind: tuple[int, int, int], phase: np.ndarray, velocity: np.ndarray) -> int:
+        for number, known in enumerate(self.attractors):
+            if (known.kind, known.impacts, known.periods) != kind:
+                continue
+            if not kind[1]:
+                return number
+            turn = (known.phase_rad - phase[-1] + np.pi) % (2.0 * np.pi) - np.pi
+            apart = np.hypot(turn, (known.velocity_nm_per_us - velocity[-1]) / self.top)
+            if apart.min() < _SAME * max(1.0, np.abs(velocity[-1]) / self.top):
+                return number
+        name = f"({kind[1]},{kind[2]})" if kind[1] else MotionKind(kind[0]).name.lower()
+        self.attractors.append(Attractor(name, *kind, phase, velocity))
+        self.radius.append(0.0)
+        return len(self.attractors) - 1
+
+    def look_around(self, high: float, low: float) -> None:
+        """Find attractors with a sample of starts, how close to an orbit a tip is its own, and what is chaotic."""
+        index = np.arange(1.0, _SAMPLE + 1.0)
+        plastic = 1.324717957244746
+        phase, speed = 2.0 * np.pi * (index / plastic % 1.0), low + (high - low) * (index / plastic**2 % 1.0)
+        tips = self.tips(phase, speed)
+        label = self.told_apart(tips)
+        orbits = [number for number, found in enumerate(self.attractors) if found.impacts]
+        if orbits:
+            self._find_radii(orbits)
+        for number, found in enumerate(self.attractors):
+            if found.kind == MotionKind.IRREGULAR:
+                chosen = np.flatnonzero(label == number)[:16]
+                some = jax.tree.map(lambda part, chosen=chosen: part[chosen], tips)
+                exponents = exponents_of_law(self.scenes(len(chosen)), some, impacts=1000, transient=_LONG)
+                larger, error = exponents.exponents_per_impact[:, 0], exponents.exponents_per_impact_error[:, 0]
+                known = np.isfinite(larger)
+                if known.any() and np.median(larger[known]) > CHAOTIC_ERRORS * np.median(error[known]):
+                    self.attractors[number] = found._replace(name="chaotic")
+
+    def _find_radii(self, orbits: list[int]) -> None:
+        """Find the largest radius around the points of each orbit from within which all tips come back to it."""
+        angle = 2.0 * np.pi * np.arange(_AROUND) / _AROUND
+        ring = np.concatenate([np.stack([np.cos(angle), np.sin(angle)], 1) * size for size in (1.0, 0.5)])
+        rows, owner, sizes = [], [], []
+        for number in orbits:
+            found = self.attractors[number]
+            for phase, velocity in zip(found.phase_rad, found.velocity_nm_per_us, strict=True):
+                for size in _RADII[:-1]:
+                    rows.append(np.stack([phase + size * ring[:, 0], velocity + size * ring[:, 1] * self.top], 1))
+                    owner += [number] * len(ring)
+                    sizes += [size] * len(ring)
+        points, owner, sizes = np.concatenate(rows), np.asarray(owner), np.asarray(sizes)
+        scenes = self.scenes(len(points))
+        time = jnp.asarray(points[:, 0] % (2.0 * np.pi) / self.omega)
+        tips = jax.tree.map(np.asarray, tips_at(scenes, time, jnp.asarray(points[:, 1])))
+
+        def work(some: Tips) -> tuple[Tips, Record]:
+            return follow(self.scenes(len(some.time_us)), some, skip=_BACK, record=RECORDED, accuracy=1e-6)
+
+        end, record = in_blocks(work, tips)
+        # on the orbit: the last point is one of its own
+        phase, velocity = self.omega * record.departure_us[:, -1], record.velocity_after_nm_per_us[:, -1]
+        for number in orbits:
+            mine, found = owner == number, self.attractors[number]
+            turn = (found.phase_rad - phase[mine, None] + np.pi) % (2.0 * np.pi) - np.pi
+            apart = np.hypot(turn, (found.velocity_nm_per_us - velocity[mine, None]) / self.top).min(axis=1)
+            size = max(1.0, np.abs(found.velocity_nm_per_us).max() / self.top)
+            back = (apart < _SAME * size) & (end.outcome[mine] == Outcome.IMPACT)
+            good = [size for size in _RADII if back[sizes[mine] <= size].all()]
+            self.radius[number] = max(good, default=0.0)
+
+    def arrived(self, tips: Tips, report: Report | None) -> Int[np.ndarray, " lanes"]:
+        """Return the attractor of every start, as soon as it has arrived."""
+        count = len(tips.time_us)
+        label, left = np.full(count, -1), np.arange(count)
+        for impacts in _ROUNDS:
+            points, radius, owner = self._targets()
+
+            def work(some: Tips, impacts=impacts, points=points, radius=radius) -> tuple[Tips, Array]:
+                return _towards(self.scene, some, points, radius, impacts=impacts)
+
+            tips, nearest = in_blocks(work, tips, block=_PART)
+            near = nearest >= 0
+            found = np.where(near, owner[np.maximum(nearest, 0)], -1)
+            for outcome, kind in (
+                (Outcome.CAPTURED, MotionKind.STUCK),
+                (Outcome.NO_FURTHER_IMPACT, MotionKind.FREE),
+            ):
+                ended = tips.outcome == outcome
+                if ended.any():
+                    found[ended] = self._known((int(kind), 0, 0), np.zeros(0), np.zeros(0))
+            lost = (tips.outcome != Outcome.IMPACT) & (found < 0)
+            if lost.any():
+                found[lost] = self._known((int(MotionKind.UNRESOLVED), 0, 0), np.zeros(0), np.zeros(0))
+            label[left] = found
+            going = found < 0
+            left, tips = left[going], jax.tree.map(lambda part, going=going: part[going], tips)
+            if report is not None:
+                report(count - left.size, count)
+            if not left.size:
+                return label
+        if left.size <= _LEFT:
+            label[left] = self.told_apart(tips)
+        else:
+            label[left] = self._known((int(MotionKind.IRREGULAR), 0, 0), np.zeros(0), np.zeros(0))
+        return label
+
+    def _targets(self) -> tuple[Array, Array, np.ndarray]:
+        """Return points of orbits (phase, velocity over beta omega), their radii and whose they are, filled up."""
+        points, radius, owner = np.zeros((_POINTS, 2)), np.full(_POINTS, -1.0), np.zeros(_POINTS, int)
+        used = 0
+        for number, found in enumerate(self.attractors):
+            if found.impacts and used + found.impacts <= _POINTS and self.radius[number] > 0.0:
+                some = slice(used, used + found.impacts)
+                points[some] = np.stack([found.phase_rad, found.velocity_nm_per_us / self.top], axis=1)
+                radius[some], owner[some] = self.radius[number], number
+                used += found.impacts
+        return jnp.asarray(points), jnp.asarray(radius), owner
+
+
+@partial(jax.jit, static_argnames=("impacts",))
+def _towards(
+    scene: Scene, tips: Tips, points: Float[Array, "points 2"], radius: Float[Array, " points"], *, impacts: int
+) -> tuple[Tips, Int[Array, " lanes"]]:
+    """Return tips some impacts later, and the number of the point that each has come close enough to; -1: none."""
+    omega, top = scene.platform.angular_frequency, scene.platform.top_speed_nm_per_us
+
+    def piece(tips: Tips) -> tuple[Tips, Array]:
+        scenes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, tips.time_us.shape), scene)
+        end = lax.fori_loop(0, impacts, lambda _, now: advance(scenes, now).end, tips)
+        turn = omega * end.time_us[:, None] - points[:, 0]
+        turn = turn - 2.0 * jnp.pi * jnp.round(turn / (2.0 * jnp.pi))
+        square = turn**2 + (end.velocity_nm_per_us[:, None] / top - points[:, 1]) ** 2
+        near = (square < radius**2) & (radius > 0.0) & (end.outcome == Outcome.IMPACT)[:, None]
+        return end, jnp.where(near.any(axis=1), jnp.argmax(near, axis=1), -1)
+
+    lanes = tips.time_us.shape[0]
+    pieces = jax.tree.map(lambda part: part.reshape(-1, min(LANES, lanes)), tips)
+    return jax.tree.map(lambda part: part.reshape(lanes), lax.map(piece, pieces))
+
+
+def _with_names(attractors: list[Attractor]) -> list[Attractor]:
+    """Return attractors whose names tell them apart: "(1,5) a" and "(1,5) b"."""
+    names = [found.name for found in attractors]
+    letters = {name: iter("abcdefghijklmnopqrstuvwxyz") for name in names if names.count(name) > 1}
+    return [
+        found._replace(name=f"{found.name} {next(letters[found.name], '+')}") if found.name in letters else found
+        for found in attractors
+    ]
+
+
+def boundary_dimension(attractor: Int[np.ndarray, "rows columns"]) -> tuple[float, float]:
+    """Return the dimension of the boundary between basins, and its standard error.
+
+    The share of pairs of starts k cells apart that end in different places goes as k^alpha; the dimension is 2 - alpha.
+    NaN where all starts end in one place, or the grid is too small.
+
+    Args:
+        attractor: the number of each start's attractor.
+    """
+    widest = min(attractor.shape) // _NARROWEST
+    apart = [1 << power for power in range(max(widest, 1).bit_length())]
+    shares = []
+    for cells in apart:
+        across = attractor[:, cells:] != attractor[:, :-cells]
+        up = attractor[cells:] != attractor[:-cells]
+        shares.append((across.sum() + up.sum()) / (across.size + up.size))
+    if len(apart) < 3 or not all(shares):
+        return float("nan"), float("nan")
+    x, y = np.log(apart), np.log(shares)
+    slope, _ = np.polyfit(x, y, 1)
+    off = y - np.polyval(np.polyfit(x, y, 1), x)
+    error = np.sqrt((off**2).sum() / (len(x) - 2) / ((x - x.mean()) ** 2).sum())
+    return float(2.0 - slope), float(error)

@@ -1,0 +1,327 @@
+"""Bifurcation diagrams: what motions come to while a parameter is swept up, and down.
+
+A sweep carries the tip from value to value, which is what makes hysteresis show, and is a long sequence. It is done in
+many lanes at once, each a stretch of neighbouring values, like this: a first tip hurries along the first values of all
+stretches; from where it was, all stretches are swept side by side; then the first value of every stretch is done again
+from the end of the stretch before it, and the stretches in which that makes a difference are swept again from there,
+until none is left. What remains is what one tip that is swept along all values does, where its motion is regular; it
+carries drive phase and rebound speed from value to value. A tip that the platform holds, or that flies away, begins
+anew at the next value, leaving the platform upward.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+
+from afm_jax.apparatus.scene import Scene
+from afm_jax.contact.contact import Contact
+from afm_jax.dynamics.contact_sequence import follow_contacts
+from afm_jax.dynamics.iteration import (
+    Record,
+    Report,
+    Tips,
+    in_blocks,
+    leaving_tips,
+    recorded,
+    require_drive,
+    skipped,
+)
+from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Verdicts, verdicts_of
+from afm_jax.outcomes import Outcome
+from afm_jax.scenefile.parameter_paths import scene_batch
+
+_LANES = 512
+"""Stretches at most that are swept side by side."""
+_HURRIED = 100
+"""Impacts at each value of the first, hurried sweep."""
+_PASSES = 40
+"""Times at most that stretches are swept again."""
+_SETTLED = 1e-6
+"""Estimated distance from an orbit below which a motion is on it."""
+_SAME = 1e-4
+"""Of the largest speed: points of orbits closer than this are the same."""
+
+
+class Sweep(NamedTuple):
+    """A sweep of a parameter, arrays of one row a value, in the order of the values.
+
+    Attributes:
+        values: of the parameter, ascending.
+        upward: the sweep's direction.
+        verdicts: what the motion has come to at each value.
+        restarted: the tip began anew there: it was held, or had flown away, at the value before.
+        phase_rad: drive phase at the end of each of the last impacts, (values, impacts); NaN where there was none. Of
+            an orbit of m impacts the last m.
+        approach_nm_per_us: their approach speeds.
+        velocity_after_nm_per_us: the tip's velocity in the lab after them.
+        height_nm: the platform's height when the tip arrives.
+        strobe_height_nm: the tip's height whenever the platform is highest, (values, drive periods), of the last ones.
+        complete: False where stretches were still being swept again when there were enough.
+    """
+
+    values: Float[np.ndarray, " values"]
+    upward: bool
+    verdicts: Verdicts
+    restarted: Bool[np.ndarray, " values"]
+    phase_rad: Float[np.ndarray, "values impacts"]
+    approach_nm_per_us: Float[np.ndarray, "values impacts"]
+    velocity_after_nm_per_us: Float[np.ndarray, "values impacts"]
+    height_nm: Float[np.ndarray, "values impacts"]
+    strobe_height_nm: Float[np.ndarray, "values periods"]
+    complete: bool
+
+
+def bifurcation_diagram(
+    scene: Scene,
+    parameter: str,
+    values: Float[np.ndarray, " values"],
+    *,
+    upward: bool = True,
+    impacts: int = 2000,
+    accuracy: float = 1e-6,
+    report: Report | None = None,
+) -> Sweep:
+    """Return what a tip comes to at each value of a parameter, swept up or down.
+
+    Args:
+        scene: a scene with a law or a contact, driven by one cosine of its platform.
+        parameter: its path in the scene file.
+        values: of the parameter, ascending.
+        upward: from the lowest value to the highest, or the other way round.
+        impacts: at each value; the last of them are recorded.
+        accuracy: of resolved contacts, as for `simulate`.
+        report: told how many of how many values are done, in the first sweep of all.
+
+    Raises:
+        RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
+        ValueError: if the scene lacks the parameter or does not repeat with one drive period, or values do not rise.
+    """
+    ordered = np.asarray(values, float)
+    if ordered.ndim != 1 or len(ordered) < 1 or np.any(np.diff(ordered) <= 0.0):
+        raise ValueError("`values` must be rising numbers, one at least")
+    scenes = scene_batch(scene, {parameter: ordered if upward else ordered[::-1]})
+    require_drive(scenes)
+    scenes = jax.tree.map(np.asarray, scenes)
+    if impacts < RECORDED:
+        raise ValueError(f"`impacts` must be {RECORDED} or more, to tell orbits, but is {impacts}")
+    sweeper = _Sweeper(scenes, impacts, accuracy)
+    swept, complete = sweeper.run(report)
+    order = slice(None) if upward else slice(None, None, -1)
+    scenes, swept = jax.tree.map(lambda part: part[order], (scenes, swept))
+    return _sweep_of(jax.tree.map(jnp.asarray, scenes), swept, ordered, upward=upward, complete=complete)
+
+
+class _Swept(NamedTuple):
+    """Of every value, arrays with a leading axis of values."""
+
+    end: Tips
+    restarted: Bool[np.ndarray, " values"]
+    record: Record
+    verdicts: Verdicts
+
+
+class _Sweeper:
+    """Sweeps of the same scenes in stretches; the scenes are in the order in which they are swept."""
+
+    def __init__(self, scenes: Scene, impacts: int, accuracy: float):
+        self.scenes, self.impacts, self.accuracy = scenes, impacts, accuracy
+        self.count = len(scenes.platform.frequency_khz)
+        self.stretch = -(-self.count // _LANES)
+        self.lanes = -(-self.count // self.stretch)
+
+    def run(self, report: Report | None) -> tuple[_Swept, bool]:
+        """Return the sweep of all values, and whether nothing was left to be swept again."""
+        every = np.arange(self.lanes)
+        starts = self._hurried()
+        parts = self._sweep(every, starts, np.zeros(self.lanes, bool), report)
+        changed = every
+        for _ in range(_PASSES):
+            behind = changed[changed + 1 < self.lanes] + 1
+            if not behind.size:
+                break
+            starts, restarted = self._carried(parts[-1], behind - 1, self._numbers(behind - 1)[:, -1], behind)
+            first = self._follow(self._numbers(behind)[:, 0], starts, restarted)
+            differs = ~_same(first, jax.tree.map(lambda part, rows=behind: part[rows], parts[0]))
+            changed = behind[differs]
+            if not changed.size:
+                break
+            chosen = jax.tree.map(lambda part, rows=differs: part[rows], starts)
+            again = self._sweep(changed, chosen, restarted[differs], None)
+            for old, new in zip(parts, again, strict=True):
+                for part, rows in zip(jax.tree.leaves(old), jax.tree.leaves(new), strict=True):
+                    part[changed] = rows
+        else:
+            return self._joined(parts), False
+        return self._joined(parts), True
+
+    def _numbers(self, lanes: np.ndarray) -> np.ndarray:
+        """Return the numbers of the values of stretches; the last stretch ends with its last value again and again."""
+        return np.minimum(lanes[:, None] * self.stretch + np.arange(self.stretch), self.count - 1)
+
+    def _joined(self, parts: list[_Swept]) -> _Swept:
+        def join(*columns: np.ndarray) -> np.ndarray:
+            return np.stack(columns, axis=1).reshape(self.lanes * self.stretch, *columns[0].shape[1:])[: self.count]
+
+        return jax.tree.map(join, *parts)
+
+    def _at(self, numbers: np.ndarray) -> Scene:
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf[numbers]), self.scenes)
+
+    def _sweep(self, lanes: np.ndarray, tips: Tips, restarted: np.ndarray, report: Report | None) -> list[_Swept]:
+        """Return what comes out at the first, second, ... value of stretches."""
+        numbers, parts = self._numbers(lanes), []
+        for place in range(self.stretch):
+            if place:
+                tips, restarted = self._carried(parts[-1], slice(None), numbers[:, place - 1], lanes, place)
+            parts.append(self._follow(numbers[:, place], tips, restarted))
+            if report is not None:
+                report(min((place + 1) * len(lanes), self.count), self.count)
+        return parts
+
+    def _carried(self, before: _Swept, rows, old: np.ndarray, lanes: np.ndarray, place: int = 0) -> tuple[Tips, Any]:
+        """Return tips of one value at the next one, and which begin anew."""
+        end = jax.tree.map(lambda part: part[rows], before.end)
+        tips = carried(self._at(old), self._at(self._numbers(lanes)[:, place]), end)
+        return jax.tree.map(np.asarray, tips), end.outcome != Outcome.IMPACT
+
+    def _follow(self, numbers: np.ndarray, tips: Tips, restarted: np.ndarray) -> _Swept:
+        """Return what tips come to, one at each value."""
+
+        def work(lanes: tuple[Scene, Tips]) -> tuple[Tips, Record]:
+            return follow(*lanes, skip=self.impacts - RECORDED, record=RECORDED, accuracy=self.accuracy)
+
+        scenes = self._at(numbers)
+        end, record = in_blocks(work, (scenes, tips))
+        period = np.asarray(scenes.platform.period_us)
+        return _Swept(end, restarted, record, verdicts_of(record, end.outcome, period, tolerance=_SETTLED))
+
+    def _hurried(self) -> Tips:
+        """Return the tips that one gets at the first values of all stretches in a sweep of those alone."""
+        firsts = self._at(self._numbers(np.arange(self.lanes))[:, 0])
+        if not isinstance(self.scenes.interaction, Contact):
+            return jax.tree.map(np.asarray, _hurried_law(firsts))
+        rows, tips = [], None
+        for lane in range(self.lanes):
+            scene = jax.tree.map(lambda leaf, lane=lane: leaf[lane : lane + 1], firsts)
+            if tips is None:
+                tips = leaving_tips(scene)
+            else:
+                before = jax.tree.map(lambda leaf, lane=lane: leaf[lane - 1 : lane], firsts)
+                tips = carried(before, scene, tips)
+            rows.append(jax.tree.map(np.asarray, tips))
+            tips, _ = follow_contacts(scene, tips, skip=1, record=0, accuracy=self.accuracy)
+        return jax.tree.map(lambda *parts: np.concatenate(parts), *rows)
+
+
+def follow(scenes: Scene, tips: Tips, *, skip: int, record: int, accuracy: float) -> tuple[Tips, Record]:
+    """Return a block of tips some impacts or contacts later, and the last of these, arrays (lanes, impacts).
+
+    Args:
+        scenes: a batch of scenes with laws or contacts.
+        tips: where they are.
+        skip: impacts before those that are recorded.
+        record: impacts that are recorded.
+        accuracy: of resolved contacts.
+    """
+    if isinstance(scenes.interaction, Contact):
+        return follow_contacts(scenes, tips, skip=skip, record=record, accuracy=accuracy)
+    tips, rows = recorded(scenes, skipped(scenes, tips, impacts=skip), impacts=record)
+    return tips, Record(*(np.asarray(part).T for part in rows))
+
+
+@jax.jit
+def _hurried_law(firsts: Scene) -> Tips:
+    def one(state, scene: Scene):
+        before, tips = state
+        tips = carried(before, scene, tips)
+        return (scene, skipped(scene, tips, impacts=_HURRIED)), tips
+
+    each = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None], firsts)
+    first = jax.tree.map(lambda leaf: leaf[0], each)
+    return jax.tree.map(lambda part: part[:, 0], jax.lax.scan(one, (first, leaving_tips(first)), each)[1])
+
+
+@jax.jit
+def carried(before: Scene, after: Scene, tips: Tips) -> Tips:
+    """Return tips in other scenes at the same drive phase with the same rebound speed; ended ones leave anew.
+
+    Args:
+        before: the scenes they are in, a batch.
+        after: the scenes they come to.
+        tips: the tips.
+    """
+    time = tips.time_us * (after.platform.period_us / before.platform.period_us)
+    rebound = tips.velocity_nm_per_us - before.platform.velocity(tips.time_us)
+    fresh = leaving_tips(after)
+    kept = tips._replace(
+        time_us=time,
+        periods=jnp.zeros_like(time),
+        velocity_nm_per_us=after.platform.velocity(time) + rebound,
+        gap_nm=fresh.gap_nm if isinstance(after.interaction, Contact) else tips.gap_nm,
+    )
+    going = tips.outcome == Outcome.IMPACT
+    return jax.tree.map(lambda old, new: jnp.where(going, old, new), kept, fresh)
+
+
+def _same(one: _Swept, other: _Swept) -> Bool[np.ndarray, " lanes"]:
+    """Say which motions are the same: of one kind, and orbits through the same points."""
+    a, b = one.verdicts, other.verdicts
+    same = (a.kind == b.kind) & (a.impacts == b.impacts) & (a.periods == b.periods)
+    for lane in np.flatnonzero(same & (a.kind == MotionKind.ORBIT)):
+        m = a.impacts[lane]
+        points = [np.sort(part.record.approach_nm_per_us[lane, -m:]) for part in (one, other)]
+        same[lane] = np.max(np.abs(points[0] - points[1])) <= _SAME * max(np.max(points[1]), 1e-12)
+    return same
+
+
+def _sweep_of(
+    scenes: Scene, swept: _Swept, values: Float[np.ndarray, " values"], *, upward: bool, complete: bool
+) -> Sweep:
+    record, verdicts = swept.record, swept.verdicts
+    period = np.asarray(scenes.platform.period_us)
+    # of an orbit its last impacts, each point once
+    number = np.arange(RECORDED, 0, -1)
+    shown = (verdicts.impacts[:, None] == 0) | (number <= verdicts.impacts[:, None])
+
+    def known(part: np.ndarray) -> np.ndarray:
+        return np.where(shown, part, np.nan)
+
+    amplitude, offset = (
+        np.asarray(part)[:, None] for part in (scenes.platform.amplitude_nm, scenes.platform.offset_nm)
+    )
+    turn = 2.0 * np.pi / period[:, None]
+    return Sweep(
+        values=values,
+        upward=upward,
+        verdicts=verdicts,
+        restarted=swept.restarted,
+        phase_rad=known(turn * record.departure_us),
+        approach_nm_per_us=known(record.approach_nm_per_us),
+        velocity_after_nm_per_us=known(record.velocity_after_nm_per_us),
+        height_nm=known(offset + amplitude * np.cos(turn * record.arrival_us)),
+        strobe_height_nm=_strobes(scenes, record, shown, period),
+        complete=complete,
+    )
+
+
+_STROBE_IMPACTS, _STROBES = 48, 8
+"""Last impacts in whose flights the tip is looked at, and looks at most in a flight."""
+
+
+def _strobes(scenes: Scene, record: Record, shown: np.ndarray, period: np.ndarray) -> np.ndarray:
+    """Return the tip's heights whenever the platform is highest."""
+    some = slice(-_STROBE_IMPACTS - 1, None)
+    begin, end = record.turns(period)[:, some], record.arrival_periods + record.arrival_us / period[:, None]
+    begin, end, used = begin[:, :-1], end[:, some][:, 1:], shown[:, some][:, 1:]
+    gap = np.asarray(scenes.interaction.bridge_breaks_nm) if isinstance(scenes.interaction, Contact) else 0.0 * period
+    column = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None, None], scenes)
+    strobe = np.ceil(begin)[..., None] + np.arange(_STROBES)
+    flown = (strobe - begin[..., None]) * period[:, None, None]
+    start = np.asarray(column.platform.position(record.departure_us[:, some][:, :-1, None])) + gap[:, None, None]
+    velocity = record.velocity_after_nm_per_us[:, some][:, :-1, None]
+    height = np.asarray(column.cantilever.propagator(np.where(np.isfinite(flown), flown, 0.0))(start, velocity)[0])
+    inside = used[..., None] & (strobe < end[..., None])
+    return np.where(inside, height, np.nan).reshape(len(period), -1)

@@ -1,0 +1,378 @@
+"""Lyapunov exponents of the impact map: how fast neighbouring motions part, from the exact Jacobians.
+
+Of the map's two exponents the larger is the growth of a tangent vector, the orthogonal factor of a QR decomposition in
+two dimensions, and their sum the mean of ln |det|. Once a motion repeats, after m impacts, they are ln |multipliers|/m
+of the Jacobian over one repetition. A tip that comes to rest on the platform and is let go by it, or stays for good,
+forgets its start: the map has rank one at the capture and rank zero after the release, and both exponents are minus
+infinity. Near grazing the Jacobian grows without bound; such impacts are counted.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from afm_jax.apparatus.scene import Scene
+from afm_jax.contact.contact import Contact
+from afm_jax.dynamics.contact_sequence import departure_jacobians, follow_contacts
+from afm_jax.dynamics.iteration import (
+    Record,
+    Report,
+    Step,
+    Tips,
+    advance,
+    batch_and_tips,
+    in_blocks,
+    record_of,
+    require_drive,
+    skipped,
+)
+from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Verdicts, verdicts_of
+from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
+from afm_jax.impact.lasting_impact import LawImpact
+from afm_jax.impact.law import impact_law_of
+from afm_jax.motion.record import State
+from afm_jax.motion.simulate import DEFAULT_ACCURACY
+from afm_jax.outcomes import Outcome
+
+_PARTS = 20
+"""Parts of a motion whose means tell the errors."""
+_CONTACTS_AT_ONCE = 256
+"""Contacts whose Jacobians are computed together."""
+_ARRIVED = 1e-8
+"""Estimated distance from an orbit below which its multipliers are taken for the exponents."""
+
+
+class Lyapunov(NamedTuple):
+    """Exponents of motions, arrays of one lane a motion; larger exponent first.
+
+    Attributes:
+        exponents_per_impact: minus infinity where the tip rests on the platform; NaN where the motion ended, without
+            an impact to the end, before a tenth of the impacts were made.
+        exponents_per_us: the same in time.
+        exponents_per_impact_error: standard errors from the means of twenty parts; of an orbit how far it may be off.
+        exponents_per_us_error: the same in time.
+        mean_log_determinant: mean of ln |det| of the map's Jacobian.
+        impacts: how many the means are over.
+        near_grazing: how many of them are near grazing.
+        rested: how many of them ended in a rest.
+        verdicts: what the motions have come to.
+    """
+
+    exponents_per_impact: Float[np.ndarray, "lanes 2"]
+    exponents_per_us: Float[np.ndarray, "lanes 2"]
+    exponents_per_impact_error: Float[np.ndarray, "lanes 2"]
+    exponents_per_us_error: Float[np.ndarray, "lanes 2"]
+    mean_log_determinant: Float[np.ndarray, " lanes"]
+    impacts: Int[np.ndarray, " lanes"]
+    near_grazing: Int[np.ndarray, " lanes"]
+    rested: Int[np.ndarray, " lanes"]
+    verdicts: Verdicts
+
+
+CHAOTIC_ERRORS = 3.0
+"""Standard errors by which the larger exponent must be above 0 to be called positive."""
+
+
+def exponent_verdicts(found: Lyapunov) -> list[str]:
+    """Return in words what the exponents of each of many motions say."""
+    words = []
+    for lane, name in enumerate(found.verdicts.names()):
+        kind = found.verdicts.kind[lane]
+        larger, error = found.exponents_per_impact[lane, 0], found.exponents_per_impact_error[lane, 0]
+        if kind == MotionKind.ORBIT:
+            forgets = ", the tip rests on the platform and forgets its start" if np.isneginf(larger) else ""
+            words.append(f"regular: the motion has come to a {name} orbit{forgets}")
+        elif kind == MotionKind.STUCK:
+            words.append("stuck: the platform holds the tip")
+        elif kind == MotionKind.IRREGULAR and np.isneginf(larger):
+            words.append("the tip rests on the platform and forgets its start")
+        elif kind == MotionKind.IRREGULAR and larger > CHAOTIC_ERRORS * error:
+            words.append("chaotic: the larger exponent is positive")
+        elif kind == MotionKind.IRREGULAR:
+            words.append("undecided: nothing repeats, and the larger exponent is not clearly positive")
+        else:
+            words.append("free: the tip no longer meets the platform" if kind == MotionKind.FREE else "unresolved")
+    return words
+
+
+class _Sums(NamedTuple):
+    """Of a part of a motion, arrays of one lane a motion."""
+
+    growth: Float[Any, " lanes"]
+    """Sum of ln |J q|."""
+    determinant: Float[Any, " lanes"]
+    """Sum of ln |det J|."""
+    impacts: Float[Any, " lanes"]
+    time_us: Float[Any, " lanes"]
+    near_grazing: Float[Any, " lanes"]
+    rested: Float[Any, " lanes"]
+
+
+def lyapunov_spectrum(
+    scene: Scene,
+    start: State | None = None,
+    *,
+    impacts: int = 2000,
+    transient: int = 500,
+    accuracy: float = DEFAULT_ACCURACY,
+    report: Report | None = None,
+) -> Lyapunov:
+    """Return the Lyapunov exponents of a motion, or of many.
+
+    Args:
+        scene: a scene with a law or a contact, driven by one cosine of its platform; or a batch of scenes.
+        start: where the motion begins; None: one scene's default, of many a tip that leaves the platform upward.
+        impacts: impacts over which the exponents are taken.
+        transient: impacts before.
+        accuracy: of resolved contacts, as for `simulate`.
+        report: told how many of how many motions are done.
+
+    Returns:
+        A `Lyapunov`; of one scene without the axis of lanes.
+
+    Raises:
+        RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
+        ValueError: if the scene does not repeat with one drive period, or there are too few impacts to tell errors.
+    """
+    require_drive(scene)
+    if impacts < _PARTS or transient < 0:
+        raise ValueError(f"`impacts` must be {_PARTS} or more and `transient` not negative: {impacts} and {transient}")
+    single = scene.platform.frequency_khz.ndim == 0
+    scenes, tips = batch_and_tips(scene, start)
+    if isinstance(scene.interaction, Contact):
+        found = _exponents_of_contacts(scenes, tips, impacts=impacts, transient=transient, accuracy=accuracy)
+    else:
+        found = exponents_of_law(scenes, tips, impacts=impacts, transient=transient, report=report)
+    return jax.tree.map(lambda part: part[0], found) if single else found
+
+
+def exponents_of_law(
+    scenes: Scene, tips: Tips, *, impacts: int, transient: int, report: Report | None = None
+) -> Lyapunov:
+    """Return the exponents of motions in a batch of law scenes; arguments as for `lyapunov_spectrum`."""
+
+    def work(lanes: tuple[Scene, Tips]) -> Lyapunov:
+        return _exponents_of_block(*lanes, impacts=impacts, transient=transient)
+
+    return in_blocks(work, (scenes, tips), report=report)
+
+
+def _exponents_of_contacts(scenes: Scene, tips: Tips, *, impacts: int, transient: int, accuracy: float) -> Lyapunov:
+    """Return the exponents of contact scenes: the motion first, then the Jacobians of all its contacts at once."""
+    each = -(-impacts // _PARTS)
+    count = (_PARTS + 1) * each + 1
+    tips, record = follow_contacts(scenes, tips, skip=transient, record=max(count, RECORDED + 1), accuracy=accuracy)
+    period, lanes = np.asarray(scenes.platform.period_us), len(tips.time_us)
+    verdicts = verdicts_of(record, tips.outcome, period, tolerance=_ARRIVED)
+    departure, velocity = record.departure_us, record.velocity_after_nm_per_us
+    turns = record.departure_periods * period[:, None] + departure
+    passed = np.diff(turns, axis=1)
+    known = np.isfinite(passed)
+    steps = passed.shape[1]
+    pairs = [np.where(known, part, 0.0).ravel() for part in (departure[:, :-1], velocity[:, :-1], passed)]
+    of_all = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), steps), scenes)
+
+    def work(rows: tuple[Scene, Array, Array, Array]) -> Array:
+        each_scene, time, speed, duration = rows
+        return departure_jacobians(each_scene, time, speed, time + duration, accuracy=accuracy)
+
+    found = in_blocks(work, (of_all, *pairs), block=_CONTACTS_AT_ONCE).reshape(lanes, steps, 2, 2)
+    unit = np.asarray(scenes.platform.angular_frequency * scenes.platform.top_speed_nm_per_us)
+    scale = np.stack([np.ones_like(unit), unit, 1.0 / unit, np.ones_like(unit)], axis=1).reshape(lanes, 1, 2, 2)
+    jacobians = np.moveaxis(np.where(known[..., None, None], found * scale, np.eye(2)), 1, 0)
+    determinants = np.linalg.det(jacobians)
+    last = steps - (_PARTS + 1) * each
+    sums = _sums_of(jacobians[last:], determinants[last:], known.T[last:], np.where(known, passed, 0.0).T[last:], each)
+    flat = np.moveaxis(jacobians.reshape(steps, lanes, 4), 1, 2)
+    return _of_orbits(_of_sums(sums, verdicts), flat, determinants, period)
+
+
+def _sums_of(
+    jacobians: np.ndarray, determinants: np.ndarray, known: np.ndarray, passed: np.ndarray, each: int
+) -> _Sums:
+    """Return what `_measured` does, from the Jacobians; the axis of impacts first."""
+    vector = np.broadcast_to([0.8, 0.6], (jacobians.shape[1], 2))
+    growth = np.zeros(known.shape)
+    for number, matrix in enumerate(jacobians):
+        image = np.einsum("lij,lj->li", matrix, vector)
+        length = np.linalg.norm(image, axis=1)
+        length = np.where(length > 0.0, length, 1.0)
+        vector, growth[number] = image / length[:, None], np.log(length)
+    logs = np.log(np.where(known & (determinants != 0.0), np.abs(determinants), 1.0))
+    parts = [growth, logs, known.astype(float), passed, np.zeros(known.shape), np.zeros(known.shape)]
+    return _Sums(*(part.reshape(_PARTS + 1, each, -1).sum(axis=1)[1:] for part in parts))
+
+
+def _exponents_of_block(scenes: Scene, tips: Tips, *, impacts: int, transient: int) -> Lyapunov:
+    each = -(-impacts // _PARTS)
+    tips = skipped(scenes, tips, impacts=transient)
+    tips, sums = _measured(scenes, tips, each=each)
+    tips, (record, jacobians, determinants) = _recorded(scenes, tips)
+    record = Record(*(np.asarray(part).T for part in record))
+    period = np.asarray(scenes.platform.period_us)
+    outcome = np.asarray(tips.outcome)
+    verdicts = verdicts_of(record, outcome, period, tolerance=_ARRIVED)
+    found = _of_sums(_Sums(*(np.asarray(part) for part in sums)), verdicts)
+    return _of_orbits(found, np.asarray(jacobians), np.asarray(determinants), period)
+
+
+@partial(jax.jit, static_argnames=("each",))
+def _measured(scenes: Scene, tips: Tips, *, each: int) -> tuple[Tips, _Sums]:
+    """Return tips later, and the sums of parts of `each` impacts; before them a part turns the tangent vectors."""
+    none = jnp.zeros_like(tips.time_us)
+    begin = _Sums(none, none, none, none, none, none)
+
+    def impact(_, state):
+        tips, vector, sums = state
+        step = advance(scenes, tips)
+        jacobian, determinant, landed = _jacobian(scenes, step)
+        a, b = vector
+        image = jacobian[0] * a + jacobian[1] * b, jacobian[2] * a + jacobian[3] * b
+        square = image[0] ** 2 + image[1] ** 2
+        counts = landed & ~step.rested & (square > 0.0)
+        growth = 0.5 * jnp.log(jnp.where(counts, square, 1.0))
+        length = jnp.sqrt(jnp.where(counts, square, 1.0))
+        vector = tuple(jnp.where(counts, new / length, old) for new, old in zip(image, vector, strict=True))
+        end = step.end
+        passed = (end.periods - tips.periods) * scenes.platform.period_us + end.time_us - tips.time_us
+        more = _Sums(
+            growth,
+            jnp.log(jnp.where(counts, jnp.abs(determinant), 1.0)),
+            landed.astype(none.dtype),
+            jnp.where(landed, passed, 0.0),
+            (landed & step.impact.near_grazing).astype(none.dtype),
+            (landed & step.rested).astype(none.dtype),
+        )
+        return end, vector, jax.tree.map(jnp.add, sums, more)
+
+    def part(state, _):
+        tips, vector, sums = lax.fori_loop(0, each, impact, (*state, begin))
+        return (tips, vector), sums
+
+    one = jnp.ones_like(none)
+    (tips, _), sums = lax.scan(part, (tips, (0.8 * one, 0.6 * one)), length=_PARTS + 1)
+    return tips, jax.tree.map(lambda rows: rows[1:], sums)
+
+
+@jax.jit
+def _recorded(scenes: Scene, tips: Tips) -> tuple[Tips, tuple[Record, Array, Array]]:
+    """Return tips later, their impacts, Jacobians and determinants, with the axis of impacts first."""
+
+    def one(now: Tips, _: Any):
+        step = advance(scenes, now)
+        jacobian, determinant, _ = _jacobian(scenes, step)
+        return step.end, (record_of(scenes, step), jnp.stack(jacobian), determinant)
+
+    return lax.scan(one, tips, length=RECORDED)
+
+
+def _jacobian(scenes: Scene, step: Step) -> tuple[tuple[Array, Array, Array, Array], Array, Array]:
+    """Return the map's Jacobian in drive phase and velocity over beta omega, its determinant, and whether it has one.
+
+    The determinant of a flight is known: -exp(-Omega T/Q) u_out/u_in, with the speeds at its start and end.
+    """
+    impact, start = step.impact, step.start
+    landed = (start.outcome == Outcome.IMPACT) & (step.end.outcome == Outcome.IMPACT)
+    arrival = jnp.where(landed, impact.arrival_time_us, start.time_us + scenes.platform.period_us)
+    before = jnp.where(landed, impact.velocity_before_nm_per_us, scenes.platform.velocity(arrival) - 1.0)
+
+    def one(scene: Scene, time: Array, velocity: Array, arrival: Array, before: Array):
+        cantilever, platform = scene.cantilever, scene.platform
+        law = LawImpact(impact_law_of(scene))
+        flight = flight_jacobian(cantilever, platform, time, velocity, arrival)
+        contact = contact_jacobian(law, cantilever, platform, arrival, before)
+        kept = jnp.exp(-2.0 * cantilever.decay_rate * (arrival - time))
+        ratio = (velocity - platform.velocity(time)) / (before - platform.velocity(arrival))
+        determinant = kept * ratio * (contact[0, 0] * contact[1, 1] - contact[0, 1] * contact[1, 0])
+        (a, b), (c, d) = contact
+        (e, f), (g, h) = flight
+        unit = platform.angular_frequency * platform.top_speed_nm_per_us
+        return (a * e + b * g, (a * f + b * h) * unit, (c * e + d * g) / unit, c * f + d * h), determinant
+
+    jacobian, determinant = jax.vmap(one)(scenes, start.time_us, start.velocity_nm_per_us, arrival, before)
+    return jacobian, determinant, landed
+
+
+def _of_sums(sums: _Sums, verdicts: Verdicts) -> Lyapunov:
+    """Return the exponents as means over all impacts."""
+    impacts = sums.impacts.sum(axis=0)
+    enough = (sums.impacts > 0).all(axis=0)
+    kind = verdicts.kind
+    rested = sums.rested.sum(axis=0)
+    forgotten = (kind == MotionKind.STUCK) | (rested > 0)
+    known = enough & ~forgotten & np.isin(kind, (MotionKind.ORBIT, MotionKind.IRREGULAR))
+    logs = np.stack([sums.growth, sums.determinant - sums.growth], axis=-1)
+
+    def mean_and_error(weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        total = np.where(known, weight.sum(axis=0), 1.0)[:, None]
+        mean = logs.sum(axis=0) / total
+        off = logs - mean * weight[..., None]
+        error = np.sqrt((off**2).sum(axis=0) * _PARTS / (_PARTS - 1)) / total
+        larger = np.argsort(-mean, axis=1)
+        mean, error = (np.take_along_axis(part, larger, axis=1) for part in (mean, error))
+        mean = np.where(known[:, None], mean, np.where(forgotten[:, None], -np.inf, np.nan))
+        return mean, np.where(known[:, None], error, np.where(forgotten[:, None], 0.0, np.nan))
+
+    per_impact, per_us = mean_and_error(sums.impacts), mean_and_error(sums.time_us)
+    determinant = sums.determinant.sum(axis=0) / np.where(known, impacts, 1.0)
+    return Lyapunov(
+        exponents_per_impact=per_impact[0],
+        exponents_per_us=per_us[0],
+        exponents_per_impact_error=per_impact[1],
+        exponents_per_us_error=per_us[1],
+        mean_log_determinant=np.where(known, determinant, np.where(forgotten, -np.inf, np.nan)),
+        impacts=impacts.astype(int),
+        near_grazing=sums.near_grazing.sum(axis=0).astype(int),
+        rested=rested.astype(int),
+        verdicts=verdicts,
+    )
+
+
+def _of_orbits(found: Lyapunov, jacobians: np.ndarray, determinants: np.ndarray, period: np.ndarray) -> Lyapunov:
+    """Return the same with the multipliers' logarithms where the motion has come to an orbit.
+
+    Args:
+        found: the means.
+        jacobians: of the last impacts, (impacts, 4, lanes).
+        determinants: theirs, (impacts, lanes).
+        period: of the drive in us.
+    """
+    verdicts = found.verdicts
+    count = verdicts.impacts
+    lanes = np.flatnonzero((count > 0) & np.isfinite(found.exponents_per_impact[:, 0]))
+    if not lanes.size:
+        return found
+    m = count[lanes]
+    product = np.broadcast_to(np.eye(2), (lanes.size, 2, 2))
+    logarithm = np.zeros(lanes.size)
+    for back in range(int(m.max()), 0, -1):
+        here = m >= back
+        matrix = np.moveaxis(jacobians[-back][:, lanes].reshape(2, 2, -1), -1, 0)
+        product = np.where(here[:, None, None], matrix @ product, product)
+        logarithm += np.where(here, np.log(np.abs(np.where(here, determinants[-back, lanes], 1.0))), 0.0)
+    half, sign = 0.5 * (product[:, 0, 0] + product[:, 1, 1]), np.sign(np.linalg.det(product))
+    inside = half**2 - sign * np.exp(logarithm)
+    # a pair on a circle has the root of the determinant for its size
+    real = inside > 0.0
+    larger = np.where(real, np.log(np.abs(half) + np.sqrt(np.where(real, inside, 0.0)) + 1e-300), 0.5 * logarithm)
+    logs = np.stack([larger, logarithm - larger], axis=1) / m[:, None]
+    per_us = m / (verdicts.periods[lanes] * period[lanes])
+    error = np.repeat(verdicts.remaining[lanes][:, None], 2, axis=1)
+
+    def replaced(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+        old = old.copy()
+        old[lanes] = new
+        return old
+
+    return found._replace(
+        exponents_per_impact=replaced(found.exponents_per_impact, logs),
+        exponents_per_us=replaced(found.exponents_per_us, logs * per_us[:, None]),
+        exponents_per_impact_error=replaced(found.exponents_per_impact_error, error),
+        exponents_per_us_error=replaced(found.exponents_per_us_error, error * per_us[:, None]),
+        mean_log_determinant=replaced(found.mean_log_determinant, logarithm / m),
+    )

@@ -1,0 +1,349 @@
+"""The closing conditions of an orbit of m impacts in N drive periods, all its flights at once, and what it is good for.
+
+Unknowns are the drive phase at which the tip arrives at each impact and the coordinate of that impact (`speeds_at`), in
+which the law is smooth up to capture. Every flight has to end at height and velocity of the next arrival: 2 m smooth
+equations, with no search for a first impact in them, that go on through folds and past a graze. Whether the tip really
+makes those flights is another question, and that of the map: `flies`.
+
+The linearised map of the whole loop is the product of its flights' and impacts' Jacobians.
+"""
+
+from functools import reduce
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene, drive_of
+from afm_jax.apparatus.surface import Surface, surface_of
+from afm_jax.impact.amplitude import FlightEnds, peak_amplitude
+from afm_jax.impact.first_impact import Flight, first_impact
+from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
+from afm_jax.impact.lasting_impact import LawImpact, lasting
+from afm_jax.impact.law import ImpactLaw, Speeds, impact_law_of
+from afm_jax.outcomes import Outcome
+from afm_jax.units import RAD_PER_US_PER_KHZ
+
+SAMPLES_PER_TURN = 32
+"""Heights of a flight that are looked at, for every turn of the faster of drive and tip."""
+_MOST_SAMPLES = 4096
+_RESTING_PERIODS = 1.25
+"""Of a tip that meets nothing: more than one, so that its nearest approach is no end of what is looked at."""
+_EARLY = 1e-7
+"""How far (in drive periods) the first impact found may lie before the orbit's own, by rounding."""
+
+
+class ImpactLoop(NamedTuple):
+    """What an (m, N) orbit is an orbit of: the surface is the one that the free tip sees (`surface_of`)."""
+
+    cantilever: Cantilever
+    surface: Platform | Surface
+    response: Surface | None
+    impact: LawImpact
+    period_us: Float[Array, ""]
+    """N drive periods."""
+    angular_frequency: Float[Array, ""]
+    """Of the drive, in rad/us."""
+
+
+class Impacts(NamedTuple):
+    """The impacts of a loop, each with the flight that follows it; heights and velocities against the resting tip.
+
+    Times and durations in us, speeds in nm/us, heights in nm.
+    """
+
+    arrival_us: Float[Array, " m"]
+    speeds: Speeds
+    leaving_us: Float[Array, " m"]
+    height: Float[Array, " m"]
+    velocity: Float[Array, " m"]
+    duration_us: Float[Array, " m"]
+
+
+def driven_part(scene: Scene) -> str:
+    """Return which part of a scene sets its period: "platform", "base" or "force".
+
+    Raises:
+        TypeError: if the scene's interaction is no impact law.
+        ValueError: if no motion can repeat under its drive; says why.
+    """
+    impact_law_of(scene)
+    drive = drive_of(scene)
+    if drive.aperiodic is not None:
+        raise ValueError(f"there are no periodic orbits: {drive.aperiodic}")
+    parts = {"base": scene.base, "force": scene.force}
+    moving = [name for name, part in parts.items() if part is not None and any(float(t.amplitude) for t in part.tones)]
+    return "platform" if float(scene.platform.amplitude_nm) or not moving else moving[0]
+
+
+def loop_of(scene: Scene, order: Float[Array, ""], driven: str) -> ImpactLoop:
+    """Return what (m, N) orbits of a scene close.
+
+    Args:
+        scene: its interaction is an `ImpactLaw`; its numbers may be traced.
+        order: N.
+        driven: the part that sets the period (`driven_part`).
+    """
+    omega = RAD_PER_US_PER_KHZ * getattr(scene, driven).frequency_khz
+    surface, response = surface_of(scene)
+    impact = LawImpact(impact_law_of(scene))
+    return ImpactLoop(scene.cantilever, surface, response, impact, 2.0 * jnp.pi * order / omega, omega)
+
+
+def samples_for(scene: Scene, order: int, driven: str) -> int:
+    """Return how many heights of every flight of an orbit of an order are looked at: a power of 2."""
+    ratio = float(scene.cantilever.frequency_khz) / float(getattr(scene, driven).frequency_khz)
+    wanted, samples = SAMPLES_PER_TURN * order * max(1.0, ratio), 64
+    while samples < wanted and samples < _MOST_SAMPLES:
+        samples *= 2
+    return samples
+
+
+def coordinate_of(approach_speed: Float[Array, "..."], law: ImpactLaw) -> Float[Array, "..."]:
+    """Return the coordinate Y of `speeds_at` of an impact that comes at a speed in nm/us above capture."""
+    square = law.epsilon + (law.viscous_loss / (2.0 * law.r)) ** 2
+    rebound = law.rebound_speed(approach_speed)
+    return rebound + jnp.sqrt(jnp.maximum(rebound**2 + square, 1e-300))
+
+
+def impacts_at(unknowns: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoop) -> Impacts:
+    """Return the impacts that unknowns stand for: m phases in rad, m coordinates over a scale in nm/us."""
+    count = unknowns.shape[0] // 2
+    omega, impact, surface = loop.angular_frequency, loop.impact, loop.surface
+    arrival = unknowns[:count] / omega
+
+    def speeds_of(time, coordinate):
+        free = impact.speeds(coordinate)
+        return lasting(free, impact, time, loop.cantilever, surface) if impact.lasts else free
+
+    speeds = jax.vmap(speeds_of)(arrival, scale * unknowns[count:])
+    leaving = arrival + speeds.delay
+    height, velocity = surface.position_and_velocity(leaving)
+    following = jnp.append(arrival[1:], arrival[:1] + loop.period_us)
+    return Impacts(arrival, speeds, leaving, height, velocity + speeds.rebound, following - leaving)
+
+
+def closing_gaps(unknowns: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoop) -> Float[Array, " n"]:
+    """Return by how much every flight misses the next arrival: heights by Omega/scale, velocities by 1/scale."""
+    if unknowns.shape[0] == 0:
+        return unknowns
+    impacts = impacts_at(unknowns, scale, loop)
+    height, velocity = loop.surface.position_and_velocity(impacts.arrival_us)
+    position, speed = loop.cantilever.propagator(impacts.duration_us)(impacts.height, impacts.velocity)
+    omega = loop.cantilever.angular_frequency
+    missed = position - jnp.roll(height, -1)
+    slower = speed - jnp.roll(velocity - impacts.speeds.approach, -1)
+    return jnp.concatenate([omega * missed, slower]) / scale
+
+
+def trace_and_determinant_of(
+    unknowns: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoop
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return T and D of the linearised map of a closed loop; of the free motion where there is no impact in it."""
+    cantilever, surface = loop.cantilever, loop.surface
+    if unknowns.shape[0] == 0:
+        p = cantilever.propagator(loop.period_us)
+        return p.position_per_position + p.velocity_per_velocity, jnp.exp(-2.0 * cantilever.decay_rate * loop.period_us)
+    impacts = impacts_at(unknowns, scale, loop)
+
+    def one(leaving, velocity, duration, before):
+        arrival = leaving + duration
+        contact = contact_jacobian(loop.impact, cantilever, surface, arrival, before)
+        return contact @ flight_jacobian(cantilever, surface, leaving, velocity, arrival)
+
+    before = surface.velocity(impacts.arrival_us) - impacts.speeds.approach
+    parts = jax.vmap(one)(impacts.leaving_us, impacts.velocity, impacts.duration_us, jnp.roll(before, -1))
+    whole = reduce(lambda product, part: part @ product, list(parts))
+    # the determinant as a product of those of the parts: that of the whole cancels
+    each = parts[:, 0, 0] * parts[:, 1, 1] - parts[:, 0, 1] * parts[:, 1, 0]
+    return whole[0, 0] + whole[1, 1], jnp.prod(each)
+
+
+class NearestApproach(NamedTuple):
+    """Where a loop's flights come closest to the surface between impacts."""
+
+    gap_nm: Float[Array, ""]
+    """Negative where a flight would pass through it; infinite where no flight has a lowest point."""
+    flight: Float[Array, ""]
+    """Number of the flight, a whole number."""
+
+
+def nearest_approach(
+    unknowns: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoop, samples: int
+) -> NearestApproach:
+    """Return the lowest point of a loop's flights above the surface, differentiable.
+
+    Args:
+        unknowns: of `impacts_at`; the loop is closed.
+        scale: of the same.
+        loop: whose.
+        samples: heights looked at in every flight; the lowest of them is improved by Newton's method.
+    """
+    if unknowns.shape[0] == 0:
+        zero = jnp.zeros((1,))
+        begin, first = zero, zero
+        height, velocity, lasts = zero, zero, _RESTING_PERIODS * loop.period_us[None]
+    else:
+        impacts = impacts_at(unknowns, scale, loop)
+        begin, height, velocity, lasts = impacts.leaving_us, impacts.height, impacts.velocity, impacts.duration_us
+        # a flight counts from max(t_in, t_out) on
+        first = jnp.maximum(-impacts.speeds.delay, 0.0)
+
+    def motion(start, height, velocity, after):
+        position, speed = loop.cantilever.propagator(after)(height, velocity)
+        level, rate = loop.surface.position_and_velocity(start + after)
+        bend = loop.cantilever.acceleration(position, speed) - loop.surface.acceleration(start + after)
+        return position - level, speed - rate, bend
+
+    step = (lasts - first) / samples
+    after = first[:, None] + step[:, None] * jnp.arange(samples + 1.0)
+    gap, _, _ = motion(begin[:, None], height[:, None], velocity[:, None], after)
+    left, middle, right = gap[:, :-2], gap[:, 1:-1], gap[:, 2:]
+    lowest = (middle <= left) & (middle <= right)
+    bend = right - 2.0 * middle + left
+    vertex = middle - (right - left) ** 2 / (8.0 * jnp.where(bend > 0.0, bend, 1.0))
+    place = jnp.argmin(jnp.where(lowest, vertex, jnp.inf))
+    flight, sample = place // (samples - 1), place % (samples - 1) + 1
+    start = begin[flight], height[flight], velocity[flight]
+    guess, width = lax.stop_gradient((after[flight, sample], step[flight]))
+
+    def improve(_, time):
+        _, slope, bend = motion(*lax.stop_gradient(start), time)
+        move = -slope / jnp.where(bend > 0.0, bend, jnp.inf)
+        return jnp.clip(time + move, guess - width, guess + width)
+
+    # its own change counts nothing, because the gap is lowest there
+    found, _, _ = motion(*start, lax.stop_gradient(lax.fori_loop(0, 6, improve, guess)))
+    return NearestApproach(jnp.where(lowest.any(), found, jnp.inf), flight.astype(found.dtype))
+
+
+def flies(unknowns: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoop) -> Bool[Array, ""]:
+    """Say whether every flight of a closed loop is one of the map: its first impact is the loop's next one."""
+    if unknowns.shape[0] == 0:
+        return -loop.surface.offset_nm >= loop.surface.reach_nm
+    impacts = impacts_at(unknowns, scale, loop)
+    drive_us = 2.0 * jnp.pi / loop.angular_frequency
+
+    def one(leaving, velocity, duration, rebound, delay):
+        flight = Flight(loop.cantilever, loop.surface, leaving, velocity)
+        skip = jnp.maximum(-delay, 0.0) if loop.impact.delayed else None
+        first = first_impact(flight, skip_us=skip)
+        hit = (first.outcome == Outcome.IMPACT) & (first.duration_us >= duration - _EARLY * drive_us)
+        # rounding can lift the end of the flight off the surface where the impact is a graze
+        clear = hit | (first.outcome == Outcome.NO_FURTHER_IMPACT)
+        return (rebound > 0.0) & (duration > 0.0) & clear
+
+    speeds = impacts.speeds
+    free = jax.vmap(one)(impacts.leaving_us, impacts.velocity, impacts.duration_us, speeds.rebound, speeds.delay)
+    return jnp.all(free) & jnp.all(speeds.approach > 0.0)
+
+
+def highest_point(unknowns: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoop, samples: int) -> Array:
+    """Return the largest height of the tip above its rest position, in nm."""
+    if unknowns.shape[0] == 0:
+        return jnp.zeros(()) if loop.response is None else _highest_of(loop, None, samples)
+    impacts = impacts_at(unknowns, scale, loop)
+    if loop.response is not None:
+        return _highest_of(loop, impacts, samples)
+    end, speed = loop.cantilever.propagator(impacts.duration_us)(impacts.height, impacts.velocity)
+    flights = FlightEnds(impacts.leaving_us, impacts.duration_us, impacts.height, impacts.velocity, end, speed)
+    return jnp.max(jax.vmap(lambda flight: peak_amplitude(loop.cantilever, flight))(flights))
+
+
+def _highest_of(loop: ImpactLoop, impacts: Impacts | None, samples: int) -> Float[Array, ""]:
+    """Return the same where other drives move the tip besides: no closed form, the highest sample improved."""
+    assert loop.response is not None  # noqa: S101
+    response, zero = loop.response, jnp.zeros((1,))
+    flights = (
+        (zero, zero, zero, loop.period_us[None])
+        if impacts is None
+        else (impacts.leaving_us, impacts.height, impacts.velocity, impacts.duration_us)
+    )
+
+    def height(start, rest, velocity, after):
+        position, _ = loop.cantilever.propagator(after)(rest, velocity)
+        return position + response.position(start + after)
+
+    begin, rest, velocity, lasts = flights
+    after = (lasts / samples)[:, None] * jnp.arange(samples + 1.0)
+    seen = height(begin[:, None], rest[:, None], velocity[:, None], after)
+    place = jnp.argmax(seen)
+    flight = place // (samples + 1)
+    own = begin[flight], rest[flight], velocity[flight]
+    rate = jax.grad(lambda time: height(*own, time))
+
+    def improve(_, time):
+        bend = jax.grad(rate)(time)
+        return jnp.clip(time - rate(time) / jnp.where(bend < 0.0, bend, -jnp.inf), 0.0, lasts[flight])
+
+    return height(*own, lax.stop_gradient(lax.fori_loop(0, 4, improve, after.reshape(-1)[place])))
+
+
+class LoopReading(eqx.Module):
+    """What there is to know of a closed loop; the first six have a number for each impact.
+
+    Attributes:
+        phase_rad: drive phase just after each impact, in [0, 2 pi).
+        velocity_after_nm_per_us: tip velocity in the lab just after.
+        velocity_before_nm_per_us: just before.
+        approach_speed_nm_per_us: relative to the surface.
+        rebound_speed_nm_per_us: likewise.
+        delay_us: collision delay.
+        peak_amplitude_nm: largest height above the rest position.
+        trace: T of the linearised map.
+        determinant: D of it.
+        admissible: every flight is one of the map.
+        missing: by how much the loop does not close, of its speeds.
+    """
+
+    phase_rad: Float[Array, "*loops m"]
+    velocity_after_nm_per_us: Float[Array, "*loops m"]
+    velocity_before_nm_per_us: Float[Array, "*loops m"]
+    approach_speed_nm_per_us: Float[Array, "*loops m"]
+    rebound_speed_nm_per_us: Float[Array, "*loops m"]
+    delay_us: Float[Array, "*loops m"]
+    peak_amplitude_nm: Float[Array, "*loops"]
+    trace: Float[Array, "*loops"]
+    determinant: Float[Array, "*loops"]
+    admissible: Bool[Array, "*loops"]
+    missing: Float[Array, "*loops"]
+
+
+def reading_of(unknowns: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoop, samples: int) -> LoopReading:
+    """Return what there is to know of a closed loop.
+
+    Args:
+        unknowns: of `impacts_at`.
+        scale: of the same.
+        loop: whose.
+        samples: of `nearest_approach`.
+    """
+    trace, determinant = trace_and_determinant_of(unknowns, scale, loop)
+    impacts = impacts_at(unknowns, scale, loop) if unknowns.shape[0] else None
+    none = jnp.zeros((0,))
+    moves, before, phase = none, none, none
+    if impacts is not None:
+        phase = (impacts.leaving_us * loop.angular_frequency) % (2.0 * jnp.pi)
+        moves, before = impacts.velocity, loop.surface.velocity(impacts.arrival_us) - impacts.speeds.approach
+        if loop.response is not None:
+            moves = moves + loop.response.velocity(impacts.leaving_us)
+            before = before + loop.response.velocity(impacts.arrival_us)
+    gaps = closing_gaps(unknowns, scale, loop)
+    return LoopReading(
+        phase_rad=phase,
+        velocity_after_nm_per_us=moves,
+        velocity_before_nm_per_us=before,
+        approach_speed_nm_per_us=none if impacts is None else impacts.speeds.approach,
+        rebound_speed_nm_per_us=none if impacts is None else impacts.speeds.rebound,
+        delay_us=none if impacts is None else impacts.speeds.delay,
+        peak_amplitude_nm=highest_point(unknowns, scale, loop, samples),
+        trace=trace,
+        determinant=determinant,
+        admissible=flies(unknowns, scale, loop),
+        missing=jnp.max(jnp.abs(gaps), initial=0.0),
+    )

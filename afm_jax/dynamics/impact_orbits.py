@@ -1,0 +1,337 @@
+"""Orbits of m impacts in N drive periods: found from many starts, told apart, polished; orbits with a rest likewise.
+
+Starts are flown through the map; every window of m of their impacts that takes about N periods is a first guess, and
+Newton's method closes the whole loop (`impact_loop`). What is left are loops that the map flies, each once.
+
+Without adhesion and delay a tip can come to rest on the surface by infinitely many impacts. Where it is let go again
+depends on the surface alone, so that one flight from there tells whether it comes to rest again: then it repeats.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Complex, Float
+
+from afm_jax.apparatus.scene import Scene, drive_of
+from afm_jax.apparatus.surface import surface_of
+from afm_jax.checks import require_float64
+from afm_jax.dynamics.impact_loop import (
+    ImpactLoop,
+    LoopReading,
+    closing_gaps,
+    coordinate_of,
+    driven_part,
+    loop_of,
+    reading_of,
+    samples_for,
+)
+from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, Flight
+from afm_jax.impact.law import impact_law_of
+from afm_jax.impact.map import impact_after
+from afm_jax.motion.law_motion import Bed, first_release, take_off
+from afm_jax.motion.observe import peaks_of_flights
+from afm_jax.motion.record import ContactKind, to_lab
+from afm_jax.motion.simulate import simulate
+from afm_jax.outcomes import Outcome
+
+DEFAULT_STARTS = 512
+MOST_IMPACTS = 64
+"""m: the linear system that closes a loop has twice as many unknowns."""
+_WINDOWS = (0, 1, 2, 4, 8, 16, 48)
+"""Impacts after a start at which a window may begin."""
+_NEWTON_STEPS = 30
+_TURN = 0.5
+"""Longest step of Newton's method in a phase, rad."""
+_SHARE = 0.7
+"""Longest step towards capture, of the distance from it."""
+_CLOSED = 1e-11
+"""Largest distance from closing, of the loop's speeds: 1e-12, and what heights of many periods lose by rounding."""
+_GRAZES = 1e-8
+"""Coordinate above capture, over the drive's speed, up to which an impact is none."""
+_SAME = 1e-7
+"""Relative distance below which two loops are one."""
+_FASTEST = 100.0
+"""Of the speeds that starts have, over the drive's."""
+_STEPS = 2000
+_MOST_RESTS = 32
+
+
+class ManyImpactOrbits(NamedTuple):
+    """Orbits of m impacts in N drive periods, by falling peak amplitude; NumPy arrays.
+
+    The first impact is the hardest one, the others follow in time. Orbits that only repeat one with fewer impacts are
+    left out.
+
+    Attributes:
+        loops: drive phases at the arrivals in rad, ascending, then coordinates in nm/us (`speeds_at`).
+        reading: what there is to know of each, a `LoopReading`; all are admissible.
+        multipliers: eigenvalues of the linearised map, the larger first.
+        stable: both lie inside the unit circle.
+    """
+
+    loops: Float[np.ndarray, "orbits n"]
+    reading: LoopReading
+    multipliers: Complex[np.ndarray, "orbits 2"]
+    stable: Bool[np.ndarray, " orbits"]
+
+
+def multipliers_of(
+    trace: Float[np.ndarray, "*orbits"], determinant: Float[np.ndarray, "*orbits"]
+) -> Complex[np.ndarray, "*orbits 2"]:
+    """Return the two eigenvalues of a 2 x 2 map, the larger modulus first, shape (..., 2)."""
+    half = 0.5 * np.asarray(trace, float)
+    determinant = np.asarray(determinant, float)
+    root = np.sqrt(half * half - determinant + 0j)
+    large = half + np.where(half < 0.0, -1.0, 1.0) * root
+    # the smaller one from the product: as a difference it cancels
+    small = np.where(np.imag(root) != 0.0, np.conj(large), determinant / np.where(large == 0.0, 1.0, large))
+    return np.stack([large, small], axis=-1)
+
+
+def is_stable(multipliers: Complex[np.ndarray, "*orbits 2"]) -> Bool[np.ndarray, "*orbits"]:
+    """Say whether multipliers, the larger first, lie inside the unit circle."""
+    return np.asarray(np.abs(multipliers[..., 0]) < 1.0)
+
+
+def many_impact_orbits(scene: Scene, order: int, impacts: int, *, starts: int = DEFAULT_STARTS) -> ManyImpactOrbits:
+    """Return the orbits of m impacts in N drive periods that a search from many starts finds.
+
+    Args:
+        scene: one scene with an `ImpactLaw`, driven with one period.
+        order: N, drive periods until the motion repeats.
+        impacts: m, impacts in them.
+        starts: how many flights the search begins with; more find more of the unstable orbits of a chaotic scene.
+
+    Returns:
+        The orbits, closed to 1e-11 of their speeds or better. Stable ones are found surely enough; of unstable ones
+        those near which some start comes.
+
+    Raises:
+        RuntimeError: if JAX is not set to 64-bit floats.
+        TypeError: if the scene's interaction is not an impact law.
+        ValueError: if order or impacts is no positive integer, there are more impacts than 64, or the drive does not
+            repeat.
+    """
+    require_float64(scene)
+    driven = driven_part(scene)
+    for name, value, most in (("order", order, 1_000_000), ("impacts", impacts, MOST_IMPACTS)):
+        if int(value) != value or not 1 <= value <= most:
+            raise ValueError(f"`{name}` must be a positive integer up to {most}, but is {value}")
+    number = jnp.asarray(float(order))
+    found, scale, good = _search(scene, number, _starts(starts), impacts=int(impacts), driven=driven)
+    loops = _told_apart(np.asarray(found)[np.asarray(good)], order)
+    size = max(16, 1 << max(len(loops) - 1, 0).bit_length())
+    padded = np.concatenate([loops, np.zeros((size - len(loops), 2 * impacts))])
+    reading = read_loops(
+        scene, number, jnp.asarray(padded), scale, driven=driven, samples=samples_for(scene, order, driven)
+    )
+    reading = jax.tree.map(lambda leaf: np.asarray(leaf)[: len(loops)], reading)
+    keep = reading.admissible & (reading.missing < _CLOSED)
+    rank = np.argsort(-reading.peak_amplitude_nm, kind="stable")
+    chosen = rank[keep[rank]]
+    reading = jax.tree.map(lambda leaf: leaf[chosen], reading)
+    absolute = loops[chosen] * np.repeat([1.0, float(scale)], impacts)
+    multipliers = multipliers_of(reading.trace, reading.determinant)
+    return ManyImpactOrbits(absolute, reading, multipliers, is_stable(multipliers))
+
+
+@partial(jax.jit, static_argnames=("driven", "samples"))
+def read_loops(
+    scene: Scene, order: Float[Array, ""], loops: Float[Array, "loops n"], scale: Array, *, driven: str, samples: int
+) -> LoopReading:
+    """Return what there is to know of loops of one scene (`reading_of`)."""
+    loop = loop_of(scene, order, driven)
+    return jax.vmap(lambda unknowns: reading_of(unknowns, scale, loop, samples))(loops)
+
+
+def _starts(number: int) -> Float[Array, "starts 2"]:
+    """Return phases and logarithms of speeds, both as shares of their range, that fill the square evenly."""
+    # additive recurrence of the plastic number: no two coordinates line up
+    steps = np.array([0.7548776662466927, 0.5698402909980532])
+    return jnp.asarray((0.5 + np.arange(1, number + 1)[:, None] * steps) % 1.0)
+
+
+@partial(jax.jit, static_argnames=("impacts", "driven"))
+def _search(scene: Scene, order: Array, starts: Array, *, impacts: int, driven: str):
+    """Return loops, the scale of their coordinates, and which of them close."""
+    loop = loop_of(scene, order, driven)
+    top_speed = loop.surface.top_speed_nm_per_us
+    seen = eqx.tree_at(lambda parts: parts.platform, scene, loop.surface)
+    phases, speeds = _walks(seen, loop, starts, _WINDOWS[-1] + impacts + 1)
+    guesses, misfit = [], []
+    for begin in _WINDOWS:
+        phase, speed = phases[:, begin : begin + impacts + 1], speeds[:, begin : begin + impacts + 1]
+        turns = (phase[:, -1] - phase[:, 0]) / (2.0 * jnp.pi) - order
+        change = (speed[:, -1] - speed[:, 0]) / (speed[:, -1] + speed[:, 0])
+        misfit.append(jnp.abs(turns) + jnp.abs(change))
+        coordinates = coordinate_of(speed[:, :-1], loop.impact.law)
+        guesses.append(jnp.concatenate([phase[:, :-1], coordinates / top_speed], axis=1))
+    guesses, misfit = jnp.concatenate(guesses), jnp.concatenate(misfit)
+    near = jnp.argsort(jnp.where(jnp.isfinite(misfit), misfit, jnp.inf))[: starts.shape[0]]
+    usable = jnp.isfinite(misfit[near])
+    guesses = jnp.where(usable[:, None], guesses[near], 1.0)
+    found = jax.vmap(lambda guess: closed_loop(guess, top_speed, loop))(guesses)
+    missing = jax.vmap(lambda unknowns: jnp.max(jnp.abs(closing_gaps(unknowns, top_speed, loop))))(found)
+    # a free motion that touches the surface is no orbit of impacts
+    leaves = jnp.min(found[:, impacts:], axis=1) > loop.impact.lowest / top_speed + _GRAZES
+    return found, top_speed, usable & (missing < _CLOSED) & leaves
+
+
+def _walks(seen: Scene, loop: ImpactLoop, starts: Array, length: int) -> tuple[Array, Array]:
+    """Return arrival phases in rad and approach speeds in nm/us of starts through the map; NaN where it ends."""
+    top_speed = loop.surface.top_speed_nm_per_us
+    tolerance = jnp.asarray(DEFAULT_ROOT_TOLERANCE_US)
+
+    def one(start):
+        time = start[0] * 2.0 * jnp.pi / loop.angular_frequency
+        velocity = loop.surface.velocity(time) + top_speed * 0.03 * (_FASTEST / 0.03) ** start[1]
+
+        def step(state, _):
+            flying, time, velocity = state
+            resting = loop.surface.velocity(time) - 1.0
+            flight = Flight(loop.cantilever, loop.surface, time, jnp.where(flying, velocity, resting))
+            impact = impact_after(seen, flight, tolerance, max_steps=_STEPS)
+            goes_on = flying & (impact.outcome == Outcome.IMPACT)
+            arrival = jnp.where(goes_on, impact.arrival_time_us, time)
+            approach = loop.surface.velocity(arrival) - impact.velocity_before_nm_per_us
+            row = jnp.where(goes_on, jnp.stack([arrival * loop.angular_frequency, approach]), jnp.nan)
+            after = jnp.where(goes_on, impact.velocity_after_nm_per_us, velocity)
+            return (goes_on, jnp.where(goes_on, impact.time_us, time), after), row
+
+        flying = jnp.ones((), bool)
+        return lax.scan(step, (flying, time, velocity), length=length)[1]
+
+    rows = jax.vmap(one)(starts)
+    return rows[:, :, 0], rows[:, :, 1]
+
+
+def closed_loop(guess: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoop) -> Float[Array, " n"]:
+    """Return the loop that Newton's method finds from a guess; whether it closes is for the caller to see."""
+    count = guess.shape[0] // 2
+    lowest = loop.impact.lowest / scale
+
+    def improve(_, unknowns):
+        value, slopes = closing_gaps(unknowns, scale, loop), jax.jacfwd(closing_gaps)(unknowns, scale, loop)
+        step = -jnp.linalg.solve(slopes, value)
+        nearer = -_SHARE * (unknowns[count:] - lowest)
+        turn = jnp.clip(step[:count], -_TURN, _TURN)
+        moved = unknowns + jnp.concatenate([turn, jnp.maximum(step[count:], nearer)])
+        return jnp.where(jnp.isfinite(moved).all(), moved, unknowns)
+
+    return lax.fori_loop(0, _NEWTON_STEPS, improve, guess)
+
+
+def _told_apart(loops: Float[np.ndarray, "found n"], order: int) -> Float[np.ndarray, "loops n"]:
+    """Return each loop once, its hardest impact first; without those that repeat a shorter one."""
+    count = loops.shape[1] // 2
+    kept: dict[tuple[int, ...], list[np.ndarray]] = {}
+    result = []
+    for unknowns in loops:
+        phases, sizes = unknowns[:count], unknowns[count:]
+        if np.any(np.diff(phases) <= 0.0) or phases[-1] - phases[0] >= 2.0 * np.pi * order:
+            continue
+        first = int(np.argmax(np.round(sizes / sizes.max(), 7)))
+        turned = np.concatenate([phases[first:], phases[:first] + 2.0 * np.pi * order])
+        turned -= 2.0 * np.pi * np.floor(turned[0] / (2.0 * np.pi))
+        own = np.stack([np.cos(turned), np.sin(turned), np.roll(sizes, -first) / sizes.max()])
+        if _repeats(own):
+            continue
+        # neighbours of a rounded number may be rounded apart: both are looked up
+        invariant = np.array([own.sum(), sizes.sum() / sizes.max()])
+        keys = {tuple(int(part) for part in np.floor(invariant * 1e4 + shift)) for shift in (0.0, 0.5)}
+        others = [other for key in keys for other in kept.get(key, [])]
+        if any(_is_a_turn_of(own, other) for other in others):
+            continue
+        for key in keys:
+            kept.setdefault(key, []).append(own)
+        result.append(np.concatenate([turned, np.roll(sizes, -first)]))
+    return np.array(result).reshape(-1, 2 * count)
+
+
+def _repeats(own: np.ndarray) -> bool:
+    """Say whether a loop comes back to its state after fewer impacts than it has."""
+    count = own.shape[1]
+    return any(count % part == 0 and np.abs(own - np.roll(own, part, axis=1)).max() < _SAME for part in range(1, count))
+
+
+def _is_a_turn_of(own: np.ndarray, other: np.ndarray) -> bool:
+    return any(np.abs(np.roll(own, turn, axis=1) - other).max() < _SAME for turn in range(own.shape[1]))
+
+
+class StickingOrbit(NamedTuple):
+    """A motion that repeats with a rest on the surface in it: infinitely many ever smaller impacts, rest, release.
+
+    A small disturbance is forgotten in the rest: both multipliers are 0, and it is stable.
+    """
+
+    order: int
+    """N, drive periods until the motion repeats."""
+    rests: int
+    """Rests in them."""
+    release_phase_rad: float
+    """Drive phase at which the surface lets the tip go; of the first rest."""
+    rest_us: float
+    """From the last impact followed to the release, in a response period."""
+    impacts: int
+    """Impacts followed one by one; those summed up as chatter not counted."""
+    peak_amplitude_nm: float
+
+
+def sticking_orbit(scene: Scene, *, longest: int = 64) -> StickingOrbit | str:
+    """Return the orbit with a rest that a tip at rest ends up on, or a sentence on why there is none.
+
+    Args:
+        scene: one scene with an `ImpactLaw`, driven with one period.
+        longest: drive periods after which a flight that has not come to rest counts as one that never does.
+
+    Raises:
+        RuntimeError: if JAX is not set to 64-bit floats.
+        TypeError: if the scene's interaction is not an impact law.
+        ValueError: if the drive does not repeat.
+    """
+    require_float64(scene)
+    driven_part(scene)
+    law, period = impact_law_of(scene), drive_of(scene).period_us
+    if float(law.epsilon) > 0.0 or law.delay is not None:
+        return "with adhesion or a delay a tip that comes to rest stays"
+    surface, response = surface_of(scene)
+    bed = Bed(scene.cantilever, surface)
+    times = period * jnp.arange(256.0) / 256.0
+    push = np.asarray(jax.vmap(bed.push)(times))
+    if push.min() >= 0.0 or push.max() <= 0.0:
+        return f"the surface {'never lets go' if push.min() >= 0.0 else 'never presses'} a tip that rests on it"
+    release = float(first_release(bed, times[int(np.argmax(push))], times[-1] + 2.0 * period).time_us)
+    first, resting, impacts, peak = release, 0.0, 0, -np.inf
+    for rests in range(1, _MOST_RESTS + 1):
+        until = jnp.asarray(release + longest * period)
+        leg = take_off(bed, jnp.asarray(release), until)
+        gap_rate = leg[2] - surface.velocity(leg[0])
+        start = to_lab(surface, response, leg[0], leg[1], gap_rate)
+        rows = simulate(scene, start, longest * period).contacts
+        kind, arrival, rebound = (
+            np.asarray(p) for p in (rows.kind, rows.arrival_time_us, rows.rebound_speed_nm_per_us)
+        )
+        departed = rows.departure_time_us, rows.departure_position_nm, rows.departure_velocity_nm_per_us
+        rested = np.flatnonzero((kind == ContactKind.CHATTER) | ((kind == ContactKind.IMPACT) & (rebound == 0.0)))
+        if not rested.size:
+            return f"a tip that is let go does not come to rest again within {longest} drive periods"
+        row = int(rested[0])
+        again = float(departed[0][row])
+        impacts += row
+        resting += again - float(arrival[row])
+        lands = slice(0, row + 1)
+        begins = [
+            np.append(np.asarray(part), np.asarray(column)[:row]) for part, column in zip(start, departed, strict=True)
+        ]
+        peak = max(peak, float(peaks_of_flights(scene, *begins, arrival[lands]).max()))
+        apart = (again - first) / period
+        if abs(apart - round(apart)) < 1e-6:
+            omega = drive_of(scene).angular_frequency
+            return StickingOrbit(round(apart), rests, first * omega % (2.0 * np.pi), resting, impacts, peak)
+        release = again
+    return f"a tip that is let go does not repeat itself within {_MOST_RESTS} rests"

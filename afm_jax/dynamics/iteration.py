@@ -1,0 +1,351 @@
+"""Many tips iterated by the impact map at once: the engine behind exponents, bifurcation diagrams and basins.
+
+Lanes run in blocks that fit the processor's cache, two threads take one block after the other, and lanes whose motion
+has ended drop out between calls. A block is written as arrays, not as a `vmap` of one tip: what only a resting tip
+needs (chatter summed up, the ride, the release) is computed in the steps in which a tip of the block rests, and no
+others. Times count within the drive's period, so that long motions keep the digits of their phase.
+"""
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from afm_jax.apparatus.scene import Scene, require_sample_drive
+from afm_jax.checks import require_float64
+from afm_jax.contact.collide import capture_speed
+from afm_jax.contact.contact import Contact
+from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, Flight
+from afm_jax.impact.law import impact_law_of
+from afm_jax.impact.map import NextImpact, impact_after
+from afm_jax.motion.law_motion import CONSTANT_PUSH, Bed, through_impact
+from afm_jax.motion.record import ContactKind, State
+from afm_jax.motion.start import default_start
+from afm_jax.outcomes import Outcome
+
+LANES = 512
+"""Tips of a block; from 300 to 1000 differ little."""
+_WIDTHS = (1, 16, 128, LANES)
+"""Sizes of blocks: few, so that few programs are compiled."""
+MAX_STEPS = 2000
+"""Steps of the search for one impact."""
+_QUICK_STEPS = 14
+"""Steps that all tips of a block take together; those that need more go on among themselves."""
+_RIDE_PERIODS = 1.1
+"""Drive periods within which a resting tip is let go, or never: its push repeats every one."""
+
+
+_FEW = 16
+"""Tips of a block whose rest, or long search, is computed together."""
+_Leaving = tuple[Array, Array, Array]
+"""Time in us, gap in nm, velocity in nm/us."""
+
+
+class Tips(NamedTuple):
+    """Tips at the beginning of a flight each, arrays of one lane a tip."""
+
+    time_us: Float[Any, " lanes"]
+    """Within the first drive period."""
+    periods: Float[Any, " lanes"]
+    """Whole drive periods gone before."""
+    gap_nm: Float[Any, " lanes"]
+    """0 just after an impact, next to nothing after a release."""
+    velocity_nm_per_us: Float[Any, " lanes"]
+    """In the lab."""
+    outcome: Int[Any, " lanes"]
+    """An `Outcome`: IMPACT while the motion goes on, else how it ended."""
+
+
+class Step(NamedTuple):
+    """One step of the map, arrays of one lane a tip; numbers without meaning where a tip had ended before."""
+
+    start: Tips
+    impact: NextImpact
+    """Times count from the same period as the start's."""
+    rested: Bool[Array, " lanes"]
+    """The tip came to rest on the platform, by a capture or by chatter."""
+    end: Tips
+
+
+def advance(scenes: Scene, tips: Tips) -> Step:
+    """Return the next impacts of a block of tips, and where their flights after them begin.
+
+    Args:
+        scenes: a batch of scenes, every number of one lane a tip.
+        tips: where they are.
+    """
+    going = tips.outcome == Outcome.IMPACT
+    impact = jax.vmap(partial(_one_impact, max_steps=_QUICK_STEPS))(scenes, tips)
+    slow = going & (impact.outcome == Outcome.STEP_LIMIT)
+    impact = _for_few(partial(_one_impact, max_steps=MAX_STEPS), slow, (scenes, tips), impact)
+    captured = going & (impact.outcome == Outcome.CAPTURED)
+    landed = captured | (going & (impact.outcome == Outcome.IMPACT))
+    surface = scenes.platform
+    rebound = impact.velocity_after_nm_per_us - surface.velocity(impact.time_us)
+    leaving = (impact.time_us, jnp.zeros_like(rebound), impact.velocity_after_nm_per_us)
+    no = jnp.zeros_like(going)
+    # without adhesion alone a tip that came to rest may leave again, and chatter comes to an end
+    law = impact_law_of(scenes)
+    may_rest = landed & (law.epsilon == 0.0) & (captured | (rebound < jax.vmap(_slowest_chatter)(scenes)))
+
+    (time, gap, velocity), rested, held = _for_few(_rest, may_rest, (scenes, impact), (leaving, no, no))
+    stuck = (captured & (law.epsilon > 0.0)) | held
+    goes_on = landed & ~stuck
+    outcome = jnp.where(goes_on, Outcome.IMPACT, jnp.where(stuck, Outcome.CAPTURED, impact.outcome))
+    whole = jnp.floor(jnp.where(goes_on, time, 0.0) / surface.period_us)
+    end = Tips(
+        time_us=jnp.where(goes_on, time - whole * surface.period_us, tips.time_us),
+        periods=tips.periods + whole,
+        gap_nm=jnp.where(goes_on, gap, 0.0),
+        velocity_nm_per_us=jnp.where(goes_on, velocity, tips.velocity_nm_per_us),
+        outcome=jnp.where(going, outcome, tips.outcome).astype(tips.outcome.dtype),
+    )
+    return Step(tips, impact, rested, end)
+
+
+def _one_impact(scene: Scene, tip: Tips, *, max_steps: int) -> NextImpact:
+    # a tip whose motion has ended does not leave the platform, so that its search ends at once
+    velocity = jnp.where(tip.outcome == Outcome.IMPACT, tip.velocity_nm_per_us, -jnp.inf)
+    flight = Flight(scene.cantilever, scene.platform, tip.time_us, velocity, tip.gap_nm)
+    tolerance = jnp.asarray(DEFAULT_ROOT_TOLERANCE_US, velocity.dtype)
+    return impact_after(scene, flight, tolerance, max_steps=max_steps)
+
+
+def _slowest_chatter(scene: Scene) -> Float[Array, ""]:
+    """Return a bound in nm/us of the rebound speeds from which on impacts may be summed up (`law_motion.chatter`)."""
+    surface, bed = scene.platform, Bed(scene.cantilever, scene.platform)
+    omega, decay = scene.cantilever.angular_frequency, scene.cantilever.decay_rate
+    reach = jnp.abs(surface.offset_nm) + surface.amplitude_nm
+    push = surface.largest_acceleration_nm_per_us2 + 2.0 * decay * surface.top_speed_nm_per_us + omega**2 * reach
+    return 0.5 * CONSTANT_PUSH * push * (1.0 - impact_law_of(scene).r) / bed.fastest
+
+
+def _for_few(work: Callable[..., Any], needed: Bool[Array, " lanes"], arguments: tuple[Any, ...], results: Any) -> Any:
+    """Return results with those of work on the lanes that need it: gathered, few at a time, so that no others wait.
+
+    Args:
+        work: of one lane.
+        needed: which lanes.
+        arguments: of the work, arrays of all lanes.
+        results: of all lanes before.
+    """
+    lanes = needed.shape[0]
+
+    def some(state):
+        left, found = state
+        chosen = jnp.nonzero(left, size=min(_FEW, lanes), fill_value=lanes)[0]
+        # what is filled up is a copy of the last lane, computed and dropped
+        few = jax.tree.map(lambda leaf: leaf.at[chosen].get(mode="clip"), arguments)
+        new = jax.vmap(work)(*few)
+        found = jax.tree.map(lambda old, part: old.at[chosen].set(part, mode="drop"), found, new)
+        return left.at[chosen].set(False, mode="drop"), found
+
+    return lax.while_loop(lambda state: jnp.any(state[0]), some, (needed, results))[1]
+
+
+def _rest(scene: Scene, impact: NextImpact) -> tuple[_Leaving, Bool[Array, ""], Bool[Array, ""]]:
+    """Return where the next flight begins, whether the tip rested before, and whether it does for ever."""
+    landed = (impact.outcome == Outcome.IMPACT) | (impact.outcome == Outcome.CAPTURED)
+    until = jnp.where(landed, impact.arrival_time_us, 0.0) + _RIDE_PERIODS * scene.platform.period_us
+    row, leg, _ = through_impact(scene, impact, landed, until)
+    held = row.kind == ContactKind.HELD
+    rested = (row.kind == ContactKind.CHATTER) | (impact.outcome == Outcome.CAPTURED)
+    return (leg.time_us, leg.gap_nm, leg.velocity), rested & ~held, held
+
+
+class Record(NamedTuple):
+    """What is kept of impacts, arrays (lanes, impacts); NaN where there was none. Times within the drive's period."""
+
+    arrival_us: Float[Any, "lanes impacts"]
+    approach_nm_per_us: Float[Any, "lanes impacts"]
+    departure_us: Float[Any, "lanes impacts"]
+    """After a rest that of the release."""
+    velocity_after_nm_per_us: Float[Any, "lanes impacts"]
+    arrival_periods: Float[Any, "lanes impacts"]
+    """Whole drive periods before the arrival."""
+    departure_periods: Float[Any, "lanes impacts"]
+    near_grazing: Bool[Any, "lanes impacts"]
+    rested: Bool[Any, "lanes impacts"]
+
+    def turns(self, period_us: Float[np.ndarray, " lanes"]) -> Float[np.ndarray, "lanes impacts"]:
+        """Return the times of the departures in drive periods."""
+        return self.departure_periods + self.departure_us / period_us[:, None]
+
+
+@partial(jax.jit, static_argnames=("impacts",))
+def skipped(scenes: Scene, tips: Tips, *, impacts: int) -> Tips:
+    """Return a block of tips some impacts later."""
+    return lax.fori_loop(0, impacts, lambda _, now: advance(scenes, now).end, tips)
+
+
+@partial(jax.jit, static_argnames=("impacts",))
+def recorded(scenes: Scene, tips: Tips, *, impacts: int) -> tuple[Tips, Record]:
+    """Return a block of tips some impacts later, and the impacts, with axes (impacts, lanes)."""
+
+    def one(now: Tips, _: None) -> tuple[Tips, Record]:
+        step = advance(scenes, now)
+        return step.end, record_of(scenes, step)
+
+    return lax.scan(one, tips, length=impacts)
+
+
+def record_of(scenes: Scene, step: Step) -> Record:
+    """Return what is kept of a step, arrays of one lane a tip."""
+    impact, end = step.impact, step.end
+    landed = (step.start.outcome == Outcome.IMPACT) & (end.outcome == Outcome.IMPACT)
+    platform = scenes.platform
+    arrival = jnp.where(landed, impact.arrival_time_us, 0.0)
+    whole = jnp.floor(arrival / platform.period_us)
+    approach = platform.velocity(arrival) - impact.velocity_before_nm_per_us
+
+    def known(value: Array) -> Array:
+        return jnp.where(landed, value, jnp.nan)
+
+    return Record(
+        arrival_us=known(arrival - whole * platform.period_us),
+        approach_nm_per_us=known(approach),
+        departure_us=known(end.time_us),
+        velocity_after_nm_per_us=known(end.velocity_nm_per_us),
+        arrival_periods=known(step.start.periods + whole),
+        departure_periods=known(end.periods),
+        near_grazing=landed & impact.near_grazing,
+        rested=landed & step.rested,
+    )
+
+
+def leaving_tips(scenes: Scene) -> Tips:
+    """Return tips that leave the platform upward at its highest speed, at that speed again or twice the capture speed.
+
+    Args:
+        scenes: a batch of scenes.
+    """
+    platform, interaction = scenes.platform, scenes.interaction
+    time = 0.75 * platform.period_us
+    if isinstance(interaction, Contact):
+        slowest, gap = jax.vmap(capture_speed)(interaction, scenes.cantilever.mass_ng), interaction.bridge_breaks_nm
+    else:
+        slowest, gap = impact_law_of(scenes).capture_speed_nm_per_us, jnp.zeros_like(time)
+    rebound = jnp.maximum(platform.top_speed_nm_per_us, 2.0 * slowest)
+    return tips_at(scenes, time, platform.velocity(time) + rebound)._replace(gap_nm=gap)
+
+
+def tips_at(scenes: Scene, time_us: Array, velocity_nm_per_us: Array) -> Tips:
+    """Return tips that leave the platform at a time in us with a velocity in nm/us in the lab; arrays of one shape."""
+    zero = jnp.zeros_like(scenes.platform.frequency_khz)
+    going = jnp.full(zero.shape, int(Outcome.IMPACT), jnp.int32)
+    return Tips(zero + time_us, zero, zero, zero + velocity_nm_per_us, going)
+
+
+@jax.jit
+def landed_tips(scenes: Scene, start: State) -> Tips:
+    """Return tips just after the first impact of a flight from anywhere above the platform.
+
+    Args:
+        scenes: a batch of scenes.
+        start: time, height and velocity in the lab, one value for all or one a scene.
+    """
+
+    def one(scene: Scene, start: State) -> Tips:
+        gap = start.position_nm - scene.platform.position(start.time_us)
+        flight = Flight(
+            scene.cantilever, scene.platform, start.time_us, start.velocity_nm_per_us, gap, jnp.zeros_like(gap)
+        )
+        impact = impact_after(scene, flight, jnp.asarray(DEFAULT_ROOT_TOLERANCE_US), max_steps=MAX_STEPS)
+        hit = impact.outcome == Outcome.IMPACT
+        time = jnp.where(hit, impact.time_us, 0.0)
+        whole = jnp.floor(time / scene.platform.period_us)
+        velocity = jnp.where(hit, impact.velocity_after_nm_per_us, 0.0)
+        left = time - whole * scene.platform.period_us
+        return Tips(left, whole, jnp.zeros_like(gap), velocity, impact.outcome.astype(jnp.int32))
+
+    whole = State(*(jnp.broadcast_to(part, scenes.platform.frequency_khz.shape) for part in start))
+    return jax.vmap(one)(scenes, whole)
+
+
+def batch_and_tips(scene: Scene, start: State | None = None) -> tuple[Scene, Tips]:
+    """Return one scene or many as a batch of scenes, and where their tips begin.
+
+    Args:
+        scene: one scene, or a batch of scenes.
+        start: the tip in the lab; None: `default_start` of one scene; of many a tip that leaves the platform upward.
+
+    Raises:
+        ValueError: if the tip cannot start there.
+    """
+    if scene.platform.frequency_khz.ndim == 0:
+        start = default_start(scene) if start is None else start
+        scene = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], scene)
+    if start is None:
+        return scene, leaving_tips(scene)
+    if not isinstance(scene.interaction, Contact):
+        tips = landed_tips(scene, start)
+        if np.all(np.asarray(tips.outcome) == Outcome.INVALID_START):
+            raise ValueError("the tip cannot start there: the start is not finite, or inside the sample")
+        return scene, tips
+    gap = start.position_nm - scene.platform.position(start.time_us)
+    return scene, tips_at(scene, start.time_us, start.velocity_nm_per_us)._replace(gap_nm=gap)
+
+
+def require_drive(scenes: Scene) -> None:
+    """Check that scenes repeat with one drive period, and that there is something to meet.
+
+    Raises:
+        RuntimeError: if JAX is not set to 64-bit floats, or was not when the scenes were built.
+        ValueError: if the tip meets nothing, the offset ramps, the platform rests, or there is another drive than one
+            cosine of the platform.
+    """
+    require_float64(scenes)
+    require_sample_drive(scenes)
+    if scenes.interaction is None:
+        raise ValueError("the scene has no interaction: a tip that meets nothing has no impacts")
+    if np.any(np.asarray(scenes.platform.offset_rate_nm_per_us) != 0.0):
+        raise ValueError("`offset_rate_nm_per_us` must be 0 here: under a ramp no motion repeats")
+    if not np.all(np.asarray(scenes.platform.amplitude_nm) > 0.0):
+        raise ValueError("`amplitude_nm` of the platform must be positive here: on a resting platform motion dies away")
+
+
+Report = Callable[[int, int], object]
+"""Told how many of how many lanes are done."""
+
+
+def in_blocks(work: Callable[[Any], Any], lanes: Any, *, block: int = LANES, report: Report | None = None) -> Any:
+    """Return the results of work on lanes, done block by block on all cores.
+
+    Args:
+        work: takes a tree of arrays with a leading axis of lanes, gives one of NumPy arrays with the same axis.
+        lanes: the tree of all lanes.
+        block: lanes of a block; fewer lanes are one smaller block, filled up.
+        report: told how far it is.
+    """
+    count = len(jax.tree.leaves(lanes)[0])
+    width = next((width for width in _WIDTHS if width >= min(count, block)), block)
+    whole = jax.tree.map(np.asarray, lanes)
+
+    def part(first: int) -> Any:
+        def cut(leaf: np.ndarray) -> Array:
+            rows = leaf[first : first + width]
+            return jnp.asarray(np.pad(rows, ((0, width - len(rows)),) + ((0, 0),) * (rows.ndim - 1), mode="edge"))
+
+        # a worker has JAX's usual precision, whatever its caller has said
+        with jax.enable_x64(True):  # noqa: FBT003
+            return jax.tree.map(np.asarray, work(jax.tree.map(cut, whole)))
+
+    firsts = range(0, count, width)
+    done = [part(0)]  # alone, so that programs are compiled once
+    with ThreadPoolExecutor(_workers()) as pool:
+        for result in pool.map(part, firsts[1:]):
+            done.append(result)
+            if report is not None:
+                report(min(len(done) * width, count), count)
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *done)
+
+
+def _workers() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -1,0 +1,90 @@
+"""How motions end: on an (m, N) orbit, on no repetition, stuck, away from the sample. Vectorised, in plain NumPy."""
+
+import enum
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from afm_jax.dynamics.iteration import Record
+from afm_jax.motion.settle import LONGEST, find_repetitions
+from afm_jax.outcomes import Outcome
+
+
+class MotionKind(enum.IntEnum):
+    """What a motion has come to."""
+
+    ORBIT = 0
+    """It repeats: m impacts in N drive periods."""
+    IRREGULAR = 1
+    """It goes on and repeats nothing."""
+    STUCK = 2
+    """The platform holds the tip for good."""
+    FREE = 3
+    """The tip no longer meets the platform."""
+    UNRESOLVED = 4
+    """A search gave up, or the start was no flight."""
+
+
+class Verdicts(NamedTuple):
+    """What motions have come to, arrays of one lane a motion."""
+
+    kind: Int[np.ndarray, " lanes"]
+    """A `MotionKind`."""
+    impacts: Int[np.ndarray, " lanes"]
+    """m of an orbit, else 0."""
+    periods: Int[np.ndarray, " lanes"]
+    """N of an orbit, else 0."""
+    remaining: Float[np.ndarray, " lanes"]
+    """Estimated distance from the orbit, of the velocity scale or in rad; infinite without one."""
+
+    def names(self) -> list[str]:
+        """Return a word for each: "(2,3)", "irregular", "stuck", "free", "unresolved"."""
+        words = [kind.name.lower() for kind in MotionKind]
+        rows = zip(self.kind.tolist(), self.impacts.tolist(), self.periods.tolist(), strict=True)
+        return [f"({m},{n})" if kind == MotionKind.ORBIT else words[kind] for kind, m, n in rows]
+
+
+REPEATED = 2
+"""Repetitions in each of the two blocks that are compared to tell an orbit."""
+RECORDED = (2 * REPEATED + 1) * LONGEST
+"""Impacts that are recorded to tell orbits of up to `LONGEST` impacts."""
+
+_KIND_OF = {
+    Outcome.IMPACT: MotionKind.IRREGULAR,
+    Outcome.CAPTURED: MotionKind.STUCK,
+    Outcome.NO_FURTHER_IMPACT: MotionKind.FREE,
+}
+
+
+def verdicts_of(
+    record: Record, outcome: Int[np.ndarray, " lanes"], period_us: Float[np.ndarray, " lanes"], *, tolerance: float
+) -> Verdicts:
+    """Return what motions have come to.
+
+    A tip that rests on the platform and is let go forgets what was before: two releases at one phase are an orbit.
+
+    Args:
+        record: their last impacts.
+        outcome: of each, an `Outcome` as an integer.
+        period_us: of the drive.
+        tolerance: of the remaining distance from an orbit (`find_repetitions`).
+    """
+    kinds = np.full(max(Outcome) + 1, MotionKind.UNRESOLVED)
+    kinds[list(_KIND_OF)] = list(_KIND_OF.values())
+    kind = kinds[outcome]
+    turns = record.turns(period_us)
+    found = find_repetitions(turns, record.velocity_after_nm_per_us, tolerance=tolerance, repeated=REPEATED)
+    impacts, periods, remaining = found
+    for lane in np.flatnonzero((impacts == 0) & (kind == MotionKind.IRREGULAR) & (record.rested.sum(axis=1) > 1)):
+        before, last = np.flatnonzero(record.rested[lane])[-2:]
+        apart = turns[lane, last] - turns[lane, before]
+        if round(apart) >= 1 and 2.0 * np.pi * abs(apart - round(apart)) < tolerance:
+            impacts[lane], periods[lane], remaining[lane] = last - before, round(apart), 0.0
+    orbit = (kind == MotionKind.IRREGULAR) & (impacts > 0)
+    return Verdicts(
+        np.where(orbit, MotionKind.ORBIT, kind),
+        np.where(orbit, impacts, 0),
+        np.where(orbit, periods, 0),
+        np.where(orbit, remaining, np.inf),
+    )

@@ -1,0 +1,150 @@
+"""Pictures of continuations: branches with their special points and bands, and curves in two parameters."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+
+from afm_jax.dynamics.bands import WITHIN_95
+from afm_jax.dynamics.continuation import Continuation, OrbitBranch, SpecialPoint
+from afm_jax.dynamics.impact_orbits import is_stable, multipliers_of
+from afm_jax.plots.dynamics import label_of
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save
+
+_MARKS = {
+    "fold": ("o", ACCENT),
+    "period_doubling": ("s", "#009E73"),
+    "torus": ("D", "#CC79A7"),
+    "grazing": ("^", "#56B4E9"),
+    "capture": ("v", DARK),
+}
+"""Shape and colour of each kind: either tells them apart (colours of Okabe and Ito)."""
+
+
+def draw_continuation(
+    found: Continuation,
+    path: Path,
+    *,
+    bands: Sequence[Float[np.ndarray, " points"]] | None = None,
+    errors: Float[np.ndarray, " special"] | None = None,
+) -> None:
+    """Draw peak amplitude against the parameter: stable solid, unstable dashed, not admissible dotted and light.
+
+    Args:
+        found: what is shown.
+        path: PDF, SVG or PNG file, by its suffix.
+        bands: standard errors of the amplitude, an array a branch: shaded to 95 %.
+        errors: standard errors of the special points: bars to 95 %.
+    """
+    figure = new_figure(7.0, 4.6)
+    axes = figure.subplots()
+    labels: set[str] = set()
+    for number, branch in enumerate(found.branches):
+        _draw_branch(axes, branch, [one for one in found.special if one.branch == number], labels)
+        if bands is not None:
+            _draw_band(axes, branch, bands[number])
+    for index, point in enumerate(found.special):
+        if not point.admissible:
+            continue
+        half = None if errors is None else WITHIN_95 * float(errors[index])
+        marker, colour = _MARKS[point.kind]
+        height = float(point.reading.peak_amplitude_nm)
+        axes.errorbar(
+            point.parameter,
+            height,
+            xerr=half,
+            fmt=marker,
+            color=colour,
+            markersize=7,
+            markeredgecolor="white",
+            capsize=3,
+            zorder=4,
+            label=_once(point.kind.replace("_", " "), labels),
+        )
+    label_axes(axes, x=label_of(found.range.path), y="peak amplitude (nm)")
+    axes.set_title(f"({found.impacts}, {found.order}) orbits", fontsize=12, loc="left")
+    axes.grid(color=GRID, alpha=0.25)
+    axes.margins(x=0.02)
+    if labels:
+        axes.legend(fontsize=10, frameon=False)
+    save(figure, path)
+
+
+def _once(label: str, labels: set[str]) -> str | None:
+    if label in labels:
+        return None
+    labels.add(label)
+    return label
+
+
+def _draw_branch(axes: Axes, branch: OrbitBranch, special: Sequence[SpecialPoint], labels: set[str]) -> None:
+    """Draw a branch, through its special points, where the style of the line changes."""
+    stable = is_stable(multipliers_of(np.asarray(branch.reading.trace), np.asarray(branch.reading.determinant)))
+    state = np.where(branch.reading.admissible, np.where(stable, 2, 1), 0)
+    place = np.array([*range(len(state)), *(one.position for one in special)])
+    rank = np.argsort(place, kind="stable")
+    x = np.array([*branch.parameter, *(one.parameter for one in special)])[rank]
+    y = np.array([*branch.reading.peak_amplitude_nm, *(float(one.reading.peak_amplitude_nm) for one in special)])[rank]
+    # a line from or to a special point is in the state of its other end
+    known = np.array([*state, *[-1] * len(special)])[rank]
+    left, right = known[:-1], known[1:]
+    lines = np.where(left < 0, right, np.where(right < 0, left, np.minimum(left, right)))
+    styles = ((":", GRID, "passes through the sample"), ("--", BLUE, "unstable"), ("-", BLUE, "stable"))
+    begin = 0
+    for end in [*(np.flatnonzero(np.diff(lines)) + 1).tolist(), len(lines)]:
+        if lines[begin] >= 0:
+            line, colour, name = styles[int(lines[begin])]
+            piece = slice(begin, end + 1)
+            axes.plot(x[piece], y[piece], line, color=colour, linewidth=1.8, label=_once(name, labels))
+        begin = end
+
+
+def _draw_band(axes: Axes, branch: OrbitBranch, error: Float[np.ndarray, " points"]) -> None:
+    """Shade where the amplitude may lie; not where a fold is so near that a held parameter says nothing."""
+    height = branch.reading.peak_amplitude_nm
+    half = WITHIN_95 * error
+    shown = np.isfinite(half) & (half < 0.3 * np.abs(height)) & branch.reading.admissible
+    begin = 0
+    for end in [*(np.flatnonzero(np.diff(shown.astype(int))) + 1).tolist(), len(shown)]:
+        if shown[begin] and end - begin > 1:
+            piece = slice(begin, end)
+            low, high = height[piece] - half[piece], height[piece] + half[piece]
+            axes.fill_between(branch.parameter[piece], low, high, color=BLUE, alpha=0.2, linewidth=0.0)
+        begin = end
+
+
+def draw_curves(found: Continuation, path: Path) -> None:
+    """Draw the curves of special points in two parameters, with cusps and meetings marked.
+
+    Args:
+        found: what is shown.
+        path: PDF, SVG or PNG file, by its suffix.
+
+    Raises:
+        ValueError: if nothing was followed in two parameters.
+    """
+    if found.second is None:
+        raise ValueError("there are no curves: no second parameter was followed")
+    figure = new_figure(7.0, 4.6)
+    axes = figure.subplots()
+    labels: set[str] = set()
+    for curve in found.curves:
+        _, colour = _MARKS[curve.kind]
+        for flown, line in ((True, "-"), (False, ":")):
+            shown = np.where(curve.admissible == flown, curve.second, np.nan)
+            if np.isfinite(shown).any():
+                name = curve.kind.replace("_", " ") + ("" if flown else ", passes through the sample")
+                axes.plot(curve.parameter, shown, line, color=colour, linewidth=1.8, label=_once(name, labels))
+        for one in curve.meetings:
+            marker = "*" if one.kind == "cusp" else "X"
+            name = "cusp" if one.kind == "cusp" else "meeting"
+            axes.plot(one.parameter, one.second, marker, color="black", markersize=9, label=_once(name, labels))
+    label_axes(axes, x=label_of(found.range.path), y=label_of(found.second.path))
+    axes.set_title(f"({found.impacts}, {found.order}) orbits", fontsize=12, loc="left")
+    axes.grid(color=GRID, alpha=0.25)
+    axes.set(xlim=(found.range.low, found.range.high), ylim=(found.second.low, found.second.high))
+    if labels:
+        axes.legend(fontsize=10, frameon=False)
+    save(figure, path)

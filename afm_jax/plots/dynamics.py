@@ -1,0 +1,144 @@
+"""Pictures of what motions come to: exponents, bifurcation diagrams, charts of orbits, basins."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.colors import BoundaryNorm, ListedColormap
+
+from afm_jax.dynamics.bifurcations import Sweep
+from afm_jax.dynamics.charts import StabilityChart
+from afm_jax.plots.charts import cell_edges
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save, with_zero_line
+
+KINDS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#8c6bb1", "#a6761d", "#999999")
+"""Colours that stand apart for every kind of colour vision (Okabe and Ito's, and three more)."""
+_LABELS = {
+    "platform.reduced_frequency": r"reduced drive frequency  $n = \omega/2\Omega$",
+    "platform.amplitude_nm": r"drive amplitude  $\beta$ (nm)",
+    "platform.offset_nm": r"tip-sample offset  $\sigma$ (nm)",
+    "platform.frequency_khz": "drive frequency (kHz)",
+    "cantilever.quality_factor": "quality factor  $Q$",
+    "interaction.r": "coefficient of restitution  $r$",
+    "interaction.epsilon": r"adhesion loss  $\epsilon$ (nm$^2$/$\mu$s$^2$)",
+    "interaction.viscous_loss": r"viscous loss (nm/$\mu$s)",
+}
+_UNITS = {
+    "_nm_per_us": r"nm/$\mu$s",
+    "_khz": "kHz",
+    "_n_per_m": "N/m",
+    "_j_per_m2": r"J/m$^2$",
+    "_pa_s": "Pa s",
+    "_gpa": "GPa",
+    "_nm": "nm",
+    "_ng": "ng",
+    "_k": "K",
+}
+
+
+def label_of(path: str) -> str:
+    """Return what an axis says of a parameter, with its unit."""
+    if path in _LABELS:
+        return _LABELS[path]
+    key = path.rpartition(".")[2]
+    suffix = next((suffix for suffix in _UNITS if key.endswith(suffix)), "")
+    words = key.removesuffix(suffix).replace("_", " ")
+    return f"{words} ({_UNITS[suffix]})" if suffix else words
+
+
+def draw_exponents(
+    path: str, values: Float[np.ndarray, " values"], exponents: Float[np.ndarray, "values 2"], target: Path
+) -> None:
+    """Draw both Lyapunov exponents per impact against a parameter; where they are minus infinity there is a tick below.
+
+    Args:
+        path: of the parameter.
+        values: of the parameter.
+        exponents: per impact.
+        target: PNG, PDF or SVG file.
+    """
+    figure = new_figure(9.0, 4.8)
+    axes: Axes = figure.subplots()
+    size = max(0.5, min(3.0, 3000.0 / len(values)))
+    axes.plot(values, exponents[:, 1], ".", ms=size, color=BLUE, label="smaller exponent", rasterized=True)
+    axes.plot(values, exponents[:, 0], ".", ms=size, color=ACCENT, label="larger exponent", rasterized=True)
+    finite = exponents[np.isfinite(exponents)]
+    low = float(np.quantile(finite, 0.01)) - 0.3 if finite.size else -1.0
+    high = float(finite.max()) + 0.2 if finite.size else 1.0
+    gone = np.isneginf(exponents[:, 0])
+    if gone.any():
+        axes.plot(values[gone], np.full(gone.sum(), low), ".", color=DARK, ms=size, label="the tip rests or sticks")
+    axes.set(xlim=(values[0], values[-1]), ylim=(low - 0.1, high))
+    with_zero_line(axes)
+    axes.axhline(0.0, color=GRID, linewidth=1.2)
+    label_axes(axes, x=label_of(path), y="Lyapunov exponent per impact")
+    legend = figure.legend(loc="outside upper center", ncols=3, fontsize=11, frameon=False)
+    for handle in legend.get_lines():
+        handle.set_markersize(10.0)
+    save(figure, target)
+
+
+def draw_bifurcations(path: str, sweeps: Sequence[Sweep], target: Path) -> None:
+    """Draw a bifurcation diagram: height at impact, and the tip's height whenever the platform is highest.
+
+    Args:
+        path: of the parameter.
+        sweeps: up, down or both; where both are, the one down lies over the one up.
+        target: PNG, PDF or SVG file.
+    """
+    figure = new_figure(9.0, 8.0)
+    panels = figure.subplots(2, 1, sharex=True)
+    for sweep in sweeps:
+        colour, word = (BLUE, "swept up") if sweep.upward else (ACCENT, "swept down")
+        parts = (sweep.height_nm, sweep.strobe_height_nm)
+        for axes, part in zip(panels, parts, strict=True):
+            there = np.isfinite(part)
+            at = np.repeat(sweep.values, there.sum(axis=1))
+            style = {"ms": max(1.0, min(3.0, 1500.0 / len(sweep.values))), "alpha": 0.5, "rasterized": True}
+            axes.plot(at, part[there], ".", color=colour, mew=0.0, label=word, **style)
+    label_axes(panels[0], x="", y="height at impact (nm)")
+    label_axes(panels[1], x=label_of(path), y="height when the platform\nis highest (nm)")
+    panels[0].set(xlim=(sweeps[0].values[0], sweeps[0].values[-1]))
+    for axes in panels:
+        axes.grid(color=GRID, alpha=0.25)
+    handles, labels = panels[0].get_legend_handles_labels()
+    legend = figure.legend(handles, labels, loc="outside upper center", ncols=2, fontsize=11, frameon=False)
+    for handle in legend.get_lines():
+        handle.set(markersize=10.0, alpha=1.0)
+    save(figure, target)
+
+
+def draw_chart(x: str, y: str, chart: StabilityChart, target: Path) -> None:
+    """Draw a chart of stable single-impact orbits: the lowest stable order, and how stable its orbit is.
+
+    Args:
+        x: path of the parameter of the columns.
+        y: of the rows.
+        chart: the chart.
+        target: PNG, PDF or SVG file.
+    """
+    figure = new_figure(12.0, 5.2)
+    left, right = figure.subplots(1, 2, sharex=True, sharey=True)
+    edges = cell_edges(chart.x_values), cell_edges(chart.y_values)
+    lowest, stable = chart.lowest_stable_order, chart.stable
+    orders = [order for order in range(1, chart.orders + 1) if (lowest == order).any()] or [1]
+    colours = ListedColormap([KINDS[(order - 1) % len(KINDS)] for order in range(1, orders[-1] + 1)])
+    norm = BoundaryNorm(np.arange(0.5, orders[-1] + 1.0), colours.N)
+    shown = np.where(lowest > 0, lowest, np.nan)
+    mesh = left.pcolormesh(*edges, shown, cmap=colours, norm=norm, rasterized=True)
+    bar = figure.colorbar(mesh, ax=left, ticks=orders)
+    bar.ax.set_yticklabels([f"(1,{order})" for order in orders])
+    several = (stable.sum(axis=0) > 1).astype(float)
+    if several.any() and not several.all():
+        left.contour(chart.x_values, chart.y_values, several, levels=[0.5], colors="black", linewidths=0.6)
+    left.set_title("lowest stable order (black line: several coexist)", fontsize=12)
+    sizes = chart.verdicts.largest_multiplier.reshape(stable.shape)
+    lowest_size = np.take_along_axis(sizes, np.maximum(lowest - 1, 0)[None], axis=0)[0]
+    mesh = right.pcolormesh(*edges, lowest_size, cmap="cividis", vmin=0.0, vmax=1.0, rasterized=True)
+    figure.colorbar(mesh, ax=right, label="size of its larger multiplier")
+    right.set_title("how stable", fontsize=12)
+    label_axes(left, x=label_of(x), y=label_of(y))
+    label_axes(right, x=label_of(x), y="")
+    save(figure, target)

@@ -1,0 +1,228 @@
+"""Parameters of a scene by their paths in its file: ranges of them as text, and scenes with other values of them.
+
+`platform.reduced_frequency=0.4:4.4:1000` is a path and a range. A path names a number of the scene file, or the reduced
+frequency omega/2 Omega of a drive; where the cantilever's frequency changes, the drives keep theirs in kHz.
+"""
+
+import difflib
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from afm_jax.apparatus.scene import Scene
+from afm_jax.checks import is_traced
+from afm_jax.scenefile.scenefile import scene_of_tables, scene_tables
+
+_MOST_VALUES = 10_000_000
+
+
+class ParameterRange(NamedTuple):
+    """Values of a parameter of a scene from ``low`` to ``high``, in the file's unit; ``number`` of them, if counted."""
+
+    path: str
+    low: float
+    high: float
+    number: int | None = None
+
+    @property
+    def values(self) -> Float[np.ndarray, " number"]:
+        """The values, evenly spaced, both ends among them."""
+        return np.linspace(self.low, self.high, self.number or 2)
+
+    def __str__(self) -> str:
+        counted = "" if self.number is None else f":{self.number}"
+        return f"{self.path}={self.low:g}:{self.high:g}{counted}"
+
+
+def parse_range(text: str, *, counted: bool) -> ParameterRange:
+    """Return the range that a text says.
+
+    >>> parse_range("platform.offset_nm=-2:2:5", counted=True).values.tolist()
+    [-2.0, -1.0, 0.0, 1.0, 2.0]
+
+    Args:
+        text: `path=low:high`, with `:count` behind it if counted.
+        counted: whether the range is that of a number of values, or everything between its ends.
+
+    Raises:
+        ValueError: if it says no rising range, or less than two values of one.
+    """
+    shape = "PARAMETER=low:high:count" if counted else "PARAMETER=low:high"
+    example = f"platform.reduced_frequency=0.9:1.1{':100' if counted else ''}"
+    path, _, rest = text.partition("=")
+    parts = [part.strip() for part in rest.split(":")]
+    if not path.strip() or len(parts) != (3 if counted else 2):
+        raise ValueError(f"`{text}` is no range of a parameter; write {shape} as in {example}")
+    try:
+        low, high = float(parts[0]), float(parts[1])
+    except ValueError:
+        low = high = math.nan
+    if not (math.isfinite(low) and math.isfinite(high)):
+        raise ValueError(f"`{text}`: the ends of a range must be numbers; write {shape} as in {example}")
+    if not low < high:
+        raise ValueError(f"`{text}`: the range is empty; its first end must be below its second, as in {example}")
+    if not counted:
+        return ParameterRange(path.strip(), low, high)
+    if not (parts[2].isascii() and parts[2].isdigit() and 2 <= int(parts[2]) <= _MOST_VALUES):
+        raise ValueError(f"`{text}`: the number of values must be from 2 to {_MOST_VALUES}, but is {parts[2]}")
+    return ParameterRange(path.strip(), low, high, int(parts[2]))
+
+
+def parameter_values(scene: Scene) -> dict[str, float]:
+    """Return the parameters that a scene has, by their paths, with their values.
+
+    Args:
+        scene: one scene, its numbers known.
+
+    Raises:
+        ValueError: if it is none that a file can hold.
+    """
+    found: dict[str, float] = {}
+    for table, contents in scene_tables(scene).items():
+        _collect(table, contents, found)
+    free = float(scene.cantilever.frequency_khz)
+    for path in [path for path in found if path.endswith(".frequency_khz") and not path.startswith("cantilever")]:
+        found[path.replace("frequency_khz", "reduced_frequency")] = found[path] / (2.0 * free)
+    return found
+
+
+def _collect(table: str, contents: dict[str, Any], found: dict[str, float]) -> None:
+    for key, value in contents.items():
+        if isinstance(value, dict):
+            _collect(f"{table}.{key}", value, found)
+        elif isinstance(value, float):
+            found[f"{table}.{key}"] = value
+
+
+def check_ranges(scene: Scene, *ranges: ParameterRange) -> None:
+    """Check that a scene has the parameters of some ranges, each once, and that it can be at their ends.
+
+    Raises:
+        ValueError: if not; one line that names what exists, or what is wrong with an end.
+    """
+    known = parameter_values(scene)
+    for given in ranges:
+        if given.path not in known:
+            nearest = difflib.get_close_matches(given.path, known, n=1)
+            meant = f"did you mean {nearest[0]}? " if nearest else ""
+            raise ValueError(f"the scene has no parameter `{given.path}`; {meant}it has {', '.join(known)}")
+    places = [_leaf_path(given.path) for given in ranges]
+    if len(set(places)) < len(places):
+        raise ValueError(f"the ranges {' and '.join(map(str, ranges))} change the same parameter: give two different")
+    for given in ranges:
+        for end in (given.low, given.high):
+            scene_of_tables(_tables_with(scene, given.path, end), str(given))
+
+
+def _leaf_path(path: str) -> str:
+    return path.replace("reduced_frequency", "frequency_khz")
+
+
+def _tables_with(scene: Scene, path: str, value: float) -> dict[str, Any]:
+    tables = scene_tables(scene)
+    table, _, key = path.rpartition(".")
+    inner: dict[str, Any] = tables
+    for name in table.split("."):
+        inner = inner[name]
+    if key == "reduced_frequency":
+        inner.pop("frequency_khz")
+    inner[key] = value
+    return tables
+
+
+def scene_family(scene: Scene, *paths: str) -> Callable[..., Scene]:
+    """Return the function from values of some parameters to the scene that has them, differentiable and for `vmap`.
+
+    >>> from afm_jax import Cantilever, ImpactLaw, Platform
+    >>> with jax.enable_x64(True):
+    ...     scene = Scene(Cantilever(90.0), Platform(2.0, 180.0), ImpactLaw(0.9))
+    ...     scene_family(scene, "platform.reduced_frequency", "interaction.r")(1.5, 0.8).platform.frequency_khz.item()
+    270.0
+
+    Args:
+        scene: one scene, its numbers known.
+        paths: of parameters that it has (`check_ranges`).
+
+    Raises:
+        ValueError: if the scene lacks one, with what it has.
+    """
+    known = parameter_values(scene)
+    for path in paths:
+        if path not in known:
+            raise ValueError(f"the scene has no parameter `{path}`; it has {', '.join(known)}")
+    of_contact = [path for path in paths if path.startswith("interaction.") and _is_contact(scene)]
+    contact = _contact_family(scene, tuple(path.partition(".")[2] for path in of_contact)) if of_contact else None
+
+    def at(*values: ArrayLike) -> Scene:
+        given = dict(zip(paths, values, strict=True))
+        made = scene
+        # the cantilever first: reduced frequencies are in its unit
+        for path in sorted(given, key=lambda path: not path.startswith("cantilever")):
+            if path not in of_contact:
+                made = with_number(made, path, given[path])
+        if contact is not None:
+            made = eqx.tree_at(lambda part: part.interaction, made, contact(*(given[path] for path in of_contact)))
+        return made
+
+    return at
+
+
+def scene_batch(scene: Scene, values: Mapping[str, ArrayLike]) -> Scene:
+    """Return scenes with columns of values of some parameters, as a batch: every number has the columns' shape.
+
+    Args:
+        scene: one scene, its numbers known.
+        values: for every path one value a scene, arrays of one length.
+
+    Raises:
+        ValueError: if the scene lacks a parameter.
+    """
+    columns = [jnp.asarray(column, float) for column in values.values()]
+    return jax.jit(jax.vmap(scene_family(scene, *values)))(*columns)
+
+
+def _is_contact(scene: Scene) -> bool:
+    return hasattr(scene.interaction, "forces")
+
+
+def _contact_family(scene: Scene, names: tuple[str, ...]) -> Callable[..., object]:
+    # only here, so that scenes with a law do without the contact's modules
+    from afm_jax.contact.contact import Contact  # noqa: PLC0415
+    from afm_jax.contact.parameters import EFFECTS  # noqa: PLC0415
+    from afm_jax.scenefile.contact import contact_parameters  # noqa: PLC0415
+
+    numbers = contact_parameters(scene.interaction)
+    effects = tuple(name for name in EFFECTS if name in scene.interaction.effects)
+    return lambda *values: Contact.paper(effects=effects, **(numbers | dict(zip(names, values, strict=True))))
+
+
+def with_number(scene: Scene, path: str, value: ArrayLike) -> Scene:
+    """Return a scene with one number of cantilever, drives or law replaced."""
+    *parts, key = path.split(".")
+    number = jnp.asarray(value, scene.platform.frequency_khz.dtype)
+    if key == "reduced_frequency":
+        key, number = "frequency_khz", 2.0 * number * scene.cantilever.frequency_khz
+    if parts[-1] == "second" and key.startswith("amplitude"):
+        key = "amplitude"
+    follows = parts[0] in ("base", "force") and parts[-1] != "second" and key == "frequency_khz" and _rests(scene)
+
+    def places(tree: Scene) -> list[object]:
+        part = tree
+        for name in parts:
+            part = getattr(part, name)
+        # the phase over a resting platform counts in the drive that moves
+        return [getattr(part, key), *([tree.platform.frequency_khz] if follows else [])]
+
+    return eqx.tree_at(places, scene, [number] * (2 if follows else 1))
+
+
+def _rests(scene: Scene) -> bool:
+    """Say whether the platform is known to rest."""
+    amplitude = scene.platform.amplitude_nm
+    return scene.platform.second is None and not is_traced(amplitude) and not np.any(np.asarray(amplitude))

@@ -1,0 +1,422 @@
+"""What a model leaves out, as uncertain as it is: one linear step after the fit, for parameters, law, band and chi2.
+
+A law of a few numbers is itself an approximation. What it misses is known in size and in character, and is put beside
+its parameters as unknowns, each with a prior:
+
+- the shape of the loss: the bridge's drag acts on a speed that its pull has raised, u_out^2 = u^2 - c sqrt(u^2 + q) -
+  epsilon with q = 110 +- 60 nm^2/us^2; and a smooth function of ln u (a Gaussian process);
+- terms of the loss that the model has no parameter for;
+- the shape of the delay: f (1/u_out^2 - 1/u^2), and a smooth path over ln u;
+- the corrections of impacts that last: the leading remainder of each, of either sign;
+- what slow impacts lack in any picture of impacts: common to peak and lock-in of a row.
+
+All of it is small, and enters to first order: one step from the fit's own linearisation.
+"""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
+
+from afm_jax.units import RAD_PER_US_PER_KHZ
+from fitting.fits.least_squares import covariance_of
+from fitting.fits.minimum import Strain
+from fitting.fits.objective import ROBUST, Objective
+from fitting.forward import ImpactSlopes, impact_of, impact_slopes
+from fitting.models import Problem
+from fitting.parameters import DELAY_SHAPE, LOSS_SHAPE, PARAMETERS
+
+LOSS_SPEED_SQUARED = 110.0, 60.0
+"""q in nm^2/us^2 and its standard error: free fits of the laws of contacts give 96 to 125, a wet one 234."""
+_LOSS_SHARE = 0.07
+"""Standard deviation of the smooth part of the loss, relative."""
+_MISSING_SHARE = 0.3
+"""That of a term that the model lacks, over the loss at the middle of the speeds."""
+_PATH_NM = 0.03
+"""That of the path that the delay stands for."""
+_SQUARE_PER_LEAD, _LEAST_SQUARE = 2.0, 2.0
+"""f over the lead b in nm/us, and its standard error; the least that this is, in nm^2/us."""
+_SMOOTH, _KNOTS = 0.8, 0.4
+"""Correlation length of the smooth functions, and distance of their knots, in ln u."""
+_CORRECTIONS = 1.5
+"""Standard deviation of a correction's remainder over what was seen."""
+_TOGETHER, _APART = 2.0, 1.0 / 16.0
+"""Variance of the mean and of the difference of peak and lock-in of a slow row (times root 2), over that of each."""
+
+
+class StepRows(NamedTuple):
+    """The rows of a fit as the step sees them: everything in the objective's errors.
+
+    Attributes:
+        residual: of the amplitudes, then of what else there is.
+        jacobian: by the parameters.
+        slopes: of the amplitudes' residuals by what impacts do.
+        measurement_error: of each amplitude, over the objective's.
+        slow_error: that slow impacts have in any picture, over the objective's error.
+        approach, rebound: of the free tip, in nm/us.
+        pull, change: acceleration at mid contact in nm/us^2 and its change in nm/us^3.
+        hertz_time: in us.
+    """
+
+    residual: Float[np.ndarray, " n"]
+    jacobian: Float[np.ndarray, "n p"]
+    slopes: ImpactSlopes
+    measurement_error: Float[np.ndarray, "rows 2"]
+    slow_error: Float[np.ndarray, "rows 2"]
+    approach: Float[np.ndarray, " rows"]
+    rebound: Float[np.ndarray, " rows"]
+    pull: Float[np.ndarray, " rows"]
+    change: Float[np.ndarray, " rows"]
+    hertz_time: Float[np.ndarray, " rows"]
+
+
+class Columns(NamedTuple):
+    """Changes of the squared rebound speed and of the delay at some speeds.
+
+    ``known``: on average; ``drag``: by the viscous loss, beyond what the model says; ``shape``: by each shape's number;
+    ``unknown``: by unknowns of unit variance. The first entry is the squared speed, the second the delay.
+    """
+
+    known: Float[np.ndarray, "2 n"]
+    drag: Float[np.ndarray, "2 n"]
+    shape: Float[np.ndarray, "2 n s"]
+    unknown: Float[np.ndarray, "2 n m"]
+
+
+@dataclass(frozen=True)
+class Unmodelled:
+    """What a model with fitted values leaves out.
+
+    Attributes:
+        problem: the model; of the resolved contact only corrections and slow impacts are uncertain.
+        values: of its parameters, by name.
+        speeds: slowest and fastest approach of the rows in nm/us.
+    """
+
+    problem: Problem
+    values: dict[str, float]
+    speeds: tuple[float, float]
+
+    @property
+    def priors(self) -> dict[str, tuple[float, float]]:
+        """Mean and standard error of the shapes' numbers, by name; only those that the model has use for."""
+        priors = {}
+        if "viscous_loss" in self.problem.own:
+            priors[LOSS_SHAPE] = LOSS_SPEED_SQUARED
+        if "delay_lead_nm" in self.problem.own:
+            mean = _SQUARE_PER_LEAD * self.values["delay_lead_nm"]
+            priors[DELAY_SHAPE] = mean, max(abs(mean), _LEAST_SQUARE)
+        return priors
+
+    def columns(self, u: Float[np.ndarray, " n"], w: Float[np.ndarray, " n"]) -> Columns:
+        """Return what is left out at approach and rebound speeds in nm/us."""
+        shape = (2, u.size)
+        known, drag, priors = np.zeros(shape), np.zeros(shape), self.priors
+        square, late = [], []
+        if LOSS_SHAPE in priors:
+            loss, raised = self.values["viscous_loss"], np.sqrt(u**2 + priors[LOSS_SHAPE][0])
+            drag[0] = u - raised
+            known[0] = loss * drag[0]
+            square = [-0.5 * loss / raised]
+        if DELAY_SHAPE in priors:
+            lag = 1.0 / np.maximum(w, 1.0) ** 2 - 1.0 / u**2
+            known[1] = priors[DELAY_SHAPE][0] * lag
+            late = [lag]
+        return Columns(known, drag, _stacked(square, late, u.size), _stacked(*self._unknown(u, w), u.size))
+
+    def _unknown(self, u: Float[np.ndarray, " n"], w: Float[np.ndarray, " n"]):
+        """Return columns of the squared speed and of the delay, for unknowns of unit variance."""
+        if self.problem.model == "contact":
+            return [], []
+        middle = float(np.sqrt(self.speeds[0] * self.speeds[1]))
+        loss = self.values.get("epsilon", 0.0) + self.values.get("viscous_loss", 0.0) * middle
+        loss += (1.0 - self.values.get("r", 1.0) ** 2) * middle**2
+        terms = {"epsilon": np.ones_like(u), "viscous_loss": u / middle}
+        missing = [-_MISSING_SHARE * loss * term for name, term in terms.items() if name not in self.problem.own]
+        smooth = self._smooth(u).T
+        return [*missing, *(-_LOSS_SHARE * (u**2 - w**2) * smooth)], [*(-_PATH_NM / u * smooth)]
+
+    def _smooth(self, u: Float[np.ndarray, " n"]) -> Float[np.ndarray, "n knots"]:
+        """Return a smooth random function of unit variance at speeds, as columns of unit variance each."""
+        low, high = np.log(0.5 * self.speeds[0]), np.log(1.2 * self.speeds[1])
+        knots = low + _KNOTS * np.arange(int(np.ceil((high - low) / _KNOTS)) + 1)
+
+        def related(one, other):
+            return np.exp(-0.5 * ((one[:, None] - other) / _SMOOTH) ** 2)
+
+        root = np.linalg.cholesky(related(knots, knots) + 1e-8 * np.eye(knots.size))
+        return solve_triangular(root, related(knots, np.log(u)), lower=True).T
+
+
+def _stacked(square: list, late: list, count: int) -> Float[np.ndarray, "2 n m"]:
+    """Return columns of the squared speed, then columns of the delay."""
+    found = np.zeros((2, count, len(square) + len(late)))
+    found[0, :, : len(square)] = np.reshape(square, (-1, count)).T
+    found[1, :, len(square) :] = np.reshape(late, (-1, count)).T
+    return found
+
+
+class Step(NamedTuple):
+    """The fit after the step.
+
+    Attributes:
+        names: of the parameters, then of the shapes.
+        values: of these.
+        change: by which they have moved.
+        covariance: of these; infinite where a direction is not determined.
+        chi2: with everything that is left out.
+        residual: of the amplitudes, in the objective's errors, what is left out being at its most likely.
+        unknown: their most likely values, of unit variance beforehand.
+        unknown_covariance: theirs for given parameters.
+        follow: how their most likely values change with the parameters.
+    """
+
+    names: tuple[str, ...]
+    values: Float[np.ndarray, " k"]
+    change: Float[np.ndarray, " k"]
+    covariance: Float[np.ndarray, "k k"]
+    chi2: float
+    residual: Float[np.ndarray, "rows 2"]
+    unknown: Float[np.ndarray, " m"]
+    unknown_covariance: Float[np.ndarray, "m m"]
+    follow: Float[np.ndarray, "m k"]
+
+
+def step_of(rows: StepRows, left_out: Unmodelled, free: Bool[np.ndarray, " p"]) -> Step:
+    """Return where one linear step leads from a fit, with all that is left out.
+
+    Args:
+        rows: of the fit.
+        left_out: by the fitted model.
+        free: which of its parameters are not at their bound.
+    """
+    count, names = rows.approach.size, left_out.problem.names
+    values = np.array([left_out.values[name] for name in names])
+    columns = left_out.columns(rows.approach, rows.rebound)
+    slopes = np.stack([rows.slopes.by_square, rows.slopes.by_delay])
+
+    def amplitudes(change):
+        """Return changes of the amplitudes' residuals that changes of the impacts make."""
+        return np.einsum("krc,kr...->rc...", slopes, change).reshape(2 * count, *change.shape[2:])
+
+    size, priors = len(values), left_out.priors
+    residual = rows.residual.copy()
+    residual[: 2 * count] += amplitudes(columns.known)
+    jacobian = np.zeros((residual.size + len(priors), size + len(priors)))
+    jacobian[: residual.size, :size] = rows.jacobian
+    if "viscous_loss" in names:
+        jacobian[: 2 * count, names.index("viscous_loss")] += amplitudes(columns.drag)
+    jacobian[: 2 * count, size:] = amplitudes(columns.shape)
+    jacobian[residual.size :, size:] = np.diag([1.0 / error for _, error in priors.values()])
+    residual = np.append(residual, np.zeros(len(priors)))
+    unknown = np.concatenate([amplitudes(columns.unknown), amplitudes(_remainders(rows))], axis=1)
+    variance = _noise(rows) + unknown @ unknown.T
+    root = np.linalg.cholesky(variance)
+
+    def whitened(matrix):
+        return np.concatenate([solve_triangular(root, matrix[: 2 * count], lower=True), matrix[2 * count :]])
+
+    white, slope = whitened(residual), whitened(jacobian)
+    moving = np.append(free, np.ones(len(priors), bool))
+    full = covariance_of(slope.T @ slope)
+    covariance = np.zeros_like(full)
+    covariance[np.ix_(moving, moving)] = covariance_of(slope[:, moving].T @ slope[:, moving])
+    held = np.flatnonzero(~moving)
+    covariance[held, held] = full[held, held]
+    begin = np.append(values, [mean for mean, _ in priors.values()])
+    ends = np.array([(PARAMETERS[name].lowest, PARAMETERS[name].highest) for name in (*names, *priors)])
+    change = _bounded(white, slope, begin, ends, moving & np.isfinite(np.diag(covariance)))
+    left = residual + jacobian @ change
+    factor = cho_factor(variance, lower=True)
+    gain = unknown.T @ cho_solve(factor, np.eye(2 * count))
+    likely = -gain @ left[: 2 * count]
+    return Step(
+        names=(*names, *priors),
+        values=begin + change,
+        change=change,
+        covariance=covariance,
+        chi2=float(np.sum((white + slope @ change) ** 2)),
+        residual=(left[: 2 * count] + unknown @ likely).reshape(count, 2),
+        unknown=likely,
+        unknown_covariance=np.eye(unknown.shape[1]) - gain @ unknown,
+        follow=-gain @ jacobian[: 2 * count],
+    )
+
+
+def _bounded(residual, slope, begin, ends, moving) -> Float[np.ndarray, " k"]:
+    """Return the least-squares step between bounds: what would leave its range is held at the end."""
+    change = np.zeros_like(begin)
+    moving = moving.copy()
+    for _ in range(begin.size):
+        change[moving] = np.linalg.lstsq(
+            slope[:, moving], -(residual + slope[:, ~moving] @ change[~moving]), rcond=None
+        )[0]
+        out = moving & ((begin + change < ends[:, 0]) | (begin + change > ends[:, 1]))
+        if not out.any():
+            break
+        change[out] = np.clip(begin + change, ends[:, 0], ends[:, 1])[out] - begin[out]
+        moving &= ~out
+    return change
+
+
+def _noise(rows: StepRows) -> Float[np.ndarray, "n n"]:
+    """Return the covariance of the amplitudes' residuals: measured errors, and what slow impacts lack."""
+    count = rows.approach.size
+    variance = np.zeros((count, 2, count, 2))
+    one = np.arange(count)
+    together, apart = 0.5 * (_TOGETHER + _APART), 0.5 * (_TOGETHER - _APART)
+    for i in range(2):
+        for j in range(2):
+            shared = (together if i == j else apart) * rows.slow_error[:, i] * rows.slow_error[:, j]
+            variance[one, i, one, j] = shared + (rows.measurement_error[:, i] ** 2 if i == j else 0.0)
+    return variance.reshape(2 * count, 2 * count)
+
+
+def _remainders(rows: StepRows) -> Float[np.ndarray, "2 rows m"]:
+    """Return the leading remainders of the corrections, of the squared rebound speed and of the delay."""
+    u, w, g, j, time = rows.approach, rows.rebound, rows.pull, rows.change, rows.hertz_time
+    slope = max(float(np.polyfit(u, u**2 - w**2, 1)[0]), 0.0)
+    nothing = np.zeros_like(u)
+    late = (0.5 * g / w**3, 0.008 * g * time**2 / u, 8.0 * j / w**4)
+    gained = (15.0 * slope * j / w**2, 2.0 * slope * g / u, 0.06 * j * time**2 * u, 5.0 * g**2 / w**2)
+    columns = [(nothing, one) for one in late] + [(one, nothing) for one in gained]
+    return _CORRECTIONS * np.moveaxis(np.array(columns), 0, 2)
+
+
+def rows_of_fit(
+    stated: Objective, objective: Objective, values: Float[np.ndarray, " p"], strain: Strain, scale: float
+) -> StepRows:
+    """Return the rows of a fit as the step sees them.
+
+    Args:
+        stated: the objective with the errors as measured.
+        objective: the fit's, following its orbits.
+        values: the fitted ones.
+        strain: of the rows.
+        scale: of the errors.
+    """
+    problem, rows = objective.problem, jax.tree.map(np.asarray, objective.measurement.rows)
+    plain = Objective(objective.measurement, problem, near=objective.near)
+    linear = plain.at_values(values[None])
+    prediction = jax.tree.map(lambda leaf: np.asarray(leaf)[0], linear.prediction)
+    impact = impact_of(jnp.asarray(values), objective.measurement, problem)
+    speeds = jax.tree.map(np.asarray, jax.vmap(impact.speeds)(jnp.asarray(prediction.coordinate)))
+    known = {name: float(value) for name, value in zip(problem.names, values, strict=True)}
+    cantilever = problem.cantilever(jnp.asarray(values), objective.measurement.cantilever)
+    omega = RAD_PER_US_PER_KHZ * rows.drive_frequency_khz
+    height = rows.drive_amplitude_nm * known.get("drive_calibration", 1.0)
+    phase = prediction.arrival_rad + 0.5 * omega * speeds.delay
+    cosine, sine = height * np.cos(phase), height * np.sin(phase)
+    position = rows.offset_nm + known.get("offset_origin_nm", 0.0) + cosine
+    spring, air = float(cantilever.angular_frequency) ** 2, 2.0 * float(cantilever.decay_rate)
+    measured = np.asarray(objective.measurement.rows.measured)
+    error = np.where(measured, rows.error_nm, 1.0)
+    if objective.robust:
+        # the squares' weights, at which least squares have the same minimum
+        error = error * (1.0 + (plain.misfit(linear) / ROBUST) ** 2) ** -0.25
+    there = prediction.orbits > 0
+    return StepRows(
+        residual=np.asarray(linear.residual)[0],
+        jacobian=np.asarray(linear.jacobian)[0],
+        slopes=impact_slopes(values, objective.measurement, problem, objective.near),
+        measurement_error=np.where(measured, scale * np.asarray(stated.measurement.rows.error_nm) / error, 1.0),
+        slow_error=np.where(measured, scale * strain.slow_error[:, None] * rows.amplitude_nm / error, 0.0),
+        approach=np.where(there, speeds.approach, 100.0),
+        rebound=np.where(there, speeds.rebound, 99.0),
+        pull=np.where(there, -spring * position + air * omega * sine + omega**2 * cosine, 0.0),
+        change=np.where(there, -(omega**3) * sine, 0.0),
+        hertz_time=np.asarray(impact.hertz_time(jnp.asarray(speeds.approach))),
+    )
+
+
+class LawAfter(NamedTuple):
+    """Rebound speeds in nm/us and delays in us, capture speed, and how they change with unknowns of unit variance."""
+
+    law: Float[np.ndarray, "2 n"]
+    factor: Float[np.ndarray, "2 n m"]
+    capture: float
+    capture_factor: Float[np.ndarray, " m"]
+
+
+class LawBefore(NamedTuple):
+    """The fitted law at approach speeds in nm/us, with its derivatives by the parameters.
+
+    Rebound speeds in nm/us and delays in us, and the capture speed in nm/us.
+    """
+
+    law: Float[np.ndarray, "2 n"]
+    slope: Float[np.ndarray, "2 n p"]
+    capture: float
+    capture_slope: Float[np.ndarray, " p"]
+
+
+def law_after(step: Step, left_out: Unmodelled, speeds: Float[np.ndarray, " n"], before: LawBefore) -> LawAfter:
+    """Return the law after the step.
+
+    Args:
+        step: the step.
+        left_out: by the fitted model.
+        speeds: approach speeds in nm/us.
+        before: the fitted law there.
+    """
+    law, slope = before.law, before.slope
+    leaves = law[0] > 0.0
+    w = np.where(leaves, law[0], 1.0)
+    # what changes the speed changes the delay along with it
+    lead = left_out.values.get("delay_lead_nm", 0.0) / (2.0 * w**3)
+
+    def seen(change):
+        """Return changes of speed and delay for changes of squared speed and delay."""
+        square, late = change
+        along = (slice(None), *(None,) * (square.ndim - 1))
+        return np.stack([square / (2.0 * w)[along], late + lead[along] * square])
+
+    columns = left_out.columns(speeds, w)
+    found, factor = _moved(step, slope, Columns(*(seen(part) for part in columns)))
+    found = np.where(leaves, law + found, law)
+    found[0] = np.maximum(found[0], 0.0)
+    # where the squared rebound speed vanishes
+    edge = left_out.columns(np.array([before.capture]), np.zeros(1)) if before.capture > 0.0 else columns
+    rising = 2.0 * left_out.values.get("r", 1.0) ** 2 * before.capture - left_out.values.get("viscous_loss", 0.0)
+    at_capture = Columns(*(-part[:1, :1] / max(rising, 1e-9) for part in edge))
+    shift, capture_factor = _moved(step, before.capture_slope[None, None], at_capture)
+    return LawAfter(
+        law=found,
+        factor=np.where(leaves[:, None], factor, 0.0),
+        capture=max(before.capture + float(shift[0, 0]), 0.0),
+        capture_factor=capture_factor[0, 0],
+    )
+
+
+def _moved(
+    step: Step, slope: Float[np.ndarray, "k n p"], columns: Columns
+) -> tuple[Float[np.ndarray, "k n"], Float[np.ndarray, "k n m"]]:
+    """Return by how much quantities move in the step, and how they change with unknowns of unit variance.
+
+    Args:
+        step: the step.
+        slope: of the quantities by the model's parameters.
+        columns: changes of the quantities with what is left out.
+    """
+    by_value = np.concatenate([slope, columns.shape], axis=2)
+    if "viscous_loss" in step.names:
+        by_value[:, :, step.names.index("viscous_loss")] += columns.drag
+    count = columns.unknown.shape[2]
+    moved = columns.known + by_value @ step.change + columns.unknown @ step.unknown[:count]
+    total = by_value + columns.unknown @ step.follow[:count]
+    own = columns.unknown @ root_of(step.unknown_covariance[:count, :count])
+    return moved, np.concatenate([total @ root_of(step.covariance), own], axis=2)
+
+
+def root_of(covariance: Float[np.ndarray, "k k"]) -> Float[np.ndarray, "k k"]:
+    """Return a matrix whose product with its transpose is the covariance; NaN where that is not finite."""
+    if not np.all(np.isfinite(covariance)):
+        return np.full_like(covariance, np.nan)
+    error = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    safe = np.where(error > 0.0, error, 1.0)
+    variance, axes = np.linalg.eigh(covariance / np.outer(safe, safe))
+    return error[:, None] * axes * np.sqrt(np.maximum(variance, 0.0))

@@ -1,0 +1,317 @@
+"""The parameters of fitted models, written once: fits, plans, inversion, help texts and reports take theirs here.
+
+Without JAX or NumPy, so that `--help` needs none.
+"""
+
+import math
+from dataclasses import dataclass
+
+from afm_jax.contact.parameters import CONTACT_PARAMETERS, PAPER
+
+
+@dataclass(frozen=True, kw_only=True)
+class Parameter:
+    """A fit parameter: what it is, where it may lie, and where a search for it starts.
+
+    Attributes:
+        name: as in tables, options and reports; a parameter of the law is called like its field of `ImpactLaw`, one of
+            the delay like its field of `CollisionDelay` with "delay_" before it.
+        unit: in words.
+        meaning: what it is, in a line.
+        lowest: end of the range that a fit may take.
+        highest: its other end.
+        reference: the value that stands for its absence, from which ``sign`` and ``width`` count.
+        sign: of a loss: the optimiser's coordinate y is that of value = reference + sign y^2. The bound becomes an
+            interior, smooth minimum of the coordinate, so that a fit that ends there converges like any other.
+        width: of a parameter of any sign: the coordinate is that of value = reference + width y. Without both the
+            coordinate is the logarithm of the value.
+        starts: range within which searches start, of the loss where there is a ``sign``, else of the value; even where
+            there is a ``width`` or it is ``even``, else logarithmic.
+        even: see ``starts``.
+        drive_power: ``starts`` are in units of this power of the drives' speeds beta omega, the lowest of the slowest
+            drive and the highest of the fastest, for on them depends what an impact captures.
+        mass_power: likewise of the effective mass in ng.
+        advice: what to measure so that the amplitudes determine it, if there is more to say than of any.
+        symbol: in the formulas of a report; none: its name.
+        example: of a quantity of the instrument, given with its error.
+    """
+
+    name: str
+    unit: str = ""
+    meaning: str = ""
+    lowest: float
+    highest: float
+    reference: float = 0.0
+    sign: int = 0
+    width: float = 0.0
+    starts: tuple[float, float] | None = None
+    even: bool = False
+    drive_power: float = 0.0
+    mass_power: float = 0.0
+    advice: str = ""
+    symbol: str = ""
+    example: str = ""
+
+    @property
+    def bound(self) -> float | None:
+        """The value at which the loss vanishes; None for a parameter without such an end."""
+        return self.reference if self.sign else None
+
+
+_SLOW = "measure slow impacts too: small drives, close to where the orbit is lost"
+
+LAW = (
+    Parameter(
+        name="r",
+        meaning="coefficient of restitution",
+        lowest=0.01,
+        highest=1.0,
+        reference=1.0,
+        sign=-1,
+        starts=(0.7, 1e-4),
+        advice="measure fast impacts too: large drives on resonance, and give the quality factor with its error",
+    ),
+    Parameter(
+        name="epsilon",
+        unit="nm^2/us^2",
+        meaning="adhesion, 2 delta/m",
+        lowest=0.0,
+        highest=1e12,
+        sign=1,
+        starts=(1e-4, 30.0),
+        drive_power=2.0,
+        advice=_SLOW,
+        symbol="ε",
+    ),
+    Parameter(
+        name="viscous_loss",
+        unit="nm/us",
+        meaning="loss linear in speed",
+        lowest=0.0,
+        highest=1e6,
+        sign=1,
+        starts=(1e-4, 10.0),
+        drive_power=1.0,
+        advice="measure over a wider range of drives at the same frequency",
+        symbol="c",
+    ),
+)
+"""What an impact law is made of."""
+
+DELAY = (
+    Parameter(
+        name="delay_hertz",
+        unit="us (nm/us)^0.2",
+        meaning="Hertz contact time at 1 nm/us",
+        lowest=0.0,
+        highest=1e3,
+        sign=1,
+        # a factor of 5 around the paper's tip
+        starts=(0.04, 1.0),
+        mass_power=0.4,
+        advice="measure at several orders, detuned to both sides of each resonance",
+        symbol="a",
+    ),
+    Parameter(
+        name="delay_lead_nm",
+        unit="nm",
+        meaning="lead of a slow way out",
+        lowest=-300.0,
+        highest=300.0,
+        width=5.0,
+        starts=(0.0, 10.0),
+        advice=_SLOW,
+        symbol="b",
+    ),
+    Parameter(
+        name="delay_offset_nm",
+        unit="nm",
+        meaning="offset of the contact surface, twice",
+        lowest=-100.0,
+        highest=100.0,
+        width=1.0,
+        starts=(-0.5, 1.5),
+        advice="measure at several offsets and drives",
+        symbol="d",
+    ),
+)
+"""What a collision delay is made of."""
+
+NUISANCES = (
+    Parameter(name="quality_factor", meaning="of the free resonance", lowest=0.51, highest=1e9, example="40 +- 2"),
+    Parameter(
+        name="offset_origin_nm",
+        unit="nm",
+        meaning="what the table's offsets lack",
+        lowest=-1e3,
+        highest=1e3,
+        width=1.0,
+        example="0 +- 0.3",
+    ),
+    Parameter(
+        name="tip_calibration",
+        meaning="measured over true amplitude of the tip",
+        lowest=0.1,
+        highest=10.0,
+        example="1 +- 0.02",
+    ),
+    Parameter(
+        name="drive_calibration",
+        meaning="true over stated amplitude of the platform",
+        lowest=0.1,
+        highest=10.0,
+        example="1 +- 0.02",
+    ),
+)
+"""What the instrument adds; each has a Gaussian constraint."""
+
+SHAPES = (
+    Parameter(
+        name="loss_speed_squared_nm2_per_us2",
+        unit="nm^2/us^2",
+        meaning="square of the speed by which a bridge's pull raises that of the drag",
+        lowest=0.0,
+        highest=1e6,
+        symbol="q",
+    ),
+    Parameter(
+        name="delay_square_nm2_per_us",
+        unit="nm^2/us",
+        meaning="second term of the lead of a slow way out",
+        lowest=-1e6,
+        highest=1e6,
+        symbol="f",
+    ),
+)
+"""What decides the shape of loss and delay of a model that has both, beside its parameters; each has a prior."""
+
+CONTACT = tuple(
+    Parameter(
+        name=known.name,
+        unit=known.unit,
+        meaning=known.meaning,
+        lowest=known.fitted[0],
+        highest=known.fitted[1],
+        width=known.width,
+        starts=known.starts,
+        even=known.evenly is not None,
+        advice=known.advice,
+    )
+    for known in CONTACT_PARAMETERS
+)
+"""The parameters of `Contact.paper`, by its keywords."""
+
+PARAMETERS = {parameter.name: parameter for parameter in (*LAW, *DELAY, *SHAPES, *NUISANCES, *CONTACT)}
+"""All of them by name."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class LawFormula:
+    """A law that can be fitted, of the loss or of the delay.
+
+    Attributes:
+        paper: its parameters, with their values for the paper's contact: what is believed where nothing was measured.
+        formula: of rebound speed or delay.
+        shaped: the same with the numbers of `SHAPES`, which a fit with a delay has besides.
+        meaning: what it says, in a line.
+    """
+
+    paper: dict[str, float]
+    formula: str
+    shaped: str = ""
+    meaning: str
+
+
+LAWS = {
+    "restitution": LawFormula(
+        paper={"r": 0.998}, formula="u_out = r u_in", meaning="a restitution without adhesion (r)"
+    ),
+    "law": LawFormula(
+        paper={"r": 0.998, "epsilon": 122.0},
+        formula="u_out^2 = r^2 u_in^2 - epsilon",
+        meaning="a restitution with adhesion (r, epsilon)",
+    ),
+    "viscous": LawFormula(
+        paper={"epsilon": 113.6, "viscous_loss": 0.5},
+        formula="u_out^2 = u_in^2 - viscous_loss u_in - epsilon",
+        shaped="u_out^2 = u_in^2 - viscous_loss sqrt(u_in^2 + loss_speed_squared_nm2_per_us2) - epsilon",
+        meaning="a loss linear in speed with adhesion (epsilon, viscous_loss)",
+    ),
+}
+DELAY_LAW = LawFormula(
+    paper={"delay_hertz": 0.206, "delay_lead_nm": 5.64, "delay_offset_nm": 0.726},
+    formula="tau = delay_hertz u_in^(-1/5) - delay_lead_nm (1/u_out - 1/u_in) - delay_offset_nm/u_in",
+    shaped="tau = delay_hertz u_in^(-1/5) - delay_lead_nm (1/u_out - 1/u_in) - delay_offset_nm/u_in "
+    "+ delay_square_nm2_per_us (1/u_out^2 - 1/u_in^2)",
+    meaning="the collision delay, which amplitudes near resonance need",
+)
+DELAY_NAMES = tuple(DELAY_LAW.paper)
+LOSS_SHAPE, DELAY_SHAPE = SHAPE_NAMES = tuple(parameter.name for parameter in SHAPES)
+NUISANCE_NAMES = tuple(parameter.name for parameter in NUISANCES)
+CONTACT_NAMES = tuple(parameter.name for parameter in CONTACT)
+CONTACT_DEFAULT = ("relative_humidity", "adhesion_energy_j_per_m2", "viscosity_pa_s", "modulus_gpa")
+"""What the model "contact" fits if nothing else is asked for."""
+MODELS = {
+    **{name: tuple(law.paper) for name, law in LAWS.items()},
+    **{f"{name}+delay": (*law.paper, *DELAY_NAMES) for name, law in LAWS.items()},
+    "contact": (),
+}
+"""Parameters of each model; those of "contact" are chosen."""
+
+
+def model_parameters(model: str, free: tuple[str, ...] | None = None) -> tuple[str, ...]:
+    """Return the names of a model's own parameters, nuisances apart.
+
+    Args:
+        model: a key of `MODELS`.
+        free: for "contact": which of its parameters are fitted; None for `CONTACT_DEFAULT`.
+
+    Raises:
+        ValueError: if there is no such model or parameter, or a law's parameters are to be chosen.
+    """
+    if model not in MODELS:
+        raise ValueError(f"`model` must be one of {', '.join(MODELS)}, but is {model!r}")
+    if model != "contact":
+        if free is not None:
+            raise ValueError(f"`free` chooses among the contact's parameters; the model {model!r} has none to choose")
+        return MODELS[model]
+    chosen = CONTACT_DEFAULT if free is None else free
+    for name in chosen:
+        if name not in CONTACT_NAMES:
+            raise ValueError(f"`free` must be chosen from {', '.join(CONTACT_NAMES)}, but one is {name!r}")
+    if len(set(chosen)) < len(chosen) or not chosen:
+        raise ValueError("`free` must name at least one parameter, and none twice")
+    return chosen
+
+
+def paper_values(model: str) -> dict[str, float]:
+    """Return the values of a model's parameters for the paper's contact.
+
+    Args:
+        model: a key of `MODELS`.
+    """
+    if model == "contact":
+        return PAPER
+    values = LAWS[model.removesuffix("+delay")].paper
+    return values | DELAY_LAW.paper if model.endswith("+delay") else values
+
+
+def check_contact_values(model: str, fixed: dict[str, float] | None) -> None:
+    """Check the values of contact parameters that are held fixed.
+
+    Raises:
+        ValueError: if the model has none, or a name or value is impossible.
+    """
+    if not fixed:
+        return
+    if model != "contact":
+        raise ValueError(f"`fixed` gives values of contact parameters; the model {model!r} has none")
+    for name, value in fixed.items():
+        if name not in CONTACT_NAMES:
+            raise ValueError(
+                f"`fixed` must name parameters of the contact ({', '.join(CONTACT_NAMES)}), but one is {name!r}"
+            )
+        parameter = PARAMETERS[name]
+        if not math.isfinite(value) or not parameter.lowest <= value <= parameter.highest:
+            between = f"between {parameter.lowest:g} and {parameter.highest:g} {parameter.unit}".rstrip()
+            raise ValueError(f"`fixed`: {name} must lie {between}, but is {value!r}")

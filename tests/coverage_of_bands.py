@@ -1,0 +1,168 @@
+"""Whole fits of random contacts: how often the 95 % band of the law holds the truth, which is not the fitted model.
+
+    python -m tests.coverage_of_bands [--contacts 10] [--seeds 5] [--model viscous+delay] [--truths FOLDER]
+
+Every contact is measured with noise of 0.3, 1 and 3 % and a Q that scatters by its error; the amplitudes are those of
+the full scene (`contact_truths`), kept in the folder. Counted are the approach speeds between 30 and 200 nm/us that
+were measured. `make bands` runs it; the exit status is 1 if less is reached than is `WANTED`.
+"""
+
+import argparse
+import dataclasses
+import sys
+import tempfile
+import zlib
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from fitting.fits.fit import find_fit, law_with_band, summarise
+from fitting.fits.intervals import at_bound, covariance
+from fitting.fits.result import FittedLaw
+from fitting.simulated.experiment import with_noise
+from fitting.tables.table import AmplitudeTable
+from tests.contact_truths import ERROR_OF_Q, ContactTruth, contact_truth, exact_table
+
+NOISES = (0.003, 0.01, 0.03)
+SLOWEST, FASTEST = 30.0, 200.0
+_SPEEDS = 40
+
+
+class Wanted(NamedTuple):
+    """What is wanted at a noise: mean coverage, and growth of the bands over those of the model taken at its word."""
+
+    coverage: float
+    growth: float
+
+
+WANTED = {0.003: Wanted(0.93, 1.7), 0.01: Wanted(0.95, 1.5), 0.03: Wanted(0.94, 1.3)}
+WORST_CONTACT = 0.85
+MEDIAN_Z, WORST_Z = 1.2, 2.5
+PER_DEGREE = (0.8, 1.1)
+LAW_ERROR = 1e-3
+"""Median relative error of the law of viscous+delay at 1 % noise."""
+
+
+class Measured(NamedTuple):
+    """One fit against the truth, over the speeds.
+
+    The share inside the band, the largest deviation over the half-width, the medians of the band's growth and of the
+    relative error of the law; and chi2 per degree of freedom.
+    """
+
+    contact: int
+    valid: bool
+    coverage: float
+    worst_z: float
+    growth: float
+    error: float
+    per_degree: float
+
+
+def noisy(exact: AmplitudeTable, noise: float, random: np.random.Generator) -> AmplitudeTable:
+    """Return a table as it would have been measured, Q too."""
+    stated = dataclasses.replace(
+        exact,
+        peak_amplitude_error_nm=noise * np.asarray(exact.peak_amplitude_nm),
+        lockin_amplitude_error_nm=noise * np.asarray(exact.lockin_amplitude_nm),
+        quality_factor=(exact.quality_factor or 0.0) * (1.0 + ERROR_OF_Q * random.normal()),
+    )
+    return with_noise(stated, random.normal(size=(3, exact.rows)))
+
+
+def measured(truth: ContactTruth, table: AmplitudeTable, model: str) -> Measured:
+    """Return what a fit of a table amounts to."""
+    found = find_fit(table, model)
+    result = summarise(table, found)
+    values = found.objective.problem.values(found.minimum.coordinates)
+    objective = found.objective.following(values)
+    own = covariance(objective, values, ~at_bound(objective, values))
+    used = np.where(result.rows.used, result.rows.approach_speed_nm_per_us, np.nan)
+    word = law_with_band(objective.problem, objective.measurement, values, own, used)
+    if not (result.valid and np.isfinite(used).any()):
+        return Measured(truth.number, False, *(np.full(5, np.nan).tolist()))  # noqa: FBT003
+    speeds = np.geomspace(max(SLOWEST, np.nanmin(used)), min(FASTEST, np.nanmax(used)), _SPEEDS)
+    right = truth.rebound_and_delay(speeds)[0]
+    inside = np.isfinite(right)
+    speeds, right = speeds[inside], right[inside]
+    fitted, half = _law(result.law, speeds)
+    z = np.abs(fitted - right) / half
+    return Measured(
+        contact=truth.number,
+        valid=True,
+        coverage=float(np.mean(z <= 1.0)),
+        worst_z=float(z.max()),
+        growth=float(np.median(half / _law(word, speeds)[1])),
+        error=float(np.median(np.abs(fitted / right - 1.0))),
+        per_degree=result.chi2 / result.degrees_of_freedom,
+    )
+
+
+def _law(law: FittedLaw, speeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return rebound speeds and half-widths of the band at approach speeds."""
+    columns = (law.rebound_speed_nm_per_us, law.rebound_high_nm_per_us - law.rebound_speed_nm_per_us)
+    fitted, half = (np.interp(speeds, law.approach_speed_nm_per_us, column) for column in columns)
+    return fitted, half
+
+
+def shortfalls(noise: float, fits: list[Measured], model: str) -> tuple[str, list[str]]:
+    """Return a line about the fits at a noise, and what is not as wanted."""
+    valid = [fit for fit in fits if fit.valid]
+    if not valid:
+        return f"{100 * noise:g} %: no valid fit", ["a valid fit"]
+    contacts = sorted({fit.contact for fit in valid})
+    shares = [np.mean([fit.coverage for fit in valid if fit.contact == contact]) for contact in contacts]
+    z, growth, error, degree = (
+        np.array([getattr(fit, name) for fit in valid]) for name in ("worst_z", "growth", "error", "per_degree")
+    )
+    wanted = WANTED[noise]
+    line = (
+        f"{100 * noise:g} %: {len(valid)} of {len(fits)} valid; coverage {np.mean(shares):.3f}, worst contact "
+        f"{min(shares):.2f} (number {contacts[int(np.argmin(shares))]}); worst |z| {np.median(z):.2f} in the median, "
+        f"{z.max():.2f} at most; bands {np.median(growth):.2f} times as wide; chi2/dof {np.median(degree):.2f}; "
+        f"law error {100 * np.median(error):.3f} %"
+    )
+    tests = {
+        f"coverage of {wanted.coverage:g}": np.mean(shares) >= wanted.coverage,
+        f"coverage of {WORST_CONTACT:g} of the worst contact": min(shares) >= WORST_CONTACT,
+        f"a median worst |z| of {MEDIAN_Z:g}": np.median(z) <= MEDIAN_Z,
+        f"a worst |z| of {WORST_Z:g}": z.max() <= WORST_Z,
+        f"bands {wanted.growth:g} times as wide": np.median(growth) <= wanted.growth,
+        f"a chi2/dof of {PER_DEGREE[0]:g} to {PER_DEGREE[1]:g}": PER_DEGREE[0] <= np.median(degree) <= PER_DEGREE[1],
+    }
+    if noise == 0.01 and model == "viscous+delay":
+        tests[f"a law error of {100 * LAW_ERROR:g} %"] = np.median(error) <= LAW_ERROR
+    return line, [name for name, reached in tests.items() if not reached]
+
+
+def main() -> int:
+    """Measure, print and judge."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0] if __doc__ else None)
+    parser.add_argument("--contacts", default="0:10", help="numbers of the random contacts, first:end")
+    parser.add_argument("--seeds", type=int, default=5, help="tables of each contact and noise")
+    parser.add_argument("--model", default="viscous+delay")
+    parser.add_argument("--truths", type=Path, default=Path(tempfile.gettempdir()) / "afm-jax-truths")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)  # noqa: FBT003
+    first, end = (int(number) for number in options.contacts.split(":"))
+    fits: dict[float, list[Measured]] = {noise: [] for noise in NOISES}
+    for number in range(first, end):
+        truth = contact_truth(number)
+        exact = exact_table(truth, options.truths)
+        for noise, seed in ((noise, seed) for noise in NOISES for seed in range(options.seeds)):
+            random = np.random.default_rng([zlib.crc32(str(noise).encode()), number, seed])
+            found = measured(truth, noisy(exact, noise, random), options.model)
+            fits[noise].append(found)
+            sys.stderr.write(f"contact {number}, {100 * noise:g} %, table {seed}: {found}\n")
+    missed = 0
+    for noise, some in fits.items():
+        line, short = shortfalls(noise, some, options.model)
+        missed += len(short)
+        sys.stdout.write(f"{line}\n" + "".join(f"    MISSED: {name}\n" for name in short))
+    return 1 if missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,398 @@
+"""Continuation: special points against closed forms, curves in two parameters, and the errors that a fit gives them.
+
+Closed forms of the undamped oscillator: eq. 9's orbits and eq. 8's trace, written out here, and eq. 6's capture speed;
+the grazing of a resting and of a driven tip.
+"""
+
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+from scipy.optimize import brentq
+
+from afm_jax import Cantilever, CollisionDelay, ForceDrive, ImpactLaw, Platform, Scene, next_impact, save_scene
+from afm_jax.cli.main import main
+from afm_jax.dynamics.bands import UncertainParameters, drawn_points, special_errors
+from afm_jax.dynamics.continuation import Continuation, continue_orbits
+from afm_jax.impact.closure import OrbitProblem, closing_residual
+from afm_jax.impact.lasting_impact import LawImpact
+from afm_jax.plots.branches import draw_continuation, draw_curves
+from afm_jax.scenefile.parameter_paths import ParameterRange
+
+FREE = 2.0 * np.pi * 0.09
+"""Omega in rad/us."""
+
+
+def scene(
+    amplitude_nm: float = 2.0, n: float = 1.05, r: float = 0.5, epsilon: float = 0.0, offset: float = -1.0
+) -> Scene:
+    return Scene(Cantilever(90.0), Platform(amplitude_nm, 180.0 * n, offset), ImpactLaw(r, epsilon))
+
+
+def eq9_orbit(
+    n: float, beta: float, sigma: float, r: float, approach: float, order: int = 1
+) -> tuple[float, float, float]:
+    """Return sine and cosine of the impact phase and V' of the undamped (1, N) orbit with an approach speed.
+
+    The flight of duration N T returns to its height: V = -V', z = V' cot(Omega N T/2)/Omega. With u = v_p - V and
+    w = V' - v_p: V' = (u + w)/2, v_p = (u - w)/2. Returns the sum of squares of both less one besides: 0 on an orbit.
+    """
+    omega = 2.0 * n * FREE
+    rebound = r * approach
+    after = 0.5 * (approach + rebound)
+    sine = -0.5 * (approach - rebound) / (beta * omega)
+    cosine = (after / FREE / np.tan(FREE * np.pi * order / omega) - sigma) / beta
+    return sine, cosine, after
+
+
+def eq8_trace(n: float, beta: float, sine: float, cosine: float, after: float, r: float, order: int = 1) -> float:
+    """Return T of eq. 8 as the paper prints it (V = -V')."""
+    omega = 2.0 * n * FREE
+    turn = FREE * 2.0 * np.pi * order / omega
+    c, s = np.cos(turn), np.sin(turn)
+    v_p = -beta * omega * sine
+    ratio = (-after - v_p) / (after - v_p)
+    bracket = (
+        beta * omega * sine
+        - beta * omega * sine * c
+        - (after + beta * omega * sine * c) * r**2 * ratio
+        + beta * omega**2 / FREE * cosine * s * (r**2 * ratio - 1.0)
+    )
+    return 1.0 + bracket / (v_p + after)
+
+
+def orbit_of(n: float, beta: float, sigma: float, r: float, near: float) -> tuple[float, float, float]:
+    """Return sine, cosine and V' of the orbit whose approach speed is next to one."""
+
+    def misses(approach: float) -> float:
+        sine, cosine, _ = eq9_orbit(n, beta, sigma, r, approach)
+        return sine**2 + cosine**2 - 1.0
+
+    low, high = 0.8 * near, 1.2 * near
+    return eq9_orbit(n, beta, sigma, r, float(brentq(misses, low, high, xtol=1e-15)))
+
+
+def only(found: Continuation, kind: str) -> list[float]:
+    return [point.parameter for point in found.special if point.kind == kind]
+
+
+@pytest.fixture(scope="module")
+def doubled() -> Continuation:
+    """The (1, 1) orbit of a lossy undamped oscillator through its period doubling, followed in the offset too."""
+    given = ParameterRange("platform.reduced_frequency", 0.9, 1.4)
+    return continue_orbits(scene(), 1, given, second=ParameterRange("platform.offset_nm", -1.9, 0.0))
+
+
+@pytest.mark.slow
+def test_period_doubling_is_that_of_eq_8(doubled: Continuation):
+    (at,) = only(doubled, "period_doubling")
+    speed = float(doubled.special[0].reading.approach_speed_nm_per_us[0])
+
+    def stability(n: float) -> float:
+        sine, cosine, after = orbit_of(n, 2.0, -1.0, 0.5, speed)
+        return eq8_trace(n, 2.0, sine, cosine, after, 0.5) + 1.25
+
+    assert at == pytest.approx(brentq(stability, at - 0.01, at + 0.01, xtol=1e-15), abs=1e-8)
+
+
+@pytest.mark.slow
+def test_points_on_a_branch_are_eq_9s_orbits_with_eq_8s_trace(doubled: Continuation):
+    (branch,) = doubled.branches
+    assert branch.parameter[[0, -1]] == pytest.approx([0.9, 1.4])
+    for index in range(0, len(branch.parameter), 7):
+        n, reading = branch.parameter[index], branch.reading
+        sine, cosine, after = orbit_of(n, 2.0, -1.0, 0.5, float(reading.approach_speed_nm_per_us[index, 0]))
+        assert np.exp(1j * reading.phase_rad[index, 0]) == pytest.approx(cosine + 1j * sine, abs=1e-10)
+        assert reading.velocity_after_nm_per_us[index, 0] == pytest.approx(after, rel=1e-10)
+        assert reading.trace[index] == pytest.approx(eq8_trace(n, 2.0, sine, cosine, after, 0.5), rel=1e-9)
+        assert reading.determinant[index] == pytest.approx(0.25, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_a_curve_in_two_parameters_is_eq_8_all_along(doubled: Continuation):
+    (curve,) = doubled.curves
+    assert curve.kind == "period_doubling"
+    assert np.ptp(curve.second) == pytest.approx(1.9)
+    for n, sigma in zip(curve.parameter[::4], curve.second[::4], strict=True):
+        # of all orbits there one must be at the doubling
+        speeds = np.linspace(0.05, 40.0, 4001)
+        sine, cosine, _ = eq9_orbit(n, 2.0, sigma, 0.5, speeds)
+        miss = sine**2 + cosine**2 - 1.0
+        near = speeds[:-1][miss[:-1] * miss[1:] < 0.0]
+        orbits = [orbit_of(n, 2.0, sigma, 0.5, float(speed) + 0.005) for speed in near]
+        left = [abs(eq8_trace(n, 2.0, *orbit, 0.5) + 1.25) for orbit in orbits]
+        assert min(left) < 1e-7
+
+
+@pytest.mark.slow
+def test_with_adhesion_a_branch_turns_at_a_fold_and_ends_at_capture():
+    # Undamped, eq. 9 closed for the capture speed u = sqrt(epsilon)/r: then w = 0, V' = u/2 = v_p.
+    r, epsilon, n, sigma = 0.95, 60.0, 1.01, -1.0
+    found = continue_orbits(scene(4.0, n, r, epsilon), 1, ParameterRange("platform.amplitude_nm", 0.5, 6.0))
+    (captured,) = only(found, "capture")
+    speed = np.sqrt(epsilon) / r
+    omega = 2.0 * n * FREE
+    height = 0.5 * speed / FREE / np.tan(FREE * np.pi / omega)
+    assert captured == pytest.approx(np.hypot(height - sigma, 0.5 * speed / omega), abs=1e-8)
+
+    # the fold: the smallest amplitude that closes eq. 9 for any speed
+    def amplitude(u: float) -> float:
+        w = np.sqrt((r * u) ** 2 - epsilon)
+        after = 0.5 * (u + w)
+        return float(np.hypot(after / FREE / np.tan(FREE * np.pi / omega) - sigma, 0.5 * (u - w) / omega))
+
+    def slope(u: float) -> float:
+        return (amplitude(u + 1e-5) - amplitude(u - 1e-5)) / 2e-5
+
+    (fold,) = only(found, "fold")
+    turn = float(brentq(slope, 1.05 * speed, 10.0 * speed))
+    assert fold == pytest.approx(amplitude(turn), abs=1e-8)
+    point = next(point for point in found.special if point.kind == "fold")
+    # |T| = |1 + D| there
+    assert float(point.reading.trace) == pytest.approx(1.0 + r**2, rel=1e-8)
+
+
+@pytest.mark.slow
+def test_a_resting_and_a_driven_tip_graze_where_they_must():
+    rest = continue_orbits(scene(), 1, ParameterRange("platform.amplitude_nm", 0.2, 4.0), impacts=0)
+    assert only(rest, "grazing") == pytest.approx([1.0], abs=1e-8)
+    assert np.array_equal(rest.branches[0].reading.admissible, rest.branches[0].parameter <= 1.0)
+    # A tip driven by a force of 0.08 nN over a resting sample: the free amplitude of a damped oscillator of 1 ng.
+    drive, quality = 2.0 * np.pi * 0.089, 40.0
+    size = 0.08 / np.hypot(FREE**2 - drive**2, FREE * drive / quality)
+    driven = Scene(Cantilever(90.0, quality), Platform(0.0, 90.0, -5.0), ImpactLaw(0.9), force=ForceDrive(0.08, 89.0))
+    given = ParameterRange("platform.offset_nm", -10.0, -4.0)
+    free = continue_orbits(driven, 1, given, impacts=0)
+    assert only(free, "grazing") == pytest.approx([-size], abs=1e-8)
+    assert float(free.special[0].reading.peak_amplitude_nm) == pytest.approx(size, rel=1e-9)
+    # the orbit of one impact begins there, with a speed of 0
+    one = continue_orbits(driven, 1, given)
+    assert only(one, "grazing") == pytest.approx([-size], abs=1e-8)
+
+
+@pytest.mark.slow
+def test_multipliers_cross_the_circle_at_a_torus_point():
+    # What happens during an impact that lasts can feed a motion that nothing else damps.
+    lasting = ImpactLaw(0.99, 0.0, 0.0, CollisionDelay(0.206, 0.0, 0.0))
+    damped = Scene(Cantilever(90.0), Platform(4.0, 181.8, -1.0), lasting)
+    found = continue_orbits(damped, 1, ParameterRange("interaction.r", 0.97, 1.0))
+    (at,) = only(found, "torus")
+    assert 0.97 < at < 1.0
+    reading = found.special[0].reading
+    there = Scene(damped.cantilever, damped.platform, ImpactLaw(at, 0.0, 0.0, lasting.delay))
+    start = np.array([reading.phase_rad[0] / (2.0 * np.pi * 0.1818), reading.velocity_after_nm_per_us[0]])
+
+    def after(time: float, velocity: float) -> np.ndarray:
+        impact = next_impact(there, time, velocity)
+        return np.array([float(impact.time_us), float(impact.velocity_after_nm_per_us)])
+
+    assert after(*start) - start == pytest.approx([1.0 / 0.1818, 0.0], abs=1e-8)
+    step = np.array([1e-5, 1e-4])
+    columns = [(after(*(start + row)) - after(*(start - row))) / (2.0 * row.sum()) for row in np.diag(step)]
+    assert np.abs(np.linalg.eigvals(np.array(columns).T)) == pytest.approx([1.0, 1.0], abs=1e-6)
+
+
+def flattest(problem: OrbitProblem) -> tuple[float, float]:
+    """Return value and slope of the closing condition of single-impact orbits at its flattest inflection near 0.
+
+    The condition is one equation for the logarithm of the coordinate; all three vanish where three orbits are one.
+    """
+
+    def residual(size: jax.Array) -> jax.Array:
+        return closing_residual(jnp.exp(size), problem)
+
+    slope, lowest = jax.grad(residual), problem.impact.lowest
+    sizes = jnp.linspace(jnp.log(1.02 * lowest), jnp.log(30.0 * lowest), 20001)
+    flat = jnp.abs(jax.vmap(residual)(sizes)) + jnp.abs(jax.vmap(slope)(sizes))
+    place, bend = float(sizes[int(jnp.argmin(flat))]), jax.jit(jax.grad(slope))
+    root = float(brentq(lambda size: float(bend(jnp.asarray(size))), place - 0.02, place + 0.02, xtol=1e-14))
+    return float(residual(jnp.asarray(root))), float(slope(jnp.asarray(root)))
+
+
+@pytest.mark.slow
+def test_cusps_are_triple_roots_and_curves_meet_in_the_same_points():
+    delayed = ImpactLaw(1.0, 114.6, 0.4994, CollisionDelay(0.20256, 6.458, 0.5634, corrections=False))
+    many = Scene(Cantilever(90.0, 40.0), Platform(2.0, 720.0, 1.0), delayed)
+    second = ParameterRange("platform.amplitude_nm", 2.0, 3.0)
+    found = continue_orbits(many, 4, ParameterRange("platform.reduced_frequency", 3.75, 4.1), second=second)
+    curves = {curve.kind: curve for curve in found.curves}
+    cusps = [one for one in curves["fold"].meetings if one.kind == "cusp"]
+    assert len(cusps) == 2
+    for one in cusps:
+        platform = Platform(one.second, 180.0 * one.parameter, 1.0)
+        value, slope = flattest(OrbitProblem(many.cantilever, platform, LawImpact(delayed), jnp.asarray(4.0)))
+        assert abs(value) < 1e-9
+        assert abs(slope) < 1e-8
+
+    def met(kind: str, name: str) -> tuple[float, float]:
+        (one,) = [one for one in curves[kind].meetings if one.kind == name]
+        return one.parameter, one.second
+
+    assert met("fold", "fold_grazing") == pytest.approx(met("grazing", "grazing_fold"), abs=1e-8)
+
+
+@pytest.mark.slow
+def test_errors_of_special_points_are_those_of_draws():
+    found = continue_orbits(scene(4.0, 1.01, 0.95, 60.0), 1, ParameterRange("platform.amplitude_nm", 0.5, 6.0))
+    errors, correlations = np.array([4e-4, 0.93]), np.array([[1.0, 0.2], [0.2, 1.0]])
+    covariance = correlations * np.outer(errors, errors)
+    known = UncertainParameters(("interaction.r", "interaction.epsilon"), np.array([0.95, 60.0]), covariance)
+    expected = special_errors(found, known)
+    for point, error in zip(found.special, expected, strict=True):
+        drawn = drawn_points(found, point, known, number=500, seed=3)
+        assert np.isfinite(drawn).all()
+        # 500 draws know a spread to 3 %; 0.1 for three of these
+        assert drawn.std() == pytest.approx(error, rel=0.1)
+        low, high = np.percentile(drawn, [2.5, 97.5])
+        assert [low, high] == pytest.approx(
+            [point.parameter - 1.96 * error, point.parameter + 1.96 * error], abs=0.4 * error
+        )
+
+
+@pytest.mark.slow
+def test_pictures_are_files_of_their_suffix(doubled: Continuation, tmp_path: Path):
+    for name, magic in (("a.png", b"\x89PNG"), ("a.pdf", b"%PDF"), ("a.svg", b"<?xml")):
+        draw_continuation(
+            doubled, tmp_path / name, bands=[np.full(len(one.parameter), 0.1) for one in doubled.branches]
+        )
+        assert (tmp_path / name).read_bytes().startswith(magic)
+    draw_curves(doubled, tmp_path / "b.png")
+    assert (tmp_path / "b.png").read_bytes().startswith(b"\x89PNG")
+
+
+def run(*arguments: str) -> Result:
+    return CliRunner().invoke(main, ["continue", *arguments], prog_name="afm-jax")
+
+
+def saved(path: Path, made: Scene) -> str:
+    save_scene(made, path)
+    return str(path)
+
+
+@pytest.mark.slow
+def test_the_command_tells_what_python_finds(doubled: Continuation, tmp_path: Path):
+    path = saved(tmp_path / "scene.toml", scene())
+    arguments = (path, "--order", "1", "--parameter", "platform.reduced_frequency=0.9:1.4")
+    result = run(*arguments, "--second", "platform.offset_nm=-1.9:0", "--json", "--out", str(tmp_path / "out"))
+    assert result.exit_code == 0, result.stderr
+    answer = json.loads(result.stdout)
+    assert [point["parameter"] for point in answer["points"]] == doubled.branches[0].parameter.tolist()
+    assert {"phase_rad", "velocity_after_nm_per_us", "peak_amplitude_nm", "multipliers", "stable", "admissible"} <= set(
+        answer["points"][0]
+    )
+    (special,) = answer["special"]
+    assert (special["kind"], special["parameter"]) == ("period_doubling", doubled.special[0].parameter)
+    for point in answer["points"]:
+        # beyond the doubling one multiplier is below -1
+        assert point["stable"] == (point["parameter"] < special["parameter"])
+        assert np.prod([complex(*one) for one in point["multipliers"]]) == pytest.approx(0.25)
+    assert answer["curves"][0]["second"] == doubled.curves[0].second.tolist()
+    names = {"branches.csv", "special.csv", "curves.csv", "branches.png", "curves.png"}
+    assert {file.name for file in (tmp_path / "out").iterdir()} == names
+
+
+def fit_file(path: Path, **changes: object) -> str:
+    """Write what `afm-jax fit --out` writes, as far as it is read, and return the path."""
+    errors, rows = (
+        {"r": (0.95, 4e-4), "epsilon": (60.0, 0.93)},
+        {key: [1.0] for key in ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")},
+    )
+    payload = {
+        "format": "afm-jax fit",
+        "model": "law",
+        "valid": True,
+        "parameters": {name: {"value": one, "standard_error": error} for name, (one, error) in errors.items()},
+        "correlations": {"names": list(errors), "matrix": [[1.0, 0.2], [0.2, 1.0]]},
+        "input": {"free_frequency_khz": 90.0, "quality_factor": None, **rows},
+    }
+    path.write_text(json.dumps(payload | changes), encoding="utf-8")
+    return str(path)
+
+
+@pytest.mark.slow
+def test_the_law_of_a_fit_gives_intervals(tmp_path: Path):
+    path = saved(tmp_path / "scene.toml", scene(4.0, 1.01, 0.5))
+    arguments = (path, "--order", "1", "--parameter", "platform.amplitude_nm=0.5:6", "--json")
+    result = run(*arguments, "--law", fit_file(tmp_path / "fit.json"), "--out", str(tmp_path / "out"))
+    assert result.exit_code == 0, result.stderr
+    answer = json.loads(result.stdout)
+    captured = next(point for point in answer["special"] if point["kind"] == "capture")
+    # undamped, closed: beta^2 = (u cot/2 Omega - sigma)^2 + (u/2 omega)^2 with u = sqrt(epsilon)/r
+    omega = 2.02 * FREE
+
+    def amplitude(r: float, epsilon: float) -> float:
+        speed = np.sqrt(epsilon) / r
+        return float(np.hypot(0.5 * speed / FREE / np.tan(FREE * np.pi / omega) + 1.0, 0.5 * speed / omega))
+
+    assert captured["parameter"] == pytest.approx(amplitude(0.95, 60.0), abs=1e-8)
+    by_r = (amplitude(0.9501, 60.0) - amplitude(0.9499, 60.0)) / 2e-4
+    by_epsilon = (amplitude(0.95, 60.01) - amplitude(0.95, 59.99)) / 0.02
+    one, other = by_r * 4e-4, by_epsilon * 0.93
+    error = np.sqrt(one**2 + other**2 + 0.4 * one * other)
+    assert captured["parameter_error"] == pytest.approx(error, rel=1e-5)
+    assert np.diff(captured["interval95"]) == pytest.approx([3.92 * error], rel=1e-4)
+    assert all(point["peak_amplitude_error_nm"] > 0.0 for point in answer["points"])
+
+
+@pytest.mark.slow
+def test_a_fit_that_says_nothing_is_refused(tmp_path: Path):
+    path = saved(tmp_path / "scene.toml", scene(4.0, 1.01, 0.5))
+    arguments = (path, "--order", "1", "--parameter", "platform.amplitude_nm=0.5:6", "--law")
+    unsure = {"r": {"value": 0.95, "standard_error": None}, "epsilon": {"value": 60.0, "standard_error": 1.0}}
+    for changes, said in (
+        ({"valid": False}, "the fit is not valid"),
+        ({"format": "other"}, "this is no saved fit"),
+        ({"parameters": unsure, "correlations": {"matrix": [[None, None], [None, 1.0]]}}, "no standard error of r"),
+    ):
+        result = run(*arguments, fit_file(tmp_path / "fit.json", **changes))
+        assert (result.exit_code, len(result.stderr.splitlines())) == (2, 1), result.stderr
+        assert said in result.stderr
+
+
+@pytest.mark.slow
+def test_nothing_in_the_range_ends_with_3_and_says_why(tmp_path: Path):
+    path = saved(tmp_path / "scene.toml", scene(0.1, epsilon=5.0))
+    result = run(path, "--order", "1", "--parameter", "platform.reduced_frequency=1.3:1.4", "--json")
+    answer = json.loads(result.stdout)
+    assert (result.exit_code, answer["points"]) == (3, [])
+    assert result.stderr == f"afm-jax: not valid: {answer['reason']}\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--parameter", "platform.amplitude=1:2"), "did you mean platform.amplitude_nm?"),
+        (("--parameter", "platform.amplitude_nm=2:1"), "the range is empty"),
+        (("--parameter", "interaction.r=0.5:2"), "`r` must be in (0, 1]"),
+        (("--parameter", "interaction.r=0.5:0.9", "--impacts", "65"), "--impacts"),
+        (("--parameter", "interaction.r=0.5:0.9", "--second", "interaction.epsilon=1:2"), "the scene's own value, 0"),
+        (("--parameter", "interaction.r=0.5:0.9", "--picture", "gif"), "must be png, pdf or svg"),
+        pytest.param(
+            ("--parameter", "interaction.r=0.5:0.9", "--law", "scene.toml"), "scene.toml", marks=pytest.mark.slow
+        ),
+    ],
+)
+def test_wrong_requests_are_one_line(arguments: tuple[str, ...], said: str, tmp_path: Path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    path = saved(tmp_path / "scene.toml", scene())
+    result = run(path, "--order", "1", *arguments)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert len(result.stderr.splitlines()) == 1
+    assert said in result.stderr
+
+
+def test_a_scene_without_a_law_is_refused(tmp_path: Path):
+    path = saved(tmp_path / "scene.toml", Scene(Cantilever(90.0), Platform(2.0, 180.0)))
+    result = run(path, "--order", "1", "--parameter", "platform.amplitude_nm=1:2")
+    assert result.exit_code == 2
+    assert 'must be "law" here' in result.stderr
+
+
+def test_a_ramp_does_not_repeat():
+    ramped = Scene(Cantilever(90.0), Platform(2.0, 180.0, offset_rate_nm_per_us=1e-3), ImpactLaw(0.5))
+    with pytest.raises(ValueError, match="ramps"):
+        continue_orbits(ramped, 1, ParameterRange("platform.amplitude_nm", 1.0, 2.0))

@@ -1,0 +1,175 @@
+"""Orbits of several impacts and orbits with a rest, against flights and impacts followed here in plain NumPy."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy.optimize import brentq
+
+from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, save_scene, single_impact_orbits
+from afm_jax.cli.main import main
+from afm_jax.dynamics.impact_orbits import many_impact_orbits, multipliers_of, sticking_orbit
+
+FREE = 2.0 * np.pi * 0.09
+"""Omega in rad/us."""
+
+
+def scene(n: float, r: float, offset: float = -1.0, epsilon: float = 0.0) -> Scene:
+    return Scene(Cantilever(90.0), Platform(2.0, 180.0 * n, offset), ImpactLaw(r, epsilon))
+
+
+def flown(n: float, r: float, sigma: float, time: float, velocity: float, epsilon: float = 0.0) -> tuple[float, ...]:
+    """Return time, V' and u_in of the next impact of an undamped tip: the gap looked at 4000 times a free period."""
+    omega, beta = 2.0 * n * FREE, 2.0
+    height = sigma + beta * np.cos(omega * time)
+
+    def gap(after: np.ndarray | float) -> np.ndarray:
+        tip = height * np.cos(FREE * after) + velocity / FREE * np.sin(FREE * after)
+        return np.asarray(tip - sigma - beta * np.cos(omega * (time + after)))
+
+    step, first = 2.0 * np.pi / FREE / 4000.0, 1e-9
+    while True:
+        after = first + step * np.arange(8000)
+        below = np.flatnonzero(gap(after) < 0.0)
+        if below.size and below[0] > 0:
+            break
+        if below.size:
+            raise AssertionError("the flight begins inside the platform")
+        first = after[-1]
+        assert first < 1e4
+    landing = float(brentq(gap, after[below[0] - 1], after[below[0]], xtol=1e-14))
+    before = -height * FREE * np.sin(FREE * landing) + velocity * np.cos(FREE * landing)
+    platform = -beta * omega * np.sin(omega * (time + landing))
+    approach = float(platform - before)
+    rebound = np.sqrt(max((r * approach) ** 2 - epsilon, 0.0))
+    return time + landing, float(platform + rebound), approach
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("impacts", "order"), [(2, 2), (2, 3), (3, 4)])
+def test_orbits_repeat_when_they_are_flown(impacts: int, order: int):
+    n, r = 1.24, 0.5
+    omega, found = 2.0 * n * FREE, many_impact_orbits(scene(n, r), order, impacts)
+    if impacts == 2 and order == 2:
+        assert found.stable.sum() == 1
+    for index in range(len(found.stable)):
+        phases, after = found.reading.phase_rad[index], found.reading.velocity_after_nm_per_us[index]
+        time, velocity = float(phases[0]) / omega, float(after[0])
+        for place in range(1, impacts + 1):
+            time, velocity, approach = flown(n, r, -1.0, time, velocity)
+            where = place % impacts
+            assert np.exp(1j * omega * time) == pytest.approx(np.exp(1j * phases[where]), abs=1e-7)
+            assert velocity == pytest.approx(float(after[where]), abs=1e-7)
+            assert approach == pytest.approx(float(found.reading.approach_speed_nm_per_us[index, where]), abs=1e-7)
+        assert omega * time - phases[0] == pytest.approx(2.0 * np.pi * order, abs=1e-7)
+        assert found.reading.determinant[index] == pytest.approx(r ** (2 * impacts), rel=1e-8)
+
+
+@pytest.mark.slow
+def test_what_long_iteration_settles_on_is_found():
+    # beyond the period doubling of the (1, 1) orbit
+    n, r, time, velocity = 1.24, 0.5, 4.0, 6.0
+    rows = []
+    for _ in range(300):
+        time, velocity, approach = flown(n, r, -1.0, time, velocity)
+        rows.append(approach)
+    found = many_impact_orbits(scene(n, r), 2, 2)
+    stable = found.reading.approach_speed_nm_per_us[found.stable][0]
+    assert sorted(rows[-2:], reverse=True) == pytest.approx(list(stable), abs=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "law",
+    [
+        ImpactLaw(0.95, 60.0),
+        ImpactLaw(1.0, 60.0, 0.5),
+        ImpactLaw(0.9999, 0.0, 0.48, CollisionDelay(0.206, 5.64, 0.726)),
+    ],
+    ids=["adhesion", "viscous", "lasting"],
+)
+def test_one_impact_is_the_single_impact_orbit(law: ImpactLaw):
+    damped = Scene(Cantilever(90.0, 40.0), Platform(4.0, 181.8, -1.0), law)
+    found, exact = many_impact_orbits(damped, 1, 1), single_impact_orbits(damped, 1)
+    good = np.flatnonzero(np.asarray(exact.admissible))
+    rank = good[np.argsort(-np.asarray(exact.peak_amplitude_nm)[good])]
+    assert len(found.stable) == len(rank) > 0
+    for name in ("phase_rad", "velocity_after_nm_per_us", "delay_us"):
+        one = getattr(found.reading, name)[:, 0]
+        np.testing.assert_allclose(one, np.asarray(getattr(exact, name))[rank], rtol=1e-9, atol=1e-9, err_msg=name)
+    for name in ("trace", "determinant", "peak_amplitude_nm"):
+        one = getattr(found.reading, name)
+        np.testing.assert_allclose(one, np.asarray(getattr(exact, name))[rank], rtol=1e-8, err_msg=name)
+    assert found.stable.tolist() == np.asarray(exact.stable)[rank].tolist()
+
+
+@pytest.mark.slow
+def test_a_tip_that_comes_to_rest_repeats_from_its_release():
+    n, r, sigma = 1.6, 0.3, 0.5
+    omega, found = 2.0 * n * FREE, sticking_orbit(scene(n, r, sigma))
+    assert not isinstance(found, str)
+    # s'' + Omega^2 s = 0, becoming negative: Omega^2 sigma = (omega^2 - Omega^2) beta cos(phase), rising cosine
+    phase = 2.0 * np.pi - np.arccos(FREE**2 * sigma / (2.0 * (omega**2 - FREE**2)))
+    assert found.release_phase_rad == pytest.approx(phase, abs=1e-6)
+    # flown here from just after the release: impacts become slower by r until the tip rests, while it is pressed
+    time = phase / omega + 1e-3
+    height = sigma + 2.0 * np.cos(phase)
+    velocity = -height * FREE * np.sin(FREE * 1e-3) - 2.0 * omega * np.sin(phase) * np.cos(FREE * 1e-3)
+    for _ in range(40):
+        time, velocity, approach = flown(n, r, sigma, time, velocity)
+        if approach < 1e-4:
+            break
+    assert approach < 1e-4
+    push = -2.0 * omega**2 * np.cos(omega * time) + FREE**2 * (sigma + 2.0 * np.cos(omega * time))
+    assert push > 0.0
+    turns = (omega * time - phase) / (2.0 * np.pi)
+    assert found.order == int(np.ceil(turns))
+    # the top of the flight after the release
+    assert found.peak_amplitude_nm == pytest.approx(np.hypot(height, 2.0 * omega * np.sin(phase) / FREE), rel=1e-6)
+
+
+def test_multipliers_are_those_of_numpy():
+    rng = np.random.default_rng(2)
+    matrices = rng.normal(size=(200, 2, 2))
+    found = multipliers_of(np.trace(matrices, axis1=1, axis2=2), np.linalg.det(matrices))
+    expected = np.linalg.eigvals(matrices)
+    for one, other in zip(found, expected, strict=True):
+        assert sorted(one, key=lambda z: (z.real, z.imag)) == pytest.approx(
+            sorted(other.astype(complex), key=lambda z: (z.real, z.imag)), rel=1e-9
+        )
+    assert np.all(np.abs(found[:, 0]) >= np.abs(found[:, 1]) * (1.0 - 1e-12))
+
+
+def test_why_a_tip_does_not_rest():
+    assert sticking_orbit(scene(1.6, 0.3, epsilon=1.0)) == "with adhesion or a delay a tip that comes to rest stays"
+
+
+@pytest.mark.slow
+def test_the_command_tells_every_impact(tmp_path: Path):
+    save_scene(scene(1.24, 0.5), tmp_path / "scene.toml")
+    arguments = ["orbits", str(tmp_path / "scene.toml"), "--order", "2", "--impacts", "2", "--json"]
+    result = CliRunner().invoke(main, [*arguments, "--out", str(tmp_path)], prog_name="afm-jax")
+    assert result.exit_code == 0, result.stderr
+    answer = json.loads(result.stdout)
+    found = many_impact_orbits(scene(1.24, 0.5), 2, 2)
+    assert len(answer["orbits"]) == len(found.stable)
+    for index, orbit in enumerate(answer["orbits"]):
+        assert len(orbit["impacts"]) == 2
+        assert orbit["phase_rad"] == orbit["impacts"][0]["phase_rad"] == found.reading.phase_rad[index, 0]
+        assert [complex(*one) for one in orbit["multipliers"]] == found.multipliers[index].tolist()
+    assert answer["sticking"] is None
+    assert "never presses" in answer["sticking_reason"] or "come to rest" in answer["sticking_reason"]
+    assert (tmp_path / "impacts.csv").exists()
+
+
+@pytest.mark.slow
+def test_no_orbit_ends_with_3(tmp_path: Path):
+    # at resonance a free vibration may touch the platform again and again, which is no orbit of impacts
+    save_scene(scene(1.0, 0.5, offset=-3.0), tmp_path / "scene.toml")
+    arguments = ["orbits", str(tmp_path / "scene.toml"), "--order", "2", "--impacts", "2", "--json"]
+    result = CliRunner().invoke(main, arguments, prog_name="afm-jax")
+    answer = json.loads(result.stdout)
+    assert (result.exit_code, answer["orbits"]) == (3, [])
+    assert "2 impacts in 2 drive periods" in answer["reason"]

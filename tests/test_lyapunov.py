@@ -1,0 +1,131 @@
+"""Lyapunov exponents against multipliers, determinants and the growth of neighbouring motions."""
+
+import json
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import afm_jax as afm
+from afm_jax.cli.main import main
+from afm_jax.dynamics.exponents import exponent_verdicts, lyapunov_spectrum
+from afm_jax.dynamics.iteration import Record, batch_and_tips, recorded
+from afm_jax.motion.start import default_start, start_of
+from afm_jax.outcomes import Outcome
+from afm_jax.scenefile.parameter_paths import scene_batch
+
+CHAOTIC, REGULAR, RESTING = 1.4875, (0.99, 1.05, 1.2), 0.2
+
+
+def law_scene(reduced: float, r: float = 0.8) -> afm.Scene:
+    return afm.Scene(afm.Cantilever(90.0), afm.Platform(2.0, 180.0 * reduced, -1.0), afm.ImpactLaw(r))
+
+
+def neighbours_grow(scene: afm.Scene, impacts: int, lanes: int) -> tuple[float, float]:
+    """Return the mean growth per impact of small distances, pulled back after every impact, and its standard error."""
+    small, omega, top = 1e-7, float(scene.platform.angular_frequency), float(scene.platform.top_speed_nm_per_us)
+    time = float(scene.platform.period_us) * (0.5 + np.arange(lanes) / (2.0 * lanes))
+    velocity = np.asarray(scene.platform.velocity(time)) + top
+    rows = afm.iterate_batch(scene, time, velocity, 100)
+    flying = np.asarray(rows.outcome[:, -1]) == Outcome.IMPACT
+    time, velocity = (np.asarray(part[:, -1])[flying] for part in (rows.time_us, rows.velocity_after_nm_per_us))
+    offset, logs = np.tile([small, 0.0], (len(time), 1)), []
+    for number in range(impacts + 20):
+        both = np.concatenate([time, time + offset[:, 0] / omega])
+        speeds = np.concatenate([velocity, velocity + offset[:, 1] * top])
+        rows = afm.iterate_batch(scene, both, speeds, 1)
+        times, after = (np.asarray(part[:, 0]).reshape(2, -1) for part in (rows.time_us, rows.velocity_after_nm_per_us))
+        apart = np.stack([(times[1] - times[0]) * omega, (after[1] - after[0]) / top], axis=1)
+        length = np.linalg.norm(apart, axis=1)
+        offset = small * apart / length[:, None]
+        time, velocity = times[0] % float(scene.platform.period_us), after[0]
+        if number >= 20:
+            logs.append(np.log(length / small))
+    # a pair that straddles a graze parts by more than any slope says
+    means = np.mean(logs, axis=0)
+    means = means[np.isfinite(means)]
+    assert len(means) > lanes // 4
+    return float(np.median(means)), float(np.std(means) / np.sqrt(len(means)))
+
+
+@pytest.mark.slow
+def test_exponents_of_orbits_are_the_logarithms_of_their_multipliers():
+    scenes = scene_batch(law_scene(1.0), {"platform.reduced_frequency": np.array(REGULAR)})
+    found = lyapunov_spectrum(scenes)
+    assert found.verdicts.names() == ["(1,1)"] * 3
+    for lane, reduced in enumerate(REGULAR):
+        orbits = afm.single_impact_orbits(law_scene(reduced), 1)
+        slot = int(np.argmax(np.asarray(orbits.stable & orbits.admissible)))
+        multipliers = np.roots([1.0, -float(orbits.trace[slot]), float(orbits.determinant[slot])])
+        wanted = np.sort(np.log(np.abs(multipliers)))[::-1]
+        np.testing.assert_allclose(found.exponents_per_impact[lane], wanted, rtol=0, atol=1e-8)
+        period = float(law_scene(reduced).platform.period_us)
+        np.testing.assert_allclose(found.exponents_per_us[lane], wanted / period, rtol=0, atol=1e-8)
+        # undamped, without adhesion: the determinant is r^2
+        assert found.mean_log_determinant[lane] == pytest.approx(2.0 * np.log(0.8), abs=1e-10)
+
+
+@pytest.mark.slow
+def test_the_larger_exponent_is_the_growth_of_neighbouring_motions():
+    found = lyapunov_spectrum(law_scene(CHAOTIC), impacts=1000, transient=200)
+    larger, error = found.exponents_per_impact[0], found.exponents_per_impact_error[0]
+    assert larger > 10.0 * error
+    grown, spread = neighbours_grow(law_scene(CHAOTIC), impacts=300, lanes=100)
+    assert abs(larger - grown) < 4.0 * np.hypot(error, spread) + 0.02
+    assert found.exponents_per_impact.sum() == pytest.approx(found.mean_log_determinant, abs=1e-10)
+    # the speeds' ratios of many flights cancel but for the ends: 2 ln r is left
+    assert found.exponents_per_impact.sum() == pytest.approx(2.0 * np.log(0.8), abs=5e-3)
+
+
+@pytest.mark.slow
+def test_a_tip_that_rests_is_followed_like_a_simulation_and_forgets_its_start():
+    scene = law_scene(RESTING, r=0.5)
+    scenes, tips = batch_and_tips(scene)
+    record = Record(*(np.asarray(part).T for part in recorded(scenes, tips, impacts=120)[1]))
+    assert record.rested.any()
+    motion = afm.simulate(scene, default_start(scene), 600.0, max_contacts=200)
+    # the tips have landed once already
+    arrivals = np.asarray(motion.contacts.arrival_time_us)[1:101]
+    found = (record.arrival_periods * float(scene.platform.period_us) + record.arrival_us)[0, :100]
+    # rests are summed up to 1e-5 of their length
+    np.testing.assert_allclose(found, arrivals, rtol=0, atol=1e-6)
+    exponents = lyapunov_spectrum(scene, impacts=400, transient=100)
+    assert np.all(np.isneginf(exponents.exponents_per_impact))
+    assert exponents.rested > 0
+    assert "forgets its start" in exponent_verdicts(lyapunov_spectrum(scenes, impacts=400, transient=100))[0]
+
+
+@pytest.mark.slow
+def test_the_contact_is_chaotic_at_high_frequency():
+    scene = afm.Scene(afm.Cantilever(90.0, 40.0), afm.Platform(4.0, 180.0 * 5.277), afm.Contact.paper())
+    start = start_of(scene, (270.0, 5.0, 60.0))
+    found = lyapunov_spectrum(scene, start, impacts=200, transient=40, accuracy=1e-6)
+    larger, error = found.exponents_per_impact[0], found.exponents_per_impact_error[0]
+    assert larger > 3.0 * error
+    assert found.exponents_per_impact.sum() == pytest.approx(found.mean_log_determinant, abs=1e-10)
+
+
+@pytest.mark.slow
+def test_the_command_tells_keys_null_and_bad_requests(tmp_path):
+    file = tmp_path / "scene.toml"
+    afm.save_scene(law_scene(RESTING, r=0.5), file)
+    run = CliRunner().invoke(main, ["lyapunov", str(file), "--json", "--impacts", "100"])
+    told = json.loads(run.stdout)
+    assert told["exponents_per_us"] == [None, None]
+    assert told["exponents_per_impact"] == [None, None]
+    assert "forgets" in told["verdict"]
+    assert {"impacts", "exponents_per_us_error", "exponents_per_impact_error"} <= set(told)
+    for text, words in (
+        ("platform.amplitude=1:2:3", "did you mean platform.amplitude_nm"),
+        ("platform.amplitude_nm=2:1:3", "the range is empty"),
+    ):
+        run = CliRunner().invoke(main, ["lyapunov", str(file), "--parameter", text])
+        assert run.exit_code == 2
+        assert words in run.stderr
+        assert run.stderr.count("\n") == 1
+
+
+def test_a_scene_without_a_drive_has_no_exponents():
+    scene = afm.Scene(afm.Cantilever(90.0), afm.Platform(0.0, 180.0), afm.ImpactLaw(0.8))
+    with pytest.raises(ValueError, match="`amplitude_nm` of the platform must be positive"):
+        lyapunov_spectrum(scene)

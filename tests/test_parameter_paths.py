@@ -1,0 +1,124 @@
+"""Parameters by their paths in a scene file: what ranges may be, and what scenes become."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.drives import ForceDrive, Tone
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene
+from afm_jax.contact.contact import Contact
+from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from afm_jax.scenefile.parameter_paths import (
+    check_ranges,
+    parameter_values,
+    parse_range,
+    scene_batch,
+    scene_family,
+)
+from afm_jax.scenefile.scenefile import load_scene, save_scene
+
+
+def law_scene(**parts) -> Scene:
+    law = ImpactLaw(0.9, 20.0, 0.3, CollisionDelay(0.2, 5.0, 0.7))
+    return Scene(Cantilever(90.0, 40.0), Platform(4.0, 180.0, 0.5, second=Tone(1.0, 33.0)), law, **parts)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("platform.amplitude_nm", "no range of a parameter"),
+        ("platform.amplitude_nm=1:2", "no range of a parameter"),
+        ("=1:2:3", "no range of a parameter"),
+        ("platform.amplitude_nm=1:nan:3", "must be numbers"),
+        ("platform.amplitude_nm=2:1:3", "the range is empty"),
+        ("platform.amplitude_nm=1:1:3", "the range is empty"),
+        ("platform.amplitude_nm=1:2:1", "the number of values"),
+        ("platform.amplitude_nm=1:2:-4", "the number of values"),
+    ],
+)
+def test_what_is_no_range_is_said(text: str, words: str):
+    with pytest.raises(ValueError, match=words):
+        parse_range(text, counted=True)
+
+
+def test_a_range_without_count_is_for_continuation():
+    assert parse_range("interaction.r=0.5:0.9", counted=False)[:3] == ("interaction.r", 0.5, 0.9)
+    with pytest.raises(ValueError, match="PARAMETER=low:high as in"):
+        parse_range("interaction.r=0.5:0.9:3", counted=False)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("platform.amplitude=1:2", "did you mean platform.amplitude_nm"),
+        ("base.amplitude_nm=1:2", "the scene has no parameter `base.amplitude_nm`"),
+        ("interaction.relative_humidity=0.1:0.2", "it has cantilever.frequency_khz"),
+        ("interaction.r=0.5:1.5", r"r=0.5:1.5: \[interaction\] `r` must be in \(0, 1\], but is 1.5"),
+        ("cantilever.quality_factor=0.2:3", "`quality_factor` must be above 0.5, but is 0.2"),
+        ("platform.reduced_frequency=0:1", "must be positive"),
+    ],
+)
+def test_what_a_scene_cannot_have_is_said(text: str, words: str):
+    with pytest.raises(ValueError, match=words):
+        check_ranges(law_scene(), parse_range(text, counted=False))
+
+
+def test_the_same_parameter_twice_is_refused():
+    ranges = [parse_range(f"platform.{name}=1:2", counted=False) for name in ("reduced_frequency", "frequency_khz")]
+    with pytest.raises(ValueError, match="change the same parameter"):
+        check_ranges(law_scene(), *ranges)
+
+
+@pytest.mark.parametrize(
+    "scene",
+    [
+        law_scene(),
+        Scene(Cantilever(90.0), Platform(0.0, 85.0), ImpactLaw(0.9), force=ForceDrive(0.5, 85.0, 10.0)),
+        Scene(Cantilever(90.0, 40.0), Platform(4.0, 180.0), Contact.paper(relative_humidity=0.4)),
+    ],
+    ids=["law", "force", "contact"],
+)
+def test_every_parameter_is_the_one_of_the_file(scene: Scene, tmp_path):
+    known = parameter_values(scene)
+    assert "platform.reduced_frequency" in known
+    for path, value in known.items():
+        other = 1.01 * value if value else 0.25
+        made = scene_family(scene, path)(other)
+        save_scene(made, tmp_path / "made.toml")
+        found = parameter_values(load_scene(tmp_path / "made.toml"))
+        changed = {name for name in found if not np.isclose(found[name], known[name], rtol=1e-12, atol=0.0)}
+        twin = path.replace("reduced_frequency", "frequency_khz")
+        own = {twin, twin.replace("frequency_khz", "reduced_frequency")} & set(found)
+        if path == "cantilever.frequency_khz":  # the drives keep their frequencies in kHz
+            own |= {name for name in found if name.endswith("reduced_frequency")}
+        if path.startswith("force.") and "frequency" in path:  # the resting platform counts in it
+            own |= {"platform.frequency_khz", "platform.reduced_frequency"}
+        assert changed == own
+        assert found[path] == pytest.approx(other, rel=1e-12)
+
+
+def test_the_cantilever_comes_before_reduced_frequencies():
+    made = scene_family(law_scene(), "platform.reduced_frequency", "cantilever.frequency_khz")(1.5, 100.0)
+    assert float(made.platform.frequency_khz) == pytest.approx(300.0, rel=1e-15)
+
+
+def test_a_batch_is_the_scenes_one_by_one():
+    values = {"interaction.epsilon": np.array([1.0, 2.0, 3.0]), "platform.reduced_frequency": np.array([1, 2, 4.0])}
+    scenes = scene_batch(law_scene(), values)
+    assert {leaf.shape for leaf in jax.tree.leaves(scenes)} == {(3,)}
+    np.testing.assert_array_equal(scenes.platform.frequency_khz, [180.0, 360.0, 720.0])
+    np.testing.assert_array_equal(scenes.interaction.epsilon, [1.0, 2.0, 3.0])
+
+
+def test_scenes_are_differentiable_by_any_path():
+    scene = Scene(Cantilever(90.0, 40.0), Platform(4.0, 180.0), Contact.paper())
+    at = scene_family(scene, "platform.reduced_frequency", "interaction.modulus_gpa")
+    slopes = jax.jacfwd(
+        lambda n, k: jnp.stack([at(n, k).platform.frequency_khz, at(n, k).interaction.junction.modulus_gpa]), (0, 1)
+    )
+    by_n, by_k = slopes(1.0, 100.0)
+    np.testing.assert_allclose(by_n, [180.0, 0.0])
+    np.testing.assert_allclose(by_k, [0.0, 1.0])

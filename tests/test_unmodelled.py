@@ -1,0 +1,168 @@
+"""What a law leaves out: the step against one least-squares problem, and bands on contacts that are not the law."""
+
+import numpy as np
+import pytest
+
+from fitting import fit
+from fitting.fits.loss import EV_PER_AJ, equivalent
+from fitting.fits.objective import Objective
+from fitting.fits.unmodelled import LawBefore, StepRows, Unmodelled, law_after, step_of
+from fitting.forward import ImpactSlopes, impact_slopes
+from fitting.models import Problem, measurement_of
+from fitting.parameters import DELAY_SHAPE, LOSS_SHAPE
+from tests.contact_experiment import paper_collisions, paper_experiment
+from tests.coverage_of_bands import noisy
+
+VALUES = {
+    "epsilon": 113.6,
+    "viscous_loss": 0.5,
+    "delay_hertz": 0.206,
+    "delay_lead_nm": 5.64,
+    "delay_offset_nm": 0.726,
+    "quality_factor": 40.0,
+}
+PROBLEM = Problem("viscous+delay", tuple(VALUES))
+LEFT_OUT = Unmodelled(PROBLEM, VALUES, (20.0, 200.0))
+ROWS = 12
+
+
+@pytest.fixture(scope="module")
+def rows() -> StepRows:
+    """Rows of random slopes, the constraint on Q last."""
+    random = np.random.default_rng(5)
+    u = np.geomspace(20.0, 200.0, ROWS)
+    jacobian = random.normal(size=(2 * ROWS + 1, 6))
+    jacobian[-1] = np.eye(6)[-1] / 0.8
+    return StepRows(
+        residual=0.1 * random.normal(size=2 * ROWS + 1),
+        jacobian=jacobian,
+        slopes=ImpactSlopes(random.normal(size=(ROWS, 2)), 1e3 * random.normal(size=(ROWS, 2))),
+        measurement_error=random.uniform(0.3, 1.0, size=(ROWS, 2)),
+        slow_error=random.uniform(0.0, 1.0, size=(ROWS, 2)),
+        approach=u,
+        rebound=np.sqrt(u**2 - 0.5 * u - 113.6),
+        pull=10.0 * random.normal(size=ROWS),
+        change=10.0 * random.normal(size=ROWS),
+        hertz_time=0.206 * u**-0.2,
+    )
+
+
+def stacked(rows: StepRows):
+    """Return matrix, right-hand side and number of parameters of one least-squares problem with everything in it."""
+    columns = LEFT_OUT.columns(rows.approach, rows.rebound)
+    found = []
+    for row in range(ROWS):
+        n, p = rows.measurement_error[row], rows.slow_error[row]
+        # the mean of both lacks twice the variance, their difference a sixteenth
+        turn = np.array([[1.0, 1.0], [1.0, -1.0]]) / np.sqrt(2.0)
+        scaled = np.diag(p) @ turn @ np.diag([2.0, 1.0 / 16.0]) @ turn @ np.diag(p)
+        white = np.linalg.inv(np.linalg.cholesky(np.diag(n**2) + scaled))
+        both = np.stack([rows.slopes.by_square[row], rows.slopes.by_delay[row]], axis=1)
+        own = rows.jacobian[2 * row : 2 * row + 2].copy()
+        own[:, 1] += both @ columns.drag[:, row]
+        u, w, g, j, t = (x[row] for x in (rows.approach, rows.rebound, rows.pull, rows.change, rows.hertz_time))
+        late = [0.5 * g / w**3, 0.008 * g * t**2 / u, 8.0 * j / w**4]
+        # the loss of these rows grows by half a nm/us for every one of approach
+        gained = [15.0 * 0.5 * j / w**2, 2.0 * 0.5 * g / u, 0.06 * j * t**2 * u, 5.0 * g**2 / w**2]
+        changes = np.array([[0.0, x] for x in late] + [[x, 0.0] for x in gained]).T
+        block = np.concatenate(
+            [own, both @ columns.shape[:, row], both @ columns.unknown[:, row], both @ (1.5 * changes)], 1
+        )
+        value = rows.residual[2 * row : 2 * row + 2] + both @ columns.known[:, row]
+        found.append((white @ block, white @ value))
+    matrix, right = (np.concatenate([one[k] for one in found]) for k in range(2))
+    size = matrix.shape[1]
+    constraint = np.concatenate([rows.jacobian[-1], np.zeros(size - 6)])[None]
+    shapes = np.eye(size)[6:8] / np.array([error for _, error in LEFT_OUT.priors.values()])[:, None]
+    matrix = np.concatenate([matrix, constraint, shapes, np.eye(size)[8:]])
+    return matrix, np.concatenate([right, rows.residual[-1:], np.zeros(size - 6)])
+
+
+def test_the_step_is_that_of_one_least_squares_problem(rows):
+    matrix, right = stacked(rows)
+    best = np.linalg.lstsq(matrix, -right, rcond=None)[0]
+    step = step_of(rows, LEFT_OUT, np.ones(6, dtype=bool))
+    assert step.names == (*VALUES, LOSS_SHAPE, DELAY_SHAPE)
+    np.testing.assert_allclose(step.change, best[:8], rtol=1e-6)
+    np.testing.assert_allclose(step.unknown, best[8:], rtol=1e-5, atol=1e-7)
+    covariance = np.linalg.inv(matrix.T @ matrix)
+    np.testing.assert_allclose(step.covariance, covariance[:8, :8], rtol=1e-5)
+    assert step.chi2 == pytest.approx(np.sum((right + matrix @ best) ** 2), rel=1e-8)
+
+
+def test_the_band_is_that_of_the_whole_covariance(rows):
+    matrix, _ = stacked(rows)
+    covariance = np.linalg.inv(matrix.T @ matrix)
+    u = np.array([30.0, 80.0, 150.0])
+    w = np.sqrt(u**2 - 0.5 * u - 113.6)
+    slope = np.zeros((2, 3, 6))
+    slope[0, :, 0], slope[0, :, 1] = -0.5 / w, -0.5 * u / w
+    step = step_of(rows, LEFT_OUT, np.ones(6, dtype=bool))
+    found = law_after(step, LEFT_OUT, u, LawBefore(np.stack([w, 0.0 * w]), slope, 10.9, np.zeros(6)))
+    columns = LEFT_OUT.columns(u, w)
+    square = np.concatenate([2.0 * w[:, None] * slope[0], columns.shape[0], columns.unknown[0]], axis=1)
+    square[:, 1] += columns.drag[0]
+    size = square.shape[1]
+    error = np.sqrt(np.einsum("nk,kj,nj->n", square, covariance[:size, :size], square)) / (2.0 * w)
+    np.testing.assert_allclose(np.linalg.norm(found.factor[0], axis=1), error, rtol=1e-5)
+
+
+def test_the_closest_law_of_the_paper_is_the_law_itself():
+    u = np.linspace(20.0, 200.0, 50)
+    w = np.sqrt((0.99 * u) ** 2 - 80.0)
+    # the speed knows r and epsilon to 0.001 and 2, independent of each other
+    factor = np.stack([0.99 * u**2 / w * 1e-3, -0.5 / w * 2.0], axis=1)
+    found = equivalent(u, w, factor, 2.0)
+    assert found is not None
+    assert found.r.value == pytest.approx(0.99, abs=1e-8)
+    assert found.r.interval95 == pytest.approx((0.99 - 1.96e-3, 0.99 + 1.96e-3), abs=1e-6)
+    assert found.epsilon_nm2_per_us2.interval95 == pytest.approx((80.0 - 3.92, 80.0 + 3.92), abs=1e-3)
+    # delta = m epsilon/2 with 2 ng
+    assert found.delta_aj.value == pytest.approx(80.0, abs=1e-4)
+    assert found.delta_ev.value == pytest.approx(80.0 / 0.160217663, rel=1e-6)
+    assert pytest.approx(6.241509, abs=1e-6) == EV_PER_AJ
+
+
+@pytest.mark.slow
+def test_residuals_change_with_impacts_as_with_the_parameters_that_change_them():
+    table = paper_experiment().exact
+    values = np.array(list(VALUES.values()))
+    objective = Objective(measurement_of(table, PROBLEM), PROBLEM).following(values)
+    found = impact_slopes(values, objective.measurement, PROBLEM, objective.near)
+    moved = values + np.array([[2e-3, 0, 0, 0, 0, 0], [0, 0, 0, 0, 1e-5, 0]])
+    above, below = objective.residual(moved), objective.residual(2.0 * values - moved)
+    count = found.by_square.shape[0]
+    change = (above - below)[:, : 2 * count].reshape(2, count, 2)
+    speed = np.asarray(objective.at_values(values[None]).prediction.approach_speed_nm_per_us)[0]
+    np.testing.assert_allclose(found.by_square, -change[0] / 4e-3, rtol=1e-4, atol=1e-6)
+    # the offset d shortens the delay by d/u
+    np.testing.assert_allclose(found.by_delay, -change[1] / 2e-5 * speed[:, None], rtol=1e-4, atol=1e-2)
+
+
+@pytest.mark.slow
+def test_bands_hold_the_law_of_a_contact_that_is_not_the_models():
+    """Precise amplitudes of the full scene: without what the law leaves out, the bands miss half of the speeds."""
+    exact = paper_experiment().exact
+    speeds = np.geomspace(30.0, 200.0, 40)
+    truth = paper_collisions(speeds)[0]
+    shares, worst, degrees = [], [], []
+    for seed in range(6):
+        result = fit(noisy(exact, 0.003, np.random.default_rng([3, seed])), "viscous+delay")
+        assert result.valid
+        law = result.law
+        rebound, high = (
+            np.interp(speeds, law.approach_speed_nm_per_us, column)
+            for column in (law.rebound_speed_nm_per_us, law.rebound_high_nm_per_us)
+        )
+        z = np.abs(rebound - truth) / (high - rebound)
+        shares.append(np.mean(z < 1.0))
+        worst.append(z.max())
+        degrees.append(result.chi2 / result.degrees_of_freedom)
+        assert result.loss is not None
+        low, top = result.loss.capture_speed_nm_per_us.interval95
+        assert low is not None
+        assert top is not None
+        assert low < 10.93845 < top
+    assert np.mean(shares) >= 0.9
+    assert max(worst) < 2.0
+    assert 0.75 < np.mean(degrees) < 1.2
