@@ -96,7 +96,8 @@ def test_command_writes_table_picture_and_one_json_object(tmp_path: Path, monkey
     result = CliRunner().invoke(main, ["accuracy", "map", "--quick", "--json", "--out", str(tmp_path)])
     assert result.exit_code == 0, result.stderr
     payload = json.loads(result.stdout)
-    assert {"rows", "cheapest", "wanted_error_us", "reference_error_us", "default_root_tolerance_us"} == set(payload)
+    own = {"rows", "cheapest", "wanted_error_us", "reference_error_us", "default_root_tolerance_us"}
+    assert own | {"format", "format_version"} == set(payload)
     assert json.loads((tmp_path / "accuracy.json").read_text("utf-8")) == payload
     assert (tmp_path / "accuracy.csv").read_text("utf-8").splitlines()[0] == ",".join(COLUMNS)
     assert (tmp_path / "accuracy.png").read_bytes().startswith(b"\x89PNG")

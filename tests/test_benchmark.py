@@ -132,7 +132,7 @@ def test_command_writes_tables_and_one_json_object(tmp_path: Path, monkeypatch: 
     result = CliRunner().invoke(main, arguments)
     assert result.exit_code == 0, result.stderr
     payload = json.loads(result.stdout)
-    assert {"rows", "contact_rows", "scene_rows", "aims", "machine"} == set(payload)
+    assert {"format", "format_version", "rows", "contact_rows", "scene_rows", "aims", "machine"} == set(payload)
     assert payload["contact_rows"] == []
     assert not (tmp_path / "bench_contact.csv").exists()
     assert json.loads((tmp_path / "bench.json").read_text("utf-8")) == payload

@@ -166,13 +166,17 @@ def test_a_mistake_in_the_program_is_not_hidden(trial: Callable[..., Result]):
     assert isinstance(trial(body).exception, TypeError)
 
 
+LABEL = {"format": "afm-jax trial", "format_version": 1}
+"""What every JSON object starts with, unless its command says so itself."""
+
+
 def test_json_is_the_only_output_and_strict(trial: Callable[..., Result]):
     def body(session: Session) -> None:
         session.note("[platform] is not markup")
         session.emit({"speeds": np.array([1.0, np.nan]), "stuck": np.bool_(0), "count": np.int64(3)}, "text")
 
     result = trial(body, "--json")
-    assert json.loads(result.stdout) == {"speeds": [1.0, None], "stuck": False, "count": 3}
+    assert json.loads(result.stdout) == LABEL | {"speeds": [1.0, None], "stuck": False, "count": 3}
     assert result.stderr == "[platform] is not markup\n"
     assert trial(body).stdout == "text\n"
 
@@ -190,7 +194,7 @@ def test_result_is_printed_before_it_is_called_not_valid(trial: Callable[..., Re
         raise NotValid("open")
 
     result = trial(body, "--json")
-    assert (result.exit_code, json.loads(result.stdout)) == (3, {"reason": "open"})
+    assert (result.exit_code, json.loads(result.stdout)) == (3, LABEL | {"reason": "open"})
 
 
 def test_tables_land_in_the_folder(trial: Callable[..., Result], tmp_path: Path):

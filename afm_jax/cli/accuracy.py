@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from afm_jax.cli.accuracy_scene import scene_study
-from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.session import Session, with_session, write_json
 from afm_jax.whole_files import write_whole
 from afm_jax.words import known
 
@@ -180,7 +180,6 @@ def command(
         return
     from afm_jax.accuracy.impacts import cheapest_settings  # noqa: PLC0415
     from afm_jax.bench.timing import run_in_own_process  # noqa: PLC0415
-    from afm_jax.strict_json import strict_json  # noqa: PLC0415
 
     with session.working("measuring"):
         result = run_in_own_process("afm_jax.accuracy.impacts:map_accuracy", QUICK if quick else FULL, cores=1)
@@ -191,7 +190,7 @@ def command(
         from afm_jax.plots.accuracy import accuracy_figure  # noqa: PLC0415
         from afm_jax.plots.picture_style import png_of  # noqa: PLC0415
 
-        write_whole(session.out / "accuracy.json", strict_json(payload) + "\n")
+        write_json(session.out / "accuracy.json", payload)
         write_whole(session.out / "accuracy.png", png_of(accuracy_figure(result["rows"], wanted_error_us)))
         session.note(f"wrote {session.out / 'accuracy.json'} and {session.out / 'accuracy.png'}")
     session.emit(
@@ -207,7 +206,6 @@ def overview_study(session: Session, *, quick: bool) -> None:
     """Run and show what each digit costs in everything."""
     from afm_jax.accuracy.overview import cheapest  # noqa: PLC0415
     from afm_jax.bench.timing import run_in_own_process  # noqa: PLC0415
-    from afm_jax.strict_json import strict_json  # noqa: PLC0415
 
     rows: list[dict[str, Any]] = []
     references: dict[str, dict[str, Any]] = {}
@@ -222,7 +220,7 @@ def overview_study(session: Session, *, quick: bool) -> None:
         from afm_jax.plots.accuracy import overview_figure  # noqa: PLC0415
         from afm_jax.plots.picture_style import save  # noqa: PLC0415
 
-        write_whole(session.out / "accuracy.json", strict_json(payload) + "\n")
+        write_json(session.out / "accuracy.json", payload)
         save(overview_figure(rows, references), session.out / "accuracy.png")
         session.note(f"wrote {session.out / 'accuracy.json'} and {session.out / 'accuracy.png'}")
     told = [
@@ -261,7 +259,6 @@ def collide_study(session: Session, accuracy: float, *, quick: bool) -> None:
     """Run and show the accuracy study of `collide`."""
     from afm_jax.accuracy.collisions import cheapest_collision  # noqa: PLC0415
     from afm_jax.bench.timing import run_in_own_process  # noqa: PLC0415
-    from afm_jax.strict_json import strict_json  # noqa: PLC0415
 
     with session.working("measuring"):
         task = "afm_jax.accuracy.collisions:collide_accuracy"
@@ -273,7 +270,7 @@ def collide_study(session: Session, accuracy: float, *, quick: bool) -> None:
         from afm_jax.plots.accuracy import collide_accuracy_figure  # noqa: PLC0415
         from afm_jax.plots.picture_style import png_of  # noqa: PLC0415
 
-        write_whole(session.out / "accuracy.json", strict_json(payload) + "\n")
+        write_json(session.out / "accuracy.json", payload)
         write_whole(session.out / "accuracy.png", png_of(collide_accuracy_figure(result["rows"])))
         session.note(f"wrote {session.out / 'accuracy.json'} and {session.out / 'accuracy.png'}")
     sentence = (

@@ -3,8 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from afm_jax.cli.session import Session
-from afm_jax.whole_files import write_whole
+from afm_jax.cli.session import Session, write_json
 from afm_jax.words import known
 
 if TYPE_CHECKING:
@@ -38,7 +37,6 @@ def scene_study(session: Session, name: str, contacts: int, *, quick: bool) -> N
     from afm_jax.accuracy.scenes import ladder_duration  # noqa: PLC0415
     from afm_jax.bench.timing import run_in_own_process  # noqa: PLC0415
     from afm_jax.contact.contact import Contact  # noqa: PLC0415
-    from afm_jax.strict_json import strict_json  # noqa: PLC0415
 
     scene, start = scene_to_study(name)
     resolved = isinstance(scene.interaction, Contact)
@@ -60,7 +58,7 @@ def scene_study(session: Session, name: str, contacts: int, *, quick: bool) -> N
         from afm_jax.plots.accuracy import scene_accuracy_figure  # noqa: PLC0415
         from afm_jax.plots.picture_style import save  # noqa: PLC0415
 
-        write_whole(session.out / "accuracy.json", strict_json(payload) + "\n")
+        write_json(session.out / "accuracy.json", payload)
         save(scene_accuracy_figure(result), session.out / "accuracy.png")
         session.note(f"wrote {session.out / 'accuracy.json'} and {session.out / 'accuracy.png'}")
     session.emit(payload, settings_table(result), reference_sentence(result), ladder_table(result), *_reasons(result))

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.cli.session import Session, with_session
-from afm_jax.whole_files import write_whole
+from afm_jax.cli.session import Session, with_session, write_json
 from afm_jax.words import known
 
 if TYPE_CHECKING:
@@ -206,7 +205,6 @@ def command(session: Session, batches: tuple[int, ...], only: str | None, *, qui
     """
     session.start_computing()
     from afm_jax.bench.timing import available_cores  # noqa: PLC0415
-    from afm_jax.strict_json import strict_json  # noqa: PLC0415
 
     cores = available_cores()
     machine = machine_facts(cores)
@@ -237,7 +235,7 @@ def command(session: Session, batches: tuple[int, ...], only: str | None, *, qui
             tables.append(fit_table(payload["fit_rows"]))
             session.write_table("bench_fits.csv", payload["fit_rows"], FIT_COLUMNS)
     if session.out is not None:
-        write_whole(session.out / "bench.json", strict_json(payload) + "\n")
+        write_json(session.out / "bench.json", payload)
         session.note(f"wrote {session.out / 'bench.json'}")
     session.emit(payload, *tables, *(aim_sentence(aim) for aim in payload["aims"]))
 

@@ -6,9 +6,8 @@ import click
 
 from afm_jax.cli.contact_options import ContactOptions, chosen_contact, with_contact_options
 from afm_jax.cli.main import NotValid
-from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.session import Session, with_session, write_json
 from afm_jax.cli.values import Numbers
-from afm_jax.whole_files import write_whole
 from afm_jax.words import known
 
 if TYPE_CHECKING:
@@ -90,9 +89,8 @@ def command(
     session.write_table("collide.csv", rows, COLUMNS)
     if session.out is not None:
         from afm_jax.plots.collisions import draw_collisions  # noqa: PLC0415
-        from afm_jax.strict_json import strict_json  # noqa: PLC0415
 
-        write_whole(session.out / "collide.json", strict_json(payload) + "\n")
+        write_json(session.out / "collide.json", payload)
         title = f"Collisions of a free tip of {mass:g} ng: {', '.join(description['effects'])}"
         draw_collisions(rows, result.capture_speed_nm_per_us, session.out / "collide.png", title=title)
         session.note(f"wrote {session.out / 'collide.json'} and {session.out / 'collide.png'}")

@@ -6,11 +6,9 @@ from typing import Any
 
 from rich.table import Table
 
-from afm_jax.cli.session import Session
+from afm_jax.cli.session import Session, write_json
 from afm_jax.effects.study import Cost, EffectReport, EffectStudy, Reduction
 from afm_jax.scenefile.scenefile import Start, scene_tables
-from afm_jax.strict_json import strict_json
-from afm_jax.whole_files import write_whole
 from afm_jax.words import known
 
 CHANGES = ("peak_amplitude", "lockin_amplitude", "lockin_phase_deg", "energy_per_impact")
@@ -102,7 +100,7 @@ def write_files(session: Session, payload: Mapping[str, Any]) -> None:
     if folder is None:
         return
     session.write_table("effects.csv", [_flat(effect) for effect in payload["effects"]], COLUMNS)
-    write_whole(folder / "effects.json", strict_json(payload) + "\n")
+    write_json(folder / "effects.json", payload)
     draw_effects(payload["effects"], payload["full"], payload["accuracy"], folder / "effects.png")
     session.note(f"wrote {folder / 'effects.json'} and {folder / 'effects.png'}")
 

@@ -7,9 +7,8 @@ import click
 
 from afm_jax.cli.contact_options import ContactOptions, chosen_contact, with_contact_options
 from afm_jax.cli.main import NotValid
-from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.session import Session, with_session, write_json
 from afm_jax.cli.values import Ends
-from afm_jax.whole_files import write_whole
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -110,10 +109,9 @@ def command(
     session.write_table("fit_law.csv", *law_rows(laws))
     session.write_table("fit_delay.csv", _delay_rows(delay), DELAY_COLUMNS)
     if session.out is not None:
-        from afm_jax.strict_json import strict_json  # noqa: PLC0415
         from fitting.report.contact_law_plot import draw_contact_law  # noqa: PLC0415
 
-        write_whole(session.out / "fit_law.json", strict_json(payload) + "\n")
+        write_json(session.out / "fit_law.json", payload)
         draw_contact_law(laws, delay, session.out / "fit_law.png")
         session.note(f"wrote {session.out / 'fit_law.json'} and {session.out / 'fit_law.png'}")
     session.emit(payload, law_table(laws), *law_sentences(laws), "", delay_table(delay), *delay_sentences(delay))

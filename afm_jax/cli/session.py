@@ -78,6 +78,20 @@ def _cells(column: Any) -> Any:
 
 
 _SECONDS_BETWEEN_NOTES = 2.0
+
+
+def labelled(payload: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a result with what it is, `format` and `format_version`, first; one that says so itself as it is."""
+    if "format" in payload:
+        return dict(payload)
+    return {"format": f"afm-jax {click.get_current_context().info_name}", "format_version": 1, **payload}
+
+
+def write_json(path: Path, payload: Mapping[str, Any]) -> None:
+    """Write a result as a JSON file, whole or not at all."""
+    write_whole(path, strict_json(labelled(payload)) + "\n")
+
+
 _WIDTH_OF_A_PIPE = 160
 """Columns of text that nobody looks at in a terminal; wide enough that no table is cut."""
 
@@ -151,7 +165,7 @@ class Session:
             text: strings and rich tables, one below the other; strings are printed as they are.
         """
         if self.json:
-            click.echo(strict_json(payload))
+            click.echo(strict_json(labelled(payload)))
             return
         console = _console(stderr=False)
         for part in text:

@@ -7,15 +7,13 @@ from typing import Any
 import numpy as np
 
 from afm_jax.apparatus.scene import Scene
-from afm_jax.cli.session import Session
+from afm_jax.cli.session import Session, write_json
 from afm_jax.contact.junction import Phase
 from afm_jax.motion.observe import Harmonic, Observables
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation
 from afm_jax.motion.settle import LongRun, Window
 from afm_jax.motion.trajectory import DensePath
 from afm_jax.scenefile.scenefile import scene_tables
-from afm_jax.strict_json import strict_json
-from afm_jax.whole_files import write_whole
 
 _WHOLE_PERIODS = 50
 """Drive periods up to which the whole simulation goes into trajectory.csv."""
@@ -147,7 +145,7 @@ def write_files(
     rows, columns = trajectory_rows(dense, *stretch_written(run.simulation, seen.window))
     session.write_table("trajectory.csv", rows, columns)
     path = session.out / "simulate.json"
-    write_whole(path, strict_json(payload) + "\n")
+    write_json(path, payload)
     session.note(f"wrote {path}")
 
 

@@ -38,6 +38,8 @@ BLOCK = 512
 """Tips computed side by side: few enough to stay in the processor's cache."""
 _CAPTURE_POINTS = 64
 _CAPTURE_ROUNDS = 9
+_MOST_SPENT = {"steps": 0.2, "collocation": 0.05}
+"""Share of the energy that dissipation may take where few steps, or few sweeps, are enough."""
 _NEAR_CAPTURE = (-0.02, 0.2)
 """Energy at the end, of that at the start, between which a tip is close to capture: below 1.1 times that speed."""
 
@@ -371,8 +373,9 @@ def go_through(
     # Few steps are enough where dissipation is small against the energies along the way and no repulsion almost stops
     # the tip inside the bridge.
     reach = jnp.minimum(start + jnp.maximum(pull_in, 0.0), inward.energy_aj)
-    easy_in = (inward.dissipated_aj < 0.2 * reach) & (inward.energy_aj > 0.1 * start) & calm_in
-    easy_out = (outward.dissipated_aj < 0.2 * solid.energy_aj) & calm_out
+    spent = _MOST_SPENT[setting.rule]
+    easy_in = (inward.dissipated_aj < spent * reach) & (inward.energy_aj > 0.1 * start) & calm_in
+    easy_out = (outward.dissipated_aj < spent * solid.energy_aj) & calm_out
     # what is left of the energy at the end has the error of all of it: close to capture that is many times its own
     left = jnp.where(solid.energy_aj > 0.0, outward.energy_aj, solid.energy_aj)
     clear = (left > _NEAR_CAPTURE[1] * start) | (left < _NEAR_CAPTURE[0] * start)
