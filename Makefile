@@ -17,7 +17,7 @@ SHARP := tests/test_polynomial_roots.py tests/test_verification.py
 BIN := .venv/bin
 SETUP := .venv/.installed
 
-.PHONY: help setup fit test check thorough lint types coverage slow mutations bands bench clean
+.PHONY: help setup fit test check thorough lint types coverage slow mutations bands fuzz bench clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -58,12 +58,17 @@ slow: $(SETUP) ## the slow tests: long iterations, references, notebooks
 mutations: $(SETUP) ## wrong formulas, one edit each: a named test must notice
 	$(BIN)/python -m pytest -m slow tests/test_mutations.py
 
+FUZZ ?= --flights 100000 --orbits 10000 --scenes 2000 --files 4000
+
+fuzz: $(SETUP) ## random work, seeded; FUZZ='--flights 1000000 --orbits 100000 --scenes 10000 --files 20000' for all of it
+	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_SOON)" $(BIN)/python -m tests.fuzz $(FUZZ)
+
 bands: $(SETUP) ## do the 95 % bands hold the laws of ten random contacts? (twenty minutes; the truths are kept in /tmp)
 	$(BIN)/python -m tests.coverage_of_bands
 
 check: lint types test slow ## all that CI runs: format, lint, types, tests, slow tests, notebooks
 
-thorough: lint types coverage mutations bands ## all of make check with the share of lines it runs, the mutations, the bands
+thorough: lint types coverage mutations bands fuzz ## all of make check with the share of lines it runs, mutations, bands, random work
 
 bench: $(SETUP) ## impacts per second, next to SciPy
 	$(BIN)/afm-jax bench --out $(OUT)

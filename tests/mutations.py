@@ -214,7 +214,7 @@ MUTATIONS = {
     "turning point on the wrong side of the well": Mutation(
         "> jnp.argmin(potential)",
         "< jnp.argmin(potential)",
-        "tests/test_collide_hard_cases.py::test_a_sharp_tip_turns_in_the_bridge[3.0]",
+        "tests/hard_cases/test_collisions.py::test_a_sharp_tip_turns_in_the_bridge[3.0]",
     ),
     "air that takes half": Mutation(
         "air = 2.0 * float(cantilever.decay_rate)", "air = float(cantilever.decay_rate)", RESPONSE

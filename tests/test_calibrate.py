@@ -322,6 +322,7 @@ def test_a_frequency_in_hz_under_the_name_of_khz_is_pointed_out():
     assert any("name their column frequency_hz" in warning for warning in calibrate(wrong).warnings)
 
 
+@pytest.mark.slow
 def test_the_background_is_chosen_by_akaikes_criterion():
     sloped, plain = synthetic_sweep(noise=1e-3, slope=0.1), synthetic_sweep(noise=1e-3)
     result = calibrate(sloped)

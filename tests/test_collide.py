@@ -58,6 +58,7 @@ def test_the_two_integrators_agree_to_ten_digits():
     np.testing.assert_allclose(stepped.viscous_loss_aj, swept.viscous_loss_aj, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_just_above_capture_the_rebound_is_still_known():
     speed = 1.001 * CAPTURE
     result = collide_in_eights(Contact.paper(), speed)

@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +16,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.cli.main import main
 from afm_jax.whole_files import write_whole
 from fitting.tables.table import TableError, read_table
+from tests.fuzz import fuzz_files, fuzz_orbits
 from tests.test_imports import LIBRARY, ROOT
 
 LAW = "[cantilever]\nfrequency_khz = 90\nquality_factor = 40\n[platform]\namplitude_nm = {}\nreduced_frequency = {}\n"
@@ -119,6 +121,39 @@ def test_an_interrupt_that_is_swallowed_ends_the_program_all_the_same():
         _, said = process.communicate(timeout=20)
     assert process.returncode == 130
     assert said == "afm-jax: interrupted\n"
+
+
+WRITING = """
+import sys
+from afm_jax.whole_files import write_whole
+print("ready", flush=True)
+for number in range(10**9):
+    write_whole(sys.argv[1], f"{number % 10}" * 3_000_000)
+"""
+
+
+@pytest.mark.slow
+def test_a_kill_at_any_time_leaves_no_half_file(tmp_path):
+    # all that commands write goes this way (above); what is left beside the file has a name of its own
+    path, random, found = tmp_path / "fit.json", np.random.default_rng(4), set()
+    for _ in range(50):
+        with subprocess.Popen([sys.executable, "-c", WRITING, path], cwd=ROOT, stdout=subprocess.PIPE) as process:
+            assert process.stdout is not None
+            process.stdout.readline()
+            time.sleep(random.uniform(0.0, 0.05))
+            process.kill()
+        if path.exists():
+            text = path.read_text(encoding="utf-8")
+            assert text == text[:1] * 3_000_000
+            found.add(text[:1])
+    assert len(found) > 1
+    assert all(rest.name.startswith(".fit.json.") for rest in tmp_path.iterdir() if rest != path)
+
+
+@pytest.mark.slow
+def test_a_little_random_work_finds_nothing():
+    fuzz_orbits(256, 3)
+    fuzz_files(200, 3)
 
 
 def test_numbers_whose_squares_are_none_are_refused(tmp_path):

@@ -18,7 +18,7 @@ import math
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
@@ -48,10 +48,14 @@ def prepare_folder(folder: Path) -> None:
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> None:
     """Write rows as CSV; numbers with all their digits, true and false in words, what is unknown as an empty cell."""
+    _write_rows(path, columns, ([_cell(row.get(column)) for column in columns] for row in rows))
+
+
+def _write_rows(path: Path, head: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(columns)
-    writer.writerows([_cell(row.get(column)) for column in columns] for row in rows)
+    writer.writerow(head)
+    writer.writerows(rows)
     write_whole(path, text.getvalue())
 
 
@@ -192,10 +196,7 @@ class Session:
         """
         if self.out is None:
             return
-        with (self.out / name).open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(columns)
-            writer.writerows(zip(*map(_cells, columns.values()), strict=True))
+        _write_rows(self.out / name, columns, zip(*map(_cells, columns.values()), strict=True))
         self.note(f"wrote {self.out / name}")
 
 
