@@ -284,7 +284,7 @@ def test_traces_of_one_drive_are_one_row():
     assert table.lockin_amplitude_nm is not None
     assert table.lockin_amplitude_error_nm is not None
     assert table.phase_deg is not None
-    amplitudes = [result.lockin_amplitude_nm for result in (one, two)]
+    amplitudes = [result.lockin_amplitude_nm or 0.0 for result in (one, two)]
     assert min(amplitudes) < table.lockin_amplitude_nm[0] < max(amplitudes)
     assert abs(table.lockin_amplitude_nm[0] - abs(value)) < 4.0 * table.lockin_amplitude_error_nm[0]
     assert one.phase_deg is not None
