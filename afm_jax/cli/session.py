@@ -192,10 +192,11 @@ class Session:
         """
         if self.out is None:
             return
-        with (self.out / name).open("w", encoding="utf-8", newline="") as file:
-            writer = csv.writer(file, lineterminator="\n")
-            writer.writerow(columns)
-            writer.writerows(zip(*map(_cells, columns.values()), strict=True))
+        text = io.StringIO(newline="")
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(zip(*map(_cells, columns.values()), strict=True))
+        write_whole(self.out / name, text.getvalue())
         self.note(f"wrote {self.out / name}")
 
 
