@@ -5,6 +5,7 @@ the grazing of a resting and of a driven tip.
 """
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -31,6 +32,10 @@ def scene(
     amplitude_nm: float = 2.0, n: float = 1.05, r: float = 0.5, epsilon: float = 0.0, offset: float = -1.0
 ) -> Scene:
     return Scene(Cantilever(90.0), Platform(amplitude_nm, 180.0 * n, offset), ImpactLaw(r, epsilon))
+
+
+def root_of(function: Callable[[float], float], low: float, high: float) -> float:
+    return float(np.asarray(brentq(function, low, high, xtol=1e-15)))
 
 
 def eq9_orbit(
@@ -73,7 +78,7 @@ def orbit_of(n: float, beta: float, sigma: float, r: float, near: float) -> tupl
         return sine**2 + cosine**2 - 1.0
 
     low, high = 0.8 * near, 1.2 * near
-    return eq9_orbit(n, beta, sigma, r, float(brentq(misses, low, high, xtol=1e-15)))
+    return eq9_orbit(n, beta, sigma, r, root_of(misses, low, high))
 
 
 def only(found: Continuation, kind: str) -> list[float]:
@@ -96,7 +101,7 @@ def test_period_doubling_is_that_of_eq_8(doubled: Continuation):
         sine, cosine, after = orbit_of(n, 2.0, -1.0, 0.5, speed)
         return eq8_trace(n, 2.0, sine, cosine, after, 0.5) + 1.25
 
-    assert at == pytest.approx(brentq(stability, at - 0.01, at + 0.01, xtol=1e-15), abs=1e-8)
+    assert at == pytest.approx(root_of(stability, at - 0.01, at + 0.01), abs=1e-8)
 
 
 @pytest.mark.slow
@@ -120,8 +125,8 @@ def test_a_curve_in_two_parameters_is_eq_8_all_along(doubled: Continuation):
     for n, sigma in zip(curve.parameter[::4], curve.second[::4], strict=True):
         # of all orbits there one must be at the doubling
         speeds = np.linspace(0.05, 40.0, 4001)
-        sine, cosine, _ = eq9_orbit(n, 2.0, sigma, 0.5, speeds)
-        miss = sine**2 + cosine**2 - 1.0
+        orbits = np.array([eq9_orbit(n, 2.0, sigma, 0.5, float(speed)) for speed in speeds])
+        miss = orbits[:, 0] ** 2 + orbits[:, 1] ** 2 - 1.0
         near = speeds[:-1][miss[:-1] * miss[1:] < 0.0]
         orbits = [orbit_of(n, 2.0, sigma, 0.5, float(speed) + 0.005) for speed in near]
         left = [abs(eq8_trace(n, 2.0, *orbit, 0.5) + 1.25) for orbit in orbits]
@@ -149,7 +154,7 @@ def test_with_adhesion_a_branch_turns_at_a_fold_and_ends_at_capture():
         return (amplitude(u + 1e-5) - amplitude(u - 1e-5)) / 2e-5
 
     (fold,) = only(found, "fold")
-    turn = float(brentq(slope, 1.05 * speed, 10.0 * speed))
+    turn = root_of(slope, 1.05 * speed, 10.0 * speed)
     assert fold == pytest.approx(amplitude(turn), abs=1e-8)
     point = next(point for point in found.special if point.kind == "fold")
     # |T| = |1 + D| there
@@ -209,7 +214,7 @@ def flattest(problem: OrbitProblem) -> tuple[float, float]:
     sizes = jnp.linspace(jnp.log(1.02 * lowest), jnp.log(30.0 * lowest), 20001)
     flat = jnp.abs(jax.vmap(residual)(sizes)) + jnp.abs(jax.vmap(slope)(sizes))
     place, bend = float(sizes[int(jnp.argmin(flat))]), jax.jit(jax.grad(slope))
-    root = float(brentq(lambda size: float(bend(jnp.asarray(size))), place - 0.02, place + 0.02, xtol=1e-14))
+    root = root_of(lambda size: float(bend(jnp.asarray(size))), place - 0.02, place + 0.02)
     return float(residual(jnp.asarray(root))), float(slope(jnp.asarray(root)))
 
 

@@ -39,7 +39,7 @@ def flown(n: float, r: float, sigma: float, time: float, velocity: float, epsilo
             raise AssertionError("the flight begins inside the platform")
         first = after[-1]
         assert first < 1e4
-    landing = float(brentq(gap, after[below[0] - 1], after[below[0]], xtol=1e-14))
+    landing = float(np.asarray(brentq(gap, after[below[0] - 1], after[below[0]], xtol=1e-14)))
     before = -height * FREE * np.sin(FREE * landing) + velocity * np.cos(FREE * landing)
     platform = -beta * omega * np.sin(omega * (time + landing))
     approach = float(platform - before)
@@ -117,6 +117,7 @@ def test_a_tip_that_comes_to_rest_repeats_from_its_release():
     time = phase / omega + 1e-3
     height = sigma + 2.0 * np.cos(phase)
     velocity = -height * FREE * np.sin(FREE * 1e-3) - 2.0 * omega * np.sin(phase) * np.cos(FREE * 1e-3)
+    approach = np.inf
     for _ in range(40):
         time, velocity, approach = flown(n, r, sigma, time, velocity)
         if approach < 1e-4:

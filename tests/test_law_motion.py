@@ -344,6 +344,13 @@ def test_derivatives_are_differences(end, at):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("within", [lambda slope: slope, jax.jit])
+def test_reverse_that_was_not_asked_for_is_one_clear_error(within):
+    with pytest.raises(ValueError, match=r"`simulate` is differentiable in reverse mode .* with `reverse=True` only"):
+        within(jax.grad(lambda offset: end_of_flights(offset, 0.9).sum()))(-1.0)
+
+
+@pytest.mark.slow
 def test_reverse_is_forward():
     weights = jnp.array([0.3, -0.7])
     _, forward = value_and_slopes(end_of_a_rest, *AT_REST)

@@ -34,6 +34,7 @@ class Outer(NamedTuple):
     number: Array
     inner: Inner
     law: ImpactLaw
+    pair: tuple[Array, Array]
 
 
 @pytest.fixture
@@ -53,7 +54,7 @@ def anew(folder: Path, said: list[str] | None = None) -> Any:
     def scaled_sum(pair, factor, values):
         TRACED.append(factor)
         law = jax.tree.map(lambda leaf: -factor * leaf, pair["law"])
-        return Outer(factor * jnp.sum(values) + pair["law"].epsilon, Inner(2.0 * values), law)
+        return Outer(factor * jnp.sum(values) + pair["law"].epsilon, Inner(2.0 * values), law, (values, -values))
 
     module.scaled_sum = scaled_sum
     said = [] if said is None else said
@@ -75,6 +76,7 @@ def test_what_is_no_array_of_a_result_is_kept_too(folder):
         assert found.inner.sure is True
         assert found.inner.nothing is None
         assert found.law.delay is None
+        np.testing.assert_array_equal(found.pair[1], [-1.0, -2.0, -3.0])
     assert TRACED == [2.0]
 
 

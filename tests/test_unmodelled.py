@@ -4,14 +4,16 @@ import numpy as np
 import pytest
 
 from fitting import fit
-from fitting.fits.loss import EV_PER_AJ, equivalent
+from fitting.fits.loss import EV_PER_AJ, Loss, energy_lost, equivalent, interval_of
 from fitting.fits.objective import Objective
 from fitting.fits.unmodelled import LawBefore, StepRows, Unmodelled, law_after, step_of
 from fitting.forward import ImpactSlopes, impact_slopes
 from fitting.models import Problem, measurement_of
 from fitting.parameters import DELAY_SHAPE, LOSS_SHAPE
+from fitting.report.words import losses_in_words
 from tests.contact_experiment import paper_collisions, paper_experiment
 from tests.coverage_of_bands import noisy
+from tests.made_fits import made_fit
 
 VALUES = {
     "epsilon": 113.6,
@@ -166,3 +168,18 @@ def test_bands_hold_the_law_of_a_contact_that_is_not_the_models():
     assert np.mean(shares) >= 0.9
     assert max(worst) < 2.0
     assert 0.75 < np.mean(degrees) < 1.2
+
+
+def test_the_loss_is_said_in_energies_and_in_the_papers_quantities():
+    u = np.linspace(20.0, 200.0, 50)
+    w = np.sqrt((0.99 * u) ** 2 - 80.0)
+    one = equivalent(u, w, np.stack([0.99 * u**2 / w * 1e-3, -1.0 / w], axis=1), 2.0)
+    assert one is not None
+    energy = energy_lost(20.0, 10.0, 0.1, 2.0)
+    loss = Loss((energy,), (one,), interval_of(9.04, float("nan")))
+    said = dict(losses_in_words(made_fit("law", loss=loss)))
+    # 2 ng (20^2 - 10^2)/2, and 2 ng times 10 times 1.96 times 0.1 to either side
+    assert said["energy lost at 20 nm/us"] == "300.0 aJ (296.1 to 303.9), 1872 eV (1848 to 1897)"
+    assert said["as eq. 6 over 20 to 200 nm/us: r"] == "0.9900 (0.9880 to 0.9920)"
+    assert said["as eq. 6 over 20 to 200 nm/us: delta"] == "80.0 aJ (76.1 to 83.9), 499 eV (475 to 524)"
+    assert said["captured below (extrapolated)"] == "9.04 nm/us"

@@ -70,7 +70,7 @@ def command(
     --out collide.csv, collide.json and collide.png. Captured tips are a result, even if all are; exit code 3 if the
     integration does not resolve one.
     """
-    session.start_computing()
+    session.start_computing("afm_jax.contact.collide:_capture_speed", "afm_jax.contact.collide:_quick")
     from afm_jax.contact.collide import collisions  # noqa: PLC0415
 
     contact, mass, description = chosen_contact(contact_options)

@@ -1,8 +1,8 @@
 """Traced programs beside JAX's compilation cache: what that has compiled it finds only after tracing anew.
 
-Commands name the few that gain more than a second by being kept traced (`jax.export`, its own serialisation) as well. A
-file is found by all that a trace depends on: loaded sources, versions, configuration, devices, shapes and structure.
-Results are modules and named tuples of arrays; arguments that are no arrays have a `repr` that says all of them.
+Commands name the few that gain half a second or more by being kept traced (`jax.export`, its own serialisation) as
+well. A file is found by all that a trace depends on: loaded sources, versions, configuration, devices, shapes and
+structure. Results are modules and tuples of arrays; arguments that are no arrays have a `repr` that says all of them.
 """
 
 import hashlib
@@ -22,6 +22,8 @@ from jax.core import Tracer
 from afm_jax.whole_files import write_whole
 
 _CONFIGURATION = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_precision", "jax_debug_nans")
+_SOON = {"xla_cpu_use_fusion_emitters": False}
+"""A third of the time that these programs take to compile, for a tenth of the time that they run."""
 _PACKAGES = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "lineax")
 
 
@@ -69,7 +71,7 @@ def _program(path: Path, trace: Callable[[], tuple[Any, Any]], tell: Callable[[s
     kept = path.read_bytes() if path.exists() else b""
     if kept[:32] == hashlib.sha256(kept[32:]).digest():
         structure, _, text = kept[32:].partition(b"\n")
-        return jax.jit(export.deserialize(bytearray(text)).call), json.loads(structure)
+        return _compiled_soon(export.deserialize(bytearray(text)).call), json.loads(structure)
     program, structure = trace()
     text = json.dumps(structure).encode() + b"\n" + program.serialize()
     try:
@@ -77,10 +79,21 @@ def _program(path: Path, trace: Callable[[], tuple[Any, Any]], tell: Callable[[s
         tell(f"{path.name} was {'damaged' if kept else 'not there'}: traced and written")
     except OSError as error:
         tell(f"{path.name} cannot be written: {error.strerror}")
-    return jax.jit(program.call), structure
+    return _compiled_soon(program.call), structure
+
+
+def _compiled_soon(call: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a jitted program without the compiler's slowest pass on the CPU, where it knows it by that name."""
+    try:
+        jax.jit(lambda x: x, compiler_options=_SOON)(0.0)
+    except jax.errors.JaxRuntimeError:
+        return jax.jit(call)
+    return jax.jit(call, compiler_options=_SOON)
 
 
 def _structure(value: Any) -> Any:
+    if type(value) is tuple:
+        return ["builtins", "tuple", {str(place): _structure(part) for place, part in enumerate(value)}]
     if not hasattr(value, "_asdict") and not isinstance(value, eqx.Module):
         return 0 if isinstance(value, jax.ShapeDtypeStruct) else {"static": value}
     parts = getattr(value, "_asdict", lambda: vars(value))()
@@ -92,6 +105,8 @@ def _filled(structure: Any, leaves: Iterator[Any]) -> Any:
         return structure["static"] if isinstance(structure, dict) else next(leaves)
     kind = getattr(sys.modules[structure[0]], structure[1])
     parts = {name: _filled(part, leaves) for name, part in structure[2].items()}
+    if kind is tuple:
+        return tuple(parts.values())
     if issubclass(kind, tuple):
         return kind(**parts)
     made = object.__new__(kind)  # without its checks, which are for what users write

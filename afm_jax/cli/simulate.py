@@ -101,7 +101,7 @@ def command(  # noqa: PLR0913
             raise click.UsageError(f"{name} must be a positive number, but is {value:g}")
     if duration_us is not None and periods is not None:
         raise click.UsageError("--duration-us and --periods say the same: give one of them")
-    session.start_computing()
+    session.start_computing("afm_jax.motion.simulate:_contact")
     from afm_jax.apparatus.scene import drive_of  # noqa: PLC0415
     from afm_jax.cli.values import scene_and_start  # noqa: PLC0415
     from afm_jax.motion.observe import observe  # noqa: PLC0415

@@ -412,7 +412,7 @@ def _follow(first: _Step, tangent: np.ndarray, frame: Frame, equations: Equation
         over = _why_over(found, shorter, equations)
         if over is not None:
             return (legs if over == "capture" else legs[:-1]), over
-        if len(legs) > 10 and _closes(legs, first, tangent, length):
+        if len(legs) > 10 and _closes(found, first._replace(tangent=tangent), length, parameters):
             return legs, "closed"
         if here.tangent @ found.tangent > _LONGER:
             length = min(1.5 * length, LONGEST_STEP)
@@ -458,12 +458,12 @@ def _is_next(found: _Step, guess: np.ndarray, length: float, here: _Step) -> boo
     return bool(np.linalg.norm(found.point - guess) < _OFF * length and here.tangent @ found.tangent > _STRAIGHT)
 
 
-def _closes(legs: list[_CurveLeg], first: _Step, tangent: np.ndarray, length: float) -> bool:
+def _closes(found: _Step, first: _Step, length: float, parameters: int) -> bool:
     """Say whether a curve has come back to its beginning; whole turns of the phases count as none."""
-    count = (len(first.point) - 1) // 2
-    apart = legs[-1].end.point - first.point
+    count = (len(first.point) - parameters) // 2
+    apart = found.point - first.point
     apart[:count] = (apart[:count] + np.pi) % (2.0 * np.pi) - np.pi
-    return bool(np.linalg.norm(apart) < length and legs[-1].end.tangent @ tangent > 0.9)
+    return bool(np.linalg.norm(apart) < length and found.tangent @ first.tangent > _STRAIGHT)
 
 
 def _at_the_border(here: _Step, beyond: _Step, frame: Frame, equations: Equations, parameters: int) -> _CurveLeg | None:
@@ -487,7 +487,7 @@ def _at_the_border(here: _Step, beyond: _Step, frame: Frame, equations: Equation
 
 def _lies_on(point: np.ndarray, way: _Way, frame: Frame, equations: Equations) -> bool:
     """Say whether a curve goes through a point, up to whole drive periods and the choice of the first impact."""
-    points, count = way.points, (len(point) - 1) // 2
+    points, parameters = way.points, len(equations.paths)
     between = np.flatnonzero((points[:-1, -1] - point[-1]) * (points[1:, -1] - point[-1]) <= 0.0)
     for index in between:
         low, high = points[index], points[index + 1]
@@ -496,16 +496,16 @@ def _lies_on(point: np.ndarray, way: _Way, frame: Frame, equations: Equations) -
         guess = low + share * (high - low)
         guess[-1] = point[-1]
         found = _solve(frame, guess, np.eye(len(guess))[-1], equations)
-        if found is not None and _same_loop(found.point[:-1], point[:-1], count):
+        if found is not None and _same_loop(found.point, point, parameters):
             return True
     return False
 
 
-def _same_loop(one: np.ndarray, other: np.ndarray, count: int) -> bool:
-    states = [np.stack([np.cos(a[:count]), np.sin(a[:count]), a[count:]]) for a in (one, other)]
-    return any(
-        np.abs(np.roll(states[0], turn, axis=1) - states[1]).max(initial=0.0) < _SAME for turn in range(max(count, 1))
-    )
+def _same_loop(one: np.ndarray, other: np.ndarray, parameters: int) -> bool:
+    count = (len(one) - parameters) // 2
+    states = [np.stack([np.cos(a[:count]), np.sin(a[:count]), a[count : 2 * count]]) for a in (one, other)]
+    apart = min(np.abs(np.roll(states[0], turn, axis=1) - states[1]).max(initial=0.0) for turn in range(max(count, 1)))
+    return bool(apart < _SAME and np.abs(one - other)[-parameters:].max() < _SAME)
 
 
 # Where curves begin.

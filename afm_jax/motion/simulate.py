@@ -6,6 +6,8 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.apparatus.platform import Platform
@@ -104,10 +106,35 @@ def simulate(  # noqa: PLR0913
             f"the interaction must be an ImpactLaw, a Contact or None, not {type(scene.interaction).__name__}"
         )
     if max_contacts is not None:
-        return follow(max_contacts)
-    room = _room(scene, surface, duration_us)
-    # in reverse mode every round is run, needed or not
-    return _with_room(follow, room if reverse else max(_LEAST_ROOM, 1 << (room - 1).bit_length()))
+        found = follow(max_contacts)
+    else:
+        room = _room(scene, surface, duration_us)
+        # in reverse mode every round is run, needed or not
+        found = _with_room(follow, room if reverse else max(_LEAST_ROOM, 1 << (room - 1).bit_length()))
+    return found if reverse else jax.tree.map(_only_forwards, found)
+
+
+_forwards = Primitive("forwards")
+"""A number itself, which says in reverse mode what that needs, before JAX says that a loop has none."""
+_forwards.def_impl(lambda number: number)
+_forwards.def_abstract_eval(lambda number: number)
+mlir.register_lowering(_forwards, lambda _, number: [number])
+batching.primitive_batchers[_forwards] = lambda numbers, axes: (_forwards.bind(*numbers), axes[0])
+
+
+def _refuse(*_):
+    raise ValueError(
+        "`simulate` is differentiable in reverse mode (`grad`, `vjp`, `jacrev`) with `reverse=True` only: add it, or "
+        "take `jvp` or `jacfwd`"
+    )
+
+
+ad.deflinear2(_forwards, _refuse)
+
+
+def _only_forwards(part: Array) -> Array:
+    """Return a part of a result that is traced so that it refuses reverse mode."""
+    return _forwards.bind(part) if is_traced(part) and jnp.issubdtype(part.dtype, jnp.floating) else part
 
 
 def _rounds(room: int, *, reverse: bool) -> int:

@@ -36,7 +36,7 @@ from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRow
 from fitting.fits.unmodelled import (
     LawAfter,
     LawBefore,
-    Step,
+    LinearStep,
     Unmodelled,
     law_after,
     root_of,
@@ -59,7 +59,7 @@ def law_with_band(
     values: Float[np.ndarray, " p"],
     covariance: Float[np.ndarray, "k k"],
     approach_speeds: Float[np.ndarray, " rows"],
-    after: tuple[Step, Unmodelled] | None = None,
+    after: tuple[LinearStep, Unmodelled] | None = None,
 ) -> FittedLaw:
     """Return the law from 0.8 times the slowest to 1.2 times the fastest approach, with its linearised 95 % band.
 
@@ -93,7 +93,7 @@ def law_at(
     values: Float[np.ndarray, " p"],
     covariance: Float[np.ndarray, "k k"],
     speeds: Float[np.ndarray, " n"],
-    after: tuple[Step, Unmodelled] | None = None,
+    after: tuple[LinearStep, Unmodelled] | None = None,
 ) -> LawAfter:
     """Return the law at approach speeds in nm/us; the other arguments as of `law_with_band`."""
     law, slope = jax.tree.map(np.asarray, law_and_slope(jnp.asarray(values), jnp.asarray(speeds), measurement, problem))
@@ -229,7 +229,7 @@ class _Summary:
         if self.after is not None:
             self._take(*self.after)
 
-    def _step(self) -> tuple[Step, Unmodelled] | None:
+    def _step(self) -> tuple[LinearStep, Unmodelled] | None:
         """Return the step with what the model leaves out; None for impacts that take no time, or without slopes."""
         if not self.problem.lasting or not np.isfinite(self.used_speeds).any():
             return None
@@ -245,7 +245,7 @@ class _Summary:
         left_out = Unmodelled(self.problem, values, speed_range(self.used_speeds))
         return step_of(rows, left_out, self.free), left_out
 
-    def _take(self, step: Step, left_out: Unmodelled) -> None:
+    def _take(self, step: LinearStep, left_out: Unmodelled) -> None:
         """Go on with values, errors and residuals after the step."""
         self.names, self.ends, self.spread = step.names, step.values, step.covariance
         self.constraints |= left_out.priors
@@ -493,10 +493,7 @@ def fit(  # noqa: PLR0913
         RuntimeError: if JAX is not set to 64-bit floats.
     """
     options: dict[str, Any] = {"free": free, "fixed": fixed, "constraints": constraints, "effects": effects}
-    if speeds is not None and not 0.0 < speeds[0] < speeds[1] < np.inf:
-        raise ValueError(f"`speeds` must be a rising pair of positive numbers in nm/us, but is {speeds!r}")
-    options["speeds"] = speeds
-    found = find_fit(table, model, scale_errors=scale_errors, robust=robust, **options)
+    found = find_fit(table, model, scale_errors=scale_errors, robust=robust, speeds=speeds, **options)
     return summarise(table, found)
 
 
@@ -514,6 +511,8 @@ def find_fit(  # noqa: PLR0913
 ) -> Found:
     """Return the minimum of a fit; arguments and errors as of `fit`."""
     require_float64()
+    if speeds is not None and not 0.0 < speeds[0] < speeds[1] < np.inf:
+        raise ValueError(f"`speeds` must be a rising pair of positive numbers in nm/us, but is {speeds!r}")
     known = constraints_of(table, constraints)
     if table.quality_factor is not None and (model.endswith("+delay") or model == "contact"):
         known = {"quality_factor": (table.quality_factor, ASSUMED_ERROR_OF_Q * table.quality_factor)} | known

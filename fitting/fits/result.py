@@ -22,8 +22,10 @@ class FittedParameter:
     Attributes:
         value: in the unit beside it.
         unit: the unit, empty for a number.
-        standard_error: Wald's, from the Fisher information; None where the data do not determine it or at a bound.
-        interval95: profile-likelihood interval; an end is None where it is open.
+        standard_error: Wald's, from the Fisher information, and where impacts last with what the model leaves out; None
+            where the data do not determine it or at a bound.
+        interval95: profile-likelihood interval, moved and widened by what the model leaves out; an end is None where it
+            is open.
         interval_reason: why an end is open; None if none is.
         undetermined: the data do not determine it, not even to first order.
         at_bound: the loss vanishes within the resolution of the data.
@@ -86,7 +88,8 @@ class FitResult:
         model: the model's name.
         parameters: by name, the law's first.
         correlations: matrix in the parameters' order; NaN where a variance is unknown.
-        chi2: sum of squared normalised residuals, constraints included; with a robust fit the soft sum.
+        chi2: sum of squared normalised residuals, constraints included, and where impacts last what the model leaves
+            out; with a robust fit the soft sum of the residuals alone.
         degrees_of_freedom: measured amplitudes plus constraints minus parameters.
         p_value: probability of a larger chi2 if the model is right.
         aic: chi2 + 2 k.

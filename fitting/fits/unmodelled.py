@@ -160,7 +160,7 @@ def _stacked(square: list, late: list, count: int) -> Float[np.ndarray, "2 n m"]
     return found
 
 
-class Step(NamedTuple):
+class LinearStep(NamedTuple):
     """The fit after the step.
 
     Attributes:
@@ -186,7 +186,7 @@ class Step(NamedTuple):
     follow: Float[np.ndarray, "m k"]
 
 
-def step_of(rows: StepRows, left_out: Unmodelled, free: Bool[np.ndarray, " p"]) -> Step:
+def step_of(rows: StepRows, left_out: Unmodelled, free: Bool[np.ndarray, " p"]) -> LinearStep:
     """Return where one linear step leads from a fit, with all that is left out.
 
     Args:
@@ -234,7 +234,7 @@ def step_of(rows: StepRows, left_out: Unmodelled, free: Bool[np.ndarray, " p"]) 
     factor = cho_factor(variance, lower=True)
     gain = unknown.T @ cho_solve(factor, np.eye(2 * count))
     likely = -gain @ left[: 2 * count]
-    return Step(
+    return LinearStep(
         names=(*names, *priors),
         values=begin + change,
         change=change,
@@ -354,7 +354,7 @@ class LawBefore(NamedTuple):
     capture_slope: Float[np.ndarray, " p"]
 
 
-def law_after(step: Step, left_out: Unmodelled, speeds: Float[np.ndarray, " n"], before: LawBefore) -> LawAfter:
+def law_after(step: LinearStep, left_out: Unmodelled, speeds: Float[np.ndarray, " n"], before: LawBefore) -> LawAfter:
     """Return the law after the step.
 
     Args:
@@ -379,21 +379,21 @@ def law_after(step: Step, left_out: Unmodelled, speeds: Float[np.ndarray, " n"],
     found, factor = _moved(step, slope, Columns(*(seen(part) for part in columns)))
     found = np.where(leaves, law + found, law)
     found[0] = np.maximum(found[0], 0.0)
+    whole = LawAfter(found, np.where(leaves[:, None], factor, 0.0), before.capture, np.full(factor.shape[2], np.nan))
+    if not before.capture > 0.0:
+        # without adhesion nothing is captured: what is left out cannot be told from there
+        return whole
     # where the squared rebound speed vanishes
-    edge = left_out.columns(np.array([before.capture]), np.zeros(1)) if before.capture > 0.0 else columns
+    edge = left_out.columns(np.array([before.capture]), np.zeros(1))
     rising = 2.0 * left_out.values.get("r", 1.0) ** 2 * before.capture - left_out.values.get("viscous_loss", 0.0)
     at_capture = Columns(*(-part[:1, :1] / max(rising, 1e-9) for part in edge))
     shift, capture_factor = _moved(step, before.capture_slope[None, None], at_capture)
-    return LawAfter(
-        law=found,
-        factor=np.where(leaves[:, None], factor, 0.0),
-        capture=max(before.capture + float(shift[0, 0]), 0.0),
-        capture_factor=capture_factor[0, 0],
-    )
+    capture = max(before.capture + float(shift[0, 0]), 0.0)
+    return whole._replace(capture=capture, capture_factor=capture_factor[0, 0])
 
 
 def _moved(
-    step: Step, slope: Float[np.ndarray, "k n p"], columns: Columns
+    step: LinearStep, slope: Float[np.ndarray, "k n p"], columns: Columns
 ) -> tuple[Float[np.ndarray, "k n"], Float[np.ndarray, "k n m"]]:
     """Return by how much quantities move in the step, and how they change with unknowns of unit variance.
 

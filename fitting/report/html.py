@@ -17,7 +17,7 @@ from markupsafe import Markup
 
 from afm_jax.words import known, plain_words
 from fitting.fits.result import FitResult, FittedRows
-from fitting.parameters import NUISANCE_NAMES, PARAMETERS
+from fitting.parameters import NUISANCE_NAMES, PARAMETERS, SHAPE_NAMES
 from fitting.report.words import (
     SHARE_OF_BAND,
     ComparedModels,
@@ -216,6 +216,8 @@ def _parameters(result: FitResult) -> Table:
         for name, parameter in result.parameters.items()
     ]
     caption = "Standard errors from the Fisher information, intervals from the profile of chi2"
+    if any(name in SHAPE_NAMES for name in result.parameters):
+        caption += ", both with what the law leaves out"
     return Table(caption, head, rows, words=("meaning", "95 % interval", "unit", "remarks"))
 
 
