@@ -85,8 +85,9 @@ def collide(
         contact: the contact; its parameters are numbers, or arrays of the speeds' shape to differ from tip to tip.
         approach_speed_nm_per_us: speeds in nm/us, of any shape.
         mass_ng: the tip's mass in ng; a number, or an array of the speeds' shape.
-        accuracy: wanted relative accuracy of the rebound speed, and a tenth of the delay's in us; picks the cheapest
-            setting that reaches it (`afm-jax accuracy collide` shows what each costs).
+        accuracy: wanted relative accuracy of the rebound speed, and a tenth of the delay's in us (relative where the
+            delay is longer than 1 us); picks the cheapest setting that reaches it (`afm-jax accuracy collide` shows
+            what each costs). Close to capture rounding of the speed itself is more: 1e-16 u_in^2/u_out^2.
         method: "diffrax" (Runge-Kutta steps in the gap) or "collocation".
 
     Returns:
