@@ -26,6 +26,7 @@ def rows_of(study: dict, method: str) -> list[dict]:
     return [row for row in study["rows"] if row["method"] == method]
 
 
+@pytest.mark.slow
 def test_every_scene_and_setting_has_its_row(study: dict):
     assert {row["scene"] for row in study["rows"]} == {"regular", "grazing", "order 5"}
     assert len(study["rows"]) == 3 * (2 * 3 + 1)
@@ -34,6 +35,7 @@ def test_every_scene_and_setting_has_its_row(study: dict):
     assert study["reference_error_us"] < 1e-40  # fifty digits
 
 
+@pytest.mark.slow
 def test_float64_keeps_its_tolerance_and_reaches_rounding(study: dict):
     for row in rows_of(study, "next_impact float64"):
         # the tolerance bounds the error; rounding of times up to 30 us and of the gap adds 1e-14 or so
@@ -44,6 +46,7 @@ def test_float64_keeps_its_tolerance_and_reaches_rounding(study: dict):
     assert coarse["error_us"] > 1e-4
 
 
+@pytest.mark.slow
 def test_float32_ends_at_its_rounding(study: dict):
     for row in rows_of(study, "next_impact float32"):
         if row["tolerance"] == 1e-13:
@@ -51,6 +54,7 @@ def test_float32_ends_at_its_rounding(study: dict):
             assert 1e-8 < row["error_us"] < 1e-3, row
 
 
+@pytest.mark.slow
 def test_scipy_misses_no_impact_and_keeps_near_its_tolerance(study: dict):
     for row in rows_of(study, "SciPy DOP853"):
         assert row["missed_impacts"] == 0
@@ -82,6 +86,7 @@ def test_cheapest_is_the_fastest_that_is_good_enough():
     assert cheapest_settings([row("a", 1e-2, 1.0, None)], 1.0)[0]["method"] is None
 
 
+@pytest.mark.slow
 def test_figure_has_a_labelled_panel_for_each_scene(study: dict):
     figure = accuracy_figure(study["rows"], 1e-9)
     assert [axes.get_title() for axes in figure.axes] == ["scene: regular", "scene: grazing", "scene: order 5"]
@@ -91,6 +96,7 @@ def test_figure_has_a_labelled_panel_for_each_scene(study: dict):
         assert len(axes.get_lines()) == 4
 
 
+@pytest.mark.slow
 def test_command_writes_table_picture_and_one_json_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(own_process, "run_in_own_process", run_here)
     result = CliRunner().invoke(main, ["accuracy", "map", "--quick", "--json", "--out", str(tmp_path)])

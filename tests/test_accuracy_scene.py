@@ -66,6 +66,7 @@ def test_highest_points_are_those_of_the_closed_form():
     assert still[0] == pytest.approx(2.0, rel=5e-4)
 
 
+@pytest.mark.slow
 def test_root_tolerances_bound_the_error_of_an_impact(law_file: str):
     scene, start = scene_to_study(law_file)
     settings = {"contacts": 6, "tolerances": [1e-3, 1e-8, 1e-13, 1e-14], "repetitions": 1}
@@ -145,6 +146,7 @@ def test_law_of_a_scene_is_fitted_over_its_own_speeds(contact_file: str):
     np.testing.assert_allclose(np.asarray(fitted.rebound_speed(speeds)), rebound, rtol=0.02)
 
 
+@pytest.mark.slow
 def test_command_tells_all_of_a_law_scene(law_file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(own_process, "run_in_own_process", run_here)
     arguments = ["accuracy", law_file, "--quick", "--contacts", "5", "--json", "--out", str(tmp_path)]

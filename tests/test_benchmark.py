@@ -126,6 +126,7 @@ def test_aims_are_judged_and_not_invented():
     assert aim_sentence(judged["one forward derivative"]).endswith("not measured in this run")
 
 
+@pytest.mark.slow
 def test_command_writes_tables_and_one_json_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(own_process, "run_in_own_process", run_here)
     arguments = ["bench", "--only", "map", "--quick", "--batch", "2", "--json", "--out", str(tmp_path)]

@@ -59,6 +59,7 @@ def test_models_are_compared_by_their_information(compared):
     assert "tells plainly: law: a restitution with adhesion" in compared.verdict
 
 
+@pytest.mark.slow
 def test_a_model_that_is_fitted_already_is_not_fitted_again(table, compared, failing):
     found = find_fit(table, "law")
     failing("law", RuntimeError("fitted again"))
@@ -71,10 +72,10 @@ def test_a_model_that_is_fitted_already_is_not_fitted_again(table, compared, fai
     ("error", "said"),
     [
         (np.linalg.LinAlgError("Eigenvalues did not converge"), "Eigenvalues did not converge"),
-        (OverflowError("math range error"), "math range error"),
-        (FloatingPointError(), "FloatingPointError"),
+        pytest.param(OverflowError("math range error"), "math range error", marks=pytest.mark.slow),
+        pytest.param(FloatingPointError(), "FloatingPointError", marks=pytest.mark.slow),
         (ValueError("the constraint on 'r' is on no parameter"), "the constraint on 'r' is on no parameter"),
-        (RuntimeError("XLA ran out of memory."), "XLA ran out of memory."),
+        pytest.param(RuntimeError("XLA ran out of memory."), "XLA ran out of memory.", marks=pytest.mark.slow),
     ],
 )
 def test_a_rival_that_fails_is_reported_beside_those_that_stand(table, compared, failing, error, said):
@@ -110,6 +111,7 @@ def test_a_wrong_call_is_no_failed_rival(table):
         compare(table, ("law", "viscous"), constraints={"rr": (1.0, 0.1)})
 
 
+@pytest.mark.slow
 def test_the_command_says_which_rival_failed(failing):
     failing("viscous", np.linalg.LinAlgError("Eigenvalues did not converge"))
     done = CliRunner().invoke(main, ["fit", str(EXAMPLE), "--compare"])

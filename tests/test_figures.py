@@ -126,6 +126,7 @@ def test_offsets_need_a_zero():
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("adhesion", [False, True])
 def test_long_iterations_agree(adhesion: bool, figure2: StabilityChart, figure3: StabilityChart):  # noqa: FBT001
     chart = figure3 if adhesion else figure2

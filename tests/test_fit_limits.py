@@ -102,6 +102,7 @@ def test_without_adhesion_epsilon_is_an_upper_limit(table):
     assert rise == pytest.approx(3.8415, rel=5e-3)  # the search stops within a thousandth
 
 
+@pytest.mark.slow
 def test_without_restitution_loss_both_laws_end_at_their_bound(table):
     """With r = 1 and with viscous_loss = 0 it is the same law, u_out^2 = u_in^2 - epsilon."""
     elastic = simulated(table, ImpactLaw(1.0, 60.0), seed=3)

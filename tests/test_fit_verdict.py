@@ -159,7 +159,12 @@ def test_no_option_makes_a_law_without_delay_a_measurement_of_a_contact(options)
         ("restitution", {"robust": True}, "14 of 82 rows are off by more than 4 errors"),
         ("restitution", {"scale_errors": True}, "residuals over the approach speed are correlated"),
         ("viscous", {"robust": True}, "without outliers chi2/dof = "),
-        ("viscous", {"scale_errors": True}, "contradicts what is known beforehand, in standard errors: quality_factor"),
+        pytest.param(
+            "viscous",
+            {"scale_errors": True},
+            "contradicts what is known beforehand, in standard errors: quality_factor",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_a_law_that_the_amplitudes_are_not_made_by_stays_invalid_with_every_option(model, options, said):

@@ -47,6 +47,7 @@ def viscous(shared) -> FitResult:
     return fit(shared, model="viscous+delay")
 
 
+@pytest.mark.slow
 def test_a_law_that_captures_nothing_has_a_finite_model_error(shared):
     problem = problem_of(shared, "viscous+delay")
     stated = Objective(measurement_of(shared, problem), problem)

@@ -42,6 +42,7 @@ def holds(statements) -> list[bool]:
     return [statement.holds for statement in statements]
 
 
+@pytest.mark.slow
 def test_pieces_join_to_one_motion():
     scene = presets.contact_scene(1.01, 4.0, 0.0)
     start = default_start(scene)

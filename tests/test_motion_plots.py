@@ -36,6 +36,7 @@ def bouncing():
     return scene, simulate(scene, default_start(scene), 120.0)
 
 
+@pytest.mark.slow
 def test_a_contact_scene_has_every_picture(bouncing, tmp_path: Path):
     scene, found = bouncing
     files = draw_motion(scene, found, tmp_path)

@@ -127,7 +127,7 @@ def test_a_file_that_cannot_be_written_costs_nothing_but_time(folder, monkeypatc
 
     said: list[str] = []
     program = anew(folder, said)
-    monkeypatch.setattr(Path, "write_bytes", full)
+    monkeypatch.setattr("afm_jax.cli.programs.write_whole", full)
     assert float(program(*arguments()).number) == 12.0
     assert said[0].endswith("cannot be written: No space left on device")
 
@@ -165,6 +165,7 @@ import afm_jax.__main__
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform in {"win32", "darwin"}, reason="the cache folder is chosen by another variable")
 def test_fits_find_their_programs_again_and_standard_error_holds_our_own_words_only(tmp_path):
     surroundings: dict[str, str | None] = {"XDG_CACHE_HOME": str(tmp_path), "TF_CPP_MIN_LOG_LEVEL": None}

@@ -90,7 +90,9 @@ def test_a_closed_standard_output_is_said():
 
 
 DEAF = """
-import sys, time, types
+import signal, sys, time, types
+# a job in the background of a shell is born deaf
+signal.signal(signal.SIGINT, signal.default_int_handler)
 import click
 from afm_jax.cli.main import COMMANDS, main
 @click.command()
@@ -118,7 +120,10 @@ def test_an_interrupt_that_is_swallowed_ends_the_program_all_the_same():
         assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
         process.send_signal(signal.SIGINT)
-        _, said = process.communicate(timeout=20)
+        try:
+            _, said = process.communicate(timeout=20)
+        finally:
+            process.kill()
     assert process.returncode == 130
     assert said == "afm-jax: interrupted\n"
 

@@ -159,7 +159,7 @@ def test_another_interaction_is_not_saved(path: Path):
         ("viscosity_pa_s = -1", "`viscosity_pa_s` must not be negative, but is -1"),
         ("structural_amplitude_n_per_m = -1", "`structural_amplitude_n_per_m` must not be negative, but is -1"),
         ("structural_offset_nm = nan", "`structural_offset_nm` must be a finite number, but is nan"),
-        ("core_constant_j_m6 = 1e300", "`core_constant_j_m6` is too large: 1e+300"),
+        ("core_constant_j_m6 = 1e300", "`core_constant_j_m6` must be at most 1e+30 in size"),
         ("core_constant_j_m6 = 0", "`core_constant_j_m6` must be positive, but is 0"),
         ("bridge_breaks_nm = 1", "`bridge_breaks_nm` must not be smaller than `bridge_forms_nm`"),
         ('effects = ["core", "jkr"]\nviscosity_pa_s = -1', "`viscosity_pa_s` must not be negative, but is -1"),

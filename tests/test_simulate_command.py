@@ -85,6 +85,7 @@ def test_too_short_to_settle_is_said_and_no_failure(law_file: Path):
     assert "Not settled: " in simulate(law_file, "--duration-us", 20).stdout
 
 
+@pytest.mark.slow
 def test_a_tip_too_slow_sticks(tmp_path: Path):
     path = tmp_path / "stuck.toml"
     # 2 nm over the sample at rest: it comes far below the capture speed of 10.9 nm/us

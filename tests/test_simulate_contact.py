@@ -77,6 +77,7 @@ def test_diffrax_in_time_goes_the_same_way(n, speed):
     np.testing.assert_allclose(arrivals(found, 4), times[:4], rtol=0.0, atol=1e-8)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_batch_are_slopes_of_diffrax_in_time():
     system = reference(5.277, 4.0)
     begin = [state(system.start(phase_deg=270, height_nm=5, velocity_nm_per_us=speed)) for speed in (40.0, 60.0, 80.0)]

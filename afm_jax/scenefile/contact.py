@@ -1,6 +1,5 @@
 """The contact of a scene file: its parameters by name, what they may be, and the contact that they make."""
 
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -33,8 +32,6 @@ def make_contact(effects: Sequence[str], parameters: Mapping[str, float]) -> Con
     """
     for name, value in parameters.items():
         check_parameter(name, value, CONTACT_RANGES[name])
-    if math.isinf(parameters.get("core_constant_j_m6", 0.0) * AJ_NM6_PER_J_M6):
-        raise ValueError(f"`core_constant_j_m6` is too large: {parameters['core_constant_j_m6']:g}")
     contact = Contact.paper(effects=tuple(effects), **parameters)
     if not bool(junction_of(contact).exists):
         raise ValueError(f"the contact has no junction: {explain_missing_junction(contact)}")
