@@ -1,10 +1,13 @@
 """Bifurcation diagrams, charts and basins against plain loops over the map, single tips and closed forms."""
 
+import csv
 import json
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
+import zarr
 from click.testing import CliRunner
 
 import afm_jax as afm
@@ -13,7 +16,7 @@ from afm_jax.cli.main import main
 from afm_jax.dynamics.basins import basins_of_attraction, boundary_dimension
 from afm_jax.dynamics.bifurcations import bifurcation_diagram
 from afm_jax.dynamics.charts import stability_chart
-from afm_jax.scenefile.parameter_paths import scene_family
+from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
 
 FREQUENCY = "platform.reduced_frequency"
 
@@ -115,6 +118,35 @@ def test_a_chart_is_that_of_plain_numpy_at_random_points():
 
 
 @pytest.mark.slow
+def test_a_thousand_random_points_of_a_chart_agree_with_long_iteration():
+    """A tip started beside the orbit comes back to it where the chart says stable, and leaves it elsewhere."""
+    scene, generator = law_scene(1.0), np.random.default_rng(11)
+    x, y = np.sort(generator.uniform(0.52, 4.4, 40)), np.sort(generator.uniform(0.3, 10.0, 25))
+    chart = stability_chart(
+        scene_family(scene, FREQUENCY, "platform.amplitude_nm"), x_values=x, y_values=y, last_order=4
+    )
+    n, beta = (np.ravel(part) for part in chart.points())
+    scenes = scene_batch(scene, {FREQUENCY: n, "platform.amplitude_nm": beta})
+    seen = 0
+    for order in range(1, 5):
+        orbits = jax.jit(jax.vmap(lambda one, order=order: afm.single_impact_orbits(one, order)))(scenes)
+        admissible = np.asarray(orbits.exists & orbits.admissible)
+        stable = admissible & np.asarray(orbits.stable)
+        rank = np.where(stable, orbits.peak_amplitude_nm, np.where(admissible, -1.0, -np.inf))
+        chosen = np.arange(len(n)), np.argmax(rank, axis=1)
+        phase, velocity = (np.asarray(part)[chosen] for part in (orbits.phase_rad, orbits.velocity_after_nm_per_us))
+        size = chart.verdicts.largest_multiplier[order - 1]
+        # so close to a border a thousand impacts do not tell
+        clear = admissible.any(axis=1) & ~(np.abs(np.nan_to_num(size) - 1.0) < 1e-3)
+        time = np.where(clear, phase / np.asarray(scenes.platform.angular_frequency), 0.0)
+        after = afm.iterate_batch(scenes, time, np.where(clear, velocity * (1.0 + 1e-7), 1.0), 1000)
+        apart = np.abs(np.asarray(after.velocity_after_nm_per_us)[:, -1] / velocity - 1.0)
+        assert np.array_equal((apart < 0.5e-7)[clear], chart.verdicts.stable[order - 1][clear]), order
+        seen += int(clear.sum())
+    assert seen > 2000
+
+
+@pytest.mark.slow
 def test_shares_of_basins_are_those_of_random_starts():
     scene = law_scene(1.57)
     found = basins_of_attraction(scene, columns=100, rows=100, speeds_nm_per_us=(0.0, 15.0))
@@ -173,3 +205,14 @@ def test_commands_write_tables_and_pictures(tmp_path: Path):
         assert json.loads(run.stdout)
         assert (tmp_path / name / f"{name}.csv").stat().st_size > 100
         assert list((tmp_path / name).glob(f"{name}.[ps][dnv][fg]"))
+    run = CliRunner().invoke(main, ["chart", str(file), *calls["chart"], "--zarr", "--out", str(tmp_path / "arrays")])
+    assert run.exit_code == 0, run.stderr
+    group = zarr.open_group(str(tmp_path / "arrays" / "chart.zarr"), mode="r")
+    assert (group.attrs["x"], group.attrs["y"]) == (FREQUENCY, "platform.amplitude_nm")
+    arrays = {name: np.asarray(part) for name, part in group.arrays()}
+    with (tmp_path / "chart" / "chart.csv").open(encoding="utf-8") as table:
+        rows = list(csv.DictReader(table))
+    for name in ("stable", "admissible"):
+        assert arrays[name].shape == (2, 3, 9)
+        assert arrays[name][0].ravel().tolist() == [row[f"{name}_1"] == "true" for row in rows]
+    np.testing.assert_array_equal(np.tile(arrays["x"], 3), [float(row[FREQUENCY]) for row in rows])

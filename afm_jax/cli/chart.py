@@ -23,7 +23,7 @@ _MOST_POINTS = 4_000_000
 @click.option("--y", metavar="P=a:b:n", required=True, help="Another one: its rows.")
 @click.option("--orders", type=click.IntRange(1, 100), default=8, show_default=True, help="Highest order N.")
 @click.option(
-    "--zarr", is_flag=True, help="Write the table as chart.zarr instead of chart.csv; needs the package zarr."
+    "--zarr", is_flag=True, help="Write the table as chart.zarr instead of chart.csv; needs the extra `zarr`."
 )
 @click.option("--picture", type=PictureFormat(), default="png", show_default=True, help="png, pdf or svg.")
 @with_session
@@ -36,7 +36,7 @@ def command(session: Session, *, scene: str, x: str, y: str, orders: int, zarr: 
     """
     if zarr:
         # said before the computation, not after it
-        import zarr as _  # noqa: PLC0415  # pyright: ignore[reportMissingImports]
+        import zarr as _  # noqa: PLC0415
     session.start_computing()
     from afm_jax.dynamics.charts import stability_chart  # noqa: PLC0415
     from afm_jax.scenefile.parameter_paths import scene_family  # noqa: PLC0415
@@ -109,7 +109,7 @@ def _write(
         "largest_multiplier": verdicts.largest_multiplier,
     }
     if zarr:
-        import zarr as store  # noqa: PLC0415  # pyright: ignore[reportMissingImports]
+        import zarr as store  # noqa: PLC0415
 
         assert session.out is not None  # asked before  # noqa: S101
         group = store.open_group(str(session.out / "chart.zarr"), mode="w")
