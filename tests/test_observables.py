@@ -250,3 +250,14 @@ def test_above_resonance_the_amplitude_rises():
     assert all(a < b for a, b in pairwise(fifths))
     # 149.7 nm at 2 nm; the ramp of 1e-3 nm/us lags by 0.14 nm of offset, 3.5 nm of height
     assert 140.0 < seen.peak_amplitude_nm < 150.0
+
+
+def test_a_noisy_orbit_is_told_by_its_fewest_contacts():
+    """Rounding beyond the shortest repetition's rate of approach must not make two contacts of one."""
+    noise = 3e-7 * np.array([1.0, -1.0, 1.0, -1.0, 0.99, -1.0] * 10)
+    times, velocities = 5.5 * np.arange(1.0, 61.0), 40.0 * (1.0 + noise)
+    found = find_repetition(times, velocities, 5.5, tolerance=1e-4)
+    assert (found.contacts, found.periods) == (1, 1)
+    # two velocities that differ by more than the tolerance are two contacts
+    apart = find_repetition(times, 40.0 * (1.0 + 1e3 * noise), 5.5, tolerance=1e-4)
+    assert apart is None or apart.contacts == 2

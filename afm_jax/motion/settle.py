@@ -144,6 +144,11 @@ def find_repetitions(
         chosen = left[repeats]
         found.contacts[chosen], found.periods[chosen] = contacts, periods[repeats]
         found.remaining[chosen] = remaining[repeats]
+        # what repeats after m contacts, and after fewer but for less than the tolerance, is of the fewer
+        for fewer in (count for count in range(contacts - 1, 0, -1) if contacts % count == 0):
+            periods, distance = _steps(turns[chosen, last], velocities[chosen, last], fewer)
+            same = distance.max(axis=1) <= tolerance
+            found.contacts[chosen[same]], found.periods[chosen[same]] = fewer, periods[same]
         left = left[~repeats]
     return found
 
