@@ -478,7 +478,8 @@ def _turning_gap(tip: Driven, level: Float[Array, "..."]) -> tuple[Float[Array, 
 
     def improve(point, _):
         value, slope = jax.jvp(lambda at: missing(at, tip, level), (point,), (jnp.ones_like(point),))
-        steep = slope != 0.0
+        # where nothing stops the tip a step would lead anywhere
+        steep = stopped.any() & (slope != 0.0)
         return point - jnp.where(steep, value / jnp.where(steep, slope, 1.0), 0.0), None
 
     # two Newton steps carry first and second derivatives
