@@ -115,7 +115,7 @@ def collide_accuracy(
     steps: Sequence[int],
     batch: int,
     repetitions: int,
-    integrators: tuple[Sequence[str], Sequence[float]],
+    integrators: Sequence[Sequence[Any]],
 ) -> dict[str, Any]:
     """Measure error and time of collisions.
 
