@@ -331,12 +331,16 @@ def _digits_checks(samples: list[Sample], where: str, wanted: int) -> list[Check
     conditions, left_out = [], 0
     for sample in samples:
         rows = np.flatnonzero(sample.ordinary if where == "ordinary" else ~sample.ordinary)[:wanted]
+        if not rows.size:
+            continue
         differences, condition = digits_differences(mp, sample, rows)
         decidable = EPSILON * condition < UNDECIDABLE
         left_out += int((~decidable).sum())
         conditions.append(condition[decidable])
         for name in EQUATIONS:
             found[name].append(differences[name][decidable])
+    if not conditions:
+        return [_digits_check(name, where, None, None, ROUNDING_LIMIT) for name in EQUATIONS]
     note = f"{left_out} states within rounding of capture or of a miss left out" if left_out else None
     condition = np.concatenate(conditions)
     return [
