@@ -9,7 +9,15 @@ from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, sing
 from afm_jax.apparatus.drives import BaseDrive, Tone
 from afm_jax.apparatus.scene import drive_of
 from afm_jax.motion.observe import Observables, observe, poincare_section
-from afm_jax.motion.settle import LongRun, close_periods, find_repetition, follow_long, last_fifth, settled
+from afm_jax.motion.settle import (
+    LongRun,
+    close_periods,
+    find_repetition,
+    find_repetitions,
+    follow_long,
+    last_fifth,
+    settled,
+)
 from afm_jax.motion.start import default_start, start_of, state
 from afm_jax.scenefile.presets import contact_scene, figure10_scene, figure11_scene
 
@@ -252,12 +260,8 @@ def test_above_resonance_the_amplitude_rises():
     assert 140.0 < seen.peak_amplitude_nm < 150.0
 
 
-def test_a_noisy_orbit_is_told_by_its_fewest_contacts():
-    """Rounding beyond the shortest repetition's rate of approach must not make two contacts of one."""
-    noise = 3e-7 * np.array([1.0, -1.0, 1.0, -1.0, 0.99, -1.0] * 10)
-    times, velocities = 5.5 * np.arange(1.0, 61.0), 40.0 * (1.0 + noise)
-    found = find_repetition(times, velocities, 5.5, tolerance=1e-4)
-    assert (found.contacts, found.periods) == (1, 1)
-    # two velocities that differ by more than the tolerance are two contacts
-    apart = find_repetition(times, 40.0 * (1.0 + 1e3 * noise), 5.5, tolerance=1e-4)
-    assert apart is None or apart.contacts == 2
+def test_velocities_that_alternate_within_rounding_are_one():
+    turns, sign = np.arange(1.0, 61.0)[None], np.array([1.0, -1.0] * 30)
+    for size, rounding, contacts in ((3e-7, 1e-6, 1), (3e-7, 1e-8, 2), (3e-4, 1e-6, 2)):
+        found = find_repetitions(turns, 40.0 * (1.0 + size * sign)[None], tolerance=1e-4, rounding=rounding)
+        assert (found.contacts[0], found.periods[0]) == (contacts, contacts)

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from afm_jax.dynamics.iteration import Record
-from afm_jax.motion.settle import LONGEST, find_repetitions
+from afm_jax.motion.settle import LONGEST, ROUNDING, find_repetitions
 from afm_jax.outcomes import Outcome
 
 
@@ -74,7 +74,10 @@ def verdicts_of(
     kinds[list(_KIND_OF)] = list(_KIND_OF.values())
     kind = kinds[outcome]
     turns = record.turns(period_us)
-    found = find_repetitions(turns, record.velocity_after_nm_per_us, tolerance=tolerance, repeated=REPEATED)
+    # resolved contacts, for which the tolerance is wide, repeat to no more than their accuracy
+    rounding = max(ROUNDING, 1e-2 * tolerance)
+    velocities = record.velocity_after_nm_per_us
+    found = find_repetitions(turns, velocities, tolerance=tolerance, repeated=REPEATED, rounding=rounding)
     impacts, periods, remaining = found
     for lane in np.flatnonzero((impacts == 0) & (kind == MotionKind.IRREGULAR) & (record.rested.sum(axis=1) > 1)):
         before, last = np.flatnonzero(record.rested[lane])[-2:]

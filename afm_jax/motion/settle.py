@@ -29,7 +29,7 @@ LONGEST = 32
 """Most contacts that a response may have before it counts as broadband."""
 _REPETITIONS = 6
 """Repetitions in each of the two blocks whose comparison gives the rate of approach."""
-_ROUNDING = 1e-8
+ROUNDING = 1e-8
 """Distance below which a block has arrived, its rate being rounding; not of the tolerance, lest slow motion passes."""
 _LAST_SHARE = 0.2
 _PIECE_PERIODS = 256
@@ -115,6 +115,7 @@ def find_repetitions(
     tolerance: float,
     longest: int = LONGEST,
     repeated: int = _REPETITIONS,
+    rounding: float = ROUNDING,
 ) -> Repetitions:
     """Return the shortest repetition of each of many sequences, as `find_repetition` does.
 
@@ -124,6 +125,7 @@ def find_repetitions(
         tolerance: as there.
         longest: as there.
         repeated: repetitions in each of the two blocks that are compared.
+        rounding: distance below which departures are the same, and a rate of approach says nothing.
     """
     lanes, count = turns.shape
     found = Repetitions(np.zeros(lanes, int), np.zeros(lanes, int), np.full(lanes, np.inf))
@@ -139,16 +141,11 @@ def find_repetitions(
         near = np.isfinite(now) & np.isfinite(before)
         rate = (np.where(near, now, 1.0) / np.where(near & (before > 0.0), before, np.inf)) ** (1.0 / repeated)
         slowly = np.where(rate < 1.0, rate / np.where(rate < 1.0, 1.0 - rate, 1.0), np.inf)
-        remaining = np.where(now <= _ROUNDING, now, np.where(near, now, 1.0) * slowly)
+        remaining = np.where(now <= rounding, now, np.where(near, now, 1.0) * slowly)
         repeats = near & (np.maximum(now, remaining) <= tolerance)
         chosen = left[repeats]
         found.contacts[chosen], found.periods[chosen] = contacts, periods[repeats]
         found.remaining[chosen] = remaining[repeats]
-        # what repeats after m contacts, and after fewer but for less than the tolerance, is of the fewer
-        for fewer in (count for count in range(contacts - 1, 0, -1) if contacts % count == 0):
-            periods, distance = _steps(turns[chosen, last], velocities[chosen, last], fewer)
-            same = distance.max(axis=1) <= tolerance
-            found.contacts[chosen[same]], found.periods[chosen[same]] = fewer, periods[same]
         left = left[~repeats]
     return found
 
