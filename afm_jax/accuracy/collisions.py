@@ -153,7 +153,8 @@ def collide_accuracy(
         np.max(np.abs(rebound[tips] / reference["rebound"][1:] - 1.0)),
         np.max(np.abs(delay[tips] - reference["delay"][1:])),
     )
-    rows += _integrators(*integrators, tolerances, (rebound[speeds.size :], delay[speeds.size :]))
+    methods, tips_of = integrators
+    rows += _integrators(methods, tips_of, tolerances, (rebound[speeds.size :], delay[speeds.size :]))
     return {"rows": rows, "reference_error": float(reference_error)}
 
 
