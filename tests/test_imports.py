@@ -27,6 +27,7 @@ LEVELS = {
     "dynamics": 6,
     "scenefile": 6,
     "effects": 7,
+    "sweeps": 7,
     "verify": 7,
     "bench": 8,
     "accuracy": 9,
