@@ -50,6 +50,7 @@ FITTING_LEVELS = {
     "calibration": 6,
     "inversion": 6,
     "experiments": 6,
+    "bulk": 6,
     "benchmark": 7,
     "examples": 7,
 }

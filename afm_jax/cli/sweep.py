@@ -76,19 +76,24 @@ def command(
     if dry_run:
         _tell_estimate(session, plan)
         return
-    run_and_tell(session, plan, workers=workers, scheduler=scheduler)
+    _tell(session, plan, run_sweep(session, plan, workers=workers, scheduler=scheduler))
     if plot:
         _draw(session, plan)
 
 
-def run_and_tell(session: Session, plan: "SweepPlan", *, workers: int | None, scheduler: str | None) -> None:
-    """Run a plan into the `--out` folder, with its progress on standard error, and say what was done."""
-    from afm_jax.sweeps.store import STORE  # noqa: PLC0415
+def run_sweep(session: Session, plan: "SweepPlan", *, workers: int | None, scheduler: str | None) -> "Swept":
+    """Run a plan into the `--out` folder, with its progress on standard error."""
     from afm_jax.sweeps.sweep import run_plan  # noqa: PLC0415
 
     assert session.out is not None  # asked before  # noqa: S101
     number = _processes(plan) if workers is None and scheduler is None else workers or 1
-    done = run_plan(plan, session.out, workers=number, scheduler=scheduler, report=_progress(session))
+    return run_plan(plan, session.out, workers=number, scheduler=scheduler, report=_progress(session))
+
+
+def _tell(session: Session, plan: "SweepPlan", done: "Swept") -> None:
+    from afm_jax.sweeps.store import STORE  # noqa: PLC0415
+
+    assert session.out is not None  # asked before  # noqa: S101
     payload = {
         "store": session.out / STORE,
         "points": plan.points,
@@ -98,7 +103,6 @@ def run_and_tell(session: Session, plan: "SweepPlan", *, workers: int | None, sc
         "chunks_damaged": len(done.kept.damaged),
         "chunks_computed": done.computed,
         "seconds": done.seconds,
-        "processes": number,
         "variables": {variable.name: variable.attributes() for variable in plan.recorder.variables},
     }
     session.emit(payload, *_words(plan, done, session.out / STORE))

@@ -140,12 +140,13 @@ def run_plan(
             for chunk, results in computing(plan, missing, workers=workers, scheduler=scheduler):
                 store.write(chunk, results)
                 computed += 1
-                if report is not None:
-                    passed = time.monotonic() - begin
-                    rate = (computed - 1) / (passed - first) if computed > 1 else 1.0 / passed
-                    # the first chunk waits for programs to be compiled, the others do not
-                    first = passed if computed == 1 else first
-                    report(round(done + computed * share), plan.points, rate * share)
+                passed = time.monotonic() - begin
+                if computed == 1:
+                    # it waited for programs to be compiled, the others do not
+                    first = passed
+                elif report is not None:
+                    rate = (computed - 1) * share / (passed - first)
+                    report(round(done + computed * share), plan.points, rate)
         except OSError as error:
             count = len(kept.done) + computed
             raise OSError(
