@@ -128,15 +128,14 @@ def run_plan(
     """Compute what a folder does not hold yet of a sweep; arguments and errors as of `sweep`."""
     folder.mkdir(parents=True, exist_ok=True)
     begin = time.monotonic()
-    with locked(folder):
-        store = open_store(folder, plan)
-        kept = store.kept()
-        missing = [chunk for chunk in range(plan.chunks) if chunk not in kept.done]
-        # the last chunks of axes may be smaller, which only a guess of the time left would notice
-        share = plan.points / plan.chunks
-        done = len(kept.done) * share
-        computed, first = 0, 0.0
-        try:
+    kept, computed, first = Kept(frozenset(), frozenset()), 0, 0.0
+    try:
+        with locked(folder):
+            store = open_store(folder, plan)
+            kept = store.kept()
+            missing = [chunk for chunk in range(plan.chunks) if chunk not in kept.done]
+            # the last chunks of axes may be smaller, which only a guess of the time left would notice
+            share = plan.points / plan.chunks
             for chunk, results in computing(plan, missing, workers=workers, scheduler=scheduler):
                 store.write(chunk, results)
                 computed += 1
@@ -146,15 +145,11 @@ def run_plan(
                     first = passed
                 elif report is not None:
                     rate = (computed - 1) * share / (passed - first)
-                    report(round(done + computed * share), plan.points, rate)
-        except OSError as error:
-            count = len(kept.done) + computed
-            raise OSError(
-                error.errno,
-                f"{error.strerror or error}: {count} of {plan.chunks} chunks are kept; make room, and give the same "
-                "command again",
-                str(folder),
-            ) from error
+                    report(round((len(kept.done) + computed) * share), plan.points, rate)
+    except OSError as error:
+        count = len(kept.done) + computed
+        what = f"{error.strerror or error}: {count} of {plan.chunks} chunks are kept; mend that"
+        raise OSError(error.errno, f"{what}, and give the same command again", str(folder)) from error
     return Swept(plan.chunks, kept, computed, time.monotonic() - begin)
 
 
