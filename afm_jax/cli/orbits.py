@@ -16,13 +16,18 @@ if TYPE_CHECKING:
     from afm_jax.dynamics.impact_loop import LoopReading
     from afm_jax.impact.orbits import SingleImpactOrbits
 
-COLUMNS = (
+IMPACT_COLUMNS = (
     "phase_rad",
     "velocity_after_nm_per_us",
     "velocity_before_nm_per_us",
     "approach_speed_nm_per_us",
     "rebound_speed_nm_per_us",
     "delay_us",
+)
+"""What is told of each impact: attributes of `LoopReading`."""
+
+COLUMNS = (
+    *IMPACT_COLUMNS,
     "peak_amplitude_nm",
     "lockin_amplitude_nm",
     "lockin_phase_deg",
@@ -33,17 +38,6 @@ COLUMNS = (
     "near_double",
 )
 """What is told of an orbit: attributes of `SingleImpactOrbits`."""
-
-
-IMPACT_COLUMNS = (
-    "phase_rad",
-    "velocity_after_nm_per_us",
-    "velocity_before_nm_per_us",
-    "approach_speed_nm_per_us",
-    "rebound_speed_nm_per_us",
-    "delay_us",
-)
-"""What is told of each impact: attributes of `LoopReading`."""
 
 MANY_COLUMNS = (*IMPACT_COLUMNS, "peak_amplitude_nm", "trace", "determinant", "stable", "admissible")
 """What is told of an orbit of several impacts, of its impacts the first."""
@@ -161,8 +155,6 @@ def _many(session: Session, scene: "Scene", path: Path, order: int, impacts: int
     rows = [{"orbit": k, **impact} for k, orbit in enumerate(orbits) for impact in orbit["impacts"]]
     session.write_table("impacts.csv", rows, ("orbit", *IMPACT_COLUMNS))
     payload = {
-        "format": "afm-jax orbits",
-        "format_version": 1,
         "order": order,
         "impacts": impacts,
         "scene": scene_tables(scene),

@@ -48,7 +48,7 @@ from afm_jax.scenefile.parameter_paths import (
     check_ranges,
     parameter_values,
     scene_family,
-    with_number,
+    with_numbers,
 )
 
 KINDS = ("fold", "period_doubling", "torus", "grazing", "capture")
@@ -244,11 +244,7 @@ def _frame(scene: Scene, order: int, scale: float, ranges: Sequence[ParameterRan
 def loop_at(shares: Float[Array, " parameters"], frame: Frame, equations: Equations) -> ImpactLoop:
     """Return what is closed where the parameters are at shares of their ranges."""
     values = dict(zip(equations.paths, frame.low + frame.width * shares, strict=True))
-    scene = frame.scene
-    # the cantilever first: reduced frequencies are in its unit
-    for path in sorted(values, key=lambda path: not path.startswith("cantilever")):
-        scene = with_number(scene, path, values[path])
-    return loop_of(scene, frame.order, equations.driven)
+    return loop_of(with_numbers(frame.scene, values), frame.order, equations.driven)
 
 
 def _split(point: Array, equations: Equations) -> tuple[Array, Array]:
@@ -563,10 +559,15 @@ def _read(frame: Frame, points: Array, equations: Equations) -> LoopReading:
 
 def read_points(points: Float[np.ndarray, "points n"], frame: Frame, equations: Equations) -> LoopReading:
     """Return what there is to know of the orbits at points of a curve, NumPy arrays."""
+    return by_blocks(lambda block: _read(frame, block, equations), points)
+
+
+def by_blocks(work: Callable[[Array], Any], points: Float[np.ndarray, "points n"]) -> Any:
+    """Return the results of work on points, NumPy arrays; blocks of one size, the last filled up, share a program."""
     blocks = -(-len(points) // _BLOCK)
     padded = np.concatenate([points, np.repeat(points[-1:], blocks * _BLOCK - len(points), axis=0)])
-    read = [_read(frame, jnp.asarray(block), equations) for block in np.split(padded, blocks)]
-    return jax.tree.map(lambda *parts: np.concatenate([np.asarray(part) for part in parts])[: len(points)], *read)
+    done = [work(jnp.asarray(block)) for block in np.split(padded, blocks)]
+    return jax.tree.map(lambda *parts: np.concatenate([np.asarray(part) for part in parts])[: len(points)], *done)
 
 
 def _branch(way: _Way, frame: Frame, equations: Equations) -> OrbitBranch:

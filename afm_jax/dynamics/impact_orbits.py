@@ -30,6 +30,7 @@ from afm_jax.dynamics.impact_loop import (
     reading_of,
     samples_for,
 )
+from afm_jax.dynamics.iteration import evenly_spread
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, Flight
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.map import impact_after
@@ -151,9 +152,7 @@ def read_loops(
 
 def _starts(number: int) -> Float[Array, "starts 2"]:
     """Return phases and logarithms of speeds, both as shares of their range, that fill the square evenly."""
-    # additive recurrence of the plastic number: no two coordinates line up
-    steps = np.array([0.7548776662466927, 0.5698402909980532])
-    return jnp.asarray((0.5 + np.arange(1, number + 1)[:, None] * steps) % 1.0)
+    return jnp.asarray((0.5 + evenly_spread(number)) % 1.0)
 
 
 @partial(jax.jit, static_argnames=("impacts", "driven"))
