@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.junction import Phase
 from afm_jax.dynamics.iteration import Record, Tips
-from afm_jax.motion.record import ContactKind, Simulation, State
+from afm_jax.motion.record import ContactKind, Contacts, Simulation, State
 from afm_jax.motion.settle import HELD_PERIODS
 from afm_jax.motion.simulate import simulate
 from afm_jax.outcomes import Outcome
@@ -113,36 +113,41 @@ def _followed(scenes: Scene, tips: Tips, duration_us: Float[Any, " lanes"], *, a
 
 
 @partial(jax.jit, static_argnames=("accuracy",))
-def departure_jacobians(
+def departures_after(
     scenes: Scene,
-    departure_us: Float[Array, " lanes"],
-    velocity_nm_per_us: Float[Array, " lanes"],
-    next_departure_us: Float[Array, " lanes"],
+    departure_us: Float[Any, " lanes"],
+    velocity_nm_per_us: Float[Any, " lanes"],
+    until_us: Float[Any, " lanes"],
     *,
     accuracy: float,
-) -> Float[Array, "lanes 2 2"]:
-    """Return the derivatives of next departures, d(time, velocity) over d(time, velocity) of these.
+) -> tuple[Contacts, Float[Array, "lanes 2 2"]]:
+    """Return the contacts after departures, and d(time, velocity) of their ends over d(time, velocity).
 
     Args:
         scenes: a batch of scenes with a contact.
         departure_us: when the tips depart.
         velocity_nm_per_us: in the lab, then.
-        next_departure_us: when their next contacts end.
+        until_us: how long their next contacts are followed.
         accuracy: of `simulate`.
     """
 
-    def one(scene: Scene, time: Array, velocity: Array, later: Array) -> Array:
-        until = later + _BEYOND / scene.cantilever.frequency_khz * 1e3
-
-        def next_departure(state: Array) -> Array:
+    def one(scene: Scene, time: Array, velocity: Array, until: Array) -> tuple[Contacts, Array]:
+        def next_departure(state: Array) -> tuple[Array, Contacts]:
             gap = scene.interaction.bridge_breaks_nm
             start = State(state[0], scene.platform.position(state[0]) + gap, state[1])
-            contacts = simulate(scene, start, until - state[0], max_contacts=1, accuracy=accuracy).contacts
-            return jnp.stack([contacts.departure_time_us[0], contacts.departure_velocity_nm_per_us[0]])
+            rows = simulate(scene, start, until - state[0], max_contacts=1, accuracy=accuracy).contacts
+            contact = jax.tree.map(lambda part: part[0], rows._replace(detail=None))
+            return jnp.stack([contact.departure_time_us, contact.departure_velocity_nm_per_us]), contact
 
-        return jax.jacfwd(next_departure)(jnp.stack([time, velocity]))
+        slopes, contact = jax.jacfwd(next_departure, has_aux=True)(jnp.stack([time, velocity]))
+        return contact, slopes
 
-    return jax.vmap(one)(scenes, departure_us, velocity_nm_per_us, next_departure_us)
+    return jax.vmap(one)(scenes, departure_us, velocity_nm_per_us, until_us)
+
+
+def surely_over_us(scenes: Scene) -> Float[Array, "..."]:
+    """Return the time after a departure at which its contact is surely over, and the next not begun."""
+    return _BEYOND / scenes.cantilever.frequency_khz * 1e3
 
 
 def _slower_period_us(scenes: Scene) -> Float[np.ndarray, " lanes"]:

@@ -120,12 +120,10 @@ def many_impact_orbits(scene: Scene, order: int, impacts: int, *, starts: int = 
     """
     require_float64(scene)
     driven = driven_part(scene)
-    for name, value, most in (("order", order, 1_000_000), ("impacts", impacts, MOST_IMPACTS)):
-        if int(value) != value or not 1 <= value <= most:
-            raise ValueError(f"`{name}` must be a positive integer up to {most}, but is {value}")
+    check_loop(order, impacts)
     number = jnp.asarray(float(order))
     found, scale, good = _search(scene, number, _starts(starts), impacts=int(impacts), driven=driven)
-    loops = _told_apart(np.asarray(found)[np.asarray(good)], order)
+    loops = loops_told_apart(np.asarray(found)[np.asarray(good)], order)
     size = max(16, 1 << max(len(loops) - 1, 0).bit_length())
     padded = np.concatenate([loops, np.zeros((size - len(loops), 2 * impacts))])
     reading = read_loops(
@@ -139,6 +137,17 @@ def many_impact_orbits(scene: Scene, order: int, impacts: int, *, starts: int = 
     absolute = loops[chosen] * np.repeat([1.0, float(scale)], impacts)
     multipliers = multipliers_of(reading.trace, reading.determinant)
     return ManyImpactOrbits(absolute, reading, multipliers, is_stable(multipliers))
+
+
+def check_loop(order: int, impacts: int) -> None:
+    """Check the numbers N and m of an orbit.
+
+    Raises:
+        ValueError: if one is no positive integer, or there are more impacts than 64.
+    """
+    for name, value, most in (("order", order, 1_000_000), ("impacts", impacts, MOST_IMPACTS)):
+        if int(value) != value or not 1 <= value <= most:
+            raise ValueError(f"`{name}` must be a positive integer up to {most}, but is {value}")
 
 
 @partial(jax.jit, static_argnames=("driven", "samples"))
@@ -225,7 +234,7 @@ def closed_loop(guess: Float[Array, " n"], scale: Float[Array, ""], loop: Impact
     return lax.fori_loop(0, _NEWTON_STEPS, improve, guess)
 
 
-def _told_apart(loops: Float[np.ndarray, "found n"], order: int) -> Float[np.ndarray, "loops n"]:
+def loops_told_apart(loops: Float[np.ndarray, "found n"], order: int) -> Float[np.ndarray, "loops n"]:
     """Return each loop once, its hardest impact first; without those that repeat a shorter one."""
     count = loops.shape[1] // 2
     kept: dict[tuple[int, ...], list[np.ndarray]] = {}
