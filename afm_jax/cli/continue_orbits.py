@@ -96,13 +96,15 @@ def command(  # noqa: PLR0913
     """
     session.start_computing()
     from afm_jax.cli.fitted_law import with_fitted_law  # noqa: PLC0415
+    from afm_jax.contact.contact import Contact  # noqa: PLC0415
     from afm_jax.dynamics.continuation import continue_orbits  # noqa: PLC0415
 
     loaded, _ = scene_and_start(scene)
     known = None
     if law is not None:
         loaded, known = with_fitted_law(loaded, law)
-    refuse_other_than_law(loaded, scene)
+    if not isinstance(loaded.interaction, Contact):
+        refuse_other_than_law(loaded, scene)
     first, *others = ranges_of(scene, loaded, [parameter, *([] if second is None else [second])], counted=False)
     try:
         with session.working("following orbits (the first run compiles for some seconds)"):

@@ -112,42 +112,45 @@ def _followed(scenes: Scene, tips: Tips, duration_us: Float[Any, " lanes"], *, a
     return jax.vmap(one)(scenes, tips, duration_us)
 
 
+def next_contact(
+    scene: Scene, departure_us: Array, velocity_nm_per_us: Array, until_us: Array, accuracy: float
+) -> Contacts:
+    """Return the first contact after a departure, followed until a time; one scene, a velocity in the lab."""
+    height = scene.platform.position(departure_us) + scene.interaction.bridge_breaks_nm
+    start = State(departure_us, height, velocity_nm_per_us)
+    rows = simulate(scene, start, until_us - departure_us, max_contacts=1, accuracy=accuracy).contacts
+    return jax.tree.map(lambda part: part[0], rows._replace(detail=None))
+
+
 @partial(jax.jit, static_argnames=("accuracy",))
-def departures_after(
+def departure_jacobians(
     scenes: Scene,
-    departure_us: Float[Any, " lanes"],
-    velocity_nm_per_us: Float[Any, " lanes"],
-    until_us: Float[Any, " lanes"],
+    departure_us: Float[Array, " lanes"],
+    velocity_nm_per_us: Float[Array, " lanes"],
+    next_departure_us: Float[Array, " lanes"],
     *,
     accuracy: float,
-) -> tuple[Contacts, Float[Array, "lanes 2 2"]]:
-    """Return the contacts after departures, and d(time, velocity) of their ends over d(time, velocity).
+) -> Float[Array, "lanes 2 2"]:
+    """Return the derivatives of next departures, d(time, velocity) over d(time, velocity) of these.
 
     Args:
         scenes: a batch of scenes with a contact.
         departure_us: when the tips depart.
         velocity_nm_per_us: in the lab, then.
-        until_us: how long their next contacts are followed.
+        next_departure_us: when their next contacts end.
         accuracy: of `simulate`.
     """
 
-    def one(scene: Scene, time: Array, velocity: Array, until: Array) -> tuple[Contacts, Array]:
-        def next_departure(state: Array) -> tuple[Array, Contacts]:
-            gap = scene.interaction.bridge_breaks_nm
-            start = State(state[0], scene.platform.position(state[0]) + gap, state[1])
-            rows = simulate(scene, start, until - state[0], max_contacts=1, accuracy=accuracy).contacts
-            contact = jax.tree.map(lambda part: part[0], rows._replace(detail=None))
-            return jnp.stack([contact.departure_time_us, contact.departure_velocity_nm_per_us]), contact
+    def one(scene: Scene, time: Array, velocity: Array, later: Array) -> Array:
+        until = later + _BEYOND / scene.cantilever.frequency_khz * 1e3
 
-        slopes, contact = jax.jacfwd(next_departure, has_aux=True)(jnp.stack([time, velocity]))
-        return contact, slopes
+        def next_departure(state: Array) -> Array:
+            contact = next_contact(scene, state[0], state[1], until, accuracy)
+            return jnp.stack([contact.departure_time_us, contact.departure_velocity_nm_per_us])
 
-    return jax.vmap(one)(scenes, departure_us, velocity_nm_per_us, until_us)
+        return jax.jacfwd(next_departure)(jnp.stack([time, velocity]))
 
-
-def surely_over_us(scenes: Scene) -> Float[Array, "..."]:
-    """Return the time after a departure at which its contact is surely over, and the next not begun."""
-    return _BEYOND / scenes.cantilever.frequency_khz * 1e3
+    return jax.vmap(one)(scenes, departure_us, velocity_nm_per_us, next_departure_us)
 
 
 def _slower_period_us(scenes: Scene) -> Float[np.ndarray, " lanes"]:

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.contact_sequence import departures_after, follow_contacts, surely_over_us
+from afm_jax.dynamics.contact_sequence import departure_jacobians, follow_contacts
 from afm_jax.dynamics.iteration import (
     MapStep,
     Record,
@@ -179,8 +179,7 @@ def _exponents_of_contacts(scenes: Scene, tips: Tips, *, impacts: int, transient
 
     def work(rows: tuple[Scene, Array, Array, Array]) -> Array:
         each_scene, time, speed, duration = rows
-        until = time + duration + surely_over_us(each_scene)
-        return departures_after(each_scene, time, speed, until, accuracy=accuracy)[1]
+        return departure_jacobians(each_scene, time, speed, time + duration, accuracy=accuracy)
 
     found = in_blocks(work, (of_all, *pairs), block=_CONTACTS_AT_ONCE).reshape(lanes, steps, 2, 2)
     unit = np.asarray(scenes.platform.angular_frequency * scenes.platform.top_speed_nm_per_us)

@@ -119,6 +119,7 @@ def many_impact_orbits(scene: Scene, order: int, impacts: int, *, starts: int = 
             repeat.
     """
     require_float64(scene)
+    impact_law_of(scene)
     driven = driven_part(scene)
     check_loop(order, impacts)
     number = jnp.asarray(float(order))
@@ -303,8 +304,8 @@ def sticking_orbit(scene: Scene, *, longest: int = 64) -> StickingOrbit | str:
         ValueError: if the drive does not repeat.
     """
     require_float64(scene)
-    driven_part(scene)
     law, period = impact_law_of(scene), drive_of(scene).period_us
+    driven_part(scene)
     if float(law.epsilon) > 0.0 or law.delay is not None:
         return "with adhesion or a delay a tip that comes to rest stays"
     surface, response = surface_of(scene)
