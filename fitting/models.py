@@ -179,6 +179,8 @@ def measurement_of(
         constraints: value and standard error of what is known beforehand, by parameter; else the table says.
         fixed: contact parameters that are not the paper's.
     """
+    if table.tapping:
+        raise ValueError(f"{table.source}: fits are of driven samples so far, and here the {table.drive} is driven")
     known = constraints_of(table, constraints)
     pairs = [
         known.get(name, (parameter.reference, np.inf))
@@ -215,7 +217,7 @@ def rows_of(table: AmplitudeTable) -> Rows:
     return Rows(
         order=jnp.asarray(padded(table.order)),
         drive_frequency_khz=jnp.asarray(padded(table.drive_frequency_khz)),
-        drive_amplitude_nm=jnp.asarray(padded(table.drive_amplitude_nm)),
+        drive_amplitude_nm=jnp.asarray(padded(table.excitation_nm)),
         offset_nm=jnp.asarray(padded(table.offset_nm)),
         amplitude_nm=jnp.asarray(np.where(measured, amplitude, 1.0)),
         error_nm=jnp.asarray(np.where(measured, error, 1.0)),
