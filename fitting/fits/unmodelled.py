@@ -328,7 +328,7 @@ def rows_of_fit(
         approach=np.where(there, speeds.approach, 100.0),
         rebound=np.where(there, speeds.rebound, 99.0),
         pull=np.where(there, -spring * position + air * omega * sine + omega**2 * cosine, 0.0),
-        change=np.where(there, -(omega**3) * sine, 0.0),
+        change=np.where(there, (spring - omega**2) * omega * sine + air * omega**2 * cosine, 0.0),
         hertz_time=np.asarray(impact.hertz_time(jnp.asarray(speeds.approach))),
     )
 
