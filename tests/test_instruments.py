@@ -308,7 +308,7 @@ def damaged(data: bytes, random: np.random.Generator) -> bytes:
 
 
 @pytest.mark.parametrize("kind", ["neasnom", "wsxm", "nid", "ibw", "gwy", "nanonis", "csv"])
-def test_damaged_files_never_end_in_a_traceback(tmp_path: Path, kind: str):
+def test_damaged_files_never_end_in_a_traceback(tmp_path: Path, kind: str, capfd: pytest.CaptureFixture[str]):
     random = np.random.default_rng(20260)
     offset, amplitude, lag = tapping_rows()
     whole = {
@@ -324,6 +324,7 @@ def test_damaged_files_never_end_in_a_traceback(tmp_path: Path, kind: str):
         path = saved(tmp_path, damaged(whole, random), f"curve.{kind}")
         fault = fault_of(path)
         assert not fault or (str(path) in fault and "\n" not in fault)
+    assert capfd.readouterr() == ("", "")
 
 
 def fault_of(path: Path) -> str:

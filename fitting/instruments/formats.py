@@ -6,6 +6,7 @@ neaSNOM text, WSxM curves, Nanonis text, NanoSurf .nid and separated text are re
 
 import csv
 import io
+import logging
 import re
 from collections.abc import Callable, Sequence
 from importlib import import_module
@@ -438,7 +439,10 @@ def parse_igor(data: bytes, name: str) -> Recording:
     """Read Asylum's ramps in Igor's binary waves: a column for each channel, notes of `key: value`, SI units."""
     if len(data) < 64 or _igor_points(data) > min(len(data), _MOST_ROWS):
         raise cut_off(name, "the header announces more numbers than the file holds")
-    wave = _package("igor2.binarywave", ".ibw").load(io.BytesIO(data))["wave"]
+    package = _package("igor2.binarywave", ".ibw")
+    # of a damaged file it would log every number
+    logging.getLogger("igor2").setLevel(logging.CRITICAL)
+    wave = package.load(io.BytesIO(data))["wave"]
     numbers = np.asarray(wave["wData"], dtype=float)
     if numbers.ndim != 2:
         raise TableError(
