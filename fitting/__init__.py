@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from afm_jax.contact.law_of_contact import ContactDelay, ContactLaw, fit_delay, fit_law
+    from fitting.bulk import fit_each
     from fitting.calibration.calibrate import calibrate
     from fitting.calibration.result import Calibration
     from fitting.calibration.sweep import ResonanceSweep, read_sweep
@@ -58,6 +59,7 @@ else:
         "design": "fitting.experiments.design",
         "drive_grid": "fitting.experiments.candidates",
         "fit": "fitting.fits.fit",
+        "fit_each": "fitting.bulk",
         "fit_delay": "afm_jax.contact.law_of_contact",
         "fit_law": "afm_jax.contact.law_of_contact",
         "lockin": "fitting.traces.lockin",
@@ -107,6 +109,7 @@ __all__ = [
     "drive_grid",
     "fit",
     "fit_delay",
+    "fit_each",
     "fit_law",
     "invert",
     "lockin",

@@ -27,6 +27,7 @@ LEVELS = {
     "dynamics": 6,
     "scenefile": 6,
     "effects": 7,
+    "sweeps": 7,
     "verify": 7,
     "bench": 8,
     "accuracy": 9,
@@ -50,6 +51,7 @@ FITTING_LEVELS = {
     "calibration": 6,
     "inversion": 6,
     "experiments": 6,
+    "bulk": 6,
     "benchmark": 7,
     "examples": 7,
 }
