@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
@@ -26,7 +25,7 @@ from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.fits.least_squares import covariance_of
 from fitting.fits.minimum import Strain
 from fitting.fits.objective import ROBUST, Objective
-from fitting.forward import ImpactSlopes, impact_of, impact_slopes
+from fitting.forward import ImpactSlopes, free_impacts, impact_at, impact_slopes
 from fitting.models import Problem
 from fitting.parameters import DELAY_SHAPE, LOSS_SHAPE, PARAMETERS
 
@@ -303,16 +302,19 @@ def rows_of_fit(
     plain = Objective(objective.measurement, problem, near=objective.near)
     linear = plain.at_values(values[None])
     prediction = jax.tree.map(lambda leaf: np.asarray(leaf)[0], linear.prediction)
-    impact = impact_of(jnp.asarray(values), objective.measurement, problem)
-    speeds = jax.tree.map(np.asarray, jax.vmap(impact.speeds)(jnp.asarray(prediction.coordinate)))
+    impact = impact_at(values, objective.measurement, problem).impact
+    free = jax.tree.map(np.asarray, free_impacts(impact, prediction.coordinate))
+    speeds = free.speeds
     known = {name: float(value) for name, value in zip(problem.names, values, strict=True)}
-    cantilever = problem.cantilever(jnp.asarray(values), objective.measurement.cantilever)
+    cantilever = objective.measurement.cantilever
+    quality = known.get("quality_factor", cantilever.quality_factor)
     omega = RAD_PER_US_PER_KHZ * rows.drive_frequency_khz
     height = rows.drive_amplitude_nm * known.get("drive_calibration", 1.0)
     phase = prediction.arrival_rad + 0.5 * omega * speeds.delay
     cosine, sine = height * np.cos(phase), height * np.sin(phase)
     position = rows.offset_nm + known.get("offset_origin_nm", 0.0) + cosine
-    spring, air = float(cantilever.angular_frequency) ** 2, 2.0 * float(cantilever.decay_rate)
+    own = RAD_PER_US_PER_KHZ * float(cantilever.frequency_khz)
+    spring, air = own**2, 0.0 if quality is None else own / float(quality)
     measured = np.asarray(objective.measurement.rows.measured)
     error = np.where(measured, rows.error_nm, 1.0)
     if objective.robust:
@@ -329,7 +331,7 @@ def rows_of_fit(
         rebound=np.where(there, speeds.rebound, 99.0),
         pull=np.where(there, -spring * position + air * omega * sine + omega**2 * cosine, 0.0),
         change=np.where(there, -(omega**3) * sine, 0.0),
-        hertz_time=np.asarray(impact.hertz_time(jnp.asarray(speeds.approach))),
+        hertz_time=free.hertz_time,
     )
 
 
