@@ -10,6 +10,7 @@ or on the way. There, and where there is no steady orbit, the gradient is NaN an
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, NamedTuple
@@ -186,6 +187,35 @@ def linearise(
     )
 
 
+def warm_up(values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem) -> None:
+    """Compile the two large programs of `linearise`, or read them from the cache, side by side.
+
+    Args:
+        values: some values of the parameters.
+        measurement: what will be compared with.
+        problem: the model.
+    """
+    filled, impacts = filled_up(np.asarray(values)[None], measurement, problem)
+    index = np.zeros(_lanes(problem), dtype=int)
+    rows = jax.tree.map(lambda column: np.asarray(column)[index], measurement.rows)
+    some = measurement._replace(rows=rows)
+    nowhere = branch_near(np.full(index.shape, np.nan))
+
+    def in_thread(program: Callable[..., Any], *more: Any) -> None:
+        # what was switched on for one thread alone is not for another
+        with jax.enable_x64(True):  # noqa: FBT003
+            jax.block_until_ready(program(filled, impacts, index, some, problem, *more))
+
+    with ThreadPoolExecutor(1) as pool:
+        other = pool.submit(in_thread, linearise_pairs, nowhere)
+        in_thread(located)
+        other.result()
+
+
+def _lanes(problem: Problem) -> int:
+    return SEARCHED if problem.lasting else SOLVED
+
+
 def _in_lanes(
     filled: Float[np.ndarray, "batch p"],
     sets: int,
@@ -198,7 +228,7 @@ def _in_lanes(
     rows = measurement.rows.order.shape[0]
     columns = jax.tree.map(np.asarray, measurement.rows)
     known = None if near is None else np.broadcast_to(np.asarray(near), (sets, rows)).ravel()
-    lanes = SEARCHED if problem.lasting else SOLVED
+    lanes = _lanes(problem)
     blocks = []
     for begin in range(0, sets * rows, lanes):
         # the last block is filled up with the last pair

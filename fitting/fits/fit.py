@@ -29,7 +29,17 @@ from fitting.fits.intervals import (
     within_range,
 )
 from fitting.fits.loss import Loss, energy_lost, equivalent, interval_of
-from fitting.fits.minimum import Minimum, Strain, minimise, relaxed, rescale_errors, settle, strain_of, untabulated
+from fitting.fits.minimum import (
+    Minimum,
+    Strain,
+    minimise,
+    relaxed,
+    rescale_errors,
+    settle,
+    starts,
+    strain_of,
+    untabulated,
+)
 from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective
 from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows
 from fitting.fits.unmodelled import (
@@ -43,7 +53,7 @@ from fitting.fits.unmodelled import (
     step_of,
 )
 from fitting.fits.verdict import ASSUMED_ERROR_OF_Q, Evidence, judge_fit, misfits
-from fitting.forward import impact_at
+from fitting.forward import impact_at, warm_up
 from fitting.models import Measurement, Problem, constraints_of, measurement_of
 from fitting.parameters import NUISANCE_NAMES, PARAMETERS, check_contact_values, model_parameters
 from fitting.tables.table import AmplitudeTable
@@ -529,6 +539,7 @@ def find_fit(  # noqa: PLR0913
             f"{table.source}: {amplitudes} measured amplitude(s) cannot determine the {len(problem.own)} "
             f"parameters of the model {model!r}; measure at other drives, orders or offsets too"
         )
+    warm_up(starts(problem, measurement)[0], measurement, problem)
     stated = Objective(measurement, problem, robust=robust)
     objective, minimum, strain = unstrained_minimum(stated)
     scale = None
