@@ -8,12 +8,17 @@ orbits are where cosine and sine of the phase, from two linear equations, lie on
 from typing import NamedTuple
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from tests.brute_force import Floats
 from tests.reference_flight import Parameters, constants, outgoing, propagator
+from tests.reference_hertz import under_pull
 
 BRIDGE_NM = 4.7
 SPEEDS = 40_000
+PULLS = np.linspace(-3.0, 4.0, 141)
+LASTS, DEPTH = (CubicSpline(PULLS, column) for column in np.array([under_pull(float(k)) for k in PULLS]).T)
+"""Duration and indentation of a Hertz contact under a pull, from quadratures."""
 
 
 class Impacts(NamedTuple):
@@ -41,11 +46,14 @@ def closing_impacts(p: Parameters, order: int, approach: Floats) -> Impacts:
         middle = np.arctan2(sine, cosine) - k.drive * delay / 2.0
         height, speed = p.offset_nm + k.amplitude * np.cos(middle), -k.amplitude * k.drive * np.sin(middle)
         pull = -(k.free**2) * height - 2.0 * k.decay * speed + k.amplitude * k.drive**2 * np.cos(middle)
-        jerk = -k.amplitude * k.drive**3 * np.sin(middle)
+        bend = -k.amplitude * k.drive**2 * np.cos(middle)
+        jerk = (k.drive**2 - k.free**2) * speed - 2.0 * k.decay * bend
         g, j = pull * lasting / approach, jerk * lasting**2 / approach
-        gain = 0.4247 * j - 0.157 * g * j + 0.027 * j**2 - (20.0 / 9.0) * k.decay * lasting
+        longer, depth = LASTS(np.clip(g, -3.0, 4.0)), DEPTH(np.clip(g, -3.0, 4.0))
+        air = 2.0 * (longer - 1.2 * np.clip(g, -3.0, 4.0) * depth) / 1.8
+        gain = 2.0 * depth * j + 0.027 * j**2 - 2.0 * air * k.decay * lasting
         rebound = np.sqrt(np.maximum(free**2 + gain * approach**2, 0.01 * free**2))
-        longer = -0.1274 * g - 0.0213 * j - 0.0234 * g**2 + 0.0267 * g * j
+        longer = longer - 1.0 - 0.0213 * j + 0.0267 * g * j
         held = _later(free, BRIDGE_NM, pull) - _later(approach, BRIDGE_NM, pull)
         delay = straight + longer * lasting - lead / (1.3 * BRIDGE_NM) * held
     return Impacts(approach, rebound, delay, *_phase(p, order, approach, rebound, delay))
