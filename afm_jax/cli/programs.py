@@ -9,6 +9,7 @@ import hashlib
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -84,11 +85,16 @@ def _program(path: Path, trace: Callable[[], tuple[Any, Any]], tell: Callable[[s
 
 def _compiled_soon(call: Callable[..., Any]) -> Callable[..., Any]:
     """Return a jitted program without the compiler's slowest pass on the CPU, where it knows it by that name."""
+    return jax.jit(call, compiler_options=_SOON if _compiles_sooner() else None)
+
+
+@cache
+def _compiles_sooner() -> bool:
     try:
         jax.jit(lambda x: x, compiler_options=_SOON)(0.0)
     except jax.errors.JaxRuntimeError:
-        return jax.jit(call)
-    return jax.jit(call, compiler_options=_SOON)
+        return False
+    return True
 
 
 def _structure(value: Any) -> Any:

@@ -314,7 +314,7 @@ def _rows(result: FitResult) -> Table:
         ("line", table.lines, ".0f"),
         ("N", table.order, ".0f"),
         ("frequency (kHz)", table.drive_frequency_khz, "g"),
-        ("drive (nm)", table.drive_amplitude_nm, "g"),
+        ("drive (nm)", table.excitation_nm, "g"),
         ("offset (nm)", table.offset_nm, "g"),
         (_APPROACH, rows.approach_speed_nm_per_us, ".4g"),
     ]
