@@ -8,6 +8,7 @@ import click
 
 from afm_jax.cli.accuracy_scene import scene_study, write_study
 from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.values import PRESET_NAMES, SceneName
 from afm_jax.words import known
 
 if TYPE_CHECKING:
@@ -126,7 +127,7 @@ WANTED = [1e-3, 1e-6, 1e-9, 1e-11]
 
 
 @click.command()
-@click.argument("study", required=False, metavar="[map|collide|SCENE.toml]")
+@click.argument("study", required=False, metavar="[map|collide|SCENE.toml|PRESET]", type=SceneName("map", "collide"))
 @click.option(
     "--wanted-error-us",
     type=click.FloatRange(min=0.0, min_open=True),
@@ -235,11 +236,7 @@ def overview_table(choices: Sequence[dict[str, Any]]) -> "Table":
 
 def is_scene(name: str) -> bool:
     """Return whether a name can only be a scene's: a file, a path, or a preset."""
-    if name.endswith(".toml") or Path(name).exists():
-        return True
-    from afm_jax.scenefile.presets import PRESETS  # noqa: PLC0415
-
-    return name in PRESETS
+    return name.endswith(".toml") or Path(name).exists() or name in PRESET_NAMES
 
 
 def collide_study(session: Session, accuracy: float, *, quick: bool) -> None:

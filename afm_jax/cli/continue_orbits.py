@@ -8,7 +8,7 @@ import click
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.orbits import IMPACT_COLUMNS, PositiveInteger, impact_rows, orbit_facts, refuse_other_than_law
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import PictureFormat, ranges_of, scene_and_start
+from afm_jax.cli.values import PictureFormat, SceneName, ranges_of, scene_and_start
 from afm_jax.units import TWO_SIDED_95
 
 if TYPE_CHECKING:
@@ -52,7 +52,7 @@ _ENDS = {
 
 
 @click.command(name="continue")
-@click.argument("scene", metavar="SCENE.toml|PRESET")
+@click.argument("scene", metavar="SCENE.toml|PRESET", type=SceneName())
 @click.option("--order", metavar="N", required=True, type=PositiveInteger(), help="Drive periods of the orbit.")
 @click.option(
     "--impacts",

@@ -4,6 +4,7 @@ Texts of `afm-jax fit`'s options turned into values: `NAME=VALUE`, `NAME=VALUE+-
 """
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +13,7 @@ import click
 from afm_jax.cli.each import fit_tables
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import Ends, Share, parse_around_plus_minus, parse_number
+from afm_jax.cli.values import Ends, Share, example_path, parse_around_plus_minus, parse_number
 from afm_jax.contact.parameters import EFFECTS, REMOVABLE_EFFECTS, idle_without
 from afm_jax.words import text_table
 from fitting.parameters import CONTACT_DEFAULT, DELAY_LAW, LAWS, MODELS, NUISANCE_NAMES
@@ -164,14 +165,14 @@ def command(session: Session, tables: tuple[Path, ...], model: str, noise: float
     from fitting.report.report import summary  # noqa: PLC0415
     from fitting.tables.table import read_table  # noqa: PLC0415
 
-    measured = read_table(_example_path() if table is None else table, noise=noise)
+    measured = read_table(example_path() if table is None else table, noise=noise)
     first = "the first run compiles for half a minute" if "delay" in model or model == "contact" else "some seconds"
     with session.working(f"fitting {measured.rows} rows, model {model} ({first})"):
         found = find_fit(measured, model, **settings)
         result = summarise(measured, found)
     extras, failure = _extras(session, found, result, settings, options)
     payload = result.to_dict() | {name: extra.to_dict() for name, extra in extras.items()}
-    session.emit(payload, summary(result), *(_words(name, extra) for name, extra in extras.items()))
+    session.emit(payload, partial(summary, result), *(partial(_words, name, extra) for name, extra in extras.items()))
     if session.out is not None:
         from fitting.report.report import write_report  # noqa: PLC0415
 
@@ -320,11 +321,3 @@ def _words(name: str, extra: Any) -> str:
         ["parameter", "from", "to"], [[key, *(f"{e:.6g}" for e in ends)] for key, ends in intervals.items()]
     )
     return "\n".join(["", head, *lines])
-
-
-def _example_path() -> Path:
-    """Return where the bundled table lies, the short way if that is below the working folder."""
-    import fitting.examples  # noqa: PLC0415
-
-    path = Path(fitting.examples.__path__[0]) / "amplitudes_law.csv"
-    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path

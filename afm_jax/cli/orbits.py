@@ -1,13 +1,13 @@
-"""`afm-jax orbits SCENE.toml --order N [--impacts m]`: the orbits of a scene."""
+"""`afm-jax orbits SCENE.toml|PRESET --order N [--impacts m]`: the orbits of a scene."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.values import SceneName, scene_and_start
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -61,7 +61,7 @@ class PositiveInteger(click.ParamType):
 
 
 @click.command()
-@click.argument("scene", metavar="SCENE.toml", type=click.Path(path_type=Path))
+@click.argument("scene", metavar="SCENE.toml|PRESET", type=SceneName())
 @click.option(
     "--order",
     metavar="N",
@@ -76,7 +76,7 @@ class PositiveInteger(click.ParamType):
     help="Impacts in these periods, found by a search from many starts; without it, all single-impact orbits.",
 )
 @with_session
-def command(session: Session, scene: Path, order: int, impacts: int | None) -> None:
+def command(session: Session, scene: str, order: int, impacts: int | None) -> None:
     """Find all single-impact orbits of a scene, or with --impacts orbits of several impacts.
 
     Of every orbit: impact phase and velocities, peak and lock-in amplitude, whether it is stable, and whether it is
@@ -88,9 +88,9 @@ def command(session: Session, scene: Path, order: int, impacts: int | None) -> N
     session.start_computing()
     from afm_jax.contact.contact import Contact  # noqa: PLC0415
     from afm_jax.impact.orbits import single_impact_orbits  # noqa: PLC0415
-    from afm_jax.scenefile.scenefile import load_scene, scene_tables  # noqa: PLC0415
+    from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
-    loaded = load_scene(scene)
+    loaded, _ = scene_and_start(scene)
     if impacts is not None or isinstance(loaded.interaction, Contact):
         _many(session, loaded, scene, order, impacts or 1)
         return
@@ -121,7 +121,7 @@ def command(session: Session, scene: Path, order: int, impacts: int | None) -> N
         raise NotValid(reason)
 
 
-def refuse_other_than_law(scene: "Scene", path: str | Path) -> None:
+def refuse_other_than_law(scene: "Scene", path: str) -> None:
     """Check that a scene's interaction is a law.
 
     Raises:
@@ -138,7 +138,7 @@ def refuse_other_than_law(scene: "Scene", path: str | Path) -> None:
     )
 
 
-def _many(session: Session, scene: "Scene", path: Path, order: int, impacts: int) -> None:
+def _many(session: Session, scene: "Scene", path: str, order: int, impacts: int) -> None:
     """Tell the orbits of several impacts, or of a resolved contact."""
     from afm_jax.contact.contact import Contact  # noqa: PLC0415
     from afm_jax.dynamics.contact_orbits import contact_orbits  # noqa: PLC0415
