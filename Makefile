@@ -17,7 +17,7 @@ SHARP := tests/test_polynomial_roots.py tests/test_verification.py
 BIN := .venv/bin
 SETUP := .venv/.installed
 
-.PHONY: help setup fit test check thorough lint types coverage slow mutations bands fuzz kills bench clean
+.PHONY: help setup fit test check thorough lint types coverage slow docs mutations bands fuzz kills bench clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -55,6 +55,9 @@ coverage: $(SETUP) ## make test and make slow with the share of lines that they 
 slow: $(SETUP) ## the slow tests: long iterations, references, notebooks
 	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_SOON)" $(BIN)/python $(PYTEST) -m slow -n auto --dist worksteal --ignore tests/test_mutations.py
 
+docs: $(SETUP) ## the site, in build/site/index.html; notebooks are run unless `make slow` did
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --config-file notebooks/mkdocs.yml
+
 mutations: $(SETUP) ## wrong formulas, one edit each: a named test must notice
 	$(BIN)/python -m pytest -m slow tests/test_mutations.py
 
@@ -71,7 +74,7 @@ KILLS ?= --times 20
 kills: $(SETUP) ## a sweep killed at twenty random times and resumed ends in the bytes of one that was not
 	$(BIN)/python -m tests.kills $(KILLS)
 
-check: lint types test slow ## all that CI runs: format, lint, types, tests, slow tests, notebooks
+check: lint types test slow docs ## all that CI runs: format, lint, types, tests, slow tests, notebooks, site
 
 thorough: lint types coverage mutations bands fuzz kills ## all of make check with the share of lines it runs, mutations, bands, random work, kills
 
