@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from afm_jax.contact.law_of_contact import ContactDelay, ContactLaw, fit_delay, fit_law
+    from fitting.bulk import fit_each
     from fitting.calibration.calibrate import calibrate
     from fitting.calibration.result import Calibration
     from fitting.calibration.sweep import ResonanceSweep, read_sweep
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from fitting.fits.fit import fit
     from fitting.fits.result import FitResult
     from fitting.forward import AmplitudeGradients, amplitude_gradients
+    from fitting.instruments.curve import MeasuredCurve, read_curve, read_curves
     from fitting.inversion.invert import invert
     from fitting.inversion.result import Inversion
     from fitting.sampling.bootstrap import Bootstrap, bootstrap
@@ -42,6 +44,7 @@ else:
         "Design": "fitting.experiments.result",
         "FitResult": "fitting.fits.result",
         "LockinResult": "fitting.traces.lockin",
+        "MeasuredCurve": "fitting.instruments.curve",
         "Posterior": "fitting.sampling.posterior_result",
         "ResonanceSweep": "fitting.calibration.sweep",
         "Inversion": "fitting.inversion.result",
@@ -56,11 +59,14 @@ else:
         "design": "fitting.experiments.design",
         "drive_grid": "fitting.experiments.candidates",
         "fit": "fitting.fits.fit",
+        "fit_each": "fitting.bulk",
         "fit_delay": "afm_jax.contact.law_of_contact",
         "fit_law": "afm_jax.contact.law_of_contact",
         "lockin": "fitting.traces.lockin",
         "invert": "fitting.inversion.invert",
         "posterior": "fitting.sampling.posterior",
+        "read_curve": "fitting.instruments.curve",
+        "read_curves": "fitting.instruments.curve",
         "read_sweep": "fitting.calibration.sweep",
         "read_table": "fitting.tables.table",
         "read_trace": "fitting.traces.trace",
@@ -88,6 +94,7 @@ __all__ = [
     "FitResult",
     "Inversion",
     "LockinResult",
+    "MeasuredCurve",
     "Posterior",
     "ResonanceSweep",
     "SimulatedExperiment",
@@ -102,10 +109,13 @@ __all__ = [
     "drive_grid",
     "fit",
     "fit_delay",
+    "fit_each",
     "fit_law",
     "invert",
     "lockin",
     "posterior",
+    "read_curve",
+    "read_curves",
     "read_sweep",
     "read_table",
     "read_trace",

@@ -27,6 +27,7 @@ LEVELS = {
     "dynamics": 6,
     "scenefile": 6,
     "effects": 7,
+    "sweeps": 7,
     "verify": 7,
     "bench": 8,
     "accuracy": 9,
@@ -40,6 +41,7 @@ FITTING_LEVELS = {
     "parameters": 0,
     "tables": 0,
     "traces": 1,
+    "instruments": 1,
     "models": 1,
     "simulated": 1,
     "forward": 2,
@@ -49,6 +51,7 @@ FITTING_LEVELS = {
     "calibration": 6,
     "inversion": 6,
     "experiments": 6,
+    "bulk": 6,
     "benchmark": 7,
     "examples": 7,
 }

@@ -1,5 +1,6 @@
 """`afm-jax calibrate SWEEP`: frequency and quality factor of the free cantilever from a resonance sweep."""
 
+from functools import partial
 from pathlib import Path
 
 import click
@@ -55,7 +56,7 @@ def command(
         measured = without_phase(measured)
     with session.working(f"fitting {measured.points} points (the first run compiles for some seconds)"):
         result = calibrate(measured, background=background, noise=noise, scale_errors=scale_errors)
-    session.emit(result.to_dict(), calibration_summary(result))
+    session.emit(result.to_dict(), partial(calibration_summary, result))
     if session.out is not None:
         from fitting.calibration.report import write_calibration  # noqa: PLC0415
 

@@ -6,7 +6,7 @@ import click
 
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import PictureFormat, ranges_of, scene_and_start
+from afm_jax.cli.values import PictureFormat, SceneName, ranges_of, scene_and_start
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -18,7 +18,7 @@ _MOST_POINTS = 4_000_000
 
 
 @click.command()
-@click.argument("scene", metavar="SCENE.toml|PRESET")
+@click.argument("scene", metavar="SCENE.toml|PRESET", type=SceneName())
 @click.option("--x", metavar="P=a:b:n", required=True, help="A parameter of the scene file: the chart's columns.")
 @click.option("--y", metavar="P=a:b:n", required=True, help="Another one: its rows.")
 @click.option("--orders", type=click.IntRange(1, 100), default=8, show_default=True, help="Highest order N.")

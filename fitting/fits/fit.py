@@ -18,6 +18,7 @@ from scipy.special import chdtrc
 from afm_jax.checks import require_float64
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact
+from afm_jax.units import TWO_SIDED_95
 from afm_jax.version import version_of
 from fitting.fits.intervals import (
     Convergence,
@@ -68,7 +69,6 @@ from fitting.parameters import NUISANCE_NAMES, PARAMETERS, check_contact_values,
 from fitting.tables.table import AmplitudeTable
 
 _POINTS = 121
-_TWO_SIDED_95 = 1.959963984540054
 
 
 def law_with_band(
@@ -93,7 +93,7 @@ def law_with_band(
     speeds = np.geomspace(0.8 * slow, 1.2 * fast, _POINTS)
     found = law_at(problem, measurement, values, covariance, speeds, after)
     rebound, delay = found.law
-    width = _TWO_SIDED_95 * np.linalg.norm(found.factor, axis=2)
+    width = TWO_SIDED_95 * np.linalg.norm(found.factor, axis=2)
     return FittedLaw(
         approach_speed_nm_per_us=speeds,
         rebound_speed_nm_per_us=rebound,
@@ -380,7 +380,7 @@ class _Summary:
                 growth = errors[i] / before[i] if before[i] > 0.0 else 1.0
                 low, high = (None if e is None else self.ends[i] + growth * (e - self.values[i]) for e in ends)
             else:
-                reason, reach = None, _TWO_SIDED_95 * errors[i]
+                reason, reach = None, TWO_SIDED_95 * errors[i]
                 low, high = self.ends[i] - reach, self.ends[i] + reach
             intervals.append(within_range(PARAMETERS[name], Interval(low, high, reason)))
         return intervals
