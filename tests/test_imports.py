@@ -19,6 +19,8 @@ LEVELS = {
     "words": 0,
     "outcomes": 0,
     "checks": 1,
+    "saved": 1,
+    "results": 1,
     "compilation_cache": 0,
     "apparatus": 2,
     "impact": 3,

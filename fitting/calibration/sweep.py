@@ -24,6 +24,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from afm_jax.results import public_result
 from fitting.tables.csv_text import (
     NUMBER,
     Column,
@@ -156,6 +157,7 @@ _COLUMNS = ("frequency_khz", "amplitude", "phase_deg", "amplitude_error", "phase
 _POSITIVE = ("frequency_khz", "amplitude_error", "phase_error_deg")
 
 
+@public_result()
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ResonanceSweep:
     """A free resonance sweep, sorted by frequency; the arrays are read-only NumPy copies.

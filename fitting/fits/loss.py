@@ -115,5 +115,5 @@ def equivalent(
         epsilon_nm2_per_us2=adhesion,
         delta_aj=delta,
         delta_ev=scaled(delta, EV_PER_AJ),
-        worst_error=float(np.max(np.abs(np.asarray(law.rebound_speed(u)) / w - 1.0))),
+        worst_error=float(np.max(np.abs(np.sqrt(np.maximum((r * u) ** 2 - epsilon, 0.0)) / w - 1.0))),
     )
