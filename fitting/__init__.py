@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from fitting.sampling.posterior_result import Posterior
     from fitting.simulated.experiment import SimulatedExperiment, simulate_experiment
     from fitting.tables.table import AmplitudeTable, TableError, read_table, write_table
+    from fitting.tapping_curves.result import Tapping
+    from fitting.tapping_curves.tapping import tapping
     from fitting.traces.lockin import LockinResult, lockin
     from fitting.traces.trace import Trace, read_trace
 else:
@@ -47,6 +49,7 @@ else:
         "Inversion": "fitting.inversion.result",
         "SimulatedExperiment": "fitting.simulated.experiment",
         "TableError": "fitting.tables.table",
+        "Tapping": "fitting.tapping_curves.result",
         "Trace": "fitting.traces.trace",
         "amplitude_gradients": "fitting.forward",
         "believe": "fitting.experiments.belief",
@@ -65,6 +68,7 @@ else:
         "read_table": "fitting.tables.table",
         "read_trace": "fitting.traces.trace",
         "simulate_experiment": "fitting.simulated.experiment",
+        "tapping": "fitting.tapping_curves.tapping",
         "write_table": "fitting.tables.table",
     }
 
@@ -92,6 +96,7 @@ __all__ = [
     "ResonanceSweep",
     "SimulatedExperiment",
     "TableError",
+    "Tapping",
     "Trace",
     "amplitude_gradients",
     "believe",
@@ -110,5 +115,6 @@ __all__ = [
     "read_table",
     "read_trace",
     "simulate_experiment",
+    "tapping",
     "write_table",
 ]
