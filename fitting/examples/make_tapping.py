@@ -91,7 +91,11 @@ def steady_curve(heights_nm: tuple[float, ...] = HEIGHTS_NM, ratio: float = 1.0)
     return rows
 
 
-def _to_flight(follow, period: float, height: float) -> Simulation:
+def _for_a_time(follow: Callable[..., Simulation], scene: Scene, start: State, time_us: float) -> Simulation:
+    return follow(scene, start, jnp.asarray(time_us))
+
+
+def _to_flight(follow: Callable[[float], Simulation], period: float, height: float) -> Simulation:
     """Return a motion that ends well above the sample, where the next one can begin."""
     motion = follow(_PERIODS * period)
     for share in (0.25, 0.5, 0.75, 0.1, 0.6):
