@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from fitting.fits.fit import fit
     from fitting.fits.result import FitResult
     from fitting.forward import AmplitudeGradients, amplitude_gradients
+    from fitting.instruments.curve import MeasuredCurve, read_curve, read_curves
     from fitting.inversion.invert import invert
     from fitting.inversion.result import Inversion
     from fitting.sampling.bootstrap import Bootstrap, bootstrap
@@ -44,6 +45,7 @@ else:
         "Design": "fitting.experiments.result",
         "FitResult": "fitting.fits.result",
         "LockinResult": "fitting.traces.lockin",
+        "MeasuredCurve": "fitting.instruments.curve",
         "Posterior": "fitting.sampling.posterior_result",
         "ResonanceSweep": "fitting.calibration.sweep",
         "Inversion": "fitting.inversion.result",
@@ -64,6 +66,8 @@ else:
         "lockin": "fitting.traces.lockin",
         "invert": "fitting.inversion.invert",
         "posterior": "fitting.sampling.posterior",
+        "read_curve": "fitting.instruments.curve",
+        "read_curves": "fitting.instruments.curve",
         "read_sweep": "fitting.calibration.sweep",
         "read_table": "fitting.tables.table",
         "read_trace": "fitting.traces.trace",
@@ -92,6 +96,7 @@ __all__ = [
     "FitResult",
     "Inversion",
     "LockinResult",
+    "MeasuredCurve",
     "Posterior",
     "ResonanceSweep",
     "SimulatedExperiment",
@@ -111,6 +116,8 @@ __all__ = [
     "invert",
     "lockin",
     "posterior",
+    "read_curve",
+    "read_curves",
     "read_sweep",
     "read_table",
     "read_trace",

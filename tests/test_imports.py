@@ -40,6 +40,7 @@ FITTING_LEVELS = {
     "parameters": 0,
     "tables": 0,
     "traces": 1,
+    "instruments": 1,
     "models": 1,
     "simulated": 1,
     "forward": 2,

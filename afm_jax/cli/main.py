@@ -183,6 +183,7 @@ COMMANDS = {
     "lockin": ("afm_jax.cli.lockin", "Read response order, amplitudes and phase off time traces of the deflection."),
     "lyapunov": ("afm_jax.cli.lyapunov", "Compute Lyapunov exponents of a motion, or along a parameter."),
     "orbits": ("afm_jax.cli.orbits", "Find the orbits of a scene, of one impact or more, and whether they are stable."),
+    "read": ("afm_jax.cli.read", "Read tapping curves out of an instrument's file, as tables."),
     "simulate": ("afm_jax.cli.simulate", "Follow a scene in time: contacts, amplitudes, phases, energies."),
     "tapping": ("afm_jax.cli.tapping", "Read the energy of a tap, and the impact law, off a tapping curve."),
     "verify": ("afm_jax.cli.verify", "Compare eqs. 5 to 8 with automatic differentiation and with 50 digits."),

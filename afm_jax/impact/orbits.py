@@ -179,12 +179,15 @@ class Verdict(NamedTuple):
 
 
 class SteadyOrbits(NamedTuple):
-    """The roots of a problem, which of them are steady (admissible and stable), peak and lock-in amplitude in nm."""
+    """The roots of a problem, which of them are steady (admissible and stable), and what is seen of them.
+
+    That is peak and lock-in amplitude in nm and the phase in degrees.
+    """
 
     place: OrbitPlace
     steady: Bool[Array, " slots"]
     near_double: Bool[Array, " slots"]
-    amplitude_nm: Float[Array, "slots 2"]
+    amplitude_nm: Float[Array, "slots 3"]
 
 
 @jax.jit
@@ -245,7 +248,7 @@ def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
     def one(place, found):
         state = orbit_state(place, problem)
         verdict = judge(place, found, state, problem)
-        return verdict.admissible & verdict.stable, verdict.near_double, _observed(state, problem)[:2]
+        return verdict.admissible & verdict.stable, verdict.near_double, _observed(state, problem)
 
     return SteadyOrbits(roots.place, *jax.vmap(one)(roots.place, roots.found))
 

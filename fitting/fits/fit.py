@@ -30,7 +30,17 @@ from fitting.fits.intervals import (
     within_range,
 )
 from fitting.fits.loss import Loss, energy_lost, equivalent, interval_of
-from fitting.fits.minimum import Minimum, Strain, minimise, relaxed, rescale_errors, settle, strain_of, untabulated
+from fitting.fits.minimum import (
+    ATTRACTED,
+    Minimum,
+    Strain,
+    minimise,
+    relaxed,
+    rescale_errors,
+    settle,
+    strain_of,
+    untabulated,
+)
 from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective
 from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows
 from fitting.fits.unmodelled import (
@@ -45,7 +55,15 @@ from fitting.fits.unmodelled import (
 )
 from fitting.fits.verdict import ASSUMED_ERROR_OF_Q, Evidence, judge_fit, misfits
 from fitting.forward import impact_of
-from fitting.models import Measurement, Problem, constraints_of, measurement_of
+from fitting.models import (
+    Measurement,
+    Problem,
+    Reach,
+    constraints_of,
+    measurement_of,
+    place_of_rows,
+    readings_of,
+)
 from fitting.parameters import NUISANCE_NAMES, PARAMETERS, check_contact_values, model_parameters
 from fitting.tables.table import AmplitudeTable
 
@@ -253,12 +271,15 @@ class _Summary:
             self.chi2 = step.chi2
         count, error = self.table.rows, np.asarray(self.searching.measurement.rows.error_nm)
         residual = step.residual[:count]
-        predicted = self.rows.predicted_nm + error[:count] * (residual - self.amplitude_residual[:count])
+        moved = error[:count] * (residual - self.amplitude_residual[:count])
         used = np.isfinite(self.rows.residual)
+        moved = np.where(used, moved, 0.0)
+        phase = self.rows.predicted_phase_deg
         self.rows = replace(
             self.rows,
             residual=np.where(used, residual, np.nan),
-            predicted_nm=np.where(used, predicted, self.rows.predicted_nm),
+            predicted_nm=self.rows.predicted_nm + moved[:, :2],
+            predicted_phase_deg=None if phase is None else phase + moved[:, 2],
         )
 
     def result(self) -> FitResult:
@@ -388,19 +409,27 @@ class _Summary:
         prediction: Any = self.prediction
         exists = prediction.orbits[0][:count] > 0
         predicted = np.where(exists[:, None], prediction.amplitude_nm[0][:count], np.nan)
-        amplitude, error = np.asarray(rows.amplitude_nm)[:count], np.asarray(rows.error_nm)[:count]
-        measured = used | (self.strain.set_aside[:count, None] & np.isfinite(_amplitudes(self.table)))
+        error = np.where(used, np.asarray(rows.error_nm)[:count], np.nan)
+        reasons = self.strain.reasons[:count].copy()
+        reasons[place_of_rows(self.table) == Reach.ATTRACTED] = ATTRACTED
+        measured = np.where(used | (reasons != "")[:, None], readings_of(self.table)[0], np.nan)
+        phases = {}
+        if measured.shape[1] > 2:
+            columns = {"predicted_phase_deg": predicted, "measured_phase_deg": measured, "phase_error_deg": error}
+            phases = {name: column[:, 2] for name, column in columns.items()}
         return FittedRows(
-            predicted_nm=predicted,
-            measured_nm=np.where(measured, amplitude, np.nan),
+            predicted_nm=predicted[:, :2],
+            measured_nm=measured[:, :2],
             residual=np.where(used, self.amplitude_residual[:count], np.nan),
-            error_nm=np.where(used, error, np.nan),
+            error_nm=error[:, :2],
             model_error=self.strain.model_error[:count],
             used=np.any(used, axis=1, keepdims=False).astype(bool),
-            set_aside=self.strain.set_aside[:count],
+            set_aside=(reasons != "").astype(bool),
             approach_speed_nm_per_us=np.where(exists, prediction.approach_speed_nm_per_us[0][:count], np.nan),
             orbits=prediction.orbits[0][:count],
             near_fold=prediction.near_fold[0][:count],
+            reasons=tuple(reasons.tolist()),
+            **phases,
         )
 
     def _other_minimum(self, errors: Float[np.ndarray, " p"]) -> tuple[dict[str, float], float] | None:
@@ -430,15 +459,8 @@ def _correlations(covariance_matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarr
     return np.where(np.outer(known, known), matrix, np.nan)
 
 
-def _amplitudes(table: AmplitudeTable) -> Float[np.ndarray, "rows 2"]:
-    """Return peak and lock-in amplitude of the table, NaN where not measured."""
-    blank = np.full(table.rows, np.nan)
-    columns = table.peak_amplitude_nm, table.lockin_amplitude_nm
-    return np.stack([blank if column is None else column for column in columns], axis=1)
-
-
-def _autocorrelation(residual: Float[np.ndarray, "rows 2"]) -> float:
-    """Return the lag-1 correlation of residuals of neighbouring rows, both amplitudes together; NaN for few rows."""
+def _autocorrelation(residual: Float[np.ndarray, "rows k"]) -> float:
+    """Return the lag-1 correlation of residuals of neighbouring rows, all readings together; NaN for few rows."""
     before, after = residual[:-1], residual[1:]
     both = np.isfinite(before) & np.isfinite(after)
     total = np.nansum(residual**2)
@@ -569,13 +591,13 @@ def problem_of(
             raise ValueError(
                 f"the constraint on {name} must be a value and a positive error, but is {value} +- {error}"
             )
-    if "offset_origin_nm" in known and model.endswith("+delay"):
+    if "offset_origin_nm" in known and model.endswith("+delay") and not table.tapping:
         raise ValueError(
             "offset_origin_nm and delay_offset_nm shift the same thing: with a delay leave the constraint on "
             "offset_origin_nm out (delay_offset_nm takes it up), or fit the model 'contact'"
         )
     nuisances = tuple(name for name in NUISANCE_NAMES if name in known)
-    return Problem(model, own + nuisances, tuple(effects))
+    return Problem(model, own + nuisances, tuple(effects), table.drive)
 
 
 def unstrained_minimum(stated: Objective) -> tuple[Objective, Minimum, Strain]:

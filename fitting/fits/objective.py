@@ -141,12 +141,12 @@ class Objective:
         """Return where the orbits of some of the sets are followed from."""
         return self.near[sets] if self.near is not None and self.near.ndim > 1 else self.near
 
-    def amplitude_residuals(self, values: Float[np.ndarray, " p"]) -> Float[np.ndarray, "rows 2"]:
-        """Return the residuals of the amplitudes at one set of values, as they are."""
+    def amplitude_residuals(self, values: Float[np.ndarray, " p"]) -> Float[np.ndarray, "rows k"]:
+        """Return the residuals of the readings at one set of values, as they are."""
         return self.misfit(self.at_values(values[None]))
 
-    def misfit(self, linear: Linearised) -> Float[np.ndarray, "rows 2"]:
-        """Return the plain residuals of the amplitudes that the first set of a linearised model predicts."""
+    def misfit(self, linear: Linearised) -> Float[np.ndarray, "rows k"]:
+        """Return the plain residuals of the readings that the first set of a linearised model predicts."""
         rows = self.measurement.rows
         apart = np.asarray(linear.prediction.amplitude_nm)[0] - np.asarray(rows.amplitude_nm)
         return np.where(np.asarray(rows.measured), apart / np.asarray(rows.error_nm), 0.0)

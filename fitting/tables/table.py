@@ -483,6 +483,13 @@ class AmplitudeTable:
         assert found is not None  # checked when it was made  # noqa: S101
         return found
 
+    @property
+    def phase_and_error_deg(self) -> tuple[Float[np.ndarray, " rows"] | None, Float[np.ndarray, " rows"] | None]:
+        """Phase of the orbit, or lag of the driven tip, and its standard error; None without them."""
+        if self.tapping:
+            return self.phase_lag_deg, self.phase_lag_error_deg
+        return self.phase_deg, self.phase_error_deg
+
 
 def _check_pairs(columns: dict[str, Float[np.ndarray, "..."]], form: Form, faults: Faults) -> None:
     """Note columns of the other form, missing ones, values or errors without the other, and no amplitudes at all."""
