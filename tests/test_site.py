@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 import yaml
 
+from notebooks.make_pictures import PICTURES
 from notebooks.run_notebooks import NOTEBOOKS
 
 ROOT = Path(__file__).parent.parent
@@ -64,6 +65,15 @@ def test_every_notebook_and_page_is_in_the_table_of_contents():
     for notebook in NOTEBOOKS:
         assert f"gallery/{notebook.name}" in listed
         assert f"({notebook.name})" in gallery
+
+
+def test_pictures_stand_beside_their_commands():
+    pages = ROOT / "notebooks" / "pages"
+    text = " ".join(" ".join(page.read_text(encoding="utf-8") for page in pages.glob("*.md")).split())
+    assert {path.stem for path in (pages / "pictures").glob("*.png")} == set(PICTURES)
+    for picture, command in PICTURES.items():
+        assert f"(pictures/{picture}.png)" in text
+        assert f"`afm-jax {command}`" in text
 
 
 @pytest.mark.slow
