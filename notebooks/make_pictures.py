@@ -13,7 +13,8 @@ PAGES = ROOT / "notebooks" / "pages"
 PICTURES = {
     "fit": "fit --example --out report",
     "invert": "invert --example --out report",
-    "chart": "chart figure3 --x platform.reduced_frequency=0.4:4.4:300 --y platform.amplitude_nm=0.1:10:200 --out chart",
+    "chart": "chart figure3 --x platform.reduced_frequency=0.4:4.4:300 --y platform.amplitude_nm=0.1:10:200"
+    " --out chart",
     "branches": "continue scene.toml --order 1 --parameter platform.amplitude_nm=0.5:6 --out branches",
     "basins": "basins scene.toml --grid 100x100 --out basins",
     "collide": "collide --speeds 12,15,20,60 --out collide",
