@@ -201,9 +201,9 @@ TAPPING = _form(
     "belongs to a sample that is driven; with '# drive = force' or '# drive = base' the columns are "
     + ", ".join(column.name for column in _TAPPING),
 )
+COLUMN_NAMES = TABLE.names
 FORMS = {drive: TABLE if drive == "sample" else TAPPING for drive in DRIVES}
 """The columns of a table by what is driven."""
-COLUMN_NAMES = TABLE.names
 _ALL = tuple({column.name: column for column in (*_SAMPLE, *_TAPPING)}.values())
 MEASURED = tuple(column for column in _ALL if column.error is not None)
 AMPLITUDES = tuple(column for column in _ALL if column.amplitude)
@@ -476,18 +476,22 @@ class AmplitudeTable:
             TableError: if a value is impossible, a column is not known or missing.
         """
         faults = Faults(str(header.get("source", "data frame")), place="row")
-        columns = {name: np.asarray(frame[name], dtype=np.float64) for name in COLUMN_NAMES if name in frame}
-        for name in frame.columns:
-            if name not in (*COLUMN_NAMES, "lines"):
-                faults.add(f"there is no column {name!r}; leave it out, or choose from {', '.join(COLUMN_NAMES)}")
-        own = {field.name for field in fields(cls)} - {*COLUMN_NAMES, "lines"}
+        names = {column.name for column in _ALL}
+        own = {field.name for field in fields(cls)} - {*names, "lines"}
         known = {name: value for name, value in frame.attrs.items() if name in own} | header
-        for name in ("free_frequency_khz", *(column.name for column in REQUIRED)):
+        form = FORMS.get(known.get("drive", "sample"), TABLE)
+        columns = {name: np.asarray(frame[name], dtype=np.float64) for name in form.names if name in frame}
+        for name in frame.columns:
+            if name not in (*form.names, "lines"):
+                faults.add(f"there is no column {name!r}; leave it out, or choose from {', '.join(form.names)}")
+        needed = (column.name for column in form.columns if column.required and column.needed)
+        for name in ("free_frequency_khz", *needed):
             if name not in known and name not in columns:
                 faults.add(f"{name} is missing; give it as a {'keyword' if name in own else 'column'}")
         faults.raise_any()
         fill_errors(columns, {name: np.zeros(len(frame), dtype=bool) for name in columns}, noise)
-        columns["order"] = columns["order"].astype(np.int64)
+        if "order" in columns:
+            columns["order"] = columns["order"].astype(np.int64)
         return cls(**columns, **({"source": "data frame"} | known))
 
     @property
