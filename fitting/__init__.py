@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from fitting.sampling.posterior_result import Posterior
     from fitting.simulated.experiment import SimulatedExperiment, simulate_experiment
     from fitting.tables.table import AmplitudeTable, TableError, read_table, write_table
+    from fitting.tapping_curves.result import Tapping
+    from fitting.tapping_curves.tapping import tapping
     from fitting.traces.lockin import LockinResult, lockin
     from fitting.traces.trace import Trace, read_trace
 else:
@@ -51,6 +53,7 @@ else:
         "Inversion": "fitting.inversion.result",
         "SimulatedExperiment": "fitting.simulated.experiment",
         "TableError": "fitting.tables.table",
+        "Tapping": "fitting.tapping_curves.result",
         "Trace": "fitting.traces.trace",
         "amplitude_gradients": "fitting.forward",
         "believe": "fitting.experiments.belief",
@@ -73,6 +76,7 @@ else:
         "read_table": "fitting.tables.table",
         "read_trace": "fitting.traces.trace",
         "simulate_experiment": "fitting.simulated.experiment",
+        "tapping": "fitting.tapping_curves.tapping",
         "write_table": "fitting.tables.table",
     }
 
@@ -101,6 +105,7 @@ __all__ = [
     "ResonanceSweep",
     "SimulatedExperiment",
     "TableError",
+    "Tapping",
     "Trace",
     "amplitude_gradients",
     "believe",
@@ -123,5 +128,6 @@ __all__ = [
     "read_table",
     "read_trace",
     "simulate_experiment",
+    "tapping",
     "write_table",
 ]

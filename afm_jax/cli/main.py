@@ -186,6 +186,7 @@ COMMANDS = {
     "read": ("afm_jax.cli.read", "Read tapping curves out of an instrument's file, as tables."),
     "simulate": ("afm_jax.cli.simulate", "Follow a scene in time: contacts, amplitudes, phases, energies."),
     "sweep": ("afm_jax.cli.sweep", "Compute many scenes, or fit many tables, over a grid of parameters; resumes."),
+    "tapping": ("afm_jax.cli.tapping", "Read the energy of a tap, and the impact law, off a tapping curve."),
     "verify": ("afm_jax.cli.verify", "Compare eqs. 5 to 8 with automatic differentiation and with 50 digits."),
 }
 """For every command the module whose `command` it is, and what the list of commands says of it."""
