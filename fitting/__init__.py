@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from afm_jax.contact.law_of_contact import ContactDelay, ContactLaw, fit_delay, fit_law
+    from afm_jax.saved import load
+    from fitting.bulk import fit_each
     from fitting.calibration.calibrate import calibrate
     from fitting.calibration.result import Calibration
     from fitting.calibration.stiffness import Stiffness, equipartition, sader, sensitivity
@@ -27,6 +29,8 @@ if TYPE_CHECKING:
     from fitting.sampling.posterior_result import Posterior
     from fitting.simulated.experiment import SimulatedExperiment, simulate_experiment
     from fitting.tables.table import AmplitudeTable, TableError, read_table, write_table
+    from fitting.tapping_curves.result import Tapping
+    from fitting.tapping_curves.tapping import tapping
     from fitting.traces.lockin import LockinResult, lockin
     from fitting.traces.trace import Trace, read_trace
 else:
@@ -51,6 +55,7 @@ else:
         "SimulatedExperiment": "fitting.simulated.experiment",
         "Stiffness": "fitting.calibration.stiffness",
         "TableError": "fitting.tables.table",
+        "Tapping": "fitting.tapping_curves.result",
         "Trace": "fitting.traces.trace",
         "amplitude_gradients": "fitting.forward",
         "believe": "fitting.experiments.belief",
@@ -61,8 +66,10 @@ else:
         "drive_grid": "fitting.experiments.candidates",
         "equipartition": "fitting.calibration.stiffness",
         "fit": "fitting.fits.fit",
+        "fit_each": "fitting.bulk",
         "fit_delay": "afm_jax.contact.law_of_contact",
         "fit_law": "afm_jax.contact.law_of_contact",
+        "load": "afm_jax.saved",
         "lockin": "fitting.traces.lockin",
         "invert": "fitting.inversion.invert",
         "posterior": "fitting.sampling.posterior",
@@ -74,6 +81,7 @@ else:
         "sader": "fitting.calibration.stiffness",
         "sensitivity": "fitting.calibration.stiffness",
         "simulate_experiment": "fitting.simulated.experiment",
+        "tapping": "fitting.tapping_curves.tapping",
         "write_table": "fitting.tables.table",
     }
 
@@ -103,6 +111,7 @@ __all__ = [
     "SimulatedExperiment",
     "Stiffness",
     "TableError",
+    "Tapping",
     "Trace",
     "amplitude_gradients",
     "believe",
@@ -114,8 +123,10 @@ __all__ = [
     "equipartition",
     "fit",
     "fit_delay",
+    "fit_each",
     "fit_law",
     "invert",
+    "load",
     "lockin",
     "posterior",
     "read_curve",
@@ -126,5 +137,6 @@ __all__ = [
     "sader",
     "sensitivity",
     "simulate_experiment",
+    "tapping",
     "write_table",
 ]

@@ -241,8 +241,8 @@ def disagreement(found: list[Stiffness]) -> str | None:
         return None
     scale = float(np.exp(-0.5 * apart))
     return (
-        f"Equipartition gives {thermal.value:.3g} N/m, Sader's method {damped.value:.3g}: if the lever's size is right,"
-        f" the deflection's nm are {scale:.3g} times the true ones (its sensitivity was not calibrated)."
+        f"Equipartition gives {thermal.value:.3g} N/m, Sader's method {damped.value:.3g}: if the lever's size is "
+        f"right, the deflection's nm are {scale:.3g} times the true ones (its sensitivity was not calibrated)."
     )
 
 
