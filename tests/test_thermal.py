@@ -108,6 +108,10 @@ def test_the_sensitivity_is_the_slope_of_the_rows_in_contact():
     assert low is not None
     assert high is not None
     assert low < found.value.value < high
+    answer = run(FORCES, "--slope", "--json")
+    assert answer.exit_code == 0, answer.stderr
+    assert strictly(answer.stdout)["deflection_nm_per_volt"]["value"] == found.value.value
+    assert run(THERMAL, "--slope").exit_code == 2
     with pytest.raises(TableError, match="no deflection in V"):
         sensitivity(read_curves(REAL / "tapping_amplitude_wsxm.f.curves"))
 
