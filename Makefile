@@ -17,7 +17,7 @@ SHARP := tests/test_polynomial_roots.py tests/test_verification.py
 BIN := .venv/bin
 SETUP := .venv/.installed
 
-.PHONY: help setup fit test check thorough lint types coverage slow docs mutations bands fuzz kills bench clean
+.PHONY: help setup fit test check thorough lint types coverage slow docs pictures mutations bands fuzz kills bench clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -57,6 +57,9 @@ slow: $(SETUP) ## the slow tests: long iterations, references, notebooks
 
 docs: $(SETUP) ## the site, in build/site/index.html; notebooks are run unless `make slow` did
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --config-file notebooks/mkdocs.yml
+
+pictures: $(SETUP) ## the pictures of README and site anew, by the commands beside them
+	$(BIN)/python notebooks/make_pictures.py
 
 mutations: $(SETUP) ## wrong formulas, one edit each: a named test must notice
 	$(BIN)/python -m pytest -m slow tests/test_mutations.py

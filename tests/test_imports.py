@@ -52,6 +52,7 @@ FITTING_LEVELS = {
     "report": 5,
     "calibration": 6,
     "inversion": 6,
+    "tapping_curves": 6,
     "experiments": 6,
     "bulk": 6,
     "benchmark": 7,

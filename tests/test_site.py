@@ -4,15 +4,17 @@ import os
 import re
 import shutil
 import signal
+import socket
 import subprocess
 import sys
-import urllib.request
+import time
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 import yaml
 
+from notebooks.make_pictures import PICTURES
 from notebooks.run_notebooks import NOTEBOOKS
 
 ROOT = Path(__file__).parent.parent
@@ -65,6 +67,15 @@ def test_every_notebook_and_page_is_in_the_table_of_contents():
         assert f"({notebook.name})" in gallery
 
 
+def test_pictures_stand_beside_their_commands():
+    pages = ROOT / "notebooks" / "pages"
+    text = " ".join(" ".join(page.read_text(encoding="utf-8") for page in pages.glob("*.md")).split())
+    assert {path.stem for path in (pages / "pictures").glob("*.png")} == set(PICTURES)
+    for picture, command in PICTURES.items():
+        assert f"(pictures/{picture}.png)" in text
+        assert f"`afm-jax {command}`" in text
+
+
 @pytest.mark.slow
 def test_nothing_is_fetched_from_other_machines(site: Path):
     pages = list(site.rglob("*.html"))
@@ -93,6 +104,19 @@ def test_search_works_from_disk(site: Path):
     assert {url.partition(":")[0] for url in asked} <= {"file", "data", "blob", "about"}
 
 
+def _wait_for(port: int, seconds: float = 120.0) -> None:
+    """Wait until a server answers."""
+    end = time.monotonic() + seconds
+    while True:
+        try:
+            socket.create_connection(("127.0.0.1", port), timeout=10).close()
+        except OSError:
+            assert time.monotonic() < end
+            time.sleep(0.5)
+        else:
+            return
+
+
 @pytest.mark.slow
 @needs_browser
 @pytest.mark.skipif(not find_spec("jupyterlab"), reason="no JupyterLab; tests/test_notebooks.py runs the page without")
@@ -100,27 +124,37 @@ def test_sliders_move_the_picture_in_jupyterlab(tmp_path: Path):
     from playwright.sync_api import sync_playwright  # noqa: PLC0415
 
     shutil.copy(ROOT / "notebooks" / "sliders.ipynb", tmp_path)
-    options = ["--no-browser", "--allow-root", "--IdentityProvider.token=", "--ServerApp.port_retries=50"]
-    server = subprocess.Popen(
-        [sys.executable, "-m", "jupyterlab", *options, f"--ServerApp.root_dir={tmp_path}"],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
-        stderr=subprocess.PIPE,
-        text=True,
-    )
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    address = f"http://127.0.0.1:{port}/"
+    options = ["--no-browser", "--allow-root", "--IdentityProvider.token=", "--ServerApp.ip=127.0.0.1"]
+    with (tmp_path / "messages.txt").open("w") as messages:
+        server = subprocess.Popen(
+            [
+                sys.executable,
+                "-m",
+                "jupyterlab",
+                *options,
+                f"--ServerApp.port={port}",
+                f"--ServerApp.root_dir={tmp_path}",
+            ],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
+            stderr=messages,
+        )
     try:
-        assert server.stderr is not None
-        address = next(found.group(0) for line in server.stderr if (found := re.search(r"http://localhost:\d+/", line)))
-        urllib.request.urlopen(address, timeout=60).close()  # noqa: S310
+        _wait_for(port)
         with sync_playwright() as playwright:
             browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
             page = browser.new_page(viewport={"width": 1400, "height": 1000})
             page.goto(f"{address}lab/tree/sliders.ipynb?reset")
-            page.get_by_text("Run", exact=True).first.click(timeout=120_000)
-            page.get_by_text("Run All Cells", exact=True).click()
-            picture = page.locator(".jp-OutputArea img.widget-image, .jp-OutputArea .widget-image img").first
-            picture.wait_for(timeout=240_000)
+            page.get_by_text("Python 3 (ipykernel) | Idle").wait_for(timeout=120_000)
+            page.locator(".lm-MenuBar-itemLabel", has_text="Run").first.click()
+            page.locator(".lm-Menu-itemLabel", has_text="Run All Cells").first.click()
+            picture = page.locator("img.widget-image, .widget-image img").first
+            picture.wait_for(timeout=120_000)
             before = picture.get_attribute("src")
-            page.locator(".widget-slider .noUi-handle").nth(1).press("ArrowRight")
+            page.locator(".noUi-handle").nth(1).focus()
+            page.keyboard.press("ArrowRight")
             page.wait_for_function("([image, old]) => image.src !== old", arg=[picture.element_handle(), before])
             browser.close()
     finally:

@@ -33,7 +33,7 @@ _MOST_DRAWN = 2
 def command(
     session: Session, *, sweep: Path, workers: int | None, scheduler: str | None, dry_run: bool, plot: bool
 ) -> None:
-    r"""Compute what SWEEP.toml records over its grid, into DIR/sweep.zarr; call it again to go on after a fault.
+    """Compute what SWEEP.toml records over its grid, into DIR/sweep.zarr; call it again to go on after a fault.
 
     \b
     scene = "scene.toml"                  # or a preset; or tables = ["a.csv", "b.csv"]
@@ -51,7 +51,7 @@ def command(
 
     The results open with xarray.open_zarr; they do not depend on workers or chunks. Chunks that are done are kept,
     whatever happens, and computed again only if their bytes have changed.
-    """
+    """  # noqa: D301 (click's mark of lines that stay as they are)
     if workers is not None and scheduler is not None:
         raise click.UsageError("--scheduler has workers of its own: leave --workers out")
     if session.out is None and not dry_run:
