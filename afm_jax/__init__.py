@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from afm_jax.motion.simulate import simulate
     from afm_jax.motion.trajectory import Trajectory, trajectory
     from afm_jax.outcomes import CollisionOutcome, Outcome
+    from afm_jax.saved import load
     from afm_jax.scenefile.parameter_paths import scene_family
     from afm_jax.scenefile.scenefile import SceneError, load_scene, save_scene
     from afm_jax.sweeps.sweep import sweep
@@ -69,6 +70,7 @@ else:
         "find_junction": "afm_jax.contact.junction",
         "iterate_batch": "afm_jax.impact.map",
         "iterate_map": "afm_jax.impact.map",
+        "load": "afm_jax.saved",
         "load_scene": "afm_jax.scenefile.scenefile",
         "lyapunov_spectrum": "afm_jax.dynamics.exponents",
         "many_impact_orbits": "afm_jax.dynamics.impact_orbits",
@@ -124,6 +126,7 @@ __all__ = [
     "find_junction",
     "iterate_batch",
     "iterate_map",
+    "load",
     "load_scene",
     "lyapunov_spectrum",
     "many_impact_orbits",

@@ -34,6 +34,12 @@ PLANE = [
 NUMBERS = [sys.executable, "-m", "tests.sweep_numbers"]
 
 
+@pytest.fixture(autouse=True)
+def same_flags_after(monkeypatch: pytest.MonkeyPatch):
+    """Take back what the command tells JAX before it starts."""
+    monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))
+
+
 @pytest.mark.slow
 def test_orbits_are_those_of_single_impact_orbits():
     scene = preset("figure2")
@@ -116,8 +122,8 @@ print(len(jax.devices()), hashlib.sha256(data).hexdigest())
 
 @pytest.mark.slow
 def test_two_devices_give_the_bits_of_one():
-    one = python(ON_DEVICES).split()
     flags = os.environ.get("XLA_FLAGS", "")
+    one = python(ON_DEVICES, XLA_FLAGS=flags).split()
     two = python(ON_DEVICES, XLA_FLAGS=f"{flags} --xla_force_host_platform_device_count=2").split()
     assert (one[0], two[0]) == ("1", "2")
     assert one[1] == two[1]
@@ -170,7 +176,7 @@ def test_a_sweep_killed_twice_ends_in_the_same_bytes(tmp_path: Path):
 
 
 FULL = """
-mount -t tmpfs -o size=64k tmpfs "$1" || exit 77
+mount -t tmpfs -o size=400k tmpfs "$1" || exit 77
 "$2" -m afm_jax sweep "$3" --out "$1" --workers 1 --json && exit 1
 echo "code $?"
 mount -o remount,size=8m "$1"
@@ -191,7 +197,7 @@ def test_a_disk_that_is_full_in_fact(tmp_path: Path):
     if done.returncode == 77 or "unshare" in done.stderr:
         pytest.skip("this machine lends no file system")
     assert "No space left on device" in done.stderr, done.stderr
-    assert "of 15 chunks are kept; make room, and give the same command again" in done.stderr
+    assert "of 15 chunks are kept; mend that, and give the same command again" in done.stderr
     code, told = done.stdout.splitlines()[-2:]
     assert code == "code 2"
     found = json.loads(told)

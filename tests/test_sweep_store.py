@@ -108,7 +108,7 @@ def test_a_full_disk_keeps_what_is_done(tmp_path: Path, monkeypatch: pytest.Monk
 
     write = SweepStore.write
     monkeypatch.setattr(SweepStore, "write", full)
-    with pytest.raises(OSError, match="No space left on device: 3 of 14 chunks are kept; make room, and give"):
+    with pytest.raises(OSError, match="No space left on device: 3 of 14 chunks are kept; mend that, and give"):
         run_plan(plan(), tmp_path)
     monkeypatch.undo()
     assert run_plan(plan(), tmp_path).computed == 11

@@ -86,6 +86,43 @@ def dynamics_table(rows: Sequence[dict[str, Any]]) -> "Table":
     return table
 
 
+SWEEPS = {"sizes": [10_000, 100_000, 1_000_000, 10_000_000], "points": 2_000_000, "processes": [1, 2, 4]}
+SWEEPS_QUICK = {"sizes": [2000], "points": 0, "processes": []}
+SWEEP_COLUMNS = (
+    "what",
+    "points",
+    "processes",
+    "devices",
+    "seconds",
+    "microseconds_per_point",
+    "processor_microseconds_per_point",
+    "peak_memory_mib",
+)
+"""What `bench_sweep.csv` tells of a measurement."""
+
+
+def measure_sweeps(cores: int, *, quick: bool) -> tuple[list[dict[str, Any]], list[tuple[str, float | None, float]]]:
+    """Measure sweeps over law scenes; return the rows, and the aims with their bounds."""
+    from afm_jax.bench.sweeps import aims as sweep_aims  # noqa: PLC0415
+    from afm_jax.bench.sweeps import sweep_rows  # noqa: PLC0415
+
+    rows = sweep_rows(**(SWEEPS_QUICK if quick else SWEEPS), cores=cores)
+    return rows, sweep_aims(rows)
+
+
+def sweep_table(rows: Sequence[dict[str, Any]]) -> "Table":
+    """Return the measurements as a table for the terminal."""
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table(title="sweeps over law scenes, one order", title_justify="left")
+    for name in ("what", "scenes", "processes", "devices", "s", "us/scene", "processor us/scene", "peak MiB"):
+        table.add_column(name, justify="left" if name == "what" else "right")
+    for row in rows:
+        counts = [f"{row[name]:,}" for name in ("points", "processes", "devices")]
+        table.add_row(row["what"], *counts, *(known(row[name]) for name in SWEEP_COLUMNS[4:]))
+    return table
+
+
 PERIODS = {"1.01": 30, "5.277": 150}
 """Drive periods of the batches by reduced frequency: about 30 contacts of a tip in both."""
 SCENES = {
@@ -226,8 +263,8 @@ CONTACT_COLUMNS = (
 )
 @click.option(
     "--only",
-    type=click.Choice(["map", "contact", "scenes", "dynamics", "fits"]),
-    help="The impact map alone, the contact of free tips, driven contacts, charts and basins, or fits from the shell.",
+    type=click.Choice(["map", "contact", "scenes", "dynamics", "sweep", "fits"]),
+    help="The impact map alone, the contact of free tips, driven contacts, charts, sweeps, or fits from the shell.",
 )
 @with_session
 def command(session: Session, batches: tuple[int, ...], only: str | None, *, quick: bool) -> None:
@@ -237,7 +274,7 @@ def command(session: Session, batches: tuple[int, ...], only: str | None, *, qui
     solve_ivp with events on the same problems. Errors of impact times are against 50 digits, those of contacts against
     finer settings. Times are the best of several repetitions, compilation apart; the machine should have nothing else
     to do. Fits of 100 rows are timed as commands. With --out bench.csv, bench_contact.csv, bench_scenes.csv,
-    bench_dynamics.csv, bench_fits.csv and bench.json.
+    bench_dynamics.csv, bench_sweep.csv, bench_fits.csv and bench.json.
     """
     session.start_computing()
     from afm_jax.bench.timing import available_cores  # noqa: PLC0415
@@ -270,6 +307,11 @@ def command(session: Session, batches: tuple[int, ...], only: str | None, *, qui
             payload["aims"] += [aim_of(name, value, at_most=bound) for name, value, bound in reached]
             tables.append(dynamics_table(payload["dynamics_rows"]))
             session.write_table("bench_dynamics.csv", payload["dynamics_rows"], DYNAMICS_COLUMNS)
+        if only in {None, "sweep"}:
+            payload["sweep_rows"], reached = measure_sweeps(cores, quick=quick)
+            payload["aims"] += [aim_of(name, value, at_most=bound) for name, value, bound in reached]
+            tables.append(sweep_table(payload["sweep_rows"]))
+            session.write_table("bench_sweep.csv", payload["sweep_rows"], SWEEP_COLUMNS)
         if only in {None, "fits"}:
             payload["fit_rows"], reached = fit_rows(quick=quick)
             payload["aims"] += [aim_of(name, value, at_most=bound) for name, value, bound in reached]

@@ -91,8 +91,9 @@ def command(  # noqa: PLR0913
     """Follow the (m, N) orbits of a scene through a parameter, round folds, by pseudo-arclength.
 
     Folds, period doublings, torus points, grazings and captures are located to rounding; with --second they are
-    followed as curves in two parameters, with cusps and meetings. With --law every special point has a 95 % interval.
-    With --out tables and pictures. Exit code 3 if there is no admissible orbit in the range.
+    followed as curves in two parameters, with cusps and meetings. In a scene with a contact the simulation is closed
+    instead of the map, and curves end where the orbit grazes or is captured. With --law every special point has a
+    95 % interval. With --out tables and pictures. Exit code 3 if there is no admissible orbit in the range.
     """
     session.start_computing()
     from afm_jax.cli.fitted_law import with_fitted_law  # noqa: PLC0415

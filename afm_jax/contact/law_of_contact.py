@@ -36,6 +36,7 @@ from afm_jax.contact.junction import Junction, find_junction
 from afm_jax.contact.junction_leg import pass_through_junction
 from afm_jax.impact.lasting_impact import TabulatedImpact, stretched
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from afm_jax.results import public_result
 
 FREE = {"law": ("r", "epsilon"), "viscous": ("epsilon", "viscous_loss"), "full": ("r", "epsilon", "viscous_loss")}
 """For every model the parameters that are fitted; the others are r = 1 and no viscous loss."""
@@ -77,6 +78,7 @@ _LEAD_SPEEDS = np.geomspace(2.0, 30.0, 8)
 _PLACES = 0.5 - 0.5 * np.cos(np.pi * np.arange(TERMS) / (TERMS - 1))
 
 
+@public_result()
 @dataclass(frozen=True)
 class ContactLaw:
     """A law fitted to a contact, and how far it is off.
@@ -310,6 +312,7 @@ def range_above_capture(
     return float(low), float(high)
 
 
+@public_result()
 @dataclass(frozen=True)
 class ContactDelay:
     """The delay of a contact against the approach speed, and the law fitted to it; times in us, shapes (n,).

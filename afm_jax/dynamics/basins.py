@@ -33,6 +33,7 @@ from afm_jax.dynamics.iteration import (
 )
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, verdicts_of
 from afm_jax.outcomes import Outcome
+from afm_jax.results import public_result
 
 _SAMPLE = 2048
 _LONG = 1000
@@ -68,6 +69,7 @@ class Attractor(NamedTuple):
     velocity_nm_per_us: Float[np.ndarray, " impacts"]
 
 
+@public_result(picture="afm_jax.plots.dynamics:basins_figure")
 class Basins(NamedTuple):
     """Which start ends where.
 

@@ -25,6 +25,7 @@ from afm_jax.impact.lasting_impact import LawImpact
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.orbits import judge, orbit_state
 from afm_jax.impact.roots import OrbitRoots, find_roots
+from afm_jax.results import public_result
 
 _BLOCK = 2048
 """Scenes gone through together."""
@@ -144,6 +145,7 @@ TABLE_COLUMNS = (
 )
 
 
+@public_result(picture="afm_jax.plots.dynamics:chart_figure", rows="table")
 @dataclass(frozen=True)
 class StabilityChart:
     """A chart of stable admissible single-impact orbits over two parameters.

@@ -45,6 +45,7 @@ from afm_jax.dynamics.impact_loop import (
 from afm_jax.dynamics.impact_orbits import MOST_IMPACTS, many_impact_orbits
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.orbits import single_impact_orbits
+from afm_jax.results import public_result
 from afm_jax.scenefile.parameter_paths import (
     ParameterRange,
     check_ranges,
@@ -156,6 +157,7 @@ class SpecialCurve(NamedTuple):
     ends: tuple[str, str]
 
 
+@public_result(picture="afm_jax.plots.branches:continuation_figure")
 class Continuation(NamedTuple):
     """What `continue_orbits` finds."""
 

@@ -39,6 +39,7 @@ from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import ContactKind, to_lab
 from afm_jax.motion.simulate import simulate
 from afm_jax.outcomes import Outcome
+from afm_jax.results import public_result
 
 DEFAULT_STARTS = 512
 MOST_IMPACTS = 64
@@ -62,6 +63,7 @@ _STEPS = 2000
 _MOST_RESTS = 32
 
 
+@public_result()
 class ManyImpactOrbits(NamedTuple):
     """Orbits of m impacts in N drive periods, by falling peak amplitude; NumPy arrays.
 

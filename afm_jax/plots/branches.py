@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from afm_jax.dynamics.continuation import Continuation, OrbitBranch, SpecialPoint
 from afm_jax.dynamics.impact_orbits import is_stable, multipliers_of
@@ -30,11 +31,20 @@ def draw_continuation(
     bands: Sequence[Float[np.ndarray, " points"]] | None = None,
     errors: Float[np.ndarray, " special"] | None = None,
 ) -> None:
-    """Draw peak amplitude against the parameter: stable solid, unstable dashed, not admissible dotted and light.
+    """Write the picture of a continuation as PDF, SVG or PNG; arguments as of `continuation_figure`."""
+    save(continuation_figure(found, bands=bands, errors=errors), path)
+
+
+def continuation_figure(
+    found: Continuation,
+    *,
+    bands: Sequence[Float[np.ndarray, " points"]] | None = None,
+    errors: Float[np.ndarray, " special"] | None = None,
+) -> Figure:
+    """Return peak amplitude against the parameter: stable solid, unstable dashed, not admissible dotted and light.
 
     Args:
         found: what is shown.
-        path: PDF, SVG or PNG file, by its suffix.
         bands: standard errors of the amplitude, an array a branch: shaded to 95 %.
         errors: standard errors of the special points: bars to 95 %.
     """
@@ -69,7 +79,7 @@ def draw_continuation(
     axes.margins(x=0.02)
     if labels:
         axes.legend(fontsize=10, frameon=False)
-    save(figure, path)
+    return figure
 
 
 def _once(label: str, labels: set[str]) -> str | None:

@@ -43,8 +43,8 @@ _UNITS = (
     ("hertz", "us (nm/us)^(1/5)"),
 )
 
-Columns = dict[str, np.ndarray]
-"""Arrays of one row a point, by name."""
+Columns = dict[str, Any]
+"""Arrays of one row a point, by name; JAX's or NumPy's."""
 
 
 @dataclass(frozen=True)

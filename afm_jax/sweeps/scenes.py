@@ -96,7 +96,7 @@ def _checked(key: str, value: Any, usual: Any) -> Any:
     wanted = int if isinstance(usual, int) else (int, float)
     if isinstance(value, bool) or not isinstance(value, wanted) or not 0 < value < math.inf:
         raise ValueError(f"[record]: `{key}` must be a positive {'whole ' if wanted is int else ''}number: {value!r}")
-    return value
+    return value if wanted is int else float(value)
 
 
 # --- over devices -----------------------------------------------------------------------------------------------------

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 _IN_FLIGHT = 2
 """Chunks handed out for every worker: it has the next one when it has done one."""
 _RETRIES = 3
-_SECONDS_TO_ANSWER = 30
+_SECONDS_TO_ANSWER, _SECONDS_TO_START = 30, 600
+"""Of a scheduler, and of its first worker, which may wait in a queue."""
 _TRIALS_S = 2.0
 """How long chunks are computed to plan by."""
 
@@ -34,7 +35,7 @@ Progress = Callable[[int, int, float], object]
 """Told how many of how many points are done, and how many a second since the start."""
 
 
-class Swept(NamedTuple):
+class SweepRun(NamedTuple):
     """What a run over a sweep did."""
 
     chunks: int
@@ -124,19 +125,18 @@ def run_plan(
     workers: int = 1,
     scheduler: str | None = None,
     report: Progress | None = None,
-) -> Swept:
+) -> SweepRun:
     """Compute what a folder does not hold yet of a sweep; arguments and errors as of `sweep`."""
     folder.mkdir(parents=True, exist_ok=True)
     begin = time.monotonic()
-    with locked(folder):
-        store = open_store(folder, plan)
-        kept = store.kept()
-        missing = [chunk for chunk in range(plan.chunks) if chunk not in kept.done]
-        # the last chunks of axes may be smaller, which only a guess of the time left would notice
-        share = plan.points / plan.chunks
-        done = len(kept.done) * share
-        computed, first = 0, 0.0
-        try:
+    kept, computed, first = Kept(frozenset(), frozenset()), 0, 0.0
+    try:
+        with locked(folder):
+            store = open_store(folder, plan)
+            kept = store.kept()
+            missing = [chunk for chunk in range(plan.chunks) if chunk not in kept.done]
+            # the last chunks of axes may be smaller, which only a guess of the time left would notice
+            share = plan.points / plan.chunks
             for chunk, results in computing(plan, missing, workers=workers, scheduler=scheduler):
                 store.write(chunk, results)
                 computed += 1
@@ -146,16 +146,12 @@ def run_plan(
                     first = passed
                 elif report is not None:
                     rate = (computed - 1) * share / (passed - first)
-                    report(round(done + computed * share), plan.points, rate)
-        except OSError as error:
-            count = len(kept.done) + computed
-            raise OSError(
-                error.errno,
-                f"{error.strerror or error}: {count} of {plan.chunks} chunks are kept; make room, and give the same "
-                "command again",
-                str(folder),
-            ) from error
-    return Swept(plan.chunks, kept, computed, time.monotonic() - begin)
+                    report(round((len(kept.done) + computed) * share), plan.points, rate)
+    except OSError as error:
+        count = len(kept.done) + computed
+        what = f"{error.strerror or error}: {count} of {plan.chunks} chunks are kept; mend that"
+        raise OSError(error.errno, f"{what}, and give the same command again", str(folder)) from error
+    return SweepRun(plan.chunks, kept, computed, time.monotonic() - begin)
 
 
 def computing(
@@ -183,12 +179,17 @@ def _handed_out(client: "Client", plan: SweepPlan, chunks: Iterable[int]) -> Ite
     def submit(chunk: int) -> Any:
         return client.submit(compute_chunk, text, chunk, key=f"sweep-{token}-{chunk}", retries=_RETRIES, pure=False)
 
-    numbers = {}
+    numbers: dict[str, int] = {}
     under_way = as_completed()
-    for chunk in itertools.islice(waiting, _IN_FLIGHT * _threads(client)):
-        future = submit(chunk)
-        numbers[future.key] = chunk
-        under_way.add(future)
+
+    def fill() -> None:
+        # workers may come and go
+        for chunk in itertools.islice(waiting, max(_IN_FLIGHT * _threads(client) - len(numbers), 1)):
+            future = submit(chunk)
+            numbers[future.key] = chunk
+            under_way.add(future)
+
+    fill()
     for future in under_way:
         try:
             results = future.result()
@@ -197,10 +198,7 @@ def _handed_out(client: "Client", plan: SweepPlan, chunks: Iterable[int]) -> Ite
                 f"chunk {numbers[future.key]} has killed every worker that was given it (out of memory?)"
             ) from error
         yield numbers.pop(future.key), results
-        for chunk in itertools.islice(waiting, 1):
-            later = submit(chunk)
-            numbers[later.key] = chunk
-            under_way.add(later)
+        fill()
 
 
 def _threads(client: "Client") -> int:
@@ -211,10 +209,7 @@ def _threads(client: "Client") -> int:
 @contextlib.contextmanager
 def _client(workers: int, scheduler: str | None) -> "Iterator[Client]":
     """Give a client of a scheduler, or of a cluster of local processes of its own."""
-    import logging  # noqa: PLC0415
-
-    from dask import config  # noqa: PLC0415
-    from distributed import Client, LocalCluster  # noqa: PLC0415
+    from distributed import Client  # noqa: PLC0415
 
     if scheduler is not None:
         try:
@@ -222,12 +217,25 @@ def _client(workers: int, scheduler: str | None) -> "Iterator[Client]":
         except (OSError, ValueError) as error:
             raise ValueError(f"{scheduler}: no Dask scheduler answers there ({error})") from error
         with client:
-            if not _threads(client):
-                raise ValueError(f"{scheduler}: the scheduler has no workers; start some (dask worker {scheduler})")
+            try:
+                client.wait_for_workers(1, timeout=_SECONDS_TO_START)
+            except TimeoutError as error:
+                raise ValueError(f"{scheduler}: has no workers; start some: dask worker {scheduler}") from error
             yield client
         return
+    with local_cluster(workers) as cluster, Client(cluster) as client:
+        yield client
+
+
+@contextlib.contextmanager
+def local_cluster(workers: int) -> "Iterator[Any]":
+    """Give a Dask cluster of processes of this machine, spawned, each with one device and without a dashboard."""
+    import logging  # noqa: PLC0415
+
+    from dask import config  # noqa: PLC0415
+    from distributed import LocalCluster  # noqa: PLC0415
+
     flags = os.environ.get("XLA_FLAGS", "").split()
-    own = {"XLA_FLAGS": " ".join(flag for flag in flags if "host_platform_device_count" not in flag)}
     settings: dict[str, Any] = {
         "n_workers": workers,
         "threads_per_worker": 1,
@@ -235,15 +243,14 @@ def _client(workers: int, scheduler: str | None) -> "Iterator[Client]":
         "memory_limit": None,
         "dashboard_address": None,
         "silence_logs": logging.CRITICAL,
-        "env": own,
+        "env": {"XLA_FLAGS": " ".join(flag for flag in flags if "host_platform_device_count" not in flag)},
     }
     with (
         tempfile.TemporaryDirectory() as scratch,
         config.set({"distributed.worker.multiprocessing-method": "spawn"}),
         LocalCluster(**settings, local_directory=scratch) as cluster,
-        Client(cluster) as client,
     ):
-        yield client
+        yield cluster
 
 
 class Estimate(NamedTuple):

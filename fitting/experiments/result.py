@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from afm_jax.results import public_result
 from afm_jax.units import TWO_SIDED_95
 from fitting.experiments.belief import Belief
 from fitting.experiments.candidates import LEFT_OUT, Candidates
@@ -35,6 +36,7 @@ class Forecast:
     reason: str | None
 
 
+@public_result(picture="fitting.experiments.report:design_figure", rows="points")
 @dataclass(frozen=True, eq=False)
 class Design:
     """The outcome of `design`; attributes are named like the keys of its JSON.

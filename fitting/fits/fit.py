@@ -478,7 +478,7 @@ _STRAIN_ROUNDS = 3
 
 
 def fit(  # noqa: PLR0913
-    table: AmplitudeTable,
+    table: AmplitudeTable | Any,
     model: str = "law",
     *,
     scale_errors: bool = False,
@@ -492,8 +492,9 @@ def fit(  # noqa: PLR0913
     """Fit an impact law to measured amplitudes of single-impact orbits.
 
     Args:
-        table: from `read_table`; what it gives with an error (Q, calibrations) is a nuisance with that constraint. A Q
-            without error is taken to be known to 2 % where impacts last, and exactly by the instantaneous laws.
+        table: from `read_table`, or a data frame as `AmplitudeTable.from_dataframe` takes it; what it gives with an
+            error (Q, calibrations) is a nuisance with that constraint. A Q without error is taken to be known to 2 %
+            where impacts last, and exactly by the instantaneous laws.
         model: "restitution" (r), "law" (r, epsilon; eq. 6) or "viscous" (epsilon, viscous_loss), each instantaneous or
             with "+delay", the collision delay; or "contact", physical parameters through the resolved contact.
         scale_errors: take the amplitudes' errors as relative only and scale them until chi2 equals its degrees of
@@ -519,6 +520,7 @@ def fit(  # noqa: PLR0913
             there are fewer measured amplitudes than parameters.
         RuntimeError: if JAX is not set to 64-bit floats.
     """
+    table = table if isinstance(table, AmplitudeTable) else AmplitudeTable.from_dataframe(table)
     options: dict[str, Any] = {"free": free, "fixed": fixed, "constraints": constraints, "effects": effects}
     found = find_fit(table, model, scale_errors=scale_errors, robust=robust, speeds=speeds, **options)
     return summarise(table, found)
