@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from afm_jax.saved import load
     from afm_jax.scenefile.parameter_paths import scene_family
     from afm_jax.scenefile.scenefile import SceneError, load_scene, save_scene
+    from afm_jax.sweeps.sweep import sweep
 
     __version__: str
 else:
@@ -80,6 +81,7 @@ else:
         "simulate": "afm_jax.motion.simulate",
         "single_impact_orbits": "afm_jax.impact.orbits",
         "stability_chart": "afm_jax.dynamics.charts",
+        "sweep": "afm_jax.sweeps.sweep",
         "time_course": "afm_jax.contact.time_course",
         "trajectory": "afm_jax.motion.trajectory",
         "use_cache": "afm_jax.compilation_cache",
@@ -135,6 +137,7 @@ __all__ = [
     "simulate",
     "single_impact_orbits",
     "stability_chart",
+    "sweep",
     "time_course",
     "trajectory",
     "use_cache",

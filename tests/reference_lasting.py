@@ -11,9 +11,13 @@ import numpy as np
 
 from tests.brute_force import Floats
 from tests.reference_flight import Parameters, constants, outgoing, propagator
+from tests.reference_hertz import rational
 
 BRIDGE_NM = 4.7
 SPEEDS = 40_000
+PULLS = (-3.0, 4.0)
+SERIES = rational(6, *PULLS)
+"""Duration and indentation of a Hertz contact under a pull in this range."""
 
 
 class Impacts(NamedTuple):
@@ -41,11 +45,16 @@ def closing_impacts(p: Parameters, order: int, approach: Floats) -> Impacts:
         middle = np.arctan2(sine, cosine) - k.drive * delay / 2.0
         height, speed = p.offset_nm + k.amplitude * np.cos(middle), -k.amplitude * k.drive * np.sin(middle)
         pull = -(k.free**2) * height - 2.0 * k.decay * speed + k.amplitude * k.drive**2 * np.cos(middle)
-        jerk = -k.amplitude * k.drive**3 * np.sin(middle)
+        bend = -k.amplitude * k.drive**2 * np.cos(middle)
+        jerk = (k.drive**2 - k.free**2) * speed - 2.0 * k.decay * bend
         g, j = pull * lasting / approach, jerk * lasting**2 / approach
-        gain = 0.4247 * j - 0.157 * g * j + 0.027 * j**2 - (20.0 / 9.0) * k.decay * lasting
+        kappa = np.clip(g, *PULLS)
+        slope, deep, over = (np.polynomial.polynomial.polyval(kappa, row) for row in SERIES)
+        longer, depth = 1.0 + kappa * slope / over, deep / over
+        air = 2.0 * (longer - 1.2 * kappa * depth) / 1.8
+        gain = 2.0 * depth * j - 2.0 * air * k.decay * lasting
         rebound = np.sqrt(np.maximum(free**2 + gain * approach**2, 0.01 * free**2))
-        longer = -0.1274 * g - 0.0213 * j - 0.0234 * g**2 + 0.0267 * g * j
+        longer = longer - 1.0
         held = _later(free, BRIDGE_NM, pull) - _later(approach, BRIDGE_NM, pull)
         delay = straight + longer * lasting - lead / (1.3 * BRIDGE_NM) * held
     return Impacts(approach, rebound, delay, *_phase(p, order, approach, rebound, delay))

@@ -11,7 +11,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
-from afm_jax.apparatus.surface import Surface, Wave, surface_of
+from afm_jax.apparatus.surface import Surface, Wave, detected, height_of_free_deflection, surface_of
 from afm_jax.impact.law import ImpactLaw
 from tests.driven_scenes import BASE, FULL, PER_KHZ, PLATFORM, TIMES, both
 
@@ -156,3 +156,22 @@ def test_undamped_at_resonance_is_refused():
     surface_of(Scene(Cantilever(90.0, 1e6), PLATFORM, base=BaseDrive(1.0, 90.0)))
     surface_of(Scene(Cantilever(90.0), PLATFORM, base=BaseDrive(0.0, 90.0)))
     surface_of(Scene(Cantilever(90.0), Platform(1.0, 90.0), base=BaseDrive(1.0, 91.0)))
+
+
+@pytest.mark.parametrize("drive", ["force", "base"])
+def test_what_a_detector_shows_follows_from_the_motion_in_the_free_tips_frame(drive: str):
+    """Complex numbers as in the textbook: z = a/gamma for a drive a, the frame's motion on top of it."""
+    ratio, quality, moves = np.array([0.9, 1.0, 1.03]), 200.0, 3.0 * np.exp(0.7j)
+    gamma = 1.0 - ratio**2 + 1j * ratio / quality
+    free = moves / gamma
+    # the frame's clock starts where the free tip is lowest
+    clock = -free / np.abs(free)
+    moved = np.array([0.0, 20.0 * np.exp(2.0j), 7.0 * np.exp(-1.0j)])
+    seen = free + moved * clock - (moves if drive == "base" else 0.0)
+    amplitude, lag = detected(
+        np.abs(moved), np.degrees(np.angle(moved)), np.abs(free), ratio, quality, base=drive == "base"
+    )
+    np.testing.assert_allclose(amplitude, np.abs(seen), rtol=1e-12)
+    np.testing.assert_allclose(lag, np.degrees(np.angle(moves / seen)) % 360.0, rtol=1e-10)
+    deflection = height_of_free_deflection(np.abs(free - moves), ratio, quality)
+    np.testing.assert_allclose(deflection, np.abs(free), rtol=1e-12)

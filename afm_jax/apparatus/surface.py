@@ -164,6 +164,71 @@ def surface_of(scene: Scene) -> tuple[Platform | Surface, Surface | None]:
     return surface, Surface(still, still, _joined(response))
 
 
+def force_per_height(
+    frequency_ratio: ArrayLike, quality_factor: ArrayLike | None
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Return gamma = 1 - s^2 + i s/Q, real and imaginary part: the force over k that a steady height 1 needs.
+
+    Args:
+        frequency_ratio: s, the drive's frequency over the free one.
+        quality_factor: Q; None: no air damping.
+    """
+    s = as_argument(frequency_ratio)
+    return (1.0 - s) * (1.0 + s), jnp.zeros_like(s) if quality_factor is None else s / quality_factor
+
+
+def height_of_free_deflection(
+    deflection_nm: ArrayLike, frequency_ratio: ArrayLike, quality_factor: ArrayLike | None
+) -> Float[Array, "..."]:
+    """Return the amplitude of the height of a free tip on a moving base, |D| / |1 - gamma|, in nm.
+
+    Args:
+        deflection_nm: amplitude |D| of the deflection z - z_base of the free tip.
+        frequency_ratio: s.
+        quality_factor: Q.
+    """
+    real, imaginary = force_per_height(frequency_ratio, quality_factor)
+    return as_argument(deflection_nm) / jnp.hypot(1.0 - real, imaginary)
+
+
+def detected(
+    amplitude_nm: ArrayLike,
+    phase_deg: ArrayLike,
+    free_amplitude_nm: ArrayLike,
+    frequency_ratio: ArrayLike,
+    quality_factor: ArrayLike | None,
+    *,
+    base: bool,
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Return what a detector shows of a driven tip over a resting sample, from its motion in the free tip's frame.
+
+    There the tip is driven by a platform sigma + A0 cos(omega t) and its lock-in value, W, is an orbit's of order 1.
+    The free height is -A0, so that Z = W - A0 is the height, and the drive -gamma A0: a force over k, or the base's
+    motion, against which the deflection is D = Z + gamma A0.
+
+    Args:
+        amplitude_nm: |W|.
+        phase_deg: its phase; 0 where the platform of the frame is highest.
+        free_amplitude_nm: A0, amplitude of the free tip's height (`height_of_free_deflection`).
+        frequency_ratio: s, the drive's frequency over the free one.
+        quality_factor: Q; None: no air damping.
+        base: whether the base moves, and the deflection is detected; else a force drives, and the height is.
+
+    Returns:
+        Amplitude in nm, and by how much it lags behind force or base, in degrees from 0 to 360; arrays of any shape.
+    """
+    real, imaginary = force_per_height(frequency_ratio, quality_factor)
+    turn = jnp.deg2rad(as_argument(phase_deg))
+    along, across = amplitude_nm * jnp.cos(turn) - free_amplitude_nm, amplitude_nm * jnp.sin(turn)
+    if base:
+        along, across = along + real * free_amplitude_nm, across + imaginary * free_amplitude_nm
+    # a tip that does not move has no phase
+    moves = (along != 0.0) | (across != 0.0)
+    along = jnp.where(moves, along, 1.0)
+    lag = jnp.arctan2(-imaginary, -real) - jnp.arctan2(across, along)
+    return jnp.where(moves, jnp.hypot(along, across), 0.0), jnp.rad2deg(lag) % 360.0
+
+
 def check_steady_response(cantilever: Cantilever, tones: tuple[Tone, ...], name: str) -> None:
     """Check that a cantilever has a steady response to tones, as far as the numbers are known.
 

@@ -16,13 +16,18 @@ if TYPE_CHECKING:
     from afm_jax.dynamics.impact_loop import LoopReading
     from afm_jax.impact.orbits import SingleImpactOrbits
 
-COLUMNS = (
+IMPACT_COLUMNS = (
     "phase_rad",
     "velocity_after_nm_per_us",
     "velocity_before_nm_per_us",
     "approach_speed_nm_per_us",
     "rebound_speed_nm_per_us",
     "delay_us",
+)
+"""What is told of each impact: attributes of `LoopReading`."""
+
+COLUMNS = (
+    *IMPACT_COLUMNS,
     "peak_amplitude_nm",
     "lockin_amplitude_nm",
     "lockin_phase_deg",
@@ -33,17 +38,6 @@ COLUMNS = (
     "near_double",
 )
 """What is told of an orbit: attributes of `SingleImpactOrbits`."""
-
-
-IMPACT_COLUMNS = (
-    "phase_rad",
-    "velocity_after_nm_per_us",
-    "velocity_before_nm_per_us",
-    "approach_speed_nm_per_us",
-    "rebound_speed_nm_per_us",
-    "delay_us",
-)
-"""What is told of each impact: attributes of `LoopReading`."""
 
 MANY_COLUMNS = (*IMPACT_COLUMNS, "peak_amplitude_nm", "trace", "determinant", "stable", "admissible")
 """What is told of an orbit of several impacts, of its impacts the first."""
@@ -88,16 +82,19 @@ def command(session: Session, scene: str, order: int, impacts: int | None) -> No
     Of every orbit: impact phase and velocities, peak and lock-in amplitude, whether it is stable, and whether it is
     admissible (its flight stays above the platform). With --out a table orbits.csv. Exit code 3 if none is admissible.
     With --impacts every impact is told, the hardest first, and the orbit with a rest on the sample if there is one.
+    A contact's are told so too: its impacts begin where the bridge forms and end, with phase and velocity, where it
+    breaks.
     """
     session.start_computing()
+    from afm_jax.contact.contact import Contact  # noqa: PLC0415
     from afm_jax.impact.orbits import single_impact_orbits  # noqa: PLC0415
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
     loaded, _ = scene_and_start(scene)
-    refuse_other_than_law(loaded, scene)
-    if impacts is not None:
-        _many(session, loaded, scene, order, impacts)
+    if impacts is not None or isinstance(loaded.interaction, Contact):
+        _many(session, loaded, scene, order, impacts or 1)
         return
+    refuse_other_than_law(loaded, scene)
     try:
         with session.working("searching for orbits"):
             found = single_impact_orbits(loaded, order)
@@ -142,14 +139,21 @@ def refuse_other_than_law(scene: "Scene", path: str) -> None:
 
 
 def _many(session: Session, scene: "Scene", path: str, order: int, impacts: int) -> None:
-    """Tell the orbits of several impacts."""
+    """Tell the orbits of several impacts, or of a resolved contact."""
+    from afm_jax.contact.contact import Contact  # noqa: PLC0415
+    from afm_jax.dynamics.contact_orbits import contact_orbits  # noqa: PLC0415
     from afm_jax.dynamics.impact_orbits import many_impact_orbits, sticking_orbit  # noqa: PLC0415
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
+    resolved = isinstance(scene.interaction, Contact)
+    if not resolved:
+        refuse_other_than_law(scene, path)
     try:
         with session.working("searching for orbits (the first run compiles for some seconds)"):
-            found = many_impact_orbits(scene, order, impacts)
-            resting = sticking_orbit(scene)
+            if resolved:
+                found, resting = contact_orbits(scene, order, impacts), "a tip that the liquid bridge holds stays"
+            else:
+                found, resting = many_impact_orbits(scene, order, impacts), sticking_orbit(scene)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     orbits = [orbit_facts(found.reading, index) for index in range(len(found.stable))]
@@ -161,8 +165,6 @@ def _many(session: Session, scene: "Scene", path: str, order: int, impacts: int)
     rows = [{"orbit": k, **impact} for k, orbit in enumerate(orbits) for impact in orbit["impacts"]]
     session.write_table("impacts.csv", rows, ("orbit", *IMPACT_COLUMNS))
     payload = {
-        "format": "afm-jax orbits",
-        "format_version": 1,
         "order": order,
         "impacts": impacts,
         "scene": scene_tables(scene),

@@ -104,7 +104,7 @@ class Session:
 
     Attributes:
         json: write one JSON object to standard output, and nothing else there.
-        out: folder for tables and pictures, made already; None if none was asked for.
+        out: folder for tables and pictures, made already, or the file to write; None if none was asked for.
         verbose: say on standard error what goes on behind: the cache, what is compiled.
     """
 
@@ -207,16 +207,23 @@ class Session:
         self.note(f"wrote {self.out / name}")
 
 
-def with_session(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a command `--json`, `--out` and `--verbose`, and pass it a `Session` as first argument."""
+def with_session(function: Callable[..., Any] | None = None, *, out_file: str = "") -> Any:
+    """Give a command `--json`, `--out` and `--verbose`, and pass it a `Session` as first argument.
+
+    Args:
+        function: the command's function; None gives the decorator.
+        out_file: what the file is called that `--out` names, for a command that writes a single one; empty: a folder.
+    """
+    if function is None:
+        return functools.partial(with_session, out_file=out_file)
 
     @click.option("--json", "as_json", is_flag=True, help="Write one JSON object to standard output, nothing else.")
     @click.option(
         "--out",
-        metavar="DIR",
+        metavar=out_file or "DIR",
         type=click.Path(path_type=Path),
-        callback=_prepared,
-        help="Write tables (CSV) and pictures (PNG) into this folder.",
+        callback=functools.partial(_prepared, is_file=bool(out_file)),
+        help="Write this table." if out_file else "Write tables (CSV) and pictures (PNG) into this folder.",
     )
     @click.option("--verbose", is_flag=True, help="Say on standard error what is kept, read and compiled, and where.")
     @functools.wraps(function)
@@ -228,12 +235,12 @@ def with_session(function: Callable[..., Any]) -> Callable[..., Any]:
     return command
 
 
-def _prepared(ctx: click.Context, parameter: click.Parameter, folder: Path | None) -> Path | None:
+def _prepared(ctx: click.Context, parameter: click.Parameter, folder: Path | None, *, is_file: bool) -> Path | None:
     """Make the folder before anything is computed, so that no result is lost at the end."""
     if folder is None or ctx.resilient_parsing:
         return folder
     try:
-        prepare_folder(folder)
+        prepare_folder(folder.parent if is_file and folder.suffix else folder)
     except OSError as error:
         raise click.BadParameter(
             f"{folder}: cannot write there ({error.strerror}); choose another folder", ctx=ctx, param=parameter

@@ -25,7 +25,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
-from scipy.optimize import OptimizeResult, least_squares, nnls
 
 from afm_jax.checks import require_float64
 from afm_jax.contact.bridge_leg import margin_of, pass_by_collocation, way_through
@@ -233,6 +232,8 @@ def closest_law(
         model: a key of `FREE`.
         residuals: one of `RESIDUALS`.
     """
+    from scipy.optimize import OptimizeResult, least_squares, nnls  # noqa: PLC0415  # a third of a second
+
     free = np.array([name in FREE[model] for name in _NAMES])
     # u_out^2 = u_in^2 - (1 - r^2) u_in^2 - epsilon - c u_in; the scales make the parameters of order one
     scales = np.array([1e-2, approach[0] ** 2, approach[0] * 1e-1])[free]

@@ -29,7 +29,7 @@ from afm_jax.impact.closure import (
 from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.impact.implicit import implicit_pair, implicit_root
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
-from afm_jax.impact.lasting_impact import INDENTATION, Impact, LawImpact, crawls
+from afm_jax.impact.lasting_impact import Impact, LawImpact, crawls, indentation, middle_of_contact
 from afm_jax.impact.law import Speeds, impact_law_of
 from afm_jax.impact.roots import COARSE, find_roots
 from afm_jax.outcomes import Outcome
@@ -179,12 +179,15 @@ class Verdict(NamedTuple):
 
 
 class SteadyOrbits(NamedTuple):
-    """The roots of a problem, which of them are steady (admissible and stable), peak and lock-in amplitude in nm."""
+    """The roots of a problem, which of them are steady (admissible and stable), and what is seen of them.
+
+    That is peak and lock-in amplitude in nm and the phase in degrees.
+    """
 
     place: OrbitPlace
     steady: Bool[Array, " slots"]
     near_double: Bool[Array, " slots"]
-    amplitude_nm: Float[Array, "slots 2"]
+    amplitude_nm: Float[Array, "slots 3"]
 
 
 @jax.jit
@@ -245,7 +248,7 @@ def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
     def one(place, found):
         state = orbit_state(place, problem)
         verdict = judge(place, found, state, problem)
-        return verdict.admissible & verdict.stable, verdict.near_double, _observed(state, problem)[:2]
+        return verdict.admissible & verdict.stable, verdict.near_double, _observed(state, problem)
 
     return SteadyOrbits(roots.place, *jax.vmap(one)(roots.place, roots.found))
 
@@ -261,7 +264,9 @@ def _observed(state: OrbitState, problem: OrbitProblem) -> Float[Array, " 3"]:
     depth = 0.0
     if impact.lasts:
         # in contact the tip is below the platform's rest surface by the indentation
-        depth = INDENTATION * state.speeds.approach * impact.hertz_time(state.speeds.approach) ** 2
+        approach, delay = state.speeds.approach, state.speeds.delay
+        middle = middle_of_contact(cantilever, platform, state.flight.start_us - 0.5 * delay)
+        depth = indentation(approach, impact.hertz_time(approach), middle)
     length, phase = lockin(cantilever, platform, state.flight, order, delayed=impact.delayed, indentation=depth)
     return jnp.stack([peak_amplitude(cantilever, state.flight), length, phase])
 

@@ -23,7 +23,7 @@ from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.contact import Contact
 from afm_jax.impact.amplitude import FlightEnds, peak_amplitude
-from afm_jax.impact.lasting_impact import INDENTATION, LawImpact
+from afm_jax.impact.lasting_impact import LawImpact, indentation, middle_of_contact
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State, to_gap
 from afm_jax.motion.settle import Settled, Window, held_since, is_stuck, settled, window_of
@@ -50,14 +50,18 @@ def impact_integral(
     arrival, departure = np.asarray(rows.arrival_time_us), np.asarray(rows.departure_time_us)
     middle = 0.5 * (arrival + departure)
     here = np.flatnonzero((np.asarray(rows.kind) == ContactKind.IMPACT) & (middle >= from_us) & (middle < to_us))
-    depth = indentation_of(law, np.asarray(rows.approach_speed_nm_per_us)[here])
+    depth = 0.0
+    surface, response = surface_of(scene)
+    if law.lasts:
+        approach = jnp.asarray(rows.approach_speed_nm_per_us)[here]
+        pulled = middle_of_contact(scene.cantilever, surface, jnp.asarray(middle[here]))
+        depth = np.asarray(indentation(approach, LawImpact(law).hertz_time(approach), pulled))
     total = -np.sum(depth * np.exp(-1j * angular_frequency * middle[here]))
     early = here[departure[here] < arrival[here]]
     if not early.size:
         return complex(total)
     half = 0.5 * (arrival - departure)[early, None]
     times = departure[early, None] + half * (_NODES + 1.0)
-    surface, response = surface_of(scene)
     state = State(
         *(
             jnp.asarray(part)[early]
@@ -70,14 +74,6 @@ def impact_integral(
     position, _ = flight((gap + height)[:, None], (rate + speed)[:, None])
     gaps = np.asarray(position - surface.position(jnp.asarray(times)))
     return complex(total + np.sum(half * _WEIGHTS * gaps * np.exp(-1j * angular_frequency * times)))
-
-
-def indentation_of(law: ImpactLaw, approach_speed: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-    """Return the time integral of the indentation in nm us at approach speeds in nm/us; 0 where nothing lasts."""
-    if not law.lasts:
-        return np.zeros(np.shape(approach_speed))
-    tau = np.asarray(LawImpact(law).hertz_time(jnp.asarray(approach_speed)))
-    return INDENTATION * approach_speed * tau**2
 
 
 _LOADS = 4001

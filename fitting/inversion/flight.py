@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.impact.amplitude import FlightEnds, lockin, peak_amplitude
-from afm_jax.impact.lasting_impact import INDENTATION, gained_and_longer, middle_of_contact
+from afm_jax.impact.lasting_impact import gained_and_longer, indentation, middle_of_contact
 from fitting.fits.least_squares import Box, Searches, descended
 
 _HALF_SINE = 0.42441318157838753
@@ -99,7 +99,8 @@ def readings(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> Fl
     end = flight.start_us + flight.duration_us
     tau = jnp.maximum(row.order * platform.period_us - flight.duration_us, 0.0)
     # in contact the tip is below the platform's rest surface by the indentation
-    depth = INDENTATION * (platform.velocity(end) - flight.end_velocity) * tau**2
+    middle = middle_of_contact(cantilever, platform, end + 0.5 * tau)
+    depth = indentation(platform.velocity(end) - flight.end_velocity, tau, middle)
     amplitude, phase = lockin(cantilever, platform, flight, row.order, delayed=True, indentation=depth)
     return jnp.stack([peak_amplitude(cantilever, flight), amplitude, phase])
 
@@ -108,8 +109,7 @@ def impact_of(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> F
     """Return the impact between a flight and the next, brought to that of a free tip on a sample at rest.
 
     What air, spring and the platform's motion do during a Hertz contact is taken back (`gained_and_longer`): its
-    duration is the delay, for want of a law that tells lead and offset apart, which is good enough for the terms of
-    first order.
+    duration is the delay, for want of a law that tells lead and offset apart.
     """
     platform = row.platform
     end = flight.start_us + flight.duration_us
@@ -119,7 +119,7 @@ def impact_of(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> F
     middle = middle_of_contact(cantilever, platform, flight.start_us - 0.5 * delay)
 
     def taken_back(tau):
-        return gained_and_longer(approach, jnp.maximum(tau, 0.0), middle, cantilever, leading=True)
+        return gained_and_longer(approach, jnp.maximum(tau, 0.0), middle, cantilever)
 
     free_delay = lax.fori_loop(0, 3, lambda _, free_delay: delay - taken_back(free_delay)[1], delay)
     gained, _ = taken_back(delay)

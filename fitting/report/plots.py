@@ -182,7 +182,7 @@ def _row_axis(result: FitResult) -> tuple[np.ndarray, np.ndarray]:
     Rows of one frequency, at several drives and offsets, stand a little beside each other.
     """
     table = result.table
-    ranking = np.lexsort((table.offset_nm, table.drive_amplitude_nm, table.drive_frequency_khz, table.order))
+    ranking = np.lexsort((table.offset_nm, table.excitation_nm, table.drive_frequency_khz, table.order))
     places = np.empty(len(ranking))
     order, frequency = table.order[ranking], table.drive_frequency_khz[ranking]
     for number, one in enumerate(np.unique(order)):

@@ -48,13 +48,15 @@ def objective_of(result: FitResult) -> Refit:
     settings = result.settings
     effects = EFFECTS if settings["effects"] is None else tuple(settings["effects"])
     names = tuple(name for name in result.parameters if name not in SHAPE_NAMES)
-    problem = Problem(result.model, names, effects)
+    problem = Problem(result.model, names, effects, result.table.drive)
     measurement = measurement_of(result.table, problem, settings["constraints"], settings["fixed"])
     values = np.array([result.parameters[name].value for name in names])
     stated = Objective(measurement, problem, robust=settings["robust"] is not None)
     size = np.asarray(measurement.rows.order).shape[0]
-    error = np.full((size, 2), np.nan)
-    error[: result.table.rows] = result.rows.error_nm
+    error = np.full(np.asarray(measurement.rows.error_nm).shape, np.nan)
+    error[: result.table.rows, :2] = result.rows.error_nm
+    if result.rows.phase_error_deg is not None:
+        error[: result.table.rows, 2] = result.rows.phase_error_deg
     used = np.isfinite(error)
     objective = stated.with_rows(error_nm=np.where(used, error, 1.0), measured=used)
     if result.model != "contact":
@@ -112,9 +114,9 @@ _SETTLED = 1e-6
 
 
 class DataSets(NamedTuple):
-    """Amplitudes of shape (sets, rows, 2), and the measured values of the constrained parameters, shape (sets, p)."""
+    """Readings of shape (sets, rows, k), and the measured values of the constrained parameters, shape (sets, p)."""
 
-    amplitude_nm: Float[np.ndarray, "sets rows 2"]
+    amplitude_nm: Float[np.ndarray, "sets rows k"]
     constraint_value: Float[np.ndarray, "sets p"]
 
 
