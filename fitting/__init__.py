@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from afm_jax.contact.law_of_contact import ContactDelay, ContactLaw, fit_delay, fit_law
     from fitting.calibration.calibrate import calibrate
     from fitting.calibration.result import Calibration
+    from fitting.calibration.stiffness import Stiffness, equipartition, sader, sensitivity
     from fitting.calibration.sweep import ResonanceSweep, read_sweep
     from fitting.experiments.belief import Belief, believe
     from fitting.experiments.candidates import drive_grid
@@ -50,6 +51,7 @@ else:
         "ResonanceSweep": "fitting.calibration.sweep",
         "Inversion": "fitting.inversion.result",
         "SimulatedExperiment": "fitting.simulated.experiment",
+        "Stiffness": "fitting.calibration.stiffness",
         "TableError": "fitting.tables.table",
         "Tapping": "fitting.tapping_curves.result",
         "Trace": "fitting.traces.trace",
@@ -60,6 +62,7 @@ else:
         "compare": "fitting.fits.comparison",
         "design": "fitting.experiments.design",
         "drive_grid": "fitting.experiments.candidates",
+        "equipartition": "fitting.calibration.stiffness",
         "fit": "fitting.fits.fit",
         "fit_delay": "afm_jax.contact.law_of_contact",
         "fit_law": "afm_jax.contact.law_of_contact",
@@ -71,6 +74,8 @@ else:
         "read_sweep": "fitting.calibration.sweep",
         "read_table": "fitting.tables.table",
         "read_trace": "fitting.traces.trace",
+        "sader": "fitting.calibration.stiffness",
+        "sensitivity": "fitting.calibration.stiffness",
         "simulate_experiment": "fitting.simulated.experiment",
         "tapping": "fitting.tapping_curves.tapping",
         "write_table": "fitting.tables.table",
@@ -100,6 +105,7 @@ __all__ = [
     "Posterior",
     "ResonanceSweep",
     "SimulatedExperiment",
+    "Stiffness",
     "TableError",
     "Tapping",
     "Trace",
@@ -110,6 +116,7 @@ __all__ = [
     "compare",
     "design",
     "drive_grid",
+    "equipartition",
     "fit",
     "fit_delay",
     "fit_law",
@@ -121,6 +128,8 @@ __all__ = [
     "read_sweep",
     "read_table",
     "read_trace",
+    "sader",
+    "sensitivity",
     "simulate_experiment",
     "tapping",
     "write_table",
