@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from afm_jax.contact.law_of_contact import ContactDelay, ContactLaw, fit_delay, fit_law
+    from afm_jax.saved import load
+    from fitting.bulk import fit_each
     from fitting.calibration.calibrate import calibrate
     from fitting.calibration.result import Calibration
     from fitting.calibration.stiffness import Stiffness, equipartition, sader, sensitivity
@@ -64,8 +66,10 @@ else:
         "drive_grid": "fitting.experiments.candidates",
         "equipartition": "fitting.calibration.stiffness",
         "fit": "fitting.fits.fit",
+        "fit_each": "fitting.bulk",
         "fit_delay": "afm_jax.contact.law_of_contact",
         "fit_law": "afm_jax.contact.law_of_contact",
+        "load": "afm_jax.saved",
         "lockin": "fitting.traces.lockin",
         "invert": "fitting.inversion.invert",
         "posterior": "fitting.sampling.posterior",
@@ -119,8 +123,10 @@ __all__ = [
     "equipartition",
     "fit",
     "fit_delay",
+    "fit_each",
     "fit_law",
     "invert",
+    "load",
     "lockin",
     "posterior",
     "read_curve",

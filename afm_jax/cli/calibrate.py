@@ -71,18 +71,26 @@ def command(session: Session, sweep: Path, *, slope: bool, amplitude_only: bool,
     with session.working(f"fitting {measured.points} points (the first run compiles for some seconds)"):
         fit_options = {name: options[name] for name in ("background", "noise", "scale_errors", "whole")}
         result = calibrate(measured, **fit_options)
-    data, text = result.to_dict(), calibration_summary(result)
     found = _stiffnesses(result, options)
+    data = result.to_dict()
     if found:
-        from fitting.calibration.stiffness import stiffness_lines, stiffness_payload  # noqa: PLC0415
+        from fitting.calibration.stiffness import stiffness_payload  # noqa: PLC0415
 
         data |= stiffness_payload(result, found)
-        text = "\n".join([text, "", "Spring constant:", *stiffness_lines(result, found)])
-    session.emit(data, text)
+
+    def summary() -> str:
+        text = calibration_summary(result)
+        if not found:
+            return text
+        from fitting.calibration.stiffness import stiffness_lines  # noqa: PLC0415
+
+        return "\n".join([text, "", "Spring constant:", *stiffness_lines(result, found)])
+
+    session.emit(data, summary)
     if session.out is not None:
         from fitting.calibration.report import write_calibration  # noqa: PLC0415
 
-        for path in write_calibration(result, session.out, session.write_table, text, data):
+        for path in write_calibration(result, session.out, session.write_table, summary(), data):
             session.note(f"wrote {path}")
     if not result.valid:
         raise NotValid(result.reasons[0])

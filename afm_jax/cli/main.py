@@ -185,6 +185,7 @@ COMMANDS = {
     "orbits": ("afm_jax.cli.orbits", "Find the orbits of a scene, of one impact or more, and whether they are stable."),
     "read": ("afm_jax.cli.read", "Read tapping curves out of an instrument's file, as tables."),
     "simulate": ("afm_jax.cli.simulate", "Follow a scene in time: contacts, amplitudes, phases, energies."),
+    "sweep": ("afm_jax.cli.sweep", "Compute many scenes, or fit many tables, over a grid of parameters; resumes."),
     "tapping": ("afm_jax.cli.tapping", "Read the energy of a tap, and the impact law, off a tapping curve."),
     "verify": ("afm_jax.cli.verify", "Compare eqs. 5 to 8 with automatic differentiation and with 50 digits."),
 }
@@ -250,7 +251,8 @@ class LazyGroup(click.Group):
     invoke_without_command=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog="Exit codes: 0 done; 1 the program failed; 2 the call or the data are wrong; 3 ran, but the result is not "
-    "valid.",
+    'valid. Completion of commands, options and presets: eval "$(_AFM_JAX_COMPLETE=bash_source afm-jax)" in ~/.bashrc; '
+    "zsh_source in ~/.zshrc; fish: _AFM_JAX_COMPLETE=fish_source afm-jax | source.",
 )
 @click.option("--version", is_flag=True, help="Show the version and exit.")
 @click.pass_context

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.results import public_result
 from afm_jax.strict_json import plain
 from afm_jax.words import decimals, with_error
 from fitting.calibration.sweep import ResonanceSweep
@@ -77,6 +78,7 @@ class Curves:
     phase_misfit_deg: Float[np.ndarray, " points"] | None
 
 
+@public_result(picture="fitting.calibration.report:calibration_figure")
 @dataclass(frozen=True)
 class Calibration:
     """The outcome of `calibrate`; attributes are named like the keys of its JSON.

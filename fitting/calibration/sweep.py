@@ -28,6 +28,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from afm_jax.results import public_result
 from fitting.instruments.formats import read_recording
 from fitting.instruments.recording import UNITS, Recording
 from fitting.tables.csv_text import (
@@ -181,6 +182,7 @@ _COLUMNS = ("frequency_khz", "amplitude", "phase_deg", "amplitude_error", "phase
 _POSITIVE = ("frequency_khz", "amplitude_error", "phase_error_deg")
 
 
+@public_result()
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ResonanceSweep:
     """A free resonance sweep, sorted by frequency; the arrays are read-only NumPy copies.

@@ -26,7 +26,7 @@ from fitting.report.words import (
     rounded_values,
     value_in_words,
 )
-from fitting.tables.table import COLUMN_NAMES, AmplitudeTable
+from fitting.tables.table import AmplitudeTable
 
 _MOST_ROWS = 1500
 """Rows beyond that stay in the CSV file: the page is for reading."""
@@ -331,7 +331,7 @@ def _instrument(measured: AmplitudeTable) -> Table:
 
 def _measured(measured: AmplitudeTable) -> Table:
     """Return the table that was fitted; names may be broken after underscores, so that narrow columns hold them."""
-    names = [name for name in COLUMN_NAMES if getattr(measured, name) is not None]
+    names = [name for name in measured.form.names if getattr(measured, name) is not None]
     columns = [measured.lines, *(getattr(measured, name) for name in names)]
     rows = zip(*(column[:_MOST_ROWS].tolist() for column in columns), strict=True)
     return Table(
