@@ -311,7 +311,19 @@ def with_law(result: Tapping, model: str = LAW_MODEL) -> Tapping:
     if result.speeds is None:
         return result
     chosen = np.isin(np.asarray(result.table.lines), result.curve.lines[result.speeds.fast])
-    return replace(result, law=fit(rows_of(result.table, chosen), model))
+    return replace(result, law=fit(_with_zero_of_phase(result, rows_of(result.table, chosen)), model))
+
+
+def _with_zero_of_phase(result: Tapping, table: AmplitudeTable) -> AmplitudeTable:
+    """Return a table that knows the zero of the phase, which the free rows fixed that it lacks.
+
+    With several drives its own is that of the first.
+    """
+    found = [] if result.fit is None else [one for one in result.fit.nuisances if one.key == "phase_zero_deg"]
+    if not found:
+        return table
+    calibration = table.calibration | {"phase_zero_deg": (float(found[0].value), float(found[0].standard_error))}
+    return replace(table, calibration=calibration)
 
 
 def rows_of(table: AmplitudeTable, chosen: Bool[np.ndarray, " rows"]) -> AmplitudeTable:
