@@ -1,15 +1,11 @@
 """The pictures of a fit: measured and predicted amplitudes, residuals, and the law with its band."""
 
-import io
-from collections.abc import Sequence
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.image import imread, imsave
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from afm_jax.plots.picture_style import png_of
+from afm_jax.plots.picture_style import pixels_of, png_of_pixels
 from fitting.fits.loss import EV_PER_AJ, Loss
 from fitting.fits.result import FitResult
 from fitting.report.words import has_delay
@@ -18,7 +14,7 @@ from fitting.report.words import has_delay
 COLOURS = ("#0072B2", "#D55E00")
 ALARM = "#B00020"
 SMALL = 8
-_WIDTH_INCHES, _DPI = 10.0, 120.0
+_WIDTH_INCHES, DPI = 10.0, 120.0
 _KINDS = ("peak", "lock-in")
 _ASIDE = "#999999"
 _ROW_AXIS = "drive frequency (kHz), for each order N to scale; rows of one frequency beside each other"
@@ -28,22 +24,15 @@ _APPROACH = "approach speed (nm/µs)"
 
 
 def fit_pictures(result: FitResult) -> list[bytes]:
-    """Return the pictures of the rows, the law, the residuals over the speed and the energy lost, of equal width (PNG).
+    """Return fit.png, and its parts: the rows, the law, the residuals over the speed and the energy lost (PNG).
 
     Without speeds there is no energy.
     """
     figures = [rows_figure(result), law_figure(result), speed_figure(result)]
     if result.loss is not None:
         figures.append(energy_figure(result, result.loss))
-    return [png_of(figure, _DPI) for figure in figures]
-
-
-def one_below_the_other(pictures: Sequence[bytes]) -> bytes:
-    """Return PNG files of equal width as one."""
-    buffer = io.BytesIO()
-    stacked = np.concatenate([imread(io.BytesIO(picture)) for picture in pictures])
-    imsave(buffer, stacked, format="png", dpi=_DPI)
-    return buffer.getvalue()
+    parts = [pixels_of(figure, DPI) for figure in figures]
+    return [png_of_pixels(part, DPI) for part in (np.concatenate(parts), *parts)]
 
 
 def rows_figure(result: FitResult) -> Figure:
