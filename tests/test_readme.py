@@ -12,7 +12,7 @@ from afm_jax.cli import main
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-PAGES = [ROOT / "README.md", *sorted((ROOT / "notebooks" / "pages").rglob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "notebooks").rglob("*.md"))]
 COMMAND = re.compile(r"^ {4}afm-jax (.*)$|`afm-jax ([a-z][^`]*)`", re.MULTILINE)
 RELATIVE = 2e-3
 """How far a number shown may be from the one that this machine prints: last digits of fits."""
