@@ -20,7 +20,7 @@ from afm_jax.sweeps.sweep import Progress, dataset_of
 from fitting.fits.fit import fit, problem_of
 from fitting.fits.result import FitResult
 from fitting.parameters import PARAMETERS
-from fitting.tables.table import AmplitudeTable, read_table
+from fitting.tables.table import AMPLITUDES, MEASURED, AmplitudeTable, read_table
 
 if TYPE_CHECKING:
     import xarray
@@ -32,7 +32,6 @@ _USUAL = {"model": "law", "noise": None, "resamples": None, "seed": 0}
 _OF_A_FIT = ("scale_errors", "free", "fixed", "constraints", "effects", "robust", "speeds")
 _FITTED, _NOT_VALID, _REFUSED = 0, 1, -1
 _FLAGS = {_REFUSED: "not_possible", _FITTED: "valid", _NOT_VALID: "not_valid"}
-_AMPLITUDES = ("peak_amplitude_nm", "lockin_amplitude_nm")
 
 
 def fit_each(  # noqa: PLR0913
@@ -231,7 +230,8 @@ def _with_instrument(table: AmplitudeTable, row: Mapping[str, float]) -> Amplitu
     """Return a table with other values of its instrument."""
     changed = {name: float(row[f"{TABLE}.{name}"]) for name in _INSTRUMENT if f"{TABLE}.{name}" in row}
     tip, drive = (row.get(f"{TABLE}.{name}", 1.0) for name in _CALIBRATIONS)
-    scaled = dict.fromkeys((*_AMPLITUDES, *(name.replace("_nm", "_error_nm") for name in _AMPLITUDES)), tip)
+    by_tip = [name for column in AMPLITUDES for name in (column.name, str(column.error))]
+    scaled = dict.fromkeys((*by_tip, "free_amplitude_nm"), tip)
     for name, factor in (scaled | {"drive_amplitude_nm": drive}).items():
         column = getattr(table, name)
         if column is not None and factor != 1.0:
@@ -240,13 +240,13 @@ def _with_instrument(table: AmplitudeTable, row: Mapping[str, float]) -> Amplitu
 
 
 def _drawn(table: AmplitudeTable, seed: tuple[int, ...]) -> AmplitudeTable:
-    """Return a table with its amplitudes drawn anew around those measured, within their errors."""
+    """Return a table with what was measured drawn anew around it, within its errors."""
     generator = np.random.default_rng(seed)
     changed = {}
-    for name in _AMPLITUDES:
-        column = getattr(table, name)
-        if column is not None:
-            error = getattr(table, name.replace("_nm", "_error_nm"))
+    for column in MEASURED:
+        values = getattr(table, column.name)
+        if values is not None:
+            drawn = values + getattr(table, str(column.error)) * generator.standard_normal(values.shape)
             # an amplitude is positive
-            changed[name] = np.abs(column + error * generator.standard_normal(column.shape))
+            changed[column.name] = np.abs(drawn) if column.amplitude else drawn
     return dataclasses.replace(table, **changed)

@@ -33,7 +33,7 @@ def fit_tables(session: Session, tables: Sequence[Path], record: Mapping[str, An
     with tempfile.TemporaryDirectory() as scratch:
         where = session if session.out is not None else replace(session, out=Path(scratch))
         done = run_sweep(where, plan, workers=workers, scheduler=None)
-        rows = _rows(tables, where.out)
+        rows = _rows(tables, [variable.name for variable in plan.recorder.variables], where.out)
     columns = [name for name in rows[0] if name not in ("parameters", "valid")]
     session.write_table("fits.csv", rows, columns)
     fits = [
@@ -47,7 +47,7 @@ def fit_tables(session: Session, tables: Sequence[Path], record: Mapping[str, An
         raise NotValid(f"{len(bad)} of {len(rows)} fits are not valid: `afm-jax fit {bad[0]}` says why")
 
 
-def _rows(tables: Sequence[Path], folder: Path | None) -> list[dict[str, Any]]:
+def _rows(tables: Sequence[Path], variables: Sequence[str], folder: Path | None) -> list[dict[str, Any]]:
     """Return a row a table: each number by its column, and the parameters as `afm-jax fit` has them."""
     import xarray  # noqa: PLC0415
 
@@ -57,10 +57,10 @@ def _rows(tables: Sequence[Path], folder: Path | None) -> list[dict[str, Any]]:
         found = store.load()
     codes = found["outcome"].attrs
     words = dict(zip(codes["flag_values"], codes["flag_meanings"].split(), strict=True))
-    names = [str(name).removesuffix("_error") for name in found.data_vars if str(name).endswith("_error")]
+    names = [name.removesuffix("_error") for name in variables if name.endswith("_error")]
     rows = []
     for number, table in enumerate(tables):
-        numbers = {str(name): found[name].values[number].item() for name in found.data_vars if name != "computed"}
+        numbers = {name: found[name].values[number].item() for name in variables}
         outcome = words[numbers.pop("outcome")]
         parameters = {name: _parameter(name, numbers) for name in names}
         told = {"table": str(table), "outcome": outcome, "valid": outcome == "valid"}

@@ -14,7 +14,7 @@ from afm_jax.cli.values import scene_and_start
 
 if TYPE_CHECKING:
     from afm_jax.sweeps.plan import SweepPlan
-    from afm_jax.sweeps.sweep import Estimate, Swept
+    from afm_jax.sweeps.sweep import Estimate, SweepRun
 
 _KEYS = ("scene", "tables", "axes", "record", "accuracy", "chunk")
 _WRITTEN = (("axes", list, "[[axes]]"), ("record", dict, "[record]"))
@@ -81,7 +81,7 @@ def command(
         _draw(session, plan)
 
 
-def run_sweep(session: Session, plan: "SweepPlan", *, workers: int | None, scheduler: str | None) -> "Swept":
+def run_sweep(session: Session, plan: "SweepPlan", *, workers: int | None, scheduler: str | None) -> "SweepRun":
     """Run a plan into the `--out` folder, with its progress on standard error."""
     from afm_jax.sweeps.sweep import run_plan  # noqa: PLC0415
 
@@ -90,7 +90,7 @@ def run_sweep(session: Session, plan: "SweepPlan", *, workers: int | None, sched
     return run_plan(plan, session.out, workers=number, scheduler=scheduler, report=_progress(session))
 
 
-def _tell(session: Session, plan: "SweepPlan", done: "Swept") -> None:
+def _tell(session: Session, plan: "SweepPlan", done: "SweepRun") -> None:
     from afm_jax.sweeps.store import STORE  # noqa: PLC0415
 
     assert session.out is not None  # asked before  # noqa: S101
@@ -108,7 +108,7 @@ def _tell(session: Session, plan: "SweepPlan", done: "Swept") -> None:
     session.emit(payload, *_words(plan, done, session.out / STORE))
 
 
-def _words(plan: "SweepPlan", done: "Swept", store: Path) -> list[str]:
+def _words(plan: "SweepPlan", done: "SweepRun", store: Path) -> list[str]:
     grid = " x ".join(map(str, plan.shape))
     lines = [f"{grid} points in {done.chunks} chunks, {done.computed} of them computed in {_duration(done.seconds)}."]
     if done.kept.done:

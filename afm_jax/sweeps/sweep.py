@@ -35,7 +35,7 @@ Progress = Callable[[int, int, float], object]
 """Told how many of how many points are done, and how many a second since the start."""
 
 
-class Swept(NamedTuple):
+class SweepRun(NamedTuple):
     """What a run over a sweep did."""
 
     chunks: int
@@ -125,7 +125,7 @@ def run_plan(
     workers: int = 1,
     scheduler: str | None = None,
     report: Progress | None = None,
-) -> Swept:
+) -> SweepRun:
     """Compute what a folder does not hold yet of a sweep; arguments and errors as of `sweep`."""
     folder.mkdir(parents=True, exist_ok=True)
     begin = time.monotonic()
@@ -151,7 +151,7 @@ def run_plan(
         count = len(kept.done) + computed
         what = f"{error.strerror or error}: {count} of {plan.chunks} chunks are kept; mend that"
         raise OSError(error.errno, f"{what}, and give the same command again", str(folder)) from error
-    return Swept(plan.chunks, kept, computed, time.monotonic() - begin)
+    return SweepRun(plan.chunks, kept, computed, time.monotonic() - begin)
 
 
 def computing(
