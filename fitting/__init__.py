@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from fitting.bulk import fit_each
     from fitting.calibration.calibrate import calibrate
     from fitting.calibration.result import Calibration
+    from fitting.calibration.stiffness import Stiffness, equipartition, sader, sensitivity
     from fitting.calibration.sweep import ResonanceSweep, read_sweep
     from fitting.experiments.belief import Belief, believe
     from fitting.experiments.candidates import drive_grid
@@ -52,6 +53,7 @@ else:
         "ResonanceSweep": "fitting.calibration.sweep",
         "Inversion": "fitting.inversion.result",
         "SimulatedExperiment": "fitting.simulated.experiment",
+        "Stiffness": "fitting.calibration.stiffness",
         "TableError": "fitting.tables.table",
         "Tapping": "fitting.tapping_curves.result",
         "Trace": "fitting.traces.trace",
@@ -62,6 +64,7 @@ else:
         "compare": "fitting.fits.comparison",
         "design": "fitting.experiments.design",
         "drive_grid": "fitting.experiments.candidates",
+        "equipartition": "fitting.calibration.stiffness",
         "fit": "fitting.fits.fit",
         "fit_each": "fitting.bulk",
         "fit_delay": "afm_jax.contact.law_of_contact",
@@ -75,6 +78,8 @@ else:
         "read_sweep": "fitting.calibration.sweep",
         "read_table": "fitting.tables.table",
         "read_trace": "fitting.traces.trace",
+        "sader": "fitting.calibration.stiffness",
+        "sensitivity": "fitting.calibration.stiffness",
         "simulate_experiment": "fitting.simulated.experiment",
         "tapping": "fitting.tapping_curves.tapping",
         "write_table": "fitting.tables.table",
@@ -104,6 +109,7 @@ __all__ = [
     "Posterior",
     "ResonanceSweep",
     "SimulatedExperiment",
+    "Stiffness",
     "TableError",
     "Tapping",
     "Trace",
@@ -114,6 +120,7 @@ __all__ = [
     "compare",
     "design",
     "drive_grid",
+    "equipartition",
     "fit",
     "fit_delay",
     "fit_each",
@@ -127,6 +134,8 @@ __all__ = [
     "read_sweep",
     "read_table",
     "read_trace",
+    "sader",
+    "sensitivity",
     "simulate_experiment",
     "tapping",
     "write_table",

@@ -169,7 +169,7 @@ COMMANDS = {
     "basins": ("afm_jax.cli.basins", "Find which start of a scene ends where."),
     "bench": ("afm_jax.cli.bench", "Measure impacts per second, next to SciPy."),
     "bifurcation": ("afm_jax.cli.bifurcation", "Sweep a parameter and record what the tip comes to."),
-    "calibrate": ("afm_jax.cli.calibrate", "Fit frequency and quality factor to a free resonance sweep."),
+    "calibrate": ("afm_jax.cli.calibrate", "Fit a resonance sweep or a thermal spectrum: frequency, Q, stiffness."),
     "chart": ("afm_jax.cli.chart", "Chart which single-impact orbits are stable over two parameters."),
     "collide": ("afm_jax.cli.collide", "Let free tips collide with the sample: rebound, delay, capture, energy."),
     "continue": ("afm_jax.cli.continue_orbits", "Follow orbits and their special points through parameters."),

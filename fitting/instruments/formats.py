@@ -228,6 +228,7 @@ _NANOSURF_KEYS = {
     "Frequency:": ("free_frequency_khz", "Hz"),
     "Q Factor:": ("quality_factor", ""),
     "Spring Constant:": ("spring_constant_n_per_m", "N/m"),
+    "Averages": ("averages", ""),
     "Vibration freq.": ("drive_frequency_khz", "Hz"),
     "Excitation frequency": ("drive_frequency_khz", "Hz"),
 }

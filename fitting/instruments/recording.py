@@ -130,6 +130,7 @@ HEADER_KEYS = {
     "deflection_nm_per_volt": "sensitivity",
     "nm_per_volt": "sensitivity",
     "temperature_k": "temperature",
+    "averages": "",
 }
 """What headers say that matters here, and what it measures."""
 _NATIVE = {
