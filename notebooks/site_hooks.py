@@ -40,9 +40,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
-    """Leave out what a page of a notebook would fetch from other machines."""
+    """Leave out what a page of a notebook would fetch from other machines; its links lead to the site's pages."""
     del config
-    return _FROM_AFAR.sub("", output) if page.file.src_uri.endswith(".ipynb") else output
+    if not page.file.src_uri.endswith(".ipynb"):
+        return output
+    own = _FROM_AFAR.sub("", output)
+    own = re.sub(r'href="(?:pages/)?(\w+)\.md"', r'href="../\1.html"', own)
+    return re.sub(r'href="(\w+)\.ipynb"', r'href="\1.html"', own)
 
 
 def commands() -> str:
