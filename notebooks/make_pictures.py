@@ -17,6 +17,7 @@ PICTURES = {
     " --out chart",
     "branches": "continue scene.toml --order 1 --parameter platform.amplitude_nm=0.5:6 --out branches",
     "basins": "basins scene.toml --grid 100x100 --out basins",
+    "tapping": "tapping fitting/examples/tapping_resonance.csv --out report",
     "collide": "collide --speeds 12,15,20,60 --out collide",
 }
 """The command that writes each picture; the scene is that of the first steps."""
@@ -26,6 +27,7 @@ def main() -> None:
     """Run the commands in a folder of their own and keep their pictures; names in the call choose some."""
     with TemporaryDirectory() as name:
         folder = Path(name)
+        (folder / "fitting").symlink_to(ROOT / "fitting")
         scene = re.search(
             r"^```toml\n(.*?)^```", (PAGES / "first_steps.md").read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
         )

@@ -63,6 +63,7 @@ def test_readme_shows_what_its_commands_print(tmp_path: Path, monkeypatch: pytes
     monkeypatch.chdir(tmp_path)
     (table,) = blocks("csv")
     (tmp_path / "my_amplitudes.csv").write_text(table)
+    (tmp_path / "fitting").symlink_to(ROOT / "fitting")
     typed = re.findall(r"^ {4}(afm-jax .*)$", README, re.MULTILINE)
     printed: list[str] = []
     for line in typed:
