@@ -478,9 +478,10 @@ class AmplitudeTable:
         faults = Faults(str(header.get("source", "data frame")), place="row")
         names = {column.name for column in _ALL}
         own = {field.name for field in fields(cls)} - {*names, "lines"}
-        known = {name: value for name, value in frame.attrs.items() if name in own} | header
+        known: dict[str, Any] = {"source": "data frame"}
+        known |= {name: value for name, value in frame.attrs.items() if name in own} | header
         form = FORMS.get(known.get("drive", "sample"), TABLE)
-        columns = {name: np.asarray(frame[name], dtype=np.float64) for name in form.names if name in frame}
+        columns: dict[str, Any] = {name: np.asarray(frame[name], np.float64) for name in form.names if name in frame}
         for name in frame.columns:
             if name not in (*form.names, "lines"):
                 faults.add(f"there is no column {name!r}; leave it out, or choose from {', '.join(form.names)}")
@@ -492,7 +493,7 @@ class AmplitudeTable:
         fill_errors(columns, {name: np.zeros(len(frame), dtype=bool) for name in columns}, noise)
         if "order" in columns:
             columns["order"] = columns["order"].astype(np.int64)
-        return cls(**columns, **({"source": "data frame"} | known))
+        return cls(**columns, **known)
 
     @property
     def rows(self) -> int:
