@@ -22,8 +22,8 @@ _KEPT_ELSEWHERE = {
     "changelog.md": "CHANGELOG.md",
     "contributing.md": "CONTRIBUTING.md",
 }
-_GALLERY = """Notebooks as they ran, from the repository's folder `notebooks/`. Each ends with assertions on what it claims, and
-is run by the tests. They are meant to be opened in JupyterLab too: *An orbit by sliders* moves there."""
+_GALLERY = """Notebooks as they ran, from the repository's folder `notebooks/`. Each ends with assertions on what it
+claims, and is run by the tests. They are meant to be opened in JupyterLab too: *An orbit by sliders* moves there."""
 _FROM_AFAR = re.compile(
     r'<script[^>]*\bsrc="https?://[^>]*>.*?</script>|<script[^>]*>\s*import mermaid.*?</script>', re.DOTALL
 )
