@@ -18,21 +18,23 @@ PICTURES = {
     "branches": "continue scene.toml --order 1 --parameter platform.amplitude_nm=0.5:6 --out branches",
     "basins": "basins scene.toml --grid 100x100 --out basins",
     "tapping": "tapping fitting/examples/tapping_resonance.csv --out report",
+    "sweep": "sweep sweep.toml --out swept --plot",
     "collide": "collide --speeds 12,15,20,60 --out collide",
 }
-"""The command that writes each picture; the scene is that of the first steps."""
+"""The command that writes each picture; scene and sweep are those of the pages."""
 
 
 def main() -> None:
     """Run the commands in a folder of their own and keep their pictures; names in the call choose some."""
-    with TemporaryDirectory() as name:
-        folder = Path(name)
+    with TemporaryDirectory() as place:
+        folder = Path(place)
         (folder / "fitting").symlink_to(ROOT / "fitting")
-        scene = re.search(
-            r"^```toml\n(.*?)^```", (PAGES / "first_steps.md").read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
-        )
-        assert scene is not None
-        (folder / "scene.toml").write_text(scene.group(1), encoding="utf-8")
+        for name, page in (("scene.toml", "first_steps.md"), ("sweep.toml", "sweeps.md")):
+            block = re.search(
+                r"^```toml\n(.*?)^```", (PAGES / page).read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+            )
+            assert block is not None
+            (folder / name).write_text(block.group(1), encoding="utf-8")
         for picture in sys.argv[1:] or PICTURES:
             arguments = shlex.split(PICTURES[picture])
             print("afm-jax", *arguments)

@@ -18,7 +18,6 @@ from notebooks.run_notebooks import NOTEBOOKS, ROOT, kept
 _KEPT_ELSEWHERE = {
     "glossary.md": "notebooks/design_notes.md",
     "adding_a_force.md": "notebooks/adding_a_force.md",
-    "sweeps.md": "notebooks/sweeps.md",
     "changelog.md": "CHANGELOG.md",
     "contributing.md": "CONTRIBUTING.md",
 }
