@@ -529,7 +529,9 @@ def _orbits_in_range(
     family, found, rejected = scene_family(scene, given.path), [], 0
     for share in shares:
         there = family(given.low + (given.high - given.low) * share)
-        if impacts == 1 and scene.base is None and scene.force is None and scene.platform.second is None:
+        if impacts == 1 and all(
+            part is None or part.second is None for part in (scene.platform, scene.base, scene.force)
+        ):
             loops, passed = _single_impact_loops(there, order)
             rejected += passed
         else:
