@@ -10,7 +10,8 @@ or on the way. There, and where there is no steady orbit, the gradient is NaN an
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -22,16 +23,19 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.surface import detected, height_of_free_deflection
 from afm_jax.checks import require_float64
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem
 from afm_jax.impact.first_impact import Flight, flight_gap
-from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact
+from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact, middle_of_contact
+from afm_jax.impact.law import Speeds
 from afm_jax.impact.map import NEAR_GRAZING
 from afm_jax.impact.orbits import amplitudes, near_fold, orbit_state, steady_orbits
 from afm_jax.impact.roots import follow_root, harmless_coordinate
+from afm_jax.results import public_result
 from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem, Rows, measurement_of
 from fitting.parameters import CONTACT_NAMES, NUISANCE_NAMES, PARAMETERS, check_contact_values, model_parameters
 from fitting.tables.table import AmplitudeTable
@@ -64,72 +68,113 @@ def orbit_problem(
 ) -> OrbitProblem:
     """Return the orbit's scene of one row at a set of values, for the impact that these stand for."""
     cantilever = problem.cantilever(values, measurement.cantilever)
-    platform = Platform(
-        row.drive_amplitude_nm * problem.nuisance(values, "drive_calibration", 1.0),
-        row.drive_frequency_khz,
-        row.offset_nm + problem.nuisance(values, "offset_origin_nm", 0.0),
+    amplitude = row.drive_amplitude_nm * problem.nuisance(values, "drive_calibration", 1.0)
+    if problem.tapping:
+        # the free tip's amplitude, read by the same detector: in the frame of the free tip the sample moves by it
+        amplitude = amplitude / problem.nuisance(values, "tip_calibration", 1.0)
+    if problem.drive == "base":
+        ratio = row.drive_frequency_khz / cantilever.frequency_khz
+        amplitude = height_of_free_deflection(amplitude, ratio, cantilever.quality_factor)
+    offset = row.offset_nm + problem.nuisance(values, "offset_origin_nm", 0.0)
+    return OrbitProblem(
+        cantilever, Platform(amplitude, row.drive_frequency_khz, offset), impact, jnp.asarray(row.order)
     )
-    return OrbitProblem(cantilever, platform, impact, row.order)
 
 
-def branch_of(orbit: OrbitProblem, row: Rows) -> Branch:
+def shown(
+    seen: Float[Array, " 3"], orbit: OrbitProblem, row: Rows, values: Float[Array, " p"], problem: Problem
+) -> Float[Array, " k"]:
+    """Return what the instrument shows of an orbit's peak, lock-in amplitude and phase; phases next to the measured."""
+    height, amplitude, phase = seen
+    if problem.tapping:
+        ratio = row.drive_frequency_khz / orbit.cantilever.frequency_khz
+        amplitude, phase = detected(
+            jnp.where(row.free, 0.0, amplitude),
+            phase,
+            orbit.platform.amplitude_nm,
+            ratio,
+            orbit.cantilever.quality_factor,
+            base=problem.drive == "base",
+        )
+        height = jnp.zeros_like(height)
+    read = jnp.stack([height, amplitude]) * problem.nuisance(values, "tip_calibration", 1.0)
+    if row.amplitude_nm.shape[0] < 3:
+        return read
+    period, known = 360.0 / row.order, row.amplitude_nm[2]
+    apart = phase + problem.nuisance(values, "phase_zero_deg", 0.0) - known
+    return jnp.append(read, known + (apart + 0.5 * period) % period - 0.5 * period)
+
+
+def nothing_shown(row: Rows) -> Float[Array, " k"]:
+    """Return what a row without an orbit is predicted as: no amplitude, and the phase that is farthest off."""
+    return jnp.append(jnp.zeros(2), row.amplitude_nm[2:] + 180.0 / row.order)
+
+
+def branch_of(orbit: OrbitProblem, row: Rows, values: Float[Array, " p"], problem: Problem) -> Branch:
     """Choose among a row's steady orbits; no derivatives.
 
-    There can be several: the one that explains the measured amplitudes best counts. A row without any is predicted as
-    0, which misses the measurement by all of it: a fixed penalty.
+    There can be several: the one that explains the measured readings best counts. A row without any is predicted as
+    `nothing_shown`: a fixed penalty. A free tip has its steady motion.
     """
     roots = steady_orbits(orbit)
-    misfit = jnp.where(row.measured, (roots.amplitude_nm - row.amplitude_nm) / row.error_nm, 0.0)
+    read = jax.vmap(lambda seen: shown(seen, orbit, row, values, problem))(roots.amplitude_nm)
+    misfit = jnp.where(row.measured, (read - row.amplitude_nm) / row.error_nm, 0.0)
     slot = jnp.argmin(jnp.where(roots.steady, jnp.sum(misfit**2, axis=1), jnp.inf))
     return Branch(
         place=OrbitPlace(roots.place.coordinate[slot], roots.place.phase[slot]),
-        exists=roots.steady[slot],
-        orbits=jnp.sum(roots.steady, dtype=jnp.int32),
-        near_fold=roots.steady[slot] & roots.near_double[slot],
+        exists=roots.steady[slot] | row.free,
+        orbits=jnp.where(row.free, 1, jnp.sum(roots.steady, dtype=jnp.int32)),
+        near_fold=roots.steady[slot] & roots.near_double[slot] & ~row.free,
     )
 
 
-def followed(orbit: OrbitProblem, known: Branch) -> Branch:
+def followed(orbit: OrbitProblem, known: Branch, row: Rows) -> Branch:
     """Follow a row's orbit from where it is known to be: exact where it was found, close at other parameters."""
     harmless = harmless_coordinate(orbit)
-    root, found = follow_root(jnp.where(known.exists, known.place.coordinate, harmless), orbit)
-    exists = known.exists & found
+    root, found = follow_root(jnp.where(known.exists & ~row.free, known.place.coordinate, harmless), orbit)
+    there = known.exists & found & ~row.free
+    exists = there | row.free
     return Branch(
-        place=OrbitPlace(jnp.where(exists, root.coordinate, harmless), root.phase),
+        place=OrbitPlace(jnp.where(there, root.coordinate, harmless), root.phase),
         exists=exists,
         orbits=jnp.where(exists, known.orbits, 0),
-        near_fold=exists & near_fold(root.coordinate, orbit),
+        near_fold=there & near_fold(root.coordinate, orbit),
     )
 
 
-def branch_near(coordinate: Float[np.ndarray, " lanes"] | Float[Array, " lanes"]) -> Branch:
-    """Return orbits that are taken to be near coordinates; NaN: there is none."""
-    there = jnp.isfinite(coordinate)
-    near = jnp.asarray(coordinate)
-    return Branch(OrbitPlace(near, jnp.zeros_like(near)), there, there.astype(jnp.int32), jnp.zeros_like(there))
+def branch_near(coordinate: Any) -> Branch:
+    """Return orbits that are taken to be near coordinates of shape (lanes,); NaN: there is none."""
+    # NumPy's for NumPy's: every JAX operation outside a compiled program would be compiled by itself
+    numpy: Any = np if isinstance(coordinate, np.ndarray) else jnp
+    coordinate = numpy.asarray(coordinate)
+    there = numpy.isfinite(coordinate)
+    nothing = numpy.zeros_like(there)
+    return Branch(OrbitPlace(coordinate, numpy.zeros_like(coordinate)), there, there.astype(np.int32), nothing)
 
 
 BATCH = 8
 """Sets of parameters that `linearise` takes at once."""
-LANES = 256
-"""Pairs of a set and a row that one program takes."""
+SEARCHED, SOLVED = 128, 1024
+"""Pairs of a set and a row that one program takes: where impacts last, and where each takes a hundredth of that."""
 CENSORED = 3.0
 """Residual of a row where no orbit was seen and the model has a steady one: e^(-9/2), a probability of 1 %."""
 
 
 class Prediction(NamedTuple):
-    """Predicted amplitudes of shape (rows, 2), 0 where there is no orbit; the rest has shape (rows,).
+    """Predicted readings of shape (rows, k) as in `Rows`, `nothing_shown` without orbit; the rest has shape (rows,).
 
     ``orbits`` counts the stable admissible orbits (where roots are followed: whether there is one); ``coordinate``,
-    ``near_fold``, ``approach_speed_nm_per_us`` and the drive's phase at arrival are those of the chosen one.
+    ``near_fold``, ``approach_speed_nm_per_us`` (NaN of a free tip) and at mid contact the pull and its change are those
+    of the chosen one.
     """
 
-    amplitude_nm: Float[Array, "rows 2"]
+    amplitude_nm: Float[Array, "rows k"]
     orbits: Int[Array, " rows"]
     near_fold: Bool[Array, " rows"]
     approach_speed_nm_per_us: Float[Array, " rows"]
     coordinate: Float[Array, " rows"]
-    arrival_rad: Float[Array, " rows"]
+    pull_nm_per_us2: Float[Array, " rows"]
+    change_nm_per_us3: Float[Array, " rows"]
 
 
 class Linearised(NamedTuple):
@@ -154,8 +199,8 @@ def linearise(
     """Return residuals, their Jacobian (forward mode through the implicit roots) and predictions for several sets.
 
     Three programs share the work, so that each is compiled once and run only where it is needed: what an impact does at
-    every set, where the orbits are, and the amplitudes with their slopes there. Pairs of a set and a row are taken
-    `LANES` at a time: the same programs serve tables of every size.
+    every set, where the orbits are, and the amplitudes with their slopes there. Pairs of a set and a row are taken a
+    fixed number at a time: the same programs serve tables of every size.
 
     Args:
         values: the parameters' values, at most `BATCH` sets.
@@ -168,19 +213,47 @@ def linearise(
     values = np.asarray(values)
     sets, count = values.shape
     rows = measurement.rows.order.shape[0]
-    filled = np.concatenate([values, np.repeat(values[-1:], BATCH - sets, axis=0)])
-    impacts = impacts_of(filled, measurement, problem)
+    filled, impacts = filled_up(values, measurement, problem)
     whole = _in_lanes(filled, sets, impacts, measurement, problem, near)
     misfit, unseen = np.asarray(whole.misfit).reshape(sets, -1), np.asarray(whole.unseen)
     strength = 1.0 / np.asarray(measurement.constraint_error)
     constraint = (values - np.asarray(measurement.constraint_value)) * strength
     pulls = np.broadcast_to(np.diag(strength), (sets, count, count))
-    flat = np.asarray(whole.slope).reshape(sets, 2 * rows, count)
+    flat = np.asarray(whole.slope).reshape(sets, -1, count)
     return Linearised(
         residual=np.concatenate([misfit, unseen, constraint], axis=1),
         jacobian=np.concatenate([flat, np.zeros((sets, rows, count)), pulls], axis=1),
         prediction=whole.prediction,
     )
+
+
+def warm_up(values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem) -> None:
+    """Compile the two large programs of `linearise`, or read them from the cache, side by side.
+
+    Args:
+        values: some values of the parameters.
+        measurement: what will be compared with.
+        problem: the model.
+    """
+    filled, impacts = filled_up(np.asarray(values)[None], measurement, problem)
+    index = np.zeros(_lanes(problem), dtype=int)
+    rows = jax.tree.map(lambda column: np.asarray(column)[index], measurement.rows)
+    some = measurement._replace(rows=rows)
+    nowhere = branch_near(np.full(index.shape, np.nan))
+
+    def in_thread(program: Callable[..., Any], *more: Any) -> None:
+        # what was switched on for one thread alone is not for another
+        with jax.enable_x64(True):  # noqa: FBT003
+            jax.block_until_ready(program(filled, impacts, index, some, problem, *more))
+
+    with ThreadPoolExecutor(1) as pool:
+        other = pool.submit(in_thread, linearise_pairs, nowhere)
+        in_thread(located)
+        other.result()
+
+
+def _lanes(problem: Problem) -> int:
+    return SEARCHED if problem.lasting else SOLVED
 
 
 def _in_lanes(
@@ -195,28 +268,34 @@ def _in_lanes(
     rows = measurement.rows.order.shape[0]
     columns = jax.tree.map(np.asarray, measurement.rows)
     known = None if near is None else np.broadcast_to(np.asarray(near), (sets, rows)).ravel()
+    lanes = _lanes(problem)
     blocks = []
-    for begin in range(0, sets * rows, LANES):
+    for begin in range(0, sets * rows, lanes):
         # the last block is filled up with the last pair
-        lane = np.minimum(np.arange(begin, begin + LANES), sets * rows - 1)
+        lane = np.minimum(np.arange(begin, begin + lanes), sets * rows - 1)
         some = measurement._replace(rows=jax.tree.map(lambda column, row=lane % rows: column[row], columns))
         index = lane // rows
         branch = branch_near(known[lane]) if known is not None else located(filled, impacts, index, some, problem)
-        blocks.append(jax.tree.map(np.asarray, linearise_pairs(filled, impacts, index, some, problem, branch)))
-    return jax.tree.map(
-        lambda *parts: np.concatenate(parts)[: sets * rows].reshape(sets, rows, *parts[0].shape[1:]), *blocks
-    )
+        # not waited for: blocks are worked on side by side
+        blocks.append(linearise_pairs(filled, impacts, index, some, problem, branch))
+
+    def whole(*parts):
+        return np.concatenate([np.asarray(part) for part in parts])[: sets * rows].reshape(
+            sets, rows, *parts[0].shape[1:]
+        )
+
+    return jax.tree.map(whole, *blocks)
 
 
 class ImpactSlopes(NamedTuple):
-    """How the residuals of the rows change with what their impacts do, shape (rows, 2): peak, lock-in.
+    """How the residuals of the rows change with what their impacts do, shape (rows, k): peak, lock-in, phase.
 
     By the squared rebound speed in nm^2/us^2, the delay changing with the speed as its law says, and by the delay in
     us; 0 where nothing was measured, and where impacts are instantaneous.
     """
 
-    by_square: Float[np.ndarray, "rows 2"]
-    by_delay: Float[np.ndarray, "rows 2"]
+    by_square: Float[np.ndarray, "rows k"]
+    by_delay: Float[np.ndarray, "rows k"]
 
 
 def impact_slopes(
@@ -230,8 +309,7 @@ def impact_slopes(
     The derivatives are those along a direction in which the impact itself is changed, put where those by the first
     parameter would be.
     """
-    filled = np.repeat(np.asarray(values)[None], BATCH, axis=0)
-    impacts = impacts_of(filled, measurement, problem)
+    filled, impacts = filled_up(np.asarray(values)[None], measurement, problem)
     still = jax.tree.map(lambda leaf: np.zeros(leaf.shape), impacts.slopes)
 
     def along(where: Callable[[Any], Any], turn: float) -> tuple[np.ndarray, np.ndarray]:
@@ -248,15 +326,15 @@ def impact_slopes(
     if not impacts.impact.delayed:
         return ImpactSlopes(by_square, np.zeros_like(by_square))
     by_offset, speed = along(lambda i: i.law.delay.offset_nm, -1.0)
-    # the offset d shortens the delay by d/u
-    return ImpactSlopes(by_square, speed[:, None] * by_offset)
+    # the offset d shortens the delay by d/u; a free tip has no speed
+    return ImpactSlopes(by_square, np.nan_to_num(speed)[:, None] * by_offset)
 
 
 class _Block(NamedTuple):
     """Misfits and their slopes, residuals of rows without orbit, and predictions, for each pair of a set and a row."""
 
-    misfit: Float[Array, "lanes 2"]
-    slope: Float[Array, "lanes 2 p"]
+    misfit: Float[Array, "lanes k"]
+    slope: Float[Array, "lanes k p"]
     unseen: Float[Array, " lanes"]
     prediction: Prediction
 
@@ -267,11 +345,49 @@ class _Impacts(NamedTuple):
     impact: LawImpact | TabulatedImpact
     slopes: LawImpact | TabulatedImpact
 
+    def first(self) -> "_Impacts":
+        """Return those of the first set, without their leading axis."""
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[0], self)
+
+
+def filled_up(
+    values: Float[np.ndarray, "sets p"], measurement: Measurement, problem: Problem
+) -> tuple[Float[np.ndarray, "batch p"], _Impacts]:
+    """Return sets of values, filled up to `BATCH`, and their impacts."""
+    filled = np.concatenate([values, np.repeat(values[-1:], BATCH - len(values), axis=0)])
+    # an impact knows no rows: one program for tables of every size
+    rows = jax.tree.map(lambda column: np.asarray(column)[:0], measurement.rows)
+    return filled, jax.tree.map(np.asarray, impacts_of(filled, measurement._replace(rows=rows), problem))
+
+
+def impact_at(values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem) -> _Impacts:
+    """Return the law, or the table of the contact, at one set of values, with its slopes, by the shared program."""
+    return filled_up(np.asarray(values)[None], measurement, problem)[1].first()
+
 
 @partial(jax.jit, static_argnames="problem")
 def impacts_of(values: Float[Array, "sets p"], measurement: Measurement, problem: Problem) -> _Impacts:
     """Return the law, or the table of the contact, of several sets of values."""
     return _Impacts(*jax.vmap(lambda v: _impact_and_slopes(v, measurement, problem))(values))
+
+
+class Free(NamedTuple):
+    """What an impact does to a free tip: at coordinates of shape (n,), and at capture; us and nm/us."""
+
+    speeds: Speeds
+    hertz_time: Float[Array, " n"]
+    lowest: Float[Array, ""]
+    capture_speed: Float[Array, ""]
+    """Just above capture."""
+    length: Float[Array, ""]
+
+
+@jax.jit
+def free_impacts(impact: LawImpact | TabulatedImpact, coordinate: Float[Array, " n"]) -> Free:
+    """Return what an impact does to free tips."""
+    speeds = jax.vmap(impact.speeds)(coordinate)
+    just_above = impact.speeds(impact.lowest * (1.0 + 1e-9)).approach
+    return Free(speeds, impact.hertz_time(speeds.approach), impact.lowest, just_above, impact.length)
 
 
 @partial(jax.jit, static_argnames="problem")
@@ -285,7 +401,7 @@ def located(
     """Return the orbit that each pair of a row and the set that its index names is on."""
 
     def one(point: Float[Array, " p"], impact, row: Rows) -> Branch:
-        return branch_of(orbit_problem(point, impact, row, measurement, problem), row)
+        return branch_of(orbit_problem(point, impact, row, measurement, problem), row, point, problem)
 
     points, impact = jax.tree.map(lambda leaf: leaf[index], (values, impacts.impact))
     return jax.vmap(one)(points, impact, measurement.rows)
@@ -305,10 +421,10 @@ def linearise_pairs(
     # One vmap over all pairs, not two nested ones: tracing costs as much as a fit otherwise.
     def one(point: Float[Array, " p"], impact, slope, row: Rows, known: Branch):
         orbit = orbit_problem(point, impact, row, measurement, problem)
-        branch = followed(orbit, known) if orbit.impact.lasts else known
+        branch = followed(orbit, known, row) if orbit.impact.lasts else known
 
         def predict(v, impact):
-            return _prediction(branch, v, orbit_problem(v, impact, row, measurement, problem), problem)
+            return _prediction(branch, v, orbit_problem(v, impact, row, measurement, problem), row, problem)
 
         def along(e, turn):
             predicted, change = jax.jvp(predict, (point, impact), (e, turn))
@@ -323,7 +439,7 @@ def linearise_pairs(
     sound = jnp.isfinite(prediction.amplitude_nm).all(axis=1) & jnp.isfinite(slope).all(axis=(1, 2))
     slope = jnp.where(sound[:, None, None], slope, 0.0)
     prediction = prediction._replace(
-        amplitude_nm=jnp.where(sound[:, None], prediction.amplitude_nm, 0.0),
+        amplitude_nm=jnp.where(sound[:, None], prediction.amplitude_nm, jax.vmap(nothing_shown)(rows)),
         orbits=jnp.where(sound, prediction.orbits, 0),
     )
     weight = jnp.where(rows.measured, 1.0 / rows.error_nm, 0.0)
@@ -345,18 +461,25 @@ def _impact_and_slopes(values: Float[Array, " p"], measurement: Measurement, pro
     return impact_of(values, measurement, problem), jax.vmap(lambda e: turned(e)[1])(jnp.eye(values.shape[0]))
 
 
-def _prediction(branch: Branch, values: Float[Array, " p"], orbit: OrbitProblem, problem: Problem) -> Prediction:
-    amplitude = amplitudes(branch.place, orbit)[:2]
-    speed = orbit.impact.speeds(branch.place.coordinate).approach
+def _prediction(
+    branch: Branch, values: Float[Array, " p"], orbit: OrbitProblem, row: Rows, problem: Problem
+) -> Prediction:
+    read = shown(amplitudes(branch.place, orbit), orbit, row, values, problem)
+    speeds = lax.stop_gradient(orbit.impact.speeds(branch.place.coordinate))
+    still = lax.stop_gradient(orbit)
+    middle = middle_of_contact(
+        still.cantilever,
+        still.platform,
+        branch.place.phase / still.platform.angular_frequency + 0.5 * speeds.delay,
+    )
     return Prediction(
-        amplitude_nm=jnp.where(
-            branch.exists, amplitude * problem.nuisance(values, "tip_calibration", 1.0), jnp.zeros_like(amplitude)
-        ),
+        amplitude_nm=jnp.where(branch.exists, read, nothing_shown(row)),
         orbits=branch.orbits,
         near_fold=branch.near_fold,
-        approach_speed_nm_per_us=lax.stop_gradient(speed),
+        approach_speed_nm_per_us=jnp.where(row.free, jnp.nan, speeds.approach),
         coordinate=branch.place.coordinate,
-        arrival_rad=branch.place.phase,
+        pull_nm_per_us2=middle.acceleration,
+        change_nm_per_us3=middle.change,
     )
 
 
@@ -371,6 +494,7 @@ SLOW_GRAZE = "the impact grazes the platform: its approach is slower than a thou
 GRAZE_ON_THE_WAY = "the flight grazes the platform on the way: a small change makes another impact there"
 
 
+@public_result()
 @dataclass(frozen=True)
 class AmplitudeGradients:
     """Predicted amplitudes of a table's rows, peak and lock-in, and their derivatives.
@@ -429,7 +553,7 @@ def amplitude_gradients(
     if mode not in ("forward", "reverse"):
         raise ValueError(f'`mode` must be "forward" or "reverse", but is {mode!r}')
     check_contact_values(model, fixed)
-    problem = _problem(model, values, effects)
+    problem = replace(_problem(model, values, effects), drive=table.drive)
     measurement = measurement_of(table, problem, fixed=fixed)
     point = jnp.asarray([float(values[name]) for name in problem.names])
     found = _in_blocks(point, measurement, problem, mode)
@@ -482,11 +606,11 @@ def _judged(values: Float[Array, " p"], measurement: Measurement, problem: Probl
 
     def one(row: Rows):
         orbit = orbit_problem(values, impact, row, measurement, problem)
-        branch = lax.stop_gradient(branch_of(orbit, row))
+        branch = lax.stop_gradient(branch_of(orbit, row, values, problem))
 
         def predicted(v):
             orbit = orbit_problem(v, impact_of(v, measurement, problem), row, measurement, problem)
-            return amplitudes(branch.place, orbit)[:2] * problem.nuisance(v, "tip_calibration", 1.0)
+            return shown(amplitudes(branch.place, orbit), orbit, row, v, problem)[:2]
 
         slow, touching = _grazes(branch.place, orbit)
         slope = differentiated(predicted)(values)

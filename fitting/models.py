@@ -5,18 +5,22 @@ arrays, with the cantilever and the Gaussian constraints.
 """
 
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.contact.parameters import EFFECTS
+from afm_jax.impact.lasting_impact import BRIDGE_NM
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from fitting.parameters import CONTACT_NAMES, DELAY, LAW, NUISANCE_NAMES, PARAMETERS, Parameter
 from fitting.tables.table import AmplitudeTable
 
+AnyArray = Array | np.ndarray
+"""JAX's within its programs, NumPy's outside."""
 Numbers = Float[np.ndarray, "..."] | float
 """Arrays, and the NumPy scalars that come of taking one element of them."""
 
@@ -53,11 +57,17 @@ def _unbounded(parameter: Parameter, coordinate: Numbers) -> Numbers:
 
 @dataclass(frozen=True)
 class Problem:
-    """What is fitted: the model's parameters, then nuisances; and which effects a contact has."""
+    """What is fitted: the model's parameters, then nuisances; which effects a contact has, and what is driven."""
 
     model: str
     names: tuple[str, ...]
     effects: tuple[str, ...] = EFFECTS
+    drive: str = "sample"
+
+    @property
+    def tapping(self) -> bool:
+        """Whether the cantilever is driven itself."""
+        return self.drive != "sample"
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
@@ -105,11 +115,13 @@ class Problem:
         return ImpactLaw(**{p.name: known.get(p.name, p.reference) for p in LAW}, delay=delay)
 
     def cantilever(self, values: Float[Array, " p"], measured: Cantilever) -> Cantilever:
-        """Return the cantilever, with its fitted quality factor where that is a nuisance."""
+        """Return the cantilever, with its fitted frequency and quality factor where these are nuisances."""
         known = self.known(values)
-        if "quality_factor" not in known:
-            return measured
-        return Cantilever(measured.frequency_khz, known["quality_factor"], measured.mass_ng)
+        return Cantilever(
+            known.get("free_frequency_khz", measured.frequency_khz),
+            known.get("quality_factor", measured.quality_factor),
+            measured.mass_ng,
+        )
 
     def nuisance(self, values: Float[Array, " p"], name: str, neutral: float) -> Float[Array, ""]:
         """Return a nuisance, or its neutral value where it is not a parameter."""
@@ -121,20 +133,23 @@ ROWS_PER_PROGRAM = 32
 
 
 class Rows(NamedTuple):
-    """A table as arrays of shape (rows,), and measured values and errors of shape (rows, 2): peak, lock-in.
+    """A table as arrays of shape (rows,), and measured values and errors of shape (rows, k): peak, lock-in, phase.
 
-    What was not measured, and every padded row, has ``measured`` False; its value and error are 1. ``no_orbit``: the
-    drive was tried and no steady orbit seen.
+    The phase is in degrees, and there (k = 3) only if the table has one: of the orbit, or the lag of a cantilever that
+    is driven itself, whose free amplitude stands for the drive's. What was not measured, and every padded row, has
+    ``measured`` False; its value and error are 1. ``no_orbit``: the drive was tried and no steady orbit seen; ``free``:
+    the driven tip does not come near the sample.
     """
 
-    order: Float[Array, " rows"]
-    drive_frequency_khz: Float[Array, " rows"]
-    drive_amplitude_nm: Float[Array, " rows"]
-    offset_nm: Float[Array, " rows"]
-    amplitude_nm: Float[Array, "rows 2"]
-    error_nm: Float[Array, "rows 2"]
-    measured: Bool[Array, "rows 2"]
-    no_orbit: Bool[Array, " rows"]
+    order: Float[AnyArray, " rows"]
+    drive_frequency_khz: Float[AnyArray, " rows"]
+    drive_amplitude_nm: Float[AnyArray, " rows"]
+    offset_nm: Float[AnyArray, " rows"]
+    amplitude_nm: Float[AnyArray, "rows k"]
+    error_nm: Float[AnyArray, "rows k"]
+    measured: Bool[AnyArray, "rows k"]
+    no_orbit: Bool[AnyArray, " rows"]
+    free: Bool[AnyArray, " rows"]
 
 
 class Measurement(NamedTuple):
@@ -150,9 +165,9 @@ class Measurement(NamedTuple):
 
     rows: Rows
     cantilever: Cantilever
-    constraint_value: Float[Array, " p"]
-    constraint_error: Float[Array, " p"]
-    contact: dict[str, Float[Array, ""]]
+    constraint_value: Float[AnyArray, " p"]
+    constraint_error: Float[AnyArray, " p"]
+    contact: dict[str, Float[AnyArray, ""]]
 
 
 def constraints_of(
@@ -162,6 +177,8 @@ def constraints_of(
     known = dict(table.calibration)
     if table.quality_factor is not None and table.quality_factor_error is not None:
         known["quality_factor"] = table.quality_factor, table.quality_factor_error
+    if table.free_frequency_error_khz is not None:
+        known["free_frequency_khz"] = table.free_frequency_khz, table.free_frequency_error_khz
     return known | dict(constraints or {})
 
 
@@ -184,12 +201,14 @@ def measurement_of(
         known.get(name, (parameter.reference, np.inf))
         for name, parameter in zip(problem.names, problem.parameters, strict=True)
     ]
-    contact = {name: jnp.asarray(float(value)) for name, value in (fixed or {}).items() if name in CONTACT_NAMES}
+    contact: dict[str, Any] = {
+        name: np.asarray(float(value)) for name, value in (fixed or {}).items() if name in CONTACT_NAMES
+    }
     return Measurement(
         rows=rows_of(table),
         cantilever=Cantilever(table.free_frequency_khz, table.quality_factor, table.mass_ng),
-        constraint_value=jnp.asarray([float(value) for value, _ in pairs]),
-        constraint_error=jnp.asarray([float(error) for _, error in pairs]),
+        constraint_value=np.array([float(value) for value, _ in pairs]),
+        constraint_error=np.array([float(error) for _, error in pairs]),
         contact=contact,
     )
 
@@ -203,22 +222,78 @@ def rows_of(table: AmplitudeTable) -> Rows:
         filler = column[-1] if filler is None else filler
         return np.concatenate([column, np.full(size - column.shape[0], filler)])
 
-    def pair(peak, lockin):
-        columns = [np.full(table.rows, np.nan) if c is None else c for c in (peak, lockin)]
-        return np.stack([padded(column, np.nan) for column in columns], axis=1)
+    def side_by_side(columns):
+        return np.stack([padded(column, np.nan) for column in columns.T], axis=1)
 
-    # NumPy up to here: every JAX operation outside a compiled program would be compiled by itself.
-    amplitude = pair(table.peak_amplitude_nm, table.lockin_amplitude_nm)
-    error = pair(table.peak_amplitude_error_nm, table.lockin_amplitude_error_nm)
-    measured = np.isfinite(amplitude)
+    # NumPy throughout: every JAX operation outside a compiled program would be compiled by itself.
+    values, errors = readings_of(table)
+    amplitude, error, where = side_by_side(values), side_by_side(errors), place_of_rows(table)
+    measured = np.isfinite(amplitude) & ~padded(where == Reach.ATTRACTED, 1.0).astype(bool)[:, None]
     unseen = np.zeros(table.rows) if table.no_orbit is None else np.nan_to_num(table.no_orbit)
     return Rows(
-        order=jnp.asarray(padded(table.order)),
-        drive_frequency_khz=jnp.asarray(padded(table.drive_frequency_khz)),
-        drive_amplitude_nm=jnp.asarray(padded(table.drive_amplitude_nm)),
-        offset_nm=jnp.asarray(padded(table.offset_nm)),
-        amplitude_nm=jnp.asarray(np.where(measured, amplitude, 1.0)),
-        error_nm=jnp.asarray(np.where(measured, error, 1.0)),
-        measured=jnp.asarray(measured),
-        no_orbit=jnp.asarray(padded(unseen, 0.0) > 0.0),
+        order=padded(table.order),
+        drive_frequency_khz=padded(table.drive_frequency_khz),
+        drive_amplitude_nm=padded(table.excitation_nm),
+        offset_nm=padded(table.offset_nm),
+        amplitude_nm=np.where(measured, amplitude, 1.0),
+        error_nm=np.where(measured, error, 1.0),
+        measured=measured,
+        no_orbit=padded(unseen, 0.0) > 0.0,
+        free=padded(where == Reach.FREE, 0.0) > 0.0,
     )
+
+
+def readings_of(table: AmplitudeTable) -> tuple[Float[np.ndarray, "rows k"], Float[np.ndarray, "rows k"]]:
+    """Return peak and lock-in amplitude and the phase, if the table has one; and their errors. NaN: not measured."""
+    peak, lockin = table.peak_amplitude_nm, table.lockin_amplitude_nm
+    columns = [(peak, table.peak_amplitude_error_nm), (lockin, table.lockin_amplitude_error_nm)]
+    phase, error = table.phase_and_error_deg
+    if phase is not None:
+        columns.append((phase, error))
+    blank = np.full(table.rows, np.nan)
+    values, errors = ([blank if one is None else one for one in part] for part in zip(*columns, strict=True))
+    return np.stack(values, axis=1), np.stack(errors, axis=1)
+
+
+class Reach(IntEnum):
+    """Where a driven tip is: it meets the sample, stays clear of it, or is only drawn to it."""
+
+    IMPACT = 0
+    FREE = 1
+    ATTRACTED = 2
+
+
+def place_of_rows(table: AmplitudeTable) -> Int[np.ndarray, " rows"]:
+    """Return the `Reach` of every row of a table; where the sample is driven, all meet it.
+
+    A tip is free whose amplitude leaves room for a bridge. Impacts push: the virial of the force, of the sign of
+    Re(gamma W conj Z) with the height's lock-in value Z and W = Z + A0, is negative; where it is not, or the tip is out
+    of reach without being free, the sample only draws it.
+    """
+    place = np.full(table.rows, Reach.IMPACT)
+    if not table.tapping:
+        return place
+    reach = table.excitation_nm + table.offset_nm
+    place[(virial_of(table) > 0.0) | (reach < 0.0)] = Reach.ATTRACTED
+    place[reach < -BRIDGE_NM] = Reach.FREE
+    return place
+
+
+def virial_of(table: AmplitudeTable) -> Float[np.ndarray, " rows"]:
+    """Return 2 <F z>/k of the first harmonics of force and height, in nm^2; NaN without amplitude and lag.
+
+    Of the stated values; in the deflection's place that of the height where the base is driven.
+    """
+    lag, amplitude = table.phase_lag_deg, table.lockin_amplitude_nm
+    if lag is None or amplitude is None:
+        return np.full(table.rows, np.nan)
+    ratio = table.drive_frequency_khz / table.free_frequency_khz
+    loss = 0.0 if table.quality_factor is None else 1.0 / table.quality_factor
+    gamma = (1.0 - ratio) * (1.0 + ratio) + 1j * ratio * loss
+    zero = table.calibration.get("phase_zero_deg", (0.0, 0.0))[0]
+    free = table.excitation_nm
+    height = -amplitude * np.exp(-1j * (np.deg2rad(lag - zero) - np.angle(gamma)))
+    if table.drive == "base":
+        free = free / np.abs(1.0 - gamma)
+        height = height - gamma * free
+    return np.real(gamma * (height + free) * np.conj(height))

@@ -157,10 +157,27 @@ NUISANCES = (
     ),
     Parameter(
         name="drive_calibration",
-        meaning="true over stated amplitude of the platform",
+        meaning="true over stated amplitude of the platform, or of the free tip",
         lowest=0.1,
         highest=10.0,
         example="1 +- 0.02",
+    ),
+    Parameter(
+        name="free_frequency_khz",
+        unit="kHz",
+        meaning="of the free resonance",
+        lowest=1e-3,
+        highest=1e6,
+        example="90 +- 0.01",
+    ),
+    Parameter(
+        name="phase_zero_deg",
+        unit="degrees",
+        meaning="what the instrument adds to every phase",
+        lowest=-1e3,
+        highest=1e3,
+        width=1.0,
+        example="0 +- 0.2",
     ),
 )
 """What the instrument adds; each has a Gaussian constraint."""

@@ -208,7 +208,7 @@ def test_the_order_of_the_rows_does_not_matter(table):
 )
 def test_of_coexisting_orbits_the_measured_one_is_taken(table, monkeypatch, measured, slot):
     """Made-up orbits: without a delay no drive of 140,000 random ones had two stable ones."""
-    amplitude = jnp.array([[100.0, 40.0], [60.0, 26.0], [60.0, 25.0], [61.0, 40.0]])
+    amplitude = jnp.array([[100.0, 40.0, 0.0], [60.0, 26.0, 0.0], [60.0, 25.0, 0.0], [61.0, 40.0, 0.0]])
     steady = jnp.array([True, False, True, False])
     made_up = SteadyOrbits(OrbitPlace(jnp.arange(4.0), jnp.zeros(4)), steady, jnp.zeros(4, dtype=bool), amplitude)
     monkeypatch.setattr(fitting.forward, "steady_orbits", lambda _: made_up)
@@ -217,7 +217,7 @@ def test_of_coexisting_orbits_the_measured_one_is_taken(table, monkeypatch, meas
     measurement = measurement_of(with_amplitudes(rows(table, slice(0, 1)), np.array([measured]), error), problem)
     row = Rows(*(column[0] for column in measurement.rows))
     orbit = orbit_problem(values, impact_of(values, measurement, problem), row, measurement, problem)
-    branch = branch_of(orbit, row)
+    branch = branch_of(orbit, row, values, problem)
     assert int(branch.place.coordinate) == slot
     assert int(branch.orbits) == 2
     assert bool(branch.exists)

@@ -1,12 +1,11 @@
 """Amplitude and phase of a tapping tip from its contact's table of collisions, against the driven contact in time."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxtyping import ArrayLike
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.drives import ForceDrive
@@ -28,10 +27,10 @@ CANTILEVER = {"frequency_khz": 90.0, "quality_factor": 200.0, "mass_ng": 16.81}
 class Read(NamedTuple):
     """Lock-in amplitude in nm and lag in degrees; of a prediction approach speed over capture, and g tau/u too."""
 
-    amplitude_nm: ArrayLike
-    lag_deg: ArrayLike
-    speed: ArrayLike = np.nan
-    pull: ArrayLike = np.nan
+    amplitude_nm: Any
+    lag_deg: Any
+    speed: Any = np.nan
+    pull: Any = np.nan
 
 
 def truth(contact: Contact, ratio: float, free_nm: float, offset_nm: float) -> Read:

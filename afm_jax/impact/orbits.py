@@ -17,7 +17,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import FreeFrame, Surface, Wave, free_frame, size_and_lag
-from afm_jax.checks import is_traced, readable, require_float64
+from afm_jax.checks import is_traced, require_float64
 from afm_jax.impact.amplitude import FlightEnds, highest_of_sum, lockin, peak_amplitude
 from afm_jax.impact.closure import (
     OrbitPlace,
@@ -34,6 +34,7 @@ from afm_jax.impact.lasting_impact import Impact, LawImpact, crawls, indentation
 from afm_jax.impact.law import Speeds, impact_law_of
 from afm_jax.impact.roots import COARSE, find_roots
 from afm_jax.outcomes import Outcome
+from afm_jax.results import public_result
 
 NEAR_DOUBLE = 1e-3
 """Slope of the closing condition per relative change of speed below which a root counts as near-double (a fold)."""
@@ -43,6 +44,7 @@ _ARRIVAL_TOLERANCE = 1e-7
 """How far (in drive periods) the first impact found may lie before the orbit's own, by rounding."""
 
 
+@public_result()
 class SingleImpactOrbits(eqx.Module):
     """All (1, N) orbits of a scene, ascending in approach speed, in a fixed number of slots.
 
@@ -93,8 +95,6 @@ class SingleImpactOrbits(eqx.Module):
     peak_deflection_nm: Float[Array, "..."] | None = None
     deflection_lockin_amplitude_nm: Float[Array, "..."] | None = None
     deflection_lockin_phase_deg: Float[Array, "..."] | None = None
-
-    __repr__ = readable
 
 
 def single_impact_orbits(scene: Scene, order: ArrayLike) -> SingleImpactOrbits:
@@ -194,12 +194,15 @@ class Verdict(NamedTuple):
 
 
 class SteadyOrbits(NamedTuple):
-    """The roots of a problem, which of them are steady (admissible and stable), peak and lock-in amplitude in nm."""
+    """The roots of a problem, which of them are steady (admissible and stable), and what is seen of them.
+
+    That is peak and lock-in amplitude in nm and the phase in degrees.
+    """
 
     place: OrbitPlace
     steady: Bool[Array, " slots"]
     near_double: Bool[Array, " slots"]
-    amplitude_nm: Float[Array, "slots 2"]
+    amplitude_nm: Float[Array, "slots 3"]
 
 
 def _seen(state: OrbitState, frame: FreeFrame, problem: OrbitProblem) -> dict[str, Float[Array, ""]]:
@@ -300,7 +303,7 @@ def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
     def one(place, found):
         state = orbit_state(place, problem)
         verdict = judge(place, found, state, problem)
-        return verdict.admissible & verdict.stable, verdict.near_double, _observed(state, problem)[:2]
+        return verdict.admissible & verdict.stable, verdict.near_double, _observed(state, problem)
 
     return SteadyOrbits(roots.place, *jax.vmap(one)(roots.place, roots.found))
 

@@ -7,7 +7,6 @@ What a minimum amounts to: errors, intervals, checks, and a verdict on whether t
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import jax
@@ -18,7 +17,8 @@ from scipy.special import chdtrc
 
 from afm_jax.checks import require_float64
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.impact.lasting_impact import LawImpact
+from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact
+from afm_jax.units import TWO_SIDED_95
 from afm_jax.version import version_of
 from fitting.fits.intervals import (
     Convergence,
@@ -30,7 +30,18 @@ from fitting.fits.intervals import (
     within_range,
 )
 from fitting.fits.loss import Loss, energy_lost, equivalent, interval_of
-from fitting.fits.minimum import Minimum, Strain, minimise, relaxed, rescale_errors, settle, strain_of, untabulated
+from fitting.fits.minimum import (
+    ATTRACTED,
+    Minimum,
+    Strain,
+    minimise,
+    relaxed,
+    rescale_errors,
+    settle,
+    starts,
+    strain_of,
+    untabulated,
+)
 from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective
 from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows
 from fitting.fits.unmodelled import (
@@ -44,13 +55,20 @@ from fitting.fits.unmodelled import (
     step_of,
 )
 from fitting.fits.verdict import ASSUMED_ERROR_OF_Q, Evidence, judge_fit, misfits
-from fitting.forward import impact_of
-from fitting.models import Measurement, Problem, constraints_of, measurement_of
+from fitting.forward import impact_at, warm_up
+from fitting.models import (
+    Measurement,
+    Problem,
+    Reach,
+    constraints_of,
+    measurement_of,
+    place_of_rows,
+    readings_of,
+)
 from fitting.parameters import NUISANCE_NAMES, PARAMETERS, check_contact_values, model_parameters
 from fitting.tables.table import AmplitudeTable
 
 _POINTS = 121
-_TWO_SIDED_95 = 1.959963984540054
 
 
 def law_with_band(
@@ -75,7 +93,7 @@ def law_with_band(
     speeds = np.geomspace(0.8 * slow, 1.2 * fast, _POINTS)
     found = law_at(problem, measurement, values, covariance, speeds, after)
     rebound, delay = found.law
-    width = _TWO_SIDED_95 * np.linalg.norm(found.factor, axis=2)
+    width = TWO_SIDED_95 * np.linalg.norm(found.factor, axis=2)
     return FittedLaw(
         approach_speed_nm_per_us=speeds,
         rebound_speed_nm_per_us=rebound,
@@ -96,7 +114,8 @@ def law_at(
     after: tuple[LinearStep, Unmodelled] | None = None,
 ) -> LawAfter:
     """Return the law at approach speeds in nm/us; the other arguments as of `law_with_band`."""
-    law, slope = jax.tree.map(np.asarray, law_and_slope(jnp.asarray(values), jnp.asarray(speeds), measurement, problem))
+    impact, slopes = impact_at(values, measurement, problem)
+    law, slope = jax.tree.map(np.asarray, law_and_slope(impact, slopes, speeds))
     count = speeds.size
     before = LawBefore(law[:, :count], slope[:, :count], float(law[0, count]), slope[0, count])
     if not np.all(np.isfinite(covariance)) or after is None:
@@ -152,17 +171,21 @@ def speed_range(approach_speeds: Float[np.ndarray, " rows"]) -> tuple[float, flo
     return (float(known.min()), float(known.max())) if known.size else (1.25, 250.0 / 3.0)
 
 
-@partial(jax.jit, static_argnames=("problem",))
+@jax.jit
 def law_and_slope(
-    values: Float[Array, " p"], speeds: Float[Array, " n"], measurement: Measurement, problem: Problem
+    impact: LawImpact | TabulatedImpact, slopes: LawImpact | TabulatedImpact, speeds: Float[Array, " n"]
 ) -> tuple[Float[Array, "2 n+1"], Float[Array, "2 n+1 p"]]:
     """Return rebound speeds and delays at approach speeds, and their derivatives by the parameters.
 
     The last column is that of the capture speed, twice.
+
+    Args:
+        impact: what is fitted.
+        slopes: its derivatives by the parameters, along a first axis.
+        speeds: in nm/us.
     """
 
-    def law(v):
-        impact = impact_of(v, measurement, problem)
+    def law(impact):
         if isinstance(impact, LawImpact):
             capture = jnp.full((2, 1), impact.law.capture_speed_nm_per_us)
             found = jnp.stack([impact.law.rebound_speed(speeds), impact.law.collision_delay(speeds)])
@@ -173,7 +196,7 @@ def law_and_slope(
         there = jnp.stack([jnp.where(free, found.rebound, 0.0), jnp.where(free, found.delay, 0.0)])
         return jnp.concatenate([there, jnp.full((2, 1), impact.lowest)], axis=1)
 
-    return law(values), jax.jacfwd(law)(values)
+    return law(impact), jax.vmap(lambda turn: jax.jvp(law, (impact,), (turn,))[1], out_axes=-1)(slopes)
 
 
 _PACKAGES = ("afm-jax", "jax", "optax", "numpy")
@@ -253,12 +276,15 @@ class _Summary:
             self.chi2 = step.chi2
         count, error = self.table.rows, np.asarray(self.searching.measurement.rows.error_nm)
         residual = step.residual[:count]
-        predicted = self.rows.predicted_nm + error[:count] * (residual - self.amplitude_residual[:count])
+        moved = error[:count] * (residual - self.amplitude_residual[:count])
         used = np.isfinite(self.rows.residual)
+        moved = np.where(used, moved, 0.0)
+        phase = self.rows.predicted_phase_deg
         self.rows = replace(
             self.rows,
             residual=np.where(used, residual, np.nan),
-            predicted_nm=np.where(used, predicted, self.rows.predicted_nm),
+            predicted_nm=self.rows.predicted_nm + moved[:, :2],
+            predicted_phase_deg=None if phase is None else phase + moved[:, 2],
         )
 
     def result(self) -> FitResult:
@@ -354,7 +380,7 @@ class _Summary:
                 growth = errors[i] / before[i] if before[i] > 0.0 else 1.0
                 low, high = (None if e is None else self.ends[i] + growth * (e - self.values[i]) for e in ends)
             else:
-                reason, reach = None, _TWO_SIDED_95 * errors[i]
+                reason, reach = None, TWO_SIDED_95 * errors[i]
                 low, high = self.ends[i] - reach, self.ends[i] + reach
             intervals.append(within_range(PARAMETERS[name], Interval(low, high, reason)))
         return intervals
@@ -388,19 +414,27 @@ class _Summary:
         prediction: Any = self.prediction
         exists = prediction.orbits[0][:count] > 0
         predicted = np.where(exists[:, None], prediction.amplitude_nm[0][:count], np.nan)
-        amplitude, error = np.asarray(rows.amplitude_nm)[:count], np.asarray(rows.error_nm)[:count]
-        measured = used | (self.strain.set_aside[:count, None] & np.isfinite(_amplitudes(self.table)))
+        error = np.where(used, np.asarray(rows.error_nm)[:count], np.nan)
+        reasons = self.strain.reasons[:count].copy()
+        reasons[place_of_rows(self.table) == Reach.ATTRACTED] = ATTRACTED
+        measured = np.where(used | (reasons != "")[:, None], readings_of(self.table)[0], np.nan)
+        phases = {}
+        if measured.shape[1] > 2:
+            columns = {"predicted_phase_deg": predicted, "measured_phase_deg": measured, "phase_error_deg": error}
+            phases = {name: column[:, 2] for name, column in columns.items()}
         return FittedRows(
-            predicted_nm=predicted,
-            measured_nm=np.where(measured, amplitude, np.nan),
+            predicted_nm=predicted[:, :2],
+            measured_nm=measured[:, :2],
             residual=np.where(used, self.amplitude_residual[:count], np.nan),
-            error_nm=np.where(used, error, np.nan),
+            error_nm=error[:, :2],
             model_error=self.strain.model_error[:count],
             used=np.any(used, axis=1, keepdims=False).astype(bool),
-            set_aside=self.strain.set_aside[:count],
+            set_aside=(reasons != "").astype(bool),
             approach_speed_nm_per_us=np.where(exists, prediction.approach_speed_nm_per_us[0][:count], np.nan),
             orbits=prediction.orbits[0][:count],
             near_fold=prediction.near_fold[0][:count],
+            reasons=tuple(reasons.tolist()),
+            **phases,
         )
 
     def _other_minimum(self, errors: Float[np.ndarray, " p"]) -> tuple[dict[str, float], float] | None:
@@ -430,15 +464,8 @@ def _correlations(covariance_matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarr
     return np.where(np.outer(known, known), matrix, np.nan)
 
 
-def _amplitudes(table: AmplitudeTable) -> Float[np.ndarray, "rows 2"]:
-    """Return peak and lock-in amplitude of the table, NaN where not measured."""
-    blank = np.full(table.rows, np.nan)
-    columns = table.peak_amplitude_nm, table.lockin_amplitude_nm
-    return np.stack([blank if column is None else column for column in columns], axis=1)
-
-
-def _autocorrelation(residual: Float[np.ndarray, "rows 2"]) -> float:
-    """Return the lag-1 correlation of residuals of neighbouring rows, both amplitudes together; NaN for few rows."""
+def _autocorrelation(residual: Float[np.ndarray, "rows k"]) -> float:
+    """Return the lag-1 correlation of residuals of neighbouring rows, all readings together; NaN for few rows."""
     before, after = residual[:-1], residual[1:]
     both = np.isfinite(before) & np.isfinite(after)
     total = np.nansum(residual**2)
@@ -451,7 +478,7 @@ _STRAIN_ROUNDS = 3
 
 
 def fit(  # noqa: PLR0913
-    table: AmplitudeTable,
+    table: AmplitudeTable | Any,
     model: str = "law",
     *,
     scale_errors: bool = False,
@@ -465,8 +492,9 @@ def fit(  # noqa: PLR0913
     """Fit an impact law to measured amplitudes of single-impact orbits.
 
     Args:
-        table: from `read_table`; what it gives with an error (Q, calibrations) is a nuisance with that constraint. A Q
-            without error is taken to be known to 2 % where impacts last, and exactly by the instantaneous laws.
+        table: from `read_table`, or a data frame as `AmplitudeTable.from_dataframe` takes it; what it gives with an
+            error (Q, calibrations) is a nuisance with that constraint. A Q without error is taken to be known to 2 %
+            where impacts last, and exactly by the instantaneous laws.
         model: "restitution" (r), "law" (r, epsilon; eq. 6) or "viscous" (epsilon, viscous_loss), each instantaneous or
             with "+delay", the collision delay; or "contact", physical parameters through the resolved contact.
         scale_errors: take the amplitudes' errors as relative only and scale them until chi2 equals its degrees of
@@ -492,6 +520,7 @@ def fit(  # noqa: PLR0913
             there are fewer measured amplitudes than parameters.
         RuntimeError: if JAX is not set to 64-bit floats.
     """
+    table = table if isinstance(table, AmplitudeTable) else AmplitudeTable.from_dataframe(table)
     options: dict[str, Any] = {"free": free, "fixed": fixed, "constraints": constraints, "effects": effects}
     found = find_fit(table, model, scale_errors=scale_errors, robust=robust, speeds=speeds, **options)
     return summarise(table, found)
@@ -525,6 +554,7 @@ def find_fit(  # noqa: PLR0913
             f"{table.source}: {amplitudes} measured amplitude(s) cannot determine the {len(problem.own)} "
             f"parameters of the model {model!r}; measure at other drives, orders or offsets too"
         )
+    warm_up(starts(problem, measurement)[0], measurement, problem)
     stated = Objective(measurement, problem, robust=robust)
     objective, minimum, strain = unstrained_minimum(stated)
     scale = None
@@ -569,13 +599,13 @@ def problem_of(
             raise ValueError(
                 f"the constraint on {name} must be a value and a positive error, but is {value} +- {error}"
             )
-    if "offset_origin_nm" in known and model.endswith("+delay"):
+    if "offset_origin_nm" in known and model.endswith("+delay") and not table.tapping:
         raise ValueError(
             "offset_origin_nm and delay_offset_nm shift the same thing: with a delay leave the constraint on "
             "offset_origin_nm out (delay_offset_nm takes it up), or fit the model 'contact'"
         )
     nuisances = tuple(name for name in NUISANCE_NAMES if name in known)
-    return Problem(model, own + nuisances, tuple(effects))
+    return Problem(model, own + nuisances, tuple(effects), table.drive)
 
 
 def unstrained_minimum(stated: Objective) -> tuple[Objective, Minimum, Strain]:

@@ -17,17 +17,16 @@ The three-parameter delay law is right to 0.15 ns, which counts where the delay 
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float, Shaped
 
-from afm_jax.contact.law_of_contact import DELAY_ERROR_US, SPEED_ERROR
-from afm_jax.impact.lasting_impact import LawImpact
+from afm_jax.impact.lasting_impact import TabulatedImpact
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.fits.objective import BATCH, FINE, PLAIN, ROUGH, SOFT, Objective, lowest, polish
-from fitting.forward import Linearised, impact_of
+from fitting.forward import Linearised, free_impacts, impact_at
 from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem
 from fitting.parameters import PARAMETERS, Parameter
 
@@ -280,8 +279,19 @@ LONGEST = 1.4
 NEAREST = 1.35
 """Approach speed in terms of the capture speed below which a row is set aside."""
 _CRAWLING, _MOST_LOST = 2.5, 0.05
-"""The same for rows that the law has no steady orbit for, their speed told from the amplitude; and their share at most:
-that close to where orbits end, a hair of the law decides whether there is one."""
+"""The same for rows that the law has no steady orbit for, their speed told from the amplitude, and for driven tips; and
+the share of those without at most: that close to where orbits end, a hair of the law decides whether there is one."""
+_PULLED = 0.8
+"""Pull times Hertz time over the approach speed from which the rows of a driven tip are set aside."""
+_MOST_IRREGULAR = 0.2
+"""Share of the rows of a driven tip at most that are taken not to be one impact a period."""
+_TURNED = 0.125
+"""Error of the phase in rad over the relative error of the amplitude: what the tip loses fixes the phase."""
+TOO_SLOW = "too slow for a law of impacts"
+TOO_PULLED = "under too strong a pull of the lever (more than 0.8 of what turns the tip round)"
+IRREGULAR = "not one a period"
+ATTRACTED = "none: the sample only draws the tip"
+"""Why rows are set aside."""
 
 
 @dataclass(frozen=True)
@@ -291,12 +301,23 @@ class Strain:
     Attributes:
         model_error: relative error of the amplitude that the picture itself has, shape (rows,).
         slow_error: the part of it that slow impacts have, without that of the delay law.
-        set_aside: rows that are not used, shape (rows,).
+        reasons: why rows are not used, empty for the others, shape (rows,).
     """
 
     model_error: Float[np.ndarray, " rows"]
     slow_error: Float[np.ndarray, " rows"]
-    set_aside: Bool[np.ndarray, " rows"]
+    reasons: Shaped[np.ndarray, " rows"]
+
+    @property
+    def set_aside(self) -> Bool[np.ndarray, " rows"]:
+        """Rows that are not used."""
+        return self.reasons != ""
+
+
+def padding(share: Float[np.ndarray, " rows"], readings: Float[np.ndarray, "rows k"]) -> Float[np.ndarray, "rows k"]:
+    """Return the errors of readings that a relative error of the amplitude stands for: of amplitudes and phase."""
+    of_phase = np.full((len(share), readings.shape[1] - 2), np.rad2deg(_TURNED))
+    return share[:, None] * np.concatenate([readings[:, :2], of_phase], axis=1)
 
 
 def strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
@@ -304,25 +325,43 @@ def strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
     rows = objective.measurement.rows
     count = rows.order.shape[0]
     if not objective.problem.lasting:
-        return Strain(np.zeros(count), np.zeros(count), np.zeros(count, dtype=bool))
-    impact = impact_of(jnp.asarray(values), objective.measurement, objective.problem)
+        return Strain(np.zeros(count), np.zeros(count), np.full(count, "", dtype=object))
+    impact = impact_at(values, objective.measurement, objective.problem).impact
     linear = objective.at_values(values[None])
     prediction = linear.prediction
     exists = np.asarray(prediction.orbits)[0] > 0
-    speeds = jax.vmap(impact.speeds)(jnp.asarray(np.asarray(prediction.coordinate)[0]))
-    approach, rebound = np.asarray(speeds.approach), np.asarray(speeds.rebound)
+    tips = jax.tree.map(np.asarray, free_impacts(impact, np.asarray(prediction.coordinate)[0]))
+    approach, rebound = tips.speeds.approach, tips.speeds.rebound
     # without adhesion nothing is captured, and no impact is slow
-    lowest = float(impact.lowest)
-    capture = float(impact.speeds(jnp.asarray(lowest * (1.0 + 1e-9))).approach) if lowest > 0.0 else 0.0
-    share = 2.0 * np.pi * np.asarray(rows.drive_frequency_khz) * 1e-3 * float(impact.length) / np.maximum(rebound, 1e-6)
-    slow = (share > LONGEST) | (approach < NEAREST * capture)
+    capture = float(tips.capture_speed) if tips.lowest > 0.0 else 0.0
+    share = 2.0 * np.pi * np.asarray(rows.drive_frequency_khz) * 1e-3 * float(tips.length) / np.maximum(rebound, 1e-6)
+    tapping, free = objective.problem.tapping, np.asarray(rows.free)
+    slow = (share > LONGEST) | (approach < (_CRAWLING if tapping else NEAREST) * capture)
     slow = np.where(exists, slow, _lost_slowly(objective, exists, _CRAWLING * capture))
+    reasons = np.where(slow, TOO_SLOW, "").astype(object)
+    if tapping:
+        pulled = np.asarray(prediction.pull_nm_per_us2)[0] * tips.hertz_time
+        reasons[exists & (pulled > _PULLED * approach)] = TOO_PULLED
+        reasons[_irregular(objective, exists)] = IRREGULAR
+        reasons[free] = ""
     near = np.minimum(1.5 * capture / np.maximum(approach, 1e-6), 1.5 / NEAREST)
     slow_error = BASE + GROWTH * np.minimum(share, LONGEST) ** 3 + SLOW * near**6
     error = slow_error
     if "delay_offset_nm" in objective.problem.names:
         error = np.hypot(error, DELAY_US * _sensitivity(objective, linear, approach))
-    return Strain(np.where(exists, error, BASE), np.where(exists, slow_error, BASE), slow)
+    error, slow_error = (np.where(exists, part, BASE) for part in (error, slow_error))
+    if tapping:
+        # the error is one of the motion in the free tip's frame
+        frame = 1.0 + np.asarray(rows.drive_amplitude_nm) / np.asarray(rows.amplitude_nm)[:, 1]
+        error, slow_error = (np.where(free, 0.0, frame * part) for part in (error, slow_error))
+    return Strain(error, slow_error, reasons)
+
+
+def _irregular(objective: Objective, exists: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
+    """Say for which measured rows of a driven tip the law has no steady orbit; none if there are many of them."""
+    measured = np.asarray(objective.measurement.rows.measured).any(axis=1)
+    lost = measured & ~exists
+    return lost if lost.sum() <= _MOST_IRREGULAR * measured.sum() else np.zeros_like(lost)
 
 
 def _lost_slowly(objective: Objective, exists: Bool[np.ndarray, " rows"], slowest: float) -> Bool[np.ndarray, " rows"]:
@@ -330,8 +369,8 @@ def _lost_slowly(objective: Objective, exists: Bool[np.ndarray, " rows"], slowes
     rows = jax.tree.map(np.asarray, objective.measurement.rows)
     measured = rows.measured.any(axis=1)
     # a tip that comes free of the platform reaches about its speed over its angular frequency; the lock-in reads half
-    height = np.max(np.where(rows.measured, rows.amplitude_nm * np.array([1.0, 2.0]), 0.0), axis=1)
-    speed = height * float(objective.measurement.cantilever.angular_frequency)
+    height = np.max(np.where(rows.measured, rows.amplitude_nm, 0.0)[:, :2] * np.array([1.0, 2.0]), axis=1)
+    speed = height * RAD_PER_US_PER_KHZ * float(objective.measurement.cantilever.frequency_khz)
     lost = measured & ~exists & (speed < slowest)
     return lost if lost.sum() <= _MOST_LOST * measured.sum() else np.zeros_like(lost)
 
@@ -340,22 +379,29 @@ def untabulated(
     objective: Objective, values: Float[np.ndarray, " p"], approach: Float[np.ndarray, " rows"]
 ) -> Bool[np.ndarray, " rows"]:
     """Say at which approach speeds the table of a contact misses its accuracy; nowhere for a law, nor at NaN."""
-    impact = impact_of(jnp.asarray(values), objective.measurement, objective.problem)
-    if isinstance(impact, LawImpact):
+    if objective.problem.model != "contact":
         return np.zeros(approach.shape, dtype=bool)
-    speed, delay = impact.errors(jnp.asarray(approach))
-    held = (np.asarray(speed) <= SPEED_ERROR) & (np.asarray(delay) <= DELAY_ERROR_US)
+    from afm_jax.contact.law_of_contact import DELAY_ERROR_US, SPEED_ERROR  # noqa: PLC0415  # for contacts alone
+
+    impact: Any = impact_at(values, objective.measurement, objective.problem).impact
+    speed, delay = jax.tree.map(np.asarray, _errors(impact, approach))
+    held = (speed <= SPEED_ERROR) & (delay <= DELAY_ERROR_US)
     return np.isfinite(approach) & ~held
+
+
+@jax.jit
+def _errors(impact: TabulatedImpact, approach: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    return impact.errors(approach)
 
 
 def _sensitivity(
     objective: Objective, linear: Linearised, approach: Float[np.ndarray, " rows"]
 ) -> Float[np.ndarray, " rows"]:
     """Return by how much the amplitude changes with the delay, relative to itself, in 1/us."""
-    count = approach.shape[0]
     offset = objective.problem.names.index("delay_offset_nm")
-    slope = linear.jacobian[0, : 2 * count, offset].reshape(count, 2) * np.asarray(objective.measurement.rows.error_nm)
-    amplitude = np.asarray(linear.prediction.amplitude_nm)[0]
+    error = np.asarray(objective.measurement.rows.error_nm)
+    slope = (linear.jacobian[0, : error.size, offset].reshape(error.shape) * error)[:, :2]
+    amplitude = np.asarray(linear.prediction.amplitude_nm)[0, :, :2]
     # the offset d shortens the delay by d/u
     relative = np.abs(slope) / np.where(amplitude > 0.0, amplitude, 1.0)
     return approach * np.where(amplitude > 0.0, relative, 0.0).max(axis=1)
@@ -370,6 +416,6 @@ def relaxed(objective: Objective, strain: Strain) -> Objective:
     """
     rows = objective.measurement.rows
     amplitude, error = np.asarray(rows.amplitude_nm), np.asarray(rows.error_nm)
-    total = np.hypot(error, strain.model_error[:, None] * amplitude)
+    total = np.hypot(error, padding(strain.model_error, amplitude))
     used = np.asarray(rows.measured) & ~strain.set_aside[:, None]
     return objective.with_rows(error_nm=np.where(used, total, 1.0), measured=used)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from afm_jax.results import public_result
 from afm_jax.strict_json import plain
 from fitting.fits.intervals import Convergence
 from fitting.fits.loss import Loss
@@ -64,13 +65,15 @@ class FittedLaw:
 class FittedRows:
     """The rows of the table beside their prediction; NaN where nothing was measured or predicted.
 
-    Amplitudes have shape (rows, 2): peak, lock-in. ``error_nm`` is the measured error with that of the model
-    (``model_error``, relative) added in quadrature; rows ``set_aside`` strain the model too much to be used.
+    Amplitudes have shape (rows, 2): peak, lock-in; residuals that of the phase besides, if the table has one.
+    ``error_nm`` and ``phase_error_deg`` are the measured error with that of the model (``model_error``, relative) added
+    in quadrature; rows ``set_aside`` are not used, ``reasons`` says why (empty for the others). Phases are those of the
+    table, the predicted ones next to the measured.
     """
 
     predicted_nm: Float[np.ndarray, "rows 2"]
     measured_nm: Float[np.ndarray, "rows 2"]
-    residual: Float[np.ndarray, "rows 2"]
+    residual: Float[np.ndarray, "rows k"]
     error_nm: Float[np.ndarray, "rows 2"]
     model_error: Float[np.ndarray, " rows"]
     used: Bool[np.ndarray, " rows"]
@@ -78,8 +81,13 @@ class FittedRows:
     approach_speed_nm_per_us: Float[np.ndarray, " rows"]
     orbits: Int[np.ndarray, " rows"]
     near_fold: Bool[np.ndarray, " rows"]
+    reasons: tuple[str, ...] = ()
+    predicted_phase_deg: Float[np.ndarray, " rows"] | None = None
+    measured_phase_deg: Float[np.ndarray, " rows"] | None = None
+    phase_error_deg: Float[np.ndarray, " rows"] | None = None
 
 
+@public_result(picture="fitting.report.plots:rows_figure", rows="parameters")
 @dataclass(frozen=True)
 class FitResult:
     """The outcome of `fit`; attributes are named like the keys of its JSON.

@@ -17,16 +17,14 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.fits.least_squares import covariance_of
-from fitting.fits.minimum import Strain
+from fitting.fits.minimum import Strain, padding
 from fitting.fits.objective import ROBUST, Objective
-from fitting.forward import ImpactSlopes, impact_of, impact_slopes
+from fitting.forward import ImpactSlopes, free_impacts, impact_at, impact_slopes
 from fitting.models import Problem
 from fitting.parameters import DELAY_SHAPE, LOSS_SHAPE, PARAMETERS
 
@@ -52,7 +50,7 @@ class StepRows(NamedTuple):
     """The rows of a fit as the step sees them: everything in the objective's errors.
 
     Attributes:
-        residual: of the amplitudes, then of what else there is.
+        residual: of the readings, then of what else there is.
         jacobian: by the parameters.
         slopes: of the amplitudes' residuals by what impacts do.
         measurement_error: of each amplitude, over the objective's.
@@ -65,8 +63,8 @@ class StepRows(NamedTuple):
     residual: Float[np.ndarray, " n"]
     jacobian: Float[np.ndarray, "n p"]
     slopes: ImpactSlopes
-    measurement_error: Float[np.ndarray, "rows 2"]
-    slow_error: Float[np.ndarray, "rows 2"]
+    measurement_error: Float[np.ndarray, "rows k"]
+    slow_error: Float[np.ndarray, "rows k"]
     approach: Float[np.ndarray, " rows"]
     rebound: Float[np.ndarray, " rows"]
     pull: Float[np.ndarray, " rows"]
@@ -180,7 +178,7 @@ class LinearStep(NamedTuple):
     change: Float[np.ndarray, " k"]
     covariance: Float[np.ndarray, "k k"]
     chi2: float
-    residual: Float[np.ndarray, "rows 2"]
+    residual: Float[np.ndarray, "rows k"]
     unknown: Float[np.ndarray, " m"]
     unknown_covariance: Float[np.ndarray, "m m"]
     follow: Float[np.ndarray, "m k"]
@@ -194,31 +192,31 @@ def step_of(rows: StepRows, left_out: Unmodelled, free: Bool[np.ndarray, " p"]) 
         left_out: by the fitted model.
         free: which of its parameters are not at their bound.
     """
-    count, names = rows.approach.size, left_out.problem.names
+    size, names = rows.measurement_error.size, left_out.problem.names
     values = np.array([left_out.values[name] for name in names])
     columns = left_out.columns(rows.approach, rows.rebound)
     slopes = np.stack([rows.slopes.by_square, rows.slopes.by_delay])
 
     def amplitudes(change):
         """Return changes of the amplitudes' residuals that changes of the impacts make."""
-        return np.einsum("krc,kr...->rc...", slopes, change).reshape(2 * count, *change.shape[2:])
+        return np.einsum("krc,kr...->rc...", slopes, change).reshape(size, *change.shape[2:])
 
-    size, priors = len(values), left_out.priors
+    known, priors = len(values), left_out.priors
     residual = rows.residual.copy()
-    residual[: 2 * count] += amplitudes(columns.known)
-    jacobian = np.zeros((residual.size + len(priors), size + len(priors)))
-    jacobian[: residual.size, :size] = rows.jacobian
+    residual[:size] += amplitudes(columns.known)
+    jacobian = np.zeros((residual.size + len(priors), known + len(priors)))
+    jacobian[: residual.size, :known] = rows.jacobian
     if "viscous_loss" in names:
-        jacobian[: 2 * count, names.index("viscous_loss")] += amplitudes(columns.drag)
-    jacobian[: 2 * count, size:] = amplitudes(columns.shape)
-    jacobian[residual.size :, size:] = np.diag([1.0 / error for _, error in priors.values()])
+        jacobian[:size, names.index("viscous_loss")] += amplitudes(columns.drag)
+    jacobian[:size, known:] = amplitudes(columns.shape)
+    jacobian[residual.size :, known:] = np.diag([1.0 / error for _, error in priors.values()])
     residual = np.append(residual, np.zeros(len(priors)))
     unknown = np.concatenate([amplitudes(columns.unknown), amplitudes(_remainders(rows))], axis=1)
     variance = _noise(rows) + unknown @ unknown.T
     root = np.linalg.cholesky(variance)
 
     def whitened(matrix):
-        return np.concatenate([solve_triangular(root, matrix[: 2 * count], lower=True), matrix[2 * count :]])
+        return np.concatenate([solve_triangular(root, matrix[:size], lower=True), matrix[size:]])
 
     white, slope = whitened(residual), whitened(jacobian)
     moving = np.append(free, np.ones(len(priors), bool))
@@ -232,18 +230,18 @@ def step_of(rows: StepRows, left_out: Unmodelled, free: Bool[np.ndarray, " p"]) 
     change = _bounded(white, slope, begin, ends, moving & np.isfinite(np.diag(covariance)))
     left = residual + jacobian @ change
     factor = cho_factor(variance, lower=True)
-    gain = unknown.T @ cho_solve(factor, np.eye(2 * count))
-    likely = -gain @ left[: 2 * count]
+    gain = unknown.T @ cho_solve(factor, np.eye(size))
+    likely = -gain @ left[:size]
     return LinearStep(
         names=(*names, *priors),
         values=begin + change,
         change=change,
         covariance=covariance,
         chi2=float(np.sum((white + slope @ change) ** 2)),
-        residual=(left[: 2 * count] + unknown @ likely).reshape(count, 2),
+        residual=(left[:size] + unknown @ likely).reshape(rows.measurement_error.shape),
         unknown=likely,
         unknown_covariance=np.eye(unknown.shape[1]) - gain @ unknown,
-        follow=-gain @ jacobian[: 2 * count],
+        follow=-gain @ jacobian[:size],
     )
 
 
@@ -264,16 +262,22 @@ def _bounded(residual, slope, begin, ends, moving) -> Float[np.ndarray, " k"]:
 
 
 def _noise(rows: StepRows) -> Float[np.ndarray, "n n"]:
-    """Return the covariance of the amplitudes' residuals: measured errors, and what slow impacts lack."""
-    count = rows.approach.size
-    variance = np.zeros((count, 2, count, 2))
+    """Return the covariance of the readings' residuals: measured errors, and what slow impacts lack.
+
+    Noise of a lock-in is as large along the measured phasor as across it, and independent: errors of amplitude and
+    phase are not correlated. What slow impacts lack is common to peak and lock-in, and to the phase its own.
+    """
+    count, kinds = rows.measurement_error.shape
+    variance = np.zeros((count, kinds, count, kinds))
     one = np.arange(count)
     together, apart = 0.5 * (_TOGETHER + _APART), 0.5 * (_TOGETHER - _APART)
-    for i in range(2):
-        for j in range(2):
-            shared = (together if i == j else apart) * rows.slow_error[:, i] * rows.slow_error[:, j]
+    shares = np.eye(kinds)
+    shares[:2, :2] = [[together, apart], [apart, together]]
+    for i in range(kinds):
+        for j in range(kinds):
+            shared = shares[i, j] * rows.slow_error[:, i] * rows.slow_error[:, j]
             variance[one, i, one, j] = shared + (rows.measurement_error[:, i] ** 2 if i == j else 0.0)
-    return variance.reshape(2 * count, 2 * count)
+    return variance.reshape(count * kinds, count * kinds)
 
 
 def _remainders(rows: StepRows) -> Float[np.ndarray, "2 rows m"]:
@@ -303,33 +307,26 @@ def rows_of_fit(
     plain = Objective(objective.measurement, problem, near=objective.near)
     linear = plain.at_values(values[None])
     prediction = jax.tree.map(lambda leaf: np.asarray(leaf)[0], linear.prediction)
-    impact = impact_of(jnp.asarray(values), objective.measurement, problem)
-    speeds = jax.tree.map(np.asarray, jax.vmap(impact.speeds)(jnp.asarray(prediction.coordinate)))
-    known = {name: float(value) for name, value in zip(problem.names, values, strict=True)}
-    cantilever = problem.cantilever(jnp.asarray(values), objective.measurement.cantilever)
-    omega = RAD_PER_US_PER_KHZ * rows.drive_frequency_khz
-    height = rows.drive_amplitude_nm * known.get("drive_calibration", 1.0)
-    phase = prediction.arrival_rad + 0.5 * omega * speeds.delay
-    cosine, sine = height * np.cos(phase), height * np.sin(phase)
-    position = rows.offset_nm + known.get("offset_origin_nm", 0.0) + cosine
-    spring, air = float(cantilever.angular_frequency) ** 2, 2.0 * float(cantilever.decay_rate)
+    impact = impact_at(values, objective.measurement, problem).impact
+    tips = jax.tree.map(np.asarray, free_impacts(impact, prediction.coordinate))
+    speeds = tips.speeds
     measured = np.asarray(objective.measurement.rows.measured)
     error = np.where(measured, rows.error_nm, 1.0)
     if objective.robust:
         # the squares' weights, at which least squares have the same minimum
         error = error * (1.0 + (plain.misfit(linear) / ROBUST) ** 2) ** -0.25
-    there = prediction.orbits > 0
+    there = (prediction.orbits > 0) & ~rows.free
     return StepRows(
         residual=np.asarray(linear.residual)[0],
         jacobian=np.asarray(linear.jacobian)[0],
         slopes=impact_slopes(values, objective.measurement, problem, objective.near),
         measurement_error=np.where(measured, scale * np.asarray(stated.measurement.rows.error_nm) / error, 1.0),
-        slow_error=np.where(measured, scale * strain.slow_error[:, None] * rows.amplitude_nm / error, 0.0),
+        slow_error=np.where(measured, scale * padding(strain.slow_error, rows.amplitude_nm) / error, 0.0),
         approach=np.where(there, speeds.approach, 100.0),
         rebound=np.where(there, speeds.rebound, 99.0),
-        pull=np.where(there, -spring * position + air * omega * sine + omega**2 * cosine, 0.0),
-        change=np.where(there, (spring - omega**2) * omega * sine + air * omega**2 * cosine, 0.0),
-        hertz_time=np.asarray(impact.hertz_time(jnp.asarray(speeds.approach))),
+        pull=np.where(there, prediction.pull_nm_per_us2, 0.0),
+        change=np.where(there, prediction.change_nm_per_us3, 0.0),
+        hertz_time=tips.hertz_time,
     )
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from scipy.special import chdtrc
 
 from fitting.fits.intervals import Convergence
+from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.result import FittedParameter, FittedRows
 from fitting.parameters import PARAMETERS, SHAPE_NAMES
 from fitting.tables.table import AmplitudeTable
@@ -210,15 +211,15 @@ def _correlations(evidence: Evidence) -> list[tuple[str, float]]:
     return [(where, excess) for where, excess in found if abs(excess) > _CORRELATED]
 
 
-def correlation_excess(residual: Float[np.ndarray, "rows 2"]) -> float:
+def correlation_excess(residual: Float[np.ndarray, "rows k"]) -> float:
     """Return by how many standard deviations the residuals of neighbouring rows are correlated.
 
     The scalar products of neighbouring rows are added up. If rows are independent and as likely positive as negative,
     the sum is 0 on average, and its variance the number of neighbours times the mean squared product of two rows of the
-    table: both amplitudes of a row may go together. Outliers count as much as the smallest of them.
+    table: the readings of a row may go together. Outliers count as much as the smallest of them.
 
     Args:
-        residual: of both amplitudes in errors, row after row; NaN where nothing was measured.
+        residual: of the readings in errors, row after row; NaN where nothing was measured.
     """
     bounded = np.clip(np.nan_to_num(residual), -_OUTLIER, _OUTLIER)
     count = len(bounded)
@@ -344,16 +345,16 @@ def _pair_warnings(evidence: Evidence) -> list[str]:
 def _row_warnings(evidence: Evidence) -> list[str]:
     warnings = []
     aside = np.flatnonzero(evidence.rows.set_aside)
-    if aside.size:
-        warnings.append(
-            "Set aside, because these impacts are too slow for a law of impacts: "
-            f"{_rows_in_words(evidence.table, aside)}."
-        )
+    reasons = evidence.rows.reasons or (TOO_SLOW,) * len(evidence.rows.set_aside)
+    for reason in dict.fromkeys(reasons[row] for row in aside):
+        named = np.array([row for row in aside if reasons[row] == reason])
+        warnings.append(f"Set aside, because these impacts are {reason}: {_rows_in_words(evidence.table, named)}.")
     strained = np.flatnonzero(evidence.rows.used & (evidence.rows.model_error > _STATED))
     if strained.size:
         worst = 100.0 * float(evidence.rows.model_error[strained].max())
+        small = "small amplitudes" if evidence.table.tapping else "slow impacts"
         warnings.append(
-            f"A model error of up to {worst:.1f} % was added to the errors of slow impacts: "
+            f"A model error of up to {worst:.1f} % was added to the errors of {small}: "
             f"{_rows_in_words(evidence.table, strained)}."
         )
     unseen = np.zeros(evidence.table.rows) if evidence.table.no_orbit is None else evidence.table.no_orbit

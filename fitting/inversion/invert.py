@@ -58,7 +58,7 @@ def invert(
 
     Args:
         table: from `read_table`; a table without phases must have rows on resonance.
-        frequency_error_khz: standard error of the free frequency; None: exactly known.
+        frequency_error_khz: standard error of the free frequency; None: the table's, exactly known if it has none.
         truth: approach and rebound speeds in nm/us, ascending, where the law is known: what the reading on resonance
             is compared with.
         fitted: a law from `read_fitted_law`, to be set beside the rows.
@@ -74,6 +74,12 @@ def invert(
     require_float64()
     if frequency_error_khz is not None and not 0.0 < frequency_error_khz < table.free_frequency_khz:
         raise ValueError(f"`frequency_error_khz` must be positive, but is {frequency_error_khz!r}")
+    if table.tapping:
+        raise TableError(
+            f"{table.source}: the {table.drive} is driven here, not the sample: there is no law-free reading of such "
+            "rows; fit a law (`afm-jax fit`)"
+        )
+    frequency_error_khz = table.free_frequency_error_khz if frequency_error_khz is None else frequency_error_khz
     with_phase = _with_phase(table)
     if not with_phase.any() and not on_resonance(table).any():
         raise TableError(
@@ -177,7 +183,7 @@ def _at(table: AmplitudeTable, chosen: np.ndarray, instrument: _Instrument) -> I
     fill = np.resize(chosen, -(-chosen.size // _BLOCK) * _BLOCK)
     # every field an array of the rows' shape, for `vmap`
     amplitude, frequency, offset = (
-        instrument.drive_calibration * table.drive_amplitude_nm,
+        instrument.drive_calibration * table.excitation_nm,
         table.drive_frequency_khz,
         instrument.offset_origin_nm + table.offset_nm,
     )

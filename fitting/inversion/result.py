@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from afm_jax.results import public_result
 from afm_jax.strict_json import plain
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.tables.table import AmplitudeTable
@@ -83,7 +84,7 @@ def read_on_resonance(
     height, error = np.where(np.isfinite(peak), (peak, peak_error), (lockin, lockin_error))
     row = np.flatnonzero(on_resonance(table))
     speed = RAD_PER_US_PER_KHZ * table.free_frequency_khz * height[row]
-    top = RAD_PER_US_PER_KHZ * table.drive_frequency_khz[row] * table.drive_amplitude_nm[row]
+    top = RAD_PER_US_PER_KHZ * table.drive_frequency_khz[row] * table.excitation_nm[row]
     approach, rebound = speed + top, speed - top
     expected = np.full(len(row), np.nan)
     if law is not None:
@@ -250,6 +251,7 @@ class ComparedLaw:
         }
 
 
+@public_result(picture="fitting.inversion.report:inversion_figure", rows="records")
 @dataclass(frozen=True, kw_only=True)
 class Inversion:
     """The outcome of `invert`.
@@ -295,7 +297,7 @@ class Inversion:
             "line": lines,
             "order": table.order,
             "drive_frequency_khz": table.drive_frequency_khz,
-            "drive_amplitude_nm": table.drive_amplitude_nm,
+            "drive_amplitude_nm": table.excitation_nm,
             "offset_nm": table.offset_nm,
         }
         for k, (name, unit) in enumerate(

@@ -181,7 +181,7 @@ def _draw_expected(axes: Axes) -> None:
 def _row_axis(result: FitResult) -> tuple[np.ndarray, list[int]]:
     """Return positions of the rows, sorted by order, frequency and drive, and where a new order begins."""
     table = result.table
-    ranking = np.lexsort((table.drive_amplitude_nm, table.drive_frequency_khz, table.order))
+    ranking = np.lexsort((table.excitation_nm, table.drive_frequency_khz, table.order))
     orders = table.order[ranking]
     return ranking, [int(i) for i in np.flatnonzero(np.diff(orders)) + 1]
 

@@ -113,7 +113,7 @@ def row_records(result: FitResult) -> list[dict[str, Any]]:
         table.lines,
         table.order,
         table.drive_frequency_khz,
-        table.drive_amplitude_nm,
+        table.excitation_nm,
         table.offset_nm,
         *(column[:, kind] for kind in range(2) for column in (rows.measured_nm, rows.predicted_nm, rows.residual)),
         rows.approach_speed_nm_per_us,

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from afm_jax.checks import require_float64
 from afm_jax.contact.parameters import EFFECTS
+from afm_jax.results import public_result
 from fitting.fits.intervals import at_bound, covariance
 from fitting.fits.least_squares import Box, Searches, descended, distance, whole_covariance_of
 from fitting.fits.objective import PLAIN, ROBUST, Objective, soft_square
@@ -47,13 +48,15 @@ def objective_of(result: FitResult) -> Refit:
     settings = result.settings
     effects = EFFECTS if settings["effects"] is None else tuple(settings["effects"])
     names = tuple(name for name in result.parameters if name not in SHAPE_NAMES)
-    problem = Problem(result.model, names, effects)
+    problem = Problem(result.model, names, effects, result.table.drive)
     measurement = measurement_of(result.table, problem, settings["constraints"], settings["fixed"])
     values = np.array([result.parameters[name].value for name in names])
     stated = Objective(measurement, problem, robust=settings["robust"] is not None)
     size = np.asarray(measurement.rows.order).shape[0]
-    error = np.full((size, 2), np.nan)
-    error[: result.table.rows] = result.rows.error_nm
+    error = np.full(np.asarray(measurement.rows.error_nm).shape, np.nan)
+    error[: result.table.rows, :2] = result.rows.error_nm
+    if result.rows.phase_error_deg is not None:
+        error[: result.table.rows, 2] = result.rows.phase_error_deg
     used = np.isfinite(error)
     objective = stated.with_rows(error_nm=np.where(used, error, 1.0), measured=used)
     if result.model != "contact":
@@ -111,9 +114,9 @@ _SETTLED = 1e-6
 
 
 class DataSets(NamedTuple):
-    """Amplitudes of shape (sets, rows, 2), and the measured values of the constrained parameters, shape (sets, p)."""
+    """Readings of shape (sets, rows, k), and the measured values of the constrained parameters, shape (sets, p)."""
 
-    amplitude_nm: Float[np.ndarray, "sets rows 2"]
+    amplitude_nm: Float[np.ndarray, "sets rows k"]
     constraint_value: Float[np.ndarray, "sets p"]
 
 
@@ -218,6 +221,7 @@ FEWEST = 40
 """With fewer samples the 2.5 % quantile is the smallest value or next to it."""
 
 
+@public_result()
 @dataclass(frozen=True, eq=False)
 class Bootstrap:
     """Fitted values of synthetic data sets.

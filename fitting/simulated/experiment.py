@@ -5,7 +5,7 @@ Settled motions of many drives: every row of a table to be, simulated in time un
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.surface import detected, height_of_free_deflection
 from afm_jax.checks import require_float64
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
@@ -24,7 +25,8 @@ from afm_jax.motion.observe import observe
 from afm_jax.motion.record import MotionOutcome, Simulation, State
 from afm_jax.motion.settle import close_periods, ends_in_flight, place_after, settled, where_to_go_on
 from afm_jax.motion.simulate import DEFAULT_ACCURACY, simulate
-from fitting.tables.table import AmplitudeTable
+from afm_jax.results import public_result
+from fitting.tables.table import DRIVES, AmplitudeTable
 
 US_PER_MS = 1e3
 BATCH = 16
@@ -41,6 +43,7 @@ _TOLERANCE = 1e-6
 """Of what remains to the steady motion, relative: ten times less than the amplitudes are wanted to."""
 
 
+@public_result()
 class Drives(NamedTuple):
     """What is driven in an experiment, one entry a row."""
 
@@ -48,6 +51,7 @@ class Drives(NamedTuple):
     """N, drive periods per impact."""
     frequency_khz: Float[np.ndarray, " rows"]
     amplitude_nm: Float[np.ndarray, " rows"]
+    """Of the sample; of the free tip (of its deflection, if the base is driven) where that is driven."""
     offset_nm: Float[np.ndarray, " rows"]
 
 
@@ -231,6 +235,7 @@ PIECES = 40
 """Most pieces of a hundred response periods that a motion may take to settle."""
 
 
+@public_result()
 @dataclass(frozen=True, kw_only=True)
 class SimulatedExperiment:
     """A simulated amplitude table, and what was behind it.
@@ -257,6 +262,7 @@ def simulate_experiment(  # noqa: PLR0913
     cantilever: Cantilever,
     drives: Drives,
     *,
+    drive: str = "sample",
     noise: float = 0.01,
     phase_noise_deg: float | None = None,
     seed: int = 0,
@@ -273,7 +279,10 @@ def simulate_experiment(  # noqa: PLR0913
     Args:
         interaction: a contact, or a law with or without a collision delay.
         cantilever: the cantilever; its Q enters the table as the known value.
-        drives: what is driven, see `drives_of`.
+        drives: how it is driven, see `drives_of`.
+        drive: what is driven: "sample", "force" (on the tip) or "base"; of the latter two (order 1) the free amplitude,
+            the lock-in amplitude and the lag are read. Simulated in the frame of the free tip, in which the sample
+            moves.
         noise: standard error of peak and lock-in amplitude as a share of each, drawn independently.
         phase_noise_deg: standard error of the phase in degrees; None: the table has no phase.
         seed: of the noise.
@@ -292,8 +301,13 @@ def simulate_experiment(  # noqa: PLR0913
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the contact, law or cantilever was built.
     """
     require_float64(interaction, cantilever)
-    _check(drives, noise, phase_noise_deg)
-    found = steady_rows(interaction, cantilever, drives, accuracy=accuracy, pieces=pieces, report=report)
+    _check(drives, drive, noise, phase_noise_deg)
+    ratio = drives.frequency_khz / float(cantilever.frequency_khz)
+    moved = drives
+    if drive == "base":
+        height = height_of_free_deflection(drives.amplitude_nm, ratio, cantilever.quality_factor)
+        moved = drives._replace(amplitude_nm=np.asarray(height))
+    found = steady_rows(interaction, cantilever, moved, accuracy=accuracy, pieces=pieces, report=report)
     kept = found.rows
     left_out = tuple(
         f"order {drives.order[i]}, {drives.frequency_khz[i]:g} kHz, {drives.amplitude_nm[i]:g} nm, "
@@ -303,24 +317,31 @@ def simulate_experiment(  # noqa: PLR0913
     if found.reading is None:
         raise ValueError(f"no drive has a steady single-impact orbit (the first: {left_out[0]})")
     peak, lockin, degrees = found.reading
-    phase = None if phase_noise_deg is None else degrees
     known = cantilever.quality_factor
+    names = ("peak_amplitude", "phase", "drive")
+    if drive != "sample":
+        seen = detected(lockin, degrees, moved.amplitude_nm[kept], ratio[kept], known, base=drive == "base")
+        lockin, degrees = (np.asarray(part) for part in seen)
+        names = (None, "phase_lag", "free")
+    columns: dict[str, Any] = {f"{names[2]}_amplitude_nm": drives.amplitude_nm[kept]}
+    if names[0] is not None:
+        columns |= {"peak_amplitude_nm": peak, "peak_amplitude_error_nm": noise * peak}
+    if phase_noise_deg is not None:
+        error = np.full(degrees.shape, phase_noise_deg)
+        columns |= {f"{names[1]}_deg": degrees, f"{names[1]}_error_deg": error}
     exact = AmplitudeTable(
+        drive=drive,
         order=drives.order[kept],
         drive_frequency_khz=drives.frequency_khz[kept],
-        drive_amplitude_nm=drives.amplitude_nm[kept],
         offset_nm=drives.offset_nm[kept],
         free_frequency_khz=float(cantilever.frequency_khz),
         quality_factor=None if known is None else float(known),
         quality_factor_error=quality_factor_error,
         mass_ng=float(cantilever.mass_ng),
-        peak_amplitude_nm=peak,
-        peak_amplitude_error_nm=noise * peak,
         lockin_amplitude_nm=lockin,
         lockin_amplitude_error_nm=noise * lockin,
-        phase_deg=phase,
-        phase_error_deg=None if phase is None else np.full(phase.shape, phase_noise_deg),
         remarks=remarks,
+        **columns,
     )
     # drawn for every drive, so that one that is left out does not change the noise of the others
     draws = np.random.default_rng(seed).normal(size=(3, len(drives.order)))[:, kept]
@@ -343,13 +364,16 @@ def with_noise(exact: AmplitudeTable, draws: Float[np.ndarray, "3 rows"]) -> Amp
         ("lockin_amplitude_nm", "lockin_amplitude_error_nm", draws[1]),
     ):
         value, spread = getattr(exact, name), getattr(exact, error)
+        if value is None and exact.tapping:
+            continue
         if value is None:
             raise ValueError(f"{exact.source}: the table has no {name}; noise is added to peak and lock-in amplitude")
         columns[name] = _rounded(value + spread * draw)
         columns[error] = _rounded(spread)
-    if exact.phase_deg is not None:
-        measured = exact.phase_deg + np.asarray(exact.phase_error_deg) * draws[2]
-        columns["phase_deg"] = np.round(measured % (360.0 / exact.order), 6)
+    phase, error = exact.phase_and_error_deg
+    if phase is not None:
+        measured = phase + np.asarray(error) * draws[2]
+        columns["phase_lag_deg" if exact.tapping else "phase_deg"] = np.round(measured % (360.0 / exact.order), 6)
     return replace(exact, **columns)
 
 
@@ -357,7 +381,11 @@ def _rounded(values: Float[np.ndarray, " rows"]) -> Float[np.ndarray, " rows"]:
     return np.array([float(f"{value:.6g}") for value in values])
 
 
-def _check(drives: Drives, noise: float, phase_noise_deg: float | None) -> None:
+def _check(drives: Drives, drive: str, noise: float, phase_noise_deg: float | None) -> None:
+    if drive not in DRIVES:
+        raise ValueError(f"`drive` must be one of {', '.join(DRIVES)}, but is {drive!r}")
+    if drive != "sample" and np.any(np.asarray(drives.order) != 1):
+        raise ValueError(f"`drives` must have the order 1 where the {drive} is driven: that is what is read")
     if not 0.0 < noise < 1.0:
         raise ValueError(f"`noise` must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
     if phase_noise_deg is not None and not 0.0 < phase_noise_deg < 90.0:

@@ -120,7 +120,7 @@ class Column:
         required: whether every row needs it.
         error: the name of the column that holds its standard errors, for a measured column.
         amplitude: whether it is a measured amplitude: each row needs one, and a relative noise applies to it.
-        flag: whether its numbers are 0 or 1.
+        flag: of a column of 0 and 1: what 1 says.
     """
 
     name: str
@@ -132,7 +132,7 @@ class Column:
     required: bool = False
     error: str | None = None
     amplitude: bool = False
-    flag: bool = False
+    flag: str = ""
 
     @property
     def says(self) -> str:
@@ -154,6 +154,7 @@ class Form:
         fewer: what to do with a row of too few cells.
         more: and with one of too many.
         number: how a number is written.
+        strange: columns that other files have, and what to do about them.
     """
 
     columns: tuple[Column, ...]
@@ -165,6 +166,7 @@ class Form:
     fewer: str = "fill the row up"
     more: str = "a decimal comma must be a point"
     number: str = "write it like 90.25 or 9.025e1, or remove the row"
+    strange: Mapping[str, str] = field(default_factory=dict)
 
     def column(self, name: str) -> Column | None:
         """Return the column of a name, None if there is none."""
@@ -186,6 +188,7 @@ class FileSetting:
         unit: its unit in words of a message, where the name might be taken for another one.
         lowest: what it must lie above.
         error: whether a standard error stands behind it: "never", "maybe" or "always".
+        choices: of a word in place of a number: which there are.
     """
 
     key: str
@@ -193,6 +196,7 @@ class FileSetting:
     unit: str = ""
     lowest: float = 0.0
     error: Literal["never", "maybe", "always"] = "never"
+    choices: tuple[str, ...] = ()
 
     @property
     def line(self) -> str:
@@ -279,6 +283,8 @@ def setting_in(text: str, settings: Settings) -> FileSetting | None:
 def parse_setting(setting: FileSetting, text: str, *, line: int, faults: Faults) -> tuple[float, float | None] | None:
     """Return the value and its error of a comment that makes a setting, or None after noting a fault.
 
+    Of a word it is its place among the choices.
+
     Args:
         setting: from `setting_in`.
         text: the comment without its number sign.
@@ -292,6 +298,14 @@ def parse_setting(setting: FileSetting, text: str, *, line: int, faults: Faults)
         return None
     # Spreadsheets fill every line up with commas.
     cells = [cell.strip() for cell in _PLUS_MINUS.split(match["value"].rstrip(",; \t"))]
+    if setting.choices:
+        if cells in [[choice] for choice in setting.choices]:
+            return float(setting.choices.index(cells[0])), None
+        choices = ", ".join(setting.choices[:-1]) + f" or {setting.choices[-1]}"
+        faults.add(
+            f"{key} must be {choices}, but is {quoted(match['value'].strip())}; write '{setting.line}'", line=line
+        )
+        return None
     fault = _fault_in_cells(setting, cells)
     if fault is not None:
         faults.add(f"{key} {fault}", line=line)
@@ -411,6 +425,9 @@ def _check_unknown(
     meant: set[str] = set()
     complete = not _missing(form, present)
     for count, (position, name) in enumerate(unknown):
+        if name in form.strange:
+            faults.add(form.strange[name], line=line, column=name)
+            continue
         suggestion = form.column(nearest_name(name, form.names) or "") if name and count < _SUGGESTIONS else None
         if form.open and (suggestion is None or suggestion.says in present):
             continue

@@ -15,17 +15,35 @@ single-impact orbit (it stuck, or moved chaotically): their amplitudes are blank
 ``# tip_calibration = 1 +- 0.02``, ``# drive_calibration = 1 +- 0.01`` and ``# offset_origin_nm = 0 +- 0.3`` say what is
 known of the instrument. Other comments are kept as remarks.
 
+A cantilever that is driven itself over a sample at rest (a tapping or amplitude-phase-distance curve) says so::
+
+    # drive = force
+    # free_frequency_khz = 90 +- 0.01
+    # quality_factor = 200 +- 2
+    # spring_constant_n_per_m = 5.4 +- 0.5
+    drive_frequency_khz,free_amplitude_nm,offset_nm,lockin_amplitude_nm,lockin_amplitude_error_nm,phase_lag_deg,phase_lag_error_deg
+    92.7,80,-40,44.1,0.13,2.3,0.2
+
+``drive = force`` acts on the tip (magnetic, photothermal), ``drive = base`` shakes the cantilever's base; ``sample``
+is the default. ``free_amplitude_nm`` is the amplitude of the free tip, ``offset_nm`` the sample's height over the tip's
+rest position, ``phase_lag_deg`` how far the response lags behind the drive; under ``base`` free and lock-in amplitude
+are those of the deflection, the lag is behind the base. ``order`` may be left out (1), ``retract`` marks by 1 the rows
+of the way back, and ``# phase_zero_deg = 0 +- 0.2`` says how well the instrument's zero of phase is known.
+
 The comment lines of an amplitude table: what `# key = value` says about the cantilever, and free remarks.
 
 The columns of an amplitude table, and the checks that every table must pass.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from afm_jax.results import public_result
+from afm_jax.units import RAD_PER_US_PER_KHZ
 from afm_jax.whole_files import write_whole
 from fitting.tables.csv_text import (
     LARGEST,
@@ -55,14 +73,18 @@ LOWEST_QUALITY_FACTOR = 0.5
 SETTINGS = {
     setting.key: setting
     for setting in (
-        FileSetting("free_frequency_khz", "90", unit="kHz"),
+        FileSetting("drive", "force", choices=("sample", "force", "base")),
+        FileSetting("free_frequency_khz", "90", unit="kHz", error="maybe"),
         FileSetting("quality_factor", "40 (or 40 +- 2)", lowest=LOWEST_QUALITY_FACTOR, error="maybe"),
         FileSetting("mass_ng", unit="ng"),
+        FileSetting("spring_constant_n_per_m", "5.4 (or 5.4 +- 0.5)", unit="N/m", error="maybe"),
         FileSetting("tip_calibration", "1 +- 0.02", error="always"),
         FileSetting("drive_calibration", "1 +- 0.02", error="always"),
         FileSetting("offset_origin_nm", "0 +- 0.3", lowest=float("-inf"), error="always"),
+        FileSetting("phase_zero_deg", "0 +- 0.2", unit="degrees", lowest=float("-inf"), error="always"),
     )
 }
+DRIVES = SETTINGS["drive"].choices
 CALIBRATION = tuple(key for key, setting in SETTINGS.items() if setting.error == "always")
 """Keys that must have an error: without one there is nothing uncertain about them."""
 
@@ -71,10 +93,14 @@ CALIBRATION = tuple(key for key, setting in SETTINGS.items() if setting.error ==
 class Header:
     """What the comment lines say; the names and units are those of ``AmplitudeTable``."""
 
+    drive: str
     free_frequency_khz: float
+    free_frequency_error_khz: float | None
     quality_factor: float | None
     quality_factor_error: float | None
     mass_ng: float
+    spring_constant_n_per_m: float | None
+    spring_constant_error_n_per_m: float | None
     calibration: dict[str, tuple[float, float]]
     remarks: tuple[str, ...]
 
@@ -101,42 +127,103 @@ def parse_comments(comments: list[tuple[int, str]], faults: Faults) -> Header:
     if "free_frequency_khz" not in seen:
         example = SETTINGS["free_frequency_khz"].line
         faults.add(f"the free frequency is missing; add a line such as '{example}' above the column names")
+    drive, _ = numbers.get("drive", (0.0, None))
+    frequency, frequency_error = numbers.get("free_frequency_khz", (float("nan"), None))
     quality_factor, quality_factor_error = numbers.get("quality_factor", (None, None))
+    spring, spring_error = numbers.get("spring_constant_n_per_m", (None, None))
     return Header(
-        free_frequency_khz=numbers.get("free_frequency_khz", (float("nan"), None))[0],
+        drive="" if np.isnan(drive) else DRIVES[int(drive)],
+        free_frequency_khz=frequency,
+        free_frequency_error_khz=frequency_error,
         quality_factor=quality_factor,
         quality_factor_error=quality_factor_error,
-        mass_ng=numbers.get("mass_ng", (1.0, None))[0],
+        mass_ng=numbers.get("mass_ng", (1.0 if spring is None else mass_of(spring, frequency), None))[0],
+        spring_constant_n_per_m=spring,
+        spring_constant_error_n_per_m=spring_error,
         calibration={key: (numbers[key][0], numbers[key][1] or 0.0) for key in CALIBRATION if key in numbers},
         remarks=tuple(remarks),
     )
 
 
-COLUMNS = (
-    Column("order", needed="order", required=True, integer=True),
-    Column("drive_frequency_khz", "kHz", needed="drive frequency", required=True),
-    Column("drive_amplitude_nm", "nm", needed="drive amplitude", required=True),
-    Column("offset_nm", "nm", needed="offset", required=True, positive=False),
-    Column("peak_amplitude_nm", "nm", needed="amplitude", error="peak_amplitude_error_nm", amplitude=True),
-    Column("peak_amplitude_error_nm", "nm"),
+_ORDER = Column("order", needed="order", required=True, integer=True)
+_FREQUENCY = Column("drive_frequency_khz", "kHz", needed="drive frequency", required=True)
+_OFFSET = Column("offset_nm", "nm", needed="offset", required=True, positive=False)
+_LOCKIN = (
     Column("lockin_amplitude_nm", "nm", needed="amplitude", error="lockin_amplitude_error_nm", amplitude=True),
     Column("lockin_amplitude_error_nm", "nm"),
+)
+_NO_ORBIT = Column("no_orbit", positive=False, flag="no steady orbit was seen")
+_SAMPLE = (
+    _ORDER,
+    _FREQUENCY,
+    Column("drive_amplitude_nm", "nm", needed="drive amplitude", required=True),
+    _OFFSET,
+    Column("peak_amplitude_nm", "nm", needed="amplitude", error="peak_amplitude_error_nm", amplitude=True),
+    Column("peak_amplitude_error_nm", "nm"),
+    *_LOCKIN,
     Column("phase_deg", "degrees", error="phase_error_deg", positive=False),
     Column("phase_error_deg", "degrees"),
-    Column("no_orbit", positive=False, flag=True),
+    _NO_ORBIT,
 )
-TABLE = Form(
-    COLUMNS,
-    "drive",
-    blanks=True,
-    fewer="fill in the others",
-    more="remove the others; a decimal comma must be a point",
-    number="write it like 174.6 or 1.746e2, without a unit",
+_TAPPING = (
+    replace(_ORDER, needed=""),
+    _FREQUENCY,
+    Column("free_amplitude_nm", "nm", needed="free amplitude", required=True),
+    _OFFSET,
+    *_LOCKIN,
+    Column("phase_lag_deg", "degrees", error="phase_lag_error_deg", positive=False),
+    Column("phase_lag_error_deg", "degrees"),
+    Column("retract", positive=False, flag="the sample moves away"),
+    _NO_ORBIT,
+)
+
+
+def _form(columns: tuple[Column, ...], strange: str) -> Form:
+    """Return the form of tables of some columns, and what to say of those of the other form."""
+    names = {column.name for column in columns}
+    return Form(
+        columns,
+        "drive",
+        blanks=True,
+        fewer="fill in the others",
+        more="remove the others; a decimal comma must be a point",
+        number="write it like 174.6 or 1.746e2, without a unit",
+        strange={column.name: strange for column in (*_SAMPLE, *_TAPPING) if column.name not in names},
+    )
+
+
+TABLE = _form(
+    _SAMPLE,
+    "belongs to a cantilever that is driven itself; add the line '# drive = force' or '# drive = base' above the names",
+)
+TAPPING = _form(
+    _TAPPING,
+    "belongs to a sample that is driven; with '# drive = force' or '# drive = base' the columns are "
+    + ", ".join(column.name for column in _TAPPING),
 )
 COLUMN_NAMES = TABLE.names
-REQUIRED = tuple(column for column in COLUMNS if column.required)
-MEASURED = tuple(column for column in COLUMNS if column.error is not None)
-AMPLITUDES = tuple(column for column in COLUMNS if column.amplitude)
+FORMS = {drive: TABLE if drive == "sample" else TAPPING for drive in DRIVES}
+"""The columns of a table by what is driven."""
+_ALL = tuple({column.name: column for column in (*_SAMPLE, *_TAPPING)}.values())
+MEASURED = tuple(column for column in _ALL if column.error is not None)
+AMPLITUDES = tuple(column for column in _ALL if column.amplitude)
+
+
+def required(columns: Columns) -> tuple[Column, ...]:
+    """Return the columns of which every row needs a number, of those that a table has."""
+    return tuple(column for column in _ALL if column.required and column.name in columns)
+
+
+def _check_order(columns: Columns, lines: Int[np.ndarray, " rows"], faults: Faults) -> None:
+    """Note orders of a cantilever that is driven itself that are not 1: it is read at the drive's frequency."""
+    for row in np.flatnonzero(columns["order"] > 1.0):
+        message = "must be 1 where the cantilever is driven: amplitude and lag are read at the drive's frequency"
+        faults.add(f"{message}; remove the row", line=int(lines[row]), column="order")
+
+
+def mass_of(spring_constant_n_per_m: float, free_frequency_khz: float) -> float:
+    """Return the effective mass k/Omega^2 in ng."""
+    return spring_constant_n_per_m / (RAD_PER_US_PER_KHZ * free_frequency_khz) ** 2
 
 
 def check_error_columns(head: Head, faults: Faults, noise: float | None) -> None:
@@ -194,17 +281,19 @@ def check_rows(
     """
     rows = len(lines)
     known_bad = {name: np.zeros(rows, dtype=bool) for name in columns} | (unreadable or {})
-    for column in COLUMNS:
+    for column in _ALL:
         if column.name in columns:
             # A cell with an impossible number is not to be blamed a second time for what depends on it.
             known_bad[column.name] |= _check_numbers(column, columns[column.name], lines, faults)
-    for column in REQUIRED:
+    for column in required(columns):
         for row in np.flatnonzero(np.isnan(columns[column.name]) & ~known_bad[column.name]):
             faults.add("is blank; every row needs it", line=int(lines[row]), column=column.name)
     blank = {name: np.isnan(values) & ~known_bad[name] for name, values in columns.items()}
     unseen = columns.get("no_orbit", np.zeros(rows)) == 1.0
     _check_measured(blank, unseen, lines, faults)
     _check_duplicates(columns, lines, faults)
+    if "free_amplitude_nm" in columns and "order" in columns:
+        _check_order(columns, lines, faults)
 
 
 def _check_numbers(
@@ -223,7 +312,7 @@ def _check_numbers(
         what = "must be a positive whole number (1, 2, 3, ...)"
     if column.flag:
         bad |= ~np.isnan(values) & (values != 0.0) & (values != 1.0)
-        what = "must be 1 (no steady orbit was seen) or 0"
+        what = f"must be 1 ({column.flag}) or 0"
     for row in np.flatnonzero(bad):
         number = repr(float(values[row])).removesuffix(".0")
         must = f"must be at most {LARGEST:g} in size" if large[row] else what
@@ -262,19 +351,24 @@ def _check_measured(
 
 
 def _check_duplicates(columns: Columns, lines: Int[np.ndarray, " rows"], faults: Faults) -> None:
-    keys = np.stack([columns[column.name] for column in REQUIRED])
+    keys = [columns[column.name] for column in required(columns)]
+    if "retract" in columns:
+        keys.append(np.nan_to_num(columns["retract"]))
+    keys = np.stack(keys)
     # The sort is stable: of rows with equal keys the earlier one stays first.
     order = np.lexsort(keys)
     same = np.all(keys[:, order[1:]] == keys[:, order[:-1]], axis=0)
     for position in np.flatnonzero(same):
         first, second = int(lines[order[position]]), int(lines[order[position + 1]])
-        what = f"repeats {faults.place} {first} (same order, drive frequency, drive amplitude and offset)"
+        strength = "free" if "free_amplitude_nm" in columns else "drive"
+        what = f"repeats {faults.place} {first} (same order, drive frequency, {strength} amplitude and offset)"
         faults.add(f"{what}; average the measurements into one row or remove one", line=second)
 
 
 __all__ = ["AmplitudeTable", "TableError", "read_table", "write_table"]
 
 
+@public_result()
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AmplitudeTable:
     """Measured amplitudes of (1, N) orbits, one row for each drive; the arrays are read-only NumPy copies.
@@ -283,23 +377,32 @@ class AmplitudeTable:
     always comes with its standard error, and every row has at least one amplitude or is marked ``no_orbit``.
 
     Attributes:
-        order: N, drive periods per impact, shape (rows,), integers.
-        drive_frequency_khz: frequency of the platform, shape (rows,).
-        drive_amplitude_nm: amplitude of the platform, shape (rows,).
+        drive_frequency_khz: frequency of the drive, shape (rows,).
         offset_nm: mean height of the platform above the tip's rest position, shape (rows,).
         free_frequency_khz: resonance frequency of the free cantilever.
+        free_frequency_error_khz: its standard error, or None: taken as exact.
+        drive: what is driven: "sample", "force" (on the tip) or "base" (of the cantilever).
+        order: N, drive periods per impact, shape (rows,), integers; 1 if left out where the sample is not driven.
+        drive_amplitude_nm: amplitude of the platform, shape (rows,); None where the sample is not driven.
+        free_amplitude_nm: amplitude of the free tip, of its deflection under "base", shape (rows,); None where the
+            sample is driven.
         peak_amplitude_nm: largest height of the tip above its rest position, shape (rows,), or None.
         peak_amplitude_error_nm: its standard error.
         lockin_amplitude_nm: 2/T |integral of z exp(-i omega t/N)| over whole response periods, shape (rows,), or None.
         lockin_amplitude_error_nm: its standard error.
         phase_deg: phi in z ~ a cos(omega t/N + phi), modulo 360/N, t = 0 when the platform is highest; or None.
         phase_error_deg: its standard error.
+        phase_lag_deg: lag of the tip (of the deflection) behind the force (the base), shape (rows,), or None.
+        phase_lag_error_deg: its standard error.
+        retract: 1 where the sample moves away, else 0, shape (rows,); or None.
         no_orbit: 1 where the tip settled on no single-impact orbit, else 0, shape (rows,); or None.
         quality_factor: of the free cantilever, or None: not known.
         quality_factor_error: its standard error, or None.
         mass_ng: effective mass of the cantilever.
-        calibration: value and standard error of ``tip_calibration``, ``drive_calibration``, ``offset_origin_nm``, as
-            far as they are uncertain.
+        spring_constant_n_per_m: of the cantilever, or None: mass and frequency say it.
+        spring_constant_error_n_per_m: its standard error, or None.
+        calibration: value and standard error of ``tip_calibration``, ``drive_calibration``, ``offset_origin_nm`` and
+            ``phase_zero_deg``, as far as they are uncertain.
         source: path of the file as it was given.
         lines: the line of the file that each row stands in, shape (rows,); 1, 2, 3, ... for a table not from a file, or
             if as many are not given.
@@ -309,21 +412,29 @@ class AmplitudeTable:
         TableError: if a value is impossible, an error is missing, a row repeats another or the lengths differ.
     """
 
-    order: Int[np.ndarray, " rows"]
     drive_frequency_khz: Float[np.ndarray, " rows"]
-    drive_amplitude_nm: Float[np.ndarray, " rows"]
     offset_nm: Float[np.ndarray, " rows"]
     free_frequency_khz: float
+    free_frequency_error_khz: float | None = None
+    drive: str = "sample"
+    order: Int[np.ndarray, " orders"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    drive_amplitude_nm: Float[np.ndarray, " rows"] | None = None
+    free_amplitude_nm: Float[np.ndarray, " rows"] | None = None
     peak_amplitude_nm: Float[np.ndarray, " rows"] | None = None
     peak_amplitude_error_nm: Float[np.ndarray, " rows"] | None = None
     lockin_amplitude_nm: Float[np.ndarray, " rows"] | None = None
     lockin_amplitude_error_nm: Float[np.ndarray, " rows"] | None = None
     phase_deg: Float[np.ndarray, " rows"] | None = None
     phase_error_deg: Float[np.ndarray, " rows"] | None = None
+    phase_lag_deg: Float[np.ndarray, " rows"] | None = None
+    phase_lag_error_deg: Float[np.ndarray, " rows"] | None = None
+    retract: Float[np.ndarray, " rows"] | None = None
     no_orbit: Float[np.ndarray, " rows"] | None = None
     quality_factor: float | None = None
     quality_factor_error: float | None = None
     mass_ng: float = 1.0
+    spring_constant_n_per_m: float | None = None
+    spring_constant_error_n_per_m: float | None = None
     calibration: dict[str, tuple[float, float]] = field(default_factory=dict)
     source: str = "table in memory"
     lines: Int[np.ndarray, " lines"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
@@ -331,12 +442,18 @@ class AmplitudeTable:
 
     def __post_init__(self):
         # Lines of another number are those of the table that this one was made from (`dataclasses.replace`).
-        own = len(self.lines) == np.size(self.order)
+        rows = np.size(self.drive_frequency_khz)
+        own = len(self.lines) == rows
         faults = Faults(self.source, place="line" if own else "row")
-        columns = {name: getattr(self, name) for name in COLUMN_NAMES if getattr(self, name) is not None}
-        lines = self.lines if own else np.arange(1, np.size(self.order) + 1)
-        columns = {name: column_of(name, values, len(lines), faults) for name, values in columns.items()}
-        _check_pairs(columns, faults)
+        if self.drive not in FORMS:
+            faults.add(f"drive must be one of {', '.join(FORMS)}, but is {self.drive!r}")
+            faults.raise_any()
+        columns = {c.name: getattr(self, c.name) for c in _ALL if getattr(self, c.name) is not None}
+        if self.drive != "sample" and np.size(self.order) == 0:
+            columns["order"] = np.ones(rows)
+        lines = self.lines if own else np.arange(1, rows + 1)
+        columns = {name: column_of(name, values, rows, faults) for name, values in columns.items()}
+        _check_pairs(columns, self.form, faults)
         _check_header(self, faults)
         faults.raise_any()
         check_rows(columns, np.asarray(lines), faults)
@@ -346,29 +463,101 @@ class AmplitudeTable:
             values.setflags(write=False)
             object.__setattr__(self, name, values)
 
+    @classmethod
+    def from_dataframe(cls, frame: Any, *, noise: float | None = None, **header: Any) -> "AmplitudeTable":
+        """Return the table of a pandas data frame.
+
+        Args:
+            frame: columns called as in a file, NaN where nothing was measured; its `attrs` may hold what follows.
+            noise: standard error relative to the amplitude, for amplitudes without one of their own.
+            header: the other attributes, as ``free_frequency_khz=90.0`` and ``quality_factor=40.0``.
+
+        Raises:
+            TableError: if a value is impossible, a column is not known or missing.
+        """
+        faults = Faults(str(header.get("source", "data frame")), place="row")
+        names = {column.name for column in _ALL}
+        own = {field.name for field in fields(cls)} - {*names, "lines"}
+        known: dict[str, Any] = {"source": "data frame"}
+        known |= {name: value for name, value in frame.attrs.items() if name in own} | header
+        form = FORMS.get(known.get("drive", "sample"), TABLE)
+        columns: dict[str, Any] = {name: np.asarray(frame[name], np.float64) for name in form.names if name in frame}
+        for name in frame.columns:
+            if name not in (*form.names, "lines"):
+                faults.add(f"there is no column {name!r}; leave it out, or choose from {', '.join(form.names)}")
+        needed = (column.name for column in form.columns if column.required and column.needed)
+        for name in ("free_frequency_khz", *needed):
+            if name not in known and name not in columns:
+                faults.add(f"{name} is missing; give it as a {'keyword' if name in own else 'column'}")
+        faults.raise_any()
+        fill_errors(columns, {name: np.zeros(len(frame), dtype=bool) for name in columns}, noise)
+        if "order" in columns:
+            columns["order"] = columns["order"].astype(np.int64)
+        return cls(**columns, **known)
+
     @property
     def rows(self) -> int:
         """Number of rows."""
         return len(self.order)
 
+    @property
+    def form(self) -> Form:
+        """The columns that it may have."""
+        return FORMS[self.drive]
 
-def _check_pairs(columns: dict[str, Float[np.ndarray, "..."]], faults: Faults) -> None:
-    """Note a measured column without its errors, errors without their column, and a table without amplitudes."""
+    @property
+    def tapping(self) -> bool:
+        """Whether the cantilever is driven itself."""
+        return self.drive != "sample"
+
+    @property
+    def excitation_nm(self) -> Float[np.ndarray, " rows"]:
+        """Amplitude of the platform, or of the free tip."""
+        found = self.free_amplitude_nm if self.tapping else self.drive_amplitude_nm
+        assert found is not None  # checked when it was made  # noqa: S101
+        return found
+
+    @property
+    def phase_and_error_deg(self) -> tuple[Float[np.ndarray, " rows"] | None, Float[np.ndarray, " rows"] | None]:
+        """Phase of the orbit, or lag of the driven tip, and its standard error; None without them."""
+        if self.tapping:
+            return self.phase_lag_deg, self.phase_lag_error_deg
+        return self.phase_deg, self.phase_error_deg
+
+
+def _check_pairs(columns: dict[str, Float[np.ndarray, "..."]], form: Form, faults: Faults) -> None:
+    """Note columns of the other form, missing ones, values or errors without the other, and no amplitudes at all."""
+    for name in columns:
+        if name in form.strange:
+            faults.add(form.strange[name], column=name)
+    for column in form.columns:
+        if column.required and column.name not in columns:
+            faults.add("is missing; give it", column=column.name)
     for column in MEASURED:
         if (column.name in columns) != (column.error in columns):
             faults.add(f"{column.name} and {column.error} come together; give both or none")
-    if not any(column.name in columns for column in AMPLITUDES):
-        faults.add(f"there is no amplitude; give {' or '.join(column.name for column in AMPLITUDES)}")
+    amplitudes = [column.name for column in form.columns if column.amplitude]
+    if not any(name in columns for name in amplitudes):
+        faults.add(f"there is no amplitude; give {' or '.join(amplitudes)}")
 
 
 def _check_header(table: AmplitudeTable, faults: Faults) -> None:
-    for key, error in (("free_frequency_khz", None), ("quality_factor", table.quality_factor_error), ("mass_ng", None)):
+    for key, error in (
+        ("free_frequency_khz", table.free_frequency_error_khz),
+        ("quality_factor", table.quality_factor_error),
+        ("mass_ng", None),
+        ("spring_constant_n_per_m", table.spring_constant_error_n_per_m),
+    ):
         value = getattr(table, key)
         fault = None if value is None else fault_in_number(SETTINGS[key], value, error)
         if fault is not None:
             faults.add(f"{key} {fault}")
     if table.quality_factor is None and table.quality_factor_error is not None:
         faults.add("quality_factor_error stands without quality_factor; give both or none")
+    if table.spring_constant_n_per_m is None and table.spring_constant_error_n_per_m is not None:
+        faults.add("spring_constant_error_n_per_m stands without spring_constant_n_per_m; give both or none")
+    if table.spring_constant_n_per_m is not None and faults.count == 0:
+        _check_mass(table, table.spring_constant_n_per_m, faults)
     for remark in table.remarks:
         if (
             setting_in(remark, SETTINGS) is not None
@@ -377,6 +566,20 @@ def _check_header(table: AmplitudeTable, faults: Faults) -> None:
             or set(remark) & set("\r\n\0")
         ):
             faults.add(f"the remark {quoted(remark)} would not be read back as one; make it one line of free text")
+
+
+_SAME_MASS, _SIGMAS = 0.02, 3.0
+"""By how much a mass may differ from k/Omega^2: a share, and standard errors of k."""
+
+
+def _check_mass(table: AmplitudeTable, spring: float, faults: Faults) -> None:
+    """Note a mass that is not that of the spring constant."""
+    mass, error = mass_of(spring, table.free_frequency_khz), table.spring_constant_error_n_per_m or 0.0
+    if abs(table.mass_ng - mass) > max(_SAME_MASS, _SIGMAS * error / spring) * mass:
+        faults.add(
+            f"mass_ng = {table.mass_ng:g} and spring_constant_n_per_m = {spring:g} contradict each other: "
+            f"k/(2 pi f0)^2 is {mass:.4g} ng; correct or remove one of them"
+        )
 
 
 def read_table(path: str | Path, noise: float | None = None) -> AmplitudeTable:
@@ -398,16 +601,23 @@ def read_table(path: str | Path, noise: float | None = None) -> AmplitudeTable:
     check_not_empty(comments, rows, faults)
     header = parse_comments(comments, faults)
     found = faults.count
-    head, rows = named_rows(rows, TABLE, faults)
+    form = FORMS.get(header.drive)
+    if form is None:
+        # which columns there must be is not known
+        faults.raise_any()
+        raise AssertionError
+    head, rows = named_rows(rows, form, faults)
     check_error_columns(head, faults, noise)
     if faults.count > found:
         # With a wrong name the cells below it cannot be judged.
         faults.raise_any()
-    columns, unreadable, lines = parse_rows(rows, head.names, TABLE, faults)
+    columns, unreadable, lines = parse_rows(rows, head.names, form, faults)
     fill_errors(columns, unreadable, noise)
     check_rows(columns, lines, faults, unreadable)
     faults.raise_any()
-    arrays = {name: columns.get(name) for name in COLUMN_NAMES} | {"order": columns["order"].astype(np.int64)}
+    arrays: dict[str, Any] = dict(columns)
+    if "order" in columns:
+        arrays["order"] = columns["order"].astype(np.int64)
     return AmplitudeTable(**arrays, **vars(header), source=str(path), lines=lines)
 
 
@@ -421,16 +631,23 @@ def write_table(table: AmplitudeTable, path: str | Path) -> None:
     Raises:
         TableError: if the file cannot be written.
     """
-    quality_factor, error = table.quality_factor, table.quality_factor_error
-    lines = [f"# free_frequency_khz = {float(table.free_frequency_khz)!r}"]
-    if quality_factor is not None:
-        tail = "" if error is None else f" +- {float(error)!r}"
-        lines.append(f"# quality_factor = {float(quality_factor)!r}{tail}")
-    lines.append(f"# mass_ng = {float(table.mass_ng)!r}")
-    known = [(name, *table.calibration[name]) for name in CALIBRATION if name in table.calibration]
-    lines += [f"# {name} = {float(value)!r} +- {float(error)!r}" for name, value, error in known]
+    known = [
+        ("free_frequency_khz", table.free_frequency_khz, table.free_frequency_error_khz),
+        ("quality_factor", table.quality_factor, table.quality_factor_error),
+        ("mass_ng", table.mass_ng, None),
+        ("spring_constant_n_per_m", table.spring_constant_n_per_m, table.spring_constant_error_n_per_m),
+        *((name, *table.calibration[name]) for name in CALIBRATION if name in table.calibration),
+    ]
+    lines = [f"# drive = {table.drive}"] if table.tapping else []
+    for name, value, error in known:
+        if value is not None:
+            tail = "" if error is None else f" +- {float(error)!r}"
+            lines.append(f"# {name} = {float(value)!r}{tail}")
     lines += [f"# {remark}" for remark in table.remarks]
-    columns = {name: getattr(table, name) for name in COLUMN_NAMES if getattr(table, name) is not None}
+    names = [name for name in table.form.names if getattr(table, name) is not None]
+    if table.tapping and np.all(table.order == 1):
+        names.remove("order")
+    columns = {name: getattr(table, name) for name in names}
     lines.append(",".join(columns))
     # tolist gives Python numbers, whose repr is the shortest text that reads back as the same number.
     cells = [["" if value != value else repr(value) for value in column.tolist()] for column in columns.values()]  # noqa: PLR0124
