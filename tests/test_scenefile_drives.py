@@ -219,6 +219,37 @@ def test_a_wrong_scene_is_named(path: Path, old: str, new: str, expected: str):
     assert complaint(path, text.replace(old, new)).startswith(expected)
 
 
+@pytest.mark.parametrize("ratio", [0.5, 0.515])
+def test_a_drive_is_as_strong_as_the_free_tips_amplitude_says(path: Path, ratio: float):
+    # z = a/(k gamma), gamma = 1 - s^2 + i s/Q, of a force a; of a base a/gamma
+    size = 40.0 * abs(1.0 - (2.0 * ratio) ** 2 + 2.0j * ratio / 40.0)
+    lines = f"free_amplitude_nm = 40\nreduced_frequency = {ratio}\n"
+    of_base = loaded(path, CANTILEVER, RESTING, "[base]\n", lines, LAW).base
+    of_force = loaded(path, CANTILEVER, RESTING, "[force]\n", lines, LAW).force
+    assert of_base is not None
+    assert of_force is not None
+    assert float(of_base.amplitude_nm) == pytest.approx(size, rel=1e-12)
+    assert float(of_force.amplitude_nn) == pytest.approx(size * (2e-3 * np.pi * 90.0) ** 2, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("lines", "expected"),
+    [
+        ("free_amplitude_nm = 40\namplitude_nn = 1", "[force] has both amplitude_nn and free_amplitude_nm; give one"),
+        ("free_amplitude_nm = -1", "[force] `free_amplitude_nm` must not be negative, but is -1"),
+        ("free_amplitude = 1", "[force] free_amplitude: the unit is missing; use free_amplitude_nm"),
+    ],
+)
+def test_a_wrong_free_amplitude_is_named(path: Path, lines: str, expected: str):
+    force = f"[force]\nfrequency_khz = 90\n{lines}\n"
+    assert complaint(path, CANTILEVER, RESTING, force, LAW).startswith(expected)
+
+
+def test_an_undamped_tip_has_no_free_amplitude_at_its_free_frequency(path: Path):
+    text = "[cantilever]\nfrequency_khz = 90\n", RESTING, "[force]\nfrequency_khz = 90\nfree_amplitude_nm = 4\n", LAW
+    assert complaint(path, *text).startswith("[force] `force` drives an undamped cantilever at its free frequency")
+
+
 def test_a_platform_that_alone_drives_must_say_how(path: Path):
     assert complaint(path, CANTILEVER, RESTING, LAW) == "[platform] amplitude_nm: missing; add it"
     expected = "[platform] the drive frequency is missing; add frequency_khz or reduced_frequency"

@@ -57,6 +57,21 @@ def require_sample_drive(scene: Scene, *, second_frequency: bool = False) -> Non
     raise ValueError(f"the scene has {drive}, but only {known} is allowed here: leave it out, or simulate the scene")
 
 
+def require_one_frequency(scene: Scene) -> None:
+    """Check that no part of a scene has a second frequency.
+
+    Raises:
+        ValueError: if one has; says which.
+    """
+    for name in ("platform", "base", "force"):
+        part = getattr(scene, name)
+        if part is not None and part.second is not None:
+            raise ValueError(
+                f"the scene has `{name}.second`, a second frequency, but only one is allowed here: leave it out, or "
+                "simulate the scene"
+            )
+
+
 _SAME = 1e-12
 """Relative distance below which two frequencies are one."""
 

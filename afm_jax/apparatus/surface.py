@@ -7,21 +7,25 @@ every integrator sees a free cantilever over a moving surface.
 """
 
 from collections.abc import Iterable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.apparatus.drives import Tone
+from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.scene import Scene, require_one_frequency
 from afm_jax.apparatus.trigonometry import sine_cosine
 from afm_jax.checks import as_argument, as_parameter, is_traced, readable
+from afm_jax.units import RAD_PER_US_PER_KHZ
 
 _AT_RESONANCE = 1e-9
 """Relative distance from the free frequency below which an undamped cantilever has no steady response."""
+_ONE_FREQUENCY = 1e-12
+"""Relative distance below which two frequencies are one."""
 
 
 class Wave(eqx.Module):
@@ -164,6 +168,104 @@ def surface_of(scene: Scene) -> tuple[Platform | Surface, Surface | None]:
     return surface, Surface(still, still, _joined(response))
 
 
+class FreeFrame(NamedTuple):
+    """A periodic scene as a freely moving tip sees it, its clock set to where the surface is highest.
+
+    Waves count in this clock.
+    """
+
+    platform: Platform
+    """The surface: offset, ramp and one cosine."""
+    phase_rad: Float[Array, "..."]
+    """Phase omega t of the scene's own clock when this one shows 0."""
+    response: Wave | None
+    """The tip's steady response, which is missing from the free motion; None without base and force."""
+    base: Wave | None
+    """The base's motion, against which the deflection counts; None where there is none."""
+    drive_phase_rad: Float[Array, "..."]
+    """Phase of the base's cosine, else of the force's, else of the platform's, in this clock."""
+    periodic: Bool[Array, "..."]
+    """Whether everything that moves has one frequency."""
+
+
+def free_frame(scene: Scene) -> FreeFrame:
+    """Return a scene as a freely moving tip sees it: over a platform, whatever drives it.
+
+    Args:
+        scene: any scene without second frequencies; its numbers may be traced.
+
+    Raises:
+        ValueError: if a part has a second frequency, or as `surface_of`.
+    """
+    require_one_frequency(scene)
+    surface, response = surface_of(scene)
+    if response is None or isinstance(surface, Platform):
+        still = jnp.zeros_like(scene.platform.frequency_khz)
+        return FreeFrame(scene.platform, still, None, None, still, still == 0.0)
+    excitations = [part for part in (scene.base, scene.force) if part is not None]
+    tones = [(scene.platform.amplitude_nm, scene.platform.frequency_khz)]
+    tones += [(part.tones[0].amplitude, part.frequency_khz) for part in excitations]
+    # the frequency of the first part that moves; where several do they must agree
+    frequency = tones[-1][1]
+    for amplitude, own in reversed(tones):
+        frequency = jnp.where(amplitude > 0.0, own, frequency)
+    periodic = jnp.ones_like(frequency, dtype=bool)
+    for amplitude, own in tones:
+        periodic = periodic & ((amplitude == 0.0) | (jnp.abs(own - frequency) <= _ONE_FREQUENCY * frequency))
+    omega = RAD_PER_US_PER_KHZ * frequency
+    motion = _summed(surface.tones, omega)
+    phase = _angle(motion.cosine, motion.sine)
+    drive = excitations[0]
+    return FreeFrame(
+        platform=Platform(motion.amplitude_nm, frequency, surface.offset_nm, surface.offset_rate_nm_per_us),
+        phase_rad=phase,
+        response=_later(_summed(response.tones, omega), phase),
+        base=None if scene.base is None else _later(_wave_of(scene.base.tones[0]), phase),
+        drive_phase_rad=drive.tones[0].phase_rad + phase,
+        periodic=periodic,
+    )
+
+
+def _summed(waves: Iterable[Wave], angular_frequency: Float[Array, "..."]) -> Wave:
+    zero = jnp.zeros_like(angular_frequency)
+    cosine, sine = zero, zero
+    for wave in waves:
+        cosine, sine = cosine + wave.cosine, sine + wave.sine
+    return Wave(cosine, sine, angular_frequency)
+
+
+def _later(wave: Wave, phase: Float[Array, "..."]) -> Wave:
+    """Return a wave against a clock that shows 0 at a phase omega t of the wave's own."""
+    sine, cosine = sine_cosine(phase)
+    return Wave(
+        wave.cosine * cosine + wave.sine * sine, wave.sine * cosine - wave.cosine * sine, wave.angular_frequency
+    )
+
+
+def _angle(cosine: Float[Array, "..."], sine: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the angle of a point, with slope 0 at the origin."""
+    moves = (cosine != 0.0) | (sine != 0.0)
+    return jnp.where(moves, jnp.arctan2(sine, jnp.where(moves, cosine, 1.0)), 0.0)
+
+
+def size_and_lag(
+    along: Float[Array, "..."], across: Float[Array, "..."], drive_rad: Float[Array, "..."], order: ArrayLike = 1.0
+) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+    """Return amplitude and lag behind a drive, in degrees modulo 360/N, of a motion Re((x + i y) exp(i omega t/N)).
+
+    Args:
+        along: x, in nm.
+        across: y.
+        drive_rad: phase of the drive's cosine of omega t.
+        order: N.
+    """
+    square = along**2 + across**2
+    moves = square > 0.0
+    size = jnp.where(moves, jnp.sqrt(jnp.where(moves, square, 1.0)), 0.0)
+    lag = jnp.rad2deg(drive_rad / order - _angle(along, across))
+    return size, lag % (360.0 / as_argument(order))
+
+
 def force_per_height(
     frequency_ratio: ArrayLike, quality_factor: ArrayLike | None
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
@@ -189,6 +291,21 @@ def height_of_free_deflection(
     """
     real, imaginary = force_per_height(frequency_ratio, quality_factor)
     return as_argument(deflection_nm) / jnp.hypot(1.0 - real, imaginary)
+
+
+def drive_per_free_height(
+    cantilever: Cantilever, frequency_khz: ArrayLike, drive: type[BaseDrive | ForceDrive]
+) -> Float[Array, "..."]:
+    """Return what amplitude of a drive moves the free tip by an amplitude of 1 nm: nm of a base, nN of a force.
+
+    Args:
+        cantilever: the tip and its spring.
+        frequency_khz: of the drive.
+        drive: which of the two.
+    """
+    ratio = as_argument(frequency_khz) / cantilever.frequency_khz
+    size = jnp.hypot(*force_per_height(ratio, cantilever.quality_factor))
+    return cantilever.stiffness_n_per_m * size if issubclass(drive, ForceDrive) else size
 
 
 def detected(
@@ -218,15 +335,24 @@ def detected(
         Amplitude in nm, and by how much it lags behind force or base, in degrees from 0 to 360; arrays of any shape.
     """
     real, imaginary = force_per_height(frequency_ratio, quality_factor)
-    turn = jnp.deg2rad(as_argument(phase_deg))
-    along, across = amplitude_nm * jnp.cos(turn) - free_amplitude_nm, amplitude_nm * jnp.sin(turn)
+    moved, free, turn = as_argument(amplitude_nm), as_argument(free_amplitude_nm), jnp.deg2rad(as_argument(phase_deg))
+    along, across = moved * jnp.cos(turn) - free, moved * jnp.sin(turn)
     if base:
-        along, across = along + real * free_amplitude_nm, across + imaginary * free_amplitude_nm
-    # a tip that does not move has no phase
-    moves = (along != 0.0) | (across != 0.0)
-    along = jnp.where(moves, along, 1.0)
-    lag = jnp.arctan2(-imaginary, -real) - jnp.arctan2(across, along)
-    return jnp.where(moves, jnp.hypot(along, across), 0.0), jnp.rad2deg(lag) % 360.0
+        along, across = along + real * free, across + imaginary * free
+    return size_and_lag(along, across, jnp.arctan2(-imaginary, -real))
+
+
+def seen_freely(scene: Scene) -> tuple[Scene, Surface | None]:
+    """Return a scene with `surface_of` in place of its platform and without base and force, and the steady response.
+
+    For whatever follows flights over surfaces; velocities there lack the response's.
+    """
+    surface, response = surface_of(scene)
+    if response is None:
+        return scene, None
+    parts = (surface, None, None)
+    seen = eqx.tree_at(lambda s: (s.platform, s.base, s.force), scene, parts, is_leaf=lambda leaf: leaf is None)
+    return seen, response
 
 
 def check_steady_response(cantilever: Cantilever, tones: tuple[Tone, ...], name: str) -> None:

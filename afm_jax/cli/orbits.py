@@ -16,6 +16,14 @@ if TYPE_CHECKING:
     from afm_jax.dynamics.impact_loop import LoopReading
     from afm_jax.impact.orbits import SingleImpactOrbits
 
+DRIVEN_COLUMNS = (
+    "phase_lag_deg",
+    "peak_deflection_nm",
+    "deflection_lockin_amplitude_nm",
+    "deflection_lockin_phase_deg",
+)
+"""What is told besides of a tip that base or force drives; the deflection's over a moving base only."""
+
 IMPACT_COLUMNS = (
     "phase_rad",
     "velocity_after_nm_per_us",
@@ -79,8 +87,9 @@ class PositiveInteger(click.ParamType):
 def command(session: Session, scene: str, order: int, impacts: int | None) -> None:
     """Find all single-impact orbits of a scene, or with --impacts orbits of several impacts.
 
-    Of every orbit: impact phase and velocities, peak and lock-in amplitude, whether it is stable, and whether it is
-    admissible (its flight stays above the platform). With --out a table orbits.csv. Exit code 3 if none is admissible.
+    Of every orbit: impact phase and velocities, peak and lock-in amplitude of the height, whether it is stable, and
+    whether it is admissible (its flight stays above the platform). Where base or force drive, the phase lag too, and
+    the deflection against a moving base. With --out a table orbits.csv. Exit code 3 if none is admissible.
     With --impacts every impact is told, the hardest first, and the orbit with a rest on the sample if there is one.
     A contact's are told so too: its impacts begin where the bridge forms and end, with phase and velocity, where it
     breaks.
@@ -100,12 +109,13 @@ def command(session: Session, scene: str, order: int, impacts: int | None) -> No
             found = single_impact_orbits(loaded, order)
     except ValueError as error:
         raise ValueError(f"{scene}: {error}") from error
+    told = columns_of(found)
     orbits = orbit_rows(found)
     reason = None if any(orbit["admissible"] for orbit in orbits) else why_none(loaded, order, rejected=len(orbits))
     near_fold = any(orbit["near_double"] for orbit in orbits)
     if not bool(found.complete):
         session.note("there are more orbits than could be listed; the slowest are shown")
-    session.write_table("orbits.csv", orbits, COLUMNS)
+    session.write_table("orbits.csv", orbits, told)
     session.emit(
         {
             "order": order,
@@ -244,9 +254,14 @@ def many_table(orbits: Sequence[Mapping[str, Any]], *, title: str) -> "Table":
     return table
 
 
+def columns_of(found: "SingleImpactOrbits") -> tuple[str, ...]:
+    """Return what is told of orbits: what their scene has."""
+    return (*COLUMNS, *(name for name in DRIVEN_COLUMNS if getattr(found, name) is not None))
+
+
 def orbit_rows(found: "SingleImpactOrbits") -> list[dict[str, Any]]:
     """Return the orbits that exist as one dict of plain numbers each, by rising approach speed."""
-    columns = {name: getattr(found, name).tolist() for name in COLUMNS}
+    columns = {name: getattr(found, name).tolist() for name in columns_of(found)}
     slots = [slot for slot, exists in enumerate(found.exists.tolist()) if exists]
     return [{name: values[slot] for name, values in columns.items()} for slot in slots]
 
@@ -265,7 +280,9 @@ def why_none(scene: "Scene", order: int, *, rejected: int, impacts: int = 1) -> 
             f"the search found no orbit of {impacts} impacts in {order} drive periods; `afm-jax orbits --order` and "
             "`afm-jax continue` say where orbits of one impact double their period"
         )
-    reduced = float(scene.platform.frequency_khz) / (2.0 * float(scene.cantilever.frequency_khz))
+    from afm_jax.apparatus.scene import drive_of  # noqa: PLC0415
+
+    reduced = float(drive_of(scene).angular_frequency) / (2.0 * float(scene.cantilever.angular_frequency))
     nearest = max(1, round(reduced))
     what = (
         f"in every orbit of order {order} the tip would have to pass through the platform"
@@ -285,12 +302,20 @@ def orbit_table(orbits: Sequence[Mapping[str, Any]], *, title: str) -> "Table":
     table.add_column("phase\nrad", justify="right")
     for name, unit in (("velocity after", "nm/us"), ("approach", "nm/us"), ("rebound", "nm/us"), ("delay", "us")):
         table.add_column(f"{name}\n{unit}", justify="right")
-    for name, unit in (("peak", "nm"), ("lock-in", "nm"), ("lock-in", "deg"), ("trace", ""), ("determinant", "")):
+    shown = ("phase_rad", "velocity_after_nm_per_us", "approach_speed_nm_per_us", "rebound_speed_nm_per_us", "delay_us")
+    shown += ("peak_amplitude_nm", "lockin_amplitude_nm", "lockin_phase_deg")
+    for name, unit in (("peak", "nm"), ("lock-in", "nm"), ("lock-in", "deg")):
         table.add_column(f"{name}\n{unit}", justify="right")
+    seen = (("deflection_lockin_amplitude_nm", "deflection\nnm"), ("phase_lag_deg", "lag\ndeg"))
+    for key, title_of_it in seen:
+        if orbits and key in orbits[0]:
+            table.add_column(title_of_it, justify="right")
+            shown += (key,)
+    for name in ("trace", "determinant"):
+        table.add_column(f"{name}\n", justify="right")
+        shown += (name,)
     table.add_column("stable")
     table.add_column("admissible")
-    shown = ("phase_rad", "velocity_after_nm_per_us", "approach_speed_nm_per_us", "rebound_speed_nm_per_us", "delay_us")
-    shown += ("peak_amplitude_nm", "lockin_amplitude_nm", "lockin_phase_deg", "trace", "determinant")
     for orbit in orbits:
         words = ("yes" if orbit[name] else "no" for name in ("stable", "admissible"))
         table.add_row(*(f"{orbit[name]:.6g}" for name in shown), *words)

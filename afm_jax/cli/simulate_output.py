@@ -20,6 +20,13 @@ _WHOLE_PERIODS = 50
 _POINTS = 2001
 _MOST_NODES = 100_000
 """Rows of trajectory.csv within contacts, from which on only every second, third, ... is kept."""
+_DEFLECTION = (
+    "peak_deflection_nm",
+    "mean_deflection_nm",
+    "deflection_lockin_amplitude_nm",
+    "deflection_lockin_phase_deg",
+    "deflection_harmonics",
+)
 _AS_THEY_ARE = (
     "peak_amplitude_nm",
     "mean_height_nm",
@@ -36,6 +43,7 @@ _AS_THEY_ARE = (
     "virial_aj",
     "peak_deflection_nm",
     "mean_deflection_nm",
+    "phase_lag_deg",
 )
 
 
@@ -43,7 +51,7 @@ def payload_of(scene: Scene, run: LongRun, seen: Observables, settings: Mapping[
     """Return the JSON object of a simulation."""
     simulation, verdict = run.simulation, run.verdict
     outcome = MotionOutcome(int(simulation.outcome))
-    final = simulation.final
+    final, deflection = simulation.final, seen.deflection_harmonics
     return {
         "impacts": int(simulation.count),
         "stuck": verdict.stuck,
@@ -56,7 +64,9 @@ def payload_of(scene: Scene, run: LongRun, seen: Observables, settings: Mapping[
         "lockin_amplitude_nm": seen.lockin_amplitude_nm,
         "lockin_phase_deg": seen.lockin_phase_deg,
         "harmonics": [harmonic._asdict() for harmonic in seen.harmonics],
-        "deflection_harmonics": _as_dicts(seen.deflection_harmonics),
+        "deflection_lockin_amplitude_nm": deflection and deflection[0].amplitude_nm,
+        "deflection_lockin_phase_deg": deflection and deflection[0].phase_deg,
+        "deflection_harmonics": _as_dicts(deflection),
         "window": {**seen.window._asdict(), "contacts": seen.contacts},
         "null_reasons": _reasons(scene, seen, verdict.stuck),
         "start": {name: float(value) for name, value in simulation.start._asdict().items()},
@@ -90,8 +100,10 @@ def _reasons(scene: Scene, seen: Observables, stuck: bool) -> dict[str, str]:  #
     if seen.energy_imbalance is None:
         reasons["energy_imbalance"] = "with an impact law the energy given by the drives closes the balance"
     if scene.base is None:
-        for name in ("peak_deflection_nm", "mean_deflection_nm", "deflection_harmonics"):
+        for name in _DEFLECTION:
             reasons[name] = "the base rests: the deflection is the height"
+    if seen.phase_lag_deg is None:
+        reasons["phase_lag_deg"] = "no base and no force drives the tip"
     return reasons
 
 
@@ -112,11 +124,16 @@ def text_of(payload: Mapping[str, Any]) -> list[str]:
         which = "the response frequency" if harmonic["multiple"] == 1 else f"{harmonic['multiple']} times that"
         lines.append(f"At {which}: {harmonic['amplitude_nm']:.6g} nm, {harmonic['phase_deg']:.6g} deg.")
     if payload["peak_deflection_nm"] is not None:
-        first = payload["deflection_harmonics"][0]
         lines.append(
             f"Against the moving base: peak deflection {payload['peak_deflection_nm']:.6g} nm; at the response "
-            f"frequency {first['amplitude_nm']:.6g} nm, {first['phase_deg']:.6g} deg."
+            f"frequency {payload['deflection_lockin_amplitude_nm']:.6g} nm, "
+            f"{payload['deflection_lockin_phase_deg']:.6g} deg."
         )
+    if payload["phase_lag_deg"] is not None:
+        what = (
+            "the height behind the force" if payload["peak_deflection_nm"] is None else "the deflection behind the base"
+        )
+        lines.append(f"Phase lag of {what}: {payload['phase_lag_deg']:.6g} deg.")
     if payload["peak_force_nn"] is not None:
         lines.append(
             f"In contact for {payload['time_in_contact_us']:.4g} us of a response period "

@@ -553,7 +553,9 @@ def _orbits_in_range(
         there = family(value)
         if flights is not None:
             loops = contact_loops(flights, np.array([value]), impacts)
-        elif impacts == 1 and scene.base is None and scene.force is None and scene.platform.second is None:
+        elif impacts == 1 and all(
+            part is None or part.second is None for part in (scene.platform, scene.base, scene.force)
+        ):
             loops, passed = _single_impact_loops(there, order)
             rejected += passed
         else:

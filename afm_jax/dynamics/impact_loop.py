@@ -21,7 +21,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import Surface, surface_of
-from afm_jax.impact.amplitude import FlightEnds, peak_amplitude
+from afm_jax.impact.amplitude import FlightEnds, highest_of_sum, peak_amplitude
 from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
 from afm_jax.impact.lasting_impact import LawImpact, lasting
@@ -243,43 +243,21 @@ def flies(unknowns: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoo
 
 def highest_point(unknowns: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoop, samples: int) -> Array:
     """Return the largest height of the tip above its rest position, in nm."""
+    response = loop.response
     if unknowns.shape[0] == 0:
-        return jnp.zeros(()) if loop.response is None else _highest_of(loop, None, samples)
+        zero = jnp.zeros(())
+        free = FlightEnds(zero, loop.period_us, zero, zero, zero, zero)
+        return zero if response is None else highest_of_sum(loop.cantilever, free, response, samples)
     impacts = impacts_at(unknowns, scale, loop)
-    if loop.response is not None:
-        return _highest_of(loop, impacts, samples)
     end, speed = loop.cantilever.propagator(impacts.duration_us)(impacts.height, impacts.velocity)
     flights = FlightEnds(impacts.leaving_us, impacts.duration_us, impacts.height, impacts.velocity, end, speed)
-    return jnp.max(jax.vmap(lambda flight: peak_amplitude(loop.cantilever, flight))(flights))
 
+    def highest(flight):
+        if response is None:
+            return peak_amplitude(loop.cantilever, flight)
+        return highest_of_sum(loop.cantilever, flight, response, samples)
 
-def _highest_of(loop: ImpactLoop, impacts: Impacts | None, samples: int) -> Float[Array, ""]:
-    """Return the same where other drives move the tip besides: no closed form, the highest sample improved."""
-    assert loop.response is not None  # noqa: S101
-    response, zero = loop.response, jnp.zeros((1,))
-    flights = (
-        (zero, zero, zero, loop.period_us[None])
-        if impacts is None
-        else (impacts.leaving_us, impacts.height, impacts.velocity, impacts.duration_us)
-    )
-
-    def height(start, rest, velocity, after):
-        position, _ = loop.cantilever.propagator(after)(rest, velocity)
-        return position + response.position(start + after)
-
-    begin, rest, velocity, lasts = flights
-    after = (lasts / samples)[:, None] * jnp.arange(samples + 1.0)
-    seen = height(begin[:, None], rest[:, None], velocity[:, None], after)
-    place = jnp.argmax(seen)
-    flight = place // (samples + 1)
-    own = begin[flight], rest[flight], velocity[flight]
-    rate = jax.grad(lambda time: height(*own, time))
-
-    def improve(_, time):
-        bend = jax.grad(rate)(time)
-        return jnp.clip(time - rate(time) / jnp.where(bend < 0.0, bend, -jnp.inf), 0.0, lasts[flight])
-
-    return height(*own, lax.stop_gradient(lax.fori_loop(0, 4, improve, after.reshape(-1)[place])))
+    return jnp.max(jax.vmap(highest)(flights))
 
 
 class LoopReading(eqx.Module):

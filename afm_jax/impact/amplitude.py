@@ -4,10 +4,12 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.surface import Surface
 from afm_jax.checks import as_argument
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
@@ -43,6 +45,42 @@ def peak_amplitude(cantilever: Cantilever, flight: FlightEnds) -> Float[Array, "
     top, _ = cantilever.propagator(turn)(flight.start_position, flight.start_velocity)
     ends = jnp.maximum(flight.start_position, flight.end_position)
     return jnp.where(turn < flight.duration_us, jnp.maximum(ends, top), ends)
+
+
+SAMPLES = 512
+"""Heights looked at of a flight that has no closed form for its highest."""
+
+
+def highest_of_sum(
+    cantilever: Cantilever, flight: FlightEnds, motion: Surface, samples: int = SAMPLES
+) -> Float[Array, ""]:
+    """Return the largest sum of a flight's height and another motion during the flight, in nm.
+
+    Args:
+        cantilever: of the free flight.
+        flight: from impact to impact.
+        motion: added to it: a steady response, less a base's motion where the deflection is meant.
+        samples: heights looked at; the highest of them is improved by Newton's method.
+    """
+
+    def at(after):
+        position, velocity = cantilever.propagator(after)(flight.start_position, flight.start_velocity)
+        height, rate = motion.position_and_velocity(flight.start_us + after)
+        bend = cantilever.acceleration(position, velocity) + motion.acceleration(flight.start_us + after)
+        return position + height, velocity + rate, bend
+
+    step = flight.duration_us / samples
+    times = step * jnp.arange(samples + 1.0)
+    seen, _, _ = at(times)
+
+    def improve(_, after):
+        _, rate, bend = at(after)
+        move = jnp.where(bend < 0.0, -rate / jnp.where(bend < 0.0, bend, 1.0), 0.0)
+        return jnp.clip(after + jnp.clip(move, -step, step), 0.0, flight.duration_us)
+
+    # its own change counts nothing, because the height is largest there
+    top = lax.fori_loop(0, 5, improve, times[jnp.argmax(seen)])
+    return at(lax.stop_gradient(top))[0]
 
 
 def lockin(

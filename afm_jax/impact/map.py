@@ -14,7 +14,8 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from afm_jax.apparatus.scene import Scene, require_sample_drive
+from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.surface import Surface, seen_freely
 from afm_jax.checks import require_float64
 from afm_jax.impact.first_impact import DEFAULT_MAX_STEPS, DEFAULT_ROOT_TOLERANCE_US, Flight, first_impact
 from afm_jax.impact.lasting_impact import LawImpact, crawls, delay_before, speeds_of_impact
@@ -60,7 +61,7 @@ def next_impact(
     """Return the next impact of a tip that has just left the platform (eqs. 2-4 and 6; the Poincare map).
 
     Args:
-        scene: a scene whose interaction is an `ImpactLaw`.
+        scene: a scene whose interaction is an `ImpactLaw`, however driven.
         time_us: when the flight starts, scalar; the tip is then at the platform's position.
         velocity_nm_per_us: tip velocity in the lab just after the impact, scalar, above the platform's velocity.
         max_steps: steps of the search for the impact before it gives up.
@@ -72,7 +73,7 @@ def next_impact(
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
         TypeError: if the scene's interaction is not an impact law.
-        ValueError: if the scene has a drive besides the platform.
+        ValueError: if an undamped cantilever is driven at its free frequency.
 
     >>> import jax
     >>> from afm_jax import Cantilever, ImpactLaw, Platform, Scene
@@ -83,10 +84,10 @@ def next_impact(
     """
     require_float64(scene)
     impact_law_of(scene)
-    require_sample_drive(scene, second_frequency=True)
-    dtype = scene.platform.frequency_khz.dtype
-    start = (jnp.asarray(time_us, dtype), jnp.asarray(velocity_nm_per_us, dtype))
-    return _next_impact(scene, start, jnp.asarray(root_tolerance_us, dtype), max_steps=max_steps)
+    seen, response = seen_freely(scene)
+    start = _start_of(scene, response, time_us, velocity_nm_per_us)
+    tolerance = jnp.asarray(root_tolerance_us, scene.platform.frequency_khz.dtype)
+    return _in_lab(_next_impact(seen, start, tolerance, max_steps=max_steps), response)
 
 
 def iterate_map(
@@ -101,7 +102,7 @@ def iterate_map(
     """Return a sequence of impacts: `next_impact` iterated.
 
     Args:
-        scene: a scene whose interaction is an `ImpactLaw`.
+        scene: a scene whose interaction is an `ImpactLaw`, however driven.
         time_us: when the first flight starts, scalar.
         velocity_nm_per_us: tip velocity in the lab at that time, scalar.
         impacts: how many impacts to follow; a plain integer, it shapes the result.
@@ -115,17 +116,41 @@ def iterate_map(
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
         TypeError: if the scene's interaction is not an impact law.
-        ValueError: if `impacts` is not positive, or the scene has a drive besides the platform.
+        ValueError: if `impacts` is not positive, or an undamped cantilever is driven at its free frequency.
     """
     require_float64(scene)
     impact_law_of(scene)
-    require_sample_drive(scene, second_frequency=True)
     if impacts < 1:
         raise ValueError(f"`impacts` must be a positive integer, but is {impacts}")
+    seen, response = seen_freely(scene)
+    start = _start_of(scene, response, time_us, velocity_nm_per_us)
+    tolerance = jnp.asarray(root_tolerance_us, scene.platform.frequency_khz.dtype)
+    return _in_lab(_iterate_map(seen, start, tolerance, impacts=impacts, max_steps=max_steps), response)
+
+
+def _start_of(
+    scene: Scene, response: Surface | None, time_us: ArrayLike, velocity_nm_per_us: ArrayLike
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return time and velocity of a start, the velocity without the steady response's."""
     dtype = scene.platform.frequency_khz.dtype
-    start = (jnp.asarray(time_us, dtype), jnp.asarray(velocity_nm_per_us, dtype))
-    tolerance = jnp.asarray(root_tolerance_us, dtype)
-    return _iterate_map(scene, start, tolerance, impacts=impacts, max_steps=max_steps)
+    time, velocity = jnp.asarray(time_us, dtype), jnp.asarray(velocity_nm_per_us, dtype)
+    return time, velocity if response is None else velocity - response.velocity(time)
+
+
+def _in_lab(found: NextImpact, response: Surface | None) -> NextImpact:
+    """Return impacts with the velocities of the steady response added."""
+    if response is None:
+        return found
+
+    def added(velocity, time):
+        there = jnp.isfinite(time)
+        return velocity + jnp.where(there, response.velocity(jnp.where(there, time, 0.0)), 0.0)
+
+    before = added(found.velocity_before_nm_per_us, found.arrival_time_us)
+    after = added(found.velocity_after_nm_per_us, found.time_us)
+    return eqx.tree_at(
+        lambda row: (row.velocity_before_nm_per_us, row.velocity_after_nm_per_us), found, (before, after)
+    )
 
 
 @partial(jax.jit, static_argnames=("max_steps",))

@@ -15,9 +15,10 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene, require_sample_drive
+from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.surface import FreeFrame, Surface, Wave, free_frame, size_and_lag
 from afm_jax.checks import is_traced, require_float64
-from afm_jax.impact.amplitude import FlightEnds, lockin, peak_amplitude
+from afm_jax.impact.amplitude import FlightEnds, highest_of_sum, lockin, peak_amplitude
 from afm_jax.impact.closure import (
     OrbitPlace,
     OrbitProblem,
@@ -67,6 +68,11 @@ class SingleImpactOrbits(eqx.Module):
         trace: T of the linearised map.
         determinant: D of the linearised map.
         complete: scalar; False if there were more orbits than slots (with a delay only).
+        phase_lag_deg: by how much the height, over a moving base the deflection, lags behind base or force, modulo
+            360/N; None where the platform alone drives, as the three that follow are without a base.
+        peak_deflection_nm: largest deflection z - z_b.
+        deflection_lockin_amplitude_nm: its amplitude at omega/N.
+        deflection_lockin_phase_deg: its phase.
     """
 
     exists: Bool[Array, "..."]
@@ -85,13 +91,18 @@ class SingleImpactOrbits(eqx.Module):
     trace: Float[Array, "..."]
     determinant: Float[Array, "..."]
     complete: Bool[Array, "..."]
+    phase_lag_deg: Float[Array, "..."] | None = None
+    peak_deflection_nm: Float[Array, "..."] | None = None
+    deflection_lockin_amplitude_nm: Float[Array, "..."] | None = None
+    deflection_lockin_phase_deg: Float[Array, "..."] | None = None
 
 
 def single_impact_orbits(scene: Scene, order: ArrayLike) -> SingleImpactOrbits:
     """Return every single-impact orbit of an order (eq. 9; damped, with viscous loss and delay).
 
     Args:
-        scene: a scene whose interaction is an `ImpactLaw`, without offset ramp and second frequency.
+        scene: a scene whose interaction is an `ImpactLaw`, driven by sample, base, force or several of them with one
+            frequency, without offset ramp.
         order: N, drive periods between impacts; a positive integer, scalar.
 
     Returns:
@@ -101,17 +112,19 @@ def single_impact_orbits(scene: Scene, order: ArrayLike) -> SingleImpactOrbits:
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
         TypeError: if the scene's interaction is not an impact law.
-        ValueError: if the order is not a positive integer, the platform's offset ramps, or the scene has another drive
-            than one cosine of the platform.
+        ValueError: if the order is not a positive integer, the platform's offset ramps, the drive has several
+            frequencies, or an undamped cantilever is driven at its free one.
     """
     require_float64(scene)
     impact_law_of(scene)
-    require_sample_drive(scene)
     _check_order(order)
+    frame = free_frame(scene)
+    if not is_traced(frame.periodic) and not np.all(frame.periodic):
+        raise ValueError("there are no periodic orbits: the drive has several frequencies")
     rate = scene.platform.offset_rate_nm_per_us
     if not is_traced(rate) and np.any(np.asarray(rate) != 0.0):
         raise ValueError(f"`offset_rate_nm_per_us` must be 0 for a periodic orbit, but is {np.asarray(rate).flat[0]:g}")
-    return _single_impact_orbits(scene, jnp.asarray(order, scene.platform.frequency_khz.dtype))
+    return _single_impact_orbits(scene, frame, jnp.asarray(order, scene.platform.frequency_khz.dtype))
 
 
 def _check_order(order: ArrayLike) -> None:
@@ -123,19 +136,23 @@ def _check_order(order: ArrayLike) -> None:
 
 
 @jax.jit
-def _single_impact_orbits(scene: Scene, order: Float[Array, ""]) -> SingleImpactOrbits:
-    problem = OrbitProblem(scene.cantilever, scene.platform, LawImpact(impact_law_of(scene)), order)
+def _single_impact_orbits(scene: Scene, frame: FreeFrame, order: Float[Array, ""]) -> SingleImpactOrbits:
+    problem = OrbitProblem(scene.cantilever, frame.platform, LawImpact(impact_law_of(scene)), order)
     roots = find_roots(problem)
-    orbits = jax.vmap(_orbit, in_axes=(0, 0, None))(roots.place, roots.found, problem)
+    orbits = jax.vmap(_orbit, in_axes=(0, 0, None, None))(roots.place, roots.found & frame.periodic, frame, problem)
     return eqx.tree_at(lambda result: result.complete, orbits, roots.complete)
 
 
-def _orbit(place: OrbitPlace, found: Bool[Array, ""], problem: OrbitProblem) -> SingleImpactOrbits:
+def _orbit(place: OrbitPlace, found: Bool[Array, ""], frame: FreeFrame, problem: OrbitProblem) -> SingleImpactOrbits:
     """Return what there is to know about one root; NaN where there is none."""
     state = orbit_state(place, problem)
     verdict = judge(place, found, state, problem)
     flight, speeds = state.flight, state.speeds
-    peak, amplitude, angle = _observed(state, problem)
+    velocities = jnp.stack([flight.start_velocity, flight.end_velocity])
+    if frame.response is not None:
+        ends = jnp.stack([flight.start_us, flight.start_us + flight.duration_us])
+        velocities = velocities + _alone(frame.response).velocity(ends)
+    seen = _seen(state, frame, problem)
 
     def known(value):
         return jnp.where(found, value, jnp.nan)
@@ -145,18 +162,16 @@ def _orbit(place: OrbitPlace, found: Bool[Array, ""], problem: OrbitProblem) -> 
         admissible=verdict.admissible,
         stable=verdict.stable,
         near_double=verdict.near_double,
-        phase_rad=known(state.phase),
-        velocity_after_nm_per_us=known(flight.start_velocity),
-        velocity_before_nm_per_us=known(flight.end_velocity),
+        phase_rad=known((state.phase + frame.phase_rad) % (2.0 * jnp.pi)),
+        velocity_after_nm_per_us=known(velocities[0]),
+        velocity_before_nm_per_us=known(velocities[1]),
         approach_speed_nm_per_us=known(speeds.approach),
         rebound_speed_nm_per_us=known(speeds.rebound),
         delay_us=known(speeds.delay),
-        peak_amplitude_nm=known(peak),
-        lockin_amplitude_nm=known(amplitude),
-        lockin_phase_deg=known(angle),
         trace=known(verdict.trace),
         determinant=known(verdict.determinant),
         complete=found,
+        **{name: known(value) for name, value in seen.items()},
     )
 
 
@@ -188,6 +203,46 @@ class SteadyOrbits(NamedTuple):
     steady: Bool[Array, " slots"]
     near_double: Bool[Array, " slots"]
     amplitude_nm: Float[Array, "slots 3"]
+
+
+def _seen(state: OrbitState, frame: FreeFrame, problem: OrbitProblem) -> dict[str, Float[Array, ""]]:
+    """Return what is read of an orbit, height and deflection, under the names of `SingleImpactOrbits`."""
+    cantilever, order = problem.cantilever, problem.order
+    peak, amplitude, angle = _observed(state, problem)
+    if frame.response is None:
+        return {"peak_amplitude_nm": peak, "lockin_amplitude_nm": amplitude, "lockin_phase_deg": angle}
+
+    def read(motion: Wave) -> tuple[Float[Array, ""], ...]:
+        """Return peak, lock-in amplitude, phase and lag of the free motion with another motion added to it."""
+        turn = jnp.deg2rad(angle)
+        # the drive's frequency is the response's for N = 1 alone
+        same = order == 1.0
+        along = amplitude * jnp.cos(turn) + jnp.where(same, motion.cosine, 0.0)
+        across = amplitude * jnp.sin(turn) - jnp.where(same, motion.sine, 0.0)
+        # the scene's own clock is ahead by the frame's phase
+        size, behind = size_and_lag(along, across, frame.phase_rad, order)
+        _, lag = size_and_lag(along, across, frame.drive_phase_rad, order)
+        return highest_of_sum(cantilever, state.flight, _alone(motion)), size, -behind % (360.0 / order), lag
+
+    peak, size, phase, lag = read(frame.response)
+    seen = {"peak_amplitude_nm": peak, "lockin_amplitude_nm": size, "lockin_phase_deg": phase, "phase_lag_deg": lag}
+    if frame.base is None:
+        return seen
+    response, base = frame.response, frame.base
+    peak, size, phase, lag = read(
+        Wave(response.cosine - base.cosine, response.sine - base.sine, response.angular_frequency)
+    )
+    return seen | {
+        "peak_deflection_nm": peak,
+        "deflection_lockin_amplitude_nm": size,
+        "deflection_lockin_phase_deg": phase,
+        "phase_lag_deg": lag,
+    }
+
+
+def _alone(wave: Wave) -> Surface:
+    still = jnp.zeros_like(wave.cosine)
+    return Surface(still, still, (wave,))
 
 
 @jax.jit

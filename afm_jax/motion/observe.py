@@ -129,6 +129,9 @@ class Observables(NamedTuple):
     """Largest z - z_b; None without a moving base, as the two that follow."""
     deflection_harmonics: tuple[Harmonic, ...] | None
     mean_deflection_nm: float | None
+    phase_lag_deg: float | None
+    """By how much the first of these harmonics, of the deflection over a moving base, else of the height, lags behind
+    base or force, modulo that harmonic's 360/N'; None where the platform alone drives."""
 
     @property
     def lockin_amplitude_nm(self) -> float:
@@ -186,11 +189,15 @@ def observe(
     peak_force, attraction = _forces(scene, simulation, path, window)
     base = scene.base
     deflection = None if base is None else path.position_nm - np.asarray(base.position_and_velocity(times)[0])
+    of_height = _harmonics(dense, path.position_nm, times, weights, window, drive, harmonics)
+    of_deflection = None
+    if deflection is not None:
+        of_deflection = _harmonics(dense, deflection, times, weights, window, drive, harmonics)
     return Observables(
         settled=verdict,
         window=window,
         peak_amplitude_nm=_peak_height(dense, path, begin, end),
-        harmonics=_harmonics(dense, path.position_nm, times, weights, window, drive, harmonics),
+        harmonics=of_height,
         mean_height_nm=_integral(dense, path.position_nm, times, weights, (begin, end), 0.0).real / span,
         contacts=begun,
         time_in_contact_us=touched / cycles * window.periods,
@@ -205,13 +212,22 @@ def observe(
         energy_imbalance=energy.imbalance,
         virial_aj=_virial(scene, simulation, path, weights, window),
         peak_deflection_nm=None if base is None else _peak_deflection(dense, path, begin, end),
-        deflection_harmonics=None
-        if deflection is None
-        else _harmonics(dense, deflection, times, weights, window, drive, harmonics),
+        deflection_harmonics=of_deflection,
         mean_deflection_nm=None
         if deflection is None
         else _integral(dense, deflection, times, weights, (begin, end), 0.0).real / span,
+        phase_lag_deg=_lag(scene, (of_deflection or of_height)[0], window),
     )
+
+
+def _lag(scene: Scene, harmonic: Harmonic, window: Window) -> float | None:
+    """Return by how much a harmonic lags behind base or force; None without."""
+    drive = scene.base if scene.base is not None else scene.force
+    if drive is None:
+        return None
+    share = harmonic.multiple / window.periods
+    turn = 360.0 * math.gcd(harmonic.multiple, window.periods) / window.periods
+    return (share * float(drive.phase_deg) - harmonic.phase_deg) % turn
 
 
 def _check_covered(found_us: float, wanted_us: float) -> None:
@@ -461,14 +477,20 @@ def _refined(
     times_us: np.ndarray,
     ends_us: tuple[float, float],
 ) -> float:
-    """Return the largest value of what `height` makes of a trajectory: on the times, then ever closer to the best."""
+    """Return the largest value of what `height` makes of a trajectory: on the times, then ever closer to the best.
+
+    To the two best: a period that begins just before its top ends nearly as high.
+    """
     times = np.unique(np.concatenate([times_us, ends_us]))
     best = -np.inf
     for _ in range(_REFINEMENTS + 1):
         values = height(dense.at(times))
         best = max(best, float(values.max()))
-        top = int(np.argmax(values))
-        times = np.linspace(times[max(top - 1, 0)], times[min(top + 1, len(times) - 1)], _REFINED)
+        framed = np.concatenate([[-np.inf], values, [-np.inf]])
+        tops = np.flatnonzero((values >= framed[:-2]) & (values >= framed[2:]))
+        tops = tops[np.argsort(values[tops])[-2:]]
+        ends = times[np.maximum(tops - 1, 0)], times[np.minimum(tops + 1, len(times) - 1)]
+        times = np.unique(np.linspace(*ends, _REFINED))
     return best
 
 

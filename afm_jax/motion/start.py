@@ -2,10 +2,12 @@
 
 import math
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
 
-from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, drive_of
+from afm_jax.apparatus.surface import surface_of
 from afm_jax.checks import as_parameter
 from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
@@ -21,11 +23,11 @@ _NEWTON_STEPS = 30
 def default_start(scene: Scene) -> State:
     """Return where a simulation of a scene begins that was not told.
 
-    Driven by the platform: just after the impact of the single-impact orbit that the scene's law, or the law with delay
-    closest to its contact, has for the order nearest to resonance; the stable one, the fastest if there are several.
-    Without such an orbit: leaving the platform upward at its highest speed, at that speed again or twice the capture
-    speed relative to it. With a drive of base or force the tip starts at rest where that is above the sample, and a
-    free cantilever always does.
+    Driven with one frequency: just after the impact of the single-impact orbit that the scene's law, or the law with
+    delay closest to its contact, has for the order nearest to resonance; the stable one, the fastest if there are
+    several. Without such an orbit: with a drive of base or force at rest where that is above the sample, else leaving
+    the platform upward at its highest speed, at that speed again or twice the capture speed relative to it. A free
+    cantilever starts at rest.
 
     Args:
         scene: one scene, its numbers known.
@@ -39,12 +41,18 @@ def default_start(scene: Scene) -> State:
     law = scene.interaction
     if isinstance(law, Contact):
         law = law_of_contact(law, float(scene.cantilever.mass_ng))
+    seconds = (part.second for part in (scene.platform, scene.base, scene.force) if part is not None)
+    still = eqx.tree_at(
+        lambda s: s.platform.offset_rate_nm_per_us, scene, jnp.zeros_like(scene.platform.offset_rate_nm_per_us)
+    )
+    periodic = not any(second is not None for second in seconds) and drive_of(still).aperiodic is None
+    found = _on_orbit(scene, still, law) if periodic and law is not None else None
+    if found is not None:
+        return found
     sample_alone = scene.base is None and scene.force is None
     if not sample_alone and -float(scene.platform.position(0.0)) > 2.0 * _clearance(scene) + 1.0:
         return state(0.0, 0.0, 0.0)
-    periodic = sample_alone and scene.platform.second is None and float(scene.platform.amplitude_nm) > 0.0
-    found = _on_orbit(scene, law) if periodic and law is not None else None
-    return found if found is not None else _leaving(scene)
+    return _leaving(scene)
 
 
 def start_of(scene: Scene, start: tuple[float, float, float] | None) -> State:
@@ -72,35 +80,37 @@ def _clearance(scene: Scene) -> float:
     return float(scene.interaction.bridge_breaks_nm) if isinstance(scene.interaction, Contact) else 0.0
 
 
-def _on_orbit(scene: Scene, law: ImpactLaw) -> State | None:
-    """Return the state just after the impact of the predicted orbit; None without one."""
-    platform, cantilever = scene.platform, scene.cantilever
-    order = max(1, round(float(platform.frequency_khz) / (2.0 * float(cantilever.frequency_khz))))
+def _on_orbit(scene: Scene, still: Scene, law: ImpactLaw) -> State | None:
+    """Return the state just after the impact of the predicted orbit, that of the scene without ramp; None without."""
+    omega = drive_of(still).angular_frequency
+    order = max(1, round(omega / (2.0 * float(scene.cantilever.angular_frequency))))
     if order > _HIGHEST_ORDER:
         return None
-    still = Platform(platform.amplitude_nm, platform.frequency_khz, platform.offset_nm)
-    orbits = single_impact_orbits(Scene(cantilever, still, law), float(order))
+    predicted = eqx.tree_at(lambda s: s.interaction, still, law)
+    orbits = single_impact_orbits(predicted, float(order))
     admissible = np.asarray(orbits.exists) & np.asarray(orbits.admissible)
     stable = admissible & np.asarray(orbits.stable)
     wanted = stable if stable.any() else admissible
     if not wanted.any():
         return None
     slot = int(np.argmax(np.where(wanted, np.asarray(orbits.approach_speed_nm_per_us), -np.inf)))
-    time = float(orbits.phase_rad[slot]) / float(platform.angular_frequency)
+    time = float(orbits.phase_rad[slot]) / omega
     velocity = float(orbits.velocity_after_nm_per_us[slot])
     if not isinstance(scene.interaction, Contact):
-        return state(time, float(platform.position(time)), velocity)
+        return state(time, float(scene.platform.position(time)), velocity)
     return _risen(scene, time, velocity, _clearance(scene))
 
 
 def _risen(scene: Scene, time: float, velocity: float, gap: float) -> State | None:
     """Return where a flight that leaves the platform first has a gap; None if it does not rise that far."""
-    position = float(scene.platform.position(time))
-    rebound = velocity - float(scene.platform.velocity(time))
-    duration, v = gap / rebound, velocity
+    surface, response = surface_of(scene)
+    # the free motion, which lacks the steady response
+    position, leaving = (float(part) for part in surface.position_and_velocity(time))
+    free = velocity - (0.0 if response is None else float(response.velocity(time)))
+    duration, v = gap / (free - leaving), free
     for _ in range(_NEWTON_STEPS):
-        height, speed = (float(part) for part in scene.platform.position_and_velocity(time + duration))
-        z, v = (float(part) for part in scene.cantilever.propagator(duration)(position, velocity))
+        height, speed = (float(part) for part in surface.position_and_velocity(time + duration))
+        z, v = (float(part) for part in scene.cantilever.propagator(duration)(position, free))
         if not v > speed:
             return None
         step = (gap - (z - height)) / (v - speed)
@@ -108,7 +118,9 @@ def _risen(scene: Scene, time: float, velocity: float, gap: float) -> State | No
         if abs(step) < 1e-13:
             break
     # a rounding above the gap at which the bridge breaks
-    return state(time + duration, float(scene.platform.position(time + duration)) + gap, v)
+    end = time + duration
+    v += 0.0 if response is None else float(response.velocity(end))
+    return state(end, float(scene.platform.position(end)) + gap, v)
 
 
 def _leaving(scene: Scene) -> State:

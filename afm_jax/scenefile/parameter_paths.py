@@ -1,7 +1,8 @@
 """Parameters of a scene by their paths in its file: ranges of them as text, and scenes with other values of them.
 
 `platform.reduced_frequency=0.4:4.4:1000` is a path and a range. A path names a number of the scene file, or the reduced
-frequency omega/2 Omega of a drive; where the cantilever's frequency changes, the drives keep theirs in kHz.
+frequency omega/2 Omega of a drive; where the cantilever's frequency changes, the drives keep theirs in kHz. What base
+or force make of the free tip, `force.free_amplitude_nm`, sets their amplitude, which stays when other numbers change.
 """
 
 import difflib
@@ -16,6 +17,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.surface import drive_per_free_height
 from afm_jax.checks import is_traced
 from afm_jax.scenefile.scenefile import scene_of_tables, scene_tables
 
@@ -89,6 +91,11 @@ def parameter_values(scene: Scene) -> dict[str, float]:
     free = float(scene.cantilever.frequency_khz)
     for path in [path for path in found if path.endswith(".frequency_khz") and not path.startswith("cantilever")]:
         found[path.replace("frequency_khz", "reduced_frequency")] = found[path] / (2.0 * free)
+    for name, drive in (("base", scene.base), ("force", scene.force)):
+        if drive is not None:
+            per_free = float(drive_per_free_height(scene.cantilever, drive.frequency_khz, type(drive)))
+            if per_free > 0.0:
+                found[f"{name}.free_amplitude_nm"] = float(drive.tones[0].amplitude) / per_free
     return found
 
 
@@ -121,7 +128,8 @@ def check_ranges(scene: Scene, *ranges: ParameterRange) -> None:
 
 
 def _leaf_path(path: str) -> str:
-    return path.replace("reduced_frequency", "frequency_khz")
+    path = path.replace("reduced_frequency", "frequency_khz")
+    return path.replace("free_amplitude_nm", "amplitude_nn" if path.startswith("force") else "amplitude_nm")
 
 
 def _tables_with(scene: Scene, path: str, value: float) -> dict[str, Any]:
@@ -130,8 +138,7 @@ def _tables_with(scene: Scene, path: str, value: float) -> dict[str, Any]:
     inner: dict[str, Any] = tables
     for name in table.split("."):
         inner = inner[name]
-    if key == "reduced_frequency":
-        inner.pop("frequency_khz")
+    inner.pop(_leaf_path(path).rpartition(".")[2], None)
     inner[key] = value
     return tables
 
@@ -200,8 +207,10 @@ def _contact_family(scene: Scene, names: tuple[str, ...]) -> Callable[..., objec
 
 def with_numbers(scene: Scene, values: Mapping[str, ArrayLike]) -> Scene:
     """Return a scene with numbers of cantilever, drives and law replaced, by their paths; they may be traced."""
-    # the cantilever first: reduced frequencies are in its unit
-    for path in sorted(values, key=lambda path: not path.startswith("cantilever")):
+    # the cantilever first: reduced frequencies are in its unit; free amplitudes last, which hang on both
+    for path in sorted(
+        values, key=lambda path: (path.endswith("free_amplitude_nm"), not path.startswith("cantilever"))
+    ):
         scene = _with_number(scene, path, values[path])
     return scene
 
@@ -211,6 +220,10 @@ def _with_number(scene: Scene, path: str, value: ArrayLike) -> Scene:
     number = jnp.asarray(value, scene.platform.frequency_khz.dtype)
     if key == "reduced_frequency":
         key, number = "frequency_khz", 2.0 * number * scene.cantilever.frequency_khz
+    if key == "free_amplitude_nm":
+        drive = getattr(scene, parts[0])
+        number = number * drive_per_free_height(scene.cantilever, drive.frequency_khz, type(drive))
+        key = _leaf_path(path).rpartition(".")[2]
     if parts[-1] == "second" and key.startswith("amplitude"):
         key = "amplitude"
     follows = parts[0] in ("base", "force") and parts[-1] != "second" and key == "frequency_khz" and _rests(scene)

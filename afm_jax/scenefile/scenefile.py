@@ -19,7 +19,7 @@ amplitude_nm = 0.1
 frequency_khz = 90           # or reduced_frequency
 phase_deg = 0
 [force]                      # leave out: no force on the tip
-amplitude_nn = 0.5
+amplitude_nn = 0.5           # or here and for [base] free_amplitude_nm, the amplitude of the free tip's height
 frequency_khz = 90           # or reduced_frequency
 phase_deg = 0
 [interaction]
@@ -62,7 +62,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, drive_of
-from afm_jax.apparatus.surface import check_steady_response
+from afm_jax.apparatus.surface import check_steady_response, drive_per_free_height
 from afm_jax.checks import check_parameter
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.motion.record import State
@@ -170,8 +170,19 @@ def _excitation_of(
     table = tables.get(name)
     if table is None:
         return None
-    numbers = table.numbers(required=(_amplitude(name),), optional=("frequency_khz", "reduced_frequency", "phase_deg"))
-    drive = table.build(kind, **_with_frequency(table, numbers, cantilever))
+    own, free = _amplitude(name), "free_amplitude_nm"
+    if own in table.values and free in table.values:
+        table.fail(f"has both {own} and {free}; give one of them")
+    needed = free if free in table.values else own
+    numbers = table.numbers(required=(needed,), optional=("frequency_khz", "reduced_frequency", "phase_deg"))
+    numbers = _with_frequency(table, numbers, cantilever)
+    if needed == free:
+        table.build(check_parameter, free, numbers[free], "not negative")
+        # the tone's amplitude only says that it moves
+        tone = table.build(Tone, numbers[free], numbers["frequency_khz"])
+        table.build(check_steady_response, cantilever, (tone,), name)
+        numbers[own] = numbers.pop(free) * float(drive_per_free_height(cantilever, numbers["frequency_khz"], kind))
+    drive = table.build(kind, **numbers)
     drive = _with_second(tables, name, drive, cantilever)
     table.build(check_steady_response, cantilever, drive.tones, name)
     return drive

@@ -1,0 +1,185 @@
+"""Tips driven by a force or by their base over a resting sample: map, orbits, simulation, and a direct integration."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene
+from afm_jax.dynamics.impact_orbits import many_impact_orbits
+from afm_jax.impact.jacobian import map_jacobian
+from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from afm_jax.impact.map import iterate_map, next_impact
+from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
+from afm_jax.motion.observe import observe
+from afm_jax.motion.record import State
+from afm_jax.motion.simulate import simulate
+
+MASS, PER_KHZ = 16.81, 2e-3 * np.pi
+INSTANT = ImpactLaw(0.99, 0.1, 0.01)
+DELAYED = ImpactLaw(0.99, 0.1, 0.01, CollisionDelay(0.1, 1.0, 0.2, corrections=False))
+LASTING = ImpactLaw(0.99, 0.1, 0.01, CollisionDelay(0.1, 1.0, 0.2))
+
+
+def driven(kind: str, law: ImpactLaw, ratio: float, free_nm: float, offset_nm: float, quality: float) -> Scene:
+    """Return a scene whose free tip has an amplitude: the drive's from the textbook's complex response."""
+    cantilever, frequency = Cantilever(90.0, quality, MASS), 90.0 * ratio
+    push = free_nm * abs(1.0 - ratio**2 + 1j * ratio / quality)
+    drives: dict[str, Any] = {"base": BaseDrive(push, frequency, -70.0)}
+    if kind == "force":
+        drives = {"force": ForceDrive(push * MASS * (PER_KHZ * 90.0) ** 2, frequency, 37.0)}
+    # nothing counts in the resting platform's own frequency
+    return Scene(cantilever, Platform(0.0, 33.0, offset_nm), law, **drives)
+
+
+def fastest(found: SingleImpactOrbits) -> int:
+    good = np.asarray(found.exists & found.admissible & found.stable)
+    assert good.any()
+    return int(np.argmax(np.where(good, found.approach_speed_nm_per_us, -np.inf)))
+
+
+def angular_frequency(scene: Scene) -> float:
+    drive = scene.force if scene.base is None else scene.base
+    assert drive is not None
+    return PER_KHZ * float(drive.frequency_khz)
+
+
+def started(scene: Scene, found: SingleImpactOrbits, slot: int) -> State:
+    return State(
+        jnp.asarray(found.phase_rad[slot] / angular_frequency(scene)),
+        scene.platform.offset_nm,
+        found.velocity_after_nm_per_us[slot],
+    )
+
+
+def integrated(scene: Scene, time: float, velocity: float, impacts: int) -> np.ndarray:
+    """Return times of impacts of the whole driven equation of motion, by SciPy's DOP853 with events."""
+    omega, free, damping = angular_frequency(scene), PER_KHZ * 90.0, 2.0 * float(scene.cantilever.decay_rate)
+    level, law = float(scene.platform.offset_nm), scene.interaction
+    if scene.force is not None:
+        push, phase = float(scene.force.amplitude_nn) / MASS, float(scene.force.phase_deg)
+    else:
+        assert scene.base is not None
+        push, phase = free**2 * float(scene.base.amplitude_nm), float(scene.base.phase_deg)
+
+    def motion(t, state):
+        force = push * np.cos(omega * t + np.radians(phase))
+        return [state[1], force - damping * state[1] - free**2 * state[0]]
+
+    def meets(_, state):
+        return state[0] - level
+
+    setattr(meets, "terminal", True)  # noqa: B010
+    setattr(meets, "direction", -1.0)  # noqa: B010
+    times = []
+    for _ in range(impacts):
+        flight = solve_ivp(
+            motion, (time, time + 100.0), [level, velocity], "DOP853", events=meets, rtol=1e-13, atol=1e-12
+        )
+        time, fast = float(flight.t_events[0][0]), -float(flight.y_events[0][0][1])
+        velocity = float(np.sqrt((float(law.r) * fast) ** 2 - float(law.viscous_loss) * fast - float(law.epsilon)))
+        times.append(time)
+    return np.array(times)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["force", "base"])
+def test_ten_impacts_are_those_of_a_direct_integration(kind: str):
+    scene = driven(kind, INSTANT, 1.03, 60.0, -40.0, 200.0)
+    found = iterate_map(scene, 3.0, 9.0, 10)
+    assert np.all(np.asarray(found.outcome) == 0)
+    np.testing.assert_allclose(found.time_us, integrated(scene, 3.0, 9.0, 10), rtol=0, atol=1e-8)
+
+
+CASES = [("force", LASTING, 1.01), ("base", LASTING, 1.01), ("force", INSTANT, 1.005), ("base", DELAYED, 1.03)]
+"""With the lowest frequency over the free one: nearer resonance these laws have no stable orbit."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "law", "nearest"), CASES)
+def test_map_and_simulation_stay_on_the_orbit_and_read_its_numbers(kind: str, law: ImpactLaw, nearest: float):
+    random = np.random.default_rng(5)
+    for ratio in (nearest, 1.04, 1.1):
+        free = float(random.uniform(40.0, 80.0))
+        scene = driven(kind, law, ratio, free, -free * random.uniform(0.3, 0.7), random.uniform(150.0, 250.0))
+        found = single_impact_orbits(scene, 1)
+        slot, period = fastest(found), 2.0 * np.pi / angular_frequency(scene)
+        start = started(scene, found, slot)
+        once = next_impact(scene, start.time_us, start.velocity_nm_per_us)
+        assert float(once.time_us - start.time_us) == pytest.approx(period, abs=1e-10)
+        assert float(once.velocity_after_nm_per_us - start.velocity_nm_per_us) == pytest.approx(0.0, abs=1e-9)
+        assert float(once.velocity_before_nm_per_us) == pytest.approx(
+            float(found.velocity_before_nm_per_us[slot]), abs=1e-9
+        )
+        seen = observe(scene, simulate(scene, start, 60.0 * period))
+        assert seen.settled.settled
+        assert seen.settled.periods == 1
+        read = {
+            "peak_amplitude_nm": seen.peak_amplitude_nm,
+            "lockin_amplitude_nm": seen.lockin_amplitude_nm,
+            "lockin_phase_deg": seen.lockin_phase_deg,
+            "phase_lag_deg": seen.phase_lag_deg,
+            "peak_deflection_nm": seen.peak_deflection_nm,
+        }
+        if seen.deflection_harmonics is not None:
+            read["deflection_lockin_amplitude_nm"] = seen.deflection_harmonics[0].amplitude_nm
+            read["deflection_lockin_phase_deg"] = seen.deflection_harmonics[0].phase_deg
+        for name, value in read.items():
+            if value is None:
+                assert getattr(found, name) is None
+            else:
+                assert value == pytest.approx(float(getattr(found, name)[slot]), rel=1e-9), name
+
+
+@pytest.mark.slow
+def test_jacobian_trace_and_determinant_are_those_of_automatic_differentiation():
+    scene = driven("force", INSTANT, 1.03, 60.0, -40.0, 200.0)
+    found = single_impact_orbits(scene, 1)
+    slot = fastest(found)
+    start = started(scene, found, slot)
+    at = jnp.stack([start.time_us, start.velocity_nm_per_us])
+
+    def after(state):
+        impact = next_impact(scene, *state)
+        return jnp.stack([impact.time_us, impact.velocity_after_nm_per_us])
+
+    jacobian = np.asarray(map_jacobian(scene, *at))
+    np.testing.assert_allclose(jacobian, jax.jacfwd(after)(at), rtol=1e-9)
+    assert np.trace(jacobian) == pytest.approx(float(found.trace[slot]), rel=1e-9)
+    assert np.linalg.det(jacobian) == pytest.approx(float(found.determinant[slot]), rel=1e-9)
+
+
+@pytest.mark.slow
+def test_sample_and_force_of_one_frequency_drive_together():
+    """An orbit of both is one of those that the search from many starts finds, peak and stability included."""
+    scene = driven("force", INSTANT, 1.03, 60.0, -40.0, 200.0)
+    scene = Scene(scene.cantilever, Platform(1.5, 92.7, -40.0), INSTANT, force=scene.force)
+    found, many = single_impact_orbits(scene, 1), many_impact_orbits(scene, 1, 1, starts=64)
+    slot = fastest(found)
+    place = int(np.argmin(np.abs(many.reading.approach_speed_nm_per_us[:, 0] - found.approach_speed_nm_per_us[slot])))
+    for name in ("approach_speed_nm_per_us", "velocity_after_nm_per_us", "phase_rad"):
+        assert getattr(many.reading, name)[place, 0] == pytest.approx(float(getattr(found, name)[slot]), rel=1e-9)
+    assert many.reading.peak_amplitude_nm[place] == pytest.approx(float(found.peak_amplitude_nm[slot]), rel=1e-9)
+    assert many.stable[place]
+
+
+@pytest.mark.slow
+def test_drives_of_several_frequencies_have_no_single_orbit():
+    force = ForceDrive(1.0, 93.0)
+    moving = Scene(Cantilever(90.0, 40.0), Platform(2.0, 180.0), INSTANT, force=force)
+    with pytest.raises(ValueError, match="no periodic orbits: the drive has several frequencies"):
+        single_impact_orbits(moving, 1)
+    second = Scene(
+        Cantilever(90.0, 40.0), Platform(2.0, 93.0), INSTANT, force=ForceDrive(1.0, 93.0, second=Tone(1.0, 5.0))
+    )
+    with pytest.raises(ValueError, match=r"the scene has `force.second`, a second frequency"):
+        single_impact_orbits(second, 1)
+    undamped = Scene(Cantilever(90.0), Platform(0.0, 90.0, -5.0), INSTANT, force=ForceDrive(1.0, 90.0))
+    with pytest.raises(ValueError, match="`force` drives an undamped cantilever at its free frequency"):
+        single_impact_orbits(undamped, 1)
