@@ -58,10 +58,8 @@ from fitting.forward import impact_of
 from fitting.models import (
     Measurement,
     Problem,
-    Reach,
     constraints_of,
     measurement_of,
-    place_of_rows,
     readings_of,
 )
 from fitting.parameters import NUISANCE_NAMES, PARAMETERS, check_contact_values, model_parameters
@@ -411,8 +409,10 @@ class _Summary:
         predicted = np.where(exists[:, None], prediction.amplitude_nm[0][:count], np.nan)
         error = np.where(used, np.asarray(rows.error_nm)[:count], np.nan)
         reasons = self.strain.reasons[:count].copy()
-        reasons[place_of_rows(self.table) == Reach.ATTRACTED] = ATTRACTED
-        measured = np.where(used | (reasons != "")[:, None], readings_of(self.table)[0], np.nan)
+        read = readings_of(self.table)[0]
+        stated = np.asarray(self.stated.measurement.rows.measured)[:count]
+        reasons[np.isfinite(read).any(axis=1) & ~stated.any(axis=1)] = ATTRACTED
+        measured = np.where(used | (reasons != "")[:, None], read, np.nan)
         phases = {}
         if measured.shape[1] > 2:
             columns = {"predicted_phase_deg": predicted, "measured_phase_deg": measured, "phase_error_deg": error}
