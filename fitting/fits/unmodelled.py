@@ -30,7 +30,7 @@ from fitting.models import Problem
 from fitting.parameters import DELAY_SHAPE, LOSS_SHAPE, PARAMETERS
 
 LOSS_SPEED_SQUARED = 110.0, 60.0
-"""q in nm^2/us^2 and its standard error: free fits of the laws of contacts give 96 to 125, a wet one 234."""
+"""q in nm^2/us^2 of a tip of 1 ng and its standard error: free fits of contacts' laws give 96 to 125, a wet one 234."""
 _LOSS_SHARE = 0.07
 """Standard deviation of the smooth part of the loss, relative."""
 _MISSING_SHARE = 0.3
@@ -94,21 +94,25 @@ class Unmodelled:
         problem: the model; of the resolved contact only corrections and slow impacts are uncertain.
         values: of its parameters, by name.
         speeds: slowest and fastest approach of the rows in nm/us.
+        mass_ng: of the tip: what a bridge does to speeds goes with its inverse square root.
     """
 
     problem: Problem
     values: dict[str, float]
     speeds: tuple[float, float]
+    mass_ng: float = 1.0
 
     @property
     def priors(self) -> dict[str, tuple[float, float]]:
         """Mean and standard error of the shapes' numbers, by name; only those that the model has use for."""
         priors = {}
         if "viscous_loss" in self.problem.own:
-            priors[LOSS_SHAPE] = LOSS_SPEED_SQUARED
+            mean, error = LOSS_SPEED_SQUARED
+            priors[LOSS_SHAPE] = mean / self.mass_ng, error / self.mass_ng
         if "delay_lead_nm" in self.problem.own:
-            mean = _SQUARE_PER_LEAD * self.values["delay_lead_nm"]
-            priors[DELAY_SHAPE] = mean, max(abs(mean), _LEAST_SQUARE)
+            slower = self.mass_ng**-0.5
+            mean = slower * _SQUARE_PER_LEAD * self.values["delay_lead_nm"]
+            priors[DELAY_SHAPE] = mean, max(abs(mean), slower * _LEAST_SQUARE)
         return priors
 
     def columns(self, u: Float[np.ndarray, " n"], w: Float[np.ndarray, " n"]) -> Columns:

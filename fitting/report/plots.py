@@ -15,11 +15,11 @@ from fitting.fits.result import FitResult
 from fitting.report.words import has_delay
 
 # Okabe and Ito's colours, distinguishable with every kind of colour vision.
-COLOURS = ("#0072B2", "#D55E00")
+COLOURS = ("#0072B2", "#D55E00", "#009E73")
 ALARM = "#B00020"
 SMALL = 8
 _WIDTH_INCHES, _DPI = 10.0, 120.0
-_KINDS = ("peak", "lock-in")
+_KINDS = ("peak", "lock-in", "phase")
 _ASIDE = "#999999"
 _ROW_AXIS = "row (by order N, drive frequency, drive amplitude)"
 _MUCH = 5.0
@@ -142,7 +142,7 @@ def draw_residuals(axes: Axes, result: FitResult) -> None:
     ranking, breaks = _row_axis(result)
     places = np.arange(len(ranking))
     _draw_expected(axes)
-    for kind in range(2):
+    for kind in range(result.rows.residual.shape[1]):
         axes.plot(places, result.rows.residual[ranking, kind], "o", ms=3, color=COLOURS[kind])
     for place in breaks:
         axes.axvline(place - 0.5, color="0.7", lw=0.8)
@@ -154,7 +154,7 @@ def draw_residuals_by_speed(axes: Axes, result: FitResult) -> None:
     """Draw the normalised residuals against the approach speed: what is left of a wrong law shows here."""
     _draw_expected(axes)
     speed = result.rows.approach_speed_nm_per_us
-    for kind in range(2):
+    for kind in range(result.rows.residual.shape[1]):
         residual = result.rows.residual[:, kind]
         if np.isfinite(residual).any():
             axes.plot(speed, residual, "o", ms=3.5, color=COLOURS[kind], label=_KINDS[kind])
@@ -181,7 +181,8 @@ def _draw_expected(axes: Axes) -> None:
 def _row_axis(result: FitResult) -> tuple[np.ndarray, list[int]]:
     """Return positions of the rows, sorted by order, frequency and drive, and where a new order begins."""
     table = result.table
-    ranking = np.lexsort((table.excitation_nm, table.drive_frequency_khz, table.order))
+    heights = (table.offset_nm,) if table.tapping else ()
+    ranking = np.lexsort((*heights, table.excitation_nm, table.drive_frequency_khz, table.order))
     orders = table.order[ranking]
     return ranking, [int(i) for i in np.flatnonzero(np.diff(orders)) + 1]
 
