@@ -17,7 +17,7 @@ SHARP := tests/test_polynomial_roots.py tests/test_verification.py
 BIN := .venv/bin
 SETUP := .venv/.installed
 
-.PHONY: help setup fit test check thorough lint types coverage slow mutations bands fuzz bench clean
+.PHONY: help setup fit test check thorough lint types coverage slow docs pictures mutations bands fuzz kills bench clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -55,6 +55,12 @@ coverage: $(SETUP) ## make test and make slow with the share of lines that they 
 slow: $(SETUP) ## the slow tests: long iterations, references, notebooks
 	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_SOON)" $(BIN)/python $(PYTEST) -m slow -n auto --dist worksteal --ignore tests/test_mutations.py
 
+docs: $(SETUP) ## the site, in build/site/index.html; notebooks are run unless `make slow` did
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --config-file notebooks/mkdocs.yml
+
+pictures: $(SETUP) ## the pictures of README and site anew, by the commands beside them
+	$(BIN)/python notebooks/make_pictures.py
+
 mutations: $(SETUP) ## wrong formulas, one edit each: a named test must notice
 	$(BIN)/python -m pytest -m slow tests/test_mutations.py
 
@@ -66,9 +72,14 @@ fuzz: $(SETUP) ## random work, seeded; FUZZ='--flights 1000000 --orbits 100000 -
 bands: $(SETUP) ## do the 95 % bands hold the laws of ten random contacts? (twenty minutes; the truths are kept in /tmp)
 	$(BIN)/python -m tests.coverage_of_bands
 
-check: lint types test slow ## all that CI runs: format, lint, types, tests, slow tests, notebooks
+KILLS ?= --times 20
 
-thorough: lint types coverage mutations bands fuzz ## all of make check with the share of lines it runs, mutations, bands, random work
+kills: $(SETUP) ## a sweep killed at twenty random times and resumed ends in the bytes of one that was not
+	$(BIN)/python -m tests.kills $(KILLS)
+
+check: lint types test slow docs ## all that CI runs: format, lint, types, tests, slow tests, notebooks, site
+
+thorough: lint types coverage mutations bands fuzz kills ## all of make check with the share of lines it runs, mutations, bands, random work, kills
 
 bench: $(SETUP) ## impacts per second, next to SciPy
 	$(BIN)/afm-jax bench --out $(OUT)

@@ -29,8 +29,10 @@ if TYPE_CHECKING:
     from afm_jax.motion.simulate import simulate
     from afm_jax.motion.trajectory import Trajectory, trajectory
     from afm_jax.outcomes import CollisionOutcome, Outcome
+    from afm_jax.saved import load
     from afm_jax.scenefile.parameter_paths import scene_family
     from afm_jax.scenefile.scenefile import SceneError, load_scene, save_scene
+    from afm_jax.sweeps.sweep import sweep
 
     __version__: str
 else:
@@ -68,6 +70,7 @@ else:
         "find_junction": "afm_jax.contact.junction",
         "iterate_batch": "afm_jax.impact.map",
         "iterate_map": "afm_jax.impact.map",
+        "load": "afm_jax.saved",
         "load_scene": "afm_jax.scenefile.scenefile",
         "lyapunov_spectrum": "afm_jax.dynamics.exponents",
         "many_impact_orbits": "afm_jax.dynamics.impact_orbits",
@@ -78,6 +81,7 @@ else:
         "simulate": "afm_jax.motion.simulate",
         "single_impact_orbits": "afm_jax.impact.orbits",
         "stability_chart": "afm_jax.dynamics.charts",
+        "sweep": "afm_jax.sweeps.sweep",
         "time_course": "afm_jax.contact.time_course",
         "trajectory": "afm_jax.motion.trajectory",
         "use_cache": "afm_jax.compilation_cache",
@@ -122,6 +126,7 @@ __all__ = [
     "find_junction",
     "iterate_batch",
     "iterate_map",
+    "load",
     "load_scene",
     "lyapunov_spectrum",
     "many_impact_orbits",
@@ -132,6 +137,7 @@ __all__ = [
     "simulate",
     "single_impact_orbits",
     "stability_chart",
+    "sweep",
     "time_course",
     "trajectory",
     "use_cache",

@@ -16,6 +16,9 @@ angular frequency         rad/us      elastic modulus             nN/nm^2 = GPa
 
 import math
 
+TWO_SIDED_95 = 1.959963984540054
+"""Half width of a 95 % interval in standard errors, where errors are normal."""
+
 RAD_PER_US_PER_KHZ = 2.0 * math.pi * 1e-3
 """Angular frequency in rad/us of a frequency of 1 kHz."""
 

@@ -1,7 +1,9 @@
 """Numbers and tables as a person reads them: the digits that an error warrants, a dash where nothing is known."""
 
+import contextlib
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from typing import Any, SupportsFloat
 
 
@@ -106,13 +108,60 @@ def text_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, words: Seq
     ['           value', '  r         0.95', '  epsilon     60']
     """
     lines = [list(head), *map(list, rows)]
+    sides = ["<" if k in words else ">" for k in range(len(head))]
+    whole = _aligned(lines, sides)
+    # remarks at the end of a line may go on below it
+    told = [line[:-1] for line in lines] if len(head) - 1 in words and len(head) > 2 else lines
+    if len(lines) == 1 or len(head) == 2 or max(map(len, _aligned(told, sides[: len(told[0])]))) <= _room.get():
+        return whole
+    return _turned(lines, _room.get())
+
+
+@contextlib.contextmanager
+def lines_at_most(width: int) -> Iterator[None]:
+    """Within this block a table wider than so many signs is turned: a line a column, as many rows abreast as fit.
+
+    >>> with lines_at_most(16):
+    ...     text_table(["", "value", "error"], [["r", "0.95", "0.01"], ["epsilon", "60", "2"]])
+    ['            r', '  value  0.95', '  error  0.01', '', '         epsilon', '  value       60', '  error        2']
+    """
+    before = _room.set(float(width))
+    try:
+        yield
+    finally:
+        _room.reset(before)
+
+
+_room: ContextVar[float] = ContextVar("_room", default=math.inf)
+
+
+def _aligned(lines: Sequence[Sequence[str]], sides: Sequence[str]) -> list[str]:
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    sides = ["<" if k in words else ">" for k in range(len(widths))]
     return [
         "  "
         + "  ".join(f"{cell:{side}{width}}" for cell, side, width in zip(line, sides, widths, strict=True)).rstrip()
         for line in lines
     ]
+
+
+def _turned(lines: Sequence[Sequence[str]], room: float) -> list[str]:
+    """Return a table with its columns below each other, in blocks of rows that fit in the room."""
+    head, *rows = lines
+    left = 2 + max(map(len, head))
+    blocks: list[list[Sequence[str]]] = []
+    used = math.inf
+    for row in rows:
+        width = 2 + max(map(len, row))
+        if used + width > room:
+            blocks.append([])
+            used = left
+        blocks[-1].append(row)
+        used += width
+    turned: list[str] = []
+    for block in blocks:
+        cells = [[name, *values] for name, *values in zip(head, *block, strict=True)]
+        turned += ["", *_aligned(cells, ["<", *">" * len(block)])]
+    return turned[1:]
 
 
 def bullets(title: str, items: Sequence[str]) -> list[str]:

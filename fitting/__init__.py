@@ -7,8 +7,11 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from afm_jax.contact.law_of_contact import ContactDelay, ContactLaw, fit_delay, fit_law
+    from afm_jax.saved import load
+    from fitting.bulk import fit_each
     from fitting.calibration.calibrate import calibrate
     from fitting.calibration.result import Calibration
+    from fitting.calibration.stiffness import Stiffness, equipartition, sader, sensitivity
     from fitting.calibration.sweep import ResonanceSweep, read_sweep
     from fitting.experiments.belief import Belief, believe
     from fitting.experiments.candidates import drive_grid
@@ -18,6 +21,7 @@ if TYPE_CHECKING:
     from fitting.fits.fit import fit
     from fitting.fits.result import FitResult
     from fitting.forward import AmplitudeGradients, amplitude_gradients
+    from fitting.instruments.curve import MeasuredCurve, read_curve, read_curves
     from fitting.inversion.invert import invert
     from fitting.inversion.result import Inversion
     from fitting.sampling.bootstrap import Bootstrap, bootstrap
@@ -25,6 +29,8 @@ if TYPE_CHECKING:
     from fitting.sampling.posterior_result import Posterior
     from fitting.simulated.experiment import SimulatedExperiment, simulate_experiment
     from fitting.tables.table import AmplitudeTable, TableError, read_table, write_table
+    from fitting.tapping_curves.result import Tapping
+    from fitting.tapping_curves.tapping import tapping
     from fitting.traces.lockin import LockinResult, lockin
     from fitting.traces.trace import Trace, read_trace
 else:
@@ -42,11 +48,14 @@ else:
         "Design": "fitting.experiments.result",
         "FitResult": "fitting.fits.result",
         "LockinResult": "fitting.traces.lockin",
+        "MeasuredCurve": "fitting.instruments.curve",
         "Posterior": "fitting.sampling.posterior_result",
         "ResonanceSweep": "fitting.calibration.sweep",
         "Inversion": "fitting.inversion.result",
         "SimulatedExperiment": "fitting.simulated.experiment",
+        "Stiffness": "fitting.calibration.stiffness",
         "TableError": "fitting.tables.table",
+        "Tapping": "fitting.tapping_curves.result",
         "Trace": "fitting.traces.trace",
         "amplitude_gradients": "fitting.forward",
         "believe": "fitting.experiments.belief",
@@ -55,16 +64,24 @@ else:
         "compare": "fitting.fits.comparison",
         "design": "fitting.experiments.design",
         "drive_grid": "fitting.experiments.candidates",
+        "equipartition": "fitting.calibration.stiffness",
         "fit": "fitting.fits.fit",
+        "fit_each": "fitting.bulk",
         "fit_delay": "afm_jax.contact.law_of_contact",
         "fit_law": "afm_jax.contact.law_of_contact",
+        "load": "afm_jax.saved",
         "lockin": "fitting.traces.lockin",
         "invert": "fitting.inversion.invert",
         "posterior": "fitting.sampling.posterior",
+        "read_curve": "fitting.instruments.curve",
+        "read_curves": "fitting.instruments.curve",
         "read_sweep": "fitting.calibration.sweep",
         "read_table": "fitting.tables.table",
         "read_trace": "fitting.traces.trace",
+        "sader": "fitting.calibration.stiffness",
+        "sensitivity": "fitting.calibration.stiffness",
         "simulate_experiment": "fitting.simulated.experiment",
+        "tapping": "fitting.tapping_curves.tapping",
         "write_table": "fitting.tables.table",
     }
 
@@ -88,10 +105,13 @@ __all__ = [
     "FitResult",
     "Inversion",
     "LockinResult",
+    "MeasuredCurve",
     "Posterior",
     "ResonanceSweep",
     "SimulatedExperiment",
+    "Stiffness",
     "TableError",
+    "Tapping",
     "Trace",
     "amplitude_gradients",
     "believe",
@@ -100,15 +120,23 @@ __all__ = [
     "compare",
     "design",
     "drive_grid",
+    "equipartition",
     "fit",
     "fit_delay",
+    "fit_each",
     "fit_law",
     "invert",
+    "load",
     "lockin",
     "posterior",
+    "read_curve",
+    "read_curves",
     "read_sweep",
     "read_table",
     "read_trace",
+    "sader",
+    "sensitivity",
     "simulate_experiment",
+    "tapping",
     "write_table",
 ]

@@ -10,6 +10,7 @@ or on the way. There, and where there is no steady orbit, the gradient is NaN an
 """
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -30,9 +31,11 @@ from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem
 from afm_jax.impact.first_impact import Flight, flight_gap
 from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact, middle_of_contact
+from afm_jax.impact.law import Speeds
 from afm_jax.impact.map import NEAR_GRAZING
 from afm_jax.impact.orbits import amplitudes, near_fold, orbit_state, steady_orbits
 from afm_jax.impact.roots import follow_root, harmless_coordinate
+from afm_jax.results import public_result
 from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem, Rows, measurement_of
 from fitting.parameters import CONTACT_NAMES, NUISANCE_NAMES, PARAMETERS, check_contact_values, model_parameters
 from fitting.tables.table import AmplitudeTable
@@ -73,7 +76,9 @@ def orbit_problem(
         ratio = row.drive_frequency_khz / cantilever.frequency_khz
         amplitude = height_of_free_deflection(amplitude, ratio, cantilever.quality_factor)
     offset = row.offset_nm + problem.nuisance(values, "offset_origin_nm", 0.0)
-    return OrbitProblem(cantilever, Platform(amplitude, row.drive_frequency_khz, offset), impact, row.order)
+    return OrbitProblem(
+        cantilever, Platform(amplitude, row.drive_frequency_khz, offset), impact, jnp.asarray(row.order)
+    )
 
 
 def shown(
@@ -137,17 +142,20 @@ def followed(orbit: OrbitProblem, known: Branch, row: Rows) -> Branch:
     )
 
 
-def branch_near(coordinate: Float[np.ndarray, " lanes"] | Float[Array, " lanes"]) -> Branch:
-    """Return orbits that are taken to be near coordinates; NaN: there is none."""
-    there = jnp.isfinite(coordinate)
-    near = jnp.asarray(coordinate)
-    return Branch(OrbitPlace(near, jnp.zeros_like(near)), there, there.astype(jnp.int32), jnp.zeros_like(there))
+def branch_near(coordinate: Any) -> Branch:
+    """Return orbits that are taken to be near coordinates of shape (lanes,); NaN: there is none."""
+    # NumPy's for NumPy's: every JAX operation outside a compiled program would be compiled by itself
+    numpy: Any = np if isinstance(coordinate, np.ndarray) else jnp
+    coordinate = numpy.asarray(coordinate)
+    there = numpy.isfinite(coordinate)
+    nothing = numpy.zeros_like(there)
+    return Branch(OrbitPlace(coordinate, numpy.zeros_like(coordinate)), there, there.astype(np.int32), nothing)
 
 
 BATCH = 8
 """Sets of parameters that `linearise` takes at once."""
-LANES = 256
-"""Pairs of a set and a row that one program takes."""
+SEARCHED, SOLVED = 128, 1024
+"""Pairs of a set and a row that one program takes: where impacts last, and where each takes a hundredth of that."""
 CENSORED = 3.0
 """Residual of a row where no orbit was seen and the model has a steady one: e^(-9/2), a probability of 1 %."""
 
@@ -191,8 +199,8 @@ def linearise(
     """Return residuals, their Jacobian (forward mode through the implicit roots) and predictions for several sets.
 
     Three programs share the work, so that each is compiled once and run only where it is needed: what an impact does at
-    every set, where the orbits are, and the amplitudes with their slopes there. Pairs of a set and a row are taken
-    `LANES` at a time: the same programs serve tables of every size.
+    every set, where the orbits are, and the amplitudes with their slopes there. Pairs of a set and a row are taken a
+    fixed number at a time: the same programs serve tables of every size.
 
     Args:
         values: the parameters' values, at most `BATCH` sets.
@@ -205,8 +213,7 @@ def linearise(
     values = np.asarray(values)
     sets, count = values.shape
     rows = measurement.rows.order.shape[0]
-    filled = np.concatenate([values, np.repeat(values[-1:], BATCH - sets, axis=0)])
-    impacts = impacts_of(filled, measurement, problem)
+    filled, impacts = filled_up(values, measurement, problem)
     whole = _in_lanes(filled, sets, impacts, measurement, problem, near)
     misfit, unseen = np.asarray(whole.misfit).reshape(sets, -1), np.asarray(whole.unseen)
     strength = 1.0 / np.asarray(measurement.constraint_error)
@@ -218,6 +225,35 @@ def linearise(
         jacobian=np.concatenate([flat, np.zeros((sets, rows, count)), pulls], axis=1),
         prediction=whole.prediction,
     )
+
+
+def warm_up(values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem) -> None:
+    """Compile the two large programs of `linearise`, or read them from the cache, side by side.
+
+    Args:
+        values: some values of the parameters.
+        measurement: what will be compared with.
+        problem: the model.
+    """
+    filled, impacts = filled_up(np.asarray(values)[None], measurement, problem)
+    index = np.zeros(_lanes(problem), dtype=int)
+    rows = jax.tree.map(lambda column: np.asarray(column)[index], measurement.rows)
+    some = measurement._replace(rows=rows)
+    nowhere = branch_near(np.full(index.shape, np.nan))
+
+    def in_thread(program: Callable[..., Any], *more: Any) -> None:
+        # what was switched on for one thread alone is not for another
+        with jax.enable_x64(True):  # noqa: FBT003
+            jax.block_until_ready(program(filled, impacts, index, some, problem, *more))
+
+    with ThreadPoolExecutor(1) as pool:
+        other = pool.submit(in_thread, linearise_pairs, nowhere)
+        in_thread(located)
+        other.result()
+
+
+def _lanes(problem: Problem) -> int:
+    return SEARCHED if problem.lasting else SOLVED
 
 
 def _in_lanes(
@@ -232,17 +268,23 @@ def _in_lanes(
     rows = measurement.rows.order.shape[0]
     columns = jax.tree.map(np.asarray, measurement.rows)
     known = None if near is None else np.broadcast_to(np.asarray(near), (sets, rows)).ravel()
+    lanes = _lanes(problem)
     blocks = []
-    for begin in range(0, sets * rows, LANES):
+    for begin in range(0, sets * rows, lanes):
         # the last block is filled up with the last pair
-        lane = np.minimum(np.arange(begin, begin + LANES), sets * rows - 1)
+        lane = np.minimum(np.arange(begin, begin + lanes), sets * rows - 1)
         some = measurement._replace(rows=jax.tree.map(lambda column, row=lane % rows: column[row], columns))
         index = lane // rows
         branch = branch_near(known[lane]) if known is not None else located(filled, impacts, index, some, problem)
-        blocks.append(jax.tree.map(np.asarray, linearise_pairs(filled, impacts, index, some, problem, branch)))
-    return jax.tree.map(
-        lambda *parts: np.concatenate(parts)[: sets * rows].reshape(sets, rows, *parts[0].shape[1:]), *blocks
-    )
+        # not waited for: blocks are worked on side by side
+        blocks.append(linearise_pairs(filled, impacts, index, some, problem, branch))
+
+    def whole(*parts):
+        return np.concatenate([np.asarray(part) for part in parts])[: sets * rows].reshape(
+            sets, rows, *parts[0].shape[1:]
+        )
+
+    return jax.tree.map(whole, *blocks)
 
 
 class ImpactSlopes(NamedTuple):
@@ -267,8 +309,7 @@ def impact_slopes(
     The derivatives are those along a direction in which the impact itself is changed, put where those by the first
     parameter would be.
     """
-    filled = np.repeat(np.asarray(values)[None], BATCH, axis=0)
-    impacts = impacts_of(filled, measurement, problem)
+    filled, impacts = filled_up(np.asarray(values)[None], measurement, problem)
     still = jax.tree.map(lambda leaf: np.zeros(leaf.shape), impacts.slopes)
 
     def along(where: Callable[[Any], Any], turn: float) -> tuple[np.ndarray, np.ndarray]:
@@ -304,11 +345,49 @@ class _Impacts(NamedTuple):
     impact: LawImpact | TabulatedImpact
     slopes: LawImpact | TabulatedImpact
 
+    def first(self) -> "_Impacts":
+        """Return those of the first set, without their leading axis."""
+        return jax.tree.map(lambda leaf: np.asarray(leaf)[0], self)
+
+
+def filled_up(
+    values: Float[np.ndarray, "sets p"], measurement: Measurement, problem: Problem
+) -> tuple[Float[np.ndarray, "batch p"], _Impacts]:
+    """Return sets of values, filled up to `BATCH`, and their impacts."""
+    filled = np.concatenate([values, np.repeat(values[-1:], BATCH - len(values), axis=0)])
+    # an impact knows no rows: one program for tables of every size
+    rows = jax.tree.map(lambda column: np.asarray(column)[:0], measurement.rows)
+    return filled, jax.tree.map(np.asarray, impacts_of(filled, measurement._replace(rows=rows), problem))
+
+
+def impact_at(values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem) -> _Impacts:
+    """Return the law, or the table of the contact, at one set of values, with its slopes, by the shared program."""
+    return filled_up(np.asarray(values)[None], measurement, problem)[1].first()
+
 
 @partial(jax.jit, static_argnames="problem")
 def impacts_of(values: Float[Array, "sets p"], measurement: Measurement, problem: Problem) -> _Impacts:
     """Return the law, or the table of the contact, of several sets of values."""
     return _Impacts(*jax.vmap(lambda v: _impact_and_slopes(v, measurement, problem))(values))
+
+
+class Free(NamedTuple):
+    """What an impact does to a free tip: at coordinates of shape (n,), and at capture; us and nm/us."""
+
+    speeds: Speeds
+    hertz_time: Float[Array, " n"]
+    lowest: Float[Array, ""]
+    capture_speed: Float[Array, ""]
+    """Just above capture."""
+    length: Float[Array, ""]
+
+
+@jax.jit
+def free_impacts(impact: LawImpact | TabulatedImpact, coordinate: Float[Array, " n"]) -> Free:
+    """Return what an impact does to free tips."""
+    speeds = jax.vmap(impact.speeds)(coordinate)
+    just_above = impact.speeds(impact.lowest * (1.0 + 1e-9)).approach
+    return Free(speeds, impact.hertz_time(speeds.approach), impact.lowest, just_above, impact.length)
 
 
 @partial(jax.jit, static_argnames="problem")
@@ -415,6 +494,7 @@ SLOW_GRAZE = "the impact grazes the platform: its approach is slower than a thou
 GRAZE_ON_THE_WAY = "the flight grazes the platform on the way: a small change makes another impact there"
 
 
+@public_result()
 @dataclass(frozen=True)
 class AmplitudeGradients:
     """Predicted amplitudes of a table's rows, peak and lock-in, and their derivatives.

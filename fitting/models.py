@@ -19,6 +19,8 @@ from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from fitting.parameters import CONTACT_NAMES, DELAY, LAW, NUISANCE_NAMES, PARAMETERS, Parameter
 from fitting.tables.table import AmplitudeTable
 
+AnyArray = Array | np.ndarray
+"""JAX's within its programs, NumPy's outside."""
 Numbers = Float[np.ndarray, "..."] | float
 """Arrays, and the NumPy scalars that come of taking one element of them."""
 
@@ -139,15 +141,15 @@ class Rows(NamedTuple):
     the driven tip does not come near the sample.
     """
 
-    order: Float[Array, " rows"]
-    drive_frequency_khz: Float[Array, " rows"]
-    drive_amplitude_nm: Float[Array, " rows"]
-    offset_nm: Float[Array, " rows"]
-    amplitude_nm: Float[Array, "rows k"]
-    error_nm: Float[Array, "rows k"]
-    measured: Bool[Array, "rows k"]
-    no_orbit: Bool[Array, " rows"]
-    free: Bool[Array, " rows"]
+    order: Float[AnyArray, " rows"]
+    drive_frequency_khz: Float[AnyArray, " rows"]
+    drive_amplitude_nm: Float[AnyArray, " rows"]
+    offset_nm: Float[AnyArray, " rows"]
+    amplitude_nm: Float[AnyArray, "rows k"]
+    error_nm: Float[AnyArray, "rows k"]
+    measured: Bool[AnyArray, "rows k"]
+    no_orbit: Bool[AnyArray, " rows"]
+    free: Bool[AnyArray, " rows"]
 
 
 class Measurement(NamedTuple):
@@ -163,9 +165,9 @@ class Measurement(NamedTuple):
 
     rows: Rows
     cantilever: Cantilever
-    constraint_value: Float[Array, " p"]
-    constraint_error: Float[Array, " p"]
-    contact: dict[str, Float[Array, ""]]
+    constraint_value: Float[AnyArray, " p"]
+    constraint_error: Float[AnyArray, " p"]
+    contact: dict[str, Float[AnyArray, ""]]
 
 
 def constraints_of(
@@ -199,18 +201,20 @@ def measurement_of(
         known.get(name, (parameter.reference, np.inf))
         for name, parameter in zip(problem.names, problem.parameters, strict=True)
     ]
-    contact = {name: jnp.asarray(float(value)) for name, value in (fixed or {}).items() if name in CONTACT_NAMES}
+    contact: dict[str, Any] = {
+        name: np.asarray(float(value)) for name, value in (fixed or {}).items() if name in CONTACT_NAMES
+    }
     cantilever = Cantilever(table.free_frequency_khz, table.quality_factor, table.mass_ng)
     rows = rows_of(table)
     if table.tapping:
         reach = reach_of(rows, cantilever, table.drive)
         hit = np.asarray(rows.measured) & (reach != Reach.ATTRACTED)[:, None]
-        rows = rows._replace(measured=jnp.asarray(hit), free=jnp.asarray(reach == Reach.FREE))
+        rows = rows._replace(measured=hit, free=reach == Reach.FREE)
     return Measurement(
         rows=rows,
         cantilever=cantilever,
-        constraint_value=jnp.asarray([float(value) for value, _ in pairs]),
-        constraint_error=jnp.asarray([float(error) for _, error in pairs]),
+        constraint_value=np.array([float(value) for value, _ in pairs]),
+        constraint_error=np.array([float(error) for _, error in pairs]),
         contact=contact,
     )
 
@@ -227,21 +231,21 @@ def rows_of(table: AmplitudeTable) -> Rows:
     def side_by_side(columns):
         return np.stack([padded(column, np.nan) for column in columns.T], axis=1)
 
-    # NumPy up to here: every JAX operation outside a compiled program would be compiled by itself.
+    # NumPy throughout: every JAX operation outside a compiled program would be compiled by itself.
     values, errors = readings_of(table)
     amplitude, error = side_by_side(values), side_by_side(errors)
     measured = np.isfinite(amplitude)
     unseen = np.zeros(table.rows) if table.no_orbit is None else np.nan_to_num(table.no_orbit)
     return Rows(
-        order=jnp.asarray(padded(table.order)),
-        drive_frequency_khz=jnp.asarray(padded(table.drive_frequency_khz)),
-        drive_amplitude_nm=jnp.asarray(padded(table.excitation_nm)),
-        offset_nm=jnp.asarray(padded(table.offset_nm)),
-        amplitude_nm=jnp.asarray(np.where(measured, amplitude, 1.0)),
-        error_nm=jnp.asarray(np.where(measured, error, 1.0)),
-        measured=jnp.asarray(measured),
-        no_orbit=jnp.asarray(padded(unseen, 0.0) > 0.0),
-        free=jnp.zeros(size, dtype=bool),
+        order=padded(table.order),
+        drive_frequency_khz=padded(table.drive_frequency_khz),
+        drive_amplitude_nm=padded(table.excitation_nm),
+        offset_nm=padded(table.offset_nm),
+        amplitude_nm=np.where(measured, amplitude, 1.0),
+        error_nm=np.where(measured, error, 1.0),
+        measured=measured,
+        no_orbit=padded(unseen, 0.0) > 0.0,
+        free=np.zeros(size, dtype=bool),
     )
 
 

@@ -32,9 +32,9 @@ def rows(table: AmplitudeTable, keep: slice | np.ndarray, **changes: Any) -> Amp
 
 
 def with_amplitudes(table: AmplitudeTable, amplitude: np.ndarray, error: np.ndarray, **changes: Any) -> AmplitudeTable:
-    """Return a table with other peak and lock-in amplitudes and their errors, both of shape (rows, 2)."""
+    """Return a table with other peak and lock-in amplitudes and their errors, both of shape (rows, 2); no phases."""
     return dataclasses.replace(
-        table,
+        dataclasses.replace(table, phase_deg=None, phase_error_deg=None),
         peak_amplitude_nm=amplitude[:, 0],
         lockin_amplitude_nm=amplitude[:, 1],
         peak_amplitude_error_nm=error[:, 0],

@@ -143,8 +143,8 @@ MUTATIONS = {
         "tests/test_polynomial_roots.py::test_a_close_pair_is_told_apart",
     ),
     "air that drives a contact": Mutation(
-        "change - 2.0 * air",
-        "change + 2.0 * air",
+        "deep * change - air",
+        "deep * change + air",
         f"{LASTING}test_air_takes_what_an_integrated_damped_contact_loses",
     ),
     "lead that a push lengthens": Mutation(

@@ -8,17 +8,16 @@ orbits are where cosine and sine of the phase, from two linear equations, lie on
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 
 from tests.brute_force import Floats
 from tests.reference_flight import Parameters, constants, outgoing, propagator
-from tests.reference_hertz import under_pull
+from tests.reference_hertz import rational
 
 BRIDGE_NM = 4.7
 SPEEDS = 40_000
-PULLS = np.linspace(-3.0, 4.0, 141)
-LASTS, DEPTH = (CubicSpline(PULLS, column) for column in np.array([under_pull(float(k)) for k in PULLS]).T)
-"""Duration and indentation of a Hertz contact under a pull, from quadratures."""
+PULLS = (-3.0, 4.0)
+SERIES = rational(6, *PULLS)
+"""Duration and indentation of a Hertz contact under a pull in this range."""
 
 
 class Impacts(NamedTuple):
@@ -49,11 +48,13 @@ def closing_impacts(p: Parameters, order: int, approach: Floats) -> Impacts:
         bend = -k.amplitude * k.drive**2 * np.cos(middle)
         jerk = (k.drive**2 - k.free**2) * speed - 2.0 * k.decay * bend
         g, j = pull * lasting / approach, jerk * lasting**2 / approach
-        longer, depth = LASTS(np.clip(g, -3.0, 4.0)), DEPTH(np.clip(g, -3.0, 4.0))
-        air = 2.0 * (longer - 1.2 * np.clip(g, -3.0, 4.0) * depth) / 1.8
-        gain = 2.0 * depth * j + 0.027 * j**2 - 2.0 * air * k.decay * lasting
+        kappa = np.clip(g, *PULLS)
+        slope, deep, over = (np.polynomial.polynomial.polyval(kappa, row) for row in SERIES)
+        longer, depth = 1.0 + kappa * slope / over, deep / over
+        air = 2.0 * (longer - 1.2 * kappa * depth) / 1.8
+        gain = 2.0 * depth * j - 2.0 * air * k.decay * lasting
         rebound = np.sqrt(np.maximum(free**2 + gain * approach**2, 0.01 * free**2))
-        longer = longer - 1.0 - 0.0213 * j + 0.0267 * g * j
+        longer = longer - 1.0
         held = _later(free, BRIDGE_NM, pull) - _later(approach, BRIDGE_NM, pull)
         delay = straight + longer * lasting - lead / (1.3 * BRIDGE_NM) * held
     return Impacts(approach, rebound, delay, *_phase(p, order, approach, rebound, delay))

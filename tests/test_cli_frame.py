@@ -15,6 +15,7 @@ import jax
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from rich.table import Table
 
 import afm_jax
 import fitting
@@ -22,6 +23,9 @@ from afm_jax import strict_json
 from afm_jax.cli import main
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.values import PRESET_NAMES, example_path
+from afm_jax.scenefile.presets import PRESETS
+from afm_jax.words import text_table
 from tests.fresh_python import python
 
 HEAVY = "{'jax', 'numpy', 'matplotlib', 'equinox', 'rich'}"
@@ -186,6 +190,59 @@ def test_strict_json_knows_jax_arrays_and_refuses_what_it_does_not_know():
     assert json.loads(strict_json.strict_json(value)) == {"a": [[0.1, None]], "b": [True, None, "x"], "c": "d"}
     with pytest.raises(TypeError):
         strict_json.strict_json({"a": object()})
+
+
+@pytest.mark.parametrize("width", [40, 60, 80])
+def test_text_fits_the_terminal_and_numbers_stay_whole(
+    trial: Callable[..., Result], monkeypatch: pytest.MonkeyPatch, width: int
+):
+    heads = [f"speed of {name} nm/us" for name in "abcdefgh"]
+    rows = [[f"{1e5 * (k + 1) / 7 + row:.9g}" for k in range(8)] for row in range(5)]
+
+    def body(session: Session) -> None:
+        table = Table(title="Speeds of many tips in a sentence that goes on and on")
+        for head in heads:
+            table.add_column(head.replace(" nm", "\nnm"))
+        for row in rows:
+            table.add_row(*row)
+        prose = "12345678.9 " * 20 + "[not markup] " + "end " * 20
+        session.emit({}, table, lambda: "\n".join(text_table(heads, rows)), prose)
+
+    monkeypatch.setenv("COLUMNS", str(width))
+    result = trial(body)
+    assert result.exception is None, result.exception
+    text = result.stdout
+    assert max(map(len, text.splitlines())) <= width
+    words = text.split()
+    assert all(words.count(cell) == 2 for row in rows for cell in row)
+    assert words.count("12345678.9") == 20
+    monkeypatch.delenv("COLUMNS")
+    wide = trial(body).stdout.splitlines()
+    assert sum(all(cell in line for cell in rows[0]) for line in wide) == 2, (
+        "nobody looks at a pipe: the table stays as it is"
+    )
+
+
+def test_presets_are_those_of_the_scene_files_and_are_completed():
+    assert tuple(PRESETS) == PRESET_NAMES
+    context = click.Context(main.main.get_command(click.Context(main.main), "orbits") or main.main)
+    for name in ("orbits", "simulate", "effects", "continue", "lyapunov", "basins", "chart", "fit-law", "collide"):
+        command = main.main.get_command(context, name)
+        assert command is not None
+        kind = next(each.type for each in command.params if each.name == "scene")
+        offered = kind.shell_complete(context, command.params[0], "figure1")
+        assert [item.value for item in offered] == ["figure10", "figure11"]
+        assert kind.shell_complete(context, command.params[0], "my")[0].type == "file"
+
+
+def test_example_is_one_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(tmp_path)
+    table = fitting.read_table(example_path())
+    assert (table.rows, table.phase_deg is not None) == (82, True)
+    for name in ("fit", "invert", "design"):
+        command = main.main.get_command(click.Context(main.main), name)
+        assert command is not None
+        assert "--example" in [option for each in command.params for option in each.opts]
 
 
 def test_result_is_printed_before_it_is_called_not_valid(trial: Callable[..., Result]):

@@ -26,7 +26,7 @@ def records(path: Path) -> list[dict[str, str]]:
 def shortened(path: Path, rows: int, *, without_errors: bool) -> Path:
     """Write the first rows of the bundled table, with or without its columns of errors."""
     comments = [line for line in EXAMPLE.read_text(encoding="utf-8").splitlines() if line.startswith("#")]
-    kept = [name for name in records(EXAMPLE)[0] if not (without_errors and "error" in name)]
+    kept = [name for name in records(EXAMPLE)[0] if not (without_errors and ("error" in name or "phase" in name))]
     cells = [",".join(row[name] for name in kept) for row in records(EXAMPLE)[:rows]]
     path.write_text("\n".join([*comments, ",".join(kept), *cells]) + "\n", encoding="utf-8")
     return path

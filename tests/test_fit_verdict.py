@@ -147,7 +147,7 @@ def test_no_option_makes_a_law_without_delay_a_measurement_of_a_contact(options)
         assert re.search(r"errors would have to be (\d\d[\d.]*) times", reason)
     else:
         assert "neighbouring residuals in the table's order are correlated" in reason
-        # so does how many rows are
+        # likewise, of 55 or of 57 rows
         assert re.search(r"5\d of 57 rows are off by more than 4 errors", reason)
     assert all(parameter.standard_error is None for parameter in result.parameters.values())
     assert all(parameter.interval95 == (None, None) for parameter in result.parameters.values())

@@ -71,16 +71,16 @@ def of_law(pull: float, jerk: float) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-@pytest.mark.parametrize(
-    ("of_pull", "of_jerk"), [(0.35, 0.0), (0.0, 0.35), (0.35, 0.35), (0.35, -0.35), (0.2, 0.1), (2.0, 0.01)]
-)
+@pytest.mark.parametrize(("of_pull", "of_jerk"), [(0.35, 0.0), (0.0, 0.1), (0.35, 0.1), (0.8, -0.1), (2.0, 0.01)])
 def test_corrections_are_those_of_an_integrated_hertz_contact(sign, of_pull, of_jerk):
     pull, jerk = sign * of_pull / HERTZ_TIME, sign * of_jerk / HERTZ_TIME**2
     rebound, duration = integrated(pull, jerk)
     found = of_law(pull, jerk)
-    # exact in the pull, of second order in its change: what is left is of third; the corrections reach 0.08 and 0.3
-    assert found[0] == pytest.approx(rebound, abs=4e-4)
-    assert found[1] / HERTZ_TIME == pytest.approx(duration / HERTZ_TIME, abs=1.5e-3)
+    # exact in the pull, of first order in its change, 0.1 at most; the corrections reach 0.03 and 0.3
+    assert found[0] == pytest.approx(rebound, abs=2e-4)
+    assert found[1] / HERTZ_TIME == pytest.approx(duration / HERTZ_TIME, abs=5e-3)
+    if of_jerk == 0.0:
+        assert found[1] == pytest.approx(duration, rel=1e-6)
 
 
 def test_a_pull_acts_as_on_an_integrated_hertz_contact():

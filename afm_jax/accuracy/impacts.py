@@ -73,7 +73,7 @@ def map_accuracy(
         progress(f"accuracy: {case.name} scene, SciPy")
         rows += [integrator_row(case, starts, tolerance, impacts) for tolerance in scipy_tolerances]
         if not case.chaotic:
-            doubts.append(_reference_error(case, starts, impacts))
+            doubts.append(doubt_of_reference(case, starts, impacts))
     return {
         "rows": rows,
         "reference_error_us": max(doubts),
@@ -194,7 +194,8 @@ def slow_ones_first(case: BenchmarkScene, starts: Starts, impacts: int, lanes: i
     return Starts(starts.time_us[order], starts.velocity_nm_per_us[order])
 
 
-def _reference_error(case: BenchmarkScene, starts: Starts, impacts: int) -> float:
+def doubt_of_reference(case: BenchmarkScene, starts: Starts, impacts: int) -> float:
+    """Return the error of the 50-digit sequence of the first tip, in us."""
     first = Starts(starts.time_us[:1], starts.velocity_nm_per_us[:1])
     states = lane_states(first, iterate_batch(case.scene, first.time_us, first.velocity_nm_per_us, impacts), 0)
     return reference_error(case.scene, tuple(states[0]), states[1:, 0])

@@ -16,6 +16,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.driven import Place, driven_by
 from afm_jax.contact.settings import DrivenSetting, QuickSetting
+from afm_jax.dynamics.iteration import evenly_spread
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.map import iterate_batch
 from afm_jax.motion.contact_motion import cross
@@ -91,23 +92,16 @@ def settled_starts(scene: Scene, batch: int, *, settling: int = 200, spread: flo
     period = scene.platform.period_us
     time = jnp.mod(rows.time_us[lane, -1], period)
     rebound = rows.velocity_after_nm_per_us[lane, -1] - scene.platform.velocity(rows.time_us[lane, -1])
-    first, second = _evenly_spread(batch)
+    first, second = evenly_spread(batch).T
     moved = time + spread * period * (first - 0.5)
     return Starts(moved, scene.platform.velocity(moved) + rebound * (1.0 + spread * (second - 0.5)))
 
 
 def scattered_starts(scene: Scene, batch: int) -> Starts:
     """Return starts all over the drive period, rebound speeds from 0.5 to 4 times the platform's top speed."""
-    first, second = _evenly_spread(batch)
+    first, second = evenly_spread(batch).T
     time = scene.platform.period_us * first
     return Starts(time, scene.platform.velocity(time) + (0.5 + 3.5 * second) * scene.platform.top_speed_nm_per_us)
-
-
-def _evenly_spread(batch: int) -> tuple[Float[Array, " batch"], Float[Array, " batch"]]:
-    """Return pairs that fill the unit square evenly (multiples of the plastic number's powers, modulo 1)."""
-    index = jnp.arange(1.0, batch + 1.0)
-    plastic = 1.324717957244746
-    return jnp.mod(index / plastic, 1.0), jnp.mod(index / plastic**2, 1.0)
 
 
 def cast(scene: Scene, dtype: str) -> Scene:

@@ -6,9 +6,9 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.cli.accuracy_scene import scene_study
-from afm_jax.cli.session import Session, with_session, write_json
-from afm_jax.whole_files import write_whole
+from afm_jax.cli.accuracy_scene import scene_study, write_study
+from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.values import PRESET_NAMES, SceneName
 from afm_jax.words import known
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ WANTED = [1e-3, 1e-6, 1e-9, 1e-11]
 
 
 @click.command()
-@click.argument("study", required=False, metavar="[map|collide|SCENE.toml]")
+@click.argument("study", required=False, metavar="[map|collide|SCENE.toml|PRESET]", type=SceneName("map", "collide"))
 @click.option(
     "--wanted-error-us",
     type=click.FloatRange(min=0.0, min_open=True),
@@ -186,13 +186,7 @@ def command(
     cheapest = cheapest_settings(result["rows"], wanted_error_us)
     payload = {**result, "wanted_error_us": wanted_error_us, "cheapest": cheapest}
     session.write_table("accuracy.csv", result["rows"], COLUMNS)
-    if session.out is not None:
-        from afm_jax.plots.accuracy import accuracy_figure  # noqa: PLC0415
-        from afm_jax.plots.picture_style import png_of  # noqa: PLC0415
-
-        write_json(session.out / "accuracy.json", payload)
-        write_whole(session.out / "accuracy.png", png_of(accuracy_figure(result["rows"], wanted_error_us)))
-        session.note(f"wrote {session.out / 'accuracy.json'} and {session.out / 'accuracy.png'}")
+    write_study(session, payload, lambda plots: plots.accuracy_figure(result["rows"], wanted_error_us))
     session.emit(
         payload,
         accuracy_table(result["rows"]),
@@ -216,13 +210,7 @@ def overview_study(session: Session, *, quick: bool) -> None:
     choices = cheapest(rows, WANTED)
     payload = {"rows": rows, "references": references, "cheapest": choices}
     session.write_table("accuracy.csv", rows, OVERVIEW_COLUMNS)
-    if session.out is not None:
-        from afm_jax.plots.accuracy import overview_figure  # noqa: PLC0415
-        from afm_jax.plots.picture_style import save  # noqa: PLC0415
-
-        write_json(session.out / "accuracy.json", payload)
-        save(overview_figure(rows, references), session.out / "accuracy.png")
-        session.note(f"wrote {session.out / 'accuracy.json'} and {session.out / 'accuracy.png'}")
+    write_study(session, payload, lambda plots: plots.overview_figure(rows, references))
     told = [
         f"{problem}: error of the {known['error_of']}, against {known['reference']}, itself known to "
         f"{known['reference_error']:.0e}"
@@ -248,11 +236,7 @@ def overview_table(choices: Sequence[dict[str, Any]]) -> "Table":
 
 def is_scene(name: str) -> bool:
     """Return whether a name can only be a scene's: a file, a path, or a preset."""
-    if name.endswith(".toml") or Path(name).exists():
-        return True
-    from afm_jax.scenefile.presets import PRESETS  # noqa: PLC0415
-
-    return name in PRESETS
+    return name.endswith(".toml") or Path(name).exists() or name in PRESET_NAMES
 
 
 def collide_study(session: Session, accuracy: float, *, quick: bool) -> None:
@@ -266,13 +250,7 @@ def collide_study(session: Session, accuracy: float, *, quick: bool) -> None:
     best = cheapest_collision(result["rows"], accuracy)
     payload = {**result, "accuracy": accuracy, "cheapest": best}
     session.write_table("accuracy.csv", result["rows"], COLLIDE_COLUMNS)
-    if session.out is not None:
-        from afm_jax.plots.accuracy import collide_accuracy_figure  # noqa: PLC0415
-        from afm_jax.plots.picture_style import png_of  # noqa: PLC0415
-
-        write_json(session.out / "accuracy.json", payload)
-        write_whole(session.out / "accuracy.png", png_of(collide_accuracy_figure(result["rows"])))
-        session.note(f"wrote {session.out / 'accuracy.json'} and {session.out / 'accuracy.png'}")
+    write_study(session, payload, lambda plots: plots.collide_accuracy_figure(result["rows"]))
     sentence = (
         f"No contestant reaches {accuracy:g}."
         if best is None

@@ -1,12 +1,14 @@
 """`afm-jax accuracy SCENE.toml`: error against time of one scene's settings, and of simpler models of it."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from afm_jax.cli.session import Session, write_json
 from afm_jax.words import known
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from rich.table import Table
 
     from afm_jax.apparatus.scene import Scene
@@ -54,14 +56,20 @@ def scene_study(session: Session, name: str, contacts: int, *, quick: bool) -> N
     payload = {**result, "scene": name, "law": law}
     session.write_table("accuracy.csv", result["rows"], COLUMNS)
     session.write_table("ladder.csv", result["ladder"], LADDER_COLUMNS)
-    if session.out is not None:
-        from afm_jax.plots.accuracy import scene_accuracy_figure  # noqa: PLC0415
-        from afm_jax.plots.picture_style import save  # noqa: PLC0415
-
-        write_json(session.out / "accuracy.json", payload)
-        save(scene_accuracy_figure(result), session.out / "accuracy.png")
-        session.note(f"wrote {session.out / 'accuracy.json'} and {session.out / 'accuracy.png'}")
+    write_study(session, payload, lambda plots: plots.scene_accuracy_figure(result))
     session.emit(payload, settings_table(result), reference_sentence(result), ladder_table(result), *_reasons(result))
+
+
+def write_study(session: Session, payload: dict[str, Any], draw: "Callable[[ModuleType], Figure]") -> None:
+    """Write a study, whole, and its picture, which a function draws with `afm_jax.plots.accuracy`."""
+    if session.out is None:
+        return
+    from afm_jax.plots import accuracy as plots  # noqa: PLC0415
+    from afm_jax.plots.picture_style import save  # noqa: PLC0415
+
+    write_json(session.out / "accuracy.json", payload)
+    save(draw(plots), session.out / "accuracy.png")
+    session.note(f"wrote {session.out / 'accuracy.json'} and {session.out / 'accuracy.png'}")
 
 
 def scene_to_study(name: str) -> "tuple[Scene, State]":

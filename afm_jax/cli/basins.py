@@ -6,7 +6,7 @@ import click
 
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import Ends, PictureFormat, scene_and_start
+from afm_jax.cli.values import Ends, PictureFormat, SceneName, scene_and_start
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -35,7 +35,7 @@ class Grid(click.ParamType):
 
 
 @click.command()
-@click.argument("scene", metavar="SCENE.toml|PRESET")
+@click.argument("scene", metavar="SCENE.toml|PRESET", type=SceneName())
 @click.option("--grid", type=Grid(), default="300x300", show_default=True, help="Drive phases x rebound speeds.")
 @click.option("--speeds", type=Ends(), metavar="LOW:HIGH", help="Range of the rebound speed, in nm/us.")
 @click.option("--picture", type=PictureFormat(), default="png", show_default=True, help="png, pdf or svg.")

@@ -20,10 +20,14 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 
-FIT_COLUMNS = ("model", "rows", "first_s", "warm_s", "valid", "chi2", "degrees_of_freedom")
+FIT_COLUMNS = (
+    *("model", "rows", "first_s", "first_processor_s", "warm_s", "warm_processor_s"),
+    *("valid", "chi2", "degrees_of_freedom"),
+)
 """What `bench_fits.csv` tells of a fit."""
 _MODELS = ("law", "law+delay", "viscous+delay", "contact")
-_BOUNDS = {"law+delay": 10.0, "viscous+delay": 10.0, "contact": 60.0}
+_BOUNDS = {"law": (12.0, 2.5), "law+delay": (20.0, 4.0), "viscous+delay": (20.0, 4.0), "contact": (45.0, 10.0)}
+"""Seconds that a fit may take on two idle cores, with an empty and with a warm cache of programs."""
 
 
 def fit_rows(*, quick: bool) -> tuple[list[dict[str, Any]], list[tuple[str, float | None, float]]]:
@@ -31,9 +35,11 @@ def fit_rows(*, quick: bool) -> tuple[list[dict[str, Any]], list[tuple[str, floa
     from fitting.benchmark import time_fits  # noqa: PLC0415
 
     rows = time_fits(("law",) if quick else _MODELS, rows=20 if quick else 100)
-    found = {row["model"]: row["warm_s"] for row in rows}
+    found = {} if quick else {row["model"]: row for row in rows}
     return rows, [
-        (f"s, fit of 100 rows, {model}, warm cache", found.get(model), bound) for model, bound in _BOUNDS.items()
+        (f"s, fit of 100 rows, {model}, {when}", found.get(model, {}).get(column), bound)
+        for model, bounds in _BOUNDS.items()
+        for when, column, bound in zip(("first time", "warm cache"), ("first_s", "warm_s"), bounds, strict=True)
     ]
 
 
@@ -42,11 +48,12 @@ def fit_table(rows: Sequence[dict[str, Any]]) -> "Table":
     from rich.table import Table  # noqa: PLC0415
 
     table = Table(title="fits from the shell", title_justify="left")
-    for name in ("model", "rows", "first time, s", "warm cache, s", "chi2/dof"):
+    for name in ("model", "rows", "first time, s", "processor s", "warm cache, s", "processor s", "chi2/dof"):
         table.add_column(name, justify="left" if name == "model" else "right")
     for row in rows:
         goodness = f"{row['chi2']:.1f}/{row['degrees_of_freedom']}"
-        table.add_row(row["model"], str(row["rows"]), f"{row['first_s']:.1f}", f"{row['warm_s']:.1f}", goodness)
+        seconds = [f"{row[name]:.1f}" for name in FIT_COLUMNS if name.endswith("_s")]
+        table.add_row(row["model"], str(row["rows"]), *seconds, goodness)
     return table
 
 
@@ -76,6 +83,43 @@ def dynamics_table(rows: Sequence[dict[str, Any]]) -> "Table":
     for row in rows:
         numbers = [known(row[name]) for name in ("seconds", "processor_seconds", "first_s", "beside_seconds", "ratio")]
         table.add_row(row["what"], row["work"], *numbers)
+    return table
+
+
+SWEEPS = {"sizes": [10_000, 100_000, 1_000_000, 10_000_000], "points": 2_000_000, "processes": [1, 2, 4]}
+SWEEPS_QUICK = {"sizes": [2000], "points": 0, "processes": []}
+SWEEP_COLUMNS = (
+    "what",
+    "points",
+    "processes",
+    "devices",
+    "seconds",
+    "microseconds_per_point",
+    "processor_microseconds_per_point",
+    "peak_memory_mib",
+)
+"""What `bench_sweep.csv` tells of a measurement."""
+
+
+def measure_sweeps(cores: int, *, quick: bool) -> tuple[list[dict[str, Any]], list[tuple[str, float | None, float]]]:
+    """Measure sweeps over law scenes; return the rows, and the aims with their bounds."""
+    from afm_jax.bench.sweeps import aims as sweep_aims  # noqa: PLC0415
+    from afm_jax.bench.sweeps import sweep_rows  # noqa: PLC0415
+
+    rows = sweep_rows(**(SWEEPS_QUICK if quick else SWEEPS), cores=cores)
+    return rows, sweep_aims(rows)
+
+
+def sweep_table(rows: Sequence[dict[str, Any]]) -> "Table":
+    """Return the measurements as a table for the terminal."""
+    from rich.table import Table  # noqa: PLC0415
+
+    table = Table(title="sweeps over law scenes, one order", title_justify="left")
+    for name in ("what", "scenes", "processes", "devices", "s", "us/scene", "processor us/scene", "peak MiB"):
+        table.add_column(name, justify="left" if name == "what" else "right")
+    for row in rows:
+        counts = [f"{row[name]:,}" for name in ("points", "processes", "devices")]
+        table.add_row(row["what"], *counts, *(known(row[name]) for name in SWEEP_COLUMNS[4:]))
     return table
 
 
@@ -219,8 +263,8 @@ CONTACT_COLUMNS = (
 )
 @click.option(
     "--only",
-    type=click.Choice(["map", "contact", "scenes", "dynamics", "fits"]),
-    help="The impact map alone, the contact of free tips, driven contacts, charts and basins, or fits from the shell.",
+    type=click.Choice(["map", "contact", "scenes", "dynamics", "sweep", "fits"]),
+    help="The impact map alone, the contact of free tips, driven contacts, charts, sweeps, or fits from the shell.",
 )
 @with_session
 def command(session: Session, batches: tuple[int, ...], only: str | None, *, quick: bool) -> None:
@@ -230,7 +274,7 @@ def command(session: Session, batches: tuple[int, ...], only: str | None, *, qui
     solve_ivp with events on the same problems. Errors of impact times are against 50 digits, those of contacts against
     finer settings. Times are the best of several repetitions, compilation apart; the machine should have nothing else
     to do. Fits of 100 rows are timed as commands. With --out bench.csv, bench_contact.csv, bench_scenes.csv,
-    bench_dynamics.csv, bench_fits.csv and bench.json.
+    bench_dynamics.csv, bench_sweep.csv, bench_fits.csv and bench.json.
     """
     session.start_computing()
     from afm_jax.bench.timing import available_cores  # noqa: PLC0415
@@ -263,6 +307,11 @@ def command(session: Session, batches: tuple[int, ...], only: str | None, *, qui
             payload["aims"] += [aim_of(name, value, at_most=bound) for name, value, bound in reached]
             tables.append(dynamics_table(payload["dynamics_rows"]))
             session.write_table("bench_dynamics.csv", payload["dynamics_rows"], DYNAMICS_COLUMNS)
+        if only in {None, "sweep"}:
+            payload["sweep_rows"], reached = measure_sweeps(cores, quick=quick)
+            payload["aims"] += [aim_of(name, value, at_most=bound) for name, value, bound in reached]
+            tables.append(sweep_table(payload["sweep_rows"]))
+            session.write_table("bench_sweep.csv", payload["sweep_rows"], SWEEP_COLUMNS)
         if only in {None, "fits"}:
             payload["fit_rows"], reached = fit_rows(quick=quick)
             payload["aims"] += [aim_of(name, value, at_most=bound) for name, value, bound in reached]

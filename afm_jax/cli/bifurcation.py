@@ -7,7 +7,7 @@ import click
 
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import PictureFormat, ranges_of, scene_and_start
+from afm_jax.cli.values import PictureFormat, SceneName, ranges_of, scene_and_start
 
 if TYPE_CHECKING:
     from afm_jax.dynamics.bifurcations import Sweep
@@ -18,7 +18,7 @@ _LISTED = 6
 
 
 @click.command()
-@click.argument("scene", metavar="SCENE.toml|PRESET")
+@click.argument("scene", metavar="SCENE.toml|PRESET", type=SceneName())
 @click.option("--parameter", metavar="P=a:b:n", required=True, help="A parameter of the scene file and its values.")
 @click.option("--both", is_flag=True, help="Sweep up and then down, so that hysteresis shows.")
 @click.option("--down", is_flag=True, help="Sweep down instead of up.")

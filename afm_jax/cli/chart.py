@@ -5,8 +5,9 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from afm_jax.cli.main import NotValid
+from afm_jax.cli.orbits import refuse_other_than_law
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import PictureFormat, ranges_of, scene_and_start
+from afm_jax.cli.values import PictureFormat, SceneName, ranges_of, scene_and_start
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -18,7 +19,7 @@ _MOST_POINTS = 4_000_000
 
 
 @click.command()
-@click.argument("scene", metavar="SCENE.toml|PRESET")
+@click.argument("scene", metavar="SCENE.toml|PRESET", type=SceneName())
 @click.option("--x", metavar="P=a:b:n", required=True, help="A parameter of the scene file: the chart's columns.")
 @click.option("--y", metavar="P=a:b:n", required=True, help="Another one: its rows.")
 @click.option("--orders", type=click.IntRange(1, 100), default=8, show_default=True, help="Highest order N.")
@@ -43,6 +44,7 @@ def command(session: Session, *, scene: str, x: str, y: str, orders: int, zarr: 
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
     loaded, _ = scene_and_start(scene)
+    refuse_other_than_law(loaded, scene)
     across, up = ranges = ranges_of(scene, loaded, [x, y], counted=True)
     if len(across.values) * len(up.values) > _MOST_POINTS:
         raise ValueError(f"{across} and {up} are more than {_MOST_POINTS} points: chart fewer")
@@ -55,7 +57,7 @@ def command(session: Session, *, scene: str, x: str, y: str, orders: int, zarr: 
                 last_order=orders,
                 report=session.progress("points"),
             )
-    except (ValueError, TypeError) as error:
+    except ValueError as error:
         raise ValueError(f"{scene}: {error}") from error
     if session.out is not None:
         _write(session, chart, across, up, zarr=zarr)

@@ -2,11 +2,11 @@
 
 import functools
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
+from afm_jax.cli.values import SceneName, scene_and_start
 from afm_jax.contact.parameters import (
     CONTACT_PARAMETERS,
     CONTACT_RANGES,
@@ -32,7 +32,7 @@ class ChosenContact(NamedTuple):
 class ContactOptions(NamedTuple):
     """The options as they were given; None and False where they were not."""
 
-    scene: Path | None
+    scene: str | None
     parameters: Mapping[str, float]
     left_out: tuple[str, ...]
     mass_ng: float | None
@@ -42,7 +42,7 @@ def with_contact_options(function: Callable[..., Any]) -> Callable[..., Any]:
     """Give a command the argument SCENE.toml and the options of a contact; it gets them as `contact_options`."""
 
     @functools.wraps(function)
-    def command(*args: Any, scene: Path | None, mass_ng: float | None, **options: Any) -> Any:
+    def command(*args: Any, scene: str | None, mass_ng: float | None, **options: Any) -> Any:
         parameters = {name: value for name in PAPER if (value := options.pop(name)) is not None}
         left_out = tuple(name for name in (*REMOVABLE_EFFECTS, *REQUIRED_EFFECTS) if options.pop(f"no_{name}"))
         chosen = ContactOptions(scene, parameters, left_out, mass_ng)
@@ -58,7 +58,7 @@ def with_contact_options(function: Callable[..., Any]) -> Callable[..., Any]:
     for parameter in CONTACT_PARAMETERS[::-1]:
         text = f"{parameter.meaning}; paper: {parameter.default:g}."
         command = click.option(_option(parameter.name), type=float, metavar="X", help=text)(command)
-    argument = click.argument("scene", metavar="[SCENE.toml]", required=False, type=click.Path(path_type=Path))
+    argument = click.argument("scene", metavar="[SCENE.toml|PRESET]", required=False, type=SceneName())
     return argument(command)
 
 
@@ -92,13 +92,12 @@ def chosen_contact(options: ContactOptions) -> ChosenContact:
     return ChosenContact(contact, mass, {"effects": list(contact.effects), **numbers})
 
 
-def _of_scene(path: Path) -> tuple[tuple[str, ...], dict[str, float], float]:
+def _of_scene(path: str) -> tuple[tuple[str, ...], dict[str, float], float]:
     """Return effects, parameters and mass of a scene file."""
     from afm_jax.contact.contact import Contact  # noqa: PLC0415
     from afm_jax.scenefile.contact import contact_parameters  # noqa: PLC0415
-    from afm_jax.scenefile.scenefile import load_scene  # noqa: PLC0415
 
-    scene = load_scene(path)
+    scene, _ = scene_and_start(path)
     if not isinstance(scene.interaction, Contact):
         model = "none" if scene.interaction is None else "law"
         raise ValueError(f'{path}: [interaction] model: must be "contact" here, but is "{model}"')  # noqa: TRY004

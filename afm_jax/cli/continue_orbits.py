@@ -8,7 +8,8 @@ import click
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.orbits import IMPACT_COLUMNS, PositiveInteger, impact_rows, orbit_facts, refuse_other_than_law
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import PictureFormat, ranges_of, scene_and_start
+from afm_jax.cli.values import PictureFormat, SceneName, ranges_of, scene_and_start
+from afm_jax.units import TWO_SIDED_95
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -51,7 +52,7 @@ _ENDS = {
 
 
 @click.command(name="continue")
-@click.argument("scene", metavar="SCENE.toml|PRESET")
+@click.argument("scene", metavar="SCENE.toml|PRESET", type=SceneName())
 @click.option("--order", metavar="N", required=True, type=PositiveInteger(), help="Drive periods of the orbit.")
 @click.option(
     "--impacts",
@@ -90,18 +91,21 @@ def command(  # noqa: PLR0913
     """Follow the (m, N) orbits of a scene through a parameter, round folds, by pseudo-arclength.
 
     Folds, period doublings, torus points, grazings and captures are located to rounding; with --second they are
-    followed as curves in two parameters, with cusps and meetings. With --law every special point has a 95 % interval.
-    With --out tables and pictures. Exit code 3 if there is no admissible orbit in the range.
+    followed as curves in two parameters, with cusps and meetings. In a scene with a contact the simulation is closed
+    instead of the map, and curves end where the orbit grazes or is captured. With --law every special point has a
+    95 % interval. With --out tables and pictures. Exit code 3 if there is no admissible orbit in the range.
     """
     session.start_computing()
     from afm_jax.cli.fitted_law import with_fitted_law  # noqa: PLC0415
+    from afm_jax.contact.contact import Contact  # noqa: PLC0415
     from afm_jax.dynamics.continuation import continue_orbits  # noqa: PLC0415
 
     loaded, _ = scene_and_start(scene)
     known = None
     if law is not None:
         loaded, known = with_fitted_law(loaded, law)
-    refuse_other_than_law(loaded, scene)
+    if not isinstance(loaded.interaction, Contact):
+        refuse_other_than_law(loaded, scene)
     first, *others = ranges_of(scene, loaded, [parameter, *([] if second is None else [second])], counted=False)
     try:
         with session.working("following orbits (the first run compiles for some seconds)"):
@@ -112,7 +116,7 @@ def command(  # noqa: PLR0913
 
 
 def _finish(session: Session, found: "Continuation", known: "UncertainParameters | None", picture: str) -> None:
-    from afm_jax.dynamics.bands import WITHIN_95, amplitude_errors, special_errors  # noqa: PLC0415
+    from afm_jax.dynamics.bands import amplitude_errors, special_errors  # noqa: PLC0415
 
     bands = None if known is None else [amplitude_errors(found, branch, known) for branch in found.branches]
     errors = None if known is None else special_errors(found, known)
@@ -132,7 +136,7 @@ def _finish(session: Session, found: "Continuation", known: "UncertainParameters
             "impacts": impact_rows(point.reading),
         }
         if errors is not None:
-            half = WITHIN_95 * float(errors[index])
+            half = TWO_SIDED_95 * float(errors[index])
             row["parameter_error"] = float(errors[index])
             row["interval95"] = [point.parameter - half, point.parameter + half]
         special.append(row)
@@ -140,8 +144,6 @@ def _finish(session: Session, found: "Continuation", known: "UncertainParameters
     reason = None if any(point["admissible"] for point in points) else _why_none(found)
     _write(session, found, points, special, curves)
     payload = {
-        "format": "afm-jax continue",
-        "format_version": 1,
         "order": found.order,
         "impacts": found.impacts,
         "parameter": found.range.path,

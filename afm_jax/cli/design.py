@@ -1,5 +1,7 @@
 """`afm-jax design`: which drives to measure next, and what they will determine."""
 
+from functools import partial
+
 import click
 
 from afm_jax.cli.design_belief import BeliefOptions, believed, with_belief_options
@@ -113,7 +115,7 @@ def command(  # noqa: PLR0913
             amplitudes=amplitudes,
             largest_nm=largest_nm,
         )
-    session.emit(result.to_dict(), design_summary(result))
+    session.emit(result.to_dict(), partial(design_summary, result))
     if session.out is not None:
         for path in write_design(result, session.out, session.write_table):
             session.note(f"wrote {path}")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from afm_jax.cli.values import ValueAndError
+from afm_jax.cli.values import ValueAndError, example_path
 from fitting.parameters import DELAY, LAW, MODELS, NUISANCE_NAMES, NUISANCES, PARAMETERS, model_parameters
 
 if TYPE_CHECKING:
@@ -56,6 +56,10 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
     def command(
         *args: Any, fit: Path | None, measured: Path | None, model: str | None, uncertainty: float, **options: Any
     ) -> Any:
+        if options.pop("example"):
+            if measured is not None:
+                raise click.UsageError("--measured and --example both name a table; give one of them")
+            measured, model = example_path(), model or "law"
         numbers = {name: options.pop(name) for name in _BELONG}
         given = {name: value for name, value in numbers.items() if value not in (None, ())}
         return function(*args, belief_options=BeliefOptions(fit, measured, model, uncertainty, given), **options)
@@ -82,6 +86,7 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
             metavar="CSV",
             help="An amplitude table to add to: it is fitted first.",
         ),
+        click.option("--example", is_flag=True, help="Add to the bundled table: --measured with it, --model law."),
         click.option(
             "--fit",
             type=click.Path(path_type=Path),

@@ -44,8 +44,6 @@ def command(session: Session) -> None:
     if cache.folder is not None and not works:
         complaint = f"{cache.folder}: a program that one process compiled was not found by the next"
     payload = {
-        "format": "afm-jax doctor",
-        "format_version": 1,
         "versions": {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES},
         "platform": platform.platform(),
         "processors": os.cpu_count(),

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import Share
+from afm_jax.cli.values import SceneName, Share
 
 if TYPE_CHECKING:
     from afm_jax.effects.study import EffectStudy
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("scene", metavar="SCENE.toml|PRESET")
+@click.argument("scene", metavar="SCENE.toml|PRESET", type=SceneName())
 @click.option(
     "--accuracy",
     type=Share(),

@@ -4,14 +4,16 @@ Texts of `afm-jax fit`'s options turned into values: `NAME=VALUE`, `NAME=VALUE+-
 """
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from afm_jax.cli.each import fit_tables
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import Ends, Share, parse_around_plus_minus, parse_number
+from afm_jax.cli.values import Ends, Share, example_path, parse_around_plus_minus, parse_number
 from afm_jax.contact.parameters import EFFECTS, REMOVABLE_EFFECTS, idle_without
 from afm_jax.words import text_table
 from fitting.parameters import CONTACT_DEFAULT, DELAY_LAW, LAWS, MODELS, NUISANCE_NAMES
@@ -83,7 +85,7 @@ class Names(click.ParamType):
 
 
 @click.command()
-@click.argument("table", metavar="[TABLE.csv]", required=False, type=click.Path(path_type=Path))
+@click.argument("tables", metavar="[TABLE.csv]...", nargs=-1, type=click.Path(path_type=Path))
 @click.option(
     "--model",
     default="law",
@@ -137,9 +139,11 @@ class Names(click.ParamType):
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of everything random.")
 @click.option("--example", is_flag=True, help="Fit the bundled table instead of a file.")
+@click.option("--each", is_flag=True, help="Fit several tables, each by itself; with --out what is done is kept.")
+@click.option("--workers", type=click.IntRange(1, 1024), metavar="N", help="Processes that --each takes, by Dask.")
 @with_session
-def command(session: Session, table: Path | None, model: str, noise: float | None, **options: Any) -> None:
-    """Fit the impact law to a table of vibration amplitudes.
+def command(session: Session, tables: tuple[Path, ...], model: str, noise: float | None, **options: Any) -> None:
+    """Fit the impact law to a table of vibration amplitudes, or to each of several.
 
     The table is a CSV file: comment lines `# free_frequency_khz = 90`, `# quality_factor = 40 +- 1`, and columns
     order, drive_frequency_khz, drive_amplitude_nm, offset_nm, peak_amplitude_nm and/or lockin_amplitude_nm, each
@@ -147,23 +151,28 @@ def command(session: Session, table: Path | None, model: str, noise: float | Non
     report: fit.html, fit.txt, fit.json, fit.png, fit_rows.csv, law.csv. Exit code 3 if the result is not valid: not
     converged, not explained by the model, or a parameter not identified.
     """
-    if options["example"] == (table is not None):
+    if options["example"] == bool(tables):
         both = "not both: " if options["example"] else ""
         raise click.UsageError(f"{both}give a table to fit, `afm-jax fit TABLE.csv`, or --example for the bundled one")
+    _check_each(tables, options)
     settings = _settings(model, options)
+    if options["each"]:
+        fit_tables(session, tables, {"model": model, "noise": noise, **settings}, options["workers"])
+        return
+    table = tables[0] if tables else None
     session.start_computing(*(f"fitting.forward:{name}" for name in ("impacts_of", "located", "linearise_pairs")))
     from fitting.fits.fit import find_fit, summarise  # noqa: PLC0415
     from fitting.report.report import summary  # noqa: PLC0415
     from fitting.tables.table import read_table  # noqa: PLC0415
 
-    measured = read_table(_example_path() if table is None else table, noise=noise)
+    measured = read_table(example_path() if table is None else table, noise=noise)
     first = "the first run compiles for half a minute" if "delay" in model or model == "contact" else "some seconds"
     with session.working(f"fitting {measured.rows} rows, model {model} ({first})"):
         found = find_fit(measured, model, **settings)
         result = summarise(measured, found)
     extras, failure = _extras(session, found, result, settings, options)
     payload = result.to_dict() | {name: extra.to_dict() for name, extra in extras.items()}
-    session.emit(payload, summary(result), *(_words(name, extra) for name, extra in extras.items()))
+    session.emit(payload, partial(summary, result), *(partial(_words, name, extra) for name, extra in extras.items()))
     if session.out is not None:
         from fitting.report.report import write_report  # noqa: PLC0415
 
@@ -173,6 +182,22 @@ def command(session: Session, table: Path | None, model: str, noise: float | Non
         raise failure
     if not result.valid:
         raise NotValid(result.reasons[0])
+
+
+def _check_each(tables: tuple[Path, ...], options: dict[str, Any]) -> None:
+    """Check that several tables are fitted each by itself, and that no option asks for more of them.
+
+    Raises:
+        click.UsageError: if not.
+    """
+    if len(tables) > 1 and not options["each"]:
+        raise click.UsageError(f"{len(tables)} tables: add --each to fit each by itself")
+    if options["workers"] is not None and not options["each"]:
+        raise click.UsageError("--workers is about several tables: add --each")
+    alone = {"--example": "example", "--compare": "comparing", "--bootstrap": "bootstrap", "--posterior": "posterior"}
+    for option, name in alone.items():
+        if options["each"] and options[name]:
+            raise click.UsageError(f"{option} is about one table: leave --each out")
 
 
 def _settings(model: str, options: dict[str, Any]) -> dict[str, Any]:
@@ -296,11 +321,3 @@ def _words(name: str, extra: Any) -> str:
         ["parameter", "from", "to"], [[key, *(f"{e:.6g}" for e in ends)] for key, ends in intervals.items()]
     )
     return "\n".join(["", head, *lines])
-
-
-def _example_path() -> Path:
-    """Return where the bundled table lies, the short way if that is below the working folder."""
-    import fitting.examples  # noqa: PLC0415
-
-    path = Path(fitting.examples.__path__[0]) / "amplitudes_law.csv"
-    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path

@@ -8,17 +8,6 @@ if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
     from afm_jax.dynamics.bands import UncertainParameters
 
-_PATHS = {
-    "r": "interaction.r",
-    "epsilon": "interaction.epsilon",
-    "viscous_loss": "interaction.viscous_loss",
-    "delay_hertz": "interaction.delay.hertz",
-    "delay_lead_nm": "interaction.delay.lead_nm",
-    "delay_offset_nm": "interaction.delay.offset_nm",
-    "quality_factor": "cantilever.quality_factor",
-}
-"""Where in a scene file the parameters of a fit stand; what else a fit may have belongs to its instrument."""
-
 
 def with_fitted_law(scene: "Scene", path: Path) -> "tuple[Scene, UncertainParameters]":
     """Return a scene with the law of a fit in place of its own, and the fit's values with their covariance.
@@ -39,6 +28,7 @@ def with_fitted_law(scene: "Scene", path: Path) -> "tuple[Scene, UncertainParame
 
     from afm_jax.dynamics.bands import UncertainParameters  # noqa: PLC0415
     from fitting.experiments.belief import belief_of_fit  # noqa: PLC0415
+    from fitting.parameters import DELAY, LAW  # noqa: PLC0415
 
     try:
         payload = json.loads(path.read_text(encoding="utf-8"))
@@ -52,7 +42,11 @@ def with_fitted_law(scene: "Scene", path: Path) -> "tuple[Scene, UncertainParame
         raise ValueError(f"{path}: is a fit of a contact, which has no law; fit --model viscous+delay")
     everything = jnp.asarray([found[name]["value"] for name in problem.names])
     law = problem.law(everything)
-    names = [name for name in problem.names if name in _PATHS]
+    # what else a fit may have belongs to its instrument
+    paths = {"quality_factor": "cantilever.quality_factor"}
+    paths |= {part.name: f"interaction.{part.name}" for part in LAW}
+    paths |= {part.name: f"interaction.delay.{part.name.removeprefix('delay_')}" for part in DELAY}
+    names = [name for name in problem.names if name in paths]
     unsure = [name for name in names if not found[name]["standard_error"]]
     if unsure:
         raise ValueError(f"{path}: the fit says no standard error of {', '.join(unsure)}; there are no bands without")
@@ -65,5 +59,5 @@ def with_fitted_law(scene: "Scene", path: Path) -> "tuple[Scene, UncertainParame
     made = eqx.tree_at(lambda parts: parts.interaction, scene, law, is_leaf=lambda part: part is None)
     if "quality_factor" in names:
         made = eqx.tree_at(lambda parts: parts.cantilever, made, problem.cantilever(everything, scene.cantilever))
-    known = UncertainParameters(tuple(_PATHS[n] for n in names), values, correlations * np.outer(errors, errors))
+    known = UncertainParameters(tuple(paths[name] for name in names), values, correlations * np.outer(errors, errors))
     return made, known

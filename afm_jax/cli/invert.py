@@ -1,12 +1,13 @@
 """`afm-jax invert TABLE.csv`: speeds and delay of every impact from amplitude and phase, without any law."""
 
+from functools import partial
 from pathlib import Path
 
 import click
 
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import Share
+from afm_jax.cli.values import Share, example_path
 
 
 @click.command()
@@ -66,12 +67,12 @@ def command(
     from fitting.inversion.report import inversion_summary  # noqa: PLC0415
     from fitting.tables.table import read_table  # noqa: PLC0415
 
-    measured = read_table(_example_path() if table is None else table, noise=noise)
+    measured = read_table(example_path() if table is None else table, noise=noise)
     known = None if truth is None else read_known_law(truth)
     fitted = None if law is None else read_fitted_law(law)
     with session.working(f"inverting {measured.rows} rows (the first run compiles for some seconds)"):
         result = invert(measured, frequency_error_khz=frequency_error_khz, truth=known, fitted=fitted)
-    session.emit(result.to_dict(), inversion_summary(result))
+    session.emit(result.to_dict(), partial(inversion_summary, result))
     if session.out is not None:
         from fitting.inversion.report import write_inversion  # noqa: PLC0415
 
@@ -79,11 +80,3 @@ def command(
             session.note(f"wrote {path}")
     if not result.valid:
         raise NotValid(result.reasons[0])
-
-
-def _example_path() -> Path:
-    """Return where the bundled table lies, the short way if that is below the working folder."""
-    import fitting.examples  # noqa: PLC0415
-
-    path = Path(fitting.examples.__path__[0]) / "amplitudes_contact.csv"
-    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path

@@ -6,7 +6,7 @@ import click
 
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import PictureFormat, ranges_of, scene_and_start
+from afm_jax.cli.values import PictureFormat, SceneName, ranges_of, scene_and_start
 
 if TYPE_CHECKING:
     import numpy as np
@@ -27,7 +27,7 @@ COLUMNS = (
 
 
 @click.command()
-@click.argument("scene", metavar="SCENE.toml|PRESET")
+@click.argument("scene", metavar="SCENE.toml|PRESET", type=SceneName())
 @click.option("--impacts", type=click.IntRange(20), default=2000, show_default=True, help="Impacts to average over.")
 @click.option("--transient", type=click.IntRange(0), default=500, show_default=True, help="Impacts before.")
 @click.option("--parameter", metavar="P=a:b:n", help="A parameter of the scene file and its values, one motion each.")

@@ -169,7 +169,7 @@ COMMANDS = {
     "basins": ("afm_jax.cli.basins", "Find which start of a scene ends where."),
     "bench": ("afm_jax.cli.bench", "Measure impacts per second, next to SciPy."),
     "bifurcation": ("afm_jax.cli.bifurcation", "Sweep a parameter and record what the tip comes to."),
-    "calibrate": ("afm_jax.cli.calibrate", "Fit frequency and quality factor to a free resonance sweep."),
+    "calibrate": ("afm_jax.cli.calibrate", "Fit a resonance sweep or a thermal spectrum: frequency, Q, stiffness."),
     "chart": ("afm_jax.cli.chart", "Chart which single-impact orbits are stable over two parameters."),
     "collide": ("afm_jax.cli.collide", "Let free tips collide with the sample: rebound, delay, capture, energy."),
     "continue": ("afm_jax.cli.continue_orbits", "Follow orbits and their special points through parameters."),
@@ -183,7 +183,10 @@ COMMANDS = {
     "lockin": ("afm_jax.cli.lockin", "Read response order, amplitudes and phase off time traces of the deflection."),
     "lyapunov": ("afm_jax.cli.lyapunov", "Compute Lyapunov exponents of a motion, or along a parameter."),
     "orbits": ("afm_jax.cli.orbits", "Find the orbits of a scene, of one impact or more, and whether they are stable."),
+    "read": ("afm_jax.cli.read", "Read tapping curves out of an instrument's file, as tables."),
     "simulate": ("afm_jax.cli.simulate", "Follow a scene in time: contacts, amplitudes, phases, energies."),
+    "sweep": ("afm_jax.cli.sweep", "Compute many scenes, or fit many tables, over a grid of parameters; resumes."),
+    "tapping": ("afm_jax.cli.tapping", "Read the energy of a tap, and the impact law, off a tapping curve."),
     "verify": ("afm_jax.cli.verify", "Compare eqs. 5 to 8 with automatic differentiation and with 50 digits."),
 }
 """For every command the module whose `command` it is, and what the list of commands says of it."""
@@ -248,7 +251,8 @@ class LazyGroup(click.Group):
     invoke_without_command=True,
     context_settings={"help_option_names": ["-h", "--help"]},
     epilog="Exit codes: 0 done; 1 the program failed; 2 the call or the data are wrong; 3 ran, but the result is not "
-    "valid.",
+    'valid. Completion of commands, options and presets: eval "$(_AFM_JAX_COMPLETE=bash_source afm-jax)" in ~/.bashrc; '
+    "zsh_source in ~/.zshrc; fish: _AFM_JAX_COMPLETE=fish_source afm-jax | source.",
 )
 @click.option("--version", is_flag=True, help="Show the version and exit.")
 @click.pass_context

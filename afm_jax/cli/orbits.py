@@ -1,13 +1,13 @@
-"""`afm-jax orbits SCENE.toml --order N [--impacts m]`: the orbits of a scene."""
+"""`afm-jax orbits SCENE.toml|PRESET --order N [--impacts m]`: the orbits of a scene."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.values import SceneName, scene_and_start
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -15,25 +15,6 @@ if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
     from afm_jax.dynamics.impact_loop import LoopReading
     from afm_jax.impact.orbits import SingleImpactOrbits
-
-COLUMNS = (
-    "phase_rad",
-    "velocity_after_nm_per_us",
-    "velocity_before_nm_per_us",
-    "approach_speed_nm_per_us",
-    "rebound_speed_nm_per_us",
-    "delay_us",
-    "peak_amplitude_nm",
-    "lockin_amplitude_nm",
-    "lockin_phase_deg",
-    "trace",
-    "determinant",
-    "stable",
-    "admissible",
-    "near_double",
-)
-"""What is told of an orbit: attributes of `SingleImpactOrbits`."""
-
 
 IMPACT_COLUMNS = (
     "phase_rad",
@@ -44,6 +25,19 @@ IMPACT_COLUMNS = (
     "delay_us",
 )
 """What is told of each impact: attributes of `LoopReading`."""
+
+COLUMNS = (
+    *IMPACT_COLUMNS,
+    "peak_amplitude_nm",
+    "lockin_amplitude_nm",
+    "lockin_phase_deg",
+    "trace",
+    "determinant",
+    "stable",
+    "admissible",
+    "near_double",
+)
+"""What is told of an orbit: attributes of `SingleImpactOrbits`."""
 
 MANY_COLUMNS = (*IMPACT_COLUMNS, "peak_amplitude_nm", "trace", "determinant", "stable", "admissible")
 """What is told of an orbit of several impacts, of its impacts the first."""
@@ -67,7 +61,7 @@ class PositiveInteger(click.ParamType):
 
 
 @click.command()
-@click.argument("scene", metavar="SCENE.toml", type=click.Path(path_type=Path))
+@click.argument("scene", metavar="SCENE.toml|PRESET", type=SceneName())
 @click.option(
     "--order",
     metavar="N",
@@ -82,22 +76,25 @@ class PositiveInteger(click.ParamType):
     help="Impacts in these periods, found by a search from many starts; without it, all single-impact orbits.",
 )
 @with_session
-def command(session: Session, scene: Path, order: int, impacts: int | None) -> None:
+def command(session: Session, scene: str, order: int, impacts: int | None) -> None:
     """Find all single-impact orbits of a scene, or with --impacts orbits of several impacts.
 
     Of every orbit: impact phase and velocities, peak and lock-in amplitude, whether it is stable, and whether it is
     admissible (its flight stays above the platform). With --out a table orbits.csv. Exit code 3 if none is admissible.
     With --impacts every impact is told, the hardest first, and the orbit with a rest on the sample if there is one.
+    A contact's are told so too: its impacts begin where the bridge forms and end, with phase and velocity, where it
+    breaks.
     """
     session.start_computing()
+    from afm_jax.contact.contact import Contact  # noqa: PLC0415
     from afm_jax.impact.orbits import single_impact_orbits  # noqa: PLC0415
-    from afm_jax.scenefile.scenefile import load_scene, scene_tables  # noqa: PLC0415
+    from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
-    loaded = load_scene(scene)
-    refuse_other_than_law(loaded, scene)
-    if impacts is not None:
-        _many(session, loaded, scene, order, impacts)
+    loaded, _ = scene_and_start(scene)
+    if impacts is not None or isinstance(loaded.interaction, Contact):
+        _many(session, loaded, scene, order, impacts or 1)
         return
+    refuse_other_than_law(loaded, scene)
     try:
         with session.working("searching for orbits"):
             found = single_impact_orbits(loaded, order)
@@ -124,7 +121,7 @@ def command(session: Session, scene: Path, order: int, impacts: int | None) -> N
         raise NotValid(reason)
 
 
-def refuse_other_than_law(scene: "Scene", path: str | Path) -> None:
+def refuse_other_than_law(scene: "Scene", path: str) -> None:
     """Check that a scene's interaction is a law.
 
     Raises:
@@ -141,15 +138,22 @@ def refuse_other_than_law(scene: "Scene", path: str | Path) -> None:
     )
 
 
-def _many(session: Session, scene: "Scene", path: Path, order: int, impacts: int) -> None:
-    """Tell the orbits of several impacts."""
+def _many(session: Session, scene: "Scene", path: str, order: int, impacts: int) -> None:
+    """Tell the orbits of several impacts, or of a resolved contact."""
+    from afm_jax.contact.contact import Contact  # noqa: PLC0415
+    from afm_jax.dynamics.contact_orbits import contact_orbits  # noqa: PLC0415
     from afm_jax.dynamics.impact_orbits import many_impact_orbits, sticking_orbit  # noqa: PLC0415
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
+    resolved = isinstance(scene.interaction, Contact)
+    if not resolved:
+        refuse_other_than_law(scene, path)
     try:
         with session.working("searching for orbits (the first run compiles for some seconds)"):
-            found = many_impact_orbits(scene, order, impacts)
-            resting = sticking_orbit(scene)
+            if resolved:
+                found, resting = contact_orbits(scene, order, impacts), "a tip that the liquid bridge holds stays"
+            else:
+                found, resting = many_impact_orbits(scene, order, impacts), sticking_orbit(scene)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
     orbits = [orbit_facts(found.reading, index) for index in range(len(found.stable))]
@@ -161,8 +165,6 @@ def _many(session: Session, scene: "Scene", path: Path, order: int, impacts: int
     rows = [{"orbit": k, **impact} for k, orbit in enumerate(orbits) for impact in orbit["impacts"]]
     session.write_table("impacts.csv", rows, ("orbit", *IMPACT_COLUMNS))
     payload = {
-        "format": "afm-jax orbits",
-        "format_version": 1,
         "order": order,
         "impacts": impacts,
         "scene": scene_tables(scene),

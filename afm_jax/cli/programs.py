@@ -9,6 +9,7 @@ import hashlib
 import json
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from functools import cache
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -22,8 +23,8 @@ from jax.core import Tracer
 from afm_jax.whole_files import write_whole
 
 _CONFIGURATION = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_precision", "jax_debug_nans")
-_SOON = {"xla_cpu_use_fusion_emitters": False}
-"""A third of the time that these programs take to compile, for a tenth of the time that they run."""
+_SOON = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
+"""Half of the time that these programs take to compile, for a tenth of the time that they run."""
 _PACKAGES = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "lineax")
 
 
@@ -51,7 +52,10 @@ def _keeping(jitted: Any, folder: Path, tell: Callable[[str], None]) -> Callable
 
         call = (tree, jax.tree.structure(static), *jax.tree.leaves(static), *map(jax.typeof, arrays))
         if call not in programs:
-            programs[call] = _program(folder / f"{jitted.__name__}-{_digest(call)}.program", trace, tell)
+            program, structure = _program(folder / f"{jitted.__name__}-{_digest(call)}.program", trace, tell)
+            # at once: a jitted function would compile again where an argument comes from another program
+            kinds = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in arrays]
+            programs[call] = jax.jit(program).lower(kinds).compile(_known_options()), structure
         return _filled(programs[call][1], iter(programs[call][0](arrays)))
 
     return kept
@@ -71,7 +75,7 @@ def _program(path: Path, trace: Callable[[], tuple[Any, Any]], tell: Callable[[s
     kept = path.read_bytes() if path.exists() else b""
     if kept[:32] == hashlib.sha256(kept[32:]).digest():
         structure, _, text = kept[32:].partition(b"\n")
-        return _compiled_soon(export.deserialize(bytearray(text)).call), json.loads(structure)
+        return export.deserialize(bytearray(text)).call, json.loads(structure)
     program, structure = trace()
     text = json.dumps(structure).encode() + b"\n" + program.serialize()
     try:
@@ -79,16 +83,17 @@ def _program(path: Path, trace: Callable[[], tuple[Any, Any]], tell: Callable[[s
         tell(f"{path.name} was {'damaged' if kept else 'not there'}: traced and written")
     except OSError as error:
         tell(f"{path.name} cannot be written: {error.strerror}")
-    return _compiled_soon(program.call), structure
+    return program.call, structure
 
 
-def _compiled_soon(call: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a jitted program without the compiler's slowest pass on the CPU, where it knows it by that name."""
+@cache
+def _known_options() -> dict[str, Any] | None:
+    """Return options that leave the compiler's slowest passes on the CPU out, where it knows them by those names."""
     try:
         jax.jit(lambda x: x, compiler_options=_SOON)(0.0)
     except jax.errors.JaxRuntimeError:
-        return jax.jit(call)
-    return jax.jit(call, compiler_options=_SOON)
+        return None
+    return _SOON
 
 
 def _structure(value: Any) -> Any:

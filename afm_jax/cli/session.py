@@ -15,8 +15,10 @@ import csv
 import functools
 import io
 import math
+import os
 import sys
 import tempfile
+import textwrap
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -29,7 +31,7 @@ import click
 from afm_jax.compilation_cache import cache_folder, make_private, silence_xla
 from afm_jax.strict_json import strict_json
 from afm_jax.whole_files import write_whole
-from afm_jax.words import shown
+from afm_jax.words import lines_at_most, shown, text_table
 
 if TYPE_CHECKING:
     from afm_jax.compilation_cache import Cache
@@ -92,8 +94,8 @@ def write_json(path: Path, payload: Mapping[str, Any]) -> None:
     write_whole(path, strict_json(labelled(payload)) + "\n")
 
 
-_WIDTH_OF_A_PIPE = 160
-"""Columns of text that nobody looks at in a terminal; wide enough that no table is cut."""
+_WIDTH_OF_A_PIPE = 10_000
+"""Columns of text that nobody looks at in a terminal: no line is broken, no table turned."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +104,7 @@ class Session:
 
     Attributes:
         json: write one JSON object to standard output, and nothing else there.
-        out: folder for tables and pictures, made already; None if none was asked for.
+        out: folder for tables and pictures, made already, or the file to write; None if none was asked for.
         verbose: say on standard error what goes on behind: the cache, what is compiled.
     """
 
@@ -162,17 +164,21 @@ class Session:
 
         Args:
             payload: the object; arrays become lists, NaN and infinity null.
-            text: strings and rich tables, one below the other; strings are printed as they are.
+            text: strings, rich tables, and functions that return a string, one below the other. In a terminal lines
+                break between words, and tables that are too wide for it are turned.
         """
         if self.json:
             click.echo(strict_json(labelled(payload)))
             return
         console = _console(stderr=False)
-        for part in text:
-            if isinstance(part, str):
-                console.print(shown(part), markup=False, highlight=False, soft_wrap=True)
-            else:
-                console.print(part)
+        with lines_at_most(console.width):
+            for part in text:
+                words = part if isinstance(part, str) else part() if callable(part) else _table_text(console, part)
+                if isinstance(words, str):
+                    words = _broken(shown(words), console.width)
+                    console.print(words, markup=False, highlight=False, soft_wrap=True)
+                else:
+                    console.print(words)
         sys.stdout.flush()
 
     def write_table(self, name: str, rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> None:
@@ -200,16 +206,23 @@ class Session:
         self.note(f"wrote {self.out / name}")
 
 
-def with_session(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a command `--json`, `--out` and `--verbose`, and pass it a `Session` as first argument."""
+def with_session(function: Callable[..., Any] | None = None, *, out_file: str = "") -> Any:
+    """Give a command `--json`, `--out` and `--verbose`, and pass it a `Session` as first argument.
+
+    Args:
+        function: the command's function; None gives the decorator.
+        out_file: what the file is called that `--out` names, for a command that writes a single one; empty: a folder.
+    """
+    if function is None:
+        return functools.partial(with_session, out_file=out_file)
 
     @click.option("--json", "as_json", is_flag=True, help="Write one JSON object to standard output, nothing else.")
     @click.option(
         "--out",
-        metavar="DIR",
+        metavar=out_file or "DIR",
         type=click.Path(path_type=Path),
-        callback=_prepared,
-        help="Write tables (CSV) and pictures (PNG) into this folder.",
+        callback=functools.partial(_prepared, is_file=bool(out_file)),
+        help="Write this table." if out_file else "Write tables (CSV) and pictures (PNG) into this folder.",
     )
     @click.option("--verbose", is_flag=True, help="Say on standard error what is kept, read and compiled, and where.")
     @functools.wraps(function)
@@ -221,12 +234,12 @@ def with_session(function: Callable[..., Any]) -> Callable[..., Any]:
     return command
 
 
-def _prepared(ctx: click.Context, parameter: click.Parameter, folder: Path | None) -> Path | None:
+def _prepared(ctx: click.Context, parameter: click.Parameter, folder: Path | None, *, is_file: bool) -> Path | None:
     """Make the folder before anything is computed, so that no result is lost at the end."""
     if folder is None or ctx.resilient_parsing:
         return folder
     try:
-        prepare_folder(folder)
+        prepare_folder(folder.parent if is_file and folder.suffix else folder)
     except OSError as error:
         raise click.BadParameter(
             f"{folder}: cannot write there ({error.strerror}); choose another folder", ctx=ctx, param=parameter
@@ -238,8 +251,43 @@ def _counted(asked: int, read: int) -> str:
     return f"{read} compiled programs were read, {asked - read} were compiled"
 
 
+def _broken(text: str, width: int) -> str:
+    """Return a text whose lines break between words, below where they begin; words and numbers stay whole."""
+    lines = []
+    for line in text.split("\n"):
+        indent = " " * (len(line) - len(line.lstrip()))
+        indent += indent and "  "
+        lines += (
+            [line]
+            if len(line) <= width
+            else textwrap.wrap(
+                line,
+                width,
+                subsequent_indent=indent,
+                break_long_words=False,
+                break_on_hyphens=False,
+                replace_whitespace=False,
+            )
+        )
+    return "\n".join(lines)
+
+
+def _table_text(console: Any, table: Any) -> Any:
+    """Return a table of rich; as the text of one that is turned, where the terminal is too narrow for it."""
+    from rich.measure import Measurement  # noqa: PLC0415
+
+    whole = console.options.update(width=_WIDTH_OF_A_PIPE, max_width=_WIDTH_OF_A_PIPE)
+    if Measurement.get(console, whole, table).maximum <= console.width:
+        return table
+    head = [str(column.header).replace("\n", " ") for column in table.columns]
+    rows = zip(*([str(cell) for cell in column.cells] for column in table.columns), strict=True)
+    return "\n".join([*([str(table.title)] if table.title else []), *text_table(head, list(rows))])
+
+
 def _console(*, stderr: bool) -> Any:
     from rich.console import Console  # noqa: PLC0415
 
     stream = sys.stderr if stderr else sys.stdout
-    return Console(stderr=stderr, width=None if stream.isatty() else _WIDTH_OF_A_PIPE)
+    asked = os.environ.get("COLUMNS", "")
+    width = int(asked) if asked.isdigit() and int(asked) else None
+    return Console(stderr=stderr, width=width or (None if stream.isatty() else _WIDTH_OF_A_PIPE))

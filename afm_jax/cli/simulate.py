@@ -7,6 +7,7 @@ import click
 
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.values import SceneName
 
 METHODS = ("collocation", "diffrax")
 """Of `simulate`; said here as well, because the command's help must not wait for JAX."""
@@ -45,7 +46,7 @@ class Multiples(click.ParamType):
 
 
 @click.command()
-@click.argument("scene", metavar="SCENE.toml|PRESET")
+@click.argument("scene", metavar="SCENE.toml|PRESET", type=SceneName())
 @click.option("--duration-us", type=float, metavar="T", help="How long to follow the scene, in us.")
 @click.option("--periods", type=float, metavar="P", help="How long, in periods of the drive.")
 @click.option(

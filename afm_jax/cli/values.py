@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
+import click.shell_completion
 
 if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
@@ -124,6 +125,31 @@ class ValueAndError(click.ParamType):
         if len(numbers) > 2 or (len(numbers) == 2 and numbers[1] <= 0.0):
             self.fail(f"`{value}` is no value with a positive error; write '40 +- 2'", param, ctx)
         return numbers[0], numbers[1] if len(numbers) == 2 else None
+
+
+PRESET_NAMES = ("figure2", "figure3", "figure8", "figure9a", "figure9b", "figure10", "figure11")
+"""Of `afm_jax.scenefile.presets`; said here as well, because help and completion must not wait for JAX."""
+
+
+class SceneName(click.ParamType):
+    """A scene file, or one of the paper's scenes by its name."""
+
+    name = "scene"
+
+    def __init__(self, *also: str):
+        """Say which other words may stand in its place."""
+        self.also = also
+
+    def shell_complete(
+        self,
+        ctx: click.Context,  # noqa: ARG002
+        param: click.Parameter,  # noqa: ARG002
+        incomplete: str,
+    ) -> list[click.shell_completion.CompletionItem]:
+        """Return the names that begin so; then the shell offers files."""
+        names = [name for name in (*self.also, *PRESET_NAMES) if name.startswith(incomplete)]
+        items = [click.shell_completion.CompletionItem(name) for name in names]
+        return items or [click.shell_completion.CompletionItem(incomplete, type="file")]
 
 
 class PictureFormat(click.ParamType):
@@ -314,3 +340,11 @@ def ranges_of(name: str, scene: "Scene", texts: Sequence[str], *, counted: bool)
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from error
     return ranges
+
+
+def example_path() -> Path:
+    """Return where the bundled table of `--example` lies, the short way if that is below the working folder."""
+    import fitting.examples  # noqa: PLC0415
+
+    path = Path(fitting.examples.__path__[0]) / "amplitudes_law.csv"
+    return path.relative_to(Path.cwd()) if path.is_relative_to(Path.cwd()) else path

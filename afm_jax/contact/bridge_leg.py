@@ -14,7 +14,6 @@ over Gauss nodes (speeds from what is spent, times from the speeds, what is spen
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -275,7 +274,7 @@ def pass_by_collocation(way: Way, nodes: int, sweeps: int) -> Passage:
     return way.end(nothing, lax.scan(add, nothing, pairs)[0])
 
 
-def pass_in_steps(way: Way, steps: int, solver: diffrax.AbstractERK | None = None) -> Passage:
+def pass_in_steps(way: Way, steps: int, solver: Any = None) -> Passage:
     """Return the passage after a fixed number of Diffrax's Runge-Kutta steps; differentiable forward and reverse.
 
     Args:
@@ -283,6 +282,8 @@ def pass_in_steps(way: Way, steps: int, solver: diffrax.AbstractERK | None = Non
         steps: number of steps.
         solver: a Diffrax solver; Dopri8 if None. Its `scan_kind` must be "bounded" to be differentiable both ways.
     """
+    import diffrax  # noqa: PLC0415  # half a second
+
     chosen = diffrax.Dopri8(scan_kind="bounded") if solver is None else solver
     term = diffrax.ODETerm(lambda share, state, _: way_rates(way, share, state))
 
@@ -322,6 +323,8 @@ def pass_bridge(way: Way, setting: Setting) -> Passage:
         return pass_by_collocation(way, max(size, setting.junction_nodes), 0)
     if setting.rule == "collocation":
         return pass_by_collocation(way, size, setting.sweeps)
+    import diffrax  # noqa: PLC0415
+
     return pass_in_steps(way, size, getattr(diffrax, setting.solver)(scan_kind="bounded"))
 
 

@@ -33,6 +33,7 @@ from afm_jax.contact.junction_leg import JunctionWay, pass_through_junction
 from afm_jax.contact.settings import CAREFUL, Setting, setting_of
 from afm_jax.impact.implicit import implicit_root
 from afm_jax.outcomes import CollisionOutcome
+from afm_jax.results import public_result
 
 BLOCK = 512
 """Tips computed side by side: few enough to stay in the processor's cache."""
@@ -44,6 +45,7 @@ _NEAR_CAPTURE = (-0.02, 0.2)
 """Energy at the end, of that at the start, between which a tip is close to capture: below 1.1 times that speed."""
 
 
+@public_result(outcome=CollisionOutcome)
 class Collision(NamedTuple):
     """What collisions end with; arrays of one shape.
 

@@ -9,6 +9,7 @@ from dataclasses import replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.checks import as_parameter, check_parameter, is_traced, readable
@@ -52,7 +53,8 @@ class Contact(eqx.Module):
         check_parameter("bridge_forms_nm", self.bridge_forms_nm, "positive")
         check_parameter("bridge_breaks_nm", self.bridge_breaks_nm, "positive")
         traced = is_traced(self.bridge_forms_nm) or is_traced(self.bridge_breaks_nm)
-        if not traced and bool((self.bridge_breaks_nm < self.bridge_forms_nm).any()):
+        # in NumPy: inside a traced function JAX would trace the comparison of two known numbers, too
+        if not traced and bool((np.asarray(self.bridge_breaks_nm) < np.asarray(self.bridge_forms_nm)).any()):
             raise ValueError(
                 "`bridge_breaks_nm` must not be smaller than `bridge_forms_nm`: a bridge that breaks before it forms "
                 "would give energy away"

@@ -24,6 +24,7 @@ from afm_jax.checks import as_argument
 from afm_jax.contact.contact import Bridge, Contact, bridge_of
 from afm_jax.contact.forces import jkr
 from afm_jax.impact.implicit import implicit_root
+from afm_jax.results import public_result
 
 SMALLEST_GAP_NM = 0.01
 """The tangency is looked for between this gap and the one at which the bridge forms."""
@@ -32,6 +33,7 @@ Tangent = tuple[Bridge, Float[Array, "..."], Float[Array, "..."]]
 """The bridge and the JKR contact's units of load and depth."""
 
 
+@public_result()
 class Junction(NamedTuple):
     """The junction of a contact, and the energies that its hysteresis takes; all arrays of the parameters' shape."""
 

@@ -25,7 +25,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
-from scipy.optimize import OptimizeResult, least_squares, nnls
 
 from afm_jax.checks import require_float64
 from afm_jax.contact.bridge_leg import margin_of, pass_by_collocation, way_through
@@ -37,6 +36,7 @@ from afm_jax.contact.junction import Junction, find_junction
 from afm_jax.contact.junction_leg import pass_through_junction
 from afm_jax.impact.lasting_impact import TabulatedImpact, stretched
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from afm_jax.results import public_result
 
 FREE = {"law": ("r", "epsilon"), "viscous": ("epsilon", "viscous_loss"), "full": ("r", "epsilon", "viscous_loss")}
 """For every model the parameters that are fitted; the others are r = 1 and no viscous loss."""
@@ -78,6 +78,7 @@ _LEAD_SPEEDS = np.geomspace(2.0, 30.0, 8)
 _PLACES = 0.5 - 0.5 * np.cos(np.pi * np.arange(TERMS) / (TERMS - 1))
 
 
+@public_result()
 @dataclass(frozen=True)
 class ContactLaw:
     """A law fitted to a contact, and how far it is off.
@@ -231,6 +232,8 @@ def closest_law(
         model: a key of `FREE`.
         residuals: one of `RESIDUALS`.
     """
+    from scipy.optimize import OptimizeResult, least_squares, nnls  # noqa: PLC0415  # a third of a second
+
     free = np.array([name in FREE[model] for name in _NAMES])
     # u_out^2 = u_in^2 - (1 - r^2) u_in^2 - epsilon - c u_in; the scales make the parameters of order one
     scales = np.array([1e-2, approach[0] ** 2, approach[0] * 1e-1])[free]
@@ -309,6 +312,7 @@ def range_above_capture(
     return float(low), float(high)
 
 
+@public_result()
 @dataclass(frozen=True)
 class ContactDelay:
     """The delay of a contact against the approach speed, and the law fitted to it; times in us, shapes (n,).

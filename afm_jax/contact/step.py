@@ -11,7 +11,6 @@ from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
 
-import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -287,6 +286,8 @@ def eighth_order_step(rates: Callable[[Place], Place], begin: Place, length: Flo
 
 def diffrax_step(rates: Callable[[Place], Place], begin: Place, length: Float[Array, "..."]) -> Place:
     """Return the place after a step of Diffrax's own solver; arguments as of `eighth_order_step`."""
+    import diffrax  # noqa: PLC0415  # half a second
+
     solver = diffrax.Dopri8(scan_kind="lax")
 
     def field(share, place, args):
@@ -302,7 +303,9 @@ def diffrax_step(rates: Callable[[Place], Place], begin: Place, length: Float[Ar
 @cache
 def _coefficients() -> tuple[np.ndarray, np.ndarray]:
     """Return the matrix of the stages, and the weights; the tableau's last stage is the next step's first."""
-    tableau = diffrax.Dopri8.tableau
+    from diffrax import Dopri8  # noqa: PLC0415
+
+    tableau = Dopri8.tableau
     weights = np.asarray(tableau.b_sol)[:-1]
     rows = np.zeros((len(weights), len(weights)))
     for number, row in enumerate(tableau.a_lower[:-1]):

@@ -20,16 +20,14 @@ from afm_jax.dynamics.continuation import (
     Frame,
     OrbitBranch,
     SpecialPoint,
+    by_blocks,
     equations_at,
     loop_at,
 )
 from afm_jax.dynamics.impact_loop import closing_gaps, highest_point
 
-WITHIN_95 = 1.959963984540054
-"""Half width of a 95 % interval in standard errors."""
 _NEWTON_STEPS = 20
 _ARRIVED = 1e-9
-_BLOCK = 64
 
 
 class UncertainParameters(NamedTuple):
@@ -92,10 +90,7 @@ def amplitude_errors(
     frame, equations = _wide(found, known, None)
     share = (branch.parameter - found.range.low) / (found.range.high - found.range.low)
     points = np.column_stack([branch.unknowns, share, np.tile(known.values, (len(share), 1))])
-    blocks = -(-len(points) // _BLOCK)
-    padded = np.concatenate([points, np.repeat(points[-1:], blocks * _BLOCK - len(points), axis=0)])
-    slopes = [_amplitude_slopes(frame, jnp.asarray(part), equations) for part in np.split(padded, blocks)]
-    slope = np.concatenate([np.asarray(part) for part in slopes])[: len(points)]
+    slope = by_blocks(lambda block: _amplitude_slopes(frame, block, equations), points)
     return np.sqrt(np.einsum("ni,ij,nj->n", slope, known.covariance, slope))
 
 

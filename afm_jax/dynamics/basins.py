@@ -25,6 +25,7 @@ from afm_jax.dynamics.iteration import (
     Report,
     Tips,
     advance,
+    evenly_spread,
     in_blocks,
     leaving_tips,
     require_drive,
@@ -32,6 +33,7 @@ from afm_jax.dynamics.iteration import (
 )
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, verdicts_of
 from afm_jax.outcomes import Outcome
+from afm_jax.results import public_result
 
 _SAMPLE = 2048
 _LONG = 1000
@@ -67,6 +69,7 @@ class Attractor(NamedTuple):
     velocity_nm_per_us: Float[np.ndarray, " impacts"]
 
 
+@public_result(picture="afm_jax.plots.dynamics:basins_figure")
 class Basins(NamedTuple):
     """Which start ends where.
 
@@ -173,13 +176,24 @@ class _Finder:
             tips = tips._replace(gap_nm=scenes.interaction.bridge_breaks_nm)
         return jax.tree.map(np.asarray, tips)
 
-    def told_apart(self, tips: Tips, report: Report | None = None) -> Int[np.ndarray, " lanes"]:
-        """Return the attractors of motions after a long time; new ones are added to those known."""
+    def _later(self, tips: Tips, impacts: int, report: Report | None = None) -> tuple[Tips, Record]:
+        """Return tips after some impacts and those that are recorded, and these."""
 
         def work(some: Tips) -> tuple[Tips, Record]:
-            return follow(self.scenes(len(some.time_us)), some, skip=_LONG, record=RECORDED, accuracy=1e-6)
+            return follow(self.scenes(len(some.time_us)), some, skip=impacts, record=RECORDED, accuracy=1e-6)
 
-        end, record = in_blocks(work, tips, report=report)
+        return in_blocks(work, tips, report=report)
+
+    def _distance(
+        self, orbit: Attractor, phase: Float[np.ndarray, " points"], velocity: Float[np.ndarray, " points"]
+    ) -> Float[np.ndarray, " points"]:
+        """Return how far points are from the nearest of an orbit's."""
+        turn = (orbit.phase_rad - phase[:, None] + np.pi) % (2.0 * np.pi) - np.pi
+        return np.hypot(turn, (orbit.velocity_nm_per_us - velocity[:, None]) / self.top).min(axis=-1)
+
+    def told_apart(self, tips: Tips, report: Report | None = None) -> Int[np.ndarray, " lanes"]:
+        """Return the attractors of motions after a long time; new ones are added to those known."""
+        end, record = self._later(tips, _LONG, report)
         period = np.full(len(end.time_us), 2.0 * np.pi / self.omega)
         verdicts = verdicts_of(record, end.outcome, period, tolerance=settled_below(self.scene))
         label = np.empty(len(period), int)
@@ -197,9 +211,8 @@ class _Finder:
                 continue
             if not kind[1]:
                 return number
-            turn = (known.phase_rad - phase[-1] + np.pi) % (2.0 * np.pi) - np.pi
-            apart = np.hypot(turn, (known.velocity_nm_per_us - velocity[-1]) / self.top)
-            if apart.min() < _SAME * max(1.0, np.abs(velocity[-1]) / self.top):
+            size = max(1.0, np.abs(velocity[-1]) / self.top)
+            if self._distance(known, phase[-1:], velocity[-1:])[0] < _SAME * size:
                 return number
         name = f"({kind[1]},{kind[2]})" if kind[1] else MotionKind(kind[0]).name.lower()
         self.attractors.append(Attractor(name, *kind, phase, velocity))
@@ -208,10 +221,8 @@ class _Finder:
 
     def look_around(self, high: float, low: float) -> None:
         """Find attractors with a sample of starts, how close to an orbit a tip is its own, and what is chaotic."""
-        index = np.arange(1.0, _SAMPLE + 1.0)
-        plastic = 1.324717957244746
-        phase, speed = 2.0 * np.pi * (index / plastic % 1.0), low + (high - low) * (index / plastic**2 % 1.0)
-        tips = self.tips(phase, speed)
+        across, up = evenly_spread(_SAMPLE).T
+        tips = self.tips(2.0 * np.pi * across, low + (high - low) * up)
         label = self.told_apart(tips)
         orbits = [number for number, found in enumerate(self.attractors) if found.impacts]
         if orbits:
@@ -242,17 +253,12 @@ class _Finder:
         scenes = self.scenes(len(points))
         time = jnp.asarray(points[:, 0] % (2.0 * np.pi) / self.omega)
         tips = jax.tree.map(np.asarray, tips_at(scenes, time, jnp.asarray(points[:, 1])))
-
-        def work(some: Tips) -> tuple[Tips, Record]:
-            return follow(self.scenes(len(some.time_us)), some, skip=_BACK, record=RECORDED, accuracy=1e-6)
-
-        end, record = in_blocks(work, tips)
+        end, record = self._later(tips, _BACK)
         # on the orbit: the last point is one of its own
         phase, velocity = self.omega * record.departure_us[:, -1], record.velocity_after_nm_per_us[:, -1]
         for number in orbits:
             mine, found = owner == number, self.attractors[number]
-            turn = (found.phase_rad - phase[mine, None] + np.pi) % (2.0 * np.pi) - np.pi
-            apart = np.hypot(turn, (found.velocity_nm_per_us - velocity[mine, None]) / self.top).min(axis=1)
+            apart = self._distance(found, phase[mine], velocity[mine])
             size = max(1.0, np.abs(found.velocity_nm_per_us).max() / self.top)
             back = (apart < _SAME * size) & (end.outcome[mine] == Outcome.IMPACT)
             good = [size for size in _RADII if back[sizes[mine] <= size].all()]

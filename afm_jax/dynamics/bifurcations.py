@@ -31,6 +31,7 @@ from afm_jax.dynamics.iteration import (
 )
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Verdicts, verdicts_of
 from afm_jax.outcomes import Outcome
+from afm_jax.results import public_result
 from afm_jax.scenefile.parameter_paths import scene_batch
 
 _LANES = 512
@@ -45,6 +46,7 @@ _SAME = 1e-4
 """Of the largest speed: points of orbits closer than this are the same."""
 
 
+@public_result()
 class Sweep(NamedTuple):
     """A sweep of a parameter, arrays of one row a value, in the order of the values.
 

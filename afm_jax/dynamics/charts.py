@@ -17,6 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.apparatus.scene import Scene
+from afm_jax.dynamics.impact_orbits import multipliers_of
 from afm_jax.dynamics.iteration import Report, in_blocks, require_drive
 from afm_jax.impact.amplitude import peak_amplitude
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem
@@ -24,6 +25,7 @@ from afm_jax.impact.lasting_impact import LawImpact
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.orbits import judge, orbit_state
 from afm_jax.impact.roots import OrbitRoots, find_roots
+from afm_jax.results import public_result
 
 _BLOCK = 2048
 """Scenes gone through together."""
@@ -89,14 +91,15 @@ def _verdicts_of_block(scenes: Scene, orders: Float[np.ndarray, " orders"]) -> O
     for column, order in enumerate(orders):
         roots = jax.tree.map(np.asarray, _roots_of_block(scenes, jnp.asarray(order)))
         scene, slot = np.nonzero(roots.found)
-        rows = [np.zeros((4, 0))]
+        rows = [np.zeros((5, 0))]
         for first in range(0, len(scene), _LANES):
             some = slice(first, first + _LANES)
             at, slots = (np.pad(part[some], (0, _LANES - len(part[some])), mode="edge") for part in (scene, slot))
             place = jax.tree.map(lambda part, at=at, slots=slots: jnp.asarray(part[at, slots]), roots.place)
             own = jax.tree.map(lambda leaf, at=at: jnp.asarray(leaf[at]), plain)
             rows.append(np.asarray(_judged(place, own, jnp.asarray(order)))[:, : len(scene[some])])
-        may_be, steady, height, size = np.concatenate(rows, axis=1)
+        may_be, steady, height, trace, determinant = np.concatenate(rows, axis=1)
+        size = np.abs(multipliers_of(trace, determinant)[:, 0])
         admissible[scene[may_be > 0.0], column] = True
         # the highest last: of several values for one place the last one stays
         chosen = np.flatnonzero(steady)[np.argsort(height[steady > 0.0])]
@@ -117,21 +120,17 @@ def _roots_of_block(scenes: Scene, order: Float[Array, ""]) -> OrbitRoots:
 
 
 @jax.jit
-def _judged(place: OrbitPlace, scenes: Scene, order: Float[Array, ""]) -> Float[Array, "4 lanes"]:
-    """Return of orbits whether they are admissible, whether stable too, peak amplitude and largest multiplier."""
+def _judged(place: OrbitPlace, scenes: Scene, order: Float[Array, ""]) -> Float[Array, "5 lanes"]:
+    """Return of orbits whether they are admissible, whether stable too, peak amplitude, and T and D of the map."""
 
-    def one(place: OrbitPlace, scene: Scene) -> Float[Array, " 4"]:
+    def one(place: OrbitPlace, scene: Scene) -> Float[Array, " 5"]:
         problem = OrbitProblem(scene.cantilever, scene.platform, LawImpact(impact_law_of(scene)), order)
         state = orbit_state(place, problem)
         verdict = judge(place, jnp.ones((), bool), state, problem)
-        half, determinant = 0.5 * jnp.abs(verdict.trace), verdict.determinant
-        inside = half**2 - determinant
-        real = inside > 0.0
-        # a pair on a circle has the root of the determinant for its size
-        size = jnp.where(real, half + jnp.sqrt(jnp.where(real, inside, 1.0)), jnp.sqrt(jnp.abs(determinant)))
         steady = verdict.admissible & verdict.stable
         height = peak_amplitude(scene.cantilever, state.flight)
-        return jnp.stack([verdict.admissible.astype(size.dtype), steady.astype(size.dtype), height, size])
+        flags = (verdict.admissible.astype(height.dtype), steady.astype(height.dtype))
+        return jnp.stack([*flags, height, verdict.trace, verdict.determinant])
 
     return jax.vmap(one)(place, scenes).T
 
@@ -146,6 +145,7 @@ TABLE_COLUMNS = (
 )
 
 
+@public_result(picture="afm_jax.plots.dynamics:chart_figure", rows="table")
 @dataclass(frozen=True)
 class StabilityChart:
     """A chart of stable admissible single-impact orbits over two parameters.

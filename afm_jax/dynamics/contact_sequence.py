@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.junction import Phase
 from afm_jax.dynamics.iteration import Record, Tips
-from afm_jax.motion.record import ContactKind, Simulation, State
+from afm_jax.motion.record import ContactKind, Contacts, Simulation, State
 from afm_jax.motion.settle import HELD_PERIODS
 from afm_jax.motion.simulate import simulate
 from afm_jax.outcomes import Outcome
@@ -112,6 +112,16 @@ def _followed(scenes: Scene, tips: Tips, duration_us: Float[Any, " lanes"], *, a
     return jax.vmap(one)(scenes, tips, duration_us)
 
 
+def next_contact(
+    scene: Scene, departure_us: Array, velocity_nm_per_us: Array, until_us: Array, accuracy: float
+) -> Contacts:
+    """Return the first contact after a departure, followed until a time; one scene, a velocity in the lab."""
+    height = scene.platform.position(departure_us) + scene.interaction.bridge_breaks_nm
+    start = State(departure_us, height, velocity_nm_per_us)
+    rows = simulate(scene, start, until_us - departure_us, max_contacts=1, accuracy=accuracy).contacts
+    return jax.tree.map(lambda part: part[0], rows._replace(detail=None))
+
+
 @partial(jax.jit, static_argnames=("accuracy",))
 def departure_jacobians(
     scenes: Scene,
@@ -135,10 +145,8 @@ def departure_jacobians(
         until = later + _BEYOND / scene.cantilever.frequency_khz * 1e3
 
         def next_departure(state: Array) -> Array:
-            gap = scene.interaction.bridge_breaks_nm
-            start = State(state[0], scene.platform.position(state[0]) + gap, state[1])
-            contacts = simulate(scene, start, until - state[0], max_contacts=1, accuracy=accuracy).contacts
-            return jnp.stack([contacts.departure_time_us[0], contacts.departure_velocity_nm_per_us[0]])
+            contact = next_contact(scene, state[0], state[1], until, accuracy)
+            return jnp.stack([contact.departure_time_us, contact.departure_velocity_nm_per_us])
 
         return jax.jacfwd(next_departure)(jnp.stack([time, velocity]))
 

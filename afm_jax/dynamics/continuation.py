@@ -27,6 +27,8 @@ from scipy.optimize import brentq
 
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.checks import require_float64
+from afm_jax.contact.contact import Contact
+from afm_jax.dynamics.contact_orbits import ContactFlights, CurveUnits, contact_loops
 from afm_jax.dynamics.impact_loop import (
     ImpactLoop,
     LoopReading,
@@ -43,12 +45,13 @@ from afm_jax.dynamics.impact_loop import (
 from afm_jax.dynamics.impact_orbits import MOST_IMPACTS, many_impact_orbits
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.orbits import single_impact_orbits
+from afm_jax.results import public_result
 from afm_jax.scenefile.parameter_paths import (
     ParameterRange,
     check_ranges,
     parameter_values,
     scene_family,
-    with_number,
+    with_numbers,
 )
 
 KINDS = ("fold", "period_doubling", "torus", "grazing", "capture")
@@ -73,6 +76,10 @@ _ROOT = 1e-7
 """Largest test function at a root; a jump or a pole is none."""
 _LONGEST_DELAY = 0.5
 """Of a drive period: beyond, a law's delay has lost its meaning close to capture."""
+_AT_AN_END = 1e-4
+"""Test function below which a contact's curve has been lost at its root."""
+_LONG_ENOUGH = 1e-5
+"""Length over which is extrapolated from there."""
 _UNLIKE = 1e-3
 """Distance at which a loop counts as one that repeats a shorter one."""
 _VALUES_TRIED = 9
@@ -99,6 +106,8 @@ class Equations(NamedTuple):
     driven: str
     samples: int
     kind: int | None = None
+    flights: ContactFlights | None = None
+    """Of a scene with a contact, whose equations are simulated."""
 
 
 class SpecialPoint(NamedTuple):
@@ -148,6 +157,7 @@ class SpecialCurve(NamedTuple):
     ends: tuple[str, str]
 
 
+@public_result(picture="afm_jax.plots.branches:continuation_figure")
 class Continuation(NamedTuple):
     """What `continue_orbits` finds."""
 
@@ -174,7 +184,8 @@ def continue_orbits(
     closes. A flight that comes to pass through the surface (grazing) ends no curve: its points are not admissible.
 
     Args:
-        scene: one scene with an `ImpactLaw`, driven with one period.
+        scene: one scene with an `ImpactLaw` or a `Contact`, driven with one period. A contact's curves end where the
+            orbit grazes and where it is captured; their cusps are not looked for.
         order: N, drive periods in which the orbit repeats.
         given: the parameter and its range.
         impacts: m, impacts in them; 0: the motion of a tip that meets nothing.
@@ -182,7 +193,7 @@ def continue_orbits(
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
-        TypeError: if the scene's interaction is not an impact law.
+        TypeError: if the tip meets nothing.
         ValueError: if the drive does not repeat, a parameter or a range is none of the scene's, or order and impacts
             are no numbers of impacts and periods.
     """
@@ -194,8 +205,9 @@ def continue_orbits(
         own = parameter_values(scene)[second.path]
         if not second.low <= own <= second.high:
             raise ValueError(f"{second}: the range must hold the scene's own value, {own:g}, where the curves begin")
-    equations = Equations((given.path,), driven, samples_for(scene, order, driven))
-    starts, rejected = _orbits_in_range(scene, order, impacts, given)
+    flights = ContactFlights(scene, order, (given.path,)) if isinstance(scene.interaction, Contact) else None
+    equations = Equations((given.path,), driven, samples_for(scene, order, driven), flights=flights)
+    starts, rejected = _orbits_in_range(scene, order, impacts, given, flights)
     scale = max((loop[impacts:].max() for _, loop in starts if impacts), default=1.0)
     frame = _frame(scene, order, scale, (given,))
     ways: list[_Way] = []
@@ -226,7 +238,10 @@ def _check(scene: Scene, order: int, impacts: int, ranges: Sequence[ParameterRan
         raise ValueError(f"`order` must be a positive integer, but is {order}")
     if int(impacts) != impacts or not 0 <= impacts <= MOST_IMPACTS:
         raise ValueError(f"`impacts` must be an integer from 0 to {MOST_IMPACTS}, but is {impacts}")
-    impact_law_of(scene)
+    if not isinstance(scene.interaction, Contact):
+        impact_law_of(scene)
+    elif impacts == 0:
+        raise ValueError("`impacts` must be 1 or more in a scene with a contact, but is 0")
     check_ranges(scene, *ranges)
     for given in ranges:
         for end in (given.low, given.high):
@@ -244,11 +259,7 @@ def _frame(scene: Scene, order: int, scale: float, ranges: Sequence[ParameterRan
 def loop_at(shares: Float[Array, " parameters"], frame: Frame, equations: Equations) -> ImpactLoop:
     """Return what is closed where the parameters are at shares of their ranges."""
     values = dict(zip(equations.paths, frame.low + frame.width * shares, strict=True))
-    scene = frame.scene
-    # the cantilever first: reduced frequencies are in its unit
-    for path in sorted(values, key=lambda path: not path.startswith("cantilever")):
-        scene = with_number(scene, path, values[path])
-    return loop_of(scene, frame.order, equations.driven)
+    return loop_of(with_numbers(frame.scene, values), frame.order, equations.driven)
 
 
 def _split(point: Array, equations: Equations) -> tuple[Array, Array]:
@@ -327,9 +338,19 @@ def _step(frame: Frame, guess: Array, row: Array, equations: Equations) -> _Step
 
 def _solve(frame: Frame, guess: np.ndarray, row: np.ndarray, equations: Equations) -> _Step | None:
     """Return the same as NumPy arrays; None where the method does not arrive."""
-    found = _Step(*(np.asarray(part) for part in _step(frame, jnp.asarray(guess), jnp.asarray(row), equations)))
+    if equations.flights is not None:
+        solved = equations.flights.solve(guess, row, _units(frame), equations.kind)
+        if solved is None:
+            return None
+        found = _Step(*solved, 0.0)
+    else:
+        found = _Step(*(np.asarray(part) for part in _step(frame, jnp.asarray(guess), jnp.asarray(row), equations)))
     arrived = np.isfinite(found.point).all() and np.isfinite(found.tangent).all() and found.moved < _ARRIVED
     return found if arrived else None
+
+
+def _units(frame: Frame) -> CurveUnits:
+    return CurveUnits(float(frame.scale), np.asarray(frame.low), np.asarray(frame.width))
 
 
 # Curves.
@@ -512,14 +533,14 @@ def _same_loop(one: np.ndarray, other: np.ndarray, parameters: int) -> bool:
 
 
 def _orbits_in_range(
-    scene: Scene, order: int, impacts: int, given: ParameterRange
+    scene: Scene, order: int, impacts: int, given: ParameterRange, flights: ContactFlights | None
 ) -> tuple[list[tuple[float, np.ndarray]], int]:
     """Return orbits in the range, and how many were left out as not admissible.
 
-    Each as its share of the range, and phases in rad and coordinates in nm/us.
+    Each as its share of the range, and phases in rad and coordinates in nm/us (of a contact: rebound speeds).
     """
     own = parameter_values(scene)[given.path]
-    tried = np.linspace(0.0, 1.0, (_VALUES_TRIED if impacts == 1 else _FEWER_TRIED) + 2)[1:-1]
+    tried = np.linspace(0.0, 1.0, (_VALUES_TRIED if impacts == 1 and flights is None else _FEWER_TRIED) + 2)[1:-1]
     # the middle first
     shares = list(tried[np.argsort(np.abs(tried - 0.5), kind="stable")])
     if given.low <= own <= given.high:
@@ -528,8 +549,11 @@ def _orbits_in_range(
         return [(float(shares[0]), np.zeros(0))], 0
     family, found, rejected = scene_family(scene, given.path), [], 0
     for share in shares:
-        there = family(given.low + (given.high - given.low) * share)
-        if impacts == 1 and scene.base is None and scene.force is None and scene.platform.second is None:
+        value = given.low + (given.high - given.low) * share
+        there = family(value)
+        if flights is not None:
+            loops = contact_loops(flights, np.array([value]), impacts)
+        elif impacts == 1 and scene.base is None and scene.force is None and scene.platform.second is None:
             loops, passed = _single_impact_loops(there, order)
             rejected += passed
         else:
@@ -563,10 +587,17 @@ def _read(frame: Frame, points: Array, equations: Equations) -> LoopReading:
 
 def read_points(points: Float[np.ndarray, "points n"], frame: Frame, equations: Equations) -> LoopReading:
     """Return what there is to know of the orbits at points of a curve, NumPy arrays."""
+    if equations.flights is not None:
+        return equations.flights.readings(points, _units(frame))
+    return by_blocks(lambda block: _read(frame, block, equations), points)
+
+
+def by_blocks(work: Callable[[Array], Any], points: Float[np.ndarray, "points n"]) -> Any:
+    """Return the results of work on points, NumPy arrays; blocks of one size, the last filled up, share a program."""
     blocks = -(-len(points) // _BLOCK)
     padded = np.concatenate([points, np.repeat(points[-1:], blocks * _BLOCK - len(points), axis=0)])
-    read = [_read(frame, jnp.asarray(block), equations) for block in np.split(padded, blocks)]
-    return jax.tree.map(lambda *parts: np.concatenate([np.asarray(part) for part in parts])[: len(points)], *read)
+    done = [work(jnp.asarray(block)) for block in np.split(padded, blocks)]
+    return jax.tree.map(lambda *parts: np.concatenate([np.asarray(part) for part in parts])[: len(points)], *done)
 
 
 def _branch(way: _Way, frame: Frame, equations: Equations) -> OrbitBranch:
@@ -594,14 +625,16 @@ def _special_points(
         for test in range(len(KINDS)):
             root = _root_on(leg, _test_function(test, equations), frame, equations)
             if root is not None and (test != _TORUS or _is_complex(root[1])):
-                found.append((place(root[0]), test, root[1]))
+                found.append((place(root[0]), test, root[1], root[1].point))
+    if equations.flights is not None:
+        found += _at_lost_ends(way)
     if not found:
         return []
     found.sort(key=lambda one: one[0])
-    reading = read_points(np.stack([step.point for _, _, step in found]), frame, equations)
+    reading = read_points(np.stack([seen for *_, seen in found]), frame, equations)
     low, width = float(frame.low[0]), float(frame.width[0])
     special = []
-    for index, (place, test, step) in enumerate(found):
+    for index, (place, test, step, _) in enumerate(found):
         own = jax.tree.map(lambda part, index=index: part[index], reading)
         beside = branch.reading.admissible[[int(np.floor(place)), int(np.ceil(place))]]
         flown = bool(beside.any()) if test in (_GRAZING, _CAPTURE) else bool(own.admissible)
@@ -611,9 +644,30 @@ def _special_points(
     return special
 
 
+def _at_lost_ends(way: _Way) -> list[tuple[float, int, _Step, np.ndarray]]:
+    """Return grazings and captures at which a contact's curve ends: beyond, its map flies otherwise, or not at all.
+
+    The curve has come within a millionth and less; the rest is extrapolated. Last is the curve's own last point.
+    """
+    found = []
+    for legs, end, place in ((way.behind, 0, 0.0), (way.ahead, 1, float(len(way.steps) - 1))):
+        if way.ends[end] != "lost" or not legs:
+            continue
+        last = legs[-1].end
+        apart = (leg.begin for leg in reversed(legs) if np.linalg.norm(leg.begin.point - last.point) > _LONG_ENOUGH)
+        before = next(apart, legs[0].begin)
+        for test in (_GRAZING, _CAPTURE):
+            falls = float(before.tests[test] - last.tests[test])
+            if 0.0 <= last.tests[test] < _AT_AN_END and falls > 0.0:
+                share = float(last.tests[test]) / falls
+                point = last.point + share * (last.point - before.point)
+                found.append((place, test, last._replace(point=point), last.point))
+    return found
+
+
 def _kind_of(test: int, step: _Step, frame: Frame, equations: Equations) -> str:
     """Return what a root of a test function is: where the law captures nothing, an impact that vanishes is a graze."""
-    if test == _CAPTURE:
+    if test == _CAPTURE and equations.flights is None:
         _, shares = _split(jnp.asarray(step.point), equations)
         if float(loop_at(shares, frame, equations).impact.lowest) == 0.0:
             return KINDS[_GRAZING]
@@ -661,12 +715,16 @@ def _curves(
 ) -> tuple[SpecialCurve, ...]:
     """Return the curves in two parameters through special points that the map flies, each once."""
     curves: list[tuple[int, _Way]] = []
-    found = []
+    found, both = [], None
     share = (own - second.low) / (second.high - second.low)
     for point in special:
         first = (point.parameter - float(frame.low[0])) / float(frame.width[0])
         start = np.concatenate([point.unknowns, [first, share]])
-        own_equations = equations._replace(paths=(*equations.paths, second.path), kind=point.test)
+        paths = (*equations.paths, second.path)
+        own_equations = equations._replace(paths=paths, kind=point.test)
+        if equations.flights is not None:
+            both = both or ContactFlights(frame.scene, int(frame.order), paths)
+            own_equations = own_equations._replace(flights=both)
         passed = (way for test, way in curves if test == point.test)
         if not point.admissible or any(_lies_on(start, way, frame, own_equations) for way in passed):
             continue
@@ -693,7 +751,7 @@ def _special_curve(kind: str, way: _Way, frame: Frame, equations: Equations) -> 
             if root is not None:
                 name = f"{kind}_{_kind_of(test, root[1], frame, equations)}"
                 meetings.append(Meeting(name, *at(root[1]).tolist()))
-        if equations.kind == _FOLD:
+        if equations.kind == _FOLD and equations.flights is None:
             root = _root_on(leg, _cusp_function(leg, frame, equations), frame, equations)
             if root is not None:
                 meetings.append(Meeting("cusp", *at(root[1]).tolist()))

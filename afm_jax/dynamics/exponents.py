@@ -38,6 +38,7 @@ from afm_jax.impact.law import impact_law_of
 from afm_jax.motion.record import State
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.outcomes import Outcome
+from afm_jax.results import public_result
 
 _PARTS = 20
 """Parts of a motion whose means tell the errors."""
@@ -47,6 +48,7 @@ _ARRIVED = 1e-8
 """Estimated distance from an orbit below which its multipliers are taken for the exponents."""
 
 
+@public_result()
 class Lyapunov(NamedTuple):
     """Exponents of motions, arrays of one lane a motion; larger exponent first.
 

@@ -69,10 +69,8 @@ def driven_part(scene: Scene) -> str:
     """Return which part of a scene sets its period: "platform", "base" or "force".
 
     Raises:
-        TypeError: if the scene's interaction is no impact law.
         ValueError: if no motion can repeat under its drive; says why.
     """
-    impact_law_of(scene)
     drive = drive_of(scene)
     if drive.aperiodic is not None:
         raise ValueError(f"there are no periodic orbits: {drive.aperiodic}")

@@ -30,6 +30,7 @@ from afm_jax.dynamics.impact_loop import (
     reading_of,
     samples_for,
 )
+from afm_jax.dynamics.iteration import evenly_spread
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, Flight
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.map import impact_after
@@ -38,6 +39,7 @@ from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import ContactKind, to_lab
 from afm_jax.motion.simulate import simulate
 from afm_jax.outcomes import Outcome
+from afm_jax.results import public_result
 
 DEFAULT_STARTS = 512
 MOST_IMPACTS = 64
@@ -61,6 +63,7 @@ _STEPS = 2000
 _MOST_RESTS = 32
 
 
+@public_result()
 class ManyImpactOrbits(NamedTuple):
     """Orbits of m impacts in N drive periods, by falling peak amplitude; NumPy arrays.
 
@@ -118,13 +121,12 @@ def many_impact_orbits(scene: Scene, order: int, impacts: int, *, starts: int = 
             repeat.
     """
     require_float64(scene)
+    impact_law_of(scene)
     driven = driven_part(scene)
-    for name, value, most in (("order", order, 1_000_000), ("impacts", impacts, MOST_IMPACTS)):
-        if int(value) != value or not 1 <= value <= most:
-            raise ValueError(f"`{name}` must be a positive integer up to {most}, but is {value}")
+    check_loop(order, impacts)
     number = jnp.asarray(float(order))
     found, scale, good = _search(scene, number, _starts(starts), impacts=int(impacts), driven=driven)
-    loops = _told_apart(np.asarray(found)[np.asarray(good)], order)
+    loops = loops_told_apart(np.asarray(found)[np.asarray(good)], order)
     size = max(16, 1 << max(len(loops) - 1, 0).bit_length())
     padded = np.concatenate([loops, np.zeros((size - len(loops), 2 * impacts))])
     reading = read_loops(
@@ -140,6 +142,17 @@ def many_impact_orbits(scene: Scene, order: int, impacts: int, *, starts: int = 
     return ManyImpactOrbits(absolute, reading, multipliers, is_stable(multipliers))
 
 
+def check_loop(order: int, impacts: int) -> None:
+    """Check the numbers N and m of an orbit.
+
+    Raises:
+        ValueError: if one is no positive integer, or there are more impacts than 64.
+    """
+    for name, value, most in (("order", order, 1_000_000), ("impacts", impacts, MOST_IMPACTS)):
+        if int(value) != value or not 1 <= value <= most:
+            raise ValueError(f"`{name}` must be a positive integer up to {most}, but is {value}")
+
+
 @partial(jax.jit, static_argnames=("driven", "samples"))
 def read_loops(
     scene: Scene, order: Float[Array, ""], loops: Float[Array, "loops n"], scale: Array, *, driven: str, samples: int
@@ -151,9 +164,7 @@ def read_loops(
 
 def _starts(number: int) -> Float[Array, "starts 2"]:
     """Return phases and logarithms of speeds, both as shares of their range, that fill the square evenly."""
-    # additive recurrence of the plastic number: no two coordinates line up
-    steps = np.array([0.7548776662466927, 0.5698402909980532])
-    return jnp.asarray((0.5 + np.arange(1, number + 1)[:, None] * steps) % 1.0)
+    return jnp.asarray((0.5 + evenly_spread(number)) % 1.0)
 
 
 @partial(jax.jit, static_argnames=("impacts", "driven"))
@@ -226,7 +237,7 @@ def closed_loop(guess: Float[Array, " n"], scale: Float[Array, ""], loop: Impact
     return lax.fori_loop(0, _NEWTON_STEPS, improve, guess)
 
 
-def _told_apart(loops: Float[np.ndarray, "found n"], order: int) -> Float[np.ndarray, "loops n"]:
+def loops_told_apart(loops: Float[np.ndarray, "found n"], order: int) -> Float[np.ndarray, "loops n"]:
     """Return each loop once, its hardest impact first; without those that repeat a shorter one."""
     count = loops.shape[1] // 2
     kept: dict[tuple[int, ...], list[np.ndarray]] = {}
@@ -295,8 +306,8 @@ def sticking_orbit(scene: Scene, *, longest: int = 64) -> StickingOrbit | str:
         ValueError: if the drive does not repeat.
     """
     require_float64(scene)
-    driven_part(scene)
     law, period = impact_law_of(scene), drive_of(scene).period_us
+    driven_part(scene)
     if float(law.epsilon) > 0.0 or law.delay is not None:
         return "with adhesion or a delay a tip that comes to rest stays"
     surface, response = surface_of(scene)

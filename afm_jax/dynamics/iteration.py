@@ -220,6 +220,12 @@ def record_of(scenes: Scene, step: MapStep) -> Record:
     )
 
 
+def evenly_spread(count: int) -> Float[np.ndarray, "count 2"]:
+    """Return pairs that fill the unit square evenly: multiples of the plastic number's inverse powers, modulo 1."""
+    plastic = 1.324717957244746
+    return np.arange(1.0, count + 1.0)[:, None] / [plastic, plastic**2] % 1.0
+
+
 def leaving_tips(scenes: Scene) -> Tips:
     """Return tips that leave the platform upward at its highest speed, at that speed again or twice the capture speed.
 

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from afm_jax.apparatus.cantilever import Cantilever, Propagator
 from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.trigonometry import sine_cosine
 from afm_jax.impact.implicit import solved_pair
 from afm_jax.impact.lasting_impact import Impact, LawImpact, corrected, lasting, middle_of_contact
 from afm_jax.impact.law import ImpactLaw, Speeds
@@ -228,7 +229,7 @@ def _delayed(speeds: Speeds, problem: OrbitProblem) -> ClosingSystem:
     cantilever, platform, _, order = problem
     p: Propagator = cantilever.propagator(order * platform.period_us - speeds.delay)
     turn = platform.angular_frequency * speeds.delay
-    cos_turn, sin_turn = jnp.cos(turn), jnp.sin(turn)
+    sin_turn, cos_turn = sine_cosine(turn)
     omega, top_speed = platform.angular_frequency, platform.top_speed_nm_per_us
     sigma = platform.offset_nm / platform.amplitude_nm
     approach, rebound = speeds.approach / top_speed, speeds.rebound / top_speed

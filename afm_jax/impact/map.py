@@ -15,16 +15,18 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from afm_jax.apparatus.scene import Scene, require_sample_drive
-from afm_jax.checks import readable, require_float64
+from afm_jax.checks import require_float64
 from afm_jax.impact.first_impact import DEFAULT_MAX_STEPS, DEFAULT_ROOT_TOLERANCE_US, Flight, first_impact
 from afm_jax.impact.lasting_impact import LawImpact, crawls, delay_before, speeds_of_impact
 from afm_jax.impact.law import impact_law_of
 from afm_jax.outcomes import Outcome
+from afm_jax.results import public_result
 
 NEAR_GRAZING = 1e-3
 """Approach speed over beta omega below which an impact counts as near grazing: its derivatives lose their meaning."""
 
 
+@public_result(outcome=Outcome)
 class NextImpact(eqx.Module):
     """The impact that follows a start, one tip and one time; batches by `vmap`.
 
@@ -45,8 +47,6 @@ class NextImpact(eqx.Module):
     velocity_after_nm_per_us: Float[Array, "..."]
     outcome: Int[Array, "..."]
     near_grazing: Bool[Array, "..."]
-
-    __repr__ = readable
 
 
 def next_impact(

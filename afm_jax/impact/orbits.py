@@ -16,7 +16,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, require_sample_drive
-from afm_jax.checks import is_traced, readable, require_float64
+from afm_jax.checks import is_traced, require_float64
 from afm_jax.impact.amplitude import FlightEnds, lockin, peak_amplitude
 from afm_jax.impact.closure import (
     OrbitPlace,
@@ -33,6 +33,7 @@ from afm_jax.impact.lasting_impact import Impact, LawImpact, crawls, indentation
 from afm_jax.impact.law import Speeds, impact_law_of
 from afm_jax.impact.roots import COARSE, find_roots
 from afm_jax.outcomes import Outcome
+from afm_jax.results import public_result
 
 NEAR_DOUBLE = 1e-3
 """Slope of the closing condition per relative change of speed below which a root counts as near-double (a fold)."""
@@ -42,6 +43,7 @@ _ARRIVAL_TOLERANCE = 1e-7
 """How far (in drive periods) the first impact found may lie before the orbit's own, by rounding."""
 
 
+@public_result()
 class SingleImpactOrbits(eqx.Module):
     """All (1, N) orbits of a scene, ascending in approach speed, in a fixed number of slots.
 
@@ -83,8 +85,6 @@ class SingleImpactOrbits(eqx.Module):
     trace: Float[Array, "..."]
     determinant: Float[Array, "..."]
     complete: Bool[Array, "..."]
-
-    __repr__ = readable
 
 
 def single_impact_orbits(scene: Scene, order: ArrayLike) -> SingleImpactOrbits:

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import Surface
-from afm_jax.checks import readable
+from afm_jax.results import public_result
 
 
 class MotionOutcome(enum.IntEnum):
@@ -56,6 +56,7 @@ class ContactKind(enum.IntEnum):
     """The tip was still held, or within its contact, when the simulation ended; there is no departure."""
 
 
+@public_result()
 class State(NamedTuple):
     """Where the tip is: lab frame, scalars of one scene."""
 
@@ -107,6 +108,7 @@ class Contacts(NamedTuple):
     detail: ContactDetail | None = None
 
 
+@public_result(outcome=MotionOutcome)
 class Simulation(eqx.Module):
     """A scene followed in time; under `vmap` every array has the batch as first axis."""
 
@@ -121,8 +123,6 @@ class Simulation(eqx.Module):
     """Whether the tip is held at the end."""
     outcome: Int[Array, "..."]
     """A `MotionOutcome`."""
-
-    __repr__ = readable
 
 
 def to_gap(

@@ -32,6 +32,7 @@ from afm_jax.contact.driven import Driven, Place, driven_by
 from afm_jax.contact.junction import Junction, Phase, find_junction, force_in_phase
 from afm_jax.contact.step import Touch, advance, eighth_order_step, fresh_touch
 from afm_jax.motion.record import ContactKind, Simulation, State, to_gap, to_lab
+from afm_jax.results import public_result
 
 _BLOCK = 128
 """Trials computed in one call."""
@@ -298,6 +299,7 @@ _PANEL_RAD = 1.5
 """Phase of the fastest motion that one panel of a flight spans."""
 
 
+@public_result(phase=Phase)
 class Trajectory(NamedTuple):
     """The tip at given times; NumPy arrays of the times' shape."""
 

@@ -6,12 +6,13 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
-from afm_jax.dynamics.bands import WITHIN_95
 from afm_jax.dynamics.continuation import Continuation, OrbitBranch, SpecialPoint
 from afm_jax.dynamics.impact_orbits import is_stable, multipliers_of
 from afm_jax.plots.dynamics import label_of
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save
+from afm_jax.units import TWO_SIDED_95
 
 _MARKS = {
     "fold": ("o", ACCENT),
@@ -30,11 +31,20 @@ def draw_continuation(
     bands: Sequence[Float[np.ndarray, " points"]] | None = None,
     errors: Float[np.ndarray, " special"] | None = None,
 ) -> None:
-    """Draw peak amplitude against the parameter: stable solid, unstable dashed, not admissible dotted and light.
+    """Write the picture of a continuation as PDF, SVG or PNG; arguments as of `continuation_figure`."""
+    save(continuation_figure(found, bands=bands, errors=errors), path)
+
+
+def continuation_figure(
+    found: Continuation,
+    *,
+    bands: Sequence[Float[np.ndarray, " points"]] | None = None,
+    errors: Float[np.ndarray, " special"] | None = None,
+) -> Figure:
+    """Return peak amplitude against the parameter: stable solid, unstable dashed, not admissible dotted and light.
 
     Args:
         found: what is shown.
-        path: PDF, SVG or PNG file, by its suffix.
         bands: standard errors of the amplitude, an array a branch: shaded to 95 %.
         errors: standard errors of the special points: bars to 95 %.
     """
@@ -48,7 +58,7 @@ def draw_continuation(
     for index, point in enumerate(found.special):
         if not point.admissible:
             continue
-        half = None if errors is None else WITHIN_95 * float(errors[index])
+        half = None if errors is None else TWO_SIDED_95 * float(errors[index])
         marker, colour = _MARKS[point.kind]
         height = float(point.reading.peak_amplitude_nm)
         axes.errorbar(
@@ -69,7 +79,7 @@ def draw_continuation(
     axes.margins(x=0.02)
     if labels:
         axes.legend(fontsize=10, frameon=False)
-    save(figure, path)
+    return figure
 
 
 def _once(label: str, labels: set[str]) -> str | None:
@@ -104,7 +114,7 @@ def _draw_branch(axes: Axes, branch: OrbitBranch, special: Sequence[SpecialPoint
 def _draw_band(axes: Axes, branch: OrbitBranch, error: Float[np.ndarray, " points"]) -> None:
     """Shade where the amplitude may lie; not where a fold is so near that a held parameter says nothing."""
     height = branch.reading.peak_amplitude_nm
-    half = WITHIN_95 * error
+    half = TWO_SIDED_95 * error
     shown = np.isfinite(half) & (half < 0.3 * np.abs(height)) & branch.reading.admissible
     begin = 0
     for end in [*(np.flatnonzero(np.diff(shown.astype(int))) + 1).tolist(), len(shown)]:

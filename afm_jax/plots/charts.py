@@ -87,9 +87,11 @@ def _add_frequency_axis(axes: Axes) -> None:
 
 
 def cell_edges(centres: Float[np.ndarray, " cells"]) -> Float[np.ndarray, " edges"]:
-    """Return the borders of evenly spaced cells."""
-    half = 0.5 * (centres[1] - centres[0])
-    return np.append(centres - half, centres[-1] + half)
+    """Return the borders of cells, half-way between their centres."""
+    if len(centres) == 1:
+        return centres[0] + np.array([-0.5, 0.5])
+    borders = 0.5 * (centres[1:] + centres[:-1])
+    return np.concatenate([[2.0 * centres[0] - borders[0]], borders, [2.0 * centres[-1] - borders[-1]]])
 
 
 SHOWN_R = (0.55, 0.6, 0.65, 0.7, 0.75, 0.8, 0.85, 0.9, 0.95, 0.99)

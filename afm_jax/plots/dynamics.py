@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
+from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from afm_jax.dynamics.basins import Basins
@@ -113,13 +114,17 @@ def draw_bifurcations(path: str, sweeps: Sequence[Sweep], target: Path) -> None:
 
 
 def draw_chart(x: str, y: str, chart: StabilityChart, target: Path) -> None:
-    """Draw a chart of stable single-impact orbits: the lowest stable order, and how stable its orbit is.
+    """Write a chart of stable single-impact orbits over two parameters, whose paths are given, as PNG, PDF or SVG."""
+    save(chart_figure(chart, label_of(x), label_of(y)), target)
+
+
+def chart_figure(chart: StabilityChart, x: str = "first parameter", y: str = "second parameter") -> Figure:
+    """Return a picture of a chart: the lowest stable order, and how stable its orbit is.
 
     Args:
-        x: path of the parameter of the columns.
-        y: of the rows.
         chart: the chart.
-        target: PNG, PDF or SVG file.
+        x: what its columns are.
+        y: what its rows are.
     """
     figure = new_figure(12.0, 5.2)
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
@@ -141,18 +146,18 @@ def draw_chart(x: str, y: str, chart: StabilityChart, target: Path) -> None:
     mesh = right.pcolormesh(*edges, lowest_size, cmap="cividis", vmin=0.0, vmax=1.0, rasterized=True)
     figure.colorbar(mesh, ax=right, label="size of its larger multiplier")
     right.set_title("how stable", fontsize=12)
-    label_axes(left, x=label_of(x), y=label_of(y))
-    label_axes(right, x=label_of(x), y="")
-    save(figure, target)
+    label_axes(left, x=x, y=y)
+    label_axes(right, x=x, y="")
+    return figure
 
 
 def draw_basins(basins: Basins, target: Path) -> None:
-    """Draw which start ends where, and the points of the orbits.
+    """Write the picture of basins as PNG, PDF or SVG."""
+    save(basins_figure(basins), target)
 
-    Args:
-        basins: what is shown.
-        target: PNG, PDF or SVG file.
-    """
+
+def basins_figure(basins: Basins) -> Figure:
+    """Return a picture of which start ends where, and the points of the orbits."""
     figure = new_figure(8.4, 6.0)
     axes: Axes = figure.subplots()
     number = min(len(basins.attractors), len(KINDS))
@@ -168,4 +173,4 @@ def draw_basins(basins: Basins, target: Path) -> None:
     axes.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]], xticks=range(0, 361, 90))
     label_axes(axes, x="drive phase at the start (deg)", y=r"rebound speed at the start (nm/$\mu$s)")
     figure.legend(handles=handles, loc="outside upper center", ncols=4, fontsize=11, frameon=False)
-    save(figure, target)
+    return figure

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.contact.contact import Contact
@@ -312,12 +313,32 @@ def _peaks(axes: Axes, look: Look) -> None:
 
 
 def draw_gap(look: Look, path: Path) -> None:
-    """Draw the gap around the last contacts as a PNG file, a panel each, with the gaps at which the phase changes."""
+    """Draw the gap as a PNG file: around the last contacts; of impacts that take no time, over the flights between."""
+    save(_gap_of_contacts(look) if isinstance(look.scene.interaction, Contact) else _gap_of_flights(look), path)
+
+
+def _gap_of_flights(look: Look) -> Figure:
+    picture = new_figure(10.0, 4.4)
+    axes = picture.subplots()
+    axes.plot(look.path.time_us, look.path.gap_nm, color="black", linewidth=1.6)
+    with_zero_line(axes)
+    shade_phases(axes, look.path, look.scene.interaction)
+    shown = look.arrival_us[(look.arrival_us >= look.path.time_us[0]) & (look.arrival_us <= look.path.time_us[-1])]
+    axes.plot(shown, np.zeros_like(shown), "o", color=ACCENT, markersize=5, label="impacts", clip_on=False)
+    axes.set_xlim(look.path.time_us[0], look.path.time_us[-1])
+    label_axes(axes, x="time (µs)", y="gap (nm)")
+    axes.set_title(f"gap over the last {shown.size} of {look.arrival_us.size} impacts", fontsize=12, loc="left")
+    axes.legend(loc="upper right", fontsize=10, framealpha=1.0)
+    return picture
+
+
+def _gap_of_contacts(look: Look) -> Figure:
+    """Return the gap around the last contacts, a panel each, with the gaps at which the phase changes."""
     rows = np.arange(look.arrival_us.size)[-_GAP_PANELS:]
     picture = new_figure(4.0 * len(rows) + 1.0, 4.4)
     panels = picture.subplots(1, len(rows), squeeze=False, sharey=True)[0]
     contact = look.scene.interaction
-    marks = _marks(contact) if isinstance(contact, Contact) else {}
+    marks = _marks(contact)
     top = 0.0
     for axes, row in zip(panels, rows, strict=True):
         begin, end = _around(look, int(row))
@@ -340,16 +361,14 @@ def draw_gap(look: Look, path: Path) -> None:
     handles, labels = panels[0].get_legend_handles_labels()
     if handles:
         panels[0].legend(handles, labels, loc="upper center", fontsize=10, framealpha=1.0)
-    save(picture, path)
+    return picture
 
 
 def _around(look: Look, row: int) -> tuple[float, float]:
     """Return the times between which a contact is shown: from and to a gap of a few nm."""
     arrival, departure = look.arrival_us[row], look.departure_us[row]
     approach = max(float(np.asarray(look.contacts.approach_speed_nm_per_us)[look.used][row]), 1.0)
-    lead = min(_GAP_SHOWN_NM / approach, 0.25 * look.drive.period_us)
-    resolved = isinstance(look.scene.interaction, Contact)
-    lead = 0.4 * lead if resolved else lead
+    lead = 0.4 * min(_GAP_SHOWN_NM / approach, 0.25 * look.drive.period_us)
     end = departure if np.isfinite(departure) else arrival + look.drive.period_us
     first, last = float(look.simulation.start.time_us), float(look.simulation.final.time_us)
     return max(first, min(arrival, end) - lead), min(last, max(arrival, end) + lead)
@@ -407,6 +426,10 @@ def draw_force_gap(look: Look, path: Path) -> None:
     save(picture, path)
 
 
+_LEAST_SHOWN = 0.02
+"""Least height of the section's axis, either way, of the largest velocity."""
+
+
 def draw_section(look: Look, path: Path) -> None:
     """Draw the section as a PNG file, the order in time as a shade."""
     section = poincare_section(look.scene, look.simulation)
@@ -421,10 +444,15 @@ def draw_section(look: Look, path: Path) -> None:
     label_axes(axes, x="phase of the drive at departure (degrees)", y="departure velocity (nm/µs)")
     axes.set(xlim=(0.0, 360.0), xticks=range(0, 361, 60))
     axes.grid(color=GRID, alpha=0.25)
+    # what is left of a settled motion is rounding: the axis does not magnify it
+    middle, spread = 0.5 * float(velocity.max() + velocity.min()), 0.5 * float(velocity.max() - velocity.min())
+    half = max(1.1 * spread, _LEAST_SHOWN * float(np.abs(velocity).max()))
+    axes.set_ylim(middle - half, middle + half)
     if velocity.min() < 0.0 < velocity.max():
         with_zero_line(axes)
     axes.legend(loc="best", fontsize=10, framealpha=1.0)
-    axes.set_title(f"Poincaré section, {phase.size} departures", fontsize=12, loc="left")
+    narrow = f", within {2.0 * spread:.1e} nm/µs" if half > 1.1 * spread and phase.size > 1 else ""
+    axes.set_title(f"Poincaré section, {phase.size} departures{narrow}", fontsize=12, loc="left")
     save(picture, path)
 
 

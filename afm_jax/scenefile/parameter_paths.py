@@ -161,11 +161,7 @@ def scene_family(scene: Scene, *paths: str) -> Callable[..., Scene]:
 
     def at(*values: ArrayLike) -> Scene:
         given = dict(zip(paths, values, strict=True))
-        made = scene
-        # the cantilever first: reduced frequencies are in its unit
-        for path in sorted(given, key=lambda path: not path.startswith("cantilever")):
-            if path not in of_contact:
-                made = with_number(made, path, given[path])
+        made = with_numbers(scene, {path: value for path, value in given.items() if path not in of_contact})
         if contact is not None:
             made = eqx.tree_at(lambda part: part.interaction, made, contact(*(given[path] for path in of_contact)))
         return made
@@ -202,8 +198,15 @@ def _contact_family(scene: Scene, names: tuple[str, ...]) -> Callable[..., objec
     return lambda *values: Contact.paper(effects=effects, **(numbers | dict(zip(names, values, strict=True))))
 
 
-def with_number(scene: Scene, path: str, value: ArrayLike) -> Scene:
-    """Return a scene with one number of cantilever, drives or law replaced."""
+def with_numbers(scene: Scene, values: Mapping[str, ArrayLike]) -> Scene:
+    """Return a scene with numbers of cantilever, drives and law replaced, by their paths; they may be traced."""
+    # the cantilever first: reduced frequencies are in its unit
+    for path in sorted(values, key=lambda path: not path.startswith("cantilever")):
+        scene = _with_number(scene, path, values[path])
+    return scene
+
+
+def _with_number(scene: Scene, path: str, value: ArrayLike) -> Scene:
     *parts, key = path.split(".")
     number = jnp.asarray(value, scene.platform.frequency_khz.dtype)
     if key == "reduced_frequency":

@@ -1,7 +1,10 @@
 """Free resonance calibration: natural frequency and quality factor of a cantilever from a sweep."""
 
+from dataclasses import replace
+
 import numpy as np
-from scipy.special import chdtrc
+from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.special import chdtrc, digamma
 
 from afm_jax.checks import require_float64
 from afm_jax.version import version_of
@@ -31,6 +34,7 @@ def calibrate(
     noise: float | None = None,
     scale_errors: bool = False,
     compare: bool = True,
+    whole: bool = False,
 ) -> Calibration:
     """Fit frequency and quality factor of the free cantilever to a resonance sweep.
 
@@ -47,6 +51,7 @@ def calibrate(
             Without either the errors are estimated from the misfit, and goodness of fit cannot be judged.
         scale_errors: scale given errors such that chi2 equals its degrees of freedom.
         compare: fit the other backgrounds too, for comparison.
+        whole: fit all of a thermal spectrum, not the part around its resonance that the model explains.
 
     Returns:
         Values, errors, intervals, goodness of fit and a verdict; see `Calibration`.
@@ -58,9 +63,48 @@ def calibrate(
     """
     require_float64()
     kind = kind_of(sweep)
-    first = "constant" if background is None else background
+    first = ("floor" if sweep.spectrum else "constant") if background is None else background
     _check_options(kind, first, noise)
     _check_sweep(sweep, kind, first)
+    settings = {"scale_errors": scale_errors, "compare": compare}
+    windows = _windows(sweep) if sweep.spectrum and not whole else [sweep]
+    result = _calibrated_sweep(windows[0], first, background, noise, **settings)
+    for window in windows[1:]:
+        if result.explained:
+            break
+        ends = f"{window.frequency_khz[0]:.6g} to {window.frequency_khz[-1]:.6g} kHz"
+        note = f"Fitted from {ends}: further out the spectrum is not that of one resonance and white noise."
+        result = _calibrated_sweep(window, first, background, noise, **settings)
+        result = replace(result, warnings=[*result.warnings, note])
+    return result
+
+
+_HALF_WIDTHS = (20.0, 10.0, 5.0)
+"""Of a thermal spectrum so much is fitted on both sides of the resonance: as much as the model explains."""
+
+
+def _windows(sweep: ResonanceSweep) -> list[ResonanceSweep]:
+    """Return parts of a spectrum around the peak that stands out most of its surroundings, the widest first."""
+    smooth = uniform_filter1d(sweep.amplitude**2, 5)
+    floor = median_filter(smooth, max(sweep.points // 10, 5), mode="nearest")
+    top = int(np.argmax(smooth / floor))
+    low = smooth < 0.5 * (smooth[top] + floor[top])
+    left, right = np.flatnonzero(low[:top]), np.flatnonzero(low[top:])
+    step = np.ptp(sweep.frequency_khz) / (sweep.points - 1)
+    wide = (int(right[0]) if right.size else 1) + (top - int(left[-1]) if left.size else 1)
+    half, centre = max(0.5 * wide, 3.0) * step, float(sweep.frequency_khz[top])
+    return [sweep.within(centre - times * half, centre + times * half) for times in _HALF_WIDTHS]
+
+
+def _calibrated_sweep(
+    sweep: ResonanceSweep,
+    first: str,
+    background: str | None,
+    noise: float | None,
+    *,
+    scale_errors: bool,
+    compare: bool,
+) -> Calibration:
     fit = fit_sweep(sweep, first, noise, scale_errors=scale_errors)
     alternatives = _alternatives(sweep, fit, first) if compare else []
     chosen = first if background is not None else preferred(fit, first, alternatives)
@@ -121,7 +165,9 @@ def _alternative(fit: SweepFit, background: str) -> Alternative:
 
 def _summary(sweep: ResonanceSweep, fit: SweepFit, background: str, alternatives: list[Alternative]) -> Calibration:
     judged = fit.errors.origin != "estimated" and fit.errors.scale is None
-    p_value = float(chdtrc(fit.freedom, fit.chi2)) if judged else float("nan")
+    # the mean of a term of the gamma deviance is a little above 1
+    size = 2.0 * sweep.averages * (np.log(sweep.averages) - digamma(sweep.averages)) if sweep.averages else 1.0
+    p_value = float(chdtrc(fit.freedom, fit.chi2 / size)) if judged else float("nan")
     explained = not p_value < IMPROBABLE
     frequency, quality_factor = _calibrated(fit, explained=explained)
     kind, curves = fit.objective.kind, _curves(sweep, fit)
@@ -148,6 +194,7 @@ def _summary(sweep: ResonanceSweep, fit: SweepFit, background: str, alternatives
         quality_factor=quality_factor,
         peak_frequency_khz=frequency.value * float(np.sqrt(below_peak)) if below_peak > 0.0 else None,
         peak_amplitude=float(height * sweep.amplitude.max()),
+        mean_square=_mean_square(fit, float(sweep.amplitude.max())) if kind == "power" and known else None,
         correlation=float(fit.covariance[0, 1] / errors[0] / errors[1]) if known else None,
         model=kind,
         background=background,
@@ -195,6 +242,21 @@ def _calibrated(fit: SweepFit, *, explained: bool) -> list[CalibratedValue]:
         )
         for value, error, interval, factor in zip(fit.values[:2], errors, intervals[:2], wider, strict=True)
     ]
+
+
+def _mean_square(fit: SweepFit, largest: float) -> CalibratedValue:
+    """Return the thermal <x^2> of the resonance: the integral of a |L|^2 over all frequencies, pi/2 f0/Q a.
+
+    Args:
+        fit: of a spectrum.
+        largest: unit of the fit's amplitudes, nm per root Hz.
+    """
+    frequency, quality_factor, power = fit.values[:3]
+    slopes = np.array([1.0 / frequency, -1.0 / quality_factor, 1.0 / power])
+    share = float(np.sqrt(slopes @ fit.covariance[:3, :3] @ slopes) * inflation_of(fit).max())
+    value = float(0.5 * np.pi * 1e3 * frequency / quality_factor * power * largest**2)
+    ends = (value * float(np.exp(-1.96 * share)), value * float(np.exp(1.96 * share)))
+    return CalibratedValue(value, value * share, ends, None)
 
 
 def _farther(end: float | None, value: float, factor: float) -> float | None:

@@ -9,9 +9,13 @@ the base, z - d, adds a constant to A L, and so do electrical crosstalk and the 
 
     with phase:      z(f) = A L + B + C x            (A, B, C complex; x from -1 to 1 over the sweep)
     amplitude only:  |z|^2 = a |L|^2 + b + c Re L     (b also holds noise in quadrature)
+    power:           the same for a thermal spectrum, |z|^2 its density: white noise shakes the lever, b is the floor
 
 of which a background keeps the first terms (``TERMS``). The second line is |A L + B|^2 up to terms of the order 1/Q^2,
 in parameters that the amplitude determines; A and B themselves it leaves ambiguous.
+
+An averaged periodogram of K spectra scatters as a gamma distribution: -2 log L = 2 K sum(u - 1 - ln u) + const with u =
+measured/fitted density. Each term is the square of a residual, so that least squares maximises the likelihood.
 
 Where the fit of a sweep starts: a grid of frequencies and quality factors, the linear parameters solved for.
 
@@ -41,6 +45,7 @@ from fitting.parameters import Parameter
 TERMS = {
     "phase": {"none": 2, "constant": 4, "linear": 6},
     "amplitude": {"none": 1, "floor": 2, "constant": 3},
+    "power": {"none": 1, "floor": 2, "constant": 3},
 }
 """How many linear parameters each background leaves, for sweeps with and without phase."""
 LINEAR_NAMES = {
@@ -53,6 +58,7 @@ LINEAR_NAMES = {
         "background_slope_sin",
     ),
     "amplitude": ("response_squared", "floor_squared", "interference"),
+    "power": ("response_squared", "floor_squared", "interference"),
 }
 _PADDING = 64
 """Sweeps are filled up to a multiple of this, so that few shapes are compiled."""
@@ -81,7 +87,7 @@ class Points(NamedTuple):
     amplitude: Float[Array, " n"]
     measured: Complex[Array, " n"]  # as a vector; without phase the amplitude once more
     turn: Complex[Array, " n"]  # of modulus 1: turns the direction of the first error onto the real axis
-    weight: Float[Array, "n 2"]  # 1/error along that direction and across it
+    weight: Float[Array, "n 2"]  # 1/error along that direction and across it; of a power spectrum the root of K
 
 
 @dataclass(frozen=True)
@@ -150,11 +156,29 @@ def slope_at(values: Float[Array, " p"], points: Points, kind: str) -> Complex[A
 @partial(jax.jit, static_argnames="kind")
 def _linearised(values: Float[Array, "sets p"], points: Points, kind: str):
     def residual(one):
+        if kind == "power":
+            used = points.weight[:, 0] > 0.0
+            ratio = jnp.where(used, points.amplitude, 1.0) / jnp.where(used, model_at(one, points, kind).real, 1.0)
+            return -points.weight[:, 0] * deviance_root(ratio**2)
         turned = points.turn * (model_at(one, points, kind) - points.measured)
         along = turned.real * points.weight[:, 0]
         return jnp.concatenate([along, turned.imag * points.weight[:, 1]]) if kind == "phase" else along
 
     return jax.vmap(residual)(values), jax.vmap(jax.jacfwd(residual))(values)
+
+
+def deviance_root(ratio: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Return the root of 2 (u - 1 - ln u) with the sign of u - 1, smooth through u = 1.
+
+    Args:
+        ratio: u, above 0.
+    """
+    apart = ratio - 1.0
+    near = jnp.abs(apart) < 1e-3
+    # sqrt(1 - 2 d/3 + d^2/2), to the order that is left in 64 bits
+    series = apart * jnp.sqrt(1.0 - jnp.where(near, 2.0 * apart / 3.0 - apart**2 / 2.0 + 0.4 * apart**3, 0.0))
+    away = jnp.where(near, 2.0, ratio)
+    return jnp.where(near, series, jnp.sign(away - 1.0) * jnp.sqrt(2.0 * (away - 1.0 - jnp.log(away))))
 
 
 class SweepObjective(Objective):
@@ -287,9 +311,11 @@ def sum_without_resonance(points: Points, used: int, kind: str) -> float:
     position = np.asarray(points.position)[:used]
     columns = np.vander(position, _BACKGROUNDS)
     weight = np.asarray(points.weight)[:used]
+    if kind == "power":
+        weight = 2.0 * weight / np.asarray(points.amplitude)[:used, None]
     turn = np.asarray(points.turn)[:used]
     turned = turn * np.asarray(points.measured)[:used]
-    if kind == "amplitude":
+    if kind != "phase":
         design, measured = weight[:, :1] * columns, weight[:, 0] * np.real(turned)
     else:
         basis = turn[:, None] * np.hstack([columns, 1j * columns])
@@ -314,7 +340,9 @@ def first_errors(
         guess: the error where nothing is known.
     """
     largest = sweep.amplitude.max()
-    if sweep.amplitude_error is None:
+    if sweep.spectrum:
+        along = np.full(sweep.points, 1.0 / np.sqrt(sweep.averages or 1.0))
+    elif sweep.amplitude_error is None:
         along = np.full(sweep.points, max(guess, SMALLEST) if noise is None else noise)
     else:
         along = sweep.amplitude_error / largest
@@ -395,6 +423,8 @@ class SweepFit:
 
 def kind_of(sweep: ResonanceSweep) -> str:
     """Return "phase" or "amplitude": what of a sweep is fitted."""
+    if sweep.spectrum:
+        return "power"
     return "amplitude" if sweep.phase_deg is None else "phase"
 
 
@@ -421,7 +451,14 @@ def fit_sweep(sweep: ResonanceSweep, background: str, noise: float | None, *, sc
     problem = SweepProblem(background, names, reference_khz=float(best[0]), width_khz=float(best[0] / best[1] / 2.0))
     objective = SweepObjective(points_of(sweep, reverse=reverse), kind, problem).with_errors(along, across)
     coordinates = _polished(objective, problem.coordinates(values))
-    if sweep.amplitude_error is None and noise is None:
+    if sweep.spectrum:
+        factor = 1.0 if sweep.averages and not scale_errors else _misfit(objective, coordinates, data)
+        objective = objective.with_errors(along * factor, across)
+        scatter = float(along[0] * factor)
+        origin = "averages" if sweep.averages else "estimated"
+        scale = factor if scale_errors and sweep.averages else None
+        errors = PointErrors(origin, scale, 0.5 * scatter * float(np.median(sweep.amplitude)), None)
+    elif sweep.amplitude_error is None and noise is None:
         objective, coordinates, errors = _estimated(objective, coordinates, sweep, data)
     else:
         factor = _misfit(objective, coordinates, data) if scale_errors else 1.0

@@ -33,12 +33,15 @@ _BACKGROUNDS = {
     ("amplitude", "none"): "|z|^2 = a |L|^2",
     ("amplitude", "floor"): "|z|^2 = a |L|^2 + b",
     ("amplitude", "constant"): "|z|^2 = a |L|^2 + b + c Re L",
+    ("power", "none"): "S = a |L|^2",
+    ("power", "floor"): "S = a |L|^2 + b",
+    ("power", "constant"): "S = a |L|^2 + b + c Re L",
 }
 
 
 def calibration_summary(result: Calibration) -> str:
     """Return the calibration as text: verdict first, then the values, their comparison, goodness of fit, notes."""
-    what = "amplitude and phase" if result.model == "phase" else "amplitude"
+    what = {"phase": "amplitude and phase", "power": "thermal spectrum"}.get(result.model, "amplitude")
     values = [
         _value_cells("frequency_khz", result.frequency_khz, "  kHz"),
         _value_cells("quality_factor", result.quality_factor, ""),
@@ -86,7 +89,11 @@ def point_records(result: Calibration) -> list[dict[str, Any]]:
 
 
 def write_calibration(
-    result: Calibration, folder: Path, write_table: Callable[[str, list[dict[str, Any]], tuple[str, ...]], None]
+    result: Calibration,
+    folder: Path,
+    write_table: Callable[[str, list[dict[str, Any]], tuple[str, ...]], None],
+    text: str,
+    data: dict[str, Any],
 ) -> list[Path]:
     """Write calibration.txt, calibration.json, calibration.png and calibration_points.csv into a folder.
 
@@ -94,6 +101,8 @@ def write_calibration(
         result: the calibration.
         folder: an existing folder; files of these names are replaced.
         write_table: called with a file name, records and columns for the CSV file.
+        text: of calibration.txt.
+        data: of calibration.json.
 
     Returns:
         The files written here (the table is `write_table`'s).
@@ -104,7 +113,7 @@ def write_calibration(
     from afm_jax.plots.picture_style import png_of  # noqa: PLC0415
     from fitting.report.report import write_report_files  # noqa: PLC0415
 
-    text, data, picture = calibration_summary(result), result.to_dict(), png_of(calibration_figure(result))
+    picture = png_of(calibration_figure(result))
     written = write_report_files(folder, "calibration", text=text, data=data, picture=picture)
     write_table("calibration_points.csv", point_records(result), POINT_COLUMNS)
     return written
@@ -165,9 +174,14 @@ def calibration_figure(result: Calibration) -> Figure:
     curves = result.curves
     _draw_curve(grid[0, 0], result, shift, result.sweep.amplitude, curves.amplitude)
     label_axes(grid[0, 0], x="", y=f"amplitude{unit}")
+    if result.model == "power":
+        grid[0, 0].set_yscale("log")
     grid[0, 0].legend(fontsize=_SMALL, loc="upper right")
     _mark_instrument(grid[0, 0], result)
-    _draw_misfit(grid[1, 0], shift, curves.amplitude_misfit, f"fit - measured{unit}")
+    if result.model == "power":
+        _draw_misfit(grid[1, 0], shift, 100.0 * curves.amplitude_misfit / curves.amplitude, "fit - measured (%)")
+    else:
+        _draw_misfit(grid[1, 0], shift, curves.amplitude_misfit, f"fit - measured{unit}")
     if result.sweep.phase_deg is not None and curves.phase_deg is not None and curves.phase_misfit_deg is not None:
         measured = np.rad2deg(np.unwrap(np.deg2rad(result.sweep.phase_deg)))
         _draw_curve(grid[0, 1], result, shift, measured, measured + curves.phase_deg - result.sweep.phase_deg)

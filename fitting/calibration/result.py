@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.results import public_result
 from afm_jax.strict_json import plain
 from afm_jax.words import decimals, with_error
 from fitting.calibration.sweep import ResonanceSweep
@@ -51,7 +52,8 @@ class PointErrors:
     """The standard errors that the points were given.
 
     Attributes:
-        origin: "file", "noise" (a share of the largest amplitude) or "estimated" (chosen such that chi2/dof = 1).
+        origin: "file", "noise" (a share of the largest amplitude), "averages" (of a spectrum's periodograms) or
+            "estimated" (chosen such that chi2/dof = 1).
         scale: factor on the errors of the file or of the noise that makes chi2/dof = 1; None if not asked for.
         amplitude: typical (median) standard error of an amplitude, in the sweep's unit.
         frequency_jitter_hz: error of the drive's frequency that explains misfit along the curve; None if not estimated.
@@ -76,6 +78,7 @@ class Curves:
     phase_misfit_deg: Float[np.ndarray, " points"] | None
 
 
+@public_result(picture="fitting.calibration.report:calibration_figure")
 @dataclass(frozen=True)
 class Calibration:
     """The outcome of `calibrate`; attributes are named like the keys of its JSON.
@@ -85,8 +88,10 @@ class Calibration:
         quality_factor: Q in m z'' + (m Omega/Q) z' + k z = F cos(omega t).
         peak_frequency_khz: where the response without background is largest; None for Q below 1/sqrt(2).
         peak_amplitude: the response without background at the natural frequency, in the sweep's unit.
+        mean_square: of a thermal spectrum, <x^2> of the resonance in nm^2, with a Wald interval of its logarithm; None
+            where there is none or its errors are not known.
         correlation: of frequency and quality factor; None where their errors are not known.
-        model: "phase" or "amplitude", what was fitted.
+        model: "phase", "amplitude" or "power", what was fitted.
         background: the background's name.
         background_values: the linear parameters, in units of the largest amplitude.
         phase_reversed: the phase rises through the resonance and was taken with the opposite sign.
@@ -111,6 +116,7 @@ class Calibration:
     quality_factor: CalibratedValue
     peak_frequency_khz: float | None
     peak_amplitude: float
+    mean_square: CalibratedValue | None
     correlation: float | None
     model: str
     background: str
@@ -131,6 +137,11 @@ class Calibration:
     warnings: list[str]
     sweep: ResonanceSweep
     versions: dict[str, str]
+
+    @property
+    def explained(self) -> bool:
+        """Whether the model explains the points, as far as their errors are known."""
+        return not self.p_value < 1e-3
 
     @property
     def table_comments(self) -> list[str]:
@@ -156,6 +167,7 @@ class Calibration:
         for name in ("frequency_khz", "quality_factor", "errors", "curves"):
             own[name] = asdict(own[name])
         own["alternatives"] = [asdict(other) for other in self.alternatives]
+        own["mean_square"] = None if self.mean_square is None else asdict(self.mean_square)
         own["convergence"] = asdict(self.convergence)
         own["table_comments"] = self.table_comments if self.valid else []
         own["instrument"] = self.sweep.instrument

@@ -10,6 +10,9 @@ The frequency stands in ``frequency_khz`` or ``frequency_hz``, the amplitude in 
 unit); ``phase_deg``, ``amplitude_error_nm`` (or ``amplitude_error``) and ``phase_error_deg`` may join them. The Nanonis
 form is recognised by its line ``[DATA]``.
 
+A thermal spectrum is a sweep whose amplitude is the root of a spectral density: NanoSurf's .nid, or a CSV file with
+``asd_nm_per_sqrt_hz`` or ``psd_nm2_per_hz`` and a comment ``# averages = 1000``, the number of spectra averaged.
+
 A resonance sweep as plain CSV.
 
 A resonance sweep as Nanonis writes it: a header of tab-separated lines, then a block of data.
@@ -18,16 +21,21 @@ The columns read are ``Frequency Shift (Hz)`` with ``Center Frequency (Hz)`` (or
 and, where it is there, ``Phase (deg)``; others are passed over.
 """
 
+import contextlib
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float, Int
 
+from afm_jax.results import public_result
+from fitting.instruments.formats import read_recording
+from fitting.instruments.recording import UNITS, Recording
 from fitting.tables.csv_text import (
     NUMBER,
     Column,
     Faults,
+    FileSetting,
     Form,
     TableError,
     check_not_empty,
@@ -35,7 +43,9 @@ from fitting.tables.csv_text import (
     named_rows,
     parse_cells,
     parse_rows,
+    parse_setting,
     read_text,
+    setting_in,
     split_lines,
 )
 
@@ -47,6 +57,8 @@ SWEEP = Form(
         Column("frequency_hz", meaning="frequency_khz", needed="frequency"),
         Column("amplitude_nm", meaning="amplitude", needed="amplitude"),
         Column("amplitude", meaning="amplitude", needed="amplitude"),
+        Column("asd_nm_per_sqrt_hz", meaning="amplitude", needed="amplitude"),
+        Column("psd_nm2_per_hz", meaning="amplitude", needed="amplitude"),
         Column("phase_deg"),
         Column("amplitude_error_nm", meaning="amplitude_error"),
         Column("amplitude_error"),
@@ -58,6 +70,11 @@ SWEEP = Form(
 """The columns a file may have, and the attribute of `ResonanceSweep` that each becomes."""
 
 
+DENSITY = "nm/sqrt(Hz)"
+"""The unit that makes a sweep a thermal spectrum."""
+SPECTRUM_SETTINGS = {"averages": FileSetting("averages", "1000")}
+
+
 @dataclass(frozen=True)
 class ParsedSweep:
     """What a file says, in the names and units of `ResonanceSweep`."""
@@ -67,6 +84,7 @@ class ParsedSweep:
     amplitude_unit: str
     instrument: dict[str, float] = field(default_factory=dict)
     remarks: tuple[str, ...] = ()
+    averages: float | None = None
 
 
 def parse_csv(text: str, faults: Faults) -> ParsedSweep:
@@ -80,6 +98,9 @@ def parse_csv(text: str, faults: Faults) -> ParsedSweep:
         TableError: at once where the column names are wrong: the cells below them cannot be judged.
     """
     comments, rows = split_lines(text)
+    settings = [setting_in(remark, SPECTRUM_SETTINGS) for _, remark in comments]
+    made = [(s, line, remark) for s, (line, remark) in zip(settings, comments, strict=True) if s is not None]
+    averages = [(parse_setting(s, remark, line=line, faults=faults) or (None,))[0] for s, line, remark in made]
     check_not_empty(comments, rows, faults)
     head, rows = named_rows(rows, SWEEP, faults)
     faults.raise_any()
@@ -87,8 +108,13 @@ def parse_csv(text: str, faults: Faults) -> ParsedSweep:
     if "frequency_hz" in columns:
         columns["frequency_hz"] = columns["frequency_hz"] / HZ_PER_KHZ
     unit = "nm" if "amplitude_nm" in columns else ""
+    if "psd_nm2_per_hz" in columns:
+        columns["psd_nm2_per_hz"] = np.sqrt(np.maximum(columns["psd_nm2_per_hz"], 0.0))
+    if {"psd_nm2_per_hz", "asd_nm_per_sqrt_hz"} & set(columns):
+        unit = DENSITY
     attributes = {column.says: columns[column.name] for column in SWEEP.columns if column.name in columns}
-    return ParsedSweep(attributes, lines, unit, remarks=tuple(remark for _, remark in comments))
+    remarks = tuple(remark for _, remark in comments)
+    return ParsedSweep(attributes, lines, unit, remarks=remarks, averages=averages[0] if averages else None)
 
 
 MARK = "[DATA]"
@@ -156,6 +182,7 @@ _COLUMNS = ("frequency_khz", "amplitude", "phase_deg", "amplitude_error", "phase
 _POSITIVE = ("frequency_khz", "amplitude_error", "phase_error_deg")
 
 
+@public_result()
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ResonanceSweep:
     """A free resonance sweep, sorted by frequency; the arrays are read-only NumPy copies.
@@ -166,8 +193,10 @@ class ResonanceSweep:
         phase_deg: of the response, z = amplitude cos(omega t + phase), shape (points,), or None.
         amplitude_error: standard error of the amplitude, shape (points,), or None: not known.
         phase_error_deg: standard error of the phase; None takes the noise as equal in all directions.
-        amplitude_unit: "nm", or empty where the file does not say.
-        instrument: what the instrument itself found, for comparison: ``frequency_khz``, ``quality_factor``.
+        amplitude_unit: "nm", empty where the file does not say, "nm/sqrt(Hz)" of a thermal spectrum.
+        instrument: what the instrument itself found, for comparison: ``frequency_khz``, ``quality_factor``; of a
+            thermal spectrum also ``spring_constant_n_per_m`` and ``temperature_k``.
+        averages: how many periodograms a thermal spectrum is the mean of, or None: not known.
         source: path of the file as it was given.
         lines: the line of the file that each point stands in, shape (points,).
         remarks: free comments of the file.
@@ -184,6 +213,7 @@ class ResonanceSweep:
     phase_error_deg: Float[np.ndarray, " points"] | None = None
     amplitude_unit: str = "nm"
     instrument: dict[str, float] = field(default_factory=dict)
+    averages: float | None = None
     source: str = "sweep in memory"
     lines: Int[np.ndarray, " points"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     remarks: tuple[str, ...] = ()
@@ -215,6 +245,23 @@ class ResonanceSweep:
         """Number of points."""
         return len(self.frequency_khz)
 
+    @property
+    def spectrum(self) -> bool:
+        """Whether it is a thermal spectrum."""
+        return self.amplitude_unit == DENSITY
+
+    def within(self, low_khz: float, high_khz: float) -> "ResonanceSweep":
+        """Return the points between two frequencies; of a spectrum those that are above zero.
+
+        Raises:
+            TableError: if there are none.
+        """
+        kept = (self.frequency_khz >= low_khz) & (self.frequency_khz <= high_khz) & (self.amplitude > 0.0)
+        if not kept.any():
+            raise TableError(f"{self.source}: there is no point between {low_khz:g} and {high_khz:g} kHz")
+        columns = {name: getattr(self, name) for name in (*_COLUMNS, "lines")}
+        return replace(self, **{name: None if column is None else column[kept] for name, column in columns.items()})
+
 
 def _check_pairs(columns: dict[str, Float[np.ndarray, "..."]], faults: Faults) -> None:
     if "phase_error_deg" in columns and "phase_deg" not in columns:
@@ -237,7 +284,7 @@ def _check_numbers(
 
 
 def read_sweep(path: str | Path) -> ResonanceSweep:
-    """Read a free resonance sweep from plain CSV or Nanonis text and check all of it.
+    """Read a free resonance sweep from plain CSV or Nanonis text, or a thermal spectrum, and check all of it.
 
     Args:
         path: the file; its form is recognised by its content, not by its name.
@@ -246,6 +293,9 @@ def read_sweep(path: str | Path) -> ResonanceSweep:
         TableError: one line that names the first fault, its place and how to mend it, and the number of other faults.
     """
     faults = Faults(str(path))
+    with contextlib.suppress(OSError), Path(path).open("rb") as file:
+        if file.read(9) == b"[DataSet]":
+            return _spectrum_of(read_recording(path))
     text = read_text(path)
     parse = parse_nanonis if any(line.strip() == MARK for line in text.split("\n")) else parse_csv
     parsed = parse(text, faults)
@@ -261,9 +311,38 @@ def read_sweep(path: str | Path) -> ResonanceSweep:
         amplitude_unit=parsed.amplitude_unit,
         instrument=parsed.instrument,
         source=str(path),
+        averages=parsed.averages,
         lines=parsed.lines,
         remarks=parsed.remarks,
     )
+
+
+def _spectrum_of(recording: Recording) -> ResonanceSweep:
+    """Return the thermal spectrum that a file of an instrument holds.
+
+    Raises:
+        TableError: if it holds none.
+    """
+    units, channels = recording.units, recording.segments[0].channels
+    density = next((name for name in channels if UNITS.get(units[name], ("",))[0] == "spectrum"), None)
+    frequency = next((name for name in channels if UNITS.get(units[name], ("",))[0] == "frequency"), None)
+    if density is None or frequency is None:
+        raise TableError(f"{recording.source}: holds no thermal spectrum, but {', '.join(channels)}")
+    khz, amplitude = (channels[name] * UNITS[units[name]][1] for name in (frequency, density))
+    used = (khz > 0.0) & (amplitude > 0.0)
+    known = {key.removeprefix("free_"): one.value for key, one in recording.known.items()}
+    found = {key: float(known[key]) for key in _FOUND_IN_SPECTRA if key in known}
+    return ResonanceSweep(
+        frequency_khz=khz[used],
+        amplitude=amplitude[used],
+        amplitude_unit=DENSITY,
+        instrument=found,
+        averages=float(known["averages"]) if "averages" in known else None,
+        source=recording.source,
+    )
+
+
+_FOUND_IN_SPECTRA = ("frequency_khz", "quality_factor", "spring_constant_n_per_m", "temperature_k")
 
 
 def without_phase(sweep: ResonanceSweep) -> ResonanceSweep:

@@ -4,8 +4,8 @@
 
 The truth: eq. 6 with r = 0.95 and epsilon = 60 nm^2/us^2 on a cantilever of 90 kHz, Q = 40 and 1 ng; orders 1 to 3,
 drives from just above capture to 10 nm around each subharmonic resonance, three offsets. Peak and lock-in amplitude
-carry independent Gaussian noise of 1 %; Q is given as measured, 40 with a standard error of 0.4. The seed makes it
-reproducible.
+carry independent Gaussian noise of 1 %, the phase one of 0.1 degrees; Q is given as measured, 40 with a standard error
+of 0.4. The seed makes it reproducible.
 """
 
 import sys
@@ -30,6 +30,7 @@ QUALITY_FACTOR_ERROR = 0.4
 NOISE = 0.01
 SEED = 1997
 ORDERS = (1, 2, 3)
+PHASE_ERROR_DEG = 0.1
 REDUCED_DETUNINGS = (0.97, 0.985, 0.995, 1.0, 1.01, 1.02)
 DRIVES_NM = (1.5, 2.5, 4.0, 6.0, 10.0)
 OFFSETS_NM = (-1.0, 0.0, 1.0)
@@ -42,9 +43,10 @@ def example_table() -> AmplitudeTable:
     offsets = np.array(OFFSETS_NM)[np.arange(len(jobs)) % len(OFFSETS_NM)]
     order, drive = jobs[:, 0].astype(int), jobs[:, 2]
     frequency = np.round(2.0 * FREE_FREQUENCY_KHZ * order * jobs[:, 1], 4)
-    peak, lockin = (np.asarray(a) for a in _amplitudes(*map(jnp.asarray, (order, frequency, drive, offsets))))
+    peak, lockin, phase = (np.asarray(a) for a in _seen(*map(jnp.asarray, (order, frequency, drive, offsets))))
     kept = np.isfinite(peak)
-    noise = np.random.default_rng(SEED).normal(size=(2, len(jobs)))
+    noise = np.random.default_rng(SEED).normal(size=(3, len(jobs)))
+    truth = f"r {TRUTH['r']}, epsilon {TRUTH['epsilon']} nm^2/us^2, Q {QUALITY_FACTOR}, no delay"
     return AmplitudeTable(
         order=order[kept],
         drive_frequency_khz=frequency[kept],
@@ -58,9 +60,11 @@ def example_table() -> AmplitudeTable:
         peak_amplitude_error_nm=_rounded(peak * NOISE)[kept],
         lockin_amplitude_nm=_rounded(lockin * (1.0 + NOISE * noise[1]))[kept],
         lockin_amplitude_error_nm=_rounded(lockin * NOISE)[kept],
+        phase_deg=np.round((phase + PHASE_ERROR_DEG * noise[2]) % (360.0 / order), 3)[kept],
+        phase_error_deg=np.full(kept.sum(), PHASE_ERROR_DEG),
         remarks=(
             "simulated single-impact orbits of the impact law u_out^2 = r^2 u_in^2 - epsilon",
-            f"truth: r {TRUTH['r']}, epsilon {TRUTH['epsilon']} nm^2/us^2, Q {QUALITY_FACTOR}, noise 1 %, seed {SEED}",
+            f"truth: {truth}; noise 1 % and {PHASE_ERROR_DEG} degrees, seed {SEED}",
             "made by python -m fitting.examples.make_amplitudes",
         ),
     )
@@ -68,15 +72,16 @@ def example_table() -> AmplitudeTable:
 
 @jax.jit
 @jax.vmap
-def _amplitudes(order, frequency_khz, drive_nm, offset_nm):
-    """Return peak and lock-in amplitude of the one steady orbit; NaN where there is none or more than one."""
+def _seen(order, frequency_khz, drive_nm, offset_nm):
+    """Return peak, lock-in amplitude and phase of the one steady orbit; NaN where there is none or more than one."""
     platform = Platform(drive_nm, frequency_khz, offset_nm)
     scene = Scene(Cantilever(FREE_FREQUENCY_KHZ, QUALITY_FACTOR), platform, ImpactLaw(TRUTH["r"], TRUTH["epsilon"]))
     orbits = single_impact_orbits(scene, order)
     steady = orbits.stable & orbits.admissible
     slot = jnp.argmax(steady)
     alone = jnp.sum(steady) == 1
-    return tuple(jnp.where(alone, a[slot], jnp.nan) for a in (orbits.peak_amplitude_nm, orbits.lockin_amplitude_nm))
+    seen = orbits.peak_amplitude_nm, orbits.lockin_amplitude_nm, orbits.lockin_phase_deg
+    return tuple(jnp.where(alone, each[slot], jnp.nan) for each in seen)
 
 
 def _rounded(values: np.ndarray) -> np.ndarray:

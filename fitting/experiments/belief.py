@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.contact.parameters import EFFECTS
+from afm_jax.results import public_result
 from fitting.fits.result import FitResult
 from fitting.models import Problem
 from fitting.parameters import (
@@ -33,6 +34,7 @@ EXACT_QUALITY_FACTOR = (
 )
 
 
+@public_result()
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Belief:
     """What is believed of cantilever and law, and how sure that is.

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import Normalize, PowerNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator
+from matplotlib.ticker import MaxNLocator, StrMethodFormatter
+from matplotlib.transforms import ScaledTranslation
 
 from afm_jax.plots.picture_style import ACCENT, BLUE, GRID, label_axes, new_figure
 from afm_jax.whole_files import write_whole
@@ -157,6 +158,9 @@ _INVALID = "#B00020"
 _SMALL = 9
 _MOST_ORDERS = 6
 _DASHES = ("--", ":", "-.")
+_MARKS = ("o-", "s--", "D-.", "^:")
+_OFFSET_POINTS = 5.5
+"""Between the marks of two offsets at one drive."""
 _UNKNOWN_PERCENT = 2e3
 
 
@@ -169,12 +173,15 @@ def design_figure(result: Design) -> Figure:
     rows = 1 if len(orders) == 1 else 2
     panels = right.subplots(rows, -(-len(orders) // rows), squeeze=False).ravel()
     gain = result.gain[np.isfinite(result.gain)]
-    scale = Normalize(0.0, float(gain.max()) if gain.size and gain.max() > 0.0 else 1.0)
+    # a few points are worth much more than all others: the root of a root of the gain tells those apart too
+    scale = PowerNorm(0.3, 0.0, float(gain.max()) if gain.size and gain.max() > 0.0 else 1.0)
     for axes, order in zip(panels, orders, strict=False):
         _draw_map(axes, result, int(order), scale)
     for axes in panels[len(orders) :]:
         axes.set_axis_off()
     right.colorbar(ScalarMappable(scale, _MAP), ax=list(panels), shrink=0.8).set_label("gain of one more measurement")
+    offsets = ", ".join(f"{offset:g}" for offset in np.unique(result.candidates.drives.offset_nm))
+    right.supxlabel(f"at each drive from left to right: offsets {offsets} nm", fontsize=_SMALL)
     title = f"{len(result.chosen)} points for {', '.join(result.interest)} ({result.belief.problem.model})"
     figure.suptitle(title if result.valid else f"NOT VALID: {title}", color="black" if result.valid else _INVALID)
     return figure
@@ -184,6 +191,7 @@ def _draw_errors(axes: Axes, result: Design) -> None:
     """Draw every parameter's standard error, relative to its size, against the number of points."""
     count = np.arange(len(result.errors))
     colours, dashes = iter(_COLOURS * len(result.interest)), iter(_DASHES * len(result.errors.T))
+    marks = iter(_MARKS * len(result.interest))
     for parameter, value, errors in zip(
         result.belief.problem.parameters, result.belief.values.tolist(), result.errors.T, strict=True
     ):
@@ -192,13 +200,15 @@ def _draw_errors(axes: Axes, result: Design) -> None:
             continue
         label = "1 - r" if parameter.name == "r" else parameter.name
         if parameter.name in result.interest:
-            axes.plot(count, share, "o-", color=next(colours), lw=2.0, ms=5, label=label, zorder=3)
+            axes.plot(count, share, next(marks), color=next(colours), lw=2.0, ms=5, label=label, zorder=3)
         else:
             axes.plot(count, share, linestyle=next(dashes), marker=".", color=GRID, lw=1.2, label=label)
     axes.set_yscale("log")
     # beyond that a parameter is as good as unknown
     axes.set_ylim(top=min(axes.get_ylim()[1], _UNKNOWN_PERCENT))
-    axes.grid(color=GRID, alpha=0.25)
+    for axis in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
+        axis(StrMethodFormatter("{x:g}"))
+    axes.grid(color=GRID, alpha=0.25, which="both")
     label_axes(axes, x="points measured", y="expected standard error (%)")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     if axes.get_legend_handles_labels()[0]:
@@ -206,28 +216,31 @@ def _draw_errors(axes: Axes, result: Design) -> None:
 
 
 def _draw_map(axes: Axes, result: Design, order: int, scale: Normalize) -> None:
-    """Draw the gain over frequency and drive amplitude, the best of the offsets, with the chosen points."""
+    """Draw the gain over frequency and drive amplitude, the offsets side by side, with the chosen points."""
     drives, usable = result.candidates.drives, result.candidates.usable
     here = drives.order == order
-    places = np.stack([drives.frequency_khz, drives.amplitude_nm], axis=1)
-    open_places = {tuple(place) for place in places[here & usable].tolist()}
-    lost = [place for place in places[here & ~usable].tolist() if tuple(place) not in open_places]
-    axes.plot(*np.array(lost).reshape(-1, 2).T, "x", color=GRID, ms=3)
-    # the highest gain is drawn last
-    rows = np.flatnonzero(here & usable)
-    rows = rows[np.argsort(result.gain[rows], kind="stable")]
-    axes.scatter(*places[rows].T, c=result.gain[rows], cmap=_MAP, norm=scale, s=26, marker="s", linewidths=0)
-    numbers: dict[tuple[float, float], list[str]] = {}
-    for number, row in enumerate(result.chosen.tolist(), start=1):
-        if drives.order[row] == order:
-            x, y = places[row].tolist()
-            numbers.setdefault((x, y), []).append(str(number))
-    for place, labels in numbers.items():
-        axes.plot(*place, "o", ms=11, mfc="none", mec=ACCENT, mew=1.5)
-        axes.annotate(",".join(labels), place, (5, 6), textcoords="offset points", fontsize=8, color=ACCENT)
+    offsets = np.unique(drives.offset_nm)
+    for number, offset in enumerate(offsets):
+        shift = (number - 0.5 * (len(offsets) - 1)) * _OFFSET_POINTS
+        beside = axes.transData + ScaledTranslation(shift / 72.0, 0.0, axes.figure.dpi_scale_trans)
+        some = here & (drives.offset_nm == offset)
+        lost, rows = np.flatnonzero(some & ~usable), np.flatnonzero(some & usable)
+        axes.plot(drives.frequency_khz[lost], drives.amplitude_nm[lost], "x", color=GRID, ms=3, transform=beside)
+        places = drives.frequency_khz[rows], drives.amplitude_nm[rows]
+        marks = {"cmap": _MAP, "norm": scale, "s": 22, "marker": "s", "linewidths": 0, "transform": beside}
+        axes.scatter(*places, c=result.gain[rows], **marks)
+        for place, row in enumerate(result.chosen.tolist(), start=1):
+            if some[row]:
+                point = drives.frequency_khz[row], drives.amplitude_nm[row]
+                axes.plot(*point, "o", ms=9, mfc="none", mec=ACCENT, mew=1.3, transform=beside)
+                middle = (shift, 6 if place % 2 else -6)
+                style = {"fontsize": 8, "color": ACCENT, "ha": "center", "va": "bottom" if place % 2 else "top"}
+                axes.annotate(str(place), point, middle, textcoords="offset points", **style)
+    axes.margins(0.1, 0.15)
+    axes.update_datalim(np.stack([drives.frequency_khz[here], drives.amplitude_nm[here]], axis=1))
+    axes.autoscale_view()
     axes.set_title(f"order {order}", fontsize=_SMALL)
     label_axes(axes, x="drive (kHz)", y="drive (nm)")
     axes.xaxis.label.set_fontsize(_SMALL)
     axes.yaxis.label.set_fontsize(_SMALL)
     axes.tick_params(labelsize=8)
-    axes.margins(0.08, 0.15)

@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from afm_jax.results import public_result
+from afm_jax.units import TWO_SIDED_95
 from fitting.experiments.belief import Belief
 from fitting.experiments.candidates import LEFT_OUT, Candidates
 from fitting.parameters import Parameter
@@ -13,7 +15,6 @@ from fitting.simulated.experiment import Drives
 
 FORMAT_VERSION = 1
 """Version of the JSON layout; raised when a key changes its meaning or goes."""
-_TWO_SIDED_95 = 1.959963984540054
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,7 @@ class Forecast:
     reason: str | None
 
 
+@public_result(picture="fitting.experiments.report:design_figure", rows="points")
 @dataclass(frozen=True, eq=False)
 class Design:
     """The outcome of `design`; attributes are named like the keys of its JSON.
@@ -161,7 +163,7 @@ class Design:
 def _forecast(parameter: Parameter, value: float, error: float) -> Forecast:
     if not np.isfinite(error):
         return Forecast(value, parameter.unit, None, (None, None), "the measurements do not determine it")
-    half = _TWO_SIDED_95 * error
+    half = TWO_SIDED_95 * error
     interval = max(value - half, parameter.lowest), min(value + half, parameter.highest)
     return Forecast(value, parameter.unit, error, interval, None)
 

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.checks import require_float64
+from afm_jax.results import public_result
 from fitting.fits.fit import Found, find_fit, summarise
 from fitting.fits.minimum import Strain, relaxed, settle
 from fitting.fits.result import FitResult
@@ -19,6 +20,7 @@ _EVEN, _LEANS, _PLAIN = 2.0, 6.0, 10.0
 """Differences of AIC up to which models are even, one is favoured, and one is clearly favoured."""
 
 
+@public_result(rows="rows")
 @dataclass(frozen=True)
 class Comparison:
     """Models of one table, the best one first.

@@ -7,7 +7,6 @@ What a minimum amounts to: errors, intervals, checks, and a verdict on whether t
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import jax
@@ -18,7 +17,8 @@ from scipy.special import chdtrc
 
 from afm_jax.checks import require_float64
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.impact.lasting_impact import LawImpact
+from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact
+from afm_jax.units import TWO_SIDED_95
 from afm_jax.version import version_of
 from fitting.fits.intervals import (
     Convergence,
@@ -39,6 +39,7 @@ from fitting.fits.minimum import (
     relaxed,
     rescale_errors,
     settle,
+    starts,
     strain_of,
     untabulated,
 )
@@ -55,7 +56,7 @@ from fitting.fits.unmodelled import (
     step_of,
 )
 from fitting.fits.verdict import ASSUMED_ERROR_OF_Q, Evidence, judge_fit, misfits
-from fitting.forward import impact_of
+from fitting.forward import impact_at, warm_up
 from fitting.models import (
     Measurement,
     Problem,
@@ -67,7 +68,6 @@ from fitting.parameters import NUISANCE_NAMES, PARAMETERS, check_contact_values,
 from fitting.tables.table import AmplitudeTable
 
 _POINTS = 121
-_TWO_SIDED_95 = 1.959963984540054
 
 
 def law_with_band(
@@ -92,7 +92,7 @@ def law_with_band(
     speeds = np.geomspace(0.8 * slow, 1.2 * fast, _POINTS)
     found = law_at(problem, measurement, values, covariance, speeds, after)
     rebound, delay = found.law
-    width = _TWO_SIDED_95 * np.linalg.norm(found.factor, axis=2)
+    width = TWO_SIDED_95 * np.linalg.norm(found.factor, axis=2)
     return FittedLaw(
         approach_speed_nm_per_us=speeds,
         rebound_speed_nm_per_us=rebound,
@@ -113,7 +113,8 @@ def law_at(
     after: tuple[LinearStep, Unmodelled] | None = None,
 ) -> LawAfter:
     """Return the law at approach speeds in nm/us; the other arguments as of `law_with_band`."""
-    law, slope = jax.tree.map(np.asarray, law_and_slope(jnp.asarray(values), jnp.asarray(speeds), measurement, problem))
+    impact, slopes = impact_at(values, measurement, problem)
+    law, slope = jax.tree.map(np.asarray, law_and_slope(impact, slopes, speeds))
     count = speeds.size
     before = LawBefore(law[:, :count], slope[:, :count], float(law[0, count]), slope[0, count])
     if not np.all(np.isfinite(covariance)) or after is None:
@@ -169,17 +170,21 @@ def speed_range(approach_speeds: Float[np.ndarray, " rows"]) -> tuple[float, flo
     return (float(known.min()), float(known.max())) if known.size else (1.25, 250.0 / 3.0)
 
 
-@partial(jax.jit, static_argnames=("problem",))
+@jax.jit
 def law_and_slope(
-    values: Float[Array, " p"], speeds: Float[Array, " n"], measurement: Measurement, problem: Problem
+    impact: LawImpact | TabulatedImpact, slopes: LawImpact | TabulatedImpact, speeds: Float[Array, " n"]
 ) -> tuple[Float[Array, "2 n+1"], Float[Array, "2 n+1 p"]]:
     """Return rebound speeds and delays at approach speeds, and their derivatives by the parameters.
 
     The last column is that of the capture speed, twice.
+
+    Args:
+        impact: what is fitted.
+        slopes: its derivatives by the parameters, along a first axis.
+        speeds: in nm/us.
     """
 
-    def law(v):
-        impact = impact_of(v, measurement, problem)
+    def law(impact):
         if isinstance(impact, LawImpact):
             capture = jnp.full((2, 1), impact.law.capture_speed_nm_per_us)
             found = jnp.stack([impact.law.rebound_speed(speeds), impact.law.collision_delay(speeds)])
@@ -190,7 +195,7 @@ def law_and_slope(
         there = jnp.stack([jnp.where(free, found.rebound, 0.0), jnp.where(free, found.delay, 0.0)])
         return jnp.concatenate([there, jnp.full((2, 1), impact.lowest)], axis=1)
 
-    return law(values), jax.jacfwd(law)(values)
+    return law(impact), jax.vmap(lambda turn: jax.jvp(law, (impact,), (turn,))[1], out_axes=-1)(slopes)
 
 
 _PACKAGES = ("afm-jax", "jax", "optax", "numpy")
@@ -381,7 +386,7 @@ class _Summary:
                 growth = errors[i] / before[i] if before[i] > 0.0 else 1.0
                 low, high = (None if e is None else self.ends[i] + growth * (e - self.values[i]) for e in ends)
             else:
-                reason, reach = None, _TWO_SIDED_95 * errors[i]
+                reason, reach = None, TWO_SIDED_95 * errors[i]
                 low, high = self.ends[i] - reach, self.ends[i] + reach
             intervals.append(within_range(PARAMETERS[name], Interval(low, high, reason)))
         return intervals
@@ -483,7 +488,7 @@ _FEWEST_LEFT, _LEAST_LEFT = 4, 0.2
 
 
 def fit(  # noqa: PLR0913
-    table: AmplitudeTable,
+    table: AmplitudeTable | Any,
     model: str = "law",
     *,
     scale_errors: bool = False,
@@ -497,8 +502,9 @@ def fit(  # noqa: PLR0913
     """Fit an impact law to measured amplitudes of single-impact orbits.
 
     Args:
-        table: from `read_table`; what it gives with an error (Q, calibrations) is a nuisance with that constraint. A Q
-            without error is taken to be known to 2 % where impacts last, and exactly by the instantaneous laws.
+        table: from `read_table`, or a data frame as `AmplitudeTable.from_dataframe` takes it; what it gives with an
+            error (Q, calibrations) is a nuisance with that constraint. A Q without error is taken to be known to 2 %
+            where impacts last, and exactly by the instantaneous laws.
         model: "restitution" (r), "law" (r, epsilon; eq. 6) or "viscous" (epsilon, viscous_loss), each instantaneous or
             with "+delay", the collision delay; or "contact", physical parameters through the resolved contact.
         scale_errors: take the amplitudes' errors as relative only and scale them until chi2 equals its degrees of
@@ -524,6 +530,7 @@ def fit(  # noqa: PLR0913
             there are fewer measured amplitudes than parameters.
         RuntimeError: if JAX is not set to 64-bit floats.
     """
+    table = table if isinstance(table, AmplitudeTable) else AmplitudeTable.from_dataframe(table)
     options: dict[str, Any] = {"free": free, "fixed": fixed, "constraints": constraints, "effects": effects}
     found = find_fit(table, model, scale_errors=scale_errors, robust=robust, speeds=speeds, **options)
     return summarise(table, found)
@@ -557,6 +564,7 @@ def find_fit(  # noqa: PLR0913
             f"{table.source}: {amplitudes} measured amplitude(s) cannot determine the {len(problem.own)} "
             f"parameters of the model {model!r}; measure at other drives, orders or offsets too"
         )
+    warm_up(starts(problem, measurement)[0], measurement, problem)
     stated = Objective(measurement, problem, robust=robust)
     objective, minimum, strain, refused = unstrained_minimum(stated)
     scale = None

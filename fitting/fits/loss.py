@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.contact.law_of_contact import closest_law
+from afm_jax.units import TWO_SIDED_95
 
 EV_PER_AJ = 1.0 / 0.1602176634
 """Electron volts in an attojoule (exact in SI)."""
-_TWO_SIDED_95 = 1.959963984540054
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def interval_of(value: float, error: float, lowest: float = -np.inf, highest: fl
     """Return a value with its 95 % interval, cut off where nothing can be."""
     if not np.isfinite(error):
         return WithInterval(value, (None, None))
-    reach = _TWO_SIDED_95 * error
+    reach = TWO_SIDED_95 * error
     return WithInterval(value, (float(max(value - reach, lowest)), float(min(value + reach, highest))))
 
 
@@ -115,5 +115,5 @@ def equivalent(
         epsilon_nm2_per_us2=adhesion,
         delta_aj=delta,
         delta_ev=scaled(delta, EV_PER_AJ),
-        worst_error=float(np.max(np.abs(np.asarray(law.rebound_speed(u)) / w - 1.0))),
+        worst_error=float(np.max(np.abs(np.sqrt(np.maximum((r * u) ** 2 - epsilon, 0.0)) / w - 1.0))),
     )

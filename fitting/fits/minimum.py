@@ -17,17 +17,16 @@ The three-parameter delay law is right to 0.15 ns, which counts where the delay 
 """
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Array, Bool, Float, Shaped
 
-from afm_jax.contact.law_of_contact import DELAY_ERROR_US, SPEED_ERROR
-from afm_jax.impact.lasting_impact import LawImpact
+from afm_jax.impact.lasting_impact import TabulatedImpact
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.fits.objective import BATCH, FINE, PLAIN, ROUGH, SOFT, Objective, lowest, polish
-from fitting.forward import Linearised, impact_of
+from fitting.forward import Linearised, free_impacts, impact_at
 from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem, Rows, tip_work
 from fitting.parameters import PARAMETERS, Parameter
 
@@ -355,22 +354,21 @@ def strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
     count = rows.order.shape[0]
     if not objective.problem.lasting:
         return Strain(np.zeros(count), np.zeros(count), np.full(count, "", dtype=object))
-    impact = impact_of(jnp.asarray(values), objective.measurement, objective.problem)
+    impact = impact_at(values, objective.measurement, objective.problem).impact
     linear = objective.at_values(values[None])
     prediction = linear.prediction
     exists = np.asarray(prediction.orbits)[0] > 0
-    speeds = jax.vmap(impact.speeds)(jnp.asarray(np.asarray(prediction.coordinate)[0]))
-    approach, rebound = np.asarray(speeds.approach), np.asarray(speeds.rebound)
+    tips = jax.tree.map(np.asarray, free_impacts(impact, np.asarray(prediction.coordinate)[0]))
+    approach, rebound = tips.speeds.approach, tips.speeds.rebound
     # without adhesion nothing is captured, and no impact is slow
-    lowest = float(impact.lowest)
-    capture = float(impact.speeds(jnp.asarray(lowest * (1.0 + 1e-9))).approach) if lowest > 0.0 else 0.0
-    share = 2.0 * np.pi * np.asarray(rows.drive_frequency_khz) * 1e-3 * float(impact.length) / np.maximum(rebound, 1e-6)
+    capture = float(tips.capture_speed) if tips.lowest > 0.0 else 0.0
+    share = 2.0 * np.pi * np.asarray(rows.drive_frequency_khz) * 1e-3 * float(tips.length) / np.maximum(rebound, 1e-6)
     tapping, free = objective.problem.tapping, np.asarray(rows.free)
     slow = (share > LONGEST) | (approach < (_CRAWLING if tapping else NEAREST) * capture)
     slow = np.where(exists, slow, _lost_slowly(objective, exists, _CRAWLING * capture))
     reasons = np.where(slow, TOO_SLOW, "").astype(object)
     if tapping:
-        pulled = np.asarray(prediction.pull_nm_per_us2)[0] * np.asarray(impact.hertz_time(jnp.asarray(approach)))
+        pulled = np.asarray(prediction.pull_nm_per_us2)[0] * tips.hertz_time
         reasons[exists & (pulled > _PULLED * approach)] = TOO_PULLED
         reasons[_irregular(objective, exists)] = IRREGULAR
         reasons[free] = ""
@@ -404,7 +402,7 @@ def _lost_slowly(objective: Objective, exists: Bool[np.ndarray, " rows"], slowes
     measured = rows.measured.any(axis=1)
     # a tip that comes free of the platform reaches about its speed over its angular frequency; the lock-in reads half
     height = np.max(np.where(rows.measured, rows.amplitude_nm, 0.0)[:, :2] * np.array([1.0, 2.0]), axis=1)
-    speed = height * float(objective.measurement.cantilever.angular_frequency)
+    speed = height * RAD_PER_US_PER_KHZ * float(objective.measurement.cantilever.frequency_khz)
     lost = measured & ~exists & (speed < slowest)
     return lost if lost.sum() <= _MOST_LOST * measured.sum() else np.zeros_like(lost)
 
@@ -413,12 +411,19 @@ def untabulated(
     objective: Objective, values: Float[np.ndarray, " p"], approach: Float[np.ndarray, " rows"]
 ) -> Bool[np.ndarray, " rows"]:
     """Say at which approach speeds the table of a contact misses its accuracy; nowhere for a law, nor at NaN."""
-    impact = impact_of(jnp.asarray(values), objective.measurement, objective.problem)
-    if isinstance(impact, LawImpact):
+    if objective.problem.model != "contact":
         return np.zeros(approach.shape, dtype=bool)
-    speed, delay = impact.errors(jnp.asarray(approach))
-    held = (np.asarray(speed) <= SPEED_ERROR) & (np.asarray(delay) <= DELAY_ERROR_US)
+    from afm_jax.contact.law_of_contact import DELAY_ERROR_US, SPEED_ERROR  # noqa: PLC0415  # for contacts alone
+
+    impact: Any = impact_at(values, objective.measurement, objective.problem).impact
+    speed, delay = jax.tree.map(np.asarray, _errors(impact, approach))
+    held = (speed <= SPEED_ERROR) & (delay <= DELAY_ERROR_US)
     return np.isfinite(approach) & ~held
+
+
+@jax.jit
+def _errors(impact: TabulatedImpact, approach: Float[Array, " n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
+    return impact.errors(approach)
 
 
 def _sensitivity(

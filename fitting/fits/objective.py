@@ -8,7 +8,6 @@ and the profile intervals all drive it from outside.
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Bool, Float, Int
@@ -101,12 +100,12 @@ class Objective:
 
     def with_rows(self, **columns: Any) -> "Objective":
         """Return the same objective with other columns of the rows."""
-        rows = self.measurement.rows._replace(**{name: jnp.asarray(column) for name, column in columns.items()})
+        rows = self.measurement.rows._replace(**{name: np.asarray(column) for name, column in columns.items()})
         return Objective(self.measurement._replace(rows=rows), self.problem, near=self.near, robust=self.robust)
 
     def of_rows(self, chosen: Int[np.ndarray, " chosen"] | Bool[np.ndarray, " rows"]) -> "Objective":
         """Return the same objective of some of the rows, with their orbits followed if they were."""
-        rows = jax.tree.map(lambda column: jnp.asarray(np.asarray(column)[chosen]), self.measurement.rows)
+        rows = jax.tree.map(lambda column: np.asarray(column)[chosen], self.measurement.rows)
         near = None if self.near is None else np.asarray(self.near)[..., chosen]
         return Objective(self.measurement._replace(rows=rows), self.problem, near=near, robust=self.robust)
 
@@ -246,11 +245,14 @@ def _lbfgs(
     gradient: Float[np.ndarray, "sets p"], state: optax.OptState | None, z: Float[np.ndarray, "sets p"]
 ) -> tuple[Float[np.ndarray, "sets p"], optax.OptState]:
     """Return optax's L-BFGS step of every set and its new state; no state: the first step."""
+    count = len(z)
+    # always as many sets: one program
+    z, gradient = (np.concatenate([part, np.repeat(part[-1:], BATCH - count, axis=0)]) for part in (z, gradient))
     # optax mixes integers of 32 and 64 bits, which strict promotion would refuse.
     with jax.numpy_dtype_promotion("standard"):
-        before = _init(jnp.asarray(z)) if state is None else state
-        step, after = _update(jnp.asarray(gradient), before, jnp.asarray(z))
-    return np.asarray(step), after
+        before = jax.tree.map(np.asarray, _init(z)) if state is None else state
+        step, after = jax.tree.map(np.asarray, _update(gradient, before, z))
+    return step[:count], after
 
 
 def _squared(gradient: Float[np.ndarray, "sets p"]) -> Float[np.ndarray, " sets"]:
@@ -271,6 +273,7 @@ def _choose(accepted: Bool[np.ndarray, " sets"], new: optax.OptState, old: optax
     """Return the new optimiser state where a step was accepted, the old one elsewhere."""
 
     def one(new_leaf, old_leaf):
-        return np.where(accepted.reshape((-1,) + (1,) * (new_leaf.ndim - 1)), new_leaf, old_leaf)
+        chosen = np.append(accepted, np.repeat(accepted[-1:], len(new_leaf) - len(accepted)))
+        return np.where(chosen.reshape((-1,) + (1,) * (new_leaf.ndim - 1)), new_leaf, old_leaf)
 
     return jax.tree.map(one, new, old)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from afm_jax.results import public_result
 from afm_jax.strict_json import plain
 from fitting.fits.intervals import Convergence
 from fitting.fits.loss import Loss
@@ -86,6 +87,7 @@ class FittedRows:
     phase_error_deg: Float[np.ndarray, " rows"] | None = None
 
 
+@public_result(picture="fitting.report.plots:rows_figure", rows="parameters")
 @dataclass(frozen=True)
 class FitResult:
     """The outcome of `fit`; attributes are named like the keys of its JSON.

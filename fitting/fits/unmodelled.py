@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
@@ -25,7 +24,7 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from fitting.fits.least_squares import covariance_of
 from fitting.fits.minimum import Strain, padding
 from fitting.fits.objective import ROBUST, Objective
-from fitting.forward import ImpactSlopes, impact_of, impact_slopes
+from fitting.forward import ImpactSlopes, free_impacts, impact_at, impact_slopes
 from fitting.models import Problem
 from fitting.parameters import DELAY_SHAPE, LOSS_SHAPE, PARAMETERS
 
@@ -316,8 +315,9 @@ def rows_of_fit(
     plain = Objective(objective.measurement, problem, near=objective.near)
     linear = plain.at_values(values[None])
     prediction = jax.tree.map(lambda leaf: np.asarray(leaf)[0], linear.prediction)
-    impact = impact_of(jnp.asarray(values), objective.measurement, problem)
-    speeds = jax.tree.map(np.asarray, jax.vmap(impact.speeds)(jnp.asarray(prediction.coordinate)))
+    impact = impact_at(values, objective.measurement, problem).impact
+    tips = jax.tree.map(np.asarray, free_impacts(impact, prediction.coordinate))
+    speeds = tips.speeds
     measured = np.asarray(objective.measurement.rows.measured)
     error = np.where(measured, rows.error_nm, 1.0)
     if objective.robust:
@@ -334,7 +334,7 @@ def rows_of_fit(
         rebound=np.where(there, speeds.rebound, 99.0),
         pull=np.where(there, prediction.pull_nm_per_us2, 0.0),
         change=np.where(there, prediction.change_nm_per_us3, 0.0),
-        hertz_time=np.asarray(impact.hertz_time(jnp.asarray(speeds.approach))),
+        hertz_time=tips.hertz_time,
     )
 
 

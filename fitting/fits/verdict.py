@@ -15,7 +15,7 @@ from scipy.special import chdtrc
 from fitting.fits.intervals import Convergence
 from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.result import FittedParameter, FittedRows
-from fitting.parameters import PARAMETERS, SHAPE_NAMES
+from fitting.parameters import DELAY_NAMES, PARAMETERS, SHAPE_NAMES
 from fitting.tables.table import AmplitudeTable
 
 IMPROBABLE = 1e-3
@@ -111,7 +111,10 @@ def _reasons(evidence: Evidence) -> list[str]:
     reasons += _contradictions(evidence)
     if evidence.freedom <= 0:
         reasons.append("As many parameters as amplitudes: the goodness of fit cannot be judged.")
-    for name, parameter in evidence.parameters.items():
+    # a tapping curve tells those of the delay only together; the law does not hang on each
+    together = DELAY_NAMES if evidence.table.tapping else ()
+    for name in (name for name in evidence.parameters if name not in together):
+        parameter = evidence.parameters[name]
         if parameter.interval95 == (None, None) and not misfit and not undetermined:
             reasons.append(f"{name} is not identified: {parameter.interval_reason}; {helpful_measurement(name)}.")
     return reasons

@@ -5,11 +5,12 @@ The picture of a direct inversion: the loss and the delay point by point, over t
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, with_zero_line
 from afm_jax.words import bullets, text_table, with_error
@@ -193,7 +194,7 @@ def inversion_figure(result: Inversion) -> Figure:
         result: the inversion; without any phase there is no delay to draw.
     """
     inverted = bool(result.rows.inverted.any())
-    figure = new_figure(11.0 if inverted else 6.5, 5.0)
+    figure = new_figure(11.0 if inverted else 6.5, 5.4)
     axes = figure.subplots(1, 2 if inverted else 1, squeeze=False)[0]
     _draw_loss(axes[0], result)
     if inverted:
@@ -222,11 +223,30 @@ def _draw_loss(axes: Axes, result: Inversion) -> None:
     error = np.sqrt(np.maximum(c[:, 0, 0] + c[:, 1, 1] - 2.0 * c[:, 0, 1], 0.0))
     _points(axes, result, rows.impact[:, 0] - rows.impact[:, 1], error)
     reading = result.resonance
+    low, high = _frame_of(axes, result)
     if len(reading.row):
         lost = reading.approach_speed_nm_per_us - reading.rebound_speed_nm_per_us
-        axes.plot(reading.approach_speed_nm_per_us, lost, "x", ms=5, color=GRID, label="on resonance (paper)")
-    _speed_axis(axes, r"loss  $u_{in} - u_{out}$ (nm/µs)", legend="upper left")
+        # where they take all that is lost in the air for the sample's, they are far above the rows
+        outside = int(((lost < low) | (lost > high)).sum())
+        label = "on resonance (paper)" + (f", {outside} of {len(lost)} outside" if outside else "")
+        axes.plot(reading.approach_speed_nm_per_us, lost, "x", ms=5, color=GRID, label=label)
+    axes.set_ylim(low, high)
+    _speed_axis(axes, r"loss  $u_{in} - u_{out}$ (nm/µs)")
+
+
+def _frame_of(axes: Axes, result: Inversion) -> tuple[float, float]:
+    """Return the losses that are shown, on a logarithmic axis: those of the rows, or all without any."""
     axes.set_yscale("log")
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
+    rows = result.rows
+    lost = (rows.impact[:, 0] - rows.impact[:, 1])[rows.inverted]
+    lost = lost[lost > 0.0]
+    if not lost.size:
+        lost = result.resonance.approach_speed_nm_per_us - result.resonance.rebound_speed_nm_per_us
+        lost = lost[lost > 0.0]
+    return (0.6 * float(lost.min()), 1.7 * float(lost.max())) if lost.size else axes.get_ylim()
 
 
 def _curve_of_fit(axes: Axes, result: Inversion, fitted: SavedLaw, values: np.ndarray) -> None:
@@ -258,7 +278,7 @@ def _draw_delay(axes: Axes, result: Inversion) -> None:
         _curve_of_fit(axes, result, fitted, _NS_PER_US * fitted.collision_delay_us)
     _points(axes, result, _NS_PER_US * result.rows.impact[:, 2], _NS_PER_US * result.rows.errors[:, 2])
     with_zero_line(axes)
-    _speed_axis(axes, r"collision delay  $\tau$ (ns)", legend="lower right")
+    _speed_axis(axes, r"collision delay  $\tau$ (ns)")
 
 
 def _points(axes: Axes, result: Inversion, values: np.ndarray, errors: np.ndarray) -> None:
@@ -281,7 +301,7 @@ def _points(axes: Axes, result: Inversion, values: np.ndarray, errors: np.ndarra
             )
 
 
-def _speed_axis(axes: Axes, y: str, *, legend: Literal["upper left", "lower right"]) -> None:
+def _speed_axis(axes: Axes, y: str) -> None:
     axes.set_xscale("log")
     low, high = axes.get_xlim()
     ticks = [tick for tick in (5, 10, 20, 50, 100, 200, 500, 1000, 2000) if low <= tick <= high]
@@ -290,4 +310,5 @@ def _speed_axis(axes: Axes, y: str, *, legend: Literal["upper left", "lower righ
     label_axes(axes, x=r"approach speed  $u_{in}$ (nm/µs)", y=y)
     axes.grid(color=GRID, alpha=0.25)
     if axes.get_legend_handles_labels()[0]:
-        axes.legend(fontsize=_SMALL, loc=legend)
+        # above the axes: no place within is free of data for every table
+        axes.legend(fontsize=_SMALL, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False)

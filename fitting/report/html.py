@@ -1,24 +1,17 @@
-"""A fit as one HTML file: what the page shows, as plain data; how it looks is in fit.html.jinja.
+"""A fit as one HTML file: what the page shows, as plain data; how it looks is in fit.html.jinja."""
 
-The file needs nothing besides itself: pictures are inside, there are no scripts, and its content security policy
-forbids a browser to load anything. Every text is escaped when it enters the page.
-"""
-
-import base64
-import re
-from collections.abc import Collection, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
-from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from afm_jax.words import known, plain_words
 from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.result import FitResult, FittedRows
 from fitting.parameters import NUISANCE_NAMES, PARAMETERS, SHAPE_NAMES
+from fitting.report.page import Table, in_signs, page, pairs, pictures_of
 from fitting.report.words import (
     SHARE_OF_BAND,
     ComparedModels,
@@ -43,8 +36,6 @@ _FAR = 3.0
 """Residual in standard errors from which a row is marked."""
 _LONGEST = 12
 """Lists longer than that are samples, not findings."""
-_NON_CHARACTERS = "".join(chr(plane << 16 | low) for plane in range(17) for low in (0xFFFE, 0xFFFF))
-_FORBIDDEN = re.compile(rf"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff\ufdd0-\ufdef{_NON_CHARACTERS}]")
 _APPROACH = Markup("u<sub>in</sub> (nm/µs)")
 _COMPARED = {
     "model": "model",
@@ -62,27 +53,6 @@ _CHECKS = {
     "estimated_distance": "by how much chi2 lies above its minimum",
     "outward": "at a bound, chi2 falls towards the outside only",
 }
-
-
-@dataclass(frozen=True)
-class Table:
-    """A table of the page; its first column names the rows.
-
-    Attributes:
-        caption: what it shows.
-        head: the columns' names.
-        rows: a cell for each column.
-        words: names of columns that hold words, not numbers.
-        marked: places of rows that stand out.
-        left_out: where the rows are that are not shown, as a sentence.
-    """
-
-    caption: str
-    head: Sequence[str]
-    rows: Sequence[Sequence[str]]
-    words: Collection[str] = ()
-    marked: Collection[int] = ()
-    left_out: str = ""
 
 
 def fit_page(
@@ -106,15 +76,8 @@ def fit_page(
     if result.valid and result.model != "contact":
         numbers = rounded_values(result)
     samples = {"Bootstrap": bootstrap, "Posterior": posterior}
-    environment = Environment(
-        loader=FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        finalize=_allowed,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("fit.html.jinja").render(
+    return page(
+        "fit.html.jinja",
         result=result,
         title=f"Impact law of {result.table.source}",
         belief=belief_in_words(result),
@@ -122,7 +85,7 @@ def fit_page(
         lasting=result.model.endswith("+delay"),
         said=_what_the_data_say(result),
         digits=f"{100.0 * SHARE_OF_BAND:g}",
-        sure=f"{_in_signs(band_in_words(result))} {goodness_in_words(result)}",
+        sure=f"{in_signs(band_in_words(result))} {goodness_in_words(result)}",
         comparison=comparison,
         compared=None if comparison is None else _compared(comparison),
         pictures=_pictures(result, pictures),
@@ -136,26 +99,9 @@ def fit_page(
         minimum=_minimum(result),
         instrument=_instrument(result.table),
         measured=_measured(result.table),
-        settings=_pairs("Options of the fit", ("option", "value"), result.settings),
-        versions=_pairs("Versions of what computed it", ("package", "version"), result.versions),
+        settings=pairs("Options of the fit", ("option", "value"), result.settings),
+        versions=pairs("Versions of what computed it", ("package", "version"), result.versions),
     )
-
-
-def _allowed(value: Any) -> Any:
-    """Return a text with U+FFFD for what HTML may not hold: controls, surrogates, non-characters."""
-    if not isinstance(value, str) or isinstance(value, Markup):
-        return value
-    return _FORBIDDEN.sub("\ufffd", value)
-
-
-def _in_signs(words: str) -> str:
-    """Return text with the signs that a terminal may lack: µs for us, ² for ^2."""
-    return re.sub(r"\bus\b", "µs", words).replace("^2", "²").replace("^3", "³")
-
-
-def _pairs(caption: str, head: tuple[str, str], values: Mapping[str, Any]) -> Table:
-    """Return a table of names and plain values."""
-    return Table(caption, head, [[name, plain_words(value)] for name, value in values.items()], words=head[1:])
 
 
 def _what_the_data_say(result: FitResult) -> Table:
@@ -163,12 +109,12 @@ def _what_the_data_say(result: FitResult) -> Table:
     caption = "What the data say"
     if len(own) < len(result.parameters):
         caption += " (calibration and damping are fitted along, see Parameters)"
-    rows = [[name, value_in_words(p), interval_in_words(p), _in_signs(p.unit)] for name, p in own.items()]
+    rows = [[name, value_in_words(p), interval_in_words(p), in_signs(p.unit)] for name, p in own.items()]
     return Table(caption, ["parameter", "value", "95 % interval", "unit"], rows, words=("95 % interval", "unit"))
 
 
 def _pictures(result: FitResult, files: Sequence[bytes]) -> list[dict[str, str]]:
-    """Return the pictures with what is to be seen, in words; for those too who do not see them."""
+    """Return the pictures with what is to be seen."""
     law = "Rebound speed and energy lost over the approach speed, with their 95 % bands."
     if has_delay(result):
         law = "Rebound speed, energy lost and collision delay over the approach speed, with their 95 % bands."
@@ -178,17 +124,14 @@ def _pictures(result: FitResult, files: Sequence[bytes]) -> list[dict[str, str]]
         "What is left of each amplitude over the approach speed, in standard errors: a wrong law leaves a curve here.",
         "The energy that an impact takes over the approach speed, with its 95 % band; dashed, the closest paper's law.",
     )[: len(files)]
-    return [
-        {"source": f"data:image/png;base64,{base64.b64encode(file).decode('ascii')}", "shows": words}
-        for file, words in zip(files, shows, strict=True)
-    ]
+    return pictures_of(files, shows)
 
 
 def _losses(result: FitResult) -> Table | None:
     rows = losses_in_words(result)
     if not (result.valid and rows):
         return None
-    cells = [[_in_signs(cell) for cell in row] for row in rows]
+    cells = [[in_signs(cell) for cell in row] for row in rows]
     return Table("What an impact takes", ["quantity", "value (95 % interval)"], cells, words=("value (95 % interval)",))
 
 
@@ -210,7 +153,7 @@ def _parameters(result: FitResult) -> Table:
             value_in_words(parameter),
             known(parameter.standard_error, ".2g"),
             interval_in_words(parameter),
-            _in_signs(parameter.unit),
+            in_signs(parameter.unit),
             "-" if parameter.constraint is None else "{:g} ± {:g}".format(*parameter.constraint),
             remarks_on(parameter),
         ]
@@ -265,7 +208,7 @@ def _sampled(title: str, sampled: Sampled, parameters: Sequence[str]) -> dict[st
         "title": title,
         "failed": found.get("converged") is False,
         "by_parameter": Table("By parameter", ["parameter", *map(_title, columns)], rows) if columns else None,
-        "besides": _pairs("Besides", ("", "value"), others) if others else None,
+        "besides": pairs("Besides", ("", "value"), others) if others else None,
     }
 
 
@@ -399,7 +342,7 @@ def _instrument(measured: AmplitudeTable) -> Table:
         "mass_ng": f"{measured.mass_ng:g}",
     }
     header |= {name: f"{value:g} ± {error:g}" for name, (value, error) in measured.calibration.items()}
-    return _pairs("What the table says of the instrument", ("", "value"), header)
+    return pairs("What the table says of the instrument", ("", "value"), header)
 
 
 def _measured(measured: AmplitudeTable) -> Table:

@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int
 
 from afm_jax.checks import require_float64
 from afm_jax.contact.parameters import EFFECTS
+from afm_jax.results import public_result
 from fitting.fits.intervals import at_bound, covariance
 from fitting.fits.least_squares import Box, Searches, descended, distance, whole_covariance_of
 from fitting.fits.objective import PLAIN, ROBUST, Objective, soft_square
@@ -220,6 +221,7 @@ FEWEST = 40
 """With fewer samples the 2.5 % quantile is the smallest value or next to it."""
 
 
+@public_result()
 @dataclass(frozen=True, eq=False)
 class Bootstrap:
     """Fitted values of synthetic data sets.

@@ -13,6 +13,7 @@ from jaxtyping import Float
 from scipy.integrate import trapezoid
 from scipy.interpolate import PchipInterpolator
 
+from afm_jax.units import TWO_SIDED_95
 from fitting.fits.objective import Objective
 from fitting.fits.result import FitResult
 from fitting.sampling.bootstrap import Refit, compact, objective_of, require_valid, standard_covariance
@@ -117,7 +118,7 @@ def grid_posterior(refit: Refit, log_uniform: tuple[str, ...] = ()) -> Posterior
         variance = _integral(weight * nuisance_square[..., k], points) - middle**2
         mean[name], deviation[name] = middle, float(np.sqrt(variance))
         # Gaussian to the order that Laplace's method keeps
-        interval[name] = middle - 1.959964 * deviation[name], middle + 1.959964 * deviation[name]
+        interval[name] = middle - TWO_SIDED_95 * deviation[name], middle + TWO_SIDED_95 * deviation[name]
     return Posterior(
         method="grid",
         log_uniform=log_uniform,

@@ -6,6 +6,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.results import public_result
+
 HIGHEST_R_HAT = 1.02
 """Samples with a larger ratio between and within chains do not describe one distribution."""
 FEWEST_EFFECTIVE = 100.0
@@ -48,6 +50,7 @@ class PosteriorChains:
     seed: int
 
 
+@public_result()
 @dataclass(frozen=True, eq=False)
 class Posterior:
     """The posterior of a fit's parameters.

@@ -25,6 +25,7 @@ from afm_jax.motion.observe import observe
 from afm_jax.motion.record import MotionOutcome, Simulation, State
 from afm_jax.motion.settle import close_periods, ends_in_flight, place_after, settled, where_to_go_on
 from afm_jax.motion.simulate import DEFAULT_ACCURACY, simulate
+from afm_jax.results import public_result
 from fitting.tables.table import DRIVES, AmplitudeTable
 
 US_PER_MS = 1e3
@@ -42,6 +43,7 @@ _TOLERANCE = 1e-6
 """Of what remains to the steady motion, relative: ten times less than the amplitudes are wanted to."""
 
 
+@public_result()
 class Drives(NamedTuple):
     """What is driven in an experiment, one entry a row."""
 
@@ -233,6 +235,7 @@ PIECES = 40
 """Most pieces of a hundred response periods that a motion may take to settle."""
 
 
+@public_result()
 @dataclass(frozen=True, kw_only=True)
 class SimulatedExperiment:
     """A simulated amplitude table, and what was behind it.

@@ -35,13 +35,14 @@ The comment lines of an amplitude table: what `# key = value` says about the can
 The columns of an amplitude table, and the checks that every table must pass.
 """
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from afm_jax.results import public_result
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from afm_jax.whole_files import write_whole
 from fitting.tables.csv_text import (
@@ -200,9 +201,9 @@ TAPPING = _form(
     "belongs to a sample that is driven; with '# drive = force' or '# drive = base' the columns are "
     + ", ".join(column.name for column in _TAPPING),
 )
+COLUMN_NAMES = TABLE.names
 FORMS = {drive: TABLE if drive == "sample" else TAPPING for drive in DRIVES}
 """The columns of a table by what is driven."""
-COLUMN_NAMES = TABLE.names
 _ALL = tuple({column.name: column for column in (*_SAMPLE, *_TAPPING)}.values())
 MEASURED = tuple(column for column in _ALL if column.error is not None)
 AMPLITUDES = tuple(column for column in _ALL if column.amplitude)
@@ -367,6 +368,7 @@ def _check_duplicates(columns: Columns, lines: Int[np.ndarray, " rows"], faults:
 __all__ = ["AmplitudeTable", "TableError", "read_table", "write_table"]
 
 
+@public_result()
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AmplitudeTable:
     """Measured amplitudes of (1, N) orbits, one row for each drive; the arrays are read-only NumPy copies.
@@ -460,6 +462,38 @@ class AmplitudeTable:
         for name, values in (columns | {"lines": np.array(lines, dtype=np.int64)}).items():
             values.setflags(write=False)
             object.__setattr__(self, name, values)
+
+    @classmethod
+    def from_dataframe(cls, frame: Any, *, noise: float | None = None, **header: Any) -> "AmplitudeTable":
+        """Return the table of a pandas data frame.
+
+        Args:
+            frame: columns called as in a file, NaN where nothing was measured; its `attrs` may hold what follows.
+            noise: standard error relative to the amplitude, for amplitudes without one of their own.
+            header: the other attributes, as ``free_frequency_khz=90.0`` and ``quality_factor=40.0``.
+
+        Raises:
+            TableError: if a value is impossible, a column is not known or missing.
+        """
+        faults = Faults(str(header.get("source", "data frame")), place="row")
+        names = {column.name for column in _ALL}
+        own = {field.name for field in fields(cls)} - {*names, "lines"}
+        known: dict[str, Any] = {"source": "data frame"}
+        known |= {name: value for name, value in frame.attrs.items() if name in own} | header
+        form = FORMS.get(known.get("drive", "sample"), TABLE)
+        columns: dict[str, Any] = {name: np.asarray(frame[name], np.float64) for name in form.names if name in frame}
+        for name in frame.columns:
+            if name not in (*form.names, "lines"):
+                faults.add(f"there is no column {name!r}; leave it out, or choose from {', '.join(form.names)}")
+        needed = (column.name for column in form.columns if column.required and column.needed)
+        for name in ("free_frequency_khz", *needed):
+            if name not in known and name not in columns:
+                faults.add(f"{name} is missing; give it as a {'keyword' if name in own else 'column'}")
+        faults.raise_any()
+        fill_errors(columns, {name: np.zeros(len(frame), dtype=bool) for name in columns}, noise)
+        if "order" in columns:
+            columns["order"] = columns["order"].astype(np.int64)
+        return cls(**columns, **known)
 
     @property
     def rows(self) -> int:

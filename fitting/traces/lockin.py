@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from afm_jax.results import public_result
 from fitting.tables.table import AmplitudeTable
 from fitting.traces.fold import Fold, OrderSearch, Reference, find_order, find_reference, fold, sampling_error_nm
 from fitting.traces.impacts import (
@@ -30,6 +31,7 @@ FORMAT_VERSION = 1
 """Version of the JSON layout; raised when a key changes its meaning or goes."""
 
 
+@public_result(picture="fitting.traces.report:lockin_figure")
 @dataclass(frozen=True, eq=False, kw_only=True)
 class LockinResult:
     """The reading of one trace; attributes are named like the keys of its JSON. Errors are standard errors.

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save
 from afm_jax.whole_files import write_whole
@@ -108,6 +109,11 @@ _DECADES = 1e-5
 
 def draw_lockin(result: LockinResult, path: Path) -> None:
     """Draw a reading as a PNG file."""
+    save(lockin_figure(result), path)
+
+
+def lockin_figure(result: LockinResult) -> Figure:
+    """Return the picture of a reading: its response periods on top of each other, and its spectrum."""
     figure = new_figure(12.0, 5.4)
     left, right = figure.subplots(1, 2)
     _draw_folded(left, result)
@@ -119,7 +125,7 @@ def draw_lockin(result: LockinResult, path: Path) -> None:
         fontsize=11,
         color="black" if result.steady else _FLAGGED,
     )
-    save(figure, path)
+    return figure
 
 
 def _draw_folded(axes: Axes, result: LockinResult) -> None:

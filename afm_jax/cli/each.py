@@ -1,0 +1,87 @@
+"""`afm-jax fit --each TABLE...`: every table a fit of its own, on all cores; fits that are done are kept."""
+
+import math
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from afm_jax.cli.main import NotValid
+from afm_jax.cli.session import Session
+from afm_jax.cli.sweep import run_sweep
+from afm_jax.words import text_table, with_error
+
+
+def fit_tables(session: Session, tables: Sequence[Path], record: Mapping[str, Any], workers: int | None) -> None:
+    """Fit every table by itself and say what was found.
+
+    Args:
+        session: the call.
+        tables: files.
+        record: model, noise and settings of the fits.
+        workers: processes; None: one a core.
+
+    Raises:
+        NotValid: if a fit is not valid.
+    """
+    session.start_computing()
+    from afm_jax.sweeps.plan import plan_of  # noqa: PLC0415
+    from fitting.bulk import table_input  # noqa: PLC0415
+
+    plan = plan_of(table_input(tables, record))
+    with tempfile.TemporaryDirectory() as scratch:
+        where = session if session.out is not None else replace(session, out=Path(scratch))
+        done = run_sweep(where, plan, workers=workers, scheduler=None)
+        rows = _rows(tables, [variable.name for variable in plan.recorder.variables], where.out)
+    columns = [name for name in rows[0] if name not in ("parameters", "valid")]
+    session.write_table("fits.csv", rows, columns)
+    fits = [
+        {name: row[name] for name in ("table", "outcome", "valid", "chi2", "degrees_of_freedom", "parameters")}
+        for row in rows
+    ]
+    payload = {"model": record["model"], "fits": fits, "seconds": done.seconds, "fits_kept": len(done.kept.done)}
+    session.emit(payload, "\n".join(_table(rows)))
+    bad = [row["table"] for row in rows if not row["valid"]]
+    if bad:
+        raise NotValid(f"{len(bad)} of {len(rows)} fits are not valid: `afm-jax fit {bad[0]}` says why")
+
+
+def _rows(tables: Sequence[Path], variables: Sequence[str], folder: Path | None) -> list[dict[str, Any]]:
+    """Return a row a table: each number by its column, and the parameters as `afm-jax fit` has them."""
+    import xarray  # noqa: PLC0415
+
+    from afm_jax.sweeps.store import STORE  # noqa: PLC0415
+
+    with xarray.open_zarr(f"{folder}/{STORE}") as store:
+        found = store.load()
+    codes = found["outcome"].attrs
+    words = dict(zip(codes["flag_values"], codes["flag_meanings"].split(), strict=True))
+    names = [name.removesuffix("_error") for name in variables if name.endswith("_error")]
+    rows = []
+    for number, table in enumerate(tables):
+        numbers = {name: found[name].values[number].item() for name in variables}
+        outcome = words[numbers.pop("outcome")]
+        parameters = {name: _parameter(name, numbers) for name in names}
+        told = {"table": str(table), "outcome": outcome, "valid": outcome == "valid"}
+        rows.append(told | numbers | {"parameters": parameters})
+    return rows
+
+
+def _parameter(name: str, numbers: Mapping[str, float]) -> dict[str, Any]:
+    return {
+        "value": numbers[name],
+        "standard_error": numbers[f"{name}_error"],
+        "interval95": [numbers[f"{name}_low"], numbers[f"{name}_high"]],
+    }
+
+
+def _table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    names = list(rows[0]["parameters"])
+    cells = []
+    for row in rows:
+        pairs = ((found["value"], found["standard_error"]) for found in (row["parameters"][name] for name in names))
+        known = [with_error(*(None if math.isnan(part) else part for part in pair)) for pair in pairs]
+        chi2 = "-" if math.isnan(row["chi2"]) else f"{row['chi2']:.1f}/{row['degrees_of_freedom']}"
+        cells.append([row["table"], *known, chi2, row["outcome"].replace("_", " ")])
+    return text_table(["table", *names, "chi2/dof", ""], cells, words=(0, len(names) + 2))

@@ -1,0 +1,84 @@
+"""`afm-jax read FILE`: tapping curves out of an instrument's file, as tables for `tapping` and `fit`."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from afm_jax.cli.main import NotValid
+from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.values import ValueAndError
+
+_NUMBERS = (
+    ("drive-frequency-khz", "KHZ", "Frequency of the drive."),
+    ("free-frequency-khz", "KHZ", "Natural frequency of the free cantilever, '90 +- 0.01' with its error."),
+    ("quality-factor", "Q", "Its quality factor, '200 +- 5' with its error."),
+    ("spring-constant-n-per-m", "N_PER_M", "Its spring constant, '5.4 +- 0.5' with its error."),
+    ("free-amplitude-nm", "NM", "Amplitude of the free tip; else the median of the rows far from the sample."),
+    ("offset-origin-nm", "NM", "Height (growing towards the tip) at which the sample is at the tip's rest position."),
+    ("amplitude-error-nm", "NM", "Standard error of every amplitude; else the scatter of the free rows."),
+    ("phase-error-deg", "DEGREES", "Standard error of every phase; else the scatter of the free rows."),
+)
+
+
+class NmPerVolt(ValueAndError):  # noqa: N818 (no exception)
+    """A value with its error, or the word `slope`."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the value and its error, or the word."""
+        return value if value == "slope" else super().convert(value, param, ctx)
+
+
+def _with_numbers(function):
+    """Add an option for everything that a file may leave out."""
+    for name, unit, text in reversed(_NUMBERS):
+        short = ("--spring-constant",) if name.startswith("spring") else ()
+        function = click.option(f"--{name}", *short, type=ValueAndError(), metavar=unit, help=text)(function)
+    return function
+
+
+@click.command()
+@click.argument("file", metavar="FILE", type=click.Path(path_type=Path))
+@click.option("--curve", type=click.IntRange(1), metavar="N", help="Only this curve of the file.")
+@click.option(
+    "--columns",
+    metavar="COLUMN=CHANNEL[:UNIT][:FACTOR],...",
+    default="",
+    help="Which channel becomes which column (offset_nm, lockin_amplitude_nm, phase_lag_deg, deflection_nm), as "
+    "offset_nm=Z:um:-1,lockin_amplitude_nm=Amp:V; the height must grow towards the tip.",
+)
+@click.option(
+    "--drive",
+    type=click.Choice(["base", "force"]),
+    help="What shakes the tip: a piezo at its base (assumed without this option), or a force (photothermal, magnetic).",
+)
+@click.option(
+    "--nm-per-volt",
+    type=NmPerVolt(),
+    metavar="NM|slope",
+    help="Sensitivity of an amplitude in volts; `slope`: such that the amplitude falls by 1 nm per nm in contact.",
+)
+@_with_numbers
+@with_session(out_file="TABLE.csv")
+def command(session: Session, file: Path, curve: int | None, **options: Any) -> None:
+    """Read amplitude and phase against height out of an instrument's file.
+
+    FILE is neaSNOM text, WSxM curves, an Asylum .ibw ramp, a NanoSurf .nid, Nanonis .dat or Gwyddion .gwy file, or text
+    separated by tabs, semicolons or commas. Says what was found, where each number comes from, what was assumed and
+    what is missing. With --out the table for `afm-jax tapping` and `afm-jax fit`; of a file of several curves one table
+    each, TABLE_1.csv and so on. Curves that must not be used (a free amplitude that jumps) are refused by name, and the
+    exit code is 3. Package extra for .ibw and .gwy: `pip install 'afm-jax[instruments]'`.
+    """
+    from fitting.instruments.curve import read_curve, read_curves  # noqa: PLC0415
+    from fitting.instruments.report import curves_payload, curves_summary, write_tables  # noqa: PLC0415
+
+    curves = read_curves(file, **options) if curve is None else [read_curve(file, curve=curve, **options)]
+    # what is missing ends the command before anything is printed
+    written = [] if session.out is None or not any(one.valid for one in curves) else write_tables(curves, session.out)
+    session.emit(curves_payload(curves), curves_summary(curves))
+    for path in written:
+        session.note(f"wrote {path}")
+    refused = [one for one in curves if not one.valid]
+    if refused:
+        numbers = ", ".join(str(one.curve) for one in refused)
+        raise NotValid(f"{file}: refused curve {numbers}; {refused[0].reasons[0]}")

@@ -1,0 +1,401 @@
+"""Orbits of m contacts in N drive periods: closed by Newton's method on the simulated map from departure to departure.
+
+First guesses are the orbits of the law with delay that comes closest to the contact, unstable ones included, and what
+tips come to that are simulated for a while. The map's Jacobian is the forward derivative of the simulation, so that a
+loop is closed to rounding and its multipliers are exact.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy.optimize import brentq
+
+from afm_jax.apparatus.scene import Scene, drive_of
+from afm_jax.apparatus.surface import surface_of
+from afm_jax.checks import require_float64
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.law_of_contact import law_of_contact
+from afm_jax.dynamics.contact_sequence import follow_contacts, next_contact
+from afm_jax.dynamics.impact_loop import LoopReading, driven_part
+from afm_jax.dynamics.impact_orbits import (
+    ManyImpactOrbits,
+    check_loop,
+    is_stable,
+    loops_told_apart,
+    many_impact_orbits,
+    multipliers_of,
+)
+from afm_jax.dynamics.iteration import evenly_spread, leaving_tips
+from afm_jax.motion.observe import peaks_of_flights
+from afm_jax.motion.record import ContactKind, Contacts
+from afm_jax.motion.simulate import DEFAULT_ACCURACY
+from afm_jax.scenefile.parameter_paths import scene_family
+from afm_jax.units import RAD_PER_US_PER_KHZ
+
+_STARTS = 8
+"""Tips that are simulated for guesses."""
+_SETTLING = 60
+"""Contacts before their guesses."""
+_WINDOW = 0.05
+"""Periods by which the contacts of a guess may miss N drive periods."""
+_NEWTON_STEPS = 25
+_TURN, _SHARE = 0.3, 0.3
+"""Longest step of Newton's method: in a phase, rad, and of a speed."""
+_ARRIVED = 1e-10
+"""Largest last step and remaining gap of a closed loop, in rad and of the fastest speed."""
+_LANES = 16
+"""Contacts followed together, one program."""
+_SAMPLES = 512
+"""Of a flight, for its lowest points."""
+_CURVE_STEPS = 12
+_CURVE_ARRIVED = 1e-12
+_DIFFERENCE = 1e-5
+"""Of unknowns without dimension, for derivatives of test functions."""
+_LONGEST_CONTACT = 0.5
+"""Time that a contact may take beyond where it was expected to end, in flights of the loop."""
+
+
+def contact_orbits(scene: Scene, order: int, impacts: int, *, accuracy: float = DEFAULT_ACCURACY) -> ManyImpactOrbits:
+    """Return the orbits of m contacts in N drive periods of a scene with a contact.
+
+    Args:
+        scene: one scene with a `Contact`, driven with one period.
+        order: N, drive periods until the motion repeats.
+        impacts: m, contacts in them.
+        accuracy: of `simulate`.
+
+    Returns:
+        The orbits; a contact begins where the bridge forms and ends where it breaks. In the reading phases and
+        velocities after are those of the departures, delays those between straight paths extrapolated to gap 0
+        (as in `collide`); ``loops`` holds departure phases in rad and rebound speeds in
+        nm/us. Stable orbits that eight tips do not come to and unstable ones that the closest law lacks are not found.
+
+    Raises:
+        RuntimeError: if JAX is not set to 64-bit floats.
+        TypeError: if the scene's interaction is no contact.
+        ValueError: if order or impacts is no positive integer, there are more impacts than 64, or the drive does not
+            repeat.
+    """
+    require_float64(scene)
+    if not isinstance(scene.interaction, Contact):
+        raise TypeError("`scene` must have a `Contact`; `many_impact_orbits` has the orbits of a law")
+    check_loop(order, impacts)
+    flights = ContactFlights(scene, order, (), accuracy=accuracy)
+    told = contact_loops(flights, np.zeros(0), impacts)
+    known = [(reading, loop) for loop in told if (reading := flights.reading(loop, np.zeros(0))) is not None]
+    known.sort(key=lambda one: -float(one[0].peak_amplitude_nm))
+    fields = [*[jnp.zeros((0, impacts))] * 6, *[jnp.zeros(0)] * 3, jnp.zeros(0, bool), jnp.zeros(0)]
+    reading = LoopReading(*fields)
+    if known:
+        reading = jax.tree.map(
+            lambda *parts: np.stack([np.asarray(part) for part in parts]), *(one for one, _ in known)
+        )
+    loops = np.array([loop for _, loop in known]).reshape(-1, 2 * impacts)
+    multipliers = multipliers_of(np.asarray(reading.trace), np.asarray(reading.determinant))
+    return ManyImpactOrbits(loops, reading, multipliers, is_stable(multipliers))
+
+
+def contact_loops(
+    flights: "ContactFlights", values: Float[np.ndarray, " parameters"], impacts: int
+) -> Float[np.ndarray, "loops n"]:
+    """Return the loops of m contacts that are found at values of a scene's parameters, each once (`FlownLoop`)."""
+    scene, order = flights.family(*values), flights.order
+    guesses = [*_orbits_of_law(scene, order, impacts), *_simulated(scene, order, impacts, flights.accuracy)]
+    loops = [loop for guess in guesses if (loop := _closed(guess, flights, values)) is not None]
+    return loops_told_apart(np.array(loops).reshape(-1, 2 * impacts), order)
+
+
+def _orbits_of_law(scene: Scene, order: int, impacts: int) -> list[np.ndarray]:
+    """Return the orbits of the law with delay closest to the contact, as guesses."""
+    law = law_of_contact(scene.interaction, float(scene.cantilever.mass_ng))
+    if law is None:
+        return []
+    simple = eqx.tree_at(lambda parts: parts.interaction, scene, law)
+    reading = many_impact_orbits(simple, order, impacts).reading
+    omega, gap = drive_of(scene).angular_frequency, float(scene.interaction.bridge_breaks_nm)
+    found = []
+    for phase, rebound in zip(reading.phase_rad, reading.rebound_speed_nm_per_us, strict=True):
+        # `phase_rad` is within a turn: the impacts follow one another
+        turns = _rising(phase)
+        found.append(np.concatenate([turns + omega * gap / rebound, rebound]))
+    return found
+
+
+def _rising(phase: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+    turned = phase.copy()
+    for place in range(1, len(turned)):
+        turned[place] += 2.0 * np.pi * np.ceil((turned[place - 1] - turned[place]) / (2.0 * np.pi))
+    return turned
+
+
+def _simulated(scene: Scene, order: int, impacts: int, accuracy: float) -> list[np.ndarray]:
+    """Return what a few tips do after a while, where it nearly repeats, as guesses."""
+    scenes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (_STARTS, *leaf.shape)), scene)
+    tips = leaving_tips(scenes)
+    period = drive_of(scene).period_us
+    across, up = evenly_spread(_STARTS).T
+    time = period * across
+    faster = np.asarray(tips.velocity_nm_per_us - scene.platform.velocity(tips.time_us)) * (0.5 + 3.0 * up)
+    tips = tips._replace(time_us=time, velocity_nm_per_us=np.asarray(scene.platform.velocity(time)) + faster)
+    _, record = follow_contacts(scenes, tips, skip=_SETTLING, record=2 * impacts + 1, accuracy=accuracy)
+    turns = record.departure_periods + record.departure_us / period
+    rebound = record.velocity_after_nm_per_us - np.asarray(scene.platform.velocity(record.departure_us))
+    found = []
+    for lane in range(_STARTS):
+        for begin in range(impacts + 1):
+            own = turns[lane, begin : begin + impacts + 1]
+            if abs(own[-1] - own[0] - order) < _WINDOW:
+                phases = 2.0 * np.pi * (own[:-1] - np.floor(own[0]))
+                found.append(np.concatenate([phases, rebound[lane, begin : begin + impacts]]))
+    return found
+
+
+def _closed(guess: np.ndarray, flights: "ContactFlights", values: np.ndarray) -> np.ndarray | None:
+    """Return the loop that Newton's method finds, departure phases and rebound speeds; None where it finds none."""
+    loop, count = guess.copy(), len(guess) // 2
+    for _ in range(_NEWTON_STEPS):
+        flown = flights.flown(loop, values)
+        if flown is None:
+            return None
+        step = -np.linalg.lstsq(flown.slopes[:, : len(loop)], flown.gaps, rcond=None)[0]
+        relative = np.concatenate([step[:count] / _TURN, step[count:] / (_SHARE * loop[count:])])
+        weights = np.repeat([1.0, 1.0 / loop[count:].max()], count)
+        loop = loop + step / max(1.0, np.abs(relative).max())
+        if np.abs(step * weights).max() < _ARRIVED and np.abs(flown.gaps * weights).max() < _ARRIVED:
+            return loop
+    return None
+
+
+class CurveUnits(NamedTuple):
+    """What a curve of loops is measured in: the unit of speeds, and the parameters' ranges."""
+
+    speed_nm_per_us: float
+    low: Float[np.ndarray, " parameters"]
+    width: Float[np.ndarray, " parameters"]
+
+
+class FlownLoop(NamedTuple):
+    """A loop as it was simulated; phases in rad, rebound speeds in nm/us."""
+
+    gaps: Float[np.ndarray, " n"]
+    """By how much the departures miss the next ones: m phases, m rebound speeds."""
+    slopes: Float[np.ndarray, "n unknowns"]
+    """Their derivatives by departure phases, rebound speeds and parameters."""
+    contacts: Any
+    """`Contacts`, m rows; of each the one that follows the departure."""
+    maps: Float[np.ndarray, "m 2 2"]
+    """Derivatives of the next departure's phase and rebound speed by this one's."""
+
+    @property
+    def trace_and_determinant(self) -> tuple[float, float]:
+        """T and D of the linearised map."""
+        whole = np.eye(2)
+        for one in self.maps:
+            whole = one @ whole
+        # the determinant of the product cancels
+        return float(np.trace(whole)), float(np.prod(np.linalg.det(self.maps)))
+
+
+class ContactFlights:
+    """A contact scene from departure to departure; some of its parameters may move.
+
+    Args:
+        scene: one scene with a contact, its numbers known.
+        order: N, drive periods in which a loop closes.
+        paths: of the parameters.
+        accuracy: of `simulate`.
+    """
+
+    def __init__(self, scene: Scene, order: int, paths: Sequence[str], *, accuracy: float = DEFAULT_ACCURACY):
+        """Make the program, which is compiled when it is first used."""
+        self.accuracy = accuracy
+        self.order, self._driven = order, driven_part(scene)
+        self.family = scene_family(scene, *paths) if paths else lambda: scene
+
+        def one(phase: Array, rebound: Array, until: Array, values: Array) -> tuple[Contacts, Array]:
+            def departs(unknowns: Array) -> tuple[Array, Contacts]:
+                there = self.family(*unknowns[2:])
+                omega = RAD_PER_US_PER_KHZ * getattr(there, self._driven).frequency_khz
+                time = unknowns[0] / omega
+                velocity = unknowns[1] + there.platform.velocity(time)
+                contact = next_contact(there, time, velocity, until / omega, accuracy)
+                return jnp.stack([omega * contact.departure_time_us, contact.rebound_speed_nm_per_us]), contact
+
+            slopes, contact = jax.jacfwd(departs, has_aux=True)(jnp.concatenate([jnp.stack([phase, rebound]), values]))
+            return contact, slopes
+
+        self._fly = jax.jit(jax.vmap(one, in_axes=(0, 0, 0, None)))
+
+    def flown(self, loop: Float[np.ndarray, " n"], values: Float[np.ndarray, " parameters"]) -> FlownLoop | None:
+        """Return a loop with each of its contacts simulated; None where one does not end in time.
+
+        Args:
+            loop: m departure phases in rad, m rebound speeds in nm/us.
+            values: of the parameters.
+        """
+        count = len(loop) // 2
+        phase, rebound = loop[:count], loop[count:]
+        turn = 2.0 * np.pi * self.order
+        following = np.append(phase[1:], phase[0] + turn)
+        lasts = following - phase
+        if lasts.min() <= 0.0 or rebound.min() <= 0.0:
+            return None
+        lanes = (phase, rebound, following + _LONGEST_CONTACT * lasts.min())
+        padded = (np.pad(part, (0, -count % _LANES), mode="edge") for part in lanes)
+        found = self._fly(*map(jnp.asarray, padded), jnp.asarray(values))
+        contacts, slopes = jax.tree.map(lambda part: np.asarray(part)[:count], found)
+        if not ((contacts.kind == ContactKind.IMPACT).all() and np.isfinite(slopes).all()):
+            return None
+        # phases from the departure on, which loses no digits in later periods
+        passed = contacts.departure_time_us * self._omega(values)
+        gaps = np.concatenate([passed - following, contacts.rebound_speed_nm_per_us - np.roll(rebound, -1)])
+        whole = np.zeros((2, count, 2 * count + len(values)))
+        places, later = np.arange(count), (np.arange(count) + 1) % count
+        for row in range(2):
+            for column in range(2):
+                whole[row, places, column * count + places] = slopes[:, row, column]
+            whole[row, places, row * count + later] -= 1.0
+            whole[row, :, 2 * count :] = slopes[:, row, 2:]
+        return FlownLoop(gaps, whole.reshape(2 * count, -1), contacts, slopes[:, :, :2])
+
+    def _omega(self, values: Float[np.ndarray, " parameters"]) -> float:
+        return float(RAD_PER_US_PER_KHZ * getattr(self.family(*values), self._driven).frequency_khz)
+
+    def reading(self, loop: Float[np.ndarray, " n"], values: Float[np.ndarray, " parameters"]) -> LoopReading | None:
+        """Return what there is to know of a closed loop; arguments as for `flown`."""
+        flown = self.flown(loop, values)
+        if flown is None:
+            return None
+        count, contacts, there = len(loop) // 2, flown.contacts, self.family(*values)
+        time, rebound = loop[:count] / self._omega(values), loop[count:]
+        height, rate = (np.asarray(part) for part in there.platform.position_and_velocity(time))
+        breaks, forms = (float(getattr(there.interaction, f"bridge_{what}_nm")) for what in ("breaks", "forms"))
+        peaks = peaks_of_flights(there, time, height + breaks, rebound + rate, contacts.arrival_time_us)
+        # of the contact before each departure
+        approach = np.roll(contacts.approach_speed_nm_per_us, 1)
+        lasts = np.roll(contacts.departure_time_us - contacts.arrival_time_us, 1)
+        facts = (
+            loop[:count] % (2.0 * np.pi),
+            rebound + rate,
+            np.roll(contacts.arrival_velocity_nm_per_us, 1),
+            approach,
+            rebound,
+            lasts - forms / approach - breaks / rebound,
+            np.max(peaks),
+            *flown.trace_and_determinant,
+            True,
+            np.abs(flown.gaps * np.repeat([1.0, 1.0 / rebound.max()], count)).max(),
+        )
+        return LoopReading(*(jnp.asarray(part) for part in facts))
+
+    def readings(self, points: Float[np.ndarray, "points n"], units: CurveUnits) -> LoopReading:
+        """Return what there is to know of the loops at points of a curve (`solve`), NumPy arrays."""
+        read = []
+        for point in points:
+            count = (len(point) - len(units.low)) // 2
+            scales = np.repeat([1.0, units.speed_nm_per_us], count)
+            one = self.reading(point[: 2 * count] * scales, units.low + units.width * point[2 * count :])
+            if one is None:
+                raise ValueError("a loop that was closed does not fly")
+            read.append(one)
+        return jax.tree.map(lambda *parts: np.stack([np.asarray(part) for part in parts]), *read)
+
+    def nearest_approach(self, loop: Float[np.ndarray, " n"], flown: FlownLoop, values: np.ndarray) -> float:
+        """Return the gap of the lowest point of the flights less that at which the bridge forms, in nm.
+
+        Infinite where no flight has a lowest point between two contacts.
+        """
+        count, there = len(loop) // 2, self.family(*values)
+        surface, _ = surface_of(there)
+        forms = float(there.interaction.bridge_forms_nm)
+        nearest = np.inf
+        for begin, rebound, end in zip(
+            loop[:count] / self._omega(values), loop[count:], flown.contacts.arrival_time_us, strict=True
+        ):
+            height, rate = surface.position_and_velocity(begin)
+            start = height + there.interaction.bridge_breaks_nm, rate + rebound
+
+            def gap_and_rate(after: Any, begin: float = begin, start: Any = start) -> tuple[np.ndarray, np.ndarray]:
+                flight = there.cantilever.propagator(jnp.asarray(after))(*start)
+                below = surface.position_and_velocity(begin + jnp.asarray(after))
+                return np.asarray(flight[0] - below[0]), np.asarray(flight[1] - below[1])
+
+            after = np.linspace(0.0, end - begin, _SAMPLES)
+            gap, rate = gap_and_rate(after)
+            for place in np.flatnonzero((rate[:-1] < 0.0) & (rate[1:] >= 0.0)):
+                if min(gap[place], gap[place + 1]) - forms < nearest + 1.0:
+                    lowest = brentq(lambda t: float(gap_and_rate(t)[1]), after[place], after[place + 1], xtol=1e-13)
+                    nearest = min(nearest, float(gap_and_rate(lowest)[0]) - forms)
+        return nearest
+
+    def solve(
+        self, guess: Float[np.ndarray, " n"], row: Float[np.ndarray, " n"], units: CurveUnits, kind: int | None
+    ) -> tuple[np.ndarray, float, np.ndarray, np.ndarray] | None:
+        """Return the point of a curve in the plane through a guess across a row; None where it is not found.
+
+        Args:
+            guess: m phases in rad, m rebound speeds in the unit of speeds, the parameters as shares of their ranges.
+            row: normal of the plane.
+            units: of the same.
+            kind: number of the test function that is 0 besides; None: the loop closes, and that is all.
+
+        Returns:
+            The point, Newton's last move, the curve's tangent and the test functions.
+        """
+        point, moved, matrix = guess, np.inf, np.eye(len(guess))
+        for _ in range(_CURVE_STEPS):
+            found = self._tested(point, units, tested=kind is not None)
+            if found is None:
+                return None
+            value, matrix, tests = found
+            if kind is not None:
+                value, own = np.append(value, tests[kind]), self._test_slopes(point, units, kind)
+                if own is None:
+                    return None
+                matrix = np.vstack([matrix, own])
+            matrix = np.vstack([matrix, row])
+            move = np.linalg.solve(matrix, np.append(value, row @ (point - guess)))
+            point, moved = point - move, float(np.abs(move).max())
+            if not moved > _CURVE_ARRIVED:
+                break
+        found = self._tested(point, units, tested=True)
+        if found is None:
+            return None
+        tangent = np.linalg.solve(matrix, np.eye(len(point))[-1])
+        return point, moved, tangent / np.linalg.norm(tangent), found[2]
+
+    def _tested(
+        self, point: np.ndarray, units: CurveUnits, *, tested: bool
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+        """Return gaps without dimension, their derivatives by the unknowns of `solve`, and the test functions."""
+        count = (len(point) - len(units.low)) // 2
+        values = units.low + units.width * point[2 * count :]
+        scales = np.repeat([1.0, units.speed_nm_per_us], count)
+        loop = point[: 2 * count] * scales
+        flown = self.flown(loop, values)
+        if flown is None:
+            return None
+        slopes = flown.slopes * np.concatenate([scales, units.width]) / scales[:, None]
+        if not tested:
+            return flown.gaps / scales, slopes, np.zeros(0)
+        trace, determinant = flown.trace_and_determinant
+        near = self.nearest_approach(loop, flown, values) / units.speed_nm_per_us
+        near *= float(self.family(*values).cantilever.angular_frequency)
+        slowest = point[count : 2 * count].min()
+        tests = [1.0 - trace + determinant, 1.0 + trace + determinant, determinant - 1.0, near, slowest]
+        return flown.gaps / scales, slopes, np.array(tests)
+
+    def _test_slopes(self, point: np.ndarray, units: CurveUnits, kind: int) -> np.ndarray | None:
+        """Return the derivatives of a test function, by differences: they only lead Newton's method to its root."""
+        slopes = []
+        for step in _DIFFERENCE * np.eye(len(point)):
+            ends = [self._tested(point + sign * step, units, tested=True) for sign in (1.0, -1.0)]
+            if ends[0] is None or ends[1] is None:
+                return None
+            slopes.append((ends[0][2][kind] - ends[1][2][kind]) / (2.0 * _DIFFERENCE))
+        return np.array(slopes)

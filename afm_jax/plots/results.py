@@ -1,0 +1,70 @@
+"""The picture of any result: its arrays of one length against the first of them, its planes as maps, panels by unit."""
+
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from afm_jax.plots.picture_style import ACCENT, DARK, label_axes, new_figure
+from afm_jax.results import columns_of, unit_of
+
+_MOST_PANELS = 4
+_COLOURS = (DARK, ACCENT, "#0072B2", "#009E73", "#CC79A7", "#7a6a00")
+
+
+def figure_of(result: Any) -> Figure:
+    """Return the picture of a result: curves where it has arrays of one length, else maps, else numbers as bars."""
+    numbers = {name: array for name, (array, _) in columns_of(result).items() if array.dtype.kind in "biuf"}
+    shapes = [array.shape for array in numbers.values() if array.size > 1]
+    shape = max(shapes, key=lambda each: (shapes.count(each), each), default=())
+    chosen = {name: array.astype(float) for name, array in numbers.items() if array.shape == shape}
+    if len(shape) > 1 and sum(each == shape for each in shapes) == 1:
+        return _map(*chosen.popitem())
+    flat = {name: array.ravel() for name, array in chosen.items()}
+    if len(flat) < 2 or not shape:
+        flat = {"number": np.arange(float(np.prod(shape, initial=1.0, dtype=int))), **flat}
+    return _curves(flat)
+
+
+def _curves(columns: dict[str, np.ndarray]) -> Figure:
+    (first, x), *others = columns.items()
+    panels: dict[str, list[tuple[str, np.ndarray]]] = {}
+    for name, y in others:
+        panels.setdefault(unit_of(name), []).append((name, y))
+    shown = sorted(panels.items(), key=lambda each: (not each[0], -len(each[1])))[:_MOST_PANELS]
+    figure = new_figure(8.0, 1.2 + 2.4 * max(len(shown), 1))
+    marker = "." if x.size > 40 else "o"
+    steady = x.size > 1 and bool(np.all(np.diff(x) > 0.0))
+    for number, (unit, curves) in enumerate(shown):
+        axes = figure.add_subplot(len(shown), 1, number + 1)
+        for colour, (name, y) in zip(_COLOURS, curves, strict=False):
+            axes.plot(x, y, marker, linestyle="-" if steady else "", color=colour, label=_words(name), markersize=4)
+        label_axes(axes, x=_label(first) if number == len(shown) - 1 else "", y=unit)
+        axes.legend(frameon=False, fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return figure
+
+
+def _map(name: str, plane: np.ndarray) -> Figure:
+    figure = new_figure(7.0, 5.0)
+    axes = figure.add_subplot()
+    image = axes.imshow(plane.reshape(plane.shape[0], -1), origin="lower", aspect="auto", interpolation="nearest")
+    label_axes(axes, x="column", y="row")
+    figure.colorbar(image, label=_label(name))
+    return figure
+
+
+def _words(name: str) -> str:
+    unit = next(
+        (
+            end
+            for end in ("_nm_per_us", "_per_us", "_nm", "_us", "_deg", "_rad", "_aj", "_nn", "_khz")
+            if name.endswith(end)
+        ),
+        "",
+    )
+    return name.removesuffix(unit).replace("_", " ")
+
+
+def _label(name: str) -> str:
+    unit = unit_of(name)
+    return f"{_words(name)} ({unit})" if unit else _words(name)

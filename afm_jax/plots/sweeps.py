@@ -1,0 +1,113 @@
+"""Pictures of sweeps of one or two axes: lines, planes, or points where the values are random."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from afm_jax.plots.charts import cell_edges
+from afm_jax.plots.dynamics import label_of
+from afm_jax.plots.picture_style import GRID, label_axes, new_figure, save
+
+if TYPE_CHECKING:
+    import xarray
+
+_MOST = 1000
+"""Values along an axis that a picture shows."""
+_MOST_ROWS = 4
+
+
+def draw_sweep(found: "xarray.Dataset", names: Sequence[str], target: Path) -> None:
+    """Draw variables of a sweep side by side, one below the other what has further values at each point.
+
+    Args:
+        found: the results, along one or two axes.
+        names: of the variables.
+        target: PNG, PDF or SVG file.
+
+    Raises:
+        ValueError: if there are more axes.
+    """
+    axes = [str(name) for name in found["computed"].dims]
+    if len(axes) > 2:
+        raise ValueError(f"a picture shows one or two axes, but these are {', '.join(axes)}: slice the results first")
+    thin = found.isel({name: slice(None, None, -(-found.sizes[name] // _MOST)) for name in axes})
+    thin = thin.sortby([name for name in axes if name in thin.coords])
+    along = [str(name) for name, c in thin.coords.items() if "parameter" in c.attrs and c.dims[0] in axes]
+    flat = len(along) == 2 or len(axes) == 2
+    parts = {name: _layers(thin[name], axes) for name in names}
+    rows = max(map(len, parts.values())) if flat else 1
+    figure = new_figure(6.4 * len(names), 4.4 * rows)
+    panels = figure.subplots(rows, len(names), squeeze=False)
+    for column, (name, layers) in enumerate(parts.items()):
+        label = _label(found[name])
+        for row in range(rows):
+            panel: Axes = panels[row, column]
+            if not flat:
+                _lines(panel, thin, along, layers, label)
+            elif row < len(layers):
+                _plane(figure, panel, thin, along, axes, layers[row], label)
+            else:
+                panel.set_visible(False)
+    save(figure, target)
+
+
+def _layers(variable: "xarray.DataArray", axes: Sequence[str]) -> list[tuple[str, np.ndarray]]:
+    """Return what there is of a variable over the axes, with what tells it apart."""
+    further = [str(name) for name in variable.dims if name not in axes]
+    if not further:
+        return [("", variable.values)]
+    name = further[0]
+    values = variable[name].values[:_MOST_ROWS]
+    return [(f"{name} {value:g}", variable.isel({name: index}).values) for index, value in enumerate(values)]
+
+
+def _label(variable: "xarray.DataArray") -> str:
+    unit, label = variable.attrs.get("units", "1"), label_of(str(variable.name))
+    return label if unit == "1" or label.endswith(")") else f"{label} ({unit})"
+
+
+def _lines(
+    panel: Axes, found: "xarray.Dataset", along: Sequence[str], layers: Sequence[tuple[str, np.ndarray]], label: str
+) -> None:
+    coordinate = found[along[0]]
+    style = "." if coordinate.dims[0] != along[0] else ".-"
+    for name, values in layers:
+        panel.plot(coordinate.values, values, style, ms=3.0, linewidth=0.8, label=name or None)
+    if any(name for name, _ in layers):
+        panel.legend(frameon=False)
+    panel.grid(color=GRID, alpha=0.25)
+    label_axes(panel, x=label_of(coordinate.attrs["parameter"]), y=label)
+
+
+def _plane(
+    figure: Figure,
+    panel: Axes,
+    found: "xarray.Dataset",
+    along: Sequence[str],
+    axes: Sequence[str],
+    layer: tuple[str, np.ndarray],
+    label: str,
+) -> None:
+    """Draw values over two parameters: cells of a grid, or points."""
+    name, values = layer
+    if len(axes) == 2 and set(along) == set(axes):
+        y, x = axes
+        edges = cell_edges(found[x].values), cell_edges(found[y].values)
+        mesh = panel.pcolormesh(*edges, values, cmap="cividis", rasterized=True)
+    else:
+        x, y = along[:2]
+        at = np.broadcast_arrays(*(_spread(found[part], axes) for part in (x, y)))
+        mesh = panel.scatter(*(part.ravel() for part in at), c=np.asarray(values).ravel(), s=6.0, cmap="cividis")
+    bar = figure.colorbar(mesh, ax=panel)
+    bar.set_label(label)
+    panel.set_title(name, fontsize=11)
+    label_axes(panel, x=label_of(found[x].attrs["parameter"]), y=label_of(found[y].attrs["parameter"]))
+
+
+def _spread(coordinate: "xarray.DataArray", axes: Sequence[str]) -> np.ndarray:
+    """Return a coordinate with all axes of the sweep, of length 1 where it does not change."""
+    return coordinate.values.reshape([-1 if name in coordinate.dims else 1 for name in axes])

@@ -1,0 +1,280 @@
+"""What every result can do: say itself in a few lines, be drawn, become a table, be saved.
+
+The decorator `public_result` gives it to named tuples, dataclasses and modules of equinox alike, from their fields
+alone: units are the ends of the fields' names, dimensions those of the annotations. Batches, traced values and shapes
+can be told too.
+"""
+
+import enum
+import html
+import importlib
+import math
+import types
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
+
+import numpy as np
+
+from afm_jax.saved import fields_of, is_abstract, is_array, is_record, save
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from pandas import DataFrame
+    from xarray import Dataset
+
+Kind = TypeVar("Kind", bound=type)
+MOST_LINES = 20
+_WIDTH = 110
+_SHOWN = 5
+UNITS = {
+    "nm_per_us": "nm/us",
+    "nm2_per_us2": "nm^2/us^2",
+    "n_per_m": "N/m",
+    "per_us": "1/us",
+    "nm": "nm",
+    "us": "us",
+    "khz": "kHz",
+    "mhz": "MHz",
+    "deg": "degrees",
+    "rad": "rad",
+    "aj": "aJ",
+    "nn": "nN",
+    "ng": "ng",
+    "ev": "eV",
+}
+"""Units by the end of a field's name."""
+
+
+def public_result(
+    *, picture: str = "afm_jax.plots.results:figure_of", rows: str = "", **words: type[enum.IntEnum]
+) -> Callable[[Kind], Kind]:
+    """Return a decorator that makes a class of records a result.
+
+    Args:
+        picture: the function that draws it, "module:function"; as a rule its arrays against the first of them.
+        rows: the method or attribute that gives its table as mappings; as a rule the arrays of one shape are columns.
+        words: the enumeration of each field of integers that has one.
+    """
+
+    def decorate(kind: Kind) -> Kind:
+        def plot(self: Any, path: str | Path | None = None) -> "Figure":
+            """Return the picture of this result, a matplotlib figure; write it, PNG, PDF or SVG, if a path is given."""
+            module, _, name = picture.partition(":")
+            figure = getattr(importlib.import_module(module), name)(self)
+            style = importlib.import_module("afm_jax.plots.picture_style")
+            # a figure without pyplot is shown by a notebook only if it says how
+            figure._repr_png_ = lambda: style.png_of(figure)
+            if path is not None:
+                style.save(figure, Path(path))
+            return figure
+
+        def to_pandas(self: Any) -> "DataFrame":
+            """Return this result as a table of pandas."""
+            return _frame(self, rows)
+
+        methods = {
+            "__repr__": text_of,
+            "_repr_html_": html_of,
+            "_words": words,
+            "plot": plot,
+            "to_pandas": to_pandas,
+            "to_xarray": dataset_of,
+            "save": save,
+        }
+        for name, method in methods.items():
+            setattr(kind, name, method)
+        return kind
+
+    return decorate
+
+
+def text_of(self: Any) -> str:
+    """Return a result in at most 20 lines: a field each, arrays by their range, outcomes in words."""
+    return "\n".join(
+        [f"{type(self).__name__}:", *(f"  {name:<{_widest(self)}}  {text}" for name, text in _lines(self))]
+    )
+
+
+def html_of(self: Any) -> str:
+    """Return the same as HTML, for notebooks."""
+    cells = "".join(
+        f"<tr><td style='text-align:left'><code>{html.escape(name)}</code></td>"
+        f"<td style='text-align:left'>{html.escape(text)}</td></tr>"
+        for name, text in _lines(self)
+    )
+    return f"<table><caption style='text-align:left'><b>{type(self).__name__}</b></caption>{cells}</table>"
+
+
+def unit_of(name: str) -> str:
+    """Return the unit that a field's name ends with; empty for a number.
+
+    >>> unit_of("rebound_speed_nm_per_us"), unit_of("peak_amplitude_error_nm"), unit_of("stable")
+    ('nm/us', 'nm', '')
+    """
+    return next((unit for end, unit in UNITS.items() if name.endswith(f"_{end}")), "")
+
+
+def columns_of(record: Any) -> dict[str, tuple[np.ndarray, tuple[str, ...]]]:
+    """Return the numbers of a record, with the names of their dimensions; those of an inner record after its name."""
+    found: dict[str, tuple[np.ndarray, tuple[str, ...]]] = {}
+    for name, value in fields_of(record):
+        if is_record(value):
+            for inner, column in columns_of(value).items():
+                found[f"{name}_{inner}"] = column
+        elif is_array(value) or isinstance(value, bool | int | float):
+            array = np.asarray(value)
+            if array.dtype.kind in "biufc":
+                found[name] = array, _dimensions(type(record), name, array.ndim)
+    return found
+
+
+def dataset_of(self: Any) -> "Dataset":
+    """Return this result's arrays as a data set of xarray, with their units; texts are its attributes."""
+    xarray = _needed("xarray", "xarray")
+    sizes: dict[str, int] = {}
+    variables = {}
+    for name, (array, dimensions) in columns_of(self).items():
+        names: list[str] = []
+        for dimension, size in zip(dimensions, array.shape, strict=True):
+            free = dimension not in names and sizes.setdefault(dimension, size) == size
+            names.append(dimension if free else f"{name}_{dimension}_{len(names)}")
+        # xarray keeps a name for a dimension's own coordinate
+        own = f"{name}_value" if name in names and array.ndim > 1 else name
+        variables[own] = (names, array, {"units": unit_of(name)} if unit_of(name) else {})
+    attributes = {name: value for name, value in fields_of(self) if isinstance(value, str)}
+    return xarray.Dataset(variables, attrs={"result": type(self).__name__} | attributes)
+
+
+def _frame(self: Any, rows: str) -> "DataFrame":
+    pandas = _needed("pandas", "pandas")
+    if rows:
+        records: Any = getattr(self, rows)
+        records = records() if callable(records) else records
+        if isinstance(records, Mapping):
+            plain = {name: dict(fields_of(each)) if is_record(each) else each for name, each in records.items()}
+            return pandas.DataFrame.from_dict(plain, orient="index")
+        return pandas.DataFrame(list(records))
+    columns = {name: array for name, (array, _) in columns_of(self).items()}
+    shapes = [array.shape for array in columns.values() if array.ndim]
+    shape = max(shapes, key=lambda each: (shapes.count(each), math.prod(each)), default=())
+    table = pandas.DataFrame({name: array.ravel() for name, array in columns.items() if array.shape == shape})
+    table.attrs = {name: value for name, value in fields_of(self) if isinstance(value, str | bool | int | float)}
+    if len(shape) > 1:
+        table.index = pandas.MultiIndex.from_product([range(size) for size in shape])
+    return table
+
+
+def _needed(package: str, extra: str) -> Any:
+    try:
+        return importlib.import_module(package)
+    except ModuleNotFoundError as error:
+        if error.name != package:
+            raise
+        raise ModuleNotFoundError(
+            f"this needs the package {package}: pip install 'afm-jax[{extra}]'", name=package
+        ) from error
+
+
+def _dimensions(kind: type, name: str, count: int) -> tuple[str, ...]:
+    """Return names of an array's dimensions: those of its annotation, where that has as many."""
+    annotation = _annotations(kind).get(name)
+    parts = get_args(annotation) if isinstance(annotation, types.UnionType) else (annotation,)
+    for part in parts:
+        words = getattr(part, "dim_str", "").split()
+        if len(words) == count and all(word.isidentifier() or word.isdigit() for word in words):
+            return tuple(word if word.isidentifier() else f"{name}_{word}" for word in words)
+    return tuple(f"dim_{number}" for number in range(count))
+
+
+def _annotations(kind: type) -> dict[str, Any]:
+    return {name: hint for each in kind.__mro__[::-1] for name, hint in vars(each).get("__annotations__", {}).items()}
+
+
+def _widest(record: Any) -> int:
+    return max((len(name) for name, _ in _lines(record)), default=0)
+
+
+def _lines(record: Any) -> list[tuple[str, str]]:
+    """Return names and texts of a record's fields, as many as a text may have lines."""
+    words = getattr(type(record), "_words", {})
+    lines = [(name, _in_words(value, words.get(name))) for name, value in fields_of(record)]
+    lines = [(name, text if len(text) <= _WIDTH else f"{text[: _WIDTH - 4]} ...") for name, text in lines]
+    if len(lines) < MOST_LINES:
+        return lines
+    names = ", ".join(name for name, _ in lines[MOST_LINES - 2 :])
+    return [*lines[: MOST_LINES - 2], ("and", names[:_WIDTH])]
+
+
+def _in_words(value: Any, words: type[enum.IntEnum] | None) -> str:  # noqa: PLR0911 (one return a kind of value)
+    if value is None:
+        return "none"
+    if is_abstract(value):
+        return f"{value.dtype}[{','.join(map(str, value.shape))}]"
+    if is_array(value) or isinstance(value, bool | int | float):
+        return _numbers_in_words(np.asarray(value), words)
+    if isinstance(value, str):
+        return " ".join(value.split()) or "''"
+    if is_record(value):
+        return _record_in_words(value)
+    if isinstance(value, Mapping):
+        return ", ".join(f"{key} {_in_words(item, None)}" for key, item in value.items()) or "nothing"
+    if isinstance(value, list | tuple):
+        if all(isinstance(item, str | bool | int | float) for item in value):
+            return "; ".join(_in_words(item, None) for item in value[:_SHOWN]) + _more(len(value)) or "nothing"
+        return f"{len(value)} of {type(value[0]).__name__}"
+    if isinstance(value, Path):
+        return str(value)
+    return "a function" if callable(value) else type(value).__name__
+
+
+def _record_in_words(record: Any) -> str:
+    own = dict(fields_of(record))
+    error = own.get("standard_error")
+    if "value" in own:
+        return _in_words(own["value"], None) + (f" +- {error:.2g}" if isinstance(error, float) else "")
+    if all(isinstance(item, str | bool | int | float | None) or getattr(item, "ndim", 1) == 0 for item in own.values()):
+        return f"{type(record).__name__}({', '.join(f'{name} {_in_words(item, None)}' for name, item in own.items())})"
+    return f"{type(record).__name__} of {', '.join(own)}"
+
+
+def _numbers_in_words(array: np.ndarray, words: type[enum.IntEnum] | None) -> str:
+    flat = array.ravel()
+    shape = "" if array.ndim < 2 and flat.size <= _SHOWN else f"({', '.join(map(str, array.shape))}) "
+    if words is not None:
+        return shape + _outcomes_in_words(flat, words)
+    if flat.dtype.kind not in "biufc":
+        return f"{shape}{flat.dtype}"
+    if flat.size <= _SHOWN:
+        return shape + (", ".join(map(_one, flat.tolist())) or "nothing")
+    if flat.dtype.kind == "b":
+        return f"{shape}{flat.sum()} of {flat.size} yes"
+    size = np.abs(flat) if flat.dtype.kind == "c" else flat
+    known = size[np.isfinite(size)]
+    ends = "none known" if not known.size else f"{_one(known.min().item())} to {_one(known.max().item())}"
+    unknown = flat.size - known.size
+    return f"{shape}{ends}" + (f", {unknown} not known" if unknown and known.size else "")
+
+
+def _outcomes_in_words(flat: np.ndarray, words: type[enum.IntEnum]) -> str:
+    known = {int(each) for each in words}
+    if flat.size == 1:
+        number = int(flat[0])
+        if number not in known:
+            return str(number)
+        return getattr(words(number), "sentence", words(number).name.lower().replace("_", " "))
+    numbers, counts = np.unique(flat, return_counts=True)
+    names = [words(int(n)).name.lower().replace("_", " ") if int(n) in known else str(n) for n in numbers]
+    return ", ".join(f"{count} {name}" for name, count in zip(names, counts.tolist(), strict=True)) or "nothing"
+
+
+def _one(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float) and math.isnan(value):
+        return "not known"
+    return f"{value:.6g}"
+
+
+def _more(count: int) -> str:
+    return f"; and {count - _SHOWN} more" if count > _SHOWN else ""

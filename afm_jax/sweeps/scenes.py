@@ -1,0 +1,389 @@
+"""What a sweep records of scenes: single-impact orbits, simulations, collisions, Lyapunov exponents.
+
+Orbits and collisions are one program over a block of scenes that fits the cache, a block for every local device; the
+blocks are filled up, so that there is one shape of it and no result depends on its neighbours.
+"""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.sharding import Mesh, PartitionSpec
+from jaxtyping import Array, Float, Int
+
+from afm_jax.apparatus.scene import Scene, drive_of
+from afm_jax.contact.collide import collide
+from afm_jax.contact.contact import Contact
+from afm_jax.dynamics.exponents import exponents_of_law
+from afm_jax.dynamics.iteration import LANES, leaving_tips, require_drive
+from afm_jax.dynamics.verdicts import MotionKind
+from afm_jax.impact.closure import OrbitPlace, OrbitProblem
+from afm_jax.impact.lasting_impact import LawImpact
+from afm_jax.impact.law import impact_law_of
+from afm_jax.impact.orbits import amplitudes, judge, orbit_state
+from afm_jax.impact.roots import find_roots
+from afm_jax.motion.observe import observe
+from afm_jax.motion.record import MotionOutcome
+from afm_jax.motion.settle import follow_long
+from afm_jax.motion.start import start_of
+from afm_jax.outcomes import CollisionOutcome
+from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, scene_family
+from afm_jax.scenefile.scenefile import Start, scene_of_tables
+from afm_jax.sweeps.axes import Axis
+from afm_jax.sweeps.plan import Columns, Recorder, Variable
+
+APPROACH_SPEED = "approach_speed_nm_per_us"
+"""The axis of `collide` that is no parameter of the scene."""
+SCENE_BUILDER = "afm_jax.sweeps.scenes:scene_recorder"
+_LANES = {"cpu": 1024}
+_LANES_OF_ACCELERATORS = 1 << 16
+"""Scenes of a block: what a cache holds, or what fills an accelerator."""
+_MOST_ORDERS = 100
+
+
+def scene_recorder(given: Mapping[str, Any], axes: Sequence[Axis]) -> Recorder:
+    """Return what a sweep over scenes does.
+
+    Args:
+        given: `scene` and perhaps `start`, tables as of a scene file; `record`, a table with `what` and its settings;
+            `accuracy`, a number or None.
+        axes: of the sweep.
+
+    Raises:
+        ValueError: if the scene lacks a parameter, cannot be at an end of an axis, or has no such results.
+    """
+    scene = scene_of_tables(given["scene"], "the sweep's scene")
+    record = dict(given["record"])
+    what = record.pop("what", None)
+    if what not in _RECORDERS:
+        raise ValueError(f"[record]: `what` must be one of {', '.join(_RECORDERS)}, but is {what!r}")
+    paths = {name: ends for axis in axes for name, ends in axis.ends.items() if name != APPROACH_SPEED}
+    if what != "collide" and any(APPROACH_SPEED in axis.ends for axis in axes):
+        raise ValueError(f"`{APPROACH_SPEED}` is an axis of `collide` alone")
+    check_ranges(scene, *(ParameterRange(path, low, high) for path, (low, high) in paths.items()))
+    builder, settings = _RECORDERS[what]
+    unknown = sorted(set(record) - set(settings))
+    if unknown:
+        known = f"it has {', '.join(settings)}" if settings else "it has no settings"
+        raise ValueError(f"[record]: unknown key {unknown[0]} of {what!r}; {known}")
+    start = Start(**given["start"]) if given.get("start") else None
+    if start is not None and what != "simulation":
+        raise ValueError(f"a start is of use for simulations alone: leave it out for {what!r}")
+    chosen = {key: _checked(key, record.get(key, usual), usual) for key, usual in settings.items()}
+    accuracy = given.get("accuracy")
+    if accuracy is not None and what in ("orbits", "lyapunov"):
+        raise ValueError(f"{what!r} is as accurate as 64-bit floats are: leave `accuracy` out")
+    if accuracy is not None and not (isinstance(accuracy, float) and 0.0 < accuracy < 1.0):
+        raise ValueError(f"`accuracy` must be a number between 0 and 1, but is {accuracy!r}")
+    if accuracy is not None:
+        chosen["accuracy"] = accuracy
+    if start is not None:
+        chosen["start"] = start
+    return builder(scene, tuple(paths), **chosen)
+
+
+def _checked(key: str, value: Any, usual: Any) -> Any:
+    if isinstance(usual, tuple):
+        if not (isinstance(value, (list, tuple)) and value and all(type(each) is int and each > 0 for each in value)):
+            raise ValueError(f"[record]: `{key}` must be a list of positive whole numbers, but is {value!r}")
+        if len(value) > _MOST_ORDERS or len(set(value)) < len(value):
+            raise ValueError(f"[record]: `{key}` must be at most {_MOST_ORDERS} different numbers")
+        return tuple(value)
+    wanted = int if isinstance(usual, int) else (int, float)
+    if isinstance(value, bool) or not isinstance(value, wanted) or not 0 < value < math.inf:
+        raise ValueError(f"[record]: `{key}` must be a positive {'whole ' if wanted is int else ''}number: {value!r}")
+    return value if wanted is int else float(value)
+
+
+# --- over devices -----------------------------------------------------------------------------------------------------
+
+
+def over_devices(record: Callable[..., Any], lanes: int | None = None) -> Callable[[Columns], Columns]:
+    """Return a function of columns of any length that records them block by block, a block on every local device.
+
+    Args:
+        record: from columns of one length to columns of that length, for JAX to trace.
+        lanes: rows of a block; None: as suits the devices.
+    """
+    devices = jax.local_devices()
+    lanes = lanes or _LANES.get(devices[0].platform, _LANES_OF_ACCELERATORS)
+    spread = PartitionSpec("lanes")
+    mesh = Mesh(np.array(devices), ("lanes",))
+    program = jax.jit(jax.shard_map(record, mesh=mesh, in_specs=spread, out_specs=spread, check_vma=False))
+    width = lanes * len(devices)
+
+    def work(columns: Columns) -> Columns:
+        count = len(next(iter(columns.values())))
+        parts = []
+        for first in range(0, count, width):
+            rows = {name: column[first : first + width] for name, column in columns.items()}
+            # handed out before it is asked for: the next block is prepared meanwhile
+            parts.append(program({name: _filled(column, width) for name, column in rows.items()}))
+        return {name: np.concatenate([np.asarray(part[name]) for part in parts])[:count] for name in parts[0]}
+
+    return work
+
+
+def _filled(column: np.ndarray, width: int) -> np.ndarray:
+    return np.pad(column, (0, width - len(column)), mode="edge")
+
+
+def _scenes(scene: Scene, paths: Sequence[str]) -> Callable[[Columns], Scene]:
+    """Return the function from columns of parameters to a batch of scenes, every number of one value a row."""
+    family = scene_family(scene, *paths)
+
+    def made(columns: Columns) -> Scene:
+        count = len(next(iter(columns.values())))
+        batch = jax.vmap(family)(*(columns[path] for path in paths)) if paths else scene
+        return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count,)) if leaf.ndim == 0 else leaf, batch)
+
+    return made
+
+
+# --- single-impact orbits ---------------------------------------------------------------------------------------------
+
+_ORBIT_VARIABLES = (
+    Variable("peak_amplitude_nm", "largest height above the rest position", dimensions=("order",)),
+    Variable("stable_orbits", "number of admissible stable single-impact orbits", "int8", ("order",)),
+    Variable("admissible_orbits", "number of admissible single-impact orbits", "int8", ("order",)),
+    Variable("lockin_amplitude_nm", "amplitude at the response frequency omega/N", dimensions=("order",)),
+    Variable("lockin_phase_deg", "its phase, modulo 360/N", dimensions=("order",)),
+    Variable("approach_speed_nm_per_us", "speed towards the platform before the impact", dimensions=("order",)),
+    Variable("phase_rad", "drive phase just after the impact", dimensions=("order",)),
+    Variable("velocity_after_nm_per_us", "velocity in the lab just after the impact", dimensions=("order",)),
+    Variable("largest_multiplier", "size of the larger multiplier of the map", dimensions=("order",), unit="1"),
+)
+_OF_AN_ORBIT = tuple(variable.name for variable in _ORBIT_VARIABLES if variable.dtype == "float64")
+_ORBITS_AT_ONCE = 4
+"""Blocks of roots are this many times smaller than blocks of scenes: few scenes have more than one."""
+
+
+def _orbits(scene: Scene, paths: tuple[str, ...], *, orders: tuple[int, ...]) -> Recorder:
+    """Record the stable single-impact orbits of law scenes; of several of one order the highest."""
+    require_drive(scene)
+    law = impact_law_of(scene)
+    for path in paths:
+        if path.endswith("offset_rate_nm_per_us"):
+            raise ValueError(f"under a ramp no orbit repeats: {path} cannot be an axis of 'orbits'")
+    made = _scenes(scene, paths)
+
+    def record(columns: Columns) -> dict[str, Array]:
+        scenes = made(columns)
+        found = [_orbits_of(scenes, jnp.asarray(float(order))) for order in orders]
+        return {name: jnp.stack([each[name] for each in found], axis=1) for name in found[0]}
+
+    points = 4096 if law.delay else 65536
+    return Recorder(_ORBIT_VARIABLES, over_devices(record), points, {"order": [float(order) for order in orders]})
+
+
+@jax.jit
+def _orbits_of(scenes: Scene, order: Float[Array, ""]) -> dict[str, Array]:
+    """Return what is recorded of a block of scenes at one order."""
+
+    def problem_of(scene: Scene) -> OrbitProblem:
+        return OrbitProblem(scene.cantilever, scene.platform, LawImpact(impact_law_of(scene)), order)
+
+    def orbit_at(place: OrbitPlace, row: Int[Array, ""]) -> tuple[Array, Array, Array]:
+        problem = problem_of(jax.tree.map(lambda leaf: leaf[row], scenes))
+        state = orbit_state(place, problem)
+        verdict = judge(place, jnp.ones((), bool), state, problem)
+        peak, lockin, angle = amplitudes(place, problem)
+        half, determinant = 0.5 * jnp.abs(verdict.trace), verdict.determinant
+        inside = half**2 - determinant
+        # a pair on a circle has the root of the determinant for its size
+        pair = jnp.sqrt(jnp.abs(determinant))
+        size = jnp.where(inside > 0.0, half + jnp.sqrt(jnp.where(inside > 0.0, inside, 1.0)), pair)
+        numbers = [peak, lockin, angle, state.speeds.approach, state.phase, state.flight.start_velocity, size]
+        return verdict.admissible, verdict.admissible & verdict.stable, jnp.stack(numbers)
+
+    roots = jax.vmap(lambda scene: find_roots(problem_of(scene)))(scenes)
+    count, slots = roots.found.shape
+    places = jax.tree.map(lambda part: part.ravel(), roots.place)
+    rows = jnp.arange(count * slots) // slots
+    nothing = (jnp.zeros(count * slots, bool),) * 2 + (jnp.full((count * slots, len(_OF_AN_ORBIT)), jnp.nan),)
+    few = max(count // _ORBITS_AT_ONCE, 1)
+    known = _for_those(orbit_at, roots.found.ravel(), (places, rows), nothing, few=few)
+    admissible, steady, numbers = (part.reshape(count, slots, *part.shape[1:]) for part in known)
+    highest = jnp.argmax(jnp.where(steady, numbers[..., 0], -jnp.inf), axis=1)
+    chosen = jnp.take_along_axis(numbers, highest[:, None, None], axis=1)[:, 0]
+    chosen = jnp.where(steady.any(axis=1)[:, None], chosen, jnp.nan)
+    counts = {
+        "stable_orbits": steady.sum(axis=1, dtype=jnp.int8),
+        "admissible_orbits": admissible.sum(axis=1, dtype=jnp.int8),
+    }
+    return counts | {name: chosen[:, column] for column, name in enumerate(_OF_AN_ORBIT)}
+
+
+def _for_those(work: Callable[..., Any], needed: Array, arguments: tuple[Any, ...], results: Any, *, few: int) -> Any:
+    """Return results with those of work on the rows that need it: gathered, some at a time, a loop for all."""
+    rows = needed.shape[0]
+
+    def some(state):
+        left, found = state
+        chosen = jnp.nonzero(left, size=few, fill_value=rows)[0]
+        new = jax.vmap(work)(*jax.tree.map(lambda leaf: leaf.at[chosen].get(mode="clip"), arguments))
+        found = jax.tree.map(lambda old, part: old.at[chosen].set(part, mode="drop"), found, new)
+        return left.at[chosen].set(False, mode="drop"), found
+
+    return lax.while_loop(lambda state: jnp.any(state[0]), some, (needed, results))[1]
+
+
+# --- collisions -------------------------------------------------------------------------------------------------------
+
+_COLLISION_VARIABLES = (
+    Variable("rebound_speed_nm_per_us", "speed away from the sample; 0 where the tip is captured"),
+    Variable("collision_delay_us", "time between the crossings of gap 0 by the straight paths in and out"),
+    Variable("captured", "the tip stays at the sample", "bool"),
+    Variable("outcome", "how the collision ended", "int8", flags={o.value: o.name.lower() for o in CollisionOutcome}),
+    Variable("time_in_contact_us", "from the formation of the bridge to its breaking"),
+    Variable("time_in_junction_us", "with the solids joined"),
+    Variable("deepest_gap_nm", "smallest gap"),
+    Variable("bridge_hysteresis_aj", "energy that the bridge takes"),
+    Variable("junction_hysteresis_aj", "energy that the junction takes"),
+    Variable("viscous_loss_aj", "energy that viscosity takes"),
+)
+
+
+def _collisions(
+    scene: Scene, paths: tuple[str, ...], *, approach_speed_nm_per_us: float, accuracy: float = 1e-9
+) -> Recorder:
+    """Record collisions of free tips with the contacts of scenes."""
+    if not isinstance(scene.interaction, Contact):
+        raise TypeError("'collide' is about a resolved contact: the scene needs model = \"contact\"")
+    made = _scenes(scene, paths)
+
+    def record(columns: Columns) -> dict[str, Array]:
+        count = len(next(iter(columns.values())))
+        speeds = jnp.broadcast_to(columns.get(APPROACH_SPEED, approach_speed_nm_per_us), (count,))
+        scenes = made(columns)
+        found = collide(scenes.interaction, speeds, scenes.cantilever.mass_ng, accuracy=accuracy)
+        trusted = found.outcome <= CollisionOutcome.CAPTURED_BY_JUNCTION
+
+        def known(variable: Variable) -> Array:
+            part = getattr(found, variable.name)
+            return jnp.where(trusted, part, jnp.nan) if variable.dtype == "float64" else part
+
+        return {variable.name: known(variable) for variable in _COLLISION_VARIABLES}
+
+    return Recorder(_COLLISION_VARIABLES, over_devices(record), 16384)
+
+
+# --- Lyapunov exponents -----------------------------------------------------------------------------------------------
+
+_EXPONENTS = ("exponents_per_impact", "exponents_per_us", "exponents_per_impact_error", "exponents_per_us_error")
+_EXPONENT_VARIABLES = (
+    Variable("exponents_per_impact", "Lyapunov exponents, larger first", dimensions=("exponent",), unit="1"),
+    Variable("exponents_per_us", "the same in time", dimensions=("exponent",)),
+    Variable("exponents_per_impact_error", "their standard errors", dimensions=("exponent",), unit="1"),
+    Variable("exponents_per_us_error", "their standard errors", dimensions=("exponent",)),
+    Variable("impacts", "how many the means are over", "int64"),
+    Variable("kind", "what the motion has come to", "int8", flags={k.value: k.name.lower() for k in MotionKind}),
+    Variable("orbit_impacts", "impacts of the orbit, 0 where there is none", "int32"),
+    Variable("orbit_periods", "drive periods of the orbit, 0 where there is none", "int32"),
+)
+
+
+def _lyapunov(scene: Scene, paths: tuple[str, ...], *, impacts: int, transient: int) -> Recorder:
+    """Record the exponents of motions of law scenes that begin by leaving the platform upward."""
+    require_drive(scene)
+    impact_law_of(scene)
+    made = jax.jit(_scenes(scene, paths))
+
+    def work(columns: Columns) -> Columns:
+        count = len(next(iter(columns.values())))
+        width = LANES * -(-count // LANES)
+        scenes = made({name: jnp.asarray(_filled(column, width)) for name, column in columns.items()})
+        found = exponents_of_law(scenes, leaving_tips(scenes), impacts=impacts, transient=transient)
+        verdicts = found.verdicts
+        known = {name: getattr(found, name) for name in (*_EXPONENTS, "impacts")}
+        known |= {"kind": verdicts.kind, "orbit_impacts": verdicts.impacts, "orbit_periods": verdicts.periods}
+        return {name: np.asarray(part)[:count] for name, part in known.items()}
+
+    return Recorder(_EXPONENT_VARIABLES, work, 4 * LANES, {"exponent": [1.0, 2.0]})
+
+
+# --- simulations ------------------------------------------------------------------------------------------------------
+
+_OBSERVED = {
+    "peak_amplitude_nm": "largest height above the rest position",
+    "lockin_amplitude_nm": "amplitude at the response frequency omega/N",
+    "lockin_phase_deg": "its phase, modulo 360/N",
+    "mean_height_nm": "mean height",
+    "contact_share": "share of time in contact",
+    "time_in_contact_us": "per response period",
+    "peak_force_nn": "largest force on the tip; only a resolved contact has one",
+    "most_attractive_force_nn": "most attractive force on the tip; only a resolved contact has one",
+    "dissipated_in_contact_aj": "energy lost to the sample per drive period",
+    "dissipated_in_air_aj": "energy lost to the air per drive period",
+    "given_by_drives_aj": "energy given by the drives per drive period",
+    "virial_aj": "mean of force times height",
+    "peak_deflection_nm": "largest deflection against a moving base",
+}
+_REFUSED = -1
+_SIMULATION_VARIABLES = (
+    *(Variable(name, meaning) for name, meaning in _OBSERVED.items()),
+    Variable("settled", "the motion repeats", "bool"),
+    Variable("stuck", "the sample holds the tip", "bool"),
+    Variable("order", "drive periods of a repetition, 0 where nothing repeats", "int32"),
+    Variable("contacts_per_response", "contacts of a repetition, 0 where nothing repeats", "int32"),
+    Variable("impacts", "contacts in all", "int64"),
+    Variable(
+        "outcome",
+        "how the simulation ended",
+        "int8",
+        flags={_REFUSED: "not_possible"} | {o.value: o.name.lower() for o in MotionOutcome},
+    ),
+)
+
+
+def _simulation(
+    scene: Scene, paths: tuple[str, ...], *, periods: float, accuracy: float = 1e-9, start: Start | None = None
+) -> Recorder:
+    """Record what an experiment reads of scenes in time, followed until they settle or for some drive periods."""
+    family = scene_family(scene, *paths)
+
+    def work(columns: Columns) -> Columns:
+        rows = zip(*(columns[path] for path in paths), strict=True)
+        seen = [_seen(family(*row), periods, accuracy, start) for row in rows]
+        return {variable.name: np.array([each[variable.name] for each in seen]) for variable in _SIMULATION_VARIABLES}
+
+    return Recorder(_SIMULATION_VARIABLES, work, 16, alone=True)
+
+
+def _seen(scene: Scene, periods: float, accuracy: float, start: Start | None) -> dict[str, Any]:
+    """Return what is recorded of one scene; NaN where nothing is known, and of a motion that cannot be."""
+    nothing = dict.fromkeys(_OBSERVED, math.nan) | dict.fromkeys(("settled", "stuck"), False)
+    nothing |= dict.fromkeys(("order", "contacts_per_response", "impacts"), 0)
+    try:
+        longest = periods * drive_of(scene).period_us
+        run = follow_long(scene, start_of(scene, start), longest, until_settled=True, accuracy=accuracy)
+    except ValueError:
+        return nothing | {"outcome": _REFUSED}
+    found, verdict = run.simulation, run.verdict
+    outcome = MotionOutcome(int(found.outcome))
+    told = {
+        "settled": verdict.settled,
+        "stuck": verdict.stuck,
+        "order": verdict.periods or 0,
+        "contacts_per_response": verdict.contacts or 0,
+        "impacts": int(found.count),
+        "outcome": int(outcome),
+    }
+    if outcome not in (MotionOutcome.FINISHED, MotionOutcome.HELD):
+        return nothing | told
+    seen = observe(scene, found, verdict=verdict)
+    values = {name: getattr(seen, name) for name in _OBSERVED}
+    return {name: math.nan if value is None else value for name, value in values.items()} | told
+
+
+_RECORDERS: dict[str, tuple[Callable[..., Recorder], dict[str, Any]]] = {
+    "orbits": (_orbits, {"orders": (1,)}),
+    "collide": (_collisions, {APPROACH_SPEED: 30.0}),
+    "lyapunov": (_lyapunov, {"impacts": 2000, "transient": 500}),
+    "simulation": (_simulation, {"periods": 2000.0}),
+}
+"""What can be recorded of scenes, each with its settings and their usual values."""

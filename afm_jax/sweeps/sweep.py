@@ -1,0 +1,308 @@
+"""`sweep`: many scenes, or many fits, in one call that goes on where an earlier one was broken off."""
+
+import contextlib
+import itertools
+import json
+import os
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from afm_jax.apparatus.scene import Scene
+from afm_jax.checks import require_float64
+from afm_jax.scenefile.scenefile import Start, scene_tables
+from afm_jax.sweeps.plan import Columns, SweepPlan, compute_chunk, plan_of
+from afm_jax.sweeps.scenes import SCENE_BUILDER
+from afm_jax.sweeps.store import STORE, Kept, locked, open_store
+
+if TYPE_CHECKING:
+    import xarray
+    from distributed import Client
+
+_IN_FLIGHT = 2
+"""Chunks handed out for every worker: it has the next one when it has done one."""
+_RETRIES = 3
+_SECONDS_TO_ANSWER, _SECONDS_TO_START = 30, 600
+"""Of a scheduler, and of its first worker, which may wait in a queue."""
+_TRIALS_S = 2.0
+"""How long chunks are computed to plan by."""
+
+Progress = Callable[[int, int, float], object]
+"""Told how many of how many points are done, and how many a second since the start."""
+
+
+class SweepRun(NamedTuple):
+    """What a run over a sweep did."""
+
+    chunks: int
+    kept: Kept
+    """What was there before."""
+    computed: int
+    """Chunks that were computed now."""
+    seconds: float
+
+
+def sweep(  # noqa: PLR0913
+    scene: Scene,
+    axes: Sequence[Mapping[str, Any]],
+    record: str | Mapping[str, Any],
+    *,
+    out: str | os.PathLike[str] | None = None,
+    accuracy: float | None = None,
+    start: Start | None = None,
+    chunk: int | None = None,
+    workers: int = 1,
+    scheduler: str | None = None,
+    report: Progress | None = None,
+) -> "xarray.Dataset":
+    """Return what is recorded of a scene over a grid of its parameters.
+
+    Args:
+        scene: one scene.
+        axes: of the grid, tables as in a sweep file: {"parameter": "interaction.r", "linear": [0.5, 0.9, 100]}, "log"
+            likewise, "list" with values; or {"random": {"interaction.r": [0.5, 0.9]}, "count": 100, "seed": 1}, and
+            "latin_hypercube" likewise. Parameters are paths of the scene file.
+        record: "orbits", "collide", "lyapunov" or "simulation", or a table with that as `what` and settings.
+        out: folder of the results: chunks that are done there are kept; None: nothing is kept on the disk.
+        accuracy: of resolved contacts.
+        start: of simulations; None: `default_start` of each.
+        chunk: points that are computed, kept and handed out together; None: as suits what is recorded.
+        workers: processes; above 1 a local Dask cluster is started, which needs the extra `sweep`, and a script that
+            calls this below `if __name__ == "__main__":`.
+        scheduler: address of a Dask scheduler whose workers do the work, "tcp://...".
+        report: told how far it is.
+
+    Returns:
+        The results with a coordinate for every parameter, units, and the whole input as attributes; from a folder they
+        are read when they are used.
+
+    Raises:
+        ModuleNotFoundError: if xarray or Zarr, or for several workers Dask, is not installed (extra `sweep`).
+        OSError: if the disk is full; what is done is kept.
+        RuntimeError: if JAX is not set to 64-bit floats, or workers fail again and again.
+        ValueError: if the input is impossible, or the folder holds another sweep or is being written to.
+    """
+    require_float64(scene)
+    settings = {"what": record} if isinstance(record, str) else dict(record)
+    given = {
+        "builder": SCENE_BUILDER,
+        "scene": scene_tables(scene),
+        "start": None if start is None else start._asdict(),
+        "axes": [dict(axis) for axis in axes],
+        "record": settings,
+        "accuracy": accuracy,
+        "chunk": chunk,
+    }
+    return dataset_of(plan_of(given), out, workers=workers, scheduler=scheduler, report=report)
+
+
+def dataset_of(
+    plan: SweepPlan,
+    out: str | os.PathLike[str] | None,
+    *,
+    workers: int = 1,
+    scheduler: str | None = None,
+    report: Progress | None = None,
+) -> "xarray.Dataset":
+    """Return the results of a plan; arguments as of `sweep`."""
+    import xarray  # noqa: PLC0415
+
+    with contextlib.ExitStack() as stack:
+        folder = Path(out if out is not None else stack.enter_context(tempfile.TemporaryDirectory()))
+        run_plan(plan, folder, workers=workers, scheduler=scheduler, report=report)
+        found = xarray.open_zarr(str(folder / STORE))
+        return found if out is not None else found.load()
+
+
+def run_plan(
+    plan: SweepPlan,
+    folder: Path,
+    *,
+    workers: int = 1,
+    scheduler: str | None = None,
+    report: Progress | None = None,
+) -> SweepRun:
+    """Compute what a folder does not hold yet of a sweep; arguments and errors as of `sweep`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    begin = time.monotonic()
+    kept, computed, first = Kept(frozenset(), frozenset()), 0, 0.0
+    try:
+        with locked(folder):
+            store = open_store(folder, plan)
+            kept = store.kept()
+            missing = [chunk for chunk in range(plan.chunks) if chunk not in kept.done]
+            # the last chunks of axes may be smaller, which only a guess of the time left would notice
+            share = plan.points / plan.chunks
+            for chunk, results in computing(plan, missing, workers=workers, scheduler=scheduler):
+                store.write(chunk, results)
+                computed += 1
+                passed = time.monotonic() - begin
+                if computed == 1:
+                    # it waited for programs to be compiled, the others do not
+                    first = passed
+                elif report is not None:
+                    rate = (computed - 1) * share / (passed - first)
+                    report(round((len(kept.done) + computed) * share), plan.points, rate)
+    except OSError as error:
+        count = len(kept.done) + computed
+        what = f"{error.strerror or error}: {count} of {plan.chunks} chunks are kept; mend that"
+        raise OSError(error.errno, f"{what}, and give the same command again", str(folder)) from error
+    return SweepRun(plan.chunks, kept, computed, time.monotonic() - begin)
+
+
+def computing(
+    plan: SweepPlan, chunks: Sequence[int], *, workers: int, scheduler: str | None
+) -> Iterator[tuple[int, Columns]]:
+    """Give chunks with their results, in any order."""
+    if not chunks:
+        return
+    if workers <= 1 and scheduler is None:
+        for chunk in chunks:
+            yield chunk, plan.compute(chunk)
+        return
+    with _client(min(workers, len(chunks)), scheduler) as client:
+        yield from _handed_out(client, plan, chunks)
+
+
+def _handed_out(client: "Client", plan: SweepPlan, chunks: Iterable[int]) -> Iterator[tuple[int, Columns]]:
+    """Give chunks with their results as workers have done them; no more are under way than keep them busy."""
+    from distributed import KilledWorker, as_completed  # noqa: PLC0415
+
+    text = json.dumps(plan.given)
+    waiting = iter(chunks)
+    token = os.urandom(8).hex()
+
+    def submit(chunk: int) -> Any:
+        return client.submit(compute_chunk, text, chunk, key=f"sweep-{token}-{chunk}", retries=_RETRIES, pure=False)
+
+    numbers: dict[str, int] = {}
+    under_way = as_completed()
+
+    def fill() -> None:
+        # workers may come and go
+        for chunk in itertools.islice(waiting, max(_IN_FLIGHT * _threads(client) - len(numbers), 1)):
+            future = submit(chunk)
+            numbers[future.key] = chunk
+            under_way.add(future)
+
+    fill()
+    for future in under_way:
+        try:
+            results = future.result()
+        except KilledWorker as error:
+            raise RuntimeError(
+                f"chunk {numbers[future.key]} has killed every worker that was given it (out of memory?)"
+            ) from error
+        yield numbers.pop(future.key), results
+        fill()
+
+
+def _threads(client: "Client") -> int:
+    found: Any = client.ncores()
+    return sum(found.values())
+
+
+@contextlib.contextmanager
+def _client(workers: int, scheduler: str | None) -> "Iterator[Client]":
+    """Give a client of a scheduler, or of a cluster of local processes of its own."""
+    from distributed import Client  # noqa: PLC0415
+
+    if scheduler is not None:
+        try:
+            client = Client(scheduler, timeout=_SECONDS_TO_ANSWER)
+        except (OSError, ValueError) as error:
+            raise ValueError(f"{scheduler}: no Dask scheduler answers there ({error})") from error
+        with client:
+            try:
+                client.wait_for_workers(1, timeout=_SECONDS_TO_START)
+            except TimeoutError as error:
+                raise ValueError(f"{scheduler}: has no workers; start some: dask worker {scheduler}") from error
+            yield client
+        return
+    with local_cluster(workers) as cluster, Client(cluster) as client:
+        yield client
+
+
+@contextlib.contextmanager
+def local_cluster(workers: int) -> "Iterator[Any]":
+    """Give a Dask cluster of processes of this machine, spawned, each with one device and without a dashboard."""
+    import logging  # noqa: PLC0415
+
+    from dask import config  # noqa: PLC0415
+    from distributed import LocalCluster  # noqa: PLC0415
+
+    flags = os.environ.get("XLA_FLAGS", "").split()
+    settings: dict[str, Any] = {
+        "n_workers": workers,
+        "threads_per_worker": 1,
+        "processes": True,
+        "memory_limit": None,
+        "dashboard_address": None,
+        "silence_logs": logging.CRITICAL,
+        "env": {"XLA_FLAGS": " ".join(flag for flag in flags if "host_platform_device_count" not in flag)},
+    }
+    with (
+        tempfile.TemporaryDirectory() as scratch,
+        config.set({"distributed.worker.multiprocessing-method": "spawn"}),
+        LocalCluster(**settings, local_directory=scratch) as cluster,
+    ):
+        yield cluster
+
+
+class Estimate(NamedTuple):
+    """What a sweep would take, from chunks that were computed and written to be thrown away."""
+
+    points: int
+    chunks: int
+    chunk_points: int
+    sampled_points: int
+    seconds_a_point: float
+    """In this process, on all its devices."""
+    seconds: float
+    disk_bytes: float
+    memory_bytes: int
+    """Most that this process has had so far: it does not grow with the points."""
+
+
+def estimate(plan: SweepPlan) -> Estimate:
+    """Return what a plan would take, measured on one chunk from its middle, twice: the first time compiles."""
+    middle = plan.chunks // 2
+    sampled = int(np.prod([part.stop - part.start for part in plan.region(middle)]))
+    first = plan.compute(middle)
+    begin, rounds = time.perf_counter(), 0
+    while rounds == 0 or time.perf_counter() - begin < _TRIALS_S:
+        plan.compute((middle + rounds) % plan.chunks)
+        rounds += 1
+    seconds = (time.perf_counter() - begin) / (rounds * sampled)
+    with tempfile.TemporaryDirectory() as folder:
+        store = open_store(Path(folder), plan, coordinates=False)
+        store.write(middle, first)
+        size = store.size_of(middle)
+        rest = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file()) - size
+    rest += sum(8 * axis.size * len(axis.columns) for axis in plan.axes)
+    return Estimate(
+        points=plan.points,
+        chunks=plan.chunks,
+        chunk_points=int(np.prod(plan.block)),
+        sampled_points=rounds * sampled,
+        seconds_a_point=seconds,
+        seconds=seconds * plan.points,
+        disk_bytes=size * plan.points / sampled + rest,
+        memory_bytes=peak_memory(),
+    )
+
+
+def peak_memory() -> int:
+    """Return the most memory that this process has had, in bytes; 0 where that is not known."""
+    try:
+        import resource  # noqa: PLC0415
+    except ModuleNotFoundError:
+        return 0
+    import sys  # noqa: PLC0415
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak

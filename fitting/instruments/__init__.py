@@ -1,0 +1,1 @@
+"""Curves and spectra as instruments store them."""

@@ -1,0 +1,642 @@
+"""Amplitude-phase-distance curves out of instruments' files: one result, whatever the format, with the origin of each.
+
+What a file calls its channels, which way its heights run, in which units and with which zero of the phase differs from
+instrument to instrument. Here it becomes `offset_nm` (height of the sample over the cantilever's rest position, growing
+towards the tip), `lockin_amplitude_nm`, `phase_lag_deg` (behind the drive) and a branch; what was assumed on the way is
+said, what is missing is asked for by the option that gives it.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from afm_jax.strict_json import plain
+from fitting.instruments.branch import JUMP, BranchLook, look_at
+from fitting.instruments.formats import read_recording
+from fitting.instruments.recording import UNITS, Known, Recording, Segment, unit_named
+from fitting.tables.csv_text import NUMBER, TableError
+
+FORMAT_VERSION = 1
+ROLES = {
+    "offset_nm": (("length",), ("offset.*", "z-axis sensor", "zsnsr", "z", "z rel", "z-axis", "height.*", "lvdt")),
+    "lockin_amplitude_nm": (
+        ("length", "voltage"),
+        ("lockin_amplitude.*", "m1a", r"amp(litude)?(_\w+)?", r"amp(litude)?\b.*"),
+    ),
+    "phase_lag_deg": (("angle",), ("phase_lag.*", "m1p", "phase?(_.*)?", r"phase\b.*")),
+    "deflection_nm": (("length", "voltage", "force"), ("defl.*", "normal force")),
+}
+"""What a channel can be: the quantities it may measure, and the names it goes by, likeliest first (no case)."""
+OPTIONS = {
+    "drive_frequency_khz": "kHz",
+    "free_frequency_khz": "kHz",
+    "quality_factor": "",
+    "spring_constant_n_per_m": "N/m",
+    "free_amplitude_nm": "nm",
+    "nm_per_volt": "nm/V",
+    "offset_origin_nm": "nm",
+    "amplitude_error_nm": "nm",
+    "phase_error_deg": "deg",
+}
+"""Numbers that the caller may give in place of the file's; each is an option of `afm-jax read` with dashes."""
+_NEEDED = {
+    "drive_frequency_khz": "KHZ",
+    "free_frequency_khz": "KHZ",
+    "free_amplitude_nm": "NM",
+    "nm_per_volt": "NM_PER_V|slope",
+}
+_WANTED = {"quality_factor": "Q", "spring_constant_n_per_m": "N_PER_M"}
+
+
+@dataclass(frozen=True)
+class ColumnSource:
+    """Where a column of the table comes from: a channel, its unit if the file's is wrong or missing, a factor."""
+
+    channel: str
+    unit: str = ""
+    factor: float = 1.0
+
+
+def parse_columns(text: str) -> dict[str, ColumnSource]:
+    """Return a column map: `column=CHANNEL[:UNIT][:FACTOR]`, separated by commas.
+
+    >>> parse_columns("offset_nm=Z:um:-1,lockin_amplitude_nm=Amp:0.5")["offset_nm"]
+    ColumnSource(channel='Z', unit='um', factor=-1.0)
+
+    Raises:
+        ValueError: if a part is none, with an example.
+    """
+    found = {}
+    for part in text.split(","):
+        column, sign, source = (piece.strip() for piece in part.partition("="))
+        channel, *rest = (piece.strip() for piece in source.split(":"))
+        units = [unit_named(piece) for piece in rest if not NUMBER.fullmatch(piece)]
+        factors = [float(piece) for piece in rest if NUMBER.fullmatch(piece)]
+        if not sign or not channel or len(units) > 1 or len(factors) > 1 or 0.0 in factors:
+            raise ValueError(f"`{part.strip()}` is no COLUMN=CHANNEL[:UNIT][:FACTOR]; write offset_nm=Z:um:-1")
+        if column not in ROLES:
+            raise ValueError(f"there is no column `{column}`; it is one of {', '.join(ROLES)}")
+        if units and UNITS.get(units[0], ("",))[0] not in ROLES[column][0]:
+            known = ", ".join(unit for unit, (what, _) in UNITS.items() if what in ROLES[column][0])
+            raise ValueError(f"`{units[0]}` is no unit of {column}; write one of {known}")
+        found[column] = ColumnSource(channel, units[0] if units else "", factors[0] if factors else 1.0)
+    return found
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class MeasuredCurve:
+    """One curve of a file, approach and retract together; the arrays have the shape (rows,).
+
+    Attributes:
+        source: path of the file.
+        format: of the file.
+        curve: which of the file's curves, from 1.
+        curves: how many the file holds.
+        branch: "approach" or "retract" of each row.
+        offset_nm: height of the sample over the rest position; relative if there is no `offset_origin_nm` in `known`.
+        amplitude: lock-in amplitude in `amplitude_unit`, or None.
+        amplitude_unit: "nm", or "V" where the sensitivity is not known.
+        phase_lag_deg: lag behind the drive, or None.
+        deflection: mean deflection in `deflection_unit`, or None.
+        deflection_unit: "nm", "V" or "nN".
+        free: rows of the free tip.
+        slope: change of the amplitude per nm of height in contact, in `amplitude_unit`, and its error; or None.
+        known: what is known of the measurement, with unit and origin.
+        missing: options that would give what a table needs.
+        notes: what was assumed, and traps.
+        reasons: why the curve must not be used; empty if it may.
+    """
+
+    source: str
+    format: str
+    curve: int
+    curves: int
+    branch: np.ndarray
+    offset_nm: Float[np.ndarray, " rows"]
+    amplitude: Float[np.ndarray, " rows"] | None = None
+    amplitude_unit: str = "nm"
+    phase_lag_deg: Float[np.ndarray, " rows"] | None = None
+    deflection: Float[np.ndarray, " rows"] | None = None
+    deflection_unit: str = "nm"
+    free: Bool[np.ndarray, " rows"]
+    slope: tuple[float, float] | None = None
+    known: dict[str, Known] = field(default_factory=dict)
+    missing: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    reasons: tuple[str, ...] = ()
+
+    @property
+    def valid(self) -> bool:
+        """Whether the curve may be used."""
+        return not self.reasons
+
+    def number(self, key: str) -> float | None:
+        """Return a known number, None where it is not known."""
+        found = self.known.get(key)
+        return None if found is None or isinstance(found.value, str) else found.value
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return everything as plain lists, numbers and strings; what is not known is None."""
+        own = {name: value for name, value in vars(self).items() if name != "known"}
+        return plain(own | {"valid": self.valid, "known": {key: vars(one) for key, one in self.known.items()}})
+
+
+def read_curve(path: str | Path, *, curve: int = 1, **options: Any) -> MeasuredCurve:
+    """Read one curve of an instrument's file.
+
+    Args:
+        path: neaSNOM text, WSxM curves, Asylum .ibw, NanoSurf .nid, Nanonis .dat, Gwyddion .gwy, or separated text.
+        curve: which curve of the file, from 1.
+        options: as of `read_curves`.
+
+    Raises:
+        TableError: as `read_curves`, or if the file has no such curve.
+    """
+    curves = read_curves(path, **options)
+    found = next((one for one in curves if one.curve == curve), None)
+    if found is None:
+        raise TableError(f"{path}: there is no curve {curve}; the file holds {', '.join(str(c.curve) for c in curves)}")
+    return found
+
+
+def read_curves(
+    path: str | Path,
+    *,
+    columns: str | Mapping[str, ColumnSource] = "",
+    drive: str | None = None,
+    **numbers: Any,
+) -> list[MeasuredCurve]:
+    """Read every curve of an instrument's file.
+
+    Args:
+        path: the file; its format is recognised by its content.
+        columns: which channel becomes which column, as `parse_columns` takes it or returns it, where names and units
+            do not tell.
+        drive: "base" (dither piezo) or "force" (photothermal, magnetic); None: taken as "base", and said.
+        numbers: what the file does not say, or says wrongly: the keys of `OPTIONS`, each a number or a pair with its
+            standard error; `nm_per_volt="slope"` takes the sensitivity from the curve's own slope.
+
+    Raises:
+        TableError: one line: the file is damaged, holds no such curve, or a channel is missing.
+        ValueError: if an option is impossible.
+    """
+    if drive not in {None, "base", "force"}:
+        raise ValueError(f"`drive` must be base or force, but is {drive!r}")
+    given = {key: _given(key, value) for key, value in numbers.items() if value is not None}
+    wanted = parse_columns(columns) if isinstance(columns, str) and columns else dict(columns or {})
+    recording = read_recording(path)
+    _refuse_others(recording)
+    known = dict(recording.known)
+    known["drive"] = Known(drive, "", "option --drive") if drive else Known("base", "", _ASSUMED_BASE)
+    known |= {key: one for key, one in given.items() if one.value != "slope"}
+    of_slope = "nm_per_volt" in given and given["nm_per_volt"].value == "slope"
+    places = list(dict.fromkeys(segment.curve for segment in recording.segments))
+    curves = []
+    for place in places:
+        segments = [segment for segment in recording.segments if segment.curve == place]
+        curve = _joined(recording, segments, wanted, known, len(places))
+        curves.append(_judged(curve, of_slope=of_slope))
+    return curves
+
+
+_ASSUMED_BASE = "assumed: shaken at its base by a piezo; --drive force for a photothermal or magnetic drive"
+
+
+def _given(key: str, value: Any) -> Known:
+    """Return an option as something known.
+
+    Raises:
+        ValueError: if there is none of this name, or its value is impossible.
+    """
+    if key not in OPTIONS:
+        raise TypeError(f"there is no option `{key}`; it is one of {', '.join(OPTIONS)}")
+    origin = f"option --{key.replace('_', '-')}"
+    if value == "slope" and key == "nm_per_volt":
+        return Known("slope", "", origin)
+    number, error = value if isinstance(value, tuple) else (float(value), None)
+    if not np.isfinite(number) or (key != "offset_origin_nm" and number <= 0.0) or not (error is None or error > 0.0):
+        raise ValueError(f"`{key}` must be finite and above 0, but is {value!r}")
+    return Known(float(number), OPTIONS[key], origin, error)
+
+
+def _refuse_others(recording: Recording) -> None:
+    kinds = {UNITS.get(unit, ("",))[0] for unit in recording.units.values()}
+    if {"spectrum", "voltage spectrum"} & kinds:
+        raise TableError(f"{recording.source}: holds a thermal spectrum, not a curve; `afm-jax calibrate` fits it")
+    if any(name.startswith(("Frequency Shift", "Frequency")) for name in recording.channels):
+        raise TableError(f"{recording.source}: holds a resonance sweep, not a curve; `afm-jax calibrate` fits it")
+
+
+def _joined(
+    recording: Recording,
+    segments: list[Segment],
+    wanted: Mapping[str, ColumnSource],
+    known: dict[str, Known],
+    curves: int,
+) -> MeasuredCurve:
+    """Return the segments of one curve as one, in the table's quantities."""
+    notes = list(recording.remarks)
+    sources = {role: _source(recording, segments[0], role, wanted, notes) for role in ROLES}
+    if sources["offset_nm"] is None:
+        channels = ", ".join(recording.channels)
+        raise TableError(
+            f"{recording.source}: no height among the channels {channels}; say --columns offset_nm=CHANNEL:UNIT"
+        )
+    parts: dict[str, list[Any]] = {role: [] for role in ROLES}
+    branches: list[str] = []
+    for segment in segments:
+        for role, source in sources.items():
+            if source is not None:
+                numbers = segment.channels.get(source.channel)
+                if numbers is None:
+                    where = f"{recording.source}, curve {segment.curve}"
+                    raise TableError(f"{where}: the {segment.branch} has no channel {source.channel}")
+                parts[role].append(_converted(recording, segment, source, role))
+        branches += _branches(segment.branch, parts["offset_nm"][-1])
+    columns = {role: np.concatenate(numbers) for role, numbers in parts.items() if numbers}
+    units = {
+        role: UNITS[source.unit][0] for role, source in sources.items() if source is not None and source.unit in UNITS
+    }
+    amplitude = columns.get("lockin_amplitude_nm")
+    if amplitude is not None and amplitude[np.argmax(np.abs(amplitude))] < 0.0:
+        amplitude = -amplitude
+        notes.append("Sign: the amplitude is negative (an inverted channel) and was taken with the opposite sign.")
+    scales = {"length": "nm", "voltage": "V", "force": "nN"}
+    return MeasuredCurve(
+        source=recording.source,
+        format=recording.format,
+        curve=segments[0].curve,
+        curves=curves,
+        branch=np.array(branches),
+        offset_nm=columns["offset_nm"],
+        amplitude=amplitude,
+        amplitude_unit=scales[units.get("lockin_amplitude_nm", "length")],
+        phase_lag_deg=columns.get("phase_lag_deg"),
+        deflection=columns.get("deflection_nm"),
+        deflection_unit=scales[units.get("deflection_nm", "length")],
+        free=np.zeros(len(branches), dtype=bool),
+        known=dict(known),
+        notes=tuple(notes),
+    )
+
+
+def _source(
+    recording: Recording, segment: Segment, role: str, wanted: Mapping[str, ColumnSource], notes: list[str]
+) -> ColumnSource | None:
+    """Return the channel that becomes a column, with its unit; notes say what was assumed."""
+    names = list(segment.channels)
+    quantities, patterns = ROLES[role]
+    source = wanted.get(role)
+    if source is not None and source.channel not in names:
+        raise TableError(
+            f"{recording.source}: there is no channel `{source.channel}` for {role}; it has {', '.join(names)}"
+        )
+    if source is None:
+        taken = {other.channel for other in wanted.values()}
+        ranked = [
+            name for pattern in patterns for name in names if re.fullmatch(pattern, name, re.IGNORECASE | re.DOTALL)
+        ]
+        fitting = [
+            n for n in ranked if n not in taken and UNITS.get(recording.units.get(n, ""), ("",))[0] in quantities
+        ]
+        unitless = [n for n in ranked if n not in taken and not recording.units.get(n, "")]
+        if not (fitting or unitless):
+            return None
+        name = (fitting or unitless)[0]
+        source = ColumnSource(name, "", -1.0 if role == "offset_nm" and name in recording.away else 1.0)
+        if source.factor < 0.0:
+            notes.append(f"Sign: {name} grows away from the sample in this format; the offset is its negative.")
+    unit = source.unit or recording.units.get(source.channel, "")
+    if UNITS.get(unit, ("",))[0] not in quantities:
+        unit_of = {"offset_nm": "nm", "lockin_amplitude_nm": "nm", "phase_lag_deg": "deg", "deflection_nm": "nm"}[role]
+        if unit:
+            raise TableError(
+                f"{recording.source}: the channel {source.channel} has the unit {unit!r}, which is none of {role}; say "
+                f"--columns {role}={source.channel}:{unit_of}"
+            )
+        notes.append(f"Unit: {source.channel} has none and is taken in {unit_of}; else --columns {role}=NAME:UNIT.")
+        unit = unit_of
+    return replace(source, unit=unit)
+
+
+def _converted(recording: Recording, segment: Segment, source: ColumnSource, role: str) -> Float[np.ndarray, " rows"]:
+    numbers = segment.channels[source.channel]
+    bad = np.flatnonzero(~np.isfinite(numbers))
+    if bad.size:
+        raise TableError(
+            f"{recording.source}, curve {segment.curve}, row {bad[0] + 1}, channel {source.channel}: is not a number; "
+            "remove the row, or export the file again"
+        )
+    with np.errstate(over="ignore"):
+        scaled = numbers * (UNITS[source.unit][1] * source.factor)
+    if not np.all(np.abs(scaled) < 1e9):
+        raise TableError(
+            f"{recording.source}, curve {segment.curve}, channel {source.channel}: numbers beyond 1e9; the file is "
+            f"damaged, or its unit is another one: --columns {role}={source.channel}:UNIT"
+        )
+    return np.rad2deg(np.unwrap(np.deg2rad(scaled))) if role == "phase_lag_deg" else scaled
+
+
+def _branches(branch: str, offset: Float[np.ndarray, " rows"]) -> list[str]:
+    """Return the branch of every row: as the file says, else by the heights, which turn round nearest to the sample."""
+    rows = len(offset)
+    if branch:
+        return [branch] * rows
+    turn = int(np.argmax(offset)) + 1
+    if turn > 0.9 * rows and offset[-1] > offset[0]:
+        turn = rows
+    elif turn < 0.1 * rows and offset[-1] < offset[0]:
+        turn = 0
+    return ["approach"] * turn + ["retract"] * (rows - turn)
+
+
+_ASSUMED_ORIGIN_NM = 1.0
+"""Error of an origin read off the curve: attraction moves the contact by about so much."""
+
+
+def _judged(curve: MeasuredCurve, *, of_slope: bool) -> MeasuredCurve:
+    """Return a curve with free rows, slope, origin and zero of the phase found, and everything doubtful named."""
+    amplitude = curve.amplitude
+    if amplitude is None:
+        note = "There is no lock-in amplitude in the file: it is a force curve, whose slope `afm-jax calibrate` reads."
+        return replace(curve, notes=(*curve.notes, note))
+    if curve.amplitude_unit == "V" and "nm_per_volt" in curve.known:
+        scale = float(curve.known["nm_per_volt"].value)
+        amplitude = amplitude * scale
+        curve = replace(curve, amplitude=amplitude, amplitude_unit="nm")
+    looks = _looks(curve)
+    slope = _mean_slope(looks)
+    if of_slope and slope is not None:
+        curve, looks = _scaled_by_slope(curve, amplitude, slope)
+    free = np.zeros(len(curve.offset_nm), dtype=bool)
+    for branch, look in looks.items():
+        free[np.flatnonzero(curve.branch == branch)[look.free]] = True
+    curve = replace(curve, free=free, slope=_mean_slope(looks), reasons=tuple(_reasons(curve, looks)))
+    known = curve.known | _free_amplitude(curve, looks)
+    curve = replace(curve, known=_with_errors(replace(curve, known=known), looks))
+    curve = _with_origin(curve, looks)
+    curve = _with_zero_of_phase(curve)
+    missing = [key for key in _NEEDED if _is_missing(curve, key)] + [key for key in _WANTED if key not in curve.known]
+    return replace(curve, notes=(*curve.notes, *_scale_notes(curve), *_phase_notes(curve)), missing=tuple(missing))
+
+
+def _looks(curve: MeasuredCurve) -> dict[str, BranchLook]:
+    if curve.amplitude is None:
+        return {}
+    masks = {branch: curve.branch == branch for branch in dict.fromkeys(curve.branch.tolist())}
+    return {branch: look_at(curve.offset_nm[mask], curve.amplitude[mask]) for branch, mask in masks.items()}
+
+
+def _mean_slope(looks: Mapping[str, BranchLook]) -> tuple[float, float] | None:
+    """Return the weighted mean of the branches' slopes, its error widened by what they differ beyond theirs."""
+    slopes = np.array([look.slope for look in looks.values() if look.slope is not None])
+    if not slopes.size:
+        return None
+    weights = 1.0 / slopes[:, 1] ** 2
+    mean = float(np.sum(weights * slopes[:, 0]) / weights.sum())
+    chi2 = float(np.sum(weights * (slopes[:, 0] - mean) ** 2))
+    return mean, float(np.sqrt(max(chi2, 1.0) / weights.sum()))
+
+
+def _scaled_by_slope(
+    curve: MeasuredCurve, amplitude: Float[np.ndarray, " rows"], slope: tuple[float, float]
+) -> tuple[MeasuredCurve, dict[str, BranchLook]]:
+    """Return the curve with the amplitude scaled such that it falls by 1 nm per nm in contact."""
+    scale, share = 1.0 / abs(slope[0]), slope[1] / abs(slope[0])
+    origin = (
+        f"measured: slope of the curve in contact, taken as 1 nm per nm (a hard sample); unit {curve.amplitude_unit}"
+    )
+    known = curve.known | {"nm_per_volt": Known(scale, f"nm/{curve.amplitude_unit}", origin, scale * share)}
+    scaled = replace(curve, amplitude=amplitude * scale, amplitude_unit="nm", known=known)
+    return scaled, _looks(scaled)
+
+
+def _reasons(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> list[str]:
+    """Return why a curve must not be used: free amplitudes that jump, heights that run the wrong way."""
+    reasons, unit = [], curve.amplitude_unit
+    for branch, look in looks.items():
+        if look.jump is not None:
+            low, high = look.jump
+            reasons.append(
+                f"The free amplitude jumps from {low:.4g} to {high:.4g} {unit} within the {branch}: the drive or the "
+                "demodulation changed while the curve was taken."
+            )
+    levels = [look.level for look in looks.values()]
+    if np.ptp(levels) > JUMP * max(levels):
+        text = " and ".join(f"{look.level:.4g} {unit} in the {branch}" for branch, look in looks.items())
+        reasons.append(f"The free amplitude is {text}: the drive or the demodulation changed between them.")
+    amplitude = np.ones(1) if curve.amplitude is None else curve.amplitude[np.argsort(curve.offset_nm, kind="stable")]
+    some = max(len(amplitude) // 20, 1)
+    far, near = float(np.median(amplitude[:some])), float(np.median(amplitude[-some:]))
+    if far < 0.9 * near and all(look.slope is None for look in looks.values()):
+        reasons.append(
+            f"The amplitude is smaller far from the sample ({far:.4g} {unit}) than near it ({near:.4g} {unit}): the "
+            "heights run the other way; turn them round with --columns offset_nm=CHANNEL:-1 (or drop that -1)."
+        )
+    return reasons
+
+
+def _free_amplitude(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> dict[str, Known]:
+    if "free_amplitude_nm" in curve.known or curve.amplitude_unit != "nm":
+        return {}
+    if curve.reasons and any(look.jump for look in looks.values()):
+        return {}
+    rows = int(curve.free.sum())
+    level, error = np.mean([look.level for look in looks.values()]), max(look.level_error for look in looks.values())
+    return {"free_amplitude_nm": Known(float(level), "nm", f"measured: median of {rows} free rows", float(error))}
+
+
+def _with_errors(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> dict[str, Known]:
+    """Return what is known with the errors of single rows added, from the scatter of the free ones."""
+    found, free = dict(curve.known), curve.free
+    noise = [look.noise for look in looks.values() if np.isfinite(look.noise) and look.noise > 0.0]
+    level = float(np.mean([look.level for look in looks.values()]))
+    if "amplitude_error_nm" not in found and curve.amplitude_unit == "nm":
+        origin = "measured: scatter of the free rows" if noise else "assumed: 1 % of the free amplitude"
+        found["amplitude_error_nm"] = Known(max(noise) if noise else 0.01 * level, "nm", origin)
+    if "phase_error_deg" not in found and curve.phase_lag_deg is not None:
+        scatter = max(
+            (_phase_scatter(curve.phase_lag_deg[free & (curve.branch == branch)]) for branch in looks), default=0.0
+        )
+        origin = "measured: scatter of the free rows" if scatter > 0.0 else "assumed: 1 degree"
+        found["phase_error_deg"] = Known(scatter or 1.0, "deg", origin)
+    return found
+
+
+def _phase_scatter(phase: Float[np.ndarray, " rows"]) -> float:
+    return float(np.std(np.diff(phase)) / np.sqrt(2.0)) if len(phase) > 4 else 0.0
+
+
+def _with_origin(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> MeasuredCurve:
+    """Return the curve with heights that count from the rest position of the tip, as far as that can be told."""
+    given, level = curve.number("offset_origin_nm"), curve.number("free_amplitude_nm")
+    if given is not None:
+        origin = curve.known["offset_origin_nm"]
+        return replace(
+            curve,
+            offset_nm=curve.offset_nm - given,
+            known=curve.known | {"offset_origin_nm": replace(origin, error=origin.error or _ASSUMED_ORIGIN_NM)},
+        )
+    onsets = [look.onset_nm for branch, look in sorted(looks.items()) if look.onset_nm is not None]
+    if not onsets or level is None or curve.amplitude_unit != "nm":
+        return curve
+    height = float(onsets[0] + level)
+    error = float(np.hypot(_ASSUMED_ORIGIN_NM, np.ptp(onsets)))
+    how = "measured: where the amplitude begins to fall the free tip just touches (-free_amplitude_nm); error assumed"
+    known = curve.known | {"offset_origin_nm": Known(height, "nm", how, error)}
+    return replace(curve, offset_nm=curve.offset_nm - height, known=known)
+
+
+def free_lag_deg(drive: str, frequency_ratio: float, quality_factor: float) -> float:
+    """Return the lag of the free tip behind its drive: of its height (force) or of the deflection (base).
+
+    With gamma = 1 - s^2 + i s/Q the height lags by arg gamma, the deflection behind the base by arg gamma - arg(1 -
+    gamma).
+
+    >>> free_lag_deg("force", 1.0, 200.0), round(free_lag_deg("base", 1.0, 200.0), 2)
+    (90.0, 90.29)
+    """
+    gamma = 1.0 - frequency_ratio**2 + 1j * frequency_ratio / quality_factor
+    lag = np.angle(gamma) - (np.angle(1.0 - gamma) if drive == "base" else 0.0)
+    return float(np.rad2deg(lag))
+
+
+def _with_zero_of_phase(curve: MeasuredCurve) -> MeasuredCurve:
+    """Return the curve with the lag of the free rows set to what theory says, where frequency and Q are known."""
+    phase, numbers = curve.phase_lag_deg, [curve.number(k) for k in ("drive_frequency_khz", "free_frequency_khz")]
+    quality_factor = curve.number("quality_factor")
+    if phase is None or None in numbers or quality_factor is None or not curve.free.any():
+        return curve
+    lag = free_lag_deg(str(curve.known["drive"].value), numbers[0] / numbers[1], quality_factor)  # type: ignore[operator]
+    free = phase[curve.free]
+    level, error = float(np.median(free)), float(np.std(free) / np.sqrt(len(free)))
+    how = f"measured: the free rows read {level:.2f} deg and are set to {lag:.2f}, what s and Q give"
+    known = curve.known | {"phase_zero_deg": Known(level - lag, "deg", how, max(error, 0.01))}
+    return replace(curve, phase_lag_deg=phase - (level - lag), known=known)
+
+
+def _is_missing(curve: MeasuredCurve, key: str) -> bool:
+    if key == "nm_per_volt":
+        return curve.amplitude_unit == "V"
+    if key == "free_amplitude_nm" and curve.amplitude_unit == "V":
+        return False
+    return key not in curve.known
+
+
+def _scale_notes(curve: MeasuredCurve) -> list[str]:
+    """Say what the slope in contact means for the scale of the amplitude."""
+    if curve.slope is None or curve.known.get("nm_per_volt", Known(0.0, "", "")).origin.startswith("measured"):
+        return []
+    slope, error = abs(curve.slope[0]), curve.slope[1]
+    shown = f"{slope:.3g} +- {error:.1g}"
+    if curve.amplitude_unit == "V":
+        hard = f"on a hard sample that is {1.0 / slope:.3g} nm/V (--nm-per-volt slope)"
+        return [f"Gain: in contact the amplitude falls by {shown} V per nm; {hard}."]
+    for factor, what in ((np.sqrt(0.5), "an rms amplitude"), (2.0, "a peak-to-peak amplitude")):
+        if abs(slope / factor - 1.0) < 0.05:
+            mend = f"if it is one, --columns lockin_amplitude_nm=CHANNEL:{1.0 / factor:.4g}"
+            return [f"Gain: in contact the amplitude falls by {shown} nm per nm, as {what} would: {mend}."]
+    if abs(slope - 1.0) > max(0.1, 3.0 * error):
+        why = "the scale of the amplitude is off by that" + (", or the sample is soft" if slope < 1.0 else "")
+        return [
+            f"Gain: in contact the amplitude falls by {shown} nm per nm, not by 1: {why}; --nm-per-volt slope mends it."
+        ]
+    return []
+
+
+def _phase_notes(curve: MeasuredCurve) -> list[str]:
+    """Say which sign of the phase was taken, and whether the energy of a tap contradicts it."""
+    phase, amplitude, free = curve.phase_lag_deg, curve.amplitude, curve.number("free_amplitude_nm")
+    if phase is None or amplitude is None:
+        return ["There is no phase: the energy of a tap has an upper bound only."] if amplitude is not None else []
+    notes = ["Sign: a larger phase is taken as a larger lag; if it leads, --columns phase_lag_deg=CHANNEL:-1."]
+    zero = curve.known.get("phase_zero_deg")
+    if zero is None:
+        notes.append("Zero: the phase counts from the instrument's own zero; free frequency and Q would fix it.")
+        return notes
+    near = ~curve.free & (amplitude < 0.98 * (free or 0.0))
+    ratio = float(curve.known["drive_frequency_khz"].value) / float(curve.known["free_frequency_khz"].value)
+    quality_factor = float(curve.known["quality_factor"].value)
+    if near.any() and free is not None and abs(ratio - 1.0) > 0.005 and curve.known["drive"].value == "force":
+        response = abs(1.0 - ratio**2 + 1j * ratio / quality_factor)
+        lag = free_lag_deg("force", ratio, quality_factor)
+        lost = [
+            float(
+                np.median(
+                    free * response * np.sin(np.deg2rad(lag + way * (phase[near] - lag)))
+                    - ratio * amplitude[near] / quality_factor
+                )
+            )
+            for way in (1.0, -1.0)
+        ]
+        if lost[0] < 0.0 < lost[1]:
+            notes.append("Sign: with this sign of the phase taps would give energy away; turn it round (:-1).")
+    return notes
+
+
+def table_text(curve: MeasuredCurve) -> str:
+    """Return a curve as a table of `afm-jax tapping` and `afm-jax fit`.
+
+    Raises:
+        TableError: if something is missing, naming the options that give it, or the curve must not be used.
+    """
+    if curve.amplitude is None:
+        raise TableError(f"{curve.source}, curve {curve.curve}: there is no lock-in amplitude, so no table")
+    if curve.reasons:
+        raise TableError(f"{curve.source}, curve {curve.curve}: {curve.reasons[0]}")
+    needed = [key for key in curve.missing if key in _NEEDED]
+    if needed:
+        options = " ".join(f"--{key.replace('_', '-')} {_NEEDED[key]}" for key in needed)
+        raise TableError(f"{curve.source}: the file does not say {', '.join(needed)}; give {options}")
+    phase, free = curve.phase_lag_deg, curve.known["free_amplitude_nm"]
+    columns: dict[str, Any] = {
+        "drive_frequency_khz": curve.number("drive_frequency_khz"),
+        "free_amplitude_nm": free.value,
+        "free_amplitude_error_nm": free.error,
+        "offset_nm": curve.offset_nm,
+        "lockin_amplitude_nm": curve.amplitude,
+        "lockin_amplitude_error_nm": curve.number("amplitude_error_nm"),
+        "phase_lag_deg": phase,
+        "phase_lag_error_deg": None if phase is None else curve.number("phase_error_deg"),
+        "branch": curve.branch,
+    }
+    # an offset of the detector may take the amplitude of a tip that does not move below zero
+    moving = curve.amplitude > 0.0
+    present = {
+        name: np.broadcast_to(column, moving.shape)[moving].tolist()
+        for name, column in columns.items()
+        if column is not None
+    }
+    lines = [f"# drive = {curve.known['drive'].value}", *_setting_lines(curve)]
+    remarks = [f"read from {Path(curve.source).name} ({curve.format}), curve {curve.curve}", *curve.notes]
+    if not moving.all():
+        remarks.append(f"left out: {np.sum(~moving)} rows whose amplitude is not above zero")
+    lines += [f"# {remark}" for remark in remarks]
+    lines.append(",".join(present))
+    lines += [
+        ",".join(cell if isinstance(cell, str) else repr(cell) for cell in row)
+        for row in zip(*present.values(), strict=True)
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _setting_lines(curve: MeasuredCurve) -> list[str]:
+    """Return the comment lines that a table understands."""
+    lines = []
+    for key in ("free_frequency_khz", "quality_factor", "spring_constant_n_per_m"):
+        known = curve.known.get(key)
+        if known is not None:
+            lines.append(f"# {key} = {known.value!r}" + (f" +- {known.error!r}" if known.error else ""))
+    for key in ("offset_origin_nm", "phase_zero_deg"):
+        known = curve.known.get(key)
+        if known is not None and known.error:
+            lines.append(f"# {key} = 0 +- {known.error!r}")
+    scale = curve.known.get("nm_per_volt")
+    if scale is not None and scale.error and not isinstance(scale.value, str):
+        lines.append(f"# tip_calibration = 1 +- {scale.error / scale.value!r}")
+    return lines

@@ -1,0 +1,169 @@
+"""What an instrument's file holds before it is interpreted: channels with their units, and what the header says.
+
+Every format becomes the same `Recording`; what its channels mean for a tapping curve or a thermal spectrum is decided
+by those who read it further.
+"""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from jaxtyping import Float
+
+from fitting.tables.csv_text import NUMBER, TableError
+
+UNITS = {
+    "m": ("length", 1e9),
+    "mm": ("length", 1e6),
+    "um": ("length", 1e3),
+    "nm": ("length", 1.0),
+    "pm": ("length", 1e-3),
+    "V": ("voltage", 1.0),
+    "mV": ("voltage", 1e-3),
+    "deg": ("angle", 1.0),
+    "rad": ("angle", 180.0 / np.pi),
+    "Hz": ("frequency", 1e-3),
+    "kHz": ("frequency", 1.0),
+    "MHz": ("frequency", 1e3),
+    "N": ("force", 1e9),
+    "nN": ("force", 1.0),
+    "N/m": ("stiffness", 1.0),
+    "m/V": ("sensitivity", 1e9),
+    "nm/V": ("sensitivity", 1.0),
+    "m/sqrt(Hz)": ("spectrum", 1e9),
+    "nm/sqrt(Hz)": ("spectrum", 1.0),
+    "pm/sqrt(Hz)": ("spectrum", 1e-3),
+    "fm/sqrt(Hz)": ("spectrum", 1e-6),
+    "V/sqrt(Hz)": ("voltage spectrum", 1.0),
+}
+"""What a unit measures, and its size in this package's unit: nm, V, degrees, kHz, nN, N/m, nm/V, nm per root Hz."""
+_SPELLINGS = {"µm": "um", "μm": "um", "°": "deg", "Deg": "deg", "degrees": "deg", "m/√Hz": "m/sqrt(Hz)"}
+
+
+def unit_named(text: str) -> str:
+    """Return the key of `UNITS` for a unit as a file spells it, or the text itself where there is none."""
+    plain = re.sub(r"^[\[(](.*)[\])]$", r"\1", text.strip()).strip()
+    # NanoSurf writes UTF-8 degree signs that Latin-1 readers take as two letters
+    plain = plain.removeprefix("Â")
+    return _SPELLINGS.get(plain, plain)
+
+
+@dataclass(frozen=True)
+class Known:
+    """Something known about a measurement, and where it comes from.
+
+    Attributes:
+        value: in the unit of its key; a word where it is none.
+        unit: of a number; empty for a plain one.
+        origin: "header: ...", "note: ...", "option ...", "measured: ..." or "assumed: ...".
+        error: its standard error, None where not known.
+    """
+
+    value: float | str
+    unit: str
+    origin: str
+    error: float | None = None
+
+
+@dataclass(frozen=True)
+class Segment:
+    """Channels of equal length that were recorded together.
+
+    Attributes:
+        curve: which curve of the file, from 1.
+        branch: "approach", "retract", or empty: to be told by the height's direction.
+        channels: numbers by channel name, in the units of `Recording.units`.
+    """
+
+    curve: int
+    branch: str
+    channels: dict[str, Float[np.ndarray, " rows"]]
+
+
+@dataclass(frozen=True)
+class Recording:
+    """All that a file holds.
+
+    Attributes:
+        format: its name: "neaSNOM text", "WSxM curves", ...
+        source: path as it was given.
+        segments: in the order of the file.
+        units: unit of every channel, a key of `UNITS` or as the file spells it; empty: the file does not say.
+        known: what the header says, by this package's keys.
+        away: channels that grow with the distance between tip and sample; other heights grow towards the tip.
+        remarks: what a reader should know of the format.
+    """
+
+    format: str
+    source: str
+    segments: tuple[Segment, ...]
+    units: Mapping[str, str]
+    known: dict[str, Known] = field(default_factory=dict)
+    away: tuple[str, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def channels(self) -> list[str]:
+        """The channels' names, in order."""
+        return list(dict.fromkeys(name for segment in self.segments for name in segment.channels))
+
+
+def number_in(text: str) -> tuple[float, str] | None:
+    """Return the number at the start of a text and the unit behind it; None without one.
+
+    >>> number_in("264,132.610 Hz"), number_in("5.33904 N/m"), number_in("yes")
+    ((264132.61, 'Hz'), (5.33904, 'N/m'), None)
+    """
+    match = NUMBER.match(re.sub(r"(?<=\d),(?=\d{3}(?:\D|$))", "", text.strip()))
+    if match is None or abs(float(match[0])) > 1e300:
+        return None
+    return float(match[0]), unit_named(match.string[match.end() :])
+
+
+HEADER_KEYS = {
+    "free_frequency_khz": "frequency",
+    "drive_frequency_khz": "frequency",
+    "quality_factor": "",
+    "spring_constant_n_per_m": "stiffness",
+    "free_amplitude_nm": "length",
+    "deflection_nm_per_volt": "sensitivity",
+    "nm_per_volt": "sensitivity",
+    "temperature_k": "temperature",
+    "averages": "",
+}
+"""What headers say that matters here, and what it measures."""
+_NATIVE = {
+    "frequency": "kHz",
+    "stiffness": "N/m",
+    "length": "nm",
+    "sensitivity": "nm/V",
+    "temperature": "K",
+}
+
+
+def known_from(
+    header: Mapping[str, str], keys: Mapping[str, tuple[str, str]], where: str = "header"
+) -> dict[str, Known]:
+    """Return what the lines of a header say of the measurement, in this package's units.
+
+    Args:
+        header: texts by the names that the file gives them.
+        keys: for names in the file the key of `HEADER_KEYS` and the unit where the text holds none.
+        where: what the place is called: "header" or "note".
+    """
+    found = {}
+    for name, (key, unit) in keys.items():
+        said = number_in(header.get(name, ""))
+        if said is None or not said[0] > 0.0:
+            continue
+        quantity, factor = UNITS.get(said[1] or unit, ("", 1.0))
+        if quantity == HEADER_KEYS[key]:
+            # twelve digits: a change of unit must not add others
+            found[key] = Known(float(f"{said[0] * factor:.12g}"), _NATIVE.get(quantity, ""), f"{where}: {name}")
+    return found
+
+
+def cut_off(source: str, what: str) -> TableError:
+    """Return the error of a file that ends before it should."""
+    return TableError(f"{source}: {what}; the file is damaged or cut off: copy it again from the instrument")

@@ -1,0 +1,320 @@
+"""Free rows, attractive and repulsive rows, and the heights at which a curve changes between them, out and back.
+
+On the way in the bridge forms where the tip's lowest point comes near enough; on the way back it may hold longer. And
+attractive and repulsive branch coexist over a stretch of heights, so that the jump between them comes at another height
+on the way back. Each such pair of heights, and the energy between the two branches, is a `Hysteresis`.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool
+from scipy.optimize import least_squares
+
+from fitting.tapping_curves.curve import Given, Rows, TappingCurve, TipMotion
+
+_FREE = 4.0
+"""Standard errors within which a row counts as free."""
+_HELD = 0.1
+"""Of the free amplitude: below it the tip is held, not tapping."""
+_WINDOW = 0.6
+"""Of the free amplitude: down to there the fall of the amplitude is fitted."""
+_MOST_ROWS = 60
+_STEPS = 21
+_STEEP = 0.2
+"""Of the free amplitude: a fall between two rows that may come anywhere between them."""
+_UNIFORM = 12.0**-0.5
+"""Standard deviation of what lies anywhere within a unit."""
+
+
+class Height(NamedTuple):
+    """A height in nm and its standard error."""
+
+    offset_nm: float
+    standard_error: float
+
+
+@dataclass(frozen=True)
+class Hysteresis:
+    """A change that comes at one height as the sample comes nearer and at another as it goes.
+
+    Attributes:
+        change: "contact" (the amplitude leaves that of the free tip), "half" (it crosses half of it) or "branch" (from
+            the attractive to the repulsive branch).
+        drive_frequency_khz: of the rows.
+        free_amplitude_nm: of the rows.
+        approach: where it comes as the sample comes nearer; None where it does not show.
+        retract: where it goes as the sample goes.
+        energy_between_aj: retract less approach over the heights between, and its standard error: of a tap, or for
+            a tip that is held of the whole way in and out, (k/2)(retract^2 - approach^2).
+        energy_of: "a tap" or "the way in and out"; empty where there is none.
+    """
+
+    change: str
+    drive_frequency_khz: float
+    free_amplitude_nm: float
+    approach: Height | None
+    retract: Height | None
+    energy_between_aj: tuple[float, float] | None = None
+    energy_of: str = ""
+
+    @property
+    def width_nm(self) -> tuple[float, float] | None:
+        """By how much it goes later than it came, and the standard error; None where one end does not show."""
+        if self.approach is None or self.retract is None:
+            return None
+        error = float(np.hypot(self.approach.standard_error, self.retract.standard_error))
+        return self.approach.offset_nm - self.retract.offset_nm, error
+
+
+def ways(curve: TappingCurve) -> list[np.ndarray]:
+    """Return the rows of each drive and way (in, back), numbers in the order of height, the farthest first."""
+    keys = np.stack([curve.drive_frequency_khz, curve.free_amplitude_nm, curve.retract])
+    found, which = np.unique(keys, axis=1, return_inverse=True)
+    parts = [np.flatnonzero(which.reshape(-1) == i) for i in range(found.shape[1])]
+    return [part[np.argsort(curve.offset_nm[part], kind="stable")] for part in parts]
+
+
+def free_rows(curve: TappingCurve) -> Bool[np.ndarray, " rows"]:
+    """Return the rows of the free tip: those farther away than the first that departs in amplitude or phase.
+
+    A single row that departs is none; the zero of the phase is that of the rows farther away.
+    """
+    free = np.zeros(curve.rows, bool)
+    for part in ways(curve):
+        for place, row in enumerate(part):
+            following = part[place : place + 2]
+            if all(_departs(curve, other, part[:place][free[part[:place]]]) for other in following):
+                break
+            free[row] = not _departs(curve, row, part[:place][free[part[:place]]])
+    return free
+
+
+def _departs(curve: TappingCurve, row: int, before: np.ndarray) -> bool:
+    """Say whether a row is not free, against those farther away."""
+    free, amplitude = curve.free_amplitude_nm[row], curve.amplitude_nm[row]
+    error = np.hypot(curve.amplitude_error_nm[row], curve.free_amplitude_error * free)
+    if abs(amplitude - free) > max(_FREE * error, 1e-9 * free):
+        return True
+    lags = curve.lag_deg[before]
+    if not np.isfinite(lags).any() or not np.isfinite(curve.lag_deg[row]):
+        return False
+    spread = curve.lag_error_deg[row] * np.sqrt(1.0 + 1.0 / np.isfinite(lags).sum())
+    return bool(abs(curve.lag_deg[row] - np.nanmean(lags)) > _FREE * spread)
+
+
+def held_rows(curve: TappingCurve) -> Bool[np.ndarray, " rows"]:
+    """Return the rows in which the sample holds the tip: there is hardly an amplitude left."""
+    return curve.amplitude_nm < _HELD * curve.free_amplitude_nm
+
+
+def changes(
+    curve: TappingCurve,
+    *,
+    free: Bool[np.ndarray, " rows"],
+    repulsive: Bool[np.ndarray, " rows"],
+    energy: Rows,
+    noise: Rows,
+) -> list[Hysteresis]:
+    """Return the changes of each drive, as far as they show on the way in or back.
+
+    Args:
+        curve: the curve.
+        free: from `free_rows`.
+        repulsive: which of the others are on the repulsive branch.
+        energy: of a tap in aJ, NaN where not known.
+        noise: its standard error.
+    """
+    parts = ways(curve)
+    drives = dict.fromkeys((curve.drive_frequency_khz[p[0]], curve.free_amplitude_nm[p[0]]) for p in parts)
+    found = []
+    for frequency, amplitude in drives:
+        here = [
+            p
+            for p in parts
+            if (curve.drive_frequency_khz[p[0]], curve.free_amplitude_nm[p[0]]) == (frequency, amplitude)
+        ]
+        into = next((p for p in here if not curve.retract[p[0]]), None)
+        back = next((p for p in here if curve.retract[p[0]]), None)
+        for change in ("contact", "half", "branch"):
+            ends = [
+                None if p is None else _height(change, curve, p, free=free, repulsive=repulsive) for p in (into, back)
+            ]
+            if ends[0] is None and ends[1] is None:
+                continue
+            one = Hysteresis(change, float(frequency), float(amplitude), approach=ends[0], retract=ends[1])
+            found.append(_with_energy(one, curve, into, back, energy, noise))
+    return found
+
+
+def _height(
+    change: str,
+    curve: TappingCurve,
+    part: np.ndarray,
+    *,
+    free: Bool[np.ndarray, " rows"],
+    repulsive: Bool[np.ndarray, " rows"],
+) -> Height | None:
+    if change == "contact":
+        return _contact(curve, part, free)
+    if change == "half":
+        return _half(curve, part)
+    touching = part[~free[part]]
+    before = np.flatnonzero(~repulsive[touching])
+    # the last attractive row in front of the nearest repulsive one
+    if not before.size or before[-1] + 1 == len(touching):
+        return None
+    return _between(*curve.offset_nm[touching[before[-1] : before[-1] + 2]])
+
+
+def _half(curve: TappingCurve, part: np.ndarray) -> Height | None:
+    """Return where the amplitude crosses half of the free one for good, by the straight line between two rows."""
+    above = np.flatnonzero(curve.amplitude_nm[part] >= 0.5 * curve.free_amplitude_nm[part])
+    if not above.size or above[-1] + 1 == len(part):
+        return None
+    rows = part[above[-1] : above[-1] + 2]
+    (far, near), (before, after) = curve.offset_nm[rows], curve.amplitude_nm[rows]
+    level, slope = curve.free_amplitude_nm[rows[0]], (after - before) / (near - far)
+    if before - after > _STEEP * level:
+        return _between(far, near)
+    at = far + (0.5 * level - before) / slope
+    return Height(float(at), float(curve.amplitude_error_nm[rows].max() / abs(slope)))
+
+
+def _between(low: float, high: float) -> Height:
+    return Height(float(0.5 * (low + high)), float(_UNIFORM * abs(high - low)))
+
+
+def _contact(curve: TappingCurve, part: np.ndarray, free: Bool[np.ndarray, " rows"]) -> Height | None:
+    """Return where the amplitude leaves that of the free tip: between two rows, or where its fall began."""
+    touching = ~free[part]
+    if not touching.any() or touching[0]:
+        return None
+    first = int(np.flatnonzero(touching)[0])
+    bracket = _between(float(curve.offset_nm[part[first - 1]]), float(curve.offset_nm[part[first]]))
+    below = np.flatnonzero(curve.amplitude_nm[part] < _WINDOW * curve.free_amplitude_nm[part])
+    until = min(below[0] if below.size else len(part), first + _MOST_ROWS)
+    if until - first < 4:
+        return bracket
+    rows = part[:until]
+    height, amplitude = curve.offset_nm[rows], curve.amplitude_nm[rows]
+    error, level = curve.amplitude_error_nm[rows], curve.free_amplitude_nm[rows[0]]
+    fit = _hinge(height, amplitude, error, float(level))
+    return fit if fit is not None and fit.standard_error < bracket.standard_error else bracket
+
+
+def _hinge(height: np.ndarray, amplitude: np.ndarray, error: np.ndarray, level: float) -> Height | None:
+    """Return where a straight fall from a level began, by least squares; None where a step explains it better."""
+
+    def chi2(at: float, *, step: bool) -> float:
+        after = height > at
+        basis = (
+            np.stack([np.where(after, height - at, 0.0), *([after.astype(float)] if step else [])], axis=1)
+            / error[:, None]
+        )
+        target = (amplitude - level) / error
+        return float(np.sum((target - basis @ np.linalg.lstsq(basis, target, rcond=None)[0]) ** 2))
+
+    grid = np.linspace(height[0], height[-2], _STEPS * len(height))
+    hinges = np.array([chi2(at, step=False) for at in grid])
+    best = int(np.argmin(hinges))
+    middles = 0.5 * (height[1:-1] + height[:-2])
+    if min(chi2(at, step=True) for at in middles) < hinges[best] - 2.0 * _FREE:
+        return None
+    inside = grid[hinges < hinges[best] + max(1.0, hinges[best] / len(height))]
+    return Height(float(grid[best]), float(max(0.5 * (inside[-1] - inside[0]), grid[1] - grid[0])))
+
+
+def _with_energy(
+    found: Hysteresis,
+    curve: TappingCurve,
+    into: np.ndarray | None,
+    back: np.ndarray | None,
+    energy: Rows,
+    noise: Rows,
+) -> Hysteresis:
+    """Return a change with the energy between its branches, if that is known."""
+    if found.approach is None or found.retract is None or into is None or back is None:
+        return found
+    low, high = sorted((found.approach.offset_nm, found.retract.offset_nm))
+    between = [p[(curve.offset_nm[p] > low) & (curve.offset_nm[p] < high)] for p in (into, back)]
+    if not all(len(p) for p in between):
+        return found
+    if found.approach.offset_nm > found.retract.offset_nm and held_rows(curve)[between[1]].mean() > 0.5:
+        if not curve.height_known:
+            return found
+        value = _energy_of_release(curve.spring_constant_n_per_m, found.approach, found.retract)
+        return replace(found, energy_between_aj=value, energy_of="the way in and out")
+    if not all(np.isfinite(energy[p]).any() for p in between):
+        return found
+    (before, before_error), (after, after_error) = (_mean(energy[p], noise[p]) for p in between)
+    value = after - before, float(np.hypot(before_error, after_error))
+    return replace(found, energy_between_aj=value, energy_of="a tap")
+
+
+def _mean(values: Rows, errors: Rows) -> tuple[float, float]:
+    known = np.isfinite(values) & np.isfinite(errors) & (errors > 0.0)
+    weights = errors[known] ** -2.0
+    return float(np.average(values[known], weights=weights)), float(weights.sum()) ** -0.5
+
+
+def _energy_of_release(k: Given, approach: Height, retract: Height) -> tuple[float, float]:
+    """Return what the way in and out takes of a tip that was held, with its error: the lever lets go of (k/2) h^2."""
+    value = 0.5 * k.value * (retract.offset_nm**2 - approach.offset_nm**2)
+    parts = [*(k.value * end.offset_nm * end.standard_error for end in (retract, approach)), value * k.error / k.value]
+    return value, float(np.linalg.norm(parts))
+
+
+_DEGREE = 2
+_FEWEST_SMOOTH = 6
+_ROUGH = 5.0
+_HARDLY = 0.2
+"""Of the free amplitude: change of the motion up to which taps need not come every period."""
+_ROUNDS = 8
+_BENT = 0.005
+"""Of the free amplitude: what the straight line of a branch may be bent beyond a parabola."""
+
+
+def hardly_touching_rows(motion: TipMotion) -> Bool[np.ndarray, " rows"]:
+    """Return rows whose motion is all but that of the free tip: where contact begins, taps may leave periods out."""
+    return np.abs(motion.height + motion.free_amplitude_nm) < _HARDLY * motion.free_amplitude_nm
+
+
+def rough_rows(curve: TappingCurve, chosen: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:
+    """Return rows whose amplitude is off the smooth fall of the others of their drive and way.
+
+    Taps that do not come once a period (every other, or irregularly) change the amplitude by some per cent: of such
+    rows amplitude and phase are no measure of a tap.
+
+    Args:
+        curve: the curve.
+        chosen: the rows that fall together, of one branch.
+    """
+    rough = np.zeros(curve.rows, bool)
+    for part in ways(curve):
+        rows = part[chosen[part]]
+        if len(rows) < _FEWEST_SMOOTH:
+            continue
+        height, level = curve.offset_nm[rows], curve.free_amplitude_nm[rows[0]]
+        place = (height - height.mean()) / max(np.ptp(height), 1e-12)
+        allowed = np.maximum(curve.amplitude_error_nm[rows], _BENT * level / _ROUGH)
+        smooth = np.ones(len(rows), bool)
+        for _ in range(_ROUNDS):
+            off = _off_parabola(place, curve.amplitude_nm[rows], allowed, smooth)
+            again = np.abs(off) <= _ROUGH
+            if again.sum() < _FEWEST_SMOOTH or (again == smooth).all():
+                break
+            smooth = again
+        rough[rows] = ~smooth
+    return rough
+
+
+def _off_parabola(place: Rows, amplitude: Rows, allowed: Rows, chosen: Bool[np.ndarray, " rows"]) -> Rows:
+    """Return by how much of what is allowed amplitudes are off the parabola that most of those chosen follow."""
+
+    def off(factors: np.ndarray) -> np.ndarray:
+        return (amplitude - np.polyval(factors, place)) / allowed
+
+    start = np.polyfit(place[chosen], amplitude[chosen], _DEGREE)
+    return off(least_squares(lambda factors: off(factors)[chosen], start, loss="cauchy").x)

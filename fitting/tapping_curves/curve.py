@@ -1,0 +1,158 @@
+"""A tapping curve as its energy needs it: amplitude and phase against height, and what is known of the instrument.
+
+The tip, z ~ Re(Z exp(i omega t)), obeys k gamma Z = F_drive + F_1 with gamma = 1 - s^2 + i s/Q and s = f/f0, F_1 the
+first harmonic of the sample's force. Free, Z = -A0: that sets the time. Measured are an amplitude A and a lag phi,
+
+* under a force on the tip those of the height, Z = -A exp(-i (phi - arg gamma));
+* under a base that shakes those of the deflection, behind the base: D = -A exp(-i (phi - arg gamma)), Z = D - gamma A0,
+  and A0 = A_free/|1 - gamma| with A_free the amplitude of the free deflection.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Complex, Float, Int
+
+Rows = Float[np.ndarray, " rows"]
+Phasors = Complex[np.ndarray, " rows"]
+
+
+class Given(NamedTuple):
+    """A number that is known beforehand, and its standard error (0: exactly known)."""
+
+    value: float
+    error: float = 0.0
+
+    def __str__(self) -> str:
+        return f"{self.value:g} +- {self.error:g}" if self.error else f"{self.value:g}"
+
+
+EXACTLY_ONE = Given(1.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class TappingCurve:
+    """Rows of a tapping curve; arrays of shape (rows,), NaN where nothing was measured.
+
+    Attributes:
+        source: its name, as it begins messages.
+        drive: what shakes the cantilever: a force on the tip, or its base.
+        offset_nm: height of the sample over the tip's rest position, or over any other height (`height_known`).
+        amplitude_nm: of the height (force) or the deflection (base) at the drive's frequency.
+        amplitude_error_nm: its standard error.
+        lag_deg: how far it lags behind the drive; NaN throughout where no phase was recorded.
+        lag_error_deg: its standard error.
+        free_amplitude_nm: of the free tip (force) or the free deflection (base).
+        free_amplitude_error: its relative standard error.
+        drive_frequency_khz: omega/2 pi.
+        retract: whether the sample moves away.
+        both_ways: whether the curve says which way the sample moves.
+        free_frequency_khz: f0.
+        quality_factor: Q.
+        spring_constant_n_per_m: k.
+        tip_calibration: true length over the length stated, of every amplitude.
+        phase_zero_deg: lag that the instrument adds; None: nothing is known of it.
+        height_known: whether heights count from the tip's rest position.
+        harmonic_amplitudes_nm: amplitudes at multiples of the drive's frequency, by multiple.
+        lines: where each row stands in its file.
+    """
+
+    source: str
+    drive: Literal["force", "base"] = "force"
+    offset_nm: Rows
+    amplitude_nm: Rows
+    amplitude_error_nm: Rows
+    lag_deg: Rows
+    lag_error_deg: Rows
+    free_amplitude_nm: Rows
+    free_amplitude_error: float = 0.0
+    drive_frequency_khz: Rows
+    retract: Bool[np.ndarray, " rows"]
+    both_ways: bool = False
+    free_frequency_khz: Given
+    quality_factor: Given
+    spring_constant_n_per_m: Given
+    tip_calibration: Given = EXACTLY_ONE
+    phase_zero_deg: Given | None = None
+    height_known: bool = True
+    harmonic_amplitudes_nm: dict[int, Rows] = field(default_factory=dict)
+    lines: Int[np.ndarray, " rows"]
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        return len(self.offset_nm)
+
+    @property
+    def has_phase(self) -> bool:
+        """Whether any row has a phase."""
+        return bool(np.isfinite(self.lag_deg).any())
+
+    def part(self, chosen: Bool[np.ndarray, " rows"]) -> "TappingCurve":
+        """Return the rows chosen, as a curve."""
+        own = {
+            name: value[chosen]
+            for name, value in vars(self).items()
+            if isinstance(value, np.ndarray) and value.shape == chosen.shape
+        }
+        harmonics = {n: column[chosen] for n, column in self.harmonic_amplitudes_nm.items()}
+        return replace(self, **own, harmonic_amplitudes_nm=harmonics)
+
+
+HARMONICS_FACTOR = Given(0.9, 0.1)
+"""Impacts that last excite high harmonics less: by a few per cent to a fifth in simulated curves."""
+
+
+class Instrument(NamedTuple):
+    """What of the instrument turns readings into motion, at one trial of it.
+
+    Attributes:
+        free_frequency_khz: f0.
+        quality_factor: Q.
+        phase_zero_deg: what the instrument adds to each lag.
+        free_amplitude_factor: true over stated free amplitude.
+        harmonics_factor: what the air takes at harmonics not measured, over that of one brief impact a period.
+    """
+
+    free_frequency_khz: float
+    quality_factor: float
+    phase_zero_deg: float | Rows = 0.0
+    free_amplitude_factor: float | Rows = 1.0
+    harmonics_factor: float = HARMONICS_FACTOR.value
+
+
+class TipMotion(NamedTuple):
+    """The motion at the drive's frequency, lengths as the curve states them (not calibrated).
+
+    Attributes:
+        gamma: 1 - s^2 + i s/Q.
+        free_amplitude_nm: A0 of the tip's height.
+        reading: the phasor that was measured: Z, or D under a base.
+        height: Z.
+    """
+
+    gamma: Phasors
+    free_amplitude_nm: Rows
+    reading: Phasors
+    height: Phasors
+
+
+def motion_of(curve: TappingCurve, instrument: Instrument) -> TipMotion:
+    """Return the motion that a curve's readings mean."""
+    s = curve.drive_frequency_khz / instrument.free_frequency_khz
+    gamma = 1.0 - s**2 + 1j * s / instrument.quality_factor
+    lag = np.deg2rad(curve.lag_deg - instrument.phase_zero_deg)
+    reading = -curve.amplitude_nm * np.exp(-1j * (lag - np.angle(gamma)))
+    free = curve.free_amplitude_nm * instrument.free_amplitude_factor
+    if curve.drive == "force":
+        return TipMotion(gamma, free, reading, reading)
+    free = free / np.abs(1.0 - gamma)
+    return TipMotion(gamma, free, reading, reading - gamma * free)
+
+
+def free_lag_deg(curve: TappingCurve, instrument: Instrument) -> Rows:
+    """Return the lag that the free tip shows on the instrument, in degrees."""
+    gamma = motion_of(curve, instrument).gamma
+    lag = np.angle(gamma) if curve.drive == "force" else np.angle(gamma) - np.angle(1.0 - gamma)
+    return np.rad2deg(lag) + instrument.phase_zero_deg

@@ -1,0 +1,171 @@
+"""Pictures of a tapping curve: amplitude, phase and energy over height, and the change of frame behind it."""
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, png_of
+from afm_jax.units import RAD_PER_US_PER_KHZ
+from fitting.tapping_curves.constant_energy import plain_instrument
+from fitting.tapping_curves.curve import Instrument, TipMotion, motion_of
+from fitting.tapping_curves.energy import lags_of
+from fitting.tapping_curves.result import Tapping
+
+_SMALL = 9
+_PERIODS = 2.0
+
+
+def tapping_pictures(result: Tapping) -> list[bytes]:
+    """Return PNG files: the curve, the two frames, and the law if there is one."""
+    files = [png_of(curve_figure(result)), png_of(frames_figure(result))]
+    if result.law is not None:
+        from fitting.report.plots import fit_pictures  # noqa: PLC0415
+
+        files.append(fit_pictures(result.law)[1])
+    return files
+
+
+def curve_figure(result: Tapping) -> Figure:
+    """Return amplitude, phase and energy of a tap over the height of the sample, with what the fit predicts."""
+    figure = new_figure(7.5, 9.5)
+    top, middle, bottom = figure.subplots(3, 1, sharex=True)
+    curve, rows = result.curve, result.rows
+    _points(top, result, curve.amplitude_nm, curve.amplitude_error_nm)
+    if curve.drive == "force" and curve.height_known:
+        reach = np.linspace(curve.offset_nm.min(), min(curve.offset_nm.max(), 0.0), 2)
+        reach = np.maximum(reach, -curve.free_amplitude_nm.max())
+        top.plot(reach, -reach, ":", color=GRID, label="the tip just reaches the sample")
+    label_axes(top, x="", y="amplitude (nm)")
+    top.legend(fontsize=_SMALL)
+    if curve.has_phase:
+        _points(middle, result, curve.lag_deg, curve.lag_error_deg)
+        _predicted_lag(middle, result)
+        _points(
+            bottom, result, rows.energy_of_fit_aj if result.fit is not None else rows.energy_aj, rows.energy_noise_aj
+        )
+        bottom.plot(curve.offset_nm, rows.energy_aj, "+", color=GRID, ms=4, label="instrument as given")
+        _energy_bands(bottom, result)
+        spread = np.nanpercentile(rows.energy_of_fit_aj, [5.0, 95.0])
+        bottom.set_ylim(min(spread[0], 0.0) - 0.3 * np.ptp(spread), spread[1] + 0.7 * np.ptp(spread))
+    else:
+        _points(bottom, result, rows.largest_energy_aj, np.zeros(curve.rows))
+    label_axes(middle, x="", y="lag (degrees)")
+    label_axes(
+        bottom,
+        x="height of the sample over the tip's rest position (nm)" if curve.height_known else "height (nm)",
+        y="energy of a tap (aJ)" if curve.has_phase else "at most (aJ)",
+    )
+    bottom.legend(fontsize=_SMALL)
+    for axes in (top, middle, bottom):
+        axes.grid(color=GRID, alpha=0.25)
+    return figure
+
+
+def _points(axes: Axes, result: Tapping, values: np.ndarray, errors: np.ndarray) -> None:
+    """Draw rows: filled on the way in, hollow squares on the way back, crossed out where set aside, grey where free."""
+    curve, free = result.curve, result.rows.free
+    aside = np.array([note.startswith("set aside") for note in result.rows.note])
+    for back, marker, way in ((False, "o", "way in"), (True, "s", "way back")):
+        for chosen, colour, label in (
+            (free, GRID, "free"),
+            (~free & ~aside, BLUE if not back else ACCENT, way if curve.both_ways else "rows"),
+            (~free & aside, "none", "set aside"),
+        ):
+            here = chosen & (curve.retract == back) & np.isfinite(values)
+            if here.any():
+                axes.errorbar(
+                    curve.offset_nm[here],
+                    values[here],
+                    errors[here],
+                    fmt=marker,
+                    ms=4,
+                    lw=0.8,
+                    color=DARK if colour == "none" else colour,
+                    mfc=colour,
+                    label=label if label not in axes.get_legend_handles_labels()[1] else None,
+                )
+
+
+def _predicted_lag(axes: Axes, result: Tapping) -> None:
+    """Draw the lag at which a tap of the fitted energy leaves the amplitude that was read."""
+    if result.fit is None:
+        return
+    curve = result.curve
+    wanted = result.fit.energy_aj[np.maximum(result.group_of_rows, 0)]
+    lags = lags_of(curve, result.fit.instrument, np.where(result.fit.used, wanted, np.nan))
+    for group in range(len(result.groups)):
+        for back in (False, True):
+            rows = np.flatnonzero((result.group_of_rows == group) & (curve.retract == back) & np.isfinite(lags))
+            rows = rows[np.argsort(curve.offset_nm[rows])]
+            axes.plot(curve.offset_nm[rows], lags[rows], color=ACCENT if back else BLUE, lw=1.0, alpha=0.7)
+
+
+def _energy_bands(axes: Axes, result: Tapping) -> None:
+    if result.fit is None:
+        return
+    for i, group in enumerate(result.groups):
+        heights = result.curve.offset_nm[result.fit.used & (result.group_of_rows == i)]
+        energy = result.fit.energy_aj[i]
+        low, high = result.fit.interval95_aj[i]
+        colour = BLUE if group.repulsive else ACCENT
+        ends = [heights.min(), heights.max()]
+        axes.plot(
+            ends,
+            [energy, energy],
+            color=colour,
+            lw=1.2,
+            label=f"{'repulsive' if group.repulsive else 'attractive'}: {energy:.3g} aJ",
+        )
+        axes.fill_between(ends, [low, low], [high, high], color=colour, alpha=0.15, lw=0)
+
+
+def frames_figure(result: Tapping) -> Figure:
+    """Return the motion of one row in two frames: the lab's, and that of the free motion."""
+    curve = result.curve
+    row = _example_row(result)
+    instrument = plain_instrument(curve, result.rows.free) if result.fit is None else result.fit.instrument
+    motion = motion_of(curve, instrument)
+    free = float(motion.free_amplitude_nm[row])
+    omega = RAD_PER_US_PER_KHZ * float(curve.drive_frequency_khz[row])
+    time = np.linspace(0.0, _PERIODS * 2.0 * np.pi / omega, 801)
+    z_free = -free * np.cos(omega * time)
+    flight = _flight(motion, row, omega, instrument, time)
+    sample = float(curve.offset_nm[row])
+    figure = new_figure(10.0, 4.2)
+    left, right = figure.subplots(1, 2)
+    left.plot(time, z_free, "--", color=GRID, label="free tip")
+    left.plot(time, z_free + flight, color=BLUE, label="tip")
+    left.axhline(sample, color=ACCENT, label="sample, at rest")
+    left.set_title("lab: a shaken tip, a resting sample", fontsize=_SMALL + 1)
+    right.plot(time, flight, color=BLUE, label="tip less its free motion")
+    right.plot(time, sample - z_free, color=ACCENT, label="sample, moving with the free amplitude")
+    right.set_title("the free tip's frame: free flights between impacts", fontsize=_SMALL + 1)
+    for axes in (left, right):
+        label_axes(axes, x="time (µs)", y="height (nm)")
+        axes.set_ylim(top=axes.get_ylim()[1] + 0.35 * np.ptp(axes.get_ylim()))
+        axes.legend(fontsize=_SMALL, loc="upper right")
+        axes.grid(color=GRID, alpha=0.25)
+    return figure
+
+
+def _example_row(result: Tapping) -> int:
+    """Return the row to show: of those used the one whose amplitude is nearest to two thirds of the free one."""
+    curve = result.curve
+    wanted = np.abs(curve.amplitude_nm / curve.free_amplitude_nm - 2.0 / 3.0)
+    repulsive = result.rows.used & np.isin(result.group_of_rows, result.chief)
+    return int(np.argmin(np.where(repulsive, wanted, np.inf) if repulsive.any() else wanted))
+
+
+def _flight(motion: TipMotion, row: int, omega: float, instrument: Instrument, time: np.ndarray) -> np.ndarray:
+    """Return the motion that one brief impact a period keeps up, of the impulse and moment that were read."""
+    force = motion.gamma[row] * (motion.height[row] + motion.free_amplitude_nm[row])
+    own = RAD_PER_US_PER_KHZ * instrument.free_frequency_khz
+    rate = -0.5 * own / instrument.quality_factor + 1j * own * np.sqrt(1.0 - 0.25 / instrument.quality_factor**2)
+    period = 2.0 * np.pi / omega
+    kick = own**2 * abs(force) * period / 2.0
+    # w(0) = w(period) and w'(0) - w'(period) = kick, w = Re(c exp(rate t)) from one impact to the next
+    turn = 1.0 - np.exp(rate * period)
+    sides = np.array([[turn.real, -turn.imag], [(rate * turn).real, -(rate * turn).imag]])
+    c = np.linalg.solve(sides, [0.0, kick])
+    since = (time + np.angle(force) / omega) % period
+    return np.real((c[0] + 1j * c[1]) * np.exp(rate * since))

@@ -1,0 +1,319 @@
+"""`tapping`: what a tapping curve says of a tap, and where its drive allows it of the impact law."""
+
+from dataclasses import replace
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from afm_jax.units import RAD_PER_US_PER_KHZ
+from fitting.tables.csv_text import TableError, printable
+from fitting.tables.table import AmplitudeTable
+from fitting.tapping_curves.branches import changes, free_rows, hardly_touching_rows, held_rows, rough_rows
+from fitting.tapping_curves.constant_energy import ConstantEnergy, fit_constant_energy, plain_instrument, turned
+from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, TappingCurve, free_lag_deg, motion_of
+from fitting.tapping_curves.energy import energies, largest_energies, noise_of
+from fitting.tapping_curves.result import EnergyGroup, MeasuredSpeeds, Tapping, TapRows
+from fitting.tapping_curves.speeds import speeds
+
+LAW_MODEL = "viscous+delay"
+_FEWEST_ROWS = 3
+"""Of a group of rows that gets an energy of its own."""
+_FEWEST_FOR_LAW = 6
+"""Rows with a fast impact: the law has two parameters, its delay three."""
+_SLOWEST = 2.5
+"""In capture speeds."""
+_PULLED = 0.8
+"""Largest share of its speed that lever and drive may give the tip during an impact."""
+_VAGUE = 0.25
+"""Relative error from which a speed counts as not measured."""
+_ORIGIN_NM = 0.3
+"""What the height's origin is uncertain by where the table does not say."""
+
+
+def tapping(table: AmplitudeTable, *, law: bool = True, model: str = LAW_MODEL) -> Tapping:
+    """Return the energy of a tap along a tapping curve, its branches and hysteresis, and the law if rows allow it.
+
+    Args:
+        table: with `drive` "force" or "base"; see `read_table`.
+        law: whether to fit the impact law where the rows allow it (that imports JAX and compiles for half a minute).
+        model: of the law, as for `fit`.
+
+    Raises:
+        TableError: if the table is none of a driven cantilever, or something is missing that no energy can do without.
+    """
+    result = _energies(table, curve_of(table))
+    return with_law(result, model) if law and result.law_allowed else result
+
+
+def curve_of(table: AmplitudeTable) -> TappingCurve:
+    """Return a table's rows as a tapping curve.
+
+    Raises:
+        TableError: if it is a table of another drive, or Q or the spring constant is missing.
+    """
+    name = printable(table.source)
+    if not table.tapping:
+        raise TableError(
+            f"{name}: is a table of a sample that moves; say '# drive = force' (or base) where the cantilever is "
+            "driven, or use `afm-jax fit`"
+        )
+    if table.quality_factor is None:
+        raise TableError(
+            f"{name}: the quality factor is missing; add the line '# quality_factor = 200 +- 2' or "
+            "--quality-factor 200+-2"
+        )
+    if table.spring_constant_n_per_m is None and table.mass_ng == 1.0:
+        raise TableError(
+            f"{name}: the spring constant is missing; add the line '# spring_constant_n_per_m = 5.4 +- 0.5' or "
+            "--spring-constant 5.4+-0.5"
+        )
+    if table.lockin_amplitude_nm is None or table.lockin_amplitude_error_nm is None:
+        raise TableError(f"{name}: there is no lockin_amplitude_nm; the energy needs the lock-in's amplitude and phase")
+    rows = np.isfinite(table.lockin_amplitude_nm)
+    blank = np.full(table.rows, np.nan)
+    lag, lag_error = (blank if part is None else part for part in (table.phase_lag_deg, table.phase_lag_error_deg))
+    spring = Given(table.spring_constant_n_per_m or _stiffness(table), table.spring_constant_error_n_per_m or 0.0)
+    noise = table.lockin_amplitude_error_nm / table.lockin_amplitude_nm
+    zero = table.calibration.get("phase_zero_deg")
+    whole = TappingCurve(
+        source=table.source,
+        drive="base" if table.drive == "base" else "force",
+        offset_nm=table.offset_nm,
+        amplitude_nm=table.lockin_amplitude_nm,
+        amplitude_error_nm=table.lockin_amplitude_error_nm,
+        lag_deg=lag,
+        lag_error_deg=lag_error,
+        free_amplitude_nm=table.excitation_nm,
+        free_amplitude_error=float(np.nanmedian(noise)),
+        drive_frequency_khz=table.drive_frequency_khz,
+        retract=np.zeros(table.rows, bool) if table.retract is None else table.retract == 1.0,
+        both_ways=table.retract is not None,
+        free_frequency_khz=Given(table.free_frequency_khz, table.free_frequency_error_khz or 0.0),
+        quality_factor=Given(table.quality_factor, table.quality_factor_error or 0.0),
+        spring_constant_n_per_m=spring,
+        tip_calibration=Given(*table.calibration.get("tip_calibration", (1.0, 0.0))),
+        phase_zero_deg=None if zero is None else Given(*zero),
+        lines=np.asarray(table.lines),
+    )
+    return whole.part(rows)
+
+
+def _stiffness(table: AmplitudeTable) -> float:
+    return table.mass_ng * (RAD_PER_US_PER_KHZ * table.free_frequency_khz) ** 2
+
+
+def _energies(table: AmplitudeTable, curve: TappingCurve) -> Tapping:
+    """Return everything but the law."""
+    free, held = free_rows(curve), held_rows(curve)
+    given = plain_instrument(curve, free)
+    plain = energies(curve, given)
+    noise = noise_of(curve, plain)
+    departure = turned(curve.lag_deg - free_lag_deg(curve, given))
+    tapping = ~free & ~held & np.isfinite(curve.lag_deg)
+    repulsive = ~free & (departure < 0.0)
+    rough = rough_rows(curve, tapping & repulsive) | rough_rows(curve, tapping & ~repulsive)
+    early = tapping & hardly_touching_rows(motion_of(curve, given))
+    usable = tapping & ~rough & ~early
+    keys, groups = _groups(curve, usable, repulsive)
+    fitted = None
+    if keys:
+        usable &= groups >= 0
+        fitted = fit_constant_energy(curve, np.maximum(groups, 0), tapping=usable, free=free)
+    instrument = given if fitted is None else fitted.instrument
+    at = energies(curve, instrument)
+    bound = None if curve.has_phase else _bound(curve, given, free)
+    energy = plain.energy_aj
+    hysteresis = changes(curve, free=free, repulsive=repulsive, energy=np.where(free, 0.0, at.energy_aj), noise=noise)
+    far = np.zeros(curve.rows, bool) if fitted is None else fitted.outliers
+    notes = _notes(curve, free=free, held=held, rough=rough, early=early, far=far, alone=tapping & (groups < 0))
+    rows = TapRows(
+        state=tuple(_state(free[i], held[i], departure[i]) for i in range(curve.rows)),
+        lag_departure_deg=departure,
+        energy_aj=energy,
+        energy_noise_aj=noise,
+        energy_errors_aj=_errors(curve, given, free),
+        energy_of_fit_aj=at.energy_aj,
+        virial_aj=at.virial_aj,
+        largest_energy_aj=largest_energies(curve, given),
+        used=np.zeros(curve.rows, bool) if fitted is None else fitted.used,
+        note=notes,
+    )
+    named = [EnergyGroup(*key, repulsive=state) for key, state in keys]
+    result = Tapping(
+        table=table,
+        curve=curve,
+        rows=rows,
+        groups=tuple(named),
+        fit=fitted,
+        bound_aj=bound,
+        hysteresis=tuple(hysteresis),
+        speeds=None,
+        versions={name: version(name) for name in ("afm-jax", "numpy", "scipy")},
+    )
+    return result if fitted is None else replace(result, speeds=_speeds(result, fitted))
+
+
+def _groups(
+    curve: TappingCurve, usable: Bool[np.ndarray, " rows"], repulsive: Bool[np.ndarray, " rows"]
+) -> tuple[list[tuple[tuple[float, float], bool]], Int[np.ndarray, " rows"]]:
+    """Return the groups of rows that share an energy (drive, branch), and of every row the number of its own or -1."""
+    groups = np.full(curve.rows, -1)
+    keys = []
+    drives = sorted(set(zip(curve.drive_frequency_khz.tolist(), curve.free_amplitude_nm.tolist(), strict=True)))
+    for drive in drives:
+        of_drive = (curve.drive_frequency_khz == drive[0]) & (curve.free_amplitude_nm == drive[1])
+        for state in (True, False):
+            here = usable & of_drive & (repulsive == state)
+            if here.sum() >= _FEWEST_ROWS:
+                groups[here] = len(keys)
+                keys.append((drive, state))
+    return keys, groups
+
+
+def _state(free: bool, held: bool, departure: float) -> str:  # noqa: FBT001
+    if free:
+        return "free"
+    if held:
+        return "held"
+    if not np.isfinite(departure):
+        return "touching"
+    return "repulsive" if departure < 0.0 else "attractive"
+
+
+def _notes(curve: TappingCurve, **which: Bool[np.ndarray, " rows"]) -> tuple[str, ...]:
+    """Return why each row is not in the fit, or what it is for; the first reason that holds."""
+    said = {
+        "free": "free: fixes the zero of the phase" if curve.has_phase else "free",
+        "held": "set aside: the tip is held, a tenth of the free amplitude is left or less",
+        "silent": "set aside: no phase, only a bound",
+        "rough": "set aside: off the smooth fall of its branch, so probably not one impact a period",
+        "early": "set aside: hardly touching yet, taps need not come every period",
+        "far": "set aside: its energy is more than 4 standard errors from the others'",
+        "alone": f"set aside: fewer than {_FEWEST_ROWS} rows of this branch",
+    }
+    which["silent"] = np.isnan(curve.lag_deg)
+    return tuple(next((words for name, words in said.items() if which[name][i]), "") for i in range(curve.rows))
+
+
+def _errors(curve: TappingCurve, given: Instrument, free: Bool[np.ndarray, " rows"]) -> dict[str, np.ndarray]:
+    """Return by how much each energy changes with one standard error of what all rows share."""
+    known = np.isfinite(curve.lag_error_deg) & free
+    zero = curve.phase_zero_deg.error if curve.phase_zero_deg else 0.0
+    if known.any():
+        zero = float(np.sum(curve.lag_error_deg[known] ** -2.0) ** -0.5)
+    frequency, quality = curve.free_frequency_khz, curve.quality_factor
+    moved = {
+        "free_frequency_khz": given._replace(free_frequency_khz=frequency.value + frequency.error),
+        "quality_factor": given._replace(quality_factor=quality.value + quality.error),
+        "phase_zero_deg": given._replace(phase_zero_deg=given.phase_zero_deg + zero),
+        "free_amplitude": given._replace(free_amplitude_factor=1.0 + curve.free_amplitude_error),
+        "harmonics": given._replace(harmonics_factor=HARMONICS_FACTOR.value + HARMONICS_FACTOR.error),
+    }
+    # with another frequency or Q the free rows fix another zero of the phase
+    for name in ("free_frequency_khz", "quality_factor"):
+        trial = replace(curve, **{name: Given(getattr(moved[name], name))})
+        moved[name] = moved[name]._replace(phase_zero_deg=plain_instrument(trial, free).phase_zero_deg)
+    start = energies(curve, given).energy_aj
+    found = {name: np.abs(energies(curve, at).energy_aj - start) for name, at in moved.items()}
+    found["tip_calibration"] = np.abs(start) * 2.0 * curve.tip_calibration.error / curve.tip_calibration.value
+    found["spring_constant_n_per_m"] = (
+        np.abs(start) * curve.spring_constant_n_per_m.error / curve.spring_constant_n_per_m.value
+    )
+    return found
+
+
+def _bound(curve: TappingCurve, given: Instrument, free: Bool[np.ndarray, " rows"]) -> float | None:
+    """Return the least of the rows' largest energies that hold for every tap of the curve, with 95 % for its errors."""
+    touching = ~free & ~held_rows(curve)
+    if not touching.any():
+        return None
+    largest = largest_energies(curve, given)[touching]
+    share = np.hypot(
+        np.hypot(
+            2.0 * curve.tip_calibration.error / curve.tip_calibration.value,
+            curve.spring_constant_n_per_m.error / curve.spring_constant_n_per_m.value,
+        ),
+        curve.quality_factor.error / curve.quality_factor.value,
+    )
+    return float(np.max(largest) * np.exp(1.645 * share))
+
+
+def _speeds(result: Tapping, fitted: ConstantEnergy) -> MeasuredSpeeds:
+    """Return the impact speeds of the rows fitted, with their errors from noise, calibration and origin of height."""
+    curve, instrument = result.curve, fitted.instrument
+    start = speeds(curve, instrument)
+    table = result.table.calibration
+    origin = table.get("offset_origin_nm", (0.0, _ORIGIN_NM))[1]
+    calibration = curve.tip_calibration
+    moved = [
+        speeds(replace(curve, amplitude_nm=curve.amplitude_nm + curve.amplitude_error_nm), instrument),
+        speeds(replace(curve, lag_deg=curve.lag_deg + curve.lag_error_deg), instrument),
+        speeds(curve, instrument, origin_nm=origin),
+        speeds(curve, instrument, calibration=calibration.value + calibration.error),
+    ]
+    u = start.approach_speed_nm_per_us
+    changes = np.stack([one.approach_speed_nm_per_us - u for one in moved])
+    # a flight that a standard error undoes is no measurement
+    changes = np.where(np.isfinite(changes), changes, np.inf)
+    error = np.sqrt(np.sum(changes**2, axis=0))
+    known = fitted.used & np.isfinite(u) & (error < _VAGUE * u)
+    capture = np.sqrt(2.0 * np.maximum(fitted.energy_aj[np.maximum(result.group_of_rows, 0)], 0.0) / result.mass_ng)
+    in_capture = np.where(known & (capture > 0.0), u / np.where(capture > 0.0, capture, 1.0), np.nan)
+    fast = known & (in_capture >= _SLOWEST) & (np.abs(start.pull) < _PULLED)
+    blank = np.where(known, 1.0, np.nan)
+    return MeasuredSpeeds(
+        approach_speed_nm_per_us=u * blank,
+        approach_speed_error_nm_per_us=error * blank,
+        rebound_speed_nm_per_us=start.rebound_speed_nm_per_us * blank,
+        contact_us=start.contact_us * blank,
+        pull=start.pull * blank,
+        in_capture_speeds=in_capture,
+        fast=fast,
+        why_not=_why_not(curve, fast, known, in_capture, start.pull),
+    )
+
+
+def _why_not(curve: TappingCurve, fast: np.ndarray, known: np.ndarray, in_capture: np.ndarray, pull: np.ndarray) -> str:
+    """Return why the rows do not allow a law, and what to record instead; empty where they do."""
+    if fast.sum() >= _FEWEST_FOR_LAW:
+        return ""
+    s = curve.drive_frequency_khz / curve.free_frequency_khz.value
+    where = f"{s.min():.3f}" if np.ptp(s) < 5e-4 else f"{s.min():.3f} to {s.max():.3f}"
+    f0 = curve.free_frequency_khz.value
+    advice = f"drive 3 to 10 % above resonance ({1.03 * f0:.4g} to {1.1 * f0:.4g} kHz)"
+    if not known.any():
+        what = (
+            "the speed of its impacts cannot be read off this curve: it hangs on the origin of the heights and on the "
+            "calibration far beyond their errors"
+        )
+    elif np.nanmax(in_capture) < _SLOWEST:
+        what = f"its impacts are slow, {np.nanmax(in_capture):.2g} times the capture speed at most"
+    elif not (np.abs(pull[known]) < _PULLED).any():
+        what = "lever and drive change the tip's speed during an impact by as much as it has"
+    else:
+        what = (
+            f"only {int(fast.sum())} rows have fast and brief impacts of known speed, and a law needs {_FEWEST_FOR_LAW}"
+        )
+    return f"driven at {where} of the free frequency, {what}; to get the impact law, {advice}"
+
+
+def with_law(result: Tapping, model: str = LAW_MODEL) -> Tapping:
+    """Return a result with the law fitted to its fast rows."""
+    from fitting.fits.fit import fit  # noqa: PLC0415
+
+    if result.speeds is None:
+        return result
+    chosen = np.isin(np.asarray(result.table.lines), result.curve.lines[result.speeds.fast])
+    return replace(result, law=fit(rows_of(result.table, chosen), model))
+
+
+def rows_of(table: AmplitudeTable, chosen: Bool[np.ndarray, " rows"]) -> AmplitudeTable:
+    """Return the rows chosen of a table."""
+    own: dict[str, Any] = {
+        name: value[chosen]
+        for name, value in vars(table).items()
+        if isinstance(value, np.ndarray) and value.shape == chosen.shape
+    }
+    return replace(table, **own)

@@ -1,0 +1,50 @@
+"""Make the pictures of README and of the pages anew, by the commands that stand beside them: `make pictures`."""
+
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+ROOT = Path(__file__).parent.parent
+PAGES = ROOT / "notebooks" / "pages"
+PICTURES = {
+    "fit": "fit --example --out report",
+    "invert": "invert --example --out report",
+    "chart": "chart figure3 --x platform.reduced_frequency=0.4:4.4:300 --y platform.amplitude_nm=0.1:10:200"
+    " --out chart",
+    "branches": "continue scene.toml --order 1 --parameter platform.amplitude_nm=0.5:6 --out branches",
+    "basins": "basins scene.toml --grid 100x100 --out basins",
+    "collide": "collide --speeds 12,15,20,60 --out collide",
+    "sweep": "sweep sweep.toml --out swept --plot",
+}
+"""The command that writes each picture; scene and sweep files are those of the pages."""
+
+
+def block(page: str, language: str = "toml") -> str:
+    """Return the first block of a language on a page."""
+    found = re.search(
+        rf"^```{language}\n(.*?)^```", (PAGES / page).read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+    )
+    assert found is not None
+    return found.group(1)
+
+
+def main() -> None:
+    """Run the commands in a folder of their own and keep their pictures; names in the call choose some."""
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "scene.toml").write_text(block("first_steps.md"), encoding="utf-8")
+        (folder / "sweep.toml").write_text(block("sweeps.md"), encoding="utf-8")
+        for picture in sys.argv[1:] or PICTURES:
+            arguments = shlex.split(PICTURES[picture])
+            print("afm-jax", *arguments)
+            subprocess.run([sys.executable, "-m", "afm_jax", *arguments], cwd=folder, check=True)
+            made = folder / arguments[arguments.index("--out") + 1] / f"{picture}.png"
+            shutil.copy(made, PAGES / "pictures" / made.name)
+
+
+if __name__ == "__main__":
+    main()

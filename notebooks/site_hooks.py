@@ -1,0 +1,65 @@
+"""What the site's build adds to the pages: notebooks as they ran, commands from their own help, the public names."""
+
+import re
+
+import click
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.plugins import event_priority
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+import afm_jax
+import fitting
+from afm_jax.cli.main import main
+from notebooks.run_notebooks import NOTEBOOKS, ROOT, kept
+
+_KEPT_ELSEWHERE = {
+    "glossary.md": "notebooks/design_notes.md",
+    "adding_a_force.md": "notebooks/adding_a_force.md",
+    "changelog.md": "CHANGELOG.md",
+    "contributing.md": "CONTRIBUTING.md",
+}
+_FROM_AFAR = re.compile(
+    r'<script[^>]*\bsrc="https?://[^>]*>.*?</script>|<script[^>]*>\s*import mermaid.*?</script>', re.DOTALL
+)
+
+
+@event_priority(100)  # before the plugin that turns notebooks into pages
+def on_files(files: Files, config: MkDocsConfig) -> Files:
+    """Add the pages that are made or kept outside the folder of pages."""
+    for path in NOTEBOOKS:
+        place = kept(path)
+        name = f"{place.parent.name}/{place.name}"
+        files.append(File(name, str(place.parent.parent), config.site_dir, config.use_directory_urls))
+    for name, place in _KEPT_ELSEWHERE.items():
+        files.append(File.generated(config, name, abs_src_path=str(ROOT / place)))
+    files.append(File.generated(config, "commands.md", content=commands()))
+    files.append(File.generated(config, "api.md", content=public_names()))
+    return files
+
+
+def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
+    """Leave out what a page of a notebook would fetch from other machines."""
+    del config
+    return _FROM_AFAR.sub("", output) if page.file.src_uri.endswith(".ipynb") else output
+
+
+def commands() -> str:
+    """Return the page of all commands, each with what `--help` prints."""
+    top = click.Context(main, info_name="afm-jax", max_content_width=100, terminal_width=100)
+    parts = ["# Commands", "What `afm-jax COMMAND --help` prints, command by command."]
+    for name in main.list_commands(top):
+        command = main.get_command(top, name)
+        assert command is not None
+        context = click.Context(command, info_name=name, parent=top, max_content_width=100, terminal_width=100)
+        parts.append(f"## {name}\n\n```text\n{command.get_help(context)}\n```")
+    return "\n\n".join(parts)
+
+
+def public_names() -> str:
+    """Return the page of all public names, for mkdocstrings to fill in from their docstrings."""
+    parts = ["# Python reference"]
+    for package, title in ((afm_jax, "afm_jax: scenes and what becomes of them"), (fitting, "fitting: laws from data")):
+        names = sorted(name for name in package.__all__ if not name.startswith("_"))
+        parts += [f"## {title}", *(f"::: {package.__name__}.{name}" for name in names)]
+    return "\n\n".join(parts)

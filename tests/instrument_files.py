@@ -1,0 +1,67 @@
+"""Instruments' files made for tests: a tapping curve that every format holds, and Igor waves byte by byte."""
+
+import struct
+
+import numpy as np
+import pytest
+
+FREE_NM, LAG_DEG, TOUCHES_NM = 40.0, 90.0, -40.0
+
+
+def tapping_rows(points: int = 120, *, retract: bool = False) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return heights (growing towards the tip), amplitudes and lags of a hard sample that the tip meets at -40 nm."""
+    offset = np.linspace(-80.0, -10.0, points)
+    if retract:
+        offset = offset[::-1]
+    noise = 0.02 * np.sin(7.3 * np.arange(points))
+    amplitude = np.minimum(FREE_NM, -offset) + noise
+    return offset, amplitude, LAG_DEG - 0.8 * np.maximum(offset - TOUCHES_NM, 0.0) + 0.1 * noise
+
+
+def igor_wave(columns: dict[str, np.ndarray], note: str, *, order: str = "<") -> bytes:
+    """Return a binary wave of version 5 (WaveMetrics' Technical Note 003): a column for each channel, their labels."""
+    table = np.stack(list(columns.values()), axis=1)
+    data = np.asfortranarray(table).astype(order + "f4").tobytes(order="F")
+    labels = b"".join(name.encode().ljust(32, b"\0") for name in ("", *columns))
+    text = note.encode("latin-1")
+    sizes = [320 + len(data), 0, len(text), 0, 0, 0, 0, 0, 0, len(labels), 0, 0, 0, 0, 0]
+    wave = struct.pack(order + "IIIihh6sh32sii", 0, 0, 0, table.size, 2, 0, b"", 1, b"ramp", 0, 0)
+    wave += struct.pack(order + "4i4d4d4s16s", *table.shape, 0, 0, *[1.0] * 4, *[0.0] * 4, b"", b"")
+    wave = wave.ljust(320, b"\0")
+    head = struct.pack(order + "h", 5)
+    body = struct.pack(order + "15i", *sizes)
+    checked = np.frombuffer(head + b"\0\0" + body + wave, order + "i2").astype(np.int64).sum()
+    return head + struct.pack(order + "h", ((-checked + 32768) % 65536) - 32768) + body + wave + data + text + labels
+
+
+def asylum_ramp(*, order: str = "<") -> bytes:
+    """Return an Asylum ramp of `tapping_rows`, approach and retract, in SI units."""
+    there, back = tapping_rows(), tapping_rows(retract=True)
+    offset, amplitude, lag = (np.concatenate(pair) for pair in zip(there, back, strict=True))
+    columns = {"ZSnsr": 1e-9 * offset, "Amp": 1e-9 * amplitude, "Phase": lag, "Defl": 1e-9 * 0.01 * offset}
+    note = "SpringConstant: 5.4\rInvOLS: 1.1e-07\rAmpInvOLS: 1.2e-07\rDriveFrequency: 90000\rThermalFrequency: 90000\r"
+    note += "ThermalQ: 200\rFreeAirAmplitude: 0.33333\rFreeAirPhase: 90\rIndexes: 0,119,239\rDirection: NaN,1,-1\r"
+    return igor_wave(columns, note, order=order)
+
+
+def nanonis_ramp() -> str:
+    """Return a Nanonis Z ramp of `tapping_rows`: heights that grow away from the sample, forward and backward."""
+    offset, amplitude, lag = tapping_rows()
+    names = ["Z rel (m)", "Amplitude (m)", "Phase (deg)", "Amplitude [bwd] (m)", "Phase [bwd] (deg)"]
+    rows = zip(-1e-9 * offset, 1e-9 * amplitude, lag, 1e-9 * amplitude, lag, strict=True)
+    lines = ["Experiment\tZ spectroscopy\t", "f0 (Hz)\t90000\t", "", "[DATA]", "\t".join(names)]
+    return "\n".join([*lines, *("\t".join(f"{cell:.9E}" for cell in row) for row in rows)]) + "\n"
+
+
+def gwyddion_bytes() -> bytes:
+    """Return a Gwyddion file with two graphs of `tapping_rows`, as the package gwyfile writes them."""
+    gwyfile = pytest.importorskip("gwyfile.objects")
+    offset, amplitude, lag = tapping_rows()
+    content = gwyfile.GwyContainer()
+    for number, (title, unit, numbers) in enumerate((("Amplitude", "m", 1e-9 * amplitude), ("Phase", "deg", lag))):
+        data = {"xdata": 1e-9 * offset, "ydata": numbers, "description": title}
+        curve = gwyfile.GwyObject("GwyGraphCurveModel", data)
+        units = {f"{side}_unit": gwyfile.GwySIUnit(unitstr=one) for side, one in (("x", "m"), ("y", unit))}
+        graph = gwyfile.GwyObject("GwyGraphModel", {"title": title, "curves": [curve], **units}, {"curves": "O"})
+        content[f"/0/graph/graph/{number + 1}"] = graph
+    return b"GWYP" + content.serialize()

@@ -1,0 +1,60 @@
+"""A sweep whose points are plain sums, for tests of what happens around them; and a program that runs one."""
+
+import json
+import os
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from afm_jax.sweeps.axes import Axis
+from afm_jax.sweeps.plan import Columns, Recorder, SweepPlan, Variable, plan_of
+from afm_jax.sweeps.sweep import run_plan
+
+SIZES = (7, 12)
+"""Of the axes; the chunks of ten points do not fill them evenly."""
+
+
+def recorder(given: Mapping[str, Any], axes: Sequence[Axis]) -> Recorder:  # noqa: ARG001
+    """Return what adds a tenth of y to x; slowly if asked for, and telling in a folder which process does."""
+    record = given["record"]
+
+    def work(columns: Columns) -> Columns:
+        time.sleep(record.get("seconds", 0.0))
+        if "told" in record:
+            (Path(record["told"]) / f"{os.getpid()}").touch()
+        found = columns["x"] + 0.1 * columns["y"]
+        return {"sum_nm": np.where(found < 2.0, np.nan, found), "large": found > 4.0, "parts": np.stack([found] * 2, 1)}
+
+    variables = (
+        Variable("sum_nm", "x and a tenth of y"),
+        Variable("large", "it is above 4", "bool"),
+        Variable("parts", "the same twice", dimensions=("part",)),
+    )
+    return Recorder(variables, work, points=10, extra={"part": [1.0, 2.0]})
+
+
+def plan(*, chunk: int | None = None, last: float = 11.0, **record: Any) -> SweepPlan:
+    """Return a plan of sums."""
+    axes = [
+        {"parameter": "x", "linear": [0.0, 6.0, SIZES[0]]},
+        {"parameter": "y", "linear": [0.0, last, SIZES[1]]},
+    ]
+    return plan_of({"builder": "tests.sweep_numbers:recorder", "axes": axes, "record": record, "chunk": chunk})
+
+
+def contents(folder: Path) -> dict[str, bytes]:
+    """Return everything in a sweep's folder but its lock."""
+    files = [path for path in folder.rglob("*") if path.is_file() and path.name != "lock"]
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
+
+
+if __name__ == "__main__":
+    # python -m tests.sweep_numbers FOLDER WORKERS '{"seconds": 0.1}'
+    jax.config.update("jax_enable_x64", True)  # noqa: FBT003
+    done = run_plan(plan(**json.loads(sys.argv[3])), Path(sys.argv[1]), workers=int(sys.argv[2]))
+    sys.stdout.write(json.dumps({"kept": len(done.kept.done), "computed": done.computed}) + "\n")

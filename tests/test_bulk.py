@@ -1,0 +1,107 @@
+"""Many fits at once: each is that of its table alone, whatever the instrument, the draw and the process."""
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner, Result
+
+import fitting
+from afm_jax.cli.main import main
+from afm_jax.sweeps.plan import plan_of
+from fitting.bulk import _drawn, _table_of, _with_instrument, table_input
+from fitting.tables.table import AmplitudeTable, read_table, write_table
+
+AXIS = {"parameter": "table.quality_factor", "list": [38.0, 42.0]}
+
+
+def table(scale: float = 1.0) -> AmplitudeTable:
+    """Return the bundled table of an instantaneous law, amplitudes scaled."""
+    bundled = read_table(Path(str(fitting.__file__)).parent / "examples" / "amplitudes_law.csv")
+    assert bundled.peak_amplitude_nm is not None
+    return replace(bundled, peak_amplitude_nm=scale * bundled.peak_amplitude_nm)
+
+
+def test_a_table_survives_the_way_to_a_worker():
+    given = plan_of(table_input([table()], {})).given["tables"][0]
+    there = vars(_table_of(given))
+    for name, value in vars(table()).items():
+        np.testing.assert_array_equal(there[name], value)
+
+
+def test_draws_and_instruments_change_what_they_say():
+    plain = table()
+    drawn = _drawn(plain, (1, 2, 3))
+    assert drawn.peak_amplitude_nm is not None
+    assert plain.peak_amplitude_nm is not None
+    assert plain.peak_amplitude_error_nm is not None
+    pulls = (drawn.peak_amplitude_nm - plain.peak_amplitude_nm) / plain.peak_amplitude_error_nm
+    assert 0.5 < np.nanstd(pulls) < 1.5
+    np.testing.assert_array_equal(_drawn(plain, (1, 2, 3)).peak_amplitude_nm, drawn.peak_amplitude_nm)
+    other = _with_instrument(plain, {"table.quality_factor": 30.0, "table.tip_calibration": 1.1})
+    assert (other.quality_factor, other.free_frequency_khz) == (30.0, plain.free_frequency_khz)
+    assert other.peak_amplitude_nm is not None
+    np.testing.assert_allclose(other.peak_amplitude_nm, 1.1 * plain.peak_amplitude_nm, rtol=1e-15)
+    np.testing.assert_array_equal(other.drive_amplitude_nm, plain.drive_amplitude_nm)
+
+
+@pytest.mark.parametrize(
+    ("record", "axes", "message"),
+    [
+        ({"what": "orbits"}, [], 'only `what` = "fit" can be recorded'),
+        ({"modle": "law"}, [], "unknown key modle of 'fit'; it has model"),
+        ({"resamples": 0}, [], "`resamples` must be a positive whole number"),
+        ({}, [{"parameter": "interaction.r", "linear": [0.1, 0.2, 3]}], "interaction.r cannot be an axis of tables"),
+        ({}, [AXIS | {"list": [-1.0]}], "table.quality_factor must be positive"),
+    ],
+)
+def test_impossible_sweeps_over_tables_are_named(record: dict, axes: list, message: str):
+    with pytest.raises(ValueError, match=message):
+        plan_of(table_input([table()], record, axes=axes))
+
+
+@pytest.fixture
+def fit() -> Callable[..., Result]:
+    return lambda *arguments: CliRunner().invoke(main, ["fit", *map(str, arguments)], prog_name="afm-jax")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["a.csv", "b.csv"], "2 tables: add --each to fit each by itself"),
+        (["a.csv", "--workers", "2"], "--workers is about several tables: add --each"),
+        (["a.csv", "--each", "--compare"], "--compare is about one table: leave --each out"),
+        (["a.csv", "--each"], "a.csv"),
+    ],
+)
+def test_wrong_calls_are_one_line(fit: Callable[..., Result], arguments: list[str], message: str):
+    result = fit(*arguments)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+@pytest.mark.slow
+def test_every_fit_is_that_of_its_table_alone(tmp_path: Path, fit: Callable[..., Result]):
+    tables = [table(), table(1.02)]
+    found = fitting.fit_each(tables, "law", axes=[AXIS], out=tmp_path / "kept")
+    for number, own in enumerate(tables):
+        alone = fitting.fit(replace(own, quality_factor=42.0), "law")
+        there = found.isel(table=number).sel(table_quality_factor=42.0)
+        for name in ("r", "epsilon"):
+            parameter = alone.parameters[name]
+            wanted = parameter.value, parameter.standard_error, *parameter.interval95
+            told = [float(there[name + ending]) for ending in ("", "_error", "_low", "_high")]
+            np.testing.assert_array_equal(told, [np.nan if part is None else part for part in wanted])
+        assert float(there["chi2"]) == alone.chi2
+    files = [tmp_path / f"{number}.csv" for number in range(2)]
+    for own, path in zip(tables, files, strict=True):
+        write_table(own, path)
+    result = fit("--each", *files, "--model", "law", "--workers", 1, "--out", tmp_path / "out")
+    assert result.exit_code in (0, 3), result.stderr
+    told = (tmp_path / "out" / "fits.csv").read_text().splitlines()
+    assert told[0].startswith("table,outcome,r,r_error,r_low,r_high,epsilon,")
+    values = [float(line.split(",")[2]) for line in told[1:]]
+    assert values == [fitting.fit(own, "law").parameters["r"].value for own in tables]

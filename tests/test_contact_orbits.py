@@ -1,0 +1,90 @@
+"""Orbits of resolved contacts against an integration of their own (`reference_driven_contact`)."""
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import afm_jax as afm
+from afm_jax.cli.main import main
+from afm_jax.dynamics.contact_orbits import contact_orbits
+from tests.reference_driven_contact import DrivenContact, follow
+from tests.strict_reading import strictly
+
+pytestmark = pytest.mark.slow
+AMPLITUDE_NM, FREQUENCY_KHZ = 4.0, 181.8
+SYSTEM = DrivenContact(amplitude_nm=AMPLITUDE_NM, drive_frequency_khz=FREQUENCY_KHZ)
+PERIOD_US, OMEGA = 1e3 / FREQUENCY_KHZ, 2e-3 * np.pi * FREQUENCY_KHZ
+
+
+@pytest.fixture(scope="module")
+def scene():
+    platform = afm.Platform(amplitude_nm=AMPLITUDE_NM, frequency_khz=FREQUENCY_KHZ)
+    return afm.Scene(afm.Cantilever(frequency_khz=90.0, quality_factor=40.0), platform, afm.Contact.paper())
+
+
+@pytest.fixture(scope="module")
+def found(scene):
+    return contact_orbits(scene, 1, 1)
+
+
+def next_departure(time_us: float, velocity: float) -> np.ndarray:
+    """Return time and velocity in the lab at the end of the contact after a departure, by the reference."""
+    gap = SYSTEM.contact.bridge_breaks_nm
+    course = follow(SYSTEM, time_us, AMPLITUDE_NM * np.cos(OMEGA * time_us) + gap, velocity, contacts=1)
+    last = course.contacts[-1]
+    rate = -AMPLITUDE_NM * OMEGA * np.sin(OMEGA * last.departure_time_us)
+    return np.array([last.departure_time_us, last.rebound_speed_nm_per_us + rate])
+
+
+def test_a_stable_orbit_and_a_saddle_near_capture_close_in_the_reference(found):
+    assert found.stable.tolist() == [True, False]
+    assert found.reading.missing.max() < 1e-10
+    # from another simulation (the table of the delay)
+    assert found.reading.peak_amplitude_nm[0] == pytest.approx(98.7, rel=2e-3)
+    for phase, velocity in zip(
+        found.reading.phase_rad[:, 0], found.reading.velocity_after_nm_per_us[:, 0], strict=True
+    ):
+        time = float(phase) / OMEGA
+        later = next_departure(time, float(velocity))
+        assert later[0] - time == pytest.approx(PERIOD_US, abs=1e-7)
+        assert later[1] == pytest.approx(float(velocity), rel=1e-7)
+
+
+def test_the_multipliers_are_those_of_differences_in_the_reference(found):
+    for index in range(2):
+        time = float(found.reading.phase_rad[index, 0]) / OMEGA
+        velocity = float(found.reading.velocity_after_nm_per_us[index, 0])
+        steps = np.array([1e-4, 1e-3]) if index == 0 else np.array([1e-5, 1e-4])
+        columns = [
+            (next_departure(time + one[0], velocity + one[1]) - next_departure(time - one[0], velocity - one[1]))
+            / (2.0 * step)
+            for step, one in zip(steps, np.diag(steps), strict=True)
+        ]
+        matrix = np.stack(columns, axis=1)
+        assert np.trace(matrix) == pytest.approx(float(found.reading.trace[index]), rel=2e-4)
+        assert np.linalg.det(matrix) == pytest.approx(float(found.reading.determinant[index]), rel=2e-4)
+
+
+def test_orbits_of_a_contact_scene_are_told_by_the_command(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(
+        "[cantilever]\nfrequency_khz = 90\nquality_factor = 40\nmass_ng = 1\n[platform]\namplitude_nm = 4\n"
+        'frequency_khz = 181.8\n[interaction]\nmodel = "contact"\n',
+        encoding="utf-8",
+    )
+    result = CliRunner().invoke(main, ["orbits", str(path), "--order", "1", "--json"])
+    assert result.exit_code == 0, result.stderr
+    told = strictly(result.stdout)
+    first = told["orbits"][0]
+    assert first["stable"]
+    assert first["peak_amplitude_nm"] == pytest.approx(98.56, abs=0.01)
+    assert first["impacts"][0]["delay_us"] == pytest.approx(0.078, abs=1e-3)
+    assert told["sticking"] is None
+
+
+def test_scenes_without_a_contact_and_numbers_that_are_none_are_refused(scene):
+    law = afm.Scene(scene.cantilever, scene.platform, afm.ImpactLaw(r=0.998, epsilon=122.0))
+    with pytest.raises(TypeError, match="many_impact_orbits"):
+        contact_orbits(law, 1, 1)
+    with pytest.raises(ValueError, match="`impacts` must be a positive integer"):
+        contact_orbits(scene, 1, 0)

@@ -1,0 +1,403 @@
+"""Instruments' files: the real ones completely, the others against their writers; traps named; damage in one line."""
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import fitting.instruments.formats as formats_module
+from afm_jax.cli.main import main
+from fitting import TableError, read_curve, read_curves
+from fitting.instruments.curve import free_lag_deg, parse_columns, table_text
+from fitting.instruments.formats import read_recording
+from tests.instrument_files import asylum_ramp, gwyddion_bytes, igor_wave, nanonis_ramp, tapping_rows
+from tests.strict_reading import strictly
+
+REAL = Path(__file__).parent.parent / "fitting" / "examples" / "real"
+AMPLITUDES, FORCES = (REAL / f"tapping_{what}_wsxm.f.curves" for what in ("amplitude", "normal_force"))
+NEASNOM, THERMAL = REAL / "tapping_approach_neasnom.txt", REAL / "thermal_nanosurf.nid"
+HEAD = "offset_nm,lockin_amplitude_nm,phase_lag_deg\n"
+
+
+def saved(folder: Path, data: bytes | str, name: str = "curve.dat") -> Path:
+    path = folder / name
+    path.write_bytes(data.encode() if isinstance(data, str) else data)
+    return path
+
+
+def separated(columns: dict[str, np.ndarray], sign: str = ",", decimal: str = ".") -> str:
+    rows = [
+        sign.join(f"{cell:.6f}".replace(".", decimal) for cell in row) for row in zip(*columns.values(), strict=True)
+    ]
+    return "\n".join([sign.join(columns), *rows]) + "\n"
+
+
+def given(column: np.ndarray | None) -> np.ndarray:
+    assert column is not None
+    return column
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(main, ["read", *(str(argument) for argument in arguments)])
+
+
+# ---- the real files
+
+
+def test_neasnom_text_is_read_completely():
+    lines = NEASNOM.read_text("utf-8").split("\n")
+    head = next(number for number, line in enumerate(lines) if line.startswith("Row"))
+    names = lines[head].split("\t")
+    wanted = np.loadtxt(NEASNOM, skiprows=head + 1, usecols=range(len(names) - 1))
+    curve = read_curve(NEASNOM)
+    assert len(curve.offset_nm) == len(wanted) == 200
+    np.testing.assert_allclose(given(curve.amplitude), wanted[:, names.index("M1A")], rtol=1e-15)
+    lag = np.rad2deg(np.unwrap(wanted[:, names.index("M1P")]))
+    np.testing.assert_allclose(given(curve.phase_lag_deg), lag, rtol=1e-12)
+    # heights grow towards the tip, from an origin of their own
+    heights = 1e9 * wanted[:, names.index("Z")]
+    np.testing.assert_allclose(np.diff(curve.offset_nm), -np.diff(heights), atol=1e-10)
+    assert set(curve.branch) == {"retract"}
+    assert curve.number("drive_frequency_khz") == 264.13261
+    assert curve.known["drive_frequency_khz"].origin == "header: Tip Frequency:"
+    assert {"free_frequency_khz", "quality_factor", "spring_constant_n_per_m"} == set(curve.missing)
+    # the amplitude falls by more than the height rises: its scale is off
+    assert curve.slope == (pytest.approx(-1.37, abs=0.02), pytest.approx(0.018, abs=0.01))
+    assert any("falls by 1.37" in note for note in curve.notes)
+    assert curve.number("free_amplitude_nm") == pytest.approx(77.26, abs=0.02)
+    rescaled = read_curve(NEASNOM, nm_per_volt="slope")
+    assert rescaled.number("free_amplitude_nm") == pytest.approx(56.4, abs=0.3)
+
+
+@pytest.mark.parametrize("path", [AMPLITUDES, FORCES])
+def test_wsxm_curves_are_read_completely(path: Path):
+    curves = read_curves(path)
+    assert [(len(c.offset_nm), int(np.sum(c.branch == "approach"))) for c in curves] == [(1024, 512)] * 5
+    last = struct.unpack("<2048d", path.read_bytes()[-16384:])
+    recorded = read_recording(path).segments[-2:]
+    pairs = np.concatenate([np.stack(list(segment.channels.values()), axis=1) for segment in recorded])
+    np.testing.assert_array_equal(pairs.ravel(), last)
+    heights = np.array(last[::2])
+    assert curves[4].offset_nm - curves[4].offset_nm[0] == pytest.approx(heights - heights[0], abs=1e-12)
+    known = {key: curves[0].number(key) for key in ("free_frequency_khz", "quality_factor", "spring_constant_n_per_m")}
+    assert known == {"free_frequency_khz": 89.7046, "quality_factor": 201.854, "spring_constant_n_per_m": 5.33904}
+
+
+def test_wsxm_curves_whose_free_amplitude_jumps_are_refused_by_name():
+    curves = read_curves(AMPLITUDES)
+    assert [curve.valid for curve in curves] == [True, False, False, False, True]
+    assert "3.513 V in the approach and 2.854 V in the retract" in curves[1].reasons[1]
+    # tapping at 1.08 to 1.12 V/nm, on a channel that is inverted
+    assert all(-1.13 < curve.slope[0] < -1.08 for curve in curves if curve.slope is not None)
+    assert "nm_per_volt" in curves[0].missing
+    assert any("inverted channel" in note for note in curves[0].notes)
+    with pytest.raises(TableError, match=r"--nm-per-volt NM_PER_V\|slope"):
+        table_text(curves[0])
+    force = read_curves(FORCES)[0]
+    assert force.amplitude is None
+    assert force.deflection is not None
+    assert (force.deflection_unit, float(force.deflection.min())) == ("V", pytest.approx(-0.755, abs=1e-3))
+
+
+def test_a_nanosurf_spectrum_is_what_their_own_package_reads():
+    recording = read_recording(THERMAL)
+    channels = recording.segments[0].channels
+    assert {len(numbers) for numbers in channels.values()} == {8369}
+    assert recording.known["spring_constant_n_per_m"].value == 27.13
+    assert recording.known["quality_factor"].value == 442.0
+    assert recording.known["temperature_k"].value == pytest.approx(313.15)
+    np.testing.assert_allclose(channels["Frequency"], np.arange(8369) * 319214.0 / 8368.0, rtol=1e-14)
+    with pytest.raises(TableError, match="holds a thermal spectrum"):
+        read_curve(THERMAL)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_nanosurf_force_curves_are_what_their_own_package_reads():
+    package = pytest.importorskip("NSFopen")
+    path = Path(package.__file__).parent / "example" / "Force_Spectroscopy" / "spectroscopy.nid"
+    if not path.exists():
+        pytest.skip("this release of NSFopen comes without its example")
+    theirs = pytest.importorskip("NSFopen.read").read(str(path)).data["Spec"]
+    segments = read_recording(path).segments
+    assert len(segments) == 200
+    for segment in (segments[0], segments[3], segments[-1]):
+        way = {"approach": "Forward", "retract": "Backward"}[segment.branch]
+        for name in ("Z-Axis Sensor", "Deflection"):
+            np.testing.assert_allclose(segment.channels[name], theirs[way][name][segment.curve - 1], rtol=1e-12)
+    curve = read_curve(path, curve=2)
+    assert (curve.deflection_unit, curve.amplitude) == ("nN", None)
+
+
+# ---- formats of which no real file is at hand
+
+
+@pytest.mark.parametrize("order", ["<", ">"])
+def test_asylum_ramps_are_read_with_their_note(tmp_path: Path, order: str):
+    pytest.importorskip("igor2")
+    curve = read_curve(saved(tmp_path, asylum_ramp(order=order), "ramp.ibw"), drive="force")
+    offset, amplitude, lag = tapping_rows()
+    assert [int(np.sum(curve.branch == name)) for name in ("approach", "retract")] == [120, 120]
+    # 32-bit numbers
+    np.testing.assert_allclose(given(curve.amplitude)[:120], amplitude, rtol=2e-7)
+    np.testing.assert_allclose(given(curve.phase_lag_deg)[:120], lag, atol=0.01)
+    np.testing.assert_allclose(curve.offset_nm[:120], offset, atol=0.3)
+    wanted = {
+        "spring_constant_n_per_m": (5.4, "N/m", "note: SpringConstant"),
+        "free_frequency_khz": (90.0, "kHz", "note: ThermalFrequency"),
+        "quality_factor": (200.0, "", "note: ThermalQ"),
+        "drive_frequency_khz": (90.0, "kHz", "note: DriveFrequency"),
+        "deflection_nm_per_volt": (110.0, "nm/V", "note: InvOLS"),
+        "nm_per_volt": (120.0, "nm/V", "note: AmpInvOLS"),
+        "free_amplitude_nm": (39.9996, "nm", "note: FreeAirAmplitude, taken in V, times AmpInvOLS"),
+    }
+    for key, (value, unit, origin) in wanted.items():
+        known = curve.known[key]
+        assert (known.value, known.unit, known.origin) == (pytest.approx(value, rel=1e-12), unit, origin)
+    assert curve.missing == ()
+
+
+def test_gwyddion_graphs_are_read(tmp_path: Path):
+    _, amplitude, lag = tapping_rows()
+    path = saved(tmp_path, gwyddion_bytes(), "curve.gwy")
+    curve = read_curve(path, drive_frequency_khz=90.0, free_frequency_khz=90.0, quality_factor=200.0, drive="force")
+    np.testing.assert_allclose(given(curve.amplitude), amplitude, rtol=1e-12)
+    np.testing.assert_allclose(given(curve.phase_lag_deg), lag, atol=0.01)
+    assert curve.known["drive"].origin == "option --drive"
+
+
+def test_nanonis_ramps_are_read_both_ways(tmp_path: Path):
+    curve = read_curve(saved(tmp_path, nanonis_ramp()))
+    offset, amplitude, _ = tapping_rows()
+    assert [int(np.sum(curve.branch == name)) for name in ("approach", "retract")] == [120, 120]
+    np.testing.assert_allclose(given(curve.amplitude)[:120], amplitude, rtol=1e-9)
+    np.testing.assert_allclose(curve.offset_nm[:120], offset, atol=0.3)
+    assert curve.number("free_frequency_khz") == 90.0
+    assert any("grows away from the sample" in note for note in curve.notes)
+
+
+@pytest.mark.parametrize(("sign", "decimal"), [(",", "."), ("\t", "."), (";", ","), (";", ".")])
+def test_separated_text_with_units_in_the_names(tmp_path: Path, sign: str, decimal: str):
+    offset, amplitude, lag = tapping_rows()
+    columns = {"Z [um]": 1e-3 * offset, "Amp (nm)": amplitude, "Phase/rad": np.deg2rad(lag)}
+    curve = read_curve(saved(tmp_path, separated(columns, sign, decimal)))
+    np.testing.assert_allclose(given(curve.amplitude), amplitude, atol=1e-6)
+    np.testing.assert_allclose(given(curve.phase_lag_deg), lag, atol=1e-4)
+    np.testing.assert_allclose(np.diff(curve.offset_nm), np.diff(offset), atol=1e-2)
+    # where the amplitude begins to fall the sample is one free amplitude below the rest position
+    assert curve.offset_nm[0] == pytest.approx(offset[0], abs=0.3)
+
+
+def test_a_column_map_names_channels_units_and_factors(tmp_path: Path):
+    offset, amplitude, lag = tapping_rows()
+    columns = {"a": -1e-3 * offset, "b": 0.01 * amplitude, "c": -lag}
+    path = saved(tmp_path, separated(columns, ";"))
+    with pytest.raises(TableError, match="no height among the channels a, b, c; say --columns offset_nm=CHANNEL:UNIT"):
+        read_curve(path)
+    wanted = "offset_nm=a:um:-1,lockin_amplitude_nm=b:V,phase_lag_deg=c:-1"
+    curve = read_curve(path, columns=wanted)
+    assert (curve.amplitude_unit, "nm_per_volt" in curve.missing) == ("V", True)
+    curve = read_curve(path, columns=wanted, nm_per_volt=(100.0, 2.0))
+    # six decimals of hundredths
+    np.testing.assert_allclose(given(curve.amplitude), amplitude, atol=1e-4)
+    np.testing.assert_allclose(given(curve.phase_lag_deg), lag, atol=1e-5)
+    assert "# tip_calibration = 1 +- 0.02\n" in table_text(
+        read_curve(path, columns=wanted, nm_per_volt=(100.0, 2.0), drive_frequency_khz=90.0, free_frequency_khz=90.0)
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("offset_nm", "is no COLUMN=CHANNEL"),
+        ("height=Z", "there is no column `height`; it is one of offset_nm, lockin_amplitude_nm"),
+        ("offset_nm=Z:V", "`V` is no unit of offset_nm; write one of m, mm, um, nm, pm"),
+        ("offset_nm=Z:0", "is no COLUMN=CHANNEL"),
+        ("offset_nm=Z:2:3", "is no COLUMN=CHANNEL"),
+    ],
+)
+def test_wrong_column_maps_are_named(text: str, said: str):
+    with pytest.raises(ValueError, match=said):
+        parse_columns(text)
+
+
+# ---- what the numbers say themselves
+
+
+def test_the_zero_of_the_phase_is_that_of_the_free_rows(tmp_path: Path):
+    offset, amplitude, lag = tapping_rows()
+    path = saved(tmp_path, separated({"Z (nm)": offset, "Amp (nm)": amplitude, "Phase (deg)": lag - 33.0}))
+    known: dict[str, Any] = {"drive_frequency_khz": 92.7, "free_frequency_khz": 90.0, "quality_factor": 200.0}
+    for drive in ("force", "base"):
+        ratio = 92.7 / 90.0
+        gamma = 1.0 - ratio**2 + 1j * ratio / 200.0
+        wanted = np.angle(gamma) if drive == "force" else np.angle(gamma / (1.0 - gamma))
+        curve = read_curve(path, drive=drive, curve=1, **known)
+        assert np.median(given(curve.phase_lag_deg)[curve.free]) == pytest.approx(np.rad2deg(wanted), abs=1e-9)
+    assert free_lag_deg("base", 1.0, 200.0) == pytest.approx(90.286, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("factor", "said"),
+    [(np.sqrt(0.5), "an rms amplitude would"), (2.0, "a peak-to-peak amplitude would"), (1.3, "is off")],
+)
+def test_a_gain_that_is_off_shows_in_the_slope(tmp_path: Path, factor: float, said: str):
+    offset, amplitude, _ = tapping_rows()
+    curve = read_curve(saved(tmp_path, separated({"Z (nm)": offset, "Amp (nm)": factor * amplitude})))
+    assert any(said in note for note in curve.notes), curve.notes
+
+
+def test_heights_that_run_the_other_way_are_refused(tmp_path: Path):
+    offset, amplitude, _ = tapping_rows()
+    curve = read_curve(saved(tmp_path, separated({"Z (nm)": -offset, "Amp (nm)": amplitude})))
+    assert "the heights run the other way" in curve.reasons[0]
+
+
+def test_a_ramp_there_and_back_is_parted_where_it_turns(tmp_path: Path):
+    there, back = tapping_rows(), tapping_rows(80, retract=True)
+    offset, amplitude = (np.concatenate([there[k], back[k]]) for k in (0, 1))
+    curve = read_curve(saved(tmp_path, separated({"Z (nm)": offset, "Amp (nm)": amplitude})))
+    assert curve.branch.tolist() == ["approach"] * 120 + ["retract"] * 80
+
+
+# ---- wrong and damaged files
+
+
+@pytest.mark.parametrize(
+    ("data", "said"),
+    [
+        (b"", "the file is empty"),
+        (b"\x00\x01\x02 what", "is neither text nor a known format"),
+        (b"hello\n", "columns separated by tabs, semicolons or commas are expected"),
+        (HEAD.encode(), "there are column names but no rows of numbers"),
+        (HEAD.encode() + b"1,2,3\n2,3\n", "line 3: there are 2 cells for 3 columns"),
+        (HEAD.encode() + b"1,2,3\n2,x,4\n", "row 2, channel lockin_amplitude_nm: is not a number"),
+        (b"WSxM file copyright UAM\r\n", r"no '\[Header end\]'"),
+        (b"[DataSet]\r\nVersion=2\r\n", "the mark '#!' in front of the data is missing"),
+        (b"GWYP", "damaged or cut off"),
+    ],
+)
+def test_wrong_files_are_one_line(tmp_path: Path, data: bytes, said: str):
+    with pytest.raises(TableError, match=said) as caught:
+        read_curves(saved(tmp_path, data))
+    assert "\n" not in str(caught.value)
+
+
+def test_what_reads_a_format_is_named_where_it_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def missing(name: str):
+        raise ModuleNotFoundError(name=name)
+
+    monkeypatch.setattr(formats_module, "import_module", missing)
+    with pytest.raises(
+        TableError, match=r"read by the package igor2; install it with: pip install 'afm-jax\[instruments\]'"
+    ):
+        read_curves(saved(tmp_path, asylum_ramp(), "ramp.ibw"))
+
+
+def damaged(data: bytes, random: np.random.Generator) -> bytes:
+    """Return a file cut off or with flipped bits, most of them in its header."""
+    if random.random() < 0.4:
+        return data[: random.integers(0, len(data))]
+    flipped = bytearray(data)
+    for _ in range(random.integers(1, 6)):
+        place = random.integers(0, min(len(data), 4000 if random.random() < 0.7 else len(data)))
+        flipped[place] ^= 1 << random.integers(0, 8)
+    return bytes(flipped)
+
+
+@pytest.mark.parametrize("kind", ["neasnom", "wsxm", "nid", "ibw", "gwy", "nanonis", "csv"])
+def test_damaged_files_never_end_in_a_traceback(tmp_path: Path, kind: str, capfd: pytest.CaptureFixture[str]):
+    random = np.random.default_rng(20260)
+    offset, amplitude, lag = tapping_rows()
+    whole = {
+        "neasnom": NEASNOM.read_bytes,
+        "wsxm": AMPLITUDES.read_bytes,
+        "nid": THERMAL.read_bytes,
+        "ibw": asylum_ramp,
+        "gwy": gwyddion_bytes,
+        "nanonis": lambda: nanonis_ramp().encode(),
+        "csv": lambda: separated({"Z (nm)": offset, "Amp (nm)": amplitude, "Phase (deg)": lag}, ";").encode(),
+    }[kind]()
+    for _ in range(40):
+        path = saved(tmp_path, damaged(whole, random), f"curve.{kind}")
+        fault = fault_of(path)
+        assert not fault or (str(path) in fault and "\n" not in fault)
+    assert capfd.readouterr() == ("", "")
+
+
+def fault_of(path: Path) -> str:
+    """Return the message of a file that is refused; of one that is read its numbers are checked."""
+    try:
+        curves = read_curves(path)
+    except TableError as error:
+        return str(error)
+    assert all(np.all(np.isfinite(curve.offset_nm)) for curve in curves)
+    return ""
+
+
+# ---- the command
+
+
+def test_the_command_asks_for_what_is_missing_and_writes_the_table(tmp_path: Path):
+    out = tmp_path / "new" / "table.csv"
+    result = run(NEASNOM, "--out", out)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert "the file does not say free_frequency_khz; give --free-frequency-khz KHZ" in result.stderr
+    numbers = ["--free-frequency-khz", "264 +- 0.05", "--quality-factor", "500", "--spring-constant", "40 +- 4"]
+    result = run(NEASNOM, "--out", out, "--drive", "force", *numbers)
+    assert result.exit_code == 0, result.stderr
+    lines = out.read_text("utf-8").splitlines()
+    assert lines[:4] == [
+        "# drive = force",
+        "# free_frequency_khz = 264.0 +- 0.05",
+        "# quality_factor = 500.0",
+        "# spring_constant_n_per_m = 40.0 +- 4.0",
+    ]
+    head = next(line for line in lines if not line.startswith("#")).split(",")
+    assert {"drive_frequency_khz", "free_amplitude_nm", "offset_nm", "lockin_amplitude_nm", "phase_lag_deg"} <= set(
+        head
+    )
+    rows = [line.split(",") for line in lines if line[0] in "0123456789"]
+    assert len(rows) == 200
+    assert float(rows[0][head.index("lockin_amplitude_nm")]) == 70.7583
+
+
+def test_refused_curves_end_with_exit_code_3_beside_the_tables_of_the_others(tmp_path: Path):
+    result = run(AMPLITUDES, "--json", "--nm-per-volt", "slope", "--out", tmp_path / "wsxm.csv")
+    assert result.exit_code == 3
+    assert "refused curve 2, 3, 4" in result.stderr
+    answer = strictly(result.stdout)
+    assert (answer["format"], [curve["valid"] for curve in answer["curves"]]) == (
+        "afm-jax read",
+        [True, False, False, False, True],
+    )
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["wsxm_1.csv", "wsxm_5.csv"]
+    # the amplitude in contact is an offset of the detector, in part below zero
+    assert "rows whose amplitude is not above zero" in (tmp_path / "wsxm_1.csv").read_text("utf-8")
+    assert run(AMPLITUDES, "--curve", 1).exit_code == 0
+    assert run(AMPLITUDES, "--curve", 9).exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--free-frequency-khz", "-1"], "`free_frequency_khz` must be finite and above 0"),
+        (["--columns", "offset_nm=Q:nm"], "there is no channel `Q` for offset_nm; it has Z, M0A"),
+        (["--columns", "offset_nm"], "is no COLUMN=CHANNEL"),
+        (["--nm-per-volt", "steep"], "steep"),
+    ],
+)
+def test_wrong_calls_are_one_line(arguments: list[str], said: str):
+    result = run(NEASNOM, *arguments)
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert said in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+
+
+def test_a_wave_that_is_no_ramp_is_named(tmp_path: Path):
+    pytest.importorskip("igor2")
+    data = igor_wave({"Amp": np.ones(8)}, "")
+    with pytest.raises(TableError, match="no height among the channels Amp"):
+        read_curve(saved(tmp_path, data, "one.ibw"))

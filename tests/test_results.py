@@ -1,0 +1,296 @@
+"""Every public result says itself, is drawn, becomes a table, comes back from its file; no class can be forgotten."""
+
+import collections.abc
+import dataclasses
+import enum
+import inspect
+import json
+import math
+import types
+import typing
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pandas as pd
+import pytest
+
+import afm_jax as afm
+import fitting
+from afm_jax import results, saved
+from afm_jax.impact.map import NextImpact
+from afm_jax.motion.record import State
+from tests.fit_tables import EXAMPLE
+from tests.fresh_python import python
+from tests.strict_reading import strictly
+
+PARAMETERS = {
+    "BaseDrive",
+    "Cantilever",
+    "CollisionDelay",
+    "Contact",
+    "ForceDrive",
+    "ImpactLaw",
+    "Platform",
+    "Scene",
+    "Tone",
+}
+"""What a simulation is made of, and scene files hold."""
+SIZES = {"rows": 7, "points": 5, "p": 2, "columns": 3, "orders": 2, "scenes": 21}
+
+
+def public_results() -> dict[str, Any]:
+    """Return every class of records that the packages export, or that one of their functions returns."""
+    found = {}
+    for package in (afm, fitting):
+        for name in package.__all__:
+            public = getattr(package, name)
+            kinds = [public]
+            if inspect.isfunction(public):
+                kinds = [inspect.signature(public).return_annotation]
+            for kind in kinds:
+                record = inspect.isclass(kind) and (dataclasses.is_dataclass(kind) or hasattr(kind, "_fields"))
+                if record and kind.__name__ not in PARAMETERS:
+                    found[kind.__name__] = kind
+    return found
+
+
+RESULTS = public_results()
+SOME: Any = State
+"""What the decorator adds is not known to type checkers."""
+
+
+def made(kind: Any, draw: np.random.Generator) -> Any:
+    """Return a record of a class with random numbers of the shapes that its annotations tell, some of them NaN."""
+    hints = results._annotations(kind)
+    names = kind._fields if hasattr(kind, "_fields") else [field.name for field in dataclasses.fields(kind)]
+    return saved._built(kind, {name: of_hint(hints[name], draw) for name in names})
+
+
+def of_hint(hint: Any, draw: np.random.Generator) -> Any:  # noqa: C901, PLR0911, PLR0912
+    if isinstance(hint, str):
+        return None
+    if isinstance(hint, types.UnionType):
+        return of_hint(typing.get_args(hint)[0], draw)
+    if hasattr(hint, "dim_str"):
+        return array_of(hint, draw)
+    origin, inner = typing.get_origin(hint), typing.get_args(hint)
+    if origin is tuple:
+        return tuple(of_hint(each, draw) for each in inner if each is not Ellipsis)
+    if origin is list:
+        return [of_hint(inner[0], draw) for _ in range(3)]
+    if origin in (dict, collections.abc.Mapping):
+        return {name: of_hint(inner[1], draw) for name in ("one", "two")}
+    if origin is collections.abc.Callable or hint is Any:
+        return None
+    if hint is np.ndarray:
+        return draw.normal(size=5)
+    if hint is bool:
+        return True
+    if hint is int:
+        return 3
+    if hint is float:
+        return [0.1, math.nan, math.inf][draw.integers(3)]
+    if hint is str:
+        return 'words, with "signs"\nand lines'
+    if inspect.isclass(hint) and issubclass(hint, enum.Enum):
+        return next(iter(hint))
+    return (
+        made(hint, draw)
+        if inspect.isclass(hint) and (dataclasses.is_dataclass(hint) or hasattr(hint, "_fields"))
+        else None
+    )
+
+
+def array_of(hint: Any, draw: np.random.Generator) -> np.ndarray:
+    words = hint.dim_str.split()
+    shape = (4,) if "..." in words else tuple(int(word) if word.isdigit() else SIZES.get(word, 4) for word in words)
+    kinds = set(hint.dtypes)
+    if any("bool" in kind for kind in kinds):
+        return draw.random(shape) < 0.5
+    if any("int" in kind for kind in kinds):
+        return np.zeros(shape, int)
+    numbers = draw.normal(size=shape) * 10.0 ** draw.integers(-9, 9, shape)
+    if any("complex" in kind for kind in kinds):
+        return numbers + 1j * numbers
+    numbers.flat[0] = math.nan
+    numbers.flat[-1] = -math.inf
+    return numbers
+
+
+def same(one: Any, other: Any) -> bool:
+    """Say whether two records are the same to the last bit, NaN where NaN is."""
+    if saved.is_record(one):
+        own, its = dict(saved.fields_of(one)), dict(saved.fields_of(other))
+        return type(one) is type(other) and own.keys() == its.keys() and all(same(own[name], its[name]) for name in own)
+    if isinstance(one, dict):
+        return one.keys() == other.keys() and all(same(one[name], other[name]) for name in one)
+    if isinstance(one, list | tuple):
+        return type(one) is type(other) and len(one) == len(other) and all(map(same, one, other))
+    if isinstance(one, np.ndarray | jax.Array):
+        return isinstance(other, type(one)) and one.dtype == other.dtype and np.array_equal(one, other, equal_nan=True)
+    if isinstance(one, float):
+        return isinstance(other, float) and (one == other or (math.isnan(one) and math.isnan(other)))
+    return callable(one) or (type(one) is type(other) and one == other)
+
+
+def test_there_are_as_many_results_as_there_should_be():
+    assert len(RESULTS) >= 30
+    assert {"FitResult", "Simulation", "Collision", "Basins", "TimeCourse", "Continuation", "Posterior"} <= set(RESULTS)
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_a_result_says_itself_in_a_few_lines(name: str):
+    record = made(RESULTS[name], np.random.default_rng(3))
+    lines = repr(record).splitlines()
+    assert lines[0] == f"{name}:"
+    assert len(lines) <= results.MOST_LINES
+    assert max(map(len, lines)) <= 160
+    page = record._repr_html_()
+    assert page.startswith("<table>")
+    assert "with &quot;signs" in page or "words" not in page
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_a_result_comes_back_from_its_file(name: str, tmp_path: Path):
+    record = made(RESULTS[name], np.random.default_rng(4))
+    if hasattr(record, "to_dict"):
+        # what its command writes is made from real results elsewhere
+        payload = {"format": saved.FORMAT, "format_version": 1, **saved._record(record, name)}
+        (tmp_path / "result.json").write_text(saved.strict_json(payload))
+    else:
+        record.save(tmp_path / "result.json")
+    payload = strictly((tmp_path / "result.json").read_text())
+    assert (payload["format"], payload["format_version"], payload["type"]) == ("afm-jax result", 1, name)
+    assert same(record, afm.load(tmp_path / "result.json"))
+
+
+@pytest.mark.parametrize("name", RESULTS)
+def test_a_result_becomes_a_data_set(name: str):
+    record = made(RESULTS[name], np.random.default_rng(5))
+    data = record.to_xarray()
+    numbers = [value for _, value in saved.fields_of(record) if isinstance(value, np.ndarray)]
+    assert len(data) >= len(numbers)
+    assert all(variable.attrs["units"] == results.unit_of(key) for key, variable in data.items() if variable.attrs)
+
+
+def test_arrays_of_one_shape_are_columns_and_units_are_told():
+    table = SOME(np.arange(3.0), np.zeros(3), np.ones(3)).to_pandas()
+    assert list(table.columns) == ["time_us", "position_nm", "velocity_nm_per_us"]
+    assert table["velocity_nm_per_us"].tolist() == [1.0, 1.0, 1.0]
+    assert SOME(np.zeros((2, 3)), np.zeros((2, 3)), np.zeros((2, 3))).to_pandas().index.nlevels == 2
+    assert SOME(np.arange(3.0), np.zeros(3), np.ones(3)).to_xarray()["velocity_nm_per_us"].units == "nm/us"
+
+
+def test_outcomes_are_words_and_traced_values_and_shapes_can_be_told():
+    zeros = jnp.zeros(3)
+    many: Any = NextImpact(zeros, zeros, zeros, zeros, jnp.array([0, 0, 1]), jnp.zeros(3, bool))
+    assert "2 impact, 1 captured" in repr(many)
+    told = []
+    jax.jit(lambda x: told.append(repr(SOME(x, x, x))))(np.zeros((2, 3)))
+    assert "float64[2,3]" in told[0]
+    assert "float64[4]" in repr(jax.eval_shape(lambda: SOME(*(jnp.zeros(4),) * 3)))
+    with pytest.raises(ValueError, match=r"State.time_us is traced: save a result outside `jit`"):
+        jax.jit(lambda x: SOME(x, x, x).save("never.json"))(1.0)
+
+
+@pytest.mark.parametrize(
+    ("text", "wrong"),
+    [
+        ("{", "is no JSON"),
+        ("{}", "is no saved result"),
+        ('{"format": "afm-jax result", "format_version": 2, "type": "State", "fields": {}}', "update afm-jax"),
+        ('{"format": "afm-jax result", "format_version": 1, "type": "Path", "fields": {}}', "no record called Path"),
+        (
+            '{"format": "afm-jax result", "format_version": 1, "type": "State", "fields": {"a": 1}}',
+            "cannot be read|read here",
+        ),
+    ],
+)
+def test_other_files_are_refused(tmp_path: Path, text: str, wrong: str):
+    path = tmp_path / "other.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=wrong):
+        fitting.load(path)
+
+
+def test_a_file_written_once_is_read_for_ever(tmp_path: Path):
+    # the layout of version 1, written by hand: it must not change
+    (tmp_path / "old.json").write_text(
+        '{"format": "afm-jax result", "format_version": 1, "type": "State", "fields": {"time_us": 0.1, "position_nm": '
+        '{"array": "float64", "shape": [2], "values": [null, "inf"]}, "velocity_nm_per_us": {"number": null}}}'
+    )
+    state = afm.load(tmp_path / "old.json")
+    assert state.time_us == 0.1
+    assert np.array_equal(state.position_nm, [math.nan, math.inf], equal_nan=True)
+    assert math.isnan(state.velocity_nm_per_us)
+
+
+def test_results_need_neither_pandas_nor_xarray_nor_matplotlib():
+    code = (
+        "import sys, jax; jax.config.update('jax_enable_x64', True)\n"
+        "import afm_jax\nrepr(afm_jax.State(0.0, 0.0, 0.0))\nafm_jax.State(0.0, 0.0, 0.0).save('/dev/null')\n"
+        "print({'pandas', 'xarray', 'matplotlib'} & set(sys.modules))\nsys.modules['xarray'] = None\n"
+        "try:\n    afm_jax.State(0.0, 0.0, 0.0).to_xarray()\nexcept ModuleNotFoundError as error:\n    print(error)"
+    )
+    first, second = python(code).splitlines()
+    assert first == "set()"
+    assert "pip install 'afm-jax[xarray]'" in second
+
+
+def test_a_table_of_pandas_is_an_amplitude_table_and_back():
+    table: Any = fitting.read_table(EXAMPLE)
+    frame = table.to_pandas()
+    assert isinstance(frame, pd.DataFrame)
+    again = fitting.AmplitudeTable.from_dataframe(frame)
+    for name, value in saved.fields_of(table):
+        if name not in ("lines", "remarks"):
+            assert same(value, getattr(again, name)), name
+    bare = frame[["order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm", "peak_amplitude_nm"]].copy()
+    bare.attrs = {}
+    noisy: Any = fitting.AmplitudeTable.from_dataframe(bare, noise=0.01, free_frequency_khz=90.0)
+    assert noisy.peak_amplitude_error_nm == pytest.approx(0.01 * table.peak_amplitude_nm, rel=1e-15)
+    with pytest.raises(fitting.TableError, match="free_frequency_khz is missing"):
+        fitting.AmplitudeTable.from_dataframe(bare, noise=0.01)
+    with pytest.raises(fitting.TableError, match="there is no column 'peak'"):
+        fitting.AmplitudeTable.from_dataframe(frame.rename(columns={"peak_amplitude_nm": "peak"}))
+
+
+def test_both_packages_tell_type_checkers_that_they_are_typed():
+    for package in (afm, fitting):
+        assert (Path(package.__path__[0]) / "py.typed").exists()
+
+
+@pytest.mark.slow
+def test_results_of_computations_come_back_with_pictures(tmp_path: Path):
+    table: Any = fitting.read_table(EXAMPLE)
+    scene = afm.Scene(afm.Cantilever(90.0, 40.0), afm.Platform(4.0, 180.0), afm.ImpactLaw(0.95, 60.0))
+    fitted: Any = fitting.fit(table.to_pandas())
+    found: dict[str, Any] = {
+        "fit": fitted,
+        "inversion": fitting.invert(table),
+        "design": fitting.design(
+            fitting.believe("law", free_frequency_khz=90.0, quality_factor=40.0),
+            fitting.drive_grid(
+                orders=(1,), amplitudes_nm=(2.0, 4.0), offsets_nm=(0.0,), detunings=(0.98, 1.0), free_frequency_khz=90.0
+            ),
+            points=2,
+        ),
+        "orbits": afm.single_impact_orbits(scene, 1),
+        "simulation": afm.simulate(scene, SOME(0.0, 10.0, 0.0), 100.0),
+        "collision": afm.collide(afm.Contact.paper(), np.array([8.0, 20.0, 30.0])),
+    }
+    for name, record in found.items():
+        path = tmp_path / f"{name}.json"
+        record.save(path)
+        again = fitting.load(path)
+        assert same(record, again), name
+        assert repr(again) == repr(record)
+        assert len(repr(record).splitlines()) <= results.MOST_LINES
+        record.plot(tmp_path / f"{name}.png")
+        assert (tmp_path / f"{name}.png").stat().st_size > 5000
+        assert len(record.to_pandas())
+    payload = json.loads((tmp_path / "fit.json").read_text())
+    assert payload["parameters"]["r"]["value"] == fitted.parameters["r"].value

@@ -1,0 +1,162 @@
+"""The site: whole, strict, nothing fetched from other machines; its search and the sliders work in a browser."""
+
+import os
+import re
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+import yaml
+
+from notebooks.make_pictures import PICTURES
+from notebooks.run_notebooks import NOTEBOOKS
+
+ROOT = Path(__file__).parent.parent
+CHROMIUM = next(
+    (place for name in ("chromium", "chromium-browser", "google-chrome") if (place := shutil.which(name))), ""
+)
+needs_browser = pytest.mark.skipif(not (CHROMIUM and find_spec("playwright")), reason="no Chromium, or no playwright")
+UNTESTED_NOTEBOOKS = """
+import shutil, sys
+from pathlib import Path
+import notebooks.run_notebooks as notebooks
+folder = Path(sys.argv.pop(1)) / "gallery"
+folder.mkdir()
+notebooks.kept = lambda path: Path(shutil.copy(path, folder / path.name))
+from mkdocs.__main__ import cli
+cli()
+"""
+"""mkdocs, with the notebooks as they are stored: what they show when they run is `tests/test_notebooks.py`'s."""
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("site")
+    command = [
+        "build",
+        "--strict",
+        "--quiet",
+        "--config-file",
+        "notebooks/mkdocs.yml",
+        "--site-dir",
+        str(folder / "site"),
+    ]
+    done = subprocess.run(
+        [sys.executable, "-c", UNTESTED_NOTEBOOKS, str(folder), *command],
+        cwd=ROOT,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    return folder / "site"
+
+
+def test_every_notebook_and_page_is_in_the_table_of_contents():
+    listed = str(yaml.safe_load((ROOT / "notebooks" / "mkdocs.yml").read_text(encoding="utf-8"))["nav"])
+    gallery = (ROOT / "notebooks" / "pages" / "gallery" / "index.md").read_text(encoding="utf-8")
+    for notebook in NOTEBOOKS:
+        assert f"gallery/{notebook.name}" in listed
+        assert f"({notebook.name})" in gallery
+
+
+def test_pictures_stand_beside_their_commands():
+    pages = ROOT / "notebooks" / "pages"
+    text = " ".join(" ".join(page.read_text(encoding="utf-8") for page in pages.glob("*.md")).split())
+    assert {path.stem for path in (pages / "pictures").glob("*.png")} == set(PICTURES)
+    for picture, command in PICTURES.items():
+        assert f"(pictures/{picture}.png)" in text
+        assert f"`afm-jax {command}`" in text
+
+
+@pytest.mark.slow
+def test_nothing_is_fetched_from_other_machines(site: Path):
+    pages = list(site.rglob("*.html"))
+    assert len(pages) > 25
+    for page in pages:
+        text = page.read_text(encoding="utf-8")
+        assert not re.search(r"<(?:script|link|img|iframe)\b[^>]*(?:src|href)=\"?https?://", text), page
+    assert "capture_speed" in (site / "api.html").read_text(encoding="utf-8")
+    assert "--scale-errors" in (site / "commands.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+@needs_browser
+def test_search_works_from_disk(site: Path):
+    from playwright.sync_api import sync_playwright  # noqa: PLC0415
+
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        page = browser.new_page()
+        asked: list[str] = []
+        page.on("request", lambda request: asked.append(request.url))
+        page.goto((site / "index.html").as_uri())
+        page.locator("input.md-search__input").press_sequentially("capture speed")
+        page.locator(".md-search-result__item").first.wait_for(timeout=60_000)
+        browser.close()
+    assert {url.partition(":")[0] for url in asked} <= {"file", "data", "blob", "about"}
+
+
+def _wait_for(port: int, seconds: float = 120.0) -> None:
+    """Wait until a server answers."""
+    end = time.monotonic() + seconds
+    while True:
+        try:
+            socket.create_connection(("127.0.0.1", port), timeout=10).close()
+        except OSError:
+            assert time.monotonic() < end
+            time.sleep(0.5)
+        else:
+            return
+
+
+@pytest.mark.slow
+@needs_browser
+@pytest.mark.skipif(not find_spec("jupyterlab"), reason="no JupyterLab; tests/test_notebooks.py runs the page without")
+def test_sliders_move_the_picture_in_jupyterlab(tmp_path: Path):
+    from playwright.sync_api import sync_playwright  # noqa: PLC0415
+
+    shutil.copy(ROOT / "notebooks" / "sliders.ipynb", tmp_path)
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    address = f"http://127.0.0.1:{port}/"
+    options = ["--no-browser", "--allow-root", "--IdentityProvider.token=", "--ServerApp.ip=127.0.0.1"]
+    with (tmp_path / "messages.txt").open("w") as messages:
+        server = subprocess.Popen(
+            [
+                sys.executable,
+                "-m",
+                "jupyterlab",
+                *options,
+                f"--ServerApp.port={port}",
+                f"--ServerApp.root_dir={tmp_path}",
+            ],
+            env={**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])},
+            stderr=messages,
+        )
+    try:
+        _wait_for(port)
+        with sync_playwright() as playwright:
+            browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+            page = browser.new_page(viewport={"width": 1400, "height": 1000})
+            page.goto(f"{address}lab/tree/sliders.ipynb?reset")
+            page.get_by_text("Python 3 (ipykernel) | Idle").wait_for(timeout=120_000)
+            page.locator(".lm-MenuBar-itemLabel", has_text="Run").first.click()
+            page.locator(".lm-Menu-itemLabel", has_text="Run All Cells").first.click()
+            picture = page.locator("img.widget-image, .widget-image img").first
+            picture.wait_for(timeout=120_000)
+            before = picture.get_attribute("src")
+            page.locator(".noUi-handle").nth(1).focus()
+            page.keyboard.press("ArrowRight")
+            page.wait_for_function("([image, old]) => image.src !== old", arg=[picture.element_handle(), before])
+            browser.close()
+    finally:
+        server.send_signal(signal.SIGTERM)
+        server.wait(timeout=60)

@@ -1,0 +1,252 @@
+"""Sweeps for real: against the functions they record, over devices and processes, killed, on a full disk."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+import xarray
+from click.testing import CliRunner
+
+import afm_jax
+from afm_jax.cli.main import main
+from afm_jax.dynamics.exponents import lyapunov_spectrum
+from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
+from afm_jax.scenefile.presets import preset
+from afm_jax.sweeps.sweep import run_plan, sweep
+from tests.fresh_python import python
+from tests.kills import ROOT, killed, survive
+from tests.sweep_numbers import contents, plan
+
+FREQUENCY, AMPLITUDE = "platform.reduced_frequency", "platform.amplitude_nm"
+PLANE = [
+    {"parameter": AMPLITUDE, "linear": [1.0, 8.0, 9]},
+    {"parameter": FREQUENCY, "linear": [0.8, 2.2, 15]},
+]
+NUMBERS = [sys.executable, "-m", "tests.sweep_numbers"]
+
+
+@pytest.fixture(autouse=True)
+def same_flags_after(monkeypatch: pytest.MonkeyPatch):
+    """Take back what the command tells JAX before it starts."""
+    monkeypatch.setenv("XLA_FLAGS", os.environ.get("XLA_FLAGS", ""))
+
+
+@pytest.mark.slow
+def test_orbits_are_those_of_single_impact_orbits():
+    scene = preset("figure2")
+    found = sweep(scene, PLANE, {"what": "orbits", "orders": [1, 2]})
+    family = jax.jit(scene_family(scene, AMPLITUDE, FREQUENCY))
+    seen = 0
+    for row in (2, 5, 8):
+        for column in range(0, 15, 2):
+            at = found.isel(platform_amplitude_nm=row, platform_reduced_frequency=column)
+            values = float(at["platform_amplitude_nm"]), float(at["platform_reduced_frequency"])
+            for order in (1, 2):
+                there, orbits = at.sel(order=float(order)), afm_jax.single_impact_orbits(family(*values), order)
+                good = np.asarray(orbits.admissible & orbits.stable)
+                assert int(there["stable_orbits"]) == good.sum()
+                assert int(there["admissible_orbits"]) == np.asarray(orbits.admissible).sum()
+                if not good.any():
+                    assert np.isnan(there["peak_amplitude_nm"])
+                    continue
+                slot = int(np.argmax(np.where(good, orbits.peak_amplitude_nm, -np.inf)))
+                for name in ("peak_amplitude_nm", "lockin_amplitude_nm", "approach_speed_nm_per_us", "phase_rad"):
+                    # rounding, enlarged where the orbit is close to a fold
+                    np.testing.assert_allclose(there[name], getattr(orbits, name)[slot], rtol=1e-8)
+                seen += 1
+    assert seen > 10
+
+
+@pytest.mark.slow
+def test_collisions_and_exponents_are_those_of_their_functions():
+    contact = preset("figure8")
+    axes = [
+        {"parameter": "approach_speed_nm_per_us", "list": [12.0, 30.0, 100.0]},
+        {"parameter": "interaction.relative_humidity", "linear": [0.3, 0.5, 2]},
+    ]
+    found = sweep(contact, axes, "collide")
+    alone = afm_jax.collide(afm_jax.Contact.paper(relative_humidity=0.5), np.array([12.0, 30.0, 100.0]))
+    for name in ("rebound_speed_nm_per_us", "collision_delay_us", "viscous_loss_aj"):
+        np.testing.assert_allclose(found[name].values[:, 1], getattr(alone, name), rtol=1e-9)
+    assert not found["captured"].any()
+    scene = preset("figure2")
+    values = np.linspace(1.2, 1.6, 3)
+    axes = [{"parameter": FREQUENCY, "linear": [1.2, 1.6, 3]}]
+    found = sweep(scene, axes, {"what": "lyapunov", "impacts": 100, "transient": 50})
+    alone = lyapunov_spectrum(scene_batch(scene, {FREQUENCY: values}), impacts=100, transient=50)
+    np.testing.assert_allclose(found["exponents_per_impact"], alone.exponents_per_impact, rtol=1e-9)
+    np.testing.assert_array_equal(found["kind"], alone.verdicts.kind)
+
+
+@pytest.mark.slow
+def test_simulations_are_those_of_the_command(tmp_path: Path):
+    (tmp_path / "sweep.toml").write_text(
+        f'scene = "figure2"\n[record]\nwhat = "simulation"\nperiods = 300\n[[axes]]\nparameter = "{AMPLITUDE}"\n'
+        "list = [4.0, 8.0]\n"
+    )
+    run = CliRunner().invoke(main, ["sweep", str(tmp_path / "sweep.toml"), "--out", str(tmp_path), "--workers", "1"])
+    assert run.exit_code == 0, run.stderr
+    found = xarray.open_zarr(str(tmp_path / "sweep.zarr")).load()
+    afm_jax.save_scene(scene_family(preset("figure2"), AMPLITUDE)(8.0), tmp_path / "scene.toml")
+    told = json.loads(
+        CliRunner()
+        .invoke(main, ["simulate", str(tmp_path / "scene.toml"), "--periods", "300", "--until-settled", "--json"])
+        .stdout
+    )
+    for name in ("peak_amplitude_nm", "lockin_amplitude_nm", "dissipated_in_contact_aj"):
+        np.testing.assert_allclose(found[name].values[1], told[name], rtol=1e-9)
+    assert bool(found["settled"][1]) == told["settled"]
+    assert int(found["order"][1]) == told["order"]
+
+
+ON_DEVICES = """
+import hashlib, sys, jax
+jax.config.update("jax_enable_x64", True)
+from afm_jax.scenefile.presets import preset
+from afm_jax.sweeps.sweep import sweep
+from tests.test_sweep import PLANE
+found = sweep(preset("figure2"), PLANE, "orbits", chunk=int(sys.argv[1]) if len(sys.argv) > 1 else None)
+data = b"".join(found[name].values.tobytes() for name in sorted(map(str, found.data_vars)))
+print(len(jax.devices()), hashlib.sha256(data).hexdigest())
+"""
+
+
+@pytest.mark.slow
+def test_two_devices_give_the_bits_of_one():
+    flags = os.environ.get("XLA_FLAGS", "")
+    one = python(ON_DEVICES, XLA_FLAGS=flags).split()
+    two = python(ON_DEVICES, XLA_FLAGS=f"{flags} --xla_force_host_platform_device_count=2").split()
+    assert (one[0], two[0]) == ("1", "2")
+    assert one[1] == two[1]
+
+
+@pytest.mark.slow
+def test_four_workers_give_the_bytes_of_one(tmp_path: Path):
+    axes = [{"parameter": AMPLITUDE, "linear": [1.0, 8.0, 5]}, PLANE[1]]
+    for workers in (1, 4):
+        sweep(preset("figure2"), axes, "orbits", out=tmp_path / str(workers), chunk=15, workers=workers)
+    assert contents(tmp_path / "1") == contents(tmp_path / "4")
+
+
+@pytest.mark.slow
+def test_a_killed_worker_costs_nothing_but_time(tmp_path: Path):
+    run_plan(plan(), tmp_path / "whole")
+    told = tmp_path / "told"
+    told.mkdir()
+    victims = []
+
+    def kill() -> None:
+        until = time.monotonic() + 120.0
+        while not victims and time.monotonic() < until:
+            done = len(list((tmp_path / "out" / "done").glob("*.json")))
+            victims.extend(int(path.name) for path in list(told.iterdir())[:1] if done >= 2)
+            time.sleep(0.05)
+        os.kill(victims[0], signal.SIGKILL)
+
+    thread = threading.Thread(target=kill)
+    thread.start()
+    done = run_plan(plan(seconds=0.4, told=str(told)), tmp_path / "out", workers=2)
+    thread.join()
+    assert done.computed == 14
+    # two workers, and the one that took the place of the killed one
+    assert len(list(told.iterdir())) == 3
+    found, whole = (xarray.open_zarr(str(tmp_path / name / "sweep.zarr")).load() for name in ("out", "whole"))
+    assert found.drop_attrs().identical(whole.drop_attrs())
+
+
+@pytest.mark.slow
+def test_a_sweep_killed_twice_ends_in_the_same_bytes(tmp_path: Path):
+    settings = json.dumps({"seconds": 0.1})
+    for name in ("whole", "killed"):
+        (tmp_path / name).mkdir()
+    assert not killed([*NUMBERS, str(tmp_path / "whole"), "1", settings], tmp_path / "whole", 99, 0.0)
+    line = [*NUMBERS, str(tmp_path / "killed"), "1", settings]
+    counts = survive(line, tmp_path / "killed", times=2, chunks=14, seed=3)
+    assert sum(counts) == 14
+    assert contents(tmp_path / "whole") == contents(tmp_path / "killed")
+
+
+FULL = """
+mount -t tmpfs -o size=400k tmpfs "$1" || exit 77
+"$2" -m afm_jax sweep "$3" --out "$1" --workers 1 --json && exit 1
+echo "code $?"
+mount -o remount,size=8m "$1"
+"$2" -m afm_jax sweep "$3" --out "$1" --workers 1 --json
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("unshare") is None, reason="needs a file system of its own")
+def test_a_disk_that_is_full_in_fact(tmp_path: Path):
+    (tmp_path / "disk").mkdir()
+    (tmp_path / "sweep.toml").write_text(
+        'scene = "figure2"\nchunk = 20\n[record]\nwhat = "orbits"\n'
+        f'[[axes]]\nparameter = "{FREQUENCY}"\nlinear = [0.8, 2.2, 300]\n'
+    )
+    line = ["unshare", "-rm", "sh", "-c", FULL, "sh", str(tmp_path / "disk"), sys.executable]
+    done = subprocess.run([*line, str(tmp_path / "sweep.toml")], cwd=ROOT, capture_output=True, text=True, check=False)
+    if done.returncode == 77 or "unshare" in done.stderr:
+        pytest.skip("this machine lends no file system")
+    assert "No space left on device" in done.stderr, done.stderr
+    assert "of 15 chunks are kept; mend that, and give the same command again" in done.stderr
+    code, told = done.stdout.splitlines()[-2:]
+    assert code == "code 2"
+    found = json.loads(told)
+    assert found["chunks_kept"] + found["chunks_computed"] == 15
+    assert found["chunks_kept"] > 0
+
+
+def complaint(tmp_path: Path, text: str, *options: str) -> str:
+    """Return what the command says of a sweep file; it must say one line."""
+    (tmp_path / "sweep.toml").write_text(text)
+    result = CliRunner().invoke(main, ["sweep", str(tmp_path / "sweep.toml"), *options], prog_name="afm-jax")
+    assert result.exit_code == 2, result.output
+    lines = result.stderr.splitlines()
+    assert len(lines) == 1
+    return lines[0]
+
+
+ORBITS = '[record]\nwhat = "orbits"\n'
+AXIS = '[[axes]]\nparameter = "platform.amplitude_nm"\nlinear = [1, 2, 3]\n'
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("scene =", "not TOML"),
+        ("scenes = 1", "unknown key scenes; a sweep has scene, tables, axes, record, accuracy, chunk"),
+        (ORBITS, 'give scene = "scene.toml", or tables'),
+        ('scene = "figure2"', "[record] is missing"),
+        (f'scene = "figure2"\n{ORBITS}', "a sweep needs at least one axis"),
+        (f'scene = "nothing.toml"\n{ORBITS}{AXIS}', "nothing.toml: there is no such file"),
+        (f'scene = "figure2"\n[record]\nwhat = "amplitudes"\n{AXIS}', "`what` must be one of orbits, collide"),
+        (f'scene = "figure2"\n{ORBITS}order = 1\n{AXIS}', "unknown key order of 'orbits'; it has orders"),
+        (f'scene = "figure2"\n{ORBITS}orders = [0]\n{AXIS}', "`orders` must be a list of positive whole numbers"),
+        (f'scene = "figure2"\n{ORBITS}{AXIS.replace("amplitude", "amplitud")}', "did you mean platform.amplitude_nm?"),
+        (f'scene = "figure2"\n{ORBITS}{AXIS.replace("[1, 2", "[-1, 2")}', "`amplitude_nm` must not be negative"),
+        (f'scene = "figure2"\naccuracy = 1e-6\n{ORBITS}{AXIS}', "leave `accuracy` out"),
+        (f'scene = "figure2"\nchunk = 0\n{ORBITS}{AXIS}', "`chunk` must be a positive whole number"),
+        (f'scene = "figure2"\n[record]\nwhat = "collide"\n{AXIS}', "is about a resolved contact"),
+    ],
+)
+def test_a_wrong_sweep_is_one_line(tmp_path: Path, text: str, message: str):
+    assert message in complaint(tmp_path, text, "--out", str(tmp_path / "out"))
+
+
+def test_wrong_options_are_one_line(tmp_path: Path):
+    text = f'scene = "figure2"\n{ORBITS}{AXIS}'
+    assert "--out is missing" in complaint(tmp_path, text)
+    out = ("--out", str(tmp_path / "out"))
+    assert "--scheduler has workers of its own" in complaint(tmp_path, text, *out, "--workers", "2", "--scheduler", "a")
+    assert "computes nothing to --plot" in complaint(tmp_path, text, "--dry-run", "--plot")
+    three = text + AXIS.replace("amplitude_nm", "offset_nm") + AXIS.replace("amplitude_nm", "reduced_frequency")
+    assert "one or two axes, but this has 3" in complaint(tmp_path, three, *out, "--plot")

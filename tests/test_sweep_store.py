@@ -1,0 +1,214 @@
+"""What a sweep keeps, and how it goes on after faults; its points are plain sums, so that nothing is compiled."""
+
+import errno
+import json
+import multiprocessing
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+import xarray
+from scipy.stats import qmc
+
+from afm_jax.sweeps.axes import axes_of
+from afm_jax.sweeps.store import STORE, SweepStore, locked
+from afm_jax.sweeps.sweep import dataset_of, estimate, run_plan
+from tests.sweep_numbers import SIZES, contents, plan
+
+X, Y = np.linspace(0.0, 6.0, SIZES[0]), np.linspace(0.0, 11.0, SIZES[1])
+SUM = X[:, None] + 0.1 * Y
+
+
+def test_results_open_with_xarray_alone(tmp_path: Path):
+    done = run_plan(plan(), tmp_path)
+    assert (done.chunks, done.computed) == (14, 14)
+    found = xarray.open_zarr(str(tmp_path / STORE)).load()
+    np.testing.assert_array_equal(found["sum_nm"], np.where(SUM < 2.0, np.nan, SUM))
+    np.testing.assert_array_equal(found["large"], SUM > 4.0)
+    np.testing.assert_array_equal(found["parts"].sel(part=2.0), SUM)
+    np.testing.assert_array_equal(found["x"], X)
+    assert found["computed"].values.all()
+    assert found["large"].dtype == bool
+    assert found["sum_nm"].attrs == {"long_name": "x and a tenth of y", "units": "nm"}
+    given = json.loads(found.attrs["input"])
+    assert given["axes"][1] == {"parameter": "y", "linear": [0.0, 11.0, 12]}
+    assert {"jax", "afm-jax", "numpy"} <= set(given["versions"])
+
+
+def test_results_do_not_depend_on_chunks():
+    whole = dataset_of(plan(), None)
+    for chunk in (5, 84):
+        assert whole.drop_attrs().identical(dataset_of(plan(chunk=chunk), None).drop_attrs())
+    assert plan(chunk=30).block == (2, 12)
+    assert plan(chunk=30).grid == (4, 1)
+
+
+def test_chunks_that_are_done_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    run_plan(plan(), tmp_path / "whole")
+    write, count = SweepStore.write, 0
+
+    def breaking(store: SweepStore, chunk: int, results: dict) -> None:
+        nonlocal count
+        count += 1
+        if count > 5:
+            raise KeyboardInterrupt
+        write(store, chunk, results)
+
+    monkeypatch.setattr(SweepStore, "write", breaking)
+    with pytest.raises(KeyboardInterrupt):
+        run_plan(plan(), tmp_path / "broken")
+    monkeypatch.undo()
+    partly = xarray.open_zarr(str(tmp_path / "broken" / STORE))["computed"].values
+    assert 0 < partly.sum() < partly.size
+    again = run_plan(plan(), tmp_path / "broken")
+    assert (len(again.kept.done), again.computed) == (5, 9)
+    assert contents(tmp_path / "whole") == contents(tmp_path / "broken")
+    assert run_plan(plan(), tmp_path / "broken").computed == 0
+
+
+@pytest.mark.parametrize("fault", ["cut", "changed", "gone", "marker"])
+def test_damaged_chunks_are_computed_again(tmp_path: Path, fault: str):
+    run_plan(plan(), tmp_path)
+    before = contents(tmp_path)
+    path = tmp_path / STORE / "sum_nm" / "c" / "3" / "0"
+    if fault == "marker":
+        path = tmp_path / "done" / "6.json"
+    data = bytearray(path.read_bytes())
+    if fault == "gone":
+        path.unlink()
+    elif fault == "changed":
+        data[-1] ^= 1
+        path.write_bytes(data)
+    else:
+        path.write_bytes(data[:-2])
+    again = run_plan(plan(), tmp_path)
+    assert (len(again.kept.damaged), again.computed) == (1, 1)
+    assert contents(tmp_path) == before
+
+
+def test_a_changed_input_is_refused_and_named(tmp_path: Path):
+    run_plan(plan(), tmp_path)
+    with pytest.raises(ValueError, match=r"axes\[2\].linear is \[0.0, 11.0, 12\], not \[0.0, 12.0, 12\]: choose"):
+        run_plan(plan(last=12.0), tmp_path)
+    with pytest.raises(ValueError, match=r"chunk is absent, not 5"):
+        run_plan(plan(chunk=5), tmp_path)
+    with pytest.raises(ValueError, match=r"record.seconds is absent, not 0.001"):
+        run_plan(plan(seconds=0.001), tmp_path)
+    (tmp_path / STORE / "zarr.json").write_text("{}")
+    with pytest.raises(ValueError, match="is not a sweep of afm-jax; choose another folder"):
+        run_plan(plan(), tmp_path)
+
+
+def test_a_full_disk_keeps_what_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def full(store: SweepStore, chunk: int, results: dict) -> None:
+        if chunk >= 3:
+            raise OSError(errno.ENOSPC, "No space left on device", str(store.folder / "sum_nm"))
+        write(store, chunk, results)
+
+    write = SweepStore.write
+    monkeypatch.setattr(SweepStore, "write", full)
+    with pytest.raises(OSError, match="No space left on device: 3 of 14 chunks are kept; mend that, and give"):
+        run_plan(plan(), tmp_path)
+    monkeypatch.undo()
+    assert run_plan(plan(), tmp_path).computed == 11
+
+
+def _hold(folder: str, held, let_go) -> None:
+    with locked(Path(folder)):
+        held.set()
+        let_go.wait(60)
+
+
+@pytest.mark.slow
+def test_two_sweeps_on_one_folder(tmp_path: Path):
+    spawned = multiprocessing.get_context("spawn")
+    held, let_go = spawned.Event(), spawned.Event()
+    other = spawned.Process(target=_hold, args=(str(tmp_path), held, let_go))
+    other.start()
+    assert held.wait(60)
+    with pytest.raises(ValueError, match=f"another sweep is writing there .process {other.pid} on .*; wait for it"):
+        run_plan(plan(), tmp_path)
+    # killed, it leaves its lock file behind, which does not count
+    other.kill()
+    other.join()
+    assert (tmp_path / "lock").exists()
+    assert run_plan(plan(), tmp_path).computed == 14
+
+
+def test_what_a_killed_sweep_left_unfinished_is_cleared(tmp_path: Path):
+    run_plan(plan(), tmp_path)
+    before = contents(tmp_path)
+    (tmp_path / STORE / "sum_nm" / "c" / "3" / "0.abc.partial").touch()
+    (tmp_path / "done" / ".3.json.abcd.part").touch()
+    run_plan(plan(), tmp_path)
+    assert contents(tmp_path) == before
+
+
+def test_the_plan_of_a_billion_points_is_quick():
+    axes = [
+        {"random": {"x": [0.0, 1.0]}, "count": 10**6, "seed": 1},
+        {"parameter": "y", "log": [1.0, 10.0, 1000]},
+    ]
+    given = dict(plan().given, axes=axes, chunk=20_000)
+    found = estimate(type(plan())(given, axes_of(axes), plan().recorder))
+    assert (found.points, found.chunks) == (10**9, 50_000)
+    assert 0.0 < found.seconds_a_point < 1e-5
+    # eight bytes three times, and two bits, at most
+    assert 1e8 < found.disk_bytes < 26e9
+
+
+def test_axes_are_what_they_say():
+    log, listed, random, cube = axes_of(
+        [
+            {"parameter": "a", "log": [1.0, 100.0, 3]},
+            {"parameter": "b", "list": [3, 1, 2]},
+            {"random": {"c": [0.0, 2.0], "d": {"log": [1.0, 10.0]}}, "count": 1001, "seed": 5},
+            {"latin_hypercube": {"e": [-1.0, 1.0], "f": [0.0, 1.0]}, "count": 20, "seed": 5},
+        ]
+    )
+    np.testing.assert_allclose(log.columns["a"](0, 3), np.geomspace(1.0, 100.0, 3), rtol=1e-15)
+    assert listed.columns["b"](1, 3).tolist() == [1.0, 2.0]
+    assert (random.dimension, cube.dimension) == ("sample", "sample_2")
+    # any stretch is the same as in the whole, however it lies in the generator's steps
+    c, d = random.columns["c"], random.columns["d"]
+    whole = c(0, 1001)
+    assert all(np.array_equal(c(first, first + 9), whole[first : first + 9]) for first in (0, 1, 2, 3, 4, 511))
+    generator = np.random.Generator(np.random.Philox(np.random.SeedSequence(5, spawn_key=(0,))))
+    np.testing.assert_array_equal(whole, 2.0 * generator.random(1001))
+    assert abs(np.corrcoef(whole, d(0, 1001))[0, 1]) < 0.1
+    assert abs(np.median(d(0, 1001)) / np.sqrt(10.0) - 1.0) < 0.2
+    shares = qmc.LatinHypercube(2, rng=np.random.default_rng(5)).random(20)
+    np.testing.assert_allclose(cube.columns["e"](0, 20), 2.0 * shares[:, 0] - 1.0, rtol=0.0, atol=1e-15)
+    # one sample in each twentieth
+    assert np.array_equal(np.sort(np.floor(20.0 * cube.columns["f"](0, 20))), np.arange(20))
+
+
+@pytest.mark.parametrize(
+    ("axes", "message"),
+    [
+        ([], "a sweep needs at least one axis"),
+        ([{"parameter": "x"}], "axis 1: has no values; give one of linear, log, list"),
+        ([{"parameter": "x", "linear": [1, 2]}], r"axis 1: `linear` must be \[low, high, count\]"),
+        ([{"parameter": "x", "linear": [2, 1, 5]}], "does not rise"),
+        ([{"parameter": "x", "linear": [1, 2, 0]}], "`count` must be a whole number from 1 on, but is 0"),
+        ([{"parameter": "x", "log": [0, 1, 5]}], "the ends of `log` must be positive, but one is 0"),
+        ([{"parameter": "x", "list": [1, "a"]}], "a value of the list must be a number, but is 'a'"),
+        ([{"parameter": "x", "list": [1, 1]}], "stands there twice"),
+        ([{"linear": [1, 2, 3]}], "`parameter` is missing"),
+        ([{"parameter": "x", "linear": [1, 2, 3], "seed": 1}], "unknown key seed"),
+        ([{"random": {"x": [0, 1]}, "count": 5}], "`seed` must be a whole number from 0 on, but is None"),
+        ([{"random": {"x": {"log": [0, 1]}}, "count": 5, "seed": 1}], "no rising pair of positive numbers"),
+        ([{"parameter": "x", "list": [1]}, {"parameter": "x", "list": [2]}], "x changes along two axes"),
+    ],
+)
+def test_impossible_axes_are_named(axes: list, message: str):
+    with pytest.raises(ValueError, match=message):
+        axes_of(axes)
+
+
+def test_the_store_opens_without_warnings(tmp_path: Path):
+    run_plan(plan(), tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert xarray.open_zarr(str(tmp_path / STORE)).sizes == {"x": 7, "y": 12, "part": 2}
