@@ -13,11 +13,11 @@ from fitting.fits.result import FitResult
 from fitting.report.words import has_delay
 
 # Okabe and Ito's colours, distinguishable with every kind of colour vision.
-COLOURS = ("#0072B2", "#D55E00")
+COLOURS = ("#0072B2", "#D55E00", "#009E73")
 ALARM = "#B00020"
 SMALL = 8
 _WIDTH_INCHES, DPI = 10.0, 120.0
-_KINDS = ("peak", "lock-in")
+_KINDS = ("peak", "lock-in", "phase")
 _ASIDE = "#999999"
 _ROW_AXIS = "drive frequency (kHz), for each order N to scale; rows of one frequency beside each other"
 _MUCH = 5.0
@@ -132,7 +132,7 @@ def draw_residuals(axes: Axes, result: FitResult) -> None:
     """Draw the normalised residuals row by row."""
     ranking, places = _row_axis(result)
     _draw_expected(axes)
-    for kind in range(2):
+    for kind in range(result.rows.residual.shape[1]):
         axes.plot(places, result.rows.residual[ranking, kind], "o", ms=3, color=COLOURS[kind])
     _name_frequencies(axes, result)
     axes.set_ylabel("residual (errors)")
@@ -143,7 +143,7 @@ def draw_residuals_by_speed(axes: Axes, result: FitResult) -> None:
     """Draw the normalised residuals against the approach speed: what is left of a wrong law shows here."""
     _draw_expected(axes)
     speed = result.rows.approach_speed_nm_per_us
-    for kind in range(2):
+    for kind in range(result.rows.residual.shape[1]):
         residual = result.rows.residual[:, kind]
         if np.isfinite(residual).any():
             axes.plot(speed, residual, "o", ms=3.5, color=COLOURS[kind], label=_KINDS[kind])
