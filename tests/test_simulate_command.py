@@ -12,6 +12,8 @@ from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, save_scene,
 from afm_jax.cli.main import main
 from afm_jax.motion.trajectory import pieces_between
 from afm_jax.scenefile.scenefile import Start
+from fitting.traces.lockin import lockin
+from fitting.traces.trace import read_trace
 from tests.fresh_python import python
 
 LAW = Scene(Cantilever(90.0, 40.0), Platform(4.0, 181.8), ImpactLaw(0.9, 20.0))
@@ -86,6 +88,25 @@ def test_too_short_to_settle_is_said_and_no_failure(law_file: Path):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("order", [1, 3])
+def test_lockin_reads_the_trace_it_writes(tmp_path: Path, order: int):
+    scene = Scene(Cantilever(90.0, 40.0), Platform(4.0, 181.8 * order, -1.0), LAW.interaction)
+    save_scene(scene, tmp_path / "scene.toml")
+    result = simulate(tmp_path / "scene.toml", "--json", "--out", tmp_path / "out", "--samples", "uniform")
+    assert result.exit_code == 0, result.stderr
+    answer = json.loads(result.stdout)
+    trace = read_trace(tmp_path / "out" / "trace.csv")
+    assert (trace.settings.drive_amplitude_nm, trace.settings.offset_nm, trace.settings.quality_factor) == (4, -1, 40)
+    read = lockin(trace)
+    assert (read.steady, read.order) == (True, answer["order"])
+    # two ways through the same motion: integrals over flights, and a fit of harmonics to 400 samples a drive period
+    np.testing.assert_allclose(read.lockin_amplitude_nm, answer["lockin_amplitude_nm"], rtol=1e-3)
+    np.testing.assert_allclose(read.peak_amplitude_nm, answer["peak_amplitude_nm"], rtol=1e-4)
+    turn = 360.0 / order
+    assert abs((read.phase_deg - answer["lockin_phase_deg"] + 0.5 * turn) % turn - 0.5 * turn) < 0.05
+
+
+@pytest.mark.slow
 def test_a_tip_too_slow_sticks(tmp_path: Path):
     path = tmp_path / "stuck.toml"
     # 2 nm over the sample at rest: it comes far below the capture speed of 10.9 nm/us
@@ -115,6 +136,7 @@ def test_a_preset_has_its_start():
         (("--duration-us", "nan"), "--duration-us must be a positive number, but is nan"),
         (("--periods", "0"), "--periods must be a positive number, but is 0"),
         (("--periods", "3", "--duration-us", "3"), "say the same: give one of them"),
+        (("--samples", "uniform"), "--samples writes a trace: say into which folder by --out DIR"),
         (("--harmonics", "1,0"), "must be integers from 1 to 1000 as in 1,2,3, but is 1,0"),
     ],
 )

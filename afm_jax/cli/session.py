@@ -53,8 +53,9 @@ def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[s
     _write_rows(path, columns, ([_cell(row.get(column)) for column in columns] for row in rows))
 
 
-def _write_rows(path: Path, head: Iterable[str], rows: Iterable[Iterable[Any]]) -> None:
+def _write_rows(path: Path, head: Iterable[str], rows: Iterable[Iterable[Any]], comments: Iterable[str] = ()) -> None:
     text = io.StringIO()
+    text.writelines(f"# {comment}\n" for comment in comments)
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(head)
     writer.writerows(rows)
@@ -194,16 +195,17 @@ class Session:
             write_csv(self.out / name, rows, columns)
             self.note(f"wrote {self.out / name}")
 
-    def write_columns(self, name: str, columns: Mapping[str, Any]) -> None:
+    def write_columns(self, name: str, columns: Mapping[str, Any], comments: Iterable[str] = ()) -> None:
         """Write a long table as CSV into the `--out` folder, if there is one, and say so.
 
         Args:
             name: file name.
             columns: lists or arrays of one length, in order; what is not finite stays empty.
+            comments: lines above the table, each after a number sign.
         """
         if self.out is None:
             return
-        _write_rows(self.out / name, columns, zip(*map(_cells, columns.values()), strict=True))
+        _write_rows(self.out / name, columns, zip(*map(_cells, columns.values()), strict=True), comments)
         self.note(f"wrote {self.out / name}")
 
 

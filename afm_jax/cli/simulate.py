@@ -77,6 +77,12 @@ class Multiples(click.ParamType):
     show_default=True,
     help="The way through a resolved contact: leg by leg, or by Diffrax in time (ten times slower).",
 )
+@click.option(
+    "--samples",
+    type=click.Choice(["uniform"]),
+    help="Write trace.csv into --out, too: the deflection over the last response periods at equal steps of time, as "
+    "`afm-jax lockin` reads it.",
+)
 @with_session
 def command(  # noqa: PLR0913
     session: Session,
@@ -88,6 +94,7 @@ def command(  # noqa: PLR0913
     harmonics: tuple[int, ...],
     accuracy: float,
     method: str,
+    samples: str | None,
 ) -> None:
     """Follow a scene in time: contacts, amplitudes, phases, forces, energies.
 
@@ -102,6 +109,8 @@ def command(  # noqa: PLR0913
             raise click.UsageError(f"{name} must be a positive number, but is {value:g}")
     if duration_us is not None and periods is not None:
         raise click.UsageError("--duration-us and --periods say the same: give one of them")
+    if samples and session.out is None:
+        raise click.UsageError("--samples writes a trace: say into which folder by --out DIR")
     session.start_computing("afm_jax.motion.simulate:_contact")
     from afm_jax.apparatus.scene import drive_of  # noqa: PLC0415
     from afm_jax.cli.values import scene_and_start  # noqa: PLC0415
@@ -121,7 +130,7 @@ def command(  # noqa: PLR0913
             seen = observe(loaded, run.simulation, harmonics=harmonics, verdict=run.verdict, dense=dense)
     except ValueError as error:
         raise ValueError(f"{scene}: {error}") from error
-    from afm_jax.cli.simulate_output import payload_of, text_of, write_files  # noqa: PLC0415
+    from afm_jax.cli.simulate_output import payload_of, text_of, write_files, write_trace  # noqa: PLC0415
 
     settings = {
         "accuracy": accuracy,
@@ -133,6 +142,8 @@ def command(  # noqa: PLR0913
     payload = payload_of(loaded, run, seen, settings)
     if session.out is not None:
         write_files(session, run, seen, dense, payload)
+        if samples:
+            write_trace(session, loaded, run, seen.window)
         _draw(session, loaded, run, dense)
     session.emit(payload, *text_of(payload))
     if not payload["valid"]:

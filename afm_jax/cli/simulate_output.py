@@ -6,20 +6,25 @@ from typing import Any
 
 import numpy as np
 
-from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.cli.session import Session, write_json
 from afm_jax.contact.junction import Phase
 from afm_jax.motion.observe import Harmonic, Observables
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation
 from afm_jax.motion.settle import LongRun, Window
-from afm_jax.motion.trajectory import DensePath
+from afm_jax.motion.trajectory import DensePath, dense_path
 from afm_jax.scenefile.scenefile import scene_tables
+from afm_jax.units import RAD_PER_US_PER_KHZ
 
 _WHOLE_PERIODS = 50
 """Drive periods up to which the whole simulation goes into trajectory.csv."""
 _POINTS = 2001
 _MOST_NODES = 100_000
 """Rows of trajectory.csv within contacts, from which on only every second, third, ... is kept."""
+_TRACE_RESPONSES = 24
+"""Response periods of trace.csv at most: enough for an instrument's errors from their scatter."""
+_SAMPLES_A_PERIOD = 400
+"""Of the drive."""
 _DEFLECTION = (
     "peak_deflection_nm",
     "mean_deflection_nm",
@@ -202,3 +207,43 @@ def trajectory_rows(dense: DensePath, begin: float, end: float) -> tuple[list[di
     for row in rows:
         row["phase"] = Phase(row["phase"]).name.lower()
     return rows, list(lists)
+
+
+def write_trace(session: Session, scene: Scene, run: LongRun, window: Window) -> None:
+    """Write trace.csv, the deflection over the last response periods at equal steps of time, into the `--out` folder.
+
+    Args:
+        session: whose folder.
+        scene: the scene.
+        run: its simulation.
+        window: of the observables; how long a response period is, and the end of the trace.
+    """
+    drive = drive_of(scene)
+    response = window.periods * drive.period_us
+    responses = min((window.to_us - float(run.simulation.start.time_us)) / response, _TRACE_RESPONSES)
+    begin = window.to_us - responses * response
+    count = math.ceil(responses * window.periods * _SAMPLES_A_PERIOD)
+    path = dense_path(scene, run.simulation, begin, window.to_us)
+    times = np.linspace(begin, window.to_us, count, endpoint=False)
+    deflection = path.at(times).position_nm
+    columns = {"time_us": times, "deflection_nm": deflection}
+    if scene.base is not None:
+        columns["drive"] = np.asarray(scene.base.position_and_velocity(times)[0])
+        columns["deflection_nm"] = deflection - columns["drive"]
+    elif scene.force is not None:
+        columns["drive"] = np.asarray(scene.force.force(times))
+    else:
+        columns["platform_nm"] = np.asarray(scene.platform.position(times))
+    session.write_columns("trace.csv", columns, _trace_comments(scene, drive))
+
+
+def _trace_comments(scene: Scene, drive: DrivePeriod) -> list[str]:
+    """Return what a trace says of its measurement, a setting each."""
+    cantilever, platform = scene.cantilever, scene.platform
+    known = {"drive_frequency_khz": drive.angular_frequency / RAD_PER_US_PER_KHZ}
+    if scene.base is None and scene.force is None and drive.aperiodic is None and platform.second is None:
+        known |= {"drive_amplitude_nm": platform.amplitude_nm, "offset_nm": platform.offset_nm}
+    known |= {"free_frequency_khz": cantilever.frequency_khz, "mass_ng": cantilever.mass_ng}
+    if cantilever.quality_factor is not None:
+        known["quality_factor"] = cantilever.quality_factor
+    return [f"{name} = {float(value)!r}" for name, value in known.items()]
