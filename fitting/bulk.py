@@ -147,7 +147,7 @@ def table_recorder(given: Mapping[str, Any], axes: Sequence[Axis]) -> Recorder:
                 raise ValueError(f"{name} cannot be an axis of tables; choose from {', '.join(known)}")
             if name in known and low <= 0.0:
                 raise ValueError(f"{name} must be positive, but starts at {low:g}")
-    chosen = {name: record[name] for name in ("free", "constraints", "effects") if name in record}
+    chosen = {name: record[name] for name in ("free", "fixed", "constraints", "effects") if name in record}
     own = problem_of(tables[0], model, **chosen).own
 
     def work(columns: Columns) -> Columns:

@@ -37,7 +37,7 @@ from afm_jax.impact.orbits import amplitudes, near_fold, orbit_state, steady_orb
 from afm_jax.impact.roots import follow_root, harmless_coordinate
 from afm_jax.results import public_result
 from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem, Rows, measurement_of
-from fitting.parameters import CONTACT_NAMES, NUISANCE_NAMES, PARAMETERS, check_contact_values, model_parameters
+from fitting.parameters import CONTACT_NAMES, NUISANCE_NAMES, PARAMETERS, model_parameters
 from fitting.tables.table import AmplitudeTable
 
 
@@ -53,9 +53,9 @@ class Branch(NamedTuple):
 def impact_of(values: Float[Array, " p"], measurement: Measurement, problem: Problem) -> LawImpact | TabulatedImpact:
     """Return what an impact does at a set of values: the model's law, or the table of its contact."""
     if problem.model != "contact":
-        return LawImpact(problem.law(values))
+        return LawImpact(problem.law(values, measurement.fixed))
     chosen = {name: value for name, value in problem.known(values).items() if name in problem.own}
-    contact = Contact.paper(effects=problem.effects, **(measurement.contact | chosen))
+    contact = Contact.paper(effects=problem.effects, **(measurement.fixed | chosen))
     return tabulated(contact, measurement.cantilever.mass_ng)
 
 
@@ -555,7 +555,7 @@ def amplitude_gradients(
         values: the model's parameters (for "contact" any of them) and any nuisances, by name: what is not named is the
             table's.
         mode: "forward" costs as much as there are parameters, "reverse" as there are amplitudes; same numbers.
-        fixed: for "contact": values of parameters that are not the paper's and not differentiated by.
+        fixed: values of the model's parameters that are not differentiated by; of a contact else the paper's.
         effects: for "contact": the effects there are.
 
     Raises:
@@ -565,8 +565,7 @@ def amplitude_gradients(
     require_float64()
     if mode not in ("forward", "reverse"):
         raise ValueError(f'`mode` must be "forward" or "reverse", but is {mode!r}')
-    check_contact_values(model, fixed)
-    problem = replace(_problem(model, values, effects), drive=table.drive)
+    problem = replace(_problem(model, values, effects, fixed), drive=table.drive)
     measurement = measurement_of(table, problem, fixed=fixed)
     point = jnp.asarray([float(values[name]) for name in problem.names])
     found = _in_blocks(point, measurement, problem, mode)
@@ -583,10 +582,12 @@ def amplitude_gradients(
     )
 
 
-def _problem(model: str, values: Mapping[str, float], effects: Sequence[str]) -> Problem:
+def _problem(
+    model: str, values: Mapping[str, float], effects: Sequence[str], fixed: dict[str, float] | None
+) -> Problem:
     """Return the parameters that are differentiated by, the model's own first."""
     chosen = tuple(name for name in values if name in CONTACT_NAMES)
-    own = model_parameters(model, chosen if model == "contact" else None)
+    own = model_parameters(model, chosen if model == "contact" else None, fixed)
     missing = [name for name in own if name not in values]
     if missing:
         raise ValueError(f"`values` lacks {' and '.join(missing)}, which the model {model!r} needs; add it")

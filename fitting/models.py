@@ -4,6 +4,7 @@ A model's parameters as vectors, in the optimiser's coordinates and as the law t
 arrays, with the cantilever and the Gaussian constraints.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, NamedTuple
@@ -16,7 +17,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.lasting_impact import BRIDGE_NM
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
-from fitting.parameters import CONTACT_NAMES, DELAY, LAW, NUISANCE_NAMES, PARAMETERS, Parameter
+from fitting.parameters import DELAY, LAW, NUISANCE_NAMES, PARAMETERS, Parameter
 from fitting.tables.table import AmplitudeTable
 
 AnyArray = Array | np.ndarray
@@ -105,9 +106,9 @@ class Problem:
         """Return the parameters by name."""
         return dict(zip(self.names, values, strict=True))
 
-    def law(self, values: Float[Array, " p"]) -> ImpactLaw:
-        """Return the impact law, with its delay; what the model leaves out is lossless."""
-        known = self.known(values)
+    def law(self, values: Float[Array, " p"], fixed: Mapping[str, Any]) -> ImpactLaw:
+        """Return the impact law, with its delay, some parameters fixed; what the model leaves out is lossless."""
+        known = {**fixed, **self.known(values)}
         delay = None
         if self.lasting:
             parts: dict[str, Any] = {p.name.removeprefix("delay_"): known.get(p.name, p.reference) for p in DELAY}
@@ -160,14 +161,14 @@ class Measurement(NamedTuple):
         cantilever: as the table gives it.
         constraint_value: what is known of each parameter beforehand, shape (p,).
         constraint_error: its standard error, infinite where nothing is known.
-        contact: for the model "contact" its parameters that are not fitted, by keyword of `Contact.paper`.
+        fixed: values of the model's parameters that are not fitted, by name; of a contact those not the paper's.
     """
 
     rows: Rows
     cantilever: Cantilever
     constraint_value: Float[AnyArray, " p"]
     constraint_error: Float[AnyArray, " p"]
-    contact: dict[str, Float[AnyArray, ""]]
+    fixed: dict[str, Float[AnyArray, ""]]
 
 
 def constraints_of(
@@ -194,16 +195,14 @@ def measurement_of(
         table: the amplitudes.
         problem: the model; its parameters' order is that of the constraints.
         constraints: value and standard error of what is known beforehand, by parameter; else the table says.
-        fixed: contact parameters that are not the paper's.
+        fixed: values of the model's parameters that are not fitted.
     """
     known = constraints_of(table, constraints)
     pairs = [
         known.get(name, (parameter.reference, np.inf))
         for name, parameter in zip(problem.names, problem.parameters, strict=True)
     ]
-    contact: dict[str, Any] = {
-        name: np.asarray(float(value)) for name, value in (fixed or {}).items() if name in CONTACT_NAMES
-    }
+    held: dict[str, Any] = {name: np.asarray(float(value)) for name, value in (fixed or {}).items()}
     cantilever = Cantilever(table.free_frequency_khz, table.quality_factor, table.mass_ng)
     rows = rows_of(table)
     if table.tapping:
@@ -215,7 +214,7 @@ def measurement_of(
         cantilever=cantilever,
         constraint_value=np.array([float(value) for value, _ in pairs]),
         constraint_error=np.array([float(error) for _, error in pairs]),
-        contact=contact,
+        fixed=held,
     )
 
 

@@ -4,6 +4,7 @@ Without JAX or NumPy, so that `--help` needs none.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from afm_jax.contact.parameters import CONTACT_PARAMETERS, PAPER
@@ -254,6 +255,12 @@ LAWS = {
         shaped="u_out^2 = u_in^2 - viscous_loss sqrt(u_in^2 + loss_speed_squared_nm2_per_us2) - epsilon",
         meaning="a loss linear in speed with adhesion (epsilon, viscous_loss)",
     ),
+    "full": LawFormula(
+        paper={"r": 0.9999, "epsilon": 114.0, "viscous_loss": 0.48},
+        formula="u_out^2 = r^2 u_in^2 - viscous_loss u_in - epsilon",
+        shaped="u_out^2 = r^2 u_in^2 - viscous_loss sqrt(u_in^2 + loss_speed_squared_nm2_per_us2) - epsilon",
+        meaning="a restitution, a loss linear in speed and adhesion (r, epsilon, viscous_loss)",
+    ),
 }
 DELAY_LAW = LawFormula(
     paper={"delay_hertz": 0.206, "delay_lead_nm": 5.64, "delay_offset_nm": 0.726},
@@ -276,29 +283,57 @@ MODELS = {
 """Parameters of each model; those of "contact" are chosen."""
 
 
-def model_parameters(model: str, free: tuple[str, ...] | None = None) -> tuple[str, ...]:
-    """Return the names of a model's own parameters, nuisances apart.
+def model_parameters(
+    model: str, free: tuple[str, ...] | None = None, fixed: Mapping[str, float] | None = None
+) -> tuple[str, ...]:
+    """Return the names of the parameters that a model's fit has, nuisances apart.
 
     Args:
         model: a key of `MODELS`.
-        free: for "contact": which of its parameters are fitted; None for `CONTACT_DEFAULT`.
+        free: those that are fitted; None: all of a law and its delay, of "contact" `CONTACT_DEFAULT`, that are not
+            fixed.
+        fixed: values at which others are held; those of a contact that are neither are the paper's.
 
     Raises:
-        ValueError: if there is no such model or parameter, or a law's parameters are to be chosen.
+        ValueError: if there is no such model or parameter, none is fitted, one is twice, one of a law is neither fitted
+            nor fixed, or a value is impossible.
     """
     if model not in MODELS:
         raise ValueError(f"`model` must be one of {', '.join(MODELS)}, but is {model!r}")
-    if model != "contact":
-        if free is not None:
-            raise ValueError(f"`free` chooses among the contact's parameters; the model {model!r} has none to choose")
-        return MODELS[model]
-    chosen = CONTACT_DEFAULT if free is None else free
+    names, held = CONTACT_NAMES if model == "contact" else MODELS[model], fixed or {}
+    _check_fixed(model, names, held)
+    usual = CONTACT_DEFAULT if model == "contact" else names
+    chosen = tuple(name for name in usual if name not in held) if free is None else free
     for name in chosen:
-        if name not in CONTACT_NAMES:
-            raise ValueError(f"`free` must be chosen from {', '.join(CONTACT_NAMES)}, but one is {name!r}")
+        if name not in names:
+            raise ValueError(f"`free` must be chosen from {', '.join(names)}, but one is {name!r}")
+        if name in held:
+            raise ValueError(f"{name} is both fitted (`free`) and held (`fixed`); remove it from one")
     if len(set(chosen)) < len(chosen) or not chosen:
-        raise ValueError("`free` must name at least one parameter, and none twice")
-    return chosen
+        raise ValueError("`free` must name at least one parameter that is not fixed, and none twice")
+    if model == "contact":
+        return chosen
+    loose = [name for name in names if name not in (*chosen, *held)]
+    if loose:
+        raise ValueError(f"{' and '.join(loose)} must be fitted (`free`) or held at a value (`fixed`)")
+    return tuple(name for name in names if name in chosen)
+
+
+def _check_fixed(model: str, names: tuple[str, ...], fixed: Mapping[str, float]) -> None:
+    """Check the values of parameters that are held fixed.
+
+    Raises:
+        ValueError: if a name or value is impossible.
+    """
+    for name, value in fixed.items():
+        if name not in names:
+            raise ValueError(
+                f"`fixed` must name parameters of the model {model!r} ({', '.join(names)}), but one is {name!r}"
+            )
+        parameter = PARAMETERS[name]
+        if not math.isfinite(value) or not parameter.lowest <= value <= parameter.highest:
+            between = f"between {parameter.lowest:g} and {parameter.highest:g} {parameter.unit}".rstrip()
+            raise ValueError(f"`fixed`: {name} must lie {between}, but is {value!r}")
 
 
 def paper_values(model: str) -> dict[str, float]:
@@ -311,24 +346,3 @@ def paper_values(model: str) -> dict[str, float]:
         return PAPER
     values = LAWS[model.removesuffix("+delay")].paper
     return values | DELAY_LAW.paper if model.endswith("+delay") else values
-
-
-def check_contact_values(model: str, fixed: dict[str, float] | None) -> None:
-    """Check the values of contact parameters that are held fixed.
-
-    Raises:
-        ValueError: if the model has none, or a name or value is impossible.
-    """
-    if not fixed:
-        return
-    if model != "contact":
-        raise ValueError(f"`fixed` gives values of contact parameters; the model {model!r} has none")
-    for name, value in fixed.items():
-        if name not in CONTACT_NAMES:
-            raise ValueError(
-                f"`fixed` must name parameters of the contact ({', '.join(CONTACT_NAMES)}), but one is {name!r}"
-            )
-        parameter = PARAMETERS[name]
-        if not math.isfinite(value) or not parameter.lowest <= value <= parameter.highest:
-            between = f"between {parameter.lowest:g} and {parameter.highest:g} {parameter.unit}".rstrip()
-            raise ValueError(f"`fixed`: {name} must lie {between}, but is {value!r}")

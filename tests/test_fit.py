@@ -5,14 +5,17 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.stats import chi2
 
+from afm_jax import ImpactLaw
+from afm_jax.cli.values import example_path
 from fitting import fit, read_table
 from fitting.examples.make_amplitudes import TRUTH, example_table
 from fitting.fits.fit import problem_of
 from fitting.fits.objective import Objective
 from fitting.fits.result import FitResult
 from fitting.models import measurement_of
+from fitting.report.report import summary
 from fitting.tables.table import AmplitudeTable
-from tests.fit_tables import EXAMPLE, amplitudes_and_errors, rows, values_of, with_amplitudes
+from tests.fit_tables import EXAMPLE, amplitudes_and_errors, rows, simulated, values_of, with_amplitudes
 from tests.reference_systems import Parameters, single_impact_orbits
 
 
@@ -123,6 +126,56 @@ def test_other_models_are_refused_by_their_chi2(table):
         assert result.p_value < 1e-10
         assert all(parameter.interval95 == (None, None) for parameter in result.parameters.values())
         assert all(parameter.standard_error is None for parameter in result.parameters.values())
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("held", "model"), [({"viscous_loss": 0.0}, "law"), ({"r": 1.0}, "viscous"), ({"epsilon": 61.0}, None)]
+)
+def test_a_full_law_with_one_loss_held_is_the_law_without_it(table, held, model):
+    """u_out^2 = r^2 u_in^2 - c u_in - epsilon is eq. 6 at c = 0, and the viscous law at r = 1."""
+    full = fit(table, "full", fixed=held)
+    assert (*full.parameters, *held).count("quality_factor") == 1
+    assert set(full.parameters) | set(held) == {"r", "epsilon", "viscous_loss", "quality_factor"}
+    assert full.settings["fixed"] == held
+    if model is not None:
+        plain = fit(table, model)
+        np.testing.assert_allclose(values_of(full), values_of(plain), rtol=1e-6)
+        assert full.chi2 == pytest.approx(plain.chi2, rel=1e-9)
+        return
+    # the law that is shown holds the value, too
+    speed = full.law.approach_speed_nm_per_us
+    r, loss = (full.parameters[name].value for name in ("r", "viscous_loss"))
+    square = (r * speed) ** 2 - loss * speed - 61.0
+    np.testing.assert_allclose(full.law.rebound_speed_nm_per_us, np.sqrt(square), rtol=1e-12)
+    assert "Held fixed: epsilon = 61 nm^2/us^2" in summary(full)
+
+
+@pytest.mark.slow
+def test_chi2_rises_as_the_profile_says_where_r_is_held(law, table):
+    for end in law.parameters["r"].interval95:
+        held = fit(table, "law", fixed={"r": end})
+        assert held.chi2 - law.chi2 == pytest.approx(3.8415, rel=5e-3)
+        assert held.degrees_of_freedom == law.degrees_of_freedom + 1
+
+
+@pytest.mark.slow
+def test_full_law_with_a_delay_and_r_of_1_is_the_viscous_law_with_a_delay():
+    contact = read_table(example_path())
+    full, plain = fit(contact, "full+delay", fixed={"r": 1.0}), fit(contact, "viscous+delay")
+    assert list(full.parameters) == list(plain.parameters)
+    np.testing.assert_allclose(values_of(full), values_of(plain), rtol=1e-4)
+    assert (full.valid, full.chi2) == (plain.valid, pytest.approx(plain.chi2, rel=1e-6))
+
+
+@pytest.mark.slow
+def test_full_law_is_found_from_its_amplitudes(table):
+    truth = ImpactLaw(0.97, 60.0, 2.0)
+    found = fit(simulated(table, truth, seed=None), "full")
+    for name in ("r", "epsilon", "viscous_loss"):
+        parameter = found.parameters[name]
+        assert parameter.value == pytest.approx(float(getattr(truth, name)), rel=1e-4), name
+    assert found.chi2 < 1e-3
 
 
 def test_scaled_errors_bring_chi2_to_its_degrees_of_freedom(table):

@@ -99,6 +99,8 @@ def test_lockin_reads_the_trace_it_writes(tmp_path: Path, order: int):
     assert (trace.settings.drive_amplitude_nm, trace.settings.offset_nm, trace.settings.quality_factor) == (4, -1, 40)
     read = lockin(trace)
     assert (read.steady, read.order) == (True, answer["order"])
+    assert read.lockin_amplitude_nm is not None
+    assert read.peak_amplitude_nm is not None
     # two ways through the same motion: integrals over flights, and a fit of harmonics to 400 samples a drive period
     np.testing.assert_allclose(read.lockin_amplitude_nm, answer["lockin_amplitude_nm"], rtol=1e-3)
     np.testing.assert_allclose(read.peak_amplitude_nm, answer["peak_amplitude_nm"], rtol=1e-4)

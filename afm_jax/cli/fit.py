@@ -16,7 +16,7 @@ from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import Ends, Share, example_path, parse_around_plus_minus, parse_number
 from afm_jax.contact.parameters import EFFECTS, REMOVABLE_EFFECTS, idle_without
 from afm_jax.words import text_table
-from fitting.parameters import CONTACT_DEFAULT, DELAY_LAW, LAWS, MODELS, NUISANCE_NAMES
+from fitting.parameters import CONTACT_DEFAULT, DELAY_LAW, LAWS, MODELS, NUISANCE_NAMES, model_parameters
 
 if TYPE_CHECKING:
     from fitting.fits.fit import Found
@@ -110,9 +110,10 @@ class Names(click.ParamType):
     "--free",
     type=Names(),
     metavar="NAME,...",
-    help=f"contact: the parameters that are fitted; if left out {','.join(CONTACT_DEFAULT)}.",
+    help="The parameters that are fitted, if not all that are not fixed; of a contact, if left out, "
+    f"{','.join(CONTACT_DEFAULT)}.",
 )
-@click.option("--fix", type=Fixed(), multiple=True, metavar="NAME=VALUE", help="contact: a value not the paper's.")
+@click.option("--fix", type=Fixed(), multiple=True, metavar="NAME=VALUE", help="Hold a parameter at a value.")
 @click.option(
     "--constrain",
     type=Constraint(),
@@ -206,22 +207,30 @@ def _settings(model: str, options: dict[str, Any]) -> dict[str, Any]:
     """Return the keywords of `fitting.fit`.
 
     Raises:
-        click.UsageError: if options of the contact stand with another model.
+        click.UsageError: if options contradict each other or the model.
     """
-    for option, given in (("--free", options["free"]), ("--fix", options["fix"]), ("--no", options["left_out"])):
-        if given and model != "contact":
-            raise click.UsageError(f"{option} is about the contact's parameters; add --model contact")
+    if options["left_out"] and model != "contact":
+        raise click.UsageError("--no is about the contact's effects; add --model contact")
+    fixed, free = dict(options["fix"]), options["free"]
     settings: dict[str, Any] = {
         "scale_errors": options["scale_errors"],
         "robust": options["robust"],
         "speeds": options.get("speeds"),
         "constraints": dict(options["constrain"]),
+        "free": free,
+        "fixed": fixed,
     }
+    for name in free or ():
+        if name in fixed:
+            raise click.UsageError(f"{name} is both fitted (--free) and held fixed (--fix); remove it from one")
     if model == "contact":
-        effects = _effects(options["left_out"] or ())
-        settings["fixed"], settings["effects"] = dict(options["fix"]), effects
-        _check_contact_options(options["free"] or (), settings["fixed"], effects)
-        settings["free"] = options["free"] or _usual_parameters(settings["fixed"], effects)
+        settings["effects"] = effects = _effects(options["left_out"] or ())
+        _check_of_use(free or (), fixed, effects)
+        settings["free"] = free or _usual_parameters(fixed, effects)
+    try:
+        model_parameters(model, settings["free"], fixed)
+    except ValueError as error:
+        raise click.UsageError(str(error).replace("`free`", "--free").replace("`fixed`", "--fix")) from error
     return settings
 
 
@@ -241,15 +250,12 @@ def _usual_parameters(fixed: dict[str, float], effects: tuple[str, ...]) -> tupl
     return tuple(chosen)
 
 
-def _check_contact_options(free: tuple[str, ...], fixed: dict[str, float], effects: tuple[str, ...]) -> None:
-    """Check that no parameter is fitted and held fixed at once, and that each is of use.
+def _check_of_use(free: tuple[str, ...], fixed: dict[str, float], effects: tuple[str, ...]) -> None:
+    """Check that each parameter of a contact is of use.
 
     Raises:
         click.UsageError: if one is not.
     """
-    for name in free:
-        if name in fixed:
-            raise click.UsageError(f"{name} is both fitted (--free) and held fixed (--fix); remove it from one")
     for option, names in (("--free", free), ("--fix", tuple(fixed))):
         for name in names:
             missing = idle_without(name, effects)
@@ -280,7 +286,7 @@ def _extras(
 def _comparison(session: Session, found: "Found", result: "FitResult", settings: dict[str, Any]) -> Any:
     from fitting.fits.comparison import compare, rivals  # noqa: PLC0415
 
-    models = rivals(result.model)
+    models = rivals(result.model, settings["fixed"])
     with session.working(f"comparing {', '.join(models)}"):
         return compare(result.table, models, known={result.model: (found, result)}, **settings)
 

@@ -41,7 +41,7 @@ def with_fitted_law(scene: "Scene", path: Path) -> "tuple[Scene, UncertainParame
     if problem.model == "contact":
         raise ValueError(f"{path}: is a fit of a contact, which has no law; fit --model viscous+delay")
     everything = jnp.asarray([found[name]["value"] for name in problem.names])
-    law = problem.law(everything)
+    law = problem.law(everything, belief.fixed)
     # what else a fit may have belongs to its instrument
     paths = {"quality_factor": "cantilever.quality_factor"}
     paths |= {part.name: f"interaction.{part.name}" for part in LAW}

@@ -20,7 +20,6 @@ from fitting.parameters import (
     PARAMETERS,
     SHAPE_NAMES,
     Parameter,
-    check_contact_values,
     model_parameters,
     paper_values,
 )
@@ -47,7 +46,7 @@ class Belief:
         free_frequency_khz: of the cantilever.
         quality_factor: of the cantilever; None: no air damping.
         mass_ng: of the cantilever.
-        fixed: contact parameters that are not fitted and not the paper's.
+        fixed: values of the model's parameters that are not fitted; of a contact those not the paper's.
         uncertainty: how far values may be off, relative, where `information` does not say: an orbit that is not there
             for some of these values is not planned with.
         constraints: value and standard error of what is known apart from the measured drives; part of `information`.
@@ -118,17 +117,16 @@ def believe(  # noqa: PLR0913
         values: of the model's parameters; those not given are the paper's contact's.
         constraints: value and standard error of what the instrument leaves uncertain: `quality_factor`,
             `tip_calibration`, `drive_calibration`, `offset_origin_nm`; or of a parameter of the model.
-        free: for "contact": the parameters that are fitted.
-        fixed: for "contact": values of the others that are not the paper's.
+        free: the parameters that are fitted, as of `fit`.
+        fixed: values of others of the model's parameters.
         effects: for "contact": the effects there are.
         uncertainty: how far the values may be off, relative (0.1 stands for 10 %).
 
     Raises:
         ValueError: if a name or value is impossible.
     """
-    own = model_parameters(model, None if free is None else tuple(free))
+    own = model_parameters(model, None if free is None else tuple(free), fixed)
     known = {name: (float(value), float(error)) for name, (value, error) in (constraints or {}).items()}
-    check_contact_values(model, dict(fixed or {}))
     _check_constraints(model, own, known)
     given = dict(values or {})
     for name in given:

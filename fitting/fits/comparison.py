@@ -12,7 +12,7 @@ from afm_jax.results import public_result
 from fitting.fits.fit import Found, find_fit, summarise
 from fitting.fits.minimum import Strain, relaxed, settle
 from fitting.fits.result import FitResult
-from fitting.parameters import LAWS, model_parameters
+from fitting.parameters import CONTACT_NAMES, LAWS, MODELS, model_parameters
 from fitting.tables.table import AmplitudeTable
 
 _T = TypeVar("_T")
@@ -43,12 +43,18 @@ class Comparison:
         return {"rows": self.rows, "verdict": self.verdict, "failed": self.failed}
 
 
-def rivals(model: str) -> tuple[str, ...]:
-    """Return the models that a model is usually compared with, itself first."""
+def rivals(model: str, fixed: Mapping[str, float] | None = None) -> tuple[str, ...]:
+    """Return the models that a model is usually compared with, itself first: the laws with one loss beside adhesion.
+
+    Args:
+        model: a model of `fit`.
+        fixed: what is held fixed; models that would have nothing left to fit are left out.
+    """
     if model == "contact":
         return ("contact", "viscous+delay", "law+delay")
     ending = "+delay" if model.endswith("+delay") else ""
-    return (model, *(f"{law}{ending}" for law in LAWS if f"{law}{ending}" != model))
+    others = (f"{law}{ending}" for law in LAWS if law != "full" and f"{law}{ending}" != model)
+    return (model, *(other for other in others if set(MODELS[other]) - set(fixed or {})))
 
 
 def compare(
@@ -69,7 +75,7 @@ def compare(
         models: names of models.
         report: called with each model's name before it is fitted.
         known: minimum and summary of models that were fitted to the table with the same options already.
-        options: as of `fit`; `free`, `fixed` and `effects` go to the model "contact" only.
+        options: as of `fit`; `free` and `fixed` go to models that have such parameters, `effects` to "contact".
 
     Raises:
         ValueError: if fewer than two different models are named, or one of them there is not; as `fit`, if no model can
@@ -79,8 +85,9 @@ def compare(
     if len(set(models)) < 2:
         raise ValueError("comparing needs at least two different models")
     for model in models:
-        free = _options_of(model, options).get("free")
-        model_parameters(model, None if free is None else tuple(free))
+        of_model = _options_of(model, options)
+        free = of_model.get("free")
+        model_parameters(model, None if free is None else tuple(free), of_model.get("fixed"))
 
     def fitted(model: str) -> tuple[Found, FitResult]:
         if known is not None and model in known:
@@ -132,8 +139,16 @@ def _finite(result: FitResult) -> FitResult:
 
 
 def _options_of(model: str, options: dict[str, Any]) -> dict[str, Any]:
-    only_contact = {"free", "fixed", "effects"}
-    return {name: value for name, value in options.items() if model == "contact" or name not in only_contact}
+    """Return what of the options is about a model: another one has other parameters."""
+    names = CONTACT_NAMES if model == "contact" else MODELS[model]
+    chosen = dict(options)
+    if model != "contact":
+        chosen.pop("effects", None)
+    if any(name not in names for name in chosen.get("free") or ()):
+        del chosen["free"]
+    if chosen.get("fixed"):
+        chosen["fixed"] = {name: value for name, value in chosen["fixed"].items() if name in names}
+    return chosen
 
 
 def _row(model: str, found: Found, result: FitResult, common: Strain) -> dict[str, Any]:

@@ -64,7 +64,7 @@ from fitting.models import (
     measurement_of,
     readings_of,
 )
-from fitting.parameters import NUISANCE_NAMES, PARAMETERS, check_contact_values, model_parameters
+from fitting.parameters import NUISANCE_NAMES, PARAMETERS, model_parameters
 from fitting.tables.table import AmplitudeTable
 
 _POINTS = 121
@@ -268,7 +268,7 @@ class _Summary:
         # of the Hertz time, in us and kHz
         shares = 1e-3 * rows.hertz_time[used] * self.table.drive_frequency_khz[used]
         self.contact_share = float(shares.max())
-        values = dict(zip(self.problem.names, self.values.tolist(), strict=True))
+        values = self.settings["fixed"] | dict(zip(self.problem.names, self.values.tolist(), strict=True))
         mass = float(self.stated.measurement.cantilever.mass_ng)
         left_out = Unmodelled(self.problem, values, speed_range(self.used_speeds), mass)
         return step_of(rows, left_out, self.free), left_out
@@ -505,14 +505,15 @@ def fit(  # noqa: PLR0913
         table: from `read_table`, or a data frame as `AmplitudeTable.from_dataframe` takes it; what it gives with an
             error (Q, calibrations) is a nuisance with that constraint. A Q without error is taken to be known to 2 %
             where impacts last, and exactly by the instantaneous laws.
-        model: "restitution" (r), "law" (r, epsilon; eq. 6) or "viscous" (epsilon, viscous_loss), each instantaneous or
-            with "+delay", the collision delay; or "contact", physical parameters through the resolved contact.
+        model: "restitution" (r), "law" (r, epsilon; eq. 6), "viscous" (epsilon, viscous_loss) or "full" (all three),
+            each instantaneous or with "+delay", the collision delay; or "contact", physical parameters through the
+            resolved contact.
         scale_errors: take the amplitudes' errors as relative only and scale them until chi2 equals its degrees of
             freedom (the error of Q stays); the result is valid only if the scale is believable and what is left of the
             amplitudes random (see `verdict`).
-        free: for "contact": the parameters that are fitted, by keyword of `Contact.paper`; None: relative humidity,
-            adhesion energy, viscosity and modulus.
-        fixed: for "contact": values of parameters that are not the paper's.
+        free: the parameters that are fitted; None: all of a law and its delay, of "contact" (keywords of
+            `Contact.paper`) relative humidity, adhesion energy, viscosity and modulus, without those fixed.
+        fixed: values at which other parameters of the model are held; of "contact" what is not named is the paper's.
         constraints: value and standard error of what else is known, by parameter: a nuisance (`quality_factor`,
             `tip_calibration`, `drive_calibration`, `offset_origin_nm`), which then is fitted along, or one of the
             model's parameters.
@@ -555,8 +556,7 @@ def find_fit(  # noqa: PLR0913
     known = constraints_of(table, constraints)
     if table.quality_factor is not None and (model.endswith("+delay") or model == "contact"):
         known = {"quality_factor": (table.quality_factor, ASSUMED_ERROR_OF_Q * table.quality_factor)} | known
-    problem = problem_of(table, model, free=free, constraints=known, effects=effects)
-    check_contact_values(model, fixed)
+    problem = problem_of(table, model, free=free, fixed=fixed, constraints=known, effects=effects)
     measurement = measurement_of(table, problem, known, fixed)
     amplitudes = int(np.asarray(measurement.rows.measured).sum())
     if amplitudes < len(problem.own):
@@ -578,7 +578,7 @@ def find_fit(  # noqa: PLR0913
         "robust": ROBUST if robust else None,
         "constraints": known,
         "free": list(problem.own),
-        "fixed": fixed or {},
+        "fixed": dict(fixed or {}),
         "effects": list(effects) if model == "contact" else None,
         "speeds": speeds,
     }
@@ -590,6 +590,7 @@ def problem_of(
     model: str,
     *,
     free: Sequence[str] | None = None,
+    fixed: dict[str, float] | None = None,
     constraints: dict[str, tuple[float, float]] | None = None,
     effects: Sequence[str] = EFFECTS,
 ) -> Problem:
@@ -598,7 +599,7 @@ def problem_of(
     Raises:
         ValueError: if there is no such model or parameter, or a constraint is impossible.
     """
-    own = model_parameters(model, None if free is None else tuple(free))
+    own = model_parameters(model, None if free is None else tuple(free), fixed)
     known = constraints_of(table, constraints)
     for name, (value, error) in known.items():
         if name not in (*own, *NUISANCE_NAMES):

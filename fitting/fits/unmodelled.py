@@ -91,7 +91,7 @@ class Unmodelled:
 
     Attributes:
         problem: the model; of the resolved contact only corrections and slow impacts are uncertain.
-        values: of its parameters, by name.
+        values: of its parameters, by name, fitted and fixed.
         speeds: slowest and fastest approach of the rows in nm/us.
         mass_ng: of the tip: what a bridge does to speeds goes with its inverse square root.
     """
@@ -105,10 +105,10 @@ class Unmodelled:
     def priors(self) -> dict[str, tuple[float, float]]:
         """Mean and standard error of the shapes' numbers, by name; only those that the model has use for."""
         priors = {}
-        if "viscous_loss" in self.problem.own:
+        if "viscous_loss" in self.values:
             mean, error = LOSS_SPEED_SQUARED
             priors[LOSS_SHAPE] = mean / self.mass_ng, error / self.mass_ng
-        if "delay_lead_nm" in self.problem.own:
+        if "delay_lead_nm" in self.values:
             slower = self.mass_ng**-0.5
             mean = slower * _SQUARE_PER_LEAD * self.values["delay_lead_nm"]
             priors[DELAY_SHAPE] = mean, max(abs(mean), slower * _LEAST_SQUARE)
@@ -138,7 +138,7 @@ class Unmodelled:
         loss = self.values.get("epsilon", 0.0) + self.values.get("viscous_loss", 0.0) * middle
         loss += (1.0 - self.values.get("r", 1.0) ** 2) * middle**2
         terms = {"epsilon": np.ones_like(u), "viscous_loss": u / middle}
-        missing = [-_MISSING_SHARE * loss * term for name, term in terms.items() if name not in self.problem.own]
+        missing = [-_MISSING_SHARE * loss * term for name, term in terms.items() if name not in self.values]
         smooth = self._smooth(u).T
         return [*missing, *(-_LOSS_SHARE * (u**2 - w**2) * smooth)], [*(-_PATH_NM / u * smooth)]
 

@@ -259,7 +259,11 @@ def _why_not_explained(evidence: Evidence) -> str:
             f"platform that hardly moves meanwhile; measure at lower frequencies, or at lower orders; {tail}."
         )
     if evidence.lasting:
-        other = "The loss may depend on the speed otherwise (try viscous+delay), the" if "r" in names else "The"
+        other = (
+            "The loss may depend on the speed otherwise (try viscous+delay), the"
+            if names.keys() & {"r", "viscous_loss"} == {"r"}
+            else "The"
+        )
         return (
             f"{other} errors may be too small, the calibration (quality_factor, amplitudes, offsets) off, or some rows "
             f"not single-impact orbits; {tail}."

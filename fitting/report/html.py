@@ -20,6 +20,7 @@ from fitting.report.words import (
     belief_in_words,
     goodness_in_words,
     has_delay,
+    held_in_words,
     interval_in_words,
     law_points,
     losses_in_words,
@@ -72,7 +73,8 @@ def fit_page(
         bootstrap: intervals from synthetic data sets, or None.
         posterior: credible intervals, or None.
     """
-    numbers = {name: PARAMETERS[name].symbol or name for name in result.parameters}
+    names = [*result.parameters, *(result.settings.get("fixed") or {})]
+    numbers = {name: PARAMETERS[name].symbol or name for name in names}
     if result.valid and result.model != "contact":
         numbers = rounded_values(result)
     samples = {"Bootstrap": bootstrap, "Posterior": posterior}
@@ -81,6 +83,7 @@ def fit_page(
         result=result,
         title=f"Impact law of {result.table.source}",
         belief=belief_in_words(result),
+        held=in_signs(held_in_words(result)),
         numbers=numbers,
         lasting=result.model.endswith("+delay"),
         said=_what_the_data_say(result),

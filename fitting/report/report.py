@@ -15,6 +15,7 @@ from fitting.report.words import (
     Sampled,
     band_in_words,
     formulas,
+    held_in_words,
     interval_in_words,
     losses_in_words,
     rows_in_words,
@@ -59,7 +60,7 @@ def summary(result: FitResult) -> str:
     parameters = [_parameter_cells(name, parameter) for name, parameter in result.parameters.items()]
     lines = [
         f"Impact law of {result.table.source} ({rows_in_words(result.table.rows)}), model {result.model}:",
-        *(f"  {formula}" for formula in formulas(result)),
+        *(f"  {line}" for line in (*formulas(result), held_in_words(result)) if line),
         "",
         "VALID" if result.valid else "NOT VALID: the numbers below are not a measurement of the law.",
         *(f"  - {reason}" for reason in result.reasons),

@@ -10,7 +10,7 @@ from afm_jax.words import decimals, interval, percent, value_alone
 from fitting.fits.loss import WithInterval
 from fitting.fits.result import FitResult, FittedParameter
 from fitting.fits.verdict import IMPROBABLE
-from fitting.parameters import DELAY_LAW, DELAY_SHAPE, LAWS, LOSS_SHAPE, SHAPE_NAMES
+from fitting.parameters import DELAY_LAW, DELAY_SHAPE, LAWS, LOSS_SHAPE, PARAMETERS, SHAPE_NAMES
 
 SHARE_OF_BAND = 0.1
 """How far the rounded formula may be off, in half-widths of the 95 % band."""
@@ -99,6 +99,13 @@ def formulas(result: FitResult) -> list[str]:
     shaped = any(name in result.parameters for name in SHAPE_NAMES)
     used = [law, DELAY_LAW] if lasting else [law]
     return [(shaped and one.shaped) or one.formula for one in used]
+
+
+def held_in_words(result: FitResult) -> str:
+    """Return 'Held fixed: r = 0.998, epsilon = 120 nm^2/us^2'; nothing where nothing was."""
+    fixed = result.settings.get("fixed") or {}
+    held = ", ".join(f"{name} = {value:g} {PARAMETERS[name].unit}".rstrip() for name, value in fixed.items())
+    return f"Held fixed: {held}" if held else ""
 
 
 def has_delay(result: FitResult) -> bool:
@@ -261,7 +268,7 @@ def rounded_values(result: FitResult) -> dict[str, str]:
         texts = {name: f"{p.value:.{_own_decimals(p) + extra}f}" for name, p in result.parameters.items()}
         if _close_enough(result, {name: float(text) for name, text in texts.items()}):
             break
-    return texts
+    return texts | {name: f"{value:.12g}" for name, value in (result.settings.get("fixed") or {}).items()}
 
 
 def _own_decimals(parameter: FittedParameter) -> int:
@@ -280,8 +287,9 @@ def _close_enough(result: FitResult, values: dict[str, float]) -> bool:
         return True
     speed = law.approach_speed_nm_per_us
     measured = (speed >= width.slowest_nm_per_us) & (speed <= width.fastest_nm_per_us)
-    rounded = _formula(values, speed[measured])
-    exact = _formula({name: p.value for name, p in result.parameters.items()}, speed[measured])
+    fixed = result.settings.get("fixed") or {}
+    rounded = _formula(fixed | values, speed[measured])
+    exact = _formula(fixed | {name: p.value for name, p in result.parameters.items()}, speed[measured])
     bands = (
         law.rebound_high_nm_per_us - law.rebound_speed_nm_per_us,
         law.delay_high_us - law.collision_delay_us,
