@@ -140,7 +140,7 @@ def _finite(result: FitResult) -> FitResult:
 
 def _options_of(model: str, options: dict[str, Any]) -> dict[str, Any]:
     """Return what of the options is about a model: another one has other parameters."""
-    names = CONTACT_NAMES if model == "contact" else MODELS[model]
+    names = CONTACT_NAMES if model == "contact" else MODELS.get(model, ())
     chosen = dict(options)
     if model != "contact":
         chosen.pop("effects", None)
