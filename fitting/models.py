@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.contact.parameters import EFFECTS
@@ -204,9 +204,15 @@ def measurement_of(
     contact: dict[str, Any] = {
         name: np.asarray(float(value)) for name, value in (fixed or {}).items() if name in CONTACT_NAMES
     }
+    cantilever = Cantilever(table.free_frequency_khz, table.quality_factor, table.mass_ng)
+    rows = rows_of(table)
+    if table.tapping:
+        reach = reach_of(rows, cantilever, table.drive)
+        hit = np.asarray(rows.measured) & (reach != Reach.ATTRACTED)[:, None]
+        rows = rows._replace(measured=hit, free=reach == Reach.FREE)
     return Measurement(
-        rows=rows_of(table),
-        cantilever=Cantilever(table.free_frequency_khz, table.quality_factor, table.mass_ng),
+        rows=rows,
+        cantilever=cantilever,
         constraint_value=np.array([float(value) for value, _ in pairs]),
         constraint_error=np.array([float(error) for _, error in pairs]),
         contact=contact,
@@ -227,8 +233,8 @@ def rows_of(table: AmplitudeTable) -> Rows:
 
     # NumPy throughout: every JAX operation outside a compiled program would be compiled by itself.
     values, errors = readings_of(table)
-    amplitude, error, where = side_by_side(values), side_by_side(errors), place_of_rows(table)
-    measured = np.isfinite(amplitude) & ~padded(where == Reach.ATTRACTED, 1.0).astype(bool)[:, None]
+    amplitude, error = side_by_side(values), side_by_side(errors)
+    measured = np.isfinite(amplitude)
     unseen = np.zeros(table.rows) if table.no_orbit is None else np.nan_to_num(table.no_orbit)
     return Rows(
         order=padded(table.order),
@@ -239,7 +245,7 @@ def rows_of(table: AmplitudeTable) -> Rows:
         error_nm=np.where(measured, error, 1.0),
         measured=measured,
         no_orbit=padded(unseen, 0.0) > 0.0,
-        free=padded(where == Reach.FREE, 0.0) > 0.0,
+        free=np.zeros(size, dtype=bool),
     )
 
 
@@ -263,37 +269,39 @@ class Reach(IntEnum):
     ATTRACTED = 2
 
 
-def place_of_rows(table: AmplitudeTable) -> Int[np.ndarray, " rows"]:
-    """Return the `Reach` of every row of a table; where the sample is driven, all meet it.
+def reach_of(rows: Rows, cantilever: Cantilever, drive: str) -> Int[np.ndarray, " rows"]:
+    """Return the `Reach` of every row; where the sample is driven, all meet it.
 
     A tip is free whose amplitude leaves room for a bridge. Impacts push: the virial of the force, of the sign of
     Re(gamma W conj Z) with the height's lock-in value Z and W = Z + A0, is negative; where it is not, or the tip is out
     of reach without being free, the sample only draws it.
     """
-    place = np.full(table.rows, Reach.IMPACT)
-    if not table.tapping:
-        return place
-    reach = table.excitation_nm + table.offset_nm
-    place[(virial_of(table) > 0.0) | (reach < 0.0)] = Reach.ATTRACTED
-    place[reach < -BRIDGE_NM] = Reach.FREE
-    return place
+    found = np.full(len(np.asarray(rows.order)), Reach.IMPACT)
+    if drive == "sample":
+        return found
+    reach = np.asarray(rows.drive_amplitude_nm) + np.asarray(rows.offset_nm)
+    found[(np.real(tip_work(rows, cantilever, drive)) > 0.0) | (reach < 0.0)] = Reach.ATTRACTED
+    found[reach < -BRIDGE_NM] = Reach.FREE
+    return found
 
 
-def virial_of(table: AmplitudeTable) -> Float[np.ndarray, " rows"]:
-    """Return 2 <F z>/k of the first harmonics of force and height, in nm^2; NaN without amplitude and lag.
+def tip_work(rows: Rows, cantilever: Cantilever, drive: str) -> Complex[np.ndarray, " rows"]:
+    """Return the first harmonic's force over k times height, gamma W conj Z with W = Z + A0, in nm^2.
 
-    Of the stated values; in the deflection's place that of the height where the base is driven.
+    Its real part is twice the virial over k, its imaginary part minus the energy lost in a period over pi k. NaN where
+    not both amplitude and lag were measured. Under "base" the height is that of the deflection that is read.
     """
-    lag, amplitude = table.phase_lag_deg, table.lockin_amplitude_nm
-    if lag is None or amplitude is None:
-        return np.full(table.rows, np.nan)
-    ratio = table.drive_frequency_khz / table.free_frequency_khz
-    loss = 0.0 if table.quality_factor is None else 1.0 / table.quality_factor
+    known = np.array(rows.measured)
+    if known.shape[1] < 3:
+        return np.full(len(known), np.nan, dtype=complex)
+    read = np.where(np.all(known[:, 1:], axis=1, keepdims=True), np.asarray(rows.amplitude_nm)[:, 1:], np.nan)
+    ratio = np.asarray(rows.drive_frequency_khz) / float(cantilever.frequency_khz)
+    loss = 0.0 if cantilever.quality_factor is None else 1.0 / float(cantilever.quality_factor)
     gamma = (1.0 - ratio) * (1.0 + ratio) + 1j * ratio * loss
-    zero = table.calibration.get("phase_zero_deg", (0.0, 0.0))[0]
-    free = table.excitation_nm
-    height = -amplitude * np.exp(-1j * (np.deg2rad(lag - zero) - np.angle(gamma)))
-    if table.drive == "base":
+    free = np.asarray(rows.drive_amplitude_nm)
+    height = -read[:, 0] * np.exp(-1j * (np.deg2rad(read[:, 1]) - np.angle(gamma)))
+    if drive == "base":
+        height = height * np.exp(-1j * np.angle(1.0 - gamma))
         free = free / np.abs(1.0 - gamma)
         height = height - gamma * free
-    return np.real(gamma * (height + free) * np.conj(height))
+    return gamma * (height + free) * np.conj(height)

@@ -17,27 +17,24 @@ PICTURES = {
     " --out chart",
     "branches": "continue scene.toml --order 1 --parameter platform.amplitude_nm=0.5:6 --out branches",
     "basins": "basins scene.toml --grid 100x100 --out basins",
-    "collide": "collide --speeds 12,15,20,60 --out collide",
+    "tapping": "tapping fitting/examples/tapping_resonance.csv --out report",
     "sweep": "sweep sweep.toml --out swept --plot",
+    "collide": "collide --speeds 12,15,20,60 --out collide",
 }
-"""The command that writes each picture; scene and sweep files are those of the pages."""
-
-
-def block(page: str, language: str = "toml") -> str:
-    """Return the first block of a language on a page."""
-    found = re.search(
-        rf"^```{language}\n(.*?)^```", (PAGES / page).read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
-    )
-    assert found is not None
-    return found.group(1)
+"""The command that writes each picture; scene and sweep are those of the pages."""
 
 
 def main() -> None:
     """Run the commands in a folder of their own and keep their pictures; names in the call choose some."""
-    with TemporaryDirectory() as name:
-        folder = Path(name)
-        (folder / "scene.toml").write_text(block("first_steps.md"), encoding="utf-8")
-        (folder / "sweep.toml").write_text(block("sweeps.md"), encoding="utf-8")
+    with TemporaryDirectory() as place:
+        folder = Path(place)
+        (folder / "fitting").symlink_to(ROOT / "fitting")
+        for name, page in (("scene.toml", "first_steps.md"), ("sweep.toml", "sweeps.md")):
+            block = re.search(
+                r"^```toml\n(.*?)^```", (PAGES / page).read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL
+            )
+            assert block is not None
+            (folder / name).write_text(block.group(1), encoding="utf-8")
         for picture in sys.argv[1:] or PICTURES:
             arguments = shlex.split(PICTURES[picture])
             print("afm-jax", *arguments)

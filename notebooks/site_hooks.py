@@ -1,8 +1,10 @@
 """What the site's build adds to the pages: notebooks as they ran, commands from their own help, the public names."""
 
 import re
+from pathlib import Path
 
 import click
+import nbformat
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
@@ -19,9 +21,18 @@ _KEPT_ELSEWHERE = {
     "changelog.md": "CHANGELOG.md",
     "contributing.md": "CONTRIBUTING.md",
 }
+_GALLERY = """Notebooks as they ran, from the repository's folder `notebooks/`. Each ends with assertions on what it
+claims, and is run by the tests. They are meant to be opened in JupyterLab too: *An orbit by sliders* moves there."""
 _FROM_AFAR = re.compile(
     r'<script[^>]*\bsrc="https?://[^>]*>.*?</script>|<script[^>]*>\s*import mermaid.*?</script>', re.DOTALL
 )
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """List the notebooks that the table of contents does not name at the end of its gallery."""
+    gallery = next(part["Gallery"] for part in config.nav or [] if "Gallery" in part)
+    gallery += [place for path in NOTEBOOKS if (place := f"gallery/{path.name}") not in gallery]
+    return config
 
 
 @event_priority(100)  # before the plugin that turns notebooks into pages
@@ -31,6 +42,10 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         place = kept(path)
         name = f"{place.parent.name}/{place.name}"
         files.append(File(name, str(place.parent.parent), config.site_dir, config.use_directory_urls))
+    listed = next(part["Gallery"] for part in config.nav or [] if "Gallery" in part)
+    files.append(
+        File.generated(config, "gallery/index.md", content=gallery([Path(place).name for place in listed[1:]]))
+    )
     for name, place in _KEPT_ELSEWHERE.items():
         files.append(File.generated(config, name, abs_src_path=str(ROOT / place)))
     files.append(File.generated(config, "commands.md", content=commands()))
@@ -39,9 +54,26 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_post_page(output: str, page: Page, config: MkDocsConfig) -> str:
-    """Leave out what a page of a notebook would fetch from other machines."""
+    """Leave out what a page of a notebook would fetch from other machines; its links lead to the site's pages."""
     del config
-    return _FROM_AFAR.sub("", output) if page.file.src_uri.endswith(".ipynb") else output
+    if not page.file.src_uri.endswith(".ipynb"):
+        return output
+    own = _FROM_AFAR.sub("", output)
+    own = re.sub(r'href="(?:pages/)?(\w+)\.md"', r'href="../\1.html"', own)
+    return re.sub(r'href="(\w+)\.ipynb"', r'href="\1.html"', own)
+
+
+def gallery(names: list[str]) -> str:
+    """Return the page of all notebooks, each with its title and its first sentence."""
+    parts = [
+        "# Gallery",
+        _GALLERY,
+    ]
+    for name in names:
+        title, _, text = nbformat.read(ROOT / "notebooks" / name, as_version=4).cells[0].source.partition("\n")
+        sentence = re.split(r"(?<=[.?!])\s", re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", text.strip()), maxsplit=1)[0]
+        parts.append(f"[**{title.lstrip('# ')}**]({name})\n: {' '.join(sentence.split())}")
+    return "\n\n".join(parts)
 
 
 def commands() -> str:

@@ -12,7 +12,7 @@ from afm_jax.cli import main
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-PAGES = [ROOT / "README.md", *sorted((ROOT / "notebooks" / "pages").rglob("*.md"))]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "notebooks").rglob("*.md"))]
 COMMAND = re.compile(r"^ {4}afm-jax (.*)$|`afm-jax ([a-z][^`]*)`", re.MULTILINE)
 RELATIVE = 2e-3
 """How far a number shown may be from the one that this machine prints: last digits of fits."""
@@ -63,6 +63,7 @@ def test_readme_shows_what_its_commands_print(tmp_path: Path, monkeypatch: pytes
     monkeypatch.chdir(tmp_path)
     (table,) = blocks("csv")
     (tmp_path / "my_amplitudes.csv").write_text(table)
+    (tmp_path / "fitting").symlink_to(ROOT / "fitting")
     typed = re.findall(r"^ {4}(afm-jax .*)$", README, re.MULTILINE)
     printed: list[str] = []
     for line in typed:

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 _LAW = tuple(parameter.name for parameter in (*LAW, *DELAY))
 _REMARKS = {"quality_factor": "; none: no air damping", "offset_origin_nm": "; not with a delay"}
-_BELONG = ("free_frequency_khz", "mass_ng", "free", "value", *_LAW, *NUISANCE_NAMES)
+_BELONG = ("mass_ng", "free", "value", *_LAW, *NUISANCE_NAMES)
 
 
 class BeliefOptions(NamedTuple):
@@ -78,7 +78,6 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
         ),
         click.option("--free", metavar="NAMES", help="With contact: its parameters that a fit would determine."),
         click.option("--mass-ng", type=float, metavar="X", help="Effective mass of the tip; else 1."),
-        click.option("--free-frequency-khz", type=float, metavar="X", help="Resonance of the free cantilever."),
         click.option("--model", type=click.Choice(MODELS), help="What will be fitted; else law+delay, or the fit's."),
         click.option(
             "--measured",
@@ -143,11 +142,11 @@ def _from_values(options: BeliefOptions) -> "Belief":
     contact = dict(numbers.get("value", ()))
     values = {name: value for name, value in numbers.items() if name in _LAW}
     for name in NUISANCE_NAMES:
-        if name != "quality_factor" and name in numbers and numbers[name][1] is None:
+        if name not in {"quality_factor", "free_frequency_khz"} and name in numbers and numbers[name][1] is None:
             raise click.UsageError(f"{_option(name)} needs its standard error; write '{PARAMETERS[name].example}'")
     return believe(
         model,
-        free_frequency_khz=numbers["free_frequency_khz"],
+        free_frequency_khz=numbers["free_frequency_khz"][0],
         quality_factor=quality_factor,
         mass_ng=numbers.get("mass_ng", 1.0),
         values=values | {name: value for name, value in contact.items() if name in own},

@@ -147,7 +147,9 @@ def command(session: Session, tables: tuple[Path, ...], model: str, noise: float
 
     The table is a CSV file: comment lines `# free_frequency_khz = 90`, `# quality_factor = 40 +- 1`, and columns
     order, drive_frequency_khz, drive_amplitude_nm, offset_nm, peak_amplitude_nm and/or lockin_amplitude_nm, each
-    with its ..._error_nm; a column no_orbit marks by 1 drives on which the tip settled on nothing. With --out the
+    with its ..._error_nm; a column no_orbit marks by 1 drives on which the tip settled on nothing; phase_deg
+    counts too. With a line `# drive = force` (or base) it is a tapping curve: drive_frequency_khz, free_amplitude_nm,
+    offset_nm, lockin_amplitude_nm and phase_lag_deg. With --out the
     report: fit.html, fit.txt, fit.json, fit.png, fit_rows.csv, law.csv. Exit code 3 if the result is not valid: not
     converged, not explained by the model, or a parameter not identified.
     """

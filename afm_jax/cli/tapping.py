@@ -7,46 +7,91 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from afm_jax.cli.main import NotValid
-from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.read import NmPerVolt
+from afm_jax.cli.session import Session, prepare_folder, with_session
 from afm_jax.cli.values import Share, ValueAndError
 
 if TYPE_CHECKING:
     from fitting.tables.table import AmplitudeTable
+    from fitting.tapping_curves.measured import MeasuredFile
+    from fitting.tapping_curves.result import Tapping
 
 
 @click.command()
-@click.argument("curve", metavar="CURVE", type=click.Path(path_type=Path))
+@click.argument("curve_file", metavar="CURVE", type=click.Path(path_type=Path))
 @click.option(
     "--noise",
     type=Share("a relative error"),
     metavar="SHARE",
-    help="Relative error of amplitudes without one, such as 1%.",
+    help="Relative error of a table's amplitudes without one, such as 1%.",
 )
-@click.option("--free-frequency-khz", type=ValueAndError(), metavar="KHZ[+-KHZ]", help="Instead of the file's.")
-@click.option("--quality-factor", type=ValueAndError(), metavar="Q[+-Q]", help="Instead of the file's.")
-@click.option("--spring-constant", type=ValueAndError(), metavar="K[+-K]", help="In N/m, instead of the file's.")
-@click.option("--tip-calibration", type=ValueAndError(), metavar="C[+-C]", help="True over stated amplitude.")
+@click.option("--free-frequency-khz", type=ValueAndError(), metavar="KHZ", help="Instead of the file's; '90 +- 0.01'.")
+@click.option("--quality-factor", type=ValueAndError(), metavar="Q", help="Instead of the file's; '200 +- 2'.")
+@click.option(
+    "--spring-constant",
+    "--spring-constant-n-per-m",
+    "spring_constant_n_per_m",
+    type=ValueAndError(),
+    metavar="N_PER_M",
+    help="Instead of the file's; '5.4 +- 0.5'.",
+)
+@click.option("--tip-calibration", type=ValueAndError(), metavar="C", help="True over stated amplitude; '1 +- 0.02'.")
+@click.option("--drive", type=click.Choice(["base", "force"]), help="Of an instrument's file: what shakes the tip.")
+@click.option("--nm-per-volt", type=NmPerVolt(), metavar="NM|slope", help="Of an instrument's file, as for `read`.")
+@click.option("--curve", type=click.IntRange(1), metavar="N", help="Only this curve of an instrument's file.")
 @click.option("--model", default="viscous+delay", show_default=True, help="Of the law, as for `afm-jax fit`.")
 @click.option("--no-law", is_flag=True, help="Leave the impact law out: energy, thresholds and speeds only, at once.")
 @with_session
-def command(session: Session, curve: Path, noise: float | None, **options: Any) -> None:
+def command(session: Session, curve_file: Path, *, no_law: bool, model: str, **options: Any) -> None:
     """Read the energy of a tap off a tapping curve, and where the drive allows it the impact law.
 
     CURVE is a table of amplitude and phase against height (`# drive = force` or base, columns drive_frequency_khz,
-    free_amplitude_nm, offset_nm, lockin_amplitude_nm, phase_lag_deg with their errors, retract). Energy, thresholds and
-    hysteresis, attractive or repulsive branch, impact speeds where they can be known; then the law from the rows with
-    fast impacts, or why not and what to record instead. With --out the report: tapping.html, .txt, .json, .png and
-    tapping_rows.csv, and that of the law. Exit code 3 if the energy of a tap is not determined.
+    free_amplitude_nm, offset_nm, lockin_amplitude_nm, phase_lag_deg with their errors, retract), or an instrument's
+    file, as for `afm-jax read`. Energy, thresholds and hysteresis, attractive or repulsive branch, impact speeds where
+    they can be known; then the law from the rows with fast impacts, or why not and what to record instead. With --out
+    the report: tapping.html, .txt, .json, .png and tapping_rows.csv, and that of the law; of a file of several curves
+    in a folder each. Exit code 3 if the energy of a tap is not determined.
     """
     from fitting.tables.table import read_table  # noqa: PLC0415
-    from fitting.tapping_curves.report import tapping_summary, write_tapping  # noqa: PLC0415
+    from fitting.tapping_curves.measured import is_table, read_measured  # noqa: PLC0415
+
+    if is_table(curve_file):
+        result = _analysed(
+            session, _given(read_table(curve_file, noise=options["noise"]), options), model, no_law=no_law
+        )
+        _finish(session, result)
+        return
+    asked = ("free_frequency_khz", "quality_factor", "spring_constant_n_per_m", "drive", "nm_per_volt")
+    file = read_measured(curve_file, curve=options["curve"], **{name: options[name] for name in asked})
+    results = {
+        number: _analysed(session, _calibrated(table, options), model, no_law=no_law)
+        for number, table in file.tables.items()
+    }
+    if len(results) == 1 and not file.refused:
+        _finish(session, next(iter(results.values())))
+        return
+    _finish_several(session, curve_file, file, results)
+
+
+def _analysed(session: Session, table: "AmplitudeTable", model: str, *, no_law: bool) -> "Tapping":
     from fitting.tapping_curves.tapping import tapping, with_law  # noqa: PLC0415
 
-    result = tapping(_given(read_table(curve, noise=noise), options), law=False)
-    if result.law_allowed and not options["no_law"]:
-        session.start_computing(*(f"fitting.forward:{name}" for name in ("impacts_of", "located", "linearise_pairs")))
-        with session.working("fitting the impact law (the first run compiles for half a minute)"):
-            result = with_law(result, options["model"])
+    result = tapping(table, law=False)
+    if no_law or not result.law_allowed:
+        return result
+    session.start_computing(*(f"fitting.forward:{name}" for name in ("impacts_of", "located", "linearise_pairs")))
+    with session.working("fitting the impact law (the first run compiles for half a minute)"):
+        return with_law(result, model)
+
+
+def _finish(session: Session, result: "Tapping") -> None:
+    """Print a result and write its report.
+
+    Raises:
+        NotValid: if the energy of a tap is not determined.
+    """
+    from fitting.tapping_curves.report import tapping_summary, write_tapping  # noqa: PLC0415
+
     session.emit(result.to_dict(), tapping_summary(result))
     if session.out is not None:
         for path in write_tapping(result, session.out, session.write_table):
@@ -55,12 +100,49 @@ def command(session: Session, curve: Path, noise: float | None, **options: Any) 
         raise NotValid(result.reasons[0])
 
 
+def _finish_several(session: Session, path: Path, file: "MeasuredFile", results: "dict[int, Tapping]") -> None:
+    """The same for the curves of one file, with the hysteresis of all of them.
+
+    Raises:
+        NotValid: if the energy is not determined on every curve, or a curve is refused.
+    """
+    from fitting.tapping_curves.report import tapping_summary, write_tapping  # noqa: PLC0415
+
+    width = file.half_width_nm
+    text = [tapping_summary(result) + "\n" for result in results.values()]
+    text += [f"Curve {number} refused: {reason}" for number, reason in file.refused.items()]
+    if width is not None:
+        each = ", ".join(f"{one:.2f}" for one in file.half_widths_nm.values())
+        text.append(
+            f"Hysteresis at half of the free amplitude: {width[0]:.2f} nm, scatter {width[1]:.2f} nm over "
+            f"{len(file.half_widths_nm)} curves ({each}); it needs no calibration of the amplitude"
+        )
+    payload = {
+        "valid": bool(results) and not file.refused and all(result.valid for result in results.values()),
+        "curves": [{"curve": number, **result.to_dict()} for number, result in results.items()],
+        "refused": [{"curve": number, "reason": reason} for number, reason in file.refused.items()],
+        "half_width_nm": None if width is None else {"mean": width[0], "scatter": width[1]},
+        "half_widths_nm": [{"curve": number, "width_nm": one} for number, one in file.half_widths_nm.items()],
+    }
+    session.emit(payload, "\n".join(text))
+    if session.out is not None:
+        for number, result in results.items():
+            own = replace(session, out=session.out / f"curve_{number}")
+            prepare_folder(session.out / f"curve_{number}")
+            for written in write_tapping(result, session.out / f"curve_{number}", own.write_table):
+                session.note(f"wrote {written}")
+    if not payload["valid"]:
+        named = [f"curve {number} refused" for number in file.refused]
+        named += [f"curve {number}: {result.reasons[0]}" for number, result in results.items() if not result.valid]
+        raise NotValid(f"{path}: {'; '.join(named)}")
+
+
 def _given(table: "AmplitudeTable", options: dict[str, Any]) -> "AmplitudeTable":
     """Return a table with what the call says of the instrument in place of its own."""
     names = {
         "free_frequency_khz": ("free_frequency_khz", "free_frequency_error_khz"),
         "quality_factor": ("quality_factor", "quality_factor_error"),
-        "spring_constant": ("spring_constant_n_per_m", "spring_constant_error_n_per_m"),
+        "spring_constant_n_per_m": ("spring_constant_n_per_m", "spring_constant_error_n_per_m"),
     }
     own = {
         name: number
@@ -68,7 +150,21 @@ def _given(table: "AmplitudeTable", options: dict[str, Any]) -> "AmplitudeTable"
         if options[option] is not None
         for name, number in zip(pair, options[option], strict=True)
     }
-    if options["tip_calibration"] is not None:
-        value, error = options["tip_calibration"]
-        own["calibration"] = table.calibration | {"tip_calibration": (value, error or 0.0)}
+    return _calibrated(_with_mass(table, own), options)
+
+
+def _with_mass(table: "AmplitudeTable", own: dict[str, Any]) -> "AmplitudeTable":
+    """Return a table with numbers in place of its own; the mass is what spring constant and frequency make it."""
+    from fitting.tables.table import mass_of  # noqa: PLC0415
+
+    spring = own.get("spring_constant_n_per_m", table.spring_constant_n_per_m)
+    if own and spring is not None:
+        own = own | {"mass_ng": mass_of(spring, own.get("free_frequency_khz", table.free_frequency_khz))}
     return replace(table, **own) if own else table
+
+
+def _calibrated(table: "AmplitudeTable", options: dict[str, Any]) -> "AmplitudeTable":
+    if options["tip_calibration"] is None:
+        return table
+    value, error = options["tip_calibration"]
+    return replace(table, calibration=table.calibration | {"tip_calibration": (value, error or 0.0)})

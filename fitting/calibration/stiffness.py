@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.special import kv, stdtrit
 
+from afm_jax.results import public_result
 from afm_jax.strict_json import plain
 from afm_jax.words import interval, known, text_table, with_error
 from fitting.calibration.result import CalibratedValue, Calibration
@@ -38,6 +39,7 @@ _IMAGINARY = (
 )
 
 
+@public_result()
 @dataclass(frozen=True)
 class Stiffness:
     """A spring constant or a sensitivity, with what it rests on.
@@ -260,7 +262,11 @@ def stiffness_lines(calibration: Calibration, found: list[Stiffness]) -> list[st
                 f"  The instrument says {stated:g} N/m: this {100.0 * (one.value.value / stated - 1.0):+.1f} %."
             )
     note = disagreement(found)
-    lines += ["", note] if note else []
+    if note is not None:
+        lines += ["", note]
+    else:
+        line = f"# spring_constant_n_per_m = {with_error(found[-1].value.value, found[-1].value.standard_error)}"
+        lines += ["", "For the top of a table:", line]
     keys = ("share", *WORTH)
     rows = budget(calibration, found)
     cells = [[row["quantity"], *(known(row[key], ".2%") for key in keys), row["why"]] for row in rows]

@@ -34,6 +34,7 @@ from fitting.fits.minimum import (
     ATTRACTED,
     Minimum,
     Strain,
+    lost_rows,
     minimise,
     relaxed,
     rescale_errors,
@@ -59,10 +60,8 @@ from fitting.forward import impact_at, warm_up
 from fitting.models import (
     Measurement,
     Problem,
-    Reach,
     constraints_of,
     measurement_of,
-    place_of_rows,
     readings_of,
 )
 from fitting.parameters import NUISANCE_NAMES, PARAMETERS, check_contact_values, model_parameters
@@ -204,13 +203,17 @@ _PACKAGES = ("afm-jax", "jax", "optax", "numpy")
 
 @dataclass(frozen=True)
 class Found:
-    """A minimum before it is summarised: the objective with the errors as stated and as used, and the settings."""
+    """A minimum before it is summarised: the objective with the errors as stated and as used, and the settings.
+
+    ``refused``: hardly a row of the table is one that a law of impacts can be read off.
+    """
 
     stated: Objective
     objective: Objective
     minimum: Minimum
     strain: Strain
     settings: dict[str, Any]
+    refused: bool = False
 
 
 def summarise(table: AmplitudeTable, found: Found) -> FitResult:
@@ -229,6 +232,7 @@ class _Summary:
         objective, minimum = found.objective, found.minimum
         self.searching, self.table, self.minimum, self.strain = objective, table, minimum, found.strain
         self.settings, self.problem, self.stated = found.settings, objective.problem, found.stated
+        self.refused = found.refused
         self.values = self.problem.values(minimum.coordinates)
         # orbits are followed from here on: only their places change a little
         self.objective = objective.following(self.values)
@@ -254,7 +258,7 @@ class _Summary:
 
     def _step(self) -> tuple[LinearStep, Unmodelled] | None:
         """Return the step with what the model leaves out; None for impacts that take no time, or without slopes."""
-        if not self.problem.lasting or not np.isfinite(self.used_speeds).any():
+        if not self.problem.lasting or self.refused or not np.isfinite(self.used_speeds).any():
             return None
         scale = self.settings["error_scale"] or 1.0
         rows = rows_of_fit(self.stated, self.objective, self.values, self.strain, scale)
@@ -265,7 +269,8 @@ class _Summary:
         shares = 1e-3 * rows.hertz_time[used] * self.table.drive_frequency_khz[used]
         self.contact_share = float(shares.max())
         values = dict(zip(self.problem.names, self.values.tolist(), strict=True))
-        left_out = Unmodelled(self.problem, values, speed_range(self.used_speeds))
+        mass = float(self.stated.measurement.cantilever.mass_ng)
+        left_out = Unmodelled(self.problem, values, speed_range(self.used_speeds), mass)
         return step_of(rows, left_out, self.free), left_out
 
     def _take(self, step: LinearStep, left_out: Unmodelled) -> None:
@@ -311,6 +316,7 @@ class _Summary:
             correlations=_correlations(self.spread),
             untabulated=tuple(np.flatnonzero(missed).tolist()),
             contact_share=self.contact_share,
+            refused=self.refused,
         )
         # Errors that assume the model would be confident numbers about a law that is not there.
         explained = not misfits(evidence)
@@ -416,8 +422,10 @@ class _Summary:
         predicted = np.where(exists[:, None], prediction.amplitude_nm[0][:count], np.nan)
         error = np.where(used, np.asarray(rows.error_nm)[:count], np.nan)
         reasons = self.strain.reasons[:count].copy()
-        reasons[place_of_rows(self.table) == Reach.ATTRACTED] = ATTRACTED
-        measured = np.where(used | (reasons != "")[:, None], readings_of(self.table)[0], np.nan)
+        read = readings_of(self.table)[0]
+        stated = np.asarray(self.stated.measurement.rows.measured)[:count]
+        reasons[np.isfinite(read).any(axis=1) & ~stated.any(axis=1)] = ATTRACTED
+        measured = np.where(used | (reasons != "")[:, None], read, np.nan)
         phases = {}
         if measured.shape[1] > 2:
             columns = {"predicted_phase_deg": predicted, "measured_phase_deg": measured, "phase_error_deg": error}
@@ -475,6 +483,8 @@ def _autocorrelation(residual: Float[np.ndarray, "rows k"]) -> float:
 
 
 _STRAIN_ROUNDS = 3
+_FEWEST_LEFT, _LEAST_LEFT = 4, 0.2
+"""Rows of a driven tip, and their share, of which at least a law of impacts is read off."""
 
 
 def fit(  # noqa: PLR0913
@@ -556,7 +566,7 @@ def find_fit(  # noqa: PLR0913
         )
     warm_up(starts(problem, measurement)[0], measurement, problem)
     stated = Objective(measurement, problem, robust=robust)
-    objective, minimum, strain = unstrained_minimum(stated)
+    objective, minimum, strain, refused = unstrained_minimum(stated)
     scale = None
     if scale_errors:
         objective, minimum, scale = rescale_errors(objective, minimum, len(problem.own))
@@ -572,7 +582,7 @@ def find_fit(  # noqa: PLR0913
         "effects": list(effects) if model == "contact" else None,
         "speeds": speeds,
     }
-    return Found(stated, objective, minimum, strain, settings)
+    return Found(stated, objective, minimum, strain, settings, refused)
 
 
 def problem_of(
@@ -608,19 +618,37 @@ def problem_of(
     return Problem(model, own + nuisances, tuple(effects), table.drive)
 
 
-def unstrained_minimum(stated: Objective) -> tuple[Objective, Minimum, Strain]:
-    """Return the minimum with the model's own error in the weights and strained rows set aside, until both settle."""
+def unstrained_minimum(stated: Objective) -> tuple[Objective, Minimum, Strain, bool]:
+    """Return the minimum with the model's own error in the weights and strained rows set aside, until both settle.
+
+    The last is True if hardly a row of a driven tip is left then: they are not set aside, and the law is refused.
+    """
     minimum = minimise(stated)
     strain = strain_of(stated, stated.problem.values(minimum.coordinates))
     if not stated.problem.lasting:
-        return stated, minimum, strain
+        return stated, minimum, strain, False
+    if _few_left(stated, strain, minimum):
+        return stated, minimum, strain, True
     objective = relaxed(stated, strain)
     for _ in range(_STRAIN_ROUNDS):
         minimum = settle(objective, minimum)
         again = strain_of(stated, stated.problem.values(minimum.coordinates))
         same = np.array_equal(again.set_aside, strain.set_aside)
         close = np.allclose(again.model_error, strain.model_error, rtol=0.02)
+        if _few_left(stated, again, minimum):
+            return stated, minimum, again, True
         if same and close:
-            return objective, minimum, strain
+            return objective, minimum, strain, False
         objective, strain = relaxed(stated, again), again
-    return objective, settle(objective, minimum), strain
+    return objective, settle(objective, minimum), strain, False
+
+
+def _few_left(stated: Objective, strain: Strain, minimum: Minimum) -> bool:
+    """Say whether the law has an orbit on fewer than four unstrained rows of a driven tip, or on fewer than a fifth."""
+    if not stated.problem.tapping:
+        return False
+    rows = stated.measurement.rows
+    hits = np.asarray(rows.measured).any(axis=1) & ~np.asarray(rows.free)
+    lost = lost_rows(stated, stated.problem.values(minimum.coordinates))
+    left = int((hits & ~lost & ~strain.set_aside).sum())
+    return left < max(_FEWEST_LEFT, _LEAST_LEFT * hits.sum())

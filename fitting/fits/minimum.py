@@ -27,7 +27,7 @@ from afm_jax.impact.lasting_impact import TabulatedImpact
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.fits.objective import BATCH, FINE, PLAIN, ROUGH, SOFT, Objective, lowest, polish
 from fitting.forward import Linearised, free_impacts, impact_at
-from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem
+from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem, Rows, tip_work
 from fitting.parameters import PARAMETERS, Parameter
 
 _GRID_PER_PARAMETER = {1: 96, 2: 16}
@@ -43,7 +43,7 @@ def starts(problem: Problem, measurement: Measurement) -> Float[np.ndarray, "poi
     own = problem.own
 
     def started(name: str, place: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
-        return _range(PARAMETERS[name], measurement, place)
+        return _range(PARAMETERS[name], measurement, problem, place)
 
     if len(own) in _GRID_PER_PARAMETER and not problem.lasting:
         count = _GRID_PER_PARAMETER[len(own)]
@@ -67,9 +67,34 @@ def _spread(count: int, dimensions: int) -> Float[np.ndarray, "count dimensions"
     return np.mod(0.5 + np.outer(np.arange(1, count + 1), steps), 1.0)
 
 
-def _range(parameter: Parameter, measurement: Measurement, place: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+_STARTS_OF_LOSS = 0.03, 2.0
+"""Range of the starts of a loss of a driven tip, in terms of what its readings say."""
+_USUAL_SPEED = 0.2
+"""Approach speed of a tip that taps above resonance, about, over the speed of the free tip."""
+
+
+def _lost_squared(measurement: Measurement, problem: Problem) -> tuple[float, float] | None:
+    """Return the loss u_in^2 - u_out^2 that amplitude and phase of a driven tip amount to, and a usual speed.
+
+    In nm^2/us^2 and nm/us, roughly: the first harmonic's energy, at the middle of the rows; None if nothing is lost.
+    """
+    rows, cantilever = measurement.rows, measurement.cantilever
+    lost = -2.0 * np.pi * float(cantilever.angular_frequency) ** 2 * np.imag(tip_work(rows, cantilever, problem.drive))
+    lost = lost[np.isfinite(lost) & (lost > 0.0) & ~np.asarray(rows.free)]
+    top = RAD_PER_US_PER_KHZ * np.asarray(rows.drive_amplitude_nm) * np.asarray(rows.drive_frequency_khz)
+    return (float(np.median(lost)), _USUAL_SPEED * float(np.median(top))) if lost.size else None
+
+
+def _range(
+    parameter: Parameter, measurement: Measurement, problem: Problem, place: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, " n"]:
     """Return the values that places between 0 and 1 of a parameter's starting range stand for."""
     rows = measurement.rows
+    if problem.tapping and parameter.drive_power:
+        lost = _lost_squared(measurement, problem)
+        if lost is not None:
+            low, high = np.array(_STARTS_OF_LOSS) * lost[0] / lost[1] ** (2.0 - parameter.drive_power)
+            return parameter.reference + parameter.sign * low * (high / low) ** place
     drive = RAD_PER_US_PER_KHZ * np.asarray(rows.drive_amplitude_nm) * np.asarray(rows.drive_frequency_khz)
     scale = np.array([drive.min(), drive.max()]) ** parameter.drive_power
     scale *= float(np.asarray(measurement.cantilever.mass_ng)) ** parameter.mass_power
@@ -272,6 +297,9 @@ def _polished(
 
 BASE, GROWTH, SLOW = 0.0005, 0.012, 0.016
 """Relative model error of fast impacts, its growth with s^3, and its value at 1.5 times the capture speed."""
+TAPPED, IN_FRAME = 0.0012, 1e-4
+"""Growth of that of a driven tip, and its error in the frame of the free tip, over the amplitude there: what the law's
+parameters do not make up for (full contacts of tips of 12, 20 and 100 nm, 3 and 10 % above resonance)."""
 DELAY_US = 1.5e-4
 """Error of the delay law in us."""
 LONGEST = 1.4
@@ -281,14 +309,14 @@ NEAREST = 1.35
 _CRAWLING, _MOST_LOST = 2.5, 0.05
 """The same for rows that the law has no steady orbit for, their speed told from the amplitude, and for driven tips; and
 the share of those without at most: that close to where orbits end, a hair of the law decides whether there is one."""
-_PULLED = 0.8
+_PULLED = 1.2
 """Pull times Hertz time over the approach speed from which the rows of a driven tip are set aside."""
 _MOST_IRREGULAR = 0.2
 """Share of the rows of a driven tip at most that are taken not to be one impact a period."""
 _TURNED = 0.125
 """Error of the phase in rad over the relative error of the amplitude: what the tip loses fixes the phase."""
 TOO_SLOW = "too slow for a law of impacts"
-TOO_PULLED = "under too strong a pull of the lever (more than 0.8 of what turns the tip round)"
+TOO_PULLED = "under too strong a pull of the lever (more than 1.2 times what turns the tip round)"
 IRREGULAR = "not one a period"
 ATTRACTED = "none: the sample only draws the tip"
 """Why rows are set aside."""
@@ -345,16 +373,20 @@ def strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
         reasons[_irregular(objective, exists)] = IRREGULAR
         reasons[free] = ""
     near = np.minimum(1.5 * capture / np.maximum(approach, 1e-6), 1.5 / NEAREST)
-    slow_error = BASE + GROWTH * np.minimum(share, LONGEST) ** 3 + SLOW * near**6
+    base, growth = (_frame_error(rows), TAPPED) if tapping else (BASE, GROWTH)
+    slow_error = base + growth * np.minimum(share, LONGEST) ** 3 + SLOW * near**6
     error = slow_error
     if "delay_offset_nm" in objective.problem.names:
         error = np.hypot(error, DELAY_US * _sensitivity(objective, linear, approach))
     error, slow_error = (np.where(exists, part, BASE) for part in (error, slow_error))
     if tapping:
-        # the error is one of the motion in the free tip's frame
-        frame = 1.0 + np.asarray(rows.drive_amplitude_nm) / np.asarray(rows.amplitude_nm)[:, 1]
-        error, slow_error = (np.where(free, 0.0, frame * part) for part in (error, slow_error))
+        error, slow_error = (np.where(free, 0.0, part) for part in (error, slow_error))
     return Strain(error, slow_error, reasons)
+
+
+def _frame_error(rows: Rows) -> Float[np.ndarray, " rows"]:
+    """Return the relative model error of a driven tip's amplitude: that of its motion in the free tip's frame."""
+    return IN_FRAME * (1.0 + np.asarray(rows.drive_amplitude_nm) / np.asarray(rows.amplitude_nm)[:, 1])
 
 
 def _irregular(objective: Objective, exists: Bool[np.ndarray, " rows"]) -> Bool[np.ndarray, " rows"]:

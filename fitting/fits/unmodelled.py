@@ -29,7 +29,7 @@ from fitting.models import Problem
 from fitting.parameters import DELAY_SHAPE, LOSS_SHAPE, PARAMETERS
 
 LOSS_SPEED_SQUARED = 110.0, 60.0
-"""q in nm^2/us^2 and its standard error: free fits of the laws of contacts give 96 to 125, a wet one 234."""
+"""q in nm^2/us^2 of a tip of 1 ng and its standard error: free fits of contacts' laws give 96 to 125, a wet one 234."""
 _LOSS_SHARE = 0.07
 """Standard deviation of the smooth part of the loss, relative."""
 _MISSING_SHARE = 0.3
@@ -93,21 +93,25 @@ class Unmodelled:
         problem: the model; of the resolved contact only corrections and slow impacts are uncertain.
         values: of its parameters, by name.
         speeds: slowest and fastest approach of the rows in nm/us.
+        mass_ng: of the tip: what a bridge does to speeds goes with its inverse square root.
     """
 
     problem: Problem
     values: dict[str, float]
     speeds: tuple[float, float]
+    mass_ng: float = 1.0
 
     @property
     def priors(self) -> dict[str, tuple[float, float]]:
         """Mean and standard error of the shapes' numbers, by name; only those that the model has use for."""
         priors = {}
         if "viscous_loss" in self.problem.own:
-            priors[LOSS_SHAPE] = LOSS_SPEED_SQUARED
+            mean, error = LOSS_SPEED_SQUARED
+            priors[LOSS_SHAPE] = mean / self.mass_ng, error / self.mass_ng
         if "delay_lead_nm" in self.problem.own:
-            mean = _SQUARE_PER_LEAD * self.values["delay_lead_nm"]
-            priors[DELAY_SHAPE] = mean, max(abs(mean), _LEAST_SQUARE)
+            slower = self.mass_ng**-0.5
+            mean = slower * _SQUARE_PER_LEAD * self.values["delay_lead_nm"]
+            priors[DELAY_SHAPE] = mean, max(abs(mean), slower * _LEAST_SQUARE)
         return priors
 
     def columns(self, u: Float[np.ndarray, " n"], w: Float[np.ndarray, " n"]) -> Columns:
@@ -211,7 +215,9 @@ def step_of(rows: StepRows, left_out: Unmodelled, free: Bool[np.ndarray, " p"]) 
     jacobian[:size, known:] = amplitudes(columns.shape)
     jacobian[residual.size :, known:] = np.diag([1.0 / error for _, error in priors.values()])
     residual = np.append(residual, np.zeros(len(priors)))
-    unknown = np.concatenate([amplitudes(columns.unknown), amplitudes(_remainders(rows))], axis=1)
+    unknown = np.concatenate(
+        [amplitudes(columns.unknown), amplitudes(_remainders(rows, tapping=left_out.problem.tapping))], axis=1
+    )
     variance = _noise(rows) + unknown @ unknown.T
     root = np.linalg.cholesky(variance)
 
@@ -280,13 +286,15 @@ def _noise(rows: StepRows) -> Float[np.ndarray, "n n"]:
     return variance.reshape(count * kinds, count * kinds)
 
 
-def _remainders(rows: StepRows) -> Float[np.ndarray, "2 rows m"]:
+def _remainders(rows: StepRows, *, tapping: bool) -> Float[np.ndarray, "2 rows m"]:
     """Return the leading remainders of the corrections, of the squared rebound speed and of the delay."""
     u, w, g, j, time = rows.approach, rows.rebound, rows.pull, rows.change, rows.hertz_time
     slope = max(float(np.polyfit(u, u**2 - w**2, 1)[0]), 0.0)
     nothing = np.zeros_like(u)
+    # where the lever's own pull is most of it, it hardly changes during the contact: full contacts say so
+    by_square = 0.02 if tapping else 5.0
     late = (0.5 * g / w**3, 0.008 * g * time**2 / u, 8.0 * j / w**4)
-    gained = (15.0 * slope * j / w**2, 2.0 * slope * g / u, 0.06 * j * time**2 * u, 5.0 * g**2 / w**2)
+    gained = (15.0 * slope * j / w**2, 2.0 * slope * g / u, 0.06 * j * time**2 * u, by_square * g**2 / w**2)
     columns = [(nothing, one) for one in late] + [(one, nothing) for one in gained]
     return _CORRECTIONS * np.moveaxis(np.array(columns), 0, 2)
 

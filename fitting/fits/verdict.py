@@ -15,7 +15,7 @@ from scipy.special import chdtrc
 from fitting.fits.intervals import Convergence
 from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.result import FittedParameter, FittedRows
-from fitting.parameters import PARAMETERS, SHAPE_NAMES
+from fitting.parameters import DELAY_NAMES, PARAMETERS, SHAPE_NAMES
 from fitting.tables.table import AmplitudeTable
 
 IMPROBABLE = 1e-3
@@ -39,6 +39,10 @@ _NEGLIGIBLE = 0.3
 _FEWEST_NEIGHBOURS = 8
 _LONG_CONTACT = 0.2
 """Share of the drive's period in contact from which a misfit is laid to it: the corrections are fitted up to there."""
+_REFUSED = (
+    "No law of impacts can be read off this curve: on nearly all of its rows impacts are too slow, or the lever's own "
+    "pull turns the tip round; drive 3 to 10 % above resonance, with a large free amplitude."
+)
 ASSUMED_ERROR_OF_Q = 0.02
 """Relative standard error of a quality factor that is given without one."""
 _PULLED, _TORN = 2.0, 3.0
@@ -66,11 +70,13 @@ class Evidence:
     """Rows whose impacts the table of a contact does not hold to its accuracy."""
     contact_share: float = 0.0
     """Largest share of a drive's period that the tip is in contact."""
+    refused: bool = False
+    """Hardly a row is left that a law of impacts can be read off."""
 
 
 def judge_fit(evidence: Evidence) -> tuple[list[str], list[str]]:
     """Return what makes a fit invalid, and its warnings; each a sentence."""
-    return _reasons(evidence), _warnings(evidence)
+    return [_REFUSED] if evidence.refused else _reasons(evidence), _warnings(evidence)
 
 
 def _reasons(evidence: Evidence) -> list[str]:
@@ -105,7 +111,10 @@ def _reasons(evidence: Evidence) -> list[str]:
     reasons += _contradictions(evidence)
     if evidence.freedom <= 0:
         reasons.append("As many parameters as amplitudes: the goodness of fit cannot be judged.")
-    for name, parameter in evidence.parameters.items():
+    # a tapping curve tells those of the delay only together; the law does not hang on each
+    together = DELAY_NAMES if evidence.table.tapping else ()
+    for name in (name for name in evidence.parameters if name not in together):
+        parameter = evidence.parameters[name]
         if parameter.interval95 == (None, None) and not misfit and not undetermined:
             reasons.append(f"{name} is not identified: {parameter.interval_reason}; {helpful_measurement(name)}.")
     return reasons
@@ -130,6 +139,8 @@ def misfits(evidence: Evidence) -> list[str]:
 
     The parameters' errors and intervals are not looked at.
     """
+    if evidence.refused:
+        return [_REFUSED]
     found = []
     if evidence.p_value < IMPROBABLE:
         found.append(f"chi2/dof = {evidence.chi2 / evidence.freedom:.3g} (probability {evidence.p_value:.1g})")

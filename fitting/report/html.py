@@ -8,6 +8,7 @@ import numpy as np
 from markupsafe import Markup
 
 from afm_jax.words import known, plain_words
+from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.result import FitResult, FittedRows
 from fitting.parameters import NUISANCE_NAMES, PARAMETERS, SHAPE_NAMES
 from fitting.report.page import Table, in_signs, page, pairs, pictures_of
@@ -257,7 +258,7 @@ def _rows(result: FitResult) -> Table:
         ("line", table.lines, ".0f"),
         ("N", table.order, ".0f"),
         ("frequency (kHz)", table.drive_frequency_khz, "g"),
-        ("drive (nm)", table.excitation_nm, "g"),
+        ("free (nm)" if table.tapping else "drive (nm)", table.excitation_nm, "g"),
         ("offset (nm)", table.offset_nm, "g"),
         (_APPROACH, rows.approach_speed_nm_per_us, ".4g"),
     ]
@@ -269,6 +270,13 @@ def _rows(result: FitResult) -> Table:
                 ("predicted", rows.predicted_nm[:, kind], ".5g"),
                 ("residual", rows.residual[:, kind], "+.2f"),
             ]
+    if rows.measured_phase_deg is not None and rows.predicted_phase_deg is not None:
+        columns += [
+            ("phase (degrees)", rows.measured_phase_deg, ".5g"),
+            ("±", np.full(table.rows, np.nan) if rows.phase_error_deg is None else rows.phase_error_deg, ".2g"),
+            ("predicted", rows.predicted_phase_deg, ".5g"),
+            ("residual", rows.residual[:, 2], "+.2f"),
+        ]
     columns.append(("model error (%)", 100.0 * rows.model_error, ".2g"))
     numbers = zip(
         *([known(value, form) for value in column[: len(shown)].astype(float).tolist()] for _, column, form in columns),
@@ -296,10 +304,16 @@ def _left_out(count: int, where: str) -> str:
     return f"The first {_MOST_ROWS} of {count} rows; all of them are in {where}, written beside this page."
 
 
+def _why_aside(rows: FittedRows, i: int) -> str:
+    reason = rows.reasons[i] if rows.reasons else TOO_SLOW
+    said = "this impact is too slow for the law to describe it" if reason == TOO_SLOW else reason
+    return f"set aside: {said}"
+
+
 def _row_remarks(rows: FittedRows, i: int, *, unseen: bool) -> str:
     exists = rows.orbits[i] > 0
     said = (
-        (rows.set_aside[i], "set aside: this impact is too slow for the law to describe it"),
+        (rows.set_aside[i], _why_aside(rows, i)),
         (unseen and exists, "nothing steady seen, though an orbit is predicted"),
         (unseen and not exists, "nothing steady seen, as predicted"),
         (not unseen and not exists, "no stable orbit at the fitted law"),
@@ -319,9 +333,11 @@ def _instrument(measured: AmplitudeTable) -> Table:
     quality = "not given" if measured.quality_factor is None else f"{measured.quality_factor:g}"
     if measured.quality_factor_error is not None:
         quality += f" ± {measured.quality_factor_error:g}"
+    spread = measured.free_frequency_error_khz
     header = {
         "source": measured.source,
-        "free_frequency_khz": f"{measured.free_frequency_khz:g}",
+        "drive": measured.drive,
+        "free_frequency_khz": f"{measured.free_frequency_khz:g}" + ("" if spread is None else f" ± {spread:g}"),
         "quality_factor": quality,
         "mass_ng": f"{measured.mass_ng:g}",
     }

@@ -9,7 +9,7 @@ import numpy as np
 
 from afm_jax.whole_files import write_whole
 from afm_jax.words import bullets, known, text_table
-from fitting.fits.result import FitResult, FittedParameter
+from fitting.fits.result import FitResult, FittedParameter, FittedRows
 from fitting.report.words import (
     ComparedModels,
     Sampled,
@@ -107,8 +107,9 @@ def _correlation_lines(result: FitResult) -> list[str]:
 
 
 def row_records(result: FitResult) -> list[dict[str, Any]]:
-    """Return a mapping per row of the table, with the columns `ROW_COLUMNS`."""
+    """Return a mapping per row of the table: the columns `ROW_COLUMNS`, and those of a phase or of a driven tip."""
     table, rows = result.table, result.rows
+    names = ["free_amplitude_nm" if table.tapping and name == "drive_amplitude_nm" else name for name in ROW_COLUMNS]
     columns = (
         table.lines,
         table.order,
@@ -122,7 +123,21 @@ def row_records(result: FitResult) -> list[dict[str, Any]]:
         rows.used,
         rows.set_aside,
     )
-    return [dict(zip(ROW_COLUMNS, cells, strict=True)) for cells in zip(*(c.tolist() for c in columns), strict=True)]
+    more = phase_columns(rows)
+    names += more
+    cells = zip(*(c.tolist() for c in (*columns, *more.values())), strict=True)
+    return [dict(zip(names, row, strict=True)) for row in cells]
+
+
+def phase_columns(rows: FittedRows) -> dict[str, np.ndarray]:
+    """Return what was measured, predicted and left of the phase, none without one."""
+    if rows.measured_phase_deg is None or rows.predicted_phase_deg is None:
+        return {}
+    return {
+        "measured_phase_deg": rows.measured_phase_deg,
+        "predicted_phase_deg": rows.predicted_phase_deg,
+        "phase_residual": rows.residual[:, 2],
+    }
 
 
 def law_records(result: FitResult) -> list[dict[str, float]]:
@@ -157,13 +172,12 @@ def write_report(
         OSError: if a file cannot be written.
     """
     from fitting.report.html import fit_page  # noqa: PLC0415
-    from fitting.report.plots import fit_pictures, one_below_the_other  # noqa: PLC0415
+    from fitting.report.plots import fit_pictures  # noqa: PLC0415
 
-    pictures = fit_pictures(result)
+    picture, *pictures = fit_pictures(result)
     page = folder / "fit.html"
     markup = fit_page(result, pictures, comparison=comparison, bootstrap=bootstrap, posterior=posterior)
     write_whole(page, markup)
-    picture = one_below_the_other(pictures)
     others = write_report_files(folder, "fit", text=summary(result), data=result.to_dict(), picture=picture)
     write_table("fit_rows.csv", row_records(result), ROW_COLUMNS)
     write_table("law.csv", law_records(result), LAW_COLUMNS)

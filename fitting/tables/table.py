@@ -593,11 +593,25 @@ def read_table(path: str | Path, noise: float | None = None) -> AmplitudeTable:
     Raises:
         TableError: one line that names the first fault, its place and how to mend it, and the number of other faults.
     """
-    faults = Faults(str(path))
+    return parse_table(read_text(path), str(path), noise)
+
+
+def parse_table(text: str, source: str, noise: float | None = None) -> AmplitudeTable:
+    """Return the amplitude table that a text holds, all of it checked.
+
+    Args:
+        text: what stands in the file.
+        source: its name, as it begins every message.
+        noise: as for `read_table`.
+
+    Raises:
+        TableError: as `read_table`.
+    """
+    faults = Faults(source)
     if noise is not None and not 0.0 < noise < 1.0:
         faults.add(f"the relative noise must be between 0 and 1, but is {noise!r}; write 0.01 for 1 %")
         faults.raise_any()
-    comments, rows = split_lines(read_text(path))
+    comments, rows = split_lines(text)
     check_not_empty(comments, rows, faults)
     header = parse_comments(comments, faults)
     found = faults.count
@@ -618,7 +632,7 @@ def read_table(path: str | Path, noise: float | None = None) -> AmplitudeTable:
     arrays: dict[str, Any] = dict(columns)
     if "order" in columns:
         arrays["order"] = columns["order"].astype(np.int64)
-    return AmplitudeTable(**arrays, **vars(header), source=str(path), lines=lines)
+    return AmplitudeTable(**arrays, **vars(header), source=source, lines=lines)
 
 
 def write_table(table: AmplitudeTable, path: str | Path) -> None:

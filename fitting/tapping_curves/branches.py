@@ -12,10 +12,14 @@ import numpy as np
 from jaxtyping import Bool
 from scipy.optimize import least_squares
 
-from fitting.tapping_curves.curve import Given, Rows, TappingCurve, TipMotion
+from fitting.tapping_curves.curve import Rows, TappingCurve, TipMotion
 
 _FREE = 4.0
 """Standard errors within which a row counts as free."""
+_DRIFT, _DRIFT_DEG = 0.005, 0.3
+"""Of the free amplitude, and in degrees: what a free tip may drift beyond its noise."""
+_NEIGHBOURS = 20
+"""Free rows that the lag of the next is compared with."""
 _HELD = 0.1
 """Of the free amplitude: below it the tip is held, not tapping."""
 _WINDOW = 0.6
@@ -83,8 +87,8 @@ def free_rows(curve: TappingCurve) -> Bool[np.ndarray, " rows"]:
     """
     free = np.zeros(curve.rows, bool)
     for part in ways(curve):
-        for place, row in enumerate(part):
-            following = part[place : place + 2]
+        for place, row in enumerate(part.tolist()):
+            following = part[place : place + 2].tolist()
             if all(_departs(curve, other, part[:place][free[part[:place]]]) for other in following):
                 break
             free[row] = not _departs(curve, row, part[:place][free[part[:place]]])
@@ -95,13 +99,13 @@ def _departs(curve: TappingCurve, row: int, before: np.ndarray) -> bool:
     """Say whether a row is not free, against those farther away."""
     free, amplitude = curve.free_amplitude_nm[row], curve.amplitude_nm[row]
     error = np.hypot(curve.amplitude_error_nm[row], curve.free_amplitude_error * free)
-    if abs(amplitude - free) > max(_FREE * error, 1e-9 * free):
+    if abs(amplitude - free) > max(_FREE * error, _DRIFT * free):
         return True
-    lags = curve.lag_deg[before]
+    lags = curve.lag_deg[before[-_NEIGHBOURS:]]
     if not np.isfinite(lags).any() or not np.isfinite(curve.lag_deg[row]):
         return False
     spread = curve.lag_error_deg[row] * np.sqrt(1.0 + 1.0 / np.isfinite(lags).sum())
-    return bool(abs(curve.lag_deg[row] - np.nanmean(lags)) > _FREE * spread)
+    return bool(abs(curve.lag_deg[row] - np.nanmean(lags)) > max(_FREE * spread, _DRIFT_DEG))
 
 
 def held_rows(curve: TappingCurve) -> Bool[np.ndarray, " rows"]:
@@ -165,7 +169,7 @@ def _height(
     # the last attractive row in front of the nearest repulsive one
     if not before.size or before[-1] + 1 == len(touching):
         return None
-    return _between(*curve.offset_nm[touching[before[-1] : before[-1] + 2]])
+    return _between(*curve.offset_nm[touching[before[-1] : before[-1] + 2]].tolist())
 
 
 def _half(curve: TappingCurve, part: np.ndarray) -> Height | None:
@@ -174,7 +178,7 @@ def _half(curve: TappingCurve, part: np.ndarray) -> Height | None:
     if not above.size or above[-1] + 1 == len(part):
         return None
     rows = part[above[-1] : above[-1] + 2]
-    (far, near), (before, after) = curve.offset_nm[rows], curve.amplitude_nm[rows]
+    (far, near), (before, after) = curve.offset_nm[rows].tolist(), curve.amplitude_nm[rows].tolist()
     level, slope = curve.free_amplitude_nm[rows[0]], (after - before) / (near - far)
     if before - after > _STEEP * level:
         return _between(far, near)
@@ -244,7 +248,7 @@ def _with_energy(
     if found.approach.offset_nm > found.retract.offset_nm and held_rows(curve)[between[1]].mean() > 0.5:
         if not curve.height_known:
             return found
-        value = _energy_of_release(curve.spring_constant_n_per_m, found.approach, found.retract)
+        value = _energy_of_release(curve, found.approach.offset_nm, found.retract.offset_nm)
         return replace(found, energy_between_aj=value, energy_of="the way in and out")
     if not all(np.isfinite(energy[p]).any() for p in between):
         return found
@@ -259,11 +263,14 @@ def _mean(values: Rows, errors: Rows) -> tuple[float, float]:
     return float(np.average(values[known], weights=weights)), float(weights.sum()) ** -0.5
 
 
-def _energy_of_release(k: Given, approach: Height, retract: Height) -> tuple[float, float]:
-    """Return what the way in and out takes of a tip that was held, with its error: the lever lets go of (k/2) h^2."""
-    value = 0.5 * k.value * (retract.offset_nm**2 - approach.offset_nm**2)
-    parts = [*(k.value * end.offset_nm * end.standard_error for end in (retract, approach)), value * k.error / k.value]
-    return value, float(np.linalg.norm(parts))
+def _energy_of_release(curve: TappingCurve, approach: float, retract: float) -> tuple[float, float]:
+    """Return what the way in and out takes of a tip that was held, with its error: the lever lets go of (k/2) h^2.
+
+    Heights are known far better to each other than to the tip's rest position.
+    """
+    k = curve.spring_constant_n_per_m
+    value = 0.5 * k.value * (retract**2 - approach**2)
+    return value, float(np.hypot(k.value * (retract - approach) * curve.origin_error_nm, value * k.error / k.value))
 
 
 _DEGREE = 2

@@ -7,11 +7,11 @@ determines energy and instrument together.
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.optimize import brentq, least_squares
+from scipy.optimize import least_squares
 from scipy.stats import chi2 as chi2_distribution
 
 from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, Rows, TappingCurve, free_lag_deg
@@ -22,13 +22,9 @@ _ROBUST_FROM = 2.0
 _FAR = 4.0
 """Residual in standard errors from which a row is set aside."""
 _MOST_OUTLIERS = 0.2
-_SWEEPS = 3
-"""Times that the rows' weights follow the instrument."""
 _HARMONICS_THAT_TELL = 4
 """With as many measured, what is left of the others does not matter."""
 _Z95 = 1.959964
-_WIDEST = 1e3
-"""Standard errors within which an end of an interval is looked for."""
 
 
 class Nuisance(NamedTuple):
@@ -63,7 +59,7 @@ class ConstantEnergy:
     Attributes:
         energy_aj: of each group.
         standard_error_aj: of each, from noise and instrument, that of the spring constant and the calibration included.
-        interval95_aj: profile of chi2, of each, shape (groups, 2).
+        interval95_aj: of each, shape (groups, 2).
         covariance: of the groups' energies, in aJ^2.
         budget: variance of each group's energy by what it comes from, in aJ^2.
         nuisances: of the instrument.
@@ -213,29 +209,64 @@ def _start(unknowns: _Unknowns, tapping: Bool[np.ndarray, " rows"], free: Bool[n
     return start
 
 
-def _row_residuals(
-    unknowns: _Unknowns, x: np.ndarray, used: Bool[np.ndarray, " rows"], noise: Rows | None = None
-) -> Rows:
+def _row_residuals(unknowns: _Unknowns, x: np.ndarray, used: Bool[np.ndarray, " rows"]) -> Rows:
+    """Return what each energy is off its group's, in errors at the same instrument: else one without losses fits."""
     found = energies(unknowns.curve, unknowns.instrument(x))
-    spread = noise_of(unknowns.curve, found) if noise is None else noise
-    return np.where(used, (found.energy_aj - x[unknowns.groups]) / spread, 0.0)
+    return np.where(used, (found.energy_aj - x[unknowns.groups]) / noise_of(unknowns.curve, found), 0.0)
 
 
 def _residuals(
-    unknowns: _Unknowns, used: Bool[np.ndarray, " rows"], free: Bool[np.ndarray, " rows"], noise: Rows
+    unknowns: _Unknowns, used: Bool[np.ndarray, " rows"], free: Bool[np.ndarray, " rows"]
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """Return residuals of the rows fitted, of the free rows' phase and amplitude, and of what is known beforehand."""
+    """Return residuals of the rows fitted, of the free rows' mean phase and amplitude, and of what is known before."""
     curve, priors = unknowns.curve, np.array([np.isfinite(given.error) for given in unknowns.given], bool)
+    lags = _means(curve.lag_deg, curve.lag_error_deg, unknowns.frequencies, free, turning=True)
+    factors = _means(
+        curve.amplitude_nm / curve.free_amplitude_nm,
+        curve.amplitude_error_nm / curve.free_amplitude_nm,
+        unknowns.amplitudes,
+        free,
+    )
 
     def residuals(x: np.ndarray) -> np.ndarray:
         instrument = unknowns.instrument(x)
-        lag = turned(curve.lag_deg - free_lag_deg(curve, instrument)) / curve.lag_error_deg
-        amplitude = curve.amplitude_nm - curve.free_amplitude_nm * instrument.free_amplitude_factor
-        free_rows = np.concatenate([lag[free], (amplitude / curve.amplitude_error_nm)[free]])
-        rows = _row_residuals(unknowns, x, used, noise)[used]
-        return np.concatenate([rows, free_rows[np.isfinite(free_rows)], x[unknowns.energies :][priors]])
+        expected = free_lag_deg(curve, instrument)
+        factor = np.broadcast_to(instrument.free_amplitude_factor, (curve.rows,))
+        of_free = [turned(lags.mean - expected[lags.row]) / lags.error]
+        of_free.append((factors.mean - factor[factors.row]) / factors.error)
+        rows = _row_residuals(unknowns, x, used)[used]
+        return np.concatenate([rows, *of_free, x[unknowns.energies :][priors]])
 
     return residuals
+
+
+class _Means(NamedTuple):
+    row: Int[np.ndarray, " kinds"]
+    mean: Float[np.ndarray, " kinds"]
+    error: Float[np.ndarray, " kinds"]
+
+
+def _means(
+    values: Rows,
+    errors: Rows,
+    kinds: Int[np.ndarray, " rows"],
+    free: Bool[np.ndarray, " rows"],
+    *,
+    turning: bool = False,
+) -> _Means:
+    """Return the mean of the free rows of each kind: one of these rows, mean, and an error that allows for drift."""
+    found = []
+    for kind in np.unique(kinds):
+        rows = np.flatnonzero(free & (kinds == kind) & np.isfinite(values))
+        if rows.size:
+            off = values[rows] - values[rows[0]]
+            off = turned(off) if turning else off
+            weights = errors[rows] ** -2.0
+            mean = np.average(off, weights=weights)
+            drift = np.sqrt(max(np.var(off) - 1.0 / weights.mean(), 0.0))
+            found.append((rows[0], values[rows[0]] + mean, np.hypot(weights.sum() ** -0.5, drift)))
+    row, mean, error = np.array(found).reshape(-1, 3).T
+    return _Means(row.astype(int), mean, error)
 
 
 def _minimum(
@@ -244,12 +275,10 @@ def _minimum(
     used: Bool[np.ndarray, " rows"],
     free: Bool[np.ndarray, " rows"],
     *,
-    loss: Any,
+    loss: Literal["linear", "soft_l1"],
 ) -> np.ndarray:
-    for _ in range(_SWEEPS):
-        noise = noise_of(unknowns.curve, energies(unknowns.curve, unknowns.instrument(x)))
-        x = least_squares(_residuals(unknowns, used, free, noise), x, loss=loss, f_scale=_ROBUST_FROM, x_scale="jac").x
-    return x
+    residuals = _residuals(unknowns, used, free)
+    return least_squares(residuals, x, loss=loss, f_scale=_ROBUST_FROM, x_scale="jac").x
 
 
 def _result(
@@ -260,12 +289,14 @@ def _result(
     outliers: Bool[np.ndarray, " rows"],
 ) -> ConstantEnergy:
     curve, count = unknowns.curve, unknowns.energies
-    noise = noise_of(curve, energies(curve, unknowns.instrument(x)))
-    residuals = _residuals(unknowns, used, free, noise)
+    residuals = _residuals(unknowns, used, free)
     at = least_squares(residuals, x, x_scale="jac")
-    covariance = np.linalg.pinv(at.jac.T @ at.jac)
+    sizes = np.linalg.norm(at.jac, axis=0)
+    sizes[sizes == 0.0] = 1.0
+    inverse = np.linalg.pinv(at.jac / sizes) / sizes[:, None]
+    covariance = inverse @ inverse.T
     # each residual has variance 1, and moves the minimum by a column of this
-    gains = covariance @ at.jac.T
+    gains = inverse
     known = [name for name, given in zip(unknowns.names, unknowns.given, strict=True) if np.isfinite(given.error)]
     sources = ["noise"] * (len(at.fun) - len(known)) + [_without_number(name) for name in known]
     budget: dict[str, np.ndarray] = {}
@@ -286,13 +317,11 @@ def _result(
     )
     total = covariance[:count, :count] + share**2 * np.outer(energy, energy)
     rows = np.full(curve.rows, np.nan)
-    rows[used] = _row_residuals(unknowns, at.x, used, noise)[used]
+    rows[used] = _row_residuals(unknowns, at.x, used)[used]
     return ConstantEnergy(
         energy_aj=energy,
         standard_error_aj=np.sqrt(np.diag(total)),
-        interval95_aj=np.array(
-            [_widened(energy[i], _profile(residuals, at.x, i, errors[i]), share) for i in range(count)]
-        ),
+        interval95_aj=np.array([_interval(energy[i], errors[i], share) for i in range(count)]),
         covariance=total,
         budget=budget,
         nuisances=nuisances,
@@ -306,44 +335,12 @@ def _result(
     )
 
 
-def _profile(
-    residuals: Callable[[np.ndarray], np.ndarray], x: np.ndarray, place: int, error: float
-) -> tuple[float, float]:
-    """Return the ends of the 95 % interval of one unknown, where the others' least chi2 has grown by 3.84."""
-    others = np.delete(np.arange(len(x)), place)
-    least = float(np.sum(residuals(x) ** 2))
-
-    def grown(value: float) -> float:
-        start = x.copy()
-        start[place] = value
-
-        def rest(y: np.ndarray) -> np.ndarray:
-            start[others] = y
-            return residuals(start)
-
-        found = least_squares(rest, x[others], x_scale="jac").fun if len(others) else residuals(start)
-        return float(np.sum(found**2)) - least - _Z95**2
-
-    ends = []
-    for side in (-1.0, 1.0):
-        far = 2.5 * error
-        while grown(x[place] + side * far) < 0.0 and far < _WIDEST * error:
-            far *= 2.0
-        inside, outside = x[place], x[place] + side * far
-        found = grown(outside)
-        ends.append(_root(grown, inside, outside) if found > 0.0 else side * np.inf)
-    return ends[0], ends[1]
-
-
-def _root(function: Callable[[float], float], inside: float, outside: float) -> float:
-    return float(brentq(function, inside, outside, xtol=1e-4 * abs(outside - inside)))  # pyright: ignore[reportArgumentType]
-
-
-def _widened(energy: float, ends: tuple[float, float], share: float) -> tuple[float, float]:
-    """Return an interval with the relative error of a factor added, in logarithms: a factor is positive."""
+def _interval(energy: float, error: float, share: float) -> tuple[float, float]:
+    """Return the 95 % interval of an energy, with the relative error of a factor in logarithms: it is positive."""
+    low, high = energy - _Z95 * error, energy + _Z95 * error
     if share == 0.0 or energy <= 0.0:
-        return ends
-    low, high = ends
-    below = np.hypot(np.log(energy / low), _Z95 * share) if low > 0.0 else np.inf
-    above = np.hypot(np.log(high / energy), _Z95 * share)
-    return (float(energy * np.exp(-below)) if low > 0.0 else low), float(energy * np.exp(above))
+        return low, high
+    above = float(np.hypot(np.log(high / energy), _Z95 * share))
+    if low <= 0.0:
+        return low, float(energy * np.exp(above))
+    return float(energy * np.exp(-np.hypot(np.log(energy / low), _Z95 * share))), float(energy * np.exp(above))

@@ -54,6 +54,7 @@ class TappingCurve:
         tip_calibration: true length over the length stated, of every amplitude.
         phase_zero_deg: lag that the instrument adds; None: nothing is known of it.
         height_known: whether heights count from the tip's rest position.
+        origin_error_nm: standard error of that position.
         harmonic_amplitudes_nm: amplitudes at multiples of the drive's frequency, by multiple.
         lines: where each row stands in its file.
     """
@@ -76,6 +77,7 @@ class TappingCurve:
     tip_calibration: Given = EXACTLY_ONE
     phase_zero_deg: Given | None = None
     height_known: bool = True
+    origin_error_nm: float = 0.3
     harmonic_amplitudes_nm: dict[int, Rows] = field(default_factory=dict)
     lines: Int[np.ndarray, " rows"]
 

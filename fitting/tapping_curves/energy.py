@@ -72,7 +72,7 @@ def _lost_at_harmonics(curve: TappingCurve, instrument: Instrument, force: Rows)
     """Return what the air takes at the harmonics, over k; measured where they are, else those of a brief impact."""
     s, q = curve.drive_frequency_khz / instrument.free_frequency_khz, instrument.quality_factor
     n = np.arange(2, _HARMONICS + 1)[:, None]
-    amplitudes = np.sqrt(instrument.harmonics_factor) * force / np.abs(1.0 - (n * s) ** 2 + 1j * n * s / q)
+    amplitudes = np.sqrt(max(instrument.harmonics_factor, 0.0)) * force / np.abs(1.0 - (n * s) ** 2 + 1j * n * s / q)
     for multiple, measured in curve.harmonic_amplitudes_nm.items():
         here = np.isfinite(measured) & (2 <= multiple <= _HARMONICS)
         amplitudes[multiple - 2, here] = measured[here]

@@ -19,17 +19,18 @@ def tapping_pictures(result: Tapping) -> list[bytes]:
     """Return PNG files: the curve, the two frames, and the law if there is one."""
     files = [png_of(curve_figure(result)), png_of(frames_figure(result))]
     if result.law is not None:
-        from fitting.report.plots import fit_pictures  # noqa: PLC0415
+        from fitting.report.plots import DPI, law_figure  # noqa: PLC0415
 
-        files.append(fit_pictures(result.law)[1])
+        files.append(png_of(law_figure(result.law), DPI))
     return files
 
 
 def curve_figure(result: Tapping) -> Figure:
     """Return amplitude, phase and energy of a tap over the height of the sample, with what the fit predicts."""
-    figure = new_figure(7.5, 9.5)
-    top, middle, bottom = figure.subplots(3, 1, sharex=True)
     curve, rows = result.curve, result.rows
+    panels = 3 if curve.has_phase else 2
+    figure = new_figure(7.5, 0.5 + 3.0 * panels)
+    top, *between, bottom = figure.subplots(panels, 1, sharex=True)
     _points(top, result, curve.amplitude_nm, curve.amplitude_error_nm)
     if curve.drive == "force" and curve.height_known:
         reach = np.linspace(curve.offset_nm.min(), min(curve.offset_nm.max(), 0.0), 2)
@@ -37,9 +38,11 @@ def curve_figure(result: Tapping) -> Figure:
         top.plot(reach, -reach, ":", color=GRID, label="the tip just reaches the sample")
     label_axes(top, x="", y="amplitude (nm)")
     top.legend(fontsize=_SMALL)
-    if curve.has_phase:
+    if between:
+        middle = between[0]
         _points(middle, result, curve.lag_deg, curve.lag_error_deg)
         _predicted_lag(middle, result)
+        label_axes(middle, x="", y="lag (degrees)")
         _points(
             bottom, result, rows.energy_of_fit_aj if result.fit is not None else rows.energy_aj, rows.energy_noise_aj
         )
@@ -49,14 +52,13 @@ def curve_figure(result: Tapping) -> Figure:
         bottom.set_ylim(min(spread[0], 0.0) - 0.3 * np.ptp(spread), spread[1] + 0.7 * np.ptp(spread))
     else:
         _points(bottom, result, rows.largest_energy_aj, np.zeros(curve.rows))
-    label_axes(middle, x="", y="lag (degrees)")
     label_axes(
         bottom,
         x="height of the sample over the tip's rest position (nm)" if curve.height_known else "height (nm)",
         y="energy of a tap (aJ)" if curve.has_phase else "at most (aJ)",
     )
     bottom.legend(fontsize=_SMALL)
-    for axes in (top, middle, bottom):
+    for axes in (top, *between, bottom):
         axes.grid(color=GRID, alpha=0.25)
     return figure
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from pathlib import Path
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from afm_jax.words import bullets, interval, known, percent, text_table, with_er
 from fitting.tapping_curves.branches import Height, Hysteresis
 from fitting.tapping_curves.result import Tapping, origin_in_words
 
+_WIDTH = 100
 _EV_PER_AJ = 6.241509
 _CHANGES = {
     "contact": "contact: the amplitude leaves the free one",
@@ -46,6 +48,8 @@ def energy_in_words(result: Tapping) -> str:
     if energy["kind"] == "none":
         return "not known"
     low, high = energy["interval95"]
+    if energy["kind"] == "bracket" and energy["value"] is None:
+        return f"between {low:.2g} and {high:.3g} aJ"
     if energy["value"] is None:
         return f"at most {high:.3g} aJ, {_EV_PER_AJ * high:.3g} eV"
     value = with_error(energy["value"], energy["standard_error"])
@@ -56,7 +60,7 @@ def energy_in_words(result: Tapping) -> str:
 def law_in_words(result: Tapping) -> str:
     """Return what became of the law, as a sentence."""
     if result.law is None:
-        return f"No impact law: {result.reason}."
+        return fill(f"No impact law: {result.reason}.", _WIDTH)
     from fitting.report.report import summary  # noqa: PLC0415
 
     return summary(result.law)
@@ -64,21 +68,22 @@ def law_in_words(result: Tapping) -> str:
 
 def _energy_lines(result: Tapping) -> list[str]:
     plainly, epsilon = result.plain_energy, result.epsilon
-    lines = [
-        (
-            f"  epsilon = 2 E/m = {with_error(epsilon['value'], epsilon['standard_error'])} nm^2/us^2, "
-            f"m = {result.mass_ng:.4g} ng"
-        )
-    ]
+    lines = []
+    if epsilon["value"] is not None:
+        value = with_error(epsilon["value"], epsilon["standard_error"])
+        lines.append(f"  epsilon = 2 E/m = {value} nm^2/us^2, m = {result.mass_ng:.4g} ng")
     if plainly["mean"] is not None:
         scatter = known(plainly["standard_deviation"], ".2g")
         lines.append(
             f"  row by row, instrument as given: mean {plainly['mean']:.3g} aJ, scatter {scatter}, "
             f"systematic {plainly['systematic_error']:.2g}"
         )
-    shares = sorted(result.energy["share_of_variance"].items(), key=lambda pair: -pair[1])
+    shares = sorted(result.energy.get("share_of_variance", {}).items(), key=lambda pair: -pair[1])
     words = [f"{origin_in_words(name)} {percent(share)}" for name, share in shares if share > 0.005]
-    lines += [f"  its variance comes from {', '.join(words)}", ""]
+    lines += [f"  its variance comes from {', '.join(words)}"] if words else []
+    if not result.described:
+        return lines
+    lines.append("")
     lines += text_table(["branch", "rows", "energy (aJ)", "95 %"], _group_cells(result), words=(0,))
     lines += ["", *text_table(["instrument", "given", "fitted"], _instrument_cells(result), words=(0,))]
     assert result.fit is not None  # noqa: S101

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Int
 
+from afm_jax.results import public_result
 from afm_jax.strict_json import plain
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.tables.table import AmplitudeTable
@@ -119,6 +120,7 @@ class MeasuredSpeeds:
     why_not: str
 
 
+@public_result()
 @dataclass(frozen=True, kw_only=True)
 class Tapping:
     """The outcome of `tapping`.
@@ -185,6 +187,8 @@ class Tapping:
             bound = None if self.bound_aj is None else (0.0, self.bound_aj)
             kind = "none" if bound is None else "upper bound"
             return {"value": None, "standard_error": None, "interval95": bound, "kind": kind}
+        if not self.described:
+            return {"value": None, "standard_error": None, "interval95": self._bracket(), "kind": "bracket"}
         chosen = self.chief
         covariance = self.fit.covariance[np.ix_(chosen, chosen)]
         weights = np.linalg.pinv(covariance).sum(axis=0)
@@ -204,6 +208,19 @@ class Tapping:
             "kind": "bracket" if not error < _BRACKET * value else "fit",
             "share_of_variance": {name: part / total for name, part in budget.items()},
         }
+
+    @property
+    def described(self) -> bool:
+        """Whether one energy a branch describes the rows, however badly."""
+        return self.fit is not None and not self.fit.chi2 > _WORST * max(self.fit.degrees_of_freedom, 1)
+
+    def _bracket(self) -> tuple[float, float]:
+        """Return what the energies of single rows, with all their errors, and the bound of each leave open, in aJ."""
+        rows = self.rows
+        used = rows.used & np.isfinite(rows.energy_aj)
+        error = 1.96 * np.hypot(rows.energy_noise_aj, rows.energy_systematic_aj)[used]
+        low = np.maximum(rows.energy_aj[used] - error, 0.0)
+        return float(low.min()), float(np.minimum(rows.energy_aj[used] + error, rows.largest_energy_aj[used]).max())
 
     @property
     def plain_energy(self) -> dict[str, Any]:
@@ -251,7 +268,13 @@ class Tapping:
                 return ["without a phase the curve gives no more than an upper bound of the energy of a tap"]
             return ["no branch has enough rows in contact for an energy of a tap"]
         found, energy = [], self.energy
-        if not energy["value"] > 0.0:
+        if not self.described:
+            low, high = energy["interval95"]
+            found.append(
+                f"one energy a branch does not describe the rows (chi2 {self.fit.chi2:.0f} for "
+                f"{self.fit.degrees_of_freedom} degrees of freedom): only a bracket, {low:.2g} to {high:.2g} aJ"
+            )
+        elif not energy["value"] > 0.0:
             found.append("the energy of a tap is not positive: frequency, Q or the zero of the phase is wrong")
         elif energy["kind"] == "bracket":
             chief = max(energy["share_of_variance"], key=lambda name: energy["share_of_variance"][name])
@@ -259,11 +282,6 @@ class Tapping:
             found.append(
                 f"the energy of a tap is only bracketed, {low:.2g} to {high:.2g} aJ; most of that is "
                 f"{origin_in_words(chief)}"
-            )
-        if self.fit.degrees_of_freedom and self.fit.chi2 > _WORST * self.fit.degrees_of_freedom:
-            found.append(
-                f"one energy a branch does not describe the rows (chi2 {self.fit.chi2:.0f} for "
-                f"{self.fit.degrees_of_freedom} degrees of freedom)"
             )
         return found
 
@@ -276,7 +294,7 @@ class Tapping:
     def warnings(self) -> list[str]:
         """What a reader should know besides."""
         found = []
-        if self.fit is not None:
+        if self.fit is not None and self.described:
             if self.stretch > 1.0:
                 found.append(
                     f"the rows scatter {self.stretch:.2g} times more than their noise: errors are multiplied by that"

@@ -59,15 +59,19 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
             f"{name}: is a table of a sample that moves; say '# drive = force' (or base) where the cantilever is "
             "driven, or use `afm-jax fit`"
         )
-    if table.quality_factor is None:
-        raise TableError(
-            f"{name}: the quality factor is missing; add the line '# quality_factor = 200 +- 2' or "
-            "--quality-factor 200+-2"
-        )
+    missing = []
+    quality = table.quality_factor or 0.0
+    if not quality:
+        missing.append(("the quality factor", "quality_factor = 200 +- 2", "--quality-factor '200 +- 2'"))
     if table.spring_constant_n_per_m is None and table.mass_ng == 1.0:
+        missing.append(
+            ("the spring constant", "spring_constant_n_per_m = 5.4 +- 0.5", "--spring-constant '5.4 +- 0.5'")
+        )
+    if missing:
+        what, lines, options = zip(*missing, strict=True)
         raise TableError(
-            f"{name}: the spring constant is missing; add the line '# spring_constant_n_per_m = 5.4 +- 0.5' or "
-            "--spring-constant 5.4+-0.5"
+            f"{name}: {' and '.join(what)} {'is' if len(what) == 1 else 'are'} missing; give {' '.join(options)}, or "
+            f"the comment line '# {lines[0]}'"
         )
     if table.lockin_amplitude_nm is None or table.lockin_amplitude_error_nm is None:
         raise TableError(f"{name}: there is no lockin_amplitude_nm; the energy needs the lock-in's amplitude and phase")
@@ -91,10 +95,11 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
         retract=np.zeros(table.rows, bool) if table.retract is None else table.retract == 1.0,
         both_ways=table.retract is not None,
         free_frequency_khz=Given(table.free_frequency_khz, table.free_frequency_error_khz or 0.0),
-        quality_factor=Given(table.quality_factor, table.quality_factor_error or 0.0),
+        quality_factor=Given(quality, table.quality_factor_error or 0.0),
         spring_constant_n_per_m=spring,
         tip_calibration=Given(*table.calibration.get("tip_calibration", (1.0, 0.0))),
         phase_zero_deg=None if zero is None else Given(*zero),
+        origin_error_nm=table.calibration.get("offset_origin_nm", (0.0, _ORIGIN_NM))[1],
         lines=np.asarray(table.lines),
     )
     return whole.part(rows)
@@ -115,6 +120,8 @@ def _energies(table: AmplitudeTable, curve: TappingCurve) -> Tapping:
     repulsive = ~free & (departure < 0.0)
     rough = rough_rows(curve, tapping & repulsive) | rough_rows(curve, tapping & ~repulsive)
     early = tapping & hardly_touching_rows(motion_of(curve, given))
+    if (tapping & ~rough & ~early).sum() < _FEWEST_ROWS:
+        early = np.zeros(curve.rows, bool)
     usable = tapping & ~rough & ~early
     keys, groups = _groups(curve, usable, repulsive)
     fitted = None
@@ -129,7 +136,7 @@ def _energies(table: AmplitudeTable, curve: TappingCurve) -> Tapping:
     far = np.zeros(curve.rows, bool) if fitted is None else fitted.outliers
     notes = _notes(curve, free=free, held=held, rough=rough, early=early, far=far, alone=tapping & (groups < 0))
     rows = TapRows(
-        state=tuple(_state(free[i], held[i], departure[i]) for i in range(curve.rows)),
+        state=tuple(_state(*row) for row in zip(free.tolist(), held.tolist(), departure.tolist(), strict=True)),
         lag_departure_deg=departure,
         energy_aj=energy,
         energy_noise_aj=noise,
@@ -244,13 +251,11 @@ def _speeds(result: Tapping, fitted: ConstantEnergy) -> MeasuredSpeeds:
     """Return the impact speeds of the rows fitted, with their errors from noise, calibration and origin of height."""
     curve, instrument = result.curve, fitted.instrument
     start = speeds(curve, instrument)
-    table = result.table.calibration
-    origin = table.get("offset_origin_nm", (0.0, _ORIGIN_NM))[1]
     calibration = curve.tip_calibration
     moved = [
         speeds(replace(curve, amplitude_nm=curve.amplitude_nm + curve.amplitude_error_nm), instrument),
         speeds(replace(curve, lag_deg=curve.lag_deg + curve.lag_error_deg), instrument),
-        speeds(curve, instrument, origin_nm=origin),
+        speeds(curve, instrument, origin_nm=curve.origin_error_nm),
         speeds(curve, instrument, calibration=calibration.value + calibration.error),
     ]
     u = start.approach_speed_nm_per_us
@@ -306,7 +311,19 @@ def with_law(result: Tapping, model: str = LAW_MODEL) -> Tapping:
     if result.speeds is None:
         return result
     chosen = np.isin(np.asarray(result.table.lines), result.curve.lines[result.speeds.fast])
-    return replace(result, law=fit(rows_of(result.table, chosen), model))
+    return replace(result, law=fit(_with_zero_of_phase(result, rows_of(result.table, chosen)), model))
+
+
+def _with_zero_of_phase(result: Tapping, table: AmplitudeTable) -> AmplitudeTable:
+    """Return a table that knows the zero of the phase, which the free rows fixed that it lacks.
+
+    With several drives its own is that of the first.
+    """
+    found = [] if result.fit is None else [one for one in result.fit.nuisances if one.key == "phase_zero_deg"]
+    if not found:
+        return table
+    calibration = table.calibration | {"phase_zero_deg": (float(found[0].value), float(found[0].standard_error))}
+    return replace(table, calibration=calibration)
 
 
 def rows_of(table: AmplitudeTable, chosen: Bool[np.ndarray, " rows"]) -> AmplitudeTable:

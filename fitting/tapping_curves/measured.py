@@ -1,0 +1,95 @@
+"""Tapping curves straight out of an instrument's file: each as a table, and the hysteresis of all of them."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from fitting.instruments.curve import MeasuredCurve, read_curves, table_text
+from fitting.tables.csv_text import TableError
+from fitting.tables.table import AmplitudeTable, parse_table
+
+_IS_TABLE = (b"lockin_amplitude_nm", b"peak_amplitude_nm", b"free_frequency_khz")
+
+
+@dataclass(frozen=True)
+class MeasuredFile:
+    """The curves of an instrument's file.
+
+    Attributes:
+        tables: of the curves that may be used, by their number in the file.
+        refused: why the others may not, by number.
+        half_widths_nm: of every curve, refused ones too: by how many nm nearer the amplitude falls to half on the way
+            in than it comes back on the way out; by number, as far as both ways show it.
+    """
+
+    tables: dict[int, AmplitudeTable]
+    refused: dict[int, str]
+    half_widths_nm: dict[int, float]
+
+    @property
+    def half_width_nm(self) -> tuple[float, float] | None:
+        """Mean of the half widths and their scatter (standard deviation), None with fewer than two."""
+        widths = list(self.half_widths_nm.values())
+        return (float(np.mean(widths)), float(np.std(widths, ddof=1))) if len(widths) > 1 else None
+
+
+def is_table(path: str | Path) -> bool:
+    """Say whether a file is (meant to be) an amplitude table, not an instrument's; one that is not there is one."""
+    try:
+        with Path(path).open("rb") as file:
+            head = file.read(1 << 16)
+    except OSError:
+        return True
+    return any(word in head for word in _IS_TABLE)
+
+
+def read_measured(path: str | Path, *, curve: int | None = None, **options: Any) -> MeasuredFile:
+    """Return the curves of an instrument's file as tables.
+
+    Args:
+        path: the file.
+        curve: only this one.
+        options: as of `read_curves`.
+
+    Raises:
+        TableError: if the file cannot be read, says too little (with the options that give it), or has no such curve.
+    """
+    curves = read_curves(path, **options)
+    chosen = [one for one in curves if curve in {None, one.curve}]
+    if not chosen:
+        raise TableError(f"{path}: there is no curve {curve}; the file holds {', '.join(str(c.curve) for c in curves)}")
+    names = {one.curve: f"{path}, curve {one.curve}" if len(curves) > 1 else str(path) for one in chosen}
+    tables = {one.curve: parse_table(table_text(one), names[one.curve]) for one in chosen if one.valid}
+    widths = {one.curve: width for one in chosen if (width := half_width(one)) is not None}
+    return MeasuredFile(tables, {one.curve: one.reasons[0] for one in chosen if not one.valid}, widths)
+
+
+def half_width(curve: MeasuredCurve) -> float | None:
+    """Return by how many nm later the amplitude comes back to half of the free one, None where that does not show."""
+    if curve.amplitude is None:
+        return None
+    heights = []
+    for branch in ("approach", "retract"):
+        here = curve.branch == branch
+        free = here & curve.free
+        if not free.any():
+            return None
+        height = _crossing(curve.offset_nm[here], curve.amplitude[here], 0.5 * float(np.median(curve.amplitude[free])))
+        if height is None:
+            return None
+        heights.append(height)
+    return heights[0] - heights[1]
+
+
+def _crossing(offset: Float[np.ndarray, " n"], amplitude: Float[np.ndarray, " n"], level: float) -> float | None:
+    """Return the height beyond which the amplitude stays below a level, between two rows by the straight line."""
+    order = np.argsort(offset, kind="stable")
+    offset, amplitude = offset[order], amplitude[order]
+    above = np.flatnonzero(amplitude >= level)
+    if not above.size or above[-1] + 1 == len(offset):
+        return None
+    last = int(above[-1])
+    return float(np.interp(-level, -amplitude[last : last + 2], offset[last : last + 2]))

@@ -1,0 +1,62 @@
+"""Fits of driven tips: the law of a full contact from amplitude and phase, and what is said where there is none."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.law_of_contact import tabulated
+from fitting.examples import make_tapping_curve
+from fitting.fits.fit import fit
+from fitting.models import reach_of, rows_of, tip_work
+from fitting.tables.table import AmplitudeTable, read_table
+
+EXAMPLE = "fitting/examples/tapping_contact.csv"
+TIP = Cantilever(90.0, 200.0, 16.81)
+
+
+def test_work_of_a_free_and_of_a_drawn_tip():
+    """The force of a known height: F/k = gamma Z - F_drive/k, written out for one period."""
+    ratio, free, height = 1.1, 80.0, 40.0 * np.exp(-0.3j)
+    gamma = 1.0 - ratio**2 + 1j * ratio / 200.0
+    force = gamma * (height + free)
+    lag = np.rad2deg(np.angle(gamma) - np.angle(-height))
+    table = AmplitudeTable(
+        drive="force",
+        drive_frequency_khz=np.array([99.0, 99.0, 99.0]),
+        free_amplitude_nm=np.array([free, free, free]),
+        offset_nm=np.array([-40.0, -90.0, -81.0]),
+        free_frequency_khz=90.0,
+        lockin_amplitude_nm=np.array([40.0, 80.0, 79.0]),
+        lockin_amplitude_error_nm=np.ones(3),
+        phase_lag_deg=np.array([lag, 178.5, 178.5]),
+        phase_lag_error_deg=np.ones(3),
+    )
+    rows = rows_of(table)
+    found = tip_work(rows, TIP, "force")[0]
+    time = np.linspace(0.0, 2.0 * np.pi, 1000, endpoint=False)
+    z, f = (np.real(part * np.exp(1j * time)) for part in (height, force))
+    v = np.real(1j * height * np.exp(1j * time))
+    np.testing.assert_allclose([found.real, found.imag], [2.0 * np.mean(f * z), -2.0 * -np.mean(f * v)], rtol=1e-9)
+    assert reach_of(rows, TIP, "force")[:3].tolist() == [0, 1, 2]
+
+
+@pytest.mark.slow
+def test_two_tapping_curves_give_the_law_of_their_contact():
+    table = read_table(EXAMPLE)
+    result = fit(table, "viscous+delay")
+    contact = tabulated(Contact.paper(**make_tapping_curve.CONTACT), 16.81)
+    speeds = result.rows.approach_speed_nm_per_us[result.rows.used]
+    grid = np.linspace(speeds.min(), speeds.max(), 50)
+    exact = np.asarray(jax.vmap(contact.speeds)(jnp.asarray(grid)).rebound)
+    found = np.interp(grid, result.law.approach_speed_nm_per_us, result.law.rebound_speed_nm_per_us)
+    # 0.3 % and 0.2 degrees of noise: one draw; the median of several is 0.3 %
+    np.testing.assert_allclose(found, exact, rtol=0.012)
+    assert result.rows.residual.shape == (table.rows, 3)
+    assert abs(result.parameters["tip_calibration"].value - 1.0) < 0.015
+    without = dataclasses.replace(table, phase_lag_deg=None, phase_lag_error_deg=None)
+    assert rows_of(without).amplitude_nm.shape[1] == 2
