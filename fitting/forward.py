@@ -265,9 +265,10 @@ def _in_lanes(
     near: Float[np.ndarray, "..."] | None,
 ) -> "_Block":
     """Return what `linearise_pairs` finds, as arrays of shape (sets, rows, ...)."""
-    rows = measurement.rows.order.shape[0]
     columns = jax.tree.map(np.asarray, measurement.rows)
-    known = None if near is None else np.broadcast_to(np.asarray(near), (sets, rows)).ravel()
+    filling = _filling(columns)
+    rows = columns.order.shape[0] - filling
+    known = None if near is None else np.broadcast_to(np.asarray(near), (sets, rows + filling))[:, :rows].ravel()
     lanes = _lanes(problem)
     blocks = []
     for begin in range(0, sets * rows, lanes):
@@ -280,11 +281,23 @@ def _in_lanes(
         blocks.append(linearise_pairs(filled, impacts, index, some, problem, branch))
 
     def whole(*parts):
-        return np.concatenate([np.asarray(part) for part in parts])[: sets * rows].reshape(
-            sets, rows, *parts[0].shape[1:]
-        )
+        found = np.concatenate([np.asarray(part) for part in parts])[: sets * rows]
+        found = found.reshape(sets, rows, *found.shape[1:])
+        return np.concatenate([found, np.repeat(found[:, -1:], filling, axis=1)], axis=1)
 
-    return jax.tree.map(whole, *blocks)
+    block: _Block = jax.tree.map(whole, *blocks)
+    for unread in (block.misfit, block.slope, block.unseen):
+        np.asarray(unread)[:, rows:] = 0.0
+    return block
+
+
+def _filling(rows: Rows) -> int:
+    """Return how many rows at the end only fill a table up: on the drive of the row before, without a reading."""
+    drives = np.stack([rows.order, rows.drive_frequency_khz, rows.drive_amplitude_nm, rows.offset_nm, rows.free])
+    filling = ~(np.any(rows.measured, axis=1) | rows.no_orbit)
+    filling[0] = False
+    filling[1:] &= (drives[:, 1:] == drives[:, :-1]).all(axis=0)
+    return int(np.argmin(filling[::-1]))
 
 
 class ImpactSlopes(NamedTuple):

@@ -7,12 +7,13 @@ from click.testing import CliRunner
 import afm_jax as afm
 from afm_jax.cli.main import main
 from afm_jax.dynamics.contact_orbits import contact_orbits
+from afm_jax.dynamics.continuation import continue_orbits
+from afm_jax.scenefile.parameter_paths import ParameterRange
 from tests.reference_driven_contact import DrivenContact, follow
 from tests.strict_reading import strictly
 
 pytestmark = pytest.mark.slow
 AMPLITUDE_NM, FREQUENCY_KHZ = 4.0, 181.8
-SYSTEM = DrivenContact(amplitude_nm=AMPLITUDE_NM, drive_frequency_khz=FREQUENCY_KHZ)
 PERIOD_US, OMEGA = 1e3 / FREQUENCY_KHZ, 2e-3 * np.pi * FREQUENCY_KHZ
 
 
@@ -27,12 +28,13 @@ def found(scene):
     return contact_orbits(scene, 1, 1)
 
 
-def next_departure(time_us: float, velocity: float) -> np.ndarray:
+def next_departure(time_us: float, velocity: float, amplitude_nm: float = AMPLITUDE_NM) -> np.ndarray:
     """Return time and velocity in the lab at the end of the contact after a departure, by the reference."""
-    gap = SYSTEM.contact.bridge_breaks_nm
-    course = follow(SYSTEM, time_us, AMPLITUDE_NM * np.cos(OMEGA * time_us) + gap, velocity, contacts=1)
+    system = DrivenContact(amplitude_nm=amplitude_nm, drive_frequency_khz=FREQUENCY_KHZ)
+    gap = system.contact.bridge_breaks_nm
+    course = follow(system, time_us, amplitude_nm * np.cos(OMEGA * time_us) + gap, velocity, contacts=1)
     last = course.contacts[-1]
-    rate = -AMPLITUDE_NM * OMEGA * np.sin(OMEGA * last.departure_time_us)
+    rate = -amplitude_nm * OMEGA * np.sin(OMEGA * last.departure_time_us)
     return np.array([last.departure_time_us, last.rebound_speed_nm_per_us + rate])
 
 
@@ -63,6 +65,33 @@ def test_the_multipliers_are_those_of_differences_in_the_reference(found):
         matrix = np.stack(columns, axis=1)
         assert np.trace(matrix) == pytest.approx(float(found.reading.trace[index]), rel=2e-4)
         assert np.linalg.det(matrix) == pytest.approx(float(found.reading.determinant[index]), rel=2e-4)
+
+
+def test_the_fold_that_ends_both_orbits_is_one_of_the_reference(scene):
+    found = continue_orbits(scene, 1, ParameterRange("platform.amplitude_nm", 1.0, 4.5))
+    assert [point.kind for point in found.special] == ["fold"]
+    (fold,) = found.special
+    assert fold.parameter > 1.0
+    peaks = found.branches[0].reading.peak_amplitude_nm
+    assert {len(found.branches), found.branches[0].ends} == {1, ("range", "range")}
+    assert found.branches[0].parameter[[0, -1]].tolist() == [4.5, 4.5]
+    assert max(peaks[0], peaks[-1]) > 5.0 * min(peaks[0], peaks[-1])
+    time = float(fold.reading.phase_rad[0]) / OMEGA
+    velocity = float(fold.reading.velocity_after_nm_per_us[0])
+    later = next_departure(time, velocity, fold.parameter)
+    assert later[0] - time == pytest.approx(PERIOD_US, abs=1e-7)
+    assert later[1] == pytest.approx(velocity, rel=1e-6)
+    steps = np.array([1e-4, 1e-3])
+    columns = [
+        (
+            next_departure(time + one[0], velocity + one[1], fold.parameter)
+            - next_departure(time - one[0], velocity - one[1], fold.parameter)
+        )
+        / (2.0 * step)
+        for step, one in zip(steps, np.diag(steps), strict=True)
+    ]
+    multipliers = np.linalg.eigvals(np.stack(columns, axis=1))
+    assert np.abs(multipliers - 1.0).min() < 2e-4
 
 
 def test_orbits_of_a_contact_scene_are_told_by_the_command(tmp_path):

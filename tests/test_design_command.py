@@ -106,6 +106,7 @@ def test_a_measured_table_is_fitted_first(tmp_path):
     path = tmp_path / "table.csv"
     path.write_text("\n".join(lines[: header + 21]) + "\n", encoding="utf-8")
     table = read_table(path)
+    assert table.drive_amplitude_nm is not None
     frequency, drive = table.drive_frequency_khz[0], table.drive_amplitude_nm[0]
     offsets = f"{table.offset_nm[0]},{table.offset_nm[0] + 0.125}"
     grid = ("--orders", table.order[0], "--frequencies-khz", frequency, "--drive-nm", drive, "--offsets-nm", offsets)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from fitting.forward import Linearised, linearise
+from fitting.forward import Linearised, _filling, linearise
 from fitting.models import ROWS_PER_PROGRAM, Problem, measurement_of
 from fitting.tables.table import AmplitudeTable
 from tests.reference_examples import scene
@@ -60,6 +60,15 @@ def test_predictions_are_the_orbits_amplitudes(linear):
     (orbit,) = [o for o in single_impact_orbits(parameters(ROWS[0], VALUES), 1) if o.stable and o.admissible]
     speed = float(linear.prediction.approach_speed_nm_per_us[0, 0])
     assert speed == pytest.approx(float(orbit.approach_speed_nm_per_us), rel=1e-10)
+
+
+def test_only_rows_that_fill_a_table_up_are_left_out():
+    rows = measurement_of(table(), Problem("law", tuple(VALUES))).rows
+    assert _filling(rows) == ROWS_PER_PROGRAM - len(ROWS)
+    # a drive without a reading is asked for all the same; rows set aside on one drive are asked once
+    assert _filling(rows._replace(measured=np.zeros_like(rows.measured))) == ROWS_PER_PROGRAM - len(ROWS)
+    nowhere = np.arange(ROWS_PER_PROGRAM) == ROWS_PER_PROGRAM - 1
+    assert _filling(rows._replace(no_orbit=nowhere)) == 0
 
 
 def test_residuals_are_misfits_in_errors_and_the_constraint(linear):

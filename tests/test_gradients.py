@@ -96,7 +96,7 @@ def test_on_resonance_it_is_the_closed_form(mode, r):
     values = {"r": r, "tip_calibration": 1.0, "drive_calibration": 1.0, "offset_origin_nm": 0.0}
     found = amplitude_gradients(table, "restitution", values, mode=mode)
     assert found.parameters == ("r", "offset_origin_nm", "tip_calibration", "drive_calibration")
-    beta, sigma = table.drive_amplitude_nm, table.offset_nm
+    beta, sigma = np.asarray(table.drive_amplitude_nm, float), table.offset_nm
     square = beta**2 - sigma**2
     peak = 2.0 * table.order * np.sqrt(square) * (1 + r) / (1 - r)
     relative = np.stack([np.full(2, 2 / (1 - r**2)), -sigma / square, np.ones(2), beta**2 / square], axis=-1)

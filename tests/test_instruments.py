@@ -10,7 +10,7 @@ from click.testing import CliRunner
 
 import fitting.instruments.formats as formats_module
 from afm_jax.cli.main import main
-from fitting import TableError, read_curve, read_curves
+from fitting import TableError, read_curve, read_curves, read_table
 from fitting.instruments.curve import free_lag_deg, parse_columns, table_text
 from fitting.instruments.formats import read_recording
 from tests.instrument_files import asylum_ramp, gwyddion_bytes, igor_wave, nanonis_ramp, tapping_rows
@@ -362,6 +362,9 @@ def test_the_command_asks_for_what_is_missing_and_writes_the_table(tmp_path: Pat
     rows = [line.split(",") for line in lines if line[0] in "0123456789"]
     assert len(rows) == 200
     assert float(rows[0][head.index("lockin_amplitude_nm")]) == 70.7583
+    table = read_table(out)
+    np.testing.assert_array_equal(table.offset_nm, [float(row[head.index("offset_nm")]) for row in rows])
+    assert (table.free_frequency_khz, table.quality_factor) == (264.0, 500.0)
 
 
 def test_refused_curves_end_with_exit_code_3_beside_the_tables_of_the_others(tmp_path: Path):
@@ -376,6 +379,8 @@ def test_refused_curves_end_with_exit_code_3_beside_the_tables_of_the_others(tmp
     assert sorted(path.name for path in tmp_path.iterdir()) == ["wsxm_1.csv", "wsxm_5.csv"]
     # the amplitude in contact is an offset of the detector, in part below zero
     assert "rows whose amplitude is not above zero" in (tmp_path / "wsxm_1.csv").read_text("utf-8")
+    # approach and retract pass the same heights
+    assert set(given(read_table(tmp_path / "wsxm_1.csv").retract)) == {0.0, 1.0}
     assert run(AMPLITUDES, "--curve", 1).exit_code == 0
     assert run(AMPLITUDES, "--curve", 9).exit_code == 2
 

@@ -183,7 +183,7 @@ def test_calibration_of_the_instrument_is_taken_back(exact):
     other = dataclasses.replace(
         table,
         **read,
-        drive_amplitude_nm=2.0 * table.drive_amplitude_nm,
+        drive_amplitude_nm=2.0 * np.asarray(table.drive_amplitude_nm, float),
         offset_nm=table.offset_nm - 0.3,
         calibration=known,
     )

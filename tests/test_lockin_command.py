@@ -118,6 +118,7 @@ def test_a_table_needs_what_the_fitter_needs(tmp_path):
     # drive and offset come from the platform's column
     assert run(path, "--out", tmp_path / "out", "--free-frequency-khz", 90).exit_code == 0
     table = read_table(tmp_path / "out" / "amplitudes.csv")
+    assert table.drive_amplitude_nm is not None
     assert table.drive_amplitude_nm[0] == pytest.approx(4.0, rel=1e-6)
     assert table.offset_nm[0] == pytest.approx(-1.0, rel=1e-6)
 

@@ -1,5 +1,6 @@
 """Traced programs that outlive the process: found again, never the wrong one, and out of the way where none is kept."""
 
+import re
 import sys
 from functools import partial
 from pathlib import Path
@@ -94,6 +95,22 @@ def test_the_next_process_traces_nothing(folder):
     assert TRACED == [2.0]
 
 
+def test_what_another_program_has_made_is_no_other_argument(folder):
+    program, compiled = anew(folder), []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, *_, **__: compiled.append(event) if event.endswith("backend_compile_duration") else None
+    )
+    try:
+        pair, factor, values = arguments()
+        made = program(pair, factor, values).pair[0]
+        count = len(compiled)
+        assert count > 0
+        assert float(program(pair, factor, made).number) == 12.0
+        assert len(compiled) == count
+    finally:
+        jax.monitoring.clear_event_listeners()
+
+
 def test_another_shape_structure_or_static_argument_is_another_program(folder):
     program = anew(folder)
     pair, _, values = arguments()
@@ -177,4 +194,7 @@ def test_fits_find_their_programs_again_and_standard_error_holds_our_own_words_o
     lines = said_again.splitlines()
     assert len(lines) == 2
     assert lines[0].startswith(f"compiled programs: {tmp_path}")
-    assert lines[1].endswith(" compiled programs were read, 0 were compiled")
+    found = re.fullmatch(r"(?:afm-jax: )?(\d+) compiled programs were read, 0 were compiled", lines[1])
+    assert found is not None
+    # every operation outside a compiled program would be a program of its own, of 10 ms each: there were 78
+    assert int(found[1]) <= 20

@@ -57,7 +57,7 @@ def test_contact_amplitudes_agree_with_an_independent_program(contact_table_path
             for order, frequency, amplitude, offset in zip(
                 other.order[chosen],
                 other.drive_frequency_khz[chosen],
-                other.drive_amplitude_nm[chosen],
+                np.asarray(other.drive_amplitude_nm)[chosen],
                 other.offset_nm[chosen],
                 strict=True,
             )

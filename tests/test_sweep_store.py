@@ -11,7 +11,9 @@ import pytest
 import xarray
 from scipy.stats import qmc
 
+from afm_jax import compilation_cache
 from afm_jax.sweeps.axes import axes_of
+from afm_jax.sweeps.plan import compute_chunk
 from afm_jax.sweeps.store import STORE, SweepStore, locked
 from afm_jax.sweeps.sweep import dataset_of, estimate, run_plan
 from tests.sweep_numbers import SIZES, contents, plan
@@ -212,3 +214,15 @@ def test_the_store_opens_without_warnings(tmp_path: Path):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert xarray.open_zarr(str(tmp_path / STORE)).sizes == {"x": 7, "y": 12, "part": 2}
+
+
+def test_a_worker_with_other_versions_is_refused(monkeypatch: pytest.MonkeyPatch):
+    # a worker is a process of its own; this one keeps its settings
+    for name in ("open_cache", "silence_xla"):
+        monkeypatch.setattr(compilation_cache, name, lambda: None)
+    given = plan().given
+    found = compute_chunk(json.dumps(given), 5)
+    np.testing.assert_array_equal(found["large"], plan().compute(5)["large"])
+    other = given | {"versions": given["versions"] | {"jax": "0.0.1"}}
+    with pytest.raises(RuntimeError, match=r"a worker would compute otherwise than the others: jax is .*, not 0.0.1"):
+        compute_chunk(json.dumps(other), 5)

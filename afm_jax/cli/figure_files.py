@@ -52,8 +52,8 @@ def write_figure(number: str, figure: FigureData | ContactFigure | MotionFigure,
 
 _CHART_CONDITIONS = rf"$r$ = {presets.STABILITY_R:g}, $\sigma = {presets.STABILITY_OFFSET_NM:g}$ nm"
 _CHART_TITLES = {
-    "2": rf"Stable single-impact orbits (white), {_CHART_CONDITIONS}, $\epsilon$ = 0",
-    "3": rf"Stable single-impact orbits with adhesion (white), {_CHART_CONDITIONS}, "
+    "2": rf"Stable single-impact orbits (light), {_CHART_CONDITIONS}, $\epsilon$ = 0",
+    "3": rf"Stable single-impact orbits with adhesion (light), {_CHART_CONDITIONS}, "
     rf"$\epsilon$ = {presets.ADHESION:g} $\mu$J/kg",
 }
 _AMPLITUDE_TITLE = (

@@ -1,6 +1,8 @@
 """`afm-jax figures --only 2,3,4`: the paper's figures as PNG and CSV, and the paper's words about them checked."""
 
 import time
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -58,29 +60,29 @@ def command(session: Session, *, only: tuple[str, ...], coarse: bool, seed: int)
     folder = session.out or _DEFAULT_FOLDER
     prepare_folder(folder)
     session.start_computing()
-    results = _compute(session, only, coarse=coarse, seed=seed)
     from afm_jax.cli.figure_files import write_figure  # noqa: PLC0415
 
-    payload = []
-    for number, figure in results.items():
+    told = {}
+    # each is written before the next is computed: who interrupts keeps what there is
+    for number, figure in _computed(session, only, coarse=coarse, seed=seed):
         files = write_figure(number, figure, folder)
-        payload.append(_payload(number, figure, files))
+        told[number] = _payload(number, figure, files)
         for name in files:
             session.note(f"wrote {folder / name}")
-    valid = all(figure.valid for figure in results.values())
+    payload = [told[number] for number in only]
+    valid = all(figure["valid"] for figure in payload)
     session.emit({"figures": payload, "folder": str(folder), "valid": valid}, *_text(payload))
     if not valid:
-        wrong = [number for number, figure in results.items() if not figure.valid]
+        wrong = [number for number in only if not told[number]["valid"]]
         raise NotValid(f"figure {', '.join(wrong)}: a statement or a spot check fails, see the output")
 
 
-def _compute(
+def _computed(
     session: Session, only: tuple[str, ...], *, coarse: bool, seed: int
-) -> "dict[str, FigureData | ContactFigure | MotionFigure]":
-    """Compute the figures; each one's time goes to standard error."""
+) -> "Iterator[tuple[str, FigureData | ContactFigure | MotionFigure]]":
+    """Give the figures' numbers and data, each when it is computed; its time goes to standard error."""
     from afm_jax.paper import charts as paper_figures  # noqa: PLC0415
 
-    results: dict[str, FigureData | ContactFigure | MotionFigure] = {}
     points = _COARSE_SPOT_CHECKS if coarse else _SPOT_CHECKS
     start = time.perf_counter()
 
@@ -92,28 +94,25 @@ def _compute(
         without = paper_figures.figure2_chart(coarse=coarse, report=report)
         if "2" in only:
             report("figure 2: statements and spot checks")
-            results["2"] = paper_figures.figure2(without, seed=seed, points=points)
+            yield "2", paper_figures.figure2(without, seed=seed, points=points)
         if "3" in only:
             adhesive = paper_figures.figure3_chart(coarse=coarse, report=report)
             report("figure 3: statements and spot checks")
-            results["3"] = paper_figures.figure3(adhesive, without, seed=seed, points=points)
+            yield "3", paper_figures.figure3(adhesive, without, seed=seed, points=points)
     for number in (each for each in only if each in _OF_THE_CONTACT):
         from afm_jax.paper.contact_figures import CONTACT_FIGURES  # noqa: PLC0415
 
         report(f"figure {number}: {_OF_THE_CONTACT[number]}")
-        results[number] = CONTACT_FIGURES[number]()
+        yield number, CONTACT_FIGURES[number]()
     for number in (each for each in only if each in _OF_MOTIONS):
         from afm_jax.paper.motion_figures import MOTION_FIGURES  # noqa: PLC0415
 
         report(f"figure {number}: {_OF_MOTIONS[number]}")
-        results[number] = MOTION_FIGURES[number](
-            coarse=coarse, report=lambda what, number=number: report(f"figure {number}: {what}")
-        )
+        tell = partial(lambda number, what: report(f"figure {number}: {what}"), number)
+        yield number, MOTION_FIGURES[number](coarse=coarse, report=tell)
     if "9" in only:
         report("figure 9: amplitudes and spot checks")
-        results["9"] = paper_figures.figure9(coarse=coarse, seed=seed, points=points)
-    report("drawing")
-    return {number: results[number] for number in only}
+        yield "9", paper_figures.figure9(coarse=coarse, seed=seed, points=points)
 
 
 def _payload(number: str, figure: "FigureData | ContactFigure | MotionFigure", files: list[str]) -> dict[str, Any]:

@@ -144,14 +144,15 @@ class Session:
         _console(stderr=True).print(shown(message), markup=False, highlight=False, soft_wrap=True)
 
     def progress(self, what: str) -> Callable[[int, int], None]:
-        """Return what tells on standard error how much is done, every two seconds at most."""
-        last = time.monotonic()
+        """Return what tells on standard error, every two seconds at most, what is done and how long the rest takes."""
+        first = last = time.monotonic()
 
         def report(done: int, total: int) -> None:
             nonlocal last
             if time.monotonic() - last > _SECONDS_BETWEEN_NOTES:
                 last = time.monotonic()
-                self.note(f"{done} of {total} {what}")
+                left = (last - first) * (total - done) / done if done else math.inf
+                self.note(f"{done} of {total} {what}" + (f", about {_duration(left)} left" if 0.0 < left < 1e6 else ""))
 
         return report
 
@@ -245,6 +246,10 @@ def _prepared(ctx: click.Context, parameter: click.Parameter, folder: Path | Non
             f"{folder}: cannot write there ({error.strerror}); choose another folder", ctx=ctx, param=parameter
         ) from error
     return folder
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.0f} min"
 
 
 def _counted(asked: int, read: int) -> str:

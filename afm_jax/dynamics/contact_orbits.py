@@ -387,8 +387,8 @@ class ContactFlights:
         near = self.nearest_approach(loop, flown, values) / units.speed_nm_per_us
         near *= float(self.family(*values).cantilever.angular_frequency)
         slowest = point[count : 2 * count].min()
-        tests = [1.0 - trace + determinant, 1.0 + trace + determinant, determinant - 1.0, near, slowest]
-        return flown.gaps / scales, slopes, np.array(tests)
+        tests = np.append(np.array([1.0 - trace, 1.0 + trace, -1.0]) + determinant, [near, slowest])
+        return flown.gaps / scales, slopes, tests
 
     def _test_slopes(self, point: np.ndarray, units: CurveUnits, kind: int) -> np.ndarray | None:
         """Return the derivatives of a test function, by differences: they only lead Newton's method to its root."""

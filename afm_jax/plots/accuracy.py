@@ -5,6 +5,7 @@ The picture of the accuracy study of collisions: time of an impact against its a
 The picture of a scene's accuracy study: time against error of its settings, and of ever fuller models.
 """
 
+import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -154,7 +155,7 @@ def scene_accuracy_figure(result: Mapping[str, Any]) -> Figure:
     _settings(second, rows, "peak_error_nm", result["reference_error_nm"])
     label_axes(second, x="error of the largest height (nm)", y="")
     _ladder(third, result["ladder"])
-    label_axes(third, x=f"error of the amplitude against the {result['model_reference']} (relative)", y="time (s)")
+    label_axes(third, x=f"error of the amplitude against the {result['model_reference']}\n(relative)", y="time (s)")
     handles, labels = first.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=4, frameon=False)
     return figure
@@ -232,7 +233,11 @@ def overview_figure(rows: Sequence[Mapping[str, Any]], references: Mapping[str, 
                 told["reference_error"], color=DARK, linestyle=":", linewidth=1.2, label="error of the reference"
             )
         axes.set_title(problem)
-        label_axes(axes, x=f"error of the {told['error_of'].replace('(us)', '(µs)')}", y="time (µs), one core")
+        label_axes(
+            axes,
+            x=textwrap.fill(f"error of the {told['error_of'].replace('(us)', '(µs)')}", 48),
+            y="time (µs), one core",
+        )
         axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.15), ncols=2, frameon=False)
     for axes in panels[len(references) :]:
         axes.set_visible(False)

@@ -1,4 +1,4 @@
-"""Pictures of stability charts: white where a single-impact orbit is stable, as in figures 2 and 3.
+"""Pictures of stability charts: light where a single-impact orbit is stable, a colour an order, as figures 2 and 3.
 
 Pictures of the amplitude against the offset, as in figure 9: a curve for each coefficient of restitution.
 """
@@ -7,17 +7,19 @@ from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
-from matplotlib.colors import ListedColormap
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MultipleLocator
+from scipy.ndimage import gaussian_filter
 
 from afm_jax.dynamics.charts import OffsetAmplitudes, StabilityChart
 from afm_jax.plots.picture_style import ACCENT, DARK, GRID, label_axes, new_figure, save
 from afm_jax.scenefile import presets
 
-_LOST = "#c9d3dd"
+_LOST = "#8a97a5"
+_PALE = ("#cfe8f7", "#fbe3b5", "#c8ecdf", "#f3d3e5", "#f7f3b2", "#f8d0bd", "#ddd2ee", "#ecd9b8")
+"""A colour an order, light enough for labels on them."""
 
 
 def draw_stability_chart(
@@ -39,12 +41,13 @@ def draw_stability_chart(
     """
     figure = new_figure(9.0, 5.6)
     axes = figure.subplots()
-    stable = chart.any_stable
-    lost = np.zeros_like(stable) if compared_with is None else compared_with.any_stable & ~stable
-    shade = np.where(stable, 2, np.where(lost, 1, 0))
     edges = cell_edges(chart.x_values), cell_edges(chart.y_values)
-    colours = ListedColormap([DARK, _LOST, "white"])
-    axes.pcolormesh(*edges, shade, cmap=colours, vmin=0, vmax=2, rasterized=True)
+    axes.set_facecolor(DARK)
+    if compared_with is not None:
+        _fill(axes, chart, compared_with.any_stable, _LOST)
+    # lower orders over higher ones, as `lowest_stable_order` has it
+    for order in range(chart.orders, 0, -1):
+        _fill(axes, chart, chart.stable[order - 1], _PALE[(order - 1) % len(_PALE)])
     axes.set(xlim=edges[0][[0, -1]], ylim=edges[1][[0, -1]])
     resonance = r"resonance $\omega = 2N\Omega$"
     for order in range(1, int(edges[0][-1]) + 1):
@@ -60,6 +63,13 @@ def draw_stability_chart(
     label_axes(axes, x=r"reduced drive frequency  $n = \omega/2\Omega$", y=r"drive amplitude  $\beta$ (nm)")
     axes.set_title(title, fontsize=12)
     save(figure, path)
+
+
+def _fill(axes: Axes, chart: StabilityChart, where: Bool[np.ndarray, "rows columns"], colour: str) -> None:
+    """Fill a region with a border that passes between the points: blurred by less than a cell, cut at a half."""
+    if where.any():
+        share = gaussian_filter(where.astype(float), 0.6, mode="nearest")
+        axes.contourf(chart.x_values, chart.y_values, share, levels=[0.5, 2.0], colors=[colour])
 
 
 def _label_order(axes: Axes, chart: StabilityChart, order: int) -> None:

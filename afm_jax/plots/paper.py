@@ -7,6 +7,7 @@ Pictures of figures 8, 10 and 11: the Poincare section, and motions under a slow
 
 from pathlib import Path
 
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 
@@ -335,8 +336,9 @@ def _ramps(number: str, figure: MotionFigure, path: Path) -> None:
     picture = new_figure(8.5, 8.0)
     above, below = picture.subplots(2, 1, height_ratios=[1.0, 1.0])
     shown = figure.ramps[0] if number == "10" else figure.ramps[-1]
-    _trajectory(above, shown)
-    for ramp, colour, style in zip(figure.ramps, (BLUE, ACCENT), ("-", "--"), strict=False):
+    colours = dict(zip((ramp.rate_nm_per_us for ramp in figure.ramps), (BLUE, ACCENT), strict=False))
+    _trajectory(above, shown, colours[shown.rate_nm_per_us])
+    for ramp, colour, style in zip(figure.ramps, colours.values(), ("-", "--"), strict=False):
         label = f"peak, ramp of {ramp.rate_nm_per_us:g} nm/µs"
         below.plot(ramp.offset_nm, ramp.motion.peak_height_nm, style, color=colour, linewidth=1.8, label=label)
         held = ramp.motion.held_from_us
@@ -366,23 +368,26 @@ def _ramps(number: str, figure: MotionFigure, path: Path) -> None:
     save(picture, path)
 
 
-def _trajectory(axes: Axes, ramp: Ramp) -> None:
-    """Draw the tip against the offset; a tip that is held rides on the platform."""
+def _trajectory(axes: Axes, ramp: Ramp, colour: str) -> None:
+    """Draw what the tip sweeps against the offset, from contact to peak; a tip that is held rides on the platform."""
     motion, platform = ramp.motion, ramp.motion.scene.platform
-    time, height = motion.path()
     offset = np.array([ramp.offset_at(0.0), ramp.offset_at(1.0)])
     first, rate = offset[0], offset[1] - offset[0]
-    axes.plot(first + rate * time, height, color=BLUE, linewidth=0.3, label="tip in flight")
+    # hundreds of flights side by side would be no lines but moire
+    time, height = motion.departure_time_us, motion.peak_height_nm
+    touched = np.asarray(platform.position_and_velocity(jnp.asarray(time))[0])
+    label = "tip, from its contacts to its peaks"
+    axes.fill_between(first + rate * time, touched, height, color=colour, alpha=0.55, linewidth=0.0, label=label)
     reach = float(platform.amplitude_nm)
     ends = np.array([motion.begin_us, motion.end_us])
     middle = first + rate * ends
-    axes.fill_between(middle, middle - reach, middle + reach, color=ACCENT, alpha=0.45, linewidth=0, label="platform")
+    axes.fill_between(middle, middle - reach, middle + reach, color=DARK, alpha=0.6, linewidth=0, label="platform")
     if motion.held_from_us is not None:
         held = first + rate * motion.held_from_us
         axes.annotate(
             "the sample holds the tip,\nwhich rides on the platform",
             (0.5 * (held + middle[1]), middle.mean() + reach),
-            (0.5 * (held + middle[1]), 0.45 * float(height.max())),
+            (0.5 * (held + middle[1]), 0.45 * float(np.nanmax(height))),
             ha="center",
             color=DARK,
             arrowprops={"arrowstyle": "-", "color": DARK, "linewidth": 0.8},

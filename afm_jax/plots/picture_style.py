@@ -3,9 +3,12 @@
 import io
 from pathlib import Path
 
+import numpy as np
+from jaxtyping import Shaped
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.image import imsave
 
 from afm_jax.whole_files import write_whole
 
@@ -45,10 +48,27 @@ def save(figure: Figure, path: Path) -> None:
 
 def png_of(figure: Figure, dpi: float = 150.0) -> bytes:
     """Return a figure as a PNG file."""
-    return _bytes_of(figure, "png", dpi)
+    return png_of_pixels(pixels_of(figure, dpi), dpi)
+
+
+def pixels_of(figure: Figure, dpi: float) -> Shaped[np.ndarray, "height width 4"]:
+    """Return a figure's pixels: drawn once, where matplotlib's own saving draws all of it for the layout as well."""
+    figure.set_dpi(dpi)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.array(canvas.buffer_rgba())
+
+
+def png_of_pixels(pixels: Shaped[np.ndarray, "height width 4"], dpi: float) -> bytes:
+    """Return pixels as a PNG file."""
+    buffer = io.BytesIO()
+    imsave(buffer, pixels, format="png", dpi=dpi)
+    return buffer.getvalue()
 
 
 def _bytes_of(figure: Figure, suffix: str, dpi: float) -> bytes:
+    if suffix == "png":
+        return png_of(figure, dpi)
     buffer = io.BytesIO()
     figure.savefig(buffer, format=suffix, dpi=dpi)
     return buffer.getvalue()

@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+from jaxtyping import Float
 from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import chdtrc, digamma
 
@@ -85,15 +86,23 @@ _HALF_WIDTHS = (20.0, 10.0, 5.0)
 
 def _windows(sweep: ResonanceSweep) -> list[ResonanceSweep]:
     """Return parts of a spectrum around the peak that stands out most of its surroundings, the widest first."""
-    smooth = uniform_filter1d(sweep.amplitude**2, 5)
+    power = sweep.amplitude**2
+    smooth = uniform_filter1d(power, 5)
     floor = median_filter(smooth, max(sweep.points // 10, 5), mode="nearest")
     top = int(np.argmax(smooth / floor))
-    low = smooth < 0.5 * (smooth[top] + floor[top])
-    left, right = np.flatnonzero(low[:top]), np.flatnonzero(low[top:])
+    # few averages scatter: a wide peak is measured on a curve that is smoothed more
+    widths = [(size, _points_above_half(uniform_filter1d(power, size), top, float(floor[top]))) for size in (5, 21, 85)]
+    wide = max(width for size, width in widths if size == 5 or width > 2 * size)
     step = np.ptp(sweep.frequency_khz) / (sweep.points - 1)
-    wide = (int(right[0]) if right.size else 1) + (top - int(left[-1]) if left.size else 1)
     half, centre = max(0.5 * wide, 3.0) * step, float(sweep.frequency_khz[top])
     return [sweep.within(centre - times * half, centre + times * half) for times in _HALF_WIDTHS]
+
+
+def _points_above_half(smooth: Float[np.ndarray, " n"], top: int, floor: float) -> int:
+    """Return how many points around the top of a curve lie above half of it."""
+    low = smooth < 0.5 * (smooth[top] + floor)
+    left, right = np.flatnonzero(low[:top]), np.flatnonzero(low[top:])
+    return (int(right[0]) if right.size else 1) + (top - int(left[-1]) if left.size else 1)
 
 
 def _calibrated_sweep(

@@ -179,14 +179,14 @@ def calibration_figure(result: Calibration) -> Figure:
     grid[0, 0].legend(fontsize=_SMALL, loc="upper right")
     _mark_instrument(grid[0, 0], result)
     if result.model == "power":
-        _draw_misfit(grid[1, 0], shift, 100.0 * curves.amplitude_misfit / curves.amplitude, "fit - measured (%)")
+        _draw_misfit(grid[1, 0], shift, 100.0 * curves.amplitude_misfit / curves.amplitude, "fit - measured\n(%)")
     else:
-        _draw_misfit(grid[1, 0], shift, curves.amplitude_misfit, f"fit - measured{unit}")
+        _draw_misfit(grid[1, 0], shift, curves.amplitude_misfit, f"fit - measured\n{unit.strip()}".strip())
     if result.sweep.phase_deg is not None and curves.phase_deg is not None and curves.phase_misfit_deg is not None:
         measured = np.rad2deg(np.unwrap(np.deg2rad(result.sweep.phase_deg)))
         _draw_curve(grid[0, 1], result, shift, measured, measured + curves.phase_deg - result.sweep.phase_deg)
         label_axes(grid[0, 1], x="", y="phase (degrees)")
-        _draw_misfit(grid[1, 1], shift, curves.phase_misfit_deg, "fit - measured (degrees)")
+        _draw_misfit(grid[1, 1], shift, curves.phase_misfit_deg, "fit - measured\n(degrees)")
     title = f"f0 = {value_in_words(result.frequency_khz)} kHz,  Q = {value_in_words(result.quality_factor)}"
     title += f"  (background '{result.background}')"
     title = title.replace("+-", "±")

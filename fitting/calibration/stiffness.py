@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.special import kv, stdtrit
 
+from afm_jax.results import public_result
 from afm_jax.strict_json import plain
 from afm_jax.words import interval, known, text_table, with_error
 from fitting.calibration.result import CalibratedValue, Calibration
@@ -38,6 +39,7 @@ _IMAGINARY = (
 )
 
 
+@public_result()
 @dataclass(frozen=True)
 class Stiffness:
     """A spring constant or a sensitivity, with what it rests on.
@@ -65,14 +67,14 @@ def hydrodynamic_function(reynolds: Float[np.ndarray, "..."]) -> Complex[np.ndar
     real, imaginary = (
         np.polyval(over[::-1], place) / np.polyval(under[::-1], place) for over, under in (_REAL, _IMAGINARY)
     )
-    return (real + 1j * imaginary) * cylinder
+    return np.asarray((real + 1j * imaginary) * cylinder)
 
 
 def air_at(temperature_k: float, pressure_pa: float = 101325.0) -> tuple[float, float]:
     """Return density (kg/m^3) and viscosity (Pa s, Sutherland's formula) of dry air.
 
-    >>> [round(1e6 * x) / 1e6 for x in air_at(293.15)]
-    [1.204105, 1.8e-05]
+    >>> [f"{x:.4g}" for x in air_at(293.15)]
+    ['1.204', '1.813e-05']
     """
     return pressure_pa / (287.05 * temperature_k), 1.458e-6 * temperature_k**1.5 / (temperature_k + 110.4)
 
@@ -260,7 +262,11 @@ def stiffness_lines(calibration: Calibration, found: list[Stiffness]) -> list[st
                 f"  The instrument says {stated:g} N/m: this {100.0 * (one.value.value / stated - 1.0):+.1f} %."
             )
     note = disagreement(found)
-    lines += ["", note] if note else []
+    if note is not None:
+        lines += ["", note]
+    else:
+        line = f"# spring_constant_n_per_m = {with_error(found[-1].value.value, found[-1].value.standard_error)}"
+        lines += ["", "For the top of a table:", line]
     keys = ("share", *WORTH)
     rows = budget(calibration, found)
     cells = [[row["quantity"], *(known(row[key], ".2%") for key in keys), row["why"]] for row in rows]

@@ -244,3 +244,4 @@ def _draw_map(axes: Axes, result: Design, order: int, scale: Normalize) -> None:
     axes.xaxis.label.set_fontsize(_SMALL)
     axes.yaxis.label.set_fontsize(_SMALL)
     axes.tick_params(labelsize=8)
+    axes.xaxis.set_major_locator(MaxNLocator(5))

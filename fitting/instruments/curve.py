@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from afm_jax.results import public_result
 from afm_jax.strict_json import plain
 from fitting.instruments.branch import JUMP, BranchLook, look_at
 from fitting.instruments.formats import read_recording
@@ -88,6 +89,7 @@ def parse_columns(text: str) -> dict[str, ColumnSource]:
     return found
 
 
+@public_result()
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MeasuredCurve:
     """One curve of a file, approach and retract together; the arrays have the shape (rows,).
@@ -593,17 +595,16 @@ def table_text(curve: MeasuredCurve) -> str:
     if needed:
         options = " ".join(f"--{key.replace('_', '-')} {_NEEDED[key]}" for key in needed)
         raise TableError(f"{curve.source}: the file does not say {', '.join(needed)}; give {options}")
-    phase, free = curve.phase_lag_deg, curve.known["free_amplitude_nm"]
+    phase = curve.phase_lag_deg
     columns: dict[str, Any] = {
         "drive_frequency_khz": curve.number("drive_frequency_khz"),
-        "free_amplitude_nm": free.value,
-        "free_amplitude_error_nm": free.error,
+        "free_amplitude_nm": curve.number("free_amplitude_nm"),
         "offset_nm": curve.offset_nm,
         "lockin_amplitude_nm": curve.amplitude,
         "lockin_amplitude_error_nm": curve.number("amplitude_error_nm"),
         "phase_lag_deg": phase,
         "phase_lag_error_deg": None if phase is None else curve.number("phase_error_deg"),
-        "branch": curve.branch,
+        "retract": (curve.branch == "retract").astype(int),
     }
     # an offset of the detector may take the amplitude of a tip that does not move below zero
     moving = curve.amplitude > 0.0

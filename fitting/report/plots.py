@@ -1,15 +1,11 @@
 """The pictures of a fit: measured and predicted amplitudes, residuals, and the law with its band."""
 
-import io
-from collections.abc import Sequence
-
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.image import imread, imsave
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from afm_jax.plots.picture_style import png_of
+from afm_jax.plots.picture_style import pixels_of, png_of_pixels
 from fitting.fits.loss import EV_PER_AJ, Loss
 from fitting.fits.result import FitResult
 from fitting.report.words import has_delay
@@ -18,32 +14,25 @@ from fitting.report.words import has_delay
 COLOURS = ("#0072B2", "#D55E00", "#009E73")
 ALARM = "#B00020"
 SMALL = 8
-_WIDTH_INCHES, _DPI = 10.0, 120.0
+_WIDTH_INCHES, DPI = 10.0, 120.0
 _KINDS = ("peak", "lock-in", "phase")
 _ASIDE = "#999999"
-_ROW_AXIS = "row (by order N, drive frequency, drive amplitude)"
+_ROW_AXIS = "drive frequency (kHz), for each order N to scale; rows of one frequency beside each other"
 _MUCH = 5.0
 """How much the loss must change to be drawn on a logarithmic axis."""
 _APPROACH = "approach speed (nm/µs)"
 
 
 def fit_pictures(result: FitResult) -> list[bytes]:
-    """Return the pictures of the rows, the law, the residuals over the speed and the energy lost, of equal width (PNG).
+    """Return fit.png, and its parts: the rows, the law, the residuals over the speed and the energy lost (PNG).
 
     Without speeds there is no energy.
     """
     figures = [rows_figure(result), law_figure(result), speed_figure(result)]
     if result.loss is not None:
         figures.append(energy_figure(result, result.loss))
-    return [png_of(figure, _DPI) for figure in figures]
-
-
-def one_below_the_other(pictures: Sequence[bytes]) -> bytes:
-    """Return PNG files of equal width as one."""
-    buffer = io.BytesIO()
-    stacked = np.concatenate([imread(io.BytesIO(picture)) for picture in pictures])
-    imsave(buffer, stacked, format="png", dpi=_DPI)
-    return buffer.getvalue()
+    parts = [pixels_of(figure, DPI) for figure in figures]
+    return [png_of_pixels(part, DPI) for part in (np.concatenate(parts), *parts)]
 
 
 def rows_figure(result: FitResult) -> Figure:
@@ -62,10 +51,11 @@ def rows_figure(result: FitResult) -> Figure:
 
 
 def law_figure(result: FitResult) -> Figure:
-    """Return the figure of the law: rebound speed, energy lost, and the delay where impacts last."""
-    draw = [draw_law, draw_losses, *([draw_delay] if has_delay(result) else [])]
-    figure = Figure(figsize=(_WIDTH_INCHES, 3.6), layout="constrained")
-    for panel, axes in zip(draw, figure.subplots(1, len(draw)), strict=True):
+    """Return the figure of the law: rebound speed, its band, energy lost, and the delay where impacts last."""
+    draw = [draw_law, draw_band, draw_losses, *([draw_delay] if has_delay(result) else [])]
+    shape, height = ((2, 2), 6.4) if len(draw) == 4 else ((1, 3), 3.6)
+    figure = Figure(figsize=(_WIDTH_INCHES, height), layout="constrained")
+    for panel, axes in zip(draw, figure.subplots(*shape).ravel(), strict=True):
         panel(axes, result)
     return figure
 
@@ -114,8 +104,7 @@ def energy_figure(result: FitResult, loss: Loss) -> Figure:
 
 def draw_amplitudes(axes: Axes, result: FitResult) -> None:
     """Draw each row's measured amplitudes with their prediction; rows set aside or without an orbit are marked."""
-    ranking, breaks = _row_axis(result)
-    places = np.arange(len(ranking))
+    ranking, places = _row_axis(result)
     aside = result.rows.set_aside[ranking]
     drawn = False
     for kind in range(2):
@@ -130,8 +119,8 @@ def draw_amplitudes(axes: Axes, result: FitResult) -> None:
             label = None if drawn else "measured, set aside"
             axes.plot(places[aside], measured[aside], "x", ms=6, mew=1.4, color=_ASIDE, label=label)
             drawn = True
-    _mark_missing(axes, result, ranking)
-    _mark_orders(axes, result.table.order[ranking], breaks)
+    _mark_missing(axes, result, ranking, places)
+    _mark_orders(axes, result.table.order[ranking])
     axes.set_yscale("log")
     axes.set_ylabel("amplitude (nm)")
     axes.tick_params(labelbottom=False)
@@ -139,13 +128,11 @@ def draw_amplitudes(axes: Axes, result: FitResult) -> None:
 
 def draw_residuals(axes: Axes, result: FitResult) -> None:
     """Draw the normalised residuals row by row."""
-    ranking, breaks = _row_axis(result)
-    places = np.arange(len(ranking))
+    ranking, places = _row_axis(result)
     _draw_expected(axes)
     for kind in range(result.rows.residual.shape[1]):
         axes.plot(places, result.rows.residual[ranking, kind], "o", ms=3, color=COLOURS[kind])
-    for place in breaks:
-        axes.axvline(place - 0.5, color="0.7", lw=0.8)
+    _name_frequencies(axes, result)
     axes.set_ylabel("residual (errors)")
     axes.set_xlabel(_ROW_AXIS)
 
@@ -178,16 +165,45 @@ def _draw_expected(axes: Axes) -> None:
     axes.axhline(0, color="0.5", lw=0.8)
 
 
-def _row_axis(result: FitResult) -> tuple[np.ndarray, list[int]]:
-    """Return positions of the rows, sorted by order, frequency and drive, and where a new order begins."""
+def _row_axis(result: FitResult) -> tuple[np.ndarray, np.ndarray]:
+    """Return the rows in order, and where each stands: an order N is as wide as any, its drive frequencies to scale.
+
+    Rows of one frequency, at several drives and offsets, stand a little beside each other.
+    """
     table = result.table
-    heights = (table.offset_nm,) if table.tapping else ()
-    ranking = np.lexsort((*heights, table.excitation_nm, table.drive_frequency_khz, table.order))
-    orders = table.order[ranking]
-    return ranking, [int(i) for i in np.flatnonzero(np.diff(orders)) + 1]
+    ranking = np.lexsort((table.offset_nm, table.excitation_nm, table.drive_frequency_khz, table.order))
+    places = np.empty(len(ranking))
+    order, frequency = table.order[ranking], table.drive_frequency_khz[ranking]
+    for number, one in enumerate(np.unique(order)):
+        here = order == one
+        different, which = np.unique(frequency[here], return_inverse=True)
+        width = max(float(np.ptp(different)), 1e-9)
+        room = float(np.diff(different).min()) / width if len(different) > 1 else 1.0
+        rank = np.arange(here.sum()) - np.searchsorted(which, which)
+        beside = 0.6 * room * (rank / max(np.bincount(which).max() - 1, 1) - 0.5)
+        places[here] = (
+            number + 0.06 + 0.88 * ((frequency[here] - different[0]) / width + 0.5 * room + beside) / (1.0 + room)
+        )
+    return ranking, places
 
 
-def _mark_missing(axes: Axes, result: FitResult, ranking: np.ndarray) -> None:
+def _name_frequencies(axes: Axes, result: FitResult) -> None:
+    """Name the lowest, a middle and the highest drive frequency of each order."""
+    ranking, places = _row_axis(result)
+    order, frequency = result.table.order[ranking], result.table.drive_frequency_khz[ranking]
+    ticks, names = [], []
+    for one in np.unique(order):
+        different = np.unique(frequency[order == one])
+        for chosen in sorted({0, len(different) // 2, len(different) - 1}):
+            here = (order == one) & (frequency == different[chosen])
+            ticks.append(float(places[here].mean()))
+            names.append(f"{different[chosen]:.4g}")
+    axes.set_xticks(ticks, names)
+    for number in range(1, len(np.unique(order))):
+        axes.axvline(number, color="0.7", lw=0.8)
+
+
+def _mark_missing(axes: Axes, result: FitResult, ranking: np.ndarray, places: np.ndarray) -> None:
     """Mark the rows for which the law has no stable orbit, and those that were seen without one."""
     seen = np.zeros(len(ranking), dtype=bool) if result.table.no_orbit is None else result.table.no_orbit[ranking] > 0
     missing = result.rows.orbits[ranking] == 0
@@ -196,18 +212,18 @@ def _mark_missing(axes: Axes, result: FitResult, ranking: np.ndarray) -> None:
         (seen & missing, _ASIDE, "no orbit, as predicted"),
         (seen & ~missing, "black", "no orbit seen, one predicted"),
     ):
-        for count, place in enumerate(np.flatnonzero(rows).tolist()):
+        for count, place in enumerate(places[rows].tolist()):
             axes.axvline(place, color=colour, lw=0.8, ls=":", label=None if count else label)
 
 
-def _mark_orders(axes: Axes, orders: np.ndarray, breaks: list[int]) -> None:
+def _mark_orders(axes: Axes, orders: np.ndarray) -> None:
     """Separate the orders N by lines and name them at the top."""
-    for place in breaks:
-        axes.axvline(place - 0.5, color="0.7", lw=0.8)
-    for begin, end in zip([0, *breaks], [*breaks, len(orders)], strict=True):
+    for number, order in enumerate(np.unique(orders)):
+        if number:
+            axes.axvline(number, color="0.7", lw=0.8)
         axes.annotate(
-            f"N = {orders[begin]}",
-            ((begin + end - 1) / 2, 1.0),
+            f"N = {order}",
+            (number + 0.5, 1.0),
             xycoords=("data", "axes fraction"),
             xytext=(0, 3),
             textcoords="offset points",
@@ -232,6 +248,23 @@ def draw_law(axes: Axes, result: FitResult) -> None:
     axes.set_xlim(left=0)
     axes.set_ylim(bottom=0)
     axes.legend(fontsize=SMALL, loc="upper left")
+
+
+def draw_band(axes: Axes, result: FitResult) -> None:
+    """Draw the 95 % band of the rebound speed as deviation from the fit in per cent: beside the law it is too thin."""
+    law = result.law
+    speed, fitted = law.approach_speed_nm_per_us, law.rebound_speed_nm_per_us
+    with np.errstate(invalid="ignore", divide="ignore"):
+        low, high = (100.0 * (end / fitted - 1.0) for end in (law.rebound_low_nm_per_us, law.rebound_high_nm_per_us))
+    axes.axhline(0.0, color=COLOURS[0])
+    if np.isfinite(high).any():
+        axes.fill_between(speed, low, high, color=COLOURS[0], alpha=0.3, lw=0, label="95 % band")
+        axes.legend(fontsize=SMALL, loc="upper right")
+    _mark_speeds(axes, result)
+    log_speed_axis(axes)
+    _frame(axes, result, (low, high))
+    axes.set_xlabel(_APPROACH)
+    axes.set_ylabel("rebound speed: deviation (%)")
 
 
 def draw_losses(axes: Axes, result: FitResult) -> None:
@@ -281,16 +314,22 @@ def _mark_speeds(axes: Axes, result: FitResult, label: str | None = None) -> Non
 
 def _frame_measured(axes: Axes, result: FitResult) -> None:
     """Let the measured speeds decide the height: below them the delay may fall steeply."""
+    law = result.law
+    _frame(
+        axes, result, tuple(1e3 * column for column in (law.collision_delay_us, law.delay_low_us, law.delay_high_us))
+    )
+
+
+def _frame(axes: Axes, result: FitResult, columns: Sequence[np.ndarray]) -> None:
+    """Let the values at the measured speeds, and 0, decide an axis' height."""
     law, rows = result.law, result.rows
     reached = rows.approach_speed_nm_per_us[rows.used & np.isfinite(rows.approach_speed_nm_per_us)]
     if not reached.size:
         return
     inside = (law.approach_speed_nm_per_us >= reached.min()) & (law.approach_speed_nm_per_us <= reached.max())
-    columns = np.concatenate(
-        [column[inside] for column in (law.collision_delay_us, law.delay_low_us, law.delay_high_us)]
-    )
-    columns = 1e3 * columns[np.isfinite(columns)]
-    if columns.size:
-        low, high = min(float(columns.min()), 0.0), max(float(columns.max()), 0.0)
+    values = np.concatenate([column[inside] for column in columns])
+    values = values[np.isfinite(values)]
+    if values.size:
+        low, high = min(float(values.min()), 0.0), max(float(values.max()), 0.0)
         margin = 0.12 * (high - low) or 1.0
         axes.set_ylim(low - margin, high + margin)

@@ -172,13 +172,12 @@ def write_report(
         OSError: if a file cannot be written.
     """
     from fitting.report.html import fit_page  # noqa: PLC0415
-    from fitting.report.plots import fit_pictures, one_below_the_other  # noqa: PLC0415
+    from fitting.report.plots import fit_pictures  # noqa: PLC0415
 
-    pictures = fit_pictures(result)
+    picture, *pictures = fit_pictures(result)
     page = folder / "fit.html"
     markup = fit_page(result, pictures, comparison=comparison, bootstrap=bootstrap, posterior=posterior)
     write_whole(page, markup)
-    picture = one_below_the_other(pictures)
     others = write_report_files(folder, "fit", text=summary(result), data=result.to_dict(), picture=picture)
     write_table("fit_rows.csv", row_records(result), ROW_COLUMNS)
     write_table("law.csv", law_records(result), LAW_COLUMNS)

@@ -19,9 +19,9 @@ def tapping_pictures(result: Tapping) -> list[bytes]:
     """Return PNG files: the curve, the two frames, and the law if there is one."""
     files = [png_of(curve_figure(result)), png_of(frames_figure(result))]
     if result.law is not None:
-        from fitting.report.plots import fit_pictures  # noqa: PLC0415
+        from fitting.report.plots import DPI, law_figure  # noqa: PLC0415
 
-        files.append(fit_pictures(result.law)[1])
+        files.append(png_of(law_figure(result.law), DPI))
     return files
 
 

@@ -1,0 +1,178 @@
+"""Thermal spectra and stiffness: the likelihood, the real spectrum, Sader's method, slopes, and what intervals hold."""
+
+from pathlib import Path
+
+import jax.numpy as jnp
+import mpmath
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy.stats import gamma
+
+from afm_jax.cli.main import main
+from fitting import TableError, calibrate, equipartition, read_curves, read_sweep, sader, sensitivity
+from fitting.calibration.model import deviance_root
+from fitting.calibration.result import CalibratedValue, Calibration
+from fitting.calibration.stiffness import BOLTZMANN, air_at, disagreement, hydrodynamic_function
+from fitting.calibration.sweep import DENSITY, ResonanceSweep
+from tests.strict_reading import strictly
+
+REAL = Path(__file__).parent.parent / "fitting" / "examples" / "real"
+THERMAL, FORCES = REAL / "thermal_nanosurf.nid", REAL / "tapping_normal_force_wsxm.f.curves"
+FREQUENCY_KHZ, QUALITY_FACTOR, STIFFNESS_N_PER_M, WARM_K = 90.0, 150.0, 5.4, 300.0
+
+
+def density(khz: np.ndarray, floor: float = 2e-8) -> np.ndarray:
+    """Return the one-sided density (nm^2/Hz) of an oscillator in thermal motion, from Langevin's equation."""
+    variance = 1e18 * BOLTZMANN * WARM_K / STIFFNESS_N_PER_M
+    hz, natural = 1e3 * khz, 1e3 * FREQUENCY_KHZ
+    shape = natural**4 / ((natural**2 - hz**2) ** 2 + (hz * natural / QUALITY_FACTOR) ** 2)
+    return 2.0 * variance / (np.pi * QUALITY_FACTOR * natural) * shape + floor
+
+
+def thermal_spectrum(averages: float, random: np.random.Generator, *, points: int = 128, known: bool = True):
+    khz = np.linspace(86.0, 94.0, points)
+    drawn = density(khz) * random.gamma(averages, 1.0 / averages, points)
+    count = averages if known else None
+    return ResonanceSweep(frequency_khz=khz, amplitude=np.sqrt(drawn), amplitude_unit=DENSITY, averages=count)
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(main, ["calibrate", *(str(argument) for argument in arguments)])
+
+
+def test_the_residuals_squared_are_the_gamma_likelihood():
+    # apart from what does not depend on the model
+    ratio = np.array([0.02, 0.3, 0.9995, 1.0, 1.0 + 1e-7, 1.2, 7.0])
+    averages, measured = 30.0, 2.0
+    likelihood = gamma.logpdf(measured, averages, scale=measured / ratio / averages)
+    best = gamma.logpdf(measured, averages, scale=measured / averages)
+    root = np.asarray(deviance_root(jnp.asarray(ratio)))
+    np.testing.assert_allclose(averages * root**2, 2.0 * (best - likelihood), rtol=1e-9, atol=2e-13)
+    assert np.all(np.sign(root) == np.sign(ratio - 1.0))
+    exact = [float(mpmath.sqrt(2 * (mpmath.mpf(u) - 1 - mpmath.log(u)))) for u in (1.00099, 1.00101)]
+    np.testing.assert_allclose(np.asarray(deviance_root(jnp.array([1.00099, 1.00101]))), exact, rtol=1e-9)
+
+
+def test_the_hydrodynamic_function_is_that_of_a_cylinder_times_saders_correction():
+    for reynolds in (0.01, 1.0, 28.0, 1000.0):
+        root = mpmath.sqrt(1j * mpmath.mpf(reynolds))
+        turned = mpmath.mpc(0, -1) * root
+        cylinder = 1 + 4j * mpmath.besselk(1, turned) / (root * mpmath.besselk(0, turned))
+        correction = hydrodynamic_function(np.array(reynolds)) / complex(cylinder)
+        # between a flat plate and a cylinder there is at most a tenth
+        assert abs(complex(correction) - 1.0) < 0.12
+    # Maali et al. 2005: Im Gamma = 3.8018 d/b + 2.7364 (d/b)^2 with d = sqrt(2 eta/rho omega)
+    # (a fit of theirs, good to some per cent here)
+    for reynolds in (5.0, 28.0):
+        share = np.sqrt(1.0 / (2.0 * reynolds))
+        wanted = 3.8018 * share + 2.7364 * share**2
+        assert np.imag(hydrodynamic_function(np.array(reynolds))) == pytest.approx(wanted, rel=0.03)
+
+
+def test_air_has_the_tabulated_density_and_viscosity():
+    # CRC handbook, dry air at 1013 hPa: 300 K
+    assert air_at(300.0) == (pytest.approx(1.177, rel=2e-3), pytest.approx(1.846e-5, rel=5e-3))
+
+
+def calibrated(frequency: float, quality: float) -> Calibration:
+    """Return what `sader` asks of a calibration, without a fit."""
+    found = object.__new__(Calibration)
+    for name, value in (("frequency_khz", frequency), ("quality_factor", quality)):
+        object.__setattr__(found, name, CalibratedValue(value, 1e-3 * value, (None, None), None))
+    return found
+
+
+def test_saders_stiffness_is_what_nanosurf_states_in_the_file():
+    # the vendor's frequency and Q, the lever's nominal size (ACL-A, 225 x 40 um): their 27.13 N/m
+    stated = sader(calibrated(179.8, 442.0), length_um=(225.0, 0.0), width_um=(40.0, 0.0))
+    assert stated.value.value == pytest.approx(27.13, rel=0.1)
+    width = sader(calibrated(179.8, 442.0), length_um=(225.0, 0.0), width_um=(40.0, 1.0)).value
+    assert width.standard_error is not None
+    # in air at such speeds as b^1.5 or so: 2.5 % of the width
+    assert width.standard_error / width.value == pytest.approx(0.025, rel=0.4)
+
+
+def test_the_sensitivity_is_the_slope_of_the_rows_in_contact():
+    curves = read_curves(FORCES)
+    found = sensitivity(curves)
+    slopes = []
+    for curve in curves:
+        volts = np.asarray(curve.deflection)
+        for branch in ("approach", "retract"):
+            rows = (curve.branch == branch) & (curve.offset_nm > 13.0)
+            slopes.append(np.polyfit(curve.offset_nm[rows], volts[rows], 1)[0])
+    # the last 2 of some 5 nm in contact, fitted apart
+    assert found.value.value == pytest.approx(1.0 / np.mean(slopes), rel=0.08)
+    low, high = found.value.interval95
+    assert low is not None
+    assert high is not None
+    assert low < found.value.value < high
+    answer = run(FORCES, "--slope", "--json")
+    assert answer.exit_code == 0, answer.stderr
+    assert strictly(answer.stdout)["deflection_nm_per_volt"]["value"] == found.value.value
+    assert run(THERMAL, "--slope").exit_code == 2
+    with pytest.raises(TableError, match="no deflection in V"):
+        sensitivity(read_curves(REAL / "tapping_amplitude_wsxm.f.curves"))
+
+
+def test_spectra_are_read_from_csv(tmp_path):
+    khz = np.linspace(80.0, 100.0, 30)
+    rows = "\n".join(f"{1e3 * f!r},{s!r}" for f, s in zip(khz.tolist(), density(khz).tolist(), strict=True))
+    path = tmp_path / "spectrum.csv"
+    path.write_text(f"# averages = 200\nfrequency_hz,psd_nm2_per_hz\n{rows}\n", encoding="utf-8")
+    sweep = read_sweep(path)
+    assert (sweep.averages, sweep.spectrum) == (200.0, True)
+    np.testing.assert_allclose(sweep.amplitude**2, density(khz), rtol=1e-14)
+    path.write_text(f"# averages = many\nfrequency_hz,psd_nm2_per_hz\n{rows}\n", encoding="utf-8")
+    with pytest.raises(TableError, match="line 1: averages has 'many' where a number must stand"):
+        read_sweep(path)
+    cut = tmp_path / "cut.nid"
+    cut.write_bytes(THERMAL.read_bytes()[:-8])
+    with pytest.raises(TableError, match="announces 66952 bytes"):
+        read_sweep(cut)
+
+
+@pytest.mark.slow
+def test_the_real_spectrum_meets_the_vendors_numbers(tmp_path):
+    sizes = ["--length-um", "225 +- 2", "--width-um", "40 +- 1"]
+    result = run(THERMAL, "--json", "--out", tmp_path, *sizes)
+    assert result.exit_code == 0, result.stderr
+    answer = strictly(result.stdout)
+    assert answer["frequency_khz"]["value"] == pytest.approx(179.8, rel=1e-3)
+    assert answer["quality_factor"]["value"] == pytest.approx(442.0, rel=0.05)
+    stiffness = answer["spring_constant_n_per_m"]
+    assert stiffness["sader"]["value"] == pytest.approx(27.13, rel=0.1)
+    # the deflection's own scale says less than half: it was not calibrated, and that is said
+    assert stiffness["equipartition"]["value"] == pytest.approx(9.7, rel=0.05)
+    assert "are 1.65 times the true ones" in answer["note"]
+    assert any("Fitted from 178.5" in warning for warning in answer["warnings"])
+    assert {row["quantity"] for row in answer["budget"]} >= {"quality_factor", "spring_constant_n_per_m (Sader)"}
+    assert strictly((tmp_path / "calibration.json").read_text("utf-8")) == answer
+    half = run(THERMAL, "--length-um", "225")
+    assert half.exit_code == 2
+    assert "needs both --length-um and --width-um" in half.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("known", [True, False])
+def test_intervals_hold_the_truth_as_often_as_they_say(known):
+    random, draws = np.random.default_rng(11), 200 if known else 80
+    wanted = (FREQUENCY_KHZ, QUALITY_FACTOR, STIFFNESS_N_PER_M)
+    held, apart = np.zeros(3), []
+    for _ in range(draws):
+        spectrum = thermal_spectrum(100.0, random, known=known)
+        result = calibrate(spectrum, background="floor", compare=False, whole=True)
+        assert result.explained
+        # the whole of kT here: the oscillator is a point, not a lever's first mode
+        stiffness = equipartition(result, temperature_k=(WARM_K, 0.0), static=False).value
+        found = [(one, 1.0) for one in (result.frequency_khz, result.quality_factor)] + [(stiffness, 0.971)]
+        for place, ((one, factor), truth) in enumerate(zip(found, wanted, strict=True)):
+            low, high = one.interval95
+            held[place] += (low or 0.0) < factor * truth < (high or 0.0)
+        apart.append([one.value / factor / truth - 1.0 for (one, factor), truth in zip(found, wanted, strict=True)])
+    # 95 % of 200 is known to 1.5 %
+    low, high = (0.92, 0.985) if known else (0.88, 1.0)
+    assert np.all((held / draws >= low) & (held / draws <= high)), held / draws
+    assert np.all(np.abs(np.mean(apart, axis=0)) < 4.0 * np.std(apart, axis=0) / np.sqrt(draws))
+    assert disagreement([]) is None
