@@ -1,5 +1,7 @@
 """The pictures of a fit: measured and predicted amplitudes, residuals, and the law with its band."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
