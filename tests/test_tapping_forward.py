@@ -39,9 +39,11 @@ def truth(contact: Contact, ratio: float, free_nm: float, offset_nm: float) -> R
     force = ForceDrive(free_nm * float(drive_per_free_height(cantilever, frequency, ForceDrive)), frequency)
     scene = Scene(cantilever, Platform(0.0, frequency, offset_nm), contact, force=force)
     run = follow_long(scene, default_start(scene), 20_000.0, until_settled=True)
-    seen = observe(scene, run.simulation, verdict=run.verdict)
-    if (seen.settled.periods, seen.settled.contacts) != (1, 1) or seen.phase_lag_deg is None:
+    periods = run.verdict.periods
+    if periods is None or run.verdict.contacts != periods:
         return Read(np.nan, np.nan)
+    # what dies away slowly may count as several periods: the drive's frequency is that multiple of theirs
+    seen = observe(scene, run.simulation, verdict=run.verdict, harmonics=(periods,))
     return Read(seen.lockin_amplitude_nm, seen.phase_lag_deg)
 
 
@@ -61,7 +63,7 @@ def predicted(impact: TabulatedImpact, ratio: jax.Array, free_nm: jax.Array, off
     return Read(size, lag, u / impact.lowest, middle.acceleration * impact.hertz_time(u) / u)
 
 
-ROWS = [(100.0, 1.1, 80.0), (20.0, 1.1, 80.0), (20.0, 1.03, 80.0), (20.0, 1.03, 40.0)]
+ROWS = [(100.0, 1.1, 80.0), (20.0, 1.1, 80.0)]
 """Radius of the tip in nm, frequency over the free one, free amplitude in nm."""
 SHARES = (0.8, 0.4)
 """Of the free amplitude: distance of the sample from the rest position."""

@@ -652,4 +652,4 @@ def _few_left(stated: Objective, strain: Strain, minimum: Minimum) -> bool:
     hits = np.asarray(rows.measured).any(axis=1) & ~np.asarray(rows.free)
     lost = lost_rows(stated, stated.problem.values(minimum.coordinates))
     left = int((hits & ~lost & ~strain.set_aside).sum())
-    return left < max(_FEWEST_LEFT, _LEAST_LEFT * hits.sum())
+    return bool(left < max(_FEWEST_LEFT, _LEAST_LEFT * hits.sum()))

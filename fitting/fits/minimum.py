@@ -309,14 +309,14 @@ NEAREST = 1.35
 _CRAWLING, _MOST_LOST = 2.5, 0.05
 """The same for rows that the law has no steady orbit for, their speed told from the amplitude, and for driven tips; and
 the share of those without at most: that close to where orbits end, a hair of the law decides whether there is one."""
-_PULLED = 1.2
+_PULLED = 0.8
 """Pull times Hertz time over the approach speed from which the rows of a driven tip are set aside."""
 _MOST_IRREGULAR = 0.2
 """Share of the rows of a driven tip at most that are taken not to be one impact a period."""
 _TURNED = 0.125
 """Error of the phase in rad over the relative error of the amplitude: what the tip loses fixes the phase."""
 TOO_SLOW = "too slow for a law of impacts"
-TOO_PULLED = "under too strong a pull of the lever (more than 1.2 times what turns the tip round)"
+TOO_PULLED = "under too strong a pull of the lever (more than 0.8 times what turns the tip round)"
 IRREGULAR = "not one a period"
 ATTRACTED = "none: the sample only draws the tip"
 """Why rows are set aside."""
