@@ -15,6 +15,7 @@ angular frequency         rad/us      elastic modulus             nN/nm^2 = GPa
 """
 
 import math
+from typing import Any
 
 TWO_SIDED_95 = 1.959963984540054
 """Half width of a 95 % interval in standard errors, where errors are normal."""
@@ -33,3 +34,12 @@ NN_US_PER_NM2_PER_PA_S = 1e-3
 
 AJ_NM6_PER_J_M6 = 1e72
 """Core constant of 1 J m^6 in aJ nm^6."""
+
+
+def within_turn(angle: Any, turn: Any) -> Any:
+    """Return an angle within [0, turn), of numbers and arrays of any kind; -1e-17 is at 0, not at a whole turn.
+
+    >>> within_turn(-90.0, 360.0), within_turn(-1e-17, 360.0)
+    (270.0, 0.0)
+    """
+    return angle % turn % turn

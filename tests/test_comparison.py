@@ -49,7 +49,7 @@ def test_models_are_compared_by_their_information(compared):
     assert set(rows) == set(MODELS)
     for model, row in rows.items():
         count = len(compared.results[model].parameters)
-        # peak, lock-in amplitude and phase of 82 rows, and the constraint on Q: no row of an instantaneous law is set aside
+        # peak, lock-in amplitude and phase of 82 rows, none set aside, and the constraint on Q
         assert row["degrees_of_freedom"] == 247 - count
         assert row["aic"] == pytest.approx(row["chi2"] + 2.0 * count)
         assert row["bic"] == pytest.approx(row["chi2"] + count * math.log(247))

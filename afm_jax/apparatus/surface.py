@@ -20,7 +20,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, require_one_frequency
 from afm_jax.apparatus.trigonometry import sine_cosine
 from afm_jax.checks import as_argument, as_parameter, is_traced, readable
-from afm_jax.units import RAD_PER_US_PER_KHZ
+from afm_jax.units import RAD_PER_US_PER_KHZ, within_turn
 
 _AT_RESONANCE = 1e-9
 """Relative distance from the free frequency below which an undamped cantilever has no steady response."""
@@ -263,7 +263,7 @@ def size_and_lag(
     moves = square > 0.0
     size = jnp.where(moves, jnp.sqrt(jnp.where(moves, square, 1.0)), 0.0)
     lag = jnp.rad2deg(drive_rad / order - _angle(along, across))
-    return size, lag % (360.0 / as_argument(order))
+    return size, within_turn(lag, 360.0 / as_argument(order))
 
 
 def force_per_height(

@@ -34,6 +34,7 @@ from afm_jax.dynamics.iteration import (
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, verdicts_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import public_result
+from afm_jax.units import within_turn
 
 _SAMPLE = 2048
 _LONG = 1000
@@ -57,7 +58,7 @@ _NARROWEST = 16
 class Attractor(NamedTuple):
     """What starts come to.
 
-    ``phase_rad`` and ``velocity_nm_per_us``: of an orbit, just after each of its impacts; else empty.
+    ``phase_rad``, in [0, 2 pi), and ``velocity_nm_per_us``: of an orbit, just after each of its impacts; else empty.
     """
 
     name: str
@@ -199,7 +200,7 @@ class _Finder:
         label = np.empty(len(period), int)
         for lane in range(len(period)):
             m = int(verdicts.impacts[lane])
-            phase = self.omega * record.departure_us[lane, -m:] if m else np.zeros(0)
+            phase = within_turn(self.omega * record.departure_us[lane, -m:], 2.0 * np.pi) if m else np.zeros(0)
             velocity = record.velocity_after_nm_per_us[lane, -m:] if m else np.zeros(0)
             kind = int(verdicts.kind[lane]), m, int(verdicts.periods[lane])
             label[lane] = self._known(kind, phase, velocity)

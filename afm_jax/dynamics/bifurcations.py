@@ -33,6 +33,7 @@ from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Verdicts, verdicts_o
 from afm_jax.outcomes import Outcome
 from afm_jax.results import public_result
 from afm_jax.scenefile.parameter_paths import scene_batch
+from afm_jax.units import within_turn
 
 _LANES = 512
 """Stretches at most that are swept side by side."""
@@ -55,8 +56,8 @@ class Sweep(NamedTuple):
         upward: the sweep's direction.
         verdicts: what the motion has come to at each value.
         restarted: the tip began anew there: it was held, or had flown away, at the value before.
-        phase_rad: drive phase at the end of each of the last impacts, (values, impacts); NaN where there was none. Of
-            an orbit of m impacts the last m.
+        phase_rad: drive phase, in [0, 2 pi), at the end of each of the last impacts, (values, impacts); NaN where there
+            was none. Of an orbit of m impacts the last m.
         approach_nm_per_us: their approach speeds.
         velocity_after_nm_per_us: the tip's velocity in the lab after them.
         height_nm: the platform's height when the tip arrives.
@@ -309,7 +310,7 @@ def _sweep_of(
         upward=upward,
         verdicts=verdicts,
         restarted=swept.restarted,
-        phase_rad=known(turn * record.departure_us),
+        phase_rad=known(within_turn(turn * record.departure_us, 2.0 * np.pi)),
         approach_nm_per_us=known(record.approach_nm_per_us),
         velocity_after_nm_per_us=known(record.velocity_after_nm_per_us),
         height_nm=known(offset + amplitude * np.cos(turn * record.arrival_us)),

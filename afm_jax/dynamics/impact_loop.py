@@ -27,7 +27,7 @@ from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
 from afm_jax.impact.lasting_impact import LawImpact, lasting
 from afm_jax.impact.law import ImpactLaw, Speeds, impact_law_of
 from afm_jax.outcomes import Outcome
-from afm_jax.units import RAD_PER_US_PER_KHZ
+from afm_jax.units import RAD_PER_US_PER_KHZ, within_turn
 
 SAMPLES_PER_TURN = 32
 """Heights of a flight that are looked at, for every turn of the faster of drive and tip."""
@@ -304,7 +304,7 @@ def reading_of(unknowns: Float[Array, " n"], scale: Float[Array, ""], loop: Impa
     none = jnp.zeros((0,))
     moves, before, phase = none, none, none
     if impacts is not None:
-        phase = (impacts.leaving_us * loop.angular_frequency) % (2.0 * jnp.pi)
+        phase = within_turn(impacts.leaving_us * loop.angular_frequency, 2.0 * jnp.pi)
         moves, before = impacts.velocity, loop.surface.velocity(impacts.arrival_us) - impacts.speeds.approach
         if loop.response is not None:
             moves = moves + loop.response.velocity(impacts.leaving_us)

@@ -40,6 +40,7 @@ from afm_jax.motion.record import ContactKind, to_lab
 from afm_jax.motion.simulate import simulate
 from afm_jax.outcomes import Outcome
 from afm_jax.results import public_result
+from afm_jax.units import within_turn
 
 DEFAULT_STARTS = 512
 MOST_IMPACTS = 64
@@ -343,6 +344,6 @@ def sticking_orbit(scene: Scene, *, longest: int = 64) -> StickingOrbit | str:
         apart = (again - first) / period
         if abs(apart - round(apart)) < 1e-6:
             omega = drive_of(scene).angular_frequency
-            return StickingOrbit(round(apart), rests, first * omega % (2.0 * np.pi), resting, impacts, peak)
+            return StickingOrbit(round(apart), rests, within_turn(first * omega, 2.0 * np.pi), resting, impacts, peak)
         release = again
     return f"a tip that is let go does not repeat itself within {_MOST_RESTS} rests"

@@ -11,6 +11,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import Surface
 from afm_jax.checks import as_argument
+from afm_jax.units import within_turn
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 
@@ -118,7 +119,7 @@ def lockin(
         flying = flying + _platform_integral(platform, nu, end_us, start_us)
         flying = flying - indentation * _turned_back(nu, 0.5 * (end_us + start_us))
     cosine, sine = 2.0 / period * flying
-    phase = jnp.rad2deg(jnp.arctan2(sine, cosine)) % (360.0 / as_argument(order))
+    phase = within_turn(jnp.rad2deg(jnp.arctan2(sine, cosine)), 360.0 / as_argument(order))
     return jnp.sqrt(cosine**2 + sine**2), phase
 
 

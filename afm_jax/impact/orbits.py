@@ -35,6 +35,7 @@ from afm_jax.impact.law import Speeds, impact_law_of
 from afm_jax.impact.roots import COARSE, find_roots
 from afm_jax.outcomes import Outcome
 from afm_jax.results import public_result
+from afm_jax.units import within_turn
 
 NEAR_DOUBLE = 1e-3
 """Slope of the closing condition per relative change of speed below which a root counts as near-double (a fold)."""
@@ -162,7 +163,7 @@ def _orbit(place: OrbitPlace, found: Bool[Array, ""], frame: FreeFrame, problem:
         admissible=verdict.admissible,
         stable=verdict.stable,
         near_double=verdict.near_double,
-        phase_rad=known((state.phase + frame.phase_rad) % (2.0 * jnp.pi)),
+        phase_rad=known(within_turn(state.phase + frame.phase_rad, 2.0 * jnp.pi)),
         velocity_after_nm_per_us=known(velocities[0]),
         velocity_before_nm_per_us=known(velocities[1]),
         approach_speed_nm_per_us=known(speeds.approach),
@@ -222,7 +223,7 @@ def _seen(state: OrbitState, frame: FreeFrame, problem: OrbitProblem) -> dict[st
         # the scene's own clock is ahead by the frame's phase
         size, behind = size_and_lag(along, across, frame.phase_rad, order)
         _, lag = size_and_lag(along, across, frame.drive_phase_rad, order)
-        return highest_of_sum(cantilever, state.flight, _alone(motion)), size, -behind % (360.0 / order), lag
+        return highest_of_sum(cantilever, state.flight, _alone(motion)), size, within_turn(-behind, 360.0 / order), lag
 
     peak, size, phase, lag = read(frame.response)
     seen = {"peak_amplitude_nm": peak, "lockin_amplitude_nm": size, "lockin_phase_deg": phase, "phase_lag_deg": lag}

@@ -28,6 +28,7 @@ from afm_jax.impact.law import ImpactLaw
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State, to_gap
 from afm_jax.motion.settle import Settled, Window, held_since, is_stuck, settled, window_of
 from afm_jax.motion.trajectory import DensePath, Trajectory, dense_path, flights_of, fly
+from afm_jax.units import within_turn
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 
@@ -227,7 +228,7 @@ def _lag(scene: Scene, harmonic: Harmonic, window: Window) -> float | None:
         return None
     share = harmonic.multiple / window.periods
     turn = 360.0 * math.gcd(harmonic.multiple, window.periods) / window.periods
-    return (share * float(drive.phase_deg) - harmonic.phase_deg) % turn
+    return within_turn(share * float(drive.phase_deg) - harmonic.phase_deg, turn)
 
 
 def _check_covered(found_us: float, wanted_us: float) -> None:
@@ -254,7 +255,7 @@ def _harmonics(
         omega = k * drive.angular_frequency / window.periods
         value = _lockin(dense, height, times, weights, (window.from_us, window.to_us), omega)
         turn = 360.0 * math.gcd(int(k), window.periods) / window.periods
-        found.append(Harmonic(int(k), float(abs(value)), float(np.degrees(np.angle(value)) % turn)))
+        found.append(Harmonic(int(k), float(abs(value)), float(within_turn(np.degrees(np.angle(value)), turn))))
     return tuple(found)
 
 
@@ -312,6 +313,7 @@ class Reading(NamedTuple):
     lockin_amplitude_nm: float
     """2/T |integral z exp(-i omega t)| at the given frequency."""
     lockin_phase_deg: float
+    """In [0, 360)."""
     energy_per_impact_aj: float | None
     """None without impacts."""
     impacts: int
@@ -335,7 +337,7 @@ def read_window(dense: DensePath, from_us: float, to_us: float, *, angular_frequ
     return Reading(
         peak_amplitude_nm=_peak_height(dense, path, from_us, to_us),
         lockin_amplitude_nm=float(abs(value)),
-        lockin_phase_deg=float(np.degrees(np.angle(value))),
+        lockin_phase_deg=float(within_turn(np.degrees(np.angle(value)), 360.0)),
         energy_per_impact_aj=float(lost.mean()) if lost.size else None,
         impacts=int(lost.size),
     )
@@ -581,7 +583,7 @@ def poincare_section(scene: Scene, simulation: Simulation) -> Section:
     time = np.asarray(rows.departure_time_us)[left]
     return Section(
         time_us=time,
-        drive_phase_deg=360.0 * ((time / drive_of(scene).period_us) % 1.0),
+        drive_phase_deg=360.0 * within_turn(time / drive_of(scene).period_us, 1.0),
         departure_velocity_nm_per_us=np.asarray(rows.departure_velocity_nm_per_us)[left],
         approach_speed_nm_per_us=np.asarray(rows.approach_speed_nm_per_us)[left],
     )
@@ -612,7 +614,7 @@ class Departures(NamedTuple):
     @property
     def drive_phase_deg(self) -> Float[np.ndarray, " contacts"]:
         """Phase of the drive at each departure."""
-        return 360.0 * np.mod(self.departure_time_us / drive_of(self.scene).period_us, 1.0)
+        return 360.0 * within_turn(self.departure_time_us / drive_of(self.scene).period_us, 1.0)
 
     def path(self, points: int = 24) -> Float[np.ndarray, "2 times"]:
         """Return times in us and heights in nm along all flights that ended, a straight line through every contact."""

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from afm_jax.results import public_result
+from afm_jax.units import within_turn
 from fitting.tables.table import AmplitudeTable
 from fitting.traces.fold import Fold, OrderSearch, Reference, find_order, find_reference, fold, sampling_error_nm
 from fitting.traces.impacts import (
@@ -225,7 +226,7 @@ class _Readings(NamedTuple):
         phase = np.degrees(np.angle(value)) - self.reference.phase_deg / order
         across = float(np.hypot(self._error_along(1j), sampling_error_nm(self.folded))) / max(abs(value), 1e-300)
         error = float(np.hypot(np.degrees(across), self.reference.phase_error_deg / order))
-        return float(np.mod(phase, 360.0 / order)), max(min(error, 180.0), _ROUNDING)
+        return float(within_turn(phase, 360.0 / order)), max(min(error, 180.0), _ROUNDING)
 
     def _error_along(self, turned: complex) -> float:
         """Return the error of the lock-in value along its own direction, turned by a unit complex number."""
