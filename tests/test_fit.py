@@ -12,13 +12,13 @@ from fitting.fits.objective import Objective
 from fitting.fits.result import FitResult
 from fitting.models import measurement_of
 from fitting.tables.table import AmplitudeTable
-from tests.fit_tables import EXAMPLE, amplitudes_and_errors, rows, values_of, with_amplitudes
+from tests.fit_tables import amplitudes_and_errors, example_amplitudes, rows, values_of, with_amplitudes
 from tests.reference_systems import Parameters, single_impact_orbits
 
 
 @pytest.fixture(scope="module")
 def table() -> AmplitudeTable:
-    return read_table(EXAMPLE)
+    return example_amplitudes()
 
 
 @pytest.fixture(scope="module")

@@ -92,8 +92,9 @@ def compare(
 
     fits, failed = _attempted(fitted, dict.fromkeys(models))
     errors = np.max([one.strain.model_error for one, _ in fits.values()], axis=0)
-    aside = np.any([one.strain.set_aside for one, _ in fits.values()], axis=0)
-    judged, lost = _attempted(lambda model: _row(model, *fits[model], Strain(errors, errors, aside)), fits)
+    # the strings' maximum: any reason rather than none
+    reasons = np.max([one.strain.reasons for one, _ in fits.values()], axis=0)
+    judged, lost = _attempted(lambda model: _row(model, *fits[model], Strain(errors, errors, reasons)), fits)
     results = {model: fits[model][1] for model in judged}
     rows = sorted(judged.values(), key=lambda row: row["aic"])
     for row in rows:
