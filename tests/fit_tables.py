@@ -15,10 +15,15 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
 from fitting.fits.result import FitResult
-from fitting.tables.table import AmplitudeTable
+from fitting.tables.table import AmplitudeTable, read_table
 
 EXAMPLE = Path(fitting.examples.__path__[0]) / "amplitudes_law.csv"
 NOISE = 0.01
+
+
+def example_amplitudes() -> AmplitudeTable:
+    """Return the bundled table without its phases."""
+    return dataclasses.replace(read_table(EXAMPLE), phase_deg=None, phase_error_deg=None)
 
 
 def rows(table: AmplitudeTable, keep: slice | np.ndarray, **changes: Any) -> AmplitudeTable:

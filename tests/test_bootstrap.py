@@ -4,9 +4,16 @@ import numpy as np
 import pytest
 
 from afm_jax.impact.law import ImpactLaw
-from fitting import bootstrap, fit, read_table
+from fitting import bootstrap, fit
 from fitting.sampling.bootstrap import DataSets, compact, draw_data, fit_data_sets, objective_of
-from tests.fit_tables import EXAMPLE, rows, simulated, standard_errors_of, values_of, with_amplitudes
+from tests.fit_tables import (
+    example_amplitudes,
+    rows,
+    simulated,
+    standard_errors_of,
+    values_of,
+    with_amplitudes,
+)
 
 pytestmark = pytest.mark.slow
 """Each compiles programs of its own for a minute or more."""
@@ -16,7 +23,7 @@ SAMPLES = 200
 
 @pytest.fixture(scope="module")
 def table():
-    example = read_table(EXAMPLE)
+    example = example_amplitudes()
     return simulated(rows(example, np.arange(0, example.rows, 3)), ImpactLaw(0.95, 60.0), seed=3)
 
 
@@ -45,7 +52,7 @@ def test_scaled_and_robust_fits_are_rebuilt_too(table, options):
 
 
 def test_rows_that_say_nothing_are_left_out():
-    refit = objective_of(fit(read_table(EXAMPLE), "law"))
+    refit = objective_of(fit(example_amplitudes(), "law"))
     used = np.asarray(refit.objective.measurement.rows.measured).copy()
     assert used.shape == (96, 2)
     assert compact(refit) is refit
@@ -123,7 +130,7 @@ def test_the_seed_decides(result, boot):
 
 
 def test_a_parameter_at_its_bound_stays_inside():
-    example = read_table(EXAMPLE)
+    example = example_amplitudes()
     lossless = simulated(rows(example, np.arange(0, example.rows, 3)), ImpactLaw(0.95, 0.0), seed=None)
     refit = objective_of(fit(lossless, "law"))
     # no noise: the fit is at the truth, no adhesion, within what a thousandth of an error says

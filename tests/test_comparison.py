@@ -8,11 +8,10 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax.cli.main import main
-from fitting import read_table
 from fitting.fits import comparison
 from fitting.fits.comparison import compare
 from fitting.fits.fit import find_fit, summarise
-from tests.fit_tables import EXAMPLE
+from tests.fit_tables import EXAMPLE, example_amplitudes
 from tests.strict_reading import strictly
 
 MODELS = ("law", "restitution", "viscous")
@@ -35,7 +34,7 @@ def failing(monkeypatch: pytest.MonkeyPatch):
 
 @pytest.fixture(scope="module")
 def table():
-    return read_table(EXAMPLE)
+    return example_amplitudes()
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from fitting.fits.minimum import relaxed, strain_of
 from fitting.fits.objective import Objective
 from fitting.models import Problem, measurement_of
 from fitting.sampling.bootstrap import BatchFit, DataSets, Refit, draw_data, fit_data_sets
-from tests.fit_tables import EXAMPLE, rows, simulated
+from tests.fit_tables import example_amplitudes, rows, simulated
 
 pytestmark = pytest.mark.slow
 
@@ -39,7 +39,7 @@ TRUTHS = {
 def experiment(model: str) -> Refit:
     """Return a model at its truth on the drives of a bundled table, with its errors of 1 %."""
     if model == "law":
-        example = read_table(EXAMPLE)
+        example = example_amplitudes()
         table = simulated(rows(example, np.arange(0, example.rows, 3)), ImpactLaw(0.95, 60.0), seed=None)
     else:
         table = read_table(CONTACT_EXAMPLE)

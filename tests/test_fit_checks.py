@@ -8,14 +8,14 @@ from scipy.linalg import eigh
 from scipy.optimize import least_squares
 
 from afm_jax.strict_json import strict_json
-from fitting import fit, read_table
+from fitting import fit
 from fitting.fits.fit import find_fit, problem_of, summarise
 from fitting.fits.intervals import check_minimum, covariance
 from fitting.fits.objective import FINE, PLAIN, Objective, polish
 from fitting.fits.result import FitResult
 from fitting.models import measurement_of
 from fitting.tables.table import AmplitudeTable
-from tests.fit_tables import EXAMPLE, standard_errors_of, values_of
+from tests.fit_tables import example_amplitudes, standard_errors_of, values_of
 from tests.strict_reading import strictly
 
 FREE = np.ones(3, dtype=bool)
@@ -24,7 +24,7 @@ STEPS = np.array([1e-6, 1e-2, 1e-3])  # of r, epsilon and Q: hundredths of a sta
 
 @pytest.fixture(scope="module")
 def table() -> AmplitudeTable:
-    return read_table(EXAMPLE)
+    return example_amplitudes()
 
 
 @pytest.fixture(scope="module")

@@ -44,7 +44,7 @@ def test_json_holds_the_promised_keys_and_nothing_else_is_printed(reported):
     answer = strictly(result.stdout)
     assert answer["model"] == "law"
     assert answer["valid"] is True
-    assert answer["degrees_of_freedom"] == 162
+    assert answer["degrees_of_freedom"] == 244
     assert {"chi2", "warnings", "reasons", "law", "input", "settings", "versions"} <= set(answer)
     for name in ("r", "epsilon"):
         parameter = answer["parameters"][name]
@@ -89,6 +89,12 @@ def test_tables_of_the_report_hold_the_fit(reported):
                 misfit / float(given[f"{kind}_amplitude_error_nm"]), rel=1e-9
             )
             pulls.append(float(row[f"{kind}_residual"]))
+        pulls.append(float(row["phase_residual"]))
+        # of the N periods of a response any is locked
+        turn = 360.0 / float(given["order"])
+        misfit = float(row["predicted_phase_deg"]) - float(given["phase_deg"])
+        misfit = (misfit + 0.5 * turn) % turn - 0.5 * turn
+        assert pulls[-1] == pytest.approx(misfit / float(given["phase_error_deg"]), rel=1e-6, abs=1e-9)
     pulls.append((answer["parameters"]["quality_factor"]["value"] - 40.0) / 0.4)
     assert answer["chi2"] == pytest.approx(sum(pull**2 for pull in pulls), rel=1e-12)
 

@@ -8,10 +8,10 @@ import pytest
 from scipy.stats import binom, kstest
 
 from afm_jax.impact.law import ImpactLaw
-from fitting import fit, read_table
+from fitting import fit
 from fitting.fits.result import FitResult
 from fitting.tables.table import AmplitudeTable
-from tests.fit_tables import EXAMPLE, NOISE, amplitudes_and_errors, rows, simulated, with_amplitudes
+from tests.fit_tables import NOISE, amplitudes_and_errors, example_amplitudes, rows, simulated, with_amplitudes
 
 pytestmark = pytest.mark.slow
 
@@ -44,7 +44,7 @@ def noisy(clean: AmplitudeTable, random: np.random.Generator) -> AmplitudeTable:
 
 @pytest.fixture(scope="module")
 def experiments() -> Experiments:
-    example = read_table(EXAMPLE)
+    example = example_amplitudes()
     twenty = rows(example, np.arange(0, example.rows, 4)[:20])
     clean = simulated(twenty, ImpactLaw(TRUTH["r"], TRUTH["epsilon"]), seed=None)
     assert clean.rows == 20

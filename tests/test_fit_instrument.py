@@ -6,10 +6,17 @@ import numpy as np
 import pytest
 
 from afm_jax.impact.law import ImpactLaw
-from fitting import fit, read_table
+from fitting import fit
 from fitting.fits.result import FitResult
 from fitting.tables.table import AmplitudeTable
-from tests.fit_tables import EXAMPLE, amplitudes_and_errors, rows, simulated, standard_errors_of, values_of
+from tests.fit_tables import (
+    amplitudes_and_errors,
+    example_amplitudes,
+    rows,
+    simulated,
+    standard_errors_of,
+    values_of,
+)
 from tests.fit_tables import with_amplitudes as table_with
 
 pytestmark = pytest.mark.slow
@@ -21,7 +28,7 @@ LAW = ImpactLaw(0.95, 60.0)
 @pytest.fixture(scope="module")
 def table() -> AmplitudeTable:
     """Return a made table with noise of 1 %; its Q is known to 1 %."""
-    return simulated(read_table(EXAMPLE), LAW, seed=11)
+    return simulated(example_amplitudes(), LAW, seed=11)
 
 
 @pytest.fixture(scope="module")

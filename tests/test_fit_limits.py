@@ -11,15 +11,15 @@ import fitting.forward
 from afm_jax.impact.closure import OrbitPlace
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import SteadyOrbits
-from fitting import fit, read_table
+from fitting import fit
 from fitting.fits.fit import problem_of
 from fitting.fits.objective import Objective
 from fitting.forward import branch_of, impact_of, orbit_problem
 from fitting.models import Rows, measurement_of
 from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import (
-    EXAMPLE,
     amplitudes_and_errors,
+    example_amplitudes,
     rows,
     simulated,
     standard_errors_of,
@@ -30,7 +30,7 @@ from tests.fit_tables import (
 
 @pytest.fixture(scope="module")
 def table() -> AmplitudeTable:
-    return read_table(EXAMPLE)
+    return example_amplitudes()
 
 
 def chi2_beside(table: AmplitudeTable, held: dict[str, float], start: dict[str, float]) -> float:

@@ -10,7 +10,7 @@ from fitting import fit, read_table
 from fitting.examples.make_contact_amplitudes import EXAMPLE as CONTACT_TABLE
 from fitting.fits.verdict import Evidence, correlation_excess, judge_fit
 from fitting.tables.table import AmplitudeTable
-from tests.fit_tables import EXAMPLE, amplitudes_and_errors, with_amplitudes
+from tests.fit_tables import amplitudes_and_errors, example_amplitudes, with_amplitudes
 from tests.made_fits import made_fit, made_parameter, made_table
 
 
@@ -169,14 +169,14 @@ def test_no_option_makes_a_law_without_delay_a_measurement_of_a_contact(options)
     ],
 )
 def test_a_law_that_the_amplitudes_are_not_made_by_stays_invalid_with_every_option(model, options, said):
-    result = fit(read_table(EXAMPLE), model=model, **options)
+    result = fit(example_amplitudes(), model=model, **options)
     assert not result.valid
     assert said in result.reasons[0]
 
 
 @pytest.mark.parametrize("options", [{"robust": True}, {"scale_errors": True}])
 def test_the_right_law_stays_valid_with_outliers_and_with_misstated_errors(options):
-    table = read_table(EXAMPLE)
+    table = example_amplitudes()
     amplitude, error = amplitudes_and_errors(table)
     if "robust" in options:
         amplitude[[5, 20, 30, 60], [0, 0, 1, 0]] *= [1.3, 1.08, 0.75, 1.5]

@@ -9,13 +9,20 @@ import pytest
 from scipy.integrate import quad
 
 from afm_jax.impact.law import ImpactLaw
-from fitting import fit, posterior, read_table
+from fitting import fit, posterior
 from fitting.models import Problem
 from fitting.sampling.bootstrap import objective_of, standard_covariance
 from fitting.sampling.nuts import log_density_of, space_around
 from fitting.sampling.posterior import grid_posterior
 from fitting.sampling.posterior_result import PosteriorChains, posterior_of_chains
-from tests.fit_tables import EXAMPLE, amplitudes_and_errors, rows, simulated, standard_errors_of, values_of
+from tests.fit_tables import (
+    amplitudes_and_errors,
+    example_amplitudes,
+    rows,
+    simulated,
+    standard_errors_of,
+    values_of,
+)
 from tests.fit_tables import steady_amplitudes as amplitudes_of
 
 pytestmark = pytest.mark.slow
@@ -27,14 +34,14 @@ EVERY_FOURTH = slice(0, None, 4)
 @pytest.fixture(scope="module")
 def exact_q():
     """A table of a law without adhesion, its quality factor exactly known."""
-    example = read_table(EXAMPLE)
+    example = example_amplitudes()
     table = simulated(rows(example, EVERY_FOURTH), ImpactLaw(0.95, 0.0), seed=8)
     return dataclasses.replace(table, quality_factor=40.0, quality_factor_error=None)
 
 
 @pytest.fixture(scope="module")
 def law():
-    example = read_table(EXAMPLE)
+    example = example_amplitudes()
     return fit(simulated(rows(example, EVERY_FOURTH), ImpactLaw(0.95, 60.0), seed=8), "law")
 
 

@@ -67,14 +67,14 @@ def hydrodynamic_function(reynolds: Float[np.ndarray, "..."]) -> Complex[np.ndar
     real, imaginary = (
         np.polyval(over[::-1], place) / np.polyval(under[::-1], place) for over, under in (_REAL, _IMAGINARY)
     )
-    return (real + 1j * imaginary) * cylinder
+    return np.asarray((real + 1j * imaginary) * cylinder)
 
 
 def air_at(temperature_k: float, pressure_pa: float = 101325.0) -> tuple[float, float]:
     """Return density (kg/m^3) and viscosity (Pa s, Sutherland's formula) of dry air.
 
     >>> [round(1e6 * x) / 1e6 for x in air_at(293.15)]
-    [1.204105, 1.8e-05]
+    [1.204118, 1.8e-05]
     """
     return pressure_pa / (287.05 * temperature_k), 1.458e-6 * temperature_k**1.5 / (temperature_k + 110.4)
 

@@ -1,6 +1,5 @@
 """Models compared on the same table: information criteria, and in plain words what the measurement can tell."""
 
-import functools
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -100,10 +99,8 @@ def compare(
 
     fits, failed = _attempted(fitted, dict.fromkeys(models))
     errors = np.max([one.strain.model_error for one, _ in fits.values()], axis=0)
-    # the first reason of any model: none of them has one where it is empty
-    reasons = functools.reduce(
-        lambda first, other: np.where(first == "", other, first), (one.strain.reasons for one, _ in fits.values())
-    )
+    # the strings' maximum: any reason rather than none
+    reasons = np.max([one.strain.reasons for one, _ in fits.values()], axis=0)
     judged, lost = _attempted(lambda model: _row(model, *fits[model], Strain(errors, errors, reasons)), fits)
     results = {model: fits[model][1] for model in judged}
     rows = sorted(judged.values(), key=lambda row: row["aic"])

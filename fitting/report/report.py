@@ -180,7 +180,8 @@ def write_report(
     markup = fit_page(result, pictures, comparison=comparison, bootstrap=bootstrap, posterior=posterior)
     write_whole(page, markup)
     others = write_report_files(folder, "fit", text=summary(result), data=result.to_dict(), picture=picture)
-    write_table("fit_rows.csv", row_records(result), ROW_COLUMNS)
+    records = row_records(result)
+    write_table("fit_rows.csv", records, tuple(records[0]))
     write_table("law.csv", law_records(result), LAW_COLUMNS)
     return [page, *others]
 
