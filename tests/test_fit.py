@@ -15,11 +15,7 @@ from fitting.fits.result import FitResult
 from fitting.models import measurement_of
 from fitting.report.report import summary
 from fitting.tables.table import AmplitudeTable
-<<<<<<< HEAD
-from tests.fit_tables import EXAMPLE, amplitudes_and_errors, rows, simulated, values_of, with_amplitudes
-=======
-from tests.fit_tables import amplitudes_and_errors, example_amplitudes, rows, values_of, with_amplitudes
->>>>>>> main
+from tests.fit_tables import amplitudes_and_errors, example_amplitudes, rows, simulated, values_of, with_amplitudes
 from tests.reference_systems import Parameters, single_impact_orbits
 
 
