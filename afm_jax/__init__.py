@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from afm_jax.dynamics.basins import basins_of_attraction
     from afm_jax.dynamics.bifurcations import bifurcation_diagram
     from afm_jax.dynamics.charts import stability_chart
+    from afm_jax.dynamics.contact_orbits import contact_orbits
     from afm_jax.dynamics.continuation import continue_orbits
     from afm_jax.dynamics.exponents import lyapunov_spectrum
     from afm_jax.dynamics.impact_orbits import many_impact_orbits
@@ -66,6 +67,7 @@ else:
         "bifurcation_diagram": "afm_jax.dynamics.bifurcations",
         "capture_speed": "afm_jax.contact.collide",
         "collide": "afm_jax.contact.collide",
+        "contact_orbits": "afm_jax.dynamics.contact_orbits",
         "continue_orbits": "afm_jax.dynamics.continuation",
         "find_junction": "afm_jax.contact.junction",
         "iterate_batch": "afm_jax.impact.map",
@@ -122,6 +124,7 @@ __all__ = [
     "bifurcation_diagram",
     "capture_speed",
     "collide",
+    "contact_orbits",
     "continue_orbits",
     "find_junction",
     "iterate_batch",
