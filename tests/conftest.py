@@ -1,7 +1,9 @@
 """What all tests share: 64-bit floats, strict promotion, and annotations that are checked at run time."""
 
+import ctypes
 import gc
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import coverage
@@ -35,6 +37,22 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     measured = coverage.Coverage.current()
     if measured is not None and hasattr(session.config, "workerinput"):
         measured.save()
+
+
+MOST_BYTES = 4 * 2**30
+"""Of memory that a worker holds when it begins a module; two workers and what they start must fit beside each other."""
+
+
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    """Forget compiled programs between modules once they fill the memory; the cache on disk has them still."""
+    held = Path("/proc/self/statm")
+    if nextitem is None or nextitem.path == item.path or not held.exists():
+        return
+    if int(held.read_text(encoding="ascii").split()[1]) * os.sysconf("SC_PAGE_SIZE") > MOST_BYTES:
+        jax.clear_caches()
+        gc.collect()
+        with suppress(AttributeError):  # glibc alone keeps what was freed, and gives it back when asked
+            ctypes.CDLL(None).malloc_trim(0)
 
 
 SHARED_DATA = Path(__file__).parent.parent.parent / "shared" / "data"
