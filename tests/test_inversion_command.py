@@ -27,7 +27,7 @@ def run(*arguments: object):
 @pytest.fixture(scope="module")
 def reported(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
-    return run("--example", "--json", "--out", folder), folder
+    return run(EXAMPLE, "--json", "--out", folder), folder
 
 
 def test_json_holds_rows_and_laws_near_the_truth(reported):
@@ -171,6 +171,6 @@ def test_a_fitted_law_is_drawn_over_the_rows(tmp_path):
 def test_faulty_truths_are_refused(tmp_path, text, said):
     path = tmp_path / "truth.csv"
     path.write_text(text, encoding="utf-8")
-    result = run("--example", "--truth", path)
+    result = run(EXAMPLE, "--truth", path)
     assert result.exit_code == 2
     assert said in result.stderr

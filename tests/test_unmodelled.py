@@ -1,5 +1,7 @@
 """What a law leaves out: the step against one least-squares problem, and bands on contacts that are not the law."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -134,7 +136,8 @@ def test_residuals_change_with_impacts_as_with_the_parameters_that_change_them()
     moved = values + np.array([[2e-3, 0, 0, 0, 0, 0], [0, 0, 0, 0, 1e-5, 0]])
     above, below = objective.residual(moved), objective.residual(2.0 * values - moved)
     count = found.by_square.shape[0]
-    change = (above - below)[:, : 2 * count].reshape(2, count, 2)
+    kinds = found.by_square.shape[1]
+    change = (above - below)[:, : kinds * count].reshape(2, count, kinds)
     speed = np.asarray(objective.at_values(values[None]).prediction.approach_speed_nm_per_us)[0]
     np.testing.assert_allclose(found.by_square, -change[0] / 4e-3, rtol=1e-4, atol=1e-6)
     # the offset d shortens the delay by d/u
@@ -144,7 +147,7 @@ def test_residuals_change_with_impacts_as_with_the_parameters_that_change_them()
 @pytest.mark.slow
 def test_bands_hold_the_law_of_a_contact_that_is_not_the_models():
     """Precise amplitudes of the full scene: without what the law leaves out, the bands miss half of the speeds."""
-    exact = paper_experiment().exact
+    exact = dataclasses.replace(paper_experiment().exact, phase_deg=None, phase_error_deg=None)
     speeds = np.geomspace(30.0, 200.0, 40)
     truth = paper_collisions(speeds)[0]
     shares, worst, degrees = [], [], []
