@@ -61,6 +61,7 @@ def test_commands_named_exist_with_their_options(page: Path):
 @pytest.mark.slow
 def test_readme_shows_what_its_commands_print(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("COLUMNS", "200")
     (table,) = blocks("csv")
     (tmp_path / "my_amplitudes.csv").write_text(table)
     (tmp_path / "fitting").symlink_to(ROOT / "fitting")
