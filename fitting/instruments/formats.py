@@ -27,7 +27,7 @@ from fitting.instruments.recording import (
     number_in,
     unit_named,
 )
-from fitting.tables.csv_text import NUMBER, TableError, printable
+from fitting.tables.csv_text import NUMBER, TableError, printable, read_bytes
 
 _MOST_ROWS = 10_000_000
 _CURVE = {"approach": "approach", "extend": "approach", "fwd": "approach", "forward": "approach"}
@@ -45,15 +45,7 @@ def read_recording(path: str | Path) -> Recording:
             package that reads it is not installed (the line names the extra).
     """
     name = printable(str(path))
-    try:
-        data = Path(path).read_bytes()
-    except FileNotFoundError:
-        raise TableError(f"{name}: there is no such file; check the path") from None
-    except IsADirectoryError:
-        raise TableError(f"{name}: is a folder; give the path of one file") from None
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise TableError(f"{name}: cannot be read ({reason}); check the path and its permissions") from error
+    data = read_bytes(path, "one file")
     if not data.strip():
         raise TableError(f"{name}: the file is empty; copy it again from the instrument")
     parse = _parser_of(data, str(path))

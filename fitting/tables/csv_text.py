@@ -223,6 +223,28 @@ class Head:
     present: set[str]
 
 
+def read_bytes(path: str | Path, wanted: str) -> bytes:
+    """Return what a file holds.
+
+    Args:
+        path: the file.
+        wanted: what the path is to be of, in words.
+
+    Raises:
+        TableError: if there is no such file, or it cannot be read.
+    """
+    name = printable(str(path))
+    try:
+        return Path(path).read_bytes()
+    except FileNotFoundError:
+        raise TableError(f"{name}: there is no such file; check the path") from None
+    except IsADirectoryError:
+        raise TableError(f"{name}: is a folder; give the path of {wanted}") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or str(error)
+        raise TableError(f"{name}: cannot be read ({reason}); check the path and its permissions") from error
+
+
 def read_text(path: str | Path) -> str:
     """Return the text of a UTF-8 file, with or without a byte order mark, with every line end as a newline.
 
@@ -233,15 +255,7 @@ def read_text(path: str | Path) -> str:
         TableError: if there is no such file, it cannot be read or is not UTF-8 text.
     """
     name = printable(str(path))
-    try:
-        data = Path(path).read_bytes()
-    except FileNotFoundError:
-        raise TableError(f"{name}: there is no such file; check the path") from None
-    except IsADirectoryError:
-        raise TableError(f"{name}: is a folder; give the path of a CSV file") from None
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise TableError(f"{name}: cannot be read ({reason}); check the path and its permissions") from error
+    data = read_bytes(path, "a CSV file")
     data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     try:
         text = data.decode("utf-8-sig")
