@@ -85,7 +85,7 @@ def test_links_lead_somewhere_and_nothing_is_fetched_from_other_machines(site: P
 @pytest.mark.slow
 @needs_browser
 def test_search_works_from_disk(site: Path):
-    from playwright.sync_api import sync_playwright  # noqa: PLC0415
+    sync_playwright = pytest.importorskip("playwright.sync_api").sync_playwright
 
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
@@ -116,7 +116,7 @@ def _wait_for(port: int, seconds: float = 120.0) -> None:
 @needs_browser
 @pytest.mark.skipif(not find_spec("jupyterlab"), reason="no JupyterLab; tests/test_notebooks.py runs the page without")
 def test_sliders_move_the_picture_in_jupyterlab(tmp_path: Path):
-    from playwright.sync_api import sync_playwright  # noqa: PLC0415
+    sync_playwright = pytest.importorskip("playwright.sync_api").sync_playwright
 
     shutil.copy(ROOT / "notebooks" / "sliders.ipynb", tmp_path)
     with socket.create_server(("127.0.0.1", 0)) as free:
