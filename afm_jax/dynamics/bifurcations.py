@@ -118,6 +118,7 @@ def bifurcation_diagram(
     swept, complete = sweeper.run(report)
     order = slice(None) if upward else slice(None, None, -1)
     seen, platform, swept = jax.tree.map(lambda part: part[order], (seen, scenes.platform, swept))
+    seen, platform = jax.tree.map(jnp.asarray, (seen, platform))
     return _sweep_of(seen, platform, swept, ordered, upward=upward, complete=complete)
 
 

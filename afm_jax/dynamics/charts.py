@@ -18,6 +18,8 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import FreeFrame
+from afm_jax.contact.contact import Contact
+from afm_jax.dynamics.contact_orbits import single_contact_orbits
 from afm_jax.dynamics.iteration import Report, SampleDriven, for_few, in_blocks, sample_driven
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem
 from afm_jax.impact.lasting_impact import LawImpact
@@ -36,12 +38,14 @@ class OrbitVerdicts(NamedTuple):
     ``stable``: an orbit that is admissible and stable. ``admissible``: an admissible orbit, stable or not.
     ``peak_amplitude_nm``: of the stable one (the highest, if there are several); NaN where there is none.
     ``largest_multiplier``: how stable that one is: the size of the larger multiplier of the linearised map.
+    ``unresolved``, of contacts only: the closest law has an orbit, but none was found.
     """
 
     stable: Bool[np.ndarray, "orders scenes"]
     admissible: Bool[np.ndarray, "orders scenes"]
     peak_amplitude_nm: Float[np.ndarray, "orders scenes"]
     largest_multiplier: Float[np.ndarray, "orders scenes"]
+    unresolved: Bool[np.ndarray, "orders scenes"] | None = None
 
     def any_stable(self) -> Bool[np.ndarray, " scenes"]:
         """Return where an orbit of any order is stable."""
@@ -60,7 +64,7 @@ def orbit_verdicts(
     Roots are searched for at all scenes; only where there is one its orbit is looked at.
 
     Args:
-        scenes: a batch of scenes with a law: every parameter has shape (scenes,).
+        scenes: a batch of scenes with a law or a contact: every parameter has shape (scenes,).
         first_order: lowest order N.
         last_order: highest order N.
         report: told how many of how many scenes are done.
@@ -69,6 +73,9 @@ def orbit_verdicts(
         RuntimeError: if JAX is not set to 64-bit floats.
     """
     seen = sample_driven(scenes)
+    if isinstance(scenes.interaction, Contact):
+        numbers = single_contact_orbits(seen, range(first_order, last_order + 1), report=report)
+        return OrbitVerdicts(**{name: column.T for name, column in numbers.items()})
     orders = jnp.arange(first_order, last_order + 1, dtype=float)
 
     def work(part: SampleDriven) -> OrbitVerdicts:
@@ -81,7 +88,7 @@ def orbit_verdicts(
         )
 
     found = in_blocks(work, seen, block=_LANES, report=report)
-    return OrbitVerdicts(*(column.T for column in found))
+    return jax.tree.map(np.transpose, found)
 
 
 ORBIT_NUMBERS = (
@@ -234,7 +241,7 @@ def stability_chart(
     last_order: int,
     report: Report | None = None,
 ) -> StabilityChart:
-    """Return which single-impact orbits exist, are stable and coexist over two parameters of a scene with a law.
+    """Return which single-impact orbits exist, are stable and coexist over two parameters of a scene.
 
     Args:
         scene_of: the scene at the two parameters' values; it must allow `vmap` (`parameter_paths.scene_family`).
@@ -245,7 +252,6 @@ def stability_chart(
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
-        TypeError: if the scenes' interaction is not an impact law.
         ValueError: if the scenes do not repeat with one drive period, or there is no order to look for.
     """
     if last_order < 1:
