@@ -224,19 +224,19 @@ def _readings(orbits: list[StickingOrbit], scenes: list[Scene]) -> LoopReading:
         surface, response = surface_of(scene)
         time = orbit.release_phase_rad / drive_of(scene).angular_frequency
         velocity = float(to_lab(surface, response, time, 0.0, 0.0).velocity_nm_per_us)
-        nothing, moves = np.zeros(1), np.array([velocity])
+        nothing, moves = jnp.zeros(1), jnp.asarray([velocity])
         row = LoopReading(
-            phase_rad=np.array([orbit.release_phase_rad]),
+            phase_rad=jnp.asarray([orbit.release_phase_rad]),
             velocity_after_nm_per_us=moves,
             velocity_before_nm_per_us=moves,
             approach_speed_nm_per_us=nothing,
             rebound_speed_nm_per_us=nothing,
             delay_us=nothing,
-            peak_amplitude_nm=np.array(orbit.peak_amplitude_nm),
-            trace=np.zeros(()),
-            determinant=np.zeros(()),
-            admissible=np.ones((), bool),
-            missing=np.zeros(()),
+            peak_amplitude_nm=jnp.asarray(orbit.peak_amplitude_nm),
+            trace=jnp.zeros(()),
+            determinant=jnp.zeros(()),
+            admissible=jnp.ones((), bool),
+            missing=jnp.zeros(()),
         )
-        rows.append(jax.tree.map(jnp.asarray, row))
+        rows.append(row)
     return jax.tree.map(lambda *parts: np.stack([np.asarray(part) for part in parts]), *rows)
