@@ -290,7 +290,9 @@ def _noise(rows: StepRows) -> Float[np.ndarray, "n n"]:
 def _remainders(rows: StepRows, *, tapping: bool) -> Float[np.ndarray, "2 rows m"]:
     """Return the leading remainders of the corrections, of the squared rebound speed and of the delay."""
     u, w, g, j, time = rows.approach, rows.rebound, rows.pull, rows.change, rows.hertz_time
-    slope = max(float(np.polyfit(u, u**2 - w**2, 1)[0]), 0.0)
+    # of the loss by the speed; rows of one speed say nothing of it
+    apart = u - u.mean()
+    slope = max(float(apart @ (u**2 - w**2)) / max(float(apart @ apart), 1e-9), 0.0)
     nothing = np.zeros_like(u)
     # where the lever's own pull is most of it, it hardly changes during the contact: full contacts say so
     by_square = 0.02 if tapping else 5.0
