@@ -4,9 +4,10 @@
 
 Every contact is measured with noise of 0.3, 1 and 3 % and a Q that scatters by its error; the amplitudes are those of
 the full scene (`contact_truths`), kept in the folder. Counted are the approach speeds between 30 and 200 nm/us that
-were measured. `make bands` runs it; the exit status is 1 if less is reached than is `WANTED`. The errors of a law at all
-speeds are two or three numbers, so that the share of one table is mostly 1 and now and then a half: that of a contact
-needs a dozen tables, which leave it a standard error of 0.05.
+were measured. `make bands` runs it; the exit status is 1 if less is reached than is `WANTED`.
+
+The errors of a law at all speeds are two or three numbers, so that the share of one table is mostly 1 and now and then
+a half: that of a contact needs a dozen tables, which leave it a standard error of 0.05.
 """
 
 import argparse
