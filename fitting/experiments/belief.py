@@ -212,6 +212,10 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
     kept = [name not in SHAPE_NAMES for name in payload["parameters"]]
     found = dict(compress(payload["parameters"].items(), kept))
     matrix = [list(compress(row, kept)) for row in compress(payload["correlations"]["matrix"], kept)]
+    # amplitudes are expected of a law without shapes
+    believed = {name: entry["value"] for name, entry in found.items()} | (payload.get("plain_law") or {}).get(
+        "values", {}
+    )
     problem = Problem(payload["model"], tuple(found), tuple(settings.get("effects") or EFFECTS))
     columns = ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")
     notes = []
@@ -222,7 +226,7 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
         notes.append(EXACT_QUALITY_FACTOR)
     return Belief(
         problem=problem,
-        values=checked_values(problem, {name: entry["value"] for name, entry in found.items()}),
+        values=checked_values(problem, believed),
         information=_information(found, matrix),
         free_frequency_khz=float(table["free_frequency_khz"]),
         quality_factor=table.get("quality_factor"),
