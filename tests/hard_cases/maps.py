@@ -11,6 +11,15 @@ from tests.package_scenes import scene_of
 from tests.reference_systems import Parameters
 
 EPS = float(np.finfo(float).eps)
+USUAL = Parameters(
+    frequency_khz=90.0,
+    quality_factor=40.0,
+    amplitude_nm=4.0,
+    drive_frequency_khz=181.8,
+    offset_nm=-1.0,
+    r=0.95,
+    epsilon=60.0,
+)
 both = jax.jit(lambda scene, time, velocity: (next_impact(scene, time, velocity), map_jacobian(scene, time, velocity)))
 
 

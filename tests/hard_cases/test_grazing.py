@@ -8,6 +8,7 @@ velocity), lifted or lowered, and rounded; how deep the dip of the rounded fligh
 with 50 digits.
 """
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -69,7 +70,7 @@ def touching(drive_khz: float, turns: float, flown: float, lift_nm: float) -> To
     offset, velocity = mp.lu_solve(
         mp.matrix([[p11 - 1, p12], [p21, p22]]), mp.matrix([there - p11 * here + lift_nm, fall - p21 * here])
     )
-    p = Parameters(**(vars(made) | {"offset_nm": float(offset)}))
+    p = replace(made, offset_nm=float(offset))
     gap = _Gap(p, start, float(velocity))
     lowest = mp.findroot(lambda t: gap(t, 1), touch)
     return Touch(p, start, float(velocity), lowest, gap(lowest), gap(lowest, 2))
