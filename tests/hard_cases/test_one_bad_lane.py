@@ -1,4 +1,4 @@
-"""A batch with one tip that makes all the trouble: the others come out as without it, and what it costs is bounded.
+"""A batch with one tip that makes all the trouble: the others come out as without it, and what it costs is its own.
 
 Hard: a batch goes on until its last tip is done, and a number that is none in one lane must not reach another.
 
@@ -27,68 +27,52 @@ from afm_jax.motion.simulate import simulate
 pytestmark = pytest.mark.slow
 
 LANES, BAD = 256, 77
-Lanes = Callable[[float | None], Any]
 
 
-def _impacts(trouble: float | None) -> Any:
-    """A tip that leaves the platform at a speed of 1e-9 nm/us and chatters on it, or one that is no number."""
-    scene = Scene(Cantilever(90.0, 40.0), Platform(4.0, 181.8, 3.0), ImpactLaw(r=0.95, epsilon=1e-6))
-    times = np.linspace(0.0, 5.0, LANES)
-    speeds = np.asarray(scene.platform.velocity(times)) + 60.0
-    if trouble is not None:
-        speeds[BAD] += trouble - 60.0
-    return iterate_batch(scene, times, speeds, 20, block=LANES)
+def _impacts(velocity: np.ndarray) -> Any:
+    """Impacts; a tip of -30 nm/us takes to the air a hundred nanometres below rest and is hardly reached again."""
+    offset = np.where(velocity < 0.0, -100.0, -1.0)
+    platform = Platform(4.0 * np.ones(LANES), 181.8 * np.ones(LANES), offset, np.zeros(LANES))
+    scene = Scene(Cantilever(90.0, 1e7), platform, ImpactLaw(r=0.95, epsilon=1.0))
+    return iterate_batch(scene, np.linspace(0.0, 5.0, LANES), np.abs(velocity), 20, block=LANES)
 
 
-def _collisions(trouble: float | None) -> Any:
-    """A tip a billionth above its capture speed, or one that is no number."""
-    speeds = np.linspace(12.0, 200.0, LANES)
-    if trouble is not None:
-        speeds[BAD] = trouble
-    return collide(Contact.paper(), speeds)
+def _collisions(velocity: np.ndarray) -> Any:
+    """Collisions; a tip a billionth above its capture speed is resolved much more finely."""
+    return collide(Contact.paper(), velocity)
 
 
 @jax.jit
 @jax.vmap
-def _moved(velocity):
+def _motions(velocity):
+    """Motions over a contact; a tip that comes at 8 nm/us is held and rings in the junction."""
     scene = Scene(Cantilever(90.0, 40.0), Platform(4.0, 181.8), Contact.paper())
     start = State(jnp.zeros(()), jnp.full((), 9.0), velocity)
     return simulate(scene, start, 12.0, max_contacts=16)
 
 
-def _motions(trouble: float | None) -> Any:
-    """A tip that is held and rings in the junction, or one that is no number."""
-    velocities = np.linspace(80.0, 200.0, LANES)
-    if trouble is not None:
-        velocities[BAD] = trouble
-    return _moved(velocities)
-
-
-def _seconds(work: Lanes, trouble: float | None) -> float:
+def _seconds(work: Callable[[np.ndarray], Any], velocities: np.ndarray) -> float:
     """Return the least of five times."""
     taken = []
     for _ in range(5):
         begin = time.perf_counter()
-        jax.block_until_ready(work(trouble))
+        jax.block_until_ready(work(velocities))
         taken.append(time.perf_counter() - begin)
     return min(taken)
 
 
 @pytest.mark.parametrize(
-    ("work", "trouble", "most"),
-    # measured: 1.2 1.0; 1.4 1.0; 1.8 1.1 times
-    [
-        (_impacts, 1e-9, 4.0),
-        (_impacts, np.nan, 2.0),
-        (_collisions, 10.938450059496711 * (1.0 + 1e-9), 4.0),
-        (_collisions, np.nan, 2.0),
-        (_motions, -8.0, 6.0),
-        (_motions, np.nan, 3.0),
-    ],
+    ("work", "slowest", "trouble"),
+    [(_impacts, 40.0, -30.0), (_collisions, 12.0, 10.938450059496711 * (1.0 + 1e-9)), (_motions, 80.0, -8.0)],
 )
-def test_the_others_are_as_without_it(work: Lanes, trouble: float, most: float):
-    others = np.arange(LANES) != BAD
-    for good, mixed in zip(jax.tree.leaves(work(None)), jax.tree.leaves(work(trouble)), strict=True):
-        if np.ndim(good):
-            np.testing.assert_array_equal(np.asarray(mixed)[others], np.asarray(good)[others])
-    assert _seconds(work, trouble) < most * _seconds(work, None)
+def test_the_others_are_as_without_it_and_wait_for_it_at_most(work, slowest: float, trouble: float):
+    good = np.linspace(slowest, 200.0, LANES)
+    lane = np.arange(LANES) == BAD
+    mixed, alone, spoiled = np.where(lane, trouble, good), np.where(lane, trouble, np.nan), np.where(lane, np.nan, good)
+    for batch in (mixed, spoiled):
+        for ours, right in zip(jax.tree.leaves(work(batch)), jax.tree.leaves(work(good)), strict=True):
+            if np.ndim(right):
+                # gathered with others, a lane is computed in another order
+                np.testing.assert_allclose(np.asarray(ours)[~lane], np.asarray(right)[~lane], rtol=1e-12)
+    # one and the other, and what a busy machine makes of it; it is no product
+    assert _seconds(work, mixed) < 3.0 * (_seconds(work, good) + _seconds(work, alone))
