@@ -94,14 +94,14 @@ def test_a_folder_of_somebody_else_is_not_used(tmp_path: Path, monkeypatch: pyte
 
 
 @linux
-def test_whole_programs_of_a_folder_that_others_may_write_to_are_not_read(tmp_path: Path):
+def test_traced_programs_of_a_folder_that_others_may_write_to_are_not_read(tmp_path: Path):
     surroundings = {"XDG_CACHE_HOME": str(tmp_path), **dict.fromkeys(WITHOUT)}
     folder = Path(python(f"import os\n{START}", **surroundings).split()[1])
-    (folder / "programs").mkdir()
-    (folder / "programs").chmod(0o777)
+    (folder / "traced").mkdir()
+    (folder / "traced").chmod(0o777)
     code = "import sys\nsys.argv = ['afm-jax', 'fit', 'none.csv', '--verbose']\nimport afm_jax.__main__"
     _, said = outputs(code, surroundings, (2,))
-    assert f"whole programs are not kept: {folder}/programs: others may write to the folder" in said
+    assert f"traced programs are not kept: {folder}/traced: others may write to the folder" in said
 
 
 @linux

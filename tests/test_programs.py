@@ -1,4 +1,4 @@
-"""Programs that outlive the process: found again, never the wrong one, and out of the way where none is kept."""
+"""Traced programs that outlive the process: found again, never the wrong one, and out of the way where none is kept."""
 
 import re
 import sys
@@ -133,7 +133,7 @@ def test_a_damaged_file_is_replaced_and_said(folder, damage):
     said: list[str] = []
     assert float(anew(folder, said)(*arguments()).number) == 12.0
     assert len(TRACED) == 2
-    assert "compiled and written" in said[0]
+    assert "traced and written" in said[0]
     assert float(anew(folder)(*arguments()).number) == 12.0
     assert len(TRACED) == 2
 
@@ -189,7 +189,7 @@ def test_fits_find_their_programs_again_and_standard_error_holds_our_own_words_o
     surroundings |= {"JAX_COMPILATION_CACHE_DIR": None, "JAX_ENABLE_COMPILATION_CACHE": None}
     (first, said), (second, said_again) = (outputs(FIT, surroundings) for _ in range(2))
     assert first == second
-    assert len([line for line in said.splitlines() if line.endswith("was not there: compiled and written")]) == 3
+    assert len([line for line in said.splitlines() if line.endswith("was not there: traced and written")]) == 3
     # one line a program and processor with AVX-512 otherwise
     lines = said_again.splitlines()
     assert len(lines) == 2

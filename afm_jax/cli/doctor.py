@@ -17,7 +17,7 @@ from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.compilation_cache import silence_xla
 
-_PACKAGES = ("afm-jax", "jax", "jaxlib", "numpy", "scipy", "equinox", "diffrax", "optimistix")
+_PACKAGES = ("afm-jax", "jax", "jaxlib", "numpy", "scipy", "equinox", "diffrax", "optimistix", "flatbuffers")
 _PROBE = "small_program_of_the_doctor"
 _IMPACTS = 20
 _TIPS = 1000

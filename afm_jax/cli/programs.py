@@ -1,15 +1,13 @@
-"""Whole programs beside JAX's compilation cache: what that has compiled it finds only after tracing and lowering anew.
+"""Traced programs beside JAX's compilation cache: what that has compiled it finds only after tracing anew.
 
-Commands name the few that gain half a second or more by being kept as they are loaded (`serialize_executable`) as well.
-A file is found by all that a program depends on: loaded sources, versions, configuration, devices, shapes and
+Commands name the few that gain half a second or more by being kept traced (`jax.export`, its own serialisation) as
+well. A file is found by all that a trace depends on: loaded sources, versions, configuration, devices, shapes and
 structure. Results are modules and tuples of arrays; arguments that are no arrays have a `repr` that says all of them.
 """
 
 import hashlib
 import json
-import secrets
 import sys
-import zlib
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
 from importlib import import_module
@@ -19,9 +17,8 @@ from typing import Any
 
 import equinox as eqx
 import jax
+from jax import export
 from jax.core import Tracer
-from jax.experimental.serialize_executable import deserialize_and_load, serialize
-from jaxlib.mlir.passmanager import PassManager
 
 from afm_jax.whole_files import write_whole
 
@@ -32,7 +29,7 @@ _PACKAGES = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "line
 
 
 def keep_programs(names: Sequence[str], folder: Path, tell: Callable[[str], None]) -> None:
-    """Let compiled programs of jitted functions, "module:function" each, outlive the process, as files in a folder."""
+    """Let traced programs of jitted functions, "module:function" each, outlive the process, as files in a folder."""
     for module, function in (name.split(":") for name in names):
         setattr(import_module(module), function, _keeping(getattr(sys.modules[module], function), folder, tell))
 
@@ -41,89 +38,52 @@ def _keeping(jitted: Any, folder: Path, tell: Callable[[str], None]) -> Callable
     programs: dict[Any, tuple[Any, Any]] = {}
 
     def kept(*arguments: Any, **named: Any) -> Any:
-        leaves, tree = jax.tree.flatten((arguments, named))
-        arrays = [leaf for leaf in leaves if hasattr(leaf, "dtype")]
+        dynamic, static = eqx.partition((arguments, named), lambda leaf: hasattr(leaf, "dtype"))
+        arrays, tree = jax.tree.flatten(dynamic)
         if any(isinstance(leaf, Tracer) for leaf in arrays):
             return jitted(*arguments, **named)
-        static = tuple(None if hasattr(leaf, "dtype") else leaf for leaf in leaves)
-        call = (tree, static, *((leaf.shape, leaf.dtype) for leaf in arrays))
+
+        def flat(arrays: list[Any]) -> list[Any]:
+            positional, by_name = eqx.combine(jax.tree.unflatten(tree, arrays), static)
+            return jax.tree.leaves(jitted(*positional, **by_name))
+
+        def trace() -> tuple[Any, Any]:
+            return export.export(jax.jit(flat))(arrays), _structure(jax.eval_shape(jitted, *arguments, **named))
+
+        call = (tree, jax.tree.structure(static), *jax.tree.leaves(static), *map(jax.typeof, arrays))
         if call not in programs:
-
-            def flat(arrays: list[Any]) -> Any:
-                given = iter(arrays)
-                both = zip(leaves, static, strict=True)
-                whole = [next(given) if hasattr(leaf, "dtype") else known for leaf, known in both]
-                positional, by_name = jax.tree.unflatten(tree, whole)
-                return jitted(*positional, **by_name)
-
-            path = folder / f"{jitted.__name__}-{_digest(call)}.program"
-            program, structure = _program(path, flat, arrays, tell)
-            found = program(arrays)
-            # the structure is as JSON has it
-            result = _filled(structure, iter(found))
-            programs[call] = program, jax.tree.structure(result)
-            return result
-        program, structure = programs[call]
-        return jax.tree.unflatten(structure, program(arrays))
+            program, structure = _program(folder / f"{jitted.__name__}-{_digest(call)}.program", trace, tell)
+            # at once: a jitted function would compile again where an argument comes from another program
+            kinds = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in arrays]
+            programs[call] = jax.jit(program).lower(kinds).compile(_known_options()), structure
+        return _filled(programs[call][1], iter(programs[call][0](arrays)))
 
     return kept
 
 
 def _digest(call: Any) -> str:
     settings = [getattr(jax.config, option) for option in _CONFIGURATION]
-    said = f"{call} {settings} {jax.devices()} {_versions(_PACKAGES)}".encode()
+    said = f"{call} {settings} {jax.devices()} {[version(name) for name in _PACKAGES]}".encode()
     ours = sorted(name for name in sys.modules if name.startswith(("afm_jax.", "fitting.")))
     files = (getattr(sys.modules[name], "__file__", None) for name in ours)
     sources = b"".join(Path(file).read_bytes() for file in files if file)
     return hashlib.sha256(said + sources).hexdigest()[:32]
 
 
-@cache
-def _versions(packages: tuple[str, ...]) -> list[str]:
-    return [version(name) for name in packages]
-
-
-def _program(
-    path: Path, function: Callable[..., Any], arrays: list[Any], tell: Callable[[str], None]
-) -> tuple[Any, Any]:
-    """Return a program of lists of arrays and the structure of its result, from a file if both are behind their digest.
-
-    Args:
-        path: the file.
-        function: of a list of arrays, traced and compiled where there is no such file.
-        arrays: like those that the program will be called with.
-        tell: told of what is written.
-    """
+def _program(path: Path, trace: Callable[[], tuple[Any, Any]], tell: Callable[[str], None]) -> tuple[Any, Any]:
+    """Return program and structure of its result from a file, where both are behind their digest, or traced anew."""
     kept = path.read_bytes() if path.exists() else b""
     if kept[:32] == hashlib.sha256(kept[32:]).digest():
         structure, _, text = kept[32:].partition(b"\n")
-        known = json.loads(structure)
-        # one device: what a file holds runs on one
-        trees = jax.tree.structure((([0] * len(arrays),), {})), jax.tree.structure([0] * _count(known))
-        return deserialize_and_load(zlib.decompress(text), *trees, execution_devices=jax.devices()[:1]), known
-    found: list[Any] = []
-
-    def flat(arrays: list[Any]) -> list[Any]:
-        result = function(arrays)
-        found.append(_structure(result))
-        return jax.tree.leaves(result)
-
-    # XLA writes half of a program that it has read itself: by this name JAX's cache knows none
-    flat.__name__ = f"{function.__name__}_{secrets.token_hex(8)}"
-    # at once: a jitted function would compile again where an argument comes from another program
-    lowered = jax.jit(flat).lower([jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in arrays])
-    module: Any = lowered.compiler_ir()
-    with module.context:
-        # where an operation comes from is a third of what is read again
-        PassManager.parse("builtin.module(strip-debuginfo)").run(module.operation)
-    program = lowered.compile(_known_options())
-    text = json.dumps(found[0]).encode() + b"\n" + zlib.compress(serialize(program)[0], 1)
+        return export.deserialize(bytearray(text)).call, json.loads(structure)
+    program, structure = trace()
+    text = json.dumps(structure).encode() + b"\n" + program.serialize()
     try:
         write_whole(path, hashlib.sha256(text).digest() + text)
-        tell(f"{path.name} was {'damaged' if kept else 'not there'}: compiled and written")
+        tell(f"{path.name} was {'damaged' if kept else 'not there'}: traced and written")
     except OSError as error:
         tell(f"{path.name} cannot be written: {error.strerror}")
-    return program, found[0]
+    return program.call, structure
 
 
 @cache
@@ -140,13 +100,9 @@ def _structure(value: Any) -> Any:
     if type(value) is tuple:
         return ["builtins", "tuple", {str(place): _structure(part) for place, part in enumerate(value)}]
     if not hasattr(value, "_asdict") and not isinstance(value, eqx.Module):
-        return 0 if hasattr(value, "dtype") else {"static": value}
+        return 0 if isinstance(value, jax.ShapeDtypeStruct) else {"static": value}
     parts = getattr(value, "_asdict", lambda: vars(value))()
     return [type(value).__module__, type(value).__name__, {name: _structure(part) for name, part in parts.items()}]
-
-
-def _count(structure: Any) -> int:
-    return sum(map(_count, structure[2].values())) if isinstance(structure, list) else structure == 0
 
 
 def _filled(structure: Any, leaves: Iterator[Any]) -> Any:

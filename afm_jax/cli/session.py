@@ -117,7 +117,7 @@ class Session:
         """Start JAX with 64-bit floats and its compilation cache; call it before importing the physics.
 
         Args:
-            programs: jitted functions that are kept as they are loaded, "module:function" (see `keep_programs`).
+            programs: jitted functions whose traces are kept as well, "module:function" (see `keep_programs`).
         """
         from afm_jax.cli.compilation import count_programs, start_jax  # noqa: PLC0415
 
@@ -129,10 +129,10 @@ class Session:
             from afm_jax.cli.programs import keep_programs  # noqa: PLC0415
 
             try:
-                make_private(cache.folder / "programs")
-                keep_programs(programs, cache.folder / "programs", self.tell)
+                make_private(cache.folder / "traced")
+                keep_programs(programs, cache.folder / "traced", self.tell)
             except OSError as error:
-                self.tell(f"whole programs are not kept: {error.filename}: {error.strerror}")
+                self.tell(f"traced programs are not kept: {error.filename}: {error.strerror}")
         return cache
 
     def tell(self, message: str) -> None:
