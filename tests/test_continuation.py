@@ -16,6 +16,7 @@ from click.testing import CliRunner, Result
 from scipy.optimize import brentq
 
 from afm_jax import Cantilever, CollisionDelay, ForceDrive, ImpactLaw, Platform, Scene, save_scene
+from afm_jax.cli.fitted_law import with_fitted_law
 from afm_jax.cli.main import main
 from afm_jax.dynamics import continuation
 from afm_jax.dynamics.bands import UncertainParameters, drawn_points, special_errors
@@ -357,6 +358,17 @@ def test_the_law_of_a_fit_gives_intervals(tmp_path: Path):
     assert captured["parameter_error"] == pytest.approx(error, rel=1e-5)
     assert np.diff(captured["interval95"]) == pytest.approx([3.92 * error], rel=1e-4)
     assert all(point["peak_amplitude_error_nm"] > 0.0 for point in answer["points"])
+
+
+@pytest.mark.slow
+def test_a_scene_takes_the_plain_law_of_a_fit(tmp_path: Path):
+    plain = {"values": {"r": 0.94, "epsilon": 70.0}, "covariance": [[1e-6, 1e-4], [1e-4, 4.0]]}
+    made, known = with_fitted_law(scene(), Path(fit_file(tmp_path / "fit.json", plain_law=plain)))
+    assert isinstance(made.interaction, ImpactLaw)
+    assert (float(made.interaction.r), float(made.interaction.epsilon)) == (0.94, 70.0)
+    assert known.paths == ("interaction.r", "interaction.epsilon")
+    assert known.values.tolist() == [0.94, 70.0]
+    assert known.covariance.tolist() == plain["covariance"]
 
 
 @pytest.mark.slow

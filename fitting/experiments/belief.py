@@ -207,11 +207,17 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
     """
     payload = result.to_dict() if isinstance(result, FitResult) else result
     _check_payload(payload)
-    table, settings = payload["input"], payload.get("settings") or {}
+    settings, tables = payload.get("settings") or {}, payload["input"].get("tables") or [payload["input"]]
+    # of several tables the first one's cantilever is designed with
+    table, driven = tables[0], [one for one in tables if one.get("drive", "sample") == "sample"]
     # the shapes of loss and delay are known beforehand, not to be determined: what they do to the others stays
     kept = [name not in SHAPE_NAMES for name in payload["parameters"]]
     found = dict(compress(payload["parameters"].items(), kept))
     matrix = [list(compress(row, kept)) for row in compress(payload["correlations"]["matrix"], kept)]
+    # amplitudes are expected of a law without shapes
+    believed = {name: entry["value"] for name, entry in found.items()} | (payload.get("plain_law") or {}).get(
+        "values", {}
+    )
     problem = Problem(payload["model"], tuple(found), tuple(settings.get("effects") or EFFECTS))
     columns = ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")
     notes = []
@@ -222,7 +228,7 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
         notes.append(EXACT_QUALITY_FACTOR)
     return Belief(
         problem=problem,
-        values=checked_values(problem, {name: entry["value"] for name, entry in found.items()}),
+        values=checked_values(problem, believed),
         information=_information(found, matrix),
         free_frequency_khz=float(table["free_frequency_khz"]),
         quality_factor=table.get("quality_factor"),
@@ -234,7 +240,7 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
             for name, entry in found.items()
             if entry.get("constraint")
         },
-        measured=np.array([table[name] for name in columns], float).T,
+        measured=np.array([[place for one in driven for place in one[name]] for name in columns], float).T,
         source=f"fit of {table.get('source', 'a table')}",
         notes=tuple(notes),
     )

@@ -44,7 +44,7 @@ from fitting.fits.minimum import (
     untabulated,
 )
 from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective
-from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows, FittedTable, Scatter
+from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows, FittedTable, PlainLaw, Scatter
 from fitting.fits.several import Between, Pull, departures_of, parts_of, pulls_of, scatter_between, student_factor
 from fitting.fits.unmodelled import (
     LawAfter,
@@ -53,6 +53,7 @@ from fitting.fits.unmodelled import (
     StepSystem,
     Unmodelled,
     law_after,
+    plain_law,
     root_of,
     rows_of_fit,
     step_of,
@@ -119,12 +120,9 @@ def law_at(
     after: tuple[LinearStep, Unmodelled] | None = None,
 ) -> LawAfter:
     """Return the law at approach speeds in nm/us; the other arguments as of `law_with_band`."""
-    impact, slopes = impact_at(values, measurement, problem)
-    law, slope = jax.tree.map(np.asarray, law_and_slope(impact, slopes, speeds))
-    count = speeds.size
-    before = LawBefore(law[:, :count], slope[:, :count], float(law[0, count]), slope[0, count])
+    before = law_before(problem, measurement, values, speeds)
     if not np.all(np.isfinite(covariance)) or after is None:
-        root = root_of(covariance)[: slope.shape[2]]
+        root = root_of(covariance)[: before.slope.shape[2]]
         found = LawAfter(before.law, before.slope @ root, before.capture, before.capture_slope @ root)
         if after is None:
             return found
@@ -132,6 +130,16 @@ def law_at(
         moved = law_after(*after, speeds, before)
         return LawAfter(moved.law, unknown[0], moved.capture, unknown[1])
     return law_after(*after, speeds, before)
+
+
+def law_before(
+    problem: Problem, measurement: Measurement, values: Float[np.ndarray, " p"], speeds: Float[np.ndarray, " n"]
+) -> LawBefore:
+    """Return the law of fitted values at approach speeds in nm/us; the other arguments as of `law_with_band`."""
+    impact, slopes = impact_at(values, measurement, problem)
+    law, slope = jax.tree.map(np.asarray, law_and_slope(impact, slopes, speeds))
+    count = speeds.size
+    return LawBefore(law[:, :count], slope[:, :count], float(law[0, count]), slope[0, count])
 
 
 def loss_of(
@@ -390,6 +398,7 @@ class _Summary:
                 self.after,
             ),
             loss=self._loss(shown_covariance),
+            plain_law=self._plain_law() if explained else None,
             rows=rows,
             residual_autocorrelation=evidence.autocorrelation,
             convergence=self.convergence,
@@ -452,6 +461,20 @@ class _Summary:
 
         asked = self.settings.get("speeds")
         return loss_of(found, speed_range(self.used_speeds), asked, float(measurement.cantilever.mass_ng))
+
+    def _plain_law(self) -> PlainLaw | None:
+        """Return what scenes and designs take for the law; None where that is what was fitted."""
+        if self.after is None or self.problem.model == "contact" or not self.problem.lasting:
+            return None
+        speeds = np.geomspace(*speed_range(self.used_speeds), _POINTS)
+        before = law_before(self.problem, self.objective.measurement, self.values, speeds)
+        found = plain_law(*self.after, speeds, before, self.values, self.free)
+        if found is None:
+            return None
+        # what one of several tables has to itself belongs to its instrument
+        kept = [i for i, name in enumerate(found.values) if not is_of_one_table(name)]
+        values = {name: value for name, value in found.values.items() if not is_of_one_table(name)}
+        return PlainLaw(values, found.covariance[np.ix_(kept, kept)])
 
     def _explained_parameters(self, moved: Bool[np.ndarray, " k"]) -> dict[str, FittedParameter]:
         """Return the parameters with their errors and, where all are determined, their intervals."""

@@ -63,6 +63,21 @@ class FittedLaw:
 
 
 @dataclass(frozen=True)
+class PlainLaw:
+    """The law of a model's parameters alone that comes closest to a fitted one over the measured speeds.
+
+    A fit's own law has besides what its model leaves out (the numbers of its shapes, smooth parts); a scene's has not.
+
+    Attributes:
+        values: of the parameters, and of the nuisances as fitted, by name.
+        covariance: of these, with all that the model leaves out; 0 for one that is held at its bound.
+    """
+
+    values: dict[str, float]
+    covariance: Float[np.ndarray, "p p"]
+
+
+@dataclass(frozen=True)
 class FittedRows:
     """The rows of the table beside their prediction; NaN where nothing was measured or predicted.
 
@@ -155,6 +170,8 @@ class FitResult:
         warnings: what a reader should know besides.
         law: the fitted impact law with its band.
         loss: what an impact takes: energies, the paper's r and delta, the capture speed; None if no speed was reached.
+        plain_law: what scenes and designs take for the law; None where the parameters themselves are that, or are not
+            determined.
         rows: measured and predicted amplitudes.
         residual_autocorrelation: lag-1 correlation of neighbouring rows' residuals.
         convergence: what the checks of the minimum found.
@@ -187,6 +204,7 @@ class FitResult:
     loss: Loss | None = None
     tables: tuple[FittedTable, ...] = ()
     scatter: dict[str, Scatter] = field(default_factory=dict)
+    plain_law: PlainLaw | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain lists, numbers and strings; what is not known is None."""
@@ -207,6 +225,7 @@ class FitResult:
             "residual_autocorrelation": plain(self.residual_autocorrelation),
             "law": {name: plain(column) for name, column in vars(self.law).items()},
             "loss": None if self.loss is None else plain(asdict(self.loss)),
+            "plain_law": None if self.plain_law is None else plain(asdict(self.plain_law)),
             "rows": {name: plain(column) for name, column in vars(self.rows).items()},
             "convergence": plain(asdict(self.convergence)),
             "input": plain({"tables": [*map(vars, self.table.tables)]} if self.tables else vars(self.table)),

@@ -24,6 +24,7 @@ from scipy.linalg import cho_factor, cho_solve, solve_triangular
 from fitting.fits.least_squares import covariance_of
 from fitting.fits.minimum import Strain, padding
 from fitting.fits.objective import ROBUST, Objective
+from fitting.fits.result import PlainLaw
 from fitting.forward import ImpactSlopes, free_impacts, impact_at, impact_slopes
 from fitting.models import Problem
 from fitting.parameters import DELAY_SHAPE, LOSS_SHAPE, parameter_called
@@ -322,7 +323,9 @@ def _noise(rows: StepRows) -> Float[np.ndarray, "n n"]:
 def _remainders(rows: StepRows, *, tapping: bool) -> Float[np.ndarray, "2 rows m"]:
     """Return the leading remainders of the corrections, of the squared rebound speed and of the delay."""
     u, w, g, j, time = rows.approach, rows.rebound, rows.pull, rows.change, rows.hertz_time
-    slope = max(float(np.polyfit(u, u**2 - w**2, 1)[0]), 0.0)
+    # of the loss by the speed; rows of one speed say nothing of it
+    apart = u - u.mean()
+    slope = max(float(apart @ (u**2 - w**2)) / max(float(apart @ apart), 1e-9), 0.0)
     nothing = np.zeros_like(u)
     # where the lever's own pull is most of it, it hardly changes during the contact: full contacts say so
     by_square = 0.02 if tapping else 5.0
@@ -428,6 +431,48 @@ def law_after(step: LinearStep, left_out: Unmodelled, speeds: Float[np.ndarray, 
     shift, capture_factor = _moved(step, before.capture_slope[None, None], at_capture)
     capture = max(before.capture + float(shift[0, 0]), 0.0)
     return whole._replace(capture=capture, capture_factor=capture_factor[0, 0])
+
+
+def plain_law(
+    step: LinearStep,
+    left_out: Unmodelled,
+    speeds: Float[np.ndarray, " n"],
+    before: LawBefore,
+    begin: Float[np.ndarray, " p"],
+    free: Bool[np.ndarray, " p"],
+) -> PlainLaw | None:
+    """Return the parameters of the closest law without what is left out, the band's widths being its errors.
+
+    Args:
+        step: the step.
+        left_out: by the fitted model.
+        speeds: approach speeds in nm/us over which it is the closest.
+        before: the fitted law there.
+        begin: the fitted values.
+        free: which of these are not at their bound.
+
+    Returns:
+        None where the parameters are not determined.
+    """
+    after, names = law_after(step, left_out, speeds, before), left_out.problem.names
+    if not (np.isfinite(step.covariance).all() and np.isfinite(after.factor).all()):
+        return None
+    weight = 1.0 / np.maximum(np.linalg.norm(after.factor, axis=2), 1e-300)
+    own = np.array([name in left_out.problem.own for name in names])
+    slope = (weight[..., None] * before.slope)[:, before.law[0] > 0.0].reshape(-1, len(names))
+    missing, factor = (
+        (weight[:, :, None] * part.reshape(*weight.shape, -1))[:, before.law[0] > 0.0].reshape(len(slope), -1)
+        for part in (before.law - after.law, after.factor)
+    )
+    ends = np.array([(p.lowest, p.highest) for p in map(parameter_called, names)])
+    moving = own & free
+    change = _bounded(missing[:, 0], slope, begin, ends, moving)
+    spread = np.zeros((len(names), factor.shape[1]))
+    spread[:, : len(step.names)] = root_of(step.covariance)[: len(names)]
+    spread[own] = 0.0
+    spread[moving] = np.linalg.lstsq(slope[:, moving], factor, rcond=None)[0]
+    values = np.where(own, begin + change, step.values[: len(names)])
+    return PlainLaw(dict(zip(names, values.tolist(), strict=True)), spread @ spread.T)
 
 
 def _moved(
