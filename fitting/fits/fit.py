@@ -45,7 +45,7 @@ from fitting.fits.minimum import (
 )
 from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective
 from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows, FittedTable, PlainLaw, Scatter
-from fitting.fits.several import Between, Pull, departures_of, parts_of, pulls_of, scatter_between, student_factor
+from fitting.fits.several import Between, Pull, departures_of, parts_of, pulls_of, scatter_between
 from fitting.fits.unmodelled import (
     LawAfter,
     LawBefore,
@@ -293,35 +293,35 @@ class _Summary:
         left_out = Unmodelled(self.problem, values, speed_range(self.used_speeds), mass)
         if joint is None:
             return step_of(rows, left_out, self.free), left_out
-        departing, factor = self._tables_compared(system_of(rows, left_out), joint, scattering=scattering)
-        if not self.problem.lasting and departing is None:
+        departing = self._tables_compared(system_of(rows, left_out), joint, scattering=scattering)
+        if not (self.problem.lasting or departing):
             return None
-        step = step_of(rows, left_out, self.free, departing)
-        return step._replace(covariance=step.covariance * factor**2), left_out
+        step, *cautious = (step_of(rows, left_out, self.free, one) for one in departing or [None])
+        return step._replace(covariance=(*cautious, step)[0].covariance), left_out
 
     def _tables_compared(
         self, system: StepSystem, joint: Joint, *, scattering: bool
-    ) -> tuple[Float[np.ndarray, "readings m"] | None, float]:
-        """Note the tables' pulls and scatter; return the departures of their laws and by how much errors grow.
+    ) -> list[Float[np.ndarray, "readings m"]]:
+        """Note the tables' pulls and scatter; return what departures of their laws do, most likely and cautious ones.
 
-        Without scatter there are no departures.
+        There are none without scatter.
         """
         table: Any = self.searching.measurement.rows.table
         free = np.append(self.free, np.ones(system.jacobian.shape[1] - self.free.size, dtype=bool))
-        own, tables = len(self.problem.own), len(joint.drives)
-        parts, departing, factor = parts_of(system, table, joint.place, free, own), None, 1.0
+        own, departing = len(self.problem.own), []
+        parts = parts_of(system, table, joint.place, free, own)
         if scattering:
             unit = departures_of(system, table, parts.law, np.ones(parts.law.size))
             between = scatter_between(parts_of(system, table, joint.place, free, own, unit))
             if np.isfinite(between.value).all():
-                departing = departures_of(system, table, parts.law, between.value)
-                alike, parts = parts, parts_of(system, table, joint.place, free, own, departing)
-                covariance, change = parts.solved()
-                factor = student_factor(covariance, alike.solved()[0], tables)
-                departures = change[-departing.shape[1] :].reshape(tables, -1) * between.value
-                self.between = between, departures
+                departing = [
+                    departures_of(system, table, parts.law, size) for size in (between.value, between.cautious)
+                ]
+                parts = parts_of(system, table, joint.place, free, own, departing[0])
+                departed = parts.solved()[1][-departing[0].shape[1] :].reshape(len(joint.drives), -1)
+                self.between = between, departed * between.value
         self.pulls = pulls_of(parts)
-        return departing, factor
+        return departing
 
     def _take(self, step: LinearStep, left_out: Unmodelled) -> None:
         """Go on with values, errors and residuals after the step."""
@@ -420,7 +420,7 @@ class _Summary:
         found = self.between[0]
         return {
             name: Scatter(float(value), (float(low), _or_none(high)), parameter_called(name).unit)
-            for name, value, low, high in zip(self._free_own, *found, strict=True)
+            for name, value, low, high in zip(self._free_own, *found[:3], strict=True)
         }
 
     def _fitted_tables(self, parameters: dict[str, FittedParameter]) -> tuple[FittedTable, ...]:

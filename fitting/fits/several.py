@@ -9,19 +9,18 @@ maximise the restricted likelihood (REML): that of the residuals after all param
 Thompson 1971).
 """
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import brentq, minimize
-from scipy.special import chdtrc, ndtri, stdtrit
+from scipy.special import chdtrc, ndtri
 
-from afm_jax.units import TWO_SIDED_95
 from fitting.fits.intervals import CHI2_95
 from fitting.fits.least_squares import covariance_of
 from fitting.fits.unmodelled import StepSystem
 
-_SURE = 0.975
 _LEAST_SHARE = 1e-9
 """Variance that a table takes from a direction of the law, over the variance there, below which it says nothing."""
 
@@ -186,11 +185,20 @@ def pulls_of(parts: Parts) -> list[Pull]:
 
 
 class Between(NamedTuple):
-    """The scatter of each free parameter of the law between tables, and its 95 % interval; an open end is infinite."""
+    """The scatter of each free parameter of the law between tables.
+
+    Attributes:
+        value: which has the largest restricted likelihood.
+        low: lower end of the 95 % interval.
+        high: its upper end, infinite where it is open.
+        cautious: with which errors are stated: a standard error larger. A few tables alone say how much they scatter,
+            and with the most likely scatter intervals of the mean hold it in 88 to 91 % of sets of four or eight.
+    """
 
     value: Float[np.ndarray, " l"]
     low: Float[np.ndarray, " l"]
     high: Float[np.ndarray, " l"]
+    cautious: Float[np.ndarray, " l"]
 
 
 _FIRST = 0.3, 1.0, 3.0
@@ -209,7 +217,7 @@ def scatter_between(parts: Parts) -> Between:
     first = matrix.shape[0] - count * tables
     unit = np.sqrt(np.diag(covariance_of(matrix[:first, :first]))[parts.law] * tables)
     if not np.all(np.isfinite(unit)):
-        return Between(*np.full((3, count), np.nan))
+        return Between(*np.full((4, count), np.nan))
     # all but the departures are integrated out once and for all
     scale = np.append(1.0 / np.sqrt(np.maximum(np.diag(matrix)[:first], 1e-300)), np.tile(unit, tables))
     matrix = matrix * np.outer(scale, scale) - np.diag(np.append(np.zeros(first), np.tile(unit**2, tables)))
@@ -239,33 +247,26 @@ def scatter_between(parts: Parts) -> Between:
         return float(found.fun), found.x
 
     least, best = min((lowest(np.full(count, start), {}) for start in _FIRST), key=lambda found: found[0])
-    low, high = np.zeros(count), np.full(count, np.inf)
+    ends = np.zeros((3, count))
     for i in range(count):
 
-        def above(value: float, i: int = i) -> float:
-            return lowest(best, {i: value})[0] - least - CHI2_95
+        def rise(value: float, i: int = i) -> float:
+            return lowest(best, {i: value})[0] - least
 
-        far = max(2.0 * best[i], 1.0)
+        ends[0, i] = _crossing(lambda value: rise(value) - CHI2_95, best[i], 0.0) if best[i] > 0.0 else 0.0
+        ends[1, i] = _crossing(lambda value: rise(value) - CHI2_95, best[i], np.inf)
+        ends[2, i] = _crossing(lambda value: rise(value) - 1.0, best[i], np.inf)
+    ends[2] = np.where(np.isfinite(ends[2]), ends[2], best)
+    return Between(best * unit, *(ends * unit))
+
+
+def _crossing(above: Callable[[float], float], inside: float, last: float) -> float:
+    """Return where a function becomes positive between a place where it is not and the last one, or that."""
+    far = last
+    if last > inside:
+        far = max(2.0 * inside, 1.0)
         while far < _LARGEST and above(far) < 0.0:
             far *= 2.0
-        if far < _LARGEST:
-            high[i] = float(brentq(above, best[i], far, xtol=1e-4))  # pyright: ignore[reportArgumentType]
-        if best[i] > 0.0 and above(0.0) > 0.0:
-            low[i] = float(brentq(above, 0.0, best[i], xtol=1e-4))  # pyright: ignore[reportArgumentType]
-    return Between(best * unit, low * unit, high * unit)
-
-
-def student_factor(with_scatter: Float[np.ndarray, "l l"], without: Float[np.ndarray, "l l"], tables: int) -> float:
-    """Return by how much errors grow because a few tables alone say how much they scatter.
-
-    The part of a variance that is the scatter's has a degree of freedom less than there are tables; the whole, by
-    Satterthwaite, as many more as the part is smaller. The least of all parameters counts.
-
-    Args:
-        with_scatter: covariance of the law's parameters.
-        without: the same without scatter.
-        tables: how many.
-    """
-    share = 1.0 - np.diag(without) / np.diag(with_scatter)
-    largest = float(np.clip(np.max(share, initial=0.0), 1e-6, 1.0))
-    return float(stdtrit((tables - 1) / largest**2, _SURE)) / TWO_SIDED_95
+    if far >= _LARGEST or above(far) < 0.0:
+        return last
+    return float(brentq(above, inside, far, xtol=1e-4))  # pyright: ignore[reportArgumentType]
