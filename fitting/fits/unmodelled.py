@@ -27,7 +27,7 @@ from fitting.fits.objective import ROBUST, Objective
 from fitting.fits.result import PlainLaw
 from fitting.forward import ImpactSlopes, free_impacts, impact_at, impact_slopes
 from fitting.models import Problem
-from fitting.parameters import DELAY_SHAPE, LOSS_SHAPE, PARAMETERS
+from fitting.parameters import DELAY_SHAPE, LOSS_SHAPE, parameter_called
 
 LOSS_SPEED_SQUARED = 110.0, 60.0
 """q in nm^2/us^2 of a tip of 1 ng and its standard error: free fits of contacts' laws give 96 to 125, a wet one 234."""
@@ -106,6 +106,8 @@ class Unmodelled:
     def priors(self) -> dict[str, tuple[float, float]]:
         """Mean and standard error of the shapes' numbers, by name; only those that the model has use for."""
         priors = {}
+        if not self.problem.lasting:
+            return priors
         if "viscous_loss" in self.values:
             mean, error = LOSS_SPEED_SQUARED
             priors[LOSS_SHAPE] = mean / self.mass_ng, error / self.mass_ng
@@ -133,7 +135,7 @@ class Unmodelled:
 
     def _unknown(self, u: Float[np.ndarray, " n"], w: Float[np.ndarray, " n"]):
         """Return columns of the squared speed and of the delay, for unknowns of unit variance."""
-        if self.problem.model == "contact":
+        if self.problem.model == "contact" or not self.problem.lasting:
             return [], []
         middle = float(np.sqrt(self.speeds[0] * self.speeds[1]))
         loss = self.values.get("epsilon", 0.0) + self.values.get("viscous_loss", 0.0) * middle
@@ -189,16 +191,25 @@ class LinearStep(NamedTuple):
     follow: Float[np.ndarray, "m k"]
 
 
-def step_of(rows: StepRows, left_out: Unmodelled, free: Bool[np.ndarray, " p"]) -> LinearStep:
-    """Return where one linear step leads from a fit, with all that is left out.
+class StepSystem(NamedTuple):
+    """A fit's rows, linearised, with all that is left out.
 
-    Args:
-        rows: of the fit.
-        left_out: by the fitted model.
-        free: which of its parameters are not at their bound.
+    Attributes:
+        residual: of the readings, then of what else there is, the shapes' priors last.
+        jacobian: by the parameters, then by the shapes.
+        unknown: how the readings' residuals change with unknowns of unit variance.
+        noise: covariance of the readings' residuals, of each row by itself.
     """
+
+    residual: Float[np.ndarray, " n"]
+    jacobian: Float[np.ndarray, "n k"]
+    unknown: Float[np.ndarray, "readings m"]
+    noise: Float[np.ndarray, "readings readings"]
+
+
+def system_of(rows: StepRows, left_out: Unmodelled) -> StepSystem:
+    """Return the rows of a fit, linearised, with what its model leaves out."""
     size, names = rows.measurement_error.size, left_out.problem.names
-    values = np.array([left_out.values[name] for name in names])
     columns = left_out.columns(rows.approach, rows.rebound)
     slopes = np.stack([rows.slopes.by_square, rows.slopes.by_delay])
 
@@ -206,7 +217,7 @@ def step_of(rows: StepRows, left_out: Unmodelled, free: Bool[np.ndarray, " p"]) 
         """Return changes of the amplitudes' residuals that changes of the impacts make."""
         return np.einsum("krc,kr...->rc...", slopes, change).reshape(size, *change.shape[2:])
 
-    known, priors = len(values), left_out.priors
+    known, priors = len(names), left_out.priors
     residual = rows.residual.copy()
     residual[:size] += amplitudes(columns.known)
     jacobian = np.zeros((residual.size + len(priors), known + len(priors)))
@@ -216,10 +227,32 @@ def step_of(rows: StepRows, left_out: Unmodelled, free: Bool[np.ndarray, " p"]) 
     jacobian[:size, known:] = amplitudes(columns.shape)
     jacobian[residual.size :, known:] = np.diag([1.0 / error for _, error in priors.values()])
     residual = np.append(residual, np.zeros(len(priors)))
-    unknown = np.concatenate(
-        [amplitudes(columns.unknown), amplitudes(_remainders(rows, tapping=left_out.problem.tapping))], axis=1
-    )
-    variance = _noise(rows) + unknown @ unknown.T
+    unknown = [amplitudes(columns.unknown)]
+    if left_out.problem.lasting:
+        unknown.append(amplitudes(_remainders(rows, tapping=left_out.problem.tapping)))
+    return StepSystem(residual, jacobian, np.concatenate(unknown, axis=1), _noise(rows))
+
+
+def step_of(
+    rows: StepRows,
+    left_out: Unmodelled,
+    free: Bool[np.ndarray, " p"],
+    more: Float[np.ndarray, "readings m"] | None = None,
+) -> LinearStep:
+    """Return where one linear step leads from a fit, with all that is left out.
+
+    Args:
+        rows: of the fit.
+        left_out: by the fitted model.
+        free: which of its parameters are not at their bound.
+        more: how the readings' residuals change with further unknowns of unit variance, which the law does not have.
+    """
+    size, names, priors = rows.measurement_error.size, left_out.problem.names, left_out.priors
+    values = np.array([left_out.values[name] for name in names])
+    residual, jacobian, unknown, noise = system_of(rows, left_out)
+    if more is not None:
+        unknown = np.concatenate([unknown, more], axis=1)
+    variance = noise + unknown @ unknown.T
     root = np.linalg.cholesky(variance)
 
     def whitened(matrix):
@@ -233,7 +266,7 @@ def step_of(rows: StepRows, left_out: Unmodelled, free: Bool[np.ndarray, " p"]) 
     held = np.flatnonzero(~moving)
     covariance[held, held] = full[held, held]
     begin = np.append(values, [mean for mean, _ in priors.values()])
-    ends = np.array([(PARAMETERS[name].lowest, PARAMETERS[name].highest) for name in (*names, *priors)])
+    ends = np.array([(p.lowest, p.highest) for p in map(parameter_called, (*names, *priors))])
     change = _bounded(white, slope, begin, ends, moving & np.isfinite(np.diag(covariance)))
     left = residual + jacobian @ change
     factor = cho_factor(variance, lower=True)
@@ -431,7 +464,7 @@ def plain_law(
         (weight[:, :, None] * part.reshape(*weight.shape, -1))[:, before.law[0] > 0.0].reshape(len(slope), -1)
         for part in (before.law - after.law, after.factor)
     )
-    ends = np.array([(PARAMETERS[name].lowest, PARAMETERS[name].highest) for name in names])
+    ends = np.array([(p.lowest, p.highest) for p in map(parameter_called, names)])
     moving = own & free
     change = _bounded(missing[:, 0], slope, begin, ends, moving)
     spread = np.zeros((len(names), factor.shape[1]))
