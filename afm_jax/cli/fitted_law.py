@@ -54,7 +54,8 @@ def with_fitted_law(scene: "Scene", path: Path) -> "tuple[Scene, UncertainParame
     correlations = np.array(payload["correlations"]["matrix"], float)[np.ix_(places, places)]
     covariance = correlations * np.outer(errors, errors)
     if plain is not None:
-        covariance = np.array(plain["covariance"], float)[np.ix_(places, places)]
+        places_there = [list(plain["values"]).index(name) for name in names]
+        covariance = np.array(plain["covariance"], float)[np.ix_(places_there, places_there)]
     made = eqx.tree_at(lambda parts: parts.interaction, scene, law, is_leaf=lambda part: part is None)
     if "quality_factor" in names:
         made = eqx.tree_at(lambda parts: parts.cantilever, made, problem.cantilever(everything, scene.cantilever))
