@@ -229,11 +229,17 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
     """
     payload = result.to_dict() if isinstance(result, FitResult) else result
     _check_payload(payload)
-    table, settings = payload["input"], payload.get("settings") or {}
+    settings, tables = payload.get("settings") or {}, payload["input"].get("tables") or [payload["input"]]
+    # of several tables the first one's cantilever is designed with
+    table, driven = tables[0], [one for one in tables if one.get("drive", "sample") == "sample"]
     # the shapes of loss and delay are known beforehand, not to be determined: what they do to the others stays
     kept = [name not in SHAPE_NAMES for name in payload["parameters"]]
     found = dict(compress(payload["parameters"].items(), kept))
     matrix = [list(compress(row, kept)) for row in compress(payload["correlations"]["matrix"], kept)]
+    # amplitudes are expected of a law without shapes
+    believed = {name: entry["value"] for name, entry in found.items()} | (payload.get("plain_law") or {}).get(
+        "values", {}
+    )
     problem = Problem(payload["model"], tuple(found), tuple(settings.get("effects") or EFFECTS))
     notes = []
     if not payload["valid"]:
@@ -243,7 +249,7 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
         notes.append(EXACT_QUALITY_FACTOR)
     return Belief(
         problem=problem,
-        values=checked_values(problem, {name: entry["value"] for name, entry in found.items()}),
+        values=checked_values(problem, believed),
         information=_information(found, matrix),
         free_frequency_khz=float(table["free_frequency_khz"]),
         quality_factor=table.get("quality_factor"),
@@ -255,7 +261,7 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
             for name, entry in found.items()
             if entry.get("constraint")
         },
-        measured=np.array([table[name] for name in _COLUMNS], float).T,
+        measured=np.array([[place for one in driven for place in one[name]] for name in _COLUMNS], float).T,
         source=f"fit of {table.get('source', 'a table')}",
         notes=tuple(notes),
     )
@@ -299,9 +305,11 @@ def _is_whole(payload: Mapping[str, Any]) -> bool:
     try:
         entries = [(entry["value"], entry["standard_error"] or 0.0) for entry in payload["parameters"].values()]
         matrix = [[np.nan if c is None else c for c in row] for row in payload["correlations"]["matrix"]]
-        columns = [payload["input"][name] for name in _COLUMNS]
-        drives = np.array([column for column in columns if column is not None], float)
-        whole = np.isfinite(np.array(entries, float)).all() and math.isfinite(payload["input"]["free_frequency_khz"])
-        return bool(whole) and drives.ndim == 2 and np.array(matrix, float).shape == (len(entries), len(entries))
+        tables = payload["input"].get("tables") or [payload["input"]]
+        columns = [[column for name in _COLUMNS if (column := table[name]) is not None] for table in tables]
+        drives = all(np.array(of_one, float).ndim == 2 for of_one in columns)
+        whole = np.isfinite([number for entry in entries for number in entry]).all()
+        known = all(math.isfinite(table["free_frequency_khz"]) for table in tables)
+        return bool(whole) and known and drives and np.array(matrix, float).shape == (len(entries), len(entries))
     except (AttributeError, KeyError, TypeError, ValueError):
         return False
