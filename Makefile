@@ -72,9 +72,9 @@ fuzz: $(SETUP) ## random work, seeded; FUZZ='--flights 1000000 --orbits 100000 -
 bands: $(SETUP) ## do the 95 % bands hold the laws of ten random contacts? (twenty minutes; the truths are kept in /tmp)
 	$(BIN)/python -m tests.coverage_of_bands
 
-KILLS ?= --times 20
+KILLS ?= --times 50
 
-kills: $(SETUP) ## a sweep killed at twenty random times and resumed ends in the bytes of one that was not
+kills: $(SETUP) ## a sweep killed at fifty random times and resumed ends in the bytes of one that was not
 	$(BIN)/python -m tests.kills $(KILLS)
 
 check: lint types test slow docs ## all that CI runs: format, lint, types, tests, slow tests, notebooks, site
