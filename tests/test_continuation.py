@@ -18,7 +18,7 @@ from scipy.optimize import brentq
 from afm_jax import Cantilever, CollisionDelay, ForceDrive, ImpactLaw, Platform, Scene, save_scene
 from afm_jax.cli.fitted_law import with_fitted_law
 from afm_jax.cli.main import main
-from afm_jax.dynamics import continuation
+from afm_jax.dynamics import closed_loops
 from afm_jax.dynamics.bands import UncertainParameters, drawn_points, special_errors
 from afm_jax.dynamics.continuation import Continuation, continue_orbits
 from afm_jax.impact.closure import OrbitProblem, closing_residual
@@ -184,13 +184,13 @@ def test_a_resting_and_a_driven_tip_graze_where_they_must():
 @pytest.fixture
 def feeding(monkeypatch: pytest.MonkeyPatch):
     """Let every impact feed the motion by a hundredth more than it does: no law of the package does."""
-    true = continuation.trace_and_determinant_of
+    true = closed_loops.trace_and_determinant_of
 
     def more(*arguments):
         trace, determinant = true(*arguments)
         return trace, 1.02 * determinant
 
-    monkeypatch.setattr(continuation, "trace_and_determinant_of", more)
+    monkeypatch.setattr(closed_loops, "trace_and_determinant_of", more)
     jax.clear_caches()
     yield
     jax.clear_caches()

@@ -1,6 +1,5 @@
 """`--law fit.json`: a scene with the law that a fit found, and what the fit says of its errors."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -29,14 +28,10 @@ def with_fitted_law(scene: "Scene", path: Path) -> "tuple[Scene, UncertainParame
     import numpy as np  # noqa: PLC0415
 
     from afm_jax.dynamics.bands import UncertainParameters  # noqa: PLC0415
-    from fitting.experiments.belief import belief_of_fit  # noqa: PLC0415
+    from fitting.experiments.belief import read_belief  # noqa: PLC0415
     from fitting.parameters import DELAY, LAW  # noqa: PLC0415
 
-    try:
-        payload = json.loads(path.read_text(encoding="utf-8"))
-        belief = belief_of_fit(payload)
-    except (ValueError, AttributeError, TypeError) as error:
-        raise ValueError(f"{path}: {error}; give the fit.json of `afm-jax fit --out`") from error
+    belief, payload = read_belief(path)
     if not payload["valid"]:
         raise ValueError(f"{path}: the fit is not valid, so that its law means nothing; give a valid one")
     problem, found, plain = belief.problem, payload["parameters"], payload.get("plain_law")

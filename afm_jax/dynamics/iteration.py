@@ -43,6 +43,8 @@ _RIDE_PERIODS = 1.1
 """Drive periods within which a resting tip is let go, or never: its push repeats every one."""
 
 
+_TOUCHING = 1e-13
+"""Gap over the heights it is the difference of, below which it is rounding."""
 _FEW = 16
 """Tips of a block whose rest, or long search, is computed together."""
 _Leaving = tuple[Array, Array, Array]
@@ -264,6 +266,8 @@ def landed_tips(scenes: Scene, start: State) -> Tips:
 
     def one(scene: Scene, start: State) -> Tips:
         gap = start.position_nm - scene.platform.position(start.time_us)
+        # on the surface but for rounding
+        gap = jnp.where(jnp.abs(gap) < _TOUCHING * (jnp.abs(start.position_nm) + scene.platform.amplitude_nm), 0.0, gap)
         flight = Flight(
             scene.cantilever, scene.platform, start.time_us, start.velocity_nm_per_us, gap, jnp.zeros_like(gap)
         )
