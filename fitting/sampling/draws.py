@@ -116,7 +116,7 @@ def densities(
     objective: Objective,
     values: Float[np.ndarray, "sets p"],
     log_uniform: tuple[str, ...] = (),
-    shift: Float[np.ndarray, " n"] | float = 0.0,
+    shift: Float[np.ndarray, "... n"] | float = 0.0,
 ) -> Densities:
     """Return what sets of values predict and how likely that makes the readings.
 
@@ -126,7 +126,7 @@ def densities(
         objective: of the rows.
         values: of the parameters, within their ranges.
         log_uniform: as the posterior's.
-        shift: what other readings add to the residuals.
+        shift: what other readings add to the residuals, the same of all sets or of each.
     """
     found: Linearised = plain(objective).at_values(values)
     rows, predicted = objective.measurement.rows, np.asarray(found.prediction.amplitude_nm)
