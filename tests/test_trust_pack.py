@@ -2,6 +2,8 @@
 
 import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,10 +11,12 @@ from scipy.stats import genpareto, kstest, norm
 
 from afm_jax.impact.law import ImpactLaw
 from fitting import fit, posterior, trust, write_inference_data
+from fitting.fits.objective import Objective
 from fitting.report.report import write_report
 from fitting.sampling import rank_calibration
 from fitting.sampling.bootstrap import BatchFit, Refit
 from fitting.sampling.draws import believe_draws, densities, noise_of, refit_of_rows
+from fitting.sampling.influence import _moves
 from fitting.sampling.leave_one_out import leave_one_out, pareto_smoothed
 from fitting.sampling.posterior_result import PosteriorChains, posterior_of_chains
 from fitting.sampling.rank_calibration import _deviation, _ranks, calibrate_ranks
@@ -45,6 +49,30 @@ def test_leave_one_out_of_a_mean_is_its_closed_form():
     assert found.elpd_by_row == pytest.approx(exact, abs=0.01)
     assert found.elpd == pytest.approx(exact.sum(), abs=0.05)
     assert np.all(found.pareto_k < found.highest_k)
+
+
+def test_a_row_that_says_nothing_has_equal_weights():
+    found = leave_one_out(np.repeat([[-4.5, 0.0]], 200, axis=0))
+    assert found.elpd_by_row == pytest.approx([-4.5, 0.0], abs=1e-12)
+    assert not np.any(found.pareto_k > found.highest_k)
+
+
+def test_moves_are_those_of_least_squares_without_the_row():
+    random = np.random.default_rng(6)
+    jacobian, target = random.normal(size=(12, 3)), random.normal(size=12)
+    # two readings a row, of which the last alone knows the third parameter
+    jacobian[:10, 2] = 0.0
+    best = np.linalg.lstsq(jacobian, target)[0]
+    linear: Any = object.__new__(Objective)
+    linear.at_values = lambda _: SimpleNamespace(residual=(jacobian @ best - target)[None], jacobian=jacobian[None])
+    linear.measurement = SimpleNamespace(rows=SimpleNamespace(amplitude_nm=np.zeros((6, 2))))
+    normal, moves = _moves(linear, best, np.ones(3, dtype=bool))
+    assert normal == pytest.approx(jacobian.T @ jacobian, rel=1e-12)
+    for row in range(5):
+        kept = np.arange(12) // 2 != row
+        without = np.linalg.lstsq(jacobian[kept], target[kept])[0]
+        assert moves[row] == pytest.approx(without - best, rel=1e-9, abs=1e-12)
+    assert np.isinf(moves[5]).all()
 
 
 def test_ranks_are_uniform_only_in_the_right_posterior():

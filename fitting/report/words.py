@@ -6,7 +6,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.words import decimals, interval, percent, value_alone
+from afm_jax.words import decimals, interval, known, percent, value_alone
 from fitting.fits.loss import WithInterval
 from fitting.fits.result import FitResult, FittedParameter
 from fitting.fits.verdict import IMPROBABLE
@@ -61,7 +61,8 @@ def trust_in_words(pack: TrustPack) -> list[str]:
     )
     uniform = f"probability if uniform {ranks.p_value:.2g}, of the Gaussian ones {ranks.gaussian_p_value:.2g}"
     most = f"Pareto k at most {np.max(loo.pareto_k):.2f} (line {pack.lines[np.argmax(loo.pareto_k)]})"
-    move = f"{influence.law_moves[first]:.2f} of its standard errors, refitted {influence.law_moves_refitted[0]:.2f}"
+    move = f"{known(influence.law_moves[first], '.2f')} of its standard errors, refitted "
+    move += known(influence.law_moves_refitted[0], ".2f")
     return [
         predicted,
         f"ranks in the posteriors of {len(ranks.ranks)} simulated tables{without}: {uniform}",

@@ -53,7 +53,9 @@ def influence_of_rows(refit: Refit, approach_speeds: Float[np.ndarray, " measure
     free = ~at_bound(refit.objective, best)
     normal, moves = _moves(refit.objective, best, free)
     error = np.sqrt(np.einsum("np,pq,nq->n", slope[:, free], np.linalg.inv(normal), slope[:, free]))
-    law_moves = np.max(np.abs(moves @ slope[:, free].T) / error, axis=1)
+    known: Bool[np.ndarray, " rows"] = np.asarray(np.isfinite(moves).all(axis=1))
+    moves = np.where(known[:, None], moves, 0.0)
+    law_moves = np.where(known, np.max(np.abs(moves @ slope[:, free].T) / error, axis=1), np.inf)
     chosen = np.argsort(-law_moves)[:CHECKED]
     fits = _fits_without(refit, chosen)
     refitted = [
@@ -62,7 +64,7 @@ def influence_of_rows(refit: Refit, approach_speeds: Float[np.ndarray, " measure
     ]
     return Influence(
         law_moves=law_moves,
-        cooks_distance=np.einsum("rp,pq,rq->r", moves, normal, moves) / free.sum(),
+        cooks_distance=np.where(known, np.einsum("rp,pq,rq->r", moves, normal, moves) / free.sum(), np.inf),
         checked=chosen,
         law_moves_refitted=np.array(refitted),
     )

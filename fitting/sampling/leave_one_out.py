@@ -69,6 +69,9 @@ def pareto_smoothed(
     """
     draws = log_weight.size
     log_weight = log_weight - log_weight.max()
+    if not log_weight.any():
+        # equal weights have no tail
+        return log_weight - np.log(draws), -np.inf
     order = np.argsort(log_weight)
     tail = order[draws - int(np.ceil(min(0.2 * draws, 3.0 * np.sqrt(draws / efficiency)))) :]
     # where everything before the tail is of no weight, the smallest number stands for it

@@ -192,7 +192,10 @@ def _complaints(
             f"the posterior without line {_named(lines[heavy])} is too far from the whole one for importance sampling "
             f"(Pareto k above {loo.highest_k:.2g}): its leave-one-out density is not reliable"
         )
-    much = influence.law_moves > MOVES_MUCH
+    lost = np.isinf(influence.law_moves)
+    if lost.any():
+        said.append(f"without line {_named(lines[lost])} the data do not determine every parameter")
+    much = ~lost & (influence.law_moves > MOVES_MUCH)
     if much.any():
         said.append(
             f"the law moves by more than {MOVES_MUCH:g} standard error without line {_named(lines[much])}: look at it"
