@@ -21,7 +21,6 @@ from fitting.sampling.rank_calibration import calibrate_ranks
 TABLES = (
     ("amplitudes_law.csv", "law"),
     ("amplitudes_contact.csv", "viscous+delay"),
-    ("tapping_contact.csv", "viscous+delay"),
 )
 PROBABILITY = 1e-3
 

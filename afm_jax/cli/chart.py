@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from afm_jax.cli.main import NotValid
-from afm_jax.cli.orbits import refuse_other_than_law
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import PictureFormat, SceneName, ranges_of, scene_and_start
 
@@ -29,11 +28,13 @@ _MOST_POINTS = 4_000_000
 @click.option("--picture", type=PictureFormat(), default="png", show_default=True, help="png, pdf or svg.")
 @with_session
 def command(session: Session, *, scene: str, x: str, y: str, orders: int, zarr: bool, picture: str) -> None:
-    """Chart over two parameters of a law scene which single-impact orbits exist, are stable and coexist.
+    """Chart over two parameters of a scene which single-impact orbits exist, are stable and coexist.
 
     Of every point and order: whether an orbit is admissible, whether one is stable, and of the stable one (the highest,
-    if there are several) the peak amplitude and the size of the larger multiplier. With --out a table (chart.csv or
-    chart.zarr) and a picture. Exit code 3 if there is no admissible orbit at all.
+    if there are several) the peak amplitude and the size of the larger multiplier. A contact's orbits are closed by
+    simulation from those of the law closest to it: chart a thousand points, not a million; where none closes the point
+    is unresolved. With --out a table (chart.csv or chart.zarr) and a picture. Exit code 3 if there is no admissible
+    orbit at all.
     """
     if zarr:
         # said before the computation, not after it
@@ -44,7 +45,6 @@ def command(session: Session, *, scene: str, x: str, y: str, orders: int, zarr: 
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
     loaded, _ = scene_and_start(scene)
-    refuse_other_than_law(loaded, scene)
     across, up = ranges = ranges_of(scene, loaded, [x, y], counted=True)
     if len(across.values) * len(up.values) > _MOST_POINTS:
         raise ValueError(f"{across} and {up} are more than {_MOST_POINTS} points: chart fewer")
@@ -79,6 +79,8 @@ def command(session: Session, *, scene: str, x: str, y: str, orders: int, zarr: 
         "any_stable_share": float(verdicts.any_stable().mean()),
         "several_stable_share": float(several.mean()),
     }
+    if verdicts.unresolved is not None:
+        payload["unresolved_share"] = verdicts.unresolved.mean(axis=1)
     reason = None if verdicts.admissible.any() else _why_none(ranges, orders)
     lines = [
         f"order {order}: stable at {100.0 * stable:.4g} % of the points, admissible at {100.0 * admissible:.4g} %"
@@ -110,6 +112,8 @@ def _write(
         "peak_amplitude_nm": verdicts.peak_amplitude_nm,
         "largest_multiplier": verdicts.largest_multiplier,
     }
+    if verdicts.unresolved is not None:
+        parts["unresolved"] = verdicts.unresolved
     if zarr:
         import zarr as store  # noqa: PLC0415
 

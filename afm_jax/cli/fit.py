@@ -153,21 +153,30 @@ class Names(click.ParamType):
     help="Write the posterior for ArviZ (with --posterior; extra `arviz`).",
 )
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of everything random.")
+@click.option(
+    "--share",
+    type=Names(),
+    metavar="NAME,...",
+    help="Of several tables: nuisances (of --constrain) that all have in common, or all; left out, each has its own.",
+)
+@click.option(
+    "--hierarchical", is_flag=True, help="Let the laws of several tables scatter around their mean, and say how much."
+)
 @click.option("--example", is_flag=True, help="Fit the bundled table instead of a file.")
-@click.option("--each", is_flag=True, help="Fit several tables, each by itself; with --out what is done is kept.")
+@click.option("--each", is_flag=True, help="Fit each of several tables by itself; with --out what is done is kept.")
 @click.option("--workers", type=click.IntRange(1, 1024), metavar="N", help="Processes that --each takes, by Dask.")
 @with_session
 def command(session: Session, tables: tuple[Path, ...], model: str, noise: float | None, **options: Any) -> None:
-    """Fit the impact law to a table of vibration amplitudes, or to each of several.
+    """Fit the impact law to a table of vibration amplitudes, or one law to several tables.
 
     The table is a CSV file: comment lines `# free_frequency_khz = 90`, `# quality_factor = 40 +- 1`, and columns
     order, drive_frequency_khz, drive_amplitude_nm, offset_nm, peak_amplitude_nm and/or lockin_amplitude_nm, each
     with its ..._error_nm; a column no_orbit marks by 1 drives on which the tip settled on nothing; phase_deg
     counts too. With a line `# drive = force` (or base) it is a tapping curve: drive_frequency_khz, free_amplitude_nm,
-    offset_nm, lockin_amplitude_nm and phase_lag_deg. With --out the
-    report: fit.html, fit.txt, fit.json, fit.png, fit_rows.csv, law.csv, and with --trust
-    trust.png, trust_rows.csv. Exit code 3 if the result is not valid: not
-    converged, not explained by the model, or a parameter not identified.
+    offset_nm, lockin_amplitude_nm and phase_lag_deg. Several tables have one law, each nuisances of its own or shared
+    ones, and the report says how far each is from the others (its pull). With --out the report: fit.html, fit.txt,
+    fit.json, fit.png, fit_rows.csv, law.csv, and with --trust trust.png, trust_rows.csv. Exit code 3 if the result is
+    not valid: not converged, not explained by the model, or a parameter not identified.
     """
     if options["example"] == bool(tables):
         both = "not both: " if options["example"] else ""
@@ -177,10 +186,10 @@ def command(session: Session, tables: tuple[Path, ...], model: str, noise: float
     if options["each"]:
         fit_tables(session, tables, {"model": model, "noise": noise, **settings}, options["workers"])
         return
-    table = tables[0] if tables else None
     session.start_computing(*(f"fitting.forward:{name}" for name in ("impacts_of", "located", "linearise_pairs")))
     from fitting.fits.fit import find_fit, summarise  # noqa: PLC0415
     from fitting.report.report import summary  # noqa: PLC0415
+    from fitting.tables.several import SeveralTables  # noqa: PLC0415
     from fitting.tables.table import read_table  # noqa: PLC0415
 
     if options["arviz"] is not None:
@@ -189,9 +198,11 @@ def command(session: Session, tables: tuple[Path, ...], model: str, noise: float
         prepare_folder(options["arviz"].absolute().parent)
         require_netcdf()
     options["posterior"] = options["posterior"] or options["trust"] or options["arviz"] is not None
-    measured = read_table(example_path() if table is None else table, noise=noise)
+    read = [read_table(path, noise=noise) for path in tables or (example_path(),)]
+    measured = read[0] if len(read) == 1 else SeveralTables(tuple(read))
     first = "the first run compiles for half a minute" if "delay" in model or model == "contact" else "some seconds"
-    with session.working(f"fitting {measured.rows} rows, model {model} ({first})"):
+    rows = f"{measured.rows} rows" + (f" of {len(read)} tables" if len(read) > 1 else "")
+    with session.working(f"fitting {rows}, model {model} ({first})"):
         found = find_fit(measured, model, **settings)
         result = summarise(measured, found)
     extras, failure = _extras(session, found, result, settings, options)
@@ -209,13 +220,14 @@ def command(session: Session, tables: tuple[Path, ...], model: str, noise: float
 
 
 def _check_each(tables: tuple[Path, ...], options: dict[str, Any]) -> None:
-    """Check that several tables are fitted each by itself, and that no option asks for more of them.
+    """Check that options are those of one table, of several together, or of each of several by itself.
 
     Raises:
         click.UsageError: if not.
     """
-    if len(tables) > 1 and not options["each"]:
-        raise click.UsageError(f"{len(tables)} tables: add --each to fit each by itself")
+    for option in ("share", "hierarchical"):
+        if options[option] and (len(tables) < 2 or options["each"]):
+            raise click.UsageError(f"--{option} is about several tables that are fitted together; leave it out")
     if options["workers"] is not None and not options["each"]:
         raise click.UsageError("--workers is about several tables: add --each")
     alone = {
@@ -229,6 +241,10 @@ def _check_each(tables: tuple[Path, ...], options: dict[str, Any]) -> None:
     for option, name in alone.items():
         if options["each"] and options[name]:
             raise click.UsageError(f"{option} is about one table: leave --each out")
+        if len(tables) > 1 and options[name] and option != "--compare":
+            raise click.UsageError(f"{option} is about one table: give one, or leave it out")
+    if options["comparing"] and options["hierarchical"]:
+        raise click.UsageError("--compare is about tables that have one law: leave --hierarchical out")
 
 
 def _settings(model: str, options: dict[str, Any]) -> dict[str, Any]:
@@ -244,6 +260,7 @@ def _settings(model: str, options: dict[str, Any]) -> dict[str, Any]:
         "scale_errors": options["scale_errors"],
         "robust": options["robust"],
         "speeds": options.get("speeds"),
+        **{name: options[name] for name in ("share", "hierarchical") if options.get(name)},
         "constraints": dict(options["constrain"]),
         "free": free,
         "fixed": fixed,

@@ -1,8 +1,9 @@
 """Traced programs beside JAX's compilation cache: what that has compiled it finds only after tracing anew.
 
-Commands name the few that gain half a second or more by being kept traced (`jax.export`, its own serialisation) as
-well. A file is found by all that a trace depends on: loaded sources, versions, configuration, devices, shapes and
-structure. Results are modules and tuples of arrays; arguments that are no arrays have a `repr` that says all of them.
+Commands name the few that gain half a second or more by being kept traced (`jax.export`, its own serialisation; what
+`serialize_executable` writes is read by pickle, which runs any code that a file names) as well. A file is found by all
+that a trace depends on: loaded sources, versions, configuration, devices, shapes and structure. Results are modules and
+tuples of arrays; arguments that are no arrays have a `repr` that says all of them.
 """
 
 import hashlib

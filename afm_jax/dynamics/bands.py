@@ -14,17 +14,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from afm_jax.dynamics.continuation import (
-    Continuation,
-    Equations,
-    Frame,
-    OrbitBranch,
-    SpecialPoint,
-    by_blocks,
-    equations_at,
-    loop_at,
-)
+from afm_jax.dynamics.closed_loops import Equations, Frame, by_blocks, equations_at, loop_at
+from afm_jax.dynamics.continuation import Continuation
 from afm_jax.dynamics.impact_loop import closing_gaps, highest_point
+from afm_jax.dynamics.special_points import OrbitBranch, SpecialPoint
 
 _NEWTON_STEPS = 20
 _ARRIVED = 1e-9

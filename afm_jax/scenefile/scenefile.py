@@ -342,7 +342,7 @@ def load_start(path: str | os.PathLike[str]) -> Start | None:
 def load_scene_and_start(path: str | os.PathLike[str]) -> tuple[Scene, Start | None]:
     """Return what `load_scene` and `load_start` return, from one reading of the file."""
     source = os.fspath(path)
-    tables = _checked(_parsed(source), source)
+    tables = _checked(read_toml(source), source)
     scene = _scene_of(tables)
     return scene, _start_of(tables, scene)
 
@@ -441,7 +441,12 @@ def _checked(contents: Mapping[str, Any], source: str) -> dict[str, SceneTable]:
     return tables
 
 
-def _parsed(source: str) -> dict[str, Any]:
+def read_toml(source: str) -> dict[str, Any]:
+    """Return the contents of a TOML file.
+
+    Raises:
+        SceneError: if it cannot be read, or is no TOML.
+    """
     where = printable(source)
     try:
         # a byte order mark, as some editors write, is no part of the text

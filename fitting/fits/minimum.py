@@ -41,6 +41,8 @@ def starts(problem: Problem, measurement: Measurement) -> Float[np.ndarray, "poi
     Nuisances stay where they were measured.
     """
     own = problem.own
+    if measurement.joint is not None:
+        measurement = measurement._replace(rows=measurement.of_drive(problem.drive).rows)
 
     def started(name: str, place: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         return _range(PARAMETERS[name], measurement, problem, place)
@@ -350,10 +352,19 @@ def padding(share: Float[np.ndarray, " rows"], readings: Float[np.ndarray, "rows
 
 def strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
     """Return the strain of every row (padded) at a set of values; none where impacts are instantaneous."""
+    count = objective.measurement.rows.order.shape[0]
+    found = Strain(np.zeros(count), np.zeros(count), np.full(count, "", dtype=object))
+    if objective.problem.lasting:
+        for mine, part in objective.by_instrument():
+            strain = _strain_of(part, values)
+            for whole, some in zip(vars(found).values(), vars(strain).values(), strict=True):
+                whole[mine] = some
+    return found
+
+
+def _strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
+    """Return the strain of every row of one instrument."""
     rows = objective.measurement.rows
-    count = rows.order.shape[0]
-    if not objective.problem.lasting:
-        return Strain(np.zeros(count), np.zeros(count), np.full(count, "", dtype=object))
     impact = impact_at(values, objective.measurement, objective.problem).impact
     linear = objective.at_values(values[None])
     prediction = linear.prediction

@@ -13,6 +13,7 @@ from fitting.fits.result import FitResult, FittedRows
 from fitting.parameters import NUISANCE_NAMES, PARAMETERS, SHAPE_NAMES
 from fitting.report.page import Table, in_signs, page, pairs, pictures_of
 from fitting.report.words import (
+    PULLS,
     SHARE_OF_BAND,
     ComparedModels,
     Sampled,
@@ -24,8 +25,11 @@ from fitting.report.words import (
     interval_in_words,
     law_points,
     losses_in_words,
+    nuisances_in_words,
     remarks_on,
     rounded_values,
+    scatter_in_words,
+    tables_in_words,
     trust_in_words,
     value_in_words,
 )
@@ -105,8 +109,8 @@ def fit_page(
         trust=None if trust is None else _trusted(*trust),
         rows=_rows(result),
         minimum=_minimum(result),
-        instrument=_instrument(result.table),
-        measured=_measured(result.table),
+        tables=_tables(result),
+        inputs=[(_instrument(one), one.remarks, _measured(one)) for one in result.table.tables],
         settings=pairs("Options of the fit", ("option", "value"), result.settings),
         versions=pairs("Versions of what computed it", ("package", "version"), result.versions),
     )
@@ -119,6 +123,19 @@ def _what_the_data_say(result: FitResult) -> Table:
         caption += " (calibration and damping are fitted along, see Parameters)"
     rows = [[name, value_in_words(p), interval_in_words(p), in_signs(p.unit)] for name, p in own.items()]
     return Table(caption, ["parameter", "value", "95 % interval", "unit"], rows, words=("95 % interval", "unit"))
+
+
+def _tables(result: FitResult) -> list[Table]:
+    """Return pulls of several tables, what each has to itself, and the scatter between them; nothing of one."""
+    if not result.tables:
+        return []
+    captions = (PULLS, "Scatter of the law between tables", "What each table has to itself")
+    found = zip(captions, (tables_in_words(result), scatter_in_words(result), nuisances_in_words(result)), strict=True)
+    return [
+        Table(caption, head, [[in_signs(cell) for cell in row] for row in rows], words=("95 % interval", "unit"))
+        for caption, (head, rows) in found
+        if rows
+    ]
 
 
 def _pictures(result: FitResult, files: Sequence[bytes]) -> list[dict[str, str]]:
@@ -316,6 +333,7 @@ def _rows(result: FitResult) -> Table:
         *([known(value, form) for value in column[: len(shown)].astype(float).tolist()] for _, column, form in columns),
         strict=True,
     )
+    lines = table.row_names.tolist()
     unseen = np.zeros(table.rows, dtype=bool) if table.no_orbit is None else table.no_orbit > 0
     remarks = [_row_remarks(rows, i, unseen=bool(unseen[i])) for i in shown]
     caption = (
@@ -325,7 +343,7 @@ def _rows(result: FitResult) -> Table:
     return Table(
         caption,
         [*(name for name, _, _ in columns), "remarks"],
-        [[*cells, words] for cells, words in zip(numbers, remarks, strict=True)],
+        [[line, *cells[1:], words] for line, cells, words in zip(lines[: len(shown)], numbers, remarks, strict=True)],
         words=("remarks",),
         marked={i for i in shown if remarks[i]},
         left_out=_left_out(table.rows, "fit_rows.csv"),

@@ -11,6 +11,7 @@ from afm_jax.whole_files import write_whole
 from afm_jax.words import bullets, known, text_table
 from fitting.fits.result import FitResult, FittedParameter, FittedRows
 from fitting.report.words import (
+    PULLS,
     ComparedModels,
     Sampled,
     band_in_words,
@@ -18,10 +19,14 @@ from fitting.report.words import (
     held_in_words,
     interval_in_words,
     losses_in_words,
+    nuisances_in_words,
     rows_in_words,
+    scatter_in_words,
+    tables_in_words,
     value_in_words,
 )
 from fitting.sampling.trust_pack import TrustPack
+from fitting.tables.several import SeveralTables
 
 _MANY_PARAMETERS = 3
 _WORTH_SAYING = 0.9
@@ -71,6 +76,7 @@ def summary(result: FitResult) -> str:
         f"  {band_in_words(result)}",
         _goodness_line(result),
         *_correlation_lines(result),
+        *_table_lines(result),
         *_loss_lines(result),
         *bullets("Notes:", result.warnings),
     ]
@@ -88,6 +94,17 @@ def _goodness_line(result: FitResult) -> str:
     probability = f", probability {result.p_value:.2g}" if np.isfinite(result.p_value) else ""
     goodness = f"chi2/dof = {result.chi2:.1f}/{result.degrees_of_freedom}{probability}"
     return f"  {goodness}, AIC {result.aic:.1f}, BIC {result.bic:.1f}"
+
+
+def _table_lines(result: FitResult) -> list[str]:
+    """Return each of several tables' pull, what it has to itself, and the scatter of laws between them."""
+    if not result.tables:
+        return []
+    lines = ["", *text_table(*tables_in_words(result)), f"  {PULLS}."]
+    for head, rows in (scatter_in_words(result), nuisances_in_words(result)):
+        if rows:
+            lines += ["", *text_table(head, rows, words=(0, 1, len(head) - 1))]
+    return lines
 
 
 def _loss_lines(result: FitResult) -> list[str]:
@@ -127,6 +144,8 @@ def row_records(result: FitResult) -> list[dict[str, Any]]:
     )
     more = phase_columns(rows)
     names += more
+    if isinstance(table, SeveralTables):
+        names, columns = ["table", *names], (np.array(table.labels)[table.number], *columns)
     cells = zip(*(c.tolist() for c in (*columns, *more.values())), strict=True)
     return [dict(zip(names, row, strict=True)) for row in cells]
 

@@ -112,6 +112,53 @@ def losses_in_words(result: FitResult) -> list[list[str]]:
     return [*rows, ["captured below (extrapolated)", known_in_words(loss.capture_speed_nm_per_us, "nm/us")]]
 
 
+def tables_in_words(result: FitResult) -> tuple[list[str], list[list[str]]]:
+    """Return what there is to say of each of several tables: the names of columns, and a row for each table."""
+    law = list(result.tables[0].pulls) if result.tables else []
+    head = ["table", "rows used", "chi2/readings", "pull", *(f"on {name}" for name in law)]
+    rows = [
+        [
+            one.name,
+            f"{one.used}/{one.rows}",
+            f"{one.chi2:.1f}/{one.readings}",
+            known(one.pull, ".2f"),
+            *(known(one.pulls[name], "+.2f") for name in law),
+        ]
+        for one in result.tables
+    ]
+    return head, rows
+
+
+PULLS = (
+    "Pull: how far a table's law is from that of the others, in standard deviations; then by how much it moves each "
+    "parameter of the law, in standard deviations of that move"
+)
+
+
+def nuisances_in_words(result: FitResult) -> tuple[list[str], list[list[str]]]:
+    """Return what each of several tables has to itself: the names of columns, and rows."""
+    departing = any(one.departures for one in result.tables)
+    head = ["table", "of its own", "value", "95 % interval", "given"]
+    rows = []
+    for one in result.tables:
+        for name, parameter in one.nuisances.items():
+            given = "-" if parameter.constraint is None else "{:g} +- {:g}".format(*parameter.constraint)
+            rows.append([one.name, name, value_in_words(parameter), interval_in_words(parameter), given])
+        if departing:
+            rows += [[one.name, f"{name}, from the mean", f"{by:+.3g}", "", ""] for name, by in one.departures.items()]
+    return head, rows
+
+
+def scatter_in_words(result: FitResult) -> tuple[list[str], list[list[str]]]:
+    """Return the scatter of the law between tables: the names of columns, and rows; none where it was not asked for."""
+    rows = []
+    for name, one in result.scatter.items():
+        low, high = one.interval95
+        ends = f"> {low:.3g}" if high is None else f"{low:.3g} to {high:.3g}" if low else f"< {high:.3g}"
+        rows.append([name, f"{one.value:.3g}", ends, one.unit])
+    return ["scatter between tables", "standard deviation", "95 % interval", "unit"], rows
+
+
 def formulas(result: FitResult) -> list[str]:
     """Return the fitted law in formulas."""
     model = result.model

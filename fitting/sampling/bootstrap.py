@@ -24,6 +24,7 @@ from fitting.fits.objective import PLAIN, ROBUST, Objective, soft_square
 from fitting.fits.result import FitResult
 from fitting.models import ROWS_PER_PROGRAM, Problem, measurement_of
 from fitting.parameters import SHAPE_NAMES
+from fitting.tables.several import SeveralTables
 
 
 class Refit(NamedTuple):
@@ -42,9 +43,14 @@ def objective_of(result: FitResult) -> Refit:
         result: from `fitting.fit`.
 
     Raises:
+        ValueError: if the fit is of several tables.
         RuntimeError: if JAX is not set to 64-bit floats.
     """
     require_float64()
+    if isinstance(result.table, SeveralTables):
+        raise ValueError(  # noqa: TRY004 (a fit of several tables is no wrong type)
+            "bootstrap and posterior are about one table; the intervals of a joint fit are its own"
+        )
     settings = result.settings
     effects = EFFECTS if settings["effects"] is None else tuple(settings["effects"])
     names = tuple(name for name in result.parameters if name not in SHAPE_NAMES)

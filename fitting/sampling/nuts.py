@@ -172,8 +172,9 @@ def log_density_of(refit: Refit, space: Space):
 
     def evaluate(values: Float[Array, " p"]) -> tuple[Float[Array, ""], Float[Array, " p"]]:
         impacts = impacts_of(values[None], measurement, problem)
-        branch = located(values[None], impacts, lanes, measurement, problem) if near is None else branch_near(near)
-        block = linearise_pairs(values[None], impacts, lanes, measurement, problem, branch)
+        points = jnp.broadcast_to(values, (lanes.size, values.size))
+        branch = located(points, impacts, lanes, measurement, problem) if near is None else branch_near(near)
+        block = linearise_pairs(points, impacts, lanes, measurement, problem, branch)
         pull = (values - measurement.constraint_value) / measurement.constraint_error
         residual = jnp.concatenate([block.misfit.ravel(), block.unseen, pull])
         half, weight = _half_loss(residual, robust=robust)
