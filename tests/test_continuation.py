@@ -17,6 +17,7 @@ from click.testing import CliRunner, Result
 from scipy.optimize import brentq
 
 from afm_jax import Cantilever, CollisionDelay, ForceDrive, ImpactLaw, Platform, Scene, save_scene, single_impact_orbits
+from afm_jax.cli.fitted_law import with_fitted_law
 from afm_jax.cli.main import main
 from afm_jax.dynamics import closed_loops
 from afm_jax.dynamics.bands import UncertainParameters, drawn_points, special_errors
@@ -393,13 +394,24 @@ def test_charts_and_exponents_take_the_law_of_a_fit(tmp_path: Path):
 
 
 @pytest.mark.slow
+def test_a_scene_takes_the_plain_law_of_a_fit(tmp_path: Path):
+    plain = {"values": {"r": 0.94, "epsilon": 70.0}, "covariance": [[1e-6, 1e-4], [1e-4, 4.0]]}
+    made, known = with_fitted_law(scene(), Path(fit_file(tmp_path / "fit.json", plain_law=plain)))
+    assert isinstance(made.interaction, ImpactLaw)
+    assert (float(made.interaction.r), float(made.interaction.epsilon)) == (0.94, 70.0)
+    assert known.paths == ("interaction.r", "interaction.epsilon")
+    assert known.values.tolist() == [0.94, 70.0]
+    assert known.covariance.tolist() == plain["covariance"]
+
+
+@pytest.mark.slow
 def test_a_fit_that_says_nothing_is_refused(tmp_path: Path):
     path = saved(tmp_path / "scene.toml", scene(4.0, 1.01, 0.5))
     arguments = (path, "--order", "1", "--parameter", "platform.amplitude_nm=0.5:6", "--law")
     unsure = {"r": {"value": 0.95, "standard_error": None}, "epsilon": {"value": 60.0, "standard_error": 1.0}}
     for changes, said in (
         ({"valid": False}, "the fit is not valid"),
-        ({"format": "other"}, "this is no saved fit"),
+        ({"format": "other"}, "is no fit"),
         ({"parameters": unsure, "correlations": {"matrix": [[None, None], [None, 1.0]]}}, "no standard error of r"),
     ):
         result = run(*arguments, fit_file(tmp_path / "fit.json", **changes))

@@ -7,11 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 
-from fitting.experiments.belief import Belief
+from fitting.experiments.belief import Belief, size_of
+from fitting.fits.fit import speed_range
+from fitting.fits.least_squares import covariance_of
 from fitting.fits.minimum import strain_of
 from fitting.fits.objective import BATCH, Objective
+from fitting.fits.unmodelled import Unmodelled, rows_of_fit, step_of
+from fitting.forward import ImpactSlopes
 from fitting.models import Measurement, measurement_of
 from fitting.simulated.experiment import Drives
 from fitting.tables.table import AmplitudeTable
@@ -201,8 +205,18 @@ def candidates_of(
 
 def _measurement(belief: Belief, drives: Drives, amplitudes: str) -> Measurement:
     """Return the drives as a measurement of 1 nm with an error of 1 nm: its Jacobian is that of the amplitudes."""
-    one = np.ones(len(drives.order))
-    peak, lockin = (one if amplitudes in ("both", name) else None for name in ("peak", "lockin"))
+    one = np.ones((len(drives.order), 2))
+    return _measured(belief, drives, np.where([amplitudes != "lockin", amplitudes != "peak"], one, np.nan), one)
+
+
+def _measured(
+    belief: Belief, drives: Drives, amplitude: Float[np.ndarray, "rows 2"], error: Float[np.ndarray, "rows 2"]
+) -> Measurement:
+    """Return amplitudes (a column of NaN: not read) with their errors as a measurement."""
+    columns = {}
+    for i, name in enumerate(("peak_amplitude", "lockin_amplitude")):
+        if np.isfinite(amplitude[:, i]).all():
+            columns |= {f"{name}_nm": amplitude[:, i], f"{name}_error_nm": error[:, i]}
     table = AmplitudeTable(
         order=drives.order,
         drive_frequency_khz=drives.frequency_khz,
@@ -212,9 +226,47 @@ def _measurement(belief: Belief, drives: Drives, amplitudes: str) -> Measurement
         quality_factor=belief.quality_factor,
         mass_ng=belief.mass_ng,
         source="the drives",
-        peak_amplitude_nm=peak,
-        peak_amplitude_error_nm=peak,
-        lockin_amplitude_nm=lockin,
-        lockin_amplitude_error_nm=lockin,
+        **columns,
     )
     return measurement_of(table, belief.problem, fixed=belief.fixed)
+
+
+def forecast(
+    belief: Belief, candidates: Candidates, chosen: Int[np.ndarray, " points"], noise: float
+) -> Float[np.ndarray, "steps p"]:
+    """Return the standard errors that a fit will state, before and after each chosen point.
+
+    Where impacts last these contain what the model leaves out, by the same step as after a fit, anew for these points.
+
+    Args:
+        belief: the law and the instrument.
+        candidates: all drives.
+        chosen: numbers of the points.
+        noise: standard error of an amplitude relative to it.
+    """
+    problem, each = belief.problem, candidates.information[chosen]
+    steps = belief.information + np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each, axis=0)])
+    errors = np.array([np.sqrt(np.diag(covariance_of(information))) for information in steps])
+    if not problem.lasting or not chosen.size:
+        return errors
+    drives = Drives(*(column[chosen] for column in candidates.drives))
+    amplitude = candidates.amplitude_nm[chosen]
+    read = np.where(np.isfinite(candidates.error_nm[chosen]), amplitude, np.nan)
+    objective = Objective(_measured(belief, drives, read, noise * amplitude), problem)
+    strain = strain_of(objective, belief.values)
+    rows = rows_of_fit(objective, objective.following(belief.values), belief.values, strain, 1.0)
+    values = belief.fixed | dict(zip(problem.names, belief.values.tolist(), strict=True))
+    left_out = Unmodelled(problem, values, speed_range(rows.approach[: len(chosen)]), belief.mass_ng)
+    size = np.array([size_of(p, v) for p, v in zip(problem.parameters, belief.values.tolist(), strict=True)])
+    known, axes = np.linalg.eigh(size[:, None] * belief.information * size)
+    known = np.sqrt(np.maximum(known, 0.0))[:, None] * axes.T / size
+    readings, free = rows.measurement_error.shape, np.ones(len(size), dtype=bool)
+    by_row = rows.jacobian[: rows.measurement_error.size].reshape(*readings, -1)
+    for count in range(1, len(chosen) + 1):
+        # a reading without slopes says nothing
+        seen = np.arange(readings[0])[:, None] < count
+        jacobian = np.concatenate([(seen[..., None] * by_row).reshape(-1, len(size)), known])
+        slopes = ImpactSlopes(*(seen * part for part in rows.slopes))
+        some = rows._replace(slopes=slopes, jacobian=jacobian, residual=np.zeros(len(jacobian)))
+        errors[count] = np.sqrt(np.diag(step_of(some, left_out, free).covariance))[: len(size)]
+    return errors
