@@ -23,6 +23,7 @@ from fitting.parameters import (
     model_parameters,
     paper_values,
 )
+from fitting.tables.table import DRIVES
 
 UNCERTAINTY = 0.1
 """How far a belief is off, relative, where no measurement says."""
@@ -106,6 +107,7 @@ def believe(  # noqa: PLR0913
     fixed: Mapping[str, float] | None = None,
     effects: Sequence[str] = EFFECTS,
     uncertainty: float = UNCERTAINTY,
+    drive: str = "sample",
 ) -> Belief:
     """Return a belief made of values, before anything was measured.
 
@@ -121,20 +123,23 @@ def believe(  # noqa: PLR0913
         fixed: values of others of the model's parameters.
         effects: for "contact": the effects there are.
         uncertainty: how far the values may be off, relative (0.1 stands for 10 %).
+        drive: what is driven: "sample", "force" (on the tip) or "base".
 
     Raises:
         ValueError: if a name or value is impossible.
     """
+    if drive not in DRIVES:
+        raise ValueError(f"`drive` must be one of {', '.join(DRIVES)}, but is {drive!r}")
     own = model_parameters(model, None if free is None else tuple(free), fixed)
     known = {name: (float(value), float(error)) for name, (value, error) in (constraints or {}).items()}
-    _check_constraints(model, own, known)
+    _check_constraints(model, own, known, drive)
     given = dict(values or {})
     for name in given:
         if name not in own:
             raise ValueError(f"`values` names {name!r}, but the model {model!r} has {', '.join(own)}")
     if not 0.0 < uncertainty < 1.0:
         raise ValueError(f"`uncertainty` must be between 0 and 1, but is {uncertainty!r}; write 0.1 for 10 %")
-    problem = Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in known), tuple(effects))
+    problem = Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in known), tuple(effects), drive)
     assumed = [name for name in own if name not in given and name not in known]
     start = paper_values(model) | {name: value for name, (value, _) in known.items()} | given
     return Belief(
@@ -152,14 +157,14 @@ def believe(  # noqa: PLR0913
     )
 
 
-def _check_constraints(model: str, own: tuple[str, ...], known: Mapping[str, tuple[float, float]]) -> None:
+def _check_constraints(model: str, own: tuple[str, ...], known: Mapping[str, tuple[float, float]], drive: str) -> None:
     for name, (value, error) in known.items():
         if name not in (*own, *NUISANCE_NAMES):
             choice = ", ".join((*own, *NUISANCE_NAMES))
             raise ValueError(f"`constraints` names {name!r}, which is none of {choice}")
         if not (np.isfinite(value) and 0.0 < error < np.inf):
             raise ValueError(f"the constraint on {name} must be a value and a positive error, not {value} +- {error}")
-    if "offset_origin_nm" in known and model.endswith("+delay"):
+    if "offset_origin_nm" in known and model.endswith("+delay") and drive == "sample":
         raise ValueError(
             "offset_origin_nm and delay_offset_nm shift the same thing: with a delay leave the error of the offsets' "
             "origin out, or take the model 'contact'"
@@ -212,8 +217,9 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
     kept = [name not in SHAPE_NAMES for name in payload["parameters"]]
     found = dict(compress(payload["parameters"].items(), kept))
     matrix = [list(compress(row, kept)) for row in compress(payload["correlations"]["matrix"], kept)]
-    problem = Problem(payload["model"], tuple(found), tuple(settings.get("effects") or EFFECTS))
-    columns = ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")
+    drive = table.get("drive") or "sample"
+    problem = Problem(payload["model"], tuple(found), tuple(settings.get("effects") or EFFECTS), drive)
+    columns = ("order", "drive_frequency_khz", f"{'free' if problem.tapping else 'drive'}_amplitude_nm", "offset_nm")
     notes = []
     if not payload["valid"]:
         reason = " ".join(payload.get("reasons") or ["no reason given."])
