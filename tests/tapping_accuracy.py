@@ -174,12 +174,12 @@ def judge_fits(name: str, fits: list[Fitted], *, exact: bool) -> int:
         f"{np.mean([one.rows for one in fits]):.0f} rows used"
     )
     tests = {
-        f"{100 * MEDIAN_LAW} % in the median": np.median(median) <= MEDIAN_LAW,
+        f"{100 * MEDIAN_LAW} % in the median": bool(np.median(median) <= MEDIAN_LAW),
         "at worst": max(worst) <= WORST_LAW,
     }
     if exact:
         tests = {f"{100 * NOISE_FREE_LAW} %": max(worst) <= NOISE_FREE_LAW}
-        tests["calibration"] = np.median(off) <= NOISE_FREE_CALIBRATION
+        tests["calibration"] = bool(np.median(off) <= NOISE_FREE_CALIBRATION)
     return _judge(line, tests)
 
 

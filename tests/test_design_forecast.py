@@ -164,7 +164,7 @@ def test_joint_scatter_is_the_forecast(designed, refitted):
 def test_readings_of_tapping_points_are_those_of_the_motion_in_time(designed):
     if not designed.tapping:
         pytest.skip("of a cantilever that is driven itself")
-    delay = CollisionDelay(*(TAPPED[f"delay_{name}"] for name in ("hertz", "lead_nm", "offset_nm")))
+    delay = CollisionDelay(TAPPED["delay_hertz"], TAPPED["delay_lead_nm"], TAPPED["delay_offset_nm"])
     law = ImpactLaw(1.0, TAPPED["epsilon"], TAPPED["viscous_loss"], delay)
     made = simulate_experiment(
         law, Cantilever(90.0, 200.0, 16.81), designed.drives, drive="force", noise=2e-4, phase_noise_deg=0.01

@@ -124,7 +124,7 @@ def test_a_spring_shortens_a_contact():
     assert HERTZ_TIME - float(found.delay) == pytest.approx(HERTZ_TIME - left(motion, 10.0)[1], rel=0.01)
     assert float(found.rebound) == 1.0
     deepest = DEEPEST / HERTZ_TIME
-    assert pytest.approx(0.7 * beta(1.2, 0.5) / beta(0.4, 0.5) * deepest**2, rel=1e-3) == STIFFER
+    assert pytest.approx(0.7 * beta(1.2, 0.5) / beta(0.4, 0.5) * deepest**2, rel=1e-10) == STIFFER
 
 
 def test_air_takes_what_an_integrated_damped_contact_loses():

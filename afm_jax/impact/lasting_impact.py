@@ -62,7 +62,7 @@ _OVER = (
 """(F - 1)/kappa and H as quotients of polynomials in kappa, lowest power first (`tests/reference_hertz.py`)."""
 AIR = 10.0 / 9.0
 """Twice the integral of the squared speed over a Hertz contact, over tau u^2."""
-STIFFER = 0.03934
+STIFFER = 3.9337034362e-02
 """Share by which a spring of its own frequency Omega shortens a Hertz contact, over (Omega tau)^2."""
 BRIDGE_NM = 4.7
 """Length in nm over which a leaving tip keeps its energy, where nothing says it: the paper's bridge."""
