@@ -16,8 +16,9 @@ from click.testing import CliRunner, Result
 from scipy.optimize import brentq
 
 from afm_jax import Cantilever, CollisionDelay, ForceDrive, ImpactLaw, Platform, Scene, save_scene
+from afm_jax.cli.fitted_law import with_fitted_law
 from afm_jax.cli.main import main
-from afm_jax.dynamics import continuation
+from afm_jax.dynamics import closed_loops
 from afm_jax.dynamics.bands import UncertainParameters, drawn_points, special_errors
 from afm_jax.dynamics.continuation import Continuation, continue_orbits
 from afm_jax.impact.closure import OrbitProblem, closing_residual
@@ -183,13 +184,13 @@ def test_a_resting_and_a_driven_tip_graze_where_they_must():
 @pytest.fixture
 def feeding(monkeypatch: pytest.MonkeyPatch):
     """Let every impact feed the motion by a hundredth more than it does: no law of the package does."""
-    true = continuation.trace_and_determinant_of
+    true = closed_loops.trace_and_determinant_of
 
     def more(*arguments):
         trace, determinant = true(*arguments)
         return trace, 1.02 * determinant
 
-    monkeypatch.setattr(continuation, "trace_and_determinant_of", more)
+    monkeypatch.setattr(closed_loops, "trace_and_determinant_of", more)
     jax.clear_caches()
     yield
     jax.clear_caches()
@@ -360,13 +361,24 @@ def test_the_law_of_a_fit_gives_intervals(tmp_path: Path):
 
 
 @pytest.mark.slow
+def test_a_scene_takes_the_plain_law_of_a_fit(tmp_path: Path):
+    plain = {"values": {"r": 0.94, "epsilon": 70.0}, "covariance": [[1e-6, 1e-4], [1e-4, 4.0]]}
+    made, known = with_fitted_law(scene(), Path(fit_file(tmp_path / "fit.json", plain_law=plain)))
+    assert isinstance(made.interaction, ImpactLaw)
+    assert (float(made.interaction.r), float(made.interaction.epsilon)) == (0.94, 70.0)
+    assert known.paths == ("interaction.r", "interaction.epsilon")
+    assert known.values.tolist() == [0.94, 70.0]
+    assert known.covariance.tolist() == plain["covariance"]
+
+
+@pytest.mark.slow
 def test_a_fit_that_says_nothing_is_refused(tmp_path: Path):
     path = saved(tmp_path / "scene.toml", scene(4.0, 1.01, 0.5))
     arguments = (path, "--order", "1", "--parameter", "platform.amplitude_nm=0.5:6", "--law")
     unsure = {"r": {"value": 0.95, "standard_error": None}, "epsilon": {"value": 60.0, "standard_error": 1.0}}
     for changes, said in (
         ({"valid": False}, "the fit is not valid"),
-        ({"format": "other"}, "this is no saved fit"),
+        ({"format": "other"}, "is no fit"),
         ({"parameters": unsure, "correlations": {"matrix": [[None, None], [None, 1.0]]}}, "no standard error of r"),
     ):
         result = run(*arguments, fit_file(tmp_path / "fit.json", **changes))

@@ -1,12 +1,15 @@
 """Forecasts that come true: synthetic experiments at the designed points, each fitted, scatter as was forecast."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import chi2, kstest, norm
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
-from fitting import believe, design, drive_grid, simulate_experiment
+from fitting import believe, design, drive_grid, fit, simulate_experiment
+from fitting.experiments.design import standard_errors
 from fitting.experiments.result import Design
 from fitting.fits.objective import BATCH, Objective
 from fitting.models import measurement_of
@@ -66,6 +69,11 @@ def designed(request) -> Design:
     return design(belief, drives, points=14, noise=0.003)
 
 
+def by_noise(result: Design) -> np.ndarray:
+    """Standard errors after all points if the law were the model's own, without what that leaves out."""
+    return standard_errors(result.belief.information + result.candidates.information[result.chosen].sum(axis=0))
+
+
 def exact_table(result: Design) -> AmplitudeTable:
     """Return the readings that the belief expects at the points, without noise."""
     drives, found = result.drives, result.candidates
@@ -109,7 +117,7 @@ def exact_table(result: Design) -> AmplitudeTable:
 @pytest.fixture(scope="module")
 def refitted(designed) -> np.ndarray:
     """The values (experiments, p) that Gauss-Newton steps find for data with noise, Q measured anew each time."""
-    belief, errors = designed.belief, designed.errors[-1]
+    belief, errors = designed.belief, by_noise(designed)
     searching = Objective(measurement_of(exact_table(designed), belief.problem), belief.problem)
     objective = searching.following(belief.values)
     random = np.random.default_rng(11)
@@ -138,15 +146,34 @@ def test_what_is_designed_is_worth_simulating(designed):
     assert np.isfinite(designed.errors[-1]).all()
 
 
+def test_the_forecast_is_what_a_fit_states(designed):
+    drives, found = designed.drives, designed.candidates.amplitude_nm[designed.chosen]
+    assert len(designed.errors) == len(drives.order) + 1
+    assert np.all(designed.errors[-1] >= by_noise(designed) * (1.0 - 1e-9))
+    if designed.tapping:
+        return
+    table = replace(
+        exact_table(designed),
+        peak_amplitude_error_nm=0.003 * found[:, 0],
+        lockin_amplitude_error_nm=0.003 * found[:, 1],
+    )
+    result = fit(table, "law+delay")
+    assert result.valid
+    stated = np.array([result.parameters[name].standard_error for name in designed.belief.problem.names], float)
+    # the fit ends beside the believed law: its loss has a viscous part of its own
+    np.testing.assert_allclose(designed.errors[-1], stated, rtol=0.05)
+    assert np.all(designed.errors[-1] > by_noise(designed))
+
+
 def test_scatter_is_the_forecast(designed, refitted):
-    ratio = refitted.var(axis=0) / designed.errors[-1] ** 2
+    ratio = refitted.var(axis=0) / by_noise(designed) ** 2
     # once in ten thousand of right forecasts would lie outside on either side
     low, high = chi2.ppf([1e-4, 1.0 - 1e-4], EXPERIMENTS - 1) / (EXPERIMENTS - 1)
     assert np.all((low < ratio) & (ratio < high)), dict(zip(designed.belief.problem.names, ratio, strict=True))
 
 
 def test_intervals_hold_the_truth(designed, refitted):
-    pulls = (refitted - designed.belief.values) / designed.errors[-1]
+    pulls = (refitted - designed.belief.values) / by_noise(designed)
     covered = np.mean(np.abs(pulls) < norm.ppf(0.975), axis=0)
     # 95 % +- 1.5 %: four standard deviations
     assert np.all(np.abs(covered - 0.95) < 0.062), covered

@@ -1,7 +1,6 @@
 """The options of `afm-jax design` about what is believed: the cantilever, the law, or a fit of both."""
 
 import functools
-import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -130,11 +129,10 @@ def believed(options: BeliefOptions, noise: float) -> "Belief":
             raise click.UsageError(f"{_option(name)} is what {source} says already; leave one of them out")
     if options.drive is not None:
         raise click.UsageError(f"--drive is what {source} says already; leave one of them out")
-    from fitting.experiments.belief import belief_of_fit  # noqa: PLC0415
+    from fitting.experiments.belief import belief_of_fit, read_belief  # noqa: PLC0415
 
     if options.fit is not None:
-        payload = _read_json(options.fit)
-        belief = belief_of_fit(payload, options.uncertainty)
+        belief, _ = read_belief(options.fit, options.uncertainty)
         if options.model not in (None, belief.problem.model):
             raise click.UsageError(f"{options.fit} is a fit of the model {belief.problem.model}, not {options.model}")
         return belief
@@ -175,17 +173,6 @@ def _from_values(options: BeliefOptions) -> "Belief":
 def _names(options: BeliefOptions) -> tuple[str, ...] | None:
     names = options.numbers.get("free")
     return None if names is None else tuple(name.strip().replace("-", "_") for name in names.split(","))
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    text = path.read_text(encoding="utf-8")
-    try:
-        payload = json.loads(text)
-    except ValueError as error:
-        raise ValueError(f"{path}: is no JSON ({error}); give what `afm-jax fit --json` writes") from error
-    if not isinstance(payload, dict):
-        raise ValueError(f"{path}: is no saved fit; give what `afm-jax fit --json` writes")  # noqa: TRY004
-    return payload
 
 
 def _option(name: str) -> str:

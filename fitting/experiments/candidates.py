@@ -7,11 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 
-from fitting.experiments.belief import Belief
+from fitting.experiments.belief import Belief, size_of
+from fitting.fits.fit import speed_range
+from fitting.fits.least_squares import covariance_of
 from fitting.fits.minimum import padding, strain_of
 from fitting.fits.objective import BATCH, Objective
+from fitting.fits.unmodelled import Unmodelled, rows_of_fit, step_of
+from fitting.forward import ImpactSlopes
 from fitting.models import Measurement, measurement_of
 from fitting.simulated.experiment import Drives
 from fitting.tables.table import AmplitudeTable
@@ -204,9 +208,7 @@ def candidates_of(
     amplitude, kinds = expected[:count], expected.shape[1]
     own = padding(strain.model_error, expected)[:count]
     read = np.array([False, True, True] if tapping else [amplitudes != "lockin", amplitudes != "peak"])
-    stated = noise * amplitude
-    if tapping:
-        stated = np.concatenate([stated[:, :2], np.full((count, 1), phase_noise_deg)], axis=1)
+    stated = _stated(amplitude, noise, phase_noise_deg)
     error = np.where(read, np.hypot(stated, own), np.inf)
     raw = np.asarray(linear.jacobian)[0, : kinds * count].reshape(count, kinds, -1)
     orbits = np.asarray(prediction.orbits)[:, :count]
@@ -235,12 +237,30 @@ def candidates_of(
 
 def _measurement(belief: Belief, drives: Drives, amplitudes: str) -> Measurement:
     """Return the drives as a measurement of 1 nm with an error of 1 nm: its Jacobian is that of the amplitudes."""
-    one, tapping = np.ones(len(drives.order)), belief.problem.tapping
-    peak, lockin = (one if amplitudes in ("both", name) else None for name in ("peak", "lockin"))
-    columns = {"peak_amplitude_nm": peak, "peak_amplitude_error_nm": peak, "drive_amplitude_nm": drives.amplitude_nm}
-    if tapping:
-        lockin = one
-        columns = {"phase_lag_deg": one, "phase_lag_error_deg": one, "free_amplitude_nm": drives.amplitude_nm}
+    columns = 3 if belief.problem.tapping else 2
+    one = np.ones((len(drives.order), columns))
+    read = [False, True, True] if belief.problem.tapping else [amplitudes != "lockin", amplitudes != "peak"]
+    return _measured(belief, drives, np.where(read, one, np.nan), one)
+
+
+def _stated(
+    amplitude: Float[np.ndarray, "rows k"], noise: float, phase_noise_deg: float
+) -> Float[np.ndarray, "rows k"]:
+    """Return the errors of amplitudes, and of lags if there are any."""
+    lag = np.full((len(amplitude), amplitude.shape[1] - 2), phase_noise_deg)
+    return np.concatenate([noise * amplitude[:, :2], lag], axis=1)
+
+
+def _measured(
+    belief: Belief, drives: Drives, amplitude: Float[np.ndarray, "rows k"], error: Float[np.ndarray, "rows k"]
+) -> Measurement:
+    """Return readings (a column of NaN: not read) with their errors as a measurement."""
+    tapping, columns = belief.problem.tapping, {}
+    columns["free_amplitude_nm" if tapping else "drive_amplitude_nm"] = drives.amplitude_nm
+    kinds = (("peak_amplitude", "nm"), ("lockin_amplitude", "nm"), ("phase_lag", "deg"))
+    for i, (name, unit) in enumerate(kinds[: amplitude.shape[1]]):
+        if np.isfinite(amplitude[:, i]).all():
+            columns |= {f"{name}_{unit}": amplitude[:, i], f"{name}_error_{unit}": error[:, i]}
     table = AmplitudeTable(
         drive=belief.problem.drive,
         order=drives.order,
@@ -250,14 +270,59 @@ def _measurement(belief: Belief, drives: Drives, amplitudes: str) -> Measurement
         quality_factor=belief.quality_factor,
         mass_ng=belief.mass_ng,
         source="the drives",
-        lockin_amplitude_nm=lockin,
-        lockin_amplitude_error_nm=lockin,
         **columns,
     )
     found = measurement_of(table, belief.problem, fixed=belief.fixed)
     if not tapping:
         return found
     # nothing was read that could tell which rows are free
-    there = np.arange(len(found.rows.order)) < len(one)
+    there = np.arange(len(found.rows.order)) < len(drives.order)
     measured = there[:, None] & np.array([False, True, True])
     return found._replace(rows=found.rows._replace(measured=measured, free=np.zeros_like(there)))
+
+
+def forecast(
+    belief: Belief,
+    candidates: Candidates,
+    chosen: Int[np.ndarray, " points"],
+    noise: float,
+    phase_noise_deg: float = PHASE_NOISE_DEG,
+) -> Float[np.ndarray, "steps p"]:
+    """Return the standard errors that a fit will state, before and after each chosen point.
+
+    Where impacts last these contain what the model leaves out, by the same step as after a fit, anew for these points.
+
+    Args:
+        belief: the law and the instrument.
+        candidates: all drives.
+        chosen: numbers of the points.
+        noise: standard error of an amplitude relative to it.
+        phase_noise_deg: standard error of a lag in degrees.
+    """
+    problem, each = belief.problem, candidates.information[chosen]
+    steps = belief.information + np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each, axis=0)])
+    errors = np.array([np.sqrt(np.diag(covariance_of(information))) for information in steps])
+    if not problem.lasting or not chosen.size:
+        return errors
+    drives = Drives(*(column[chosen] for column in candidates.drives))
+    amplitude = candidates.amplitude_nm[chosen]
+    read = np.where(np.isfinite(candidates.error_nm[chosen]), amplitude, np.nan)
+    stated = _stated(amplitude, noise, phase_noise_deg)
+    objective = Objective(_measured(belief, drives, read, stated), problem)
+    strain = strain_of(objective, belief.values)
+    rows = rows_of_fit(objective, objective.following(belief.values), belief.values, strain, 1.0)
+    values = belief.fixed | dict(zip(problem.names, belief.values.tolist(), strict=True))
+    left_out = Unmodelled(problem, values, speed_range(rows.approach[: len(chosen)]), belief.mass_ng)
+    size = np.array([size_of(p, v) for p, v in zip(problem.parameters, belief.values.tolist(), strict=True)])
+    known, axes = np.linalg.eigh(size[:, None] * belief.information * size)
+    known = np.sqrt(np.maximum(known, 0.0))[:, None] * axes.T / size
+    readings, free = rows.measurement_error.shape, np.ones(len(size), dtype=bool)
+    by_row = rows.jacobian[: rows.measurement_error.size].reshape(*readings, -1)
+    for count in range(1, len(chosen) + 1):
+        # a reading without slopes says nothing
+        seen = np.arange(readings[0])[:, None] < count
+        jacobian = np.concatenate([(seen[..., None] * by_row).reshape(-1, len(size)), known])
+        slopes = ImpactSlopes(*(seen * part for part in rows.slopes))
+        some = rows._replace(slopes=slopes, jacobian=jacobian, residual=np.zeros(len(jacobian)))
+        errors[count] = np.sqrt(np.diag(step_of(some, left_out, free).covariance))[: len(size)]
+    return errors

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from afm_jax.checks import require_float64
 from afm_jax.version import version_of
 from fitting.experiments.belief import Belief, belief_of_fit, size_of
-from fitting.experiments.candidates import AMPLITUDES, LEFT_OUT, PHASE_NOISE_DEG, Candidates, candidates_of
+from fitting.experiments.candidates import AMPLITUDES, LEFT_OUT, PHASE_NOISE_DEG, Candidates, candidates_of, forecast
 from fitting.experiments.result import Design
 from fitting.fits.least_squares import covariance_of
 from fitting.fits.result import FitResult
@@ -149,7 +149,8 @@ def judge_design(
     belief: Belief,
     candidates: Candidates,
     chosen: Int[np.ndarray, " points"],
-    steps: Float[np.ndarray, "steps p p"],
+    reached: Float[np.ndarray, "p p"],
+    forecasts: Float[np.ndarray, " p"],
     wanted: tuple[str, ...],
     points: int,
 ) -> tuple[list[str], list[str]]:
@@ -159,12 +160,13 @@ def judge_design(
         belief: what it rests on.
         candidates: among which was chosen.
         chosen: their numbers.
-        steps: information so far and after each point.
+        reached: information after all points, by noise alone.
+        forecasts: standard errors then.
         wanted: the parameters that matter.
         points: how many were asked for.
     """
     names = belief.problem.names
-    errors = dict(zip(names, standard_errors(steps[-1]).tolist(), strict=True))
+    errors = dict(zip(names, forecasts.tolist(), strict=True))
     unknown = [name for name in wanted if not np.isfinite(errors[name])]
     if not len(chosen):
         counts = [f"{LEFT_OUT[name]}: {count}" for name, count in candidates.left_out.items()]
@@ -178,7 +180,7 @@ def judge_design(
     warnings = list(belief.notes)
     if len(chosen) < points:
         warnings.append(f"Only {len(chosen)} of the {points} points asked for can be planned with: all are chosen.")
-    warnings += _dominated(belief, steps[-1], errors, wanted)
+    warnings += _dominated(belief, reached, wanted)
     for name in wanted:
         index = names.index(name)
         size = size_of(belief.problem.parameters[index], float(belief.values[index]))
@@ -192,11 +194,10 @@ def judge_design(
     return reasons, warnings
 
 
-def _dominated(
-    belief: Belief, information: Float[np.ndarray, "p p"], errors: dict[str, float], wanted: tuple[str, ...]
-) -> list[str]:
+def _dominated(belief: Belief, information: Float[np.ndarray, "p p"], wanted: tuple[str, ...]) -> list[str]:
     """Name the quantities of the instrument whose uncertainty is most of the error of a parameter that matters."""
     names = belief.problem.names
+    errors = dict(zip(names, standard_errors(information).tolist(), strict=True))
     warnings = []
     for nuisance in (name for name in names if name in NUISANCE_NAMES and name not in wanted):
         rest = [i for i, name in enumerate(names) if name != nuisance]
@@ -247,7 +248,8 @@ def design(  # noqa: PLR0913
     """Choose the drives to measure next, and forecast how well the parameters will then be known.
 
     The forecast is the Fisher information: derivatives of the predicted amplitudes by every parameter at the believed
-    values, by automatic differentiation through the orbits. Every drive is chosen once. A drive is left out where the
+    values, by automatic differentiation through the orbits; of laws with a delay the errors contain what the model
+    leaves out, as those of a fit. Every drive is chosen once. A drive is left out where the
     belief has no steady single-impact orbit, or several, or is not sure of it, and where a fit would set its row aside.
 
     Args:
@@ -282,8 +284,9 @@ def design(  # noqa: PLR0913
     measure = _criterion(believed, candidates, wanted, criterion)
     usable, each = np.flatnonzero(candidates.usable), candidates.information
     chosen = usable[choose_points(believed.information, each[usable], points, measure)]
-    steps = believed.information + np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each[chosen], axis=0)])
-    reasons, warnings = judge_design(believed, candidates, chosen, steps, wanted, points)
+    reached = believed.information + each[chosen].sum(axis=0)
+    errors = forecast(believed, candidates, chosen, float(noise), phase_noise_deg)
+    reasons, warnings = judge_design(believed, candidates, chosen, reached, errors[-1], wanted, points)
     return Design(
         belief=believed,
         interest=wanted,
@@ -291,8 +294,8 @@ def design(  # noqa: PLR0913
         noise=float(noise),
         candidates=candidates,
         chosen=chosen,
-        errors=np.array([standard_errors(information) for information in steps]),
-        gain=_gain(measure, steps[-1], candidates),
+        errors=errors,
+        gain=_gain(measure, reached, candidates),
         valid=not reasons,
         reasons=reasons,
         warnings=warnings,

@@ -48,8 +48,8 @@ class Design:
         noise: standard error of an amplitude relative to it.
         candidates: every drive that was looked at.
         chosen: numbers of the points among the candidates, the most useful first.
-        errors: standard error of every parameter so far and after each point, shape (points + 1, p); infinite where
-            not determined.
+        errors: standard error of every parameter so far and after each point, as a fit will state it, shape
+            (points + 1, p); infinite where not determined.
         gain: what one more measurement at each candidate would add to the criterion after the chosen ones (D: to the
             log of the determinant; A: share by which the sum of variances falls), shape (rows,); NaN where left out.
         valid: there is something to measure, and it determines the parameters of interest.
