@@ -75,9 +75,9 @@ bands: $(SETUP) ## do the 95 % bands hold the laws of ten random contacts? (twen
 ranks: $(SETUP) ## are true values anywhere in the posteriors of 1000 simulated tables equally often? (half an hour)
 	$(BIN)/python -m tests.coverage_of_ranks
 
-KILLS ?= --times 20
+KILLS ?= --times 50
 
-kills: $(SETUP) ## a sweep killed at twenty random times and resumed ends in the bytes of one that was not
+kills: $(SETUP) ## a sweep killed at fifty random times and resumed ends in the bytes of one that was not
 	$(BIN)/python -m tests.kills $(KILLS)
 
 check: lint types test slow docs ## all that CI runs: format, lint, types, tests, slow tests, notebooks, site

@@ -378,7 +378,7 @@ def test_a_fit_that_says_nothing_is_refused(tmp_path: Path):
     unsure = {"r": {"value": 0.95, "standard_error": None}, "epsilon": {"value": 60.0, "standard_error": 1.0}}
     for changes, said in (
         ({"valid": False}, "the fit is not valid"),
-        ({"format": "other"}, "this is no saved fit"),
+        ({"format": "other"}, "is no fit"),
         ({"parameters": unsure, "correlations": {"matrix": [[None, None], [None, 1.0]]}}, "no standard error of r"),
     ):
         result = run(*arguments, fit_file(tmp_path / "fit.json", **changes))

@@ -227,6 +227,8 @@ def test_the_loss_is_said_in_energies_and_in_the_papers_quantities():
     one = equivalent(u, w, np.stack([0.99 * u**2 / w * 1e-3, -1.0 / w], axis=1), 2.0)
     assert one is not None
     energy = energy_lost(20.0, 10.0, 0.1, 2.0)
+    # 2 ng (20^2 - 19.9^2)/2 -+ 39: no sample at rest gives energy
+    assert energy_lost(20.0, 19.9, 0.5, 2.0).energy_aj.interval95 == pytest.approx((0.0, 3.99 + 39.004), abs=1e-3)
     loss = Loss((energy,), (one,), interval_of(9.04, float("nan")))
     said = dict(losses_in_words(made_fit("law", loss=loss)))
     # 2 ng (20^2 - 10^2)/2, and 2 ng times 10 times 1.96 times 0.1 to either side

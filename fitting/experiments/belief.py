@@ -309,6 +309,10 @@ def _is_whole(payload: Mapping[str, Any]) -> bool:
         columns = [[column for name in _COLUMNS if (column := table[name]) is not None] for table in tables]
         drives = all(np.array(of_one, float).ndim == 2 for of_one in columns)
         whole = np.isfinite([number for entry in entries for number in entry]).all()
+        if (plain := payload.get("plain_law")) is not None:
+            spread = np.array(plain["covariance"], float)
+            whole &= bool(np.isfinite([*plain["values"].values(), *spread.ravel()]).all())
+            whole &= {*plain["values"]} <= {*payload["parameters"]} and spread.shape == (len(plain["values"]),) * 2
         known = all(math.isfinite(table["free_frequency_khz"]) for table in tables)
         return bool(whole) and known and drives and np.array(matrix, float).shape == (len(entries), len(entries))
     except (AttributeError, KeyError, TypeError, ValueError):

@@ -206,14 +206,17 @@ def candidates_of(
 def _measurement(belief: Belief, drives: Drives, amplitudes: str) -> Measurement:
     """Return the drives as a measurement of 1 nm with an error of 1 nm: its Jacobian is that of the amplitudes."""
     one = np.ones((len(drives.order), 2))
-    read = np.array([amplitudes != "lockin", amplitudes != "peak"])
-    return _measured(belief, drives, np.where(read, one, np.nan), one)
+    return _measured(belief, drives, np.where([amplitudes != "lockin", amplitudes != "peak"], one, np.nan), one)
 
 
 def _measured(
     belief: Belief, drives: Drives, amplitude: Float[np.ndarray, "rows 2"], error: Float[np.ndarray, "rows 2"]
 ) -> Measurement:
-    """Return amplitudes with their errors, NaN where none is read, as a measurement."""
+    """Return amplitudes (a column of NaN: not read) with their errors as a measurement."""
+    columns = {}
+    for i, name in enumerate(("peak_amplitude", "lockin_amplitude")):
+        if np.isfinite(amplitude[:, i]).all():
+            columns |= {f"{name}_nm": amplitude[:, i], f"{name}_error_nm": error[:, i]}
     table = AmplitudeTable(
         order=drives.order,
         drive_frequency_khz=drives.frequency_khz,
@@ -223,10 +226,7 @@ def _measured(
         quality_factor=belief.quality_factor,
         mass_ng=belief.mass_ng,
         source="the drives",
-        peak_amplitude_nm=amplitude[:, 0],
-        peak_amplitude_error_nm=error[:, 0],
-        lockin_amplitude_nm=amplitude[:, 1],
-        lockin_amplitude_error_nm=error[:, 1],
+        **columns,
     )
     return measurement_of(table, belief.problem, fixed=belief.fixed)
 

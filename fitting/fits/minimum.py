@@ -189,6 +189,9 @@ def minimise(objective: Objective) -> Minimum:
     With impacts that last the search for orbits is what costs: the screening and the first polish look at a part of the
     rows, the rest follows orbits once they are known.
     """
+    common = objective.of_common_parameters()
+    if common is not None:
+        return _with_own_nuisances(objective, minimise(common))
     points = starts(objective.problem, objective.measurement)
     scout = _thinned(objective) if objective.problem.lasting else objective
     best = np.argsort(scout.screen(points), kind="stable")[:BATCH]
@@ -202,6 +205,19 @@ def minimise(objective: Objective) -> Minimum:
         return found
     other = settle(objective, replace(found, coordinates=back))
     return other if other.chi2[0] < found.chi2[0] else found
+
+
+def _with_own_nuisances(objective: Objective, found: Minimum) -> Minimum:
+    """Return the minimum with the nuisances that tables have to themselves, from one where these were held."""
+    known = np.asarray(objective.measurement.constraint_value)[len(found.start) :]
+
+    def whole(values: Float[np.ndarray, "... q"]) -> Float[np.ndarray, "... p"]:
+        return np.concatenate([values, np.broadcast_to(known, (*values.shape[:-1], known.size))], axis=-1)
+
+    ends = whole(found.ends)
+    best = objective.problem.coordinates(ends[lowest(found.chi2)])
+    begun = replace(found, coordinates=best, start=whole(found.start), ends=ends)
+    return settle(objective, begun) if objective.problem.lasting else _polished(objective, best[None], begun.start)
 
 
 def _scouted(scout: Objective, coordinates: Float[np.ndarray, "starts p"]) -> Float[np.ndarray, "starts p"]:

@@ -15,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from fitting.forward import BATCH, Linearised, linearise
 from fitting.models import Measurement, Problem
+from fitting.parameters import is_of_one_table
 
 SOFT = 5.0
 """Residual, in errors, beyond which the screening and the first polish count a row linearly (soft-l1)."""
@@ -127,6 +128,20 @@ class Objective:
             problem = replace(self.problem, drive=head[0])
             parts.append((mine, part._of(measurement, problem)))  # noqa: SLF001
         return [part for part in parts if part[0].any()]
+
+    def of_common_parameters(self) -> "Objective | None":
+        """Return the objective with the nuisances held that one of several tables has to itself; None without such."""
+        names, joint = self.problem.names, self.measurement.joint
+        count = sum(not is_of_one_table(name) for name in names)
+        if joint is None or count == len(names):
+            return None
+        value, error = np.asarray(self.measurement.constraint_value), np.asarray(self.measurement.constraint_error)
+        own = joint.place >= count
+        held = replace(joint, place=np.where(own, -1, joint.place), held=np.where(own, value[joint.place], joint.held))
+        measurement = self.measurement._replace(
+            constraint_value=value[:count], constraint_error=error[:count], joint=held
+        )
+        return Objective(measurement, replace(self.problem, names=names[:count]), robust=self.robust)
 
     def _of(self, measurement: Measurement, problem: Problem) -> "Objective":
         return Objective(measurement, problem, near=self.near, robust=self.robust, searched=self.searched)
