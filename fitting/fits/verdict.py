@@ -269,7 +269,7 @@ def _why_not_explained(evidence: Evidence) -> str:
     worst = np.nanmax(np.abs(np.where(np.isfinite(evidence.rows.residual), evidence.rows.residual, 0.0)), axis=1)
     far = np.argsort(-worst)[: max(1, len(worst) // 20)]
     names = evidence.parameters
-    tail = f"farthest off: {_rows_in_words(evidence.table, np.sort(far))}"
+    tail = f"farthest off: {_unexplained_tables(evidence)}{_rows_in_words(evidence.table, np.sort(far))}"
     # counting outliers less helps where the others are well explained: not if most are off, or off together
     few = 2 * _outliers(evidence, evidence.error_scale or 1.0).sum() <= evidence.rows.used.sum()
     if few and not evidence.robust and not _correlations(evidence):
@@ -293,6 +293,20 @@ def _why_not_explained(evidence: Evidence) -> str:
         "The impacts may last too long for an instantaneous law (a collision delay decides amplitudes near resonance: "
         f"try the model with +delay), the errors may be too small, or the calibration off; {tail}."
     )
+
+
+def _unexplained_tables(evidence: Evidence) -> str:
+    """Return which of several tables are not explained by themselves: 'B.csv (chi2 141/60); '; nothing of one table."""
+    if not isinstance(evidence.table, SeveralTables):
+        return ""
+    named = []
+    for t, label in enumerate(evidence.table.labels):
+        residual = evidence.rows.residual[evidence.table.number == t]
+        residual = residual[np.isfinite(residual)]
+        chi2 = float(residual @ residual)
+        if len(evidence.table.labels) * chdtrc(residual.size, chi2) < IMPROBABLE:
+            named.append((chi2 / residual.size, f"{label} (chi2 {chi2:.0f}/{residual.size}); "))
+    return "".join(words for _, words in sorted(named, reverse=True))
 
 
 def helpful_measurement(name: str) -> str:
