@@ -131,8 +131,9 @@ def branch_of(orbit: OrbitProblem, row: Rows, values: Float[Array, " p"], proble
 def followed(orbit: OrbitProblem, known: Branch, row: Rows) -> Branch:
     """Follow a row's orbit from where it is known to be: exact where it was found, close at other parameters."""
     harmless = harmless_coordinate(orbit)
-    root, found = follow_root(jnp.where(known.exists & ~row.free, known.place.coordinate, harmless), orbit)
-    there = known.exists & found & ~row.free
+    wanted = known.exists & ~row.free
+    root, found = follow_root(jnp.where(wanted, known.place.coordinate, harmless), orbit, wanted)
+    there = wanted & found
     exists = there | row.free
     return Branch(
         place=OrbitPlace(jnp.where(there, root.coordinate, harmless), root.phase),

@@ -211,7 +211,7 @@ def test_charts_sweeps_exponents_and_basins_of_driven_tips_come_to_the_orbit(kin
         float(seen.position_nm), abs=1e-6
     )
     lyapunov = lyapunov_spectrum(scene, impacts=400, transient=400)
-    multipliers = multipliers_of(orbits.trace[slot], orbits.determinant[slot])
+    multipliers = multipliers_of(*(np.asarray(part)[[slot]] for part in (orbits.trace, orbits.determinant)))[0]
     assert lyapunov.exponents_per_impact == pytest.approx(np.log(np.abs(multipliers)), abs=1e-8)
     basins = basins_of_attraction(scene, columns=12, rows=8)
     (orbit,) = (one for one in basins.attractors if one.name == "(1,1)")

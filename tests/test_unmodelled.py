@@ -208,14 +208,6 @@ def test_bands_hold_the_law_of_a_contact_that_is_not_the_models():
         assert low is not None
         assert top is not None
         assert low < 10.93845 < top
-        # the law that a scene takes is as close, and that of the parameters without their shapes is not
-        assert result.plain_law is not None
-        far = np.zeros(2)
-        for i, numbers in enumerate((result.plain_law.values, {n: p.value for n, p in result.parameters.items()})):
-            epsilon, loss = numbers["epsilon"], numbers["viscous_loss"]
-            far[i] = np.abs(np.sqrt(speeds**2 - loss * speeds - epsilon) / truth - 1.0).max()
-        assert far[0] < 0.5 * far[1]
-        assert far[0] < 2e-3
     assert np.mean(shares) >= 0.9
     assert max(worst) < 2.0
     assert 0.75 < np.mean(degrees) < 1.2
@@ -227,6 +219,8 @@ def test_the_loss_is_said_in_energies_and_in_the_papers_quantities():
     one = equivalent(u, w, np.stack([0.99 * u**2 / w * 1e-3, -1.0 / w], axis=1), 2.0)
     assert one is not None
     energy = energy_lost(20.0, 10.0, 0.1, 2.0)
+    # 2 ng (20^2 - 19.9^2)/2 -+ 39: no sample at rest gives energy
+    assert energy_lost(20.0, 19.9, 0.5, 2.0).energy_aj.interval95 == pytest.approx((0.0, 3.99 + 39.004), abs=1e-3)
     loss = Loss((energy,), (one,), interval_of(9.04, float("nan")))
     said = dict(losses_in_words(made_fit("law", loss=loss)))
     # 2 ng (20^2 - 10^2)/2, and 2 ng times 10 times 1.96 times 0.1 to either side

@@ -1,11 +1,28 @@
 """`--law fit.json`: a scene with the law that a fit found, and what the fit says of its errors."""
 
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import click
 
 if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
     from afm_jax.dynamics.bands import UncertainParameters
+
+
+def with_law_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command the options --law and --draws."""
+    law = click.option(
+        "--law",
+        type=click.Path(path_type=Path),
+        metavar="JSON",
+        help="A fit (fit.json of `afm-jax fit --out`): its law in place of the scene's, its errors as bands.",
+    )
+    draws = click.option(
+        "--draws", type=click.IntRange(2), default=20, show_default=True, help="Laws drawn from the fit for the bands."
+    )
+    return law(draws(function))
 
 
 def with_fitted_law(scene: "Scene", path: Path) -> "tuple[Scene, UncertainParameters]":
@@ -54,7 +71,8 @@ def with_fitted_law(scene: "Scene", path: Path) -> "tuple[Scene, UncertainParame
     correlations = np.array(payload["correlations"]["matrix"], float)[np.ix_(places, places)]
     covariance = correlations * np.outer(errors, errors)
     if plain is not None:
-        covariance = np.array(plain["covariance"], float)[np.ix_(places, places)]
+        places_there = [list(plain["values"]).index(name) for name in names]
+        covariance = np.array(plain["covariance"], float)[np.ix_(places_there, places_there)]
     made = eqx.tree_at(lambda parts: parts.interaction, scene, law, is_leaf=lambda part: part is None)
     if "quality_factor" in names:
         made = eqx.tree_at(lambda parts: parts.cantilever, made, problem.cantilever(everything, scene.cantilever))

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import FreeFrame
 from afm_jax.contact.contact import Contact
+from afm_jax.dynamics.bands import UncertainParameters
 from afm_jax.dynamics.contact_orbits import single_contact_orbits
 from afm_jax.dynamics.iteration import Report, SampleDriven, for_few, in_blocks, sample_driven
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem
@@ -27,6 +28,7 @@ from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.orbits import orbit_at
 from afm_jax.impact.roots import find_roots
 from afm_jax.results import public_result
+from afm_jax.scenefile.parameter_paths import scene_family
 
 _LANES = 1024
 """Scenes gone through together: few enough for the cache, many enough to fill the vector units."""
@@ -260,6 +262,27 @@ def stability_chart(
     columns = (column.ravel() for column in np.meshgrid(x, y))
     verdicts = orbit_verdicts(batch_of_scenes(scene_of, *columns), last_order=last_order, report=report)
     return StabilityChart(scene_of, x, y, verdicts)
+
+
+def stable_probability(
+    scene: Scene, chart: StabilityChart, known: UncertainParameters, paths: tuple[str, str], *, draws: int
+) -> Float[np.ndarray, "orders points"]:
+    """Return the share of draws of uncertain parameters in which an orbit of each order is stable.
+
+    Args:
+        scene: that of the chart.
+        chart: whose points are meant.
+        known: what is drawn; a parameter of the chart counts as its axis says.
+        paths: of the chart's parameters.
+        draws: how many.
+    """
+    known = known.without(paths[0]).without(paths[1])
+    family, columns = scene_family(scene, *paths, *known.paths), chart.points()
+    total = np.zeros(chart.verdicts.stable.shape)
+    for drawn in known.possible_draws(draws):
+        scenes = batch_of_scenes(family, *columns, *(np.full(len(columns[0]), value) for value in drawn))
+        total += orbit_verdicts(scenes, last_order=chart.orders).stable
+    return total / draws
 
 
 def batch_of_scenes(scene_of: Callable[..., Scene], *columns: np.ndarray) -> Scene:

@@ -30,8 +30,6 @@ from afm_jax.units import within_turn
 
 _MOST_RESTS = 32
 _FLIGHTS = 64
-_VALUES = 65
-"""At which the orbit is looked for before the ends of where it exists are narrowed."""
 _NARROWED = 1e-10
 """Of the range."""
 _SHORT_REST = 0.05
@@ -115,13 +113,16 @@ def sticking_orbit(scene: Scene, *, longest: int = 64) -> StickingOrbit | str:
     return f"a tip that is let go does not repeat itself within {_MOST_RESTS} rests"
 
 
-def follow_sticking(scene: Scene, order: int, given: ParameterRange, *, report: Report | None = None) -> Continuation:
+def follow_sticking(
+    scene: Scene, order: int, given: ParameterRange, *, values: int = 65, report: Report | None = None
+) -> Continuation:
     """Follow the orbit with rests on the surface through a parameter.
 
     Args:
         scene: one scene with an `ImpactLaw`, driven with one period.
         order: N, drive periods in which the orbit repeats.
         given: the parameter and its range.
+        values: at which the orbit is looked for, before the ends of where it exists are narrowed.
         report: told how many of how many values are done.
 
     Returns:
@@ -143,24 +144,24 @@ def follow_sticking(scene: Scene, order: int, given: ParameterRange, *, report: 
         found = sticking_orbit(family(given.low + width * share))
         return found if isinstance(found, StickingOrbit) and found.order == order else None
 
-    shares, orbits = np.linspace(0.0, 1.0, _VALUES).tolist(), []
+    shares, orbits = np.linspace(0.0, 1.0, values).tolist(), []
     for number, share in enumerate(shares):
         orbits.append(at(share))
         if report is not None:
-            report(number + 1, _VALUES)
+            report(number + 1, values)
     period = drive_of(scene).period_us
     stretches = [_ended(at, shares, orbits, stretch, _SHORT_REST * period) for stretch in _stretches(orbits)]
     branches, special = [], []
     for number, (points, ends) in enumerate(stretches):
-        values = given.low + width * np.array([share for share, _ in points])
-        readings = _readings([one for _, one in points], [family(value) for value in values])
-        branches.append(OrbitBranch(values, np.zeros((len(points), 0)), readings, ends))
+        places = given.low + width * np.array([share for share, _ in points])
+        readings = _readings([one for _, one in points], [family(value) for value in places])
+        branches.append(OrbitBranch(places, np.zeros((len(points), 0)), readings, ends))
         for place, kind in ((0, ends[0]), (len(points) - 1, ends[1])):
             if kind != "range":
                 own = jax.tree.map(lambda part, place=place: part[place], readings)
                 point = SpecialPoint(
                     kind=kind,
-                    parameter=float(values[place]),
+                    parameter=float(places[place]),
                     branch=number,
                     position=float(place),
                     admissible=True,
@@ -224,19 +225,19 @@ def _readings(orbits: list[StickingOrbit], scenes: list[Scene]) -> LoopReading:
         surface, response = surface_of(scene)
         time = orbit.release_phase_rad / drive_of(scene).angular_frequency
         velocity = float(to_lab(surface, response, time, 0.0, 0.0).velocity_nm_per_us)
-        nothing, moves = np.zeros(1), np.array([velocity])
+        nothing, moves = jnp.zeros(1), jnp.asarray([velocity])
         row = LoopReading(
-            phase_rad=np.array([orbit.release_phase_rad]),
+            phase_rad=jnp.asarray([orbit.release_phase_rad]),
             velocity_after_nm_per_us=moves,
             velocity_before_nm_per_us=moves,
             approach_speed_nm_per_us=nothing,
             rebound_speed_nm_per_us=nothing,
             delay_us=nothing,
-            peak_amplitude_nm=np.array(orbit.peak_amplitude_nm),
-            trace=np.zeros(()),
-            determinant=np.zeros(()),
-            admissible=np.ones((), bool),
-            missing=np.zeros(()),
+            peak_amplitude_nm=jnp.asarray(orbit.peak_amplitude_nm),
+            trace=jnp.zeros(()),
+            determinant=jnp.zeros(()),
+            admissible=jnp.ones((), bool),
+            missing=jnp.zeros(()),
         )
-        rows.append(jax.tree.map(jnp.asarray, row))
+        rows.append(row)
     return jax.tree.map(lambda *parts: np.stack([np.asarray(part) for part in parts]), *rows)

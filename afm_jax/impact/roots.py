@@ -117,10 +117,11 @@ def _monotone_roots(coefficients, left: Float[Array, " m"], right: Float[Array, 
 
 _LEAVING = 0.4
 """Share of the drive's period that a leaving tip may take to lose its energy: beyond, no law of impacts holds."""
-_REGULA_FALSI = 20
+_REGULA_FALSI, _BEFORE_NEWTON = 20, 10
+"""Steps towards a root of the scalar condition: to its last digit, and to where Newton's method goes on."""
 _SECTIONS = 16
 _GOLDEN = 0.6180339887498949
-_NEWTON = 5
+_NEWTON = 6
 _CLOSED = 1e-9
 """By how much a turn of the map may miss its start, in units of the drive: near a fold rounding leaves as much."""
 
@@ -169,18 +170,23 @@ def find_roots(problem: OrbitProblem, scan: Scan = FINE) -> OrbitRoots:
     driven = (problem.platform.amplitude_nm > 0.0) & (problem.platform.offset_rate_nm_per_us == 0.0)
     coordinate, found, complete = _scanned_roots(problem, scan) if problem.impact.delayed else _quartic_roots(problem)
     safe = jnp.where(found, coordinate, harmless_coordinate(problem))
-    place, there = jax.vmap(follow_root if problem.impact.lasts else _regular, in_axes=(0, None))(safe, problem)
+    if problem.impact.lasts:
+        place, there = jax.vmap(follow_root, in_axes=(0, None, 0))(safe, problem, found)
+    else:
+        place, there = jax.vmap(_regular, in_axes=(0, None))(safe, problem)
     found = found & driven & there
     return OrbitRoots(OrbitPlace(jnp.where(found, place.coordinate, safe), place.phase), found, complete)
 
 
 @jax.jit
-def follow_root(near: Float[Array, ""], problem: OrbitProblem) -> tuple[OrbitPlace, Bool[Array, ""]]:
-    """Return where the map of a lasting impact closes, close to a coordinate, and whether it does."""
+def follow_root(
+    near: Float[Array, ""], problem: OrbitProblem, wanted: Bool[Array, ""]
+) -> tuple[OrbitPlace, Bool[Array, ""]]:
+    """Return where the map of a lasting impact closes, close to a coordinate, and whether it does; if that is asked."""
     problem = lax.stop_gradient(problem)
     speeds, system = closure(near, problem)
-    unknowns, gaps = close_map(place_of(near, speeds, system, problem), problem, _NEWTON)
-    return OrbitPlace(*unknowns), system.regular & jnp.all(jnp.abs(gaps) < _CLOSED)
+    closed = close_map(place_of(near, speeds, system, problem), problem, _NEWTON, wanted)
+    return OrbitPlace(*closed.unknowns), system.regular & jnp.all(jnp.abs(closed.gaps) < _CLOSED)
 
 
 def harmless_coordinate(problem: OrbitProblem) -> Float[Array, ""]:
@@ -305,6 +311,7 @@ def _narrowed(crossings: _Brackets, dips: _Dips, problem: OrbitProblem) -> tuple
     count, turns = crossings.left.shape[0], dips.middle.shape[0]
     sign = jnp.sign(dips.middle)
     waits = jnp.arange(count + 2 * turns) >= count
+    illinois = _BEFORE_NEWTON if problem.impact.lasts else _REGULA_FALSI
 
     def pairs(middle, bottom) -> _Brackets:
         """Return the brackets to either side of the extrema."""
@@ -334,7 +341,7 @@ def _narrowed(crossings: _Brackets, dips: _Dips, problem: OrbitProblem) -> tuple
         either = jax.tree.map(
             lambda head, tail: jnp.concatenate([head[:count], tail]), brackets, pairs(points[0], value[count:][:turns])
         )
-        begun = jnp.where(waits, step > _SECTIONS, step < _REGULA_FALSI)
+        begun = jnp.where(waits, step > _SECTIONS, step < illinois)
         brackets = jax.tree.map(
             lambda new, found, old: jnp.where(begun, new, jnp.where(step == _SECTIONS, found, old)),
             closer,
@@ -345,6 +352,6 @@ def _narrowed(crossings: _Brackets, dips: _Dips, problem: OrbitProblem) -> tuple
 
     empty = jax.tree.map(lambda part: jnp.zeros((2 * turns,), part.dtype), dips.ends).kept(harmless)
     begin = jax.tree.map(lambda head, tail: jnp.concatenate([head, tail]), crossings.kept(harmless), empty)
-    steps = _SECTIONS + 1 + _REGULA_FALSI
+    steps = _SECTIONS + 1 + illinois
     brackets, _ = lax.fori_loop(0, steps, narrow, (begin, (dips.ends.left, dips.ends.right)))
     return brackets.left, brackets.real

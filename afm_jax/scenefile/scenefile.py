@@ -282,12 +282,12 @@ def check_start(start: Start, scene: Scene) -> None:
 
 
 def _check_leaves(start: Start, platform: Platform) -> None:
-    """Check that a tip on the platform moves away from it."""
+    """Check that a tip on the platform does not move into it; one at rest on it rides until the platform lets go."""
     time_us = start.phase_deg / 360.0 * float(platform.period_us)
     moving = float(platform.velocity(time_us))
-    if start.velocity_nm_per_us <= moving:
+    if start.velocity_nm_per_us < moving:
         raise ValueError(
-            f"`velocity_nm_per_us` must be above the platform's {moving:.6g} where the tip starts on it, but is "
+            f"`velocity_nm_per_us` must not be below the platform's {moving:.6g} where the tip starts on it, but is "
             f"{start.velocity_nm_per_us:.6g}: start faster or higher"
         )
 

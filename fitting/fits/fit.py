@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from scipy.special import chdtrc
 
 from afm_jax.checks import require_float64
 from afm_jax.contact.parameters import EFFECTS
@@ -29,6 +28,7 @@ from fitting.fits.intervals import (
     profile_intervals,
     within_range,
 )
+from fitting.fits.least_squares import chi2_tail
 from fitting.fits.loss import Loss, energy_lost, equivalent, interval_of
 from fitting.fits.minimum import (
     ATTRACTED,
@@ -344,7 +344,7 @@ class _Summary:
 
     def result(self) -> FitResult:
         judged = self.freedom > 0 and self.settings["error_scale"] is None and not self.searching.robust
-        p_value = float(chdtrc(self.freedom, self.chi2)) if judged else float("nan")
+        p_value = chi2_tail(self.chi2, self.freedom) if judged else float("nan")
         errors = np.sqrt(np.diag(self.covariance))
         moved = ~self.free | ~np.isfinite(errors) | (np.abs(self.values - self.minimum.start) > 1e-3 * errors)
         moved = np.append(moved, np.ones(len(self.names) - len(moved), dtype=bool))

@@ -19,7 +19,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from fitting.fits.least_squares import covariance_of
 from fitting.fits.minimum import Strain, padding
@@ -154,7 +153,7 @@ class Unmodelled:
             return np.exp(-0.5 * ((one[:, None] - other) / _SMOOTH) ** 2)
 
         root = np.linalg.cholesky(related(knots, knots) + 1e-8 * np.eye(knots.size))
-        return solve_triangular(root, related(knots, np.log(u)), lower=True).T
+        return np.linalg.solve(root, related(knots, np.log(u))).T
 
 
 def _stacked(square: list, late: list, count: int) -> Float[np.ndarray, "2 n m"]:
@@ -256,7 +255,7 @@ def step_of(
     root = np.linalg.cholesky(variance)
 
     def whitened(matrix):
-        return np.concatenate([solve_triangular(root, matrix[:size], lower=True), matrix[size:]])
+        return np.concatenate([np.linalg.solve(root, matrix[:size]), matrix[size:]])
 
     white, slope = whitened(residual), whitened(jacobian)
     moving = np.append(free, np.ones(len(priors), bool))
@@ -269,8 +268,7 @@ def step_of(
     ends = np.array([(p.lowest, p.highest) for p in map(parameter_called, (*names, *priors))])
     change = _bounded(white, slope, begin, ends, moving & np.isfinite(np.diag(covariance)))
     left = residual + jacobian @ change
-    factor = cho_factor(variance, lower=True)
-    gain = unknown.T @ cho_solve(factor, np.eye(size))
+    gain = np.linalg.solve(variance, unknown).T
     likely = -gain @ left[:size]
     return LinearStep(
         names=(*names, *priors),

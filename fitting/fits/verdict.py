@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.special import chdtrc
 
 from fitting.fits.intervals import Convergence
+from fitting.fits.least_squares import chi2_tail
 from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.result import FittedParameter, FittedRows
 from fitting.parameters import DELAY_NAMES, SHAPE_NAMES, name_of_table, parameter_called
@@ -196,7 +196,7 @@ def _scaled_misfits(evidence: Evidence) -> list[str]:
             f"{LARGEST_SCALE:g} is a misfit, not a matter of scale (if the errors are no more than weights, state them "
             "to within that)"
         )
-    if pulls and chdtrc(len(pulls), sum(pull**2 for pull in pulls.values())) < IMPROBABLE:
+    if pulls and chi2_tail(sum(pull**2 for pull in pulls.values()), len(pulls)) < IMPROBABLE:
         moved = ", ".join(f"{name} by {pull:+.1f}" for name, pull in pulls.items())
         found.append(f"it contradicts what is known beforehand, in standard errors: {moved}")
     return found
@@ -225,7 +225,7 @@ def _without_outliers(evidence: Evidence) -> tuple[float, int, float]:
     # the shapes are known as well as they are determined: neither data nor free
     freedom = inside.size + len(pulls) - sum(name not in SHAPE_NAMES for name in evidence.parameters)
     chi2 = float(np.sum(inside**2) + sum(pull**2 for pull in pulls.values()))
-    return chi2, freedom, float(chdtrc(freedom, chi2)) if freedom > 0 else float("nan")
+    return chi2, freedom, chi2_tail(chi2, freedom) if freedom > 0 else float("nan")
 
 
 def _outliers(evidence: Evidence, scale: float = 1.0) -> Bool[np.ndarray, " rows"]:

@@ -18,8 +18,8 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import chdtrc
 
+from fitting.fits.least_squares import chi2_tail
 from fitting.inversion.result import (
     Coefficient,
     ComparedLaw,
@@ -76,7 +76,7 @@ class Regression:
     @property
     def p_value(self) -> float:
         """Probability of a larger chi2 if the law is right; NaN without degrees of freedom."""
-        return float(chdtrc(self.degrees_of_freedom, self.chi2)) if self.degrees_of_freedom > 0 else float("nan")
+        return chi2_tail(self.chi2, self.degrees_of_freedom) if self.degrees_of_freedom > 0 else float("nan")
 
 
 def loss(u: np.ndarray, w: np.ndarray, _: np.ndarray) -> np.ndarray:
