@@ -43,7 +43,7 @@ from tests.malformed import corpus
 from tests.test_first_impact import compare_with_brute_force
 
 LONGEST_S = 60
-"""For a batch; a file, or the slowest of its tips, takes a tenth of a second."""
+"""Of the processor, for a batch; a file, or the slowest of its tips, takes a tenth of a second."""
 LANES = 256
 ROOT = Path(__file__).parent.parent
 Random = np.random.Generator
@@ -262,11 +262,11 @@ def main() -> None:
         # in slices, so that one that hangs is told from many
         for first in range(0, asked[name], _SLICE[name]):
             # not while the two programs of a kind of work are compiled
-            signal.alarm(LONGEST_S if first > _SLICE[name] else 0)
+            signal.setitimer(signal.ITIMER_PROF, LONGEST_S if first > _SLICE[name] else 0.0)
             start = time.monotonic()
             work(min(_SLICE[name], asked[name] - first), asked["seed"] + first)
             slowest = max(slowest, time.monotonic() - start)
-        signal.alarm(0)
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
         sys.stdout.write(
             f"{asked[name]} {name}: nothing found in {time.monotonic() - begin:.0f} s, a batch in {slowest:.0f}\n"
         )

@@ -51,7 +51,7 @@ def tapping_truth(number: int) -> TappingTruth:
     """Return one of the random contacts; each number always gives the same."""
     random = np.random.default_rng([SEED, number])
     while True:
-        share = random.uniform(size=6)
+        share = random.uniform(size=6).tolist()
         truth = TappingTruth(
             number=number,
             parameters={

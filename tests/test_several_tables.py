@@ -16,13 +16,15 @@ from afm_jax.impact.law import ImpactLaw
 from afm_jax.saved import save
 from fitting.experiments.belief import belief_of_fit
 from fitting.fits.fit import fit
+from fitting.fits.objective import Objective
 from fitting.fits.result import FitResult, FittedTable, Scatter
 from fitting.fits.several import Parts, departures_of, parts_of, pulls_of, scatter_between
 from fitting.fits.unmodelled import StepSystem
+from fitting.models import Problem, measurement_of
 from fitting.report.html import fit_page
 from fitting.report.report import row_records, summary
 from fitting.tables.several import SeveralTables
-from fitting.tables.table import AmplitudeTable
+from fitting.tables.table import AmplitudeTable, read_table
 from tests.fit_tables import example_amplitudes, rows, simulated
 from tests.made_fits import made_fit, made_parameter, made_rows, made_table
 
@@ -286,3 +288,24 @@ def test_laws_that_differ_are_named_and_their_scatter_is_found(tmp_path: Path):
     assert payload["scatter"]["r"]["value"] == pytest.approx(differing.scatter["r"].value)
     assert [table["name"] for table in payload["tables"]] == [path.name for path in paths]
     assert "part2.csv" in (tmp_path / "fit.html").read_text()
+
+
+@pytest.mark.slow
+def test_a_driven_sample_and_a_driven_tip_have_one_law():
+    sample, tapping = cut(example_amplitudes(), 2)[0], read_table("fitting/examples/tapping_contact.csv")
+    tapping = dataclasses.replace(tapping, mass_ng=1.0)
+    # what the same law predicts for the driven tip, and no noise
+    problem = Problem("law", ("r", "epsilon"), drive="force")
+    found = Objective(measurement_of(tapping, problem), problem).at_values(np.array([[0.95, 60.0]])).prediction
+    steady = np.asarray(found.orbits)[0, : tapping.rows] > 0
+    read = np.asarray(found.amplitude_nm)[0, : tapping.rows][steady]
+    driven = rows(tapping, steady, lockin_amplitude_nm=read[:, 1], phase_lag_deg=read[:, 2], source="tip.csv")
+    one, other = fit([sample, driven]), fit([driven, sample])
+    assert one.valid
+    assert [table.used for table in one.tables] == [sample.rows, steady.sum()]
+    for name, truth in (("r", 0.95), ("epsilon", 60.0)):
+        parameter = one.parameters[name]
+        assert abs(parameter.value - truth) < 3.0 * (parameter.standard_error or 0.0)
+        assert other.parameters[name].value == pytest.approx(parameter.value, rel=1e-6)
+    assert one.tables[1].nuisances.keys() > {"tip_calibration", "phase_zero_deg"}
+    assert one.tables[0].nuisances.keys() == {"quality_factor"}

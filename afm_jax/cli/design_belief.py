@@ -25,6 +25,7 @@ class BeliefOptions(NamedTuple):
     measured: Path | None
     model: str | None
     uncertainty: float
+    drive: str | None
     numbers: Mapping[str, Any]
 
 
@@ -53,7 +54,13 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(function)
     def command(
-        *args: Any, fit: Path | None, measured: Path | None, model: str | None, uncertainty: float, **options: Any
+        *args: Any,
+        fit: Path | None,
+        measured: Path | None,
+        model: str | None,
+        uncertainty: float,
+        drive: str | None,
+        **options: Any,
     ) -> Any:
         if options.pop("example"):
             if measured is not None:
@@ -61,7 +68,7 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
             measured, model = example_path(), model or "law"
         numbers = {name: options.pop(name) for name in _BELONG}
         given = {name: value for name, value in numbers.items() if value not in (None, ())}
-        return function(*args, belief_options=BeliefOptions(fit, measured, model, uncertainty, given), **options)
+        return function(*args, belief_options=BeliefOptions(fit, measured, model, uncertainty, drive, given), **options)
 
     # click lists options in the order of the decorators, the last one first
     for nuisance in NUISANCES[::-1]:
@@ -76,6 +83,11 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
             *value, type=Assignment(), multiple=True, metavar="NAME=X", help="A contact's parameter; repeatable."
         ),
         click.option("--free", metavar="NAMES", help="With contact: its parameters that a fit would determine."),
+        click.option(
+            "--drive",
+            type=click.Choice(("sample", "force", "base")),
+            help="What is driven: the sample, or the cantilever itself; else the sample, or as measured.",
+        ),
         click.option("--mass-ng", type=float, metavar="X", help="Effective mass of the tip; else 1."),
         click.option("--model", type=click.Choice(MODELS), help="What will be fitted; else law+delay, or the fit's."),
         click.option(
@@ -115,6 +127,8 @@ def believed(options: BeliefOptions, noise: float) -> "Belief":
     for name in options.numbers:
         if options.measured is None or name != "free":
             raise click.UsageError(f"{_option(name)} is what {source} says already; leave one of them out")
+    if options.drive is not None:
+        raise click.UsageError(f"--drive is what {source} says already; leave one of them out")
     from fitting.experiments.belief import belief_of_fit, read_belief  # noqa: PLC0415
 
     if options.fit is not None:
@@ -152,6 +166,7 @@ def _from_values(options: BeliefOptions) -> "Belief":
         free=free,
         fixed={name: value for name, value in contact.items() if name not in own},
         uncertainty=options.uncertainty,
+        drive=options.drive or "sample",
     )
 
 

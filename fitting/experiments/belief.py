@@ -27,8 +27,8 @@ from fitting.parameters import (
     paper_values,
 )
 from fitting.tables.csv_text import TableError, printable, read_fit_json
+from fitting.tables.table import DRIVES
 
-_COLUMNS = ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")
 UNCERTAINTY = 0.1
 """How far a belief is off, relative, where no measurement says."""
 DRAW_SEED = 1997
@@ -111,6 +111,7 @@ def believe(  # noqa: PLR0913
     fixed: Mapping[str, float] | None = None,
     effects: Sequence[str] = EFFECTS,
     uncertainty: float = UNCERTAINTY,
+    drive: str = "sample",
 ) -> Belief:
     """Return a belief made of values, before anything was measured.
 
@@ -126,20 +127,23 @@ def believe(  # noqa: PLR0913
         fixed: values of others of the model's parameters.
         effects: for "contact": the effects there are.
         uncertainty: how far the values may be off, relative (0.1 stands for 10 %).
+        drive: what is driven: "sample", "force" (on the tip) or "base".
 
     Raises:
         ValueError: if a name or value is impossible.
     """
+    if drive not in DRIVES:
+        raise ValueError(f"`drive` must be one of {', '.join(DRIVES)}, but is {drive!r}")
     own = model_parameters(model, None if free is None else tuple(free), fixed)
     known = {name: (float(value), float(error)) for name, (value, error) in (constraints or {}).items()}
-    _check_constraints(model, own, known)
+    _check_constraints(model, own, known, drive)
     given = dict(values or {})
     for name in given:
         if name not in own:
             raise ValueError(f"`values` names {name!r}, but the model {model!r} has {', '.join(own)}")
     if not 0.0 < uncertainty < 1.0:
         raise ValueError(f"`uncertainty` must be between 0 and 1, but is {uncertainty!r}; write 0.1 for 10 %")
-    problem = Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in known), tuple(effects))
+    problem = Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in known), tuple(effects), drive)
     assumed = [name for name in own if name not in given and name not in known]
     start = paper_values(model) | {name: value for name, (value, _) in known.items()} | given
     return Belief(
@@ -157,14 +161,14 @@ def believe(  # noqa: PLR0913
     )
 
 
-def _check_constraints(model: str, own: tuple[str, ...], known: Mapping[str, tuple[float, float]]) -> None:
+def _check_constraints(model: str, own: tuple[str, ...], known: Mapping[str, tuple[float, float]], drive: str) -> None:
     for name, (value, error) in known.items():
         if name not in (*own, *NUISANCE_NAMES):
             choice = ", ".join((*own, *NUISANCE_NAMES))
             raise ValueError(f"`constraints` names {name!r}, which is none of {choice}")
         if not (np.isfinite(value) and 0.0 < error < np.inf):
             raise ValueError(f"the constraint on {name} must be a value and a positive error, not {value} +- {error}")
-    if "offset_origin_nm" in known and model.endswith("+delay"):
+    if "offset_origin_nm" in known and model.endswith("+delay") and drive == "sample":
         raise ValueError(
             "offset_origin_nm and delay_offset_nm shift the same thing: with a delay leave the error of the offsets' "
             "origin out, or take the model 'contact'"
@@ -217,6 +221,12 @@ def read_belief(path: str | Path, uncertainty: float = UNCERTAINTY) -> tuple[Bel
         raise TableError(f"{printable(str(path))}: {error}") from error
 
 
+def _columns_of(drive: str | None) -> tuple[str, str, str, str]:
+    """Return the columns that say how a table's rows were driven."""
+    amplitude = "drive_amplitude_nm" if drive in (None, "sample") else "free_amplitude_nm"
+    return "order", "drive_frequency_khz", amplitude, "offset_nm"
+
+
 def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNCERTAINTY) -> Belief:
     """Return the belief that a fit leaves: its values, its covariance, and the drives that it used.
 
@@ -231,7 +241,8 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
     _check_payload(payload)
     settings, tables = payload.get("settings") or {}, payload["input"].get("tables") or [payload["input"]]
     # of several tables the first one's cantilever is designed with
-    table, driven = tables[0], [one for one in tables if one.get("drive", "sample") == "sample"]
+    table, drive = tables[0], tables[0].get("drive") or "sample"
+    driven = [one for one in tables if (one.get("drive") or "sample") == drive]
     # the shapes of loss and delay are known beforehand, not to be determined: what they do to the others stays
     kept = [name not in SHAPE_NAMES for name in payload["parameters"]]
     found = dict(compress(payload["parameters"].items(), kept))
@@ -240,7 +251,7 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
     believed = {name: entry["value"] for name, entry in found.items()} | (payload.get("plain_law") or {}).get(
         "values", {}
     )
-    problem = Problem(payload["model"], tuple(found), tuple(settings.get("effects") or EFFECTS))
+    problem = Problem(payload["model"], tuple(found), tuple(settings.get("effects") or EFFECTS), drive)
     notes = []
     if not payload["valid"]:
         reason = " ".join(payload.get("reasons") or ["no reason given."])
@@ -261,7 +272,7 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
             for name, entry in found.items()
             if entry.get("constraint")
         },
-        measured=np.array([[place for one in driven for place in one[name]] for name in _COLUMNS], float).T,
+        measured=np.array([[place for one in driven for place in one[name]] for name in _columns_of(drive)], float).T,
         source=f"fit of {table.get('source', 'a table')}",
         notes=tuple(notes),
     )
@@ -306,7 +317,10 @@ def _is_whole(payload: Mapping[str, Any]) -> bool:
         entries = [(entry["value"], entry["standard_error"] or 0.0) for entry in payload["parameters"].values()]
         matrix = [[np.nan if c is None else c for c in row] for row in payload["correlations"]["matrix"]]
         tables = payload["input"].get("tables") or [payload["input"]]
-        columns = [[column for name in _COLUMNS if (column := table[name]) is not None] for table in tables]
+        columns = [
+            [column for name in _columns_of(table.get("drive")) if (column := table[name]) is not None]
+            for table in tables
+        ]
         drives = all(np.array(of_one, float).ndim == 2 for of_one in columns)
         whole = np.isfinite([number for entry in entries for number in entry]).all()
         if (plain := payload.get("plain_law")) is not None:

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from afm_jax.checks import require_float64
 from afm_jax.version import version_of
 from fitting.experiments.belief import Belief, belief_of_fit, size_of
-from fitting.experiments.candidates import AMPLITUDES, LEFT_OUT, Candidates, candidates_of, forecast
+from fitting.experiments.candidates import AMPLITUDES, LEFT_OUT, PHASE_NOISE_DEG, Candidates, candidates_of, forecast
 from fitting.experiments.result import Design
 from fitting.fits.least_squares import covariance_of
 from fitting.fits.result import FitResult
@@ -190,7 +190,7 @@ def judge_design(
                 f"The forecast for {name} is rough: its error is {errors[name] / size:.0%} of {what} itself. Expect a "
                 "one-sided limit rather than a value."
             )
-    warnings += _edges(candidates, chosen)
+    warnings += _edges(candidates, chosen, tapping=belief.problem.tapping)
     return reasons, warnings
 
 
@@ -209,16 +209,18 @@ def _dominated(belief: Belief, information: Float[np.ndarray, "p p"], wanted: tu
             gains = " and ".join(f"{name} to {without[name]:.2g} instead of {errors[name]:.2g}" for name in led)
             warnings.append(
                 f"Most of the error comes from {nuisance}: if that were exactly known, these points would determine "
-                f"{gains}. Measure it better before adding points."
+                f"{gains} (by noise alone). Measure it better before adding points."
             )
     return warnings
 
 
-def _edges(candidates: Candidates, chosen: Int[np.ndarray, " points"]) -> list[str]:
+def _edges(candidates: Candidates, chosen: Int[np.ndarray, " points"], *, tapping: bool) -> list[str]:
     """Say where most points lie at the end of what can be driven: a wider range may then be better."""
     drives, usable = candidates.drives, candidates.usable
     warnings = []
-    for column, what in ((drives.amplitude_nm, "drive amplitude"), (drives.offset_nm, "offset")):
+    what = "free amplitude" if tapping else "drive amplitude"
+    columns = [(drives.amplitude_nm, what), (drives.offset_nm, "offset")]
+    for column, what in columns[:1] if tapping else columns:
         for end, word in ((column.min(), "smallest"), (column.max(), "largest")):
             share = float(np.mean(column[chosen] == end))
             if len(np.unique(column[usable])) > 1 and share > 0.5 and len(chosen) > 1:
@@ -241,6 +243,7 @@ def design(  # noqa: PLR0913
     criterion: str = "D",
     amplitudes: str = "both",
     largest_nm: float | None = None,
+    phase_noise_deg: float = PHASE_NOISE_DEG,
 ) -> Design:
     """Choose the drives to measure next, and forecast how well the parameters will then be known.
 
@@ -257,8 +260,11 @@ def design(  # noqa: PLR0913
         interest: the parameters to be known well, all others being unknown too; None: those of the law.
         criterion: "D": the smallest volume of their joint confidence region; "A": the smallest sum of their variances,
             each relative to the parameter (to the loss 1 - r for r).
-        amplitudes: what is read of each point: "peak", "lockin" or "both".
-        largest_nm: peak amplitude that the instrument takes; None: any.
+        amplitudes: what is read of each point: "peak", "lockin" or "both"; of a cantilever that is driven itself always
+            the lock-in amplitude and the lag.
+        largest_nm: peak amplitude that the instrument takes (of a cantilever that is driven itself the free one); None:
+            any.
+        phase_noise_deg: standard error of a lag in degrees.
 
     Returns:
         The points in the order of their use, with expected readings and errors; see `Design`.
@@ -270,14 +276,16 @@ def design(  # noqa: PLR0913
     require_float64()
     believed = belief_of_fit(belief) if isinstance(belief, FitResult) else belief
     wanted = _interest(believed, interest)
-    _check_options(points, noise, criterion, amplitudes, largest_nm)
+    _check_options(points, noise, criterion, amplitudes, largest_nm, phase_noise_deg)
     largest = np.inf if largest_nm is None else float(largest_nm)
-    candidates = candidates_of(believed, drives, noise=noise, amplitudes=amplitudes, largest_nm=largest)
+    candidates = candidates_of(
+        believed, drives, noise=noise, amplitudes=amplitudes, largest_nm=largest, phase_noise_deg=phase_noise_deg
+    )
     measure = _criterion(believed, candidates, wanted, criterion)
     usable, each = np.flatnonzero(candidates.usable), candidates.information
     chosen = usable[choose_points(believed.information, each[usable], points, measure)]
     reached = believed.information + each[chosen].sum(axis=0)
-    errors = forecast(believed, candidates, chosen, float(noise))
+    errors = forecast(believed, candidates, chosen, float(noise), phase_noise_deg)
     reasons, warnings = judge_design(believed, candidates, chosen, reached, errors[-1], wanted, points)
     return Design(
         belief=believed,
@@ -298,6 +306,8 @@ def design(  # noqa: PLR0913
             "criterion": criterion,
             "amplitudes": amplitudes,
             "largest_nm": largest_nm,
+            "phase_noise_deg": phase_noise_deg if believed.problem.tapping else None,
+            "drive": believed.problem.drive,
             "uncertainty": believed.uncertainty,
             "drives": len(drives.order),
         },
@@ -318,7 +328,9 @@ def _interest(belief: Belief, interest: Sequence[str] | None) -> tuple[str, ...]
     return tuple(interest)
 
 
-def _check_options(points: int, noise: float, criterion: str, amplitudes: str, largest_nm: float | None) -> None:
+def _check_options(
+    points: int, noise: float, criterion: str, amplitudes: str, largest_nm: float | None, phase_noise_deg: float
+) -> None:
     if points < 1:
         raise ValueError(f"`points` must be at least 1, but is {points}")
     if not 0.0 < noise < 1.0:
@@ -327,6 +339,8 @@ def _check_options(points: int, noise: float, criterion: str, amplitudes: str, l
         raise ValueError(f"`criterion` must be one of {', '.join(CRITERIA)}, but is {criterion!r}")
     if amplitudes not in AMPLITUDES:
         raise ValueError(f"`amplitudes` must be one of {', '.join(AMPLITUDES)}, but is {amplitudes!r}")
+    if not 0.0 < phase_noise_deg < 90.0:
+        raise ValueError(f"`phase_noise_deg` must be between 0 and 90, but is {phase_noise_deg!r}")
     if largest_nm is not None and not largest_nm > 0.0:
         raise ValueError(f"`largest_nm` must be positive, but is {largest_nm!r}")
 

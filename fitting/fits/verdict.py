@@ -269,7 +269,7 @@ def _why_not_explained(evidence: Evidence) -> str:
     worst = np.nanmax(np.abs(np.where(np.isfinite(evidence.rows.residual), evidence.rows.residual, 0.0)), axis=1)
     far = np.argsort(-worst)[: max(1, len(worst) // 20)]
     names = evidence.parameters
-    tail = f"farthest off: {_rows_in_words(evidence.table, np.sort(far))}"
+    tail = f"farthest off: {_unexplained_tables(evidence)}{_rows_in_words(evidence.table, np.sort(far))}"
     # counting outliers less helps where the others are well explained: not if most are off, or off together
     few = 2 * _outliers(evidence, evidence.error_scale or 1.0).sum() <= evidence.rows.used.sum()
     if few and not evidence.robust and not _correlations(evidence):
@@ -293,6 +293,20 @@ def _why_not_explained(evidence: Evidence) -> str:
         "The impacts may last too long for an instantaneous law (a collision delay decides amplitudes near resonance: "
         f"try the model with +delay), the errors may be too small, or the calibration off; {tail}."
     )
+
+
+def _unexplained_tables(evidence: Evidence) -> str:
+    """Return which of several tables are not explained by themselves: 'B.csv (chi2 141/60); '; nothing of one table."""
+    if not isinstance(evidence.table, SeveralTables):
+        return ""
+    named = []
+    for t, label in enumerate(evidence.table.labels):
+        residual = evidence.rows.residual[evidence.table.number == t]
+        residual = residual[np.isfinite(residual)]
+        chi2 = float(residual @ residual)
+        if len(evidence.table.labels) * chi2_tail(chi2, residual.size) < IMPROBABLE:
+            named.append((chi2 / residual.size, f"{label} (chi2 {chi2:.0f}/{residual.size}); "))
+    return "".join(words for _, words in sorted(named, reverse=True))
 
 
 def helpful_measurement(name: str) -> str:
@@ -319,13 +333,16 @@ def _table_warnings(evidence: Evidence) -> list[str]:
 
 
 def _damping_warnings(evidence: Evidence) -> list[str]:
-    several, warnings = isinstance(evidence.table, SeveralTables), []
+    warnings: dict[str, list[str]] = {}
     for table, label in zip(evidence.table.tables, evidence.table.labels, strict=True):
         own = name_of_table("quality_factor", label)
         along = evidence.parameters.get(own) or evidence.parameters.get("quality_factor")
         said = _damping_warning(table, along)
-        warnings += [f"{label}: {said}" if several else said] if said else []
-    return warnings
+        if said:
+            warnings.setdefault(said, []).append(label)
+    if not isinstance(evidence.table, SeveralTables):
+        return list(warnings)
+    return [f"{', '.join(labels)}: {said}" for said, labels in warnings.items()]
 
 
 def _damping_warning(table: AmplitudeTable, along: FittedParameter | None) -> str:

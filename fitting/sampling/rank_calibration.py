@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from fitting.fits.objective import Objective
+from fitting.fits.unmodelled import root_of
 from fitting.sampling.bootstrap import DataSets, Refit, fit_data_sets, shifts
 from fitting.sampling.draws import densities, noise_of
 from fitting.sampling.leave_one_out import pareto_smoothed
@@ -146,10 +147,8 @@ def _posterior(
     random: np.random.Generator,
 ) -> tuple[Float[np.ndarray, "draws q"], Float[np.ndarray, " draws"] | None]:
     """Return Gaussian draws around a fit with their likelihoods, and weights that make them the exact posterior's."""
-    error = np.sqrt(np.diag(covariance))
-    root = error[:, None] * np.linalg.cholesky(covariance / np.outer(error, error))
     z = random.normal(size=(DRAWS, values.size))
-    drawn = values + z @ root.T
+    drawn = values + z @ root_of(covariance).T
     lowest, highest = np.array([(p.lowest, p.highest) for p in objective.problem.parameters]).T
     inside = np.all((drawn >= lowest) & (drawn <= highest), axis=1)
     within = np.clip(drawn, lowest, highest)
