@@ -304,7 +304,7 @@ def _unexplained_tables(evidence: Evidence) -> str:
         residual = evidence.rows.residual[evidence.table.number == t]
         residual = residual[np.isfinite(residual)]
         chi2 = float(residual @ residual)
-        if len(evidence.table.labels) * chdtrc(residual.size, chi2) < IMPROBABLE:
+        if len(evidence.table.labels) * chi2_tail(chi2, residual.size) < IMPROBABLE:
             named.append((chi2 / residual.size, f"{label} (chi2 {chi2:.0f}/{residual.size}); "))
     return "".join(words for _, words in sorted(named, reverse=True))
 
