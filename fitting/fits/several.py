@@ -211,7 +211,7 @@ def scatter_between(parts: Parts) -> Between:
     Args:
         parts: with departures that have the parameters' units.
     """
-    from scipy.optimize import minimize  # noqa: PLC0415
+    from scipy.optimize import minimize  # noqa: PLC0415 (half a second that most fits do not need)
 
     count, tables = parts.law.size, len(parts.own)
     matrix, vector = parts.matrix.sum(axis=0), parts.vector.sum(axis=0)
@@ -263,7 +263,7 @@ def scatter_between(parts: Parts) -> Between:
 
 def _crossing(above: Callable[[float], float], inside: float, last: float) -> float:
     """Return where a function becomes positive between a place where it is not and the last one, or that."""
-    from scipy.optimize import brentq  # noqa: PLC0415
+    from scipy.optimize import brentq  # noqa: PLC0415 (as above)
 
     far = last
     if last > inside:
