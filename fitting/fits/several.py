@@ -191,7 +191,7 @@ class Between(NamedTuple):
         low: lower end of the 95 % interval.
         high: its upper end, infinite where it is open.
         cautious: with which errors are stated: a standard error larger. A few tables alone say how much they scatter,
-            and with the most likely scatter intervals of the mean hold it in 88 to 91 % of sets of four or eight.
+            and with the most likely scatter the intervals of the mean are too short.
     """
 
     value: Float[np.ndarray, " l"]
