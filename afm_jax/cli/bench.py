@@ -282,7 +282,7 @@ def command(session: Session, batches: tuple[int, ...], only: str | None, *, qui
     bench_dynamics.csv, bench_sweep.csv, bench_fits.csv and bench.json.
     """
     session.start_computing()
-    from afm_jax.bench.timing import available_cores  # noqa: PLC0415
+    from afm_jax.dynamics.iteration import available_cores  # noqa: PLC0415
 
     cores = available_cores()
     machine = machine_facts(cores)

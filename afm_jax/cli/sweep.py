@@ -182,7 +182,7 @@ def _tables(given: Any, folder: Path) -> list[Path]:
 
 def _use_all_cores() -> None:
     """Let JAX have a device for every core, before it starts, unless the user has said how many there are."""
-    from afm_jax.bench.timing import available_cores  # noqa: PLC0415
+    from afm_jax.dynamics.iteration import available_cores  # noqa: PLC0415
 
     flags = os.environ.get("XLA_FLAGS", "")
     if "host_platform_device_count" not in flags:
@@ -193,7 +193,7 @@ def _processes(plan: "SweepPlan") -> int:
     """Return how many processes use this machine best: one for batches, which take every device themselves."""
     from importlib.util import find_spec  # noqa: PLC0415
 
-    from afm_jax.bench.timing import available_cores  # noqa: PLC0415
+    from afm_jax.dynamics.iteration import available_cores  # noqa: PLC0415
 
     if not plan.recorder.alone or find_spec("distributed") is None:
         return 1

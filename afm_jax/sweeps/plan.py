@@ -7,7 +7,6 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from importlib import import_module
 from typing import Any
 
@@ -209,21 +208,12 @@ def plan_of(given: Mapping[str, Any]) -> SweepPlan:
     return SweepPlan(whole, axes, recorder)
 
 
-def compute_chunk(text: str, chunk: int) -> Columns:
-    """Return the results of a chunk, for a process that knows nothing but the input.
-
-    Args:
-        text: `SweepPlan.given` as JSON.
-        chunk: its number.
+def plan_of_worker(text: str) -> SweepPlan:
+    """Return the plan for a process that knows nothing but its input, `SweepPlan.given` as JSON.
 
     Raises:
         RuntimeError: if this process would compute otherwise than the one that asks.
     """
-    return _known_plan(text).compute(chunk)
-
-
-@lru_cache(maxsize=4)
-def _known_plan(text: str) -> SweepPlan:
     from afm_jax.compilation_cache import open_cache, silence_xla  # noqa: PLC0415
 
     silence_xla()
