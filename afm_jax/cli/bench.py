@@ -91,7 +91,7 @@ def dynamics_table(rows: Sequence[dict[str, Any]]) -> "Table":
     return table
 
 
-SWEEPS = {"sizes": [10_000, 100_000, 1_000_000, 10_000_000], "points": 4_000_000, "processes": [1, 2, 4]}
+SWEEPS = {"sizes": [10_000, 100_000, 1_000_000, 10_000_000], "points": 8_000_000, "processes": [1, 2, 4]}
 SWEEPS_QUICK = {"sizes": [2000], "points": 0, "processes": []}
 SWEEP_COLUMNS = (
     "what",

@@ -28,12 +28,13 @@ from afm_jax.sweeps.plan import SweepPlan, Variable, plan_of_worker, unit_of
 from afm_jax.version import __version__
 from afm_jax.whole_files import write_whole
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 STORE = "sweep.zarr"
 _MARKERS, _LOCK = "done", "lock"
 _COMPUTED = "computed"
 _SLAB = 1_000_000
 """Values of a coordinate that are written, and lie, together."""
+_FILLS = {"float64": math.nan, "string": ""}
 _MOST_SHOWN = 60
 
 
@@ -217,7 +218,7 @@ def _make(group: zarr.Group, plan: SweepPlan) -> dict[str, zarr.Array]:
             shape=plan.shape + extra,
             chunks=plan.block + extra,
             dtype=variable.dtype,
-            fill_value=math.nan if variable.dtype == "float64" else 0,
+            fill_value=_FILLS.get(variable.dtype, 0),
             dimension_names=tuple(axis.dimension for axis in plan.axes) + variable.dimensions,
             attributes={**variable.attributes(), "coordinates": _others(plan)},
         )

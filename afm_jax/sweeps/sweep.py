@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 import json
+import math
 import os
 import tempfile
 import time
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 _IN_FLIGHT = 2
 """Chunks handed out for every worker: it has the next one when it has done one."""
+_SECONDS_BETWEEN_LOOKS = 1.0
+"""At how many workers there are."""
 _RETRIES = 3
 _SECONDS_TO_ANSWER, _SECONDS_TO_START = 30, 600
 """Of a scheduler, and of its first worker, which may wait in a queue."""
@@ -183,10 +186,14 @@ def _handed_out(client: "Client", plan: SweepPlan, chunks: Iterable[int]) -> Ite
 
     numbers: dict[str, int] = {}
     under_way = as_completed()
+    threads, asked = 0, -math.inf
 
     def fill() -> None:
-        # workers may come and go
-        for chunk in itertools.islice(waiting, max(_IN_FLIGHT * _threads(client) - len(numbers), 1)):
+        nonlocal threads, asked
+        # workers may come and go; to ask takes as long as to write a chunk
+        if time.monotonic() - asked > _SECONDS_BETWEEN_LOOKS:
+            threads, asked = _threads(client), time.monotonic()
+        for chunk in itertools.islice(waiting, max(_IN_FLIGHT * threads - len(numbers), 1)):
             future = submit(chunk)
             numbers[future.key] = chunk
             under_way.add(future)
@@ -231,7 +238,7 @@ def _client(workers: int, scheduler: str | None) -> "Iterator[Client]":
 
 @contextlib.contextmanager
 def local_cluster(workers: int, *, cores_each: int | None = None) -> "Iterator[Any]":
-    """Give a Dask cluster of processes of this machine, spawned, each with one device and without a dashboard.
+    """Give a Dask cluster of processes of this machine, spawned, each with one device.
 
     Args:
         workers: how many.
@@ -249,7 +256,7 @@ def local_cluster(workers: int, *, cores_each: int | None = None) -> "Iterator[A
         "threads_per_worker": 1,
         "processes": True,
         "memory_limit": None,
-        "dashboard_address": None,
+        "dashboard_address": ":0",
         "silence_logs": logging.CRITICAL,
         "env": {
             "XLA_FLAGS": " ".join(flag for flag in flags if "host_platform_device_count" not in flag),
