@@ -37,6 +37,18 @@ def test_results_open_with_xarray_alone(tmp_path: Path):
     assert {"jax", "afm-jax", "numpy"} <= set(given["versions"])
 
 
+def test_points_without_a_result_say_why(tmp_path: Path):
+    run_plan(plan(explained=True), tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = xarray.open_zarr(str(tmp_path / STORE)).load()
+    np.testing.assert_array_equal(found["message"], np.where(SUM < 2.0, "the sum is below 2 \u00e4", ""))
+    before = contents(tmp_path)
+    (tmp_path / "done" / "0.json").unlink()
+    run_plan(plan(explained=True), tmp_path)
+    assert contents(tmp_path) == before
+
+
 def test_results_do_not_depend_on_chunks():
     whole = dataset_of(plan(), None)
     for chunk in (5, 84):
