@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import free_frame
-from afm_jax.contact.collide import collide
+from afm_jax.contact.collide import ONLY_FREE, collide
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.charts import highest_orbits
 from afm_jax.dynamics.exponents import lyapunov_spectrum
@@ -178,7 +178,9 @@ def _orbits(scene: Scene, paths: tuple[str, ...], *, orders: tuple[int, ...]) ->
 
 _COLLISION_VARIABLES = (
     Variable("rebound_speed_nm_per_us", "speed away from the sample; 0 where the tip is captured"),
-    Variable("collision_delay_us", "time between the crossings of gap 0 by the straight paths in and out"),
+    Variable(
+        "collision_delay_us", "time between the crossings of gap 0 by the straight paths in and out, if it leaves"
+    ),
     Variable("captured", "the tip stays at the sample", "bool"),
     Variable(
         "outcome",
@@ -212,8 +214,10 @@ def _collisions(
         trusted = found.outcome <= CollisionOutcome.CAPTURED_BY_JUNCTION
 
         def known(variable: Variable) -> Array:
-            part = getattr(found, variable.name)
-            return jnp.where(trusted, part, jnp.nan) if variable.dtype == "float64" else part
+            part, exists = getattr(found, variable.name), trusted
+            if variable.name in ONLY_FREE and variable.name != "rebound_speed_nm_per_us":
+                exists &= ~found.captured
+            return jnp.where(exists, part, jnp.nan) if variable.dtype == "float64" else part
 
         return {variable.name: known(variable) for variable in _COLLISION_VARIABLES}
 
