@@ -19,6 +19,7 @@ LEVELS = {
     "words": 0,
     "outcomes": 0,
     "checks": 1,
+    "least_squares": 0,
     "saved": 1,
     "results": 1,
     "compilation_cache": 0,
