@@ -190,7 +190,6 @@ TAPPING = _form(
     "belongs to a sample that is driven; with '# drive = force' or '# drive = base' the columns are "
     + ", ".join(column.name for column in _TAPPING),
 )
-COLUMN_NAMES = TABLE.names
 FORMS = {drive: TABLE if drive == "sample" else TAPPING for drive in DRIVES}
 """The columns of a table by what is driven."""
 _ALL = tuple({column.name: column for column in (*_SAMPLE, *_TAPPING)}.values())
