@@ -125,7 +125,7 @@ def test_simulations_are_those_of_the_command(tmp_path: Path):
         .invoke(main, ["simulate", str(tmp_path / "scene.toml"), "--periods", "300", "--until-settled", "--json"])
         .stdout
     )
-    for name in ("peak_amplitude_nm", "lockin_amplitude_nm", "dissipated_in_contact_aj"):
+    for name in ("peak_amplitude_nm", "lockin_amplitude_nm", "dissipated_in_contact_aj", "dissipated_per_contact_aj"):
         np.testing.assert_allclose(found[name].values[1], told[name], rtol=1e-9)
     assert bool(found["settled"][1]) == told["settled"]
     assert int(found["order"][1]) == told["order"]

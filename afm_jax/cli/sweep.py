@@ -26,7 +26,12 @@ _MOST_DRAWN = 2
 
 @click.command()
 @click.argument("sweep", metavar="SWEEP.toml", type=click.Path(path_type=Path))
-@click.option("--workers", type=click.IntRange(1, 1024), metavar="N", help="Processes of this machine, by Dask.")
+@click.option(
+    "--workers",
+    type=click.IntRange(1, 1024),
+    metavar="N",
+    help="Processes of this machine that share its cores, by Dask; 1: this one alone.",
+)
 @click.option("--scheduler", metavar="tcp://...", help="A Dask scheduler whose workers do the work.")
 @click.option("--dry-run", is_flag=True, help="Measure a chunk and say what the sweep would take; keep nothing.")
 @click.option("--plot", is_flag=True, help="Draw a sweep of one or two axes, sweep.png.")

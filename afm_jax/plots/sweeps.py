@@ -3,11 +3,12 @@
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 from afm_jax.plots.charts import cell_edges
 from afm_jax.plots.dynamics import label_of
@@ -71,15 +72,19 @@ def _logarithmic(found: "xarray.Dataset") -> list[str]:
     return names
 
 
-def _scaled(coordinate: "xarray.DataArray", side: str, *, ends: bool) -> dict[str, Any]:
-    """Return the scale of a side, "x" or "y", and its ends, which are all that was swept, drawn or not."""
+def _scale(panel: Axes, name: str, coordinate: "xarray.DataArray", *, ends: bool) -> None:
+    """Give a side, "x" or "y", the scale of its values and, if asked for, their ends: all that was swept."""
     log = "log" in coordinate.attrs
-    settings: dict[str, Any] = {f"{side}scale": "log" if log else "linear"}
+    if log:
+        panel.set(**{f"{name}scale": "log"})
+        side = panel.xaxis if name == "x" else panel.yaxis
+        side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        side.set_major_formatter("{x:g}")
+        side.set_minor_formatter("")
     low, high = coordinate.values.min(), coordinate.values.max()
     if ends and low < high:
         factor, step = (high / low) ** _MARGIN if log else 1.0, 0.0 if log else _MARGIN * (high - low)
-        settings[f"{side}lim"] = low / factor - step, high * factor + step
-    return settings
+        panel.set(**{f"{name}lim": (low / factor - step, high * factor + step)})
 
 
 def _layers(variable: "xarray.DataArray", axes: Sequence[str]) -> list[tuple[str, np.ndarray]]:
@@ -106,7 +111,7 @@ def _lines(
         panel.plot(coordinate.values, values, style, ms=3.0, linewidth=0.8, label=name or None)
     if any(name for name, _ in layers):
         panel.legend(frameon=False)
-    panel.set(**_scaled(coordinate, "x", ends=True))
+    _scale(panel, "x", coordinate, ends=True)
     panel.grid(color=GRID, alpha=0.25)
     label_axes(panel, x=label_of(coordinate.attrs["parameter"]), y=label)
 
@@ -131,7 +136,8 @@ def _plane(
         x, y = along[:2]
         at = np.broadcast_arrays(*(_spread(found[part], axes) for part in (x, y)))
         mesh = panel.scatter(*(part.ravel() for part in at), c=np.asarray(values).ravel(), s=6.0, cmap="cividis")
-    panel.set(**_scaled(found[x], "x", ends=not cells), **_scaled(found[y], "y", ends=not cells))
+    _scale(panel, "x", found[x], ends=not cells)
+    _scale(panel, "y", found[y], ends=not cells)
     bar = figure.colorbar(mesh, ax=panel)
     bar.set_label(label)
     panel.set_title(name, fontsize=11)

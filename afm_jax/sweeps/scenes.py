@@ -277,10 +277,17 @@ _OBSERVED = {
     "peak_force_nn": "largest force on the tip; only a resolved contact has one",
     "most_attractive_force_nn": "most attractive force on the tip; only a resolved contact has one",
     "dissipated_in_contact_aj": "energy lost to the sample per drive period",
+    "dissipated_per_contact_aj": "the same per contact",
     "dissipated_in_air_aj": "energy lost to the air per drive period",
     "given_by_drives_aj": "energy given by the drives per drive period",
+    "stored_aj": "growth of the energy of tip and spring per drive period",
+    "energy_imbalance": "what these energies leave unexplained, of the largest; only of a resolved contact",
     "virial_aj": "mean of force times height",
     "peak_deflection_nm": "largest deflection against a moving base",
+    "mean_deflection_nm": "its mean",
+    "deflection_lockin_amplitude_nm": "its amplitude at the response frequency",
+    "deflection_lockin_phase_deg": "its phase, modulo 360/N",
+    "phase_lag_deg": "lag of deflection or height behind the base or force that drives the tip, modulo 360/N",
 }
 _REFUSED = -1
 _SIMULATION_VARIABLES = (
