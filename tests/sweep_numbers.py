@@ -20,13 +20,16 @@ SIZES = (7, 12)
 
 
 def recorder(given: Mapping[str, Any], axes: Sequence[Axis]) -> Recorder:  # noqa: ARG001
-    """Return what adds a tenth of y to x; slowly if asked for, and telling in a folder which process does."""
+    """Return what adds a tenth of y to x; slowly if asked for, telling which process does, with how many threads."""
     record = given["record"]
 
     def work(columns: Columns) -> Columns:
         time.sleep(record.get("seconds", 0.0))
         if "told" in record:
-            (Path(record["told"]) / f"{os.getpid()}").touch()
+            path = Path(record["told"]) / f"{os.getpid()}"
+            # once, since it may be killed at any time
+            if not path.exists():
+                path.write_text(os.environ.get("NPROC", ""))
         found = columns["x"] + 0.1 * columns["y"]
         why = np.where(found < 2.0, "the sum is below 2 \u00e4", "")
         parts = {

@@ -20,6 +20,7 @@ from click.testing import CliRunner
 import afm_jax
 from afm_jax.cli.main import main
 from afm_jax.dynamics.exponents import Lyapunov, lyapunov_spectrum
+from afm_jax.dynamics.iteration import available_cores
 from afm_jax.dynamics.verdicts import Verdicts
 from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
 from afm_jax.scenefile.presets import preset
@@ -182,6 +183,7 @@ def test_a_killed_worker_costs_nothing_but_time(tmp_path: Path):
     assert done.computed == 14
     # two workers, and the one that took the place of the killed one
     assert len(list(told.iterdir())) == 3
+    assert {path.read_text() for path in told.iterdir()} == {str(max(available_cores() // 2, 1))}
     found, whole = (xarray.open_zarr(str(tmp_path / name / "sweep.zarr")).load() for name in ("out", "whole"))
     assert found.drop_attrs().identical(whole.drop_attrs())
 
