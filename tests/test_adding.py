@@ -50,8 +50,8 @@ DELAY = {
         (
             '        symbol="d",\n    ),\n',
             (
-                '{}    Parameter(name="delay_late_nm2_per_us", unit="nm^2/us", meaning="late", lowest=-1e3, highest=1e3,\n'
-                '        width=1.0, starts=(-0.5, 0.5), symbol="f"),\n'
+                '{}    Parameter(name="delay_late_nm2_per_us", unit="nm^2/us", meaning="late",\n'
+                '        lowest=-1.0, highest=1.0, width=1.0, starts=(-0.5, 0.5), symbol="f"),\n'
             ),
         ),
         ('"delay_offset_nm": 0.726', '{}, "delay_late_nm2_per_us": 0.0'),
