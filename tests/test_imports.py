@@ -207,6 +207,11 @@ def test_packages_start_without_jax():
     assert python(code).split() == ["False", "True"]
 
 
+def test_fits_load_no_scipy():
+    # its statistics alone take as long as JAX: they are for posteriors, which import them when they need them
+    assert python("import sys, fitting.fits.fit, fitting.report.report; print('scipy' in sys.modules)") == "False"
+
+
 def test_no_module_takes_the_place_of_a_public_function():
     # `import fitting.calibration.sweep` puts the name `calibration` into `fitting`: were a folder called `calibrate`,
     # the function of that name would be gone.

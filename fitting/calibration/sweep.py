@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from afm_jax.results import public_result
-from fitting.instruments.formats import read_recording
+from fitting.instruments.formats import holds_curves, read_recording
 from fitting.instruments.recording import UNITS, Recording
 from fitting.tables.csv_text import (
     NUMBER,
@@ -291,8 +291,14 @@ def read_sweep(path: str | Path) -> ResonanceSweep:
     """
     faults = Faults(str(path))
     with contextlib.suppress(OSError), Path(path).open("rb") as file:
-        if file.read(9) == b"[DataSet]":
+        head = file.read(4096)
+        if head.startswith(b"[DataSet]"):
             return _spectrum_of(read_recording(path))
+        if holds_curves(head, str(path)):
+            raise TableError(
+                f"{path}: holds curves against height, no resonance sweep; --slope reads the sensitivity off force "
+                "curves, `afm-jax tapping` the energy of a tap off amplitude and phase"
+            )
     text = read_text(path)
     parse = parse_nanonis if any(line.strip() == MARK for line in text.split("\n")) else parse_csv
     parsed = parse(text, faults)
