@@ -298,3 +298,14 @@ def test_interrupt_ends_with_130():
         process.send_signal(signal.SIGINT)
         _, complaint = process.communicate(timeout=30)
     assert (process.returncode, complaint.strip()) == (130, b"afm-jax: interrupted")
+
+
+def test_compiling_is_not_counted_in_the_time_left(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    clock = iter([0.0, *[30.0] * 3, *[33.0] * 2])
+    monkeypatch.setattr("afm_jax.cli.session.time.monotonic", lambda: next(clock))
+    report = Session(json=False, out=None).progress("points")
+    for done in (100, 200):
+        report(done, 400)
+    first, second = capsys.readouterr().err.splitlines()
+    assert first == "100 of 400 points"
+    assert second == "200 of 400 points, about 6 s left"

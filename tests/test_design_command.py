@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from afm_jax.cli.design_belief import BeliefOptions, believed
 from afm_jax.cli.main import main
 from fitting import fit, read_table
 from tests.fit_tables import EXAMPLE, rows
@@ -143,6 +144,8 @@ def test_too_few_points_determine_nothing():
     [
         ((), "give --free-frequency-khz"),
         (("--free-frequency-khz", 90, "--fit", "fit.json"), "leave one of them out"),
+        (("--free-frequency-khz", 90, "--model", "law", "--free", "r"), "held at a value (--fix)"),
+        (("--free-frequency-khz", 90, "--model", "law", "--fix", "lag=1"), "--fix must name parameters of the model"),
         (("--fit", "a", "--measured", "b"), "give one of them"),
         ((*CANTILEVER, "--frequencies-khz", 180, "--detuning", 1), "give one"),
         ((*CANTILEVER, "--offsets-nm", "1;2"), "is not a number"),
@@ -182,3 +185,10 @@ def test_help_needs_no_jax():
         "try:\n    main(['design', '--help'])\nexcept SystemExit:\n    pass\nprint('jax' in sys.modules)"
     )
     assert python(code).split()[-1] == "False"
+
+
+def test_what_is_held_is_not_forecast():
+    options = BeliefOptions(None, None, "full", 0.1, None, {"free_frequency_khz": (90.0, None), "fix": (("r", 0.9),)})
+    belief = believed(options, 0.01)
+    assert belief.problem.names == ("epsilon", "viscous_loss")
+    assert belief.fixed == {"r": 0.9}

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 _LAW = tuple(parameter.name for parameter in (*LAW, *DELAY))
 _REMARKS = {"quality_factor": "; none: no air damping", "offset_origin_nm": "; not with a delay"}
-_BELONG = ("mass_ng", "free", "value", *_LAW, *NUISANCE_NAMES)
+_BELONG = ("mass_ng", "free", "fix", "value", *_LAW, *NUISANCE_NAMES)
 
 
 class BeliefOptions(NamedTuple):
@@ -82,7 +82,10 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
         click.option(
             *value, type=Assignment(), multiple=True, metavar="NAME=X", help="A contact's parameter; repeatable."
         ),
-        click.option("--free", metavar="NAMES", help="With contact: its parameters that a fit would determine."),
+        click.option("--free", metavar="NAMES", help="Parameters that a fit would determine, if not all not fixed."),
+        click.option(
+            "--fix", type=Assignment(), multiple=True, metavar="NAME=X", help="A parameter that is not fitted."
+        ),
         click.option(
             "--drive",
             type=click.Choice(("sample", "force", "base")),
@@ -125,7 +128,7 @@ def believed(options: BeliefOptions, noise: float) -> "Belief":
         return _from_values(options)
     source = "--fit" if options.measured is None else "--measured"
     for name in options.numbers:
-        if options.measured is None or name != "free":
+        if options.measured is None or name not in {"free", "fix"}:
             raise click.UsageError(f"{_option(name)} is what {source} says already; leave one of them out")
     if options.drive is not None:
         raise click.UsageError(f"--drive is what {source} says already; leave one of them out")
@@ -140,7 +143,10 @@ def believed(options: BeliefOptions, noise: float) -> "Belief":
     from fitting.tables.table import read_table  # noqa: PLC0415
 
     table = read_table(options.measured or "", noise=noise)
-    return belief_of_fit(fit(table, options.model or "law+delay", free=_names(options)), options.uncertainty)
+    return belief_of_fit(
+        fit(table, options.model or "law+delay", free=_names(options), fixed=dict(options.numbers.get("fix", ()))),
+        options.uncertainty,
+    )
 
 
 def _from_values(options: BeliefOptions) -> "Belief":
@@ -150,7 +156,11 @@ def _from_values(options: BeliefOptions) -> "Belief":
     if "free_frequency_khz" not in numbers:
         raise click.UsageError("give --free-frequency-khz (and --quality-factor), or --fit or --measured")
     quality_factor, _ = numbers.get("quality_factor", (None, None))
-    own = model_parameters(model, free)
+    fixed = dict(numbers.get("fix", ()))
+    try:
+        own = model_parameters(model, free, fixed)
+    except ValueError as error:
+        raise click.UsageError(str(error).replace("`free`", "--free").replace("`fixed`", "--fix")) from error
     contact = dict(numbers.get("value", ()))
     values = {name: value for name, value in numbers.items() if name in _LAW}
     for name in NUISANCE_NAMES:
@@ -164,7 +174,7 @@ def _from_values(options: BeliefOptions) -> "Belief":
         values=values | {name: value for name, value in contact.items() if name in own},
         constraints={name: numbers[name] for name in NUISANCE_NAMES if numbers.get(name, (0, None))[1] is not None},
         free=free,
-        fixed={name: value for name, value in contact.items() if name not in own},
+        fixed=fixed | {name: value for name, value in contact.items() if name not in own},
         uncertainty=options.uncertainty,
         drive=options.drive or "sample",
     )

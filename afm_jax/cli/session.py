@@ -146,13 +146,16 @@ class Session:
 
     def progress(self, what: str) -> Callable[[int, int], None]:
         """Return what tells on standard error, every two seconds at most, what is done and how long the rest takes."""
-        first = last = time.monotonic()
+        last = time.monotonic()
+        begun: tuple[float, int] | None = None
 
         def report(done: int, total: int) -> None:
-            nonlocal last
+            nonlocal last, begun
+            # until the first report programs were compiled, which the rest need not wait for
+            since, before = begun = begun or (time.monotonic(), done)
             if time.monotonic() - last > _SECONDS_BETWEEN_NOTES:
                 last = time.monotonic()
-                left = (last - first) * (total - done) / done if done else math.inf
+                left = (last - since) * (total - done) / (done - before) if done > before else math.inf
                 self.note(f"{done} of {total} {what}" + (f", about {_duration(left)} left" if 0.0 < left < 1e6 else ""))
 
         return report

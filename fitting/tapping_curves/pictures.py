@@ -57,7 +57,8 @@ def curve_figure(result: Tapping) -> Figure:
         x="height of the sample over the tip's rest position (nm)" if curve.height_known else "height (nm)",
         y="energy of a tap (aJ)" if curve.has_phase else "at most (aJ)",
     )
-    bottom.legend(fontsize=_SMALL)
+    # a legend in the panel would hide readings
+    bottom.legend(fontsize=_SMALL, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=4)
     for axes in (top, *between, bottom):
         axes.grid(color=GRID, alpha=0.25)
     return figure
