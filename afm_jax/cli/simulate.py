@@ -111,7 +111,7 @@ def command(  # noqa: PLR0913
         raise click.UsageError("--duration-us and --periods say the same: give one of them")
     if samples and session.out is None:
         raise click.UsageError("--samples writes a trace: say into which folder by --out DIR")
-    session.start_computing("afm_jax.motion.simulate:_contact")
+    session.start_computing()
     from afm_jax.apparatus.scene import drive_of  # noqa: PLC0415
     from afm_jax.cli.values import scene_and_start  # noqa: PLC0415
     from afm_jax.motion.observe import observe  # noqa: PLC0415
