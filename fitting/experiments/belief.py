@@ -82,6 +82,9 @@ class Belief:
         """
         sizes = np.array([size_of(p, v) for p, v in zip(self.problem.parameters, self.values, strict=True)])
         spread = self.uncertainty * sizes
+        # a share of the frequency would be many widths of the resonance
+        if "free_frequency_khz" in self.constraints:
+            spread[self.problem.names.index("free_frequency_khz")] = self.constraints["free_frequency_khz"][1]
         # In units of the spread: the information then has eigenvalues of at least 1.
         scaled = spread[:, None] * self.information * spread + np.eye(len(spread))
         curvature, axes = np.linalg.eigh(scaled)
