@@ -148,7 +148,7 @@ def believe(  # noqa: PLR0913
         raise ValueError(f"`uncertainty` must be between 0 and 1, but is {uncertainty!r}; write 0.1 for 10 %")
     problem = Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in known), tuple(effects), drive)
     assumed = [name for name in own if name not in given and name not in known]
-    start = paper_values(model) | {name: value for name, (value, _) in known.items()} | given
+    start = paper_values(model, mass_ng) | {name: value for name, (value, _) in known.items()} | given
     return Belief(
         problem=problem,
         values=checked_values(problem, start),
