@@ -196,7 +196,9 @@ def interval_in_words(parameter: FittedParameter) -> str:
 
 
 def value_in_words(parameter: FittedParameter) -> str:
-    """Return the value with the digits that its error warrants; three where it has none."""
+    """Return the value with the digits that its error warrants, three where it has none; 0 or 1 of one at its bound."""
+    if parameter.at_bound:
+        return f"{parameter.value:z.0f}"
     return value_alone(parameter.value, parameter.standard_error)
 
 
