@@ -34,19 +34,19 @@ def value_alone(value: float, error: float | None, *, unknown: str = ".3g") -> s
     ('40.1', '40.1')
     """
     # the 95 % interval is about four standard errors wide
-    return f"{value:{unknown}}" if error is None else f"{value:.{decimals(4.0 * error)}f}"
+    return f"{value:{unknown}}" if error is None else f"{value:z.{decimals(4.0 * error)}f}"
 
 
 def with_error(value: float | None, error: float | None) -> str:
     """Return a value and its error with two digits of the error.
 
-    >>> with_error(40.1234, 0.41), with_error(40.1, None)
-    ('40.12 +- 0.41', 'not known')
+    >>> with_error(40.1234, 0.41), with_error(-0.001, 0.41), with_error(40.1, None)
+    ('40.12 +- 0.41', '0.00 +- 0.41', 'not known')
     """
     if value is None or error is None:
         return "not known"
     digits = decimals(error)
-    return f"{value:.{digits}f} +- {error:.{digits}f}"
+    return f"{value:z.{digits}f} +- {error:.{digits}f}"
 
 
 def interval(low: float, high: float) -> str:
@@ -56,7 +56,7 @@ def interval(low: float, high: float) -> str:
     '0.9492 to 0.9508'
     """
     digits = decimals(high - low)
-    return f"{low:.{digits}f} to {high:.{digits}f}"
+    return f"{low:z.{digits}f} to {high:z.{digits}f}"
 
 
 def known(value: SupportsFloat | None, form: str = ".3g") -> str:

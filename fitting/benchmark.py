@@ -187,9 +187,7 @@ def tapped_table(rows: int) -> AmplitudeTable:
     """
     mass = 16.81
     problem = Problem(DELAYED, model_parameters(DELAYED), drive="force")
-    # a loss of squared speed is an energy over the mass
-    power = {parameter.name: -1.0 if parameter.sign else parameter.mass_power for parameter in problem.parameters}
-    values = np.array([paper_values(DELAYED)[name] * mass ** power[name] for name in problem.names])
+    values = np.array([paper_values(DELAYED, mass)[name] for name in problem.names])
     count = 2 * rows
     free = np.array([60.0, 80.0, 100.0])[np.arange(count) % 3]
     share = np.linspace(0.9, 0.3, count)

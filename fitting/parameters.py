@@ -358,13 +358,16 @@ def _check_fixed(model: str, names: tuple[str, ...], fixed: Mapping[str, float])
             raise ValueError(f"`fixed`: {name} must lie {between}, but is {value!r}")
 
 
-def paper_values(model: str) -> dict[str, float]:
+def paper_values(model: str, mass_ng: float = 1.0) -> dict[str, float]:
     """Return the values of a model's parameters for the paper's contact.
 
     Args:
         model: a key of `MODELS`.
+        mass_ng: of the tip; the paper's is 1. Losses of squared speed are an energy over the mass.
     """
     if model == "contact":
         return PAPER
     values = LAWS[model.removesuffix("+delay")].paper
-    return values | DELAY_LAW.paper if model.endswith("+delay") else values
+    values = values | DELAY_LAW.paper if model.endswith("+delay") else values
+    power = {"epsilon": -1.0, "viscous_loss": -1.0}
+    return {name: value * mass_ng ** power.get(name, PARAMETERS[name].mass_power) for name, value in values.items()}

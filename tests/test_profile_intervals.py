@@ -120,3 +120,43 @@ def test_a_side_where_chi2_is_not_finite_is_open_and_the_others_are_not(number):
     assert first.low == pytest.approx(0.8 - QUANTILE * 0.01, abs=1e-5)
     assert second.low is not None
     assert second.high is not None
+
+
+def test_an_interval_goes_on_along_a_bent_valley_where_a_straight_step_loses_an_orbit():
+    # r is known to 0.01; epsilon follows 120 + bend (r - 0.8)^2, and 3 of its errors beside that an orbit is lost
+    bend, error, stated = 4.0 * 3.0 / 0.01372**2, 3.0, 0.007
+
+    class Lost(LinearObjective):
+        def at_values(self, values):
+            found = super().at_values(values)
+            apart = values[:, 0] - 0.8
+            beside = (values[:, 1] - 120.0 - bend * apart**2) / error
+            residual, jacobian = np.array(found.residual), np.array(found.jacobian)
+            residual[:, 1], jacobian[:, 1, 0] = beside, -2.0 * bend * apart / error
+            lost = np.abs(beside) > 3.0
+            residual[lost, 1], jacobian[lost, 1] = 300.0, 0.0
+            return found._replace(residual=residual, jacobian=jacobian)
+
+    centre = np.array([0.8, 120.0])
+    first, _ = profile_intervals(
+        Lost(np.diag([100.0, 1.0 / error]), centre), centre, np.diag([stated**2, error**2]), 1.5**2
+    )
+    assert first.low == pytest.approx(0.8 - QUANTILE * 0.01, abs=1e-5)
+    assert first.high == pytest.approx(0.8 + QUANTILE * 0.01, abs=1e-5)
+
+
+def test_an_interval_ends_where_an_orbit_is_lost():
+    class Torn(LinearObjective):
+        def at_values(self, values):
+            found = super().at_values(values)
+            lost = (values[:, 0] > 0.81)[:, None]
+            return found._replace(
+                residual=np.where(lost, 300.0, found.residual),
+                jacobian=np.where(lost[..., None], 0.0, found.jacobian),
+            )
+
+    centre = np.array([0.8, 120.0])
+    first, _ = profile_intervals(Torn(np.diag([100.0, 0.3]), centre), centre, np.diag([1e-4, 9.0]), 1.5**2)
+    # within a hundredth of the standard error
+    assert first.high == pytest.approx(0.81, abs=1e-4)
+    assert first.low == pytest.approx(0.8 - QUANTILE * 0.01, abs=1e-5)

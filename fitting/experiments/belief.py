@@ -82,6 +82,9 @@ class Belief:
         """
         sizes = np.array([size_of(p, v) for p, v in zip(self.problem.parameters, self.values, strict=True)])
         spread = self.uncertainty * sizes
+        # a share of the frequency would be many widths of the resonance
+        if "free_frequency_khz" in self.constraints:
+            spread[self.problem.names.index("free_frequency_khz")] = self.constraints["free_frequency_khz"][1]
         # In units of the spread: the information then has eigenvalues of at least 1.
         scaled = spread[:, None] * self.information * spread + np.eye(len(spread))
         curvature, axes = np.linalg.eigh(scaled)
@@ -145,7 +148,7 @@ def believe(  # noqa: PLR0913
         raise ValueError(f"`uncertainty` must be between 0 and 1, but is {uncertainty!r}; write 0.1 for 10 %")
     problem = Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in known), tuple(effects), drive)
     assumed = [name for name in own if name not in given and name not in known]
-    start = paper_values(model) | {name: value for name, (value, _) in known.items()} | given
+    start = paper_values(model, mass_ng) | {name: value for name, (value, _) in known.items()} | given
     return Belief(
         problem=problem,
         values=checked_values(problem, start),

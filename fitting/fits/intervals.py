@@ -22,6 +22,10 @@ _SETTLED = 1e-6
 """Estimated distance of chi2 to its minimum over the others at which these have arrived."""
 _FARTHEST = 100.0
 """Distance in standard errors at which a search gives up: the data do not determine the parameter on that side."""
+_LOST = 1e3
+"""Rise of chi2 that says that a row has lost its orbit on the way there: shorter steps may keep it."""
+_NEAREST = 0.01
+"""Step in standard errors from which that is the end."""
 _FIRST_TRIAL = float(np.sqrt(CHI2_95))
 """In standard errors: where the end lies if chi2 is a parabola."""
 
@@ -41,7 +45,8 @@ class _Side:
 
     index: int
     direction: float
-    others: Float[np.ndarray, " p"]  # places (`_Places`); the profiled one is not used
+    others: Float[np.ndarray, " p"]  # places (`_Places`) at `inside`; the profiled one is not used
+    along: Float[np.ndarray, " p"]  # how they go on from there, by distance
     inside: float = 0.0  # distance in errors that lies inside the interval
     outside: float = np.inf
     inside_root: float = 0.0  # root of the rise of chi2 there
@@ -66,8 +71,9 @@ def profile_intervals(
         chi2: at the fitted values.
     """
     errors = np.sqrt(np.diag(covariance))
+    here = _Places(objective).of_values(values)
     sides = [
-        _Side(index, direction, _followers(objective, values, covariance, index, direction))
+        _Side(index, direction, here, _followers(objective, values, covariance, index, direction))
         for index in range(len(values))
         for direction in (-1.0, 1.0)
         if np.isfinite(errors[index]) and not is_of_one_table(objective.problem.names[index])
@@ -101,9 +107,16 @@ def _advance(objective: Objective, sides: list[_Side], values, errors, chi2: flo
         if not np.isfinite(above):
             side.reason = "chi2 is not finite on this side"
             continue
+        if above > _LOST:
+            # an orbit that was seen must be there: where it is lost the interval ends
+            side.trial = side.inside + 0.5 * (distance - side.inside)
+            side.end = float(target) if distance - side.inside < _NEAREST else None
+            continue
         root = float(np.sqrt(max(above, 0.0)))
         if above < rise:
-            side.inside_root = root if distance >= side.inside else side.inside_root
+            if distance > side.inside:
+                side.along = (coordinates - side.others) / (distance - side.inside)
+                side.inside_root = root
             side.inside, side.others = max(side.inside, distance), coordinates
             if target == end:
                 side.reason = f"reaches the end of its range, {end:g}"
@@ -126,12 +139,14 @@ def _advance(objective: Objective, sides: list[_Side], values, errors, chi2: flo
 
 
 def _followers(objective: Objective, values, covariance, index: int, direction: float) -> Float[np.ndarray, " p"]:
-    """Return where the other parameters go, to first order, when one moves to its first trial (places)."""
+    """Return how the places of the others change, to first order, when one moves by a standard error."""
     variance = covariance[index, index]
     shift = direction * _FIRST_TRIAL * covariance[:, index] / np.sqrt(variance) if variance > 0.0 else 0.0
     parameters = objective.problem.parameters
     guess = np.clip(values + shift, [p.lowest for p in parameters], [p.highest for p in parameters])
-    return _Places(objective).of_values(np.where(np.isfinite(guess), guess, values))
+    places = _Places(objective)
+    moved = places.of_values(np.where(np.isfinite(guess), guess, values))
+    return (moved - places.of_values(values)) / _FIRST_TRIAL
 
 
 def _target(side: _Side, objective: Objective, values, errors) -> float:
@@ -171,7 +186,9 @@ class _Places:
 def _minimise_others(objective: Objective, sides: list[_Side], targets):
     """Minimise chi2 over the parameters that are not profiled, on all sides at once."""
     places = _Places(objective)
-    z = np.array([side.others for side in sides])
+    ahead = np.array([side.trial - side.inside for side in sides])
+    z = np.array([side.others for side in sides]) + ahead[:, None] * np.array([side.along for side in sides])
+    z = np.clip(z, places.lowest, places.highest)
     index = np.array([side.index for side in sides])
     lanes = np.arange(len(sides))
     fixed = np.zeros_like(z, dtype=bool)

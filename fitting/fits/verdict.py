@@ -382,7 +382,7 @@ def _parameter_warnings(evidence: Evidence) -> list[str]:
         if parameter.at_bound and explained:
             limit = f"< {high:.4g}" if high is not None else f"> {low:.6g}" if low is not None else None
             reading = f": read it as a limit, {name} {limit} (95 %)" if limit else ""
-            warnings.append(f"{name} is at its bound, {parameter.value:.3g}{reading}.")
+            warnings.append(f"{name} is at its bound, {parameter.value:z.0f}{reading}.")
         if parameter.did_not_move:
             warnings.append(f"{name} did not move from the grid point it started at.")
     if evidence.other_minimum is not None:

@@ -145,7 +145,8 @@ def nuisances_in_words(result: FitResult) -> tuple[list[str], list[list[str]]]:
             given = "-" if parameter.constraint is None else "{:g} +- {:g}".format(*parameter.constraint)
             rows.append([one.name, name, value_in_words(parameter), interval_in_words(parameter), given])
         if departing:
-            rows += [[one.name, f"{name}, from the mean", f"{by:+.3g}", "", ""] for name, by in one.departures.items()]
+            apart = ((name, by + 0.0) for name, by in one.departures.items())
+            rows += [[one.name, f"{name}, from the mean", f"{by:+.3g}", "", ""] for name, by in apart]
     return head, rows
 
 
@@ -195,7 +196,9 @@ def interval_in_words(parameter: FittedParameter) -> str:
 
 
 def value_in_words(parameter: FittedParameter) -> str:
-    """Return the value with the digits that its error warrants; three where it has none."""
+    """Return the value with the digits that its error warrants, three where it has none; 0 or 1 of one at its bound."""
+    if parameter.at_bound:
+        return f"{parameter.value:z.0f}"
     return value_alone(parameter.value, parameter.standard_error)
 
 
