@@ -99,6 +99,21 @@ def test_a_tip_that_rests_is_followed_like_a_simulation_and_forgets_its_start():
 
 
 @pytest.mark.slow
+def test_a_start_at_rest_on_the_platform_is_let_go_or_held():
+    # undamped, the platform stops pressing after three quarters of a period, where it is fastest
+    platform = afm.Platform(4.0, 181.8)
+    scene = afm.Scene(afm.Cantilever(90.0), platform, afm.ImpactLaw(0.5))
+    period = float(platform.period_us)
+    _, tips = batch_and_tips(scene, State(*map(np.asarray, (0.5 * period, -4.0, 0.0))))
+    assert tips.outcome.tolist() == [Outcome.IMPACT]
+    assert float(tips.time_us[0]) == pytest.approx(0.75 * period, abs=1e-3 * period)
+    assert float(tips.velocity_nm_per_us[0]) == pytest.approx(float(platform.top_speed_nm_per_us), rel=1e-3)
+    pressed = afm.Scene(scene.cantilever, afm.Platform(1.0, 30.0, 3.0), scene.interaction)
+    _, tips = batch_and_tips(pressed, State(*map(np.asarray, (0.0, 4.0, 0.0))))
+    assert tips.outcome.tolist() == [Outcome.CAPTURED]
+
+
+@pytest.mark.slow
 def test_the_contact_is_chaotic_at_high_frequency():
     scene = afm.Scene(afm.Cantilever(90.0, 40.0), afm.Platform(4.0, 180.0 * 5.277), afm.Contact.paper())
     start = start_of(scene, (270.0, 5.0, 60.0))
