@@ -76,7 +76,7 @@ def test_every_level_holds_for_random_contacts(tips, reference, method):
 def test_every_level_holds_for_random_driven_contacts():
     tips = random_tips(64, 11)
     right = exact(tips)
-    assert np.isfinite(right[0]).sum() > 30
+    assert np.isfinite(right[0]).sum() > 20
     for accuracy in (1e-6, 1e-9, 1e-11):
         off = how_far_off(jax.tree.map(np.asarray, through(jax.tree.map(jnp.asarray, tips), accuracy)), right)
         # python -m tests.driven_contacts --tips 1024 tells at which share
