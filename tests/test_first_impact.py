@@ -39,9 +39,10 @@ def compare_with_brute_force(seed: int, count: int, family: str) -> int:
     assert set(np.unique(mine.outcome)) <= {Outcome.IMPACT, Outcome.NO_FURTHER_IMPACT, Outcome.STEP_LIMIT}
     # Without damping a tip can swing for thousands of periods just above a platform: a stated end, and a rare one
     # (once in 10,000 flights, so that a small batch may have one).
-    assert np.sum(mine.outcome == Outcome.STEP_LIMIT) <= max(3, 1e-3 * count)
+    limited = mine.outcome == Outcome.STEP_LIMIT
+    assert np.sum(limited) <= max(3, 1e-3 * count)
 
-    sure = ~exact.near_grazing
+    sure = ~exact.near_grazing & ~limited
     np.testing.assert_array_equal(found[sure], exact.found[sure])
     both = sure & found
     some = Flights(*(field[both] for field in flights))
