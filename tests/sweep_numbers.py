@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from afm_jax.sweeps.axes import Axis
-from afm_jax.sweeps.plan import Columns, Recorder, SweepPlan, Variable, plan_of
+from afm_jax.sweeps.plan import MESSAGE, Columns, Recorder, SweepPlan, Variable, plan_of
 from afm_jax.sweeps.sweep import run_plan
 
 SIZES = (7, 12)
@@ -20,21 +20,31 @@ SIZES = (7, 12)
 
 
 def recorder(given: Mapping[str, Any], axes: Sequence[Axis]) -> Recorder:  # noqa: ARG001
-    """Return what adds a tenth of y to x; slowly if asked for, and telling in a folder which process does."""
+    """Return what adds a tenth of y to x; slowly if asked for, telling which process does, with how many threads."""
     record = given["record"]
 
     def work(columns: Columns) -> Columns:
         time.sleep(record.get("seconds", 0.0))
         if "told" in record:
-            (Path(record["told"]) / f"{os.getpid()}").touch()
+            path = Path(record["told"]) / f"{os.getpid()}"
+            # once, since it may be killed at any time
+            if not path.exists():
+                path.write_text(os.environ.get("NPROC", ""))
         found = columns["x"] + 0.1 * columns["y"]
-        return {"sum_nm": np.where(found < 2.0, np.nan, found), "large": found > 4.0, "parts": np.stack([found] * 2, 1)}
+        why = np.where(found < 2.0, "the sum is below 2 \u00e4", "")
+        parts = {
+            "sum_nm": np.where(found < 2.0, np.nan, found),
+            "large": found > 4.0,
+            "parts": np.stack([found] * 2, 1),
+        }
+        return parts | {MESSAGE.name: why}
 
     variables = (
         Variable("sum_nm", "x and a tenth of y"),
         Variable("large", "it is above 4", "bool"),
         Variable("parts", "the same twice", dimensions=("part",)),
     )
+    variables += (MESSAGE,) * bool(record.get("explained"))
     return Recorder(variables, work, points=10, extra={"part": [1.0, 2.0]})
 
 

@@ -99,6 +99,7 @@ def test_every_fit_is_that_of_its_table_alone(tmp_path: Path, fit: Callable[...,
             told = [float(there[name + ending]) for ending in ("", "_error", "_low", "_high")]
             np.testing.assert_array_equal(told, [np.nan if part is None else part for part in wanted])
         assert float(there["chi2"]) == alone.chi2
+        assert str(there["message"].values) == " ".join(alone.reasons)
     files = [tmp_path / f"{number}.csv" for number in range(2)]
     for own, path in zip(tables, files, strict=True):
         write_table(own, path)

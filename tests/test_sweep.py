@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -18,7 +19,9 @@ from click.testing import CliRunner
 
 import afm_jax
 from afm_jax.cli.main import main
-from afm_jax.dynamics.exponents import lyapunov_spectrum
+from afm_jax.dynamics.exponents import Lyapunov, lyapunov_spectrum
+from afm_jax.dynamics.iteration import available_cores
+from afm_jax.dynamics.verdicts import Verdicts
 from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
 from afm_jax.scenefile.presets import preset
 from afm_jax.sweeps.sweep import run_plan, sweep
@@ -88,6 +91,27 @@ def test_collisions_and_exponents_are_those_of_their_functions():
 
 
 @pytest.mark.slow
+def test_exponents_of_contacts_are_followed_in_rows_of_one_length(monkeypatch: pytest.MonkeyPatch):
+    asked = []
+
+    def spectrum(scenes: afm_jax.Scene, **settings: Any) -> Lyapunov:
+        values = np.asarray(scenes.platform.amplitude_nm)
+        asked.append((len(values), settings))
+        whole = values.astype(int)
+        pairs = np.stack([values, -values], axis=1)
+        return Lyapunov(
+            pairs, 2.0 * pairs, pairs, pairs, values, whole, whole, whole, Verdicts(whole, whole, whole, values)
+        )
+
+    monkeypatch.setattr("afm_jax.sweeps.scenes.lyapunov_spectrum", spectrum)
+    axes = [{"parameter": AMPLITUDE, "linear": [3.0, 20.0, 18]}]
+    found = sweep(preset("figure8"), axes, {"what": "lyapunov", "impacts": 40, "transient": 7}, accuracy=1e-5, chunk=18)
+    assert asked == [(32, {"impacts": 40, "transient": 7, "accuracy": 1e-5})]
+    np.testing.assert_array_equal(found["exponents_per_us"].sel(exponent=2.0), -2.0 * np.arange(3.0, 21.0))
+    np.testing.assert_array_equal(found["orbit_periods"], np.arange(3, 21))
+
+
+@pytest.mark.slow
 def test_simulations_are_those_of_the_command(tmp_path: Path):
     (tmp_path / "sweep.toml").write_text(
         f'scene = "figure2"\n[record]\nwhat = "simulation"\nperiods = 300\n[[axes]]\nparameter = "{AMPLITUDE}"\n'
@@ -102,7 +126,7 @@ def test_simulations_are_those_of_the_command(tmp_path: Path):
         .invoke(main, ["simulate", str(tmp_path / "scene.toml"), "--periods", "300", "--until-settled", "--json"])
         .stdout
     )
-    for name in ("peak_amplitude_nm", "lockin_amplitude_nm", "dissipated_in_contact_aj"):
+    for name in ("peak_amplitude_nm", "lockin_amplitude_nm", "dissipated_in_contact_aj", "dissipated_per_contact_aj"):
         np.testing.assert_allclose(found[name].values[1], told[name], rtol=1e-9)
     assert bool(found["settled"][1]) == told["settled"]
     assert int(found["order"][1]) == told["order"]
@@ -159,6 +183,7 @@ def test_a_killed_worker_costs_nothing_but_time(tmp_path: Path):
     assert done.computed == 14
     # two workers, and the one that took the place of the killed one
     assert len(list(told.iterdir())) == 3
+    assert {path.read_text() for path in told.iterdir()} == {str(max(available_cores() // 2, 1))}
     found, whole = (xarray.open_zarr(str(tmp_path / name / "sweep.zarr")).load() for name in ("out", "whole"))
     assert found.drop_attrs().identical(whole.drop_attrs())
 
@@ -234,12 +259,34 @@ AXIS = '[[axes]]\nparameter = "platform.amplitude_nm"\nlinear = [1, 2, 3]\n'
         (f'scene = "figure2"\n{ORBITS}{AXIS.replace("amplitude", "amplitud")}', "did you mean platform.amplitude_nm?"),
         (f'scene = "figure2"\n{ORBITS}{AXIS.replace("[1, 2", "[-1, 2")}', "`amplitude_nm` must not be negative"),
         (f'scene = "figure2"\naccuracy = 1e-6\n{ORBITS}{AXIS}', "leave `accuracy` out"),
+        (f'scene = "figure2"\naccuracy = 1e-6\n[record]\nwhat = "simulation"\n{AXIS}', "this scene has none"),
         (f'scene = "figure2"\nchunk = 0\n{ORBITS}{AXIS}', "`chunk` must be a positive whole number"),
         (f'scene = "figure2"\n[record]\nwhat = "collide"\n{AXIS}', "is about a resolved contact"),
     ],
 )
 def test_a_wrong_sweep_is_one_line(tmp_path: Path, text: str, message: str):
     assert message in complaint(tmp_path, text, "--out", str(tmp_path / "out"))
+
+
+def test_the_command_says_why_points_have_no_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    def follow(scene: afm_jax.Scene, *_: Any, **__: Any) -> None:
+        raise ValueError("too wide" if scene.platform.amplitude_nm > 1.8 else "it will not go")
+
+    monkeypatch.setattr("afm_jax.sweeps.scenes.follow_long", follow)
+    afm_jax.save_scene(preset("figure2"), tmp_path / "scene.toml")
+    with (tmp_path / "scene.toml").open("a") as file:
+        file.write("[start]\nphase_deg = 0.0\nheight_above_platform_nm = 1.0\nvelocity_nm_per_us = 0.0\n")
+    (tmp_path / "sweep.toml").write_text(f'scene = "scene.toml"\nchunk = 2\n[record]\nwhat = "simulation"\n{AXIS}')
+    line = ["sweep", str(tmp_path / "sweep.toml"), "--out", str(tmp_path), "--workers", "1"]
+    run = CliRunner().invoke(main, line)
+    assert run.exit_code == 0, run.stderr
+    assert "3 points have no result to be trusted (`message` says why), most of them:\n" in run.stdout
+    assert "\n  2: it will not go\n  1: too wide\n" in run.stdout
+    told = json.loads(CliRunner().invoke(main, [*line, "--json"]).stdout)
+    assert (told["without_result"], told["messages"]) == (3, {"it will not go": 2, "too wide": 1})
+    found = xarray.open_zarr(str(tmp_path / "sweep.zarr")).load()
+    assert found["message"].values.tolist() == ["it will not go"] * 2 + ["too wide"]
+    assert found["outcome"].values.tolist() == [-1] * 3
 
 
 def test_wrong_options_are_one_line(tmp_path: Path):

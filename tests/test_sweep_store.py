@@ -12,7 +12,9 @@ import xarray
 from scipy.stats import qmc
 
 from afm_jax import compilation_cache
+from afm_jax.plots.sweeps import draw_sweep
 from afm_jax.sweeps.axes import axes_of
+from afm_jax.sweeps.plan import plan_of
 from afm_jax.sweeps.store import STORE, SweepStore, compute_chunk, locked
 from afm_jax.sweeps.sweep import dataset_of, estimate, run_plan
 from tests.sweep_numbers import SIZES, contents, plan
@@ -35,6 +37,18 @@ def test_results_open_with_xarray_alone(tmp_path: Path):
     given = json.loads(found.attrs["input"])
     assert given["axes"][1] == {"parameter": "y", "linear": [0.0, 11.0, 12]}
     assert {"jax", "afm-jax", "numpy"} <= set(given["versions"])
+
+
+def test_points_without_a_result_say_why(tmp_path: Path):
+    run_plan(plan(explained=True), tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = xarray.open_zarr(str(tmp_path / STORE)).load()
+    np.testing.assert_array_equal(found["message"], np.where(SUM < 2.0, "the sum is below 2 \u00e4", ""))
+    before = contents(tmp_path)
+    (tmp_path / "done" / "0.json").unlink()
+    run_plan(plan(explained=True), tmp_path)
+    assert contents(tmp_path) == before
 
 
 def test_results_do_not_depend_on_chunks():
@@ -226,3 +240,21 @@ def test_a_worker_with_other_versions_is_refused(tmp_path: Path, monkeypatch: py
     other = given | {"versions": given["versions"] | {"jax": "0.0.1"}}
     with pytest.raises(RuntimeError, match=r"a worker would compute otherwise than the others: jax is .*, not 0.0.1"):
         compute_chunk(json.dumps(other), 5)
+
+
+@pytest.mark.parametrize("log", [False, True])
+def test_a_picture_shows_all_that_was_swept(log: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path):  # noqa: FBT001
+    kept = []
+    monkeypatch.setattr("afm_jax.plots.sweeps.save", lambda figure, _: kept.append(figure))
+    line = {"parameter": "x", "log": [1.0, 16.0, 5]} if log else {"parameter": "x", "linear": [1.0, 16.0, 5]}
+    found = dataset_of(plan_of(plan().given | {"axes": [line, {"parameter": "y", "linear": [0.0, 10.0, 11]}]}), None)
+    for shown in (found.isel(y=0, drop=True), found):
+        draw_sweep(shown, ["sum_nm"], tmp_path / "sweep.png")
+    lines, plane = (figure.axes[0] for figure in kept)
+    assert lines.get_xscale() == plane.get_yscale() == ("log" if log else "linear")
+    assert plane.get_xscale() == "linear"
+    assert lines.get_xlim()[0] < 1.0
+    assert lines.get_xlim()[1] > 16.0
+    # the first cell reaches from as far below its value as the second from above
+    assert plane.get_ylim()[0] == pytest.approx(2.0**-0.5 if log else 1.0 - 0.5 * 15.0 / 4.0)
+    assert lines.get_ylabel() == "sum (nm)"

@@ -56,7 +56,7 @@ def payload_of(scene: Scene, run: LongRun, seen: Observables, settings: Mapping[
     """Return the JSON object of a simulation."""
     simulation, verdict = run.simulation, run.verdict
     outcome = MotionOutcome(int(simulation.outcome))
-    final, deflection = simulation.final, seen.deflection_harmonics
+    final = simulation.final
     return {
         "impacts": int(simulation.count),
         "stuck": verdict.stuck,
@@ -69,9 +69,9 @@ def payload_of(scene: Scene, run: LongRun, seen: Observables, settings: Mapping[
         "lockin_amplitude_nm": seen.lockin_amplitude_nm,
         "lockin_phase_deg": seen.lockin_phase_deg,
         "harmonics": [harmonic._asdict() for harmonic in seen.harmonics],
-        "deflection_lockin_amplitude_nm": deflection and deflection[0].amplitude_nm,
-        "deflection_lockin_phase_deg": deflection and deflection[0].phase_deg,
-        "deflection_harmonics": _as_dicts(deflection),
+        "deflection_lockin_amplitude_nm": seen.deflection_lockin_amplitude_nm,
+        "deflection_lockin_phase_deg": seen.deflection_lockin_phase_deg,
+        "deflection_harmonics": _as_dicts(seen.deflection_harmonics),
         "window": {**seen.window._asdict(), "contacts": seen.contacts},
         "null_reasons": _reasons(scene, seen, verdict.stuck),
         "start": {name: float(value) for name, value in simulation.start._asdict().items()},

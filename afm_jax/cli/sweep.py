@@ -26,7 +26,12 @@ _MOST_DRAWN = 2
 
 @click.command()
 @click.argument("sweep", metavar="SWEEP.toml", type=click.Path(path_type=Path))
-@click.option("--workers", type=click.IntRange(1, 1024), metavar="N", help="Processes of this machine, by Dask.")
+@click.option(
+    "--workers",
+    type=click.IntRange(1, 1024),
+    metavar="N",
+    help="Processes of this machine that share its cores, by Dask; 1: this one alone.",
+)
 @click.option("--scheduler", metavar="tcp://...", help="A Dask scheduler whose workers do the work.")
 @click.option("--dry-run", is_flag=True, help="Measure a chunk and say what the sweep would take; keep nothing.")
 @click.option("--plot", is_flag=True, help="Draw a sweep of one or two axes, sweep.png.")
@@ -114,7 +119,6 @@ def _tell(session: Session, plan: "SweepPlan", done: "SweepRun") -> None:
 
 def _messages(plan: "SweepPlan", store: Path) -> Counter[str]:
     """Return why points have no result to be trusted, and how many each time."""
-    import numpy as np  # noqa: PLC0415
     import xarray  # noqa: PLC0415
 
     from afm_jax.sweeps.plan import MESSAGE  # noqa: PLC0415
@@ -122,17 +126,16 @@ def _messages(plan: "SweepPlan", store: Path) -> Counter[str]:
     if MESSAGE not in plan.recorder.variables:
         return Counter()
     with xarray.open_zarr(str(store)) as found:
-        texts, counts = np.unique(found[MESSAGE.name].values.astype(str), return_counts=True)
-    return Counter({str(text): int(count) for text, count in zip(texts, counts, strict=True) if text})
+        return Counter(text for text in found[MESSAGE.name].values.ravel().tolist() if text)
 
 
 def _words(plan: "SweepPlan", done: "SweepRun", messages: Counter[str], store: Path) -> list[str]:
     grid = " x ".join(map(str, plan.shape))
-    lines = [f"{grid} points in {done.chunks} chunks, {done.computed} of them computed in {_duration(done.seconds)}."]
+    lines = [f"{grid} points in {done.chunks} chunks. Computed in {_duration(done.seconds)}: {done.computed}."]
     if done.kept.done:
-        lines.append(f"{len(done.kept.done)} chunks were done before and kept.")
+        lines.append(f"Done before and kept: {len(done.kept.done)}.")
     if done.kept.damaged:
-        lines.append(f"{len(done.kept.damaged)} chunks had other bytes than they were written with: computed again.")
+        lines.append(f"With other bytes than they were written with, computed again: {len(done.kept.damaged)}.")
     if messages:
         lines.append(
             f"{sum(messages.values())} points have no result to be trusted (`message` says why), most of them:"

@@ -494,9 +494,9 @@ def collision_of_turn(
 
 _POINTS = 20
 _TOP_SPEED = 200.0
-_ONLY_FREE = ("rebound_speed_nm_per_us", "collision_delay_us", "time_in_contact_us", "time_in_junction_us")
+ONLY_FREE = ("rebound_speed_nm_per_us", "collision_delay_us", "time_in_contact_us", "time_in_junction_us")
 # a captured tip stops before it has lost all of that
-_ONLY_FREE += ("bridge_hysteresis_aj", "junction_hysteresis_aj", "viscous_loss_aj")
+ONLY_FREE += ("bridge_hysteresis_aj", "junction_hysteresis_aj", "viscous_loss_aj")
 
 
 class Collisions(NamedTuple):
@@ -576,7 +576,7 @@ def _rows(found: dict[str, np.ndarray]) -> list[dict[str, Any]]:
         if outcome > CollisionOutcome.CAPTURED_BY_JUNCTION:
             row |= {name: None for name in columns if name not in ("approach_speed_nm_per_us", "outcome")}
         elif row["captured"]:
-            row |= dict.fromkeys(_ONLY_FREE)
+            row |= dict.fromkeys(ONLY_FREE)
         rows.append(row)
     return rows
 

@@ -144,6 +144,16 @@ class Observables(NamedTuple):
         """Its phase."""
         return self.harmonics[0].phase_deg
 
+    @property
+    def deflection_lockin_amplitude_nm(self) -> float | None:
+        """The same of the deflection against a moving base."""
+        return None if self.deflection_harmonics is None else self.deflection_harmonics[0].amplitude_nm
+
+    @property
+    def deflection_lockin_phase_deg(self) -> float | None:
+        """Its phase."""
+        return None if self.deflection_harmonics is None else self.deflection_harmonics[0].phase_deg
+
 
 def observe(
     scene: Scene,

@@ -30,6 +30,12 @@ _LABELS = {
 }
 _UNITS = {
     "_nm_per_us": r"nm/$\mu$s",
+    "_per_us": r"1/$\mu$s",
+    "_us": r"$\mu$s",
+    "_aj": "aJ",
+    "_nn": "nN",
+    "_deg": "degrees",
+    "_rad": "rad",
     "_khz": "kHz",
     "_n_per_m": "N/m",
     "_j_per_m2": r"J/m$^2$",

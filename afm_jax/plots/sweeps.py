@@ -1,5 +1,6 @@
 """Pictures of sweeps of one or two axes: lines, planes, or points where the values are random."""
 
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -7,10 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 from afm_jax.plots.charts import cell_edges
 from afm_jax.plots.dynamics import label_of
 from afm_jax.plots.picture_style import GRID, label_axes, new_figure, save
+from afm_jax.sweeps.axes import dimension_of
 
 if TYPE_CHECKING:
     import xarray
@@ -18,6 +21,7 @@ if TYPE_CHECKING:
 _MOST = 1000
 """Values along an axis that a picture shows."""
 _MOST_ROWS = 4
+_MARGIN = 0.02
 
 
 def draw_sweep(found: "xarray.Dataset", names: Sequence[str], target: Path) -> None:
@@ -36,6 +40,9 @@ def draw_sweep(found: "xarray.Dataset", names: Sequence[str], target: Path) -> N
         raise ValueError(f"a picture shows one or two axes, but these are {', '.join(axes)}: slice the results first")
     thin = found.isel({name: slice(None, None, -(-found.sizes[name] // _MOST)) for name in axes})
     thin = thin.sortby([name for name in axes if name in thin.coords])
+    for name in map(dimension_of, _logarithmic(found)):
+        if name in thin.coords:
+            thin[name].attrs["log"] = True
     along = [str(name) for name, c in thin.coords.items() if "parameter" in c.attrs and c.dims[0] in axes]
     flat = len(along) == 2 or len(axes) == 2
     parts = {name: _layers(thin[name], axes) for name in names}
@@ -53,6 +60,31 @@ def draw_sweep(found: "xarray.Dataset", names: Sequence[str], target: Path) -> N
             else:
                 panel.set_visible(False)
     save(figure, target)
+
+
+def _logarithmic(found: "xarray.Dataset") -> list[str]:
+    """Return the parameters that are spread logarithmically."""
+    names: list[str] = []
+    for axis in json.loads(found.attrs["input"])["axes"]:
+        names += [axis["parameter"]] if "log" in axis else []
+        for kind in ("random", "latin_hypercube"):
+            names += [name for name, ends in axis.get(kind, {}).items() if isinstance(ends, dict)]
+    return names
+
+
+def _scale(panel: Axes, name: str, coordinate: "xarray.DataArray", *, ends: bool) -> None:
+    """Give a side, "x" or "y", the scale of its values and, if asked for, their ends: all that was swept."""
+    log = "log" in coordinate.attrs
+    if log:
+        panel.set(**{f"{name}scale": "log"})
+        side = panel.xaxis if name == "x" else panel.yaxis
+        side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        side.set_major_formatter("{x:g}")
+        side.set_minor_formatter("")
+    low, high = coordinate.values.min(), coordinate.values.max()
+    if ends and low < high:
+        factor, step = (high / low) ** _MARGIN if log else 1.0, 0.0 if log else _MARGIN * (high - low)
+        panel.set(**{f"{name}lim": (low / factor - step, high * factor + step)})
 
 
 def _layers(variable: "xarray.DataArray", axes: Sequence[str]) -> list[tuple[str, np.ndarray]]:
@@ -79,6 +111,7 @@ def _lines(
         panel.plot(coordinate.values, values, style, ms=3.0, linewidth=0.8, label=name or None)
     if any(name for name, _ in layers):
         panel.legend(frameon=False)
+    _scale(panel, "x", coordinate, ends=True)
     panel.grid(color=GRID, alpha=0.25)
     label_axes(panel, x=label_of(coordinate.attrs["parameter"]), y=label)
 
@@ -94,18 +127,26 @@ def _plane(
 ) -> None:
     """Draw values over two parameters: cells of a grid, or points."""
     name, values = layer
-    if len(axes) == 2 and set(along) == set(axes):
+    cells = len(axes) == 2 and set(along) == set(axes)
+    if cells:
         y, x = axes
-        edges = cell_edges(found[x].values), cell_edges(found[y].values)
+        edges = _edges(found[x]), _edges(found[y])
         mesh = panel.pcolormesh(*edges, values, cmap="cividis", rasterized=True)
     else:
         x, y = along[:2]
         at = np.broadcast_arrays(*(_spread(found[part], axes) for part in (x, y)))
         mesh = panel.scatter(*(part.ravel() for part in at), c=np.asarray(values).ravel(), s=6.0, cmap="cividis")
+    _scale(panel, "x", found[x], ends=not cells)
+    _scale(panel, "y", found[y], ends=not cells)
     bar = figure.colorbar(mesh, ax=panel)
     bar.set_label(label)
     panel.set_title(name, fontsize=11)
     label_axes(panel, x=label_of(found[x].attrs["parameter"]), y=label_of(found[y].attrs["parameter"]))
+
+
+def _edges(coordinate: "xarray.DataArray") -> np.ndarray:
+    values = coordinate.values
+    return np.exp(cell_edges(np.log(values))) if "log" in coordinate.attrs else cell_edges(values)
 
 
 def _spread(coordinate: "xarray.DataArray", axes: Sequence[str]) -> np.ndarray:

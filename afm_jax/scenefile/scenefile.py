@@ -50,6 +50,7 @@ Where a simulation begins: the start of a scene file, whether it is possible in 
 import os
 import tomllib
 from collections.abc import Mapping
+from dataclasses import MISSING, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
@@ -511,7 +512,10 @@ def _contact_of(table: SceneTable) -> "Contact":
 def _delay_of(table: SceneTable | None) -> CollisionDelay | None:
     if table is None:
         return None
-    numbers = table.numbers(required=tuple(key for key in KEYS["interaction.delay"] if key != "corrections"))
+    # what has a default may be left out
+    required = tuple(field.name for field in fields(CollisionDelay) if field.default is MISSING)
+    optional = tuple(key for key in KEYS["interaction.delay"] if key not in (*required, "corrections"))
+    numbers = table.numbers(required=required, optional=optional)
     return table.build(CollisionDelay, **numbers, corrections=table.truth("corrections", usual=True))
 
 

@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import free_frame
-from afm_jax.contact.collide import collide
+from afm_jax.contact.collide import ONLY_FREE, collide
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.charts import highest_orbits
 from afm_jax.dynamics.exponents import lyapunov_spectrum
@@ -178,7 +178,9 @@ def _orbits(scene: Scene, paths: tuple[str, ...], *, orders: tuple[int, ...]) ->
 
 _COLLISION_VARIABLES = (
     Variable("rebound_speed_nm_per_us", "speed away from the sample; 0 where the tip is captured"),
-    Variable("collision_delay_us", "time between the crossings of gap 0 by the straight paths in and out"),
+    Variable(
+        "collision_delay_us", "time between the crossings of gap 0 by the straight paths in and out, if it leaves"
+    ),
     Variable("captured", "the tip stays at the sample", "bool"),
     Variable(
         "outcome",
@@ -212,8 +214,10 @@ def _collisions(
         trusted = found.outcome <= CollisionOutcome.CAPTURED_BY_JUNCTION
 
         def known(variable: Variable) -> Array:
-            part = getattr(found, variable.name)
-            return jnp.where(trusted, part, jnp.nan) if variable.dtype == "float64" else part
+            part, exists = getattr(found, variable.name), trusted
+            if variable.name in ONLY_FREE and variable.name != "rebound_speed_nm_per_us":
+                exists &= ~found.captured
+            return jnp.where(exists, part, jnp.nan) if variable.dtype == "float64" else part
 
         return {variable.name: known(variable) for variable in _COLLISION_VARIABLES}
 
@@ -273,10 +277,17 @@ _OBSERVED = {
     "peak_force_nn": "largest force on the tip; only a resolved contact has one",
     "most_attractive_force_nn": "most attractive force on the tip; only a resolved contact has one",
     "dissipated_in_contact_aj": "energy lost to the sample per drive period",
+    "dissipated_per_contact_aj": "the same per contact",
     "dissipated_in_air_aj": "energy lost to the air per drive period",
     "given_by_drives_aj": "energy given by the drives per drive period",
+    "stored_aj": "growth of the energy of tip and spring per drive period",
+    "energy_imbalance": "what these energies leave unexplained, of the largest; only of a resolved contact",
     "virial_aj": "mean of force times height",
     "peak_deflection_nm": "largest deflection against a moving base",
+    "mean_deflection_nm": "its mean",
+    "deflection_lockin_amplitude_nm": "its amplitude at the response frequency",
+    "deflection_lockin_phase_deg": "its phase, modulo 360/N",
+    "phase_lag_deg": "lag of deflection or height behind the base or force that drives the tip, modulo 360/N",
 }
 _REFUSED = -1
 _SIMULATION_VARIABLES = (

@@ -1,0 +1,131 @@
+"""A force and a parameter of the delay are added to a copy as `notebooks/adding_a_force.md` says: few files each."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.fresh_python import python
+
+ROOT = Path(__file__).parent.parent
+# By file: what stands there (the first time), and what it becomes.
+FORCE = {
+    "afm_jax/contact/parameters.py": [
+        ('"viscous", "jkr")', '"viscous", "attraction", "jkr")'),
+        (
+            '    ContactParameter(name="tip_radius_nm"',
+            (
+                '    ContactParameter(name="hamaker_constant_aj", unit="aJ", default=0.01, allowed="not negative",\n'
+                '        meaning="H of the attraction", fitted=(1e-4, 10.0), serves=("attraction",)),\n'
+                '    ContactParameter(name="tip_radius_nm"'
+            ),
+        ),
+    ],
+    "afm_jax/contact/contact.py": [
+        ("import CoreRepulsion", "import Attraction, CoreRepulsion"),
+        ('"viscous": Viscous}', '"viscous": Viscous, "attraction": Attraction}'),
+        (
+            "        tip_radius_nm: ArrayLike",
+            '        hamaker_constant_aj: ArrayLike = PAPER["hamaker_constant_aj"],\n{}',
+        ),
+        (
+            '            "viscous": lambda',
+            '            "attraction": lambda: Attraction(hamaker_constant_aj, tip_radius_nm),\n{}',
+        ),
+    ],
+    "afm_jax/contact/forces/solid.py": [("class VanDerWaals(", "class Attraction(StaticForce):{body}\n\n\n{}")],
+}
+DELAY = {
+    "afm_jax/impact/law.py": [
+        (
+            "    corrections: bool = eqx.field(static=True, default=True)\n",
+            '{}    late_nm2_per_us: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.0)\n',
+        ),
+        ("(1.0 / w - 1.0 / u) - self.offset_nm / u", "{} + self.late_nm2_per_us / u**2"),
+        ("+ self.offset_nm / u**2", "{} - 2.0 * self.late_nm2_per_us / u**3"),
+    ],
+    "afm_jax/scenefile/tables.py": [('"offset_nm", "corrections")', '"offset_nm", "late_nm2_per_us", "corrections")')],
+    "afm_jax/scenefile/scenefile.py": [("offset_nm = 0.726\n", "{}late_nm2_per_us = 0\n")],
+    "fitting/parameters.py": [
+        (
+            '        symbol="d",\n    ),\n',
+            (
+                '{}    Parameter(name="delay_late_nm2_per_us", unit="nm^2/us", meaning="late",\n'
+                '        lowest=-1.0, highest=1.0, width=1.0, starts=(-0.5, 0.5), symbol="f"),\n'
+            ),
+        ),
+        ('"delay_offset_nm": 0.726', '{}, "delay_late_nm2_per_us": 0.0'),
+        ("- delay_offset_nm/u_in", "{} + delay_late_nm2_per_us/u_in^2"),
+    ],
+    "fitting/report/words.py": [
+        ("(1.0 / w - 1.0 / u) - offset / u", '{} + values.get("delay_late_nm2_per_us", 0.0) / u**2'),
+    ],
+}
+SCENE = """
+[cantilever]
+frequency_khz = 90
+[platform]
+amplitude_nm = 4
+frequency_khz = 181.8
+[interaction]
+model = "law"
+r = 0.95
+[interaction.delay]
+hertz = 0.206
+lead_nm = 5.64
+offset_nm = 0.726
+"""
+
+
+def changed(folder: Path, edits: dict[str, list[tuple[str, str]]]) -> None:
+    """Make the edits in a copy of the two packages."""
+    for package in ("afm_jax", "fitting"):
+        shutil.copytree(ROOT / package, folder / package, ignore=shutil.ignore_patterns("__pycache__"))
+    for name, pairs in edits.items():
+        text = (folder / name).read_text()
+        # the class of an existing force stands for one that is written anew
+        body = text.partition("class VanDerWaals(StaticForce):")[2]
+        for old, new in pairs:
+            assert old in text, f"{name} has no {old!r}"
+            text = text.replace(old, new.replace("{}", old).replace("{body}", body), 1)
+        (folder / name).write_text(text)
+
+
+def said(folder: Path, code: str) -> str:
+    """Return what a program prints that has the packages of a folder."""
+    start = f"import sys; sys.path.insert(0, {str(folder)!r})\nimport jax; jax.config.update('jax_enable_x64', True)\n"
+    return python(start + code)
+
+
+@pytest.mark.slow
+def test_a_force_is_added_in_three_files(tmp_path: Path):
+    assert len(FORCE) == 3
+    changed(tmp_path, FORCE)
+    assert "--hamaker-constant-aj X" in said(tmp_path, "from afm_jax.cli.main import main; main(['collide', '--help'])")
+    code = (
+        "from afm_jax import Contact; from fitting.parameters import CONTACT_NAMES\n"
+        "less = Contact.paper(effects=('capillary', 'structural', 'core', 'viscous', 'jkr'))\n"
+        "more = float(Contact.paper().forces.static(2.0) - less.forces.static(2.0))\n"
+        "print(more, 'hamaker_constant_aj' in CONTACT_NAMES)"
+    )
+    force, fitted = said(tmp_path, code).split()
+    # -H R / (6 D^2)
+    assert float(force) == pytest.approx(-0.01 * 100.0 / 24.0, rel=1e-9)
+    assert fitted == "True"
+
+
+@pytest.mark.slow
+def test_a_parameter_of_the_delay_is_added_in_five_files(tmp_path: Path):
+    assert len(DELAY) == 5
+    changed(tmp_path, DELAY)
+    for name, line in (("old", ""), ("new", "late_nm2_per_us = 3\n")):
+        (tmp_path / f"{name}.toml").write_text(SCENE + line)
+    code = (
+        "from afm_jax.scenefile.scenefile import load_scene; from fitting.parameters import model_parameters\n"
+        f"files = [{str(tmp_path)!r} + name for name in ('/old.toml', '/new.toml')]\n"
+        "old, new = (load_scene(file).interaction.delay(50.0, 40.0) for file in files)\n"
+        "print(float(new - old), *model_parameters('law+delay'))"
+    )
+    more, *names = said(tmp_path, code).split()
+    assert float(more) == pytest.approx(3.0 / 50.0**2, rel=1e-9)
+    assert "delay_late_nm2_per_us" in names
