@@ -73,11 +73,11 @@ def test_every_level_holds_for_random_contacts(tips, reference, method):
 
 
 @pytest.mark.slow
-def test_random_driven_contacts_are_within_what_is_said_of_them():
+def test_every_level_holds_for_random_driven_contacts():
     tips = random_tips(64, 11)
     right = exact(tips)
-    off = how_far_off(jax.tree.map(np.asarray, through(jax.tree.map(jnp.asarray, tips), 1e-9)), right)
     assert np.isfinite(right[0]).sum() > 20
-    # `simulate` says 96 %, and the rest within 500 times as much; python -m tests.driven_contacts --tips 512 tells all
-    assert np.mean(off <= 1e-9) >= 0.9
-    assert off.max() <= 5e-7
+    for accuracy in (1e-6, 1e-9, 1e-11):
+        off = how_far_off(jax.tree.map(np.asarray, through(jax.tree.map(jnp.asarray, tips), accuracy)), right)
+        # python -m tests.driven_contacts --tips 1024 tells at which share
+        assert off.max() <= accuracy, accuracy

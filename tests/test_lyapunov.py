@@ -13,7 +13,7 @@ from afm_jax.dynamics.contact_sequence import follow_contacts
 from afm_jax.dynamics.exponents import exponent_verdicts, lyapunov_spectrum
 from afm_jax.dynamics.iteration import Record, batch_and_tips, recorded
 from afm_jax.motion.record import State
-from afm_jax.motion.start import default_start, start_of
+from afm_jax.motion.start import default_start, start_of, state
 from afm_jax.outcomes import Outcome
 from afm_jax.scenefile.parameter_paths import scene_batch
 
@@ -96,6 +96,21 @@ def test_a_tip_that_rests_is_followed_like_a_simulation_and_forgets_its_start():
     assert np.all(np.isneginf(exponents.exponents_per_impact))
     assert exponents.rested > 0
     assert "forgets its start" in exponent_verdicts(lyapunov_spectrum(scenes, impacts=400, transient=100))[0]
+
+
+@pytest.mark.slow
+def test_a_start_at_rest_on_the_platform_is_let_go_or_held():
+    # undamped, the platform stops pressing after three quarters of a period, where it is fastest
+    platform = afm.Platform(4.0, 181.8)
+    scene = afm.Scene(afm.Cantilever(90.0), platform, afm.ImpactLaw(0.5))
+    period = float(platform.period_us)
+    _, tips = batch_and_tips(scene, state(0.5 * period, -4.0, 0.0))
+    assert tips.outcome.tolist() == [Outcome.IMPACT]
+    assert float(tips.time_us[0]) == pytest.approx(0.75 * period, abs=1e-3 * period)
+    assert float(tips.velocity_nm_per_us[0]) == pytest.approx(float(platform.top_speed_nm_per_us), rel=1e-3)
+    pressed = afm.Scene(scene.cantilever, afm.Platform(1.0, 30.0, 3.0), scene.interaction)
+    _, tips = batch_and_tips(pressed, state(0.0, 4.0, 0.0))
+    assert tips.outcome.tolist() == [Outcome.CAPTURED]
 
 
 @pytest.mark.slow

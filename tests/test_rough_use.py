@@ -63,10 +63,11 @@ def test_a_full_device_is_named():
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
 def test_a_full_standard_output_is_named(tmp_path):
     (tmp_path / "curve.csv").write_text("offset_nm,lockin_amplitude_nm\n1,2\n2,3\n", encoding="utf-8")
-    call = f"exec {sys.executable} -m afm_jax read {tmp_path}/curve.csv >/dev/full"
-    full = subprocess.run(call, shell=True, cwd=ROOT, capture_output=True, text=True, check=False)  # noqa: S602
-    assert full.returncode == 2
-    assert full.stderr == "afm-jax: standard output: cannot be written (No space left on device)\n"
+    for arguments in (f"read {tmp_path}/curve.csv", "--help", "fit --help", "--version"):
+        call = f"exec {sys.executable} -m afm_jax {arguments} >/dev/full"
+        full = subprocess.run(call, shell=True, cwd=ROOT, capture_output=True, text=True, check=False)  # noqa: S602
+        assert full.returncode == 2
+        assert full.stderr == "afm-jax: standard output: cannot be written (No space left on device)\n"
 
 
 def test_nothing_writes_files_another_way():
@@ -104,6 +105,9 @@ import signal, sys, time, types
 signal.signal(signal.SIGINT, signal.default_int_handler)
 import click
 from afm_jax.cli.main import COMMANDS, main
+class Lost:
+    def __del__(self):
+        raise KeyboardInterrupt
 @click.command()
 def command():
     ready = False
@@ -114,7 +118,8 @@ def command():
                 print("ready", flush=True)
             time.sleep(0.02)
         except KeyboardInterrupt:
-            pass
+            # as in the callbacks of a garbage collection: nobody hears it
+            Lost()
 sys.modules["deaf"] = types.SimpleNamespace(command=command)
 COMMANDS["deaf"] = ("deaf", "")
 sys.argv[1:] = ["deaf"]

@@ -10,6 +10,7 @@ from click.testing import CliRunner, Result
 
 from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, save_scene, single_impact_orbits
 from afm_jax.cli.main import main
+from afm_jax.cli.simulate_output import text_of
 from afm_jax.motion.trajectory import pieces_between
 from afm_jax.scenefile.scenefile import Start
 from fitting.traces.lockin import lockin
@@ -177,3 +178,21 @@ def test_help_does_without_jax():
         "print(result.exit_code, 'PRESET' in result.output, 'jax' in sys.modules)"
     )
     assert python(code) == "0 True False"
+
+
+def test_nothing_is_said_over_a_response_period_that_is_not_there():
+    numbers = ("peak_amplitude_nm", "mean_height_nm", "given_by_drives_aj", "dissipated_in_air_aj")
+    nothing = dict.fromkeys(("peak_deflection_nm", "phase_lag_deg", "peak_force_nn"))
+    payload = dict.fromkeys(numbers, 1.0) | nothing | {"dissipated_in_contact_aj": 1.0, "stuck": False}
+    payload |= {"impacts": 3, "settled": False, "settled_reason": "too short", "start": {"time_us": 0.0}}
+    payload |= {"harmonics": [{"multiple": 1, "amplitude_nm": 10.0, "phase_deg": 0.0}]}
+    payload |= {"final": {"time_us": 9.0, "position_nm": 1.0, "velocity_nm_per_us": 1.0, "phase": "dry"}}
+
+    def said(responses: int) -> str:
+        return " ".join(text_of(payload | {"window": {"from_us": 7.2, "to_us": 9.0, "responses": responses}}))
+
+    assert "At the response frequency: 10 nm" in said(1)
+    assert "Energy of a drive period" in said(1)
+    assert "10 nm" not in said(0)
+    assert "Energy" not in said(0)
+    assert "Less than a response period" in said(0)

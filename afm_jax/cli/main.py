@@ -7,6 +7,7 @@ How a command ends: exit codes, and one line on standard error for whatever went
 """
 
 import difflib
+import errno
 import os
 import signal
 import socket
@@ -27,6 +28,10 @@ _NUMERICAL_PACKAGES = frozenset(
 )
 _TRACEBACK = "AFM_JAX_TRACEBACK"
 """Environment variable that, if set, lets a failure of the program pass through with its traceback."""
+
+
+_FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
+"""How writing fails where there is no room."""
 
 
 class NotValid(Exception):  # noqa: N818
@@ -77,10 +82,17 @@ def _verdict(error: Exception) -> tuple[str, int]:
         case ModuleNotFoundError():
             return _missing_package(error), 2
         case OSError():
-            where = f"{error.filename}: " if error.filename else ""
-            return f"{where}{error.strerror or error}", 2
+            return _refused_by_the_system(error), 2
         case _:
             return _wrong_values(error)
+
+
+def _refused_by_the_system(error: OSError) -> str:
+    if error.filename is None and error.errno in _FULL:
+        # what writes files names them
+        return f"standard output: cannot be written ({error.strerror})"
+    where = f"{error.filename}: " if error.filename else ""
+    return f"{where}{error.strerror or error}"
 
 
 def _wrong_values(error: Exception) -> tuple[str, int]:
@@ -151,6 +163,13 @@ def _end_when_interrupted() -> threading.Event:
     heard, told = socket.socketpair()
     told.settimeout(0.0)
     signal.set_wakeup_fd(told.fileno(), warn_on_full_buffer=False)
+    usual = sys.unraisablehook
+
+    def unraisable(lost: Any) -> None:
+        if not issubclass(lost.exc_type, KeyboardInterrupt):
+            usual(lost)
+
+    sys.unraisablehook = unraisable
 
     def wait() -> None:
         while signal.SIGINT not in heard.recv(64):

@@ -112,19 +112,9 @@ def _reasons(scene: Scene, seen: Observables, stuck: bool) -> dict[str, str]:  #
     return reasons
 
 
-def text_of(payload: Mapping[str, Any]) -> list[str]:
-    """Return a short summary of a simulation, a line each."""
-    final, window = payload["final"], payload["window"]
-    head = "Settled" if payload["settled"] else "Not settled"
-    plural = "" if payload["impacts"] == 1 else "s"
-    lines = [
-        f"{payload['impacts']} contact{plural} from {payload['start']['time_us']:.6g} to {final['time_us']:.6g} us.",
-        f"{head}: {payload['settled_reason']}.",
-    ]
-    lines.append(
-        f"Peak amplitude {payload['peak_amplitude_nm']:.6g} nm, mean height {payload['mean_height_nm']:.6g} nm, "
-        f"from {window['from_us']:.6g} to {window['to_us']:.6g} us."
-    )
+def _over_a_response(payload: Mapping[str, Any]) -> list[str]:
+    """Return the lines of what is read over whole response periods."""
+    lines = []
     for harmonic in payload["harmonics"]:
         which = "the response frequency" if harmonic["multiple"] == 1 else f"{harmonic['multiple']} times that"
         lines.append(f"At {which}: {harmonic['amplitude_nm']:.6g} nm, {harmonic['phase_deg']:.6g} deg.")
@@ -149,6 +139,29 @@ def text_of(payload: Mapping[str, Any]) -> list[str]:
         f"Energy of a drive period: {payload['given_by_drives_aj']:.5g} aJ given; "
         f"{payload['dissipated_in_air_aj']:.5g} taken by air, {payload['dissipated_in_contact_aj']:.5g} by the sample."
     )
+    return lines
+
+
+def text_of(payload: Mapping[str, Any]) -> list[str]:
+    """Return a short summary of a simulation, a line each."""
+    final, window = payload["final"], payload["window"]
+    head = "Settled" if payload["settled"] else "Not settled"
+    plural = "" if payload["impacts"] == 1 else "s"
+    lines = [
+        f"{payload['impacts']} contact{plural} from {payload['start']['time_us']:.6g} to {final['time_us']:.6g} us.",
+        f"{head}: {payload['settled_reason']}.",
+    ]
+    lines.append(
+        f"Peak amplitude {payload['peak_amplitude_nm']:.6g} nm, mean height {payload['mean_height_nm']:.6g} nm, "
+        f"from {window['from_us']:.6g} to {window['to_us']:.6g} us."
+    )
+    if window["responses"]:
+        lines += _over_a_response(payload)
+    else:
+        lines.append(
+            "Less than a response period: amplitude and phase at its frequency, and energies, would be of a part; "
+            "follow the motion longer."
+        )
     lines.append(
         f"At the end: {final['position_nm']:.6g} nm, {final['velocity_nm_per_us']:.6g} nm/us, {final['phase']}"
         f"{'; the sample holds the tip' if payload['stuck'] else ''}."

@@ -89,19 +89,23 @@ class DrivenSetting(NamedTuple):
 
     `quick` is the way leg by leg, or None to go through every contact in time; `fineness` the steps per unit of the
     local pace of the way in time; `trials` the trial steps that a tip in contact may take in one round; `method`
-    "diffrax" takes the steps in time by Diffrax's solver.
+    "diffrax" takes the steps in time by Diffrax's solver. Contacts that magnify errors (left at less than one in
+    `magnified` of their energy, or with more than one junction) are computed again in finer steps, until two in a row
+    agree within `agreement`; None: never.
     """
 
     quick: QuickSetting | None
     fineness: float
     trials: int
     method: str = "collocation"
+    agreement: float | None = None
+    magnified: float = 1.0
 
 
 DRIVEN_SETTINGS = {
-    1e-6: DrivenSetting(QuickSetting(12, 8, 10, 12, 1e-6, 6, 4, 3e-3), 2.4, 60),
-    1e-9: DrivenSetting(QuickSetting(18, 13, 15, 16, 1e-9, 10, 7, 2e-4), 5.0, 120),
-    1e-11: DrivenSetting(QuickSetting(22, 16, 18, 20, 1e-11, 12, 9, 1e-5), 7.0, 180),
+    1e-6: DrivenSetting(QuickSetting(12, 8, 10, 12, 1e-6, 6, 4, 3e-3), 2.6, 60, agreement=1e-6, magnified=8.0),
+    1e-9: DrivenSetting(QuickSetting(18, 13, 15, 16, 1e-9, 10, 7, 1e-4), 5.5, 120, agreement=1e-9, magnified=4.0),
+    1e-11: DrivenSetting(QuickSetting(22, 16, 18, 20, 1e-11, 12, 9, 1e-5), 10.0, 250, agreement=1e-11, magnified=2.0),
 }
 """Settings by the accuracy of one driven contact: relative of the rebound speed, a tenth of it in us of the times."""
 

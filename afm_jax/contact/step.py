@@ -2,9 +2,9 @@
 
 A trial is one step of Dormand and Prince's method of order 8, Diffrax's own or a leaner one with the same coefficients.
 A trial that ends within the phase is taken. One that passes a threshold, or the end of the simulation, is not: its
-cubic says where to try again, until a trial ends so close to the threshold that a first-order correction of its length
-lands on it to rounding. Step lengths follow from the place alone (no error control), so that results are smooth in
-every parameter; the correction carries the derivative of the time at which the threshold is met.
+cubic says where to try again, until a trial ends so close to the threshold that a parabola corrects its length to
+rounding. Step lengths follow from the place alone (no error control), so that results are smooth in every parameter;
+the correction carries the derivative of the time at which the threshold is met.
 """
 
 from collections.abc import Callable
@@ -22,7 +22,7 @@ from afm_jax.contact.forces import jkr
 from afm_jax.contact.junction import Phase
 
 _NEAR = 1e-7
-"""Share of a threshold from which on the first-order correction is exact to rounding."""
+"""Share of a threshold from which on the correction by a parabola is exact to rounding."""
 _SHORTEST = 1e-3
 """Bounds of the share of a failed trial at which the next is tried: this, and 1 less a tenth of it."""
 _SHARE = 0.4
@@ -66,7 +66,11 @@ class Trial(NamedTuple):
 
 
 def advance(
-    driven: Driven, touch: Touch, until_us: Float[Array, "..."], fineness: float, method: str = "collocation"
+    driven: Driven,
+    touch: Touch,
+    until_us: Float[Array, "..."],
+    fineness: float | Float[Array, "..."],
+    method: str = "collocation",
 ) -> Touch:
     """Return a tip in contact after one trial.
 
@@ -111,7 +115,7 @@ def advance(
 
 
 def _tried(
-    driven: Driven, touch: Touch, until_us: Float[Array, "..."], fineness: float, step: Callable[..., Place]
+    driven: Driven, touch: Touch, until_us: Float[Array, "..."], fineness: float | Array, step: Callable[..., Place]
 ) -> Trial:
     start, solid = touch.place, touch.phase == Phase.JUNCTION
     low = jnp.where(solid, jkr.FOLD, driven.junction.forms_gap_nm)
@@ -137,17 +141,20 @@ def _pace(driven: Driven, place: Place, rates: Place, solid: Bool[Array, "..."])
 def _aimed(place: Place, rates: Place, thresholds: tuple[Array, Array], until_us: Float[Array, "..."]) -> Array:
     """Return the length after which the place's parabola meets the threshold ahead, or time ends; infinite if never."""
     low, high = thresholds
+    aim = _to_meet(place, rates, jnp.where(rates.x < 0.0, low, high) - place.x)
+    left = (until_us - place.time_us) / rates.time_us
+    return jnp.minimum(jnp.where(aim > 0.0, aim, jnp.inf), jnp.where(left > 0.0, left, jnp.inf))
+
+
+def _to_meet(place: Place, rates: Place, distance: Array) -> Array:
+    """Return the length after which the place's parabola has gone a distance in x; infinite if never."""
     # x'' along the step: in both phases x' is proportional to the gap's rate, whose slope is known
     ratio = rates.x / jnp.where(place.gap_rate == 0.0, 1.0, place.gap_rate)
     bend = 0.5 * ratio * rates.gap_rate
-    ahead = jnp.where(rates.x < 0.0, low, high) - place.x
-    square = rates.x * rates.x + 4.0 * bend * ahead
-    meets = (square > 0.0) & jnp.isfinite(ahead) & (rates.x != 0.0)
+    square = rates.x * rates.x + 4.0 * bend * distance
+    meets = (square > 0.0) & jnp.isfinite(distance) & (rates.x != 0.0)
     root = jnp.where(rates.x < 0.0, -1.0, 1.0) * jnp.sqrt(jnp.where(meets, square, 1.0))
-    distance = jnp.where(meets, ahead, 1.0)
-    aim = jnp.where(meets, 2.0 * distance / (rates.x + root), jnp.inf)
-    left = (until_us - place.time_us) / rates.time_us
-    return jnp.minimum(jnp.where(aim > 0.0, aim, jnp.inf), jnp.where(left > 0.0, left, jnp.inf))
+    return jnp.where(meets, 2.0 * jnp.where(meets, distance, 1.0) / jnp.where(meets, rates.x + root, 1.0), jnp.inf)
 
 
 def _passed(
@@ -202,8 +209,9 @@ def _land(trial: Trial, until_us: Float[Array, "..."], below: Array, above: Arra
     near_high = above | (trial.high - end.x < _NEAR * trial.high) & (rates.x > 0.0)
     target = jnp.where(near_low, trial.low, jnp.where(near_high, trial.high, end.x))
     at_threshold = near_low | near_high
-    moving = at_threshold & (rates.x != 0.0)
-    rest = jnp.where(moving, (target - end.x) / jnp.where(moving, rates.x, 1.0), 0.0)
+    # where the tip is slow, its acceleration counts in that little, too
+    rest = _to_meet(end, rates, target - end.x)
+    rest = jnp.where(at_threshold & jnp.isfinite(rest), rest, 0.0)
     ends = late & ~at_threshold
     rest = jnp.where(ends, (until_us - end.time_us) / jnp.where(ends, rates.time_us, 1.0), rest)
     moved = jax.tree.map(lambda value, rate: value + rate * rest, end, rates)

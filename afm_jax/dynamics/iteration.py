@@ -26,7 +26,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, Flight
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.map import NextImpact, impact_after
-from afm_jax.motion.law_motion import CONSTANT_PUSH, Bed, through_impact
+from afm_jax.motion.law_motion import CONSTANT_PUSH, Bed, LawLeg, or_rest, through_impact
 from afm_jax.motion.record import ContactKind, State
 from afm_jax.motion.start import default_start
 from afm_jax.outcomes import Outcome
@@ -88,6 +88,12 @@ def advance(scenes: Scene, tips: Tips) -> MapStep:
     impact = jax.vmap(partial(_one_impact, max_steps=_QUICK_STEPS))(scenes, tips)
     slow = going & (impact.outcome == Outcome.STEP_LIMIT)
     impact = for_few(partial(_one_impact, max_steps=MAX_STEPS), slow, (scenes, tips), impact)
+    return _landed(scenes, tips, impact)
+
+
+def _landed(scenes: Scene, tips: Tips, impact: NextImpact) -> MapStep:
+    """Return the step of tips to impacts that were found."""
+    going = tips.outcome == Outcome.IMPACT
     captured = going & (impact.outcome == Outcome.CAPTURED)
     landed = captured | (going & (impact.outcome == Outcome.IMPACT))
     surface = scenes.platform
@@ -257,14 +263,14 @@ def tips_at(scenes: Scene, time_us: Array, velocity_nm_per_us: Array) -> Tips:
 
 @jax.jit
 def landed_tips(scenes: Scene, start: State) -> Tips:
-    """Return tips just after the first impact of a flight from anywhere above the platform.
+    """Return tips just after the first impact of a flight from anywhere above the platform, or of a rest on it.
 
     Args:
         scenes: a batch of scenes.
         start: time, height and velocity in the lab, one value for all or one a scene.
     """
 
-    def one(scene: Scene, start: State) -> Tips:
+    def one(scene: Scene, start: State) -> NextImpact:
         gap = start.position_nm - scene.platform.position(start.time_us)
         # on the surface but for rounding
         gap = jnp.where(jnp.abs(gap) < _TOUCHING * (jnp.abs(start.position_nm) + scene.platform.amplitude_nm), 0.0, gap)
@@ -272,15 +278,10 @@ def landed_tips(scenes: Scene, start: State) -> Tips:
             scene.cantilever, scene.platform, start.time_us, start.velocity_nm_per_us, gap, jnp.zeros_like(gap)
         )
         impact = impact_after(scene, flight, jnp.asarray(DEFAULT_ROOT_TOLERANCE_US), max_steps=MAX_STEPS)
-        hit = impact.outcome == Outcome.IMPACT
-        time = jnp.where(hit, impact.time_us, 0.0)
-        whole = jnp.floor(time / scene.platform.period_us)
-        velocity = jnp.where(hit, impact.velocity_after_nm_per_us, 0.0)
-        left = time - whole * scene.platform.period_us
-        return Tips(left, whole, jnp.zeros_like(gap), velocity, impact.outcome.astype(jnp.int32))
+        return or_rest(scene, LawLeg(start.time_us, gap, start.velocity_nm_per_us), impact)
 
     whole = State(*(jnp.broadcast_to(part, scenes.platform.frequency_khz.shape) for part in start))
-    return jax.vmap(one)(scenes, whole)
+    return _landed(scenes, tips_at(scenes, whole.time_us, whole.velocity_nm_per_us), jax.vmap(one)(scenes, whole)).end
 
 
 def batch_and_tips(scene: Scene, start: State | None = None) -> tuple[Scene, Tips]:

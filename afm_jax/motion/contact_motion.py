@@ -299,6 +299,11 @@ _LEGS_AT_ONCE, _TRIALS_AT_ONCE = 256, 64
 """Tips of a batch that go the quick way together, and that try steps in time together."""
 _TRIALS = 4
 """Trial steps between two looks at which tips of a batch need more."""
+_LASTS_LONG = 10.0
+"""Times that a tip as fast as it came takes for the bridge's gaps, in and out."""
+_FINER, _MOST_REPEATS = 1.5, 5
+"""Steps are so many times as fine every time: an eighth-order error is 25 times smaller, or 4 to be careful."""
+_LESS = 4.0
 
 
 class ContactRow(NamedTuple):
@@ -327,6 +332,14 @@ class Arrival(NamedTuple):
     gap_rate: Float[Array, ""]
 
 
+class Repeats(NamedTuple):
+    """How often the present contact was computed again, and what it ended with the last time; scalars of one tip."""
+
+    times: Int[Array, ""]
+    departure_us: Float[Array, ""]
+    departure_rate: Float[Array, ""]
+
+
 class ContactTip(NamedTuple):
     """A tip on its way; scalars of one tip, but for the rows."""
 
@@ -334,6 +347,7 @@ class ContactTip(NamedTuple):
     """Its place and phase, and the contact it is in; the gap of a free tip."""
     arrival: Arrival
     """Where the present contact began."""
+    repeats: Repeats
     contacts: Int[Array, ""]
     rows: Float[Array, "rows columns"]
     outcome: Int[Array, ""]
@@ -352,6 +366,7 @@ def begin(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, rows: int)
     return ContactTip(
         touch=fresh_touch(Place(gap_nm, rate, time_us, zero), phase),
         arrival=Arrival(time_us, gap_nm, rate),
+        repeats=Repeats(jnp.zeros_like(phase, dtype=jnp.int32), zero, zero),
         contacts=jnp.zeros_like(phase),
         rows=jnp.zeros((rows, len(ContactRow._fields)), time_us.dtype),
         outcome=outcome.astype(jnp.int32),
@@ -396,12 +411,14 @@ def _round(driven: Driven, tip: ContactTip, *, until_us: Array, setting: DrivenS
     arrival = Arrival(*(jnp.where(arrived, new, old) for new, old in zip(began, tip.arrival, strict=True)))
     fresh = fresh_touch(place, jnp.where(arrived, Phase.BRIDGE, Phase.DRY))
     touch = jax.tree.map(lambda new, old: jnp.where(free, new, old), fresh, tip.touch)
-    touch = _through(driven, touch, arrived, ~tip.done, until_us, setting)
-    touch = _step(driven, touch, ~tip.done, until_us, setting, reverse=reverse)
+    active, first = ~tip.done, tip.repeats.times == 0
+    touch = _through(driven, touch, arrived, active & first, until_us, setting)
+    touch = _step(driven, touch, active, tip.repeats.times, until_us, setting, reverse=reverse)
     over = touch.place.time_us >= until_us
     left = touch.phase == Phase.DRY
-    touched = arrived | ((tip.touch.phase != Phase.DRY) & ~tip.done)
-    ended = touched & (left | over)
+    touched = arrived | ((tip.touch.phase != Phase.DRY) & active)
+    again, repeats = _again(touch, arrival, tip.repeats, touched & left & ~over, setting)
+    ended = touched & (left | over) & ~again
     room = tip.contacts < tip.rows.shape[0]
     row = _row(touch, arrival, held=~left)
     place_of_row = jnp.where(ended & room, tip.contacts, tip.rows.shape[0])
@@ -411,15 +428,40 @@ def _round(driven: Driven, tip: ContactTip, *, until_us: Array, setting: DrivenS
     outcome = jnp.where(lost, MotionOutcome.STEP_LIMIT, outcome)
     outcome = jnp.where(jnp.isfinite(touch.place.x), outcome, MotionOutcome.UNRESOLVED)
     flown = free & ~arrived
+    if setting.agreement is not None:
+        came = Place(arrival.gap_nm, arrival.gap_rate, arrival.time_us, jnp.zeros_like(arrival.time_us))
+        back = fresh_touch(came, jnp.full_like(touch.phase, Phase.BRIDGE))
+        touch = jax.tree.map(lambda new, old: jnp.where(again, new, old), back, touch)
     return ContactTip(
         touch=touch,
         arrival=arrival,
+        repeats=repeats,
         contacts=tip.contacts + ended.astype(tip.contacts.dtype),
         rows=tip.rows.at[place_of_row].set(row, mode="drop"),
         outcome=jnp.where(tip.done, tip.outcome, outcome).astype(jnp.int32),
         done=tip.done | flown | (touched & over) | full | lost | ~jnp.isfinite(touch.place.x),
         rounds=tip.rounds + 1,
     )
+
+
+def _again(
+    touch: Touch, arrival: Arrival, repeats: Repeats, left: Array, setting: DrivenSetting
+) -> tuple[Array, Repeats]:
+    """Say whether a contact that a tip has left is to be computed again in finer steps, and what that will know."""
+    if setting.agreement is None:
+        return jnp.zeros_like(left), repeats
+    came, now, before = lax.stop_gradient((arrival, touch.place, repeats))
+    lasts = (now.time_us - came.time_us) * jnp.abs(came.gap_rate) > _LASTS_LONG * (came.gap_nm + now.x)
+    slowed = setting.magnified * now.gap_rate**2 < came.gap_rate**2
+    differs = jnp.maximum(
+        jnp.abs(now.gap_rate - before.departure_rate),
+        10.0 * jnp.abs(now.time_us - before.departure_us) * jnp.abs(now.gap_rate),
+    ) > _LESS * setting.agreement * jnp.abs(now.gap_rate)
+    magnified = slowed | lasts | (touch.junctions != 1)
+    again = left & jnp.where(repeats.times == 0, magnified, differs & (repeats.times < _MOST_REPEATS))
+    known = Repeats(repeats.times + 1, now.time_us, now.gap_rate)
+    kept = repeats._replace(times=jnp.where(left, 0, repeats.times))
+    return again, jax.tree.map(lambda new, old: jnp.where(again, new, old), known, kept)
 
 
 def _fly(driven: Driven, place: Place, free: Array, until_us: Array) -> tuple[Array, Array, Place]:
@@ -460,43 +502,56 @@ def _through(
 
 
 def _step(
-    driven: Driven, touch: Touch, active: Array, until_us: Array, setting: DrivenSetting, *, reverse: bool
+    driven: Driven,
+    touch: Touch,
+    active: Array,
+    repeats: Array,
+    until_us: Array,
+    setting: DrivenSetting,
+    *,
+    reverse: bool,
 ) -> Touch:
     """Return a tip in contact after some trial steps, or where the quick way may go on; a free one stays as it is."""
+    fineness = setting.fineness * _FINER ** repeats.astype(until_us.dtype)
 
     def going(touch, active, until_us):
         finite = jnp.isfinite(touch.place.x) & jnp.isfinite(touch.place.gap_rate)
         return active & (touch.phase != Phase.DRY) & (touch.place.time_us < until_us) & finite
 
-    def waits_not(driven, touch, active, until_us):
-        # a tip that has just formed the junction waits for the quick way; one for which that did not hold does not
+    def waits_not(driven, touch, active, fineness, until_us):
+        # a tip that has just formed the junction waits for the quick way; one for which that did not hold does not,
+        # nor one that repeats its contact
         moves = going(touch, active, until_us)
-        return moves if setting.quick is None else moves & ~at_junction(driven, touch)
+        if setting.quick is None:
+            return moves
+        return moves & ~(at_junction(driven, touch) & (fineness == setting.fineness))
 
-    def advanced(driven, touch, moves, until_us):
-        after = advance(driven, touch, until_us, setting.fineness, setting.method)
+    def advanced(driven, touch, moves, fineness, until_us):
+        after = advance(driven, touch, until_us, fineness, setting.method)
         return jax.tree.map(lambda new, old: jnp.where(moves, new, old), after, touch)
 
     if reverse:
 
         def once(touch, _):
-            return advanced(driven, touch, going(touch, active, until_us), until_us), None
+            return advanced(driven, touch, going(touch, active, until_us), fineness, until_us), None
 
         return lax.scan(once, touch, None, length=setting.trials)[0]
 
-    def run(driven, touch, active, until_us):
+    def run(driven, touch, active, fineness, until_us):
         def on(state):
             touch, count = state
-            return jnp.any(waits_not(driven, touch, active, until_us)) & (count < _TRIALS)
+            return jnp.any(waits_not(driven, touch, active, fineness, until_us)) & (count < _TRIALS)
 
         def more(state):
             touch, count = state
-            return advanced(driven, touch, waits_not(driven, touch, active, until_us), until_us), count + 1
+            moves = waits_not(driven, touch, active, fineness, until_us)
+            return advanced(driven, touch, moves, fineness, until_us), count + 1
 
         return lax.while_loop(on, more, (touch, 0))[0]
 
     passes = -(-setting.trials // _TRIALS)
-    return for_the_few(run, waits_not, changed=1, passes=passes, block=_TRIALS_AT_ONCE)(driven, touch, active, until_us)
+    few = for_the_few(run, waits_not, changed=1, passes=passes, block=_TRIALS_AT_ONCE)
+    return few(driven, touch, active, fineness, until_us)
 
 
 def _row(touch: Touch, arrival: Arrival, *, held: Array) -> Float[Array, " columns"]:

@@ -314,7 +314,8 @@ def _round(seen: Scene, tip: LawTip, until: Array) -> LawTip:
     )
     tolerance = jnp.asarray(DEFAULT_ROOT_TOLERANCE_US, until.dtype)
     impact = impact_after(seen, flight, tolerance, max_steps=_FLIGHT_STEPS, latest_us=until - leg.time_us)
-    impact = _or_rest(seen, tip, impact)
+    rested = or_rest(seen, leg, impact)
+    impact = jax.tree.map(lambda one, other: jnp.where(tip.rounds == 0, one, other), rested, impact)
     ended = impact.outcome
     landed = (ended == Outcome.IMPACT) | (ended == Outcome.CAPTURED)
     arrived = ~tip.done & landed & (impact.arrival_time_us < until)
@@ -339,13 +340,13 @@ def _round(seen: Scene, tip: LawTip, until: Array) -> LawTip:
     )
 
 
-def _or_rest(seen: Scene, tip: LawTip, impact: NextImpact) -> NextImpact:
+def or_rest(seen: Scene, leg: LawLeg, impact: NextImpact) -> NextImpact:
     """Return the capture that a tip at rest on the surface at its start has had, or the impact that was found."""
-    leg, surface = tip.leg, seen.platform
+    surface = seen.platform
     speed = surface.velocity(leg.time_us)
     rate = jnp.abs(leg.velocity - speed)
     slow = rate <= _ON_SURFACE_NM * Bed(seen.cantilever, surface).fastest
-    rests = (tip.rounds == 0) & (leg.gap_nm == 0.0) & slow
+    rests = (leg.gap_nm == 0.0) & slow
     captured = NextImpact(
         leg.time_us, leg.time_us, speed, speed, jnp.full_like(impact.outcome, Outcome.CAPTURED), rests
     )
