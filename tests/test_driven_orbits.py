@@ -219,3 +219,20 @@ def test_charts_sweeps_exponents_and_basins_of_driven_tips_come_to_the_orbit(kin
     plane = scene_family(scene, "platform.offset_nm", "interaction.r")
     chart = stability_chart(plane, x_values=np.array([-5.0, -4.5]), y_values=np.array([0.8]), last_order=1)
     assert chart.verdicts.peak_amplitude_nm[0, 0] == pytest.approx(float(orbits.peak_amplitude_nm[slot]), rel=1e-12)
+
+
+@pytest.mark.slow
+def test_a_diagram_begins_where_there_is_motion_or_where_it_is_told_to():
+    """Adhesion holds a tip that merely leaves the sample, beside a stable orbit at a free amplitude of 80 nm."""
+    scene = driven("force", ImpactLaw(0.9, 60.0), 92.0 / 90.0, 80.0, -61.0, 40.0)
+    orbits = single_impact_orbits(scene, 1)
+    slot, values = fastest(orbits), np.array([-67.0, -64.0, -61.0])
+    swept = bifurcation_diagram(scene, "platform.offset_nm", values, impacts=600)
+    # too long a step for the tip, which begins anew
+    assert swept.verdicts.names() == ["(1,1)", "stuck", "(1,1)"]
+    assert swept.restarted.tolist() == [False, False, True]
+    found = swept.phase_rad[2, -1], swept.velocity_after_nm_per_us[2, -1]
+    assert found == pytest.approx((float(orbits.phase_rad[slot]), float(orbits.velocity_after_nm_per_us[slot])))
+    at_rest = bifurcation_diagram(scene, "platform.offset_nm", values, start=(0.0, 1.0, 0.0), impacts=600)
+    assert at_rest.verdicts.names() == ["stuck"] * 3
+    assert at_rest.restarted.tolist() == [False, True, True]

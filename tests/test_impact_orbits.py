@@ -153,6 +153,16 @@ def test_an_orbit_with_a_rest_is_followed_to_where_it_ends():
         assert sum(isinstance(one, StickingOrbit) and one.order == own.order for one in ends) == 1
 
 
+@pytest.mark.slow
+def test_an_orbit_with_a_rest_ends_where_the_sample_holds_the_tip():
+    """There the sample's largest acceleration is the spring's: beta (Omega^2 - omega^2) = Omega^2 sigma."""
+    found = follow_sticking(scene(0.35, 0.4, 1.0), 1, ParameterRange("platform.offset_nm", 0.98, 1.1), values=4)
+    (point,) = found.special
+    assert point.kind == "held"
+    assert found.branches[0].ends == ("range", "held")
+    assert point.parameter == pytest.approx(2.0 * (1.0 - 0.7**2), abs=1e-10)
+
+
 def test_multipliers_are_those_of_numpy():
     rng = np.random.default_rng(2)
     matrices = rng.normal(size=(200, 2, 2))

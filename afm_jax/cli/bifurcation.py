@@ -45,11 +45,13 @@ def command(  # noqa: PLR0913
 ) -> None:
     """Sweep a parameter and record what the tip comes to at each of its values.
 
-    The tip is carried from value to value with its drive phase and rebound speed; one that the platform holds, or that
-    flies away, begins anew at the next value. Of each value the verdict is told, (m,N): m impacts in N drive periods,
-    irregular, stuck or free; and the last impacts are. With --out bifurcation.csv (a row a value), impacts.csv (a row
-    an impact; of an orbit each once), strobe.csv (heights whenever the platform is highest) and a picture. With --law
-    the share of the fit's draws with the same verdict is told too. Exit code 3 if no motion went on anywhere.
+    The tip is carried from value to value with its drive phase and rebound speed. It begins, and begins anew where the
+    platform held it or it flew away, at the file's [start]; without one on the stable single-impact orbit of the order
+    nearest to resonance, else leaving the platform upward. Of each value the verdict is told, (m,N): m impacts in N
+    drive periods, irregular, stuck or free; and the last impacts are. With --out bifurcation.csv (a row a value),
+    impacts.csv (a row an impact; of an orbit each once), strobe.csv (heights whenever the platform is highest) and a
+    picture. With --law the share of the fit's draws with the same verdict is told too. Exit code 3 if no motion went on
+    anywhere.
     """
     session.start_computing()
     import numpy as np  # noqa: PLC0415
@@ -58,7 +60,7 @@ def command(  # noqa: PLR0913
     from afm_jax.dynamics.motion_bands import verdict_probability  # noqa: PLC0415
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
-    loaded, _ = scene_and_start(scene)
+    loaded, start = scene_and_start(scene)
     loaded, known = with_fitted_law(loaded, law)
     (swept,) = ranges_of(scene, loaded, [parameter], counted=True)
     directions = [True, False] if both else [not down]
@@ -68,13 +70,15 @@ def command(  # noqa: PLR0913
             with session.working("sweeping up" if upward else "sweeping down"):
                 told = session.progress("values up" if upward else "values down")
                 sweeps.append(
-                    bifurcation_diagram(loaded, swept.path, swept.values, upward=upward, impacts=impacts, report=told)
+                    bifurcation_diagram(
+                        loaded, swept.path, swept.values, start=start, upward=upward, impacts=impacts, report=told
+                    )
                 )
         probabilities = None
         if known is not None:
             with session.working("sweeping with drawn laws"):
                 probabilities = [
-                    verdict_probability(loaded, swept.path, sweep, known, draws=draws, impacts=impacts)
+                    verdict_probability(loaded, swept.path, sweep, known, start=start, draws=draws, impacts=impacts)
                     for sweep in sweeps
                 ]
     except ValueError as error:
@@ -100,7 +104,9 @@ def command(  # noqa: PLR0913
             told["verdict_probability"] = sure
     session.emit(payload, *(_summary(sweep) for sweep in sweeps))
     if not any(np.isfinite(sweep.phase_rad).any() for sweep in sweeps):
-        raise NotValid("no motion went on at any value: the tip sticks or flies away; try a larger drive amplitude")
+        raise NotValid(
+            "no motion went on at any value: the tip sticks or flies away; try a larger drive amplitude, or a [start]"
+        )
 
 
 def _payload(sweep: "Sweep") -> dict[str, Any]:

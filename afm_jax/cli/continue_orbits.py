@@ -48,6 +48,7 @@ _ENDS = {
     "delay": "close to capture, where the law's delay is longer than half a drive period",
     "shorter": "where it becomes an orbit of fewer impacts",
     "closed": "where it began: it is closed",
+    "held": "where the sample no longer lets the tip go",
     "rest_lost": "where the sample no longer holds the tip for a while",
     "grazing": "where a flight grazes the sample, and another motion follows",
     "lost": "a point that it could not be followed beyond",
@@ -94,8 +95,9 @@ def command(  # noqa: PLR0913
     Folds, period doublings, torus points, grazings and captures are located to rounding; with --second they are
     followed as curves in two parameters, with cusps and meetings. In a scene with a contact the simulation is closed
     instead of the map, and curves end where the orbit grazes or is captured. With --sticking the phase is that of the
-    release, and the branches end where the rest is lost or a flight grazes. With --law every special point has a
-    95 % interval. With --out tables and pictures. Exit code 3 if there is no admissible orbit in the range.
+    release, and the branches end where the rest is lost, the sample lets go no more or a flight grazes. With --law
+    every special point has a 95 % interval. With --out tables and pictures. Exit code 3 if there is no admissible
+    orbit in the range.
     """
     if sticking and (second is not None or law is not None or impacts != 1):
         raise ValueError("--sticking goes without --impacts, --second and --law: an orbit with a rest has no equations")

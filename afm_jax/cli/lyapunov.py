@@ -53,15 +53,16 @@ def command(  # noqa: PLR0913
     """Compute Lyapunov exponents by QR of the impact map's exact Jacobians; a contact's come from its simulation.
 
     Of a motion that has come to an orbit they are the logarithms of its multipliers. A tip that rests on the platform
-    forgets its start: its exponents are minus infinity, null in JSON. Begins at the file's [start]; without one, and
-    with --parameter, at a tip that leaves the platform upward, or on the orbit that `simulate` starts on. With --law
-    there is a band for the larger one, from tips that leave the platform upward. With --out
-    lyapunov.csv, and with --parameter a picture. Exit code 3 where the motion ends before enough impacts.
+    forgets its start: its exponents are minus infinity, null in JSON. Begins at the file's [start]; without one on the
+    stable single-impact orbit of the order nearest to resonance, if there is one, else leaving the platform upward.
+    With --law there is a band for the larger one, begun without [start]. With --out lyapunov.csv, and with --parameter
+    a picture. Exit code 3 where the motion ends before enough impacts.
     """
     session.start_computing()
     import numpy as np  # noqa: PLC0415
 
     from afm_jax.dynamics.exponents import exponent_verdicts, lyapunov_spectrum  # noqa: PLC0415
+    from afm_jax.dynamics.iteration import states_of  # noqa: PLC0415
     from afm_jax.dynamics.motion_bands import drawn_exponents  # noqa: PLC0415
     from afm_jax.motion.start import start_of  # noqa: PLC0415
     from afm_jax.scenefile.parameter_paths import scene_batch  # noqa: PLC0415
@@ -72,10 +73,11 @@ def command(  # noqa: PLR0913
     ranges = ranges_of(scene, loaded, [parameter] if parameter else [], counted=True)
     given = {one.path: one.values for one in ranges}
     try:
-        start = None if told is None or given else start_of(loaded, told)
+        motions = scene_batch(loaded, given) if given else loaded
+        start = None if told is None else states_of(motions, told) if given else start_of(loaded, told)
         with session.working("following the motion (the first run compiles for some seconds)"):
             found = lyapunov_spectrum(
-                scene_batch(loaded, given) if given else loaded,
+                motions,
                 start,
                 impacts=impacts,
                 transient=transient,

@@ -1,9 +1,10 @@
 """Traced programs beside JAX's compilation cache: what that has compiled it finds only after tracing anew.
 
 Commands name the few that gain by being kept traced as well (processor seconds of a warm call, with and without: fit by
-viscous+delay 5.3 and 11.9, collide 2.1 and 3.3; a simulation gains too little): by `jax.export`, its own serialisation (what `serialize_executable` writes is read by pickle, which runs any code that a file names). A file is
-found by all that a trace depends on: loaded sources, versions, configuration, devices, shapes and structure. Results
-are modules and tuples of arrays; arguments that are no arrays have a `repr` that says all of them.
+viscous+delay 5.3 and 11.9, collide 2.1 and 3.3; a simulation gains too little): by `jax.export`, its own serialisation
+(what `serialize_executable` writes is read by pickle, which runs any code that a file names). A file is found by all
+that a trace depends on: loaded sources, versions, configuration, devices, shapes and structure. Results are modules
+and tuples of arrays; arguments that are no arrays have a `repr` that says all of them.
 """
 
 import hashlib

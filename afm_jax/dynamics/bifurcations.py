@@ -6,7 +6,7 @@ stretches; from where it was, all stretches are swept side by side; then the fir
 from the end of the stretch before it, and the stretches in which that makes a difference are swept again from there,
 until none is left. What remains is what one tip that is swept along all values does, where its motion is regular; it
 carries drive phase and rebound speed from value to value. A tip that the platform holds, or that flies away, begins
-anew at the next value, leaving the platform upward.
+anew at the next value, where it is told to or where there is motion (`bouncing_tips`).
 """
 
 from typing import Any, NamedTuple
@@ -25,11 +25,12 @@ from afm_jax.dynamics.iteration import (
     Report,
     SampleDriven,
     Tips,
+    batch_and_tips,
     in_blocks,
-    leaving_tips,
     recorded,
     sample_driven,
     skipped,
+    states_of,
 )
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Verdicts, verdicts_of
 from afm_jax.outcomes import Outcome
@@ -82,11 +83,12 @@ class Sweep(NamedTuple):
     complete: bool
 
 
-def bifurcation_diagram(
+def bifurcation_diagram(  # noqa: PLR0913
     scene: Scene,
     parameter: str,
     values: Float[np.ndarray, " values"],
     *,
+    start: tuple[float, float, float] | None = None,
     upward: bool = True,
     impacts: int = 2000,
     accuracy: float = 1e-6,
@@ -98,6 +100,8 @@ def bifurcation_diagram(
         scene: a scene with a law or a contact, driven with one frequency.
         parameter: its path in the scene file.
         values: of the parameter, ascending.
+        start: where the tip begins, and anew where its motion has ended: as of `start_of`; None: on the stable
+            single-impact orbit of the order nearest to resonance, else leaving the platform upward.
         upward: from the lowest value to the highest, or the other way round.
         impacts: at each value; the last of them are recorded.
         accuracy: of resolved contacts, as for `simulate`.
@@ -111,22 +115,25 @@ def bifurcation_diagram(
     if ordered.ndim != 1 or len(ordered) < 1 or np.any(np.diff(ordered) <= 0.0):
         raise ValueError("`values` must be rising numbers, one at least")
     scenes = scene_batch(scene, {parameter: ordered if upward else ordered[::-1]})
-    seen = jax.tree.map(np.asarray, sample_driven(scenes))
+    seen = sample_driven(scenes)
     if impacts < RECORDED:
         raise ValueError(f"`impacts` must be {RECORDED} or more, to tell orbits, but is {impacts}")
-    sweeper = _Sweeper(seen.scenes, impacts, accuracy)
+    begin = None if start is None else seen.start(states_of(scenes, start))
+    _, fresh = batch_and_tips(seen.scenes, begin)
+    seen, fresh = jax.tree.map(np.asarray, (seen, fresh))
+    sweeper = _Sweeper(seen.scenes, fresh, impacts, accuracy)
     swept, complete = sweeper.run(report)
+    restarted = np.append(False, swept.end.outcome[:-1] != Outcome.IMPACT)
     order = slice(None) if upward else slice(None, None, -1)
-    seen, platform, swept = jax.tree.map(lambda part: part[order], (seen, scenes.platform, swept))
+    seen, platform, swept, restarted = jax.tree.map(lambda part: part[order], (seen, scenes.platform, swept, restarted))
     seen, platform = jax.tree.map(jnp.asarray, (seen, platform))
-    return _sweep_of(seen, platform, swept, ordered, upward=upward, complete=complete)
+    return _sweep_of(seen, platform, swept, restarted, ordered, upward=upward, complete=complete)
 
 
 class _SweptRows(NamedTuple):
     """Of every value, arrays with a leading axis of values."""
 
     end: Tips
-    restarted: Bool[np.ndarray, " values"]
     record: Record
     verdicts: Verdicts
 
@@ -134,8 +141,8 @@ class _SweptRows(NamedTuple):
 class _Sweeper:
     """Sweeps of the same scenes in stretches; the scenes are in the order in which they are swept."""
 
-    def __init__(self, scenes: Scene, impacts: int, accuracy: float):
-        self.scenes, self.impacts, self.accuracy = scenes, impacts, accuracy
+    def __init__(self, scenes: Scene, fresh: Tips, impacts: int, accuracy: float):
+        self.scenes, self.fresh, self.impacts, self.accuracy = scenes, fresh, impacts, accuracy
         self.count = len(scenes.platform.frequency_khz)
         shortest, longest = (-(-self.count // most) for most in (_MORE_STRETCHES, _STRETCHES))
         self.stretch = max(shortest, min(longest, _LONG_STRETCH))
@@ -145,20 +152,20 @@ class _Sweeper:
         """Return the sweep of all values, and whether nothing was left to be swept again."""
         every = np.arange(self.lanes)
         starts = self._hurried()
-        parts = self._sweep(every, starts, np.zeros(self.lanes, bool), report)
+        parts = self._sweep(every, starts, report)
         changed = every
         for _ in range(_PASSES):
             behind = changed[changed + 1 < self.lanes] + 1
             if not behind.size:
                 break
-            starts, restarted = self._carried(parts[-1], behind - 1, self._numbers(behind - 1)[:, -1], behind)
-            first = self._follow(self._numbers(behind)[:, 0], starts, restarted)
+            starts = self._carried(parts[-1], behind - 1, self._numbers(behind - 1)[:, -1], behind)
+            first = self._follow(self._numbers(behind)[:, 0], starts)
             differs = ~_same(first, jax.tree.map(lambda part, rows=behind: part[rows], parts[0]))
             changed = behind[differs]
             if not changed.size:
                 break
             chosen = jax.tree.map(lambda part, rows=differs: part[rows], starts)
-            again = self._sweep(changed, chosen, restarted[differs], None)
+            again = self._sweep(changed, chosen, None)
             for old, new in zip(parts, again, strict=True):
                 for part, rows in zip(jax.tree.leaves(old), jax.tree.leaves(new), strict=True):
                     part[changed] = rows
@@ -176,54 +183,48 @@ class _Sweeper:
 
         return jax.tree.map(join, *parts)
 
-    def _at(self, numbers: np.ndarray) -> Scene:
-        return jax.tree.map(lambda leaf: jnp.asarray(leaf[numbers]), self.scenes)
+    def _at(self, numbers: np.ndarray) -> tuple[Scene, Tips]:
+        """Return the scenes of values, and the tips that begin there."""
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf[numbers]), (self.scenes, self.fresh))
 
-    def _sweep(self, lanes: np.ndarray, tips: Tips, restarted: np.ndarray, report: Report | None) -> list[_SweptRows]:
+    def _sweep(self, lanes: np.ndarray, tips: Tips, report: Report | None) -> list[_SweptRows]:
         """Return what comes out at the first, second, ... value of stretches."""
         numbers, parts = self._numbers(lanes), []
         for place in range(self.stretch):
             if place:
-                tips, restarted = self._carried(parts[-1], slice(None), numbers[:, place - 1], lanes, place)
-            parts.append(self._follow(numbers[:, place], tips, restarted))
+                tips = self._carried(parts[-1], slice(None), numbers[:, place - 1], lanes, place)
+            parts.append(self._follow(numbers[:, place], tips))
             if report is not None:
                 report(min((place + 1) * len(lanes), self.count), self.count)
         return parts
 
-    def _carried(
-        self, before: _SweptRows, rows, old: np.ndarray, lanes: np.ndarray, place: int = 0
-    ) -> tuple[Tips, Any]:
-        """Return tips of one value at the next one, and which begin anew."""
+    def _carried(self, before: _SweptRows, rows: Any, old: np.ndarray, lanes: np.ndarray, place: int = 0) -> Tips:
+        """Return tips of one value at the next one."""
         end = jax.tree.map(lambda part: part[rows], before.end)
-        tips = carried(self._at(old), self._at(self._numbers(lanes)[:, place]), end)
-        return jax.tree.map(np.asarray, tips), end.outcome != Outcome.IMPACT
+        tips = carried(self._at(old)[0], *self._at(self._numbers(lanes)[:, place]), end)
+        return jax.tree.map(np.asarray, tips)
 
-    def _follow(self, numbers: np.ndarray, tips: Tips, restarted: np.ndarray) -> _SweptRows:
+    def _follow(self, numbers: np.ndarray, tips: Tips) -> _SweptRows:
         """Return what tips come to, one at each value."""
 
         def work(lanes: tuple[Scene, Tips]) -> tuple[Tips, Record]:
             return follow(*lanes, skip=self.impacts - RECORDED, record=RECORDED, accuracy=self.accuracy)
 
-        scenes = self._at(numbers)
+        scenes, _ = self._at(numbers)
         end, record = in_blocks(work, (scenes, tips))
         period = np.asarray(scenes.platform.period_us)
-        return _SweptRows(
-            end, restarted, record, verdicts_of(record, end.outcome, period, tolerance=settled_below(scenes))
-        )
+        return _SweptRows(end, record, verdicts_of(record, end.outcome, period, tolerance=settled_below(scenes)))
 
     def _hurried(self) -> Tips:
         """Return the tips that one gets at the first values of all stretches in a sweep of those alone."""
-        firsts = self._at(self._numbers(np.arange(self.lanes))[:, 0])
+        firsts, fresh = self._at(self._numbers(np.arange(self.lanes))[:, 0])
         if not isinstance(self.scenes.interaction, Contact):
-            return jax.tree.map(np.asarray, _hurried_law(firsts))
-        rows, tips = [], None
+            return jax.tree.map(np.asarray, _hurried_law(firsts, fresh))
+        rows, tips, before = [], None, None
         for lane in range(self.lanes):
-            scene = jax.tree.map(lambda leaf, lane=lane: leaf[lane : lane + 1], firsts)
-            if tips is None:
-                tips = leaving_tips(scene)
-            else:
-                before = jax.tree.map(lambda leaf, lane=lane: leaf[lane - 1 : lane], firsts)
-                tips = carried(before, scene, tips)
+            scene, begin = jax.tree.map(lambda leaf, lane=lane: leaf[lane : lane + 1], (firsts, fresh))
+            tips = begin if tips is None else carried(before, scene, begin, tips)
+            before = scene
             rows.append(jax.tree.map(np.asarray, tips))
             tips, _ = follow_contacts(scene, tips, skip=1, record=0, accuracy=self.accuracy)
         return jax.tree.map(lambda *parts: np.concatenate(parts), *rows)
@@ -251,34 +252,34 @@ def settled_below(scenes: Scene) -> float:
 
 
 @jax.jit
-def _hurried_law(firsts: Scene) -> Tips:
-    def one(state, scene: Scene):
-        before, tips = state
-        tips = carried(before, scene, tips)
+def _hurried_law(firsts: Scene, fresh: Tips) -> Tips:
+    def one(state, place: tuple[Scene, Tips]):
+        scene, _ = place
+        tips = carried(state[0], *place, state[1])
         return (scene, skipped(scene, tips, impacts=_HURRIED)), tips
 
-    each = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None], firsts)
+    each = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None], (firsts, fresh))
     first = jax.tree.map(lambda leaf: leaf[0], each)
-    return jax.tree.map(lambda part: part[:, 0], jax.lax.scan(one, (first, leaving_tips(first)), each)[1])
+    return jax.tree.map(lambda part: part[:, 0], jax.lax.scan(one, first, each)[1])
 
 
 @jax.jit
-def carried(before: Scene, after: Scene, tips: Tips) -> Tips:
-    """Return tips in other scenes at the same drive phase with the same rebound speed; ended ones leave anew.
+def carried(before: Scene, after: Scene, fresh: Tips, tips: Tips) -> Tips:
+    """Return tips in other scenes at the same drive phase with the same rebound speed; ended ones begin anew.
 
     Args:
         before: the scenes they are in, a batch.
         after: the scenes they come to.
+        fresh: tips that begin there.
         tips: the tips.
     """
     time = tips.time_us * (after.platform.period_us / before.platform.period_us)
     rebound = tips.velocity_nm_per_us - before.platform.velocity(tips.time_us)
-    fresh = leaving_tips(after)
     kept = tips._replace(
         time_us=time,
         periods=jnp.zeros_like(time),
         velocity_nm_per_us=after.platform.velocity(time) + rebound,
-        gap_nm=fresh.gap_nm if isinstance(after.interaction, Contact) else tips.gap_nm,
+        gap_nm=after.interaction.bridge_breaks_nm if isinstance(after.interaction, Contact) else tips.gap_nm,
     )
     going = tips.outcome == Outcome.IMPACT
     return jax.tree.map(lambda old, new: jnp.where(going, old, new), kept, fresh)
@@ -299,6 +300,7 @@ def _sweep_of(
     seen: SampleDriven,
     platform: Platform,
     swept: _SweptRows,
+    restarted: Bool[np.ndarray, " values"],
     values: Float[np.ndarray, " values"],
     *,
     upward: bool,
@@ -322,7 +324,7 @@ def _sweep_of(
         values=values,
         upward=upward,
         verdicts=verdicts,
-        restarted=swept.restarted,
+        restarted=restarted,
         phase_rad=known(within_turn(turn * record.departure_us + ahead, 2.0 * np.pi)),
         approach_nm_per_us=known(record.approach_nm_per_us),
         velocity_after_nm_per_us=known(

@@ -31,7 +31,7 @@ from afm_jax.dynamics.impact_orbits import (
     many_impact_orbits,
     multipliers_of,
 )
-from afm_jax.dynamics.iteration import Report, SampleDriven, evenly_spread, in_blocks, leaving_tips
+from afm_jax.dynamics.iteration import Report, SampleDriven, evenly_spread, in_blocks, laws_of, leaving_tips
 from afm_jax.impact.amplitude import FlightEnds, highest_of_sum, peak_amplitude
 from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
 from afm_jax.motion.observe import peaks_of_flights
@@ -245,30 +245,24 @@ def _guesses_of_law(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return guesses: numbers of scenes and of orders, departure phases, rebound speeds, rad that an orbit takes."""
     scenes = jax.tree.map(np.asarray, seen.scenes)
-    leaves = [*jax.tree.leaves(scenes.interaction), scenes.cantilever.mass_ng]
-    rows, owner = np.unique(np.stack(leaves, axis=1), axis=0, return_inverse=True)
-    parts: list[tuple[np.ndarray, ...]] = [(np.zeros(0, int), np.zeros(0, int), *np.zeros((3, 0)))]
-    for number in range(len(rows)):
-        own = np.flatnonzero(owner.ravel() == number)
-        contact = jax.tree.map(lambda leaf, own=own: jnp.asarray(leaf[own[0]]), scenes.interaction)
-        law = law_of_contact(contact, float(scenes.cantilever.mass_ng[own[0]]))
-        if law is None:
-            continue
-        some = jax.tree.map(lambda leaf, own=own: jnp.asarray(leaf[own]), scenes)
-        laws = jax.tree.map(lambda leaf, own=own: jnp.full(len(own), leaf), law)
-        simple = Scene(some.cantilever, some.platform, laws)
-        gap, omega = contact.bridge_breaks_nm, np.asarray(some.platform.angular_frequency)
-        for column, order in enumerate(orders):
+    found = laws_of(scenes)
+    if found is None:
+        none = np.zeros(0)
+        return none.astype(int), none.astype(int), none, none, none
+    law, known = found
+    own, parts = np.flatnonzero(known), []
+    simple = jax.tree.map(lambda leaf: leaf[own], Scene(scenes.cantilever, scenes.platform, law))
+    rise = scenes.platform.angular_frequency * scenes.interaction.bridge_breaks_nm
+    for column, order in enumerate(orders):
 
-            def work(part: Scene, order: int = order) -> SingleImpactOrbits:
-                return jax.vmap(lambda scene: single_impact_orbits(scene, order))(part)
+        def work(part: Scene, order: int = order) -> SingleImpactOrbits:
+            return jax.vmap(lambda scene: single_impact_orbits(scene, order))(part)
 
-            orbits = in_blocks(work, simple, block=_CONTACTS_AT_ONCE)
-            lane, slot = np.nonzero(orbits.exists & orbits.admissible)
-            rebound = orbits.rebound_speed_nm_per_us[lane, slot]
-            phase = orbits.phase_rad[lane, slot] + omega[lane] * float(gap) / rebound
-            turn = np.full(len(lane), 2.0 * np.pi * order)
-            parts.append((own[lane], np.full(len(lane), column), phase, rebound, turn))
+        orbits = in_blocks(work, simple, block=_CONTACTS_AT_ONCE)
+        lane, slot = np.nonzero(orbits.exists & orbits.admissible)
+        rebound, at = orbits.rebound_speed_nm_per_us[lane, slot], own[lane]
+        phase, turn = orbits.phase_rad[lane, slot] + rise[at] / rebound, np.full(len(lane), 2.0 * np.pi * order)
+        parts.append((at, np.full(len(lane), column), phase, rebound, turn))
     lanes, columns, phase, rebound, turns = (np.concatenate(part) for part in zip(*parts, strict=True))
     return lanes, columns, phase, rebound, turns
 

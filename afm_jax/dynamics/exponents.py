@@ -128,7 +128,7 @@ def lyapunov_spectrum(
 
     Args:
         scene: a scene with a law or a contact, driven with one frequency; or a batch of scenes.
-        start: where the motion begins; None: one scene's default, of many a tip that leaves the platform upward.
+        start: where the motion begins; None: one scene's default, of many `bouncing_tips`.
         impacts: impacts over which the exponents are taken.
         transient: impacts before.
         accuracy: of resolved contacts, as for `simulate`.

@@ -23,9 +23,11 @@ from afm_jax.apparatus.surface import FreeFrame, free_frame
 from afm_jax.checks import require_float64
 from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
+from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, Flight
-from afm_jax.impact.law import impact_law_of
+from afm_jax.impact.law import ImpactLaw, impact_law_of
 from afm_jax.impact.map import NextImpact, impact_after
+from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.law_motion import CONSTANT_PUSH, Bed, LawLeg, or_rest, through_impact
 from afm_jax.motion.record import ContactKind, State
 from afm_jax.motion.start import default_start
@@ -47,6 +49,9 @@ _TOUCHING = 1e-13
 """Gap over the heights it is the difference of, below which it is rounding."""
 _FEW = 16
 """Tips of a block whose rest, or long search, is computed together."""
+_ORBITS_AT_ONCE = 128
+_RISEN = 0.9
+"""Of the gap at which the bridge breaks: from there a tip on its way up is free."""
 _Leaving = tuple[Array, Array, Array]
 """Time in us, gap in nm, velocity in nm/us."""
 
@@ -254,6 +259,73 @@ def leaving_tips(scenes: Scene) -> Tips:
     return tips_at(scenes, time, platform.velocity(time) + rebound)._replace(gap_nm=gap)
 
 
+def bouncing_tips(scenes: Scene) -> Tips:
+    """Return tips where there is motion: on the stable single-impact orbit of the order nearest to resonance.
+
+    The fastest one if there are several; of a contact that of the law closest to it. Where there is none the tip is one
+    of `leaving_tips`.
+
+    Args:
+        scenes: a batch of scenes, driven by the sample alone.
+    """
+    usual, gap = leaving_tips(scenes), jnp.zeros_like(scenes.platform.frequency_khz)
+    found = laws_of(scenes)
+    if found is None:
+        return usual
+    law, known = found
+    if isinstance(scenes.interaction, Contact):
+        gap = scenes.interaction.bridge_breaks_nm
+
+    def work(lanes: tuple[Scene, Array]) -> tuple[Array, Tips]:
+        return _on_orbits(*lanes)
+
+    there, tips = in_blocks(work, (Scene(scenes.cantilever, scenes.platform, law), gap), block=_ORBITS_AT_ONCE)
+    return jax.tree.map(lambda own, other: jnp.where(there & known, own, other), tips, usual)
+
+
+@jax.jit
+def _on_orbits(scenes: Scene, clearance_nm: Float[Array, " lanes"]) -> tuple[Bool[Array, " lanes"], Tips]:
+    """Return which scenes with laws have a stable orbit, and tips on them, about as high above the platform as told."""
+
+    def one(scene: Scene, clearance: Array) -> tuple[Array, ...]:
+        omega = scene.platform.angular_frequency
+        order = jnp.maximum(1.0, jnp.round(omega / (2.0 * scene.cantilever.angular_frequency)))
+        orbits = single_impact_orbits(scene, order)
+        steady = orbits.exists & orbits.admissible & orbits.stable
+        slot = jnp.argmax(jnp.where(steady, orbits.approach_speed_nm_per_us, -jnp.inf))
+        start, velocity = orbits.phase_rad[slot] / omega, orbits.velocity_after_nm_per_us[slot]
+        rise = clearance / orbits.rebound_speed_nm_per_us[slot]
+        height, speed = scene.cantilever.propagator(rise)(scene.platform.position(start), velocity)
+        gap = jnp.where(clearance > 0.0, height - scene.platform.position(start + rise), 0.0)
+        risen = (clearance == 0.0) | (gap > _RISEN * clearance)
+        return steady.any() & risen, (start + rise) % scene.platform.period_us, gap, speed
+
+    there, time, gap, velocity = jax.vmap(one)(scenes, clearance_nm)
+    return there, tips_at(scenes, time, velocity)._replace(gap_nm=gap)
+
+
+def laws_of(scenes: Scene) -> tuple[ImpactLaw, Bool[np.ndarray, " lanes"]] | None:
+    """Return a batch of laws, those closest to the contacts of scenes with one, and where there is one; None: nowhere.
+
+    Args:
+        scenes: a batch of scenes.
+    """
+    if not isinstance(scenes.interaction, Contact):
+        return impact_law_of(scenes), np.ones(len(scenes.platform.frequency_khz), bool)
+    columns = [np.asarray(leaf) for leaf in (*jax.tree.leaves(scenes.interaction), scenes.cantilever.mass_ng)]
+    _, first, owner = np.unique(np.stack(columns, axis=1), axis=0, return_index=True, return_inverse=True)
+    each = []
+    for lane in first:
+        contact = jax.tree.map(lambda leaf, lane=lane: jnp.asarray(leaf)[lane], scenes.interaction)
+        each.append(law_of_contact(contact, float(columns[-1][lane])))
+    some = next((law for law in each if law is not None), None)
+    if some is None:
+        return None
+    known = np.array([law is not None for law in each])[owner.ravel()]
+    whole = jax.tree.map(lambda *parts: jnp.stack(parts), *(some if law is None else law for law in each))
+    return jax.tree.map(lambda leaf: leaf[owner.ravel()], whole), known
+
+
 def tips_at(scenes: Scene, time_us: Array, velocity_nm_per_us: Array) -> Tips:
     """Return tips that leave the platform at a time in us with a velocity in nm/us in the lab; arrays of one shape."""
     zero = jnp.zeros_like(scenes.platform.frequency_khz)
@@ -289,7 +361,7 @@ def batch_and_tips(scene: Scene, start: State | None = None) -> tuple[Scene, Tip
 
     Args:
         scene: one scene, or a batch of scenes.
-        start: the tip in the lab; None: `default_start` of one scene; of many a tip that leaves the platform upward.
+        start: the tip in the lab; None: `default_start` of one scene, of many `bouncing_tips`.
 
     Raises:
         ValueError: if the tip cannot start there.
@@ -298,7 +370,7 @@ def batch_and_tips(scene: Scene, start: State | None = None) -> tuple[Scene, Tip
         start = default_start(scene) if start is None else start
         scene = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], scene)
     if start is None:
-        return scene, leaving_tips(scene)
+        return scene, bouncing_tips(scene)
     if not isinstance(scene.interaction, Contact):
         tips = landed_tips(scene, start)
         if np.all(np.asarray(tips.outcome) == Outcome.INVALID_START):
@@ -306,6 +378,13 @@ def batch_and_tips(scene: Scene, start: State | None = None) -> tuple[Scene, Tip
         return scene, tips
     gap = start.position_nm - scene.platform.position(start.time_us)
     return scene, tips_at(scene, start.time_us, start.velocity_nm_per_us)._replace(gap_nm=gap)
+
+
+def states_of(scenes: Scene, start: tuple[float, float, float]) -> State:
+    """Return the states of a start as of `start_of`, one of each of many scenes that repeat with one drive period."""
+    phase, height, velocity = start
+    time = (phase % 360.0) / 360.0 * free_frame(scenes).platform.period_us
+    return State(time, scenes.platform.position(time) + height, jnp.full_like(time, velocity))
 
 
 class SampleDriven(NamedTuple):

@@ -48,7 +48,14 @@ def drawn_exponents(
 
 
 def verdict_probability(
-    scene: Scene, parameter: str, sweep: Sweep, known: UncertainParameters, *, draws: int, impacts: int
+    scene: Scene,
+    parameter: str,
+    sweep: Sweep,
+    known: UncertainParameters,
+    *,
+    start: tuple[float, float, float] | None = None,
+    draws: int,
+    impacts: int,
 ) -> Float[np.ndarray, " values"]:
     """Return the share of drawn scenes whose sweep comes to the same verdict, at each value.
 
@@ -57,12 +64,13 @@ def verdict_probability(
         parameter: that is swept.
         sweep: of the scene.
         known: what is drawn.
+        start: of the sweeps, as of `bifurcation_diagram`.
         draws: how many.
         impacts: at each value.
     """
     names, same = np.array(sweep.verdicts.names()), np.zeros(len(sweep.values))
     for one in _drawn(scene, known.without(parameter), draws):
-        other = bifurcation_diagram(one, parameter, sweep.values, upward=sweep.upward, impacts=impacts)
+        other = bifurcation_diagram(one, parameter, sweep.values, start=start, upward=sweep.upward, impacts=impacts)
         same += names == np.array(other.verdicts.names())
     return same / draws
 

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.optimize import brentq
 
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
@@ -34,6 +35,8 @@ _NARROWED = 1e-10
 """Of the range."""
 _SHORT_REST = 0.05
 """Of a drive period: a rest that is shorter where the orbit ends has come to nothing there."""
+_SHORT_FLIGHT = 1e-6
+"""Of the range: where the orbit is lost so close to where the surface no longer lets go, this is why."""
 _NO_TEST = -1
 
 
@@ -127,8 +130,9 @@ def follow_sticking(
 
     Returns:
         Branches between the values where the orbit begins and ends, located to 1e-10 of the range. Their special points
-        are ``rest_lost``, where the rest shrinks to nothing or the surface no longer lets go, and ``grazing``, where a
-        flight touches the surface and another motion follows. Multipliers are 0: the rest forgets what was before.
+        are ``rest_lost``, where the rest shrinks to nothing, ``held``, where the surface no longer lets go, and
+        ``grazing``, where a flight touches the surface and another motion follows. Multipliers are 0: the rest forgets
+        what was before.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
@@ -149,8 +153,12 @@ def follow_sticking(
         orbits.append(at(share))
         if report is not None:
             report(number + 1, values)
-    period = drive_of(scene).period_us
-    stretches = [_ended(at, shares, orbits, stretch, _SHORT_REST * period) for stretch in _stretches(orbits)]
+    short = _SHORT_REST * drive_of(scene).period_us
+
+    def least(share: float) -> float:
+        return _least_push(family(given.low + width * share))
+
+    stretches = [_ended(at, least, shares, orbits, stretch, short) for stretch in _stretches(orbits)]
     branches, special = [], []
     for number, (points, ends) in enumerate(stretches):
         places = given.low + width * np.array([share for share, _ in points])
@@ -189,8 +197,21 @@ def _stretches(orbits: list[StickingOrbit | None]) -> list[range]:
     return [range(*pair) for pair in pairs if _rests(orbits[pair[0]])]
 
 
+def _least_push(scene: Scene) -> float:
+    """Return the least push of the surface on a tip that rests on it, a constant and a cosine of the drive's period."""
+    turns = np.arange(8) / 8.0
+    bed = Bed(scene.cantilever, surface_of(scene)[0])
+    push = np.asarray(jax.vmap(bed.push)(drive_of(scene).period_us * jnp.asarray(turns)))
+    return float(push.mean() - 2.0 * np.abs(np.mean(push * np.exp(2j * np.pi * turns))))
+
+
 def _ended(
-    at: _At, shares: list[float], orbits: list[StickingOrbit | None], stretch: range, short_us: float
+    at: _At,
+    least: Callable[[float], float],
+    shares: list[float],
+    orbits: list[StickingOrbit | None],
+    stretch: range,
+    short_us: float,
 ) -> tuple[list[_Found], tuple[str, str]]:
     """Return the points of a stretch with its narrowed ends, and why it ends there."""
     points = [(shares[k], one) for k in stretch if (one := orbits[k]) is not None]
@@ -199,10 +220,15 @@ def _ended(
         if not 0 <= beyond < len(shares):
             ends.append("range")
             continue
-        end = _narrowed(at, points[last], shares[beyond])
+        end, kind = _narrowed(at, points[last], shares[beyond]), None
+        if least(end[0]) < 0.0 <= least(shares[beyond]):
+            # shortly before, the flight is too short to be flown
+            held = float(np.asarray(brentq(least, end[0], shares[beyond], xtol=1e-14)))
+            if abs(held - end[0]) < _SHORT_FLIGHT:
+                end, kind = (held, end[1]), "held"
         if end[0] != points[last][0]:
             points = [end, *points] if last == 0 else [*points, end]
-        ends.append("rest_lost" if end[1].rest_us < short_us else "grazing")
+        ends.append(kind or ("rest_lost" if end[1].rest_us < short_us else "grazing"))
     return points, (ends[0], ends[1])
 
 

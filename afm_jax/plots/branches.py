@@ -22,6 +22,7 @@ _MARKS = {
     "grazing": ("^", "#56B4E9"),
     "capture": ("v", DARK),
     "rest_lost": ("P", "#D55E00"),
+    "held": ("H", "#0072B2"),
 }
 """Shape and colour of each kind: either tells them apart (colours of Okabe and Ito)."""
 

@@ -103,7 +103,7 @@ def draw_bifurcations(
     target: Path,
     probabilities: Sequence[Float[np.ndarray, " values"]] | None = None,
 ) -> None:
-    """Draw a bifurcation diagram: height at impact, and the tip's height whenever the platform is highest.
+    """Draw a bifurcation diagram: height at impact, and the tip's height whenever the drive's phase is 0.
 
     Args:
         path: of the parameter.
@@ -119,15 +119,16 @@ def draw_bifurcations(
         for axes, part in zip(panels, parts, strict=True):
             there = np.isfinite(part)
             at = np.repeat(sweep.values, there.sum(axis=1))
-            style = {"ms": max(1.0, min(3.0, 1500.0 / len(sweep.values))), "alpha": 0.5, "rasterized": True}
+            size = float(np.interp(len(sweep.values), [30, 100, 500, 1500], [6.0, 3.0, 3.0, 1.0]))
+            style = {"ms": size, "alpha": 0.5, "rasterized": True}
             axes.plot(at, part[there], ".", color=colour, mew=0.0, label=word, **style)
     for sweep, sure in zip(sweeps, probabilities or (), strict=False):
         for axes in panels:
             ground = axes.get_xaxis_transform()
             axes.fill_between(sweep.values, 0.0, 1.0, where=sure < 0.95, color=GRID, alpha=0.3, lw=0, transform=ground)
     label_axes(panels[0], x="", y="height at impact (nm)")
-    label_axes(panels[1], x=label_of(path), y="height when the platform\nis highest (nm)")
-    panels[0].set(xlim=(sweeps[0].values[0], sweeps[0].values[-1]))
+    label_axes(panels[1], x=label_of(path), y="height at drive phase 0 (nm)")
+    panels[0].margins(x=0.5 / len(sweeps[0].values))
     for axes in panels:
         axes.grid(color=GRID, alpha=0.25)
     handles, labels = panels[0].get_legend_handles_labels()

@@ -244,7 +244,7 @@ _EXPONENT_VARIABLES = (
 def _lyapunov(
     scene: Scene, paths: tuple[str, ...], *, impacts: int, transient: int, accuracy: float = DEFAULT_ACCURACY
 ) -> Recorder:
-    """Record the exponents of motions that begin by leaving the platform upward."""
+    """Record the exponents of motions that begin as in `bouncing_tips`."""
     sample_driven(scene)
     resolved = isinstance(scene.interaction, Contact)
     lanes = _CONTACTS if resolved else LANES
