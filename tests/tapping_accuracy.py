@@ -6,7 +6,7 @@ The truth is the full scene in time, kept in the folder. Forward: amplitude and 
 collisions predicts, at speeds of 4 times the capture speed and more and pulls below 0.8 times what turns the tip round.
 Fits: two free amplitudes 3 % above resonance, without noise and with 0.3 % and 0.2 degrees, frequency, Q, calibration,
 origin and zero of phase free within their errors. `make tapping` runs it; the exit status is 1 if less is reached than
-is wanted. Contacts whose law is refused (too few fast impacts) are counted.
+is wanted. Contacts whose law is refused (too few fast impacts) or whose fit is not valid are counted.
 """
 
 import argparse
@@ -103,8 +103,10 @@ class Fitted(NamedTuple):
 
 
 def fitted(truth: TappingTruth, table: AmplitudeTable) -> Fitted | None:
-    """Return what a fit gives; None where the law is refused."""
+    """Return what a valid fit gives; None where the law is refused or the fit says that it is not valid."""
     result = fit(table, MODEL)
+    if not result.valid:
+        return None
     used = result.rows.approach_speed_nm_per_us[result.rows.used]
     found = result.parameters["tip_calibration"]
     if found.standard_error is None or not np.isfinite(used).any():
@@ -168,7 +170,7 @@ def judge_fits(name: str, fits: list[Fitted], *, exact: bool) -> int:
     worst = [float(np.abs(one.law).max()) for one in fits]
     off = [abs(one.calibration) for one in fits]
     line = (
-        f"{name}: {len(fits)} laws, errors {100 * np.median(median):.3f} % in the median, {100 * max(worst):.3f} % at "
+        f"{name}: {len(fits)} valid laws, errors {100 * np.median(median):.3f} % in the median, {100 * max(worst):.3f} % at "
         f"worst; calibration off by {100 * np.median(off):.3f} % in the median, {100 * max(off):.3f} % at most, stated "
         f"{100 * np.median([one.calibration_error for one in fits]):.3f} %; "
         f"{np.mean([one.rows for one in fits]):.0f} rows used"
@@ -201,7 +203,7 @@ def main() -> int:
     exact = [as_measured(exact_table(truth, RATIO, options.truths)) for truth in truths]
     without = [fitted(truth, table) for truth, table in zip(truths, exact, strict=True)]
     known = [i for i, one in enumerate(without) if one is not None]
-    sys.stdout.write(f"law refused of {len(truths) - len(known)} of {len(truths)} contacts\n")
+    sys.stdout.write(f"no valid law of {len(truths) - len(known)} of {len(truths)} contacts\n")
     limits = [calibration_limit(exact[i]) for i in known]
     sys.stdout.write(f"calibration: noise alone leaves {', '.join(f'{100 * one:.2f}' for one in limits)} %\n")
     missed += judge_fits("fits without noise", [one for one in without if one is not None], exact=True)

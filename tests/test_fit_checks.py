@@ -144,6 +144,18 @@ def test_a_bound_that_chi2_pushes_inward_from_is_no_minimum(objective):
     assert held.estimated_distance < 1e-4
 
 
+def test_a_bound_that_holds_hardly_anything_back_is_no_reason_to_go_on(objective):
+    """SciPy's minimum, and a loss held a thousandth of its error below it: a millionth of chi2 is to be had."""
+    best = least_squares(
+        lambda values: objective.residual(values[None])[0], [0.94, 60.0, 40.0], x_scale=[1e-3, 1.0, 1.0], xtol=1e-12
+    )
+    error = np.sqrt(np.linalg.inv(best.jac.T @ best.jac)[1, 1])
+    for share, well in ((1e-3, True), (0.5, False)):
+        values = best.x - np.array([0.0, share * error, 0.0])
+        held = check_minimum(objective, objective.problem.coordinates(values), np.array([True, False, True]))
+        assert held.outward == well
+
+
 def test_errors_hold_the_share_of_an_uncertain_quality_factor(table, law, objective):
     """The Fisher matrix in blocks: var(r) = exact + (what Q leaves to r)^2/(what all say of Q)."""
     exact = fit(dataclasses.replace(table, quality_factor_error=None), model="law")

@@ -155,6 +155,8 @@ def orbit_at(place: OrbitPlace, found: Bool[Array, ""], frame: FreeFrame, proble
     """
     state = orbit_state(place, problem)
     verdict = judge(place, found, state, problem)
+    # an approach that is less than the rounding of the flight's end is none
+    found = found & ~jnp.isnan(verdict.trace)
     flight, speeds = state.flight, state.speeds
     velocities = jnp.stack([flight.start_velocity, flight.end_velocity])
     if frame.response is not None:
@@ -167,9 +169,9 @@ def orbit_at(place: OrbitPlace, found: Bool[Array, ""], frame: FreeFrame, proble
 
     return SingleImpactOrbits(
         exists=found,
-        admissible=verdict.admissible,
+        admissible=found & verdict.admissible,
         stable=verdict.stable,
-        near_double=verdict.near_double,
+        near_double=found & verdict.near_double,
         phase_rad=known(within_turn(state.phase + frame.phase_rad, 2.0 * jnp.pi)),
         velocity_after_nm_per_us=known(velocities[0]),
         velocity_before_nm_per_us=known(velocities[1]),

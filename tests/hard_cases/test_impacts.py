@@ -14,7 +14,11 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from afm_jax.impact.law import ImpactLaw
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import Scene
+from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from afm_jax.impact.orbits import single_impact_orbits
 from tests import reference_flight
 from tests.hard_cases.maps import USUAL, compare, leaving
 
@@ -80,3 +84,15 @@ def test_the_law_within_1e_minus_12_of_capture():
         slope = float(reference_flight.rebound_slope(p, speed))
         assert float(law.rebound_slope(speed)) == pytest.approx(slope, rel=1e-15 / away + 1e-14)
         assert bool(law.captures(bound * (1.0 - away)))
+
+
+def test_an_approach_below_its_own_rounding_is_no_orbit():
+    # r = 1: the closing condition of a delay that hardly ends goes on to 1e-9 nm/us, out of velocities of 0.01
+    platform = Platform(0.9789296819917331, 1.850981555539128, 0.29367890459751994)
+    delay = CollisionDelay(0.23570558938570135, 4.886879915814397, 0.0, corrections=False)
+    scene = Scene(Cantilever(92.5490777769564, 706821.3703142771), platform, ImpactLaw(1.0, 0.0, delay=delay))
+    found = single_impact_orbits(scene, 5)
+    exists = np.asarray(found.exists)
+    assert exists.any()
+    for name in ("trace", "determinant", "approach_speed_nm_per_us"):
+        np.testing.assert_array_equal(np.isfinite(getattr(found, name)), exists)
