@@ -170,9 +170,9 @@ def judge_fits(name: str, fits: list[Fitted], *, exact: bool) -> int:
     worst = [float(np.abs(one.law).max()) for one in fits]
     off = [abs(one.calibration) for one in fits]
     line = (
-        f"{name}: {len(fits)} valid laws, errors {100 * np.median(median):.3f} % in the median, {100 * max(worst):.3f} % at "
-        f"worst; calibration off by {100 * np.median(off):.3f} % in the median, {100 * max(off):.3f} % at most, stated "
-        f"{100 * np.median([one.calibration_error for one in fits]):.3f} %; "
+        f"{name}: {len(fits)} valid laws, errors {100 * np.median(median):.3f} % in the median, "
+        f"{100 * max(worst):.3f} % at worst; calibration off by {100 * np.median(off):.3f} % in the median, "
+        f"{100 * max(off):.3f} % at most, stated {100 * np.median([one.calibration_error for one in fits]):.3f} %; "
         f"{np.mean([one.rows for one in fits]):.0f} rows used"
     )
     tests = {
