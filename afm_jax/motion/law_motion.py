@@ -429,7 +429,7 @@ def _contacts(scene: Scene, surface: Platform | Surface, response: Surface | Non
         arrival_time_us=row.arrival_us,
         arrival_position_nm=where(used, arrival.position_nm),
         arrival_velocity_nm_per_us=where(used, arrival.velocity_nm_per_us),
-        approach_speed_nm_per_us=row.approach,
+        approach_speed_nm_per_us=jnp.maximum(row.approach, 0.0),  # of a tip that rests, rounding
         departure_time_us=row.departure_us,
         departure_position_nm=where(left, departure.position_nm),
         departure_velocity_nm_per_us=where(left, departure.velocity_nm_per_us),

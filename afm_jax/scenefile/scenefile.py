@@ -461,8 +461,10 @@ def read_toml(source: str) -> dict[str, Any]:
         raise SceneError(f"{where}: line {line} is not UTF-8 text; save the file as UTF-8") from error
     try:
         return tomllib.loads(text)
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise SceneError(f"{where}: not TOML: {' '.join(str(error).split())}") from error
+    except RecursionError:
+        raise SceneError(f"{where}: has too many brackets within each other") from None
 
 
 def _table(source: str, name: str, value: Any) -> SceneTable:
