@@ -208,6 +208,12 @@ def test_a_column_map_names_channels_units_and_factors(tmp_path: Path):
     )
 
 
+def test_names_of_channels_can_be_printed(tmp_path: Path):
+    path = tmp_path / "curve.csv"
+    path.write_text("offset_nm,lockin_amplit\x1dude_nm,phase_lag_deg\n" + "1,2,3\n" * 9, encoding="utf-8")
+    assert read_recording(path).channels == ["offset_nm", r"'lockin_amplit\x1dude_nm'", "phase_lag_deg"]
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

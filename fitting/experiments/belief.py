@@ -15,6 +15,7 @@ from jaxtyping import Float
 
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.results import public_result
+from afm_jax.scenefile.tables import printable
 from fitting.fits.result import FitResult
 from fitting.models import Problem
 from fitting.parameters import (
@@ -26,7 +27,7 @@ from fitting.parameters import (
     model_parameters,
     paper_values,
 )
-from fitting.tables.csv_text import TableError, printable, read_fit_json
+from fitting.tables.csv_text import TableError, read_fit_json
 from fitting.tables.table import DRIVES
 
 UNCERTAINTY = 0.1

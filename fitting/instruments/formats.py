@@ -8,7 +8,8 @@ import csv
 import io
 import logging
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.scenefile.tables import printable
 from fitting.instruments.recording import (
     HEADER_KEYS,
     UNITS,
@@ -27,7 +29,7 @@ from fitting.instruments.recording import (
     number_in,
     unit_named,
 )
-from fitting.tables.csv_text import NUMBER, TableError, printable, read_bytes
+from fitting.tables.csv_text import NUMBER, TableError, read_bytes
 
 _MOST_ROWS = 10_000_000
 _CURVE = {"approach": "approach", "extend": "approach", "fwd": "approach", "forward": "approach"}
@@ -58,7 +60,18 @@ def read_recording(path: str | Path) -> Recording:
         raise cut_off(name, f"cannot be read ({printable(what)})") from error
     if not recording.segments or any(not np.size(v) for s in recording.segments for v in s.channels.values()):
         raise cut_off(name, "holds no rows of numbers")
-    return recording
+    return recording if all(channel.isprintable() for channel in recording.channels) else _spelled(recording)
+
+
+def _spelled(recording: Recording) -> Recording:
+    """Return a recording whose channels have names that can be printed, and so given in options."""
+
+    def keys(named: Mapping[str, Any]) -> dict[str, Any]:
+        return {printable(name): value for name, value in named.items()}
+
+    segments = tuple(replace(segment, channels=keys(segment.channels)) for segment in recording.segments)
+    away = tuple(printable(name) for name in recording.away)
+    return replace(recording, segments=segments, units=keys(recording.units), away=away)
 
 
 def _parser_of(data: bytes, path: str) -> Callable[[bytes, str], Recording]:

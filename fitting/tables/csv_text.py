@@ -18,6 +18,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
+from afm_jax.scenefile.tables import printable
+
 NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 """A number as a file writes it; stricter than ``float``, which also takes "nan", "inf" and "1_000"."""
 DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(?:[eE][+-]?\d+)?", re.ASCII)
@@ -95,11 +97,6 @@ class Faults:
 
 LARGEST = 1e9
 """Size of any number in a table: a length of a metre, a frequency of a terahertz."""
-
-
-def printable(text: str) -> str:
-    """Return a text that fits on one line of a message: escaped where it holds line breaks or control characters."""
-    return text if text.isprintable() else repr(text)
 
 
 def quoted(text: str) -> str:

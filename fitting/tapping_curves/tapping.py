@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Int
 
+from afm_jax.scenefile.tables import printable
 from afm_jax.units import RAD_PER_US_PER_KHZ
-from fitting.tables.csv_text import TableError, printable
+from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable
 from fitting.tapping_curves.branches import changes, free_rows, hardly_touching_rows, held_rows, rough_rows
 from fitting.tapping_curves.constant_energy import ConstantEnergy, fit_constant_energy, plain_instrument, turned

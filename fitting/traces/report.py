@@ -13,9 +13,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save
+from afm_jax.scenefile.tables import printable
 from afm_jax.whole_files import write_whole
 from afm_jax.words import with_error
-from fitting.tables.csv_text import printable
 from fitting.tables.table import AmplitudeTable, write_table
 from fitting.traces.lockin import FORMAT_VERSION, LockinResult
 
