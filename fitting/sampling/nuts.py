@@ -1,8 +1,7 @@
 """The posterior of many parameters by the no-U-turn sampler of blackjax, an optional package.
 
-Coordinates without ends for a sampler: each parameter's range on the whole line, with its prior.
-
-A value with an end, such as a loss, is its end plus or minus e log(1 + exp(y)), with e its standard error: linear where
+The sampler moves in coordinates without ends: each parameter's range on the whole line, with its prior. A
+value with an end, such as a loss, is its end plus or minus e log(1 + exp(y)), with e its standard error: linear where
 the end is errors away, exponential close to it. A posterior that is Gaussian but for the end stays nearly so in y.
 """
 
@@ -107,9 +106,6 @@ def _coordinate(parameter: Parameter, value: float, error: float) -> float:
         return (value - parameter.reference) / parameter.width
     distance = _distance(parameter, value, error)
     return distance + float(np.log(-np.expm1(-distance)))
-
-
-__all__ = ["Space", "space_around"]
 
 
 CHAINS = 4

@@ -1,8 +1,6 @@
-"""The posterior of a fit: on a grid for one or two parameters, by NUTS for more.
+"""The posterior of a fit: on a grid that fits itself to the density for one or two parameters, by NUTS for more.
 
-The posterior of one or two parameters on a grid that fits itself around where the density is.
-
-Nuisances have a Gaussian constraint each: they are integrated out by Laplace's method at every point of the grid.
+On the grid nuisances have a Gaussian constraint each: they are integrated out by Laplace's method at every point.
 """
 
 from collections.abc import Callable, Sequence
@@ -311,6 +309,3 @@ def grid_draws(
     _, mean, variance, _ = _integrate_nuisances(refit.objective, np.concatenate([own, nuisance], axis=1), density.own)
     scatter = np.einsum("spq,sq->sp", np.linalg.cholesky(variance), random.normal(size=mean.shape))
     return np.concatenate([own, mean + scatter], axis=1)
-
-
-__all__ = ["POINTS", "grid_draws", "grid_posterior", "log_prior"]
