@@ -244,7 +244,7 @@ def _guesses_of_law(
     seen: SampleDriven, orders: Sequence[int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Return guesses: numbers of scenes and of orders, departure phases, rebound speeds, rad that an orbit takes."""
-    scenes = jax.tree.map(np.asarray, seen.scenes)
+    scenes = jax.tree.map(jnp.asarray, seen.scenes)
     found = laws_of(scenes)
     if found is None:
         none = np.zeros(0)
@@ -252,7 +252,7 @@ def _guesses_of_law(
     law, known = found
     own, parts = np.flatnonzero(known), []
     simple = jax.tree.map(lambda leaf: leaf[own], Scene(scenes.cantilever, scenes.platform, law))
-    rise = scenes.platform.angular_frequency * scenes.interaction.bridge_breaks_nm
+    rise = np.asarray(scenes.platform.angular_frequency * scenes.interaction.bridge_breaks_nm)
     for column, order in enumerate(orders):
 
         def work(part: Scene, order: int = order) -> SingleImpactOrbits:
