@@ -464,7 +464,7 @@ def read_toml(source: str) -> dict[str, Any]:
     except ValueError as error:
         raise SceneError(f"{where}: not TOML: {' '.join(str(error).split())}") from error
     except RecursionError:
-        raise SceneError(f"{where}: has too many brackets within each other") from None
+        raise SceneError(f"{where}: not TOML: too many brackets within each other") from None
 
 
 def _table(source: str, name: str, value: Any) -> SceneTable:
