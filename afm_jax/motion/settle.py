@@ -45,7 +45,6 @@ def find_repetition(
     period_us: float,
     *,
     tolerance: float,
-    longest: int = LONGEST,
 ) -> Repetition | None:
     """Return the shortest repetition of a sequence of departures, closer than a tolerance; None if there is none.
 
@@ -59,10 +58,9 @@ def find_repetition(
         velocities: velocity of the tip then, in nm/us.
         period_us: of the drive.
         tolerance: largest remaining distance that counts as none.
-        longest: largest m to try.
     """
     turns = np.asarray(times_us)[None] / period_us
-    found = find_repetitions(turns, np.asarray(velocities)[None], tolerance=tolerance, longest=longest)
+    found = find_repetitions(turns, np.asarray(velocities)[None], tolerance=tolerance)
     if not found.contacts[0]:
         return None
     return Repetition(int(found.contacts[0]), int(found.periods[0]), float(found.remaining[0]))
@@ -81,7 +79,6 @@ def find_repetitions(
     velocities: Float[np.ndarray, "lanes contacts"],
     *,
     tolerance: float,
-    longest: int = LONGEST,
     repeated: int = _REPETITIONS,
     rounding: float = ROUNDING,
 ) -> Repetitions:
@@ -91,14 +88,13 @@ def find_repetitions(
         turns: times of the departures in drive periods.
         velocities: as there; a sequence with NaN in its end repeats nothing.
         tolerance: as there.
-        longest: as there.
         repeated: repetitions in each of the two blocks that are compared.
         rounding: distance below which departures are the same, and a rate of approach says nothing.
     """
     lanes, count = turns.shape
     found = Repetitions(np.zeros(lanes, int), np.zeros(lanes, int), np.full(lanes, np.inf))
     left = np.arange(lanes)
-    for contacts in range(1, longest + 1):
+    for contacts in range(1, LONGEST + 1):
         block = repeated * contacts
         if count < 2 * block + contacts or not left.size:
             break
@@ -153,9 +149,7 @@ class Settled(NamedTuple):
     """In words, what was found."""
 
 
-def settled(
-    scene: Scene, simulation: Simulation, *, tolerance: float = DEFAULT_TOLERANCE, longest: int = LONGEST
-) -> Settled:
+def settled(scene: Scene, simulation: Simulation, *, tolerance: float = DEFAULT_TOLERANCE) -> Settled:
     """Say whether a motion has settled, on m contacts in N drive periods.
 
     It has if the sequence of departures (phase of the drive, velocity) repeats after m contacts and N periods, and what
@@ -167,7 +161,6 @@ def settled(
         scene: the scene that was simulated.
         simulation: of one scene, not of a batch.
         tolerance: of the remaining distance, relative to the velocity scale; of phases in rad.
-        longest: largest m to try.
 
     Raises:
         ValueError: if the tolerance is not positive.
@@ -191,9 +184,9 @@ def settled(
     rows = simulation.contacts
     left = np.isin(np.asarray(rows.kind), (ContactKind.IMPACT, ContactKind.CHATTER))
     times, velocities = (np.asarray(part)[left] for part in (rows.departure_time_us, rows.departure_velocity_nm_per_us))
-    found = find_repetition(times, velocities, drive.period_us, tolerance=tolerance, longest=longest)
+    found = find_repetition(times, velocities, drive.period_us, tolerance=tolerance)
     if found is None:
-        return _not(f"no sequence of up to {longest} contacts repeats to {tolerance:g} (of {len(times)} contacts)")
+        return _not(f"no sequence of up to {LONGEST} contacts repeats to {tolerance:g} (of {len(times)} contacts)")
     what = f"{found.contacts} contact{'s' if found.contacts > 1 else ''} in {found.periods} drive period"
     why = f"the motion repeats: {what}{'s' if found.periods > 1 else ''}"
     return _settled(why, contacts=found.contacts, periods=found.periods, remaining=found.remaining)
@@ -259,7 +252,7 @@ class Window(NamedTuple):
     """Whole response periods in the stretch; 0 where it is shorter than one."""
 
 
-def window_of(scene: Scene, simulation: Simulation, verdict: Settled, drive: DrivePeriod | None = None) -> Window:
+def window_of(scene: Scene, simulation: Simulation, verdict: Settled) -> Window:
     """Return the last response period of a settled motion, else whole response periods in the last fifth.
 
     The end is moved into a flight where there is one, so that no contact is cut in a motion that repeats.
@@ -268,9 +261,8 @@ def window_of(scene: Scene, simulation: Simulation, verdict: Settled, drive: Dri
         scene: the scene.
         simulation: of one scene.
         verdict: what `settled` says of it.
-        drive: in whose periods to count; the scene's if None.
     """
-    drive = drive_of(scene) if drive is None else drive
+    drive = drive_of(scene)
     first, last = float(simulation.start.time_us), float(simulation.final.time_us)
     periods = verdict.periods or _likely_order(simulation, drive.period_us, stuck=verdict.stuck)
     response = periods * drive.period_us

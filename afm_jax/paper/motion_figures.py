@@ -171,14 +171,11 @@ class Growth(NamedTuple):
     """Of the last one: from the scatter of blocks of contacts."""
 
 
-def survey(
-    velocities: tuple[float, ...], *, until_us: float = _UNTIL_US, report: Report = lambda _: None
-) -> list[RampCourse]:
+def survey(velocities: tuple[float, ...], *, report: Report = lambda _: None) -> list[RampCourse]:
     """Follow figure 8's scene from several starts, each until it locks.
 
     Args:
         velocities: of the starts, in nm/us, all at drive phase 270 degrees and 5 nm above the platform.
-        until_us: longest time to follow one.
         report: told how far it is.
     """
     scene = presets.figure8_scene()
@@ -189,10 +186,10 @@ def survey(
         run = follow_long(
             scene,
             start,
-            until_us - float(start.time_us),
+            _UNTIL_US - float(start.time_us),
             enough=lambda motion: _has_come_to_rest(motion, period),
             piece_contacts=CONTACTS_OF_A_PIECE,
-            report=told_of_progress(report, f"from {velocity:g} nm/us", until_us),
+            report=told_of_progress(report, f"from {velocity:g} nm/us", _UNTIL_US),
         )
         motion = departures(scene, run.simulation)
         courses.append(RampCourse(velocity, motion, *locked_from(motion.departure_time_us, period)))
