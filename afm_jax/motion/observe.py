@@ -3,7 +3,7 @@
 One way of reading for all: sums over the nodes of a dense path, whose contacts are integrated once more or, where that
 would cost more than it tells, straight between the points that the simulation keeps (`dense_path`).
 
-What impacts of a law add to a lock-in beyond flights and rests on the surface: the same as in `orbit_amplitude`.
+What impacts of a law add to a lock-in beyond flights and rests on the surface: as in `impact/amplitude.py`.
 
 In an impact that lasts the tip is below the surface by the indentation of a Hertz contact. A negative collision delay
 lets a flight begin before the last one has ended: until then both are there, and the surface once too often.
