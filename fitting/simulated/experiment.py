@@ -25,7 +25,7 @@ from afm_jax.motion.observe import observe
 from afm_jax.motion.record import MotionOutcome, Simulation, State
 from afm_jax.motion.settle import close_periods, ends_in_flight, place_after, settled, where_to_go_on
 from afm_jax.motion.simulate import DEFAULT_ACCURACY, simulate
-from afm_jax.results import public_result
+from afm_jax.results import Result, ResultTuple, public_result
 from fitting.tables.table import DRIVES, AmplitudeTable
 
 US_PER_MS = 1e3
@@ -44,7 +44,7 @@ _TOLERANCE = 1e-6
 
 
 @public_result()
-class Drives(NamedTuple):
+class Drives(ResultTuple):
     """What is driven in an experiment, one entry a row."""
 
     order: Int[np.ndarray, " rows"]
@@ -237,7 +237,7 @@ PIECES = 40
 
 @public_result()
 @dataclass(frozen=True, kw_only=True)
-class SimulatedExperiment:
+class SimulatedExperiment(Result):
     """A simulated amplitude table, and what was behind it.
 
     Attributes:
