@@ -335,9 +335,6 @@ class EffectStudy(NamedTuple):
     reduction: Reduction | None
 
 
-Progress = Callable[[str], None]
-
-
 def study_effects(  # noqa: PLR0913
     scene: Scene,
     start: State | None = None,
@@ -347,7 +344,7 @@ def study_effects(  # noqa: PLR0913
     only: Sequence[str] | None = None,
     derivatives: bool = True,
     programs: Programs | None = None,
-    progress: Progress = lambda _: None,
+    report: Callable[[int, int], object] = lambda *_: None,
 ) -> EffectStudy:
     """Return what each effect of a scene changes and costs.
 
@@ -359,7 +356,7 @@ def study_effects(  # noqa: PLR0913
         only: names of the effects to look at; None: all.
         derivatives: whether to predict changes by derivatives too, which compiles as long as two or three scenes.
         programs: compiled programs to go on with.
-        progress: is told what is being done.
+        report: told how many of how many scenes, with and without an effect, are done.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
@@ -375,7 +372,6 @@ def study_effects(  # noqa: PLR0913
     begin = default_start(scene) if start is None else start
     duration = PERIODS_AT_MOST * drive.period_us if duration_us is None else duration_us
     view = View(begin, duration, drive, drive.aperiodic is None)
-    progress("the full scene")
     full = observe_scene(programs, scene, view)
     if full.reading is None and view.settles and full.reason is not None and full.reason.startswith("nothing repeats"):
         view = view._replace(settles=False)
@@ -383,13 +379,13 @@ def study_effects(  # noqa: PLR0913
     if full.reading is None:
         raise ValueError(f"the scene has no motion to compare with: {full.reason}; give it another start")
     cost = _cost(programs, full, view, None)
-    reports = []
+    reports, total = [], 1 + len(chosen) + (accuracy is not None)
     for effect in chosen:
-        progress(effect.name)
+        report(1 + len(reports), total)
         reports.append(_report(programs, full, view, effect, cost, derivatives=derivatives))
     reduction = None
     if accuracy is not None:
-        progress("what can be left out together")
+        report(total - 1, total)
         reduction = _reduce(programs, full, view, reports, accuracy, cost)
     return EffectStudy(scene, view, full, cost, reports, reduction)
 

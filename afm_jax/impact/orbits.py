@@ -34,7 +34,7 @@ from afm_jax.impact.lasting_impact import Impact, LawImpact, crawls, indentation
 from afm_jax.impact.law import Speeds, impact_law_of
 from afm_jax.impact.roots import COARSE, find_roots
 from afm_jax.outcomes import Outcome
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from afm_jax.units import within_turn
 
 NEAR_DOUBLE = 1e-3
@@ -46,7 +46,7 @@ _ARRIVAL_TOLERANCE = 1e-7
 
 
 @public_result()
-class SingleImpactOrbits(eqx.Module):
+class SingleImpactOrbits(Result, eqx.Module):
     """All (1, N) orbits of a scene, ascending in approach speed, in a fixed number of slots.
 
     Without a collision delay there are 4 slots, as many as eq. 9 can have roots; with one there are 16. Every

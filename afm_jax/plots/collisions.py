@@ -47,7 +47,7 @@ def draw_collisions(
     label_axes(lower, x=r"approach speed  $u_{in}$ (nm/µs)", y="collision delay (µs)")
     for axes in (upper, lower):
         axes.grid(color=GRID, alpha=0.25)
-    upper.legend(fontsize=10, loc="upper left")
+    upper.legend(fontsize=10, loc="lower right")
     figure.suptitle(title, fontsize=12)
     save(figure, path)
 

@@ -328,7 +328,7 @@ def _gap_of_flights(look: Look) -> Figure:
     axes.set_xlim(look.path.time_us[0], look.path.time_us[-1])
     label_axes(axes, x="time (µs)", y="gap (nm)")
     axes.set_title(f"gap over the last {shown.size} of {look.arrival_us.size} impacts", fontsize=12, loc="left")
-    axes.legend(loc="upper right", fontsize=10, framealpha=1.0)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, fontsize=10, frameon=False)
     return picture
 
 

@@ -27,7 +27,7 @@ from afm_jax.motion.periodic import close_periods, ends_in_flight
 from afm_jax.motion.record import MotionOutcome, Simulation, State
 from afm_jax.motion.settle import settled
 from afm_jax.motion.simulate import DEFAULT_ACCURACY, simulate
-from afm_jax.results import public_result
+from afm_jax.results import Result, ResultTuple, public_result
 from fitting.tables.table import DRIVES, AmplitudeTable
 
 US_PER_MS = 1e3
@@ -46,7 +46,7 @@ _TOLERANCE = 1e-6
 
 
 @public_result()
-class Drives(NamedTuple):
+class Drives(ResultTuple):
     """What is driven in an experiment, one entry a row."""
 
     order: Int[np.ndarray, " rows"]
@@ -239,7 +239,7 @@ PIECES = 40
 
 @public_result()
 @dataclass(frozen=True, kw_only=True)
-class SimulatedExperiment:
+class SimulatedExperiment(Result):
     """A simulated amplitude table, and what was behind it.
 
     Attributes:
