@@ -444,7 +444,8 @@ def test_nothing_in_the_range_ends_with_3_and_says_why(tmp_path: Path):
     [
         (("--parameter", "platform.amplitude=1:2"), "did you mean platform.amplitude_nm?"),
         (("--parameter", "platform.amplitude_nm=2:1"), "the range is empty"),
-        (("--parameter", "interaction.r=0.5:2"), "`r` must be in (0, 1]"),
+        (("--parameter", "interaction.r=0:0.9"), "begin the range above 0"),
+        (("--parameter", "interaction.r=0.5:2"), "`r` must be in [0, 1]"),
         (("--parameter", "interaction.r=0.5:0.9", "--impacts", "65"), "--impacts"),
         (("--parameter", "interaction.r=0.5:0.9", "--second", "interaction.epsilon=1:2"), "the scene's own value, 0"),
         (("--parameter", "interaction.r=0.5:0.9", "--picture", "gif"), "must be png, pdf or svg"),

@@ -12,7 +12,7 @@ lets a flight begin before the last one has ended: until then both are there, an
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -96,8 +96,31 @@ class Harmonic(NamedTuple):
     """In [0, 360/N'): which of the N' = N/gcd(k, N) equivalent periods is locked is unknown."""
 
 
+NEEDS_A_RESPONSE = (
+    "harmonics",
+    "mean_height_nm",
+    "time_in_contact_us",
+    "contact_share",
+    "dissipated_in_contact_aj",
+    "dissipated_per_contact_aj",
+    "dissipated_in_air_aj",
+    "given_by_drives_aj",
+    "stored_aj",
+    "virial_aj",
+    "deflection_harmonics",
+    "mean_deflection_nm",
+    "phase_lag_deg",
+)
+"""Observables that a part of a response period cannot tell."""
+TOO_SHORT = "the window is shorter than a response period: follow the motion longer"
+
+
 class Observables(NamedTuple):
-    """What is read of a motion over a window; None where a quantity does not exist for the scene."""
+    """What is read of a motion over a window; None where a quantity does not exist for the scene.
+
+    Of a window shorter than a response period (`window.responses` is 0) all but the largest heights and forces is NaN:
+    see `NEEDS_A_RESPONSE`.
+    """
 
     settled: Settled
     window: Window
@@ -202,7 +225,7 @@ def observe(
     of_deflection = None
     if deflection is not None:
         of_deflection = _harmonics(dense, deflection, times, weights, window, drive, harmonics)
-    return Observables(
+    seen = Observables(
         settled=verdict,
         window=window,
         peak_amplitude_nm=_peak_height(dense, path, begin, end),
@@ -227,6 +250,18 @@ def observe(
         else _integral(dense, deflection, times, weights, (begin, end), 0.0).real / span,
         phase_lag_deg=_lag(scene, (of_deflection or of_height)[0], window),
     )
+    return seen if window.responses else _of_a_part(seen)
+
+
+def _of_a_part(seen: Observables) -> Observables:
+    """Return readings with NaN for what needs a whole response period."""
+
+    def unknown(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return tuple(Harmonic(one.multiple, math.nan, math.nan) for one in value)
+        return None if value is None else math.nan
+
+    return seen._replace(**{name: unknown(getattr(seen, name)) for name in NEEDS_A_RESPONSE})
 
 
 def _lag(scene: Scene, harmonic: Harmonic, window: Window) -> float | None:
