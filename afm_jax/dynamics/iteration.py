@@ -7,7 +7,7 @@ others. Times count within the drive's period, so that long motions keep the dig
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
@@ -444,17 +444,25 @@ Report = Callable[[int, int], object]
 """Told how many of how many lanes are done."""
 
 
-def in_blocks(work: Callable[[Any], Any], lanes: Any, *, block: int = LANES, report: Report | None = None) -> Any:
+def in_blocks(
+    work: Callable[[Any], Any],
+    lanes: Any,
+    *,
+    block: int = LANES,
+    widths: Sequence[int] = _WIDTHS,
+    report: Report | None = None,
+) -> Any:
     """Return the results of work on lanes, done block by block on all cores.
 
     Args:
         work: takes a tree of arrays with a leading axis of lanes, gives one of NumPy arrays with the same axis.
         lanes: the tree of all lanes.
         block: lanes of a block; fewer lanes are one smaller block, filled up.
+        widths: sizes that a smaller block may have.
         report: told how far it is.
     """
     count = len(jax.tree.leaves(lanes)[0])
-    width = next((width for width in _WIDTHS if width >= min(count, block)), block)
+    width = next((width for width in widths if width >= min(count, block)), block)
     whole = jax.tree.map(np.asarray, lanes)
 
     def part(first: int) -> Any:
