@@ -24,10 +24,12 @@ from afm_jax.checks import require_float64
 from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
+from afm_jax.impact.closure import OrbitProblem
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, Flight
+from afm_jax.impact.lasting_impact import LawImpact
 from afm_jax.impact.law import ImpactLaw, impact_law_of
 from afm_jax.impact.map import NextImpact, impact_after
-from afm_jax.impact.orbits import single_impact_orbits
+from afm_jax.impact.orbits import fastest_steady_orbit
 from afm_jax.motion.law_motion import CONSTANT_PUSH, Bed, LawLeg, or_rest, through_impact
 from afm_jax.motion.record import ContactKind, State
 from afm_jax.motion.start import default_start
@@ -288,17 +290,16 @@ def _on_orbits(scenes: Scene, clearance_nm: Float[Array, " lanes"]) -> tuple[Boo
     """Return which scenes with laws have a stable orbit, and tips on them, about as high above the platform as told."""
 
     def one(scene: Scene, clearance: Array) -> tuple[Array, ...]:
-        omega = scene.platform.angular_frequency
-        order = jnp.maximum(1.0, jnp.round(omega / (2.0 * scene.cantilever.angular_frequency)))
-        orbits = single_impact_orbits(scene, order)
-        steady = orbits.exists & orbits.admissible & orbits.stable
-        slot = jnp.argmax(jnp.where(steady, orbits.approach_speed_nm_per_us, -jnp.inf))
-        start, velocity = orbits.phase_rad[slot] / omega, orbits.velocity_after_nm_per_us[slot]
-        rise = clearance / orbits.rebound_speed_nm_per_us[slot]
-        height, speed = scene.cantilever.propagator(rise)(scene.platform.position(start), velocity)
-        gap = jnp.where(clearance > 0.0, height - scene.platform.position(start + rise), 0.0)
+        platform = scene.platform
+        order = jnp.round(platform.angular_frequency / (2.0 * scene.cantilever.angular_frequency))
+        problem = OrbitProblem(scene.cantilever, platform, LawImpact(impact_law_of(scene)), jnp.maximum(1.0, order))
+        orbit, steady = fastest_steady_orbit(problem)
+        start, velocity = orbit.flight.start_us, orbit.flight.start_velocity
+        rise = clearance / orbit.speeds.rebound
+        height, speed = scene.cantilever.propagator(rise)(platform.position(start), velocity)
+        gap = jnp.where(clearance > 0.0, height - platform.position(start + rise), 0.0)
         risen = (clearance == 0.0) | (gap > _RISEN * clearance)
-        return steady.any() & risen, (start + rise) % scene.platform.period_us, gap, speed
+        return steady & risen, (start + rise) % platform.period_us, gap, speed
 
     there, time, gap, velocity = jax.vmap(one)(scenes, clearance_nm)
     return there, tips_at(scenes, time, velocity)._replace(gap_nm=gap)
