@@ -10,7 +10,8 @@ from matplotlib.image import imread
 
 import fitting
 from afm_jax.cli.main import main
-from fitting.tables.table import AmplitudeTable, TableError, mass_of
+from fitting.tables.csv_text import TableError
+from fitting.tables.table import AmplitudeTable, mass_of
 from fitting.tapping_curves.branches import changes, free_rows
 from fitting.tapping_curves.curve import Given, Instrument, TappingCurve
 from fitting.tapping_curves.energy import energies, lags_of, largest_energies
@@ -158,6 +159,7 @@ def test_bundled_curve_gives_the_energy_of_the_simulations_ledger():
     # the law is refused, with what to record instead
     assert result.law is None
     assert "3 to 10 % above resonance" in (result.reason or "")
+    assert result.plot().axes[0].get_ylabel() == "amplitude (nm)"
     branch = next(one for one in result.hysteresis if one.change == "branch")
     assert branch.approach is not None
     assert branch.retract is not None

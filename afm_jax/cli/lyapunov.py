@@ -61,7 +61,6 @@ def command(  # noqa: PLR0913
     session.start_computing()
 
     from afm_jax.dynamics.exponents import exponent_verdicts, lyapunov_spectrum  # noqa: PLC0415
-    from afm_jax.dynamics.iteration import states_of  # noqa: PLC0415
     from afm_jax.dynamics.motion_bands import drawn_exponents  # noqa: PLC0415
     from afm_jax.motion.start import start_of  # noqa: PLC0415
     from afm_jax.scenefile.parameter_paths import scene_batch  # noqa: PLC0415
@@ -73,14 +72,14 @@ def command(  # noqa: PLR0913
     given = {one.path: one.values for one in ranges}
     try:
         motions = scene_batch(loaded, given) if given else loaded
-        start = None if told is None else states_of(motions, told) if given else start_of(loaded, told)
-        with session.working("following the motion (the first run compiles for some seconds)"):
+        start = None if told is None else start_of(motions, told)
+        with session.working("following the motion (the first run compiles for some seconds)", "motions") as report:
             found = lyapunov_spectrum(
                 motions,
                 start,
                 impacts=impacts,
                 transient=transient,
-                report=session.progress("motions"),
+                report=report,
             )
             band = None
             if known is not None:

@@ -1,9 +1,8 @@
 """`afm-jax sweep SWEEP.toml --out DIR`: a grid of scenes or of fits, in chunks, on all cores; goes on where it was."""
 
 import os
-import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +10,7 @@ import click
 
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import scene_and_start
+from afm_jax.compilation_cache import available_cores
 
 if TYPE_CHECKING:
     from afm_jax.sweeps.plan import SweepPlan
@@ -18,7 +18,6 @@ if TYPE_CHECKING:
 
 _KEYS = ("scene", "tables", "axes", "record", "accuracy", "chunk")
 _WRITTEN = (("axes", list, "[[axes]]"), ("record", dict, "[record]"))
-_SECONDS_BETWEEN_NOTES = 2.0
 _MOST_MESSAGES = 3
 _MOST_DRAWN = 2
 """Axes of a sweep that a picture can show."""
@@ -93,7 +92,14 @@ def run_sweep(session: Session, plan: "SweepPlan", *, workers: int | None, sched
 
     assert session.out is not None  # asked before  # noqa: S101
     number = _processes(plan) if workers is None and scheduler is None else workers or 1
-    return run_plan(plan, session.out, workers=number, scheduler=scheduler, report=_progress(session))
+    with session.working("computing (the first chunk compiles)", "points") as tell:
+        return run_plan(
+            plan,
+            session.out,
+            workers=number,
+            scheduler=scheduler,
+            report=lambda done, total, _: tell(done, total),
+        )
 
 
 def _tell(session: Session, plan: "SweepPlan", done: "SweepRun") -> None:
@@ -209,8 +215,6 @@ def _tables(given: Any, folder: Path) -> list[Path]:
 
 def _use_all_cores() -> None:
     """Let JAX have a device for every core, before it starts, unless the user has said how many there are."""
-    from afm_jax.dynamics.iteration import available_cores  # noqa: PLC0415
-
     flags = os.environ.get("XLA_FLAGS", "")
     if "host_platform_device_count" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} --xla_force_host_platform_device_count={available_cores()}".strip()
@@ -220,24 +224,9 @@ def _processes(plan: "SweepPlan") -> int:
     """Return how many processes use this machine best: one for batches, which take every device themselves."""
     from importlib.util import find_spec  # noqa: PLC0415
 
-    from afm_jax.dynamics.iteration import available_cores  # noqa: PLC0415
-
     if not plan.recorder.alone or find_spec("distributed") is None:
         return 1
     return min(available_cores(), plan.chunks)
-
-
-def _progress(session: Session) -> Callable[[int, int, float], None]:
-    last = time.monotonic()
-
-    def report(done: int, total: int, rate: float) -> None:
-        nonlocal last
-        if time.monotonic() - last > _SECONDS_BETWEEN_NOTES:
-            last = time.monotonic()
-            left = _duration((total - done) / rate)
-            session.note(f"{done} of {total} points, {rate:.3g} a second, {left} left")
-
-    return report
 
 
 def _duration(seconds: float) -> str:

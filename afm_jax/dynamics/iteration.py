@@ -6,7 +6,6 @@ needs (chatter summed up, the ride, the release) is computed in the steps in whi
 others. Times count within the drive's period, so that long motions keep the digits of their phase.
 """
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -21,15 +20,14 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import FreeFrame, free_frame
 from afm_jax.checks import require_float64
+from afm_jax.compilation_cache import available_cores
 from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
-from afm_jax.impact.closure import OrbitProblem
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, Flight
-from afm_jax.impact.lasting_impact import LawImpact
 from afm_jax.impact.law import ImpactLaw, impact_law_of
 from afm_jax.impact.map import NextImpact, impact_after
-from afm_jax.impact.orbits import fastest_steady_orbit
+from afm_jax.impact.orbits import fastest_steady_orbit, orbit_problem
 from afm_jax.motion.law_motion import CONSTANT_PUSH, Bed, LawLeg, or_rest, through_impact
 from afm_jax.motion.record import ContactKind, State
 from afm_jax.motion.start import default_start
@@ -257,7 +255,7 @@ def leaving_tips(scenes: Scene) -> Tips:
         slowest, gap = jax.vmap(capture_speed)(interaction, scenes.cantilever.mass_ng), interaction.bridge_breaks_nm
     else:
         slowest, gap = impact_law_of(scenes).capture_speed_nm_per_us, jnp.zeros_like(time)
-    rebound = jnp.maximum(platform.top_speed_nm_per_us, 2.0 * slowest)
+    rebound = jnp.maximum(platform.top_speed_nm_per_us, jnp.where(jnp.isfinite(slowest), 2.0 * slowest, 0.0))
     return tips_at(scenes, time, platform.velocity(time) + rebound)._replace(gap_nm=gap)
 
 
@@ -292,14 +290,14 @@ def _on_orbits(scenes: Scene, clearance_nm: Float[Array, " lanes"]) -> tuple[Boo
     def one(scene: Scene, clearance: Array) -> tuple[Array, ...]:
         platform = scene.platform
         order = jnp.round(platform.angular_frequency / (2.0 * scene.cantilever.angular_frequency))
-        problem = OrbitProblem(scene.cantilever, platform, LawImpact(impact_law_of(scene)), jnp.maximum(1.0, order))
-        orbit, steady = fastest_steady_orbit(problem)
+        law = impact_law_of(scene)
+        orbit, steady = fastest_steady_orbit(orbit_problem(scene.cantilever, platform, law, jnp.maximum(1.0, order)))
         start, velocity = orbit.flight.start_us, orbit.flight.start_velocity
         rise = clearance / orbit.speeds.rebound
         height, speed = scene.cantilever.propagator(rise)(platform.position(start), velocity)
         gap = jnp.where(clearance > 0.0, height - platform.position(start + rise), 0.0)
         risen = (clearance == 0.0) | (gap > _RISEN * clearance)
-        return steady & risen, (start + rise) % platform.period_us, gap, speed
+        return steady & risen & (law.r > 0.0), (start + rise) % platform.period_us, gap, speed
 
     there, time, gap, velocity = jax.vmap(one)(scenes, clearance_nm)
     return there, tips_at(scenes, time, velocity)._replace(gap_nm=gap)
@@ -379,13 +377,6 @@ def batch_and_tips(scene: Scene, start: State | None = None) -> tuple[Scene, Tip
         return scene, tips
     gap = start.position_nm - scene.platform.position(start.time_us)
     return scene, tips_at(scene, start.time_us, start.velocity_nm_per_us)._replace(gap_nm=gap)
-
-
-def states_of(scenes: Scene, start: tuple[float, float, float]) -> State:
-    """Return the states of a start as of `start_of`, one of each of many scenes that repeat with one drive period."""
-    phase, height, velocity = start
-    time = (phase % 360.0) / 360.0 * free_frame(scenes).platform.period_us
-    return State(time, scenes.platform.position(time) + height, jnp.full_like(time, velocity))
 
 
 class SampleDriven(NamedTuple):
@@ -483,8 +474,3 @@ def in_blocks(
             if report is not None:
                 report(min(len(done) * width, count), count)
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *done)
-
-
-def available_cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

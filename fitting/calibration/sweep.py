@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from fitting.instruments.formats import holds_curves, read_recording
 from fitting.instruments.recording import UNITS, Recording
 from fitting.tables.csv_text import (
@@ -173,15 +173,13 @@ def _cells(text: str) -> list[str]:
     return cells[:-1] if len(cells) > 1 and not cells[-1] else cells
 
 
-__all__ = ["ResonanceSweep", "TableError", "read_sweep", "without_phase"]
-
 _COLUMNS = ("frequency_khz", "amplitude", "phase_deg", "amplitude_error", "phase_error_deg")
 _POSITIVE = ("frequency_khz", "amplitude_error", "phase_error_deg")
 
 
 @public_result()
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ResonanceSweep:
+class ResonanceSweep(Result):
     """A free resonance sweep, sorted by frequency; the arrays are read-only NumPy copies.
 
     Attributes:

@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from afm_jax.units import within_turn
+from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable
 from fitting.traces.fold import Fold, OrderSearch, Reference, find_order, find_reference, fold, sampling_error_nm
 from fitting.traces.impacts import (
@@ -25,7 +26,7 @@ from fitting.traces.impacts import (
     find_ringing,
     look_at_periods,
 )
-from fitting.traces.trace import TableError, Trace
+from fitting.traces.trace import Trace
 from fitting.traces.verdict import TraceEvidence, TraceKind, is_flightless, judge
 
 FORMAT_VERSION = 1
@@ -34,7 +35,7 @@ FORMAT_VERSION = 1
 
 @public_result(picture="fitting.traces.report:lockin_figure")
 @dataclass(frozen=True, eq=False, kw_only=True)
-class LockinResult:
+class LockinResult(Result):
     """The reading of one trace; attributes are named like the keys of its JSON. Errors are standard errors.
 
     Attributes:

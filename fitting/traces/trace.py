@@ -29,13 +29,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from fitting.tables.csv_text import (
     Column,
     Faults,
     FileSetting,
     Form,
-    TableError,
     check_names,
     fault_in_number,
     named_rows,
@@ -292,8 +291,6 @@ def _column(name: str, dataset: Any, faults: Faults) -> np.ndarray:
     return np.asarray(dataset[...], dtype=np.float64)
 
 
-__all__ = ["TableError", "Trace", "read_trace"]
-
 _UNEVEN = 0.1
 """Share of a sampling step by which a time may miss its place: rounding of the printed times, not a lost sample."""
 _LEAST_RATE = 4.0
@@ -303,7 +300,7 @@ _KHZ_PER_MHZ = 1e3
 
 @public_result()
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Trace:
+class Trace(Result):
     """Equally spaced samples of the deflection and what is known of the measurement.
 
     Attributes:
