@@ -327,6 +327,36 @@ def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
     return SteadyOrbits(roots.place, *jax.vmap(one)(roots.place, roots.found))
 
 
+def fastest_steady_orbit(problem: OrbitProblem) -> tuple[OrbitState, Bool[Array, ""]]:
+    """Return the steady motion that comes fastest, without derivatives, and whether there is one.
+
+    The roots are those of `steady_orbits`; of the stable ones flights are followed only until one is admissible.
+    """
+    problem = lax.stop_gradient(problem)
+    cantilever, platform, impact, _ = problem
+    roots = find_roots(problem, COARSE)
+    states = jax.vmap(orbit_state, in_axes=(0, None))(roots.place, problem)
+
+    def lasts(state):
+        return contracts(*trace_and_determinant(impact, cantilever, platform, state.flight))
+
+    def looking(so_far):
+        left, _, steady = so_far
+        return jnp.any(left > -jnp.inf) & ~steady
+
+    def look(so_far):
+        left, _, _ = so_far
+        slot = jnp.argmax(left)
+        place, state = jax.tree.map(lambda leaf: leaf[slot], (roots.place, states))
+        # of a batch, one that is done looks for nothing
+        verdict = judge(place, looking(so_far), state, problem)
+        return left.at[slot].set(-jnp.inf), slot, verdict.admissible
+
+    left = jnp.where(roots.found & jax.vmap(lasts)(states), states.speeds.approach, -jnp.inf)
+    _, slot, steady = lax.while_loop(looking, look, (left, jnp.argmax(left), jnp.zeros((), bool)))
+    return jax.tree.map(lambda leaf: leaf[slot], states), steady
+
+
 def amplitudes(place: OrbitPlace, problem: OrbitProblem) -> Float[Array, " 3"]:
     """Return peak and lock-in amplitude in nm and the phase in degrees of the orbit at a root, differentiable."""
     return _observed(orbit_state(place, problem), problem)
