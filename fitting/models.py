@@ -76,6 +76,11 @@ class Problem:
         return tuple(PARAMETERS[name] for name in self.names)
 
     @property
+    def pulled(self) -> bool:
+        """Whether impacts are those of a contact under a bent lever."""
+        return self.model == "contact" and self.tapping
+
+    @property
     def lasting(self) -> bool:
         """Whether impacts take time: a delay, or the contact itself."""
         return self.model.endswith("+delay") or self.model == "contact"
@@ -162,6 +167,7 @@ class Measurement(NamedTuple):
         constraint_value: what is known of each parameter beforehand, shape (p,).
         constraint_error: its standard error, infinite where nothing is known.
         fixed: values of the model's parameters that are not fitted, by name; of a contact those not the paper's.
+        pulls: weakest and strongest of the bent lever in nm/us^2, where a driven tip meets a contact; None elsewhere.
     """
 
     rows: Rows
@@ -169,6 +175,7 @@ class Measurement(NamedTuple):
     constraint_value: Float[AnyArray, " p"]
     constraint_error: Float[AnyArray, " p"]
     fixed: dict[str, Float[AnyArray, ""]]
+    pulls: Float[AnyArray, " 2"] | None = None
 
 
 def constraints_of(
@@ -215,7 +222,25 @@ def measurement_of(
         constraint_value=np.array([float(value) for value, _ in pairs]),
         constraint_error=np.array([float(error) for _, error in pairs]),
         fixed=held,
+        pulls=_pulls(rows, cantilever) if problem.pulled else None,
     )
+
+
+_PULL_ROOM, _WIDEST = 1.15, 0.02
+"""By how much a table of pulls goes beyond those of the rows, which shift with heights and calibrations; the weakest of
+it over the strongest, at least."""
+
+
+def _pulls(rows: Rows, cantilever: Cantilever) -> Float[np.ndarray, " 2"]:
+    """Return the weakest and the strongest pull of spring and drive at the sample that the rows have, in nm/us^2."""
+    ratio = np.asarray(rows.drive_frequency_khz) / float(cantilever.frequency_khz)
+    # the tip meets the sample near the bottom of its swing
+    push = np.maximum(ratio**2 - 1.0, 0.0) * np.asarray(rows.drive_amplitude_nm)
+    hits = np.asarray(rows.measured).any(axis=1) & ~rows.free
+    pull = np.where(hits, -np.asarray(rows.offset_nm), 0.0)
+    strongest = _PULL_ROOM * np.max(pull + np.where(hits, push, 0.0), initial=1.0)
+    weakest = np.min(np.where(hits, pull + 0.5 * push, np.inf), initial=strongest) / _PULL_ROOM
+    return float(cantilever.angular_frequency) ** 2 * np.array([max(weakest, _WIDEST * strongest), strongest])
 
 
 def rows_of(table: AmplitudeTable) -> Rows:

@@ -17,6 +17,7 @@ Higher orders in J, below 0.03 as a rule, count nothing. Orbits over a driven pl
 0.01 % of those of the full contact, within 1 % at twice the capture speed.
 """
 
+from dataclasses import replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
@@ -285,6 +286,136 @@ def _rebound(u: Float[Array, "..."], loss: Float[Array, "..."]) -> Float[Array, 
     return jnp.sqrt(jnp.maximum(u * u - loss, 1e-6))
 
 
+class Taps(eqx.Module):
+    """Taps of one kind, as series over the speed with which they come, and over ln g.
+
+    Attributes:
+        terms: coefficients of u_in^2 - u_out^2 and of the other numbers of `Tap`, shape (pulls, terms, 5).
+        low: squared speed where they begin, coefficients of shape (pulls,).
+        high: where they end: the squared speed of light ones, of hard ones the variable.
+        scale: of the variable: ratio of gaps of light ones, speed of hard ones.
+        pulls: weakest and strongest pull in nm/us^2.
+        hard: whether the junction forms.
+    """
+
+    terms: Float[Array, "pulls terms 5"]
+    low: Float[Array, " pulls"]
+    high: Float[Array, " pulls"]
+    scale: Float[Array, ""]
+    pulls: Float[Array, " 2"]
+    hard: bool = eqx.field(static=True)
+
+    def at(self, pull: Float[Array, ""]) -> "Taps":
+        """Return the series over the speed alone, at a pull."""
+        weakest, strongest = self.pulls
+        held = jnp.clip(pull, weakest, strongest)
+        far = 2.0 * jnp.log(held / weakest) / jnp.log(strongest / weakest) - 1.0
+        own = {name: chebyshev_sum(getattr(self, name), far) for name in ("terms", "low", "high")}
+        return replace(self, **own)
+
+    def place(self, square: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return where a squared speed lies in the series, -1 to 1; of a table at one pull."""
+        if self.hard:
+            beyond = square > self.low
+            v = jnp.sqrt(jnp.where(beyond, square - self.low, 1.0)) / self.scale
+            return jnp.where(beyond, 2.0 * stretched(v) / self.high - 1.0, -1.0)
+        left = jnp.clip((self.high - square) / (self.high - self.low), 0.0, 1.0)
+        return 1.0 - 2.0 * jnp.log1p((self.scale - 1.0) * left) / jnp.log(self.scale)
+
+    def holds(self, square: Float[Array, "..."], pull: Float[Array, "..."]) -> Bool[Array, "..."]:
+        """Say whether there are taps of this kind at a squared speed and a pull; of a table at that pull."""
+        inside = (pull >= self.pulls[0] * (1.0 - _BESIDE)) & (pull <= self.pulls[1] * (1.0 + _BESIDE))
+        end = self.place(square) <= 1.0 if self.hard else square <= self.high
+        return inside & (square >= self.low) & end
+
+
+_BESIDE = 0.02
+"""Share by which a pull may lie outside a table."""
+_NOWHERE_US = 1e3
+"""What the delay of a tap that does not exist is longer by, and more: no orbit has it."""
+
+
+class Tap(NamedTuple):
+    """What a tap does: speeds and time at the plane; time integrals of the depth below it and of the squared speed.
+
+    ``late``: by how much the mean time of the depth is behind the middle of the tap.
+    """
+
+    speeds: Speeds
+    area: Float[Array, "..."]
+    action: Float[Array, "..."]
+    late: Float[Array, "..."]
+
+
+class PulledImpact(eqx.Module):
+    """Taps, light and hard, of a tip on a bent lever (`contact.bent_lever`); the coordinate is the speed at the plane.
+
+    Attributes:
+        light: taps that the bridge turns round.
+        hard: taps with a solid junction.
+        free: collisions of a free tip, at gap 0.
+        plane_nm: gap of the plane, where the bridge breaks.
+    """
+
+    light: Taps
+    hard: Taps
+    free: TabulatedImpact
+    plane_nm: Float[Array, ""]
+
+    @property
+    def delayed(self) -> bool:
+        """It takes time."""
+        return True
+
+    @property
+    def lasts(self) -> bool:
+        """And the tip is not alone meanwhile."""
+        return True
+
+    @property
+    def lowest(self) -> Float[Array, ""]:
+        """No tap comes slower."""
+        return 0.5 * self.free.lowest
+
+    @property
+    def reach(self) -> Float[Array, ""]:
+        """The capture speed of a free tip."""
+        return self.free.lowest
+
+    @property
+    def lead(self) -> Float[Array, ""]:
+        """None: the way through the bridge is part of the time."""
+        return jnp.zeros_like(self.plane_nm)
+
+    @property
+    def length(self) -> Float[Array, ""]:
+        """Gap at which the bridge breaks."""
+        return self.free.length
+
+    def hertz_time(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return the Hertz time at a speed."""
+        return self.free.hertz_time(approach_speed)
+
+    def speeds(self, coordinate: Float[Array, "..."]) -> Speeds:
+        """Return speeds and time of a tap under a middling pull."""
+        return self.tap(coordinate, jnp.sqrt(self.hard.pulls[0] * self.hard.pulls[1])).speeds
+
+    def at_approach(self, approach_speed: Float[Array, ""]) -> Speeds:
+        """Return the same."""
+        return self.speeds(approach_speed)
+
+    def tap(self, approach_speed: Float[Array, ""], pull: Float[Array, ""]) -> Tap:
+        """Return a tap; one that does not exist has a time that no orbit has."""
+        square = approach_speed**2
+        light, hard = self.light.at(pull), self.hard.at(pull)
+        is_hard, is_light = hard.holds(square, pull), light.holds(square, pull)
+        parts = [chebyshev_sum(kind.terms, kind.place(square)) for kind in (light, hard)]
+        loss, time, area, action, late = jnp.where(is_hard, parts[1], parts[0])
+        time = time + jnp.where(is_hard | is_light, 0.0, _NOWHERE_US * (1.0 + approach_speed))
+        rebound = jnp.sqrt(jnp.maximum(square - loss, 1e-6))
+        return Tap(Speeds(approach_speed, rebound, time), area, action, late)
+
+
 class Middle(NamedTuple):
     """The tip relative to the platform at mid contact: acceleration g in nm/us^2 and its change j in nm/us^3."""
 
@@ -347,6 +478,11 @@ def corrected(free: Speeds, middle: Middle, cantilever: Cantilever, impact: Impa
         impact: for its Hertz time and its lead.
     """
     u, w = free.approach, free.rebound
+    if isinstance(impact, PulledImpact):
+        speeds, area, action, _ = impact.tap(u, middle.acceleration)
+        gained = 2.0 * (middle.change * area - 2.0 * cantilever.decay_rate * action)
+        w = speeds.rebound
+        return Speeds(u, jnp.sqrt(jnp.maximum(w**2 + gained, (0.1 * w) ** 2)), speeds.delay)
     gained, longer = gained_and_longer(u, impact.hertz_time(u), middle, cantilever)
     rebound = jnp.sqrt(jnp.maximum(w**2 + gained, (0.1 * w) ** 2))
     held = _lag(w, impact.length, middle.acceleration) - _lag(u, impact.length, middle.acceleration)

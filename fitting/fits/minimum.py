@@ -369,7 +369,8 @@ def strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
     reasons = np.where(slow, TOO_SLOW, "").astype(object)
     if tapping:
         pulled = np.asarray(prediction.pull_nm_per_us2)[0] * tips.hertz_time
-        reasons[exists & (pulled > _PULLED * approach)] = TOO_PULLED
+        if not objective.problem.pulled:
+            reasons[exists & (pulled > _PULLED * approach)] = TOO_PULLED
         reasons[_irregular(objective, exists)] = IRREGULAR
         reasons[free] = ""
     near = np.minimum(1.5 * capture / np.maximum(approach, 1e-6), 1.5 / NEAREST)

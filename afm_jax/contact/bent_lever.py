@@ -1,0 +1,219 @@
+"""Taps: collisions of a tip on a bent lever, which pulls it away from the sample, as a table over speed and pull.
+
+A cantilever that is shaken near its resonance meets the sample slowly, bent by nearly its amplitude: the
+lever turns the tip round as much as the sample does. Gap 0 may be out of reach of the lever's motion alone, so that
+speeds and times are those at the *plane*, the gap where the bridge breaks: beyond, the tip moves freely. At the plane
+the pull is g (the acceleration of the gap), below it the lever adds its stiffness.
+
+A tap is light, turned round in the bridge, or hard, with a solid junction. Light taps are followed from the gap where
+they turn, hard ones from the energy with which the junction forms, against time to where they come from and with it to
+where they go. Both are smooth functions of the squared speed at the plane, in Chebyshev's series, as are their
+coefficients of ln g.
+"""
+
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.contact.bridge_leg import Way, sweep
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.driven import Driven, free_tip
+from afm_jax.contact.forces import jkr
+from afm_jax.contact.junction import find_junction
+from afm_jax.contact.junction_leg import pass_through_junction
+from afm_jax.contact.law_of_contact import tabulated
+from afm_jax.contact.leg import gauss_nodes
+from afm_jax.impact.lasting_impact import PulledImpact, Taps, stretched
+
+PULLS, LIGHT, HARD = 9, 16, 24
+"""Pulls of a table, and speeds of light and of hard taps."""
+_NODES, _SWEEPS, _JUNCTION = 16, 6, 16
+_BARRIER_GAPS, _GAPS = 24, 32
+_DRAWN = 1.1
+_FARTHEST = 100.0
+"""Speed with which a junction forms at most, in terms of the speed that hysteresis takes."""
+_ABOVE, _ROUND = 0.05, 0.05
+"""Energy above what a hard tap needs to get away, and rounding of that where its reason changes: shares of what
+hysteresis takes."""
+
+
+class _Near(NamedTuple):
+    """D = scale exp(y^2), y linear in the share: takes the square root out where the tip is slow at the inner end."""
+
+    scale_nm: Float[Array, "..."]
+    start_y: Float[Array, "..."]
+    end_y: Float[Array, "..."]
+
+    def at(self, share: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Return the gap, and the path per share."""
+        width = self.end_y - self.start_y
+        y = self.start_y + width * share
+        gap = self.scale_nm * jnp.exp(y * y)
+        return gap, 2.0 * width * y * gap
+
+
+class _Leg(NamedTuple):
+    """Kinetic energy at the end in aJ; integrals over time of 1, the gap, the squared speed, and the gap times time."""
+
+    energy: Float[Array, ""]
+    time: Float[Array, ""]
+    gap: Float[Array, ""]
+    action: Float[Array, ""]
+    moment: Float[Array, ""]
+
+
+@jax.jit
+def tapped(contact: Contact, lever: Cantilever, pulls: Float[Array, " 2"]) -> PulledImpact:
+    """Return the table of a contact's taps, differentiable in every parameter.
+
+    Args:
+        contact: the contact, of numbers.
+        lever: for its mass and frequency.
+        pulls: weakest and strongest pull at the plane, in nm/us^2.
+    """
+    junction = find_junction(contact)
+    tip = free_tip(contact, junction, lever.mass_ng)._replace(lever_n_per_m=lever.stiffness_n_per_m)
+    plane = jnp.maximum(contact.bridge_breaks_nm, junction.breaks_gap_nm)
+    place = -np.cos(np.pi * np.arange(PULLS) / (PULLS - 1))
+    inverse = jnp.asarray(np.linalg.inv(np.polynomial.chebyshev.chebvander(place, PULLS - 1)))
+
+    def series(taps, weakest) -> Taps:
+        ends = jnp.stack([weakest, jnp.maximum(pulls[1], 1.01 * weakest)])
+        pull = ends[0] * (ends[1] / ends[0]) ** jnp.asarray(0.5 + 0.5 * place)
+        bent = pull + lever.angular_frequency**2 * plane
+        tables = jax.vmap(lambda g: taps(contact, tip._replace(pull=g), plane))(bent)
+        own = {name: jnp.tensordot(inverse, getattr(tables, name), axes=1) for name in ("terms", "low", "high")}
+        return replace(jax.tree.map(lambda leaf: leaf[0], tables), **own, pulls=ends)
+
+    gaps = junction.forms_gap_nm * (contact.bridge_forms_nm / junction.forms_gap_nm) ** jnp.linspace(0.0, 1.0, _GAPS)
+    # where the bridge draws more than the lever pulls no tip turns round
+    drawn = _DRAWN * jnp.max(-tip.bridge.force(gaps)) / lever.mass_ng - lever.angular_frequency**2 * plane
+    light = series(_light, jnp.maximum(pulls[0], drawn))
+    return PulledImpact(light, series(_hard, pulls[0]), tabulated(contact, lever.mass_ng), plane)
+
+
+def _light(contact: Contact, tip: Driven, plane: Float[Array, ""]) -> Taps:
+    """Return the table of the taps that turn in the bridge, between its formation and the junction's."""
+    share = jnp.asarray(0.5 - 0.5 * np.cos(np.pi * np.arange(LIGHT) / (LIGHT - 1)))
+    near, far = tip.junction.forms_gap_nm, contact.bridge_forms_nm
+    gaps = far * (near / far) ** share
+    taps = jax.vmap(lambda gap: _tap(contact, tip, plane, (gap, gap), (jnp.zeros(()), jnp.zeros(())), None))(gaps)
+    own = Taps(jnp.zeros(()), taps.coming[0], taps.coming[-1], far / near, jnp.zeros(2), hard=False)
+    return _filled(own, taps)
+
+
+def _hard(contact: Contact, tip: Driven, plane: Float[Array, ""]) -> Taps:
+    """Return the table of the taps with a junction, from the slowest that gets away."""
+    junction, mass = tip.junction, tip.mass_ng
+    taken = jnp.maximum(junction.hysteresis_aj, 1e-6)
+    scale = jnp.sqrt(2.0 * taken / mass)
+    places = 0.5 - 0.5 * np.cos(np.pi * np.arange(HARD) / (HARD - 1))
+    formed = 0.5 * mass * (scale * jnp.sinh(stretched(jnp.asarray(_FARTHEST)) * jnp.asarray(places))) ** 2
+    formed = formed + _needed(contact, tip, plane, taken)
+    gaps = junction.forms_gap_nm, junction.breaks_gap_nm
+
+    def one(energy):
+        inside = pass_through_junction(tip, energy, _JUNCTION)
+        return _tap(contact, tip, plane, gaps, (energy, inside.energy_aj), inside)
+
+    taps = jax.vmap(one)(formed)
+    low = taps.coming[0]
+    high = stretched(jnp.sqrt(taps.coming[-1] - low) / scale)
+    return _filled(Taps(jnp.zeros(()), low, high, scale, jnp.zeros(2), hard=True), taps)
+
+
+def _filled(taps: Taps, seen: "_Tap") -> Taps:
+    """Return a table with its series, through values at places that the loss has shifted."""
+    # the root of 0 has no derivative
+    inner = taps.place(seen.coming[1:-1])
+    place = jnp.concatenate([-jnp.ones(1), inner, jnp.ones(1)])
+    rows = [jnp.ones_like(place), place]
+    for _ in range(place.shape[0] - 2):
+        rows.append(2.0 * place * rows[-1] - rows[-2])
+    values = jnp.stack([seen.coming - seen.leaving, seen.time, seen.area, seen.action, seen.late], axis=1)
+    return replace(taps, terms=jnp.linalg.solve(jnp.stack(rows, axis=1), values))
+
+
+def _needed(contact: Contact, tip: Driven, plane: Float[Array, ""], taken: Float[Array, ""]) -> Float[Array, ""]:
+    """Return the energy in aJ with which the junction must form for the tip to come from the plane and to get back."""
+    junction, solid = tip.junction, contact.junction
+    share = jnp.asarray(np.linspace(0.0, 1.0, _BARRIER_GAPS))
+    on, breaks = junction.forms_gap_nm, junction.breaks_gap_nm
+    elastic = solid.energy_scale_aj * (jkr.work(jkr.FOLD) - jkr.work(junction.forms_root))
+    out, back = breaks * (plane / breaks) ** share, on * (contact.bridge_forms_nm / on) ** share
+    leaving = elastic - tip.pulled_aj(on, breaks) + tip.potential(out) - tip.potential(breaks)
+    coming = tip.potential(back) - tip.potential(on)
+    most = jnp.maximum(jnp.max(leaving), jnp.max(coming)) + _ABOVE * taken
+    # a rounded maximum with a little energy
+    least, width = _ABOVE * taken, _ROUND * taken
+    return 0.5 * (most + least + jnp.sqrt((most - least) ** 2 + width**2))
+
+
+class _Tap(NamedTuple):
+    """Squared speeds at the plane, in and out, and integrals of a tap."""
+
+    coming: Float[Array, "..."]
+    leaving: Float[Array, "..."]
+    time: Float[Array, "..."]
+    area: Float[Array, "..."]
+    action: Float[Array, "..."]
+    late: Float[Array, "..."]
+
+
+def _tap(contact: Contact, tip: Driven, plane, gaps, energies, inside: Any) -> _Tap:
+    """Return a tap from the inner gaps of its ways in and out, with the kinetic energies there, and what is between."""
+    back = tip._replace(bridge=tip.bridge.reversed())
+    coming = _outward(back, gaps[0], contact.bridge_forms_nm, energies[0])
+    before = _after(coming, _arc(back, contact.bridge_forms_nm, plane, coming.energy))
+    leaving = _outward(tip, gaps[1], plane, energies[1])
+    if inside is not None:
+        solid = _Leg(
+            inside.energy_aj, inside.time_us, inside.gap_nm_us, inside.action, 0.5 * inside.time_us * inside.gap_nm_us
+        )
+        leaving = _after(solid, leaving)
+    time, gap = before.time + leaving.time, before.gap + leaving.gap
+    area = plane * time - gap
+    # the middle of the tap is later than its turning by half of what its ways out and in differ by
+    apart = 0.5 * (leaving.time - before.time)
+    moment = 0.5 * plane * (leaving.time**2 - before.time**2) - (leaving.moment - before.moment)
+    twice = 2.0 / tip.mass_ng
+    action = before.action + leaving.action
+    return _Tap(twice * before.energy, twice * leaving.energy, time, area, action, moment / area - apart)
+
+
+def _after(first: _Leg, second: _Leg) -> _Leg:
+    """Return two legs, one after the other."""
+    moment = first.moment + second.moment + first.time * second.gap
+    return _Leg(second.energy, first.time + second.time, first.gap + second.gap, first.action + second.action, moment)
+
+
+def _outward(tip: Driven, inner, outer, energy) -> _Leg:
+    """Return the way from an inner gap to an outer one, left with a kinetic energy."""
+    push = -(tip.potential(inner * 1.001) - tip.potential(inner * 0.999)) / 0.002
+    # how far inside the speed would vanish, in ln D
+    margin = jnp.where(energy < push, jnp.maximum(energy, 0.0) / jnp.where(energy < push, push, 1.0), 1.0)
+    margin = jax.lax.stop_gradient(jnp.clip(margin, 1e-14, 1.0))
+    start = jnp.sqrt(margin)
+    course: Any = _Near(inner * jnp.exp(-margin), start, jnp.sqrt(margin + jnp.log(outer / inner)))
+    total = energy + tip.potential(inner)
+    slowest = 1e-9 * jnp.abs(tip.potential(outer) - tip.potential(inner)) + 1e-12
+    swept = sweep(Way(tip, -1.0, jnp.zeros(()), total, tip.potential(outer), course, slowest), _NODES, _SWEEPS)
+    _, weights, _ = gauss_nodes(_NODES)
+    gap = swept.at.gap_nm
+    sums = (weights @ (swept.pace * part) for part in (gap, swept.speed**2, gap * swept.lasted_us))
+    return _Leg(swept.passage.energy_aj, swept.passage.time_us, *sums)
+
+
+def _arc(tip: Driven, inner, outer, energy) -> _Leg:
+    """Return the way of the lever alone; over this little its pull is as good as steady."""
+    end = energy + tip.pulled_aj(inner, outer)
+    first, last = (jnp.sqrt(2.0 / tip.mass_ng * jnp.maximum(one, 1e-9)) for one in (energy, end))
+    time = 2.0 * (outer - inner) / (first + last)
+    gap = inner * time + time**2 * (2.0 * first + last) / 6.0
+    moment = time**2 * (0.5 * inner + time * (5.0 * first + 3.0 * last) / 24.0)
+    return _Leg(end, time, gap, time * (first * first + first * last + last * last) / 3.0, moment)
