@@ -333,20 +333,24 @@ def impact_slopes(
     filled, impacts = filled_up(np.asarray(values)[None], measurement, problem)
     still = jax.tree.map(lambda leaf: np.zeros(leaf.shape), impacts.slopes)
 
-    def along(where: Callable[[Any], Any], turn: float) -> tuple[np.ndarray, np.ndarray]:
-        leaf = np.array(where(still))
-        # tables have a series: its constant term
-        leaf[(slice(None), 0, *(0,) * (leaf.ndim - 2))] = turn
-        turned = impacts._replace(slopes=eqx.tree_at(where, still, leaf))
+    def along(where: Callable[[Any], Any], turn: float, number: int = 0) -> tuple[np.ndarray, np.ndarray]:
+        leaves = [np.array(leaf) for leaf in where(still)]
+        for leaf in leaves:
+            # series have a constant term
+            leaf[(slice(None), 0, *(0,) * (leaf.ndim - 3), number)[: leaf.ndim]] = turn
+        turned = impacts._replace(slopes=eqx.tree_at(where, still, leaves))
         block = _in_lanes(filled, 1, turned, measurement, problem, near)
         return np.asarray(block.slope)[0, :, :, 0], np.asarray(block.prediction.approach_speed_nm_per_us)[0]
 
-    if not isinstance(impacts.impact, LawImpact):
-        return ImpactSlopes(along(lambda i: i.loss, -1.0)[0], along(lambda i: i.time, 1.0)[0])
-    by_square, _ = along(lambda i: i.law.epsilon, -1.0)
+    if isinstance(impacts.impact, PulledImpact):
+        kinds = lambda i: (i.light.terms, i.hard.terms)  # noqa: E731
+        return ImpactSlopes(along(kinds, -1.0)[0], along(kinds, 1.0, 1)[0])
+    if isinstance(impacts.impact, TabulatedImpact):
+        return ImpactSlopes(along(lambda i: (i.loss,), -1.0)[0], along(lambda i: (i.time,), 1.0)[0])
+    by_square, _ = along(lambda i: (i.law.epsilon,), -1.0)
     if not impacts.impact.delayed:
         return ImpactSlopes(by_square, np.zeros_like(by_square))
-    by_offset, speed = along(lambda i: i.law.delay.offset_nm, -1.0)
+    by_offset, speed = along(lambda i: (i.law.delay.offset_nm,), -1.0)
     # the offset d shortens the delay by d/u; a free tip has no speed
     return ImpactSlopes(by_square, np.nan_to_num(speed)[:, None] * by_offset)
 
@@ -405,7 +409,9 @@ class Free(NamedTuple):
 
 @jax.jit
 def free_impacts(impact: AnyImpact, coordinate: Float[Array, " n"]) -> Free:
-    """Return what an impact does to free tips."""
+    """Return what an impact does to free tips; coordinates of taps are taken for those of free ones."""
+    if isinstance(impact, PulledImpact):
+        impact = impact.free
     speeds = jax.vmap(impact.speeds)(coordinate)
     just_above = impact.speeds(impact.lowest * (1.0 + 1e-9)).approach
     return Free(speeds, impact.hertz_time(speeds.approach), impact.lowest, just_above, impact.length)

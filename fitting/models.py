@@ -239,7 +239,7 @@ def _pulls(rows: Rows, cantilever: Cantilever) -> Float[np.ndarray, " 2"]:
     hits = np.asarray(rows.measured).any(axis=1) & ~rows.free
     pull = np.where(hits, -np.asarray(rows.offset_nm), 0.0)
     strongest = _PULL_ROOM * np.max(pull + np.where(hits, push, 0.0), initial=1.0)
-    weakest = np.min(np.where(hits, pull + 0.5 * push, np.inf), initial=strongest) / _PULL_ROOM
+    weakest = np.min(np.where(hits, pull - BRIDGE_NM + 0.5 * push, np.inf), initial=strongest) / _PULL_ROOM
     return float(cantilever.angular_frequency) ** 2 * np.array([max(weakest, _WIDEST * strongest), strongest])
 
 

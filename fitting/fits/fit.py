@@ -17,7 +17,7 @@ from scipy.special import chdtrc
 
 from afm_jax.checks import require_float64
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact
+from afm_jax.impact.lasting_impact import LawImpact, PulledImpact
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.version import version_of
 from fitting.fits.intervals import (
@@ -56,7 +56,7 @@ from fitting.fits.unmodelled import (
     step_of,
 )
 from fitting.fits.verdict import ASSUMED_ERROR_OF_Q, Evidence, judge_fit, misfits
-from fitting.forward import impact_at, warm_up
+from fitting.forward import AnyImpact, impact_at, warm_up
 from fitting.models import (
     Measurement,
     Problem,
@@ -172,7 +172,7 @@ def speed_range(approach_speeds: Float[np.ndarray, " rows"]) -> tuple[float, flo
 
 @jax.jit
 def law_and_slope(
-    impact: LawImpact | TabulatedImpact, slopes: LawImpact | TabulatedImpact, speeds: Float[Array, " n"]
+    impact: AnyImpact, slopes: AnyImpact, speeds: Float[Array, " n"]
 ) -> tuple[Float[Array, "2 n+1"], Float[Array, "2 n+1 p"]]:
     """Return rebound speeds and delays at approach speeds, and their derivatives by the parameters.
 
@@ -189,6 +189,7 @@ def law_and_slope(
             capture = jnp.full((2, 1), impact.law.capture_speed_nm_per_us)
             found = jnp.stack([impact.law.rebound_speed(speeds), impact.law.collision_delay(speeds)])
             return jnp.concatenate([found, capture], axis=1)
+        impact = impact.free if isinstance(impact, PulledImpact) else impact
         found = jax.vmap(impact.speeds)(speeds)
         # below the table the contact captures
         free = speeds > impact.lowest
@@ -317,6 +318,7 @@ class _Summary:
             untabulated=tuple(np.flatnonzero(missed).tolist()),
             contact_share=self.contact_share,
             refused=self.refused,
+            tapped=self.problem.pulled,
         )
         # Errors that assume the model would be confident numbers about a law that is not there.
         explained = not misfits(evidence)
@@ -507,7 +509,7 @@ def fit(  # noqa: PLR0913
             where impacts last, and exactly by the instantaneous laws.
         model: "restitution" (r), "law" (r, epsilon; eq. 6), "viscous" (epsilon, viscous_loss) or "full" (all three),
             each instantaneous or with "+delay", the collision delay; or "contact", physical parameters through the
-            resolved contact.
+            resolved contact, which a tapping curve gives on resonance too.
         scale_errors: take the amplitudes' errors as relative only and scale them until chi2 equals its degrees of
             freedom (the error of Q stays); the result is valid only if the scale is believable and what is left of the
             amplitudes random (see `verdict`).

@@ -364,6 +364,9 @@ def strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
     capture = float(tips.capture_speed) if tips.lowest > 0.0 else 0.0
     share = 2.0 * np.pi * np.asarray(rows.drive_frequency_khz) * 1e-3 * float(tips.length) / np.maximum(rebound, 1e-6)
     tapping, free = objective.problem.tapping, np.asarray(rows.free)
+    if objective.problem.pulled:
+        # a bent lever pulls slow tips out of the bridge: its taps are known down to the slowest
+        capture = 0.0
     slow = (share > LONGEST) | (approach < (_CRAWLING if tapping else NEAREST) * capture)
     slow = np.where(exists, slow, _lost_slowly(objective, exists, _CRAWLING * capture))
     reasons = np.where(slow, TOO_SLOW, "").astype(object)
@@ -412,7 +415,7 @@ def untabulated(
     objective: Objective, values: Float[np.ndarray, " p"], approach: Float[np.ndarray, " rows"]
 ) -> Bool[np.ndarray, " rows"]:
     """Say at which approach speeds the table of a contact misses its accuracy; nowhere for a law, nor at NaN."""
-    if objective.problem.model != "contact":
+    if objective.problem.model != "contact" or objective.problem.pulled:
         return np.zeros(approach.shape, dtype=bool)
     from afm_jax.contact.law_of_contact import DELAY_ERROR_US, SPEED_ERROR  # noqa: PLC0415  # for contacts alone
 

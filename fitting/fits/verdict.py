@@ -41,7 +41,12 @@ _LONG_CONTACT = 0.2
 """Share of the drive's period in contact from which a misfit is laid to it: the corrections are fitted up to there."""
 _REFUSED = (
     "No law of impacts can be read off this curve: on nearly all of its rows impacts are too slow, or the lever's own "
-    "pull turns the tip round; drive 3 to 10 % above resonance, with a large free amplitude."
+    "pull turns the tip round; drive 3 to 10 % above resonance, with a large free amplitude, or fit the contact's own "
+    "parameters (--model contact), which needs no law."
+)
+_NO_TAPS = (
+    "The contact's taps explain hardly a row of this curve: it has no steady tap of one impact a period there. Fix what "
+    "is known of it (--fix tip_radius_nm=20, for example), or leave rows out that are not one impact a period."
 )
 ASSUMED_ERROR_OF_Q = 0.02
 """Relative standard error of a quality factor that is given without one."""
@@ -71,12 +76,19 @@ class Evidence:
     contact_share: float = 0.0
     """Largest share of a drive's period that the tip is in contact."""
     refused: bool = False
+    tapped: bool = False
+    """Whether a contact's own taps were fitted, not a law."""
     """Hardly a row is left that a law of impacts can be read off."""
+
+    @property
+    def refusal(self) -> str:
+        """Why hardly a row is one that the model can be read off."""
+        return _NO_TAPS if self.tapped else _REFUSED
 
 
 def judge_fit(evidence: Evidence) -> tuple[list[str], list[str]]:
     """Return what makes a fit invalid, and its warnings; each a sentence."""
-    return [_REFUSED] if evidence.refused else _reasons(evidence), _warnings(evidence)
+    return [evidence.refusal] if evidence.refused else _reasons(evidence), _warnings(evidence)
 
 
 def _reasons(evidence: Evidence) -> list[str]:
@@ -140,7 +152,7 @@ def misfits(evidence: Evidence) -> list[str]:
     The parameters' errors and intervals are not looked at.
     """
     if evidence.refused:
-        return [_REFUSED]
+        return [evidence.refusal]
     found = []
     if evidence.p_value < IMPROBABLE:
         found.append(f"chi2/dof = {evidence.chi2 / evidence.freedom:.3g} (probability {evidence.p_value:.1g})")
