@@ -45,8 +45,8 @@ _REFUSED = (
     "parameters (--model contact), which needs no law."
 )
 _NO_TAPS = (
-    "The contact's taps explain hardly a row of this curve: it has no steady tap of one impact a period there. Fix what "
-    "is known of it (--fix tip_radius_nm=20, for example), or leave rows out that are not one impact a period."
+    "The contact's taps explain hardly a row of this curve: it has no steady tap a period there; fix what "
+    "is known of it (--fix tip_radius_nm=20, for example), or leave out rows that are not one impact a period."
 )
 ASSUMED_ERROR_OF_Q = 0.02
 """Relative standard error of a quality factor that is given without one."""
