@@ -1,5 +1,7 @@
 """Taps of a tip on a bent lever against the driven contact of the tests' own integrator."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,12 +18,18 @@ from tests.reference_driven_contact import DrivenContact, follow
 
 LEVER = Cantilever(90.0, 200.0, 16.81)
 OMEGA = 2e-3 * np.pi * 90.0
-MIXED = {"tip_radius_nm": 50.0, "relative_humidity": 0.42, "adhesion_energy_j_per_m2": 0.22, "modulus_gpa": 70.0}
+MIXED: dict[str, Any] = {
+    "tip_radius_nm": 50.0,
+    "relative_humidity": 0.42,
+    "adhesion_energy_j_per_m2": 0.22,
+    "modulus_gpa": 70.0,
+}
 
 
-def system(numbers: dict[str, float], **more: float | None) -> DrivenContact:
-    contact = ContactParameters(**numbers)  # pyright: ignore[reportArgumentType]
-    return DrivenContact(**{"drive_frequency_khz": 90.0, "mass_ng": 16.81, "contact": contact} | more)  # pyright: ignore[reportArgumentType]
+def system(numbers: dict[str, Any], **more: Any) -> DrivenContact:
+    return DrivenContact(
+        **{"drive_frequency_khz": 90.0, "mass_ng": 16.81, "contact": ContactParameters(**numbers)} | more
+    )
 
 
 @pytest.mark.slow

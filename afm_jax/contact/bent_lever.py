@@ -136,7 +136,23 @@ def _filled(taps: Taps, seen: "_Tap") -> Taps:
     for _ in range(place.shape[0] - 2):
         rows.append(2.0 * place * rows[-1] - rows[-2])
     values = jnp.stack([seen.coming - seen.leaving, seen.time, seen.area, seen.action, seen.late], axis=1)
-    return replace(taps, terms=jnp.linalg.solve(jnp.stack(rows, axis=1), values))
+    return replace(taps, terms=_solved(jnp.stack(rows, axis=1), values))
+
+
+def _solved(matrix: Float[Array, "n n"], values: Float[Array, "n k"]) -> Float[Array, "n k"]:
+    """Return the solution of a system whose matrix is nearly that of Chebyshev's polynomials at Chebyshev's points.
+
+    Written out: over sets and pulls the library's own has been seen to wait for itself for ever.
+    """
+    count = matrix.shape[0]
+    places = -np.cos(np.pi * np.arange(count) / (count - 1))
+    near = jnp.asarray(np.linalg.inv(np.polynomial.chebyshev.chebvander(places, count - 1)))
+
+    def eliminate(index, rows):
+        own = rows[index] / rows[index, index]
+        return (rows - rows[:, index, None] * own).at[index].set(own)
+
+    return jax.lax.fori_loop(0, count, eliminate, near @ jnp.concatenate([matrix, values], axis=1))[:, count:]
 
 
 def _needed(contact: Contact, tip: Driven, plane: Float[Array, ""], taken: Float[Array, ""]) -> Float[Array, ""]:
@@ -203,8 +219,7 @@ def _outward(tip: Driven, inner, outer, energy) -> _Leg:
     total = energy + tip.potential(inner)
     slowest = 1e-9 * jnp.abs(tip.potential(outer) - tip.potential(inner)) + 1e-12
     swept = sweep(Way(tip, -1.0, jnp.zeros(()), total, tip.potential(outer), course, slowest), _NODES, _SWEEPS)
-    _, weights, _ = gauss_nodes(_NODES)
-    gap = swept.at.gap_nm
+    weights, gap = jnp.asarray(gauss_nodes(_NODES)[1]), swept.at.gap_nm
     sums = (weights @ (swept.pace * part) for part in (gap, swept.speed**2, gap * swept.lasted_us))
     return _Leg(swept.passage.energy_aj, swept.passage.time_us, *sums)
 

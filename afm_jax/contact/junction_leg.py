@@ -65,7 +65,8 @@ def pass_through_junction(tip: Driven, energy_aj: Float[Array, "..."], nodes: in
 
 def _sums(weights: Array, pace: Array, gap: Array, speed: Array) -> tuple[Array, Array, Array]:
     """Return the integrals over time of 1, of the gap and of the squared speed."""
-    return tuple(jnp.tensordot(weights, pace * part, axes=1) for part in (jnp.ones_like(pace), gap, speed**2))
+    time, below, action = (jnp.tensordot(weights, pace * part, axes=1) for part in (jnp.ones_like(pace), gap, speed**2))
+    return time, below, action
 
 
 class Stretch(NamedTuple):
