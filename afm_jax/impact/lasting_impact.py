@@ -310,7 +310,8 @@ class Taps(eqx.Module):
         weakest, strongest = self.pulls
         held = jnp.clip(pull, weakest, strongest)
         far = 2.0 * jnp.log(held / weakest) / jnp.log(strongest / weakest) - 1.0
-        own = {name: chebyshev_sum(getattr(self, name), far) for name in ("terms", "low", "high")}
+        weights = _polynomials(far, self.low.shape[0])
+        own = {name: jnp.tensordot(weights, getattr(self, name), axes=1) for name in ("terms", "low", "high")}
         return replace(self, **own)
 
     def place(self, square: Float[Array, "..."]) -> Float[Array, "..."]:
@@ -333,6 +334,15 @@ _BESIDE = 0.02
 """Share by which a pull may lie outside a table."""
 _NOWHERE_US = 1e3
 """What the delay of a tap that does not exist is longer by, and more: no orbit has it."""
+
+
+def _polynomials(place: Float[Array, ""], count: int) -> Float[Array, " count"]:
+    """Return Chebyshev's polynomials at a place in [-1, 1]: in few operations, for the program is large enough."""
+    return jnp.cos(jnp.arange(count) * jnp.arccos(jnp.clip(place, -_END, _END)))
+
+
+_END = 1.0 - 1e-12
+"""Where their derivatives are still finite."""
 
 
 class Tap(NamedTuple):
@@ -409,7 +419,7 @@ class PulledImpact(eqx.Module):
         square = approach_speed**2
         light, hard = self.light.at(pull), self.hard.at(pull)
         is_hard, is_light = hard.holds(square, pull), light.holds(square, pull)
-        parts = [chebyshev_sum(kind.terms, kind.place(square)) for kind in (light, hard)]
+        parts = [_polynomials(kind.place(square), kind.terms.shape[0]) @ kind.terms for kind in (light, hard)]
         loss, time, area, action, late = jnp.where(is_hard, parts[1], parts[0])
         time = time + jnp.where(is_hard | is_light, 0.0, _NOWHERE_US * (1.0 + approach_speed))
         rebound = jnp.sqrt(jnp.maximum(square - loss, 1e-6))
