@@ -17,7 +17,7 @@ SHARP := tests/test_polynomial_roots.py tests/test_verification.py
 BIN := .venv/bin
 SETUP := .venv/.installed
 
-.PHONY: help setup fit test check thorough lint types coverage slow docs pictures mutations bands fuzz kills bench clean
+.PHONY: help setup fit test check thorough lint types coverage slow docs pictures mutations bands tapping ranks fuzz kills bench clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -72,14 +72,20 @@ fuzz: $(SETUP) ## random work, seeded; FUZZ='--flights 1000000 --orbits 100000 -
 bands: $(SETUP) ## do the 95 % bands hold the laws of ten random contacts? (twenty minutes; the truths are kept in /tmp)
 	$(BIN)/python -m tests.coverage_of_bands
 
-KILLS ?= --times 20
+tapping: $(SETUP) ## are tapping curves of random contacts predicted and fitted as they should be? (the truths are kept in /tmp)
+	$(BIN)/python -m tests.tapping_accuracy
 
-kills: $(SETUP) ## a sweep killed at twenty random times and resumed ends in the bytes of one that was not
+ranks: $(SETUP) ## are true values anywhere in the posteriors of 1000 simulated tables equally often? (half an hour)
+	$(BIN)/python -m tests.coverage_of_ranks
+
+KILLS ?= --times 50
+
+kills: $(SETUP) ## a sweep killed at fifty random times and resumed ends in the bytes of one that was not
 	$(BIN)/python -m tests.kills $(KILLS)
 
 check: lint types test slow docs ## all that CI runs: format, lint, types, tests, slow tests, notebooks, site
 
-thorough: lint types coverage mutations bands fuzz kills ## all of make check with the share of lines it runs, mutations, bands, random work, kills
+thorough: lint types coverage mutations bands tapping ranks fuzz kills ## all of make check with the share of lines it runs, mutations, bands, tapping curves, ranks, random work, kills
 
 bench: $(SETUP) ## impacts per second, next to SciPy
 	$(BIN)/afm-jax bench --out $(OUT)

@@ -25,8 +25,10 @@ if TYPE_CHECKING:
     from fitting.inversion.invert import invert
     from fitting.inversion.result import Inversion
     from fitting.sampling.bootstrap import Bootstrap, bootstrap
+    from fitting.sampling.inference_data import write_inference_data
     from fitting.sampling.posterior import posterior
     from fitting.sampling.posterior_result import Posterior
+    from fitting.sampling.trust_pack import TrustPack, trust
     from fitting.simulated.experiment import SimulatedExperiment, simulate_experiment
     from fitting.tables.table import AmplitudeTable, TableError, read_table, write_table
     from fitting.tapping_curves.result import Tapping
@@ -57,6 +59,7 @@ else:
         "TableError": "fitting.tables.table",
         "Tapping": "fitting.tapping_curves.result",
         "Trace": "fitting.traces.trace",
+        "TrustPack": "fitting.sampling.trust_pack",
         "amplitude_gradients": "fitting.forward",
         "believe": "fitting.experiments.belief",
         "bootstrap": "fitting.sampling.bootstrap",
@@ -82,6 +85,8 @@ else:
         "sensitivity": "fitting.calibration.stiffness",
         "simulate_experiment": "fitting.simulated.experiment",
         "tapping": "fitting.tapping_curves.tapping",
+        "trust": "fitting.sampling.trust_pack",
+        "write_inference_data": "fitting.sampling.inference_data",
         "write_table": "fitting.tables.table",
     }
 
@@ -113,6 +118,7 @@ __all__ = [
     "TableError",
     "Tapping",
     "Trace",
+    "TrustPack",
     "amplitude_gradients",
     "believe",
     "bootstrap",
@@ -138,5 +144,7 @@ __all__ = [
     "sensitivity",
     "simulate_experiment",
     "tapping",
+    "trust",
+    "write_inference_data",
     "write_table",
 ]

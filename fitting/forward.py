@@ -139,8 +139,9 @@ def branch_of(orbit: OrbitProblem, row: Rows, values: Float[Array, " p"], proble
 def followed(orbit: OrbitProblem, known: Branch, row: Rows) -> Branch:
     """Follow a row's orbit from where it is known to be: exact where it was found, close at other parameters."""
     harmless = harmless_coordinate(orbit)
-    root, found = follow_root(jnp.where(known.exists & ~row.free, known.place.coordinate, harmless), orbit)
-    there = known.exists & found & ~row.free
+    wanted = known.exists & ~row.free
+    root, found = follow_root(jnp.where(wanted, known.place.coordinate, harmless), orbit, wanted)
+    there = wanted & found
     exists = there | row.free
     return Branch(
         place=OrbitPlace(jnp.where(there, root.coordinate, harmless), root.phase),
@@ -222,12 +223,15 @@ def linearise(
     sets, count = values.shape
     rows = measurement.rows.order.shape[0]
     filled, impacts = filled_up(values, measurement, problem)
-    whole = _in_lanes(filled, sets, impacts, measurement, problem, near)
+    whole = _in_every_lane(filled, sets, impacts, measurement, problem, near)
     misfit, unseen = np.asarray(whole.misfit).reshape(sets, -1), np.asarray(whole.unseen)
     strength = 1.0 / np.asarray(measurement.constraint_error)
     constraint = (values - np.asarray(measurement.constraint_value)) * strength
     pulls = np.broadcast_to(np.diag(strength), (sets, count, count))
-    flat = np.asarray(whole.slope).reshape(sets, -1, count)
+    slope = np.asarray(whole.slope)
+    if measurement.joint is not None and measurement.rows.table is not None:
+        slope = measurement.joint.spread(slope, measurement.rows.table, count)
+    flat = slope.reshape(sets, -1, count)
     return Linearised(
         residual=np.concatenate([misfit, unseen, constraint], axis=1),
         jacobian=np.concatenate([flat, np.zeros((sets, rows, count)), pulls], axis=1),
@@ -244,15 +248,20 @@ def warm_up(values: Float[np.ndarray, " p"], measurement: Measurement, problem: 
         problem: the model.
     """
     filled, impacts = filled_up(np.asarray(values)[None], measurement, problem)
+    if measurement.joint is not None:
+        # one of what is driven: the program of another is compiled when it comes to it
+        drive = measurement.joint.drives[0]
+        filled, problem = filled[:, 0], replace(measurement.joint.problem, drive=drive)
+        measurement = measurement.of_drive(drive)
     index = np.zeros(_lanes(problem), dtype=int)
     rows = jax.tree.map(lambda column: np.asarray(column)[index], measurement.rows)
-    some = measurement._replace(rows=rows)
+    some, points = measurement._replace(rows=rows), filled[index]
     nowhere = branch_near(np.full(index.shape, np.nan))
 
     def in_thread(program: Callable[..., Any], *more: Any) -> None:
         # what was switched on for one thread alone is not for another
         with jax.enable_x64(True):  # noqa: FBT003
-            jax.block_until_ready(program(filled, impacts, index, some, problem, *more))
+            jax.block_until_ready(program(points, impacts, index, some, problem, *more))
 
     with ThreadPoolExecutor(1) as pool:
         other = pool.submit(in_thread, linearise_pairs, nowhere)
@@ -264,15 +273,39 @@ def _lanes(problem: Problem) -> int:
     return SEARCHED if problem.lasting else SOLVED
 
 
-def _in_lanes(
-    filled: Float[np.ndarray, "batch p"],
+def _in_every_lane(
+    filled: Float[np.ndarray, "batch ..."],
     sets: int,
     impacts: "_Impacts",
     measurement: Measurement,
     problem: Problem,
     near: Float[np.ndarray, "..."] | None,
 ) -> "_Block":
-    """Return what `linearise_pairs` finds, as arrays of shape (sets, rows, ...)."""
+    """Return what `_in_lanes` finds, of several tables drive by drive; slopes are by the parameters of a row's own."""
+    joint, table = measurement.joint, measurement.rows.table
+    if joint is None or table is None:
+        return _in_lanes(filled, sets, impacts, measurement, problem, near)
+    drives = np.array(joint.drives)[table]
+    places, blocks = [], []
+    for drive in dict.fromkeys(drives.tolist()):
+        mine = np.flatnonzero(drives == drive)
+        points = np.moveaxis(filled[:, table[mine]], 1, -2)
+        one, known = replace(joint.problem, drive=drive), None if near is None else np.asarray(near)[..., mine]
+        places.append(mine)
+        blocks.append(_in_lanes(points, sets, impacts, measurement.of_drive(drive), one, known))
+    order = np.argsort(np.concatenate(places))
+    return jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, order], *blocks)
+
+
+def _in_lanes(
+    filled: Float[np.ndarray, "batch p"] | Float[np.ndarray, "batch rows p"],
+    sets: int,
+    impacts: "_Impacts",
+    measurement: Measurement,
+    problem: Problem,
+    near: Float[np.ndarray, "..."] | None,
+) -> "_Block":
+    """Return what `linearise_pairs` finds, as arrays of shape (sets, rows, ...); `filled` may differ row by row."""
     columns = jax.tree.map(np.asarray, measurement.rows)
     filling = _filling(columns)
     rows = columns.order.shape[0] - filling
@@ -284,9 +317,10 @@ def _in_lanes(
         lane = np.minimum(np.arange(begin, begin + lanes), sets * rows - 1)
         some = measurement._replace(rows=jax.tree.map(lambda column, row=lane % rows: column[row], columns))
         index = lane // rows
-        branch = branch_near(known[lane]) if known is not None else located(filled, impacts, index, some, problem)
+        points = filled[index] if filled.ndim == 2 else filled[index, lane % rows]
+        branch = branch_near(known[lane]) if known is not None else located(points, impacts, index, some, problem)
         # not waited for: blocks are worked on side by side
-        blocks.append(linearise_pairs(filled, impacts, index, some, problem, branch))
+        blocks.append(linearise_pairs(points, impacts, index, some, problem, branch))
 
     def whole(*parts):
         found = np.concatenate([np.asarray(part) for part in parts])[: sets * rows]
@@ -339,7 +373,7 @@ def impact_slopes(
             # series have a constant term
             leaf[(slice(None), 0, *(0,) * (leaf.ndim - 3), number)[: leaf.ndim]] = turn
         turned = impacts._replace(slopes=eqx.tree_at(where, still, leaves))
-        block = _in_lanes(filled, 1, turned, measurement, problem, near)
+        block = _in_every_lane(filled, 1, turned, measurement, problem, near)
         return np.asarray(block.slope)[0, :, :, 0], np.asarray(block.prediction.approach_speed_nm_per_us)[0]
 
     if isinstance(impacts.impact, PulledImpact):
@@ -377,17 +411,27 @@ class _Impacts(NamedTuple):
 
 def filled_up(
     values: Float[np.ndarray, "sets p"], measurement: Measurement, problem: Problem
-) -> tuple[Float[np.ndarray, "batch p"], _Impacts]:
-    """Return sets of values, filled up to `BATCH`, and their impacts."""
+) -> tuple[Float[np.ndarray, "batch ..."], _Impacts]:
+    """Return sets of values, filled up to `BATCH`, and their impacts; of several tables the values of each."""
     filled = np.concatenate([values, np.repeat(values[-1:], BATCH - len(values), axis=0)])
+    points = filled
+    if measurement.joint is not None:
+        # an impact knows no nuisances
+        problem, filled = measurement.joint.problem, measurement.joint.values(filled)
+        measurement, points = measurement.of_drive(problem.drive), filled[:, 0]
     # an impact knows no rows: one program for tables of every size
     rows = jax.tree.map(lambda column: np.asarray(column)[:0], measurement.rows)
-    return filled, jax.tree.map(np.asarray, impacts_of(filled, measurement._replace(rows=rows), problem))
+    return filled, jax.tree.map(np.asarray, impacts_of(points, measurement._replace(rows=rows), problem))
 
 
 def impact_at(values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem) -> _Impacts:
     """Return the law, or the table of the contact, at one set of values, with its slopes, by the shared program."""
-    return filled_up(np.asarray(values)[None], measurement, problem)[1].first()
+    impact, slopes = filled_up(np.asarray(values)[None], measurement, problem)[1].first()
+    if measurement.joint is None:
+        return _Impacts(impact, slopes)
+    # the parameters of the law come first in every table, and nuisances change no impact
+    own, others = len(problem.own), len(problem.names) - len(problem.own)
+    return _Impacts(impact, jax.tree.map(lambda s: np.pad(s[:own], [(0, others), *[(0, 0)] * (s.ndim - 1)]), slopes))
 
 
 @partial(jax.jit, static_argnames="problem")
@@ -419,31 +463,31 @@ def free_impacts(impact: AnyImpact, coordinate: Float[Array, " n"]) -> Free:
 
 @partial(jax.jit, static_argnames="problem")
 def located(
-    values: Float[Array, "sets p"],
+    points: Float[Array, "lanes p"],
     impacts: _Impacts,
     index: Int[Array, " lanes"],
     measurement: Measurement,
     problem: Problem,
 ) -> Branch:
-    """Return the orbit that each pair of a row and the set that its index names is on."""
+    """Return the orbit that each pair of a row, with its values, and the set that its index names is on."""
 
     def one(point: Float[Array, " p"], impact, row: Rows) -> Branch:
         return branch_of(orbit_problem(point, impact, row, measurement, problem), row, point, problem)
 
-    points, impact = jax.tree.map(lambda leaf: leaf[index], (values, impacts.impact))
+    impact = jax.tree.map(lambda leaf: leaf[index], impacts.impact)
     return jax.vmap(one)(points, impact, measurement.rows)
 
 
 @partial(jax.jit, static_argnames="problem")
 def linearise_pairs(
-    values: Float[Array, "sets p"],
+    points: Float[Array, "lanes p"],
     impacts: _Impacts,
     index: Int[Array, " lanes"],
     measurement: Measurement,
     problem: Problem,
     branch: Branch,
 ) -> _Block:
-    """Return misfits and slopes of pairs of a row and the set of values that its index names, on given orbits."""
+    """Return misfits and slopes of pairs of a row, with its values, and the set that its index names, on its orbit."""
 
     # One vmap over all pairs, not two nested ones: tracing costs as much as a fit otherwise.
     def one(point: Float[Array, " p"], impact, slope, row: Rows, known: Branch):
@@ -459,7 +503,7 @@ def linearise_pairs(
 
         return jax.vmap(along, out_axes=(-1, None))(jnp.eye(point.shape[0]), slope)
 
-    points, impact, slopes = jax.tree.map(lambda leaf: leaf[index], (values, *impacts))
+    impact, slopes = jax.tree.map(lambda leaf: leaf[index], tuple(impacts))
     rows = measurement.rows
     slope, prediction = jax.vmap(one)(points, impact, slopes, rows, branch)
     # far from any law (a start of the search) a root can be no motion at all: no orbit there

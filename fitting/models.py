@@ -4,11 +4,12 @@ A model's parameters as vectors, in the optimiser's coordinates and as the law t
 arrays, with the cantilever and the Gaussian constraints.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
@@ -17,7 +18,8 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.lasting_impact import BRIDGE_NM
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
-from fitting.parameters import DELAY, LAW, NUISANCE_NAMES, PARAMETERS, Parameter
+from fitting.parameters import DELAY, LAW, Parameter, is_nuisance, parameter_called
+from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable
 
 AnyArray = Array | np.ndarray
@@ -73,7 +75,7 @@ class Problem:
     @property
     def parameters(self) -> tuple[Parameter, ...]:
         """The parameters in the order of every vector."""
-        return tuple(PARAMETERS[name] for name in self.names)
+        return tuple(parameter_called(name) for name in self.names)
 
     @property
     def pulled(self) -> bool:
@@ -88,7 +90,7 @@ class Problem:
     @property
     def own(self) -> tuple[str, ...]:
         """The names of the model's parameters, without nuisances."""
-        return tuple(name for name in self.names if name not in NUISANCE_NAMES)
+        return tuple(name for name in self.names if not is_nuisance(name))
 
     def values(self, coordinates: Float[np.ndarray, "... p"]) -> Float[np.ndarray, "... p"]:
         """Return the parameters' values at optimiser coordinates."""
@@ -144,7 +146,7 @@ class Rows(NamedTuple):
     The phase is in degrees, and there (k = 3) only if the table has one: of the orbit, or the lag of a cantilever that
     is driven itself, whose free amplitude stands for the drive's. What was not measured, and every padded row, has
     ``measured`` False; its value and error are 1. ``no_orbit``: the drive was tried and no steady orbit seen; ``free``:
-    the driven tip does not come near the sample.
+    the driven tip does not come near the sample. ``table``: which of several tables a row is of; None: of the one.
     """
 
     order: Float[AnyArray, " rows"]
@@ -156,6 +158,39 @@ class Rows(NamedTuple):
     measured: Bool[AnyArray, "rows k"]
     no_orbit: Bool[AnyArray, " rows"]
     free: Bool[AnyArray, " rows"]
+    table: Int[np.ndarray, " rows"] | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Joint:
+    """How the parameters of several tables that are fitted together are those of each.
+
+    Attributes:
+        problem: of every one of them: the model's parameters, and the nuisances that any has.
+        cantilevers: as each table gives it; all of one mass.
+        drives: what is driven in each.
+        place: of each table's parameters among all that are fitted, shape (tables, p); -1 where one is held.
+        held: the values of these.
+    """
+
+    problem: Problem
+    cantilevers: tuple[Cantilever, ...]
+    drives: tuple[str, ...]
+    place: Int[np.ndarray, "tables p"]
+    held: Float[np.ndarray, "tables p"]
+
+    def values(self, everything: Float[np.ndarray, "sets q"]) -> Float[np.ndarray, "sets tables p"]:
+        """Return the values of each table's parameters."""
+        return np.where(self.place >= 0, everything[:, self.place], self.held)
+
+    def spread(
+        self, slope: Float[np.ndarray, "sets rows k p"], table: Int[np.ndarray, " rows"], count: int
+    ) -> Float[np.ndarray, "sets rows k q"]:
+        """Return derivatives by all parameters that are fitted, from those by each row's own."""
+        # what is held is put into a last column, which is cut
+        whole = np.zeros((*slope.shape[:-1], count + 1))
+        np.put_along_axis(whole, np.broadcast_to(self.place[table][:, None, :], slope.shape), slope, axis=-1)
+        return whole[..., :count]
 
 
 class Measurement(NamedTuple):
@@ -168,6 +203,7 @@ class Measurement(NamedTuple):
         constraint_error: its standard error, infinite where nothing is known.
         fixed: values of the model's parameters that are not fitted, by name; of a contact those not the paper's.
         pulls: weakest and strongest of the bent lever in nm/us^2, where a driven tip meets a contact; None elsewhere.
+        joint: where the rows are of several tables: which parameters are whose; no compiled program takes it.
     """
 
     rows: Rows
@@ -176,6 +212,15 @@ class Measurement(NamedTuple):
     constraint_error: Float[AnyArray, " p"]
     fixed: dict[str, Float[AnyArray, ""]]
     pulls: Float[AnyArray, " 2"] | None = None
+    joint: Joint | None = None
+
+    def of_drive(self, drive: str) -> "Measurement":
+        """Return the rows of several tables of which this is driven as those of one; its parameters are `joint`'s."""
+        assert self.joint is not None and self.rows.table is not None  # noqa: S101, PT018
+        chosen = np.array(self.joint.drives)[self.rows.table] == drive
+        rows = jax.tree.map(lambda column: np.asarray(column)[chosen], self.rows._replace(table=None))
+        count = len(self.joint.problem.names)
+        return Measurement(rows, self.cantilever, np.ones(count), np.full(count, np.inf), self.fixed)
 
 
 def constraints_of(
@@ -204,11 +249,7 @@ def measurement_of(
         constraints: value and standard error of what is known beforehand, by parameter; else the table says.
         fixed: values of the model's parameters that are not fitted.
     """
-    known = constraints_of(table, constraints)
-    pairs = [
-        known.get(name, (parameter.reference, np.inf))
-        for name, parameter in zip(problem.names, problem.parameters, strict=True)
-    ]
+    value, error = _constraint_columns(problem, constraints_of(table, constraints))
     held: dict[str, Any] = {name: np.asarray(float(value)) for name, value in (fixed or {}).items()}
     cantilever = Cantilever(table.free_frequency_khz, table.quality_factor, table.mass_ng)
     rows = rows_of(table)
@@ -219,8 +260,8 @@ def measurement_of(
     return Measurement(
         rows=rows,
         cantilever=cantilever,
-        constraint_value=np.array([float(value) for value, _ in pairs]),
-        constraint_error=np.array([float(error) for _, error in pairs]),
+        constraint_value=value,
+        constraint_error=error,
         fixed=held,
         pulls=_pulls(rows, cantilever) if problem.pulled else None,
     )
@@ -241,6 +282,51 @@ def _pulls(rows: Rows, cantilever: Cantilever) -> Float[np.ndarray, " 2"]:
     strongest = _PULL_ROOM * np.max(pull + np.where(hits, push, 0.0), initial=1.0)
     weakest = np.min(np.where(hits, pull - BRIDGE_NM + 0.5 * push, np.inf), initial=strongest) / _PULL_ROOM
     return float(cantilever.angular_frequency) ** 2 * np.array([max(weakest, _WIDEST * strongest), strongest])
+
+
+def _constraint_columns(
+    problem: Problem, known: Mapping[str, tuple[float, float]]
+) -> tuple[Float[np.ndarray, " p"], Float[np.ndarray, " p"]]:
+    """Return what is known of each parameter and its standard error, infinite where nothing is."""
+    pairs = [
+        known.get(name, (parameter.reference, np.inf))
+        for name, parameter in zip(problem.names, problem.parameters, strict=True)
+    ]
+    return np.array([float(value) for value, _ in pairs]), np.array([float(error) for _, error in pairs])
+
+
+def joint_measurement(
+    tables: SeveralTables,
+    parts: Sequence[Measurement],
+    problem: Problem,
+    joint: Joint,
+    known: Mapping[str, tuple[float, float]],
+) -> Measurement:
+    """Return several tables as one measurement.
+
+    Args:
+        tables: the tables.
+        parts: each as a measurement of its own.
+        problem: everything that is fitted.
+        joint: which of that is whose.
+        known: value and standard error of what is known beforehand, by the names of the problem.
+    """
+    kinds = max(part.rows.measured.shape[1] for part in parts)
+
+    def whole(name: str) -> np.ndarray:
+        columns = [np.asarray(getattr(p.rows, name))[: t.rows] for p, t in zip(parts, tables.tables, strict=True)]
+        if columns[0].ndim > 1:
+            filler = name != "measured"
+            columns = [np.pad(c, ((0, 0), (0, kinds - c.shape[1])), constant_values=filler) for c in columns]
+        return np.concatenate(columns)
+
+    rows = Rows(**{name: whole(name) for name in Rows._fields if name != "table"}, table=tables.number)
+    spare = -tables.rows % ROWS_PER_PROGRAM
+    rows = jax.tree.map(lambda column: np.concatenate([column, np.repeat(column[-1:], spare, axis=0)]), rows)
+    for unread in (rows.measured, rows.no_orbit):
+        unread[tables.rows :] = False
+    value, error = _constraint_columns(problem, known)
+    return parts[0]._replace(rows=rows, constraint_value=value, constraint_error=error, joint=joint)
 
 
 def rows_of(table: AmplitudeTable) -> Rows:
@@ -273,8 +359,17 @@ def rows_of(table: AmplitudeTable) -> Rows:
     )
 
 
-def readings_of(table: AmplitudeTable) -> tuple[Float[np.ndarray, "rows k"], Float[np.ndarray, "rows k"]]:
+def readings_of(
+    table: AmplitudeTable | SeveralTables,
+) -> tuple[Float[np.ndarray, "rows k"], Float[np.ndarray, "rows k"]]:
     """Return peak and lock-in amplitude and the phase, if the table has one; and their errors. NaN: not measured."""
+    if isinstance(table, SeveralTables):
+        parts = list(zip(*map(readings_of, table.tables), strict=True))
+        kinds = max(part.shape[1] for part in parts[0])
+        values, errors = (
+            [np.pad(p, ((0, 0), (0, kinds - p.shape[1])), constant_values=np.nan) for p in part] for part in parts
+        )
+        return np.concatenate(values), np.concatenate(errors)
     peak, lockin = table.peak_amplitude_nm, table.lockin_amplitude_nm
     columns = [(peak, table.peak_amplitude_error_nm), (lockin, table.lockin_amplitude_error_nm)]
     phase, error = table.phase_and_error_deg

@@ -222,6 +222,28 @@ CONTACT = tuple(
 PARAMETERS = {parameter.name: parameter for parameter in (*LAW, *DELAY, *SHAPES, *NUISANCES, *CONTACT)}
 """All of them by name."""
 
+_OF = " of "
+
+
+def name_of_table(name: str, table: str) -> str:
+    """Return what a nuisance that a table has to itself is called where several tables are fitted together."""
+    return f"{name}{_OF}{table}"
+
+
+def parameter_called(name: str) -> Parameter:
+    """Return the parameter of a name, that of a nuisance of one table too."""
+    return PARAMETERS[name.partition(_OF)[0]]
+
+
+def is_of_one_table(name: str) -> bool:
+    """Say whether a name is that of a nuisance that one of several tables has to itself."""
+    return _OF in name
+
+
+def is_nuisance(name: str) -> bool:
+    """Say whether a name is that of a nuisance, of one table or of all."""
+    return name.partition(_OF)[0] in NUISANCE_NAMES
+
 
 @dataclass(frozen=True, kw_only=True)
 class LawFormula:

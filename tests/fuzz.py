@@ -9,6 +9,7 @@ import signal
 import sys
 import tempfile
 import time
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -27,16 +28,22 @@ from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.record import ContactKind, MotionOutcome, State
 from afm_jax.motion.simulate import simulate
 from afm_jax.outcomes import Outcome
-from afm_jax.scenefile.scenefile import load_scene_and_start
+from afm_jax.scenefile.scenefile import load_scene_and_start, read_toml
+from afm_jax.sweeps.axes import axes_of
 from fitting.calibration.sweep import read_sweep
+from fitting.experiments.belief import read_belief
+from fitting.instruments.curve import read_curves
+from fitting.inversion.regression import read_fitted_law
 from fitting.tables.table import read_table
+from fitting.tapping_curves.tapping import tapping
 from fitting.traces.lockin import lockin
 from fitting.traces.trace import read_trace
 from tests.flight_families import FAMILIES
+from tests.malformed import corpus
 from tests.test_first_impact import compare_with_brute_force
 
 LONGEST_S = 60
-"""For a batch; a file, or the slowest of its tips, takes a tenth of a second."""
+"""Of the processor, for a batch; a file, or the slowest of its tips, takes a tenth of a second."""
 LANES = 256
 ROOT = Path(__file__).parent.parent
 Random = np.random.Generator
@@ -199,40 +206,37 @@ def spoiled(text: str, random: Random) -> bytes:
     return data
 
 
-def _texts(random: Random) -> dict[str, tuple[str, Callable[[Path], Any]]]:
-    time_us = np.arange(0.0, 120.0, 0.2)
-    height = 70.0 * np.abs(np.cos(0.5655 * time_us)) + random.normal(size=time_us.size)
-    trace = "# drive_frequency_khz = 180\n# free_frequency_khz = 90\ntime_us,deflection_nm\n"
-    trace += "\n".join(f"{t:.1f},{z:.4f}" for t, z in zip(time_us, height, strict=True))
-    sweep = "frequency_khz,amplitude_nm,phase_deg\n" + "".join(
-        f"{90.0 + x:.4f},{1.0 / np.hypot(1.0, x):.6f},{-np.degrees(np.arctan(x)):.4f}\n" for x in np.linspace(-1, 1, 40)
-    )
-    with (ROOT / "fitting/examples/amplitudes_law.csv").open(encoding="utf-8") as file:
-        table = "".join(file.readline() for _ in range(20))
-    scene = "[cantilever]\nfrequency_khz = 90\n[platform]\namplitude_nm = 4\nreduced_frequency = 1.01\n"
-    scene += "[interaction]\nmodel = 'contact'\nrelative_humidity = 0.4\n"
-    scene += "[start]\nphase_deg = 270\nheight_above_platform_nm = 5\nvelocity_nm_per_us = 80\n"
-    return {
-        "table.csv": (table, read_table),
-        "trace.csv": (trace, lambda path: lockin(read_trace(path))),
-        "sweep.csv": (sweep, read_sweep),
-        "scene.toml": (scene, load_scene_and_start),
-    }
+READERS: dict[str, Callable[[Path], Any]] = {
+    "table": read_table,
+    "tap": lambda path: tapping(read_table(path), law=False),
+    "scene": load_scene_and_start,
+    "contact": load_scene_and_start,
+    "sweep": lambda path: axes_of(read_toml(str(path)).get("axes", ())),
+    "trace": lambda path: lockin(read_trace(path)),
+    "spectrum": read_sweep,
+    "psd": read_sweep,
+    "curve": read_curves,
+    "nanonis": read_curves,
+    "law": lambda path: (read_belief(path), read_fitted_law(path)),
+}
+"""What reads a sound file of the corpus of malformed ones."""
 
 
 def fuzz_files(count: int, seed: int) -> None:
     """Look for spoiled files that end in anything but a result or one clear line."""
-    random = np.random.default_rng(seed)
+    random, bases = np.random.default_rng(seed), corpus()[0]
+    assert bases.keys() == READERS.keys()
     with tempfile.TemporaryDirectory() as folder:
         for number in range(count):
-            texts = _texts(random)
-            name = tuple(texts)[number % len(texts)]
-            text, read = texts[name]
-            path = Path(folder) / name
-            path.write_bytes(spoiled(text, random))
+            base = tuple(bases.values())[number % len(bases)]
+            path, read = Path(folder) / base["file"], READERS[base["base"]]
+            path.write_bytes(spoiled(base["text"], random))
             where = f"files, seed {seed}, number {number}"
             try:
-                read(path)
+                with warnings.catch_warnings():
+                    # what NumPy says on standard error is not for users
+                    warnings.simplefilter("error")
+                    read(path)
             except ValueError as error:
                 if _is_inner(error) or not str(error).isprintable():
                     raise AssertionError(f"{where}: {error!r}\n{path.read_bytes()!r}") from error
@@ -258,11 +262,11 @@ def main() -> None:
         # in slices, so that one that hangs is told from many
         for first in range(0, asked[name], _SLICE[name]):
             # not while the two programs of a kind of work are compiled
-            signal.alarm(LONGEST_S if first > _SLICE[name] else 0)
+            signal.setitimer(signal.ITIMER_PROF, LONGEST_S if first > _SLICE[name] else 0.0)
             start = time.monotonic()
             work(min(_SLICE[name], asked[name] - first), asked["seed"] + first)
             slowest = max(slowest, time.monotonic() - start)
-        signal.alarm(0)
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
         sys.stdout.write(
             f"{asked[name]} {name}: nothing found in {time.monotonic() - begin:.0f} s, a batch in {slowest:.0f}\n"
         )

@@ -1,6 +1,6 @@
 """Sweeps killed at random times and resumed until they are done: nothing is lost, and the bytes are those of one run.
 
-python -m tests.kills --times 20
+python -m tests.kills --times 50
 """
 
 import argparse
@@ -79,7 +79,7 @@ def survive(line: list[str], folder: Path, *, times: int, chunks: int, seed: int
 def main() -> None:
     """Run what the command line asks for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--times", type=int, default=20)
+    parser.add_argument("--times", type=int, default=50)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--seed", type=int, default=int.from_bytes(os.urandom(2)))
     options = parser.parse_args()

@@ -233,7 +233,7 @@ MUTATIONS = {
     "push of the platform without its acceleration": Mutation(
         "return self.surface.acceleration(time_us) - self.cantilever",
         "return -self.cantilever",
-        f"{LAW_MOTION}test_a_tip_captured_without_adhesion_is_let_go_too",
+        "tests/hard_cases/test_rests.py::test_a_tip_captured_without_adhesion_is_let_go_too",
     ),
     "impacts that lose what they leave": Mutation(
         "(row.approach**2 - row.rebound**2)",

@@ -8,10 +8,11 @@ orbits are where cosine and sine of the phase, from two linear equations, lie on
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import beta
 
 from tests.brute_force import Floats
 from tests.reference_flight import Parameters, constants, outgoing, propagator
-from tests.reference_hertz import rational
+from tests.reference_hertz import DEEPEST, HERTZ_TIME, rational
 
 BRIDGE_NM = 4.7
 SPEEDS = 40_000
@@ -54,7 +55,8 @@ def closing_impacts(p: Parameters, order: int, approach: Floats) -> Impacts:
         air = 2.0 * (longer - 1.2 * kappa * depth) / 1.8
         gain = 2.0 * depth * j - 2.0 * air * k.decay * lasting
         rebound = np.sqrt(np.maximum(free**2 + gain * approach**2, 0.01 * free**2))
-        longer = longer - 1.0
+        # to first order in a spring a period is shorter by the energy's slope of its share of the action
+        longer = longer - 1.0 - 0.7 * beta(1.2, 0.5) / beta(0.4, 0.5) * (DEEPEST / HERTZ_TIME * k.free * lasting) ** 2
         held = _later(free, BRIDGE_NM, pull) - _later(approach, BRIDGE_NM, pull)
         delay = straight + longer * lasting - lead / (1.3 * BRIDGE_NM) * held
     return Impacts(approach, rebound, delay, *_phase(p, order, approach, rebound, delay))

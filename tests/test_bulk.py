@@ -70,7 +70,10 @@ def fit() -> Callable[..., Result]:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["a.csv", "b.csv"], "2 tables: add --each to fit each by itself"),
+        (["a.csv", "b.csv", "--bootstrap", "50"], "--bootstrap is about one table"),
+        (["a.csv", "b.csv", "--compare", "--hierarchical"], "--compare is about tables that have one law"),
+        (["a.csv", "--share", "all"], "--share is about several tables"),
+        (["a.csv", "b.csv", "--each", "--hierarchical"], "--hierarchical is about several tables"),
         (["a.csv", "--workers", "2"], "--workers is about several tables: add --each"),
         (["a.csv", "--each", "--compare"], "--compare is about one table: leave --each out"),
         (["a.csv", "--each"], "a.csv"),

@@ -4,6 +4,7 @@ Closed forms of the undamped oscillator: eq. 9's orbits and eq. 8's trace, writt
 the grazing of a resting and of a driven tip.
 """
 
+import csv
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -15,9 +16,10 @@ import pytest
 from click.testing import CliRunner, Result
 from scipy.optimize import brentq
 
-from afm_jax import Cantilever, CollisionDelay, ForceDrive, ImpactLaw, Platform, Scene, save_scene
+from afm_jax import Cantilever, CollisionDelay, ForceDrive, ImpactLaw, Platform, Scene, save_scene, single_impact_orbits
+from afm_jax.cli.fitted_law import with_fitted_law
 from afm_jax.cli.main import main
-from afm_jax.dynamics import continuation
+from afm_jax.dynamics import closed_loops
 from afm_jax.dynamics.bands import UncertainParameters, drawn_points, special_errors
 from afm_jax.dynamics.continuation import Continuation, continue_orbits
 from afm_jax.impact.closure import OrbitProblem, closing_residual
@@ -183,13 +185,13 @@ def test_a_resting_and_a_driven_tip_graze_where_they_must():
 @pytest.fixture
 def feeding(monkeypatch: pytest.MonkeyPatch):
     """Let every impact feed the motion by a hundredth more than it does: no law of the package does."""
-    true = continuation.trace_and_determinant_of
+    true = closed_loops.trace_and_determinant_of
 
     def more(*arguments):
         trace, determinant = true(*arguments)
         return trace, 1.02 * determinant
 
-    monkeypatch.setattr(continuation, "trace_and_determinant_of", more)
+    monkeypatch.setattr(closed_loops, "trace_and_determinant_of", more)
     jax.clear_caches()
     yield
     jax.clear_caches()
@@ -360,13 +362,56 @@ def test_the_law_of_a_fit_gives_intervals(tmp_path: Path):
 
 
 @pytest.mark.slow
+def test_charts_and_exponents_take_the_law_of_a_fit(tmp_path: Path):
+    """The share of draws with a stable orbit is that of a plain loop over the same draws."""
+    path, law = saved(tmp_path / "scene.toml", scene(4.0, 1.01, 0.5)), fit_file(tmp_path / "fit.json")
+    both, number = 0.2 * 4e-4 * 0.93, 20
+    covariance = [[4e-4**2, both], [both, 0.93**2]]
+    drawn = np.random.default_rng(0).multivariate_normal([0.95, 60.0], covariance, size=50 * number)[:number]
+
+    def steady(amplitude: float, r: float, epsilon: float) -> bool:
+        platform = Platform(amplitude, 180.0 * 1.01, -1.0)
+        found = single_impact_orbits(Scene(Cantilever(90.0), platform, ImpactLaw(r, epsilon)), 1)
+        return bool(np.any(np.asarray(found.stable & found.admissible)))
+
+    low, high = 0.3, 4.0
+    while high - low > 1e-3:
+        middle = 0.5 * (low + high)
+        low, high = (low, middle) if steady(middle, 0.95, 60.0) else (middle, high)
+    given = ("--x", f"platform.amplitude_nm={high - 0.02}:{high + 0.02}:5", "--y", "platform.offset_nm=-1:-0.99:2")
+    chart = ["chart", path, *given, "--orders", "1", "--law", law, "--draws", str(number), "--out", str(tmp_path)]
+    answer = CliRunner().invoke(main, [*chart, "--json"])
+    assert answer.exit_code == 0, answer.stderr
+    with (tmp_path / "chart.csv").open(encoding="utf-8") as stream:
+        rows = [row for row in csv.DictReader(stream) if float(row["platform.offset_nm"]) == -1.0]
+    shares = [np.mean([steady(float(row["platform.amplitude_nm"]), *one) for one in drawn]) for row in rows]
+    assert min(shares) < 0.5 < max(shares)
+    assert [float(row["stable_probability_1"]) for row in rows] == pytest.approx(shares)
+    told = CliRunner().invoke(main, ["lyapunov", path, "--law", law, "--draws", "8", "--impacts", "200", "--json"])
+    assert told.exit_code == 0, told.stderr
+    ends = json.loads(told.stdout)["exponent_per_impact_interval95"]
+    assert ends[0] < ends[1]
+
+
+@pytest.mark.slow
+def test_a_scene_takes_the_plain_law_of_a_fit(tmp_path: Path):
+    plain = {"values": {"r": 0.94, "epsilon": 70.0}, "covariance": [[1e-6, 1e-4], [1e-4, 4.0]]}
+    made, known = with_fitted_law(scene(), Path(fit_file(tmp_path / "fit.json", plain_law=plain)))
+    assert isinstance(made.interaction, ImpactLaw)
+    assert (float(made.interaction.r), float(made.interaction.epsilon)) == (0.94, 70.0)
+    assert known.paths == ("interaction.r", "interaction.epsilon")
+    assert known.values.tolist() == [0.94, 70.0]
+    assert known.covariance.tolist() == plain["covariance"]
+
+
+@pytest.mark.slow
 def test_a_fit_that_says_nothing_is_refused(tmp_path: Path):
     path = saved(tmp_path / "scene.toml", scene(4.0, 1.01, 0.5))
     arguments = (path, "--order", "1", "--parameter", "platform.amplitude_nm=0.5:6", "--law")
     unsure = {"r": {"value": 0.95, "standard_error": None}, "epsilon": {"value": 60.0, "standard_error": 1.0}}
     for changes, said in (
         ({"valid": False}, "the fit is not valid"),
-        ({"format": "other"}, "this is no saved fit"),
+        ({"format": "other"}, "is no fit"),
         ({"parameters": unsure, "correlations": {"matrix": [[None, None], [None, 1.0]]}}, "no standard error of r"),
     ):
         result = run(*arguments, fit_file(tmp_path / "fit.json", **changes))

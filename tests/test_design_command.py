@@ -167,9 +167,7 @@ def test_a_wrong_call_is_one_line(arguments, fault):
     assert found.stdout == ""
 
 
-@pytest.mark.parametrize(
-    ("text", "fault"), [("{", "is no JSON"), ("[]", "is no saved fit"), ("{}", "this is no saved fit")]
-)
+@pytest.mark.parametrize(("text", "fault"), [("{", "is no JSON"), ("[]", "is no fit"), ("{}", "is no fit")])
 def test_a_file_that_is_no_fit_is_named(tmp_path: Path, text, fault):
     path = tmp_path / "fit.json"
     path.write_text(text, encoding="utf-8")

@@ -12,7 +12,11 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
-from afm_jax.dynamics.impact_orbits import many_impact_orbits
+from afm_jax.dynamics.basins import basins_of_attraction
+from afm_jax.dynamics.bifurcations import bifurcation_diagram
+from afm_jax.dynamics.charts import stability_chart
+from afm_jax.dynamics.exponents import lyapunov_spectrum
+from afm_jax.dynamics.impact_orbits import many_impact_orbits, multipliers_of
 from afm_jax.impact.jacobian import map_jacobian
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.impact.map import iterate_map, next_impact
@@ -20,6 +24,8 @@ from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
 from afm_jax.motion.observe import observe
 from afm_jax.motion.record import State
 from afm_jax.motion.simulate import simulate
+from afm_jax.motion.trajectory import state_at
+from afm_jax.scenefile.parameter_paths import scene_family
 
 MASS, PER_KHZ = 16.81, 2e-3 * np.pi
 INSTANT = ImpactLaw(0.99, 0.1, 0.01)
@@ -183,3 +189,33 @@ def test_drives_of_several_frequencies_have_no_single_orbit():
     undamped = Scene(Cantilever(90.0), Platform(0.0, 90.0, -5.0), INSTANT, force=ForceDrive(1.0, 90.0))
     with pytest.raises(ValueError, match="`force` drives an undamped cantilever at its free frequency"):
         single_impact_orbits(undamped, 1)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["force", "base"])
+def test_charts_sweeps_exponents_and_basins_of_driven_tips_come_to_the_orbit(kind: str):
+    """What they come to is the orbit of `single_impact_orbits`, in the scene's own clock and in the lab."""
+    scene = driven(kind, ImpactLaw(0.8, 0.5), 1.1, 6.0, -5.0, 40.0)
+    orbits = single_impact_orbits(scene, 1)
+    slot = fastest(orbits)
+    place = float(orbits.phase_rad[slot]), float(orbits.velocity_after_nm_per_us[slot])
+    swept = bifurcation_diagram(scene, "platform.offset_nm", np.array([-5.0, -4.9]), impacts=600)
+    assert swept.verdicts.names()[0] == "(1,1)"
+    found = swept.phase_rad[0, -1], swept.velocity_after_nm_per_us[0, -1]
+    assert found == pytest.approx(place, rel=1e-8)
+    assert swept.height_nm[0, -1] == pytest.approx(-5.0, abs=1e-12)
+    period = 2.0 * np.pi / angular_frequency(scene)
+    seen = state_at(scene, simulate(scene, started(scene, orbits, slot), 3.0 * period), 2.0 * period)
+    assert seen is not None
+    assert swept.strobe_height_nm[0][np.isfinite(swept.strobe_height_nm[0])][-1] == pytest.approx(
+        float(seen.position_nm), abs=1e-6
+    )
+    lyapunov = lyapunov_spectrum(scene, impacts=400, transient=400)
+    multipliers = multipliers_of(*(np.asarray(part)[[slot]] for part in (orbits.trace, orbits.determinant)))[0]
+    assert lyapunov.exponents_per_impact == pytest.approx(np.log(np.abs(multipliers)), abs=1e-8)
+    basins = basins_of_attraction(scene, columns=12, rows=8)
+    (orbit,) = (one for one in basins.attractors if one.name == "(1,1)")
+    assert (orbit.phase_rad[0], orbit.velocity_nm_per_us[0]) == pytest.approx(place, rel=1e-6)
+    plane = scene_family(scene, "platform.offset_nm", "interaction.r")
+    chart = stability_chart(plane, x_values=np.array([-5.0, -4.5]), y_values=np.array([0.8]), last_order=1)
+    assert chart.verdicts.peak_amplitude_nm[0, 0] == pytest.approx(float(orbits.peak_amplitude_nm[slot]), rel=1e-12)

@@ -1,6 +1,7 @@
 """`afm-jax fit`: what it prints, writes and returns."""
 
 import csv
+import importlib.util
 import math
 from pathlib import Path
 
@@ -185,6 +186,16 @@ def test_wrong_calls_end_with_one_line_and_exit_code_2(arguments, said):
     assert said in result.stderr
 
 
+def test_a_package_that_a_file_for_arviz_needs_is_asked_for_before_the_fit(tmp_path, monkeypatch):
+    have = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "h5netcdf" else have(name))
+    result = run("--example", "--arviz", tmp_path / "posterior.nc")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr.splitlines() == [
+        "afm-jax: the Python package `h5netcdf` is missing; install it with: pip install h5netcdf"
+    ]
+
+
 def test_a_contact_without_an_effect_is_not_fitted_by_its_parameters():
     options = {"scale_errors": False, "robust": False, "constrain": (), "free": None}
     settings = _settings("contact", options | {"left_out": ("viscous",), "fix": (("modulus_gpa", 90.0),)})
@@ -193,8 +204,9 @@ def test_a_contact_without_an_effect_is_not_fitted_by_its_parameters():
 
 
 def test_what_an_invalid_fit_leaves_out_is_said(tmp_path):
-    result = run(shortened(tmp_path / "one.csv", 1, without_errors=False), "--bootstrap", "50", "--posterior")
+    result = run(shortened(tmp_path / "one.csv", 1, without_errors=False), "--bootstrap", "50", "--trust")
     assert result.exit_code == 3
     assert "(1 row)" in result.stdout
     assert "no bootstrap: the fit is not valid" in result.stderr
     assert "no posterior: the fit is not valid" in result.stderr
+    assert "no trust: the fit is not valid" in result.stderr

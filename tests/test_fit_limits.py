@@ -2,6 +2,7 @@
 
 import dataclasses
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from fitting import fit
 from fitting.fits.fit import problem_of
 from fitting.fits.objective import Objective
 from fitting.forward import branch_of, impact_of, orbit_problem
-from fitting.models import Rows, measurement_of
+from fitting.models import measurement_of
 from fitting.tables.table import AmplitudeTable
 from tests.fit_tables import (
     amplitudes_and_errors,
@@ -215,7 +216,7 @@ def test_of_coexisting_orbits_the_measured_one_is_taken(table, monkeypatch, meas
     error = np.where(np.isnan(measured), np.nan, 1.0)[None]
     problem, values = problem_of(table, "law"), jnp.array([0.95, 60.0, 40.0])
     measurement = measurement_of(with_amplitudes(rows(table, slice(0, 1)), np.array([measured]), error), problem)
-    row = Rows(*(column[0] for column in measurement.rows))
+    row = jax.tree.map(lambda column: column[0], measurement.rows)
     orbit = orbit_problem(values, impact_of(values, measurement, problem), row, measurement, problem)
     branch = branch_of(orbit, row, values, problem)
     assert int(branch.place.coordinate) == slot

@@ -2,8 +2,6 @@
 
 import itertools
 
-import jax
-import jax.numpy as jnp
 import mpmath
 import numpy as np
 import pytest
@@ -115,21 +113,6 @@ def test_the_quartic_is_inverted_in_closed_form(s):
         back = float(jkr_formulas.root_of_depth(float(exact)))
     # near the fold the root is a square root of the depth: half of the digits
     assert back == pytest.approx(s, rel=4e-15 + 3e-16 / (s - jkr_formulas.FOLD))
-
-
-def test_jkr_at_its_fold_and_at_its_largest_tension():
-    solid = Jkr()
-    assert float(solid.force(solid.pull_off_depth_nm)) == pytest.approx(
-        -5.0 / 6.0 * float(solid.load_scale_nn), rel=1e-7
-    )
-    # load control: -3/2 pi w R where s^3 = sqrt(6)/2
-    deepest = float(jkr_formulas.load((6.0**0.5 / 2.0) ** (1.0 / 3.0)))
-    assert deepest == pytest.approx(-1.5, rel=1e-15)
-    assert jnp.isfinite(jax.grad(solid.force)(solid.pull_off_depth_nm + 1e-9))
-    for depth in (-0.1, 0.0, 0.5, 4.0):
-        work = quadrature(solid.force, [-0.15, depth])
-        rise = float(solid.potential(depth) - solid.potential(-0.15))
-        assert rise == pytest.approx(work, rel=1e-8, abs=1e-10)
 
 
 def test_adhesionless_limit_of_jkr_is_hertz():

@@ -10,7 +10,9 @@ from scipy.optimize import brentq
 
 from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, save_scene, single_impact_orbits
 from afm_jax.cli.main import main
-from afm_jax.dynamics.impact_orbits import many_impact_orbits, multipliers_of, sticking_orbit
+from afm_jax.dynamics.impact_orbits import many_impact_orbits, multipliers_of
+from afm_jax.dynamics.sticking_orbits import StickingOrbit, follow_sticking, sticking_orbit
+from afm_jax.scenefile.parameter_paths import ParameterRange
 
 FREE = 2.0 * np.pi * 0.09
 """Omega in rad/us."""
@@ -129,6 +131,26 @@ def test_a_tip_that_comes_to_rest_repeats_from_its_release():
     assert found.order == int(np.ceil(turns))
     # the top of the flight after the release
     assert found.peak_amplitude_nm == pytest.approx(np.hypot(height, 2.0 * omega * np.sin(phase) / FREE), rel=1e-6)
+
+
+@pytest.mark.slow
+def test_an_orbit_with_a_rest_is_followed_to_where_it_ends():
+    """Its release lies where the closed form says; on either side of an end the single scene says the same."""
+    given = ParameterRange("platform.offset_nm", 0.1, 1.2)
+    own = sticking_orbit(scene(1.6, 0.3, 0.5))
+    assert isinstance(own, StickingOrbit)
+    found = follow_sticking(scene(1.6, 0.3, 0.5), own.order, given, values=9)
+    omega = 2.0 * 1.6 * FREE
+    branch = max(found.branches, key=lambda one: len(one.parameter))
+    assert len(branch.parameter) > 4
+    sigma = branch.parameter
+    phase = 2.0 * np.pi - np.arccos(FREE**2 * sigma / (2.0 * (omega**2 - FREE**2)))
+    np.testing.assert_allclose(branch.reading.phase_rad[:, 0], phase, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(branch.reading.velocity_after_nm_per_us[:, 0], -2.0 * omega * np.sin(phase), rtol=1e-5)
+    assert found.special
+    for point in found.special:
+        ends = [sticking_orbit(scene(1.6, 0.3, point.parameter + shift)) for shift in (-1e-7, 1e-7)]
+        assert sum(isinstance(one, StickingOrbit) and one.order == own.order for one in ends) == 1
 
 
 def test_multipliers_are_those_of_numpy():

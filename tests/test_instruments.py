@@ -406,3 +406,15 @@ def test_a_wave_that_is_no_ramp_is_named(tmp_path: Path):
     data = igor_wave({"Amp": np.ones(8)}, "")
     with pytest.raises(TableError, match="no height among the channels Amp"):
         read_curve(saved(tmp_path, data, "one.ibw"))
+
+
+def test_rows_exactly_on_a_line_have_a_slope(tmp_path: Path):
+    # found by tests/fuzz.py: the line's error is 0, and its weight was none
+    path = tmp_path / "curve.csv"
+    offsets = [-50, -49, -48, -47, 46, *range(-45, -30)]
+    rows = "".join(f"{offset},{min(40, 50 - row)},{95 + row}\n" for row, offset in enumerate(offsets))
+    path.write_text(f"offset_nm,lockin_amplitude_nm,phase_lag_deg\n{rows}", encoding="utf-8")
+    (curve,) = read_curves(path)
+    assert curve.slope is not None
+    assert curve.slope[0] == pytest.approx(-1.0, rel=1e-12)
+    assert 0.0 < curve.slope[1] < 1e-8

@@ -17,6 +17,7 @@ from afm_jax.impact.lasting_impact import (
     AIR,
     BRIDGE_NM,
     PULLS,
+    STIFFER,
     USUAL_LEAD,
     LawImpact,
     Middle,
@@ -28,7 +29,8 @@ from afm_jax.impact.lasting_impact import (
 from afm_jax.impact.law import CollisionDelay, ImpactLaw, Speeds
 from tests.reference_hertz import DEEPEST, HERTZ_TIME, rational, under_pull
 
-UNDAMPED = afm.Cantilever(90.0)
+UNDAMPED = afm.Cantilever(1e-3)
+"""Next to no spring."""
 
 
 def integrated(pull: float, jerk: float) -> tuple[float, float]:
@@ -106,6 +108,23 @@ def test_the_series_of_a_pull_are_those_of_their_command():
     longer, deep, over = (np.polynomial.polynomial.polyval(kappa, row) for row in rational(6, *PULLS))
     found = hertz_under_pull(jnp.asarray(kappa))
     np.testing.assert_allclose(found, (1.0 + kappa * longer / over, deep / over), rtol=1e-8)
+
+
+def test_a_spring_shortens_a_contact():
+    cantilever = afm.Cantilever(8.0)
+    stiffness = float(cantilever.angular_frequency) ** 2
+
+    def motion(_, state):
+        return [state[1], np.maximum(-state[0], 0.0) ** 1.5 - stiffness * state[0]]
+
+    free = Speeds(jnp.array(1.0), jnp.array(1.0), jnp.array(HERTZ_TIME))
+    still = Middle(jnp.array(0.0), jnp.array(0.0))
+    found = corrected(free, still, cantilever, impact_of(HERTZ_TIME, 0.0))
+    # first order in the square of 0.16, the frequency times the duration
+    assert HERTZ_TIME - float(found.delay) == pytest.approx(HERTZ_TIME - left(motion, 10.0)[1], rel=0.01)
+    assert float(found.rebound) == 1.0
+    deepest = DEEPEST / HERTZ_TIME
+    assert pytest.approx(0.7 * beta(1.2, 0.5) / beta(0.4, 0.5) * deepest**2, rel=1e-10) == STIFFER
 
 
 def test_air_takes_what_an_integrated_damped_contact_loses():

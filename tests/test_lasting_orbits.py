@@ -21,6 +21,7 @@ DRIVES = [(1, 0.97, 4.0, -1.0), (1, 1.01, 4.0, 1.0), (2, 2.0, 6.0, 0.0), (3, 3.0
 find = jax.jit(lambda problem: find_roots(problem, COARSE))
 steady = jax.jit(steady_orbits)
 follow = jax.jit(follow_root)
+WANTED = jnp.asarray(1.0) > 0.0
 
 
 def problem_of(p: Parameters, order: int, *, delay: CollisionDelay | None = None) -> OrbitProblem:
@@ -131,7 +132,7 @@ def test_following_leads_to_the_root_that_a_search_finds(drive):
     begin = steady(problem_of(p, order))
     (slot,) = np.flatnonzero(begin.steady)
     moved = problem_of(dataclasses.replace(p, epsilon=118.0, quality_factor=39.0), order)
-    followed, found = follow(begin.place.coordinate[slot], moved)
+    followed, found = follow(begin.place.coordinate[slot], moved, WANTED)
     assert bool(found)
     roots = find(moved)
     coordinates = np.asarray(roots.place.coordinate)[np.asarray(roots.found)]
@@ -146,5 +147,5 @@ def test_following_says_where_there_is_nothing():
     begin = steady(problem_of(p, order))
     (slot,) = np.flatnonzero(begin.steady)
     # a tenth of the drive: nothing leaves the sample
-    _, found = follow(begin.place.coordinate[slot], problem_of(dataclasses.replace(p, amplitude_nm=0.1), order))
+    _, found = follow(begin.place.coordinate[slot], problem_of(dataclasses.replace(p, amplitude_nm=0.1), order), WANTED)
     assert not bool(found)

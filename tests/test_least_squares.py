@@ -3,8 +3,17 @@
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
+from scipy.special import chdtrc
 
-from fitting.fits.least_squares import Box, Searches, covariance_of, descended, distance, whole_covariance_of
+from fitting.fits.least_squares import (
+    Box,
+    Searches,
+    chi2_tail,
+    covariance_of,
+    descended,
+    distance,
+    whole_covariance_of,
+)
 
 TIME = np.linspace(0.0, 3.0, 20)
 TRUTHS = np.array([[2.0, 1.3, 0.5], [1.0, 0.4, -0.2], [3.0, 2.0, 0.9], [0.5, 0.7, 1.5]])
@@ -87,3 +96,11 @@ def test_covariances_are_inverses_where_there_are_some():
     assert np.all(whole[1] == np.inf)
     np.testing.assert_array_equal(whole[0], found[0])
     np.testing.assert_array_equal(covariance_of(fisher[0]), found[0])
+
+
+@pytest.mark.parametrize("freedom", [1, 2, 3, 10, 195, 5000])
+def test_the_tail_of_chi2_is_scipys(freedom):
+    for chi2 in (0.0, 1e-3, 0.5 * freedom, float(freedom), 1.3 * freedom, 5.0 * freedom, 1e7, np.inf):
+        # SciPy's own error where the tail is tiny
+        assert chi2_tail(chi2, freedom) == pytest.approx(float(chdtrc(freedom, chi2)), rel=1e-10, abs=1e-300)
+    assert np.isnan(chi2_tail(float("nan"), freedom))

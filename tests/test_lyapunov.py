@@ -2,14 +2,17 @@
 
 import json
 
+import jax
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 import afm_jax as afm
 from afm_jax.cli.main import main
+from afm_jax.dynamics.contact_sequence import follow_contacts
 from afm_jax.dynamics.exponents import exponent_verdicts, lyapunov_spectrum
 from afm_jax.dynamics.iteration import Record, batch_and_tips, recorded
+from afm_jax.motion.record import State
 from afm_jax.motion.start import default_start, start_of
 from afm_jax.outcomes import Outcome
 from afm_jax.scenefile.parameter_paths import scene_batch
@@ -103,6 +106,28 @@ def test_the_contact_is_chaotic_at_high_frequency():
     larger, error = found.exponents_per_impact[0], found.exponents_per_impact_error[0]
     assert larger > 3.0 * error
     assert found.exponents_per_impact.sum() == pytest.approx(found.mean_log_determinant, abs=1e-10)
+    # pairs of close tips, simulated: how far they part from the third contact to the tenth
+    longest, lanes, few = 3, 10, 24
+    scenes, tips = batch_and_tips(scene, start)
+    _, record = follow_contacts(scenes, tips, skip=40, record=few * lanes, accuracy=1e-6)
+    omega = 2e-3 * np.pi * 180.0 * 5.277
+    time, velocity = record.departure_us[0, ::lanes], record.velocity_after_nm_per_us[0, ::lanes]
+
+    def contacts(time, velocity):
+        height = scene.platform.position(time) + scene.interaction.bridge_breaks_nm
+        return afm.simulate(
+            scene, State(time, height, velocity), 40.0 * lanes, max_contacts=lanes, accuracy=1e-9
+        ).contacts
+
+    flown = jax.jit(jax.vmap(contacts))
+    one, other = flown(time, velocity), flown(time, velocity + 1e-6)
+    apart = np.hypot(
+        omega * np.asarray(other.departure_time_us - one.departure_time_us),
+        np.asarray(other.departure_velocity_nm_per_us - one.departure_velocity_nm_per_us) / (4.0 * omega),
+    )
+    growth = np.log(apart[:, -1] / apart[:, longest - 1]) / (lanes - longest)
+    assert np.isfinite(growth).all()
+    assert np.mean(growth) == pytest.approx(larger, abs=4.0 * np.hypot(error, np.std(growth) / np.sqrt(few)))
 
 
 @pytest.mark.slow

@@ -58,6 +58,15 @@ def test_a_repetition_is_found_with_its_smallest_period(m: int, n: int):
     assert (found.contacts, found.periods) == (m, n)
 
 
+@pytest.mark.parametrize(("m", "n"), [(1, 1), (2, 3)])
+@pytest.mark.parametrize("turns", [0.25, 0.331, 0.5])
+def test_a_slow_approach_that_turns_is_no_longer_repetition(m: int, n: int, turns: float):
+    # a quarter of a turn a repetition: every fourth comes close long before neighbours do
+    every = [spiral(m, n, 0.98, turns, count) for count in range(60 * m, 1000 * m, 40 * m)]
+    found = next(filter(None, (find_repetition(*one, 2.0, tolerance=1e-4) for one in every)))
+    assert (found.contacts, found.periods) == (m, n)
+
+
 def test_a_slow_approach_has_not_arrived():
     # each repetition moves by 1e-5 of the scale, but 1/(1 - rate) = 1000 of them are to come
     times, velocities = spiral(1, 1, 0.999, 0.0, 3000)

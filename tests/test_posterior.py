@@ -222,6 +222,8 @@ def test_nuts_agrees_with_the_grid(law, law_grid):
     found = posterior(law, method="nuts", samples=500)
     assert found.converged, found.reasons
     assert found.chains is not None
+    assert found.chains.statistics["diverging"].sum() == found.chains.divergences
+    assert found.chains.statistics["energy"].shape == (4, 500)
     for k, name in enumerate(law.parameters):
         # four standard errors of a mean and of a width of this many independent samples
         count = found.chains.effective_samples[k]

@@ -60,6 +60,15 @@ def test_a_full_device_is_named():
         write_whole("/dev/full", "x")
 
 
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
+def test_a_full_standard_output_is_named(tmp_path):
+    (tmp_path / "curve.csv").write_text("offset_nm,lockin_amplitude_nm\n1,2\n2,3\n", encoding="utf-8")
+    call = f"exec {sys.executable} -m afm_jax read {tmp_path}/curve.csv >/dev/full"
+    full = subprocess.run(call, shell=True, cwd=ROOT, capture_output=True, text=True, check=False)  # noqa: S602
+    assert full.returncode == 2
+    assert full.stderr == "afm-jax: standard output: cannot be written (No space left on device)\n"
+
+
 def test_nothing_writes_files_another_way():
     other = re.compile(r"\.write_text\(|\.write_bytes\(|\.savefig\((?!buffer)|open\([^)]*[\"']w")
     found = {str(path) for path in LIBRARY if other.search((ROOT / path).read_text(encoding="utf-8"))}

@@ -38,6 +38,7 @@ GOOD = [
     ("law", Start(270.0, 5.0, -80.0)),
     ("law", Start(270.0, 0.0, UP + 1e-6)),
     ("law", Start(90.0, 0.0, DOWN + 1e-6)),
+    ("law", Start(0.0, 0.0, 0.5)),
     ("law", Start(90.0 + 720.0, 0.0, DOWN + 1e-6)),
     ("contact", Start(270.0, 5.0, 40.0)),
     ("contact", Start(-90.0, 0.1237, -40.0)),
@@ -59,13 +60,21 @@ def test_loop_is_exact(path: Path, interaction: str, start: Start):
 INSIDE = "must be positive, but is {}: the tip would start inside the sample"
 BAD = [
     ("law", Start(270.0, -0.5, 80.0), "`height_above_platform_nm` must not be negative, but is -0.5"),
-    ("law", Start(270.0, 0.0, UP - 1e-3), f"`velocity_nm_per_us` must be above the platform's {UP:.6g} where the tip"),
+    (
+        "law",
+        Start(270.0, 0.0, UP - 1e-3),
+        f"`velocity_nm_per_us` must not be below the platform's {UP:.6g} where the tip",
+    ),
     (
         "law",
         Start(90.0, 0.0, DOWN - 1e-3),
-        f"`velocity_nm_per_us` must be above the platform's {DOWN:.6g} where the tip",
+        f"`velocity_nm_per_us` must not be below the platform's {DOWN:.6g} where the tip",
     ),
-    ("law", Start(0.0, 0.0, 0.5), "`velocity_nm_per_us` must be above the platform's 0.5 where the tip starts on it"),
+    (
+        "law",
+        Start(0.0, 0.0, 0.25),
+        "`velocity_nm_per_us` must not be below the platform's 0.5 where the tip starts on it",
+    ),
     ("contact", Start(270.0, 0.0, 80.0), f"`height_above_platform_nm` {INSIDE.format(0)}"),
     ("contact", Start(270.0, -5.0, 80.0), f"`height_above_platform_nm` {INSIDE.format(-5)}"),
     # where the paper's junction forms: 0.12360 nm to five digits
@@ -93,7 +102,7 @@ def test_a_start_that_cannot_be_is_named(path: Path, interaction: str, start: St
 
 def test_a_start_that_cannot_be_is_not_saved(path: Path):
     platform = Platform(4.0, 180.0)
-    for interaction, said in ((Contact.paper(), "inside the sample"), (ImpactLaw(0.9), "above the platform's 4.52389")):
+    for interaction, said in ((Contact.paper(), "inside the sample"), (ImpactLaw(0.9), "below the platform's 4.52389")):
         with pytest.raises(ValueError, match=said):
             save_scene(Scene(Cantilever(90.0), platform, interaction), path, start=Start(270.0, 0.0, 1.0))
         assert not path.exists()
@@ -107,7 +116,7 @@ def test_the_commands_read_a_file_once(path: Path, monkeypatch: pytest.MonkeyPat
         read.append(source)
         return tomllib.loads(Path(source).read_text(encoding="utf-8"))
 
-    monkeypatch.setattr("afm_jax.scenefile.scenefile._parsed", parsed)
+    monkeypatch.setattr("afm_jax.scenefile.scenefile.read_toml", parsed)
     scene, start = scene_and_start(str(path))
     assert read == [str(path)]
     assert float(scene.platform.amplitude_nm) == 4.0

@@ -11,7 +11,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import Phase
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.motion.record import ContactDetail, ContactKind, MotionOutcome, Simulation, State
+from afm_jax.motion.record import ContactDetail, MotionOutcome, Simulation, State
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.trajectory import nodes, trajectory
 from afm_jax.scenefile.presets import contact_scene
@@ -127,25 +127,6 @@ def test_other_scenes_agree_too():
         np.testing.assert_allclose(arrivals(simulation, 4), times, rtol=0.0, atol=2e-8)
 
 
-def test_a_held_tip_is_followed():
-    system = reference(1.01, 0.5)
-    start = system.start(phase_deg=0, height_nm=5, velocity_nm_per_us=-8.0)
-    course = follow(system, *start, until_us=start[0] + 9.0)
-    simulation = simulate(scene_of(system), state(start), 9.0)
-    assert course.phase == "junction"
-    assert int(simulation.outcome) == MotionOutcome.HELD
-    assert bool(simulation.held)
-    assert int(simulation.contacts.kind[int(simulation.count) - 1]) == ContactKind.HELD
-    assert np.isinf(simulation.contacts.departure_time_us[int(simulation.count) - 1])
-    assert float(simulation.final.time_us) == pytest.approx(start[0] + 9.0, abs=1e-12)
-    # six junctions form and break, hardly: the error of 1e-9 grows tenfold with each
-    np.testing.assert_allclose(float(simulation.final.position_nm), course.position_nm, rtol=0.0, atol=1e-4)
-    np.testing.assert_allclose(
-        float(simulation.final.velocity_nm_per_us), course.velocity_nm_per_us, rtol=0.0, atol=3e-3
-    )
-    assert int(detail_of(simulation).junctions[0]) == course.contacts[0].junctions == 6
-
-
 def test_the_end_may_lie_within_a_contact():
     system = reference(1.01, 4.0)
     start = system.start(phase_deg=270, height_nm=5, velocity_nm_per_us=150.0)
@@ -250,16 +231,6 @@ def test_derivatives_forward_and_reverse():
         slope = (independent(base + shift) - independent(base - shift)) / (2.0 * step)
         # rounding of the differences: 1e-12 us over the steps
         np.testing.assert_allclose(float(forward[place]), slope, rtol=1e-5, atol=1e-9)
-
-
-@pytest.mark.slow
-def test_a_tip_that_is_held_for_long_is_followed_to_the_end():
-    # held for five periods of a slow cantilever, 5,000 oscillations in the junction: room for 64 contacts is enough
-    scene = Scene(Cantilever(5.0, 40.0), Platform(4.0, 10.1), Contact.paper(modulus_gpa=70.0))
-    simulation = simulate(scene, state((0.0, 10.0, -8.0)), 1000.0)
-    assert MotionOutcome(int(simulation.outcome)) == MotionOutcome.HELD
-    assert float(simulation.final.time_us) == 1000.0
-    assert int(simulation.count) == 1
 
 
 def test_too_little_room_is_an_outcome():

@@ -1,6 +1,7 @@
 """Fits of driven tips: the law of a full contact from amplitude and phase, and what is said where there is none."""
 
 import dataclasses
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -14,8 +15,12 @@ from fitting.examples import make_tapping_curve
 from fitting.fits.fit import fit
 from fitting.models import reach_of, rows_of, tip_work
 from fitting.tables.table import AmplitudeTable, read_table
+from tests.tapping_accuracy import RATIO, fitted, forward, judge_fits, noisy
+from tests.tapping_truths import as_measured, exact_table, tapping_truth
 
 EXAMPLE = "fitting/examples/tapping_contact.csv"
+TABLES = Path(__file__).parent / "tapping_tables"
+"""Truths of two of the random contacts of `tests.tapping_accuracy`."""
 TIP = Cantilever(90.0, 200.0, 16.81)
 
 
@@ -60,3 +65,24 @@ def test_two_tapping_curves_give_the_law_of_their_contact():
     assert abs(result.parameters["tip_calibration"].value - 1.0) < 0.015
     without = dataclasses.replace(table, phase_lag_deg=None, phase_lag_error_deg=None)
     assert rows_of(without).amplitude_nm.shape[1] == 2
+
+
+@pytest.mark.slow
+def test_unseen_contacts_are_predicted_and_fitted_as_wanted():
+    truths = [tapping_truth(number) for number in (0, 1)]
+    exact = [exact_table(truth, RATIO, TABLES) for truth in truths]
+    for truth, table in zip(truths, exact, strict=True):
+        nm, degrees, amplitude, speed, pull = (np.asarray(part) for part in forward(truth, table))
+        used = (speed > 4.0) & (pull < 0.8) & np.isfinite(nm)
+        assert np.count_nonzero(used) >= 8
+        assert np.max(np.abs(nm[used])) < 0.07
+        assert np.max(np.abs(degrees[used])) < 0.1
+        assert np.median(np.abs(nm / amplitude)[used]) < 1e-3
+    tables = [as_measured(table) for table in exact]
+    for name, made in (
+        ("exact", tables),
+        ("noisy", [noisy(table, truth, 0) for truth, table in zip(truths, tables, strict=True)]),
+    ):
+        fits = [fitted(truth, table) for truth, table in zip(truths, made, strict=True)]
+        assert judge_fits(name, [one for one in fits if one is not None], exact=name == "exact") == 0
+        assert None not in fits

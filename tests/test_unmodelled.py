@@ -4,11 +4,12 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.optimize import approx_fprime, least_squares
 
 from fitting import fit
 from fitting.fits.loss import EV_PER_AJ, Loss, energy_lost, equivalent, interval_of
 from fitting.fits.objective import Objective
-from fitting.fits.unmodelled import LawBefore, StepRows, Unmodelled, law_after, step_of
+from fitting.fits.unmodelled import LawBefore, StepRows, Unmodelled, law_after, plain_law, root_of, step_of
 from fitting.forward import ImpactSlopes, impact_slopes
 from fitting.models import Problem, measurement_of
 from fitting.parameters import DELAY_SHAPE, LOSS_SHAPE
@@ -111,6 +112,45 @@ def test_the_band_is_that_of_the_whole_covariance(rows):
     np.testing.assert_allclose(np.linalg.norm(found.factor[0], axis=1), error, rtol=1e-5)
 
 
+def loss_and_delay(values: np.ndarray, u: np.ndarray) -> np.ndarray:
+    """Rebound speeds and delays of epsilon, viscous loss and a delay law."""
+    epsilon, loss, hertz, lead, offset = values[:5]
+    w = np.sqrt(u**2 - loss * u - epsilon)
+    return np.stack([w, hertz * u**-0.2 - lead * (1.0 / w - 1.0 / u) - offset / u])
+
+
+def test_the_plain_law_is_the_closest_one_and_as_unsure(rows):
+    u, values = np.geomspace(25.0, 180.0, 30), np.array(list(VALUES.values()))
+    slope = np.asarray(approx_fprime(values, lambda at: loss_and_delay(at, u).ravel(), 1e-6)).reshape(2, 30, 6)
+    before = LawBefore(loss_and_delay(values, u), slope, 10.9, np.zeros(6))
+    step = step_of(rows, LEFT_OUT, np.ones(6, dtype=bool))
+    after = law_after(step, LEFT_OUT, u, before)
+    found = plain_law(step, LEFT_OUT, u, before, values, np.ones(6, dtype=bool))
+    assert found is not None
+    width = np.linalg.norm(after.factor, axis=2)
+
+    def closest(law):
+        # in steps of the errors
+        miss = least_squares(
+            lambda at: ((before.law + slope[:, :, :5] @ (error * at) - law) / width).ravel(), np.zeros(5), xtol=1e-14
+        )
+        return values[:5] + error * miss.x
+
+    error = np.sqrt(np.diag(found.covariance))[:5]
+    best = closest(after.law)
+    np.testing.assert_allclose((np.array(list(found.values.values()))[:5] - best) / error, 0.0, atol=1e-5)
+    moved = np.stack([closest(after.law + one) - best for one in np.moveaxis(after.factor, 2, 0)])
+    np.testing.assert_allclose(
+        (moved.T @ moved) / np.outer(error, error), found.covariance[:5, :5] / np.outer(error, error), atol=1e-4
+    )
+    # and what a quantity of the instrument has to do with it
+    assert found.values["quality_factor"] == step.values[5]
+    assert found.covariance[5, 5] == pytest.approx(step.covariance[5, 5], rel=1e-8)
+    with_q = (after.factor[:, :, :8] @ np.linalg.pinv(root_of(step.covariance))) @ step.covariance[:, 5]
+    turned = closest(after.law + with_q) - best
+    np.testing.assert_allclose(found.covariance[:5, 5] / error, turned / error, atol=1e-4)
+
+
 def test_the_closest_law_of_the_paper_is_the_law_itself():
     u = np.linspace(20.0, 200.0, 50)
     w = np.sqrt((0.99 * u) ** 2 - 80.0)
@@ -179,6 +219,8 @@ def test_the_loss_is_said_in_energies_and_in_the_papers_quantities():
     one = equivalent(u, w, np.stack([0.99 * u**2 / w * 1e-3, -1.0 / w], axis=1), 2.0)
     assert one is not None
     energy = energy_lost(20.0, 10.0, 0.1, 2.0)
+    # 2 ng (20^2 - 19.9^2)/2 -+ 39: no sample at rest gives energy
+    assert energy_lost(20.0, 19.9, 0.5, 2.0).energy_aj.interval95 == pytest.approx((0.0, 3.99 + 39.004), abs=1e-3)
     loss = Loss((energy,), (one,), interval_of(9.04, float("nan")))
     said = dict(losses_in_words(made_fit("law", loss=loss)))
     # 2 ng (20^2 - 10^2)/2, and 2 ng times 10 times 1.96 times 0.1 to either side

@@ -21,7 +21,7 @@ from afm_jax.sweeps.sweep import local_cluster, peak_memory, run_plan
 
 Row = dict[str, Any]
 _TASK = "afm_jax.bench.sweeps:law_sweep"
-_CHUNK = 16384
+_SHORT = 10_000
 _SAMPLES = {"platform.reduced_frequency": [0.4, 4.4], "platform.amplitude_nm": [0.5, 8.0], "interaction.r": [0.5, 0.99]}
 
 
@@ -56,7 +56,7 @@ def law_sweep(*, points: int, processes: int, by_dask: bool = False) -> Row:
         # of all chunks but the first, which waits for compilation
         seconds = points / _run(_plan(points), processes)
     else:
-        short = _plan(2 * _CHUNK)
+        short = _plan(_SHORT)
         _run(short, None)
         begin, wall = _processor_seconds(), time.perf_counter()
         # with the programs of the short one
@@ -94,7 +94,7 @@ def _plan(points: int) -> SweepPlan:
             "record": {"what": "orbits"},
             "axes": [{"random": _SAMPLES, "count": points, "seed": 1}],
             "accuracy": None,
-            "chunk": _CHUNK,
+            "chunk": None,
         }
     )
 

@@ -4,6 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from afm_jax.cli.fitted_law import with_fitted_law, with_law_options
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import Ends, PictureFormat, SceneName, scene_and_start
@@ -38,33 +39,47 @@ class Grid(click.ParamType):
 @click.argument("scene", metavar="SCENE.toml|PRESET", type=SceneName())
 @click.option("--grid", type=Grid(), default="300x300", show_default=True, help="Drive phases x rebound speeds.")
 @click.option("--speeds", type=Ends(), metavar="LOW:HIGH", help="Range of the rebound speed, in nm/us.")
+@with_law_options
 @click.option("--picture", type=PictureFormat(), default="png", show_default=True, help="png, pdf or svg.")
 @with_session
 def command(
-    session: Session, *, scene: str, grid: tuple[int, int], speeds: tuple[float, float] | None, picture: str
+    session: Session,
+    *,
+    scene: str,
+    grid: tuple[int, int],
+    speeds: tuple[float, float] | None,
+    law: "Path | None",
+    draws: int,
+    picture: str,
 ) -> None:
     """Find what the starts of a scene come to, and which comes to what.
 
     A start is a drive phase and a speed at which the tip leaves the platform, at most four times the platform's top
     speed unless --speeds says otherwise. Attractors are named (m,N), m impacts in N drive periods, chaotic (the larger
     Lyapunov exponent is positive), irregular, stuck or free. Told are their shares, with the errors of as many random
-    starts, and the dimension of the boundaries between them. With --out basins.csv (a row a start), attractors.csv and
-    a picture. Exit code 3 if starts could not be followed.
+    starts, and the dimension of the boundaries between them.
+    With --law shares have a band from drawn laws. With --out basins.csv (a row a start), attractors.csv and a picture.
+    Exit code 3 if starts could not be followed.
     """
     session.start_computing()
     import numpy as np  # noqa: PLC0415
 
     from afm_jax.dynamics.basins import basins_of_attraction  # noqa: PLC0415
+    from afm_jax.dynamics.motion_bands import drawn_shares  # noqa: PLC0415
     from afm_jax.dynamics.verdicts import MotionKind  # noqa: PLC0415
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
     loaded, _ = scene_and_start(scene)
+    known = None
+    if law is not None:
+        loaded, known = with_fitted_law(loaded, law)
     columns, rows = grid
     try:
         with session.working("following starts (the first run compiles for some seconds)"):
             found = basins_of_attraction(
                 loaded, columns=columns, rows=rows, speeds_nm_per_us=speeds, report=session.progress("starts")
             )
+            band = None if known is None else drawn_shares(loaded, found, known, draws=draws)
     except ValueError as error:
         raise ValueError(f"{scene}: {error}") from error
     if session.out is not None:
@@ -86,6 +101,8 @@ def command(
         }
         for attractor, share, error in zip(found.attractors, found.share, found.share_error, strict=True)
     ]
+    for one, pair in zip(attractors, () if band is None else band.tolist(), strict=False):
+        one["share_interval95"] = pair
     payload = {
         "scene": scene_tables(loaded),
         "starts": found.attractor.size,
@@ -95,7 +112,8 @@ def command(
     }
     lines = [
         f"{one['name']}: {100.0 * one['share']:.4g} +- {100.0 * one['share_error']:.2g} % of the starts"
-        for one in attractors
+        + ("" if band is None else "; {:.4g} to {:.4g} % of 95 % of the draws".format(*(100.0 * band[index])))
+        for index, one in enumerate(attractors)
     ]
     if np.isfinite(found.boundary_dimension):
         lines.append(

@@ -5,11 +5,16 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from afm_jax.cli.fitted_law import with_fitted_law, with_law_options
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import PictureFormat, SceneName, ranges_of, scene_and_start
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
+    import numpy as np
+
     from afm_jax.dynamics.bifurcations import Sweep
 
 POINTS = ("phase_rad", "approach_speed_nm_per_us", "velocity_after_nm_per_us", "platform_height_nm")
@@ -23,26 +28,40 @@ _LISTED = 6
 @click.option("--both", is_flag=True, help="Sweep up and then down, so that hysteresis shows.")
 @click.option("--down", is_flag=True, help="Sweep down instead of up.")
 @click.option("--impacts", type=click.IntRange(200), default=2000, show_default=True, help="At every value.")
+@with_law_options
 @click.option("--picture", type=PictureFormat(), default="png", show_default=True, help="png, pdf or svg.")
 @with_session
-def command(
-    session: Session, *, scene: str, parameter: str, both: bool, down: bool, impacts: int, picture: str
+def command(  # noqa: PLR0913
+    session: Session,
+    *,
+    scene: str,
+    parameter: str,
+    both: bool,
+    down: bool,
+    impacts: int,
+    law: "Path | None",
+    draws: int,
+    picture: str,
 ) -> None:
     """Sweep a parameter and record what the tip comes to at each of its values.
 
     The tip is carried from value to value with its drive phase and rebound speed; one that the platform holds, or that
     flies away, begins anew at the next value. Of each value the verdict is told, (m,N): m impacts in N drive periods,
     irregular, stuck or free; and the last impacts are. With --out bifurcation.csv (a row a value), impacts.csv (a row
-    an impact; of an orbit each once), strobe.csv (heights whenever the platform is highest) and a picture. Exit code 3
-    if no motion went on anywhere.
+    an impact; of an orbit each once), strobe.csv (heights whenever the platform is highest) and a picture. With --law
+    the share of the fit's draws with the same verdict is told too. Exit code 3 if no motion went on anywhere.
     """
     session.start_computing()
     import numpy as np  # noqa: PLC0415
 
     from afm_jax.dynamics.bifurcations import bifurcation_diagram  # noqa: PLC0415
+    from afm_jax.dynamics.motion_bands import verdict_probability  # noqa: PLC0415
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
     loaded, _ = scene_and_start(scene)
+    known = None
+    if law is not None:
+        loaded, known = with_fitted_law(loaded, law)
     (swept,) = ranges_of(scene, loaded, [parameter], counted=True)
     directions = [True, False] if both else [not down]
     sweeps = []
@@ -53,16 +72,23 @@ def command(
                 sweeps.append(
                     bifurcation_diagram(loaded, swept.path, swept.values, upward=upward, impacts=impacts, report=told)
                 )
+        probabilities = None
+        if known is not None:
+            with session.working("sweeping with drawn laws"):
+                probabilities = [
+                    verdict_probability(loaded, swept.path, sweep, known, draws=draws, impacts=impacts)
+                    for sweep in sweeps
+                ]
     except ValueError as error:
         raise ValueError(f"{scene}: {error}") from error
     if not all(sweep.complete for sweep in sweeps):
         session.note("some stretches were not followed to the end of a branch: sweep fewer values, or a smaller range")
     if session.out is not None:
-        _write(session, swept.path, sweeps)
+        _write(session, swept.path, sweeps, probabilities)
         from afm_jax.plots.dynamics import draw_bifurcations  # noqa: PLC0415
 
         target = session.out / f"bifurcation.{picture}"
-        draw_bifurcations(swept.path, sweeps, target)
+        draw_bifurcations(swept.path, sweeps, target, probabilities)
         session.note(f"wrote {target}")
     payload = {
         "parameter": swept.path,
@@ -70,6 +96,10 @@ def command(
         "impacts_each": impacts,
         "sweeps": [_payload(sweep) for sweep in sweeps],
     }
+    if probabilities is not None:
+        payload["draws"] = draws
+        for told, sure in zip(payload["sweeps"], probabilities, strict=True):
+            told["verdict_probability"] = sure
     session.emit(payload, *(_summary(sweep) for sweep in sweeps))
     if not any(np.isfinite(sweep.phase_rad).any() for sweep in sweeps):
         raise NotValid("no motion went on at any value: the tip sticks or flies away; try a larger drive amplitude")
@@ -98,7 +128,7 @@ def _summary(sweep: "Sweep") -> str:
     return f"swept {'up' if sweep.upward else 'down'}: {words}" + (f", others at {rest}" if rest else "")
 
 
-def _write(session: Session, path: str, sweeps: "list[Sweep]") -> None:
+def _write(session: Session, path: str, sweeps: "list[Sweep]", probabilities: "list[np.ndarray] | None") -> None:
     import numpy as np  # noqa: PLC0415
 
     rows: dict[str, list[Any]] = {name: [] for name in ("direction", path, "verdict", "restarted")}
@@ -114,6 +144,8 @@ def _write(session: Session, path: str, sweeps: "list[Sweep]") -> None:
         seen = np.isfinite(sweep.strobe_height_nm)
         at = np.repeat(sweep.values, seen.sum(axis=1))
         _extend(strobe, [word] * len(at), at, sweep.strobe_height_nm[seen])
+    if probabilities is not None:
+        rows["verdict_probability"] = np.concatenate(probabilities).tolist()
     session.write_columns("bifurcation.csv", rows)
     session.write_columns("impacts.csv", impacts)
     session.write_columns("strobe.csv", strobe)

@@ -4,13 +4,15 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from afm_jax.cli.fitted_law import with_fitted_law, with_law_options
 from afm_jax.cli.main import NotValid
-from afm_jax.cli.orbits import refuse_other_than_law
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import PictureFormat, SceneName, ranges_of, scene_and_start
 
 if TYPE_CHECKING:
     from pathlib import Path
+
+    import numpy as np
 
     from afm_jax.dynamics.charts import StabilityChart
     from afm_jax.scenefile.parameter_paths import ParameterRange
@@ -26,25 +28,41 @@ _MOST_POINTS = 4_000_000
 @click.option(
     "--zarr", is_flag=True, help="Write the table as chart.zarr instead of chart.csv; needs the extra `zarr`."
 )
+@with_law_options
 @click.option("--picture", type=PictureFormat(), default="png", show_default=True, help="png, pdf or svg.")
 @with_session
-def command(session: Session, *, scene: str, x: str, y: str, orders: int, zarr: bool, picture: str) -> None:
-    """Chart over two parameters of a law scene which single-impact orbits exist, are stable and coexist.
+def command(  # noqa: PLR0913
+    session: Session,
+    *,
+    scene: str,
+    x: str,
+    y: str,
+    orders: int,
+    zarr: bool,
+    law: "Path | None",
+    draws: int,
+    picture: str,
+) -> None:
+    """Chart over two parameters of a scene which single-impact orbits exist, are stable and coexist.
 
     Of every point and order: whether an orbit is admissible, whether one is stable, and of the stable one (the highest,
-    if there are several) the peak amplitude and the size of the larger multiplier. With --out a table (chart.csv or
-    chart.zarr) and a picture. Exit code 3 if there is no admissible orbit at all.
+    if there are several) the peak amplitude and the size of the larger multiplier. A contact's orbits are closed by
+    simulation from those of the law closest to it: chart a thousand points, not a million; where none closes the point
+    is unresolved. With --law the share of the fit's draws in which an orbit is stable is told too. With --out a table
+    (chart.csv or chart.zarr) and a picture. Exit code 3 if there is no admissible orbit at all.
     """
     if zarr:
         # said before the computation, not after it
         import zarr as _  # noqa: PLC0415
     session.start_computing()
-    from afm_jax.dynamics.charts import stability_chart  # noqa: PLC0415
+    from afm_jax.dynamics.charts import stability_chart, stable_probability  # noqa: PLC0415
     from afm_jax.scenefile.parameter_paths import scene_family  # noqa: PLC0415
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
     loaded, _ = scene_and_start(scene)
-    refuse_other_than_law(loaded, scene)
+    known = None
+    if law is not None:
+        loaded, known = with_fitted_law(loaded, law)
     across, up = ranges = ranges_of(scene, loaded, [x, y], counted=True)
     if len(across.values) * len(up.values) > _MOST_POINTS:
         raise ValueError(f"{across} and {up} are more than {_MOST_POINTS} points: chart fewer")
@@ -57,14 +75,17 @@ def command(session: Session, *, scene: str, x: str, y: str, orders: int, zarr: 
                 last_order=orders,
                 report=session.progress("points"),
             )
+            probability = None
+            if known is not None:
+                probability = stable_probability(loaded, chart, known, (across.path, up.path), draws=draws)
     except ValueError as error:
         raise ValueError(f"{scene}: {error}") from error
     if session.out is not None:
-        _write(session, chart, across, up, zarr=zarr)
+        _write(session, chart, across, up, probability, zarr=zarr)
         from afm_jax.plots.dynamics import draw_chart  # noqa: PLC0415
 
         target: Path = session.out / f"chart.{picture}"
-        draw_chart(across.path, up.path, chart, target)
+        draw_chart(across.path, up.path, chart, target, probability)
         session.note(f"wrote {target}")
     verdicts = chart.verdicts
     several = verdicts.stable.sum(axis=0) > 1
@@ -79,6 +100,11 @@ def command(session: Session, *, scene: str, x: str, y: str, orders: int, zarr: 
         "any_stable_share": float(verdicts.any_stable().mean()),
         "several_stable_share": float(several.mean()),
     }
+    if verdicts.unresolved is not None:
+        payload["unresolved_share"] = verdicts.unresolved.mean(axis=1)
+    if probability is not None:
+        payload["draws"] = draws
+        payload["uncertain_share"] = ((probability > 0.0) & (probability < 1.0)).mean(axis=1)
     reason = None if verdicts.admissible.any() else _why_none(ranges, orders)
     lines = [
         f"order {order}: stable at {100.0 * stable:.4g} % of the points, admissible at {100.0 * admissible:.4g} %"
@@ -100,7 +126,13 @@ def _why_none(ranges: "list[ParameterRange]", orders: int) -> str:
 
 
 def _write(
-    session: Session, chart: "StabilityChart", across: "ParameterRange", up: "ParameterRange", *, zarr: bool
+    session: Session,
+    chart: "StabilityChart",
+    across: "ParameterRange",
+    up: "ParameterRange",
+    probability: "np.ndarray | None",
+    *,
+    zarr: bool,
 ) -> None:
     """Write a row a point, or arrays over orders, rows and columns."""
     verdicts = chart.verdicts
@@ -110,6 +142,10 @@ def _write(
         "peak_amplitude_nm": verdicts.peak_amplitude_nm,
         "largest_multiplier": verdicts.largest_multiplier,
     }
+    if verdicts.unresolved is not None:
+        parts["unresolved"] = verdicts.unresolved
+    if probability is not None:
+        parts["stable_probability"] = probability
     if zarr:
         import zarr as store  # noqa: PLC0415
 

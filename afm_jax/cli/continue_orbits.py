@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from afm_jax.dynamics.bands import UncertainParameters
-    from afm_jax.dynamics.continuation import Continuation, OrbitBranch, SpecialCurve
+    from afm_jax.dynamics.continuation import Continuation
+    from afm_jax.dynamics.special_points import OrbitBranch, SpecialCurve
 
 POINT_COLUMNS = (
     "branch",
@@ -46,6 +47,8 @@ _ENDS = {
     "delay": "close to capture, where the law's delay is longer than half a drive period",
     "shorter": "where it becomes an orbit of fewer impacts",
     "closed": "where it began: it is closed",
+    "rest_lost": "where the sample no longer holds the tip for a while",
+    "grazing": "where a flight grazes the sample, and another motion follows",
     "lost": "a point that it could not be followed beyond",
     "too long": "the most points that are followed",
 }
@@ -69,6 +72,7 @@ _ENDS = {
     help="A parameter of the scene file and its range, such as platform.reduced_frequency=0.9:1.1.",
 )
 @click.option("--second", metavar="P=A:B", help="Another one: the special points are followed as curves in both.")
+@click.option("--sticking", is_flag=True, help="Follow the orbit with a rest on the sample: chatter, ride, release.")
 @click.option(
     "--law",
     type=click.Path(path_type=Path),
@@ -85,6 +89,7 @@ def command(  # noqa: PLR0913
     impacts: int,
     parameter: str,
     second: str | None,
+    sticking: bool,
     law: Path | None,
     picture: str,
 ) -> None:
@@ -92,9 +97,12 @@ def command(  # noqa: PLR0913
 
     Folds, period doublings, torus points, grazings and captures are located to rounding; with --second they are
     followed as curves in two parameters, with cusps and meetings. In a scene with a contact the simulation is closed
-    instead of the map, and curves end where the orbit grazes or is captured. With --law every special point has a
+    instead of the map, and curves end where the orbit grazes or is captured. With --sticking the phase is that of the
+    release, and the branches end where the rest is lost or a flight grazes. With --law every special point has a
     95 % interval. With --out tables and pictures. Exit code 3 if there is no admissible orbit in the range.
     """
+    if sticking and (second is not None or law is not None or impacts != 1):
+        raise ValueError("--sticking goes without --impacts, --second and --law: an orbit with a rest has no equations")
     session.start_computing()
     from afm_jax.cli.fitted_law import with_fitted_law  # noqa: PLC0415
     from afm_jax.contact.contact import Contact  # noqa: PLC0415
@@ -104,12 +112,17 @@ def command(  # noqa: PLR0913
     known = None
     if law is not None:
         loaded, known = with_fitted_law(loaded, law)
-    if not isinstance(loaded.interaction, Contact):
+    if sticking or not isinstance(loaded.interaction, Contact):
         refuse_other_than_law(loaded, scene)
     first, *others = ranges_of(scene, loaded, [parameter, *([] if second is None else [second])], counted=False)
     try:
         with session.working("following orbits (the first run compiles for some seconds)"):
-            found = continue_orbits(loaded, order, first, impacts=impacts, second=others[0] if others else None)
+            if sticking:
+                from afm_jax.dynamics.sticking_orbits import follow_sticking  # noqa: PLC0415
+
+                found = follow_sticking(loaded, order, first, report=session.progress("values"))
+            else:
+                found = continue_orbits(loaded, order, first, impacts=impacts, second=others[0] if others else None)
     except ValueError as error:
         raise ValueError(f"{scene}: {error}") from error
     _finish(session, found, known, picture)
@@ -153,6 +166,7 @@ def _finish(session: Session, found: "Continuation", known: "UncertainParameters
         "special": special,
         "curves": curves,
         "branches": [{"points": len(one.parameter), "ends": list(one.ends)} for one in found.branches],
+        "sticking": found.sticking,
         "law_parameters": None if known is None else list(known.paths),
         "reason": reason,
     }
@@ -219,6 +233,8 @@ def _write(
 
 
 def _why_none(found: "Continuation") -> str:
+    if found.sticking:
+        return f"no tip rests on the sample, is let go and rests again after {found.order} periods with {found.range}"
     what = f"orbit of {found.impacts} impact{'s' if found.impacts != 1 else ''} in {found.order} drive periods"
     if found.impacts == 0:
         return f"the tip meets the sample at every value of {found.range}; try --impacts 1"
@@ -230,7 +246,8 @@ def _why_none(found: "Continuation") -> str:
 def _text(found: "Continuation", special: list[dict[str, Any]], curves: list[dict[str, Any]]) -> "list[str | Table]":
     from rich.table import Table  # noqa: PLC0415
 
-    what = f"({found.impacts}, {found.order}) orbits with {found.range}"
+    kind = f"Orbits with a rest, N = {found.order}," if found.sticking else f"({found.impacts}, {found.order}) orbits"
+    what = f"{kind} with {found.range}"
     lines: list[str | Table] = [what if found.branches else f"No {what}"]
     for number, branch in enumerate(found.branches):
         low, high = branch.parameter.min(), branch.parameter.max()

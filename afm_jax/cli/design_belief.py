@@ -1,7 +1,6 @@
 """The options of `afm-jax design` about what is believed: the cantilever, the law, or a fit of both."""
 
 import functools
-import json
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -26,6 +25,7 @@ class BeliefOptions(NamedTuple):
     measured: Path | None
     model: str | None
     uncertainty: float
+    drive: str | None
     numbers: Mapping[str, Any]
 
 
@@ -54,7 +54,13 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(function)
     def command(
-        *args: Any, fit: Path | None, measured: Path | None, model: str | None, uncertainty: float, **options: Any
+        *args: Any,
+        fit: Path | None,
+        measured: Path | None,
+        model: str | None,
+        uncertainty: float,
+        drive: str | None,
+        **options: Any,
     ) -> Any:
         if options.pop("example"):
             if measured is not None:
@@ -62,7 +68,7 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
             measured, model = example_path(), model or "law"
         numbers = {name: options.pop(name) for name in _BELONG}
         given = {name: value for name, value in numbers.items() if value not in (None, ())}
-        return function(*args, belief_options=BeliefOptions(fit, measured, model, uncertainty, given), **options)
+        return function(*args, belief_options=BeliefOptions(fit, measured, model, uncertainty, drive, given), **options)
 
     # click lists options in the order of the decorators, the last one first
     for nuisance in NUISANCES[::-1]:
@@ -77,6 +83,11 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
             *value, type=Assignment(), multiple=True, metavar="NAME=X", help="A contact's parameter; repeatable."
         ),
         click.option("--free", metavar="NAMES", help="With contact: its parameters that a fit would determine."),
+        click.option(
+            "--drive",
+            type=click.Choice(("sample", "force", "base")),
+            help="What is driven: the sample, or the cantilever itself; else the sample, or as measured.",
+        ),
         click.option("--mass-ng", type=float, metavar="X", help="Effective mass of the tip; else 1."),
         click.option("--model", type=click.Choice(MODELS), help="What will be fitted; else law+delay, or the fit's."),
         click.option(
@@ -116,11 +127,12 @@ def believed(options: BeliefOptions, noise: float) -> "Belief":
     for name in options.numbers:
         if options.measured is None or name != "free":
             raise click.UsageError(f"{_option(name)} is what {source} says already; leave one of them out")
-    from fitting.experiments.belief import belief_of_fit  # noqa: PLC0415
+    if options.drive is not None:
+        raise click.UsageError(f"--drive is what {source} says already; leave one of them out")
+    from fitting.experiments.belief import belief_of_fit, read_belief  # noqa: PLC0415
 
     if options.fit is not None:
-        payload = _read_json(options.fit)
-        belief = belief_of_fit(payload, options.uncertainty)
+        belief, _ = read_belief(options.fit, options.uncertainty)
         if options.model not in (None, belief.problem.model):
             raise click.UsageError(f"{options.fit} is a fit of the model {belief.problem.model}, not {options.model}")
         return belief
@@ -154,23 +166,13 @@ def _from_values(options: BeliefOptions) -> "Belief":
         free=free,
         fixed={name: value for name, value in contact.items() if name not in own},
         uncertainty=options.uncertainty,
+        drive=options.drive or "sample",
     )
 
 
 def _names(options: BeliefOptions) -> tuple[str, ...] | None:
     names = options.numbers.get("free")
     return None if names is None else tuple(name.strip().replace("-", "_") for name in names.split(","))
-
-
-def _read_json(path: Path) -> dict[str, Any]:
-    text = path.read_text(encoding="utf-8")
-    try:
-        payload = json.loads(text)
-    except ValueError as error:
-        raise ValueError(f"{path}: is no JSON ({error}); give what `afm-jax fit --json` writes") from error
-    if not isinstance(payload, dict):
-        raise ValueError(f"{path}: is no saved fit; give what `afm-jax fit --json` writes")  # noqa: TRY004
-    return payload
 
 
 def _option(name: str) -> str:

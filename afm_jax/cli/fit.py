@@ -12,7 +12,7 @@ import click
 
 from afm_jax.cli.each import fit_tables
 from afm_jax.cli.main import NotValid
-from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.session import Session, prepare_folder, with_session
 from afm_jax.cli.values import Ends, Share, example_path, parse_around_plus_minus, parse_number
 from afm_jax.contact.parameters import EFFECTS, REMOVABLE_EFFECTS, idle_without
 from afm_jax.words import text_table
@@ -21,6 +21,8 @@ from fitting.parameters import CONTACT_DEFAULT, DELAY_LAW, LAWS, MODELS, NUISANC
 if TYPE_CHECKING:
     from fitting.fits.fit import Found
     from fitting.fits.result import FitResult
+    from fitting.sampling.posterior_result import Posterior
+    from fitting.sampling.trust_pack import TrustPack
 
 
 class Fixed(click.ParamType):
@@ -139,21 +141,43 @@ class Names(click.ParamType):
 @click.option(
     "--posterior", is_flag=True, help="Credible intervals, too: by a grid, or NUTS for more than two parameters."
 )
+@click.option(
+    "--trust",
+    is_flag=True,
+    help="What speaks for the posterior and against it, too (with --posterior): predicted readings, ranks in 100 "
+    "simulated tables, leave-one-out, influence of single rows.",
+)
+@click.option(
+    "--arviz",
+    metavar="FILE.nc",
+    type=click.Path(path_type=Path, dir_okay=False),
+    help="Write the posterior for ArviZ (with --posterior; extra `arviz`).",
+)
 @click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of everything random.")
+@click.option(
+    "--share",
+    type=Names(),
+    metavar="NAME,...",
+    help="Of several tables: nuisances (of --constrain) that all have in common, or all; left out, each has its own.",
+)
+@click.option(
+    "--hierarchical", is_flag=True, help="Let the laws of several tables scatter around their mean, and say how much."
+)
 @click.option("--example", is_flag=True, help="Fit the bundled table instead of a file.")
-@click.option("--each", is_flag=True, help="Fit several tables, each by itself; with --out what is done is kept.")
+@click.option("--each", is_flag=True, help="Fit each of several tables by itself; with --out what is done is kept.")
 @click.option("--workers", type=click.IntRange(1, 1024), metavar="N", help="Processes that --each takes, by Dask.")
 @with_session
 def command(session: Session, tables: tuple[Path, ...], model: str, noise: float | None, **options: Any) -> None:
-    """Fit the impact law to a table of vibration amplitudes, or to each of several.
+    """Fit the impact law to a table of vibration amplitudes, or one law to several tables.
 
     The table is a CSV file: comment lines `# free_frequency_khz = 90`, `# quality_factor = 40 +- 1`, and columns
     order, drive_frequency_khz, drive_amplitude_nm, offset_nm, peak_amplitude_nm and/or lockin_amplitude_nm, each
     with its ..._error_nm; a column no_orbit marks by 1 drives on which the tip settled on nothing; phase_deg
     counts too. With a line `# drive = force` (or base) it is a tapping curve: drive_frequency_khz, free_amplitude_nm,
-    offset_nm, lockin_amplitude_nm and phase_lag_deg. With --out the
-    report: fit.html, fit.txt, fit.json, fit.png, fit_rows.csv, law.csv. Exit code 3 if the result is not valid: not
-    converged, not explained by the model, or a parameter not identified.
+    offset_nm, lockin_amplitude_nm and phase_lag_deg. Several tables have one law, each nuisances of its own or shared
+    ones, and the report says how far each is from the others (its pull). With --out the report: fit.html, fit.txt,
+    fit.json, fit.png, fit_rows.csv, law.csv, and with --trust trust.png, trust_rows.csv. Exit code 3 if the result is
+    not valid: not converged, not explained by the model, or a parameter not identified.
     """
     if options["example"] == bool(tables):
         both = "not both: " if options["example"] else ""
@@ -163,15 +187,23 @@ def command(session: Session, tables: tuple[Path, ...], model: str, noise: float
     if options["each"]:
         fit_tables(session, tables, {"model": model, "noise": noise, **settings}, options["workers"])
         return
-    table = tables[0] if tables else None
     session.start_computing(*(f"fitting.forward:{name}" for name in ("impacts_of", "located", "linearise_pairs")))
     from fitting.fits.fit import find_fit, summarise  # noqa: PLC0415
     from fitting.report.report import summary  # noqa: PLC0415
+    from fitting.tables.several import SeveralTables  # noqa: PLC0415
     from fitting.tables.table import read_table  # noqa: PLC0415
 
-    measured = read_table(example_path() if table is None else table, noise=noise)
+    if options["arviz"] is not None:
+        from fitting.sampling.inference_data import require_netcdf  # noqa: PLC0415
+
+        prepare_folder(options["arviz"].absolute().parent)
+        require_netcdf()
+    options["posterior"] = options["posterior"] or options["trust"] or options["arviz"] is not None
+    read = [read_table(path, noise=noise) for path in tables or (example_path(),)]
+    measured = read[0] if len(read) == 1 else SeveralTables(tuple(read))
     first = "the first run compiles for half a minute" if "delay" in model or model == "contact" else "some seconds"
-    with session.working(f"fitting {measured.rows} rows, model {model} ({first})"):
+    rows = f"{measured.rows} rows" + (f" of {len(read)} tables" if len(read) > 1 else "")
+    with session.working(f"fitting {rows}, model {model} ({first})"):
         found = find_fit(measured, model, **settings)
         result = summarise(measured, found)
     extras, failure = _extras(session, found, result, settings, options)
@@ -189,19 +221,31 @@ def command(session: Session, tables: tuple[Path, ...], model: str, noise: float
 
 
 def _check_each(tables: tuple[Path, ...], options: dict[str, Any]) -> None:
-    """Check that several tables are fitted each by itself, and that no option asks for more of them.
+    """Check that options are those of one table, of several together, or of each of several by itself.
 
     Raises:
         click.UsageError: if not.
     """
-    if len(tables) > 1 and not options["each"]:
-        raise click.UsageError(f"{len(tables)} tables: add --each to fit each by itself")
+    for option in ("share", "hierarchical"):
+        if options[option] and (len(tables) < 2 or options["each"]):
+            raise click.UsageError(f"--{option} is about several tables that are fitted together; leave it out")
     if options["workers"] is not None and not options["each"]:
         raise click.UsageError("--workers is about several tables: add --each")
-    alone = {"--example": "example", "--compare": "comparing", "--bootstrap": "bootstrap", "--posterior": "posterior"}
+    alone = {
+        "--example": "example",
+        "--compare": "comparing",
+        "--bootstrap": "bootstrap",
+        "--posterior": "posterior",
+        "--trust": "trust",
+        "--arviz": "arviz",
+    }
     for option, name in alone.items():
         if options["each"] and options[name]:
             raise click.UsageError(f"{option} is about one table: leave --each out")
+        if len(tables) > 1 and options[name] and option != "--compare":
+            raise click.UsageError(f"{option} is about one table: give one, or leave it out")
+    if options["comparing"] and options["hierarchical"]:
+        raise click.UsageError("--compare is about tables that have one law: leave --hierarchical out")
 
 
 def _settings(model: str, options: dict[str, Any]) -> dict[str, Any]:
@@ -217,6 +261,7 @@ def _settings(model: str, options: dict[str, Any]) -> dict[str, Any]:
         "scale_errors": options["scale_errors"],
         "robust": options["robust"],
         "speeds": options.get("speeds"),
+        **{name: options[name] for name in ("share", "hierarchical") if options.get(name)},
         "constraints": dict(options["constrain"]),
         "free": free,
         "fixed": fixed,
@@ -269,7 +314,7 @@ def _extras(
 ) -> tuple[dict[str, Any], Exception | None]:
     """Return what was asked for besides the fit, as far as it came, and what ended it: the fit itself stands."""
     extras: dict[str, Any] = {}
-    for name in ("bootstrap", "posterior"):
+    for name in ("bootstrap", "posterior", "trust", "arviz"):
         if options[name] and not result.valid:
             session.note(f"no {name}: the fit is not valid")
     try:
@@ -278,7 +323,11 @@ def _extras(
         if options["bootstrap"] and result.valid:
             extras["bootstrap"] = _bootstrap(session, result, options["bootstrap"], options["seed"])
         if options["posterior"] and result.valid:
-            extras["posterior"] = _posterior(session, result, options["seed"])
+            extras["posterior"] = believed = _posterior(session, result, options["seed"])
+            if options["arviz"]:
+                _write_arviz(session, result, believed, options)
+            if options["trust"]:
+                extras["trust"] = _trust(session, result, believed, options["seed"])
     except Exception as error:  # noqa: BLE001
         return extras, error
     return extras, None
@@ -306,8 +355,27 @@ def _posterior(session: Session, result: "FitResult", seed: int) -> Any:
         return posterior(result, seed=seed)
 
 
+def _write_arviz(session: Session, result: "FitResult", found: "Posterior", options: dict[str, Any]) -> None:
+    from fitting.sampling.inference_data import write_inference_data  # noqa: PLC0415
+
+    write_inference_data(result, found, options["arviz"], seed=options["seed"])
+    session.note(f"wrote {options['arviz']}")
+
+
+def _trust(session: Session, result: "FitResult", found: "Posterior", seed: int) -> "TrustPack":
+    from fitting.sampling.trust_pack import trust  # noqa: PLC0415
+
+    with session.working("checking the posterior by simulated tables"):
+        return trust(result, found, seed=seed, report=session.progress("simulated tables"))
+
+
 def _words(name: str, extra: Any) -> str:
-    """Return a comparison, a bootstrap or a posterior as text."""
+    """Return a comparison, a bootstrap, a posterior or what speaks for it as text."""
+    if name == "trust":
+        from fitting.report.words import trust_in_words  # noqa: PLC0415
+
+        head = [f"  - {line}" for line in extra.complaints] or ["  Nothing speaks against it."]
+        return "\n".join(["", "Trust in the posterior:", *head, *(f"  {line}" for line in trust_in_words(extra))])
     if name == "comparison":
         cells = [
             [

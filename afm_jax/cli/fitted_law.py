@@ -1,16 +1,34 @@
 """`--law fit.json`: a scene with the law that a fit found, and what the fit says of its errors."""
 
-import json
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import click
 
 if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
     from afm_jax.dynamics.bands import UncertainParameters
 
 
+def with_law_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command the options --law and --draws."""
+    law = click.option(
+        "--law",
+        type=click.Path(path_type=Path),
+        metavar="JSON",
+        help="A fit (fit.json of `afm-jax fit --out`): its law in place of the scene's, its errors as bands.",
+    )
+    draws = click.option(
+        "--draws", type=click.IntRange(2), default=20, show_default=True, help="Laws drawn from the fit for the bands."
+    )
+    return law(draws(function))
+
+
 def with_fitted_law(scene: "Scene", path: Path) -> "tuple[Scene, UncertainParameters]":
     """Return a scene with the law of a fit in place of its own, and the fit's values with their covariance.
+
+    Of a fit that knows what its model leaves out it is the closest law without, over the measured speeds (`PlainLaw`).
 
     The quality factor is that of the fit where it was fitted along. What the fit found of its instrument (calibrations,
     origin of offsets) belongs to the table, not to the scene; its uncertainty is in the covariance.
@@ -27,20 +45,16 @@ def with_fitted_law(scene: "Scene", path: Path) -> "tuple[Scene, UncertainParame
     import numpy as np  # noqa: PLC0415
 
     from afm_jax.dynamics.bands import UncertainParameters  # noqa: PLC0415
-    from fitting.experiments.belief import belief_of_fit  # noqa: PLC0415
+    from fitting.experiments.belief import read_belief  # noqa: PLC0415
     from fitting.parameters import DELAY, LAW  # noqa: PLC0415
 
-    try:
-        payload = json.loads(path.read_text(encoding="utf-8"))
-        belief = belief_of_fit(payload)
-    except (ValueError, AttributeError, TypeError) as error:
-        raise ValueError(f"{path}: {error}; give the fit.json of `afm-jax fit --out`") from error
+    belief, payload = read_belief(path)
     if not payload["valid"]:
         raise ValueError(f"{path}: the fit is not valid, so that its law means nothing; give a valid one")
-    problem, found = belief.problem, payload["parameters"]
+    problem, found, plain = belief.problem, payload["parameters"], payload.get("plain_law")
     if problem.model == "contact":
         raise ValueError(f"{path}: is a fit of a contact, which has no law; fit --model viscous+delay")
-    everything = jnp.asarray([found[name]["value"] for name in problem.names])
+    everything = jnp.asarray(belief.values)
     law = problem.law(everything, belief.fixed)
     # what else a fit may have belongs to its instrument
     paths = {"quality_factor": "cantilever.quality_factor"}
@@ -55,9 +69,12 @@ def with_fitted_law(scene: "Scene", path: Path) -> "tuple[Scene, UncertainParame
     places = [problem.names.index(name) for name in names]
     errors = np.array([found[name]["standard_error"] for name in names], float)
     correlations = np.array(payload["correlations"]["matrix"], float)[np.ix_(places, places)]
-    values = np.array([found[name]["value"] for name in names], float)
+    covariance = correlations * np.outer(errors, errors)
+    if plain is not None:
+        places_there = [list(plain["values"]).index(name) for name in names]
+        covariance = np.array(plain["covariance"], float)[np.ix_(places_there, places_there)]
     made = eqx.tree_at(lambda parts: parts.interaction, scene, law, is_leaf=lambda part: part is None)
     if "quality_factor" in names:
         made = eqx.tree_at(lambda parts: parts.cantilever, made, problem.cantilever(everything, scene.cantilever))
-    known = UncertainParameters(tuple(paths[name] for name in names), values, correlations * np.outer(errors, errors))
+    known = UncertainParameters(tuple(paths[name] for name in names), belief.values[places], covariance)
     return made, known

@@ -4,11 +4,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from afm_jax.cli.fitted_law import with_fitted_law, with_law_options
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import PictureFormat, SceneName, ranges_of, scene_and_start
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import numpy as np
 
     from afm_jax.dynamics.exponents import Lyapunov
@@ -24,6 +27,8 @@ COLUMNS = (
     "rested",
     "verdict",
 )
+BAND = ("exponent_per_impact_low", "exponent_per_impact_high")
+"""With --law: between which 95 % of the draws lie."""
 
 
 @click.command()
@@ -31,25 +36,41 @@ COLUMNS = (
 @click.option("--impacts", type=click.IntRange(20), default=2000, show_default=True, help="Impacts to average over.")
 @click.option("--transient", type=click.IntRange(0), default=500, show_default=True, help="Impacts before.")
 @click.option("--parameter", metavar="P=a:b:n", help="A parameter of the scene file and its values, one motion each.")
+@with_law_options
 @click.option("--picture", type=PictureFormat(), default="png", show_default=True, help="png, pdf or svg.")
 @with_session
-def command(session: Session, *, scene: str, impacts: int, transient: int, parameter: str | None, picture: str) -> None:
+def command(  # noqa: PLR0913
+    session: Session,
+    *,
+    scene: str,
+    impacts: int,
+    transient: int,
+    parameter: str | None,
+    law: "Path | None",
+    draws: int,
+    picture: str,
+) -> None:
     """Compute Lyapunov exponents by QR of the impact map's exact Jacobians; a contact's come from its simulation.
 
     Of a motion that has come to an orbit they are the logarithms of its multipliers. A tip that rests on the platform
     forgets its start: its exponents are minus infinity, null in JSON. Begins at the file's [start]; without one, and
-    with --parameter, at a tip that leaves the platform upward, or on the orbit that `simulate` starts on. With --out
+    with --parameter, at a tip that leaves the platform upward, or on the orbit that `simulate` starts on. With --law
+    there is a band for the larger one, from tips that leave the platform upward. With --out
     lyapunov.csv, and with --parameter a picture. Exit code 3 where the motion ends before enough impacts.
     """
     session.start_computing()
     import numpy as np  # noqa: PLC0415
 
     from afm_jax.dynamics.exponents import exponent_verdicts, lyapunov_spectrum  # noqa: PLC0415
+    from afm_jax.dynamics.motion_bands import drawn_exponents  # noqa: PLC0415
     from afm_jax.motion.start import start_of  # noqa: PLC0415
     from afm_jax.scenefile.parameter_paths import scene_batch  # noqa: PLC0415
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
     loaded, told = scene_and_start(scene)
+    known = None
+    if law is not None:
+        loaded, known = with_fitted_law(loaded, law)
     ranges = ranges_of(scene, loaded, [parameter] if parameter else [], counted=True)
     given = {one.path: one.values for one in ranges}
     try:
@@ -62,24 +83,32 @@ def command(session: Session, *, scene: str, impacts: int, transient: int, param
                 transient=transient,
                 report=session.progress("motions"),
             )
+            band = None
+            if known is not None:
+                band = drawn_exponents(loaded, given, known, draws=draws, impacts=impacts, transient=transient)
     except ValueError as error:
         raise ValueError(f"{scene}: {error}") from error
     many = found if given else _as_batch(found)
     verdicts = exponent_verdicts(many)
     rows = _rows(many, verdicts)
     columns = COLUMNS
+    if band is not None:
+        columns = (*COLUMNS, *BAND)
+        rows = [row | dict(zip(BAND, pair, strict=True)) for row, pair in zip(rows, band.tolist(), strict=True)]
     if given:
         path = ranges[0].path
         rows = [{path: value} | row for value, row in zip(given[path].tolist(), rows, strict=True)]
-        columns = (path, *COLUMNS)
+        columns = (path, *columns)
     session.write_table("lyapunov.csv", rows, columns)
     if session.out is not None and given:
         from afm_jax.plots.dynamics import draw_exponents  # noqa: PLC0415
 
         target = session.out / f"lyapunov.{picture}"
-        draw_exponents(ranges[0].path, given[ranges[0].path], many.exponents_per_impact, target)
+        draw_exponents(ranges[0].path, given[ranges[0].path], many.exponents_per_impact, target, band)
         session.note(f"wrote {target}")
     payload = _payload(found, verdicts if given else verdicts[0]) | {"scene": scene_tables(loaded)}
+    if band is not None:
+        payload |= {"draws": draws, "exponent_per_impact_interval95": band if given else band[0]}
     if given:
         payload |= {"parameter": ranges[0].path, "values": given[ranges[0].path]}
         session.emit(payload, _summary(many, str(ranges[0])))

@@ -152,7 +152,8 @@ def _many(session: Session, scene: "Scene", path: str, order: int, impacts: int)
     """Tell the orbits of several impacts, or of a resolved contact."""
     from afm_jax.contact.contact import Contact  # noqa: PLC0415
     from afm_jax.dynamics.contact_orbits import contact_orbits  # noqa: PLC0415
-    from afm_jax.dynamics.impact_orbits import many_impact_orbits, sticking_orbit  # noqa: PLC0415
+    from afm_jax.dynamics.impact_orbits import many_impact_orbits  # noqa: PLC0415
+    from afm_jax.dynamics.sticking_orbits import sticking_orbit  # noqa: PLC0415
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
     resolved = isinstance(scene.interaction, Contact)

@@ -1,10 +1,12 @@
 """Traced programs beside JAX's compilation cache: what that has compiled it finds only after tracing anew.
 
-Commands name the few that gain half a second or more by being kept traced (`jax.export`, its own serialisation) as
-well. A file is found by all that a trace depends on: loaded sources, versions, configuration, devices, shapes and
-structure. Results are modules and tuples of arrays; arguments that are no arrays have a `repr` that says all of them.
+Commands name the few that gain half a second or more by being kept traced as well: by `jax.export`, its own
+serialisation (what `serialize_executable` writes is read by pickle, which runs any code that a file names). A file is
+found by all that a trace depends on: loaded sources, versions, configuration, devices, shapes and structure. Results
+are modules and tuples of arrays; arguments that are no arrays have a `repr` that says all of them.
 """
 
+import dataclasses
 import hashlib
 import json
 import sys
@@ -19,6 +21,9 @@ import equinox as eqx
 import jax
 from jax import export
 from jax.core import Tracer
+from jax.extend.mlir import ir
+from jax.extend.mlir.dialects import stablehlo
+from jax.extend.mlir.passmanager import PassManager
 
 from afm_jax.whole_files import write_whole
 
@@ -38,36 +43,60 @@ def _keeping(jitted: Any, folder: Path, tell: Callable[[str], None]) -> Callable
     programs: dict[Any, tuple[Any, Any]] = {}
 
     def kept(*arguments: Any, **named: Any) -> Any:
-        dynamic, static = eqx.partition((arguments, named), lambda leaf: hasattr(leaf, "dtype"))
-        arrays, tree = jax.tree.flatten(dynamic)
+        leaves, tree = jax.tree.flatten((arguments, named))
+        arrays = [leaf for leaf in leaves if hasattr(leaf, "dtype")]
         if any(isinstance(leaf, Tracer) for leaf in arrays):
             return jitted(*arguments, **named)
+        static = tuple(None if hasattr(leaf, "dtype") else leaf for leaf in leaves)
+        call = (tree, static, *((leaf.shape, leaf.dtype) for leaf in arrays))
+        if call in programs:
+            program, result = programs[call]
+            return jax.tree.unflatten(result, program(arrays))
 
         def flat(arrays: list[Any]) -> list[Any]:
-            positional, by_name = eqx.combine(jax.tree.unflatten(tree, arrays), static)
+            given = iter(arrays)
+            both = zip(leaves, static, strict=True)
+            whole = [next(given) if hasattr(leaf, "dtype") else known for leaf, known in both]
+            positional, by_name = jax.tree.unflatten(tree, whole)
             return jax.tree.leaves(jitted(*positional, **by_name))
 
         def trace() -> tuple[Any, Any]:
-            return export.export(jax.jit(flat))(arrays), _structure(jax.eval_shape(jitted, *arguments, **named))
+            exported = export.export(jax.jit(flat))(arrays)
+            return _nameless(exported), _structure(jax.eval_shape(jitted, *arguments, **named))
 
-        call = (tree, jax.tree.structure(static), *jax.tree.leaves(static), *map(jax.typeof, arrays))
-        if call not in programs:
-            program, structure = _program(folder / f"{jitted.__name__}-{_digest(call)}.program", trace, tell)
-            # at once: a jitted function would compile again where an argument comes from another program
-            kinds = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in arrays]
-            programs[call] = jax.jit(program).lower(kinds).compile(_known_options()), structure
-        return _filled(programs[call][1], iter(programs[call][0](arrays)))
+        program, structure = _program(folder / f"{jitted.__name__}-{_digest(call)}.program", trace, tell)
+        # at once: a jitted function would compile again where an argument comes from another program
+        kinds = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in arrays]
+        compiled = jax.jit(program).lower(kinds).compile(_known_options())
+        found = _filled(structure, iter(compiled(arrays)))
+        programs[call] = compiled, jax.tree.structure(found)
+        return found
 
     return kept
 
 
+def _nameless(exported: export.Exported) -> export.Exported:
+    """Return a traced program that does not say where its operations come from: a third of what is read again."""
+    with ir.Context() as context:
+        stablehlo.register_dialect(context)
+        module: Any = stablehlo.deserialize_portable_artifact(context, exported.mlir_module_serialized)
+        PassManager.parse("builtin.module(strip-debuginfo)").run(module.operation)
+        text = stablehlo.serialize_portable_artifact(module, stablehlo.get_current_version())
+    return dataclasses.replace(exported, mlir_module_serialized=text)
+
+
 def _digest(call: Any) -> str:
     settings = [getattr(jax.config, option) for option in _CONFIGURATION]
-    said = f"{call} {settings} {jax.devices()} {[version(name) for name in _PACKAGES]}".encode()
+    said = f"{call} {settings} {jax.devices()} {_versions(_PACKAGES)}".encode()
     ours = sorted(name for name in sys.modules if name.startswith(("afm_jax.", "fitting.")))
     files = (getattr(sys.modules[name], "__file__", None) for name in ours)
     sources = b"".join(Path(file).read_bytes() for file in files if file)
     return hashlib.sha256(said + sources).hexdigest()[:32]
+
+
+@cache
+def _versions(packages: tuple[str, ...]) -> list[str]:
+    return [version(name) for name in packages]
 
 
 def _program(path: Path, trace: Callable[[], tuple[Any, Any]], tell: Callable[[str], None]) -> tuple[Any, Any]:

@@ -169,6 +169,15 @@ class Session:
             text: strings, rich tables, and functions that return a string, one below the other. In a terminal lines
                 break between words, and tables that are too wide for it are turned.
         """
+        try:
+            self._print(payload, text)
+        except OSError as error:
+            # a pipe that nobody reads any more is no fault
+            if isinstance(error, BrokenPipeError) or error.filename is not None:
+                raise
+            raise OSError(error.errno, f"cannot be written ({error.strerror})", "standard output") from error
+
+    def _print(self, payload: Mapping[str, Any], text: tuple[Any, ...]) -> None:
         if self.json:
             click.echo(strict_json(labelled(payload)))
             return

@@ -2,7 +2,6 @@
 
 import os
 import time
-import tomllib
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -124,12 +123,9 @@ def _read(path: Path) -> dict[str, Any]:
     Raises:
         ValueError: if it cannot be read, or has other keys.
     """
-    try:
-        given = tomllib.loads(path.read_bytes().decode("utf-8-sig"))
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read ({error.strerror})") from error
-    except ValueError as error:
-        raise ValueError(f"{path}: not TOML: {' '.join(str(error).split())}") from error
+    from afm_jax.scenefile.scenefile import read_toml  # noqa: PLC0415
+
+    given = read_toml(str(path))
     unknown = sorted(set(given) - set(_KEYS))
     if unknown:
         raise ValueError(f"{path}: unknown key {unknown[0]}; a sweep has {', '.join(_KEYS)}")

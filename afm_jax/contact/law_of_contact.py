@@ -18,6 +18,7 @@ to 0. The capture speed is where a rebound speed of 0 comes from.
 
 import math
 from dataclasses import dataclass, replace
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import jax
@@ -46,7 +47,7 @@ LAW_SPEEDS = 1.5, 250.0
 DELAY_SPEEDS = 1.37, 700.0
 """The same of `fit_delay`: for the paper's contact 15 to 700 nm/us."""
 _NAMES = ("r", "epsilon", "viscous_loss")
-_TOLERANCE = 1e-14
+_STEPS, _TOLERANCE, _SETTLED = 50, 1e-15, 1e-9
 
 _GUESSES = 12
 _GUESS_SPEEDS = 1.4, 500.0
@@ -232,41 +233,53 @@ def closest_law(
         model: a key of `FREE`.
         residuals: one of `RESIDUALS`.
     """
-    from scipy.optimize import OptimizeResult, least_squares, nnls  # noqa: PLC0415  # a third of a second
-
     free = np.array([name in FREE[model] for name in _NAMES])
     # u_out^2 = u_in^2 - (1 - r^2) u_in^2 - epsilon - c u_in; the scales make the parameters of order one
     scales = np.array([1e-2, approach[0] ** 2, approach[0] * 1e-1])[free]
     losses = np.stack([approach**2, np.ones_like(approach), approach], axis=1)[:, free] * scales
     weights = 1.0 / rebound if residuals == "relative" else np.ones_like(rebound)
+    sets = [list(some) for n in range(len(scales) + 1) for some in combinations(range(len(scales)), n)]
+    found = [_least(losses[:, some], approach, rebound, weights) for some in sets]
+    best, some = min(zip(found, sets, strict=True), key=lambda pair: pair[0].square)
+    parameters = np.zeros(len(scales))
+    parameters[some] = best.parameters
+    values = np.zeros(3)
+    values[free] = parameters * scales
+    loss, epsilon, viscous_loss = values.tolist()
+    return ImpactLaw(r=math.sqrt(max(1.0 - loss, 1e-12)), epsilon=epsilon, viscous_loss=viscous_loss), best.converged
 
-    def fitted(parameters: Float[np.ndarray, " p"]) -> Float[np.ndarray, " n"]:
-        # a law that captures a tip of the range has the smallest speed instead: far from any minimum
-        return np.sqrt(np.maximum(approach**2 - losses @ parameters, 1e-12))
 
-    def residual(parameters: Float[np.ndarray, " p"]) -> Float[np.ndarray, " n"]:
-        return (fitted(parameters) - rebound) * weights
+class _Least(NamedTuple):
+    """Losses with the least sum of squared residuals, the sum (infinite where a loss is negative), and if it is one."""
 
-    def slopes(parameters: Float[np.ndarray, " p"]) -> Float[np.ndarray, "n p"]:
-        return -0.5 * losses * (weights / fitted(parameters))[:, None]
+    parameters: Float[np.ndarray, " p"]
+    square: float
+    converged: bool
 
+
+def _least(
+    losses: Float[np.ndarray, "n p"],
+    approach: Float[np.ndarray, " n"],
+    rebound: Float[np.ndarray, " n"],
+    weights: Float[np.ndarray, " n"],
+) -> _Least:
+    """Return the best losses without bounds, by Gauss-Newton steps: the residuals are small and nearly linear."""
     # to first order the residual is that of the squares over 2 u_out
     linear = weights / (2.0 * rebound)
-    start, _ = nnls(losses * linear[:, None], (approach**2 - rebound**2) * linear)
-    found: OptimizeResult = least_squares(
-        residual,
-        start,
-        slopes,  # pyright: ignore[reportArgumentType]
-        bounds=(0.0, np.inf),
-        method="dogbox",
-        xtol=_TOLERANCE,
-        ftol=_TOLERANCE,
-        gtol=1e-12,
-    )
-    values = np.zeros(3)
-    values[free] = found.x * scales
-    loss, epsilon, viscous_loss = values.tolist()
-    return ImpactLaw(r=math.sqrt(max(1.0 - loss, 1e-12)), epsilon=epsilon, viscous_loss=viscous_loss), found.status > 0
+    parameters = np.linalg.lstsq(losses * linear[:, None], (approach**2 - rebound**2) * linear, rcond=None)[0]
+    fitted, moved = approach, np.inf
+    for _ in range(_STEPS):
+        # a law that captures a tip of the range has the smallest speed instead: far from any minimum
+        fitted = np.sqrt(np.maximum(approach**2 - losses @ parameters, 1e-12))
+        if moved < _TOLERANCE:
+            break
+        slopes = losses * (0.5 * weights / fitted)[:, None]
+        step = np.linalg.lstsq(slopes, (fitted - rebound) * weights, rcond=None)[0]
+        parameters = parameters + step
+        moved = float(np.max(np.abs(step), initial=0.0))
+    inside = bool(np.all(parameters >= 0.0))
+    square = float(np.sum(((fitted - rebound) * weights) ** 2))
+    return _Least(parameters, square if inside else np.inf, inside and moved < _SETTLED)
 
 
 def rebounds(contact: Contact, speeds: Float[np.ndarray, " n"], mass_ng: float) -> dict[str, np.ndarray]:

@@ -14,18 +14,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from afm_jax.dynamics.continuation import (
-    Continuation,
-    Equations,
-    Frame,
-    OrbitBranch,
-    SpecialPoint,
-    by_blocks,
-    equations_at,
-    loop_at,
-)
+from afm_jax.dynamics.closed_loops import Equations, Frame, by_blocks, equations_at, loop_at
+from afm_jax.dynamics.continuation import Continuation
 from afm_jax.dynamics.impact_loop import closing_gaps, highest_point
+from afm_jax.dynamics.special_points import OrbitBranch, SpecialPoint
 
+_NEVER_NEGATIVE = ("interaction.epsilon", "interaction.viscous_loss", "cantilever.quality_factor")
 _NEWTON_STEPS = 20
 _ARRIVED = 1e-9
 
@@ -42,6 +36,21 @@ class UncertainParameters(NamedTuple):
         keep = np.array([own != path for own in self.paths])
         paths = tuple(own for own in self.paths if own != path)
         return UncertainParameters(paths, self.values[keep], self.covariance[np.ix_(keep, keep)])
+
+    def possible_draws(self, number: int, seed: int = 0) -> Float[np.ndarray, "draws parameters"]:
+        """Return draws that can be: the coefficient of restitution at most 1, nothing else below 0.
+
+        Raises:
+            ValueError: if hardly any can be.
+        """
+        drawn = self.draws(50 * number, seed)
+        good = np.ones(len(drawn), bool)
+        for path, column in zip(self.paths, drawn.T, strict=True):
+            good &= (column > 0.0) & (column <= 1.0) if path == "interaction.r" else True
+            good &= column >= 0.0 if path in _NEVER_NEGATIVE else True
+        if good.sum() < number:
+            raise ValueError("the law's errors are so wide that hardly any draw is a law: there are no bands")
+        return drawn[good][:number]
 
     def draws(self, number: int, seed: int = 0) -> Float[np.ndarray, "draws parameters"]:
         """Return values drawn from the normal distribution of this covariance."""

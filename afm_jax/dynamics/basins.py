@@ -28,7 +28,7 @@ from afm_jax.dynamics.iteration import (
     evenly_spread,
     in_blocks,
     leaving_tips,
-    require_drive,
+    sample_driven,
     tips_at,
 )
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, verdicts_of
@@ -107,7 +107,7 @@ def basins_of_attraction(
     """Return which start, in drive phase and rebound speed, ends where.
 
     Args:
-        scene: one scene with a law or a contact, driven by one cosine of its platform.
+        scene: one scene with a law or a contact, driven with one frequency.
         columns: phases, over the whole drive period.
         rows: rebound speeds.
         speeds_nm_per_us: their range; None: from 0 to four times the platform's top speed, or the capture speed.
@@ -117,7 +117,8 @@ def basins_of_attraction(
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
         ValueError: if the scene does not repeat with one drive period, or there is no such grid.
     """
-    require_drive(scene)
+    seen = sample_driven(scene)
+    scene, ahead = seen.scenes, float(seen.frame.phase_rad)
     if scene.platform.frequency_khz.ndim or columns < 2 or rows < 2:
         raise ValueError("basins are those of one scene, on a grid of 2 x 2 starts or more")
     if speeds_nm_per_us is None:
@@ -130,7 +131,7 @@ def basins_of_attraction(
     phase = 2.0 * np.pi * (np.arange(columns) + 0.5) / columns
     speed = low + (high - low) * (np.arange(rows) + 0.5) / rows
     finder = _Finder(scene)
-    grid = np.meshgrid(phase, speed)
+    grid = np.meshgrid((phase - ahead) % (2.0 * np.pi), speed)
     starts = finder.tips(*(part.ravel() for part in grid))
     if isinstance(scene.interaction, Contact):
         label = finder.told_apart(starts, report)
@@ -144,10 +145,16 @@ def basins_of_attraction(
     label = place[label].reshape(rows, columns)
     share = count[order] / label.size
     dimension, error = boundary_dimension(label)
+
+    def in_lab(found: Attractor) -> Attractor:
+        moved = np.asarray(seen.response(found.phase_rad / finder.omega)[1])
+        phase = within_turn(found.phase_rad + ahead, 2.0 * np.pi)
+        return found._replace(phase_rad=phase, velocity_nm_per_us=found.velocity_nm_per_us + moved)
+
     return Basins(
         phase_rad=phase,
         rebound_speed_nm_per_us=speed,
-        attractors=_with_names([finder.attractors[number] for number in order]),
+        attractors=_with_names([in_lab(finder.attractors[number]) for number in order]),
         attractor=label,
         share=share,
         share_error=np.sqrt(share * (1.0 - share) / label.size),

@@ -16,17 +16,19 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
+from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.contact_sequence import follow_contacts
 from afm_jax.dynamics.iteration import (
     Record,
     Report,
+    SampleDriven,
     Tips,
     in_blocks,
     leaving_tips,
     recorded,
-    require_drive,
+    sample_driven,
     skipped,
 )
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Verdicts, verdicts_of
@@ -35,8 +37,10 @@ from afm_jax.results import public_result
 from afm_jax.scenefile.parameter_paths import scene_batch
 from afm_jax.units import within_turn
 
-_LANES = 512
-"""Stretches at most that are swept side by side."""
+_STRETCHES, _MORE_STRETCHES = 512, 1024
+"""Stretches at most that are swept side by side: one block of tips; two, for two cores, where that leaves long ones."""
+_LONG_STRETCH = 8
+"""Values: the shorter stretches are, the more often they are swept again."""
 _HURRIED = 100
 """Impacts at each value of the first, hurried sweep."""
 _PASSES = 40
@@ -61,7 +65,8 @@ class Sweep(NamedTuple):
         approach_nm_per_us: their approach speeds.
         velocity_after_nm_per_us: the tip's velocity in the lab after them.
         height_nm: the platform's height when the tip arrives.
-        strobe_height_nm: the tip's height whenever the platform is highest, (values, drive periods), of the last ones.
+        strobe_height_nm: the tip's height whenever the drive's phase is 0 (the platform, if it moves, is highest),
+            (values, drive periods), of the last ones.
         complete: False where stretches were still being swept again when there were enough.
     """
 
@@ -90,7 +95,7 @@ def bifurcation_diagram(
     """Return what a tip comes to at each value of a parameter, swept up or down.
 
     Args:
-        scene: a scene with a law or a contact, driven by one cosine of its platform.
+        scene: a scene with a law or a contact, driven with one frequency.
         parameter: its path in the scene file.
         values: of the parameter, ascending.
         upward: from the lowest value to the highest, or the other way round.
@@ -106,15 +111,15 @@ def bifurcation_diagram(
     if ordered.ndim != 1 or len(ordered) < 1 or np.any(np.diff(ordered) <= 0.0):
         raise ValueError("`values` must be rising numbers, one at least")
     scenes = scene_batch(scene, {parameter: ordered if upward else ordered[::-1]})
-    require_drive(scenes)
-    scenes = jax.tree.map(np.asarray, scenes)
+    seen = jax.tree.map(np.asarray, sample_driven(scenes))
     if impacts < RECORDED:
         raise ValueError(f"`impacts` must be {RECORDED} or more, to tell orbits, but is {impacts}")
-    sweeper = _Sweeper(scenes, impacts, accuracy)
+    sweeper = _Sweeper(seen.scenes, impacts, accuracy)
     swept, complete = sweeper.run(report)
     order = slice(None) if upward else slice(None, None, -1)
-    scenes, swept = jax.tree.map(lambda part: part[order], (scenes, swept))
-    return _sweep_of(jax.tree.map(jnp.asarray, scenes), swept, ordered, upward=upward, complete=complete)
+    seen, platform, swept = jax.tree.map(lambda part: part[order], (seen, scenes.platform, swept))
+    seen, platform = jax.tree.map(jnp.asarray, (seen, platform))
+    return _sweep_of(seen, platform, swept, ordered, upward=upward, complete=complete)
 
 
 class _SweptRows(NamedTuple):
@@ -132,7 +137,8 @@ class _Sweeper:
     def __init__(self, scenes: Scene, impacts: int, accuracy: float):
         self.scenes, self.impacts, self.accuracy = scenes, impacts, accuracy
         self.count = len(scenes.platform.frequency_khz)
-        self.stretch = -(-self.count // _LANES)
+        shortest, longest = (-(-self.count // most) for most in (_MORE_STRETCHES, _STRETCHES))
+        self.stretch = max(shortest, min(longest, _LONG_STRETCH))
         self.lanes = -(-self.count // self.stretch)
 
     def run(self, report: Report | None) -> tuple[_SweptRows, bool]:
@@ -290,10 +296,17 @@ def _same(one: _SweptRows, other: _SweptRows) -> Bool[np.ndarray, " lanes"]:
 
 
 def _sweep_of(
-    scenes: Scene, swept: _SweptRows, values: Float[np.ndarray, " values"], *, upward: bool, complete: bool
+    seen: SampleDriven,
+    platform: Platform,
+    swept: _SweptRows,
+    values: Float[np.ndarray, " values"],
+    *,
+    upward: bool,
+    complete: bool,
 ) -> Sweep:
+    """Return the rows as they are in the lab, where the platform is another one than the frame's."""
     record, verdicts = swept.record, swept.verdicts
-    period = np.asarray(scenes.platform.period_us)
+    period = np.asarray(seen.scenes.platform.period_us)
     # of an orbit its last impacts, each point once
     number = np.arange(RECORDED, 0, -1)
     shown = (verdicts.impacts[:, None] == 0) | (number <= verdicts.impacts[:, None])
@@ -301,8 +314,8 @@ def _sweep_of(
     def known(part: np.ndarray) -> np.ndarray:
         return np.where(shown, part, np.nan)
 
-    amplitude, offset = (
-        np.asarray(part)[:, None] for part in (scenes.platform.amplitude_nm, scenes.platform.offset_nm)
+    amplitude, offset, ahead = (
+        np.asarray(part)[:, None] for part in (platform.amplitude_nm, platform.offset_nm, seen.frame.phase_rad)
     )
     turn = 2.0 * np.pi / period[:, None]
     return Sweep(
@@ -310,11 +323,13 @@ def _sweep_of(
         upward=upward,
         verdicts=verdicts,
         restarted=swept.restarted,
-        phase_rad=known(within_turn(turn * record.departure_us, 2.0 * np.pi)),
+        phase_rad=known(within_turn(turn * record.departure_us + ahead, 2.0 * np.pi)),
         approach_nm_per_us=known(record.approach_nm_per_us),
-        velocity_after_nm_per_us=known(record.velocity_after_nm_per_us),
-        height_nm=known(offset + amplitude * np.cos(turn * record.arrival_us)),
-        strobe_height_nm=_strobes(scenes, record, shown, period),
+        velocity_after_nm_per_us=known(
+            record.velocity_after_nm_per_us + np.asarray(seen.response(record.departure_us)[1])
+        ),
+        height_nm=known(offset + amplitude * np.cos(turn * record.arrival_us + ahead)),
+        strobe_height_nm=_strobes(seen, record, shown, period),
         complete=complete,
     )
 
@@ -323,10 +338,13 @@ _STROBE_IMPACTS, _STROBES = 48, 8
 """Last impacts in whose flights the tip is looked at, and looks at most in a flight."""
 
 
-def _strobes(scenes: Scene, record: Record, shown: np.ndarray, period: np.ndarray) -> np.ndarray:
-    """Return the tip's heights whenever the platform is highest."""
-    some = slice(-_STROBE_IMPACTS - 1, None)
-    begin, end = record.turns(period)[:, some], record.arrival_periods + record.arrival_us / period[:, None]
+def _strobes(seen: SampleDriven, record: Record, shown: np.ndarray, period: np.ndarray) -> np.ndarray:
+    """Return the tip's heights whenever the drive's phase is 0: with a moving platform, whenever it is highest."""
+    scenes, some = seen.scenes, slice(-_STROBE_IMPACTS - 1, None)
+    # in periods of the scene's own clock
+    ahead = np.asarray(seen.frame.phase_rad)[:, None] / (2.0 * np.pi)
+    begin = record.turns(period)[:, some] + ahead
+    end = record.arrival_periods + record.arrival_us / period[:, None] + ahead
     begin, end, used = begin[:, :-1], end[:, some][:, 1:], shown[:, some][:, 1:]
     gap = np.asarray(scenes.interaction.bridge_breaks_nm) if isinstance(scenes.interaction, Contact) else 0.0 * period
     column = jax.tree.map(lambda leaf: jnp.asarray(leaf)[:, None, None], scenes)
@@ -335,5 +353,6 @@ def _strobes(scenes: Scene, record: Record, shown: np.ndarray, period: np.ndarra
     start = np.asarray(column.platform.position(record.departure_us[:, some][:, :-1, None])) + gap[:, None, None]
     velocity = record.velocity_after_nm_per_us[:, some][:, :-1, None]
     height = np.asarray(column.cantilever.propagator(np.where(np.isfinite(flown), flown, 0.0))(start, velocity)[0])
+    height = height + np.asarray(seen.response(-(ahead * period[:, None])[..., None])[0])
     inside = used[..., None] & (strobe < end[..., None])
     return np.where(inside, height, np.nan).reshape(len(period), -1)

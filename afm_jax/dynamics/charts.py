@@ -14,23 +14,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from afm_jax.apparatus.scene import Scene
-from afm_jax.dynamics.impact_orbits import multipliers_of
-from afm_jax.dynamics.iteration import Report, in_blocks, require_drive
-from afm_jax.impact.amplitude import peak_amplitude
+from afm_jax.apparatus.surface import FreeFrame
+from afm_jax.contact.contact import Contact
+from afm_jax.dynamics.bands import UncertainParameters
+from afm_jax.dynamics.contact_orbits import single_contact_orbits
+from afm_jax.dynamics.iteration import Report, SampleDriven, for_few, in_blocks, sample_driven
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem
 from afm_jax.impact.lasting_impact import LawImpact
 from afm_jax.impact.law import impact_law_of
-from afm_jax.impact.orbits import judge, orbit_state
-from afm_jax.impact.roots import OrbitRoots, find_roots
+from afm_jax.impact.orbits import orbit_at
+from afm_jax.impact.roots import find_roots
 from afm_jax.results import public_result
+from afm_jax.scenefile.parameter_paths import scene_family
 
-_BLOCK = 2048
-"""Scenes gone through together."""
 _LANES = 1024
-"""Roots, and orbits, computed together: few enough for the cache, many enough to fill the vector units."""
+"""Scenes gone through together: few enough for the cache, many enough to fill the vector units."""
 
 
 class OrbitVerdicts(NamedTuple):
@@ -39,12 +40,14 @@ class OrbitVerdicts(NamedTuple):
     ``stable``: an orbit that is admissible and stable. ``admissible``: an admissible orbit, stable or not.
     ``peak_amplitude_nm``: of the stable one (the highest, if there are several); NaN where there is none.
     ``largest_multiplier``: how stable that one is: the size of the larger multiplier of the linearised map.
+    ``unresolved``, of contacts only: the closest law has an orbit, but none was found.
     """
 
     stable: Bool[np.ndarray, "orders scenes"]
     admissible: Bool[np.ndarray, "orders scenes"]
     peak_amplitude_nm: Float[np.ndarray, "orders scenes"]
     largest_multiplier: Float[np.ndarray, "orders scenes"]
+    unresolved: Bool[np.ndarray, "orders scenes"] | None = None
 
     def any_stable(self) -> Bool[np.ndarray, " scenes"]:
         """Return where an orbit of any order is stable."""
@@ -63,7 +66,7 @@ def orbit_verdicts(
     Roots are searched for at all scenes; only where there is one its orbit is looked at.
 
     Args:
-        scenes: a batch of scenes with a law: every parameter has shape (scenes,).
+        scenes: a batch of scenes with a law or a contact: every parameter has shape (scenes,).
         first_order: lowest order N.
         last_order: highest order N.
         report: told how many of how many scenes are done.
@@ -71,68 +74,88 @@ def orbit_verdicts(
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
     """
-    require_drive(scenes)
-    orders = np.arange(first_order, last_order + 1, dtype=float)
-    block = _BLOCK if not impact_law_of(scenes).delay else _LANES
+    seen = sample_driven(scenes)
+    if isinstance(scenes.interaction, Contact):
+        numbers = single_contact_orbits(seen, range(first_order, last_order + 1), report=report)
+        return OrbitVerdicts(**{name: column.T for name, column in numbers.items()})
+    orders = jnp.arange(first_order, last_order + 1, dtype=float)
 
-    def work(part: Scene) -> OrbitVerdicts:
-        return _verdicts_of_block(part, orders)
+    def work(part: SampleDriven) -> OrbitVerdicts:
+        found = highest_orbits(part.scenes, part.frame, orders)
+        return OrbitVerdicts(
+            stable=found["stable_orbits"] > 0,
+            admissible=found["admissible_orbits"] > 0,
+            peak_amplitude_nm=found["peak_amplitude_nm"],
+            largest_multiplier=found["largest_multiplier"],
+        )
 
-    found = in_blocks(work, scenes, block=block, report=report)
-    return OrbitVerdicts(*(column.T for column in found))
+    found = in_blocks(work, seen, block=_LANES, report=report)
+    return jax.tree.map(np.transpose, found)
 
 
-def _verdicts_of_block(scenes: Scene, orders: Float[np.ndarray, " orders"]) -> OrbitVerdicts:
-    """Return the verdicts on a block of scenes, the axis of scenes first."""
-    count = len(scenes.platform.frequency_khz)
-    stable, admissible = np.zeros((2, count, len(orders)), bool)
-    peak, multiplier = np.full((2, count, len(orders)), np.nan)
-    plain = jax.tree.map(np.asarray, scenes)
-    for column, order in enumerate(orders):
-        roots = jax.tree.map(np.asarray, _roots_of_block(scenes, jnp.asarray(order)))
-        scene, slot = np.nonzero(roots.found)
-        rows = [np.zeros((5, 0))]
-        for first in range(0, len(scene), _LANES):
-            some = slice(first, first + _LANES)
-            at, slots = (np.pad(part[some], (0, _LANES - len(part[some])), mode="edge") for part in (scene, slot))
-            place = jax.tree.map(lambda part, at=at, slots=slots: jnp.asarray(part[at, slots]), roots.place)
-            own = jax.tree.map(lambda leaf, at=at: jnp.asarray(leaf[at]), plain)
-            rows.append(np.asarray(_judged(place, own, jnp.asarray(order)))[:, : len(scene[some])])
-        may_be, steady, height, trace, determinant = np.concatenate(rows, axis=1)
-        size = np.abs(multipliers_of(trace, determinant)[:, 0])
-        admissible[scene[may_be > 0.0], column] = True
-        # the highest last: of several values for one place the last one stays
-        chosen = np.flatnonzero(steady)[np.argsort(height[steady > 0.0])]
-        stable[scene[chosen], column] = True
-        peak[scene[chosen], column], multiplier[scene[chosen], column] = height[chosen], size[chosen]
-    return OrbitVerdicts(stable, admissible, peak, multiplier)
+ORBIT_NUMBERS = (
+    "peak_amplitude_nm",
+    "lockin_amplitude_nm",
+    "lockin_phase_deg",
+    "approach_speed_nm_per_us",
+    "phase_rad",
+    "velocity_after_nm_per_us",
+    "largest_multiplier",
+)
+"""What is told of a scene's highest stable orbit: attributes of `SingleImpactOrbits`, and the multiplier's size."""
+_OF_ORBITS = ORBIT_NUMBERS[:-1]
+_ORBITS_AT_ONCE = 2
+"""Blocks of roots are this many times smaller than blocks of scenes: few scenes have more than one."""
 
 
 @jax.jit
-def _roots_of_block(scenes: Scene, order: Float[Array, ""]) -> OrbitRoots:
-    def one(scene: Scene) -> OrbitRoots:
-        return find_roots(OrbitProblem(scene.cantilever, scene.platform, LawImpact(impact_law_of(scene)), order))
+def highest_orbits(
+    scenes: Scene, frame: FreeFrame, orders: Float[Array, " orders"]
+) -> dict[str, Shaped[Array, "lanes orders"]]:
+    """Return of a block of scenes, for each order, how many orbits there are, and the highest stable one's numbers.
 
-    # cut into what the cache holds; the loops of a piece wait for its own slowest lane only
-    pieces = jax.tree.map(lambda leaf: leaf.reshape(-1, min(_LANES, leaf.shape[0])), scenes)
-    found = lax.map(jax.vmap(one), pieces)
-    return jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), found)
+    Args:
+        scenes: a batch of scenes with a law.
+        frame: theirs, a batch.
+        orders: N.
 
+    Returns:
+        ``stable_orbits``, ``admissible_orbits``, and `ORBIT_NUMBERS`, NaN where no orbit is stable.
+    """
 
-@jax.jit
-def _judged(place: OrbitPlace, scenes: Scene, order: Float[Array, ""]) -> Float[Array, "5 lanes"]:
-    """Return of orbits whether they are admissible, whether stable too, peak amplitude, and T and D of the map."""
+    def problem_of(scene: Scene, own: FreeFrame, order: Array) -> OrbitProblem:
+        return OrbitProblem(scene.cantilever, own.platform, LawImpact(impact_law_of(scene)), order)
 
-    def one(place: OrbitPlace, scene: Scene) -> Float[Array, " 5"]:
-        problem = OrbitProblem(scene.cantilever, scene.platform, LawImpact(impact_law_of(scene)), order)
-        state = orbit_state(place, problem)
-        verdict = judge(place, jnp.ones((), bool), state, problem)
-        steady = verdict.admissible & verdict.stable
-        height = peak_amplitude(scene.cantilever, state.flight)
-        flags = (verdict.admissible.astype(height.dtype), steady.astype(height.dtype))
-        return jnp.stack([*flags, height, verdict.trace, verdict.determinant])
+    def of_order(order: Array) -> dict[str, Array]:
+        def orbit_of(place: OrbitPlace, row: Array) -> tuple[Array, Array, Array]:
+            scene, own = jax.tree.map(lambda leaf: leaf[row], (scenes, frame))
+            orbit = orbit_at(place, jnp.ones((), bool), own, problem_of(scene, own, order))
+            half, determinant = 0.5 * jnp.abs(orbit.trace), orbit.determinant
+            inside = half**2 - determinant
+            # a pair on a circle has the root of the determinant for its size
+            pair = jnp.sqrt(jnp.abs(determinant))
+            size = jnp.where(inside > 0.0, half + jnp.sqrt(jnp.where(inside > 0.0, inside, 1.0)), pair)
+            numbers = jnp.stack([*(getattr(orbit, name) for name in _OF_ORBITS), size])
+            return orbit.admissible, orbit.admissible & orbit.stable, numbers
 
-    return jax.vmap(one)(place, scenes).T
+        roots = jax.vmap(lambda scene, own: find_roots(problem_of(scene, own, order)))(scenes, frame)
+        count, slots = roots.found.shape
+        places = jax.tree.map(lambda part: part.ravel(), roots.place)
+        rows = jnp.arange(count * slots) // slots
+        nothing = (jnp.zeros(count * slots, bool),) * 2 + (jnp.full((count * slots, len(ORBIT_NUMBERS)), jnp.nan),)
+        few = max(count // _ORBITS_AT_ONCE, 1)
+        known = for_few(orbit_of, roots.found.ravel() & jnp.repeat(frame.periodic, slots), (places, rows), nothing, few)
+        admissible, steady, numbers = (part.reshape(count, slots, *part.shape[1:]) for part in known)
+        highest = jnp.argmax(jnp.where(steady, numbers[..., 0], -jnp.inf), axis=1)
+        chosen = jnp.take_along_axis(numbers, highest[:, None, None], axis=1)[:, 0]
+        chosen = jnp.where(steady.any(axis=1)[:, None], chosen, jnp.nan)
+        counts = {
+            "stable_orbits": steady.sum(axis=1, dtype=jnp.int8),
+            "admissible_orbits": admissible.sum(axis=1, dtype=jnp.int8),
+        }
+        return counts | {name: chosen[:, column] for column, name in enumerate(ORBIT_NUMBERS)}
+
+    return jax.tree.map(jnp.transpose, lax.map(of_order, orders))
 
 
 TABLE_COLUMNS = (
@@ -220,7 +243,7 @@ def stability_chart(
     last_order: int,
     report: Report | None = None,
 ) -> StabilityChart:
-    """Return which single-impact orbits exist, are stable and coexist over two parameters of a scene with a law.
+    """Return which single-impact orbits exist, are stable and coexist over two parameters of a scene.
 
     Args:
         scene_of: the scene at the two parameters' values; it must allow `vmap` (`parameter_paths.scene_family`).
@@ -231,7 +254,6 @@ def stability_chart(
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
-        TypeError: if the scenes' interaction is not an impact law.
         ValueError: if the scenes do not repeat with one drive period, or there is no order to look for.
     """
     if last_order < 1:
@@ -240,6 +262,27 @@ def stability_chart(
     columns = (column.ravel() for column in np.meshgrid(x, y))
     verdicts = orbit_verdicts(batch_of_scenes(scene_of, *columns), last_order=last_order, report=report)
     return StabilityChart(scene_of, x, y, verdicts)
+
+
+def stable_probability(
+    scene: Scene, chart: StabilityChart, known: UncertainParameters, paths: tuple[str, str], *, draws: int
+) -> Float[np.ndarray, "orders points"]:
+    """Return the share of draws of uncertain parameters in which an orbit of each order is stable.
+
+    Args:
+        scene: that of the chart.
+        chart: whose points are meant.
+        known: what is drawn; a parameter of the chart counts as its axis says.
+        paths: of the chart's parameters.
+        draws: how many.
+    """
+    known = known.without(paths[0]).without(paths[1])
+    family, columns = scene_family(scene, *paths, *known.paths), chart.points()
+    total = np.zeros(chart.verdicts.stable.shape)
+    for drawn in known.possible_draws(draws):
+        scenes = batch_of_scenes(family, *columns, *(np.full(len(columns[0]), value) for value in drawn))
+        total += orbit_verdicts(scenes, last_order=chart.orders).stable
+    return total / draws
 
 
 def batch_of_scenes(scene_of: Callable[..., Scene], *columns: np.ndarray) -> Scene:

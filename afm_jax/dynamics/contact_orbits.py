@@ -6,17 +6,18 @@ loop is closed to rounding and its multipliers are exact.
 """
 
 from collections.abc import Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Shaped
 from scipy.optimize import brentq
 
 from afm_jax.apparatus.scene import Scene, drive_of
-from afm_jax.apparatus.surface import surface_of
+from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.checks import require_float64
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
@@ -30,7 +31,9 @@ from afm_jax.dynamics.impact_orbits import (
     many_impact_orbits,
     multipliers_of,
 )
-from afm_jax.dynamics.iteration import evenly_spread, leaving_tips
+from afm_jax.dynamics.iteration import Report, SampleDriven, evenly_spread, in_blocks, leaving_tips
+from afm_jax.impact.amplitude import FlightEnds, highest_of_sum, peak_amplitude
+from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
 from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import ContactKind, Contacts
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
@@ -50,6 +53,12 @@ _ARRIVED = 1e-10
 """Largest last step and remaining gap of a closed loop, in rad and of the fastest speed."""
 _LANES = 16
 """Contacts followed together, one program."""
+_CONTACTS_AT_ONCE = 128
+"""Of a chart."""
+_CHART_ACCURACY = 1e-6
+_CHART_STEPS = 15
+_CHART_ARRIVED = 1e-7
+"""Of a phase in rad and of a speed."""
 _SAMPLES = 512
 """Of a flight, for its lowest points."""
 _CURVE_STEPS = 12
@@ -169,6 +178,157 @@ def _closed(guess: np.ndarray, flights: "ContactFlights", values: np.ndarray) ->
         if np.abs(step * weights).max() < _ARRIVED and np.abs(flown.gaps * weights).max() < _ARRIVED:
             return loop
     return None
+
+
+def single_contact_orbits(
+    seen: SampleDriven, orders: Sequence[int], *, accuracy: float = _CHART_ACCURACY, report: Report | None = None
+) -> dict[str, Shaped[np.ndarray, "lanes orders"]]:
+    """Return which orbits of one contact there are at many scenes with a contact.
+
+    Every orbit of the law with delay closest to the contact is a guess, from which Newton's method closes the simulated
+    map. What the law lacks is not found, and where no guess closes there may be an orbit nevertheless: ``unresolved``.
+
+    Args:
+        seen: the scenes, a batch.
+        orders: N.
+        accuracy: of `simulate`.
+        report: told how many of how many orbits of the law have been followed.
+
+    Returns:
+        ``stable``, ``admissible`` and ``unresolved``, and of the stable orbit, the highest if there are several,
+        ``peak_amplitude_nm`` and ``largest_multiplier``, NaN where there is none.
+    """
+    lanes, columns, phase, rebound, turns = _guesses_of_law(seen, orders)
+    shape = len(seen.scenes.platform.frequency_khz), len(orders)
+    found = {name: np.zeros(shape, bool) for name in ("stable", "admissible", "unresolved")}
+    found |= {name: np.full(shape, np.nan) for name in ("peak_amplitude_nm", "largest_multiplier")}
+    whole = jax.tree.map(np.asarray, seen)
+    left, done = np.arange(len(lanes)), np.zeros(len(lanes), bool)
+    for _ in range(_CHART_STEPS):
+        if not left.size:
+            break
+
+        def work(part: tuple[SampleDriven, Array, Array, Array]) -> _Return:
+            return _returns(*part, accuracy=accuracy)
+
+        rows = jax.tree.map(lambda leaf, left=left: leaf[lanes[left]], whole)
+        flown = in_blocks(work, (rows, phase[left], rebound[left], turns[left]), block=_CONTACTS_AT_ONCE)
+        scale = np.stack([np.ones(left.size), rebound[left]], axis=1)
+        arrived = np.abs(flown.gaps / scale).max(axis=1) < _CHART_ARRIVED
+        at, column = lanes[left[arrived]], columns[left[arrived]]
+        multipliers = np.abs(multipliers_of(flown.trace[arrived], flown.determinant[arrived])[:, 0])
+        done[left[arrived]] = True
+        found["admissible"][at, column] = True
+        # the highest last: of several values for one place the last one stays
+        peak = flown.peak_amplitude_nm[arrived]
+        steady = np.flatnonzero(multipliers < 1.0)
+        steady = steady[np.argsort(peak[steady], kind="stable")]
+        steady = steady[~(peak[steady] <= found["peak_amplitude_nm"][at[steady], column[steady]])]
+        place = at[steady], column[steady]
+        found["stable"][place] = True
+        found["peak_amplitude_nm"][place], found["largest_multiplier"][place] = peak[steady], multipliers[steady]
+        goes_on = ~arrived & np.isfinite(flown.step).all(axis=1)
+        change = flown.step[goes_on] / scale[goes_on]
+        left = left[goes_on]
+        change /= np.maximum(1.0, np.abs(change / [_TURN, _SHARE]).max(axis=1))[:, None]
+        phase[left] += change[:, 0]
+        rebound[left] *= 1.0 + change[:, 1]
+        if report is not None:
+            report(len(lanes) - left.size, len(lanes))
+    found["unresolved"][lanes[~done], columns[~done]] = True
+    found["unresolved"] &= ~found["admissible"]
+    return found
+
+
+def _guesses_of_law(
+    seen: SampleDriven, orders: Sequence[int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Return guesses: numbers of scenes and of orders, departure phases, rebound speeds, rad that an orbit takes."""
+    scenes = jax.tree.map(np.asarray, seen.scenes)
+    leaves = [*jax.tree.leaves(scenes.interaction), scenes.cantilever.mass_ng]
+    rows, owner = np.unique(np.stack(leaves, axis=1), axis=0, return_inverse=True)
+    parts: list[tuple[np.ndarray, ...]] = [(np.zeros(0, int), np.zeros(0, int), *np.zeros((3, 0)))]
+    for number in range(len(rows)):
+        own = np.flatnonzero(owner.ravel() == number)
+        contact = jax.tree.map(lambda leaf, own=own: jnp.asarray(leaf[own[0]]), scenes.interaction)
+        law = law_of_contact(contact, float(scenes.cantilever.mass_ng[own[0]]))
+        if law is None:
+            continue
+        some = jax.tree.map(lambda leaf, own=own: jnp.asarray(leaf[own]), scenes)
+        laws = jax.tree.map(lambda leaf, own=own: jnp.full(len(own), leaf), law)
+        simple = Scene(some.cantilever, some.platform, laws)
+        gap, omega = contact.bridge_breaks_nm, np.asarray(some.platform.angular_frequency)
+        for column, order in enumerate(orders):
+
+            def work(part: Scene, order: int = order) -> SingleImpactOrbits:
+                return jax.vmap(lambda scene: single_impact_orbits(scene, order))(part)
+
+            orbits = in_blocks(work, simple, block=_CONTACTS_AT_ONCE)
+            lane, slot = np.nonzero(orbits.exists & orbits.admissible)
+            rebound = orbits.rebound_speed_nm_per_us[lane, slot]
+            phase = orbits.phase_rad[lane, slot] + omega[lane] * float(gap) / rebound
+            turn = np.full(len(lane), 2.0 * np.pi * order)
+            parts.append((own[lane], np.full(len(lane), column), phase, rebound, turn))
+    lanes, columns, phase, rebound, turns = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return lanes, columns, phase, rebound, turns
+
+
+class _Return(NamedTuple):
+    """What comes of departures after a contact, arrays of one lane each; NaN where it does not end in time."""
+
+    gaps: Any
+    """By how much the next departure misses this one: phase in rad, rebound speed in nm/us."""
+    step: Any
+    """Of Newton's method."""
+    trace: Any
+    determinant: Any
+    peak_amplitude_nm: Any
+
+
+@partial(jax.jit, static_argnames=("accuracy",))
+def _returns(seen: SampleDriven, phase: Array, rebound: Array, turns: Array, *, accuracy: float) -> _Return:
+    def one(seen: SampleDriven, phase: Array, rebound: Array, turn: Array) -> _Return:
+        scene = seen.scenes
+        platform, omega = scene.platform, scene.platform.angular_frequency
+
+        def departs(unknowns: Array) -> tuple[Array, Contacts]:
+            time = unknowns[0] / omega
+            velocity = unknowns[1] + platform.velocity(time)
+            contact = next_contact(scene, time, velocity, (phase + (1.0 + _LONGEST_CONTACT) * turn) / omega, accuracy)
+            return jnp.stack([omega * contact.departure_time_us, contact.rebound_speed_nm_per_us]), contact
+
+        unknowns = jnp.stack([phase, rebound])
+        # forward once: value and derivatives of one simulation
+        (value, contact), slopes = _with_slopes(departs, unknowns)
+        good = contact.kind == ContactKind.IMPACT
+        gaps = jnp.where(good, value - unknowns - jnp.array([1.0, 0.0]) * turn, jnp.nan)
+        step = -jnp.linalg.solve(slopes - jnp.eye(2), gaps)
+        start = phase / omega
+        height, rate = platform.position_and_velocity(start)
+        height, rate, lasts = (
+            height + scene.interaction.bridge_breaks_nm,
+            rate + rebound,
+            contact.arrival_time_us - start,
+        )
+        flight = FlightEnds(start, lasts, height, rate, *scene.cantilever.propagator(lasts)(height, rate))
+        if seen.frame.response is None:
+            peak = peak_amplitude(scene.cantilever, flight)
+        else:
+            still = jnp.zeros_like(start)
+            peak = highest_of_sum(scene.cantilever, flight, Surface(still, still, (seen.frame.response,)))
+        determinant = slopes[0, 0] * slopes[1, 1] - slopes[0, 1] * slopes[1, 0]
+        return _Return(gaps, step, slopes[0, 0] + slopes[1, 1], determinant, peak)
+
+    return jax.vmap(one)(seen, phase, rebound, turns)
+
+
+def _with_slopes(function: Any, unknowns: Array) -> tuple[Any, Array]:
+    def twice(unknowns: Array) -> tuple[Array, Any]:
+        value, other = function(unknowns)
+        return value, (value, other)
+
+    slopes, found = jax.jacfwd(twice, has_aux=True)(unknowns)
+    return found, slopes
 
 
 class CurveUnits(NamedTuple):

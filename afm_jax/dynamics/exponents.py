@@ -28,7 +28,7 @@ from afm_jax.dynamics.iteration import (
     batch_and_tips,
     in_blocks,
     record_of,
-    require_drive,
+    sample_driven,
     skipped,
 )
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Verdicts, verdicts_of
@@ -127,7 +127,7 @@ def lyapunov_spectrum(
     """Return the Lyapunov exponents of a motion, or of many.
 
     Args:
-        scene: a scene with a law or a contact, driven by one cosine of its platform; or a batch of scenes.
+        scene: a scene with a law or a contact, driven with one frequency; or a batch of scenes.
         start: where the motion begins; None: one scene's default, of many a tip that leaves the platform upward.
         impacts: impacts over which the exponents are taken.
         transient: impacts before.
@@ -141,11 +141,11 @@ def lyapunov_spectrum(
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
         ValueError: if the scene does not repeat with one drive period, or there are too few impacts to tell errors.
     """
-    require_drive(scene)
+    seen = sample_driven(scene)
     if impacts < _PARTS or transient < 0:
         raise ValueError(f"`impacts` must be {_PARTS} or more and `transient` not negative: {impacts} and {transient}")
     single = scene.platform.frequency_khz.ndim == 0
-    scenes, tips = batch_and_tips(scene, start)
+    scenes, tips = batch_and_tips(seen.scenes, None if start is None else seen.start(start))
     if isinstance(scene.interaction, Contact):
         found = _exponents_of_contacts(scenes, tips, impacts=impacts, transient=transient, accuracy=accuracy)
     else:

@@ -17,8 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float
 
-from afm_jax.apparatus.scene import Scene, drive_of
-from afm_jax.apparatus.surface import surface_of
+from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import require_float64
 from afm_jax.dynamics.impact_loop import (
     ImpactLoop,
@@ -34,13 +33,8 @@ from afm_jax.dynamics.iteration import evenly_spread
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, Flight
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.map import impact_after
-from afm_jax.motion.law_motion import Bed, first_release, take_off
-from afm_jax.motion.observe import peaks_of_flights
-from afm_jax.motion.record import ContactKind, to_lab
-from afm_jax.motion.simulate import simulate
 from afm_jax.outcomes import Outcome
 from afm_jax.results import public_result
-from afm_jax.units import within_turn
 
 DEFAULT_STARTS = 512
 MOST_IMPACTS = 64
@@ -61,7 +55,6 @@ _SAME = 1e-7
 _FASTEST = 100.0
 """Of the speeds that starts have, over the drive's."""
 _STEPS = 2000
-_MOST_RESTS = 32
 
 
 @public_result()
@@ -273,77 +266,3 @@ def _repeats(own: np.ndarray) -> bool:
 
 def _is_a_turn_of(own: np.ndarray, other: np.ndarray) -> bool:
     return any(np.abs(np.roll(own, turn, axis=1) - other).max() < _SAME for turn in range(own.shape[1]))
-
-
-class StickingOrbit(NamedTuple):
-    """A motion that repeats with a rest on the surface in it: infinitely many ever smaller impacts, rest, release.
-
-    A small disturbance is forgotten in the rest: both multipliers are 0, and it is stable.
-    """
-
-    order: int
-    """N, drive periods until the motion repeats."""
-    rests: int
-    """Rests in them."""
-    release_phase_rad: float
-    """Drive phase at which the surface lets the tip go; of the first rest."""
-    rest_us: float
-    """From the last impact followed to the release, in a response period."""
-    impacts: int
-    """Impacts followed one by one; those summed up as chatter not counted."""
-    peak_amplitude_nm: float
-
-
-def sticking_orbit(scene: Scene, *, longest: int = 64) -> StickingOrbit | str:
-    """Return the orbit with a rest that a tip at rest ends up on, or a sentence on why there is none.
-
-    Args:
-        scene: one scene with an `ImpactLaw`, driven with one period.
-        longest: drive periods after which a flight that has not come to rest counts as one that never does.
-
-    Raises:
-        RuntimeError: if JAX is not set to 64-bit floats.
-        TypeError: if the scene's interaction is not an impact law.
-        ValueError: if the drive does not repeat.
-    """
-    require_float64(scene)
-    law, period = impact_law_of(scene), drive_of(scene).period_us
-    driven_part(scene)
-    if float(law.epsilon) > 0.0 or law.delay is not None:
-        return "with adhesion or a delay a tip that comes to rest stays"
-    surface, response = surface_of(scene)
-    bed = Bed(scene.cantilever, surface)
-    times = period * jnp.arange(256.0) / 256.0
-    push = np.asarray(jax.vmap(bed.push)(times))
-    if push.min() >= 0.0 or push.max() <= 0.0:
-        return f"the surface {'never lets go' if push.min() >= 0.0 else 'never presses'} a tip that rests on it"
-    release = float(first_release(bed, times[int(np.argmax(push))], times[-1] + 2.0 * period).time_us)
-    first, resting, impacts, peak = release, 0.0, 0, -np.inf
-    for rests in range(1, _MOST_RESTS + 1):
-        until = jnp.asarray(release + longest * period)
-        leg = take_off(bed, jnp.asarray(release), until)
-        gap_rate = leg[2] - surface.velocity(leg[0])
-        start = to_lab(surface, response, leg[0], leg[1], gap_rate)
-        rows = simulate(scene, start, longest * period).contacts
-        kind, arrival, rebound = (
-            np.asarray(p) for p in (rows.kind, rows.arrival_time_us, rows.rebound_speed_nm_per_us)
-        )
-        departed = rows.departure_time_us, rows.departure_position_nm, rows.departure_velocity_nm_per_us
-        rested = np.flatnonzero((kind == ContactKind.CHATTER) | ((kind == ContactKind.IMPACT) & (rebound == 0.0)))
-        if not rested.size:
-            return f"a tip that is let go does not come to rest again within {longest} drive periods"
-        row = int(rested[0])
-        again = float(departed[0][row])
-        impacts += row
-        resting += again - float(arrival[row])
-        lands = slice(0, row + 1)
-        begins = [
-            np.append(np.asarray(part), np.asarray(column)[:row]) for part, column in zip(start, departed, strict=True)
-        ]
-        peak = max(peak, float(peaks_of_flights(scene, *begins, arrival[lands]).max()))
-        apart = (again - first) / period
-        if abs(apart - round(apart)) < 1e-6:
-            omega = drive_of(scene).angular_frequency
-            return StickingOrbit(round(apart), rests, within_turn(first * omega, 2.0 * np.pi), resting, impacts, peak)
-        release = again
-    return f"a tip that is let go does not repeat itself within {_MOST_RESTS} rests"

@@ -16,9 +16,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from afm_jax.apparatus.scene import Scene, require_sample_drive
+from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.surface import FreeFrame, free_frame
 from afm_jax.checks import require_float64
 from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
@@ -42,6 +43,8 @@ _RIDE_PERIODS = 1.1
 """Drive periods within which a resting tip is let go, or never: its push repeats every one."""
 
 
+_TOUCHING = 1e-13
+"""Gap over the heights it is the difference of, below which it is rounding."""
 _FEW = 16
 """Tips of a block whose rest, or long search, is computed together."""
 _Leaving = tuple[Array, Array, Array]
@@ -84,7 +87,7 @@ def advance(scenes: Scene, tips: Tips) -> MapStep:
     going = tips.outcome == Outcome.IMPACT
     impact = jax.vmap(partial(_one_impact, max_steps=_QUICK_STEPS))(scenes, tips)
     slow = going & (impact.outcome == Outcome.STEP_LIMIT)
-    impact = _for_few(partial(_one_impact, max_steps=MAX_STEPS), slow, (scenes, tips), impact)
+    impact = for_few(partial(_one_impact, max_steps=MAX_STEPS), slow, (scenes, tips), impact)
     captured = going & (impact.outcome == Outcome.CAPTURED)
     landed = captured | (going & (impact.outcome == Outcome.IMPACT))
     surface = scenes.platform
@@ -95,7 +98,7 @@ def advance(scenes: Scene, tips: Tips) -> MapStep:
     law = impact_law_of(scenes)
     may_rest = landed & (law.epsilon == 0.0) & (captured | (rebound < jax.vmap(_slowest_chatter)(scenes)))
 
-    (time, gap, velocity), rested, held = _for_few(_rest, may_rest, (scenes, impact), (leaving, no, no))
+    (time, gap, velocity), rested, held = for_few(_rest, may_rest, (scenes, impact), (leaving, no, no))
     stuck = (captured & (law.epsilon > 0.0)) | held
     goes_on = landed & ~stuck
     outcome = jnp.where(goes_on, Outcome.IMPACT, jnp.where(stuck, Outcome.CAPTURED, impact.outcome))
@@ -127,7 +130,9 @@ def _slowest_chatter(scene: Scene) -> Float[Array, ""]:
     return 0.5 * CONSTANT_PUSH * push * (1.0 - impact_law_of(scene).r) / bed.fastest
 
 
-def _for_few(work: Callable[..., Any], needed: Bool[Array, " lanes"], arguments: tuple[Any, ...], results: Any) -> Any:
+def for_few(
+    work: Callable[..., Any], needed: Bool[Array, " lanes"], arguments: tuple[Any, ...], results: Any, few: int = _FEW
+) -> Any:
     """Return results with those of work on the lanes that need it: gathered, few at a time, so that no others wait.
 
     Args:
@@ -135,15 +140,16 @@ def _for_few(work: Callable[..., Any], needed: Bool[Array, " lanes"], arguments:
         needed: which lanes.
         arguments: of the work, arrays of all lanes.
         results: of all lanes before.
+        few: how many at a time.
     """
     lanes = needed.shape[0]
 
     def some(state):
         left, found = state
-        chosen = jnp.nonzero(left, size=min(_FEW, lanes), fill_value=lanes)[0]
+        chosen = jnp.nonzero(left, size=min(few, lanes), fill_value=lanes)[0]
         # what is filled up is a copy of the last lane, computed and dropped
-        few = jax.tree.map(lambda leaf: leaf.at[chosen].get(mode="clip"), arguments)
-        new = jax.vmap(work)(*few)
+        gathered = jax.tree.map(lambda leaf: leaf.at[chosen].get(mode="clip"), arguments)
+        new = jax.vmap(work)(*gathered)
         found = jax.tree.map(lambda old, part: old.at[chosen].set(part, mode="drop"), found, new)
         return left.at[chosen].set(False, mode="drop"), found
 
@@ -260,6 +266,8 @@ def landed_tips(scenes: Scene, start: State) -> Tips:
 
     def one(scene: Scene, start: State) -> Tips:
         gap = start.position_nm - scene.platform.position(start.time_us)
+        # on the surface but for rounding
+        gap = jnp.where(jnp.abs(gap) < _TOUCHING * (jnp.abs(start.position_nm) + scene.platform.amplitude_nm), 0.0, gap)
         flight = Flight(
             scene.cantilever, scene.platform, start.time_us, start.velocity_nm_per_us, gap, jnp.zeros_like(gap)
         )
@@ -299,22 +307,57 @@ def batch_and_tips(scene: Scene, start: State | None = None) -> tuple[Scene, Tip
     return scene, tips_at(scene, start.time_us, start.velocity_nm_per_us)._replace(gap_nm=gap)
 
 
-def require_drive(scenes: Scene) -> None:
-    """Check that scenes repeat with one drive period, and that there is something to meet.
+class SampleDriven(NamedTuple):
+    """Scenes as their freely moving tips see them, whatever drives them: over a platform that moves with one cosine."""
+
+    scenes: Scene
+    """Without base and force; impacts and contacts are the same ones at the same times of the frame's clock."""
+    frame: FreeFrame
+
+    def start(self, start: State) -> State:
+        """Return a start in the lab as it is in the frame."""
+        frame = self.frame
+        if frame.response is None:
+            return start
+        omega = frame.platform.angular_frequency
+        time = start.time_us + (2.0 * jnp.pi - frame.phase_rad % (2.0 * jnp.pi)) / omega
+        height, velocity = self.response(time)
+        return State(time, start.position_nm - height, start.velocity_nm_per_us - velocity)
+
+    def response(self, time_us: ArrayLike) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Return height and velocity of what the frame leaves out, at a time of its clock: the free tip's response."""
+        time, wave = jnp.asarray(time_us), self.frame.response
+        if wave is None:
+            return jnp.zeros_like(time), jnp.zeros_like(time)
+        cosine, sine, omega = (
+            part.reshape(*part.shape, *[1] * (time.ndim - part.ndim))
+            for part in (wave.cosine, wave.sine, wave.angular_frequency)
+        )
+        turned = jnp.cos(omega * time), jnp.sin(omega * time)
+        return cosine * turned[0] + sine * turned[1], omega * (sine * turned[0] - cosine * turned[1])
+
+
+def sample_driven(scenes: Scene) -> SampleDriven:
+    """Return scenes as their freely moving tips see them, checked that they repeat with one drive period.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scenes were built.
-        ValueError: if the tip meets nothing, the offset ramps, the platform rests, or there is another drive than one
-            cosine of the platform.
+        ValueError: if the tip meets nothing, the offset ramps, what the tip sees rests, or the drive has several
+            frequencies.
     """
     require_float64(scenes)
-    require_sample_drive(scenes)
     if scenes.interaction is None:
         raise ValueError("the scene has no interaction: a tip that meets nothing has no impacts")
     if np.any(np.asarray(scenes.platform.offset_rate_nm_per_us) != 0.0):
         raise ValueError("`offset_rate_nm_per_us` must be 0 here: under a ramp no motion repeats")
-    if not np.all(np.asarray(scenes.platform.amplitude_nm) > 0.0):
+    frame = free_frame(scenes)
+    if not np.all(np.asarray(frame.periodic)):
+        raise ValueError("the drive has several frequencies, so that no period of the drive repeats")
+    if not np.all(np.asarray(frame.platform.amplitude_nm) > 0.0):
         raise ValueError("`amplitude_nm` of the platform must be positive here: on a resting platform motion dies away")
+    if frame.response is not None:
+        scenes = Scene(scenes.cantilever, frame.platform, scenes.interaction)
+    return SampleDriven(scenes, frame)
 
 
 Report = Callable[[int, int], object]

@@ -27,6 +27,8 @@ from afm_jax.impact.law import ImpactLaw, Speeds
 _REGULAR = 1e-12
 """Relative size below which a determinant is taken for the rounding of 0."""
 _PASSES = 3
+_CLOSE = 1e-10
+"""Gaps, and the last step of Newton's method, that leave an error of the order of their square."""
 _LONGEST_STEP = 0.3
 """Of Newton's method: share of the distance from capture, and rad."""
 
@@ -133,23 +135,46 @@ def map_gaps(unknowns: Float[Array, " 2"], problem: OrbitProblem) -> Float[Array
     return jnp.stack([(position - height) / platform.amplitude_nm, missing])
 
 
-def close_map(place: OrbitPlace, problem: OrbitProblem, steps: int) -> tuple[Float[Array, " 2"], Float[Array, " 2"]]:
-    """Return coordinate and phase after steps of Newton's method towards the orbit of the map, and its gaps there."""
+class ClosedMap(NamedTuple):
+    """Coordinate and phase where Newton's method has ended, and the last gaps it has seen."""
+
+    unknowns: Float[Array, " 2"]
+    gaps: Float[Array, " 2"]
+
+
+def close_map(place: OrbitPlace, problem: OrbitProblem, steps: int, wanted: Bool[Array, ""]) -> ClosedMap:
+    """Return where steps of Newton's method towards the orbit of the map end: as many as it takes.
+
+    Args:
+        place: where to begin.
+        problem: what orbits are of.
+        steps: at most.
+        wanted: False: none at all.
+    """
 
     def twice(unknowns):
         value = map_gaps(unknowns, problem)
         return value, value
 
-    def improve(_, state):
-        unknowns = state[0]
-        slopes, value = jax.jacfwd(twice, has_aux=True)(unknowns)
-        longest = jnp.stack([unknowns[0] - problem.impact.lowest, jnp.ones_like(unknowns[1])]) * _LONGEST_STEP
-        step = -solved_pair([slopes[:, 0], slopes[:, 1]], value)
-        return unknowns + jnp.clip(step, -longest, longest), unknowns, value
+    def longest(unknowns):
+        return jnp.stack([unknowns[0] - problem.impact.lowest, jnp.ones_like(unknowns[1])])
 
-    # once more for the gaps at the end, because the map is compiled for every use of it
+    def unsettled(state):
+        count, unknowns, gaps, step = state
+        small = (jnp.abs(gaps) < _CLOSE) & (jnp.abs(step) < _CLOSE * longest(unknowns))
+        return wanted & (count < steps) & ~jnp.all(small)
+
+    def improve(state):
+        count, unknowns, _, _ = state
+        slopes, gaps = jax.jacfwd(twice, has_aux=True)(unknowns)
+        most = longest(unknowns) * _LONGEST_STEP
+        step = jnp.clip(-solved_pair([slopes[:, 0], slopes[:, 1]], gaps), -most, most)
+        return count + 1, unknowns + step, gaps, step
+
     first = jnp.stack(place)
-    return lax.fori_loop(0, steps + 1, improve, (first, first, jnp.zeros_like(first)))[1:]
+    far = jnp.full_like(first, jnp.inf)
+    _, unknowns, gaps, _ = lax.while_loop(unsettled, improve, (0, first, far, far))
+    return ClosedMap(unknowns, gaps)
 
 
 def instantaneous_quartic(problem: OrbitProblem) -> Float[Array, " 5"]:

@@ -5,14 +5,15 @@ corrections follow from the time courses of a Hertz contact and of a leaving tip
 the Hertz time tau = a u^(-1/5), the pull g away from the sample (the tip's acceleration against the platform) at mid
 contact and its change j, kappa = g tau/u and J = j tau^2/u:
 
-    duration              tau_d += (F(kappa) - 1) tau
+    duration              tau_d += (F(kappa) - 1 - 0.0393 (Omega tau)^2) tau
     indentation           its integral over time is H(kappa) u tau^2
     platform and spring   u_out^2 += 2 H(kappa) J u^2
     air damping           u_out^2 -= (10/9) (F(kappa) - 1.2 kappa H(kappa)) (Omega/Q) tau u^2
     lead                  a tip that leaves keeps its energy over a length, which acceleration makes it pass sooner
 
 F and H are those of a Hertz contact under a constant pull, x'' = -x^(3/2) - kappa/3.2181, x(0) = 0, x'(0) = 1, whose
-duration is 3.2181 F and whose integral of x is 3.2181^2 H; the energy that air takes follows from both (virial).
+duration is 3.2181 F and whose integral of x is 3.2181^2 H; the energy that air takes follows from both (virial). The
+spring, weak beside the contact, stiffens it and shortens it by the second of the terms.
 Higher orders in J, below 0.03 as a rule, count nothing. Orbits over a driven platform have amplitudes within about
 0.01 % of those of the full contact, within 1 % at twice the capture speed.
 """
@@ -62,6 +63,8 @@ _OVER = (
 """(F - 1)/kappa and H as quotients of polynomials in kappa, lowest power first (`tests/reference_hertz.py`)."""
 AIR = 10.0 / 9.0
 """Twice the integral of the squared speed over a Hertz contact, over tau u^2."""
+STIFFER = 3.9337034362e-02
+"""Share by which a spring of its own frequency Omega shortens a Hertz contact, over (Omega tau)^2."""
 BRIDGE_NM = 4.7
 """Length in nm over which a leaving tip keeps its energy, where nothing says it: the paper's bridge."""
 USUAL_LEAD = 1.3
@@ -475,7 +478,7 @@ def gained_and_longer(
     lasts, deep = hertz_under_pull(pull)
     air = AIR * (lasts - 1.2 * jnp.clip(pull, *PULLS) * deep)
     gained = 2.0 * (deep * change - air * cantilever.decay_rate * tau)
-    return gained * approach_speed**2, (lasts - 1.0) * tau
+    return gained * approach_speed**2, (lasts - 1.0 - STIFFER * (cantilever.angular_frequency * tau) ** 2) * tau
 
 
 def corrected(free: Speeds, middle: Middle, cantilever: Cantilever, impact: Impact) -> Speeds:

@@ -140,12 +140,19 @@ def _check_order(order: ArrayLike) -> None:
 def _single_impact_orbits(scene: Scene, frame: FreeFrame, order: Float[Array, ""]) -> SingleImpactOrbits:
     problem = OrbitProblem(scene.cantilever, frame.platform, LawImpact(impact_law_of(scene)), order)
     roots = find_roots(problem)
-    orbits = jax.vmap(_orbit, in_axes=(0, 0, None, None))(roots.place, roots.found & frame.periodic, frame, problem)
+    orbits = jax.vmap(orbit_at, in_axes=(0, 0, None, None))(roots.place, roots.found & frame.periodic, frame, problem)
     return eqx.tree_at(lambda result: result.complete, orbits, roots.complete)
 
 
-def _orbit(place: OrbitPlace, found: Bool[Array, ""], frame: FreeFrame, problem: OrbitProblem) -> SingleImpactOrbits:
-    """Return what there is to know about one root; NaN where there is none."""
+def orbit_at(place: OrbitPlace, found: Bool[Array, ""], frame: FreeFrame, problem: OrbitProblem) -> SingleImpactOrbits:
+    """Return what there is to know about one root; NaN where there is none.
+
+    Args:
+        place: the root.
+        found: whether it is one.
+        frame: of the scene.
+        problem: of the frame's platform.
+    """
     state = orbit_state(place, problem)
     verdict = judge(place, found, state, problem)
     flight, speeds = state.flight, state.speeds

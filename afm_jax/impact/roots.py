@@ -29,8 +29,8 @@ from afm_jax.impact.closure import (
 )
 from afm_jax.impact.lasting_impact import PulledImpact
 
-_MAX_STEPS = 200  # Newton needs about 10; bisection alone over the widest interval about 100
-_SETTLED = 1e-12  # the last relative step; Newton has squared it by then
+_MAX_STEPS = 200  # Laguerre's method needs about 5; bisection alone over the widest interval about 100
+_SETTLED = 1e-12  # the last relative step; it has been cubed by then
 
 
 def real_roots(
@@ -79,12 +79,15 @@ def _quadratic_roots(coefficients: Float[Array, " 3"], low, high):
 
 
 def _monotone_roots(coefficients, left: Float[Array, " m"], right: Float[Array, " m"]):
-    """Newton's method kept inside a shrinking bracket, on every interval at once."""
-    derivative = _derivative(coefficients)
+    """Laguerre's method kept inside a shrinking bracket, on every interval at once."""
+    degree = coefficients.shape[0] - 1
+    first_derivative = _derivative(coefficients)
+    second_derivative = _derivative(first_derivative)
     value_left, value_right = evaluate(coefficients, left), evaluate(coefficients, right)
     # A root on a knot belongs to the interval on its left; one on `low` itself to the first interval.
     first = jnp.arange(left.shape[0]) == 0
-    found = (value_left * value_right < 0.0) | ((value_right == 0.0) & (left < right)) | (first & (value_left == 0.0))
+    inside = value_left * value_right < 0.0
+    found = inside | ((value_right == 0.0) & (left < right)) | (first & (value_left == 0.0))
     rising = value_right > value_left
 
     def unsettled(state):
@@ -93,18 +96,21 @@ def _monotone_roots(coefficients, left: Float[Array, " m"], right: Float[Array, 
 
     def narrow(state):
         step, a, b, x, move = state
-        value, slope = evaluate(coefficients, x), evaluate(derivative, x)
+        value, slope = evaluate(coefficients, x), evaluate(first_derivative, x)
+        bend = evaluate(second_derivative, x)
         beyond = (value > 0.0) == rising
         a, b = jnp.where(beyond, a, x), jnp.where(beyond, x, b)
-        newton = -value / jnp.where(slope != 0.0, slope, 1.0)
-        # Bisect where Newton would leave the bracket or shrinks its steps by less than half.
-        slow = jnp.abs(2.0 * value) > jnp.abs(move * slope)
-        trusted = (x + newton > a) & (x + newton < b) & ~slow & (slope != 0.0)
-        move = jnp.where(trusted, newton, 0.5 * (a + b) - x)
-        move = jnp.where(found & (value != 0.0), move, 0.0)
+        square = (degree - 1) * ((degree - 1) * slope**2 - degree * value * bend)
+        divisor = slope + jnp.where(slope < 0.0, -1.0, 1.0) * jnp.sqrt(jnp.maximum(square, 0.0))
+        nearer = jnp.where(divisor != 0.0, -degree * value / jnp.where(divisor != 0.0, divisor, 1.0), jnp.inf)
+        # Bisect where a step would leave the bracket or is more than half the last; the last ones are rounding.
+        quick = (x + nearer >= a) & (x + nearer <= b) & (jnp.abs(2.0 * nearer) <= jnp.abs(move))
+        trusted = quick | (jnp.abs(nearer) <= _SETTLED * jnp.abs(x))
+        move = jnp.where(trusted, nearer, 0.5 * (a + b) - x)
+        move = jnp.where(inside & (value != 0.0), move, 0.0)
         return step + 1, a, b, x + move, move
 
-    width = jnp.where(found, right - left, 0.0)
+    width = jnp.where(inside, right - left, 0.0)
     _, _, _, root, _ = lax.while_loop(unsettled, narrow, (0, left, right, 0.5 * (left + right), width))
     root = jnp.where(first & (value_left == 0.0), left, jnp.where(value_right == 0.0, right, root))
     return jnp.where(found, root, right), found
@@ -112,10 +118,11 @@ def _monotone_roots(coefficients, left: Float[Array, " m"], right: Float[Array, 
 
 _LEAVING = 0.4
 """Share of the drive's period that a leaving tip may take to lose its energy: beyond, no law of impacts holds."""
-_REGULA_FALSI = 20
+_REGULA_FALSI, _BEFORE_NEWTON = 20, 10
+"""Steps towards a root of the scalar condition: to its last digit, and to where Newton's method goes on."""
 _SECTIONS = 16
 _GOLDEN = 0.6180339887498949
-_NEWTON = 5
+_NEWTON = 6
 _CLOSED = 1e-9
 """By how much a turn of the map may miss its start, in units of the drive: near a fold rounding leaves as much."""
 
@@ -164,18 +171,23 @@ def find_roots(problem: OrbitProblem, scan: Scan = FINE) -> OrbitRoots:
     driven = (problem.platform.amplitude_nm > 0.0) & (problem.platform.offset_rate_nm_per_us == 0.0)
     coordinate, found, complete = _scanned_roots(problem, scan) if problem.impact.delayed else _quartic_roots(problem)
     safe = jnp.where(found, coordinate, harmless_coordinate(problem))
-    place, there = jax.vmap(follow_root if problem.impact.lasts else _regular, in_axes=(0, None))(safe, problem)
+    if problem.impact.lasts:
+        place, there = jax.vmap(follow_root, in_axes=(0, None, 0))(safe, problem, found)
+    else:
+        place, there = jax.vmap(_regular, in_axes=(0, None))(safe, problem)
     found = found & driven & there
     return OrbitRoots(OrbitPlace(jnp.where(found, place.coordinate, safe), place.phase), found, complete)
 
 
 @jax.jit
-def follow_root(near: Float[Array, ""], problem: OrbitProblem) -> tuple[OrbitPlace, Bool[Array, ""]]:
-    """Return where the map of a lasting impact closes, close to a coordinate, and whether it does."""
+def follow_root(
+    near: Float[Array, ""], problem: OrbitProblem, wanted: Bool[Array, ""]
+) -> tuple[OrbitPlace, Bool[Array, ""]]:
+    """Return where the map of a lasting impact closes, close to a coordinate, and whether it does; if that is asked."""
     problem = lax.stop_gradient(problem)
     speeds, system = closure(near, problem)
-    unknowns, gaps = close_map(place_of(near, speeds, system, problem), problem, _NEWTON)
-    return OrbitPlace(*unknowns), system.regular & jnp.all(jnp.abs(gaps) < _CLOSED)
+    closed = close_map(place_of(near, speeds, system, problem), problem, _NEWTON, wanted)
+    return OrbitPlace(*closed.unknowns), system.regular & jnp.all(jnp.abs(closed.gaps) < _CLOSED)
 
 
 def harmless_coordinate(problem: OrbitProblem) -> Float[Array, ""]:
@@ -304,6 +316,7 @@ def _narrowed(crossings: _Brackets, dips: _Dips, problem: OrbitProblem) -> tuple
     count, turns = crossings.left.shape[0], dips.middle.shape[0]
     sign = jnp.sign(dips.middle)
     waits = jnp.arange(count + 2 * turns) >= count
+    illinois = _BEFORE_NEWTON if problem.impact.lasts else _REGULA_FALSI
 
     def pairs(middle, bottom) -> _Brackets:
         """Return the brackets to either side of the extrema."""
@@ -333,7 +346,7 @@ def _narrowed(crossings: _Brackets, dips: _Dips, problem: OrbitProblem) -> tuple
         either = jax.tree.map(
             lambda head, tail: jnp.concatenate([head[:count], tail]), brackets, pairs(points[0], value[count:][:turns])
         )
-        begun = jnp.where(waits, step > _SECTIONS, step < _REGULA_FALSI)
+        begun = jnp.where(waits, step > _SECTIONS, step < illinois)
         brackets = jax.tree.map(
             lambda new, found, old: jnp.where(begun, new, jnp.where(step == _SECTIONS, found, old)),
             closer,
@@ -344,6 +357,6 @@ def _narrowed(crossings: _Brackets, dips: _Dips, problem: OrbitProblem) -> tuple
 
     empty = jax.tree.map(lambda part: jnp.zeros((2 * turns,), part.dtype), dips.ends).kept(harmless)
     begin = jax.tree.map(lambda head, tail: jnp.concatenate([head, tail]), crossings.kept(harmless), empty)
-    steps = _SECTIONS + 1 + _REGULA_FALSI
+    steps = _SECTIONS + 1 + illinois
     brackets, _ = lax.fori_loop(0, steps, narrow, (begin, (dips.ends.left, dips.ends.right)))
     return brackets.left, brackets.real

@@ -29,6 +29,8 @@ LONGEST = 32
 """Most contacts that a response may have before it counts as broadband."""
 _REPETITIONS = 6
 """Repetitions in each of the two blocks whose comparison gives the rate of approach."""
+_BOTH = 2.0
+"""Two departures of a motion that tends to one are as far apart as each is from it, together."""
 ROUNDING = 1e-8
 """Distance below which a block has arrived, its rate being rounding; not of the tolerance, lest slow motion passes."""
 _LAST_SHARE = 0.2
@@ -84,7 +86,8 @@ def find_repetition(
 
     Two departures m contacts apart differ by a velocity and a phase. Their distance e is the largest over a block of
     six repetitions; from the block before, q = (e/e_before)^(1/6) is the rate per repetition, and e q/(1 - q) what is
-    left of the geometric series. A block takes a maximum because distances oscillate where an approach spirals.
+    left of the geometric series. A block takes a maximum because distances oscillate where an approach spirals. What
+    repeats after a part of the m contacts, to within twice what is left, repeats after that part.
 
     Args:
         times_us: when each contact ended, in order.
@@ -146,6 +149,12 @@ def find_repetitions(
         chosen = left[repeats]
         found.contacts[chosen], found.periods[chosen] = contacts, periods[repeats]
         found.remaining[chosen] = remaining[repeats]
+        for fewer in (part for part in range(1, contacts) if contacts % part == 0 and chosen.size):
+            # what dies away as it turns comes back after some rounds, long before one round is as near
+            periods, distance = _steps(turns[chosen, last], velocities[chosen, last], fewer)
+            within = distance[:, -repeated * fewer :].max(axis=1) <= _BOTH * found.remaining[chosen]
+            found.contacts[chosen[within]], found.periods[chosen[within]] = fewer, periods[within]
+            chosen = chosen[~within]
         left = left[~repeats]
     return found
 

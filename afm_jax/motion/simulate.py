@@ -60,7 +60,9 @@ def simulate(  # noqa: PLR0913
         max_contacts: most contacts (impacts) there is room for, a plain integer that shapes the result; None: a power
             of two, enough for the duration, which must then be a number. A motion with more (chatter with r close to 1)
             is then followed once more with room for them, outside `jit` and `vmap` up to a million.
-        accuracy: of each resolved contact: relative of the rebound speed, a tenth of it in us of the times.
+        accuracy: of each resolved contact: relative of the rebound speed, a tenth of it in us of the times. Of 512
+            random contacts from the capture speed on all hold it at 1e-3, 97 % at 1e-6, 96 % at 1e-9, 81 % at 1e-11;
+            what turns in the bridge or hardly leaves is up to 500 times as far off.
         method: the way through a resolved contact: "collocation" (leg by leg, and in time where a tip turns in the
             bridge or is held) or "diffrax" (in time throughout, by Diffrax's Dopri8; some ten times slower).
         reverse: make it differentiable in reverse mode, in memory that grows with the square root of the length.

@@ -8,8 +8,9 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from afm_jax.dynamics.continuation import Continuation, OrbitBranch, SpecialPoint
+from afm_jax.dynamics.continuation import Continuation
 from afm_jax.dynamics.impact_orbits import is_stable, multipliers_of
+from afm_jax.dynamics.special_points import OrbitBranch, SpecialPoint
 from afm_jax.plots.dynamics import label_of
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save
 from afm_jax.units import TWO_SIDED_95
@@ -20,6 +21,7 @@ _MARKS = {
     "torus": ("D", "#CC79A7"),
     "grazing": ("^", "#56B4E9"),
     "capture": ("v", DARK),
+    "rest_lost": ("P", "#D55E00"),
 }
 """Shape and colour of each kind: either tells them apart (colours of Okabe and Ito)."""
 
@@ -74,7 +76,8 @@ def continuation_figure(
             label=_once(point.kind.replace("_", " "), labels),
         )
     label_axes(axes, x=label_of(found.range.path), y="peak amplitude (nm)")
-    axes.set_title(f"({found.impacts}, {found.order}) orbits", fontsize=12, loc="left")
+    what = f"orbits with a rest, N = {found.order}" if found.sticking else f"({found.impacts}, {found.order}) orbits"
+    axes.set_title(what, fontsize=12, loc="left")
     axes.grid(color=GRID, alpha=0.25)
     axes.margins(x=0.02)
     if labels:

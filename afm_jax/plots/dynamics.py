@@ -52,7 +52,11 @@ def label_of(path: str) -> str:
 
 
 def draw_exponents(
-    path: str, values: Float[np.ndarray, " values"], exponents: Float[np.ndarray, "values 2"], target: Path
+    path: str,
+    values: Float[np.ndarray, " values"],
+    exponents: Float[np.ndarray, "values 2"],
+    target: Path,
+    band: Float[np.ndarray, "values 2"] | None = None,
 ) -> None:
     """Draw both Lyapunov exponents per impact against a parameter; where they are minus infinity there is a tick below.
 
@@ -61,10 +65,14 @@ def draw_exponents(
         values: of the parameter.
         exponents: per impact.
         target: PNG, PDF or SVG file.
+        band: within which 95 % of the larger one's draws lie.
     """
     figure = new_figure(9.0, 4.8)
     axes: Axes = figure.subplots()
     size = max(0.5, min(3.0, 3000.0 / len(values)))
+    if band is not None:
+        finite = np.where(np.isfinite(band), band, np.nan)
+        axes.fill_between(values, finite[:, 0], finite[:, 1], color=ACCENT, alpha=0.25, linewidth=0.0)
     axes.plot(values, exponents[:, 1], ".", ms=size, color=BLUE, label="smaller exponent", rasterized=True)
     axes.plot(values, exponents[:, 0], ".", ms=size, color=ACCENT, label="larger exponent", rasterized=True)
     finite = exponents[np.isfinite(exponents)]
@@ -83,13 +91,19 @@ def draw_exponents(
     save(figure, target)
 
 
-def draw_bifurcations(path: str, sweeps: Sequence[Sweep], target: Path) -> None:
+def draw_bifurcations(
+    path: str,
+    sweeps: Sequence[Sweep],
+    target: Path,
+    probabilities: Sequence[Float[np.ndarray, " values"]] | None = None,
+) -> None:
     """Draw a bifurcation diagram: height at impact, and the tip's height whenever the platform is highest.
 
     Args:
         path: of the parameter.
         sweeps: up, down or both; where both are, the one down lies over the one up.
         target: PNG, PDF or SVG file.
+        probabilities: of each sweep's verdicts; where one is below 95 % there is a grey ground.
     """
     figure = new_figure(9.0, 8.0)
     panels = figure.subplots(2, 1, sharex=True)
@@ -101,6 +115,10 @@ def draw_bifurcations(path: str, sweeps: Sequence[Sweep], target: Path) -> None:
             at = np.repeat(sweep.values, there.sum(axis=1))
             style = {"ms": max(1.0, min(3.0, 1500.0 / len(sweep.values))), "alpha": 0.5, "rasterized": True}
             axes.plot(at, part[there], ".", color=colour, mew=0.0, label=word, **style)
+    for sweep, sure in zip(sweeps, probabilities or (), strict=False):
+        for axes in panels:
+            ground = axes.get_xaxis_transform()
+            axes.fill_between(sweep.values, 0.0, 1.0, where=sure < 0.95, color=GRID, alpha=0.3, lw=0, transform=ground)
     label_axes(panels[0], x="", y="height at impact (nm)")
     label_axes(panels[1], x=label_of(path), y="height when the platform\nis highest (nm)")
     panels[0].set(xlim=(sweeps[0].values[0], sweeps[0].values[-1]))
@@ -113,18 +131,30 @@ def draw_bifurcations(path: str, sweeps: Sequence[Sweep], target: Path) -> None:
     save(figure, target)
 
 
-def draw_chart(x: str, y: str, chart: StabilityChart, target: Path) -> None:
+def draw_chart(
+    x: str,
+    y: str,
+    chart: StabilityChart,
+    target: Path,
+    probability: Float[np.ndarray, "orders points"] | None = None,
+) -> None:
     """Write a chart of stable single-impact orbits over two parameters, whose paths are given, as PNG, PDF or SVG."""
-    save(chart_figure(chart, label_of(x), label_of(y)), target)
+    save(chart_figure(chart, label_of(x), label_of(y), probability), target)
 
 
-def chart_figure(chart: StabilityChart, x: str = "first parameter", y: str = "second parameter") -> Figure:
+def chart_figure(
+    chart: StabilityChart,
+    x: str = "first parameter",
+    y: str = "second parameter",
+    probability: Float[np.ndarray, "orders points"] | None = None,
+) -> Figure:
     """Return a picture of a chart: the lowest stable order, and how stable its orbit is.
 
     Args:
         chart: the chart.
         x: what its columns are.
         y: what its rows are.
+        probability: that an orbit of each order is stable; dashed where that of one is 2.5 or 97.5 %.
     """
     figure = new_figure(12.0, 5.2)
     left, right = figure.subplots(1, 2, sharex=True, sharey=True)
@@ -141,6 +171,10 @@ def chart_figure(chart: StabilityChart, x: str = "first parameter", y: str = "se
     if several.any() and not several.all():
         left.contour(chart.x_values, chart.y_values, several, levels=[0.5], colors="black", linewidths=0.6)
     left.set_title("lowest stable order (black line: several coexist)", fontsize=12)
+    for row in () if probability is None else probability.reshape(stable.shape):
+        if row.min() < row.max():
+            style = {"colors": DARK, "linewidths": 0.8, "linestyles": "dashed"}
+            left.contour(chart.x_values, chart.y_values, row, levels=[0.025, 0.975], **style)
     sizes = chart.verdicts.largest_multiplier.reshape(stable.shape)
     lowest_size = np.take_along_axis(sizes, np.maximum(lowest - 1, 0)[None], axis=0)[0]
     mesh = right.pcolormesh(*edges, lowest_size, cmap="cividis", vmin=0.0, vmax=1.0, rasterized=True)

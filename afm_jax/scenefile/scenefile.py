@@ -282,12 +282,12 @@ def check_start(start: Start, scene: Scene) -> None:
 
 
 def _check_leaves(start: Start, platform: Platform) -> None:
-    """Check that a tip on the platform moves away from it."""
+    """Check that a tip on the platform does not move into it; one at rest on it rides until the platform lets go."""
     time_us = start.phase_deg / 360.0 * float(platform.period_us)
     moving = float(platform.velocity(time_us))
-    if start.velocity_nm_per_us <= moving:
+    if start.velocity_nm_per_us < moving:
         raise ValueError(
-            f"`velocity_nm_per_us` must be above the platform's {moving:.6g} where the tip starts on it, but is "
+            f"`velocity_nm_per_us` must not be below the platform's {moving:.6g} where the tip starts on it, but is "
             f"{start.velocity_nm_per_us:.6g}: start faster or higher"
         )
 
@@ -342,7 +342,7 @@ def load_start(path: str | os.PathLike[str]) -> Start | None:
 def load_scene_and_start(path: str | os.PathLike[str]) -> tuple[Scene, Start | None]:
     """Return what `load_scene` and `load_start` return, from one reading of the file."""
     source = os.fspath(path)
-    tables = _checked(_parsed(source), source)
+    tables = _checked(read_toml(source), source)
     scene = _scene_of(tables)
     return scene, _start_of(tables, scene)
 
@@ -441,7 +441,12 @@ def _checked(contents: Mapping[str, Any], source: str) -> dict[str, SceneTable]:
     return tables
 
 
-def _parsed(source: str) -> dict[str, Any]:
+def read_toml(source: str) -> dict[str, Any]:
+    """Return the contents of a TOML file.
+
+    Raises:
+        SceneError: if it cannot be read, or is no TOML.
+    """
     where = printable(source)
     try:
         # a byte order mark, as some editors write, is no part of the text

@@ -11,21 +11,18 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jax.sharding import Mesh, PartitionSpec
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array
 
 from afm_jax.apparatus.scene import Scene, drive_of
+from afm_jax.apparatus.surface import free_frame
 from afm_jax.contact.collide import collide
 from afm_jax.contact.contact import Contact
+from afm_jax.dynamics.charts import highest_orbits
 from afm_jax.dynamics.exponents import exponents_of_law
-from afm_jax.dynamics.iteration import LANES, leaving_tips, require_drive
+from afm_jax.dynamics.iteration import LANES, leaving_tips, sample_driven
 from afm_jax.dynamics.verdicts import MotionKind
-from afm_jax.impact.closure import OrbitPlace, OrbitProblem
-from afm_jax.impact.lasting_impact import LawImpact
 from afm_jax.impact.law import impact_law_of
-from afm_jax.impact.orbits import amplitudes, judge, orbit_state
-from afm_jax.impact.roots import find_roots
 from afm_jax.motion.observe import observe
 from afm_jax.motion.record import MotionOutcome
 from afm_jax.motion.settle import follow_long
@@ -157,14 +154,11 @@ _ORBIT_VARIABLES = (
     Variable("velocity_after_nm_per_us", "velocity in the lab just after the impact", dimensions=("order",)),
     Variable("largest_multiplier", "size of the larger multiplier of the map", dimensions=("order",), unit="1"),
 )
-_OF_AN_ORBIT = tuple(variable.name for variable in _ORBIT_VARIABLES if variable.dtype == "float64")
-_ORBITS_AT_ONCE = 4
-"""Blocks of roots are this many times smaller than blocks of scenes: few scenes have more than one."""
 
 
 def _orbits(scene: Scene, paths: tuple[str, ...], *, orders: tuple[int, ...]) -> Recorder:
     """Record the stable single-impact orbits of law scenes; of several of one order the highest."""
-    require_drive(scene)
+    sample_driven(scene)
     law = impact_law_of(scene)
     for path in paths:
         if path.endswith("offset_rate_nm_per_us"):
@@ -173,63 +167,10 @@ def _orbits(scene: Scene, paths: tuple[str, ...], *, orders: tuple[int, ...]) ->
 
     def record(columns: Columns) -> dict[str, Array]:
         scenes = made(columns)
-        found = [_orbits_of(scenes, jnp.asarray(float(order))) for order in orders]
-        return {name: jnp.stack([each[name] for each in found], axis=1) for name in found[0]}
+        return highest_orbits(scenes, free_frame(scenes), jnp.asarray(orders, float))
 
     points = 4096 if law.delay else 65536
     return Recorder(_ORBIT_VARIABLES, over_devices(record), points, {"order": [float(order) for order in orders]})
-
-
-@jax.jit
-def _orbits_of(scenes: Scene, order: Float[Array, ""]) -> dict[str, Array]:
-    """Return what is recorded of a block of scenes at one order."""
-
-    def problem_of(scene: Scene) -> OrbitProblem:
-        return OrbitProblem(scene.cantilever, scene.platform, LawImpact(impact_law_of(scene)), order)
-
-    def orbit_at(place: OrbitPlace, row: Int[Array, ""]) -> tuple[Array, Array, Array]:
-        problem = problem_of(jax.tree.map(lambda leaf: leaf[row], scenes))
-        state = orbit_state(place, problem)
-        verdict = judge(place, jnp.ones((), bool), state, problem)
-        peak, lockin, angle = amplitudes(place, problem)
-        half, determinant = 0.5 * jnp.abs(verdict.trace), verdict.determinant
-        inside = half**2 - determinant
-        # a pair on a circle has the root of the determinant for its size
-        pair = jnp.sqrt(jnp.abs(determinant))
-        size = jnp.where(inside > 0.0, half + jnp.sqrt(jnp.where(inside > 0.0, inside, 1.0)), pair)
-        numbers = [peak, lockin, angle, state.speeds.approach, state.phase, state.flight.start_velocity, size]
-        return verdict.admissible, verdict.admissible & verdict.stable, jnp.stack(numbers)
-
-    roots = jax.vmap(lambda scene: find_roots(problem_of(scene)))(scenes)
-    count, slots = roots.found.shape
-    places = jax.tree.map(lambda part: part.ravel(), roots.place)
-    rows = jnp.arange(count * slots) // slots
-    nothing = (jnp.zeros(count * slots, bool),) * 2 + (jnp.full((count * slots, len(_OF_AN_ORBIT)), jnp.nan),)
-    few = max(count // _ORBITS_AT_ONCE, 1)
-    known = _for_those(orbit_at, roots.found.ravel(), (places, rows), nothing, few=few)
-    admissible, steady, numbers = (part.reshape(count, slots, *part.shape[1:]) for part in known)
-    highest = jnp.argmax(jnp.where(steady, numbers[..., 0], -jnp.inf), axis=1)
-    chosen = jnp.take_along_axis(numbers, highest[:, None, None], axis=1)[:, 0]
-    chosen = jnp.where(steady.any(axis=1)[:, None], chosen, jnp.nan)
-    counts = {
-        "stable_orbits": steady.sum(axis=1, dtype=jnp.int8),
-        "admissible_orbits": admissible.sum(axis=1, dtype=jnp.int8),
-    }
-    return counts | {name: chosen[:, column] for column, name in enumerate(_OF_AN_ORBIT)}
-
-
-def _for_those(work: Callable[..., Any], needed: Array, arguments: tuple[Any, ...], results: Any, *, few: int) -> Any:
-    """Return results with those of work on the rows that need it: gathered, some at a time, a loop for all."""
-    rows = needed.shape[0]
-
-    def some(state):
-        left, found = state
-        chosen = jnp.nonzero(left, size=few, fill_value=rows)[0]
-        new = jax.vmap(work)(*jax.tree.map(lambda leaf: leaf.at[chosen].get(mode="clip"), arguments))
-        found = jax.tree.map(lambda old, part: old.at[chosen].set(part, mode="drop"), found, new)
-        return left.at[chosen].set(False, mode="drop"), found
-
-    return lax.while_loop(lambda state: jnp.any(state[0]), some, (needed, results))[1]
 
 
 # --- collisions -------------------------------------------------------------------------------------------------------
@@ -289,14 +230,16 @@ _EXPONENT_VARIABLES = (
 
 def _lyapunov(scene: Scene, paths: tuple[str, ...], *, impacts: int, transient: int) -> Recorder:
     """Record the exponents of motions of law scenes that begin by leaving the platform upward."""
-    require_drive(scene)
+    sample_driven(scene)
     impact_law_of(scene)
     made = jax.jit(_scenes(scene, paths))
 
     def work(columns: Columns) -> Columns:
         count = len(next(iter(columns.values())))
         width = LANES * -(-count // LANES)
-        scenes = made({name: jnp.asarray(_filled(column, width)) for name, column in columns.items()})
+        scenes = sample_driven(
+            made({name: jnp.asarray(_filled(column, width)) for name, column in columns.items()})
+        ).scenes
         found = exponents_of_law(scenes, leaving_tips(scenes), impacts=impacts, transient=transient)
         verdicts = found.verdicts
         known = {name: getattr(found, name) for name in (*_EXPONENTS, "impacts")}

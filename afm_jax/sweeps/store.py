@@ -50,6 +50,8 @@ class SweepStore:
         """Take the store of a folder; see `open_store`."""
         self.folder, self.plan = folder, plan
         self._group = zarr.open_group(str(folder / STORE), mode="r+", use_consolidated=False)
+        # opened once: that takes as long as a chunk's writing
+        self._arrays: dict[str, zarr.Array] = {}
 
     def kept(self) -> Kept:
         """Return which chunks are done, every byte of them looked at."""
@@ -83,9 +85,11 @@ class SweepStore:
         return self.folder / _MARKERS / f"{chunk}.json"
 
     def _array(self, name: str) -> zarr.Array:
-        found = self._group[name]
-        assert isinstance(found, zarr.Array)  # as it was made  # noqa: S101
-        return found
+        if name not in self._arrays:
+            found = self._group[name]
+            assert isinstance(found, zarr.Array)  # as it was made  # noqa: S101
+            self._arrays[name] = found
+        return self._arrays[name]
 
     def _files(self, chunk: int) -> dict[str, Path]:
         place = self.plan.place(chunk)

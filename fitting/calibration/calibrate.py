@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import median_filter, uniform_filter1d
-from scipy.special import chdtrc, digamma
+from scipy.special import digamma
 
 from afm_jax.checks import require_float64
 from afm_jax.version import version_of
@@ -23,6 +23,7 @@ from fitting.calibration.verdict import (
     runs_excess,
 )
 from fitting.fits.intervals import Interval, profile_intervals
+from fitting.fits.least_squares import chi2_tail
 from fitting.tables.csv_text import TableError
 
 _PACKAGES = ("afm-jax", "jax", "optax", "numpy")
@@ -176,7 +177,7 @@ def _summary(sweep: ResonanceSweep, fit: SweepFit, background: str, alternatives
     judged = fit.errors.origin != "estimated" and fit.errors.scale is None
     # the mean of a term of the gamma deviance is a little above 1
     size = 2.0 * sweep.averages * (np.log(sweep.averages) - digamma(sweep.averages)) if sweep.averages else 1.0
-    p_value = float(chdtrc(fit.freedom, fit.chi2 / size)) if judged else float("nan")
+    p_value = chi2_tail(fit.chi2 / size, fit.freedom) if judged else float("nan")
     explained = not p_value < IMPROBABLE
     frequency, quality_factor = _calibrated(fit, explained=explained)
     kind, curves = fit.objective.kind, _curves(sweep, fit)

@@ -3,9 +3,11 @@
 The belief that a fit leaves: its values, its covariance, and the drives that were measured.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import compress
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +18,7 @@ from afm_jax.results import public_result
 from fitting.fits.result import FitResult
 from fitting.models import Problem
 from fitting.parameters import (
+    MODELS,
     NUISANCE_NAMES,
     PARAMETERS,
     SHAPE_NAMES,
@@ -23,6 +26,8 @@ from fitting.parameters import (
     model_parameters,
     paper_values,
 )
+from fitting.tables.csv_text import TableError, printable, read_fit_json
+from fitting.tables.table import DRIVES
 
 UNCERTAINTY = 0.1
 """How far a belief is off, relative, where no measurement says."""
@@ -106,6 +111,7 @@ def believe(  # noqa: PLR0913
     fixed: Mapping[str, float] | None = None,
     effects: Sequence[str] = EFFECTS,
     uncertainty: float = UNCERTAINTY,
+    drive: str = "sample",
 ) -> Belief:
     """Return a belief made of values, before anything was measured.
 
@@ -121,20 +127,23 @@ def believe(  # noqa: PLR0913
         fixed: values of others of the model's parameters.
         effects: for "contact": the effects there are.
         uncertainty: how far the values may be off, relative (0.1 stands for 10 %).
+        drive: what is driven: "sample", "force" (on the tip) or "base".
 
     Raises:
         ValueError: if a name or value is impossible.
     """
+    if drive not in DRIVES:
+        raise ValueError(f"`drive` must be one of {', '.join(DRIVES)}, but is {drive!r}")
     own = model_parameters(model, None if free is None else tuple(free), fixed)
     known = {name: (float(value), float(error)) for name, (value, error) in (constraints or {}).items()}
-    _check_constraints(model, own, known)
+    _check_constraints(model, own, known, drive)
     given = dict(values or {})
     for name in given:
         if name not in own:
             raise ValueError(f"`values` names {name!r}, but the model {model!r} has {', '.join(own)}")
     if not 0.0 < uncertainty < 1.0:
         raise ValueError(f"`uncertainty` must be between 0 and 1, but is {uncertainty!r}; write 0.1 for 10 %")
-    problem = Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in known), tuple(effects))
+    problem = Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in known), tuple(effects), drive)
     assumed = [name for name in own if name not in given and name not in known]
     start = paper_values(model) | {name: value for name, (value, _) in known.items()} | given
     return Belief(
@@ -152,14 +161,14 @@ def believe(  # noqa: PLR0913
     )
 
 
-def _check_constraints(model: str, own: tuple[str, ...], known: Mapping[str, tuple[float, float]]) -> None:
+def _check_constraints(model: str, own: tuple[str, ...], known: Mapping[str, tuple[float, float]], drive: str) -> None:
     for name, (value, error) in known.items():
         if name not in (*own, *NUISANCE_NAMES):
             choice = ", ".join((*own, *NUISANCE_NAMES))
             raise ValueError(f"`constraints` names {name!r}, which is none of {choice}")
         if not (np.isfinite(value) and 0.0 < error < np.inf):
             raise ValueError(f"the constraint on {name} must be a value and a positive error, not {value} +- {error}")
-    if "offset_origin_nm" in known and model.endswith("+delay"):
+    if "offset_origin_nm" in known and model.endswith("+delay") and drive == "sample":
         raise ValueError(
             "offset_origin_nm and delay_offset_nm shift the same thing: with a delay leave the error of the offsets' "
             "origin out, or take the model 'contact'"
@@ -195,6 +204,29 @@ def _assumptions(
     return tuple(notes)
 
 
+def read_belief(path: str | Path, uncertainty: float = UNCERTAINTY) -> tuple[Belief, dict[str, Any]]:
+    """Return the belief that a saved fit leaves, and the fit's own object.
+
+    Args:
+        path: what `afm-jax fit --json` prints, or the fit.json of its report.
+        uncertainty: how far values may be off, relative, where the fit does not say.
+
+    Raises:
+        TableError: if the file cannot be read, or is no fit.
+    """
+    payload = read_fit_json(path)
+    try:
+        return belief_of_fit(payload, uncertainty), payload
+    except ValueError as error:
+        raise TableError(f"{printable(str(path))}: {error}") from error
+
+
+def _columns_of(drive: str | None) -> tuple[str, str, str, str]:
+    """Return the columns that say how a table's rows were driven."""
+    amplitude = "drive_amplitude_nm" if drive in (None, "sample") else "free_amplitude_nm"
+    return "order", "drive_frequency_khz", amplitude, "offset_nm"
+
+
 def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNCERTAINTY) -> Belief:
     """Return the belief that a fit leaves: its values, its covariance, and the drives that it used.
 
@@ -207,13 +239,19 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
     """
     payload = result.to_dict() if isinstance(result, FitResult) else result
     _check_payload(payload)
-    table, settings = payload["input"], payload.get("settings") or {}
+    settings, tables = payload.get("settings") or {}, payload["input"].get("tables") or [payload["input"]]
+    # of several tables the first one's cantilever is designed with
+    table, drive = tables[0], tables[0].get("drive") or "sample"
+    driven = [one for one in tables if (one.get("drive") or "sample") == drive]
     # the shapes of loss and delay are known beforehand, not to be determined: what they do to the others stays
     kept = [name not in SHAPE_NAMES for name in payload["parameters"]]
     found = dict(compress(payload["parameters"].items(), kept))
     matrix = [list(compress(row, kept)) for row in compress(payload["correlations"]["matrix"], kept)]
-    problem = Problem(payload["model"], tuple(found), tuple(settings.get("effects") or EFFECTS))
-    columns = ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")
+    # amplitudes are expected of a law without shapes
+    believed = {name: entry["value"] for name, entry in found.items()} | (payload.get("plain_law") or {}).get(
+        "values", {}
+    )
+    problem = Problem(payload["model"], tuple(found), tuple(settings.get("effects") or EFFECTS), drive)
     notes = []
     if not payload["valid"]:
         reason = " ".join(payload.get("reasons") or ["no reason given."])
@@ -222,7 +260,7 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
         notes.append(EXACT_QUALITY_FACTOR)
     return Belief(
         problem=problem,
-        values=checked_values(problem, {name: entry["value"] for name, entry in found.items()}),
+        values=checked_values(problem, believed),
         information=_information(found, matrix),
         free_frequency_khz=float(table["free_frequency_khz"]),
         quality_factor=table.get("quality_factor"),
@@ -234,7 +272,7 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
             for name, entry in found.items()
             if entry.get("constraint")
         },
-        measured=np.array([table[name] for name in columns], float).T,
+        measured=np.array([[place for one in driven for place in one[name]] for name in _columns_of(drive)], float).T,
         source=f"fit of {table.get('source', 'a table')}",
         notes=tuple(notes),
     )
@@ -264,6 +302,32 @@ def _check_payload(payload: Mapping[str, Any]) -> None:
     for key in ("model", "parameters", "correlations", "input", "valid"):
         if key not in payload:
             raise ValueError(f"the saved fit lacks {key!r}; write it again with `afm-jax fit TABLE.csv --json`")
+    if payload["model"] not in MODELS:
+        raise ValueError(f"the saved fit has the unknown model {payload['model']!r}; fit the table again")
     for name in payload["parameters"]:
         if name not in PARAMETERS:
             raise ValueError(f"the saved fit has the unknown parameter {name!r}; fit the table again")
+    if not _is_whole(payload):
+        raise ValueError("the saved fit's parameters, correlations or drives are damaged; fit the table again")
+
+
+def _is_whole(payload: Mapping[str, Any]) -> bool:
+    """Say whether a saved fit has the numbers that belief rests on, as many as it should."""
+    try:
+        entries = [(entry["value"], entry["standard_error"] or 0.0) for entry in payload["parameters"].values()]
+        matrix = [[np.nan if c is None else c for c in row] for row in payload["correlations"]["matrix"]]
+        tables = payload["input"].get("tables") or [payload["input"]]
+        columns = [
+            [column for name in _columns_of(table.get("drive")) if (column := table[name]) is not None]
+            for table in tables
+        ]
+        drives = all(np.array(of_one, float).ndim == 2 for of_one in columns)
+        whole = np.isfinite([number for entry in entries for number in entry]).all()
+        if (plain := payload.get("plain_law")) is not None:
+            spread = np.array(plain["covariance"], float)
+            whole &= bool(np.isfinite([*plain["values"].values(), *spread.ravel()]).all())
+            whole &= {*plain["values"]} <= {*payload["parameters"]} and spread.shape == (len(plain["values"]),) * 2
+        known = all(math.isfinite(table["free_frequency_khz"]) for table in tables)
+        return bool(whole) and known and drives and np.array(matrix, float).shape == (len(entries), len(entries))
+    except (AttributeError, KeyError, TypeError, ValueError):
+        return False

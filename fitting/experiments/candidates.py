@@ -7,11 +7,15 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Bool, Float, Int, Shaped
 
-from fitting.experiments.belief import Belief
-from fitting.fits.minimum import strain_of
+from fitting.experiments.belief import Belief, size_of
+from fitting.fits.fit import speed_range
+from fitting.fits.least_squares import covariance_of
+from fitting.fits.minimum import padding, strain_of
 from fitting.fits.objective import BATCH, Objective
+from fitting.fits.unmodelled import Unmodelled, rows_of_fit, step_of
+from fitting.forward import ImpactSlopes
 from fitting.models import Measurement, measurement_of
 from fitting.simulated.experiment import Drives
 from fitting.tables.table import AmplitudeTable
@@ -21,10 +25,12 @@ MOST = 20_000
 MARGIN = 0.05
 """Uncertainty of every parameter, relative to its size (the loss, for r), that an orbit must bear however well the law
 seems to be known: a law is none of a real contact to better than that where its orbits end."""
+PHASE_NOISE_DEG = 0.2
+"""Standard error of a lag, where nothing is said of it."""
 Numbers = Sequence[int | float] | Shaped[np.ndarray, " n"]
 
 
-def drive_grid(
+def drive_grid(  # noqa: PLR0913
     *,
     orders: Numbers,
     amplitudes_nm: Numbers,
@@ -32,16 +38,22 @@ def drive_grid(
     frequencies_khz: Numbers | None = None,
     detunings: Numbers | None = None,
     free_frequency_khz: float | None = None,
+    drive: str = "sample",
+    heights: Numbers | None = None,
 ) -> Drives:
     """Return every combination of what can be driven, each once.
 
     Args:
-        orders: N, drive periods per impact.
-        amplitudes_nm: of the platform.
+        orders: N, drive periods per impact; 1 where the cantilever is driven itself.
+        amplitudes_nm: of the platform; of the free tip where that is driven.
         offsets_nm: mean heights of the platform above the tip's rest position.
         frequencies_khz: of the drive, the same for every order; or
-        detunings: drive frequencies as multiples of each order's resonance 2 N f0, with
+        detunings: drive frequencies as multiples of each order's resonance 2 N f0 (of f0 where the cantilever is driven
+            itself), with
         free_frequency_khz: f0.
+        drive: what is driven: "sample", "force" (on the tip) or "base".
+        heights: in place of the offsets, distances of the sample from the rest position of a tip that is driven itself,
+            as shares of its free amplitude: 0.9 is where it begins to tap.
 
     Raises:
         ValueError: if a list is empty or a number impossible, not exactly one of both kinds of frequency is given, or
@@ -52,6 +64,15 @@ def drive_grid(
         raise ValueError(f"`orders` must hold whole numbers, but is {list(orders)}")
     _check_list("amplitudes_nm", amplitudes_nm, positive=True)
     _check_list("offsets_nm", offsets_nm, positive=False)
+    resonance = 2.0
+    if drive != "sample":
+        if any(order != 1 for order in orders):
+            raise ValueError(f"`orders` must be 1 where the {drive} is driven, but is {list(orders)}")
+        resonance = 1.0
+    if heights is not None:
+        if drive == "sample":
+            raise ValueError("`heights` are shares of a free amplitude: give `offsets_nm` where the sample is driven")
+        _check_list("heights", heights, positive=False)
     if (frequencies_khz is None) == (detunings is None):
         raise ValueError("give either `frequencies_khz` or `detunings`, what the drive frequency can be")
     for name, numbers in (("frequencies_khz", frequencies_khz), ("detunings", detunings)):
@@ -60,9 +81,9 @@ def drive_grid(
     rows = [
         (order, frequency, amplitude, offset)
         for order in map(int, orders)
-        for frequency in _frequencies(order, frequencies_khz, detunings, free_frequency_khz)
+        for frequency in _frequencies(resonance * order, frequencies_khz, detunings, free_frequency_khz)
         for amplitude in amplitudes_nm
-        for offset in offsets_nm
+        for offset in (offsets_nm if heights is None else [round(-height * amplitude, 6) for height in heights])
     ]
     rows = list(dict.fromkeys((order, *map(float, rest)) for order, *rest in rows))
     if len(rows) > MOST:
@@ -83,7 +104,7 @@ def _key(row: Sequence[int | float]) -> tuple[float, ...]:
 
 
 def _frequencies(
-    order: int,
+    resonance: float,
     frequencies_khz: Numbers | None,
     detunings: Numbers | None,
     free_frequency_khz: float | None,
@@ -93,7 +114,7 @@ def _frequencies(
     if free_frequency_khz is None:
         raise ValueError("`detunings` need `free_frequency_khz`, the cantilever's resonance")
     # Rounded to what an instrument is told: a thousandth of a hertz.
-    return [round(2.0 * order * free_frequency_khz * detuning, 6) for detuning in detunings]
+    return [round(resonance * free_frequency_khz * detuning, 6) for detuning in detunings]
 
 
 def _check_list(name: str, numbers: Numbers, *, positive: bool) -> None:
@@ -113,7 +134,7 @@ LEFT_OUT = {
     "fold": "near a fold, where the orbit ends and has no derivative",
     "unsure": "no single steady orbit for some of the values that the belief, or a law's own misfit, allows",
     "too large": "amplitudes above what the instrument takes",
-    "strained": "impacts too slow for the model: a fit sets such rows aside",
+    "strained": "impacts too slow, or too strongly pulled, for the model: a fit sets such rows aside",
 }
 """Why a drive is no candidate, in words."""
 
@@ -125,18 +146,19 @@ class Candidates:
     Attributes:
         drives: all that can be driven.
         why_not: a key of `LEFT_OUT` for each drive; empty for those that can be planned with.
-        amplitude_nm: expected peak and lock-in amplitude, shape (rows, 2).
+        amplitude_nm: expected peak and lock-in amplitude, shape (rows, 2); of a cantilever that is driven itself
+            its lag in degrees too, shape (rows, 3).
         error_nm: standard errors of their measurement, the model's own error included; infinite where not measured.
         approach_speed_nm_per_us: expected.
-        slope: d amplitude/d parameter in units of the error, shape (rows, 2, p); 0 where not usable.
+        slope: d amplitude/d parameter in units of the error, shape (rows, k, p); 0 where not usable.
     """
 
     drives: Drives
     why_not: tuple[str, ...]
-    amplitude_nm: Float[np.ndarray, "rows 2"]
-    error_nm: Float[np.ndarray, "rows 2"]
+    amplitude_nm: Float[np.ndarray, "rows k"]
+    error_nm: Float[np.ndarray, "rows k"]
     approach_speed_nm_per_us: Float[np.ndarray, " rows"]
-    slope: Float[np.ndarray, "rows 2 p"]
+    slope: Float[np.ndarray, "rows k p"]
 
     @property
     def usable(self) -> Bool[np.ndarray, " rows"]:
@@ -155,26 +177,40 @@ class Candidates:
 
 
 def candidates_of(
-    belief: Belief, drives: Drives, *, noise: float, amplitudes: str = "both", largest_nm: float = np.inf
+    belief: Belief,
+    drives: Drives,
+    *,
+    noise: float,
+    amplitudes: str = "both",
+    largest_nm: float = np.inf,
+    phase_noise_deg: float = PHASE_NOISE_DEG,
 ) -> Candidates:
-    """Return what a measurement at every drive would say, by derivatives of the predicted amplitudes.
+    """Return what a measurement at every drive would say, by derivatives of the predicted readings.
 
     Args:
         belief: the law and the instrument; orbits must be there for values as uncertain as it is.
         drives: what can be driven.
         noise: standard error of an amplitude relative to it.
-        amplitudes: what is read: "peak", "lockin" or "both".
-        largest_nm: peak amplitude that the instrument takes.
+        amplitudes: what is read: "peak", "lockin" or "both"; of a cantilever that is driven itself always the lock-in
+            amplitude and the lag.
+        largest_nm: peak amplitude that the instrument takes; of a cantilever that is driven itself the free one.
+        phase_noise_deg: standard error of the lag in degrees.
     """
     objective = Objective(_measurement(belief, drives, amplitudes), belief.problem)
     linear = objective.at_values(belief.draws(BATCH, least=MARGIN))
-    strain = strain_of(objective, belief.values)
-    count = len(drives.order)
+    count, tapping = len(drives.order), belief.problem.tapping
     prediction = linear.prediction
-    amplitude = np.asarray(prediction.amplitude_nm)[0, :count]
-    read = np.array([amplitudes != "lockin", amplitudes != "peak"])
-    error = np.where(read, np.hypot(noise, strain.model_error[:count, None]) * amplitude, np.inf)
-    raw = np.asarray(linear.jacobian)[0, : 2 * count].reshape(count, 2, -1)
+    expected = np.asarray(prediction.amplitude_nm)[0]
+    # the model's own error goes with what is read
+    strain = strain_of(
+        objective.with_rows(amplitude_nm=np.where(expected, expected, 1.0)) if tapping else objective, belief.values
+    )
+    amplitude, kinds = expected[:count], expected.shape[1]
+    own = padding(strain.model_error, expected)[:count]
+    read = np.array([False, True, True] if tapping else [amplitudes != "lockin", amplitudes != "peak"])
+    stated = _stated(amplitude, noise, phase_noise_deg)
+    error = np.where(read, np.hypot(stated, own), np.inf)
+    raw = np.asarray(linear.jacobian)[0, : kinds * count].reshape(count, kinds, -1)
     orbits = np.asarray(prediction.orbits)[:, :count]
     fold = np.asarray(prediction.near_fold)[:, :count]
     holds = {
@@ -183,7 +219,7 @@ def candidates_of(
         "several orbits": orbits[0] > 1,
         "fold": fold[0] | ~np.isfinite(raw).all(axis=(1, 2)),
         "unsure": np.any((orbits != 1) | fold, axis=0),
-        "too large": amplitude[:, 0] > largest_nm,
+        "too large": (drives.amplitude_nm if tapping else amplitude[:, 0]) > largest_nm,
         "strained": strain.set_aside[:count],
     }
     why_not = tuple(next((name for name in LEFT_OUT if holds[name][row]), USABLE) for row in range(count))
@@ -201,20 +237,92 @@ def candidates_of(
 
 def _measurement(belief: Belief, drives: Drives, amplitudes: str) -> Measurement:
     """Return the drives as a measurement of 1 nm with an error of 1 nm: its Jacobian is that of the amplitudes."""
-    one = np.ones(len(drives.order))
-    peak, lockin = (one if amplitudes in ("both", name) else None for name in ("peak", "lockin"))
+    columns = 3 if belief.problem.tapping else 2
+    one = np.ones((len(drives.order), columns))
+    read = [False, True, True] if belief.problem.tapping else [amplitudes != "lockin", amplitudes != "peak"]
+    return _measured(belief, drives, np.where(read, one, np.nan), one)
+
+
+def _stated(
+    amplitude: Float[np.ndarray, "rows k"], noise: float, phase_noise_deg: float
+) -> Float[np.ndarray, "rows k"]:
+    """Return the errors of amplitudes, and of lags if there are any."""
+    lag = np.full((len(amplitude), amplitude.shape[1] - 2), phase_noise_deg)
+    return np.concatenate([noise * amplitude[:, :2], lag], axis=1)
+
+
+def _measured(
+    belief: Belief, drives: Drives, amplitude: Float[np.ndarray, "rows k"], error: Float[np.ndarray, "rows k"]
+) -> Measurement:
+    """Return readings (a column of NaN: not read) with their errors as a measurement."""
+    tapping, columns = belief.problem.tapping, {}
+    columns["free_amplitude_nm" if tapping else "drive_amplitude_nm"] = drives.amplitude_nm
+    kinds = (("peak_amplitude", "nm"), ("lockin_amplitude", "nm"), ("phase_lag", "deg"))
+    for i, (name, unit) in enumerate(kinds[: amplitude.shape[1]]):
+        if np.isfinite(amplitude[:, i]).all():
+            columns |= {f"{name}_{unit}": amplitude[:, i], f"{name}_error_{unit}": error[:, i]}
     table = AmplitudeTable(
+        drive=belief.problem.drive,
         order=drives.order,
         drive_frequency_khz=drives.frequency_khz,
-        drive_amplitude_nm=drives.amplitude_nm,
         offset_nm=drives.offset_nm,
         free_frequency_khz=belief.free_frequency_khz,
         quality_factor=belief.quality_factor,
         mass_ng=belief.mass_ng,
         source="the drives",
-        peak_amplitude_nm=peak,
-        peak_amplitude_error_nm=peak,
-        lockin_amplitude_nm=lockin,
-        lockin_amplitude_error_nm=lockin,
+        **columns,
     )
-    return measurement_of(table, belief.problem, fixed=belief.fixed)
+    found = measurement_of(table, belief.problem, fixed=belief.fixed)
+    if not tapping:
+        return found
+    # nothing was read that could tell which rows are free
+    there = np.arange(len(found.rows.order)) < len(drives.order)
+    measured = there[:, None] & np.array([False, True, True])
+    return found._replace(rows=found.rows._replace(measured=measured, free=np.zeros_like(there)))
+
+
+def forecast(
+    belief: Belief,
+    candidates: Candidates,
+    chosen: Int[np.ndarray, " points"],
+    noise: float,
+    phase_noise_deg: float = PHASE_NOISE_DEG,
+) -> Float[np.ndarray, "steps p"]:
+    """Return the standard errors that a fit will state, before and after each chosen point.
+
+    Where impacts last these contain what the model leaves out, by the same step as after a fit, anew for these points.
+
+    Args:
+        belief: the law and the instrument.
+        candidates: all drives.
+        chosen: numbers of the points.
+        noise: standard error of an amplitude relative to it.
+        phase_noise_deg: standard error of a lag in degrees.
+    """
+    problem, each = belief.problem, candidates.information[chosen]
+    steps = belief.information + np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each, axis=0)])
+    errors = np.array([np.sqrt(np.diag(covariance_of(information))) for information in steps])
+    if not problem.lasting or not chosen.size:
+        return errors
+    drives = Drives(*(column[chosen] for column in candidates.drives))
+    amplitude = candidates.amplitude_nm[chosen]
+    read = np.where(np.isfinite(candidates.error_nm[chosen]), amplitude, np.nan)
+    stated = _stated(amplitude, noise, phase_noise_deg)
+    objective = Objective(_measured(belief, drives, read, stated), problem)
+    strain = strain_of(objective, belief.values)
+    rows = rows_of_fit(objective, objective.following(belief.values), belief.values, strain, 1.0)
+    values = belief.fixed | dict(zip(problem.names, belief.values.tolist(), strict=True))
+    left_out = Unmodelled(problem, values, speed_range(rows.approach[: len(chosen)]), belief.mass_ng)
+    size = np.array([size_of(p, v) for p, v in zip(problem.parameters, belief.values.tolist(), strict=True)])
+    known, axes = np.linalg.eigh(size[:, None] * belief.information * size)
+    known = np.sqrt(np.maximum(known, 0.0))[:, None] * axes.T / size
+    readings, free = rows.measurement_error.shape, np.ones(len(size), dtype=bool)
+    by_row = rows.jacobian[: rows.measurement_error.size].reshape(*readings, -1)
+    for count in range(1, len(chosen) + 1):
+        # a reading without slopes says nothing
+        seen = np.arange(readings[0])[:, None] < count
+        jacobian = np.concatenate([(seen[..., None] * by_row).reshape(-1, len(size)), known])
+        slopes = ImpactSlopes(*(seen * part for part in rows.slopes))
+        some = rows._replace(slopes=slopes, jacobian=jacobian, residual=np.zeros(len(jacobian)))
+        errors[count] = np.sqrt(np.diag(step_of(some, left_out, free).covariance))[: len(size)]
+    return errors

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int
 from afm_jax.checks import require_float64
 from afm_jax.version import version_of
 from fitting.experiments.belief import Belief, belief_of_fit, size_of
-from fitting.experiments.candidates import AMPLITUDES, LEFT_OUT, Candidates, candidates_of
+from fitting.experiments.candidates import AMPLITUDES, LEFT_OUT, PHASE_NOISE_DEG, Candidates, candidates_of, forecast
 from fitting.experiments.result import Design
 from fitting.fits.least_squares import covariance_of
 from fitting.fits.result import FitResult
@@ -149,7 +149,8 @@ def judge_design(
     belief: Belief,
     candidates: Candidates,
     chosen: Int[np.ndarray, " points"],
-    steps: Float[np.ndarray, "steps p p"],
+    reached: Float[np.ndarray, "p p"],
+    forecasts: Float[np.ndarray, " p"],
     wanted: tuple[str, ...],
     points: int,
 ) -> tuple[list[str], list[str]]:
@@ -159,12 +160,13 @@ def judge_design(
         belief: what it rests on.
         candidates: among which was chosen.
         chosen: their numbers.
-        steps: information so far and after each point.
+        reached: information after all points, by noise alone.
+        forecasts: standard errors then.
         wanted: the parameters that matter.
         points: how many were asked for.
     """
     names = belief.problem.names
-    errors = dict(zip(names, standard_errors(steps[-1]).tolist(), strict=True))
+    errors = dict(zip(names, forecasts.tolist(), strict=True))
     unknown = [name for name in wanted if not np.isfinite(errors[name])]
     if not len(chosen):
         counts = [f"{LEFT_OUT[name]}: {count}" for name, count in candidates.left_out.items()]
@@ -178,7 +180,7 @@ def judge_design(
     warnings = list(belief.notes)
     if len(chosen) < points:
         warnings.append(f"Only {len(chosen)} of the {points} points asked for can be planned with: all are chosen.")
-    warnings += _dominated(belief, steps[-1], errors, wanted)
+    warnings += _dominated(belief, reached, wanted)
     for name in wanted:
         index = names.index(name)
         size = size_of(belief.problem.parameters[index], float(belief.values[index]))
@@ -188,15 +190,14 @@ def judge_design(
                 f"The forecast for {name} is rough: its error is {errors[name] / size:.0%} of {what} itself. Expect a "
                 "one-sided limit rather than a value."
             )
-    warnings += _edges(candidates, chosen)
+    warnings += _edges(candidates, chosen, tapping=belief.problem.tapping)
     return reasons, warnings
 
 
-def _dominated(
-    belief: Belief, information: Float[np.ndarray, "p p"], errors: dict[str, float], wanted: tuple[str, ...]
-) -> list[str]:
+def _dominated(belief: Belief, information: Float[np.ndarray, "p p"], wanted: tuple[str, ...]) -> list[str]:
     """Name the quantities of the instrument whose uncertainty is most of the error of a parameter that matters."""
     names = belief.problem.names
+    errors = dict(zip(names, standard_errors(information).tolist(), strict=True))
     warnings = []
     for nuisance in (name for name in names if name in NUISANCE_NAMES and name not in wanted):
         rest = [i for i, name in enumerate(names) if name != nuisance]
@@ -213,11 +214,13 @@ def _dominated(
     return warnings
 
 
-def _edges(candidates: Candidates, chosen: Int[np.ndarray, " points"]) -> list[str]:
+def _edges(candidates: Candidates, chosen: Int[np.ndarray, " points"], *, tapping: bool) -> list[str]:
     """Say where most points lie at the end of what can be driven: a wider range may then be better."""
     drives, usable = candidates.drives, candidates.usable
     warnings = []
-    for column, what in ((drives.amplitude_nm, "drive amplitude"), (drives.offset_nm, "offset")):
+    what = "free amplitude" if tapping else "drive amplitude"
+    columns = [(drives.amplitude_nm, what), (drives.offset_nm, "offset")]
+    for column, what in columns[:1] if tapping else columns:
         for end, word in ((column.min(), "smallest"), (column.max(), "largest")):
             share = float(np.mean(column[chosen] == end))
             if len(np.unique(column[usable])) > 1 and share > 0.5 and len(chosen) > 1:
@@ -240,11 +243,13 @@ def design(  # noqa: PLR0913
     criterion: str = "D",
     amplitudes: str = "both",
     largest_nm: float | None = None,
+    phase_noise_deg: float = PHASE_NOISE_DEG,
 ) -> Design:
     """Choose the drives to measure next, and forecast how well the parameters will then be known.
 
     The forecast is the Fisher information: derivatives of the predicted amplitudes by every parameter at the believed
-    values, by automatic differentiation through the orbits. Every drive is chosen once. A drive is left out where the
+    values, by automatic differentiation through the orbits; of laws with a delay the errors contain what the model
+    leaves out, as those of a fit. Every drive is chosen once. A drive is left out where the
     belief has no steady single-impact orbit, or several, or is not sure of it, and where a fit would set its row aside.
 
     Args:
@@ -255,8 +260,11 @@ def design(  # noqa: PLR0913
         interest: the parameters to be known well, all others being unknown too; None: those of the law.
         criterion: "D": the smallest volume of their joint confidence region; "A": the smallest sum of their variances,
             each relative to the parameter (to the loss 1 - r for r).
-        amplitudes: what is read of each point: "peak", "lockin" or "both".
-        largest_nm: peak amplitude that the instrument takes; None: any.
+        amplitudes: what is read of each point: "peak", "lockin" or "both"; of a cantilever that is driven itself always
+            the lock-in amplitude and the lag.
+        largest_nm: peak amplitude that the instrument takes (of a cantilever that is driven itself the free one); None:
+            any.
+        phase_noise_deg: standard error of a lag in degrees.
 
     Returns:
         The points in the order of their use, with expected readings and errors; see `Design`.
@@ -268,14 +276,17 @@ def design(  # noqa: PLR0913
     require_float64()
     believed = belief_of_fit(belief) if isinstance(belief, FitResult) else belief
     wanted = _interest(believed, interest)
-    _check_options(points, noise, criterion, amplitudes, largest_nm)
+    _check_options(points, noise, criterion, amplitudes, largest_nm, phase_noise_deg)
     largest = np.inf if largest_nm is None else float(largest_nm)
-    candidates = candidates_of(believed, drives, noise=noise, amplitudes=amplitudes, largest_nm=largest)
+    candidates = candidates_of(
+        believed, drives, noise=noise, amplitudes=amplitudes, largest_nm=largest, phase_noise_deg=phase_noise_deg
+    )
     measure = _criterion(believed, candidates, wanted, criterion)
     usable, each = np.flatnonzero(candidates.usable), candidates.information
     chosen = usable[choose_points(believed.information, each[usable], points, measure)]
-    steps = believed.information + np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each[chosen], axis=0)])
-    reasons, warnings = judge_design(believed, candidates, chosen, steps, wanted, points)
+    reached = believed.information + each[chosen].sum(axis=0)
+    errors = forecast(believed, candidates, chosen, float(noise), phase_noise_deg)
+    reasons, warnings = judge_design(believed, candidates, chosen, reached, errors[-1], wanted, points)
     return Design(
         belief=believed,
         interest=wanted,
@@ -283,8 +294,8 @@ def design(  # noqa: PLR0913
         noise=float(noise),
         candidates=candidates,
         chosen=chosen,
-        errors=np.array([standard_errors(information) for information in steps]),
-        gain=_gain(measure, steps[-1], candidates),
+        errors=errors,
+        gain=_gain(measure, reached, candidates),
         valid=not reasons,
         reasons=reasons,
         warnings=warnings,
@@ -295,6 +306,8 @@ def design(  # noqa: PLR0913
             "criterion": criterion,
             "amplitudes": amplitudes,
             "largest_nm": largest_nm,
+            "phase_noise_deg": phase_noise_deg if believed.problem.tapping else None,
+            "drive": believed.problem.drive,
             "uncertainty": believed.uncertainty,
             "drives": len(drives.order),
         },
@@ -315,7 +328,9 @@ def _interest(belief: Belief, interest: Sequence[str] | None) -> tuple[str, ...]
     return tuple(interest)
 
 
-def _check_options(points: int, noise: float, criterion: str, amplitudes: str, largest_nm: float | None) -> None:
+def _check_options(
+    points: int, noise: float, criterion: str, amplitudes: str, largest_nm: float | None, phase_noise_deg: float
+) -> None:
     if points < 1:
         raise ValueError(f"`points` must be at least 1, but is {points}")
     if not 0.0 < noise < 1.0:
@@ -324,6 +339,8 @@ def _check_options(points: int, noise: float, criterion: str, amplitudes: str, l
         raise ValueError(f"`criterion` must be one of {', '.join(CRITERIA)}, but is {criterion!r}")
     if amplitudes not in AMPLITUDES:
         raise ValueError(f"`amplitudes` must be one of {', '.join(AMPLITUDES)}, but is {amplitudes!r}")
+    if not 0.0 < phase_noise_deg < 90.0:
+        raise ValueError(f"`phase_noise_deg` must be between 0 and 90, but is {phase_noise_deg!r}")
     if largest_nm is not None and not largest_nm > 0.0:
         raise ValueError(f"`largest_nm` must be positive, but is {largest_nm!r}")
 

@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Normalize, PowerNorm
 from matplotlib.figure import Figure
-from matplotlib.ticker import MaxNLocator, StrMethodFormatter
+from matplotlib.ticker import MaxNLocator, NullFormatter, StrMethodFormatter
 from matplotlib.transforms import ScaledTranslation
 
 from afm_jax.plots.picture_style import ACCENT, BLUE, GRID, label_axes, new_figure
@@ -23,20 +24,24 @@ from fitting.experiments.candidates import LEFT_OUT
 from fitting.experiments.result import Design, Forecast
 from fitting.parameters import NUISANCE_NAMES
 
-POINT_COLUMNS = (
-    "order",
-    "drive_frequency_khz",
-    "drive_amplitude_nm",
-    "offset_nm",
-    "expected_peak_amplitude_nm",
-    "expected_peak_amplitude_error_nm",
-    "expected_lockin_amplitude_nm",
-    "expected_lockin_amplitude_error_nm",
-    "expected_approach_speed_nm_per_us",
-)
-CANDIDATE_COLUMNS = (*POINT_COLUMNS, "chosen", "gain", "left_out")
+_CANDIDATE_COLUMNS = ("chosen", "gain", "left_out")
 _CRITERIA = {"D": "D-optimal: smallest joint confidence region of", "A": "A-optimal: smallest sum of variances of"}
 Table = Callable[[str, list[dict[str, Any]], tuple[str, ...]], None]
+
+
+def point_columns(result: Design) -> tuple[str, ...]:
+    """Return the columns of design.csv: the drive, then what is expected."""
+    read = (
+        ("lockin_amplitude_{}nm", "phase_lag_{}deg")
+        if result.tapping
+        else ("peak_amplitude_{}nm", "lockin_amplitude_{}nm")
+    )
+    expected = [f"expected_{name.format(error)}" for name in read for error in ("", "error_")]
+    return *_drive_columns(result), *expected, "expected_approach_speed_nm_per_us"
+
+
+def _drive_columns(result: Design) -> tuple[str, ...]:
+    return "order", "drive_frequency_khz", f"{'free' if result.tapping else 'drive'}_amplitude_nm", "offset_nm"
 
 
 def design_summary(result: Design) -> str:
@@ -81,38 +86,46 @@ def write_design(result: Design, folder: Path, write_table: Table) -> list[Path]
     text, data, picture = design_summary(result), result.to_dict(), png_of(design_figure(result))
     written = write_report_files(folder, "design", text=text, data=data, picture=picture)
     write_whole(blank, table_to_fill_in(result))
-    write_table("design.csv", result.points(), POINT_COLUMNS)
-    write_table("candidates.csv", result.all_candidates(), CANDIDATE_COLUMNS)
+    write_table("design.csv", result.points(), point_columns(result))
+    write_table("candidates.csv", result.all_candidates(), (*point_columns(result), *_CANDIDATE_COLUMNS))
     return [*written, blank]
 
 
 def table_to_fill_in(result: Design) -> str:
     """Return an amplitude table of the points, the measured columns empty."""
     belief, known = result.belief, result.belief.constraints
-    lines = [f"# free_frequency_khz = {belief.free_frequency_khz!r}", f"# mass_ng = {belief.mass_ng!r}"]
+    lines = [f"# drive = {belief.problem.drive}"] if result.tapping else []
+    if "free_frequency_khz" not in known:
+        lines.append(f"# free_frequency_khz = {belief.free_frequency_khz!r}")
+    lines.append(f"# mass_ng = {belief.mass_ng!r}")
     if belief.quality_factor is not None and "quality_factor" not in known:
         lines.append(f"# quality_factor = {belief.quality_factor!r}")
     instrument = [(name, *known[name]) for name in NUISANCE_NAMES if name in known]
     lines += [f"# {name} = {value!r} +- {error!r}" for name, value, error in instrument]
     read = [kind for kind in ("peak", "lockin") if result.settings["amplitudes"] in ("both", kind)]
-    columns = [f"{kind}_amplitude_nm,{kind}_amplitude_error_nm" for kind in read]
-    lines.append(",".join([*POINT_COLUMNS[:4], *columns]))
-    cells = "," * (2 * len(read))
-    lines += [",".join(repr(point[name]) for name in POINT_COLUMNS[:4]) + cells for point in result.points()]
+    columns = [f"{kind}_amplitude_nm,{kind}_amplitude_error_nm" for kind in (["lockin"] if result.tapping else read)]
+    columns += ["phase_lag_deg,phase_lag_error_deg"] if result.tapping else []
+    drive = _drive_columns(result)
+    lines.append(",".join([*drive, *columns]))
+    cells = "," * (2 * len(columns))
+    lines += [",".join(repr(point[name]) for name in drive) + cells for point in result.points()]
     return "\n".join(lines) + "\n"
 
 
 def _point_lines(result: Design) -> list[str]:
     shown = result.interest[:4]
-    head = ["N", "kHz", "nm", "offset", "peak nm", "lock-in nm", "u_in", *(f"+- {name}"[:15] for name in shown)]
+    read = ("lockin_amplitude_nm", "phase_lag_deg") if result.tapping else ("peak_amplitude_nm", "lockin_amplitude_nm")
+    columns = ("lock-in nm", "lag deg") if result.tapping else ("peak nm", "lock-in nm")
+    amplitude = _drive_columns(result)[2]
+    head = ["N", "kHz", "free nm" if result.tapping else "nm", "offset", *columns, "u_in"]
+    head += [f"+- {name}"[:15] for name in shown]
     rows = [
         [
             f"{point['order']}",
             f"{point['drive_frequency_khz']:.8g}",
-            f"{point['drive_amplitude_nm']:.5g}",
+            f"{point[amplitude]:.5g}",
             f"{point['offset_nm']:.4g}",
-            _reading(point, "peak"),
-            _reading(point, "lockin"),
+            *(_reading(point, name) for name in read),
             f"{point['expected_approach_speed_nm_per_us']:.1f}",
             *(known(point["standard_errors"][name], ".2g") for name in shown),
         ]
@@ -140,11 +153,12 @@ def _forecast_lines(result: Design) -> list[str]:
     return [*text_table(head, rows, words=(0, 4)), "  * what the points are chosen for"]
 
 
-def _reading(point: dict[str, Any], kind: str) -> str:
-    value = point.get(f"expected_{kind}_amplitude_nm")
+def _reading(point: dict[str, Any], name: str) -> str:
+    value, (what, unit) = point.get(f"expected_{name}"), name.rsplit("_", 1)
     if value is None:
         return "-"
-    return f"{value:.1f} +- {point[f'expected_{kind}_amplitude_error_nm']:.1f}"
+    digits = 1 if value >= 100.0 and unit == "nm" else 2
+    return f"{value:.{digits}f} +- {point[f'expected_{what}_error_{unit}']:.{digits}f}"
 
 
 def _interval(forecast: Forecast) -> str:
@@ -162,11 +176,18 @@ _MARKS = ("o-", "s--", "D-.", "^:")
 _OFFSET_POINTS = 5.5
 """Between the marks of two offsets at one drive."""
 _UNKNOWN_PERCENT = 2e3
+_FEW_DECADES = 100.0
+"""Up to there an axis has room for the labels between its decades."""
 
 
 def design_figure(result: Design) -> Figure:
-    """Return the figure: forecast errors on the left, a map of the gain per order (the first six) on the right."""
-    orders = np.unique(result.candidates.drives.order)[:_MOST_ORDERS]
+    """Return the figure: forecast errors on the left, on the right a map of the gain for each of the first six orders.
+
+    Of a cantilever that is driven itself, for each frequency.
+    """
+    drives = result.candidates.drives
+    each = drives.frequency_khz if result.tapping else drives.order
+    orders = np.unique(each)[:_MOST_ORDERS]
     figure = new_figure(12.0, 5.6)
     left, right = np.asarray(figure.subfigures(1, 2, width_ratios=(1.0, 1.4)), dtype=object)
     _draw_errors(left.subplots(), result)
@@ -176,12 +197,14 @@ def design_figure(result: Design) -> Figure:
     # a few points are worth much more than all others: the root of a root of the gain tells those apart too
     scale = PowerNorm(0.3, 0.0, float(gain.max()) if gain.size and gain.max() > 0.0 else 1.0)
     for axes, order in zip(panels, orders, strict=False):
-        _draw_map(axes, result, int(order), scale)
+        _draw_map(axes, result, each == order, scale)
+        axes.set_title(f"{order:g} kHz" if result.tapping else f"order {order}", fontsize=_SMALL)
     for axes in panels[len(orders) :]:
         axes.set_axis_off()
     right.colorbar(ScalarMappable(scale, _MAP), ax=list(panels), shrink=0.8).set_label("gain of one more measurement")
-    offsets = ", ".join(f"{offset:g}" for offset in np.unique(result.candidates.drives.offset_nm))
-    right.supxlabel(f"at each drive from left to right: offsets {offsets} nm", fontsize=_SMALL)
+    if not result.tapping:
+        offsets = ", ".join(f"{offset:g}" for offset in np.unique(drives.offset_nm))
+        right.supxlabel(f"at each drive from left to right: offsets {offsets} nm", fontsize=_SMALL)
     title = f"{len(result.chosen)} points for {', '.join(result.interest)} ({result.belief.problem.model})"
     figure.suptitle(title if result.valid else f"NOT VALID: {title}", color="black" if result.valid else _INVALID)
     return figure
@@ -206,8 +229,9 @@ def _draw_errors(axes: Axes, result: Design) -> None:
     axes.set_yscale("log")
     # beyond that a parameter is as good as unknown
     axes.set_ylim(top=min(axes.get_ylim()[1], _UNKNOWN_PERCENT))
-    for axis in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
-        axis(StrMethodFormatter("{x:g}"))
+    axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    low, high = axes.get_ylim()
+    axes.yaxis.set_minor_formatter(StrMethodFormatter("{x:g}") if high < _FEW_DECADES * low else NullFormatter())
     axes.grid(color=GRID, alpha=0.25, which="both")
     label_axes(axes, x="points measured", y="expected standard error (%)")
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
@@ -215,32 +239,38 @@ def _draw_errors(axes: Axes, result: Design) -> None:
         axes.legend(fontsize=_SMALL, loc="best")
 
 
-def _draw_map(axes: Axes, result: Design, order: int, scale: Normalize) -> None:
-    """Draw the gain over frequency and drive amplitude, the offsets side by side, with the chosen points."""
+def _draw_map(axes: Axes, result: Design, here: Bool[np.ndarray, " rows"], scale: Normalize) -> None:
+    """Draw the gain over frequency and drive amplitude, the offsets side by side, with the chosen points.
+
+    Of a cantilever that is driven itself over height and free amplitude.
+    """
     drives, usable = result.candidates.drives, result.candidates.usable
-    here = drives.order == order
-    offsets = np.unique(drives.offset_nm)
+    across = drives.offset_nm if result.tapping else drives.frequency_khz
+    beside = np.zeros(len(here)) if result.tapping else drives.offset_nm
+    offsets = np.unique(beside)
     for number, offset in enumerate(offsets):
         shift = (number - 0.5 * (len(offsets) - 1)) * _OFFSET_POINTS
-        beside = axes.transData + ScaledTranslation(shift / 72.0, 0.0, axes.figure.dpi_scale_trans)
-        some = here & (drives.offset_nm == offset)
+        moved = axes.transData + ScaledTranslation(shift / 72.0, 0.0, axes.figure.dpi_scale_trans)
+        some = here & (beside == offset)
         lost, rows = np.flatnonzero(some & ~usable), np.flatnonzero(some & usable)
-        axes.plot(drives.frequency_khz[lost], drives.amplitude_nm[lost], "x", color=GRID, ms=3, transform=beside)
-        places = drives.frequency_khz[rows], drives.amplitude_nm[rows]
-        marks = {"cmap": _MAP, "norm": scale, "s": 22, "marker": "s", "linewidths": 0, "transform": beside}
+        axes.plot(across[lost], drives.amplitude_nm[lost], "x", color=GRID, ms=3, transform=moved)
+        places = across[rows], drives.amplitude_nm[rows]
+        marks = {"cmap": _MAP, "norm": scale, "s": 22, "marker": "s", "linewidths": 0, "transform": moved}
         axes.scatter(*places, c=result.gain[rows], **marks)
         for place, row in enumerate(result.chosen.tolist(), start=1):
             if some[row]:
-                point = drives.frequency_khz[row], drives.amplitude_nm[row]
-                axes.plot(*point, "o", ms=9, mfc="none", mec=ACCENT, mew=1.3, transform=beside)
+                point = across[row], drives.amplitude_nm[row]
+                axes.plot(*point, "o", ms=9, mfc="none", mec=ACCENT, mew=1.3, transform=moved)
                 middle = (shift, 6 if place % 2 else -6)
                 style = {"fontsize": 8, "color": ACCENT, "ha": "center", "va": "bottom" if place % 2 else "top"}
                 axes.annotate(str(place), point, middle, textcoords="offset points", **style)
     axes.margins(0.1, 0.15)
-    axes.update_datalim(np.stack([drives.frequency_khz[here], drives.amplitude_nm[here]], axis=1))
+    axes.update_datalim(np.stack([across[here], drives.amplitude_nm[here]], axis=1))
     axes.autoscale_view()
-    axes.set_title(f"order {order}", fontsize=_SMALL)
-    label_axes(axes, x="drive (kHz)", y="drive (nm)")
+    tapping = result.tapping
+    label_axes(
+        axes, x="height of the sample (nm)" if tapping else "drive (kHz)", y="free (nm)" if tapping else "drive (nm)"
+    )
     axes.xaxis.label.set_fontsize(_SMALL)
     axes.yaxis.label.set_fontsize(_SMALL)
     axes.tick_params(labelsize=8)

@@ -48,8 +48,8 @@ class Design:
         noise: standard error of an amplitude relative to it.
         candidates: every drive that was looked at.
         chosen: numbers of the points among the candidates, the most useful first.
-        errors: standard error of every parameter so far and after each point, shape (points + 1, p); infinite where
-            not determined.
+        errors: standard error of every parameter so far and after each point, as a fit will state it, shape
+            (points + 1, p); infinite where not determined.
         gain: what one more measurement at each candidate would add to the criterion after the chosen ones (D: to the
             log of the determinant; A: share by which the sum of variances falls), shape (rows,); NaN where left out.
         valid: there is something to measure, and it determines the parameters of interest.
@@ -88,6 +88,11 @@ class Design:
         """How well every parameter will be known once the points are measured."""
         return self._forecasts(self.errors[-1])
 
+    @property
+    def tapping(self) -> bool:
+        """Whether the cantilever is driven itself, not the sample."""
+        return self.belief.problem.tapping
+
     def points(self) -> list[dict[str, Any]]:
         """Return the points as mappings: the drive, what is expected to be read, and the errors once it is."""
         names = self.belief.problem.names
@@ -102,13 +107,14 @@ class Design:
         answer = {
             "order": int(drives.order[row]),
             "drive_frequency_khz": float(drives.frequency_khz[row]),
-            "drive_amplitude_nm": float(drives.amplitude_nm[row]),
+            f"{'free' if self.tapping else 'drive'}_amplitude_nm": float(drives.amplitude_nm[row]),
             "offset_nm": float(drives.offset_nm[row]),
         }
-        for i, name in enumerate(("peak", "lockin")):
-            if np.isfinite(found.error_nm[row, i]):
-                answer[f"expected_{name}_amplitude_nm"] = float(found.amplitude_nm[row, i])
-                answer[f"expected_{name}_amplitude_error_nm"] = float(found.error_nm[row, i])
+        readings = ("peak_amplitude", "nm"), ("lockin_amplitude", "nm"), ("phase_lag", "deg")
+        for (name, unit), value, error in zip(readings, found.amplitude_nm[row], found.error_nm[row], strict=False):
+            if np.isfinite(error):
+                answer[f"expected_{name}_{unit}"] = float(value) % 360.0 if unit == "deg" else float(value)
+                answer[f"expected_{name}_error_{unit}"] = float(error)
         answer["expected_approach_speed_nm_per_us"] = float(found.approach_speed_nm_per_us[row])
         return answer
 
@@ -118,7 +124,7 @@ class Design:
         answer = []
         for row, why_not in enumerate(found.why_not):
             record = self.candidate(row)
-            if not found.amplitude_nm[row, 0] > 0.0:
+            if not found.amplitude_nm[row, 1] > 0.0:
                 record = {name: value for name, value in record.items() if not name.startswith("expected")}
             gain = _finite(float(self.gain[row]))
             answer.append(record | {"chosen": place.get(row), "gain": gain, "left_out": LEFT_OUT.get(why_not)})
@@ -130,6 +136,7 @@ class Design:
         return {
             "format": "afm-jax design",
             "format_version": FORMAT_VERSION,
+            "drive": belief.problem.drive,
             "model": belief.problem.model,
             "valid": self.valid,
             "reasons": self.reasons,

@@ -9,10 +9,11 @@ from jaxtyping import Float
 
 from afm_jax.checks import require_float64
 from afm_jax.results import public_result
-from fitting.fits.fit import Found, find_fit, summarise
+from fitting.fits.fit import Found, find_fit, summarise, tables_of
 from fitting.fits.minimum import Strain, relaxed, settle
 from fitting.fits.result import FitResult
 from fitting.parameters import CONTACT_NAMES, LAWS, MODELS, model_parameters
+from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable
 
 _T = TypeVar("_T")
@@ -58,7 +59,7 @@ def rivals(model: str, fixed: Mapping[str, float] | None = None) -> tuple[str, .
 
 
 def compare(
-    table: AmplitudeTable,
+    table: AmplitudeTable | SeveralTables | Sequence[AmplitudeTable],
     models: Sequence[str] = ("law+delay", "viscous+delay"),
     *,
     report: Callable[[str], None] | None = None,
@@ -71,7 +72,7 @@ def compare(
     model that cannot be fitted is left out, and the comparison says so.
 
     Args:
-        table: the amplitudes.
+        table: the amplitudes, of one table or of several.
         models: names of models.
         report: called with each model's name before it is fitted.
         known: minimum and summary of models that were fitted to the table with the same options already.
@@ -84,18 +85,22 @@ def compare(
     require_float64()
     if len(set(models)) < 2:
         raise ValueError("comparing needs at least two different models")
+    if options.get("hierarchical"):
+        raise ValueError("models are compared where all tables have one law: leave `hierarchical` out")
     for model in models:
         of_model = _options_of(model, options)
         free = of_model.get("free")
         model_parameters(model, None if free is None else tuple(free), of_model.get("fixed"))
+
+    whole = tables_of(table)
 
     def fitted(model: str) -> tuple[Found, FitResult]:
         if known is not None and model in known:
             return known[model][0], _finite(known[model][1])
         if report is not None:
             report(model)
-        found = find_fit(table, model, **_options_of(model, options))
-        return found, _finite(summarise(table, found))
+        found = find_fit(whole, model, **_options_of(model, options))
+        return found, _finite(summarise(whole, found))
 
     fits, failed = _attempted(fitted, dict.fromkeys(models))
     errors = np.max([one.strain.model_error for one, _ in fits.values()], axis=0)

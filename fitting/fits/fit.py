@@ -13,7 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from scipy.special import chdtrc
 
 from afm_jax.checks import require_float64
 from afm_jax.contact.parameters import EFFECTS
@@ -29,6 +28,7 @@ from fitting.fits.intervals import (
     profile_intervals,
     within_range,
 )
+from fitting.fits.least_squares import chi2_tail
 from fitting.fits.loss import Loss, energy_lost, equivalent, interval_of
 from fitting.fits.minimum import (
     ATTRACTED,
@@ -44,27 +44,34 @@ from fitting.fits.minimum import (
     untabulated,
 )
 from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective
-from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows
+from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows, FittedTable, PlainLaw, Scatter
+from fitting.fits.several import Between, Pull, departures_of, parts_of, pulls_of, scatter_between
 from fitting.fits.unmodelled import (
     LawAfter,
     LawBefore,
     LinearStep,
+    StepSystem,
     Unmodelled,
     law_after,
+    plain_law,
     root_of,
     rows_of_fit,
     step_of,
+    system_of,
 )
 from fitting.fits.verdict import ASSUMED_ERROR_OF_Q, Evidence, judge_fit, misfits
 from fitting.forward import AnyImpact, impact_at, warm_up
 from fitting.models import (
+    Joint,
     Measurement,
     Problem,
     constraints_of,
+    joint_measurement,
     measurement_of,
     readings_of,
 )
-from fitting.parameters import NUISANCE_NAMES, PARAMETERS, model_parameters
+from fitting.parameters import NUISANCE_NAMES, is_of_one_table, model_parameters, name_of_table, parameter_called
+from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable
 
 _POINTS = 121
@@ -113,12 +120,9 @@ def law_at(
     after: tuple[LinearStep, Unmodelled] | None = None,
 ) -> LawAfter:
     """Return the law at approach speeds in nm/us; the other arguments as of `law_with_band`."""
-    impact, slopes = impact_at(values, measurement, problem)
-    law, slope = jax.tree.map(np.asarray, law_and_slope(impact, slopes, speeds))
-    count = speeds.size
-    before = LawBefore(law[:, :count], slope[:, :count], float(law[0, count]), slope[0, count])
+    before = law_before(problem, measurement, values, speeds)
     if not np.all(np.isfinite(covariance)) or after is None:
-        root = root_of(covariance)[: slope.shape[2]]
+        root = root_of(covariance)[: before.slope.shape[2]]
         found = LawAfter(before.law, before.slope @ root, before.capture, before.capture_slope @ root)
         if after is None:
             return found
@@ -126,6 +130,16 @@ def law_at(
         moved = law_after(*after, speeds, before)
         return LawAfter(moved.law, unknown[0], moved.capture, unknown[1])
     return law_after(*after, speeds, before)
+
+
+def law_before(
+    problem: Problem, measurement: Measurement, values: Float[np.ndarray, " p"], speeds: Float[np.ndarray, " n"]
+) -> LawBefore:
+    """Return the law of fitted values at approach speeds in nm/us; the other arguments as of `law_with_band`."""
+    impact, slopes = impact_at(values, measurement, problem)
+    law, slope = jax.tree.map(np.asarray, law_and_slope(impact, slopes, speeds))
+    count = speeds.size
+    return LawBefore(law[:, :count], slope[:, :count], float(law[0, count]), slope[0, count])
 
 
 def loss_of(
@@ -217,7 +231,7 @@ class Found:
     refused: bool = False
 
 
-def summarise(table: AmplitudeTable, found: Found) -> FitResult:
+def summarise(table: AmplitudeTable | SeveralTables, found: Found) -> FitResult:
     """Return errors, intervals, checks and verdict of a minimum."""
     return _Summary(table, found).result()
 
@@ -229,7 +243,7 @@ class _Summary:
     ``chi2``, of the ``parameters``, those after the step.
     """
 
-    def __init__(self, table: AmplitudeTable, found: Found):
+    def __init__(self, table: AmplitudeTable | SeveralTables, found: Found):
         objective, minimum = found.objective, found.minimum
         self.searching, self.table, self.minimum, self.strain = objective, table, minimum, found.strain
         self.settings, self.problem, self.stated = found.settings, objective.problem, found.stated
@@ -253,13 +267,19 @@ class _Summary:
         self.used_speeds = np.where(self.rows.used, self.rows.approach_speed_nm_per_us, np.nan)
         self.names, self.ends, self.spread = self.problem.names, self.values, self.covariance
         self.chi2, self.contact_share = self.minimum_chi2, 0.0
+        self.pulls: list[Pull] = []
+        self.between: tuple[Between, Float[np.ndarray, "tables l"]] | None = None
         self.after = self._step()
         if self.after is not None:
             self._take(*self.after)
 
     def _step(self) -> tuple[LinearStep, Unmodelled] | None:
-        """Return the step with what the model leaves out; None for impacts that take no time, or without slopes."""
-        if not self.problem.lasting or self.refused or not np.isfinite(self.used_speeds).any():
+        """Return the step with what the model leaves out, and the scatter between tables; None where there is neither.
+
+        Nor is there one without slopes.
+        """
+        joint, scattering = self.searching.measurement.joint, bool(self.settings.get("hierarchical"))
+        if not (self.problem.lasting or joint) or self.refused or not np.isfinite(self.used_speeds).any():
             return None
         scale = self.settings["error_scale"] or 1.0
         rows = rows_of_fit(self.stated, self.objective, self.values, self.strain, scale)
@@ -272,7 +292,37 @@ class _Summary:
         values = self.settings["fixed"] | dict(zip(self.problem.names, self.values.tolist(), strict=True))
         mass = float(self.stated.measurement.cantilever.mass_ng)
         left_out = Unmodelled(self.problem, values, speed_range(self.used_speeds), mass)
-        return step_of(rows, left_out, self.free), left_out
+        if joint is None:
+            return step_of(rows, left_out, self.free), left_out
+        departing = self._tables_compared(system_of(rows, left_out), joint, scattering=scattering)
+        if not (self.problem.lasting or departing):
+            return None
+        step, *cautious = (step_of(rows, left_out, self.free, one) for one in departing or [None])
+        return step._replace(covariance=(*cautious, step)[0].covariance), left_out
+
+    def _tables_compared(
+        self, system: StepSystem, joint: Joint, *, scattering: bool
+    ) -> list[Float[np.ndarray, "readings m"]]:
+        """Note the tables' pulls and scatter; return what departures of their laws do, most likely and cautious ones.
+
+        There are none without scatter.
+        """
+        table: Any = self.searching.measurement.rows.table
+        free = np.append(self.free, np.ones(system.jacobian.shape[1] - self.free.size, dtype=bool))
+        own, departing = len(self.problem.own), []
+        parts = parts_of(system, table, joint.place, free, own)
+        if scattering:
+            unit = departures_of(system, table, parts.law, np.ones(parts.law.size))
+            between = scatter_between(parts_of(system, table, joint.place, free, own, unit))
+            if np.isfinite(between.value).all():
+                departing = [
+                    departures_of(system, table, parts.law, size) for size in (between.value, between.cautious)
+                ]
+                parts = parts_of(system, table, joint.place, free, own, departing[0])
+                departed = parts.solved()[1][-departing[0].shape[1] :].reshape(len(joint.drives), -1)
+                self.between = between, departed * between.value
+        self.pulls = pulls_of(parts)
+        return departing
 
     def _take(self, step: LinearStep, left_out: Unmodelled) -> None:
         """Go on with values, errors and residuals after the step."""
@@ -295,7 +345,7 @@ class _Summary:
 
     def result(self) -> FitResult:
         judged = self.freedom > 0 and self.settings["error_scale"] is None and not self.searching.robust
-        p_value = float(chdtrc(self.freedom, self.chi2)) if judged else float("nan")
+        p_value = chi2_tail(self.chi2, self.freedom) if judged else float("nan")
         errors = np.sqrt(np.diag(self.covariance))
         moved = ~self.free | ~np.isfinite(errors) | (np.abs(self.values - self.minimum.start) > 1e-3 * errors)
         moved = np.append(moved, np.ones(len(self.names) - len(moved), dtype=bool))
@@ -319,6 +369,8 @@ class _Summary:
             contact_share=self.contact_share,
             refused=self.refused,
             tapped=self.problem.pulled,
+            pulls=tuple(pull.p_value for pull in self.pulls),
+            scattering=self.between is not None,
         )
         # Errors that assume the model would be confident numbers about a law that is not there.
         explained = not misfits(evidence)
@@ -326,10 +378,11 @@ class _Summary:
         if explained:
             evidence = replace(evidence, parameters=self._explained_parameters(moved))
         reasons, warnings = judge_fit(evidence)
+        common = [i for i, name in enumerate(self.names) if not is_of_one_table(name)]
         return FitResult(
             model=self.problem.model,
-            parameters=evidence.parameters,
-            correlations=_correlations(shown_covariance),
+            parameters={name: one for name, one in evidence.parameters.items() if not is_of_one_table(name)},
+            correlations=_correlations(shown_covariance)[np.ix_(common, common)],
             chi2=self.chi2,
             degrees_of_freedom=self.freedom,
             p_value=evidence.p_value,
@@ -347,13 +400,57 @@ class _Summary:
                 self.after,
             ),
             loss=self._loss(shown_covariance),
+            plain_law=self._plain_law() if explained else None,
             rows=rows,
             residual_autocorrelation=evidence.autocorrelation,
             convergence=self.convergence,
             table=self.table,
             settings=self.settings,
             versions={name: version_of(name) for name in _PACKAGES},
+            tables=self._fitted_tables(evidence.parameters),
+            scatter=self._scatter() if explained else {},
         )
+
+    @property
+    def _free_own(self) -> list[str]:
+        """The law's parameters that are not at their bound."""
+        return [name for name, free in zip(self.problem.own, self.free, strict=False) if free]
+
+    def _scatter(self) -> dict[str, Scatter]:
+        if self.between is None:
+            return {}
+        found = self.between[0]
+        return {
+            name: Scatter(float(value), (float(low), _or_none(high)), parameter_called(name).unit)
+            for name, value, low, high in zip(self._free_own, *found[:3], strict=True)
+        }
+
+    def _fitted_tables(self, parameters: dict[str, FittedParameter]) -> tuple[FittedTable, ...]:
+        """Return what there is to say of each of several tables; nothing of one."""
+        if not isinstance(self.table, SeveralTables):
+            return ()
+        own = self._free_own
+        nothing = Pull(np.nan, np.nan, np.full(len(own), np.nan), np.nan)
+        told = []
+        for t, (table, label) in enumerate(zip(self.table.tables, self.table.labels, strict=True)):
+            mine, pull = self.table.number == t, self.pulls[t] if self.pulls else nothing
+            named = {name: name_of_table(name, label) for name in NUISANCE_NAMES}
+            told.append(
+                FittedTable(
+                    source=table.source,
+                    name=label,
+                    rows=table.rows,
+                    used=int(self.rows.used[mine].sum()),
+                    chi2=pull.chi2,
+                    readings=int(np.isfinite(self.rows.residual[mine]).sum()),
+                    pull=_or_none(pull.pull),
+                    p_value=_or_none(pull.p_value),
+                    pulls={name: _or_none(one) for name, one in zip(own, pull.pulls, strict=True)},
+                    nuisances={name: parameters[key] for name, key in named.items() if key in parameters},
+                    departures={} if self.between is None else dict(zip(own, self.between[1][t].tolist(), strict=True)),
+                )
+            )
+        return tuple(told)
 
     def _loss(self, shown: Float[np.ndarray, "k k"]) -> Loss | None:
         """Return what impacts take; None where no row has a speed."""
@@ -366,6 +463,20 @@ class _Summary:
 
         asked = self.settings.get("speeds")
         return loss_of(found, speed_range(self.used_speeds), asked, float(measurement.cantilever.mass_ng))
+
+    def _plain_law(self) -> PlainLaw | None:
+        """Return what scenes and designs take for the law; None where that is what was fitted."""
+        if self.after is None or self.problem.model == "contact" or not self.problem.lasting:
+            return None
+        speeds = np.geomspace(*speed_range(self.used_speeds), _POINTS)
+        before = law_before(self.problem, self.objective.measurement, self.values, speeds)
+        found = plain_law(*self.after, speeds, before, self.values, self.free)
+        if found is None:
+            return None
+        # what one of several tables has to itself belongs to its instrument
+        kept = [i for i, name in enumerate(found.values) if not is_of_one_table(name)]
+        values = {name: value for name, value in found.values.items() if not is_of_one_table(name)}
+        return PlainLaw(values, found.covariance[np.ix_(kept, kept)])
 
     def _explained_parameters(self, moved: Bool[np.ndarray, " k"]) -> dict[str, FittedParameter]:
         """Return the parameters with their errors and, where all are determined, their intervals."""
@@ -390,7 +501,7 @@ class _Summary:
             else:
                 reason, reach = None, TWO_SIDED_95 * errors[i]
                 low, high = self.ends[i] - reach, self.ends[i] + reach
-            intervals.append(within_range(PARAMETERS[name], Interval(low, high, reason)))
+            intervals.append(within_range(parameter_called(name), Interval(low, high, reason)))
         return intervals
 
     def _parameters(
@@ -401,18 +512,18 @@ class _Summary:
             intervals = [Interval(None, None, intervals)] * len(errors)
         free = np.append(self.free, np.ones(len(errors) - len(self.free), dtype=bool))
         return {
-            parameter.name: FittedParameter(
+            name: FittedParameter(
                 value=float(self.ends[i]),
-                unit=parameter.unit,
+                unit=parameter_called(name).unit,
                 standard_error=float(errors[i]) if free[i] and np.isfinite(errors[i]) else None,
                 interval95=(intervals[i].low, intervals[i].high),
                 interval_reason=intervals[i].reason,
                 undetermined=not np.isfinite(self.spread[i, i]),
                 at_bound=not bool(free[i]),
-                did_not_move=not bool(moved[i]) and parameter.name not in self.constraints,
-                constraint=self.constraints.get(parameter.name),
+                did_not_move=not bool(moved[i]) and name not in self.constraints,
+                constraint=self.constraints.get(name),
             )
-            for i, parameter in enumerate(PARAMETERS[name] for name in self.names)
+            for i, name in enumerate(self.names)
         }
 
     def _rows(self) -> FittedRows:
@@ -466,6 +577,10 @@ class _Summary:
         return dict(zip(self.problem.names, values[index].tolist(), strict=True)), found
 
 
+def _or_none(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
 def _correlations(covariance_matrix: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
     error = np.sqrt(np.diag(covariance_matrix))
     known = np.isfinite(error) & (error > 0.0)
@@ -490,9 +605,11 @@ _FEWEST_LEFT, _LEAST_LEFT = 4, 0.2
 
 
 def fit(  # noqa: PLR0913
-    table: AmplitudeTable | Any,
+    table: AmplitudeTable | Sequence[AmplitudeTable] | Any,
     model: str = "law",
     *,
+    share: Sequence[str] = (),
+    hierarchical: bool = False,
     scale_errors: bool = False,
     free: Sequence[str] | None = None,
     fixed: dict[str, float] | None = None,
@@ -506,10 +623,14 @@ def fit(  # noqa: PLR0913
     Args:
         table: from `read_table`, or a data frame as `AmplitudeTable.from_dataframe` takes it; what it gives with an
             error (Q, calibrations) is a nuisance with that constraint. A Q without error is taken to be known to 2 %
-            where impacts last, and exactly by the instantaneous laws.
+            where impacts last, and exactly by the instantaneous laws. Several of them: one law for all, each with
+            nuisances of its own.
         model: "restitution" (r), "law" (r, epsilon; eq. 6), "viscous" (epsilon, viscous_loss) or "full" (all three),
             each instantaneous or with "+delay", the collision delay; or "contact", physical parameters through the
             resolved contact, which a tapping curve gives on resonance too.
+        share: nuisances that several tables have in common, by name; "all": every one.
+        hierarchical: let the laws of several tables scatter around a mean, each parameter by a standard deviation that
+            is fitted too: the values are then means.
         scale_errors: take the amplitudes' errors as relative only and scale them until chi2 equals its degrees of
             freedom (the error of Q stays); the result is valid only if the scale is believable and what is left of the
             amplitudes random (see `verdict`).
@@ -518,7 +639,7 @@ def fit(  # noqa: PLR0913
         fixed: values at which other parameters of the model are held; of "contact" what is not named is the paper's.
         constraints: value and standard error of what else is known, by parameter: a nuisance (`quality_factor`,
             `tip_calibration`, `drive_calibration`, `offset_origin_nm`), which then is fitted along, or one of the
-            model's parameters.
+            model's parameters. Of several tables every one's nuisance is known that well.
         effects: for "contact": the effects there are.
         robust: let outliers count linearly from two errors on; the result is valid only if they are few and the other
             amplitudes are explained.
@@ -529,20 +650,38 @@ def fit(  # noqa: PLR0913
         Values, errors, intervals, goodness of fit and a verdict; see `FitResult`.
 
     Raises:
-        ValueError: if there is no such model or parameter, a constraint is impossible or degenerate with the model, or
-            there are fewer measured amplitudes than parameters.
+        ValueError: if there is no such model or parameter, a constraint is impossible or degenerate with the model,
+            there are fewer measured amplitudes than parameters, or tables have no law in common.
         RuntimeError: if JAX is not set to 64-bit floats.
     """
-    table = table if isinstance(table, AmplitudeTable) else AmplitudeTable.from_dataframe(table)
     options: dict[str, Any] = {"free": free, "fixed": fixed, "constraints": constraints, "effects": effects}
-    found = find_fit(table, model, scale_errors=scale_errors, robust=robust, speeds=speeds, **options)
-    return summarise(table, found)
+    options |= {
+        "scale_errors": scale_errors,
+        "robust": robust,
+        "speeds": speeds,
+        "share": share,
+        "hierarchical": hierarchical,
+    }
+    whole = tables_of(table)
+    return summarise(whole, find_fit(whole, model, **options))
+
+
+def tables_of(given: Any) -> AmplitudeTable | SeveralTables:
+    """Return what was given as a table, or as several."""
+    if isinstance(given, AmplitudeTable | SeveralTables):
+        return given
+    if not isinstance(given, Sequence):
+        return AmplitudeTable.from_dataframe(given)
+    tables = [one if isinstance(one, AmplitudeTable) else AmplitudeTable.from_dataframe(one) for one in given]
+    return tables[0] if len(tables) == 1 else SeveralTables(tuple(tables))
 
 
 def find_fit(  # noqa: PLR0913
-    table: AmplitudeTable,
+    table: AmplitudeTable | SeveralTables,
     model: str,
     *,
+    share: Sequence[str] = (),
+    hierarchical: bool = False,
     scale_errors: bool = False,
     free: Sequence[str] | None = None,
     fixed: dict[str, float] | None = None,
@@ -555,11 +694,15 @@ def find_fit(  # noqa: PLR0913
     require_float64()
     if speeds is not None and not 0.0 < speeds[0] < speeds[1] < np.inf:
         raise ValueError(f"`speeds` must be a rising pair of positive numbers in nm/us, but is {speeds!r}")
-    known = constraints_of(table, constraints)
-    if table.quality_factor is not None and (model.endswith("+delay") or model == "contact"):
-        known = {"quality_factor": (table.quality_factor, ASSUMED_ERROR_OF_Q * table.quality_factor)} | known
-    problem = problem_of(table, model, free=free, fixed=fixed, constraints=known, effects=effects)
-    measurement = measurement_of(table, problem, known, fixed)
+    if isinstance(table, AmplitudeTable):
+        for name, asked in (("share", share), ("hierarchical", hierarchical)):
+            if asked:
+                raise ValueError(f"`{name}` is about several tables: leave it out, or give more than one")
+        known = _known_of(table, model, constraints)
+        problem = problem_of(table, model, free=free, fixed=fixed, constraints=known, effects=effects)
+        measurement = measurement_of(table, problem, known, fixed)
+    else:
+        known, problem, measurement = _joint(table, model, share, constraints, free=free, fixed=fixed, effects=effects)
     amplitudes = int(np.asarray(measurement.rows.measured).sum())
     if amplitudes < len(problem.own):
         raise ValueError(
@@ -584,7 +727,97 @@ def find_fit(  # noqa: PLR0913
         "effects": list(effects) if model == "contact" else None,
         "speeds": speeds,
     }
+    if isinstance(table, SeveralTables):
+        settings |= {"share": list(share), "hierarchical": hierarchical}
     return Found(stated, objective, minimum, strain, settings, refused)
+
+
+def _known_of(
+    table: AmplitudeTable, model: str, constraints: dict[str, tuple[float, float]] | None
+) -> dict[str, tuple[float, float]]:
+    """Return everything that is known beforehand of a table's fit, the quality factor's assumed error included."""
+    known = constraints_of(table, constraints)
+    if table.quality_factor is not None and (model.endswith("+delay") or model == "contact"):
+        known = {"quality_factor": (table.quality_factor, ASSUMED_ERROR_OF_Q * table.quality_factor)} | known
+    return known
+
+
+def _joint(
+    tables: SeveralTables,
+    model: str,
+    share: Sequence[str],
+    constraints: dict[str, tuple[float, float]] | None,
+    **options: Any,
+) -> tuple[dict[str, tuple[float, float]], Problem, Measurement]:
+    """Return what is known beforehand of several tables, what is fitted, and what it is compared with.
+
+    Raises:
+        ValueError: if there is no such nuisance to share, or the tables contradict each other on it.
+    """
+    if model == "contact" and any(table.tapping for table in tables.tables):
+        raise ValueError(
+            "the model 'contact' takes one table of a driven cantilever at a time: fit each by itself, or put several "
+            "amplitudes and frequencies into one table"
+        )
+    each = [_known_of(table, model, constraints) for table in tables.tables]
+    there = [name for name in NUISANCE_NAMES if any(name in known for known in each)]
+    shared = there if "all" in share else [name for name in there if name in share]
+    for name in share:
+        if name not in (*NUISANCE_NAMES, "all"):
+            raise ValueError(f"`share` must be chosen from {', '.join(NUISANCE_NAMES)} and all, but one is {name!r}")
+        if name not in (*there, "all"):
+            raise ValueError(f"`share` names {name}, but no table gives it with an error; state it, or leave it out")
+    _check_shared(tables, each, shared)
+    several = {name: pair for name, pair in each[0].items() if name in shared}
+    # what is each table's own may differ by what a delay takes up in common
+    own = problem_of(tables.tables[0], model, constraints=several, **options).own
+    for table, known in zip(tables.tables, each, strict=True):
+        checked = {name: pair for name, pair in known.items() if name != "offset_origin_nm"}
+        problem_of(replace(table, calibration={}), model, constraints=checked, **options)
+    labels, names = tables.labels, [*own, *shared]
+    known = {name: pair for name, pair in each[0].items() if name in (*own, *shared)}
+    heads = {"free_frequency_khz", "quality_factor"}
+    differing = {name for name in heads if len({getattr(table, name) for table in tables.tables}) > 1}
+    local = (*own, *(name for name in NUISANCE_NAMES if name in (*there, *differing)))
+    place, held = np.full((len(labels), len(local)), -1), np.zeros((len(labels), len(local)))
+    for t, (table, label) in enumerate(zip(tables.tables, labels, strict=True)):
+        for i, name in enumerate(local):
+            if name in names:
+                place[t, i] = names.index(name)
+            elif name in each[t]:
+                place[t, i] = len(names)
+                names.append(name_of_table(name, label))
+                known[names[-1]] = each[t][name]
+            else:
+                held[t, i] = getattr(table, name) if name in heads else _NEUTRAL[name]
+    drives = tuple(table.drive for table in tables.tables)
+    problem = Problem(model, tuple(names), tuple(options["effects"]), tables.drive)
+    one = replace(problem, names=local, drive=drives[0])
+    parts = [measurement_of(table, one, known, options["fixed"]) for table in tables.tables]
+    joint = Joint(one, tuple(part.cantilever for part in parts), drives, place, held)
+    return known, problem, joint_measurement(tables, parts, problem, joint, known)
+
+
+_NEUTRAL = {"tip_calibration": 1.0, "drive_calibration": 1.0, "offset_origin_nm": 0.0, "phase_zero_deg": 0.0}
+"""What stands for the absence of a nuisance."""
+
+
+def _check_shared(tables: SeveralTables, each: Sequence[dict[str, tuple[float, float]]], shared: Sequence[str]) -> None:
+    """Check that tables say the same of what they share.
+
+    Raises:
+        ValueError: if they do not.
+    """
+    for name in shared:
+        for known, label in zip(each, tables.labels, strict=True):
+            if known.get(name) != each[0].get(name):
+                said = [
+                    f"{where} {'says nothing of it' if pair is None else 'says {:g} +- {:g}'.format(*pair)}"
+                    for where, pair in ((tables.labels[0], each[0].get(name)), (label, known.get(name)))
+                ]
+                raise ValueError(
+                    f"{name} is shared, but {', and '.join(said)}; say it once (`constraints`), or do not share it"
+                )
 
 
 def problem_of(

@@ -8,10 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from afm_jax.units import TWO_SIDED_95
 from fitting.fits.least_squares import Box, Searches, covariance_of, descended
 from fitting.fits.objective import PLAIN, Objective
 from fitting.models import coordinate_of
-from fitting.parameters import Parameter
+from fitting.parameters import Parameter, is_of_one_table
 
 CHI2_95 = 3.841458820694124
 """95 % quantile of chi2 with one degree of freedom."""
@@ -56,7 +57,7 @@ def profile_intervals(
     covariance: Float[np.ndarray, "p p"],
     chi2: float,
 ) -> list[Interval]:
-    """Return the 95 % profile interval of every parameter.
+    """Return the 95 % profile interval of every parameter; Wald's of a nuisance that a table has to itself.
 
     Args:
         objective: chi2 of a table and a model.
@@ -69,14 +70,22 @@ def profile_intervals(
         _Side(index, direction, _followers(objective, values, covariance, index, direction))
         for index in range(len(values))
         for direction in (-1.0, 1.0)
-        if np.isfinite(errors[index])
+        if np.isfinite(errors[index]) and not is_of_one_table(objective.problem.names[index])
     ]
     for _ in range(_OUTER_STEPS):
         active = [side for side in sides if side.end is None and side.reason is None]
         if not active:
             break
         _advance(objective, active, values, errors, chi2)
-    return [_interval(sides, index) for index in range(len(values))]
+    reach = TWO_SIDED_95 * errors
+    ends = list(zip((values - reach).tolist(), (values + reach).tolist(), strict=True))
+    # it has a Gaussian constraint, and there are as many as tables
+    return [
+        within_range(objective.problem.parameters[index], Interval(*ends[index]))
+        if np.isfinite(errors[index]) and is_of_one_table(name)
+        else _interval(sides, index)
+        for index, name in enumerate(objective.problem.names)
+    ]
 
 
 def _advance(objective: Objective, sides: list[_Side], values, errors, chi2: float) -> None:

@@ -3,6 +3,7 @@
 The covariance that a Fisher matrix stands for.
 """
 
+import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -124,3 +125,17 @@ def whole_covariance_of(fisher: Float[np.ndarray, "... p p"]) -> Float[np.ndarra
     """Return the inverse of Fisher matrices; all infinite where one determines not every parameter."""
     inverse = covariance_of(fisher)
     return np.where(np.isfinite(inverse).all(axis=(-2, -1), keepdims=True), inverse, np.inf)
+
+
+def chi2_tail(chi2: float, freedom: int) -> float:
+    """Return the probability that chi2 of so many degrees of freedom is larger: the finite sum, without SciPy's import.
+
+    Q = [erfc(sqrt h)] + exp(-h) sum of h^a / Gamma(a + 1) with h = chi2/2, over a = 0, 1, ... < freedom/2; for odd ones
+    a = 1/2, 3/2, ... and the term in brackets.
+    """
+    half, odd = 0.5 * chi2, freedom % 2
+    tail = math.erfc(math.sqrt(half)) if odd else 0.0
+    if half in {0.0, math.inf}:
+        return float(half == 0.0)
+    powers = (0.5 * odd + k for k in range(freedom // 2))
+    return min(tail + math.fsum(math.exp(a * math.log(half) - half - math.lgamma(a + 1.0)) for a in powers), 1.0)

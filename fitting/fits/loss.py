@@ -70,7 +70,7 @@ def scaled(known: WithInterval, factor: float) -> WithInterval:
 
 
 def energy_lost(speed: float, rebound: float, error: float, mass_ng: float) -> EnergyLost:
-    """Return the energy that an impact takes.
+    """Return the energy that an impact takes; its interval ends at 0, for a sample at rest gives none.
 
     Args:
         speed: approach speed in nm/us.
@@ -78,7 +78,7 @@ def energy_lost(speed: float, rebound: float, error: float, mass_ng: float) -> E
         error: standard error of that.
         mass_ng: of the tip.
     """
-    taken = interval_of(0.5 * mass_ng * (speed**2 - rebound**2), mass_ng * rebound * error)
+    taken = interval_of(0.5 * mass_ng * (speed**2 - rebound**2), mass_ng * rebound * error, lowest=0.0)
     return EnergyLost(speed, taken, scaled(taken, EV_PER_AJ))
 
 

@@ -41,6 +41,8 @@ def starts(problem: Problem, measurement: Measurement) -> Float[np.ndarray, "poi
     Nuisances stay where they were measured.
     """
     own = problem.own
+    if measurement.joint is not None:
+        measurement = measurement._replace(rows=measurement.of_drive(problem.drive).rows)
 
     def started(name: str, place: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         return _range(PARAMETERS[name], measurement, problem, place)
@@ -187,6 +189,9 @@ def minimise(objective: Objective) -> Minimum:
     With impacts that last the search for orbits is what costs: the screening and the first polish look at a part of the
     rows, the rest follows orbits once they are known.
     """
+    common = objective.of_common_parameters()
+    if common is not None:
+        return _with_own_nuisances(objective, minimise(common))
     points = starts(objective.problem, objective.measurement)
     scout = _thinned(objective) if objective.problem.lasting else objective
     best = np.argsort(scout.screen(points), kind="stable")[:BATCH]
@@ -200,6 +205,19 @@ def minimise(objective: Objective) -> Minimum:
         return found
     other = settle(objective, replace(found, coordinates=back))
     return other if other.chi2[0] < found.chi2[0] else found
+
+
+def _with_own_nuisances(objective: Objective, found: Minimum) -> Minimum:
+    """Return the minimum with the nuisances that tables have to themselves, from one where these were held."""
+    known = np.asarray(objective.measurement.constraint_value)[len(found.start) :]
+
+    def whole(values: Float[np.ndarray, "... q"]) -> Float[np.ndarray, "... p"]:
+        return np.concatenate([values, np.broadcast_to(known, (*values.shape[:-1], known.size))], axis=-1)
+
+    ends = whole(found.ends)
+    best = objective.problem.coordinates(ends[lowest(found.chi2)])
+    begun = replace(found, coordinates=best, start=whole(found.start), ends=ends)
+    return settle(objective, begun) if objective.problem.lasting else _polished(objective, best[None], begun.start)
 
 
 def _scouted(scout: Objective, coordinates: Float[np.ndarray, "starts p"]) -> Float[np.ndarray, "starts p"]:
@@ -350,10 +368,19 @@ def padding(share: Float[np.ndarray, " rows"], readings: Float[np.ndarray, "rows
 
 def strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
     """Return the strain of every row (padded) at a set of values; none where impacts are instantaneous."""
+    count = objective.measurement.rows.order.shape[0]
+    found = Strain(np.zeros(count), np.zeros(count), np.full(count, "", dtype=object))
+    if objective.problem.lasting:
+        for mine, part in objective.by_instrument():
+            strain = _strain_of(part, values)
+            for whole, some in zip(vars(found).values(), vars(strain).values(), strict=True):
+                whole[mine] = some
+    return found
+
+
+def _strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
+    """Return the strain of every row of one instrument."""
     rows = objective.measurement.rows
-    count = rows.order.shape[0]
-    if not objective.problem.lasting:
-        return Strain(np.zeros(count), np.zeros(count), np.full(count, "", dtype=object))
     impact = impact_at(values, objective.measurement, objective.problem).impact
     linear = objective.at_values(values[None])
     prediction = linear.prediction

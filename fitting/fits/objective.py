@@ -5,6 +5,7 @@ with their Jacobian for a handful of parameter sets at once (`forward.linearise`
 and the profile intervals all drive it from outside.
 """
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import jax
@@ -14,6 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from fitting.forward import BATCH, Linearised, linearise
 from fitting.models import Measurement, Problem
+from fitting.parameters import is_of_one_table
 
 SOFT = 5.0
 """Residual, in errors, beyond which the screening and the first polish count a row linearly (soft-l1)."""
@@ -108,6 +110,41 @@ class Objective:
         rows = jax.tree.map(lambda column: np.asarray(column)[chosen], self.measurement.rows)
         near = None if self.near is None else np.asarray(self.near)[..., chosen]
         return Objective(self.measurement._replace(rows=rows), self.problem, near=near, robust=self.robust)
+
+    def by_instrument(self) -> list[tuple[Bool[np.ndarray, " rows"], "Objective"]]:
+        """Return which rows are of each head and drive, and the objective of these; all of them of one table."""
+        joint, table = self.measurement.joint, self.measurement.rows.table
+        if joint is None or table is None:
+            return [(np.ones(len(self.measurement.rows.order), dtype=bool), self)]
+        heads = [
+            (drive, float(head.frequency_khz), None if head.quality_factor is None else float(head.quality_factor))
+            for drive, head in zip(joint.drives, joint.cantilevers, strict=True)
+        ]
+        parts = []
+        for head in dict.fromkeys(heads):
+            mine = np.array([other == head for other in heads])[table]
+            part = self if mine.all() else self.of_rows(mine)
+            measurement = part.measurement._replace(cantilever=joint.cantilevers[heads.index(head)])
+            problem = replace(self.problem, drive=head[0])
+            parts.append((mine, part._of(measurement, problem)))  # noqa: SLF001
+        return [part for part in parts if part[0].any()]
+
+    def of_common_parameters(self) -> "Objective | None":
+        """Return the objective with the nuisances held that one of several tables has to itself; None without such."""
+        names, joint = self.problem.names, self.measurement.joint
+        count = sum(not is_of_one_table(name) for name in names)
+        if joint is None or count == len(names):
+            return None
+        value, error = np.asarray(self.measurement.constraint_value), np.asarray(self.measurement.constraint_error)
+        own = joint.place >= count
+        held = replace(joint, place=np.where(own, -1, joint.place), held=np.where(own, value[joint.place], joint.held))
+        measurement = self.measurement._replace(
+            constraint_value=value[:count], constraint_error=error[:count], joint=held
+        )
+        return Objective(measurement, replace(self.problem, names=names[:count]), robust=self.robust)
+
+    def _of(self, measurement: Measurement, problem: Problem) -> "Objective":
+        return Objective(measurement, problem, near=self.near, robust=self.robust, searched=self.searched)
 
     def at_values(self, values: Float[np.ndarray, "sets p"]) -> Linearised:
         """Return the linearised model at parameter values, as NumPy arrays."""

@@ -10,6 +10,7 @@ from afm_jax.results import public_result
 from afm_jax.strict_json import plain
 from fitting.fits.intervals import Convergence
 from fitting.fits.loss import Loss
+from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable
 
 FORMAT_VERSION = 1
@@ -62,6 +63,21 @@ class FittedLaw:
 
 
 @dataclass(frozen=True)
+class PlainLaw:
+    """The law of a model's parameters alone that comes closest to a fitted one over the measured speeds.
+
+    A fit's own law has besides what its model leaves out (the numbers of its shapes, smooth parts); a scene's has not.
+
+    Attributes:
+        values: of the parameters, and of the nuisances as fitted, by name.
+        covariance: of these, with all that the model leaves out; 0 for one that is held at its bound.
+    """
+
+    values: dict[str, float]
+    covariance: Float[np.ndarray, "p p"]
+
+
+@dataclass(frozen=True)
 class FittedRows:
     """The rows of the table beside their prediction; NaN where nothing was measured or predicted.
 
@@ -87,6 +103,53 @@ class FittedRows:
     phase_error_deg: Float[np.ndarray, " rows"] | None = None
 
 
+@dataclass(frozen=True)
+class FittedTable:
+    """One of several tables that were fitted together.
+
+    Attributes:
+        source: its file.
+        name: what it is called.
+        rows: how many it has.
+        used: how many of them count.
+        chi2: of its readings, of what is known of its own nuisances, and of its law's departure.
+        readings: how many there are.
+        pull: how far its law is from that of the others, as standard deviations of a single Gaussian number; None where
+            they do not determine it.
+        p_value: probability of a larger pull if all have the same law.
+        pulls: by how much it moves each parameter of the law, in standard deviations of that.
+        nuisances: its own, as `FitResult.parameters`.
+        departures: of its law from the mean, by parameter; empty where all have one law.
+    """
+
+    source: str
+    name: str
+    rows: int
+    used: int
+    chi2: float
+    readings: int
+    pull: float | None
+    p_value: float | None
+    pulls: dict[str, float | None]
+    nuisances: dict[str, FittedParameter]
+    departures: dict[str, float]
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Standard deviation of a parameter of the law between tables.
+
+    Attributes:
+        value: which has the largest restricted likelihood.
+        interval95: from its profile; the upper end is None where the tables set none.
+        unit: of both.
+    """
+
+    value: float
+    interval95: tuple[float, float | None]
+    unit: str
+
+
 @public_result(picture="fitting.report.plots:rows_figure", rows="parameters")
 @dataclass(frozen=True)
 class FitResult:
@@ -107,10 +170,15 @@ class FitResult:
         warnings: what a reader should know besides.
         law: the fitted impact law with its band.
         loss: what an impact takes: energies, the paper's r and delta, the capture speed; None if no speed was reached.
+        plain_law: what scenes and designs take for the law; None where the parameters themselves are that, or are not
+            determined.
         rows: measured and predicted amplitudes.
         residual_autocorrelation: lag-1 correlation of neighbouring rows' residuals.
         convergence: what the checks of the minimum found.
-        table: the table that was fitted.
+        table: the table that was fitted, or all of several.
+        tables: of several: each one's rows, chi2, pull on the law, and what it has to itself; `parameters` are then
+            those that all have in common.
+        scatter: of the law's parameters between tables where it was asked for; `parameters` are then means.
         settings: every option of the fit.
         versions: of the packages that computed it.
     """
@@ -130,10 +198,13 @@ class FitResult:
     rows: FittedRows
     residual_autocorrelation: float
     convergence: Convergence
-    table: AmplitudeTable
+    table: AmplitudeTable | SeveralTables
     settings: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=dict)
     loss: Loss | None = None
+    tables: tuple[FittedTable, ...] = ()
+    scatter: dict[str, Scatter] = field(default_factory=dict)
+    plain_law: PlainLaw | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain lists, numbers and strings; what is not known is None."""
@@ -154,9 +225,17 @@ class FitResult:
             "residual_autocorrelation": plain(self.residual_autocorrelation),
             "law": {name: plain(column) for name, column in vars(self.law).items()},
             "loss": None if self.loss is None else plain(asdict(self.loss)),
+            "plain_law": None if self.plain_law is None else plain(asdict(self.plain_law)),
             "rows": {name: plain(column) for name, column in vars(self.rows).items()},
             "convergence": plain(asdict(self.convergence)),
-            "input": plain(vars(self.table)),
+            "input": plain({"tables": [*map(vars, self.table.tables)]} if self.tables else vars(self.table)),
             "settings": plain(self.settings),
             "versions": self.versions,
-        }
+        } | (
+            {
+                "tables": [plain(asdict(table)) for table in self.tables],
+                "scatter": {name: plain(asdict(one)) for name, one in self.scatter.items()} or None,
+            }
+            if self.tables
+            else {}
+        )

@@ -19,14 +19,14 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from fitting.fits.least_squares import covariance_of
 from fitting.fits.minimum import Strain, padding
 from fitting.fits.objective import ROBUST, Objective
+from fitting.fits.result import PlainLaw
 from fitting.forward import ImpactSlopes, free_impacts, impact_at, impact_slopes
 from fitting.models import Problem
-from fitting.parameters import DELAY_SHAPE, LOSS_SHAPE, PARAMETERS
+from fitting.parameters import DELAY_SHAPE, LOSS_SHAPE, parameter_called
 
 LOSS_SPEED_SQUARED = 110.0, 60.0
 """q in nm^2/us^2 of a tip of 1 ng and its standard error: free fits of contacts' laws give 96 to 125, a wet one 234."""
@@ -105,6 +105,8 @@ class Unmodelled:
     def priors(self) -> dict[str, tuple[float, float]]:
         """Mean and standard error of the shapes' numbers, by name; only those that the model has use for."""
         priors = {}
+        if not self.problem.lasting:
+            return priors
         if "viscous_loss" in self.values:
             mean, error = LOSS_SPEED_SQUARED
             priors[LOSS_SHAPE] = mean / self.mass_ng, error / self.mass_ng
@@ -132,7 +134,7 @@ class Unmodelled:
 
     def _unknown(self, u: Float[np.ndarray, " n"], w: Float[np.ndarray, " n"]):
         """Return columns of the squared speed and of the delay, for unknowns of unit variance."""
-        if self.problem.model == "contact":
+        if self.problem.model == "contact" or not self.problem.lasting:
             return [], []
         middle = float(np.sqrt(self.speeds[0] * self.speeds[1]))
         loss = self.values.get("epsilon", 0.0) + self.values.get("viscous_loss", 0.0) * middle
@@ -151,7 +153,7 @@ class Unmodelled:
             return np.exp(-0.5 * ((one[:, None] - other) / _SMOOTH) ** 2)
 
         root = np.linalg.cholesky(related(knots, knots) + 1e-8 * np.eye(knots.size))
-        return solve_triangular(root, related(knots, np.log(u)), lower=True).T
+        return np.linalg.solve(root, related(knots, np.log(u))).T
 
 
 def _stacked(square: list, late: list, count: int) -> Float[np.ndarray, "2 n m"]:
@@ -188,16 +190,25 @@ class LinearStep(NamedTuple):
     follow: Float[np.ndarray, "m k"]
 
 
-def step_of(rows: StepRows, left_out: Unmodelled, free: Bool[np.ndarray, " p"]) -> LinearStep:
-    """Return where one linear step leads from a fit, with all that is left out.
+class StepSystem(NamedTuple):
+    """A fit's rows, linearised, with all that is left out.
 
-    Args:
-        rows: of the fit.
-        left_out: by the fitted model.
-        free: which of its parameters are not at their bound.
+    Attributes:
+        residual: of the readings, then of what else there is, the shapes' priors last.
+        jacobian: by the parameters, then by the shapes.
+        unknown: how the readings' residuals change with unknowns of unit variance.
+        noise: covariance of the readings' residuals, of each row by itself.
     """
+
+    residual: Float[np.ndarray, " n"]
+    jacobian: Float[np.ndarray, "n k"]
+    unknown: Float[np.ndarray, "readings m"]
+    noise: Float[np.ndarray, "readings readings"]
+
+
+def system_of(rows: StepRows, left_out: Unmodelled) -> StepSystem:
+    """Return the rows of a fit, linearised, with what its model leaves out."""
     size, names = rows.measurement_error.size, left_out.problem.names
-    values = np.array([left_out.values[name] for name in names])
     columns = left_out.columns(rows.approach, rows.rebound)
     slopes = np.stack([rows.slopes.by_square, rows.slopes.by_delay])
 
@@ -205,7 +216,7 @@ def step_of(rows: StepRows, left_out: Unmodelled, free: Bool[np.ndarray, " p"]) 
         """Return changes of the amplitudes' residuals that changes of the impacts make."""
         return np.einsum("krc,kr...->rc...", slopes, change).reshape(size, *change.shape[2:])
 
-    known, priors = len(values), left_out.priors
+    known, priors = len(names), left_out.priors
     residual = rows.residual.copy()
     residual[:size] += amplitudes(columns.known)
     jacobian = np.zeros((residual.size + len(priors), known + len(priors)))
@@ -215,12 +226,36 @@ def step_of(rows: StepRows, left_out: Unmodelled, free: Bool[np.ndarray, " p"]) 
     jacobian[:size, known:] = amplitudes(columns.shape)
     jacobian[residual.size :, known:] = np.diag([1.0 / error for _, error in priors.values()])
     residual = np.append(residual, np.zeros(len(priors)))
-    unknown = np.concatenate([amplitudes(columns.unknown), amplitudes(_remainders(rows, left_out.problem))], axis=1)
-    variance = _noise(rows) + unknown @ unknown.T
+    unknown = [amplitudes(columns.unknown)]
+    if left_out.problem.lasting:
+        unknown.append(amplitudes(_remainders(rows, left_out.problem)))
+    return StepSystem(residual, jacobian, np.concatenate(unknown, axis=1), _noise(rows))
+
+
+def step_of(
+    rows: StepRows,
+    left_out: Unmodelled,
+    free: Bool[np.ndarray, " p"],
+    more: Float[np.ndarray, "readings m"] | None = None,
+) -> LinearStep:
+    """Return where one linear step leads from a fit, with all that is left out.
+
+    Args:
+        rows: of the fit.
+        left_out: by the fitted model.
+        free: which of its parameters are not at their bound.
+        more: how the readings' residuals change with further unknowns of unit variance, which the law does not have.
+    """
+    size, names, priors = rows.measurement_error.size, left_out.problem.names, left_out.priors
+    values = np.array([left_out.values[name] for name in names])
+    residual, jacobian, unknown, noise = system_of(rows, left_out)
+    if more is not None:
+        unknown = np.concatenate([unknown, more], axis=1)
+    variance = noise + unknown @ unknown.T
     root = np.linalg.cholesky(variance)
 
     def whitened(matrix):
-        return np.concatenate([solve_triangular(root, matrix[:size], lower=True), matrix[size:]])
+        return np.concatenate([np.linalg.solve(root, matrix[:size]), matrix[size:]])
 
     white, slope = whitened(residual), whitened(jacobian)
     moving = np.append(free, np.ones(len(priors), bool))
@@ -230,11 +265,10 @@ def step_of(rows: StepRows, left_out: Unmodelled, free: Bool[np.ndarray, " p"]) 
     held = np.flatnonzero(~moving)
     covariance[held, held] = full[held, held]
     begin = np.append(values, [mean for mean, _ in priors.values()])
-    ends = np.array([(PARAMETERS[name].lowest, PARAMETERS[name].highest) for name in (*names, *priors)])
+    ends = np.array([(p.lowest, p.highest) for p in map(parameter_called, (*names, *priors))])
     change = _bounded(white, slope, begin, ends, moving & np.isfinite(np.diag(covariance)))
     left = residual + jacobian @ change
-    factor = cho_factor(variance, lower=True)
-    gain = unknown.T @ cho_solve(factor, np.eye(size))
+    gain = np.linalg.solve(variance, unknown).T
     likely = -gain @ left[:size]
     return LinearStep(
         names=(*names, *priors),
@@ -287,7 +321,9 @@ def _noise(rows: StepRows) -> Float[np.ndarray, "n n"]:
 def _remainders(rows: StepRows, problem: Problem) -> Float[np.ndarray, "2 rows m"]:
     """Return the leading remainders of the corrections, of the squared rebound speed and of the delay."""
     u, w, g, j, time = rows.approach, rows.rebound, rows.pull, rows.change, rows.hertz_time
-    slope = max(float(np.polyfit(u, u**2 - w**2, 1)[0]), 0.0)
+    # of the loss by the speed; rows of one speed say nothing of it
+    apart = u - u.mean()
+    slope = max(float(apart @ (u**2 - w**2)) / max(float(apart @ apart), 1e-9), 0.0)
     nothing = np.zeros_like(u)
     # where the lever's own pull is most of it, it hardly changes during the contact: full contacts say so
     by_square = 0.02 if problem.tapping else 5.0
@@ -396,6 +432,48 @@ def law_after(step: LinearStep, left_out: Unmodelled, speeds: Float[np.ndarray, 
     shift, capture_factor = _moved(step, before.capture_slope[None, None], at_capture)
     capture = max(before.capture + float(shift[0, 0]), 0.0)
     return whole._replace(capture=capture, capture_factor=capture_factor[0, 0])
+
+
+def plain_law(
+    step: LinearStep,
+    left_out: Unmodelled,
+    speeds: Float[np.ndarray, " n"],
+    before: LawBefore,
+    begin: Float[np.ndarray, " p"],
+    free: Bool[np.ndarray, " p"],
+) -> PlainLaw | None:
+    """Return the parameters of the closest law without what is left out, the band's widths being its errors.
+
+    Args:
+        step: the step.
+        left_out: by the fitted model.
+        speeds: approach speeds in nm/us over which it is the closest.
+        before: the fitted law there.
+        begin: the fitted values.
+        free: which of these are not at their bound.
+
+    Returns:
+        None where the parameters are not determined.
+    """
+    after, names = law_after(step, left_out, speeds, before), left_out.problem.names
+    if not (np.isfinite(step.covariance).all() and np.isfinite(after.factor).all()):
+        return None
+    weight = 1.0 / np.maximum(np.linalg.norm(after.factor, axis=2), 1e-300)
+    own = np.array([name in left_out.problem.own for name in names])
+    slope = (weight[..., None] * before.slope)[:, before.law[0] > 0.0].reshape(-1, len(names))
+    missing, factor = (
+        (weight[:, :, None] * part.reshape(*weight.shape, -1))[:, before.law[0] > 0.0].reshape(len(slope), -1)
+        for part in (before.law - after.law, after.factor)
+    )
+    ends = np.array([(p.lowest, p.highest) for p in map(parameter_called, names)])
+    moving = own & free
+    change = _bounded(missing[:, 0], slope, begin, ends, moving)
+    spread = np.zeros((len(names), factor.shape[1]))
+    spread[:, : len(step.names)] = root_of(step.covariance)[: len(names)]
+    spread[own] = 0.0
+    spread[moving] = np.linalg.lstsq(slope[:, moving], factor, rcond=None)[0]
+    values = np.where(own, begin + change, step.values[: len(names)])
+    return PlainLaw(dict(zip(names, values.tolist(), strict=True)), spread @ spread.T)
 
 
 def _moved(

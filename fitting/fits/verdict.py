@@ -10,12 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float
-from scipy.special import chdtrc
 
 from fitting.fits.intervals import Convergence
+from fitting.fits.least_squares import chi2_tail
 from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.result import FittedParameter, FittedRows
-from fitting.parameters import DELAY_NAMES, PARAMETERS, SHAPE_NAMES
+from fitting.parameters import DELAY_NAMES, SHAPE_NAMES, name_of_table, parameter_called
+from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable
 
 IMPROBABLE = 1e-3
@@ -58,7 +59,7 @@ _PULLED, _TORN = 2.0, 3.0
 class Evidence:
     """All that the verdict looks at; ``other_minimum`` are the values of another minimum and its chi2."""
 
-    table: AmplitudeTable
+    table: AmplitudeTable | SeveralTables
     parameters: dict[str, FittedParameter]
     convergence: Convergence
     rows: FittedRows
@@ -79,6 +80,10 @@ class Evidence:
     tapped: bool = False
     """Whether a contact's own taps were fitted, not a law."""
     """Hardly a row is left that a law of impacts can be read off."""
+    pulls: tuple[float, ...] = ()
+    """Of several tables, the probability that each one's law is that of the others."""
+    scattering: bool = False
+    """Laws were allowed to differ from table to table."""
 
     @property
     def refusal(self) -> str:
@@ -120,7 +125,7 @@ def _reasons(evidence: Evidence) -> list[str]:
     misfit = misfits(evidence)
     if misfit:
         reasons.append(f"The model does not explain the data: {'; '.join(misfit)}. {_why_not_explained(evidence)}")
-    reasons += _contradictions(evidence)
+    reasons += [*_contradictions(evidence), *_different_laws(evidence)]
     if evidence.freedom <= 0:
         reasons.append("As many parameters as amplitudes: the goodness of fit cannot be judged.")
     # a tapping curve tells those of the delay only together; the law does not hang on each
@@ -130,6 +135,22 @@ def _reasons(evidence: Evidence) -> list[str]:
         if parameter.interval95 == (None, None) and not misfit and not undetermined:
             reasons.append(f"{name} is not identified: {parameter.interval_reason}; {helpful_measurement(name)}.")
     return reasons
+
+
+def _different_laws(evidence: Evidence) -> list[str]:
+    disagreeing = _disagreeing(evidence)
+    if not disagreeing or evidence.scattering:
+        return []
+    advice = "look at what is different there, leave it out, or let laws differ from table to table (--hierarchical)"
+    return [f"The tables do not have one law: {disagreeing}; {advice}."]
+
+
+def _disagreeing(evidence: Evidence) -> str:
+    """Return which tables' laws are not that of the others, in words; nothing where all may have one."""
+    pulls = np.array(evidence.pulls)
+    far = np.flatnonzero(pulls * pulls.size < IMPROBABLE)
+    named = sorted(far, key=lambda t: pulls[t])
+    return "; ".join(f"{evidence.table.labels[t]} is off the others (probability {pulls[t]:.1g})" for t in named)
 
 
 def _contradictions(evidence: Evidence) -> list[str]:
@@ -187,7 +208,7 @@ def _scaled_misfits(evidence: Evidence) -> list[str]:
             f"{LARGEST_SCALE:g} is a misfit, not a matter of scale (if the errors are no more than weights, state them "
             "to within that)"
         )
-    if pulls and chdtrc(len(pulls), sum(pull**2 for pull in pulls.values())) < IMPROBABLE:
+    if pulls and chi2_tail(sum(pull**2 for pull in pulls.values()), len(pulls)) < IMPROBABLE:
         moved = ", ".join(f"{name} by {pull:+.1f}" for name, pull in pulls.items())
         found.append(f"it contradicts what is known beforehand, in standard errors: {moved}")
     return found
@@ -216,7 +237,7 @@ def _without_outliers(evidence: Evidence) -> tuple[float, int, float]:
     # the shapes are known as well as they are determined: neither data nor free
     freedom = inside.size + len(pulls) - sum(name not in SHAPE_NAMES for name in evidence.parameters)
     chi2 = float(np.sum(inside**2) + sum(pull**2 for pull in pulls.values()))
-    return chi2, freedom, float(chdtrc(freedom, chi2)) if freedom > 0 else float("nan")
+    return chi2, freedom, chi2_tail(chi2, freedom) if freedom > 0 else float("nan")
 
 
 def _outliers(evidence: Evidence, scale: float = 1.0) -> Bool[np.ndarray, " rows"]:
@@ -260,7 +281,7 @@ def _why_not_explained(evidence: Evidence) -> str:
     worst = np.nanmax(np.abs(np.where(np.isfinite(evidence.rows.residual), evidence.rows.residual, 0.0)), axis=1)
     far = np.argsort(-worst)[: max(1, len(worst) // 20)]
     names = evidence.parameters
-    tail = f"farthest off: {_rows_in_words(evidence.table, np.sort(far))}"
+    tail = f"farthest off: {_unexplained_tables(evidence)}{_rows_in_words(evidence.table, np.sort(far))}"
     # counting outliers less helps where the others are well explained: not if most are off, or off together
     few = 2 * _outliers(evidence, evidence.error_scale or 1.0).sum() <= evidence.rows.used.sum()
     if few and not evidence.robust and not _correlations(evidence):
@@ -286,48 +307,76 @@ def _why_not_explained(evidence: Evidence) -> str:
     )
 
 
+def _unexplained_tables(evidence: Evidence) -> str:
+    """Return which of several tables are not explained by themselves: 'B.csv (chi2 141/60); '; nothing of one table."""
+    if not isinstance(evidence.table, SeveralTables):
+        return ""
+    named = []
+    for t, label in enumerate(evidence.table.labels):
+        residual = evidence.rows.residual[evidence.table.number == t]
+        residual = residual[np.isfinite(residual)]
+        chi2 = float(residual @ residual)
+        if len(evidence.table.labels) * chi2_tail(chi2, residual.size) < IMPROBABLE:
+            named.append((chi2 / residual.size, f"{label} (chi2 {chi2:.0f}/{residual.size}); "))
+    return "".join(words for _, words in sorted(named, reverse=True))
+
+
 def helpful_measurement(name: str) -> str:
     """Return what to measure, or to say, so that a parameter gets determined."""
-    known = PARAMETERS[name].advice if name in PARAMETERS else ""
-    return known or "measure at other drives, orders or offsets too, or hold it fixed at a known value"
+    return (
+        parameter_called(name).advice
+        or "measure at other drives, orders or offsets too, or hold it fixed at a known value"
+    )
 
 
 def _warnings(evidence: Evidence) -> list[str]:
     return [
         *_damping_warnings(evidence),
+        *_table_warnings(evidence),
         *_parameter_warnings(evidence),
         *_pair_warnings(evidence),
         *_row_warnings(evidence),
     ]
 
 
+def _table_warnings(evidence: Evidence) -> list[str]:
+    disagreeing = _disagreeing(evidence) if evidence.scattering else ""
+    return [f"Far from the mean law even for this scatter: {disagreeing}."] if disagreeing else []
+
+
 def _damping_warnings(evidence: Evidence) -> list[str]:
-    table = evidence.table
-    along = evidence.parameters.get("quality_factor")
+    several, warnings = isinstance(evidence.table, SeveralTables), []
+    for table, label in zip(evidence.table.tables, evidence.table.labels, strict=True):
+        own = name_of_table("quality_factor", label)
+        along = evidence.parameters.get(own) or evidence.parameters.get("quality_factor")
+        said = _damping_warning(table, along)
+        warnings += [f"{label}: {said}" if several else said] if said else []
+    return warnings
+
+
+def _damping_warning(table: AmplitudeTable, along: FittedParameter | None) -> str:
+    """Return what there is to say of a table's quality factor, which was fitted along or not; "" for nothing."""
     if along is not None:
         assumed = (table.quality_factor or 0.0, ASSUMED_ERROR_OF_Q * (table.quality_factor or 0.0))
         if table.quality_factor_error is not None or along.constraint != assumed:
-            return []
+            return ""
         given, error = assumed
-        message = (
+        return (
             f"quality_factor = {given:g} is given without an error: {100.0 * ASSUMED_ERROR_OF_Q:g} % was assumed "
             f"({given:g} +- {error:.3g}). The loss hangs on it: state it, like `# quality_factor = {given:g} +- 1`."
         )
-        return [message]
     if table.quality_factor is None:
-        message = (
+        return (
             "The table gives no quality_factor: air damping is left out, and what it takes is counted as impact loss. "
             "Add a line like `# quality_factor = 40 +- 1`."
         )
-        return [message]
     if table.quality_factor_error is None:
         known = f"quality_factor = {table.quality_factor:g}"
-        message = (
+        return (
             f"{known} is taken as exact. Amplitudes tell the impact's loss from the air's only as well as Q is known: "
             f"`# {known} +- 1` lets the intervals show it."
         )
-        return [message]
-    return []
+    return ""
 
 
 def _parameter_warnings(evidence: Evidence) -> list[str]:
@@ -423,8 +472,8 @@ def _row_warnings(evidence: Evidence) -> list[str]:
     return warnings
 
 
-def _rows_in_words(table: AmplitudeTable, rows: np.ndarray) -> str:
-    """Return 'line 7' or 'lines 7, 9, 12 and 3 more' of the table's file."""
-    numbers = [str(int(table.lines[i])) if len(table.lines) else str(int(i) + 1) for i in rows]
+def _rows_in_words(table: AmplitudeTable | SeveralTables, rows: np.ndarray) -> str:
+    """Return 'line 7' or 'lines 7, 9, 12 and 3 more' of the table's file; 'line B.csv:7' of several."""
+    numbers = table.row_names[rows].tolist()
     shown = ", ".join(numbers[:6]) + (f" and {len(numbers) - 6} more" if len(numbers) > 6 else "")
     return f"{'line' if len(numbers) == 1 else 'lines'} {shown}"

@@ -394,12 +394,17 @@ def _looks(curve: MeasuredCurve) -> dict[str, BranchLook]:
     return {branch: look_at(curve.offset_nm[mask], curve.amplitude[mask]) for branch, mask in masks.items()}
 
 
+_LEAST_ERROR = 1e-9
+"""Of a slope, relative."""
+
+
 def _mean_slope(looks: Mapping[str, BranchLook]) -> tuple[float, float] | None:
     """Return the weighted mean of the branches' slopes, its error widened by what they differ beyond theirs."""
     slopes = np.array([look.slope for look in looks.values() if look.slope is not None])
     if not slopes.size:
         return None
-    weights = 1.0 / slopes[:, 1] ** 2
+    # rows that lie on a line exactly leave no error at all
+    weights = np.maximum(slopes[:, 1], _LEAST_ERROR * np.abs(slopes[:, 0])) ** -2.0
     mean = float(np.sum(weights * slopes[:, 0]) / weights.sum())
     chi2 = float(np.sum(weights * (slopes[:, 0] - mean) ** 2))
     return mean, float(np.sqrt(max(chi2, 1.0) / weights.sum()))

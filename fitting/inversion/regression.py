@@ -11,7 +11,6 @@ The law that a fit found, read back from the JSON of `afm-jax fit`, to be drawn 
 A law that is known otherwise, from a CSV file such as `afm-jax collide --out` writes.
 """
 
-import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,8 +18,8 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import chdtrc
 
+from fitting.fits.least_squares import chi2_tail
 from fitting.inversion.result import (
     Coefficient,
     ComparedLaw,
@@ -37,6 +36,7 @@ from fitting.tables.csv_text import (
     TableError,
     parse_rows,
     printable,
+    read_fit_json,
     read_text,
     split_cells,
     split_lines,
@@ -76,7 +76,7 @@ class Regression:
     @property
     def p_value(self) -> float:
         """Probability of a larger chi2 if the law is right; NaN without degrees of freedom."""
-        return float(chdtrc(self.degrees_of_freedom, self.chi2)) if self.degrees_of_freedom > 0 else float("nan")
+        return chi2_tail(self.chi2, self.degrees_of_freedom) if self.degrees_of_freedom > 0 else float("nan")
 
 
 def loss(u: np.ndarray, w: np.ndarray, _: np.ndarray) -> np.ndarray:
@@ -348,16 +348,14 @@ def read_fitted_law(path: str | Path) -> SavedLaw:
         TableError: if the file cannot be read, is no fit, or the fit is not valid.
     """
     name = printable(str(path))
-    try:
-        found = json.loads(read_text(path))
-    except json.JSONDecodeError as error:
-        raise TableError(f"{name}, line {error.lineno}: is no JSON; give the fit.json of `afm-jax fit --out`") from None
-    if not isinstance(found, dict) or found.get("format") != "afm-jax fit" or not isinstance(found.get("law"), dict):
-        raise TableError(f"{name}: is no fit; give the fit.json of `afm-jax fit --out`")
+    found = read_fit_json(path)
+    if not isinstance(found.get("law"), dict):
+        raise TableError(f"{name}: is no fit of a law; give the fit.json of `afm-jax fit --out`")
     if not found.get("valid"):
         raise TableError(f"{name}: the fit is not valid, so that its law means nothing; give a valid one")
     columns = [_numbers(found["law"].get(column)) for column in _COLUMNS]
-    if any(column.shape != columns[0].shape or column.size < 2 for column in columns):
+    alike = all(column.shape == columns[0].shape for column in columns) and columns[0].size > 1
+    if not alike or not np.isfinite(columns[0]).all():
         raise TableError(f"{name}: its law lacks {', '.join(_COLUMNS)}; fit again with this version")
     given = found.get("input")
     given = given if isinstance(given, dict) else {}

@@ -13,6 +13,7 @@ from fitting.fits.result import FitResult, FittedRows
 from fitting.parameters import NUISANCE_NAMES, PARAMETERS, SHAPE_NAMES
 from fitting.report.page import Table, in_signs, page, pairs, pictures_of
 from fitting.report.words import (
+    PULLS,
     SHARE_OF_BAND,
     ComparedModels,
     Sampled,
@@ -24,10 +25,15 @@ from fitting.report.words import (
     interval_in_words,
     law_points,
     losses_in_words,
+    nuisances_in_words,
     remarks_on,
     rounded_values,
+    scatter_in_words,
+    tables_in_words,
+    trust_in_words,
     value_in_words,
 )
+from fitting.sampling.trust_pack import TrustPack
 from fitting.tables.table import AmplitudeTable
 
 _MOST_ROWS = 1500
@@ -63,6 +69,7 @@ def fit_page(
     comparison: ComparedModels | None = None,
     bootstrap: Sampled | None = None,
     posterior: Sampled | None = None,
+    trust: tuple[TrustPack, Sequence[bytes]] | None = None,
 ) -> str:
     """Return the page; it is well-formed XML too.
 
@@ -72,6 +79,7 @@ def fit_page(
         comparison: other models of the same table, or None.
         bootstrap: intervals from synthetic data sets, or None.
         posterior: credible intervals, or None.
+        trust: what speaks for the posterior, and its pictures, or None.
     """
     names = [*result.parameters, *(result.settings.get("fixed") or {})]
     numbers = {name: PARAMETERS[name].symbol or name for name in names}
@@ -98,10 +106,11 @@ def fit_page(
         goodness=_goodness(result),
         correlations=_correlations(result),
         samples=[_sampled(title, one, list(result.parameters)) for title, one in samples.items() if one is not None],
+        trust=None if trust is None else _trusted(*trust),
         rows=_rows(result),
         minimum=_minimum(result),
-        instrument=_instrument(result.table),
-        measured=_measured(result.table),
+        tables=_tables(result),
+        inputs=[(_instrument(one), one.remarks, _measured(one)) for one in result.table.tables],
         settings=pairs("Options of the fit", ("option", "value"), result.settings),
         versions=pairs("Versions of what computed it", ("package", "version"), result.versions),
     )
@@ -114,6 +123,19 @@ def _what_the_data_say(result: FitResult) -> Table:
         caption += " (calibration and damping are fitted along, see Parameters)"
     rows = [[name, value_in_words(p), interval_in_words(p), in_signs(p.unit)] for name, p in own.items()]
     return Table(caption, ["parameter", "value", "95 % interval", "unit"], rows, words=("95 % interval", "unit"))
+
+
+def _tables(result: FitResult) -> list[Table]:
+    """Return pulls of several tables, what each has to itself, and the scatter between them; nothing of one."""
+    if not result.tables:
+        return []
+    captions = (PULLS, "Scatter of the law between tables", "What each table has to itself")
+    found = zip(captions, (tables_in_words(result), scatter_in_words(result), nuisances_in_words(result)), strict=True)
+    return [
+        Table(caption, head, [[in_signs(cell) for cell in row] for row in rows], words=("95 % interval", "unit"))
+        for caption, (head, rows) in found
+        if rows
+    ]
 
 
 def _pictures(result: FitResult, files: Sequence[bytes]) -> list[dict[str, str]]:
@@ -215,6 +237,32 @@ def _sampled(title: str, sampled: Sampled, parameters: Sequence[str]) -> dict[st
     }
 
 
+def _trusted(pack: TrustPack, files: Sequence[bytes]) -> dict[str, Any]:
+    """Return what speaks for a posterior and what against it."""
+    shows = (
+        "What was read, and the bands of replicated readings, as deviations from their median.",
+        "How far the law moves without each row, and how far the posterior without it is from the whole one.",
+        "Ranks of true values in the posteriors of simulated tables; grey, where 95 % of uniform ones stay.",
+        "The posterior's parameters in pairs; the ellipses of a Gaussian hold 68 and 95 %.",
+    )
+    heads = {
+        "line": "line",
+        "law_moves": "law moves (errors)",
+        "law_moves_refitted": "refitted",
+        "cooks_distance": "Cook's distance",
+        "elpd": "elpd",
+        "pareto_k": "Pareto k",
+    }
+    records = pack.row_records()
+    rows = [[known(records[i][name], ".4g") for name in heads] for i in pack.influence.checked.tolist()]
+    return {
+        "complaints": pack.complaints,
+        "words": [in_signs(line) for line in trust_in_words(pack)],
+        "pictures": pictures_of(files, shows),
+        "rows": Table("Rows that move the law most; all of them are in trust_rows.csv", list(heads.values()), rows),
+    }
+
+
 def _title(name: str) -> str:
     return name.removeprefix("parameters ").replace("interval95", "95 % interval").replace("_", " ")
 
@@ -285,6 +333,7 @@ def _rows(result: FitResult) -> Table:
         *([known(value, form) for value in column[: len(shown)].astype(float).tolist()] for _, column, form in columns),
         strict=True,
     )
+    lines = table.row_names.tolist()
     unseen = np.zeros(table.rows, dtype=bool) if table.no_orbit is None else table.no_orbit > 0
     remarks = [_row_remarks(rows, i, unseen=bool(unseen[i])) for i in shown]
     caption = (
@@ -294,7 +343,7 @@ def _rows(result: FitResult) -> Table:
     return Table(
         caption,
         [*(name for name, _, _ in columns), "remarks"],
-        [[*cells, words] for cells, words in zip(numbers, remarks, strict=True)],
+        [[line, *cells[1:], words] for line, cells, words in zip(lines[: len(shown)], numbers, remarks, strict=True)],
         words=("remarks",),
         marked={i for i in shown if remarks[i]},
         left_out=_left_out(table.rows, "fit_rows.csv"),

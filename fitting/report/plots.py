@@ -20,6 +20,7 @@ _WIDTH_INCHES, DPI = 10.0, 120.0
 _KINDS = ("peak", "lock-in", "phase")
 _ASIDE = "#999999"
 _ROW_AXIS = "drive frequency (kHz), for each order N to scale; rows of one frequency beside each other"
+_HEIGHT = "height of the sample over the tip's rest position (nm)"
 _MUCH = 5.0
 """How much the loss must change to be drawn on a logarithmic axis."""
 _APPROACH = "approach speed (nm/µs)"
@@ -38,12 +39,15 @@ def fit_pictures(result: FitResult) -> list[bytes]:
 
 
 def rows_figure(result: FitResult) -> Figure:
-    """Return the figure of the rows: amplitudes above, residuals below."""
-    figure = Figure(figsize=(_WIDTH_INCHES, 6.4), layout="constrained")
-    above, below = figure.subplots(2, 1, sharex=True, height_ratios=(1.7, 1.0))
-    draw_amplitudes(above, result)
-    draw_residuals(below, result)
-    handles, labels = above.get_legend_handles_labels()
+    """Return the figure of the rows: amplitudes above, residuals below; of a tapping curve the lag between them."""
+    draw = [draw_amplitudes, draw_residuals]
+    if result.table.tapping and result.rows.measured_phase_deg is not None:
+        draw.insert(1, draw_lags)
+    figure = Figure(figsize=(_WIDTH_INCHES, 1.2 + 2.6 * len(draw)), layout="constrained")
+    panels = figure.subplots(len(draw), 1, sharex=True, height_ratios=(1.7, *([1.0] * (len(draw) - 1))))
+    for panel, axes in zip(draw, panels, strict=True):
+        panel(axes, result)
+    handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(handles, labels, fontsize=SMALL, ncols=4, loc="outside lower center")
     goodness = f"chi²/dof = {result.chi2:.4g}/{result.degrees_of_freedom}"
     title = f"Impact law from {result.table.rows} rows, model {result.model}, {goodness}"
@@ -107,25 +111,37 @@ def energy_figure(result: FitResult, loss: Loss) -> Figure:
 def draw_amplitudes(axes: Axes, result: FitResult) -> None:
     """Draw each row's measured amplitudes with their prediction; rows set aside or without an orbit are marked."""
     ranking, places = _row_axis(result)
-    aside = result.rows.set_aside[ranking]
-    drawn = False
     for kind in range(2):
-        measured = result.rows.measured_nm[ranking, kind]
-        if not np.isfinite(measured).any():
-            continue
-        predicted = result.rows.predicted_nm[ranking, kind]
-        fitted = np.where(aside, np.nan, measured)
-        axes.plot(places, fitted, "o", ms=4, mfc="none", color=COLOURS[kind], label=f"{_KINDS[kind]}, measured")
-        axes.plot(places, predicted, "_", ms=8, mew=1.6, color=COLOURS[kind], label=f"{_KINDS[kind]}, predicted")
-        if (aside & np.isfinite(measured)).any():
-            label = None if drawn else "measured, set aside"
-            axes.plot(places[aside], measured[aside], "x", ms=6, mew=1.4, color=_ASIDE, label=label)
-            drawn = True
+        _draw_readings(axes, result, kind, result.rows.measured_nm[:, kind], result.rows.predicted_nm[:, kind])
     _mark_missing(axes, result, ranking, places)
-    _mark_orders(axes, result.table.order[ranking])
-    axes.set_yscale("log")
+    if not result.table.tapping:
+        _mark_orders(axes, result.table.order[ranking])
+        axes.set_yscale("log")
     axes.set_ylabel("amplitude (nm)")
     axes.tick_params(labelbottom=False)
+
+
+def draw_lags(axes: Axes, result: FitResult) -> None:
+    """Draw each row's measured lag with its prediction."""
+    rows = result.rows
+    if rows.measured_phase_deg is not None and rows.predicted_phase_deg is not None:
+        _draw_readings(axes, result, 2, rows.measured_phase_deg, rows.predicted_phase_deg)
+    axes.set_ylabel("lag (degrees)")
+
+
+def _draw_readings(axes: Axes, result: FitResult, kind: int, measured: np.ndarray, predicted: np.ndarray) -> None:
+    """Draw readings of a kind, if there are any, with their prediction."""
+    ranking, places = _row_axis(result)
+    aside, measured, predicted = result.rows.set_aside[ranking], measured[ranking], predicted[ranking]
+    if not np.isfinite(measured).any():
+        return
+    fitted = np.where(aside, np.nan, measured)
+    axes.plot(places, fitted, "o", ms=4, mfc="none", color=COLOURS[kind], label=f"{_KINDS[kind]}, measured")
+    axes.plot(places, predicted, "_", ms=8, mew=1.6, color=COLOURS[kind], label=f"{_KINDS[kind]}, predicted")
+    if (aside & np.isfinite(measured)).any():
+        label = "measured, set aside"
+        once = None if label in axes.get_legend_handles_labels()[1] else label
+        axes.plot(places[aside], measured[aside], "x", ms=6, mew=1.4, color=_ASIDE, label=once)
 
 
 def draw_residuals(axes: Axes, result: FitResult) -> None:
@@ -134,9 +150,10 @@ def draw_residuals(axes: Axes, result: FitResult) -> None:
     _draw_expected(axes)
     for kind in range(result.rows.residual.shape[1]):
         axes.plot(places, result.rows.residual[ranking, kind], "o", ms=3, color=COLOURS[kind])
-    _name_frequencies(axes, result)
+    if not result.table.tapping:
+        _name_frequencies(axes, result)
     axes.set_ylabel("residual (errors)")
-    axes.set_xlabel(_ROW_AXIS)
+    axes.set_xlabel(_HEIGHT if result.table.tapping else _ROW_AXIS)
 
 
 def draw_residuals_by_speed(axes: Axes, result: FitResult) -> None:
@@ -170,9 +187,13 @@ def _draw_expected(axes: Axes) -> None:
 def _row_axis(result: FitResult) -> tuple[np.ndarray, np.ndarray]:
     """Return the rows in order, and where each stands: an order N is as wide as any, its drive frequencies to scale.
 
-    Rows of one frequency, at several drives and offsets, stand a little beside each other.
+    Rows of one frequency, at several drives and offsets, stand a little beside each other; those of a tapping curve at
+    their height.
     """
     table = result.table
+    if table.tapping:
+        ranking = np.argsort(table.offset_nm, kind="stable")
+        return ranking, table.offset_nm[ranking]
     ranking = np.lexsort((table.offset_nm, table.excitation_nm, table.drive_frequency_khz, table.order))
     places = np.empty(len(ranking))
     order, frequency = table.order[ranking], table.drive_frequency_khz[ranking]

@@ -11,6 +11,7 @@ from afm_jax.whole_files import write_whole
 from afm_jax.words import bullets, known, text_table
 from fitting.fits.result import FitResult, FittedParameter, FittedRows
 from fitting.report.words import (
+    PULLS,
     ComparedModels,
     Sampled,
     band_in_words,
@@ -18,9 +19,14 @@ from fitting.report.words import (
     held_in_words,
     interval_in_words,
     losses_in_words,
+    nuisances_in_words,
     rows_in_words,
+    scatter_in_words,
+    tables_in_words,
     value_in_words,
 )
+from fitting.sampling.trust_pack import TrustPack
+from fitting.tables.several import SeveralTables
 
 _MANY_PARAMETERS = 3
 _WORTH_SAYING = 0.9
@@ -70,6 +76,7 @@ def summary(result: FitResult) -> str:
         f"  {band_in_words(result)}",
         _goodness_line(result),
         *_correlation_lines(result),
+        *_table_lines(result),
         *_loss_lines(result),
         *bullets("Notes:", result.warnings),
     ]
@@ -87,6 +94,17 @@ def _goodness_line(result: FitResult) -> str:
     probability = f", probability {result.p_value:.2g}" if np.isfinite(result.p_value) else ""
     goodness = f"chi2/dof = {result.chi2:.1f}/{result.degrees_of_freedom}{probability}"
     return f"  {goodness}, AIC {result.aic:.1f}, BIC {result.bic:.1f}"
+
+
+def _table_lines(result: FitResult) -> list[str]:
+    """Return each of several tables' pull, what it has to itself, and the scatter of laws between them."""
+    if not result.tables:
+        return []
+    lines = ["", *text_table(*tables_in_words(result)), f"  {PULLS}."]
+    for head, rows in (scatter_in_words(result), nuisances_in_words(result)):
+        if rows:
+            lines += ["", *text_table(head, rows, words=(0, 1, len(head) - 1))]
+    return lines
 
 
 def _loss_lines(result: FitResult) -> list[str]:
@@ -126,6 +144,8 @@ def row_records(result: FitResult) -> list[dict[str, Any]]:
     )
     more = phase_columns(rows)
     names += more
+    if isinstance(table, SeveralTables):
+        names, columns = ["table", *names], (np.array(table.labels)[table.number], *columns)
     cells = zip(*(c.tolist() for c in (*columns, *more.values())), strict=True)
     return [dict(zip(names, row, strict=True)) for row in cells]
 
@@ -155,6 +175,7 @@ def write_report(
     comparison: ComparedModels | None = None,
     bootstrap: Sampled | None = None,
     posterior: Sampled | None = None,
+    trust: TrustPack | None = None,
 ) -> list[Path]:
     """Write fit.html, fit.txt, fit.json, fit.png and the tables fit_rows.csv and law.csv into a folder.
 
@@ -165,6 +186,7 @@ def write_report(
         comparison: other models of the same table, for fit.html.
         bootstrap: intervals from synthetic data sets, for fit.html.
         posterior: credible intervals, for fit.html.
+        trust: what speaks for the posterior, for fit.html, trust.png and trust_rows.csv.
 
     Returns:
         The files written here (the tables are `write_table`'s).
@@ -177,13 +199,22 @@ def write_report(
 
     picture, *pictures = fit_pictures(result)
     page = folder / "fit.html"
-    markup = fit_page(result, pictures, comparison=comparison, bootstrap=bootstrap, posterior=posterior)
+    trusted = None
+    if trust is not None:
+        from fitting.report.trust_plots import trust_pictures  # noqa: PLC0415
+
+        whole, *parts = trust_pictures(trust)
+        write_whole(folder / "trust.png", whole)
+        records = trust.row_records()
+        write_table("trust_rows.csv", records, tuple(records[0]))
+        trusted = trust, parts
+    markup = fit_page(result, pictures, comparison=comparison, bootstrap=bootstrap, posterior=posterior, trust=trusted)
     write_whole(page, markup)
     others = write_report_files(folder, "fit", text=summary(result), data=result.to_dict(), picture=picture)
     records = row_records(result)
     write_table("fit_rows.csv", records, tuple(records[0]))
     write_table("law.csv", law_records(result), LAW_COLUMNS)
-    return [page, *others]
+    return [page, *others, *([] if trust is None else [folder / "trust.png"])]
 
 
 def write_report_files(folder: Path, name: str, *, text: str, data: dict[str, Any], picture: bytes) -> list[Path]:

@@ -6,11 +6,12 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.words import decimals, interval, percent, value_alone
+from afm_jax.words import decimals, interval, known, percent, value_alone
 from fitting.fits.loss import WithInterval
 from fitting.fits.result import FitResult, FittedParameter
 from fitting.fits.verdict import IMPROBABLE
 from fitting.parameters import DELAY_LAW, DELAY_SHAPE, LAWS, LOSS_SHAPE, PARAMETERS, SHAPE_NAMES
+from fitting.sampling.trust_pack import TrustPack
 
 SHARE_OF_BAND = 0.1
 """How far the rounded formula may be off, in half-widths of the 95 % band."""
@@ -47,6 +48,27 @@ class Sampled(Protocol):
     def to_dict(self) -> dict[str, Any]:
         """Return everything; what is a mapping by parameter becomes a table."""
         ...
+
+
+def trust_in_words(pack: TrustPack) -> list[str]:
+    """Return what a trust pack found, in lines."""
+    (inside50, readings), (inside95, _) = pack.predictive.inside(1, 3), pack.predictive.inside(0, 4)
+    ranks, loo, influence = pack.calibration, pack.loo, pack.influence
+    first = int(influence.checked[0])
+    without = f"; {ranks.failed} more could not be fitted" if ranks.failed else ""
+    predicted = (
+        f"{inside50} of {readings} readings lie in the 50 % bands of replicated ones, {inside95} in the 95 % bands"
+    )
+    uniform = f"probability if uniform {ranks.p_value:.2g}, of the Gaussian ones {ranks.gaussian_p_value:.2g}"
+    most = f"Pareto k at most {np.max(loo.pareto_k):.2f} (line {pack.lines[np.argmax(loo.pareto_k)]})"
+    move = f"{known(influence.law_moves[first], '.2f')} of its standard errors, refitted "
+    move += known(influence.law_moves_refitted[0], ".2f")
+    return [
+        predicted,
+        f"ranks in the posteriors of {len(ranks.ranks)} simulated tables{without}: {uniform}",
+        f"leave-one-out: elpd {loo.elpd:.1f} +- {loo.elpd_error:.1f}, {loo.p_loo:.1f} effective parameters, {most}",
+        f"the law moves most without line {pack.lines[first]}: by {move}",
+    ]
 
 
 def rows_in_words(count: int) -> str:
@@ -88,6 +110,53 @@ def losses_in_words(result: FitResult) -> list[list[str]]:
             [f"{over}: delta", f"{known_in_words(one.delta_aj, 'aJ')}, {known_in_words(one.delta_ev, 'eV')}"],
         ]
     return [*rows, ["captured below (extrapolated)", known_in_words(loss.capture_speed_nm_per_us, "nm/us")]]
+
+
+def tables_in_words(result: FitResult) -> tuple[list[str], list[list[str]]]:
+    """Return what there is to say of each of several tables: the names of columns, and a row for each table."""
+    law = list(result.tables[0].pulls) if result.tables else []
+    head = ["table", "rows used", "chi2/readings", "pull", *(f"on {name}" for name in law)]
+    rows = [
+        [
+            one.name,
+            f"{one.used}/{one.rows}",
+            f"{one.chi2:.1f}/{one.readings}",
+            known(one.pull, ".2f"),
+            *(known(one.pulls[name], "+.2f") for name in law),
+        ]
+        for one in result.tables
+    ]
+    return head, rows
+
+
+PULLS = (
+    "Pull: how far a table's law is from that of the others, in standard deviations; then by how much it moves each "
+    "parameter of the law, in standard deviations of that move"
+)
+
+
+def nuisances_in_words(result: FitResult) -> tuple[list[str], list[list[str]]]:
+    """Return what each of several tables has to itself: the names of columns, and rows."""
+    departing = any(one.departures for one in result.tables)
+    head = ["table", "of its own", "value", "95 % interval", "given"]
+    rows = []
+    for one in result.tables:
+        for name, parameter in one.nuisances.items():
+            given = "-" if parameter.constraint is None else "{:g} +- {:g}".format(*parameter.constraint)
+            rows.append([one.name, name, value_in_words(parameter), interval_in_words(parameter), given])
+        if departing:
+            rows += [[one.name, f"{name}, from the mean", f"{by:+.3g}", "", ""] for name, by in one.departures.items()]
+    return head, rows
+
+
+def scatter_in_words(result: FitResult) -> tuple[list[str], list[list[str]]]:
+    """Return the scatter of the law between tables: the names of columns, and rows; none where it was not asked for."""
+    rows = []
+    for name, one in result.scatter.items():
+        low, high = one.interval95
+        ends = f"> {low:.3g}" if high is None else f"{low:.3g} to {high:.3g}" if low else f"< {high:.3g}"
+        rows.append([name, f"{one.value:.3g}", ends, one.unit])
+    return ["scatter between tables", "standard deviation", "95 % interval", "unit"], rows
 
 
 def formulas(result: FitResult) -> list[str]:

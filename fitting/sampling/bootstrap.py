@@ -24,6 +24,7 @@ from fitting.fits.objective import PLAIN, ROBUST, Objective, soft_square
 from fitting.fits.result import FitResult
 from fitting.models import ROWS_PER_PROGRAM, Problem, measurement_of
 from fitting.parameters import SHAPE_NAMES
+from fitting.tables.several import SeveralTables
 
 
 class Refit(NamedTuple):
@@ -42,9 +43,14 @@ def objective_of(result: FitResult) -> Refit:
         result: from `fitting.fit`.
 
     Raises:
+        ValueError: if the fit is of several tables.
         RuntimeError: if JAX is not set to 64-bit floats.
     """
     require_float64()
+    if isinstance(result.table, SeveralTables):
+        raise ValueError(  # noqa: TRY004 (a fit of several tables is no wrong type)
+            "bootstrap and posterior are about one table; the intervals of a joint fit are its own"
+        )
     settings = result.settings
     effects = EFFECTS if settings["effects"] is None else tuple(settings["effects"])
     names = tuple(name for name in result.parameters if name not in SHAPE_NAMES)
@@ -75,7 +81,7 @@ def compact(refit: Refit) -> Refit:
     """
     objective = refit.objective
     rows = objective.measurement.rows
-    telling = np.flatnonzero(np.asarray(rows.measured).any(axis=1) | np.asarray(rows.no_orbit))
+    telling = telling_rows(objective)
     size = max(-(-telling.size // ROWS_PER_PROGRAM), 1) * ROWS_PER_PROGRAM
     if size == np.asarray(rows.order).shape[0]:
         return refit
@@ -83,6 +89,12 @@ def compact(refit: Refit) -> Refit:
     silent = np.setdiff1d(np.arange(np.asarray(rows.order).shape[0]), telling)
     chosen = np.concatenate([telling, silent[: size - telling.size]])
     return Refit(objective.of_rows(chosen), refit.values)
+
+
+def telling_rows(objective: Objective) -> Int[np.ndarray, " telling"]:
+    """Return the places of the rows that say something."""
+    rows = objective.measurement.rows
+    return np.flatnonzero(np.asarray(rows.measured).any(axis=1) | np.asarray(rows.no_orbit))
 
 
 def standard_covariance(refit: Refit) -> Float[np.ndarray, "p p"]:
@@ -158,26 +170,31 @@ def draw_data(refit: Refit, sets: int, random: np.random.Generator) -> DataSets:
     )
 
 
-def fit_data_sets(refit: Refit, data: DataSets) -> BatchFit:
+def fit_data_sets(refit: Refit, data: DataSets, kept: Bool[np.ndarray, "sets rows"] | None = None) -> BatchFit:
     """Fit every data set by damped Gauss-Newton steps (Levenberg, Marquardt) from the fit's values.
 
     Args:
         refit: the fit that the data sets resemble; its orbits are followed.
         data: from `draw_data`.
+        kept: the rows that each data set has; None: all.
 
     Returns:
         The fits. A parameter at an end of its range is held there while chi2 falls towards the outside.
     """
-    objective, sets = refit.objective, data.amplitude_nm.shape[0]
-    shift = _shifts(objective, data)
+    objective, (sets, count, kinds) = refit.objective, data.amplitude_nm.shape
+    shift = shifts(objective, data)
+    there = np.ones(shift.shape)
+    if kept is not None:
+        there[:, : count * (kinds + 1)] = np.concatenate([np.repeat(kept, kinds, axis=1), kept], axis=1)
     start = np.broadcast_to(refit.values, (1, refit.values.size))
-    one = _plain(objective).at_values(start)
-    shared = np.broadcast_to(np.asarray(one.residual), shift.shape), np.asarray(one.jacobian)
-    start = _searches(objective, np.repeat(start, sets, axis=0), shared[0] + shift, np.repeat(shared[1], sets, 0))
+    one = plain(objective).at_values(start)
+    residual = there * (np.asarray(one.residual) + shift)
+    start = _searches(objective, np.repeat(start, sets, axis=0), residual, there[:, :, None] * np.asarray(one.jacobian))
 
     def look(values: Float[np.ndarray, "some p"], some: Int[np.ndarray, " some"]) -> Searches:
-        found = _plain(objective).at_values(values)
-        return _searches(objective, values, np.asarray(found.residual) + shift[some], np.asarray(found.jacobian))
+        found = plain(objective).at_values(values)
+        residual = there[some] * (np.asarray(found.residual) + shift[some])
+        return _searches(objective, values, residual, there[some][:, :, None] * np.asarray(found.jacobian))
 
     parameters = objective.problem.parameters
     box = Box(
@@ -190,7 +207,7 @@ def fit_data_sets(refit: Refit, data: DataSets) -> BatchFit:
     return BatchFit(end.place, end.chi2, whole_covariance_of(normal), distance(end, box) <= _SETTLED)
 
 
-def _shifts(objective: Objective, data: DataSets) -> Float[np.ndarray, "sets n"]:
+def shifts(objective: Objective, data: DataSets) -> Float[np.ndarray, "sets n"]:
     """Return what each data set adds to the residuals of the table itself."""
     rows, known = objective.measurement.rows, objective.measurement
     weight = np.where(np.asarray(rows.measured), 1.0 / np.asarray(rows.error_nm), 0.0)
@@ -200,7 +217,7 @@ def _shifts(objective: Objective, data: DataSets) -> Float[np.ndarray, "sets n"]
     return np.concatenate([amplitudes.reshape(sets, -1), np.zeros((sets, count)), constraints], axis=1)
 
 
-def _plain(objective: Objective) -> Objective:
+def plain(objective: Objective) -> Objective:
     """Return the objective without its soft loss, which is applied after the shift."""
     return Objective(objective.measurement, objective.problem, near=objective.near)
 

@@ -136,10 +136,11 @@ def nuts_posterior(refit: Refit, log_uniform: tuple[str, ...], samples: int, see
     space = space_around(problem, refit.values, standard_covariance(refit), log_uniform)
     # blackjax mixes integers of 32 and 64 bits, which strict promotion would refuse
     with jax.numpy_dtype_promotion("standard"):
-        drawn, divergent = _chains(blackjax, log_density_of(refit, space), len(problem.names), samples, seed)
+        drawn, statistics = _chains(blackjax, log_density_of(refit, space), len(problem.names), samples, seed)
         values = np.asarray(jax.jit(jax.vmap(jax.vmap(lambda z: space.values_and_log_prior(z)[0])))(drawn))
         r_hat, effective = diagnose(blackjax, values)
-    chains = PosteriorChains(values, r_hat, effective, int(np.sum(divergent)), seed)
+    statistics = {name: np.asarray(each) for name, each in statistics.items()}
+    chains = PosteriorChains(values, r_hat, effective, int(statistics["diverging"].sum()), seed, statistics)
     return posterior_of_chains(chains, problem.names, log_uniform)
 
 
@@ -171,8 +172,9 @@ def log_density_of(refit: Refit, space: Space):
 
     def evaluate(values: Float[Array, " p"]) -> tuple[Float[Array, ""], Float[Array, " p"]]:
         impacts = impacts_of(values[None], measurement, problem)
-        branch = located(values[None], impacts, lanes, measurement, problem) if near is None else branch_near(near)
-        block = linearise_pairs(values[None], impacts, lanes, measurement, problem, branch)
+        points = jnp.broadcast_to(values, (lanes.size, values.size))
+        branch = located(points, impacts, lanes, measurement, problem) if near is None else branch_near(near)
+        block = linearise_pairs(points, impacts, lanes, measurement, problem, branch)
         pull = (values - measurement.constraint_value) / measurement.constraint_error
         residual = jnp.concatenate([block.misfit.ravel(), block.unseen, pull])
         half, weight = _half_loss(residual, robust=robust)
@@ -210,7 +212,7 @@ def _half_loss(residual: Float[Array, " n"], *, robust: bool) -> tuple[Float[Arr
 
 @partial(jax.jit, static_argnames=("blackjax", "log_density", "count", "samples"))
 def _sampled(blackjax, log_density, count: int, samples: int, key):
-    """Return draws and divergences of one chain that warms up for itself."""
+    """Return draws of one chain that warms up for itself, and what ArviZ knows of the steps, by its names."""
     start, warm, draw = jax.random.split(key, 3)
     place = _SPREAD * jax.random.normal(start, (count,))
     adaptation = blackjax.window_adaptation(blackjax.nuts, log_density, is_mass_matrix_diagonal=False)
@@ -219,13 +221,19 @@ def _sampled(blackjax, log_density, count: int, samples: int, key):
 
     def one(state, key):
         state, info = kernel.step(key, state)
-        return state, (state.position, info.is_divergent)
+        told = {
+            "diverging": info.is_divergent,
+            "energy": info.energy,
+            "acceptance_rate": info.acceptance_rate,
+            "n_steps": info.num_integration_steps,
+        }
+        return state, (state.position, told)
 
     return jax.lax.scan(one, state, jax.random.split(draw, samples))[1]
 
 
 def _chains(blackjax, log_density, count: int, samples: int, seed: int):
-    """Return draws (chains, draws, p) and divergences (chains, draws)."""
+    """Return draws (chains, draws, p) and statistics (chains, draws)."""
     keys = jax.random.split(jax.random.key(seed), CHAINS)
     return jax.jit(jax.vmap(lambda key: _sampled(blackjax, log_density, count, samples, key)))(keys)
 

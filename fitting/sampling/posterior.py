@@ -16,6 +16,7 @@ from scipy.interpolate import PchipInterpolator
 from afm_jax.units import TWO_SIDED_95
 from fitting.fits.objective import Objective
 from fitting.fits.result import FitResult
+from fitting.models import Problem
 from fitting.sampling.bootstrap import Refit, compact, objective_of, require_valid, standard_covariance
 from fitting.sampling.posterior_result import Posterior, PosteriorGrid
 
@@ -155,16 +156,20 @@ class _Density:
         chi2, nuisance, variance, volume = _integrate_nuisances(
             self.objective, np.concatenate([mesh, nuisance], axis=1), self.own
         )
-        log_density = -0.5 * chi2 + volume + self._log_prior(mesh)
-        square = nuisance**2 + variance
+        log_density = -0.5 * chi2 + volume + log_prior(self.objective.problem, mesh, self.log_uniform)
+        square = nuisance**2 + np.einsum("spp->sp", variance)
         return log_density.reshape(shape), nuisance.reshape(*shape, -1), square.reshape(*shape, -1)
 
-    def _log_prior(self, mesh: Float[np.ndarray, "points own"]) -> Float[np.ndarray, " points"]:
-        total = np.zeros(len(mesh))
-        for parameter, column in zip(self.objective_parameters, mesh.T, strict=True):
-            if parameter.name in self.log_uniform:
-                total -= np.log(np.maximum(np.abs(column - parameter.reference), 1e-300))
-        return total
+
+def log_prior(
+    problem: Problem, values: Float[np.ndarray, "points k"], log_uniform: Sequence[str]
+) -> Float[np.ndarray, " points"]:
+    """Return the logarithm of the prior of a problem's first parameters, but for constraints and a constant."""
+    total = np.zeros(len(values))
+    for parameter, column in zip(problem.parameters, values.T, strict=False):
+        if parameter.name in log_uniform:
+            total -= np.log(np.maximum(np.abs(column - parameter.reference), 1e-300))
+    return total
 
 
 class _Nuisances(NamedTuple):
@@ -186,7 +191,7 @@ def _nuisances(objective: Objective, values: Float[np.ndarray, "points p"], own:
 
 
 def _integrate_nuisances(objective: Objective, values: Float[np.ndarray, "points p"], own: int):
-    """Return chi2 at its minimum over the nuisances, where that is, their variances, and the log volume around it."""
+    """Return chi2 at its minimum over the nuisances, where that is, their covariance, and the log volume around it."""
     values = values.copy()
     found = _nuisances(objective, values, own)
     for _ in range(_NUISANCE_STEPS):
@@ -196,9 +201,8 @@ def _integrate_nuisances(objective: Objective, values: Float[np.ndarray, "points
             break
         values[:, own:] += np.where(moving[:, None], found.step, 0.0)
         found = _nuisances(objective, values, own)
-    variance = np.einsum("spp->sp", np.linalg.inv(found.curvature))
     volume = -0.5 * np.linalg.slogdet(found.curvature)[1]
-    return found.chi2 - found.fall, values[:, own:] + found.step, variance, volume
+    return found.chi2 - found.fall, values[:, own:] + found.step, np.linalg.inv(found.curvature), volume
 
 
 def _box(density: _Density) -> list[_Axis]:
@@ -277,4 +281,36 @@ def _integral(weight: Float[np.ndarray, "..."], points: tuple[Float[np.ndarray, 
     return float(weight)
 
 
-__all__ = ["POINTS", "grid_posterior"]
+def grid_draws(
+    refit: Refit, grid: PosteriorGrid, log_uniform: tuple[str, ...], count: int, random: np.random.Generator
+) -> Float[np.ndarray, "count p"]:
+    """Return draws of a posterior on a grid, nuisances included.
+
+    Between the points the density is linear, a sum of triangles around them: a draw is a point and a triangle's. The
+    nuisances are Gaussian for given parameters (Laplace).
+
+    Args:
+        refit: the fit, from `fitting.sampling.bootstrap.objective_of`.
+        grid: its posterior.
+        log_uniform: as the posterior's.
+        count: of the draws.
+        random: the generator that is drawn from.
+    """
+    weight = grid.density.copy()
+    for k in range(weight.ndim):
+        # a triangle at an end is a half
+        np.moveaxis(weight, k, 0)[[0, -1]] *= 0.5
+    chosen = np.unravel_index(random.choice(weight.size, count, p=weight.ravel() / weight.sum()), weight.shape)
+    columns = []
+    for axis, index in zip(grid.axes, chosen, strict=True):
+        drawn = axis[index] + (axis[1] - axis[0]) * random.triangular(-1.0, 0.0, 1.0, count)
+        # folded at an end: the half that is there
+        columns.append(axis[-1] - np.abs(axis[-1] - (axis[0] + np.abs(drawn - axis[0]))))
+    own, density = np.stack(columns, axis=1), _Density(refit, log_uniform)
+    nuisance = refit.values[density.own :] + (own - refit.values[: density.own]) @ density.follow.T
+    _, mean, variance, _ = _integrate_nuisances(refit.objective, np.concatenate([own, nuisance], axis=1), density.own)
+    scatter = np.einsum("spq,sq->sp", np.linalg.cholesky(variance), random.normal(size=mean.shape))
+    return np.concatenate([own, mean + scatter], axis=1)
+
+
+__all__ = ["POINTS", "grid_draws", "grid_posterior", "log_prior"]

@@ -1,6 +1,6 @@
 """What is believed of the parameters after the data: densities on a grid, or samples with what says they are enough."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -41,6 +41,7 @@ class PosteriorChains:
         effective_samples: number of independent samples worth as much.
         divergences: transitions that lost the energy.
         seed: of the sampler.
+        statistics: of every step, by ArviZ's names, each of shape (chains, draws).
     """
 
     samples: Float[np.ndarray, "chains draws p"]
@@ -48,6 +49,7 @@ class PosteriorChains:
     effective_samples: Float[np.ndarray, " p"]
     divergences: int
     seed: int
+    statistics: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 @public_result()

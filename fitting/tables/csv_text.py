@@ -8,11 +8,12 @@ read by the same functions.
 import contextlib
 import csv
 import difflib
+import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -245,11 +246,34 @@ def read_bytes(path: str | Path, wanted: str) -> bytes:
         raise TableError(f"{name}: cannot be read ({reason}); check the path and its permissions") from error
 
 
-def read_text(path: str | Path) -> str:
+_AS_CSV = "save the table as CSV with the encoding UTF-8"
+_A_FIT = "give the fit.json of `afm-jax fit --out`"
+
+
+def read_fit_json(path: str | Path) -> dict[str, Any]:
+    """Return the object of a saved fit: what `afm-jax fit --json` prints, or the fit.json of its report.
+
+    Raises:
+        TableError: if the file cannot be read or is no fit.
+    """
+    name = printable(str(path))
+    try:
+        found = json.loads(read_text(path, _A_FIT))
+    except json.JSONDecodeError as error:
+        raise TableError(f"{name}, line {error.lineno}: is no JSON; {_A_FIT}") from None
+    except RecursionError:
+        raise TableError(f"{name}: has too many brackets within each other; {_A_FIT}") from None
+    if not isinstance(found, dict) or found.get("format") != "afm-jax fit":
+        raise TableError(f"{name}: is no fit; {_A_FIT}")
+    return found
+
+
+def read_text(path: str | Path, mend: str = _AS_CSV) -> str:
     """Return the text of a UTF-8 file, with or without a byte order mark, with every line end as a newline.
 
     Args:
         path: the file.
+        mend: what to do where it is not UTF-8.
 
     Raises:
         TableError: if there is no such file, it cannot be read or is not UTF-8 text.
@@ -265,7 +289,7 @@ def read_text(path: str | Path) -> str:
         text, start = data[: error.start].decode("utf-8", errors="replace"), error.start
     if start >= 0:
         line = text.count("\n", 0, start) + 1
-        raise TableError(f"{name}, line {line}: is not UTF-8 text; save the table as CSV with the encoding UTF-8")
+        raise TableError(f"{name}, line {line}: is not UTF-8 text; {mend}")
     return text
 
 

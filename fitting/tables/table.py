@@ -40,7 +40,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
 from afm_jax.results import public_result
 from afm_jax.units import RAD_PER_US_PER_KHZ
@@ -499,6 +499,21 @@ class AmplitudeTable:
     def rows(self) -> int:
         """Number of rows."""
         return len(self.order)
+
+    @property
+    def tables(self) -> tuple["AmplitudeTable", ...]:
+        """The table itself: what several fitted together have more of."""
+        return (self,)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """Where it is from."""
+        return (self.source,)
+
+    @property
+    def row_names(self) -> Shaped[np.ndarray, " rows"]:
+        """The line of the file that each row stands in."""
+        return self.lines.astype(str)
 
     @property
     def form(self) -> Form:

@@ -11,7 +11,16 @@ from tests.package_scenes import scene_of
 from tests.reference_systems import Parameters
 
 EPS = float(np.finfo(float).eps)
-_both = jax.jit(lambda scene, time, velocity: (next_impact(scene, time, velocity), map_jacobian(scene, time, velocity)))
+USUAL = Parameters(
+    frequency_khz=90.0,
+    quality_factor=40.0,
+    amplitude_nm=4.0,
+    drive_frequency_khz=181.8,
+    offset_nm=-1.0,
+    r=0.95,
+    epsilon=60.0,
+)
+both = jax.jit(lambda scene, time, velocity: (next_impact(scene, time, velocity), map_jacobian(scene, time, velocity)))
 
 
 def leaving(p: Parameters, phase_turns: float, rebound: float) -> tuple[float, float]:
@@ -36,7 +45,7 @@ def compare(p: Parameters, time_us: float, velocity: float, *, periods: float = 
     assert found.found[0], "there is no impact to compare"
     guess = float(time_us + found.flight_time_us[0])
     exact = reference_map.next_impact(p, time_us, velocity, guess)
-    mine, jacobian = _both(scene_of(p), time_us, velocity)
+    mine, jacobian = both(scene_of(p), time_us, velocity)
     drive, free = (2e-3 * np.pi * khz for khz in (p.drive_frequency_khz, p.frequency_khz))
     size = p.amplitude_nm + abs(p.offset_nm) + abs(velocity) / free
     approach = float(-p.amplitude_nm * drive * np.sin(drive * guess) - float(exact.velocity_before_nm_per_us))

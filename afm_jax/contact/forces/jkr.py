@@ -58,11 +58,11 @@ def cube_of_load(normalised_load: ArrayLike) -> Float[Array, "..."]:
 
 
 def root_of_depth(normalised_depth: ArrayLike) -> Float[Array, "..."]:
-    """Return the s of the branch that is stable when pulled, for Delta >= -3 6^(-2/3).
+    """Return the s of the branch that is stable when pulled, for Delta >= -3 6^(-2/3); below it that of the fold.
 
     The quartic s^4 - q s - Delta = 0 is split into two quadratics by the one positive root y of y^3 + Delta y = 1/3.
     """
-    third = as_argument(normalised_depth) / 3.0
+    third = jnp.maximum(as_argument(normalised_depth), FOLD_DEPTH) / 3.0
     discriminant = 1.0 / 36.0 + third**3
     above = discriminant > 0.0
     large = jnp.cbrt(1.0 / 6.0 + jnp.where(above, jnp.sqrt(jnp.where(above, discriminant, 1.0)), 0.0))

@@ -1,0 +1,194 @@
+"""Closed loops where parameters are at shares of their ranges: what is solved for a point of a curve, and its solution.
+
+The unknowns of `impact_loop` are followed by the parameters' shares. Newton's method closes a loop in a plane, with a
+test function that vanishes besides on curves in two parameters:
+
+    fold             the tangent's share in the parameter, on curves in two parameters 1 - T + D
+    period_doubling  1 + T + D, a multiplier -1
+    torus            D - 1 with |T| < 2, a pair of multipliers on the unit circle
+    grazing          the lowest point of a flight above the surface; or an impact without adhesion whose speed vanishes
+    capture          the distance of the slowest impact from capture
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from afm_jax.apparatus.scene import Scene
+from afm_jax.dynamics.contact_orbits import ContactFlights, CurveUnits
+from afm_jax.dynamics.impact_loop import (
+    ImpactLoop,
+    LoopReading,
+    closing_gaps,
+    impacts_at,
+    loop_of,
+    nearest_approach,
+    reading_of,
+    trace_and_determinant_of,
+)
+from afm_jax.scenefile.parameter_paths import ParameterRange, with_numbers
+
+KINDS = ("fold", "period_doubling", "torus", "grazing", "capture")
+FOLD, DOUBLING, TORUS, GRAZING, CAPTURE = range(len(KINDS))
+_NEWTON_STEPS = 10
+_ARRIVED = 1e-11
+_BLOCK = 64
+"""Points read together: one program."""
+
+
+class Frame(NamedTuple):
+    """What a curve is followed in: the scene, N, the coordinates' scale, and the parameters' ranges."""
+
+    scene: Scene
+    order: Float[Array, ""]
+    scale: Float[Array, ""]
+    low: Float[Array, " parameters"]
+    width: Float[Array, " parameters"]
+
+
+class Equations(NamedTuple):
+    """What is solved, a different program each: which parameters move, and which test function is 0; None: none is."""
+
+    paths: tuple[str, ...]
+    driven: str
+    samples: int
+    kind: int | None = None
+    flights: ContactFlights | None = None
+    """Of a scene with a contact, whose equations are simulated."""
+
+
+def frame_of(scene: Scene, order: int, scale: float, ranges: Sequence[ParameterRange]) -> Frame:
+    """Return what curves in some parameters are followed in; the scale in nm/us."""
+    low, high = (jnp.asarray([getattr(one, end) for one in ranges]) for end in ("low", "high"))
+    return Frame(scene, jnp.asarray(float(order)), jnp.asarray(scale), low, high - low)
+
+
+def loop_at(shares: Float[Array, " parameters"], frame: Frame, equations: Equations) -> ImpactLoop:
+    """Return what is closed where the parameters are at shares of their ranges."""
+    values = dict(zip(equations.paths, frame.low + frame.width * shares, strict=True))
+    return loop_of(with_numbers(frame.scene, values), frame.order, equations.driven)
+
+
+def split_point(point: Array, equations: Equations) -> tuple[Array, Array]:
+    """Return the unknowns of a point and the parameters' shares."""
+    count = point.shape[0] - len(equations.paths)
+    return point[:count], point[count:]
+
+
+def _tests(unknowns: Array, frame: Frame, loop: ImpactLoop, samples: int) -> list[Array]:
+    """Return the test functions in the order of `KINDS`, without dimension."""
+    trace, determinant = trace_and_determinant_of(unknowns, frame.scale, loop)
+    near = nearest_approach(unknowns, frame.scale, loop, samples).gap_nm
+    slowest = jnp.min(unknowns[unknowns.shape[0] // 2 :], initial=jnp.inf)
+    return [
+        1.0 - trace + determinant,
+        1.0 + trace + determinant,
+        determinant - 1.0,
+        near * loop.cantilever.angular_frequency / frame.scale,
+        slowest - loop.impact.lowest / frame.scale,
+    ]
+
+
+def equations_at(point: Float[Array, " n"], frame: Frame, equations: Equations) -> Float[Array, " rows"]:
+    """Return what is to be 0 at unknowns followed by the parameters' shares."""
+    unknowns, shares = split_point(point, equations)
+    loop = loop_at(shares, frame, equations)
+    gaps = closing_gaps(unknowns, frame.scale, loop)
+    if equations.kind is None:
+        return gaps
+    test = _tests(unknowns, frame, loop, equations.samples)[equations.kind]
+    return jnp.append(gaps, test)
+
+
+class CurvePoint(NamedTuple):
+    """Where Newton's method arrived: the point, its last move, the tangent, test functions, the longest delay."""
+
+    point: Any
+    moved: Any
+    tangent: Any
+    tests: Any
+    delay: Any
+
+
+@partial(jax.jit, static_argnames=("equations",))
+def _step(frame: Frame, guess: Array, row: Array, equations: Equations) -> CurvePoint:
+    """Return the point of a curve in the plane through a guess across a row."""
+
+    def twice(point):
+        value = equations_at(point, frame, equations)
+        return value, value
+
+    def searching(state):
+        _, moved, steps, _ = state
+        return (moved > _ARRIVED * 0.01) & (steps < _NEWTON_STEPS)
+
+    def improve(state):
+        point, _, steps, _ = state
+        slopes, value = jax.jacfwd(twice, has_aux=True)(point)
+        matrix = jnp.concatenate([slopes, row[None]])
+        move = jnp.linalg.solve(matrix, jnp.append(value, row @ (point - guess)))
+        return point - move, jnp.max(jnp.abs(move)), steps + 1, matrix
+
+    count = guess.shape[0]
+    begin = (guess, jnp.asarray(jnp.inf), 0, jnp.eye(count))
+    point, moved, _, matrix = lax.while_loop(searching, improve, begin)
+    tangent = jnp.linalg.solve(matrix, jnp.zeros(count).at[-1].set(1.0))
+    tangent = tangent / jnp.linalg.norm(tangent)
+    unknowns, shares = split_point(point, equations)
+    loop = loop_at(shares, frame, equations)
+    tests = _tests(unknowns, frame, loop, equations.samples)
+    delay = jnp.zeros(())
+    if loop.impact.delayed:
+        delays = impacts_at(unknowns, frame.scale, loop).speeds.delay
+        delay = jnp.max(jnp.abs(delays)) * loop.angular_frequency / (2.0 * jnp.pi)
+    return CurvePoint(point, moved, tangent, jnp.stack(tests), delay)
+
+
+def solved_point(frame: Frame, guess: np.ndarray, row: np.ndarray, equations: Equations) -> CurvePoint | None:
+    """Return the same as NumPy arrays; None where the method does not arrive."""
+    if equations.flights is not None:
+        solved = equations.flights.solve(guess, row, units_of(frame), equations.kind)
+        if solved is None:
+            return None
+        found = CurvePoint(*solved, 0.0)
+    else:
+        found = CurvePoint(
+            *(np.asarray(part) for part in _step(frame, jnp.asarray(guess), jnp.asarray(row), equations))
+        )
+    arrived = np.isfinite(found.point).all() and np.isfinite(found.tangent).all() and found.moved < _ARRIVED
+    return found if arrived else None
+
+
+def units_of(frame: Frame) -> CurveUnits:
+    """Return what a frame measures speeds and parameters in."""
+    return CurveUnits(float(frame.scale), np.asarray(frame.low), np.asarray(frame.width))
+
+
+@partial(jax.jit, static_argnames=("equations",))
+def _read(frame: Frame, points: Array, equations: Equations) -> LoopReading:
+    def one(point):
+        unknowns, shares = split_point(point, equations)
+        return reading_of(unknowns, frame.scale, loop_at(shares, frame, equations), equations.samples)
+
+    return jax.vmap(one)(points)
+
+
+def read_points(points: Float[np.ndarray, "points n"], frame: Frame, equations: Equations) -> LoopReading:
+    """Return what there is to know of the orbits at points of a curve, NumPy arrays."""
+    if equations.flights is not None:
+        return equations.flights.readings(points, units_of(frame))
+    return by_blocks(lambda block: _read(frame, block, equations), points)
+
+
+def by_blocks(work: Callable[[Array], Any], points: Float[np.ndarray, "points n"]) -> Any:
+    """Return the results of work on points, NumPy arrays; blocks of one size, the last filled up, share a program."""
+    blocks = -(-len(points) // _BLOCK)
+    padded = np.concatenate([points, np.repeat(points[-1:], blocks * _BLOCK - len(points), axis=0)])
+    done = [work(jnp.asarray(block)) for block in np.split(padded, blocks)]
+    return jax.tree.map(lambda *parts: np.concatenate([np.asarray(part) for part in parts])[: len(points)], *done)

@@ -1,0 +1,272 @@
+"""What several tables fitted together say of one another: each one's pull on the law, and the scatter between them.
+
+The fit is linearised at its minimum. What all tables have in common is the law, shared nuisances and what the model
+leaves out; what a table has to itself are its own nuisances and, where laws scatter, its law's departure from the mean.
+Each part of the normal equations is then of one table, which can be left out.
+
+The departures are Gaussian, each parameter of the law with a standard deviation of its own between tables. These
+maximise the restricted likelihood (REML): that of the residuals after all parameters were integrated out (Patterson and
+Thompson 1971).
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from scipy.optimize import brentq, minimize
+from scipy.special import chdtrc, ndtri
+
+from fitting.fits.intervals import CHI2_95
+from fitting.fits.least_squares import covariance_of
+from fitting.fits.unmodelled import StepSystem
+
+_LEAST_SHARE = 1e-9
+"""Variance that a table takes from a direction of the law, over the variance there, below which it says nothing."""
+
+
+class Parts(NamedTuple):
+    """The normal equations of a fit, part by part: of each table, and last of what is no table's own.
+
+    Attributes:
+        matrix: shape (tables + 1, q, q).
+        vector: the right-hand sides.
+        square: sums of squared residuals.
+        own: which unknowns are each table's own.
+        law: places of the law's free parameters among the unknowns, which come first.
+    """
+
+    matrix: Float[np.ndarray, "parts q q"]
+    vector: Float[np.ndarray, "parts q"]
+    square: Float[np.ndarray, " parts"]
+    own: Bool[np.ndarray, "tables q"]
+    law: Int[np.ndarray, " l"]
+
+    def solved(self, table: int | None = None) -> tuple[Float[np.ndarray, "l l"], Float[np.ndarray, " q"]]:
+        """Return the covariance of the law's parameters and the change of all unknowns, one table left out or none.
+
+        What is the table's own does not change then.
+        """
+        kept = np.ones(len(self.square), dtype=bool)
+        there = np.ones(self.matrix.shape[1], dtype=bool)
+        if table is not None:
+            kept[table], there = False, ~self.own[table]
+        some = np.ix_(there, there)
+        matrix, vector = self.matrix[kept].sum(axis=0)[some], self.vector[kept].sum(axis=0)[there]
+        change = np.zeros(there.size)
+        change[there] = -np.linalg.lstsq(matrix, vector, rcond=None)[0]
+        return covariance_of(matrix)[np.ix_(self.law, self.law)], change
+
+
+def parts_of(
+    system: StepSystem,
+    table: Int[np.ndarray, " rows"],
+    place: Int[np.ndarray, "tables p"],
+    free: Bool[np.ndarray, " k"],
+    own: int,
+    departing: Float[np.ndarray, "readings m"] | None = None,
+) -> Parts:
+    """Return the normal equations of a fit to several tables, part by part.
+
+    Args:
+        system: the fit.
+        table: which each row is of.
+        place: of each table's parameters, as of `Joint`.
+        free: which parameters, shapes included, are not at their bound.
+        own: how many parameters the law has; they come first.
+        departing: how the readings' residuals change with the departures, as of `departures_of`.
+    """
+    size, count, tables = system.unknown.shape[0], system.jacobian.shape[1], len(place)
+    of = np.repeat(table, size // len(table))
+    holders = np.array([np.isin(np.arange(count), row) for row in place])
+    owner = np.where(holders.sum(axis=0) == 1, np.argmax(holders, axis=0), tables)
+    unknown, owners = [system.unknown], [owner, np.full(system.unknown.shape[1], tables)]
+    if departing is not None:
+        unknown.append(departing)
+        owners.append(np.repeat(np.arange(tables), departing.shape[1] // tables))
+    whole = np.zeros((len(system.residual), count + sum(block.shape[1] for block in unknown)))
+    whole[:, :count] = system.jacobian * free
+    whole[:size, count:] = np.concatenate(unknown, axis=1)
+    white = _whitened(system, np.column_stack([system.residual, whole]), len(table))
+    # after the readings: rows without orbit, and what is known of each parameter and shape
+    part = np.concatenate([of, table, owner])
+    blocks = [white[part == t] for t in range(tables + 1)]
+    matrix = np.array([block[:, 1:].T @ block[:, 1:] for block in blocks])
+    owned = np.concatenate(owners)
+    prior = np.append(np.flatnonzero(~free), np.arange(count, owned.size))
+    matrix[owned[prior], prior, prior] += 1.0
+    return Parts(
+        matrix=matrix,
+        vector=np.array([block[:, 1:].T @ block[:, 0] for block in blocks]),
+        square=np.array([block[:, 0] @ block[:, 0] for block in blocks]),
+        own=owned == np.arange(tables)[:, None],
+        law=np.flatnonzero(free[:own]),
+    )
+
+
+def departures_of(
+    system: StepSystem,
+    table: Int[np.ndarray, " rows"],
+    law: Int[np.ndarray, " l"],
+    scatter: Float[np.ndarray, " l"],
+) -> Float[np.ndarray, "readings m"]:
+    """Return how the readings' residuals change with the departures of every table's law, of unit variance each.
+
+    Args:
+        system: the fit.
+        table: which each row is of.
+        law: places of the law's free parameters.
+        scatter: their standard deviations between tables.
+    """
+    size = system.unknown.shape[0]
+    of = np.repeat(table, size // len(table))
+    slope = system.jacobian[:size, law] * scatter
+    return np.concatenate([slope * (of == t)[:, None] for t in range(int(table.max()) + 1)], axis=1)
+
+
+def _whitened(system: StepSystem, columns: Float[np.ndarray, "n m"], rows: int) -> Float[np.ndarray, "n m"]:
+    """Return columns in units of the readings' noise, which is that of each row by itself."""
+    size = system.noise.shape[0]
+    kinds = size // rows
+    one = np.arange(rows)
+    blocks = system.noise.reshape(rows, kinds, rows, kinds)[one, :, one, :]
+    white = np.linalg.solve(np.linalg.cholesky(blocks), columns[:size].reshape(rows, kinds, -1))
+    return np.concatenate([white.reshape(size, -1), columns[size:]])
+
+
+class Pull(NamedTuple):
+    """How far a table is from the others.
+
+    Attributes:
+        pull: of its law, as standard deviations of a single Gaussian number; NaN where the others do not determine it.
+        p_value: probability of a larger one by chance.
+        pulls: by how much it moves each free parameter of the law, in standard deviations of that; NaN likewise.
+        chi2: its part of the sum of squares.
+    """
+
+    pull: float
+    p_value: float
+    pulls: Float[np.ndarray, " l"]
+    chi2: float
+
+
+def pulls_of(parts: Parts) -> list[Pull]:
+    """Return every table's pull: the law of all tables against that of the others.
+
+    Leaving a table out moves the law's parameters by an amount whose covariance is the difference of both fits'.
+    """
+    everything, change = parts.solved()
+    found = []
+    for table in range(len(parts.own)):
+        others, without = parts.solved(table)
+        moved = (change - without)[parts.law]
+        matrix, vector = parts.matrix[table], parts.vector[table]
+        chi2 = float(parts.square[table] + 2.0 * change @ vector + change @ matrix @ change)
+        known = np.isfinite(np.diag(others)) & np.isfinite(np.diag(everything))
+        pulls = np.full(parts.law.size, np.nan)
+        if not known.any():
+            found.append(Pull(np.nan, np.nan, pulls, chi2))
+            continue
+        some = np.ix_(known, known)
+        # in units of what the others leave open
+        unit = np.sqrt(np.diag(others)[known])
+        variance, axes = np.linalg.eigh((others[some] - everything[some]) / np.outer(unit, unit))
+        said = variance > _LEAST_SHARE
+        square = float(np.sum((axes.T @ (moved[known] / unit))[said] ** 2 / variance[said]))
+        spread = np.diag(others - everything)[known] / unit**2
+        pulls[known] = np.where(
+            spread > _LEAST_SHARE, moved[known] / unit / np.sqrt(np.maximum(spread, _LEAST_SHARE)), 0.0
+        )
+        p_value = float(chdtrc(int(said.sum()), square)) if said.any() else 1.0
+        # beyond what a probability can hold, all but the largest direction count nothing
+        pull = float(-ndtri(0.5 * p_value)) if p_value > 0.0 else float(np.sqrt(square))
+        found.append(Pull(pull, p_value, pulls, chi2))
+    return found
+
+
+class Between(NamedTuple):
+    """The scatter of each free parameter of the law between tables.
+
+    Attributes:
+        value: which has the largest restricted likelihood.
+        low: lower end of the 95 % interval.
+        high: its upper end, infinite where it is open.
+        cautious: with which errors are stated: a standard error larger. A few tables alone say how much they scatter,
+            and with the most likely scatter intervals of the mean hold it in 88 to 91 % of sets of four or eight.
+    """
+
+    value: Float[np.ndarray, " l"]
+    low: Float[np.ndarray, " l"]
+    high: Float[np.ndarray, " l"]
+    cautious: Float[np.ndarray, " l"]
+
+
+_FIRST = 0.3, 1.0, 3.0
+_LARGEST = 1e6
+"""Scatters that are tried first, and the largest, in standard errors of one table's parameter."""
+
+
+def scatter_between(parts: Parts) -> Between:
+    """Return the scatter of the law's parameters between tables.
+
+    Args:
+        parts: with departures that have the parameters' units.
+    """
+    count, tables = parts.law.size, len(parts.own)
+    matrix, vector = parts.matrix.sum(axis=0), parts.vector.sum(axis=0)
+    first = matrix.shape[0] - count * tables
+    unit = np.sqrt(np.diag(covariance_of(matrix[:first, :first]))[parts.law] * tables)
+    if not np.all(np.isfinite(unit)):
+        return Between(*np.full((4, count), np.nan))
+    # all but the departures are integrated out once and for all
+    scale = np.append(1.0 / np.sqrt(np.maximum(np.diag(matrix)[:first], 1e-300)), np.tile(unit, tables))
+    matrix = matrix * np.outer(scale, scale) - np.diag(np.append(np.zeros(first), np.tile(unit**2, tables)))
+    vector = vector * scale
+    gain = np.linalg.lstsq(
+        matrix[:first, :first], np.column_stack([matrix[:first, first:], vector[:first]]), rcond=None
+    )[0]
+    fisher = matrix[first:, first:] - matrix[first:, :first] @ gain[:, :-1]
+    pushed = vector[first:] - matrix[first:, :first] @ gain[:, -1]
+
+    def criterion(scatter: Float[np.ndarray, " l"]) -> tuple[float, Float[np.ndarray, " l"]]:
+        """Return -2 log of the restricted likelihood, but for a constant, and its gradient."""
+        s = np.tile(scatter, tables)
+        inner = s[:, None] * fisher * s + np.eye(s.size)
+        inverse = np.linalg.inv(inner)
+        likely = inverse @ (s * pushed)
+        turned = fisher @ (s * likely)
+        slope = 2.0 * (np.einsum("ij,j,ji->i", fisher, s, inverse) - likely * (pushed - turned))
+        value = np.linalg.slogdet(inner)[1] - (s * pushed) @ likely
+        return float(value), slope.reshape(tables, count).sum(axis=0)
+
+    def lowest(start: Float[np.ndarray, " l"], held: dict[int, float]) -> tuple[float, Float[np.ndarray, " l"]]:
+        """Return the minimum with some scatters held, and where it is."""
+        ends = [(held[i], held[i]) if i in held else (0.0, _LARGEST) for i in range(count)]
+        begin = np.clip(start, *np.array(ends).T)
+        found = minimize(criterion, begin, jac=True, bounds=ends, method="L-BFGS-B", options={"ftol": 1e-10})
+        return float(found.fun), found.x
+
+    least, best = min((lowest(np.full(count, start), {}) for start in _FIRST), key=lambda found: found[0])
+    ends = np.zeros((3, count))
+    for i in range(count):
+
+        def rise(value: float, i: int = i) -> float:
+            return lowest(best, {i: value})[0] - least
+
+        ends[0, i] = _crossing(lambda value: rise(value) - CHI2_95, best[i], 0.0) if best[i] > 0.0 else 0.0
+        ends[1, i] = _crossing(lambda value: rise(value) - CHI2_95, best[i], np.inf)
+        ends[2, i] = _crossing(lambda value: rise(value) - 1.0, best[i], np.inf)
+    ends[2] = np.where(np.isfinite(ends[2]), ends[2], best)
+    return Between(best * unit, *(ends * unit))
+
+
+def _crossing(above: Callable[[float], float], inside: float, last: float) -> float:
+    """Return where a function becomes positive between a place where it is not and the last one, or that."""
+    far = last
+    if last > inside:
+        far = max(2.0 * inside, 1.0)
+        while far < _LARGEST and above(far) < 0.0:
+            far *= 2.0
+    if far >= _LARGEST or above(far) < 0.0:
+        return last
+    return float(brentq(above, inside, far, xtol=1e-4))  # pyright: ignore[reportArgumentType]

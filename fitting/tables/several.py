@@ -1,0 +1,130 @@
+"""Several tables that are fitted together, as reports and verdicts see them: their rows one after the other."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int, Shaped
+
+from fitting.tables.table import AmplitudeTable
+
+
+@dataclass(frozen=True)
+class SeveralTables:
+    """Tables of one tip on one sample; what is asked of a single table can be asked of all their rows.
+
+    Attributes:
+        tables: at least two.
+
+    Raises:
+        ValueError: if tables are fewer, or what every table must have in common differs.
+    """
+
+    tables: tuple[AmplitudeTable, ...]
+
+    def __post_init__(self):
+        if len(self.tables) < 2:
+            raise ValueError("a joint fit needs at least two tables")
+        first, name = self.tables[0], self.labels[0]
+        for table, label in zip(self.tables[1:], self.labels[1:], strict=True):
+            if abs(table.mass_ng / first.mass_ng - 1.0) > _SAME_MASS:
+                raise ValueError(
+                    f"mass_ng is {first.mass_ng:g} in {name} and {table.mass_ng:g} in {label}: tips of different "
+                    "mass share no law of impacts; fit them with --each"
+                )
+            if (table.quality_factor is None) != (first.quality_factor is None):
+                without, having = (label, name) if table.quality_factor is None else (name, label)
+                raise ValueError(f"{without} lacks quality_factor, which {having} gives; add it, with its error")
+
+    @cached_property
+    def labels(self) -> tuple[str, ...]:
+        """What each table is called: its file's name, with as much of its path as tells it from the others."""
+        paths = [Path(table.source).parts[::-1] for table in self.tables]
+        depth = 1
+        while True:
+            names = ["/".join(reversed(parts[:depth])) for parts in paths]
+            if len(set(names)) == len(names):
+                return tuple(names)
+            if depth >= max(map(len, paths)):
+                return tuple(f"{name} ({number})" for number, name in enumerate(names, 1))
+            depth += 1
+
+    @property
+    def source(self) -> str:
+        """The tables' names, the first few of them."""
+        names = self.labels
+        return (
+            ", ".join(names) if len(names) <= _NAMED else f"{', '.join(names[:_NAMED])} and {len(names) - _NAMED} more"
+        )
+
+    @cached_property
+    def number(self) -> Int[np.ndarray, " rows"]:
+        """Which table each row is of."""
+        return np.repeat(np.arange(len(self.tables)), [table.rows for table in self.tables])
+
+    @property
+    def rows(self) -> int:
+        """Number of rows of all tables."""
+        return sum(table.rows for table in self.tables)
+
+    @property
+    def row_names(self) -> Shaped[np.ndarray, " rows"]:
+        """The table and the line of it that each row stands in."""
+        return np.array([f"{self.labels[i]}:{line}" for i, line in zip(self.number, self.lines, strict=True)])
+
+    @property
+    def tapping(self) -> bool:
+        """Whether the cantilever itself is driven in every table."""
+        return all(table.tapping for table in self.tables)
+
+    @property
+    def drive(self) -> str:
+        """What is driven; the sample where that differs and it is in some."""
+        return self.tables[0].drive if self.tapping else "sample"
+
+    @property
+    def mass_ng(self) -> float:
+        """Effective mass of the tip."""
+        return self.tables[0].mass_ng
+
+    @property
+    def lines(self) -> Int[np.ndarray, " rows"]:
+        """The line of its file that each row stands in."""
+        return self._joined([table.lines for table in self.tables])
+
+    @property
+    def order(self) -> Int[np.ndarray, " rows"]:
+        """Drive periods per impact."""
+        return self._joined([table.order for table in self.tables])
+
+    @property
+    def drive_frequency_khz(self) -> Float[np.ndarray, " rows"]:
+        """Frequency of the drive."""
+        return self._joined([table.drive_frequency_khz for table in self.tables])
+
+    @property
+    def excitation_nm(self) -> Float[np.ndarray, " rows"]:
+        """Amplitude of the platform, or of the free tip."""
+        return self._joined([table.excitation_nm for table in self.tables])
+
+    @property
+    def offset_nm(self) -> Float[np.ndarray, " rows"]:
+        """Offset of the platform, or height of the sample."""
+        return self._joined([table.offset_nm for table in self.tables])
+
+    @property
+    def no_orbit(self) -> Float[np.ndarray, " rows"]:
+        """1 where the tip settled on no single-impact orbit, else 0."""
+        return self._joined([np.zeros(t.rows) if t.no_orbit is None else t.no_orbit for t in self.tables])
+
+    @staticmethod
+    def _joined(columns: Sequence[np.ndarray]) -> np.ndarray:
+        return np.concatenate(columns)
+
+
+_SAME_MASS = 0.01
+"""Relative difference of masses that is none: they come of spring constants."""
+_NAMED = 3
+"""Tables that a title names."""

@@ -1,0 +1,214 @@
+"""Tapping curves of random contacts: what is predicted of them, and what whole fits of them give back.
+
+    python -m tests.tapping_accuracy [--contacts 0:6] [--seeds 2] [--truths FOLDER]
+
+The truth is the full scene in time, kept in the folder. Forward: amplitude and lag that the contact's own table of
+collisions predicts, at speeds of 4 times the capture speed and more and pulls below 0.8 times what turns the tip round.
+Fits: two free amplitudes 3 % above resonance, without noise and with 0.3 % and 0.2 degrees, frequency, Q, calibration,
+origin and zero of phase free within their errors. `make tapping` runs it; the exit status is 1 if less is reached than
+is wanted. Contacts whose law is refused (too few fast impacts) are counted.
+"""
+
+import argparse
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.surface import detected
+from afm_jax.impact.closure import OrbitProblem
+from afm_jax.impact.lasting_impact import TabulatedImpact, middle_of_contact
+from afm_jax.impact.orbits import amplitudes, orbit_state, steady_orbits
+from fitting.fits.fit import fit, problem_of
+from fitting.fits.least_squares import covariance_of
+from fitting.fits.objective import Objective
+from fitting.models import measurement_of
+from fitting.simulated.experiment import with_noise
+from fitting.tables.table import AmplitudeTable
+from tests.tapping_truths import MASS_NG, SHARES, TappingTruth, as_measured, exact_table, tapping_truth
+
+MODEL = "viscous+delay"
+RATIO, RATIOS = 1.03, (1.03, 1.1)
+FASTER, PULLED = 4.0, 0.8
+FEW_SHARES = tuple(np.linspace(0.88, 0.16, 8).tolist())
+LARGEST_NM, LARGEST_DEG, MEDIAN_SHARE, MEDIAN_DEG = 0.07, 0.1, 1e-3, 0.01
+"""What is wanted of predictions."""
+MEDIAN_LAW, WORST_LAW, NOISE_FREE_LAW = 0.006, 0.012, 0.003
+"""And of fitted laws, relative."""
+NOISE_FREE_CALIBRATION = 1e-3
+_SPEEDS = 60
+
+
+class Forward(NamedTuple):
+    """Of each row: errors in nm and degrees, the amplitude, speed over capture and g tau/u."""
+
+    nm: Any
+    degrees: Any
+    amplitude_nm: Any
+    speed: Any
+    pull: Any
+
+
+@jax.jit
+def _predicted(impact: TabulatedImpact, quality_factor, frequency_khz, free_nm, offset_nm, read) -> Forward:
+    """Return how far the steady orbit nearest to what was read is from it."""
+
+    def one(frequency_khz, free_nm, offset_nm, read):
+        cantilever = Cantilever(90.0, quality_factor, MASS_NG)
+        platform = Platform(free_nm, frequency_khz, offset_nm)
+        problem = OrbitProblem(cantilever, platform, impact, jnp.ones(()))
+        orbits = steady_orbits(problem)
+        slot = jnp.argmax(jnp.where(orbits.steady, orbits.place.coordinate, -jnp.inf))
+        place = jax.tree.map(lambda part: part[slot], orbits.place)
+        state = orbit_state(place, problem)
+        _, amplitude, phase = amplitudes(place, problem)
+        ratio = frequency_khz / 90.0
+        size, lag = detected(amplitude, phase, free_nm, ratio, quality_factor, base=False)
+        middle = middle_of_contact(cantilever, platform, state.flight.start_us - 0.5 * state.speeds.delay)
+        u = state.speeds.approach
+        turn = (lag - read[1] + 180.0) % 360.0 - 180.0
+        error = jnp.where(orbits.steady[slot], size - read[0], jnp.nan)
+        return Forward(error, turn, read[0], u / impact.lowest, middle.acceleration * impact.hertz_time(u) / u)
+
+    return jax.vmap(one)(frequency_khz, free_nm, offset_nm, read)
+
+
+def forward(truth: TappingTruth, exact: AmplitudeTable) -> Forward:
+    """Return the errors of what the contact's table of collisions predicts for a table's rows."""
+    size = 2 * len(SHARES)
+    columns = (exact.drive_frequency_khz, exact.excitation_nm, exact.offset_nm)
+    assert exact.lockin_amplitude_nm is not None
+    assert exact.phase_lag_deg is not None
+    read = np.stack([exact.lockin_amplitude_nm, exact.phase_lag_deg], axis=1)
+    filled = [jnp.asarray(np.resize(column, size)) for column in columns]
+    found = _predicted(
+        truth.impact, jnp.asarray(truth.quality_factor), *filled, jnp.asarray(np.resize(read, (size, 2)))
+    )
+    return Forward(*(np.asarray(part)[: exact.rows] for part in found))
+
+
+class Fitted(NamedTuple):
+    """A fit: relative errors of the law over the speeds covered, calibration less 1 and its error, rows used."""
+
+    law: np.ndarray
+    calibration: float
+    calibration_error: float
+    rows: int
+
+
+def fitted(truth: TappingTruth, table: AmplitudeTable) -> Fitted | None:
+    """Return what a fit gives; None where the law is refused."""
+    result = fit(table, MODEL)
+    used = result.rows.approach_speed_nm_per_us[result.rows.used]
+    found = result.parameters["tip_calibration"]
+    if found.standard_error is None or not np.isfinite(used).any():
+        return None
+    speeds = np.linspace(np.nanmin(used), np.nanmax(used), _SPEEDS)
+    law = np.interp(speeds, result.law.approach_speed_nm_per_us, result.law.rebound_speed_nm_per_us)
+    return Fitted(
+        law / truth.rebound(speeds) - 1.0, found.value - 1.0, found.standard_error, int(result.rows.used.sum())
+    )
+
+
+def noisy(exact: AmplitudeTable, truth: TappingTruth, seed: int) -> AmplitudeTable:
+    """Return a table as it would have been measured."""
+    return with_noise(exact, np.random.default_rng([truth.number, seed]).normal(size=(3, exact.rows)))
+
+
+def calibration_limit(exact: AmplitudeTable) -> float:
+    """Return the standard error of the calibration that the noise alone leaves, the law taken at its word.
+
+    The inverse of the Fisher information of all rows with an orbit, everything else free.
+    """
+    result = fit(exact, MODEL)
+    problem = problem_of(exact, MODEL)
+    values = np.array([result.parameters[name].value for name in problem.names])
+    jacobian = np.asarray(Objective(measurement_of(exact, problem), problem).at_values(values[None]).jacobian)[0]
+    return float(np.sqrt(np.diag(covariance_of(jacobian.T @ jacobian)))[problem.names.index("tip_calibration")])
+
+
+def _judge(line: str, tests: dict[str, bool]) -> int:
+    missed = [name for name, reached in tests.items() if not reached]
+    sys.stdout.write(f"{line}\n" + "".join(f"    MISSED: {name}\n" for name in missed))
+    return len(missed)
+
+
+def _judge_forward(ratio: float, found: Forward) -> int:
+    nm, degrees, amplitude, speed, pull = (np.asarray(part) for part in found)
+    used = (speed > FASTER) & (pull < PULLED) & np.isfinite(nm)
+    if not used.any():
+        return _judge(f"forward, s = {ratio:g}: no row of {len(nm)} is as fast and as little pulled", {})
+    nm, degrees, share = np.abs(nm[used]), np.abs(degrees[used]), np.abs(nm / amplitude)[used]
+    line = (
+        f"forward, s = {ratio:g}: {used.sum()} of {len(used)} rows; at most {nm.max():.4f} nm and {degrees.max():.4f} "
+        f"degrees, medians {100 * np.median(share):.4f} % and {np.median(degrees):.4f} degrees"
+    )
+    return _judge(
+        line,
+        {
+            f"{LARGEST_NM} nm": nm.max() <= LARGEST_NM,
+            f"{LARGEST_DEG} degrees": degrees.max() <= LARGEST_DEG,
+            f"a median of {100 * MEDIAN_SHARE:g} %": np.median(share) <= MEDIAN_SHARE,
+            f"a median of {MEDIAN_DEG} degrees": np.median(degrees) <= MEDIAN_DEG,
+        },
+    )
+
+
+def judge_fits(name: str, fits: list[Fitted], *, exact: bool) -> int:
+    """Print a line about fits, and what is not as wanted; return how much that is."""
+    if not fits:
+        return _judge(f"{name}: no law", {"a law": False})
+    median = [float(np.median(np.abs(one.law))) for one in fits]
+    worst = [float(np.abs(one.law).max()) for one in fits]
+    off = [abs(one.calibration) for one in fits]
+    line = (
+        f"{name}: {len(fits)} laws, errors {100 * np.median(median):.3f} % in the median, {100 * max(worst):.3f} % at "
+        f"worst; calibration off by {100 * np.median(off):.3f} % in the median, {100 * max(off):.3f} % at most, stated "
+        f"{100 * np.median([one.calibration_error for one in fits]):.3f} %; "
+        f"{np.mean([one.rows for one in fits]):.0f} rows used"
+    )
+    tests = {
+        f"{100 * MEDIAN_LAW} % in the median": bool(np.median(median) <= MEDIAN_LAW),
+        "at worst": max(worst) <= WORST_LAW,
+    }
+    if exact:
+        tests = {f"{100 * NOISE_FREE_LAW} %": max(worst) <= NOISE_FREE_LAW}
+        tests["calibration"] = bool(np.median(off) <= NOISE_FREE_CALIBRATION)
+    return _judge(line, tests)
+
+
+def main() -> int:
+    """Measure, print and judge."""
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0] if __doc__ else None)
+    parser.add_argument("--contacts", default="0:6", help="numbers of the random contacts, first:end")
+    parser.add_argument("--seeds", type=int, default=2, help="noisy tables of each contact")
+    parser.add_argument("--truths", type=Path, default=Path(tempfile.gettempdir()) / "afm-jax-truths")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)  # noqa: FBT003
+    first, end = (int(number) for number in options.contacts.split(":"))
+    truths = [tapping_truth(number) for number in range(first, end)]
+    missed = 0
+    for ratio in RATIOS:
+        shares = SHARES if ratio == RATIO else FEW_SHARES
+        parts = [forward(truth, exact_table(truth, ratio, options.truths, shares)) for truth in truths]
+        missed += _judge_forward(ratio, Forward(*(np.concatenate(part) for part in zip(*parts, strict=True))))
+    exact = [as_measured(exact_table(truth, RATIO, options.truths)) for truth in truths]
+    without = [fitted(truth, table) for truth, table in zip(truths, exact, strict=True)]
+    known = [i for i, one in enumerate(without) if one is not None]
+    sys.stdout.write(f"law refused of {len(truths) - len(known)} of {len(truths)} contacts\n")
+    limits = [calibration_limit(exact[i]) for i in known]
+    sys.stdout.write(f"calibration: noise alone leaves {', '.join(f'{100 * one:.2f}' for one in limits)} %\n")
+    missed += judge_fits("fits without noise", [one for one in without if one is not None], exact=True)
+    drawn = [fitted(truths[i], noisy(exact[i], truths[i], seed)) for i in known for seed in range(options.seeds)]
+    missed += judge_fits("fits at 0.3 % and 0.2 degrees", [one for one in drawn if one is not None], exact=False)
+    return 1 if missed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

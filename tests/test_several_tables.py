@@ -1,0 +1,311 @@
+"""Several tables fitted together: one law, nuisances of each, pulls and scatter, against direct calculations."""
+
+import dataclasses
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy.optimize import minimize
+
+import fitting
+from afm_jax.cli.main import main
+from afm_jax.impact.law import ImpactLaw
+from afm_jax.saved import save
+from fitting.experiments.belief import belief_of_fit
+from fitting.fits.fit import fit
+from fitting.fits.objective import Objective
+from fitting.fits.result import FitResult, FittedTable, Scatter
+from fitting.fits.several import Parts, departures_of, parts_of, pulls_of, scatter_between
+from fitting.fits.unmodelled import StepSystem
+from fitting.models import Problem, measurement_of
+from fitting.report.html import fit_page
+from fitting.report.report import row_records, summary
+from fitting.tables.several import SeveralTables
+from fitting.tables.table import AmplitudeTable, read_table
+from tests.fit_tables import example_amplitudes, rows, simulated
+from tests.made_fits import made_fit, made_parameter, made_rows, made_table
+
+TABLES, READINGS = 5, 24
+SCATTER = np.array([0.6, 0.3])
+
+
+def linear_sets(seed: int, scatter: np.ndarray, own: float = 0.3) -> tuple[StepSystem, np.ndarray, np.ndarray]:
+    """Return tables whose readings are linear in two parameters (both 0) and a nuisance each, with unit noise.
+
+    Also which table each row is of, and the places of its parameters.
+    """
+    random, design = np.random.default_rng(seed), np.random.default_rng(1)
+    table = np.repeat(np.arange(TABLES), READINGS // 2)
+    of = np.repeat(table, 2)
+    slope = np.zeros((of.size, 2 + TABLES))
+    slope[:, 0], slope[:, 1] = 1.0, np.repeat(design.uniform(-1.0, 1.0, table.size), 2)
+    slope[np.arange(of.size), 2 + of] = np.tile([0.5, -0.3], table.size)
+    departures = random.normal(size=(TABLES, 2)) * scatter
+    nuisance = own * random.normal(size=TABLES)
+    read = random.normal(size=of.size) + np.sum(slope[:, :2] * departures[of], axis=1) + slope[:, 2:] @ nuisance
+    residual = np.concatenate([-read, np.zeros(table.size + 2 + TABLES)])
+    jacobian = np.concatenate([slope, np.zeros((table.size + 2 + TABLES, 2 + TABLES))])
+    jacobian[-TABLES:, 2:] = np.eye(TABLES) / own
+    place = np.column_stack([np.zeros(TABLES, int), np.ones(TABLES, int), 2 + np.arange(TABLES)])
+    return StepSystem(residual, jacobian, np.zeros((of.size, 0)), np.eye(of.size)), table, place
+
+
+def parts_with(system: StepSystem, table: np.ndarray, place: np.ndarray, scatter: np.ndarray | None) -> Parts:
+    departing = None if scatter is None else departures_of(system, table, np.arange(2), scatter)
+    return parts_of(system, table, place, np.ones(2 + TABLES, dtype=bool), 2, departing)
+
+
+def test_pulls_are_those_of_fits_without_the_table():
+    system, table, place = linear_sets(3, SCATTER)
+    found = pulls_of(parts_with(system, table, place, None))
+
+    def solved(rows_kept: np.ndarray, columns: np.ndarray):
+        slope = system.jacobian[rows_kept][:, columns]
+        inverse = np.linalg.inv(slope.T @ slope)
+        return -inverse @ slope.T @ system.residual[rows_kept], inverse
+
+    every = np.arange(len(system.residual))
+    whole, variance = solved(every, np.arange(2 + TABLES))
+    for t, one in enumerate(found):
+        mine = np.concatenate([np.repeat(table, 2) == t, np.zeros(len(table) + 2, bool), np.arange(TABLES) == t])
+        others, wider = solved(every[~mine], np.delete(np.arange(2 + TABLES), 2 + t))
+        moved, spread = (whole[:2] - others[:2]), (wider - np.delete(np.delete(variance, 2 + t, 0), 2 + t, 1))[:2, :2]
+        np.testing.assert_allclose(one.pulls, moved / np.sqrt(np.diag(spread)), rtol=1e-7)
+        square = moved @ np.linalg.solve(spread, moved)
+        # two degrees of freedom: the probability is an exponential
+        assert one.p_value == pytest.approx(np.exp(-0.5 * square), rel=1e-6)
+        left = (system.residual + system.jacobian @ whole)[mine]
+        assert one.chi2 == pytest.approx(left @ left, rel=1e-9)
+
+
+@pytest.mark.slow
+def test_scatter_has_the_largest_restricted_likelihood():
+    system, table, place = linear_sets(3, SCATTER)
+    size = system.unknown.shape[0]
+    of = np.repeat(table, 2)
+    # readings, and what is known of each table's nuisance
+    slope = np.concatenate([system.jacobian[:size], system.jacobian[-TABLES:]])
+    residual = np.concatenate([system.residual[:size], np.zeros(TABLES)])
+
+    def criterion(logarithms: np.ndarray) -> float:
+        variance = np.eye(len(residual))
+        same = of[:, None] == of
+        for parameter in range(2):
+            column = slope[:size, parameter]
+            variance[:size, :size] += np.exp(2.0 * logarithms[parameter]) * np.outer(column, column) * same
+        inverse = np.linalg.inv(variance)
+        fisher = slope.T @ inverse @ slope
+        projected = inverse - inverse @ slope @ np.linalg.solve(fisher, slope.T @ inverse)
+        logs = np.linalg.slogdet(variance)[1] + np.linalg.slogdet(fisher)[1]
+        return logs + residual @ projected @ residual
+
+    best = minimize(criterion, np.log(SCATTER), method="Nelder-Mead", options={"xatol": 1e-7, "fatol": 1e-10})
+    found = scatter_between(parts_with(system, table, place, np.ones(2)))
+    np.testing.assert_allclose(found.value, np.exp(best.x), rtol=1e-4)
+    # the ends of the first one's interval: there the criterion is 3.84 higher
+    for end, rise in ((found.low[0], 3.841), (found.high[0], 3.841), (found.cautious[0], 1.0)):
+        there = minimize(lambda x, end=end: criterion(np.array([np.log(end), x[0]])), best.x[1:], method="Nelder-Mead")
+        assert there.fun - best.fun == pytest.approx(rise, abs=0.01)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scatter", [np.zeros(2), SCATTER])
+def test_intervals_hold_scatter_and_mean(scatter: np.ndarray):
+    sets, means, scatters, improbable = 60, [], [], []
+    for seed in range(sets):
+        system, table, place = linear_sets(seed, scatter)
+        found = scatter_between(parts_with(system, table, place, np.ones(2)))
+        mean = parts_with(system, table, place, found.value).solved()[1][:2]
+        covariance, _ = parts_with(system, table, place, found.cautious).solved()
+        means.append(np.abs(mean) < 1.96 * np.sqrt(np.diag(covariance)))
+        scatters.append((found.low <= scatter) & (scatter <= found.high))
+        improbable += [one.p_value < 0.05 for one in pulls_of(parts_with(system, table, place, None))]
+    # 95 % less four binomial standard deviations; of a scatter of nothing, and of few tables, intervals are wide
+    least = 0.95 - 4.0 * np.sqrt(0.05 * 0.95 / sets)
+    assert min(np.mean(means), np.mean(scatters)) > least
+    if not scatter.any():
+        assert np.mean(improbable) == pytest.approx(0.05, abs=0.03)
+
+
+def cut(table: AmplitudeTable, count: int) -> list[AmplitudeTable]:
+    """Return every so-many-th row of a table as a table of its own."""
+    return [rows(table, np.arange(table.rows)[i::count], source=f"part{i}.csv") for i in range(count)]
+
+
+def joined(tables: list[AmplitudeTable], whole: AmplitudeTable) -> AmplitudeTable:
+    """Return the rows of a table in the order of its parts."""
+    order = np.concatenate([np.arange(whole.rows)[i :: len(tables)] for i in range(len(tables))])
+    return rows(whole, order)
+
+
+def test_names_tell_tables_apart():
+    def named(*sources: str) -> tuple[str, ...]:
+        return SeveralTables(tuple(made_table(source=source) for source in sources)).labels
+
+    assert named("x/a.csv", "x/b.csv") == ("a.csv", "b.csv")
+    assert named("x/a.csv", "y/a.csv") == ("x/a.csv", "y/a.csv")
+    assert named("a.csv", "a.csv") == ("a.csv (1)", "a.csv (2)")
+    assert SeveralTables((made_table(source="a.csv"), made_table(source="b.csv"))).row_names[4] == "b.csv:1"
+
+
+@pytest.mark.parametrize(
+    ("changes", "options", "message"),
+    [
+        ({"mass_ng": 2.0}, {}, "mass_ng is 1 in a.csv and 2 in b.csv: tips of different mass share no law"),
+        ({"quality_factor": None, "quality_factor_error": None}, {}, "b.csv lacks quality_factor, which a.csv gives"),
+        ({"quality_factor": 41.0}, {"share": ["quality_factor"]}, "a.csv says 40 \\+- 0.4, and b.csv says 41 \\+- 0.4"),
+        ({}, {"share": ["all"], "constraints": {"quality": (1.0, 0.1)}}, "the constraint on 'quality' is on no"),
+        ({}, {"share": ["r"]}, "`share` must be chosen from quality_factor, .* and all, but one is 'r'"),
+        ({}, {"share": ["tip_calibration"]}, "`share` names tip_calibration, but no table gives it with an error"),
+    ],
+)
+def test_what_tables_cannot_share_is_said(changes: dict, options: dict, message: str):
+    with pytest.raises(ValueError, match=message):
+        fit([made_table(source="a.csv"), made_table(source="b.csv", **changes)], **options)
+
+
+def test_options_of_several_tables_need_several():
+    with pytest.raises(ValueError, match="`share` is about several tables"):
+        fit(made_table(), share=["all"])
+    with pytest.raises(ValueError, match="`hierarchical` is about several tables"):
+        fit([made_table()], hierarchical=True)
+
+
+def made_joint() -> FitResult:
+    """Return a fit of two tables."""
+    both = SeveralTables((made_table(source="a.csv"), made_table(source="b.csv", mass_ng=1.001)))
+    own = {"quality_factor": made_parameter("quality_factor", 40.0)}
+    one = FittedTable("a.csv", "a.csv", 4, 4, 3.0, 7, 1.25, 0.2, {"r": -0.5, "epsilon": None}, own, {"r": 0.01})
+    other = dataclasses.replace(one, source="b.csv", name="b.csv", pull=None, p_value=None)
+    single = made_rows(both.tables[0])
+    columns = {
+        name: np.concatenate([value, value]) for name, value in vars(single).items() if isinstance(value, np.ndarray)
+    }
+    scatter = {"r": Scatter(0.02, (0.01, None), "")}
+    found = made_fit("law", table=both.tables[0], rows=dataclasses.replace(single, reasons=("",) * 8, **columns))
+    return dataclasses.replace(found, table=both, tables=(one, other), scatter=scatter)
+
+
+def test_reports_say_each_tables_pull(tmp_path: Path):
+    result = made_joint()
+    said = " ".join(summary(result).split())
+    assert "a.csv 4/4 3.0/7 1.25 -0.50 -" in said
+    assert "a.csv r, from the mean +0.01" in said
+    assert "b.csv quality_factor" in said
+    assert "r 0.02 > 0.01" in said
+    page = fit_page(result, [b""] * 4)
+    assert page.count("<caption>What the table says of the instrument") == 2
+    assert "<h2>Tables</h2>" in page
+    assert row_records(result)[5] | {"table": "b.csv", "line": 2} == row_records(result)[5]
+    told = result.to_dict()
+    assert [table["pull"] for table in told["tables"]] == [1.25, None]
+    assert [table["source"] for table in told["input"]["tables"]] == ["a.csv", "b.csv"]
+    assert told["scatter"]["r"]["interval95"] == [0.01, None]
+    # saved and read again, and as a belief
+    save(result, tmp_path / "fit.json")
+    again = fitting.load(tmp_path / "fit.json")
+    assert again.tables[0].pulls == {"r": -0.5, "epsilon": None}
+    assert again.table.labels == ("a.csv", "b.csv")
+    assert belief_of_fit(json.loads((tmp_path / "fit.json").read_text())).measured.shape == (8, 4)
+
+
+@pytest.mark.slow
+def test_ten_tables_are_the_table_that_they_are_parts_of():
+    whole = example_amplitudes()
+    parts = cut(whole, 10)
+    together = joined(parts, whole)
+
+    def timed(table, **options) -> tuple[FitResult, float]:
+        begin = time.process_time()
+        return fit(table, **options), time.process_time() - begin
+
+    times = np.array([[timed(together)[1], timed(parts, share=["all"])[1]] for _ in range(3)]).min(axis=0)
+    one, many = fit(together), fit(parts, share=["all"])
+    assert times[1] < 1.5 * times[0]
+    for name, parameter in one.parameters.items():
+        assert many.parameters[name].value == pytest.approx(parameter.value, rel=1e-6)
+        np.testing.assert_allclose(
+            np.array(many.parameters[name].interval95, float), np.array(parameter.interval95, float), rtol=1e-6
+        )
+    assert many.chi2 == pytest.approx(one.chi2, rel=1e-6)
+    assert many.law.rebound_high_nm_per_us == pytest.approx(one.law.rebound_high_nm_per_us, rel=1e-6)
+
+
+@pytest.mark.slow
+def test_tables_with_their_own_nuisances_are_their_fits_put_together():
+    parts = cut(example_amplitudes(), 3)
+    result = fit(parts)
+    # each table's law by itself, weighted by its covariance: to first order the same
+    information, pushed = np.zeros((2, 2)), np.zeros(2)
+    for part in parts:
+        alone = fit(part)
+        error = np.array([alone.parameters[name].standard_error for name in ("r", "epsilon")], float)
+        inverse = np.linalg.inv(alone.correlations[:2, :2] * np.outer(error, error))
+        information += inverse
+        pushed += inverse @ [alone.parameters[name].value for name in ("r", "epsilon")]
+    found = np.array([result.parameters[name].value for name in ("r", "epsilon")])
+    error = np.sqrt(np.diag(np.linalg.inv(information)))
+    np.testing.assert_allclose(found, np.linalg.solve(information, pushed), atol=0.1 * error.min(), rtol=2e-3)
+    shown = np.array([result.parameters[name].standard_error for name in ("r", "epsilon")], float)
+    np.testing.assert_allclose(shown, error, rtol=0.05)
+    assert sum(table.chi2 for table in result.tables) == pytest.approx(result.chi2, rel=1e-6)
+    assert list(result.parameters) == ["r", "epsilon"]
+
+
+@pytest.mark.slow
+def test_laws_that_differ_are_named_and_their_scatter_is_found(tmp_path: Path):
+    parts = cut(example_amplitudes(), 4)
+    truth = [0.95, 0.951, 0.947, 0.953]
+    tables = [
+        dataclasses.replace(simulated(part, ImpactLaw(r, 60.0), seed=seed), source=f"part{seed}.csv")
+        for seed, (part, r) in enumerate(zip(parts, truth, strict=True))
+    ]
+    alike = fit(tables)
+    assert not alike.valid
+    assert "part2.csv is off the others" in " ".join(alike.reasons)
+    differing = fit(tables, hierarchical=True)
+    assert differing.valid
+    low, high = differing.scatter["r"].interval95
+    assert low > 0.0
+    assert high is not None
+    # their own standard deviation is 0.0025
+    assert low < np.std(truth, ddof=1) < high
+    low, high = differing.parameters["r"].interval95
+    assert low is not None
+    assert high is not None
+    assert low < np.mean(truth) < high
+    found = [table.departures["r"] for table in differing.tables]
+    np.testing.assert_allclose(found, np.array(truth) - np.mean(truth), atol=0.001)
+    paths = [tmp_path / table.source for table in tables]
+    for table, path in zip(tables, paths, strict=True):
+        fitting.write_table(table, path)
+    called = CliRunner().invoke(main, ["fit", *map(str, paths), "--hierarchical", "--json", "--out", str(tmp_path)])
+    assert called.exit_code == 0
+    payload = json.loads(called.stdout)
+    assert payload["scatter"]["r"]["value"] == pytest.approx(differing.scatter["r"].value)
+    assert [table["name"] for table in payload["tables"]] == [path.name for path in paths]
+    assert "part2.csv" in (tmp_path / "fit.html").read_text()
+
+
+@pytest.mark.slow
+def test_a_driven_sample_and_a_driven_tip_have_one_law():
+    sample, tapping = cut(example_amplitudes(), 2)[0], read_table("fitting/examples/tapping_contact.csv")
+    tapping = dataclasses.replace(tapping, mass_ng=1.0)
+    # what the same law predicts for the driven tip, and no noise
+    problem = Problem("law", ("r", "epsilon"), drive="force")
+    found = Objective(measurement_of(tapping, problem), problem).at_values(np.array([[0.95, 60.0]])).prediction
+    steady = np.asarray(found.orbits)[0, : tapping.rows] > 0
+    read = np.asarray(found.amplitude_nm)[0, : tapping.rows][steady]
+    driven = rows(tapping, steady, lockin_amplitude_nm=read[:, 1], phase_lag_deg=read[:, 2], source="tip.csv")
+    one, other = fit([sample, driven]), fit([driven, sample])
+    assert one.valid
+    assert [table.used for table in one.tables] == [sample.rows, steady.sum()]
+    for name, truth in (("r", 0.95), ("epsilon", 60.0)):
+        parameter = one.parameters[name]
+        assert abs(parameter.value - truth) < 3.0 * (parameter.standard_error or 0.0)
+        assert other.parameters[name].value == pytest.approx(parameter.value, rel=1e-6)
+    assert one.tables[1].nuisances.keys() > {"tip_calibration", "phase_zero_deg"}
+    assert one.tables[0].nuisances.keys() == {"quality_factor"}
