@@ -57,7 +57,7 @@ class _Near(NamedTuple):
         return gap, 2.0 * width * y * gap
 
 
-class _Leg(NamedTuple):
+class _Stretch(NamedTuple):
     """Kinetic energy at the end in aJ; integrals over time of 1, the gap, the squared speed, and the gap times time."""
 
     energy: Float[Array, ""]
@@ -188,7 +188,7 @@ def _tap(contact: Contact, tip: Driven, plane, gaps, energies, inside: Any) -> _
     before = _after(coming, _arc(back, contact.bridge_forms_nm, plane, coming.energy))
     leaving = _outward(tip, gaps[1], plane, energies[1])
     if inside is not None:
-        solid = _Leg(
+        solid = _Stretch(
             inside.energy_aj, inside.time_us, inside.gap_nm_us, inside.action, 0.5 * inside.time_us * inside.gap_nm_us
         )
         leaving = _after(solid, leaving)
@@ -202,13 +202,15 @@ def _tap(contact: Contact, tip: Driven, plane, gaps, energies, inside: Any) -> _
     return _Tap(twice * before.energy, twice * leaving.energy, time, area, action, moment / area - apart)
 
 
-def _after(first: _Leg, second: _Leg) -> _Leg:
+def _after(first: _Stretch, second: _Stretch) -> _Stretch:
     """Return two legs, one after the other."""
     moment = first.moment + second.moment + first.time * second.gap
-    return _Leg(second.energy, first.time + second.time, first.gap + second.gap, first.action + second.action, moment)
+    return _Stretch(
+        second.energy, first.time + second.time, first.gap + second.gap, first.action + second.action, moment
+    )
 
 
-def _outward(tip: Driven, inner, outer, energy) -> _Leg:
+def _outward(tip: Driven, inner, outer, energy) -> _Stretch:
     """Return the way from an inner gap to an outer one, left with a kinetic energy."""
     push = -(tip.potential(inner * 1.001) - tip.potential(inner * 0.999)) / 0.002
     # how far inside the speed would vanish, in ln D
@@ -221,14 +223,14 @@ def _outward(tip: Driven, inner, outer, energy) -> _Leg:
     swept = sweep(Way(tip, -1.0, jnp.zeros(()), total, tip.potential(outer), course, slowest), _NODES, _SWEEPS)
     weights, gap = jnp.asarray(gauss_nodes(_NODES)[1]), swept.at.gap_nm
     sums = (weights @ (swept.pace * part) for part in (gap, swept.speed**2, gap * swept.lasted_us))
-    return _Leg(swept.passage.energy_aj, swept.passage.time_us, *sums)
+    return _Stretch(swept.passage.energy_aj, swept.passage.time_us, *sums)
 
 
-def _arc(tip: Driven, inner, outer, energy) -> _Leg:
+def _arc(tip: Driven, inner, outer, energy) -> _Stretch:
     """Return the way of the lever alone; over this little its pull is as good as steady."""
     end = energy + tip.pulled_aj(inner, outer)
     first, last = (jnp.sqrt(2.0 / tip.mass_ng * jnp.maximum(one, 1e-9)) for one in (energy, end))
     time = 2.0 * (outer - inner) / (first + last)
     gap = inner * time + time**2 * (2.0 * first + last) / 6.0
     moment = time**2 * (0.5 * inner + time * (5.0 * first + 3.0 * last) / 24.0)
-    return _Leg(end, time, gap, time * (first * first + first * last + last * last) / 3.0, moment)
+    return _Stretch(end, time, gap, time * (first * first + first * last + last * last) / 3.0, moment)
