@@ -301,11 +301,11 @@ class Taps(eqx.Module):
         hard: whether the junction forms.
     """
 
-    terms: Float[Array, "pulls terms 5"]
-    low: Float[Array, " pulls"]
-    high: Float[Array, " pulls"]
+    terms: Float[Array, "..."]
+    low: Float[Array, "..."]
+    high: Float[Array, "..."]
     scale: Float[Array, ""]
-    pulls: Float[Array, " 2"]
+    pulls: Float[Array, "..."]
     hard: bool = eqx.field(static=True)
 
     def at(self, pull: Float[Array, ""]) -> "Taps":
