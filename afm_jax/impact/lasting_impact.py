@@ -341,7 +341,7 @@ _NOWHERE_US = 1e3
 
 def _polynomials(place: Float[Array, ""], count: int) -> Float[Array, " count"]:
     """Return Chebyshev's polynomials at a place in [-1, 1]: in few operations, for the program is large enough."""
-    return jnp.cos(jnp.arange(count) * jnp.arccos(jnp.clip(place, -_END, _END)))
+    return jnp.cos(jnp.arange(count, dtype=place.dtype) * jnp.arccos(jnp.clip(place, -_END, _END)))
 
 
 _END = 1.0 - 1e-12
