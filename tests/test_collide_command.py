@@ -237,12 +237,3 @@ def test_wrong_calls_end_with_one_line_and_exit_code_2(
     assert result.stdout == ""
     assert len(result.stderr.strip().splitlines()) == 1
     assert said in result.stderr
-
-
-def test_charts_want_a_law(tmp_path: Path):
-    path = tmp_path / "contact.toml"
-    save_scene(Scene(Cantilever(90.0), Platform(4.0, 180.0), Contact.paper()), path)
-    axes = ("--x", "platform.reduced_frequency=0.9:1.1:3", "--y", "platform.amplitude_nm=1:2:3")
-    result = CliRunner().invoke(main, ["chart", str(path), *axes])
-    assert result.exit_code == 2
-    assert '[interaction] model: must be "law" here' in result.stderr

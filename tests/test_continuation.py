@@ -399,9 +399,15 @@ def test_a_scene_takes_the_plain_law_of_a_fit(tmp_path: Path):
     made, known = with_fitted_law(scene(), Path(fit_file(tmp_path / "fit.json", plain_law=plain)))
     assert isinstance(made.interaction, ImpactLaw)
     assert (float(made.interaction.r), float(made.interaction.epsilon)) == (0.94, 70.0)
+    assert known is not None
     assert known.paths == ("interaction.r", "interaction.epsilon")
     assert known.values.tolist() == [0.94, 70.0]
     assert known.covariance.tolist() == plain["covariance"]
+
+
+def test_where_axes_set_every_parameter_of_a_fit_nothing_is_drawn():
+    known = UncertainParameters(("interaction.r",), np.array([0.9]), np.array([[1e-4]]))
+    assert known.without("interaction.r").possible_draws(3).shape == (3, 0)
 
 
 @pytest.mark.slow

@@ -92,11 +92,13 @@ def swept_by_one_tip(values: np.ndarray, impacts: int) -> np.ndarray:
         omega = float(scene.platform.angular_frequency)
         rebound = float(scene.platform.top_speed_nm_per_us) if rebound is None else rebound
         time = np.array([phase / omega])
-        rows = afm.iterate_batch(scene, time, np.asarray(scene.platform.velocity(time)) + rebound, impacts)
-        found.append(repeats_after(np.asarray(rows.velocity_after_nm_per_us))[0])
-        last = float(rows.time_us[0, -1])
+        rows = afm.iterate_batch(scene, time, np.asarray(scene.platform.velocity(time)) + rebound, 2 * impacts)
+        velocities = np.asarray(rows.velocity_after_nm_per_us)
+        # of what repeats but is slow to settle twice as many impacts tell the shortest repetition
+        found.append(repeats_after(velocities)[0] if repeats_after(velocities[:, :impacts])[0] else 0)
+        last = float(rows.time_us[0, impacts - 1])
         phase = omega * last % (2.0 * np.pi)
-        rebound = float(rows.velocity_after_nm_per_us[0, -1] - scene.platform.velocity(last))
+        rebound = float(rows.velocity_after_nm_per_us[0, impacts - 1] - scene.platform.velocity(last))
     return np.array(found)
 
 

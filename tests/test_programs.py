@@ -198,3 +198,14 @@ def test_fits_find_their_programs_again_and_standard_error_holds_our_own_words_o
     assert found is not None
     # every operation outside a compiled program would be a program of its own, of 10 ms each: there were 78
     assert int(found[1]) <= 20
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform in {"win32", "darwin"}, reason="the cache folder is chosen by another variable")
+def test_programs_of_a_contact_are_kept_and_read_again(tmp_path):
+    """They hold operations of a dialect that those of laws do without."""
+    surroundings: dict[str, str | None] = {"XDG_CACHE_HOME": str(tmp_path), "JAX_COMPILATION_CACHE_DIR": None}
+    table = Path(__file__).parent.parent / "fitting" / "examples" / "amplitudes_contact.csv"
+    fit = FIT.replace('"--example", "--model", "law"', f'"{table}", "--model", "contact"')
+    (first, _), (second, _) = (outputs(fit, surroundings) for _ in range(2))
+    assert first == second

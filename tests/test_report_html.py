@@ -9,6 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax.cli.main import main
+from afm_jax.saved import load
 from fitting.fits.result import FitResult
 from fitting.report.html import fit_page
 from fitting.report.plots import law_figure, rows_figure, speed_figure
@@ -280,6 +281,8 @@ def test_report_is_written_with_its_page(tmp_path):
     assert all(0 < path.stat().st_size < 2_000_000 for path in written)
     assert sum(1 for _ in read_page(written[0].read_text(encoding="utf-8")).iter("img")) == 3
     assert set(tables) == {"fit_rows.csv", "law.csv"}
+    again = load(tmp_path / "fit.json")
+    assert summary(again) == written[1].read_text(encoding="utf-8").rstrip("\n")
 
 
 def test_command_writes_the_page_of_the_bundled_table(tmp_path):

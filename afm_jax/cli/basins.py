@@ -70,9 +70,7 @@ def command(
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
     loaded, _ = scene_and_start(scene)
-    known = None
-    if law is not None:
-        loaded, known = with_fitted_law(loaded, law)
+    loaded, known = with_fitted_law(loaded, law)
     columns, rows = grid
     try:
         with session.working("following starts (the first run compiles for some seconds)"):

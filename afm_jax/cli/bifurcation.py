@@ -59,9 +59,7 @@ def command(  # noqa: PLR0913
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
     loaded, _ = scene_and_start(scene)
-    known = None
-    if law is not None:
-        loaded, known = with_fitted_law(loaded, law)
+    loaded, known = with_fitted_law(loaded, law)
     (swept,) = ranges_of(scene, loaded, [parameter], counted=True)
     directions = [True, False] if both else [not down]
     sweeps = []

@@ -60,9 +60,7 @@ def command(  # noqa: PLR0913
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
     loaded, _ = scene_and_start(scene)
-    known = None
-    if law is not None:
-        loaded, known = with_fitted_law(loaded, law)
+    loaded, known = with_fitted_law(loaded, law)
     across, up = ranges = ranges_of(scene, loaded, [x, y], counted=True)
     if len(across.values) * len(up.values) > _MOST_POINTS:
         raise ValueError(f"{across} and {up} are more than {_MOST_POINTS} points: chart fewer")

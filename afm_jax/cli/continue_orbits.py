@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from afm_jax.cli.fitted_law import with_fitted_law, with_law_option
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.orbits import IMPACT_COLUMNS, PositiveInteger, impact_rows, orbit_facts, refuse_other_than_law
 from afm_jax.cli.session import Session, with_session
@@ -73,12 +74,7 @@ _ENDS = {
 )
 @click.option("--second", metavar="P=A:B", help="Another one: the special points are followed as curves in both.")
 @click.option("--sticking", is_flag=True, help="Follow the orbit with a rest on the sample: chatter, ride, release.")
-@click.option(
-    "--law",
-    type=click.Path(path_type=Path),
-    metavar="JSON",
-    help="A fit (fit.json of `afm-jax fit --out`): its law in place of the scene's, its errors as bands.",
-)
+@with_law_option
 @click.option("--picture", type=PictureFormat(), default="png", show_default=True, help="png, pdf or svg.")
 @with_session
 def command(  # noqa: PLR0913
@@ -104,14 +100,11 @@ def command(  # noqa: PLR0913
     if sticking and (second is not None or law is not None or impacts != 1):
         raise ValueError("--sticking goes without --impacts, --second and --law: an orbit with a rest has no equations")
     session.start_computing()
-    from afm_jax.cli.fitted_law import with_fitted_law  # noqa: PLC0415
     from afm_jax.contact.contact import Contact  # noqa: PLC0415
     from afm_jax.dynamics.continuation import continue_orbits  # noqa: PLC0415
 
     loaded, _ = scene_and_start(scene)
-    known = None
-    if law is not None:
-        loaded, known = with_fitted_law(loaded, law)
+    loaded, known = with_fitted_law(loaded, law)
     if sticking or not isinstance(loaded.interaction, Contact):
         refuse_other_than_law(loaded, scene)
     first, *others = ranges_of(scene, loaded, [parameter, *([] if second is None else [second])], counted=False)

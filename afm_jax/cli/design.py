@@ -88,7 +88,7 @@ def command(  # noqa: PLR0913
     noise: float,
     amplitudes: str,
     phase_noise_deg: float,
-    **lists: tuple[float, ...] | None,
+    **lists: tuple[int, ...] | tuple[float, ...] | None,
 ) -> None:
     """Choose the drives to measure next, and forecast how well the law will then be known.
 
@@ -142,7 +142,7 @@ def command(  # noqa: PLR0913
         raise NotValid(result.reasons[0])
 
 
-def _with_defaults(lists: Mapping[str, tuple[float, ...] | None], *, tapping: bool) -> dict[str, Any]:
+def _with_defaults(lists: Mapping[str, tuple[int, ...] | tuple[float, ...] | None], *, tapping: bool) -> dict[str, Any]:
     """Return what can be driven, with the usual lists where none were given."""
     usual = dict(_TAPPING if tapping else _SAMPLE)
     if lists["offsets_nm"] is not None:

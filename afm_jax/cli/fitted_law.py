@@ -11,22 +11,28 @@ if TYPE_CHECKING:
     from afm_jax.dynamics.bands import UncertainParameters
 
 
-def with_law_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a command the options --law and --draws."""
-    law = click.option(
+def with_law_option(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command the option --law."""
+    return click.option(
         "--law",
         type=click.Path(path_type=Path),
         metavar="JSON",
         help="A fit (fit.json of `afm-jax fit --out`): its law in place of the scene's, its errors as bands.",
-    )
+    )(function)
+
+
+def with_law_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command the options --law and --draws."""
     draws = click.option(
         "--draws", type=click.IntRange(2), default=20, show_default=True, help="Laws drawn from the fit for the bands."
     )
-    return law(draws(function))
+    return with_law_option(draws(function))
 
 
-def with_fitted_law(scene: "Scene", path: Path) -> "tuple[Scene, UncertainParameters]":
+def with_fitted_law(scene: "Scene", path: Path | None) -> "tuple[Scene, UncertainParameters | None]":
     """Return a scene with the law of a fit in place of its own, and the fit's values with their covariance.
+
+    Without a fit it is the scene itself, of which nothing is uncertain.
 
     Of a fit that knows what its model leaves out it is the closest law without, over the measured speeds (`PlainLaw`).
 
@@ -35,11 +41,13 @@ def with_fitted_law(scene: "Scene", path: Path) -> "tuple[Scene, UncertainParame
 
     Args:
         scene: whose cantilever and drives are kept.
-        path: the fit.json that `afm-jax fit --out` writes.
+        path: the fit.json that `afm-jax fit --out` writes, if there is one.
 
     Raises:
         ValueError: if the file is no valid fit of a law, or the fit does not say how sure its parameters are.
     """
+    if path is None:
+        return scene, None
     import equinox as eqx  # noqa: PLC0415
     import jax.numpy as jnp  # noqa: PLC0415
     import numpy as np  # noqa: PLC0415

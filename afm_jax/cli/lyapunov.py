@@ -68,9 +68,7 @@ def command(  # noqa: PLR0913
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
     loaded, told = scene_and_start(scene)
-    known = None
-    if law is not None:
-        loaded, known = with_fitted_law(loaded, law)
+    loaded, known = with_fitted_law(loaded, law)
     ranges = ranges_of(scene, loaded, [parameter] if parameter else [], counted=True)
     given = {one.path: one.values for one in ranges}
     try:

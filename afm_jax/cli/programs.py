@@ -6,7 +6,6 @@ found by all that a trace depends on: loaded sources, versions, configuration, d
 are modules and tuples of arrays; arguments that are no arrays have a `repr` that says all of them.
 """
 
-import dataclasses
 import hashlib
 import json
 import sys
@@ -21,9 +20,6 @@ import equinox as eqx
 import jax
 from jax import export
 from jax.core import Tracer
-from jax.extend.mlir import ir
-from jax.extend.mlir.dialects import stablehlo
-from jax.extend.mlir.passmanager import PassManager
 
 from afm_jax.whole_files import write_whole
 
@@ -61,8 +57,7 @@ def _keeping(jitted: Any, folder: Path, tell: Callable[[str], None]) -> Callable
             return jax.tree.leaves(jitted(*positional, **by_name))
 
         def trace() -> tuple[Any, Any]:
-            exported = export.export(jax.jit(flat))(arrays)
-            return _nameless(exported), _structure(jax.eval_shape(jitted, *arguments, **named))
+            return export.export(jax.jit(flat))(arrays), _structure(jax.eval_shape(jitted, *arguments, **named))
 
         program, structure = _program(folder / f"{jitted.__name__}-{_digest(call)}.program", trace, tell)
         # at once: a jitted function would compile again where an argument comes from another program
@@ -73,16 +68,6 @@ def _keeping(jitted: Any, folder: Path, tell: Callable[[str], None]) -> Callable
         return found
 
     return kept
-
-
-def _nameless(exported: export.Exported) -> export.Exported:
-    """Return a traced program that does not say where its operations come from: a third of what is read again."""
-    with ir.Context() as context:
-        stablehlo.register_dialect(context)
-        module: Any = stablehlo.deserialize_portable_artifact(context, exported.mlir_module_serialized)
-        PassManager.parse("builtin.module(strip-debuginfo)").run(module.operation)
-        text = stablehlo.serialize_portable_artifact(module, stablehlo.get_current_version())
-    return dataclasses.replace(exported, mlir_module_serialized=text)
 
 
 def _digest(call: Any) -> str:

@@ -53,7 +53,9 @@ class UncertainParameters(NamedTuple):
         return drawn[good][:number]
 
     def draws(self, number: int, seed: int = 0) -> Float[np.ndarray, "draws parameters"]:
-        """Return values drawn from the normal distribution of this covariance."""
+        """Return values drawn from the normal distribution of this covariance; of no parameters empty rows."""
+        if not self.paths:
+            return np.zeros((number, 0))
         return np.random.default_rng(seed).multivariate_normal(self.values, self.covariance, size=number)
 
 

@@ -59,7 +59,7 @@ def continue_orbits(
 
     Args:
         scene: one scene with an `ImpactLaw` or a `Contact`, driven with one period. A contact's curves end where the
-            orbit grazes and where it is captured; their cusps are not looked for.
+            orbit grazes and where it is captured.
         order: N, drive periods in which the orbit repeats.
         given: the parameter and its range.
         impacts: m, impacts in them; 0: the motion of a tip that meets nothing.

@@ -247,7 +247,14 @@ def local_cluster(workers: int) -> "Iterator[Any]":
     }
     with (
         tempfile.TemporaryDirectory() as scratch,
-        config.set({"distributed.worker.multiprocessing-method": "spawn"}),
+        config.set(
+            {
+                "distributed.worker.multiprocessing-method": "spawn",
+                # what is freed is soon wanted again
+                "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 30,
+                "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 1 << 28,
+            }
+        ),
         LocalCluster(**settings, local_directory=scratch) as cluster,
     ):
         yield cluster

@@ -209,7 +209,7 @@ def _dominated(belief: Belief, information: Float[np.ndarray, "p p"], wanted: tu
             gains = " and ".join(f"{name} to {without[name]:.2g} instead of {errors[name]:.2g}" for name in led)
             warnings.append(
                 f"Most of the error comes from {nuisance}: if that were exactly known, these points would determine "
-                f"{gains}. Measure it better before adding points."
+                f"{gains} (by noise alone). Measure it better before adding points."
             )
     return warnings
 

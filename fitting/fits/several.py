@@ -10,15 +10,14 @@ Thompson 1971).
 """
 
 from collections.abc import Callable
+from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.optimize import brentq, minimize
-from scipy.special import chdtrc, ndtri
 
 from fitting.fits.intervals import CHI2_95
-from fitting.fits.least_squares import covariance_of
+from fitting.fits.least_squares import chi2_tail, covariance_of
 from fitting.fits.unmodelled import StepSystem
 
 _LEAST_SHARE = 1e-9
@@ -177,9 +176,9 @@ def pulls_of(parts: Parts) -> list[Pull]:
         pulls[known] = np.where(
             spread > _LEAST_SHARE, moved[known] / unit / np.sqrt(np.maximum(spread, _LEAST_SHARE)), 0.0
         )
-        p_value = float(chdtrc(int(said.sum()), square)) if said.any() else 1.0
+        p_value = chi2_tail(square, int(said.sum())) if said.any() else 1.0
         # beyond what a probability can hold, all but the largest direction count nothing
-        pull = float(-ndtri(0.5 * p_value)) if p_value > 0.0 else float(np.sqrt(square))
+        pull = -NormalDist().inv_cdf(0.5 * p_value) if p_value > 0.0 else float(np.sqrt(square))
         found.append(Pull(pull, p_value, pulls, chi2))
     return found
 
@@ -192,7 +191,7 @@ class Between(NamedTuple):
         low: lower end of the 95 % interval.
         high: its upper end, infinite where it is open.
         cautious: with which errors are stated: a standard error larger. A few tables alone say how much they scatter,
-            and with the most likely scatter intervals of the mean hold it in 88 to 91 % of sets of four or eight.
+            and with the most likely scatter the intervals of the mean are too short.
     """
 
     value: Float[np.ndarray, " l"]
@@ -212,6 +211,8 @@ def scatter_between(parts: Parts) -> Between:
     Args:
         parts: with departures that have the parameters' units.
     """
+    from scipy.optimize import minimize  # noqa: PLC0415 (half a second that most fits do not need)
+
     count, tables = parts.law.size, len(parts.own)
     matrix, vector = parts.matrix.sum(axis=0), parts.vector.sum(axis=0)
     first = matrix.shape[0] - count * tables
@@ -262,6 +263,8 @@ def scatter_between(parts: Parts) -> Between:
 
 def _crossing(above: Callable[[float], float], inside: float, last: float) -> float:
     """Return where a function becomes positive between a place where it is not and the last one, or that."""
+    from scipy.optimize import brentq  # noqa: PLC0415 (as above)
+
     far = last
     if last > inside:
         far = max(2.0 * inside, 1.0)

@@ -345,13 +345,16 @@ def _table_warnings(evidence: Evidence) -> list[str]:
 
 
 def _damping_warnings(evidence: Evidence) -> list[str]:
-    several, warnings = isinstance(evidence.table, SeveralTables), []
+    warnings: dict[str, list[str]] = {}
     for table, label in zip(evidence.table.tables, evidence.table.labels, strict=True):
         own = name_of_table("quality_factor", label)
         along = evidence.parameters.get(own) or evidence.parameters.get("quality_factor")
         said = _damping_warning(table, along)
-        warnings += [f"{label}: {said}" if several else said] if said else []
-    return warnings
+        if said:
+            warnings.setdefault(said, []).append(label)
+    if not isinstance(evidence.table, SeveralTables):
+        return list(warnings)
+    return [f"{', '.join(labels)}: {said}" for said, labels in warnings.items()]
 
 
 def _damping_warning(table: AmplitudeTable, along: FittedParameter | None) -> str:

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from afm_jax.saved import saved
 from afm_jax.whole_files import write_whole
 from afm_jax.words import bullets, known, text_table
 from fitting.fits.result import FitResult, FittedParameter, FittedRows
@@ -180,7 +181,7 @@ def write_report(
     """Write fit.html, fit.txt, fit.json, fit.png and the tables fit_rows.csv and law.csv into a folder.
 
     Args:
-        result: the fit.
+        result: the fit; `afm_jax.load` of fit.json gives it back.
         folder: an existing folder; files of these names are replaced.
         write_table: called with a file name, records and columns for each CSV file.
         comparison: other models of the same table, for fit.html.
@@ -210,7 +211,7 @@ def write_report(
         trusted = trust, parts
     markup = fit_page(result, pictures, comparison=comparison, bootstrap=bootstrap, posterior=posterior, trust=trusted)
     write_whole(page, markup)
-    others = write_report_files(folder, "fit", text=summary(result), data=result.to_dict(), picture=picture)
+    others = write_report_files(folder, "fit", text=summary(result), data=saved(result), picture=picture)
     records = row_records(result)
     write_table("fit_rows.csv", records, tuple(records[0]))
     write_table("law.csv", law_records(result), LAW_COLUMNS)

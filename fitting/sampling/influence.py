@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from fitting.fits.fit import law_and_slope, speed_range
+from fitting.fits.fit import law_before, speed_range
 from fitting.fits.intervals import at_bound
 from fitting.fits.least_squares import whole_covariance_of
 from fitting.fits.objective import Objective
-from fitting.forward import impact_at
+from fitting.fits.unmodelled import LawBefore
 from fitting.sampling.bootstrap import BatchFit, DataSets, Refit, fit_data_sets
 
 CHECKED = 7
@@ -49,7 +49,8 @@ def influence_of_rows(refit: Refit, approach_speeds: Float[np.ndarray, " measure
     """
     best = _fits_without(refit, np.array([], dtype=int)).values[0]
     speeds = np.geomspace(*speed_range(approach_speeds), _SPEEDS)
-    rebound, slope = _rebound(refit, best, speeds)
+    fitted = _law(refit, best, speeds)
+    rebound, slope = fitted.law[0], fitted.slope[0]
     free = ~at_bound(refit.objective, best)
     normal, moves = _moves(refit.objective, best, free)
     error = np.sqrt(np.einsum("np,pq,nq->n", slope[:, free], np.linalg.inv(normal), slope[:, free]))
@@ -59,7 +60,7 @@ def influence_of_rows(refit: Refit, approach_speeds: Float[np.ndarray, " measure
     chosen = np.argsort(-law_moves)[:CHECKED]
     fits = _fits_without(refit, chosen)
     refitted = [
-        float(np.max(np.abs(_rebound(refit, values, speeds)[0] - rebound) / error)) if converged else np.nan
+        float(np.max(np.abs(_law(refit, values, speeds).law[0] - rebound) / error)) if converged else np.nan
         for values, converged in zip(fits.values[1:], fits.converged[1:], strict=True)
     ]
     return Influence(
@@ -105,8 +106,5 @@ def _moves(
     return normal, moves
 
 
-def _rebound(refit: Refit, values: Float[np.ndarray, " p"], speeds: Float[np.ndarray, " n"]):
-    """Return the rebound speed in nm/us at approach speeds, and its slopes by the parameters."""
-    impact, slopes = impact_at(values, refit.objective.measurement, refit.objective.problem)
-    law, slope = law_and_slope(impact, slopes, speeds)
-    return np.asarray(law)[0, :-1], np.asarray(slope)[0, :-1]
+def _law(refit: Refit, values: Float[np.ndarray, " p"], speeds: Float[np.ndarray, " n"]) -> LawBefore:
+    return law_before(refit.objective.problem, refit.objective.measurement, values, speeds)

@@ -87,7 +87,8 @@ NO_NUMBERS = {
     # read, write, remember; NumPy alone; or what one of the above hands to them
     *("load", "load_scene", "save_scene", "scene_family", "use_cache", "trajectory"),
     *("believe", "design", "drive_grid", "equipartition", "fit_each", "lockin", "posterior", "read_curve"),
-    *("read_curves", "read_sweep", "read_table", "read_trace", "sader", "sensitivity", "write_table"),
+    *("read_curves", "read_sweep", "read_table", "read_trace", "sader", "sensitivity", "trust"),
+    *("write_inference_data", "write_table"),
 }
 
 
