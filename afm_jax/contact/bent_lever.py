@@ -32,7 +32,7 @@ from afm_jax.impact.lasting_impact import PulledImpact, Taps, stretched
 
 PULLS, LIGHT, HARD = 9, 16, 24
 """Pulls of a table, and speeds of light and of hard taps."""
-_NODES, _SWEEPS, _JUNCTION = 16, 6, 16
+_NODES, _SWEEPS, _JUNCTION, _ARC = 16, 6, 16, 6
 _BARRIER_GAPS, _GAPS = 24, 32
 _DRAWN = 1.1
 _FARTHEST = 100.0
@@ -221,16 +221,22 @@ def _outward(tip: Driven, inner, outer, energy) -> _Stretch:
     total = energy + tip.potential(inner)
     slowest = 1e-9 * jnp.abs(tip.potential(outer) - tip.potential(inner)) + 1e-12
     swept = sweep(Way(tip, -1.0, jnp.zeros(()), total, tip.potential(outer), course, slowest), _NODES, _SWEEPS)
-    weights, gap = jnp.asarray(gauss_nodes(_NODES)[1]), swept.at.gap_nm
-    sums = (weights @ (swept.pace * part) for part in (gap, swept.speed**2, gap * swept.lasted_us))
-    return _Stretch(swept.passage.energy_aj, swept.passage.time_us, *sums)
+    return _stretch(swept.passage.energy_aj, swept.at.gap_nm, swept.speed, swept.pace)
 
 
 def _arc(tip: Driven, inner, outer, energy) -> _Stretch:
-    """Return the way of the lever alone; over this little its pull is as good as steady."""
+    """Return the way of the lever alone: at the places of a steady pull, whose square root is thereby gone."""
     end = energy + tip.pulled_aj(inner, outer)
     first, last = (jnp.sqrt(2.0 / tip.mass_ng * jnp.maximum(one, 1e-9)) for one in (energy, end))
-    time = 2.0 * (outer - inner) / (first + last)
-    gap = inner * time + time**2 * (2.0 * first + last) / 6.0
-    moment = time**2 * (0.5 * inner + time * (5.0 * first + 3.0 * last) / 24.0)
-    return _Stretch(end, time, gap, time * (first * first + first * last + last * last) / 3.0, moment)
+    share = jnp.asarray(gauss_nodes(_ARC)[0])
+    time, steady = 2.0 * (outer - inner) / (first + last), first + (last - first) * share
+    gap = inner + 0.5 * time * share * (first + steady)
+    speed = jnp.sqrt(2.0 / tip.mass_ng * jnp.maximum(energy + tip.pulled_aj(inner, gap), 1e-9))
+    return _stretch(end, gap, speed, time * steady / speed)
+
+
+def _stretch(energy, gap, speed, pace) -> _Stretch:
+    """Return a way from what it ends with, and gap, speed and time per share at Gauss nodes."""
+    _, weights, cumulative = (jnp.asarray(part) for part in gauss_nodes(gap.shape[0]))
+    parts = jnp.ones_like(gap), gap, speed**2, gap * (cumulative @ pace)
+    return _Stretch(energy, *(weights @ (pace * part) for part in parts))

@@ -55,8 +55,8 @@ def pass_through_junction(tip: Driven, energy_aj: Float[Array, "..."], nodes: in
     if tip.pull is not None:
         leaving = leaving + tip.pulled_aj(tip.gap_of_root(form), tip.junction.breaks_gap_nm)
         for _ in range(_TURNS):
-            turn = _turn_under(tip, form, level, tip.pull, turn)
-    at = _Half(tip, form).along(turn, points, tip.pull)
+            turn = _turn_under(tip, form, level, _mean_pull(tip, form, turn), turn)
+    at = _Half(tip, form).along(turn, points)
     inside = _sums(weights, at.pace, tip.gap_of_root(at.s), at.y * at.over_y)
     outside = _to_fold(tip, form, jnp.maximum(leaving, 0.0) / unit, nodes)
     time, gap, action = (2.0 * one + other for one, other in zip(inside, outside, strict=True))
@@ -67,6 +67,14 @@ def _sums(weights: Array, pace: Array, gap: Array, speed: Array) -> tuple[Array,
     """Return the integrals over time of 1, of the gap and of the squared speed."""
     time, below, action = (jnp.tensordot(weights, pace * part, axes=1) for part in (jnp.ones_like(pace), gap, speed**2))
     return time, below, action
+
+
+def _mean_pull(tip: Driven, s: Array, turn: Array) -> Array | None:
+    """Return the mean over the depth of what a bent lever does, between s and the turning point: it is linear there."""
+    if tip.pull is None:
+        return None
+    middle = 0.5 * (tip.gap_of_root(s) + tip.gap_of_root(turn))
+    return tip.pull - tip.lever_n_per_m * tip.inverse_mass * middle
 
 
 class Stretch(NamedTuple):
@@ -180,13 +188,14 @@ class _Half(NamedTuple):
     pressing: bool = True
 
     def along(self, turn: Array, points: Array, means: Array | None = None) -> _Along:
-        """Return the places at nodes of y, with means of g, or without any."""
+        """Return the places at nodes of y, with means of g, or with those of a steady pull, if there is one."""
         apart = turn > self.end
         reach = jnp.where(apart, jnp.sqrt(jnp.where(apart, turn - self.end, 1.0)), 0.0)
         twice = 2.0 * self.driven.depth_scale_nm
         y = reach * points
         s = turn - y * y
         square = _unit(self.driven) * _mean_work_slope(turn, s)
+        means = _mean_pull(self.driven, s, turn) if means is None else means
         if means is not None:
             square = square + twice * _mean_depth_slope(turn, s) * means
         over_y, slope = jnp.sqrt(square), jkr.depth_slope(s)
