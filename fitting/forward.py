@@ -367,24 +367,24 @@ def impact_slopes(
     filled, impacts = filled_up(np.asarray(values)[None], measurement, problem)
     still = jax.tree.map(lambda leaf: np.zeros(leaf.shape), impacts.slopes)
 
-    def along(where: Callable[[Any], Any], turn: float, number: int = 0) -> tuple[np.ndarray, np.ndarray]:
-        leaves = [np.array(leaf) for leaf in where(still)]
-        for leaf in leaves:
-            # series have a constant term
-            leaf[(slice(None), 0, *(0,) * (leaf.ndim - 3), number)[: leaf.ndim]] = turn
-        turned = impacts._replace(slopes=eqx.tree_at(where, still, leaves))
+    def along(where: Callable[[Any], Any], turn: float, *constant: Any) -> tuple[np.ndarray, np.ndarray]:
+        leaf = np.array(where(still))
+        leaf[(slice(None), 0, *constant)] = turn
+        turned = impacts._replace(slopes=eqx.tree_at(where, still, leaf))
         block = _in_every_lane(filled, 1, turned, measurement, problem, near)
         return np.asarray(block.slope)[0, :, :, 0], np.asarray(block.prediction.approach_speed_nm_per_us)[0]
 
+    # of a series its constant term
     if isinstance(impacts.impact, PulledImpact):
-        kinds = lambda i: (i.light.terms, i.hard.terms)  # noqa: E731
-        return ImpactSlopes(along(kinds, -1.0)[0], along(kinds, 1.0, 1)[0])
+        both = 0, slice(None), 0
+        squares, times = along(lambda i: i.taps.terms, -1.0, *both, 0), along(lambda i: i.taps.terms, 1.0, *both, 1)
+        return ImpactSlopes(squares[0], times[0])
     if isinstance(impacts.impact, TabulatedImpact):
-        return ImpactSlopes(along(lambda i: (i.loss,), -1.0)[0], along(lambda i: (i.time,), 1.0)[0])
-    by_square, _ = along(lambda i: (i.law.epsilon,), -1.0)
+        return ImpactSlopes(along(lambda i: i.loss, -1.0, 0)[0], along(lambda i: i.time, 1.0, 0)[0])
+    by_square, _ = along(lambda i: i.law.epsilon, -1.0)
     if not impacts.impact.delayed:
         return ImpactSlopes(by_square, np.zeros_like(by_square))
-    by_offset, speed = along(lambda i: (i.law.delay.offset_nm,), -1.0)
+    by_offset, speed = along(lambda i: i.law.delay.offset_nm, -1.0)
     # the offset d shortens the delay by d/u; a free tip has no speed
     return ImpactSlopes(by_square, np.nan_to_num(speed)[:, None] * by_offset)
 

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
@@ -30,10 +31,10 @@ from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.contact.leg import gauss_nodes
 from afm_jax.impact.lasting_impact import PulledImpact, Taps, stretched
 
-PULLS, LIGHT, HARD = 9, 16, 24
-"""Pulls of a table, and speeds of light and of hard taps."""
+PULLS, SPEEDS = 9, 24
+"""Pulls of a table, and speeds of light and of hard taps each."""
 _NODES, _SWEEPS, _JUNCTION, _ARC = 16, 6, 16, 6
-_BARRIER_GAPS, _GAPS = 24, 32
+_BARRIER_GAPS, _GAPS, _TURN_GAPS = 24, 32, 128
 _DRAWN = 1.1
 _FARTHEST = 100.0
 """Speed with which a junction forms at most, in terms of the speed that hysteresis takes."""
@@ -79,64 +80,82 @@ def tapped(contact: Contact, lever: Cantilever, pulls: Float[Array, " 2"]) -> Pu
     junction = find_junction(contact)
     tip = free_tip(contact, junction, lever.mass_ng)._replace(lever_n_per_m=lever.stiffness_n_per_m)
     plane = jnp.maximum(contact.bridge_breaks_nm, junction.breaks_gap_nm)
-    place = -np.cos(np.pi * np.arange(PULLS) / (PULLS - 1))
-    inverse = jnp.asarray(np.linalg.inv(np.polynomial.chebyshev.chebvander(place, PULLS - 1)))
-
-    def series(taps, weakest) -> Taps:
-        ends = jnp.stack([weakest, jnp.maximum(pulls[1], 1.01 * weakest)])
-        pull = ends[0] * (ends[1] / ends[0]) ** jnp.asarray(0.5 + 0.5 * place)
-        bent = pull + lever.angular_frequency**2 * plane
-        tables = jax.vmap(lambda g: taps(contact, tip._replace(pull=g), plane))(bent)
-        own = {name: jnp.tensordot(inverse, getattr(tables, name), axes=1) for name in ("terms", "low", "high")}
-        return replace(jax.tree.map(lambda leaf: leaf[0], tables), **own, pulls=ends)
-
-    gaps = junction.forms_gap_nm * (contact.bridge_forms_nm / junction.forms_gap_nm) ** jnp.linspace(0.0, 1.0, _GAPS)
+    straight = lever.angular_frequency**2 * plane
+    near, far, off = junction.forms_gap_nm, contact.bridge_forms_nm, junction.breaks_gap_nm
+    between = near * (far / near) ** jnp.linspace(0.0, 1.0, _GAPS)
     # where the bridge draws more than the lever pulls no tip turns round
-    drawn = _DRAWN * jnp.max(-tip.bridge.force(gaps)) / lever.mass_ng - lever.angular_frequency**2 * plane
-    light = series(_light, jnp.maximum(pulls[0], drawn))
-    return PulledImpact(light, series(_hard, pulls[0]), tabulated(contact, lever.mass_ng), plane)
-
-
-def _light(contact: Contact, tip: Driven, plane: Float[Array, ""]) -> Taps:
-    """Return the table of the taps that turn in the bridge, between its formation and the junction's."""
-    share = jnp.asarray(0.5 - 0.5 * np.cos(np.pi * np.arange(LIGHT) / (LIGHT - 1)))
-    near, far = tip.junction.forms_gap_nm, contact.bridge_forms_nm
-    gaps = far * (near / far) ** share
-    taps = jax.vmap(lambda gap: _tap(contact, tip, plane, (gap, gap), (jnp.zeros(()), jnp.zeros(())), None))(gaps)
-    own = Taps(jnp.zeros(()), taps.coming[0], taps.coming[-1], far / near, jnp.zeros(2), hard=False)
-    return _filled(own, taps)
-
-
-def _hard(contact: Contact, tip: Driven, plane: Float[Array, ""]) -> Taps:
-    """Return the table of the taps with a junction, from the slowest that gets away."""
-    junction, mass = tip.junction, tip.mass_ng
+    drawn = _DRAWN * jnp.max(-tip.bridge.force(between)) / lever.mass_ng - straight
+    weakest = jnp.stack([jnp.maximum(pulls[0], drawn), pulls[0]])
+    ends = jnp.stack([weakest, jnp.maximum(pulls[1], 1.01 * weakest)])
+    pull = straight + ends[0] * (ends[1] / ends[0]) ** jnp.asarray(0.5 - 0.5 * _points(PULLS))[:, None]
+    share = jnp.asarray(0.5 - 0.5 * _points(SPEEDS))
+    turns = jax.vmap(lambda g: _turns(tip._replace(pull=g), near, far))(pull[:, 0])
     taken = jnp.maximum(junction.hysteresis_aj, 1e-6)
-    scale = jnp.sqrt(2.0 * taken / mass)
-    places = 0.5 - 0.5 * np.cos(np.pi * np.arange(HARD) / (HARD - 1))
-    formed = 0.5 * mass * (scale * jnp.sinh(stretched(jnp.asarray(_FARTHEST)) * jnp.asarray(places))) ** 2
-    formed = formed + _needed(contact, tip, plane, taken)
-    gaps = junction.forms_gap_nm, junction.breaks_gap_nm
+    scale = jnp.sqrt(2.0 * taken / lever.mass_ng)
 
-    def one(energy):
-        inside = pass_through_junction(tip, energy, _JUNCTION)
-        return _tap(contact, tip, plane, gaps, (energy, inside.energy_aj), inside)
+    def of_hard(g):
+        bent = tip._replace(pull=g)
+        formed = 0.5 * lever.mass_ng * (scale * jnp.sinh(stretched(jnp.asarray(_FARTHEST)) * share)) ** 2
+        formed = formed + _needed(contact, bent, plane, taken)
+        return formed, jax.vmap(lambda energy: pass_through_junction(bent, energy, _JUNCTION))(formed)
 
-    taps = jax.vmap(one)(formed)
-    low = taps.coming[0]
-    high = stretched(jnp.sqrt(taps.coming[-1] - low) / scale)
-    return _filled(Taps(jnp.zeros(()), low, high, scale, jnp.zeros(2), hard=True), taps)
+    formed, inside = jax.vmap(of_hard)(pull[:, 1])
+    half = 0.5 * inside.time_us * inside.gap_nm_us
+    solid = _Stretch(inside.energy_aj, inside.time_us, inside.gap_nm_us, inside.action, half)
+    nothing = jnp.zeros_like(formed)
+    legs = (turns, turns), (nothing, nothing), _Stretch(*(nothing,) * 5)
+    others = (jnp.full_like(formed, near), jnp.full_like(formed, off)), (formed, inside.energy_aj), solid
+    both = jax.tree.map(lambda *kinds: jnp.stack(kinds, axis=1), legs, others)
+
+    def of_pull(g, lanes):
+        return jax.vmap(lambda lane: _tap(contact, tip._replace(pull=g), plane, *lane))(lanes)
+
+    taps = jax.vmap(jax.vmap(of_pull))(pull, both)
+    return PulledImpact(_filled(taps, ends, far / near, scale), tabulated(contact, lever.mass_ng), plane)
 
 
-def _filled(taps: Taps, seen: "_Tap") -> Taps:
-    """Return a table with its series, through values at places that the loss has shifted."""
+def _turns(tip: Driven, near: Float[Array, ""], far: Float[Array, ""]) -> Float[Array, " speeds"]:
+    """Return the gaps where light taps turn whose speeds, but for the loss, are at the places of the series.
+
+    Other places would do but for the rounding: only the ends have derivatives.
+    """
+    gaps = far * (near / far) ** jnp.linspace(0.0, 1.0, _TURN_GAPS)
+    risen = tip.potential(gaps) - tip.potential(far)
+    left = jnp.expm1(jnp.log(far / near) * jnp.asarray(0.5 + 0.5 * _points(SPEEDS))) / (far / near - 1.0)
+    inner = lax.stop_gradient(jnp.exp(jnp.interp(risen[-1] * (1.0 - left), risen, jnp.log(gaps))))
+    return jnp.concatenate([far[None], inner[1:-1], near[None]])
+
+
+def _points(count: int) -> np.ndarray:
+    """Return where Chebyshev's polynomials are largest, from 1 to -1."""
+    return np.cos(np.pi * np.arange(count) / (count - 1))
+
+
+def _filled(taps: "_Tap", pulls: Float[Array, "2 kinds"], gaps: Float[Array, ""], scale: Float[Array, ""]) -> Taps:
+    """Return the series through taps of shape (pulls, kinds, speeds), at places that the loss has shifted."""
+    low, last = taps.coming[:, :, 0], taps.coming[:, :, -1]
+    farthest = stretched(jnp.sqrt(last[:, 1] - low[:, 1]) / scale)
+    high = jnp.stack([last[:, 0], farthest], axis=1)
+    table = Taps(jnp.zeros(()), low, high, gaps, scale, pulls)
+    inner = jax.vmap(lambda low, high, at: jax.vmap(replace(table, low=low, high=high).place, 1, 1)(at))(
+        low, high, taps.coming[:, :, 1:-1]
+    )
     # the root of 0 has no derivative
-    inner = taps.place(seen.coming[1:-1])
-    place = jnp.concatenate([-jnp.ones(1), inner, jnp.ones(1)])
+    edge = jnp.ones_like(low)[:, :, None]
+    place = jnp.concatenate([-edge, inner, edge], axis=2)
     rows = [jnp.ones_like(place), place]
-    for _ in range(place.shape[0] - 2):
+    for _ in range(SPEEDS - 2):
         rows.append(2.0 * place * rows[-1] - rows[-2])
-    values = jnp.stack([seen.coming - seen.leaving, seen.time, seen.area, seen.action, seen.late], axis=1)
-    return replace(taps, terms=_solved(jnp.stack(rows, axis=1), values))
+    values = jnp.stack([taps.coming - taps.leaving, taps.time, taps.area, taps.action, taps.late], axis=-1)
+    terms = jax.vmap(jax.vmap(_solved))(jnp.stack(rows, axis=-1), values)
+    inverse = jnp.asarray(np.linalg.inv(np.polynomial.chebyshev.chebvander(-_points(PULLS), PULLS - 1)))
+    return replace(
+        table,
+        **{
+            name: jnp.tensordot(inverse, part, axes=1)
+            for name, part in (("terms", terms), ("low", low), ("high", high))
+        },
+    )
 
 
 def _solved(matrix: Float[Array, "n n"], values: Float[Array, "n k"]) -> Float[Array, "n k"]:
@@ -145,14 +164,13 @@ def _solved(matrix: Float[Array, "n n"], values: Float[Array, "n k"]) -> Float[A
     Written out: over sets and pulls the library's own has been seen to wait for itself for ever.
     """
     count = matrix.shape[0]
-    places = -np.cos(np.pi * np.arange(count) / (count - 1))
-    near = jnp.asarray(np.linalg.inv(np.polynomial.chebyshev.chebvander(places, count - 1)))
+    near = jnp.asarray(np.linalg.inv(np.polynomial.chebyshev.chebvander(-_points(count), count - 1)))
 
     def eliminate(index, rows):
         own = rows[index] / rows[index, index]
         return (rows - rows[:, index, None] * own).at[index].set(own)
 
-    return jax.lax.fori_loop(0, count, eliminate, near @ jnp.concatenate([matrix, values], axis=1))[:, count:]
+    return lax.fori_loop(0, count, eliminate, near @ jnp.concatenate([matrix, values], axis=1))[:, count:]
 
 
 def _needed(contact: Contact, tip: Driven, plane: Float[Array, ""], taken: Float[Array, ""]) -> Float[Array, ""]:
@@ -181,17 +199,17 @@ class _Tap(NamedTuple):
     late: Float[Array, "..."]
 
 
-def _tap(contact: Contact, tip: Driven, plane, gaps, energies, inside: Any) -> _Tap:
+def _tap(contact: Contact, tip: Driven, plane, gaps, energies, solid: _Stretch) -> _Tap:
     """Return a tap from the inner gaps of its ways in and out, with the kinetic energies there, and what is between."""
-    back = tip._replace(bridge=tip.bridge.reversed())
-    coming = _outward(back, gaps[0], contact.bridge_forms_nm, energies[0])
-    before = _after(coming, _arc(back, contact.bridge_forms_nm, plane, coming.energy))
-    leaving = _outward(tip, gaps[1], plane, energies[1])
-    if inside is not None:
-        solid = _Stretch(
-            inside.energy_aj, inside.time_us, inside.gap_nm_us, inside.action, 0.5 * inside.time_us * inside.gap_nm_us
-        )
-        leaving = _after(solid, leaving)
+
+    def way(arrow, inner, outer, energy):
+        return _outward(tip._replace(bridge=replace(tip.bridge, arrow=arrow)), inner, outer, energy)
+
+    ends = jnp.stack([contact.bridge_forms_nm, plane])
+    both = jax.vmap(way)(jnp.array([-1.0, 1.0]), jnp.stack(gaps), ends, jnp.stack(energies))
+    coming, leaving = (jax.tree.map(lambda part, one=one: part[one], both) for one in (0, 1))
+    before = _after(coming, _arc(tip, contact.bridge_forms_nm, plane, coming.energy))
+    leaving = _after(solid, leaving)
     time, gap = before.time + leaving.time, before.gap + leaving.gap
     area = plane * time - gap
     # the middle of the tap is later than its turning by half of what its ways out and in differ by
@@ -215,7 +233,7 @@ def _outward(tip: Driven, inner, outer, energy) -> _Stretch:
     push = -(tip.potential(inner * 1.001) - tip.potential(inner * 0.999)) / 0.002
     # how far inside the speed would vanish, in ln D
     margin = jnp.where(energy < push, jnp.maximum(energy, 0.0) / jnp.where(energy < push, push, 1.0), 1.0)
-    margin = jax.lax.stop_gradient(jnp.clip(margin, 1e-14, 1.0))
+    margin = lax.stop_gradient(jnp.clip(margin, 1e-14, 1.0))
     start = jnp.sqrt(margin)
     course: Any = _Near(inner * jnp.exp(-margin), start, jnp.sqrt(margin + jnp.log(outer / inner)))
     total = energy + tip.potential(inner)

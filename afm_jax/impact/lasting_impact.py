@@ -290,23 +290,23 @@ def _rebound(u: Float[Array, "..."], loss: Float[Array, "..."]) -> Float[Array, 
 
 
 class Taps(eqx.Module):
-    """Taps of one kind, as series over the speed with which they come, and over ln g.
+    """Taps, light (that the bridge turns round) and hard, as series over the speed with which they come, and over ln g.
 
     Attributes:
-        terms: coefficients of u_in^2 - u_out^2 and of the other numbers of `Tap`, shape (pulls, terms, 5).
-        low: squared speed where they begin, coefficients of shape (pulls,).
+        terms: coefficients of u_in^2 - u_out^2 and of the other numbers of `Tap`, shape (pulls, kinds, terms, 5).
+        low: squared speed where they begin, coefficients of shape (pulls, kinds).
         high: where they end: the squared speed of light ones, of hard ones the variable.
-        scale: of the variable: ratio of gaps of light ones, speed of hard ones.
-        pulls: weakest and strongest pull in nm/us^2.
-        hard: whether the junction forms.
+        gaps: between which light ones turn, as a ratio.
+        scale: speed of the hard ones' variable, in nm/us.
+        pulls: weakest and strongest pull in nm/us^2, shape (2, kinds).
     """
 
     terms: Float[Array, "..."]
     low: Float[Array, "..."]
     high: Float[Array, "..."]
+    gaps: Float[Array, ""]
     scale: Float[Array, ""]
     pulls: Float[Array, "..."]
-    hard: bool = eqx.field(static=True)
 
     def at(self, pull: Float[Array, ""]) -> "Taps":
         """Return the series over the speed alone, at a pull."""
@@ -314,34 +314,39 @@ class Taps(eqx.Module):
         held = jnp.clip(pull, weakest, strongest)
         far = 2.0 * jnp.log(held / weakest) / jnp.log(strongest / weakest) - 1.0
         weights = _polynomials(far, self.low.shape[0])
-        own = {name: jnp.tensordot(weights, getattr(self, name), axes=1) for name in ("terms", "low", "high")}
+        own = {name: jnp.einsum("kp,pk...->k...", weights, getattr(self, name)) for name in ("terms", "low", "high")}
         return replace(self, **own)
 
-    def place(self, square: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return where a squared speed lies in the series, -1 to 1; of a table at one pull."""
-        if self.hard:
-            beyond = square > self.low
-            v = jnp.sqrt(jnp.where(beyond, square - self.low, 1.0)) / self.scale
-            return jnp.where(beyond, 2.0 * stretched(v) / self.high - 1.0, -1.0)
-        left = jnp.clip((self.high - square) / (self.high - self.low), 0.0, 1.0)
-        return 1.0 - 2.0 * jnp.log1p((self.scale - 1.0) * left) / jnp.log(self.scale)
+    def place(self, square: Float[Array, "..."]) -> Float[Array, " 2"]:
+        """Return where squared speeds, one or one a kind, lie in the series, -1 to 1; of a table at one pull."""
+        # light ones by the gap where they turn, which is about linear in ln of what is left to the nearest
+        light, hard = jnp.broadcast_to(square, (2,))
+        left = jnp.clip((self.high[0] - light) / (self.high[0] - self.low[0]), 0.0, 1.0)
+        beyond = hard > self.low[1]
+        v = jnp.sqrt(jnp.where(beyond, hard - self.low[1], 1.0)) / self.scale
+        far = jnp.where(beyond, 2.0 * stretched(v) / self.high[1] - 1.0, -1.0)
+        return jnp.stack([1.0 - 2.0 * jnp.log1p((self.gaps - 1.0) * left) / jnp.log(self.gaps), far])
 
-    def holds(self, square: Float[Array, "..."], pull: Float[Array, "..."]) -> Bool[Array, "..."]:
-        """Say whether there are taps of this kind at a squared speed and a pull; of a table at that pull."""
+    def holds(self, square: Float[Array, ""], pull: Float[Array, ""]) -> Bool[Array, " 2"]:
+        """Say whether there are taps of either kind at a squared speed and a pull; of a table at that pull."""
         inside = (pull >= self.pulls[0] * (1.0 - _BESIDE)) & (pull <= self.pulls[1] * (1.0 + _BESIDE))
-        end = self.place(square) <= 1.0 if self.hard else square <= self.high
+        # next to the first hard tap the last light one holds
+        last = jnp.where(self.low[1] < _NEXT * self.high[0], jnp.maximum(self.low[1], self.high[0]), self.high[0])
+        end = jnp.stack([square <= last, self.place(square)[1] <= 1.0])
         return inside & (square >= self.low) & end
 
 
+_NEXT = 1.02
+"""Squared speed of the first hard tap over that of the last light one up to which there is none between."""
 _BESIDE = 0.02
 """Share by which a pull may lie outside a table."""
 _NOWHERE_US = 1e3
 """What the delay of a tap that does not exist is longer by, and more: no orbit has it."""
 
 
-def _polynomials(place: Float[Array, ""], count: int) -> Float[Array, " count"]:
-    """Return Chebyshev's polynomials at a place in [-1, 1]: in few operations, for the program is large enough."""
-    return jnp.cos(jnp.arange(count, dtype=place.dtype) * jnp.arccos(jnp.clip(place, -_END, _END)))
+def _polynomials(place: Float[Array, "..."], count: int) -> Float[Array, "... count"]:
+    """Return Chebyshev's polynomials at places in [-1, 1]: in few operations, for the program is large enough."""
+    return jnp.cos(jnp.arange(count, dtype=place.dtype) * jnp.arccos(jnp.clip(place, -_END, _END))[..., None])
 
 
 _END = 1.0 - 1e-12
@@ -364,14 +369,12 @@ class PulledImpact(eqx.Module):
     """Taps, light and hard, of a tip on a bent lever (`contact.bent_lever`); the coordinate is the speed at the plane.
 
     Attributes:
-        light: taps that the bridge turns round.
-        hard: taps with a solid junction.
+        taps: those under a pull.
         free: collisions of a free tip, at gap 0.
         plane_nm: gap of the plane, where the bridge breaks.
     """
 
-    light: Taps
-    hard: Taps
+    taps: Taps
     free: TabulatedImpact
     plane_nm: Float[Array, ""]
 
@@ -411,7 +414,7 @@ class PulledImpact(eqx.Module):
 
     def speeds(self, coordinate: Float[Array, "..."]) -> Speeds:
         """Return speeds and time of a tap under a middling pull."""
-        return self.tap(coordinate, jnp.sqrt(self.hard.pulls[0] * self.hard.pulls[1])).speeds
+        return self.tap(coordinate, jnp.sqrt(self.taps.pulls[0, 1] * self.taps.pulls[1, 1])).speeds
 
     def at_approach(self, approach_speed: Float[Array, ""]) -> Speeds:
         """Return the same."""
@@ -420,9 +423,9 @@ class PulledImpact(eqx.Module):
     def tap(self, approach_speed: Float[Array, ""], pull: Float[Array, ""]) -> Tap:
         """Return a tap; one that does not exist has a time that no orbit has."""
         square = approach_speed**2
-        light, hard = self.light.at(pull), self.hard.at(pull)
-        is_hard, is_light = hard.holds(square, pull), light.holds(square, pull)
-        parts = [_polynomials(kind.place(square), kind.terms.shape[0]) @ kind.terms for kind in (light, hard)]
+        taps = self.taps.at(pull)
+        is_light, is_hard = taps.holds(square, pull)
+        parts = jnp.einsum("kn,knc->kc", _polynomials(taps.place(square), taps.terms.shape[1]), taps.terms)
         loss, time, area, action, late = jnp.where(is_hard, parts[1], parts[0])
         time = time + jnp.where(is_hard | is_light, 0.0, _NOWHERE_US * (1.0 + approach_speed))
         rebound = jnp.sqrt(jnp.maximum(square - loss, 1e-6))
