@@ -220,7 +220,7 @@ class Measurement(NamedTuple):
         chosen = np.array(self.joint.drives)[self.rows.table] == drive
         rows = jax.tree.map(lambda column: np.asarray(column)[chosen], self.rows._replace(table=None))
         count = len(self.joint.problem.names)
-        return Measurement(rows, self.cantilever, np.ones(count), np.full(count, np.inf), self.fixed)
+        return Measurement(rows, self.cantilever, np.ones(count), np.full(count, np.inf), self.fixed, self.pulls)
 
 
 def constraints_of(
@@ -326,7 +326,11 @@ def joint_measurement(
     for unread in (rows.measured, rows.no_orbit):
         unread[tables.rows :] = False
     value, error = _constraint_columns(problem, known)
-    return parts[0]._replace(rows=rows, constraint_value=value, constraint_error=error, joint=joint)
+    whole_measurement = parts[0]._replace(rows=rows, constraint_value=value, constraint_error=error, joint=joint)
+    if not problem.pulled:
+        return whole_measurement
+    pulls = np.array([part.pulls for part in parts])
+    return whole_measurement._replace(pulls=np.array([pulls.min(), pulls.max()]))
 
 
 def rows_of(table: AmplitudeTable) -> Rows:

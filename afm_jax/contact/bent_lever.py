@@ -29,7 +29,7 @@ from afm_jax.contact.junction import find_junction
 from afm_jax.contact.junction_leg import pass_through_junction
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.contact.leg import gauss_nodes
-from afm_jax.impact.lasting_impact import PulledImpact, Taps, stretched
+from afm_jax.impact.lasting_impact import PulledImpact, Taps, polynomials, stretched
 
 PULLS, SPEEDS = 9, 24
 """Pulls of a table, and speeds of light and of hard taps each."""
@@ -143,11 +143,8 @@ def _filled(taps: "_Tap", pulls: Float[Array, "2 kinds"], gaps: Float[Array, ""]
     # the root of 0 has no derivative
     edge = jnp.ones_like(low)[:, :, None]
     place = jnp.concatenate([-edge, inner, edge], axis=2)
-    rows = [jnp.ones_like(place), place]
-    for _ in range(SPEEDS - 2):
-        rows.append(2.0 * place * rows[-1] - rows[-2])
     values = jnp.stack([taps.coming - taps.leaving, taps.time, taps.area, taps.action, taps.late], axis=-1)
-    terms = jax.vmap(jax.vmap(_solved))(jnp.stack(rows, axis=-1), values)
+    terms = jax.vmap(jax.vmap(_solved))(polynomials(place, SPEEDS), values)
     inverse = jnp.asarray(np.linalg.inv(np.polynomial.chebyshev.chebvander(-_points(PULLS), PULLS - 1)))
     return replace(
         table,

@@ -54,8 +54,10 @@ def pass_through_junction(tip: Driven, energy_aj: Float[Array, "..."], nodes: in
     points, weights, _ = nodes_along(nodes, turn)
     if tip.pull is not None:
         leaving = leaving + tip.pulled_aj(tip.gap_of_root(form), tip.junction.breaks_gap_nm)
-        for _ in range(_TURNS):
-            turn = _turn_under(tip, form, level, _mean_pull(tip, form, turn), turn)
+        # in a loop, for copies take long to compile
+        turn = lax.fori_loop(
+            0, _TURNS, lambda _, at: _turn_under(tip, form, level, _mean_pull(tip, form, at), at), turn
+        )
     at = _Half(tip, form).along(turn, points)
     inside = _sums(weights, at.pace, tip.gap_of_root(at.s), at.y * at.over_y)
     outside = _to_fold(tip, form, jnp.maximum(leaving, 0.0) / unit, nodes)

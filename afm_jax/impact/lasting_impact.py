@@ -313,7 +313,7 @@ class Taps(eqx.Module):
         weakest, strongest = self.pulls
         held = jnp.clip(pull, weakest, strongest)
         far = 2.0 * jnp.log(held / weakest) / jnp.log(strongest / weakest) - 1.0
-        weights = _polynomials(far, self.low.shape[0])
+        weights = polynomials(far, self.low.shape[0])
         own = {name: jnp.einsum("kp,pk...->k...", weights, getattr(self, name)) for name in ("terms", "low", "high")}
         return replace(self, **own)
 
@@ -344,7 +344,7 @@ _NOWHERE_US = 1e3
 """What the delay of a tap that does not exist is longer by, and more: no orbit has it."""
 
 
-def _polynomials(place: Float[Array, "..."], count: int) -> Float[Array, "... count"]:
+def polynomials(place: Float[Array, "..."], count: int) -> Float[Array, "... count"]:
     """Return Chebyshev's polynomials at places in [-1, 1]: in few operations, for the program is large enough."""
     return jnp.cos(jnp.arange(count, dtype=place.dtype) * jnp.arccos(jnp.clip(place, -_END, _END))[..., None])
 
@@ -425,7 +425,7 @@ class PulledImpact(eqx.Module):
         square = approach_speed**2
         taps = self.taps.at(pull)
         is_light, is_hard = taps.holds(square, pull)
-        parts = jnp.einsum("kn,knc->kc", _polynomials(taps.place(square), taps.terms.shape[1]), taps.terms)
+        parts = jnp.einsum("kn,knc->kc", polynomials(taps.place(square), taps.terms.shape[1]), taps.terms)
         loss, time, area, action, late = jnp.where(is_hard, parts[1], parts[0])
         time = time + jnp.where(is_hard | is_light, 0.0, _NOWHERE_US * (1.0 + approach_speed))
         rebound = jnp.sqrt(jnp.maximum(square - loss, 1e-6))

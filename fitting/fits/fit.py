@@ -754,11 +754,7 @@ def _joint(
     Raises:
         ValueError: if there is no such nuisance to share, or the tables contradict each other on it.
     """
-    if model == "contact" and any(table.tapping for table in tables.tables):
-        raise ValueError(
-            "the model 'contact' takes one table of a driven cantilever at a time: fit each by itself, or put several "
-            "amplitudes and frequencies into one table"
-        )
+    _check_levers(tables, model)
     each = [_known_of(table, model, constraints) for table in tables.tables]
     there = [name for name in NUISANCE_NAMES if any(name in known for known in each)]
     shared = there if "all" in share else [name for name in there if name in share]
@@ -796,6 +792,31 @@ def _joint(
     parts = [measurement_of(table, one, known, options["fixed"]) for table in tables.tables]
     joint = Joint(one, tuple(part.cantilever for part in parts), drives, place, held)
     return known, problem, joint_measurement(tables, parts, problem, joint, known)
+
+
+_ONE_LEVER = 0.01
+"""Share by which the frequencies of levers may differ that taps of one are those of the others."""
+
+
+def _check_levers(tables: SeveralTables, model: str) -> None:
+    """Check that one table of taps serves all tables, where the model asks for it.
+
+    Raises:
+        ValueError: if it does not.
+    """
+    if model != "contact" or not any(table.tapping for table in tables.tables):
+        return
+    if not tables.tapping:
+        raise ValueError(
+            "the model 'contact' takes tables of a driven cantilever (# drive = force or base) or of a driven sample, "
+            "not both at a time: fit each kind by itself"
+        )
+    frequencies = [table.free_frequency_khz for table in tables.tables]
+    if max(frequencies) > (1.0 + _ONE_LEVER) * min(frequencies):
+        raise ValueError(
+            "the model 'contact' takes tables of driven cantilevers of one free frequency at a time, but there are "
+            f"{min(frequencies):g} and {max(frequencies):g} kHz: fit each cantilever by itself"
+        )
 
 
 _NEUTRAL = {"tip_calibration": 1.0, "drive_calibration": 1.0, "offset_origin_nm": 0.0, "phase_zero_deg": 0.0}
