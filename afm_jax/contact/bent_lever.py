@@ -31,7 +31,7 @@ from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.contact.leg import gauss_nodes
 from afm_jax.impact.lasting_impact import PulledImpact, Taps, polynomials, stretched
 
-PULLS, SPEEDS = 9, 24
+PULLS, SPEEDS = 7, 18
 """Pulls of a table, and speeds of light and of hard taps each."""
 _NODES, _SWEEPS, _JUNCTION, _ARC = 16, 6, 16, 6
 _BARRIER_GAPS, _GAPS, _TURN_GAPS = 24, 32, 128

@@ -22,6 +22,7 @@ from dataclasses import replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
@@ -413,8 +414,8 @@ class PulledImpact(eqx.Module):
         return self.free.hertz_time(approach_speed)
 
     def speeds(self, coordinate: Float[Array, "..."]) -> Speeds:
-        """Return speeds and time of a tap under a middling pull."""
-        return self.tap(coordinate, jnp.sqrt(self.taps.pulls[0, 1] * self.taps.pulls[1, 1])).speeds
+        """Return speeds and time of a tap under a middling pull, or of the next that there is."""
+        return self._found(coordinate, jnp.sqrt(self.taps.pulls[0, 1] * self.taps.pulls[1, 1]))[0].speeds
 
     def at_approach(self, approach_speed: Float[Array, ""]) -> Speeds:
         """Return the same."""
@@ -422,21 +423,45 @@ class PulledImpact(eqx.Module):
 
     def tap(self, approach_speed: Float[Array, ""], pull: Float[Array, ""]) -> Tap:
         """Return a tap; one that does not exist has a time that no orbit has."""
+        tap, exists = self._found(approach_speed, pull)
+        never = jnp.where(exists, 0.0, _NOWHERE_US * (1.0 + approach_speed))
+        return tap._replace(speeds=tap.speeds._replace(delay=tap.speeds.delay + never))
+
+    def during(self, approach_speed: Float[Array, ""], middle: "Middle", cantilever: Cantilever) -> Tap:
+        """Return a tap while the pull changes, in air.
+
+        To first order the even part of the change counts by its mean; what is odd about the middle of the tap, the air
+        with it, makes the speeds differ, and leaves the rest as it is for the mean of their squares.
+        """
+
+        def gained(tap: Tap) -> Array:
+            return 2.0 * (middle.change * tap.area - 2.0 * cantilever.decay_rate * tap.action)
+
+        first = self.tap(approach_speed, middle.acceleration)
+        square = approach_speed**2
+        mean = jnp.maximum(square + 0.5 * gained(first), (0.1 * approach_speed) ** 2)
+        tap = self.tap(jnp.sqrt(mean), middle.acceleration + middle.bend * first.speeds.delay**2 / 24.0)
+        left = tap.speeds.rebound**2 - mean + square + gained(tap)
+        rebound = jnp.sqrt(jnp.maximum(left, (0.1 * tap.speeds.rebound) ** 2))
+        return tap._replace(speeds=Speeds(approach_speed, rebound, tap.speeds.delay))
+
+    def _found(self, approach_speed: Float[Array, ""], pull: Float[Array, ""]) -> tuple[Tap, Bool[Array, ""]]:
+        """Return a tap, or the next that there is, and whether it exists."""
         square = approach_speed**2
         taps = self.taps.at(pull)
         is_light, is_hard = taps.holds(square, pull)
         parts = jnp.einsum("kn,knc->kc", polynomials(taps.place(square), taps.terms.shape[1]), taps.terms)
         loss, time, area, action, late = jnp.where(is_hard, parts[1], parts[0])
-        time = time + jnp.where(is_hard | is_light, 0.0, _NOWHERE_US * (1.0 + approach_speed))
         rebound = jnp.sqrt(jnp.maximum(square - loss, 1e-6))
-        return Tap(Speeds(approach_speed, rebound, time), area, action, late)
+        return Tap(Speeds(approach_speed, rebound, time), area, action, late), is_hard | is_light
 
 
 class Middle(NamedTuple):
-    """The tip relative to the platform at mid contact: acceleration g in nm/us^2 and its change j in nm/us^3."""
+    """The tip relative to the platform at mid contact: acceleration g in nm/us^2 and its first two derivatives."""
 
     acceleration: Float[Array, ""]
     change: Float[Array, ""]
+    bend: Float[Array, ""]
 
 
 def middle_of_contact(cantilever: Cantilever, surface: Platform | Surface, time_us: Float[Array, "..."]) -> Middle:
@@ -450,7 +475,9 @@ def middle_of_contact(cantilever: Cantilever, surface: Platform | Surface, time_
     height, velocity = surface.position_and_velocity(time_us)
     acceleration = surface.acceleration(time_us)
     pull = cantilever.acceleration(height, velocity) - acceleration
-    return Middle(pull, cantilever.acceleration(velocity, acceleration) - surface.jerk(time_us))
+    jerk, snap = jax.jvp(surface.jerk, (time_us,), (jnp.ones_like(time_us),))
+    change = cantilever.acceleration(velocity, acceleration) - jerk
+    return Middle(pull, change, cantilever.acceleration(acceleration, jerk) - snap)
 
 
 def hertz_under_pull(kappa: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
@@ -495,10 +522,7 @@ def corrected(free: Speeds, middle: Middle, cantilever: Cantilever, impact: Impa
     """
     u, w = free.approach, free.rebound
     if isinstance(impact, PulledImpact):
-        speeds, area, action, _ = impact.tap(u, middle.acceleration)
-        gained = 2.0 * (middle.change * area - 2.0 * cantilever.decay_rate * action)
-        w = speeds.rebound
-        return Speeds(u, jnp.sqrt(jnp.maximum(w**2 + gained, (0.1 * w) ** 2)), speeds.delay)
+        return impact.during(u, middle, cantilever).speeds
     gained, longer = gained_and_longer(u, impact.hertz_time(u), middle, cantilever)
     rebound = jnp.sqrt(jnp.maximum(w**2 + gained, (0.1 * w) ** 2))
     held = _lag(w, impact.length, middle.acceleration) - _lag(u, impact.length, middle.acceleration)

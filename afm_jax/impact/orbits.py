@@ -332,7 +332,7 @@ def _observed(state: OrbitState, problem: OrbitProblem) -> Float[Array, " 3"]:
         if isinstance(impact, PulledImpact):
             # spread over the contact about as a parabola is
             turn = delay * platform.angular_frequency / order
-            tap = impact.tap(approach, middle.acceleration)
+            tap = impact.during(approach, middle, cantilever)
             depth, late = tap.area * (1.0 - turn**2 / 40.0), tap.late
         else:
             depth = indentation(approach, impact.hertz_time(approach), middle)
