@@ -59,13 +59,14 @@ class _Near(NamedTuple):
 
 
 class _Stretch(NamedTuple):
-    """Kinetic energy at the end in aJ; integrals over time of 1, the gap, the squared speed, and the gap times time."""
+    """Kinetic energy at the end in aJ; integrals over time of 1, the gap, the squared speed, and the gap times time and its square."""
 
     energy: Float[Array, ""]
     time: Float[Array, ""]
     gap: Float[Array, ""]
     action: Float[Array, ""]
     moment: Float[Array, ""]
+    second: Float[Array, ""]
 
 
 @jax.jit
@@ -100,10 +101,10 @@ def tapped(contact: Contact, lever: Cantilever, pulls: Float[Array, " 2"]) -> Pu
         return formed, jax.vmap(lambda energy: pass_through_junction(bent, energy, _JUNCTION))(formed)
 
     formed, inside = jax.vmap(of_hard)(pull[:, 1])
-    half = 0.5 * inside.time_us * inside.gap_nm_us
-    solid = _Stretch(inside.energy_aj, inside.time_us, inside.gap_nm_us, inside.action, half)
+    moments = (inside.time_us ** (n - 1) * inside.gap_nm_us / n for n in (2, 3))
+    solid = _Stretch(inside.energy_aj, inside.time_us, inside.gap_nm_us, inside.action, *moments)
     nothing = jnp.zeros_like(formed)
-    legs = (turns, turns), (nothing, nothing), _Stretch(*(nothing,) * 5)
+    legs = (turns, turns), (nothing, nothing), _Stretch(*(nothing,) * 6)
     others = (jnp.full_like(formed, near), jnp.full_like(formed, off)), (formed, inside.energy_aj), solid
     both = jax.tree.map(lambda *kinds: jnp.stack(kinds, axis=1), legs, others)
 
@@ -143,7 +144,7 @@ def _filled(taps: "_Tap", pulls: Float[Array, "2 kinds"], gaps: Float[Array, ""]
     # the root of 0 has no derivative
     edge = jnp.ones_like(low)[:, :, None]
     place = jnp.concatenate([-edge, inner, edge], axis=2)
-    values = jnp.stack([taps.coming - taps.leaving, taps.time, taps.area, taps.action, taps.late], axis=-1)
+    values = jnp.stack([taps.coming - taps.leaving, taps.time, taps.area, taps.action, taps.late, taps.spread], axis=-1)
     terms = jax.vmap(jax.vmap(_solved))(polynomials(place, SPEEDS), values)
     inverse = jnp.asarray(np.linalg.inv(np.polynomial.chebyshev.chebvander(-_points(PULLS), PULLS - 1)))
     return replace(
@@ -194,6 +195,7 @@ class _Tap(NamedTuple):
     area: Float[Array, "..."]
     action: Float[Array, "..."]
     late: Float[Array, "..."]
+    spread: Float[Array, "..."]
 
 
 def _tap(contact: Contact, tip: Driven, plane, gaps, energies, solid: _Stretch) -> _Tap:
@@ -211,17 +213,29 @@ def _tap(contact: Contact, tip: Driven, plane, gaps, energies, solid: _Stretch) 
     area = plane * time - gap
     # the middle of the tap is later than its turning by half of what its ways out and in differ by
     apart = 0.5 * (leaving.time - before.time)
-    moment = 0.5 * plane * (leaving.time**2 - before.time**2) - (leaving.moment - before.moment)
+    behind = leaving.moment - before.moment - apart * gap
+    second = before.second + leaving.second - apart * (2.0 * behind + apart * gap)
     twice = 2.0 / tip.mass_ng
-    action = before.action + leaving.action
-    return _Tap(twice * before.energy, twice * leaving.energy, time, area, action, moment / area - apart)
+    return _Tap(
+        coming=twice * before.energy,
+        leaving=twice * leaving.energy,
+        time=time,
+        area=area,
+        action=before.action + leaving.action,
+        late=-behind / area,
+        spread=(plane * time**3 / 12.0 - second) / area,
+    )
 
 
 def _after(first: _Stretch, second: _Stretch) -> _Stretch:
     """Return two legs, one after the other."""
-    moment = first.moment + second.moment + first.time * second.gap
     return _Stretch(
-        second.energy, first.time + second.time, first.gap + second.gap, first.action + second.action, moment
+        energy=second.energy,
+        time=first.time + second.time,
+        gap=first.gap + second.gap,
+        action=first.action + second.action,
+        moment=first.moment + second.moment + first.time * second.gap,
+        second=first.second + second.second + first.time * (2.0 * second.moment + first.time * second.gap),
     )
 
 
@@ -253,5 +267,6 @@ def _arc(tip: Driven, inner, outer, energy) -> _Stretch:
 def _stretch(energy, gap, speed, pace) -> _Stretch:
     """Return a way from what it ends with, and gap, speed and time per share at Gauss nodes."""
     _, weights, cumulative = (jnp.asarray(part) for part in gauss_nodes(gap.shape[0]))
-    parts = jnp.ones_like(gap), gap, speed**2, gap * (cumulative @ pace)
+    lasted = cumulative @ pace
+    parts = jnp.ones_like(gap), gap, speed**2, gap * lasted, gap * lasted**2
     return _Stretch(energy, *(weights @ (pace * part) for part in parts))

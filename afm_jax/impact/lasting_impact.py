@@ -18,6 +18,7 @@ Higher orders in J, below 0.03 as a rule, count nothing. Orbits over a driven pl
 0.01 % of those of the full contact, within 1 % at twice the capture speed.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
@@ -294,7 +295,7 @@ class Taps(eqx.Module):
     """Taps, light (that the bridge turns round) and hard, as series over the speed with which they come, and over ln g.
 
     Attributes:
-        terms: coefficients of u_in^2 - u_out^2 and of the other numbers of `Tap`, shape (pulls, kinds, terms, 5).
+        terms: coefficients of u_in^2 - u_out^2 and of the other numbers of `Tap`, shape (pulls, kinds, terms, 6).
         low: squared speed where they begin, coefficients of shape (pulls, kinds).
         high: where they end: the squared speed of light ones, of hard ones the variable.
         gaps: between which light ones turn, as a ratio.
@@ -357,13 +358,15 @@ _END = 1.0 - 1e-12
 class Tap(NamedTuple):
     """What a tap does: speeds and time at the plane; time integrals of the depth below it and of the squared speed.
 
-    ``late``: by how much the mean time of the depth is behind the middle of the tap.
+    ``late``: by how much the mean time of the depth is behind the middle of the tap, and ``spread``, in us^2, the mean
+    square of that time.
     """
 
     speeds: Speeds
     area: Float[Array, "..."]
     action: Float[Array, "..."]
     late: Float[Array, "..."]
+    spread: Float[Array, "..."]
 
 
 class PulledImpact(eqx.Module):
@@ -435,7 +438,8 @@ class PulledImpact(eqx.Module):
         """
 
         def gained(tap: Tap) -> Array:
-            return 2.0 * (middle.change * tap.area - 2.0 * cantilever.decay_rate * tap.action)
+            change = middle.change + 0.5 * middle.twist * tap.spread
+            return 2.0 * (change * tap.area - 2.0 * cantilever.decay_rate * tap.action)
 
         first = self.tap(approach_speed, middle.acceleration)
         square = approach_speed**2
@@ -451,17 +455,18 @@ class PulledImpact(eqx.Module):
         taps = self.taps.at(pull)
         is_light, is_hard = taps.holds(square, pull)
         parts = jnp.einsum("kn,knc->kc", polynomials(taps.place(square), taps.terms.shape[1]), taps.terms)
-        loss, time, area, action, late = jnp.where(is_hard, parts[1], parts[0])
+        loss, time, *others = jnp.where(is_hard, parts[1], parts[0])
         rebound = jnp.sqrt(jnp.maximum(square - loss, 1e-6))
-        return Tap(Speeds(approach_speed, rebound, time), area, action, late), is_hard | is_light
+        return Tap(Speeds(approach_speed, rebound, time), *others), is_hard | is_light
 
 
 class Middle(NamedTuple):
-    """The tip relative to the platform at mid contact: acceleration g in nm/us^2 and its first two derivatives."""
+    """The tip relative to the platform at mid contact: acceleration g in nm/us^2 and its first derivatives."""
 
     acceleration: Float[Array, ""]
     change: Float[Array, ""]
     bend: Float[Array, ""]
+    twist: Float[Array, ""]
 
 
 def middle_of_contact(cantilever: Cantilever, surface: Platform | Surface, time_us: Float[Array, "..."]) -> Middle:
@@ -475,9 +480,21 @@ def middle_of_contact(cantilever: Cantilever, surface: Platform | Surface, time_
     height, velocity = surface.position_and_velocity(time_us)
     acceleration = surface.acceleration(time_us)
     pull = cantilever.acceleration(height, velocity) - acceleration
-    jerk, snap = jax.jvp(surface.jerk, (time_us,), (jnp.ones_like(time_us),))
-    change = cantilever.acceleration(velocity, acceleration) - jerk
-    return Middle(pull, change, cantilever.acceleration(acceleration, jerk) - snap)
+    jerk, (snap, crackle) = _thrice(surface.jerk, time_us)
+    pulled = cantilever.acceleration
+    return Middle(
+        pull, pulled(velocity, acceleration) - jerk, pulled(acceleration, jerk) - snap, pulled(jerk, snap) - crackle
+    )
+
+
+def _thrice(of: Callable[[Array], Array], at: Float[Array, "..."]) -> tuple[Array, tuple[Array, Array]]:
+    """Return a function's value and its first two derivatives."""
+
+    def twice(at):
+        return jax.jvp(of, (at,), (jnp.ones_like(at),))
+
+    (value, rate), (_, second) = jax.jvp(twice, (at,), (jnp.ones_like(at),))
+    return value, (rate, second)
 
 
 def hertz_under_pull(kappa: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:

@@ -330,10 +330,11 @@ def _observed(state: OrbitState, problem: OrbitProblem) -> Float[Array, " 3"]:
         approach, delay = state.speeds.approach, state.speeds.delay
         middle = middle_of_contact(cantilever, platform, state.flight.start_us - 0.5 * delay)
         if isinstance(impact, PulledImpact):
-            # spread over the contact about as a parabola is
-            turn = delay * platform.angular_frequency / order
+            nu = platform.angular_frequency / order
             tap = impact.during(approach, middle, cantilever)
-            depth, late = tap.area * (1.0 - turn**2 / 40.0), tap.late
+            # the last term as of a parabola
+            depth = tap.area * (1.0 - 0.5 * nu**2 * tap.spread + (nu * delay) ** 4 / 4480.0)
+            late = tap.late
         else:
             depth = indentation(approach, impact.hertz_time(approach), middle)
     below = {"indentation": depth, "late_us": late}
