@@ -59,7 +59,7 @@ class _Near(NamedTuple):
 
 
 class _Stretch(NamedTuple):
-    """Kinetic energy at the end in aJ; integrals over time of 1, the gap, the squared speed, and the gap times time and its square."""
+    """Kinetic energy at the end in aJ; integrals over time of 1, gap, squared speed, gap times time and its square."""
 
     energy: Float[Array, ""]
     time: Float[Array, ""]

@@ -342,6 +342,8 @@ _NEXT = 1.02
 """Squared speed of the first hard tap over that of the last light one up to which there is none between."""
 _BESIDE = 0.02
 """Share by which a pull may lie outside a table."""
+_PEAKED = 1.65
+"""Depth of a tap over its mean depth: between those of a parabola and of a triangle."""
 _NOWHERE_US = 1e3
 """What the delay of a tap that does not exist is longer by, and more: no orbit has it."""
 
@@ -433,8 +435,10 @@ class PulledImpact(eqx.Module):
     def during(self, approach_speed: Float[Array, ""], middle: "Middle", cantilever: Cantilever) -> Tap:
         """Return a tap while the pull changes, in air.
 
-        To first order the even part of the change counts by its mean; what is odd about the middle of the tap, the air
-        with it, makes the speeds differ, and leaves the rest as it is for the mean of their squares.
+        To first order what is odd about the middle of the tap, the air with it, makes the speeds differ, and leaves the
+        rest as it is for the mean of their squares. What is even, bend t^2/2, shifts the ends: with h half the time,
+        h' its slope by the speed and paths that move apart evenly outside the turn, the time grows by
+        -bend h^3 (h'/3 - h (g h' - 1)/(12 u)), and the area by the depth times that, less bend h^5/10.
         """
 
         def gained(tap: Tap) -> Array:
@@ -444,10 +448,16 @@ class PulledImpact(eqx.Module):
         first = self.tap(approach_speed, middle.acceleration)
         square = approach_speed**2
         mean = jnp.maximum(square + 0.5 * gained(first), (0.1 * approach_speed) ** 2)
-        tap = self.tap(jnp.sqrt(mean), middle.acceleration + middle.bend * first.speeds.delay**2 / 24.0)
+        pull, speed = middle.acceleration, jnp.sqrt(mean)
+        tap, slope = jax.jvp(lambda u: self.tap(u, pull), (speed,), (jnp.ones_like(speed),))
+        half, steep = 0.5 * tap.speeds.delay, 0.5 * slope.speeds.delay
+        longer = -middle.bend * half**3 * (steep / 3.0 - half * (pull * steep - 1.0) / (12.0 * speed))
+        longer = jnp.clip(longer, -0.2 * half, 0.2 * half)
+        deepest = _PEAKED * tap.area / tap.speeds.delay
         left = tap.speeds.rebound**2 - mean + square + gained(tap)
         rebound = jnp.sqrt(jnp.maximum(left, (0.1 * tap.speeds.rebound) ** 2))
-        return tap._replace(speeds=Speeds(approach_speed, rebound, tap.speeds.delay))
+        area = tap.area + deepest * longer - 0.1 * middle.bend * half**5
+        return tap._replace(speeds=Speeds(approach_speed, rebound, tap.speeds.delay + longer), area=area)
 
     def _found(self, approach_speed: Float[Array, ""], pull: Float[Array, ""]) -> tuple[Tap, Bool[Array, ""]]:
         """Return a tap, or the next that there is, and whether it exists."""
