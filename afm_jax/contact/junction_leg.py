@@ -53,11 +53,13 @@ def pass_through_junction(tip: Driven, energy_aj: Float[Array, "..."], nodes: in
     leaving = energy_aj + unit * (jkr.work(form) - jkr.work(jkr.FOLD))
     points, weights, _ = nodes_along(nodes, turn)
     if tip.pull is not None:
-        leaving = leaving + tip.pulled_aj(tip.gap_of_root(form), tip.junction.breaks_gap_nm)
+        leaving, pull = leaving + tip.pulled_aj(tip.gap_of_root(form), tip.junction.breaks_gap_nm), tip.pull
+
         # in a loop, for copies take long to compile
-        turn = lax.fori_loop(
-            0, _TURNS, lambda _, at: _turn_under(tip, form, level, _mean_pull(tip, form, at), at), turn
-        )
+        def improve(_, turn):
+            return _turn_under(tip, form, level, _mean_pull(tip, pull, form, turn), turn)
+
+        turn = lax.fori_loop(0, _TURNS, improve, turn)
     at = _Half(tip, form).along(turn, points)
     inside = _sums(weights, at.pace, tip.gap_of_root(at.s), at.y * at.over_y)
     outside = _to_fold(tip, form, jnp.maximum(leaving, 0.0) / unit, nodes)
@@ -71,12 +73,10 @@ def _sums(weights: Array, pace: Array, gap: Array, speed: Array) -> tuple[Array,
     return time, below, action
 
 
-def _mean_pull(tip: Driven, s: Array, turn: Array) -> Array | None:
+def _mean_pull(tip: Driven, pull: Array, s: Array, turn: Array) -> Array:
     """Return the mean over the depth of what a bent lever does, between s and the turning point: it is linear there."""
-    if tip.pull is None:
-        return None
     middle = 0.5 * (tip.gap_of_root(s) + tip.gap_of_root(turn))
-    return tip.pull - tip.lever_n_per_m * tip.inverse_mass * middle
+    return pull - tip.lever_n_per_m * tip.inverse_mass * middle
 
 
 class Stretch(NamedTuple):
@@ -197,7 +197,8 @@ class _Half(NamedTuple):
         y = reach * points
         s = turn - y * y
         square = _unit(self.driven) * _mean_work_slope(turn, s)
-        means = _mean_pull(self.driven, s, turn) if means is None else means
+        if means is None and self.driven.pull is not None:
+            means = _mean_pull(self.driven, self.driven.pull, s, turn)
         if means is not None:
             square = square + twice * _mean_depth_slope(turn, s) * means
         over_y, slope = jnp.sqrt(square), jkr.depth_slope(s)
