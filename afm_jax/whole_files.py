@@ -5,7 +5,7 @@ import secrets
 from pathlib import Path
 
 
-def write_whole(path: str | os.PathLike[str], content: str | bytes) -> None:
+def write_whole(path: str | os.PathLike[str], content: str | bytes, *, synced: bool = True) -> None:
     """Write a file whole or not at all: beside its place, and then there in one step; one that was there is replaced.
 
     A device or a pipe is written to as it is.
@@ -13,6 +13,7 @@ def write_whole(path: str | os.PathLike[str], content: str | bytes) -> None:
     Args:
         path: of the file.
         content: bytes, or a text to be encoded as UTF-8; what no encoding has, as in names of files, is escaped.
+        synced: whether it must outlast a power cut, too, which takes the disk's time.
 
     Raises:
         OSError: naming the file, if it cannot be written; what was there before is still there.
@@ -29,8 +30,9 @@ def write_whole(path: str | os.PathLike[str], content: str | bytes) -> None:
         try:
             with fresh.open("xb") as file:
                 file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
+                if synced:
+                    file.flush()
+                    os.fsync(file.fileno())
             fresh.replace(target)
         except BaseException:
             fresh.unlink(missing_ok=True)

@@ -15,7 +15,7 @@ import numpy as np
 from afm_jax.checks import require_float64
 from afm_jax.strict_json import plain
 from afm_jax.sweeps.axes import Axis
-from afm_jax.sweeps.plan import Columns, Recorder, Variable, plan_of
+from afm_jax.sweeps.plan import MESSAGE, Columns, Recorder, Variable, plan_of
 from afm_jax.sweeps.sweep import Progress, dataset_of
 from fitting.fits.fit import fit, problem_of
 from fitting.fits.result import FitResult
@@ -154,7 +154,7 @@ def table_recorder(given: Mapping[str, Any], axes: Sequence[Axis]) -> Recorder:
         names = list(columns)
         rows = [dict(zip(names, row, strict=True)) for row in zip(*columns.values(), strict=True)]
         fits = [_fitted(tables[int(row[TABLE])], row, seed, model, record, own) for row in rows]
-        return {name: np.array([found[name] for found in fits]) for name in fits[0]}
+        return {name: [found[name] for found in fits] for name in fits[0]}
 
     sources = [table.source for table in tables]
     return Recorder(_variables(own), work, points=1, labels={TABLE: {"sources": sources}}, alone=True)
@@ -176,6 +176,7 @@ def _variables(own: Sequence[str]) -> tuple[Variable, ...]:
         Variable("chi2", "sum of squared normalised residuals"),
         Variable("degrees_of_freedom", "amplitudes and constraints minus parameters", "int32"),
         Variable("outcome", "what the fit says of itself", "int8", flags=_FLAGS),
+        MESSAGE,
     )
 
 
@@ -201,29 +202,29 @@ def _fitted(
     model: str,
     settings: Mapping[str, Any],
     own: Sequence[str],
-) -> dict[str, float]:
+) -> dict[str, Any]:
     """Return what is recorded of one fit."""
-    nothing = dict.fromkeys((variable.name for variable in _variables(own)), math.nan)
+    nothing: dict[str, Any] = dict.fromkeys((variable.name for variable in _variables(own)), math.nan)
     nothing |= {"degrees_of_freedom": 0, "outcome": _REFUSED}
     try:
         measured = _with_instrument(table, row)
         if RESAMPLE in row:
             measured = _drawn(measured, (seed, int(row[TABLE]), int(row[RESAMPLE])))
         found = fit(measured, model, **settings)
-    except ValueError:
-        return nothing
+    except ValueError as error:
+        return nothing | {MESSAGE.name: str(error)}
     return _columns_of(found, own)
 
 
-def _columns_of(found: FitResult, own: Sequence[str]) -> dict[str, float]:
-    values: dict[str, float] = {}
+def _columns_of(found: FitResult, own: Sequence[str]) -> dict[str, Any]:
+    values: dict[str, Any] = {}
     for name in own:
         parameter = found.parameters[name]
         numbers = (parameter.value, parameter.standard_error, *parameter.interval95)
         for ending, number in zip(("", "_error", "_low", "_high"), numbers, strict=True):
             values[name + ending] = math.nan if number is None else number
     told = {"chi2": found.chi2, "degrees_of_freedom": found.degrees_of_freedom}
-    return values | told | {"outcome": _FITTED if found.valid else _NOT_VALID}
+    return values | told | {"outcome": _FITTED if found.valid else _NOT_VALID, MESSAGE.name: " ".join(found.reasons)}
 
 
 def _with_instrument(table: AmplitudeTable, row: Mapping[str, float]) -> AmplitudeTable:

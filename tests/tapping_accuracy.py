@@ -25,8 +25,8 @@ from afm_jax.apparatus.surface import detected
 from afm_jax.impact.closure import OrbitProblem
 from afm_jax.impact.lasting_impact import TabulatedImpact, middle_of_contact
 from afm_jax.impact.orbits import amplitudes, orbit_state, steady_orbits
+from afm_jax.least_squares import covariance_of
 from fitting.fits.fit import fit, problem_of
-from fitting.fits.least_squares import covariance_of
 from fitting.fits.objective import Objective
 from fitting.models import measurement_of
 from fitting.simulated.experiment import with_noise

@@ -37,8 +37,9 @@ def compare_with_brute_force(seed: int, count: int, family: str) -> int:
     flown = np.where(mine.outcome == Outcome.IMPACT, mine.arrival_time_us - flights.time_us, np.inf)
     found = flown <= FOLLOWED_US
     assert set(np.unique(mine.outcome)) <= {Outcome.IMPACT, Outcome.NO_FURTHER_IMPACT, Outcome.STEP_LIMIT}
-    # Without damping a tip can swing for thousands of periods just above a platform: a stated end, and a rare one.
-    assert np.sum(mine.outcome == Outcome.STEP_LIMIT) <= 1e-3 * count
+    # Without damping a tip can swing for thousands of periods just above a platform: a stated end, and a rare one
+    # (once in 10,000 flights, so that a small batch may have one).
+    assert np.sum(mine.outcome == Outcome.STEP_LIMIT) <= max(3, 1e-3 * count)
 
     sure = ~exact.near_grazing
     np.testing.assert_array_equal(found[sure], exact.found[sure])

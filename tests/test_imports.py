@@ -2,6 +2,7 @@
 
 import ast
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,7 @@ LEVELS = {
     "words": 0,
     "outcomes": 0,
     "checks": 1,
+    "least_squares": 0,
     "saved": 1,
     "results": 1,
     "compilation_cache": 0,
@@ -116,6 +118,73 @@ def test_files_import_each_other_in_no_circle():
         needs = {name: needed for name, needed in needs.items() if name not in free}
 
 
+def names_run(node: ast.AST) -> Iterator[str]:
+    """Give the names that a definition uses when it runs: all but those of annotations."""
+    for field, value in ast.iter_fields(node):
+        if field in {"annotation", "returns"}:
+            continue
+        for part in value if isinstance(value, list) else [value]:
+            if isinstance(part, ast.AST):
+                yield from names_run(part)
+    if isinstance(node, ast.Name):
+        yield node.id
+
+
+Known = dict[tuple[str, str], tuple[str, str] | ast.AST]
+
+
+@cache
+def definitions() -> Known:
+    """Return what every name of every module stands for: its definition, or module and name of what is imported."""
+    trees = {".".join(path.with_suffix("").parts): ast.parse((ROOT / path).read_text()) for path in LIBRARY}
+    known: Known = {}
+    for module, tree in trees.items():
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module:
+                known |= {(module, one.asname or one.name): (node.module, one.name) for one in node.names}
+        for node in tree.body:
+            targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", node)]
+            for target in targets:
+                for part in ast.walk(target) if isinstance(target, ast.expr) else [target]:
+                    name = getattr(part, "id", None) or getattr(part, "name", None)
+                    if name is not None:
+                        known[module, name] = node
+    return known
+
+
+def crossed(start: tuple[str, str]) -> set[str]:
+    """Return the modules with something that a public call can enter: definitions followed by the names they use."""
+    known = definitions()
+    seen, ahead = {start}, [start]
+    while ahead:
+        here = ahead.pop()
+        there = known.get(here)
+        if isinstance(there, ast.AST):
+            found = {(here[0], name) for name in names_run(there)} & set(known)
+        else:
+            found = {there} if there is not None else set()
+        ahead += found - seen
+        seen |= found
+    # a name that is imported lies in the file that defines it
+    return {module for module, name in seen if isinstance(known.get((module, name)), ast.AST)}
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "most"),
+    [
+        ("afm_jax.motion.simulate", "simulate", 34),
+        ("fitting.fits.fit", "fit", 52),
+        ("afm_jax.contact.collide", "collide", 18),
+        ("afm_jax.effects.study", "study_effects", 50),
+    ],
+)
+def test_a_call_crosses_few_files(module: str, name: str, most: int):
+    # five of them write results into files; those of a contact are the most of the others
+    files = crossed((module, name))
+    assert {module, "afm_jax.results"} <= files
+    assert len(files) <= most, sorted(files)
+
+
 def test_no_two_classes_have_one_name():
     found: dict[str, list[str]] = {}
     for path in LIBRARY:
@@ -136,6 +205,11 @@ def test_packages_start_without_jax():
     # Names are taken when they are used; then JAX is there.
     code = "import sys, afm_jax, fitting; print('jax' in sys.modules); afm_jax.Cantilever; print('jax' in sys.modules)"
     assert python(code).split() == ["False", "True"]
+
+
+def test_fits_load_no_scipy():
+    # its statistics alone take as long as JAX: they are for posteriors, which import them when they need them
+    assert python("import sys, fitting.fits.fit, fitting.report.report; print('scipy' in sys.modules)") == "False"
 
 
 def test_no_module_takes_the_place_of_a_public_function():

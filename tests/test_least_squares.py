@@ -5,7 +5,7 @@ import pytest
 from scipy.optimize import least_squares
 from scipy.special import chdtrc
 
-from fitting.fits.least_squares import (
+from afm_jax.least_squares import (
     Box,
     Searches,
     chi2_tail,

@@ -165,7 +165,10 @@ ROWS = "time_us,deflection_nm\n0,1\n0.1,{}\n0.2,3\n"
         (with_time(GOOD, "# drive_frequency_khz = 0\n"), "drive_frequency_khz must be finite and above 0, but is 0.0"),
         (with_time(GOOD, "# drive_frequency_khz = 181,8\n"), "write the decimal comma as a point"),
         (with_time(GOOD, "# drive_frequency_hz = 181800\n"), "the key is drive_frequency_khz"),
-        (with_time(GOOD, "# offset_nm = 1\n# offset_nm = 2\n"), "line 2: offset_nm is given a second time"),
+        (
+            with_time(GOOD, "# offset_nm = 1\n# offset_nm = 2\n"),
+            "line 2: offset_nm was given in line 1 already; remove one of the two",
+        ),
         (with_time(GOOD, "# offset_nm = 1 +- 2\n"), "offset_nm takes no such error"),
     ],
 )

@@ -13,8 +13,7 @@ from scipy.stats import qmc
 
 from afm_jax import compilation_cache
 from afm_jax.sweeps.axes import axes_of
-from afm_jax.sweeps.plan import compute_chunk
-from afm_jax.sweeps.store import STORE, SweepStore, locked
+from afm_jax.sweeps.store import STORE, SweepStore, compute_chunk, locked
 from afm_jax.sweeps.sweep import dataset_of, estimate, run_plan
 from tests.sweep_numbers import SIZES, contents, plan
 
@@ -50,12 +49,12 @@ def test_chunks_that_are_done_are_kept(tmp_path: Path, monkeypatch: pytest.Monke
     run_plan(plan(), tmp_path / "whole")
     write, count = SweepStore.write, 0
 
-    def breaking(store: SweepStore, chunk: int, results: dict) -> None:
+    def breaking(store: SweepStore, chunk: int, files: dict) -> None:
         nonlocal count
         count += 1
         if count > 5:
             raise KeyboardInterrupt
-        write(store, chunk, results)
+        write(store, chunk, files)
 
     monkeypatch.setattr(SweepStore, "write", breaking)
     with pytest.raises(KeyboardInterrupt):
@@ -103,10 +102,10 @@ def test_a_changed_input_is_refused_and_named(tmp_path: Path):
 
 
 def test_a_full_disk_keeps_what_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    def full(store: SweepStore, chunk: int, results: dict) -> None:
+    def full(store: SweepStore, chunk: int, files: dict) -> None:
         if chunk >= 3:
             raise OSError(errno.ENOSPC, "No space left on device", str(store.folder / "sum_nm"))
-        write(store, chunk, results)
+        write(store, chunk, files)
 
     write = SweepStore.write
     monkeypatch.setattr(SweepStore, "write", full)
@@ -141,7 +140,7 @@ def test_two_sweeps_on_one_folder(tmp_path: Path):
 def test_what_a_killed_sweep_left_unfinished_is_cleared(tmp_path: Path):
     run_plan(plan(), tmp_path)
     before = contents(tmp_path)
-    (tmp_path / STORE / "sum_nm" / "c" / "3" / "0.abc.partial").touch()
+    (tmp_path / STORE / "sum_nm" / "c" / "3" / ".0.abc.part").touch()
     (tmp_path / "done" / ".3.json.abcd.part").touch()
     run_plan(plan(), tmp_path)
     assert contents(tmp_path) == before
@@ -216,13 +215,14 @@ def test_the_store_opens_without_warnings(tmp_path: Path):
         assert xarray.open_zarr(str(tmp_path / STORE)).sizes == {"x": 7, "y": 12, "part": 2}
 
 
-def test_a_worker_with_other_versions_is_refused(monkeypatch: pytest.MonkeyPatch):
+def test_a_worker_with_other_versions_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     # a worker is a process of its own; this one keeps its settings
     for name in ("open_cache", "silence_xla"):
         monkeypatch.setattr(compilation_cache, name, lambda: None)
     given = plan().given
     found = compute_chunk(json.dumps(given), 5)
-    np.testing.assert_array_equal(found["large"], plan().compute(5)["large"])
+    run_plan(plan(), tmp_path)
+    assert found["sum_nm"] == (tmp_path / STORE / "sum_nm" / "c" / "2" / "1").read_bytes()
     other = given | {"versions": given["versions"] | {"jax": "0.0.1"}}
     with pytest.raises(RuntimeError, match=r"a worker would compute otherwise than the others: jax is .*, not 0.0.1"):
         compute_chunk(json.dumps(other), 5)

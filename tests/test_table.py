@@ -14,7 +14,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from fitting.tables.csv_text import setting_in
-from fitting.tables.table import COLUMN_NAMES, SETTINGS, AmplitudeTable, TableError, read_table, write_table
+from fitting.tables.table import SETTINGS, TABLE, AmplitudeTable, TableError, read_table, write_table
 
 NAMES = "order,drive_frequency_khz,drive_amplitude_nm,offset_nm,peak_amplitude_nm,peak_amplitude_error_nm\n"
 TEXT = f"# free_frequency_khz = 90\n{NAMES}1,180,4,0,163.3,1.63\n2,349.2,2,-1,106.67,1.06\n"
@@ -254,7 +254,7 @@ def test_an_unwritable_path_is_one_line(tmp_path: Path):
 def test_a_hundred_thousand_rows_read_in_seconds(tmp_path: Path):
     rows = 100_000
     random = np.random.default_rng(1)
-    columns = {name: random.uniform(1.0, 100.0, rows) for name in COLUMN_NAMES}
+    columns = {name: random.uniform(1.0, 100.0, rows) for name in TABLE.names}
     columns |= {"order": np.full(rows, 2), "no_orbit": np.zeros(rows)}
     table = small_table(**columns)
     write_table(table, tmp_path / "long.csv")

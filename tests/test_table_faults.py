@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fitting.tables.table import COLUMN_NAMES, TableError, read_table
+from fitting.tables.table import TABLE, TableError, read_table
 from tests.table_texts import KEY, NAMES, ROW, fault_of, message_of
 
 Q = "'# quality_factor = 40 (or 40 +- 2)'"
@@ -56,7 +56,7 @@ def test_paths_that_are_no_file(tmp_path: Path):
         ("offset_nm", "offset", ": unknown column 'offset'; did you mean offset_nm (in nm)?"),
         ("offset_nm", "Offset_nm", ": unknown column 'Offset_nm'; did you mean offset_nm (in nm)?"),
         ("order", "ordre", ": unknown column 'ordre'; did you mean order?"),
-        ("\n", ",room\n", f": unknown column 'room'; remove it, the columns are {', '.join(COLUMN_NAMES)}"),
+        ("\n", ",room\n", f": unknown column 'room'; remove it, the columns are {', '.join(TABLE.names)}"),
         ("\n", ",\n", ": column 7 has no name; name it or remove its comma"),
         ("\n", ",order\n", ", column order: is there twice, as columns 1 and 7; remove one"),
         (

@@ -7,13 +7,14 @@ import mpmath
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from matplotlib.image import imread
 from scipy.stats import gamma
 
 from afm_jax.cli.main import main
 from fitting import TableError, calibrate, equipartition, read_curves, read_sweep, sader, sensitivity
 from fitting.calibration.model import deviance_root
 from fitting.calibration.result import CalibratedValue, Calibration
-from fitting.calibration.stiffness import BOLTZMANN, air_at, disagreement, hydrodynamic_function
+from fitting.calibration.stiffness import BOLTZMANN, Stiffness, air_at, disagreement, hydrodynamic_function
 from fitting.calibration.sweep import DENSITY, ResonanceSweep
 from tests.strict_reading import strictly
 
@@ -93,7 +94,22 @@ def test_saders_stiffness_is_what_nanosurf_states_in_the_file():
     assert width.standard_error / width.value == pytest.approx(0.025, rel=0.4)
 
 
-def test_the_sensitivity_is_the_slope_of_the_rows_in_contact():
+def test_spring_constants_that_differ_are_pointed_out():
+    def stiffness(method: str, value: float) -> Stiffness:
+        return Stiffness(method, CalibratedValue(value, 0.01 * value, (None, None), None), ())
+
+    assert disagreement([]) is None
+    assert disagreement([stiffness("equipartition", 9.7)]) is None
+    assert disagreement([stiffness("equipartition", 26.0)], 27.13) is None
+    # k goes with 1/<x^2>: sqrt(27.13/9.7) = 1.67
+    assert "1.67 times the true ones" in (disagreement([stiffness("equipartition", 9.7)], 27.13) or "")
+    assert "--length-um" in (disagreement([stiffness("equipartition", 9.7)], 27.13) or "")
+    # where Sader's method was used, it is the one to compare with
+    both = [stiffness("equipartition", 26.0), stiffness("Sader", 27.0)]
+    assert disagreement(both, 9.7) is None
+
+
+def test_the_sensitivity_is_the_slope_of_the_rows_in_contact(tmp_path):
     curves = read_curves(FORCES)
     found = sensitivity(curves)
     slopes = []
@@ -111,7 +127,12 @@ def test_the_sensitivity_is_the_slope_of_the_rows_in_contact():
     answer = run(FORCES, "--slope", "--json")
     assert answer.exit_code == 0, answer.stderr
     assert strictly(answer.stdout)["deflection_nm_per_volt"]["value"] == found.value.value
+    assert {row["quantity"] for row in strictly(answer.stdout)["budget"]} == {"deflection_nm_per_volt"}
+    assert run(FORCES, "--slope", "--out", tmp_path).exit_code == 0
+    assert len(np.unique(imread(tmp_path / "calibration.png"))) > 50
+    assert (tmp_path / "calibration.txt").read_text("utf-8").startswith("deflection_nm_per_volt: ")
     assert run(THERMAL, "--slope").exit_code == 2
+    assert "--slope reads the sensitivity" in run(FORCES).stderr
     with pytest.raises(TableError, match="no deflection in V"):
         sensitivity(read_curves(REAL / "tapping_amplitude_wsxm.f.curves"))
 
@@ -126,6 +147,9 @@ def test_spectra_are_read_from_csv(tmp_path):
     np.testing.assert_allclose(sweep.amplitude**2, density(khz), rtol=1e-14)
     path.write_text(f"# averages = many\nfrequency_hz,psd_nm2_per_hz\n{rows}\n", encoding="utf-8")
     with pytest.raises(TableError, match="line 1: averages has 'many' where a number must stand"):
+        read_sweep(path)
+    path.write_text(f"# averages = 200\n# averages = 300\nfrequency_hz,psd_nm2_per_hz\n{rows}\n", encoding="utf-8")
+    with pytest.raises(TableError, match="line 2: averages was given in line 1 already; remove one of the two"):
         read_sweep(path)
     cut = tmp_path / "cut.nid"
     cut.write_bytes(THERMAL.read_bytes()[:-8])
@@ -175,4 +199,3 @@ def test_intervals_hold_the_truth_as_often_as_they_say(known):
     low, high = (0.92, 0.985) if known else (0.88, 1.0)
     assert np.all((held / draws >= low) & (held / draws <= high)), held / draws
     assert np.all(np.abs(np.mean(apart, axis=0)) < 4.0 * np.std(apart, axis=0) / np.sqrt(draws))
-    assert disagreement([]) is None

@@ -1,4 +1,8 @@
-"""Sweeps over law scenes: time and memory as they grow, and as processes are added."""
+"""Sweeps over law scenes: time and memory as they grow, and as processes of one core each are added.
+
+One process uses all cores by itself, so that more processes than cores, and two of all cores, gain nothing: what is
+measured is what a cluster gains, whose workers bring their cores with them.
+"""
 
 import contextlib
 import math
@@ -31,7 +35,7 @@ def sweep_rows(sizes: Sequence[int], *, points: int, processes: Sequence[int], c
     Args:
         sizes: numbers of scenes, in one process on all devices.
         points: scenes of the sweeps by several processes.
-        processes: numbers of them, each with one device.
+        processes: numbers of them, of one core each; more than `cores` share these.
         cores: devices of the one process.
 
     Returns:
@@ -44,7 +48,7 @@ def sweep_rows(sizes: Sequence[int], *, points: int, processes: Sequence[int], c
         rows.append(run_in_own_process(_TASK, {"points": size, "processes": 1}, cores=cores))
     for number in processes:
         progress(f"bench: sweeps, {number} processes")
-        # not pinned to a core, which its workers would be, too
+        # not pinned, as its workers would be, too, all of them to the same core
         rows.append(run_in_own_process(_TASK, {"points": points, "processes": number, "by_dask": True}, cores=cores))
     return rows
 
@@ -63,7 +67,7 @@ def law_sweep(*, points: int, processes: int, by_dask: bool = False) -> Row:
         _run(replace(_plan(points), recorder=short.recorder), None)
         seconds = time.perf_counter() - wall
     return {
-        "what": "processes of Dask" if by_dask else "one process, all devices",
+        "what": "processes of one core" if by_dask else "one process, all devices",
         "points": points,
         "processes": processes,
         "devices": 1 if by_dask else len(jax.devices()),
@@ -80,7 +84,7 @@ def _run(plan: SweepPlan, processes: int | None) -> float:
     with contextlib.ExitStack() as stack:
         folder, scheduler = Path(stack.enter_context(tempfile.TemporaryDirectory())), None
         if processes is not None:
-            scheduler = stack.enter_context(local_cluster(processes)).scheduler_address
+            scheduler = stack.enter_context(local_cluster(processes, cores_each=1)).scheduler_address
         run_plan(plan, folder, scheduler=scheduler, report=lambda *told: rates.append(told[2]))
     return rates[-1]
 
@@ -118,5 +122,5 @@ def aims(rows: Sequence[Mapping[str, Any]]) -> list[tuple[str, float | None, flo
     return [
         ("time a scene of the largest sweep over the smallest's", flat, 1.2),
         ("memory of the largest sweep over the smallest's", memory, 1.2),
-        ("time of two processes over one's", two, 1.0 / 1.8),
+        ("time of two processes of one core over one's", two, 1.0 / 1.8),
     ]

@@ -59,13 +59,6 @@ def _seconds(compiled: Compiled, arguments: tuple[Any, ...], calls: int) -> floa
     return (time.perf_counter() - began) / calls
 
 
-def available_cores() -> int:
-    """Return how many cores this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
 def run_in_own_process(task: str, settings: Mapping[str, Any], *, cores: int) -> Any:
     """Run a function in a new process and return its result.
 
@@ -78,18 +71,19 @@ def run_in_own_process(task: str, settings: Mapping[str, Any], *, cores: int) ->
     Raises:
         ValueError: if the process fails; its own message went to standard error.
     """
-    flags = os.environ.get("XLA_FLAGS", "")
+    flags, threads = os.environ.get("XLA_FLAGS", ""), {}
     if cores > 1:
         flags += f" --xla_force_host_platform_device_count={cores}"
     elif not hasattr(os, "sched_setaffinity"):
-        flags += " --xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
+        # XLA reads that; its flags do not bring its threads down to one
+        threads = {"NPROC": "1"}
     done = subprocess.run(  # noqa: S603
         [sys.executable, "-m", "afm_jax.bench.timing", task, str(cores)],
         input=json.dumps(dict(settings)),
         stdout=subprocess.PIPE,
         text=True,
         check=False,
-        env={**os.environ, "XLA_FLAGS": flags.strip(), "JAX_PLATFORMS": "cpu"},
+        env={**os.environ, **threads, "XLA_FLAGS": flags.strip(), "JAX_PLATFORMS": "cpu"},
     )
     if done.returncode != 0:
         raise ValueError(f"the measurement in a process of its own ended with exit code {done.returncode}")

@@ -7,7 +7,7 @@ import click
 from afm_jax.cli.fitted_law import with_fitted_law, with_law_options
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import Ends, PictureFormat, SceneName, scene_and_start
+from afm_jax.cli.values import Ends, SceneName, scene_and_start, with_picture
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -40,7 +40,7 @@ class Grid(click.ParamType):
 @click.option("--grid", type=Grid(), default="300x300", show_default=True, help="Drive phases x rebound speeds.")
 @click.option("--speeds", type=Ends(), metavar="LOW:HIGH", help="Range of the rebound speed, in nm/us.")
 @with_law_options
-@click.option("--picture", type=PictureFormat(), default="png", show_default=True, help="png, pdf or svg.")
+@with_picture
 @with_session
 def command(
     session: Session,

@@ -91,7 +91,7 @@ def dynamics_table(rows: Sequence[dict[str, Any]]) -> "Table":
     return table
 
 
-SWEEPS = {"sizes": [10_000, 100_000, 1_000_000, 10_000_000], "points": 4_000_000, "processes": [1, 2, 4]}
+SWEEPS = {"sizes": [10_000, 100_000, 1_000_000, 10_000_000], "points": 8_000_000, "processes": [1, 2, 4]}
 SWEEPS_QUICK = {"sizes": [2000], "points": 0, "processes": []}
 SWEEP_COLUMNS = (
     "what",
@@ -282,7 +282,7 @@ def command(session: Session, batches: tuple[int, ...], only: str | None, *, qui
     bench_dynamics.csv, bench_sweep.csv, bench_fits.csv and bench.json.
     """
     session.start_computing()
-    from afm_jax.bench.timing import available_cores  # noqa: PLC0415
+    from afm_jax.dynamics.iteration import available_cores  # noqa: PLC0415
 
     cores = available_cores()
     machine = machine_facts(cores)

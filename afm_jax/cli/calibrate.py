@@ -54,8 +54,8 @@ def command(session: Session, sweep: Path, *, slope: bool, amplitude_only: bool,
     maximum. A thermal spectrum (NanoSurf .nid, or CSV with asd_nm_per_sqrt_hz or psd_nm2_per_hz and a comment
     `# averages = 1000`) gives the spring constant besides, by equipartition and, with the lever's length and width, by
     Sader's method; --slope gives the sensitivity from force curves. With --out the report: calibration.txt, .json, .png
-    and calibration_points.csv. Exit code 3 if the result is not valid: no resonance, at the edge, not converged, or not
-    explained by the model.
+    and (without --slope) calibration_points.csv. Exit code 3 if the result is not valid: no resonance, at the edge, not
+    converged, or not explained by the model.
     """
     if slope:
         _sensitivity(session, sweep)
@@ -123,11 +123,21 @@ def _stiffnesses(result: "Calibration", options: dict[str, Any]) -> "list[Stiffn
 def _sensitivity(session: Session, path: Path) -> None:
     from dataclasses import asdict  # noqa: PLC0415
 
-    from afm_jax.words import with_error  # noqa: PLC0415
-    from fitting.calibration.stiffness import sensitivity  # noqa: PLC0415
+    from afm_jax.strict_json import plain  # noqa: PLC0415
+    from fitting.calibration.stiffness import budget, sensitivity, stiffness_lines  # noqa: PLC0415
     from fitting.instruments.curve import read_curves  # noqa: PLC0415
 
-    found = sensitivity(read_curves(path))
+    curves = read_curves(path)
+    found = sensitivity(curves)
     data = {"deflection_nm_per_volt": asdict(found.value), "assumed": found.assumed, "valid": True}
-    text = f"deflection_nm_per_volt: {with_error(found.value.value, found.value.standard_error)} nm/V"
-    session.emit(data, "\n".join([text, *(f"  - {line}" for line in found.assumed)]))
+    data |= {"budget": budget(None, [found])}
+    text = "\n".join(stiffness_lines(None, [found]))
+    session.emit(data, text)
+    if session.out is not None:
+        from afm_jax.plots.picture_style import png_of  # noqa: PLC0415
+        from fitting.calibration.report import slope_figure  # noqa: PLC0415
+        from fitting.report.report import write_report_files  # noqa: PLC0415
+
+        picture = png_of(slope_figure(curves, found))
+        for written in write_report_files(session.out, "calibration", text=text, data=plain(data), picture=picture):
+            session.note(f"wrote {written}")

@@ -9,7 +9,7 @@ from afm_jax.cli.fitted_law import with_fitted_law, with_law_option
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.orbits import IMPACT_COLUMNS, PositiveInteger, impact_rows, orbit_facts, refuse_other_than_law
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import PictureFormat, SceneName, ranges_of, scene_and_start
+from afm_jax.cli.values import SceneName, ranges_of, scene_and_start, with_picture
 from afm_jax.units import TWO_SIDED_95
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ _ENDS = {
 @click.option("--second", metavar="P=A:B", help="Another one: the special points are followed as curves in both.")
 @click.option("--sticking", is_flag=True, help="Follow the orbit with a rest on the sample: chatter, ride, release.")
 @with_law_option
-@click.option("--picture", type=PictureFormat(), default="png", show_default=True, help="png, pdf or svg.")
+@with_picture
 @with_session
 def command(  # noqa: PLR0913
     session: Session,

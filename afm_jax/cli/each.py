@@ -37,14 +37,18 @@ def fit_tables(session: Session, tables: Sequence[Path], record: Mapping[str, An
     columns = [name for name in rows[0] if name not in ("parameters", "valid")]
     session.write_table("fits.csv", rows, columns)
     fits = [
-        {name: row[name] for name in ("table", "outcome", "valid", "chi2", "degrees_of_freedom", "parameters")}
+        {
+            name: row[name]
+            for name in ("table", "outcome", "valid", "message", "chi2", "degrees_of_freedom", "parameters")
+        }
         for row in rows
     ]
     payload = {"model": record["model"], "fits": fits, "seconds": done.seconds, "fits_kept": len(done.kept.done)}
-    session.emit(payload, "\n".join(_table(rows)))
+    why = [f"{row['table']}: {row['message']}" for row in rows if row["message"]]
+    session.emit(payload, "\n".join(_table(rows)), *why)
     bad = [row["table"] for row in rows if not row["valid"]]
     if bad:
-        raise NotValid(f"{len(bad)} of {len(rows)} fits are not valid: `afm-jax fit {bad[0]}` says why")
+        raise NotValid(f"{len(bad)} of {len(rows)} fits are not valid")
 
 
 def _rows(tables: Sequence[Path], variables: Sequence[str], folder: Path | None) -> list[dict[str, Any]]:
@@ -60,11 +64,12 @@ def _rows(tables: Sequence[Path], variables: Sequence[str], folder: Path | None)
     names = [name.removesuffix("_error") for name in variables if name.endswith("_error")]
     rows = []
     for number, table in enumerate(tables):
-        numbers = {name: found[name].values[number].item() for name in variables}
+        numbers = {name: found[name].values[number].item() for name in variables if name != "message"}
         outcome = words[numbers.pop("outcome")]
         parameters = {name: _parameter(name, numbers) for name in names}
         told = {"table": str(table), "outcome": outcome, "valid": outcome == "valid"}
-        rows.append(told | numbers | {"parameters": parameters})
+        why = str(found["message"].values[number])
+        rows.append(told | numbers | {"message": why, "parameters": parameters})
     return rows
 
 

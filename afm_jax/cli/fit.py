@@ -13,7 +13,7 @@ import click
 from afm_jax.cli.each import fit_tables
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, prepare_folder, with_session
-from afm_jax.cli.values import Ends, Share, example_path, parse_around_plus_minus, parse_number
+from afm_jax.cli.values import Ends, example_path, parse_around_plus_minus, parse_number, with_noise
 from afm_jax.contact.parameters import EFFECTS, REMOVABLE_EFFECTS, idle_without
 from afm_jax.words import text_table
 from fitting.parameters import CONTACT_DEFAULT, DELAY_LAW, LAWS, MODELS, NUISANCE_NAMES, model_parameters
@@ -97,12 +97,7 @@ class Names(click.ParamType):
     + f"; each with {DELAY_LAW.meaning} (+delay); contact: physical parameters through the resolved contact, "
     "of tapping curves on resonance too.",
 )
-@click.option(
-    "--noise",
-    type=Share("a relative error"),
-    metavar="SHARE",
-    help="Relative error of amplitudes without one, such as 1%.",
-)
+@with_noise
 @click.option(
     "--scale-errors",
     is_flag=True,

@@ -7,17 +7,12 @@ import click
 
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import Share, example_path
+from afm_jax.cli.values import example_path, with_noise
 
 
 @click.command()
 @click.argument("table", metavar="[TABLE.csv]", required=False, type=click.Path(path_type=Path))
-@click.option(
-    "--noise",
-    type=Share("a relative error"),
-    metavar="SHARE",
-    help="Relative error of amplitudes without one, such as 1%.",
-)
+@with_noise
 @click.option(
     "--frequency-error",
     "frequency_error_khz",

@@ -7,7 +7,7 @@ import click
 from afm_jax.cli.fitted_law import with_fitted_law, with_law_options
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import PictureFormat, SceneName, ranges_of, scene_and_start
+from afm_jax.cli.values import SceneName, ranges_of, scene_and_start, with_picture
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -37,7 +37,7 @@ BAND = ("exponent_per_impact_low", "exponent_per_impact_high")
 @click.option("--transient", type=click.IntRange(0), default=500, show_default=True, help="Impacts before.")
 @click.option("--parameter", metavar="P=a:b:n", help="A parameter of the scene file and its values, one motion each.")
 @with_law_options
-@click.option("--picture", type=PictureFormat(), default="png", show_default=True, help="png, pdf or svg.")
+@with_picture
 @with_session
 def command(  # noqa: PLR0913
     session: Session,

@@ -2,6 +2,7 @@
 
 import os
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 _KEYS = ("scene", "tables", "axes", "record", "accuracy", "chunk")
 _WRITTEN = (("axes", list, "[[axes]]"), ("record", dict, "[record]"))
 _SECONDS_BETWEEN_NOTES = 2.0
+_MOST_MESSAGES = 3
 _MOST_DRAWN = 2
 """Axes of a sweep that a picture can show."""
 
@@ -93,6 +95,7 @@ def _tell(session: Session, plan: "SweepPlan", done: "SweepRun") -> None:
     from afm_jax.sweeps.store import STORE  # noqa: PLC0415
 
     assert session.out is not None  # asked before  # noqa: S101
+    messages = _messages(plan, session.out / STORE)
     payload = {
         "store": session.out / STORE,
         "points": plan.points,
@@ -102,18 +105,39 @@ def _tell(session: Session, plan: "SweepPlan", done: "SweepRun") -> None:
         "chunks_damaged": len(done.kept.damaged),
         "chunks_computed": done.computed,
         "seconds": done.seconds,
+        "without_result": sum(messages.values()),
+        "messages": dict(messages.most_common(_MOST_MESSAGES)),
         "variables": {variable.name: variable.attributes() for variable in plan.recorder.variables},
     }
-    session.emit(payload, *_words(plan, done, session.out / STORE))
+    session.emit(payload, *_words(plan, done, messages, session.out / STORE))
 
 
-def _words(plan: "SweepPlan", done: "SweepRun", store: Path) -> list[str]:
+def _messages(plan: "SweepPlan", store: Path) -> Counter[str]:
+    """Return why points have no result to be trusted, and how many each time."""
+    import numpy as np  # noqa: PLC0415
+    import xarray  # noqa: PLC0415
+
+    from afm_jax.sweeps.plan import MESSAGE  # noqa: PLC0415
+
+    if MESSAGE not in plan.recorder.variables:
+        return Counter()
+    with xarray.open_zarr(str(store)) as found:
+        texts, counts = np.unique(found[MESSAGE.name].values.astype(str), return_counts=True)
+    return Counter({str(text): int(count) for text, count in zip(texts, counts, strict=True) if text})
+
+
+def _words(plan: "SweepPlan", done: "SweepRun", messages: Counter[str], store: Path) -> list[str]:
     grid = " x ".join(map(str, plan.shape))
     lines = [f"{grid} points in {done.chunks} chunks, {done.computed} of them computed in {_duration(done.seconds)}."]
     if done.kept.done:
         lines.append(f"{len(done.kept.done)} chunks were done before and kept.")
     if done.kept.damaged:
         lines.append(f"{len(done.kept.damaged)} chunks had other bytes than they were written with: computed again.")
+    if messages:
+        lines.append(
+            f"{sum(messages.values())} points have no result to be trusted (`message` says why), most of them:"
+        )
+        lines += [f"  {count}: {text}" for text, count in messages.most_common(_MOST_MESSAGES)]
     return [*lines, f"Open them with xarray.open_zarr({str(store)!r})."]
 
 
@@ -182,7 +206,7 @@ def _tables(given: Any, folder: Path) -> list[Path]:
 
 def _use_all_cores() -> None:
     """Let JAX have a device for every core, before it starts, unless the user has said how many there are."""
-    from afm_jax.bench.timing import available_cores  # noqa: PLC0415
+    from afm_jax.dynamics.iteration import available_cores  # noqa: PLC0415
 
     flags = os.environ.get("XLA_FLAGS", "")
     if "host_platform_device_count" not in flags:
@@ -193,7 +217,7 @@ def _processes(plan: "SweepPlan") -> int:
     """Return how many processes use this machine best: one for batches, which take every device themselves."""
     from importlib.util import find_spec  # noqa: PLC0415
 
-    from afm_jax.bench.timing import available_cores  # noqa: PLC0415
+    from afm_jax.dynamics.iteration import available_cores  # noqa: PLC0415
 
     if not plan.recorder.alone or find_spec("distributed") is None:
         return 1

@@ -9,7 +9,7 @@ import click
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.read import NmPerVolt
 from afm_jax.cli.session import Session, prepare_folder, with_session
-from afm_jax.cli.values import Share, ValueAndError
+from afm_jax.cli.values import ValueAndError, with_noise
 
 if TYPE_CHECKING:
     from fitting.tables.table import AmplitudeTable
@@ -19,12 +19,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("curve_file", metavar="CURVE", type=click.Path(path_type=Path))
-@click.option(
-    "--noise",
-    type=Share("a relative error"),
-    metavar="SHARE",
-    help="Relative error of a table's amplitudes without one, such as 1%.",
-)
+@with_noise
 @click.option("--free-frequency-khz", type=ValueAndError(), metavar="KHZ", help="Instead of the file's; '90 +- 0.01'.")
 @click.option("--quality-factor", type=ValueAndError(), metavar="Q", help="Instead of the file's; '200 +- 2'.")
 @click.option(

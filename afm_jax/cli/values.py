@@ -169,6 +169,19 @@ class PictureFormat(click.ParamType):
         return suffix
 
 
+with_picture = click.option(
+    "--picture", type=PictureFormat(), default="png", show_default=True, help="png, pdf or svg."
+)
+"""Give a command the option --picture."""
+with_noise = click.option(
+    "--noise",
+    type=Share("a relative error"),
+    metavar="SHARE",
+    help="Relative error of amplitudes without one, such as 1%.",
+)
+"""Give a command the option --noise."""
+
+
 def parse_numbers(text: str, what: str = "number", *, positive: bool = False) -> tuple[float, ...]:
     """Return the numbers that a text lists.
 

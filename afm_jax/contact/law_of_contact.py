@@ -18,7 +18,6 @@ to 0. The capture speed is where a rebound speed of 0 comes from.
 
 import math
 from dataclasses import dataclass, replace
-from itertools import combinations
 from typing import Any, NamedTuple
 
 import jax
@@ -37,6 +36,7 @@ from afm_jax.contact.junction import Junction, find_junction
 from afm_jax.contact.junction_leg import pass_through_junction
 from afm_jax.impact.lasting_impact import TabulatedImpact, stretched
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from afm_jax.least_squares import Box, Searches, descended, distance
 from afm_jax.results import public_result
 
 FREE = {"law": ("r", "epsilon"), "viscous": ("epsilon", "viscous_loss"), "full": ("r", "epsilon", "viscous_loss")}
@@ -47,7 +47,8 @@ LAW_SPEEDS = 1.5, 250.0
 DELAY_SPEEDS = 1.37, 700.0
 """The same of `fit_delay`: for the paper's contact 15 to 700 nm/us."""
 _NAMES = ("r", "epsilon", "viscous_loss")
-_STEPS, _TOLERANCE, _SETTLED = 50, 1e-15, 1e-9
+_STEPS, _TOLERANCE, _SETTLED = 100, 1e-28, 1e-18
+"""Distances of the sum of squares to its minimum, over the squared rebound speeds, to stop at and to have settled."""
 
 _GUESSES = 12
 _GUESS_SPEEDS = 1.4, 500.0
@@ -238,48 +239,27 @@ def closest_law(
     scales = np.array([1e-2, approach[0] ** 2, approach[0] * 1e-1])[free]
     losses = np.stack([approach**2, np.ones_like(approach), approach], axis=1)[:, free] * scales
     weights = 1.0 / rebound if residuals == "relative" else np.ones_like(rebound)
-    sets = [list(some) for n in range(len(scales) + 1) for some in combinations(range(len(scales)), n)]
-    found = [_least(losses[:, some], approach, rebound, weights) for some in sets]
-    best, some = min(zip(found, sets, strict=True), key=lambda pair: pair[0].square)
-    parameters = np.zeros(len(scales))
-    parameters[some] = best.parameters
-    values = np.zeros(3)
-    values[free] = parameters * scales
-    loss, epsilon, viscous_loss = values.tolist()
-    return ImpactLaw(r=math.sqrt(max(1.0 - loss, 1e-12)), epsilon=epsilon, viscous_loss=viscous_loss), best.converged
 
+    def look(place: Float[np.ndarray, "1 p"], _: object) -> Searches:
+        # a law that captures a tip of the range has the smallest speed instead: far from any minimum
+        fitted = np.sqrt(np.maximum(approach**2 - place @ losses.T, 1e-12))
+        residual = (fitted - rebound) * weights
+        slopes = (-0.5 * weights / fitted)[:, :, None] * losses
+        return Searches(place, residual, slopes, np.sum(residual**2, axis=1))
 
-class _Least(NamedTuple):
-    """Losses with the least sum of squared residuals, the sum (infinite where a loss is negative), and if it is one."""
-
-    parameters: Float[np.ndarray, " p"]
-    square: float
-    converged: bool
-
-
-def _least(
-    losses: Float[np.ndarray, "n p"],
-    approach: Float[np.ndarray, " n"],
-    rebound: Float[np.ndarray, " n"],
-    weights: Float[np.ndarray, " n"],
-) -> _Least:
-    """Return the best losses without bounds, by Gauss-Newton steps: the residuals are small and nearly linear."""
     # to first order the residual is that of the squares over 2 u_out
     linear = weights / (2.0 * rebound)
-    parameters = np.linalg.lstsq(losses * linear[:, None], (approach**2 - rebound**2) * linear, rcond=None)[0]
-    fitted, moved = approach, np.inf
-    for _ in range(_STEPS):
-        # a law that captures a tip of the range has the smallest speed instead: far from any minimum
-        fitted = np.sqrt(np.maximum(approach**2 - losses @ parameters, 1e-12))
-        if moved < _TOLERANCE:
-            break
-        slopes = losses * (0.5 * weights / fitted)[:, None]
-        step = np.linalg.lstsq(slopes, (fitted - rebound) * weights, rcond=None)[0]
-        parameters = parameters + step
-        moved = float(np.max(np.abs(step), initial=0.0))
-    inside = bool(np.all(parameters >= 0.0))
-    square = float(np.sum(((fitted - rebound) * weights) ** 2))
-    return _Least(parameters, square if inside else np.inf, inside and moved < _SETTLED)
+    guess = np.linalg.lstsq(losses * linear[:, None], (approach**2 - rebound**2) * linear, rcond=None)[0]
+    guess = np.maximum(guess, 0.0)
+    guess /= max(1.0, 1.01 * float(np.max(losses @ guess / approach**2)))
+    size = float(np.sum((weights * rebound) ** 2))
+    box = Box(np.zeros(len(scales)), np.full(len(scales), np.inf), np.zeros((1, len(scales)), bool))
+    found = descended(look, look(guess[None], None), box, settled=_TOLERANCE * size, most=_STEPS)
+    values = np.zeros(3)
+    values[free] = found.place[0] * scales
+    loss, epsilon, viscous_loss = values.tolist()
+    law = ImpactLaw(r=math.sqrt(max(1.0 - loss, 1e-12)), epsilon=epsilon, viscous_loss=viscous_loss)
+    return law, bool(distance(found, box)[0] < _SETTLED * size)
 
 
 def rebounds(contact: Contact, speeds: Float[np.ndarray, " n"], mass_ng: float) -> dict[str, np.ndarray]:

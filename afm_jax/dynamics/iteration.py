@@ -388,7 +388,7 @@ def in_blocks(work: Callable[[Any], Any], lanes: Any, *, block: int = LANES, rep
 
     firsts = range(0, count, width)
     done = [part(0)]  # alone, so that programs are compiled once
-    with ThreadPoolExecutor(_workers()) as pool:
+    with ThreadPoolExecutor(available_cores()) as pool:
         for result in pool.map(part, firsts[1:]):
             done.append(result)
             if report is not None:
@@ -396,5 +396,6 @@ def in_blocks(work: Callable[[Any], Any], lanes: Any, *, block: int = LANES, rep
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *done)
 
 
-def _workers() -> int:
+def available_cores() -> int:
+    """Return how many cores this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -7,7 +7,6 @@ import json
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import lru_cache
 from importlib import import_module
 from typing import Any
 
@@ -54,10 +53,11 @@ class Variable:
     Attributes:
         name: with its unit.
         meaning: in words.
-        dtype: of the numbers; floats are NaN where there is nothing.
+        dtype: of the numbers, or "string"; floats are NaN where there is nothing.
         dimensions: besides those of the axes.
         unit: None: as the name says.
         flags: for integers that are codes, what each means.
+        sentences: the same in whole sentences, in their order.
     """
 
     name: str
@@ -66,6 +66,7 @@ class Variable:
     dimensions: tuple[str, ...] = ()
     unit: str | None = None
     flags: Mapping[int, str] = field(default_factory=dict)
+    sentences: tuple[str, ...] = ()
 
     def attributes(self) -> dict[str, Any]:
         """Return unit and meaning as attributes of the CF conventions."""
@@ -74,7 +75,12 @@ class Variable:
             found["units"] = unit_of(self.name) if self.unit is None else self.unit
         if self.flags:
             found |= {"flag_values": list(self.flags), "flag_meanings": " ".join(self.flags.values())}
+        if self.sentences:
+            found["flag_sentences"] = list(self.sentences)
         return found
+
+
+MESSAGE = Variable("message", "why there is no result, or none to be trusted; empty where there is one", "string")
 
 
 @dataclass(frozen=True)
@@ -182,9 +188,9 @@ class SweepPlan:
         with jax.enable_x64(True):  # noqa: FBT003
             found = self.recorder.work(columns)
         return {
-            variable.name: np.asarray(found[variable.name], variable.dtype).reshape(
-                (*sides, *(len(self.recorder.extra[name]) for name in variable.dimensions))
-            )
+            variable.name: np.asarray(
+                found[variable.name], object if variable.dtype == "string" else variable.dtype
+            ).reshape((*sides, *(len(self.recorder.extra[name]) for name in variable.dimensions)))
             for variable in self.recorder.variables
         }
 
@@ -209,21 +215,12 @@ def plan_of(given: Mapping[str, Any]) -> SweepPlan:
     return SweepPlan(whole, axes, recorder)
 
 
-def compute_chunk(text: str, chunk: int) -> Columns:
-    """Return the results of a chunk, for a process that knows nothing but the input.
-
-    Args:
-        text: `SweepPlan.given` as JSON.
-        chunk: its number.
+def plan_of_worker(text: str) -> SweepPlan:
+    """Return the plan for a process that knows nothing but its input, `SweepPlan.given` as JSON.
 
     Raises:
         RuntimeError: if this process would compute otherwise than the one that asks.
     """
-    return _known_plan(text).compute(chunk)
-
-
-@lru_cache(maxsize=4)
-def _known_plan(text: str) -> SweepPlan:
     from afm_jax.compilation_cache import open_cache, silence_xla  # noqa: PLC0415
 
     silence_xla()

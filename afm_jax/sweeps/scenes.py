@@ -19,19 +19,20 @@ from afm_jax.apparatus.surface import free_frame
 from afm_jax.contact.collide import collide
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.charts import highest_orbits
-from afm_jax.dynamics.exponents import exponents_of_law
-from afm_jax.dynamics.iteration import LANES, leaving_tips, sample_driven
+from afm_jax.dynamics.exponents import lyapunov_spectrum
+from afm_jax.dynamics.iteration import LANES, sample_driven
 from afm_jax.dynamics.verdicts import MotionKind
 from afm_jax.impact.law import impact_law_of
 from afm_jax.motion.observe import observe
 from afm_jax.motion.record import MotionOutcome
 from afm_jax.motion.settle import follow_long
+from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.motion.start import start_of
 from afm_jax.outcomes import CollisionOutcome
 from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, scene_family
 from afm_jax.scenefile.scenefile import Start, scene_of_tables
 from afm_jax.sweeps.axes import Axis
-from afm_jax.sweeps.plan import Columns, Recorder, Variable
+from afm_jax.sweeps.plan import MESSAGE, Columns, Recorder, Variable
 
 APPROACH_SPEED = "approach_speed_nm_per_us"
 """The axis of `collide` that is no parameter of the scene."""
@@ -72,8 +73,8 @@ def scene_recorder(given: Mapping[str, Any], axes: Sequence[Axis]) -> Recorder:
         raise ValueError(f"a start is of use for simulations alone: leave it out for {what!r}")
     chosen = {key: _checked(key, record.get(key, usual), usual) for key, usual in settings.items()}
     accuracy = given.get("accuracy")
-    if accuracy is not None and what in ("orbits", "lyapunov"):
-        raise ValueError(f"{what!r} is as accurate as 64-bit floats are: leave `accuracy` out")
+    if accuracy is not None and not isinstance(scene.interaction, Contact):
+        raise ValueError("`accuracy` is about resolved contacts, and this scene has none: leave `accuracy` out")
     if accuracy is not None and not (isinstance(accuracy, float) and 0.0 < accuracy < 1.0):
         raise ValueError(f"`accuracy` must be a number between 0 and 1, but is {accuracy!r}")
     if accuracy is not None:
@@ -169,7 +170,7 @@ def _orbits(scene: Scene, paths: tuple[str, ...], *, orders: tuple[int, ...]) ->
         scenes = made(columns)
         return highest_orbits(scenes, free_frame(scenes), jnp.asarray(orders, float))
 
-    points = 4096 if law.delay else 65536
+    points = 4096 if law.delay else 131072
     return Recorder(_ORBIT_VARIABLES, over_devices(record), points, {"order": [float(order) for order in orders]})
 
 
@@ -179,7 +180,13 @@ _COLLISION_VARIABLES = (
     Variable("rebound_speed_nm_per_us", "speed away from the sample; 0 where the tip is captured"),
     Variable("collision_delay_us", "time between the crossings of gap 0 by the straight paths in and out"),
     Variable("captured", "the tip stays at the sample", "bool"),
-    Variable("outcome", "how the collision ended", "int8", flags={o.value: o.name.lower() for o in CollisionOutcome}),
+    Variable(
+        "outcome",
+        "how the collision ended",
+        "int8",
+        flags={o.value: o.name.lower() for o in CollisionOutcome},
+        sentences=tuple(o.sentence for o in CollisionOutcome),
+    ),
     Variable("time_in_contact_us", "from the formation of the bridge to its breaking"),
     Variable("time_in_junction_us", "with the solids joined"),
     Variable("deepest_gap_nm", "smallest gap"),
@@ -215,6 +222,8 @@ def _collisions(
 
 # --- Lyapunov exponents -----------------------------------------------------------------------------------------------
 
+_CONTACTS = 16
+"""Motions with a resolved contact that are followed together."""
 _EXPONENTS = ("exponents_per_impact", "exponents_per_us", "exponents_per_impact_error", "exponents_per_us_error")
 _EXPONENT_VARIABLES = (
     Variable("exponents_per_impact", "Lyapunov exponents, larger first", dimensions=("exponent",), unit="1"),
@@ -228,25 +237,28 @@ _EXPONENT_VARIABLES = (
 )
 
 
-def _lyapunov(scene: Scene, paths: tuple[str, ...], *, impacts: int, transient: int) -> Recorder:
-    """Record the exponents of motions of law scenes that begin by leaving the platform upward."""
+def _lyapunov(
+    scene: Scene, paths: tuple[str, ...], *, impacts: int, transient: int, accuracy: float = DEFAULT_ACCURACY
+) -> Recorder:
+    """Record the exponents of motions that begin by leaving the platform upward."""
     sample_driven(scene)
-    impact_law_of(scene)
+    resolved = isinstance(scene.interaction, Contact)
+    lanes = _CONTACTS if resolved else LANES
     made = jax.jit(_scenes(scene, paths))
 
     def work(columns: Columns) -> Columns:
         count = len(next(iter(columns.values())))
-        width = LANES * -(-count // LANES)
-        scenes = sample_driven(
-            made({name: jnp.asarray(_filled(column, width)) for name, column in columns.items()})
-        ).scenes
-        found = exponents_of_law(scenes, leaving_tips(scenes), impacts=impacts, transient=transient)
+        # always as many lanes, so that there is one shape of every program
+        width = lanes * -(-count // lanes)
+        filled = {name: jnp.asarray(_filled(column, width)) for name, column in columns.items()}
+        found = lyapunov_spectrum(made(filled), impacts=impacts, transient=transient, accuracy=accuracy)
         verdicts = found.verdicts
         known = {name: getattr(found, name) for name in (*_EXPONENTS, "impacts")}
         known |= {"kind": verdicts.kind, "orbit_impacts": verdicts.impacts, "orbit_periods": verdicts.periods}
         return {name: np.asarray(part)[:count] for name, part in known.items()}
 
-    return Recorder(_EXPONENT_VARIABLES, work, 4 * LANES, {"exponent": [1.0, 2.0]})
+    points = _CONTACTS if resolved else 4 * LANES
+    return Recorder(_EXPONENT_VARIABLES, work, points, {"exponent": [1.0, 2.0]}, alone=resolved)
 
 
 # --- simulations ------------------------------------------------------------------------------------------------------
@@ -280,6 +292,7 @@ _SIMULATION_VARIABLES = (
         "int8",
         flags={_REFUSED: "not_possible"} | {o.value: o.name.lower() for o in MotionOutcome},
     ),
+    MESSAGE,
 )
 
 
@@ -292,7 +305,7 @@ def _simulation(
     def work(columns: Columns) -> Columns:
         rows = zip(*(columns[path] for path in paths), strict=True)
         seen = [_seen(family(*row), periods, accuracy, start) for row in rows]
-        return {variable.name: np.array([each[variable.name] for each in seen]) for variable in _SIMULATION_VARIABLES}
+        return {variable.name: [each[variable.name] for each in seen] for variable in _SIMULATION_VARIABLES}
 
     return Recorder(_SIMULATION_VARIABLES, work, 16, alone=True)
 
@@ -300,12 +313,12 @@ def _simulation(
 def _seen(scene: Scene, periods: float, accuracy: float, start: Start | None) -> dict[str, Any]:
     """Return what is recorded of one scene; NaN where nothing is known, and of a motion that cannot be."""
     nothing = dict.fromkeys(_OBSERVED, math.nan) | dict.fromkeys(("settled", "stuck"), False)
-    nothing |= dict.fromkeys(("order", "contacts_per_response", "impacts"), 0)
+    nothing |= dict.fromkeys(("order", "contacts_per_response", "impacts"), 0) | {MESSAGE.name: ""}
     try:
         longest = periods * drive_of(scene).period_us
         run = follow_long(scene, start_of(scene, start), longest, until_settled=True, accuracy=accuracy)
-    except ValueError:
-        return nothing | {"outcome": _REFUSED}
+    except ValueError as error:
+        return nothing | {"outcome": _REFUSED, MESSAGE.name: str(error)}
     found, verdict = run.simulation, run.verdict
     outcome = MotionOutcome(int(found.outcome))
     told = {
@@ -317,10 +330,10 @@ def _seen(scene: Scene, periods: float, accuracy: float, start: Start | None) ->
         "outcome": int(outcome),
     }
     if outcome not in (MotionOutcome.FINISHED, MotionOutcome.HELD):
-        return nothing | told
+        return nothing | told | {MESSAGE.name: outcome.sentence}
     seen = observe(scene, found, verdict=verdict)
     values = {name: getattr(seen, name) for name in _OBSERVED}
-    return {name: math.nan if value is None else value for name, value in values.items()} | told
+    return nothing | {name: value for name, value in values.items() if value is not None} | told
 
 
 _RECORDERS: dict[str, tuple[Callable[..., Recorder], dict[str, Any]]] = {

@@ -14,25 +14,32 @@ import shutil
 import socket
 import warnings
 from collections.abc import Iterator, Mapping
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import zarr
+from zarr.storage import MemoryStore
 
 from afm_jax.strict_json import strict_json
 from afm_jax.sweeps.axes import dimension_of
-from afm_jax.sweeps.plan import Columns, SweepPlan, unit_of
+from afm_jax.sweeps.plan import SweepPlan, Variable, plan_of_worker, unit_of
 from afm_jax.version import __version__
 from afm_jax.whole_files import write_whole
 
-FORMAT_VERSION = 1
+FORMAT_VERSION = 2
 STORE = "sweep.zarr"
 _MARKERS, _LOCK = "done", "lock"
 _COMPUTED = "computed"
 _SLAB = 1_000_000
 """Values of a coordinate that are written, and lie, together."""
+_FILLS = {"float64": math.nan, "string": ""}
 _MOST_SHOWN = 60
+
+
+ChunkFiles = dict[str, bytes | None]
+"""What a chunk's files hold, by the variable; None where there is none, all of it being the fill value."""
 
 
 class Kept(NamedTuple):
@@ -49,9 +56,6 @@ class SweepStore:
     def __init__(self, folder: Path, plan: SweepPlan):
         """Take the store of a folder; see `open_store`."""
         self.folder, self.plan = folder, plan
-        self._group = zarr.open_group(str(folder / STORE), mode="r+", use_consolidated=False)
-        # opened once: that takes as long as a chunk's writing
-        self._arrays: dict[str, zarr.Array] = {}
 
     def kept(self) -> Kept:
         """Return which chunks are done, every byte of them looked at."""
@@ -62,53 +66,93 @@ class SweepStore:
                 sums = json.loads(path.read_bytes())
             except ValueError:
                 sums = None
-            (done if sums == self._sums(chunk) else damaged).add(chunk)
+            (done if sums == _sums(self._there(chunk)) else damaged).add(chunk)
         return Kept(frozenset(done), frozenset(damaged))
 
-    def write(self, chunk: int, results: Columns) -> None:
-        """Write the results of a chunk, and then that it is done.
+    def write(self, chunk: int, files: ChunkFiles) -> None:
+        """Write the files of a chunk, and then that it is done.
 
         Raises:
             OSError: if there is no room, or the folder is gone; the chunk then counts as not done.
         """
-        region = self.plan.region(chunk)
-        for name, part in results.items():
-            self._array(name)[(*region, ...)] = part
-        self._array(_COMPUTED)[region] = True
-        write_whole(self._marker(chunk), strict_json(self._sums(chunk)))
-
-    def size_of(self, chunk: int) -> int:
-        """Return the bytes that a chunk takes on the disk."""
-        return sum(path.stat().st_size for path in [*self._files(chunk).values(), self._marker(chunk)] if path.exists())
+        for name, data in files.items():
+            path = self._path(name, chunk)
+            if data is None:
+                path.unlink(missing_ok=True)
+                continue
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # what a power cut takes, the checksums tell
+            write_whole(path, data, synced=False)
+        write_whole(self._marker(chunk), strict_json(_sums(files)))
 
     def _marker(self, chunk: int) -> Path:
         return self.folder / _MARKERS / f"{chunk}.json"
 
-    def _array(self, name: str) -> zarr.Array:
-        if name not in self._arrays:
-            found = self._group[name]
-            assert isinstance(found, zarr.Array)  # as it was made  # noqa: S101
-            self._arrays[name] = found
-        return self._arrays[name]
+    def _path(self, name: str, chunk: int) -> Path:
+        return self.folder / STORE / _key(self.plan, name, chunk)
 
-    def _files(self, chunk: int) -> dict[str, Path]:
-        place = self.plan.place(chunk)
-        behind = {variable.name: len(variable.dimensions) for variable in self.plan.recorder.variables}
-        behind[_COMPUTED] = 0
-        return {
-            name: self.folder.joinpath(STORE, name, "c", *map(str, place + (0,) * count))
-            for name, count in behind.items()
-        }
-
-    def _sums(self, chunk: int) -> dict[str, str | None]:
-        """Return the checksums of a chunk's files; None where there is none, all of it being the fill value."""
-        sums = {}
-        for name, path in self._files(chunk).items():
+    def _there(self, chunk: int) -> ChunkFiles:
+        """Return the files of a chunk as they lie on the disk."""
+        files: ChunkFiles = {}
+        for name in _names(self.plan):
             try:
-                sums[name] = hashlib.sha256(path.read_bytes()).hexdigest()
+                files[name] = self._path(name, chunk).read_bytes()
             except FileNotFoundError:
-                sums[name] = None
-        return sums
+                files[name] = None
+        return files
+
+
+def _names(plan: SweepPlan) -> list[str]:
+    return [*(variable.name for variable in plan.recorder.variables), _COMPUTED]
+
+
+def _key(plan: SweepPlan, name: str, chunk: int) -> str:
+    """Return where in a Zarr store the chunk of a variable lies."""
+    behind = {variable.name: len(variable.dimensions) for variable in plan.recorder.variables}
+    return "/".join([name, "c", *map(str, plan.place(chunk) + (0,) * behind.get(name, 0))])
+
+
+def _sums(files: ChunkFiles) -> dict[str, str | None]:
+    return {name: None if data is None else hashlib.sha256(data).hexdigest() for name, data in files.items()}
+
+
+class ChunkEncoder:
+    """Makes files of results, as Zarr would write them: a worker does, so that writing is all that is left."""
+
+    def __init__(self, plan: SweepPlan):
+        """Take a plan."""
+        self.plan = plan
+        self._files: dict[str, Any] = {}
+        self._arrays = _make(zarr.open_group(MemoryStore(self._files), mode="w", zarr_format=3), plan)
+
+    def compute(self, chunk: int) -> ChunkFiles:
+        """Return the files of a chunk."""
+        region = self.plan.region(chunk)
+        results = self.plan.compute(chunk) | {_COMPUTED: True}
+        files: ChunkFiles = {}
+        for name in _names(self.plan):
+            self._arrays[name][(*region, ...)] = results[name]
+            data = self._files.pop(_key(self.plan, name, chunk), None)
+            files[name] = None if data is None else data.to_bytes()
+        return files
+
+
+def compute_chunk(text: str, chunk: int) -> ChunkFiles:
+    """Return the files of a chunk, for a process that knows nothing but the input.
+
+    Args:
+        text: `SweepPlan.given` as JSON.
+        chunk: its number.
+
+    Raises:
+        RuntimeError: if this process would compute otherwise than the one that asks.
+    """
+    return _known_encoder(text).compute(chunk)
+
+
+@lru_cache(maxsize=4)
+def _known_encoder(text: str) -> ChunkEncoder:
+    return ChunkEncoder(plan_of_worker(text))
 
 
 def open_store(folder: Path, plan: SweepPlan, *, coordinates: bool = True) -> SweepStore:
@@ -128,17 +172,17 @@ def open_store(folder: Path, plan: SweepPlan, *, coordinates: bool = True) -> Sw
         # beside its place first: it is there whole or not at all
         fresh = folder / f".{STORE}.part"
         shutil.rmtree(fresh, ignore_errors=True)
-        _make(fresh, plan, coordinates=coordinates)
+        _make_whole(fresh, plan, coordinates=coordinates)
         shutil.rmtree(folder / _MARKERS, ignore_errors=True)
         shutil.rmtree(folder / STORE, ignore_errors=True)
         fresh.rename(folder / STORE)
     (folder / _MARKERS).mkdir(exist_ok=True)
-    for unfinished in (*(folder / STORE).rglob("*.partial"), *(folder / _MARKERS).glob(".*.part")):
+    for unfinished in (*(folder / STORE).rglob(".*.part"), *(folder / _MARKERS).glob(".*.part")):
         unfinished.unlink()
     return SweepStore(folder, plan)
 
 
-def _make(path: Path, plan: SweepPlan, *, coordinates: bool) -> None:
+def _make_whole(path: Path, plan: SweepPlan, *, coordinates: bool) -> None:
     group = zarr.open_group(str(path), mode="w", zarr_format=3)
     group.attrs.update(
         {
@@ -157,31 +201,28 @@ def _make(path: Path, plan: SweepPlan, *, coordinates: bool) -> None:
                 array[first:end] = values(first, end)
     for name, values in plan.recorder.extra.items():
         _coordinate(group, name, name, {}, len(values))[:] = np.asarray(values)
-    dimensions = tuple(axis.dimension for axis in plan.axes)
-    for variable in plan.recorder.variables:
-        extra = tuple(len(plan.recorder.extra[name]) for name in variable.dimensions)
-        group.create_array(
-            variable.name,
-            shape=plan.shape + extra,
-            chunks=plan.block + extra,
-            dtype=variable.dtype,
-            fill_value=math.nan if variable.dtype == "float64" else 0,
-            dimension_names=dimensions + variable.dimensions,
-            attributes={**variable.attributes(), "coordinates": _others(plan)},
-        )
-    group.create_array(
-        _COMPUTED,
-        shape=plan.shape,
-        chunks=plan.block,
-        dtype="bool",
-        fill_value=False,
-        dimension_names=dimensions,
-        attributes={"long_name": "this point has been computed", "coordinates": _others(plan)},
-    )
+    _make(group, plan)
     with warnings.catch_warnings():
         # that xarray opens the store by one file is worth a part of the format that is not settled yet
         warnings.simplefilter("ignore")
         zarr.consolidate_metadata(str(path))
+
+
+def _make(group: zarr.Group, plan: SweepPlan) -> dict[str, zarr.Array]:
+    """Make the arrays of what is recorded."""
+    arrays = {}
+    for variable in (*plan.recorder.variables, Variable(_COMPUTED, "this point has been computed", "bool")):
+        extra = tuple(len(plan.recorder.extra[name]) for name in variable.dimensions)
+        arrays[variable.name] = group.create_array(
+            variable.name,
+            shape=plan.shape + extra,
+            chunks=plan.block + extra,
+            dtype=variable.dtype,
+            fill_value=_FILLS.get(variable.dtype, 0),
+            dimension_names=tuple(axis.dimension for axis in plan.axes) + variable.dimensions,
+            attributes={**variable.attributes(), "coordinates": _others(plan)},
+        )
+    return arrays
 
 
 def _others(plan: SweepPlan) -> str:

@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 import json
+import math
 import os
 import tempfile
 import time
@@ -14,10 +15,11 @@ import numpy as np
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import require_float64
+from afm_jax.dynamics.iteration import available_cores
 from afm_jax.scenefile.scenefile import Start, scene_tables
-from afm_jax.sweeps.plan import Columns, SweepPlan, compute_chunk, plan_of
+from afm_jax.sweeps.plan import SweepPlan, plan_of
 from afm_jax.sweeps.scenes import SCENE_BUILDER
-from afm_jax.sweeps.store import STORE, Kept, locked, open_store
+from afm_jax.sweeps.store import STORE, ChunkEncoder, ChunkFiles, Kept, compute_chunk, locked, open_store
 
 if TYPE_CHECKING:
     import xarray
@@ -25,6 +27,8 @@ if TYPE_CHECKING:
 
 _IN_FLIGHT = 2
 """Chunks handed out for every worker: it has the next one when it has done one."""
+_SECONDS_BETWEEN_LOOKS = 1.0
+"""At how many workers there are."""
 _RETRIES = 3
 _SECONDS_TO_ANSWER, _SECONDS_TO_START = 30, 600
 """Of a scheduler, and of its first worker, which may wait in a queue."""
@@ -137,8 +141,8 @@ def run_plan(
             missing = [chunk for chunk in range(plan.chunks) if chunk not in kept.done]
             # the last chunks of axes may be smaller, which only a guess of the time left would notice
             share = plan.points / plan.chunks
-            for chunk, results in computing(plan, missing, workers=workers, scheduler=scheduler):
-                store.write(chunk, results)
+            for chunk, files in computing(plan, missing, workers=workers, scheduler=scheduler):
+                store.write(chunk, files)
                 computed += 1
                 passed = time.monotonic() - begin
                 if computed == 1:
@@ -156,20 +160,21 @@ def run_plan(
 
 def computing(
     plan: SweepPlan, chunks: Sequence[int], *, workers: int, scheduler: str | None
-) -> Iterator[tuple[int, Columns]]:
-    """Give chunks with their results, in any order."""
+) -> Iterator[tuple[int, ChunkFiles]]:
+    """Give chunks with their files, in any order."""
     if not chunks:
         return
     if workers <= 1 and scheduler is None:
+        encoder = ChunkEncoder(plan)
         for chunk in chunks:
-            yield chunk, plan.compute(chunk)
+            yield chunk, encoder.compute(chunk)
         return
     with _client(min(workers, len(chunks)), scheduler) as client:
         yield from _handed_out(client, plan, chunks)
 
 
-def _handed_out(client: "Client", plan: SweepPlan, chunks: Iterable[int]) -> Iterator[tuple[int, Columns]]:
-    """Give chunks with their results as workers have done them; no more are under way than keep them busy."""
+def _handed_out(client: "Client", plan: SweepPlan, chunks: Iterable[int]) -> Iterator[tuple[int, ChunkFiles]]:
+    """Give chunks with their files as workers have done them; no more are under way than keep them busy."""
     from distributed import KilledWorker, as_completed  # noqa: PLC0415
 
     text = json.dumps(plan.given)
@@ -181,10 +186,14 @@ def _handed_out(client: "Client", plan: SweepPlan, chunks: Iterable[int]) -> Ite
 
     numbers: dict[str, int] = {}
     under_way = as_completed()
+    threads, asked = 0, -math.inf
 
     def fill() -> None:
-        # workers may come and go
-        for chunk in itertools.islice(waiting, max(_IN_FLIGHT * _threads(client) - len(numbers), 1)):
+        nonlocal threads, asked
+        # workers may come and go; to ask takes as long as to write a chunk
+        if time.monotonic() - asked > _SECONDS_BETWEEN_LOOKS:
+            threads, asked = _threads(client), time.monotonic()
+        for chunk in itertools.islice(waiting, max(_IN_FLIGHT * threads - len(numbers), 1)):
             future = submit(chunk)
             numbers[future.key] = chunk
             under_way.add(future)
@@ -192,12 +201,12 @@ def _handed_out(client: "Client", plan: SweepPlan, chunks: Iterable[int]) -> Ite
     fill()
     for future in under_way:
         try:
-            results = future.result()
+            files = future.result()
         except KilledWorker as error:
             raise RuntimeError(
                 f"chunk {numbers[future.key]} has killed every worker that was given it (out of memory?)"
             ) from error
-        yield numbers.pop(future.key), results
+        yield numbers.pop(future.key), files
         fill()
 
 
@@ -228,22 +237,32 @@ def _client(workers: int, scheduler: str | None) -> "Iterator[Client]":
 
 
 @contextlib.contextmanager
-def local_cluster(workers: int) -> "Iterator[Any]":
-    """Give a Dask cluster of processes of this machine, spawned, each with one device and without a dashboard."""
+def local_cluster(workers: int, *, cores_each: int | None = None) -> "Iterator[Any]":
+    """Give a Dask cluster of processes of this machine, spawned, each with one device.
+
+    Args:
+        workers: how many.
+        cores_each: cores that XLA uses in each; None: its share of this machine's.
+    """
     import logging  # noqa: PLC0415
 
     from dask import config  # noqa: PLC0415
     from distributed import LocalCluster  # noqa: PLC0415
 
     flags = os.environ.get("XLA_FLAGS", "").split()
+    cores = cores_each or max(available_cores() // workers, 1)
     settings: dict[str, Any] = {
         "n_workers": workers,
         "threads_per_worker": 1,
         "processes": True,
         "memory_limit": None,
-        "dashboard_address": None,
+        "dashboard_address": ":0",
         "silence_logs": logging.CRITICAL,
-        "env": {"XLA_FLAGS": " ".join(flag for flag in flags if "host_platform_device_count" not in flag)},
+        "env": {
+            "XLA_FLAGS": " ".join(flag for flag in flags if "host_platform_device_count" not in flag),
+            # of XLA's threads: its flags do not reach them
+            "NPROC": str(cores),
+        },
     }
     with (
         tempfile.TemporaryDirectory() as scratch,
@@ -279,18 +298,18 @@ def estimate(plan: SweepPlan) -> Estimate:
     """Return what a plan would take, measured on one chunk from its middle, twice: the first time compiles."""
     middle = plan.chunks // 2
     sampled = int(np.prod([part.stop - part.start for part in plan.region(middle)]))
-    first = plan.compute(middle)
-    begin, rounds = time.perf_counter(), 0
-    while rounds == 0 or time.perf_counter() - begin < _TRIALS_S:
-        plan.compute((middle + rounds) % plan.chunks)
-        rounds += 1
-    seconds = (time.perf_counter() - begin) / (rounds * sampled)
-    with tempfile.TemporaryDirectory() as folder:
-        store = open_store(Path(folder), plan, coordinates=False)
-        store.write(middle, first)
-        size = store.size_of(middle)
-        rest = sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file()) - size
-    rest += sum(8 * axis.size * len(axis.columns) for axis in plan.axes)
+    encoder = ChunkEncoder(plan)
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        store = open_store(folder, plan, coordinates=False)
+        empty = _bytes_in(folder)
+        store.write(middle, encoder.compute(middle))
+        size = _bytes_in(folder) - empty
+        begin, rounds = time.perf_counter(), 0
+        while rounds == 0 or time.perf_counter() - begin < _TRIALS_S:
+            store.write(middle, encoder.compute((middle + rounds) % plan.chunks))
+            rounds += 1
+        seconds = (time.perf_counter() - begin) / (rounds * sampled)
     return Estimate(
         points=plan.points,
         chunks=plan.chunks,
@@ -298,9 +317,13 @@ def estimate(plan: SweepPlan) -> Estimate:
         sampled_points=rounds * sampled,
         seconds_a_point=seconds,
         seconds=seconds * plan.points,
-        disk_bytes=size * plan.points / sampled + rest,
+        disk_bytes=size * plan.points / sampled + empty + sum(8 * axis.size * len(axis.columns) for axis in plan.axes),
         memory_bytes=peak_memory(),
     )
+
+
+def _bytes_in(folder: Path) -> int:
+    return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file())
 
 
 def peak_memory() -> int:

@@ -8,6 +8,7 @@ from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import digamma
 
 from afm_jax.checks import require_float64
+from afm_jax.least_squares import chi2_tail
 from afm_jax.version import version_of
 from fitting.calibration.model import TERMS, SweepFit, fit_sweep, kind_of, model_at, refit, sum_without_resonance
 from fitting.calibration.result import Alternative, CalibratedValue, Calibration, Curves
@@ -23,7 +24,6 @@ from fitting.calibration.verdict import (
     runs_excess,
 )
 from fitting.fits.intervals import Interval, profile_intervals
-from fitting.fits.least_squares import chi2_tail
 from fitting.tables.csv_text import TableError
 
 _PACKAGES = ("afm-jax", "jax", "optax", "numpy")

@@ -33,10 +33,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Complex, Float
 
+from afm_jax.least_squares import whole_covariance_of
 from fitting.calibration.result import PointErrors
 from fitting.calibration.sweep import ResonanceSweep
 from fitting.fits.intervals import Convergence, check_minimum
-from fitting.fits.least_squares import whole_covariance_of
 from fitting.fits.objective import BATCH, PLAIN, Objective, lowest, polish
 from fitting.forward import Linearised, Prediction
 from fitting.models import Problem

@@ -15,6 +15,8 @@ from matplotlib.figure import Figure
 from afm_jax.plots.picture_style import ACCENT, DARK, GRID, label_axes, new_figure
 from afm_jax.words import bullets, interval, known, text_table, value_alone, with_error
 from fitting.calibration.result import CalibratedValue, Calibration
+from fitting.calibration.stiffness import Stiffness
+from fitting.instruments.curve import MeasuredCurve
 
 POINT_COLUMNS = (
     "line",
@@ -191,6 +193,24 @@ def calibration_figure(result: Calibration) -> Figure:
     title += f"  (background '{result.background}')"
     title = title.replace("+-", "±")
     figure.suptitle(title if result.valid else f"NOT VALID    {title}", color="black" if result.valid else _INVALID)
+    return figure
+
+
+def slope_figure(curves: list[MeasuredCurve], found: Stiffness) -> Figure:
+    """Return the figure of force curves, the sensitivity found as a straight line through the end of each."""
+    figure = new_figure(7.0, 4.6)
+    axes = figure.subplots()
+    for curve in curves:
+        volts = np.asarray(curve.deflection)
+        for branch in dict.fromkeys(curve.branch.tolist()):
+            here = curve.branch == branch
+            axes.plot(curve.offset_nm[here], volts[here], "-", lw=0.7, color=DARK)
+        last = int(np.argmax(curve.offset_nm))
+        reach = 0.5 * np.ptp(volts) * found.value.value
+        height = curve.offset_nm[last] + np.array([-reach, 0.0])
+        axes.plot(height, volts[last] + np.array([-reach, 0.0]) / found.value.value, "--", lw=1.4, color=ACCENT)
+    label_axes(axes, x="height of the sample (nm)", y="deflection (V)")
+    axes.set_title(f"{value_in_words(found.value)} nm/V".replace("+-", "±"))
     return figure
 
 

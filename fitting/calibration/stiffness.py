@@ -29,6 +29,7 @@ _SADER_FACTOR = 0.1906
 _95 = 1.959964
 AIR_K = (296.0, 3.0)
 """Temperature of lever and air where none is given."""
+_SIZES = "; --length-um and --width-um give k by Sader's method, which needs no such scale"
 _REAL = (
     (0.91324, -0.48274, 0.46842, -0.12886, 0.044055, -0.0035117, 0.00069085),
     (1.0, -0.56964, 0.48690, -0.13444, 0.045155, -0.0035862, 0.00069085),
@@ -201,17 +202,18 @@ def _slope(curve: MeasuredCurve, branch: str) -> tuple[float, float] | None:
     return (float(slope), float(np.sqrt(covariance[0, 0]))) if slope > 0.0 else None
 
 
-def budget(calibration: Calibration, found: list[Stiffness]) -> list[dict[str, Any]]:
+def budget(calibration: Calibration | None, found: list[Stiffness]) -> list[dict[str, Any]]:
     """Return what each calibrated number is worth: shares of the energy of a tap and of the law's parameters.
 
     On resonance the energy of a tap is pi k A (A0 sin(phi) - A)/Q: in proportion to k and to 1/Q, to first order
     independent of the frequency, and quadratic in the scale of the amplitude, which k from equipartition of the same
     deflection cancels. epsilon = 2 E/m has no k in it (m = k/omega^2 goes with it), and 1 - r^2 = 2 E/(m u^2) no scale.
     """
-    rows = [
-        _worth("quality_factor", calibration.quality_factor, (1.0, 1.0, 1.0), "the air's share of the loss"),
-        _worth("frequency_khz", calibration.frequency_khz, (0.0, 0.0, 0.0), "first order vanishes on resonance"),
-    ]
+    rows = []
+    if calibration is not None:
+        air, drive = "the air's share of the loss", "first order vanishes on resonance"
+        rows.append(_worth("quality_factor", calibration.quality_factor, (1.0, 1.0, 1.0), air))
+        rows.append(_worth("frequency_khz", calibration.frequency_khz, (0.0, 0.0, 0.0), drive))
     for one in found:
         if one.method == "slope":
             worth, why = (2.0, 2.0, 0.0), "lengths squared; cancels with k from equipartition"
@@ -231,40 +233,51 @@ def _worth(name: str, value: CalibratedValue, times: tuple[float, ...], why: str
     return {"quantity": name, "share": share, **worth, "why": why}
 
 
-def disagreement(found: list[Stiffness]) -> str | None:
-    """Return what two spring constants that differ say about the scale of the deflection; None if they agree."""
-    by_method = {one.method: one.value for one in found}
-    if not {"equipartition", "Sader"} <= set(by_method):
+def disagreement(found: list[Stiffness], stated_n_per_m: float | None = None) -> str | None:
+    """Return what a spring constant by equipartition says about the scale of the deflection; None if all agree.
+
+    Args:
+        found: spring constants of one lever.
+        stated_n_per_m: what the instrument says, looked at where Sader's method was not used.
+    """
+    values = {one.method: one.value for one in found}
+    if "equipartition" not in values:
         return None
-    thermal, damped = by_method["equipartition"], by_method["Sader"]
-    apart = np.log(thermal.value / damped.value)
-    shares = [(one.standard_error or 0.0) / one.value for one in (thermal, damped)]
-    if abs(apart) < 1.96 * np.sqrt(shares[0] ** 2 + shares[1] ** 2 + 0.05**2):
+    thermal, damped = values["equipartition"], values.get("Sader")
+    wanted, share, condition, advice = stated_n_per_m, 0.1, "the instrument is right", _SIZES
+    other = "the instrument"
+    if damped is not None:
+        wanted, share = damped.value, float(np.hypot((damped.standard_error or 0.0) / damped.value, 0.05))
+        other, condition, advice = "Sader's method", "the lever's size is right", ""
+    if wanted is None:
         return None
-    scale = float(np.exp(-0.5 * apart))
+    apart = float(np.log(thermal.value / wanted))
+    if abs(apart) < 1.96 * np.hypot((thermal.standard_error or 0.0) / thermal.value, share):
+        return None
     return (
-        f"Equipartition gives {thermal.value:.3g} N/m, Sader's method {damped.value:.3g}: if the lever's size is "
-        f"right, the deflection's nm are {scale:.3g} times the true ones (its sensitivity was not calibrated)."
+        f"Equipartition gives {thermal.value:.3g} N/m, {other} {wanted:.3g}: if {condition}, the deflection's nm are "
+        f"{np.exp(-0.5 * apart):.3g} times the true ones (its sensitivity was not calibrated){advice}."
     )
 
 
-def stiffness_lines(calibration: Calibration, found: list[Stiffness]) -> list[str]:
+def stiffness_lines(calibration: Calibration | None, found: list[Stiffness]) -> list[str]:
     """Return spring constants, sensitivity and budget as lines of text."""
-    lines, stated = [], calibration.sweep.instrument.get("spring_constant_n_per_m")
+    stated = None if calibration is None else calibration.sweep.instrument.get("spring_constant_n_per_m")
+    lines = []
     for one in found:
-        unit = "nm/V" if one.method == "slope" else "N/m"
+        name, unit = ("deflection_nm_per_volt", "nm/V") if one.method == "slope" else (one.method, "N/m")
         low, high = one.value.interval95
         shown = interval(low or 0.0, high or 0.0)
-        lines.append(f"{one.method}: {with_error(one.value.value, one.value.standard_error)} {unit} (95 % {shown})")
+        lines.append(f"{name}: {with_error(one.value.value, one.value.standard_error)} {unit} (95 % {shown})")
         lines += [f"  - {text}" for text in one.assumed]
-        if stated is not None and unit == "N/m":
+        if stated is not None:
             lines.append(
                 f"  The instrument says {stated:g} N/m: this {100.0 * (one.value.value / stated - 1.0):+.1f} %."
             )
-    note = disagreement(found)
+    note = disagreement(found, stated)
     if note is not None:
         lines += ["", note]
-    else:
+    if calibration is not None and (note is None or found[-1].method == "Sader"):
         line = f"# spring_constant_n_per_m = {with_error(found[-1].value.value, found[-1].value.standard_error)}"
         lines += ["", "For the top of a table:", line]
     keys = ("share", *WORTH)
@@ -277,5 +290,5 @@ def stiffness_lines(calibration: Calibration, found: list[Stiffness]) -> list[st
 def stiffness_payload(calibration: Calibration, found: list[Stiffness]) -> dict[str, Any]:
     """Return spring constants and budget as plain lists, numbers and strings."""
     named = {one.method.lower(): asdict(one.value) | {"assumed": list(one.assumed)} for one in found}
-    stated = {"spring_constant_n_per_m": named, "budget": budget(calibration, found), "note": disagreement(found)}
-    return plain(stated)
+    note = disagreement(found, calibration.sweep.instrument.get("spring_constant_n_per_m"))
+    return plain({"spring_constant_n_per_m": named, "budget": budget(calibration, found), "note": note})

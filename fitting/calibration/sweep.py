@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from afm_jax.results import public_result
-from fitting.instruments.formats import read_recording
+from fitting.instruments.formats import holds_curves, read_recording
 from fitting.instruments.recording import UNITS, Recording
 from fitting.tables.csv_text import (
     NUMBER,
@@ -43,9 +43,8 @@ from fitting.tables.csv_text import (
     named_rows,
     parse_cells,
     parse_rows,
-    parse_setting,
     read_text,
-    setting_in,
+    settings_in,
     split_lines,
 )
 
@@ -98,9 +97,7 @@ def parse_csv(text: str, faults: Faults) -> ParsedSweep:
         TableError: at once where the column names are wrong: the cells below them cannot be judged.
     """
     comments, rows = split_lines(text)
-    settings = [setting_in(remark, SPECTRUM_SETTINGS) for _, remark in comments]
-    made = [(s, line, remark) for s, (line, remark) in zip(settings, comments, strict=True) if s is not None]
-    averages = [(parse_setting(s, remark, line=line, faults=faults) or (None,))[0] for s, line, remark in made]
+    settings, _ = settings_in(comments, SPECTRUM_SETTINGS, faults)
     check_not_empty(comments, rows, faults)
     head, rows = named_rows(rows, SWEEP, faults)
     faults.raise_any()
@@ -114,7 +111,7 @@ def parse_csv(text: str, faults: Faults) -> ParsedSweep:
         unit = DENSITY
     attributes = {column.says: columns[column.name] for column in SWEEP.columns if column.name in columns}
     remarks = tuple(remark for _, remark in comments)
-    return ParsedSweep(attributes, lines, unit, remarks=remarks, averages=averages[0] if averages else None)
+    return ParsedSweep(attributes, lines, unit, remarks=remarks, averages=settings.get("averages", (None,))[0])
 
 
 MARK = "[DATA]"
@@ -294,8 +291,14 @@ def read_sweep(path: str | Path) -> ResonanceSweep:
     """
     faults = Faults(str(path))
     with contextlib.suppress(OSError), Path(path).open("rb") as file:
-        if file.read(9) == b"[DataSet]":
+        head = file.read(4096)
+        if head.startswith(b"[DataSet]"):
             return _spectrum_of(read_recording(path))
+        if holds_curves(head, str(path)):
+            raise TableError(
+                f"{path}: holds curves against height, no resonance sweep; --slope reads the sensitivity off force "
+                "curves, `afm-jax tapping` the energy of a tap off amplitude and phase"
+            )
     text = read_text(path)
     parse = parse_nanonis if any(line.strip() == MARK for line in text.split("\n")) else parse_csv
     parsed = parse(text, faults)

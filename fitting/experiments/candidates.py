@@ -9,9 +9,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
+from afm_jax.least_squares import covariance_of
 from fitting.experiments.belief import Belief, size_of
 from fitting.fits.fit import speed_range
-from fitting.fits.least_squares import covariance_of
 from fitting.fits.minimum import padding, strain_of
 from fitting.fits.objective import BATCH, Objective
 from fitting.fits.unmodelled import Unmodelled, rows_of_fit, step_of

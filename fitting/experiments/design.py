@@ -14,11 +14,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from afm_jax.checks import require_float64
+from afm_jax.least_squares import covariance_of
 from afm_jax.version import version_of
 from fitting.experiments.belief import Belief, belief_of_fit, size_of
 from fitting.experiments.candidates import AMPLITUDES, LEFT_OUT, PHASE_NOISE_DEG, Candidates, candidates_of, forecast
 from fitting.experiments.result import Design
-from fitting.fits.least_squares import covariance_of
 from fitting.fits.result import FitResult
 from fitting.parameters import DELAY_NAMES, NUISANCE_NAMES
 from fitting.simulated.experiment import Drives

@@ -17,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 from afm_jax.checks import require_float64
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.lasting_impact import LawImpact, PulledImpact
+from afm_jax.least_squares import chi2_tail
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.version import version_of
 from fitting.fits.intervals import (
@@ -28,7 +29,6 @@ from fitting.fits.intervals import (
     profile_intervals,
     within_range,
 )
-from fitting.fits.least_squares import chi2_tail
 from fitting.fits.loss import Loss, energy_lost, equivalent, interval_of
 from fitting.fits.minimum import (
     ATTRACTED,

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from afm_jax.least_squares import Box, Searches, covariance_of, descended
 from afm_jax.units import TWO_SIDED_95
-from fitting.fits.least_squares import Box, Searches, covariance_of, descended
 from fitting.fits.objective import PLAIN, Objective
 from fitting.models import coordinate_of
 from fitting.parameters import Parameter, is_of_one_table

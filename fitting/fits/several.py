@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from afm_jax.least_squares import chi2_tail, covariance_of
 from fitting.fits.intervals import CHI2_95
-from fitting.fits.least_squares import chi2_tail, covariance_of
 from fitting.fits.unmodelled import StepSystem
 
 _LEAST_SHARE = 1e-9

@@ -20,7 +20,7 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fitting.fits.least_squares import covariance_of
+from afm_jax.least_squares import covariance_of
 from fitting.fits.minimum import Strain, padding
 from fitting.fits.objective import ROBUST, Objective
 from fitting.fits.result import PlainLaw

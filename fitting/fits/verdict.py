@@ -11,8 +11,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
+from afm_jax.least_squares import chi2_tail
 from fitting.fits.intervals import Convergence
-from fitting.fits.least_squares import chi2_tail
 from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.result import FittedParameter, FittedRows
 from fitting.parameters import DELAY_NAMES, SHAPE_NAMES, name_of_table, parameter_called

@@ -74,6 +74,11 @@ def _parser_of(data: bytes, path: str) -> Callable[[bytes, str], Recording]:
     return parse_nanonis_text if re.search(rb"^\[DATA\]\s*$", data, re.MULTILINE) else parse_separated
 
 
+def holds_curves(head: bytes, path: str) -> bool:
+    """Say whether a file that begins so is of a format that holds nothing but curves against height."""
+    return _parser_of(head, path) in {parse_igor, parse_wsxm, parse_gwyddion, parse_neasnom}
+
+
 def text_of(data: bytes, name: str) -> str:
     """Return the text of a file, UTF-8 or Latin-1, with every line end as a newline.
 

@@ -19,7 +19,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.impact.amplitude import FlightEnds, lockin, peak_amplitude
 from afm_jax.impact.lasting_impact import gained_and_longer, indentation, middle_of_contact
-from fitting.fits.least_squares import Box, Searches, descended
+from afm_jax.least_squares import Box, Searches, descended
 
 _HALF_SINE = 0.42441318157838753
 """4/(3 pi): lock-in amplitude of half sines at their own frequency, over their height."""

@@ -76,8 +76,8 @@ def invert(
         raise ValueError(f"`frequency_error_khz` must be positive, but is {frequency_error_khz!r}")
     if table.tapping:
         raise TableError(
-            f"{table.source}: the {table.drive} is driven here, not the sample: there is no law-free reading of such "
-            "rows; fit a law (`afm-jax fit`)"
+            f"{table.source}: the {'cantilever' if table.drive == 'base' else 'tip'} is driven here, not the sample; "
+            "`afm-jax tapping` reads energy and impact speeds off such rows without a law, `afm-jax fit` fits a law"
         )
     frequency_error_khz = table.free_frequency_error_khz if frequency_error_khz is None else frequency_error_khz
     with_phase = _with_phase(table)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from fitting.fits.least_squares import chi2_tail
+from afm_jax.least_squares import chi2_tail
 from fitting.inversion.result import (
     Coefficient,
     ComparedLaw,

@@ -17,9 +17,9 @@ from jaxtyping import Bool, Float, Int
 
 from afm_jax.checks import require_float64
 from afm_jax.contact.parameters import EFFECTS
+from afm_jax.least_squares import Box, Searches, descended, distance, whole_covariance_of
 from afm_jax.results import public_result
 from fitting.fits.intervals import at_bound, covariance
-from fitting.fits.least_squares import Box, Searches, descended, distance, whole_covariance_of
 from fitting.fits.objective import PLAIN, ROBUST, Objective, soft_square
 from fitting.fits.result import FitResult
 from fitting.models import ROWS_PER_PROGRAM, Problem, measurement_of

@@ -5,8 +5,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.special import kve
-from scipy.stats import genhyperbolic
 
 from fitting.fits.objective import PLAIN, ROBUST, Objective, soft_square
 from fitting.fits.result import FitResult
@@ -128,6 +126,8 @@ def densities(
         log_uniform: as the posterior's.
         shift: what other readings add to the residuals, the same of all sets or of each.
     """
+    from scipy.special import kve  # noqa: PLC0415 (most fits need no SciPy)
+
     found: Linearised = plain(objective).at_values(values)
     rows, predicted = objective.measurement.rows, np.asarray(found.prediction.amplitude_nm)
     residual = np.asarray(found.residual) + shift
@@ -151,6 +151,8 @@ def noise_of(objective: Objective, sets: int, random: np.random.Generator) -> Fl
     shape: Any = (sets, *used.shape)
     standard = random.normal(size=shape)
     if objective.robust:
+        from scipy.stats import genhyperbolic  # noqa: PLC0415 (most fits need no SciPy)
+
         # e^(-s^2 sqrt(1 + x^2/s^2)), with s the softness
         standard = genhyperbolic(1.0, ROBUST**2, 0.0, scale=ROBUST).rvs(size=shape, random_state=random)
     return np.where(used, np.asarray(rows.error_nm), 0.0) * standard

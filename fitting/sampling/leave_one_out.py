@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import logsumexp
 
 _LEAST_TAIL = 5
 _PRIOR_DRAWS, _PRIOR_SHAPE = 10, 0.5
@@ -46,8 +45,8 @@ def leave_one_out(log_likelihood: Float[np.ndarray, "draws rows"], efficiency: f
     draws, count = log_likelihood.shape
     smoothed = [pareto_smoothed(-column, efficiency) for column in log_likelihood.T]
     weight = np.stack([each for each, _ in smoothed], axis=1)
-    elpd = np.asarray(logsumexp(weight + log_likelihood, axis=0))
-    seen = np.asarray(logsumexp(log_likelihood, axis=0)) - np.log(draws)
+    elpd = np.asarray(np.logaddexp.reduce(weight + log_likelihood, axis=0))
+    seen = np.asarray(np.logaddexp.reduce(log_likelihood, axis=0)) - np.log(draws)
     return LeaveOneOut(
         elpd=float(elpd.sum()),
         elpd_error=float(np.sqrt(count * elpd.var())),
@@ -83,7 +82,7 @@ def pareto_smoothed(
         shape, size = _fitted_tail(excess)
         if np.isfinite(shape):
             log_weight[tail] = np.minimum(np.log(_quantiles(tail.size, shape, size) + np.exp(cut)), 0.0)
-    return log_weight - logsumexp(log_weight), float(shape)
+    return log_weight - np.logaddexp.reduce(log_weight), float(shape)
 
 
 def _fitted_tail(excess: Float[np.ndarray, " n"]) -> tuple[float, float]:
@@ -94,7 +93,7 @@ def _fitted_tail(excess: Float[np.ndarray, " n"]) -> tuple[float, float]:
     b += 1.0 / excess[-1]
     shape = np.mean(np.log1p(-b[:, None] * excess), axis=1)
     likelihood = count * (np.log(-b / shape) - shape - 1.0)
-    weight = np.exp(likelihood - logsumexp(likelihood))
+    weight = np.exp(likelihood - np.logaddexp.reduce(likelihood))
     middle = float(np.sum(b * weight) / np.sum(weight))
     found = float(np.mean(np.log1p(-middle * excess)))
     shrunk = (count * found + _PRIOR_DRAWS * _PRIOR_SHAPE) / (count + _PRIOR_DRAWS)

@@ -10,8 +10,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.integrate import trapezoid
-from scipy.interpolate import PchipInterpolator
 
 from afm_jax.units import TWO_SIDED_95
 from fitting.fits.objective import Objective
@@ -112,7 +110,7 @@ def grid_posterior(refit: Refit, log_uniform: tuple[str, ...] = ()) -> Posterior
     _require_proper(weight, points, own, density)
     mean, deviation, interval = {}, {}, {}
     for k, name in enumerate(own):
-        marginal = weight if len(own) == 1 else trapezoid(weight, points[1 - k], axis=1 - k)
+        marginal = weight if len(own) == 1 else np.trapezoid(weight, points[1 - k], axis=1 - k)
         mean[name], deviation[name], interval[name] = _summary(points[k], marginal)
     for k, name in enumerate(refit.objective.problem.names[len(own) :]):
         middle = _integral(weight * nuisance_mean[..., k], points)
@@ -266,8 +264,10 @@ def _require_proper(weight, points, own: tuple[str, ...], density: _Density) -> 
 
 def _summary(points: Float[np.ndarray, " n"], marginal: Float[np.ndarray, " n"]):
     """Return mean, standard deviation and equal-tailed 95 % interval of a tabulated density."""
-    mean = float(trapezoid(points * marginal, points))
-    deviation = float(np.sqrt(trapezoid((points - mean) ** 2 * marginal, points)))
+    from scipy.interpolate import PchipInterpolator  # noqa: PLC0415 (most fits need no SciPy)
+
+    mean = float(np.trapezoid(points * marginal, points))
+    deviation = float(np.sqrt(np.trapezoid((points - mean) ** 2 * marginal, points)))
     fine = np.linspace(points[0], points[-1], _FINE)
     rising: Callable[[np.ndarray], np.ndarray] = PchipInterpolator(points, marginal).antiderivative()
     cumulated = rising(fine)
@@ -277,7 +277,7 @@ def _summary(points: Float[np.ndarray, " n"], marginal: Float[np.ndarray, " n"])
 
 def _integral(weight: Float[np.ndarray, "..."], points: tuple[Float[np.ndarray, "..."], ...]) -> float:
     for axis in reversed(points):
-        weight = trapezoid(weight, axis, axis=-1)
+        weight = np.trapezoid(weight, axis, axis=-1)
     return float(weight)
 
 

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.stats import binom
 
 from afm_jax.results import public_result
 from fitting.fits.result import FitResult
@@ -172,6 +171,8 @@ def _complaints(
     influence: Influence,
     lines: Int[np.ndarray, " rows"],
 ) -> list[str]:
+    from scipy.stats import binom  # noqa: PLC0415 (most fits need no SciPy)
+
     said = []
     inside, readings = bands.inside(0, 4)
     if binom.cdf(inside, readings, 0.95) < _TOO_FEW:

@@ -318,7 +318,7 @@ def setting_in(text: str, settings: Settings) -> FileSetting | None:
     return settings.get(_SHORT_NAMES.get(match["key"].lower()) or nearest_name(match["key"], settings) or "")
 
 
-def parse_setting(setting: FileSetting, text: str, *, line: int, faults: Faults) -> tuple[float, float | None] | None:
+def _parse_setting(setting: FileSetting, text: str, *, line: int, faults: Faults) -> tuple[float, float | None] | None:
     """Return the value and its error of a comment that makes a setting, or None after noting a fault.
 
     Of a word it is its place among the choices.
@@ -349,6 +349,31 @@ def parse_setting(setting: FileSetting, text: str, *, line: int, faults: Faults)
         faults.add(f"{key} {fault}", line=line)
         return None
     return float(cells[0]), float(cells[1]) if len(cells) > 1 else None
+
+
+def settings_in(
+    comments: NumberedLines, settings: Settings, faults: Faults
+) -> tuple[dict[str, tuple[float, float | None]], tuple[str, ...]]:
+    """Return value and error of the settings that comments make (NaN where it is at fault), and the other comments.
+
+    Args:
+        comments: line number and text (without the number sign, stripped) of each.
+        settings: those there are.
+        faults: where a misspelt key, a value that is no number and a repeated key are noted.
+    """
+    found: dict[str, tuple[float, float | None]] = {}
+    seen: dict[str, int] = {}
+    remarks = []
+    for line, text in comments:
+        setting = setting_in(text, settings)
+        if setting is None:
+            remarks.append(text)
+        elif setting.key in seen:
+            faults.add(f"{setting.key} was given in line {seen[setting.key]} already; remove one of the two", line=line)
+        else:
+            seen[setting.key] = line
+            found[setting.key] = _parse_setting(setting, text, line=line, faults=faults) or (float("nan"), None)
+    return found, tuple(remarks)
 
 
 def _fault_in_cells(setting: FileSetting, cells: list[str]) -> str | None:

@@ -60,11 +60,11 @@ from fitting.tables.csv_text import (
     fault_in_number,
     named_rows,
     parse_rows,
-    parse_setting,
     printable,
     quoted,
     read_text,
     setting_in,
+    settings_in,
     split_lines,
 )
 
@@ -112,19 +112,8 @@ def parse_comments(comments: list[tuple[int, str]], faults: Faults) -> Header:
         comments: line number and text (without the number sign, stripped) of each.
         faults: where the faults are noted; with any, the result is not to be used.
     """
-    numbers: dict[str, tuple[float, float | None]] = {}
-    seen: dict[str, int] = {}
-    remarks: list[str] = []
-    for line, text in comments:
-        setting = setting_in(text, SETTINGS)
-        if setting is None:
-            remarks.append(text)
-        elif setting.key in seen:
-            faults.add(f"{setting.key} was given in line {seen[setting.key]} already; remove one of the two", line=line)
-        else:
-            seen[setting.key] = line
-            numbers[setting.key] = parse_setting(setting, text, line=line, faults=faults) or (float("nan"), None)
-    if "free_frequency_khz" not in seen:
+    numbers, remarks = settings_in(comments, SETTINGS, faults)
+    if "free_frequency_khz" not in numbers:
         example = SETTINGS["free_frequency_khz"].line
         faults.add(f"the free frequency is missing; add a line such as '{example}' above the column names")
     drive, _ = numbers.get("drive", (0.0, None))
@@ -141,7 +130,7 @@ def parse_comments(comments: list[tuple[int, str]], faults: Faults) -> Header:
         spring_constant_n_per_m=spring,
         spring_constant_error_n_per_m=spring_error,
         calibration={key: (numbers[key][0], numbers[key][1] or 0.0) for key in CALIBRATION if key in numbers},
-        remarks=tuple(remarks),
+        remarks=remarks,
     )
 
 
@@ -201,7 +190,6 @@ TAPPING = _form(
     "belongs to a sample that is driven; with '# drive = force' or '# drive = base' the columns are "
     + ", ".join(column.name for column in _TAPPING),
 )
-COLUMN_NAMES = TABLE.names
 FORMS = {drive: TABLE if drive == "sample" else TAPPING for drive in DRIVES}
 """The columns of a table by what is driven."""
 _ALL = tuple({column.name: column for column in (*_SAMPLE, *_TAPPING)}.values())

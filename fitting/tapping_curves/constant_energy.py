@@ -12,8 +12,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.optimize import least_squares
-from scipy.stats import chi2 as chi2_distribution
 
+from afm_jax.least_squares import chi2_tail
 from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, Rows, TappingCurve, free_lag_deg
 from fitting.tapping_curves.energy import energies, noise_of
 
@@ -91,7 +91,7 @@ class ConstantEnergy:
         """Probability of a larger chi2 if each group has one energy."""
         if self.degrees_of_freedom < 1:
             return float("nan")
-        return float(chi2_distribution.sf(self.chi2, self.degrees_of_freedom))
+        return chi2_tail(self.chi2, self.degrees_of_freedom)
 
 
 class _Unknowns(NamedTuple):

@@ -40,10 +40,9 @@ from fitting.tables.csv_text import (
     fault_in_number,
     named_rows,
     parse_rows,
-    parse_setting,
     quoted,
     read_text,
-    setting_in,
+    settings_in,
     split_lines,
 )
 from fitting.tables.table import LOWEST_QUALITY_FACTOR
@@ -102,19 +101,9 @@ def settings_of_comments(comments: list[tuple[int, str]], faults: Faults) -> tup
         comments: line number and text (without the number sign, stripped) of each.
         faults: where a misspelt key, a value that is no number and a repeated key are noted.
     """
-    found: dict[str, float] = {}
-    remarks = []
-    for line, text in comments:
-        setting = setting_in(text, SETTINGS)
-        if setting is None:
-            remarks.append(text)
-        elif setting.key in found:
-            faults.add(f"{setting.key} is given a second time; remove one of the two", line=line)
-        else:
-            numbers = parse_setting(setting, text, line=line, faults=faults) or ()
-            names = (setting.key, f"{setting.key}_error")
-            found |= {name: number for name, number in zip(names, numbers, strict=False) if number is not None}
-    return found, tuple(remarks)
+    found, remarks = settings_in(comments, SETTINGS, faults)
+    errors = {f"{key}_error": error for key, (_, error) in found.items() if error is not None}
+    return {key: value for key, (value, _) in found.items()} | errors, remarks
 
 
 def settings_of_attributes(attributes: Mapping[str, Any], faults: Faults) -> dict[str, float]:

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-_FIRST_DAMPING, _LARGEST_DAMPING = 1e-6, 1e8
+_SMALLEST_DAMPING, _FIRST_DAMPING, _LARGEST_DAMPING = 1e-12, 1e-6, 1e8
 
 
 class Searches(NamedTuple):
@@ -65,14 +65,15 @@ def descended(look: Look, start: Searches, box: Box, *, settled: float, most: in
         better = found.chi2 <= some.chi2
         for leaf, new in zip(state, found, strict=True):
             leaf[active[better]] = new[better]
-        damping[active] = np.where(better, 0.1 * damping[active], np.maximum(30.0 * damping[active], 1e-3))
+        less = np.maximum(0.1 * damping[active], _SMALLEST_DAMPING)
+        damping[active] = np.where(better, less, np.maximum(30.0 * damping[active], 1e-3))
     return state
 
 
 def distance(state: Searches, box: Box) -> Float[np.ndarray, " sets"]:
     """Return the estimated distance of the sum of squares to its minimum, g H^-1 g, H = J^T J; NaN where not finite."""
     gradient = np.einsum("snp,sn->sp", state.jacobian, state.residual) * ~_held(state, box)
-    step = _step(state, box, np.full(len(state.chi2), 1e-12))
+    step = _step(state, box, np.full(len(state.chi2), _SMALLEST_DAMPING))
     return -np.einsum("sp,sp->s", gradient, step)
 
 
