@@ -1,5 +1,6 @@
-"""Taps of a tip on a bent lever against the driven contact of the tests' own integrator."""
+"""Taps of a tip on a bent lever against the tests' own integrator, and against full simulations."""
 
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -9,12 +10,15 @@ import pytest
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.surface import detected
 from afm_jax.contact.bent_lever import tapped
 from afm_jax.contact.contact import Contact
 from afm_jax.impact.closure import OrbitProblem
-from afm_jax.impact.orbits import orbit_state, steady_orbits
+from afm_jax.impact.orbits import steady_orbits
+from fitting import read_table
 from tests.reference_contact_forces import ContactParameters
 from tests.reference_driven_contact import DrivenContact, follow
+from tests.tapping_truths import MASS_NG, tapping_truth
 
 LEVER = Cantilever(90.0, 200.0, 16.81)
 OMEGA = 2e-3 * np.pi * 90.0
@@ -48,20 +52,32 @@ def test_taps_are_collisions_of_the_undriven_lever():
     assert seen == {0, 1}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(("ratio", "share"), [(1.0, 0.6), (1.0, 0.9), (1.03, 0.5)])
-def test_orbits_of_taps_repeat_in_the_driven_contact(ratio: float, share: float):
-    """In the free tip's frame the sample moves by the free amplitude; from an orbit the tip comes back to it."""
-    impact = tapped(Contact.paper(**MIXED), LEVER, jnp.array([4.0, 30.0]))
-    offset, free = -share * 80.0, 80.0
-    problem = OrbitProblem(LEVER, Platform(free, 90.0 * ratio, offset + impact.plane_nm), impact, jnp.ones(()))
+@jax.jit
+def read_of(impact, cantilever, free_nm, frequency_khz, offset_nm):
+    """Return amplitude and lag of the fastest steady orbit, and whether there is one."""
+    platform = Platform(free_nm, frequency_khz, offset_nm + impact.plane_nm)
+    problem = OrbitProblem(cantilever, platform, impact, jnp.ones(()))
     orbits = steady_orbits(problem)
-    assert np.any(orbits.steady)
-    moved = system(MIXED, amplitude_nm=free, drive_frequency_khz=90.0 * ratio, offset_nm=offset, quality_factor=200.0)
-    for slot in np.flatnonzero(orbits.steady):
-        flight = orbit_state(jax.tree.map(lambda part, slot=slot: part[slot], orbits.place), problem).flight
-        start, period = float(flight.start_us), 1e3 / (90.0 * ratio)
-        position, velocity = float(flight.start_position), float(flight.start_velocity)
-        course = follow(moved, start, position, velocity, until_us=start + period)
-        assert course.position_nm == pytest.approx(position, abs=0.02)
-        assert course.velocity_nm_per_us == pytest.approx(velocity, abs=0.02)
+    slot = jnp.argmax(jnp.where(orbits.steady, orbits.place.coordinate, -jnp.inf))
+    _, size, phase = orbits.amplitude_nm[slot]
+    ratio = frequency_khz / cantilever.frequency_khz
+    read = detected(size, phase, free_nm, ratio, cantilever.quality_factor, base=False)
+    return jnp.stack(read), orbits.steady[slot]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["tapping_712_0_1_8.csv", "tapping_712_0_1.03_12.csv"])
+def test_taps_are_read_as_full_simulations_are(name: str):
+    """On resonance and 3 % above it; the full scene in time, followed until it repeats."""
+    truth, table = tapping_truth(0), read_table(Path(__file__).parent / "tapping_tables" / name)
+    cantilever = Cantilever(90.0, truth.quality_factor, MASS_NG)
+    impact = tapped(Contact.paper(**truth.parameters), cantilever, jnp.array([1.0, 30.0]))
+    # nearer the sample taps are slow and last a quarter of the period
+    near = -table.offset_nm > 0.35 * table.excitation_nm
+    assert np.count_nonzero(near) >= 12
+    for row in np.flatnonzero(near):
+        drive = (table.excitation_nm[row], table.drive_frequency_khz[row], table.offset_nm[row])
+        (amplitude, lag), steady = read_of(impact, cantilever, *map(jnp.asarray, drive))
+        assert steady
+        assert amplitude == pytest.approx(table.lockin_amplitude_nm[row], rel=1e-4)
+        assert (lag - table.phase_lag_deg[row] + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=0.006)

@@ -77,9 +77,9 @@ class Evidence:
     contact_share: float = 0.0
     """Largest share of a drive's period that the tip is in contact."""
     refused: bool = False
+    """Hardly a row is left that a law of impacts can be read off."""
     tapped: bool = False
     """Whether a contact's own taps were fitted, not a law."""
-    """Hardly a row is left that a law of impacts can be read off."""
     pulls: tuple[float, ...] = ()
     """Of several tables, the probability that each one's law is that of the others."""
     scattering: bool = False
