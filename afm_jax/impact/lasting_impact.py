@@ -349,12 +349,13 @@ _NOWHERE_US = 1e3
 
 
 def polynomials(place: Float[Array, "..."], count: int) -> Float[Array, "... count"]:
-    """Return Chebyshev's polynomials at places in [-1, 1]: in few operations, for the program is large enough."""
-    return jnp.cos(jnp.arange(count, dtype=place.dtype) * jnp.arccos(jnp.clip(place, -_END, _END))[..., None])
-
-
-_END = 1.0 - 1e-12
-"""Where their derivatives are still finite."""
+    """Return Chebyshev's polynomials at places, held in [-1, 1]: T_(k+j) = 2 T_k T_j - T_(k-j) doubles them."""
+    place = jnp.clip(place, -1.0, 1.0)
+    found = jnp.stack([jnp.ones_like(place), place], axis=-1)
+    while found.shape[-1] < count:
+        last = found[..., -1:]
+        found = jnp.concatenate([found, 2.0 * last * found[..., 1:] - found[..., -2::-1]], axis=-1)
+    return found[..., :count]
 
 
 class Tap(NamedTuple):
