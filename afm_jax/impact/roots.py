@@ -27,6 +27,7 @@ from afm_jax.impact.closure import (
     instantaneous_quartic,
     place_of,
 )
+from afm_jax.impact.lasting_impact import PulledImpact
 
 _MAX_STEPS = 200  # Laguerre's method needs about 5; bisection alone over the widest interval about 100
 _SETTLED = 1e-12  # the last relative step; it has been cubed by then
@@ -242,7 +243,11 @@ def _brief(coordinate: Float[Array, ""], problem: OrbitProblem) -> Bool[Array, "
 
     One that lasts must end within half a drive period, and the tip have lost its energy by then.
     """
-    speeds, period = problem.impact.speeds(coordinate), problem.platform.period_us
+    period = problem.platform.period_us
+    if isinstance(problem.impact, PulledImpact):
+        # a bent lever pulls the tip out of the bridge
+        return jnp.abs(closure(coordinate, problem).speeds.delay) < 0.5 * period
+    speeds = problem.impact.speeds(coordinate)
     if not problem.impact.lasts:
         return jnp.abs(speeds.delay) < period
     return (jnp.abs(speeds.delay) < 0.5 * period) & (problem.impact.length / speeds.rebound < _LEAVING * period)

@@ -391,12 +391,16 @@ def _strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
     capture = float(tips.capture_speed) if tips.lowest > 0.0 else 0.0
     share = 2.0 * np.pi * np.asarray(rows.drive_frequency_khz) * 1e-3 * float(tips.length) / np.maximum(rebound, 1e-6)
     tapping, free = objective.problem.tapping, np.asarray(rows.free)
+    if objective.problem.pulled:
+        # a bent lever pulls slow tips out of the bridge: its taps are known down to the slowest
+        capture = 0.0
     slow = (share > LONGEST) | (approach < (_CRAWLING if tapping else NEAREST) * capture)
     slow = np.where(exists, slow, _lost_slowly(objective, exists, _CRAWLING * capture))
     reasons = np.where(slow, TOO_SLOW, "").astype(object)
     if tapping:
         pulled = np.asarray(prediction.pull_nm_per_us2)[0] * tips.hertz_time
-        reasons[exists & (pulled > _PULLED * approach)] = TOO_PULLED
+        if not objective.problem.pulled:
+            reasons[exists & (pulled > _PULLED * approach)] = TOO_PULLED
         reasons[_irregular(objective, exists)] = IRREGULAR
         reasons[free] = ""
     near = np.minimum(1.5 * capture / np.maximum(approach, 1e-6), 1.5 / NEAREST)
@@ -438,7 +442,7 @@ def untabulated(
     objective: Objective, values: Float[np.ndarray, " p"], approach: Float[np.ndarray, " rows"]
 ) -> Bool[np.ndarray, " rows"]:
     """Say at which approach speeds the table of a contact misses its accuracy; nowhere for a law, nor at NaN."""
-    if objective.problem.model != "contact":
+    if objective.problem.model != "contact" or objective.problem.pulled:
         return np.zeros(approach.shape, dtype=bool)
     from afm_jax.contact.law_of_contact import DELAY_ERROR_US, SPEED_ERROR  # noqa: PLC0415  # for contacts alone
 

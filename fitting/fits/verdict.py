@@ -42,7 +42,12 @@ _LONG_CONTACT = 0.2
 """Share of the drive's period in contact from which a misfit is laid to it: the corrections are fitted up to there."""
 _REFUSED = (
     "No law of impacts can be read off this curve: on nearly all of its rows impacts are too slow, or the lever's own "
-    "pull turns the tip round; drive 3 to 10 % above resonance, with a large free amplitude."
+    "pull turns the tip round; drive 3 to 10 % above resonance, with a large free amplitude, or fit the contact's own "
+    "parameters (--model contact), which needs no law."
+)
+_NO_TAPS = (
+    "The contact's taps explain hardly a row of this curve: it has no steady tap a period there; fix what "
+    "is known of it (--fix tip_radius_nm=20, for example), or leave out rows that are not one impact a period."
 )
 ASSUMED_ERROR_OF_Q = 0.02
 """Relative standard error of a quality factor that is given without one."""
@@ -73,15 +78,22 @@ class Evidence:
     """Largest share of a drive's period that the tip is in contact."""
     refused: bool = False
     """Hardly a row is left that a law of impacts can be read off."""
+    tapped: bool = False
+    """Whether a contact's own taps were fitted, not a law."""
     pulls: tuple[float, ...] = ()
     """Of several tables, the probability that each one's law is that of the others."""
     scattering: bool = False
     """Laws were allowed to differ from table to table."""
 
+    @property
+    def refusal(self) -> str:
+        """Why hardly a row is one that the model can be read off."""
+        return _NO_TAPS if self.tapped else _REFUSED
+
 
 def judge_fit(evidence: Evidence) -> tuple[list[str], list[str]]:
     """Return what makes a fit invalid, and its warnings; each a sentence."""
-    return [_REFUSED] if evidence.refused else _reasons(evidence), _warnings(evidence)
+    return [evidence.refusal] if evidence.refused else _reasons(evidence), _warnings(evidence)
 
 
 def _reasons(evidence: Evidence) -> list[str]:
@@ -161,7 +173,7 @@ def misfits(evidence: Evidence) -> list[str]:
     The parameters' errors and intervals are not looked at.
     """
     if evidence.refused:
-        return [_REFUSED]
+        return [evidence.refusal]
     found = []
     if evidence.p_value < IMPROBABLE:
         found.append(f"chi2/dof = {evidence.chi2 / evidence.freedom:.3g} (probability {evidence.p_value:.1g})")
