@@ -420,8 +420,12 @@ def filled_up(
         problem, filled = measurement.joint.problem, measurement.joint.values(filled)
         measurement, points = measurement.of_drive(problem.drive), filled[:, 0]
     # an impact knows no rows: one program for tables of every size
-    rows = jax.tree.map(lambda column: np.asarray(column)[:0], measurement.rows)
-    return filled, jax.tree.map(np.asarray, impacts_of(points, measurement._replace(rows=rows), problem))
+    rowless = measurement._replace(rows=jax.tree.map(lambda column: np.asarray(column)[:0], measurement.rows))
+    # a table of taps takes long, and a fit mostly asks for one: each by itself
+    parts = [points[i : i + 1] for i in range(len(values))] if problem.pulled else [points]
+    found = [jax.tree.map(np.asarray, impacts_of(part, rowless, problem)) for part in parts]
+    found += [found[-1]] * (BATCH - sum(len(part) for part in parts))
+    return filled, jax.tree.map(lambda *leaves: np.concatenate(leaves), *found) if found[1:] else found[0]
 
 
 def impact_at(values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem) -> _Impacts:
@@ -528,8 +532,11 @@ def _impact_and_slopes(values: Float[Array, " p"], measurement: Measurement, pro
     def turned(e):
         return jax.jvp(lambda v: impact_of(v, measurement, problem), (values,), (e,))
 
-    # The derivatives by a nuisance are zeros: not worth another program.
-    return impact_of(values, measurement, problem), jax.vmap(lambda e: turned(e)[1])(jnp.eye(values.shape[0]))
+    own = jax.vmap(lambda e: turned(e)[1])(jnp.eye(len(problem.own), values.shape[0]))
+    # those by a nuisance, of which the others come after the model's own, are zeros
+    nothing = values.shape[0] - len(problem.own)
+    slopes = jax.tree.map(lambda leaf: jnp.pad(leaf, [(0, nothing), *[(0, 0)] * (leaf.ndim - 1)]), own)
+    return impact_of(values, measurement, problem), slopes
 
 
 def _prediction(

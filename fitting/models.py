@@ -58,6 +58,13 @@ def _unbounded(parameter: Parameter, coordinate: Numbers) -> Numbers:
     return np.exp(coordinate)
 
 
+def left_open(parameter: Parameter, value: float) -> float:
+    """Return the standard error of a value of which nothing is known but its range."""
+    even = parameter.sign or parameter.width
+    reach = parameter.highest - parameter.lowest if even else value * np.log(parameter.highest / parameter.lowest)
+    return float(reach / np.sqrt(12.0))
+
+
 @dataclass(frozen=True)
 class Problem:
     """What is fitted: the model's parameters, then nuisances; which effects a contact has, and what is driven."""
@@ -129,6 +136,18 @@ class Problem:
             known.get("free_frequency_khz", measured.frequency_khz),
             known.get("quality_factor", measured.quality_factor),
             measured.mass_ng,
+        )
+
+    def known_by_range(self, values: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+        """Return the inverse variances of values of which nothing is known but their range; 0 of what needs data.
+
+        Parameters of a contact under a bent lever may stay open: its law does not hang on each of them.
+        """
+        return np.array(
+            [
+                left_open(parameter, value) ** -2.0 if self.pulled and name in self.own else 0.0
+                for name, parameter, value in zip(self.names, self.parameters, values, strict=True)
+            ]
         )
 
     def nuisance(self, values: Float[Array, " p"], name: str, neutral: float) -> Float[Array, ""]:

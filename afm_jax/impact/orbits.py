@@ -32,7 +32,7 @@ from afm_jax.impact.implicit import implicit_pair, implicit_root
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
 from afm_jax.impact.lasting_impact import Impact, LawImpact, PulledImpact, crawls, indentation, middle_of_contact
 from afm_jax.impact.law import Speeds, impact_law_of
-from afm_jax.impact.roots import COARSE, find_roots
+from afm_jax.impact.roots import COARSE, TAPPED, find_roots
 from afm_jax.outcomes import Outcome
 from afm_jax.results import public_result
 from afm_jax.units import within_turn
@@ -308,7 +308,7 @@ def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
     A delayed closing condition is scanned coarsely: orbits close to each other or to capture may be missed.
     """
     problem = lax.stop_gradient(problem)
-    roots = find_roots(problem, COARSE)
+    roots = find_roots(problem, TAPPED if isinstance(problem.impact, PulledImpact) else COARSE)
 
     def one(place, found):
         state = orbit_state(place, problem)

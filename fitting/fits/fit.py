@@ -21,6 +21,7 @@ from afm_jax.least_squares import chi2_tail
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.version import version_of
 from fitting.fits.intervals import (
+    END_OF_RANGE,
     Convergence,
     Interval,
     at_bound,
@@ -511,20 +512,26 @@ class _Summary:
         if isinstance(intervals, str):
             intervals = [Interval(None, None, intervals)] * len(errors)
         free = np.append(self.free, np.ones(len(errors) - len(self.free), dtype=bool))
+        open_ = np.array([self._is_open(name, one) for name, one in zip(self.names, intervals, strict=True)])
         return {
             name: FittedParameter(
                 value=float(self.ends[i]),
                 unit=parameter_called(name).unit,
-                standard_error=float(errors[i]) if free[i] and np.isfinite(errors[i]) else None,
+                standard_error=float(errors[i]) if free[i] and not open_[i] and np.isfinite(errors[i]) else None,
                 interval95=(intervals[i].low, intervals[i].high),
                 interval_reason=intervals[i].reason,
-                undetermined=not np.isfinite(self.spread[i, i]),
+                undetermined=bool(open_[i]) or not np.isfinite(self.spread[i, i]),
                 at_bound=not bool(free[i]),
-                did_not_move=not bool(moved[i]) and name not in self.constraints,
+                did_not_move=not (moved[i] or open_[i] or name in self.constraints),
                 constraint=self.constraints.get(name),
             )
             for i, name in enumerate(self.names)
         }
+
+    def _is_open(self, name: str, interval: Interval) -> bool:
+        """Say whether a parameter of a contact under a bent lever may be anything within its range."""
+        searched = (interval.reason or "").count(END_OF_RANGE) == 2
+        return self.problem.pulled and name in self.problem.own and searched
 
     def _rows(self) -> FittedRows:
         count = self.table.rows

@@ -20,6 +20,8 @@ _OUTER_STEPS = 30
 _INNER_STEPS = 25
 _SETTLED = 1e-6
 """Estimated distance of chi2 to its minimum over the others at which these have arrived."""
+END_OF_RANGE = "reaches the end of its range"
+"""Why an interval is open."""
 _FARTHEST = 100.0
 """Distance in standard errors at which a search gives up: the data do not determine the parameter on that side."""
 _LOST = 1e3
@@ -119,7 +121,7 @@ def _advance(objective: Objective, sides: list[_Side], values, errors, chi2: flo
                 side.inside_root = root
             side.inside, side.others = max(side.inside, distance), coordinates
             if target == end:
-                side.reason = f"reaches the end of its range, {end:g}"
+                side.reason = f"{END_OF_RANGE}, {end:g}"
             elif distance >= _FARTHEST:
                 side.reason = "the data set no limit on this side"
         else:
@@ -210,7 +212,7 @@ def within_range(parameter: Parameter, interval: Interval) -> Interval:
         end = ends[i]
         if end is not None and beyond * (end - last) > 0.0:
             ends[i] = None
-            reasons.append(f"{name} end: reaches the end of its range, {last:g}")
+            reasons.append(f"{name} end: {END_OF_RANGE}, {last:g}")
     return Interval(ends[0], ends[1], "; ".join(reasons) or None)
 
 
@@ -261,15 +263,21 @@ def covariance(
 
     A parameter at its bound is held there; its own variance is the one it would have if it were free.
     """
-    jacobian = np.asarray(objective.at_values(values[None]).jacobian)[0]
-    full = covariance_of(jacobian.T @ jacobian)
+    fisher = _fisher(objective, values)
+    full = covariance_of(fisher)
     if free.all():
         return full
     result = np.zeros_like(full)
-    result[np.ix_(free, free)] = covariance_of(jacobian[:, free].T @ jacobian[:, free])
+    result[np.ix_(free, free)] = covariance_of(fisher[np.ix_(free, free)])
     held = np.flatnonzero(~free)
     result[held, held] = full[held, held]
     return result
+
+
+def _fisher(objective: Objective, values: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p p"]:
+    """Return the Fisher matrix of the parameters' values, with what ranges say where data may leave them open."""
+    jacobian = np.asarray(objective.at_values(values[None]).jacobian)[0]
+    return jacobian.T @ jacobian + np.diag(objective.problem.known_by_range(values))
 
 
 def check_minimum(
@@ -287,7 +295,9 @@ def check_minimum(
     if count == 0:
         return Convergence(outward, 0.0, [], 0.0, outward)
     _, jacobian = objective.linearise(coordinates[None])
-    fisher = jacobian[0][:, free].T @ jacobian[0][:, free]
+    values, slopes = objective.problem.values_and_slopes(coordinates)
+    known = np.diag((objective.problem.known_by_range(values) * slopes**2)[free])
+    fisher = jacobian[0][:, free].T @ jacobian[0][:, free] + known
     if not np.all(np.isfinite(fisher)):
         return _adrift([], outward=outward, reason="the slopes of the residuals are not finite where the search ended")
     curvature, axes = np.linalg.eigh(fisher)
@@ -301,7 +311,7 @@ def check_minimum(
     hessian = (slope[1 : count + 1] - slope[count + 1 :]) / (2.0 * _STEP)
     if not np.all(np.isfinite(hessian)) or not np.all(np.isfinite(slope[0])):
         return _adrift([], outward=outward, reason="chi2 has no finite curvature where the search ended")
-    hessian = 0.5 * (hessian + hessian.T)
+    hessian = 0.5 * (hessian + hessian.T) + scale.T @ known @ scale
     eigenvalues = np.linalg.eigvalsh(hessian)
     distance = float(slope[0] @ np.linalg.solve(hessian, slope[0])) if eigenvalues[0] > 0 else float("inf")
     converged = bool(eigenvalues[0] > 0 and distance < _ENOUGH and outward)
@@ -321,11 +331,15 @@ def _adrift(eigenvalues: list[float], *, outward: bool, reason: str | None = Non
 
 
 def at_bound(objective: Objective, values: Float[np.ndarray, " p"]) -> Bool[np.ndarray, " p"]:
-    """Say which losses vanish within a hundredth of what the data could resolve."""
-    jacobian = np.asarray(objective.at_values(values[None]).jacobian)[0]
-    resolution = np.sqrt(np.diag(covariance_of(jacobian.T @ jacobian)))
-    ends = [np.inf if p.bound is None else p.bound for p in objective.problem.parameters]
-    return np.abs(values - np.array(ends)) < 0.01 * np.where(np.isfinite(resolution), resolution, 0.0)
+    """Say which losses vanish within a hundredth of what the data could resolve, and what is at an end of its range."""
+    resolution = np.sqrt(np.diag(covariance_of(_fisher(objective, values))))
+    resolution = np.where(np.isfinite(resolution), resolution, 0.0)
+    parameters = objective.problem.parameters
+    losses = np.array([np.inf if p.bound is None else p.bound for p in parameters])
+    ends = np.array([(p.lowest, p.highest) for p in parameters]).T
+    # so near that the steps of the Hessian would leave it
+    at_end = np.any(np.abs(values - ends) <= _STEP * resolution, axis=0) & np.isinf(losses)
+    return (np.abs(values - losses) < 0.01 * resolution) | at_end
 
 
 def _pushes_outward(objective: Objective, coordinates, free) -> bool:
@@ -339,5 +353,11 @@ def _pushes_outward(objective: Objective, coordinates, free) -> bool:
     jacobian = np.asarray(result.jacobian)[0]
     slope = jacobian.T @ np.asarray(result.residual)[0]
     little = slope**2 < _ENOUGH * np.sum(jacobian**2, axis=0)
-    inward = np.array([p.sign for p in objective.problem.parameters])
+    values = objective.problem.values(coordinates)
+    inward = np.array(
+        [
+            1.0 if v - p.lowest < p.highest - v else -1.0
+            for v, p in zip(values, objective.problem.parameters, strict=True)
+        ]
+    )
     return bool(np.all(((slope * inward >= 0.0) | little)[~free]))

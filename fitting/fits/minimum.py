@@ -32,7 +32,9 @@ from fitting.parameters import PARAMETERS, Parameter
 
 _GRID_PER_PARAMETER = {1: 96, 2: 16}
 _SPREAD_POINTS = 64
-"""Points of a low-discrepancy sequence, where a grid would have too many."""
+"""Points of a low-discrepancy sequence, where a grid would have too many; half as many of taps, which take long."""
+_FEW_STARTS = 4
+"""Of these, how many are polished of taps."""
 
 
 def starts(problem: Problem, measurement: Measurement) -> Float[np.ndarray, "points p"]:
@@ -52,7 +54,7 @@ def starts(problem: Problem, measurement: Measurement) -> Float[np.ndarray, "poi
         mesh = np.meshgrid(*(started(name, np.linspace(0.0, 1.0, count)) for name in own), indexing="ij")
         columns = {name: axis.ravel() for name, axis in zip(own, mesh, strict=True)}
     else:
-        places = _spread(_SPREAD_POINTS, len(own))
+        places = _spread(_SPREAD_POINTS // (1 + problem.pulled), len(own))
         columns = {name: started(name, place) for name, place in zip(own, places.T, strict=True)}
     count = len(columns[own[0]])
     known = dict(zip(problem.names, np.asarray(measurement.constraint_value).tolist(), strict=True))
@@ -193,8 +195,9 @@ def minimise(objective: Objective) -> Minimum:
     if common is not None:
         return _with_own_nuisances(objective, minimise(common))
     points = starts(objective.problem, objective.measurement)
-    scout = _thinned(objective) if objective.problem.lasting else objective
-    best = np.argsort(scout.screen(points), kind="stable")[:BATCH]
+    pulled = objective.problem.pulled
+    scout = _thinned(objective, ROWS_PER_PROGRAM // (1 + pulled)) if objective.problem.lasting else objective
+    best = np.argsort(scout.screen(points), kind="stable")[: _FEW_STARTS if pulled else BATCH]
     first = objective.problem.coordinates(points[best])
     if not objective.problem.lasting:
         return _polished(objective, polish(scout, first, SOFT, settled=ROUGH).coordinates, points[best])
@@ -258,14 +261,14 @@ def settle(objective: Objective, minimum: Minimum) -> Minimum:
     return minimum
 
 
-def _thinned(objective: Objective) -> Objective:
-    """Return the objective of at most `ROWS_PER_PROGRAM` rows, spread over orders, frequencies and drives."""
+def _thinned(objective: Objective, most: int) -> Objective:
+    """Return the objective of so many rows at most, spread over orders, frequencies and drives."""
     rows = jax.tree.map(np.asarray, objective.measurement.rows)
     seen = np.flatnonzero(rows.measured.any(axis=1) | rows.no_orbit)
-    if seen.size <= ROWS_PER_PROGRAM:
+    if seen.size <= most:
         return objective
     ranked = seen[np.lexsort((rows.drive_amplitude_nm[seen], rows.drive_frequency_khz[seen], rows.order[seen]))]
-    chosen = ranked[np.linspace(0, ranked.size - 1, ROWS_PER_PROGRAM).round().astype(int)]
+    chosen = ranked[np.linspace(0, ranked.size - 1, most).round().astype(int)]
     return objective.of_rows(chosen)
 
 
@@ -318,6 +321,8 @@ BASE, GROWTH, SLOW = 0.0005, 0.012, 0.016
 TAPPED, IN_FRAME = 0.0012, 1e-4
 """Growth of that of a driven tip, and its error in the frame of the free tip, over the amplitude there: what the law's
 parameters do not make up for (full contacts of tips of 12, 20 and 100 nm, 3 and 10 % above resonance)."""
+_OF_TAPS = 7e-4
+"""Error of amplitudes of taps that leaves their phases the 0.005 degrees by which full simulations differ."""
 DELAY_US = 1.5e-4
 """Error of the delay law in us."""
 LONGEST = 1.4
@@ -380,6 +385,8 @@ def strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
 
 def _strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
     """Return the strain of every row of one instrument."""
+    if objective.problem.pulled:
+        return _strain_of_taps(objective, values)
     rows = objective.measurement.rows
     impact = impact_at(values, objective.measurement, objective.problem).impact
     linear = objective.at_values(values[None])
@@ -391,16 +398,12 @@ def _strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
     capture = float(tips.capture_speed) if tips.lowest > 0.0 else 0.0
     share = 2.0 * np.pi * np.asarray(rows.drive_frequency_khz) * 1e-3 * float(tips.length) / np.maximum(rebound, 1e-6)
     tapping, free = objective.problem.tapping, np.asarray(rows.free)
-    if objective.problem.pulled:
-        # a bent lever pulls slow tips out of the bridge: its taps are known down to the slowest
-        capture = 0.0
     slow = (share > LONGEST) | (approach < (_CRAWLING if tapping else NEAREST) * capture)
     slow = np.where(exists, slow, _lost_slowly(objective, exists, _CRAWLING * capture))
     reasons = np.where(slow, TOO_SLOW, "").astype(object)
     if tapping:
         pulled = np.asarray(prediction.pull_nm_per_us2)[0] * tips.hertz_time
-        if not objective.problem.pulled:
-            reasons[exists & (pulled > _PULLED * approach)] = TOO_PULLED
+        reasons[exists & (pulled > _PULLED * approach)] = TOO_PULLED
         reasons[_irregular(objective, exists)] = IRREGULAR
         reasons[free] = ""
     near = np.minimum(1.5 * capture / np.maximum(approach, 1e-6), 1.5 / NEAREST)
@@ -413,6 +416,15 @@ def _strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
     if tapping:
         error, slow_error = (np.where(free, 0.0, part) for part in (error, slow_error))
     return Strain(error, slow_error, reasons)
+
+
+def _strain_of_taps(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
+    """Return the strain of the rows of a contact under a bent lever, which pulls the slowest tips out of the bridge."""
+    rows = objective.measurement.rows
+    exists = np.asarray(objective.at_values(values[None]).prediction.orbits)[0] > 0
+    reasons = np.where(_irregular(objective, exists) & ~np.asarray(rows.free), IRREGULAR, "").astype(object)
+    error = np.where(rows.free, 0.0, _OF_TAPS + np.where(exists, _frame_error(rows), 0.0))
+    return Strain(error, error, reasons)
 
 
 def _frame_error(rows: Rows) -> Float[np.ndarray, " rows"]:

@@ -15,7 +15,7 @@ from afm_jax.least_squares import chi2_tail
 from fitting.fits.intervals import Convergence
 from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.result import FittedParameter, FittedRows
-from fitting.parameters import DELAY_NAMES, SHAPE_NAMES, name_of_table, parameter_called
+from fitting.parameters import DELAY_NAMES, SHAPE_NAMES, is_nuisance, name_of_table, parameter_called
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable
 
@@ -51,6 +51,7 @@ _NO_TAPS = (
 )
 ASSUMED_ERROR_OF_Q = 0.02
 """Relative standard error of a quality factor that is given without one."""
+_AT_BOUND = 0.005
 _PULLED, _TORN = 2.0, 3.0
 """Distance from what is known of a quantity, in its standard errors, from which it is named, and not believed."""
 
@@ -99,7 +100,7 @@ def judge_fit(evidence: Evidence) -> tuple[list[str], list[str]]:
 def _reasons(evidence: Evidence) -> list[str]:
     reasons = []
     convergence = evidence.convergence
-    undetermined = [name for name, parameter in evidence.parameters.items() if parameter.undetermined]
+    undetermined = [] if _may_stay_open(evidence) else _undetermined(evidence)
     if convergence.reason is not None:
         reasons.append(f"Not converged: {convergence.reason}.")
     elif undetermined:
@@ -129,12 +130,22 @@ def _reasons(evidence: Evidence) -> list[str]:
     if evidence.freedom <= 0:
         reasons.append("As many parameters as amplitudes: the goodness of fit cannot be judged.")
     # a tapping curve tells those of the delay only together; the law does not hang on each
-    together = DELAY_NAMES if evidence.table.tapping else ()
+    together = (*(DELAY_NAMES if evidence.table.tapping else ()), *_undetermined(evidence))
     for name in (name for name in evidence.parameters if name not in together):
         parameter = evidence.parameters[name]
         if parameter.interval95 == (None, None) and not misfit and not undetermined:
             reasons.append(f"{name} is not identified: {parameter.interval_reason}; {helpful_measurement(name)}.")
     return reasons
+
+
+def _undetermined(evidence: Evidence) -> list[str]:
+    return [name for name, parameter in evidence.parameters.items() if parameter.undetermined]
+
+
+def _may_stay_open(evidence: Evidence) -> bool:
+    """Say whether what is not determined need not be: of a contact's taps, unless nothing is."""
+    own = [name for name in evidence.parameters if not is_nuisance(name)]
+    return evidence.tapped and any(not evidence.parameters[name].undetermined for name in own)
 
 
 def _different_laws(evidence: Evidence) -> list[str]:
@@ -321,6 +332,11 @@ def _unexplained_tables(evidence: Evidence) -> str:
     return "".join(words for _, words in sorted(named, reverse=True))
 
 
+def value_at_bound(value: float) -> str:
+    """Return the value of a parameter at its bound in words: that of a loss is 0 or 1, not 3e-15."""
+    return f"{value:z.0f}" if abs(value - round(value)) < _AT_BOUND else f"{value:.4g}"
+
+
 def helpful_measurement(name: str) -> str:
     """Return what to measure, or to say, so that a parameter gets determined."""
     return (
@@ -385,6 +401,13 @@ def _damping_warning(table: AmplitudeTable, along: FittedParameter | None) -> st
 def _parameter_warnings(evidence: Evidence) -> list[str]:
     warnings = []
     explained = not misfits(evidence)
+    undetermined = _undetermined(evidence)
+    if explained and undetermined and _may_stay_open(evidence):
+        advice = "; ".join(dict.fromkeys(helpful_measurement(name) for name in undetermined))
+        warnings.append(
+            f"Not determined by these taps: {' and '.join(undetermined)}, anything within their ranges explains them, "
+            f"and the law's band takes that in; {advice}."
+        )
     for name, pull in _pulls(evidence).items():
         if _PULLED < abs(pull) <= _TORN:
             warnings.append(f"{_pull_in_words(evidence, name, pull)}: check it, the loss hangs on it.")
@@ -394,7 +417,7 @@ def _parameter_warnings(evidence: Evidence) -> list[str]:
         if parameter.at_bound and explained:
             limit = f"< {high:.4g}" if high is not None else f"> {low:.6g}" if low is not None else None
             reading = f": read it as a limit, {name} {limit} (95 %)" if limit else ""
-            warnings.append(f"{name} is at its bound, {parameter.value:z.0f}{reading}.")
+            warnings.append(f"{name} is at its bound, {value_at_bound(parameter.value)}{reading}.")
         if parameter.did_not_move:
             warnings.append(f"{name} did not move from the grid point it started at.")
     if evidence.other_minimum is not None:
