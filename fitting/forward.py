@@ -163,8 +163,9 @@ def branch_near(coordinate: Any) -> Branch:
 
 BATCH = 8
 """Sets of parameters that `linearise` takes at once."""
-SEARCHED, SOLVED = 128, 1024
-"""Pairs of a set and a row that one program takes: where impacts last, and where each takes a hundredth of that."""
+TAPPED, SEARCHED, SOLVED = 32, 128, 1024
+"""Pairs of a set and a row that one program takes: of taps, where impacts last, and where each takes a hundredth of
+that."""
 CENSORED = 3.0
 """Residual of a row where no orbit was seen and the model has a steady one: e^(-9/2), a probability of 1 %."""
 
@@ -270,7 +271,7 @@ def warm_up(values: Float[np.ndarray, " p"], measurement: Measurement, problem: 
 
 
 def _lanes(problem: Problem) -> int:
-    return SEARCHED if problem.lasting else SOLVED
+    return TAPPED if problem.pulled else SEARCHED if problem.lasting else SOLVED
 
 
 def _in_every_lane(

@@ -446,11 +446,19 @@ class PulledImpact(eqx.Module):
             change = middle.change + 0.5 * middle.twist * tap.spread
             return 2.0 * (change * tap.area - 2.0 * cantilever.decay_rate * tap.action)
 
-        first = self.tap(approach_speed, middle.acceleration)
-        square = approach_speed**2
-        mean = jnp.maximum(square + 0.5 * gained(first), (0.1 * approach_speed) ** 2)
-        pull, speed = middle.acceleration, jnp.sqrt(mean)
-        tap, slope = jax.jvp(lambda u: self.tap(u, pull), (speed,), (jnp.ones_like(speed),))
+        pull, square = middle.acceleration, approach_speed**2
+
+        def look(_, state):
+            """Return the tap of a speed with its slope, and the speed that it says the mean one is."""
+            speed = state[0]
+            tap, slope = jax.jvp(lambda u: self.tap(u, pull), (speed,), (jnp.ones_like(speed),))
+            mean = jnp.maximum(square + 0.5 * gained(tap), (0.1 * approach_speed) ** 2)
+            return jnp.sqrt(mean), speed, tap, slope
+
+        # a loop, because the program is compiled for every use of it
+        nothing = Tap(Speeds(*(jnp.zeros_like(square),) * 3), *(jnp.zeros_like(square),) * 4)
+        _, speed, tap, slope = lax.fori_loop(0, 2, look, (approach_speed, approach_speed, nothing, nothing))
+        mean = speed**2
         half, steep = 0.5 * tap.speeds.delay, 0.5 * slope.speeds.delay
         longer = -middle.bend * half**3 * (steep / 3.0 - half * (pull * steep - 1.0) / (12.0 * speed))
         longer = jnp.clip(longer, -0.2 * half, 0.2 * half)

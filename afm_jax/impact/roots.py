@@ -231,8 +231,13 @@ def _scale(problem: OrbitProblem) -> Float[Array, ""]:
 def _scanned_roots(problem: OrbitProblem, scan: Scan) -> _Coordinates:
     """Scan the closing condition from just above capture to speeds that no orbit reaches; narrow every bracket."""
     grid = problem.impact.lowest + jnp.asarray(np.geomspace(scan.lowest, scan.highest, scan.points)) * _scale(problem)
-    value = jax.vmap(closing_residual, in_axes=(0, None))(grid, problem)
-    brief = jax.vmap(_brief, in_axes=(0, None))(grid, problem)
+    speeds, system = jax.vmap(closure, in_axes=(0, None))(grid, problem)
+    value = jax.vmap(lambda system: system.residual)(system)
+    if isinstance(problem.impact, PulledImpact):
+        # a bent lever pulls the tip out of the bridge
+        brief = jnp.abs(speeds.delay) < 0.5 * problem.platform.period_us
+    else:
+        brief = jax.vmap(_brief, in_axes=(0, None))(grid, problem)
     crossing = (value[:-1] * value[1:] < 0.0) & brief[:-1] & brief[1:]
     root, found = _narrowed(_crossings(crossing, grid, value, scan), _dips(brief, grid, value, scan), problem)
     order = jnp.argsort(jnp.where(found, root, jnp.inf))[: scan.slots]
@@ -246,9 +251,6 @@ def _brief(coordinate: Float[Array, ""], problem: OrbitProblem) -> Bool[Array, "
     One that lasts must end within half a drive period, and the tip have lost its energy by then.
     """
     period = problem.platform.period_us
-    if isinstance(problem.impact, PulledImpact):
-        # a bent lever pulls the tip out of the bridge
-        return jnp.abs(closure(coordinate, problem).speeds.delay) < 0.5 * period
     speeds = problem.impact.speeds(coordinate)
     if not problem.impact.lasts:
         return jnp.abs(speeds.delay) < period

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Int
 from afm_jax.least_squares import Box, Searches, covariance_of, descended
 from afm_jax.units import TWO_SIDED_95
 from fitting.fits.objective import PLAIN, Objective
-from fitting.models import coordinate_of
-from fitting.parameters import Parameter, is_of_one_table
+from fitting.models import Problem, coordinate_of
+from fitting.parameters import Parameter, is_nuisance, is_of_one_table
 
 CHI2_95 = 3.841458820694124
 """95 % quantile of chi2 with one degree of freedom."""
@@ -47,7 +47,7 @@ class _Side:
 
     index: int
     direction: float
-    others: Float[np.ndarray, " p"]  # places (`_Places`) at `inside`; the profiled one is not used
+    others: Float[np.ndarray, " p"]  # places (`Places`) at `inside`; the profiled one is not used
     along: Float[np.ndarray, " p"]  # how they go on from there, by distance
     inside: float = 0.0  # distance in errors that lies inside the interval
     outside: float = np.inf
@@ -64,7 +64,7 @@ def profile_intervals(
     covariance: Float[np.ndarray, "p p"],
     chi2: float,
 ) -> list[Interval]:
-    """Return the 95 % profile interval of every parameter; Wald's of a nuisance that a table has to itself.
+    """Return the 95 % profile interval of every parameter; Wald's of nuisances of one of several tables, and of taps.
 
     Args:
         objective: chi2 of a table and a model.
@@ -73,12 +73,12 @@ def profile_intervals(
         chi2: at the fitted values.
     """
     errors = np.sqrt(np.diag(covariance))
-    here = _Places(objective).of_values(values)
+    here = Places(objective).of_values(values)
     sides = [
         _Side(index, direction, here, _followers(objective, values, covariance, index, direction))
         for index in range(len(values))
         for direction in (-1.0, 1.0)
-        if np.isfinite(errors[index]) and not is_of_one_table(objective.problem.names[index])
+        if np.isfinite(errors[index]) and not _by_its_error(objective.problem, objective.problem.names[index])
     ]
     for _ in range(_OUTER_STEPS):
         active = [side for side in sides if side.end is None and side.reason is None]
@@ -90,10 +90,15 @@ def profile_intervals(
     # it has a Gaussian constraint, and there are as many as tables
     return [
         within_range(objective.problem.parameters[index], Interval(*ends[index]))
-        if np.isfinite(errors[index]) and is_of_one_table(name)
+        if np.isfinite(errors[index]) and _by_its_error(objective.problem, name)
         else _interval(sides, index)
         for index, name in enumerate(objective.problem.names)
     ]
+
+
+def _by_its_error(problem: Problem, name: str) -> bool:
+    """Say whether a nuisance is one of many, or of taps, each look at which takes long."""
+    return is_of_one_table(name) or (problem.pulled and is_nuisance(name))
 
 
 def _advance(objective: Objective, sides: list[_Side], values, errors, chi2: float) -> None:
@@ -146,7 +151,7 @@ def _followers(objective: Objective, values, covariance, index: int, direction: 
     shift = direction * _FIRST_TRIAL * covariance[:, index] / np.sqrt(variance) if variance > 0.0 else 0.0
     parameters = objective.problem.parameters
     guess = np.clip(values + shift, [p.lowest for p in parameters], [p.highest for p in parameters])
-    places = _Places(objective)
+    places = Places(objective)
     moved = places.of_values(np.where(np.isfinite(guess), guess, values))
     return (moved - places.of_values(values)) / _FIRST_TRIAL
 
@@ -157,7 +162,7 @@ def _target(side: _Side, objective: Objective, values, errors) -> float:
     return float(np.clip(target, parameter.lowest, parameter.highest))
 
 
-class _Places:
+class Places:
     """Where the minimisation over the other parameters moves: a loss by its value, the others by their coordinates.
 
     The coordinate of a loss is a root, in which a loss of 0 never grows again: there its derivative vanishes. By value
@@ -165,20 +170,28 @@ class _Places:
     """
 
     def __init__(self, objective: Objective):
+        """Keep the objective, and the places that bound it."""
         self.objective, parameters = objective, objective.problem.parameters
         self.by_value = np.array([parameter.sign != 0 for parameter in parameters])
-        self.lowest = np.array([p.lowest if p.sign else -np.inf for p in parameters])
-        self.highest = np.array([p.highest if p.sign else np.inf for p in parameters])
+        self.lowest, self.highest = (
+            np.array(
+                [end if p.sign else coordinate_of(p, np.asarray(end)) for p, end in zip(parameters, ends, strict=True)]
+            )
+            for ends in ([p.lowest for p in parameters], [p.highest for p in parameters])
+        )
 
     def of_values(self, values: Float[np.ndarray, "... p"]) -> Float[np.ndarray, "... p"]:
+        """Return the places of values."""
         return np.where(self.by_value, values, self.objective.problem.coordinates(values))
+
+    def coordinates(self, places: Float[np.ndarray, "... p"]) -> Float[np.ndarray, "... p"]:
+        """Return the optimiser's coordinates of places."""
+        columns = zip(self.objective.problem.parameters, np.moveaxis(places, -1, 0), strict=True)
+        return np.stack([coordinate_of(p, place) if p.sign else place for p, place in columns], axis=-1)
 
     def look(self, places: Float[np.ndarray, "sets p"], some: Int[np.ndarray, " sets"]) -> Searches:  # noqa: ARG002
         """Return chi2, the residuals and their Jacobian by the places."""
-        problem = self.objective.problem
-        columns = zip(problem.parameters, np.moveaxis(places, -1, 0), strict=True)
-        coordinates = np.stack([coordinate_of(p, place) if p.sign else place for p, place in columns], axis=-1)
-        known, slopes = problem.values_and_slopes(coordinates)
+        known, slopes = self.objective.problem.values_and_slopes(self.coordinates(places))
         result = self.objective.at_values(np.where(self.by_value, places, known))
         residual, jacobian = np.asarray(result.residual), np.asarray(result.jacobian)
         jacobian = jacobian * np.where(self.by_value, 1.0, slopes)[:, None, :]
@@ -187,7 +200,7 @@ class _Places:
 
 def _minimise_others(objective: Objective, sides: list[_Side], targets):
     """Minimise chi2 over the parameters that are not profiled, on all sides at once."""
-    places = _Places(objective)
+    places = Places(objective)
     ahead = np.array([side.trial - side.inside for side in sides])
     z = np.array([side.others for side in sides]) + ahead[:, None] * np.array([side.along for side in sides])
     z = np.clip(z, places.lowest, places.highest)

@@ -24,8 +24,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Shaped
 
 from afm_jax.impact.lasting_impact import TabulatedImpact
+from afm_jax.least_squares import Box, descended
 from afm_jax.units import RAD_PER_US_PER_KHZ
-from fitting.fits.objective import BATCH, FINE, PLAIN, ROUGH, SOFT, Objective, lowest, polish
+from fitting.fits.intervals import Places
+from fitting.fits.objective import BATCH, FINE, PLAIN, ROUGH, SOFT, Objective, Polished, lowest, polish
 from fitting.forward import Linearised, free_impacts, impact_at
 from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem, Rows, tip_work
 from fitting.parameters import PARAMETERS, Parameter
@@ -203,7 +205,9 @@ def minimise(objective: Objective) -> Minimum:
         return _polished(objective, polish(scout, first, SOFT, settled=ROUGH).coordinates, points[best])
     found = settle(objective, _whole(objective, _scouted(scout, first), points[best]))
     lost = lost_rows(objective, objective.problem.values(found.coordinates))
-    back = recovered(objective, found.coordinates, lost) if lost.any() else None
+    # of taps some may be lost: they are set aside
+    seen = np.asarray(objective.measurement.rows.measured).any(axis=1)
+    back = recovered(objective, found.coordinates, lost) if lost.sum() > pulled * _MOST_IRREGULAR * seen.sum() else None
     if back is None:
         return found
     other = settle(objective, replace(found, coordinates=back))
@@ -243,9 +247,23 @@ def _whole(
     winner = lowest(chi2)
     follower = objective.following(values[winner])
     softly = polish(follower, found[winner][None], SOFT, settled=ROUGH)
-    end = polish(follower, softly.coordinates, PLAIN, settled=FINE)
+    end = _plainly(follower, softly.coordinates)
     best = objective.problem.values(end.coordinates)[0]
     return Minimum(end.coordinates[0], origins[winner], np.vstack([best, values]), np.append(end.objective, chi2))
+
+
+_MOST_STEPS = 40
+
+
+def _plainly(objective: Objective, starts: Float[np.ndarray, "starts p"]) -> Polished:
+    """Polish plainly: what taps tell lies in narrow valleys that end at bounds, where damped steps go along them."""
+    if not objective.problem.pulled:
+        return polish(objective, starts, PLAIN, settled=FINE)
+    places = Places(objective)
+    here = places.of_values(objective.problem.values(starts))
+    box = Box(places.lowest, places.highest, np.zeros(here.shape, dtype=bool))
+    end = descended(places.look, places.look(here, np.arange(len(here))), box, settled=FINE, most=_MOST_STEPS)
+    return Polished(places.coordinates(end.place), end.chi2, 0)
 
 
 def settle(objective: Objective, minimum: Minimum) -> Minimum:
@@ -253,7 +271,7 @@ def settle(objective: Objective, minimum: Minimum) -> Minimum:
     for _ in range(_ROUNDS):
         values = objective.problem.values(minimum.coordinates)
         follower = objective.following(values)
-        end = polish(follower, minimum.coordinates[None], PLAIN, settled=FINE)
+        end = _plainly(follower, minimum.coordinates[None])
         chi2 = float(np.sum(objective.searching().residual(objective.problem.values(end.coordinates)) ** 2))
         minimum = replace(minimum, coordinates=end.coordinates[0], chi2=np.append(chi2, minimum.chi2[1:]))
         if abs(chi2 - end.objective[0]) < 1e-6 * (1.0 + chi2):
@@ -341,6 +359,7 @@ _TURNED = 0.125
 TOO_SLOW = "too slow for a law of impacts"
 TOO_PULLED = "under too strong a pull of the lever (more than 0.8 times what turns the tip round)"
 IRREGULAR = "not one a period"
+NO_TAPS = "not steady taps, one a period, of the fitted contact"
 ATTRACTED = "none: the sample only draws the tip"
 """Why rows are set aside."""
 
@@ -422,7 +441,7 @@ def _strain_of_taps(objective: Objective, values: Float[np.ndarray, " p"]) -> St
     """Return the strain of the rows of a contact under a bent lever, which pulls the slowest tips out of the bridge."""
     rows = objective.measurement.rows
     exists = np.asarray(objective.at_values(values[None]).prediction.orbits)[0] > 0
-    reasons = np.where(_irregular(objective, exists) & ~np.asarray(rows.free), IRREGULAR, "").astype(object)
+    reasons = np.where(_irregular(objective, exists) & ~np.asarray(rows.free), NO_TAPS, "").astype(object)
     error = np.where(rows.free, 0.0, _OF_TAPS + np.where(exists, _frame_error(rows), 0.0))
     return Strain(error, error, reasons)
 
