@@ -7,10 +7,12 @@ PYTEST ?= -m pytest
 
 # Compilation is most of what the tests cost. XLA's older kernel emitter halves it and more in the same arithmetic; no
 # optimisation at all pays for programs that run for milliseconds, a little for those of the slow tests. `pytest` by
-# itself, `make mutations`, the notebooks and tests/test_as_compiled_for_users.py compile as users do. (An XLA that does
-# not know one of these flags any more says so and stops: leave it out then.)
-COMPILED_AT_ONCE := --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0
-COMPILED_SOON := --xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=1
+# itself, `make mutations`, the notebooks and tests/test_as_compiled_for_users.py compile as users do. An XLA that does
+# not know a flag stops, as that of jax 0.12 does at the first one: it is given to those that take it.
+OLD_EMITTER := --xla_cpu_use_fusion_emitters=false
+KNOWN = $(shell XLA_FLAGS=$(OLD_EMITTER) $(BIN)/python -c 'import jax; jax.devices()' 2>/dev/null && echo $(OLD_EMITTER))
+COMPILED_AT_ONCE = $(KNOWN) --xla_backend_optimization_level=0
+COMPILED_SOON = $(KNOWN) --xla_backend_optimization_level=1
 # Tests of the last digits, which the order of roundings decides.
 SHARP := tests/test_polynomial_roots.py tests/test_verification.py
 

@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     from afm_jax.outcomes import CollisionOutcome, Outcome
     from afm_jax.saved import load
     from afm_jax.scenefile.parameter_paths import scene_family
-    from afm_jax.scenefile.scenefile import SceneError, load_scene, save_scene
+    from afm_jax.scenefile.scenefile import load_scene, save_scene
+    from afm_jax.scenefile.tables import SceneError
     from afm_jax.sweeps.sweep import sweep
 
     __version__: str
@@ -56,7 +57,7 @@ else:
         "Phase": "afm_jax.contact.junction",
         "Platform": "afm_jax.apparatus.platform",
         "Scene": "afm_jax.apparatus.scene",
-        "SceneError": "afm_jax.scenefile.scenefile",
+        "SceneError": "afm_jax.scenefile.tables",
         "Simulation": "afm_jax.motion.record",
         "SingleImpactOrbits": "afm_jax.impact.orbits",
         "State": "afm_jax.motion.record",

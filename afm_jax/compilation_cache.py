@@ -109,6 +109,11 @@ def processor_key() -> str:
     return hashlib.sha256("\n".join(kind).encode()).hexdigest()[:12]
 
 
+def available_cores() -> int:
+    """Return how many cores this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def make_private(folder: Path) -> None:
     """Make a folder, and those above it that are missing, for this user alone; check it and the one above it.
 

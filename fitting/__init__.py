@@ -30,7 +30,8 @@ if TYPE_CHECKING:
     from fitting.sampling.posterior_result import Posterior
     from fitting.sampling.trust_pack import TrustPack, trust
     from fitting.simulated.experiment import SimulatedExperiment, simulate_experiment
-    from fitting.tables.table import AmplitudeTable, TableError, read_table, write_table
+    from fitting.tables.csv_text import TableError
+    from fitting.tables.table import AmplitudeTable, read_table, write_table
     from fitting.tapping_curves.result import Tapping
     from fitting.tapping_curves.tapping import tapping
     from fitting.traces.lockin import LockinResult, lockin
@@ -56,7 +57,7 @@ else:
         "Inversion": "fitting.inversion.result",
         "SimulatedExperiment": "fitting.simulated.experiment",
         "Stiffness": "fitting.calibration.stiffness",
-        "TableError": "fitting.tables.table",
+        "TableError": "fitting.tables.csv_text",
         "Tapping": "fitting.tapping_curves.result",
         "Trace": "fitting.traces.trace",
         "TrustPack": "fitting.sampling.trust_pack",

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from fitting.tables.table import TableError, read_table
+from fitting.tables.csv_text import TableError
+from fitting.tables.table import read_table
 
 KEY = "# free_frequency_khz = 90\n"
 NAMES = "order,drive_frequency_khz,drive_amplitude_nm,offset_nm,peak_amplitude_nm,peak_amplitude_error_nm\n"

@@ -61,7 +61,7 @@ def test_all_cores_really_are_several():
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="this system cannot pin a process")
 def test_one_core_really_is_one():
-    assert run_in_own_process("afm_jax.dynamics.iteration:available_cores", {}, cores=1) == 1
+    assert run_in_own_process("afm_jax.compilation_cache:available_cores", {}, cores=1) == 1
 
 
 def test_a_process_that_fails_is_an_error():

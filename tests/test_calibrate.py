@@ -9,7 +9,8 @@ from scipy.optimize import least_squares
 from scipy.stats import chi2 as chi2_distribution
 
 from fitting import calibrate, read_sweep
-from fitting.calibration.sweep import ResonanceSweep, TableError, without_phase
+from fitting.calibration.sweep import ResonanceSweep, without_phase
+from fitting.tables.csv_text import TableError
 from tests.resonance_sweeps import FREQUENCY_KHZ, QUALITY_FACTOR, synthetic_sweep
 
 REAL = Path(__file__).parent.parent.parent / "shared" / "data" / "free_resonance_nanonis.dat"

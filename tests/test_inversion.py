@@ -14,7 +14,8 @@ from afm_jax.impact.orbits import single_impact_orbits
 from fitting.inversion.flight import _best_ends, _look
 from fitting.inversion.invert import invert
 from fitting.simulated.experiment import with_noise
-from fitting.tables.table import AmplitudeTable, TableError
+from fitting.tables.csv_text import TableError
+from fitting.tables.table import AmplitudeTable
 from tests.contact_experiment import paper_collisions, paper_experiment
 
 pytestmark = pytest.mark.slow

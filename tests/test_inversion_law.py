@@ -16,7 +16,8 @@ from fitting.inversion.regression import (
     regress,
 )
 from fitting.inversion.result import InvertedRows, read_on_resonance
-from fitting.tables.table import TableError, read_table
+from fitting.tables.csv_text import TableError
+from fitting.tables.table import read_table
 
 EPSILON, SLOPES = 113.6, {"viscous": 0.5, "restitution": 3e-3}
 

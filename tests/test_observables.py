@@ -216,6 +216,12 @@ def test_a_start_has_the_phase_it_was_told():
     assert float(begin.time_us) == pytest.approx(0.25 * float(scene.platform.period_us), rel=1e-14)
     # a quarter of a period after its highest point the platform is at its mean, 0
     assert [float(begin.position_nm), float(begin.velocity_nm_per_us)] == pytest.approx([5.0, 80.0], rel=1e-12)
+    # of many scenes one each, at their own times; the platform at its mean may rest at another height
+    frequencies, offsets = np.array([150.0, 180.0, 200.0]), np.array([0.0, 1.0, -2.0])
+    many = start_of(Scene(Cantilever(90.0, 40.0), Platform(4.0, frequencies, offsets), TABULATED), (450.0, 5.0, 80.0))
+    np.testing.assert_allclose(many.time_us, 250.0 / frequencies, rtol=1e-14)
+    np.testing.assert_allclose(many.position_nm, 5.0 + offsets, rtol=1e-12)
+    np.testing.assert_array_equal(many.velocity_nm_per_us, [80.0] * 3)
 
 
 def test_bad_arguments_are_told():

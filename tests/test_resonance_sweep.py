@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from fitting import read_sweep
-from fitting.calibration.sweep import ResonanceSweep, TableError
+from fitting.calibration.sweep import ResonanceSweep
+from fitting.tables.csv_text import TableError
 
 PLAIN = "frequency_khz,amplitude_nm,phase_deg\n89.5,1.25,60\n90,2.5,-3.5e1\n90.5,1.125,-120\n"
 NANONIS = (

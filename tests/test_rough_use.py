@@ -15,7 +15,8 @@ from click.testing import CliRunner
 from afm_jax.apparatus.platform import Platform
 from afm_jax.cli.main import main
 from afm_jax.whole_files import write_whole
-from fitting.tables.table import TableError, read_table
+from fitting.tables.csv_text import TableError
+from fitting.tables.table import read_table
 from tests.fuzz import fuzz_files, fuzz_orbits
 from tests.test_imports import LIBRARY, ROOT
 

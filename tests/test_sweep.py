@@ -19,8 +19,8 @@ from click.testing import CliRunner
 
 import afm_jax
 from afm_jax.cli.main import main
+from afm_jax.compilation_cache import available_cores
 from afm_jax.dynamics.exponents import Lyapunov, lyapunov_spectrum
-from afm_jax.dynamics.iteration import available_cores
 from afm_jax.dynamics.verdicts import Verdicts
 from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
 from afm_jax.scenefile.presets import preset

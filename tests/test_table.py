@@ -13,8 +13,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from fitting.tables.csv_text import setting_in
-from fitting.tables.table import SETTINGS, TABLE, AmplitudeTable, TableError, read_table, write_table
+from fitting.tables.csv_text import TableError, setting_in
+from fitting.tables.table import SETTINGS, TABLE, AmplitudeTable, read_table, write_table
 
 NAMES = "order,drive_frequency_khz,drive_amplitude_nm,offset_nm,peak_amplitude_nm,peak_amplitude_error_nm\n"
 TEXT = f"# free_frequency_khz = 90\n{NAMES}1,180,4,0,163.3,1.63\n2,349.2,2,-1,106.67,1.06\n"

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from fitting.tables.table import TABLE, TableError, read_table
+from fitting.tables.csv_text import TableError
+from fitting.tables.table import TABLE, read_table
 from tests.table_texts import KEY, NAMES, ROW, fault_of, message_of
 
 Q = "'# quality_factor = 40 (or 40 +- 2)'"

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from fitting.tables.csv_text import Faults, column_of
-from fitting.tables.table import AmplitudeTable, TableError
+from fitting.tables.csv_text import Faults, TableError, column_of
+from fitting.tables.table import AmplitudeTable
 from tests.table_texts import KEY, NAMES, ROW, fault_of
 
 NOT_NUMBER = "is not a number; write it like 174.6 or 1.746e2, without a unit"

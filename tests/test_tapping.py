@@ -10,7 +10,8 @@ from matplotlib.image import imread
 
 import fitting
 from afm_jax.cli.main import main
-from fitting.tables.table import AmplitudeTable, TableError, mass_of
+from fitting.tables.csv_text import TableError
+from fitting.tables.table import AmplitudeTable, mass_of
 from fitting.tapping_curves.branches import changes, free_rows
 from fitting.tapping_curves.curve import Given, Instrument, TappingCurve
 from fitting.tapping_curves.energy import energies, lags_of, largest_energies

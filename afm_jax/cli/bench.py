@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from afm_jax.cli.session import Session, with_session, write_json
+from afm_jax.compilation_cache import available_cores
 from afm_jax.words import known
 
 if TYPE_CHECKING:
@@ -282,8 +283,6 @@ def command(session: Session, batches: tuple[int, ...], only: str | None, *, qui
     bench_dynamics.csv, bench_sweep.csv, bench_fits.csv and bench.json.
     """
     session.start_computing()
-    from afm_jax.dynamics.iteration import available_cores  # noqa: PLC0415
-
     cores = available_cores()
     machine = machine_facts(cores)
     if (machine["load_before"] or 0.0) > 0.3 * cores:

@@ -49,12 +49,13 @@ def command(
     a picture of every trace, lockin.json, and amplitudes.csv for `afm-jax fit` with the steady ones; traces of one
     drive give one row, their mean. Exit code 3 if a trace is flagged.
     """
+    from fitting.tables.csv_text import TableError  # noqa: PLC0415
     from fitting.traces.lockin import (  # noqa: PLC0415
         lockin,
         table_of,
     )
     from fitting.traces.report import lockin_payload, lockin_summary, write_lockin  # noqa: PLC0415
-    from fitting.traces.trace import TableError, read_trace  # noqa: PLC0415
+    from fitting.traces.trace import read_trace  # noqa: PLC0415
 
     # all are read first: a fault in the last should not come after minutes of work on the others
     read = [read_trace(path, group=group, **settings) for path in traces]

@@ -62,7 +62,6 @@ def command(  # noqa: PLR0913
     import numpy as np  # noqa: PLC0415
 
     from afm_jax.dynamics.exponents import exponent_verdicts, lyapunov_spectrum  # noqa: PLC0415
-    from afm_jax.dynamics.iteration import states_of  # noqa: PLC0415
     from afm_jax.dynamics.motion_bands import drawn_exponents  # noqa: PLC0415
     from afm_jax.motion.start import start_of  # noqa: PLC0415
     from afm_jax.scenefile.parameter_paths import scene_batch  # noqa: PLC0415
@@ -74,7 +73,7 @@ def command(  # noqa: PLR0913
     given = {one.path: one.values for one in ranges}
     try:
         motions = scene_batch(loaded, given) if given else loaded
-        start = None if told is None else states_of(motions, told) if given else start_of(loaded, told)
+        start = None if told is None else start_of(motions, told)
         with session.working("following the motion (the first run compiles for some seconds)"):
             found = lyapunov_spectrum(
                 motions,

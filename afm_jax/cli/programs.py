@@ -1,17 +1,15 @@
-"""Traced programs beside JAX's compilation cache: what that has compiled it finds only after tracing anew.
+"""Traced programs beside JAX's compilation cache, which finds what it has compiled only after tracing anew.
 
-Commands name the few that gain by being kept traced as well (processor seconds of a warm call, with and without: fit by
-viscous+delay 5.3 and 11.9, collide 2.1 and 3.3; a simulation gains too little): by `jax.export`, its own serialisation
-(what `serialize_executable` writes is read by pickle, which runs any code that a file names). A file is found by all
-that a trace depends on: loaded sources, versions, configuration, devices, shapes and structure. Results are modules
-and tuples of arrays; arguments that are no arrays have a `repr` that says all of them.
+Commands name the few that gain (processor seconds of a warm call, with and without: fit by viscous+delay 5.3 and 11.9,
+collide 2.1 and 3.3; a simulation gains too little). `jax.export` writes them, its own serialisation; pickle would run
+any code that a file names. A file is found by all that a trace depends on: loaded sources, versions, configuration,
+devices, shapes and structure. Results are modules and tuples of arrays; other arguments have a `repr` that says all.
 """
 
 import hashlib
 import json
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from functools import cache
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
@@ -19,14 +17,12 @@ from typing import Any
 
 import equinox as eqx
 import jax
-from jax import export
-from jax.core import Tracer
+from jax import core, export
 
+from afm_jax.cli.compilation import quick_options
 from afm_jax.whole_files import write_whole
 
 _CONFIGURATION = ("jax_enable_x64", "jax_numpy_dtype_promotion", "jax_default_matmul_precision", "jax_debug_nans")
-_SOON = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 1}
-"""Half of the time that these programs take to compile, for a tenth of the time that they run."""
 _PACKAGES = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "lineax")
 
 
@@ -41,94 +37,64 @@ def _keeping(jitted: Any, folder: Path, tell: Callable[[str], None]) -> Callable
 
     def kept(*arguments: Any, **named: Any) -> Any:
         leaves, tree = jax.tree.flatten((arguments, named))
-        arrays = [leaf for leaf in leaves if hasattr(leaf, "dtype")]
-        if any(isinstance(leaf, Tracer) for leaf in arrays):
+        arrays, static = eqx.partition(leaves, lambda leaf: hasattr(leaf, "dtype"))
+        if any(isinstance(leaf, core.Tracer) for leaf in arrays):
             return jitted(*arguments, **named)
-        static = tuple(None if hasattr(leaf, "dtype") else leaf for leaf in leaves)
-        call = (tree, static, *((leaf.shape, leaf.dtype) for leaf in arrays))
-        if call in programs:
-            program, result = programs[call]
-            return jax.tree.unflatten(result, program(arrays))
 
-        def flat(arrays: list[Any]) -> list[Any]:
-            given = iter(arrays)
-            both = zip(leaves, static, strict=True)
-            whole = [next(given) if hasattr(leaf, "dtype") else known for leaf, known in both]
-            positional, by_name = jax.tree.unflatten(tree, whole)
-            return jax.tree.leaves(jitted(*positional, **by_name))
+        def of_arrays(arrays: list[Any]) -> Any:
+            positional, by_name = jax.tree.unflatten(tree, eqx.combine(arrays, static))
+            return jitted(*positional, **by_name)
 
-        def trace() -> tuple[Any, Any]:
-            return export.export(jax.jit(flat))(arrays), _structure(jax.eval_shape(jitted, *arguments, **named))
-
-        program, structure = _program(folder / f"{jitted.__name__}-{_digest(call)}.program", trace, tell)
-        # at once: a jitted function would compile again where an argument comes from another program
-        kinds = [jax.ShapeDtypeStruct(leaf.shape, leaf.dtype) for leaf in arrays]
-        compiled = jax.jit(program).lower(kinds).compile(_known_options())
-        found = _filled(structure, iter(compiled(arrays)))
-        programs[call] = compiled, jax.tree.structure(found)
-        return found
+        call = (tree, *static, *((leaf.shape, leaf.dtype) for leaf in jax.tree.leaves(arrays)))
+        if call not in programs:
+            programs[call] = _program(folder / f"{jitted.__name__}-{_digest(call)}.program", of_arrays, arrays, tell)
+        program, result = programs[call]
+        return jax.tree.unflatten(result, program(arrays))
 
     return kept
 
 
 def _digest(call: Any) -> str:
-    settings = [getattr(jax.config, option) for option in _CONFIGURATION]
-    said = f"{call} {settings} {jax.devices()} {_versions(_PACKAGES)}".encode()
-    ours = sorted(name for name in sys.modules if name.startswith(("afm_jax.", "fitting.")))
-    files = (getattr(sys.modules[name], "__file__", None) for name in ours)
-    sources = b"".join(Path(file).read_bytes() for file in files if file)
-    return hashlib.sha256(said + sources).hexdigest()[:32]
+    said = [call, *(getattr(jax.config, option) for option in _CONFIGURATION), jax.devices(), *map(version, _PACKAGES)]
+    files = (sys.modules[name].__file__ for name in sorted(sys.modules) if name.startswith(("afm_jax.", "fitting.")))
+    return hashlib.sha256(f"{said}".encode() + b"".join(Path(file).read_bytes() for file in files if file)).hexdigest()
 
 
-@cache
-def _versions(packages: tuple[str, ...]) -> list[str]:
-    return [version(name) for name in packages]
-
-
-def _program(path: Path, trace: Callable[[], tuple[Any, Any]], tell: Callable[[str], None]) -> tuple[Any, Any]:
-    """Return program and structure of its result from a file, where both are behind their digest, or traced anew."""
+def _program(path: Path, function: Any, arrays: list[Any], tell: Callable[[str], None]) -> tuple[Any, Any]:
+    """Return a function's program and the tree of its result, from a file if both are behind their digest there."""
     kept = path.read_bytes() if path.exists() else b""
-    if kept[:32] == hashlib.sha256(kept[32:]).digest():
-        structure, _, text = kept[32:].partition(b"\n")
-        return export.deserialize(bytearray(text)).call, json.loads(structure)
-    program, structure = trace()
-    text = json.dumps(structure).encode() + b"\n" + program.serialize()
-    try:
-        write_whole(path, hashlib.sha256(text).digest() + text)
-        tell(f"{path.name} was {'damaged' if kept else 'not there'}: traced and written")
-    except OSError as error:
-        tell(f"{path.name} cannot be written: {error.strerror}")
-    return program.call, structure
-
-
-@cache
-def _known_options() -> dict[str, Any] | None:
-    """Return options that leave the compiler's slowest passes on the CPU out, where it knows them by those names."""
-    try:
-        jax.jit(lambda x: x, compiler_options=_SOON)(0.0)
-    except jax.errors.JaxRuntimeError:
-        return None
-    return _SOON
+    text = kept[32:]
+    if kept[:32] != hashlib.sha256(text).digest():
+        structure = _structure(jax.eval_shape(function, arrays))
+        program = export.export(jax.jit(lambda arrays: jax.tree.leaves(function(arrays))))(arrays)
+        text = json.dumps(structure).encode() + b"\n" + program.serialize()
+        try:
+            write_whole(path, hashlib.sha256(text).digest() + text)
+            tell(f"{path.name} was {'damaged' if kept else 'not there'}: traced and written")
+        except OSError as error:
+            tell(f"{path.name} cannot be written: {error.strerror}")
+    structure, _, text = text.partition(b"\n")
+    program = export.deserialize(bytearray(text))
+    # at once: a jitted function would compile again where an argument comes from another program
+    like, _ = jax.tree.unflatten(program.in_tree, program.in_avals)
+    return jax.jit(program.call).lower(*like).compile(quick_options()), jax.tree.structure(_made(json.loads(structure)))
 
 
 def _structure(value: Any) -> Any:
-    if type(value) is tuple:
-        return ["builtins", "tuple", {str(place): _structure(part) for place, part in enumerate(value)}]
-    if not hasattr(value, "_asdict") and not isinstance(value, eqx.Module):
-        return 0 if isinstance(value, jax.ShapeDtypeStruct) else {"static": value}
-    parts = getattr(value, "_asdict", lambda: vars(value))()
+    """Return what JSON can hold of a result: names of a type and of its parts; values as they are, for arrays 0."""
+    if not isinstance(value, tuple | eqx.Module):
+        return {"value": 0 if isinstance(value, jax.ShapeDtypeStruct) else value}
+    parts = vars(value) if isinstance(value, eqx.Module) else dict(enumerate(value))
     return [type(value).__module__, type(value).__name__, {name: _structure(part) for name, part in parts.items()}]
 
 
-def _filled(structure: Any, leaves: Iterator[Any]) -> Any:
-    if not isinstance(structure, list):
-        return structure["static"] if isinstance(structure, dict) else next(leaves)
+def _made(structure: Any) -> Any:
+    if isinstance(structure, dict):
+        return structure["value"]
     kind = getattr(sys.modules[structure[0]], structure[1])
-    parts = {name: _filled(part, leaves) for name, part in structure[2].items()}
-    if kind is tuple:
-        return tuple(parts.values())
+    parts = {name: _made(part) for name, part in structure[2].items()}
     if issubclass(kind, tuple):
-        return kind(**parts)
+        return tuple.__new__(kind, parts.values())
     made = object.__new__(kind)  # without its checks, which are for what users write
     vars(made).update(parts)
     return made

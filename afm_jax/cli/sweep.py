@@ -11,6 +11,7 @@ import click
 
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import scene_and_start
+from afm_jax.compilation_cache import available_cores
 
 if TYPE_CHECKING:
     from afm_jax.sweeps.plan import SweepPlan
@@ -209,8 +210,6 @@ def _tables(given: Any, folder: Path) -> list[Path]:
 
 def _use_all_cores() -> None:
     """Let JAX have a device for every core, before it starts, unless the user has said how many there are."""
-    from afm_jax.dynamics.iteration import available_cores  # noqa: PLC0415
-
     flags = os.environ.get("XLA_FLAGS", "")
     if "host_platform_device_count" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} --xla_force_host_platform_device_count={available_cores()}".strip()
@@ -219,8 +218,6 @@ def _use_all_cores() -> None:
 def _processes(plan: "SweepPlan") -> int:
     """Return how many processes use this machine best: one for batches, which take every device themselves."""
     from importlib.util import find_spec  # noqa: PLC0415
-
-    from afm_jax.dynamics.iteration import available_cores  # noqa: PLC0415
 
     if not plan.recorder.alone or find_spec("distributed") is None:
         return 1

@@ -2,7 +2,7 @@
 
 A special point obeys G(x, p; a) = 0, the closing conditions and its test function, for parameters a that are known up
 to a covariance C. By the implicit function theorem it moves by d(x, p)/da = -(dG/d(x, p))^-1 dG/da, and the parameter
-where it lies has the variance (dp/da) C (dp/da)^T. Draws from C, each with its own root, say whether that is enough.
+where it lies has the variance (dp/da) C (dp/da)^T.
 """
 
 from functools import partial
@@ -11,7 +11,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
 from afm_jax.dynamics.closed_loops import Equations, Frame, by_blocks, equations_at, loop_at
@@ -20,8 +19,6 @@ from afm_jax.dynamics.impact_loop import closing_gaps, highest_point
 from afm_jax.dynamics.special_points import OrbitBranch, SpecialPoint
 
 _NEVER_NEGATIVE = ("interaction.epsilon", "interaction.viscous_loss", "cantilever.quality_factor")
-_NEWTON_STEPS = 20
-_ARRIVED = 1e-9
 
 
 class UncertainParameters(NamedTuple):
@@ -68,26 +65,6 @@ def special_errors(found: Continuation, known: UncertainParameters) -> Float[np.
     """
     known = known.without(found.range.path)
     return np.array([_error(_sensitivity(found, point, known), known) for point in found.special])
-
-
-def drawn_points(
-    found: Continuation, point: SpecialPoint, known: UncertainParameters, *, number: int = 500, seed: int = 0
-) -> Float[np.ndarray, " draws"]:
-    """Return where a special point lies for each draw of the parameters; NaN where there is none near.
-
-    Args:
-        found: of the scene with the known parameters' values.
-        point: one of its special points.
-        known: what is drawn.
-        number: of draws.
-        seed: of the random numbers.
-    """
-    known = known.without(found.range.path)
-    frame, equations, start = _problem(found, point, known)
-    slope = _slopes_by_known(frame, jnp.asarray(start), equations)
-    roots, arrived = _roots(frame, jnp.asarray(start), slope, jnp.asarray(known.draws(number, seed)), equations)
-    value = found.range.low + (found.range.high - found.range.low) * np.asarray(roots)
-    return np.where(np.asarray(arrived), value, np.nan)
 
 
 def amplitude_errors(
@@ -137,26 +114,6 @@ def _slopes_by_known(frame: Frame, point: Array, equations: Equations) -> Float[
     slopes = jax.jacfwd(lambda all_: equations_at(all_, frame, equations))(point)
     own = slopes.shape[0]
     return -jnp.linalg.solve(slopes[:, :own], slopes[:, own:])
-
-
-@partial(jax.jit, static_argnames=("equations",))
-def _roots(frame: Frame, point: Array, slope: Array, drawn: Array, equations: Equations) -> tuple[Array, Array]:
-    own = point.shape[0] - drawn.shape[1]
-
-    def one(values):
-        def gaps(unknowns):
-            return equations_at(jnp.concatenate([unknowns, values]), frame, equations)
-
-        def improve(_, state):
-            unknowns, _ = state
-            move = jnp.linalg.solve(jax.jacfwd(gaps)(unknowns), gaps(unknowns))
-            return unknowns - move, jnp.max(jnp.abs(move))
-
-        begin = point[:own] + slope @ (values - point[own:])
-        unknowns, moved = lax.fori_loop(0, _NEWTON_STEPS, improve, (begin, jnp.asarray(jnp.inf)))
-        return unknowns[-1], moved < _ARRIVED
-
-    return jax.vmap(one)(drawn)
 
 
 @partial(jax.jit, static_argnames=("equations",))

@@ -30,9 +30,9 @@ from afm_jax.dynamics.iteration import (
     recorded,
     sample_driven,
     skipped,
-    states_of,
 )
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Verdicts, verdicts_of
+from afm_jax.motion.start import start_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import public_result
 from afm_jax.scenefile.parameter_paths import scene_batch
@@ -118,7 +118,7 @@ def bifurcation_diagram(  # noqa: PLR0913
     seen = sample_driven(scenes)
     if impacts < RECORDED:
         raise ValueError(f"`impacts` must be {RECORDED} or more, to tell orbits, but is {impacts}")
-    begin = None if start is None else seen.start(states_of(scenes, start))
+    begin = None if start is None else seen.start(start_of(scenes, start))
     _, fresh = batch_and_tips(seen.scenes, begin)
     seen, fresh = jax.tree.map(np.asarray, (seen, fresh))
     sweeper = _Sweeper(seen.scenes, fresh, impacts, accuracy)

@@ -6,7 +6,6 @@ needs (chatter summed up, the ride, the release) is computed in the steps in whi
 others. Times count within the drive's period, so that long motions keep the digits of their phase.
 """
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -21,6 +20,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import FreeFrame, free_frame
 from afm_jax.checks import require_float64
+from afm_jax.compilation_cache import available_cores
 from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
@@ -380,13 +380,6 @@ def batch_and_tips(scene: Scene, start: State | None = None) -> tuple[Scene, Tip
     return scene, tips_at(scene, start.time_us, start.velocity_nm_per_us)._replace(gap_nm=gap)
 
 
-def states_of(scenes: Scene, start: tuple[float, float, float]) -> State:
-    """Return the states of a start as of `start_of`, one of each of many scenes that repeat with one drive period."""
-    phase, height, velocity = start
-    time = (phase % 360.0) / 360.0 * free_frame(scenes).platform.period_us
-    return State(time, scenes.platform.position(time) + height, jnp.full_like(time, velocity))
-
-
 class SampleDriven(NamedTuple):
     """Scenes as their freely moving tips see them, whatever drives them: over a platform that moves with one cosine."""
 
@@ -474,8 +467,3 @@ def in_blocks(work: Callable[[Any], Any], lanes: Any, *, block: int = LANES, rep
             if report is not None:
                 report(min(len(done) * width, count), count)
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *done)
-
-
-def available_cores() -> int:
-    """Return how many cores this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from afm_jax.apparatus.scene import Scene, drive_of
-from afm_jax.apparatus.surface import surface_of
+from afm_jax.apparatus.surface import free_frame, surface_of
 from afm_jax.checks import as_parameter
 from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
@@ -59,15 +59,17 @@ def start_of(scene: Scene, start: tuple[float, float, float] | None) -> State:
     """Return the state of a scene file's start, at the first time from 0 on at which the drive has its phase.
 
     Args:
-        scene: the scene.
+        scene: the scene; with a start also many, which repeat with one drive period each.
         start: phase of the drive in degrees, height above the platform in nm, velocity in the lab in nm/us (a `Start`);
             None: `default_start`.
     """
     if start is None:
         return default_start(scene)
     phase, height, velocity = start
-    time = (phase % 360.0) / 360.0 * drive_of(scene).period_us
-    return state(time, float(scene.platform.position(time)) + height, velocity)
+    many = scene.platform.frequency_khz.ndim > 0
+    period = free_frame(scene).platform.period_us if many else drive_of(scene).period_us
+    time = as_parameter((phase % 360.0) / 360.0 * period)
+    return State(time, scene.platform.position(time) + height, jnp.full_like(time, velocity))
 
 
 def state(time_us: float, position_nm: float, velocity_nm_per_us: float) -> State:

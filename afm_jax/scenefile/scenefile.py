@@ -306,18 +306,6 @@ def as_in_file(scene: Scene, state: State) -> Start:
     return Start(phase % 360.0, height, float(state.velocity_nm_per_us))
 
 
-__all__ = [
-    "SceneError",
-    "Start",
-    "load_scene",
-    "load_scene_and_start",
-    "load_start",
-    "save_scene",
-    "scene_of_tables",
-    "scene_tables",
-]
-
-
 def load_scene(path: str | os.PathLike[str]) -> Scene:
     """Return the scene that a TOML file describes.
 

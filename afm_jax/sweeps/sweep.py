@@ -15,7 +15,7 @@ import numpy as np
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import require_float64
-from afm_jax.dynamics.iteration import available_cores
+from afm_jax.compilation_cache import available_cores
 from afm_jax.scenefile.scenefile import Start, scene_tables
 from afm_jax.sweeps.plan import SweepPlan, plan_of
 from afm_jax.sweeps.scenes import SCENE_BUILDER

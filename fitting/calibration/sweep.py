@@ -173,8 +173,6 @@ def _cells(text: str) -> list[str]:
     return cells[:-1] if len(cells) > 1 and not cells[-1] else cells
 
 
-__all__ = ["ResonanceSweep", "TableError", "read_sweep", "without_phase"]
-
 _COLUMNS = ("frequency_khz", "amplitude", "phase_deg", "amplitude_error", "phase_error_deg")
 _POSITIVE = ("frequency_khz", "amplitude_error", "phase_error_deg")
 

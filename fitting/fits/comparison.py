@@ -226,6 +226,3 @@ def _said_of(best: dict[str, Any], second: dict[str, Any]) -> str:
 def _meaning(model: str) -> str:
     law = LAWS.get(model.removesuffix("+delay"))
     return f"{model}: {law.meaning if law else 'the resolved contact'}"
-
-
-__all__ = ["Comparison", "compare", "rivals"]

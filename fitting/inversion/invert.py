@@ -14,7 +14,8 @@ from afm_jax.version import version_of
 from fitting.inversion.flight import Inverted, MeasuredRow, invert_rows
 from fitting.inversion.regression import Laws, compare_law, regressed_laws
 from fitting.inversion.result import Inversion, InvertedRows, RegressedLaw, SavedLaw, on_resonance, read_on_resonance
-from fitting.tables.table import AmplitudeTable, TableError
+from fitting.tables.csv_text import TableError
+from fitting.tables.table import AmplitudeTable
 
 _BLOCK = 64
 """Rows come filled up to a multiple of this, so that one program serves most tables."""

@@ -353,9 +353,6 @@ def _check_duplicates(columns: Columns, lines: Int[np.ndarray, " rows"], faults:
         faults.add(f"{what}; average the measurements into one row or remove one", line=second)
 
 
-__all__ = ["AmplitudeTable", "TableError", "read_table", "write_table"]
-
-
 @public_result()
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AmplitudeTable:

@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Complex, Float, Int
 from scipy.linalg import solve_toeplitz
 
-from fitting.traces.trace import TableError, Trace
+from fitting.tables.csv_text import TableError
+from fitting.traces.trace import Trace
 
 PER_RESPONSE = 16
 """Harmonics of the response frequency per drive period in it: what an impact's kink leaves beyond them is below 1 %."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from afm_jax.results import public_result
 from afm_jax.units import within_turn
+from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable
 from fitting.traces.fold import Fold, OrderSearch, Reference, find_order, find_reference, fold, sampling_error_nm
 from fitting.traces.impacts import (
@@ -25,7 +26,7 @@ from fitting.traces.impacts import (
     find_ringing,
     look_at_periods,
 )
-from fitting.traces.trace import TableError, Trace
+from fitting.traces.trace import Trace
 from fitting.traces.verdict import TraceEvidence, TraceKind, is_flightless, judge
 
 FORMAT_VERSION = 1

@@ -35,7 +35,6 @@ from fitting.tables.csv_text import (
     Faults,
     FileSetting,
     Form,
-    TableError,
     check_names,
     fault_in_number,
     named_rows,
@@ -291,8 +290,6 @@ def _column(name: str, dataset: Any, faults: Faults) -> np.ndarray:
         return np.zeros(0)
     return np.asarray(dataset[...], dtype=np.float64)
 
-
-__all__ = ["TableError", "Trace", "read_trace"]
 
 _UNEVEN = 0.1
 """Share of a sampling step by which a time may miss its place: rounding of the printed times, not a lost sample."""
