@@ -252,7 +252,7 @@ def _whole(
     return Minimum(end.coordinates[0], origins[winner], np.vstack([best, values]), np.append(end.objective, chi2))
 
 
-_MOST_STEPS = 40
+_MOST_STEPS = 150
 
 
 def _plainly(objective: Objective, starts: Float[np.ndarray, "starts p"]) -> Polished:
