@@ -36,7 +36,7 @@ from afm_jax.impact.law import Speeds
 from afm_jax.impact.map import NEAR_GRAZING
 from afm_jax.impact.orbits import amplitudes, near_fold, orbit_state, steady_orbits
 from afm_jax.impact.roots import follow_root, harmless_coordinate
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem, Rows, measurement_of
 from fitting.parameters import CONTACT_NAMES, NUISANCE_NAMES, PARAMETERS, model_parameters
 from fitting.tables.table import AmplitudeTable
@@ -575,7 +575,7 @@ GRAZE_ON_THE_WAY = "the flight grazes the platform on the way: a small change ma
 
 @public_result()
 @dataclass(frozen=True)
-class AmplitudeGradients:
+class AmplitudeGradients(Result):
     """Predicted amplitudes of a table's rows, peak and lock-in, and their derivatives.
 
     Attributes:

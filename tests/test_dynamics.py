@@ -203,6 +203,8 @@ def test_shares_of_basins_are_those_of_random_starts():
     scene = law_scene(1.57)
     found = basins_of_attraction(scene, columns=100, rows=100, speeds_nm_per_us=(0.0, 15.0))
     assert {attractor.name for attractor in found.attractors} == {"(3,4)", "(2,4)"}
+    assert len(found.to_pandas()) == 10_000
+    assert found.plot().axes[0].get_xlabel()
     starts = 10_000
     phase, rebound = np.random.default_rng(7).uniform([[0.0], [0.0]], [[2.0 * np.pi], [15.0]], (2, starts))
     m = repeats_after(followed_in_numpy(1.57, 0.8, phase, rebound, 300))

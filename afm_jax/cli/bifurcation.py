@@ -67,11 +67,11 @@ def command(  # noqa: PLR0913
     sweeps = []
     try:
         for upward in directions:
-            with session.working("sweeping up" if upward else "sweeping down"):
-                told = session.progress("values up" if upward else "values down")
+            way = "up" if upward else "down"
+            with session.working(f"sweeping {way}", f"values {way}") as report:
                 sweeps.append(
                     bifurcation_diagram(
-                        loaded, swept.path, swept.values, start=start, upward=upward, impacts=impacts, report=told
+                        loaded, swept.path, swept.values, start=start, upward=upward, impacts=impacts, report=report
                     )
                 )
         probabilities = None

@@ -74,13 +74,13 @@ def command(  # noqa: PLR0913
     try:
         motions = scene_batch(loaded, given) if given else loaded
         start = None if told is None else start_of(motions, told)
-        with session.working("following the motion (the first run compiles for some seconds)"):
+        with session.working("following the motion (the first run compiles for some seconds)", "motions") as report:
             found = lyapunov_spectrum(
                 motions,
                 start,
                 impacts=impacts,
                 transient=transient,
-                report=session.progress("motions"),
+                report=report,
             )
             band = None
             if known is not None:
