@@ -94,7 +94,8 @@ class Names(click.ParamType):
     show_default=True,
     type=click.Choice(MODELS),
     help="; ".join(f"{name}: {law.meaning}" for name, law in LAWS.items())
-    + f"; each with {DELAY_LAW.meaning} (+delay); contact: physical parameters through the resolved contact.",
+    + f"; each with {DELAY_LAW.meaning} (+delay); contact: physical parameters through the resolved contact, "
+    "of tapping curves on resonance too.",
 )
 @with_noise
 @click.option(

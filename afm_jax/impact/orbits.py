@@ -30,9 +30,9 @@ from afm_jax.impact.closure import (
 from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.impact.implicit import implicit_pair, implicit_root
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
-from afm_jax.impact.lasting_impact import Impact, LawImpact, crawls, indentation, middle_of_contact
+from afm_jax.impact.lasting_impact import Impact, LawImpact, PulledImpact, crawls, indentation, middle_of_contact
 from afm_jax.impact.law import ImpactLaw, Speeds, impact_law_of
-from afm_jax.impact.roots import COARSE, find_roots
+from afm_jax.impact.roots import COARSE, TAPPED, find_roots
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, public_result
 from afm_jax.units import within_turn
@@ -317,7 +317,7 @@ def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
     A delayed closing condition is scanned coarsely: orbits close to each other or to capture may be missed.
     """
     problem = lax.stop_gradient(problem)
-    roots = find_roots(problem, COARSE)
+    roots = find_roots(problem, TAPPED if isinstance(problem.impact, PulledImpact) else COARSE)
 
     def one(place, found):
         state = orbit_state(place, problem)
@@ -365,13 +365,21 @@ def amplitudes(place: OrbitPlace, problem: OrbitProblem) -> Float[Array, " 3"]:
 @jax.jit
 def _observed(state: OrbitState, problem: OrbitProblem) -> Float[Array, " 3"]:
     cantilever, platform, impact, order = problem
-    depth = 0.0
+    depth, late = 0.0, 0.0
     if impact.lasts:
         # in contact the tip is below the platform's rest surface by the indentation
         approach, delay = state.speeds.approach, state.speeds.delay
         middle = middle_of_contact(cantilever, platform, state.flight.start_us - 0.5 * delay)
-        depth = indentation(approach, impact.hertz_time(approach), middle)
-    length, phase = lockin(cantilever, platform, state.flight, order, delayed=impact.delayed, indentation=depth)
+        if isinstance(impact, PulledImpact):
+            nu = platform.angular_frequency / order
+            tap = impact.during(approach, middle, cantilever)
+            # the last term as of a parabola
+            depth = tap.area * (1.0 - 0.5 * nu**2 * tap.spread + (nu * delay) ** 4 / 4480.0)
+            late = tap.late
+        else:
+            depth = indentation(approach, impact.hertz_time(approach), middle)
+    below = {"indentation": depth, "late_us": late}
+    length, phase = lockin(cantilever, platform, state.flight, order, delayed=impact.delayed, **below)
     return jnp.stack([peak_amplitude(cantilever, state.flight), length, phase])
 
 
