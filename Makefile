@@ -77,8 +77,8 @@ fuzz: $(SETUP) ## random work, seeded; FUZZ='--flights 1000000 --orbits 100000 -
 bands: $(SETUP) ## do the 95 % bands hold the laws of ten random contacts? (twenty minutes; the truths are kept in /tmp)
 	$(BIN)/python -m tests.coverage_of_bands
 
-tapping: $(SETUP) ## are tapping curves of random contacts predicted and fitted as they should be? (the truths are kept in /tmp)
-	$(BIN)/python -m tests.tapping_accuracy
+tapping: $(SETUP) ## are tapping curves of random contacts predicted and fitted as they should be? (TAPPING="--model contact")
+	$(BIN)/python -m tests.tapping_accuracy $(TAPPING)
 
 ranks: $(SETUP) ## are true values anywhere in the posteriors of 1000 simulated tables equally often? (half an hour)
 	$(BIN)/python -m tests.coverage_of_ranks

@@ -12,7 +12,7 @@ import math
 import types
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self, TypeVar, dataclass_transform, get_args
 
 import numpy as np
 
@@ -46,10 +46,63 @@ UNITS = {
 """Units by the end of a field's name."""
 
 
+class Result:
+    """The methods that `public_result` gives; what a named tuple has instead of this base: see `ResultTuple`."""
+
+    _picture: ClassVar[str]
+    _rows: ClassVar[str]
+    _words: ClassVar[dict[str, type[enum.IntEnum]]]
+
+    def __repr__(self) -> str:
+        return text_of(self)
+
+    def _repr_html_(self) -> str:
+        return html_of(self)
+
+    def plot(self, path: str | Path | None = None) -> "Figure":
+        """Return the picture of this result, a matplotlib figure; write it, PNG, PDF or SVG, if a path is given."""
+        module, _, name = self._picture.partition(":")
+        figure = getattr(importlib.import_module(module), name)(self)
+        style = importlib.import_module("afm_jax.plots.picture_style")
+        # a figure without pyplot is shown by a notebook only if it says how
+        figure._repr_png_ = lambda: style.png_of(figure)
+        if path is not None:
+            style.save(figure, Path(path))
+        return figure
+
+    def to_pandas(self) -> "DataFrame":
+        """Return this result as a table of pandas."""
+        return _frame(self, self._rows)
+
+    def to_xarray(self) -> "Dataset":
+        """Return this result's arrays as a data set of xarray, with their units; texts are its attributes."""
+        return dataset_of(self)
+
+    def save(self, path: str | Path) -> None:
+        """Write this result as a JSON file, whole or not at all; `afm_jax.load` gives it back."""
+        save(self, path)
+
+
+if TYPE_CHECKING:
+
+    @dataclass_transform(frozen_default=True)
+    class ResultTuple(Result, tuple[Any, ...]):
+        """A named tuple with the methods of `Result`, as type checkers see it: Python allows it no other base."""
+
+        __slots__ = ()
+        _fields: ClassVar[tuple[str, ...]]
+
+        def _asdict(self) -> dict[str, Any]: ...
+        def _replace(self, **values: Any) -> Self: ...
+
+else:
+    ResultTuple = NamedTuple
+
+
 def public_result(
     *, picture: str = "afm_jax.plots.results:figure_of", rows: str = "", **words: type[enum.IntEnum]
 ) -> Callable[[Kind], Kind]:
-    """Return a decorator that makes a class of records a result.
+    """Return a decorator that makes a `Result` or `ResultTuple` a result.
 
     Args:
         picture: the function that draws it, "module:function"; as a rule its arrays against the first of them.
@@ -58,32 +111,9 @@ def public_result(
     """
 
     def decorate(kind: Kind) -> Kind:
-        def plot(self: Any, path: str | Path | None = None) -> "Figure":
-            """Return the picture of this result, a matplotlib figure; write it, PNG, PDF or SVG, if a path is given."""
-            module, _, name = picture.partition(":")
-            figure = getattr(importlib.import_module(module), name)(self)
-            style = importlib.import_module("afm_jax.plots.picture_style")
-            # a figure without pyplot is shown by a notebook only if it says how
-            figure._repr_png_ = lambda: style.png_of(figure)
-            if path is not None:
-                style.save(figure, Path(path))
-            return figure
-
-        def to_pandas(self: Any) -> "DataFrame":
-            """Return this result as a table of pandas."""
-            return _frame(self, rows)
-
-        methods = {
-            "__repr__": text_of,
-            "_repr_html_": html_of,
-            "_words": words,
-            "plot": plot,
-            "to_pandas": to_pandas,
-            "to_xarray": dataset_of,
-            "save": save,
-        }
-        for name, method in methods.items():
-            setattr(kind, name, method)
+        methods = {name: method for name, method in vars(Result).items() if callable(method)}
+        for name, value in {**methods, "_picture": picture, "_rows": rows, "_words": words}.items():
+            setattr(kind, name, value)
         return kind
 
     return decorate

@@ -25,17 +25,18 @@ from jaxtyping import Array, Bool, Float, Int
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import detected, height_of_free_deflection
 from afm_jax.checks import require_float64
+from afm_jax.contact.bent_lever import tapped
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem
 from afm_jax.impact.first_impact import Flight, flight_gap
-from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact, middle_of_contact
+from afm_jax.impact.lasting_impact import LawImpact, PulledImpact, TabulatedImpact, middle_of_contact
 from afm_jax.impact.law import Speeds
 from afm_jax.impact.map import NEAR_GRAZING
 from afm_jax.impact.orbits import amplitudes, near_fold, orbit_state, steady_orbits
 from afm_jax.impact.roots import follow_root, harmless_coordinate
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem, Rows, measurement_of
 from fitting.parameters import CONTACT_NAMES, NUISANCE_NAMES, PARAMETERS, model_parameters
 from fitting.tables.table import AmplitudeTable
@@ -50,18 +51,23 @@ class Branch(NamedTuple):
     near_fold: Bool[Array, ""]
 
 
-def impact_of(values: Float[Array, " p"], measurement: Measurement, problem: Problem) -> LawImpact | TabulatedImpact:
+AnyImpact = LawImpact | TabulatedImpact | PulledImpact
+
+
+def impact_of(values: Float[Array, " p"], measurement: Measurement, problem: Problem) -> AnyImpact:
     """Return what an impact does at a set of values: the model's law, or the table of its contact."""
     if problem.model != "contact":
         return LawImpact(problem.law(values, measurement.fixed))
     chosen = {name: value for name, value in problem.known(values).items() if name in problem.own}
     contact = Contact.paper(effects=problem.effects, **(measurement.fixed | chosen))
+    if measurement.pulls is not None:
+        return tapped(contact, measurement.cantilever, measurement.pulls)
     return tabulated(contact, measurement.cantilever.mass_ng)
 
 
 def orbit_problem(
     values: Float[Array, " p"],
-    impact: LawImpact | TabulatedImpact,
+    impact: AnyImpact,
     row: Rows,
     measurement: Measurement,
     problem: Problem,
@@ -76,6 +82,8 @@ def orbit_problem(
         ratio = row.drive_frequency_khz / cantilever.frequency_khz
         amplitude = height_of_free_deflection(amplitude, ratio, cantilever.quality_factor)
     offset = row.offset_nm + problem.nuisance(values, "offset_origin_nm", 0.0)
+    if isinstance(impact, PulledImpact):
+        offset = offset + impact.plane_nm
     return OrbitProblem(
         cantilever, Platform(amplitude, row.drive_frequency_khz, offset), impact, jnp.asarray(row.order)
     )
@@ -155,8 +163,9 @@ def branch_near(coordinate: Any) -> Branch:
 
 BATCH = 8
 """Sets of parameters that `linearise` takes at once."""
-SEARCHED, SOLVED = 128, 1024
-"""Pairs of a set and a row that one program takes: where impacts last, and where each takes a hundredth of that."""
+TAPPED, SEARCHED, SOLVED = 32, 128, 1024
+"""Pairs of a set and a row that one program takes: of taps, where impacts last, and where each takes a hundredth of
+that."""
 CENSORED = 3.0
 """Residual of a row where no orbit was seen and the model has a steady one: e^(-9/2), a probability of 1 %."""
 
@@ -262,7 +271,7 @@ def warm_up(values: Float[np.ndarray, " p"], measurement: Measurement, problem: 
 
 
 def _lanes(problem: Problem) -> int:
-    return SEARCHED if problem.lasting else SOLVED
+    return TAPPED if problem.pulled else SEARCHED if problem.lasting else SOLVED
 
 
 def _in_every_lane(
@@ -359,16 +368,20 @@ def impact_slopes(
     filled, impacts = filled_up(np.asarray(values)[None], measurement, problem)
     still = jax.tree.map(lambda leaf: np.zeros(leaf.shape), impacts.slopes)
 
-    def along(where: Callable[[Any], Any], turn: float) -> tuple[np.ndarray, np.ndarray]:
+    def along(where: Callable[[Any], Any], turn: float, *constant: Any) -> tuple[np.ndarray, np.ndarray]:
         leaf = np.array(where(still))
-        # tables have a series: its constant term
-        leaf[(slice(None), 0, *(0,) * (leaf.ndim - 2))] = turn
+        leaf[(slice(None), 0, *constant)] = turn
         turned = impacts._replace(slopes=eqx.tree_at(where, still, leaf))
         block = _in_every_lane(filled, 1, turned, measurement, problem, near)
         return np.asarray(block.slope)[0, :, :, 0], np.asarray(block.prediction.approach_speed_nm_per_us)[0]
 
+    # of a series its constant term
+    if isinstance(impacts.impact, PulledImpact):
+        both = 0, slice(None), 0
+        squares, times = along(lambda i: i.taps.terms, -1.0, *both, 0), along(lambda i: i.taps.terms, 1.0, *both, 1)
+        return ImpactSlopes(squares[0], times[0])
     if isinstance(impacts.impact, TabulatedImpact):
-        return ImpactSlopes(along(lambda i: i.loss, -1.0)[0], along(lambda i: i.time, 1.0)[0])
+        return ImpactSlopes(along(lambda i: i.loss, -1.0, 0)[0], along(lambda i: i.time, 1.0, 0)[0])
     by_square, _ = along(lambda i: i.law.epsilon, -1.0)
     if not impacts.impact.delayed:
         return ImpactSlopes(by_square, np.zeros_like(by_square))
@@ -389,8 +402,8 @@ class _Block(NamedTuple):
 class _Impacts(NamedTuple):
     """What an impact does at each set of values, and its derivatives by each parameter along a second axis."""
 
-    impact: LawImpact | TabulatedImpact
-    slopes: LawImpact | TabulatedImpact
+    impact: AnyImpact
+    slopes: AnyImpact
 
     def first(self) -> "_Impacts":
         """Return those of the first set, without their leading axis."""
@@ -408,8 +421,12 @@ def filled_up(
         problem, filled = measurement.joint.problem, measurement.joint.values(filled)
         measurement, points = measurement.of_drive(problem.drive), filled[:, 0]
     # an impact knows no rows: one program for tables of every size
-    rows = jax.tree.map(lambda column: np.asarray(column)[:0], measurement.rows)
-    return filled, jax.tree.map(np.asarray, impacts_of(points, measurement._replace(rows=rows), problem))
+    rowless = measurement._replace(rows=jax.tree.map(lambda column: np.asarray(column)[:0], measurement.rows))
+    # a table of taps takes long, and a fit mostly asks for one: each by itself
+    parts = [points[i : i + 1] for i in range(len(values))] if problem.pulled else [points]
+    found = [jax.tree.map(np.asarray, impacts_of(part, rowless, problem)) for part in parts]
+    found += [found[-1]] * (BATCH - sum(len(part) for part in parts))
+    return filled, jax.tree.map(lambda *leaves: np.concatenate(leaves), *found) if found[1:] else found[0]
 
 
 def impact_at(values: Float[np.ndarray, " p"], measurement: Measurement, problem: Problem) -> _Impacts:
@@ -440,8 +457,10 @@ class Free(NamedTuple):
 
 
 @jax.jit
-def free_impacts(impact: LawImpact | TabulatedImpact, coordinate: Float[Array, " n"]) -> Free:
-    """Return what an impact does to free tips."""
+def free_impacts(impact: AnyImpact, coordinate: Float[Array, " n"]) -> Free:
+    """Return what an impact does to free tips; coordinates of taps are taken for those of free ones."""
+    if isinstance(impact, PulledImpact):
+        impact = impact.free
     speeds = jax.vmap(impact.speeds)(coordinate)
     just_above = impact.speeds(impact.lowest * (1.0 + 1e-9)).approach
     return Free(speeds, impact.hertz_time(speeds.approach), impact.lowest, just_above, impact.length)
@@ -514,8 +533,11 @@ def _impact_and_slopes(values: Float[Array, " p"], measurement: Measurement, pro
     def turned(e):
         return jax.jvp(lambda v: impact_of(v, measurement, problem), (values,), (e,))
 
-    # The derivatives by a nuisance are zeros: not worth another program.
-    return impact_of(values, measurement, problem), jax.vmap(lambda e: turned(e)[1])(jnp.eye(values.shape[0]))
+    own = jax.vmap(lambda e: turned(e)[1])(jnp.eye(len(problem.own), values.shape[0]))
+    # those by a nuisance, of which the others come after the model's own, are zeros
+    nothing = values.shape[0] - len(problem.own)
+    slopes = jax.tree.map(lambda leaf: jnp.pad(leaf, [(0, nothing), *[(0, 0)] * (leaf.ndim - 1)]), own)
+    return impact_of(values, measurement, problem), slopes
 
 
 def _prediction(
@@ -553,7 +575,7 @@ GRAZE_ON_THE_WAY = "the flight grazes the platform on the way: a small change ma
 
 @public_result()
 @dataclass(frozen=True)
-class AmplitudeGradients:
+class AmplitudeGradients(Result):
     """Predicted amplitudes of a table's rows, peak and lock-in, and their derivatives.
 
     Attributes:

@@ -58,6 +58,13 @@ def _unbounded(parameter: Parameter, coordinate: Numbers) -> Numbers:
     return np.exp(coordinate)
 
 
+def left_open(parameter: Parameter, value: float) -> float:
+    """Return the standard error of a value of which nothing is known but its range."""
+    even = parameter.sign or parameter.width
+    reach = parameter.highest - parameter.lowest if even else value * np.log(parameter.highest / parameter.lowest)
+    return float(reach / np.sqrt(12.0))
+
+
 @dataclass(frozen=True)
 class Problem:
     """What is fitted: the model's parameters, then nuisances; which effects a contact has, and what is driven."""
@@ -76,6 +83,11 @@ class Problem:
     def parameters(self) -> tuple[Parameter, ...]:
         """The parameters in the order of every vector."""
         return tuple(parameter_called(name) for name in self.names)
+
+    @property
+    def pulled(self) -> bool:
+        """Whether impacts are those of a contact under a bent lever."""
+        return self.model == "contact" and self.tapping
 
     @property
     def lasting(self) -> bool:
@@ -124,6 +136,18 @@ class Problem:
             known.get("free_frequency_khz", measured.frequency_khz),
             known.get("quality_factor", measured.quality_factor),
             measured.mass_ng,
+        )
+
+    def known_by_range(self, values: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+        """Return the inverse variances of values of which nothing is known but their range; 0 of what needs data.
+
+        Parameters of a contact under a bent lever may stay open: its law does not hang on each of them.
+        """
+        return np.array(
+            [
+                left_open(parameter, value) ** -2.0 if self.pulled and name in self.own else 0.0
+                for name, parameter, value in zip(self.names, self.parameters, values, strict=True)
+            ]
         )
 
     def nuisance(self, values: Float[Array, " p"], name: str, neutral: float) -> Float[Array, ""]:
@@ -197,6 +221,7 @@ class Measurement(NamedTuple):
         constraint_value: what is known of each parameter beforehand, shape (p,).
         constraint_error: its standard error, infinite where nothing is known.
         fixed: values of the model's parameters that are not fitted, by name; of a contact those not the paper's.
+        pulls: weakest and strongest of the bent lever in nm/us^2, where a driven tip meets a contact; None elsewhere.
         joint: where the rows are of several tables: which parameters are whose; no compiled program takes it.
     """
 
@@ -205,6 +230,7 @@ class Measurement(NamedTuple):
     constraint_value: Float[AnyArray, " p"]
     constraint_error: Float[AnyArray, " p"]
     fixed: dict[str, Float[AnyArray, ""]]
+    pulls: Float[AnyArray, " 2"] | None = None
     joint: Joint | None = None
 
     def of_drive(self, drive: str) -> "Measurement":
@@ -213,7 +239,7 @@ class Measurement(NamedTuple):
         chosen = np.array(self.joint.drives)[self.rows.table] == drive
         rows = jax.tree.map(lambda column: np.asarray(column)[chosen], self.rows._replace(table=None))
         count = len(self.joint.problem.names)
-        return Measurement(rows, self.cantilever, np.ones(count), np.full(count, np.inf), self.fixed)
+        return Measurement(rows, self.cantilever, np.ones(count), np.full(count, np.inf), self.fixed, self.pulls)
 
 
 def constraints_of(
@@ -256,7 +282,25 @@ def measurement_of(
         constraint_value=value,
         constraint_error=error,
         fixed=held,
+        pulls=_pulls(rows, cantilever) if problem.pulled else None,
     )
+
+
+_PULL_ROOM, _WIDEST = 1.15, 0.02
+"""By how much a table of pulls goes beyond those of the rows, which shift with heights and calibrations; the weakest of
+it over the strongest, at least."""
+
+
+def _pulls(rows: Rows, cantilever: Cantilever) -> Float[np.ndarray, " 2"]:
+    """Return the weakest and the strongest pull of spring and drive at the sample that the rows have, in nm/us^2."""
+    ratio = np.asarray(rows.drive_frequency_khz) / float(cantilever.frequency_khz)
+    # the tip meets the sample near the bottom of its swing
+    push = np.maximum(ratio**2 - 1.0, 0.0) * np.asarray(rows.drive_amplitude_nm)
+    hits = np.asarray(rows.measured).any(axis=1) & ~rows.free
+    pull = np.where(hits, -np.asarray(rows.offset_nm), 0.0)
+    strongest = _PULL_ROOM * np.max(pull + np.where(hits, push, 0.0), initial=1.0)
+    weakest = np.min(np.where(hits, pull - BRIDGE_NM + 0.5 * push, np.inf), initial=strongest) / _PULL_ROOM
+    return float(cantilever.angular_frequency) ** 2 * np.array([max(weakest, _WIDEST * strongest), strongest])
 
 
 def _constraint_columns(
@@ -301,7 +345,11 @@ def joint_measurement(
     for unread in (rows.measured, rows.no_orbit):
         unread[tables.rows :] = False
     value, error = _constraint_columns(problem, known)
-    return parts[0]._replace(rows=rows, constraint_value=value, constraint_error=error, joint=joint)
+    whole_measurement = parts[0]._replace(rows=rows, constraint_value=value, constraint_error=error, joint=joint)
+    if not problem.pulled:
+        return whole_measurement
+    pulls = np.array([part.pulls for part in parts])
+    return whole_measurement._replace(pulls=np.array([pulls.min(), pulls.max()]))
 
 
 def rows_of(table: AmplitudeTable) -> Rows:

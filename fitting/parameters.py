@@ -210,6 +210,7 @@ CONTACT = tuple(
         meaning=known.meaning,
         lowest=known.fitted[0],
         highest=known.fitted[1],
+        sign=int(known.allowed == "not negative"),
         width=known.width,
         starts=known.starts,
         even=known.evenly is not None,

@@ -200,7 +200,7 @@ MUTATIONS = {
         "integrals[:, 0] = 1.0 - roots",
         COLLOCATION,
     ),
-    "time in the junction counted once": Mutation("2.0 * inside + outside", "inside + outside", COLLISIONS),
+    "time in the junction counted once": Mutation("2.0 * one + other", "one + other", COLLISIONS),
     "delay counted from where the bridge forms, both ways": Mutation(
         "approach_speed + ways.outer_gap_nm",
         "approach_speed + contact.bridge_forms_nm",

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from types import ModuleType
 
@@ -15,12 +16,13 @@ import jax
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+from rich.console import Console
 from rich.table import Table
 
 import afm_jax
 import fitting
 from afm_jax import strict_json
-from afm_jax.cli import main
+from afm_jax.cli import main, session
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import PRESET_NAMES, example_path
@@ -302,11 +304,39 @@ def test_interrupt_ends_with_130():
 
 
 def test_compiling_is_not_counted_in_the_time_left(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    clock = iter([0.0, *[30.0] * 3, *[33.0] * 2])
+    clock = iter([0.0, 0.0, *[30.0] * 3, *[33.0] * 3])
     monkeypatch.setattr("afm_jax.cli.session.time.monotonic", lambda: next(clock))
-    report = Session(json=False, out=None).progress("points")
-    for done in (100, 200):
-        report(done, 400)
+    with Session(json=False, out=None).working("computing", "points") as report:
+        for done in (100, 200):
+            report(done, 400)
     first, second = capsys.readouterr().err.splitlines()
     assert first == "100 of 400 points"
     assert second == "200 of 400 points, about 6 s left"
+
+
+def test_a_terminal_is_told_how_long_it_took_the_last_time(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
+    now = 0.0
+    monkeypatch.setattr("afm_jax.cli.session.time.monotonic", lambda: now)
+    monkeypatch.setattr("afm_jax.cli.session.cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(Console, "is_terminal", True)
+    waits: list[session._Wait] = []
+    monkeypatch.setattr(Console, "status", lambda _, wait: waits.append(wait) or nullcontext())
+    lines = []
+    for seconds in (1.0, 5.0, 3.0):
+        now = 0.0
+        with Session(json=False, out=None).working("fitting 9 rows (the first run compiles)"):
+            now = seconds
+            lines.append(waits[-1].line())
+    assert lines == [
+        "fitting 9 rows (the first run compiles)",
+        "fitting 9 rows (the first run compiles): 5 s",
+        "fitting 9 rows: 3 s, last time 5 s",
+    ]
+    (tmp_path / "waits.json").write_text("{")
+    wait = session._Wait("sweeping up", "values", None)
+    now, last = 40.0, session._read_waits(tmp_path / "waits.json")
+    wait.count(1, 5)
+    now = 42.0
+    wait.count(2, 5)
+    now = 45.0
+    assert (wait.line(), last) == ("sweeping up: 2 of 5 values, about 3 s left", {})

@@ -32,13 +32,19 @@ def found(scene):
     return contact_orbits(scene, 1, 1)
 
 
-def next_departure(time_us: float, velocity: float, amplitude_nm: float = AMPLITUDE_NM) -> np.ndarray:
-    """Return time and velocity in the lab at the end of the contact after a departure, by the reference."""
-    system = DrivenContact(amplitude_nm=amplitude_nm, drive_frequency_khz=FREQUENCY_KHZ)
-    gap = system.contact.bridge_breaks_nm
-    course = follow(system, time_us, amplitude_nm * np.cos(OMEGA * time_us) + gap, velocity, contacts=1)
-    last = course.contacts[-1]
-    rate = -amplitude_nm * OMEGA * np.sin(OMEGA * last.departure_time_us)
+def next_departure(
+    time_us: float,
+    velocity: float,
+    amplitude_nm: float = AMPLITUDE_NM,
+    frequency_khz: float = FREQUENCY_KHZ,
+    contacts: int = 1,
+) -> np.ndarray:
+    """Return time and velocity in the lab by the reference, at the end of some contacts after a departure."""
+    system = DrivenContact(amplitude_nm=amplitude_nm, drive_frequency_khz=frequency_khz)
+    omega = 2e-3 * np.pi * frequency_khz
+    height = amplitude_nm * np.cos(omega * time_us) + system.contact.bridge_breaks_nm
+    last = follow(system, time_us, height, velocity, contacts=contacts).contacts[-1]
+    rate = -amplitude_nm * omega * np.sin(omega * last.departure_time_us)
     return np.array([last.departure_time_us, last.rebound_speed_nm_per_us + rate])
 
 
@@ -116,6 +122,24 @@ def test_the_fold_that_ends_both_orbits_is_one_of_the_reference(scene):
     ]
     multipliers = np.linalg.eigvals(np.stack(columns, axis=1))
     assert np.abs(multipliers - 1.0).min() < 2e-4
+
+
+def test_beyond_its_period_doubling_an_orbit_makes_two_contacts_in_the_reference():
+    # the orbit of one contact doubles its period at 1.3202 times 180 kHz
+    amplitude_nm, frequency_khz = 15.0, 180.0 * 1.3217
+    omega = 2e-3 * np.pi * frequency_khz
+    platform = afm.Platform(amplitude_nm=amplitude_nm, frequency_khz=frequency_khz)
+    found = contact_orbits(afm.Scene(afm.Cantilever(90.0, 40.0), platform, afm.Contact.paper()), 2, 2)
+    assert found.stable.tolist() == [True]
+    phase, velocity = found.reading.phase_rad[0], found.reading.velocity_after_nm_per_us[0]
+    time, speed = float(phase[0]) / omega, float(velocity[0])
+    half = next_departure(time, speed, amplitude_nm, frequency_khz)
+    assert np.exp(1j * omega * half[0]) == pytest.approx(np.exp(1j * float(phase[1])), abs=1e-6)
+    assert half[1] == pytest.approx(float(velocity[1]), rel=1e-6)
+    # not the orbit of one contact twice
+    assert abs(half[1] - speed) > 1e-3 * abs(speed)
+    whole = next_departure(time, speed, amplitude_nm, frequency_khz, contacts=2)
+    assert whole == pytest.approx([time + 2e3 / frequency_khz, speed], abs=1e-5)
 
 
 def test_orbits_of_a_contact_scene_are_told_by_the_command(tmp_path):

@@ -5,6 +5,7 @@ import json
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import zarr
@@ -16,6 +17,7 @@ from afm_jax.cli.main import main
 from afm_jax.dynamics.basins import basins_of_attraction, boundary_dimension
 from afm_jax.dynamics.bifurcations import bifurcation_diagram
 from afm_jax.dynamics.charts import stability_chart
+from afm_jax.dynamics.iteration import bouncing_tips
 from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
 
 FREQUENCY = "platform.reduced_frequency"
@@ -199,10 +201,33 @@ def test_a_thousand_random_points_of_a_chart_agree_with_long_iteration():
 
 
 @pytest.mark.slow
+def test_many_tips_begin_on_the_fastest_stable_orbit_of_the_full_search():
+    delay = afm.CollisionDelay(0.20774, 5.3795, 0.79532)
+    law = afm.ImpactLaw(1.0, 111.5, 0.55, delay)
+    scene = afm.Scene(afm.Cantilever(90.0, 40.0), afm.Platform(4.0, 181.8, 0.5), law)
+    values = np.linspace(0.9, 2.6, 300)
+    scenes = scene_batch(scene, {FREQUENCY: values})
+    tips = bouncing_tips(scenes)
+    found = jax.vmap(afm.single_impact_orbits)(scenes, jnp.maximum(1.0, jnp.round(jnp.asarray(values))))
+    steady = np.asarray(found.exists & found.admissible & found.stable)
+    slot = np.argmax(np.where(steady, found.approach_speed_nm_per_us, -np.inf), axis=1)
+    there, rows = steady.any(axis=1), np.arange(len(values))
+    assert 0.3 < there.mean() < 1.0
+    omega = np.asarray(scenes.platform.angular_frequency)
+    usual = 0.75 * np.asarray(scenes.platform.period_us)
+    time = np.where(there, np.asarray(found.phase_rad)[rows, slot] / omega, usual)
+    np.testing.assert_allclose(tips.time_us, time, rtol=1e-9)
+    velocity = np.asarray(found.velocity_after_nm_per_us)[rows, slot]
+    np.testing.assert_allclose(np.asarray(tips.velocity_nm_per_us)[there], velocity[there], rtol=1e-9)
+
+
+@pytest.mark.slow
 def test_shares_of_basins_are_those_of_random_starts():
     scene = law_scene(1.57)
     found = basins_of_attraction(scene, columns=100, rows=100, speeds_nm_per_us=(0.0, 15.0))
     assert {attractor.name for attractor in found.attractors} == {"(3,4)", "(2,4)"}
+    assert len(found.to_pandas()) == 10_000
+    assert found.plot().axes[0].get_xlabel()
     starts = 10_000
     phase, rebound = np.random.default_rng(7).uniform([[0.0], [0.0]], [[2.0 * np.pi], [15.0]], (2, starts))
     m = repeats_after(followed_in_numpy(1.57, 0.8, phase, rebound, 300))

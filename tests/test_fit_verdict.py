@@ -71,6 +71,18 @@ def test_a_bound_is_only_worth_a_word_where_the_model_explains_the_data(p_value,
     assert any("at its bound" in warning for warning in warnings) is said
 
 
+@pytest.mark.parametrize(("tapped", "open_ones", "refused"), [(True, 1, False), (True, 2, True), (False, 1, True)])
+def test_what_taps_do_not_determine_is_named_and_no_reason_to_refuse(tapped: bool, open_ones: int, refused: bool):  # noqa: FBT001
+    given = evidence("law", made_table())
+    names = ("modulus_gpa", "relative_humidity")
+    known = {name: made_parameter(name, 1.0) for name in names}
+    for name in names[:open_ones]:
+        known[name] = dataclasses.replace(known[name], interval95=(None, None), undetermined=True)
+    reasons, warnings = judge_fit(dataclasses.replace(given, parameters=known, correlations=np.eye(2), tapped=tapped))
+    assert any("modulus_gpa" in reason for reason in reasons) is refused
+    assert any(said.startswith("Not determined by these taps: modulus_gpa,") for said in warnings) is not refused
+
+
 @pytest.mark.parametrize(
     ("model", "said"),
     [

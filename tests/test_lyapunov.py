@@ -163,6 +163,12 @@ def test_the_command_tells_keys_null_and_bad_requests(tmp_path):
         assert run.exit_code == 2
         assert words in run.stderr
         assert run.stderr.count("\n") == 1
+    # far above the platform the free motion dies away
+    away = afm.Scene(afm.Cantilever(90.0, 40.0), afm.Platform(1.0, 180.0, -30.0), afm.ImpactLaw(0.5))
+    afm.save_scene(away, file)
+    run = CliRunner().invoke(main, ["lyapunov", str(file), "--json", "--parameter", "platform.amplitude_nm=1:2:3"])
+    assert run.exit_code == 3
+    assert "free: the tip no longer meets the platform" in json.loads(run.stdout)["reason"]
 
 
 def test_a_scene_without_a_drive_has_no_exponents():

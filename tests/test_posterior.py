@@ -208,6 +208,11 @@ def test_wrong_calls_are_refused_in_one_line(law, monkeypatch):
         posterior(law, method="nuts")
 
 
+def test_the_picture_of_a_grid_has_its_parameters_at_the_axes(law_grid):
+    axes = law_grid.plot().axes[0]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("r", "epsilon")
+
+
 def test_everything_goes_to_json(law_grid):
     plain = law_grid.to_dict()
     assert plain["method"] == "grid"

@@ -7,7 +7,7 @@ import pytest
 
 from afm_jax import Contact, ImpactLaw, load_scene, save_scene
 from afm_jax.scenefile import presets
-from afm_jax.scenefile.scenefile import load_start
+from afm_jax.scenefile.scenefile import load_scene_and_start
 
 # from the paper's captions: reduced frequency, drive amplitude, offset at the start; figures 2 and 3 are charts
 CAPTIONS = {
@@ -48,7 +48,7 @@ def test_a_preset_is_the_scene_of_its_caption(name: str, tmp_path: Path):
     path = tmp_path / "scene.toml"
     save_scene(scene, path, start=presets.preset_start(name))
     assert eqx.tree_equal(load_scene(path), scene)
-    assert load_start(path) == presets.preset_start(name)
+    assert load_scene_and_start(path)[1] == presets.preset_start(name)
 
 
 def test_figure_8_starts_as_told():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from fitting.fits.intervals import profile_intervals
+from fitting.fits.intervals import at_bound, check_minimum, covariance, profile_intervals
 from fitting.fits.objective import Objective
 from fitting.forward import Linearised
 from fitting.models import Problem
@@ -14,12 +14,15 @@ from fitting.models import Problem
 QUANTILE = 1.959963984540054  # 97.5 % of a normal distribution: its square is the 95 % of chi2
 
 
+LAW = Problem("law", ("r", "epsilon"))
+
+
 class LinearObjective(Objective):
     """Residuals that are linear in the values, with one constant among them."""
 
-    def __init__(self, design: np.ndarray, centre: np.ndarray):
+    def __init__(self, design: np.ndarray, centre: np.ndarray, problem: Problem = LAW):
         """Keep the matrix of the residuals and the values at which they vanish."""
-        self.problem = Problem("law", ("r", "epsilon"))
+        self.problem = problem
         self.design, self.centre = design, centre
 
     def at_values(self, values):
@@ -160,3 +163,40 @@ def test_an_interval_ends_where_an_orbit_is_lost():
     # within a hundredth of the standard error
     assert first.high == pytest.approx(0.81, abs=1e-4)
     assert first.low == pytest.approx(0.8 - QUANTILE * 0.01, abs=1e-5)
+
+
+TAPS = Problem("contact", ("relative_humidity", "modulus_gpa"), drive="force")
+ALL = np.ones(2, dtype=bool)
+
+
+def test_what_taps_leave_open_is_anything_within_its_range():
+    """Of the sample's own contact it is no minimum; the variance of ln K over its range is that of an even density."""
+    values, design = np.array([0.4, 90.0]), np.diag([50.0, 0.0])
+    taps = LinearObjective(design, values, TAPS)
+    here = taps.problem.coordinates(values)
+    assert check_minimum(taps, here, ALL).converged
+    sample = LinearObjective(design, values, Problem("contact", TAPS.names))
+    assert not check_minimum(sample, here, ALL).converged
+    assert np.isinf(covariance(sample, values, ALL)[1, 1])
+    spread = covariance(taps, values, ALL)
+    ranged = np.diff(np.log(np.array([1.0, 2000.0])))[0] / np.sqrt(12.0)
+    assert np.sqrt(np.diag(spread)) == pytest.approx([0.02, 90.0 * ranged], rel=0.01)
+    humidity, modulus = profile_intervals(taps, values, spread, 1.5**2)
+    assert (humidity.low, humidity.high) == pytest.approx((0.4 - QUANTILE * 0.02, 0.4 + QUANTILE * 0.02), abs=1e-4)
+    assert (modulus.low, modulus.high) == (None, None)
+    assert modulus.reason == "; ".join(
+        f"{name} end: reaches the end of its range, {end}" for name, end in (("lower", 1), ("upper", 2000))
+    )
+
+
+@pytest.mark.parametrize(("drawn_to", "outward"), [(2100.0, True), (1900.0, False)])
+def test_a_parameter_at_the_end_of_its_range_is_held_there(drawn_to: float, outward: bool):  # noqa: FBT001
+    values = np.array([0.4, 2000.0])
+    objective = LinearObjective(np.diag([50.0, 0.01]), np.array([0.4, drawn_to]), TAPS)
+    held = at_bound(objective, values)
+    assert held.tolist() == [False, True]
+    state = check_minimum(objective, objective.problem.coordinates(values), ~held)
+    assert state.converged == state.outward == outward
+    _, modulus = profile_intervals(objective, values, covariance(objective, values, ~held), 1.5**2)
+    assert modulus.high is None
+    assert modulus.low is not None

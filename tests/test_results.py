@@ -6,8 +6,12 @@ import enum
 import inspect
 import json
 import math
+import re
+import subprocess
+import sys
 import types
 import typing
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -22,8 +26,11 @@ import fitting
 from afm_jax import results, saved
 from afm_jax.impact.map import NextImpact
 from afm_jax.motion.record import State
+from afm_jax.scenefile.parameter_paths import ParameterRange
+from fitting.fits.comparison import Comparison
 from tests.fit_tables import EXAMPLE
 from tests.fresh_python import python
+from tests.lockin_traces import noisy_bounce
 from tests.strict_reading import strictly
 
 PARAMETERS = {
@@ -38,6 +45,22 @@ PARAMETERS = {
     "Tone",
 }
 """What a simulation is made of, and scene files hold."""
+ROOT = Path(__file__).parent.parent
+OF_ONE_PIECE = {
+    "Basins",
+    "Bootstrap",
+    "Comparison",
+    "Continuation",
+    "Design",
+    "FitResult",
+    "Inversion",
+    "LockinResult",
+    "Posterior",
+    "StabilityChart",
+    "Tapping",
+    "TrustPack",
+}
+"""What is drawn in its own way, from parts that belong together: these are made by computations."""
 SIZES = {"rows": 7, "points": 5, "p": 2, "columns": 3, "orders": 2, "scenes": 21}
 
 
@@ -59,7 +82,7 @@ def public_results() -> dict[str, Any]:
 
 RESULTS = public_results()
 SOME: Any = State
-"""What the decorator adds is not known to type checkers."""
+"""Its fields are arrays; some tests have numbers and NumPy's arrays there."""
 
 
 def made(kind: Any, draw: np.random.Generator) -> Any:
@@ -131,6 +154,7 @@ def same(one: Any, other: Any) -> bool:
         return type(one) is type(other) and len(one) == len(other) and all(map(same, one, other))
     if isinstance(one, np.ndarray | jax.Array):
         return isinstance(other, type(one)) and one.dtype == other.dtype and np.array_equal(one, other, equal_nan=True)
+    one = one.item() if isinstance(one, np.generic) else one
     if isinstance(one, float):
         return isinstance(other, float) and (one == other or (math.isnan(one) and math.isnan(other)))
     return callable(one) or (type(one) is type(other) and one == other)
@@ -186,7 +210,7 @@ def test_arrays_of_one_shape_are_columns_and_units_are_told():
 
 def test_outcomes_are_words_and_traced_values_and_shapes_can_be_told():
     zeros = jnp.zeros(3)
-    many: Any = NextImpact(zeros, zeros, zeros, zeros, jnp.array([0, 0, 1]), jnp.zeros(3, bool))
+    many = NextImpact(zeros, zeros, zeros, zeros, jnp.array([0, 0, 1]), jnp.zeros(3, bool))
     assert "2 impact, 1 captured" in repr(many)
     told = []
     jax.jit(lambda x: told.append(repr(SOME(x, x, x))))(np.zeros((2, 3)))
@@ -250,7 +274,7 @@ def test_a_table_of_pandas_is_an_amplitude_table_and_back():
             assert same(value, getattr(again, name)), name
     bare = frame[["order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm", "peak_amplitude_nm"]].copy()
     bare.attrs = {}
-    noisy: Any = fitting.AmplitudeTable.from_dataframe(bare, noise=0.01, free_frequency_khz=90.0)
+    noisy = fitting.AmplitudeTable.from_dataframe(bare, noise=0.01, free_frequency_khz=90.0)
     assert noisy.peak_amplitude_error_nm == pytest.approx(0.01 * table.peak_amplitude_nm, rel=1e-15)
     with pytest.raises(fitting.TableError, match="free_frequency_khz is missing"):
         fitting.AmplitudeTable.from_dataframe(bare, noise=0.01)
@@ -264,10 +288,64 @@ def test_both_packages_tell_type_checkers_that_they_are_typed():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")  # numbers at random, some of them NaN
+def test_every_result_of_numbers_is_a_table_and_a_picture_that_says_what_is_drawn(tmp_path: Path):
+    for name in sorted(RESULTS.keys() - OF_ONE_PIECE):
+        record = made(RESULTS[name], np.random.default_rng(6))
+        table = record.to_pandas()
+        assert table.size, name
+        figure = record.plot(tmp_path / "picture.svg")
+        assert any(axes.get_xlabel() for axes in figure.axes), name
+        assert "<svg" in (tmp_path / "picture.svg").read_text(), name
+
+
+USER = """
+import afm_jax as afm
+import fitting
+from typing import reveal_type
+
+result = fitting.fit(fitting.read_table("amplitudes.csv"))
+orbits = afm.single_impact_orbits(afm.load_scene("scene.toml"), 1)
+collision = afm.collide(afm.Contact.paper(), 1.0)
+reveal_type(result.plot())
+reveal_type(result.parameters["r"].value)
+reveal_type(orbits.plot)
+reveal_type(orbits.to_pandas())
+reveal_type(collision.save)
+reveal_type(collision.to_xarray())
+reveal_type(collision.rebound_speed_nm_per_us)
+collision.rebound_speed
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not find_spec("pyright"), reason="no pyright")
+def test_type_checkers_of_users_see_the_methods_of_results(tmp_path: Path):
+    (tmp_path / "user.py").write_text(USER)
+    (tmp_path / "pyrightconfig.json").write_text(json.dumps({"extraPaths": [str(ROOT)]}))
+    command = [sys.executable, "-m", "pyright", "--outputjson", "--pythonpath", sys.executable, "user.py"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    told = [each["message"] for each in json.loads(done.stdout)["generalDiagnostics"]]
+    path = "path: str | Path | None = None"
+    assert [re.sub("^Type of .* is ", "", message).partition("\n")[0] for message in told] == [
+        '"Figure"',
+        '"float"',
+        f'"({path}) -> Figure"',
+        '"DataFrame"',
+        '"(path: str | Path) -> None"',
+        '"Dataset"',
+        '"Array"',
+        'Cannot access attribute "rebound_speed" for class "Collision"',
+    ]
+
+
+@pytest.mark.slow
 def test_results_of_computations_come_back_with_pictures(tmp_path: Path):
     table: Any = fitting.read_table(EXAMPLE)
     scene = afm.Scene(afm.Cantilever(90.0, 40.0), afm.Platform(4.0, 180.0), afm.ImpactLaw(0.95, 60.0))
     fitted: Any = fitting.fit(table.to_pandas())
+    amplitude = ParameterRange("platform.amplitude_nm", 3.0, 4.5)
+    plane = afm.scene_family(scene, "platform.reduced_frequency", "platform.amplitude_nm")
     found: dict[str, Any] = {
         "fit": fitted,
         "inversion": fitting.invert(table),
@@ -281,7 +359,19 @@ def test_results_of_computations_come_back_with_pictures(tmp_path: Path):
         "orbits": afm.single_impact_orbits(scene, 1),
         "simulation": afm.simulate(scene, SOME(0.0, 10.0, 0.0), 100.0),
         "collision": afm.collide(afm.Contact.paper(), np.array([8.0, 20.0, 30.0])),
+        "chart": afm.stability_chart(
+            plane, x_values=np.array([0.9, 1.0, 1.01]), y_values=np.array([3.0, 4.0]), last_order=1
+        ),
+        "branches": afm.continue_orbits(scene, 1, amplitude),
+        "comparison": Comparison([{"model": "law"}], "one only", {"law": fitted}),
+        "bootstrap": fitting.Bootstrap(
+            ("r", "epsilon"), np.zeros(2), np.random.default_rng(3).normal(size=(50, 2)), failures=0, seed=3
+        ),
+        "lockin": fitting.lockin(noisy_bounce(1)[0]),
     }
+    # these take longer, and are drawn by the tests of their own
+    later = {"Basins", "Posterior", "Tapping", "TrustPack"}
+    assert OF_ONE_PIECE - {type(record).__name__ for record in found.values()} == later
     for name, record in found.items():
         path = tmp_path / f"{name}.json"
         record.save(path)

@@ -8,7 +8,7 @@ import pytest
 
 from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, SceneError, load_scene, save_scene
 from afm_jax.cli.values import scene_and_start
-from afm_jax.scenefile.scenefile import Start, load_start
+from afm_jax.scenefile.scenefile import Start, load_scene_and_start
 
 HEAD = (
     "[cantilever]\nfrequency_khz = 90\n[platform]\namplitude_nm = 4\nfrequency_khz = 180\noffset_rate_nm_per_us = 0.5\n"
@@ -50,11 +50,11 @@ GOOD = [
 @pytest.mark.parametrize(("interaction", "start"), GOOD)
 def test_loop_is_exact(path: Path, interaction: str, start: Start):
     write(path, interaction, start)
-    assert load_start(path) == start
+    assert load_scene_and_start(path)[1] == start
     scene = load_scene(path)
     path.unlink()
     save_scene(scene, path, start=start)
-    assert load_start(path) == start
+    assert load_scene_and_start(path)[1] == start
 
 
 INSIDE = "must be positive, but is {}: the tip would start inside the sample"
@@ -92,7 +92,7 @@ BAD += [
 @pytest.mark.parametrize(("interaction", "start", "expected"), BAD)
 def test_a_start_that_cannot_be_is_named(path: Path, interaction: str, start: Start, expected: str):
     write(path, interaction, start)
-    for load in (load_scene, load_start):
+    for load in (load_scene, load_scene_and_start):
         with pytest.raises(SceneError) as caught:
             load(path)
         line = str(caught.value)

@@ -159,6 +159,7 @@ def test_bundled_curve_gives_the_energy_of_the_simulations_ledger():
     # the law is refused, with what to record instead
     assert result.law is None
     assert "3 to 10 % above resonance" in (result.reason or "")
+    assert result.plot().axes[0].get_ylabel() == "amplitude (nm)"
     branch = next(one for one in result.hysteresis if one.change == "branch")
     assert branch.approach is not None
     assert branch.retract is not None

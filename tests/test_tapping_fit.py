@@ -15,7 +15,16 @@ from fitting.examples import make_tapping_curve
 from fitting.fits.fit import fit
 from fitting.models import reach_of, rows_of, tip_work
 from fitting.tables.table import AmplitudeTable, read_table
-from tests.tapping_accuracy import RATIO, fitted, forward, judge_fits, noisy
+from tests.tapping_accuracy import (
+    RATIO,
+    WORST_OF_CONTACT,
+    against_truth,
+    contact_of,
+    fitted,
+    forward,
+    judge_fits,
+    noisy,
+)
 from tests.tapping_truths import as_measured, exact_table, tapping_truth
 
 EXAMPLE = "fitting/examples/tapping_contact.csv"
@@ -83,3 +92,19 @@ def test_an_unseen_contact_is_predicted_and_fitted_as_wanted():
         found = fitted(truth, made)
         assert found is not None
         assert judge_fits(name, [found], exact=name == "exact") == 0
+
+
+@pytest.mark.slow
+def test_a_contact_comes_out_of_a_noisy_curve():
+    """What its taps hold, and to one side what they hold no better; nothing but the tip's radius is known."""
+    truth = tapping_truth(0)
+    result = contact_of(truth, noisy(as_measured(exact_table(truth, RATIO, TABLES)), truth, 0))
+    assert result.valid, result.reasons
+    found = against_truth(truth, result)
+    assert found is not None
+    assert np.max(np.abs(found.law)) < WORST_OF_CONTACT
+    for name in ("relative_humidity", "adhesion_energy_j_per_m2", "viscosity_pa_s", "modulus_gpa"):
+        low, high = result.parameters[name].interval95
+        assert (low or 0.0) < truth.parameters[name] < (high or np.inf)
+    assert result.parameters["viscosity_pa_s"].at_bound
+    assert None not in result.parameters["modulus_gpa"].interval95

@@ -175,6 +175,8 @@ def test_a_right_posterior_is_not_complained_of(pack):
     assert abs(inside50 - 0.5 * readings) < 4.0 * np.sqrt(0.25 * readings)
     assert inside95 > 0.95 * readings - 4.0 * np.sqrt(0.0475 * readings)
     assert not [line for line in pack.complaints if "uniform" in line or "readings" in line]
+    assert len(pack.to_pandas()) == readings
+    assert pack.plot().axes
 
 
 @pytest.mark.slow

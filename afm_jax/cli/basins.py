@@ -73,10 +73,8 @@ def command(
     loaded, known = with_fitted_law(loaded, law)
     columns, rows = grid
     try:
-        with session.working("following starts (the first run compiles for some seconds)"):
-            found = basins_of_attraction(
-                loaded, columns=columns, rows=rows, speeds_nm_per_us=speeds, report=session.progress("starts")
-            )
+        with session.working("following starts (the first run compiles for some seconds)", "starts") as report:
+            found = basins_of_attraction(loaded, columns=columns, rows=rows, speeds_nm_per_us=speeds, report=report)
             band = None if known is None else drawn_shares(loaded, found, known, draws=draws)
     except ValueError as error:
         raise ValueError(f"{scene}: {error}") from error

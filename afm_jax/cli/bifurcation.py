@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from afm_jax.dynamics.bifurcations import Sweep
 
 POINTS = ("phase_rad", "approach_speed_nm_per_us", "velocity_after_nm_per_us", "platform_height_nm")
+_NONE_WENT_ON = (
+    "no motion went on at any value: the tip sticks or flies away; try a larger drive amplitude, or a [start]"
+)
 _LISTED = 6
 """Kinds of motion named in the summary."""
 
@@ -67,11 +70,11 @@ def command(  # noqa: PLR0913
     sweeps = []
     try:
         for upward in directions:
-            with session.working("sweeping up" if upward else "sweeping down"):
-                told = session.progress("values up" if upward else "values down")
+            way = "up" if upward else "down"
+            with session.working(f"sweeping {way}", f"values {way}") as report:
                 sweeps.append(
                     bifurcation_diagram(
-                        loaded, swept.path, swept.values, start=start, upward=upward, impacts=impacts, report=told
+                        loaded, swept.path, swept.values, start=start, upward=upward, impacts=impacts, report=report
                     )
                 )
         probabilities = None
@@ -92,21 +95,21 @@ def command(  # noqa: PLR0913
         target = session.out / f"bifurcation.{picture}"
         draw_bifurcations(swept.path, sweeps, target, probabilities)
         session.note(f"wrote {target}")
+    went_on = any(np.isfinite(sweep.phase_rad).any() for sweep in sweeps)
     payload = {
         "parameter": swept.path,
         "scene": scene_tables(loaded),
         "impacts_each": impacts,
         "sweeps": [_payload(sweep) for sweep in sweeps],
+        "reason": None if went_on else _NONE_WENT_ON,
     }
     if probabilities is not None:
         payload["draws"] = draws
         for told, sure in zip(payload["sweeps"], probabilities, strict=True):
             told["verdict_probability"] = sure
     session.emit(payload, *(_summary(sweep) for sweep in sweeps))
-    if not any(np.isfinite(sweep.phase_rad).any() for sweep in sweeps):
-        raise NotValid(
-            "no motion went on at any value: the tip sticks or flies away; try a larger drive amplitude, or a [start]"
-        )
+    if not went_on:
+        raise NotValid(_NONE_WENT_ON)
 
 
 def _payload(sweep: "Sweep") -> dict[str, Any]:

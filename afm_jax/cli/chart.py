@@ -65,13 +65,13 @@ def command(  # noqa: PLR0913
     if len(across.values) * len(up.values) > _MOST_POINTS:
         raise ValueError(f"{across} and {up} are more than {_MOST_POINTS} points: chart fewer")
     try:
-        with session.working("searching for orbits (the first run compiles for some seconds)"):
+        with session.working("searching for orbits (the first run compiles for some seconds)", "points") as report:
             chart = stability_chart(
                 scene_family(loaded, across.path, up.path),
                 x_values=across.values,
                 y_values=up.values,
                 last_order=orders,
-                report=session.progress("points"),
+                report=report,
             )
             probability = None
             if known is not None:

@@ -111,11 +111,11 @@ def command(  # noqa: PLR0913
         refuse_other_than_law(loaded, scene)
     first, *others = ranges_of(scene, loaded, [parameter, *([] if second is None else [second])], counted=False)
     try:
-        with session.working("following orbits (the first run compiles for some seconds)"):
+        with session.working("following orbits (the first run compiles for some seconds)", "values") as report:
             if sticking:
                 from afm_jax.dynamics.sticking_orbits import follow_sticking  # noqa: PLC0415
 
-                found = follow_sticking(loaded, order, first, report=session.progress("values"))
+                found = follow_sticking(loaded, order, first, report=report)
             else:
                 found = continue_orbits(loaded, order, first, impacts=impacts, second=others[0] if others else None)
     except ValueError as error:

@@ -76,7 +76,8 @@ def _studied(
     from afm_jax.scenefile.scenefile import as_in_file  # noqa: PLC0415
 
     scene, start = scene_and_start(name)
-    with session.working("simulating with and without each effect (every program compiles for some seconds)"):
+    told = "simulating with and without each effect (every program compiles for some seconds)"
+    with session.working(told, "scenes") as report:
         if start is None:
             start = as_in_file(scene, default_start(scene))
         study = study_effects(
@@ -85,6 +86,6 @@ def _studied(
             duration_us=duration_us,
             accuracy=accuracy,
             only=only,
-            progress=lambda what: session.note(f"simulating: {what}"),
+            report=report,
         )
     return study, start

@@ -94,7 +94,8 @@ class Names(click.ParamType):
     show_default=True,
     type=click.Choice(MODELS),
     help="; ".join(f"{name}: {law.meaning}" for name, law in LAWS.items())
-    + f"; each with {DELAY_LAW.meaning} (+delay); contact: physical parameters through the resolved contact.",
+    + f"; each with {DELAY_LAW.meaning} (+delay); contact: physical parameters through the resolved contact, "
+    "of tapping curves on resonance too.",
 )
 @with_noise
 @click.option(
@@ -331,8 +332,14 @@ def _comparison(session: Session, found: "Found", result: "FitResult", settings:
     from fitting.fits.comparison import compare, rivals  # noqa: PLC0415
 
     models = rivals(result.model, settings["fixed"])
-    with session.working(f"comparing {', '.join(models)}"):
-        return compare(result.table, models, known={result.model: (found, result)}, **settings)
+    with session.working(f"comparing {', '.join(models)}", "models") as tell:
+        return compare(
+            result.table,
+            models,
+            report=lambda model: tell(models.index(model), len(models)),
+            known={result.model: (found, result)},
+            **settings,
+        )
 
 
 def _bootstrap(session: Session, result: "FitResult", samples: int, seed: int) -> Any:
@@ -359,8 +366,8 @@ def _write_arviz(session: Session, result: "FitResult", found: "Posterior", opti
 def _trust(session: Session, result: "FitResult", found: "Posterior", seed: int) -> "TrustPack":
     from fitting.sampling.trust_pack import trust  # noqa: PLC0415
 
-    with session.working("checking the posterior by simulated tables"):
-        return trust(result, found, seed=seed, report=session.progress("simulated tables"))
+    with session.working("checking the posterior", "simulated tables") as report:
+        return trust(result, found, seed=seed, report=report)
 
 
 def _words(name: str, extra: Any) -> str:

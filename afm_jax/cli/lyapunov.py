@@ -56,10 +56,9 @@ def command(  # noqa: PLR0913
     forgets its start: its exponents are minus infinity, null in JSON. Begins at the file's [start]; without one on the
     stable single-impact orbit of the order nearest to resonance, if there is one, else leaving the platform upward.
     With --law there is a band for the larger one, begun without [start]. With --out lyapunov.csv, and with --parameter
-    a picture. Exit code 3 where the motion ends before enough impacts.
+    a picture. Exit code 3 where every motion ends before enough impacts.
     """
     session.start_computing()
-    import numpy as np  # noqa: PLC0415
 
     from afm_jax.dynamics.exponents import exponent_verdicts, lyapunov_spectrum  # noqa: PLC0415
     from afm_jax.dynamics.motion_bands import drawn_exponents  # noqa: PLC0415
@@ -74,13 +73,13 @@ def command(  # noqa: PLR0913
     try:
         motions = scene_batch(loaded, given) if given else loaded
         start = None if told is None else start_of(motions, told)
-        with session.working("following the motion (the first run compiles for some seconds)"):
+        with session.working("following the motion (the first run compiles for some seconds)", "motions") as report:
             found = lyapunov_spectrum(
                 motions,
                 start,
                 impacts=impacts,
                 transient=transient,
-                report=session.progress("motions"),
+                report=report,
             )
             band = None
             if known is not None:
@@ -108,13 +107,25 @@ def command(  # noqa: PLR0913
     payload = _payload(found, verdicts if given else verdicts[0]) | {"scene": scene_tables(loaded)}
     if band is not None:
         payload |= {"draws": draws, "exponent_per_impact_interval95": band if given else band[0]}
+    reason = payload["reason"] = _why_none(many, verdicts)
     if given:
         payload |= {"parameter": ranges[0].path, "values": given[ranges[0].path]}
         session.emit(payload, _summary(many, str(ranges[0])))
-        return
-    session.emit(payload, *_text(found, verdicts[0]))
-    if np.isnan(found.exponents_per_impact[0]):
-        raise NotValid(f"{verdicts[0]}; there were {int(found.impacts)} impacts to average over")
+    else:
+        session.emit(payload, *_text(found, verdicts[0]))
+    if reason is not None:
+        raise NotValid(reason)
+
+
+def _why_none(found: "Lyapunov", verdicts: list[str]) -> str | None:
+    """Return why there are no exponents at all; None where there are some."""
+    import numpy as np  # noqa: PLC0415
+
+    if not np.isnan(found.exponents_per_impact[:, 0]).all():
+        return None
+    words = "; ".join(dict.fromkeys(verdicts))
+    most = "at most " if len(verdicts) > 1 else ""
+    return f"{words}; there were {most}{int(found.impacts.max())} impacts to average over"
 
 
 def _as_batch(found: "Lyapunov") -> "Lyapunov":

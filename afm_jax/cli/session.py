@@ -14,14 +14,15 @@ The `--out` folder: made and tried out before the computation, and the tables in
 import csv
 import functools
 import io
+import json
 import math
 import os
 import sys
 import tempfile
 import textwrap
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -99,6 +100,72 @@ _WIDTH_OF_A_PIPE = 10_000
 """Columns of text that nobody looks at in a terminal: no line is broken, no table turned."""
 
 
+class _Wait:
+    """Something being done, as the line that a terminal shows of it."""
+
+    def __init__(self, what: str, parts: str, last_s: float | None) -> None:
+        self.what, self.parts, self.last_s = what, parts, last_s
+        self.begun = time.monotonic()
+        self.first: tuple[float, int] | None = None
+        self.done, self.total, self.until = 0, 0, math.inf
+
+    def seconds(self) -> float:
+        return time.monotonic() - self.begun
+
+    def count(self, done: int, total: int) -> None:
+        """Take note of how much is done; until the first call programs were compiled, which the rest need not be."""
+        now = time.monotonic()
+        since, before = self.first = self.first or (now, done)
+        self.done, self.total = done, total
+        self.until = now + (now - since) * (total - done) / (done - before) if done > before else math.inf
+
+    def counted(self, now: float) -> str:
+        left = self.until - now
+        return f"{self.done} of {self.total} {self.parts}" + (
+            f", about {_duration(left)} left" if 0.0 < left < 1e6 else ""
+        )
+
+    def __rich__(self) -> Any:
+        from rich.text import Text  # noqa: PLC0415
+
+        return Text(shown(self.line()), overflow="ellipsis", no_wrap=True)
+
+    def line(self) -> str:
+        """Return what is known by now."""
+        now = time.monotonic()
+        known = self.what.partition(" (")[0]
+        if self.first is not None:
+            return f"{known}: {self.counted(now)}"
+        if now - self.begun < _SECONDS_BETWEEN_NOTES:
+            return self.what
+        if self.last_s is None:
+            return f"{self.what}: {_duration(now - self.begun)}"
+        return f"{known}: {_duration(now - self.begun)}, last time {_duration(self.last_s)}"
+
+
+_MOST_WAITS = 200
+
+
+def _kept_waits() -> Path | None:
+    """Return the file of how long waits took on this machine, beside the programs compiled for it, if any are kept."""
+    folder = cache_folder()
+    return folder / "waits.json" if folder.is_dir() else None
+
+
+def _read_waits(path: Path) -> dict[str, float]:
+    """Return the seconds that each wait took the last time; none where the file is missing or damaged."""
+    try:
+        return {name: float(seconds) for name, seconds in json.loads(path.read_text(encoding="utf-8")).items()}
+    except (OSError, ValueError, TypeError, AttributeError):
+        return {}
+
+
+def _keep_wait(path: Path, key: str, seconds: float) -> None:
+    others = {name: value for name, value in _read_waits(path).items() if name != key}
+    with suppress(OSError):
+        write_whole(path, json.dumps(dict([*others.items(), (key, round(seconds, 1))][-_MOST_WAITS:])))
+
+
 @dataclass(frozen=True)
 class Session:
     """One call of a command.
@@ -144,25 +211,38 @@ class Session:
         """Write a message to standard error."""
         _console(stderr=True).print(shown(message), markup=False, highlight=False, soft_wrap=True)
 
-    def progress(self, what: str) -> Callable[[int, int], None]:
-        """Return what tells on standard error, every two seconds at most, what is done and how long the rest takes."""
-        last = time.monotonic()
-        begun: tuple[float, int] | None = None
+    @contextmanager
+    def working(self, what: str, parts: str = "") -> Iterator[Callable[[int, int], None]]:
+        """Tell on standard error what is being done, and from two seconds on how long it takes.
 
-        def report(done: int, total: int) -> None:
-            nonlocal last, begun
-            # until the first report programs were compiled, which the rest need not wait for
-            since, before = begun = begun or (time.monotonic(), done)
-            if time.monotonic() - last > _SECONDS_BETWEEN_NOTES:
-                last = time.monotonic()
-                left = (last - since) * (total - done) / (done - before) if done > before else math.inf
-                self.note(f"{done} of {total} {what}" + (f", about {_duration(left)} left" if 0.0 < left < 1e6 else ""))
+        A terminal shows for how long it has been going on and what it took the last time on this machine. What is
+        counted is shown with the time that the rest takes: there, and where no terminal is as a line every two seconds.
 
-        return report
+        Args:
+            what: is done; in brackets at its end what is told of a first run.
+            parts: what is counted, by calls of what this gives: how many are done, of how many.
+        """
+        console = _console(stderr=True)
+        command = click.get_current_context(silent=True)
+        key = f"{command and command.info_name}: {what}"
+        kept = _kept_waits() if console.is_terminal else None
+        wait = _Wait(what, parts, None if kept is None else _read_waits(kept).get(key))
+        if kept is None:
+            last = time.monotonic()
 
-    def working(self, what: str) -> AbstractContextManager[object]:
-        """Show on standard error what is being done, for as long as it takes, if that is a terminal."""
-        return _console(stderr=True).status(shown(what))
+            def report(done: int, total: int) -> None:
+                nonlocal last
+                wait.count(done, total)
+                if time.monotonic() - last > _SECONDS_BETWEEN_NOTES:
+                    last = time.monotonic()
+                    self.note(wait.counted(last))
+
+            yield report
+            return
+        with console.status(wait):
+            yield wait.count
+        if wait.seconds() > _SECONDS_BETWEEN_NOTES:
+            _keep_wait(kept, key, wait.seconds())
 
     def emit(self, payload: Mapping[str, Any], *text: Any) -> None:
         """Write the result to standard output: the JSON object if asked for, else the text.

@@ -14,7 +14,7 @@ METHODS = ("collocation", "diffrax")
 
 if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
-    from afm_jax.motion.settle import LongRun
+    from afm_jax.motion.follow import LongRun
     from afm_jax.motion.trajectory import DensePath
     from afm_jax.scenefile.scenefile import Start
 
@@ -24,7 +24,6 @@ LARGEST_OFFSET_NM = 10_000.0
 """How far a ramp may take the sample from the tip's rest position, either way."""
 MOST_OSCILLATIONS = 1e7
 """Of the free tip: some minutes of computing."""
-_PIECES_A_LINE = 8
 """Pieces of a long run between two lines on standard error."""
 
 
@@ -187,19 +186,19 @@ def _follow(
     settings: dict[str, Any],
 ) -> "LongRun":
     """Return the simulation; progress of long runs goes to standard error."""
-    from afm_jax.motion.settle import follow_long  # noqa: PLC0415
+    from afm_jax.motion.follow import follow_long  # noqa: PLC0415
     from afm_jax.motion.start import start_of  # noqa: PLC0415
 
-    pieces = 0
-
-    def report(time_us: float, contacts: int) -> None:
-        nonlocal pieces
-        pieces += 1
-        if pieces % _PIECES_A_LINE == 0:
-            session.note(f"at {time_us:.6g} us, after {contacts} contacts")
-
-    with session.working("simulating (the first run compiles for some seconds)"):
-        run = follow_long(scene, start_of(scene, told), longest_us, report=report, **settings)
+    start = start_of(scene, told)
+    begin_us, parts = float(start.time_us), "us at most" if settings["until_settled"] else "us"
+    with session.working("simulating (the first run compiles for some seconds)", parts) as tell:
+        run = follow_long(
+            scene,
+            start,
+            longest_us,
+            report=lambda time_us, _: tell(round(time_us - begin_us), round(longest_us)),
+            **settings,
+        )
     if int(run.simulation.outcome) == _invalid_start():
         raise ValueError("the tip cannot start there: the start is not finite, or inside the sample")
     return run

@@ -9,9 +9,10 @@ import numpy as np
 from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.cli.session import Session, write_json
 from afm_jax.contact.junction import Phase
+from afm_jax.motion.follow import LongRun
 from afm_jax.motion.observe import NEEDS_A_RESPONSE, TOO_SHORT, Harmonic, Observables
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation
-from afm_jax.motion.settle import LongRun, Window
+from afm_jax.motion.settle import Window
 from afm_jax.motion.trajectory import DensePath, dense_path
 from afm_jax.scenefile.scenefile import scene_tables
 from afm_jax.units import RAD_PER_US_PER_KHZ

@@ -1,9 +1,8 @@
 """`afm-jax sweep SWEEP.toml --out DIR`: a grid of scenes or of fits, in chunks, on all cores; goes on where it was."""
 
 import os
-import time
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
 
 _KEYS = ("scene", "tables", "axes", "record", "accuracy", "chunk")
 _WRITTEN = (("axes", list, "[[axes]]"), ("record", dict, "[record]"))
-_SECONDS_BETWEEN_NOTES = 2.0
 _MOST_MESSAGES = 3
 _MOST_DRAWN = 2
 """Axes of a sweep that a picture can show."""
@@ -94,7 +92,14 @@ def run_sweep(session: Session, plan: "SweepPlan", *, workers: int | None, sched
 
     assert session.out is not None  # asked before  # noqa: S101
     number = _processes(plan) if workers is None and scheduler is None else workers or 1
-    return run_plan(plan, session.out, workers=number, scheduler=scheduler, report=_progress(session))
+    with session.working("computing (the first chunk compiles)", "points") as tell:
+        return run_plan(
+            plan,
+            session.out,
+            workers=number,
+            scheduler=scheduler,
+            report=lambda done, total, _: tell(done, total),
+        )
 
 
 def _tell(session: Session, plan: "SweepPlan", done: "SweepRun") -> None:
@@ -222,19 +227,6 @@ def _processes(plan: "SweepPlan") -> int:
     if not plan.recorder.alone or find_spec("distributed") is None:
         return 1
     return min(available_cores(), plan.chunks)
-
-
-def _progress(session: Session) -> Callable[[int, int, float], None]:
-    last = time.monotonic()
-
-    def report(done: int, total: int, rate: float) -> None:
-        nonlocal last
-        if time.monotonic() - last > _SECONDS_BETWEEN_NOTES:
-            last = time.monotonic()
-            left = _duration((total - done) / rate)
-            session.note(f"{done} of {total} points, {rate:.3g} a second, {left} left")
-
-    return report
 
 
 def _duration(seconds: float) -> str:

@@ -33,7 +33,7 @@ from afm_jax.contact.junction_leg import JunctionWay, pass_through_junction
 from afm_jax.contact.settings import CAREFUL, Setting, setting_of
 from afm_jax.impact.implicit import implicit_root
 from afm_jax.outcomes import CollisionOutcome
-from afm_jax.results import public_result
+from afm_jax.results import ResultTuple, public_result
 
 BLOCK = 512
 """Tips computed side by side: few enough to stay in the processor's cache."""
@@ -46,7 +46,7 @@ _NEAR_CAPTURE = (-0.02, 0.2)
 
 
 @public_result(outcome=CollisionOutcome)
-class Collision(NamedTuple):
+class Collision(ResultTuple):
     """What collisions end with; arrays of one shape.
 
     Energies are in aJ. Where the tip is captured rebound speed, delay and time in junction are 0: see `outcome`.

@@ -152,14 +152,14 @@ class Bridge(eqx.Module):
     """The forces of a bridge, reduced to their coefficients.
 
     A force's parameters enter thousands of evaluations of its potential; what depends on them alone is computed here.
-    ``backwards``: time runs backwards, so that drag gives the energy that it takes.
+    ``arrow``: -1 where time runs backwards, so that drag gives the energy that it takes; None: it does not.
     """
 
     static_kinds: tuple[type[StaticForce], ...] = eqx.field(static=True)
     static: tuple[tuple[Float[Array, "..."], ...], ...]
     dissipative_kinds: tuple[type[DissipativeForce], ...] = eqx.field(static=True)
     dissipative: tuple[tuple[Float[Array, "..."], ...], ...]
-    backwards: bool = eqx.field(static=True, default=False)
+    arrow: Float[Array, "..."] | float | None = None
 
     @property
     def conserves(self) -> bool:
@@ -183,11 +183,11 @@ class Bridge(eqx.Module):
         """Return the damping of all dissipative forces in nN us/nm at a gap in nm."""
         terms = zip(self.dissipative_kinds, self.dissipative, strict=True)
         total = sum((kind.damping_of(parts, gap) for kind, parts in terms), start=jnp.zeros_like(gap))
-        return -total if self.backwards else total
+        return total if self.arrow is None else self.arrow * total
 
     def reversed(self) -> "Bridge":
         """Return the bridge for a motion that is followed against time."""
-        return replace(self, backwards=not self.backwards)
+        return replace(self, arrow=-1.0)
 
 
 def bridge_of(contact: Contact) -> Bridge:

@@ -13,7 +13,6 @@ bridge's range. Within a phase every force is smooth.
 
 import enum
 import math
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +23,7 @@ from afm_jax.checks import as_argument
 from afm_jax.contact.contact import Bridge, Contact, bridge_of
 from afm_jax.contact.forces import jkr
 from afm_jax.impact.implicit import implicit_root
-from afm_jax.results import public_result
+from afm_jax.results import ResultTuple, public_result
 
 SMALLEST_GAP_NM = 0.01
 """The tangency is looked for between this gap and the one at which the bridge forms."""
@@ -34,7 +33,7 @@ Tangent = tuple[Bridge, Float[Array, "..."], Float[Array, "..."]]
 
 
 @public_result()
-class Junction(NamedTuple):
+class Junction(ResultTuple):
     """The junction of a contact, and the energies that its hysteresis takes; all arrays of the parameters' shape."""
 
     exists: Bool[Array, "..."]

@@ -20,6 +20,9 @@ from afm_jax.contact.forces import jkr
 from afm_jax.contact.leg import Leg, mean_matrix, nodes_along, settled
 from afm_jax.contact.settings import QuickSetting
 
+_TURNS = 6
+"""Steps of Newton's method to the turning point under a pull."""
+
 
 class JunctionWay(NamedTuple):
     """What the way of a free tip through the junction ends with."""
@@ -30,13 +33,17 @@ class JunctionWay(NamedTuple):
     """Time in the junction; meaningless where the energy is not positive."""
     deepest_gap_nm: Float[Array, "..."]
     """Gap at the turning point, negative where the tip indents the sample."""
+    gap_nm_us: Float[Array, "..."]
+    """Integral of the gap over time."""
+    action: Float[Array, "..."]
+    """Integral of the squared speed over time, in nm^2/us."""
 
 
 def pass_through_junction(tip: Driven, energy_aj: Float[Array, "..."], nodes: int) -> JunctionWay:
-    """Return the way of a free tip from the formation of the junction to its breaking.
+    """Return the way of a free tip, or of one under a steady pull, from the formation of the junction to its breaking.
 
     Args:
-        tip: the tip.
+        tip: the tip, without drive.
         energy_aj: kinetic energy where it forms, in aJ.
         nodes: number of Gauss nodes of each quadrature.
     """
@@ -45,9 +52,31 @@ def pass_through_junction(tip: Driven, energy_aj: Float[Array, "..."], nodes: in
     turn = turning_root(level)
     leaving = energy_aj + unit * (jkr.work(form) - jkr.work(jkr.FOLD))
     points, weights, _ = nodes_along(nodes, turn)
-    inside = jnp.tensordot(weights, _Half(tip, form).along(turn, points).pace, axes=1)
-    outside = _time_to_fold(form, jnp.maximum(leaving, 0.0) / unit, nodes) * tip.depth_scale_nm / _speed_scale(tip)
-    return JunctionWay(leaving, 2.0 * inside + outside, tip.gap_of_root(turn))
+    if tip.pull is not None:
+        leaving, pull = leaving + tip.pulled_aj(tip.gap_of_root(form), tip.junction.breaks_gap_nm), tip.pull
+
+        # in a loop, for copies take long to compile
+        def improve(_, turn):
+            return _turn_under(tip, form, level, _mean_pull(tip, pull, form, turn), turn)
+
+        turn = lax.fori_loop(0, _TURNS, improve, turn)
+    at = _Half(tip, form).along(turn, points)
+    inside = _sums(weights, at.pace, tip.gap_of_root(at.s), at.y * at.over_y)
+    outside = _to_fold(tip, form, jnp.maximum(leaving, 0.0) / unit, nodes)
+    time, gap, action = (2.0 * one + other for one, other in zip(inside, outside, strict=True))
+    return JunctionWay(leaving, time, tip.gap_of_root(turn), gap, action)
+
+
+def _sums(weights: Array, pace: Array, gap: Array, speed: Array) -> tuple[Array, Array, Array]:
+    """Return the integrals over time of 1, of the gap and of the squared speed."""
+    time, below, action = (jnp.tensordot(weights, pace * part, axes=1) for part in (jnp.ones_like(pace), gap, speed**2))
+    return time, below, action
+
+
+def _mean_pull(tip: Driven, pull: Array, s: Array, turn: Array) -> Array:
+    """Return the mean over the depth of what a bent lever does, between s and the turning point: it is linear there."""
+    middle = 0.5 * (tip.gap_of_root(s) + tip.gap_of_root(turn))
+    return pull - tip.lever_n_per_m * tip.inverse_mass * middle
 
 
 class Stretch(NamedTuple):
@@ -161,13 +190,15 @@ class _Half(NamedTuple):
     pressing: bool = True
 
     def along(self, turn: Array, points: Array, means: Array | None = None) -> _Along:
-        """Return the places at nodes of y, with means of g, or without any."""
+        """Return the places at nodes of y, with means of g, or with those of a steady pull, if there is one."""
         apart = turn > self.end
         reach = jnp.where(apart, jnp.sqrt(jnp.where(apart, turn - self.end, 1.0)), 0.0)
         twice = 2.0 * self.driven.depth_scale_nm
         y = reach * points
         s = turn - y * y
         square = _unit(self.driven) * _mean_work_slope(turn, s)
+        if means is None and self.driven.pull is not None:
+            means = _mean_pull(self.driven, self.driven.pull, s, turn)
         if means is not None:
             square = square + twice * _mean_depth_slope(turn, s) * means
         over_y, slope = jnp.sqrt(square), jkr.depth_slope(s)
@@ -245,8 +276,10 @@ def _mean_depth_slope(turn: Array, s: Array) -> Array:
     return (turn + s) * (turn * turn + s * s) - jkr.SLOPE
 
 
-def _time_to_fold(start: Float[Array, "..."], leaving: Float[Array, "..."], nodes: int) -> Float[Array, "..."]:
-    """Return the integral of dDelta / sqrt(leaving + work(fold) - work) from the fold to s = start."""
+def _to_fold(
+    tip: Driven, start: Float[Array, "..."], leaving: Float[Array, "..."], nodes: int
+) -> tuple[Array, Array, Array]:
+    """Return time and integrals between the fold, left with a kinetic energy in the unit of the work, and s = start."""
     points, weights, _ = nodes_along(nodes, leaving)
     # work(fold) - work(s) is _CURVATURE (s - fold)^2 to leading order
     width = jnp.sqrt(jnp.maximum(leaving, 1e-12) / _CURVATURE)
@@ -255,9 +288,14 @@ def _time_to_fold(start: Float[Array, "..."], leaving: Float[Array, "..."], node
     grown = jnp.exp(reach * points)
     s = jkr.FOLD + 0.5 * width * (grown - 1.0 / grown)
     kinetic = leaving + (jkr.work(jkr.FOLD) - jkr.work(s))
+    if tip.pull is not None:
+        pulled = tip.pulled_aj(tip.gap_of_root(s), tip.junction.breaks_gap_nm)
+        kinetic = kinetic - pulled / (tip.load_scale_nn * tip.depth_scale_nm)
     moving = kinetic > 0.0
-    pace = jkr.depth_slope(s) * 0.5 * width * (grown + 1.0 / grown) / jnp.sqrt(jnp.where(moving, kinetic, 1.0))
-    return reach * jnp.tensordot(weights, jnp.where(moving, pace, 0.0), axes=1)
+    rate = jnp.sqrt(jnp.where(moving, kinetic, 1.0))
+    pace = jnp.where(moving, jkr.depth_slope(s) * 0.5 * width * (grown + 1.0 / grown) / rate, 0.0)
+    scale = _speed_scale(tip)
+    return _sums(weights, reach * pace * (tip.depth_scale_nm / scale), tip.gap_of_root(s), scale * rate)
 
 
 # work' = P Delta' and Delta'(fold) = 0, so that work''(fold) = P(fold) Delta''(fold) = P(fold) 12 fold^2

@@ -37,7 +37,7 @@ from afm_jax.contact.junction_leg import pass_through_junction
 from afm_jax.impact.lasting_impact import TabulatedImpact, stretched
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.least_squares import Box, Searches, descended, distance
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 
 FREE = {"law": ("r", "epsilon"), "viscous": ("epsilon", "viscous_loss"), "full": ("r", "epsilon", "viscous_loss")}
 """For every model the parameters that are fitted; the others are r = 1 and no viscous loss."""
@@ -82,7 +82,7 @@ _PLACES = 0.5 - 0.5 * np.cos(np.pi * np.arange(TERMS) / (TERMS - 1))
 
 @public_result()
 @dataclass(frozen=True)
-class ContactLaw:
+class ContactLaw(Result):
     """A law fitted to a contact, and how far it is off.
 
     Attributes:
@@ -307,7 +307,7 @@ def range_above_capture(
 
 @public_result()
 @dataclass(frozen=True)
-class ContactDelay:
+class ContactDelay(Result):
     """The delay of a contact against the approach speed, and the law fitted to it; times in us, shapes (n,).
 
     Attributes:

@@ -104,7 +104,7 @@ CONTACT_PARAMETERS = (
         default=1.005e-3,
         allowed="not negative",
         meaning="of the liquid",
-        fitted=(1e-6, 1.0),
+        fitted=(0.0, 1.0),
         serves=("viscous",),
         advice="measure over a wider range of drives, or hold it fixed at the liquid's known value",
     ),
@@ -115,7 +115,7 @@ CONTACT_PARAMETERS = (
         default=40.0,
         allowed="not negative",
         meaning="A_0 of the structural force",
-        fitted=(1e-3, 1e4),
+        fitted=(0.0, 1e4),
         serves=("structural",),
     ),
     ContactParameter(

@@ -20,7 +20,7 @@ from afm_jax.contact.driven import Driven, free_tip
 from afm_jax.contact.forces import jkr
 from afm_jax.contact.junction import Junction, Phase, explain_missing_junction, find_junction, force_in_phase
 from afm_jax.contact.junction_leg import stretch_in_junction, turning_root
-from afm_jax.results import public_result
+from afm_jax.results import ResultTuple, public_result
 
 _NODES = 64
 _SWEEPS = 12
@@ -29,7 +29,7 @@ _FLIGHT_SHARE = 0.5
 
 
 @public_result(phase=Phase)
-class TimeCourse(NamedTuple):
+class TimeCourse(ResultTuple):
     """An impact in time; arrays of one length, times increasing.
 
     A captured tip's course ends where it first stops on its way out.

@@ -33,7 +33,7 @@ from afm_jax.dynamics.iteration import (
 )
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, verdicts_of
 from afm_jax.outcomes import Outcome
-from afm_jax.results import public_result
+from afm_jax.results import ResultTuple, public_result
 from afm_jax.units import within_turn
 
 _SAMPLE = 2048
@@ -71,7 +71,7 @@ class Attractor(NamedTuple):
 
 
 @public_result(picture="afm_jax.plots.dynamics:basins_figure")
-class Basins(NamedTuple):
+class Basins(ResultTuple):
     """Which start ends where.
 
     Attributes:

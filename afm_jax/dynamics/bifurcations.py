@@ -34,7 +34,7 @@ from afm_jax.dynamics.iteration import (
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Verdicts, verdicts_of
 from afm_jax.motion.start import start_of
 from afm_jax.outcomes import Outcome
-from afm_jax.results import public_result
+from afm_jax.results import ResultTuple, public_result
 from afm_jax.scenefile.parameter_paths import scene_batch
 from afm_jax.units import within_turn
 
@@ -53,7 +53,7 @@ _SAME = 1e-4
 
 
 @public_result()
-class Sweep(NamedTuple):
+class Sweep(ResultTuple):
     """A sweep of a parameter, arrays of one row a value, in the order of the values.
 
     Attributes:

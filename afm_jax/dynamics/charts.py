@@ -26,7 +26,7 @@ from afm_jax.impact.closure import OrbitPlace, OrbitProblem
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.orbits import orbit_at, orbit_problem
 from afm_jax.impact.roots import find_roots
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from afm_jax.scenefile.parameter_paths import scene_family
 
 _LANES = 1024
@@ -170,7 +170,7 @@ TABLE_COLUMNS = (
 
 @public_result(picture="afm_jax.plots.dynamics:chart_figure", rows="table")
 @dataclass(frozen=True)
-class StabilityChart:
+class StabilityChart(Result):
     """A chart of stable admissible single-impact orbits over two parameters.
 
     Attributes:

@@ -182,7 +182,7 @@ def _read(frame: Frame, points: Array, equations: Equations) -> LoopReading:
 def read_points(points: Float[np.ndarray, "points n"], frame: Frame, equations: Equations) -> LoopReading:
     """Return what there is to know of the orbits at points of a curve, NumPy arrays."""
     if equations.flights is not None:
-        return equations.flights.readings(points, units_of(frame))
+        return equations.flights.readings_of_points(points, units_of(frame))
     return by_blocks(lambda block: _read(frame, block, equations), points)
 
 

@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Shaped
-from scipy.optimize import brentq
 
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import Surface, surface_of
@@ -22,7 +21,7 @@ from afm_jax.checks import require_float64
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.dynamics.contact_sequence import follow_contacts, next_contact
-from afm_jax.dynamics.impact_loop import LoopReading, driven_part
+from afm_jax.dynamics.impact_loop import FreeFlights, LoopReading, driven_part, lowest_of_flights
 from afm_jax.dynamics.impact_orbits import (
     ManyImpactOrbits,
     check_loop,
@@ -59,6 +58,8 @@ _CHART_ACCURACY = 1e-6
 _CHART_STEPS = 15
 _CHART_ARRIVED = 1e-7
 """Of a phase in rad and of a speed."""
+_GRAZING = 3
+"""Number of its test function in `closed_loops`."""
 _SAMPLES = 512
 """Of a flight, for its lowest points."""
 _CURVE_STEPS = 12
@@ -96,7 +97,8 @@ def contact_orbits(scene: Scene, order: int, impacts: int, *, accuracy: float = 
     check_loop(order, impacts)
     flights = ContactFlights(scene, order, (), accuracy=accuracy)
     told = contact_loops(flights, np.zeros(0), impacts)
-    known = [(reading, loop) for loop in told if (reading := flights.reading(loop, np.zeros(0))) is not None]
+    readings = flights.readings(told, np.zeros((len(told), 0)))
+    known = [(reading, loop) for reading, loop in zip(readings, told, strict=True) if reading is not None]
     known.sort(key=lambda one: -float(one[0].peak_amplitude_nm))
     fields = [*[jnp.zeros((0, impacts))] * 6, *[jnp.zeros(0)] * 3, jnp.zeros(0, bool), jnp.zeros(0)]
     reading = LoopReading(*fields)
@@ -115,8 +117,8 @@ def contact_loops(
     """Return the loops of m contacts that are found at values of a scene's parameters, each once (`FlownLoop`)."""
     scene, order = flights.family(*values), flights.order
     guesses = [*_orbits_of_law(scene, order, impacts), *_simulated(scene, order, impacts, flights.accuracy)]
-    loops = [loop for guess in guesses if (loop := _closed(guess, flights, values)) is not None]
-    return loops_told_apart(np.array(loops).reshape(-1, 2 * impacts), order)
+    loops = _closed(np.array(guesses).reshape(-1, 2 * impacts), flights, values)
+    return loops_told_apart(loops, order)
 
 
 def _orbits_of_law(scene: Scene, order: int, impacts: int) -> list[np.ndarray]:
@@ -125,14 +127,45 @@ def _orbits_of_law(scene: Scene, order: int, impacts: int) -> list[np.ndarray]:
     if law is None:
         return []
     simple = eqx.tree_at(lambda parts: parts.interaction, scene, law)
-    reading = many_impact_orbits(simple, order, impacts).reading
-    omega, gap = drive_of(scene).angular_frequency, float(scene.interaction.bridge_breaks_nm)
-    found = []
-    for phase, rebound in zip(reading.phase_rad, reading.rebound_speed_nm_per_us, strict=True):
-        # `phase_rad` is within a turn: the impacts follow one another
-        turns = _rising(phase)
-        found.append(np.concatenate([turns + omega * gap / rebound, rebound]))
-    return found
+    if impacts == 1:
+        # all of them, close to capture too, where no start of a search stays
+        single = single_impact_orbits(simple, order)
+        there = np.asarray(single.exists & single.admissible)
+        phases, rebounds = (
+            np.asarray(part)[there, None] for part in (single.phase_rad, single.rebound_speed_nm_per_us)
+        )
+    else:
+        reading = many_impact_orbits(simple, order, impacts).reading
+        phases, rebounds = np.asarray(reading.phase_rad), np.asarray(reading.rebound_speed_nm_per_us)
+    # `phase_rad` is within a turn: the impacts follow one another
+    starts = np.array([_rising(phase) for phase in phases]).reshape(rebounds.shape)
+    departures, speeds = _where_the_bridge_breaks(scene, starts, rebounds)
+    return [
+        np.concatenate(guess)
+        for guess in zip(departures, speeds, strict=True)
+        if np.isfinite(guess).all() and np.min(guess[1]) > 0.0
+    ]
+
+
+def _where_the_bridge_breaks(
+    scene: Scene, phases: Float[np.ndarray, "orbits m"], rebounds: Float[np.ndarray, "orbits m"]
+) -> tuple[Float[np.ndarray, "orbits m"], Float[np.ndarray, "orbits m"]]:
+    """Return phases and speeds against the surface at which flights from the surface first are as high; NaN if never.
+
+    Straight paths are not enough: slow tips take a good part of a drive period.
+    """
+    surface, _ = surface_of(scene)
+    omega = float(drive_of(scene).angular_frequency)
+    begin, after = phases[..., None] / omega, np.linspace(0.0, 2.0 * np.pi / omega, _SAMPLES)
+    height, rate = surface.position_and_velocity(begin)
+    position, velocity = scene.cantilever.propagator(after)(height, rate + rebounds[..., None])
+    level, moves = surface.position_and_velocity(begin + after)
+    above = np.asarray(position - level) - float(scene.interaction.bridge_breaks_nm)
+    place = np.argmax(above > 0.0, axis=-1)[..., None]
+    before, now = (np.take_along_axis(above, np.maximum(place - back, 0), axis=-1)[..., 0] for back in (1, 0))
+    share = np.where(now > 0.0, now / np.maximum(now - before, 1e-300), np.nan)
+    risen = (place[..., 0] - share) * after[1]
+    return phases + omega * risen, np.take_along_axis(np.asarray(velocity - moves), place, axis=-1)[..., 0]
 
 
 def _rising(phase: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
@@ -164,20 +197,27 @@ def _simulated(scene: Scene, order: int, impacts: int, accuracy: float) -> list[
     return found
 
 
-def _closed(guess: np.ndarray, flights: "ContactFlights", values: np.ndarray) -> np.ndarray | None:
-    """Return the loop that Newton's method finds, departure phases and rebound speeds; None where it finds none."""
-    loop, count = guess.copy(), len(guess) // 2
+def _closed(
+    guesses: Float[np.ndarray, "guesses n"], flights: "ContactFlights", values: Float[np.ndarray, " parameters"]
+) -> Float[np.ndarray, "loops n"]:
+    """Return the loops that Newton's method finds, departure phases and rebound speeds."""
+    loops, count = guesses.copy(), guesses.shape[1] // 2
+    left, arrived = np.arange(len(loops)), np.zeros(len(loops), bool)
     for _ in range(_NEWTON_STEPS):
-        flown = flights.flown(loop, values)
-        if flown is None:
-            return None
-        step = -np.linalg.lstsq(flown.slopes[:, : len(loop)], flown.gaps, rcond=None)[0]
-        relative = np.concatenate([step[:count] / _TURN, step[count:] / (_SHARE * loop[count:])])
-        weights = np.repeat([1.0, 1.0 / loop[count:].max()], count)
-        loop = loop + step / max(1.0, np.abs(relative).max())
-        if np.abs(step * weights).max() < _ARRIVED and np.abs(flown.gaps * weights).max() < _ARRIVED:
-            return loop
-    return None
+        goes_on = np.zeros(len(loops), bool)
+        for place, flown in zip(left, flights.flown(loops[left], np.tile(values, (len(left), 1))), strict=True):
+            if flown is None:
+                continue
+            loop = loops[place]
+            step = -np.linalg.lstsq(flown.slopes[:, : len(loop)], flown.gaps, rcond=None)[0]
+            relative = np.concatenate([step[:count] / _TURN, step[count:] / (_SHARE * loop[count:])])
+            weights = np.repeat([1.0, 1.0 / loop[count:].max()], count)
+            loops[place] = loop + step / max(1.0, np.abs(relative).max())
+            missing = max(np.abs(step * weights).max(), np.abs(flown.gaps * weights).max())
+            arrived[place] = missing < _ARRIVED
+            goes_on[place] = not arrived[place]
+        left = np.flatnonzero(goes_on)
+    return loops[arrived]
 
 
 def single_contact_orbits(
@@ -332,10 +372,21 @@ class CurveUnits(NamedTuple):
     low: Float[np.ndarray, " parameters"]
     width: Float[np.ndarray, " parameters"]
 
+    def scales(self, impacts: int) -> Float[np.ndarray, " n"]:
+        """Return the units of a loop's unknowns: m phases, m speeds."""
+        return np.repeat([1.0, self.speed_nm_per_us], impacts)
+
+    def of_points(self, points: Float[np.ndarray, "points n"]) -> tuple[np.ndarray, np.ndarray]:
+        """Return the loops and the values of the parameters at points of a curve."""
+        count = points.shape[1] - len(self.low)
+        return points[:, :count] * self.scales(count // 2), self.low + self.width * points[:, count:]
+
 
 class FlownLoop(NamedTuple):
     """A loop as it was simulated; phases in rad, rebound speeds in nm/us."""
 
+    loop: Float[np.ndarray, " n"]
+    values: Float[np.ndarray, " parameters"]
     gaps: Float[np.ndarray, " n"]
     """By how much the departures miss the next ones: m phases, m rebound speeds."""
     slopes: Float[np.ndarray, "n unknowns"]
@@ -355,6 +406,19 @@ class FlownLoop(NamedTuple):
         return float(np.trace(whole)), float(np.prod(np.linalg.det(self.maps)))
 
 
+def _closing_slopes(slopes: Float[np.ndarray, "m 2 unknowns"]) -> Float[np.ndarray, "n all"]:
+    """Return the derivatives of all gaps of a loop, from those of each contact by its departure and the parameters."""
+    count, parameters = len(slopes), slopes.shape[2] - 2
+    whole = np.zeros((2, count, 2 * count + parameters))
+    places, later = np.arange(count), (np.arange(count) + 1) % count
+    for row in range(2):
+        for column in range(2):
+            whole[row, places, column * count + places] = slopes[:, row, column]
+        whole[row, places, row * count + later] -= 1.0
+        whole[row, :, 2 * count :] = slopes[:, row, 2:]
+    return whole.reshape(2 * count, -1)
+
+
 class ContactFlights:
     """A contact scene from departure to departure; some of its parameters may move.
 
@@ -371,7 +435,7 @@ class ContactFlights:
         self.order, self._driven = order, driven_part(scene)
         self.family = scene_family(scene, *paths) if paths else lambda: scene
 
-        def one(phase: Array, rebound: Array, until: Array, values: Array) -> tuple[Contacts, Array]:
+        def one(phase: Array, rebound: Array, until: Array, values: Array) -> tuple[Array, Contacts, Array]:
             def departs(unknowns: Array) -> tuple[Array, Contacts]:
                 there = self.family(*unknowns[2:])
                 omega = RAD_PER_US_PER_KHZ * getattr(there, self._driven).frequency_khz
@@ -380,53 +444,49 @@ class ContactFlights:
                 contact = next_contact(there, time, velocity, until / omega, accuracy)
                 return jnp.stack([omega * contact.departure_time_us, contact.rebound_speed_nm_per_us]), contact
 
-            slopes, contact = jax.jacfwd(departs, has_aux=True)(jnp.concatenate([jnp.stack([phase, rebound]), values]))
-            return contact, slopes
+            (value, contact), slopes = _with_slopes(departs, jnp.concatenate([jnp.stack([phase, rebound]), values]))
+            return value, contact, slopes
 
-        self._fly = jax.jit(jax.vmap(one, in_axes=(0, 0, 0, None)))
+        self._fly = jax.jit(jax.vmap(one))
 
-    def flown(self, loop: Float[np.ndarray, " n"], values: Float[np.ndarray, " parameters"]) -> FlownLoop | None:
-        """Return a loop with each of its contacts simulated; None where one does not end in time.
+    def flown(
+        self, loops: Float[np.ndarray, "loops n"], values: Float[np.ndarray, "loops parameters"]
+    ) -> list[FlownLoop | None]:
+        """Return loops with each of their contacts simulated, all at once; None where one does not end in time.
 
         Args:
-            loop: m departure phases in rad, m rebound speeds in nm/us.
+            loops: of each m departure phases in rad and m rebound speeds in nm/us.
             values: of the parameters.
         """
-        count = len(loop) // 2
-        phase, rebound = loop[:count], loop[count:]
-        turn = 2.0 * np.pi * self.order
-        following = np.append(phase[1:], phase[0] + turn)
-        lasts = following - phase
-        if lasts.min() <= 0.0 or rebound.min() <= 0.0:
-            return None
-        lanes = (phase, rebound, following + _LONGEST_CONTACT * lasts.min())
-        padded = (np.pad(part, (0, -count % _LANES), mode="edge") for part in lanes)
-        found = self._fly(*map(jnp.asarray, padded), jnp.asarray(values))
-        contacts, slopes = jax.tree.map(lambda part: np.asarray(part)[:count], found)
-        if not ((contacts.kind == ContactKind.IMPACT).all() and np.isfinite(slopes).all()):
-            return None
-        # phases from the departure on, which loses no digits in later periods
-        passed = contacts.departure_time_us * self._omega(values)
-        gaps = np.concatenate([passed - following, contacts.rebound_speed_nm_per_us - np.roll(rebound, -1)])
-        whole = np.zeros((2, count, 2 * count + len(values)))
-        places, later = np.arange(count), (np.arange(count) + 1) % count
-        for row in range(2):
-            for column in range(2):
-                whole[row, places, column * count + places] = slopes[:, row, column]
-            whole[row, places, row * count + later] -= 1.0
-            whole[row, :, 2 * count :] = slopes[:, row, 2:]
-        return FlownLoop(gaps, whole.reshape(2 * count, -1), contacts, slopes[:, :, :2])
+        count, turn = loops.shape[1] // 2, 2.0 * np.pi * self.order
+        phase, rebound = loops[:, :count], loops[:, count:]
+        following = np.concatenate([phase[:, 1:], phase[:, :1] + turn], axis=1)
+        shortest = np.min(following - phase, axis=1, keepdims=True)
+        found: list[FlownLoop | None] = [None] * len(loops)
+        flies = np.flatnonzero((shortest[:, 0] > 0.0) & (rebound > 0.0).all(axis=1))
+        if not flies.size:
+            return found
+        lanes = (part[flies].ravel() for part in (phase, rebound, following + _LONGEST_CONTACT * shortest))
+        whole = (*lanes, np.repeat(values[flies], count, axis=0))
+        flown = in_blocks(lambda part: self._fly(*part), whole, block=_LANES, widths=(_LANES,))
+        by_loops = jax.tree.map(lambda part: part.reshape(-1, count, *part.shape[1:]), flown)
+        for place, one in enumerate(flies):
+            later, contacts, slopes = jax.tree.map(lambda part, place=place: part[place], by_loops)
+            if (contacts.kind == ContactKind.IMPACT).all() and np.isfinite(slopes).all():
+                gaps = np.concatenate([later[:, 0] - following[one], later[:, 1] - np.roll(rebound[one], -1)])
+                whole = _closing_slopes(slopes)
+                found[one] = FlownLoop(loops[one], values[one], gaps, whole, contacts, slopes[:, :, :2])
+        return found
 
-    def _omega(self, values: Float[np.ndarray, " parameters"]) -> float:
-        return float(RAD_PER_US_PER_KHZ * getattr(self.family(*values), self._driven).frequency_khz)
+    def readings(
+        self, loops: Float[np.ndarray, "loops n"], values: Float[np.ndarray, "loops parameters"]
+    ) -> list[LoopReading | None]:
+        """Return what there is to know of closed loops, NumPy arrays; arguments as for `flown`."""
+        return [None if one is None else self._reading(one) for one in self.flown(loops, values)]
 
-    def reading(self, loop: Float[np.ndarray, " n"], values: Float[np.ndarray, " parameters"]) -> LoopReading | None:
-        """Return what there is to know of a closed loop; arguments as for `flown`."""
-        flown = self.flown(loop, values)
-        if flown is None:
-            return None
-        count, contacts, there = len(loop) // 2, flown.contacts, self.family(*values)
-        time, rebound = loop[:count] / self._omega(values), loop[count:]
+    def _reading(self, flown: FlownLoop) -> LoopReading:
+        there, time, rebound = self._departures(flown)
+        loop, contacts, count = flown.loop, flown.contacts, len(rebound)
         height, rate = (np.asarray(part) for part in there.platform.position_and_velocity(time))
         breaks, forms = (float(getattr(there.interaction, f"bridge_{what}_nm")) for what in ("breaks", "forms"))
         peaks = peaks_of_flights(there, time, height + breaks, rebound + rate, contacts.arrival_time_us)
@@ -447,45 +507,18 @@ class ContactFlights:
         )
         return LoopReading(*(jnp.asarray(part) for part in facts))
 
-    def readings(self, points: Float[np.ndarray, "points n"], units: CurveUnits) -> LoopReading:
+    def readings_of_points(self, points: Float[np.ndarray, "points n"], units: CurveUnits) -> LoopReading:
         """Return what there is to know of the loops at points of a curve (`solve`), NumPy arrays."""
-        read = []
-        for point in points:
-            count = (len(point) - len(units.low)) // 2
-            scales = np.repeat([1.0, units.speed_nm_per_us], count)
-            one = self.reading(point[: 2 * count] * scales, units.low + units.width * point[2 * count :])
-            if one is None:
-                raise ValueError("a loop that was closed does not fly")
-            read.append(one)
+        read = [one for one in self.readings(*units.of_points(points)) if one is not None]
+        if len(read) < len(points):
+            raise ValueError("a loop that was closed does not fly")
         return jax.tree.map(lambda *parts: np.stack([np.asarray(part) for part in parts]), *read)
 
-    def nearest_approach(self, loop: Float[np.ndarray, " n"], flown: FlownLoop, values: np.ndarray) -> float:
-        """Return the gap of the lowest point of the flights less that at which the bridge forms, in nm.
-
-        Infinite where no flight has a lowest point between two contacts.
-        """
-        count, there = len(loop) // 2, self.family(*values)
-        surface, _ = surface_of(there)
-        forms = float(there.interaction.bridge_forms_nm)
-        nearest = np.inf
-        for begin, rebound, end in zip(
-            loop[:count] / self._omega(values), loop[count:], flown.contacts.arrival_time_us, strict=True
-        ):
-            height, rate = surface.position_and_velocity(begin)
-            start = height + there.interaction.bridge_breaks_nm, rate + rebound
-
-            def gap_and_rate(after: Any, begin: float = begin, start: Any = start) -> tuple[np.ndarray, np.ndarray]:
-                flight = there.cantilever.propagator(jnp.asarray(after))(*start)
-                below = surface.position_and_velocity(begin + jnp.asarray(after))
-                return np.asarray(flight[0] - below[0]), np.asarray(flight[1] - below[1])
-
-            after = np.linspace(0.0, end - begin, _SAMPLES)
-            gap, rate = gap_and_rate(after)
-            for place in np.flatnonzero((rate[:-1] < 0.0) & (rate[1:] >= 0.0)):
-                if min(gap[place], gap[place + 1]) - forms < nearest + 1.0:
-                    lowest = brentq(lambda t: float(gap_and_rate(t)[1]), after[place], after[place + 1], xtol=1e-13)
-                    nearest = min(nearest, float(gap_and_rate(lowest)[0]) - forms)
-        return nearest
+    def _departures(self, flown: FlownLoop) -> tuple[Scene, np.ndarray, np.ndarray]:
+        """Return the scene of a loop, its departure times in us and rebound speeds in nm/us."""
+        phase, rebound = np.split(flown.loop, 2)
+        there = self.family(*flown.values)
+        return there, phase / float(RAD_PER_US_PER_KHZ * getattr(there, self._driven).frequency_khz), rebound
 
     def solve(
         self, guess: Float[np.ndarray, " n"], row: Float[np.ndarray, " n"], units: CurveUnits, kind: int | None
@@ -501,55 +534,51 @@ class ContactFlights:
         Returns:
             The point, Newton's last move, the curve's tangent and the test functions.
         """
-        point, moved, matrix = guess, np.inf, np.eye(len(guess))
-        for _ in range(_CURVE_STEPS):
-            found = self._tested(point, units, tested=kind is not None)
-            if found is None:
+        point, size = guess, len(guess)
+        # the test function's derivatives are differences, which only lead to its root
+        around = [np.eye(size), -np.eye(size)] if kind is not None else []
+        aside = _DIFFERENCE * np.concatenate([np.zeros((1, size)), *around])
+        steps = 0
+        while True:
+            flown = [one for one in self.flown(*units.of_points(point + aside)) if one is not None]
+            if len(flown) < len(aside):
                 return None
-            value, matrix, tests = found
+            here = flown[0]
+            scales = units.scales(len(here.loop) // 2)
+            value, matrix = here.gaps / scales, here.slopes * np.concatenate([scales, units.width]) / scales[:, None]
             if kind is not None:
-                value, own = np.append(value, tests[kind]), self._test_slopes(point, units, kind)
-                if own is None:
-                    return None
-                matrix = np.vstack([matrix, own])
+                tests = np.array([self._tests(one, units, grazing=kind == _GRAZING)[kind] for one in flown])
+                value = np.append(value, tests[0])
+                matrix = np.vstack([matrix, (tests[1 : size + 1] - tests[size + 1 :]) / (2.0 * _DIFFERENCE)])
             matrix = np.vstack([matrix, row])
             move = np.linalg.solve(matrix, np.append(value, row @ (point - guess)))
-            point, moved = point - move, float(np.abs(move).max())
-            if not moved > _CURVE_ARRIVED:
+            moved, steps = float(np.abs(move).max()), steps + 1
+            if not moved > _CURVE_ARRIVED or steps == _CURVE_STEPS:
                 break
-        found = self._tested(point, units, tested=True)
-        if found is None:
-            return None
-        tangent = np.linalg.solve(matrix, np.eye(len(point))[-1])
-        return point, moved, tangent / np.linalg.norm(tangent), found[2]
+            point = point - move
+        tangent = np.linalg.solve(matrix, np.eye(size)[-1])
+        return point, moved, tangent / np.linalg.norm(tangent), self._tests(here, units)
 
-    def _tested(
-        self, point: np.ndarray, units: CurveUnits, *, tested: bool
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
-        """Return gaps without dimension, their derivatives by the unknowns of `solve`, and the test functions."""
-        count = (len(point) - len(units.low)) // 2
-        values = units.low + units.width * point[2 * count :]
-        scales = np.repeat([1.0, units.speed_nm_per_us], count)
-        loop = point[: 2 * count] * scales
-        flown = self.flown(loop, values)
-        if flown is None:
-            return None
-        slopes = flown.slopes * np.concatenate([scales, units.width]) / scales[:, None]
-        if not tested:
-            return flown.gaps / scales, slopes, np.zeros(0)
+    def _tests(self, flown: FlownLoop, units: CurveUnits, *, grazing: bool = True) -> np.ndarray:
+        """Return the test functions of `closed_loops`; that of grazing NaN where it is not asked for."""
         trace, determinant = flown.trace_and_determinant
-        near = self.nearest_approach(loop, flown, values) / units.speed_nm_per_us
-        near *= float(self.family(*values).cantilever.angular_frequency)
-        slowest = point[count : 2 * count].min()
-        tests = np.append(np.array([1.0 - trace, 1.0 + trace, -1.0]) + determinant, [near, slowest])
-        return flown.gaps / scales, slopes, tests
+        slowest = np.split(flown.loop, 2)[1].min() / units.speed_nm_per_us
+        near = np.nan
+        if grazing:
+            lowest, omega = _lowest_gap(*self._departures(flown), flown.contacts.arrival_time_us)
+            near = float(lowest * omega) / units.speed_nm_per_us
+        return np.append(np.array([1.0 - trace, 1.0 + trace, -1.0]) + determinant, [near, slowest])
 
-    def _test_slopes(self, point: np.ndarray, units: CurveUnits, kind: int) -> np.ndarray | None:
-        """Return the derivatives of a test function, by differences: they only lead Newton's method to its root."""
-        slopes = []
-        for step in _DIFFERENCE * np.eye(len(point)):
-            ends = [self._tested(point + sign * step, units, tested=True) for sign in (1.0, -1.0)]
-            if ends[0] is None or ends[1] is None:
-                return None
-            slopes.append((ends[0][2][kind] - ends[1][2][kind]) / (2.0 * _DIFFERENCE))
-        return np.array(slopes)
+
+@jax.jit
+def _lowest_gap(scene: Scene, begin_us: Array, rebound: Array, arrival_us: Array) -> tuple[Array, Array]:
+    """Return the lowest point of flights between two contacts above the gap at which the bridge forms, in nm.
+
+    Infinite where no flight has one; and the free tip's angular frequency in rad/us.
+    """
+    surface, _ = surface_of(scene)
+    height, rate = surface.position_and_velocity(begin_us)
+    contact, still = scene.interaction, jnp.zeros_like(begin_us)
+    flights = FreeFlights(begin_us, height + contact.bridge_breaks_nm, rate + rebound, still, arrival_us - begin_us)
+    lowest = lowest_of_flights(scene.cantilever, surface, flights, _SAMPLES).gap_nm - contact.bridge_forms_nm
+    return lowest, scene.cantilever.angular_frequency

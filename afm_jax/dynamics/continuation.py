@@ -5,7 +5,7 @@ solved at a point of it is in `closed_loops`, special points and their curves in
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -22,15 +22,15 @@ from afm_jax.dynamics.impact_orbits import MOST_IMPACTS, many_impact_orbits
 from afm_jax.dynamics.special_points import OrbitBranch, SpecialCurve, SpecialPoint, special_curves, special_points_of
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.orbits import single_impact_orbits
-from afm_jax.results import public_result
+from afm_jax.results import ResultTuple, columns_of, public_result
 from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, parameter_values, scene_family
 
 _VALUES_TRIED = 9
 _FEWER_TRIED = 3
 
 
-@public_result(picture="afm_jax.plots.branches:continuation_figure")
-class Continuation(NamedTuple):
+@public_result(picture="afm_jax.plots.branches:continuation_figure", rows="points")
+class Continuation(ResultTuple):
     """What `continue_orbits` finds."""
 
     order: int
@@ -46,6 +46,16 @@ class Continuation(NamedTuple):
     equations: Equations
     sticking: bool = False
     """The orbits rest on the surface (`follow_sticking`)."""
+
+    def points(self) -> list[dict[str, Any]]:
+        """Return a mapping for each point of the branches: the branch, the parameter, what is read of the orbit."""
+        found = []
+        for number, branch in enumerate(self.branches):
+            read = {name: array for name, (array, _) in columns_of(branch.reading).items() if array.ndim == 1}
+            for i, value in enumerate(branch.parameter.tolist()):
+                orbit = {name: array[i].item() for name, array in read.items()}
+                found.append({"branch": number, "parameter": value, **orbit})
+        return found
 
 
 def continue_orbits(

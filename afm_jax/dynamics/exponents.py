@@ -38,7 +38,7 @@ from afm_jax.impact.law import impact_law_of
 from afm_jax.motion.record import State
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.outcomes import Outcome
-from afm_jax.results import public_result
+from afm_jax.results import ResultTuple, public_result
 
 _PARTS = 20
 """Parts of a motion whose means tell the errors."""
@@ -49,7 +49,7 @@ _ARRIVED = 1e-8
 
 
 @public_result()
-class Lyapunov(NamedTuple):
+class Lyapunov(ResultTuple):
     """Exponents of motions, arrays of one lane a motion; larger exponent first.
 
     Attributes:

@@ -192,10 +192,31 @@ def nearest_approach(
         # a flight counts from max(t_in, t_out) on
         first = jnp.maximum(-impacts.speeds.delay, 0.0)
 
+    flights = FreeFlights(begin, height, velocity, first, lasts)
+    return lowest_of_flights(loop.cantilever, loop.surface, flights, samples)
+
+
+class FreeFlights(NamedTuple):
+    """Flights of a loop, arrays of one number each: us, nm and nm/us against the resting tip."""
+
+    begin_us: Float[Array, " m"]
+    height: Float[Array, " m"]
+    velocity: Float[Array, " m"]
+    first_us: Float[Array, " m"]
+    """Time after the beginning from which on a flight counts."""
+    lasts_us: Float[Array, " m"]
+
+
+def lowest_of_flights(
+    cantilever: Cantilever, surface: Platform | Surface, flights: FreeFlights, samples: int
+) -> NearestApproach:
+    """Return the lowest point of flights above the surface, differentiable; arguments as for `nearest_approach`."""
+    begin, height, velocity, first, lasts = flights
+
     def motion(start, height, velocity, after):
-        position, speed = loop.cantilever.propagator(after)(height, velocity)
-        level, rate = loop.surface.position_and_velocity(start + after)
-        bend = loop.cantilever.acceleration(position, speed) - loop.surface.acceleration(start + after)
+        position, speed = cantilever.propagator(after)(height, velocity)
+        level, rate = surface.position_and_velocity(start + after)
+        bend = cantilever.acceleration(position, speed) - surface.acceleration(start + after)
         return position - level, speed - rate, bend
 
     step = (lasts - first) / samples

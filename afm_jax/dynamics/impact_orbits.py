@@ -8,7 +8,6 @@ depends on the surface alone, so that one flight from there tells whether it com
 """
 
 from functools import partial
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -34,7 +33,7 @@ from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, Flight
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.map import impact_after
 from afm_jax.outcomes import Outcome
-from afm_jax.results import public_result
+from afm_jax.results import ResultTuple, public_result
 
 DEFAULT_STARTS = 512
 MOST_IMPACTS = 64
@@ -58,7 +57,7 @@ _STEPS = 2000
 
 
 @public_result()
-class ManyImpactOrbits(NamedTuple):
+class ManyImpactOrbits(ResultTuple):
     """Orbits of m impacts in N drive periods, by falling peak amplitude; NumPy arrays.
 
     The first impact is the hardest one, the others follow in time. Orbits that only repeat one with fewer impacts are

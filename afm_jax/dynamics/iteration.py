@@ -6,7 +6,7 @@ needs (chatter summed up, the ride, the release) is computed in the steps in whi
 others. Times count within the drive's period, so that long motions keep the digits of their phase.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
@@ -27,7 +27,7 @@ from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, Flight
 from afm_jax.impact.law import ImpactLaw, impact_law_of
 from afm_jax.impact.map import NextImpact, impact_after
-from afm_jax.impact.orbits import single_impact_orbits
+from afm_jax.impact.orbits import fastest_steady_orbit, orbit_problem
 from afm_jax.motion.law_motion import CONSTANT_PUSH, Bed, LawLeg, or_rest, through_impact
 from afm_jax.motion.record import ContactKind, State
 from afm_jax.motion.start import default_start
@@ -288,17 +288,16 @@ def _on_orbits(scenes: Scene, clearance_nm: Float[Array, " lanes"]) -> tuple[Boo
     """Return which scenes with laws have a stable orbit, and tips on them, about as high above the platform as told."""
 
     def one(scene: Scene, clearance: Array) -> tuple[Array, ...]:
-        omega = scene.platform.angular_frequency
-        order = jnp.maximum(1.0, jnp.round(omega / (2.0 * scene.cantilever.angular_frequency)))
-        orbits = single_impact_orbits(scene, order)
-        steady = orbits.exists & orbits.admissible & orbits.stable
-        slot = jnp.argmax(jnp.where(steady, orbits.approach_speed_nm_per_us, -jnp.inf))
-        start, velocity = orbits.phase_rad[slot] / omega, orbits.velocity_after_nm_per_us[slot]
-        rise = clearance / orbits.rebound_speed_nm_per_us[slot]
-        height, speed = scene.cantilever.propagator(rise)(scene.platform.position(start), velocity)
-        gap = jnp.where(clearance > 0.0, height - scene.platform.position(start + rise), 0.0)
+        platform = scene.platform
+        order = jnp.round(platform.angular_frequency / (2.0 * scene.cantilever.angular_frequency))
+        law = impact_law_of(scene)
+        orbit, steady = fastest_steady_orbit(orbit_problem(scene.cantilever, platform, law, jnp.maximum(1.0, order)))
+        start, velocity = orbit.flight.start_us, orbit.flight.start_velocity
+        rise = clearance / orbit.speeds.rebound
+        height, speed = scene.cantilever.propagator(rise)(platform.position(start), velocity)
+        gap = jnp.where(clearance > 0.0, height - platform.position(start + rise), 0.0)
         risen = (clearance == 0.0) | (gap > _RISEN * clearance)
-        return steady.any() & risen, (start + rise) % scene.platform.period_us, gap, speed
+        return steady & risen & (law.r > 0.0), (start + rise) % platform.period_us, gap, speed
 
     there, time, gap, velocity = jax.vmap(one)(scenes, clearance_nm)
     return there, tips_at(scenes, time, velocity)._replace(gap_nm=gap)
@@ -437,17 +436,25 @@ Report = Callable[[int, int], object]
 """Told how many of how many lanes are done."""
 
 
-def in_blocks(work: Callable[[Any], Any], lanes: Any, *, block: int = LANES, report: Report | None = None) -> Any:
+def in_blocks(
+    work: Callable[[Any], Any],
+    lanes: Any,
+    *,
+    block: int = LANES,
+    widths: Sequence[int] = _WIDTHS,
+    report: Report | None = None,
+) -> Any:
     """Return the results of work on lanes, done block by block on all cores.
 
     Args:
         work: takes a tree of arrays with a leading axis of lanes, gives one of NumPy arrays with the same axis.
         lanes: the tree of all lanes.
         block: lanes of a block; fewer lanes are one smaller block, filled up.
+        widths: sizes that a smaller block may have.
         report: told how far it is.
     """
     count = len(jax.tree.leaves(lanes)[0])
-    width = next((width for width in _WIDTHS if width >= min(count, block)), block)
+    width = next((width for width in widths if width >= min(count, block)), block)
     whole = jax.tree.map(np.asarray, lanes)
 
     def part(first: int) -> Any:

@@ -18,20 +18,11 @@ from jax.stages import Compiled
 from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.checks import require_float64
 from afm_jax.effects.scene_effects import Scaled, SceneEffect, effects_in
+from afm_jax.motion.follow import Piece, follow_in_pieces, joined, joined_motions, place_after, why_over
 from afm_jax.motion.observe import Reading, read_window
+from afm_jax.motion.periodic import Orbit, follow_to_orbit, why_impossible
 from afm_jax.motion.record import Simulation, State
-from afm_jax.motion.settle import (
-    Orbit,
-    Piece,
-    follow_in_pieces,
-    follow_to_orbit,
-    joined,
-    joined_motions,
-    last_fifth,
-    place_after,
-    why_impossible,
-    why_over,
-)
+from afm_jax.motion.settle import last_fifth
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start
 from afm_jax.motion.trajectory import dense_path
@@ -344,9 +335,6 @@ class EffectStudy(NamedTuple):
     reduction: Reduction | None
 
 
-Progress = Callable[[str], None]
-
-
 def study_effects(  # noqa: PLR0913
     scene: Scene,
     start: State | None = None,
@@ -356,7 +344,7 @@ def study_effects(  # noqa: PLR0913
     only: Sequence[str] | None = None,
     derivatives: bool = True,
     programs: Programs | None = None,
-    progress: Progress = lambda _: None,
+    report: Callable[[int, int], object] = lambda *_: None,
 ) -> EffectStudy:
     """Return what each effect of a scene changes and costs.
 
@@ -368,7 +356,7 @@ def study_effects(  # noqa: PLR0913
         only: names of the effects to look at; None: all.
         derivatives: whether to predict changes by derivatives too, which compiles as long as two or three scenes.
         programs: compiled programs to go on with.
-        progress: is told what is being done.
+        report: told how many of how many scenes, with and without an effect, are done.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
@@ -384,7 +372,6 @@ def study_effects(  # noqa: PLR0913
     begin = default_start(scene) if start is None else start
     duration = PERIODS_AT_MOST * drive.period_us if duration_us is None else duration_us
     view = View(begin, duration, drive, drive.aperiodic is None)
-    progress("the full scene")
     full = observe_scene(programs, scene, view)
     if full.reading is None and view.settles and full.reason is not None and full.reason.startswith("nothing repeats"):
         view = view._replace(settles=False)
@@ -392,13 +379,13 @@ def study_effects(  # noqa: PLR0913
     if full.reading is None:
         raise ValueError(f"the scene has no motion to compare with: {full.reason}; give it another start")
     cost = _cost(programs, full, view, None)
-    reports = []
+    reports, total = [], 1 + len(chosen) + (accuracy is not None)
     for effect in chosen:
-        progress(effect.name)
+        report(1 + len(reports), total)
         reports.append(_report(programs, full, view, effect, cost, derivatives=derivatives))
     reduction = None
     if accuracy is not None:
-        progress("what can be left out together")
+        report(total - 1, total)
         reduction = _reduce(programs, full, view, reports, accuracy, cost)
     return EffectStudy(scene, view, full, cost, reports, reduction)
 

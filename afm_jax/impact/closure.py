@@ -61,6 +61,12 @@ class ClosingSystem(NamedTuple):
         cosine = jnp.where(self.regular, self.cosine / safe, 1.0)
         return jnp.arctan2(jnp.where(self.regular, self.sine / safe, 0.0), cosine)
 
+    @property
+    def residual(self) -> Float[Array, ""]:
+        """a^2 + b^2 - 1 times the squared determinant, relative to the sum of its terms."""
+        total = self.cosine**2 + self.sine**2 + self.determinant**2
+        return (self.cosine**2 + self.sine**2 - self.determinant**2) / total
+
 
 class Closure(NamedTuple):
     """The impact at a coordinate, and the linear system it leads to."""
@@ -200,9 +206,7 @@ def _law_of(problem: OrbitProblem) -> ImpactLaw:
 @jax.jit
 def closing_residual(coordinate: Float[Array, ""], problem: OrbitProblem) -> Float[Array, ""]:
     """Return a^2 + b^2 - 1 times the squared determinant, relative to the sum of its terms: 0 on an orbit."""
-    cosine, sine, determinant, _ = closure(coordinate, problem).system
-    total = cosine**2 + sine**2 + determinant**2
-    return (cosine**2 + sine**2 - determinant**2) / total
+    return closure(coordinate, problem).system.residual
 
 
 class _ReturningFlight(NamedTuple):

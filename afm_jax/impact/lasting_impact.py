@@ -18,9 +18,12 @@ Higher orders in J, below 0.03 as a rule, count nothing. Orbits over a driven pl
 0.01 % of those of the full contact, within 1 % at twice the capture speed.
 """
 
+from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
@@ -288,11 +291,201 @@ def _rebound(u: Float[Array, "..."], loss: Float[Array, "..."]) -> Float[Array, 
     return jnp.sqrt(jnp.maximum(u * u - loss, 1e-6))
 
 
+class Taps(eqx.Module):
+    """Taps, light (that the bridge turns round) and hard, as series over the speed with which they come, and over ln g.
+
+    Attributes:
+        terms: coefficients of u_in^2 - u_out^2 and of the other numbers of `Tap`, shape (pulls, kinds, terms, 6).
+        low: squared speed where they begin, coefficients of shape (pulls, kinds).
+        high: where they end: the squared speed of light ones, of hard ones the variable.
+        gaps: between which light ones turn, as a ratio.
+        scale: speed of the hard ones' variable, in nm/us.
+        pulls: weakest and strongest pull in nm/us^2, shape (2, kinds).
+    """
+
+    terms: Float[Array, "..."]
+    low: Float[Array, "..."]
+    high: Float[Array, "..."]
+    gaps: Float[Array, ""]
+    scale: Float[Array, ""]
+    pulls: Float[Array, "..."]
+
+    def at(self, pull: Float[Array, ""]) -> "Taps":
+        """Return the series over the speed alone, at a pull."""
+        weakest, strongest = self.pulls
+        held = jnp.clip(pull, weakest, strongest)
+        far = 2.0 * jnp.log(held / weakest) / jnp.log(strongest / weakest) - 1.0
+        weights = polynomials(far, self.low.shape[0])
+        own = {name: jnp.einsum("kp,pk...->k...", weights, getattr(self, name)) for name in ("terms", "low", "high")}
+        return replace(self, **own)
+
+    def place(self, square: Float[Array, "..."]) -> Float[Array, " 2"]:
+        """Return where squared speeds, one or one a kind, lie in the series, -1 to 1; of a table at one pull."""
+        # light ones by the gap where they turn, which is about linear in ln of what is left to the nearest
+        light, hard = jnp.broadcast_to(square, (2,))
+        left = jnp.clip((self.high[0] - light) / (self.high[0] - self.low[0]), 0.0, 1.0)
+        beyond = hard > self.low[1]
+        v = jnp.sqrt(jnp.where(beyond, hard - self.low[1], 1.0)) / self.scale
+        far = jnp.where(beyond, 2.0 * stretched(v) / self.high[1] - 1.0, -1.0)
+        return jnp.stack([1.0 - 2.0 * jnp.log1p((self.gaps - 1.0) * left) / jnp.log(self.gaps), far])
+
+    def holds(self, square: Float[Array, ""], pull: Float[Array, ""]) -> Bool[Array, " 2"]:
+        """Say whether there are taps of either kind at a squared speed and a pull; of a table at that pull."""
+        inside = (pull >= self.pulls[0] * (1.0 - _BESIDE)) & (pull <= self.pulls[1] * (1.0 + _BESIDE))
+        # next to the first hard tap the last light one holds
+        last = jnp.where(self.low[1] < _NEXT * self.high[0], jnp.maximum(self.low[1], self.high[0]), self.high[0])
+        end = jnp.stack([square <= last, self.place(square)[1] <= 1.0])
+        return inside & (square >= self.low) & end
+
+
+_NEXT = 1.02
+"""Squared speed of the first hard tap over that of the last light one up to which there is none between."""
+_BESIDE = 0.02
+"""Share by which a pull may lie outside a table."""
+_PEAKED = 1.65
+"""Depth of a tap over its mean depth: between those of a parabola and of a triangle."""
+_NOWHERE_US = 1e3
+"""What the delay of a tap that does not exist is longer by, and more: no orbit has it."""
+
+
+def polynomials(place: Float[Array, "..."], count: int) -> Float[Array, "... count"]:
+    """Return Chebyshev's polynomials at places, held in [-1, 1]: T_(k+j) = 2 T_k T_j - T_(k-j) doubles them."""
+    place = jnp.clip(place, -1.0, 1.0)
+    found = jnp.stack([jnp.ones_like(place), place], axis=-1)
+    while found.shape[-1] < count:
+        last = found[..., -1:]
+        found = jnp.concatenate([found, 2.0 * last * found[..., 1:] - found[..., -2::-1]], axis=-1)
+    return found[..., :count]
+
+
+class Tap(NamedTuple):
+    """What a tap does: speeds and time at the plane; time integrals of the depth below it and of the squared speed.
+
+    ``late``: by how much the mean time of the depth is behind the middle of the tap, and ``spread``, in us^2, the mean
+    square of that time.
+    """
+
+    speeds: Speeds
+    area: Float[Array, "..."]
+    action: Float[Array, "..."]
+    late: Float[Array, "..."]
+    spread: Float[Array, "..."]
+
+
+class PulledImpact(eqx.Module):
+    """Taps, light and hard, of a tip on a bent lever (`contact.bent_lever`); the coordinate is the speed at the plane.
+
+    Attributes:
+        taps: those under a pull.
+        free: collisions of a free tip, at gap 0.
+        plane_nm: gap of the plane, where the bridge breaks.
+    """
+
+    taps: Taps
+    free: TabulatedImpact
+    plane_nm: Float[Array, ""]
+
+    @property
+    def delayed(self) -> bool:
+        """It takes time."""
+        return True
+
+    @property
+    def lasts(self) -> bool:
+        """And the tip is not alone meanwhile."""
+        return True
+
+    @property
+    def lowest(self) -> Float[Array, ""]:
+        """No tap comes slower."""
+        return 0.5 * self.free.lowest
+
+    @property
+    def reach(self) -> Float[Array, ""]:
+        """The capture speed of a free tip."""
+        return self.free.lowest
+
+    @property
+    def lead(self) -> Float[Array, ""]:
+        """None: the way through the bridge is part of the time."""
+        return jnp.zeros_like(self.plane_nm)
+
+    @property
+    def length(self) -> Float[Array, ""]:
+        """Gap at which the bridge breaks."""
+        return self.free.length
+
+    def hertz_time(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return the Hertz time at a speed."""
+        return self.free.hertz_time(approach_speed)
+
+    def speeds(self, coordinate: Float[Array, "..."]) -> Speeds:
+        """Return speeds and time of a tap under a middling pull, or of the next that there is."""
+        return self._found(coordinate, jnp.sqrt(self.taps.pulls[0, 1] * self.taps.pulls[1, 1]))[0].speeds
+
+    def at_approach(self, approach_speed: Float[Array, ""]) -> Speeds:
+        """Return the same."""
+        return self.speeds(approach_speed)
+
+    def tap(self, approach_speed: Float[Array, ""], pull: Float[Array, ""]) -> Tap:
+        """Return a tap; one that does not exist has a time that no orbit has."""
+        tap, exists = self._found(approach_speed, pull)
+        never = jnp.where(exists, 0.0, _NOWHERE_US * (1.0 + approach_speed))
+        return tap._replace(speeds=tap.speeds._replace(delay=tap.speeds.delay + never))
+
+    def during(self, approach_speed: Float[Array, ""], middle: "Middle", cantilever: Cantilever) -> Tap:
+        """Return a tap while the pull changes, in air.
+
+        To first order what is odd about the middle of the tap, the air with it, makes the speeds differ, and leaves the
+        rest as it is for the mean of their squares. What is even, bend t^2/2, shifts the ends: with h half the time,
+        h' its slope by the speed and paths that move apart evenly outside the turn, the time grows by
+        -bend h^3 (h'/3 - h (g h' - 1)/(12 u)), and the area by the depth times that, less bend h^5/10.
+        """
+
+        def gained(tap: Tap) -> Array:
+            change = middle.change + 0.5 * middle.twist * tap.spread
+            return 2.0 * (change * tap.area - 2.0 * cantilever.decay_rate * tap.action)
+
+        pull, square = middle.acceleration, approach_speed**2
+
+        def look(_, state):
+            """Return the tap of a speed with its slope, and the speed that it says the mean one is."""
+            speed = state[0]
+            tap, slope = jax.jvp(lambda u: self.tap(u, pull), (speed,), (jnp.ones_like(speed),))
+            mean = jnp.maximum(square + 0.5 * gained(tap), (0.1 * approach_speed) ** 2)
+            return jnp.sqrt(mean), speed, tap, slope
+
+        # a loop, because the program is compiled for every use of it
+        nothing = Tap(Speeds(*(jnp.zeros_like(square),) * 3), *(jnp.zeros_like(square),) * 4)
+        _, speed, tap, slope = lax.fori_loop(0, 2, look, (approach_speed, approach_speed, nothing, nothing))
+        mean = speed**2
+        half, steep = 0.5 * tap.speeds.delay, 0.5 * slope.speeds.delay
+        longer = -middle.bend * half**3 * (steep / 3.0 - half * (pull * steep - 1.0) / (12.0 * speed))
+        longer = jnp.clip(longer, -0.2 * half, 0.2 * half)
+        deepest = _PEAKED * tap.area / tap.speeds.delay
+        left = tap.speeds.rebound**2 - mean + square + gained(tap)
+        rebound = jnp.sqrt(jnp.maximum(left, (0.1 * tap.speeds.rebound) ** 2))
+        area = tap.area + deepest * longer - 0.1 * middle.bend * half**5
+        return tap._replace(speeds=Speeds(approach_speed, rebound, tap.speeds.delay + longer), area=area)
+
+    def _found(self, approach_speed: Float[Array, ""], pull: Float[Array, ""]) -> tuple[Tap, Bool[Array, ""]]:
+        """Return a tap, or the next that there is, and whether it exists."""
+        square = approach_speed**2
+        taps = self.taps.at(pull)
+        is_light, is_hard = taps.holds(square, pull)
+        parts = jnp.einsum("kn,knc->kc", polynomials(taps.place(square), taps.terms.shape[1]), taps.terms)
+        loss, time, *others = jnp.where(is_hard, parts[1], parts[0])
+        rebound = jnp.sqrt(jnp.maximum(square - loss, 1e-6))
+        return Tap(Speeds(approach_speed, rebound, time), *others), is_hard | is_light
+
+
 class Middle(NamedTuple):
-    """The tip relative to the platform at mid contact: acceleration g in nm/us^2 and its change j in nm/us^3."""
+    """The tip relative to the platform at mid contact: acceleration g in nm/us^2 and its first derivatives."""
 
     acceleration: Float[Array, ""]
     change: Float[Array, ""]
+    bend: Float[Array, ""]
+    twist: Float[Array, ""]
 
 
 def middle_of_contact(cantilever: Cantilever, surface: Platform | Surface, time_us: Float[Array, "..."]) -> Middle:
@@ -306,7 +499,21 @@ def middle_of_contact(cantilever: Cantilever, surface: Platform | Surface, time_
     height, velocity = surface.position_and_velocity(time_us)
     acceleration = surface.acceleration(time_us)
     pull = cantilever.acceleration(height, velocity) - acceleration
-    return Middle(pull, cantilever.acceleration(velocity, acceleration) - surface.jerk(time_us))
+    jerk, (snap, crackle) = _thrice(surface.jerk, time_us)
+    pulled = cantilever.acceleration
+    return Middle(
+        pull, pulled(velocity, acceleration) - jerk, pulled(acceleration, jerk) - snap, pulled(jerk, snap) - crackle
+    )
+
+
+def _thrice(of: Callable[[Array], Array], at: Float[Array, "..."]) -> tuple[Array, tuple[Array, Array]]:
+    """Return a function's value and its first two derivatives."""
+
+    def twice(at):
+        return jax.jvp(of, (at,), (jnp.ones_like(at),))
+
+    (value, rate), (_, second) = jax.jvp(twice, (at,), (jnp.ones_like(at),))
+    return value, (rate, second)
 
 
 def hertz_under_pull(kappa: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
@@ -350,6 +557,8 @@ def corrected(free: Speeds, middle: Middle, cantilever: Cantilever, impact: Impa
         impact: for its Hertz time and its lead.
     """
     u, w = free.approach, free.rebound
+    if isinstance(impact, PulledImpact):
+        return impact.during(u, middle, cantilever).speeds
     gained, longer = gained_and_longer(u, impact.hertz_time(u), middle, cantilever)
     rebound = jnp.sqrt(jnp.maximum(w**2 + gained, (0.1 * w) ** 2))
     held = _lag(w, impact.length, middle.acceleration) - _lag(u, impact.length, middle.acceleration)

@@ -21,14 +21,14 @@ from afm_jax.impact.first_impact import DEFAULT_MAX_STEPS, DEFAULT_ROOT_TOLERANC
 from afm_jax.impact.lasting_impact import LawImpact, crawls, delay_before, speeds_of_impact
 from afm_jax.impact.law import impact_law_of
 from afm_jax.outcomes import Outcome
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 
 NEAR_GRAZING = 1e-3
 """Approach speed over beta omega below which an impact counts as near grazing: its derivatives lose their meaning."""
 
 
 @public_result(outcome=Outcome)
-class NextImpact(eqx.Module):
+class NextImpact(Result, eqx.Module):
     """The impact that follows a start, one tip and one time; batches by `vmap`.
 
     Attributes:

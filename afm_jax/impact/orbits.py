@@ -30,11 +30,11 @@ from afm_jax.impact.closure import (
 from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.impact.implicit import implicit_pair, implicit_root
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
-from afm_jax.impact.lasting_impact import Impact, LawImpact, crawls, indentation, middle_of_contact
+from afm_jax.impact.lasting_impact import Impact, LawImpact, PulledImpact, crawls, indentation, middle_of_contact
 from afm_jax.impact.law import ImpactLaw, Speeds, impact_law_of
-from afm_jax.impact.roots import COARSE, find_roots
+from afm_jax.impact.roots import COARSE, TAPPED, find_roots
 from afm_jax.outcomes import Outcome
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from afm_jax.units import within_turn
 
 NEAR_DOUBLE = 1e-3
@@ -46,7 +46,7 @@ _ARRIVAL_TOLERANCE = 1e-7
 
 
 @public_result()
-class SingleImpactOrbits(eqx.Module):
+class SingleImpactOrbits(Result, eqx.Module):
     """All (1, N) orbits of a scene, ascending in approach speed, in a fixed number of slots.
 
     Without a collision delay there are 4 slots, as many as eq. 9 can have roots; with one there are 16. Every
@@ -317,7 +317,7 @@ def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
     A delayed closing condition is scanned coarsely: orbits close to each other or to capture may be missed.
     """
     problem = lax.stop_gradient(problem)
-    roots = find_roots(problem, COARSE)
+    roots = find_roots(problem, TAPPED if isinstance(problem.impact, PulledImpact) else COARSE)
 
     def one(place, found):
         state = orbit_state(place, problem)
@@ -325,6 +325,36 @@ def steady_orbits(problem: OrbitProblem) -> SteadyOrbits:
         return verdict.admissible & verdict.stable, verdict.near_double, _observed(state, problem)
 
     return SteadyOrbits(roots.place, *jax.vmap(one)(roots.place, roots.found))
+
+
+def fastest_steady_orbit(problem: OrbitProblem) -> tuple[OrbitState, Bool[Array, ""]]:
+    """Return the steady motion that comes fastest, without derivatives, and whether there is one.
+
+    The roots are those of `steady_orbits`; of the stable ones flights are followed only until one is admissible.
+    """
+    problem = lax.stop_gradient(problem)
+    cantilever, platform, impact, _ = problem
+    roots = find_roots(problem, COARSE)
+    states = jax.vmap(orbit_state, in_axes=(0, None))(roots.place, problem)
+
+    def lasts(state):
+        return contracts(*trace_and_determinant(impact, cantilever, platform, state.flight))
+
+    def looking(so_far):
+        left, _, steady = so_far
+        return jnp.any(left > -jnp.inf) & ~steady
+
+    def look(so_far):
+        left, _, _ = so_far
+        slot = jnp.argmax(left)
+        place, state = jax.tree.map(lambda leaf: leaf[slot], (roots.place, states))
+        # of a batch, one that is done looks for nothing
+        verdict = judge(place, looking(so_far), state, problem)
+        return left.at[slot].set(-jnp.inf), slot, verdict.admissible
+
+    left = jnp.where(roots.found & jax.vmap(lasts)(states), states.speeds.approach, -jnp.inf)
+    _, slot, steady = lax.while_loop(looking, look, (left, jnp.argmax(left), jnp.zeros((), bool)))
+    return jax.tree.map(lambda leaf: leaf[slot], states), steady
 
 
 def amplitudes(place: OrbitPlace, problem: OrbitProblem) -> Float[Array, " 3"]:
@@ -335,13 +365,21 @@ def amplitudes(place: OrbitPlace, problem: OrbitProblem) -> Float[Array, " 3"]:
 @jax.jit
 def _observed(state: OrbitState, problem: OrbitProblem) -> Float[Array, " 3"]:
     cantilever, platform, impact, order = problem
-    depth = 0.0
+    depth, late = 0.0, 0.0
     if impact.lasts:
         # in contact the tip is below the platform's rest surface by the indentation
         approach, delay = state.speeds.approach, state.speeds.delay
         middle = middle_of_contact(cantilever, platform, state.flight.start_us - 0.5 * delay)
-        depth = indentation(approach, impact.hertz_time(approach), middle)
-    length, phase = lockin(cantilever, platform, state.flight, order, delayed=impact.delayed, indentation=depth)
+        if isinstance(impact, PulledImpact):
+            nu = platform.angular_frequency / order
+            tap = impact.during(approach, middle, cantilever)
+            # the last term as of a parabola
+            depth = tap.area * (1.0 - 0.5 * nu**2 * tap.spread + (nu * delay) ** 4 / 4480.0)
+            late = tap.late
+        else:
+            depth = indentation(approach, impact.hertz_time(approach), middle)
+    below = {"indentation": depth, "late_us": late}
+    length, phase = lockin(cantilever, platform, state.flight, order, delayed=impact.delayed, **below)
     return jnp.stack([peak_amplitude(cantilever, state.flight), length, phase])
 
 

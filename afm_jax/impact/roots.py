@@ -27,6 +27,7 @@ from afm_jax.impact.closure import (
     instantaneous_quartic,
     place_of,
 )
+from afm_jax.impact.lasting_impact import PulledImpact
 
 _MAX_STEPS = 200  # Laguerre's method needs about 5; bisection alone over the widest interval about 100
 _SETTLED = 1e-12  # the last relative step; it has been cubed by then
@@ -146,6 +147,8 @@ FINE = Scan(8192, 1e-7, 1e5, crossings=16, turns=6, slots=16)
 """Some 680 points to the decade: for whoever asks for all orbits."""
 COARSE = Scan(512, 1e-3, 1e4, crossings=6, turns=2, slots=10)
 """Some 70 to the decade: for fits, which search a hundred thousand times."""
+TAPPED = Scan(128, 1e-2, 3.0, crossings=6, turns=2, slots=6)
+"""Of taps, each of which takes long to look up, and none of which is much faster than the drive."""
 
 
 class OrbitRoots(NamedTuple):
@@ -228,8 +231,13 @@ def _scale(problem: OrbitProblem) -> Float[Array, ""]:
 def _scanned_roots(problem: OrbitProblem, scan: Scan) -> _Coordinates:
     """Scan the closing condition from just above capture to speeds that no orbit reaches; narrow every bracket."""
     grid = problem.impact.lowest + jnp.asarray(np.geomspace(scan.lowest, scan.highest, scan.points)) * _scale(problem)
-    value = jax.vmap(closing_residual, in_axes=(0, None))(grid, problem)
-    brief = jax.vmap(_brief, in_axes=(0, None))(grid, problem)
+    speeds, system = jax.vmap(closure, in_axes=(0, None))(grid, problem)
+    value = jax.vmap(lambda system: system.residual)(system)
+    if isinstance(problem.impact, PulledImpact):
+        # a bent lever pulls the tip out of the bridge
+        brief = jnp.abs(speeds.delay) < 0.5 * problem.platform.period_us
+    else:
+        brief = jax.vmap(_brief, in_axes=(0, None))(grid, problem)
     crossing = (value[:-1] * value[1:] < 0.0) & brief[:-1] & brief[1:]
     root, found = _narrowed(_crossings(crossing, grid, value, scan), _dips(brief, grid, value, scan), problem)
     order = jnp.argsort(jnp.where(found, root, jnp.inf))[: scan.slots]
@@ -242,7 +250,8 @@ def _brief(coordinate: Float[Array, ""], problem: OrbitProblem) -> Bool[Array, "
 
     One that lasts must end within half a drive period, and the tip have lost its energy by then.
     """
-    speeds, period = problem.impact.speeds(coordinate), problem.platform.period_us
+    period = problem.platform.period_us
+    speeds = problem.impact.speeds(coordinate)
     if not problem.impact.lasts:
         return jnp.abs(speeds.delay) < period
     return (jnp.abs(speeds.delay) < 0.5 * period) & (problem.impact.length / speeds.rebound < _LEAVING * period)

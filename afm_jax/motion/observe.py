@@ -3,7 +3,7 @@
 One way of reading for all: sums over the nodes of a dense path, whose contacts are integrated once more or, where that
 would cost more than it tells, straight between the points that the simulation keeps (`dense_path`).
 
-What impacts of a law add to a lock-in beyond flights and rests on the surface: the same as in `orbit_amplitude`.
+What impacts of a law add to a lock-in beyond flights and rests on the surface: as in `impact/amplitude.py`.
 
 In an impact that lasts the tip is below the surface by the indentation of a Hertz contact. A negative collision delay
 lets a flight begin before the last one has ended: until then both are there, and the surface once too often.
@@ -183,7 +183,6 @@ def observe(
     simulation: Simulation,
     *,
     harmonics: Sequence[int] = (1,),
-    drive: DrivePeriod | None = None,
     verdict: Settled | None = None,
     dense: DensePath | None = None,
 ) -> Observables:
@@ -197,7 +196,6 @@ def observe(
         scene: the scene that was simulated.
         simulation: of one scene, not of a batch.
         harmonics: multiples k of the response frequency, positive integers.
-        drive: whose periods count; the scene's if None.
         verdict: what `settled` said, if it is known already.
         dense: the tip over the window and whatever else is looked at, if that is known already.
 
@@ -208,9 +206,9 @@ def observe(
     """
     if not harmonics or any(k != int(k) or k < 1 for k in harmonics):
         raise ValueError(f"`harmonics` must be positive integers, but are {tuple(harmonics)}")
-    drive = drive_of(scene) if drive is None else drive
+    drive = drive_of(scene)
     verdict = settled(scene, simulation) if verdict is None else verdict
-    window = window_of(scene, simulation, verdict, drive)
+    window = window_of(scene, simulation, verdict)
     begin, end = window.from_us, window.to_us
     dense = dense_path(scene, simulation, begin, end) if dense is None else dense
     times, weights = dense.nodes(begin, end)

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import Surface
-from afm_jax.results import public_result
+from afm_jax.results import Result, ResultTuple, public_result
 
 
 class MotionOutcome(enum.IntEnum):
@@ -57,7 +57,7 @@ class ContactKind(enum.IntEnum):
 
 
 @public_result()
-class State(NamedTuple):
+class State(ResultTuple):
     """Where the tip is: lab frame, scalars of one scene."""
 
     time_us: Float[Array, "..."]
@@ -109,7 +109,7 @@ class Contacts(NamedTuple):
 
 
 @public_result(outcome=MotionOutcome)
-class Simulation(eqx.Module):
+class Simulation(Result, eqx.Module):
     """A scene followed in time; under `vmap` every array has the batch as first axis."""
 
     start: State

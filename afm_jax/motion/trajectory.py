@@ -32,7 +32,7 @@ from afm_jax.contact.driven import Driven, Place, driven_by
 from afm_jax.contact.junction import Junction, Phase, find_junction, force_in_phase
 from afm_jax.contact.step import Touch, advance, eighth_order_step, fresh_touch
 from afm_jax.motion.record import ContactKind, Simulation, State, to_gap, to_lab
-from afm_jax.results import public_result
+from afm_jax.results import ResultTuple, public_result
 
 _BLOCK = 128
 """Trials computed in one call."""
@@ -300,7 +300,7 @@ _PANEL_RAD = 1.5
 
 
 @public_result(phase=Phase)
-class Trajectory(NamedTuple):
+class Trajectory(ResultTuple):
     """The tip at given times; NumPy arrays of the times' shape."""
 
     time_us: np.ndarray

@@ -109,7 +109,7 @@ def _responses_shown(scene: Scene, simulation: Simulation, verdict: Settled, to_
     response = (verdict.periods or 1) * drive.period_us if repeats else drive.period_us
     first, last = float(simulation.start.time_us), float(simulation.final.time_us)
     if repeats:
-        last = window_of(scene, simulation, verdict, drive).to_us
+        last = window_of(scene, simulation, verdict).to_us
     elif verdict.stuck:
         last = to_us
     # only what has settled repeats: the last fifth at most
@@ -328,7 +328,7 @@ def _gap_of_flights(look: Look) -> Figure:
     axes.set_xlim(look.path.time_us[0], look.path.time_us[-1])
     label_axes(axes, x="time (µs)", y="gap (nm)")
     axes.set_title(f"gap over the last {shown.size} of {look.arrival_us.size} impacts", fontsize=12, loc="left")
-    axes.legend(loc="upper right", fontsize=10, framealpha=1.0)
+    axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4, fontsize=10, frameon=False)
     return picture
 
 

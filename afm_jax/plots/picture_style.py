@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Shaped
+from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.image import imsave
 
@@ -19,6 +21,7 @@ BLUE = "#0072B2"
 GRID = "#9aa5b1"
 _FONT = 11.0
 _DPI = 200.0
+_MANY_POINTS = 2000
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
@@ -63,6 +66,20 @@ def png_of_pixels(pixels: Shaped[np.ndarray, "height width 4"], dpi: float) -> b
     """Return pixels as a PNG file."""
     buffer = io.BytesIO()
     imsave(buffer, pixels, format="png", dpi=dpi)
+    return buffer.getvalue()
+
+
+def svg_of(figure: Figure) -> bytes:
+    """Return a figure as an SVG file, in the layout in which it was drawn before: a layout costs as much as drawing.
+
+    Lines and marks of many points are pixels in it, of the resolution in which it was drawn.
+    """
+    figure.set_layout_engine("none")
+    for line in (line for axes in figure.axes for line in axes.lines if np.size(line.get_xdata()) > _MANY_POINTS):
+        line.set_rasterized(True)
+    buffer = io.BytesIO()
+    with rc_context({"svg.hashsalt": "afm-jax"}):
+        FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
     return buffer.getvalue()
 
 

@@ -319,17 +319,12 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
     return load_scene_and_start(path)[0]
 
 
-def load_start(path: str | os.PathLike[str]) -> Start | None:
-    """Return the start that a scene file asks for, or None where it leaves the choice to the simulation.
+def load_scene_and_start(path: str | os.PathLike[str]) -> tuple[Scene, Start | None]:
+    """Return scene and start of a file; no start where it leaves the choice to the simulation.
 
     Raises:
-        SceneError: if the file is not a valid scene file.
+        SceneError: as `load_scene`.
     """
-    return load_scene_and_start(path)[1]
-
-
-def load_scene_and_start(path: str | os.PathLike[str]) -> tuple[Scene, Start | None]:
-    """Return what `load_scene` and `load_start` return, from one reading of the file."""
     source = os.fspath(path)
     tables = _checked(read_toml(source), source)
     scene = _scene_of(tables)

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from afm_jax.words import decimals, with_error
 from fitting.calibration.sweep import ResonanceSweep
@@ -80,7 +80,7 @@ class Curves:
 
 @public_result(picture="fitting.calibration.report:calibration_figure")
 @dataclass(frozen=True)
-class Calibration:
+class Calibration(Result):
     """The outcome of `calibrate`; attributes are named like the keys of its JSON.
 
     Attributes:

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.special import kv, stdtrit
 
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from afm_jax.words import interval, known, text_table, with_error
 from fitting.calibration.result import CalibratedValue, Calibration
@@ -42,7 +42,7 @@ _IMAGINARY = (
 
 @public_result()
 @dataclass(frozen=True)
-class Stiffness:
+class Stiffness(Result):
     """A spring constant or a sensitivity, with what it rests on.
 
     Attributes:

@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from fitting.instruments.formats import holds_curves, read_recording
 from fitting.instruments.recording import UNITS, Recording
 from fitting.tables.csv_text import (
@@ -179,7 +179,7 @@ _POSITIVE = ("frequency_khz", "amplitude_error", "phase_error_deg")
 
 @public_result()
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ResonanceSweep:
+class ResonanceSweep(Result):
     """A free resonance sweep, sorted by frequency; the arrays are read-only NumPy copies.
 
     Attributes:

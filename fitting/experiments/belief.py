@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from afm_jax.scenefile.tables import printable
 from fitting.fits.result import FitResult
 from fitting.models import Problem
@@ -41,7 +41,7 @@ EXACT_QUALITY_FACTOR = (
 
 @public_result()
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Belief:
+class Belief(Result):
     """What is believed of cantilever and law, and how sure that is.
 
     Attributes:

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from afm_jax.units import TWO_SIDED_95
 from fitting.experiments.belief import Belief
 from fitting.experiments.candidates import LEFT_OUT, Candidates
@@ -38,7 +38,7 @@ class Forecast:
 
 @public_result(picture="fitting.experiments.report:design_figure", rows="points")
 @dataclass(frozen=True, eq=False)
-class Design:
+class Design(Result):
     """The outcome of `design`; attributes are named like the keys of its JSON.
 
     Attributes:

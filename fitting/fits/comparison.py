@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.checks import require_float64
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from fitting.fits.fit import Found, find_fit, summarise, tables_of
 from fitting.fits.minimum import Strain, relaxed, settle
 from fitting.fits.result import FitResult
@@ -21,9 +21,9 @@ _EVEN, _LEANS, _PLAIN = 2.0, 6.0, 10.0
 """Differences of AIC up to which models are even, one is favoured, and one is clearly favoured."""
 
 
-@public_result(rows="rows")
+@public_result(picture="fitting.report.plots:models_figure", rows="rows")
 @dataclass(frozen=True)
-class Comparison:
+class Comparison(Result):
     """Models of one table, the best one first.
 
     Attributes:

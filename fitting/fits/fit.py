@@ -16,11 +16,12 @@ from jaxtyping import Array, Bool, Float
 
 from afm_jax.checks import require_float64
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.impact.lasting_impact import LawImpact, TabulatedImpact
+from afm_jax.impact.lasting_impact import LawImpact, PulledImpact
 from afm_jax.least_squares import chi2_tail
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.version import version_of
 from fitting.fits.intervals import (
+    END_OF_RANGE,
     Convergence,
     Interval,
     at_bound,
@@ -60,7 +61,7 @@ from fitting.fits.unmodelled import (
     system_of,
 )
 from fitting.fits.verdict import ASSUMED_ERROR_OF_Q, Evidence, judge_fit, misfits
-from fitting.forward import impact_at, warm_up
+from fitting.forward import AnyImpact, impact_at, warm_up
 from fitting.models import (
     Joint,
     Measurement,
@@ -186,7 +187,7 @@ def speed_range(approach_speeds: Float[np.ndarray, " rows"]) -> tuple[float, flo
 
 @jax.jit
 def law_and_slope(
-    impact: LawImpact | TabulatedImpact, slopes: LawImpact | TabulatedImpact, speeds: Float[Array, " n"]
+    impact: AnyImpact, slopes: AnyImpact, speeds: Float[Array, " n"]
 ) -> tuple[Float[Array, "2 n+1"], Float[Array, "2 n+1 p"]]:
     """Return rebound speeds and delays at approach speeds, and their derivatives by the parameters.
 
@@ -203,6 +204,7 @@ def law_and_slope(
             capture = jnp.full((2, 1), impact.law.capture_speed_nm_per_us)
             found = jnp.stack([impact.law.rebound_speed(speeds), impact.law.collision_delay(speeds)])
             return jnp.concatenate([found, capture], axis=1)
+        impact = impact.free if isinstance(impact, PulledImpact) else impact
         found = jax.vmap(impact.speeds)(speeds)
         # below the table the contact captures
         free = speeds > impact.lowest
@@ -367,6 +369,7 @@ class _Summary:
             untabulated=tuple(np.flatnonzero(missed).tolist()),
             contact_share=self.contact_share,
             refused=self.refused,
+            tapped=self.problem.pulled,
             pulls=tuple(pull.p_value for pull in self.pulls),
             scattering=self.between is not None,
         )
@@ -509,20 +512,26 @@ class _Summary:
         if isinstance(intervals, str):
             intervals = [Interval(None, None, intervals)] * len(errors)
         free = np.append(self.free, np.ones(len(errors) - len(self.free), dtype=bool))
+        open_ = np.array([self._is_open(name, one) for name, one in zip(self.names, intervals, strict=True)])
         return {
             name: FittedParameter(
                 value=float(self.ends[i]),
                 unit=parameter_called(name).unit,
-                standard_error=float(errors[i]) if free[i] and np.isfinite(errors[i]) else None,
+                standard_error=float(errors[i]) if free[i] and not open_[i] and np.isfinite(errors[i]) else None,
                 interval95=(intervals[i].low, intervals[i].high),
                 interval_reason=intervals[i].reason,
-                undetermined=not np.isfinite(self.spread[i, i]),
+                undetermined=bool(open_[i]) or not np.isfinite(self.spread[i, i]),
                 at_bound=not bool(free[i]),
-                did_not_move=not bool(moved[i]) and name not in self.constraints,
+                did_not_move=not (moved[i] or open_[i] or name in self.constraints),
                 constraint=self.constraints.get(name),
             )
             for i, name in enumerate(self.names)
         }
+
+    def _is_open(self, name: str, interval: Interval) -> bool:
+        """Say whether a parameter of a contact under a bent lever may be anything within its range."""
+        searched = (interval.reason or "").count(END_OF_RANGE) == 2
+        return self.problem.pulled and name in self.problem.own and searched
 
     def _rows(self) -> FittedRows:
         count = self.table.rows
@@ -625,7 +634,7 @@ def fit(  # noqa: PLR0913
             nuisances of its own.
         model: "restitution" (r), "law" (r, epsilon; eq. 6), "viscous" (epsilon, viscous_loss) or "full" (all three),
             each instantaneous or with "+delay", the collision delay; or "contact", physical parameters through the
-            resolved contact.
+            resolved contact, which a tapping curve gives on resonance too.
         share: nuisances that several tables have in common, by name; "all": every one.
         hierarchical: let the laws of several tables scatter around a mean, each parameter by a standard deviation that
             is fitted too: the values are then means.
@@ -752,6 +761,7 @@ def _joint(
     Raises:
         ValueError: if there is no such nuisance to share, or the tables contradict each other on it.
     """
+    _check_levers(tables, model)
     each = [_known_of(table, model, constraints) for table in tables.tables]
     there = [name for name in NUISANCE_NAMES if any(name in known for known in each)]
     shared = there if "all" in share else [name for name in there if name in share]
@@ -789,6 +799,31 @@ def _joint(
     parts = [measurement_of(table, one, known, options["fixed"]) for table in tables.tables]
     joint = Joint(one, tuple(part.cantilever for part in parts), drives, place, held)
     return known, problem, joint_measurement(tables, parts, problem, joint, known)
+
+
+_ONE_LEVER = 0.01
+"""Share by which the frequencies of levers may differ that taps of one are those of the others."""
+
+
+def _check_levers(tables: SeveralTables, model: str) -> None:
+    """Check that one table of taps serves all tables, where the model asks for it.
+
+    Raises:
+        ValueError: if it does not.
+    """
+    if model != "contact" or not any(table.tapping for table in tables.tables):
+        return
+    if not tables.tapping:
+        raise ValueError(
+            "the model 'contact' takes tables of a driven cantilever (# drive = force or base) or of a driven sample, "
+            "not both at a time: fit each kind by itself"
+        )
+    frequencies = [table.free_frequency_khz for table in tables.tables]
+    if max(frequencies) > (1.0 + _ONE_LEVER) * min(frequencies):
+        raise ValueError(
+            "the model 'contact' takes tables of driven cantilevers of one free frequency at a time, but there are "
+            f"{min(frequencies):g} and {max(frequencies):g} kHz: fit each cantilever by itself"
+        )
 
 
 _NEUTRAL = {"tip_calibration": 1.0, "drive_calibration": 1.0, "offset_origin_nm": 0.0, "phase_zero_deg": 0.0}

@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float, Int
 from afm_jax.least_squares import Box, Searches, covariance_of, descended
 from afm_jax.units import TWO_SIDED_95
 from fitting.fits.objective import PLAIN, Objective
-from fitting.models import coordinate_of
-from fitting.parameters import Parameter, is_of_one_table
+from fitting.models import Problem, coordinate_of
+from fitting.parameters import Parameter, is_nuisance, is_of_one_table
 
 CHI2_95 = 3.841458820694124
 """95 % quantile of chi2 with one degree of freedom."""
@@ -20,6 +20,8 @@ _OUTER_STEPS = 30
 _INNER_STEPS = 25
 _SETTLED = 1e-6
 """Estimated distance of chi2 to its minimum over the others at which these have arrived."""
+END_OF_RANGE = "reaches the end of its range"
+"""Why an interval is open."""
 _FARTHEST = 100.0
 """Distance in standard errors at which a search gives up: the data do not determine the parameter on that side."""
 _LOST = 1e3
@@ -45,7 +47,7 @@ class _Side:
 
     index: int
     direction: float
-    others: Float[np.ndarray, " p"]  # places (`_Places`) at `inside`; the profiled one is not used
+    others: Float[np.ndarray, " p"]  # places (`Places`) at `inside`; the profiled one is not used
     along: Float[np.ndarray, " p"]  # how they go on from there, by distance
     inside: float = 0.0  # distance in errors that lies inside the interval
     outside: float = np.inf
@@ -62,7 +64,7 @@ def profile_intervals(
     covariance: Float[np.ndarray, "p p"],
     chi2: float,
 ) -> list[Interval]:
-    """Return the 95 % profile interval of every parameter; Wald's of a nuisance that a table has to itself.
+    """Return the 95 % profile interval of every parameter; Wald's of nuisances of one of several tables, and of taps.
 
     Args:
         objective: chi2 of a table and a model.
@@ -71,12 +73,12 @@ def profile_intervals(
         chi2: at the fitted values.
     """
     errors = np.sqrt(np.diag(covariance))
-    here = _Places(objective).of_values(values)
+    here = Places(objective).of_values(values)
     sides = [
         _Side(index, direction, here, _followers(objective, values, covariance, index, direction))
         for index in range(len(values))
         for direction in (-1.0, 1.0)
-        if np.isfinite(errors[index]) and not is_of_one_table(objective.problem.names[index])
+        if np.isfinite(errors[index]) and not _by_its_error(objective.problem, objective.problem.names[index])
     ]
     for _ in range(_OUTER_STEPS):
         active = [side for side in sides if side.end is None and side.reason is None]
@@ -88,10 +90,15 @@ def profile_intervals(
     # it has a Gaussian constraint, and there are as many as tables
     return [
         within_range(objective.problem.parameters[index], Interval(*ends[index]))
-        if np.isfinite(errors[index]) and is_of_one_table(name)
+        if np.isfinite(errors[index]) and _by_its_error(objective.problem, name)
         else _interval(sides, index)
         for index, name in enumerate(objective.problem.names)
     ]
+
+
+def _by_its_error(problem: Problem, name: str) -> bool:
+    """Say whether a nuisance is one of many, or of taps, each look at which takes long."""
+    return is_of_one_table(name) or (problem.pulled and is_nuisance(name))
 
 
 def _advance(objective: Objective, sides: list[_Side], values, errors, chi2: float) -> None:
@@ -119,7 +126,7 @@ def _advance(objective: Objective, sides: list[_Side], values, errors, chi2: flo
                 side.inside_root = root
             side.inside, side.others = max(side.inside, distance), coordinates
             if target == end:
-                side.reason = f"reaches the end of its range, {end:g}"
+                side.reason = f"{END_OF_RANGE}, {end:g}"
             elif distance >= _FARTHEST:
                 side.reason = "the data set no limit on this side"
         else:
@@ -144,7 +151,7 @@ def _followers(objective: Objective, values, covariance, index: int, direction: 
     shift = direction * _FIRST_TRIAL * covariance[:, index] / np.sqrt(variance) if variance > 0.0 else 0.0
     parameters = objective.problem.parameters
     guess = np.clip(values + shift, [p.lowest for p in parameters], [p.highest for p in parameters])
-    places = _Places(objective)
+    places = Places(objective)
     moved = places.of_values(np.where(np.isfinite(guess), guess, values))
     return (moved - places.of_values(values)) / _FIRST_TRIAL
 
@@ -155,7 +162,7 @@ def _target(side: _Side, objective: Objective, values, errors) -> float:
     return float(np.clip(target, parameter.lowest, parameter.highest))
 
 
-class _Places:
+class Places:
     """Where the minimisation over the other parameters moves: a loss by its value, the others by their coordinates.
 
     The coordinate of a loss is a root, in which a loss of 0 never grows again: there its derivative vanishes. By value
@@ -163,20 +170,28 @@ class _Places:
     """
 
     def __init__(self, objective: Objective):
+        """Keep the objective, and the places that bound it."""
         self.objective, parameters = objective, objective.problem.parameters
         self.by_value = np.array([parameter.sign != 0 for parameter in parameters])
-        self.lowest = np.array([p.lowest if p.sign else -np.inf for p in parameters])
-        self.highest = np.array([p.highest if p.sign else np.inf for p in parameters])
+        self.lowest, self.highest = (
+            np.array(
+                [end if p.sign else coordinate_of(p, np.asarray(end)) for p, end in zip(parameters, ends, strict=True)]
+            )
+            for ends in ([p.lowest for p in parameters], [p.highest for p in parameters])
+        )
 
     def of_values(self, values: Float[np.ndarray, "... p"]) -> Float[np.ndarray, "... p"]:
+        """Return the places of values."""
         return np.where(self.by_value, values, self.objective.problem.coordinates(values))
+
+    def coordinates(self, places: Float[np.ndarray, "... p"]) -> Float[np.ndarray, "... p"]:
+        """Return the optimiser's coordinates of places."""
+        columns = zip(self.objective.problem.parameters, np.moveaxis(places, -1, 0), strict=True)
+        return np.stack([coordinate_of(p, place) if p.sign else place for p, place in columns], axis=-1)
 
     def look(self, places: Float[np.ndarray, "sets p"], some: Int[np.ndarray, " sets"]) -> Searches:  # noqa: ARG002
         """Return chi2, the residuals and their Jacobian by the places."""
-        problem = self.objective.problem
-        columns = zip(problem.parameters, np.moveaxis(places, -1, 0), strict=True)
-        coordinates = np.stack([coordinate_of(p, place) if p.sign else place for p, place in columns], axis=-1)
-        known, slopes = problem.values_and_slopes(coordinates)
+        known, slopes = self.objective.problem.values_and_slopes(self.coordinates(places))
         result = self.objective.at_values(np.where(self.by_value, places, known))
         residual, jacobian = np.asarray(result.residual), np.asarray(result.jacobian)
         jacobian = jacobian * np.where(self.by_value, 1.0, slopes)[:, None, :]
@@ -185,7 +200,7 @@ class _Places:
 
 def _minimise_others(objective: Objective, sides: list[_Side], targets):
     """Minimise chi2 over the parameters that are not profiled, on all sides at once."""
-    places = _Places(objective)
+    places = Places(objective)
     ahead = np.array([side.trial - side.inside for side in sides])
     z = np.array([side.others for side in sides]) + ahead[:, None] * np.array([side.along for side in sides])
     z = np.clip(z, places.lowest, places.highest)
@@ -210,7 +225,7 @@ def within_range(parameter: Parameter, interval: Interval) -> Interval:
         end = ends[i]
         if end is not None and beyond * (end - last) > 0.0:
             ends[i] = None
-            reasons.append(f"{name} end: reaches the end of its range, {last:g}")
+            reasons.append(f"{name} end: {END_OF_RANGE}, {last:g}")
     return Interval(ends[0], ends[1], "; ".join(reasons) or None)
 
 
@@ -261,15 +276,21 @@ def covariance(
 
     A parameter at its bound is held there; its own variance is the one it would have if it were free.
     """
-    jacobian = np.asarray(objective.at_values(values[None]).jacobian)[0]
-    full = covariance_of(jacobian.T @ jacobian)
+    fisher = _fisher(objective, values)
+    full = covariance_of(fisher)
     if free.all():
         return full
     result = np.zeros_like(full)
-    result[np.ix_(free, free)] = covariance_of(jacobian[:, free].T @ jacobian[:, free])
+    result[np.ix_(free, free)] = covariance_of(fisher[np.ix_(free, free)])
     held = np.flatnonzero(~free)
     result[held, held] = full[held, held]
     return result
+
+
+def _fisher(objective: Objective, values: Float[np.ndarray, " p"]) -> Float[np.ndarray, "p p"]:
+    """Return the Fisher matrix of the parameters' values, with what ranges say where data may leave them open."""
+    jacobian = np.asarray(objective.at_values(values[None]).jacobian)[0]
+    return jacobian.T @ jacobian + np.diag(objective.problem.known_by_range(values))
 
 
 def check_minimum(
@@ -287,7 +308,9 @@ def check_minimum(
     if count == 0:
         return Convergence(outward, 0.0, [], 0.0, outward)
     _, jacobian = objective.linearise(coordinates[None])
-    fisher = jacobian[0][:, free].T @ jacobian[0][:, free]
+    values, slopes = objective.problem.values_and_slopes(coordinates)
+    known = np.diag((objective.problem.known_by_range(values) * slopes**2)[free])
+    fisher = jacobian[0][:, free].T @ jacobian[0][:, free] + known
     if not np.all(np.isfinite(fisher)):
         return _adrift([], outward=outward, reason="the slopes of the residuals are not finite where the search ended")
     curvature, axes = np.linalg.eigh(fisher)
@@ -301,7 +324,7 @@ def check_minimum(
     hessian = (slope[1 : count + 1] - slope[count + 1 :]) / (2.0 * _STEP)
     if not np.all(np.isfinite(hessian)) or not np.all(np.isfinite(slope[0])):
         return _adrift([], outward=outward, reason="chi2 has no finite curvature where the search ended")
-    hessian = 0.5 * (hessian + hessian.T)
+    hessian = 0.5 * (hessian + hessian.T) + scale.T @ known @ scale
     eigenvalues = np.linalg.eigvalsh(hessian)
     distance = float(slope[0] @ np.linalg.solve(hessian, slope[0])) if eigenvalues[0] > 0 else float("inf")
     converged = bool(eigenvalues[0] > 0 and distance < _ENOUGH and outward)
@@ -321,11 +344,15 @@ def _adrift(eigenvalues: list[float], *, outward: bool, reason: str | None = Non
 
 
 def at_bound(objective: Objective, values: Float[np.ndarray, " p"]) -> Bool[np.ndarray, " p"]:
-    """Say which losses vanish within a hundredth of what the data could resolve."""
-    jacobian = np.asarray(objective.at_values(values[None]).jacobian)[0]
-    resolution = np.sqrt(np.diag(covariance_of(jacobian.T @ jacobian)))
-    ends = [np.inf if p.bound is None else p.bound for p in objective.problem.parameters]
-    return np.abs(values - np.array(ends)) < 0.01 * np.where(np.isfinite(resolution), resolution, 0.0)
+    """Say which losses vanish within a hundredth of what the data could resolve, and what is at an end of its range."""
+    resolution = np.sqrt(np.diag(covariance_of(_fisher(objective, values))))
+    resolution = np.where(np.isfinite(resolution), resolution, 0.0)
+    parameters = objective.problem.parameters
+    losses = np.array([np.inf if p.bound is None else p.bound for p in parameters])
+    ends = np.array([(p.lowest, p.highest) for p in parameters]).T
+    # so near that the steps of the Hessian would leave it
+    at_end = np.any(np.abs(values - ends) <= _STEP * resolution, axis=0) & np.isinf(losses)
+    return (np.abs(values - losses) < 0.01 * resolution) | at_end
 
 
 def _pushes_outward(objective: Objective, coordinates, free) -> bool:
@@ -339,5 +366,11 @@ def _pushes_outward(objective: Objective, coordinates, free) -> bool:
     jacobian = np.asarray(result.jacobian)[0]
     slope = jacobian.T @ np.asarray(result.residual)[0]
     little = slope**2 < _ENOUGH * np.sum(jacobian**2, axis=0)
-    inward = np.array([p.sign for p in objective.problem.parameters])
+    values = objective.problem.values(coordinates)
+    inward = np.array(
+        [
+            1.0 if v - p.lowest < p.highest - v else -1.0
+            for v, p in zip(values, objective.problem.parameters, strict=True)
+        ]
+    )
     return bool(np.all(((slope * inward >= 0.0) | little)[~free]))

@@ -24,15 +24,19 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Shaped
 
 from afm_jax.impact.lasting_impact import TabulatedImpact
+from afm_jax.least_squares import Box, descended
 from afm_jax.units import RAD_PER_US_PER_KHZ
-from fitting.fits.objective import BATCH, FINE, PLAIN, ROUGH, SOFT, Objective, lowest, polish
+from fitting.fits.intervals import Places
+from fitting.fits.objective import BATCH, FINE, PLAIN, ROUGH, SOFT, Objective, Polished, lowest, polish
 from fitting.forward import Linearised, free_impacts, impact_at
 from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem, Rows, tip_work
 from fitting.parameters import PARAMETERS, Parameter
 
 _GRID_PER_PARAMETER = {1: 96, 2: 16}
 _SPREAD_POINTS = 64
-"""Points of a low-discrepancy sequence, where a grid would have too many."""
+"""Points of a low-discrepancy sequence, where a grid would have too many; half as many of taps, which take long."""
+_FEW_STARTS = 4
+"""Of these, how many are polished of taps."""
 
 
 def starts(problem: Problem, measurement: Measurement) -> Float[np.ndarray, "points p"]:
@@ -52,7 +56,7 @@ def starts(problem: Problem, measurement: Measurement) -> Float[np.ndarray, "poi
         mesh = np.meshgrid(*(started(name, np.linspace(0.0, 1.0, count)) for name in own), indexing="ij")
         columns = {name: axis.ravel() for name, axis in zip(own, mesh, strict=True)}
     else:
-        places = _spread(_SPREAD_POINTS, len(own))
+        places = _spread(_SPREAD_POINTS // (1 + problem.pulled), len(own))
         columns = {name: started(name, place) for name, place in zip(own, places.T, strict=True)}
     count = len(columns[own[0]])
     known = dict(zip(problem.names, np.asarray(measurement.constraint_value).tolist(), strict=True))
@@ -193,14 +197,17 @@ def minimise(objective: Objective) -> Minimum:
     if common is not None:
         return _with_own_nuisances(objective, minimise(common))
     points = starts(objective.problem, objective.measurement)
-    scout = _thinned(objective) if objective.problem.lasting else objective
-    best = np.argsort(scout.screen(points), kind="stable")[:BATCH]
+    pulled = objective.problem.pulled
+    scout = _thinned(objective, ROWS_PER_PROGRAM // (1 + pulled)) if objective.problem.lasting else objective
+    best = np.argsort(scout.screen(points), kind="stable")[: _FEW_STARTS if pulled else BATCH]
     first = objective.problem.coordinates(points[best])
     if not objective.problem.lasting:
         return _polished(objective, polish(scout, first, SOFT, settled=ROUGH).coordinates, points[best])
     found = settle(objective, _whole(objective, _scouted(scout, first), points[best]))
     lost = lost_rows(objective, objective.problem.values(found.coordinates))
-    back = recovered(objective, found.coordinates, lost) if lost.any() else None
+    # of taps some may be lost: they are set aside
+    seen = np.asarray(objective.measurement.rows.measured).any(axis=1)
+    back = recovered(objective, found.coordinates, lost) if lost.sum() > pulled * _MOST_IRREGULAR * seen.sum() else None
     if back is None:
         return found
     other = settle(objective, replace(found, coordinates=back))
@@ -240,9 +247,23 @@ def _whole(
     winner = lowest(chi2)
     follower = objective.following(values[winner])
     softly = polish(follower, found[winner][None], SOFT, settled=ROUGH)
-    end = polish(follower, softly.coordinates, PLAIN, settled=FINE)
+    end = _plainly(follower, softly.coordinates)
     best = objective.problem.values(end.coordinates)[0]
     return Minimum(end.coordinates[0], origins[winner], np.vstack([best, values]), np.append(end.objective, chi2))
+
+
+_MOST_STEPS = 150
+
+
+def _plainly(objective: Objective, starts: Float[np.ndarray, "starts p"]) -> Polished:
+    """Polish plainly: what taps tell lies in narrow valleys that end at bounds, where damped steps go along them."""
+    if not objective.problem.pulled:
+        return polish(objective, starts, PLAIN, settled=FINE)
+    places = Places(objective)
+    here = places.of_values(objective.problem.values(starts))
+    box = Box(places.lowest, places.highest, np.zeros(here.shape, dtype=bool))
+    end = descended(places.look, places.look(here, np.arange(len(here))), box, settled=FINE, most=_MOST_STEPS)
+    return Polished(places.coordinates(end.place), end.chi2, 0)
 
 
 def settle(objective: Objective, minimum: Minimum) -> Minimum:
@@ -250,7 +271,7 @@ def settle(objective: Objective, minimum: Minimum) -> Minimum:
     for _ in range(_ROUNDS):
         values = objective.problem.values(minimum.coordinates)
         follower = objective.following(values)
-        end = polish(follower, minimum.coordinates[None], PLAIN, settled=FINE)
+        end = _plainly(follower, minimum.coordinates[None])
         chi2 = float(np.sum(objective.searching().residual(objective.problem.values(end.coordinates)) ** 2))
         minimum = replace(minimum, coordinates=end.coordinates[0], chi2=np.append(chi2, minimum.chi2[1:]))
         if abs(chi2 - end.objective[0]) < 1e-6 * (1.0 + chi2):
@@ -258,14 +279,14 @@ def settle(objective: Objective, minimum: Minimum) -> Minimum:
     return minimum
 
 
-def _thinned(objective: Objective) -> Objective:
-    """Return the objective of at most `ROWS_PER_PROGRAM` rows, spread over orders, frequencies and drives."""
+def _thinned(objective: Objective, most: int) -> Objective:
+    """Return the objective of so many rows at most, spread over orders, frequencies and drives."""
     rows = jax.tree.map(np.asarray, objective.measurement.rows)
     seen = np.flatnonzero(rows.measured.any(axis=1) | rows.no_orbit)
-    if seen.size <= ROWS_PER_PROGRAM:
+    if seen.size <= most:
         return objective
     ranked = seen[np.lexsort((rows.drive_amplitude_nm[seen], rows.drive_frequency_khz[seen], rows.order[seen]))]
-    chosen = ranked[np.linspace(0, ranked.size - 1, ROWS_PER_PROGRAM).round().astype(int)]
+    chosen = ranked[np.linspace(0, ranked.size - 1, most).round().astype(int)]
     return objective.of_rows(chosen)
 
 
@@ -318,6 +339,8 @@ BASE, GROWTH, SLOW = 0.0005, 0.012, 0.016
 TAPPED, IN_FRAME = 0.0012, 1e-4
 """Growth of that of a driven tip, and its error in the frame of the free tip, over the amplitude there: what the law's
 parameters do not make up for (full contacts of tips of 12, 20 and 100 nm, 3 and 10 % above resonance)."""
+_OF_TAPS = 7e-4
+"""Error of amplitudes of taps that leaves their phases the 0.005 degrees by which full simulations differ."""
 DELAY_US = 1.5e-4
 """Error of the delay law in us."""
 LONGEST = 1.4
@@ -336,6 +359,7 @@ _TURNED = 0.125
 TOO_SLOW = "too slow for a law of impacts"
 TOO_PULLED = "under too strong a pull of the lever (more than 0.8 times what turns the tip round)"
 IRREGULAR = "not one a period"
+NO_TAPS = "not steady taps, one a period, of the fitted contact"
 ATTRACTED = "none: the sample only draws the tip"
 """Why rows are set aside."""
 
@@ -380,6 +404,8 @@ def strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
 
 def _strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
     """Return the strain of every row of one instrument."""
+    if objective.problem.pulled:
+        return _strain_of_taps(objective, values)
     rows = objective.measurement.rows
     impact = impact_at(values, objective.measurement, objective.problem).impact
     linear = objective.at_values(values[None])
@@ -411,6 +437,15 @@ def _strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
     return Strain(error, slow_error, reasons)
 
 
+def _strain_of_taps(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
+    """Return the strain of the rows of a contact under a bent lever, which pulls the slowest tips out of the bridge."""
+    rows = objective.measurement.rows
+    exists = np.asarray(objective.at_values(values[None]).prediction.orbits)[0] > 0
+    reasons = np.where(_irregular(objective, exists) & ~np.asarray(rows.free), NO_TAPS, "").astype(object)
+    error = np.where(rows.free, 0.0, _OF_TAPS + np.where(exists, _frame_error(rows), 0.0))
+    return Strain(error, error, reasons)
+
+
 def _frame_error(rows: Rows) -> Float[np.ndarray, " rows"]:
     """Return the relative model error of a driven tip's amplitude: that of its motion in the free tip's frame."""
     return IN_FRAME * (1.0 + np.asarray(rows.drive_amplitude_nm) / np.asarray(rows.amplitude_nm)[:, 1])
@@ -438,7 +473,7 @@ def untabulated(
     objective: Objective, values: Float[np.ndarray, " p"], approach: Float[np.ndarray, " rows"]
 ) -> Bool[np.ndarray, " rows"]:
     """Say at which approach speeds the table of a contact misses its accuracy; nowhere for a law, nor at NaN."""
-    if objective.problem.model != "contact":
+    if objective.problem.model != "contact" or objective.problem.pulled:
         return np.zeros(approach.shape, dtype=bool)
     from afm_jax.contact.law_of_contact import DELAY_ERROR_US, SPEED_ERROR  # noqa: PLC0415  # for contacts alone
 

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from fitting.fits.intervals import Convergence
 from fitting.fits.loss import Loss
@@ -152,7 +152,7 @@ class Scatter:
 
 @public_result(picture="fitting.report.plots:rows_figure", rows="parameters")
 @dataclass(frozen=True)
-class FitResult:
+class FitResult(Result):
     """The outcome of `fit`; attributes are named like the keys of its JSON.
 
     Attributes:

@@ -225,6 +225,10 @@ def system_of(rows: StepRows, left_out: Unmodelled) -> StepSystem:
     residual[:size] += amplitudes(columns.known)
     jacobian = np.zeros((residual.size + len(priors), known + len(priors)))
     jacobian[: residual.size, :known] = rows.jacobian
+    # what may stay open has its range, around where the fit ended; the rows' last residuals are what is known of each
+    place = residual.size - known + np.arange(known), np.arange(known)
+    ranges = np.sqrt(left_out.problem.known_by_range(np.array([left_out.values[name] for name in names])))
+    jacobian[place] = np.where(jacobian[place] == 0.0, ranges, jacobian[place])
     if "viscous_loss" in names:
         jacobian[:size, names.index("viscous_loss")] += amplitudes(columns.drag)
     jacobian[:size, known:] = amplitudes(columns.shape)
@@ -232,7 +236,7 @@ def system_of(rows: StepRows, left_out: Unmodelled) -> StepSystem:
     residual = np.append(residual, np.zeros(len(priors)))
     unknown = [amplitudes(columns.unknown)]
     if left_out.problem.lasting:
-        unknown.append(amplitudes(_remainders(rows, tapping=left_out.problem.tapping)))
+        unknown.append(amplitudes(_remainders(rows, left_out.problem)))
     return StepSystem(residual, jacobian, np.concatenate(unknown, axis=1), _noise(rows))
 
 
@@ -322,15 +326,20 @@ def _noise(rows: StepRows) -> Float[np.ndarray, "n n"]:
     return variance.reshape(count * kinds, count * kinds)
 
 
-def _remainders(rows: StepRows, *, tapping: bool) -> Float[np.ndarray, "2 rows m"]:
-    """Return the leading remainders of the corrections, of the squared rebound speed and of the delay."""
+def _remainders(rows: StepRows, problem: Problem) -> Float[np.ndarray, "2 rows m"]:
+    """Return the leading remainders of the corrections, of the squared rebound speed and of the delay.
+
+    Taps have none: they have been through the pull, and what they lack of its change is in the rows' errors.
+    """
+    if problem.pulled:
+        return np.zeros((2, rows.approach.size, 0))
     u, w, g, j, time = rows.approach, rows.rebound, rows.pull, rows.change, rows.hertz_time
     # of the loss by the speed; rows of one speed say nothing of it
     apart = u - u.mean()
     slope = max(float(apart @ (u**2 - w**2)) / max(float(apart @ apart), 1e-9), 0.0)
     nothing = np.zeros_like(u)
     # where the lever's own pull is most of it, it hardly changes during the contact: full contacts say so
-    by_square = 0.02 if tapping else 5.0
+    by_square = 0.02 if problem.tapping else 5.0
     late = (0.5 * g / w**3, 0.008 * g * time**2 / u, 8.0 * j / w**4)
     gained = (15.0 * slope * j / w**2, 2.0 * slope * g / u, 0.06 * j * time**2 * u, by_square * g**2 / w**2)
     columns = [(nothing, one) for one in late] + [(one, nothing) for one in gained]

@@ -15,7 +15,7 @@ from afm_jax.least_squares import chi2_tail
 from fitting.fits.intervals import Convergence
 from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.result import FittedParameter, FittedRows
-from fitting.parameters import DELAY_NAMES, SHAPE_NAMES, name_of_table, parameter_called
+from fitting.parameters import DELAY_NAMES, SHAPE_NAMES, is_nuisance, name_of_table, parameter_called
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable
 
@@ -42,10 +42,16 @@ _LONG_CONTACT = 0.2
 """Share of the drive's period in contact from which a misfit is laid to it: the corrections are fitted up to there."""
 _REFUSED = (
     "No law of impacts can be read off this curve: on nearly all of its rows impacts are too slow, or the lever's own "
-    "pull turns the tip round; drive 3 to 10 % above resonance, with a large free amplitude."
+    "pull turns the tip round; drive 3 to 10 % above resonance, with a large free amplitude, or fit the contact's own "
+    "parameters (--model contact), which needs no law."
+)
+_NO_TAPS = (
+    "The contact's taps explain hardly a row of this curve: it has no steady tap a period there; fix what "
+    "is known of it (--fix tip_radius_nm=20, for example), or leave out rows that are not one impact a period."
 )
 ASSUMED_ERROR_OF_Q = 0.02
 """Relative standard error of a quality factor that is given without one."""
+_AT_BOUND = 0.005
 _PULLED, _TORN = 2.0, 3.0
 """Distance from what is known of a quantity, in its standard errors, from which it is named, and not believed."""
 
@@ -73,21 +79,28 @@ class Evidence:
     """Largest share of a drive's period that the tip is in contact."""
     refused: bool = False
     """Hardly a row is left that a law of impacts can be read off."""
+    tapped: bool = False
+    """Whether a contact's own taps were fitted, not a law."""
     pulls: tuple[float, ...] = ()
     """Of several tables, the probability that each one's law is that of the others."""
     scattering: bool = False
     """Laws were allowed to differ from table to table."""
 
+    @property
+    def refusal(self) -> str:
+        """Why hardly a row is one that the model can be read off."""
+        return _NO_TAPS if self.tapped else _REFUSED
+
 
 def judge_fit(evidence: Evidence) -> tuple[list[str], list[str]]:
     """Return what makes a fit invalid, and its warnings; each a sentence."""
-    return [_REFUSED] if evidence.refused else _reasons(evidence), _warnings(evidence)
+    return [evidence.refusal] if evidence.refused else _reasons(evidence), _warnings(evidence)
 
 
 def _reasons(evidence: Evidence) -> list[str]:
     reasons = []
     convergence = evidence.convergence
-    undetermined = [name for name, parameter in evidence.parameters.items() if parameter.undetermined]
+    undetermined = [] if _may_stay_open(evidence) else _undetermined(evidence)
     if convergence.reason is not None:
         reasons.append(f"Not converged: {convergence.reason}.")
     elif undetermined:
@@ -117,12 +130,22 @@ def _reasons(evidence: Evidence) -> list[str]:
     if evidence.freedom <= 0:
         reasons.append("As many parameters as amplitudes: the goodness of fit cannot be judged.")
     # a tapping curve tells those of the delay only together; the law does not hang on each
-    together = DELAY_NAMES if evidence.table.tapping else ()
+    together = (*(DELAY_NAMES if evidence.table.tapping else ()), *_undetermined(evidence))
     for name in (name for name in evidence.parameters if name not in together):
         parameter = evidence.parameters[name]
         if parameter.interval95 == (None, None) and not misfit and not undetermined:
             reasons.append(f"{name} is not identified: {parameter.interval_reason}; {helpful_measurement(name)}.")
     return reasons
+
+
+def _undetermined(evidence: Evidence) -> list[str]:
+    return [name for name, parameter in evidence.parameters.items() if parameter.undetermined]
+
+
+def _may_stay_open(evidence: Evidence) -> bool:
+    """Say whether what is not determined need not be: of a contact's taps, unless nothing is."""
+    own = [name for name in evidence.parameters if not is_nuisance(name)]
+    return evidence.tapped and any(not evidence.parameters[name].undetermined for name in own)
 
 
 def _different_laws(evidence: Evidence) -> list[str]:
@@ -161,7 +184,7 @@ def misfits(evidence: Evidence) -> list[str]:
     The parameters' errors and intervals are not looked at.
     """
     if evidence.refused:
-        return [_REFUSED]
+        return [evidence.refusal]
     found = []
     if evidence.p_value < IMPROBABLE:
         found.append(f"chi2/dof = {evidence.chi2 / evidence.freedom:.3g} (probability {evidence.p_value:.1g})")
@@ -309,6 +332,11 @@ def _unexplained_tables(evidence: Evidence) -> str:
     return "".join(words for _, words in sorted(named, reverse=True))
 
 
+def value_at_bound(value: float) -> str:
+    """Return the value of a parameter at its bound in words: that of a loss is 0 or 1, not 3e-15."""
+    return f"{value:z.0f}" if abs(value - round(value)) < _AT_BOUND else f"{value:.4g}"
+
+
 def helpful_measurement(name: str) -> str:
     """Return what to measure, or to say, so that a parameter gets determined."""
     return (
@@ -373,6 +401,13 @@ def _damping_warning(table: AmplitudeTable, along: FittedParameter | None) -> st
 def _parameter_warnings(evidence: Evidence) -> list[str]:
     warnings = []
     explained = not misfits(evidence)
+    undetermined = _undetermined(evidence)
+    if explained and undetermined and _may_stay_open(evidence):
+        advice = "; ".join(dict.fromkeys(helpful_measurement(name) for name in undetermined))
+        warnings.append(
+            f"Not determined by these taps: {' and '.join(undetermined)}, anything within their ranges explains them, "
+            f"and the law's band takes that in; {advice}."
+        )
     for name, pull in _pulls(evidence).items():
         if _PULLED < abs(pull) <= _TORN:
             warnings.append(f"{_pull_in_words(evidence, name, pull)}: check it, the loss hangs on it.")
@@ -382,7 +417,7 @@ def _parameter_warnings(evidence: Evidence) -> list[str]:
         if parameter.at_bound and explained:
             limit = f"< {high:.4g}" if high is not None else f"> {low:.6g}" if low is not None else None
             reading = f": read it as a limit, {name} {limit} (95 %)" if limit else ""
-            warnings.append(f"{name} is at its bound, {parameter.value:z.0f}{reading}.")
+            warnings.append(f"{name} is at its bound, {value_at_bound(parameter.value)}{reading}.")
         if parameter.did_not_move:
             warnings.append(f"{name} did not move from the grid point it started at.")
     if evidence.other_minimum is not None:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from fitting.instruments.branch import JUMP, BranchLook, look_at
 from fitting.instruments.formats import read_recording
@@ -91,7 +91,7 @@ def parse_columns(text: str) -> dict[str, ColumnSource]:
 
 @public_result()
 @dataclass(frozen=True, eq=False, kw_only=True)
-class MeasuredCurve:
+class MeasuredCurve(Result):
     """One curve of a file, approach and retract together; the arrays have the shape (rows,).
 
     Attributes:

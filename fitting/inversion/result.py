@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.tables.table import AmplitudeTable
@@ -253,7 +253,7 @@ class ComparedLaw:
 
 @public_result(picture="fitting.inversion.report:inversion_figure", rows="records")
 @dataclass(frozen=True, kw_only=True)
-class Inversion:
+class Inversion(Result):
     """The outcome of `invert`.
 
     Attributes:

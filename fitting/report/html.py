@@ -75,7 +75,7 @@ def fit_page(
 
     Args:
         result: the fit.
-        pictures: PNG files of the rows, the law, and the residuals over the speed.
+        pictures: SVG files of the rows, the law, and the residuals over the speed.
         comparison: other models of the same table, or None.
         bootstrap: intervals from synthetic data sets, or None.
         posterior: credible intervals, or None.

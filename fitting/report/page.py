@@ -77,8 +77,8 @@ def pairs(caption: str, head: tuple[str, str], values: Mapping[str, Any]) -> Tab
 
 
 def pictures_of(files: Sequence[bytes], shows: Sequence[str]) -> list[dict[str, str]]:
-    """Return pictures with what is to be seen, in words; for those too who do not see them."""
+    """Return pictures (SVG) with what is to be seen, in words; for those too who do not see them."""
     return [
-        {"source": f"data:image/png;base64,{base64.b64encode(file).decode('ascii')}", "shows": words}
+        {"source": f"data:image/svg+xml;base64,{base64.b64encode(file).decode('ascii')}", "shows": words}
         for file, words in zip(files, shows, strict=True)
     ]

@@ -7,7 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from afm_jax.plots.picture_style import pixels_of, png_of_pixels
+from afm_jax.plots.picture_style import pixels_of, png_of_pixels, svg_of
+from fitting.fits.comparison import Comparison
 from fitting.fits.loss import EV_PER_AJ, Loss
 from fitting.fits.result import FitResult
 from fitting.report.words import has_delay
@@ -27,7 +28,7 @@ _APPROACH = "approach speed (nm/µs)"
 
 
 def fit_pictures(result: FitResult) -> list[bytes]:
-    """Return fit.png, and its parts: the rows, the law, the residuals over the speed and the energy lost (PNG).
+    """Return fit.png, and its parts as SVG: the rows, the law, the residuals over the speed and the energy lost.
 
     Without speeds there is no energy.
     """
@@ -35,7 +36,7 @@ def fit_pictures(result: FitResult) -> list[bytes]:
     if result.loss is not None:
         figures.append(energy_figure(result, result.loss))
     parts = [pixels_of(figure, DPI) for figure in figures]
-    return [png_of_pixels(part, DPI) for part in (np.concatenate(parts), *parts)]
+    return [png_of_pixels(np.concatenate(parts), DPI), *map(svg_of, figures)]
 
 
 def rows_figure(result: FitResult) -> Figure:
@@ -96,8 +97,14 @@ def energy_figure(result: FitResult, loss: Loss) -> Figure:
         axes.errorbar([u], [energy], yerr=reach, fmt="o", color="black", ms=3.5, capsize=3)
     _mark_speeds(axes, result)
     log_speed_axis(axes)
-    top = max(1.4 * max(max(energy, high or 0.0) for _, energy, _, high in known), 1e-12)
-    axes.set_ylim(0.0, top)
+    top = max(max(energy, high or 0.0) for _, energy, _, high in known)
+    bottom = min(energy if low is None else low for _, energy, low, _ in known)
+    if 0.0 < _MUCH * bottom < top:
+        axes.set_yscale("log")
+        axes.set_ylim(0.5 * bottom, 2.0 * top)
+        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+    else:
+        axes.set_ylim(0.0, max(1.4 * top, 1e-12))
     axes.set_xlabel(_APPROACH)
     axes.set_ylabel("energy lost in an impact (aJ)")
     volts = axes.secondary_yaxis(
@@ -105,6 +112,29 @@ def energy_figure(result: FitResult, loss: Loss) -> Figure:
     )
     volts.set_ylabel("(eV)")
     axes.legend(fontsize=SMALL, loc="upper left")
+    return figure
+
+
+def models_figure(compared: Comparison) -> Figure:
+    """Return the figure of what the models say: each one's rebound speed as deviation from the best one's."""
+    figure = Figure(figsize=(_WIDTH_INCHES, 4.0), layout="constrained")
+    axes = figure.subplots()
+    best = compared.results[compared.rows[0]["model"]].law
+    speed, reference = best.approach_speed_nm_per_us, best.rebound_speed_nm_per_us
+    with np.errstate(invalid="ignore", divide="ignore"):
+        low, high = (
+            100.0 * (end / reference - 1.0) for end in (best.rebound_low_nm_per_us, best.rebound_high_nm_per_us)
+        )
+        axes.fill_between(speed, low, high, color="0.85", lw=0, label="95 % band of the best")
+        for name in (row["model"] for row in compared.rows):
+            law = compared.results[name].law
+            own, rebound = law.approach_speed_nm_per_us, law.rebound_speed_nm_per_us
+            there = np.interp(speed, own, rebound, left=np.nan, right=np.nan)
+            axes.plot(speed, 100.0 * (there / reference - 1.0), label=name)
+    log_speed_axis(axes)
+    axes.set_xlabel(_APPROACH)
+    axes.set_ylabel(f"rebound speed: deviation from\n{compared.rows[0]['model']} (%)")
+    axes.legend(fontsize=SMALL, loc="upper left", bbox_to_anchor=(1.0, 1.0))
     return figure
 
 

@@ -1,11 +1,16 @@
-"""The pictures of a trust pack: readings beside replicated ones, single rows, ranks, and parameters in pairs."""
+"""The pictures of draws: parameters in pairs; of a trust pack also replicated readings, single rows and ranks."""
+
+from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, SubFigure
 
-from afm_jax.plots.picture_style import pixels_of, png_of_pixels
+from afm_jax.plots.picture_style import label_axes, new_figure, pixels_of, png_of_pixels, svg_of
 from fitting.report.plots import COLOURS, DPI, SMALL
+from fitting.sampling.bootstrap import Bootstrap
+from fitting.sampling.posterior_result import Posterior
 from fitting.sampling.trust_pack import MOVES_MUCH, TrustPack
 
 _WIDTH_INCHES = 10.0
@@ -15,13 +20,14 @@ _MOST_NAMED = 14
 
 
 def trust_pictures(pack: TrustPack) -> list[bytes]:
-    """Return trust.png, and its parts: replicated readings, single rows, ranks, parameters in pairs (PNG)."""
-    parts = []
+    """Return trust.png, and its parts as SVG: replicated readings, single rows, ranks, parameters in pairs."""
+    figures = []
     for draw, height in _panels(pack):
         figure = Figure(figsize=(_WIDTH_INCHES, height), layout="constrained")
         draw(figure, pack)
-        parts.append(pixels_of(figure, DPI))
-    return [png_of_pixels(part, DPI) for part in (np.concatenate(parts), *parts)]
+        figures.append(figure)
+    whole = np.concatenate([pixels_of(figure, DPI) for figure in figures])
+    return [png_of_pixels(whole, DPI), *map(svg_of, figures)]
 
 
 def trust_figure(pack: TrustPack) -> Figure:
@@ -35,12 +41,45 @@ def trust_figure(pack: TrustPack) -> Figure:
     return figure
 
 
+def bootstrap_figure(found: Bootstrap) -> Figure:
+    """Return the figure of the fitted values of synthetic tables, one by one and in pairs."""
+    return _corner_figure(found.names, found.samples)
+
+
+def posterior_figure(found: Posterior) -> Figure:
+    """Return the figure of a posterior: its density on a grid, or its samples one by one and in pairs."""
+    if found.chains is not None:
+        return _corner_figure(tuple(found.mean), found.chains.samples)
+    figure = new_figure(7.0, 4.5)
+    axes = figure.subplots()
+    if found.grid is not None:
+        grid, names = found.grid, [*found.grid.names, "density"]
+        if len(grid.axes) == 1:
+            axes.plot(grid.axes[0], grid.density, color=COLOURS[0])
+        else:
+            image = axes.pcolormesh(grid.axes[0], grid.axes[1], grid.density.T, cmap="Blues", rasterized=True)
+            figure.colorbar(image, label="density")
+        label_axes(axes, x=names[0], y=names[1])
+        axes.locator_params(axis="x", nbins=6)
+    return figure
+
+
+def _corner_figure(names: Sequence[str], samples: Float[np.ndarray, "... p"]) -> Figure:
+    size = min(0.8 + 1.5 * len(names), _WIDTH_INCHES)
+    figure = Figure(figsize=(max(size, 4.0), size), layout="constrained")
+    draw_corner(figure, names, samples)
+    return figure
+
+
 def _panels(pack: TrustPack):
     return [
         (draw_replicated, 0.6 + 2.0 * len(_kinds(pack))),
         (draw_rows, 4.2),
         (draw_ranks, 3.4),
-        (draw_corner, min(0.8 + 1.5 * len(pack.names), _WIDTH_INCHES)),
+        (
+            lambda figure, pack: draw_corner(figure, pack.names, pack.draws),
+            min(0.8 + 1.5 * len(pack.names), _WIDTH_INCHES),
+        ),
     ]
 
 
@@ -115,10 +154,10 @@ def draw_ranks(figure: Figure | SubFigure, pack: TrustPack) -> None:
     figure.legend(*panels[0].get_legend_handles_labels(), fontsize=SMALL, loc="outside right center")
 
 
-def draw_corner(figure: Figure | SubFigure, pack: TrustPack) -> None:
-    """Draw the posterior's parameters one by one and in pairs, with the 68 and 95 % contours of the pairs."""
-    flat = pack.draws.reshape(-1, len(pack.names))
-    count = len(pack.names)
+def draw_corner(figure: Figure | SubFigure, names: Sequence[str], draws: Float[np.ndarray, "... p"]) -> None:
+    """Draw parameters one by one and in pairs, with the 68 and 95 % contours of the pairs."""
+    count = len(names)
+    flat = draws.reshape(-1, count)
     panels = figure.subplots(count, count, squeeze=False, sharex="col")
     for i in range(count):
         for j in range(count):
@@ -137,9 +176,9 @@ def draw_corner(figure: Figure | SubFigure, pack: TrustPack) -> None:
                 axes.plot(flat[:, j], flat[:, i], ".", ms=1.2, alpha=0.4, color=COLOURS[0], rasterized=True)
                 _ellipses(axes, flat[:, j], flat[:, i])
             if i == count - 1:
-                axes.set_xlabel(_broken(pack.names[j]), fontsize=7)
+                axes.set_xlabel(_broken(names[j]), fontsize=7)
             if j == 0 and i > 0:
-                axes.set_ylabel(_broken(pack.names[i]), fontsize=7)
+                axes.set_ylabel(_broken(names[i]), fontsize=7)
             elif j > 0:
                 axes.set_yticklabels([])
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from afm_jax.words import decimals, interval, known, percent, value_alone
 from fitting.fits.loss import WithInterval
 from fitting.fits.result import FitResult, FittedParameter
-from fitting.fits.verdict import IMPROBABLE
+from fitting.fits.verdict import IMPROBABLE, value_at_bound
 from fitting.parameters import DELAY_LAW, DELAY_SHAPE, LAWS, LOSS_SHAPE, PARAMETERS, SHAPE_NAMES
 from fitting.sampling.trust_pack import TrustPack
 
@@ -198,7 +198,7 @@ def interval_in_words(parameter: FittedParameter) -> str:
 def value_in_words(parameter: FittedParameter) -> str:
     """Return the value with the digits that its error warrants, three where it has none; 0 or 1 of one at its bound."""
     if parameter.at_bound:
-        return f"{parameter.value:z.0f}"
+        return value_at_bound(parameter.value)
     return value_alone(parameter.value, parameter.standard_error)
 
 
@@ -284,7 +284,9 @@ def belief_in_words(result: FitResult) -> str:
         explained = "the law explains the amplitudes within errors of a believable size"
     elif result.settings.get("robust") is not None:
         explained = "the law explains the amplitudes within their errors but for a few outliers"
-    words = f"You can believe it: the fit converged, {explained}, and every parameter is {determined} by the data."
+    open_ = [name for name, parameter in result.parameters.items() if parameter.undetermined]
+    which = f"every parameter but {' and '.join(open_)}" if open_ else "every parameter"
+    words = f"You can believe it: the fit converged, {explained}, and {which} is {determined} by the data."
     width = band_width(result)
     if width is not None:
         words += (

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from afm_jax.checks import require_float64
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.least_squares import Box, Searches, descended, distance, whole_covariance_of
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from fitting.fits.intervals import at_bound, covariance
 from fitting.fits.objective import PLAIN, ROBUST, Objective, soft_square
 from fitting.fits.result import FitResult
@@ -238,9 +238,9 @@ FEWEST = 40
 """With fewer samples the 2.5 % quantile is the smallest value or next to it."""
 
 
-@public_result()
+@public_result(picture="fitting.report.trust_plots:bootstrap_figure")
 @dataclass(frozen=True, eq=False)
-class Bootstrap:
+class Bootstrap(Result):
     """Fitted values of synthetic data sets.
 
     Attributes:

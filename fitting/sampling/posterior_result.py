@@ -6,7 +6,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 
 HIGHEST_R_HAT = 1.02
 """Samples with a larger ratio between and within chains do not describe one distribution."""
@@ -52,9 +52,9 @@ class PosteriorChains:
     statistics: dict[str, np.ndarray] = field(default_factory=dict)
 
 
-@public_result()
+@public_result(picture="fitting.report.trust_plots:posterior_figure")
 @dataclass(frozen=True, eq=False)
-class Posterior:
+class Posterior(Result):
     """The posterior of a fit's parameters.
 
     Attributes:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from fitting.fits.result import FitResult
 from fitting.sampling.bootstrap import require_valid
 from fitting.sampling.draws import Believed, believe_draws, refit_of_rows
@@ -45,7 +45,7 @@ class PredictiveBands:
 
 @public_result(picture="fitting.report.trust_plots:trust_figure", rows="row_records")
 @dataclass(frozen=True, eq=False)
-class TrustPack:
+class TrustPack(Result):
     """What speaks for a posterior and what against it.
 
     Attributes:

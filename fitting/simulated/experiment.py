@@ -21,11 +21,13 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
+from afm_jax.motion.follow import place_after, where_to_go_on
 from afm_jax.motion.observe import observe
+from afm_jax.motion.periodic import close_periods, ends_in_flight
 from afm_jax.motion.record import MotionOutcome, Simulation, State
-from afm_jax.motion.settle import close_periods, ends_in_flight, place_after, settled, where_to_go_on
+from afm_jax.motion.settle import settled
 from afm_jax.motion.simulate import DEFAULT_ACCURACY, simulate
-from afm_jax.results import public_result
+from afm_jax.results import Result, ResultTuple, public_result
 from fitting.tables.table import DRIVES, AmplitudeTable
 
 US_PER_MS = 1e3
@@ -44,7 +46,7 @@ _TOLERANCE = 1e-6
 
 
 @public_result()
-class Drives(NamedTuple):
+class Drives(ResultTuple):
     """What is driven in an experiment, one entry a row."""
 
     order: Int[np.ndarray, " rows"]
@@ -237,7 +239,7 @@ PIECES = 40
 
 @public_result()
 @dataclass(frozen=True, kw_only=True)
-class SimulatedExperiment:
+class SimulatedExperiment(Result):
     """A simulated amplitude table, and what was behind it.
 
     Attributes:

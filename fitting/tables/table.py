@@ -42,7 +42,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from afm_jax.whole_files import write_whole
 from fitting.tables.csv_text import (
@@ -355,7 +355,7 @@ def _check_duplicates(columns: Columns, lines: Int[np.ndarray, " rows"], faults:
 
 @public_result()
 @dataclass(frozen=True, eq=False, kw_only=True)
-class AmplitudeTable:
+class AmplitudeTable(Result):
     """Measured amplitudes of (1, N) orbits, one row for each drive; the arrays are read-only NumPy copies.
 
     A measured column is None if the table does not have it, and NaN in the rows where nothing was measured. A value

@@ -4,7 +4,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, png_of
+from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, png_of, svg_of
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.tapping_curves.constant_energy import plain_instrument
 from fitting.tapping_curves.curve import Instrument, TipMotion, motion_of
@@ -15,14 +15,14 @@ _SMALL = 9
 _PERIODS = 2.0
 
 
-def tapping_pictures(result: Tapping) -> list[bytes]:
-    """Return PNG files: the curve, the two frames, and the law if there is one."""
-    files = [png_of(curve_figure(result)), png_of(frames_figure(result))]
+def tapping_pictures(result: Tapping) -> tuple[list[bytes], list[bytes]]:
+    """Return as PNG and as SVG: the curve, the two frames, and the law if there is one."""
+    figures = [curve_figure(result), frames_figure(result)]
     if result.law is not None:
-        from fitting.report.plots import DPI, law_figure  # noqa: PLC0415
+        from fitting.report.plots import law_figure  # noqa: PLC0415
 
-        files.append(png_of(law_figure(result.law), DPI))
-    return files
+        figures.append(law_figure(result.law))
+    return [png_of(figure) for figure in figures], [svg_of(figure) for figure in figures]
 
 
 def curve_figure(result: Tapping) -> Figure:

@@ -197,20 +197,20 @@ def write_tapping(
     from fitting.report.report import write_report, write_report_files  # noqa: PLC0415
     from fitting.tapping_curves.pictures import tapping_pictures  # noqa: PLC0415
 
-    pictures = tapping_pictures(result)
+    (curve, frames, *_), pictures = tapping_pictures(result)
     page = folder / "tapping.html"
     write_whole(page, tapping_page(result, pictures))
     data = {"format": "afm-jax tapping", "format_version": 1, **result.to_dict()}
     written = [
         page,
-        *write_report_files(folder, "tapping", text=tapping_summary(result), data=data, picture=pictures[0]),
+        *write_report_files(folder, "tapping", text=tapping_summary(result), data=data, picture=curve),
     ]
-    frames = folder / "tapping_frames.png"
-    write_whole(frames, pictures[1])
+    frames_path = folder / "tapping_frames.png"
+    write_whole(frames_path, frames)
     records = result.records()
     write_table("tapping_rows.csv", records, tuple(records[0]))
     law = [] if result.law is None else write_report(result.law, folder, write_table)
-    return [*written, frames, *law]
+    return [*written, frames_path, *law]
 
 
 def tapping_page(result: Tapping, pictures: list[bytes]) -> str:
@@ -218,7 +218,7 @@ def tapping_page(result: Tapping, pictures: list[bytes]) -> str:
 
     Args:
         result: what was found.
-        pictures: PNG files from `tapping_pictures`.
+        pictures: SVG files from `tapping_pictures`.
     """
     from fitting.report.page import Table, page, pairs, pictures_of  # noqa: PLC0415
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Int
 
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.tables.table import AmplitudeTable
@@ -120,9 +120,9 @@ class MeasuredSpeeds:
     why_not: str
 
 
-@public_result()
+@public_result(picture="fitting.tapping_curves.pictures:curve_figure")
 @dataclass(frozen=True, kw_only=True)
-class Tapping:
+class Tapping(Result):
     """The outcome of `tapping`.
 
     Attributes:

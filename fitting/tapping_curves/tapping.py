@@ -302,7 +302,8 @@ def _why_not(curve: TappingCurve, fast: np.ndarray, known: np.ndarray, in_captur
         what = (
             f"only {int(fast.sum())} rows have fast and brief impacts of known speed, and a law needs {_FEWEST_FOR_LAW}"
         )
-    return f"driven at {where} of the free frequency, {what}; to get the impact law, {advice}"
+    contact = "; the contact's own parameters need no law: afm-jax fit CURVE --model contact"
+    return f"driven at {where} of the free frequency, {what}; to get the impact law, {advice}{contact}"
 
 
 def with_law(result: Tapping, model: str = LAW_MODEL) -> Tapping:

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from afm_jax.units import within_turn
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable
@@ -35,7 +35,7 @@ FORMAT_VERSION = 1
 
 @public_result(picture="fitting.traces.report:lockin_figure")
 @dataclass(frozen=True, eq=False, kw_only=True)
-class LockinResult:
+class LockinResult(Result):
     """The reading of one trace; attributes are named like the keys of its JSON. Errors are standard errors.
 
     Attributes:

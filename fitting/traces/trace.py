@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.results import public_result
+from afm_jax.results import Result, public_result
 from fitting.tables.csv_text import (
     Column,
     Faults,
@@ -300,7 +300,7 @@ _KHZ_PER_MHZ = 1e3
 
 @public_result()
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Trace:
+class Trace(Result):
     """Equally spaced samples of the deflection and what is known of the measurement.
 
     Attributes:

@@ -1,0 +1,83 @@
+"""Taps of a tip on a bent lever against the tests' own integrator, and against full simulations."""
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from afm_jax.apparatus.cantilever import Cantilever
+from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.surface import detected
+from afm_jax.contact.bent_lever import tapped
+from afm_jax.contact.contact import Contact
+from afm_jax.impact.closure import OrbitProblem
+from afm_jax.impact.orbits import steady_orbits
+from fitting import read_table
+from tests.reference_contact_forces import ContactParameters
+from tests.reference_driven_contact import DrivenContact, follow
+from tests.tapping_truths import MASS_NG, tapping_truth
+
+LEVER = Cantilever(90.0, 200.0, 16.81)
+OMEGA = 2e-3 * np.pi * 90.0
+MIXED: dict[str, Any] = {
+    "tip_radius_nm": 50.0,
+    "relative_humidity": 0.42,
+    "adhesion_energy_j_per_m2": 0.22,
+    "modulus_gpa": 70.0,
+}
+
+
+def system(numbers: dict[str, Any], **more: Any) -> DrivenContact:
+    return DrivenContact(
+        **{"drive_frequency_khz": 90.0, "mass_ng": 16.81, "contact": ContactParameters(**numbers)} | more
+    )
+
+
+@pytest.mark.slow
+def test_taps_are_collisions_of_the_undriven_lever():
+    impact = tapped(Contact.paper(**MIXED), LEVER, jnp.array([2.0, 26.0]))
+    seen = set()
+    for pull, approach in ((12.0, 7.0), (12.0, 10.5), (12.0, 11.5), (3.7, 9.0), (21.0, 17.0), (21.0, 40.0)):
+        tap = jax.jit(type(impact).tap)(impact, jnp.array(approach), jnp.array(pull))
+        # at the plane the lever is bent by pull/Omega^2
+        plane = -pull / OMEGA**2
+        lever = system(MIXED, amplitude_nm=0.0, offset_nm=plane - 4.7, quality_factor=None)
+        contact = follow(lever, 0.0, plane, -approach, contacts=1).contacts[0]
+        seen.add(contact.junctions)
+        assert float(tap.speeds.rebound) == pytest.approx(contact.rebound_speed_nm_per_us, rel=1e-7)
+        assert float(tap.speeds.delay) == pytest.approx(contact.departure_time_us, abs=2e-4)
+    assert seen == {0, 1}
+
+
+@jax.jit
+def read_of(impact, cantilever, free_nm, frequency_khz, offset_nm):
+    """Return amplitude and lag of the fastest steady orbit, and whether there is one."""
+    platform = Platform(free_nm, frequency_khz, offset_nm + impact.plane_nm)
+    problem = OrbitProblem(cantilever, platform, impact, jnp.ones(()))
+    orbits = steady_orbits(problem)
+    slot = jnp.argmax(jnp.where(orbits.steady, orbits.place.coordinate, -jnp.inf))
+    _, size, phase = orbits.amplitude_nm[slot]
+    ratio = frequency_khz / cantilever.frequency_khz
+    read = detected(size, phase, free_nm, ratio, cantilever.quality_factor, base=False)
+    return jnp.stack(read), orbits.steady[slot]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["tapping_712_0_1_8.csv", "tapping_712_0_1.03_12.csv"])
+def test_taps_are_read_as_full_simulations_are(name: str):
+    """On resonance and 3 % above it; the full scene in time, followed until it repeats."""
+    truth, table = tapping_truth(0), read_table(Path(__file__).parent / "tapping_tables" / name)
+    cantilever = Cantilever(90.0, truth.quality_factor, MASS_NG)
+    impact = tapped(Contact.paper(**truth.parameters), cantilever, jnp.array([1.0, 30.0]))
+    # nearer the sample taps are slow and last a quarter of the period
+    near = -table.offset_nm > 0.35 * table.excitation_nm
+    assert np.count_nonzero(near) >= 12
+    for row in np.flatnonzero(near):
+        drive = (table.excitation_nm[row], table.drive_frequency_khz[row], table.offset_nm[row])
+        (amplitude, lag), steady = read_of(impact, cantilever, *map(jnp.asarray, drive))
+        assert steady
+        assert amplitude == pytest.approx(table.lockin_amplitude_nm[row], rel=1e-4)
+        assert (lag - table.phase_lag_deg[row] + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=0.006)
