@@ -261,6 +261,8 @@ class _Finder:
         scenes = self.scenes(len(points))
         time = jnp.asarray(points[:, 0] % (2.0 * np.pi) / self.omega)
         tips = jax.tree.map(np.asarray, tips_at(scenes, time, jnp.asarray(points[:, 1])))
+        # no start: beside the orbit of a tip that leaves with the platform's own speed
+        into = points[:, 1] <= np.asarray(scenes.platform.velocity(time))
         end, record = self._later(tips, _BACK)
         # on the orbit: the last point is one of its own
         phase, velocity = self.omega * record.departure_us[:, -1], record.velocity_after_nm_per_us[:, -1]
@@ -268,7 +270,7 @@ class _Finder:
             mine, found = owner == number, self.attractors[number]
             apart = self._distance(found, phase[mine], velocity[mine])
             size = max(1.0, np.abs(found.velocity_nm_per_us).max() / self.top)
-            back = (apart < _SAME * size) & (end.outcome[mine] == Outcome.IMPACT)
+            back = ((apart < _SAME * size) & (end.outcome[mine] == Outcome.IMPACT)) | into[mine]
             good = [size for size in _RADII if back[sizes[mine] <= size].all()]
             self.radius[number] = max(good, default=0.0)
 
