@@ -50,7 +50,7 @@ def check_parameter(name: str, value: ArrayLike | None, allowed: str) -> None:
     Args:
         name: what the message calls it, with its unit.
         value: the number or array; None (an absent effect) and traced values pass.
-        allowed: "finite", "positive", "not negative", "above 0.5", "in (0, 1]" or
+        allowed: "finite", "positive", "not negative", "above 0.5", "in [0, 1]" or
             "between 0 and 1" (neither of the two).
 
     Raises:
@@ -76,7 +76,7 @@ _RANGES = {
     "positive": lambda number: number > 0,
     "not negative": lambda number: number >= 0,
     "above 0.5": lambda number: number > 0.5,
-    "in (0, 1]": lambda number: (number > 0) & (number <= 1),
+    "in [0, 1]": lambda number: (number >= 0) & (number <= 1),
     "between 0 and 1": lambda number: (number > 0) & (number < 1),
 }
 

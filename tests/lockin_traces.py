@@ -8,7 +8,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from afm_jax import Cantilever, ImpactLaw, Platform, Scene, single_impact_orbits
-from afm_jax.motion.settle import LongRun, follow_long
+from afm_jax.motion.follow import LongRun, follow_long
 from afm_jax.motion.start import state
 from afm_jax.motion.trajectory import trajectory
 from fitting.traces.trace import Trace, TraceSettings

@@ -115,7 +115,7 @@ def test_wrong_calls_are_one_line(arguments: list[str], expected: str):
 @pytest.mark.parametrize(
     ("error", "code", "line"),
     [
-        (ValueError("`r` must be in (0, 1],\nbut is 2"), 2, "`r` must be in (0, 1], but is 2"),
+        (ValueError("`r` must be in [0, 1],\nbut is 2"), 2, "`r` must be in [0, 1], but is 2"),
         (fitting.TableError("t.csv, line 3: bad"), 2, "t.csv, line 3: bad"),
         (FileNotFoundError(2, "No such file or directory", "t.csv"), 2, "t.csv: No such file or directory"),
         (OSError(28, "No space left on device"), 2, "standard output: cannot be written (No space left on device)"),

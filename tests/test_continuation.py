@@ -274,7 +274,7 @@ def test_errors_of_special_points_are_those_of_orbits_followed_anew():
     slopes = np.array([0.5 * (up - down) for up, down in pairs])
     expected = np.sqrt(np.sum(slopes**2, axis=0) + 2.0 * 0.2 * slopes[0] * slopes[1])
     assert len(middle) >= 2
-    # third order in the errors: measured
+    # what is of third order in the errors: 3e-5 was measured
     np.testing.assert_allclose(special_errors(found, known), expected, rtol=1e-3)
     # what is second order is small: bands of +- 1.96 errors are where they should be
     bends = np.abs([up + down - 2.0 * middle for up, down in pairs])
@@ -444,7 +444,8 @@ def test_nothing_in_the_range_ends_with_3_and_says_why(tmp_path: Path):
     [
         (("--parameter", "platform.amplitude=1:2"), "did you mean platform.amplitude_nm?"),
         (("--parameter", "platform.amplitude_nm=2:1"), "the range is empty"),
-        (("--parameter", "interaction.r=0.5:2"), "`r` must be in (0, 1]"),
+        (("--parameter", "interaction.r=0:0.9"), "begin the range above 0"),
+        (("--parameter", "interaction.r=0.5:2"), "`r` must be in [0, 1]"),
         (("--parameter", "interaction.r=0.5:0.9", "--impacts", "65"), "--impacts"),
         (("--parameter", "interaction.r=0.5:0.9", "--second", "interaction.epsilon=1:2"), "the scene's own value, 0"),
         (("--parameter", "interaction.r=0.5:0.9", "--picture", "gif"), "must be png, pdf or svg"),

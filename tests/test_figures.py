@@ -188,6 +188,10 @@ def test_share_above_tells_missing_orders(figure2: StabilityChart):
     assert share_above(figure2, last_order=20, stride=2) < 1e-3
 
 
+PARAMETERS = ("reduced_frequency", "offset_nm", "r")
+"""Of figure 9."""
+
+
 def figures(*arguments: str) -> Result:
     return CliRunner().invoke(main, ["figures", *arguments], prog_name="afm-jax")
 
@@ -229,6 +233,12 @@ def test_without_out_the_folder_is_figures(monkeypatch: pytest.MonkeyPatch, tmp_
     result = figures("--only", " 9,9 ", "--coarse")
     assert result.exit_code == 0, result.stderr
     assert sorted(path.name for path in (tmp_path / "figures").iterdir()) == ["figure9.csv", "figure9.png"]
+    with (tmp_path / "figures" / "figure9.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    # a row for each of its own parameters; only amplitudes may have gaps
+    assert set(rows[0]) == {*PARAMETERS, "stable", "peak_amplitude_nm", "rescaled_amplitude"}
+    assert len({tuple(row[name] for name in PARAMETERS) for row in rows}) == len(rows)
+    assert all(float(row["r"]) <= 1.0 for row in rows)
     assert "holds: the amplitude falls" in result.stdout
 
 
@@ -245,5 +255,5 @@ def test_other_figures_are_refused_in_one_line(only: str, says: str, tmp_path: P
 
 
 def test_pictures_leave_pyplot_alone():
-    code = "import sys, afm_jax.cli.figure_files; print('matplotlib.pyplot' in sys.modules)"
+    code = "import sys, afm_jax.plots.paper; print('matplotlib.pyplot' in sys.modules)"
     assert python(code) == "False"

@@ -172,10 +172,10 @@ def crossed(start: tuple[str, str]) -> set[str]:
 @pytest.mark.parametrize(
     ("module", "name", "most"),
     [
-        ("afm_jax.motion.simulate", "simulate", 34),
-        ("fitting.fits.fit", "fit", 52),
-        ("afm_jax.contact.collide", "collide", 18),
-        ("afm_jax.effects.study", "study_effects", 50),
+        ("afm_jax.motion.simulate", "simulate", 32),
+        ("fitting.fits.fit", "fit", 51),
+        ("afm_jax.contact.collide", "collide", 17),
+        ("afm_jax.effects.study", "study_effects", 49),
     ],
 )
 def test_a_call_crosses_few_files(module: str, name: str, most: int):

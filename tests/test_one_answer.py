@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, simulate, single_impact_orbits
-from afm_jax.apparatus.scene import drive_of
 from afm_jax.impact.jacobian import map_jacobian
 from afm_jax.impact.map import iterate_map, next_impact
 from afm_jax.motion.observe import observe
@@ -137,7 +136,7 @@ def test_simulations_stay_on_the_orbit_and_read_its_amplitudes(orbits):
     assert early.size
     for lane in (*late, *early):
         scene, run = (jax.tree.map(lambda part, lane=lane: part[lane], tree) for tree in (orbits.scenes, runs))
-        seen = observe(scene, run, drive=drive_of(scene))
+        seen = observe(scene, run)
         assert seen.settled.settled
         assert seen.peak_amplitude_nm == pytest.approx(orbits.one.peak_amplitude_nm[lane], rel=1e-9)
         assert seen.lockin_amplitude_nm == pytest.approx(orbits.one.lockin_amplitude_nm[lane], rel=1e-9)

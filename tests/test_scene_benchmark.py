@@ -14,7 +14,7 @@ from click.testing import CliRunner
 from afm_jax.bench import timing as own_process
 from afm_jax.bench.problems import batch_run, bouncing_starts, single_contacts, spread_starts
 from afm_jax.bench.scenes import REFERENCE, aims, contact_errors
-from afm_jax.bench.scipy_contacts import scipy_driven_contact
+from afm_jax.bench.scipy_contacts import diffrax_driven_contact, scipy_driven_contact
 from afm_jax.cli.bench import SCENE_COLUMNS
 from afm_jax.cli.main import main
 from afm_jax.motion.record import ContactKind, MotionOutcome
@@ -86,6 +86,18 @@ def test_scipys_baseline_follows_straight_and_turning_contacts(scene, course):
         assert found.rebound_speed_nm_per_us == pytest.approx(contact.rebound_speed_nm_per_us, rel=1e-6)
         assert found.departure_time_us == pytest.approx(contact.departure_time_us, abs=1e-7)
         assert found.evaluations > 100
+
+
+@pytest.mark.slow
+def test_diffraxs_events_come_to_the_same(scene, course):
+    turning = next(contact for contact in course.contacts if contact.junctions != 1)
+    straight = next(contact for contact in course.contacts if contact.junctions == 1)
+    for contact in (straight, turning):
+        found = diffrax_driven_contact(scene, contact.arrival_time_us, contact.approach_speed_nm_per_us, rtol=1e-9)
+        assert found.junctions == contact.junctions
+        # its tolerance, times some tens of steps and the slow parts of a turning contact
+        assert found.rebound_speed_nm_per_us == pytest.approx(contact.rebound_speed_nm_per_us, rel=1e-6)
+        assert found.departure_time_us == pytest.approx(contact.departure_time_us, abs=1e-7)
 
 
 def test_scipy_says_that_a_tip_is_held():

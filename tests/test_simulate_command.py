@@ -89,6 +89,19 @@ def test_too_short_to_settle_is_said_and_no_failure(law_file: Path):
 
 
 @pytest.mark.slow
+def test_a_part_of_a_response_period_has_no_mean(law_file: Path):
+    result = simulate(law_file, "--duration-us", 3, "--harmonics", "1,2", "--json")
+    answer = json.loads(result.stdout)
+    assert (result.exit_code, answer["window"]["responses"]) == (0, 0)
+    assert nulls(answer) == answer["null_reasons"].keys()
+    short = {name for name, reason in answer["null_reasons"].items() if "shorter than a response period" in reason}
+    assert short >= {"lockin_amplitude_nm", "lockin_phase_deg", "mean_height_nm", "given_by_drives_aj", "virial_aj"}
+    assert answer["harmonics"] == [{"multiple": k, "amplitude_nm": None, "phase_deg": None} for k in (1, 2)]
+    # the highest it has been is known
+    assert answer["peak_amplitude_nm"] > 0.0
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 3])
 def test_lockin_reads_the_trace_it_writes(tmp_path: Path, order: int):
     scene = Scene(Cantilever(90.0, 40.0), Platform(4.0, 181.8 * order, -1.0), LAW.interaction)

@@ -17,8 +17,8 @@ from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.impact.closure import OrbitProblem
 from afm_jax.impact.lasting_impact import TabulatedImpact, middle_of_contact
 from afm_jax.impact.orbits import amplitudes, orbit_state, steady_orbits
+from afm_jax.motion.follow import follow_long
 from afm_jax.motion.observe import observe
-from afm_jax.motion.settle import follow_long
 from afm_jax.motion.start import default_start
 
 CANTILEVER = {"frequency_khz": 90.0, "quality_factor": 200.0, "mass_ng": 16.81}

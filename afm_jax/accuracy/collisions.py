@@ -27,7 +27,7 @@ from afm_jax.bench.timing import compiled_for, progress, time_compiled
 from afm_jax.contact.bridge_leg import Passage, Way, nothing_spent, way_rates
 from afm_jax.contact.collide import Collision, batch_of, capture_speed, collision_of, go_through
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.junction import find_junction
+from afm_jax.contact.junction import Junction, find_junction
 from afm_jax.contact.settings import SETTINGS, Setting
 
 SOLVERS = {
@@ -236,7 +236,6 @@ def _adaptive(
 ) -> list[Row]:
     """Measure an adaptive solver; its tolerance is an argument of one program, so that none is compiled twice."""
     variable, solver = kind
-    crossing = _CROSSINGS[variable]
     if solver == _IMPLICIT:
         # two hundred times slower here: a few tips and loose tolerances show it
         tolerances = [tolerance for tolerance in tolerances if tolerance >= 1e-5]
@@ -244,17 +243,7 @@ def _adaptive(
     if not tolerances:
         return []
     # of static forces alone: the viscosity, by which slopes are taken, has no part in it
-    place = find_junction(Contact.paper())
-
-    def one(contact, junction, speed, tolerance):
-        mass = jnp.ones_like(speed)
-        finest = SETTINGS["diffrax"][1e-11]
-        ways = go_through(contact, junction, speed, mass, finest, lambda way: crossing(way, solver, tolerance))
-        return collision_of(contact, junction, speed, mass, ways)
-
-    def run(contact, junction, speeds, tolerance):
-        return jax.vmap(one, in_axes=(None, None, 0, None))(contact, junction, speeds, tolerance)
-
+    place, run = find_junction(Contact.paper()), adaptive_collisions(variable, solver)
     contact = Contact.paper()
     # one tip that a loose tolerance keeps near capture would hold up all lanes
     timed = speeds[1:]
@@ -282,6 +271,19 @@ def _adaptive(
             }
         )
     return rows
+
+
+def adaptive_collisions(variable: str, solver: str) -> Callable[[Contact, Junction, Array, Array], Collision]:
+    """Return collisions of a contact with its junction, at speeds, by an adaptive solver with a tolerance."""
+    crossing = _CROSSINGS[variable]
+
+    def one(contact, junction, speed, tolerance):
+        mass = jnp.ones_like(speed)
+        finest = SETTINGS["diffrax"][1e-11]
+        ways = go_through(contact, junction, speed, mass, finest, lambda way: crossing(way, solver, tolerance))
+        return collision_of(contact, junction, speed, mass, ways)
+
+    return jax.vmap(one, in_axes=(None, None, 0, None))
 
 
 def _integrators(

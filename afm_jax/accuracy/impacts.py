@@ -1,7 +1,7 @@
 """Error of impact times against the time they take: root tolerances, float32 and float64, next to SciPy.
 
-Runs in a process of its own on one core (`own_process`). Errors are achieved ones, against 50 digits, impact by impact
-from the computed state before each, near-grazing impacts apart: there a time has fewer digits whatever computes it.
+Runs in a process of its own on one core (`run_in_own_process`). Errors are achieved ones, against 50 digits, impact by
+impact from the computed state before each, near-grazing ones apart: there a time has fewer digits whatever computes it.
 """
 
 from collections.abc import Sequence

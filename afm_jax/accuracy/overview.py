@@ -8,7 +8,7 @@ this package's?), reason (where there is no error); and `references`: of each pr
 measured against, and how well that is known.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import product
 from typing import Any
 
@@ -20,12 +20,12 @@ import optimistix
 from jaxtyping import Array
 from scipy.optimize import root
 
-from afm_jax.accuracy.collisions import collide_accuracy, values_and_slopes
+from afm_jax.accuracy.collisions import adaptive_collisions, collide_accuracy, values_and_slopes
 from afm_jax.accuracy.impacts import doubt_of_reference, integrator_row, map_rows, slow_ones_first
 from afm_jax.apparatus.scene import Scene
 from afm_jax.bench.collisions import COARSER_REFERENCE, REFERENCE, speeds_of
 from afm_jax.bench.impacts import sequence_errors
-from afm_jax.bench.integrators import title
+from afm_jax.bench.integrators import EVENT, title
 from afm_jax.bench.problems import (
     BenchmarkScene,
     Starts,
@@ -41,6 +41,7 @@ from afm_jax.bench.scipy_impacts import scipy_impacts
 from afm_jax.bench.timing import compiled_for, progress, time_compiled
 from afm_jax.contact.collide import batch_of
 from afm_jax.contact.contact import Contact
+from afm_jax.contact.junction import find_junction
 from afm_jax.contact.parameters import PAPER
 from afm_jax.contact.settings import DRIVEN_SETTINGS, SETTINGS, DrivenSetting
 from afm_jax.impact.law import impact_law_of
@@ -50,11 +51,11 @@ from afm_jax.verify.fifty_digits import exact_orbit_state, mpmath_or_reason
 
 Row = dict[str, Any]
 Study = dict[str, Any]
-EVENT = "Diffrax Dopri8 with Event"
 _LONGEST_PERIODS = 10.0
 _IN_TIME = (DrivenSetting(None, 12.0, 400), DrivenSetting(None, 9.0, 300))
 """References of driven contacts, all of the way in fine steps in time: the better one first."""
 _SCIPYS_BEST = 1e-13
+_MOST_NEWTON_STEPS = 12
 
 
 def overview_row(problem: str, method: str, setting: str, microseconds: float | None, error: float | None) -> Row:
@@ -112,7 +113,29 @@ def _diffrax_impacts(
     case: BenchmarkScene, starts: Starts, tolerances: Sequence[float], impacts: int, repetitions: int
 ) -> Iterator[Row]:
     """Measure Diffrax's own events, restarted after each impact: what a user of Diffrax would write."""
-    law, cantilever, platform = impact_law_of(case.scene), case.scene.cantilever, case.scene.platform
+    one = _diffrax_impact(case.scene)
+
+    def run(time: Array, velocity: Array, tolerance: Array) -> Array:
+        def step(state: Array, _: None) -> tuple[Array, Array]:
+            after = one(state, tolerance)
+            return after, after
+
+        return jax.lax.scan(step, jnp.stack([time, velocity]), None, length=impacts)[1]
+
+    first = (starts.time_us[0], starts.velocity_nm_per_us[0])
+    compiled = compiled_for(run, *first, jnp.asarray(tolerances[0]))
+    single = BenchmarkScene(case.name, case.scene, chaotic=True)
+    for tolerance in tolerances:
+        progress(f"accuracy: impacts, {EVENT}, {tolerance:g}")
+        timing, found = time_compiled(compiled, *first, jnp.asarray(tolerance), repetitions=repetitions)
+        states = np.vstack([[float(part) for part in first], np.asarray(found)])
+        error = float(np.max(sequence_errors(single, states)))
+        yield overview_row("impacts", EVENT, f"tolerance {tolerance:g}", 1e6 * timing.best_s / impacts, error)
+
+
+def _diffrax_impact(scene: Scene) -> Callable[[Array, Array], Array]:
+    """Return the function from time and velocity after an impact, and a tolerance, to those after the next."""
+    law, cantilever, platform = impact_law_of(scene), scene.cantilever, scene.platform
     period = platform.period_us
 
     def motion(time: Any, state: Any, args: Any) -> Any:
@@ -123,7 +146,7 @@ def _diffrax_impacts(
         del args, extra
         return y[0] - platform.position(t)
 
-    def one(start: tuple[Array, Array], tolerance: Array) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+    def one(start: Array, tolerance: Array) -> Array:
         time, velocity = start
         solution = diffrax.diffeqsolve(
             diffrax.ODETerm(motion),
@@ -142,21 +165,9 @@ def _diffrax_impacts(
         assert solution.ys is not None  # noqa: S101
         arrival, before = solution.ts[-1], solution.ys[1][-1]
         speed = platform.velocity(arrival)
-        after = speed + law.rebound_speed(speed - before)
-        return (arrival, after), (arrival, after)
+        return jnp.stack([arrival, speed + law.rebound_speed(speed - before)])
 
-    def run(time: Array, velocity: Array, tolerance: Array) -> tuple[Array, Array]:
-        return jax.lax.scan(lambda state, _: one(state, tolerance), (time, velocity), None, length=impacts)[1]
-
-    first = (starts.time_us[0], starts.velocity_nm_per_us[0])
-    compiled = compiled_for(run, *first, jnp.asarray(tolerances[0]))
-    single = BenchmarkScene(case.name, case.scene, chaotic=True)
-    for tolerance in tolerances:
-        progress(f"accuracy: impacts, {EVENT}, {tolerance:g}")
-        timing, found = time_compiled(compiled, *first, jnp.asarray(tolerance), repetitions=repetitions)
-        states = np.vstack([[float(part) for part in first], np.stack([np.asarray(part) for part in found], axis=1)])
-        error = float(np.max(sequence_errors(single, states)))
-        yield overview_row("impacts", EVENT, f"tolerance {tolerance:g}", 1e6 * timing.best_s / impacts, error)
+    return one
 
 
 def collisions(
@@ -216,6 +227,18 @@ def _gradients(
             timing, slopes = time_compiled(compiled_for(run, speeds), speeds, repetitions=repetitions)
             cells = (f"accuracy {accuracy:g}", 1e6 * timing.best_s / speeds.size, _slope_error(slopes, exact))
             rows.append(overview_row("gradients", f"collide, {method}, autodiff", *cells))
+    contact, run_in_time = Contact.paper(), adaptive_collisions("time", "Dopri8")
+    junction = find_junction(contact)
+
+    def by_events(junction: Any, at: Array, tolerance: Array) -> dict[str, Array]:
+        return values_and_slopes(lambda contact, some: run_in_time(contact, junction, some, tolerance), at)
+
+    compiled = compiled_for(by_events, junction, speeds, jnp.asarray(tolerances[0]))
+    for tolerance in tolerances:
+        progress(f"accuracy: gradients, {EVENT}, {tolerance:g}")
+        timing, slopes = time_compiled(compiled, junction, speeds, jnp.asarray(tolerance), repetitions=repetitions)
+        cells = (f"tolerance {tolerance:g}", 1e6 * timing.best_s / speeds.size, _slope_error(slopes, exact))
+        rows.append(overview_row("gradients", f"{EVENT}, autodiff", *cells))
     places = np.unique(np.linspace(0, speeds.size - 1, 3).astype(int))
     expected = {name: np.asarray(exact[name])[places] for name in _SLOPES}
     for method, tolerance in product(integrators, tolerances):
@@ -284,7 +307,8 @@ def driven_contacts(
             _worst(contact_errors(found, reference, single)),
         )
         rows.append(overview_row("driven contacts", "simulate", *cells))
-    for row in scipy_rows("n = 5.277", scene, reference, single, contacts, methods=integrators, tolerances=tolerances):
+    rivals = (*integrators, EVENT)
+    for row in scipy_rows("n = 5.277", scene, reference, single, contacts, methods=rivals, tolerances=tolerances):
         method, setting = row["what"].split(" with events, the contact alone, rtol ")
         cells = (f"tolerance {setting}", row.get("microseconds_per_contact"), _worst(row))
         rows.append(overview_row("driven contacts", method, *cells) | _reason(row))
@@ -324,6 +348,7 @@ def orbits(*, tolerances: Sequence[float], integrators: Sequence[str], batch: in
     for method, tolerance in product(integrators, tolerances):
         progress(f"accuracy: orbits, {title(method)}, {tolerance:g}")
         rows.append(_shooting(scene, place, (method, tolerance), float(exact[1])))
+    rows += _diffrax_shooting(scene, place, tolerances, float(exact[1]), repetitions)
     return _study("orbits", rows, "velocity after the impact, relative", "50 digits", 1e-40)
 
 
@@ -339,13 +364,50 @@ def _shooting(scene: Scene, place: tuple[float, float], how: tuple[str, float], 
         spent += run.seconds
         return run.states[1] - state - np.array([period, 0.0])
 
-    start = np.array([place[0] / float(scene.platform.angular_frequency) + 0.02 * period, 1.05 * place[1]])
+    start = _beside(scene, place)
     cells = ("orbits", f"{title(method)}, shooting", f"tolerance {tolerance:g}")
     try:
         found = root(leap, start, tol=max(tolerance, 1e-14))
     except (ValueError, ModuleNotFoundError) as failure:
         return overview_row(*cells, None, None) | {"reason": str(failure)}
     return overview_row(*cells, 1e6 * spent, abs(found.x[1] / exact - 1.0))
+
+
+def _beside(scene: Scene, place: tuple[float, float]) -> np.ndarray:
+    """Return time and velocity of a start a few percent off an orbit's phase and velocity."""
+    turn = 0.02 * float(scene.platform.period_us)
+    return np.array([place[0] / float(scene.platform.angular_frequency) + turn, 1.05 * place[1]])
+
+
+def _diffrax_shooting(
+    scene: Scene, place: tuple[float, float], tolerances: Sequence[float], exact: float, repetitions: int
+) -> Iterator[Row]:
+    """Close the orbit by Newton's method on Diffrax's flight with its event, derivatives by autodiff."""
+    one, period = _diffrax_impact(scene), jnp.stack([scene.platform.period_us, jnp.zeros(())])
+
+    def closed(start: Array, tolerance: Array) -> Array:
+        def missed(state: Array) -> tuple[Array, Array]:
+            gap = one(state, tolerance) - state - period
+            return gap, gap
+
+        def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+            count, at, _ = state
+            slope, gap = jax.jacfwd(missed, has_aux=True)(at)
+            move = -jnp.linalg.solve(slope, gap)
+            return count + 1, at + move, jnp.max(jnp.abs(move / at))
+
+        def goes_on(state: tuple[Array, Array, Array]) -> Array:
+            return (state[0] < _MOST_NEWTON_STEPS) & (state[2] > jnp.maximum(tolerance, 1e-14))
+
+        return jax.lax.while_loop(goes_on, step, (jnp.zeros((), int), start, jnp.ones(())))[1]
+
+    start = jnp.asarray(_beside(scene, place))
+    compiled = compiled_for(closed, start, jnp.asarray(tolerances[0]))
+    for tolerance in tolerances:
+        progress(f"accuracy: orbits, {EVENT}, {tolerance:g}")
+        timing, found = time_compiled(compiled, start, jnp.asarray(tolerance), repetitions=repetitions)
+        error = abs(float(found[1]) / exact - 1.0)
+        yield overview_row("orbits", f"{EVENT}, shooting", f"tolerance {tolerance:g}", 1e6 * timing.best_s, error)
 
 
 def cheapest(rows: Sequence[Row], wanted: Sequence[float]) -> list[Row]:

@@ -3,7 +3,7 @@
 Runs in a process of its own on one core. Errors are achieved ones, against the finest setting, whose own error is the
 difference to the second finest.
 
-Error against time of one scene with an impact law: tolerances of the search for an impact; see `scene_accuracy`.
+Error against time of one scene with an impact law: tolerances of the search for an impact; see `contact_accuracy`.
 
 The fidelity ladder of a scene: the same amplitude from ever fuller models, each with its error and its time.
 

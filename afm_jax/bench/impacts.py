@@ -1,6 +1,6 @@
 """Impacts per second: the map in batches, on one core and on all, its derivatives, and SciPy on the same problem.
 
-Each function here runs in a process of its own (`own_process`) and returns rows as plain dicts:
+Each function here runs in a process of its own (`run_in_own_process`) and returns rows as plain dicts:
 
 what, scene, batch, cores, block, impacts, microseconds_per_impact (best), median_microseconds_per_impact,
 impacts_per_second, compile_s, error_us, error_kind ("after N impacts" or "impact by impact"), near_grazing,

@@ -12,6 +12,8 @@ Event = Callable[[float, Any], float]
 
 CVODE = {"CVODE Adams": "Adams", "CVODE BDF": "BDF"}
 """Methods of SUNDIALS by the names that `integrate_to_event` knows beside those of `solve_ivp`."""
+EVENT = "Diffrax Dopri8 with Event"
+"""Diffrax's own events, begun again after each; it needs JAX's rates and does not go through `integrate_to_event`."""
 _MOST_STEPS = 100_000
 
 
@@ -35,6 +37,8 @@ class Reached(NamedTuple):
 
 def title(method: str) -> str:
     """Return a method's name with the library that it is from."""
+    if method == EVENT:
+        return method
     return f"SUNDIALS {method}" if method in CVODE else f"SciPy {method}"
 
 

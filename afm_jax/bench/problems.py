@@ -69,22 +69,26 @@ def high_order_scene() -> BenchmarkScene:
     )
 
 
-def settled_starts(scene: Scene, batch: int, *, settling: int = 200, spread: float = 1e-2) -> Starts:
+_SETTLING = 200
+"""Impacts after which a motion counts as settled."""
+_SPREAD = 1e-2
+"""Share of a drive period, and relative part of the rebound speed, by which starts on a regular attractor are scattered
+around it."""
+
+
+def settled_starts(scene: Scene, batch: int) -> Starts:
     """Return starts near where the motion settles, the first of them the same for every batch size.
 
     Args:
         scene: the scene.
         batch: how many.
-        settling: impacts after which the motion counts as settled.
-        spread: share of a drive period, and relative part of the rebound speed, by which starts on a regular
-            attractor are scattered around it.
 
     Raises:
         ValueError: if tips do not stay in motion in this scene.
     """
     lanes = 64
     scattered = scattered_starts(scene, lanes)
-    rows = iterate_batch(scene, scattered.time_us, scattered.velocity_nm_per_us, settling)
+    rows = iterate_batch(scene, scattered.time_us, scattered.velocity_nm_per_us, _SETTLING)
     flying = np.flatnonzero(np.asarray(rows.outcome[:, -1]) == Outcome.IMPACT)
     if flying.size == 0:
         raise ValueError("no tip stays in motion in this scene; speeds cannot be measured")
@@ -93,8 +97,8 @@ def settled_starts(scene: Scene, batch: int, *, settling: int = 200, spread: flo
     time = jnp.mod(rows.time_us[lane, -1], period)
     rebound = rows.velocity_after_nm_per_us[lane, -1] - scene.platform.velocity(rows.time_us[lane, -1])
     first, second = evenly_spread(batch).T
-    moved = time + spread * period * (first - 0.5)
-    return Starts(moved, scene.platform.velocity(moved) + rebound * (1.0 + spread * (second - 0.5)))
+    moved = time + _SPREAD * period * (first - 0.5)
+    return Starts(moved, scene.platform.velocity(moved) + rebound * (1.0 + _SPREAD * (second - 0.5)))
 
 
 def scattered_starts(scene: Scene, batch: int) -> Starts:
@@ -228,7 +232,7 @@ def single_contacts(scene: Scene, found: Simulation, count: int) -> SingleContac
     return SingleContacts(State(time - _BEFORE_US, *starts), until, turning | ~straight)
 
 
-def _goes_straight(scene: Scene, time: Array, approach_speed: Array, setting: QuickSetting = _FINE) -> np.ndarray:
+def _goes_straight(scene: Scene, time: Array, approach_speed: Array) -> np.ndarray:
     driven = driven_by(scene.interaction, scene.cantilever, scene.platform)
     place = Place(jnp.full_like(time, driven.forms_nm), -approach_speed, time, jnp.zeros_like(time))
-    return np.asarray(jax.jit(cross, static_argnums=2)(driven, place, setting).holds)
+    return np.asarray(jax.jit(cross, static_argnums=2)(driven, place, _FINE).holds)

@@ -1,19 +1,25 @@
 """General-purpose integrators with events on one collision and one driven contact, phase by phase in time.
 
-SciPy's and SUNDIALS', the baselines of the contact benchmarks.
+SciPy's and SUNDIALS', and Diffrax's own events: the baselines of the contact benchmarks.
 """
 
 import math
 import time
 from collections.abc import Sequence
+from functools import partial
 from itertools import product
 from typing import Any, NamedTuple
 
+import diffrax
 import jax
+import jax.numpy as jnp
 import numpy as np
+import optimistix
+from jax import lax
+from jaxtyping import Array
 
 from afm_jax.apparatus.scene import Scene
-from afm_jax.bench.integrators import Integrator, integrate_to_event, title
+from afm_jax.bench.integrators import EVENT, Integrator, integrate_to_event, title
 from afm_jax.bench.problems import SingleContacts
 from afm_jax.bench.timing import progress
 from afm_jax.contact.contact import Contact
@@ -213,6 +219,108 @@ def scipy_driven_contact(
     raise ValueError(f"the tip that arrives at {arrival_time_us:g} us forms the junction {junctions} times: it is held")
 
 
+def diffrax_driven_contact(
+    scene: Scene, arrival_time_us: float, approach_speed_nm_per_us: float, *, rtol: float
+) -> ScipyContact:
+    """Follow the tip of `scipy_driven_contact` by Dopri8, each phase ended by Diffrax's event; compiling is not timed.
+
+    The rebound speed is NaN where a phase has no end.
+    """
+    numbers = _numbers(scene.interaction)
+    on = float(_root_of_depth((numbers.shift - numbers.snap_on) / numbers.depth))
+    arguments = scene, numbers, on, arrival_time_us, approach_speed_nm_per_us, rtol
+    arguments = jax.tree.map(jnp.asarray, arguments)
+    jax.block_until_ready(_diffrax_contact(*arguments))
+    began = time.perf_counter()
+    found = jax.block_until_ready(_diffrax_contact(*arguments))
+    seconds = time.perf_counter() - began
+    left, rebound, junctions, steps = (part.item() for part in found)
+    return ScipyContact(left, rebound, junctions, seconds, _STAGES * steps)
+
+
+_STAGES = 14
+"""Evaluations of the rates in a step of Dopri8."""
+
+
+@jax.jit
+def _diffrax_contact(
+    scene: Scene, numbers: _ContactNumbers, on: Array, arrival: Array, speed: Array, rtol: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Return departure time, rebound speed, junctions and steps."""
+    cantilever, platform, contact = scene.cantilever, scene.platform, scene.interaction
+
+    def acceleration(now: Array, gap: Array, rate: Array, force: Array) -> Array:
+        height, wall = platform.position_and_velocity(now)
+        free = cantilever.acceleration(gap + height, rate + wall)
+        return force / cantilever.mass_ng + free - platform.acceleration(now)
+
+    def in_bridge(now: Any, state: Any, _: Any) -> Any:
+        gap, rate = state
+        return rate, acceleration(now, gap, rate, contact.forces(jnp.maximum(gap, 0.5 * numbers.snap_on), rate))
+
+    def in_junction(_: Any, state: Any, args: Any) -> Any:
+        del args
+        s, rate, now = state
+        slope = numbers.depth * (4.0 * s**3 - jkr.SLOPE)
+        gap = numbers.shift - numbers.depth * (s**4 - jkr.SLOPE * s)
+        load = numbers.load * s**3 * (s**3 - math.sqrt(6.0))
+        return -rate, slope * acceleration(now, gap, rate, load), slope
+
+    def passing(level: Array) -> Any:
+        def beyond(t: Any, y: Any, args: Any, **extra: Any) -> Any:
+            del t, args, extra
+            return y[0] - level
+
+        return beyond
+
+    def phase(rates: Any, begin: Array, state: tuple[Any, ...], down: Any, up: Any) -> diffrax.Solution:
+        """Follow until the first part of the state falls to a value, or rises to another."""
+        return diffrax.diffeqsolve(
+            diffrax.ODETerm(rates),
+            diffrax.Dopri8(),
+            begin,
+            begin + _LONGEST_US,
+            None,
+            state,
+            stepsize_controller=diffrax.PIDController(rtol=rtol, atol=1e-3 * rtol),
+            event=diffrax.Event(
+                [passing(down), passing(up)],
+                optimistix.Newton(1e-14, 1e-14),
+                direction=[False, True],
+            ),
+            adjoint=diffrax.ForwardMode(),
+            max_steps=None,
+            throw=False,
+        )
+
+    def last(solution: diffrax.Solution) -> tuple[Any, ...]:
+        assert solution.ts is not None  # noqa: S101 (for the type checker: the end is saved)
+        assert solution.ys is not None  # noqa: S101
+        return solution.ts[-1], *(part[-1] for part in solution.ys), solution.stats["num_steps"]
+
+    def round_of(state: tuple[Any, ...]) -> tuple[Any, ...]:
+        now, gap, rate, junctions, steps, _ = state
+        through = phase(in_bridge, now, (gap, rate), numbers.snap_on, numbers.breaks)
+        met: Any = through.event_mask
+        forms, leaves = met
+        now, _, rate, more = last(through)
+
+        def pressed(now: Array, rate: Array) -> tuple[Array, Array, Array]:
+            _, _, rate, now, more = last(phase(in_junction, jnp.zeros_like(now), (on, rate, now), fold, never))
+            return now, rate, more
+
+        now, rate, pressing = lax.cond(forms, pressed, lambda now, rate: (now, rate, jnp.zeros_like(more)), now, rate)
+        rate = jnp.where(forms | leaves, rate, jnp.nan)
+        steps = steps + more + pressing
+        return now, numbers.snap_off, rate, junctions + forms.astype(junctions.dtype), steps, ~forms
+
+    fold, never = jnp.full_like(on, jkr.FOLD), jnp.full_like(on, jnp.inf)
+    none = jnp.zeros((), int)
+    first: tuple[Any, ...] = (arrival, numbers.forms, -speed, none, none, jnp.zeros((), bool))
+    found = lax.while_loop(lambda state: ~state[-1] & (state[3] < _MOST_PHASES), round_of, first)
+    return found[0], jnp.where(found[-1], found[2], jnp.nan), found[3], found[4]
+
+
 def scipy_rows(
     name: str,
     scene: Scene,
@@ -231,7 +339,7 @@ def scipy_rows(
         reference: the contacts, each the first of its tip.
         single: the same contacts, and which of them turn.
         count: how many to follow.
-        methods: see `Integrator`.
+        methods: see `Integrator`, or `EVENT`.
         tolerances: relative ones.
     """
     contacts = reference.contacts
@@ -244,7 +352,8 @@ def scipy_rows(
         progress(f"bench: scenes, {name}, {title(method)} {rtol:g}")
         columns = (contacts.arrival_time_us, contacts.approach_speed_nm_per_us)
         began = [tuple(float(column[tip, 0]) for column in columns) for tip in tips]
-        runs = [scipy_driven_contact(scene, *state, rtol=rtol, method=method) for state in began]
+        follow = diffrax_driven_contact if method == EVENT else partial(scipy_driven_contact, method=method)
+        runs = [follow(scene, *state, rtol=rtol) for state in began]
         expected = [
             np.asarray(column)[tips, 0] for column in (contacts.rebound_speed_nm_per_us, contacts.departure_time_us)
         ]

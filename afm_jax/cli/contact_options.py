@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from afm_jax.cli.values import SceneName, scene_and_start
+from afm_jax.cli.values import SceneName, option_of, scene_and_start
 from afm_jax.contact.parameters import (
     CONTACT_PARAMETERS,
     CONTACT_RANGES,
@@ -57,7 +57,7 @@ def with_contact_options(function: Callable[..., Any]) -> Callable[..., Any]:
     command = mass(command)
     for parameter in CONTACT_PARAMETERS[::-1]:
         text = f"{parameter.meaning}; paper: {parameter.default:g}."
-        command = click.option(_option(parameter.name), type=float, metavar="X", help=text)(command)
+        command = click.option(option_of(parameter.name), type=float, metavar="X", help=text)(command)
     argument = click.argument("scene", metavar="[SCENE.toml|PRESET]", required=False, type=SceneName())
     return argument(command)
 
@@ -76,7 +76,7 @@ def chosen_contact(options: ContactOptions) -> ChosenContact:
         if name in REQUIRED_EFFECTS:
             raise click.UsageError(f"--no-{name} is not possible: {REQUIRED_EFFECTS[name]}")
     for name, value in options.parameters.items():
-        check_parameter(_option(name), value, CONTACT_RANGES[name])
+        check_parameter(option_of(name), value, CONTACT_RANGES[name])
     check_parameter("--mass-ng", options.mass_ng, "positive")
     effects, parameters, mass = EFFECTS, {}, 1.0
     if options.scene is not None:
@@ -85,7 +85,7 @@ def chosen_contact(options: ContactOptions) -> ChosenContact:
     for name in options.parameters:
         missing = idle_without(name, effects)
         if missing:
-            raise click.UsageError(f"{_option(name)} changes nothing without the effect {' or '.join(missing)}")
+            raise click.UsageError(f"{option_of(name)} changes nothing without the effect {' or '.join(missing)}")
     contact = make_contact(effects, {**parameters, **options.parameters})
     mass = mass if options.mass_ng is None else options.mass_ng
     numbers = {name: float(value) for name, value in contact_parameters(contact).items()}
@@ -103,7 +103,3 @@ def _of_scene(path: str) -> tuple[tuple[str, ...], dict[str, float], float]:
         raise ValueError(f'{path}: [interaction] model: must be "contact" here, but is "{model}"')  # noqa: TRY004
     numbers = {name: float(value) for name, value in contact_parameters(scene.interaction).items()}
     return scene.interaction.effects, numbers, float(scene.cantilever.mass_ng)
-
-
-def _option(parameter: str) -> str:
-    return f"--{parameter.replace('_', '-')}"

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from afm_jax.cli.values import ValueAndError, example_path
+from afm_jax.cli.values import ValueAndError, example_path, option_of
 from fitting.parameters import DELAY, LAW, MODELS, NUISANCE_NAMES, NUISANCES, PARAMETERS, model_parameters
 
 if TYPE_CHECKING:
@@ -73,10 +73,10 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
     # click lists options in the order of the decorators, the last one first
     for nuisance in NUISANCES[::-1]:
         what = f"{nuisance.meaning}, such as '{nuisance.example}'{_REMARKS.get(nuisance.name, '')}."
-        command = click.option(_option(nuisance.name), type=ValueAndError(), metavar="X", help=what)(command)
+        command = click.option(option_of(nuisance.name), type=ValueAndError(), metavar="X", help=what)(command)
     for name in _LAW[::-1]:
         what = ", ".join(filter(None, (PARAMETERS[name].meaning, PARAMETERS[name].unit)))
-        command = click.option(_option(name), type=float, metavar="X", help=f"{what}; else the paper's.")(command)
+        command = click.option(option_of(name), type=float, metavar="X", help=f"{what}; else the paper's.")(command)
     value = "--value", "value"
     for decorate in (
         click.option(
@@ -129,7 +129,7 @@ def believed(options: BeliefOptions, noise: float) -> "Belief":
     source = "--fit" if options.measured is None else "--measured"
     for name in options.numbers:
         if options.measured is None or name not in {"free", "fix"}:
-            raise click.UsageError(f"{_option(name)} is what {source} says already; leave one of them out")
+            raise click.UsageError(f"{option_of(name)} is what {source} says already; leave one of them out")
     if options.drive is not None:
         raise click.UsageError(f"--drive is what {source} says already; leave one of them out")
     from fitting.experiments.belief import belief_of_fit, read_belief  # noqa: PLC0415
@@ -165,7 +165,7 @@ def _from_values(options: BeliefOptions) -> "Belief":
     values = {name: value for name, value in numbers.items() if name in _LAW}
     for name in NUISANCE_NAMES:
         if name not in {"quality_factor", "free_frequency_khz"} and name in numbers and numbers[name][1] is None:
-            raise click.UsageError(f"{_option(name)} needs its standard error; write '{PARAMETERS[name].example}'")
+            raise click.UsageError(f"{option_of(name)} needs its standard error; write '{PARAMETERS[name].example}'")
     return believe(
         model,
         free_frequency_khz=numbers["free_frequency_khz"][0],
@@ -183,7 +183,3 @@ def _from_values(options: BeliefOptions) -> "Belief":
 def _names(options: BeliefOptions) -> tuple[str, ...] | None:
     names = options.numbers.get("free")
     return None if names is None else tuple(name.strip().replace("-", "_") for name in names.split(","))
-
-
-def _option(name: str) -> str:
-    return f"--{name.replace('_', '-')}"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from afm_jax.cli.main import NotValid
-from afm_jax.cli.session import Session, prepare_folder, with_session
+from afm_jax.cli.session import Session, prepare_folder, with_session, write_csv
 
 if TYPE_CHECKING:
     from afm_jax.paper.charts import FigureData
@@ -60,12 +60,14 @@ def command(session: Session, *, only: tuple[str, ...], coarse: bool, seed: int)
     folder = session.out or _DEFAULT_FOLDER
     prepare_folder(folder)
     session.start_computing()
-    from afm_jax.cli.figure_files import write_figure  # noqa: PLC0415
+    from afm_jax.plots.paper import draw_figure  # noqa: PLC0415
 
     told = {}
     # each is written before the next is computed: who interrupts keeps what there is
     for number, figure in _computed(session, only, coarse=coarse, seed=seed):
-        files = write_figure(number, figure, folder)
+        files = [f"figure{number}.png", f"figure{number}.csv"]
+        draw_figure(number, figure, folder / files[0])
+        write_csv(folder / files[1], figure.table(), tuple(figure.columns))
         told[number] = _payload(number, figure, files)
         for name in files:
             session.note(f"wrote {folder / name}")

@@ -109,7 +109,7 @@ def command(
     session.write_table("fit_law.csv", *law_rows(laws))
     session.write_table("fit_delay.csv", _delay_rows(delay), DELAY_COLUMNS)
     if session.out is not None:
-        from fitting.report.contact_law_plot import draw_contact_law  # noqa: PLC0415
+        from afm_jax.plots.collisions import draw_contact_law  # noqa: PLC0415
 
         write_json(session.out / "fit_law.json", payload)
         draw_contact_law(laws, delay, session.out / "fit_law.png")

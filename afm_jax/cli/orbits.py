@@ -276,6 +276,8 @@ def why_none(scene: "Scene", order: int, *, rejected: int, impacts: int = 1) -> 
         rejected: how many orbits would close if the tip could pass through the platform.
         impacts: m, impacts in an orbit.
     """
+    if float(getattr(scene.interaction, "r", 1.0)) == 0.0:
+        return "with r = 0 every impact is a capture: no orbit leaves the sample; `afm-jax simulate` follows the tip"
     if impacts > 1:
         return (
             f"the search found no orbit of {impacts} impacts in {order} drive periods; `afm-jax orbits --order` and "

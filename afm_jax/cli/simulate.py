@@ -14,7 +14,7 @@ METHODS = ("collocation", "diffrax")
 
 if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
-    from afm_jax.motion.settle import LongRun
+    from afm_jax.motion.follow import LongRun
     from afm_jax.motion.trajectory import DensePath
     from afm_jax.scenefile.scenefile import Start
 
@@ -186,7 +186,7 @@ def _follow(
     settings: dict[str, Any],
 ) -> "LongRun":
     """Return the simulation; progress of long runs goes to standard error."""
-    from afm_jax.motion.settle import follow_long  # noqa: PLC0415
+    from afm_jax.motion.follow import follow_long  # noqa: PLC0415
     from afm_jax.motion.start import start_of  # noqa: PLC0415
 
     start = start_of(scene, told)

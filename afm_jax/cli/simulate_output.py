@@ -9,9 +9,10 @@ import numpy as np
 from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.cli.session import Session, write_json
 from afm_jax.contact.junction import Phase
-from afm_jax.motion.observe import Harmonic, Observables
+from afm_jax.motion.follow import LongRun
+from afm_jax.motion.observe import NEEDS_A_RESPONSE, TOO_SHORT, Harmonic, Observables
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation
-from afm_jax.motion.settle import LongRun, Window
+from afm_jax.motion.settle import Window
 from afm_jax.motion.trajectory import DensePath, dense_path
 from afm_jax.scenefile.scenefile import scene_tables
 from afm_jax.units import RAD_PER_US_PER_KHZ
@@ -73,7 +74,7 @@ def payload_of(scene: Scene, run: LongRun, seen: Observables, settings: Mapping[
         "deflection_lockin_phase_deg": seen.deflection_lockin_phase_deg,
         "deflection_harmonics": _as_dicts(seen.deflection_harmonics),
         "window": {**seen.window._asdict(), "contacts": seen.contacts},
-        "null_reasons": _reasons(scene, seen, verdict.stuck),
+        "null_reasons": _reasons(scene, seen, verdict.stuck) | _too_short(seen),
         "start": {name: float(value) for name, value in simulation.start._asdict().items()},
         "final": {
             **{name: float(value) for name, value in final._asdict().items()},
@@ -110,6 +111,18 @@ def _reasons(scene: Scene, seen: Observables, stuck: bool) -> dict[str, str]:  #
     if seen.phase_lag_deg is None:
         reasons["phase_lag_deg"] = "no base and no force drives the tip"
     return reasons
+
+
+def _too_short(seen: Observables) -> dict[str, str]:
+    """Return for every key that is null for want of a whole response period that this is so."""
+    if seen.window.responses:
+        return {}
+    names = [
+        name.replace("harmonics", f"lockin_{what}")
+        for name in NEEDS_A_RESPONSE
+        for what in ("amplitude_nm", "phase_deg")
+    ]
+    return {name: TOO_SHORT for name in names if getattr(seen, name) is not None}
 
 
 def _over_a_response(payload: Mapping[str, Any]) -> list[str]:
@@ -151,15 +164,16 @@ def text_of(payload: Mapping[str, Any]) -> list[str]:
         f"{payload['impacts']} contact{plural} from {payload['start']['time_us']:.6g} to {final['time_us']:.6g} us.",
         f"{head}: {payload['settled_reason']}.",
     ]
+    mean = f"mean height {payload['mean_height_nm']:.6g} nm, " if window["responses"] else ""
     lines.append(
-        f"Peak amplitude {payload['peak_amplitude_nm']:.6g} nm, mean height {payload['mean_height_nm']:.6g} nm, "
+        f"Peak amplitude {payload['peak_amplitude_nm']:.6g} nm, {mean}"
         f"from {window['from_us']:.6g} to {window['to_us']:.6g} us."
     )
     if window["responses"]:
         lines += _over_a_response(payload)
     else:
         lines.append(
-            "Less than a response period: amplitude and phase at its frequency, and energies, would be of a part; "
+            "Less than a response period: means, energies, amplitude and phase at its frequency would be of a part; "
             "follow the motion longer."
         )
     lines.append(

@@ -20,6 +20,11 @@ if TYPE_CHECKING:
 _MOST = 1_000_000
 
 
+def option_of(parameter: str) -> str:
+    """Return the option of a parameter: of tip_radius_nm, --tip-radius-nm."""
+    return f"--{parameter.replace('_', '-')}"
+
+
 class Numbers(click.ParamType):
     """A comma list of numbers; each part a number or a range start:stop:step that holds the stop if it fits."""
 

@@ -23,9 +23,8 @@ from afm_jax.dynamics.bands import UncertainParameters
 from afm_jax.dynamics.contact_orbits import single_contact_orbits
 from afm_jax.dynamics.iteration import Report, SampleDriven, for_few, in_blocks, sample_driven
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem
-from afm_jax.impact.lasting_impact import LawImpact
 from afm_jax.impact.law import impact_law_of
-from afm_jax.impact.orbits import orbit_at
+from afm_jax.impact.orbits import orbit_at, orbit_problem
 from afm_jax.impact.roots import find_roots
 from afm_jax.results import Result, public_result
 from afm_jax.scenefile.parameter_paths import scene_family
@@ -124,7 +123,7 @@ def highest_orbits(
     """
 
     def problem_of(scene: Scene, own: FreeFrame, order: Array) -> OrbitProblem:
-        return OrbitProblem(scene.cantilever, own.platform, LawImpact(impact_law_of(scene)), order)
+        return orbit_problem(scene.cantilever, own.platform, impact_law_of(scene), order)
 
     def of_order(order: Array) -> dict[str, Array]:
         def orbit_of(place: OrbitPlace, row: Array) -> tuple[Array, Array, Array]:
@@ -143,8 +142,9 @@ def highest_orbits(
         places = jax.tree.map(lambda part: part.ravel(), roots.place)
         rows = jnp.arange(count * slots) // slots
         nothing = (jnp.zeros(count * slots, bool),) * 2 + (jnp.full((count * slots, len(ORBIT_NUMBERS)), jnp.nan),)
+        there = frame.periodic & (impact_law_of(scenes).r > 0.0)
         few = max(count // _ORBITS_AT_ONCE, 1)
-        known = for_few(orbit_of, roots.found.ravel() & jnp.repeat(frame.periodic, slots), (places, rows), nothing, few)
+        known = for_few(orbit_of, roots.found.ravel() & jnp.repeat(there, slots), (places, rows), nothing, few)
         admissible, steady, numbers = (part.reshape(count, slots, *part.shape[1:]) for part in known)
         highest = jnp.argmax(jnp.where(steady, numbers[..., 0], -jnp.inf), axis=1)
         chosen = jnp.take_along_axis(numbers, highest[:, None, None], axis=1)[:, 0]

@@ -128,6 +128,10 @@ def _check(scene: Scene, order: int, impacts: int, ranges: Sequence[ParameterRan
         raise ValueError("`impacts` must be 1 or more in a scene with a contact, but is 0")
     check_ranges(scene, *ranges)
     for given in ranges:
+        if impacts and given.path == "interaction.r" and given.low == 0.0:
+            raise ValueError(
+                f"{given}: at r = 0 every impact is a capture and no orbit leaves; begin the range above 0"
+            )
         for end in (given.low, given.high):
             driven_part(scene_family(scene, given.path)(end))
 

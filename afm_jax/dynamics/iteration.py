@@ -255,7 +255,7 @@ def leaving_tips(scenes: Scene) -> Tips:
         slowest, gap = jax.vmap(capture_speed)(interaction, scenes.cantilever.mass_ng), interaction.bridge_breaks_nm
     else:
         slowest, gap = impact_law_of(scenes).capture_speed_nm_per_us, jnp.zeros_like(time)
-    rebound = jnp.maximum(platform.top_speed_nm_per_us, 2.0 * slowest)
+    rebound = jnp.maximum(platform.top_speed_nm_per_us, jnp.where(jnp.isfinite(slowest), 2.0 * slowest, 0.0))
     return tips_at(scenes, time, platform.velocity(time) + rebound)._replace(gap_nm=gap)
 
 

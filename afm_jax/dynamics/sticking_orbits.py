@@ -31,6 +31,8 @@ from afm_jax.units import within_turn
 
 _MOST_RESTS = 32
 _FLIGHTS = 64
+_LONGEST = 64
+"""Drive periods after which a flight that has not come to rest counts as one that never does."""
 _NARROWED = 1e-10
 """Of the range."""
 _SHORT_REST = 0.05
@@ -59,12 +61,11 @@ class StickingOrbit(NamedTuple):
     peak_amplitude_nm: float
 
 
-def sticking_orbit(scene: Scene, *, longest: int = 64) -> StickingOrbit | str:
+def sticking_orbit(scene: Scene) -> StickingOrbit | str:
     """Return the orbit with a rest that a tip at rest ends up on, or a sentence on why there is none.
 
     Args:
         scene: one scene with an `ImpactLaw`, driven with one period.
-        longest: drive periods after which a flight that has not come to rest counts as one that never does.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
@@ -85,18 +86,18 @@ def sticking_orbit(scene: Scene, *, longest: int = 64) -> StickingOrbit | str:
     release = float(first_release(bed, times[int(np.argmax(push))], times[-1] + 2.0 * period).time_us)
     first, resting, impacts, peak = release, 0.0, 0, -np.inf
     for rests in range(1, _MOST_RESTS + 1):
-        until = jnp.asarray(release + longest * period)
+        until = jnp.asarray(release + _LONGEST * period)
         leg = take_off(bed, jnp.asarray(release), until)
         gap_rate = leg[2] - surface.velocity(leg[0])
         start = to_lab(surface, response, leg[0], leg[1], gap_rate)
-        rows = simulate(scene, start, longest * period).contacts
+        rows = simulate(scene, start, _LONGEST * period).contacts
         kind, arrival, rebound = (
             np.asarray(p) for p in (rows.kind, rows.arrival_time_us, rows.rebound_speed_nm_per_us)
         )
         departed = rows.departure_time_us, rows.departure_position_nm, rows.departure_velocity_nm_per_us
         rested = np.flatnonzero((kind == ContactKind.CHATTER) | ((kind == ContactKind.IMPACT) & (rebound == 0.0)))
         if not rested.size:
-            return f"a tip that is let go does not come to rest again within {longest} drive periods"
+            return f"a tip that is let go does not come to rest again within {_LONGEST} drive periods"
         row = int(rested[0])
         again = float(departed[0][row])
         impacts += row

@@ -18,20 +18,11 @@ from jax.stages import Compiled
 from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.checks import require_float64
 from afm_jax.effects.scene_effects import Scaled, SceneEffect, effects_in
+from afm_jax.motion.follow import Piece, follow_in_pieces, joined, joined_motions, place_after, why_over
 from afm_jax.motion.observe import Reading, read_window
+from afm_jax.motion.periodic import Orbit, follow_to_orbit, why_impossible
 from afm_jax.motion.record import Simulation, State
-from afm_jax.motion.settle import (
-    Orbit,
-    Piece,
-    follow_in_pieces,
-    follow_to_orbit,
-    joined,
-    joined_motions,
-    last_fifth,
-    place_after,
-    why_impossible,
-    why_over,
-)
+from afm_jax.motion.settle import last_fifth
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start
 from afm_jax.motion.trajectory import dense_path

@@ -80,7 +80,7 @@ class ImpactLaw(eqx.Module):
     while the impact lasts (`afm_jax.impact.lasting_impact`).
 
     Args:
-        r: coefficient of restitution, in (0, 1].
+        r: coefficient of restitution, in [0, 1]; at 0 every impact is a capture.
         epsilon: loss by adhesion, 2 delta/m in nm^2/us^2 (= uJ/kg), not negative.
         viscous_loss: loss linear in speed, in nm/us, not negative.
         delay: a `CollisionDelay`, or None for instantaneous impacts.
@@ -102,7 +102,7 @@ class ImpactLaw(eqx.Module):
     __repr__ = readable
 
     def __check_init__(self):
-        check_parameter("r", self.r, "in (0, 1]")
+        check_parameter("r", self.r, "in [0, 1]")
         check_parameter("epsilon", self.epsilon, "not negative")
         check_parameter("viscous_loss", self.viscous_loss, "not negative")
 
@@ -117,7 +117,7 @@ class ImpactLaw(eqx.Module):
 
     @property
     def capture_speed_nm_per_us(self) -> Float[Array, "..."]:
-        """Approach speed up to which the tip is captured: (c + sqrt(c^2 + 4 r^2 epsilon)) / 2 r^2."""
+        """Approach speed up to which the tip is captured: (c + sqrt(c^2 + 4 r^2 epsilon)) / 2 r^2, or infinite."""
         return self.approach_speed(jnp.zeros_like(self.r))
 
     def rebound_speed(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
@@ -134,14 +134,15 @@ class ImpactLaw(eqx.Module):
         return jnp.where(free, (2.0 * self.r**2 * u - self.viscous_loss) / (2.0 * jnp.where(free, rebound, 1.0)), 0.0)
 
     def approach_speed(self, rebound_speed: ArrayLike) -> Float[Array, "..."]:
-        """Return the u_in in nm/us that leaves at u_out: the law read backwards."""
+        """Return the u_in in nm/us that leaves at u_out: the law read backwards; infinite at r = 0."""
         w = as_argument(rebound_speed)
         square = w * w + self.epsilon
         # double where: the root's slope is infinite at c = epsilon = w = 0, where the answer is 0 all the same
         discriminant = self.viscous_loss**2 + 4.0 * self.r**2 * square
         positive = discriminant > 0.0
         root = jnp.where(positive, jnp.sqrt(jnp.where(positive, discriminant, 1.0)), 0.0)
-        return (self.viscous_loss + root) / (2.0 * self.r**2)
+        leaves = self.r > 0.0
+        return jnp.where(leaves, (self.viscous_loss + root) / (2.0 * jnp.where(leaves, self.r, 1.0) ** 2), jnp.inf)
 
     def energy_lost(self, approach_speed: ArrayLike, mass_ng: ArrayLike = 1.0) -> Float[Array, "..."]:
         """Return the energy an impact takes in aJ, m (u_in^2 - u_out^2)/2; all of it where the tip is captured."""

@@ -31,7 +31,7 @@ from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.impact.implicit import implicit_pair, implicit_root
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
 from afm_jax.impact.lasting_impact import Impact, LawImpact, crawls, indentation, middle_of_contact
-from afm_jax.impact.law import Speeds, impact_law_of
+from afm_jax.impact.law import ImpactLaw, Speeds, impact_law_of
 from afm_jax.impact.roots import COARSE, find_roots
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, public_result
@@ -108,7 +108,8 @@ def single_impact_orbits(scene: Scene, order: ArrayLike) -> SingleImpactOrbits:
 
     Returns:
         The orbits in a fixed number of slots with a mask, differentiable in the scene's parameters. Without a delay
-        they are all roots of a quartic; with one, all that a scan of 8192 speeds brackets, close pairs included.
+        they are all roots of a quartic; with one, all that a scan of 8192 speeds brackets, close pairs included. With
+        r = 0 there are none: every impact is a capture, `simulate` follows what becomes of the tip.
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
@@ -138,10 +139,18 @@ def _check_order(order: ArrayLike) -> None:
 
 @jax.jit
 def _single_impact_orbits(scene: Scene, frame: FreeFrame, order: Float[Array, ""]) -> SingleImpactOrbits:
-    problem = OrbitProblem(scene.cantilever, frame.platform, LawImpact(impact_law_of(scene)), order)
+    law = impact_law_of(scene)
+    problem = orbit_problem(scene.cantilever, frame.platform, law, order)
     roots = find_roots(problem)
-    orbits = jax.vmap(orbit_at, in_axes=(0, 0, None, None))(roots.place, roots.found & frame.periodic, frame, problem)
+    found = roots.found & frame.periodic & (law.r > 0.0)
+    orbits = jax.vmap(orbit_at, in_axes=(0, 0, None, None))(roots.place, found, frame, problem)
     return eqx.tree_at(lambda result: result.complete, orbits, roots.complete)
+
+
+def orbit_problem(cantilever: Cantilever, platform: Platform, law: ImpactLaw, order: Float[Array, ""]) -> OrbitProblem:
+    """Return what orbits are of; for a law with r = 0, which captures every tip and has none, one with r = 1."""
+    leaving = eqx.tree_at(lambda law: law.r, law, jnp.where(law.r > 0.0, law.r, 1.0))
+    return OrbitProblem(cantilever, platform, LawImpact(leaving), order)
 
 
 def orbit_at(place: OrbitPlace, found: Bool[Array, ""], frame: FreeFrame, problem: OrbitProblem) -> SingleImpactOrbits:

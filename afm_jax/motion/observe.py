@@ -3,7 +3,7 @@
 One way of reading for all: sums over the nodes of a dense path, whose contacts are integrated once more or, where that
 would cost more than it tells, straight between the points that the simulation keeps (`dense_path`).
 
-What impacts of a law add to a lock-in beyond flights and rests on the surface: the same as in `orbit_amplitude`.
+What impacts of a law add to a lock-in beyond flights and rests on the surface: as in `impact/amplitude.py`.
 
 In an impact that lasts the tip is below the surface by the indentation of a Hertz contact. A negative collision delay
 lets a flight begin before the last one has ended: until then both are there, and the surface once too often.
@@ -12,7 +12,7 @@ lets a flight begin before the last one has ended: until then both are there, an
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -96,8 +96,31 @@ class Harmonic(NamedTuple):
     """In [0, 360/N'): which of the N' = N/gcd(k, N) equivalent periods is locked is unknown."""
 
 
+NEEDS_A_RESPONSE = (
+    "harmonics",
+    "mean_height_nm",
+    "time_in_contact_us",
+    "contact_share",
+    "dissipated_in_contact_aj",
+    "dissipated_per_contact_aj",
+    "dissipated_in_air_aj",
+    "given_by_drives_aj",
+    "stored_aj",
+    "virial_aj",
+    "deflection_harmonics",
+    "mean_deflection_nm",
+    "phase_lag_deg",
+)
+"""Observables that a part of a response period cannot tell."""
+TOO_SHORT = "the window is shorter than a response period: follow the motion longer"
+
+
 class Observables(NamedTuple):
-    """What is read of a motion over a window; None where a quantity does not exist for the scene."""
+    """What is read of a motion over a window; None where a quantity does not exist for the scene.
+
+    Of a window shorter than a response period (`window.responses` is 0) all but the largest heights and forces is NaN:
+    see `NEEDS_A_RESPONSE`.
+    """
 
     settled: Settled
     window: Window
@@ -160,7 +183,6 @@ def observe(
     simulation: Simulation,
     *,
     harmonics: Sequence[int] = (1,),
-    drive: DrivePeriod | None = None,
     verdict: Settled | None = None,
     dense: DensePath | None = None,
 ) -> Observables:
@@ -174,7 +196,6 @@ def observe(
         scene: the scene that was simulated.
         simulation: of one scene, not of a batch.
         harmonics: multiples k of the response frequency, positive integers.
-        drive: whose periods count; the scene's if None.
         verdict: what `settled` said, if it is known already.
         dense: the tip over the window and whatever else is looked at, if that is known already.
 
@@ -185,9 +206,9 @@ def observe(
     """
     if not harmonics or any(k != int(k) or k < 1 for k in harmonics):
         raise ValueError(f"`harmonics` must be positive integers, but are {tuple(harmonics)}")
-    drive = drive_of(scene) if drive is None else drive
+    drive = drive_of(scene)
     verdict = settled(scene, simulation) if verdict is None else verdict
-    window = window_of(scene, simulation, verdict, drive)
+    window = window_of(scene, simulation, verdict)
     begin, end = window.from_us, window.to_us
     dense = dense_path(scene, simulation, begin, end) if dense is None else dense
     times, weights = dense.nodes(begin, end)
@@ -204,7 +225,7 @@ def observe(
     of_deflection = None
     if deflection is not None:
         of_deflection = _harmonics(dense, deflection, times, weights, window, drive, harmonics)
-    return Observables(
+    seen = Observables(
         settled=verdict,
         window=window,
         peak_amplitude_nm=_peak_height(dense, path, begin, end),
@@ -229,6 +250,18 @@ def observe(
         else _integral(dense, deflection, times, weights, (begin, end), 0.0).real / span,
         phase_lag_deg=_lag(scene, (of_deflection or of_height)[0], window),
     )
+    return seen if window.responses else _of_a_part(seen)
+
+
+def _of_a_part(seen: Observables) -> Observables:
+    """Return readings with NaN for what needs a whole response period."""
+
+    def unknown(value: Any) -> Any:
+        if isinstance(value, tuple):
+            return tuple(Harmonic(one.multiple, math.nan, math.nan) for one in value)
+        return None if value is None else math.nan
+
+    return seen._replace(**{name: unknown(getattr(seen, name)) for name in NEEDS_A_RESPONSE})
 
 
 def _lag(scene: Scene, harmonic: Harmonic, window: Window) -> float | None:

@@ -8,8 +8,9 @@ The verdicts come from eq. 9 and the linearised map; the iteration knows neither
 tip back, an unstable one must let it go, and where there is no stable orbit no start may settle on one.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -20,6 +21,8 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.dynamics.charts import (
+    AMPLITUDE_COLUMNS,
+    TABLE_COLUMNS,
     OffsetAmplitudes,
     OrbitVerdicts,
     StabilityChart,
@@ -45,6 +48,31 @@ class Statement:
     statement: str
     holds: bool
     numbers: dict[str, object]
+
+
+@dataclass(frozen=True)
+class PaperFigure:
+    """One figure of the paper.
+
+    Attributes:
+        columns: the table, by column name; of equal lengths.
+        numbers: key numbers of the figure.
+        statements: what the paper says of it, checked.
+    """
+
+    columns: Mapping[str, Float[np.ndarray, " rows"]]
+    numbers: dict[str, Any]
+    statements: list[Statement]
+
+    @property
+    def valid(self) -> bool:
+        """Whether every statement holds."""
+        return all(statement.holds for statement in self.statements)
+
+    def table(self) -> list[dict[str, float]]:
+        """Return the rows of the table."""
+        names = list(self.columns)
+        return [dict(zip(names, row, strict=True)) for row in zip(*self.columns.values(), strict=True)]
 
 
 def complete_orders(chart: StabilityChart) -> list[int]:
@@ -341,6 +369,15 @@ class FigureData:
     def valid(self) -> bool:
         """Whether every statement holds and every spot check agreed."""
         return all(statement.holds for statement in self.statements) and not self.spot_checks.failures
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """Names of the table's columns."""
+        return AMPLITUDE_COLUMNS if isinstance(self.data, OffsetAmplitudes) else TABLE_COLUMNS
+
+    def table(self) -> list[dict[str, object]]:
+        """Return the rows of the table."""
+        return self.data.table()
 
 
 def chart_grid(*, coarse: bool) -> tuple[Float[np.ndarray, " columns"], Float[np.ndarray, " rows"]]:

@@ -4,7 +4,7 @@ What the paper says of figures 4 to 7, as numbers worked out from the computed d
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,7 +19,7 @@ from afm_jax.contact.junction import Junction, find_junction
 from afm_jax.contact.law_of_contact import closest_law
 from afm_jax.contact.time_course import TimeCourse, time_course
 from afm_jax.impact.law import ImpactLaw
-from afm_jax.paper.charts import Statement
+from afm_jax.paper.charts import PaperFigure, Statement
 
 PAPER = {
     "forms_gap_nm": 0.124,
@@ -190,30 +190,10 @@ Columns = dict[str, Float[np.ndarray, " points"]]
 
 
 @dataclass(frozen=True)
-class ContactFigure:
-    """One figure: columns of equal length, key numbers, statements.
+class ContactFigure(PaperFigure):
+    """Figure 4, 5, 6 or 7; ``course``: the time course of figure 7."""
 
-    Attributes:
-        columns: the table, by column name.
-        numbers: key numbers of the figure.
-        statements: what the paper says of it, checked.
-        course: the time course, for figure 7.
-    """
-
-    columns: Columns
-    numbers: dict[str, Any]
-    statements: list[Statement]
-    course: TimeCourse | None = field(default=None)
-
-    @property
-    def valid(self) -> bool:
-        """Whether every statement holds."""
-        return all(statement.holds for statement in self.statements)
-
-    def table(self) -> list[dict[str, float]]:
-        """Return the rows of the table."""
-        names = list(self.columns)
-        return [dict(zip(names, row, strict=True)) for row in zip(*self.columns.values(), strict=True)]
+    course: TimeCourse | None = None
 
 
 def figure4() -> ContactFigure:

@@ -7,7 +7,7 @@ Figure 8: the Poincare section of several starts, told apart into what is broadb
 What the paper says of figures 8, 10 and 11, as numbers worked out from the computed motions.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -20,12 +20,12 @@ from jaxtyping import Float
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.impact.orbits import single_impact_orbits
+from afm_jax.motion.follow import follow_long
 from afm_jax.motion.observe import Departures, departures
 from afm_jax.motion.record import ContactKind, Simulation, State
-from afm_jax.motion.settle import follow_long
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start, start_of
-from afm_jax.paper.charts import Statement
+from afm_jax.paper.charts import PaperFigure, Statement
 from afm_jax.scenefile import presets
 
 CONTACTS_OF_A_PIECE = 400
@@ -171,14 +171,11 @@ class Growth(NamedTuple):
     """Of the last one: from the scatter of blocks of contacts."""
 
 
-def survey(
-    velocities: tuple[float, ...], *, until_us: float = _UNTIL_US, report: Report = lambda _: None
-) -> list[RampCourse]:
+def survey(velocities: tuple[float, ...], *, report: Report = lambda _: None) -> list[RampCourse]:
     """Follow figure 8's scene from several starts, each until it locks.
 
     Args:
         velocities: of the starts, in nm/us, all at drive phase 270 degrees and 5 nm above the platform.
-        until_us: longest time to follow one.
         report: told how far it is.
     """
     scene = presets.figure8_scene()
@@ -189,10 +186,10 @@ def survey(
         run = follow_long(
             scene,
             start,
-            until_us - float(start.time_us),
+            _UNTIL_US - float(start.time_us),
             enough=lambda motion: _has_come_to_rest(motion, period),
             piece_contacts=CONTACTS_OF_A_PIECE,
-            report=told_of_progress(report, f"from {velocity:g} nm/us", until_us),
+            report=told_of_progress(report, f"from {velocity:g} nm/us", _UNTIL_US),
         )
         motion = departures(scene, run.simulation)
         courses.append(RampCourse(velocity, motion, *locked_from(motion.departure_time_us, period)))
@@ -435,34 +432,18 @@ _RISE_RAMPS = ((1e-2, 2.0), (1e-3, 2.0))
 
 
 @dataclass(frozen=True)
-class MotionFigure:
-    """One figure.
+class MotionFigure(PaperFigure):
+    """Figure 8, 10 or 11, a row for every contact.
 
     Attributes:
-        columns: the table, by column name, a row for every contact.
-        numbers: key numbers.
-        statements: what the paper says of it, checked.
         courses: the motions of figure 8.
         growth: of small distances in figure 8.
         ramps: the motions of figures 10 and 11.
     """
 
-    columns: Mapping[str, Float[np.ndarray, " contacts"]]
-    numbers: dict[str, Any]
-    statements: list[Statement]
     courses: tuple[RampCourse, ...] = ()
     growth: Growth | None = None
     ramps: tuple[Ramp, ...] = ()
-
-    @property
-    def valid(self) -> bool:
-        """Whether every statement holds."""
-        return all(statement.holds for statement in self.statements)
-
-    def table(self) -> list[dict[str, float]]:
-        """Return the rows of the table."""
-        names = list(self.columns)
-        return [dict(zip(names, row, strict=True)) for row in zip(*self.columns.values(), strict=True)]
 
 
 def figure8(*, coarse: bool = False, report: Report = lambda _: None) -> MotionFigure:

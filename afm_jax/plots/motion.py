@@ -109,7 +109,7 @@ def _responses_shown(scene: Scene, simulation: Simulation, verdict: Settled, to_
     response = (verdict.periods or 1) * drive.period_us if repeats else drive.period_us
     first, last = float(simulation.start.time_us), float(simulation.final.time_us)
     if repeats:
-        last = window_of(scene, simulation, verdict, drive).to_us
+        last = window_of(scene, simulation, verdict).to_us
     elif verdict.stuck:
         last = to_us
     # only what has settled repeats: the last fifth at most

@@ -1,8 +1,7 @@
-"""Pictures of the contact's forces, figures 4 and 5, the paper's numbers marked; 6 and 7 are in `impact_figures`.
+"""Pictures of the paper's figures, its numbers marked.
 
-Pictures of what an impact does, figures 6 and 7: the impact law of the contact, and one impact in time.
-
-Pictures of figures 8, 10 and 11: the Poincare section, and motions under a slowly rising offset.
+2, 3 and 9: where orbits are stable, and their amplitudes. 4 and 5: the contact's forces. 6 and 7: its impact law, and
+one impact in time. 8, 10 and 11: the Poincare section, and motions under a slowly rising offset.
 """
 
 from pathlib import Path
@@ -12,12 +11,48 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from afm_jax.contact.junction import Phase
+from afm_jax.dynamics.charts import OffsetAmplitudes
+from afm_jax.paper.charts import FigureData, adhesion_limit_nm
 from afm_jax.paper.contact_figures import FIT_RANGE, PAPER, SMALL_GAP_NM, ContactFigure
 from afm_jax.paper.motion_figures import SECTION_POINTS, SHOWN, MotionFigure, Ramp, RampCourse
+from afm_jax.plots.charts import draw_offset_amplitudes, draw_stability_chart
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save, with_zero_line
+from afm_jax.scenefile import presets
 
 
-def draw_law(figure: ContactFigure, path: Path) -> None:
+def draw_figure(number: str, figure: FigureData | ContactFigure | MotionFigure, path: Path) -> None:
+    """Draw a figure of the paper as a PNG file."""
+    if isinstance(figure, ContactFigure):
+        {"4": _forces, "5": _hysteresis, "6": _law, "7": _course}[number](figure, path)
+    elif isinstance(figure, MotionFigure) and number == "8":
+        _section(figure, path)
+    elif isinstance(figure, MotionFigure):
+        _ramps(number, figure, path)
+    elif isinstance(figure.data, OffsetAmplitudes):
+        draw_offset_amplitudes(figure.data, path, title=_AMPLITUDE_TITLE)
+    else:
+        draw_stability_chart(
+            figure.data,
+            path,
+            title=_CHART_TITLES[number],
+            compared_with=figure.compared_with,
+            limit_nm=adhesion_limit_nm(figure.data.x_values) if number == "3" else None,
+        )
+
+
+_CHART_CONDITIONS = rf"$r$ = {presets.STABILITY_R:g}, $\sigma = {presets.STABILITY_OFFSET_NM:g}$ nm"
+_CHART_TITLES = {
+    "2": rf"Stable single-impact orbits (light), {_CHART_CONDITIONS}, $\epsilon$ = 0",
+    "3": rf"Stable single-impact orbits with adhesion (light), {_CHART_CONDITIONS}, "
+    rf"$\epsilon$ = {presets.ADHESION:g} $\mu$J/kg",
+}
+_AMPLITUDE_TITLE = (
+    r"Amplitude of the stable (1,1) orbit, "
+    rf"$\beta$ = {presets.OFFSET_SWEEP_AMPLITUDE_NM:g} nm, $\epsilon$ = {presets.ADHESION:g} $\mu$J/kg"
+)
+
+
+def _law(figure: ContactFigure, path: Path) -> None:
     """Draw figure 6 as a PNG file: the impact law with its fit above, the residuals of two fits below."""
     picture = new_figure(7.5, 7.0)
     axes, below = picture.subplots(2, 1, sharex=True, height_ratios=[2.0, 1.0])
@@ -88,7 +123,7 @@ def _residuals(axes: Axes, figure: ContactFigure) -> None:
     axes.legend(loc="lower right", fontsize=10, framealpha=1.0)
 
 
-def draw_course(figure: ContactFigure, path: Path) -> None:
+def _course(figure: ContactFigure, path: Path) -> None:
     """Draw figure 7 as a PNG file: the distance against time beside that of an instantaneous impact."""
     picture = new_figure(8.0, 5.8)
     axes = picture.subplots()
@@ -141,11 +176,6 @@ def _times(axes: Axes, figure: ContactFigure) -> None:
 
 
 _LEADER = {"arrowstyle": "-", "color": DARK, "linewidth": 0.8}
-
-
-def draw_contact_figure(number: str, figure: ContactFigure, path: Path) -> None:
-    """Draw figure 4, 5, 6 or 7 as a PNG file."""
-    {"4": _forces, "5": _hysteresis, "6": draw_law, "7": draw_course}[number](figure, path)
 
 
 def _forces(figure: ContactFigure, path: Path) -> None:
@@ -248,14 +278,6 @@ def _snap_on(axes: Axes, figure: ContactFigure) -> None:
 
 
 _COLOURS = dict(zip(SHOWN, (BLUE, ACCENT, "black"), strict=True))
-
-
-def draw_motion_figure(number: str, figure: MotionFigure, path: Path) -> None:
-    """Draw figure 8, 10 or 11 as a PNG file."""
-    if number == "8":
-        _section(figure, path)
-    else:
-        _ramps(number, figure, path)
 
 
 def _section(figure: MotionFigure, path: Path) -> None:

@@ -23,9 +23,9 @@ from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.dynamics.iteration import LANES, sample_driven
 from afm_jax.dynamics.verdicts import MotionKind
 from afm_jax.impact.law import impact_law_of
-from afm_jax.motion.observe import observe
+from afm_jax.motion.follow import follow_long
+from afm_jax.motion.observe import TOO_SHORT, observe
 from afm_jax.motion.record import MotionOutcome
-from afm_jax.motion.settle import follow_long
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.motion.start import start_of
 from afm_jax.outcomes import CollisionOutcome
@@ -344,6 +344,7 @@ def _seen(scene: Scene, periods: float, accuracy: float, start: Start | None) ->
         return nothing | told | {MESSAGE.name: outcome.sentence}
     seen = observe(scene, found, verdict=verdict)
     values = {name: getattr(seen, name) for name in _OBSERVED}
+    told |= {} if seen.window.responses else {MESSAGE.name: TOO_SHORT}
     return nothing | {name: value for name, value in values.items() if value is not None} | told
 
 

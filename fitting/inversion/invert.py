@@ -54,8 +54,8 @@ def invert(
     """Return approach speed, rebound speed and collision delay of every row with a phase, and the laws they follow.
 
     A row's amplitude and phase fix the flight between two impacts; no impact law is assumed. What the platform's
-    motion and the air do during the contact is taken back by parameter-free corrections (see `inversion_flight`), so
-    that the speeds are those of a free tip on a sample at rest. Rows on resonance are also read as the paper proposes.
+    motion and the air do during the contact is taken back by parameter-free corrections (`inversion.flight`), so that
+    the speeds are those of a free tip on a sample at rest. Rows on resonance are also read as the paper proposes.
 
     Args:
         table: from `read_table`; a table without phases must have rows on resonance.

@@ -21,9 +21,11 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
+from afm_jax.motion.follow import place_after, where_to_go_on
 from afm_jax.motion.observe import observe
+from afm_jax.motion.periodic import close_periods, ends_in_flight
 from afm_jax.motion.record import MotionOutcome, Simulation, State
-from afm_jax.motion.settle import close_periods, ends_in_flight, place_after, settled, where_to_go_on
+from afm_jax.motion.settle import settled
 from afm_jax.motion.simulate import DEFAULT_ACCURACY, simulate
 from afm_jax.results import Result, ResultTuple, public_result
 from fitting.tables.table import DRIVES, AmplitudeTable

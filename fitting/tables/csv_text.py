@@ -554,13 +554,16 @@ def _has_unit(name: str) -> bool:
     return name.rpartition("_")[2] in {"khz", "nm", "deg", "ng"}
 
 
-def nearest_name(text: str, known: Iterable[str], *, cutoff: float = 0.75) -> str | None:
+_SIMILAR = 0.75
+"""Similarity (0 to 1, as difflib counts it) that a misspelling must reach."""
+
+
+def nearest_name(text: str, known: Iterable[str]) -> str | None:
     """Return the known name that a misspelt one or one with another unit was meant to be, or None.
 
     Args:
         text: the name as it stands in the file.
         known: the right names; their unit is the last word.
-        cutoff: similarity (0 to 1, as difflib counts it) that a misspelling must reach.
     """
     known = list(known)
     name = plain_name(text)
@@ -570,7 +573,7 @@ def nearest_name(text: str, known: Iterable[str], *, cutoff: float = 0.75) -> st
     for candidate in known:
         if _has_unit(candidate) and without_unit(name) == without_unit(candidate):
             return candidate
-    return next(iter(difflib.get_close_matches(name, known, n=1, cutoff=cutoff)), None)
+    return next(iter(difflib.get_close_matches(name, known, n=1, cutoff=_SIMILAR)), None)
 
 
 def parse_rows(

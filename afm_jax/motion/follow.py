@@ -1,0 +1,206 @@
+"""Following a motion: piece by piece, until it is over, has settled, or is enough.
+
+A piece ends at a departure, and the next one continues from there, so that no contact is cut in two and counted twice.
+"""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.surface import surface_of
+from afm_jax.contact.junction import Phase
+from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
+from afm_jax.motion.settle import Settled, held_since, is_stuck, settled, slower_period_us
+from afm_jax.motion.simulate import DEFAULT_ACCURACY, simulate
+
+_PIECE_PERIODS = 256
+"""Periods of the fastest motion in a piece."""
+_ROOM = 1040
+"""Contacts in a piece: four for every period, as `simulate` reckons."""
+_LITTLE = 1.001
+"""What is left is followed with the piece before, if it is next to nothing."""
+_HELD_LONG_ENOUGH = 12.0
+"""Drive periods (and free periods) for which a tip that is held is followed, where the end is left open: reading what
+it does takes longer than following it."""
+_GOES_ON = (MotionOutcome.FINISHED, MotionOutcome.HELD, MotionOutcome.CONTACT_LIMIT)
+
+Run = Callable[[State, float], Simulation]
+"""Of a start and a duration in us: the motion of one scene."""
+
+
+class Piece(NamedTuple):
+    """A stretch of a motion, simulated at once."""
+
+    motion: Simulation
+    length_us: float
+    row: int | None
+    """The contact after whose departure the motion goes on; None: it goes on from the end."""
+    goes_on: bool
+    """Whether it can go on from there: it is no part of a contact that began with the piece and still lasts."""
+    stuck: bool
+    """Whether the sample holds the tip at the end (`is_stuck`)."""
+
+    @property
+    def contacts(self) -> int:
+        """Number of its contacts up to where the next piece begins."""
+        return int(self.motion.count) if self.row is None else self.row + 1
+
+
+class LongRun(NamedTuple):
+    """A long simulation, joined; arrays of its contacts are NumPy's and have no unused rows."""
+
+    simulation: Simulation
+    verdict: Settled
+    pieces: int
+
+
+def follow_in_pieces(
+    scene: Scene, start: State, until_us: float, run: Run, *, piece_us: float = math.inf
+) -> Iterator[Piece]:
+    """Follow a scene piece by piece to a time, or until it breaks off; give every piece once it is done.
+
+    A piece from which the motion cannot go on, the tip being in a contact that began with it, is done again, twice as
+    long; in one go to the end where the sample holds the tip. Whoever has seen enough asks for no more.
+
+    Args:
+        scene: one scene, its numbers known.
+        start: the tip at the start.
+        until_us: the end.
+        run: simulates a stretch of the scene's motion.
+        piece_us: how long a piece is; ends where there is no more room for contacts, too.
+    """
+    state, stretch = start, 1.0
+    while True:
+        left = until_us - float(state.time_us)
+        length = stretch * piece_us if left > stretch * piece_us * _LITTLE else left
+        motion = run(state, length)
+        outcome = MotionOutcome(int(motion.outcome))
+        stuck = outcome in _GOES_ON and is_stuck(scene, motion)
+        row, goes_on = where_to_go_on(motion)
+        goes_on = goes_on and outcome in _GOES_ON and not stuck
+        yield Piece(motion, length, row, goes_on, stuck)
+        full = outcome == MotionOutcome.CONTACT_LIMIT
+        if outcome not in _GOES_ON or (length == left and not (full and goes_on)):
+            return
+        if goes_on:
+            state, stretch = place_after(motion, row), 1.0
+        else:
+            stretch = math.ceil(left / piece_us) if stuck else 2.0 * stretch
+
+
+def where_to_go_on(motion: Simulation) -> tuple[int | None, bool]:
+    """Return the last contact that the tip left, None: the end of a motion in flight; and whether there is either."""
+    left = np.flatnonzero(np.asarray(motion.contacts.kind) == ContactKind.IMPACT)
+    if left.size:
+        return int(left[-1]), True
+    flying = int(motion.phase) == Phase.DRY and not bool(motion.held) and motion.outcome == MotionOutcome.FINISHED
+    return None, bool(flying)
+
+
+def place_after(motion: Simulation, row: int | None) -> State:
+    """Return where the tip departs after a contact, or is at the end; of a motion's derivative: how that changes."""
+    rows = motion.contacts
+    if row is None:
+        return State(*motion.final)
+    return State(rows.departure_time_us[row], rows.departure_position_nm[row], rows.departure_velocity_nm_per_us[row])
+
+
+def joined(pieces: Sequence[Piece]) -> Simulation:
+    """Return pieces that follow each other as one simulation that ended as the last one did; arrays of NumPy's."""
+    counts = [*(piece.contacts for piece in pieces[:-1]), int(pieces[-1].motion.count)]
+    return joined_motions([piece.motion for piece in pieces], counts)
+
+
+def joined_motions(motions: Sequence[Simulation], counts: Sequence[int]) -> Simulation:
+    """Return simulations that follow each other, or their derivatives, as one; of each the first few contacts count."""
+    rows = [
+        jax.tree.map(lambda column, count=count: np.asarray(column)[:count], motion.contacts)
+        for motion, count in zip(motions, counts, strict=True)
+    ]
+    contacts = jax.tree.map(lambda *columns: np.concatenate(columns), *rows)
+    last = motions[-1]
+    return Simulation(
+        start=motions[0].start,
+        contacts=contacts,
+        count=jnp.asarray(len(contacts.kind), jnp.int32),
+        final=last.final,
+        phase=last.phase,
+        held=last.held,
+        outcome=last.outcome,
+    )
+
+
+def why_over(piece: Piece) -> str | None:
+    """Return why a motion does not go on after a piece; None where it does, or could have."""
+    outcome = MotionOutcome(int(piece.motion.outcome))
+    if outcome not in _GOES_ON:
+        return outcome.sentence
+    return f"the sample captures the tip (at {held_since(piece.motion):.4g} us)" if piece.stuck else None
+
+
+def follow_long(  # noqa: PLR0913
+    scene: Scene,
+    start: State,
+    duration_us: float,
+    *,
+    until_settled: bool = False,
+    enough: Callable[[Simulation], bool] = lambda _: False,
+    piece_contacts: int | None = None,
+    accuracy: float = DEFAULT_ACCURACY,
+    method: str = "collocation",
+    report: Callable[[float, int], None] | None = None,
+) -> LongRun:
+    """Return a scene followed for a duration, or until it has settled or is enough if that is earlier.
+
+    Args:
+        scene: one scene, its numbers known.
+        start: the tip at the start.
+        duration_us: the longest duration.
+        until_settled: end with the piece in which the motion has settled, or some periods after the sample has come to
+            hold the tip.
+        enough: asked after every piece of the motion so far: whether to stop.
+        piece_contacts: contacts of a piece; None: what some periods of the fastest motion have room for.
+        accuracy: of `simulate`.
+        method: of `simulate`.
+        report: called after every piece with the time reached in us and the number of contacts so far.
+
+    Raises:
+        ValueError: as `simulate`.
+    """
+    surface, _ = surface_of(scene)
+    fastest = max(float(scene.cantilever.angular_frequency), float(surface.fastest_angular_frequency))
+    piece_us = _PIECE_PERIODS * 2.0 * math.pi / fastest if piece_contacts is None else math.inf
+
+    def run(state: State, length_us: float) -> Simulation:
+        room = (piece_contacts or _ROOM) if length_us <= piece_us * _LITTLE else None
+        return simulate(scene, state, length_us, max_contacts=room, accuracy=accuracy, method=method)
+
+    count, pieces, whole, verdict = 0, [], None, None
+    for found in follow_in_pieces(scene, start, float(start.time_us) + duration_us, run, piece_us=piece_us):
+        piece = found
+        if until_settled and found.stuck:
+            shown_us = _end_of_held(scene, found.motion) - float(found.motion.start.time_us)
+            piece = found._replace(motion=run(found.motion.start, min(found.length_us, shown_us)))
+        count, pieces = count + 1, [*(done for done in pieces if done.goes_on), piece]
+        whole = joined(pieces)
+        if report is not None:
+            report(float(whole.final.time_us), len(whole.contacts.kind))
+        if until_settled:
+            verdict = settled(scene, whole)
+            if verdict.settled or piece.stuck:
+                break
+        if enough(whole):
+            verdict = None
+            break
+    assert whole is not None  # there is one piece at least  # noqa: S101
+    return LongRun(whole, settled(scene, whole) if verdict is None else verdict, count)
+
+
+def _end_of_held(scene: Scene, motion: Simulation) -> float:
+    """Return the time in us until which a tip that the sample holds is followed."""
+    return held_since(motion) + _HELD_LONG_ENOUGH * slower_period_us(scene)

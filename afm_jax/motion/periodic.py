@@ -1,0 +1,228 @@
+"""The periodic motion that a scene comes to: Newton's method on the map of one response period ends its transient."""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from afm_jax.apparatus.scene import Scene, drive_of
+from afm_jax.apparatus.surface import surface_of
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.junction import Phase, explain_missing_junction, find_junction
+from afm_jax.motion.follow import Run, follow_in_pieces, why_over
+from afm_jax.motion.record import MotionOutcome, Simulation, State
+from afm_jax.motion.trajectory import flights_of, state_at
+
+_ORBIT_PIECE = 50.0
+"""Drive periods after which a motion is looked at: is it near an orbit?"""
+_LONGEST_RESPONSE = 12
+"""Drive periods."""
+_NEAR = 0.05
+"""Distance, of the tip's largest speed, within which an orbit belongs to a simulated motion."""
+_OVERSHOOT = 4.0
+_CLOSED = 1e-9
+"""Distance from closing, of the tip's largest speed, at which an orbit is found."""
+_NEWTON_STEPS = 12
+_DIFFERENCE = 1e-5
+"""Of the tip's largest speed: between the error of a simulated period, 1e-9 of it, and the map's curvature."""
+_ATTRACTS = 1.0 - 1e-7
+_LAST_FLIGHTS = 12
+
+
+class Orbit(NamedTuple):
+    """A periodic motion that attracts."""
+
+    start: State
+    """In flight."""
+    period_us: float
+    periods: int
+    """N: drive periods in a response period."""
+    impacts: int
+    """m: impacts in a response period."""
+    contraction: float
+    """By which a small distance from it shrinks in a response period."""
+    monodromy: Float[np.ndarray, "2 2"]
+    """Derivative of one response period's map: position in nm, velocity in nm/us."""
+    motion: Simulation
+    """One response period."""
+
+
+class Followed(NamedTuple):
+    """A scene followed from a start until it settles."""
+
+    orbit: Orbit | None
+    reason: str | None
+    """Why there is no orbit."""
+
+
+def why_impossible(scene: Scene) -> str | None:
+    """Return why a scene cannot be simulated at all; None if it can."""
+    try:
+        surface_of(scene)
+    except ValueError as error:
+        return str(error)
+    if isinstance(scene.interaction, Contact) and not bool(find_junction(scene.interaction).exists):
+        return f"no junction forms: {explain_missing_junction(scene.interaction)}"
+    return None
+
+
+def follow_to_orbit(scene: Scene, start: State, most_us: float, run: Run) -> Followed:
+    """Follow a scene until it is near a periodic orbit, and close in on that to rounding.
+
+    An orbit counts only if it is near the simulated motion, and attracts.
+
+    Args:
+        scene: one scene whose drive has one period.
+        start: where the motion begins.
+        most_us: how long to follow it at most, in us.
+        run: simulates a stretch of the scene's motion.
+    """
+    reason = why_impossible(scene)
+    if reason is not None:
+        return Followed(None, reason)
+    piece_us = min(_ORBIT_PIECE * drive_of(scene).period_us, most_us)
+    for piece in follow_in_pieces(scene, start, float(start.time_us) + most_us, run, piece_us=piece_us):
+        reason = why_over(piece)
+        if reason is not None:
+            return Followed(None, reason)
+        orbit = _orbit_near(scene, piece.motion, run)
+        if orbit is not None:
+            return Followed(orbit, None)
+    return Followed(None, f"nothing repeats: no steady orbit within {most_us:.4g} us of the start")
+
+
+def _orbit_near(scene: Scene, motion: Simulation, run: Run) -> Orbit | None:
+    """Return the orbit that a motion is close to, of the fewest drive periods; None without one."""
+    flights = flights_of(scene, motion)
+    if not flights.begin_us.size:
+        return None
+    last = np.arange(flights.begin_us.size) >= flights.begin_us.size - _LAST_FLIGHTS
+    state = state_at(scene, motion, flights.middle_of_longest(last))
+    if state is None:
+        return None
+    period = drive_of(scene).period_us
+    ahead = run(state, (_LONGEST_RESPONSE + 0.5) * period)
+    omega = float(scene.cantilever.angular_frequency)
+    for periods in range(1, _LONGEST_RESPONSE + 1):
+        after = state_at(scene, ahead, float(state.time_us) + periods * period)
+        if after is not None and _apart(_column(state), _column(after), omega)[0] <= _NEAR:
+            orbit = _orbit_of(scene, state, periods, run)
+            if orbit is not None:
+                return orbit
+    return None
+
+
+def _orbit_of(scene: Scene, near: State, periods: int, run: Run) -> Orbit | None:
+    """Return the attracting orbit of a number of drive periods near a state; None if there is none."""
+    duration = periods * drive_of(scene).period_us
+
+    def ends(starts: np.ndarray, _: np.ndarray) -> np.ndarray:
+        motions = [run(State(near.time_us, *(jnp.asarray(part) for part in start[1:])), duration) for start in starts.T]
+        return np.stack([ends_in_flight(motion) for motion in motions], axis=1)
+
+    omega = float(scene.cantilever.angular_frequency)
+    found = close_periods(ends, _column(near), np.zeros(1, int), angular_frequency=omega, reach=_NEAR)
+    if not found.closed[0] or not found.contraction[0] < _ATTRACTS:
+        return None
+    start = State(near.time_us, *(jnp.asarray(part) for part in found.starts[1:, 0]))
+    motion = run(start, duration)
+    contraction = float(found.contraction[0])
+    return Orbit(start, duration, periods, int(motion.count), contraction, found.slopes[0], motion)
+
+
+def _column(state: State) -> Float[np.ndarray, "3 1"]:
+    return np.array([[float(part)] for part in state])
+
+
+def ends_in_flight(motion: Simulation) -> np.ndarray:
+    """Return position and velocity at the end of a motion, a column each of a batch; NaN if not in flight then."""
+    free = (np.asarray(motion.outcome) == MotionOutcome.FINISHED) & (np.asarray(motion.phase) == Phase.DRY)
+    return np.where(free, np.stack([motion.final.position_nm, motion.final.velocity_nm_per_us]), np.nan)
+
+
+class ClosedPeriods(NamedTuple):
+    """Where a search for periodic motions ended, one entry a row."""
+
+    starts: Float[np.ndarray, "3 rows"]
+    """Time, position and velocity."""
+    closed: Bool[np.ndarray, " rows"]
+    """Whether the motion comes back to its start."""
+    contraction: Float[np.ndarray, " rows"]
+    """Largest modulus of the multipliers of the linearised map; infinite where it is not known."""
+    slopes: Float[np.ndarray, "rows 2 2"]
+    """The linearised map: of the end's position and velocity by the start's."""
+
+
+def close_periods(
+    ends: Callable[[Float[np.ndarray, "3 n"], Int[np.ndarray, " n"]], Float[np.ndarray, "2 n"]],
+    starts: Float[np.ndarray, "3 rows"],
+    rows: Int[np.ndarray, " rows"],
+    *,
+    angular_frequency: float,
+    reach: float = math.inf,
+) -> ClosedPeriods:
+    """Return starts whose motion comes back to them.
+
+    Newton's method on x - F(x) = 0, x = (z, v), with the slopes of F by central differences.
+
+    Args:
+        ends: F: of starts and the numbers of their scenes, position and velocity one response period later; NaN where
+            there is none.
+        starts: first guesses: time in us, position in nm and velocity in nm/us.
+        rows: the numbers of their scenes.
+        angular_frequency: of the free tip in rad/us; turns lengths into velocities.
+        reach: how far from its first guess a start may end, of the tip's largest speed; on the way four times as far.
+    """
+    near, starts, count = starts, np.array(starts), len(rows)
+    closed, contraction = np.zeros(count, bool), np.full(count, np.inf)
+    slopes = np.full((count, 2, 2), np.nan)
+    alive = np.arange(count)
+    for _ in range(_NEWTON_STEPS):
+        if not alive.size:
+            break
+        place = starts[1:, alive]
+        gap, jacobian = _map_of(ends, starts[:, alive], rows[alive], angular_frequency)
+        known = np.asarray(np.isfinite(jacobian).all(axis=(1, 2)) & np.isfinite(gap).all(axis=0))
+        known &= np.linalg.det(np.eye(2) - np.where(known[:, None, None], jacobian, 0.0)) != 0.0
+        safe = np.where(known[:, None, None], jacobian, 0.0)
+        slopes[alive] = jacobian
+        contraction[alive] = np.where(known, np.abs(np.linalg.eigvals(safe)).max(axis=1), np.inf)
+        end = np.concatenate([starts[:1, alive], place + gap])
+        done = known & (_apart(starts[:, alive], end, angular_frequency) <= _CLOSED)
+        closed[alive[done]] = True
+        step = np.linalg.solve(np.eye(2) - safe, np.where(known, gap, 0.0).T[:, :, None])[:, :, 0].T
+        go = known & ~done
+        starts[1:, alive[go]] += step[:, go]
+        alive = alive[go]
+        alive = alive[_apart(near[:, alive], starts[:, alive], angular_frequency) <= _OVERSHOOT * reach]
+    closed &= _apart(near, starts, angular_frequency) <= reach
+    return ClosedPeriods(starts, closed, contraction, slopes)
+
+
+def _map_of(
+    ends: Callable[..., np.ndarray], starts: Float[np.ndarray, "3 n"], rows: Int[np.ndarray, " n"], omega: float
+) -> tuple[Float[np.ndarray, "2 n"], Float[np.ndarray, "n 2 2"]]:
+    """Return by how much position and velocity change in a period, and the slopes of where they end."""
+    steps = _DIFFERENCE * _speed(starts, omega) * np.array([[1.0 / omega], [1.0]])
+    moves = np.concatenate([np.zeros((1, 2)), np.eye(2), -np.eye(2)])
+    # trials[:, k]: the starts, and then moved
+    trials = np.stack(
+        [starts + np.concatenate([np.zeros(starts[:1].shape), move[:, None] * steps]) for move in moves], 1
+    )
+    found = ends(trials.reshape(3, -1), np.tile(rows, len(moves))).reshape(2, len(moves), -1)
+    jacobian = (found[:, 1:3] - found[:, 3:]) / (2.0 * steps)
+    return found[:, 0] - starts[1:], np.moveaxis(jacobian, -1, 0)
+
+
+def _speed(starts: Float[np.ndarray, "3 n"], omega: float) -> Float[np.ndarray, " n"]:
+    """Return the largest speeds in nm/us of free vibrations through states; 1e-3 nm of amplitude at least."""
+    return np.maximum(np.hypot(omega * starts[1], starts[2]), 1e-3 * omega)
+
+
+def _apart(one: Float[np.ndarray, "3 n"], other: Float[np.ndarray, "3 n"], omega: float) -> Float[np.ndarray, " n"]:
+    """Return the distances of states, of the largest speed of the first."""
+    _, position, velocity = other - one
+    return np.hypot(omega * position, velocity) / _speed(one, omega)
