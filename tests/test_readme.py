@@ -75,6 +75,92 @@ def test_readme_shows_what_its_commands_print(tmp_path: Path, monkeypatch: pytes
         assert any(same(line, other) for other in printed), line
 
 
+EXAMPLES = ROOT / "fitting" / "examples"
+STAND_FOR = {
+    "TABLE.csv": str(EXAMPLES / "amplitudes_law.csv"),
+    "my_amplitudes.csv": str(EXAMPLES / "amplitudes_law.csv"),
+    "SWEEP": str(EXAMPLES / "real" / "thermal_nanosurf.nid"),
+    "trace1.csv": "trace/trace.csv",
+}
+FEWER = (
+    (r"(:\d+(?:\.\d+)?):\d+$", r"\1:3"),
+    (r"^\d+x\d+$", "4x4"),
+    (r"^trace2\.h5$", ""),
+    (r"^viscous\+delay$", "law"),
+)
+"""What pages name, as what is there; grids of a few points, and models that compile quickly."""
+LEFT_OUT = {
+    "simulate figure8": "tests/test_presets.py simulates it",
+    "fit monday.csv": "three tables are fitted by tests/test_several_tables.py",
+    "fit my_amplitudes.csv --model law --trust": "minutes: tests/test_trust_pack.py",
+    **dict.fromkeys(
+        ("basins", "bifurcation", "lyapunov"),
+        "compile for twenty seconds: tests/test_dynamics.py, tests/test_lyapunov.py",
+    ),
+    "design --drive force": "a law with a delay compiles for half a minute: tests/test_experiment_drives.py",
+    "tapping fitting/examples/real": "its sensitivity is found for ten seconds: tests/test_instruments.py",
+}
+
+
+def of_page(page: str, language: str) -> list[str]:
+    text = (ROOT / "notebooks" / "pages" / f"{page}.md").read_text(encoding="utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder with what the pages tell to save, and what their first commands write."""
+    folder = tmp_path_factory.mktemp("desk")
+    (folder / "fitting").symlink_to(ROOT / "fitting")
+    (folder / "scene.toml").write_text(of_page("first_steps", "toml")[0])
+    (folder / "sweep.toml").write_text(of_page("sweeps", "toml")[0].replace("201", "3"))
+    return folder
+
+
+def cheap(arguments: list[str]) -> list[str]:
+    """Return the arguments of a command as it can be called here."""
+    made = []
+    for word in arguments:
+        other = STAND_FOR.get(word, word)
+        for pattern, new in FEWER:
+            other = re.sub(pattern, new, other)
+        made += [other] if other else []
+    return made
+
+
+@pytest.mark.slow
+def test_commands_of_the_pages_run(desk: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(desk)
+    for page in (
+        "first_steps",
+        "simulate",
+        "contact",
+        "fit",
+        "orbits",
+        "dynamics",
+        "instrument",
+        "design",
+        "tapping",
+        "sweeps",
+    ):
+        text = (ROOT / "notebooks" / "pages" / f"{page}.md").read_text(encoding="utf-8")
+        for line, comment in re.findall(r"^ {4}afm-jax ([^#\n]*)(.*)$", text, re.MULTILINE):
+            if any(line.startswith(one) for one in LEFT_OUT):
+                continue
+            result = CliRunner().invoke(main.main, cheap(shlex.split(line)))
+            expected = 3 if "exit code 3" in comment else 0
+            assert result.exit_code == expected, (page, line, result.output, result.exception)
+
+
+@pytest.mark.slow
+def test_python_of_the_pages_runs(desk: Path, monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.chdir(desk)
+    # slopes through contacts compile for half a minute: tests/test_collide_derivatives.py has them
+    for page in ("first_steps", "contact", "fit", "orbits", "results", "simulate"):
+        (code,) = of_page(page, "python")
+        exec(re.sub(r"^slope = jax.*$", "", code, flags=re.MULTILINE), {})  # noqa: S102
+
+
 @pytest.mark.slow
 def test_python_of_readme_runs(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(ROOT)

@@ -285,7 +285,10 @@ def test_report_is_written_with_its_page(tmp_path):
 def test_command_writes_the_page_of_the_bundled_table(tmp_path):
     result = CliRunner().invoke(main, ["fit", "--example", "--out", str(tmp_path)])
     assert result.exit_code == 0
-    seen = first_screen(read_page((tmp_path / "fit.html").read_text(encoding="utf-8")))
+    page = read_page((tmp_path / "fit.html").read_text(encoding="utf-8"))
+    # rows, law, residuals over the speed, energy of an impact
+    assert sum(1 for _ in page.iter("img")) == 4
+    seen = first_screen(page)
     # made with r 0.95 and epsilon 60 (its own comments say so)
     assert "0.9494 to 0.9507" in seen
     assert "VALID" in seen.splitlines()

@@ -377,7 +377,7 @@ def test_results_of_computations_come_back_with_pictures(tmp_path: Path):
         record.save(path)
         again = fitting.load(path)
         assert same(record, again), name
-        assert repr(again) == repr(record)
+        assert repr(again) == repr(record).replace("a function", "none")
         assert len(repr(record).splitlines()) <= results.MOST_LINES
         record.plot(tmp_path / f"{name}.png")
         assert (tmp_path / f"{name}.png").stat().st_size > 5000

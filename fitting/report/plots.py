@@ -48,8 +48,8 @@ def rows_figure(result: FitResult) -> Figure:
     panels = figure.subplots(len(draw), 1, sharex=True, height_ratios=(1.7, *([1.0] * (len(draw) - 1))))
     for panel, axes in zip(draw, panels, strict=True):
         panel(axes, result)
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(handles, labels, fontsize=SMALL, ncols=4, loc="outside lower center")
+    named = [one for axes in panels for one in zip(*axes.get_legend_handles_labels(), strict=True)]
+    figure.legend(*zip(*named, strict=True), fontsize=SMALL, ncols=5, loc="outside lower center")
     goodness = f"chi²/dof = {result.chi2:.4g}/{result.degrees_of_freedom}"
     title = f"Impact law from {result.table.rows} rows, model {result.model}, {goodness}"
     colour = "black" if result.valid else ALARM
@@ -179,7 +179,10 @@ def draw_residuals(axes: Axes, result: FitResult) -> None:
     ranking, places = _row_axis(result)
     _draw_expected(axes)
     for kind in range(result.rows.residual.shape[1]):
-        axes.plot(places, result.rows.residual[ranking, kind], "o", ms=3, color=COLOURS[kind])
+        residual = result.rows.residual[ranking, kind]
+        # readings of other kinds are in a panel above, with their names
+        alone = kind == 2 and not result.table.tapping and np.isfinite(residual).any()
+        axes.plot(places, residual, "o", ms=3, color=COLOURS[kind], label="phase, residual" if alone else None)
     if not result.table.tapping:
         _name_frequencies(axes, result)
     axes.set_ylabel("residual (errors)")
