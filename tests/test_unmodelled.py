@@ -15,7 +15,6 @@ from fitting.models import Problem, measurement_of
 from fitting.parameters import DELAY_SHAPE, LOSS_SHAPE
 from fitting.report.words import losses_in_words
 from tests.contact_experiment import paper_collisions, paper_experiment
-from tests.contact_truths import contact_truth
 from tests.coverage_of_bands import noisy
 from tests.made_fits import made_fit
 
@@ -212,22 +211,6 @@ def test_bands_hold_the_law_of_a_contact_that_is_not_the_models():
     assert np.mean(shares) >= 0.9
     assert max(worst) < 2.0
     assert 0.75 < np.mean(degrees) < 1.2
-
-
-@pytest.mark.slow
-def test_the_delays_shape_is_what_contacts_have():
-    """A soft sticky contact, two usual ones and a wet one; their delays by least squares, with f and without."""
-    for number in (26, 30, 31, 3):
-        u = np.geomspace(30.0, 200.0, 40)
-        w, delay = contact_truth(number).rebound_and_delay(u)
-        known = np.isfinite(delay)
-        u, w, delay = u[known], w[known], delay[known]
-        law = np.stack([u**-0.2, 1.0 / u - 1.0 / w, -1.0 / u, 1.0 / w**2 - 1.0 / u**2], axis=1)
-        # as paths, which are known about equally well
-        plain, shaped = (np.linalg.lstsq(u[:, None] * law[:, :n], u * delay, rcond=None)[0] for n in (3, 4))
-        priors = Unmodelled(PROBLEM, VALUES | {"delay_lead_nm": plain[1]}, (30.0, 200.0)).priors
-        mean, error = priors[DELAY_SHAPE]
-        assert abs(shaped[3] - mean) < 1.5 * error, (number, shaped[3], mean, error)
 
 
 def test_the_loss_is_said_in_energies_and_in_the_papers_quantities():

@@ -36,12 +36,8 @@ _MISSING_SHARE = 0.3
 """That of a term that the model lacks, over the loss at the middle of the speeds."""
 _PATH_NM = 0.03
 """That of the path that the delay stands for."""
-_SQUARE_PER_LEAD, _LEAD_WITHOUT_NM, _LEAST_SQUARE = 4.8, 5.0, 10.0
-"""f over what the lead b is beyond one in nm, in nm/us; the least standard error of f in nm^2/us, else f itself.
-
-Delays of ten random contacts from 30 nm/us on: f from -12 (b = 3 nm: stiff or sticky tips) to 42 (b = 12 nm: wet ones),
-8 nm^2/us^2 away from the line in the root mean square; of ten others 7.
-"""
+_SQUARE_PER_LEAD, _LEAST_SQUARE = 2.0, 2.0
+"""f over the lead b in nm/us, and its standard error; the least that this is, in nm^2/us."""
 _SMOOTH, _KNOTS = 0.8, 0.4
 """Correlation length of the smooth functions, and distance of their knots, in ln u."""
 _CORRECTIONS = 1.5
@@ -116,7 +112,7 @@ class Unmodelled:
             priors[LOSS_SHAPE] = mean / self.mass_ng, error / self.mass_ng
         if "delay_lead_nm" in self.values:
             slower = self.mass_ng**-0.5
-            mean = slower * _SQUARE_PER_LEAD * (self.values["delay_lead_nm"] - _LEAD_WITHOUT_NM)
+            mean = slower * _SQUARE_PER_LEAD * self.values["delay_lead_nm"]
             priors[DELAY_SHAPE] = mean, max(abs(mean), slower * _LEAST_SQUARE)
         return priors
 
