@@ -68,7 +68,7 @@ class Driven(NamedTuple):
     """None: a free tip over a sample at rest."""
     pull: Float[Array, "..."] | None = None
     """What a bent lever without drive makes of D'' at gap 0, away from the sample, in nm/us^2; None: a free tip."""
-    lever_n_per_m: Float[Array, "..."] | float = 0.0
+    lever_n_per_m: Float[Array, "..."] | None = None
     """Its stiffness."""
 
     @property

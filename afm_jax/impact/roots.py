@@ -147,7 +147,7 @@ FINE = Scan(8192, 1e-7, 1e5, crossings=16, turns=6, slots=16)
 """Some 680 points to the decade: for whoever asks for all orbits."""
 COARSE = Scan(512, 1e-3, 1e4, crossings=6, turns=2, slots=10)
 """Some 70 to the decade: for fits, which search a hundred thousand times."""
-TAPPED = Scan(128, 1e-2, 3.0, crossings=6, turns=2, slots=6)
+TAPPED = Scan(512, 1e-2, 3.0, crossings=6, turns=2, slots=6)
 """Of taps, each of which takes long to look up, and none of which is much faster than the drive."""
 
 
