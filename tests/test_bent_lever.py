@@ -72,6 +72,8 @@ def test_taps_are_read_as_full_simulations_are(name: str):
     truth, table = tapping_truth(0), read_table(Path(__file__).parent / "tapping_tables" / name)
     cantilever = Cantilever(90.0, truth.quality_factor, MASS_NG)
     impact = tapped(Contact.paper(**truth.parameters), cantilever, jnp.array([1.0, 30.0]))
+    assert table.lockin_amplitude_nm is not None
+    assert table.phase_lag_deg is not None
     # nearer the sample taps are slow and last a quarter of the period
     near = -table.offset_nm > 0.35 * table.excitation_nm
     assert np.count_nonzero(near) >= 12
