@@ -484,8 +484,8 @@ class Middle(NamedTuple):
 
     acceleration: Float[Array, ""]
     change: Float[Array, ""]
-    bend: Float[Array, ""]
-    twist: Float[Array, ""]
+    bend: Float[Array, ""] | float = 0.0
+    twist: Float[Array, ""] | float = 0.0
 
 
 def middle_of_contact(cantilever: Cantilever, surface: Platform | Surface, time_us: Float[Array, "..."]) -> Middle:
