@@ -69,7 +69,7 @@ class Driven(NamedTuple):
     pull: Float[Array, "..."] | None = None
     """What a bent lever without drive makes of D'' at gap 0, away from the sample, in nm/us^2; None: a free tip."""
     lever_n_per_m: Float[Array, "..."] | None = None
-    """Its stiffness."""
+    """Its stiffness; None: it has none."""
 
     @property
     def cantilever(self) -> Cantilever:
@@ -94,11 +94,16 @@ class Driven(NamedTuple):
             return force * self.inverse_mass
         return force * self.inverse_mass + self.drive.cantilever.acceleration(gap, rate) + self.drive.push(time_us)
 
+    @property
+    def lever_stiffness_n_per_m(self) -> Float[Array, "..."] | float:
+        """Stiffness of the bent lever, 0 where there is none."""
+        return 0.0 if self.lever_n_per_m is None else self.lever_n_per_m
+
     def pulled_aj(self, start_nm: Float[Array, "..."], end_nm: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return the energy in aJ that a bent lever gives on the way between two gaps."""
         if self.pull is None:
             return jnp.zeros(())
-        force = self.mass_ng * self.pull - 0.5 * self.lever_n_per_m * (start_nm + end_nm)
+        force = self.mass_ng * self.pull - 0.5 * self.lever_stiffness_n_per_m * (start_nm + end_nm)
         return force * (end_nm - start_nm)
 
     def potential(self, gap: Float[Array, "..."]) -> Float[Array, "..."]:

@@ -76,7 +76,7 @@ def _sums(weights: Array, pace: Array, gap: Array, speed: Array) -> tuple[Array,
 def _mean_pull(tip: Driven, pull: Array, s: Array, turn: Array) -> Array:
     """Return the mean over the depth of what a bent lever does, between s and the turning point: it is linear there."""
     middle = 0.5 * (tip.gap_of_root(s) + tip.gap_of_root(turn))
-    return pull - tip.lever_n_per_m * tip.inverse_mass * middle
+    return pull - tip.lever_stiffness_n_per_m * tip.inverse_mass * middle
 
 
 class Stretch(NamedTuple):
