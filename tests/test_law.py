@@ -97,7 +97,7 @@ def test_batch_equals_loop():
     np.testing.assert_allclose(batch, loop, rtol=1e-13)
 
 
-@pytest.mark.parametrize(("name", "value"), [("r", 0.0), ("r", 1.1), ("epsilon", -1.0), ("viscous_loss", -0.1)])
+@pytest.mark.parametrize(("name", "value"), [("r", -0.1), ("r", 1.1), ("epsilon", -1.0), ("viscous_loss", -0.1)])
 def test_impossible_values_are_named(name, value):
     values = {"r": 0.9, "epsilon": 0.0, "viscous_loss": 0.0} | {name: value}
     with pytest.raises(ValueError, match=f"`{name}` must (not )?be"):

@@ -58,11 +58,6 @@ def test_restitutions_of_next_to_nothing_and_of_one(r: float):
     compare(p, *leaving(p, 0.7, 6.0))
 
 
-def test_no_restitution_at_all_is_refused():
-    with pytest.raises(ValueError, match=r"`r` must be in \(0, 1\], but is 0"):
-        ImpactLaw(r=0.0)
-
-
 @pytest.mark.slow
 def test_a_tip_laid_on_a_platform_that_pushes_rests_and_one_that_is_pulled_leaves():
     # where the platform lies below rest the spring pulls the tip off: z = -2 cos(Omega t), back after a whole period
