@@ -56,7 +56,7 @@ def test_a_range_without_count_is_for_continuation():
         ("platform.amplitude=1:2", "did you mean platform.amplitude_nm"),
         ("base.amplitude_nm=1:2", "the scene has no parameter `base.amplitude_nm`"),
         ("interaction.relative_humidity=0.1:0.2", "it has cantilever.frequency_khz"),
-        ("interaction.r=0.5:1.5", r"r=0.5:1.5: \[interaction\] `r` must be in \(0, 1\], but is 1.5"),
+        ("interaction.r=0.5:1.5", r"r=0.5:1.5: \[interaction\] `r` must be in \[0, 1\], but is 1.5"),
         ("cantilever.quality_factor=0.2:3", "`quality_factor` must be above 0.5, but is 0.2"),
         ("platform.reduced_frequency=0:1", "must be positive"),
     ],
