@@ -70,7 +70,7 @@ class Attractor(NamedTuple):
     velocity_nm_per_us: Float[np.ndarray, " impacts"]
 
 
-@public_result(picture="afm_jax.plots.dynamics:basins_figure")
+@public_result(picture="afm_jax.plots.dynamics:basins_figure", rows="table")
 class Basins(ResultTuple):
     """Which start ends where.
 
@@ -94,6 +94,13 @@ class Basins(ResultTuple):
     share_error: Float[np.ndarray, " attractors"]
     boundary_dimension: float
     boundary_dimension_error: float
+
+    def table(self) -> list[dict[str, object]]:
+        """Return one row a start: where it is, and the number of its attractor."""
+        speed, phase = np.meshgrid(self.rebound_speed_nm_per_us, self.phase_rad, indexing="ij")
+        names = ("phase_rad", "rebound_speed_nm_per_us", "attractor")
+        columns = (np.ravel(column).tolist() for column in (phase, speed, self.attractor))
+        return [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
 
 
 def basins_of_attraction(
