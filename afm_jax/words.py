@@ -2,8 +2,10 @@
 
 import contextlib
 import math
+import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextvars import ContextVar
+from itertools import zip_longest
 from typing import Any, SupportsFloat
 
 
@@ -77,6 +79,15 @@ def percent(share: float) -> str:
     return f"{float(f'{100.0 * share:.2g}'):g} %"
 
 
+def counted(number: int, what: str) -> str:
+    """Return a number of things.
+
+    >>> counted(1, "impact"), counted(2, "drive period")
+    ('1 impact', '2 drive periods')
+    """
+    return f"{number} {what}{'' if number == 1 else 's'}"
+
+
 def plain_words(value: Any) -> str:
     """Return a plain value as text: numbers short, lists joined, mappings as 'name: value'.
 
@@ -109,12 +120,18 @@ def text_table(head: Sequence[str], rows: Iterable[Sequence[str]], *, words: Seq
     """
     lines = [list(head), *map(list, rows)]
     sides = ["<" if k in words else ">" for k in range(len(head))]
+    room = _room.get()
     whole = _aligned(lines, sides)
-    # remarks at the end of a line may go on below it
-    told = [line[:-1] for line in lines] if len(head) - 1 in words and len(head) > 2 else lines
-    if len(lines) == 1 or len(head) == 2 or max(map(len, _aligned(told, sides[: len(told[0])]))) <= _room.get():
+    if len(lines) == 1 or _widest(whole) <= room:
         return whole
-    return _turned(lines, _room.get())
+    if sides[-1] == "<" or len(head) == 2:
+        # remarks at the end of a line go on below where they begin
+        left = room - _widest(_aligned([line[:-1] for line in lines], sides)) - 2
+        cells = [broken(line[-1], max(int(left), 1)) for line in lines]
+        if left >= _LEAST_REMARK and max(map(_widest, cells)) <= left:
+            lines = [[*line[:-1], "\n".join(cell)] for line, cell in zip(lines, cells, strict=True)]
+            return _aligned(lines, [*sides[:-1], "<"])
+    return whole if len(head) == 2 else _turned(lines, int(room))
 
 
 @contextlib.contextmanager
@@ -135,23 +152,53 @@ def lines_at_most(width: int) -> Iterator[None]:
 _room: ContextVar[float] = ContextVar("_room", default=math.inf)
 
 
+_LEAST_REMARK = 12
+
+
+def broken(text: str, width: int, indent: str = "") -> list[str]:
+    """Return a text in lines of at most so many signs, broken between words; a value keeps its error beside it.
+
+    Args:
+        text: one line.
+        width: signs in a line; words that are longer stay whole.
+        indent: what all lines but the first begin with.
+
+    >>> broken("epsilon 59.8 +- 0.3 nm^2/us^2 (given)", 16)
+    ['epsilon', '59.8 +- 0.3', 'nm^2/us^2', '(given)']
+    """
+    whole = text.replace(" +- ", "\0+-\0")
+    lines = textwrap.wrap(whole, width, subsequent_indent=indent, break_long_words=False, break_on_hyphens=False)
+    return [line.replace("\0", " ") for line in lines] or [""]
+
+
+def _widest(lines: Iterable[str]) -> int:
+    return max(map(len, lines), default=0)
+
+
 def _aligned(lines: Sequence[Sequence[str]], sides: Sequence[str]) -> list[str]:
-    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    """Return rows as lines of text; a cell may have several lines."""
+    cells = [[cell.split("\n") for cell in line] for line in lines]
+    widths = [max(_widest(cell) for cell in column) for column in zip(*cells, strict=True)]
     return [
         "  "
-        + "  ".join(f"{cell:{side}{width}}" for cell, side, width in zip(line, sides, widths, strict=True)).rstrip()
-        for line in lines
+        + "  ".join(f"{part:{side}{width}}" for part, side, width in zip(parts, sides, widths, strict=False)).rstrip()
+        for line in cells
+        for parts in zip_longest(*line, fillvalue="")
     ]
 
 
-def _turned(lines: Sequence[Sequence[str]], room: float) -> list[str]:
+def _turned(lines: Sequence[Sequence[str]], room: int) -> list[str]:
     """Return a table with its columns below each other, in blocks of rows that fit in the room."""
     head, *rows = lines
-    left = 2 + max(map(len, head))
+    head = ["\n".join(broken(name, room // 2)) if len(name) > room // 2 else name for name in head]
+    left = 2 + max(_widest(name.split("\n")) for name in head)
+    # names and remarks longer than the room go on below
+    most = max(room - left - 2, _LEAST_REMARK)
+    rows = [["\n".join(broken(cell, most)) if len(cell) > most else cell for cell in row] for row in rows]
     blocks: list[list[Sequence[str]]] = []
-    used = math.inf
+    used = room + 1
     for row in rows:
-        width = 2 + max(map(len, row))
+        width = 2 + max(_widest(cell.split("\n")) for cell in row)
         if used + width > room:
             blocks.append([])
             used = left
@@ -160,7 +207,7 @@ def _turned(lines: Sequence[Sequence[str]], room: float) -> list[str]:
     turned: list[str] = []
     for block in blocks:
         cells = [[name, *values] for name, *values in zip(head, *block, strict=True)]
-        turned += ["", *_aligned(cells, ["<", *">" * len(block)])]
+        turned += ["", *_aligned(cells, ["<", *("<" if any("\n" in cell for cell in row) else ">" for row in block)])]
     return turned[1:]
 
 

@@ -27,7 +27,7 @@ from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import PRESET_NAMES, example_path
 from afm_jax.scenefile.presets import PRESETS
-from afm_jax.words import text_table
+from afm_jax.words import lines_at_most, text_table
 from tests.fresh_python import python
 
 HEAVY = "{'jax', 'numpy', 'matplotlib', 'equinox', 'rich'}"
@@ -224,6 +224,23 @@ def test_text_fits_the_terminal_and_numbers_stay_whole(
     assert sum(all(cell in line for cell in rows[0]) for line in wide) == 2, (
         "nobody looks at a pipe: the table stays as it is"
     )
+
+
+@pytest.mark.parametrize("width", [40, 60, 80, 95])
+def test_remarks_stay_in_their_column_and_values_keep_their_errors(width: int):
+    head = ["threshold (height in nm)", "way in", "way back", "between"]
+    rows = [
+        ["contact: the amplitude leaves the free one", "-43.59 +- 0.21", "-43.25 +- 0.14", "-"],
+        ["from the attractive to the repulsive branch", "-37.00 +- 0.58", "-40.25 +- 0.14", "-0.37 +- 0.25 aJ a tap"],
+    ]
+    with lines_at_most(width):
+        lines = text_table(head, rows, words=(0, 3))
+    text = "\n".join(lines)
+    assert max(map(len, lines)) <= width
+    assert sum(text.count(value) for value in ("-43.59 +- 0.21", "-40.25 +- 0.14", "-0.37 +- 0.25")) == 3
+    if width == 95:
+        where = lines[0].index("between")
+        assert [line[where:] for line in lines] == ["between", "-", "-0.37 +- 0.25", "aJ a tap"]
 
 
 def test_presets_are_those_of_the_scene_files_and_are_completed():

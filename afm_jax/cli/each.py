@@ -45,7 +45,7 @@ def fit_tables(session: Session, tables: Sequence[Path], record: Mapping[str, An
     ]
     payload = {"model": record["model"], "fits": fits, "seconds": done.seconds, "fits_kept": len(done.kept.done)}
     why = [f"{row['table']}: {row['message']}" for row in rows if row["message"]]
-    session.emit(payload, "\n".join(_table(rows)), *why)
+    session.emit(payload, lambda: "\n".join(_table(rows)), *why)
     bad = [row["table"] for row in rows if not row["valid"]]
     if bad:
         raise NotValid(f"{len(bad)} of {len(rows)} fits are not valid")

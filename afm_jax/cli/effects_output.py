@@ -9,7 +9,7 @@ from rich.table import Table
 from afm_jax.cli.session import Session, write_json
 from afm_jax.effects.study import Cost, EffectReport, EffectStudy, Reduction
 from afm_jax.scenefile.scenefile import Start, scene_tables
-from afm_jax.words import known
+from afm_jax.words import counted, known
 
 CHANGES = ("peak_amplitude", "lockin_amplitude", "lockin_phase_deg", "energy_per_impact")
 """What is compared; all but the phase relative to the full scene."""
@@ -138,7 +138,7 @@ def text_of(payload: Mapping[str, Any]) -> list[Any]:
 def _of_full(payload: Mapping[str, Any]) -> str:
     full = payload["full"]
     motion = (
-        f"steady orbit, {full['impacts']} impact(s) in {full['drive_periods']} drive period(s)"
+        f"steady orbit, {counted(full['impacts'], 'impact')} in {counted(full['drive_periods'], 'drive period')}"
         if full["drive_periods"] is not None
         else f"no steady orbit, {full['impacts']} impacts in the {payload['compared']}"
     )
@@ -180,4 +180,4 @@ def _sentences(payload: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _percent(share: float | None) -> str:
-    return "-" if share is None else f"{100.0 * share:+.3g} %"
+    return "-" if share is None else f"{100.0 * share:+z.3g} %"

@@ -8,6 +8,7 @@ from afm_jax.cli.fitted_law import with_fitted_law, with_law_options
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import SceneName, ranges_of, scene_and_start, with_picture
+from afm_jax.words import with_error
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -167,7 +168,8 @@ def _rows(found: "Lyapunov", verdicts: list[str]) -> list[dict[str, Any]]:
 
 def _text(found: "Lyapunov", verdict: str) -> list[str]:
     def pair(values: "np.ndarray", errors: "np.ndarray") -> str:
-        return ", ".join(f"{value:.6g} +- {error:.1e}" for value, error in zip(values, errors, strict=True))
+        found = zip(values, errors, strict=True)
+        return ", ".join(with_error(value, error) if error > 0.0 else f"{value:.6g}" for value, error in found)
 
     lines = [
         f"Lyapunov exponents per impact: {pair(found.exponents_per_impact, found.exponents_per_impact_error)}",

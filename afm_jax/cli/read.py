@@ -75,7 +75,7 @@ def command(session: Session, file: Path, curve: int | None, **options: Any) -> 
     curves = read_curves(file, **options) if curve is None else [read_curve(file, curve=curve, **options)]
     # what is missing ends the command before anything is printed
     written = [] if session.out is None or not any(one.valid for one in curves) else write_tables(curves, session.out)
-    session.emit(curves_payload(curves), curves_summary(curves))
+    session.emit(curves_payload(curves), lambda: curves_summary(curves))
     for path in written:
         session.note(f"wrote {path}")
     refused = [one for one in curves if not one.valid]

@@ -19,7 +19,6 @@ import math
 import os
 import sys
 import tempfile
-import textwrap
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
@@ -32,7 +31,7 @@ import click
 from afm_jax.compilation_cache import cache_folder, make_private, silence_xla
 from afm_jax.strict_json import strict_json
 from afm_jax.whole_files import write_whole
-from afm_jax.words import lines_at_most, shown, text_table
+from afm_jax.words import broken, lines_at_most, shown, text_table
 
 if TYPE_CHECKING:
     from afm_jax.compilation_cache import Cache
@@ -347,18 +346,7 @@ def _broken(text: str, width: int) -> str:
     for line in text.split("\n"):
         indent = " " * (len(line) - len(line.lstrip()))
         indent += indent and "  "
-        lines += (
-            [line]
-            if len(line) <= width
-            else textwrap.wrap(
-                line,
-                width,
-                subsequent_indent=indent,
-                break_long_words=False,
-                break_on_hyphens=False,
-                replace_whitespace=False,
-            )
-        )
+        lines += [line] if len(line) <= width else broken(line, width, indent)
     return "\n".join(lines)
 
 

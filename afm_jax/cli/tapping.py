@@ -87,7 +87,7 @@ def _finish(session: Session, result: "Tapping") -> None:
     """
     from fitting.tapping_curves.report import tapping_summary, write_tapping  # noqa: PLC0415
 
-    session.emit(result.to_dict(), tapping_summary(result))
+    session.emit(result.to_dict(), lambda: tapping_summary(result))
     if session.out is not None:
         for path in write_tapping(result, session.out, session.write_table):
             session.note(f"wrote {path}")
@@ -104,8 +104,8 @@ def _finish_several(session: Session, path: Path, file: "MeasuredFile", results:
     from fitting.tapping_curves.report import tapping_summary, write_tapping  # noqa: PLC0415
 
     width = file.half_width_nm
-    text = [tapping_summary(result) + "\n" for result in results.values()]
-    text += [f"Curve {number} refused: {reason}" for number, reason in file.refused.items()]
+    summaries = [lambda result=result: tapping_summary(result) + "\n" for result in results.values()]
+    text = [f"Curve {number} refused: {reason}" for number, reason in file.refused.items()]
     if width is not None:
         each = ", ".join(f"{one:.2f}" for one in file.half_widths_nm.values())
         text.append(
@@ -119,7 +119,7 @@ def _finish_several(session: Session, path: Path, file: "MeasuredFile", results:
         "half_width_nm": None if width is None else {"mean": width[0], "scatter": width[1]},
         "half_widths_nm": [{"curve": number, "width_nm": one} for number, one in file.half_widths_nm.items()],
     }
-    session.emit(payload, "\n".join(text))
+    session.emit(payload, *summaries, *text)
     if session.out is not None:
         for number, result in results.items():
             own = replace(session, out=session.out / f"curve_{number}")

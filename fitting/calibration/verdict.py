@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.words import counted
 from fitting.calibration.model import SweepFit
 from fitting.calibration.result import Alternative, CalibratedValue
 from fitting.calibration.sweep import ResonanceSweep
@@ -103,7 +104,7 @@ def _range_reasons(evidence: SweepEvidence) -> list[str]:
     half = frequency / evidence.quality_factor.value / 2.0
     inside = int(np.sum(np.abs(evidence.sweep.frequency_khz - frequency) < half))
     if inside < 3:
-        return [f"Only {inside} point(s) within the half-width of the resonance: sweep in finer steps."]
+        return [f"Only {counted(inside, 'point')} within the half-width of the resonance: sweep in finer steps."]
     return []
 
 

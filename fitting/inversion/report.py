@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, with_zero_line
-from afm_jax.words import bullets, text_table, with_error
+from afm_jax.words import bullets, decimals, known, text_table, with_error
 from fitting.inversion.result import Coefficient, Inversion, RegressedLaw, SavedLaw
 from fitting.parameters import LAWS
 
@@ -129,7 +129,7 @@ def _coefficient(found: Coefficient) -> str:
 def _row_lines(result: Inversion) -> list[str]:
     """Return the rows as a table, speeds in nm/us, delays in ns."""
     rows, records = result.rows, result.records()
-    head = ["line", "N", "kHz", "nm", "u_in", "+-", "u_out", "+-", "tau ns", "+-", "loss u_in - u_out"]
+    head = ["line", "N", "kHz", "nm", "u_in", "+-", "u_out", "+-", "tau", "+-", "loss"]
     cells = []
     for i, row in enumerate(records):
         note = row["note"] or ""
@@ -142,10 +142,10 @@ def _row_lines(result: Inversion) -> list[str]:
         du, dw, dtau = rows.errors[i]
         covariance = rows.covariance[i]
         lost = np.sqrt(max(covariance[0, 0] + covariance[1, 1] - 2.0 * covariance[0, 1], 0.0))
-        loss = f"{u - w:.3f} +- {lost:.3f}" + (f"  ({note})" if note else "")
-        delay = [f"{NS_PER_US * tau:.2f}", f"{NS_PER_US * dtau:.2f}"]
-        cells.append([*start, f"{u:.3f}", f"{du:.3f}", f"{w:.3f}", f"{dw:.3f}", *delay, loss])
-    lines = text_table(head, cells, words=(10,))
+        loss = with_error(u - w, lost) + (f" ({note})" if note else "")
+        pairs = [(u, du), (w, dw), (NS_PER_US * tau, NS_PER_US * dtau)]
+        cells.append([*start, *(word for pair in pairs for word in with_error(*pair).split(" +- ")), loss])
+    lines = [*text_table(head, cells, words=(10,)), "  Speeds in nm/us, tau in ns; loss: u_in - u_out."]
     if rows.shared_names:
         names = " and ".join(rows.shared_names)
         lines.append(
@@ -163,7 +163,8 @@ def _resonance_lines(result: Inversion) -> list[str]:
     cells = [
         [
             f"{table.lines[row]}",
-            *(f"{speed:.3f}" for speed in found),
+            known(found[0], f".{decimals(found[2])}f"),
+            *with_error(*found[1:]).split(" +- "),
             "not known" if np.isnan(bias) else f"{100.0 * bias:+.1f} %",
         ]
         for row, bias, *found in zip(reading.row, reading.bias, *speeds, strict=True)

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -12,7 +11,6 @@ from afm_jax.words import bullets, interval, known, percent, text_table, with_er
 from fitting.tapping_curves.branches import Height, Hysteresis
 from fitting.tapping_curves.result import Tapping, origin_in_words
 
-_WIDTH = 100
 _EV_PER_AJ = 6.241509
 _CHANGES = {
     "contact": "contact: the amplitude leaves the free one",
@@ -60,7 +58,7 @@ def energy_in_words(result: Tapping) -> str:
 def law_in_words(result: Tapping) -> str:
     """Return what became of the law, as a sentence."""
     if result.law is None:
-        return fill(f"No impact law: {result.reason}.", _WIDTH)
+        return f"No impact law: {result.reason}."
     from fitting.report.report import summary  # noqa: PLC0415
 
     return summary(result.law)
@@ -127,7 +125,7 @@ def _threshold_lines(result: Tapping) -> list[str]:
         *text_table(
             ["threshold (height in nm)", "way in", "way back", "later by", "between"],
             threshold_cells(result),
-            words=(0,),
+            words=(0, 4),
         ),
     ]
 
