@@ -240,7 +240,7 @@ def test_remarks_stay_in_their_column_and_values_keep_their_errors(width: int):
     assert sum(text.count(value) for value in ("-43.59 +- 0.21", "-40.25 +- 0.14", "-0.37 +- 0.25")) == 3
     if width == 95:
         where = lines[0].index("between")
-        assert [line[where:] for line in lines] == ["between", "-", "-0.37 +- 0.25", "aJ a tap"]
+        assert [line[where:] for line in lines] == ["between", "-", "-0.37 +- 0.25 aJ", "a tap"]
 
 
 def test_presets_are_those_of_the_scene_files_and_are_completed():

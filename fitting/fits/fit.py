@@ -713,8 +713,8 @@ def find_fit(  # noqa: PLR0913
     amplitudes = int(np.asarray(measurement.rows.measured).sum())
     if amplitudes < len(problem.own):
         raise ValueError(
-            f"{table.source}: {amplitudes} measured amplitude{'s' if amplitudes != 1 else ''} cannot determine the {len(problem.own)} "
-            f"parameters of the model {model!r}; measure at other drives, orders or offsets too"
+            f"{table.source}: {amplitudes} measured amplitude{'s' if amplitudes != 1 else ''} cannot determine the "
+            f"{len(problem.own)} parameters of the model {model!r}; measure at other drives, orders or offsets too"
         )
     warm_up(starts(problem, measurement)[0], measurement, problem)
     stated = Objective(measurement, problem, robust=robust)
