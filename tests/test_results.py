@@ -314,6 +314,7 @@ reveal_type(orbits.to_pandas())
 reveal_type(collision.save)
 reveal_type(collision.to_xarray())
 reveal_type(collision.rebound_speed_nm_per_us)
+reveal_type(afm.simulate(afm.load_scene("scene.toml"), afm.State(0.0, 10, -5.0), 100.0).final.time_us)
 collision.rebound_speed
 """
 
@@ -334,6 +335,7 @@ def test_type_checkers_of_users_see_the_methods_of_results(tmp_path: Path):
         '"DataFrame"',
         '"(path: str | Path) -> None"',
         '"Dataset"',
+        '"Array"',
         '"Array"',
         'Cannot access attribute "rebound_speed" for class "Collision"',
     ]

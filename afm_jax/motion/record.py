@@ -4,7 +4,7 @@ Between the lab and the gap: heights and velocities of the tip against the surfa
 """
 
 import enum
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -63,6 +63,12 @@ class State(ResultTuple):
     time_us: Float[Array, "..."]
     position_nm: Float[Array, "..."]
     velocity_nm_per_us: Float[Array, "..."]
+
+    if TYPE_CHECKING:  # plain numbers are arrays enough
+
+        def __new__(cls, time_us: ArrayLike, position_nm: ArrayLike, velocity_nm_per_us: ArrayLike) -> Self: ...  # noqa: D102
+
+        def __init__(self, time_us: ArrayLike, position_nm: ArrayLike, velocity_nm_per_us: ArrayLike) -> None: ...  # noqa: D107
 
 
 class ContactDetail(NamedTuple):
