@@ -13,6 +13,7 @@ from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
 from fitting.inversion.flight import _best_ends, _look
 from fitting.inversion.invert import invert
+from fitting.inversion.report import inversion_figure
 from fitting.simulated.experiment import with_noise
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable
@@ -27,6 +28,15 @@ SPEEDS = np.geomspace(30.0, 200.0, 60)
 @pytest.fixture(scope="module")
 def exact():
     return invert(paper_experiment().exact)
+
+
+def test_a_law_that_the_picture_does_not_reach_is_said_to_be_outside(exact):
+    name, law = next(iter(exact.laws.items()))
+    far = dataclasses.replace(law, curve=exact.approach_speed_nm_per_us * (1.0 - 1e-6))
+    for laws, outside in ((exact.laws, 0), ({**exact.laws, name: far}, 1)):
+        axes = inversion_figure(dataclasses.replace(exact, laws=laws)).axes[0]
+        labels = axes.get_legend_handles_labels()[1]
+        assert sum(label.endswith(", outside the frame") for label in labels) == outside, labels
 
 
 def noisy(seed: int, phase_deg: float) -> AmplitudeTable:

@@ -263,6 +263,7 @@ def test_pictures_show_the_delay_and_the_rows_set_aside():
     labels = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
     for label in ("measured, set aside", "no stable orbit predicted", "no orbit seen, one predicted"):
         assert label in labels
+    assert figure.axes[0].yaxis.get_major_formatter()(200.0, 0) == "200", "amplitudes are plain numbers"
     fit = made_fit("law+delay")
     axes = law_figure(fit).axes
     assert [panel.get_ylabel() for panel in axes][-1] == "collision delay (ns)"

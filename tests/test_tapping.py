@@ -66,6 +66,14 @@ def linear_curve(*, drive: str, s: float, damping: float, stiffness: float, free
     )
 
 
+def test_a_given_number_is_told_with_two_digits_of_its_error():
+    assert [str(Given(1.0, 0.00299914)), str(Given(90.008, 0.01)), str(Given(3.0))] == [
+        "1 +- 0.003",
+        "90.008 +- 0.01",
+        "3",
+    ]
+
+
 @pytest.mark.parametrize("drive", ["force", "base"])
 @pytest.mark.parametrize("s", [0.98, 1.0, 1.03, 1.1])
 def test_energy_and_virial_of_a_linear_sample_are_the_closed_forms(drive: str, s: float):

@@ -356,7 +356,7 @@ def _band(axes: Axes, course: RampCourse) -> None:
 
 def _ramps(number: str, figure: MotionFigure, path: Path) -> None:
     picture = new_figure(8.5, 8.0)
-    above, below = picture.subplots(2, 1, height_ratios=[1.0, 1.0])
+    above, below = picture.subplots(2, 1, sharex=True)
     shown = figure.ramps[0] if number == "10" else figure.ramps[-1]
     colours = dict(zip((ramp.rate_nm_per_us for ramp in figure.ramps), (BLUE, ACCENT), strict=False))
     _trajectory(above, shown, colours[shown.rate_nm_per_us])
@@ -416,7 +416,7 @@ def _trajectory(axes: Axes, ramp: Ramp, colour: str) -> None:
         )
     axes.grid(color=GRID, alpha=0.25)
     axes.set_xlim(middle[0], middle[1])
-    label_axes(axes, x=r"tip-sample offset $\sigma$ (nm)", y="height (nm)")
+    label_axes(axes, x="", y="height (nm)")
     legend = axes.legend(
         loc="upper left" if motion.held_from_us is None else "upper right", fontsize=10, framealpha=1.0
     )

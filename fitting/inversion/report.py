@@ -200,7 +200,11 @@ def inversion_figure(result: Inversion) -> Figure:
     _draw_loss(axes[0], result)
     if inverted:
         _draw_delay(axes[1], result)
-    title = result.verdict if inverted else "the paper's reading on resonance: phase assumed, bias "
+    title = (
+        result.verdict[:1].upper() + result.verdict[1:]
+        if inverted
+        else "the paper's reading on resonance: phase assumed, bias "
+    )
     if not inverted:
         title += "not known" if result.resonance.reference == "none" else "in invert.txt"
     figure.suptitle(
@@ -211,10 +215,13 @@ def inversion_figure(result: Inversion) -> Figure:
 
 def _draw_loss(axes: Axes, result: Inversion) -> None:
     rows, speeds = result.rows, result.approach_speed_nm_per_us
+    low, high = _frame_of(axes, result)
     for name, law in result.laws.items():
         colour, dashes, symbols = _STYLES[name]
         label = f"{symbols}: $\\chi^2$ {law.chi2:.1f}/{law.degrees_of_freedom}"
         lost = speeds - law.curve
+        seen = (lost > low) & (lost < high)
+        label += "" if seen.any() else ", outside the frame"
         axes.plot(speeds, lost, dashes, color=colour, lw=1.6, label=label)
         axes.fill_between(speeds, lost - law.curve_error, lost + law.curve_error, color=colour, alpha=0.15, lw=0)
     if result.fitted is not None:
@@ -224,7 +231,6 @@ def _draw_loss(axes: Axes, result: Inversion) -> None:
     error = np.sqrt(np.maximum(c[:, 0, 0] + c[:, 1, 1] - 2.0 * c[:, 0, 1], 0.0))
     _points(axes, result, rows.impact[:, 0] - rows.impact[:, 1], error)
     reading = result.resonance
-    low, high = _frame_of(axes, result)
     if len(reading.row):
         lost = reading.approach_speed_nm_per_us - reading.rebound_speed_nm_per_us
         # where they take all that is lost in the air for the sample's, they are far above the rows

@@ -147,6 +147,9 @@ def draw_amplitudes(axes: Axes, result: FitResult) -> None:
     if not result.table.tapping:
         _mark_orders(axes, result.table.order[ranking])
         axes.set_yscale("log")
+        axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axes.yaxis.set_minor_formatter(NullFormatter())
     axes.set_ylabel("amplitude (nm)")
     axes.tick_params(labelbottom=False)
 

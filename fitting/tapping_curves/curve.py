@@ -25,7 +25,7 @@ class Given(NamedTuple):
     error: float = 0.0
 
     def __str__(self) -> str:
-        return f"{self.value:g} +- {self.error:g}" if self.error else f"{self.value:g}"
+        return f"{self.value:g} +- {float(f'{self.error:.2g}'):g}" if self.error else f"{self.value:g}"
 
 
 EXACTLY_ONE = Given(1.0)
