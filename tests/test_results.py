@@ -276,8 +276,8 @@ def test_a_table_of_pandas_is_an_amplitude_table_and_back():
     bare.attrs = {}
     noisy = fitting.AmplitudeTable.from_dataframe(bare, noise=0.01, free_frequency_khz=90.0)
     assert noisy.peak_amplitude_error_nm == pytest.approx(0.01 * table.peak_amplitude_nm, rel=1e-15)
-    with pytest.raises(fitting.TableError, match="free_frequency_khz is missing"):
-        fitting.AmplitudeTable.from_dataframe(bare, noise=0.01)
+    with pytest.raises(fitting.TableError, match=r"free_frequency_khz is missing; give it in `frame.attrs`"):
+        fitting.fit(bare)
     with pytest.raises(fitting.TableError, match="there is no column 'peak'"):
         fitting.AmplitudeTable.from_dataframe(frame.rename(columns={"peak_amplitude_nm": "peak"}))
 

@@ -473,7 +473,8 @@ class AmplitudeTable(Result):
         needed = (column.name for column in form.columns if column.required and column.needed)
         for name in ("free_frequency_khz", *needed):
             if name not in known and name not in columns:
-                faults.add(f"{name} is missing; give it as a {'keyword' if name in own else 'column'}")
+                how = f"in `frame.attrs`, or as {name}=... to AmplitudeTable.from_dataframe"
+                faults.add(f"{name} is missing; give it {how if name in own else 'as a column'}")
         faults.raise_any()
         fill_errors(columns, {name: np.zeros(len(frame), dtype=bool) for name in columns}, noise)
         if "order" in columns:
