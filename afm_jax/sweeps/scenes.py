@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
@@ -37,9 +38,8 @@ from afm_jax.sweeps.plan import MESSAGE, Columns, Recorder, Variable
 APPROACH_SPEED = "approach_speed_nm_per_us"
 """The axis of `collide` that is no parameter of the scene."""
 SCENE_BUILDER = "afm_jax.sweeps.scenes:scene_recorder"
-_LANES = {"cpu": 1024}
-_LANES_OF_ACCELERATORS = 1 << 16
-"""Scenes of a block: what a cache holds, or what fills an accelerator."""
+_BLOCKS, _BLOCKS_OF_ACCELERATORS = {"cpu": (1024, 16)}, (1 << 16, 1)
+"""Scenes of a block, what a cache holds, or what fills an accelerator; and blocks that a device is given at once."""
 _MOST_ORDERS = 100
 
 
@@ -100,28 +100,57 @@ def _checked(key: str, value: Any, usual: Any) -> Any:
 # --- over devices -----------------------------------------------------------------------------------------------------
 
 
-def over_devices(record: Callable[..., Any], lanes: int | None = None) -> Callable[[Columns], Columns]:
-    """Return a function of columns of any length that records them block by block, a block on every local device.
+def over_devices(record: Callable[[Columns], Columns]) -> Callable[[Columns], Columns]:
+    """Return a function of columns of any length that records them block by block, on all local devices.
+
+    A call of the program is many blocks, since to make it takes as long as some hundred scenes; how many is an
+    argument, so that it does not change the program, and with it last digits.
 
     Args:
         record: from columns of one length to columns of that length, for JAX to trace.
-        lanes: rows of a block; None: as suits the devices.
     """
     devices = jax.local_devices()
-    lanes = lanes or _LANES.get(devices[0].platform, _LANES_OF_ACCELERATORS)
-    spread = PartitionSpec("lanes")
-    mesh = Mesh(np.array(devices), ("lanes",))
-    program = jax.jit(jax.shard_map(record, mesh=mesh, in_specs=spread, out_specs=spread, check_vma=False))
-    width = lanes * len(devices)
+    lanes, blocks = _BLOCKS.get(devices[0].platform, _BLOCKS_OF_ACCELERATORS)
+    record = jax.jit(record)
+
+    def each(columns: dict[str, Array], count: Array) -> dict[str, Array]:
+        """Record the first blocks of one device."""
+        shapes = jax.eval_shape(record, {name: column[0] for name, column in columns.items()})
+        empty = {name: jnp.zeros((blocks, *shape.shape), shape.dtype) for name, shape in shapes.items()}
+
+        def block(at: Array, found: dict[str, Array]) -> dict[str, Array]:
+            part = record({name: column[at] for name, column in columns.items()})
+            return {name: found[name].at[at].set(part[name]) for name in found}
+
+        return lax.fori_loop(0, count, block, empty)
+
+    spread = PartitionSpec("devices")
+    mesh = Mesh(np.array(devices), ("devices",))
+    specs = {"in_specs": (spread, PartitionSpec()), "out_specs": spread}
+    program = jax.jit(jax.shard_map(each, mesh=mesh, check_vma=False, **specs))
+    number = len(devices)
+
+    def spread_out(column: np.ndarray, count: int) -> np.ndarray:
+        filled = np.empty((number, blocks, lanes))
+        filled[:, :count] = _filled(column, number * count * lanes).reshape(number, count, lanes)
+        return filled.reshape(-1, lanes)
+
+    def gathered(found: Array, count: int, rows: int) -> np.ndarray:
+        values = np.asarray(found)
+        values = values.reshape(number, blocks, *values.shape[1:])[:, :count]
+        return values.reshape(-1, *values.shape[3:])[:rows]
 
     def work(columns: Columns) -> Columns:
-        count = len(next(iter(columns.values())))
-        parts = []
-        for first in range(0, count, width):
-            rows = {name: column[first : first + width] for name, column in columns.items()}
-            # handed out before it is asked for: the next block is prepared meanwhile
-            parts.append(program({name: _filled(column, width) for name, column in rows.items()}))
-        return {name: np.concatenate([np.asarray(part[name]) for part in parts])[:count] for name in parts[0]}
+        total = len(next(iter(columns.values())))
+        calls = []
+        for first in range(0, total, number * blocks * lanes):
+            rows = min(number * blocks * lanes, total - first)
+            count = -(-rows // (number * lanes))
+            whole = {name: spread_out(column[first : first + rows], count) for name, column in columns.items()}
+            # handed out before it is asked for: the next call is prepared meanwhile
+            calls.append((program(whole, count), count, rows))
+        names = calls[0][0]
+        return {name: np.concatenate([gathered(found[name], *sizes) for found, *sizes in calls]) for name in names}
 
     return work
 
