@@ -147,10 +147,14 @@ def over_devices(record: Callable[[Columns], Columns]) -> Callable[[Columns], Co
             rows = min(number * blocks * lanes, total - first)
             count = -(-rows // (number * lanes))
             whole = {name: spread_out(column[first : first + rows], count) for name, column in columns.items()}
-            # handed out before it is asked for: the next call is prepared meanwhile
-            calls.append((program(whole, count), count, rows))
-        names = calls[0][0]
-        return {name: np.concatenate([gathered(found[name], *sizes) for found, *sizes in calls]) for name in names}
+            calls.append((first, rows, count, program(whole, count)))
+        # all are handed out before the first is asked for, and put in place while the others are computed
+        results: Columns = {}
+        for first, rows, count, found in calls:
+            for name, part in found.items():
+                values = gathered(part, count, rows)
+                results.setdefault(name, np.empty((total, *values.shape[1:]), values.dtype))[first:][:rows] = values
+        return results
 
     return work
 
@@ -199,7 +203,7 @@ def _orbits(scene: Scene, paths: tuple[str, ...], *, orders: tuple[int, ...]) ->
         scenes = made(columns)
         return highest_orbits(scenes, free_frame(scenes), jnp.asarray(orders, float))
 
-    points = 4096 if law.delay else 131072
+    points = 4096 if law.delay else 1 << 18
     return Recorder(_ORBIT_VARIABLES, over_devices(record), points, {"order": [float(order) for order in orders]})
 
 

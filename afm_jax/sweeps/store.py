@@ -82,8 +82,11 @@ class SweepStore:
             if data is None:
                 path.unlink(missing_ok=True)
                 continue
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(path, data, synced=False)
+            try:
+                write_whole(path, data, synced=False)
+            except FileNotFoundError:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                write_whole(path, data, synced=False)
         write_whole(self._marker(chunk), strict_json(_sums(files)), synced=False)
 
     def _marker(self, chunk: int) -> Path:
