@@ -258,3 +258,16 @@ def test_a_picture_shows_all_that_was_swept(log: bool, monkeypatch: pytest.Monke
     # the first cell reaches from as far below its value as the second from above
     assert plane.get_ylim()[0] == pytest.approx(2.0**-0.5 if log else 1.0 - 0.5 * 15.0 / 4.0)
     assert lines.get_ylabel() == "sum (nm)"
+
+
+@pytest.mark.parametrize(("last", "labels"), [(16.0, [1, 2, 5, 10]), (1600.0, [1, 10, 100, 1000])])
+def test_labels_of_a_logarithmic_axis_leave_room(
+    last: float, labels: list[int], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    kept = []
+    monkeypatch.setattr("afm_jax.plots.sweeps.save", lambda figure, _: kept.append(figure))
+    axes = [{"parameter": "x", "log": [1.0, last, 5]}, {"parameter": "y", "list": [1.0]}]
+    draw_sweep(dataset_of(plan_of(plan().given | {"axes": axes}), None).isel(y=0, drop=True), ["sum_nm"], tmp_path)
+    panel = kept[0].axes[0]
+    low, high = panel.get_xlim()
+    assert [at for at in panel.get_xticks() if low <= at <= high] == pytest.approx(labels)

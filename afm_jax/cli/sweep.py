@@ -137,7 +137,9 @@ def _messages(plan: "SweepPlan", store: Path) -> Counter[str]:
 
 def _words(plan: "SweepPlan", done: "SweepRun", messages: Counter[str], store: Path) -> list[str]:
     grid = " x ".join(map(str, plan.shape))
-    lines = [f"{grid} points in {done.chunks} chunks. Computed in {_duration(done.seconds)}: {done.computed}."]
+    points, chunks = ("" if number == 1 else "s" for number in (plan.points, done.chunks))
+    took = f"Computed in {_duration(done.seconds)}: {done.computed}."
+    lines = [f"{grid} point{points} in {done.chunks} chunk{chunks}. {took}"]
     if done.kept.done:
         lines.append(f"Done before and kept: {len(done.kept.done)}.")
     if done.kept.damaged:
