@@ -191,6 +191,21 @@ def test_a_killed_worker_costs_nothing_but_time(tmp_path: Path):
 
 
 @pytest.mark.slow
+def test_an_interrupt_is_one_message(tmp_path: Path):
+    (tmp_path / "out").mkdir()
+    line = [*NUMBERS, str(tmp_path / "out"), "2", json.dumps({"seconds": 0.3})]
+    # the keyboard interrupts the whole group of processes
+    with subprocess.Popen(line, cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
+        while process.poll() is None and len(list((tmp_path / "out").glob("done/*.json"))) < 2:
+            time.sleep(0.05)
+        os.killpg(process.pid, signal.SIGINT)
+        told = process.communicate(timeout=60)[1]
+    assert process.returncode != 0
+    assert told.count("Traceback") <= 1, told
+    assert told.rstrip().endswith("KeyboardInterrupt"), told
+
+
+@pytest.mark.slow
 def test_a_sweep_killed_twice_ends_in_the_same_bytes(tmp_path: Path):
     settings = json.dumps({"seconds": 0.1})
     for name in ("whole", "killed"):

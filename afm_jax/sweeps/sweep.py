@@ -293,6 +293,8 @@ def local_cluster(workers: int, *, cores_each: int | None = None) -> "Iterator[A
         config.set(
             {
                 "distributed.worker.multiprocessing-method": "spawn",
+                # an interrupt from the keyboard reaches all processes, but is this one's business
+                "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
                 # nobody looks at what these find
                 "distributed.worker.profile.enabled": False,
                 "distributed.admin.tick.interval": "500ms",
