@@ -164,7 +164,9 @@ def test_four_workers_give_the_bytes_of_one(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_a_killed_worker_costs_nothing_but_time(tmp_path: Path):
+def test_a_killed_worker_costs_nothing_but_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    # as JAX leaves it behind
+    monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", "1")
     run_plan(plan(), tmp_path / "whole")
     told = tmp_path / "told"
     told.mkdir()
@@ -185,7 +187,7 @@ def test_a_killed_worker_costs_nothing_but_time(tmp_path: Path):
     assert done.computed == 14
     # two workers, and the one that took the place of the killed one
     assert len(list(told.iterdir())) == 3
-    assert {path.read_text() for path in told.iterdir()} == {str(max(available_cores() // 2, 1))}
+    assert {path.read_text() for path in told.iterdir()} == {f"{max(available_cores() // 2, 1)} 3"}
     found, whole = (xarray.open_zarr(str(tmp_path / name / "sweep.zarr")).load() for name in ("out", "whole"))
     assert found.drop_attrs().identical(whole.drop_attrs())
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import require_float64
-from afm_jax.compilation_cache import available_cores
+from afm_jax.compilation_cache import available_cores, silence_xla
 from afm_jax.scenefile.scenefile import Start, scene_tables
 from afm_jax.sweeps.plan import Columns, SweepPlan, plan_of
 from afm_jax.sweeps.scenes import SCENE_BUILDER
@@ -273,6 +273,8 @@ def local_cluster(workers: int, *, cores_each: int | None = None) -> "Iterator[A
     from dask import config  # noqa: PLC0415
     from distributed import LocalCluster  # noqa: PLC0415
 
+    # workers import what their caller's program imports before they can be told anything
+    silence_xla()
     flags = os.environ.get("XLA_FLAGS", "").split()
     cores = cores_each or max(available_cores() // workers, 1)
     settings: dict[str, Any] = {
