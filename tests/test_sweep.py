@@ -70,6 +70,20 @@ def test_orbits_are_those_of_single_impact_orbits():
 
 
 @pytest.mark.slow
+def test_orbits_of_a_contact_are_those_that_simulations_end_in():
+    axes = [{"parameter": FREQUENCY, "list": [2.1]}, {"parameter": AMPLITUDE, "list": [0.0, 8.0]}]
+    found = sweep(preset("figure8"), axes, {"what": "orbits", "orders": [1, 2]}).isel(platform_reduced_frequency=0)
+    ends = sweep(preset("figure8"), axes, {"what": "simulation", "periods": 1000.0}).isel(platform_reduced_frequency=0)
+    assert found["stable"].values.tolist() == [[False, False], [False, True]]
+    assert (bool(ends["settled"][1]), int(ends["order"][1]), int(ends["contacts_per_response"][1])) == (True, 2, 1)
+    # the accuracy of contacts in search of orbits
+    np.testing.assert_allclose(found["peak_amplitude_nm"][1, 1], ends["peak_amplitude_nm"][1], rtol=1e-6)
+    assert float(found["largest_multiplier"][1, 1]) < 1.0
+    why = found["message"].values.tolist()
+    assert (why[0].startswith("`amplitude_nm` of the platform must be positive here"), why[1]) == (True, "")
+
+
+@pytest.mark.slow
 def test_collisions_and_exponents_are_those_of_their_functions():
     contact = preset("figure8")
     axes = [

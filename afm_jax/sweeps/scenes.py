@@ -20,6 +20,7 @@ from afm_jax.apparatus.surface import free_frame
 from afm_jax.contact.collide import ONLY_FREE, collide
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.charts import highest_orbits
+from afm_jax.dynamics.contact_orbits import CHART_ACCURACY, single_contact_orbits
 from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.dynamics.iteration import LANES, sample_driven
 from afm_jax.dynamics.verdicts import MotionKind
@@ -30,7 +31,7 @@ from afm_jax.motion.record import MotionOutcome
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.motion.start import start_of
 from afm_jax.outcomes import CollisionOutcome
-from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, scene_family
+from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, scene_batch, scene_family
 from afm_jax.scenefile.scenefile import Start, scene_of_tables
 from afm_jax.sweeps.axes import Axis
 from afm_jax.sweeps.plan import MESSAGE, Columns, Recorder, Variable
@@ -190,13 +191,18 @@ _ORBIT_VARIABLES = (
 )
 
 
-def _orbits(scene: Scene, paths: tuple[str, ...], *, orders: tuple[int, ...]) -> Recorder:
-    """Record the stable single-impact orbits of law scenes; of several of one order the highest."""
+def _orbits(
+    scene: Scene, paths: tuple[str, ...], *, orders: tuple[int, ...], accuracy: float = CHART_ACCURACY
+) -> Recorder:
+    """Record the stable single-impact orbits of scenes; of several of one order the highest."""
     sample_driven(scene)
-    law = impact_law_of(scene)
     for path in paths:
         if path.endswith("offset_rate_nm_per_us"):
             raise ValueError(f"under a ramp no orbit repeats: {path} cannot be an axis of 'orbits'")
+    extra = {"order": [float(order) for order in orders]}
+    if isinstance(scene.interaction, Contact):
+        return _contact_orbits(scene, orders, accuracy, extra)
+    law = impact_law_of(scene)
     made = _scenes(scene, paths)
 
     def record(columns: Columns) -> dict[str, Array]:
@@ -204,7 +210,41 @@ def _orbits(scene: Scene, paths: tuple[str, ...], *, orders: tuple[int, ...]) ->
         return highest_orbits(scenes, free_frame(scenes), jnp.asarray(orders, float))
 
     points = 4096 if law.delay else 1 << 18
-    return Recorder(_ORBIT_VARIABLES, over_devices(record), points, {"order": [float(order) for order in orders]})
+    return Recorder(_ORBIT_VARIABLES, over_devices(record), points, extra)
+
+
+_CONTACT_ORBIT_VARIABLES = (
+    _ORBIT_VARIABLES[0],
+    Variable("stable", "an admissible single-impact orbit is stable", "bool", ("order",)),
+    Variable("admissible", "there is an admissible single-impact orbit", "bool", ("order",)),
+    Variable("unresolved", "the law closest to the contact has an orbit, but none was found", "bool", ("order",)),
+    _ORBIT_VARIABLES[-1],
+    MESSAGE,
+)
+
+
+def _contact_orbits(
+    scene: Scene, orders: tuple[int, ...], accuracy: float, extra: Mapping[str, list[float]]
+) -> Recorder:
+    """Record orbits of resolved contacts, one scene at a time: how many are followed together tells in last digits."""
+    nothing = {
+        variable.name: np.full((1, len(orders)), math.nan if variable.dtype == "float64" else False)
+        for variable in _CONTACT_ORBIT_VARIABLES[:-1]
+    }
+
+    def seen(row: dict[str, float]) -> Columns:
+        try:
+            one = sample_driven(scene_batch(scene, {name: np.array([value]) for name, value in row.items()}))
+            found = single_contact_orbits(one, orders, accuracy=accuracy)
+        except ValueError as error:
+            return nothing | {MESSAGE.name: [str(error)]}
+        return found | {MESSAGE.name: [""]}
+
+    def work(columns: Columns) -> Columns:
+        rows = [seen(dict(zip(columns, row, strict=True))) for row in zip(*columns.values(), strict=True)]
+        return {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
+
+    return Recorder(_CONTACT_ORBIT_VARIABLES, work, 16, extra, alone=True)
 
 
 # --- collisions -------------------------------------------------------------------------------------------------------
