@@ -210,6 +210,8 @@ def test_axes_are_what_they_say():
         ([{"parameter": "x", "log": [0, 1, 5]}], "the ends of `log` must be positive, but one is 0"),
         ([{"parameter": "x", "list": [1, "a"]}], "a value of the list must be a number, but is 'a'"),
         ([{"parameter": "x", "list": [1, 1]}], "stands there twice"),
+        ([{"parameter": "x", "list": 3}], r"axis 1: `list` must be \[value, ...\], but is 3"),
+        ([{"parameter": "x", "log": [1, None, 3]}], "an end of `log` must be a number, but is not finite"),
         ([{"linear": [1, 2, 3]}], "`parameter` is missing"),
         ([{"parameter": "x", "linear": [1, 2, 3], "seed": 1}], "unknown key seed"),
         ([{"random": {"x": [0, 1]}, "count": 5}], "`seed` must be a whole number from 0 on, but is None"),
