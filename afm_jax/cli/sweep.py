@@ -244,6 +244,15 @@ def _duration(seconds: float) -> str:
     return f"{seconds / 3600.0:.1f} h" if seconds < 200.0 * 3600.0 else f"{seconds / 86400.0:.0f} days"
 
 
+def _size(size_bytes: float) -> str:
+    """Return a size in words.
+
+    >>> _size(3e6), _size(45e9)
+    ('2.9 MiB', '41.9 GiB')
+    """
+    return f"{size_bytes / 2**20:.1f} MiB" if size_bytes < 2**30 else f"{size_bytes / 2**30:,.1f} GiB"
+
+
 def _tell_estimate(session: Session, plan: "SweepPlan") -> None:
     from afm_jax.sweeps.sweep import estimate  # noqa: PLC0415
 
@@ -256,7 +265,7 @@ def _tell_estimate(session: Session, plan: "SweepPlan") -> None:
             f"Time: {_duration(found.seconds / number)} with {number} process{'es' if number > 1 else ''} here, "
             f"{1e6 * found.seconds_a_point:.3g} us a point as measured on {found.sampled_points:,}."
         ),
-        f"Disk: {found.disk_bytes / 2**20:,.1f} MiB, compressed as the sample was.",
+        f"Disk: {_size(found.disk_bytes)}, compressed as the sample was.",
         f"Memory: {found.memory_bytes / 2**20:,.0f} MiB a process, whatever the number of points.",
     ]
     session.emit(found._asdict() | {"processes": number}, *lines)
