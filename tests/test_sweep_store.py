@@ -4,6 +4,7 @@ import errno
 import json
 import multiprocessing
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -110,6 +111,11 @@ def test_a_changed_input_is_refused_and_named(tmp_path: Path):
         run_plan(plan(chunk=5), tmp_path)
     with pytest.raises(ValueError, match=r"record.seconds is absent, not 0.001"):
         run_plan(plan(seconds=0.001), tmp_path)
+    # by a program that would cut it otherwise
+    same = plan()
+    other = replace(same, recorder=replace(same.recorder, points=24))
+    with pytest.raises(ValueError, match=r"shape of its chunks is \[1, 10\], not \[2, 12\]: choose another folder"):
+        run_plan(other, tmp_path)
     (tmp_path / STORE / "zarr.json").write_text("{}")
     with pytest.raises(ValueError, match="is not a sweep of afm-jax; choose another folder"):
         run_plan(plan(), tmp_path)

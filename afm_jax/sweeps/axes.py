@@ -98,7 +98,7 @@ def _axis(table: dict[str, Any], sample: str) -> Axis:
 
 def _listed(given: Any) -> tuple[Stretch, tuple[float, float], int]:
     if not isinstance(given, (list, tuple)):
-        raise ValueError(f"`list` must be [value, ...], but is {given}")
+        raise TypeError(f"`list` must be [value, ...], but is {given}")
     numbers = [_number(value, "a value of the list") for value in given]
     if not 0 < len(numbers) <= _MOST_HELD:
         raise ValueError(f"a list needs from 1 to {_MOST_HELD} values, but has {len(numbers)}")

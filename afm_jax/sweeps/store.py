@@ -252,13 +252,15 @@ def _coordinate(group: zarr.Group, name: str, dimension: str, attributes: Mappin
 
 def _check_same(folder: Path, plan: SweepPlan) -> None:
     try:
-        found = json.loads((folder / STORE / "zarr.json").read_bytes())["attributes"]
-        there, version = json.loads(found["input"]), found["format_version"]
+        whole = json.loads((folder / STORE / "zarr.json").read_bytes())
+        there, version = json.loads(whole["attributes"]["input"]), whole["attributes"]["format_version"]
+        block = whole["consolidated_metadata"]["metadata"][_COMPUTED]["chunk_grid"]["configuration"]["chunk_shape"]
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{folder / STORE}: is not a sweep of afm-jax; choose another folder") from error
     if version != FORMAT_VERSION:
         raise ValueError(f"{folder / STORE}: has format_version {version}, not {FORMAT_VERSION}; choose another folder")
-    differences = changes(there, plan.given)
+    # how a sweep is cut that leaves it open is settled by the program
+    differences = changes(there, plan.given) or changes(block, list(plan.block), "shape of its chunks")
     if differences:
         raise ValueError(
             f"{folder}: holds another sweep, in which {'; '.join(differences[:3])}"
