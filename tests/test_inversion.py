@@ -36,7 +36,7 @@ def test_a_law_that_the_picture_does_not_reach_is_said_to_be_outside(exact):
     for laws, outside in ((exact.laws, 0), ({**exact.laws, name: far}, 1)):
         axes = inversion_figure(dataclasses.replace(exact, laws=laws)).axes[0]
         labels = axes.get_legend_handles_labels()[1]
-        assert sum(label.endswith(", outside the frame") for label in labels) == outside, labels
+        assert sum(label.endswith(", outside") for label in labels) == outside, labels
 
 
 def noisy(seed: int, phase_deg: float) -> AmplitudeTable:

@@ -221,7 +221,7 @@ def _draw_loss(axes: Axes, result: Inversion) -> None:
         label = f"{symbols}: $\\chi^2$ {law.chi2:.1f}/{law.degrees_of_freedom}"
         lost = speeds - law.curve
         seen = (lost > low) & (lost < high)
-        label += "" if seen.any() else ", outside the frame"
+        label += "" if seen.any() else ", outside"
         axes.plot(speeds, lost, dashes, color=colour, lw=1.6, label=label)
         axes.fill_between(speeds, lost - law.curve_error, lost + law.curve_error, color=colour, alpha=0.15, lw=0)
     if result.fitted is not None:
@@ -318,4 +318,5 @@ def _speed_axis(axes: Axes, y: str) -> None:
     axes.grid(color=GRID, alpha=0.25)
     if axes.get_legend_handles_labels()[0]:
         # above the axes: no place within is free of data for every table
-        axes.legend(fontsize=_SMALL, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, frameon=False)
+        place = {"loc": "lower left", "bbox_to_anchor": (0.0, 1.0), "frameon": False}
+        axes.legend(fontsize=_SMALL, ncols=2, columnspacing=1.0, handletextpad=0.5, **place)
