@@ -146,6 +146,11 @@ def test_with_adhesion_a_branch_turns_at_a_fold_and_ends_at_capture():
     omega = 2.0 * n * FREE
     height = 0.5 * speed / FREE / np.tan(FREE * np.pi / omega)
     assert captured == pytest.approx(np.hypot(height - sigma, 0.5 * speed / omega), abs=1e-8)
+    # the branch reaches as far: its last point leaves as slowly as it may
+    (branch,) = found.branches
+    last = 0 if branch.ends[0] == "capture" else -1
+    assert branch.parameter[last] == pytest.approx(captured, abs=1e-4)
+    assert 0.0 < branch.reading.rebound_speed_nm_per_us[last, 0] < 0.02 * speed
 
     # the fold: the smallest amplitude that closes eq. 9 for any speed
     def amplitude(u: float) -> float:

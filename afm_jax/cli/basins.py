@@ -66,7 +66,7 @@ def command(
 
     from afm_jax.dynamics.basins import basins_of_attraction  # noqa: PLC0415
     from afm_jax.dynamics.motion_bands import drawn_shares  # noqa: PLC0415
-    from afm_jax.dynamics.verdicts import MotionKind  # noqa: PLC0415
+    from afm_jax.dynamics.verdicts import WHY_UNRESOLVED, MotionKind  # noqa: PLC0415
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
     loaded, _ = scene_and_start(scene)
@@ -122,7 +122,7 @@ def command(
         if attractor.kind == MotionKind.UNRESOLVED
     )
     if unresolved:
-        raise NotValid(f"{100.0 * unresolved:.3g} % of the starts could not be followed")
+        raise NotValid(f"{100.0 * unresolved:.3g} % of the starts could not be followed: they come {WHY_UNRESOLVED}")
 
 
 def _write(session: Session, found: "Basins") -> None:
