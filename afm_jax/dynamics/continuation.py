@@ -104,9 +104,7 @@ def continue_orbits(
                 ways.append(way)
     branches = tuple(_branch(way, frame, equations) for way in ways)
     special = tuple(
-        point
-        for number, (way, branch) in enumerate(zip(ways, branches, strict=True))
-        for point in special_points_of(way, branch, number, frame, equations)
+        point for number, way in enumerate(ways) for point in special_points_of(way, number, frame, equations)
     )
     curves = ()
     if second is not None:
