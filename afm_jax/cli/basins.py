@@ -108,7 +108,7 @@ def command(
     }
     lines = [
         f"{one['name']}: {100.0 * one['share']:.4g} +- {100.0 * one['share_error']:.2g} % of the starts"
-        + ("" if band is None else "; {:.4g} to {:.4g} % of 95 % of the draws".format(*(100.0 * band[index])))
+        + ("" if band is None else "; {:.4g} to {:.4g} % in 95 % of the draws".format(*(100.0 * band[index])))
         for index, one in enumerate(attractors)
     ]
     if np.isfinite(found.boundary_dimension):
