@@ -140,12 +140,35 @@ def test_a_curve_in_two_parameters_is_eq_8_all_along(doubled: Continuation):
 def test_with_adhesion_a_branch_turns_at_a_fold_and_ends_at_capture():
     # Undamped, eq. 9 closed for the capture speed u = sqrt(epsilon)/r: then w = 0, V' = u/2 = v_p.
     r, epsilon, n, sigma = 0.95, 60.0, 1.01, -1.0
-    found = continue_orbits(scene(4.0, n, r, epsilon), 1, ParameterRange("platform.amplitude_nm", 0.5, 6.0))
+    given, second = (
+        ParameterRange("platform.amplitude_nm", 0.5, 6.0),
+        ParameterRange("platform.reduced_frequency", 0.8, 1.1),
+    )
+    found = continue_orbits(scene(4.0, n, r, epsilon), 1, given, second=second)
     (captured,) = only(found, "capture")
     speed = np.sqrt(epsilon) / r
     omega = 2.0 * n * FREE
     height = 0.5 * speed / FREE / np.tan(FREE * np.pi / omega)
     assert captured == pytest.approx(np.hypot(height - sigma, 0.5 * speed / omega), abs=1e-8)
+    # the branch reaches as far: its last point leaves as slowly as it may
+    (branch,) = found.branches
+    last = 0 if branch.ends[0] == "capture" else -1
+    assert branch.parameter[last] == pytest.approx(captured, abs=1e-4)
+    assert 0.0 < branch.reading.rebound_speed_nm_per_us[last, 0] < 0.02 * speed
+
+    # Where the tip and the platform leave one another with no acceleration either, the tip grazes as it leaves: from
+    # there on the captured orbit passes through the platform.
+    def rises(n: float) -> float:
+        height = 0.5 * speed / FREE / np.tan(0.5 * np.pi / n)
+        return (2.0 * n) ** 2 * (height - sigma) - height
+
+    held = root_of(rises, 0.85, 0.95)
+    (curve,) = (curve for curve in found.curves if curve.kind == "capture")
+    (meeting,) = curve.meetings
+    assert (meeting.kind, meeting.second) == ("capture_grazing", pytest.approx(held, abs=1e-8))
+    assert ((curve.second > held) == curve.admissible).all()
+    beyond = continue_orbits(scene(4.0, 0.87, r, epsilon), 1, given)
+    assert not any(point.admissible for point in beyond.special if point.kind == "capture")
 
     # the fold: the smallest amplitude that closes eq. 9 for any speed
     def amplitude(u: float) -> float:

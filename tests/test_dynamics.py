@@ -285,6 +285,9 @@ def test_commands_write_tables_and_pictures(tmp_path: Path):
     group = zarr.open_group(str(tmp_path / "arrays" / "chart.zarr"), mode="r")
     assert (group.attrs["x"], group.attrs["y"]) == (FREQUENCY, "platform.amplitude_nm")
     arrays = {name: np.asarray(part) for name, part in group.arrays()}
+    told = json.loads((tmp_path / "arrays" / "chart.zarr" / "stable" / "zarr.json").read_text(encoding="utf-8"))
+    assert told["dimension_names"] == ["order", "y", "x"]
+    assert arrays["order"].tolist() == [1, 2]
     with (tmp_path / "chart" / "chart.csv").open(encoding="utf-8") as table:
         rows = list(csv.DictReader(table))
     for name in ("stable", "admissible"):

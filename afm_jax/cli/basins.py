@@ -66,7 +66,7 @@ def command(
 
     from afm_jax.dynamics.basins import basins_of_attraction  # noqa: PLC0415
     from afm_jax.dynamics.motion_bands import drawn_shares  # noqa: PLC0415
-    from afm_jax.dynamics.verdicts import MotionKind  # noqa: PLC0415
+    from afm_jax.dynamics.verdicts import WHY_UNRESOLVED, MotionKind  # noqa: PLC0415
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
     loaded, _ = scene_and_start(scene)
@@ -108,7 +108,7 @@ def command(
     }
     lines = [
         f"{one['name']}: {100.0 * one['share']:.4g} +- {100.0 * one['share_error']:.2g} % of the starts"
-        + ("" if band is None else "; {:.4g} to {:.4g} % of 95 % of the draws".format(*(100.0 * band[index])))
+        + ("" if band is None else "; {:.4g} to {:.4g} % in 95 % of the draws".format(*(100.0 * band[index])))
         for index, one in enumerate(attractors)
     ]
     if np.isfinite(found.boundary_dimension):
@@ -122,7 +122,7 @@ def command(
         if attractor.kind == MotionKind.UNRESOLVED
     )
     if unresolved:
-        raise NotValid(f"{100.0 * unresolved:.3g} % of the starts could not be followed")
+        raise NotValid(f"{100.0 * unresolved:.3g} % of the starts could not be followed: they come {WHY_UNRESOLVED}")
 
 
 def _write(session: Session, found: "Basins") -> None:

@@ -145,13 +145,17 @@ def _write(
     if probability is not None:
         parts["stable_probability"] = probability
     if zarr:
+        import numpy as np  # noqa: PLC0415
         import zarr as store  # noqa: PLC0415
 
         assert session.out is not None  # asked before  # noqa: S101
         group = store.open_group(str(session.out / "chart.zarr"), mode="w")
+        axes = {"order": np.arange(1, chart.orders + 1), "y": chart.y_values, "x": chart.x_values}
         for name, part in parts.items():
-            group[name] = part.reshape(-1, len(chart.y_values), len(chart.x_values))
-        group["x"], group["y"] = chart.x_values, chart.y_values
+            whole = part.reshape([len(values) for values in axes.values()])
+            group.create_array(name, data=whole, dimension_names=tuple(axes))
+        for name, values in axes.items():
+            group.create_array(name, data=values, dimension_names=(name,))
         group.attrs["x"], group.attrs["y"] = across.path, up.path
         session.note(f"wrote {session.out / 'chart.zarr'}")
         return

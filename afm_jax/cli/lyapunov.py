@@ -113,7 +113,10 @@ def command(  # noqa: PLR0913
         payload |= {"parameter": ranges[0].path, "values": given[ranges[0].path]}
         session.emit(payload, _summary(many, str(ranges[0])))
     else:
-        session.emit(payload, *_text(found, verdicts[0]))
+        drawn = (
+            [] if band is None else ["the larger per impact: {:.6g} to {:.6g} in 95 % of the draws".format(*band[0])]
+        )
+        session.emit(payload, *_text(found, verdicts[0]), *drawn)
     if reason is not None:
         raise NotValid(reason)
 

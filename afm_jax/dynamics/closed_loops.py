@@ -81,10 +81,12 @@ def split_point(point: Array, equations: Equations) -> tuple[Array, Array]:
     return point[:count], point[count:]
 
 
-def _tests(unknowns: Array, frame: Frame, loop: ImpactLoop, samples: int) -> list[Array]:
+def _tests(unknowns: Array, frame: Frame, loop: ImpactLoop, equations: Equations) -> list[Array]:
     """Return the test functions in the order of `KINDS`, without dimension."""
     trace, determinant = trace_and_determinant_of(unknowns, frame.scale, loop)
-    near = nearest_approach(unknowns, frame.scale, loop, samples).gap_nm
+    near = nearest_approach(unknowns, frame.scale, loop, equations.samples).gap_nm
+    if equations.kind == CAPTURE:
+        near = jnp.minimum(near, _rise_when_captured(unknowns, frame, loop))
     slowest = jnp.min(unknowns[unknowns.shape[0] // 2 :], initial=jnp.inf)
     return [
         1.0 - trace + determinant,
@@ -95,6 +97,18 @@ def _tests(unknowns: Array, frame: Frame, loop: ImpactLoop, samples: int) -> lis
     ]
 
 
+def _rise_when_captured(unknowns: Array, frame: Frame, loop: ImpactLoop) -> Array:
+    """Return how the gap opens after the slowest impact, which leaves without speed: z'' - z_p'' over Omega^2, in nm.
+
+    Where it is negative the tip passes through the surface, in a dip too shallow and short to be seen among samples.
+    """
+    impacts = impacts_at(unknowns, frame.scale, loop)
+    slowest = jnp.argmin(unknowns[unknowns.shape[0] // 2 :])
+    leaving, height, velocity = impacts.leaving_us[slowest], impacts.height[slowest], impacts.velocity[slowest]
+    omega, decay = loop.cantilever.angular_frequency, loop.cantilever.decay_rate
+    return -height - (2.0 * decay * velocity + jax.grad(loop.surface.velocity)(leaving)) / omega**2
+
+
 def equations_at(point: Float[Array, " n"], frame: Frame, equations: Equations) -> Float[Array, " rows"]:
     """Return what is to be 0 at unknowns followed by the parameters' shares."""
     unknowns, shares = split_point(point, equations)
@@ -102,7 +116,7 @@ def equations_at(point: Float[Array, " n"], frame: Frame, equations: Equations) 
     gaps = closing_gaps(unknowns, frame.scale, loop)
     if equations.kind is None:
         return gaps
-    test = _tests(unknowns, frame, loop, equations.samples)[equations.kind]
+    test = _tests(unknowns, frame, loop, equations)[equations.kind]
     return jnp.append(gaps, test)
 
 
@@ -142,7 +156,7 @@ def _step(frame: Frame, guess: Array, row: Array, equations: Equations) -> Curve
     tangent = tangent / jnp.linalg.norm(tangent)
     unknowns, shares = split_point(point, equations)
     loop = loop_at(shares, frame, equations)
-    tests = _tests(unknowns, frame, loop, equations.samples)
+    tests = _tests(unknowns, frame, loop, equations)
     delay = jnp.zeros(())
     if loop.impact.delayed:
         delays = impacts_at(unknowns, frame.scale, loop).speeds.delay

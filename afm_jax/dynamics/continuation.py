@@ -7,16 +7,15 @@ solved at a point of it is in `closed_loops`, special points and their curves in
 from collections.abc import Sequence
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.checks import require_float64
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.closed_loops import Equations, Frame, frame_of, read_points
+from afm_jax.dynamics.closed_loops import CAPTURE, Equations, Frame, frame_of, read_points
 from afm_jax.dynamics.contact_orbits import ContactFlights, contact_loops
-from afm_jax.dynamics.curves import FollowedCurve, followed_both_ways, lies_on
+from afm_jax.dynamics.curves import CurveLeg, FollowedCurve, followed_both_ways, lies_on, root_on, tested_by
 from afm_jax.dynamics.impact_loop import coordinate_of, driven_part, samples_for
 from afm_jax.dynamics.impact_orbits import MOST_IMPACTS, many_impact_orbits
 from afm_jax.dynamics.special_points import OrbitBranch, SpecialCurve, SpecialPoint, special_curves, special_points_of
@@ -27,6 +26,8 @@ from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, para
 
 _VALUES_TRIED = 9
 _FEWER_TRIED = 3
+_BEFORE_CAPTURE = 1e-6
+"""Of the last step's way to capture: there the orbit still exists."""
 
 
 @public_result(picture="afm_jax.plots.branches:continuation_figure", rows="points")
@@ -103,13 +104,8 @@ def continue_orbits(
                 ways.append(way)
     branches = tuple(_branch(way, frame, equations) for way in ways)
     special = tuple(
-        point
-        for number, (way, branch) in enumerate(zip(ways, branches, strict=True))
-        for point in special_points_of(way, branch, number, frame, equations)
+        point for number, way in enumerate(ways) for point in special_points_of(way, number, frame, equations)
     )
-    # the point behind a capture at the beginning goes
-    special = tuple(one._replace(position=one.position - (ways[one.branch].ends[0] == "capture")) for one in special)
-    branches = tuple(map(_before_capture, branches))
     curves = ()
     if second is not None:
         wide, own = frame_of(scene, order, scale, ranges), parameter_values(scene)[second.path]
@@ -180,17 +176,17 @@ def _single_impact_loops(scene: Scene, order: int) -> tuple[Float[np.ndarray, "o
 
 
 def _branch(way: FollowedCurve, frame: Frame, equations: Equations) -> OrbitBranch:
+    """Return what there is to know of a curve; where it ends at capture its last point is the one just before."""
     points = way.points
+    for end, legs, place in ((way.ends[0], way.behind, 0), (way.ends[1], way.ahead, -1)):
+        if end == "capture":
+            points[place] = _before_capture(legs[-1], frame, equations)
     value = float(frame.low[0]) + float(frame.width[0]) * points[:, -1]
     return OrbitBranch(value, points[:, :-1], read_points(points, frame, equations), way.ends)
 
 
-def _before_capture(branch: OrbitBranch) -> OrbitBranch:
-    """Return a branch without the point after its end by capture, where there is no orbit."""
-    inside = slice(int(branch.ends[0] == "capture"), len(branch.parameter) - int(branch.ends[1] == "capture"))
-    return OrbitBranch(
-        branch.parameter[inside],
-        branch.unknowns[inside],
-        jax.tree.map(lambda part: part[inside], branch.reading),
-        branch.ends,
-    )
+def _before_capture(leg: CurveLeg, frame: Frame, equations: Equations) -> Float[np.ndarray, " n"]:
+    """Return the last point of a leg before capture, to a millionth of the way."""
+    root = root_on(leg, tested_by(CAPTURE, equations), frame, equations)
+    step = None if root is None else leg.at((1.0 - _BEFORE_CAPTURE) * root[0], frame, equations)
+    return leg.begin.point if step is None else step.point

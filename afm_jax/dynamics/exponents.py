@@ -31,7 +31,7 @@ from afm_jax.dynamics.iteration import (
     sample_driven,
     skipped,
 )
-from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Verdicts, verdicts_of
+from afm_jax.dynamics.verdicts import RECORDED, WHY_UNRESOLVED, MotionKind, Verdicts, verdicts_of
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
 from afm_jax.impact.lasting_impact import LawImpact
 from afm_jax.impact.law import impact_law_of
@@ -97,8 +97,10 @@ def exponent_verdicts(found: Lyapunov) -> list[str]:
             words.append("chaotic: the larger exponent is positive")
         elif kind == MotionKind.IRREGULAR:
             words.append("undecided: nothing repeats, and the larger exponent is not clearly positive")
+        elif kind == MotionKind.FREE:
+            words.append("free: the tip no longer meets the platform")
         else:
-            words.append("free: the tip no longer meets the platform" if kind == MotionKind.FREE else "unresolved")
+            words.append(f"unresolved: the motion comes {WHY_UNRESOLVED}")
     return words
 
 

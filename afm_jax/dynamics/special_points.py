@@ -39,6 +39,8 @@ from afm_jax.dynamics.curves import (
 from afm_jax.dynamics.impact_loop import LoopReading
 from afm_jax.scenefile.parameter_paths import ParameterRange
 
+_ASIDE = 1e-5
+"""Of a step between points: how far to either side of a grazing or a capture is looked."""
 _AT_AN_END = 1e-4
 """Test function below which a contact's curve has been lost at its root."""
 _LONG_ENOUGH = 1e-5
@@ -92,32 +94,43 @@ class SpecialCurve(NamedTuple):
     ends: tuple[str, str]
 
 
-def special_points_of(
-    way: FollowedCurve, branch: OrbitBranch, number: int, frame: Frame, equations: Equations
-) -> list[SpecialPoint]:
+def special_points_of(way: FollowedCurve, number: int, frame: Frame, equations: Equations) -> list[SpecialPoint]:
     """Return the special points of a branch in their order along it, and where a contact's curve was lost at one."""
     found = []
     for leg, place in way.places():
         for test in range(len(KINDS)):
             root = root_on(leg, tested_by(test, equations), frame, equations)
             if root is not None and (test != TORUS or _is_complex(root[1])):
-                found.append((place(root[0]), test, root[1], root[1].point))
+                share, step = root
+                position = place(share)
+                if test == CAPTURE:
+                    # there the branch ends: its last point is beside it
+                    position = 0.0 if position < 1.0 and way.ends[0] == "capture" else np.ceil(position)
+                found.append((position, test, step, [step.point, *_beside(leg, share, test, frame, equations)]))
     if equations.flights is not None:
-        found += _at_lost_ends(way)
+        found += [(place, test, step, [seen]) for place, test, step, seen in _at_lost_ends(way)]
     if not found:
         return []
     found.sort(key=lambda one: one[0])
-    reading = read_points(np.stack([seen for *_, seen in found]), frame, equations)
+    reading = read_points(np.stack([point for *_, seen in found for point in seen]), frame, equations)
     low, width = float(frame.low[0]), float(frame.width[0])
-    special = []
-    for index, (place, test, step, _) in enumerate(found):
-        own = jax.tree.map(lambda part, index=index: part[index], reading)
-        beside = branch.reading.admissible[[int(np.floor(place)), int(np.ceil(place))]]
-        flown = bool(beside.any()) if test in (GRAZING, CAPTURE) else bool(own.admissible)
+    special, first = [], 0
+    for place, test, step, seen in found:
+        own = jax.tree.map(lambda part, first=first: part[first], reading)
+        flown = bool(reading.admissible[first : first + len(seen)].any())
+        first += len(seen)
         kind = _kind_of(test, step, frame, equations)
         parameter = low + width * float(step.point[-1])
         special.append(SpecialPoint(kind, parameter, number, place, flown, step.point[:-1], own, test))
     return special
+
+
+def _beside(leg: CurveLeg, share: float, test: int, frame: Frame, equations: Equations) -> list[np.ndarray]:
+    """Return the points on either side of a grazing or a capture: on one of them the orbit may be flown."""
+    if test not in (GRAZING, CAPTURE):
+        return []
+    steps = (leg.at(share + apart, frame, equations) for apart in (-_ASIDE, _ASIDE))
+    return [step.point for step in steps if step is not None]
 
 
 def _at_lost_ends(way: FollowedCurve) -> list[tuple[float, int, CurvePoint, np.ndarray]]:

@@ -23,7 +23,13 @@ class MotionKind(enum.IntEnum):
     FREE = 3
     """The tip no longer meets the platform."""
     UNRESOLVED = 4
-    """A search gave up, or the start was no flight."""
+    """It could not be followed (`WHY_UNRESOLVED`)."""
+
+
+WHY_UNRESOLVED = (
+    "so close to capture that a law's delay puts the tip inside the platform, or further than a search for the next "
+    "impact goes"
+)
 
 
 class Verdicts(NamedTuple):

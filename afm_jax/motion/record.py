@@ -39,7 +39,10 @@ _SENTENCES = {
     MotionOutcome.STEP_LIMIT: "The motion took more steps than it was given (max_rounds), or a search did not end.",
     MotionOutcome.INVALID_START: "The start is not finite, or inside the sample.",
     MotionOutcome.NO_JUNCTION: "With these parameters no junction forms: force and stiffness are equal nowhere.",
-    MotionOutcome.UNRESOLVED: "An integration step left the range of the forces; the motion is not trusted beyond.",
+    MotionOutcome.UNRESOLVED: (
+        "An integration step left the range of the forces, or close to capture a law's delay put the tip inside the "
+        "sample; the motion is not trusted beyond."
+    ),
 }
 
 

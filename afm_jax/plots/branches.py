@@ -147,7 +147,11 @@ def draw_curves(found: Continuation, path: Path) -> None:
     for curve in found.curves:
         _, colour = _MARKS[curve.kind]
         for flown, line in ((True, "-"), (False, ":")):
-            shown = np.where(curve.admissible == flown, curve.second, np.nan)
+            here = curve.admissible == flown
+            if not flown:
+                # up to the next point of the other kind
+                here = np.convolve(here, [True, True, True], mode="same")
+            shown = np.where(here, curve.second, np.nan)
             if np.isfinite(shown).any():
                 name = curve.kind.replace("_", " ") + ("" if flown else ", passes through the sample")
                 axes.plot(curve.parameter, shown, line, color=colour, linewidth=1.8, label=_once(name, labels))

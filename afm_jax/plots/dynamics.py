@@ -1,5 +1,6 @@
 """Pictures of what motions come to: exponents, bifurcation diagrams, charts of orbits, basins."""
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from afm_jax.dynamics.bifurcations import Sweep
 from afm_jax.dynamics.charts import StabilityChart
 from afm_jax.plots.charts import cell_edges
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save, with_zero_line
+from afm_jax.results import unit_of, words_of
 
 KINDS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#8c6bb1", "#a6761d", "#999999")
 """Colours that stand apart for every kind of colour vision (Okabe and Ito's, and three more)."""
@@ -28,33 +30,21 @@ _LABELS = {
     "interaction.epsilon": r"adhesion loss  $\epsilon$ (nm$^2$/$\mu$s$^2$)",
     "interaction.viscous_loss": r"viscous loss (nm/$\mu$s)",
 }
-_UNITS = {
-    "_nm_per_us": r"nm/$\mu$s",
-    "_per_us": r"1/$\mu$s",
-    "_us": r"$\mu$s",
-    "_aj": "aJ",
-    "_nn": "nN",
-    "_deg": "degrees",
-    "_rad": "rad",
-    "_khz": "kHz",
-    "_n_per_m": "N/m",
-    "_j_per_m2": r"J/m$^2$",
-    "_pa_s": "Pa s",
-    "_gpa": "GPa",
-    "_nm": "nm",
-    "_ng": "ng",
-    "_k": "K",
-}
 
 
 def label_of(path: str) -> str:
-    """Return what an axis says of a parameter, with its unit."""
+    """Return what an axis says of a parameter, with its unit.
+
+    >>> label_of("force.free_amplitude_nm"), label_of("interaction.adhesion_energy_j_per_m2")
+    ('force free amplitude (nm)', 'adhesion energy (J/m$^2$)')
+    """
     if path in _LABELS:
         return _LABELS[path]
-    key = path.rpartition(".")[2]
-    suffix = next((suffix for suffix in _UNITS if key.endswith(suffix)), "")
-    words = key.removesuffix(suffix).replace("_", " ")
-    return f"{words} ({_UNITS[suffix]})" if suffix else words
+    *tables, key = path.split(".")
+    words, unit = words_of(key), unit_of(key).replace("us", r"$\mu$s")
+    words = " ".join([*(table for table in tables[-1:] if table not in ("platform", "interaction")), words])
+    unit = re.sub(r"\^(\d)", r"$^\1$", unit)
+    return f"{words} ({unit})" if unit else words
 
 
 def draw_exponents(
@@ -128,7 +118,10 @@ def draw_bifurcations(
             axes.fill_between(sweep.values, 0.0, 1.0, where=sure < 0.95, color=GRID, alpha=0.3, lw=0, transform=ground)
     label_axes(panels[0], x="", y="height at impact (nm)")
     label_axes(panels[1], x=label_of(path), y="height at drive phase 0 (nm)")
-    panels[0].margins(x=0.5 / len(sweeps[0].values))
+    # also where the tip is stuck and there is nothing to draw
+    ends = [end for sweep in sweeps for end in (sweep.values.min(), sweep.values.max())]
+    margin = 0.5 * (max(ends) - min(ends)) / len(sweeps[0].values)
+    panels[0].set_xlim(min(ends) - margin, max(ends) + margin)
     for axes in panels:
         axes.grid(color=GRID, alpha=0.25)
     handles, labels = panels[0].get_legend_handles_labels()

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from afm_jax.plots.picture_style import ACCENT, DARK, label_axes, new_figure
-from afm_jax.results import columns_of, unit_of
+from afm_jax.results import columns_of, unit_of, words_of
 
 _MOST_PANELS = 4
 _COLOURS = (DARK, ACCENT, "#0072B2", "#009E73", "#CC79A7", "#7a6a00")
@@ -38,7 +38,7 @@ def _curves(columns: dict[str, np.ndarray]) -> Figure:
     for number, (unit, curves) in enumerate(shown):
         axes = figure.add_subplot(len(shown), 1, number + 1)
         for colour, (name, y) in zip(_COLOURS, curves, strict=False):
-            axes.plot(x, y, marker, linestyle="-" if steady else "", color=colour, label=_words(name), markersize=4)
+            axes.plot(x, y, marker, linestyle="-" if steady else "", color=colour, label=words_of(name), markersize=4)
         label_axes(axes, x=_label(first) if number == len(shown) - 1 else "", y=unit)
         axes.legend(frameon=False, fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5))
     return figure
@@ -53,18 +53,6 @@ def _map(name: str, plane: np.ndarray) -> Figure:
     return figure
 
 
-def _words(name: str) -> str:
-    unit = next(
-        (
-            end
-            for end in ("_nm_per_us", "_per_us", "_nm", "_us", "_deg", "_rad", "_aj", "_nn", "_khz")
-            if name.endswith(end)
-        ),
-        "",
-    )
-    return name.removesuffix(unit).replace("_", " ")
-
-
 def _label(name: str) -> str:
     unit = unit_of(name)
-    return f"{_words(name)} ({unit})" if unit else _words(name)
+    return f"{words_of(name)} ({unit})" if unit else words_of(name)

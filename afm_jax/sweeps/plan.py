@@ -13,34 +13,14 @@ from typing import Any
 import jax
 import numpy as np
 
+from afm_jax.results import unit_of as unit_of_field
 from afm_jax.strict_json import strict_json
 from afm_jax.sweeps.axes import Axis, axes_of, dimension_of
 from afm_jax.version import version_of
 
 _PACKAGES = ("afm-jax", "jax", "jaxlib", "numpy", "scipy")
-_UNITS = (
-    ("_nm_per_us", "nm/us"),
-    ("_cm3_per_mol", "cm3/mol"),
-    ("_j_per_m2", "J/m2"),
-    ("_n_per_m", "N/m"),
-    ("_per_us", "1/us"),
-    ("_per_impact", "1"),
-    ("_j_m6", "J m6"),
-    ("_pa_s", "Pa s"),
-    ("_gpa", "GPa"),
-    ("_khz", "kHz"),
-    ("_deg", "degrees"),
-    ("_rad", "rad"),
-    ("_nm", "nm"),
-    ("_nn", "nN"),
-    ("_ng", "ng"),
-    ("_us", "us"),
-    ("_aj", "aJ"),
-    ("_k", "K"),
-    ("epsilon", "nm2/us2"),
-    ("viscous_loss", "nm/us"),
-    ("hertz", "us (nm/us)^(1/5)"),
-)
+_NAMED = {"epsilon": "nm2/us2", "viscous_loss": "nm/us", "hertz": "us (nm/us)^(1/5)"}
+"""Units of parameters whose names do not say them."""
 
 Columns = dict[str, Any]
 """Arrays of one row a point, by name; JAX's or NumPy's."""
@@ -111,7 +91,8 @@ def unit_of(name: str) -> str:
     ('nm', '1')
     """
     plain = name.rpartition(".")[2].removesuffix("_error")
-    return next((unit for ending, unit in _UNITS if plain.endswith(ending)), "1")
+    named = next((unit for ending, unit in _NAMED.items() if plain.endswith(ending)), "")
+    return named or unit_of_field(plain).replace("^", "") or "1"
 
 
 def versions() -> dict[str, str]:
