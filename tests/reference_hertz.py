@@ -18,12 +18,12 @@ DEEPEST = 1.25**0.4
 HERTZ_TIME = 0.8 * DEEPEST * beta(0.4, 0.5)
 
 
-def under_pull(kappa: float) -> tuple[float, float]:
-    """Return F, the duration over T, and H, the integral of x over T^2."""
+def under_pull(kappa: float, stiffness: float = 0.0) -> tuple[float, float]:
+    """Return F, the duration over T, and H, the integral of x over T^2; with a spring, -stiffness x, too."""
     c, high = kappa / HERTZ_TIME, 1.0
 
     def squared_speed(x: float) -> float:
-        return 1.0 - 2.0 * c * x - 0.8 * x**2.5
+        return 1.0 - 2.0 * c * x - 0.8 * x**2.5 - stiffness * x * x
 
     while squared_speed(high) > 0.0:
         high *= 2.0
@@ -34,7 +34,7 @@ def under_pull(kappa: float) -> tuple[float, float]:
         def inner(s: float) -> float:
             x, below = turn * (1.0 - s * s), turn * s * s
             bend = (turn**2.5 - x**2.5) / below if below > 1e-9 * turn else 2.5 * turn**1.5
-            return weight(x) * 4.0 * np.sqrt(turn) / np.sqrt(2.0 * c + 0.8 * bend)
+            return weight(x) * 4.0 * np.sqrt(turn) / np.sqrt(2.0 * c + 0.8 * bend + stiffness * (turn + x))
 
         return quad(inner, 0.0, 1.0, epsabs=1e-13, epsrel=1e-13)[0]
 

@@ -37,8 +37,7 @@ def closing_impacts(p: Parameters, order: int, approach: Floats) -> Impacts:
     k = constants(p, np)
     hertz, lead, offset = p.delay
     free = outgoing(k, approach, np)
-    lasting = hertz * approach**-0.2
-    straight = lasting - lead * (1.0 / free - 1.0 / approach) - offset / approach
+    straight = hertz * approach**-0.2 - lead * (1.0 / free - 1.0 / approach) - offset / approach
     rebound, delay = free, straight
     for _ in range(12):
         cosine, sine = _phase(p, order, approach, rebound, delay)
@@ -48,17 +47,21 @@ def closing_impacts(p: Parameters, order: int, approach: Floats) -> Impacts:
         pull = -(k.free**2) * height - 2.0 * k.decay * speed + k.amplitude * k.drive**2 * np.cos(middle)
         bend = -k.amplitude * k.drive**2 * np.cos(middle)
         jerk = (k.drive**2 - k.free**2) * speed - 2.0 * k.decay * bend
-        g, j = pull * lasting / approach, jerk * lasting**2 / approach
+        # the surface is half the offset above gap 0
+        hit = np.sqrt(np.maximum(approach**2 + pull * offset, (0.1 * approach) ** 2))
+        lasting = hertz * hit**-0.2
+        g, j = pull * lasting / hit, jerk * lasting**2 / hit
         kappa = np.clip(g, *PULLS)
         slope, deep, over = (np.polynomial.polynomial.polyval(kappa, row) for row in SERIES)
         longer, depth = 1.0 + kappa * slope / over, deep / over
         air = 2.0 * (longer - 1.2 * kappa * depth) / 1.8
         gain = 2.0 * depth * j - 2.0 * air * k.decay * lasting
-        rebound = np.sqrt(np.maximum(free**2 + gain * approach**2, 0.01 * free**2))
+        rebound = np.sqrt(np.maximum(free**2 + gain * hit**2, 0.01 * free**2))
         # to first order in a spring a period is shorter by the energy's slope of its share of the action
         longer = longer - 1.0 - 0.7 * beta(1.2, 0.5) / beta(0.4, 0.5) * (DEEPEST / HERTZ_TIME * k.free * lasting) ** 2
         held = _later(free, BRIDGE_NM, pull) - _later(approach, BRIDGE_NM, pull)
-        delay = straight + longer * lasting - lead / (1.3 * BRIDGE_NM) * held
+        above = _later(approach, 0.5 * offset, pull) + _later(free, 0.5 * offset, pull)
+        delay = straight + (1.0 + longer) * lasting - hertz * approach**-0.2 - above - lead / (1.3 * BRIDGE_NM) * held
     return Impacts(approach, rebound, delay, *_phase(p, order, approach, rebound, delay))
 
 

@@ -15,6 +15,7 @@ from afm_jax.contact.bent_lever import tapped
 from afm_jax.contact.contact import Contact
 from afm_jax.impact.closure import OrbitProblem
 from afm_jax.impact.orbits import steady_orbits
+from afm_jax.impact.roots import TAPPED, Scan, find_roots
 from fitting import read_table
 from tests.reference_contact_forces import ContactParameters
 from tests.reference_driven_contact import DrivenContact, follow
@@ -83,3 +84,23 @@ def test_taps_are_read_as_full_simulations_are(name: str):
         assert steady
         assert amplitude == pytest.approx(table.lockin_amplitude_nm[row], rel=1e-4)
         assert (lag - table.phase_lag_deg[row] + 180.0) % 360.0 - 180.0 == pytest.approx(0.0, abs=0.006)
+
+
+@pytest.mark.slow
+def test_light_and_hard_taps_beside_each_other_are_both_found():
+    """A row of a fit on its way: orbits 0.1 nm/us apart to either side of the first hard tap, where the scan jumps."""
+    found: dict[str, Any] = {"relative_humidity": 0.327516, "adhesion_energy_j_per_m2": 0.154908, "viscosity_pa_s": 0.0}
+    contact = Contact.paper(tip_radius_nm=15.0, modulus_gpa=43.4047, **found)
+    lever = Cantilever(89.9984, 136.187, MASS_NG)
+    impact = tapped(contact, lever, jnp.array([1.5, 26.0]))
+    platform = Platform(80.04042, 90.0, -70.4127964 + impact.plane_nm)
+    problem = OrbitProblem(lever, platform, impact, jnp.ones(()))
+    dense = Scan(8192, 0.1, 1.0, crossings=6, turns=2, slots=6)
+    some, all_of = (jax.jit(find_roots, static_argnums=1)(problem, scan) for scan in (TAPPED, dense))
+    # from the jump between them Newton's method goes to either
+    speeds, expected = (
+        np.unique(np.asarray(one.place.coordinate)[np.asarray(one.found)].round(8)) for one in (some, all_of)
+    )
+    assert len(expected) == 2
+    assert expected[1] - expected[0] < 0.15
+    np.testing.assert_allclose(speeds, expected, rtol=1e-7)

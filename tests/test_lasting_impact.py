@@ -17,11 +17,14 @@ from afm_jax.impact.lasting_impact import (
     AIR,
     BRIDGE_NM,
     PULLS,
+    SHALLOWER,
+    SPREAD,
     STIFFER,
     USUAL_LEAD,
     LawImpact,
     Middle,
     corrected,
+    depth_of_impact,
     hertz_under_pull,
     indentation,
     middle_of_contact,
@@ -98,7 +101,8 @@ def test_a_pull_acts_as_on_an_integrated_hertz_contact():
     assert float(hertz_under_pull(jnp.array(0.0))[0]) == 1.0
     depth = 0.8 * DEEPEST**2 * beta(0.8, 0.5) / HERTZ_TIME**2
     still = Middle(jnp.array(0.0), jnp.array(0.0))
-    assert float(indentation(jnp.array(2.0), jnp.array(3.0), still)) == pytest.approx(18.0 * depth, rel=1e-6)
+    found = indentation(jnp.array(2.0), jnp.array(3.0), still, UNDAMPED, 0.0)
+    assert float(found) == pytest.approx(18.0 * depth, rel=1e-6)
     assert pytest.approx(1.6 * DEEPEST * beta(0.4, 1.5) / HERTZ_TIME, rel=1e-12) == AIR
 
 
@@ -125,6 +129,46 @@ def test_a_spring_shortens_a_contact():
     assert float(found.rebound) == 1.0
     deepest = DEEPEST / HERTZ_TIME
     assert pytest.approx(0.7 * beta(1.2, 0.5) / beta(0.4, 0.5) * deepest**2, rel=1e-10) == STIFFER
+
+
+def test_a_spring_and_a_lockin_make_an_indentation_count_less():
+    deeper, shallower = (under_pull(0.0, stiffness)[1] for stiffness in (-1e-3, 1e-3))
+    share = (deeper - shallower) / (deeper + shallower) / (1e-3 * HERTZ_TIME**2)
+    assert share == pytest.approx(SHALLOWER, rel=1e-4)
+    times = np.linspace(0.0, HERTZ_TIME, 2001)
+    depth = solve_ivp(lambda _, x: [x[1], -(max(x[0], 0.0) ** 1.5)], (0.0, 4.0), [0.0, 1.0], t_eval=times, rtol=1e-10)
+    from_middle = (times / HERTZ_TIME - 0.5) ** 2
+    assert np.sum(depth.y[0] * from_middle) / np.sum(depth.y[0]) == pytest.approx(SPREAD, rel=1e-4)
+    cantilever, still = afm.Cantilever(8.0), Middle(jnp.array(0.0), jnp.array(0.0))
+    found = indentation(jnp.array(1.0), jnp.array(1.0), still, cantilever, 0.3)
+    missed = SHALLOWER * (0.016 * np.pi) ** 2 + 0.045 * SPREAD
+    assert float(found) == pytest.approx(under_pull(0.0)[1] * (1.0 - missed), rel=1e-6)
+
+
+@pytest.mark.parametrize("pull", [-0.2, 0.2, 0.4])
+def test_a_delay_with_an_offset_is_that_of_a_raised_surface(pull):
+    """Parabolas to gap 0 from a Hertz contact whose surface stands above it, and what they leave of the way below."""
+    raised, coming = 0.3, np.sqrt(1.0 + 0.6 * pull)
+    beside = (coming - 1.0) / pull  # from the surface to gap 0, and as long back
+
+    def motion(_, state):
+        return [state[1], max(raised - state[0], 0.0) ** 1.5 + pull]
+
+    def out(_, state):
+        return state[0] - raised
+
+    setattr(out, "terminal", True)  # noqa: B010
+    setattr(out, "direction", 1.0)  # noqa: B010
+    end = solve_ivp(motion, (0.0, 10.0), [raised, -coming], events=out, rtol=1e-11, atol=1e-13, dense_output=True)
+    leaves = float(end.t_events[0][0])
+    times, way = np.linspace(0.0, leaves, 2001), np.linspace(0.0, beside, 2001)
+    flown = 2.0 * np.trapezoid(raised - coming * way + 0.5 * pull * way**2, way)
+    impact = LawImpact(ImpactLaw(1.0, delay=CollisionDelay(HERTZ_TIME, 0.0, 2.0 * raised)))
+    free = Speeds(jnp.array(1.0), jnp.array(1.0), jnp.array(HERTZ_TIME - 2.0 * raised))
+    middle = Middle(jnp.array(pull), jnp.array(0.0))
+    assert float(corrected(free, middle, UNDAMPED, impact).delay) == pytest.approx(leaves - 2.0 * beside, rel=1e-6)
+    depth = float(depth_of_impact(impact, jnp.array(1.0), middle, UNDAMPED, 0.0))
+    assert depth == pytest.approx(flown - np.trapezoid(end.sol(times)[0], times), rel=1e-5)
 
 
 def test_air_takes_what_an_integrated_damped_contact_loses():

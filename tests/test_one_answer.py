@@ -40,7 +40,7 @@ class Orbits(NamedTuple):
 def made(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return random laws (laws, 5) and drives (drives, 4): order, frequency, amplitude, offset."""
     random = np.random.default_rng(7)
-    low, high = np.array([0.9, 50.0, 0.1, -2.0, 0.0]), np.array([1.0, 130.0, 0.25, 9.0, 14.0])
+    low, high = np.array([0.9, 50.0, 0.1, -2.0, 0.0]), np.array([1.0, 130.0, 0.25, 9.0, 2.0])
     laws = random.uniform(low, high, (LAWS, 5))
     order = random.integers(1, 5, count)
     drives = [order, 180.0 * order * (1.0 + random.uniform(-0.03, 0.03, count))]

@@ -16,6 +16,7 @@ from fitting.fits.fit import fit
 from fitting.models import reach_of, rows_of, tip_work
 from fitting.tables.table import AmplitudeTable, read_table
 from tests.tapping_accuracy import (
+    FEW_SHARES,
     RATIO,
     WORST_OF_CONTACT,
     against_truth,
@@ -29,7 +30,7 @@ from tests.tapping_truths import as_measured, exact_table, tapping_truth
 
 EXAMPLE = "fitting/examples/tapping_contact.csv"
 TABLES = Path(__file__).parent / "tapping_tables"
-"""Truths of two of the random contacts of `tests.tapping_accuracy`."""
+"""Truths of three of the random contacts of `tests.tapping_accuracy`."""
 TIP = Cantilever(90.0, 200.0, 16.81)
 
 
@@ -92,6 +93,20 @@ def test_an_unseen_contact_is_predicted_and_fitted_as_wanted():
         found = fitted(truth, made)
         assert found is not None
         assert judge_fits(name, [found], exact=name == "exact") == 0
+
+
+@pytest.mark.slow
+def test_a_soft_contact_is_predicted_as_wanted_above_resonance():
+    """The softest of those of `make tapping`: its surface is 0.6 nm above gap 0, as its delays say."""
+    truth = tapping_truth(2)
+    found = forward(truth, exact_table(truth, 1.1, TABLES, FEW_SHARES))
+    nm, degrees, share = np.abs(found.nm), np.abs(found.degrees), np.abs(found.nm / found.amplitude_nm)
+    assert nm.shape == (16,)
+    assert np.min(found.speed) > 4.0
+    assert nm.max() < 0.02
+    assert degrees.max() < 0.02
+    assert np.median(share) < 1e-3
+    assert np.median(degrees) < 0.01
 
 
 @pytest.mark.slow

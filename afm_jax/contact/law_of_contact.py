@@ -483,12 +483,14 @@ def tabulated(contact: Contact, mass_ng: Float[Array, ""]) -> TabulatedImpact:
         outer_nm=outer,
         hertz=delay * u[-1] ** 0.2,
         early_nm=jnp.zeros(()),
+        raised_nm=jnp.zeros(()),
         length_nm=contact.bridge_breaks_nm,
         loss_error=_tail(loss),
         speed_error=jnp.max(jnp.abs(finer.approach_speed / u[_COMPARED] - 1.0)),
         time_error=_tail(time_terms) + jnp.max(jnp.abs(finer.time - time[_COMPARED])),
     )
-    return replace(table, early_nm=_lead(table))
+    early, raised = _lead_and_height(table)
+    return replace(table, early_nm=early, raised_nm=raised)
 
 
 def _traced_back(
@@ -529,13 +531,18 @@ def _barrier(contact: Contact, bridge: Bridge, junction: Junction, outer: Float[
     return jnp.maximum(jnp.maximum(out.max(), before.max()), 0.0)
 
 
-def _lead(table: TabulatedImpact) -> Float[Array, ""]:
-    """Return b of the delay law a u^(-1/5) - b (1/w - 1/u) - d/u closest from 2 to 30 times the capture speed."""
+def _lead_and_height(table: TabulatedImpact) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return b of the delay law a u^(-1/5) - b (1/w - 1/u) - d/u closest from 2 to 30 times the capture speed.
+
+    And half of d at the last of them, for the table's own a.
+    """
     u, w, delay = jax.vmap(table.speeds)(table.lowest * jnp.asarray(_LEAD_SPEEDS))
     terms = jnp.stack(_delay_terms(u, w), axis=1)
     scale = jnp.sqrt(jnp.sum(terms**2, axis=0))
     terms = terms / scale
-    return jnp.linalg.solve(terms.T @ terms, terms.T @ delay)[1] / scale[1]
+    lead = jnp.linalg.solve(terms.T @ terms, terms.T @ delay)[1] / scale[1]
+    early = table.hertz_time(u) - delay - lead * (1.0 / w - 1.0 / u)
+    return lead, 0.5 * (u * early)[-1]
 
 
 def _polynomials(place: Float[Array, " n"]) -> Float[Array, "n n"]:

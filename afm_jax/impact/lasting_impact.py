@@ -6,10 +6,14 @@ the Hertz time tau = a u^(-1/5), the pull g away from the sample (the tip's acce
 contact and its change j, kappa = g tau/u and J = j tau^2/u:
 
     duration              tau_d += (F(kappa) - 1 - 0.0393 (Omega tau)^2) tau
-    indentation           its integral over time is H(kappa) u tau^2
+    indentation           its integral over time is H(kappa) (1 - 0.0836 (Omega tau)^2) u tau^2
     platform and spring   u_out^2 += 2 H(kappa) J u^2
     air damping           u_out^2 -= (10/9) (F(kappa) - 1.2 kappa H(kappa)) (Omega/Q) tau u^2
     lead                  a tip that leaves keeps its energy over a length, which acceleration makes it pass sooner
+
+A delay whose offset is d is that of a surface d/2 above gap 0: the pull acts on the way there, and the tip is less deep
+below gap 0 by as much. A lock-in at nu counts what happens away from mid contact less: an indentation by
+0.0232 (nu tau)^2.
 
 F and H are those of a Hertz contact under a constant pull, x'' = -x^(3/2) - kappa/3.2181, x(0) = 0, x'(0) = 1, whose
 duration is 3.2181 F and whose integral of x is 3.2181^2 H; the energy that air takes follows from both (virial). The
@@ -67,6 +71,10 @@ AIR = 10.0 / 9.0
 """Twice the integral of the squared speed over a Hertz contact, over tau u^2."""
 STIFFER = 3.9337034362e-02
 """Share by which a spring of its own frequency Omega shortens a Hertz contact, over (Omega tau)^2."""
+SHALLOWER = 8.3576e-2
+"""The same of the integral of its indentation."""
+SPREAD = 4.6448e-2
+"""Mean square of the time from mid contact, weighted by a Hertz contact's indentation, over tau^2."""
 BRIDGE_NM = 4.7
 """Length in nm over which a leaving tip keeps its energy, where nothing says it: the paper's bridge."""
 USUAL_LEAD = 1.3
@@ -109,6 +117,11 @@ class Impact(Protocol):
     @property
     def lead(self) -> Float[Array, ""]:
         """Length b in nm of the lead b (1/u_out - 1/u_in) that the delay contains."""
+        ...
+
+    @property
+    def raised(self) -> Float[Array, ""]:
+        """Height in nm of the solid's surface over gap 0, as the delay tells it: half its offset."""
         ...
 
     @property
@@ -160,6 +173,11 @@ class LawImpact(eqx.Module):
         return jnp.zeros_like(self.law.r) if self.law.delay is None else self.law.delay.lead_nm
 
     @property
+    def raised(self) -> Float[Array, ""]:
+        """Half the delay's offset."""
+        return jnp.zeros_like(self.law.r) if self.law.delay is None else 0.5 * self.law.delay.offset_nm
+
+    @property
     def length(self) -> Float[Array, ""]:
         """That of the paper's bridge."""
         return jnp.full_like(self.law.r, BRIDGE_NM)
@@ -195,6 +213,7 @@ class TabulatedImpact(eqx.Module):
         outer_nm: gap at which contact ends.
         hertz: Hertz time at 1 nm/us, in us (nm/us)^0.2: that of the table's end, where nothing else is left.
         early_nm: lead b of the delay law that is closest to the delay.
+        raised_nm: half the offset d that is left then.
         length_nm: gap at which the bridge breaks.
         loss_error: estimated error of the series for the loss, in nm^2/us^2.
         speed_error: estimated error of the approach speeds that it goes through, as a share.
@@ -210,6 +229,7 @@ class TabulatedImpact(eqx.Module):
     outer_nm: Float[Array, ""]
     hertz: Float[Array, ""]
     early_nm: Float[Array, ""]
+    raised_nm: Float[Array, ""]
     length_nm: Float[Array, ""]
     loss_error: Float[Array, ""]
     speed_error: Float[Array, ""]
@@ -243,6 +263,11 @@ class TabulatedImpact(eqx.Module):
     def lead(self) -> Float[Array, ""]:
         """The lead b that comes closest to the delay, in nm."""
         return self.early_nm
+
+    @property
+    def raised(self) -> Float[Array, ""]:
+        """Half the offset that comes closest to it."""
+        return self.raised_nm
 
     @property
     def length(self) -> Float[Array, ""]:
@@ -411,6 +436,11 @@ class PulledImpact(eqx.Module):
         return jnp.zeros_like(self.plane_nm)
 
     @property
+    def raised(self) -> Float[Array, ""]:
+        """None: the way below the plane is known."""
+        return jnp.zeros_like(self.plane_nm)
+
+    @property
     def length(self) -> Float[Array, ""]:
         """Gap at which the bridge breaks."""
         return self.free.length
@@ -530,10 +560,37 @@ def _horner(series: tuple[float, ...], x: Float[Array, "..."]) -> Float[Array, "
     return value
 
 
-def indentation(approach_speed: Float[Array, "..."], tau: Float[Array, "..."], middle: Middle) -> Float[Array, "..."]:
-    """Return the time integral of the indentation of a Hertz contact of a duration tau (us), in nm us."""
+def indentation(
+    approach_speed: Float[Array, "..."],
+    tau: Float[Array, "..."],
+    middle: Middle,
+    cantilever: Cantilever,
+    nu: Float[Array, "..."] | float,
+) -> Float[Array, "..."]:
+    """Return the time integral of the indentation of a Hertz contact of a duration tau (us), in nm us.
+
+    As a lock-in counts it that looks at an angular frequency nu in rad/us.
+    """
     _, deep = hertz_under_pull(middle.acceleration * tau / approach_speed)
-    return deep * approach_speed * tau**2
+    missed = (SHALLOWER * cantilever.angular_frequency**2 + 0.5 * SPREAD * nu**2) * tau**2
+    return deep * (1.0 - missed) * approach_speed * tau**2
+
+
+def depth_of_impact(
+    impact: Impact,
+    approach_speed: Float[Array, "..."],
+    middle: Middle,
+    cantilever: Cantilever,
+    nu: Float[Array, "..."] | float,
+) -> Float[Array, "..."]:
+    """Return the same of how deep the tip of an impact is below gap 0, beyond its flights to there and from there."""
+    at_surface = speed_over(approach_speed, impact.raised, middle.acceleration)
+    tau = impact.hertz_time(at_surface)
+    lasts, _ = hertz_under_pull(middle.acceleration * tau / at_surface)
+    # the parabolas between the surface and gap 0 are of the flight
+    beside = 2.0 * impact.raised / (at_surface + approach_speed)
+    flown = beside**2 * (at_surface + 2.0 * approach_speed) / 3.0
+    return indentation(at_surface, tau, middle, cantilever, nu) - impact.raised * lasts * tau + flown
 
 
 def gained_and_longer(
@@ -559,9 +616,13 @@ def corrected(free: Speeds, middle: Middle, cantilever: Cantilever, impact: Impa
     u, w = free.approach, free.rebound
     if isinstance(impact, PulledImpact):
         return impact.during(u, middle, cantilever).speeds
-    gained, longer = gained_and_longer(u, impact.hertz_time(u), middle, cantilever)
+    pull, raised = middle.acceleration, impact.raised
+    at_surface = speed_over(u, raised, pull)
+    tau = impact.hertz_time(at_surface)
+    gained, longer = gained_and_longer(at_surface, tau, middle, cantilever)
     rebound = jnp.sqrt(jnp.maximum(w**2 + gained, (0.1 * w) ** 2))
-    held = _lag(w, impact.length, middle.acceleration) - _lag(u, impact.length, middle.acceleration)
+    longer = longer + tau - impact.hertz_time(u) - _lag(u, raised, pull) - _lag(w, raised, pull)
+    held = _lag(w, impact.length, pull) - _lag(u, impact.length, pull)
     share = jnp.maximum(impact.lead, 0.0) / (USUAL_LEAD * impact.length)
     return Speeds(u, rebound, free.delay + longer - share * held)
 
@@ -668,9 +729,14 @@ def delay_before(
 
 def _lag(speed: Float[Array, ""], length: Float[Array, ""], acceleration: Float[Array, ""]) -> Float[Array, ""]:
     """Return by how much a length takes longer at constant acceleration than without, in us."""
-    square = speed**2 + 2.0 * acceleration * length
-    end = jnp.sqrt(jnp.maximum(square, (0.1 * speed) ** 2))
-    return 2.0 * length / (end + speed) - length / speed
+    return 2.0 * length / (speed_over(speed, length, acceleration) + speed) - length / speed
+
+
+def speed_over(
+    speed: Float[Array, "..."], length: Float[Array, "..."], acceleration: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """Return the speed at the end of a length in nm at constant acceleration, in nm/us."""
+    return jnp.sqrt(jnp.maximum(speed**2 + 2.0 * acceleration * length, (0.1 * speed) ** 2))
 
 
 def chebyshev_sum(coefficients: Float[Array, " terms"], place: Float[Array, "..."]) -> Float[Array, "..."]:

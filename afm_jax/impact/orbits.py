@@ -30,7 +30,7 @@ from afm_jax.impact.closure import (
 from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.impact.implicit import implicit_pair, implicit_root
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
-from afm_jax.impact.lasting_impact import Impact, LawImpact, PulledImpact, crawls, indentation, middle_of_contact
+from afm_jax.impact.lasting_impact import Impact, LawImpact, PulledImpact, crawls, depth_of_impact, middle_of_contact
 from afm_jax.impact.law import ImpactLaw, Speeds, impact_law_of
 from afm_jax.impact.roots import COARSE, TAPPED, find_roots
 from afm_jax.outcomes import Outcome
@@ -370,14 +370,14 @@ def _observed(state: OrbitState, problem: OrbitProblem) -> Float[Array, " 3"]:
         # in contact the tip is below the platform's rest surface by the indentation
         approach, delay = state.speeds.approach, state.speeds.delay
         middle = middle_of_contact(cantilever, platform, state.flight.start_us - 0.5 * delay)
+        nu = platform.angular_frequency / order
         if isinstance(impact, PulledImpact):
-            nu = platform.angular_frequency / order
             tap = impact.during(approach, middle, cantilever)
             # the last term as of a parabola
             depth = tap.area * (1.0 - 0.5 * nu**2 * tap.spread + (nu * delay) ** 4 / 4480.0)
             late = tap.late
         else:
-            depth = indentation(approach, impact.hertz_time(approach), middle)
+            depth = depth_of_impact(impact, approach, middle, cantilever, nu)
     below = {"indentation": depth, "late_us": late}
     length, phase = lockin(cantilever, platform, state.flight, order, delayed=impact.delayed, **below)
     return jnp.stack([peak_amplitude(cantilever, state.flight), length, phase])

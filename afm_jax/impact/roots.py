@@ -141,14 +141,17 @@ class Scan(NamedTuple):
     """Extrema without one that are looked at for a pair of roots."""
     slots: int
     """Roots there is room for."""
+    within: int = 0
+    """Coordinates at which an interval with a change of sign is looked at again, `points/crossings`; 0: it is not."""
 
 
 FINE = Scan(8192, 1e-7, 1e5, crossings=16, turns=6, slots=16)
 """Some 680 points to the decade: for whoever asks for all orbits."""
 COARSE = Scan(512, 1e-3, 1e4, crossings=6, turns=2, slots=10)
 """Some 70 to the decade: for fits, which search a hundred thousand times."""
-TAPPED = Scan(512, 1e-2, 3.0, crossings=6, turns=2, slots=6)
-"""Of taps, each of which takes long to look up, and none of which is much faster than the drive."""
+TAPPED = Scan(192, 1e-2, 3.0, crossings=6, turns=2, slots=6, within=32)
+"""Of taps, each of which takes long to look up, and none of which is much faster than the drive. From light to hard
+ones the condition jumps: to either side of that there may be an orbit, and between neighbours of the scan both."""
 
 
 class OrbitRoots(NamedTuple):
@@ -231,18 +234,61 @@ def _scale(problem: OrbitProblem) -> Float[Array, ""]:
 def _scanned_roots(problem: OrbitProblem, scan: Scan) -> _Coordinates:
     """Scan the closing condition from just above capture to speeds that no orbit reaches; narrow every bracket."""
     grid = problem.impact.lowest + jnp.asarray(np.geomspace(scan.lowest, scan.highest, scan.points)) * _scale(problem)
+    looked = _looked_closer(grid, problem, scan) if scan.within else (_look(grid, problem),) * 2
+    crossing = [_changes(at.value, at.brief) for at in looked]
+    if scan.within:
+        # from one interval to the next there is nothing
+        own = np.arange(1, scan.points) % scan.within != 0
+        crossing[1] = crossing[1] & own & jnp.repeat(_inside(crossing[0], scan)[1], scan.within)[1:]
+    (grid, value, brief), closer = looked
+    root, found = _narrowed(
+        _crossings(crossing[1], closer.grid, closer.value, scan), _dips(brief, grid, value, scan), problem
+    )
+    order = jnp.argsort(jnp.where(found, root, jnp.inf))[: scan.slots]
+    few = jnp.all(jnp.stack([jnp.sum(one) for one in crossing]) <= scan.crossings) & (jnp.sum(found) <= scan.slots)
+    return _Coordinates(root[order], found[order], few)
+
+
+class _Looked(NamedTuple):
+    """Coordinates, the residuals there, and whether impacts are over soon."""
+
+    grid: Float[Array, " points"]
+    value: Float[Array, " points"]
+    brief: Bool[Array, " points"]
+
+
+def _look(grid: Float[Array, " points"], problem: OrbitProblem) -> _Looked:
     speeds, system = jax.vmap(closure, in_axes=(0, None))(grid, problem)
     value = jax.vmap(lambda system: system.residual)(system)
     if isinstance(problem.impact, PulledImpact):
         # a bent lever pulls the tip out of the bridge
-        brief = jnp.abs(speeds.delay) < 0.5 * problem.platform.period_us
-    else:
-        brief = jax.vmap(_brief, in_axes=(0, None))(grid, problem)
-    crossing = (value[:-1] * value[1:] < 0.0) & brief[:-1] & brief[1:]
-    root, found = _narrowed(_crossings(crossing, grid, value, scan), _dips(brief, grid, value, scan), problem)
-    order = jnp.argsort(jnp.where(found, root, jnp.inf))[: scan.slots]
-    few = (jnp.sum(crossing) <= scan.crossings) & (jnp.sum(found) <= scan.slots)
-    return _Coordinates(root[order], found[order], few)
+        return _Looked(grid, value, jnp.abs(speeds.delay) < 0.5 * problem.platform.period_us)
+    return _Looked(grid, value, jax.vmap(_brief, in_axes=(0, None))(grid, problem))
+
+
+def _looked_closer(grid: Float[Array, " points"], problem: OrbitProblem, scan: Scan) -> tuple[_Looked, _Looked]:
+    """Look at a scan, and at the intervals where it changes its sign: one after the other, ascending."""
+
+    def again(_, state):
+        grid, _, last = state
+        here = _look(grid, problem)
+        at, _ = _inside(_changes(here.value, here.brief), scan)
+        share = jnp.linspace(0.0, 1.0, scan.within)
+        return (grid[at, None] + share * (grid[at + 1] - grid[at])[:, None]).ravel(), last, here
+
+    # a loop, because the residual is compiled for every use of it
+    nothing = _Looked(grid, jnp.zeros_like(grid), jnp.zeros(grid.shape, bool))
+    return lax.fori_loop(0, 2, again, (grid, nothing, nothing))[1:]
+
+
+def _changes(value: Float[Array, " points"], brief: Bool[Array, " points"]) -> Bool[Array, " intervals"]:
+    return (value[:-1] * value[1:] < 0.0) & brief[:-1] & brief[1:]
+
+
+def _inside(crossing: Bool[Array, " intervals"], scan: Scan) -> tuple[Array, Array]:
+    """Return where the changes of sign are, ascending, the fastest ones if there are too many, and which are some."""
+    at = crossing.shape[0] - 1 - jnp.nonzero(crossing[::-1], size=scan.crossings, fill_value=0)[0]
+    return at[::-1], (jnp.arange(scan.crossings) < jnp.sum(crossing))[::-1]
 
 
 def _brief(coordinate: Float[Array, ""], problem: OrbitProblem) -> Bool[Array, ""]:
@@ -283,8 +329,7 @@ class _Dips(NamedTuple):
 
 def _crossings(crossing: Bool[Array, " intervals"], grid, value, scan: Scan) -> _Brackets:
     """Return the changes of sign, the fastest ones if there are too many: close to capture the law itself ends."""
-    at = crossing.shape[0] - 1 - jnp.nonzero(crossing[::-1], size=scan.crossings, fill_value=0)[0]
-    real = jnp.arange(scan.crossings) < jnp.sum(crossing)
+    at, real = _inside(crossing, scan)
     return _Brackets(grid[at], grid[at + 1], value[at], value[at + 1], real)
 
 

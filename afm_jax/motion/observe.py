@@ -23,7 +23,7 @@ from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.contact import Contact
 from afm_jax.impact.amplitude import FlightEnds, peak_amplitude
-from afm_jax.impact.lasting_impact import LawImpact, indentation, middle_of_contact
+from afm_jax.impact.lasting_impact import LawImpact, depth_of_impact, middle_of_contact
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State, to_gap
 from afm_jax.motion.settle import Settled, Window, held_since, is_stuck, settled, window_of
@@ -56,7 +56,7 @@ def impact_integral(
     if law.lasts:
         approach = jnp.asarray(rows.approach_speed_nm_per_us)[here]
         pulled = middle_of_contact(scene.cantilever, surface, jnp.asarray(middle[here]))
-        depth = np.asarray(indentation(approach, LawImpact(law).hertz_time(approach), pulled))
+        depth = np.asarray(depth_of_impact(LawImpact(law), approach, pulled, scene.cantilever, angular_frequency))
     total = -np.sum(depth * np.exp(-1j * angular_frequency * middle[here]))
     early = here[departure[here] < arrival[here]]
     if not early.size:

@@ -100,7 +100,8 @@ def readings(flight: FlightEnds, row: MeasuredRow, cantilever: Cantilever) -> Fl
     tau = jnp.maximum(row.order * platform.period_us - flight.duration_us, 0.0)
     # in contact the tip is below the platform's rest surface by the indentation
     middle = middle_of_contact(cantilever, platform, end + 0.5 * tau)
-    depth = indentation(platform.velocity(end) - flight.end_velocity, tau, middle)
+    nu = platform.angular_frequency / row.order
+    depth = indentation(platform.velocity(end) - flight.end_velocity, tau, middle, cantilever, nu)
     amplitude, phase = lockin(cantilever, platform, flight, row.order, delayed=True, indentation=depth)
     return jnp.stack([peak_amplitude(cantilever, flight), amplitude, phase])
 
