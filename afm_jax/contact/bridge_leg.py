@@ -8,10 +8,12 @@ which vary most, thereby leave the equation, and only what is spent is integrate
 
 q the push of the surface's motion (`Drive`). A free tip has neither Omega nor q. The gap is a function of the share of
 the way that takes the square roots out of w at its ends (`Exit`, `Turning`). Two integrators follow the share: sweeps
-over Gauss nodes (speeds from what is spent, times from the speeds, what is spent from both), and Diffrax's steps.
+over Gauss nodes (speeds from what is spent, times from the speeds, what is spent from both), and Runge-Kutta steps by
+the tableaus of Diffrax.
 """
 
 from collections.abc import Callable
+from functools import cache
 from typing import Any, NamedTuple
 
 import jax
@@ -34,6 +36,8 @@ _SLOWEST = 0.01
 """Share of K at the start below which no sweep lets it fall; a driven tip that gets slower is not for the quick way."""
 _WRITTEN_OUT = 5
 """So many sweeps are written out in the program; more are a loop."""
+_REMEMBERED = 20
+"""So many steps leave behind what their derivatives in reverse mode need."""
 _TURN_NODES, _TURN_SWEEPS = 48, 12
 _TURN_ROUNDS = 2
 _SCAN = 256
@@ -170,14 +174,23 @@ def way_through(
         inward: whether the tip goes from the outer to the inner gap.
         begin_us: time at the start.
     """
+    potentials = tuple(tip.potential(gap) for gap in gaps_nm)
+    start, end = _either(potentials, potentials[::-1], inward=inward)
+    total, course = start_energy_aj + start, exit_course(gaps_nm, margin, inward=inward)
+    return Way(tip, course.sense, jnp.asarray(begin_us, total.dtype), total, end, course)
+
+
+def exit_course(
+    gaps_nm: tuple[Float[Array, "..."], Float[Array, "..."]],
+    margin: Float[Array, "..."],
+    *,
+    inward: bool | Bool[Array, ""],
+) -> Exit:
+    """Return the gaps along a way; arguments as of `way_through`."""
     outer, inner = gaps_nm
     at_outer, at_inner = jnp.sqrt(margin), jnp.sqrt(margin + jnp.log(outer / inner))
-    potentials = tip.potential(outer), tip.potential(inner)
-    start, end = _either(potentials, potentials[::-1], inward=inward)
-    sense = _either(1.0, -1.0, inward=inward)
-    course = Exit(outer * jnp.exp(margin), _either(at_outer, at_inner, inward=inward), at_inner - at_outer, sense)
-    total = start_energy_aj + start
-    return Way(tip, sense, jnp.asarray(begin_us, total.dtype), total, end, course)
+    start_y, sense = _either(at_outer, at_inner, inward=inward), _either(1.0, -1.0, inward=inward)
+    return Exit(outer * jnp.exp(margin), start_y, at_inner - at_outer, sense)
 
 
 def _either(one: Any, other: Any, *, inward: bool | Bool[Array, ""]) -> Any:
@@ -274,32 +287,55 @@ def pass_by_collocation(way: Way, nodes: int, sweeps: int) -> Passage:
     return way.end(nothing, lax.scan(add, nothing, pairs)[0])
 
 
-def pass_in_steps(way: Way, steps: int, solver: Any = None) -> Passage:
-    """Return the passage after a fixed number of Diffrax's Runge-Kutta steps; differentiable forward and reverse.
+@cache
+def _tableau(solver: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the matrix, the nodes and the weights of one of Diffrax's Runge-Kutta solvers, as far as they count."""
+    import diffrax  # noqa: PLC0415  # half a second
+
+    known = getattr(diffrax, solver).tableau
+    count = int(np.flatnonzero(known.b_sol)[-1]) + 1
+    matrix = np.zeros((count, count))
+    for stage, row in enumerate(known.a_lower[: count - 1], start=1):
+        matrix[stage, :stage] = row
+    return matrix, np.concatenate([[0.0], known.c])[:count], np.asarray(known.b_sol)[:count]
+
+
+def pass_in_steps(way: Way, steps: int, solver: str = "Dopri8") -> Passage:
+    """Return the passage after a fixed number of Runge-Kutta steps; differentiable forward and reverse.
+
+    The stages are a plain loop over the tableau: Diffrax's own keeps what a reverse pass through any number of them
+    may need, which takes twice as long to compile and thirty times the memory.
 
     Args:
         way: the way.
         steps: number of steps.
-        solver: a Diffrax solver; Dopri8 if None. Its `scan_kind` must be "bounded" to be differentiable both ways.
+        solver: the name of the Diffrax solver whose tableau is taken.
     """
-    import diffrax  # noqa: PLC0415  # half a second
+    begin = nothing_spent(way)
+    matrix, nodes, weights = (jnp.asarray(part, begin[0].dtype) for part in _tableau(solver))
 
-    chosen = diffrax.Dopri8(scan_kind="bounded") if solver is None else solver
-    term = diffrax.ODETerm(lambda share, state, _: way_rates(way, share, state))
+    def moved(state, length, shares, rates):
+        return tuple(one + length * jnp.tensordot(shares, rate, axes=1) for one, rate in zip(state, rates, strict=True))
 
     # The share of the way is the time of the solver, one for all tips: a batch is an axis of the state, which costs
     # less than a batch of solvers.
-    def step(carried, ends):
-        state, memory = carried
-        after, _, _, memory, _ = chosen.step(term, ends[0], ends[1], state, None, memory, made_jump=False)
-        return (after, memory), None
+    def step(state, ends):
+        length = ends[1] - ends[0]
+
+        def stage(rates, at):
+            number, row, node = at
+            new = way_rates(way, ends[0] + node * length, moved(state, length, row, rates))
+            return tuple(rate.at[number].set(one) for rate, one in zip(rates, new, strict=True)), None
+
+        unknown = tuple(jnp.zeros((len(nodes), *one.shape), one.dtype) for one in state)
+        rates, _ = lax.scan(stage, unknown, (jnp.arange(len(nodes)), matrix, nodes))
+        return moved(state, length, weights, rates), None
 
     even = np.linspace(0.0, 1.0, steps + 1)
     fractions = _either(1.0 - (1.0 - even) ** GRADING, even, inward=way.inward)
-    begin = nothing_spent(way)
     ends = jnp.stack([fractions[:-1], fractions[1:]], axis=1).astype(begin[0].dtype)
-    memory = chosen.init(term, ends[0, 0], ends[0, 1], begin, None)
-    (state, _), _ = lax.scan(step, (begin, memory), ends)
+    # in reverse mode many steps are computed again one by one, few are remembered
+    state, _ = lax.scan(step if steps <= _REMEMBERED else jax.checkpoint(step), begin, ends)
     return way.end(*state)
 
 
@@ -323,9 +359,7 @@ def pass_bridge(way: Way, setting: Setting) -> Passage:
         return pass_by_collocation(way, max(size, setting.junction_nodes), 0)
     if setting.rule == "collocation":
         return pass_by_collocation(way, size, setting.sweeps)
-    import diffrax  # noqa: PLC0415
-
-    return pass_in_steps(way, size, getattr(diffrax, setting.solver)(scan_kind="bounded"))
+    return pass_in_steps(way, size, setting.solver)
 
 
 def go_in(driven: Driven, place: Place, setting: QuickSetting) -> Leg:

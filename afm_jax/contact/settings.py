@@ -16,9 +16,9 @@ Free collisions take the steps in the gap, driven ones, which may turn anywhere,
 class Setting(NamedTuple):
     """The numbers of steps and nodes of one collision; hashable, for it shapes the program.
 
-    `rule` is "steps" (a Diffrax solver with fixed steps) or "collocation" (`sweeps` Picard sweeps at `inward` and
-    `outward` Gauss nodes). Without dissipation both are one quadrature. `careful`: the short first pass of the way out
-    takes as many steps as the way itself.
+    `rule` is "steps" (fixed ones by the tableau of a Diffrax solver) or "collocation" (`sweeps` Picard sweeps at
+    `inward` and `outward` Gauss nodes). Without dissipation both are one quadrature. `careful`: the short first pass of
+    the way out takes as many steps as the way itself.
     """
 
     rule: str
