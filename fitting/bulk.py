@@ -7,6 +7,7 @@ import dataclasses
 import math
 import os
 from collections.abc import Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,7 @@ from afm_jax.sweeps.sweep import Progress, dataset_of
 from fitting.fits.fit import fit, problem_of
 from fitting.fits.result import FitResult
 from fitting.parameters import PARAMETERS
+from fitting.sampling.bootstrap import require_valid
 from fitting.tables.table import AMPLITUDES, MEASURED, AmplitudeTable, read_table
 
 if TYPE_CHECKING:
@@ -30,6 +32,8 @@ _INSTRUMENT = ("free_frequency_khz", "quality_factor", "mass_ng")
 _CALIBRATIONS = ("tip_calibration", "drive_calibration")
 _USUAL = {"model": "law", "noise": None, "resamples": None, "seed": 0}
 _OF_A_FIT = ("scale_errors", "free", "fixed", "constraints", "effects", "robust", "speeds")
+_MOST_KEPT = 64
+"""Fits from which tables are drawn."""
 _FITTED, _NOT_VALID, _REFUSED = 0, 1, -1
 _FLAGS = {_REFUSED: "not_possible", _FITTED: "valid", _NOT_VALID: "not_valid"}
 
@@ -56,7 +60,8 @@ def fit_each(  # noqa: PLR0913
         axes: of further values of each table's instrument, as of `afm_jax.sweep`; their parameters are
             `table.free_frequency_khz`, `table.quality_factor`, `table.mass_ng`, and `table.tip_calibration` and
             `table.drive_calibration`, true amplitudes over those written down.
-        resamples: how often every table is fitted with its amplitudes drawn anew within their errors; None: as it is.
+        resamples: how often every table is fitted with what was measured drawn anew, within its errors, about what its
+            own fit, which must be valid, predicts; None: as it is.
         seed: of the draws.
         noise: relative error of amplitudes without one, of files.
         out: folder of the results: fits that are done there are kept; None: nothing is kept on the disk.
@@ -150,10 +155,26 @@ def table_recorder(given: Mapping[str, Any], axes: Sequence[Axis]) -> Recorder:
     chosen = {name: record[name] for name in ("free", "fixed", "constraints", "effects") if name in record}
     own = problem_of(tables[0], model, **chosen).own
 
+    @lru_cache(maxsize=_MOST_KEPT)
+    def fit_of(row: tuple[tuple[str, float], ...]) -> tuple[AmplitudeTable, FitResult]:
+        """Return a table with its instrument, and its fit."""
+        measured = _with_instrument(tables[int(dict(row)[TABLE])], dict(row))
+        return measured, fit(measured, model, **record)
+
+    def fitted(row: dict[str, float]) -> dict[str, Any]:
+        number = row.pop(RESAMPLE, None)
+        try:
+            measured, found = fit_of(tuple(row.items()))
+            if number is not None:
+                require_valid(found)
+                found = fit(_drawn(measured, found, (seed, int(row[TABLE]), int(number))), model, **record)
+        except ValueError as error:
+            nothing: dict[str, Any] = dict.fromkeys((variable.name for variable in _variables(own)), math.nan)
+            return nothing | {"degrees_of_freedom": 0, "outcome": _REFUSED, MESSAGE.name: str(error)}
+        return _columns_of(found, own)
+
     def work(columns: Columns) -> Columns:
-        names = list(columns)
-        rows = [dict(zip(names, row, strict=True)) for row in zip(*columns.values(), strict=True)]
-        fits = [_fitted(tables[int(row[TABLE])], row, seed, model, record, own) for row in rows]
+        fits = [fitted(dict(zip(columns, row, strict=True))) for row in zip(*columns.values(), strict=True)]
         return {name: [found[name] for found in fits] for name in fits[0]}
 
     sources = [table.source for table in tables]
@@ -195,27 +216,6 @@ def _table_of(given: Mapping[str, Any]) -> AmplitudeTable:
     return AmplitudeTable(**parts)
 
 
-def _fitted(
-    table: AmplitudeTable,
-    row: Mapping[str, float],
-    seed: int,
-    model: str,
-    settings: Mapping[str, Any],
-    own: Sequence[str],
-) -> dict[str, Any]:
-    """Return what is recorded of one fit."""
-    nothing: dict[str, Any] = dict.fromkeys((variable.name for variable in _variables(own)), math.nan)
-    nothing |= {"degrees_of_freedom": 0, "outcome": _REFUSED}
-    try:
-        measured = _with_instrument(table, row)
-        if RESAMPLE in row:
-            measured = _drawn(measured, (seed, int(row[TABLE]), int(row[RESAMPLE])))
-        found = fit(measured, model, **settings)
-    except ValueError as error:
-        return nothing | {MESSAGE.name: str(error)}
-    return _columns_of(found, own)
-
-
 def _columns_of(found: FitResult, own: Sequence[str]) -> dict[str, Any]:
     values: dict[str, Any] = {}
     for name in own:
@@ -240,14 +240,22 @@ def _with_instrument(table: AmplitudeTable, row: Mapping[str, float]) -> Amplitu
     return dataclasses.replace(table, **changed)
 
 
-def _drawn(table: AmplitudeTable, seed: tuple[int, ...]) -> AmplitudeTable:
-    """Return a table with what was measured drawn anew around it, within its errors."""
+def _drawn(table: AmplitudeTable, found: FitResult, seed: tuple[int, ...]) -> AmplitudeTable:
+    """Return a table as it would have been measured if its fit were the truth, within its errors.
+
+    Drawn about what was measured, which scatters itself, it would scatter twice as much (variances) as its errors say.
+    """
     generator = np.random.default_rng(seed)
+    rows = found.rows
+    predicted: dict[str, Any] = dict(
+        zip(("peak_amplitude_nm", "lockin_amplitude_nm"), rows.predicted_nm.T, strict=True)
+    )
     changed = {}
     for column in MEASURED:
         values = getattr(table, column.name)
         if values is not None:
-            drawn = values + getattr(table, str(column.error)) * generator.standard_normal(values.shape)
-            # an amplitude is positive
-            changed[column.name] = np.abs(drawn) if column.amplitude else drawn
+            truth = predicted[column.name] if column.amplitude else rows.predicted_phase_deg
+            drawn = truth + getattr(table, str(column.error)) * generator.standard_normal(values.shape)
+            # an amplitude is positive, and what has no prediction stays as it was measured
+            changed[column.name] = np.where(np.isnan(drawn), values, np.abs(drawn) if column.amplitude else drawn)
     return dataclasses.replace(table, **changed)

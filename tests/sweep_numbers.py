@@ -29,7 +29,7 @@ def recorder(given: Mapping[str, Any], axes: Sequence[Axis]) -> Recorder:  # noq
             path = Path(record["told"]) / f"{os.getpid()}"
             # once, since it may be killed at any time
             if not path.exists():
-                path.write_text(os.environ.get("NPROC", ""))
+                path.write_text(" ".join(os.environ.get(name, "") for name in ("NPROC", "TF_CPP_MIN_LOG_LEVEL")))
         found = columns["x"] + 0.1 * columns["y"]
         why = np.where(found < 2.0, "the sum is below 2 \u00e4", "")
         parts = {

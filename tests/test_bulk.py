@@ -31,17 +31,11 @@ def test_a_table_survives_the_way_to_a_worker():
         np.testing.assert_array_equal(there[name], value)
 
 
-def test_draws_and_instruments_change_what_they_say():
+def test_instruments_change_what_they_say():
     plain = table()
-    drawn = _drawn(plain, (1, 2, 3))
-    assert drawn.peak_amplitude_nm is not None
-    assert plain.peak_amplitude_nm is not None
-    assert plain.peak_amplitude_error_nm is not None
-    pulls = (drawn.peak_amplitude_nm - plain.peak_amplitude_nm) / plain.peak_amplitude_error_nm
-    assert 0.5 < np.nanstd(pulls) < 1.5
-    np.testing.assert_array_equal(_drawn(plain, (1, 2, 3)).peak_amplitude_nm, drawn.peak_amplitude_nm)
     other = _with_instrument(plain, {"table.quality_factor": 30.0, "table.tip_calibration": 1.1})
     assert (other.quality_factor, other.free_frequency_khz) == (30.0, plain.free_frequency_khz)
+    assert plain.peak_amplitude_nm is not None
     assert other.peak_amplitude_nm is not None
     np.testing.assert_allclose(other.peak_amplitude_nm, 1.1 * plain.peak_amplitude_nm, rtol=1e-15)
     np.testing.assert_array_equal(other.drive_amplitude_nm, plain.drive_amplitude_nm)
@@ -109,3 +103,32 @@ def test_every_fit_is_that_of_its_table_alone(tmp_path: Path, fit: Callable[...,
     assert told[0].startswith("table,outcome,r,r_error,r_low,r_high,epsilon,")
     values = [float(line.split(",")[2]) for line in told[1:]]
     assert values == [fitting.fit(own, "law").parameters["r"].value for own in tables]
+
+
+@pytest.mark.slow
+def test_tables_are_drawn_about_their_fit():
+    plain = table()
+    found = fitting.fit(plain, "law")
+    drawn = [_drawn(plain, found, (1, 2, number)) for number in range(40)]
+    for column, predicted, error in (
+        ("peak_amplitude_nm", found.rows.predicted_nm[:, 0], plain.peak_amplitude_error_nm),
+        ("lockin_amplitude_nm", found.rows.predicted_nm[:, 1], plain.lockin_amplitude_error_nm),
+        ("phase_deg", found.rows.predicted_phase_deg, plain.phase_error_deg),
+    ):
+        pulls = (np.array([getattr(each, column) for each in drawn]) - predicted) / np.asarray(error)
+        # of 40 x 93 draws
+        assert abs(np.nanmean(pulls)) < 0.08
+        assert abs(np.nanstd(pulls) - 1.0) < 0.06
+    np.testing.assert_array_equal(_drawn(plain, found, (1, 2, 0)).phase_deg, drawn[0].phase_deg)
+
+
+@pytest.mark.slow
+def test_fits_of_drawn_tables_scatter_by_their_errors():
+    found = fitting.fit_each([table()], "law", resamples=12, seed=3).isel(table=0)
+    # noise about noise would make it 2
+    assert 0.8 < float((found["chi2"] / found["degrees_of_freedom"]).mean()) < 1.2
+    assert int((found["outcome"] == 0).sum()) >= 11
+    assert 0.4 < float(found["r"].std() / found["r_error"].mean()) < 1.8
+    wrong = fitting.fit_each([table(1.1)], "law", resamples=1).isel(table=0, resample=0)
+    assert int(wrong["outcome"]) == -1
+    assert "is not valid (The model does not explain the data" in str(wrong["message"].values)

@@ -311,7 +311,7 @@ def test_compiling_is_not_counted_in_the_time_left(monkeypatch: pytest.MonkeyPat
             report(done, 400)
     first, second = capsys.readouterr().err.splitlines()
     assert first == "100 of 400 points"
-    assert second == "200 of 400 points, about 6 s left"
+    assert second == "200 of 400 points, 33 a second, about 6 s left"
 
 
 def test_a_terminal_is_told_how_long_it_took_the_last_time(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
@@ -339,4 +339,4 @@ def test_a_terminal_is_told_how_long_it_took_the_last_time(monkeypatch: pytest.M
     now = 42.0
     wait.count(2, 5)
     now = 45.0
-    assert (wait.line(), last) == ("sweeping up: 2 of 5 values, about 3 s left", {})
+    assert (wait.line(), last) == ("sweeping up: 2 of 5 values, 0.5 a second, about 3 s left", {})

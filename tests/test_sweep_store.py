@@ -4,6 +4,7 @@ import errno
 import json
 import multiprocessing
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -110,6 +111,11 @@ def test_a_changed_input_is_refused_and_named(tmp_path: Path):
         run_plan(plan(chunk=5), tmp_path)
     with pytest.raises(ValueError, match=r"record.seconds is absent, not 0.001"):
         run_plan(plan(seconds=0.001), tmp_path)
+    # by a program that would cut it otherwise
+    same = plan()
+    other = replace(same, recorder=replace(same.recorder, points=24))
+    with pytest.raises(ValueError, match=r"shape of its chunks is \[1, 10\], not \[2, 12\]: choose another folder"):
+        run_plan(other, tmp_path)
     (tmp_path / STORE / "zarr.json").write_text("{}")
     with pytest.raises(ValueError, match="is not a sweep of afm-jax; choose another folder"):
         run_plan(plan(), tmp_path)
@@ -210,6 +216,8 @@ def test_axes_are_what_they_say():
         ([{"parameter": "x", "log": [0, 1, 5]}], "the ends of `log` must be positive, but one is 0"),
         ([{"parameter": "x", "list": [1, "a"]}], "a value of the list must be a number, but is 'a'"),
         ([{"parameter": "x", "list": [1, 1]}], "stands there twice"),
+        ([{"parameter": "x", "list": 3}], r"axis 1: `list` must be \[value, ...\], but is 3"),
+        ([{"parameter": "x", "log": [1, None, 3]}], "an end of `log` must be a number, but is not finite"),
         ([{"linear": [1, 2, 3]}], "`parameter` is missing"),
         ([{"parameter": "x", "linear": [1, 2, 3], "seed": 1}], "unknown key seed"),
         ([{"random": {"x": [0, 1]}, "count": 5}], "`seed` must be a whole number from 0 on, but is None"),
@@ -258,3 +266,16 @@ def test_a_picture_shows_all_that_was_swept(log: bool, monkeypatch: pytest.Monke
     # the first cell reaches from as far below its value as the second from above
     assert plane.get_ylim()[0] == pytest.approx(2.0**-0.5 if log else 1.0 - 0.5 * 15.0 / 4.0)
     assert lines.get_ylabel() == "sum (nm)"
+
+
+@pytest.mark.parametrize(("last", "labels"), [(16.0, [1, 2, 5, 10]), (1600.0, [1, 10, 100, 1000])])
+def test_labels_of_a_logarithmic_axis_leave_room(
+    last: float, labels: list[int], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+):
+    kept = []
+    monkeypatch.setattr("afm_jax.plots.sweeps.save", lambda figure, _: kept.append(figure))
+    axes = [{"parameter": "x", "log": [1.0, last, 5]}, {"parameter": "y", "list": [1.0]}]
+    draw_sweep(dataset_of(plan_of(plan().given | {"axes": axes}), None).isel(y=0, drop=True), ["sum_nm"], tmp_path)
+    panel = kept[0].axes[0]
+    low, high = panel.get_xlim()
+    assert [at for at in panel.get_xticks() if low <= at <= high] == pytest.approx(labels)

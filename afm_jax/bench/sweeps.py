@@ -57,7 +57,6 @@ def law_sweep(*, points: int, processes: int, by_dask: bool = False) -> Row:
     """Run one sweep; what is compiled, and how long processes take to start, is not counted."""
     if by_dask:
         begin = _processor_seconds()
-        # of all chunks but the first, which waits for compilation
         seconds = points / _run(_plan(points), processes)
     else:
         short = _plan(_SHORT)
@@ -79,14 +78,20 @@ def law_sweep(*, points: int, processes: int, by_dask: bool = False) -> Row:
 
 
 def _run(plan: SweepPlan, processes: int | None) -> float:
-    """Run a sweep to be thrown away, here or by a cluster of processes; return the points a second at its end."""
-    rates = [math.nan]
+    """Run a sweep to be thrown away, here or by a cluster of processes.
+
+    Returns:
+        Points a second after the first quarter: by then every process has its programs, and no chunk of several that
+        were under way together is counted without its time.
+    """
+    told: list[tuple[float, int]] = []
     with contextlib.ExitStack() as stack:
         folder, scheduler = Path(stack.enter_context(tempfile.TemporaryDirectory())), None
         if processes is not None:
             scheduler = stack.enter_context(local_cluster(processes, cores_each=1)).scheduler_address
-        run_plan(plan, folder, scheduler=scheduler, report=lambda *told: rates.append(told[2]))
-    return rates[-1]
+        run_plan(plan, folder, scheduler=scheduler, report=lambda done, *_: told.append((time.perf_counter(), done)))
+    late = [each for each in told if 4 * each[1] >= plan.points]
+    return (late[-1][1] - late[0][1]) / (late[-1][0] - late[0][0]) if len(late) > 1 else math.nan
 
 
 def _plan(points: int) -> SweepPlan:

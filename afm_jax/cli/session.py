@@ -107,7 +107,7 @@ class _Wait:
         self.what, self.parts, self.last_s = what, parts, last_s
         self.begun = time.monotonic()
         self.first: tuple[float, int] | None = None
-        self.done, self.total, self.until = 0, 0, math.inf
+        self.done, self.total, self.rate, self.until = 0, 0, 0.0, math.inf
 
     def seconds(self) -> float:
         return time.monotonic() - self.begun
@@ -117,12 +117,13 @@ class _Wait:
         now = time.monotonic()
         since, before = self.first = self.first or (now, done)
         self.done, self.total = done, total
-        self.until = now + (now - since) * (total - done) / (done - before) if done > before else math.inf
+        self.rate = (done - before) / (now - since) if now > since else 0.0
+        self.until = now + (total - done) / self.rate if self.rate > 0.0 else math.inf
 
     def counted(self, now: float) -> str:
         left = self.until - now
         return f"{self.done} of {self.total} {self.parts}" + (
-            f", about {_duration(left)} left" if 0.0 < left < 1e6 else ""
+            f", {_rate(self.rate)} a second, about {_duration(left)} left" if 0.0 < left < 1e6 else ""
         )
 
     def __rich__(self) -> Any:
@@ -335,6 +336,10 @@ def _prepared(ctx: click.Context, parameter: click.Parameter, folder: Path | Non
 
 def _duration(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 120.0 else f"{seconds / 60.0:.0f} min"
+
+
+def _rate(per_second: float) -> str:
+    return f"{per_second:,.0f}" if per_second >= 10.0 else f"{per_second:.2g}"
 
 
 def _counted(asked: int, read: int) -> str:

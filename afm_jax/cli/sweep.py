@@ -137,7 +137,9 @@ def _messages(plan: "SweepPlan", store: Path) -> Counter[str]:
 
 def _words(plan: "SweepPlan", done: "SweepRun", messages: Counter[str], store: Path) -> list[str]:
     grid = " x ".join(map(str, plan.shape))
-    lines = [f"{grid} points in {done.chunks} chunks. Computed in {_duration(done.seconds)}: {done.computed}."]
+    points, chunks = ("" if number == 1 else "s" for number in (plan.points, done.chunks))
+    took = f"Computed in {_duration(done.seconds)}: {done.computed}."
+    lines = [f"{grid} point{points} in {done.chunks} chunk{chunks}. {took}"]
     if done.kept.done:
         lines.append(f"Done before and kept: {len(done.kept.done)}.")
     if done.kept.damaged:
@@ -242,6 +244,15 @@ def _duration(seconds: float) -> str:
     return f"{seconds / 3600.0:.1f} h" if seconds < 200.0 * 3600.0 else f"{seconds / 86400.0:.0f} days"
 
 
+def _size(size_bytes: float) -> str:
+    """Return a size in words.
+
+    >>> _size(3e6), _size(45e9)
+    ('2.9 MiB', '41.9 GiB')
+    """
+    return f"{size_bytes / 2**20:.1f} MiB" if size_bytes < 2**30 else f"{size_bytes / 2**30:,.1f} GiB"
+
+
 def _tell_estimate(session: Session, plan: "SweepPlan") -> None:
     from afm_jax.sweeps.sweep import estimate  # noqa: PLC0415
 
@@ -254,7 +265,7 @@ def _tell_estimate(session: Session, plan: "SweepPlan") -> None:
             f"Time: {_duration(found.seconds / number)} with {number} process{'es' if number > 1 else ''} here, "
             f"{1e6 * found.seconds_a_point:.3g} us a point as measured on {found.sampled_points:,}."
         ),
-        f"Disk: {found.disk_bytes / 2**20:,.1f} MiB, compressed as the sample was.",
+        f"Disk: {_size(found.disk_bytes)}, compressed as the sample was.",
         f"Memory: {found.memory_bytes / 2**20:,.0f} MiB a process, whatever the number of points.",
     ]
     session.emit(found._asdict() | {"processes": number}, *lines)

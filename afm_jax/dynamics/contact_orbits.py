@@ -54,7 +54,7 @@ _LANES = 16
 """Contacts followed together, one program."""
 _CONTACTS_AT_ONCE = 128
 """Of a chart."""
-_CHART_ACCURACY = 1e-6
+CHART_ACCURACY = 1e-6
 _CHART_STEPS = 15
 _CHART_ARRIVED = 1e-7
 """Of a phase in rad and of a speed."""
@@ -221,7 +221,7 @@ def _closed(
 
 
 def single_contact_orbits(
-    seen: SampleDriven, orders: Sequence[int], *, accuracy: float = _CHART_ACCURACY, report: Report | None = None
+    seen: SampleDriven, orders: Sequence[int], *, accuracy: float = CHART_ACCURACY, report: Report | None = None
 ) -> dict[str, Shaped[np.ndarray, "lanes orders"]]:
     """Return which orbits of one contact there are at many scenes with a contact.
 

@@ -22,6 +22,8 @@ _MOST = 1000
 """Values along an axis that a picture shows."""
 _MOST_ROWS = 4
 _MARGIN = 0.02
+_MOST_IN_BETWEEN = 100.0
+"""Ratio of the ends up to which there is room for labels between powers of ten."""
 
 
 def draw_sweep(found: "xarray.Dataset", names: Sequence[str], target: Path) -> None:
@@ -75,13 +77,13 @@ def _logarithmic(found: "xarray.Dataset") -> list[str]:
 def _scale(panel: Axes, name: str, coordinate: "xarray.DataArray", *, ends: bool) -> None:
     """Give a side, "x" or "y", the scale of its values and, if asked for, their ends: all that was swept."""
     log = "log" in coordinate.attrs
+    low, high = coordinate.values.min(), coordinate.values.max()
     if log:
         panel.set(**{f"{name}scale": "log"})
         side = panel.xaxis if name == "x" else panel.yaxis
-        side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+        side.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < _MOST_IN_BETWEEN * low else (1.0,)))
         side.set_major_formatter("{x:g}")
         side.set_minor_formatter("")
-    low, high = coordinate.values.min(), coordinate.values.max()
     if ends and low < high:
         factor, step = (high / low) ** _MARGIN if log else 1.0, 0.0 if log else _MARGIN * (high - low)
         panel.set(**{f"{name}lim": (low / factor - step, high * factor + step)})

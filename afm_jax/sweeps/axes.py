@@ -97,6 +97,8 @@ def _axis(table: dict[str, Any], sample: str) -> Axis:
 
 
 def _listed(given: Any) -> tuple[Stretch, tuple[float, float], int]:
+    if not isinstance(given, (list, tuple)):
+        raise TypeError(f"`list` must be [value, ...], but is {given}")
     numbers = [_number(value, "a value of the list") for value in given]
     if not 0 < len(numbers) <= _MOST_HELD:
         raise ValueError(f"a list needs from 1 to {_MOST_HELD} values, but has {len(numbers)}")
@@ -184,7 +186,8 @@ def _hypercube(number: int, count: int, seed: int) -> list[Stretch]:
 
 def _number(value: Any, what: str) -> float:
     if isinstance(value, bool) or not isinstance(value, (int, float)) or not math.isfinite(value):
-        raise ValueError(f"{what} must be a number, but is {value!r}")
+        # JSON, in which inputs are kept, has no infinity
+        raise ValueError(f"{what} must be a number, but is {'not finite' if value is None else repr(value)}")
     return float(value)
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jax.sharding import Mesh, PartitionSpec
 from jaxtyping import Array
 
@@ -19,6 +20,7 @@ from afm_jax.apparatus.surface import free_frame
 from afm_jax.contact.collide import ONLY_FREE, collide
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.charts import highest_orbits
+from afm_jax.dynamics.contact_orbits import CHART_ACCURACY, single_contact_orbits
 from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.dynamics.iteration import LANES, sample_driven
 from afm_jax.dynamics.verdicts import MotionKind
@@ -29,7 +31,7 @@ from afm_jax.motion.record import MotionOutcome
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.motion.start import start_of
 from afm_jax.outcomes import CollisionOutcome
-from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, scene_family
+from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, scene_batch, scene_family
 from afm_jax.scenefile.scenefile import Start, scene_of_tables
 from afm_jax.sweeps.axes import Axis
 from afm_jax.sweeps.plan import MESSAGE, Columns, Recorder, Variable
@@ -37,9 +39,8 @@ from afm_jax.sweeps.plan import MESSAGE, Columns, Recorder, Variable
 APPROACH_SPEED = "approach_speed_nm_per_us"
 """The axis of `collide` that is no parameter of the scene."""
 SCENE_BUILDER = "afm_jax.sweeps.scenes:scene_recorder"
-_LANES = {"cpu": 1024}
-_LANES_OF_ACCELERATORS = 1 << 16
-"""Scenes of a block: what a cache holds, or what fills an accelerator."""
+_BLOCKS, _BLOCKS_OF_ACCELERATORS = {"cpu": (1024, 16)}, (1 << 16, 1)
+"""Scenes of a block, what a cache holds, or what fills an accelerator; and blocks that a device is given at once."""
 _MOST_ORDERS = 100
 
 
@@ -100,28 +101,61 @@ def _checked(key: str, value: Any, usual: Any) -> Any:
 # --- over devices -----------------------------------------------------------------------------------------------------
 
 
-def over_devices(record: Callable[..., Any], lanes: int | None = None) -> Callable[[Columns], Columns]:
-    """Return a function of columns of any length that records them block by block, a block on every local device.
+def over_devices(record: Callable[[Columns], Columns]) -> Callable[[Columns], Columns]:
+    """Return a function of columns of any length that records them block by block, on all local devices.
+
+    A call of the program is many blocks, since to make it takes as long as some hundred scenes; how many is an
+    argument, so that it does not change the program, and with it last digits.
 
     Args:
         record: from columns of one length to columns of that length, for JAX to trace.
-        lanes: rows of a block; None: as suits the devices.
     """
     devices = jax.local_devices()
-    lanes = lanes or _LANES.get(devices[0].platform, _LANES_OF_ACCELERATORS)
-    spread = PartitionSpec("lanes")
-    mesh = Mesh(np.array(devices), ("lanes",))
-    program = jax.jit(jax.shard_map(record, mesh=mesh, in_specs=spread, out_specs=spread, check_vma=False))
-    width = lanes * len(devices)
+    lanes, blocks = _BLOCKS.get(devices[0].platform, _BLOCKS_OF_ACCELERATORS)
+    record = jax.jit(record)
+
+    def each(columns: dict[str, Array], count: Array) -> dict[str, Array]:
+        """Record the first blocks of one device."""
+        shapes = jax.eval_shape(record, {name: column[0] for name, column in columns.items()})
+        empty = {name: jnp.zeros((blocks, *shape.shape), shape.dtype) for name, shape in shapes.items()}
+
+        def block(at: Array, found: dict[str, Array]) -> dict[str, Array]:
+            part = record({name: column[at] for name, column in columns.items()})
+            return {name: found[name].at[at].set(part[name]) for name in found}
+
+        return lax.fori_loop(0, count, block, empty)
+
+    spread = PartitionSpec("devices")
+    mesh = Mesh(np.array(devices), ("devices",))
+    specs = {"in_specs": (spread, PartitionSpec()), "out_specs": spread}
+    program = jax.jit(jax.shard_map(each, mesh=mesh, check_vma=False, **specs))
+    number = len(devices)
+
+    def spread_out(column: np.ndarray, count: int) -> np.ndarray:
+        filled = np.empty((number, blocks, lanes))
+        filled[:, :count] = _filled(column, number * count * lanes).reshape(number, count, lanes)
+        return filled.reshape(-1, lanes)
+
+    def gathered(found: Array, count: int, rows: int) -> np.ndarray:
+        values = np.asarray(found)
+        values = values.reshape(number, blocks, *values.shape[1:])[:, :count]
+        return values.reshape(-1, *values.shape[3:])[:rows]
 
     def work(columns: Columns) -> Columns:
-        count = len(next(iter(columns.values())))
-        parts = []
-        for first in range(0, count, width):
-            rows = {name: column[first : first + width] for name, column in columns.items()}
-            # handed out before it is asked for: the next block is prepared meanwhile
-            parts.append(program({name: _filled(column, width) for name, column in rows.items()}))
-        return {name: np.concatenate([np.asarray(part[name]) for part in parts])[:count] for name in parts[0]}
+        total = len(next(iter(columns.values())))
+        calls = []
+        for first in range(0, total, number * blocks * lanes):
+            rows = min(number * blocks * lanes, total - first)
+            count = -(-rows // (number * lanes))
+            whole = {name: spread_out(column[first : first + rows], count) for name, column in columns.items()}
+            calls.append((first, rows, count, program(whole, count)))
+        # all are handed out before the first is asked for, and put in place while the others are computed
+        results: Columns = {}
+        for first, rows, count, found in calls:
+            for name, part in found.items():
+                values = gathered(part, count, rows)
+                results.setdefault(name, np.empty((total, *values.shape[1:]), values.dtype))[first:][:rows] = values
+        return results
 
     return work
 
@@ -157,21 +191,60 @@ _ORBIT_VARIABLES = (
 )
 
 
-def _orbits(scene: Scene, paths: tuple[str, ...], *, orders: tuple[int, ...]) -> Recorder:
-    """Record the stable single-impact orbits of law scenes; of several of one order the highest."""
+def _orbits(
+    scene: Scene, paths: tuple[str, ...], *, orders: tuple[int, ...], accuracy: float = CHART_ACCURACY
+) -> Recorder:
+    """Record the stable single-impact orbits of scenes; of several of one order the highest."""
     sample_driven(scene)
-    law = impact_law_of(scene)
     for path in paths:
         if path.endswith("offset_rate_nm_per_us"):
             raise ValueError(f"under a ramp no orbit repeats: {path} cannot be an axis of 'orbits'")
+    extra = {"order": [float(order) for order in orders]}
+    if isinstance(scene.interaction, Contact):
+        return _contact_orbits(scene, orders, accuracy, extra)
+    law = impact_law_of(scene)
     made = _scenes(scene, paths)
 
     def record(columns: Columns) -> dict[str, Array]:
         scenes = made(columns)
         return highest_orbits(scenes, free_frame(scenes), jnp.asarray(orders, float))
 
-    points = 4096 if law.delay else 131072
-    return Recorder(_ORBIT_VARIABLES, over_devices(record), points, {"order": [float(order) for order in orders]})
+    points = 4096 if law.delay else 1 << 18
+    return Recorder(_ORBIT_VARIABLES, over_devices(record), points, extra)
+
+
+_CONTACT_ORBIT_VARIABLES = (
+    _ORBIT_VARIABLES[0],
+    Variable("stable", "an admissible single-impact orbit is stable", "bool", ("order",)),
+    Variable("admissible", "there is an admissible single-impact orbit", "bool", ("order",)),
+    Variable("unresolved", "the law closest to the contact has an orbit, but none was found", "bool", ("order",)),
+    _ORBIT_VARIABLES[-1],
+    MESSAGE,
+)
+
+
+def _contact_orbits(
+    scene: Scene, orders: tuple[int, ...], accuracy: float, extra: Mapping[str, list[float]]
+) -> Recorder:
+    """Record orbits of resolved contacts, one scene at a time: how many are followed together tells in last digits."""
+    nothing = {
+        variable.name: np.full((1, len(orders)), math.nan if variable.dtype == "float64" else False)
+        for variable in _CONTACT_ORBIT_VARIABLES[:-1]
+    }
+
+    def seen(row: dict[str, float]) -> Columns:
+        try:
+            one = sample_driven(scene_batch(scene, {name: np.array([value]) for name, value in row.items()}))
+            found = single_contact_orbits(one, orders, accuracy=accuracy)
+        except ValueError as error:
+            return nothing | {MESSAGE.name: [str(error)]}
+        return found | {MESSAGE.name: [""]}
+
+    def work(columns: Columns) -> Columns:
+        rows = [seen(dict(zip(columns, row, strict=True))) for row in zip(*columns.values(), strict=True)]
+        return {name: np.concatenate([row[name] for row in rows]) for name in rows[0]}
+
+    return Recorder(_CONTACT_ORBIT_VARIABLES, work, 16, extra, alone=True)
 
 
 # --- collisions -------------------------------------------------------------------------------------------------------

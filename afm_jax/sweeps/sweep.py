@@ -8,6 +8,7 @@ import os
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,11 +16,11 @@ import numpy as np
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import require_float64
-from afm_jax.compilation_cache import available_cores
+from afm_jax.compilation_cache import available_cores, silence_xla
 from afm_jax.scenefile.scenefile import Start, scene_tables
-from afm_jax.sweeps.plan import SweepPlan, plan_of
+from afm_jax.sweeps.plan import Columns, SweepPlan, plan_of
 from afm_jax.sweeps.scenes import SCENE_BUILDER
-from afm_jax.sweeps.store import STORE, ChunkEncoder, ChunkFiles, Kept, compute_chunk, locked, open_store
+from afm_jax.sweeps.store import STORE, ChunkEncoder, ChunkFiles, Kept, SweepStore, compute_chunk, locked, open_store
 
 if TYPE_CHECKING:
     import xarray
@@ -141,8 +142,7 @@ def run_plan(
             missing = [chunk for chunk in range(plan.chunks) if chunk not in kept.done]
             # the last chunks of axes may be smaller, which only a guess of the time left would notice
             share = plan.points / plan.chunks
-            for chunk, files in computing(plan, missing, workers=workers, scheduler=scheduler):
-                store.write(chunk, files)
+            for _ in _computed(store, missing, workers=workers, scheduler=scheduler):
                 computed += 1
                 passed = time.monotonic() - begin
                 if computed == 1:
@@ -158,19 +158,34 @@ def run_plan(
     return SweepRun(plan.chunks, kept, computed, time.monotonic() - begin)
 
 
-def computing(
-    plan: SweepPlan, chunks: Sequence[int], *, workers: int, scheduler: str | None
-) -> Iterator[tuple[int, ChunkFiles]]:
-    """Give chunks with their files, in any order."""
-    if not chunks:
-        return
+def _computed(store: SweepStore, chunks: Sequence[int], *, workers: int, scheduler: str | None) -> Iterator[int]:
+    """Give chunks, in any order, once they have been computed and written."""
     if workers <= 1 and scheduler is None:
-        encoder = ChunkEncoder(plan)
+        yield from _computed_here(store, chunks)
+    elif chunks:
+        with _client(min(workers, len(chunks)), scheduler) as client:
+            for chunk, files in _handed_out(client, store.plan, chunks):
+                store.write(chunk, files)
+                yield chunk
+
+
+def _computed_here(store: SweepStore, chunks: Sequence[int]) -> Iterator[int]:
+    """Compute chunks in this process, each while the one before is written."""
+    encoder = ChunkEncoder(store.plan)
+
+    def write(chunk: int, results: Columns) -> int:
+        store.write(chunk, encoder.files(chunk, results))
+        return chunk
+
+    with ThreadPoolExecutor(1) as aside:
+        writing: list[Future[int]] = []
         for chunk in chunks:
-            yield chunk, encoder.compute(chunk)
-        return
-    with _client(min(workers, len(chunks)), scheduler) as client:
-        yield from _handed_out(client, plan, chunks)
+            results = store.plan.compute(chunk)
+            if writing:
+                yield writing.pop().result()
+            writing.append(aside.submit(write, chunk, results))
+        for last in writing:
+            yield last.result()
 
 
 def _handed_out(client: "Client", plan: SweepPlan, chunks: Iterable[int]) -> Iterator[tuple[int, ChunkFiles]]:
@@ -222,7 +237,7 @@ def _client(workers: int, scheduler: str | None) -> "Iterator[Client]":
 
     if scheduler is not None:
         try:
-            client = Client(scheduler, timeout=_SECONDS_TO_ANSWER)
+            client = Client(scheduler, timeout=_SECONDS_TO_ANSWER, direct_to_workers=_here(scheduler))
         except (OSError, ValueError) as error:
             raise ValueError(f"{scheduler}: no Dask scheduler answers there ({error})") from error
         with client:
@@ -232,8 +247,17 @@ def _client(workers: int, scheduler: str | None) -> "Iterator[Client]":
                 raise ValueError(f"{scheduler}: has no workers; start some: dask worker {scheduler}") from error
             yield client
         return
-    with local_cluster(workers) as cluster, Client(cluster) as client:
+    with local_cluster(workers) as cluster, Client(cluster, direct_to_workers=True) as client:
         yield client
+
+
+def _here(scheduler: str) -> bool:
+    """Return whether a scheduler has workers of this machine alone, from which results come without its help.
+
+    >>> _here("tcp://127.0.0.1:8786"), _here("tcp://10.0.0.7:8786")
+    (True, False)
+    """
+    return "://127." in scheduler or "://localhost" in scheduler
 
 
 @contextlib.contextmanager
@@ -249,6 +273,8 @@ def local_cluster(workers: int, *, cores_each: int | None = None) -> "Iterator[A
     from dask import config  # noqa: PLC0415
     from distributed import LocalCluster  # noqa: PLC0415
 
+    # workers import what their caller's program imports before they can be told anything
+    silence_xla()
     flags = os.environ.get("XLA_FLAGS", "").split()
     cores = cores_each or max(available_cores() // workers, 1)
     settings: dict[str, Any] = {
@@ -256,7 +282,7 @@ def local_cluster(workers: int, *, cores_each: int | None = None) -> "Iterator[A
         "threads_per_worker": 1,
         "processes": True,
         "memory_limit": None,
-        "dashboard_address": ":0",
+        "dashboard_address": None,
         "silence_logs": logging.CRITICAL,
         "env": {
             "XLA_FLAGS": " ".join(flag for flag in flags if "host_platform_device_count" not in flag),
@@ -269,6 +295,11 @@ def local_cluster(workers: int, *, cores_each: int | None = None) -> "Iterator[A
         config.set(
             {
                 "distributed.worker.multiprocessing-method": "spawn",
+                # an interrupt from the keyboard reaches all processes, but is this one's business
+                "distributed.worker.preload": ["import signal; signal.signal(signal.SIGINT, signal.SIG_IGN)"],
+                # nobody looks at what these find
+                "distributed.worker.profile.enabled": False,
+                "distributed.admin.tick.interval": "500ms",
                 # what is freed is soon wanted again
                 "distributed.nanny.pre-spawn-environ.MALLOC_TRIM_THRESHOLD_": 1 << 30,
                 "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 1 << 28,
@@ -295,21 +326,21 @@ class Estimate(NamedTuple):
 
 
 def estimate(plan: SweepPlan) -> Estimate:
-    """Return what a plan would take, measured on one chunk from its middle, twice: the first time compiles."""
+    """Return what a plan would take, measured on chunks from its middle on, after one for which programs compile."""
     middle = plan.chunks // 2
     sampled = int(np.prod([part.stop - part.start for part in plan.region(middle)]))
-    encoder = ChunkEncoder(plan)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         store = open_store(folder, plan, coordinates=False)
         empty = _bytes_in(folder)
-        store.write(middle, encoder.compute(middle))
+        _seconds_of(store, [middle])
         size = _bytes_in(folder) - empty
-        begin, rounds = time.perf_counter(), 0
-        while rounds == 0 or time.perf_counter() - begin < _TRIALS_S:
-            store.write(middle, encoder.compute((middle + rounds) % plan.chunks))
-            rounds += 1
-        seconds = (time.perf_counter() - begin) / (rounds * sampled)
+        rounds, seconds = 1, _seconds_of(store, [middle])
+        if seconds < _TRIALS_S:
+            # as a sweep does it: each is written while the next is computed
+            rounds = math.ceil(_TRIALS_S / seconds)
+            seconds = _seconds_of(store, [(middle + more) % plan.chunks for more in range(rounds)])
+        seconds /= rounds * sampled
     return Estimate(
         points=plan.points,
         chunks=plan.chunks,
@@ -320,6 +351,13 @@ def estimate(plan: SweepPlan) -> Estimate:
         disk_bytes=size * plan.points / sampled + empty + sum(8 * axis.size * len(axis.columns) for axis in plan.axes),
         memory_bytes=peak_memory(),
     )
+
+
+def _seconds_of(store: SweepStore, chunks: Sequence[int]) -> float:
+    begin = time.perf_counter()
+    for _ in _computed_here(store, chunks):
+        pass
+    return time.perf_counter() - begin
 
 
 def _bytes_in(folder: Path) -> int:
