@@ -27,7 +27,7 @@ import numpy as np
 
 from afm_jax.strict_json import strict_json
 from afm_jax.version import __version__
-from afm_jax.whole_files import write_whole
+from afm_jax.whole_files import read_whole, write_whole
 
 FORMAT = "afm-jax result"
 FORMAT_VERSION = 1
@@ -111,7 +111,7 @@ def load(path: str | Path) -> Any:
         raise ValueError(f"{path}: {what}")
 
     try:
-        payload = json.loads(Path(path).read_text(encoding="utf-8"))
+        payload = json.loads(read_whole(path).decode("utf-8"))
     except ValueError as error:
         refuse(f"is no JSON ({error})")
     if not isinstance(payload, dict) or not {"format", "type", "fields"} <= set(payload):

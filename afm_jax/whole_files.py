@@ -1,8 +1,25 @@
-"""Files that appear whole or not at all: what every command writes goes through here."""
+"""Files that appear whole or not at all, as every command writes them, and files read whole, up to a size."""
 
+import errno
 import os
 import secrets
 from pathlib import Path
+
+LARGEST_BYTES = 1 << 30
+"""Of what is read: a device or a pipe without end would fill the memory."""
+
+
+def read_whole(path: str | os.PathLike[str]) -> bytes:
+    """Return what a file, a device or a pipe holds.
+
+    Raises:
+        OSError: if it cannot be read, or holds too much.
+    """
+    with Path(path).open("rb") as file:
+        data = file.read(LARGEST_BYTES + 1)
+    if len(data) > LARGEST_BYTES:
+        raise OSError(errno.EFBIG, f"it holds more than {LARGEST_BYTES:,} bytes", os.fspath(path))
+    return data
 
 
 def write_whole(path: str | os.PathLike[str], content: str | bytes, *, synced: bool = True) -> None:

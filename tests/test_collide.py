@@ -213,3 +213,13 @@ def test_the_same_program_serves_other_numbers():
     assert np.isfinite(np.asarray(second)).all()
     mapped = jax.vmap(lambda speed: collide(Contact.paper(), speed).rebound_speed_nm_per_us)(jnp.array([12.0, 40.0]))
     np.testing.assert_allclose(mapped, first, rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_gradient_of_many_tips_needs_little_memory():
+    # were every stage of every careful step remembered, it would be 1.4 GB
+    speeds = jnp.linspace(30.0, 200.0, BLOCK)
+    gradient = jax.jit(jax.grad(lambda speeds: jnp.sum(collide(Contact.paper(), speeds).rebound_speed_nm_per_us)))
+    memory = gradient.lower(speeds).compile().memory_analysis()
+    assert memory is not None
+    assert memory.temp_size_in_bytes < 200e6

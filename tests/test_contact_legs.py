@@ -2,12 +2,22 @@
 
 from functools import partial
 
+import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from afm_jax.contact.bridge_leg import driven_way, go_in, pass_in_steps, sweep
+from afm_jax.contact.bridge_leg import (
+    GRADING,
+    driven_way,
+    go_in,
+    nothing_spent,
+    pass_in_steps,
+    sweep,
+    way_rates,
+    way_through,
+)
 from afm_jax.contact.collide import collide
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Place, driven_by, free_tip
@@ -151,6 +161,31 @@ def test_both_integrators_take_a_driven_tip_through_the_bridge(inward):
     # the drive counts: a free tip ends elsewhere
     alone = sweep(driven_way(driven._replace(drive=None), gaps, place, inward=inward), 30, 25).passage
     assert (np.abs(np.asarray(alone.energy_aj) / np.asarray(both(place)[1].energy_aj) - 1.0) > 1e-3).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", ["Dopri5", "Dopri8"])
+def test_steps_in_the_gap_are_those_of_diffrax(solver):
+    contact = Contact.paper()
+    tip = free_tip(contact, find_junction(contact), jnp.asarray(1.0))
+    speeds = jnp.asarray([15.0, 40.0, 200.0])
+    gaps = tip.forms_nm, tip.junction.forms_gap_nm
+    way = way_through(tip, gaps, 0.5 * speeds**2, jnp.ones_like(speeds), inward=True)
+    ends = 1.0 - (1.0 - np.linspace(0.0, 1.0, 4)) ** GRADING
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda share, state, _: way_rates(way, share, state)),
+        getattr(diffrax, solver)(),
+        0.0,
+        1.0,
+        None,
+        nothing_spent(way),
+        stepsize_controller=diffrax.StepTo(ts=jnp.asarray(ends)),
+    )
+    assert solution.ys is not None
+    found = pass_in_steps(way, 3, solver)
+    # the same sums in another order
+    np.testing.assert_allclose(found.dissipated_aj, solution.ys[0][-1], rtol=1e-13)
+    np.testing.assert_allclose(found.time_us, solution.ys[1][-1], rtol=1e-13)
 
 
 def test_a_step_is_of_order_eight():

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import pytest
 
+from afm_jax.scenefile.scenefile import SceneError, load_scene
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import TABLE, read_table
 from tests.table_texts import KEY, NAMES, ROW, fault_of, message_of
@@ -42,6 +43,15 @@ def test_paths_that_are_no_file(tmp_path: Path):
     assert message_of(tmp_path) == "is a folder; give the path of a CSV file"
     with pytest.raises(TableError, match=r"^'a\\nb': there is no such file; check the path$"):
         read_table("a\nb")
+
+
+def test_a_file_without_end_is_refused(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr("afm_jax.whole_files.LARGEST_BYTES", 1 << 20)
+    why = "it holds more than 1,048,576 bytes"
+    with pytest.raises(TableError, match=f"^/dev/zero: cannot be read [(]{why}[)]; check the path"):
+        read_table("/dev/zero")
+    with pytest.raises(SceneError, match=f"^/dev/zero: cannot be read [(]{why}[)]$"):
+        load_scene("/dev/zero")
 
 
 @pytest.mark.parametrize(

@@ -34,6 +34,8 @@ _SLOWEST = 0.01
 """Share of K at the start below which no sweep lets it fall; a driven tip that gets slower is not for the quick way."""
 _WRITTEN_OUT = 5
 """So many sweeps are written out in the program; more are a loop."""
+_REMEMBERED = 20
+"""So many steps leave behind what their derivatives in reverse mode need."""
 _TURN_NODES, _TURN_SWEEPS = 48, 12
 _TURN_ROUNDS = 2
 _SCAN = 256
@@ -170,14 +172,23 @@ def way_through(
         inward: whether the tip goes from the outer to the inner gap.
         begin_us: time at the start.
     """
+    potentials = tuple(tip.potential(gap) for gap in gaps_nm)
+    start, end = _either(potentials, potentials[::-1], inward=inward)
+    total, course = start_energy_aj + start, exit_course(gaps_nm, margin, inward=inward)
+    return Way(tip, course.sense, jnp.asarray(begin_us, total.dtype), total, end, course)
+
+
+def exit_course(
+    gaps_nm: tuple[Float[Array, "..."], Float[Array, "..."]],
+    margin: Float[Array, "..."],
+    *,
+    inward: bool | Bool[Array, ""],
+) -> Exit:
+    """Return the gaps along a way; arguments as of `way_through`."""
     outer, inner = gaps_nm
     at_outer, at_inner = jnp.sqrt(margin), jnp.sqrt(margin + jnp.log(outer / inner))
-    potentials = tip.potential(outer), tip.potential(inner)
-    start, end = _either(potentials, potentials[::-1], inward=inward)
-    sense = _either(1.0, -1.0, inward=inward)
-    course = Exit(outer * jnp.exp(margin), _either(at_outer, at_inner, inward=inward), at_inner - at_outer, sense)
-    total = start_energy_aj + start
-    return Way(tip, sense, jnp.asarray(begin_us, total.dtype), total, end, course)
+    start_y, sense = _either(at_outer, at_inner, inward=inward), _either(1.0, -1.0, inward=inward)
+    return Exit(outer * jnp.exp(margin), start_y, at_inner - at_outer, sense)
 
 
 def _either(one: Any, other: Any, *, inward: bool | Bool[Array, ""]) -> Any:
@@ -274,17 +285,18 @@ def pass_by_collocation(way: Way, nodes: int, sweeps: int) -> Passage:
     return way.end(nothing, lax.scan(add, nothing, pairs)[0])
 
 
-def pass_in_steps(way: Way, steps: int, solver: Any = None) -> Passage:
+def pass_in_steps(way: Way, steps: int, solver: str = "Dopri8") -> Passage:
     """Return the passage after a fixed number of Diffrax's Runge-Kutta steps; differentiable forward and reverse.
 
     Args:
         way: the way.
         steps: number of steps.
-        solver: a Diffrax solver; Dopri8 if None. Its `scan_kind` must be "bounded" to be differentiable both ways.
+        solver: the name of a Runge-Kutta solver of Diffrax.
     """
     import diffrax  # noqa: PLC0415  # half a second
 
-    chosen = diffrax.Dopri8(scan_kind="bounded") if solver is None else solver
+    # the kind of scan that can be differentiated both ways
+    chosen = getattr(diffrax, solver)(scan_kind="bounded")
     term = diffrax.ODETerm(lambda share, state, _: way_rates(way, share, state))
 
     # The share of the way is the time of the solver, one for all tips: a batch is an axis of the state, which costs
@@ -299,7 +311,8 @@ def pass_in_steps(way: Way, steps: int, solver: Any = None) -> Passage:
     begin = nothing_spent(way)
     ends = jnp.stack([fractions[:-1], fractions[1:]], axis=1).astype(begin[0].dtype)
     memory = chosen.init(term, ends[0, 0], ends[0, 1], begin, None)
-    (state, _), _ = lax.scan(step, (begin, memory), ends)
+    # in reverse mode many steps are computed again one by one, few are remembered
+    (state, _), _ = lax.scan(step if steps <= _REMEMBERED else jax.checkpoint(step), (begin, memory), ends)
     return way.end(*state)
 
 
@@ -323,9 +336,7 @@ def pass_bridge(way: Way, setting: Setting) -> Passage:
         return pass_by_collocation(way, max(size, setting.junction_nodes), 0)
     if setting.rule == "collocation":
         return pass_by_collocation(way, size, setting.sweeps)
-    import diffrax  # noqa: PLC0415
-
-    return pass_in_steps(way, size, getattr(diffrax, setting.solver)(scan_kind="bounded"))
+    return pass_in_steps(way, size, setting.solver)
 
 
 def go_in(driven: Driven, place: Place, setting: QuickSetting) -> Leg:

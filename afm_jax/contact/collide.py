@@ -20,6 +20,7 @@ from afm_jax.contact.bridge_leg import (
     Passage,
     Turn,
     Way,
+    exit_course,
     margin_of,
     pass_bridge,
     pass_by_collocation,
@@ -356,10 +357,10 @@ def go_through(
     `crossing`, if not None, replaces the setting's way of crossing the bridge.
     """
     cross = crossing or (lambda way: pass_bridge(way, setting))
-    tip, forces = free_tip(contact, junction, mass), contact.forces.static
+    tip = free_tip(contact, junction, mass)
     forms, breaks = contact.bridge_forms_nm, junction.breaks_gap_nm
     outer = jnp.maximum(contact.bridge_breaks_nm, breaks)
-    pull_in, pull_out = (-forces(gap) * gap for gap in (forms, outer))
+    pull_in, pull_out = (-tip.bridge.force(gap) * gap for gap in (forms, outer))
 
     start = 0.5 * mass * approach_speed * approach_speed
     crossings = _Crossings((forms, junction.forms_gap_nm), (outer, breaks), pull_in, pull_out)
@@ -406,12 +407,10 @@ def _one_by_one(
     inward = cross(way_through(tip, at.gaps_in, start, margin_of(start, at.pull_in), inward=True))
     solid = pass_through_junction(tip, inward.energy_aj, setting.junction_nodes)
 
-    def way_out(margin: Float[Array, "..."]) -> Way:
-        return way_through(tip, at.gaps_out, solid.energy_aj, margin, inward=False)
-
-    trial = way_out(jnp.full_like(start, _TRIAL_MARGIN))
+    trial = way_through(tip, at.gaps_out, solid.energy_aj, jnp.full_like(start, _TRIAL_MARGIN), inward=False)
     end = trial.total_aj - trial.end_potential_aj if trial.quiet else pass_by_collocation(trial, 6, 1).energy_aj
-    return inward, solid, cross(way_out(margin_of(end, at.pull_out)))
+    course = exit_course(at.gaps_out, margin_of(end, at.pull_out), inward=False)
+    return inward, solid, cross(trial._replace(course=course))
 
 
 def _in_a_loop(tip: Driven, start: Float[Array, "..."], at: _Crossings, setting: Setting) -> _Parts:

@@ -110,9 +110,11 @@ def _elastic_cube(load: Float[Array, "..."]) -> Float[Array, "..."]:
 
 def _tangency(model: Tangent, forms_nm: Float[Array, ""]) -> tuple[Array, Array]:
     """Return ln D_on and whether it exists: two nested scans for the sign change, then Newton's method."""
-    low = jnp.log(jnp.full_like(forms_nm, SMALLEST_GAP_NM))
-    low, high, _ = _scan(model, low, jnp.maximum(jnp.log(forms_nm), low))
-    low, high, found = _scan(model, low, high)
+    least = jnp.log(jnp.full_like(forms_nm, SMALLEST_GAP_NM))
+    ends = least, jnp.maximum(jnp.log(forms_nm), least)
+    # in a loop, for copies take long to compile
+    (low, high), found = lax.scan(lambda ends, _: _scan(model, *ends), ends, length=2)
+    found = found[-1]
 
     def newton(_, point):
         excess, slope = jax.jvp(lambda at: _excess_stiffness(at, model), (point,), (jnp.ones_like(point),))
@@ -122,7 +124,7 @@ def _tangency(model: Tangent, forms_nm: Float[Array, ""]) -> tuple[Array, Array]
     return jnp.where(found, root, jnp.zeros_like(root)), found
 
 
-def _scan(model: Tangent, low: Float[Array, ""], high: Float[Array, ""]) -> tuple[Array, Array, Array]:
+def _scan(model: Tangent, low: Float[Array, ""], high: Float[Array, ""]) -> tuple[tuple[Array, Array], Array]:
     """Return the outermost interval of ln D where the bridge gets stiffer than the JKR contact, and if there is one.
 
     Without one, the interval around the least excess of stiffness is returned: a narrow crossing may hide there.
@@ -154,7 +156,7 @@ def _scan(model: Tangent, low: Float[Array, ""], high: Float[Array, ""]) -> tupl
     start = (never, never, low, jnp.full_like(low, jnp.inf), low)
     # a loop rather than an array of points: what depends on the parameters alone is then computed once
     (_, found, left, _, place), _ = lax.scan(inward, start, jnp.arange(_POINTS, dtype=low.dtype))
-    return jnp.where(found, left, place - step), jnp.where(found, left + step, place + step), found
+    return (jnp.where(found, left, place - step), jnp.where(found, left + step, place + step)), found
 
 
 def _meniscus_fits(contact: Contact) -> Bool[Array, "..."]:

@@ -147,9 +147,7 @@ def turning_root(level: Float[Array, "..."]) -> Float[Array, "..."]:
     """
     fixed = lax.stop_gradient(level)
     far = (2.5 * jnp.maximum(fixed, 0.0)) ** 0.1
-    root = jnp.cbrt(far**3 + 3.4)
-    for _ in range(7):
-        root = _newton(root, fixed)
+    root = lax.fori_loop(0, 7, lambda _, root: _newton(root, fixed), jnp.cbrt(far**3 + 3.4))
     return _newton(_newton(lax.stop_gradient(root), level), level)
 
 

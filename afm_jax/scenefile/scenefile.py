@@ -51,7 +51,6 @@ import os
 import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, fields
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -79,7 +78,7 @@ from afm_jax.scenefile.tables import (
     in_words,
     printable,
 )
-from afm_jax.whole_files import write_whole
+from afm_jax.whole_files import read_whole, write_whole
 
 if TYPE_CHECKING:
     from afm_jax.contact.contact import Contact
@@ -434,7 +433,7 @@ def read_toml(source: str) -> dict[str, Any]:
     where = printable(source)
     try:
         # a byte order mark, as some editors write, is no part of the text
-        text = Path(source).read_bytes().decode("utf-8-sig")
+        text = read_whole(source).decode("utf-8-sig")
     except FileNotFoundError as error:
         raise SceneError(f"{where}: there is no such file") from error
     except OSError as error:

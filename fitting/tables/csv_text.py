@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
 from afm_jax.scenefile.tables import printable
+from afm_jax.whole_files import read_whole
 
 NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 """A number as a file writes it; stricter than ``float``, which also takes "nan", "inf" and "1_000"."""
@@ -233,7 +234,7 @@ def read_bytes(path: str | Path, wanted: str) -> bytes:
     """
     name = printable(str(path))
     try:
-        return Path(path).read_bytes()
+        return read_whole(path)
     except FileNotFoundError:
         raise TableError(f"{name}: there is no such file; check the path") from None
     except IsADirectoryError:
