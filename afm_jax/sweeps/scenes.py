@@ -5,6 +5,7 @@ blocks are filled up, so that there is one shape of it and no result depends on 
 """
 
 import math
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -41,6 +42,8 @@ APPROACH_SPEED = "approach_speed_nm_per_us"
 SCENE_BUILDER = "afm_jax.sweeps.scenes:scene_recorder"
 _BLOCKS, _BLOCKS_OF_ACCELERATORS = {"cpu": (1024, 16)}, (1 << 16, 1)
 """Scenes of a block, what a cache holds, or what fills an accelerator; and blocks that a device is given at once."""
+_CALLS = 2
+"""Calls of a program under way while an earlier one's results are put in place."""
 _MOST_ORDERS = 100
 
 
@@ -112,23 +115,10 @@ def over_devices(record: Callable[[Columns], Columns]) -> Callable[[Columns], Co
     """
     devices = jax.local_devices()
     lanes, blocks = _BLOCKS.get(devices[0].platform, _BLOCKS_OF_ACCELERATORS)
-    record = jax.jit(record)
-
-    def each(columns: dict[str, Array], count: Array) -> dict[str, Array]:
-        """Record the first blocks of one device."""
-        shapes = jax.eval_shape(record, {name: column[0] for name, column in columns.items()})
-        empty = {name: jnp.zeros((blocks, *shape.shape), shape.dtype) for name, shape in shapes.items()}
-
-        def block(at: Array, found: dict[str, Array]) -> dict[str, Array]:
-            part = record({name: column[at] for name, column in columns.items()})
-            return {name: found[name].at[at].set(part[name]) for name in found}
-
-        return lax.fori_loop(0, count, block, empty)
-
     spread = PartitionSpec("devices")
     mesh = Mesh(np.array(devices), ("devices",))
     specs = {"in_specs": (spread, PartitionSpec()), "out_specs": spread}
-    program = jax.jit(jax.shard_map(each, mesh=mesh, check_vma=False, **specs))
+    program = jax.jit(jax.shard_map(_first_blocks(record, blocks), mesh=mesh, check_vma=False, **specs))
     number = len(devices)
 
     def spread_out(column: np.ndarray, count: int) -> np.ndarray:
@@ -143,21 +133,45 @@ def over_devices(record: Callable[[Columns], Columns]) -> Callable[[Columns], Co
 
     def work(columns: Columns) -> Columns:
         total = len(next(iter(columns.values())))
-        calls = []
+        results: Columns = {}
+        calls: deque[tuple[int, int, int, dict[str, Array]]] = deque()
+
+        def put_in_place() -> None:
+            first, rows, count, found = calls.popleft()
+            for name, part in found.items():
+                values = gathered(part, count, rows)
+                results.setdefault(name, np.empty((total, *values.shape[1:]), values.dtype))[first:][:rows] = values
+
         for first in range(0, total, number * blocks * lanes):
             rows = min(number * blocks * lanes, total - first)
             count = -(-rows // (number * lanes))
             whole = {name: spread_out(column[first : first + rows], count) for name, column in columns.items()}
             calls.append((first, rows, count, program(whole, count)))
-        # all are handed out before the first is asked for, and put in place while the others are computed
-        results: Columns = {}
-        for first, rows, count, found in calls:
-            for name, part in found.items():
-                values = gathered(part, count, rows)
-                results.setdefault(name, np.empty((total, *values.shape[1:]), values.dtype))[first:][:rows] = values
+            if len(calls) > _CALLS:
+                put_in_place()
+        while calls:
+            put_in_place()
         return results
 
     return work
+
+
+def _first_blocks(record: Callable[[Columns], Columns], blocks: int) -> Callable[..., dict[str, Array]]:
+    """Return a function of columns of so many blocks and of how many of these to record."""
+    record = jax.jit(record)
+
+    def each(columns: dict[str, Array], count: Array) -> dict[str, Array]:
+        """Record the first blocks of one device."""
+        shapes = jax.eval_shape(record, {name: column[0] for name, column in columns.items()})
+        empty = {name: jnp.zeros((blocks, *shape.shape), shape.dtype) for name, shape in shapes.items()}
+
+        def block(at: Array, found: dict[str, Array]) -> dict[str, Array]:
+            part = record({name: column[at] for name, column in columns.items()})
+            return {name: found[name].at[at].set(part[name]) for name in found}
+
+        return lax.fori_loop(0, count, block, empty)
+
+    return each
 
 
 def _filled(column: np.ndarray, width: int) -> np.ndarray:
