@@ -1,6 +1,7 @@
 """Simulated experiments: tables of the full contact, and of a law whose orbits are known in closed form."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,11 +16,13 @@ from fitting.examples.make_contact_amplitudes import EXAMPLE
 from fitting.simulated.experiment import drives_of, simulate_experiment, with_noise
 from fitting.tables.table import read_table
 from tests.contact_experiment import paper_experiment
+from tests.tapping_truths import MASS_NG, tapping_truth
 
 pytestmark = pytest.mark.slow
 """Each compiles programs of its own for a minute or more."""
 
 MEASURED = ("peak_amplitude_nm", "lockin_amplitude_nm", "phase_deg")
+ON_RESONANCE = ("free_amplitude_nm", "offset_nm", "lockin_amplitude_nm", "phase_lag_deg")
 ROWS = ((1, 177.3, 4.0, 1.0), (1, 180.0, 4.0, 0.0), (2, 349.2, 4.0, -1.0), (3, 545.4, 4.0, 0.0))
 LAW = ImpactLaw(0.97, 60.0, 0.3, CollisionDelay(0.2, 5.6, 0.6))
 
@@ -134,3 +137,17 @@ def test_noise_needs_both_amplitudes(of_a_law):
     lacking = dataclasses.replace(of_a_law.exact, lockin_amplitude_nm=None, lockin_amplitude_error_nm=None)
     with pytest.raises(ValueError, match="has no lockin_amplitude_nm"):
         with_noise(lacking, np.zeros((3, lacking.rows)))
+
+
+def test_taps_on_resonance_are_found_without_the_law():
+    truth = tapping_truth(0)
+    kept = read_table(Path(__file__).parent / "tapping_tables/tapping_712_0_1_8.csv")
+    chosen = [0, 6, 10]
+    of = {name: np.asarray(getattr(kept, name))[chosen] for name in ON_RESONANCE}
+    drives = [(1, 90.0, *row) for row in zip(of["free_amplitude_nm"], of["offset_nm"], strict=True)]
+    contact, cantilever = Contact.paper(**truth.parameters), Cantilever(90.0, truth.quality_factor, MASS_NG)
+    made = simulate_experiment(contact, cantilever, drives_of(drives), drive="force", phase_noise_deg=0.2)
+    assert not made.left_out
+    # kept were those made from other starts
+    for name, error in (("lockin_amplitude_nm", 2e-3), ("phase_lag_deg", 2e-3)):
+        np.testing.assert_allclose(np.asarray(getattr(made.exact, name)), of[name], rtol=0.0, atol=error)

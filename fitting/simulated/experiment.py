@@ -103,7 +103,8 @@ def steady_rows(
     """Return what is observed of every drive once its motion is the (1, N) orbit asked for.
 
     Every row starts in the middle of the flight of the stable orbit that the law with delay closest to the contact
-    predicts, the fastest if there are several.
+    predicts, the fastest if there are several. If it predicts none at all, as on resonance, where the lever turns the
+    tip round, they start as taps that cost nothing.
 
     Args:
         interaction: a contact, or a law with or without a collision delay.
@@ -124,6 +125,8 @@ def steady_rows(
         return SteadyRows(nothing, None, dict.fromkeys(range(count), "the contact captures tips of every speed"))
     follow = _follower(interaction, cantilever, drives, accuracy)
     starts, predicted = _starts(law, cantilever, drives)
+    if not predicted.any():
+        starts, predicted = _starts_on_resonance(drives)
     reasons = dict.fromkeys(np.flatnonzero(~predicted).tolist(), _NOT_PREDICTED)
     waiting = np.flatnonzero(predicted)
     if not waiting.size:
@@ -190,6 +193,15 @@ def _starts(law: ImpactLaw, cantilever: Cantilever, drives: Drives) -> tuple[Flo
     starts = np.concatenate([np.asarray(part[0]) for part in parts])[: len(drives.order)].T
     found = np.concatenate([np.asarray(part[1]) for part in parts])[: len(drives.order)]
     return np.array(starts), found
+
+
+def _starts_on_resonance(drives: Drives) -> tuple[Float[np.ndarray, "3 rows"], np.ndarray]:
+    """Return the same of tips that tap on resonance without loss, which are far out where the free one is."""
+    height, omega = -drives.offset_nm, 2e-3 * np.pi * drives.frequency_khz
+    share = np.clip(height / drives.amplitude_nm, 0.0, 1.0)
+    speed = omega * drives.amplitude_nm * np.sqrt(1.0 - share**2)
+    starts = np.stack([np.arccos(-share) / omega, np.zeros_like(omega), -speed])
+    return starts, (drives.order == 1) & (share > 0.0) & (share < 1.0)
 
 
 def _follower(interaction: Contact | ImpactLaw, cantilever: Cantilever, drives: Drives, accuracy: float) -> Follow:
