@@ -215,10 +215,12 @@ def test_an_interrupt_is_one_message(tmp_path: Path):
         while process.poll() is None and len(list((tmp_path / "out").glob("done/*.json"))) < 2:
             time.sleep(0.05)
         os.killpg(process.pid, signal.SIGINT)
-        told = process.communicate(timeout=60)[1]
+        told = process.communicate(timeout=200)[1]
     assert process.returncode != 0
     assert told.count("Traceback") <= 1, told
-    assert told.rstrip().endswith("KeyboardInterrupt"), told
+    # where workers take long to end, Python's own tracker of what they held may say so behind it
+    own = [line for line in told.splitlines() if "resource_tracker" not in line and "warnings.warn" not in line]
+    assert own[-1] == "KeyboardInterrupt", told
 
 
 @pytest.mark.slow
