@@ -466,6 +466,14 @@ def free_impacts(impact: AnyImpact, coordinate: Float[Array, " n"]) -> Free:
     return Free(speeds, impact.hertz_time(speeds.approach), impact.lowest, just_above, impact.length)
 
 
+@jax.jit
+def times_of_taps(
+    impact: PulledImpact, approach_speed: Float[Array, " n"], pull: Float[Array, " n"]
+) -> Float[Array, " n"]:
+    """Return how long taps last, in us."""
+    return jax.vmap(impact.tap)(approach_speed, pull).speeds.delay
+
+
 @partial(jax.jit, static_argnames="problem")
 def located(
     points: Float[Array, "lanes p"],

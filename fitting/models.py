@@ -286,21 +286,24 @@ def measurement_of(
     )
 
 
-_PULL_ROOM, _WIDEST = 1.15, 0.02
-"""By how much a table of pulls goes beyond those of the rows, which shift with heights and calibrations; the weakest of
-it over the strongest, at least."""
+_PULL_ROOM, _PULL_ROOM_NM = 1.15, 1.0
+"""By how much a table of pulls goes beyond those of the rows, which shift with heights and calibrations: the strongest
+as a share, the weakest as a length that the lever is bent by."""
 
 
 def _pulls(rows: Rows, cantilever: Cantilever) -> Float[np.ndarray, " 2"]:
-    """Return the weakest and the strongest pull of spring and drive at the sample that the rows have, in nm/us^2."""
+    """Return the weakest and the strongest pull of spring and drive at the sample that the rows have, in nm/us^2.
+
+    Above resonance the drive pushes a tip that meets the sample near the bottom of its free swing away from it, one
+    that does so near the top towards it: there may be no pull.
+    """
     ratio = np.asarray(rows.drive_frequency_khz) / float(cantilever.frequency_khz)
-    # the tip meets the sample near the bottom of its swing
     push = np.maximum(ratio**2 - 1.0, 0.0) * np.asarray(rows.drive_amplitude_nm)
     hits = np.asarray(rows.measured).any(axis=1) & ~rows.free
     pull = np.where(hits, -np.asarray(rows.offset_nm), 0.0)
     strongest = _PULL_ROOM * np.max(pull + np.where(hits, push, 0.0), initial=1.0)
-    weakest = np.min(np.where(hits, pull - BRIDGE_NM + 0.5 * push, np.inf), initial=strongest) / _PULL_ROOM
-    return float(cantilever.angular_frequency) ** 2 * np.array([max(weakest, _WIDEST * strongest), strongest])
+    weakest = np.min(np.where(hits, pull - BRIDGE_NM - push, np.inf), initial=strongest) - _PULL_ROOM_NM
+    return float(cantilever.angular_frequency) ** 2 * np.array([weakest, strongest])
 
 
 def _constraint_columns(

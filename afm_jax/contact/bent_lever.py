@@ -35,7 +35,8 @@ PULLS, SPEEDS = 7, 18
 """Pulls of a table, and speeds of light and of hard taps each."""
 _NODES, _SWEEPS, _JUNCTION, _ARC = 16, 6, 16, 6
 _BARRIER_GAPS, _GAPS, _TURN_GAPS = 24, 32, 128
-_DRAWN = 1.1
+_DRAWN, _WIDEST = 1.1, 0.02
+"""Weakest pull of light taps: over what the bridge draws, and over the strongest."""
 _FARTHEST = 100.0
 """Speed with which a junction forms at most, in terms of the speed that hysteresis takes."""
 _ABOVE, _ROUND = 0.05, 0.05
@@ -86,9 +87,14 @@ def tapped(contact: Contact, lever: Cantilever, pulls: Float[Array, " 2"]) -> Pu
     between = near * (far / near) ** jnp.linspace(0.0, 1.0, _GAPS)
     # where the bridge draws more than the lever pulls no tip turns round
     drawn = _DRAWN * jnp.max(-tip.bridge.force(between)) / lever.mass_ng - straight
-    weakest = jnp.stack([jnp.maximum(pulls[0], drawn), pulls[0]])
+    least = jnp.maximum(pulls[0], _WIDEST * pulls[1])
+    weakest = jnp.stack([jnp.maximum(least, drawn), least])
     ends = jnp.stack([weakest, jnp.maximum(pulls[1], 1.01 * weakest)])
-    pull = straight + ends[0] * (ends[1] / ends[0]) ** jnp.asarray(0.5 - 0.5 * _points(PULLS))[:, None]
+    # hard ones also where the lever hardly pulls, or pushes
+    ends = jnp.concatenate([ends, jnp.stack([jnp.minimum(pulls[0], 0.5 * least), least])[:, None]], axis=1)
+    more = jnp.maximum(straight - ends[0], 0.0) * jnp.array([0.0, 0.0, 1.0])
+    first, last = ends + more
+    pull = straight + first * (last / first) ** jnp.asarray(0.5 - 0.5 * _points(PULLS))[:, None] - more
     share = jnp.asarray(0.5 - 0.5 * _points(SPEEDS))
     turns = jax.vmap(lambda g: _turns(tip._replace(pull=g), near, far))(pull[:, 0])
     taken = jnp.maximum(junction.hysteresis_aj, 1e-6)
@@ -100,19 +106,19 @@ def tapped(contact: Contact, lever: Cantilever, pulls: Float[Array, " 2"]) -> Pu
         formed = formed + _needed(contact, bent, plane, taken)
         return formed, jax.vmap(lambda energy: pass_through_junction(bent, energy, _JUNCTION))(formed)
 
-    formed, inside = jax.vmap(of_hard)(pull[:, 1])
+    formed, inside = jax.vmap(jax.vmap(of_hard))(pull[:, 1:])
     moments = (inside.time_us ** (n - 1) * inside.gap_nm_us / n for n in (2, 3))
     solid = _Stretch(inside.energy_aj, inside.time_us, inside.gap_nm_us, inside.action, *moments)
-    nothing = jnp.zeros_like(formed)
+    nothing = jnp.zeros_like(turns)
     legs = (turns, turns), (nothing, nothing), _Stretch(*(nothing,) * 6)
     others = (jnp.full_like(formed, near), jnp.full_like(formed, off)), (formed, inside.energy_aj), solid
-    both = jax.tree.map(lambda *kinds: jnp.stack(kinds, axis=1), legs, others)
+    kinds = jax.tree.map(lambda light, hard: jnp.concatenate([light[:, None], hard], axis=1), legs, others)
 
     def of_pull(g, lanes):
         return jax.vmap(lambda lane: _tap(contact, tip._replace(pull=g), plane, *lane))(lanes)
 
-    taps = jax.vmap(jax.vmap(of_pull))(pull, both)
-    return PulledImpact(_filled(taps, ends, far / near, scale), tabulated(contact, lever.mass_ng), plane)
+    taps = jax.vmap(jax.vmap(of_pull))(pull, kinds)
+    return PulledImpact(_filled(taps, ends, more, far / near, scale), tabulated(contact, lever.mass_ng), plane)
 
 
 def _turns(tip: Driven, near: Float[Array, ""], far: Float[Array, ""]) -> Float[Array, " speeds"]:
@@ -132,12 +138,12 @@ def _points(count: int) -> np.ndarray:
     return np.cos(np.pi * np.arange(count) / (count - 1))
 
 
-def _filled(taps: "_Tap", pulls: Float[Array, "2 kinds"], gaps: Float[Array, ""], scale: Float[Array, ""]) -> Taps:
+def _filled(taps: "_Tap", pulls: Float[Array, "2 kinds"], more: Float[Array, " kinds"], gaps, scale) -> Taps:
     """Return the series through taps of shape (pulls, kinds, speeds), at places that the loss has shifted."""
     low, last = taps.coming[:, :, 0], taps.coming[:, :, -1]
-    farthest = stretched(jnp.sqrt(last[:, 1] - low[:, 1]) / scale)
-    high = jnp.stack([last[:, 0], farthest], axis=1)
-    table = Taps(jnp.zeros(()), low, high, gaps, scale, pulls)
+    farthest = stretched(jnp.sqrt(last[:, 1:] - low[:, 1:]) / scale)
+    high = jnp.concatenate([last[:, :1], farthest], axis=1)
+    table = Taps(jnp.zeros(()), low, high, gaps, scale, pulls, more)
     inner = jax.vmap(lambda low, high, at: jax.vmap(replace(table, low=low, high=high).place, 1, 1)(at))(
         low, high, taps.coming[:, :, 1:-1]
     )

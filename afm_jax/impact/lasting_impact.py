@@ -317,7 +317,9 @@ def _rebound(u: Float[Array, "..."], loss: Float[Array, "..."]) -> Float[Array, 
 
 
 class Taps(eqx.Module):
-    """Taps, light (that the bridge turns round) and hard, as series over the speed with which they come, and over ln g.
+    """Taps as series over the speed with which they come, and over ln(g + more) of the pull g.
+
+    Of three kinds: light, that the bridge turns round; hard; and hard under less pull than that, or pushed.
 
     Attributes:
         terms: coefficients of u_in^2 - u_out^2 and of the other numbers of `Tap`, shape (pulls, kinds, terms, 6).
@@ -326,6 +328,7 @@ class Taps(eqx.Module):
         gaps: between which light ones turn, as a ratio.
         scale: speed of the hard ones' variable, in nm/us.
         pulls: weakest and strongest pull in nm/us^2, shape (2, kinds).
+        more: what is added to pulls before their logarithms are taken, shape (kinds,).
     """
 
     terms: Float[Array, "..."]
@@ -334,32 +337,38 @@ class Taps(eqx.Module):
     gaps: Float[Array, ""]
     scale: Float[Array, ""]
     pulls: Float[Array, "..."]
+    more: Float[Array, "..."]
 
     def at(self, pull: Float[Array, ""]) -> "Taps":
         """Return the series over the speed alone, at a pull."""
         weakest, strongest = self.pulls
         held = jnp.clip(pull, weakest, strongest)
-        far = 2.0 * jnp.log(held / weakest) / jnp.log(strongest / weakest) - 1.0
+        first, last = weakest + self.more, strongest + self.more
+        far = 2.0 * jnp.log((held + self.more) / first) / jnp.log(last / first) - 1.0
         weights = polynomials(far, self.low.shape[0])
         own = {name: jnp.einsum("kp,pk...->k...", weights, getattr(self, name)) for name in ("terms", "low", "high")}
         return replace(self, **own)
 
-    def place(self, square: Float[Array, "..."]) -> Float[Array, " 2"]:
+    def place(self, square: Float[Array, "..."]) -> Float[Array, " kinds"]:
         """Return where squared speeds, one or one a kind, lie in the series, -1 to 1; of a table at one pull."""
         # light ones by the gap where they turn, which is about linear in ln of what is left to the nearest
-        light, hard = jnp.broadcast_to(square, (2,))
-        left = jnp.clip((self.high[0] - light) / (self.high[0] - self.low[0]), 0.0, 1.0)
-        beyond = hard > self.low[1]
-        v = jnp.sqrt(jnp.where(beyond, hard - self.low[1], 1.0)) / self.scale
-        far = jnp.where(beyond, 2.0 * stretched(v) / self.high[1] - 1.0, -1.0)
-        return jnp.stack([1.0 - 2.0 * jnp.log1p((self.gaps - 1.0) * left) / jnp.log(self.gaps), far])
+        square = jnp.broadcast_to(square, self.low.shape)
+        left = jnp.clip((self.high[0] - square[0]) / (self.high[0] - self.low[0]), 0.0, 1.0)
+        turned = 1.0 - 2.0 * jnp.log1p((self.gaps - 1.0) * left) / jnp.log(self.gaps)
+        hard, low = square[1:], self.low[1:]
+        beyond = hard > low
+        v = jnp.sqrt(jnp.where(beyond, hard - low, 1.0)) / self.scale
+        return jnp.append(turned, jnp.where(beyond, 2.0 * stretched(v) / self.high[1:] - 1.0, -1.0))
 
-    def holds(self, square: Float[Array, ""], pull: Float[Array, ""]) -> Bool[Array, " 2"]:
-        """Say whether there are taps of either kind at a squared speed and a pull; of a table at that pull."""
-        inside = (pull >= self.pulls[0] * (1.0 - _BESIDE)) & (pull <= self.pulls[1] * (1.0 + _BESIDE))
+    def holds(self, square: Float[Array, ""], pull: Float[Array, ""]) -> Bool[Array, " kinds"]:
+        """Say whether there are taps of each kind at a squared speed and a pull; of a table at that pull."""
+        beside = _BESIDE * jnp.abs(self.pulls)
+        first, end = self.pulls[0] - beside[0], self.pulls[1] + beside[1]
+        # the two tables of hard ones meet where both are exact
+        inside = (pull >= first.at[1].set(self.pulls[0, 1])) & (pull <= end.at[2].set(self.pulls[0, 1]))
         # next to the first hard tap the last light one holds
         last = jnp.where(self.low[1] < _NEXT * self.high[0], jnp.maximum(self.low[1], self.high[0]), self.high[0])
-        end = jnp.stack([square <= last, self.place(square)[1] <= 1.0])
+        end = jnp.append(square <= last, self.place(square)[1:] <= 1.0)
         return inside & (square >= self.low) & end
 
 
@@ -502,11 +511,11 @@ class PulledImpact(eqx.Module):
         """Return a tap, or the next that there is, and whether it exists."""
         square = approach_speed**2
         taps = self.taps.at(pull)
-        is_light, is_hard = taps.holds(square, pull)
+        is_light, *is_hard = taps.holds(square, pull)
         parts = jnp.einsum("kn,knc->kc", polynomials(taps.place(square), taps.terms.shape[1]), taps.terms)
-        loss, time, *others = jnp.where(is_hard, parts[1], parts[0])
+        loss, time, *others = jnp.where(is_hard[0], parts[1], jnp.where(is_hard[1], parts[2], parts[0]))
         rebound = jnp.sqrt(jnp.maximum(square - loss, 1e-6))
-        return Tap(Speeds(approach_speed, rebound, time), *others), is_hard | is_light
+        return Tap(Speeds(approach_speed, rebound, time), *others), is_hard[0] | is_hard[1] | is_light
 
 
 class Middle(NamedTuple):

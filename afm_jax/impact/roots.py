@@ -123,6 +123,8 @@ _REGULA_FALSI, _BEFORE_NEWTON = 20, 10
 _SECTIONS = 16
 _GOLDEN = 0.6180339887498949
 _NEWTON = 6
+_SAME = 1e-7
+"""Relative difference of approach speeds below which roots are one."""
 _CLOSED = 1e-9
 """By how much a turn of the map may miss its start, in units of the drive: near a fold rounding leaves as much."""
 
@@ -181,6 +183,8 @@ def find_roots(problem: OrbitProblem, scan: Scan = FINE) -> OrbitRoots:
     else:
         place, there = jax.vmap(_regular, in_axes=(0, None))(safe, problem)
     found = found & driven & there
+    if problem.impact.lasts:
+        found = found & ~_seen_before(place.coordinate, found)
     return OrbitRoots(OrbitPlace(jnp.where(found, place.coordinate, safe), place.phase), found, complete)
 
 
@@ -193,6 +197,12 @@ def follow_root(
     speeds, system = closure(near, problem)
     closed = close_map(place_of(near, speeds, system, problem), problem, _NEWTON, wanted)
     return OrbitPlace(*closed.unknowns), system.regular & jnp.all(jnp.abs(closed.gaps) < _CLOSED)
+
+
+def _seen_before(coordinate: Float[Array, " slots"], found: Bool[Array, " slots"]) -> Bool[Array, " slots"]:
+    """Say which roots are those of an earlier slot: from two brackets Newton's method may come to one orbit."""
+    same = jnp.abs(coordinate[:, None] - coordinate) <= _SAME * coordinate
+    return jnp.any(jnp.tril(same & found, k=-1), axis=1)
 
 
 def harmless_coordinate(problem: OrbitProblem) -> Float[Array, ""]:
@@ -244,7 +254,9 @@ def _scanned_roots(problem: OrbitProblem, scan: Scan) -> _Coordinates:
     root, found = _narrowed(
         _crossings(crossing[1], closer.grid, closer.value, scan), _dips(brief, grid, value, scan), problem
     )
-    order = jnp.argsort(jnp.where(found, root, jnp.inf))[: scan.slots]
+    # the fastest ones if there are too many
+    fastest = jnp.argsort(jnp.where(found, -root, jnp.inf))[: scan.slots]
+    order = fastest[jnp.argsort(jnp.where(found[fastest], root[fastest], jnp.inf))]
     few = jnp.all(jnp.stack([jnp.sum(one) for one in crossing]) <= scan.crossings) & (jnp.sum(found) <= scan.slots)
     return _Coordinates(root[order], found[order], few)
 
