@@ -53,6 +53,21 @@ def test_taps_are_collisions_of_the_undriven_lever():
     assert seen == {0, 1}
 
 
+@pytest.mark.slow
+def test_light_taps_have_the_slopes_of_their_table():
+    """What the adhesion of a junction that never forms changes is the places of the series alone."""
+
+    def time(adhesion):
+        contact = Contact.paper(**MIXED | {"adhesion_energy_j_per_m2": adhesion})
+        impact = tapped(contact, LEVER, jnp.array([0.5, 26.0]))
+        return impact.tap(jnp.array(3.0), jnp.array(1.0)).speeds.delay
+
+    at = jnp.array([0.2199, 0.22, 0.2201])
+    times, slopes = jax.jit(jax.vmap(lambda x: jax.jvp(time, (x,), (jnp.ones(()),))))(at)
+    assert slopes[1] != 0.0
+    assert float(slopes[1]) == pytest.approx(float(times[2] - times[0]) / 2e-4, rel=1e-4)
+
+
 @jax.jit
 def read_of(impact, cantilever, free_nm, frequency_khz, offset_nm):
     """Return amplitude and lag of the fastest steady orbit, and whether there is one."""

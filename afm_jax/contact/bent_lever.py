@@ -122,14 +122,11 @@ def tapped(contact: Contact, lever: Cantilever, pulls: Float[Array, " 2"]) -> Pu
 
 
 def _turns(tip: Driven, near: Float[Array, ""], far: Float[Array, ""]) -> Float[Array, " speeds"]:
-    """Return the gaps where light taps turn whose speeds, but for the loss, are at the places of the series.
-
-    Other places would do but for the rounding: only the ends have derivatives.
-    """
+    """Return the gaps where light taps turn whose speeds, but for the loss, are at the places of the series."""
     gaps = far * (near / far) ** jnp.linspace(0.0, 1.0, _TURN_GAPS)
     risen = tip.potential(gaps) - tip.potential(far)
     left = jnp.expm1(jnp.log(far / near) * jnp.asarray(0.5 + 0.5 * _points(SPEEDS))) / (far / near - 1.0)
-    inner = lax.stop_gradient(jnp.exp(jnp.interp(risen[-1] * (1.0 - left), risen, jnp.log(gaps))))
+    inner = jnp.exp(jnp.interp(risen[-1] * (1.0 - left), risen, jnp.log(gaps)))
     return jnp.concatenate([far[None], inner[1:-1], near[None]])
 
 
