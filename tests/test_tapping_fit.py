@@ -30,7 +30,7 @@ from tests.tapping_truths import as_measured, exact_table, tapping_truth
 
 EXAMPLE = "fitting/examples/tapping_contact.csv"
 TABLES = Path(__file__).parent / "tapping_tables"
-"""Truths of three of the random contacts of `tests.tapping_accuracy`."""
+"""Truths of some of the random contacts of `tests.tapping_accuracy`."""
 TIP = Cantilever(90.0, 200.0, 16.81)
 
 
@@ -96,6 +96,23 @@ def test_an_unseen_contact_is_predicted_and_fitted_as_wanted():
 
 
 @pytest.mark.slow
+def test_a_sticky_contact_on_which_the_lever_pulls_hard_is_fitted_as_wanted():
+    """Most of its rows are pulled by 0.8 to 1.2 times what turns the tip round, and are predicted as well as others."""
+    truth = tapping_truth(4)
+    exact = exact_table(truth, RATIO, TABLES)
+    found = forward(truth, exact)
+    used = (found.speed > 4.0) & (found.pull > 0.8) & (found.pull < 1.2)
+    assert np.count_nonzero(used) >= 5
+    assert np.max(np.abs(found.nm[used])) < 0.07
+    assert np.max(np.abs(found.degrees[used])) < 0.01
+    # of the second one the viscous loss ends next to 0, where its coordinate has no curvature
+    for name, made in (("exact", as_measured(exact)), ("noisy", noisy(as_measured(exact), truth, 0))):
+        result = fitted(truth, made)
+        assert result is not None
+        assert judge_fits(name, [result], exact=name == "exact") == 0
+
+
+@pytest.mark.slow
 def test_a_soft_contact_is_predicted_as_wanted_above_resonance():
     """The softest of those of `make tapping`: its surface is 0.6 nm above gap 0, as its delays say."""
     truth = tapping_truth(2)
@@ -116,6 +133,8 @@ def test_a_contact_comes_out_of_a_noisy_curve():
     result = contact_of(truth, noisy(as_measured(exact_table(truth, RATIO, TABLES)), truth, 0))
     assert result.valid, result.reasons
     found = against_truth(truth, result)
+    # those next to the sample too
+    assert result.rows.used.all()
     assert found is not None
     assert np.max(np.abs(found.law)) < WORST_OF_CONTACT
     for name in ("relative_humidity", "adhesion_energy_j_per_m2", "viscosity_pa_s", "modulus_gpa"):
