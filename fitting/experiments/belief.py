@@ -223,6 +223,9 @@ def read_belief(path: str | Path, uncertainty: float = UNCERTAINTY) -> tuple[Bel
         return belief_of_fit(payload, uncertainty), payload
     except ValueError as error:
         raise TableError(f"{printable(str(path))}: {error}") from error
+    except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
+        # an entry of another kind than `afm-jax fit` writes there
+        raise TableError(f"{printable(str(path))}: the saved fit is damaged; fit the table again") from error
 
 
 def _columns_of(drive: str | None) -> tuple[str, str, str, str]:
