@@ -174,8 +174,8 @@ def crossed(start: tuple[str, str]) -> set[str]:
     [
         ("afm_jax.motion.simulate", "simulate", 32),
         ("fitting.fits.fit", "fit", 51),
-        ("afm_jax.contact.collide", "collide", 17),
-        ("afm_jax.effects.study", "study_effects", 49),
+        ("afm_jax.contact.collide", "collide", 18),
+        ("afm_jax.effects.study", "study_effects", 50),
     ],
 )
 def test_a_call_crosses_few_files(module: str, name: str, most: int):

@@ -27,6 +27,7 @@ from afm_jax.contact.bridge_leg import (
     turn_in_bridge,
     way_through,
 )
+from afm_jax.contact.by_tangents import by_tangents
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Driven, free_tip
 from afm_jax.contact.junction import Junction, explain_missing_junction, find_junction
@@ -82,7 +83,8 @@ def collide(
 ) -> Collision:
     """Return what becomes of free tips that hit a sample at rest.
 
-    Works under `jit`, `vmap`, `grad` and `jvp`, in every parameter of the contact. A million speeds are one call.
+    Works under `jit`, `vmap`, `grad` and `jvp`, in every parameter of the contact. A million speeds are one call; under
+    `vmap` the tips of all examples are one batch.
 
     Args:
         contact: the contact; its parameters are numbers, or arrays of the speeds' shape to differ from tip to tip.
@@ -118,8 +120,8 @@ def collide(
             )
     # one axis of tips inside, the speeds' own shape outside
     contact, mass = jax.tree.map(lambda leaf: leaf.ravel() if leaf.ndim else leaf, (contact, mass))
-    quick, resolved, place = _quick(contact, mass, speeds.ravel(), setting)
-    result = _resolve((contact, place), mass, speeds.ravel(), quick, resolved)
+    small = speeds.size <= BLOCK
+    result = by_tangents(_tips, contact, mass, speeds.ravel(), small=small, setting=setting)
     _complain(contact, result)
     return jax.tree.map(lambda part: part.reshape(speeds.shape), result)
 
@@ -146,6 +148,11 @@ def collide_in_blocks(
 def batch_of(contact: Contact, mass_ng: ArrayLike, speeds: Float[Array, " tips"], setting: Setting) -> Collision:
     """Return a batch by one setting, without a second look at what its few steps do not resolve: for measurements."""
     return _quick(contact, jnp.asarray(mass_ng, speeds.dtype), speeds, setting)[0]
+
+
+def _tips(contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, " tips"], setting: Setting) -> Collision:
+    quick, resolved, place = _quick(contact, mass, speeds, setting)
+    return _resolve((contact, place), mass, speeds, quick, resolved)
 
 
 def _complain(contact: Contact, result: Collision) -> None:
