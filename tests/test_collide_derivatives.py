@@ -137,4 +137,15 @@ def test_reverse_mode_keeps_little():
     program = jax.jit(jax.grad(lambda contact: jnp.sum(collide(contact, speeds).rebound_speed_nm_per_us)))
     memory = program.lower(Contact.paper()).compile().memory_analysis()
     # 54 MB where the way itself is turned round
+    assert memory is not None
     assert memory.temp_size_in_bytes < 25e6
+
+
+def test_capture_speed_has_second_derivatives():
+    def of(viscosity):
+        return capture_speed(Contact.paper(viscosity_pa_s=viscosity))
+
+    slope, step = jax.jit(jax.grad(of)), 1e-5
+    expected = (slope(4e-3 + step) - slope(4e-3 - step)) / (2.0 * step)
+    # what is left of the energy bends sharply at the capture speed itself: all directions at once would cancel
+    assert float(jax.jit(jax.hessian(of))(4e-3)) == pytest.approx(float(expected), rel=1e-6)

@@ -128,6 +128,29 @@ main()
 """
 
 
+LEAVING = """
+import atexit, os, signal, sys, types
+import click
+from afm_jax.cli.main import COMMANDS, main
+# as of JAX's threads, which still compute while the interpreter is taken down
+atexit.register(lambda: os.kill(os.getpid(), signal.SIGSEGV))
+@click.command()
+def command():
+    print("whole")
+    raise KeyboardInterrupt
+sys.modules["leaving"] = types.SimpleNamespace(command=command)
+COMMANDS["leaving"] = ("leaving", "")
+sys.argv[1:] = ["leaving"]
+main()
+"""
+
+
+def test_an_interrupted_program_leaves_before_its_threads_can_crash_it():
+    done = subprocess.run([sys.executable, "-c", LEAVING], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stdout) == (130, "whole\n")
+    assert done.stderr.strip() == "afm-jax: interrupted"
+
+
 def test_an_interrupt_that_is_swallowed_ends_the_program_all_the_same():
     with subprocess.Popen(
         [sys.executable, "-c", DEAF], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

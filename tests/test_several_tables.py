@@ -160,6 +160,7 @@ def test_names_tell_tables_apart():
         ({}, {"share": ["all"], "constraints": {"quality": (1.0, 0.1)}}, "the constraint on 'quality' is on no"),
         ({}, {"share": ["r"]}, "`share` must be chosen from quality_factor, .* and all, but one is 'r'"),
         ({}, {"share": ["tip_calibration"]}, "`share` names tip_calibration, but no table gives it with an error"),
+        ({}, {}, "b.csv holds the same readings as a.csv; give each table once"),
     ],
 )
 def test_what_tables_cannot_share_is_said(changes: dict, options: dict, message: str):

@@ -103,6 +103,21 @@ def test_damaged_chunks_are_computed_again(tmp_path: Path, fault: str):
     assert contents(tmp_path) == before
 
 
+@pytest.mark.parametrize("fault", ["cut", "gone"])
+def test_damaged_axes_are_written_again(tmp_path: Path, fault: str):
+    run_plan(plan(), tmp_path)
+    before = contents(tmp_path)
+    axes = [path for path in (tmp_path / STORE).glob("*/c/*") if path.is_file()]
+    assert axes
+    for path in axes:
+        data = path.read_bytes()
+        path.unlink()
+        if fault == "cut":
+            path.write_bytes(data[:-2])
+    assert run_plan(plan(), tmp_path).computed == 0
+    assert contents(tmp_path) == before
+
+
 def test_a_changed_input_is_refused_and_named(tmp_path: Path):
     run_plan(plan(), tmp_path)
     with pytest.raises(ValueError, match=r"axes\[2\].linear is \[0.0, 11.0, 12\], not \[0.0, 12.0, 12\]: choose"):

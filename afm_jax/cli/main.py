@@ -6,6 +6,7 @@ How a command ends: exit codes, and one line on standard error for whatever went
 3: ran, but the result is not valid. 130: interrupted.
 """
 
+import contextlib
 import difflib
 import errno
 import os
@@ -28,6 +29,9 @@ _NUMERICAL_PACKAGES = frozenset(
 )
 _TRACEBACK = "AFM_JAX_TRACEBACK"
 """Environment variable that, if set, lets a failure of the program pass through with its traceback."""
+
+
+_INTERRUPTED = 130
 
 
 _FULL = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO})
@@ -76,7 +80,7 @@ def _verdict(error: Exception) -> tuple[str, int]:
         case NotValid():
             return f"not valid: {error}", 3
         case click.Abort():
-            return "interrupted", 130
+            return "interrupted", _INTERRUPTED
         case click.ClickException():
             return _called_wrongly(error), 2
         case ModuleNotFoundError():
@@ -176,7 +180,7 @@ def _end_when_interrupted() -> threading.Event:
             pass
         if not ended.wait(_GRACE_S):
             click.echo("afm-jax: interrupted", err=True)
-            os._exit(130)
+            os._exit(_INTERRUPTED)
         told.close()
 
     threading.Thread(target=wait, daemon=True).start()
@@ -262,6 +266,12 @@ class LazyGroup(click.Group):
         ended = _end_when_interrupted() if args is None else threading.Event()
         code = exit_code_of(run)
         ended.set()
+        if args is None and code == _INTERRUPTED:
+            # JAX's threads still compute: taking the interpreter down under them ends in a segmentation fault
+            for stream in (sys.stdout, sys.stderr):
+                with contextlib.suppress(AttributeError, OSError, ValueError):
+                    stream.flush()
+            os._exit(code)
         return sys.exit(code)
 
 

@@ -107,12 +107,18 @@ def simulate(  # noqa: PLR0913
         raise TypeError(
             f"the interaction must be an ImpactLaw, a Contact or None, not {type(scene.interaction).__name__}"
         )
-    if max_contacts is not None:
-        found = follow(max_contacts)
-    else:
-        room = _room(scene, surface, duration_us)
-        # in reverse mode every round is run, needed or not
-        found = _with_room(follow, room if reverse else max(_LEAST_ROOM, 1 << (room - 1).bit_length()))
+    try:
+        if max_contacts is not None:
+            found = follow(max_contacts)
+        else:
+            room = _room(scene, surface, duration_us)
+            # in reverse mode every round is run, needed or not
+            found = _with_room(follow, room if reverse else max(_LEAST_ROOM, 1 << (room - 1).bit_length()))
+    except TypeError as error:
+        # JAX's own, where reverse derivatives through its loop are differentiated once more
+        if reverse or "NoneType" not in str(error):
+            raise
+        raise ValueError(_NOT_BACKWARDS) from error
     return found if reverse else jax.tree.map(_only_forwards, found)
 
 
@@ -124,11 +130,14 @@ mlir.register_lowering(_forwards, lambda _, number: [number])
 batching.primitive_batchers[_forwards] = lambda numbers, axes: (_forwards.bind(*numbers), axes[0])
 
 
+_NOT_BACKWARDS = (
+    "`simulate` is differentiable in reverse mode (`grad`, `vjp`, `jacrev`, `hessian`) with `reverse=True` only: add "
+    "it, or take `jvp` or `jacfwd`"
+)
+
+
 def _refuse(*_):
-    raise ValueError(
-        "`simulate` is differentiable in reverse mode (`grad`, `vjp`, `jacrev`) with `reverse=True` only: add it, or "
-        "take `jvp` or `jacfwd`"
-    )
+    raise ValueError(_NOT_BACKWARDS)
 
 
 ad.deflinear2(_forwards, _refuse)

@@ -172,6 +172,8 @@ def open_store(folder: Path, plan: SweepPlan, *, coordinates: bool = True) -> Sw
     """
     if (folder / STORE / "zarr.json").exists():
         _check_same(folder, plan)
+        # of the axes no checksum is kept: they are what the plan says
+        _write_axes(zarr.open_group(str(folder / STORE), mode="r+", zarr_format=3), plan, coordinates=coordinates)
     else:
         # beside its place first: it is there whole or not at all
         fresh = folder / f".{STORE}.part"
@@ -197,19 +199,42 @@ def _make_whole(path: Path, plan: SweepPlan, *, coordinates: bool) -> None:
         }
     )
     for axis in plan.axes:
-        for parameter, values in axis.columns.items():
+        for parameter in axis.columns:
             own = {"parameter": parameter, "units": unit_of(parameter)} | dict(plan.recorder.labels.get(parameter, {}))
-            array = _coordinate(group, dimension_of(parameter), axis.dimension, own, axis.size)
-            for first in range(0, axis.size if coordinates else 0, _SLAB):
-                end = min(first + _SLAB, axis.size)
-                array[first:end] = values(first, end)
+            _coordinate(group, dimension_of(parameter), axis.dimension, own, axis.size)
     for name, values in plan.recorder.extra.items():
-        _coordinate(group, name, name, {}, len(values))[:] = np.asarray(values)
+        _coordinate(group, name, name, {}, len(values))
+    _write_axes(group, plan, coordinates=coordinates)
     _make(group, plan)
     with warnings.catch_warnings():
         # that xarray opens the store by one file is worth a part of the format that is not settled yet
         warnings.simplefilter("ignore")
         zarr.consolidate_metadata(str(path))
+
+
+def _write_axes(group: zarr.Group, plan: SweepPlan, *, coordinates: bool) -> None:
+    """Write the values along the axes, where they do not stand there already."""
+    for axis in plan.axes if coordinates else ():
+        for parameter, values in axis.columns.items():
+            for first in range(0, axis.size, _SLAB):
+                _write_once(group, dimension_of(parameter), first, values(first, min(first + _SLAB, axis.size)))
+    for name, values in plan.recorder.extra.items():
+        for first in range(0, len(values), _SLAB):
+            _write_once(group, name, first, values[first : first + _SLAB])
+
+
+def _write_once(group: zarr.Group, name: str, first: int, values: Any) -> None:
+    """Write a chunk of a coordinate, unless it holds these values."""
+    array: Any = group[name]
+    wanted = np.asarray(values, float)
+    place = slice(first, first + wanted.size)
+    try:
+        there = np.array_equal(array[place], wanted, equal_nan=True)
+    # what a damaged chunk does the codec decides
+    except (OSError, RuntimeError, ValueError):
+        there = False
+    if not there:
+        array[place] = wanted
 
 
 def _make(group: zarr.Group, plan: SweepPlan) -> dict[str, zarr.Array]:

@@ -5,6 +5,7 @@ import itertools
 import json
 import math
 import os
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -305,9 +306,21 @@ def local_cluster(workers: int, *, cores_each: int | None = None) -> "Iterator[A
                 "distributed.nanny.pre-spawn-environ.MALLOC_MMAP_THRESHOLD_": 1 << 28,
             }
         ),
+        _quiet_tracker(),
         LocalCluster(**settings, local_directory=scratch) as cluster,
     ):
         yield cluster
+
+
+@contextlib.contextmanager
+def _quiet_tracker() -> "Iterator[None]":
+    """Have Python's tracker of what processes share, once it is started, clean up behind an interrupt silently."""
+    option = "ignore:resource_tracker:UserWarning"
+    sys.warnoptions.append(option)
+    try:
+        yield
+    finally:
+        sys.warnoptions.remove(option)
 
 
 class Estimate(NamedTuple):

@@ -38,12 +38,14 @@ from fitting.tables.csv_text import (
     FileSetting,
     Form,
     TableError,
+    beyond,
     check_not_empty,
     column_of,
     named_rows,
     parse_cells,
     parse_rows,
     read_text,
+    said_beyond,
     settings_in,
     split_lines,
 )
@@ -71,7 +73,7 @@ SWEEP = Form(
 
 DENSITY = "nm/sqrt(Hz)"
 """The unit that makes a sweep a thermal spectrum."""
-SPECTRUM_SETTINGS = {"averages": FileSetting("averages", "1000")}
+SPECTRUM_SETTINGS = {"averages": FileSetting("averages", "1000", lowest=0.5)}
 
 
 @dataclass(frozen=True)
@@ -273,9 +275,10 @@ def _check_numbers(
         bad, what = bad | (values <= 0.0), "must be finite and above 0"
     elif name == "amplitude":
         bad, what = bad | (values < 0.0), "must be finite and not negative"
-    for row in np.flatnonzero(bad):
-        number = repr(float(values[row])).removesuffix(".0")
-        faults.add(f"{what}, but is {number}; correct it or remove the row", line=int(lines[row]), column=name)
+    far = beyond(values, positive=name in _POSITIVE or name == "amplitude")
+    for row in np.flatnonzero(bad | far):
+        number, must = repr(float(values[row])).removesuffix(".0"), said_beyond(values[row]) if far[row] else what
+        faults.add(f"{must}, but is {number}; correct it or remove the row", line=int(lines[row]), column=name)
 
 
 def read_sweep(path: str | Path) -> ResonanceSweep:

@@ -27,7 +27,7 @@ from fitting.parameters import (
     model_parameters,
     paper_values,
 )
-from fitting.tables.csv_text import TableError, read_fit_json
+from fitting.tables.csv_text import TableError, beyond, read_fit_json
 from fitting.tables.table import DRIVES
 
 UNCERTAINTY = 0.1
@@ -223,6 +223,9 @@ def read_belief(path: str | Path, uncertainty: float = UNCERTAINTY) -> tuple[Bel
         return belief_of_fit(payload, uncertainty), payload
     except ValueError as error:
         raise TableError(f"{printable(str(path))}: {error}") from error
+    except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
+        # an entry of another kind than `afm-jax fit` writes there
+        raise TableError(f"{printable(str(path))}: the saved fit is damaged; fit the table again") from error
 
 
 def _columns_of(drive: str | None) -> tuple[str, str, str, str]:
@@ -327,6 +330,7 @@ def _is_whole(payload: Mapping[str, Any]) -> bool:
         ]
         drives = all(np.array(of_one, float).ndim == 2 for of_one in columns)
         whole = np.isfinite([number for entry in entries for number in entry]).all()
+        whole &= not np.any(beyond(np.array([error for _, error in entries], float), positive=True))
         if (plain := payload.get("plain_law")) is not None:
             spread = np.array(plain["covariance"], float)
             whole &= bool(np.isfinite([*plain["values"].values(), *spread.ravel()]).all())

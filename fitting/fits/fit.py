@@ -777,6 +777,7 @@ def _joint(
     for table, known in zip(tables.tables, each, strict=True):
         checked = {name: pair for name, pair in known.items() if name != "offset_origin_nm"}
         problem_of(replace(table, calibration={}), model, constraints=checked, **options)
+    tables.check_different()
     labels, names = tables.labels, [*own, *shared]
     known = {name: pair for name, pair in each[0].items() if name in (*own, *shared)}
     heads = {"free_frequency_khz", "quality_factor"}

@@ -413,7 +413,10 @@ def _numbers(cells: Any) -> Float[np.ndarray, " points"]:
     """Return a list of numbers as an array, NaN for null; an empty one for anything else."""
     if not isinstance(cells, list) or any(not isinstance(cell, (int, float, type(None))) for cell in cells):
         return np.zeros(0)
-    return np.array([np.nan if cell is None else float(cell) for cell in cells], dtype=np.float64)
+    try:
+        return np.array([np.nan if cell is None else float(cell) for cell in cells], dtype=np.float64)
+    except OverflowError:
+        return np.zeros(0)
 
 
 _KNOWN_COLUMNS = _COLUMNS[:2]

@@ -98,6 +98,25 @@ class Faults:
 
 LARGEST = 1e9
 """Size of any number in a table: a length of a metre, a frequency of a terahertz."""
+FARTHEST = 1e30
+"""Size of a number in any unit, and the inverse of one that must be above 0: the powers of others are no numbers."""
+
+
+def beyond(values: Any, *, positive: bool, largest: float = FARTHEST) -> Any:
+    """Say which numbers are too large, or too small for ones that must be above 0, to compute with.
+
+    Args:
+        values: a number or an array; what is none, or infinite, is not meant.
+        positive: whether they must be above 0.
+        largest: size of the largest that is not too large.
+    """
+    small = (values > 0.0) & (values < 1.0 / FARTHEST) if positive else False
+    return np.isfinite(values) & ((np.abs(values) > largest) | small)
+
+
+def said_beyond(value: float, largest: float = FARTHEST) -> str:
+    """Return what a number that is `beyond` must be instead."""
+    return f"must be at most {largest:g} in size" if abs(value) > largest else f"must be at least {1.0 / FARTHEST:g}"
 
 
 def quoted(text: str) -> str:
@@ -393,10 +412,12 @@ def fault_in_number(setting: FileSetting, value: float, error: float | None = No
     if not setting.lowest < value < float("inf"):
         above = "" if setting.lowest == float("-inf") else f" and above {setting.lowest:g}"
         return f"must be finite{above}, but is {value!r}; correct it"
-    if abs(value) > LARGEST:
-        return f"must be at most {LARGEST:g} in size, but is {value!r}; correct it"
+    if beyond(value, positive=setting.lowest >= 0.0, largest=LARGEST):
+        return f"{said_beyond(value, LARGEST)}, but is {value!r}; correct it"
     if error is not None and not 0.0 < error < float("inf"):
         return f"has the error {error!r}; it must be finite and above 0, or left out"
+    if error is not None and beyond(error, positive=True, largest=LARGEST):
+        return f"has the error {error!r}; it {said_beyond(error, LARGEST)}, or left out"
     return None
 
 

@@ -38,6 +38,18 @@ class SeveralTables:
                 without, having = (label, name) if table.quality_factor is None else (name, label)
                 raise ValueError(f"{without} lacks quality_factor, which {having} gives; add it, with its error")
 
+    def check_different(self) -> None:
+        """Check that no table is there twice: its readings would count twice.
+
+        Raises:
+            ValueError: if one is.
+        """
+        known: dict[tuple[bytes, ...], str] = {}
+        for table, label in zip(self.tables, self.labels, strict=True):
+            other = known.setdefault(_readings(table), label)
+            if other is not label:
+                raise ValueError(f"{label} holds the same readings as {other}; give each table once")
+
     @cached_property
     def labels(self) -> tuple[str, ...]:
         """What each table is called: its file's name, with as much of its path as tells it from the others."""
@@ -122,6 +134,12 @@ class SeveralTables:
     @staticmethod
     def _joined(columns: Sequence[np.ndarray]) -> np.ndarray:
         return np.concatenate(columns)
+
+
+def _readings(table: AmplitudeTable) -> tuple[bytes, ...]:
+    """Return what tells tables apart: noise alone makes no two measurements alike."""
+    names = ("drive_frequency_khz", "excitation_nm", "offset_nm", "peak_amplitude_nm", "lockin_amplitude_nm")
+    return tuple(b"" if (column := getattr(table, name)) is None else column.tobytes() for name in names)
 
 
 _SAME_MASS = 0.01

@@ -55,6 +55,7 @@ from fitting.tables.csv_text import (
     Head,
     Masks,
     TableError,
+    beyond,
     check_not_empty,
     column_of,
     fault_in_number,
@@ -63,6 +64,7 @@ from fitting.tables.csv_text import (
     printable,
     quoted,
     read_text,
+    said_beyond,
     setting_in,
     settings_in,
     split_lines,
@@ -288,8 +290,8 @@ def _check_numbers(
     column: Column, values: Float[np.ndarray, " rows"], lines: Int[np.ndarray, " rows"], faults: Faults
 ) -> Bool[np.ndarray, " rows"]:
     # a whole number only has to survive the way through 64-bit floats
-    large = np.isfinite(values) & (np.abs(values) > (np.inf if column.integer else LARGEST))
-    bad = np.isinf(values) | large
+    far = beyond(values, positive=column.positive, largest=np.inf if column.integer else LARGEST)
+    bad = np.isinf(values) | far
     what = "must be finite"
     if column.positive:
         bad |= values <= 0.0
@@ -303,7 +305,7 @@ def _check_numbers(
         what = f"must be 1 ({column.flag}) or 0"
     for row in np.flatnonzero(bad):
         number = repr(float(values[row])).removesuffix(".0")
-        must = f"must be at most {LARGEST:g} in size" if large[row] else what
+        must = said_beyond(values[row], LARGEST) if far[row] else what
         faults.add(f"{must}, but is {number}; correct it{_or_blank(column)}", line=int(lines[row]), column=column.name)
     return bad
 

@@ -35,12 +35,14 @@ from fitting.tables.csv_text import (
     Faults,
     FileSetting,
     Form,
+    beyond,
     check_names,
     fault_in_number,
     named_rows,
     parse_rows,
     quoted,
     read_text,
+    said_beyond,
     settings_in,
     split_lines,
 )
@@ -383,9 +385,11 @@ def _check_samples(name: str, values: np.ndarray, trace: Trace, faults: Faults) 
         faults.add(f"has the shape {np.shape(values)}; it must have the deflection's, one number a sample", column=name)
         return
     # blank lines and comments between the samples are rare: the line is right without them
-    for index in np.flatnonzero(~np.isfinite(values)):
+    far = beyond(np.asarray(values), positive=False)
+    for index in np.flatnonzero(~np.isfinite(values) | far):
         line = int(index) + (trace.first_line or 1)
-        faults.add(f"must be finite, but is {values[index]}; cut the trace there or repair it", line=line, column=name)
+        must = said_beyond(values[index]) if far[index] else "must be finite"
+        faults.add(f"{must}, but is {values[index]}; cut the trace there or repair it", line=line, column=name)
 
 
 def _check_length(trace: Trace, faults: Faults) -> None:
