@@ -29,13 +29,15 @@ Look = Callable[[Float[np.ndarray, "some p"], Int[np.ndarray, " some"]], Searche
 class Box(NamedTuple):
     """Where searches may go: between bounds (infinite: none), which parameters of each search stay, and how far a step.
 
-    ``longest`` is the most by which a parameter changes at once.
+    ``longest`` is the most by which a parameter changes at once. ``known`` is information on where each parameter is
+    that steps start from: what the residuals leave open moves by no more than that lets it.
     """
 
     lowest: Float[np.ndarray, " p"]
     highest: Float[np.ndarray, " p"]
     fixed: Bool[np.ndarray, "sets p"]
     longest: float = np.inf
+    known: Float[np.ndarray, " p"] | float = 0.0
 
     def of(self, some: Int[np.ndarray, " some"]) -> "Box":
         """Return the box of some of the searches."""
@@ -71,7 +73,10 @@ def descended(look: Look, start: Searches, box: Box, *, settled: float, most: in
 
 
 def distance(state: Searches, box: Box) -> Float[np.ndarray, " sets"]:
-    """Return the estimated distance of the sum of squares to its minimum, g H^-1 g, H = J^T J; NaN where not finite."""
+    """Return the estimated distance of the sum of squares to its minimum, g H^-1 g; NaN where not finite.
+
+    H = J^T J, and what is known besides.
+    """
     gradient = np.einsum("snp,sn->sp", state.jacobian, state.residual) * ~_held(state, box)
     step = _step(state, box, np.full(len(state.chi2), _SMALLEST_DAMPING))
     return -np.einsum("sp,sp->s", gradient, step)
@@ -92,7 +97,8 @@ def _step(state: Searches, box: Box, damping: Float[np.ndarray, " sets"]) -> Flo
     scaled = jacobian / unit[:, None, :]
     normal = np.einsum("snp,snq->spq", scaled, scaled)
     # a held parameter's own curvature is 1 instead of 0: its step is then 0
-    normal += (damping[:, None] + held)[:, :, None] * np.eye(unit.shape[1])
+    own = damping[:, None] + held + np.where(held, 0.0, box.known) / unit**2
+    normal += own[:, :, None] * np.eye(unit.shape[1])
     gradient = np.einsum("snp,sn->sp", scaled, state.residual)
     sound = np.all(np.isfinite(normal), axis=(1, 2))
     safe = np.where(sound[:, None, None], normal, np.eye(unit.shape[1]))

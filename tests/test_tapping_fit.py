@@ -11,9 +11,13 @@ import pytest
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
+from afm_jax.least_squares import Box, distance
 from fitting.examples import make_tapping_curve
-from fitting.fits.fit import fit
-from fitting.models import reach_of, rows_of, tip_work
+from fitting.fits.fit import fit, problem_of
+from fitting.fits.intervals import Places
+from fitting.fits.minimum import Minimum, settle
+from fitting.fits.objective import Objective
+from fitting.models import measurement_of, reach_of, rows_of, tip_work
 from fitting.tables.table import AmplitudeTable, read_table
 from tests.tapping_accuracy import (
     FEW_SHARES,
@@ -142,3 +146,20 @@ def test_a_contact_comes_out_of_a_noisy_curve():
         assert (low or 0.0) < truth.parameters[name] < (high or np.inf)
     assert result.parameters["viscosity_pa_s"].at_bound
     assert None not in result.parameters["modulus_gpa"].interval95
+
+
+@pytest.mark.slow
+def test_light_taps_that_leave_adhesion_and_modulus_open_are_fitted_to_their_minimum():
+    truth = tapping_truth(1)
+    table = noisy(as_measured(exact_table(truth, 1.0, TABLES, FEW_SHARES)), truth, 0)
+    fixed = {"tip_radius_nm": truth.parameters["tip_radius_nm"]}
+    problem = problem_of(table, "contact", fixed=fixed)
+    objective = Objective(measurement_of(table, problem, None, fixed), problem)
+    near = np.array([0.2416, 0.163, 1e-5, 28.0, 393.5, -0.004, 0.9994, 90.002, 0.074])
+    found = settle(objective, Minimum(problem.coordinates(near), near, near[None], np.zeros(1)))
+    end = problem.values(found.coordinates)
+    places = Places(objective.following(end))
+    here = places.look(places.of_values(end)[None], np.arange(1))
+    known = places.known_by_range(found.coordinates)
+    box = Box(places.lowest, places.highest, np.zeros(here.place.shape, dtype=bool), known=known)
+    assert distance(here, box)[0] < 1e-6

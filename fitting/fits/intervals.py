@@ -189,6 +189,11 @@ class Places:
         columns = zip(self.objective.problem.parameters, np.moveaxis(places, -1, 0), strict=True)
         return np.stack([coordinate_of(p, place) if p.sign else place for p, place in columns], axis=-1)
 
+    def known_by_range(self, coordinates: Float[np.ndarray, " p"]) -> Float[np.ndarray, " p"]:
+        """Return the inverse variances of places of which nothing is known but their range."""
+        values, slopes = self.objective.problem.values_and_slopes(coordinates)
+        return self.objective.problem.known_by_range(values) * np.where(self.by_value, 1.0, slopes) ** 2
+
     def look(self, places: Float[np.ndarray, "sets p"], some: Int[np.ndarray, " sets"]) -> Searches:  # noqa: ARG002
         """Return chi2, the residuals and their Jacobian by the places."""
         known, slopes = self.objective.problem.values_and_slopes(self.coordinates(places))

@@ -259,13 +259,14 @@ def _plainly(objective: Objective, starts: Float[np.ndarray, "starts p"]) -> Pol
     """Polish plainly, then with damped steps between bounds where that has not arrived.
 
     A loss close to 0 has no curvature by its coordinate, and what taps tell lies in narrow valleys that end at bounds:
-    damped steps alone go along these.
+    damped steps alone go along these. What taps leave open moves no farther at once than its range lets it.
     """
     polished = None if objective.problem.pulled else polish(objective, starts, PLAIN, settled=FINE)
     begin = starts if polished is None else polished.coordinates
     places = Places(objective)
     here = places.of_values(objective.problem.values(begin))
-    box = Box(places.lowest, places.highest, np.zeros(here.shape, dtype=bool))
+    known = places.known_by_range(begin[0])
+    box = Box(places.lowest, places.highest, np.zeros(here.shape, dtype=bool), known=known)
     end = descended(places.look, places.look(here, np.arange(len(here))), box, settled=FINE, most=_MOST_STEPS)
     found = Polished(places.coordinates(end.place), end.chi2, 0)
     # the last digits stay
