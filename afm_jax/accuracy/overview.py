@@ -255,7 +255,7 @@ def _gradients(
         cells = (1e6 * float(np.mean([run["seconds"] for run in runs])), _slope_error(slopes, expected))
         rows.append(overview_row("gradients", name, f"tolerance {tolerance:g}", *cells))
     own = _slope_error(coarser, exact)
-    return _study("gradients", rows, "derivatives of the rebound speed, relative", "derivatives of the quadrature", own)
+    return _study("gradients", rows, "slopes of the rebound speed, relative", "derivatives of the quadrature", own)
 
 
 def _slope_error(found: Mapping[str, Any], exact: Mapping[str, Any]) -> float:
