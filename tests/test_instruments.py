@@ -1,5 +1,6 @@
 """Instruments' files: the real ones completely, the others against their writers; traps named; damage in one line."""
 
+import re
 import struct
 from pathlib import Path
 from typing import Any
@@ -230,6 +231,19 @@ def test_wrong_column_maps_are_named(text: str, said: str):
 
 
 # ---- what the numbers say themselves
+
+
+def test_channels_whose_names_say_nothing_are_asked_for(tmp_path: Path):
+    path = tmp_path / "curve.csv"
+    path.write_text("Z;A;P\n-10;9.8;80\n-9;9;70\n-8;8.2;65\n")
+    curve = read_curve(path)
+    asked = "if one of the channels A, P is: --columns lockin_amplitude_nm=CHANNEL:UNIT"
+    assert any(asked in note for note in curve.notes)
+    with pytest.raises(TableError, match=re.escape(asked)):
+        table_text(curve)
+    path.write_text(path.read_text().replace("A", "Amplitude"))
+    curve = read_curve(path)
+    assert any("if one of the channels P is: --columns phase_lag_deg=CHANNEL:UNIT" in note for note in curve.notes)
 
 
 def test_the_zero_of_the_phase_is_that_of_the_free_rows(tmp_path: Path):

@@ -51,6 +51,7 @@ _NEEDED = {
     "free_amplitude_nm": "NM",
     "nm_per_volt": "NM_PER_V|slope",
 }
+_NO_AMPLITUDE = "There is no lock-in amplitude"
 _WANTED = {"quality_factor": "Q", "spring_constant_n_per_m": "N_PER_M"}
 
 
@@ -249,6 +250,13 @@ def _joined(
         raise TableError(
             f"{recording.source}: no height among the channels {channels}; say --columns offset_nm=CHANNEL:UNIT"
         )
+    taken = {source.channel for source in sources.values() if source is not None}
+    others = ", ".join(name for name in segments[0].channels if name not in taken)
+    if sources["lockin_amplitude_nm"] is None:
+        told = f"; if one of the channels {others} is: --columns lockin_amplitude_nm=CHANNEL:UNIT" if others else ""
+        notes.append(f"{_NO_AMPLITUDE}{told}. The slope of a force curve is what `afm-jax calibrate` reads.")
+    elif sources["phase_lag_deg"] is None and others:
+        notes.append(f"Phase: none known; if one of the channels {others} is: --columns phase_lag_deg=CHANNEL:UNIT.")
     parts: dict[str, list[Any]] = {role: [] for role in ROLES}
     branches: list[str] = []
     for segment in segments:
@@ -365,8 +373,7 @@ def _judged(curve: MeasuredCurve, *, of_slope: bool) -> MeasuredCurve:
     """Return a curve with free rows, slope, origin and zero of the phase found, and everything doubtful named."""
     amplitude = curve.amplitude
     if amplitude is None:
-        note = "There is no lock-in amplitude in the file: it is a force curve, whose slope `afm-jax calibrate` reads."
-        return replace(curve, notes=(*curve.notes, note))
+        return curve
     if curve.amplitude_unit == "V" and "nm_per_volt" in curve.known:
         scale = float(curve.known["nm_per_volt"].value)
         amplitude = amplitude * scale
@@ -593,7 +600,8 @@ def table_text(curve: MeasuredCurve) -> str:
         TableError: if something is missing, naming the options that give it, or the curve must not be used.
     """
     if curve.amplitude is None:
-        raise TableError(f"{curve.source}, curve {curve.curve}: there is no lock-in amplitude, so no table")
+        why = next((note for note in curve.notes if note.startswith(_NO_AMPLITUDE)), _NO_AMPLITUDE)
+        raise TableError(f"{curve.source}, curve {curve.curve}: no table of this. {why}")
     if curve.reasons:
         raise TableError(f"{curve.source}, curve {curve.curve}: {curve.reasons[0]}")
     needed = [key for key in curve.missing if key in _NEEDED]
