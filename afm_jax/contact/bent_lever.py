@@ -135,7 +135,13 @@ def _points(count: int) -> np.ndarray:
     return np.cos(np.pi * np.arange(count) / (count - 1))
 
 
-def _filled(taps: "_Tap", pulls: Float[Array, "2 kinds"], more: Float[Array, " kinds"], gaps, scale) -> Taps:
+def _filled(
+    taps: "_Tap",
+    pulls: Float[Array, "2 kinds"],
+    more: Float[Array, " kinds"],
+    gaps: Float[Array, ""],
+    scale: Float[Array, ""],
+) -> Taps:
     """Return the series through taps of shape (pulls, kinds, speeds), at places that the loss has shifted."""
     low, last = taps.coming[:, :, 0], taps.coming[:, :, -1]
     farthest = stretched(jnp.sqrt(last[:, 1:] - low[:, 1:]) / scale)

@@ -117,9 +117,6 @@ def _side_by_side(work: _Work | _Slopes, *leaves: Array) -> Any:
     if not any(is_traced(leaf) for leaf in leaves):
         return work.of(*leaves)
 
-    def one(*leaves):
-        return work.of(*leaves)
-
     def all_examples(size, batched, *leaves):
         if not any(batched):
             # asked by derivatives of `custom_vmap` itself: one place, several directions
@@ -137,7 +134,7 @@ def _side_by_side(work: _Work | _Slopes, *leaves: Array) -> Any:
         parted = jax.tree.map(lambda part: part.reshape(size, tips, *part.shape[1:]), results)
         return parted, jax.tree.map(lambda _: True, parted)
 
-    mapped = custom_vmap(one)
+    mapped = custom_vmap(work.of)
     mapped.def_vmap(all_examples)
     return mapped(*leaves)
 
