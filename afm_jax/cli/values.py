@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 import click.shell_completion
 
+from afm_jax.cli.session import add_note
+
 if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
     from afm_jax.scenefile.parameter_paths import ParameterRange
@@ -319,20 +321,24 @@ def parse_share(text: str) -> float:
     return share
 
 
-def scene_and_start(name: str) -> "tuple[Scene, Start | None]":
+def scene_and_start(name: str, *, notes: bool = True) -> "tuple[Scene, Start | None]":
     """Return the scene that an argument names, and the start that comes with it; None where it is to be chosen.
 
     Args:
         name: a path, or a name of `afm_jax.scenefile.presets.PRESETS` where there is no file of that name.
+        notes: whether the result says what the file leaves to be assumed.
 
     Raises:
         ValueError: if there is neither such a file nor such a preset, or the file is no valid scene file.
     """
     from afm_jax.scenefile.presets import PRESETS, preset, preset_start  # noqa: PLC0415
-    from afm_jax.scenefile.scenefile import load_scene_and_start  # noqa: PLC0415
+    from afm_jax.scenefile.scenefile import read_scene  # noqa: PLC0415
 
     if Path(name).exists() or name.endswith(".toml") or len(Path(name).parts) > 1:
-        return load_scene_and_start(name)
+        read = read_scene(name)
+        for note in read.notes if notes else ():
+            add_note(note)
+        return read.scene, read.start
     if name not in PRESETS:
         raise ValueError(f"{name}: there is no such file or preset; presets are {', '.join(PRESETS)}")
     return preset(name), preset_start(name)
