@@ -356,7 +356,8 @@ def _parse_setting(setting: FileSetting, text: str, *, line: int, faults: Faults
     if setting.choices:
         if cells in [[choice] for choice in setting.choices]:
             return float(setting.choices.index(cells[0])), None
-        choices = ", ".join(setting.choices[:-1]) + f" or {setting.choices[-1]}"
+        *others, last = setting.choices
+        choices = f"{', '.join(others)} or {last}" if others else quoted(last)
         faults.add(
             f"{key} must be {choices}, but is {quoted(match['value'].strip())}; write '{setting.line}'", line=line
         )

@@ -13,7 +13,8 @@ measured column has a column of standard errors (``..._error_nm``, ``phase_error
 column says that this was not measured. A column ``no_orbit`` marks by 1 drives on which the tip settled on no steady
 single-impact orbit (it stuck, or moved chaotically): their amplitudes are blank. Comments such as
 ``# tip_calibration = 1 +- 0.02``, ``# drive_calibration = 1 +- 0.01`` and ``# offset_origin_nm = 0 +- 0.3`` say what is
-known of the instrument. Other comments are kept as remarks.
+known of the instrument. ``# rows = in order of time`` says that the rows stand as they were measured, so that a slow
+drift of phase and amplitude is told from what they mean. Other comments are kept as remarks.
 
 A cantilever that is driven itself over a sample at rest (a tapping or amplitude-phase-distance curve) says so::
 
@@ -76,6 +77,7 @@ SETTINGS = {
     setting.key: setting
     for setting in (
         FileSetting("drive", "force", choices=("sample", "force", "base")),
+        FileSetting("rows", "in order of time", choices=("in order of time",)),
         FileSetting("free_frequency_khz", "90", unit="kHz", error="maybe"),
         FileSetting("quality_factor", "40 (or 40 +- 2)", lowest=LOWEST_QUALITY_FACTOR, error="maybe"),
         FileSetting("mass_ng", unit="ng"),
@@ -96,6 +98,7 @@ class Header:
     """What the comment lines say; the names and units are those of ``AmplitudeTable``."""
 
     drive: str
+    rows_in_order_of_time: bool
     free_frequency_khz: float
     free_frequency_error_khz: float | None
     quality_factor: float | None
@@ -124,6 +127,7 @@ def parse_comments(comments: list[tuple[int, str]], faults: Faults) -> Header:
     spring, spring_error = numbers.get("spring_constant_n_per_m", (None, None))
     return Header(
         drive="" if np.isnan(drive) else DRIVES[int(drive)],
+        rows_in_order_of_time="rows" in numbers,
         free_frequency_khz=frequency,
         free_frequency_error_khz=frequency_error,
         quality_factor=quality_factor,
@@ -390,6 +394,7 @@ class AmplitudeTable(Result):
         spring_constant_error_n_per_m: its standard error, or None.
         calibration: value and standard error of ``tip_calibration``, ``drive_calibration``, ``offset_origin_nm`` and
             ``phase_zero_deg``, as far as they are uncertain.
+        rows_in_order_of_time: whether the rows stand in the order in which they were measured.
         source: path of the file as it was given.
         lines: the line of the file that each row stands in, shape (rows,); 1, 2, 3, ... for a table not from a file, or
             if as many are not given.
@@ -423,6 +428,7 @@ class AmplitudeTable(Result):
     spring_constant_n_per_m: float | None = None
     spring_constant_error_n_per_m: float | None = None
     calibration: dict[str, tuple[float, float]] = field(default_factory=dict)
+    rows_in_order_of_time: bool = False
     source: str = "table in memory"
     lines: Int[np.ndarray, " lines"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     remarks: tuple[str, ...] = ()
@@ -668,6 +674,7 @@ def csv_of(table: AmplitudeTable) -> str:
         if value is not None:
             tail = "" if error is None else f" +- {float(error)!r}"
             lines.append(f"# {name} = {float(value)!r}{tail}")
+    lines += [SETTINGS["rows"].line] if table.rows_in_order_of_time else []
     lines += [f"# {remark}" for remark in table.remarks]
     names = [name for name in table.form.names if getattr(table, name) is not None]
     if table.tapping and np.all(table.order == 1):
