@@ -14,11 +14,13 @@ from click.testing import CliRunner
 
 from afm_jax.apparatus.platform import Platform
 from afm_jax.cli.main import main
+from afm_jax.sweeps.store import STORE
 from afm_jax.whole_files import write_whole
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import read_table
 from tests.fuzz import fuzz_files, fuzz_orbits
 from tests.test_imports import LIBRARY, ROOT
+from tests.writing_commands import CALLS, prepare, unchecked
 
 LAW = "[cantilever]\nfrequency_khz = 90\nquality_factor = 40\n[platform]\namplitude_nm = {}\nreduced_frequency = {}\n"
 LAW += "[interaction]\nmodel = 'law'\nr = 0.95\nepsilon = 60\n"
@@ -44,13 +46,16 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch):
     assert [file.name for file in tmp_path.iterdir()] == ["fit.txt"]
 
 
-def test_new_files_have_the_modes_of_others_and_links_are_followed(tmp_path):
+def test_new_files_have_the_modes_of_others_and_only_links_named_by_the_user_are_followed(tmp_path):
     path, link, other = tmp_path / "a", tmp_path / "link", tmp_path / "other"
     write_whole(path, b"a")
     other.touch()
     assert path.stat().st_mode == other.stat().st_mode
     link.symlink_to(path)
-    write_whole(link, b"b")
+    with pytest.raises(OSError, match=r"is a link, which is not followed; delete it or choose another folder.*/link"):
+        write_whole(link, b"c")
+    assert path.read_bytes() == b"a"
+    write_whole(link, b"b", named_by_user=True)
     assert link.is_symlink()
     assert path.read_bytes() == b"b"
 
@@ -58,7 +63,7 @@ def test_new_files_have_the_modes_of_others_and_links_are_followed(tmp_path):
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
 def test_a_full_device_is_named():
     with pytest.raises(OSError, match="/dev/full"):
-        write_whole("/dev/full", "x")
+        write_whole("/dev/full", "x", named_by_user=True)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
@@ -72,10 +77,47 @@ def test_a_full_standard_output_is_named(tmp_path):
 
 
 def test_nothing_writes_files_another_way():
-    other = re.compile(r"\.write_text\(|\.write_bytes\(|\.savefig\((?!buffer)|open\([^)]*[\"']w")
-    found = {str(path) for path in LIBRARY if other.search((ROOT / path).read_text(encoding="utf-8"))}
+    other = re.compile(r"\.write_text\(|\.write_bytes\(|\.savefig\((?!buffer)|open\([^)]*[\"']w|\.to_(csv|zarr|json)\(")
+    # into new folders that `whole_folder` then puts in their place, and into memory
+    new = re.compile(r"open_group\((str\((fresh|path)\)|MemoryStore)")
+    found = {str(path) for path in LIBRARY if other.search(new.sub("", (ROOT / path).read_text(encoding="utf-8")))}
     # the writer itself, and a standard error that is closed
     assert found == {"afm_jax/whole_files.py", "afm_jax/cli/main.py"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "call", ["calibrate", "chart --zarr", "figures", "lockin", "orbits", "read", "simulate", "sweep"]
+)
+def test_files_of_commands_are_checked_for_links_first(tmp_path, call):
+    prepare(tmp_path)
+    code, said, written, loose = unchecked(call, tmp_path)
+    assert code in (0, 3), said
+    assert written
+    assert loose == []
+    # a link in place of each file, and of each folder that holds some; those in a sweep's have tests of their own
+    for place in {name.partition("/")[0] for name in written} - {"done", STORE}:
+        whole = tmp_path / f"out of {call}" / place
+        kept = whole.with_name("kept")
+        whole.rename(kept)
+        whole.symlink_to(tmp_path / "letter")
+        code, said, *_ = unchecked(call, tmp_path)
+        assert (code, "is a link, which is not followed" in said, (tmp_path / "letter").exists()) == (2, True, False)
+        whole.unlink()
+        kept.rename(whole)
+
+
+def test_a_table_named_by_the_user_may_be_a_link_but_no_numbered_one(tmp_path):
+    (tmp_path / "link.csv").symlink_to(tmp_path / "meant.csv")
+    file = CALLS["read"][0]
+    assert run("read", *CALLS["read"], "--out", tmp_path / "link.csv").exit_code == 0, file
+    assert (tmp_path / "link.csv").is_symlink()
+    assert (tmp_path / "meant.csv").read_text(encoding="utf-8").startswith("#")
+    (tmp_path / "tables").mkdir()
+    (tmp_path / "tables" / "curve.csv").symlink_to(tmp_path / "other.csv")
+    refused = run("read", *CALLS["read"], "--out", tmp_path / "tables")
+    assert (refused.exit_code, (tmp_path / "other.csv").exists()) == (2, False)
+    assert "curve.csv: cannot be written (is a link, which is not followed" in refused.stderr
 
 
 def test_names_cannot_command_the_terminal(tmp_path):
@@ -168,6 +210,7 @@ def test_an_interrupt_that_is_swallowed_ends_the_program_all_the_same():
 
 WRITING = """
 import sys
+from afm_jax.sweeps.store import STORE
 from afm_jax.whole_files import write_whole
 print("ready", flush=True)
 for number in range(10**9):

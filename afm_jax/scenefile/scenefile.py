@@ -358,7 +358,7 @@ def save_scene(scene: Scene, path: str | os.PathLike[str], *, start: Start | Non
     if start is not None:
         check_start(start, scene)
         tables["start"] = {key: float(value) for key, value in start._asdict().items()}
-    write_whole(path, tomli_w.dumps(tables))
+    write_whole(path, tomli_w.dumps(tables), named_by_user=True)
 
 
 def scene_tables(scene: Scene) -> dict[str, dict[str, Any]]:
