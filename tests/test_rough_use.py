@@ -5,6 +5,7 @@ import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from click.testing import CliRunner
 from afm_jax.apparatus.platform import Platform
 from afm_jax.cli.main import main
 from afm_jax.sweeps.store import STORE
-from afm_jax.whole_files import write_whole
+from afm_jax.whole_files import read_whole, write_whole
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import read_table
 from tests.fuzz import fuzz_files, fuzz_orbits
@@ -120,6 +121,34 @@ def test_a_table_named_by_the_user_may_be_a_link_but_no_numbered_one(tmp_path):
     assert "curve.csv: cannot be written (is a link, which is not followed" in refused.stderr
 
 
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names")
+def test_a_pipe_is_read_if_somebody_writes_and_named_if_nobody_does(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for command in (
+        ["orbits", pipe, "--order", "1"],
+        ["fit", pipe],
+        ["lockin", pipe],
+        ["tapping", pipe],
+        ["read", pipe],
+    ):
+        refused = run(*command)
+        assert refused.exit_code == 2
+        assert "it is a pipe that nobody writes to" in refused.stderr
+
+    def write() -> None:
+        with pipe.open("wb") as file:
+            for part in (b"a" * 300_000, b"b", b"c" * 100_000):
+                file.write(part)
+                file.flush()
+                time.sleep(0.2)
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    assert read_whole(pipe) == b"a" * 300_000 + b"b" + b"c" * 100_000
+    writer.join()
+
+
 def test_names_cannot_command_the_terminal(tmp_path):
     path = tmp_path / "a\x1b[31m\x07b.csv"
     path.write_text("order\n1\n", encoding="utf-8")
@@ -211,7 +240,7 @@ def test_an_interrupt_that_is_swallowed_ends_the_program_all_the_same():
 WRITING = """
 import sys
 from afm_jax.sweeps.store import STORE
-from afm_jax.whole_files import write_whole
+from afm_jax.whole_files import read_whole, write_whole
 print("ready", flush=True)
 for number in range(10**9):
     write_whole(sys.argv[1], f"{number % 10}" * 3_000_000)
