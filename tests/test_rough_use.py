@@ -1,5 +1,6 @@
 """What hard use broke once: full disks, closed streams, hostile names, interrupts, numbers out of all proportion."""
 
+import contextlib
 import os
 import re
 import signal
@@ -9,6 +10,7 @@ import threading
 import time
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -147,6 +149,64 @@ def test_a_pipe_is_read_if_somebody_writes_and_named_if_nobody_does(tmp_path):
     writer.start()
     assert read_whole(pipe) == b"a" * 300_000 + b"b" + b"c" * 100_000
     writer.join()
+
+
+def test_no_option_takes_numbers_that_are_none():
+    """Every option of every command: what compares with no limit, and what has none."""
+    seen = 0
+    for name in main.list_commands(click.Context(main)):
+        command = main.get_command(click.Context(main), name)
+        assert command is not None
+        for option in (part for part in command.params if isinstance(part, click.Option)):
+            for bad in (
+                "nan",
+                "inf",
+                "-inf",
+                "1e400",
+                "1:nan:2",
+                "0:inf:1",
+                "r=nan",
+                "40 +- nan",
+                "r=1+-inf",
+                "1:1e400",
+            ):
+                with contextlib.suppress(click.BadParameter):
+                    value = option.type.convert(bad, option, click.Context(command))
+                    numbers = [part for part in np.ravel(np.array(value, dtype=object)) if isinstance(part, float)]
+                    assert np.all(np.isfinite(numbers)), (name, option.opts, bad)
+                    seen += 1
+    assert seen > 100
+
+
+def test_no_message_quotes_a_name_of_any_length(tmp_path):
+    name = "k" * 200_000
+    path = tmp_path / "scene.toml"
+    for text in (f"{name} = 1\n", f"[{name}]\na = 1\n", f"[{name} b]\n"):
+        path.write_text(LAW.format(4, 1.01) + text, encoding="utf-8")
+        said = run("orbits", path, "--order", "1")
+        assert (said.exit_code, len(said.stderr) < 1000) == (2, True)
+    path.write_text(LAW.format(4, 1.01), encoding="utf-8")
+    for call in (("bifurcation", path, "--parameter", f"{name}=1:2:3"), (name,), ("fit", name), ("fit", f"--{name}")):
+        said = run(*call)
+        assert (said.exit_code, len(said.stderr) < 1000) == (2, True)
+
+
+def test_drives_that_are_too_fast_to_follow_and_frequencies_that_are_none_are_refused(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(LAW.format(4, "1e9"), encoding="utf-8")
+    for command in (["simulate"], ["basins"], ["lyapunov"], ["orbits", "--order", "1"]):
+        said = run(*command, path)
+        assert said.exit_code == 2
+        assert "must be at most 10000 times the cantilever's free frequency, but is 2e+09 times as high" in said.stderr
+    path.write_text(LAW.format(4, 1.01), encoding="utf-8")
+    said = run("bifurcation", path, "--parameter", "platform.reduced_frequency=1:1e9:3")
+    assert (said.exit_code, "10000 times the cantilever's" in said.stderr) == (2, True)
+    path.write_text(LAW.format(4, 1000), encoding="utf-8")
+    said = run("simulate", path, "--duration-us", 1e5)
+    assert "the drive would oscillate 1.8e+07 times, more than the 1e+07 that can be followed" in said.stderr
+    path.write_text(LAW.format(4, 1.01).replace("= 90", "= 1e-320"), encoding="utf-8")
+    said = run("simulate", path)
+    assert (said.exit_code, "must be at least 1e-30, so that its inverse stays a number" in said.stderr) == (2, True)
 
 
 def test_names_cannot_command_the_terminal(tmp_path):

@@ -470,7 +470,7 @@ def _scene_of(tables: dict[str, SceneTable]) -> Scene:
     numbers = table.numbers(required=("frequency_khz",), optional=("quality_factor", "mass_ng"))
     cantilever = table.build(Cantilever, **numbers)
     platform, base, force = read_drives(tables, cantilever)
-    return Scene(cantilever, platform, _interaction_of(tables), base, force)
+    return tables["platform"].build(Scene, cantilever, platform, _interaction_of(tables), base, force)
 
 
 def _interaction_of(tables: dict[str, SceneTable]) -> Any:
