@@ -21,7 +21,8 @@ from typing import Any
 
 import click
 
-from afm_jax.words import cut_short, shown
+from afm_jax.scenefile.tables import cut_short
+from afm_jax.words import shown
 
 _OWN_PACKAGES = ("afm_jax", "fitting")
 _NUMERICAL_PACKAGES = frozenset(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import click.shell_completion
 
-from afm_jax.words import cut_short
+from afm_jax.scenefile.tables import cut_short
 
 if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene

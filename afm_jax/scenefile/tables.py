@@ -7,8 +7,6 @@ import difflib
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, NoReturn, TypeVar
 
-from afm_jax.words import cut_short
-
 _FREQUENCY = ("frequency_khz", "reduced_frequency")
 _MOTION = ("amplitude_nm", *_FREQUENCY, "phase_deg")
 _FORCE = ("amplitude_nn", *_FREQUENCY, "phase_deg")
@@ -252,6 +250,12 @@ def printable(text: str) -> str:
 
 
 _LONGEST_NAME = 300
+
+
+def cut_short(text: str, length: int) -> str:
+    """Return a text without its middle where it is longer than a number of letters."""
+    half = (length - 5) // 2
+    return text if len(text) <= length else f"{text[:half]} ... {text[-half:]}"
 
 
 def _looks_like_a_number(text: str) -> bool:

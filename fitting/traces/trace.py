@@ -31,9 +31,8 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.results import Result, public_result
-from afm_jax.scenefile.tables import printable
+from afm_jax.scenefile.tables import cut_short, printable
 from afm_jax.whole_files import MOST_PACKED, MOST_VALUES
-from afm_jax.words import cut_short
 from fitting.tables.csv_text import (
     Column,
     Faults,
