@@ -15,15 +15,18 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Shaped
 
 
-def as_parameter(value: ArrayLike) -> Float[Array, "..."]:
+def as_parameter(value: Any) -> Any:
     """Return a parameter as a floating-point array; arrays that are floating-point already keep their precision.
 
     Python numbers become arrays of the default precision and never weakly typed, so that one compiled program serves
-    numbers and arrays alike.
+    numbers and arrays alike. What is no real number stays as it is, for `check_parameter` to refuse by its name.
     """
+    if not isinstance(value, float) and not _is_real(value):
+        # `check_parameter` names it
+        return value
     array = jnp.asarray(value)
     return jnp.asarray(array, array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else float)
 
@@ -44,36 +47,89 @@ def is_traced(value: ArrayLike) -> bool:
     return isinstance(value, Tracer)
 
 
-def check_parameter(name: str, value: ArrayLike | None, allowed: str) -> None:
+def check_parameter(name: str, value: ArrayLike | None, allowed: str, *, optional: bool = False) -> None:
     """Check a parameter that is a concrete number.
 
     Args:
         name: what the message calls it, with its unit.
-        value: the number or array; None (an absent effect) and traced values pass.
-        allowed: "finite", "positive", "not negative", "above 0.5", "in [0, 1]" or
+        value: the number or array; traced values pass.
+        allowed: "finite", "positive", "above 0" (however small), "not negative", "above 0.5", "in [0, 1]" or
             "between 0 and 1" (neither of the two).
+        optional: whether None, an absent effect, passes.
 
     Raises:
-        ValueError: if a value is not finite, not in the allowed range, or beyond 1e30.
+        ValueError: if a value is not finite, not in the allowed range, beyond 1e30, or, where it must be positive,
+            below 1e-30.
+        TypeError: if it is no real number.
     """
-    if value is None or is_traced(value):
+    if (value is None and optional) or isinstance(value, Tracer):
         return
-    number = np.asarray(value)
+    number = as_real(name, value)
     # An infinite quality factor is a meaningful limit; every other infinity is a mistake.
     finite = ~np.isnan(number) if allowed == "above 0.5" else np.abs(number) <= _LARGEST
     good = finite & _RANGES[allowed](number)
     if not np.all(good):
         offender = float(number[~good].flat[0]) if number.ndim else float(number)
-        must = {"finite": "be a finite number", "not negative": "not be negative"}.get(allowed, f"be {allowed}")
+        must = {"finite": "be a finite number", "above 0": "be positive", "not negative": "not be negative"}.get(
+            allowed, f"be {allowed}"
+        )
         if np.isfinite(offender) and abs(offender) > _LARGEST:
             must = f"be at most {_LARGEST:g} in size, so that its powers stay numbers"
+        elif allowed == "positive" and 0.0 < offender < 1.0 / _LARGEST:
+            must = f"be at least {1.0 / _LARGEST:g}, so that its inverse stays a number"
         raise ValueError(f"`{name}` must {must}, but is {offender:g}")
+
+
+def as_real(name: str, value: Any) -> Shaped[np.ndarray, "..."]:
+    """Return a number or an array of numbers that a caller gave.
+
+    Raises:
+        TypeError: if it is, or holds, a text, true or false, a complex number, None or anything else that is no real
+            number.
+    """
+    if not _is_real(value):
+        raise TypeError(f"`{name}` must be a real number, but is {in_a_word(value)}")
+    return np.asarray(value)
+
+
+def _is_real(value: Any) -> bool:
+    dtype = getattr(value, "dtype", None)
+    if dtype is None:
+        try:
+            dtype = np.asarray(value).dtype
+        except (TypeError, ValueError, jax.errors.TracerArrayConversionError):
+            # a list of traced numbers, or of unequal length, which JAX knows better
+            return isinstance(value, list | tuple)
+    return jnp.issubdtype(dtype, jnp.floating) or jnp.issubdtype(dtype, jnp.integer)
+
+
+def as_count(name: str, value: Any, *, least: int = 1) -> int:
+    """Return a whole number that a caller gave.
+
+    Raises:
+        TypeError: if it is no whole number; true and false are none.
+        ValueError: if it is below the least.
+    """
+    if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
+        raise TypeError(f"`{name}` must be a whole number, but is {in_a_word(value)}")
+    if value < least:
+        raise ValueError(f"`{name}` must be at least {least}, but is {value}")
+    return int(value)
+
+
+def in_a_word(value: Any) -> str:
+    """Return what a value is, short enough for a message: itself where that is short, and its type."""
+    shown, kind = repr(value), type(value).__name__
+    if value is None:
+        return shown
+    return f"{shown} ({kind})" if len(shown) <= 40 and "\n" not in shown else f"a {kind}"
 
 
 _LARGEST = 1e30
 _RANGES = {
     "finite": lambda number: np.full(number.shape, fill_value=True),
-    "positive": lambda number: number > 0,
+    "positive": lambda number: number >= 1.0 / _LARGEST,
+    "above 0": lambda number: number > 0,
     "not negative": lambda number: number >= 0,
     "above 0.5": lambda number: number > 0.5,
     "in [0, 1]": lambda number: (number >= 0) & (number <= 1),

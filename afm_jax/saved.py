@@ -92,7 +92,7 @@ def save(result: Any, path: str | Path) -> None:
         ValueError: if a number in it is traced: save outside `jit`, `vmap` and `grad`.
     """
     lines = (f"{json.dumps(key)}: {strict_json(value)}" for key, value in saved(result).items())
-    write_whole(Path(path), "{" + ",\n ".join(lines) + "}\n")
+    write_whole(Path(path), "{" + ",\n ".join(lines) + "}\n", named_by_user=True)
 
 
 def load(path: str | Path) -> Any:

@@ -358,7 +358,7 @@ def save_scene(scene: Scene, path: str | os.PathLike[str], *, start: Start | Non
     if start is not None:
         check_start(start, scene)
         tables["start"] = {key: float(value) for key, value in start._asdict().items()}
-    write_whole(path, tomli_w.dumps(tables))
+    write_whole(path, tomli_w.dumps(tables), named_by_user=True)
 
 
 def scene_tables(scene: Scene) -> dict[str, dict[str, Any]]:
@@ -470,7 +470,7 @@ def _scene_of(tables: dict[str, SceneTable]) -> Scene:
     numbers = table.numbers(required=("frequency_khz",), optional=("quality_factor", "mass_ng"))
     cantilever = table.build(Cantilever, **numbers)
     platform, base, force = read_drives(tables, cantilever)
-    return Scene(cantilever, platform, _interaction_of(tables), base, force)
+    return tables["platform"].build(Scene, cantilever, platform, _interaction_of(tables), base, force)
 
 
 def _interaction_of(tables: dict[str, SceneTable]) -> Any:

@@ -135,7 +135,7 @@ def run_plan(
     """Compute what a folder does not hold yet of a sweep; arguments and errors as of `sweep`."""
     folder.mkdir(parents=True, exist_ok=True)
     begin = time.monotonic()
-    kept, computed, first = Kept(frozenset(), frozenset()), 0, 0.0
+    kept, computed, first = None, 0, 0.0
     try:
         with locked(folder):
             store = open_store(folder, plan)
@@ -153,8 +153,11 @@ def run_plan(
                     rate = (computed - 1) * share / (passed - first)
                     report(round((len(kept.done) + computed) * share), plan.points, rate)
     except OSError as error:
+        if kept is None:
+            raise
         count = len(kept.done) + computed
-        what = f"{error.strerror or error}: {count} of {plan.chunks} chunks are kept; mend that"
+        where = f"{error.filename}: " if error.filename and Path(error.filename) != folder else ""
+        what = f"{where}{error.strerror or error}: {count} of {plan.chunks} chunks are kept; mend that"
         raise OSError(error.errno, f"{what}, and give the same command again", str(folder)) from error
     return SweepRun(plan.chunks, kept, computed, time.monotonic() - begin)
 

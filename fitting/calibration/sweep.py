@@ -29,6 +29,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from afm_jax.results import Result, public_result
+from afm_jax.whole_files import first_bytes
 from fitting.instruments.formats import holds_curves, read_recording
 from fitting.instruments.recording import UNITS, Recording
 from fitting.tables.csv_text import (
@@ -291,8 +292,8 @@ def read_sweep(path: str | Path) -> ResonanceSweep:
         TableError: one line that names the first fault, its place and how to mend it, and the number of other faults.
     """
     faults = Faults(str(path))
-    with contextlib.suppress(OSError), Path(path).open("rb") as file:
-        head = file.read(4096)
+    with contextlib.suppress(OSError):
+        head = first_bytes(path, 4096)
         if head.startswith(b"[DataSet]"):
             return _spectrum_of(read_recording(path))
         if holds_curves(head, str(path)):

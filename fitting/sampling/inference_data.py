@@ -77,4 +77,4 @@ def write_inference_data(result: FitResult, found: Posterior, path: str | Path, 
         for group, (variables, coordinates) in groups.items():
             data = xarray.Dataset(variables, coords=coordinates, attrs=about)
             data.to_netcdf(whole, group=group, mode="a" if whole.exists() else "w", engine="h5netcdf")
-        write_whole(path, whole.read_bytes())
+        write_whole(path, whole.read_bytes(), named_by_user=True)

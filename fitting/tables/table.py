@@ -654,6 +654,14 @@ def write_table(table: AmplitudeTable, path: str | Path) -> None:
     Raises:
         TableError: if the file cannot be written.
     """
+    try:
+        write_whole(path, csv_of(table), named_by_user=True)
+    except OSError as error:
+        raise TableError(f"{printable(str(path))}: {error.strerror}; choose another path") from error
+
+
+def csv_of(table: AmplitudeTable) -> str:
+    """Return an amplitude table as the text of a CSV file that ``read_table`` reads back without loss."""
     known = [
         ("free_frequency_khz", table.free_frequency_khz, table.free_frequency_error_khz),
         ("quality_factor", table.quality_factor, table.quality_factor_error),
@@ -676,7 +684,4 @@ def write_table(table: AmplitudeTable, path: str | Path) -> None:
     # tolist gives Python numbers, whose repr is the shortest text that reads back as the same number.
     cells = [["" if value != value else repr(value) for value in column.tolist()] for column in columns.values()]  # noqa: PLR0124
     lines += [",".join(row) for row in zip(*cells, strict=True)]
-    try:
-        write_whole(path, "\n".join(lines) + "\n")
-    except OSError as error_met:
-        raise TableError(f"{printable(str(path))}: {error_met.strerror}; choose another path") from error_met
+    return "\n".join(lines) + "\n"
