@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from afm_jax.cli.session import add_note
-from afm_jax.cli.values import SceneName, option_of, scene_and_start
+from afm_jax.cli.values import Finite, SceneName, option_of, scene_and_start
 from afm_jax.contact.parameters import (
     CONTACT_PARAMETERS,
     CONTACT_RANGES,
@@ -64,10 +64,10 @@ def with_contact_options(function: Callable[..., Any]) -> Callable[..., Any]:
     for name in REMOVABLE_EFFECTS[::-1]:
         command = click.option(f"--no-{name}", is_flag=True, help=f"Leave the {name} force out.")(command)
     for name, text in list(_OF_THE_TIP.items())[::-1]:
-        command = click.option(option_of(name), type=float, metavar="X", help=text)(command)
+        command = click.option(option_of(name), type=Finite(), metavar="X", help=text)(command)
     for parameter in CONTACT_PARAMETERS[::-1]:
         text = f"{parameter.meaning}; paper: {parameter.default:g}."
-        command = click.option(option_of(parameter.name), type=float, metavar="X", help=text)(command)
+        command = click.option(option_of(parameter.name), type=Finite(), metavar="X", help=text)(command)
     argument = click.argument("scene", metavar="[SCENE.toml|PRESET]", required=False, type=SceneName())
     return argument(command)
 
@@ -87,9 +87,9 @@ def chosen_contact(options: ContactOptions) -> ChosenContact:
         if name in REQUIRED_EFFECTS:
             raise click.UsageError(f"--no-{name} is not possible: {REQUIRED_EFFECTS[name]}")
     for name, value in options.parameters.items():
-        check_parameter(option_of(name), value, CONTACT_RANGES[name])
+        check_parameter(option_of(name), value, CONTACT_RANGES[name], optional=True)
     for name in _OF_THE_TIP:
-        check_parameter(option_of(name), getattr(options, name), "positive")
+        check_parameter(option_of(name), getattr(options, name), "positive", optional=True)
     effects, parameters, known = EFFECTS, {}, {}
     stated = options.mass_ng is not None or options.spring_constant_n_per_m is not None
     if options.scene is not None:

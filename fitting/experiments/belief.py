@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.checks import checked
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.results import Result, public_result
 from afm_jax.scenefile.tables import printable
@@ -103,6 +104,7 @@ def size_of(parameter: Parameter, value: float) -> float:
     return size or parameter.width or 1.0
 
 
+@checked
 def believe(  # noqa: PLR0913
     model: str = "law+delay",
     *,

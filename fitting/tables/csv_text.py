@@ -295,8 +295,16 @@ def read_text(path: str | Path, mend: str = _AS_CSV) -> str:
     Raises:
         TableError: if there is no such file, it cannot be read or is not UTF-8 text.
     """
+    return text_of(read_bytes(path, "a CSV file"), path, mend)
+
+
+def text_of(data: bytes, path: str | Path, mend: str = _AS_CSV) -> str:
+    """Return the text that the bytes of a file are; see `read_text`.
+
+    Raises:
+        TableError: if they are not UTF-8 text.
+    """
     name = printable(str(path))
-    data = read_bytes(path, "a CSV file")
     data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     try:
         text = data.decode("utf-8-sig")
