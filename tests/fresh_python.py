@@ -6,15 +6,15 @@ import sys
 from collections.abc import Mapping
 
 
-def python(code: str, limit_s: float | None = None, **environment: str | None) -> str:
-    """Return what a program of its own prints; it must succeed, in time. Variables that are None are not set."""
-    return outputs(code, environment, limit_s=limit_s)[0]
+def python(code: str, **environment: str | None) -> str:
+    """Return what a program of its own prints; it must succeed. Variables that are None are not set."""
+    return outputs(code, environment)[0]
 
 
 def outputs(
     code: str, environment: Mapping[str, str | None], codes: tuple[int, ...] = (0,), limit_s: float | None = None
 ) -> tuple[str, str]:
-    """Return what a program of its own writes to standard output and to standard error."""
+    """Return what a program of its own writes to standard output and to standard error, in time."""
     variables = {name: value for name, value in {**os.environ, **environment}.items() if value is not None}
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=variables, timeout=limit_s

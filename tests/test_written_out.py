@@ -23,7 +23,7 @@ from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.contact.settings import METHODS, SETTINGS, Setting
 from afm_jax.motion.simulate import State
 from afm_jax.scenefile.presets import preset
-from tests.fresh_python import python
+from tests.fresh_python import outputs
 from tests.written_out import MOST, written_out
 
 SPEEDS = jnp.array([20.0, 30.0])
@@ -137,5 +137,5 @@ def test_collisions_of_any_number_of_tips_are_compiled_in_time(
 ):
     # as users do: optimised, and none of it found in a cache
     program = PROGRAM.format(tips=tips, method=method, slowest=slowest, accuracies=accuracies)
-    unset = dict.fromkeys(("XLA_FLAGS", "JAX_COMPILATION_CACHE_DIR"))
-    assert python(program, limit_s=LIMIT_S, **unset).splitlines()[-1] == compiled
+    unset: dict[str, str | None] = {"XLA_FLAGS": None, "JAX_COMPILATION_CACHE_DIR": None}
+    assert outputs(program, unset, limit_s=LIMIT_S)[0].splitlines()[-1] == compiled

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.checks import checked
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.results import Result, public_result
 from afm_jax.scenefile.tables import printable
@@ -101,6 +102,7 @@ def size_of(parameter: Parameter, value: float) -> float:
     return size or parameter.width or 1.0
 
 
+@checked
 def believe(  # noqa: PLR0913
     model: str = "law+delay",
     *,

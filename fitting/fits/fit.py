@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from afm_jax.checks import require_float64
+from afm_jax.checks import checked, require_float64
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.lasting_impact import LawImpact, PulledImpact
 from afm_jax.least_squares import chi2_tail
@@ -83,7 +83,7 @@ from fitting.models import (
 )
 from fitting.parameters import NUISANCE_NAMES, is_of_one_table, model_parameters, name_of_table, parameter_called
 from fitting.tables.several import SeveralTables
-from fitting.tables.table import AmplitudeTable
+from fitting.tables.table import AmplitudeTable, as_table
 
 _POINTS = 121
 
@@ -629,6 +629,7 @@ _FEWEST_LEFT, _LEAST_LEFT = 4, 0.2
 """Rows of a driven tip, and their share, of which at least a law of impacts is read off."""
 
 
+@checked
 def fit(  # noqa: PLR0913
     table: AmplitudeTable | Sequence[AmplitudeTable] | Any,
     model: str = "law",
@@ -645,10 +646,10 @@ def fit(  # noqa: PLR0913
     """Fit an impact law to measured amplitudes of single-impact orbits.
 
     Args:
-        table: from `read_table`, or a data frame as `AmplitudeTable.from_dataframe` takes it; what it gives with an
-            error (Q, calibrations) is a nuisance with that constraint. A Q without error is taken to be known to 2 %
-            where impacts last, and exactly by the instantaneous laws. Several of them: one law for all, each with
-            nuisances of its own.
+        table: from `read_table`, the path of a file, or a data frame as `AmplitudeTable.from_dataframe` takes it; what
+            it gives with an error (Q, calibrations) is a nuisance with that constraint. A Q without error is taken to
+            be known to 2 % where impacts last, and exactly by the instantaneous laws. Several of them: one law for all,
+            each with nuisances of its own.
         model: "restitution" (r), "law" (r, epsilon; eq. 6), "viscous" (epsilon, viscous_loss) or "full" (all three),
             each instantaneous or with "+delay", the collision delay; or "contact", physical parameters through the
             resolved contact, which a tapping curve gives on resonance too.
@@ -687,13 +688,19 @@ def fit(  # noqa: PLR0913
     return summarise(whole, find_fit(whole, model, **options))
 
 
+def _one_table(given: Any) -> AmplitudeTable:
+    return AmplitudeTable.from_dataframe(given) if hasattr(given, "columns") else as_table(given)
+
+
 def tables_of(given: Any) -> AmplitudeTable | SeveralTables:
     """Return what was given as a table, or as several."""
-    if isinstance(given, AmplitudeTable | SeveralTables):
+    if isinstance(given, SeveralTables):
         return given
-    if not isinstance(given, Sequence):
-        return AmplitudeTable.from_dataframe(given)
-    tables = [one if isinstance(one, AmplitudeTable) else AmplitudeTable.from_dataframe(one) for one in given]
+    if isinstance(given, str) or not isinstance(given, Sequence):
+        return _one_table(given)
+    if not given:
+        raise ValueError("there is no table: give one, or the path of one")
+    tables = [_one_table(one) for one in given]
     return tables[0] if len(tables) == 1 else SeveralTables(tuple(tables))
 
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from afm_jax.checks import require_float64
+from afm_jax.checks import checked, require_float64
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.least_squares import Box, Searches, descended, distance, whole_covariance_of
 from afm_jax.results import Result, public_result
@@ -309,6 +309,7 @@ class Bootstrap(Result):
         }
 
 
+@checked
 def bootstrap(result: FitResult, samples: int = 400, *, seed: int = 0) -> Bootstrap:
     """Fit synthetic data sets that the fitted law would give, with the errors of the rows.
 
