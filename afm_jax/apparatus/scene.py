@@ -4,6 +4,8 @@ The period that a scene is driven with, and whether there is only one.
 """
 
 import math
+import os
+from importlib import import_module
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,7 +14,7 @@ import numpy as np
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.drives import BaseDrive, ForceDrive
 from afm_jax.apparatus.platform import Platform
-from afm_jax.checks import in_a_word, is_traced, readable
+from afm_jax.checks import check_kind, in_a_word, is_traced, readable
 
 
 class Scene(eqx.Module):
@@ -48,6 +50,24 @@ class Scene(eqx.Module):
             what = in_a_word(self.interaction)
             raise TypeError(f"the scene's `interaction` must be an ImpactLaw, a Contact or None, but is {what}")
         _check_frequencies(self)
+
+
+SceneLike = Scene | str | os.PathLike[str]
+"""A scene, the path of a scene file, or the name of one of the paper's scenes."""
+
+
+def as_scene(given: SceneLike) -> Scene:
+    """Return a scene that was given, or is read from its file, or has its name.
+
+    Raises:
+        TypeError: if it is something else.
+        ValueError: if there is no such file or name, or the file is no valid scene file.
+    """
+    if isinstance(given, Scene):
+        return given
+    check_kind("scene", given, SceneLike)
+    # what reads files is built on scenes
+    return import_module("afm_jax.scenefile.presets").scene_and_start(os.fspath(given))[0]
 
 
 LARGEST_FREQUENCY_RATIO = 1e4

@@ -347,22 +347,10 @@ def parse_share(text: str) -> float:
 
 
 def scene_and_start(name: str) -> "tuple[Scene, Start | None]":
-    """Return the scene that an argument names, and the start that comes with it; None where it is to be chosen.
+    """Return the scene that an argument names and its start; see `afm_jax.scenefile.presets.scene_and_start`."""
+    from afm_jax.scenefile import presets  # noqa: PLC0415
 
-    Args:
-        name: a path, or a name of `afm_jax.scenefile.presets.PRESETS` where there is no file of that name.
-
-    Raises:
-        ValueError: if there is neither such a file nor such a preset, or the file is no valid scene file.
-    """
-    from afm_jax.scenefile.presets import PRESETS, preset, preset_start  # noqa: PLC0415
-    from afm_jax.scenefile.scenefile import load_scene_and_start  # noqa: PLC0415
-
-    if Path(name).exists() or name.endswith(".toml") or len(Path(name).parts) > 1:
-        return load_scene_and_start(name)
-    if name not in PRESETS:
-        raise ValueError(f"{name}: there is no such file or preset; presets are {', '.join(PRESETS)}")
-    return preset(name), preset_start(name)
+    return presets.scene_and_start(name)
 
 
 def ranges_of(name: str, scene: "Scene", texts: Sequence[str], *, counted: bool) -> "list[ParameterRange]":

@@ -26,7 +26,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from afm_jax.checks import require_float64
+from afm_jax.checks import checked, require_float64
 from afm_jax.contact.bridge_leg import margin_of, pass_by_collocation, way_through
 from afm_jax.contact.collide import capture_speed, collide, collide_in_blocks
 from afm_jax.contact.contact import Bridge, Contact, bridge_of
@@ -168,6 +168,7 @@ class ContactLaw(Result):
         return float(np.sqrt(np.mean(self.error_nm_per_us**2)))
 
 
+@checked
 def fit_law(
     contact: Contact,
     *,
@@ -344,6 +345,7 @@ class ContactDelay(Result):
         return float(np.abs(self.fitted_us - self.delay_us).max())
 
 
+@checked
 def fit_delay(
     contact: Contact, *, speed_range: tuple[float, float] | None = None, mass_ng: float = 1.0, points: int = 512
 ) -> ContactDelay:

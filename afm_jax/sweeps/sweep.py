@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from afm_jax.apparatus.scene import Scene
-from afm_jax.checks import require_float64
+from afm_jax.apparatus.scene import SceneLike, as_scene
+from afm_jax.checks import checked, require_float64
 from afm_jax.compilation_cache import available_cores, silence_xla
 from afm_jax.scenefile.scenefile import Start, scene_tables
 from afm_jax.sweeps.plan import Columns, SweepPlan, plan_of
@@ -52,8 +52,9 @@ class SweepRun(NamedTuple):
     seconds: float
 
 
+@checked
 def sweep(  # noqa: PLR0913
-    scene: Scene,
+    scene: SceneLike,
     axes: Sequence[Mapping[str, Any]],
     record: str | Mapping[str, Any],
     *,
@@ -92,6 +93,7 @@ def sweep(  # noqa: PLR0913
         RuntimeError: if JAX is not set to 64-bit floats, or workers fail again and again.
         ValueError: if the input is impossible, or the folder holds another sweep or is being written to.
     """
+    scene = as_scene(scene)
     require_float64(scene)
     settings = {"what": record} if isinstance(record, str) else dict(record)
     given = {

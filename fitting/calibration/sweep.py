@@ -28,6 +28,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from afm_jax.checks import checked
 from afm_jax.results import Result, public_result
 from afm_jax.whole_files import first_bytes
 from fitting.instruments.formats import holds_curves, read_recording
@@ -282,6 +283,7 @@ def _check_numbers(
         faults.add(f"{must}, but is {number}; correct it or remove the row", line=int(lines[row]), column=name)
 
 
+@checked
 def read_sweep(path: str | Path) -> ResonanceSweep:
     """Read a free resonance sweep from plain CSV or Nanonis text, or a thermal spectrum, and check all of it.
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from afm_jax.checks import checked
 from afm_jax.version import __version__
 from afm_jax.whole_files import write_whole
 from fitting.fits.result import FitResult
@@ -30,6 +31,7 @@ def require_netcdf() -> Any:
     return importlib.import_module("xarray")
 
 
+@checked
 def write_inference_data(result: FitResult, found: Posterior, path: str | Path, *, seed: int = 0) -> None:
     """Write a posterior for ArviZ: `arviz.from_netcdf(path)` reads it.
 

@@ -36,6 +36,7 @@ The comment lines of an amplitude table: what `# key = value` says about the can
 The columns of an amplitude table, and the checks that every table must pass.
 """
 
+import os
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
+from afm_jax.checks import check_kind, checked
 from afm_jax.results import Result, public_result
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from afm_jax.whole_files import write_whole
@@ -591,6 +593,7 @@ def _check_mass(table: AmplitudeTable, spring: float, faults: Faults) -> None:
         )
 
 
+@checked
 def read_table(path: str | Path, noise: float | None = None) -> AmplitudeTable:
     """Read an amplitude table from a CSV file and check all of it.
 
@@ -603,6 +606,23 @@ def read_table(path: str | Path, noise: float | None = None) -> AmplitudeTable:
         TableError: one line that names the first fault, its place and how to mend it, and the number of other faults.
     """
     return parse_table(read_text(path), str(path), noise)
+
+
+TableLike = AmplitudeTable | str | os.PathLike[str]
+"""An amplitude table, or the path of its file."""
+
+
+def as_table(given: TableLike) -> AmplitudeTable:
+    """Return a table that was given, or is read from its file.
+
+    Raises:
+        TypeError: if it is something else.
+        TableError: as `read_table`.
+    """
+    if isinstance(given, AmplitudeTable):
+        return given
+    check_kind("table", given, TableLike)
+    return read_table(Path(os.fspath(given)))
 
 
 def parse_table(text: str, source: str, noise: float | None = None) -> AmplitudeTable:
@@ -644,7 +664,8 @@ def parse_table(text: str, source: str, noise: float | None = None) -> Amplitude
     return AmplitudeTable(**arrays, **vars(header), source=source, lines=lines)
 
 
-def write_table(table: AmplitudeTable, path: str | Path) -> None:
+@checked
+def write_table(table: TableLike, path: str | Path) -> None:
     """Write an amplitude table as a CSV file that ``read_table`` reads back without loss.
 
     Args:
@@ -654,6 +675,7 @@ def write_table(table: AmplitudeTable, path: str | Path) -> None:
     Raises:
         TableError: if the file cannot be written.
     """
+    table = as_table(table)
     try:
         write_whole(path, csv_of(table), named_by_user=True)
     except OSError as error:

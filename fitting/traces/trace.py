@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.checks import checked
 from afm_jax.results import Result, public_result
 from afm_jax.scenefile.tables import cut_short, printable
 from afm_jax.whole_files import MOST_PACKED, MOST_VALUES
@@ -453,6 +454,7 @@ def _check_length(trace: Trace, faults: Faults) -> None:
         )
 
 
+@checked
 def read_trace(path: str | Path, *, group: str | None = None, **settings: float | None) -> Trace:
     """Read a time trace from a CSV or HDF5 file and check all of it.
 
