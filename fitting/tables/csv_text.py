@@ -264,6 +264,8 @@ def read_bytes(path: str | Path, wanted: str) -> bytes:
 
 
 _AS_CSV = "save the table as CSV with the encoding UTF-8"
+FIT_FORMAT_VERSION = 2
+"""Version of the layout of fit.json; raised when a key changes its meaning or goes."""
 _A_FIT = "give the fit.json of `afm-jax fit --out`"
 
 
@@ -282,6 +284,11 @@ def read_fit_json(path: str | Path) -> dict[str, Any]:
         raise TableError(f"{name}: has too many brackets within each other; {_A_FIT}") from None
     if not isinstance(found, dict) or found.get("format") != "afm-jax fit":
         raise TableError(f"{name}: is no fit; {_A_FIT}")
+    if found.get("format_version") != FIT_FORMAT_VERSION:
+        raise TableError(
+            f"{name}: has format_version {found.get('format_version')}, but {FIT_FORMAT_VERSION} is known here; write "
+            "it anew: afm-jax fit TABLE.csv --model MODEL --out FOLDER"
+        )
     return found
 
 
