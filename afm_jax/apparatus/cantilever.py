@@ -78,7 +78,7 @@ class Cantilever(eqx.Module):
 
     frequency_khz: Float[Array, "..."] = eqx.field(converter=as_parameter)
     quality_factor: Float[Array, "..."] | None = eqx.field(converter=as_optional_parameter, default=None)
-    mass_ng: Float[Array, "..."] = eqx.field(converter=as_parameter)
+    mass_ng: Float[Array, "..."] = eqx.field(converter=as_parameter, default=1.0)
 
     __repr__ = readable
 
