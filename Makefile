@@ -1,5 +1,6 @@
-# Everything runs in one virtual environment, .venv, made on first use. PYTHON chooses the interpreter (>= 3.11).
+# Everything runs in one virtual environment, VENV, made on first use. PYTHON chooses the interpreter (>= 3.11).
 PYTHON ?= python3
+VENV ?= .venv
 TABLE ?=
 MODEL ?= law
 OUT ?= report
@@ -16,21 +17,22 @@ COMPILED_SOON = $(KNOWN) --xla_backend_optimization_level=1
 # Tests of the last digits, which the order of roundings decides.
 SHARP := tests/test_polynomial_roots.py tests/test_verification.py
 
-BIN := .venv/bin
-SETUP := .venv/.installed
+BIN := $(VENV)/bin
+SETUP := $(VENV)/.installed
+PIP ?=
 
-.PHONY: help setup fit test check thorough lint types coverage slow docs pictures mutations bands tapping ranks fuzz kills bench clean
+.PHONY: help setup fit test newest oldest check thorough lint types coverage slow docs pictures mutations bands tapping ranks fuzz kills bench clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
 	@grep -E '^[a-z]+:.*##' $(MAKEFILE_LIST) | sed -e 's/:.*##/:/' -e 's/^/  make /'
 
-setup: $(SETUP) ## make .venv with the package and what its tests need
+setup: $(SETUP) ## make VENV with the package and what its tests need
 
 $(SETUP): pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(None if sys.version_info >= (3, 11) else "afm-jax needs Python >= 3.11; name one with: make PYTHON=python3.12 ...")'
-	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP) --editable '.[dev]'
 	@touch $@
 
 fit: $(SETUP) ## fit the bundled table (or TABLE=..., MODEL=...), print the impact law, write OUT=report/
@@ -40,12 +42,33 @@ test: $(SETUP) ## the tests (under 7 minutes on two cores)
 	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_AT_ONCE)" $(BIN)/python $(PYTEST) -n auto --dist worksteal $(SHARP:%=--ignore %)
 	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_SOON)" $(BIN)/python $(PYTEST) -n auto $(SHARP)
 
+# The Pythons that are found, those of pyenv included: the first is the oldest, the last the newest.
+PYTHONS = $(shell for minor in $$(seq 11 30); do \
+	for python in python3.$$minor $${PYENV_ROOT:-$$HOME/.pyenv}/versions/3.$$minor.*/bin/python3; do \
+	$$python -c 'import ensurepip, sys; sys.exit(sys.version_info.releaselevel != "final")' 2>/dev/null && \
+	echo $$python && break; done; done; true)
+RUN ?= test
+VERSIONS = $(1)/bin/python -c 'import sys, jax; print("Python", *sys.version.split()[:1], "with jax", jax.__version__)'
+
+newest: ## make test on the newest Python and JAX found, in .venv-newest; RUN=check: all of make check there
+	rm -f .venv-newest/.installed
+	$(MAKE) setup VENV=.venv-newest PYTHON=$(lastword $(PYTHONS)) PIP='--upgrade --upgrade-strategy eager'
+	@$(call VERSIONS,.venv-newest)
+	$(MAKE) $(RUN) VENV=.venv-newest
+
+oldest: ## make test with exactly the lower bounds of pyproject.toml, on the oldest Python found, in .venv-oldest
+	@mkdir -p .venv-oldest && rm -f .venv-oldest/.installed
+	$(firstword $(PYTHONS)) -m tests.lower_bounds > .venv-oldest/constraints.txt
+	$(MAKE) setup VENV=.venv-oldest PYTHON=$(firstword $(PYTHONS)) PIP='--constraint .venv-oldest/constraints.txt'
+	@$(call VERSIONS,.venv-oldest)
+	$(MAKE) $(RUN) VENV=.venv-oldest
+
 lint: $(SETUP)
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 
 types: $(SETUP)
-	$(BIN)/pyright
+	$(BIN)/pyright --pythonpath $(BIN)/python
 
 # From Python 3.12 on lines are counted by sys.monitoring, which costs little; the tracer before it doubles the time.
 TRACED := COVERAGE_CORE=$$($(BIN)/python -c 'import sys; print("sysmon" if sys.version_info >= (3, 12) else "ctrace")')
@@ -90,11 +113,11 @@ kills: $(SETUP) ## a sweep killed at fifty random times and resumed ends in the 
 
 check: lint types test slow docs ## all that CI runs: format, lint, types, tests, slow tests, notebooks, site
 
-thorough: lint types coverage mutations bands tapping ranks fuzz kills ## all of make check with the share of lines it runs, mutations, bands, tapping curves, ranks, random work, kills
+thorough: lint types coverage mutations bands tapping ranks fuzz kills newest ## all of make check with the share of lines it runs, mutations, bands, tapping curves, ranks, random work, kills, the newest Python and JAX
 
 bench: $(SETUP) ## impacts per second, next to SciPy
 	$(BIN)/afm-jax bench --out $(OUT)
 
 clean: ## remove the environment, caches and reports
-	rm -rf .venv report results .pytest_cache .ruff_cache .hypothesis .coverage build dist *.egg-info
+	rm -rf .venv .venv-newest .venv-oldest report results .pytest_cache .ruff_cache .hypothesis .coverage build dist *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

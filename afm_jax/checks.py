@@ -4,76 +4,269 @@ Values are checked only while they are concrete; inside ``jit``, ``grad`` or ``v
 check is skipped, because a compiled program cannot raise.
 """
 
+import collections.abc
 import contextlib
 import dataclasses
-from collections.abc import Iterator
+import functools
+import inspect
+import operator
+import os
+import sys
+import types
+from collections.abc import Callable, Iterator
 from contextvars import ContextVar
-from typing import Any
+from pathlib import Path
+from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Shaped
 
 
-def as_parameter(value: ArrayLike) -> Float[Array, "..."]:
+def as_parameter(value: Any) -> Any:
     """Return a parameter as a floating-point array; arrays that are floating-point already keep their precision.
 
     Python numbers become arrays of the default precision and never weakly typed, so that one compiled program serves
-    numbers and arrays alike.
+    numbers and arrays alike. What is no real number stays as it is, for `check_parameter` to refuse by its name.
     """
+    if not isinstance(value, float) and not _is_real(value):
+        # `check_parameter` names it
+        return value
+    import jax.numpy as jnp  # noqa: PLC0415
+
     array = jnp.asarray(value)
     return jnp.asarray(array, array.dtype if jnp.issubdtype(array.dtype, jnp.floating) else float)
 
 
-def as_argument(value: ArrayLike) -> Float[Array, "..."]:
+def as_argument(value: Any) -> Any:
     """Return the argument of a formula as a floating-point array; Python numbers adapt to the parameters' precision."""
+    import jax.numpy as jnp  # noqa: PLC0415
+
     array = jnp.asarray(value)
     return array if jnp.issubdtype(array.dtype, jnp.floating) else array * 1.0
 
 
-def as_optional_parameter(value: ArrayLike | None) -> Float[Array, "..."] | None:
+def as_optional_parameter(value: Any) -> Any:
     """Return `as_parameter(value)`, or None where the effect is absent."""
     return None if value is None else as_parameter(value)
 
 
-def is_traced(value: ArrayLike) -> bool:
+def is_traced(value: Any) -> bool:
     """Say whether a value is an abstract one inside `jit`, `grad` or `vmap`, whose number cannot be looked at."""
-    return isinstance(value, Tracer)
+    # where JAX is not loaded nothing can be traced: readers of files do without it
+    jax = sys.modules.get("jax")
+    return jax is not None and isinstance(value, jax.core.Tracer)
 
 
-def check_parameter(name: str, value: ArrayLike | None, allowed: str) -> None:
+def check_parameter(name: str, value: Any, allowed: str, *, optional: bool = False) -> None:
     """Check a parameter that is a concrete number.
 
     Args:
         name: what the message calls it, with its unit.
-        value: the number or array; None (an absent effect) and traced values pass.
-        allowed: "finite", "positive", "not negative", "above 0.5", "in [0, 1]" or
+        value: the number or array; traced values pass.
+        allowed: "finite", "positive", "above 0" (however small), "not negative", "above 0.5", "in [0, 1]" or
             "between 0 and 1" (neither of the two).
+        optional: whether None, an absent effect, passes.
 
     Raises:
-        ValueError: if a value is not finite, not in the allowed range, or beyond 1e30.
+        ValueError: if a value is not finite, not in the allowed range, beyond 1e30, or, where it must be positive,
+            below 1e-30.
+        TypeError: if it is no real number.
     """
-    if value is None or is_traced(value):
+    if (value is None and optional) or is_traced(value):
         return
-    number = np.asarray(value)
+    number = as_real(name, value)
     # An infinite quality factor is a meaningful limit; every other infinity is a mistake.
     finite = ~np.isnan(number) if allowed == "above 0.5" else np.abs(number) <= _LARGEST
     good = finite & _RANGES[allowed](number)
     if not np.all(good):
         offender = float(number[~good].flat[0]) if number.ndim else float(number)
-        must = {"finite": "be a finite number", "not negative": "not be negative"}.get(allowed, f"be {allowed}")
+        must = {"finite": "be a finite number", "above 0": "be positive", "not negative": "not be negative"}.get(
+            allowed, f"be {allowed}"
+        )
         if np.isfinite(offender) and abs(offender) > _LARGEST:
             must = f"be at most {_LARGEST:g} in size, so that its powers stay numbers"
+        elif allowed == "positive" and 0.0 < offender < 1.0 / _LARGEST:
+            must = f"be at least {1.0 / _LARGEST:g}, so that its inverse stays a number"
         raise ValueError(f"`{name}` must {must}, but is {offender:g}")
 
+
+def as_real(name: str, value: Any) -> Shaped[np.ndarray, "..."]:
+    """Return a number or an array of numbers that a caller gave.
+
+    Raises:
+        TypeError: if it is, or holds, a text, true or false, a complex number, None or anything else that is no real
+            number.
+    """
+    if not _is_real(value):
+        raise TypeError(f"`{name}` must be a real number, but is {in_a_word(value)}")
+    return np.asarray(value)
+
+
+def _is_real(value: Any) -> bool:
+    dtype = getattr(value, "dtype", None)
+    if dtype is None:
+        try:
+            dtype = np.asarray(value).dtype
+        except (TypeError, ValueError):
+            # a list of traced numbers, or of unequal length, which JAX knows better
+            return isinstance(value, list | tuple)
+    if dtype.kind == "O" and isinstance(value, list | tuple):
+        return all(is_traced(one) or _is_real(one) for one in value)
+    # JAX's own narrow numbers are of no kind that NumPy knows
+    return dtype.kind in "fiu" or "float" in dtype.name
+
+
+def in_a_word(value: Any) -> str:
+    """Return what a value is, short enough for a message: itself where that is short, and its type."""
+    shown, kind = repr(value), type(value).__name__
+    if value is None:
+        return shown
+    return f"{shown} ({kind})" if len(shown) <= 40 and "\n" not in shown else _with_article(kind)
+
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def checked(function: Function) -> Function:
+    """Let a public function refuse arguments of another kind than its annotations say, before it computes.
+
+    A whole number is no true or false, a number no text and no complex number, an array one of real numbers, a class
+    itself; what an annotation leaves open passes.
+
+    Raises:
+        TypeError: by the function, naming the argument, what it must be and what it is.
+    """
+    signature = inspect.signature(function)
+    hints: dict[str, Any] = {}
+
+    @functools.wraps(function)
+    def call(*arguments: Any, **named: Any) -> Any:
+        if not hints:
+            several = (inspect.Parameter.VAR_POSITIONAL, inspect.Parameter.VAR_KEYWORD)
+            for name, one in signature.parameters.items():
+                hints[name] = Any if one.kind in several else _resolved(one.annotation, function)
+        try:
+            given = signature.bind(*arguments, **named).arguments
+        except TypeError:
+            # what is missing or too much Python itself says best
+            return function(*arguments, **named)
+        for name, value in given.items():
+            check_kind(name, value, hints[name])
+        return function(*arguments, **named)
+
+    return cast("Function", call)
+
+
+def check_kind(name: str, value: Any, kind: Any) -> None:
+    """Check that a part of an object is of the kind that an annotation says.
+
+    Raises:
+        TypeError: if not; names it.
+    """
+    must = _misfit(kind, value)
+    if must:
+        raise TypeError(f"`{name}` must be {must}, but is {in_a_word(value)}")
+
+
+def _resolved(annotation: Any, function: Callable[..., Any]) -> Any:
+    """Return an annotation; Any where it is a text that means nothing while the program runs."""
+    if not isinstance(annotation, str):
+        return Any if annotation is inspect.Parameter.empty else annotation
+    return getattr(inspect.getmodule(function), annotation, Any)
+
+
+def _misfit(kind: Any, value: Any) -> str:
+    """Return what a value must be that an annotation does not allow; nothing where it does, or leaves it open."""
+    if kind is Any or isinstance(kind, TypeVar | str) or is_traced(value):
+        return ""
+    parts = get_args(kind)
+    if get_origin(kind) not in (Union, types.UnionType):
+        return _misfit_of_one(get_origin(kind) or kind, parts, value)
+    words = []
+    if complex in parts:
+        # true, false and complex numbers are among JAX's numbers, but none here
+        words = ["" if _is_real(value) else "a real number or an array of them"]
+        parts = tuple(part for part in parts if part is type(None))
+    words += [_misfit(part, value) for part in parts]
+    return "" if "" in words else " or ".join(dict.fromkeys(words))
+
+
+def _misfit_of_one(kind: Any, parts: tuple[Any, ...], value: Any) -> str:  # noqa: PLR0911
+    """Return the same for an annotation that is no choice: a class with what is in its brackets."""
+    if kind is type(None):
+        return "" if value is None else "None"
+    simple = _SIMPLE.get(kind)
+    if simple is not None:
+        return "" if simple[1](value) else simple[0]
+    if kind is Literal:
+        return "" if value in parts else f"one of {', '.join(map(repr, parts))}"
+    if kind is Callable or kind is collections.abc.Callable:
+        return "" if callable(value) else "a function"
+    if hasattr(kind, "array_type"):
+        return "" if _is_array(value) or _is_real(value) else "an array of real numbers"
+    if kind in (list, tuple, collections.abc.Sequence):
+        return _misfit_of_several(kind, parts, value)
+    if kind in (dict, collections.abc.Mapping):
+        return "" if isinstance(value, collections.abc.Mapping) else "a dictionary"
+    if not isinstance(kind, type) or isinstance(value, kind):
+        return ""
+    # a named tuple may be written as a plain one
+    fields = getattr(kind, "_fields", None)
+    if fields is not None and isinstance(value, tuple) and len(value) == len(fields):
+        return ""
+    return _with_article(kind.__name__)
+
+
+def _with_article(name: str) -> str:
+    return f"{'an' if name[0] in 'AEIOUaeiou' else 'a'} {name}"
+
+
+def _misfit_of_several(kind: Any, parts: tuple[Any, ...], value: Any) -> str:
+    """Return the same for a list or a tuple, and what is in it."""
+    if isinstance(value, str) or not (isinstance(value, collections.abc.Sequence) or _is_array(value)):
+        return "a list"
+    if kind is tuple and Ellipsis not in parts:
+        if len(value) != len(parts):
+            return f"{len(parts)} values"
+        pairs = zip(parts, value, strict=True)
+    else:
+        pairs = ((parts[0] if parts else Any, one) for one in value)
+    inner = next((must for part, one in pairs if (must := _misfit(part, one))), "")
+    return f"a list, each {inner}" if inner else ""
+
+
+def _is_array(value: Any) -> bool:
+    return hasattr(value, "dtype") and hasattr(value, "shape")
+
+
+def _is_whole(value: Any) -> bool:
+    if isinstance(value, bool | np.bool_):
+        return False
+    try:
+        operator.index(value)
+    except TypeError:
+        return False
+    return True
+
+
+def _is_number(value: Any) -> bool:
+    return _is_real(value) and np.ndim(value) == 0 and not np.isnan(value)
+
+
+_SIMPLE: dict[Any, tuple[str, Callable[[Any], bool]]] = {
+    int: ("a whole number", _is_whole),
+    float: ("a real number", _is_number),
+    bool: ("True or False", lambda value: isinstance(value, bool | np.bool_)),
+    str: ("a text", lambda value: isinstance(value, str)),
+    os.PathLike: ("a path", lambda value: isinstance(value, os.PathLike)),
+    Path: ("a path", lambda value: isinstance(value, os.PathLike)),
+}
 
 _LARGEST = 1e30
 _RANGES = {
     "finite": lambda number: np.full(number.shape, fill_value=True),
-    "positive": lambda number: number > 0,
+    "positive": lambda number: number >= 1.0 / _LARGEST,
+    "above 0": lambda number: number > 0,
     "not negative": lambda number: number >= 0,
     "above 0.5": lambda number: number > 0.5,
     "in [0, 1]": lambda number: (number >= 0) & (number <= 1),
@@ -81,7 +274,7 @@ _RANGES = {
 }
 
 
-def readable(self: eqx.Module) -> str:
+def readable(self: Any) -> str:
     """Return a module with its numbers, the way it was written: for `__repr__`.
 
     Traced values and abstract shapes show as JAX shows them.
@@ -90,8 +283,8 @@ def readable(self: eqx.Module) -> str:
     return f"{type(self).__name__}({fields})"
 
 
-def _number(value: object) -> str:
-    if isinstance(value, jax.Array) and not is_traced(value):
+def _number(value: Any) -> str:
+    if _is_array(value) and not isinstance(value, np.ndarray) and not is_traced(value):
         return repr(np.asarray(value).item()) if value.ndim == 0 else np.array2string(np.asarray(value), separator=", ")
     return repr(value)
 
@@ -106,6 +299,8 @@ def require_float64(*models: Any) -> None:
         RuntimeError: if JAX does not, or an array was made before it was told to; results in 32 bits are not
             trustworthy by default.
     """
+    import jax  # noqa: PLC0415
+
     if not jax.config.read("jax_enable_x64"):
         raise RuntimeError(
             "afm_jax needs 64-bit floats: add `jax.config.update('jax_enable_x64', True)` before the first computation"
@@ -119,6 +314,8 @@ def refuse_float32(*models: Any) -> None:
     Raises:
         RuntimeError: if one was made before JAX was told to, or of narrower numbers.
     """
+    import jax  # noqa: PLC0415
+
     if not jax.config.read("jax_enable_x64") or _float32_allowed.get():
         return
     for model in models:
@@ -145,7 +342,7 @@ _float32_allowed = ContextVar("_float32_allowed", default=False)
 
 
 def _is_narrow(leaf: Any) -> bool:
-    return getattr(leaf, "dtype", None) in _NARROW
+    return str(getattr(leaf, "dtype", "")) in _NARROW
 
 
-_NARROW = {jnp.dtype(name) for name in ("float16", "bfloat16", "float32")}
+_NARROW = {"float16", "bfloat16", "float32"}

@@ -74,7 +74,7 @@ class Result:
         # a figure without pyplot is shown by a notebook only if it says how
         figure._repr_png_ = lambda: style.png_of(figure)
         if path is not None:
-            style.save(figure, Path(path))
+            style.save(figure, Path(path), named_by_user=True)
         return figure
 
     def to_pandas(self) -> "DataFrame":

@@ -25,6 +25,7 @@ from typing import Any, NoReturn
 
 import numpy as np
 
+from afm_jax.checks import checked
 from afm_jax.strict_json import strict_json
 from afm_jax.version import __version__
 from afm_jax.whole_files import read_whole, write_whole
@@ -92,9 +93,10 @@ def save(result: Any, path: str | Path) -> None:
         ValueError: if a number in it is traced: save outside `jit`, `vmap` and `grad`.
     """
     lines = (f"{json.dumps(key)}: {strict_json(value)}" for key, value in saved(result).items())
-    write_whole(Path(path), "{" + ",\n ".join(lines) + "}\n")
+    write_whole(Path(path), "{" + ",\n ".join(lines) + "}\n", named_by_user=True)
 
 
+@checked
 def load(path: str | Path) -> Any:
     """Return what `save` wrote.
 

@@ -1,46 +1,174 @@
-"""Files that appear whole or not at all, as every command writes them, and files read whole, up to a size."""
+"""Files that appear whole or not at all, as every command writes them, and files read whole, up to a size.
+
+A folder of results may come from somebody else: what lies in it is never followed where it is a link, so that nothing
+outside the folder is overwritten. Only a path that the user named as the one to write may be the user's own link.
+"""
 
 import errno
+import io
 import os
 import secrets
+import select
+import shutil
+import stat
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 LARGEST_BYTES = 1 << 30
 """Of what is read: a device or a pipe without end would fill the memory."""
+MOST_VALUES = LARGEST_BYTES // 8
+"""Of what a file says that it holds, in all its columns: as many 64-bit numbers as there are such bytes."""
+MOST_PACKED = 1000
+"""Times its own size that a file may unpack to: more than recorded signals can be compressed."""
+_PATIENCE_S = 2.0
+"""For somebody to begin to write into a pipe."""
 
 
 def read_whole(path: str | os.PathLike[str]) -> bytes:
     """Return what a file, a device or a pipe holds.
 
     Raises:
-        OSError: if it cannot be read, or holds too much.
+        OSError: if it cannot be read, holds too much, or is a pipe that nobody writes to.
     """
-    with Path(path).open("rb") as file:
-        data = file.read(LARGEST_BYTES + 1)
+    # a pipe that nobody has opened to write would let this wait for ever
+    with open(path, "rb", buffering=0, opener=lambda name, flags: os.open(name, flags | _AT_ONCE)) as file:
+        is_pipe = stat.S_ISFIFO(os.fstat(file.fileno()).st_mode)
+        if _AT_ONCE:
+            os.set_blocking(file.fileno(), not is_pipe)
+        data = _piped(file) if is_pipe and _AT_ONCE else _read(file)
     if len(data) > LARGEST_BYTES:
         raise OSError(errno.EFBIG, f"it holds more than {LARGEST_BYTES:,} bytes", os.fspath(path))
     return data
 
 
-def write_whole(path: str | os.PathLike[str], content: str | bytes, *, synced: bool = True) -> None:
-    """Write a file whole or not at all: beside its place, and then there in one step; one that was there is replaced.
+_AT_ONCE = getattr(os, "O_NONBLOCK", 0)
+_PART = 1 << 20
 
-    A device or a pipe is written to as it is.
+
+def _read(file: io.FileIO) -> bytes:
+    """Return what a file holds, at most a byte more than may be read."""
+    whole = bytearray()
+    while len(whole) <= LARGEST_BYTES and (part := file.read(min(_PART, LARGEST_BYTES + 1 - len(whole)))):
+        whole += part
+    return bytes(whole)
+
+
+def _piped(file: io.FileIO) -> bytes:
+    """Return what is written into a pipe until its last writer leaves.
+
+    Raises:
+        OSError: if there is none.
+    """
+    whole, until = bytearray(), time.monotonic() + _PATIENCE_S
+    begun = False
+    while len(whole) <= LARGEST_BYTES:
+        part = file.read(_PART)
+        if part:
+            whole += part
+        elif part == b"" and (begun or time.monotonic() > until):
+            break
+        # nothing yet is None: there is a writer
+        begun = begun or part is None or bool(part)
+        if not part:
+            select.select([file], [], [], 0.1)
+            time.sleep(0.0 if begun else 0.02)
+    if not begun:
+        raise OSError(errno.EPIPE, "it is a pipe that nobody writes to")
+    return bytes(whole)
+
+
+def first_bytes(path: str | os.PathLike[str], count: int) -> bytes:
+    """Return how a file begins; nothing of a device or a pipe, whose bytes can be read only once.
+
+    Raises:
+        OSError: if it cannot be read.
+    """
+    if not Path(path).is_file():
+        return b""
+    with Path(path).open("rb") as file:
+        return file.read(count)
+
+
+def check_plain(path: str | os.PathLike[str], *, within: str | os.PathLike[str] | None = None) -> None:
+    """Check that a path is not, and does not lead through, a link, a device or a pipe that lies in a folder.
+
+    Args:
+        path: of a file or a folder, which need not exist.
+        within: the folder below which every part of the path is looked at; None: the last part alone.
+
+    Raises:
+        OSError: that names the part and how to mend it.
+    """
+    place = Path(path)
+    # by its letters, not by what links would make of it
+    parts = place.relative_to(Path(within)).parts if within is not None else place.parts[-1:]
+    if ".." in parts:
+        raise OSError(errno.EINVAL, "leads out of its folder", str(place))
+    for count in reversed(range(len(parts))):
+        part = place.parents[count - 1] if count else place
+        try:
+            mode = part.lstat().st_mode
+        except FileNotFoundError:
+            return
+        if stat.S_ISLNK(mode):
+            raise OSError(
+                errno.ELOOP, "is a link, which is not followed; delete it or choose another folder", str(part)
+            )
+        if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+            what = "is a device or a pipe, not a file; delete it or choose another folder"
+            raise OSError(errno.EINVAL, what, str(part))
+
+
+@contextmanager
+def whole_folder(path: Path) -> Iterator[Path]:
+    """Give a new folder to be filled, which then takes the place of the one at a path, whole or not at all.
+
+    Raises:
+        OSError: if there is a link or a file at the path, or the folder cannot be made.
+    """
+    check_plain(path)
+    fresh = path.with_name(f".{path.name}.{secrets.token_hex(4)}.part")
+    fresh.mkdir()
+    try:
+        yield fresh
+        if path.exists():
+            shutil.rmtree(path)
+        fresh.rename(path)
+    except BaseException:
+        shutil.rmtree(fresh, ignore_errors=True)
+        raise
+
+
+def write_whole(
+    path: str | os.PathLike[str],
+    content: str | bytes,
+    *,
+    synced: bool = True,
+    within: str | os.PathLike[str] | None = None,
+    named_by_user: bool = False,
+) -> None:
+    """Write a file whole or not at all: beside its place, and then there in one step; one that was there is replaced.
 
     Args:
         path: of the file.
         content: bytes, or a text to be encoded as UTF-8; what no encoding has, as in names of files, is escaped.
         synced: whether it must outlast a power cut, too, which takes the disk's time.
+        within: folder below which no part of the path may be a link; None: the file itself must be none.
+        named_by_user: whether the user gave this very path: a link there is followed, a device or a pipe written to.
 
     Raises:
         OSError: naming the file, if it cannot be written; what was there before is still there.
     """
     place = Path(path)
     data = content if isinstance(content, bytes) else content.encode("utf-8", errors="backslashreplace")
-    # through links: the file that is meant is replaced, not the link to it
-    target = Path(os.path.realpath(place))
+    # through links of the user: the file that is meant is replaced, not the link to it
+    target = Path(os.path.realpath(place)) if named_by_user else place
     try:
-        if target.exists() and not target.is_file():
+        if not named_by_user:
+            check_plain(place, within=within)
+        elif target.exists() and not target.is_file():
             target.write_bytes(data)
             return
         fresh = target.with_name(f".{target.name[:100]}.{secrets.token_hex(4)}.part")

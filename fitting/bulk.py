@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from afm_jax.checks import require_float64
+from afm_jax.checks import checked, require_float64
 from afm_jax.strict_json import plain
 from afm_jax.sweeps.axes import Axis
 from afm_jax.sweeps.plan import MESSAGE, Columns, Recorder, Variable, plan_of
@@ -38,6 +38,7 @@ _FITTED, _NOT_VALID, _REFUSED = 0, 1, -1
 _FLAGS = {_REFUSED: "not_possible", _FITTED: "valid", _NOT_VALID: "not_valid"}
 
 
+@checked
 def fit_each(  # noqa: PLR0913
     tables: Sequence[AmplitudeTable | str | os.PathLike[str]],
     model: str = "law",

@@ -24,7 +24,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import detected, height_of_free_deflection
-from afm_jax.checks import require_float64
+from afm_jax.checks import checked, require_float64
 from afm_jax.contact.bent_lever import tapped
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
@@ -39,7 +39,7 @@ from afm_jax.impact.roots import follow_root, harmless_coordinate
 from afm_jax.results import Result, public_result
 from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem, Rows, measurement_of
 from fitting.parameters import CONTACT_NAMES, NUISANCE_NAMES, PARAMETERS, model_parameters
-from fitting.tables.table import AmplitudeTable
+from fitting.tables.table import TableLike, as_table
 
 
 class Branch(NamedTuple):
@@ -610,8 +610,9 @@ class _Judged(NamedTuple):
     touching: Bool[Array, " rows"]
 
 
+@checked
 def amplitude_gradients(
-    table: AmplitudeTable,
+    table: TableLike,
     model: str,
     values: Mapping[str, float],
     *,
@@ -636,6 +637,7 @@ def amplitude_gradients(
         ValueError: if there is no such model, mode or parameter, or one is missing or outside its range.
         RuntimeError: if JAX is not set to 64-bit floats.
     """
+    table = as_table(table)
     require_float64()
     if mode not in ("forward", "reverse"):
         raise ValueError(f'`mode` must be "forward" or "reverse", but is {mode!r}')

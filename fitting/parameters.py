@@ -201,7 +201,7 @@ SHAPES = (
         symbol="f",
     ),
 )
-"""What decides the shape of loss and delay of a model that has both, beside its parameters; each has a prior."""
+"""What decides the shape of loss and delay in the model discrepancy, each with a prior; no law is printed with them."""
 
 CONTACT = tuple(
     Parameter(
@@ -253,13 +253,11 @@ class LawFormula:
     Attributes:
         paper: its parameters, with their values for the paper's contact: what is believed where nothing was measured.
         formula: of rebound speed or delay.
-        shaped: the same with the numbers of `SHAPES`, which a fit with a delay has besides.
         meaning: what it says, in a line.
     """
 
     paper: dict[str, float]
     formula: str
-    shaped: str = ""
     meaning: str
 
 
@@ -275,25 +273,21 @@ LAWS = {
     "viscous": LawFormula(
         paper={"epsilon": 113.6, "viscous_loss": 0.5},
         formula="u_out^2 = u_in^2 - viscous_loss u_in - epsilon",
-        shaped="u_out^2 = u_in^2 - viscous_loss sqrt(u_in^2 + loss_speed_squared_nm2_per_us2) - epsilon",
         meaning="a loss linear in speed with adhesion (epsilon, viscous_loss)",
     ),
     "full": LawFormula(
         paper={"r": 0.9999, "epsilon": 114.0, "viscous_loss": 0.48},
         formula="u_out^2 = r^2 u_in^2 - viscous_loss u_in - epsilon",
-        shaped="u_out^2 = r^2 u_in^2 - viscous_loss sqrt(u_in^2 + loss_speed_squared_nm2_per_us2) - epsilon",
         meaning="a restitution, a loss linear in speed and adhesion (r, epsilon, viscous_loss)",
     ),
 }
 DELAY_LAW = LawFormula(
     paper={"delay_hertz": 0.206, "delay_lead_nm": 5.64, "delay_offset_nm": 0.726},
     formula="tau = delay_hertz u_in^(-1/5) - delay_lead_nm (1/u_out - 1/u_in) - delay_offset_nm/u_in",
-    shaped="tau = delay_hertz u_in^(-1/5) - delay_lead_nm (1/u_out - 1/u_in) - delay_offset_nm/u_in "
-    "+ delay_square_nm2_per_us (1/u_out^2 - 1/u_in^2)",
     meaning="the collision delay, which amplitudes near resonance need",
 )
 DELAY_NAMES = tuple(DELAY_LAW.paper)
-LOSS_SHAPE, DELAY_SHAPE = SHAPE_NAMES = tuple(parameter.name for parameter in SHAPES)
+LOSS_SHAPE, DELAY_SHAPE = tuple(parameter.name for parameter in SHAPES)
 NUISANCE_NAMES = tuple(parameter.name for parameter in NUISANCES)
 CONTACT_NAMES = tuple(parameter.name for parameter in CONTACT)
 CONTACT_DEFAULT = ("relative_humidity", "adhesion_energy_j_per_m2", "viscosity_pa_s", "modulus_gpa")

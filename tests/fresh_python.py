@@ -11,9 +11,13 @@ def python(code: str, **environment: str | None) -> str:
     return outputs(code, environment)[0]
 
 
-def outputs(code: str, environment: Mapping[str, str | None], codes: tuple[int, ...] = (0,)) -> tuple[str, str]:
-    """Return what a program of its own writes to standard output and to standard error."""
+def outputs(
+    code: str, environment: Mapping[str, str | None], codes: tuple[int, ...] = (0,), limit_s: float | None = None
+) -> tuple[str, str]:
+    """Return what a program of its own writes to standard output and to standard error, in time."""
     variables = {name: value for name, value in {**os.environ, **environment}.items() if value is not None}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, env=variables)
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, env=variables, timeout=limit_s
+    )
     assert done.returncode in codes, done.stderr
     return done.stdout.strip(), done.stderr

@@ -167,7 +167,7 @@ def test_overview_draws_a_panel_a_problem(tmp_path: Path, monkeypatch: pytest.Mo
     ("arguments", "line"),
     [
         (["accuracy", "speed"], "there is no accuracy study of `speed`; choose: map, collide"),
-        (["accuracy", "--wanted-error-us", "0"], "0.0 is not in the range"),
+        (["accuracy", "--wanted-error-us", "0"], "must be a positive number, but is 0"),
     ],
 )
 def test_wrong_calls_are_one_line(arguments: list[str], line: str):

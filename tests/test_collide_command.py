@@ -221,7 +221,7 @@ def test_long_lists_are_cut_in_the_text_only():
         (["--no-jkr"], "--no-jkr is not possible: the JKR contact is the solid junction itself"),
         (["--no-viscous", "--viscosity-pa-s", "1"], "--viscosity-pa-s changes nothing without the effect viscous"),
         (["--relative-humidity", "1.2"], "`--relative-humidity` must be between 0 and 1, but is 1.2"),
-        (["--relative-humidity", "wet"], "'wet' is not a valid float"),
+        (["--relative-humidity", "wet"], "'--relative-humidity': must be a finite number, but is wet"),
         (["--mass-ng", "0"], "`--mass-ng` must be positive, but is 0"),
         (["--adhesion-energy-j-per-m2", "0.05"], "the contact has no junction: the bridge pulls harder"),
         (["--accuracy", "1e-15"], "`accuracy` must be at least 1e-11"),

@@ -17,7 +17,6 @@ from click.testing import CliRunner, Result
 from scipy.optimize import brentq
 
 from afm_jax import Cantilever, CollisionDelay, ForceDrive, ImpactLaw, Platform, Scene, save_scene, single_impact_orbits
-from afm_jax.cli.fitted_law import with_fitted_law
 from afm_jax.cli.main import main
 from afm_jax.dynamics import closed_loops
 from afm_jax.dynamics.bands import UncertainParameters, special_errors
@@ -354,6 +353,7 @@ def fit_file(path: Path, **changes: object) -> str:
     )
     payload = {
         "format": "afm-jax fit",
+        "format_version": 2,
         "model": "law",
         "valid": True,
         "parameters": {name: {"value": one, "standard_error": error} for name, (one, error) in errors.items()},
@@ -419,18 +419,6 @@ def test_charts_and_exponents_take_the_law_of_a_fit(tmp_path: Path):
     assert told.exit_code == 0, told.stderr
     ends = json.loads(told.stdout)["exponent_per_impact_interval95"]
     assert ends[0] < ends[1]
-
-
-@pytest.mark.slow
-def test_a_scene_takes_the_plain_law_of_a_fit(tmp_path: Path):
-    plain = {"values": {"r": 0.94, "epsilon": 70.0}, "covariance": [[1e-6, 1e-4], [1e-4, 4.0]]}
-    made, known = with_fitted_law(scene(), Path(fit_file(tmp_path / "fit.json", plain_law=plain)))
-    assert isinstance(made.interaction, ImpactLaw)
-    assert (float(made.interaction.r), float(made.interaction.epsilon)) == (0.94, 70.0)
-    assert known is not None
-    assert known.paths == ("interaction.r", "interaction.epsilon")
-    assert known.values.tolist() == [0.94, 70.0]
-    assert known.covariance.tolist() == plain["covariance"]
 
 
 def test_where_axes_set_every_parameter_of_a_fit_nothing_is_drawn():

@@ -206,6 +206,7 @@ def test_a_saved_fit_whose_correlations_contradict_each_other_is_refused(correla
     columns = {name: [1.0] for name in ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")}
     payload = {
         "format": "afm-jax fit",
+        "format_version": 2,
         "model": "law",
         "valid": True,
         "parameters": {"r": parameter, "epsilon": parameter | {"value": 60.0}},

@@ -163,7 +163,6 @@ def test_scaled_errors_are_said(tmp_path):
     ("arguments", "said"),
     [
         (["no.csv"], "there is no such file"),
-        (["--example", "--speeds", "200:30"], "write low:high"),
         ([], "give a table to fit"),
         (["--example", str(EXAMPLE)], "give a table to fit"),
         (["--example", "--model", "hertz"], "is not one of 'restitution', 'law', 'viscous'"),

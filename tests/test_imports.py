@@ -172,13 +172,14 @@ def crossed(start: tuple[str, str]) -> set[str]:
 @pytest.mark.parametrize(
     ("module", "name", "most"),
     [
-        ("afm_jax.motion.simulate", "simulate", 32),
-        ("fitting.fits.fit", "fit", 51),
+        ("afm_jax.motion.simulate", "simulate", 36),
+        ("fitting.fits.fit", "fit", 52),
         ("afm_jax.contact.collide", "collide", 18),
-        ("afm_jax.effects.study", "study_effects", 50),
+        ("afm_jax.effects.study", "study_effects", 52),
     ],
 )
 def test_a_call_crosses_few_files(module: str, name: str, most: int):
+    # the four of a scene are named because its path may be given instead
     # five of them write results into files; those of a contact are the most of the others
     files = crossed((module, name))
     assert {module, "afm_jax.results"} <= files

@@ -144,11 +144,15 @@ def test_a_fitted_law_is_drawn_over_the_rows(tmp_path):
     path = tmp_path / "fit.json"
     pictures = []
     for drawn in ((), ("--law", path)):
-        path.write_text(json.dumps({"format": "afm-jax fit", "valid": True, "model": "law+delay", "law": law}))
+        path.write_text(
+            json.dumps({"format": "afm-jax fit", "format_version": 2, "valid": True, "model": "law+delay", "law": law})
+        )
         assert run(on_resonance(tmp_path / "table.csv"), "--out", tmp_path, *drawn).exit_code == 0
         pictures.append(imread(tmp_path / "invert.png"))
     assert np.sum(np.any(pictures[0] != pictures[1], axis=2)) > 500
-    path.write_text(json.dumps({"format": "afm-jax fit", "valid": False, "model": "law+delay", "law": law}))
+    path.write_text(
+        json.dumps({"format": "afm-jax fit", "format_version": 2, "valid": False, "model": "law+delay", "law": law})
+    )
     refused = run(tmp_path / "table.csv", "--law", path)
     assert refused.exit_code == 2
     assert "the fit is not valid" in refused.stderr

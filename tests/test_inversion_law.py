@@ -125,7 +125,14 @@ def beside(path, *, speeds: tuple[float, float], epsilon, drives=None):
     }
     columns = ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")
     fitted_to = {"source": "other.csv"} | {name: getattr(table, name).tolist() for name in columns} | (drives or {})
-    fit = {"format": "afm-jax fit", "valid": True, "model": "viscous", "law": law, "input": fitted_to}
+    fit = {
+        "format": "afm-jax fit",
+        "format_version": 2,
+        "valid": True,
+        "model": "viscous",
+        "law": law,
+        "input": fitted_to,
+    }
     path.write_text(json.dumps(fit), encoding="utf-8")
     reading = read_on_resonance(table, law=None, reference="none")
     return compare_law(read_fitted_law(path), table, rows, reading)

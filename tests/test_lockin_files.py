@@ -1,5 +1,6 @@
 """Traces from files: CSV and HDF5, settings in them and beside them, and what is wrong with them."""
 
+import contextlib
 import sys
 from pathlib import Path
 
@@ -107,6 +108,90 @@ def test_faults_of_hdf5_files(tmp_path: Path, group: str | None, said: str):
     damaged.write_bytes(path.read_bytes()[:100])
     with pytest.raises(TableError, match="cannot be read as HDF5"):
         read_trace(damaged)
+
+
+def huge(file, _) -> None:
+    file.create_dataset("deflection_nm", shape=(400_000_000,), dtype="f8", chunks=(1 << 20,))
+
+
+def packed(file, _) -> None:
+    file.create_dataset("deflection_nm", shape=(100_000_000,), dtype="f8", chunks=(1 << 20,), compression="gzip")
+
+
+def coarse(file, _) -> None:
+    file.create_dataset("deflection_nm", shape=(10,), maxshape=(None,), dtype="f8", chunks=(1 << 28,))
+
+
+def looped(file, h5py) -> None:
+    file["deflection_nm"] = h5py.SoftLink("/other")
+    file["other"] = h5py.SoftLink("/deflection_nm")
+
+
+def linked(file, h5py) -> None:
+    file["deflection_nm"] = h5py.ExternalLink("mine.h5", "/deflection_nm")
+
+
+def elsewhere(file, _) -> None:
+    place = str(Path(file.filename).parent / "letter")
+    file.create_dataset("deflection_nm", shape=(300,), dtype="f8", external=[(place, 0, 2400)])
+
+
+def virtual(file, h5py) -> None:
+    layout = h5py.VirtualLayout(shape=(300,), dtype="f8")
+    layout[:] = h5py.VirtualSource("mine.h5", "deflection_nm", shape=(300,))
+    file.create_virtual_dataset("deflection_nm", layout)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (huge, "400,000,000 numbers are announced in a file of"),
+        (packed, "100,000,000 numbers are announced in a file of"),
+        (coarse, "268,435,456 numbers are announced in a file of"),
+        (looped, "column 'deflection_nm': is a link to another place, which is not followed"),
+        (linked, "column 'deflection_nm': is a link to another file, which is not followed"),
+        (elsewhere, "its numbers are in other files, which are not read"),
+        (virtual, "its numbers are in other files, which are not read"),
+    ],
+)
+def test_an_hdf5_file_says_no_more_than_it_holds(tmp_path: Path, make, said: str):
+    h5py = pytest.importorskip("h5py")
+    (tmp_path / "letter").write_bytes(np.arange(300.0).tobytes())
+    with h5py.File(tmp_path / "mine.h5", "w") as file:
+        file["deflection_nm"] = np.zeros(300)
+    path = tmp_path / "trace.h5"
+    with h5py.File(path, "w") as file:
+        make(file, h5py)
+    with pytest.raises(TableError) as caught:
+        read_trace(path, drive_frequency_khz=180.0, sampling_rate_mhz=10.0)
+    assert said in str(caught.value)
+    with h5py.File(path, "w") as file:
+        # links of groups are none that are followed either, and groups may hold each other
+        file["scan/deflection_nm"] = np.zeros(300)
+        file["scan/back"] = file["/"]
+        file["alias"] = h5py.SoftLink("/scan")
+    with pytest.raises(TableError, match="column 'alias': is a link to another place"):
+        read_trace(path, group="alias", drive_frequency_khz=180.0, sampling_rate_mhz=10.0)
+    assert read_trace(path, group="scan/back/scan", drive_frequency_khz=180.0, sampling_rate_mhz=10.0).samples == 300
+
+
+def test_damaged_hdf5_files_end_in_one_line(tmp_path: Path):
+    h5py = pytest.importorskip("h5py")
+    path, damaged = tmp_path / "trace.h5", tmp_path / "damaged.h5"
+    with h5py.File(path, "w") as file:
+        file.attrs["drive_frequency_khz"] = 181.8
+        time, height = samples(60, 2.0)
+        file["time_us"] = time
+        file.create_dataset("deflection_nm", data=height, compression="gzip")
+    whole = path.read_bytes()
+    chance = np.random.default_rng(5)
+    for _ in range(300):
+        data = bytearray(whole)
+        for place in chance.integers(8, len(data), chance.integers(1, 4)):
+            data[place] = chance.integers(256)
+        damaged.write_bytes(data)
+        with contextlib.suppress(TableError):
+            read_trace(damaged)
 
 
 def test_groups_inside_groups_are_named(tmp_path: Path):

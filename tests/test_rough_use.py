@@ -1,24 +1,29 @@
 """What hard use broke once: full disks, closed streams, hostile names, interrupts, numbers out of all proportion."""
 
+import contextlib
 import os
 import re
 import signal
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
+import click
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
 from afm_jax.apparatus.platform import Platform
 from afm_jax.cli.main import main
-from afm_jax.whole_files import write_whole
+from afm_jax.sweeps.store import STORE
+from afm_jax.whole_files import read_whole, write_whole
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import read_table
 from tests.fuzz import fuzz_files, fuzz_orbits
 from tests.test_imports import LIBRARY, ROOT
+from tests.writing_commands import CALLS, prepare, unchecked
 
 LAW = "[cantilever]\nfrequency_khz = 90\nquality_factor = 40\n[platform]\namplitude_nm = {}\nreduced_frequency = {}\n"
 LAW += "[interaction]\nmodel = 'law'\nr = 0.95\nepsilon = 60\n"
@@ -44,13 +49,16 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path, monkeypatch):
     assert [file.name for file in tmp_path.iterdir()] == ["fit.txt"]
 
 
-def test_new_files_have_the_modes_of_others_and_links_are_followed(tmp_path):
+def test_new_files_have_the_modes_of_others_and_only_links_named_by_the_user_are_followed(tmp_path):
     path, link, other = tmp_path / "a", tmp_path / "link", tmp_path / "other"
     write_whole(path, b"a")
     other.touch()
     assert path.stat().st_mode == other.stat().st_mode
     link.symlink_to(path)
-    write_whole(link, b"b")
+    with pytest.raises(OSError, match=r"is a link, which is not followed; delete it or choose another folder.*/link"):
+        write_whole(link, b"c")
+    assert path.read_bytes() == b"a"
+    write_whole(link, b"b", named_by_user=True)
     assert link.is_symlink()
     assert path.read_bytes() == b"b"
 
@@ -58,7 +66,7 @@ def test_new_files_have_the_modes_of_others_and_links_are_followed(tmp_path):
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
 def test_a_full_device_is_named():
     with pytest.raises(OSError, match="/dev/full"):
-        write_whole("/dev/full", "x")
+        write_whole("/dev/full", "x", named_by_user=True)
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no /dev/full")
@@ -72,10 +80,133 @@ def test_a_full_standard_output_is_named(tmp_path):
 
 
 def test_nothing_writes_files_another_way():
-    other = re.compile(r"\.write_text\(|\.write_bytes\(|\.savefig\((?!buffer)|open\([^)]*[\"']w")
-    found = {str(path) for path in LIBRARY if other.search((ROOT / path).read_text(encoding="utf-8"))}
+    other = re.compile(r"\.write_text\(|\.write_bytes\(|\.savefig\((?!buffer)|open\([^)]*[\"']w|\.to_(csv|zarr|json)\(")
+    # into new folders that `whole_folder` then puts in their place, and into memory
+    new = re.compile(r"open_group\((str\((fresh|path)\)|MemoryStore)")
+    found = {str(path) for path in LIBRARY if other.search(new.sub("", (ROOT / path).read_text(encoding="utf-8")))}
     # the writer itself, and a standard error that is closed
     assert found == {"afm_jax/whole_files.py", "afm_jax/cli/main.py"}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "call", ["calibrate", "chart --zarr", "figures", "lockin", "orbits", "read", "simulate", "sweep"]
+)
+def test_files_of_commands_are_checked_for_links_first(tmp_path, call):
+    prepare(tmp_path)
+    code, said, written, loose = unchecked(call, tmp_path)
+    assert code in (0, 3), said
+    assert written
+    assert loose == []
+    # a link in place of each file, and of each folder that holds some; those in a sweep's have tests of their own
+    for place in {name.partition("/")[0] for name in written} - {"done", STORE}:
+        whole = tmp_path / f"out of {call}" / place
+        kept = whole.with_name("kept")
+        whole.rename(kept)
+        whole.symlink_to(tmp_path / "letter")
+        code, said, *_ = unchecked(call, tmp_path)
+        assert (code, "is a link, which is not followed" in said, (tmp_path / "letter").exists()) == (2, True, False)
+        whole.unlink()
+        kept.rename(whole)
+
+
+def test_a_table_named_by_the_user_may_be_a_link_but_no_numbered_one(tmp_path):
+    (tmp_path / "link.csv").symlink_to(tmp_path / "meant.csv")
+    file = CALLS["read"][0]
+    assert run("read", *CALLS["read"], "--out", tmp_path / "link.csv").exit_code == 0, file
+    assert (tmp_path / "link.csv").is_symlink()
+    assert (tmp_path / "meant.csv").read_text(encoding="utf-8").startswith("#")
+    (tmp_path / "tables").mkdir()
+    (tmp_path / "tables" / "curve.csv").symlink_to(tmp_path / "other.csv")
+    refused = run("read", *CALLS["read"], "--out", tmp_path / "tables")
+    assert (refused.exit_code, (tmp_path / "other.csv").exists()) == (2, False)
+    assert "curve.csv: cannot be written (is a link, which is not followed" in refused.stderr
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no pipes with names")
+def test_a_pipe_is_read_if_somebody_writes_and_named_if_nobody_does(tmp_path):
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for command in (
+        ["orbits", pipe, "--order", "1"],
+        ["fit", pipe],
+        ["lockin", pipe],
+        ["tapping", pipe],
+        ["read", pipe],
+    ):
+        refused = run(*command)
+        assert refused.exit_code == 2
+        assert "it is a pipe that nobody writes to" in refused.stderr
+
+    def write() -> None:
+        with pipe.open("wb") as file:
+            for part in (b"a" * 300_000, b"b", b"c" * 100_000):
+                file.write(part)
+                file.flush()
+                time.sleep(0.2)
+
+    writer = threading.Thread(target=write)
+    writer.start()
+    assert read_whole(pipe) == b"a" * 300_000 + b"b" + b"c" * 100_000
+    writer.join()
+
+
+def test_no_option_takes_numbers_that_are_none():
+    """Every option of every command: what compares with no limit, and what has none."""
+    seen = 0
+    for name in main.list_commands(click.Context(main)):
+        command = main.get_command(click.Context(main), name)
+        assert command is not None
+        for option in (part for part in command.params if isinstance(part, click.Option)):
+            for bad in (
+                "nan",
+                "inf",
+                "-inf",
+                "1e400",
+                "1:nan:2",
+                "0:inf:1",
+                "r=nan",
+                "40 +- nan",
+                "r=1+-inf",
+                "1:1e400",
+            ):
+                with contextlib.suppress(click.BadParameter):
+                    value = option.type.convert(bad, option, click.Context(command))
+                    numbers = [part for part in np.ravel(np.array(value, dtype=object)) if isinstance(part, float)]
+                    assert np.all(np.isfinite(numbers)), (name, option.opts, bad)
+                    seen += 1
+    assert seen > 100
+
+
+def test_no_message_quotes_a_name_of_any_length(tmp_path):
+    name = "k" * 200_000
+    path = tmp_path / "scene.toml"
+    for text in (f"{name} = 1\n", f"[{name}]\na = 1\n", f"[{name} b]\n"):
+        path.write_text(LAW.format(4, 1.01) + text, encoding="utf-8")
+        said = run("orbits", path, "--order", "1")
+        assert (said.exit_code, len(said.stderr) < 1000) == (2, True)
+    path.write_text(LAW.format(4, 1.01), encoding="utf-8")
+    for call in (("bifurcation", path, "--parameter", f"{name}=1:2:3"), (name,), ("fit", name), ("fit", f"--{name}")):
+        said = run(*call)
+        assert (said.exit_code, len(said.stderr) < 1000) == (2, True)
+
+
+def test_drives_that_are_too_fast_to_follow_and_frequencies_that_are_none_are_refused(tmp_path):
+    path = tmp_path / "scene.toml"
+    path.write_text(LAW.format(4, "1e9"), encoding="utf-8")
+    for command in (["simulate"], ["basins"], ["lyapunov"], ["orbits", "--order", "1"]):
+        said = run(*command, path)
+        assert said.exit_code == 2
+        assert "must be at most 10000 times the cantilever's free frequency, but is 2e+09 times as high" in said.stderr
+    path.write_text(LAW.format(4, 1.01), encoding="utf-8")
+    said = run("bifurcation", path, "--parameter", "platform.reduced_frequency=1:1e9:3")
+    assert (said.exit_code, "10000 times the cantilever's" in said.stderr) == (2, True)
+    path.write_text(LAW.format(4, 1000), encoding="utf-8")
+    said = run("simulate", path, "--duration-us", 1e5)
+    assert "the drive would oscillate 1.8e+07 times, more than the 1e+07 that can be followed" in said.stderr
+    path.write_text(LAW.format(4, 1.01).replace("= 90", "= 1e-320"), encoding="utf-8")
+    said = run("simulate", path)
+    assert (said.exit_code, "must be at least 1e-30, so that its inverse stays a number" in said.stderr) == (2, True)
 
 
 def test_names_cannot_command_the_terminal(tmp_path):
@@ -168,7 +299,8 @@ def test_an_interrupt_that_is_swallowed_ends_the_program_all_the_same():
 
 WRITING = """
 import sys
-from afm_jax.whole_files import write_whole
+from afm_jax.sweeps.store import STORE
+from afm_jax.whole_files import read_whole, write_whole
 print("ready", flush=True)
 for number in range(10**9):
     write_whole(sys.argv[1], f"{number % 10}" * 3_000_000)

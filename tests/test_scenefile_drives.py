@@ -94,10 +94,12 @@ def test_a_base_comes_before_a_force(path: Path):
     assert float(loaded(path, CANTILEVER, RESTING, FORCE, BASE, NONE).platform.frequency_khz) == 88.0
 
 
-positive = st.floats(min_value=1e-300, max_value=1e30)
+positive = st.floats(min_value=1e-30, max_value=1e30)
+# no drive is more than 1e4 times as fast as the tip
+frequencies = st.floats(min_value=1e-3, max_value=10.0)
 finite = st.floats(min_value=-1e30, max_value=1e30)
 not_negative = st.floats(min_value=0.0, max_value=1e30)
-tones = st.none() | st.builds(Tone, not_negative, positive, finite)
+tones = st.none() | st.builds(Tone, not_negative, frequencies, finite)
 
 
 def different(drive: Any) -> bool:
@@ -107,9 +109,9 @@ def different(drive: Any) -> bool:
 
 
 @given(
-    platform=st.builds(Platform, not_negative, positive, finite, finite, tones),
-    base=st.none() | st.builds(BaseDrive, not_negative, positive, finite, tones),
-    force=st.none() | st.builds(ForceDrive, not_negative, positive, finite, tones),
+    platform=st.builds(Platform, not_negative, frequencies, finite, finite, tones),
+    base=st.none() | st.builds(BaseDrive, not_negative, frequencies, finite, tones),
+    force=st.none() | st.builds(ForceDrive, not_negative, frequencies, finite, tones),
     interaction=st.sampled_from([None, ImpactLaw(0.7, 1.1)]),
 )
 def test_loop_is_exact(platform: Any, base: Any, force: Any, interaction: Any, tmp_path_factory: Any):

@@ -149,7 +149,7 @@ def test_a_preset_has_its_start():
     ("arguments", "message"),
     [
         (("--duration-us", "-1"), "--duration-us must be a positive number, but is -1"),
-        (("--duration-us", "nan"), "--duration-us must be a positive number, but is nan"),
+        (("--duration-us", "nan"), "'--duration-us': must be a finite number, but is nan"),
         (("--periods", "0"), "--periods must be a positive number, but is 0"),
         (("--periods", "3", "--duration-us", "3"), "say the same: give one of them"),
         (("--samples", "uniform"), "--samples writes a trace: say into which folder by --out DIR"),

@@ -3,6 +3,8 @@
 import errno
 import json
 import multiprocessing
+import os
+import shutil
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -179,6 +181,72 @@ def test_what_a_killed_sweep_left_unfinished_is_cleared(tmp_path: Path):
     (tmp_path / "done" / ".3.json.abcd.part").touch()
     run_plan(plan(), tmp_path)
     assert contents(tmp_path) == before
+
+
+LINKED = ["done", "done/0.json", "done/3.json", "lock", STORE, f"{STORE}/sum_nm", f"{STORE}/sum_nm/c/3/0", f"{STORE}/x"]
+LINKED += [f"{STORE}/zarr.json", f"{STORE}/x/c/0", f".{STORE}.part", f".{STORE}.0a1b2c3d.part"]
+
+
+@pytest.mark.parametrize("place", LINKED)
+@pytest.mark.parametrize("begun", [True, False])
+def test_a_folder_with_links_is_refused_and_nothing_outside_it_changes(tmp_path: Path, place: str, *, begun: bool):
+    out, mine = tmp_path / "out", tmp_path / "mine"
+    mine.mkdir()
+    for name in ("letter", "0.json", "0", "zarr.json"):
+        (mine / name).write_text("mine")
+    out.mkdir()
+    if begun:
+        run_plan(plan(), out)
+        (out / "done" / "3.json").unlink()
+    link = out / place
+    if link.is_dir():
+        shutil.rmtree(link)
+    link.unlink(missing_ok=True)
+    link.parent.mkdir(parents=True, exist_ok=True)
+    is_file = place.endswith(("json", "0", "lock"))
+    link.symlink_to(mine / "letter" if is_file else mine, target_is_directory=not is_file)
+    with pytest.raises(
+        OSError, match="is a link, which is not followed; delete it or choose another folder"
+    ) as refused:
+        run_plan(plan(), out)
+    assert refused.value.filename == str(link)
+    assert {path.name: path.read_text() for path in mine.iterdir()} == dict.fromkeys(
+        ["letter", "0.json", "0", "zarr.json"], "mine"
+    )
+
+
+def test_other_files_by_another_name_and_pipes_are_refused(tmp_path: Path):
+    (tmp_path / "letter").write_text("mine")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "lock").hardlink_to(tmp_path / "letter")
+    with pytest.raises(OSError, match=r"is another file, too .a hard link.; delete it"):
+        run_plan(plan(), tmp_path / "out")
+    assert (tmp_path / "letter").read_text() == "mine"
+    (tmp_path / "out" / "lock").unlink()
+    run_plan(plan(), tmp_path / "out")
+    for name in ("lock", "done/5.json", f"{STORE}/sum_nm/c/3/0"):
+        place = tmp_path / "out" / name
+        before = place.read_bytes()
+        place.unlink()
+        os.mkfifo(place)
+        with pytest.raises(OSError, match="is a device or a pipe, not a file; delete it") as refused:
+            run_plan(plan(), tmp_path / "out")
+        assert refused.value.filename == str(place)
+        place.unlink()
+        place.write_bytes(before)
+
+
+@pytest.mark.parametrize("name", ["0.json", "99.json", "01.json", "-1.json", "mine.json", "letter"])
+def test_what_is_no_mark_of_a_chunk_is_named(tmp_path: Path, name: str):
+    run_plan(plan(), tmp_path)
+    place = tmp_path / "done" / name
+    place.unlink(missing_ok=True)
+    if name == "0.json":
+        place.mkdir()
+    else:
+        place.write_text("{}")
+    with pytest.raises(ValueError, match=f"done/{name}: is no mark of a chunk of this sweep; delete it"):
+        run_plan(plan(), tmp_path)
 
 
 def test_the_plan_of_a_billion_points_is_quick():

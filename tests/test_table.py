@@ -159,6 +159,15 @@ def test_what_is_known_of_the_instrument_is_kept(tmp_path: Path):
     assert table.remarks == ()
 
 
+def test_rows_in_order_of_time_are_so_only_where_the_table_says_it(tmp_path: Path):
+    assert not read_table(write(tmp_path, TEXT)).rows_in_order_of_time
+    table = read_table(write(tmp_path, "# rows = in order of time\n" + TEXT))
+    assert table.rows_in_order_of_time
+    assert table.remarks == ()
+    with pytest.raises(TableError, match="rows must be 'in order of time', but is 'in order of height'"):
+        read_table(write(tmp_path, "# rows = in order of height\n" + TEXT))
+
+
 def test_replaced_columns_may_have_another_length(tmp_path: Path):
     read = read_table(write(tmp_path, "# free_frequency_khz = 90\n" + FEW))
     names = ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")
@@ -225,6 +234,7 @@ def table_fields(draw: st.DrawFn) -> dict[str, Any]:
             )
         ),
         "remarks": tuple(draw(st.lists(REMARKS, max_size=3))),
+        "rows_in_order_of_time": draw(st.booleans()),
     }
 
 

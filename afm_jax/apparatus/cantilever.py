@@ -50,7 +50,7 @@ class Cantilever(eqx.Module):
 
     def __check_init__(self):
         check_parameter("frequency_khz", self.frequency_khz, "positive")
-        check_parameter("quality_factor", self.quality_factor, "above 0.5")
+        check_parameter("quality_factor", self.quality_factor, "above 0.5", optional=True)
         check_parameter("mass_ng", self.mass_ng, "positive")
 
     @property

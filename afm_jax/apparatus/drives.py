@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.apparatus.trigonometry import sine_cosine
-from afm_jax.checks import as_argument, as_parameter, check_parameter, readable
+from afm_jax.checks import as_argument, as_parameter, check_kind, check_parameter, readable
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
 
@@ -125,6 +125,7 @@ def _check(drive: BaseDrive | ForceDrive, amplitude: str) -> None:
     check_parameter(amplitude, getattr(drive, amplitude), "not negative")
     check_parameter("frequency_khz", drive.frequency_khz, "positive")
     check_parameter("phase_deg", drive.phase_deg, "finite")
+    check_kind("second", drive.second, Tone | None)
 
 
 def _tones(drive: BaseDrive | ForceDrive, amplitude: Float[Array, "..."]) -> tuple[Tone, ...]:

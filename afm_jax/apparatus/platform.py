@@ -6,7 +6,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.apparatus.drives import Tone
 from afm_jax.apparatus.trigonometry import sine_cosine
-from afm_jax.checks import as_argument, as_parameter, check_parameter, readable
+from afm_jax.checks import as_argument, as_parameter, check_kind, check_parameter, readable
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
 
@@ -37,6 +37,7 @@ class Platform(eqx.Module):
         check_parameter("frequency_khz", self.frequency_khz, "positive")
         check_parameter("offset_nm", self.offset_nm, "finite")
         check_parameter("offset_rate_nm_per_us", self.offset_rate_nm_per_us, "finite")
+        check_kind("second", self.second, Tone | None)
 
     @property
     def angular_frequency(self) -> Float[Array, "..."]:

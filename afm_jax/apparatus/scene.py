@@ -4,14 +4,17 @@ The period that a scene is driven with, and whether there is only one.
 """
 
 import math
+import os
+from importlib import import_module
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import numpy as np
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.drives import BaseDrive, ForceDrive
 from afm_jax.apparatus.platform import Platform
-from afm_jax.checks import readable
+from afm_jax.checks import check_kind, in_a_word, is_traced, readable
 
 
 class Scene(eqx.Module):
@@ -33,6 +36,62 @@ class Scene(eqx.Module):
     force: ForceDrive | None = None
 
     __repr__ = readable
+
+    def __check_init__(self):
+        kinds = {"cantilever": Cantilever, "platform": Platform, "base": BaseDrive, "force": ForceDrive}
+        for name, kind in kinds.items():
+            part = getattr(self, name)
+            if not isinstance(part, kind) and not (part is None and name in ("base", "force")):
+                article = "" if name in ("cantilever", "platform") else " or None"
+                raise TypeError(f"the scene's `{name}` must be a {kind.__name__}{article}, but is {in_a_word(part)}")
+        if self.interaction is not None and (
+            not isinstance(self.interaction, eqx.Module) or isinstance(self.interaction, tuple(kinds.values()))
+        ):
+            what = in_a_word(self.interaction)
+            raise TypeError(f"the scene's `interaction` must be an ImpactLaw, a Contact or None, but is {what}")
+        _check_frequencies(self)
+
+
+SceneLike = Scene | str | os.PathLike[str]
+"""A scene, the path of a scene file, or the name of one of the paper's scenes."""
+
+
+def as_scene(given: SceneLike) -> Scene:
+    """Return a scene that was given, or is read from its file, or has its name.
+
+    Raises:
+        TypeError: if it is something else.
+        ValueError: if there is no such file or name, or the file is no valid scene file.
+    """
+    if isinstance(given, Scene):
+        return given
+    check_kind("scene", given, SceneLike)
+    # what reads files is built on scenes
+    return import_module("afm_jax.scenefile.presets").scene_and_start(os.fspath(given))[0]
+
+
+LARGEST_FREQUENCY_RATIO = 1e4
+"""Of a drive to the cantilever's free frequency: a search for impacts goes through every period of the drive."""
+
+
+def _check_frequencies(scene: Scene) -> None:
+    """Check that nothing drives a scene so fast that the tip cannot be followed.
+
+    Raises:
+        ValueError: if something does; says what.
+    """
+    free = scene.cantilever.frequency_khz
+    for name in ("platform", "base", "force"):
+        part = getattr(scene, name)
+        for place, tone in ((name, part), (f"{name}.second", getattr(part, "second", None))):
+            if tone is None or is_traced(free) or is_traced(tone.frequency_khz):
+                continue
+            ratio = np.max(np.asarray(tone.frequency_khz) / np.asarray(free), initial=0.0)
+            if ratio > LARGEST_FREQUENCY_RATIO:
+                raise ValueError(
+                    f"`{place}.frequency_khz` must be at most {LARGEST_FREQUENCY_RATIO:g} times the cantilever's free "
+                    f"frequency, but is {ratio:g} times as high"
+                )
 
 
 def require_sample_drive(scene: Scene, *, second_frequency: bool = False) -> None:

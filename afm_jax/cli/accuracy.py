@@ -8,7 +8,7 @@ import click
 
 from afm_jax.cli.accuracy_scene import scene_study, write_study
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import PRESET_NAMES, SceneName
+from afm_jax.cli.values import PRESET_NAMES, Finite, SceneName
 from afm_jax.words import known
 
 if TYPE_CHECKING:
@@ -130,14 +130,14 @@ WANTED = [1e-3, 1e-6, 1e-9, 1e-11]
 @click.argument("study", required=False, metavar="[map|collide|SCENE.toml|PRESET]", type=SceneName("map", "collide"))
 @click.option(
     "--wanted-error-us",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=Finite(positive=True),
     default=1e-9,
     show_default=True,
     help="Error of an impact time for which to find the cheapest setting.",
 )
 @click.option(
     "--accuracy",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=Finite(positive=True),
     default=1e-9,
     show_default=True,
     help="For collide: relative error of the rebound speed (a tenth of the delay's in us) to find the cheapest for.",

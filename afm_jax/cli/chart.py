@@ -8,6 +8,7 @@ from afm_jax.cli.fitted_law import with_fitted_law, with_law_options
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import SceneName, ranges_of, scene_and_start, with_picture
+from afm_jax.whole_files import whole_folder
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -149,14 +150,15 @@ def _write(
         import zarr as store  # noqa: PLC0415
 
         assert session.out is not None  # asked before  # noqa: S101
-        group = store.open_group(str(session.out / "chart.zarr"), mode="w")
         axes = {"order": np.arange(1, chart.orders + 1), "y": chart.y_values, "x": chart.x_values}
-        for name, part in parts.items():
-            whole = part.reshape([len(values) for values in axes.values()])
-            group.create_array(name, data=whole, dimension_names=tuple(axes))
-        for name, values in axes.items():
-            group.create_array(name, data=values, dimension_names=(name,))
-        group.attrs["x"], group.attrs["y"] = across.path, up.path
+        with whole_folder(session.out / "chart.zarr") as fresh:
+            group = store.open_group(str(fresh), mode="w")
+            for name, part in parts.items():
+                whole = part.reshape([len(values) for values in axes.values()])
+                group.create_array(name, data=whole, dimension_names=tuple(axes))
+            for name, values in axes.items():
+                group.create_array(name, data=values, dimension_names=(name,))
+            group.attrs["x"], group.attrs["y"] = across.path, up.path
         session.note(f"wrote {session.out / 'chart.zarr'}")
         return
     x, y = chart.points()

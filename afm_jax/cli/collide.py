@@ -7,7 +7,7 @@ import click
 from afm_jax.cli.contact_options import ContactOptions, chosen_contact, with_contact_options
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session, write_json
-from afm_jax.cli.values import Numbers
+from afm_jax.cli.values import Finite, Numbers
 from afm_jax.words import known
 
 if TYPE_CHECKING:
@@ -42,7 +42,7 @@ _SHOWN = 40
 )
 @click.option(
     "--accuracy",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=Finite(positive=True),
     default=1e-9,
     show_default=True,
     help="Wanted relative accuracy of the rebound speed.",

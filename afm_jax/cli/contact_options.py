@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from afm_jax.cli.values import SceneName, option_of, scene_and_start
+from afm_jax.cli.values import Finite, SceneName, option_of, scene_and_start
 from afm_jax.contact.parameters import (
     CONTACT_PARAMETERS,
     CONTACT_RANGES,
@@ -53,11 +53,11 @@ def with_contact_options(function: Callable[..., Any]) -> Callable[..., Any]:
         command = click.option(f"--no-{name}", is_flag=True, help="Not possible; says why.")(command)
     for name in REMOVABLE_EFFECTS[::-1]:
         command = click.option(f"--no-{name}", is_flag=True, help=f"Leave the {name} force out.")(command)
-    mass = click.option("--mass-ng", type=float, metavar="X", help="Effective mass of the tip; the scene's, or 1.")
+    mass = click.option("--mass-ng", type=Finite(), metavar="X", help="Effective mass of the tip; the scene's, or 1.")
     command = mass(command)
     for parameter in CONTACT_PARAMETERS[::-1]:
         text = f"{parameter.meaning}; paper: {parameter.default:g}."
-        command = click.option(option_of(parameter.name), type=float, metavar="X", help=text)(command)
+        command = click.option(option_of(parameter.name), type=Finite(), metavar="X", help=text)(command)
     argument = click.argument("scene", metavar="[SCENE.toml|PRESET]", required=False, type=SceneName())
     return argument(command)
 
@@ -76,8 +76,8 @@ def chosen_contact(options: ContactOptions) -> ChosenContact:
         if name in REQUIRED_EFFECTS:
             raise click.UsageError(f"--no-{name} is not possible: {REQUIRED_EFFECTS[name]}")
     for name, value in options.parameters.items():
-        check_parameter(option_of(name), value, CONTACT_RANGES[name])
-    check_parameter("--mass-ng", options.mass_ng, "positive")
+        check_parameter(option_of(name), value, CONTACT_RANGES[name], optional=True)
+    check_parameter("--mass-ng", options.mass_ng, "positive", optional=True)
     effects, parameters, mass = EFFECTS, {}, 1.0
     if options.scene is not None:
         effects, parameters, mass = _of_scene(options.scene)

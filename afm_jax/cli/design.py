@@ -9,7 +9,7 @@ import click
 from afm_jax.cli.design_belief import BeliefOptions, believed, with_belief_options
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import Numbers, Orders, Share
+from afm_jax.cli.values import Finite, Numbers, Orders, Share
 
 _TAPPING = {"orders": "1", "detuning": "1.02:1.1:0.02", "drive_nm": "40,80", "heights": "0.1:0.9:0.1"}
 _SAMPLE = {"orders": "1-4", "detuning": "0.97:1.05:0.01", "drive_nm": "2,4,7,10", "offsets_nm": "-1,0,1"}
@@ -38,7 +38,7 @@ _SAMPLE = {"orders": "1-4", "detuning": "0.97:1.05:0.01", "drive_nm": "2,4,7,10"
     help="Where the tip is driven, in place of offsets: distances of the sample as shares of each free amplitude; else "
     "0.1:0.9:0.1.",
 )
-@click.option("--largest-nm", type=float, metavar="X", help="Peak amplitude that the instrument takes.")
+@click.option("--largest-nm", type=Finite(), metavar="X", help="Peak amplitude that the instrument takes.")
 @click.option("--points", type=click.IntRange(1, 200), default=8, show_default=True, help="How many to choose.")
 @click.option("--for", "interest", metavar="NAMES", help="Parameters to be known well, as r,epsilon; else the law's.")
 @click.option(
@@ -57,7 +57,7 @@ _SAMPLE = {"orders": "1-4", "detuning": "0.97:1.05:0.01", "drive_nm": "2,4,7,10"
     help="Relative error of an amplitude.",
 )
 @click.option(
-    "--phase-noise-deg", type=float, default=0.2, show_default=True, metavar="X", help="Error of a lag, tip driven."
+    "--phase-noise-deg", type=Finite(), default=0.2, show_default=True, metavar="X", help="Error of a lag, tip driven."
 )
 @click.option(
     "--amplitudes",

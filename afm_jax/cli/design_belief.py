@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import click
 
-from afm_jax.cli.values import ValueAndError, example_path, option_of
+from afm_jax.cli.values import Finite, ValueAndError, example_path, option_of, parse_number
 from fitting.parameters import DELAY, LAW, MODELS, NUISANCE_NAMES, NUISANCES, PARAMETERS, model_parameters
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ class Assignment(click.ParamType):
             return value
         name, _, number = str(value).partition("=")
         try:
-            return name.strip().replace("-", "_"), float(number)
+            return name.strip().replace("-", "_"), parse_number(number)
         except ValueError:
             self.fail(f"`{value}` is no NAME=NUMBER, such as relative_humidity=0.4", param, ctx)
 
@@ -76,7 +76,7 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
         command = click.option(option_of(nuisance.name), type=ValueAndError(), metavar="X", help=what)(command)
     for name in _LAW[::-1]:
         what = ", ".join(filter(None, (PARAMETERS[name].meaning, PARAMETERS[name].unit)))
-        command = click.option(option_of(name), type=float, metavar="X", help=f"{what}; else the paper's.")(command)
+        command = click.option(option_of(name), type=Finite(), metavar="X", help=f"{what}; else the paper's.")(command)
     value = "--value", "value"
     for decorate in (
         click.option(
@@ -91,7 +91,7 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
             type=click.Choice(("sample", "force", "base")),
             help="What is driven: the sample, or the cantilever itself; else the sample, or as measured.",
         ),
-        click.option("--mass-ng", type=float, metavar="X", help="Effective mass of the tip; else 1."),
+        click.option("--mass-ng", type=Finite(), metavar="X", help="Effective mass of the tip; else 1."),
         click.option("--model", type=click.Choice(MODELS), help="What will be fitted; else law+delay, or the fit's."),
         click.option(
             "--measured",

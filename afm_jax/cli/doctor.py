@@ -7,7 +7,7 @@ import platform
 import subprocess
 import sys
 import time
-from importlib.metadata import PackageNotFoundError, version
+from importlib import metadata
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ import click
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.compilation_cache import silence_xla
+from afm_jax.version import EXCLUDED_JAX
 
 _PACKAGES = ("afm-jax", "jax", "jaxlib", "numpy", "scipy", "equinox", "diffrax", "optimistix", "flatbuffers")
 _PROBE = "small_program_of_the_doctor"
@@ -29,7 +30,8 @@ def command(session: Session) -> None:
     """Say what is installed, how JAX computes, and whether its compilation cache works.
 
     A small program is compiled by two fresh processes: the second should find it in the cache. Exit code 3 if it does
-    not, or if the cache's folder cannot be used; every command then compiles anew, which takes up to a minute.
+    not, or if the cache's folder cannot be used; every command then compiles anew, which takes up to a minute. Exit
+    code 3, too, where a version of JAX is installed that computes wrongly or very slowly.
     """
     cache = session.start_computing()
     import jax  # noqa: PLC0415
@@ -43,8 +45,10 @@ def command(session: Session) -> None:
     complaint = cache.reason if cache.refused else None
     if cache.folder is not None and not works:
         complaint = f"{cache.folder}: a program that one process compiled was not found by the next"
+    excluded = excluded_version()
     payload = {
         "versions": {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES},
+        "excluded": excluded,
         "platform": platform.platform(),
         "processors": os.cpu_count(),
         "devices": [{"platform": device.platform, "kind": device.device_kind} for device in jax.devices()],
@@ -59,8 +63,24 @@ def command(session: Session) -> None:
         "microseconds_per_impact": time_impacts(),
     }
     session.emit(payload, *_lines(payload))
+    complaints = [] if excluded is None else [excluded]
     if complaint is not None:
-        raise NotValid(f"the compilation cache does not work: {complaint}")
+        complaints.append(f"the compilation cache does not work: {complaint}")
+    if complaints:
+        raise NotValid("; ".join(complaints))
+
+
+def excluded_version() -> str | None:
+    """Say which excluded version of JAX is installed, what is wrong with it, and what to do; None if there is none."""
+    import jax  # noqa: PLC0415
+
+    # what is imported may not be what is installed
+    found = [("jax", jax.__version__), ("jax", _version("jax")), ("jaxlib", _version("jaxlib"))]
+    for name, number in found:
+        if number in EXCLUDED_JAX:
+            better = ",".join(f"!={version}" for version in EXCLUDED_JAX)
+            return f"{name} {number} {EXCLUDED_JAX[number]}; install another with: pip install -U 'jax{better}'"
+    return None
 
 
 class CacheTrial(NamedTuple):
@@ -101,8 +121,8 @@ def time_impacts() -> float:
 
 def _version(name: str) -> str | None:
     try:
-        return version(name)
-    except PackageNotFoundError:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
         return None
 
 
@@ -113,6 +133,7 @@ def _lines(payload: dict[str, Any]) -> list[str]:
     state = found if cache["works"] else "does not work" if cache["folder"] else "none"
     return [
         ", ".join(f"{name} {number or 'missing'}" for name, number in payload["versions"].items()),
+        *([] if payload["excluded"] is None else [f"Excluded version: {payload['excluded']}"]),
         f"Platform: {payload['platform']}, {payload['processors']} processors; JAX devices: {devices}",
         f"Floats: {payload['float_bits']} bits",
         f"Compilation cache: {cache['folder'] or 'no folder'} ({cache['reason']}); {state}",

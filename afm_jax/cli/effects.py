@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import click
 
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import SceneName, Share
+from afm_jax.cli.values import Finite, SceneName, Share
 
 if TYPE_CHECKING:
     from afm_jax.effects.study import EffectStudy
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Wanted accuracy of the amplitudes, 1% or 0.01: which effects does it not need?",
 )
-@click.option("--duration-us", type=float, metavar="T", help="How long to follow each scene at most, in us.")
+@click.option("--duration-us", type=Finite(), metavar="T", help="How long to follow each scene at most, in us.")
 @click.option("--only", metavar="NAME,...", help="The effects to look at; all if left out.")
 @click.option(
     "--write",

@@ -13,7 +13,7 @@ import click
 from afm_jax.cli.each import fit_tables
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, prepare_folder, with_session
-from afm_jax.cli.values import Ends, example_path, parse_around_plus_minus, parse_number, with_noise
+from afm_jax.cli.values import example_path, parse_around_plus_minus, parse_number, with_noise
 from afm_jax.contact.parameters import EFFECTS, REMOVABLE_EFFECTS, idle_without
 from afm_jax.words import text_table
 from fitting.parameters import CONTACT_DEFAULT, DELAY_LAW, LAWS, MODELS, NUISANCE_NAMES, model_parameters
@@ -118,12 +118,6 @@ class Names(click.ParamType):
     multiple=True,
     metavar="NAME=VALUE+-ERROR",
     help=f"What is known beforehand: {', '.join(NUISANCE_NAMES)}, or a parameter of the model.",
-)
-@click.option(
-    "--speeds",
-    type=Ends(),
-    metavar="LOW:HIGH",
-    help="Give the closest r and epsilon of eq. 6 over these approach speeds in nm/us, too.",
 )
 @click.option("--no", "left_out", type=Names(), metavar="EFFECT,...", help="contact: effects that it does not have.")
 @click.option("--compare", "comparing", is_flag=True, help="Fit the rival models too and say what the table can tell.")
@@ -255,7 +249,6 @@ def _settings(model: str, options: dict[str, Any]) -> dict[str, Any]:
     settings: dict[str, Any] = {
         "scale_errors": options["scale_errors"],
         "robust": options["robust"],
-        "speeds": options.get("speeds"),
         **{name: options[name] for name in ("share", "hierarchical") if options.get(name)},
         "constraints": dict(options["constrain"]),
         "free": free,

@@ -34,7 +34,7 @@ def with_fitted_law(scene: "Scene", path: Path | None) -> "tuple[Scene, Uncertai
 
     Without a fit it is the scene itself, of which nothing is uncertain.
 
-    Of a fit that knows what its model leaves out it is the closest law without, over the measured speeds (`PlainLaw`).
+    It is that of the fit's parameters: of its model's formula that is closest to what was found.
 
     The quality factor is that of the fit where it was fitted along. What the fit found of its instrument (calibrations,
     origin of offsets) belongs to the table, not to the scene; its uncertainty is in the covariance.
@@ -59,7 +59,7 @@ def with_fitted_law(scene: "Scene", path: Path | None) -> "tuple[Scene, Uncertai
     belief, payload = read_belief(path)
     if not payload["valid"]:
         raise ValueError(f"{path}: the fit is not valid, so that its law means nothing; give a valid one")
-    problem, found, plain = belief.problem, payload["parameters"], payload.get("plain_law")
+    problem, found = belief.problem, payload["parameters"]
     if problem.model == "contact":
         raise ValueError(f"{path}: is a fit of a contact, which has no law; fit --model viscous+delay")
     everything = jnp.asarray(belief.values)
@@ -78,9 +78,6 @@ def with_fitted_law(scene: "Scene", path: Path | None) -> "tuple[Scene, Uncertai
     errors = np.array([found[name]["standard_error"] for name in names], float)
     correlations = np.array(payload["correlations"]["matrix"], float)[np.ix_(places, places)]
     covariance = correlations * np.outer(errors, errors)
-    if plain is not None:
-        places_there = [list(plain["values"]).index(name) for name in names]
-        covariance = np.array(plain["covariance"], float)[np.ix_(places_there, places_there)]
     made = eqx.tree_at(lambda parts: parts.interaction, scene, law, is_leaf=lambda part: part is None)
     if "quality_factor" in names:
         made = eqx.tree_at(lambda parts: parts.cantilever, made, problem.cantilever(everything, scene.cantilever))

@@ -7,7 +7,7 @@ import click
 
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import example_path, with_noise
+from afm_jax.cli.values import Finite, example_path, with_noise
 
 
 @click.command()
@@ -16,7 +16,7 @@ from afm_jax.cli.values import example_path, with_noise
 @click.option(
     "--frequency-error",
     "frequency_error_khz",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=Finite(positive=True),
     metavar="KHZ",
     help="Standard error of the free frequency; without it, exactly known.",
 )

@@ -6,6 +6,7 @@ import click
 
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.values import Finite
 
 _SETTINGS = (
     ("sampling-rate-mhz", "MHz", "Samples per us; not needed with a column time_us."),
@@ -27,7 +28,7 @@ _SETTINGS = (
 def _with_settings(function):
     """Add an option for every setting of a trace."""
     for name, unit, text in reversed(_SETTINGS):
-        function = click.option(f"--{name}", type=float, metavar=unit, help=text)(function)
+        function = click.option(f"--{name}", type=Finite(), metavar=unit, help=text)(function)
     return function
 
 

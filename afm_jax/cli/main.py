@@ -21,6 +21,7 @@ from typing import Any
 
 import click
 
+from afm_jax.scenefile.tables import cut_short
 from afm_jax.words import shown
 
 _OWN_PACKAGES = ("afm_jax", "fitting")
@@ -55,6 +56,10 @@ _FORESEEN = (
 )
 
 
+_LONGEST_WORD, _LONGEST_LINE = 300, 2000
+"""Of a message, in letters."""
+
+
 def exit_code_of(run: Callable[[], object]) -> int:
     """Run a command line and return its exit code, after one line on standard error if it failed.
 
@@ -70,7 +75,9 @@ def exit_code_of(run: Callable[[], object]) -> int:
         line, code = _verdict(error)
         if not line or (code == 1 and os.environ.get(_TRACEBACK)):
             raise
-        click.echo(shown(f"afm-jax: {' '.join(line.split())}"), err=True)
+        # what a file holds may be quoted, however long it is
+        words = " ".join(cut_short(word, _LONGEST_WORD) for word in line.split())
+        click.echo(shown(f"afm-jax: {cut_short(words, _LONGEST_LINE)}"), err=True)
     return code if isinstance(code, int) else 0
 
 

@@ -30,19 +30,25 @@ import click
 
 from afm_jax.compilation_cache import cache_folder, make_private, silence_xla
 from afm_jax.strict_json import strict_json
-from afm_jax.whole_files import write_whole
+from afm_jax.whole_files import check_plain, write_whole
 from afm_jax.words import broken, lines_at_most, shown, text_table
 
 if TYPE_CHECKING:
     from afm_jax.compilation_cache import Cache
 
 
-def prepare_folder(folder: Path) -> None:
+def prepare_folder(folder: Path, *, within: Path | None = None) -> None:
     """Make a folder, with those above it, and check that a file can be written there.
+
+    Args:
+        folder: to be made.
+        within: the user's own folder, below which no part may be a link.
 
     Raises:
         OSError: if it cannot be made or written to.
     """
+    if within is not None:
+        check_plain(folder, within=within)
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=folder):
         pass

@@ -7,7 +7,7 @@ import click
 
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import SceneName
+from afm_jax.cli.values import Finite, SceneName
 
 METHODS = ("collocation", "diffrax")
 """Of `simulate`; said here as well, because the command's help must not wait for JAX."""
@@ -46,8 +46,8 @@ class Multiples(click.ParamType):
 
 @click.command()
 @click.argument("scene", metavar="SCENE.toml|PRESET", type=SceneName())
-@click.option("--duration-us", type=float, metavar="T", help="How long to follow the scene, in us.")
-@click.option("--periods", type=float, metavar="P", help="How long, in periods of the drive.")
+@click.option("--duration-us", type=Finite(), metavar="T", help="How long to follow the scene, in us.")
+@click.option("--periods", type=Finite(), metavar="P", help="How long, in periods of the drive.")
 @click.option(
     "--until-settled",
     is_flag=True,
@@ -64,7 +64,7 @@ class Multiples(click.ParamType):
 )
 @click.option(
     "--accuracy",
-    type=click.FloatRange(min=0.0, min_open=True),
+    type=Finite(positive=True),
     default=1e-9,
     show_default=True,
     help="Of every resolved contact: relative of the rebound speed.",
@@ -170,12 +170,16 @@ def _check_length(scene: "Scene", duration_us: float) -> None:
     Raises:
         ValueError: if the tip would oscillate too often in it.
     """
-    oscillations = float(scene.cantilever.frequency_khz) * 1e-3 * duration_us
-    if not oscillations <= MOST_OSCILLATIONS:
-        raise ValueError(
-            f"in {duration_us:.6g} us the tip would oscillate {oscillations:.3g} times, more than the "
-            f"{MOST_OSCILLATIONS:g} that can be followed: give a shorter --duration-us or fewer --periods"
-        )
+    from afm_jax.apparatus.scene import drive_of  # noqa: PLC0415
+
+    frequencies = {"tip": float(scene.cantilever.frequency_khz), "drive": 1e3 / drive_of(scene).period_us}
+    for what, frequency_khz in frequencies.items():
+        oscillations = frequency_khz * 1e-3 * duration_us
+        if not oscillations <= MOST_OSCILLATIONS:
+            raise ValueError(
+                f"in {duration_us:.6g} us the {what} would oscillate {oscillations:.3g} times, more than the "
+                f"{MOST_OSCILLATIONS:g} that can be followed: give a shorter --duration-us or fewer --periods"
+            )
 
 
 def _follow(

@@ -54,8 +54,8 @@ def command(
     count = 500                           # or random = {...}
     seed = 1
 
-    The results open with xarray.open_zarr; they do not depend on workers or chunks. Chunks that are done are kept,
-    whatever happens, and computed again only if their bytes have changed.
+    The results open with xarray.open_zarr; on other workers they differ in last digits at most. Chunks that are done
+    are kept, whatever happens, and computed again only if their bytes have changed.
     """  # noqa: D301 (click's mark of lines that stay as they are)
     if workers is not None and scheduler is not None:
         raise click.UsageError("--scheduler has workers of its own: leave --workers out")

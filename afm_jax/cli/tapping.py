@@ -123,7 +123,7 @@ def _finish_several(session: Session, path: Path, file: "MeasuredFile", results:
     if session.out is not None:
         for number, result in results.items():
             own = replace(session, out=session.out / f"curve_{number}")
-            prepare_folder(session.out / f"curve_{number}")
+            prepare_folder(session.out / f"curve_{number}", within=session.out)
             for written in write_tapping(result, session.out / f"curve_{number}", own.write_table):
                 session.note(f"wrote {written}")
     if not payload["valid"]:

@@ -11,6 +11,8 @@ from typing import TYPE_CHECKING, Any
 import click
 import click.shell_completion
 
+from afm_jax.scenefile.tables import cut_short
+
 if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
     from afm_jax.scenefile.parameter_paths import ParameterRange
@@ -23,6 +25,31 @@ _MOST = 1_000_000
 def option_of(parameter: str) -> str:
     """Return the option of a parameter: of tip_radius_nm, --tip-radius-nm."""
     return f"--{parameter.replace('_', '-')}"
+
+
+class Finite(click.ParamType):
+    """A number: neither infinite nor "nan", which compares with no limit."""
+
+    name = "number"
+
+    def __init__(self, *, positive: bool = False):
+        """Say whether it must be positive."""
+        self.positive = positive
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return the number that a text says.
+
+        Raises:
+            click.BadParameter: if it is none, not finite, or not positive where it must be.
+        """
+        try:
+            number = parse_number(str(value))
+        except ValueError:
+            number = math.nan
+        if not (number > 0.0 if self.positive else math.isfinite(number)):
+            shown = cut_short(str(value), 60)
+            self.fail(f"must be a {'positive' if self.positive else 'finite'} number, but is {shown}", param, ctx)
+        return number
 
 
 class Numbers(click.ParamType):
@@ -320,22 +347,10 @@ def parse_share(text: str) -> float:
 
 
 def scene_and_start(name: str) -> "tuple[Scene, Start | None]":
-    """Return the scene that an argument names, and the start that comes with it; None where it is to be chosen.
+    """Return the scene that an argument names and its start; see `afm_jax.scenefile.presets.scene_and_start`."""
+    from afm_jax.scenefile import presets  # noqa: PLC0415
 
-    Args:
-        name: a path, or a name of `afm_jax.scenefile.presets.PRESETS` where there is no file of that name.
-
-    Raises:
-        ValueError: if there is neither such a file nor such a preset, or the file is no valid scene file.
-    """
-    from afm_jax.scenefile.presets import PRESETS, preset, preset_start  # noqa: PLC0415
-    from afm_jax.scenefile.scenefile import load_scene_and_start  # noqa: PLC0415
-
-    if Path(name).exists() or name.endswith(".toml") or len(Path(name).parts) > 1:
-        return load_scene_and_start(name)
-    if name not in PRESETS:
-        raise ValueError(f"{name}: there is no such file or preset; presets are {', '.join(PRESETS)}")
-    return preset(name), preset_start(name)
+    return presets.scene_and_start(name)
 
 
 def ranges_of(name: str, scene: "Scene", texts: Sequence[str], *, counted: bool) -> "list[ParameterRange]":

@@ -32,7 +32,7 @@ GRADING = 1.6
 """Steps towards the inner end shrink on the way in, where the core repulsion rises as the 8th power."""
 _SLOWEST = 0.01
 """Share of K at the start below which no sweep lets it fall; a driven tip that gets slower is not for the quick way."""
-_WRITTEN_OUT = 5
+_WRITTEN_OUT = 3
 """So many sweeps are written out in the program; more are a loop."""
 _REMEMBERED = 20
 """So many steps leave behind what their derivatives in reverse mode need."""

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from afm_jax.checks import as_parameter, check_parameter, is_traced, refuse_float32, require_float64
+from afm_jax.checks import as_parameter, check_parameter, checked, is_traced, refuse_float32, require_float64
 from afm_jax.contact.bridge_leg import (
     Passage,
     Turn,
@@ -73,6 +73,7 @@ class Collision(ResultTuple):
     """Kinetic energy at the end, signed: for a captured tip minus what it lacks to leave; 0 at the capture speed."""
 
 
+@checked
 def collide(
     contact: Contact,
     approach_speed_nm_per_us: ArrayLike,
@@ -282,6 +283,7 @@ def _resolve(
     return jax.tree.map(lambda fast, careful: fast.at[open_tips].set(careful[:count]), quick, slow)
 
 
+@checked
 def capture_speed(contact: Contact, mass_ng: ArrayLike = 1.0) -> Float[Array, ""]:
     """Return the approach speed in nm/us at which the tip would come to rest where contact ends.
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from afm_jax.checks import as_parameter, check_parameter, is_traced, readable
+from afm_jax.checks import as_parameter, check_kind, check_parameter, is_traced, readable
 from afm_jax.contact.forces.force import DissipativeForce, Force, ForceSum, StaticForce, terms_of
 from afm_jax.contact.forces.jkr import Jkr
 from afm_jax.contact.forces.liquid import Capillary, Liquid, Structural, Viscous
@@ -22,6 +22,7 @@ from afm_jax.units import AJ_NM6_PER_J_M6
 
 
 def _flat(forces: Force | Sequence[Force]) -> ForceSum:
+    check_kind("forces", forces, Force | Sequence[Force])
     terms = [forces] if isinstance(forces, Force) else list(forces)
     return ForceSum(tuple(term for force in terms for term in terms_of(force)))
 

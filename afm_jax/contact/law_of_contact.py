@@ -26,7 +26,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-from afm_jax.checks import require_float64
+from afm_jax.checks import checked, require_float64
 from afm_jax.contact.bridge_leg import margin_of, pass_by_collocation, way_through
 from afm_jax.contact.collide import capture_speed, collide, collide_in_blocks
 from afm_jax.contact.contact import Bridge, Contact, bridge_of
@@ -34,7 +34,7 @@ from afm_jax.contact.driven import free_tip
 from afm_jax.contact.forces import jkr
 from afm_jax.contact.junction import Junction, find_junction
 from afm_jax.contact.junction_leg import pass_through_junction
-from afm_jax.impact.lasting_impact import TabulatedImpact, stretched
+from afm_jax.impact.lasting_impact import TabulatedImpact, polynomials, stretched
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.least_squares import Box, Searches, descended, distance
 from afm_jax.results import Result, public_result
@@ -168,6 +168,7 @@ class ContactLaw(Result):
         return float(np.sqrt(np.mean(self.error_nm_per_us**2)))
 
 
+@checked
 def fit_law(
     contact: Contact,
     *,
@@ -344,6 +345,7 @@ class ContactDelay(Result):
         return float(np.abs(self.fitted_us - self.delay_us).max())
 
 
+@checked
 def fit_delay(
     contact: Contact, *, speed_range: tuple[float, float] | None = None, mass_ng: float = 1.0, points: int = 512
 ) -> ContactDelay:
@@ -470,7 +472,9 @@ def tabulated(contact: Contact, mass_ng: Float[Array, ""]) -> TabulatedImpact:
     # through values at places that the loss has shifted a little
     far = stretched(jnp.sqrt(jnp.maximum(u[1:] ** 2 - lowest**2, 1e-12)) / scale)
     place = jnp.concatenate([-jnp.ones(1), 2.0 * far / far[-1] - 1.0])
-    loss, time_terms = jnp.linalg.solve(_polynomials(place), jnp.stack([u * u - 2.0 * left / mass_ng, time], axis=1)).T
+    loss, time_terms = jnp.linalg.solve(
+        polynomials(place, TERMS), jnp.stack([u * u - 2.0 * left / mass_ng, time], axis=1)
+    ).T
     sound = junction.exists & jnp.all(jnp.diff(u) > 0.0) & jnp.all(jnp.isfinite(loss) & jnp.isfinite(time_terms))
     delay = time[-1] - outer / jnp.sqrt(2.0 * left[-1] / mass_ng) - contact.bridge_forms_nm / u[-1]
     table = TabulatedImpact(
@@ -543,14 +547,6 @@ def _lead_and_height(table: TabulatedImpact) -> tuple[Float[Array, ""], Float[Ar
     lead = jnp.linalg.solve(terms.T @ terms, terms.T @ delay)[1] / scale[1]
     early = table.hertz_time(u) - delay - lead * (1.0 / w - 1.0 / u)
     return lead, 0.5 * (u * early)[-1]
-
-
-def _polynomials(place: Float[Array, " n"]) -> Float[Array, "n n"]:
-    """Return Chebyshev's polynomials of all degrees at places in [-1, 1]."""
-    rows = [jnp.ones_like(place), place]
-    for _ in range(TERMS - 2):
-        rows.append(2.0 * place * rows[-1] - rows[-2])
-    return jnp.stack(rows, axis=1)
 
 
 def _tail(terms: Float[Array, " terms"]) -> Float[Array, ""]:

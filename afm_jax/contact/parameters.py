@@ -138,6 +138,7 @@ CONTACT_PARAMETERS = (
     ),
     ContactParameter(
         name="core_constant_j_m6",
+        allowed="above 0",
         unit="J m^6",
         default=1e-78,
         meaning="B of the core repulsion",

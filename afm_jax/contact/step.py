@@ -333,12 +333,14 @@ def _crossing_share(start: Array, start_slope: Array, end: Array, end_slope: Arr
     bend = 3.0 * (end - start) - 2.0 * start_slope - end_slope
     twist = 2.0 * (start - end) + start_slope + end_slope
     share = start / jnp.where(start == end, 1.0, start - end)
-    # written out: a few steps of Newton's method cost less than a loop, and a miss is only tried again
-    for _ in range(_CUBIC_STEPS):
+
+    # a few steps of Newton's method: a miss is only tried again
+    def improve(_, share):
         value = start + share * (start_slope + share * (bend + share * twist))
         slope = start_slope + share * (2.0 * bend + 3.0 * share * twist)
-        share = jnp.clip(share - value / jnp.where(slope == 0.0, 1.0, slope), 0.0, 1.0)
-    return share
+        return jnp.clip(share - value / jnp.where(slope == 0.0, 1.0, slope), 0.0, 1.0)
+
+    return lax.fori_loop(0, _CUBIC_STEPS, improve, share)
 
 
 def _turning_point(start: Array, start_slope: Array, end: Array, end_slope: Array) -> tuple[Array, Array]:

@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from afm_jax.checks import as_parameter, check_parameter, refuse_float32
+from afm_jax.checks import as_parameter, check_parameter, checked, refuse_float32
 from afm_jax.contact.bridge_leg import Way, margin_of, sweep, way_through
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Driven, free_tip
@@ -56,6 +56,7 @@ class _Leg(NamedTuple):
     duration: Float[Array, ""]
 
 
+@checked
 def time_course(contact: Contact, approach_speed_nm_per_us: ArrayLike, mass_ng: ArrayLike = 1.0) -> TimeCourse:
     """Return the time course of one impact of a free tip on a sample at rest.
 

@@ -15,7 +15,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
+from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.bifurcations import follow, settled_below
 from afm_jax.dynamics.exponents import CHAOTIC_ERRORS, exponents_of_law
@@ -103,8 +104,9 @@ class Basins(ResultTuple):
         return [dict(zip(names, row, strict=True)) for row in zip(*columns, strict=True)]
 
 
+@checked
 def basins_of_attraction(
-    scene: Scene,
+    scene: SceneLike,
     *,
     columns: int = 300,
     rows: int = 300,
@@ -124,6 +126,7 @@ def basins_of_attraction(
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
         ValueError: if the scene does not repeat with one drive period, or there is no such grid.
     """
+    scene = as_scene(scene)
     seen = sample_driven(scene)
     scene, ahead = seen.scenes, float(seen.frame.phase_rad)
     if scene.platform.frequency_khz.ndim or columns < 2 or rows < 2:

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import FreeFrame
+from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.bands import UncertainParameters
 from afm_jax.dynamics.contact_orbits import single_contact_orbits
@@ -235,6 +236,7 @@ class StabilityChart(Result):
         return rows.reshape(len(rows), len(self.y_values), len(self.x_values))
 
 
+@checked
 def stability_chart(
     scene_of: Callable[..., Scene],
     *,

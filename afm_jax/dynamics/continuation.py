@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.apparatus.scene import Scene, drive_of
-from afm_jax.checks import require_float64
+from afm_jax.apparatus.scene import Scene, SceneLike, as_scene, drive_of
+from afm_jax.checks import checked, require_float64
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.closed_loops import CAPTURE, Equations, Frame, frame_of, read_points
 from afm_jax.dynamics.contact_orbits import ContactFlights, contact_loops
@@ -59,8 +59,9 @@ class Continuation(ResultTuple):
         return found
 
 
+@checked
 def continue_orbits(
-    scene: Scene, order: int, given: ParameterRange, *, impacts: int = 1, second: ParameterRange | None = None
+    scene: SceneLike, order: int, given: ParameterRange, *, impacts: int = 1, second: ParameterRange | None = None
 ) -> Continuation:
     """Follow the (m, N) orbits of a scene through a parameter, and their special points through a second one.
 
@@ -82,6 +83,7 @@ def continue_orbits(
         ValueError: if the drive does not repeat, a parameter or a range is none of the scene's, or order and impacts
             are no numbers of impacts and periods.
     """
+    scene = as_scene(scene)
     require_float64(scene)
     ranges = (given,) if second is None else (given, second)
     _check(scene, order, impacts, ranges)

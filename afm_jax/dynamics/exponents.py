@@ -16,7 +16,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
+from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.contact_sequence import departure_jacobians, follow_contacts
 from afm_jax.dynamics.iteration import (
@@ -117,8 +118,9 @@ class _Sums(NamedTuple):
     rested: Float[Any, " lanes"]
 
 
+@checked
 def lyapunov_spectrum(
-    scene: Scene,
+    scene: SceneLike,
     start: State | None = None,
     *,
     impacts: int = 2000,
@@ -143,6 +145,7 @@ def lyapunov_spectrum(
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
         ValueError: if the scene does not repeat with one drive period, or there are too few impacts to tell errors.
     """
+    scene = as_scene(scene)
     seen = sample_driven(scene)
     if impacts < _PARTS or transient < 0:
         raise ValueError(f"`impacts` must be {_PARTS} or more and `transient` not negative: {impacts} and {transient}")

@@ -16,8 +16,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float
 
-from afm_jax.apparatus.scene import Scene
-from afm_jax.checks import require_float64
+from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
+from afm_jax.checks import checked, require_float64
 from afm_jax.dynamics.impact_loop import (
     ImpactLoop,
     LoopReading,
@@ -94,7 +94,8 @@ def is_stable(multipliers: Complex[np.ndarray, "*orbits 2"]) -> Bool[np.ndarray,
     return np.asarray(np.abs(multipliers[..., 0]) < 1.0)
 
 
-def many_impact_orbits(scene: Scene, order: int, impacts: int, *, starts: int = DEFAULT_STARTS) -> ManyImpactOrbits:
+@checked
+def many_impact_orbits(scene: SceneLike, order: int, impacts: int, *, starts: int = DEFAULT_STARTS) -> ManyImpactOrbits:
     """Return the orbits of m impacts in N drive periods that a search from many starts finds.
 
     Args:
@@ -113,6 +114,7 @@ def many_impact_orbits(scene: Scene, order: int, impacts: int, *, starts: int = 
         ValueError: if order or impacts is no positive integer, there are more impacts than 64, or the drive does not
             repeat.
     """
+    scene = as_scene(scene)
     require_float64(scene)
     impact_law_of(scene)
     driven = driven_part(scene)

@@ -14,9 +14,9 @@ from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.apparatus.surface import Surface, seen_freely
-from afm_jax.checks import as_argument
+from afm_jax.checks import as_argument, checked
 from afm_jax.impact.lasting_impact import Impact, LawImpact, speeds_of_impact
 from afm_jax.impact.law import ImpactLaw, impact_law_of
 from afm_jax.impact.map import next_impact
@@ -201,7 +201,8 @@ def contact_jacobian(
     return jax.jacfwd(through)(jnp.stack([arrival_us, velocity_before]))
 
 
-def map_jacobian(scene: Scene, time_us: ArrayLike, velocity_nm_per_us: ArrayLike) -> Float[Array, "2 2"]:
+@checked
+def map_jacobian(scene: SceneLike, time_us: ArrayLike, velocity_nm_per_us: ArrayLike) -> Float[Array, "2 2"]:
     """Return d(time, velocity after) of the next impact over d(time, velocity after) of this one (eqs. 5 and 7).
 
     Args:
@@ -218,6 +219,7 @@ def map_jacobian(scene: Scene, time_us: ArrayLike, velocity_nm_per_us: ArrayLike
         TypeError: if the scene's interaction is not an impact law.
         ValueError: if an undamped cantilever is driven at its free frequency.
     """
+    scene = as_scene(scene)
     impact = next_impact(scene, time_us, velocity_nm_per_us)
     seen, response = seen_freely(scene)
     return _map_jacobian(seen, response, as_argument(time_us), as_argument(velocity_nm_per_us), impact)

@@ -378,18 +378,23 @@ _BESIDE = 0.02
 """Share by which a pull may lie outside a table."""
 _PEAKED = 1.65
 """Depth of a tap over its mean depth: between those of a parabola and of a triangle."""
+_WRITTEN_OUT = 3
+"""Steps of a series that are one round of a loop."""
 _NOWHERE_US = 1e3
 """What the delay of a tap that does not exist is longer by, and more: no orbit has it."""
 
 
 def polynomials(place: Float[Array, "..."], count: int) -> Float[Array, "... count"]:
-    """Return Chebyshev's polynomials at places, held in [-1, 1]: T_(k+j) = 2 T_k T_j - T_(k-j) doubles them."""
+    """Return Chebyshev's polynomials of the degrees 0 to count - 1 at places, held in [-1, 1]."""
     place = jnp.clip(place, -1.0, 1.0)
-    found = jnp.stack([jnp.ones_like(place), place], axis=-1)
-    while found.shape[-1] < count:
-        last = found[..., -1:]
-        found = jnp.concatenate([found, 2.0 * last * found[..., 1:] - found[..., -2::-1]], axis=-1)
-    return found[..., :count]
+
+    def step(known, _):
+        last, before = known
+        return (2.0 * place * last - before, last), last
+
+    first = jnp.ones_like(place)
+    _, rest = lax.scan(step, (place, first), None, length=count - 1, unroll=_WRITTEN_OUT)
+    return jnp.moveaxis(jnp.concatenate([first[None], rest]), 0, -1)
 
 
 class Tap(NamedTuple):
@@ -750,7 +755,11 @@ def speed_over(
 
 def chebyshev_sum(coefficients: Float[Array, " terms"], place: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return the Chebyshev series at places in [-1, 1] by Clenshaw's recurrence."""
-    ahead, further = jnp.zeros_like(place), jnp.zeros_like(place)
-    for k in range(coefficients.shape[0] - 1, 0, -1):
-        ahead, further = coefficients[k] + 2.0 * place * ahead - further, ahead
+
+    def step(sums, coefficient):
+        ahead, further = sums
+        return (coefficient + 2.0 * place * ahead - further, ahead), None
+
+    nothing = jnp.zeros_like(place)
+    (ahead, further), _ = lax.scan(step, (nothing, nothing), coefficients[:0:-1], unroll=_WRITTEN_OUT)
     return coefficients[0] + place * ahead - further

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from afm_jax.apparatus.scene import Scene
-from afm_jax.checks import as_argument, as_parameter, check_parameter, readable
+from afm_jax.checks import as_argument, as_parameter, check_kind, check_parameter, readable
 
 
 def squared_rebound_speed(
@@ -105,6 +105,7 @@ class ImpactLaw(eqx.Module):
         check_parameter("r", self.r, "in [0, 1]")
         check_parameter("epsilon", self.epsilon, "not negative")
         check_parameter("viscous_loss", self.viscous_loss, "not negative")
+        check_kind("delay", self.delay, CollisionDelay | None)
 
     def captures(self, approach_speed: ArrayLike) -> Bool[Array, "..."]:
         """Say whether the tip stays at an approach speed in nm/us: the root's argument is not positive."""

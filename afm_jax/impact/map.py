@@ -14,9 +14,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.apparatus.surface import Surface, seen_freely
-from afm_jax.checks import require_float64
+from afm_jax.checks import checked, require_float64
 from afm_jax.impact.first_impact import DEFAULT_MAX_STEPS, DEFAULT_ROOT_TOLERANCE_US, Flight, first_impact
 from afm_jax.impact.lasting_impact import LawImpact, crawls, delay_before, speeds_of_impact
 from afm_jax.impact.law import impact_law_of
@@ -50,8 +50,9 @@ class NextImpact(Result, eqx.Module):
     near_grazing: Bool[Array, "..."]
 
 
+@checked
 def next_impact(
-    scene: Scene,
+    scene: SceneLike,
     time_us: ArrayLike,
     velocity_nm_per_us: ArrayLike,
     *,
@@ -82,6 +83,7 @@ def next_impact(
     ...     print(round(float(next_impact(scene, 4.0, 6.0).time_us), 6))
     9.646489
     """
+    scene = as_scene(scene)
     require_float64(scene)
     impact_law_of(scene)
     seen, response = seen_freely(scene)
@@ -90,8 +92,9 @@ def next_impact(
     return _in_lab(_next_impact(seen, start, tolerance, max_steps=max_steps), response)
 
 
+@checked
 def iterate_map(
-    scene: Scene,
+    scene: SceneLike,
     time_us: ArrayLike,
     velocity_nm_per_us: ArrayLike,
     impacts: int,
@@ -118,6 +121,7 @@ def iterate_map(
         TypeError: if the scene's interaction is not an impact law.
         ValueError: if `impacts` is not positive, or an undamped cantilever is driven at its free frequency.
     """
+    scene = as_scene(scene)
     require_float64(scene)
     impact_law_of(scene)
     if impacts < 1:
@@ -249,8 +253,9 @@ DEFAULT_BLOCK = 1000
 """Lanes that run together; 300 to 2000 differ little on processors with vector units and 0.5 to 2 MB of cache."""
 
 
+@checked
 def iterate_batch(
-    scene: Scene,
+    scene: SceneLike,
     time_us: ArrayLike,
     velocity_nm_per_us: ArrayLike,
     impacts: int,
@@ -278,6 +283,7 @@ def iterate_batch(
         TypeError: if the scene's interaction is not an impact law.
         ValueError: if shapes do not fit together, or `impacts` or `block` is not positive.
     """
+    scene = as_scene(scene)
     require_float64(scene)
     impact_law_of(scene)
     dtype = scene.platform.frequency_khz.dtype

@@ -356,13 +356,13 @@ def _dips(brief: Bool[Array, " points"], grid, value, scan: Scan) -> _Dips:
 
 def _lowest_of(size: Float[Array, " n"], count: int) -> tuple[Array, Array]:
     """Return where the smallest numbers are, and which of them are finite."""
-    at, real = [], []
-    for _ in range(count):
+
+    def take(size, _):
         place = jnp.argmin(size)
-        at.append(place)
-        real.append(jnp.isfinite(size[place]))
-        size = size.at[place].set(jnp.inf)
-    return jnp.stack(at), jnp.stack(real)
+        return size.at[place].set(jnp.inf), (place, jnp.isfinite(size[place]))
+
+    _, (at, real) = lax.scan(take, size, None, length=count)
+    return at, real
 
 
 def _narrowed(crossings: _Brackets, dips: _Dips, problem: OrbitProblem) -> tuple[Array, Array]:

@@ -11,9 +11,9 @@ from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.apparatus.surface import Surface, surface_of
-from afm_jax.checks import check_parameter, is_traced, require_float64
+from afm_jax.checks import check_parameter, checked, is_traced, require_float64
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Driven, driven_by
 from afm_jax.contact.junction import explain_missing_junction, find_junction
@@ -38,8 +38,9 @@ _TRIALS_BACKWARDS = 40
 """Trial steps of a round when all of them are run and kept for the way back."""
 
 
+@checked
 def simulate(  # noqa: PLR0913
-    scene: Scene,
+    scene: SceneLike,
     start: State,
     duration_us: ArrayLike,
     *,
@@ -78,6 +79,7 @@ def simulate(  # noqa: PLR0913
         ValueError: if the duration is not positive, the contact has no junction, the start is inside the sample, or
             there is no such method or accuracy.
     """
+    scene = as_scene(scene)
     require_float64(scene)
     check_parameter("duration_us", duration_us, "positive")
     surface, response = surface_of(scene)

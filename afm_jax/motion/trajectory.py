@@ -25,8 +25,9 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene
+from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.apparatus.surface import Surface, surface_of
+from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Driven, Place, driven_by
 from afm_jax.contact.junction import Junction, Phase, find_junction, force_in_phase
@@ -397,7 +398,8 @@ def dense_path(
     return DensePath(scene, simulation, world, pieces_between(world, simulation, from_us, to_us))
 
 
-def trajectory(scene: Scene, simulation: Simulation, times_us: ArrayLike) -> Trajectory:
+@checked
+def trajectory(scene: SceneLike, simulation: Simulation, times_us: ArrayLike) -> Trajectory:
     """Return the tip at given times.
 
     Args:
@@ -408,6 +410,7 @@ def trajectory(scene: Scene, simulation: Simulation, times_us: ArrayLike) -> Tra
     Raises:
         ValueError: if a time lies outside the simulation, or the simulation is a batch.
     """
+    scene = as_scene(scene)
     wanted = np.asarray(times_us, float)
     # without times: a stretch of no length
     ends = (wanted.min(), wanted.max()) if wanted.size else (simulation.start.time_us,) * 2

@@ -44,9 +44,15 @@ def with_zero_line(axes: Axes) -> None:
     axes.grid(color=GRID, alpha=0.25)
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write a figure, whole or not at all, in the format of its file's suffix: PNG, PDF or SVG."""
-    write_whole(path, _bytes_of(figure, path.suffix.removeprefix("."), _DPI))
+def save(figure: Figure, path: Path, *, named_by_user: bool = False) -> None:
+    """Write a figure, whole or not at all, in the format of its file's suffix: PNG, PDF or SVG.
+
+    Args:
+        figure: of matplotlib.
+        path: of the file.
+        named_by_user: whether the user gave this very path, which may then be a link; see `write_whole`.
+    """
+    write_whole(path, _bytes_of(figure, path.suffix.removeprefix("."), _DPI), named_by_user=named_by_user)
 
 
 def png_of(figure: Figure, dpi: float = 150.0) -> bytes:

@@ -6,6 +6,7 @@ damping out; section IV, with the resolved contact, has Q = 40. Figures 4 to 7 s
 """
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 from jaxtyping import Array, ArrayLike, Float
@@ -16,7 +17,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import as_argument
 from afm_jax.contact.contact import Contact
 from afm_jax.impact.law import ImpactLaw
-from afm_jax.scenefile.scenefile import Start
+from afm_jax.scenefile.scenefile import Start, load_scene_and_start
 
 FREE_FREQUENCY_KHZ = 90.0
 STABILITY_R = 0.5
@@ -189,3 +190,19 @@ def _preset_of(name: str) -> _Preset:
     if name not in _PRESETS:
         raise ValueError(f"there is no preset {name!r}; choose from {', '.join(_PRESETS)}")
     return _PRESETS[name]
+
+
+def scene_and_start(name: str) -> tuple[Scene, Start | None]:
+    """Return the scene that a path or a name means, and the start that comes with it; None where it is to be chosen.
+
+    Args:
+        name: a path, or a name of `PRESETS` where there is no file of that name.
+
+    Raises:
+        ValueError: if there is neither such a file nor such a preset, or the file is no valid scene file.
+    """
+    if Path(name).exists() or name.endswith(".toml") or len(Path(name).parts) > 1:
+        return load_scene_and_start(name)
+    if name not in PRESETS:
+        raise ValueError(f"{name}: there is no such file or preset; presets are {', '.join(PRESETS)}")
+    return preset(name), preset_start(name)

@@ -61,9 +61,9 @@ from jaxtyping import ArrayLike
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene, drive_of
+from afm_jax.apparatus.scene import Scene, SceneLike, as_scene, drive_of
 from afm_jax.apparatus.surface import check_steady_response, drive_per_free_height
-from afm_jax.checks import check_parameter
+from afm_jax.checks import check_parameter, checked
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.motion.record import State
 from afm_jax.scenefile.tables import (
@@ -305,6 +305,7 @@ def as_in_file(scene: Scene, state: State) -> Start:
     return Start(phase % 360.0, height, float(state.velocity_nm_per_us))
 
 
+@checked
 def load_scene(path: str | os.PathLike[str]) -> Scene:
     """Return the scene that a TOML file describes.
 
@@ -343,7 +344,8 @@ def scene_of_tables(contents: Mapping[str, Any], source: str) -> Scene:
     return _scene_of(_checked(contents, source))
 
 
-def save_scene(scene: Scene, path: str | os.PathLike[str], *, start: Start | None = None) -> None:
+@checked
+def save_scene(scene: SceneLike, path: str | os.PathLike[str], *, start: Start | None = None) -> None:
     """Write a scene, and a start if there is one, to a TOML file from which `load_scene` returns an equal scene.
 
     The file names a contact's effects in the paper's order, whatever the order of its forces.
@@ -354,11 +356,12 @@ def save_scene(scene: Scene, path: str | os.PathLike[str], *, start: Start | Non
         ValueError: if the scene is a batch of scenes, its contact or its drives are none that a file can hold, or the
             start is impossible in it.
     """
+    scene = as_scene(scene)
     tables = scene_tables(scene)
     if start is not None:
         check_start(start, scene)
         tables["start"] = {key: float(value) for key, value in start._asdict().items()}
-    write_whole(path, tomli_w.dumps(tables))
+    write_whole(path, tomli_w.dumps(tables), named_by_user=True)
 
 
 def scene_tables(scene: Scene) -> dict[str, dict[str, Any]]:
@@ -470,7 +473,7 @@ def _scene_of(tables: dict[str, SceneTable]) -> Scene:
     numbers = table.numbers(required=("frequency_khz",), optional=("quality_factor", "mass_ng"))
     cantilever = table.build(Cantilever, **numbers)
     platform, base, force = read_drives(tables, cantilever)
-    return Scene(cantilever, platform, _interaction_of(tables), base, force)
+    return tables["platform"].build(Scene, cantilever, platform, _interaction_of(tables), base, force)
 
 
 def _interaction_of(tables: dict[str, SceneTable]) -> Any:

@@ -27,7 +27,7 @@ from afm_jax.strict_json import strict_json
 from afm_jax.sweeps.axes import dimension_of
 from afm_jax.sweeps.plan import Columns, SweepPlan, Variable, plan_of_worker, unit_of
 from afm_jax.version import __version__
-from afm_jax.whole_files import write_whole
+from afm_jax.whole_files import check_plain, whole_folder, write_whole
 
 FORMAT_VERSION = 2
 STORE = "sweep.zarr"
@@ -59,10 +59,19 @@ class SweepStore:
         self.folder, self.plan = folder, plan
 
     def kept(self) -> Kept:
-        """Return which chunks are done, every byte of them looked at."""
+        """Return which chunks are done, every byte of them looked at.
+
+        Raises:
+            ValueError: if something else lies among the markers; says what.
+        """
         done, damaged = set(), set()
-        for path in (self.folder / _MARKERS).glob("*.json"):
-            chunk = int(path.stem)
+        for path in (self.folder / _MARKERS).iterdir():
+            if path.name.startswith(".") and path.is_file():
+                # what systems leave in folders
+                continue
+            chunk = int(path.stem) if path.stem.isascii() and path.stem.isdecimal() and len(path.stem) < 20 else -1
+            if not 0 <= chunk < self.plan.chunks or path.name != f"{chunk}.json" or not path.is_file():
+                raise ValueError(f"{path}: is no mark of a chunk of this sweep; delete it")
             try:
                 sums = json.loads(path.read_bytes())
             except ValueError:
@@ -79,15 +88,16 @@ class SweepStore:
         # what a power cut takes, the checksums tell: the disk's time is saved
         for name, data in files.items():
             path = self._path(name, chunk)
+            check_plain(path, within=self.folder)
             if data is None:
                 path.unlink(missing_ok=True)
                 continue
             try:
-                write_whole(path, data, synced=False)
+                write_whole(path, data, synced=False, within=self.folder)
             except FileNotFoundError:
                 path.parent.mkdir(parents=True, exist_ok=True)
-                write_whole(path, data, synced=False)
-        write_whole(self._marker(chunk), strict_json(_sums(files)), synced=False)
+                write_whole(path, data, synced=False, within=self.folder)
+        write_whole(self._marker(chunk), strict_json(_sums(files)), synced=False, within=self.folder)
 
     def _marker(self, chunk: int) -> Path:
         return self.folder / _MARKERS / f"{chunk}.json"
@@ -169,23 +179,39 @@ def open_store(folder: Path, plan: SweepPlan, *, coordinates: bool = True) -> Sw
 
     Raises:
         ValueError: if there is one of another sweep; says what differs.
+        OSError: if there is a link, a device or a pipe in it; names it.
     """
+    for unfinished in _unfinished(folder):
+        unfinished.unlink()
+    for left in folder.glob(f".{STORE}.*part"):
+        check_plain(left)
+        shutil.rmtree(left)
     if (folder / STORE / "zarr.json").exists():
         _check_same(folder, plan)
         # of the axes no checksum is kept: they are what the plan says
         _write_axes(zarr.open_group(str(folder / STORE), mode="r+", zarr_format=3), plan, coordinates=coordinates)
     else:
-        # beside its place first: it is there whole or not at all
-        fresh = folder / f".{STORE}.part"
-        shutil.rmtree(fresh, ignore_errors=True)
-        _make_whole(fresh, plan, coordinates=coordinates)
-        shutil.rmtree(folder / _MARKERS, ignore_errors=True)
-        shutil.rmtree(folder / STORE, ignore_errors=True)
-        fresh.rename(folder / STORE)
+        with whole_folder(folder / STORE) as fresh:
+            _make_whole(fresh, plan, coordinates=coordinates)
+            shutil.rmtree(folder / _MARKERS, ignore_errors=True)
     (folder / _MARKERS).mkdir(exist_ok=True)
-    for unfinished in (*(folder / STORE).rglob(".*.part"), *(folder / _MARKERS).glob(".*.part")):
-        unfinished.unlink()
     return SweepStore(folder, plan)
+
+
+def _unfinished(folder: Path) -> list[Path]:
+    """Return the files of a store that a killed process left unfinished; everything in it is looked at.
+
+    Raises:
+        OSError: if there is a link, a device or a pipe in it; names it.
+    """
+    found = []
+    for top in (folder / STORE, folder / _MARKERS):
+        check_plain(top)
+        for place, folders, files in os.walk(top):
+            for name in (*folders, *files):
+                check_plain(Path(place, name))
+            found += [Path(place, name) for name in files if name.startswith(".") and name.endswith(".part")]
+    return found
 
 
 def _make_whole(path: Path, plan: SweepPlan, *, coordinates: bool) -> None:
@@ -335,7 +361,10 @@ def locked(folder: Path) -> Iterator[None]:
         OSError: if the folder cannot be written to.
     """
     path = folder / _LOCK
-    with path.open("a+", encoding="utf-8") as file:
+    check_plain(path)
+    with os.fdopen(_open_itself(path), "a+", encoding="utf-8") as file:
+        if os.fstat(file.fileno()).st_nlink > 1:
+            raise OSError(errno.EMLINK, "is another file, too (a hard link); delete it", str(path))
         try:
             _lock(file.fileno())
         except OSError as error:
@@ -350,6 +379,12 @@ def locked(folder: Path) -> Iterator[None]:
         file.write(f"process {os.getpid()} on {socket.gethostname()}\n")
         file.flush()
         yield
+
+
+def _open_itself(path: Path) -> int:
+    """Open a file to append to it, never what a link points to, and without waiting for the other end of a pipe."""
+    careful = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+    return os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | careful, 0o666)
 
 
 def _lock(descriptor: int) -> None:

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from afm_jax.apparatus.scene import Scene
-from afm_jax.checks import require_float64
+from afm_jax.apparatus.scene import SceneLike, as_scene
+from afm_jax.checks import checked, require_float64
 from afm_jax.compilation_cache import available_cores, silence_xla
 from afm_jax.scenefile.scenefile import Start, scene_tables
 from afm_jax.sweeps.plan import Columns, SweepPlan, plan_of
@@ -52,8 +52,9 @@ class SweepRun(NamedTuple):
     seconds: float
 
 
+@checked
 def sweep(  # noqa: PLR0913
-    scene: Scene,
+    scene: SceneLike,
     axes: Sequence[Mapping[str, Any]],
     record: str | Mapping[str, Any],
     *,
@@ -92,6 +93,7 @@ def sweep(  # noqa: PLR0913
         RuntimeError: if JAX is not set to 64-bit floats, or workers fail again and again.
         ValueError: if the input is impossible, or the folder holds another sweep or is being written to.
     """
+    scene = as_scene(scene)
     require_float64(scene)
     settings = {"what": record} if isinstance(record, str) else dict(record)
     given = {
@@ -135,7 +137,7 @@ def run_plan(
     """Compute what a folder does not hold yet of a sweep; arguments and errors as of `sweep`."""
     folder.mkdir(parents=True, exist_ok=True)
     begin = time.monotonic()
-    kept, computed, first = Kept(frozenset(), frozenset()), 0, 0.0
+    kept, computed, first = None, 0, 0.0
     try:
         with locked(folder):
             store = open_store(folder, plan)
@@ -153,8 +155,11 @@ def run_plan(
                     rate = (computed - 1) * share / (passed - first)
                     report(round((len(kept.done) + computed) * share), plan.points, rate)
     except OSError as error:
+        if kept is None:
+            raise
         count = len(kept.done) + computed
-        what = f"{error.strerror or error}: {count} of {plan.chunks} chunks are kept; mend that"
+        where = f"{error.filename}: " if error.filename and Path(error.filename) != folder else ""
+        what = f"{where}{error.strerror or error}: {count} of {plan.chunks} chunks are kept; mend that"
         raise OSError(error.errno, f"{what}, and give the same command again", str(folder)) from error
     return SweepRun(plan.chunks, kept, computed, time.monotonic() - begin)
 

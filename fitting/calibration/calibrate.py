@@ -1,18 +1,20 @@
 """Free resonance calibration: natural frequency and quality factor of a cantilever from a sweep."""
 
+import os
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 from scipy.ndimage import median_filter, uniform_filter1d
 from scipy.special import digamma
 
-from afm_jax.checks import require_float64
+from afm_jax.checks import checked, require_float64
 from afm_jax.least_squares import chi2_tail
 from afm_jax.version import version_of
 from fitting.calibration.model import TERMS, SweepFit, fit_sweep, kind_of, model_at, refit, sum_without_resonance
 from fitting.calibration.result import Alternative, CalibratedValue, Calibration, Curves
-from fitting.calibration.sweep import ResonanceSweep
+from fitting.calibration.sweep import ResonanceSweep, read_sweep
 from fitting.calibration.verdict import (
     IMPROBABLE,
     SweepEvidence,
@@ -29,8 +31,9 @@ from fitting.tables.csv_text import TableError
 _PACKAGES = ("afm-jax", "jax", "optax", "numpy")
 
 
+@checked
 def calibrate(
-    sweep: ResonanceSweep,
+    sweep: ResonanceSweep | str | os.PathLike[str],
     *,
     background: str | None = None,
     noise: float | None = None,
@@ -63,6 +66,8 @@ def calibrate(
         TableError: if the sweep has too few points for the model, or its amplitude is the same everywhere.
         RuntimeError: if JAX is not set to 64-bit floats.
     """
+    if not isinstance(sweep, ResonanceSweep):
+        sweep = read_sweep(Path(os.fspath(sweep)))
     require_float64()
     kind = kind_of(sweep)
     first = ("floor" if sweep.spectrum else "constant") if background is None else background

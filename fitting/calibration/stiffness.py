@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 from scipy.special import kv, stdtrit
 
+from afm_jax.checks import checked
 from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from afm_jax.words import interval, known, text_table, with_error
@@ -80,6 +81,7 @@ def air_at(temperature_k: float, pressure_pa: float = 101325.0) -> tuple[float, 
     return pressure_pa / (287.05 * temperature_k), 1.458e-6 * temperature_k**1.5 / (temperature_k + 110.4)
 
 
+@checked
 def equipartition(
     calibration: Calibration, *, temperature_k: tuple[float, float] | None = None, static: bool = True
 ) -> Stiffness:
@@ -109,6 +111,7 @@ def equipartition(
     return Stiffness("equipartition", _with_share(value, share), assumed)
 
 
+@checked
 def sader(
     calibration: Calibration,
     *,
@@ -154,6 +157,7 @@ def _with_share(value: float, share: float) -> CalibratedValue:
     return CalibratedValue(value, value * share, ends, None)
 
 
+@checked
 def sensitivity(curves: list[MeasuredCurve]) -> Stiffness:
     """Return the sensitivity in nm/V (InvOLS) from the slope of force curves on a hard sample.
 

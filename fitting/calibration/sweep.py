@@ -28,7 +28,9 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int
 
+from afm_jax.checks import checked
 from afm_jax.results import Result, public_result
+from afm_jax.whole_files import first_bytes
 from fitting.instruments.formats import holds_curves, read_recording
 from fitting.instruments.recording import UNITS, Recording
 from fitting.tables.csv_text import (
@@ -281,6 +283,7 @@ def _check_numbers(
         faults.add(f"{must}, but is {number}; correct it or remove the row", line=int(lines[row]), column=name)
 
 
+@checked
 def read_sweep(path: str | Path) -> ResonanceSweep:
     """Read a free resonance sweep from plain CSV or Nanonis text, or a thermal spectrum, and check all of it.
 
@@ -291,8 +294,8 @@ def read_sweep(path: str | Path) -> ResonanceSweep:
         TableError: one line that names the first fault, its place and how to mend it, and the number of other faults.
     """
     faults = Faults(str(path))
-    with contextlib.suppress(OSError), Path(path).open("rb") as file:
-        head = file.read(4096)
+    with contextlib.suppress(OSError):
+        head = first_bytes(path, 4096)
         if head.startswith(b"[DataSet]"):
             return _spectrum_of(read_recording(path))
         if holds_curves(head, str(path)):

@@ -6,13 +6,13 @@ The belief that a fit leaves: its values, its covariance, and the drives that we
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import compress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.checks import checked
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.results import Result, public_result
 from afm_jax.scenefile.tables import printable
@@ -22,7 +22,6 @@ from fitting.parameters import (
     MODELS,
     NUISANCE_NAMES,
     PARAMETERS,
-    SHAPE_NAMES,
     Parameter,
     model_parameters,
     paper_values,
@@ -103,6 +102,7 @@ def size_of(parameter: Parameter, value: float) -> float:
     return size or parameter.width or 1.0
 
 
+@checked
 def believe(  # noqa: PLR0913
     model: str = "law+delay",
     *,
@@ -250,14 +250,8 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
     # of several tables the first one's cantilever is designed with
     table, drive = tables[0], tables[0].get("drive") or "sample"
     driven = [one for one in tables if (one.get("drive") or "sample") == drive]
-    # the shapes of loss and delay are known beforehand, not to be determined: what they do to the others stays
-    kept = [name not in SHAPE_NAMES for name in payload["parameters"]]
-    found = dict(compress(payload["parameters"].items(), kept))
-    matrix = [list(compress(row, kept)) for row in compress(payload["correlations"]["matrix"], kept)]
-    # amplitudes are expected of a law without shapes
-    believed = {name: entry["value"] for name, entry in found.items()} | (payload.get("plain_law") or {}).get(
-        "values", {}
-    )
+    found, matrix = payload["parameters"], payload["correlations"]["matrix"]
+    believed = {name: entry["value"] for name, entry in found.items()}
     problem = Problem(payload["model"], tuple(found), tuple(settings.get("effects") or EFFECTS), drive)
     notes = []
     if not payload["valid"]:
@@ -331,10 +325,6 @@ def _is_whole(payload: Mapping[str, Any]) -> bool:
         drives = all(np.array(of_one, float).ndim == 2 for of_one in columns)
         whole = np.isfinite([number for entry in entries for number in entry]).all()
         whole &= not np.any(beyond(np.array([error for _, error in entries], float), positive=True))
-        if (plain := payload.get("plain_law")) is not None:
-            spread = np.array(plain["covariance"], float)
-            whole &= bool(np.isfinite([*plain["values"].values(), *spread.ravel()]).all())
-            whole &= {*plain["values"]} <= {*payload["parameters"]} and spread.shape == (len(plain["values"]),) * 2
         known = all(math.isfinite(table["free_frequency_khz"]) for table in tables)
         return bool(whole) and known and drives and np.array(matrix, float).shape == (len(entries), len(entries))
     except (AttributeError, KeyError, TypeError, ValueError):

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
+from afm_jax.checks import checked
 from afm_jax.least_squares import covariance_of
 from fitting.experiments.belief import Belief, size_of
 from fitting.fits.fit import speed_range
@@ -30,6 +31,7 @@ PHASE_NOISE_DEG = 0.2
 Numbers = Sequence[int | float] | Shaped[np.ndarray, " n"]
 
 
+@checked
 def drive_grid(  # noqa: PLR0913
     *,
     orders: Numbers,

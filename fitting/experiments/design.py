@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from afm_jax.checks import require_float64
+from afm_jax.checks import checked, require_float64
 from afm_jax.least_squares import covariance_of
 from afm_jax.version import version_of
 from fitting.experiments.belief import Belief, belief_of_fit, size_of
@@ -233,6 +233,7 @@ def _edges(candidates: Candidates, chosen: Int[np.ndarray, " points"], *, tappin
 _PACKAGES = ("afm-jax", "jax", "numpy")
 
 
+@checked
 def design(  # noqa: PLR0913
     belief: Belief | FitResult,
     drives: Drives,

@@ -7,14 +7,14 @@ from typing import Any, TypeVar
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.checks import require_float64
+from afm_jax.checks import checked, require_float64
 from afm_jax.results import Result, public_result
 from fitting.fits.fit import Found, find_fit, summarise, tables_of
 from fitting.fits.minimum import Strain, relaxed, settle
 from fitting.fits.result import FitResult
 from fitting.parameters import CONTACT_NAMES, LAWS, MODELS, model_parameters
 from fitting.tables.several import SeveralTables
-from fitting.tables.table import AmplitudeTable
+from fitting.tables.table import TableLike
 
 _T = TypeVar("_T")
 _EVEN, _LEANS, _PLAIN = 2.0, 6.0, 10.0
@@ -58,8 +58,9 @@ def rivals(model: str, fixed: Mapping[str, float] | None = None) -> tuple[str, .
     return (model, *(other for other in others if set(MODELS[other]) - set(fixed or {})))
 
 
+@checked
 def compare(
-    table: AmplitudeTable | SeveralTables | Sequence[AmplitudeTable],
+    table: TableLike | SeveralTables | Sequence[TableLike],
     models: Sequence[str] = ("law+delay", "viscous+delay"),
     *,
     report: Callable[[str], None] | None = None,

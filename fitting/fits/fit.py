@@ -5,7 +5,7 @@ The fitted impact law over the speeds that were measured, with the band that its
 What a minimum amounts to: errors, intervals, checks, and a verdict on whether to believe it.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from afm_jax.checks import require_float64
+from afm_jax.checks import checked, require_float64
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.lasting_impact import LawImpact, PulledImpact
 from afm_jax.least_squares import chi2_tail
@@ -30,7 +30,16 @@ from fitting.fits.intervals import (
     profile_intervals,
     within_range,
 )
-from fitting.fits.loss import Loss, energy_lost, equivalent, interval_of
+from fitting.fits.loss import (
+    EV_PER_AJ,
+    Loss,
+    WithInterval,
+    energy_lost,
+    interval_of,
+    nearness,
+    rebound_by_formula,
+    scaled,
+)
 from fitting.fits.minimum import (
     ATTRACTED,
     Minimum,
@@ -45,16 +54,17 @@ from fitting.fits.minimum import (
     untabulated,
 )
 from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective
-from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows, FittedTable, PlainLaw, Scatter
+from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows, FittedTable, Scatter
 from fitting.fits.several import Between, Pull, departures_of, parts_of, pulls_of, scatter_between
 from fitting.fits.unmodelled import (
+    ClosestMember,
     LawAfter,
     LawBefore,
     LinearStep,
     StepSystem,
     Unmodelled,
+    closest_member,
     law_after,
-    plain_law,
     root_of,
     rows_of_fit,
     step_of,
@@ -73,7 +83,7 @@ from fitting.models import (
 )
 from fitting.parameters import NUISANCE_NAMES, is_of_one_table, model_parameters, name_of_table, parameter_called
 from fitting.tables.several import SeveralTables
-from fitting.tables.table import AmplitudeTable
+from fitting.tables.table import AmplitudeTable, as_table
 
 _POINTS = 121
 
@@ -146,16 +156,18 @@ def law_before(
 def loss_of(
     found: Callable[[Float[np.ndarray, " n"]], LawAfter],
     measured: tuple[float, float],
-    asked: tuple[float, float] | None,
     mass_ng: float,
+    parameters: Mapping[str, FittedParameter],
+    formula: Mapping[str, float] | None,
 ) -> Loss:
-    """Return what impacts take: energies at measured speeds, the paper's laws over these and over those asked for.
+    """Return what impacts take: energies at measured speeds, and what the printed parameters say.
 
     Args:
         found: the law at approach speeds in nm/us.
         measured: slowest and fastest approach in nm/us.
-        asked: the same of another range; None: no other.
         mass_ng: of the tip.
+        parameters: of the fit.
+        formula: values of the model's formula, those that are held included; None: it has none.
     """
     three = np.geomspace(*measured, 3)
     # two digits, and within what was measured
@@ -166,15 +178,23 @@ def loss_of(
         energy_lost(float(u), float(w), float(e), mass_ng)
         for u, w, e in zip(three, there.law[0, :3], error[:3], strict=True)
     ]
-    laws = []
-    for ends in (measured, asked):
-        if ends is not None and ends[0] < ends[1]:
-            speeds = np.linspace(*ends, _POINTS)
-            law = found(speeds)
-            laws.append(equivalent(speeds, law.law[0], law.factor[0], mass_ng))
+    r, epsilon = (
+        WithInterval(one.value, one.interval95) if one is not None else None
+        for one in (parameters.get("r"), parameters.get("epsilon"))
+    )
+    delta = None if epsilon is None else scaled(epsilon, 0.5 * mass_ng)
+    off = None
+    if formula is not None:
+        speeds = np.geomspace(*measured, _POINTS)
+        off = nearness(speeds, found(speeds).law[0], rebound_by_formula(formula, speeds))
     return Loss(
         energies=tuple(dict.fromkeys(energies)),
-        equivalents=tuple(law for law in laws if law is not None),
+        r=r,
+        epsilon_nm2_per_us2=epsilon,
+        delta_aj=delta,
+        delta_ev=None if delta is None else scaled(delta, EV_PER_AJ),
+        formula_off=None if off is None else off.off,
+        formula_off_at_nm_per_us=None if off is None else off.at_nm_per_us,
         capture_speed_nm_per_us=interval_of(there.capture, float(np.linalg.norm(there.capture_factor)), lowest=0.0),
     )
 
@@ -241,7 +261,7 @@ class _Summary:
     """Turns a minimum into a `FitResult`: the step with what the model leaves out, errors, intervals, checks, verdict.
 
     ``values``, ``covariance``, ``free`` and ``minimum_chi2`` are those of the minimum; ``ends``, ``spread`` and
-    ``chi2``, of the ``parameters``, those after the step.
+    ``chi2``, of the ``parameters``, those after the step: of the model's law that is closest to the law after it.
     """
 
     def __init__(self, table: AmplitudeTable | SeveralTables, found: Found):
@@ -327,8 +347,11 @@ class _Summary:
 
     def _take(self, step: LinearStep, left_out: Unmodelled) -> None:
         """Go on with values, errors and residuals after the step."""
-        self.names, self.ends, self.spread = step.names, step.values, step.covariance
-        self.constraints |= left_out.priors
+        count = len(self.names)
+        self.ends, self.spread = step.values[:count], step.covariance[:count, :count]
+        member = self._closest_member(step, left_out)
+        if member is not None:
+            self.ends, self.spread = member.values, member.covariance
         if not self.searching.robust:
             self.chi2 = step.chi2
         count, error = self.table.rows, np.asarray(self.searching.measurement.rows.error_nm)
@@ -400,8 +423,7 @@ class _Summary:
                 self.used_speeds,
                 self.after,
             ),
-            loss=self._loss(shown_covariance),
-            plain_law=self._plain_law() if explained else None,
+            loss=self._loss(shown_covariance, evidence.parameters),
             rows=rows,
             residual_autocorrelation=evidence.autocorrelation,
             convergence=self.convergence,
@@ -453,7 +475,7 @@ class _Summary:
             )
         return tuple(told)
 
-    def _loss(self, shown: Float[np.ndarray, "k k"]) -> Loss | None:
+    def _loss(self, shown: Float[np.ndarray, "k k"], parameters: Mapping[str, FittedParameter]) -> Loss | None:
         """Return what impacts take; None where no row has a speed."""
         if not np.isfinite(self.used_speeds).any():
             return None
@@ -462,22 +484,22 @@ class _Summary:
         def found(speeds: Float[np.ndarray, " n"]) -> LawAfter:
             return law_at(self.problem, measurement, self.values, shown, speeds, self.after)
 
-        asked = self.settings.get("speeds")
-        return loss_of(found, speed_range(self.used_speeds), asked, float(measurement.cantilever.mass_ng))
+        formula = None
+        if self.problem.model != "contact":
+            formula = self.settings["fixed"] | {name: one.value for name, one in parameters.items()}
+        mass = float(measurement.cantilever.mass_ng)
+        return loss_of(found, speed_range(self.used_speeds), mass, parameters, formula)
 
-    def _plain_law(self) -> PlainLaw | None:
-        """Return what scenes and designs take for the law; None where that is what was fitted."""
-        if self.after is None or self.problem.model == "contact" or not self.problem.lasting:
+    def _closest_member(self, step: LinearStep, left_out: Unmodelled) -> ClosestMember | None:
+        """Return the model's law that is closest to the law after the step; None where the step is all there is."""
+        if self.problem.model == "contact" or not self.problem.lasting:
             return None
-        speeds = np.geomspace(*speed_range(self.used_speeds), _POINTS)
-        before = law_before(self.problem, self.objective.measurement, self.values, speeds)
-        found = plain_law(*self.after, speeds, before, self.values, self.free)
-        if found is None:
-            return None
-        # what one of several tables has to itself belongs to its instrument
-        kept = [i for i, name in enumerate(found.values) if not is_of_one_table(name)]
-        values = {name: value for name, value in found.values.items() if not is_of_one_table(name)}
-        return PlainLaw(values, found.covariance[np.ix_(kept, kept)])
+        speeds = self.used_speeds[np.isfinite(self.used_speeds)]
+        # one program for rows of any number up to that of a law's points
+        filled = np.append(speeds, np.full(-speeds.size % _POINTS, speeds[-1]))
+        before = law_before(self.problem, self.objective.measurement, self.values, filled)
+        there = before._replace(law=before.law[:, : speeds.size], slope=before.slope[:, : speeds.size])
+        return closest_member(step, left_out, speeds, there, self.free)
 
     def _explained_parameters(self, moved: Bool[np.ndarray, " k"]) -> dict[str, FittedParameter]:
         """Return the parameters with their errors and, where all are determined, their intervals."""
@@ -491,17 +513,13 @@ class _Summary:
         return self._parameters(errors, intervals, moved)
 
     def _widened(self, profiles: list[Interval], errors: Float[np.ndarray, " k"]) -> list[Interval]:
-        """Return profile intervals that have moved with their values and grown with their errors; of shapes, Wald's."""
+        """Return profile intervals that have moved with their values and grown with their errors."""
         intervals = []
         before = np.sqrt(np.diag(self.covariance))
         for i, name in enumerate(self.names):
-            if i < len(profiles):
-                ends, reason = (profiles[i].low, profiles[i].high), profiles[i].reason
-                growth = errors[i] / before[i] if before[i] > 0.0 else 1.0
-                low, high = (None if e is None else self.ends[i] + growth * (e - self.values[i]) for e in ends)
-            else:
-                reason, reach = None, TWO_SIDED_95 * errors[i]
-                low, high = self.ends[i] - reach, self.ends[i] + reach
+            ends, reason = (profiles[i].low, profiles[i].high), profiles[i].reason
+            growth = errors[i] / before[i] if before[i] > 0.0 else 1.0
+            low, high = (None if e is None else self.ends[i] + growth * (e - self.values[i]) for e in ends)
             intervals.append(within_range(parameter_called(name), Interval(low, high, reason)))
         return intervals
 
@@ -611,6 +629,7 @@ _FEWEST_LEFT, _LEAST_LEFT = 4, 0.2
 """Rows of a driven tip, and their share, of which at least a law of impacts is read off."""
 
 
+@checked
 def fit(  # noqa: PLR0913
     table: AmplitudeTable | Sequence[AmplitudeTable] | Any,
     model: str = "law",
@@ -623,15 +642,14 @@ def fit(  # noqa: PLR0913
     constraints: dict[str, tuple[float, float]] | None = None,
     effects: Sequence[str] = EFFECTS,
     robust: bool = False,
-    speeds: tuple[float, float] | None = None,
 ) -> FitResult:
     """Fit an impact law to measured amplitudes of single-impact orbits.
 
     Args:
-        table: from `read_table`, or a data frame as `AmplitudeTable.from_dataframe` takes it; what it gives with an
-            error (Q, calibrations) is a nuisance with that constraint. A Q without error is taken to be known to 2 %
-            where impacts last, and exactly by the instantaneous laws. Several of them: one law for all, each with
-            nuisances of its own.
+        table: from `read_table`, the path of a file, or a data frame as `AmplitudeTable.from_dataframe` takes it; what
+            it gives with an error (Q, calibrations) is a nuisance with that constraint. A Q without error is taken to
+            be known to 2 % where impacts last, and exactly by the instantaneous laws. Several of them: one law for all,
+            each with nuisances of its own.
         model: "restitution" (r), "law" (r, epsilon; eq. 6), "viscous" (epsilon, viscous_loss) or "full" (all three),
             each instantaneous or with "+delay", the collision delay; or "contact", physical parameters through the
             resolved contact, which a tapping curve gives on resonance too.
@@ -650,8 +668,6 @@ def fit(  # noqa: PLR0913
         effects: for "contact": the effects there are.
         robust: let outliers count linearly from two errors on; the result is valid only if they are few and the other
             amplitudes are explained.
-        speeds: slowest and fastest approach in nm/us over which the closest law of the paper is given, besides that
-            over the measured speeds.
 
     Returns:
         Values, errors, intervals, goodness of fit and a verdict; see `FitResult`.
@@ -665,7 +681,6 @@ def fit(  # noqa: PLR0913
     options |= {
         "scale_errors": scale_errors,
         "robust": robust,
-        "speeds": speeds,
         "share": share,
         "hierarchical": hierarchical,
     }
@@ -673,13 +688,19 @@ def fit(  # noqa: PLR0913
     return summarise(whole, find_fit(whole, model, **options))
 
 
+def _one_table(given: Any) -> AmplitudeTable:
+    return AmplitudeTable.from_dataframe(given) if hasattr(given, "columns") else as_table(given)
+
+
 def tables_of(given: Any) -> AmplitudeTable | SeveralTables:
     """Return what was given as a table, or as several."""
-    if isinstance(given, AmplitudeTable | SeveralTables):
+    if isinstance(given, SeveralTables):
         return given
-    if not isinstance(given, Sequence):
-        return AmplitudeTable.from_dataframe(given)
-    tables = [one if isinstance(one, AmplitudeTable) else AmplitudeTable.from_dataframe(one) for one in given]
+    if isinstance(given, str) or not isinstance(given, Sequence):
+        return _one_table(given)
+    if not given:
+        raise ValueError("there is no table: give one, or the path of one")
+    tables = [_one_table(one) for one in given]
     return tables[0] if len(tables) == 1 else SeveralTables(tuple(tables))
 
 
@@ -695,12 +716,9 @@ def find_fit(  # noqa: PLR0913
     constraints: dict[str, tuple[float, float]] | None = None,
     effects: Sequence[str] = EFFECTS,
     robust: bool = False,
-    speeds: tuple[float, float] | None = None,
 ) -> Found:
     """Return the minimum of a fit; arguments and errors as of `fit`."""
     require_float64()
-    if speeds is not None and not 0.0 < speeds[0] < speeds[1] < np.inf:
-        raise ValueError(f"`speeds` must be a rising pair of positive numbers in nm/us, but is {speeds!r}")
     if isinstance(table, AmplitudeTable):
         for name, asked in (("share", share), ("hierarchical", hierarchical)):
             if asked:
@@ -732,7 +750,6 @@ def find_fit(  # noqa: PLR0913
         "free": list(problem.own),
         "fixed": dict(fixed or {}),
         "effects": list(effects) if model == "contact" else None,
-        "speeds": speeds,
     }
     if isinstance(table, SeveralTables):
         settings |= {"share": list(share), "hierarchical": hierarchical}

@@ -1,11 +1,12 @@
-"""What a fitted impact takes, in the quantities that people ask for: energies, the paper's r and delta, capture."""
+"""What a fitted impact takes, in the quantities that people ask for: energies, r and delta, capture."""
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.contact.law_of_contact import closest_law
 from afm_jax.units import TWO_SIDED_95
 
 EV_PER_AJ = 1.0 / 0.1602176634
@@ -30,28 +31,28 @@ class EnergyLost:
 
 
 @dataclass(frozen=True)
-class Equivalent:
-    """The paper's law (eq. 6) that comes closest to the fitted one over a range of approach speeds in nm/us.
+class Loss:
+    """What impacts take: energies at three speeds that were measured, and what the printed parameters say.
 
-    Least squares of the rebound speed at even speeds, as of the paper's own fit. ``delta`` is m epsilon/2, the energy
-    lost to adhesion; ``worst_error`` how far this law is off somewhere, relative to the fitted rebound speed.
+    Attributes:
+        energies: at three speeds, of the law.
+        r: the fit's parameter; None of a model without.
+        epsilon_nm2_per_us2: likewise.
+        delta_aj: energy lost to adhesion, m epsilon/2.
+        delta_ev: in electron volts.
+        formula_off: largest distance of the formula with the printed parameters from the law, over the measured speeds,
+            relative to the rebound speed; None of a model without a formula.
+        formula_off_at_nm_per_us: approach speed where it is that far.
+        capture_speed_nm_per_us: of the law, extrapolated.
     """
 
-    slowest_nm_per_us: float
-    fastest_nm_per_us: float
-    r: WithInterval
-    epsilon_nm2_per_us2: WithInterval
-    delta_aj: WithInterval
-    delta_ev: WithInterval
-    worst_error: float
-
-
-@dataclass(frozen=True)
-class Loss:
-    """Energies at three speeds that were measured, the paper's laws over ranges, the capture speed (extrapolated)."""
-
     energies: tuple[EnergyLost, ...]
-    equivalents: tuple[Equivalent, ...]
+    r: WithInterval | None
+    epsilon_nm2_per_us2: WithInterval | None
+    delta_aj: WithInterval | None
+    delta_ev: WithInterval | None
+    formula_off: float | None
+    formula_off_at_nm_per_us: float | None
     capture_speed_nm_per_us: WithInterval
 
 
@@ -82,38 +83,50 @@ def energy_lost(speed: float, rebound: float, error: float, mass_ng: float) -> E
     return EnergyLost(speed, taken, scaled(taken, EV_PER_AJ))
 
 
-def equivalent(
+def rebound_by_formula(values: Mapping[str, float], speeds: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return u_out of the formula of a law's parameters at approach speeds in nm/us; 0 where the tip is captured."""
+    square = (values.get("r", 1.0) * speeds) ** 2 - values.get("viscous_loss", 0.0) * speeds
+    return np.sqrt(np.maximum(square - values.get("epsilon", 0.0), 0.0))
+
+
+class Nearness(NamedTuple):
+    """How near formulas of a family come to a law: the largest distance, relative to the rebound speed, and where."""
+
+    off: float
+    at_nm_per_us: float
+
+
+def nearness(
+    speeds: Float[np.ndarray, " n"], rebound: Float[np.ndarray, " n"], formula: Float[np.ndarray, " n"]
+) -> Nearness:
+    """Return how far rebound speeds of a formula are from those of a law, 0 where the tip is captured."""
+    off = np.where(rebound > 0.0, np.abs(formula / np.where(rebound > 0.0, rebound, 1.0) - 1.0), 0.0)
+    worst = int(np.argmax(off))
+    return Nearness(float(off[worst]), float(speeds[worst]))
+
+
+def nearest_of(
+    family: Sequence[str],
     speeds: Float[np.ndarray, " n"],
     rebound: Float[np.ndarray, " n"],
-    factor: Float[np.ndarray, "n k"],
-    mass_ng: float,
-) -> Equivalent | None:
-    """Return the closest law of the paper; None where the tip is captured at most speeds.
+    half_width: Float[np.ndarray, " n"],
+) -> Nearness:
+    """Return how near the laws of a family of losses come to a law.
+
+    Least squares in the rebound speed over the half-width of its band, the losses not negative.
 
     Args:
+        family: of r, viscous_loss and epsilon those that the family has.
         speeds: approach speeds in nm/us.
-        rebound: rebound speeds, 0 where the tip is captured.
-        factor: changes of the rebound speed with independent unknowns of unit variance; NaN: not known.
-        mass_ng: of the tip.
+        rebound: of the law.
+        half_width: of its band.
     """
-    free = rebound > 0.0
-    if 2 * free.sum() < free.size:
-        return None
-    u, w = speeds[free], rebound[free]
-    law, _ = closest_law(u, w, "law", "absolute")
-    r, epsilon = float(law.r), float(law.epsilon)
-    # w = sqrt(r^2 u^2 - epsilon) to first order in r and epsilon
-    slope = np.stack([r * u**2, np.full_like(u, -0.5)], axis=1) / w[:, None]
-    spread = np.linalg.pinv(slope) @ factor[free] if np.isfinite(factor).all() else np.full((2, 1), np.nan)
-    error_of_r, error_of_epsilon = np.sqrt(np.sum(spread**2, axis=1)).tolist()
-    adhesion = interval_of(epsilon, error_of_epsilon, lowest=0.0)
-    delta = scaled(adhesion, 0.5 * mass_ng)
-    return Equivalent(
-        slowest_nm_per_us=float(u[0]),
-        fastest_nm_per_us=float(u[-1]),
-        r=interval_of(r, error_of_r, highest=1.0),
-        epsilon_nm2_per_us2=adhesion,
-        delta_aj=delta,
-        delta_ev=scaled(delta, EV_PER_AJ),
-        worst_error=float(np.max(np.abs(np.sqrt(np.maximum((r * u) ** 2 - epsilon, 0.0)) / w - 1.0))),
-    )
+    from scipy.optimize import nnls  # noqa: PLC0415 (half a second that most fits do not need)
+
+    free = (rebound > 0.0) & (half_width > 0.0)
+    u, w, weight = speeds[free], rebound[free], 0.5 / (rebound[free] * half_width[free])
+    columns = {"r": u**2, "viscous_loss": u, "epsilon": np.ones_like(u)}
+    matrix = np.stack([columns[name] for name in family], axis=1)
+    scale = np.linalg.norm(weight[:, None] * matrix, axis=0)
+    size, _ = nnls(weight[:, None] * matrix / scale, weight * (u**2 - w**2))
+    return nearness(u, w, np.sqrt(np.maximum(u**2 - matrix @ (size / scale), 0.0)))

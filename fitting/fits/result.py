@@ -10,11 +10,9 @@ from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from fitting.fits.intervals import Convergence
 from fitting.fits.loss import Loss
+from fitting.tables.csv_text import FIT_FORMAT_VERSION
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable
-
-FORMAT_VERSION = 1
-"""Version of the JSON layout; raised when a key changes its meaning or goes."""
 
 
 @dataclass(frozen=True)
@@ -60,21 +58,6 @@ class FittedLaw:
     collision_delay_us: Float[np.ndarray, " points"]
     delay_low_us: Float[np.ndarray, " points"]
     delay_high_us: Float[np.ndarray, " points"]
-
-
-@dataclass(frozen=True)
-class PlainLaw:
-    """The law of a model's parameters alone that comes closest to a fitted one over the measured speeds.
-
-    A fit's own law has besides what its model leaves out (the numbers of its shapes, smooth parts); a scene's has not.
-
-    Attributes:
-        values: of the parameters, and of the nuisances as fitted, by name.
-        covariance: of these, with all that the model leaves out; 0 for one that is held at its bound.
-    """
-
-    values: dict[str, float]
-    covariance: Float[np.ndarray, "p p"]
 
 
 @dataclass(frozen=True)
@@ -157,7 +140,8 @@ class FitResult(Result):
 
     Attributes:
         model: the model's name.
-        parameters: by name, the law's first.
+        parameters: by name, the law's first: where impacts last those of the model's formula that is closest to `law`
+            over the speeds of the rows that were used, with errors that contain what the formula leaves out.
         correlations: matrix in the parameters' order; NaN where a variance is unknown.
         chi2: sum of squared normalised residuals, constraints included, and where impacts last what the model leaves
             out; with a robust fit the soft sum of the residuals alone.
@@ -169,9 +153,8 @@ class FitResult(Result):
         reasons: what makes the result invalid.
         warnings: what a reader should know besides.
         law: the fitted impact law with its band.
-        loss: what an impact takes: energies, the paper's r and delta, the capture speed; None if no speed was reached.
-        plain_law: what scenes and designs take for the law; None where the parameters themselves are that, or are not
-            determined.
+        loss: what an impact takes: energies, delta, how far formula and law part, the capture speed; None if no speed
+            was reached.
         rows: measured and predicted amplitudes.
         residual_autocorrelation: lag-1 correlation of neighbouring rows' residuals.
         convergence: what the checks of the minimum found.
@@ -204,13 +187,12 @@ class FitResult(Result):
     loss: Loss | None = None
     tables: tuple[FittedTable, ...] = ()
     scatter: dict[str, Scatter] = field(default_factory=dict)
-    plain_law: PlainLaw | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain lists, numbers and strings; what is not known is None."""
         return {
             "format": "afm-jax fit",
-            "format_version": FORMAT_VERSION,
+            "format_version": FIT_FORMAT_VERSION,
             "model": self.model,
             "valid": self.valid,
             "reasons": self.reasons,
@@ -225,7 +207,6 @@ class FitResult(Result):
             "residual_autocorrelation": plain(self.residual_autocorrelation),
             "law": {name: plain(column) for name, column in vars(self.law).items()},
             "loss": None if self.loss is None else plain(asdict(self.loss)),
-            "plain_law": None if self.plain_law is None else plain(asdict(self.plain_law)),
             "rows": {name: plain(column) for name, column in vars(self.rows).items()},
             "convergence": plain(asdict(self.convergence)),
             "input": plain({"tables": [*map(vars, self.table.tables)]} if self.tables else vars(self.table)),

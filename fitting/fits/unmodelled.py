@@ -23,10 +23,9 @@ from jaxtyping import Bool, Float
 from afm_jax.least_squares import covariance_of
 from fitting.fits.minimum import Strain, padding
 from fitting.fits.objective import ROBUST, Objective
-from fitting.fits.result import PlainLaw
 from fitting.forward import ImpactSlopes, free_impacts, impact_at, impact_slopes
 from fitting.models import Problem
-from fitting.parameters import DELAY_SHAPE, LOSS_SHAPE, parameter_called
+from fitting.parameters import DELAY_NAMES, DELAY_SHAPE, LOSS_SHAPE, parameter_called
 
 LOSS_SPEED_SQUARED = 110.0, 60.0
 """q in nm^2/us^2 of a tip of 1 ng and its standard error: free fits of contacts' laws give 96 to 125, a wet one 234."""
@@ -440,23 +439,35 @@ def law_after(step: LinearStep, left_out: Unmodelled, speeds: Float[np.ndarray, 
     return whole._replace(capture=capture, capture_factor=capture_factor[0, 0])
 
 
-def plain_law(
+class ClosestMember(NamedTuple):
+    """The parameters of the law of a model's family that is closest to the law after the step, and their covariance."""
+
+    values: Float[np.ndarray, " p"]
+    covariance: Float[np.ndarray, "p p"]
+
+
+_TURNS = 8
+"""Gauss-Newton steps to the closest member: squared rebound speeds are nearly linear in what is fitted."""
+
+
+def closest_member(
     step: LinearStep,
     left_out: Unmodelled,
     speeds: Float[np.ndarray, " n"],
     before: LawBefore,
-    begin: Float[np.ndarray, " p"],
     free: Bool[np.ndarray, " p"],
-) -> PlainLaw | None:
-    """Return the parameters of the closest law without what is left out, the band's widths being its errors.
+) -> ClosestMember | None:
+    """Return the parameters of the model's own formula that comes closest to the law after the step.
+
+    Least squares in the rebound speed, then in the delay, each weighted by the law's variance, within the parameters'
+    bounds. The covariance is that of this projection of the law, and so contains all that the model leaves out.
 
     Args:
         step: the step.
         left_out: by the fitted model.
-        speeds: approach speeds in nm/us over which it is the closest.
+        speeds: approach speeds in nm/us at which the formula is compared: those of the rows that were used.
         before: the fitted law there.
-        begin: the fitted values.
-        free: which of these are not at their bound.
+        free: which of the parameters are not at their bound.
 
     Returns:
         None where the parameters are not determined.
@@ -464,22 +475,50 @@ def plain_law(
     after, names = law_after(step, left_out, speeds, before), left_out.problem.names
     if not (np.isfinite(step.covariance).all() and np.isfinite(after.factor).all()):
         return None
-    weight = 1.0 / np.maximum(np.linalg.norm(after.factor, axis=2), 1e-300)
-    own = np.array([name in left_out.problem.own for name in names])
-    slope = (weight[..., None] * before.slope)[:, before.law[0] > 0.0].reshape(-1, len(names))
-    missing, factor = (
-        (weight[:, :, None] * part.reshape(*weight.shape, -1))[:, before.law[0] > 0.0].reshape(len(slope), -1)
-        for part in (before.law - after.law, after.factor)
+    there = (before.law[0] > 0.0) & (after.law[0] > 0.0)
+    u, (rebound, delay), factor = speeds[there], after.law[:, there], after.factor[:, there]
+    weight = 1.0 / np.maximum(np.linalg.norm(factor, axis=2), 1e-300)
+    values, ends = (
+        step.values[: len(names)].copy(),
+        np.array([(p.lowest, p.highest) for p in left_out.problem.parameters]),
     )
-    ends = np.array([(p.lowest, p.highest) for p in map(parameter_called, names)])
-    moving = own & free
-    change = _bounded(missing[:, 0], slope, begin, ends, moving)
-    spread = np.zeros((len(names), factor.shape[1]))
+    spread = np.zeros((len(names), factor.shape[2]))
     spread[:, : len(step.names)] = root_of(step.covariance)[: len(names)]
-    spread[own] = 0.0
-    spread[moving] = np.linalg.lstsq(slope[:, moving], factor, rcond=None)[0]
-    values = np.where(own, begin + change, step.values[: len(names)])
-    return PlainLaw(dict(zip(names, values.tolist(), strict=True)), spread @ spread.T)
+    loss, late = (
+        np.array([i for i, name in enumerate(names) if name in some and free[i]], dtype=int)
+        for some in (("r", "epsilon", "viscous_loss"), DELAY_NAMES)
+    )
+    spread[[i for i, name in enumerate(names) if name in left_out.problem.own]] = 0.0
+
+    def known(name: str, absent: float) -> float:
+        return float(values[names.index(name)]) if name in names else left_out.values.get(name, absent)
+
+    def turned(places: np.ndarray, weights: np.ndarray, slope: np.ndarray, miss: np.ndarray) -> None:
+        moving = np.ones(places.size, dtype=bool)
+        values[places] += _bounded(weights * miss, weights[:, None] * slope, values[places], ends[places], moving)
+
+    def formula() -> tuple[np.ndarray, np.ndarray]:
+        r = known("r", 1.0)
+        square = (r * u) ** 2 - known("viscous_loss", 0.0) * u - known("epsilon", 0.0)
+        w = np.sqrt(np.maximum(square, (0.1 * rebound) ** 2))
+        by_name = {"r": r * u**2 / w, "epsilon": -0.5 / w, "viscous_loss": -0.5 * u / w}
+        return w, np.array([by_name[names[i]] for i in loss]).reshape(loss.size, u.size).T
+
+    for _ in range(_TURNS):
+        w, slope = formula()
+        turned(loss, weight[0], slope, w - rebound)
+    w, slope = formula()
+    spread[loss] = np.linalg.lstsq(weight[0][:, None] * slope, weight[0][:, None] * factor[0], rcond=None)[0]
+    columns = {"delay_hertz": u**-0.2, "delay_lead_nm": 1.0 / u - 1.0 / w, "delay_offset_nm": -1.0 / u}
+    time = np.sum([known(name, 0.0) * column for name, column in columns.items()], axis=0)
+    by_delay = np.array([columns[names[i]] for i in late]).reshape(late.size, u.size).T
+    turned(late, weight[1], by_delay, time - delay)
+    # the formula's delay changes with its rebound speed
+    along = known("delay_lead_nm", 0.0) / w[:, None] ** 2 * (slope @ spread[loss])
+    spread[late] = np.linalg.lstsq(weight[1][:, None] * by_delay, weight[1][:, None] * (factor[1] - along), rcond=None)[
+        0
+    ]
+    return ClosestMember(values, spread @ spread.T)
 
 
 def _moved(

@@ -15,7 +15,7 @@ from afm_jax.least_squares import chi2_tail
 from fitting.fits.intervals import Convergence
 from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.result import FittedParameter, FittedRows
-from fitting.parameters import DELAY_NAMES, SHAPE_NAMES, is_nuisance, name_of_table, parameter_called
+from fitting.parameters import DELAY_NAMES, is_nuisance, name_of_table, parameter_called
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable
 
@@ -227,11 +227,7 @@ def _scaled_misfits(evidence: Evidence) -> list[str]:
 
 def _pulls(evidence: Evidence) -> dict[str, float]:
     """Return how far each parameter is from what was measured of it, in standard errors of that."""
-    known = {
-        name: (p.value, *p.constraint)
-        for name, p in evidence.parameters.items()
-        if p.constraint is not None and name not in SHAPE_NAMES
-    }
+    known = {name: (p.value, *p.constraint) for name, p in evidence.parameters.items() if p.constraint is not None}
     return {name: (value - given) / error for name, (value, given, error) in known.items()}
 
 
@@ -245,8 +241,7 @@ def _without_outliers(evidence: Evidence) -> tuple[float, int, float]:
     """Return chi2 of the amplitudes that are no outliers and of what is known, its freedom and its probability."""
     residual, pulls = evidence.rows.residual, _pulls(evidence)
     inside = residual[np.abs(residual) <= _OUTLIER]
-    # the shapes are known as well as they are determined: neither data nor free
-    freedom = inside.size + len(pulls) - sum(name not in SHAPE_NAMES for name in evidence.parameters)
+    freedom = inside.size + len(pulls) - len(evidence.parameters)
     chi2 = float(np.sum(inside**2) + sum(pull**2 for pull in pulls.values()))
     return chi2, freedom, chi2_tail(chi2, freedom) if freedom > 0 else float("nan")
 

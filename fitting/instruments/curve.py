@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float
 
+from afm_jax.checks import checked
 from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from fitting.instruments.branch import JUMP, BranchLook, look_at
@@ -149,6 +150,7 @@ class MeasuredCurve(Result):
         return plain(own | {"valid": self.valid, "known": {key: vars(one) for key, one in self.known.items()}})
 
 
+@checked
 def read_curve(path: str | Path, *, curve: int = 1, **options: Any) -> MeasuredCurve:
     """Read one curve of an instrument's file.
 
@@ -167,6 +169,7 @@ def read_curve(path: str | Path, *, curve: int = 1, **options: Any) -> MeasuredC
     return found
 
 
+@checked
 def read_curves(
     path: str | Path,
     *,

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.scenefile.tables import printable
+from afm_jax.whole_files import MOST_VALUES
 from fitting.instruments.recording import (
     HEADER_KEYS,
     UNITS,
@@ -31,7 +32,6 @@ from fitting.instruments.recording import (
 )
 from fitting.tables.csv_text import NUMBER, TableError, read_bytes
 
-_MOST_ROWS = 10_000_000
 _CURVE = {"approach": "approach", "extend": "approach", "fwd": "approach", "forward": "approach"}
 _CURVE |= {"retract": "retract", "bwd": "retract", "backward": "retract"}
 
@@ -448,7 +448,7 @@ _IGOR_UNITS = {"amp": "m", "defl": "m", "zsnsr": "m", "raw": "m", "lvdt": "m", "
 
 def parse_igor(data: bytes, name: str) -> Recording:
     """Read Asylum's ramps in Igor's binary waves: a column for each channel, notes of `key: value`, SI units."""
-    if len(data) < 64 or _igor_points(data) > min(len(data), _MOST_ROWS):
+    if len(data) < 64 or _igor_points(data) > min(len(data), MOST_VALUES):
         raise cut_off(name, "the header announces more numbers than the file holds")
     package = _package("igor2.binarywave", ".ibw")
     # of a damaged file it would log every number

@@ -73,12 +73,14 @@ def write_tables(curves: list[MeasuredCurve], path: Path) -> list[Path]:
     Raises:
         TableError: if something is missing that every table needs, or no curve may be used.
     """
+    named = path
     path = path if path.suffix else path / "curve.csv"
     usable = [curve for curve in curves if curve.valid] or curves[:1]
     texts = {curve.curve: table_text(curve) for curve in usable}
     written = []
     for number, text in texts.items():
         place = path if len(curves) == 1 else path.with_stem(f"{path.stem}_{number}")
-        write_whole(place, text)
+        # numbered ones, and that of a folder, are not what the user named
+        write_whole(place, text, named_by_user=place == named)
         written.append(place)
     return written

@@ -9,13 +9,13 @@ from jaxtyping import Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
-from afm_jax.checks import require_float64
+from afm_jax.checks import checked, require_float64
 from afm_jax.version import version_of
 from fitting.inversion.flight import Inverted, MeasuredRow, invert_rows
 from fitting.inversion.regression import Laws, compare_law, regressed_laws
 from fitting.inversion.result import Inversion, InvertedRows, RegressedLaw, SavedLaw, on_resonance, read_on_resonance
 from fitting.tables.csv_text import TableError
-from fitting.tables.table import AmplitudeTable
+from fitting.tables.table import AmplitudeTable, TableLike, as_table
 
 _BLOCK = 64
 """Rows come filled up to a multiple of this, so that one program serves most tables."""
@@ -44,8 +44,9 @@ class _Shared(NamedTuple):
     moved: dict[str, _Instrument]
 
 
+@checked
 def invert(
-    table: AmplitudeTable,
+    table: TableLike,
     *,
     frequency_error_khz: float | None = None,
     truth: Law | None = None,
@@ -72,6 +73,7 @@ def invert(
         ValueError: if the frequency's error is not positive.
         RuntimeError: if JAX is not set to 64-bit floats.
     """
+    table = as_table(table)
     require_float64()
     if frequency_error_khz is not None and not 0.0 < frequency_error_khz < table.free_frequency_khz:
         raise ValueError(f"`frequency_error_khz` must be positive, but is {frequency_error_khz!r}")

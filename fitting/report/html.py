@@ -10,7 +10,7 @@ from markupsafe import Markup
 from afm_jax.words import known, plain_words
 from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.result import FitResult, FittedRows
-from fitting.parameters import NUISANCE_NAMES, PARAMETERS, SHAPE_NAMES
+from fitting.parameters import NUISANCE_NAMES, PARAMETERS
 from fitting.report.page import Table, in_signs, page, pairs, pictures_of
 from fitting.report.words import (
     PULLS,
@@ -26,6 +26,7 @@ from fitting.report.words import (
     law_points,
     losses_in_words,
     nuisances_in_words,
+    parting_in_words,
     remarks_on,
     rounded_values,
     scatter_in_words,
@@ -95,6 +96,7 @@ def fit_page(
         numbers=numbers,
         lasting=result.model.endswith("+delay"),
         said=_what_the_data_say(result),
+        parting=in_signs(parting_in_words(result)),
         digits=f"{100.0 * SHARE_OF_BAND:g}",
         sure=f"{in_signs(band_in_words(result))} {goodness_in_words(result)}",
         comparison=comparison,
@@ -147,7 +149,7 @@ def _pictures(result: FitResult, files: Sequence[bytes]) -> list[dict[str, str]]
         "Amplitudes of each row, measured and predicted; below, how far apart they are in standard errors.",
         law if result.valid else f"{law} Not a measurement: see the verdict.",
         "What is left of each amplitude over the approach speed, in standard errors: a wrong law leaves a curve here.",
-        "The energy that an impact takes over the approach speed, with its 95 % band; dashed, the closest paper's law.",
+        "The energy that an impact takes over the approach speed, with its 95 % band; dashed, by the formula.",
     )[: len(files)]
     return pictures_of(files, shows)
 
@@ -185,7 +187,7 @@ def _parameters(result: FitResult) -> Table:
         for name, parameter in result.parameters.items()
     ]
     caption = "Standard errors from the Fisher information, intervals from the profile of chi2"
-    if any(name in SHAPE_NAMES for name in result.parameters):
+    if result.model.endswith("+delay"):
         caption += ", both with what the law leaves out"
     return Table(caption, head, rows, words=("meaning", "95 % interval", "unit", "remarks"))
 

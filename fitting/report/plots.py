@@ -9,7 +9,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from afm_jax.plots.picture_style import pixels_of, png_of_pixels, svg_of
 from fitting.fits.comparison import Comparison
-from fitting.fits.loss import EV_PER_AJ, Loss
+from fitting.fits.loss import EV_PER_AJ, Loss, rebound_by_formula
 from fitting.fits.result import FitResult
 from fitting.report.words import has_delay
 
@@ -75,7 +75,7 @@ def speed_figure(result: FitResult) -> Figure:
 
 
 def energy_figure(result: FitResult, loss: Loss) -> Figure:
-    """Return the figure of the energy that an impact takes over the measured speeds, beside the paper's laws."""
+    """Return the figure of the energy that an impact takes over the measured speeds, beside the formula."""
     figure = Figure(figsize=(_WIDTH_INCHES, 3.4), layout="constrained")
     axes = figure.subplots()
     law, half = result.law, 0.5 * result.table.mass_ng
@@ -85,12 +85,11 @@ def energy_figure(result: FitResult, loss: Loss) -> Figure:
     if np.isfinite(least).any():
         axes.fill_between(speed, least, most, color=COLOURS[0], alpha=0.3, lw=0, label="95 % band")
     axes.plot(speed, lost, color=COLOURS[0], label="fitted law" if result.valid else "fit, not a measurement")
-    for one, style in zip(loss.equivalents, ("--", ":"), strict=False):
-        inside = (speed >= one.slowest_nm_per_us) & (speed <= one.fastest_nm_per_us)
-        square = (1.0 - one.r.value**2) * speed**2 + one.epsilon_nm2_per_us2.value
-        over = f"{one.slowest_nm_per_us:.3g} to {one.fastest_nm_per_us:.3g} nm/µs"
-        label = f"closest law of the paper over {over}"
-        axes.plot(speed[inside], half * square[inside], color=COLOURS[1], ls=style, label=label)
+    if loss.formula_off is not None:
+        values = (result.settings.get("fixed") or {}) | {name: one.value for name, one in result.parameters.items()}
+        rebound = rebound_by_formula(values, speed)
+        label = "formula with the fitted parameters"
+        axes.plot(speed, half * (speed**2 - rebound**2), color=COLOURS[1], ls="--", label=label)
     known = [(one.approach_speed_nm_per_us, one.energy_aj.value, *one.energy_aj.interval95) for one in loss.energies]
     for u, energy, low, high in known:
         reach = None if low is None or high is None else [[energy - low], [high - energy]]

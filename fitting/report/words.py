@@ -7,10 +7,10 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.words import decimals, interval, known, percent, value_alone
-from fitting.fits.loss import WithInterval
+from fitting.fits.loss import WithInterval, nearest_of
 from fitting.fits.result import FitResult, FittedParameter
 from fitting.fits.verdict import IMPROBABLE, value_at_bound
-from fitting.parameters import DELAY_LAW, DELAY_SHAPE, LAWS, LOSS_SHAPE, PARAMETERS, SHAPE_NAMES
+from fitting.parameters import DELAY_LAW, LAWS, PARAMETERS
 from fitting.sampling.trust_pack import TrustPack
 
 SHARE_OF_BAND = 0.1
@@ -89,7 +89,7 @@ def known_in_words(known: WithInterval, unit: str = "") -> str:
 def losses_in_words(result: FitResult) -> list[list[str]]:
     """Return what an impact takes, row by row: what, and how much with its 95 % interval.
 
-    The energy at three speeds, the closest law of the paper over each range of speeds, and the capture speed.
+    The energy at three speeds, delta of the printed epsilon, and the capture speed.
     """
     loss = result.loss
     if loss is None:
@@ -101,14 +101,10 @@ def losses_in_words(result: FitResult) -> list[list[str]]:
         ]
         for one in loss.energies
     ]
-    for one in loss.equivalents:
-        over = f"as eq. 6 over {one.slowest_nm_per_us:.3g} to {one.fastest_nm_per_us:.3g} nm/us"
-        off = f", off by at most {percent(one.worst_error)} of u_out" if one.worst_error > _EXACT else ""
-        rows += [
-            [f"{over}: r", f"{known_in_words(one.r)}{off}"],
-            [f"{over}: epsilon", known_in_words(one.epsilon_nm2_per_us2, "nm^2/us^2")],
-            [f"{over}: delta", f"{known_in_words(one.delta_aj, 'aJ')}, {known_in_words(one.delta_ev, 'eV')}"],
-        ]
+    if loss.delta_aj is not None and loss.delta_ev is not None:
+        rows.append(
+            ["delta = m epsilon/2", f"{known_in_words(loss.delta_aj, 'aJ')}, {known_in_words(loss.delta_ev, 'eV')}"]
+        )
     return [*rows, ["captured below (extrapolated)", known_in_words(loss.capture_speed_nm_per_us, "nm/us")]]
 
 
@@ -166,9 +162,45 @@ def formulas(result: FitResult) -> list[str]:
     if model == "contact":
         return ["the law and the delay of the resolved contact (meniscus and JKR junction), by its parameters:"]
     law, lasting = LAWS[model.removesuffix("+delay")], model.endswith("+delay")
-    shaped = any(name in result.parameters for name in SHAPE_NAMES)
-    used = [law, DELAY_LAW] if lasting else [law]
-    return [(shaped and one.shaped) or one.formula for one in used]
+    return [one.formula for one in ([law, DELAY_LAW] if lasting else [law])]
+
+
+def parting_in_words(result: FitResult) -> str:
+    """Return how far the formula and the law part, and which model would do better if it is beyond the band.
+
+    Nothing where they are the same, or where there is no formula.
+    """
+    loss, law = result.loss, result.law
+    if loss is None or loss.formula_off is None or loss.formula_off_at_nm_per_us is None or loss.formula_off <= _EXACT:
+        return ""
+    said = (
+        "The law has besides what its formula leaves out: the formula with these parameters is off by at most "
+        f"{percent(loss.formula_off)} of u_out, at {loss.formula_off_at_nm_per_us:.3g} nm/us"
+    )
+    width = band_width(result)
+    if width is None:
+        return f"{said}."
+    speeds = law.approach_speed_nm_per_us
+    inside = (
+        (speeds >= width.slowest_nm_per_us) & (speeds <= width.fastest_nm_per_us) & (law.rebound_speed_nm_per_us > 0)
+    )
+    rebound, half = (
+        column[inside]
+        for column in (law.rebound_speed_nm_per_us, law.rebound_high_nm_per_us - law.rebound_speed_nm_per_us)
+    )
+    fixed = result.settings.get("fixed") or {}
+    formula, _ = _formula(fixed | {name: p.value for name, p in result.parameters.items()}, speeds[inside])
+    if not inside.any() or not np.isfinite(half).all() or np.all(np.abs(formula - rebound) <= half):
+        return f"{said}, within the band."
+    own = result.model.removesuffix("+delay")
+    rivals = {
+        name: nearest_of(tuple(one.paper), speeds[inside], rebound, half) for name, one in LAWS.items() if name != own
+    }
+    best = min(rivals, key=lambda name: rivals[name].off)
+    if rivals[best].off >= loss.formula_off:
+        return f"{said}, beyond the band; no other formula comes nearer: take the law itself."
+    ending = result.model[len(own) :]
+    return f"{said}, beyond the band; {best}{ending} comes within {percent(rivals[best].off)}: try that model."
 
 
 def held_in_words(result: FitResult) -> str:
@@ -377,13 +409,11 @@ def _formula(
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return rebound speed in nm/us and delay in us as the formulas of the page say; zero where the tip is captured."""
     u = approach_speed_nm_per_us
-    raised = np.sqrt(u**2 + values.get(LOSS_SHAPE, 0.0))
-    square = (values.get("r", 1.0) * u) ** 2 - values.get("viscous_loss", 0.0) * raised - values.get("epsilon", 0.0)
+    square = (values.get("r", 1.0) * u) ** 2 - values.get("viscous_loss", 0.0) * u - values.get("epsilon", 0.0)
     free = square > 0.0
     w = np.sqrt(np.where(free, square, 1.0))
     lead, offset = values.get("delay_lead_nm", 0.0), values.get("delay_offset_nm", 0.0)
     delay = values.get("delay_hertz", 0.0) * u**-0.2 - lead * (1.0 / w - 1.0 / u) - offset / u
-    delay += values.get(DELAY_SHAPE, 0.0) * (1.0 / w**2 - 1.0 / u**2)
     return np.where(free, w, 0.0), np.where(free, delay, 0.0)
 
 

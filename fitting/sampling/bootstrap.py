@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from afm_jax.checks import require_float64
+from afm_jax.checks import checked, require_float64
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.least_squares import Box, Searches, descended, distance, whole_covariance_of
 from afm_jax.results import Result, public_result
@@ -23,7 +23,6 @@ from fitting.fits.intervals import at_bound, covariance
 from fitting.fits.objective import PLAIN, ROBUST, Objective, soft_square
 from fitting.fits.result import FitResult
 from fitting.models import ROWS_PER_PROGRAM, Problem, measurement_of
-from fitting.parameters import SHAPE_NAMES
 from fitting.tables.several import SeveralTables
 
 
@@ -53,7 +52,7 @@ def objective_of(result: FitResult) -> Refit:
         )
     settings = result.settings
     effects = EFFECTS if settings["effects"] is None else tuple(settings["effects"])
-    names = tuple(name for name in result.parameters if name not in SHAPE_NAMES)
+    names = tuple(result.parameters)
     problem = Problem(result.model, names, effects, result.table.drive)
     measurement = measurement_of(result.table, problem, settings["constraints"], settings["fixed"])
     values = np.array([result.parameters[name].value for name in names])
@@ -310,6 +309,7 @@ class Bootstrap(Result):
         }
 
 
+@checked
 def bootstrap(result: FitResult, samples: int = 400, *, seed: int = 0) -> Bootstrap:
     """Fit synthetic data sets that the fitted law would give, with the errors of the rows.
 

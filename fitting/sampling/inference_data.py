@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from afm_jax.checks import checked
 from afm_jax.version import __version__
 from afm_jax.whole_files import write_whole
 from fitting.fits.result import FitResult
@@ -30,6 +31,7 @@ def require_netcdf() -> Any:
     return importlib.import_module("xarray")
 
 
+@checked
 def write_inference_data(result: FitResult, found: Posterior, path: str | Path, *, seed: int = 0) -> None:
     """Write a posterior for ArviZ: `arviz.from_netcdf(path)` reads it.
 
@@ -77,4 +79,4 @@ def write_inference_data(result: FitResult, found: Posterior, path: str | Path, 
         for group, (variables, coordinates) in groups.items():
             data = xarray.Dataset(variables, coords=coordinates, attrs=about)
             data.to_netcdf(whole, group=group, mode="a" if whole.exists() else "w", engine="h5netcdf")
-        write_whole(path, whole.read_bytes())
+        write_whole(path, whole.read_bytes(), named_by_user=True)

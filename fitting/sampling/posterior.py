@@ -9,6 +9,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.checks import checked
 from afm_jax.units import TWO_SIDED_95
 from fitting.fits.objective import Objective
 from fitting.fits.result import FitResult
@@ -19,6 +20,7 @@ from fitting.sampling.posterior_result import Posterior, PosteriorGrid
 FEWEST_SAMPLES = 100
 
 
+@checked
 def posterior(
     result: FitResult,
     *,

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
+from afm_jax.checks import checked
 from afm_jax.results import Result, public_result
 from fitting.fits.result import FitResult
 from fitting.sampling.bootstrap import require_valid
@@ -115,6 +116,7 @@ class TrustPack(Result):
         }
 
 
+@checked
 def trust(
     result: FitResult,
     found: Posterior,

@@ -16,7 +16,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import detected, height_of_free_deflection
-from afm_jax.checks import require_float64
+from afm_jax.checks import checked, require_float64
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.impact.law import ImpactLaw
@@ -271,6 +271,7 @@ def drives_of(rows: Sequence[tuple[int, float, float, float]]) -> Drives:
     return Drives(columns[0].astype(np.int64), *columns[1:])
 
 
+@checked
 def simulate_experiment(  # noqa: PLR0913
     interaction: Contact | ImpactLaw,
     cantilever: Cantilever,

@@ -264,6 +264,8 @@ def read_bytes(path: str | Path, wanted: str) -> bytes:
 
 
 _AS_CSV = "save the table as CSV with the encoding UTF-8"
+FIT_FORMAT_VERSION = 2
+"""Version of the layout of fit.json; raised when a key changes its meaning or goes."""
 _A_FIT = "give the fit.json of `afm-jax fit --out`"
 
 
@@ -282,6 +284,11 @@ def read_fit_json(path: str | Path) -> dict[str, Any]:
         raise TableError(f"{name}: has too many brackets within each other; {_A_FIT}") from None
     if not isinstance(found, dict) or found.get("format") != "afm-jax fit":
         raise TableError(f"{name}: is no fit; {_A_FIT}")
+    if found.get("format_version") != FIT_FORMAT_VERSION:
+        raise TableError(
+            f"{name}: has format_version {found.get('format_version')}, but {FIT_FORMAT_VERSION} is known here; write "
+            "it anew: afm-jax fit TABLE.csv --model MODEL --out FOLDER"
+        )
     return found
 
 
@@ -295,8 +302,16 @@ def read_text(path: str | Path, mend: str = _AS_CSV) -> str:
     Raises:
         TableError: if there is no such file, it cannot be read or is not UTF-8 text.
     """
+    return text_of(read_bytes(path, "a CSV file"), path, mend)
+
+
+def text_of(data: bytes, path: str | Path, mend: str = _AS_CSV) -> str:
+    """Return the text that the bytes of a file are; see `read_text`.
+
+    Raises:
+        TableError: if they are not UTF-8 text.
+    """
     name = printable(str(path))
-    data = read_bytes(path, "a CSV file")
     data = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     try:
         text = data.decode("utf-8-sig")
@@ -356,7 +371,8 @@ def _parse_setting(setting: FileSetting, text: str, *, line: int, faults: Faults
     if setting.choices:
         if cells in [[choice] for choice in setting.choices]:
             return float(setting.choices.index(cells[0])), None
-        choices = ", ".join(setting.choices[:-1]) + f" or {setting.choices[-1]}"
+        *others, last = setting.choices
+        choices = f"{', '.join(others)} or {last}" if others else quoted(last)
         faults.add(
             f"{key} must be {choices}, but is {quoted(match['value'].strip())}; write '{setting.line}'", line=line
         )

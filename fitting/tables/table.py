@@ -13,7 +13,8 @@ measured column has a column of standard errors (``..._error_nm``, ``phase_error
 column says that this was not measured. A column ``no_orbit`` marks by 1 drives on which the tip settled on no steady
 single-impact orbit (it stuck, or moved chaotically): their amplitudes are blank. Comments such as
 ``# tip_calibration = 1 +- 0.02``, ``# drive_calibration = 1 +- 0.01`` and ``# offset_origin_nm = 0 +- 0.3`` say what is
-known of the instrument. Other comments are kept as remarks.
+known of the instrument. ``# rows = in order of time`` says that the rows stand as they were measured, so that a slow
+drift of phase and amplitude is told from what they mean. Other comments are kept as remarks.
 
 A cantilever that is driven itself over a sample at rest (a tapping or amplitude-phase-distance curve) says so::
 
@@ -35,6 +36,7 @@ The comment lines of an amplitude table: what `# key = value` says about the can
 The columns of an amplitude table, and the checks that every table must pass.
 """
 
+import os
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -42,6 +44,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
+from afm_jax.checks import check_kind, checked
 from afm_jax.results import Result, public_result
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from afm_jax.whole_files import write_whole
@@ -76,6 +79,7 @@ SETTINGS = {
     setting.key: setting
     for setting in (
         FileSetting("drive", "force", choices=("sample", "force", "base")),
+        FileSetting("rows", "in order of time", choices=("in order of time",)),
         FileSetting("free_frequency_khz", "90", unit="kHz", error="maybe"),
         FileSetting("quality_factor", "40 (or 40 +- 2)", lowest=LOWEST_QUALITY_FACTOR, error="maybe"),
         FileSetting("mass_ng", unit="ng"),
@@ -96,6 +100,7 @@ class Header:
     """What the comment lines say; the names and units are those of ``AmplitudeTable``."""
 
     drive: str
+    rows_in_order_of_time: bool
     free_frequency_khz: float
     free_frequency_error_khz: float | None
     quality_factor: float | None
@@ -124,6 +129,7 @@ def parse_comments(comments: list[tuple[int, str]], faults: Faults) -> Header:
     spring, spring_error = numbers.get("spring_constant_n_per_m", (None, None))
     return Header(
         drive="" if np.isnan(drive) else DRIVES[int(drive)],
+        rows_in_order_of_time="rows" in numbers,
         free_frequency_khz=frequency,
         free_frequency_error_khz=frequency_error,
         quality_factor=quality_factor,
@@ -390,6 +396,7 @@ class AmplitudeTable(Result):
         spring_constant_error_n_per_m: its standard error, or None.
         calibration: value and standard error of ``tip_calibration``, ``drive_calibration``, ``offset_origin_nm`` and
             ``phase_zero_deg``, as far as they are uncertain.
+        rows_in_order_of_time: whether the rows stand in the order in which they were measured.
         source: path of the file as it was given.
         lines: the line of the file that each row stands in, shape (rows,); 1, 2, 3, ... for a table not from a file, or
             if as many are not given.
@@ -423,6 +430,7 @@ class AmplitudeTable(Result):
     spring_constant_n_per_m: float | None = None
     spring_constant_error_n_per_m: float | None = None
     calibration: dict[str, tuple[float, float]] = field(default_factory=dict)
+    rows_in_order_of_time: bool = False
     source: str = "table in memory"
     lines: Int[np.ndarray, " lines"] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     remarks: tuple[str, ...] = ()
@@ -585,6 +593,7 @@ def _check_mass(table: AmplitudeTable, spring: float, faults: Faults) -> None:
         )
 
 
+@checked
 def read_table(path: str | Path, noise: float | None = None) -> AmplitudeTable:
     """Read an amplitude table from a CSV file and check all of it.
 
@@ -597,6 +606,23 @@ def read_table(path: str | Path, noise: float | None = None) -> AmplitudeTable:
         TableError: one line that names the first fault, its place and how to mend it, and the number of other faults.
     """
     return parse_table(read_text(path), str(path), noise)
+
+
+TableLike = AmplitudeTable | str | os.PathLike[str]
+"""An amplitude table, or the path of its file."""
+
+
+def as_table(given: TableLike) -> AmplitudeTable:
+    """Return a table that was given, or is read from its file.
+
+    Raises:
+        TypeError: if it is something else.
+        TableError: as `read_table`.
+    """
+    if isinstance(given, AmplitudeTable):
+        return given
+    check_kind("table", given, TableLike)
+    return read_table(Path(os.fspath(given)))
 
 
 def parse_table(text: str, source: str, noise: float | None = None) -> AmplitudeTable:
@@ -638,7 +664,8 @@ def parse_table(text: str, source: str, noise: float | None = None) -> Amplitude
     return AmplitudeTable(**arrays, **vars(header), source=source, lines=lines)
 
 
-def write_table(table: AmplitudeTable, path: str | Path) -> None:
+@checked
+def write_table(table: TableLike, path: str | Path) -> None:
     """Write an amplitude table as a CSV file that ``read_table`` reads back without loss.
 
     Args:
@@ -648,6 +675,15 @@ def write_table(table: AmplitudeTable, path: str | Path) -> None:
     Raises:
         TableError: if the file cannot be written.
     """
+    table = as_table(table)
+    try:
+        write_whole(path, csv_of(table), named_by_user=True)
+    except OSError as error:
+        raise TableError(f"{printable(str(path))}: {error.strerror}; choose another path") from error
+
+
+def csv_of(table: AmplitudeTable) -> str:
+    """Return an amplitude table as the text of a CSV file that ``read_table`` reads back without loss."""
     known = [
         ("free_frequency_khz", table.free_frequency_khz, table.free_frequency_error_khz),
         ("quality_factor", table.quality_factor, table.quality_factor_error),
@@ -660,6 +696,7 @@ def write_table(table: AmplitudeTable, path: str | Path) -> None:
         if value is not None:
             tail = "" if error is None else f" +- {float(error)!r}"
             lines.append(f"# {name} = {float(value)!r}{tail}")
+    lines += [SETTINGS["rows"].line] if table.rows_in_order_of_time else []
     lines += [f"# {remark}" for remark in table.remarks]
     names = [name for name in table.form.names if getattr(table, name) is not None]
     if table.tapping and np.all(table.order == 1):
@@ -669,7 +706,4 @@ def write_table(table: AmplitudeTable, path: str | Path) -> None:
     # tolist gives Python numbers, whose repr is the shortest text that reads back as the same number.
     cells = [["" if value != value else repr(value) for value in column.tolist()] for column in columns.values()]  # noqa: PLR0124
     lines += [",".join(row) for row in zip(*cells, strict=True)]
-    try:
-        write_whole(path, "\n".join(lines) + "\n")
-    except OSError as error_met:
-        raise TableError(f"{printable(str(path))}: {error_met.strerror}; choose another path") from error_met
+    return "\n".join(lines) + "\n"

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.whole_files import first_bytes
 from fitting.instruments.curve import MeasuredCurve, read_curves, table_text
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable, parse_table
@@ -39,8 +40,7 @@ class MeasuredFile:
 def is_table(path: str | Path) -> bool:
     """Say whether a file is (meant to be) an amplitude table, not an instrument's; one that is not there is one."""
     try:
-        with Path(path).open("rb") as file:
-            head = file.read(1 << 16)
+        head = first_bytes(path, 1 << 16)
     except OSError:
         return True
     return any(word in head for word in _IS_TABLE)

@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Int
 
+from afm_jax.checks import checked
 from afm_jax.scenefile.tables import printable
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.tables.csv_text import TableError
-from fitting.tables.table import AmplitudeTable
+from fitting.tables.table import AmplitudeTable, TableLike, as_table
 from fitting.tapping_curves.branches import changes, free_rows, hardly_touching_rows, held_rows, rough_rows
 from fitting.tapping_curves.constant_energy import ConstantEnergy, fit_constant_energy, plain_instrument, turned
 from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, TappingCurve, free_lag_deg, motion_of
@@ -33,7 +34,8 @@ _ORIGIN_NM = 0.3
 """What the height's origin is uncertain by where the table does not say."""
 
 
-def tapping(table: AmplitudeTable, *, law: bool = True, model: str = LAW_MODEL) -> Tapping:
+@checked
+def tapping(table: TableLike, *, law: bool = True, model: str = LAW_MODEL) -> Tapping:
     """Return the energy of a tap along a tapping curve, its branches and hysteresis, and the law if rows allow it.
 
     Args:
@@ -44,6 +46,7 @@ def tapping(table: AmplitudeTable, *, law: bool = True, model: str = LAW_MODEL) 
     Raises:
         TableError: if the table is none of a driven cantilever, or something is missing that no energy can do without.
     """
+    table = as_table(table)
     result = _energies(table, curve_of(table))
     return with_law(result, model) if law and result.law_allowed else result
 

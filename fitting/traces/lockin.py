@@ -6,12 +6,15 @@ From readings of traces to an amplitude table that the fitter reads.
 """
 
 import math
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from afm_jax.checks import checked
 from afm_jax.results import Result, public_result
 from afm_jax.units import within_turn
 from fitting.tables.csv_text import TableError
@@ -26,7 +29,7 @@ from fitting.traces.impacts import (
     find_ringing,
     look_at_periods,
 )
-from fitting.traces.trace import Trace
+from fitting.traces.trace import Trace, read_trace
 from fitting.traces.verdict import TraceEvidence, TraceKind, is_flightless, judge
 
 FORMAT_VERSION = 1
@@ -117,7 +120,8 @@ _ROUNDING = 1e-9
 """Of an amplitude: smallest error, as a fit divides by it."""
 
 
-def lockin(trace: Trace, *, order: int | None = None) -> LockinResult:
+@checked
+def lockin(trace: Trace | str | os.PathLike[str], *, order: int | None = None) -> LockinResult:
     """Read response order, amplitudes and phase of a trace, and say whether it is a steady single-impact orbit.
 
     The order is the smallest N at which one half of the response periods predicts the other. Folded onto one response
@@ -133,6 +137,8 @@ def lockin(trace: Trace, *, order: int | None = None) -> LockinResult:
         TableError: if the trace is shorter than two response periods of the expected order, or the reference column
             does not hold the drive frequency.
     """
+    if not isinstance(trace, Trace):
+        trace = read_trace(Path(os.fspath(trace)))
     if order is not None:
         _check_order(trace, order)
     reference = find_reference(trace)

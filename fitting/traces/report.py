@@ -16,7 +16,7 @@ from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, ne
 from afm_jax.scenefile.tables import printable
 from afm_jax.whole_files import write_whole
 from afm_jax.words import with_error
-from fitting.tables.table import AmplitudeTable, write_table
+from fitting.tables.table import AmplitudeTable, csv_of
 from fitting.traces.lockin import FORMAT_VERSION, LockinResult
 
 
@@ -82,7 +82,7 @@ def write_lockin(
         draw_lockin(result, folder / name)
         written.append(folder / name)
     if table is not None:
-        write_table(table, folder / "amplitudes.csv")
+        write_whole(folder / "amplitudes.csv", csv_of(table))
         written.append(folder / "amplitudes.csv")
     return written
 

@@ -20,6 +20,7 @@ A time trace as plain CSV: comment lines, a row of column names, a row for each 
 A time trace in an HDF5 file: the data sets are named like the columns of a CSV trace, settings are attributes.
 """
 
+import io
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
@@ -29,22 +30,27 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.checks import checked
 from afm_jax.results import Result, public_result
+from afm_jax.scenefile.tables import cut_short, printable
+from afm_jax.whole_files import MOST_PACKED, MOST_VALUES
 from fitting.tables.csv_text import (
     Column,
     Faults,
     FileSetting,
     Form,
+    TableError,
     beyond,
     check_names,
     fault_in_number,
     named_rows,
     parse_rows,
     quoted,
-    read_text,
+    read_bytes,
     said_beyond,
     settings_in,
     split_lines,
+    text_of,
 )
 from fitting.tables.table import LOWEST_QUALITY_FACTOR
 
@@ -214,13 +220,14 @@ SIGNATURE = b"\x89HDF\r\n\x1a\n"
 """The first bytes of every HDF5 file without a user block."""
 
 
-def parse_hdf5(path: Path, group: str | None, faults: Faults) -> ParsedTrace:
+def parse_hdf5(data: bytes, group: str | None, faults: Faults) -> ParsedTrace:
     """Read the data sets deflection_nm, time_us, platform_nm or drive of a file or of one of its groups.
 
-    Attributes of the file, the group and the deflection give the settings, the last of them first.
+    Attributes of the file, the group and the deflection give the settings, the last of them first. Only what lies in
+    the file itself is read: no link, no data set whose numbers are in other files.
 
     Args:
-        path: the file.
+        data: all of the file.
         group: which of the file's groups; None is the file itself.
         faults: where faults are noted; with any, the result is not to be used.
 
@@ -229,10 +236,14 @@ def parse_hdf5(path: Path, group: str | None, faults: Faults) -> ParsedTrace:
     """
     h5py = _h5py(faults)
     try:
-        with h5py.File(path, "r") as file:
-            return _read(h5py, file, group, faults)
-    except OSError as error:
-        faults.add(f"cannot be read as HDF5 ({' '.join(str(error).split())}); save it again")
+        with h5py.File(io.BytesIO(data), "r") as file:
+            return _read(h5py, file, group, faults, len(data))
+    except TableError:
+        raise
+    # whatever a damaged file makes of the package
+    except (OSError, RuntimeError, ValueError, TypeError, LookupError, ArithmeticError, MemoryError) as error:
+        what = cut_short(" ".join(str(error).split()) or type(error).__name__, 200)
+        faults.add(f"cannot be read as HDF5 ({printable(what)}); save it again")
         faults.raise_any()
         raise
 
@@ -247,29 +258,41 @@ def _h5py(faults: Faults) -> Any:
         raise
 
 
-def _read(h5py: Any, file: Any, group: str | None, faults: Faults) -> ParsedTrace:
-    place = file if group is None else file.get(group)
+def _read(h5py: Any, file: Any, group: str | None, faults: Faults, size: int) -> ParsedTrace:
+    place = _group(h5py, file, group, faults)
     if not isinstance(place, h5py.Group):
         groups = _groups_with_deflection(h5py, file)
         faults.add(
             f"there is no group {quoted(str(group))}; those with deflection_nm are {', '.join(groups) or 'none'}"
         )
         faults.raise_any()
-    names = [name for name, item in place.items() if isinstance(item, h5py.Dataset)]
-    inner = _groups_with_deflection(h5py, place)
-    if not any(ATTRIBUTES.get(name) == "deflection_nm" for name in names) and inner:
+    found = {name: _own(h5py, place, name, faults) for name in place if name in ATTRIBUTES}
+    faults.raise_any()
+    others = [name for name in place if name not in ATTRIBUTES and _is_own_data(h5py, place, name)]
+    names = [name for name, item in found.items() if isinstance(item, h5py.Dataset)] + others
+    has_deflection = any(ATTRIBUTES.get(name) == "deflection_nm" for name in names)
+    inner = [] if has_deflection else _groups_with_deflection(h5py, place)
+    if inner:
         choice = f" (there are {', '.join(inner)})" if inner[1:] else ""
         faults.add(f"there is no data set deflection_nm here; name its group: --group {inner[0]}{choice}")
         faults.raise_any()
     wanted = wanted_columns(names, faults)
     faults.raise_any()
-    columns = {ATTRIBUTES[name]: _column(name, place[name], faults) for name in wanted}
+    _check_sizes({name: found[name] for name in wanted}, size, faults)
     faults.raise_any()
-    attributes = dict(file.attrs) | dict(place.attrs)
-    for name in wanted:
-        if ATTRIBUTES[name] == "deflection_nm":
-            attributes |= dict(place[name].attrs)
+    columns = {ATTRIBUTES[name]: np.asarray(found[name][...], dtype=np.float64) for name in wanted}
+    holders = [file, place, *(found[name] for name in wanted if ATTRIBUTES[name] == "deflection_nm")]
+    attributes = {name: holder.attrs[name] for holder in holders for name in SETTINGS if name in holder.attrs}
     return ParsedTrace(columns, settings_of_attributes(attributes, faults), "platform_nm" in wanted)
+
+
+def _group(h5py: Any, file: Any, group: str | None, faults: Faults) -> Any:
+    """Return a group of a file, something else or None where there is none of this name; links are not followed."""
+    place = file
+    for part in () if group is None else filter(None, group.split("/")):
+        place = _own(h5py, place, part, faults) if isinstance(place, h5py.Group) else None
+        faults.raise_any()
+    return place
 
 
 def _groups_with_deflection(h5py: Any, place: Any) -> list[str]:
@@ -284,13 +307,36 @@ def _groups_with_deflection(h5py: Any, place: Any) -> list[str]:
     return [name for name in dict.fromkeys(found) if name]
 
 
-def _column(name: str, dataset: Any, faults: Faults) -> np.ndarray:
-    if dataset.ndim != 1 or dataset.dtype.kind not in "fiu":
-        faults.add(
-            f"the data set has shape {dataset.shape} and type {dataset.dtype}; give one row of numbers", column=name
-        )
-        return np.zeros(0)
-    return np.asarray(dataset[...], dtype=np.float64)
+def _own(h5py: Any, place: Any, name: str, faults: Faults) -> Any:
+    """Return a member of a group, None where there is none; links are not followed, but noted."""
+    link = place.get(name, getlink=True)
+    if isinstance(link, h5py.SoftLink | h5py.ExternalLink):
+        what = "a link to another file" if isinstance(link, h5py.ExternalLink) else "a link to another place"
+        faults.add(f"is {what}, which is not followed; save the data set itself under this name", column=quoted(name))
+        return None
+    return None if link is None else place.get(name)
+
+
+def _is_own_data(h5py: Any, place: Any, name: str) -> bool:
+    return isinstance(place.get(name, getlink=True), h5py.HardLink) and place.get(name, getclass=True) is h5py.Dataset
+
+
+def _check_sizes(datasets: Mapping[str, Any], size: int, faults: Faults) -> None:
+    """Note data sets that are no row of numbers, whose numbers are elsewhere, or that a file of a size cannot hold."""
+    for name, dataset in datasets.items():
+        if dataset.ndim != 1 or dataset.dtype.kind not in "fiu":
+            faults.add(
+                f"the data set has shape {dataset.shape} and type {dataset.dtype}; give one row of numbers", column=name
+            )
+        elif dataset.external or dataset.is_virtual:
+            faults.add("its numbers are in other files, which are not read; save them in this one", column=name)
+        else:
+            # a block that is read may be larger than what it holds of the row
+            count = max(dataset.size, *(dataset.chunks or (0,)))
+            if count > MOST_VALUES or count * dataset.dtype.itemsize > MOST_PACKED * size:
+                faults.add(f"{count:,} numbers are announced in a file of {size:,} bytes; save it again", column=name)
+    if sum(dataset.size for dataset in datasets.values()) > MOST_VALUES and not faults.count:
+        faults.add(f"holds more than {MOST_VALUES:,} numbers; cut the trace into parts")
 
 
 _UNEVEN = 0.1
@@ -408,6 +454,7 @@ def _check_length(trace: Trace, faults: Faults) -> None:
         )
 
 
+@checked
 def read_trace(path: str | Path, *, group: str | None = None, **settings: float | None) -> Trace:
     """Read a time trace from a CSV or HDF5 file and check all of it.
 
@@ -420,12 +467,13 @@ def read_trace(path: str | Path, *, group: str | None = None, **settings: float 
         TableError: one line that names the first fault, its place and how to mend it, and the number of other faults.
     """
     faults = Faults(str(path))
-    if _starts_as_hdf5(path):
-        parsed = parse_hdf5(Path(path), group, faults)
+    data = read_bytes(path, "a time trace")
+    if data.startswith(SIGNATURE):
+        parsed = parse_hdf5(data, group, faults)
     else:
         if group is not None:
             faults.add("is no HDF5 file and has no groups; leave the group out")
-        parsed = parse_csv(read_text(path), faults)
+        parsed = parse_csv(text_of(data, path), faults)
     joined = joined_settings(parsed.settings, settings, faults)
     faults.raise_any()
     start, step = _clock(parsed, joined, faults)
@@ -441,15 +489,6 @@ def read_trace(path: str | Path, *, group: str | None = None, **settings: float 
         remarks=parsed.remarks,
         first_line=parsed.first_line,
     )
-
-
-def _starts_as_hdf5(path: str | Path) -> bool:
-    try:
-        with Path(path).open("rb") as file:
-            return file.read(len(SIGNATURE)) == SIGNATURE
-    except (OSError, ValueError):
-        # `read_text` says what is wrong with the path
-        return False
 
 
 def _clock(parsed: ParsedTrace, settings: TraceSettings, faults: Faults) -> tuple[float, float]:

@@ -25,7 +25,7 @@ class CoreRepulsion(StaticForce):
     tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=100.0)
 
     def __check_init__(self):
-        check_parameter("constant_aj_nm6", self.constant_aj_nm6, "positive")
+        check_parameter("constant_aj_nm6", self.constant_aj_nm6, "above 0")
         check_parameter("tip_radius_nm", self.tip_radius_nm, "positive")
 
     def __call__(self, gap_nm: ArrayLike, gap_rate_nm_per_us: ArrayLike = 0.0) -> Float[Array, "..."]:

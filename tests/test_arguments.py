@@ -1,0 +1,131 @@
+"""Arguments of another kind than a public function takes: one line of ours each; paths where scenes and tables go."""
+
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import afm_jax as afm
+import fitting
+from afm_jax.scenefile.presets import preset
+from tests.fresh_python import python
+from tests.writing_commands import EXAMPLES
+
+# in a program of its own: here annotations are checked by the tests' own means first
+PROGRAM = """
+import json, warnings
+import jax; jax.config.update("jax_enable_x64", True)
+import numpy as np, afm_jax as afm, fitting
+from afm_jax.scenefile.presets import preset
+from fitting.examples import __path__ as examples
+warnings.simplefilter("error")
+scene, contact, law = preset("figure3"), afm.Contact.paper(), afm.ImpactLaw(0.9, 1.0)
+wet = afm.Scene(scene.cantilever, scene.platform, contact)
+table = fitting.read_table(examples[0] + "/amplitudes_law.csv")
+start = afm.State(0.0, 5.0, 80.0)
+values = np.array([3.0, 4.0])
+calls = {
+    afm.Cantilever: dict(frequency_khz=90.0, mass_ng=1.0),
+    afm.Platform: dict(amplitude_nm=4.0, frequency_khz=180.0, offset_nm=0.0, second=None),
+    afm.ForceDrive: dict(amplitude_nn=4.0, frequency_khz=180.0, second=None),
+    afm.ImpactLaw: dict(r=0.9, epsilon=1.0, delay=None),
+    afm.CollisionDelay: dict(hertz=1.0, lead_nm=1.0, offset_nm=1.0),
+    afm.Contact: dict(forces=contact.forces),
+    afm.Scene: dict(cantilever=scene.cantilever, platform=scene.platform, interaction=law, base=None, force=None),
+    afm.single_impact_orbits: dict(scene=scene, order=1),
+    afm.many_impact_orbits: dict(scene=scene, order=1, impacts=2, starts=8),
+    afm.contact_orbits: dict(scene=wet, order=1, impacts=1, accuracy=1e-9),
+    afm.next_impact: dict(scene=scene, time_us=0.0, velocity_nm_per_us=30.0, max_steps=2000),
+    afm.iterate_map: dict(scene=scene, time_us=0.0, velocity_nm_per_us=30.0, impacts=3),
+    afm.iterate_batch: dict(scene=scene, time_us=values, velocity_nm_per_us=values, impacts=3, block=3),
+    afm.map_jacobian: dict(scene=scene, time_us=0.0, velocity_nm_per_us=30.0),
+    afm.simulate: dict(scene=scene, start=start, duration_us=50.0, max_contacts=16, accuracy=1e-9),
+    afm.basins_of_attraction: dict(scene=scene, columns=4, rows=4, speeds_nm_per_us=(10.0, 20.0)),
+    afm.bifurcation_diagram: dict(scene=scene, parameter="platform.amplitude_nm", values=values, impacts=200),
+    afm.continue_orbits: dict(scene=scene, order=1, given=None, impacts=1),
+    afm.lyapunov_spectrum: dict(scene=scene, start=start, impacts=20, transient=0, accuracy=1e-9),
+    afm.stability_chart: dict(scene_of=None, x_values=values, y_values=values, last_order=1),
+    afm.sweep: dict(scene=scene, axes=[{}], record="orbits", workers=1),
+    afm.collide: dict(contact=contact, approach_speed_nm_per_us=30.0, mass_ng=1.0, accuracy=1e-9, method="diffrax"),
+    afm.capture_speed: dict(contact=contact, mass_ng=1.0),
+    afm.time_course: dict(contact=contact, approach_speed_nm_per_us=30.0),
+    fitting.fit: dict(table=table, model="law", scale_errors=False, fixed={}, free=["r"], speeds=(1.0, 2.0)),
+    fitting.compare: dict(table=table, models=("restitution", "law")),
+    fitting.invert: dict(table=table),
+    fitting.tapping: dict(table=table, law=False, model="law"),
+    fitting.calibrate: dict(sweep=None, scale_errors=False),
+    fitting.lockin: dict(trace=None),
+    fitting.bootstrap: dict(result=None, samples=4),
+    fitting.posterior: dict(result=None, samples=4),
+    fitting.design: dict(belief=None, drives=None),
+    fitting.amplitude_gradients: dict(table=table, model="law", values={}),
+    fitting.fit_law: dict(contact=contact, points=8),
+    fitting.believe: dict(model="law", free_frequency_khz=90.0, mass_ng=1.0),
+    fitting.read_table: dict(path="none"),
+    fitting.read_trace: dict(path="none"),
+    fitting.read_sweep: dict(path="none"),
+    fitting.read_curve: dict(path="none"),
+}
+bad = (True, 1j, object(), contact.junction)
+said = []
+for function, good in calls.items():
+    for name in good:
+        for value in bad:
+            if value is True and isinstance(good[name], bool):
+                continue
+            if name == "interaction" and value is contact.junction:
+                continue
+            try:
+                function(**{**good, name: value})
+                told = "accepted"
+            except TypeError as error:
+                told = str(error)
+            except BaseException as error:
+                told = f"{type(error).__name__} {error}"
+            said.append([f"{function.__name__}({name}={value!r})", name, told])
+print(json.dumps(said))
+"""
+
+
+@pytest.mark.slow
+def test_arguments_of_another_kind_are_named():
+    said = json.loads(python(PROGRAM).splitlines()[-1])
+    assert len(said) > 350
+    ours = re.compile(r"(the scene's )?`\w+` must be .*, but is .*")
+    assert [one for one in said if not ours.fullmatch(one[2])] == []
+
+
+def test_swapped_arguments_of_a_scene_are_named():
+    scene = preset("figure3")
+    said = """
+import afm_jax as afm
+for parts in ((afm.Platform(4.0, 180.0), afm.Cantilever(90.0)), (afm.Cantilever(90.0), afm.ImpactLaw(0.9))):
+    try:
+        afm.Scene(*parts)
+    except TypeError as error:
+        print(error)
+"""
+    assert python(said).splitlines() == [
+        "the scene's `cantilever` must be a Cantilever, but is a Platform",
+        "the scene's `platform` must be a Platform, but is an ImpactLaw",
+    ]
+    assert scene.base is None
+
+
+def test_paths_and_presets_work_where_scenes_and_tables_do(tmp_path: Path):
+    scene = preset("figure3")
+    path = tmp_path / "scene.toml"
+    afm.save_scene(scene, path)
+    wanted = afm.single_impact_orbits(scene, 1)
+    for given in ("figure3", path, str(path)):
+        np.testing.assert_array_equal(afm.single_impact_orbits(given, 1).phase_rad, wanted.phase_rad)
+    with pytest.raises(ValueError, match="nothing: there is no such file or preset; presets are figure2, figure3"):
+        afm.single_impact_orbits("nothing", 1)
+    for function in (fitting.fit, fitting.tapping, fitting.invert, fitting.calibrate, fitting.lockin):
+        with pytest.raises(fitting.TableError, match="there is no such file"):
+            function(tmp_path / "none.csv")
+    table = EXAMPLES / "amplitudes_law.csv"
+    fitting.write_table(table, tmp_path / "again.csv")
+    assert fitting.read_table(tmp_path / "again.csv").rows == fitting.read_table(table).rows
