@@ -12,6 +12,7 @@ from click.testing import CliRunner
 import fitting.instruments.formats as formats_module
 from afm_jax.cli.main import main
 from fitting import TableError, read_curve, read_curves, read_table
+from fitting.examples.make_raw_curve import FREE_NM, NM_PER_VOLT, raw_curve
 from fitting.instruments.curve import free_lag_deg, parse_columns, table_text
 from fitting.instruments.formats import read_recording
 from tests.instrument_files import asylum_ramp, gwyddion_bytes, igor_wave, nanonis_ramp, tapping_rows
@@ -267,6 +268,33 @@ def test_a_gain_that_is_off_shows_in_the_slope(tmp_path: Path, factor: float, sa
     offset, amplitude, _ = tapping_rows()
     curve = read_curve(saved(tmp_path, separated({"Z (nm)": offset, "Amp (nm)": factor * amplitude})))
     assert any(said in note for note in curve.notes), curve.notes
+
+
+def test_slope_and_free_amplitude_of_a_curve_with_an_attractive_plateau(tmp_path: Path):
+    made = raw_curve(1200)
+    columns = {
+        "Z (nm)": made.height_nm.ravel(),
+        "Amp (V)": made.amplitude_v.ravel(),
+        "Phase (deg)": made.phase_deg.ravel(),
+    }
+    columns["branch"] = np.repeat([0.0, 1.0], 1200)
+    text = separated(columns).replace(",0.000000\n", ",approach\n").replace(",1.000000\n", ",retract\n")
+    curve = read_curve(saved(tmp_path, text), nm_per_volt="slope")
+    scale = curve.known["nm_per_volt"]
+    assert scale.error is not None
+    # through all rows in contact it would be 150 nm/V
+    assert abs(float(scale.value) - NM_PER_VOLT) < 3.0 * scale.error < 5.0
+    assert re.search(r"steepest settled part \(\d+ rows of the approach from 4[12]", scale.origin)
+    free = curve.number("free_amplitude_nm")
+    assert free is not None
+    assert free / float(scale.value) == pytest.approx(FREE_NM / NM_PER_VOLT, rel=1.5e-3)
+
+
+def test_a_curve_without_a_free_part_is_refused(tmp_path: Path):
+    offset, amplitude, _ = tapping_rows()
+    near = offset > -38.0
+    curve = read_curve(saved(tmp_path, separated({"Z (nm)": offset[near], "Amp (nm)": amplitude[near]})))
+    assert "There is no flat free part" in curve.reasons[0]
 
 
 def test_heights_that_run_the_other_way_are_refused(tmp_path: Path):

@@ -9,7 +9,42 @@ JUMP = 0.02
 """Change of the free amplitude, as a share of it, that is called a jump."""
 _FEWEST = 5
 _DEEP, _SHALLOW = 0.1, 0.9
-"""Shares of the free amplitude between which the slope of a curve that goes deep is read."""
+"""Fractions of the free amplitude between which the slope of a curve that goes deep is read."""
+_PARTS = 20
+"""Blocks that the rows in front of the contact are looked at in."""
+_FLAT, _FLAT_DEG = 0.005, 1.0
+"""What blocks of the free tip may differ by: of the amplitude, and in degrees."""
+_SLOPING = 0.01
+"""Change of the amplitude over the farthest quarter of the rows, of the amplitude, from which there is no free part."""
+_WINDOW_NM = 1.0
+"""Height over which the slope in contact is read at least."""
+_VAGUE = 4.0
+"""Standard errors that a slope must differ from 0 by."""
+_PRECISE = 0.03
+"""Relative error of the slope up to which no more rows are taken in."""
+_ALIKE = 0.8
+"""Slope through all rows of a deep curve, over that of the steepest part, from which there is no plateau."""
+_SETTLED = 3.0
+"""Scatter about a line, over that of most windows, up to which a window is settled."""
+
+
+@dataclass(frozen=True)
+class ContactSlope:
+    """The steepest settled part of a branch in contact, and its line.
+
+    Attributes:
+        value: change of the amplitude per nm of height.
+        error: standard error of it.
+        from_nm: height of its first row.
+        to_nm: height of its last row, the nearest to the sample.
+        rows: how many.
+    """
+
+    value: float
+    error: float
+    from_nm: float
+    to_nm: float
+    rows: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -21,26 +56,33 @@ class BranchLook:
         level: amplitude of the free tip.
         level_error: standard error of it.
         noise: scatter of single amplitudes there; NaN with too few rows.
-        slope: change of the amplitude per nm of height in contact, with its error; None where too few rows are there.
+        slope: change of the amplitude per nm of height in contact; None where too few rows are there.
         onset_nm: height at which the line through the rows in contact meets the free level; None without such rows.
         jump: levels before and after the largest jump of the free amplitude along the heights, None without one.
+        change: of the amplitude over the farthest quarter of the rows, of the amplitude, if that is no free part.
     """
 
     free: Bool[np.ndarray, " rows"]
     level: float
     level_error: float
     noise: float
-    slope: tuple[float, float] | None
+    slope: ContactSlope | None
     onset_nm: float | None
     jump: tuple[float, float] | None
+    change: float | None = None
 
 
-def look_at(offset_nm: Float[np.ndarray, " rows"], amplitude: Float[np.ndarray, " rows"]) -> BranchLook:
-    """Look at one branch.
+def look_at(
+    offset_nm: Float[np.ndarray, " rows"],
+    amplitude: Float[np.ndarray, " rows"],
+    lag_deg: Float[np.ndarray, " rows"] | None = None,
+) -> BranchLook:
+    """Return the free level, its noise and jumps, contact and slope of one branch.
 
     Args:
         offset_nm: heights, growing towards the tip.
         amplitude: in any unit, positive.
+        lag_deg: of the phase, with any zero; it leaves that of the free tip before the amplitude does.
     """
     order = np.argsort(offset_nm, kind="stable")
     offset, values = offset_nm[order], amplitude[order]
@@ -50,17 +92,62 @@ def look_at(offset_nm: Float[np.ndarray, " rows"], amplitude: Float[np.ndarray, 
     first, last = _contact(values, level, scatter)
     touching = slice(first, last)
     engaged = values[touching] > _DEEP * level
-    slope, onset = _line(offset[touching][engaged], values[touching][engaged], level)
+    near, fallen = offset[touching][engaged], values[touching][engaged]
+    slope = steepest_part(near, fallen, deep=bool(values.min() < 0.5 * level))
+    onset = None if slope is None else _onset(near, fallen, slope, level)
     edge = offset[first] if first < last else np.inf
     free = offset < edge - (0.1 * (edge - offset[0]) if np.isfinite(edge) else 0.0)
     if free.sum() < _FEWEST:
         free = np.arange(len(values)) < max(first, 1)
+    change = _change(offset, values)
+    jump = _jump(values[free]) if change is None else None
+    if jump is None:
+        free &= np.arange(len(values)) < _plateau_end(values[free], None if lag_deg is None else lag_deg[order][free])
     rows = values[free]
     mask = np.zeros(len(values), dtype=bool)
     mask[order] = free
     noise = _scatter(rows) if len(rows) >= _FEWEST else float("nan")
     error = float(np.std(rows) / np.sqrt(len(rows)))
-    return BranchLook(mask, float(np.median(rows)), error, noise, slope, onset, _jump(rows))
+    return BranchLook(mask, float(np.median(rows)), error, noise, slope, onset, jump, change)
+
+
+def _plateau_end(values: Float[np.ndarray, " rows"], lag: Float[np.ndarray, " rows"] | None) -> int:
+    """Return how many rows, the farthest first, are of the free tip: until blocks of them leave the farthest ones."""
+    rows = len(values)
+    size = max(rows // _PARTS, _FEWEST)
+    ends = [size * k for k in range(1, rows // size + 1)]
+    if len(ends) < 4:
+        return rows
+    until = rows
+    for column, flat in ((values, _FLAT * abs(float(np.median(values)))), (lag, _FLAT_DEG)):
+        if column is None:
+            continue
+        middles = np.array([np.median(column[end - size : end]) for end in ends])
+        first = max(len(ends) // 4, 1)
+        far = float(np.median(column[: ends[first - 1]]))
+        allowed = max(flat, 4.0 * 1.25 * _scatter(column[: ends[first - 1]]) / np.sqrt(size))
+        away = np.abs(middles - far) > allowed
+        # one block that departs may be a spike
+        leaves = np.flatnonzero(away[first:] & np.append(away[first + 1 :], True))
+        if leaves.size:
+            until = min(until, ends[first + int(leaves[0])] - size)
+    return until
+
+
+def _change(offset: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows"]) -> float | None:
+    """Return by how much the amplitude falls over the farthest quarter of the rows, of it; None where it is flat."""
+    rows = max(len(values) // 4, min(len(values), _FEWEST))
+    far, place = values[:rows], offset[:rows]
+    if rows < 4 or np.ptp(place) == 0.0:
+        return None
+    place = (place - place.mean()) / np.ptp(place)
+    (slope, _), covariance = np.polyfit(place, far, 1, cov=True)
+    change = float(slope) / float(np.median(far))
+    steep = abs(change) > _SLOPING and abs(slope) > 5.0 * float(np.sqrt(covariance[0, 0]))
+    # a step is a jump of the free amplitude, not a fall
+    of_line = float(np.sum((far - far.mean() - slope * place) ** 2))
+    of_step = min(float(np.var(far[:k]) * k + np.var(far[k:]) * (rows - k)) for k in range(1, rows))
+    return change if steep and of_line < of_step else None
 
 
 def _scatter(values: Float[np.ndarray, " rows"]) -> float:
@@ -83,17 +170,88 @@ def _contact(values: Float[np.ndarray, " rows"], level: float, scatter: float) -
     return (int(outside[-1]) + 1 if outside.size else 0), int(low[-1]) + 1
 
 
-def _line(
-    offset: Float[np.ndarray, " some"], values: Float[np.ndarray, " some"], level: float
-) -> tuple[tuple[float, float] | None, float | None]:
-    """Return slope with error, and where the line meets the free level."""
-    if len(values) < 4 or np.ptp(offset) == 0.0:
-        return None, None
-    middle = offset.mean()
-    (slope, height), covariance = np.polyfit(offset - middle, values, 1, cov=True)
-    if not slope < 0.0:
-        return None, None
-    return (float(slope), float(np.sqrt(covariance[0, 0]))), float(middle + (level - height) / slope)
+def steepest_part(
+    offset: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows"], *, deep: bool = False
+) -> ContactSlope | None:
+    """Return the steepest settled part of rows in contact, the nearest to the sample if there are several.
+
+    A curve that first falls slowly (attraction) and then by 1 nm per nm (a hard sample) tells the scale of its
+    amplitude by the second part only. Lines are laid through all windows of a nm or more; of those as steep as the
+    steepest within their errors the one nearest to the sample is taken, longer where its slope is known to worse than
+    3 % and the rows before it lie on the same line.
+
+    Args:
+        offset: heights, rising.
+        values: amplitudes in any unit.
+        deep: whether the amplitude falls below half of the free one: then the line through all rows is taken where it
+            is about as steep, because that of a small part follows the bends of the curve.
+    """
+    rows = len(values)
+    if rows < 4 or np.ptp(offset) == 0.0:
+        return None
+    length = max(_WINDOW_NM, 5.0 * float(np.median(np.diff(offset))))
+    starts = np.searchsorted(offset, offset - length, side="left")
+    lines = [_line(offset[a : b + 1], values[a : b + 1]) for b, a in enumerate(starts.tolist()) if b - a >= 3]
+    ends = [b for b, a in enumerate(starts.tolist()) if b - a >= 3]
+    # windows that the far end cuts off count only where there is no whole one
+    whole = [k for k, b in enumerate(ends) if offset[b] - offset[0] >= length] or [len(ends) - 1]
+    whole = [k for k in whole if 0 <= k < len(lines) and lines[k] is not None]
+    if not whole:
+        line = _line(offset, values)
+        chosen, first = line, 0
+        last = rows
+    else:
+        slopes, errors, scatters = np.array([lines[k] for k in whole]).T
+        settled = scatters <= _SETTLED * np.median(scatters) + 1e-12
+        steepest = int(np.argmin(np.where(settled, slopes, np.inf)))
+        alike = settled & (np.abs(slopes - slopes[steepest]) <= 2.0 * np.hypot(errors, errors[steepest]) + 1e-12)
+        end = whole[int(np.flatnonzero(alike)[-1])]
+        last = ends[end] + 1
+        first = _straight_from(offset[:last], values[:last], int(starts[ends[end]]))
+        chosen = _line(offset[first:last], values[first:last])
+        throughout = _line(offset, values)
+        if deep and chosen is not None and throughout is not None and throughout[0] < _ALIKE * chosen[0]:
+            chosen, first, last = throughout, 0, rows
+    if chosen is None or not chosen[0] < -_VAGUE * chosen[1]:
+        return None
+    return ContactSlope(chosen[0], chosen[1], float(offset[first]), float(offset[last - 1]), last - first)
+
+
+def _straight_from(offset: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows"], first: int) -> int:
+    """Return from which row on the slope is known well enough, as far as the rows up to the last lie on a line."""
+    step = max(len(offset) - first, 4) // 4
+    while first > 0:
+        line = _line(offset[first:], values[first:])
+        if line is not None and line[1] < _PRECISE * abs(line[0]):
+            return first
+        trial = max(first - step, 0)
+        place = offset[trial:] - offset[trial:].mean()
+        if len(place) < 6:
+            return first
+        (bend, _, _), covariance = np.polyfit(place / np.ptp(place), values[trial:], 2, cov=True)
+        if abs(bend) > 2.0 * np.sqrt(covariance[0, 0]) + 1e-12 * abs(values[-1]):
+            return first
+        first = trial
+    return first
+
+
+def _line(offset: Float[np.ndarray, " some"], values: Float[np.ndarray, " some"]) -> tuple[float, float, float] | None:
+    """Return slope, its error and the scatter about the line; None where all heights are one."""
+    place = offset - offset.mean()
+    width = float(np.sum(place**2))
+    if width == 0.0 or len(values) < 3:
+        return None
+    slope = float(np.sum(place * values)) / width
+    scatter = float(np.sqrt(np.sum((values - values.mean() - slope * place) ** 2) / (len(values) - 2)))
+    return slope, scatter / float(np.sqrt(width)), scatter
+
+
+def _onset(
+    offset: Float[np.ndarray, " some"], values: Float[np.ndarray, " some"], slope: ContactSlope, level: float
+) -> float:
+    """Return the height at which the line through the steepest part meets the free level."""
+    part = (offset >= slope.from_nm) & (offset <= slope.to_nm)
+    return float(offset[part].mean() + (level - values[part].mean()) / slope.value)
 
 
 def _jump(values: Float[np.ndarray, " rows"]) -> tuple[float, float] | None:

@@ -384,7 +384,7 @@ def _judged(curve: MeasuredCurve, *, of_slope: bool) -> MeasuredCurve:
     looks = _looks(curve)
     slope = _mean_slope(looks)
     if of_slope and slope is not None:
-        curve, looks = _scaled_by_slope(curve, amplitude, slope)
+        curve, looks = _scaled_by_slope(curve, amplitude, slope, looks)
     free = np.zeros(len(curve.offset_nm), dtype=bool)
     for branch, look in looks.items():
         free[np.flatnonzero(curve.branch == branch)[look.free]] = True
@@ -401,7 +401,11 @@ def _looks(curve: MeasuredCurve) -> dict[str, BranchLook]:
     if curve.amplitude is None:
         return {}
     masks = {branch: curve.branch == branch for branch in dict.fromkeys(curve.branch.tolist())}
-    return {branch: look_at(curve.offset_nm[mask], curve.amplitude[mask]) for branch, mask in masks.items()}
+    lag = curve.phase_lag_deg
+    return {
+        branch: look_at(curve.offset_nm[mask], curve.amplitude[mask], None if lag is None else lag[mask])
+        for branch, mask in masks.items()
+    }
 
 
 _LEAST_ERROR = 1e-9
@@ -410,7 +414,7 @@ _LEAST_ERROR = 1e-9
 
 def _mean_slope(looks: Mapping[str, BranchLook]) -> tuple[float, float] | None:
     """Return the weighted mean of the branches' slopes, its error widened by what they differ beyond theirs."""
-    slopes = np.array([look.slope for look in looks.values() if look.slope is not None])
+    slopes = np.array([[look.slope.value, look.slope.error] for look in looks.values() if look.slope is not None])
     if not slopes.size:
         return None
     # rows that lie on a line exactly leave no error at all
@@ -421,12 +425,21 @@ def _mean_slope(looks: Mapping[str, BranchLook]) -> tuple[float, float] | None:
 
 
 def _scaled_by_slope(
-    curve: MeasuredCurve, amplitude: Float[np.ndarray, " rows"], slope: tuple[float, float]
+    curve: MeasuredCurve,
+    amplitude: Float[np.ndarray, " rows"],
+    slope: tuple[float, float],
+    looks: Mapping[str, BranchLook],
 ) -> tuple[MeasuredCurve, dict[str, BranchLook]]:
     """Return the curve with the amplitude scaled such that it falls by 1 nm per nm in contact."""
     scale, share = 1.0 / abs(slope[0]), slope[1] / abs(slope[0])
+    parts = " and ".join(
+        f"{look.slope.rows} rows of the {branch} from {look.slope.from_nm:.2f} to {look.slope.to_nm:.2f} nm"
+        for branch, look in looks.items()
+        if look.slope is not None
+    )
     origin = (
-        f"measured: slope of the curve in contact, taken as 1 nm per nm (a hard sample); unit {curve.amplitude_unit}"
+        f"measured: slope of the steepest settled part ({parts}), taken as 1 nm per nm (a hard sample); unit "
+        f"{curve.amplitude_unit}"
     )
     known = curve.known | {"nm_per_volt": Known(scale, f"nm/{curve.amplitude_unit}", origin, scale * share)}
     scaled = replace(curve, amplitude=amplitude * scale, amplitude_unit="nm", known=known)
@@ -455,6 +468,12 @@ def _reasons(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> list[str]
             f"The amplitude is smaller far from the sample ({far:.4g} {unit}) than near it ({near:.4g} {unit}): the "
             "heights run the other way; turn them round with --columns offset_nm=CHANNEL:-1 (or drop that -1)."
         )
+    for branch, look in looks.items():
+        if look.change is not None and "free_amplitude_nm" not in curve.known:
+            reasons.append(
+                f"There is no flat free part in the {branch}: the amplitude still changes by {look.change:.1%} over "
+                "the farthest quarter of the rows; record farther away, or give --free-amplitude-nm."
+            )
     return reasons
 
 
