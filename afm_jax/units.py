@@ -36,6 +36,30 @@ AJ_NM6_PER_J_M6 = 1e72
 """Core constant of 1 J m^6 in aJ nm^6."""
 
 
+SAME_MASS = 0.02
+"""Share by which a stated mass must be closer than to k/Omega^2 of a stated spring constant."""
+
+
+def effective_mass_ng(spring_constant_n_per_m: Any, free_frequency_khz: Any) -> Any:
+    """Return the effective mass k/Omega^2 in ng of a cantilever, of numbers and arrays of any kind.
+
+    >>> round(effective_mass_ng(5.4, 90.0), 2)
+    16.89
+    """
+    return spring_constant_n_per_m / (RAD_PER_US_PER_KHZ * free_frequency_khz) ** 2
+
+
+def contradicting_mass(mass_ng: float, spring_constant_n_per_m: float, free_frequency_khz: float) -> str | None:
+    """Return what is wrong where a mass is not that of a spring constant, 2 % or more apart; None where they agree."""
+    mass = effective_mass_ng(spring_constant_n_per_m, free_frequency_khz)
+    if abs(mass_ng - mass) < SAME_MASS * mass:
+        return None
+    return (
+        f"mass_ng = {mass_ng:g} and spring_constant_n_per_m = {spring_constant_n_per_m:g} contradict each other: "
+        f"k/(2 pi f0)^2 is {mass:.4g} ng; correct or remove one of them"
+    )
+
+
 def within_turn(angle: Any, turn: Any) -> Any:
     """Return an angle within [0, turn), of numbers and arrays of any kind; -1e-17 is at 0, not at a whole turn.
 

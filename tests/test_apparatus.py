@@ -21,6 +21,20 @@ from tests.reference_systems import free_flight, platform_motion
 OMEGA = 2e-3 * np.pi * 90.0
 
 
+def test_a_spring_constant_says_the_mass():
+    mass = 5.4 / (2.0 * np.pi * 0.09) ** 2
+    cantilever = Cantilever(90.0, 200.0, spring_constant_n_per_m=5.4)
+    assert float(cantilever.mass_ng) == pytest.approx(mass, rel=1e-14)
+    assert float(cantilever.stiffness_n_per_m) == pytest.approx(5.4, rel=1e-14)
+    assert float(Cantilever(90.0).mass_ng) == 1.0
+    assert float(Cantilever(90.0, None, 1.01 * mass, spring_constant_n_per_m=5.4).mass_ng) == 1.01 * mass
+    for share in (0.97, 1.03):
+        with pytest.raises(ValueError, match="contradict each other"):
+            Cantilever(90.0, None, share * mass, spring_constant_n_per_m=5.4)
+    with pytest.raises(ValueError, match="spring_constant_n_per_m"):
+        Cantilever(90.0, spring_constant_n_per_m=0.0)
+
+
 def matrix(cantilever: Cantilever, duration: float) -> np.ndarray:
     p = cantilever.propagator(duration)
     return np.array([[p[0], p[1]], [p[2], p[3]]], dtype=float)

@@ -35,6 +35,34 @@ def answer(*arguments: object) -> dict[str, Any]:
     return strictly(result.stdout)
 
 
+def test_a_mass_that_nothing_says_is_named_as_assumed(tmp_path):
+    assumed = answer("--speeds", 40)
+    assert assumed["notes"][0].startswith("1 ng assumed")
+    assert "1 ng assumed" in run("--speeds", 40).stdout
+    path = tmp_path / "scene.toml"
+    head, rest = (
+        "[cantilever]\nfrequency_khz = 90\n",
+        "[platform]\namplitude_nm = 4\nfrequency_khz = 180\noffset_nm = 0\n",
+    )
+    path.write_text(f'{head}{rest}[interaction]\nmodel = "contact"\n')
+    assert answer(path, "--speeds", 40)["notes"][0].startswith("1 ng assumed")
+    path.write_text(f'{head}spring_constant_n_per_m = 0.5\n{rest}[interaction]\nmodel = "contact"\n')
+    stated = answer(path, "--speeds", 40)
+    assert "notes" not in stated
+    assert stated["mass_ng"] == pytest.approx(0.5 / (2.0 * np.pi * 0.09) ** 2, rel=1e-14)
+
+
+def test_a_spring_constant_says_the_mass():
+    given = ("--speeds", 40, "--spring-constant-n-per-m", 0.5)
+    assert answer(*given, "--free-frequency-khz", 90)["mass_ng"] == pytest.approx(0.5 / (2.0 * np.pi * 0.09) ** 2)
+    alone = run(*given)
+    assert alone.exit_code == 2
+    assert "--free-frequency-khz" in alone.stderr
+    both = run(*given, "--free-frequency-khz", 90, "--mass-ng", 1.6)
+    assert both.exit_code == 2
+    assert "contradict each other" in both.stderr
+
+
 @pytest.fixture(scope="module")
 def out(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("collide")

@@ -1,14 +1,15 @@
 """The cantilever: a single mass on a spring, damped by air or not, with its free flight in closed form."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.apparatus.trigonometry import sine_cosine
-from afm_jax.checks import as_argument, as_optional_parameter, as_parameter, check_parameter, readable
-from afm_jax.units import RAD_PER_US_PER_KHZ
+from afm_jax.checks import as_argument, as_optional_parameter, as_parameter, check_parameter, is_traced, readable
+from afm_jax.units import RAD_PER_US_PER_KHZ, contradicting_mass, effective_mass_ng
 
 
 class Propagator(NamedTuple):
@@ -30,16 +31,49 @@ class Propagator(NamedTuple):
         )
 
 
+def mass_of(frequency_khz: Any, mass_ng: Any, spring_constant_n_per_m: Any) -> Any:
+    """Return the effective mass in ng that mass and spring constant, either of them or neither, come to.
+
+    Args:
+        frequency_khz: of the free cantilever.
+        mass_ng: or None.
+        spring_constant_n_per_m: or None.
+
+    Raises:
+        ValueError: if both are given and 2 % apart or more, or the spring constant is not positive.
+    """
+    if spring_constant_n_per_m is None:
+        return 1.0 if mass_ng is None else mass_ng
+    check_parameter("spring_constant_n_per_m", spring_constant_n_per_m, "positive")
+    check_parameter("frequency_khz", frequency_khz, "positive")
+    if mass_ng is None:
+        if is_traced(frequency_khz) or is_traced(spring_constant_n_per_m):
+            return effective_mass_ng(spring_constant_n_per_m, frequency_khz)
+        with np.errstate(divide="ignore", over="ignore"):
+            mass = effective_mass_ng(*(np.asarray(part, float) for part in (spring_constant_n_per_m, frequency_khz)))
+        check_parameter("mass_ng", mass, "positive")
+        return mass
+    if not any(is_traced(value) for value in (frequency_khz, mass_ng, spring_constant_n_per_m)):
+        parts = np.broadcast_arrays(*map(np.asarray, (mass_ng, spring_constant_n_per_m, frequency_khz)))
+        for one in zip(*(part.ravel().tolist() for part in parts), strict=True):
+            wrong = contradicting_mass(*one)
+            if wrong:
+                raise ValueError(wrong)
+    return mass_ng
+
+
 class Cantilever(eqx.Module):
     """A cantilever with its tip as one mass: z'' + (Omega/Q) z' + Omega^2 z = 0 between impacts.
 
     Args:
         frequency_khz: free frequency, Omega / 2 pi.
         quality_factor: Q > 1/2 of the free resonance; None leaves air damping out of the program.
-        mass_ng: effective mass.
+        mass_ng: effective mass; without it and a spring constant 1 ng.
+        spring_constant_n_per_m: what the mass is taken from, m = k/Omega^2; not kept.
 
     Raises:
-        ValueError: if the frequency or the mass is not positive, or the motion overdamped (Q <= 1/2).
+        ValueError: if the frequency or the mass is not positive, mass and spring constant are 2 % apart or more, or the
+            motion is overdamped (Q <= 1/2).
     """
 
     frequency_khz: Float[Array, "..."] = eqx.field(converter=as_parameter)
@@ -47,6 +81,19 @@ class Cantilever(eqx.Module):
     mass_ng: Float[Array, "..."] = eqx.field(converter=as_parameter, default=1.0)
 
     __repr__ = readable
+
+    def __init__(
+        self,
+        frequency_khz: ArrayLike,
+        quality_factor: ArrayLike | None = None,
+        mass_ng: ArrayLike | None = None,
+        *,
+        spring_constant_n_per_m: ArrayLike | None = None,
+    ) -> None:
+        """Keep the numbers; the mass is that of the spring constant, or 1 ng, where it is not given."""
+        self.frequency_khz = frequency_khz  # pyright: ignore[reportAttributeAccessIssue]
+        self.quality_factor = quality_factor  # pyright: ignore[reportAttributeAccessIssue]
+        self.mass_ng = mass_of(frequency_khz, mass_ng, spring_constant_n_per_m)
 
     def __check_init__(self):
         check_parameter("frequency_khz", self.frequency_khz, "positive")

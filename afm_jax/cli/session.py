@@ -90,10 +90,27 @@ _SECONDS_BETWEEN_NOTES = 2.0
 
 
 def labelled(payload: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a result with what it is, `format` and `format_version`, first; one that says so itself as it is."""
+    """Return a result with what it is, `format` and `format_version`, first, and with the call's notes (`add_note`)."""
+    notes = _notes()
+    told = {**payload, "notes": [*payload.get("notes", ()), *notes]} if notes else dict(payload)
     if "format" in payload:
-        return dict(payload)
-    return {"format": f"afm-jax {click.get_current_context().info_name}", "format_version": 1, **payload}
+        return told
+    return {"format": f"afm-jax {click.get_current_context().info_name}", "format_version": 1, **told}
+
+
+_NOTES = "afm_jax.notes"
+
+
+def add_note(note: str) -> None:
+    """Let the result of this call say a sentence: in its JSON under `notes`, in its text at the end."""
+    context = click.get_current_context(silent=True)
+    if context is not None and note not in context.meta.setdefault(_NOTES, []):
+        context.meta[_NOTES].append(note)
+
+
+def _notes() -> list[str]:
+    context = click.get_current_context(silent=True)
+    return [] if context is None else list(context.meta.get(_NOTES, ()))
 
 
 def write_json(path: Path, payload: Mapping[str, Any]) -> None:
@@ -263,7 +280,7 @@ class Session:
             return
         console = _console(stderr=False)
         with lines_at_most(console.width):
-            for part in text:
+            for part in (*text, *(f"Note: {note}" for note in _notes())):
                 words = part if isinstance(part, str) else part() if callable(part) else _table_text(console, part)
                 if isinstance(words, str):
                     words = _broken(shown(words), console.width)

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import click.shell_completion
 
+from afm_jax.cli.session import add_note
 from afm_jax.scenefile.tables import cut_short
 
 if TYPE_CHECKING:
@@ -346,11 +347,19 @@ def parse_share(text: str) -> float:
     return share
 
 
-def scene_and_start(name: str) -> "tuple[Scene, Start | None]":
-    """Return the scene that an argument names and its start; see `afm_jax.scenefile.presets.scene_and_start`."""
+def scene_and_start(name: str, *, notes: bool = True) -> "tuple[Scene, Start | None]":
+    """Return the scene that an argument names and its start; see `afm_jax.scenefile.presets.scene_and_start`.
+
+    Args:
+        name: a path, or a preset's name.
+        notes: whether the result says what the file leaves to be assumed.
+    """
     from afm_jax.scenefile import presets  # noqa: PLC0415
 
-    return presets.scene_and_start(name)
+    read = presets.read_named_scene(name)
+    for note in read.notes if notes else ():
+        add_note(note)
+    return read.scene, read.start
 
 
 def ranges_of(name: str, scene: "Scene", texts: Sequence[str], *, counted: bool) -> "list[ParameterRange]":

@@ -17,7 +17,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import as_argument
 from afm_jax.contact.contact import Contact
 from afm_jax.impact.law import ImpactLaw
-from afm_jax.scenefile.scenefile import Start, load_scene_and_start
+from afm_jax.scenefile.scenefile import SceneAsRead, Start, read_scene
 
 FREE_FREQUENCY_KHZ = 90.0
 STABILITY_R = 0.5
@@ -201,8 +201,17 @@ def scene_and_start(name: str) -> tuple[Scene, Start | None]:
     Raises:
         ValueError: if there is neither such a file nor such a preset, or the file is no valid scene file.
     """
+    return read_named_scene(name)[:2]
+
+
+def read_named_scene(name: str) -> SceneAsRead:
+    """Return the scene and the start as of `scene_and_start`, with what a reader should know of the file.
+
+    Raises:
+        ValueError: as `scene_and_start`.
+    """
     if Path(name).exists() or name.endswith(".toml") or len(Path(name).parts) > 1:
-        return load_scene_and_start(name)
+        return read_scene(name)
     if name not in PRESETS:
         raise ValueError(f"{name}: there is no such file or preset; presets are {', '.join(PRESETS)}")
-    return preset(name), preset_start(name)
+    return SceneAsRead(preset(name), preset_start(name), ())

@@ -4,7 +4,7 @@
 [cantilever]
 frequency_khz = 90
 quality_factor = 40          # leave out: no air damping
-mass_ng = 1
+mass_ng = 1                  # or spring_constant_n_per_m, whose mass is k/Omega^2; leave both out: 1 ng
 [platform]
 amplitude_nm = 4
 frequency_khz = 180          # or reduced_frequency = omega / 2 Omega
@@ -325,10 +325,35 @@ def load_scene_and_start(path: str | os.PathLike[str]) -> tuple[Scene, Start | N
     Raises:
         SceneError: as `load_scene`.
     """
+    return read_scene(path)[:2]
+
+
+MASS_ASSUMED = (
+    "1 ng assumed: nothing says the tip's mass, on which hang all energies and speeds of a contact; give mass_ng or "
+    "spring_constant_n_per_m"
+)
+
+
+class SceneAsRead(NamedTuple):
+    """What a scene file holds: scene and start (None: left to the simulation), and what a reader should know of it."""
+
+    scene: Scene
+    start: Start | None
+    notes: tuple[str, ...]
+
+
+def read_scene(path: str | os.PathLike[str]) -> SceneAsRead:
+    """Return what a scene file holds.
+
+    Raises:
+        SceneError: as `load_scene`.
+    """
     source = os.fspath(path)
     tables = _checked(read_toml(source), source)
     scene = _scene_of(tables)
-    return scene, _start_of(tables, scene)
+    stated = {"mass_ng", "spring_constant_n_per_m"} & set(tables["cantilever"].values)
+    assumed = tables["interaction"].model == "contact" and not stated
+    return SceneAsRead(scene, _start_of(tables, scene), (f"{MASS_ASSUMED} in [cantilever].",) if assumed else ())
 
 
 def scene_of_tables(contents: Mapping[str, Any], source: str) -> Scene:
@@ -470,7 +495,9 @@ def _model_of(table: SceneTable) -> str:
 
 def _scene_of(tables: dict[str, SceneTable]) -> Scene:
     table = tables["cantilever"]
-    numbers = table.numbers(required=("frequency_khz",), optional=("quality_factor", "mass_ng"))
+    numbers = table.numbers(
+        required=("frequency_khz",), optional=("quality_factor", "mass_ng", "spring_constant_n_per_m")
+    )
     cantilever = table.build(Cantilever, **numbers)
     platform, base, force = read_drives(tables, cantilever)
     return tables["platform"].build(Scene, cantilever, platform, _interaction_of(tables), base, force)

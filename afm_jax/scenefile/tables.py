@@ -12,7 +12,7 @@ _MOTION = ("amplitude_nm", *_FREQUENCY, "phase_deg")
 _FORCE = ("amplitude_nn", *_FREQUENCY, "phase_deg")
 
 KEYS = {
-    "cantilever": ("frequency_khz", "quality_factor", "mass_ng"),
+    "cantilever": ("frequency_khz", "quality_factor", "mass_ng", "spring_constant_n_per_m"),
     "platform": ("amplitude_nm", *_FREQUENCY, "offset_nm", "offset_rate_nm_per_us", "second"),
     "platform.second": _MOTION,
     "base": (*_MOTION, "free_amplitude_nm", "second"),
