@@ -162,10 +162,11 @@ def check_kind(name: str, value: Any, kind: Any) -> None:
 
     Raises:
         TypeError: if not; names it.
+        ValueError: if it is NaN where a number is wanted.
     """
     must = _misfit(kind, value)
     if must:
-        raise TypeError(f"`{name}` must be {must}, but is {in_a_word(value)}")
+        raise (ValueError if _is_nan(value) else TypeError)(f"`{name}` must be {must}, but is {in_a_word(value)}")
 
 
 def _resolved(annotation: Any, function: Callable[..., Any]) -> Any:
