@@ -118,9 +118,9 @@ def equipartition(
     value = factor * BOLTZMANN * temperature / (1e-18 * mean.value)
     share = float(np.sqrt((mean.standard_error / mean.value) ** 2 + (error / temperature) ** 2 + 4.0 * scale_error**2))
     how = "by the slope of a force curve (static InvOLS)" if static else "for the mode itself"
+    good = f"good to {100.0 * scale_error:g} % (--scale-error, 5 % unless given)"
     assumed = (
-        f"The scale of the deflection is good to {100.0 * scale_error:g} % (--scale-error, 5 % unless given) and was "
-        f"calibrated {how}: factor {factor:.3f}.",
+        f"The scale of the deflection is {good} and was calibrated {how}: factor {factor:.3f}.",
         "First flexural mode of a rectangular lever, the laser on its end.",
         f"The lever is at {temperature:.1f} +- {error:.1f} K.",
     )
