@@ -166,9 +166,9 @@ def test_a_line_of_three_points_hides_no_resonance(quality: float, points: int):
     line = points // 10
     power[line : line + 3] += 0.1 * power.max()
     sweep = ResonanceSweep(frequency_khz=khz, amplitude=np.sqrt(power), amplitude_unit=DENSITY, averages=100.0)
-    for part in _windows(sweep):
-        assert part.frequency_khz[0] < FREQUENCY_KHZ < part.frequency_khz[-1]
-    assert khz[line + 2] < part.frequency_khz[0]
+    parts = _windows(sweep)
+    assert all(part.frequency_khz[0] < FREQUENCY_KHZ < part.frequency_khz[-1] for part in parts)
+    assert khz[line + 2] < parts[-1].frequency_khz[0]
 
 
 @pytest.mark.slow

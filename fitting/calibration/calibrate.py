@@ -101,19 +101,26 @@ def _windows(sweep: ResonanceSweep) -> list[ResonanceSweep]:
     """
     power = sweep.amplitude**2
     smooth = uniform_filter1d(median_filter(power, _WIDEST_LINE, mode="nearest"), 5, mode="nearest")
-    for part in _SURROUNDINGS:
-        reach = max(sweep.points // part, _WIDEST_LINE)
-        floor = median_filter(smooth, reach, mode="nearest")
-        top = int(np.argmax(smooth / floor))
-        # surroundings that the peak itself fills do not show it
-        if 2 * _points_above_half(smooth, top, float(floor[top])) < reach:
-            break
+    top, floor = _standing_out(smooth)
     # few averages scatter: a wide peak is measured on a curve that is smoothed more
     widths = [(size, _points_above_half(uniform_filter1d(power, size), top, float(floor[top]))) for size in (5, 21, 85)]
     wide = max(width for size, width in widths if size == 5 or width > 2 * size)
     step = np.ptp(sweep.frequency_khz) / (sweep.points - 1)
     half, centre = max(0.5 * wide, 3.0) * step, float(sweep.frequency_khz[top])
     return [sweep.within(centre - times * half, centre + times * half) for times in _HALF_WIDTHS]
+
+
+def _standing_out(smooth: Float[np.ndarray, " n"]) -> tuple[int, Float[np.ndarray, " n"]]:
+    """Return where a curve stands out most of its surroundings, and these."""
+    top, floor = 0, smooth
+    for part in _SURROUNDINGS:
+        reach = max(smooth.size // part, _WIDEST_LINE)
+        floor = median_filter(smooth, reach, mode="nearest")
+        top = int(np.argmax(smooth / floor))
+        # surroundings that the peak itself fills do not show it
+        if 2 * _points_above_half(smooth, top, float(floor[top])) < reach:
+            break
+    return top, floor
 
 
 def _points_above_half(smooth: Float[np.ndarray, " n"], top: int, floor: float) -> int:
