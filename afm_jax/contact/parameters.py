@@ -34,8 +34,8 @@ class ContactParameter:
         spread: the factor to either side of the paper's value within which fits start.
         evenly: the range within which fits start, evenly; None: as ``width`` or ``spread`` say.
         serves: the effects of which it needs one to mean anything; none: it is always of use.
-        unsure: standard error that is assumed where a fit holds it and nothing better is said: in its unit where there is
-            a ``width`` or ``evenly``, else relative.
+        unsure: standard error that is assumed where a fit holds it and nothing better is said: in its unit where there
+            is a ``width`` or ``evenly``, else relative.
         advice: what to measure so that a fit determines it, if there is more to say than of any.
     """
 
