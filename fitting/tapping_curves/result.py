@@ -536,7 +536,7 @@ class Tapping(Result):
 
     @property
     def set_aside(self) -> list[dict[str, Any]]:
-        """The rows that touch the sample and are not in the fit of one energy: line, height and why."""
+        """The rows that touch the sample and are in no energy: line, height and why."""
         return [
             {"line": int(self.curve.lines[i]), "offset_nm": float(self.curve.offset_nm[i]), "reason": note}
             for i, note in enumerate(self.rows.note)

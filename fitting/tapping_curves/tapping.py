@@ -160,8 +160,10 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
         curve, free=free, repulsive=repulsive, energy=np.where(free, 0.0, found.energy_aj), noise=noise
     )
     far = np.zeros(curve.rows, bool)
-    for one in (fitted, functions):
-        far |= False if one is None else one.outliers
+    if functions is not None:
+        far = functions.outliers
+    elif fitted is not None:
+        far = fitted.outliers
     alone = touching & ~np.isin(np.arange(curve.rows), np.concatenate([*alike, *stretches, np.zeros(0, int)]))
     shared, virial_shared = _errors(curve, given, free)
     rows = TapRows(
@@ -241,8 +243,8 @@ def _notes(curve: TappingCurve, **which: Bool[np.ndarray, " rows"]) -> tuple[str
         "free": "free: fixes the zero of the phase" if curve.has_phase else "free",
         "held": "set aside: the tip is held, a tenth of the free amplitude is left or less",
         "silent": "set aside: no phase, only a bound",
-        "rough": "set aside: off the smooth fall of its branch, so probably not one impact a period",
-        "early": "set aside: hardly touching yet, taps need not come every period",
+        "rough": "not in the one energy: off the smooth fall of its branch, so probably not one impact a period",
+        "early": "not in the one energy: hardly touching yet, taps need not come every period",
         "far": "set aside: its energy is more than 4 standard errors from the others'",
         "alone": f"set aside: fewer than {FEWEST_ROWS} rows of this branch",
     }
