@@ -162,10 +162,11 @@ def check_kind(name: str, value: Any, kind: Any) -> None:
 
     Raises:
         TypeError: if not; names it.
+        ValueError: if it is NaN where a number is wanted.
     """
     must = _misfit(kind, value)
     if must:
-        raise TypeError(f"`{name}` must be {must}, but is {in_a_word(value)}")
+        raise (ValueError if _is_nan(value) else TypeError)(f"`{name}` must be {must}, but is {in_a_word(value)}")
 
 
 def _resolved(annotation: Any, function: Callable[..., Any]) -> Any:
@@ -231,7 +232,8 @@ def _misfit_of_several(kind: Any, parts: tuple[Any, ...], value: Any) -> str:
         pairs = zip(parts, value, strict=True)
     else:
         pairs = ((parts[0] if parts else Any, one) for one in value)
-    inner = next((must for part, one in pairs if (must := _misfit(part, one))), "")
+    # a number that is none is of the right kind: what takes the list says what it must be
+    inner = next((must for part, one in pairs if (must := _misfit(part, one)) and not _is_nan(one)), "")
     return f"a list, each {inner}" if inner else ""
 
 
@@ -247,6 +249,10 @@ def _is_whole(value: Any) -> bool:
     except TypeError:
         return False
     return True
+
+
+def _is_nan(value: Any) -> bool:
+    return isinstance(value, float | np.floating) and bool(np.isnan(value))
 
 
 def _is_number(value: Any) -> bool:

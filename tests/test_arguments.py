@@ -51,7 +51,7 @@ calls = {
     afm.collide: dict(contact=contact, approach_speed_nm_per_us=30.0, mass_ng=1.0, accuracy=1e-9, method="diffrax"),
     afm.capture_speed: dict(contact=contact, mass_ng=1.0),
     afm.time_course: dict(contact=contact, approach_speed_nm_per_us=30.0),
-    fitting.fit: dict(table=table, model="law", scale_errors=False, fixed={}, free=["r"], speeds=(1.0, 2.0)),
+    fitting.fit: dict(table=table, model="law", scale_errors=False, fixed={}, free=["r"]),
     fitting.compare: dict(table=table, models=("restitution", "law")),
     fitting.invert: dict(table=table),
     fitting.tapping: dict(table=table, law=False, model="law"),

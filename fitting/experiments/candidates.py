@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from afm_jax.checks import checked
 from afm_jax.least_squares import covariance_of
 from fitting.experiments.belief import Belief, size_of
-from fitting.fits.fit import speed_range
+from fitting.fits.fit import member_after, speed_range
 from fitting.fits.minimum import padding, strain_of
 from fitting.fits.objective import BATCH, Objective
 from fitting.fits.unmodelled import Unmodelled, rows_of_fit, step_of
@@ -292,7 +292,8 @@ def forecast(
 ) -> Float[np.ndarray, "steps p"]:
     """Return the standard errors that a fit will state, before and after each chosen point.
 
-    Where impacts last these contain what the model leaves out, by the same step as after a fit, anew for these points.
+    Where impacts last these contain what the model leaves out, by the same step as after a fit, anew for these points,
+    and are those of the formula that is then closest to the law.
 
     Args:
         belief: the law and the instrument.
@@ -326,5 +327,8 @@ def forecast(
         jacobian = np.concatenate([(seen[..., None] * by_row).reshape(-1, len(size)), known])
         slopes = ImpactSlopes(*(seen * part for part in rows.slopes))
         some = rows._replace(slopes=slopes, jacobian=jacobian, residual=np.zeros(len(jacobian)))
-        errors[count] = np.sqrt(np.diag(step_of(some, left_out, free).covariance))[: len(size)]
+        step = step_of(some, left_out, free)
+        member = member_after(step, left_out, objective.measurement, belief.values, rows.approach[:count], free)
+        covariance = step.covariance if member is None else member.covariance
+        errors[count] = np.sqrt(np.diag(covariance))[: len(size)]
     return errors

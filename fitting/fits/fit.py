@@ -153,6 +153,34 @@ def law_before(
     return LawBefore(law[:, :count], slope[:, :count], float(law[0, count]), slope[0, count])
 
 
+def member_after(
+    step: LinearStep,
+    left_out: Unmodelled,
+    measurement: Measurement,
+    values: Float[np.ndarray, " p"],
+    speeds: Float[np.ndarray, " n"],
+    free: Bool[np.ndarray, " p"],
+) -> ClosestMember | None:
+    """Return the model's law that is closest to the law after a step; None where the step is all there is.
+
+    Args:
+        step: the step.
+        left_out: by the model.
+        measurement: gives the contact's fixed parameters.
+        values: from which the step was taken.
+        speeds: approach speeds in nm/us of the rows that are used.
+        free: which of the values are not at their bound.
+    """
+    problem = left_out.problem
+    if problem.model == "contact" or not problem.lasting:
+        return None
+    # one program for rows of any number up to that of a law's points
+    filled = np.append(speeds, np.full(-speeds.size % _POINTS, speeds[-1]))
+    before = law_before(problem, measurement, values, filled)
+    there = before._replace(law=before.law[:, : speeds.size], slope=before.slope[:, : speeds.size])
+    return closest_member(step, left_out, speeds, there, free)
+
+
 def loss_of(
     found: Callable[[Float[np.ndarray, " n"]], LawAfter],
     measured: tuple[float, float],
@@ -492,14 +520,8 @@ class _Summary:
 
     def _closest_member(self, step: LinearStep, left_out: Unmodelled) -> ClosestMember | None:
         """Return the model's law that is closest to the law after the step; None where the step is all there is."""
-        if self.problem.model == "contact" or not self.problem.lasting:
-            return None
         speeds = self.used_speeds[np.isfinite(self.used_speeds)]
-        # one program for rows of any number up to that of a law's points
-        filled = np.append(speeds, np.full(-speeds.size % _POINTS, speeds[-1]))
-        before = law_before(self.problem, self.objective.measurement, self.values, filled)
-        there = before._replace(law=before.law[:, : speeds.size], slope=before.slope[:, : speeds.size])
-        return closest_member(step, left_out, speeds, there, self.free)
+        return member_after(step, left_out, self.objective.measurement, self.values, speeds, self.free)
 
     def _explained_parameters(self, moved: Bool[np.ndarray, " k"]) -> dict[str, FittedParameter]:
         """Return the parameters with their errors and, where all are determined, their intervals."""
