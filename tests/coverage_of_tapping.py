@@ -71,9 +71,9 @@ def main() -> int:
         covered, median = float(np.mean(off < 1.96)), float(np.median(off)) / 0.6745
         virial = np.abs(np.concatenate([one.virial for one in found]))
         sys.stdout.write(
-            f"f0 to {frequency_error:g}: {len(found)} curves, {sum(one.valid for one in found)} valid; energy in its band at "
-            f"{covered:.3f} of {len(off)} points, largest deviation {off.max():.1f} errors, median {median:.2f} of what the "
-            f"errors imply; virial {np.mean(virial < 1.96):.3f}, {virial.max():.1f}\n"
+            f"f0 to {frequency_error:g}: {len(found)} curves, {sum(one.valid for one in found)} valid; energy in its "
+            f"band at {covered:.3f} of {len(off)} points, largest deviation {off.max():.1f} errors, median "
+            f"{median:.2f} of what the errors imply; virial {np.mean(virial < 1.96):.3f}, {virial.max():.1f}\n"
         )
         missed += not (LOWEST <= covered <= HIGHEST and off.max() <= LARGEST_Z and median <= LARGEST_MEDIAN)
     return 1 if missed else 0

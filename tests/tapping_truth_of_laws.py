@@ -1,4 +1,4 @@
-"""Tapping curves of impact laws in closed form: amplitude, lag, energy of a tap and virial, without the code under test.
+"""Tapping curves of impact laws in closed form: amplitude, lag, energy of a tap, virial; no code under test.
 
 The tip's motion less the free one flies freely between impacts on a sample that moves with the free amplitude. For an
 approach speed u the law gives the rebound speed w; flight and law then fix cosine and sine of the phase of the impact
@@ -10,6 +10,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.interpolate import PchipInterpolator
 
 from fitting.tables.table import AmplitudeTable, mass_of
 
@@ -102,6 +103,30 @@ def curve_of_law(tip: Tip, heights_nm: np.ndarray, rebound: Callable[[np.ndarray
     return Truth(*np.array(rows).T)
 
 
+GRAPHITE = Tip(free_nm=13.4, quality=230.0, stiffness=44.0, frequency_khz=344.6)
+SHARP = {"noise": 0.0015, "phase_noise_deg": 0.12}
+"""Noise of its measured curves."""
+
+
+def curve_like_graphite(rows: int = 150) -> Truth:
+    """Return a curve through measured figures of graphite: the energy grows, the lag rises, then falls below 90."""
+    ratio = np.linspace(0.985, 0.795, rows)
+    places = np.array([0.78, 0.80, 0.86, 0.90, 0.912, 0.92, 0.94, 0.98, 1.0])
+    energy = np.array([12.3, 12.0, 10.9, 9.3, np.nan, 7.6, 4.2, 1.6, 0.0])
+    lost = np.pi * GRAPHITE.stiffness * GRAPHITE.free_nm**2 / GRAPHITE.quality
+    # a lag of 90 degrees is where the energy is the most that a tap can take at this amplitude
+    energy[4] = lost * places[4] * (1.0 - places[4])
+    lag = np.degrees(np.arcsin(energy / (lost * places) + places))
+    lag = PchipInterpolator(places, np.where(places < 0.912, lag, 180.0 - lag))(ratio)
+    amplitude, n = ratio * GRAPHITE.free_nm, np.arange(2, 41)[:, None]
+    z = -amplitude * np.exp(-1j * np.radians(lag - 90.0))
+    over_k = 1j / GRAPHITE.quality * (z + GRAPHITE.free_nm)
+    at_harmonics = n * np.abs(over_k) / np.abs(1.0 - n**2 + 1j * n / GRAPHITE.quality)
+    taken = -np.pi * GRAPHITE.stiffness * np.imag(over_k * np.conj(z))
+    taken -= np.pi * GRAPHITE.stiffness / GRAPHITE.quality * np.sum(at_harmonics**2, axis=0)
+    return Truth(-amplitude, amplitude, lag, taken, 0.5 * GRAPHITE.stiffness * np.real(over_k * np.conj(z)))
+
+
 def curve_of_energy(tip: Tip, ratio: np.ndarray, energy_aj: np.ndarray, repulsive: np.ndarray) -> Truth:
     """Return the curve on resonance, force on the tip, of given energies: the lag balances them, harmonics too."""
     amplitude, lag, n = ratio * tip.free_nm, np.full(len(ratio), 90.0), np.arange(2, 41)[:, None]
@@ -127,33 +152,64 @@ class Stated(NamedTuple):
     phase_noise_deg: float = 0.15
 
 
-def table_of(tip: Tip, truth: Truth, stated: Stated, rng: np.random.Generator, free_rows: int = 12) -> AmplitudeTable:
-    """Return a curve as it would be measured: free rows in front, noise, an instrument off by its stated errors."""
+def table_of(
+    tip: Tip,
+    truth: Truth,
+    stated: Stated,
+    rng: np.random.Generator,
+    *,
+    free_rows: int = 12,
+    both_ways: bool = False,
+    phase_drift_deg: float = 0.0,
+    amplitude_drift: float = 0.0,
+    **also: Any,
+) -> AmplitudeTable:
+    """Return a curve as it would be measured: free rows in front, noise, an instrument off by its stated errors.
+
+    Args:
+        tip: the cantilever.
+        truth: what it does in contact.
+        stated: errors of the instrument and of the readings.
+        rng: what they are drawn from.
+        free_rows: how many there are.
+        both_ways: whether the same rows follow in the other order, as the sample goes.
+        phase_drift_deg: of the lag, from the first row to the last.
+        amplitude_drift: of the amplitude, as a fraction.
+        also: columns and comments of the table.
+    """
     free, lag = tip.free_reading
     ahead = truth.height_nm.min() - tip.free_nm * np.linspace(0.5, 0.1, free_rows)
-    height = np.concatenate([ahead, truth.height_nm])
-    amplitude = np.concatenate([np.full(free_rows, free), truth.amplitude_nm])
-    lags = np.concatenate([np.full(free_rows, lag), truth.lag_deg])
-    every = np.ones(len(height))
+    columns = [
+        np.concatenate([ahead, truth.height_nm]),
+        np.concatenate([np.full(free_rows, free), truth.amplitude_nm]),
+        np.concatenate([np.full(free_rows, lag), truth.lag_deg]),
+    ]
+    if both_ways:
+        also = {"retract": np.repeat([0.0, 1.0], len(columns[0]))} | also
+        columns = [np.concatenate([column, column[::-1]]) for column in columns]
+    height, amplitude, lags = columns
+    every, time = np.ones(len(height)), np.linspace(-0.5, 0.5, len(height))
     frequency, quality, stiffness = (
         value * (1.0 + error * rng.normal())
         for value, error in zip((tip.frequency_khz, tip.quality, tip.stiffness), stated[:3], strict=True)
     )
-    return AmplitudeTable(
-        drive=tip.drive,
-        drive_frequency_khz=tip.ratio * tip.frequency_khz * every,
-        free_amplitude_nm=free * every,
-        offset_nm=height,
-        lockin_amplitude_nm=amplitude * (1.0 + stated.noise * rng.normal(size=len(height))),
-        lockin_amplitude_error_nm=stated.noise * amplitude,
-        phase_lag_deg=lags + 3.0 + stated.phase_noise_deg * rng.normal(size=len(height)),
-        phase_lag_error_deg=stated.phase_noise_deg * every,
-        free_frequency_khz=frequency,
-        free_frequency_error_khz=stated.frequency * frequency,
-        quality_factor=quality,
-        quality_factor_error=stated.quality * quality,
-        spring_constant_n_per_m=stiffness,
-        spring_constant_error_n_per_m=stated.stiffness * stiffness,
-        mass_ng=mass_of(stiffness, frequency),
-        calibration={"tip_calibration": (1.0, 1e-6)},
-    )
+    read = amplitude * (1.0 + amplitude_drift * time) * (1.0 + stated.noise * rng.normal(size=len(height)))
+    own: dict[str, Any] = {
+        "drive": tip.drive,
+        "drive_frequency_khz": tip.ratio * tip.frequency_khz * every,
+        "free_amplitude_nm": free * every,
+        "offset_nm": height,
+        "lockin_amplitude_nm": read,
+        "lockin_amplitude_error_nm": stated.noise * amplitude,
+        "phase_lag_deg": lags + 3.0 + phase_drift_deg * time + stated.phase_noise_deg * rng.normal(size=len(height)),
+        "phase_lag_error_deg": stated.phase_noise_deg * every,
+        "free_frequency_khz": frequency,
+        "free_frequency_error_khz": stated.frequency * frequency,
+        "quality_factor": quality,
+        "quality_factor_error": stated.quality * quality,
+        "spring_constant_n_per_m": stiffness,
+        "spring_constant_error_n_per_m": stated.stiffness * stiffness,
+        "mass_ng": mass_of(stiffness, frequency),
+        "calibration": {"tip_calibration": (1.0, 1e-6)},
+    }
+    return AmplitudeTable(**(own | also))

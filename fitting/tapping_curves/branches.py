@@ -156,12 +156,17 @@ def repulsive_rows(
     return repulsive
 
 
-def smooth_stretches(curve: TappingCurve, touching: Bool[np.ndarray, " rows"]) -> list[np.ndarray]:
-    """Return the rows of each drive and way between jumps of the lag: along each the energy is a smooth function.
+def smooth_stretches(
+    curve: TappingCurve, touching: Bool[np.ndarray, " rows"], repulsive: Bool[np.ndarray, " rows"]
+) -> list[np.ndarray]:
+    """Return the rows of each drive and way, cut where the lag jumps between attraction and repulsion.
+
+    Along each the energy is a smooth function.
 
     Args:
         curve: the curve, with a phase.
         touching: the rows wanted.
+        repulsive: from `repulsive_rows`.
     """
     found = []
     for part in ways(curve):
@@ -169,10 +174,10 @@ def smooth_stretches(curve: TappingCurve, touching: Bool[np.ndarray, " rows"]) -
         lag, error = curve.lag_deg[rows], curve.lag_error_deg[rows]
         steps = np.abs(np.diff(lag))
         cuts = []
-        for i, step in enumerate(steps.tolist()):
+        for i in np.flatnonzero(np.diff(repulsive[rows])).tolist():
             others = np.concatenate([steps[max(i - _AROUND, 0) : i], steps[i + 1 : i + 1 + _AROUND]])
             usual = float(np.median(others)) if len(others) else 0.0
-            if step > max(_JUMP_ERRORS * np.hypot(error[i], error[i + 1]), _JUMP_STEPS * usual):
+            if steps[i] > max(_JUMP_ERRORS * np.hypot(error[i], error[i + 1]), _JUMP_STEPS * usual):
                 cuts.append(i + 1)
         found += [stretch for stretch in np.split(rows, cuts) if len(stretch)]
     return found

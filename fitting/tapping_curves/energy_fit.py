@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from afm_jax.least_squares import IMPROBABLE, chi2_tail
-from fitting.tapping_curves.branches import free_ends, smooth_stretches, ways
+from fitting.tapping_curves.branches import free_ends, repulsive_rows, smooth_stretches, ways
 from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, Rows, TappingCurve, free_lag_deg
 from fitting.tapping_curves.energy import Energies, energies, noise_of, virial_noise_of
 
@@ -48,7 +48,9 @@ _LEAST_SIZE = 0.3
 _ROUNDS = 30
 _SHORTEST = 1e-3
 """Fraction of a step below which the search stays as it is."""
-_SETTLED = 1e-4
+_RISE = 0.1
+"""By which a step may raise chi2: slopes are taken at smooth readings, not at those that chi2 is of."""
+_SETTLED = 1e-3
 """Change of the unknowns in their standard errors from which the search has settled."""
 
 
@@ -394,7 +396,7 @@ class _Search:
     def __post_init__(self):
         curve, free = self.curve, self.free
         self.place = depths(curve, free)
-        self.smoothed = _smoothed_readings(curve, self.touching, self.place)
+        self.smoothed = _smoothed_readings(curve, self.touching, self.place, free)
         frequency = np.unique(curve.drive_frequency_khz, return_inverse=True)[1]
         level = np.argmax(np.stack(_levels(curve)), axis=0) if curve.rows else frequency
         share = curve.amplitude_nm / curve.free_amplitude_nm
@@ -427,9 +429,27 @@ class _Search:
                 values[i] = one.given.value * np.exp(x[i] * one.unit / one.given.value)
         return values
 
-    def slopes(self, x: np.ndarray) -> _Slopes:
-        """Return the changes by every unknown."""
-        curve, at = self.smoothed, self.instrument(x)
+    def _as_fitted(self, x: np.ndarray, groups: list, smoothers: list[Smoother], found: Energies) -> TappingCurve:
+        """Return the curve with the most probable readings whose energies are those of the functions.
+
+        Slopes are taken there: at readings with noise they hang on the noise of the same rows, and pull the instrument
+        to where all energies, noise included, are smaller.
+        """
+        curve = self.smoothed
+        start = energies(curve, self.instrument(x))
+        variance = noise_of(curve, start) ** 2
+        amplitude, lag = curve.amplitude_nm.copy(), curve.lag_deg.copy()
+        for rows, smoother in zip(groups, smoothers, strict=True):
+            weights, _ = smoother.at(self.place[rows])
+            off = weights @ (smoother.bins.averages @ found.energy_aj[rows]) - start.energy_aj[rows]
+            off /= variance[rows]
+            amplitude[rows] += off * start.amplitude_slope[rows] * curve.amplitude_error_nm[rows] ** 2
+            lag[rows] += off * start.lag_slope[rows] * curve.lag_error_deg[rows] ** 2
+        return replace(curve, amplitude_nm=amplitude, lag_deg=lag)
+
+    def slopes(self, x: np.ndarray, curve: TappingCurve) -> _Slopes:
+        """Return the changes by every unknown at some readings."""
+        at = self.instrument(x)
         time = np.zeros(curve.rows) if curve.time is None else curve.time
         steps = {
             "free_frequency_khz": 1e-4 * at.free_frequency_khz / at.quality_factor,
@@ -538,20 +558,24 @@ class _Search:
         if not len(x):
             return x
         for _ in range(_ROUNDS):
-            slopes, found = self.slopes(x), energies(self.curve, self.instrument(x))
+            found = energies(self.curve, self.instrument(x))
             smoothers = self._smoothers(x, groups, processes, scale)
+            slopes = self.slopes(x, self._as_fitted(x, groups, smoothers, found))
             matrix, gradient, total = self._normal(x, slopes, found, groups, smoothers)
             step = -np.linalg.pinv(matrix, hermitian=True) @ gradient
             if step @ matrix @ step < _SETTLED**2:
                 break
             fraction = 1.0
-            while fraction > _SHORTEST and not self._total(x + fraction * step, groups, smoothers) < total:
+            while (
+                fraction > _SHORTEST and not self._total(x + fraction * step, groups, processes, scale) < total + _RISE
+            ):
                 fraction *= 0.5
             x = x + fraction * step
         return x
 
-    def _total(self, x: np.ndarray, groups: list, smoothers: list[Smoother]) -> float:
-        """Return the sum of squares with some smoothers."""
+    def _total(self, x: np.ndarray, groups: list, processes: list[Process], scale: float) -> float:
+        """Return the sum of squares."""
+        smoothers = self._smoothers(x, groups, processes, scale)
         known = np.array([np.isfinite(one.given.error) for one in self.unknowns], bool)
         found = energies(self.curve, self.instrument(x)).energy_aj
         rows = [s.root @ (s.bins.averages @ found[r]) for r, s in zip(groups, smoothers, strict=True)]
@@ -562,7 +586,7 @@ class _Search:
     def _processes(self, x: np.ndarray, groups: list, scale: float) -> list[Process]:
         """Return the processes of the groups, of the size and length that the readings make most probable."""
         curve = self.curve
-        slopes, found = self.slopes(x), energies(curve, self.instrument(x))
+        found = energies(curve, self.instrument(x))
         s = curve.drive_frequency_khz / curve.free_frequency_khz.value
         tip = curve.spring_constant_n_per_m.value * curve.tip_calibration.value**2
         free = curve.free_amplitude_nm
@@ -576,6 +600,8 @@ class _Search:
             return made
 
         best, most = processes(_USUAL_SIZE, _USUAL_LENGTH), -np.inf
+        usual = self._smoothers(x, groups, best, scale)
+        slopes = self.slopes(x, self._as_fitted(x, groups, usual, found))
         for size in _SIZES:
             for length in _LENGTHS:
                 trial = processes(size, length)
@@ -590,8 +616,9 @@ class _Search:
         return best
 
     def _result(self, x: np.ndarray, groups: list, processes: list[Process], scale: float) -> EnergyFit:
-        curve, slopes, found = self.curve, self.slopes(x), energies(self.curve, self.instrument(x))
+        curve, found = self.curve, energies(self.curve, self.instrument(x))
         smoothers = self._smoothers(x, groups, processes, scale)
+        slopes = self.slopes(x, self._as_fitted(x, groups, smoothers, found))
         matrix = self._normal(x, slopes, found, groups, smoothers)[0]
         covariance = np.linalg.pinv(matrix, hermitian=True)
         known = np.array([np.isfinite(one.given.error) for one in self.unknowns], bool)
@@ -702,14 +729,13 @@ def _stretches(curve: TappingCurve, rows: Int[np.ndarray, " some"]) -> list[np.n
     ]
 
 
-def _smoothed_readings(curve: TappingCurve, touching: Bool[np.ndarray, " rows"], place: Rows) -> TappingCurve:
-    """Return a curve with its readings smoothed along each branch.
-
-    Slopes and errors of energies are taken there: those at the readings themselves hang on the noise of the same rows,
-    and pull the instrument.
-    """
+def _smoothed_readings(
+    curve: TappingCurve, touching: Bool[np.ndarray, " rows"], place: Rows, free: Bool[np.ndarray, " rows"]
+) -> TappingCurve:
+    """Return a curve with its readings smoothed along each branch: errors of energies are taken there."""
     amplitude, lag = curve.amplitude_nm.copy(), curve.lag_deg.copy()
-    for rows in smooth_stretches(curve, touching):
+    departure = turned(curve.lag_deg - free_lag_deg(curve, plain_instrument(curve, free)))
+    for rows in smooth_stretches(curve, touching, repulsive_rows(curve, touching, departure)):
         for readings, errors in ((amplitude, curve.amplitude_error_nm), (lag, curve.lag_error_deg)):
             values = readings[rows]
             smoother = smoother_along(place[rows], values, errors[rows], max(float(np.ptp(values)), errors[rows[0]]))

@@ -7,13 +7,14 @@ from typing import Any
 import numpy as np
 
 from afm_jax.strict_json import plain
-from afm_jax.words import bullets, interval, known, percent, text_table, with_error
+from afm_jax.words import broken, bullets, interval, known, percent, text_table, with_error
 from fitting.tapping_curves.branches import Height, Hysteresis
 from fitting.tapping_curves.energy_curve import HEADLINE
 from fitting.tapping_curves.energy_fit import EnergyFit
 from fitting.tapping_curves.result import Tapping, origin_in_words
 
 _EV_PER_AJ = 6.241509
+_WIDTH = 150
 _CHANGES = {
     "contact": "contact: the amplitude leaves the free one",
     "half": "half of the free amplitude is left",
@@ -32,9 +33,10 @@ def tapping_summary(result: Tapping) -> str:
         lines += _energy_lines(result)
     lines += _threshold_lines(result)
     lines += _speed_lines(result)
-    lines += ["", law_in_words(result)]
-    lines += bullets("Assumed:", result.assumptions)
-    lines += bullets("Notes:", result.warnings)
+    law = law_in_words(result)
+    lines += ["", *(broken(law, _WIDTH) if result.law is None else [law])]
+    lines += [piece for line in bullets("Assumed:", result.assumptions) for piece in broken(line, _WIDTH, "    ")]
+    lines += [piece for line in bullets("Notes:", result.warnings) for piece in broken(line, _WIDTH, "    ")]
     return "\n".join(lines)
 
 
@@ -59,7 +61,7 @@ def energy_in_words(result: Tapping) -> str:
     low, high = energy["interval95"]
     value = with_error(energy["value"], energy["standard_error"])
     electronvolts = interval(_EV_PER_AJ * low, _EV_PER_AJ * high)
-    return f"{value} aJ (95 %: {interval(low, high)}), {electronvolts} eV"
+    return f"{value} aJ (95 %: {interval(low, high)}), {electronvolts} eV, if each takes the same"
 
 
 def law_in_words(result: Tapping) -> str:

@@ -151,7 +151,7 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
         early = np.zeros(curve.rows, bool)
     kinds, alike = _kinds(curve, touching & ~rough & ~early, repulsive)
     fitted = fit_energy(curve, alike, free, smooth=False, scale_errors=scale_errors) if kinds else None
-    stretches = [rows for rows in smooth_stretches(curve, touching) if len(rows) >= FEWEST_ROWS]
+    stretches = [rows for rows in smooth_stretches(curve, touching, repulsive) if len(rows) >= FEWEST_ROWS]
     functions = fit_energy(curve, stretches, free, smooth=True, scale_errors=scale_errors) if stretches else None
     at = functions or fitted
     found = plain if at is None else at.energies_at
