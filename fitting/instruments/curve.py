@@ -598,7 +598,8 @@ def _error_of_lag(curve: MeasuredCurve) -> float:
         return free_lag_deg(str(curve.known["drive"].value), drive / free, quality_factor)
 
     errors = {key: curve.known[key].error or share * at[key] for key, share in _USUAL.items()}
-    return float(np.hypot(*(0.5 * (lag(**{k: at[k] + e}) - lag(**{k: at[k] - e})) for k, e in errors.items())))
+    parts = [0.5 * (lag(**{key: at[key] + error}) - lag(**{key: at[key] - error})) for key, error in errors.items()]
+    return float(np.linalg.norm(parts))
 
 
 def _is_missing(curve: MeasuredCurve, key: str) -> bool:
