@@ -391,7 +391,8 @@ def _words(name: str, extra: Any) -> str:
         ]
         lines = text_table(["model", "chi2/dof", "AIC", "BIC", "law differs"], cells)
         lines += [f"  {model:<18} failed: {reason}" for model, reason in extra.failed.items()]
-        return "\n".join(["", "Models on the same rows, best first:", *lines, f"  {extra.verdict}"])
+        head = "Models, best first (AIC and BIC: of the formula alone, on the rows that all models use):"
+        return "\n".join(["", head, *lines, f"  {extra.verdict}"])
     intervals = {key: found["interval95"] for key, found in extra.to_dict()["parameters"].items()}
     head = "95 % credible intervals (posterior, flat priors):"
     if name == "bootstrap":

@@ -293,7 +293,7 @@ def forecast(
     """Return the standard errors that a fit will state, before and after each chosen point.
 
     Where impacts last these contain what the model leaves out, by the same step as after a fit, anew for these points,
-    and are those of the formula that is then closest to the law.
+    and are those of the formula that is then closest to the law. A belief that a fit left is of that formula already.
 
     Args:
         belief: the law and the instrument.
@@ -328,7 +328,9 @@ def forecast(
         slopes = ImpactSlopes(*(seen * part for part in rows.slopes))
         some = rows._replace(slopes=slopes, jacobian=jacobian, residual=np.zeros(len(jacobian)))
         step = step_of(some, left_out, free)
-        member = member_after(step, left_out, objective.measurement, belief.values, rows.approach[:count], free)
-        covariance = step.covariance if member is None else member.covariance
+        covariance = step.covariance
+        if not len(belief.measured):
+            member = member_after(step, left_out, objective.measurement, belief.values, rows.approach[:count], free)
+            covariance = covariance if member is None else member.covariance
         errors[count] = np.sqrt(np.diag(covariance))[: len(size)]
     return errors

@@ -147,8 +147,8 @@ class FitResult(Result):
             out; with a robust fit the soft sum of the residuals alone.
         degrees_of_freedom: measured amplitudes plus constraints minus parameters.
         p_value: probability of a larger chi2 if the model is right.
-        aic: chi2 + 2 k.
-        bic: chi2 + k log(n).
+        aic: chi2 + 2 k, chi2 here of the formula alone: the model discrepancy would make up for what it lacks.
+        bic: chi2 + k log(n), likewise.
         valid: converged, explained and determined; `reasons` say why not.
         reasons: what makes the result invalid.
         warnings: what a reader should know besides.
