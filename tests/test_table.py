@@ -110,7 +110,7 @@ def test_quality_factor_with_its_error(tmp_path: Path, value: str):
 
 def test_what_a_table_does_not_say_of_the_cantilever_is_not_known(tmp_path: Path):
     table = read_table(write(tmp_path, TEXT))
-    assert np.isnan(table.quality_factor)
+    assert str(table.quality_factor) == "nan"
     assert (table.quality_factor_error, table.mass_ng, table.spring_constant_n_per_m) == (None, None, None)
     undamped = read_table(write(tmp_path, f"# quality_factor = none\n{TEXT}"))
     assert undamped.quality_factor is None
