@@ -182,17 +182,10 @@ def _given(table: "AmplitudeTable", options: dict[str, Any]) -> "AmplitudeTable"
         if options[option] is not None
         for name, number in zip(pair, options[option], strict=True)
     }
-    return _calibrated(_with_mass(table, own), options)
-
-
-def _with_mass(table: "AmplitudeTable", own: dict[str, Any]) -> "AmplitudeTable":
-    """Return a table with numbers in place of its own; the mass is what spring constant and frequency make it."""
-    from fitting.tables.table import mass_of  # noqa: PLC0415
-
-    spring = own.get("spring_constant_n_per_m", table.spring_constant_n_per_m)
-    if own and spring is not None:
-        own = own | {"mass_ng": mass_of(spring, own.get("free_frequency_khz", table.free_frequency_khz))}
-    return replace(table, **own) if own else table
+    if own and own.get("spring_constant_n_per_m", table.spring_constant_n_per_m) is not None:
+        # what spring constant and frequency make it
+        own["mass_ng"] = None
+    return _calibrated(replace(table, **own) if own else table, options)
 
 
 def _calibrated(table: "AmplitudeTable", options: dict[str, Any]) -> "AmplitudeTable":
