@@ -47,7 +47,7 @@ def deviations(tip: Tip, truth: Truth, stated: Stated, rng: np.random.Generator)
             true = truth.at(f"{name}_aj", curve.amplitude_ratio, free)
             column.append((getattr(curve, f"{name}_aj") - true) / getattr(curve, f"{name}_error_aj"))
         parts.append(np.concatenate(column))
-    return Deviations(*parts, result.valid)
+    return Deviations(parts[0], parts[1], result.valid)
 
 
 def random_curve(number: int, frequency_error: float) -> Deviations:

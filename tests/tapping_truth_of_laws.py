@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.interpolate import PchipInterpolator
 
-from fitting.tables.table import AmplitudeTable, mass_of
+from fitting.tables.table import AmplitudeTable
 
 RAD_PER_US = 2e-3 * np.pi
 
@@ -209,7 +209,6 @@ def table_of(
         "quality_factor_error": stated.quality * quality,
         "spring_constant_n_per_m": stiffness,
         "spring_constant_error_n_per_m": stated.stiffness * stiffness,
-        "mass_ng": mass_of(stiffness, frequency),
         "calibration": {"tip_calibration": (1.0, 1e-6)},
     }
     return AmplitudeTable(**(own | also))

@@ -179,7 +179,7 @@ def test_each_free_amplitude_has_an_energy_of_its_own_and_the_picture_shows_all_
     assert low <= touching.min()
     assert touching.max() <= high
     assert np.allclose(
-        [line.get_ydata()[0] for line in bottom.lines if line.get_linestyle() == "--"], (4.1, 6.4), rtol=0.2
+        [np.asarray(line.get_ydata())[0] for line in bottom.lines if line.get_linestyle() == "--"], (4.1, 6.4), rtol=0.2
     )
 
 

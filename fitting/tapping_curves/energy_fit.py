@@ -738,7 +738,7 @@ def _smoothed_readings(
     for rows in smooth_stretches(curve, touching, repulsive_rows(curve, touching, departure)):
         for readings, errors in ((amplitude, curve.amplitude_error_nm), (lag, curve.lag_error_deg)):
             values = readings[rows]
-            smoother = smoother_along(place[rows], values, errors[rows], max(float(np.ptp(values)), errors[rows[0]]))
+            smoother = smoother_along(place[rows], values, errors[rows], max(float(np.ptp(values)), float(errors[rows[0]])))
             readings[rows] = smoother.at(place[rows])[0] @ (smoother.bins.averages @ values)
     return replace(curve, amplitude_nm=amplitude, lag_deg=lag)
 
