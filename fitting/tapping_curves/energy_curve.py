@@ -62,7 +62,7 @@ class EnergyCurve:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Branch:
+class TappingBranch:
     """Rows of one drive, one way and one side of the phase, and the energy along them.
 
     Attributes:
@@ -89,7 +89,7 @@ class Branch:
 
 def branches_of(
     curve: TappingCurve, fit: EnergyFit, repulsive: Bool[np.ndarray, " rows"], free: Bool[np.ndarray, " rows"]
-) -> tuple[Branch, ...]:
+) -> tuple[TappingBranch, ...]:
     """Return the branches that the functions of a fit run along."""
     place = depths(curve, free)
     found = []
@@ -98,7 +98,7 @@ def branches_of(
             here = rows[repulsive[rows] == state]
             if len(here) >= FEWEST_ROWS:
                 found.append(
-                    Branch(
+                    TappingBranch(
                         drive_frequency_khz=float(curve.drive_frequency_khz[here[0]]),
                         free_amplitude_nm=float(curve.free_amplitude_nm[here[0]]),
                         retract=bool(curve.retract[here[0]]),
@@ -162,7 +162,7 @@ class WayDifference:
     standard_error: float
 
 
-def differences_of_ways(branches: tuple[Branch, ...], fit: EnergyFit) -> dict[tuple[int, int], WayDifference]:
+def differences_of_ways(branches: tuple[TappingBranch, ...], fit: EnergyFit) -> dict[tuple[int, int], WayDifference]:
     """Return by how much retract differs from approach, by the numbers of the two branches."""
     found = {}
     for i, one in enumerate(branches):

@@ -307,7 +307,7 @@ def fit_energy(
     """
     groups = [rows[np.argsort(curve.offset_nm[rows], kind="stable")] for rows in groups]
     touching = np.isin(np.arange(curve.rows), np.concatenate(groups))
-    search = _Search(curve, free, _unknowns(curve, free), touching, smooth=smooth)
+    search = _EnergySearch(curve, free, _unknowns(curve, free), touching, smooth=smooth)
     found = search.fitted(groups, 1.0)
     far = np.abs(found.residual) > _FAR * (max(1.0, _scale(found)) if smooth else 1.0)
     if 0 < far.sum() <= _MOST_OUTLIERS * found.used.sum():
@@ -374,7 +374,7 @@ def _levels(curve: TappingCurve) -> list[Bool[np.ndarray, " rows"]]:
     return [which == i for i in range(which.max(initial=-1) + 1)]
 
 
-class _Slopes(NamedTuple):
+class _EnergySlopes(NamedTuple):
     """Changes by one unit of each unknown, shape (rows, unknowns): energy, virial, free tip's lag and amplitude."""
 
     energy: np.ndarray
@@ -384,7 +384,7 @@ class _Slopes(NamedTuple):
 
 
 @dataclass
-class _Search:
+class _EnergySearch:
     """The least squares: readings of a curve, unknowns of its instrument, functions of groups of rows."""
 
     curve: TappingCurve
@@ -447,7 +447,7 @@ class _Search:
             lag[rows] += off * start.lag_slope[rows] * curve.lag_error_deg[rows] ** 2
         return replace(curve, amplitude_nm=amplitude, lag_deg=lag)
 
-    def slopes(self, x: np.ndarray, curve: TappingCurve) -> _Slopes:
+    def slopes(self, x: np.ndarray, curve: TappingCurve) -> _EnergySlopes:
         """Return the changes by every unknown at some readings."""
         at = self.instrument(x)
         time = np.zeros(curve.rows) if curve.time is None else curve.time
@@ -484,7 +484,7 @@ class _Search:
                 column.append(part * here)
             columns[3].append(here if field == "free_amplitude_factor" else np.zeros(curve.rows))
         shape = (curve.rows, 0)
-        return _Slopes(*(np.stack(c, axis=1) if c else np.zeros(shape) for c in columns))
+        return _EnergySlopes(*(np.stack(c, axis=1) if c else np.zeros(shape) for c in columns))
 
     def fitted(self, groups: list[np.ndarray], scale: float) -> EnergyFit:
         """Return the fit of some groups, the rows' own errors multiplied by a scale."""
@@ -530,7 +530,7 @@ class _Search:
         left.append((shares.average(factor) - shares.mean) / shares.error)
         return np.concatenate(left)
 
-    def _slopes_of_free(self, slopes: _Slopes) -> np.ndarray:
+    def _slopes_of_free(self, slopes: _EnergySlopes) -> np.ndarray:
         """Return the changes of the residuals of the free rows' means."""
         lags, shares = self.lags, self.shares
         parts = [lags.average(slopes.free_lag) / lags.error[:, None]]
@@ -538,7 +538,7 @@ class _Search:
         return np.concatenate(parts)
 
     def _normal(
-        self, x: np.ndarray, slopes: _Slopes, found: Energies, groups: list, smoothers: list[Smoother]
+        self, x: np.ndarray, slopes: _EnergySlopes, found: Energies, groups: list, smoothers: list[Smoother]
     ) -> tuple[np.ndarray, np.ndarray, float]:
         """Return the normal matrix of the unknowns, the gradient, and the sum of squares."""
         known = np.array([np.isfinite(one.given.error) for one in self.unknowns], bool)
@@ -738,7 +738,9 @@ def _smoothed_readings(
     for rows in smooth_stretches(curve, touching, repulsive_rows(curve, touching, departure)):
         for readings, errors in ((amplitude, curve.amplitude_error_nm), (lag, curve.lag_error_deg)):
             values = readings[rows]
-            smoother = smoother_along(place[rows], values, errors[rows], max(float(np.ptp(values)), float(errors[rows[0]])))
+            smoother = smoother_along(
+                place[rows], values, errors[rows], max(float(np.ptp(values)), float(errors[rows[0]]))
+            )
             readings[rows] = smoother.at(place[rows])[0] @ (smoother.bins.averages @ values)
     return replace(curve, amplitude_nm=amplitude, lag_deg=lag)
 

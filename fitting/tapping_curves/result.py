@@ -16,7 +16,7 @@ from fitting.tapping_curves.curve import USUAL_ERRORS, Rows, TappingCurve
 from fitting.tapping_curves.energy_curve import (
     FEWEST_ROWS,
     HEADLINE,
-    Branch,
+    TappingBranch,
     WayDifference,
     differences_of_ways,
 )
@@ -182,7 +182,7 @@ class Tapping(Result):
     groups: tuple[EnergyGroup, ...]
     fit: EnergyFit | None
     functions: EnergyFit | None
-    branches: tuple[Branch, ...]
+    branches: tuple[TappingBranch, ...]
     scale_errors: bool
     bound_aj: float | None
     hysteresis: tuple[Hysteresis, ...]
