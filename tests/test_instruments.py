@@ -12,7 +12,7 @@ from click.testing import CliRunner
 import fitting.instruments.formats as formats_module
 from afm_jax.cli.main import main
 from fitting import TableError, read_curve, read_curves, read_table
-from fitting.examples.make_raw_curve import FREE_NM, NM_PER_VOLT, raw_curve
+from fitting.examples.make_raw_curve import EXAMPLE, FREE_NM, NM_PER_VOLT, raw_curve
 from fitting.instruments.columns import parse_columns
 from fitting.instruments.curve import free_lag_deg, table_text
 from fitting.instruments.formats import read_recording
@@ -572,3 +572,27 @@ def test_tapping_takes_a_raw_file_in_one_step(tmp_path: Path):
     refused = CliRunner().invoke(main, ["tapping", str(table), "--bin-nm", "1"])
     assert (refused.exit_code, len(refused.stderr.splitlines())) == (2, 1)
     assert "--bin-nm is for an instrument's file" in refused.stderr
+
+
+def test_the_example_is_a_simulated_raw_file_with_the_defects_of_real_ones():
+    columns = np.loadtxt(EXAMPLE, unpack=True)
+    made = raw_curve()
+    np.testing.assert_allclose(columns[0:2], made.height_nm, atol=0.006)
+    np.testing.assert_allclose(columns[4:6], made.amplitude_v, atol=6e-6)
+    np.testing.assert_allclose(columns[6:8], made.phase_deg, atol=0.006)
+    # volts, repeated and unordered heights, a free amplitude that drifts and a phase with a zero of its own
+    assert 0.2 < columns[4].max() < 0.4
+    assert len(np.unique(columns[0])) < 900 < len(columns[0])
+    assert np.any(np.diff(columns[0]) < 0.0)
+    far = [np.mean(columns[4][:300]), np.mean(columns[5][-300:])]
+    assert far[1] / far[0] - 1.0 == pytest.approx(0.0007, abs=2e-4)
+    assert np.mean(columns[6][:300]) == pytest.approx(102.3, abs=0.1)
+    answer = CliRunner().invoke(main, ["tapping", "--example", "--no-law", "--json"])
+    payload = strictly(answer.stdout)
+    assert {row["branch"] for row in payload["rows"]} == {"approach", "retract"}
+    told = " ".join(payload["notes"])
+    assert "The example is simulated; as if it were measured: afm-jax tapping " in told
+    assert "slope of the steepest settled part" in told
+    assert "rows repeat a height" in told
+    both = CliRunner().invoke(main, ["tapping", "--example", str(EXAMPLE)])
+    assert (both.exit_code, len(both.stderr.splitlines())) == (2, 1)

@@ -578,10 +578,28 @@ def _with_zero_of_phase(curve: MeasuredCurve) -> MeasuredCurve:
         return curve
     lag = free_lag_deg(str(curve.known["drive"].value), numbers[0] / numbers[1], quality_factor)  # type: ignore[operator]
     free = phase[curve.free]
-    level, error = float(np.median(free)), float(np.std(free) / np.sqrt(len(free)))
+    level, scatter = float(np.median(free)), float(np.std(free) / np.sqrt(len(free)))
+    error = float(np.hypot(max(scatter, 0.01), _error_of_lag(curve)))
     how = f"measured: the free rows read {level:.2f} deg and are set to {lag:.2f}, what s and Q give"
-    known = curve.known | {"phase_zero_deg": Known(level - lag, "deg", how, max(error, 0.01))}
+    known = curve.known | {"phase_zero_deg": Known(level - lag, "deg", how, error)}
     return replace(curve, phase_lag_deg=phase - (level - lag), known=known)
+
+
+_USUAL = {"free_frequency_khz": 2e-4, "quality_factor": 0.05}
+"""Relative errors of what is given without one."""
+
+
+def _error_of_lag(curve: MeasuredCurve) -> float:
+    """Return the standard error of the free tip's lag in degrees, from those of its frequency and quality factor."""
+    at = {key: float(curve.known[key].value) for key in ("drive_frequency_khz", *_USUAL)}
+
+    def lag(**changed: float) -> float:
+        drive, free, quality_factor = (at | changed).values()
+        return free_lag_deg(str(curve.known["drive"].value), drive / free, quality_factor)
+
+    errors = {key: curve.known[key].error or share * at[key] for key, share in _USUAL.items()}
+    parts = [0.5 * (lag(**{key: at[key] + error}) - lag(**{key: at[key] - error})) for key, error in errors.items()]
+    return float(np.linalg.norm(parts))
 
 
 def _is_missing(curve: MeasuredCurve, key: str) -> bool:
