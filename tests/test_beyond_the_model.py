@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
+from afm_jax.contact.parameters import PAPER
 from fitting import fit
 from fitting.fits.result import FitResult
+from fitting.parameters import CONTACT_DEFAULT
 from tests.fit_tables import amplitudes_and_errors, with_amplitudes
 from tests.impact_tables import bump, contact_impact, deviation, drives, measured, steady_amplitudes, with_loss
 
@@ -57,3 +59,20 @@ def test_five_outliers_leave_a_robust_fit_its_law(seed):
     result = fit(with_amplitudes(table, amplitude, error), "viscous+delay", robust=True)
     assert not any(" inf " in reason for reason in result.reasons)
     assert farthest(result, impact) <= 2.5
+
+
+@pytest.mark.parametrize("truth", [{"structural_amplitude_n_per_m": 60.0}, {"structural_decay_nm": 0.5}])
+def test_what_a_fit_of_the_contact_holds_is_not_exact(truth):
+    """The structural force is another one than the fit holds it at: its error is in law, band and intervals."""
+    impact = contact_impact(**truth)
+    result = fit(measured(drives(), steady_amplitudes(drives(), impact), 0.01, 1), "contact")
+    assert result.valid, result.reasons
+    assert np.mean(deviation(result, impact)[1] <= 1.0) >= 0.9
+    assert farthest(result, impact) <= 2.5
+    for name in CONTACT_DEFAULT:
+        low, high = result.parameters[name].interval95
+        assert low is None or low < PAPER[name]
+        assert high is None or PAPER[name] < high
+    (said,) = [warning for warning in result.warnings if warning.startswith("Held, with errors that are assumed: ")]
+    assert "structural_amplitude_n_per_m = 40 +- 12" in said
+    assert any("hangs on what is held" in warning for warning in result.warnings)

@@ -269,12 +269,14 @@ def test_bands_hold_the_law_of_a_contact_that_is_not_the_models():
 def test_the_loss_is_said_in_energies_and_delta():
     energy = energy_lost(20.0, 10.0, 0.1, 2.0)
     # 2 ng (20^2 - 19.9^2)/2 -+ 39: no sample at rest gives energy
-    assert energy_lost(20.0, 19.9, 0.5, 2.0).energy_aj.interval95 == pytest.approx((0.0, 3.99 + 39.004), abs=1e-3)
+    slower = energy_lost(20.0, 19.9, 0.5, 2.0).energy_aj
+    assert slower is not None
+    assert slower.interval95 == pytest.approx((0.0, 3.99 + 39.004), abs=1e-3)
     epsilon = WithInterval(80.0, (76.08, 83.92))
     delta = scaled(epsilon, 0.5 * 2.0)
     r = WithInterval(0.99, (0.988, 0.992))
     capture = interval_of(9.04, float("nan"))
-    loss = Loss((energy,), r, epsilon, delta, scaled(delta, EV_PER_AJ), 4e-3, 24.0, capture)
+    loss = Loss((energy,), None, r, epsilon, delta, scaled(delta, EV_PER_AJ), 4e-3, 24.0, capture)
     said = dict(losses_in_words(made_fit("law", loss=loss)))
     # 2 ng (20^2 - 10^2)/2, and 2 ng times 10 times 1.96 times 0.1 to either side
     assert said["energy lost at 20 nm/us"] == "300.0 aJ (296.1 to 303.9), 1872 eV (1848 to 1897)"

@@ -20,7 +20,6 @@ from afm_jax.impact.lasting_impact import LawImpact, PulledImpact
 from afm_jax.least_squares import chi2_tail
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.version import version_of
-from fitting.fits.held import Held, effects_of_held, held_of, split_held
 from fitting.fits.intervals import (
     END_OF_RANGE,
     Convergence,
@@ -60,6 +59,7 @@ from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRow
 from fitting.fits.several import Between, Pull, departures_of, parts_of, pulls_of, scatter_between
 from fitting.fits.unmodelled import (
     ClosestMember,
+    Held,
     LawAfter,
     LawBefore,
     LinearStep,
@@ -68,10 +68,13 @@ from fitting.fits.unmodelled import (
     Unmodelled,
     closest_member,
     containing,
+    effects_of_held,
+    held_of,
     law_after,
     longest_run,
     root_of,
     rows_of_fit,
+    split_held,
     step_of,
     system_of,
     with_runs,

@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from afm_jax.least_squares import IMPROBABLE, chi2_tail
-from fitting.fits.held import Held
 from fitting.fits.intervals import Convergence
 from fitting.fits.loss import NO_MASS
 from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.objective import MOST_OUTLIERS, OUTLIER
 from fitting.fits.result import FittedParameter, FittedRows
+from fitting.fits.unmodelled import Held
 from fitting.parameters import DELAY_NAMES, is_nuisance, name_of_table, parameter_called
 from fitting.tables.several import SeveralTables, repeats_of
 from fitting.tables.table import AmplitudeTable
