@@ -13,7 +13,7 @@ _NUMBERS = (
     ("drive-frequency-khz", "KHZ", "Frequency of the drive; where nothing says it, the free frequency."),
     ("free-frequency-khz", "KHZ", "Natural frequency of the free cantilever, '90 +- 0.01' with its error."),
     ("quality-factor", "Q", "Its quality factor, '200 +- 5' with its error."),
-    ("spring-constant-n-per-m", "N_PER_M", "Its spring constant, '5.4 +- 0.5' with its error."),
+    ("spring-constant-n-per-m", "N_PER_M", "Its modal spring constant (1.03 times the static one), '5.4 +- 0.5'."),
     ("free-amplitude-nm", "NM", "Amplitude of the free tip; else the median of the rows far from the sample."),
     ("offset-origin-nm", "NM", "Height (growing towards the tip) at which the sample is at the tip's rest position."),
     ("amplitude-error-nm", "NM", "Standard error of every amplitude; else the scatter of the free rows."),
