@@ -315,7 +315,7 @@ def forecast(
     strain = strain_of(objective, belief.values)
     rows = rows_of_fit(objective, objective.following(belief.values), belief.values, strain, 1.0)
     values = belief.fixed | dict(zip(problem.names, belief.values.tolist(), strict=True))
-    left_out = Unmodelled(problem, values, speed_range(rows.approach[: len(chosen)]), belief.mass_ng)
+    left_out = Unmodelled(problem, values, speed_range(rows.approach[: len(chosen)]), belief.mass_ng or 1.0)
     size = np.array([size_of(p, v) for p, v in zip(problem.parameters, belief.values.tolist(), strict=True)])
     known, axes = np.linalg.eigh(size[:, None] * belief.information * size)
     known = np.sqrt(np.maximum(known, 0.0))[:, None] * axes.T / size

@@ -11,7 +11,7 @@ from afm_jax.strict_json import plain
 from fitting.fits.intervals import Convergence
 from fitting.fits.loss import Loss
 from fitting.tables.csv_text import FIT_FORMAT_VERSION
-from fitting.tables.several import SeveralTables
+from fitting.tables.several import RepeatedReadings, SeveralTables, repeats_of
 from fitting.tables.table import AmplitudeTable
 
 
@@ -188,6 +188,11 @@ class FitResult(Result):
     tables: tuple[FittedTable, ...] = ()
     scatter: dict[str, Scatter] = field(default_factory=dict)
 
+    @property
+    def repeats(self) -> RepeatedReadings | None:
+        """How the readings of drives that were repeated scatter, over their errors; None where none was."""
+        return repeats_of(self.table)
+
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain lists, numbers and strings; what is not known is None."""
         return {
@@ -211,6 +216,7 @@ class FitResult(Result):
             "convergence": plain(asdict(self.convergence)),
             "input": plain({"tables": [*map(vars, self.table.tables)]} if self.tables else vars(self.table)),
             "settings": plain(self.settings),
+            "repeats": None if (repeats := self.repeats) is None else plain(asdict(repeats)),
             "versions": self.versions,
         } | (
             {
