@@ -87,7 +87,7 @@ def command(session: Session, file: Path, curve: int | None, **options: Any) -> 
     number comes from, what was assumed and what is missing. With --out the table for `afm-jax tapping` and `afm-jax
     fit`; of a file of several curves one table each, TABLE_1.csv and so on. Repeated and unordered heights become bins.
     Curves that must not be used (a free amplitude that jumps) are refused by name, and the exit code is 3. Package
-    extra for .ibw and .gwy: `pip install 'afm-jax[instruments]'`.
+    extra for .ibw: `pip install 'afm-jax[instruments]'`.
     """
     from fitting.instruments.curve import read_curve, read_curves  # noqa: PLC0415
     from fitting.instruments.report import curves_payload, curves_summary, write_tables  # noqa: PLC0415

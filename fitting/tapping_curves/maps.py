@@ -23,18 +23,12 @@ from fitting.instruments.images import AmplitudeAndPhase, read_images
 from fitting.instruments.lag import free_lag_deg, sense_of
 from fitting.instruments.recording import Known
 from fitting.tables.csv_text import TableError
-from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, TappingCurve
+from fitting.tapping_curves.curve import HARMONICS_FACTOR, USUAL_ERRORS, Given, Instrument, TappingCurve
 from fitting.tapping_curves.energy import energies
 
 _BEYOND = 3.0
 """Standard errors beyond which a pixel is out of range."""
-_USUAL = {
-    "free_frequency_khz": 2e-4,
-    "quality_factor": 0.05,
-    "spring_constant_n_per_m": 0.05,
-    "tip_calibration": 0.01,
-    "free_amplitude_nm": 0.005,
-}
+_USUAL = USUAL_ERRORS | {"free_amplitude_nm": 0.005}
 """Relative standard errors of what is given without one."""
 _USUAL_ZERO_DEG = (0.2, 1.0)
 """Standard error of the free tip's phase where it is given without one, and where it is not given."""
