@@ -5,6 +5,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -106,7 +107,7 @@ def read_images(
             f"{images.source}: the amplitude has {_shape(amplitude)} pixels, the phase {_shape(phase)}; they must be "
             "of one size"
         )
-    read: dict[str, np.ndarray] = {"amplitude": amplitude, "phase_deg": phase}
+    read: dict[str, Any] = {"amplitude": amplitude, "phase_deg": phase}
     if amplitude.ndim == 3:
         read = _at_ratio(_heights(images, amplitude.shape), amplitude, phase, ratio)
         notes.append(_note_of_curves(ratio, read["amplitude"]))
@@ -327,7 +328,7 @@ def _at_ratio(
     amplitude: Float[np.ndarray, "rows columns points"],
     phase: Float[np.ndarray, "rows columns points"],
     ratio: float,
-) -> dict[str, Float[np.ndarray, "rows columns"]]:
+) -> dict[str, Any]:
     """Return the arrays of `AmplitudeAndPhase` for a grid of curves."""
     rows, columns, _ = amplitude.shape
     height = np.broadcast_to(height, amplitude.shape)
@@ -335,7 +336,7 @@ def _at_ratio(
     return _maps([_read_at(height[at], amplitude[at], phase[at], ratio) for at in pixels], (rows, columns))
 
 
-def _maps(values: list[tuple[float, float, float, float]], grid: tuple[int, int]) -> dict[str, np.ndarray]:
+def _maps(values: list[tuple[float, float, float, float]], grid: tuple[int, int]) -> dict[str, Any]:
     columns = np.array(values).T.reshape(4, *grid)
     return dict(zip(("amplitude", "phase_deg", "free_amplitude", "free_phase_deg"), columns, strict=True))
 
@@ -360,7 +361,7 @@ def _read_at(
     ratio: float,
 ) -> tuple[float, float, float, float]:
     """Return amplitude and phase of a curve where it falls to a share of the free amplitude for good, and the free."""
-    nothing = (np.nan,) * 4
+    nothing = (np.nan, np.nan, np.nan, np.nan)
     known = np.isfinite(height) & np.isfinite(amplitude) & np.isfinite(phase)
     if known.sum() < 2 * _FREE_SHARE:
         return nothing
