@@ -28,7 +28,7 @@ _KNOWN = (
 )
 
 
-class Grid(click.ParamType):
+class RowsAndColumns(click.ParamType):
     """Rows and columns, as 10x12."""
 
     name = "grid"
@@ -74,7 +74,10 @@ def _with_known(function):
 @click.option("--amplitude-error-nm", type=Finite(positive=True), metavar="NM", help="Standard error of a pixel's.")
 @click.option("--phase-error-deg", type=Finite(positive=True), metavar="DEGREES", help="Standard error of a pixel's.")
 @click.option(
-    "--grid", type=Grid(), metavar="ROWSxCOLUMNS", help="IMAGE is a file of curves, one a pixel, as for `read`."
+    "--grid",
+    type=RowsAndColumns(),
+    metavar="ROWSxCOLUMNS",
+    help="IMAGE is a file of curves, one a pixel, as for `read`.",
 )
 @click.option(
     "--at",

@@ -133,7 +133,7 @@ class TappingMap(Result):
         return plain(own)
 
 
-class _Readings(NamedTuple):
+class _ImageReadings(NamedTuple):
     """Amplitude and free amplitude in nm, degrees behind the free tip, and the standard errors of a pixel."""
 
     amplitude_nm: Float[np.ndarray, "rows columns"]
@@ -198,7 +198,7 @@ def tapping_map(
             f"Noise: {errors[0]:.3g} nm and {errors[1]:.3g} degrees a pixel, from the roughness along the lines "
             "(--amplitude-error-nm, --phase-error-deg)."
         )
-    return _mapped(images, drive, known, _Readings(amplitude, free, behind, *errors), notes)
+    return _mapped(images, drive, known, _ImageReadings(amplitude, free, behind, *errors), notes)
 
 
 def _known(images: AmplitudeAndPhase, given: dict[str, Any], notes: list[str]) -> dict[str, Known]:
@@ -330,7 +330,7 @@ def _mapped(
     images: AmplitudeAndPhase,
     drive: str,
     known: dict[str, Known],
-    readings: _Readings,
+    readings: _ImageReadings,
     notes: list[str],
 ) -> TappingMap:
     """Return the map of readings."""
