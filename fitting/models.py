@@ -16,8 +16,7 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.impact.lasting_impact import BRIDGE_NM
-from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from afm_jax.impact.law import BRIDGE_NM, CollisionDelay, ImpactLaw
 from fitting.parameters import DELAY, LAW, Parameter, is_nuisance, parameter_called
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable, check_quality_factor

@@ -16,7 +16,8 @@ from jaxtyping import Array, Bool, Float
 
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.impact.lasting_impact import LawImpact, PulledImpact
+from afm_jax.impact.lasting_impact import PulledImpact
+from afm_jax.impact.law import Law
 from afm_jax.least_squares import chi2_tail
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.version import version_of
@@ -257,9 +258,9 @@ def law_and_slope(
     """
 
     def law(impact):
-        if isinstance(impact, LawImpact):
-            capture = jnp.full((2, 1), impact.law.capture_speed_nm_per_us)
-            found = jnp.stack([impact.law.rebound_speed(speeds), impact.law.collision_delay(speeds)])
+        if isinstance(impact, Law):
+            capture = jnp.full((2, 1), impact.capture_speed_nm_per_us)
+            found = jnp.stack([impact.rebound_speed(speeds), impact.collision_delay(speeds)])
             return jnp.concatenate([found, capture], axis=1)
         impact = impact.free if isinstance(impact, PulledImpact) else impact
         found = jax.vmap(impact.speeds)(speeds)
