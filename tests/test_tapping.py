@@ -1,5 +1,6 @@
 """The energy of a tap off a tapping curve: closed forms, simulated truths, thresholds, what is refused, the command."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from fitting.tables.table import AmplitudeTable
 from fitting.tapping_curves.branches import changes, free_rows
 from fitting.tapping_curves.curve import Given, Instrument, TappingCurve
 from fitting.tapping_curves.energy import energies, lags_of, largest_energies
+from fitting.tapping_curves.report import tapping_summary
 from fitting.tapping_curves.tapping import tapping
 from tests.strict_reading import strictly
 
@@ -217,10 +219,56 @@ def test_what_no_energy_can_do_without_is_asked_for():
     table = made_curve()
     with pytest.raises(TableError, match="--quality-factor '200 \\+- 2'"):
         tapping(replace(table, quality_factor=None, quality_factor_error=None))
-    with pytest.raises(TableError, match="--spring-constant"):
-        tapping(replace(table, spring_constant_n_per_m=None, mass_ng=None))
     with pytest.raises(TableError, match="use `afm-jax fit`"):
         tapping(fitting.read_table(AMPLITUDES))
+
+
+def test_phases_of_another_sign_or_zero_are_told_by_the_free_rows():
+    table = made_curve()
+    assert table.phase_lag_deg is not None
+    lag = table.phase_lag_deg
+    known = replace(table, calibration=table.calibration | {"phase_zero_deg": (0.0, 1.0)})
+    wanted = tapping(replace(known, phase_lag_deg=lag), law=False)
+    for other, said in (
+        (-lag, "the phase leads"),
+        (lag - 90.0, "zero is -90 degrees off"),
+        (lag + 90.0, "zero is +90"),
+    ):
+        found = tapping(replace(known, phase_lag_deg=other), law=False)
+        np.testing.assert_allclose(found.rows.energy_aj, wanted.rows.energy_aj, atol=1e-9)
+        assert any(said in one for one in found.assumptions)
+    with pytest.raises(TableError, match="write degrees, not radians"):
+        tapping(replace(known, phase_lag_deg=np.deg2rad(lag)), law=False)
+    wrong = lag.copy()
+    row = int(np.argmax(table.offset_nm * (np.asarray(table.lockin_amplitude_nm) > 0.6 * table.excitation_nm)))
+    wrong[row] = 250.0
+    with pytest.raises(TableError, match=r"lags by 250.0 degrees .*outside 0 to 180, as 1 of"):
+        tapping(replace(known, phase_lag_deg=wrong), law=False)
+
+
+def test_without_a_spring_constant_energies_are_over_it():
+    table = made_curve()
+    exact = replace(table, spring_constant_error_n_per_m=1e-6)
+    known = tapping(exact, law=False)
+    found = tapping(
+        replace(table, spring_constant_n_per_m=None, spring_constant_error_n_per_m=None, mass_ng=None), law=False
+    )
+    answer, wanted = found.to_dict(), known.to_dict()
+    assert answer["energy_per_tap_aj"] is None
+    assert answer["energy_per_tap_reason"] == "the spring constant is not known: energies are over it, in nm^2"
+    per_tap = answer["energy_per_tap_over_k_nm2"]
+    assert per_tap["value"] == pytest.approx(wanted["energy_per_tap_aj"]["value"] / K, rel=1e-3)
+    for one, other in zip(answer["branches"], wanted["branches"], strict=True):
+        curve, theirs = one["curve"], other["curve"]
+        np.testing.assert_allclose(curve["energy_over_k_nm2"], np.array(theirs["energy_aj"]) / K, rtol=1e-2)
+        assert "energy_aj" not in curve
+    # m/k cancels in it
+    assert answer["epsilon_nm2_per_us2"]["value"] == pytest.approx(wanted["epsilon_nm2_per_us2"]["value"], rel=1e-3)
+    text = tapping_summary(found)
+    assert "spring constant not known: energies and virials are over it, in nm^2" in text
+    assert re.search(r"Energy of a tap: [\d.]+ \+- [\d.]+ nm\^2 ", text)
+    assert " eV" not in text
+    assert not re.search(r"\d aJ", text)
 
 
 def test_without_a_phase_there_is_a_bound():

@@ -72,7 +72,7 @@ from fitting.fits.unmodelled import (
     step_of,
     system_of,
 )
-from fitting.fits.verdict import ASSUMED_ERROR_OF_Q, Evidence, judge_fit, misfits
+from fitting.fits.verdict import ASSUMED_ERROR_OF_Q, IMPROBABLE, Evidence, judge_fit, misfits
 from fitting.forward import AnyImpact, impact_at, warm_up
 from fitting.models import (
     Joint,
@@ -83,9 +83,16 @@ from fitting.models import (
     measurement_of,
     readings_of,
 )
-from fitting.parameters import NUISANCE_NAMES, is_of_one_table, model_parameters, name_of_table, parameter_called
+from fitting.parameters import (
+    DRIFT_NAMES,
+    NUISANCE_NAMES,
+    is_of_one_table,
+    model_parameters,
+    name_of_table,
+    parameter_called,
+)
 from fitting.tables.several import SeveralTables
-from fitting.tables.table import AmplitudeTable, as_table
+from fitting.tables.table import AmplitudeTable, as_table, in_other_units
 
 _POINTS = 121
 
@@ -265,7 +272,27 @@ def law_and_slope(
     return law(impact), jax.vmap(lambda turn: jax.jvp(law, (impact,), (turn,))[1], out_axes=-1)(slopes)
 
 
+def _untold_drifts(parameters: Mapping[str, FittedParameter]) -> list[str]:
+    """Return a sentence where drifts along the rows are hardly told by anything but what is assumed of them."""
+    untold = []
+    for name, known in parameters.items():
+        drift = parameter_called(name).name in DRIFT_NAMES
+        if drift and known.constraint is not None and (known.standard_error or np.inf) > 0.5 * known.constraint[1]:
+            untold.append(f"{name} = {known.constraint[0]:g} +- {known.constraint[1]:g}")
+    if not untold:
+        return []
+    said = (
+        f"Hardly told by the rows, which stand in order of time, only assumed: {', '.join(untold)}. Rows of the free "
+        "tip before and after the others tell drifts; `--constrain` takes what is known of them."
+    )
+    return [said]
+
+
 _PACKAGES = ("afm-jax", "jax", "optax", "numpy")
+_KINDS = (("peak amplitude", ""), ("lock-in amplitude", ""), ("phase", "degrees"))
+"""What is read, and its unit if it does not drift by a share."""
+_FOLLOWING = 4.0
+"""Standard errors of a course of the residuals along the rows beyond which it is no chance."""
 
 
 @dataclass(frozen=True)
@@ -286,6 +313,51 @@ class Found:
 def summarise(table: AmplitudeTable | SeveralTables, found: Found) -> FitResult:
     """Return errors, intervals, checks and verdict of a minimum."""
     return _Summary(table, found).result()
+
+
+_GROSS = 10.0
+"""chi2 over degrees of freedom from which on other units are tried."""
+_GRID = np.array([[r, epsilon] for r in (0.5, 0.7, 0.85, 0.93, 0.97, 0.99) for epsilon in (0.0, 30.0, 300.0, 3000.0)])
+"""Values of r and epsilon over which the law of eq. 6 is looked at."""
+_BETTER = 0.5
+
+
+def summarise_in_units(table: AmplitudeTable | SeveralTables, found: Found) -> FitResult:
+    """Return the summary of a minimum; a table far from the model is tried in other units, and one that fits is named.
+
+    Amplitudes in micrometres, peak to peak or rms, frequencies in Hz. The law of eq. 6 on a coarse grid says which of
+    them is nearest; the model is fitted to that.
+    """
+    result = summarise(table, found)
+    far = found.refused or not result.chi2 < _GROSS * max(result.degrees_of_freedom, 1)
+    if not isinstance(table, AmplitudeTable) or result.valid or not far:
+        return result
+    nearest, meant = min(
+        ((_distance_from_law(one), (words, one)) for words, one in in_other_units(table)), key=lambda pair: pair[0]
+    )
+    if not nearest < _BETTER * _distance_from_law(table):
+        return result
+    words, other = meant
+    asked = {name: found.settings[name] for name in ("free", "fixed", "constraints")}
+    try:
+        again = summarise(
+            other,
+            find_fit(other, result.model, effects=found.settings["effects"] or EFFECTS, **asked),
+        )
+    except ValueError:
+        return result
+    if not again.p_value >= IMPROBABLE:
+        return result
+    said = f"With {words} the model explains the table (chi2/dof = {again.chi2:.1f}/{again.degrees_of_freedom})."
+    return replace(result, reasons=[*result.reasons, f"{said} Check the units."])
+
+
+def _distance_from_law(table: AmplitudeTable) -> float:
+    """Return the soft objective of the law of eq. 6 at the best of a coarse grid of its parameters."""
+    problem = Problem("law", ("r", "epsilon"), drive=table.drive)
+    known = {} if table.quality_factor is None else {"quality_factor": (table.quality_factor, 1.0)}
+    objective = Objective(measurement_of(table, problem, known), problem)
+    return float(np.min(objective.screen(_GRID)))
 
 
 class _Summary:
@@ -309,6 +381,7 @@ class _Summary:
         self.residual = np.asarray(linear.residual)[0]
         self.amplitude_residual = self.searching.misfit(linear)
         self.prediction = linear.prediction
+        self.jacobian = np.asarray(linear.jacobian)[0]
         self.minimum_chi2 = float(np.sum(self.residual**2))
         self.constraints = dict(self.settings["constraints"])
         used = int(np.asarray(objective.measurement.rows.measured).sum())
@@ -434,6 +507,7 @@ class _Summary:
         if explained:
             evidence = replace(evidence, parameters=self._explained_parameters(moved))
         reasons, warnings = judge_fit(evidence)
+        warnings += self._follow_rows() + _untold_drifts(evidence.parameters)
         common = [i for i, name in enumerate(self.names) if not is_of_one_table(name)]
         return FitResult(
             model=self.problem.model,
@@ -465,6 +539,46 @@ class _Summary:
             tables=self._fitted_tables(evidence.parameters),
             scatter=self._scatter() if explained else {},
         )
+
+    def _follow_rows(self) -> list[str]:
+        """Return a sentence for each table whose residuals follow its rows, though it says nothing of their order."""
+        count, kinds = self.amplitude_residual.shape
+        said, first = [], 0
+        scale = np.sqrt(max(1.0, self.minimum_chi2 / max(self.freedom, 1)))
+        for table, label in zip(self.table.tables, self.table.labels, strict=True):
+            rows, first = np.arange(first, first + table.rows), first + table.rows
+            found = []
+            for kind, (name, unit) in zip(range(kinds), _KINDS, strict=False):
+                along = np.zeros((count, kinds))
+                size = 1.0 if unit else np.abs(np.asarray(self.prediction.amplitude_nm)[0, rows, kind])
+                error = np.asarray(self.searching.measurement.rows.error_nm)[rows, kind]
+                seen = np.asarray(self.searching.measurement.rows.measured)[rows, kind]
+                along[rows, kind] = np.where(seen, np.linspace(-0.5, 0.5, table.rows) * size / error, 0.0)
+                slope, sigmas = self._slope_along(along.ravel())
+                if abs(sigmas) > _FOLLOWING * scale:
+                    found.append(f"{name} {f'{slope:+.2g} {unit}' if unit else f'{100.0 * slope:+.2g} %'}")
+            if found and not table.rows_in_order_of_time:
+                several = f"{label}: " if len(self.table.labels) > 1 else ""
+                said.append(
+                    f"{several}Residuals follow the rows ({', '.join(found)} from the first to the last), as drifts "
+                    "do. If the rows stand as they were measured, say `# rows = in order of time`: drifts are then "
+                    "fitted along."
+                )
+        return said
+
+    def _slope_along(self, along: Float[np.ndarray, " n"]) -> tuple[float, float]:
+        """Return how far readings follow a course that the fit leaves them, and that in standard errors."""
+        column = np.append(along, np.zeros(self.residual.size - along.size))
+        slopes = np.nan_to_num(self.jacobian)
+        slopes = slopes / np.maximum(np.linalg.norm(slopes, axis=0), 1e-300)
+        basis, size, _ = np.linalg.svd(slopes, full_matrices=False)
+        basis = basis[:, size > 1e-10 * max(size[0], 1e-300)]
+        left = column - basis @ (basis.T @ column)
+        length = float(left @ left)
+        if length <= 1e-6 * float(column @ column):
+            return 0.0, 0.0
+        slope = -float(left @ np.nan_to_num(self.residual)) / length
+        return slope, slope * np.sqrt(length)
 
     @property
     def _free_own(self) -> list[str]:
@@ -710,7 +824,7 @@ def fit(  # noqa: PLR0913
         "hierarchical": hierarchical,
     }
     whole = tables_of(table)
-    return summarise(whole, find_fit(whole, model, **options))
+    return summarise_in_units(whole, find_fit(whole, model, **options))
 
 
 def _one_table(given: Any) -> AmplitudeTable:
@@ -869,7 +983,9 @@ def _check_levers(tables: SeveralTables, model: str) -> None:
         )
 
 
-_NEUTRAL = {"tip_calibration": 1.0, "drive_calibration": 1.0, "offset_origin_nm": 0.0, "phase_zero_deg": 0.0}
+_NEUTRAL = {"tip_calibration": 1.0, "drive_calibration": 1.0} | dict.fromkeys(
+    ("offset_origin_nm", "phase_zero_deg", "phase_drift_deg", "free_amplitude_drift"), 0.0
+)
 """What stands for the absence of a nuisance."""
 
 

@@ -62,7 +62,8 @@ class TappingCurve:
         both_ways: whether the curve says which way the sample moves.
         free_frequency_khz: f0.
         quality_factor: Q.
-        spring_constant_n_per_m: k.
+        spring_constant_n_per_m: k, of the mode (1.03 times the static one of a rectangular cantilever).
+        over_spring_constant: whether k is not known: it counts as 1 N/m, and energies in aJ are those over k in nm^2.
         tip_calibration: true length over the length stated, of every amplitude.
         phase_zero_deg: lag that the instrument adds; None: nothing is known of it.
         height_known: whether heights count from the tip's rest position.
@@ -70,6 +71,7 @@ class TappingCurve:
         harmonic_amplitudes_nm: amplitudes at multiples of the drive's frequency, by multiple.
         lines: where each row stands in its file.
         time: place of each row in the order of measurement, from -1/2 to 1/2; None: that order is not known.
+        phase_note: how the sign or the zero of the phase was told from the free rows, if that was odd.
         assumed: what of the instrument was given without an error: it has a usual one (`USUAL_ERRORS`).
     """
 
@@ -88,6 +90,7 @@ class TappingCurve:
     free_frequency_khz: Given
     quality_factor: Given
     spring_constant_n_per_m: Given
+    over_spring_constant: bool = False
     tip_calibration: Given = EXACTLY_ONE
     phase_zero_deg: Given | None = None
     height_known: bool = True
@@ -95,6 +98,7 @@ class TappingCurve:
     harmonic_amplitudes_nm: dict[int, Rows] = field(default_factory=dict)
     lines: Int[np.ndarray, " rows"]
     time: Rows | None = None
+    phase_note: str = ""
     assumed: tuple[str, ...] = ()
 
     @property
