@@ -328,7 +328,8 @@ def forecast(
         slopes = ImpactSlopes(*(seen * part for part in rows.slopes))
         some = rows._replace(slopes=slopes, jacobian=jacobian, residual=np.zeros(len(jacobian)))
         step = step_of(some, left_out, free)
-        member = member_after(step, left_out, objective.measurement, belief.values, rows.approach[:count], free)
+        speeds = rows.approach[:count]
+        member = member_after(step, left_out, objective.measurement, belief.values, speeds, free, computed=False)
         covariance = step.covariance if member is None else member.covariance
         errors[count] = np.sqrt(np.diag(covariance))[: len(size)]
     return errors
