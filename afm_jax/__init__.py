@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from afm_jax.dynamics.exponents import lyapunov_spectrum
     from afm_jax.dynamics.impact_orbits import many_impact_orbits
     from afm_jax.impact.jacobian import map_jacobian
-    from afm_jax.impact.law import CollisionDelay, ImpactLaw
+    from afm_jax.impact.law import CollisionDelay, ImpactLaw, TabulatedLaw
     from afm_jax.impact.map import NextImpact, iterate_batch, iterate_map, next_impact
     from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
     from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
@@ -50,6 +50,7 @@ else:
         "ContactKind": "afm_jax.motion.record",
         "ForceDrive": "afm_jax.apparatus.drives",
         "ImpactLaw": "afm_jax.impact.law",
+        "TabulatedLaw": "afm_jax.impact.law",
         "Junction": "afm_jax.contact.junction",
         "MotionOutcome": "afm_jax.motion.record",
         "NextImpact": "afm_jax.impact.map",
@@ -118,6 +119,7 @@ __all__ = [
     "Simulation",
     "SingleImpactOrbits",
     "State",
+    "TabulatedLaw",
     "Tone",
     "Trajectory",
     "__version__",

@@ -16,11 +16,10 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.impact.lasting_impact import BRIDGE_NM
-from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from afm_jax.impact.law import BRIDGE_NM, CollisionDelay, ImpactLaw
 from fitting.parameters import DELAY, LAW, Parameter, is_nuisance, parameter_called
 from fitting.tables.several import SeveralTables
-from fitting.tables.table import AmplitudeTable
+from fitting.tables.table import AmplitudeTable, check_quality_factor
 
 AnyArray = Array | np.ndarray
 """JAX's within its programs, NumPy's outside."""
@@ -245,8 +244,14 @@ class Measurement(NamedTuple):
 def constraints_of(
     table: AmplitudeTable, constraints: dict[str, tuple[float, float]] | None
 ) -> dict[str, tuple[float, float]]:
-    """Return everything that is known beforehand: what the table says, and what the caller adds or says instead."""
+    """Return everything that is known beforehand: what the table says, and what the caller adds or says instead.
+
+    Raises:
+        TableError: if nothing says the quality factor.
+    """
     known = dict(table.calibration)
+    if "quality_factor" not in (constraints or {}):
+        check_quality_factor(table)
     if table.quality_factor is not None and table.quality_factor_error is not None:
         known["quality_factor"] = table.quality_factor, table.quality_factor_error
     if table.free_frequency_error_khz is not None:
@@ -268,9 +273,13 @@ def measurement_of(
         constraints: value and standard error of what is known beforehand, by parameter; else the table says.
         fixed: values of the model's parameters that are not fitted.
     """
-    value, error = _constraint_columns(problem, constraints_of(table, constraints))
+    known = constraints_of(table, constraints)
+    value, error = _constraint_columns(problem, known)
     held: dict[str, Any] = {name: np.asarray(float(value)) for name, value in (fixed or {}).items()}
-    cantilever = Cantilever(table.free_frequency_khz, table.quality_factor, table.mass_ng)
+    quality_factor = table.quality_factor
+    if quality_factor is not None and np.isnan(quality_factor):
+        quality_factor = known["quality_factor"][0]
+    cantilever = Cantilever(table.free_frequency_khz, quality_factor, table.mass_ng)
     rows = rows_of(table)
     if table.tapping:
         reach = reach_of(rows, cantilever, table.drive)

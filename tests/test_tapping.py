@@ -11,7 +11,7 @@ from matplotlib.image import imread
 import fitting
 from afm_jax.cli.main import main
 from fitting.tables.csv_text import TableError
-from fitting.tables.table import AmplitudeTable, mass_of
+from fitting.tables.table import AmplitudeTable
 from fitting.tapping_curves.branches import changes, free_rows
 from fitting.tapping_curves.curve import Given, Instrument, TappingCurve
 from fitting.tapping_curves.energy import energies, lags_of, largest_energies
@@ -123,7 +123,6 @@ def made_curve(seed: int = 0, *, noise: float = 0.003, phase_noise: float = 0.2,
         free_frequency_error_khz=0.01,
         quality_factor=Q,
         quality_factor_error=2.0,
-        mass_ng=mass_of(K, F0 + frequency_off),
         spring_constant_n_per_m=K,
     )
 

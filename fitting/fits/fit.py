@@ -16,7 +16,8 @@ from jaxtyping import Array, Bool, Float
 
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.impact.lasting_impact import LawImpact, PulledImpact
+from afm_jax.impact.lasting_impact import PulledImpact
+from afm_jax.impact.law import Law
 from afm_jax.least_squares import chi2_tail
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.version import version_of
@@ -32,6 +33,7 @@ from fitting.fits.intervals import (
 )
 from fitting.fits.loss import (
     EV_PER_AJ,
+    NO_MASS,
     Loss,
     WithInterval,
     energy_lost,
@@ -193,7 +195,7 @@ def member_after(
 def loss_of(
     found: Callable[[Float[np.ndarray, " n"]], LawAfter],
     measured: tuple[float, float],
-    mass_ng: float,
+    mass_ng: float | None,
     parameters: Mapping[str, FittedParameter],
     formula: Mapping[str, float] | None,
 ) -> Loss:
@@ -202,7 +204,7 @@ def loss_of(
     Args:
         found: the law at approach speeds in nm/us.
         measured: slowest and fastest approach in nm/us.
-        mass_ng: of the tip.
+        mass_ng: of the tip; None: not known.
         parameters: of the fit.
         formula: values of the model's formula, those that are held included; None: it has none.
     """
@@ -219,13 +221,14 @@ def loss_of(
         WithInterval(one.value, one.interval95) if one is not None else None
         for one in (parameters.get("r"), parameters.get("epsilon"))
     )
-    delta = None if epsilon is None else scaled(epsilon, 0.5 * mass_ng)
+    delta = None if epsilon is None or mass_ng is None else scaled(epsilon, 0.5 * mass_ng)
     off = None
     if formula is not None:
         speeds = np.geomspace(*measured, _POINTS)
         off = nearness(speeds, found(speeds).law[0], rebound_by_formula(formula, speeds))
     return Loss(
         energies=tuple(dict.fromkeys(energies)),
+        energies_reason=NO_MASS if mass_ng is None else None,
         r=r,
         epsilon_nm2_per_us2=epsilon,
         delta_aj=delta,
@@ -257,9 +260,9 @@ def law_and_slope(
     """
 
     def law(impact):
-        if isinstance(impact, LawImpact):
-            capture = jnp.full((2, 1), impact.law.capture_speed_nm_per_us)
-            found = jnp.stack([impact.law.rebound_speed(speeds), impact.law.collision_delay(speeds)])
+        if isinstance(impact, Law):
+            capture = jnp.full((2, 1), impact.capture_speed_nm_per_us)
+            found = jnp.stack([impact.rebound_speed(speeds), impact.collision_delay(speeds)])
             return jnp.concatenate([found, capture], axis=1)
         impact = impact.free if isinstance(impact, PulledImpact) else impact
         found = jax.vmap(impact.speeds)(speeds)
@@ -469,6 +472,7 @@ class _Summary:
             untabulated=tuple(np.flatnonzero(missed).tolist()),
             contact_share=self.contact_share,
             refused=self.refused,
+            contact=self.problem.model == "contact",
             tapped=self.problem.pulled,
             pulls=tuple(pull.p_value for pull in self.pulls),
             scattering=self.between is not None,
@@ -489,8 +493,8 @@ class _Summary:
             chi2=self.chi2,
             degrees_of_freedom=self.freedom,
             p_value=evidence.p_value,
-            aic=self.chi2 + 2.0 * len(self.values),
-            bic=self.chi2 + len(self.values) * float(np.log(self.data)),
+            aic=self.minimum_chi2 + 2.0 * len(self.values),
+            bic=self.minimum_chi2 + len(self.values) * float(np.log(self.data)),
             valid=not reasons,
             reasons=reasons,
             warnings=warnings,
@@ -566,8 +570,7 @@ class _Summary:
         formula = None
         if self.problem.model != "contact":
             formula = self.settings["fixed"] | {name: one.value for name, one in parameters.items()}
-        mass = float(measurement.cantilever.mass_ng)
-        return loss_of(found, speed_range(self.used_speeds), mass, parameters, formula)
+        return loss_of(found, speed_range(self.used_speeds), self.table.mass_ng, parameters, formula)
 
     def _closest_member(self, step: LinearStep, left_out: Unmodelled) -> ClosestMember | None:
         """Return the model's law that is closest to the law after the step; None where the step is all there is."""

@@ -366,14 +366,17 @@ def parse_separated(data: bytes, name: str) -> Recording:
     if not rows:
         raise TableError(f"{name}: the file holds only comments; add rows of numbers")
     separator = max("\t;,", key=lambda sign: (rows[0][1].count(sign), rows[-1][1].count(sign)))
-    if separator not in rows[0][1]:
-        raise TableError(
-            f"{name}, line {rows[0][0]}: columns separated by tabs, semicolons or commas are expected here"
-        )
-    cells = [
-        (number, [cell.strip() for cell in next(csv.reader(io.StringIO(line), delimiter=separator))])
-        for number, line in rows
-    ]
+    if separator in rows[0][1]:
+        cells = [
+            (number, [cell.strip() for cell in next(csv.reader(io.StringIO(line), delimiter=separator))])
+            for number, line in rows
+        ]
+    else:
+        cells = [(number, line.split()) for number, line in rows]
+        if len(cells[0][1]) < 2 or not all(NUMBER.fullmatch(cell) for cell in cells[0][1]):
+            raise TableError(
+                f"{name}, line {rows[0][0]}: columns separated by tabs, semicolons or commas are expected here"
+            )
     decimal = "." if separator == "," else ","
     titles, units_row, body = _heads(cells, decimal)
     if not body:

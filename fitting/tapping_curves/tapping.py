@@ -64,10 +64,10 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
             "driven, or use `afm-jax fit`"
         )
     missing = []
-    quality = table.quality_factor or 0.0
+    quality = np.nan_to_num(table.quality_factor or 0.0)
     if not quality:
         missing.append(("the quality factor", "quality_factor = 200 +- 2", "--quality-factor '200 +- 2'"))
-    if table.spring_constant_n_per_m is None and table.mass_ng == 1.0:
+    if table.mass_ng is None:
         missing.append(
             ("the spring constant", "spring_constant_n_per_m = 5.4 +- 0.5", "--spring-constant '5.4 +- 0.5'")
         )
@@ -110,6 +110,7 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
 
 
 def _stiffness(table: AmplitudeTable) -> float:
+    assert table.mass_ng is not None  # checked before  # noqa: S101
     return table.mass_ng * (RAD_PER_US_PER_KHZ * table.free_frequency_khz) ** 2
 
 
