@@ -305,7 +305,7 @@ def test_the_loss_is_said_in_energies_and_delta():
     delta = scaled(epsilon, 0.5 * 2.0)
     r = WithInterval(0.99, (0.988, 0.992))
     capture = interval_of(9.04, float("nan"))
-    loss = Loss((energy,), r, epsilon, delta, scaled(delta, EV_PER_AJ), 4e-3, 24.0, capture)
+    loss = Loss((energy,), None, r, epsilon, delta, scaled(delta, EV_PER_AJ), 4e-3, 24.0, capture)
     said = dict(losses_in_words(made_fit("law", loss=loss)))
     # 2 ng (20^2 - 10^2)/2, and 2 ng times 10 times 1.96 times 0.1 to either side
     assert said["energy lost at 20 nm/us"] == "300.0 aJ (296.1 to 303.9), 1872 eV (1848 to 1897)"

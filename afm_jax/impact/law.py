@@ -6,6 +6,7 @@ u_out^2 = r^2 u_in^2 - c u_in - epsilon, and a table of speeds, measured, fitted
 speeds are relative to the platform and positive.
 """
 
+import dataclasses
 from abc import abstractmethod
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -564,12 +565,11 @@ def _read_backwards(rebound: Float[Array, "..."], law: TabulatedLaw) -> Float[Ar
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
 class Origin:
     """What a law comes from, in words: static data of a module, all equal, so that no text compiles programs anew."""
 
-    def __init__(self, text: str):
-        """Keep the words."""
-        self.text = text
+    text: str = ""
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Origin)

@@ -17,9 +17,8 @@ from jaxtyping import Array, Bool, Float
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.lasting_impact import PulledImpact
-from afm_jax.impact.law import Law
+from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw
 from afm_jax.least_squares import chi2_tail
-from afm_jax.units import TWO_SIDED_95
 from afm_jax.version import version_of
 from fitting.fits.intervals import (
     END_OF_RANGE,
@@ -56,7 +55,7 @@ from fitting.fits.minimum import (
     untabulated,
 )
 from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective, soft_square
-from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows, FittedTable, Scatter
+from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows, FittedTable, Scatter, table_of_law
 from fitting.fits.several import Between, Pull, departures_of, parts_of, pulls_of, scatter_between
 from fitting.fits.unmodelled import (
     ClosestMember,
@@ -88,16 +87,20 @@ from fitting.parameters import NUISANCE_NAMES, is_of_one_table, model_parameters
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable, as_table
 
-_POINTS = 121
+_POINTS, _FEWEST_POINTS = 121, 4
 
 
-def law_with_band(
+def law_with_band(  # noqa: PLR0913
     problem: Problem,
     measurement: Measurement,
     values: Float[np.ndarray, " p"],
     covariance: Float[np.ndarray, "k k"],
     approach_speeds: Float[np.ndarray, " rows"],
     after: tuple[LinearStep, Unmodelled] | None = None,
+    *,
+    formula: ImpactLaw | None = None,
+    mass_ng: float | None = None,
+    origin: str = "",
 ) -> FittedLaw:
     """Return the law from 0.8 times the slowest to 1.2 times the fastest approach, with its linearised 95 % band.
 
@@ -108,21 +111,46 @@ def law_with_band(
         covariance: of the values, or of those after the step; infinite entries give an open band (NaN).
         approach_speeds: of the rows' orbits in nm/us, NaN where a row has none.
         after: the step from these values with what the model leaves out; None: the model is taken at its word.
+        formula: the model's that is closest after the step.
+        mass_ng: of the tip; None: not known.
+        origin: what the law comes from, in words.
+    """
+    if after is None and problem.model != "contact":
+        formula = problem.law(jnp.asarray(values), measurement.fixed)
+
+    def law(speeds: Float[np.ndarray, " n"]) -> LawAfter:
+        return law_at(problem, measurement, values, covariance, speeds, after)
+
+    speeds, found = points_of_law(law, approach_speeds)
+    return FittedLaw(
+        speeds,
+        *found.law,
+        capture_speed_nm_per_us=found.capture,
+        delay=None if formula is None else formula.delay,
+        lasting=problem.lasting,
+        errors=np.moveaxis(found.factor, 0, 1),
+        mass_ng=mass_ng,
+        origin=origin,
+    )
+
+
+def points_of_law(
+    found: Callable[[Float[np.ndarray, " n"]], LawAfter], approach_speeds: Float[np.ndarray, " rows"]
+) -> tuple[Float[np.ndarray, " points"], LawAfter]:
+    """Return a law from 0.8 times the slowest to 1.2 times the fastest approach in nm/us, and beyond its capture.
+
+    Args:
+        found: the law at approach speeds.
+        approach_speeds: of the rows, NaN where a row has none.
     """
     slow, fast = speed_range(approach_speeds)
     speeds = np.geomspace(0.8 * slow, 1.2 * fast, _POINTS)
-    found = law_at(problem, measurement, values, covariance, speeds, after)
-    rebound, delay = found.law
-    width = TWO_SIDED_95 * np.linalg.norm(found.factor, axis=2)
-    return FittedLaw(
-        approach_speed_nm_per_us=speeds,
-        rebound_speed_nm_per_us=rebound,
-        rebound_low_nm_per_us=np.maximum(rebound - width[0], 0.0),
-        rebound_high_nm_per_us=rebound + width[0],
-        collision_delay_us=delay,
-        delay_low_us=delay - width[1],
-        delay_high_us=delay + width[1],
-    )
+    law = found(speeds)
+    if np.count_nonzero(law.law[0] > 0.0) < _FEWEST_POINTS:
+        # a law that captures nearly all of these tips
+        speeds = np.geomspace(0.8 * slow, 3.0 * max(law.capture, fast), _POINTS)
+        law = found(speeds)
+    return speeds, law
 
 
 def law_at(
@@ -272,6 +300,12 @@ def law_and_slope(
         return jnp.concatenate([there, jnp.full((2, 1), impact.lowest)], axis=1)
 
     return law(impact), jax.vmap(lambda turn: jax.jvp(law, (impact,), (turn,))[1], out_axes=-1)(slopes)
+
+
+@jax.jit
+def coordinates(law: Law, speeds: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Return the coordinates of orbits at approach speeds in nm/us."""
+    return law.coordinate(speeds)
 
 
 _PACKAGES = ("afm-jax", "jax", "optax", "numpy")
@@ -432,20 +466,30 @@ class _Summary:
         laws = [self._law_after(part, left_out) for part in parts]
         speeds = self.prediction.approach_speed_nm_per_us[0]
         exists = (self.prediction.orbits[0] > 0) & np.isfinite(speeds)
-        near = [np.where(exists, np.asarray(law.coordinate(np.where(exists, speeds, 100.0))), np.nan) for law in laws]
+        safe = jnp.asarray(np.where(exists, speeds, 100.0))
+        near = [np.where(exists, np.asarray(coordinates(law, safe)), np.nan) for law in laws]
         both = jax.tree.map(lambda *leaves: np.stack(leaves), *laws)
         return predict(values, both, measurement, problem, np.array(near))
 
-    def _law_after(self, step: LinearStep, left_out: Unmodelled):
-        from fitting.fits.standin import table
+    def _law_after(self, step: LinearStep, left_out: Unmodelled) -> TabulatedLaw:
+        """Return the law after a step as the table that predictions are made of."""
 
-        slow, fast = speed_range(self.used_speeds)
-        speeds = np.geomspace(0.8 * slow, 1.2 * fast, _POINTS)
-        measurement = self.objective.measurement
-        law = law_at(self.problem, measurement, self.values, self.covariance, speeds, (step, left_out)).law
+        def law(speeds: Float[np.ndarray, " n"]) -> LawAfter:
+            measurement = self.objective.measurement
+            return law_at(self.problem, measurement, self.values, self.covariance, speeds, (step, left_out))
+
+        speeds, found = points_of_law(law, self.used_speeds)
+        formula = self._formula(step, left_out)
+        delay = None if formula is None else formula.delay
+        return table_of_law(speeds, *found.law, capture_speed_nm_per_us=found.capture, delay=delay)
+
+    def _formula(self, step: LinearStep, left_out: Unmodelled) -> ImpactLaw | None:
+        """Return the formula that is closest to the law after a step; None of a contact, which has none."""
+        if self.problem.model == "contact":
+            return None
         member = self._closest_member(step, left_out)
-        values = step.values[: len(self.names)] if member is None else member.values
-        return table(speeds, law, self.problem.law(values, measurement.fixed))
+        values = step.values[: len(self.problem.names)] if member is None else member.values
+        return self.problem.law(jnp.asarray(values), self.objective.measurement.fixed)
 
     def result(self) -> FitResult:
         judged = self.freedom > 0 and self.settings["error_scale"] is None and not self.searching.robust
@@ -505,6 +549,9 @@ class _Summary:
                 shown_covariance,
                 self.used_speeds,
                 self.after,
+                formula=None if self.after is None else self._formula(*self.after),
+                mass_ng=self.table.mass_ng,
+                origin=f"{self.problem.model} fitted to {self.table.source}",
             ),
             loss=self._loss(shown_covariance, evidence.parameters),
             rows=rows,

@@ -151,11 +151,12 @@ def _no_way_down(evidence: Evidence) -> list[str]:
     if evidence.stuck is None:
         return []
     begin, expected = evidence.stuck
-    return [
+    said = (
         "Not converged: to first order the model discrepancy would lower chi2 from "
         f"{begin:.1f} to {expected:.1f}, but computed not even a sixteenth of it does; the amplitudes are far from "
         "linear in the law, as they are near folds: leave such rows out."
-    ]
+    )
+    return [said]
 
 
 def _undetermined(evidence: Evidence) -> list[str]:
