@@ -26,6 +26,11 @@ if TYPE_CHECKING:
 @click.option("--model", default="viscous+delay", show_default=True, help="Of the law, as for `afm-jax fit`.")
 @click.option("--example", is_flag=True, help="Analyse the bundled raw file, simulated with the defects of real ones.")
 @click.option("--no-law", is_flag=True, help="Leave the impact law out: energy, thresholds and speeds only, at once.")
+@click.option(
+    "--scale-errors",
+    is_flag=True,
+    help="Multiply the rows' errors where they scatter more (up to three times), instead of refusing their energy.",
+)
 @with_session
 def command(session: Session, curve_file: Path | None, *, no_law: bool, model: str, **options: Any) -> None:
     """Read the energy of a tap off a tapping curve, and where the drive allows it the impact law.
@@ -40,23 +45,21 @@ def command(session: Session, curve_file: Path | None, *, no_law: bool, model: s
     from fitting.tables.table import read_table  # noqa: PLC0415
     from fitting.tapping_curves.measured import is_table, read_measured  # noqa: PLC0415
 
+    how = {"no_law": no_law, "scale_errors": options.pop("scale_errors")}
     if options.pop("example") == (curve_file is not None):
         raise click.UsageError("give a curve, `afm-jax tapping CURVE`, or --example for a simulated raw file")
     if curve_file is None:
         curve_file, options = _example(options)
     if is_table(curve_file):
         _refuse_reading(curve_file, options)
-        result = _analysed(
-            session, _given(read_table(curve_file, noise=options["noise"]), options), model, no_law=no_law
-        )
+        result = _analysed(session, _given(read_table(curve_file, noise=options["noise"]), options), model, **how)
         _finish(session, result)
         return
     file = read_measured(curve_file, curve=options["curve"], **{name: options[name] for name in READING_OPTIONS})
     for note in file.notes:
         add_note(note)
     results = {
-        number: _analysed(session, _calibrated(table, options), model, no_law=no_law)
-        for number, table in file.tables.items()
+        number: _analysed(session, _calibrated(table, options), model, **how) for number, table in file.tables.items()
     }
     if len(results) == 1 and not file.refused:
         _finish(session, next(iter(results.values())))
@@ -64,10 +67,10 @@ def command(session: Session, curve_file: Path | None, *, no_law: bool, model: s
     _finish_several(session, curve_file, file, results)
 
 
-def _analysed(session: Session, table: "AmplitudeTable", model: str, *, no_law: bool) -> "Tapping":
+def _analysed(session: Session, table: "AmplitudeTable", model: str, *, no_law: bool, scale_errors: bool) -> "Tapping":
     from fitting.tapping_curves.tapping import tapping, with_law  # noqa: PLC0415
 
-    result = tapping(table, law=False)
+    result = tapping(table, law=False, scale_errors=scale_errors)
     if no_law or not result.law_allowed:
         return result
     session.start_computing(*(f"fitting.forward:{name}" for name in ("impacts_of", "located", "linearise_pairs")))

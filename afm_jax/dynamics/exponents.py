@@ -181,7 +181,7 @@ def _exponents_of_contacts(scenes: Scene, tips: Tips, *, impacts: int, transient
     known = np.isfinite(passed)
     steps = passed.shape[1]
     pairs = [np.where(known, part, 0.0).ravel() for part in (departure[:, :-1], velocity[:, :-1], passed)]
-    of_all = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), steps), scenes)
+    of_all = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), steps, axis=0), scenes)
 
     def work(rows: tuple[Scene, Array, Array, Array]) -> Array:
         each_scene, time, speed, duration = rows

@@ -8,7 +8,7 @@ speeds are relative to the platform and positive.
 
 import dataclasses
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -346,6 +346,9 @@ class TabulatedLaw(Law):
     That is smooth down to capture and positive for whatever s. The delay is that of a `CollisionDelay` and a spline of
     the same kind. Outside the table's speeds the splines go on as straight lines: `extrapolated` says where.
 
+    A law that is known with errors has deviations: changes of its numbers, one for each of several independent unknowns
+    of unit variance (`with_errors`), from which `sample` draws laws.
+
     Every number is traced, so that a law may be differentiated by them, and laws of as many rows share one compiled
     program. Each array's last axis is the spline's; batches of laws have axes in front of it.
 
@@ -382,6 +385,7 @@ class TabulatedLaw(Law):
     origin: "Origin" = eqx.field(static=True)
     mass_ng: Float[Array, "..."] | None = None
     delay: CollisionDelay | None = None
+    deviations: dict[str, Float[Array, "deviations ..."]] | None = None
 
     def __init__(
         self,
@@ -431,10 +435,129 @@ class TabulatedLaw(Law):
         self.mass_ng = None if mass_ng is None else as_parameter(mass_ng)
         self.origin = Origin(origin)
 
+    @classmethod
+    def with_errors(
+        cls,
+        approach_speed_nm_per_us: ArrayLike | Sequence[float],
+        rebound_speed_nm_per_us: ArrayLike | Sequence[float],
+        collision_delay_us: ArrayLike | Sequence[float] | None = None,
+        *,
+        rebound_changes: ArrayLike,
+        delay_changes: ArrayLike | None = None,
+        capture_changes: ArrayLike | None = None,
+        **options: Any,
+    ) -> "TabulatedLaw":
+        """Return a law whose table is known with errors: a factor of the covariance of all its columns.
+
+        Args:
+            approach_speed_nm_per_us: u_in, shape (rows,).
+            rebound_speed_nm_per_us: u_out.
+            collision_delay_us: of every row; None: instantaneous impacts.
+            rebound_changes: changes of u_out in nm/us, shape (unknowns, rows), by one standard deviation of each of
+                several independent unknowns.
+            delay_changes: likewise of the delay in us; None: it is known.
+            capture_changes: likewise of the capture speed, shape (unknowns,), for a speed that is given; None: where it
+                is extrapolated it changes with the rebounds, else it is known.
+            options: `capture_speed_nm_per_us`, `delay`, `mass_ng` and `origin` of a law.
+
+        Raises:
+            ValueError: as of a law, or if shapes do not fit.
+        """
+        law = cls(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us, **options)
+        columns = _columns(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us)
+        _, u, w, late = _free_rows(*columns)
+        free = slice(columns[0].shape[0] - u.shape[0], None)
+        by_rebound = jnp.asarray(rebound_changes, float)
+        if by_rebound.ndim != 2 or by_rebound.shape[1] != columns[0].shape[0]:
+            raise ValueError(f"`rebound_changes` must have the shape (unknowns, rows), but has {by_rebound.shape}")
+        by_rebound, count = by_rebound[:, free], by_rebound.shape[0]
+        by_delay = jnp.zeros_like(by_rebound) if delay_changes is None else jnp.asarray(delay_changes, float)[:, free]
+        by_capture = jnp.zeros(count) if capture_changes is None else jnp.asarray(capture_changes, float)
+        known = options.get("capture_speed_nm_per_us")
+
+        def numbers(w: Array, late: Array | None, capture: Array) -> dict[str, Array]:
+            # the formula beside the table and the splines' knots stay as they are
+            held = capture if known is not None else _capture_speed(u, w, 0.0)
+            square = (u - held) * (u + held)
+            place = _place(jnp.sqrt(square), law.scale_nm_per_us)
+            loss = jnp.log(w * w / (square * _formula(u, held, law.r, law.viscous_loss)))
+            changed = {"capture": held, "loss_spline": _spline_through(place, loss, law.knots)}
+            if late is None or law.delay is None:
+                return changed
+            return changed | {"delay_spline": _spline_through(place, late - law.delay(u, w), law.knots)}
+
+        def along(w_change: Array, late_change: Array, capture_change: Array) -> dict[str, Array]:
+            changes = w_change, late_change, capture_change
+            start = w, late, law.capture
+            if late is None:
+                return jax.jvp(lambda w, c: numbers(w, None, c), (w, law.capture), (changes[0], changes[2]))[1]
+            return jax.jvp(numbers, start, changes)[1]
+
+        deviations = jax.jit(jax.vmap(along))(by_rebound, by_delay, by_capture)
+        return _replaced(law, deviations=deviations)
+
+    def moved(self, unknowns: ArrayLike) -> "TabulatedLaw":
+        """Return the law for values of the unknowns of its errors, in standard deviations, shape (unknowns,)."""
+        if self.deviations is None:
+            return self
+        steps = jnp.asarray(unknowns)
+        changes = {name: jnp.tensordot(steps, change, axes=1) for name, change in self.deviations.items()}
+        made = _with_numbers(self, {name: getattr(self, name) + change for name, change in changes.items()})
+        # a loss so small that it is not sure to be one
+        return _replaced(made, capture=jnp.maximum(made.capture, 0.0), deviations=None)
+
+    def sample(self, key: Array, n: int) -> "TabulatedLaw":
+        """Return laws drawn from the errors of this one: one law whose every number has a first axis of length n.
+
+        `jax.vmap` maps over them; `jax.tree.map(lambda leaf: leaf[i], laws)` is the one of a number.
+
+        Args:
+            key: a key of `jax.random`.
+            n: how many.
+
+        Raises:
+            ValueError: if nothing is known of the law's errors.
+        """
+        if self.deviations is None:
+            raise ValueError(
+                "nothing is known of this law's errors: samples are of a fit's law, or of a table with errors"
+            )
+        return jax.vmap(self.moved)(jax.random.normal(key, (n, self.unknowns)))
+
+    @property
+    def unknowns(self) -> int:
+        """How many independent unknowns its errors have; 0 where nothing is known of them."""
+        return 0 if self.deviations is None else self.deviations["capture"].shape[-1 if self.capture.ndim else 0]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the law as numbers and lists, from which `law_of_dict` makes it again; what is absent is left out."""
+        v = self.scale_nm_per_us * self.knots / (1.0 - self.knots)
+        u = jnp.sqrt(v**2 + self.capture**2)
+        found = self.beyond_capture(u, v)
+        told: dict[str, Any] = {
+            "approach_speed_nm_per_us": np.asarray(found.approach).tolist(),
+            "rebound_speed_nm_per_us": np.asarray(found.rebound).tolist(),
+        }
+        if self.delay is not None:
+            told["collision_delay_us"] = np.asarray(found.delay).tolist()
+            told["corrections"] = self.delay.corrections
+        told["capture_speed_nm_per_us"] = float(self.capture)
+        told["speed_range_nm_per_us"] = [float(self.slowest_nm_per_us), float(self.fastest_nm_per_us)]
+        if self.mass_ng is not None:
+            told["mass_ng"] = float(self.mass_ng)
+        if self.origin.text:
+            told["origin"] = self.origin.text
+        numbers = {name: np.asarray(number).tolist() for name, number in _numbers_of(self).items()}
+        told["numbers"] = numbers | {"scale_nm_per_us": float(self.scale_nm_per_us)}
+        if self.deviations is not None:
+            told["deviations"] = {name: np.asarray(change).tolist() for name, change in self.deviations.items()}
+        return told
+
     def __repr__(self) -> str:
         """Return what the law is of, without its splines."""
-        if is_traced(self.slowest_nm_per_us) or np.ndim(self.slowest_nm_per_us):
-            return f"TabulatedLaw(knots={self.knots.shape})"
+        end = self.slowest_nm_per_us
+        if not isinstance(end, Array | np.ndarray) or is_traced(end) or end.ndim:
+            return "TabulatedLaw(...)"
         speeds = f"{float(self.slowest_nm_per_us):.6g} to {float(self.fastest_nm_per_us):.6g} nm/us"
         captured = f"captured at {float(self.capture_speed_nm_per_us):.6g}"
         return f"TabulatedLaw({speeds}, {captured}, delay={self.delay!r}, origin={self.origin.text!r})"
@@ -533,6 +656,88 @@ class TabulatedLaw(Law):
         """Return the u_in in nm/us that leaves at u_out in nm/us, by Newton's method; differentiable."""
         w = as_argument(rebound_speed)
         return _read_backwards(w, self)
+
+
+_NUMBERS = ("capture", "r", "viscous_loss", "knots", "loss_spline", "delay_spline")
+_SPLINES = ("knots", "loss_spline", "delay_spline")
+
+
+def _numbers_of(law: TabulatedLaw) -> dict[str, Array]:
+    """Return what a table's law is made of and what may be uncertain, by name."""
+    numbers = {name: getattr(law, name) for name in _NUMBERS}
+    return numbers if law.delay is None else numbers | {name: getattr(law.delay, name) for name in _OF_DELAY}
+
+
+_OF_DELAY = ("hertz", "lead_nm", "offset_nm")
+
+
+def _with_numbers(law: TabulatedLaw, numbers: dict[str, Array]) -> TabulatedLaw:
+    """Return a law with other numbers, of `_numbers_of`."""
+
+    def places(law: TabulatedLaw) -> list[Any]:
+        return [getattr(law, name) if name in _NUMBERS else getattr(law.delay, name) for name in numbers]
+
+    return eqx.tree_at(places, law, list(numbers.values()))
+
+
+def _replaced(law: TabulatedLaw, **parts: Any) -> TabulatedLaw:
+    """Return a law with other fields, without the checks of a table."""
+    made = object.__new__(TabulatedLaw)
+    for field in dataclasses.fields(law):
+        object.__setattr__(made, field.name, parts.get(field.name, getattr(law, field.name)))
+    return made
+
+
+def law_of_dict(told: Mapping[str, Any]) -> TabulatedLaw:
+    """Return the law that `TabulatedLaw.to_dict` tells, number for number.
+
+    Raises:
+        ValueError: if columns are missing or are no table of a law.
+    """
+    names = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us")
+    missing = [name for name in names[:2] if not isinstance(told.get(name), list | np.ndarray)]
+    if missing:
+        raise ValueError(f"the law lacks {' and '.join(missing)}")
+    numbers = told.get("numbers")
+    delay = None
+    if isinstance(numbers, Mapping) and told.get(names[2]) is not None:
+        delay = CollisionDelay(*(numbers[name] for name in _OF_DELAY), corrections=bool(told.get("corrections", True)))
+    u, w, late = (np.asarray(told.get(name, ()), float) for name in names)
+    law = TabulatedLaw(
+        u,
+        w,
+        late if late.size else None,
+        capture_speed_nm_per_us=told.get("capture_speed_nm_per_us"),
+        delay=delay,
+        mass_ng=told.get("mass_ng"),
+        origin=str(told.get("origin", "")),
+    )
+    if not isinstance(numbers, Mapping):
+        return law
+    made = _with_numbers(law, {name: jnp.asarray(numbers[name], float) for name in _numbers_of(law)})
+    scale, ends = numbers["scale_nm_per_us"], told["speed_range_nm_per_us"]
+    made = eqx.tree_at(
+        lambda law: (law.scale_nm_per_us, law.slowest_nm_per_us, law.fastest_nm_per_us),
+        made,
+        tuple(jnp.asarray(number, float) for number in (scale, *ends)),
+    )
+    if told.get("deviations") is None:
+        return made
+    deviations = {name: jnp.asarray(change, float) for name, change in told["deviations"].items()}
+    return _replaced(made, deviations=deviations)
+
+
+def axes_of_one(scene: Scene) -> Scene:
+    """Return how many axes each number of a scene has if it is one scene: those of a law's table have their own."""
+    axes = jax.tree.map(lambda _: 0, scene)
+    law = scene.interaction
+    if not isinstance(law, TabulatedLaw):
+        return axes
+    axes = eqx.tree_at(lambda scene: [getattr(scene.interaction, name) for name in _SPLINES], axes, [1] * len(_SPLINES))
+    if law.deviations is None:
+        return axes
+    own = {name: 2 if name in _SPLINES else 1 for name in law.deviations}
+    return eqx.tree_at(lambda scene: scene.interaction.deviations, axes, own)
 
 
 def _rebound_misfit(beyond: Array, law_and_rebound: tuple[TabulatedLaw, Array]) -> Array:
@@ -736,10 +941,11 @@ def _spline_through(
 ) -> Float[Array, " numbers"]:
     """Return the natural spline with knots through values, or of more values than knots the closest one."""
     numbers = _natural(knots)
-    if place.shape == knots.shape:
-        return numbers @ values
     shapes = jnp.concatenate([jnp.ones_like(place)[:, None], (place - knots[0])[:, None], _cubes(knots, place)], axis=1)
-    return numbers @ jnp.linalg.lstsq(shapes @ numbers, values)[0]
+    # by their values at the knots
+    by_values = shapes @ numbers
+    at_knots = jnp.linalg.solve if place.shape == knots.shape else lambda a, b: jnp.linalg.lstsq(a, b)[0]
+    return numbers @ at_knots(by_values, values)
 
 
 def closest_delay(u: Float[Array, " n"], w: Float[Array, " n"], delay: Float[Array, " n"]) -> CollisionDelay:

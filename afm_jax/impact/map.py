@@ -19,7 +19,7 @@ from afm_jax.apparatus.surface import Surface, seen_freely
 from afm_jax.checks import checked, require_float64
 from afm_jax.impact.first_impact import DEFAULT_MAX_STEPS, DEFAULT_ROOT_TOLERANCE_US, Flight, first_impact
 from afm_jax.impact.lasting_impact import crawls, delay_before, speeds_of_impact
-from afm_jax.impact.law import Law, impact_law_of
+from afm_jax.impact.law import Law, axes_of_one, impact_law_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, public_result
 
@@ -299,8 +299,8 @@ def _check(scene: Scene, times: Array, velocities: Array, impacts: int, block: i
             "`time_us` and `velocity_nm_per_us` must have one shape (batch,) with at least one row, "
             f"but have {times.shape} and {velocities.shape}"
         )
-    for leaf in jax.tree.leaves(scene):
-        if leaf.ndim and leaf.shape != times.shape:
+    for leaf, own in zip(jax.tree.leaves(scene), jax.tree.leaves(axes_of_one(scene)), strict=True):
+        if leaf.ndim > own and leaf.shape[: leaf.ndim - own] != times.shape:
             raise ValueError(
                 f"a parameter of the scene has shape {leaf.shape}; it must be a number or match {times.shape}"
             )
@@ -319,14 +319,15 @@ def _iterate_batch(
     block: int,
     max_steps: int,
 ) -> NextImpact:
-    own, shared = eqx.partition(scene, jax.tree.map(lambda leaf: leaf.ndim > 0, scene))
+    own, shared = eqx.partition(scene, jax.tree.map(lambda leaf, axes: leaf.ndim > axes, scene, axes_of_one(scene)))
     batch = starts[0].shape[0]
     blocks = -(-batch // block)
     width = -(-batch // blocks)
 
     def into_blocks(rows):
         # The last block is filled up with copies of the last row, so that every block is the same program.
-        return jnp.pad(rows, (0, blocks * width - batch), mode="edge").reshape(blocks, width)
+        filled = jnp.pad(rows, ((0, blocks * width - batch), *((0, 0),) * (rows.ndim - 1)), mode="edge")
+        return filled.reshape(blocks, width, *rows.shape[1:])
 
     def one_tip(row):
         own_parameters, (time, velocity) = row

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from afm_jax.least_squares import chi2_tail
+from afm_jax.least_squares import IMPROBABLE, chi2_tail
 from fitting.fits.intervals import Convergence
 from fitting.fits.loss import NO_MASS
 from fitting.fits.minimum import TOO_SLOW
@@ -20,8 +20,6 @@ from fitting.parameters import DELAY_NAMES, is_nuisance, name_of_table, paramete
 from fitting.tables.several import SeveralTables, repeats_of
 from fitting.tables.table import AmplitudeTable
 
-IMPROBABLE = 1e-3
-"""Probability of the chi2 below which the model does not explain the table."""
 _TIED = 0.995
 """Correlation beyond which two parameters are called determined only together."""
 _STATED = 0.003
