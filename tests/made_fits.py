@@ -100,7 +100,7 @@ def made_law(values: dict[str, float], *, width: float, lasting: bool) -> Fitted
         capture_speed_nm_per_us=u_c / (2.0 * values.get("r", 1.0) ** 2),
         delay=None,
         lasting=lasting,
-        errors=errors,
+        errors=(errors, np.zeros(1)),
         mass_ng=1.0,
         origin="made",
     )

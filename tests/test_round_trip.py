@@ -4,6 +4,7 @@ The bundled table is of the full contact, which no formula of the fitted family 
 """
 
 import json
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +18,7 @@ from fitting.examples.make_contact_amplitudes import EXAMPLE
 from tests.contact_experiment import paper_collisions
 
 pytestmark = pytest.mark.slow
+KEY = jax.random.key(4)
 
 
 @pytest.fixture(scope="module")
@@ -24,31 +26,41 @@ def result():
     return fit(read_table(EXAMPLE), "law+delay")
 
 
-def orbits_of(result, law, rows):
-    """Return all orbits of a table's rows, with the fitted instrument."""
-    table = result.table
-    found = {name: one.value for name, one in result.parameters.items()}
-    assert set(found) <= {"r", "epsilon", "delay_hertz", "delay_lead_nm", "delay_offset_nm", "quality_factor"}
-    cantilever = afm.Cantilever(table.free_frequency_khz, found["quality_factor"], table.mass_ng)
+@pytest.fixture(scope="module")
+def rows(result):
+    return np.flatnonzero(result.rows.used)
 
-    def one(frequency, amplitude, offset, order):
+
+@pytest.fixture(scope="module")
+def orbits(result, rows):
+    """All orbits of the used rows with the fitted instrument: of the law, and of five samples of it."""
+    table = result.table
+    known = {name: one.value for name, one in result.parameters.items()}
+    assert set(known) <= {"r", "epsilon", "delay_hertz", "delay_lead_nm", "delay_offset_nm", "quality_factor"}
+    cantilever = afm.Cantilever(table.free_frequency_khz, known["quality_factor"], table.mass_ng)
+    law = result.law.moved(np.zeros(result.law.unknowns))
+    laws = jax.tree.map(lambda one, more: jnp.append(one[None], more, axis=0), law, result.law.sample(KEY, 5))
+
+    def one(law, frequency, amplitude, offset, order):
         platform = afm.Platform(amplitude, frequency, offset)
         return afm.single_impact_orbits(afm.Scene(cantilever, platform, law), order)
 
+    of_rows = jax.vmap(one, in_axes=(None, 0, 0, 0, 0))
     columns = (table.drive_frequency_khz, table.drive_amplitude_nm, table.offset_nm, table.order.astype(float))
-    return jax.jit(jax.vmap(one))(*(jnp.asarray(column[rows]) for column in columns))
+    return jax.jit(jax.vmap(of_rows, in_axes=(0, None, None, None, None)))(
+        laws, *(jnp.asarray(column[rows]) for column in columns)
+    )
 
 
-def test_orbits_of_a_scene_with_the_law_are_the_rows_predictions(result):
+def test_orbits_of_a_scene_with_the_law_are_the_rows_predictions(result, rows, orbits):
     assert result.valid
-    rows = np.flatnonzero(result.rows.used)
-    orbits = orbits_of(result, result.law, rows)
-    readings = np.stack([orbits.peak_amplitude_nm, orbits.lockin_amplitude_nm], axis=2)
+    readings = np.stack([orbits.peak_amplitude_nm[0], orbits.lockin_amplitude_nm[0]], axis=2)
     apart = np.abs(readings / result.rows.predicted_nm[rows][:, None] - 1.0).max(axis=2)
-    steady = np.asarray(orbits.exists & orbits.stable & orbits.admissible)
-    assert np.where(steady, apart, np.inf).min(axis=1).max() < 1e-6
-    speeds = np.where(steady & (apart < 1e-6), np.asarray(orbits.approach_speed_nm_per_us), np.nan)
-    np.testing.assert_allclose(np.nanmax(speeds, axis=1), result.rows.approach_speed_nm_per_us[rows], rtol=1e-6)
+    steady = np.asarray(orbits.exists & orbits.stable & orbits.admissible)[0]
+    same = steady & (apart < 1e-6)
+    assert same.any(axis=1).all()
+    speeds = np.where(same, np.asarray(orbits.approach_speed_nm_per_us[0]), 0.0).max(axis=1)
+    np.testing.assert_allclose(speeds, result.rows.approach_speed_nm_per_us[rows], rtol=1e-6)
 
 
 def test_residuals_and_chi2_are_those_of_the_predictions(result):
@@ -85,7 +97,7 @@ def test_the_law_and_its_samples_hold_the_contacts_law(result):
     u = np.geomspace(30.0, 200.0, 30)
     truth = paper_collisions(u)[0]
     found = np.asarray(law.rebound_speed(u))
-    drawn = np.asarray(jax.vmap(lambda one: one.rebound_speed(u))(law.sample(jax.random.key(3), 400)))
+    drawn = np.asarray(jax.vmap(lambda one: one.rebound_speed(u))(law.sample(jax.random.key(3), 200)))
     low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
     assert np.mean((low < truth) & (truth < high)) > 0.9
     assert np.abs(found / truth - 1.0).max() < 5e-3
@@ -94,20 +106,18 @@ def test_the_law_and_its_samples_hold_the_contacts_law(result):
     np.testing.assert_allclose(1.96 * drawn.std(axis=0), half, rtol=0.15)
 
 
-def test_samples_of_the_law_are_a_band_of_amplitudes_that_holds_what_was_measured(result):
-    rows = np.flatnonzero(result.rows.used & (result.rows.orbits == 1))[::12]
-    samples = result.law.sample(jax.random.key(4), 20)
-    found = jax.vmap(lambda law: orbits_of(result, law, rows))(samples)
-    steady = np.asarray(found.exists & found.stable & found.admissible)
-    peak = np.where(steady, np.asarray(found.peak_amplitude_nm), np.nan)
+def test_samples_of_the_law_are_a_band_of_amplitudes_that_holds_what_was_measured(result, rows, orbits):
+    steady = np.asarray(orbits.exists & orbits.stable & orbits.admissible)[1:]
+    peak = np.where(steady, np.asarray(orbits.peak_amplitude_nm)[1:], np.inf)
     predicted, measured, error = (
         column[rows, 0] for column in (result.rows.predicted_nm, result.rows.measured_nm, result.rows.error_nm)
     )
-    nearest = np.take_along_axis(peak, np.nanargmin(np.abs(peak - predicted[:, None]), axis=2)[..., None], axis=2)[
-        ..., 0
-    ]
+    near = np.argmin(np.abs(peak - predicted[:, None]), axis=2)
+    nearest = np.take_along_axis(peak, near[..., None], axis=2)[..., 0]
+    seen = np.isfinite(nearest).all(axis=0) & np.isfinite(measured)
+    assert seen.mean() > 0.9
     spread = np.hypot(nearest.std(axis=0), error)
-    assert np.mean(np.abs(measured - nearest.mean(axis=0)) < 3.0 * spread) > 0.9
+    assert np.mean((np.abs(measured - nearest.mean(axis=0)) < 2.5 * spread)[seen]) > 0.9
 
 
 def test_the_law_comes_back_from_the_fits_file(result, tmp_path):
@@ -132,7 +142,8 @@ def test_an_instantaneous_law_is_the_formula():
     u = np.geomspace(1.05 * float(result.law.capture_speed_nm_per_us), 1e3, 50)
     np.testing.assert_allclose(result.law.rebound_speed(u), np.sqrt((r * u) ** 2 - epsilon), rtol=1e-9)
     assert result.law.delay is None
-    table, row = result.table, int(np.flatnonzero(result.rows.used)[0])
+    table: Any = result.table
+    row = int(np.flatnonzero(result.rows.used)[0])
     scene = afm.Scene(
         afm.Cantilever(table.free_frequency_khz, result.parameters["quality_factor"].value, table.mass_ng),
         afm.Platform(table.drive_amplitude_nm[row], table.drive_frequency_khz[row], table.offset_nm[row]),

@@ -128,7 +128,7 @@ def law_with_band(  # noqa: PLR0913
         capture_speed_nm_per_us=found.capture,
         delay=None if formula is None else formula.delay,
         lasting=problem.lasting,
-        errors=np.moveaxis(found.factor, 0, 1),
+        errors=(np.moveaxis(found.factor, 0, 1), found.capture_factor),
         mass_ng=mass_ng,
         origin=origin,
     )

@@ -57,8 +57,25 @@ def _tabulated(
     late: Float[Array, " rows"] | None,
     capture: Float[Array, ""],
     delay: CollisionDelay | None,
+    changes: tuple[Float[Array, "m 2 rows"], Float[Array, " m"]] | None,
 ) -> TabulatedLaw:
-    return TabulatedLaw(speeds, rebound, late, capture_speed_nm_per_us=capture, delay=delay)
+    known: dict[str, Any] = {"capture_speed_nm_per_us": capture, "delay": delay}
+    if changes is None:
+        return TabulatedLaw(speeds, rebound, late, **known)
+    of_rows, of_capture = changes
+    return TabulatedLaw.with_errors(
+        speeds,
+        rebound,
+        late,
+        rebound_changes=of_rows[:, 0],
+        delay_changes=None if late is None else of_rows[:, 1],
+        capture_changes=of_capture,
+        **known,
+    )
+
+
+_TOGETHER = 8
+"""Unknowns are filled up to a multiple of this, so that laws have few shapes and programs."""
 
 
 def table_of_law(
@@ -68,6 +85,7 @@ def table_of_law(
     *,
     capture_speed_nm_per_us: float,
     delay: CollisionDelay | None,
+    errors: tuple[Float[np.ndarray, "points 2 m"], Float[np.ndarray, " m"]] | None = None,
 ) -> TabulatedLaw:
     """Return a law as the table that a scene takes, by one compiled program.
 
@@ -77,19 +95,51 @@ def table_of_law(
         late: delays in us; None: impacts are instantaneous.
         capture_speed_nm_per_us: of the law, kept between the fastest tip that is captured and the slowest that leaves.
         delay: the formula that the delay is written beside; None: the closest one.
+        errors: changes of rebound speeds and delays, and of the capture speed, with independent unknowns of unit
+            variance; None: nothing is known of them.
     """
     leaves = rebound > 0.0
     u, w = speeds[leaves], np.minimum(rebound, speeds)[leaves]
     captured = speeds[~leaves][-1] if not leaves.all() else 0.0
     capture = np.clip(capture_speed_nm_per_us, captured, (1.0 - 1e-9) * u[0])
-    return _tabulated(u, w, None if late is None else late[leaves], capture, None if late is None else delay)
+    changes, count = None, 0
+    if errors is not None:
+        of_rows, of_capture = fewest_unknowns(errors[0][leaves], errors[1])
+        count = of_capture.size
+        spare = -count % _TOGETHER
+        changes = np.pad(np.moveaxis(of_rows, 2, 0), ((0, spare), (0, 0), (0, 0))).transpose(0, 2, 1)
+        changes = np.ascontiguousarray(changes), np.pad(of_capture, (0, spare))
+    law = _tabulated(u, w, None if late is None else late[leaves], capture, None if late is None else delay, changes)
+    if law.deviations is None:
+        return law
+    return eqx.tree_at(lambda law: law.deviations, law, {name: one[:count] for name, one in law.deviations.items()})
+
+
+def fewest_unknowns(
+    of_rows: Float[np.ndarray, "points 2 m"], of_capture: Float[np.ndarray, " m"]
+) -> tuple[Float[np.ndarray, "points 2 k"], Float[np.ndarray, " k"]]:
+    """Return changes with fewer independent unknowns that have the same covariance, to 3 parts in 1000 of every error.
+
+    What is not known of the capture speed (NaN) is left out.
+    """
+    flat = np.append(of_rows.reshape(-1, of_rows.shape[2]), np.nan_to_num(of_capture)[None], axis=0)
+    size = np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
+    left, strength, _ = np.linalg.svd(flat / size, full_matrices=False)
+    parts = left * strength
+    missing = np.sqrt(np.maximum(np.cumsum((parts**2)[:, ::-1], axis=1)[:, ::-1], 0.0)).max(axis=0)
+    kept = (size * parts)[:, : max(int(np.sum(missing > _LEAST_PART)), 1)]
+    return kept[:-1].reshape(*of_rows.shape[:2], -1), kept[-1]
+
+
+_LEAST_PART = 3e-3
+"""Share of an error below which unknowns are left out."""
 
 
 class FittedLaw(TabulatedLaw):
     """The impact law that a fit found, with its discrepancy: a law for scenes, and its points with a 95 % band.
 
     The points go from 0.8 times the slowest to 1.2 times the fastest speed that the rows reached; beyond them the law
-    is `extrapolated`. NaN: nothing is known of the band.
+    is `extrapolated`. `sample` draws laws that are as uncertain. NaN: nothing is known of the band.
 
     Attributes:
         approach_speed_nm_per_us: u_in at the points.
@@ -118,14 +168,13 @@ class FittedLaw(TabulatedLaw):
         capture_speed_nm_per_us: float,
         delay: CollisionDelay | None,
         lasting: bool,
-        errors: Float[np.ndarray, "points 2 m"],
+        errors: tuple[Float[np.ndarray, "points 2 m"], Float[np.ndarray, " m"]],
         mass_ng: float | None,
         origin: str,
     ):
         """Make the law of its points; arguments as of `table_of_law`.
 
-        `errors` are changes of rebound speeds and delays with independent unknowns of unit variance, NaN where nothing
-        is known of them.
+        Errors are NaN where nothing is known of them.
         """
         table = table_of_law(
             speeds,
@@ -133,11 +182,12 @@ class FittedLaw(TabulatedLaw):
             late if lasting else None,
             capture_speed_nm_per_us=capture_speed_nm_per_us,
             delay=delay,
+            errors=errors if np.isfinite(errors[0]).all() else None,
         )
         for part in dataclasses.fields(TabulatedLaw):
             setattr(self, part.name, getattr(table, part.name))
         self.mass_ng, self.origin = None if mass_ng is None else jnp.asarray(mass_ng), Origin(origin)
-        width = TWO_SIDED_95 * np.linalg.norm(errors, axis=2)
+        width = TWO_SIDED_95 * np.linalg.norm(errors[0], axis=2)
         self.approach_speed_nm_per_us = speeds
         self.rebound_speed_nm_per_us, self.collision_delay_us = map(np.asarray, _points(table, speeds))
         self.rebound_low_nm_per_us = np.maximum(self.rebound_speed_nm_per_us - width[:, 0], 0.0)
@@ -147,14 +197,7 @@ class FittedLaw(TabulatedLaw):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the law as fit.json has it: its points with units in their names, and all that makes it again."""
-        delay = self.delay and {name: float(getattr(self.delay, name)) for name in ("hertz", "lead_nm", "offset_nm")}
-        head = {
-            "origin": self.origin.text,
-            "mass_ng": None if self.mass_ng is None else float(self.mass_ng),
-            "capture_speed_nm_per_us": float(self.capture_speed_nm_per_us),
-            "delay": delay,
-        }
-        return head | {name: plain(getattr(self, name)) for name in FittedLaw.__annotations__}
+        return super().to_dict() | {name: plain(getattr(self, name)) for name in FittedLaw.__annotations__}
 
 
 @jax.jit
