@@ -78,6 +78,7 @@ def orbit_problem(
     if problem.tapping:
         # the free tip's amplitude, read by the same detector: in the frame of the free tip the sample moves by it
         amplitude = amplitude / problem.nuisance(values, "tip_calibration", 1.0)
+        amplitude = amplitude * (1.0 + problem.nuisance(values, "free_amplitude_drift", 0.0) * row.time)
     if problem.drive == "base":
         ratio = row.drive_frequency_khz / cantilever.frequency_khz
         amplitude = height_of_free_deflection(amplitude, ratio, cantilever.quality_factor)
@@ -109,7 +110,8 @@ def shown(
     if row.amplitude_nm.shape[0] < 3:
         return read
     period, known = 360.0 / row.order, row.amplitude_nm[2]
-    apart = phase + problem.nuisance(values, "phase_zero_deg", 0.0) - known
+    zero = problem.nuisance(values, "phase_zero_deg", 0.0)
+    apart = phase + zero + problem.nuisance(values, "phase_drift_deg", 0.0) * row.time - known
     return jnp.append(read, known + (apart + 0.5 * period) % period - 0.5 * period)
 
 

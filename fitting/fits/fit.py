@@ -83,7 +83,14 @@ from fitting.models import (
     measurement_of,
     readings_of,
 )
-from fitting.parameters import NUISANCE_NAMES, is_of_one_table, model_parameters, name_of_table, parameter_called
+from fitting.parameters import (
+    DRIFT_NAMES,
+    NUISANCE_NAMES,
+    is_of_one_table,
+    model_parameters,
+    name_of_table,
+    parameter_called,
+)
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable, as_table
 
@@ -308,7 +315,27 @@ def coordinates(law: Law, speeds: Float[Array, " n"]) -> Float[Array, " n"]:
     return law.coordinate(speeds)
 
 
+def _untold_drifts(parameters: Mapping[str, FittedParameter]) -> list[str]:
+    """Return a sentence where drifts along the rows are hardly told by anything but what is assumed of them."""
+    untold = []
+    for name, known in parameters.items():
+        drift = parameter_called(name).name in DRIFT_NAMES
+        if drift and known.constraint is not None and (known.standard_error or np.inf) > 0.5 * known.constraint[1]:
+            untold.append(f"{name} = {known.constraint[0]:g} +- {known.constraint[1]:g}")
+    if not untold:
+        return []
+    said = (
+        f"Hardly told by the rows, which stand in order of time, only assumed: {', '.join(untold)}. Rows of the free "
+        "tip before and after the others tell drifts; `--constrain` takes what is known of them."
+    )
+    return [said]
+
+
 _PACKAGES = ("afm-jax", "jax", "optax", "numpy")
+_KINDS = (("peak amplitude", ""), ("lock-in amplitude", ""), ("phase", "degrees"))
+"""What is read, and its unit if it does not drift by a share."""
+_FOLLOWING = 4.0
+"""Standard errors of a course of the residuals along the rows beyond which it is no chance."""
 
 
 @dataclass(frozen=True)
@@ -352,6 +379,7 @@ class _Summary:
         self.residual = np.asarray(linear.residual)[0]
         self.amplitude_residual = self.searching.misfit(linear)
         self.prediction = linear.prediction
+        self.jacobian = np.asarray(linear.jacobian)[0]
         self.minimum_chi2 = float(np.sum(self.residual**2))
         self.constraints = dict(self.settings["constraints"])
         used = int(np.asarray(objective.measurement.rows.measured).sum())
@@ -529,6 +557,7 @@ class _Summary:
         if explained:
             evidence = replace(evidence, parameters=self._explained_parameters(moved))
         reasons, warnings = judge_fit(evidence)
+        warnings += self._follow_rows() + _untold_drifts(evidence.parameters)
         common = [i for i, name in enumerate(self.names) if not is_of_one_table(name)]
         return FitResult(
             model=self.problem.model,
@@ -563,6 +592,46 @@ class _Summary:
             tables=self._fitted_tables(evidence.parameters),
             scatter=self._scatter() if explained else {},
         )
+
+    def _follow_rows(self) -> list[str]:
+        """Return a sentence for each table whose residuals follow its rows, though it says nothing of their order."""
+        count, kinds = self.amplitude_residual.shape
+        said, first = [], 0
+        scale = np.sqrt(max(1.0, self.minimum_chi2 / max(self.freedom, 1)))
+        for table, label in zip(self.table.tables, self.table.labels, strict=True):
+            rows, first = np.arange(first, first + table.rows), first + table.rows
+            found = []
+            for kind, (name, unit) in zip(range(kinds), _KINDS, strict=False):
+                along = np.zeros((count, kinds))
+                size = 1.0 if unit else np.abs(np.asarray(self.prediction.amplitude_nm)[0, rows, kind])
+                error = np.asarray(self.searching.measurement.rows.error_nm)[rows, kind]
+                seen = np.asarray(self.searching.measurement.rows.measured)[rows, kind]
+                along[rows, kind] = np.where(seen, np.linspace(-0.5, 0.5, table.rows) * size / error, 0.0)
+                slope, sigmas = self._slope_along(along.ravel())
+                if abs(sigmas) > _FOLLOWING * scale:
+                    found.append(f"{name} {f'{slope:+.2g} {unit}' if unit else f'{100.0 * slope:+.2g} %'}")
+            if found and not table.rows_in_order_of_time:
+                several = f"{label}: " if len(self.table.labels) > 1 else ""
+                said.append(
+                    f"{several}Residuals follow the rows ({', '.join(found)} from the first to the last), as drifts "
+                    "do. If the rows stand as they were measured, say `# rows = in order of time`: drifts are then "
+                    "fitted along."
+                )
+        return said
+
+    def _slope_along(self, along: Float[np.ndarray, " n"]) -> tuple[float, float]:
+        """Return how far readings follow a course that the fit leaves them, and that in standard errors."""
+        column = np.append(along, np.zeros(self.residual.size - along.size))
+        slopes = np.nan_to_num(self.jacobian)
+        slopes = slopes / np.maximum(np.linalg.norm(slopes, axis=0), 1e-300)
+        basis, size, _ = np.linalg.svd(slopes, full_matrices=False)
+        basis = basis[:, size > 1e-10 * max(size[0], 1e-300)]
+        left = column - basis @ (basis.T @ column)
+        length = float(left @ left)
+        if length <= 1e-6 * float(column @ column):
+            return 0.0, 0.0
+        slope = -float(left @ np.nan_to_num(self.residual)) / length
+        return slope, slope * np.sqrt(length)
 
     @property
     def _free_own(self) -> list[str]:
@@ -967,7 +1036,9 @@ def _check_levers(tables: SeveralTables, model: str) -> None:
         )
 
 
-_NEUTRAL = {"tip_calibration": 1.0, "drive_calibration": 1.0, "offset_origin_nm": 0.0, "phase_zero_deg": 0.0}
+_NEUTRAL = {"tip_calibration": 1.0, "drive_calibration": 1.0} | dict.fromkeys(
+    ("offset_origin_nm", "phase_zero_deg", "phase_drift_deg", "free_amplitude_drift"), 0.0
+)
 """What stands for the absence of a nuisance."""
 
 
