@@ -1,6 +1,7 @@
 """What a law leaves out: the step against one least-squares problem, and bands on contacts that are not the law."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -145,7 +146,8 @@ def test_a_step_is_damped_until_chi2_falls(rows, falls_from, share):
             + 10.0 * (one > falls_from)
             for part, one in zip(parts, taken, strict=True)
         ]
-        return Predicted(np.array(found).reshape(len(parts), ROWS, 2), Prediction(*(np.zeros((2, 1)),) * 7))
+        nothing: Any = np.zeros((2, 1))
+        return Predicted(np.array(found).reshape(len(parts), ROWS, 2), Prediction(*(nothing,) * 7))
 
     found = descending_part(step, system, predicted)
     np.testing.assert_allclose(found.step.change, share * step.change)
@@ -288,6 +290,7 @@ def test_bands_hold_the_law_of_a_contact_that_is_not_the_models():
         worst.append(z.max())
         degrees.append(result.chi2 / result.degrees_of_freedom)
         assert result.loss is not None
+        assert result.loss.capture_speed_nm_per_us is not None
         low, top = result.loss.capture_speed_nm_per_us.interval95
         assert low is not None
         assert top is not None
