@@ -303,7 +303,9 @@ def test_bands_hold_the_law_of_a_contact_that_is_not_the_models():
 def test_the_loss_is_said_in_energies_and_delta():
     energy = energy_lost(20.0, 10.0, 0.1, 2.0)
     # 2 ng (20^2 - 19.9^2)/2 -+ 39: no sample at rest gives energy
-    assert energy_lost(20.0, 19.9, 0.5, 2.0).energy_aj.interval95 == pytest.approx((0.0, 3.99 + 39.004), abs=1e-3)
+    least = energy_lost(20.0, 19.9, 0.5, 2.0).energy_aj
+    assert least is not None
+    assert least.interval95 == pytest.approx((0.0, 3.99 + 39.004), abs=1e-3)
     epsilon = WithInterval(80.0, (76.08, 83.92))
     delta = scaled(epsilon, 0.5 * 2.0)
     r = WithInterval(0.99, (0.988, 0.992))
