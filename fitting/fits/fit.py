@@ -72,7 +72,7 @@ from fitting.fits.unmodelled import (
     step_of,
     system_of,
 )
-from fitting.fits.verdict import ASSUMED_ERROR_OF_Q, Evidence, judge_fit, misfits
+from fitting.fits.verdict import ASSUMED_ERROR_OF_Q, IMPROBABLE, Evidence, judge_fit, misfits
 from fitting.forward import AnyImpact, Predicted, impact_at, predict, warm_up
 from fitting.models import (
     Joint,
@@ -92,7 +92,7 @@ from fitting.parameters import (
     parameter_called,
 )
 from fitting.tables.several import SeveralTables
-from fitting.tables.table import AmplitudeTable, as_table
+from fitting.tables.table import AmplitudeTable, as_table, in_other_units
 
 _POINTS, _FEWEST_POINTS = 121, 4
 
@@ -356,6 +356,51 @@ class Found:
 def summarise(table: AmplitudeTable | SeveralTables, found: Found) -> FitResult:
     """Return errors, intervals, checks and verdict of a minimum."""
     return _Summary(table, found).result()
+
+
+_GROSS = 10.0
+"""chi2 over degrees of freedom from which on other units are tried."""
+_GRID = np.array([[r, epsilon] for r in (0.5, 0.7, 0.85, 0.93, 0.97, 0.99) for epsilon in (0.0, 30.0, 300.0, 3000.0)])
+"""Values of r and epsilon over which the law of eq. 6 is looked at."""
+_BETTER = 0.5
+
+
+def summarise_in_units(table: AmplitudeTable | SeveralTables, found: Found) -> FitResult:
+    """Return the summary of a minimum; a table far from the model is tried in other units, and one that fits is named.
+
+    Amplitudes in micrometres, peak to peak or rms, frequencies in Hz. The law of eq. 6 on a coarse grid says which of
+    them is nearest; the model is fitted to that.
+    """
+    result = summarise(table, found)
+    far = found.refused or not result.chi2 < _GROSS * max(result.degrees_of_freedom, 1)
+    if not isinstance(table, AmplitudeTable) or result.valid or not far:
+        return result
+    nearest, meant = min(
+        ((_distance_from_law(one), (words, one)) for words, one in in_other_units(table)), key=lambda pair: pair[0]
+    )
+    if not nearest < _BETTER * _distance_from_law(table):
+        return result
+    words, other = meant
+    asked = {name: found.settings[name] for name in ("free", "fixed", "constraints")}
+    try:
+        again = summarise(
+            other,
+            find_fit(other, result.model, effects=found.settings["effects"] or EFFECTS, **asked),
+        )
+    except ValueError:
+        return result
+    if not again.p_value >= IMPROBABLE:
+        return result
+    said = f"With {words} the model explains the table (chi2/dof = {again.chi2:.1f}/{again.degrees_of_freedom})."
+    return replace(result, reasons=[*result.reasons, f"{said} Check the units."])
+
+
+def _distance_from_law(table: AmplitudeTable) -> float:
+    """Return the soft objective of the law of eq. 6 at the best of a coarse grid of its parameters."""
+    problem = Problem("law", ("r", "epsilon"), drive=table.drive)
+    known = {} if table.quality_factor is None else {"quality_factor": (table.quality_factor, 1.0)}
+    objective = Objective(measurement_of(table, problem, known), problem)
+    return float(np.min(objective.screen(_GRID)))
 
 
 class _Summary:
@@ -877,7 +922,7 @@ def fit(  # noqa: PLR0913
         "hierarchical": hierarchical,
     }
     whole = tables_of(table)
-    return summarise(whole, find_fit(whole, model, **options))
+    return summarise_in_units(whole, find_fit(whole, model, **options))
 
 
 def _one_table(given: Any) -> AmplitudeTable:

@@ -364,6 +364,7 @@ def _warnings(evidence: Evidence) -> list[str]:
     return [
         *_damping_warnings(evidence),
         *_mass_warnings(evidence),
+        *_unit_warnings(evidence),
         *_repeat_warnings(evidence),
         *_table_warnings(evidence),
         *_parameter_warnings(evidence),
@@ -395,6 +396,23 @@ def _mass_warnings(evidence: Evidence) -> list[str]:
     if evidence.table.mass_ng is not None or not evidence.contact:
         return []
     return [f"1 ng assumed: {NO_MASS}. Each of the contact's parameters hangs on it."]
+
+
+_FASTEST_KHZ, _SMALLEST_NM = 2e4, 1.0
+"""What no cantilever is faster than, and what amplitude impacts take at least: a bridge alone is that long."""
+
+
+def _unit_warnings(evidence: Evidence) -> list[str]:
+    """Return what there is to say of frequencies and amplitudes that no measurement of impacts has."""
+    said = []
+    fastest = max(table.free_frequency_khz for table in evidence.table.tables)
+    if fastest > _FASTEST_KHZ:
+        said.append(f"free_frequency_khz = {fastest:g} is more than any cantilever's: was it written in Hz for kHz?")
+    read = evidence.rows.measured_nm[np.isfinite(evidence.rows.measured_nm)]
+    usual = float(np.median(read)) if read.size else _SMALLEST_NM
+    if usual < _SMALLEST_NM:
+        said.append(f"Amplitudes are {usual:.2g} nm in the median: were they written in micrometres for nanometres?")
+    return said
 
 
 def _repeat_warnings(evidence: Evidence) -> list[str]:
