@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from fitting.tables.table import AmplitudeTable, read_table, write_table
     from fitting.tapping_curves.result import Tapping
     from fitting.tapping_curves.tapping import tapping
+    from fitting.tapping_curves.together import TappingTogether, tapping_together
     from fitting.traces.lockin import LockinResult, lockin
     from fitting.traces.trace import Trace, read_trace
 else:
@@ -86,6 +87,8 @@ else:
         "sensitivity": "fitting.calibration.stiffness",
         "simulate_experiment": "fitting.simulated.experiment",
         "tapping": "fitting.tapping_curves.tapping",
+        "TappingTogether": "fitting.tapping_curves.together",
+        "tapping_together": "fitting.tapping_curves.together",
         "trust": "fitting.sampling.trust_pack",
         "write_inference_data": "fitting.sampling.inference_data",
         "write_table": "fitting.tables.table",
@@ -118,6 +121,7 @@ __all__ = [
     "Stiffness",
     "TableError",
     "Tapping",
+    "TappingTogether",
     "Trace",
     "TrustPack",
     "amplitude_gradients",
@@ -145,6 +149,7 @@ __all__ = [
     "sensitivity",
     "simulate_experiment",
     "tapping",
+    "tapping_together",
     "trust",
     "write_inference_data",
     "write_table",

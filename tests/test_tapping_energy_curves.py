@@ -8,10 +8,12 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax.cli.main import main
+from fitting.tables.csv_text import TableError
 from fitting.tables.table import write_table
 from fitting.tapping_curves.pictures import curve_figure
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.tapping import tapping
+from fitting.tapping_curves.together import tapping_together
 from tests.coverage_of_tapping import random_curve
 from tests.strict_reading import strictly
 from tests.tapping_truth_of_laws import (
@@ -191,3 +193,41 @@ def test_bands_hold_the_energies_of_random_laws():
         assert np.mean(off < 1.96) > 0.9
         assert off.max() < 4.0
         assert np.median(off) < 1.2 * 0.6745
+
+
+@pytest.mark.slow
+def test_curves_of_one_lever_share_frequency_and_q_and_tell_their_scatter(tmp_path: Path):
+    truth, rng = curve_like_graphite(120), np.random.default_rng(4)
+    tables = []
+    exact = Stated(frequency=1e-9, quality=1e-9, stiffness=1e-9, **SHARP)
+    for number in range(4):
+        # curves of one lever that differ by 0.4 aJ on average at the top
+        factor = 1.0 + 0.04 * (number - 1.5)
+        one = curve_of_energy(GRAPHITE, truth.amplitude_nm / 13.4, truth.energy_aj * factor, truth.lag_deg < 90.0)
+        table = table_of(GRAPHITE, one, exact, rng, free_rows=30, source=f"curve {number}")
+        stated = {"free_frequency_khz": 344.604, "quality_factor": 233.0, "spring_constant_n_per_m": 44.0}
+        errors = {"free_frequency_error_khz": 0.005, "quality_factor_error": 5.0, "spring_constant_error_n_per_m": 2.0}
+        tables.append(replace(table, **stated, **errors))
+        write_table(tables[-1], tmp_path / f"{number}.csv")
+    result = tapping_together(tables)
+    assert result.valid, result.reasons
+    values = [{n.name: n.value for n in one.functions.nuisances} for one in result.curves if one.functions is not None]
+    for name in ("free_frequency_khz", "quality_factor"):
+        assert len({round(one[name], 9) for one in values}) == 1
+    repulsive = next(one for one in result.scatter if one.repulsive)
+    mean, scatter, own, common = repulsive.at(0.85) or (0.0, 0.0, 0.0, 0.0)
+    # 4 % steps scatter by 5.2 %, far beyond a curve's own errors
+    assert scatter == pytest.approx(0.052 * mean, rel=0.2)
+    assert own < 0.5 * scatter
+    assert abs(mean - truth.at("energy_aj", np.array(0.85), 13.4)) < 2.0 * np.hypot(common, own)
+    files = [str(tmp_path / f"{number}.csv") for number in range(4)]
+    run = CliRunner().invoke(main, ["tapping", *files, "--no-law", "--json", "--out", str(tmp_path / "out")])
+    assert run.exit_code == 0, run.stderr
+    answer = strictly(run.stdout)
+    assert len(answer["curves"]) == 4
+    assert answer["together"]["valid"]
+    assert (tmp_path / "out" / "together.png").stat().st_size > 10000
+    # not one lever
+    other = replace(tables[1], quality_factor=150.0)
+    with pytest.raises(TableError, match="states the Q as 150 \\+- 5"):
+        tapping_together([tables[0], other])

@@ -12,6 +12,7 @@ from fitting.tapping_curves.branches import Height, Hysteresis
 from fitting.tapping_curves.energy_curve import HEADLINE
 from fitting.tapping_curves.energy_fit import EnergyFit
 from fitting.tapping_curves.result import Tapping, origin_in_words
+from fitting.tapping_curves.together import TappingTogether, together_lines
 
 _EV_PER_AJ = 6.241509
 _WIDTH = 150
@@ -271,6 +272,32 @@ def write_tapping(
     write_table("tapping_rows.csv", records, tuple(records[0]))
     law = [] if result.law is None else write_report(result.law, folder, write_table)
     return [*written, frames_path, *law]
+
+
+def write_together(result: TappingTogether, folder: Path) -> list[Path]:
+    """Write together.txt, .json and .png, what several curves of one lever say.
+
+    Args:
+        result: what was found.
+        folder: an existing folder; files of these names are replaced.
+
+    Returns:
+        The files.
+
+    Raises:
+        OSError: if a file cannot be written.
+    """
+    from afm_jax.plots.picture_style import png_of  # noqa: PLC0415
+    from fitting.report.report import write_report_files  # noqa: PLC0415
+    from fitting.tapping_curves.pictures import together_figure  # noqa: PLC0415
+
+    return write_report_files(
+        folder,
+        "together",
+        text="\n".join(together_lines(result)),
+        data={"format": "afm-jax tapping together", "format_version": 1, **result.to_dict()},
+        picture=png_of(together_figure(result)),
+    )
 
 
 def tapping_page(result: Tapping, pictures: list[bytes]) -> str:

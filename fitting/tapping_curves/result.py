@@ -625,13 +625,13 @@ class Tapping(Result):
                     "rows_chi2": functions.rows_chi2,
                     "rows_freedom": functions.rows_freedom,
                     "scale": functions.scale,
-                    "nuisances": _nuisances(functions.nuisances),
+                    "nuisances": nuisances_as_dict(functions.nuisances),
                 },
                 "chi2": None if fit is None else fit.chi2,
                 "degrees_of_freedom": None if fit is None else fit.degrees_of_freedom,
                 "p_value": None if fit is None else fit.p_value,
                 "scale": None if fit is None else fit.scale,
-                "nuisances": {} if fit is None else _nuisances(fit.nuisances),
+                "nuisances": {} if fit is None else nuisances_as_dict(fit.nuisances),
                 "hysteresis": [
                     {
                         **vars(one),
@@ -652,7 +652,8 @@ class Tapping(Result):
         )
 
 
-def _nuisances(nuisances: tuple[Nuisance, ...]) -> dict[str, Any]:
+def nuisances_as_dict(nuisances: tuple[Nuisance, ...]) -> dict[str, Any]:
+    """Return what is given and fitted of each, by name."""
     return {
         n.name: {
             "given": n.given.value,
