@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from fitting.simulated.experiment import SimulatedExperiment, simulate_experiment
     from fitting.tables.csv_text import TableError
     from fitting.tables.table import AmplitudeTable, read_table, write_table
+    from fitting.tapping_curves.maps import TappingMap, tapping_map
     from fitting.tapping_curves.result import Tapping
     from fitting.tapping_curves.tapping import tapping
     from fitting.tapping_curves.together import TappingTogether, tapping_together
@@ -60,6 +61,7 @@ else:
         "Stiffness": "fitting.calibration.stiffness",
         "TableError": "fitting.tables.csv_text",
         "Tapping": "fitting.tapping_curves.result",
+        "TappingMap": "fitting.tapping_curves.maps",
         "Trace": "fitting.traces.trace",
         "TrustPack": "fitting.sampling.trust_pack",
         "amplitude_gradients": "fitting.forward",
@@ -87,6 +89,7 @@ else:
         "sensitivity": "fitting.calibration.stiffness",
         "simulate_experiment": "fitting.simulated.experiment",
         "tapping": "fitting.tapping_curves.tapping",
+        "tapping_map": "fitting.tapping_curves.maps",
         "TappingTogether": "fitting.tapping_curves.together",
         "tapping_together": "fitting.tapping_curves.together",
         "trust": "fitting.sampling.trust_pack",
@@ -121,6 +124,7 @@ __all__ = [
     "Stiffness",
     "TableError",
     "Tapping",
+    "TappingMap",
     "TappingTogether",
     "Trace",
     "TrustPack",
@@ -149,6 +153,7 @@ __all__ = [
     "sensitivity",
     "simulate_experiment",
     "tapping",
+    "tapping_map",
     "tapping_together",
     "trust",
     "write_inference_data",

@@ -162,6 +162,27 @@ def test_repeated_readings_count_and_tell_the_error(tmp_path, reported):
     assert strictly(reported[0].stdout)["repeats"] is None
 
 
+def test_a_drift_of_the_phase_is_noticed_and_fitted_along(tmp_path, reported):
+    table = read_table(EXAMPLE)
+    drift = 2.0 * np.linspace(0.0, 1.0, table.rows)
+    drifted = dataclasses.replace(table, phase_deg=(np.asarray(table.phase_deg) + drift) % (360.0 / table.order))
+    write_table(drifted, tmp_path / "drift.csv")
+    assert not any("follow the rows" in note for note in strictly(reported[0].stdout)["warnings"])
+    (note,) = [one for one in strictly(run(tmp_path / "drift.csv", "--json").stdout)["warnings"] if "follow" in one]
+    assert "phase +" in note
+    assert "say `# rows = in order of time`" in note
+    write_table(dataclasses.replace(drifted, rows_in_order_of_time=True), tmp_path / "drift.csv")
+    answer = strictly(run(tmp_path / "drift.csv", "--json").stdout)
+    assert answer["valid"]
+    found = answer["parameters"]["phase_drift_deg"]
+    assert found["constraint"] == [0.0, 3.0]
+    assert abs(found["value"] - 2.0) < 2.5 * found["standard_error"] < 0.5
+    for name, truth in (("r", 0.95), ("epsilon", 60.0)):
+        low, high = answer["parameters"][name]["interval95"]
+        assert low < truth < high
+    assert not any("follow the rows" in note for note in answer["warnings"])
+
+
 def test_contact_data_end_with_exit_code_3(contact_table_path):
     result = run(contact_table_path, "--model", "law", "--json")
     assert result.exit_code == 3

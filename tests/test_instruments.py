@@ -12,10 +12,11 @@ from click.testing import CliRunner
 import fitting.instruments.formats as formats_module
 from afm_jax.cli.main import main
 from fitting import TableError, read_curve, read_curves, read_table
-from fitting.examples.make_raw_curve import EXAMPLE, FREE_NM, NM_PER_VOLT, raw_curve
+from fitting.examples.make_raw_curve import EXAMPLE, FREE_NM, NM_PER_VOLT, raw_curve, true_energy_aj
 from fitting.instruments.columns import parse_columns
-from fitting.instruments.curve import free_lag_deg, table_text
+from fitting.instruments.curve import table_text
 from fitting.instruments.formats import read_recording
+from fitting.instruments.lag import free_lag_deg
 from fitting.tables.table import parse_table
 from tests.instrument_files import asylum_ramp, gwyddion_bytes, igor_wave, nanonis_ramp, tapping_rows
 from tests.strict_reading import strictly
@@ -272,6 +273,23 @@ def test_a_gain_that_is_off_shows_in_the_slope(tmp_path: Path, factor: float, sa
     assert any(said in note for note in curve.notes), curve.notes
 
 
+@pytest.mark.parametrize(
+    ("sign", "zero", "said"), [(-1.0, 0.0, "Sign: the free tip"), (1.0, -90.0, "Zero: the free tip")]
+)
+def test_sign_and_zero_of_the_phase_are_told_by_the_free_rows(tmp_path: Path, sign: float, zero: float, said: str):
+    offset, amplitude, lag = tapping_rows()
+    columns = {"Z (nm)": offset, "Amp (nm)": amplitude, "Phase (deg)": sign * lag + zero}
+    known: dict[str, Any] = {"free_frequency_khz": 90.0, "quality_factor": 200.0, "drive": "force"}
+    path = saved(tmp_path, separated(columns))
+    curve = read_curve(path, **known)
+    np.testing.assert_allclose(given(curve.phase_lag_deg), lag, atol=0.02)
+    assert any(note.startswith(said) for note in curve.notes)
+    # a sign that the caller gives stays
+    kept = read_curve(path, columns="phase_lag_deg=Phase:1", **known)
+    slope = np.polyfit(lag, given(kept.phase_lag_deg), 1)[0]
+    assert slope == pytest.approx(sign, abs=1e-3)
+
+
 def test_slope_and_free_amplitude_of_a_curve_with_an_attractive_plateau(tmp_path: Path):
     made = raw_curve(1200)
     columns = {
@@ -465,6 +483,13 @@ def test_damaged_files_never_end_in_a_traceback(tmp_path: Path, kind: str, capfd
     assert capfd.readouterr() == ("", "")
 
 
+def test_a_gwyddion_file_without_the_end_of_a_text_is_refused_at_once(tmp_path: Path):
+    # the package gwyfile, which read it before, does not come back
+    data = gwyddion_bytes().replace(b"unitstr\0sm\0y_unit", b"unitstr\0sm@y_unit")
+    with pytest.raises(TableError, match=r"a text at byte \d+ does not end"):
+        read_curves(saved(tmp_path, data, "curve.gwy"))
+
+
 def fault_of(path: Path) -> str:
     """Return the message of a file that is refused; of one that is read its numbers are checked."""
     try:
@@ -586,10 +611,18 @@ def test_the_example_is_a_simulated_raw_file_with_the_defects_of_real_ones():
     assert np.any(np.diff(columns[0]) < 0.0)
     far = [np.mean(columns[4][:300]), np.mean(columns[5][-300:])]
     assert far[1] / far[0] - 1.0 == pytest.approx(0.0007, abs=2e-4)
-    assert np.mean(columns[6][:300]) == pytest.approx(102.3, abs=0.1)
+    # a zero of 12.3 degrees, and a lag of 89.7 at 344.6 kHz beside the resonance at 344.604
+    assert np.mean(columns[6][:300]) == pytest.approx(102.0, abs=0.1)
     answer = CliRunner().invoke(main, ["tapping", "--example", "--no-law", "--json"])
     payload = strictly(answer.stdout)
-    assert {row["branch"] for row in payload["rows"]} == {"approach", "retract"}
+    assert answer.exit_code == 0
+    assert payload["valid"]
+    # the energies it was made with
+    for branch in payload["branches"]:
+        curve = branch["curve"]
+        true = true_energy_aj(np.array(curve["amplitude_ratio"]), back=branch["branch"] == "retract")
+        error = (np.array(curve["energy_high_aj"]) - np.array(curve["energy_low_aj"])) / 3.92
+        assert np.all(np.abs(np.array(curve["energy_aj"]) - true) < 3.0 * error)
     told = " ".join(payload["notes"])
     assert "The example is simulated; as if it were measured: afm-jax tapping " in told
     assert "slope of the steepest settled part" in told

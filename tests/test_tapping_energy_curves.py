@@ -24,6 +24,7 @@ from tests.tapping_truth_of_laws import (
     Truth,
     curve_like_graphite,
     curve_of_energy,
+    curve_of_law,
     table_of,
 )
 
@@ -231,3 +232,27 @@ def test_curves_of_one_lever_share_frequency_and_q_and_tell_their_scatter(tmp_pa
     other = replace(tables[1], quality_factor=150.0)
     with pytest.raises(TableError, match="states the Q as 150 \\+- 5"):
         tapping_together([tables[0], other])
+
+
+@pytest.mark.parametrize(("restitution", "viscous", "number"), [(0.95, 0.0, 0), (1.0, 1.0, 1)])
+def test_energies_against_speed_stand_beside_the_law_that_made_them(restitution: float, viscous: float, number: int):
+    tip = Tip(free_nm=80.0, ratio=1.05)
+    truth = curve_of_law(
+        tip,
+        -80.0 * np.linspace(0.95, 0.12, 60),
+        lambda u: np.sqrt(np.maximum((restitution * u) ** 2 - viscous * u - 0.3, 1e-6)),
+    )
+    result = tapping(table_of(tip, truth, Stated(), np.random.default_rng(2)), law=False)
+    answer = result.to_dict()["energy_by_speed"]
+    assert answer["reason"] is None
+    assert len(answer["approach_speed_nm_per_us"]) > 40
+    law = answer["laws"][number]
+    true = {"one_less_r_squared": 1.0 - restitution**2, "viscous_loss_nm_per_us": viscous, "epsilon_nm2_per_us2": 0.3}
+    for name, one in law["parameters"].items():
+        assert abs(one["value"] - true[name]) < 3.0 * one["standard_error"]
+    assert law["chi2"] < 2.0 * law["degrees_of_freedom"]
+    # on resonance the speed cannot be told, and why stands there
+    still = tapping(table_of(Tip(), one_energy(), Stated(), np.random.default_rng(2)), law=False)
+    unknown = still.to_dict()["energy_by_speed"]
+    assert unknown["laws"] == []
+    assert "driven at 1.000 of the free frequency" in unknown["reason"]

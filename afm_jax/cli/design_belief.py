@@ -9,14 +9,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from afm_jax.cli.values import Finite, ValueAndError, example_path, option_of, parse_number
-from fitting.parameters import DELAY, LAW, MODELS, NUISANCE_NAMES, NUISANCES, PARAMETERS, model_parameters
+from fitting.parameters import DELAY, DRIFT_NAMES, LAW, MODELS, NUISANCES, PARAMETERS, model_parameters
 
 if TYPE_CHECKING:
     from fitting.experiments.belief import Belief
 
 _LAW = tuple(parameter.name for parameter in (*LAW, *DELAY))
 _REMARKS = {"quality_factor": "; none: no air damping", "offset_origin_nm": "; not with a delay"}
-_BELONG = ("mass_ng", "spring_constant_n_per_m", "free", "fix", "value", *_LAW, *NUISANCE_NAMES)
+_NUISANCES = tuple(nuisance for nuisance in NUISANCES if nuisance.name not in DRIFT_NAMES)
+_NUISANCE_NAMES = tuple(nuisance.name for nuisance in _NUISANCES)
+_BELONG = ("mass_ng", "spring_constant_n_per_m", "free", "fix", "value", *_LAW, *_NUISANCE_NAMES)
 
 
 class BeliefOptions(NamedTuple):
@@ -72,7 +74,7 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
         return function(*args, belief_options=BeliefOptions(fit, measured, model, uncertainty, drive, given), **options)
 
     # click lists options in the order of the decorators, the last one first
-    for nuisance in NUISANCES[::-1]:
+    for nuisance in _NUISANCES[::-1]:
         what = f"{nuisance.meaning}, such as '{nuisance.example}'{_REMARKS.get(nuisance.name, '')}."
         kind = ValueAndError(none=nuisance.name == "quality_factor")
         command = click.option(option_of(nuisance.name), type=kind, metavar="X", help=what)(command)
@@ -173,7 +175,7 @@ def _from_values(options: BeliefOptions) -> "Belief":
         raise click.UsageError(str(error).replace("`free`", "--free").replace("`fixed`", "--fix")) from error
     contact = dict(numbers.get("value", ()))
     values = {name: value for name, value in numbers.items() if name in _LAW}
-    for name in NUISANCE_NAMES:
+    for name in _NUISANCE_NAMES:
         if name not in {"quality_factor", "free_frequency_khz"} and name in numbers and numbers[name][1] is None:
             raise click.UsageError(f"{option_of(name)} needs its standard error; write '{PARAMETERS[name].example}'")
     return believe(
@@ -183,7 +185,7 @@ def _from_values(options: BeliefOptions) -> "Belief":
         mass_ng=numbers.get("mass_ng"),
         spring_constant_n_per_m=numbers.get("spring_constant_n_per_m"),
         values=values | {name: value for name, value in contact.items() if name in own},
-        constraints={name: numbers[name] for name in NUISANCE_NAMES if numbers.get(name, (0, None))[1] is not None},
+        constraints={name: numbers[name] for name in _NUISANCE_NAMES if numbers.get(name, (0, None))[1] is not None},
         free=free,
         fixed=fixed | {name: value for name, value in contact.items() if name not in own},
         uncertainty=options.uncertainty,

@@ -13,7 +13,7 @@ _NUMBERS = (
     ("drive-frequency-khz", "KHZ", "Frequency of the drive; where nothing says it, the free frequency."),
     ("free-frequency-khz", "KHZ", "Natural frequency of the free cantilever, '90 +- 0.01' with its error."),
     ("quality-factor", "Q", "Its quality factor, '200 +- 5' with its error."),
-    ("spring-constant-n-per-m", "N_PER_M", "Its spring constant, '5.4 +- 0.5' with its error."),
+    ("spring-constant-n-per-m", "N_PER_M", "Its modal spring constant (1.03 times the static one), '5.4 +- 0.5'."),
     ("free-amplitude-nm", "NM", "Amplitude of the free tip; else the median of the rows far from the sample."),
     ("offset-origin-nm", "NM", "Height (growing towards the tip) at which the sample is at the tip's rest position."),
     ("amplitude-error-nm", "NM", "Standard error of every amplitude; else the scatter of the free rows."),
@@ -87,7 +87,7 @@ def command(session: Session, file: Path, curve: int | None, **options: Any) -> 
     number comes from, what was assumed and what is missing. With --out the table for `afm-jax tapping` and `afm-jax
     fit`; of a file of several curves one table each, TABLE_1.csv and so on. Repeated and unordered heights become bins.
     Curves that must not be used (a free amplitude that jumps) are refused by name, and the exit code is 3. Package
-    extra for .ibw and .gwy: `pip install 'afm-jax[instruments]'`.
+    extra for .ibw: `pip install 'afm-jax[instruments]'`.
     """
     from fitting.instruments.curve import read_curve, read_curves  # noqa: PLC0415
     from fitting.instruments.report import curves_payload, curves_summary, write_tables  # noqa: PLC0415

@@ -90,7 +90,9 @@ def _shapes() -> tuple[PchipInterpolator, PchipInterpolator]:
 
 def true_lag_deg(ratio: Float[np.ndarray, "..."], *, back: bool = False) -> Float[np.ndarray, "..."]:
     """Return the lag at an amplitude over the free one; on the way back a tap takes a little more."""
-    return 90.0 + (_shapes()[1](ratio) - 90.0) * (0.985 if back else 1.0)
+    s = DRIVE_KHZ / FREE_FREQUENCY_KHZ
+    free = np.rad2deg(np.angle(1.0 - s**2 + 1j * s / QUALITY_FACTOR))
+    return free + (_shapes()[1](ratio) - 90.0) * (0.985 if back else 1.0)
 
 
 def true_energy_aj(ratio: Float[np.ndarray, "..."], *, back: bool = False) -> Float[np.ndarray, "..."]:

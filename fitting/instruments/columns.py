@@ -30,12 +30,12 @@ class ColumnSource:
     Attributes:
         channel: of the file; `OUT/BACK` where approach and retract stand in two channels.
         unit: if the file's is wrong or missing.
-        factor: that the numbers are multiplied by.
+        factor: that the numbers are multiplied by; None: not said.
     """
 
     channel: str
     unit: str = ""
-    factor: float = 1.0
+    factor: float | None = None
 
 
 def parse_columns(text: str) -> dict[str, ColumnSource]:
@@ -62,7 +62,7 @@ def parse_columns(text: str) -> dict[str, ColumnSource]:
         if units and UNITS.get(units[0], ("",))[0] not in ROLES[column][0]:
             known = ", ".join(unit for unit, (what, _) in UNITS.items() if what in ROLES[column][0])
             raise ValueError(f"`{units[0]}` is no unit of {column}; write one of {known}")
-        found[column] = ColumnSource(channel, units[0] if units else "", factors[0] if factors else 1.0)
+        found[column] = ColumnSource(channel, units[0] if units else "", factors[0] if factors else None)
     return found
 
 

@@ -23,6 +23,7 @@ from fitting.instruments.bins import Binned, binned, faults_of_order, usual_widt
 from fitting.instruments.branch import JUMP, BranchLook, look_at
 from fitting.instruments.columns import ROLES, ColumnSource, example_of_columns, laid_out, parse_columns, turns_of
 from fitting.instruments.formats import read_recording
+from fitting.instruments.lag import free_lag_deg, sense_of
 from fitting.instruments.recording import UNITS, Known, Recording, Segment
 from fitting.tables.csv_text import TableError
 
@@ -177,10 +178,11 @@ def read_curves(
     for place in places:
         segments = [segment for segment in recording.segments if segment.curve == place]
         curve = _joined(recording, segments, wanted, known, len(places))
-        turnable = "offset_nm" not in wanted or wanted["offset_nm"].factor > 0.0
-        curve = _turned(curve) if turnable and _runs_away(curve) else curve
+        said = {role for role, source in wanted.items() if source.factor is not None}
+        curve = _turned(curve) if "offset_nm" not in said and _runs_away(curve) else curve
         curve = curve if stated else _renamed(curve)
-        curves.append(_binning(_judged(curve, of_slope=of_slope), bin_nm))
+        judged = _judged(curve, of_slope=of_slope, sign_given="phase_lag_deg" in said)
+        curves.append(_binning(judged, bin_nm))
     return curves
 
 
@@ -299,8 +301,9 @@ def _source(
         if not (fitting or unitless):
             return None
         name = (fitting or unitless)[0]
-        source = ColumnSource(name, "", -1.0 if role == "offset_nm" and name in recording.away else 1.0)
-        if source.factor < 0.0:
+        away = role == "offset_nm" and name in recording.away
+        source = ColumnSource(name, "", -1.0 if away else 1.0)
+        if away:
             notes.append(f"Sign: {name} grows away from the sample in this format; the offset is its negative.")
     unit = source.unit or recording.units.get(source.channel, "")
     if UNITS.get(unit, ("",))[0] not in quantities:
@@ -324,7 +327,7 @@ def _converted(recording: Recording, segment: Segment, source: ColumnSource, rol
             "remove the row, or export the file again"
         )
     with np.errstate(over="ignore"):
-        scaled = numbers * (UNITS[source.unit][1] * source.factor)
+        scaled = numbers * (UNITS[source.unit][1] * (source.factor or 1.0))
     if not np.all(np.abs(scaled) < 1e9):
         raise TableError(
             f"{recording.source}, curve {segment.curve}, channel {source.channel}: numbers beyond 1e9; the file is "
@@ -402,7 +405,7 @@ _ASSUMED_ORIGIN_NM = 1.0
 """Error of an origin read off the curve: attraction moves the contact by about so much."""
 
 
-def _judged(curve: MeasuredCurve, *, of_slope: bool) -> MeasuredCurve:
+def _judged(curve: MeasuredCurve, *, of_slope: bool, sign_given: bool) -> MeasuredCurve:
     """Return a curve with free rows, slope, origin and zero of the phase found, and everything doubtful named."""
     amplitude = curve.amplitude
     if amplitude is None:
@@ -422,7 +425,7 @@ def _judged(curve: MeasuredCurve, *, of_slope: bool) -> MeasuredCurve:
     known = curve.known | _free_amplitude(curve, looks)
     curve = replace(curve, known=_with_errors(replace(curve, known=known), looks))
     curve = _with_origin(curve, looks)
-    curve = _with_zero_of_phase(curve)
+    curve = _with_zero_of_phase(curve, sign_given=sign_given)
     missing = [key for key in _NEEDED if _is_missing(curve, key)] + [key for key in _WANTED if key not in curve.known]
     return replace(curve, notes=(*curve.notes, *_scale_notes(curve), *_phase_notes(curve)), missing=tuple(missing))
 
@@ -556,22 +559,8 @@ def _with_origin(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> Measu
     return replace(curve, offset_nm=curve.offset_nm - height, known=known)
 
 
-def free_lag_deg(drive: str, frequency_ratio: float, quality_factor: float) -> float:
-    """Return the lag of the free tip behind its drive: of its height (force) or of the deflection (base).
-
-    With gamma = 1 - s^2 + i s/Q the height lags by arg gamma, the deflection behind the base by arg gamma - arg(1 -
-    gamma).
-
-    >>> free_lag_deg("force", 1.0, 200.0), round(free_lag_deg("base", 1.0, 200.0), 2)
-    (90.0, 90.29)
-    """
-    gamma = 1.0 - frequency_ratio**2 + 1j * frequency_ratio / quality_factor
-    lag = np.angle(gamma) - (np.angle(1.0 - gamma) if drive == "base" else 0.0)
-    return float(np.rad2deg(lag))
-
-
-def _with_zero_of_phase(curve: MeasuredCurve) -> MeasuredCurve:
-    """Return the curve with the lag of the free rows set to what theory says, where frequency and Q are known."""
+def _with_zero_of_phase(curve: MeasuredCurve, *, sign_given: bool) -> MeasuredCurve:
+    """Return the curve with sign and zero of the phase such that free rows lag as frequency and Q say, where known."""
     phase, numbers = curve.phase_lag_deg, [curve.number(k) for k in ("drive_frequency_khz", "free_frequency_khz")]
     quality_factor = curve.number("quality_factor")
     if phase is None or None in numbers or quality_factor is None or not curve.free.any():
@@ -581,8 +570,10 @@ def _with_zero_of_phase(curve: MeasuredCurve) -> MeasuredCurve:
     level, scatter = float(np.median(free)), float(np.std(free) / np.sqrt(len(free)))
     error = float(np.hypot(max(scatter, 0.01), _error_of_lag(curve)))
     how = f"measured: the free rows read {level:.2f} deg and are set to {lag:.2f}, what s and Q give"
-    known = curve.known | {"phase_zero_deg": Known(level - lag, "deg", how, error)}
-    return replace(curve, phase_lag_deg=phase - (level - lag), known=known)
+    sense = sense_of(level, lag, sign_given=sign_given)
+    known = curve.known | {"phase_zero_deg": Known(sense.zero_deg, "deg", how, error)}
+    notes = (*curve.notes, sense.note) if sense.note else curve.notes
+    return replace(curve, phase_lag_deg=sense.lag_deg(phase), known=known, notes=notes)
 
 
 _USUAL = {"free_frequency_khz": 2e-4, "quality_factor": 0.05}
@@ -636,7 +627,9 @@ def _phase_notes(curve: MeasuredCurve) -> list[str]:
     phase, amplitude, free = curve.phase_lag_deg, curve.amplitude, curve.number("free_amplitude_nm")
     if phase is None or amplitude is None:
         return ["There is no phase: the energy of a tap has an upper bound only."] if amplitude is not None else []
-    notes = ["Sign: a larger phase is taken as a larger lag; if it leads, --columns phase_lag_deg=CHANNEL:-1."]
+    turned = any(note.startswith("Sign: the free tip") for note in curve.notes)
+    taken = "Sign: a larger phase is taken as a larger lag; if it leads, --columns phase_lag_deg=CHANNEL:-1."
+    notes = [] if turned else [taken]
     zero = curve.known.get("phase_zero_deg")
     if zero is None:
         notes.append("Zero: the phase counts from the instrument's own zero; free frequency and Q would fix it.")

@@ -17,8 +17,10 @@ _PERIODS = 2.0
 
 
 def tapping_pictures(result: Tapping) -> tuple[list[bytes], list[bytes]]:
-    """Return as PNG and as SVG: the curve, the two frames, and the law if there is one."""
+    """Return as PNG and as SVG: the curve, the two frames, energy against speed and the law if they are known."""
     figures = [curve_figure(result), frames_figure(result)]
+    if result.laws_of_energies:
+        figures.append(speed_figure(result))
     if result.law is not None:
         from fitting.report.plots import law_figure  # noqa: PLC0415
 
@@ -132,6 +134,32 @@ def _energy_bands(axes: Axes, result: Tapping) -> tuple[float, float]:
             )
             ends += [low, high]
     return min(ends), max(ends)
+
+
+def speed_figure(result: Tapping) -> Figure:
+    """Return the energy of a tap against the tip's speed at the sample, with the lines of the laws."""
+    figure = new_figure(6.5, 4.5)
+    axes = figure.subplots()
+    rows, found = result.rows_of_known_speed, result.speeds
+    assert found is not None  # noqa: S101
+    u = found.approach_speed_nm_per_us[rows]
+    axes.errorbar(
+        u,
+        result.rows.energy_of_fit_aj[rows],
+        result.rows.energy_noise_aj[rows],
+        found.approach_speed_error_nm_per_us[rows],
+        fmt="o",
+        ms=4,
+        lw=0.8,
+        color=DARK,
+        label="rows of known speed",
+    )
+    for one, colour, style in zip(result.laws_of_energies, (BLUE, ACCENT), ("-", "--"), strict=False):
+        axes.plot(u, one.energy_aj, style, color=colour, label=one.formula)
+    label_axes(axes, x="speed of approach (nm/µs)", y="energy of a tap (aJ)")
+    axes.legend(fontsize=_SMALL)
+    axes.grid(color=GRID, alpha=0.25)
+    return figure
 
 
 def together_figure(result: TappingTogether) -> Figure:

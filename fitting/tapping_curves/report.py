@@ -228,7 +228,7 @@ def _speed_lines(result: Tapping) -> list[str]:
     if not here.any():
         return ["", "Impact speeds: in no row known to a quarter."]
     many = found.in_capture_speeds[here]
-    return [
+    lines = [
         "",
         (
             f"Impact speeds: {u[here].min():.3g} to {u[here].max():.3g} nm/us in {int(here.sum())} rows "
@@ -236,6 +236,13 @@ def _speed_lines(result: Tapping) -> list[str]:
             f"{percent(float(np.median(found.approach_speed_error_nm_per_us[here] / u[here])))} in the median"
         ),
     ]
+    for one in result.laws_of_energies:
+        values = ", ".join(f"{name} {with_error(*pair)}" for name, pair in one.parameters.items())
+        lines.append(
+            f"  energy against speed: {one.formula} with {values}, chi2 {one.chi2:.1f} for {one.degrees_of_freedom} "
+            "(errors of noise and speeds alone)"
+        )
+    return lines
 
 
 def write_tapping(
@@ -318,6 +325,11 @@ def tapping_page(result: Tapping, pictures: list[bytes]) -> str:
         (
             "The same motion in two frames. Left, the lab: a shaken tip meets a sample at rest. Right, with its "
             "free motion taken away: the tip flies freely, and the sample moves up and down with the free amplitude."
+        ),
+        *(
+            ["Energy of a tap against the tip's speed at the sample, with the lines of two impact laws through it."]
+            if result.laws_of_energies
+            else []
         ),
         "The impact law from the rows with fast impacts, with its 95 % band.",
     )[: len(pictures)]
