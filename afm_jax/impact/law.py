@@ -770,12 +770,11 @@ def _read_backwards(rebound: Float[Array, "..."], law: TabulatedLaw) -> Float[Ar
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
 
 
+@dataclasses.dataclass(frozen=True, eq=False)
 class Origin:
     """What a law comes from, in words: static data of a module, all equal, so that no text compiles programs anew."""
 
-    def __init__(self, text: str):
-        """Keep the words."""
-        self.text = text
+    text: str = ""
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Origin)

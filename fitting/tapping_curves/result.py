@@ -581,6 +581,8 @@ class Tapping(Result):
             found.append("phase and free amplitude drift evenly along the rows, as free rows at both ends tell")
         else:
             found.append("phase and free amplitude drift evenly along the rows, usually by 1 degree and 1 %")
+        if curve.phase_note:
+            found.append(curve.phase_note)
         if curve.has_phase:
             free = bool(self.rows.free.any())
             zero = (
