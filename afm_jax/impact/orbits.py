@@ -31,7 +31,7 @@ from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.impact.implicit import implicit_pair, implicit_root
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
 from afm_jax.impact.lasting_impact import Impact, PulledImpact, crawls, depth_of_impact, middle_of_contact
-from afm_jax.impact.law import ImpactLaw, Law, Speeds, impact_law_of
+from afm_jax.impact.law import ImpactLaw, Law, Speeds, TabulatedLaw, impact_law_of
 from afm_jax.impact.roots import COARSE, TAPPED, find_roots
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, public_result
@@ -74,6 +74,7 @@ class SingleImpactOrbits(Result, eqx.Module):
         peak_deflection_nm: largest deflection z - z_b.
         deflection_lockin_amplitude_nm: its amplitude at omega/N.
         deflection_lockin_phase_deg: its phase.
+        extrapolated: of a law that is a table: the approach speed is outside the table's; None of a formula.
     """
 
     exists: Bool[Array, "..."]
@@ -96,6 +97,7 @@ class SingleImpactOrbits(Result, eqx.Module):
     peak_deflection_nm: Float[Array, "..."] | None = None
     deflection_lockin_amplitude_nm: Float[Array, "..."] | None = None
     deflection_lockin_phase_deg: Float[Array, "..."] | None = None
+    extrapolated: Bool[Array, "..."] | None = None
 
 
 @checked
@@ -174,7 +176,7 @@ def orbit_at(place: OrbitPlace, found: Bool[Array, ""], frame: FreeFrame, proble
     if frame.response is not None:
         ends = jnp.stack([flight.start_us, flight.start_us + flight.duration_us])
         velocities = velocities + _alone(frame.response).velocity(ends)
-    seen = _seen(state, frame, problem)
+    seen, law = _seen(state, frame, problem), problem.impact
 
     def known(value):
         return jnp.where(found, value, jnp.nan)
@@ -193,6 +195,7 @@ def orbit_at(place: OrbitPlace, found: Bool[Array, ""], frame: FreeFrame, proble
         trace=known(verdict.trace),
         determinant=known(verdict.determinant),
         complete=found,
+        extrapolated=found & law.extrapolated(speeds.approach) if isinstance(law, TabulatedLaw) else None,
         **{name: known(value) for name, value in seen.items()},
     )
 
