@@ -12,6 +12,8 @@ import platform
 import sys
 import tempfile
 import warnings
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,8 +32,8 @@ class Cache(NamedTuple):
 def use_cache() -> Path | None:
     """Keep what JAX compiles from one Python session to the next, in the folder that the `afm-jax` commands use.
 
-    To be called before the first computation, best before JAX is imported: on processors with AVX-512 XLA writes an
-    error to standard error for every program that it reads, which can be switched off only then. A cache that was
+    To be called before the first computation. XLA's messages, which are errors of no consequence for every program that
+    it reads on processors with AVX-512, are switched off unless `TF_CPP_MIN_LOG_LEVEL` asks for them. A cache that was
     chosen before (`JAX_COMPILATION_CACHE_DIR`) or switched off (`JAX_ENABLE_COMPILATION_CACHE`) stays as it is.
 
     Returns:
@@ -47,12 +49,17 @@ def use_cache() -> Path | None:
 def silence_xla() -> None:
     """Keep XLA's messages off standard error, in programs started from here too, unless the user asked for them.
 
-    Its errors about "prefer-no-gather" (openxla/xla issue 44565) take tuning for a feature of the processor. It looks
-    when jaxlib is loaded, later calls change nothing.
+    Its errors about "prefer-no-gather" (openxla/xla issue 44565) take tuning for a feature of the processor, on the
+    very machine that compiled a program. XLA looks at the variable when jaxlib is loaded; later jaxlib itself is told.
     """
     # JAX itself sets 1, and so do sessions that have imported it for the programs they start
-    if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1":
-        os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
+    if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") != "1":
+        return
+    os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
+    if "jaxlib" in sys.modules:
+        # what jax.config's jax_logging_level calls, which changes loggers of Python, too
+        with suppress(ImportError, AttributeError):
+            import_module("jaxlib.utils").absl_set_min_log_level(3)
 
 
 def open_cache() -> Cache:

@@ -147,6 +147,20 @@ def test_messages_of_xla_are_what_the_user_asked_for(monkeypatch: pytest.MonkeyP
     assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == after
 
 
+@linux
+def test_xla_is_silent_in_a_session_that_has_imported_jax_before(tmp_path: Path):
+    # the second session reads what the first has compiled, about which XLA complains on processors with AVX-512
+    code = (
+        "import jax, afm_jax\nafm_jax.use_cache()\n"
+        "print(jax.jit(lambda x: jax.numpy.sin(x).sum())(jax.numpy.arange(9.0)))"
+    )
+    for _ in range(2):
+        _, said = outputs(code, {"XDG_CACHE_HOME": str(tmp_path), **dict.fromkeys(WITHOUT)})
+        assert said == ""
+    (entry,) = (tmp_path / "afm-jax").glob("*/jit__lambda*-cache")
+    assert entry.exists()
+
+
 DOCTOR = "import sys\nsys.argv = ['afm-jax', 'doctor', '--json', *sys.argv[1:]]\nimport afm_jax.__main__"
 
 

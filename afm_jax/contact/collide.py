@@ -47,7 +47,13 @@ _NEAR_CAPTURE = (-0.02, 0.2)
 """Energy at the end, of that at the start, between which a tip is close to capture: below 1.1 times that speed."""
 
 
-@public_result(outcome=CollisionOutcome)
+ONLY_FREE = ("rebound_speed_nm_per_us", "collision_delay_us", "time_in_contact_us", "time_in_junction_us")
+# a captured tip stops before it has lost all of that
+ONLY_FREE += ("bridge_hysteresis_aj", "junction_hysteresis_aj", "viscous_loss_aj")
+"""Fields that only a tip which leaves again has."""
+
+
+@public_result(outcome=CollisionOutcome, picture="afm_jax.plots.collisions:collisions_figure")
 class Collision(ResultTuple):
     """What collisions end with; arrays of one shape.
 
@@ -71,6 +77,13 @@ class Collision(ResultTuple):
     viscous_loss_aj: Float[Array, "..."]
     end_energy_aj: Float[Array, "..."]
     """Kinetic energy at the end, signed: for a captured tip minus what it lacks to leave; 0 at the capture speed."""
+
+    def _unknown(self) -> dict[str, np.ndarray]:
+        """Return by column which tips have no value there: a captured one does not leave, an unresolved one is lost."""
+        outcome = np.asarray(self.outcome)
+        lost = outcome > CollisionOutcome.CAPTURED_BY_JUNCTION
+        stays = lost | np.asarray(self.captured)
+        return dict.fromkeys(ONLY_FREE, stays) | dict.fromkeys(("deepest_gap_nm", "end_energy_aj"), lost)
 
 
 @checked
@@ -502,9 +515,6 @@ def collision_of_turn(
 
 _POINTS = 20
 _TOP_SPEED = 200.0
-ONLY_FREE = ("rebound_speed_nm_per_us", "collision_delay_us", "time_in_contact_us", "time_in_junction_us")
-# a captured tip stops before it has lost all of that
-ONLY_FREE += ("bridge_hysteresis_aj", "junction_hysteresis_aj", "viscous_loss_aj")
 
 
 class Collisions(NamedTuple):

@@ -103,7 +103,8 @@ ORBIT_NUMBERS = (
     "largest_multiplier",
 )
 """What is told of a scene's highest stable orbit: attributes of `SingleImpactOrbits`, and the multiplier's size."""
-_OF_ORBITS = ORBIT_NUMBERS[:-1]
+DRIVEN_NUMBERS = ("drive_lockin_amplitude_nm", "drive_lockin_phase_deg", "phase_lag_deg")
+"""What is told besides of one that base or force drives."""
 _ORBITS_AT_ONCE = 2
 """Blocks of roots are this many times smaller than blocks of scenes: few scenes have more than one."""
 
@@ -120,8 +121,10 @@ def highest_orbits(
         orders: N.
 
     Returns:
-        ``stable_orbits``, ``admissible_orbits``, and `ORBIT_NUMBERS`, NaN where no orbit is stable.
+        ``stable_orbits``, ``admissible_orbits``, `ORBIT_NUMBERS` and, where base or force drive, `DRIVEN_NUMBERS`, NaN
+        where no orbit is stable.
     """
+    names = ORBIT_NUMBERS[:-1] + (() if frame.response is None else DRIVEN_NUMBERS)
 
     def problem_of(scene: Scene, own: FreeFrame, order: Array) -> OrbitProblem:
         return orbit_problem(scene.cantilever, own.platform, impact_law_of(scene), order)
@@ -135,14 +138,14 @@ def highest_orbits(
             # a pair on a circle has the root of the determinant for its size
             pair = jnp.sqrt(jnp.abs(determinant))
             size = jnp.where(inside > 0.0, half + jnp.sqrt(jnp.where(inside > 0.0, inside, 1.0)), pair)
-            numbers = jnp.stack([*(getattr(orbit, name) for name in _OF_ORBITS), size])
+            numbers = jnp.stack([*(getattr(orbit, name) for name in names), size])
             return orbit.admissible, orbit.admissible & orbit.stable, numbers
 
         roots = jax.vmap(lambda scene, own: find_roots(problem_of(scene, own, order)))(scenes, frame)
         count, slots = roots.found.shape
         places = jax.tree.map(lambda part: part.ravel(), roots.place)
         rows = jnp.arange(count * slots) // slots
-        nothing = (jnp.zeros(count * slots, bool),) * 2 + (jnp.full((count * slots, len(ORBIT_NUMBERS)), jnp.nan),)
+        nothing = (jnp.zeros(count * slots, bool),) * 2 + (jnp.full((count * slots, len(names) + 1), jnp.nan),)
         there = frame.periodic & (impact_law_of(scenes).r > 0.0)
         few = max(count // _ORBITS_AT_ONCE, 1)
         known = for_few(orbit_of, roots.found.ravel() & jnp.repeat(there, slots), (places, rows), nothing, few)
@@ -154,7 +157,7 @@ def highest_orbits(
             "stable_orbits": steady.sum(axis=1, dtype=jnp.int8),
             "admissible_orbits": admissible.sum(axis=1, dtype=jnp.int8),
         }
-        return counts | {name: chosen[:, column] for column, name in enumerate(ORBIT_NUMBERS)}
+        return counts | {name: chosen[:, column] for column, name in enumerate((*names, ORBIT_NUMBERS[-1]))}
 
     return jax.tree.map(jnp.transpose, lax.map(of_order, orders))
 

@@ -56,7 +56,7 @@ _FASTEST = 100.0
 _STEPS = 2000
 
 
-@public_result()
+@public_result(picture="afm_jax.plots.dynamics:many_orbits_figure")
 class ManyImpactOrbits(ResultTuple):
     """Orbits of m impacts in N drive periods, by falling peak amplitude; NumPy arrays.
 

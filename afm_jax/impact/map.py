@@ -11,6 +11,7 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
@@ -48,6 +49,16 @@ class NextImpact(Result, eqx.Module):
     velocity_after_nm_per_us: Float[Array, "..."]
     outcome: Int[Array, "..."]
     near_grazing: Bool[Array, "..."]
+
+    def _known_rows(self) -> np.ndarray:
+        """Return which rows were reached at all."""
+        return np.asarray(self.outcome) != Outcome.NOT_REACHED
+
+    def _unknown(self) -> dict[str, np.ndarray]:
+        """Return by column which rows have no value there: without an impact there is none of its numbers."""
+        none = ~np.isin(np.asarray(self.outcome), (Outcome.IMPACT, Outcome.CAPTURED))
+        names = ("time_us", "arrival_time_us", "velocity_before_nm_per_us", "velocity_after_nm_per_us")
+        return dict.fromkeys(names, none)
 
 
 @checked
