@@ -74,6 +74,8 @@ def open_cache() -> Cache:
     folder = cache_folder()
     if chosen is not None and chosen != str(folder):
         return Cache(Path(chosen), "chosen by jax_compilation_cache_dir")
+    if folder is None:
+        return Cache(None, "there is no home folder: set HOME or XDG_CACHE_HOME", refused=True)
     try:
         make_private(folder)
     except OSError as error:
@@ -84,23 +86,33 @@ def open_cache() -> Cache:
     return Cache(folder, "the user's cache folder")
 
 
-def cache_folder() -> Path:
-    """Return where programs that this jaxlib compiles on this kind of processor are kept."""
+def cache_folder() -> Path | None:
+    """Return where programs that this jaxlib compiles on this kind of processor are kept; None without a home."""
     from jaxlib.version import __version__ as version  # noqa: PLC0415
 
-    return user_cache_folder() / f"jaxlib-{version}-{processor_key()}"
+    folder = user_cache_folder()
+    return None if folder is None else folder / f"jaxlib-{version}-{processor_key()}"
 
 
-def user_cache_folder() -> Path:
-    """Return where this platform keeps what a user's programs can do without, in a folder named afm-jax."""
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA")
-        return Path(base) / "afm-jax" / "cache" if base else Path.home() / "AppData" / "Local" / "afm-jax" / "cache"
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "afm-jax"
-    base = os.environ.get("XDG_CACHE_HOME", "")
+def user_cache_folder() -> Path | None:
+    """Return where this platform keeps what a user's programs can do without, in a folder named afm-jax.
+
+    None where that hangs on a home folder and there is none: a user without an entry in the system's list, as
+    containers have, and without HOME; or one whose HOME is no absolute path.
+    """
+    base = os.environ.get("LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME", "")
+    try:
+        home = Path.home()
+    except RuntimeError:
+        home = Path()
     # The specification says that a relative path there is to be ignored.
-    return (Path(base) if Path(base).is_absolute() else Path.home() / ".cache") / "afm-jax"
+    if sys.platform != "darwin" and Path(base).is_absolute():
+        return Path(base) / "afm-jax" / ("cache" if sys.platform == "win32" else "")
+    if not home.is_absolute():
+        return None
+    if sys.platform == "win32":
+        return home / "AppData" / "Local" / "afm-jax" / "cache"
+    return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "afm-jax"
 
 
 def processor_key() -> str:

@@ -262,6 +262,10 @@ def test_charts_sweeps_exponents_and_basins_of_driven_tips_come_to_the_orbit(kin
     place = float(orbits.phase_rad[slot]), float(orbits.velocity_after_nm_per_us[slot])
     swept = bifurcation_diagram(scene, "platform.offset_nm", np.array([-5.0, -4.9]), impacts=600)
     assert swept.verdicts.names()[0] == "(1,1)"
+    assert [axes.get_ylabel() for axes in swept.plot().axes] == [
+        "height at impact (nm)",
+        "height at drive phase 0 (nm)",
+    ]
     found = swept.phase_rad[0, -1], swept.velocity_after_nm_per_us[0, -1]
     assert found == pytest.approx(place, rel=1e-8)
     assert swept.height_nm[0, -1] == pytest.approx(-5.0, abs=1e-12)

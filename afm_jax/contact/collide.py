@@ -15,7 +15,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from afm_jax.checks import as_parameter, check_parameter, checked, is_traced, refuse_float32, require_float64
+from afm_jax.checks import (
+    as_parameter,
+    check_parameter,
+    check_scalar,
+    checked,
+    is_traced,
+    refuse_float32,
+    require_float64,
+)
 from afm_jax.contact.bridge_leg import (
     Passage,
     Turn,
@@ -314,6 +322,7 @@ def capture_speed(contact: Contact, mass_ng: ArrayLike = 1.0) -> Float[Array, ""
     """
     refuse_float32(contact)
     check_parameter("mass_ng", mass_ng, "positive")
+    check_scalar("mass_ng", mass_ng)
     speed, exists = _capture_speed(contact, as_parameter(mass_ng))
     if not is_traced(exists) and not bool(exists):
         raise ValueError(f"the contact has no junction: {explain_missing_junction(contact)}")

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import FreeFrame
-from afm_jax.checks import checked
+from afm_jax.checks import check_kind, checked
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.bands import UncertainParameters
 from afm_jax.dynamics.contact_orbits import single_contact_orbits
@@ -259,11 +259,16 @@ def stability_chart(
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
-        ValueError: if the scenes do not repeat with one drive period, or there is no order to look for.
+        TypeError: if `scene_of` gives something else than a scene.
+        ValueError: if the scenes do not repeat with one drive period, the values do not rise, or there is no order to
+            look for.
     """
     if last_order < 1:
         raise ValueError(f"`last_order` must be 1 or more, but is {last_order}")
     x, y = (np.asarray(values, float) for values in (x_values, y_values))
+    for name, values in (("x_values", x), ("y_values", y)):
+        if values.ndim != 1 or not values.size or not np.all(np.diff(values) > 0.0):
+            raise ValueError(f"`{name}` must be rising numbers, one at least")
     columns = (column.ravel() for column in np.meshgrid(x, y))
     verdicts = orbit_verdicts(batch_of_scenes(scene_of, *columns), last_order=last_order, report=report)
     return StabilityChart(scene_of, x, y, verdicts)
@@ -292,7 +297,13 @@ def stable_probability(
 
 def batch_of_scenes(scene_of: Callable[..., Scene], *columns: np.ndarray) -> Scene:
     """Return one scene a row of some columns of arguments, as a batch."""
-    return eqx.filter_jit(eqx.filter_vmap(scene_of))(*(jnp.asarray(column, float) for column in columns))
+
+    def made(*values: Array) -> Scene:
+        scene = scene_of(*values)
+        check_kind("scene_of(...)", scene, Scene)
+        return scene
+
+    return eqx.filter_jit(eqx.filter_vmap(made))(*(jnp.asarray(column, float) for column in columns))
 
 
 def share_above(chart: StabilityChart, *, last_order: int, stride: int) -> float:

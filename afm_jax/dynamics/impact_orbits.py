@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Complex, Float
 
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
-from afm_jax.checks import checked, require_float64
+from afm_jax.checks import check_count, checked, require_float64
 from afm_jax.dynamics.impact_loop import (
     ImpactLoop,
     LoopReading,
@@ -119,6 +119,7 @@ def many_impact_orbits(scene: SceneLike, order: int, impacts: int, *, starts: in
     impact_law_of(scene)
     driven = driven_part(scene)
     check_loop(order, impacts)
+    check_count("starts", starts)
     number = jnp.asarray(float(order))
     found, scale, good = _search(scene, number, _starts(starts), impacts=int(impacts), driven=driven)
     loops = loops_told_apart(np.asarray(found)[np.asarray(good)], order)

@@ -54,7 +54,7 @@ def _collisions(
 
     Rebound speed and delay are NaN where a tip has none; tips with speeds of their own are joined by lines.
     """
-    usable = np.isfinite(approach)
+    usable = np.isfinite(approach) & (approach > 0.0)
     approach, rebound, delay, captured = (part[usable] for part in (approach, rebound, delay, captured))
     ranking = np.argsort(approach, kind="stable")
     approach, rebound, delay, captured = (part[ranking] for part in (approach, rebound, delay, captured))

@@ -89,6 +89,7 @@ def _orbits(
         "not admissible": (~admissible, {"marker": "x", "color": ACCENT}),
     }
     phase, velocity, approach = impacts
+    exists = exists & np.isfinite(peak) & np.isfinite(phase).all(axis=1) & np.isfinite(velocity).all(axis=1)
     for label, (which, style) in kinds.items():
         chosen = np.flatnonzero(exists & which)
         size = 8.0 if chosen.size <= _FEW else 3.0
@@ -97,6 +98,10 @@ def _orbits(
             left.plot(np.degrees(phase[one]), velocity[one], ls=":", lw=0.8, **own)
             right.plot(np.max(approach[one], initial=-np.inf), peak[one], ls="", **own)
     left.set(xlim=(0.0, 360.0), xticks=range(0, 361, 90))
+    for axes in (left, right):
+        # one orbit alone would have an axis of its own rounding
+        axes.update_datalim([(0.0, 0.0)], updatex=axes is right)
+        axes.autoscale_view(scalex=axes is right)
     label_axes(left, x="drive phase just after the impact (deg)", y=r"velocity after it (nm/$\mu$s)")
     label_axes(right, x=r"approach speed, of the hardest impact (nm/$\mu$s)", y="peak amplitude (nm)")
     for axes in (left, right):
