@@ -184,6 +184,7 @@ def test_at_higher_order_the_drives_frequency_is_read_as_a_direct_integration_ha
     at_drive = np.trapezoid(deflection * np.exp(-1j * omega * times), times)
     lag = (float(drive.phase_deg) - np.degrees(np.angle(at_drive))) % 360.0
     assert seen.phase_lag_deg == pytest.approx(lag, abs=1e-4)
+    assert found.phase_lag_deg is not None
     assert float(found.phase_lag_deg[slot]) == pytest.approx(lag, abs=1e-4)
 
 

@@ -397,9 +397,10 @@ FEW = [("outcome", [0, 2, 0, 5]), ("captured", [False, True, False, False])]
 
 def collisions_of_four() -> Any:
     """Return tips of which the second is captured and the last never began."""
-    ones = {name: np.array([1.0, 0.0, 3.0, 0.0]) for name in afm.Collision._fields}
-    ones |= {"approach_speed_nm_per_us": np.array([40.0, 5.0, 20.0, -1.0])}
-    return afm.Collision(**ones | {name: np.array(values) for name, values in FEW})
+    ones: dict[str, Any] = {name: np.array([1.0, 0.0, 3.0, 0.0]) for name in afm.Collision._fields}
+    ones["approach_speed_nm_per_us"] = np.array([40.0, 5.0, 20.0, -1.0])
+    ones.update((name, np.array(values)) for name, values in FEW)
+    return afm.Collision(**ones)
 
 
 def test_what_captured_tips_do_not_have_is_masked_in_tables_and_pictures(tmp_path: Path):
@@ -446,10 +447,11 @@ def test_slots_without_an_orbit_are_in_no_table_and_no_picture(tmp_path: Path):
 
 
 def test_rows_without_a_contact_are_in_no_table():
-    columns = {name: jnp.zeros(4) for name in Contacts._fields if name != "detail"}
+    columns: dict[str, Any] = {name: jnp.zeros(4) for name in Contacts._fields if name != "detail"}
     kinds = jnp.array([ContactKind.IMPACT, ContactKind.HELD, ContactKind.NONE, ContactKind.NONE])
     where, zero = State(jnp.zeros(()), jnp.zeros(()), jnp.zeros(())), jnp.array(0)
-    contacts = Contacts(**columns | {"kind": kinds, "approach_speed_nm_per_us": jnp.arange(4.0)})
+    columns.update(kind=kinds, approach_speed_nm_per_us=jnp.arange(4.0))
+    contacts = Contacts(**columns)
     found = afm.Simulation(where, contacts, jnp.array(2), where, zero, jnp.array(1, bool), zero)
     table = found.to_pandas()
     assert table["contacts_approach_speed_nm_per_us"].tolist() == [0.0, 1.0]
