@@ -21,7 +21,7 @@ BIN := $(VENV)/bin
 SETUP := $(VENV)/.installed
 PIP ?=
 
-.PHONY: help setup fit test newest oldest check thorough lint types coverage slow docs pictures mutations bands tapping ranks fuzz kills bench clean
+.PHONY: help setup fit test newest oldest check thorough lint types coverage slow docs pictures mutations bands tapping energies ranks fuzz kills bench clean
 .DEFAULT_GOAL := help
 
 help: ## list the targets
@@ -103,6 +103,11 @@ bands: $(SETUP) ## do the 95 % bands hold the laws of ten random contacts? (twen
 tapping: $(SETUP) ## are tapping curves of random contacts predicted and fitted as they should be? (TAPPING="--model contact")
 	$(BIN)/python -m tests.tapping_accuracy $(TAPPING)
 
+ENERGIES ?= --curves 200
+
+energies: $(SETUP) ## do the 95 % bands of the energy of a tap hold the energies of 400 simulated curves? (fifteen minutes)
+	$(BIN)/python -m tests.coverage_of_tapping $(ENERGIES)
+
 ranks: $(SETUP) ## are true values anywhere in the posteriors of 1000 simulated tables equally often? (half an hour)
 	$(BIN)/python -m tests.coverage_of_ranks
 
@@ -113,7 +118,7 @@ kills: $(SETUP) ## a sweep killed at fifty random times and resumed ends in the 
 
 check: lint types test slow docs ## all that CI runs: format, lint, types, tests, slow tests, notebooks, site
 
-thorough: lint types coverage mutations bands tapping ranks fuzz kills newest ## all of make check with the share of lines it runs, mutations, bands, tapping curves, ranks, random work, kills, the newest Python and JAX
+thorough: lint types coverage mutations bands tapping energies ranks fuzz kills newest ## all of make check with the share of lines it runs, mutations, bands, tapping curves, energies of taps, ranks, random work, kills, the newest Python and JAX
 
 bench: $(SETUP) ## impacts per second, next to SciPy
 	$(BIN)/afm-jax bench --out $(OUT)

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from afm_jax.dynamics.exponents import lyapunov_spectrum
     from afm_jax.dynamics.impact_orbits import many_impact_orbits
     from afm_jax.impact.jacobian import map_jacobian
-    from afm_jax.impact.law import CollisionDelay, ImpactLaw
+    from afm_jax.impact.law import CollisionDelay, ImpactLaw, TabulatedLaw
     from afm_jax.impact.map import NextImpact, iterate_batch, iterate_map, next_impact
     from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
     from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from afm_jax.motion.trajectory import Trajectory, trajectory
     from afm_jax.outcomes import CollisionOutcome, Outcome
     from afm_jax.saved import load
+    from afm_jax.scenefile.law_files import load_law, save_law
     from afm_jax.scenefile.parameter_paths import scene_family
     from afm_jax.scenefile.scenefile import load_scene, save_scene
     from afm_jax.scenefile.tables import SceneError
@@ -50,6 +51,7 @@ else:
         "ContactKind": "afm_jax.motion.record",
         "ForceDrive": "afm_jax.apparatus.drives",
         "ImpactLaw": "afm_jax.impact.law",
+        "TabulatedLaw": "afm_jax.impact.law",
         "Junction": "afm_jax.contact.junction",
         "MotionOutcome": "afm_jax.motion.record",
         "NextImpact": "afm_jax.impact.map",
@@ -74,11 +76,13 @@ else:
         "iterate_batch": "afm_jax.impact.map",
         "iterate_map": "afm_jax.impact.map",
         "load": "afm_jax.saved",
+        "load_law": "afm_jax.scenefile.law_files",
         "load_scene": "afm_jax.scenefile.scenefile",
         "lyapunov_spectrum": "afm_jax.dynamics.exponents",
         "many_impact_orbits": "afm_jax.dynamics.impact_orbits",
         "map_jacobian": "afm_jax.impact.jacobian",
         "next_impact": "afm_jax.impact.map",
+        "save_law": "afm_jax.scenefile.law_files",
         "save_scene": "afm_jax.scenefile.scenefile",
         "scene_family": "afm_jax.scenefile.parameter_paths",
         "simulate": "afm_jax.motion.simulate",
@@ -118,6 +122,7 @@ __all__ = [
     "Simulation",
     "SingleImpactOrbits",
     "State",
+    "TabulatedLaw",
     "Tone",
     "Trajectory",
     "__version__",
@@ -131,11 +136,13 @@ __all__ = [
     "iterate_batch",
     "iterate_map",
     "load",
+    "load_law",
     "load_scene",
     "lyapunov_spectrum",
     "many_impact_orbits",
     "map_jacobian",
     "next_impact",
+    "save_law",
     "save_scene",
     "scene_family",
     "simulate",

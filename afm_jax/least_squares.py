@@ -134,6 +134,10 @@ def whole_covariance_of(fisher: Float[np.ndarray, "... p p"]) -> Float[np.ndarra
     return np.where(np.isfinite(inverse).all(axis=(-2, -1), keepdims=True), inverse, np.inf)
 
 
+IMPROBABLE = 1e-3
+"""Probability of the chi2 below which a model does not explain its readings."""
+
+
 def chi2_tail(chi2: float, freedom: int) -> float:
     """Return the probability that chi2 of so many degrees of freedom is larger: the finite sum, without SciPy's import.
 

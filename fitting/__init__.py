@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from fitting.simulated.experiment import SimulatedExperiment, simulate_experiment
     from fitting.tables.csv_text import TableError
     from fitting.tables.table import AmplitudeTable, read_table, write_table
+    from fitting.tapping_curves.maps import TappingMap, tapping_map
     from fitting.tapping_curves.result import Tapping
     from fitting.tapping_curves.tapping import tapping
     from fitting.traces.lockin import LockinResult, lockin
@@ -59,6 +60,7 @@ else:
         "Stiffness": "fitting.calibration.stiffness",
         "TableError": "fitting.tables.csv_text",
         "Tapping": "fitting.tapping_curves.result",
+        "TappingMap": "fitting.tapping_curves.maps",
         "Trace": "fitting.traces.trace",
         "TrustPack": "fitting.sampling.trust_pack",
         "amplitude_gradients": "fitting.forward",
@@ -86,6 +88,7 @@ else:
         "sensitivity": "fitting.calibration.stiffness",
         "simulate_experiment": "fitting.simulated.experiment",
         "tapping": "fitting.tapping_curves.tapping",
+        "tapping_map": "fitting.tapping_curves.maps",
         "trust": "fitting.sampling.trust_pack",
         "write_inference_data": "fitting.sampling.inference_data",
         "write_table": "fitting.tables.table",
@@ -118,6 +121,7 @@ __all__ = [
     "Stiffness",
     "TableError",
     "Tapping",
+    "TappingMap",
     "Trace",
     "TrustPack",
     "amplitude_gradients",
@@ -145,6 +149,7 @@ __all__ = [
     "sensitivity",
     "simulate_experiment",
     "tapping",
+    "tapping_map",
     "trust",
     "write_inference_data",
     "write_table",

@@ -22,7 +22,7 @@ from fitting.fits.fit import fit, problem_of
 from fitting.fits.result import FitResult
 from fitting.parameters import PARAMETERS
 from fitting.sampling.bootstrap import require_valid
-from fitting.tables.table import AMPLITUDES, MEASURED, AmplitudeTable, read_table
+from fitting.tables.table import AMPLITUDES, MEASURED, AmplitudeTable, check_quality_factor, read_table
 
 if TYPE_CHECKING:
     import xarray
@@ -115,6 +115,9 @@ def table_input(
         table if isinstance(table, AmplitudeTable) else read_table(Path(table), noise=given["noise"])
         for table in tables
     ]
+    if not any(f"{TABLE}.quality_factor" in str(axis.get("parameter")) for axis in axes):
+        for table in whole:
+            check_quality_factor(table)
     if not whole:
         raise ValueError("there is no table to fit: give one at least")
     return {
@@ -230,7 +233,11 @@ def _columns_of(found: FitResult, own: Sequence[str]) -> dict[str, Any]:
 
 def _with_instrument(table: AmplitudeTable, row: Mapping[str, float]) -> AmplitudeTable:
     """Return a table with other values of its instrument."""
-    changed = {name: float(row[f"{TABLE}.{name}"]) for name in _INSTRUMENT if f"{TABLE}.{name}" in row}
+    changed: dict[str, Any] = {name: float(row[f"{TABLE}.{name}"]) for name in _INSTRUMENT if f"{TABLE}.{name}" in row}
+    if table.spring_constant_n_per_m is not None and not changed.keys().isdisjoint({"mass_ng", "free_frequency_khz"}):
+        # of mass and spring constant the one that is not said anew follows
+        other = {"spring_constant_n_per_m": None, "spring_constant_error_n_per_m": None}
+        changed = (other if "mass_ng" in changed else {"mass_ng": None}) | changed
     tip, drive = (row.get(f"{TABLE}.{name}", 1.0) for name in _CALIBRATIONS)
     by_tip = [name for column in AMPLITUDES for name in (column.name, str(column.error))]
     scaled = dict.fromkeys((*by_tip, "free_amplitude_nm"), tip)

@@ -31,8 +31,8 @@ from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem
 from afm_jax.impact.first_impact import Flight, flight_gap
-from afm_jax.impact.lasting_impact import LawImpact, PulledImpact, TabulatedImpact, middle_of_contact
-from afm_jax.impact.law import Speeds
+from afm_jax.impact.lasting_impact import PulledImpact, TabulatedImpact, middle_of_contact
+from afm_jax.impact.law import Law, Speeds
 from afm_jax.impact.map import NEAR_GRAZING
 from afm_jax.impact.orbits import amplitudes, near_fold, orbit_state, steady_orbits
 from afm_jax.impact.roots import follow_root, harmless_coordinate
@@ -51,13 +51,13 @@ class Branch(NamedTuple):
     near_fold: Bool[Array, ""]
 
 
-AnyImpact = LawImpact | TabulatedImpact | PulledImpact
+AnyImpact = Law | TabulatedImpact | PulledImpact
 
 
 def impact_of(values: Float[Array, " p"], measurement: Measurement, problem: Problem) -> AnyImpact:
     """Return what an impact does at a set of values: the model's law, or the table of its contact."""
     if problem.model != "contact":
-        return LawImpact(problem.law(values, measurement.fixed))
+        return problem.law(values, measurement.fixed)
     chosen = {name: value for name, value in problem.known(values).items() if name in problem.own}
     contact = Contact.paper(effects=problem.effects, **(measurement.fixed | chosen))
     if measurement.pulls is not None:
@@ -78,6 +78,7 @@ def orbit_problem(
     if problem.tapping:
         # the free tip's amplitude, read by the same detector: in the frame of the free tip the sample moves by it
         amplitude = amplitude / problem.nuisance(values, "tip_calibration", 1.0)
+        amplitude = amplitude * (1.0 + problem.nuisance(values, "free_amplitude_drift", 0.0) * row.time)
     if problem.drive == "base":
         ratio = row.drive_frequency_khz / cantilever.frequency_khz
         amplitude = height_of_free_deflection(amplitude, ratio, cantilever.quality_factor)
@@ -109,7 +110,8 @@ def shown(
     if row.amplitude_nm.shape[0] < 3:
         return read
     period, known = 360.0 / row.order, row.amplitude_nm[2]
-    apart = phase + problem.nuisance(values, "phase_zero_deg", 0.0) - known
+    zero = problem.nuisance(values, "phase_zero_deg", 0.0)
+    apart = phase + zero + problem.nuisance(values, "phase_drift_deg", 0.0) * row.time - known
     return jnp.append(read, known + (apart + 0.5 * period) % period - 0.5 * period)
 
 
@@ -382,10 +384,10 @@ def impact_slopes(
         return ImpactSlopes(squares[0], times[0])
     if isinstance(impacts.impact, TabulatedImpact):
         return ImpactSlopes(along(lambda i: i.loss, -1.0, 0)[0], along(lambda i: i.time, 1.0, 0)[0])
-    by_square, _ = along(lambda i: i.law.epsilon, -1.0)
+    by_square, _ = along(lambda i: i.epsilon, -1.0)
     if not impacts.impact.delayed:
         return ImpactSlopes(by_square, np.zeros_like(by_square))
-    by_offset, speed = along(lambda i: i.law.delay.offset_nm, -1.0)
+    by_offset, speed = along(lambda i: i.delay.offset_nm, -1.0)
     # the offset d shortens the delay by d/u; a free tip has no speed
     return ImpactSlopes(by_square, np.nan_to_num(speed)[:, None] * by_offset)
 

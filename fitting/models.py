@@ -16,11 +16,10 @@ from jaxtyping import Array, Bool, Complex, Float, Int
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.impact.lasting_impact import BRIDGE_NM
-from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from afm_jax.impact.law import BRIDGE_NM, CollisionDelay, ImpactLaw
 from fitting.parameters import DELAY, LAW, Parameter, is_nuisance, parameter_called
 from fitting.tables.several import SeveralTables
-from fitting.tables.table import AmplitudeTable
+from fitting.tables.table import AmplitudeTable, check_quality_factor
 
 AnyArray = Array | np.ndarray
 """JAX's within its programs, NumPy's outside."""
@@ -165,7 +164,8 @@ class Rows(NamedTuple):
     The phase is in degrees, and there (k = 3) only if the table has one: of the orbit, or the lag of a cantilever that
     is driven itself, whose free amplitude stands for the drive's. What was not measured, and every padded row, has
     ``measured`` False; its value and error are 1. ``no_orbit``: the drive was tried and no steady orbit seen; ``free``:
-    the driven tip does not come near the sample. ``table``: which of several tables a row is of; None: of the one.
+    the driven tip does not come near the sample. ``time``: from -1/2 to 1/2 where the rows stand in order of time, else
+    0. ``table``: which of several tables a row is of; None: of the one.
     """
 
     order: Float[AnyArray, " rows"]
@@ -177,6 +177,7 @@ class Rows(NamedTuple):
     measured: Bool[AnyArray, "rows k"]
     no_orbit: Bool[AnyArray, " rows"]
     free: Bool[AnyArray, " rows"]
+    time: Float[AnyArray, " rows"]
     table: Int[np.ndarray, " rows"] | None = None
 
 
@@ -245,13 +246,49 @@ class Measurement(NamedTuple):
 def constraints_of(
     table: AmplitudeTable, constraints: dict[str, tuple[float, float]] | None
 ) -> dict[str, tuple[float, float]]:
-    """Return everything that is known beforehand: what the table says, and what the caller adds or says instead."""
+    """Return everything that is known beforehand: what the table says, and what the caller adds or says instead.
+
+    Raises:
+        TableError: if nothing says the quality factor.
+    """
     known = dict(table.calibration)
+    if "quality_factor" not in (constraints or {}):
+        check_quality_factor(table)
     if table.quality_factor is not None and table.quality_factor_error is not None:
         known["quality_factor"] = table.quality_factor, table.quality_factor_error
     if table.free_frequency_error_khz is not None:
         known["free_frequency_khz"] = table.free_frequency_khz, table.free_frequency_error_khz
-    return known | dict(constraints or {})
+    given = dict(constraints or {})
+    return known | _known_of_drifts(table, given) | given
+
+
+PHASE_DRIFT_DEG, FREE_AMPLITUDE_DRIFT = 3.0, 0.03
+"""Standard errors of the drifts over a table whose rows stand in order of time, where nothing says them."""
+
+
+def _known_of_drifts(table: AmplitudeTable, given: Mapping[str, tuple[float, float]]) -> dict[str, tuple[float, float]]:
+    """Return what is known of slow drifts along the rows of a table, and of what they start from.
+
+    What the table says of the zero of phase, and of the free amplitude, held when it was set, before the first row or
+    after the last: half a drift away from the middle.
+
+    Args:
+        table: whose rows may stand in order of time.
+        given: what the caller says.
+    """
+    if not drifts(table):
+        return {}
+    assumed = []
+    if table.phase_and_error_deg[0] is not None:
+        assumed.append(("phase_drift_deg", PHASE_DRIFT_DEG, "phase_zero_deg", 0.0))
+    if table.tapping:
+        assumed.append(("free_amplitude_drift", FREE_AMPLITUDE_DRIFT, "drive_calibration", 1.0))
+    known = {}
+    for drift, usual, start, neutral in assumed:
+        known[drift] = given.get(drift, (0.0, usual))
+        value, error = table.calibration.get(start, (neutral, 0.0))
+        known[start] = value, float(np.hypot(error, 0.5 * np.hypot(*known[drift])))
+    return known
 
 
 def measurement_of(
@@ -268,9 +305,13 @@ def measurement_of(
         constraints: value and standard error of what is known beforehand, by parameter; else the table says.
         fixed: values of the model's parameters that are not fitted.
     """
-    value, error = _constraint_columns(problem, constraints_of(table, constraints))
+    known = constraints_of(table, constraints)
+    value, error = _constraint_columns(problem, known)
     held: dict[str, Any] = {name: np.asarray(float(value)) for name, value in (fixed or {}).items()}
-    cantilever = Cantilever(table.free_frequency_khz, table.quality_factor, table.mass_ng)
+    quality_factor = table.quality_factor
+    if quality_factor is not None and np.isnan(quality_factor):
+        quality_factor = known["quality_factor"][0]
+    cantilever = Cantilever(table.free_frequency_khz, quality_factor, table.mass_ng)
     rows = rows_of(table)
     if table.tapping:
         reach = reach_of(rows, cantilever, table.drive)
@@ -382,7 +423,13 @@ def rows_of(table: AmplitudeTable) -> Rows:
         measured=measured,
         no_orbit=padded(unseen, 0.0) > 0.0,
         free=np.zeros(size, dtype=bool),
+        time=padded(np.linspace(-0.5, 0.5, table.rows) if drifts(table) else np.zeros(table.rows)),
     )
+
+
+def drifts(table: AmplitudeTable) -> bool:
+    """Say whether a table's rows stand in order of time, more than one."""
+    return table.rows_in_order_of_time and table.rows > 1
 
 
 def readings_of(

@@ -180,8 +180,27 @@ NUISANCES = (
         width=1.0,
         example="0 +- 0.2",
     ),
+    Parameter(
+        name="phase_drift_deg",
+        unit="degrees",
+        meaning="what the phase drifts by from the first row to the last",
+        lowest=-1e3,
+        highest=1e3,
+        width=1.0,
+        example="0 +- 3",
+    ),
+    Parameter(
+        name="free_amplitude_drift",
+        meaning="what the free amplitude drifts by from the first row to the last, over itself",
+        lowest=-0.9,
+        highest=0.9,
+        width=0.01,
+        example="0 +- 0.03",
+    ),
 )
 """What the instrument adds; each has a Gaussian constraint."""
+DRIFT_NAMES = ("phase_drift_deg", "free_amplitude_drift")
+"""Those that are only of a table whose rows stand in order of time."""
 
 SHAPES = (
     Parameter(

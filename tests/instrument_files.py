@@ -19,14 +19,16 @@ def tapping_rows(points: int = 120, *, retract: bool = False) -> tuple[np.ndarra
 
 
 def igor_wave(columns: dict[str, np.ndarray], note: str, *, order: str = "<") -> bytes:
-    """Return a binary wave of version 5 (WaveMetrics' Technical Note 003): a column for each channel, their labels."""
-    table = np.stack(list(columns.values()), axis=1)
+    """Return a binary wave of version 5 (WaveMetrics' Technical Note 003): a column or an image a channel, labelled."""
+    table = np.stack(list(columns.values()), axis=-1)
     data = np.asfortranarray(table).astype(order + "f4").tobytes(order="F")
     labels = b"".join(name.encode().ljust(32, b"\0") for name in ("", *columns))
     text = note.encode("latin-1")
-    sizes = [320 + len(data), 0, len(text), 0, 0, 0, 0, 0, 0, len(labels), 0, 0, 0, 0, 0]
+    of_labels = [len(labels) if side == table.ndim - 1 else 0 for side in range(4)]
+    sizes = [320 + len(data), 0, len(text), 0, 0, 0, 0, 0, *of_labels, 0, 0, 0]
     wave = struct.pack(order + "IIIihh6sh32sii", 0, 0, 0, table.size, 2, 0, b"", 1, b"ramp", 0, 0)
-    wave += struct.pack(order + "4i4d4d4s16s", *table.shape, 0, 0, *[1.0] * 4, *[0.0] * 4, b"", b"")
+    shape = [*table.shape, 0, 0][:4]
+    wave += struct.pack(order + "4i4d4d4s16s", *shape, *[1.0] * 4, *[0.0] * 4, b"", b"")
     wave = wave.ljust(320, b"\0")
     head = struct.pack(order + "h", 5)
     body = struct.pack(order + "15i", *sizes)

@@ -109,6 +109,7 @@ def made_table(rows: int = 4, **changes: Any) -> AmplitudeTable:
         "lockin_amplitude_error_nm": 0.01 * lockin,
         "quality_factor": 40.0,
         "quality_factor_error": 0.4,
+        "mass_ng": 1.0,
         "remarks": ("measured on a Tuesday",),
     }
     return AmplitudeTable(**(columns | changes))

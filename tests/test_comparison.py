@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy.stats import chi2
 
 from afm_jax.cli.main import main
 from fitting.fits import comparison
@@ -144,5 +145,12 @@ def test_a_law_without_adhesion_is_a_rival_like_any_other(contact_table_path: Pa
     found = {row["model"]: row for row in answer["comparison"]["rows"]}
     assert set(found) == {"restitution+delay", "law+delay", "viscous+delay"}
     # the resolved contact, whose loss grows with speed and which holds slow tips: restitution alone is far off
-    assert found["restitution+delay"]["chi2"] > 10.0 * found["viscous+delay"]["chi2"]
+    assert found["restitution+delay"]["aic"] > 10.0 * found["viscous+delay"]["aic"]
+    # a model has one chi2, and its verdict is of that one
+    own = found[model]
+    assert {key: own[key] for key in ("chi2", "degrees_of_freedom", "valid")} == {
+        key: answer[key] for key in ("chi2", "degrees_of_freedom", "valid")
+    }
+    for row in found.values():
+        assert not row["valid"] or chi2.sf(row["chi2"], row["degrees_of_freedom"]) > 1e-3
     assert done.exit_code == (3 if model == "restitution+delay" else 0)

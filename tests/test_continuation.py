@@ -22,7 +22,6 @@ from afm_jax.dynamics import closed_loops
 from afm_jax.dynamics.bands import UncertainParameters, special_errors
 from afm_jax.dynamics.continuation import Continuation, continue_orbits
 from afm_jax.impact.closure import OrbitProblem, closing_residual
-from afm_jax.impact.lasting_impact import LawImpact
 from afm_jax.plots.branches import draw_continuation, draw_curves
 from afm_jax.scenefile.parameter_paths import ParameterRange
 
@@ -269,7 +268,7 @@ def test_cusps_are_triple_roots_and_curves_meet_in_the_same_points():
     assert len(cusps) == 2
     for one in cusps:
         platform = Platform(one.second, 180.0 * one.parameter, 1.0)
-        value, slope = flattest(OrbitProblem(many.cantilever, platform, LawImpact(delayed), jnp.asarray(4.0)))
+        value, slope = flattest(OrbitProblem(many.cantilever, platform, delayed, jnp.asarray(4.0)))
         assert abs(value) < 1e-9
         assert abs(slope) < 1e-8
 

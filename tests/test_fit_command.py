@@ -1,15 +1,19 @@
 """`afm-jax fit`: what it prints, writes and returns."""
 
 import csv
+import dataclasses
 import importlib.util
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
+from scipy.stats import chi2
 
 from afm_jax.cli.fit import _settings
 from afm_jax.cli.main import main
+from fitting.tables.table import TABLE, read_table, write_table
 from tests.fit_tables import EXAMPLE
 from tests.strict_reading import strictly
 
@@ -107,6 +111,76 @@ def test_text_says_the_verdict_and_the_law():
     assert "VALID" in result.stdout
     assert "u_out^2 = r^2 u_in^2 - epsilon" in result.stdout
     assert "0.9494 to 0.9507" in result.stdout
+
+
+def test_damping_must_be_said_and_energies_need_a_mass(tmp_path, reported):
+    lines = EXAMPLE.read_text(encoding="utf-8").splitlines()
+    bare = [line for line in lines if not line.startswith(("# quality_factor", "# mass_ng"))]
+    path = tmp_path / "bare.csv"
+    path.write_text("\n".join(bare) + "\n", encoding="utf-8")
+    for arguments in (["fit", path], ["fit", path, path, "--each"], ["invert", path]):
+        refused = CliRunner().invoke(main, [str(argument) for argument in arguments])
+        assert refused.exit_code == 2
+        assert f"{path}: the quality factor is missing" in refused.stderr
+        assert "'# quality_factor = 40 +- 2'" in refused.stderr
+        assert "'# quality_factor = none' says that there is no air damping" in refused.stderr
+        assert refused.stderr.count("\n") == 1
+    stated = strictly(run(path, "--json", "--quality-factor", "40 +- 0.4").stdout)
+    known = strictly(reported[0].stdout)
+    assert stated["parameters"] == known["parameters"]
+    assert [one["energy_aj"] for one in stated["loss"]["energies"]] == [None, None, None]
+    assert stated["loss"]["energies_reason"] == "the table gives neither mass_ng nor spring_constant_n_per_m"
+    assert stated["loss"]["delta_aj"] is None
+    assert known["loss"]["energies_reason"] is None
+    path.write_text("\n".join(["# spring_constant_n_per_m = 5.4", "# quality_factor = none", *bare]), encoding="utf-8")
+    undamped = strictly(run(path, "--json").stdout)
+    assert undamped["input"]["quality_factor"] is None
+    mass = 5.4 / (2e-3 * math.pi * 90.0) ** 2
+    u, energy = (undamped["loss"]["energies"][0][name] for name in ("approach_speed_nm_per_us", "energy_aj"))
+    r, epsilon = (undamped["parameters"][name]["value"] for name in ("r", "epsilon"))
+    assert energy["value"] == pytest.approx(0.5 * mass * (u**2 * (1.0 - r**2) + epsilon), rel=1e-6)
+
+
+def test_repeated_readings_count_and_tell_the_error(tmp_path, reported):
+    table = read_table(EXAMPLE)
+    # every row twice, the second reading two errors of the peak and one of the lock-in larger
+    kept = [name for name in TABLE.names if getattr(table, name) is not None]
+    again = {name: np.concatenate([column, column]) for name, column in vars(table).items() if name in kept}
+    for name, errors in (("peak", 2.0), ("lockin", 1.0)):
+        again[f"{name}_amplitude_nm"][table.rows :] += errors * getattr(table, f"{name}_amplitude_error_nm")
+    write_table(dataclasses.replace(table, **again), tmp_path / "twice.csv")
+    answer = strictly(run(tmp_path / "twice.csv", "--json").stdout)
+    assert answer["degrees_of_freedom"] == 244 + 3 * table.rows
+    assert answer["repeats"] == {
+        "drives": table.rows,
+        "rows": 2 * table.rows,
+        "chi2": pytest.approx((0.5 * 2.0**2 + 0.5) * table.rows),
+        "degrees_of_freedom": 3 * table.rows,
+        "error_ratio": pytest.approx(math.sqrt(2.5 / 3.0)),
+        "p_value": pytest.approx(chi2.sf(2.5 * table.rows, 3 * table.rows)),
+    }
+    assert strictly(reported[0].stdout)["repeats"] is None
+
+
+def test_a_drift_of_the_phase_is_noticed_and_fitted_along(tmp_path, reported):
+    table = read_table(EXAMPLE)
+    drift = 2.0 * np.linspace(0.0, 1.0, table.rows)
+    drifted = dataclasses.replace(table, phase_deg=(np.asarray(table.phase_deg) + drift) % (360.0 / table.order))
+    write_table(drifted, tmp_path / "drift.csv")
+    assert not any("follow the rows" in note for note in strictly(reported[0].stdout)["warnings"])
+    (note,) = [one for one in strictly(run(tmp_path / "drift.csv", "--json").stdout)["warnings"] if "follow" in one]
+    assert "phase +" in note
+    assert "say `# rows = in order of time`" in note
+    write_table(dataclasses.replace(drifted, rows_in_order_of_time=True), tmp_path / "drift.csv")
+    answer = strictly(run(tmp_path / "drift.csv", "--json").stdout)
+    assert answer["valid"]
+    found = answer["parameters"]["phase_drift_deg"]
+    assert found["constraint"] == [0.0, 3.0]
+    assert abs(found["value"] - 2.0) < 2.5 * found["standard_error"] < 0.5
+    for name, truth in (("r", 0.95), ("epsilon", 60.0)):
+        low, high = answer["parameters"][name]["interval95"]
+        assert low < truth < high
+    assert not any("follow the rows" in note for note in answer["warnings"])
 
 
 def test_contact_data_end_with_exit_code_3(contact_table_path):

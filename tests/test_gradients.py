@@ -7,7 +7,6 @@ import pytest
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem
-from afm_jax.impact.lasting_impact import LawImpact
 from afm_jax.impact.law import ImpactLaw
 from fitting import amplitude_gradients
 from fitting.forward import (
@@ -224,7 +223,7 @@ def lowest_gap_on_the_way(row: tuple[int, float, float, float], r: float) -> flo
 def test_an_impact_of_a_ten_thousandth_of_the_drives_speed_is_a_graze(share, slow):
     """Looked at directly: orbits with such an impact are unstable, no table leads there."""
     platform = Platform(4.0, 181.8, 0.0)
-    orbit = OrbitProblem(Cantilever(90.0, 40.0), platform, LawImpact(ImpactLaw(0.5, 0.0)), jnp.array(1.0))
+    orbit = OrbitProblem(Cantilever(90.0, 40.0), platform, ImpactLaw(0.5, 0.0), jnp.array(1.0))
     # without adhesion the approach speed is Y/2r, here Y itself
     found, _ = _grazes(OrbitPlace(share * platform.top_speed_nm_per_us, jnp.array(0.0)), orbit)
     assert bool(found) is slow

@@ -254,6 +254,7 @@ def test_reading_on_resonance_is_exact_where_its_assumptions_hold():
         drive_amplitude_nm=np.array([drive]),
         offset_nm=np.array([0.0]),
         free_frequency_khz=90.0,
+        quality_factor=None,
         peak_amplitude_nm=np.array([peak]),
         peak_amplitude_error_nm=np.array([0.01 * peak]),
     )

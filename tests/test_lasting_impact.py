@@ -15,13 +15,11 @@ from afm_jax.contact.junction import find_junction
 from afm_jax.contact.law_of_contact import DELAY_ERROR_US, SPEED_ERROR, tabulated
 from afm_jax.impact.lasting_impact import (
     AIR,
-    BRIDGE_NM,
     PULLS,
     SHALLOWER,
     SPREAD,
     STIFFER,
     USUAL_LEAD,
-    LawImpact,
     Middle,
     corrected,
     depth_of_impact,
@@ -29,7 +27,7 @@ from afm_jax.impact.lasting_impact import (
     indentation,
     middle_of_contact,
 )
-from afm_jax.impact.law import CollisionDelay, ImpactLaw, Speeds
+from afm_jax.impact.law import BRIDGE_NM, CollisionDelay, ImpactLaw, Speeds
 from tests.reference_hertz import DEEPEST, HERTZ_TIME, rational, under_pull
 
 UNDAMPED = afm.Cantilever(1e-3)
@@ -62,9 +60,9 @@ def left(motion, latest: float) -> tuple[float, float]:
     return float(end.y_events[0][0][1]), float(end.t_events[0][0])
 
 
-def impact_of(hertz: float, lead_nm: float) -> LawImpact:
+def impact_of(hertz: float, lead_nm: float) -> ImpactLaw:
     """Return a law without loss whose contact lasts `hertz` at speed 1."""
-    return LawImpact(ImpactLaw(1.0, delay=CollisionDelay(hertz, lead_nm, 0.0)))
+    return ImpactLaw(1.0, delay=CollisionDelay(hertz, lead_nm, 0.0))
 
 
 def of_law(pull: float, jerk: float) -> tuple[float, float]:
@@ -163,7 +161,7 @@ def test_a_delay_with_an_offset_is_that_of_a_raised_surface(pull):
     leaves = float(end.t_events[0][0])
     times, way = np.linspace(0.0, leaves, 2001), np.linspace(0.0, beside, 2001)
     flown = 2.0 * np.trapezoid(raised - coming * way + 0.5 * pull * way**2, way)
-    impact = LawImpact(ImpactLaw(1.0, delay=CollisionDelay(HERTZ_TIME, 0.0, 2.0 * raised)))
+    impact = ImpactLaw(1.0, delay=CollisionDelay(HERTZ_TIME, 0.0, 2.0 * raised))
     free = Speeds(jnp.array(1.0), jnp.array(1.0), jnp.array(HERTZ_TIME - 2.0 * raised))
     middle = Middle(jnp.array(pull), jnp.array(0.0))
     assert float(corrected(free, middle, UNDAMPED, impact).delay) == pytest.approx(leaves - 2.0 * beside, rel=1e-6)
@@ -221,7 +219,7 @@ def test_a_lead_is_covered_sooner_with_a_push(pull):
 
 def test_a_law_as_lasting_impact_is_the_law():
     law = ImpactLaw(0.998, 120.0, 0.4, CollisionDelay(0.2, 5.0, 0.6))
-    impact = LawImpact(law)
+    impact = law
     found = jax.vmap(impact.speeds)(impact.lowest * jnp.array([1.5, 3.0, 20.0]))
     for u, w, delay in zip(*(np.asarray(column) for column in found), strict=True):
         square = 0.998**2 * u**2 - 0.4 * u - 120.0

@@ -9,7 +9,6 @@ import pytest
 
 import afm_jax as afm
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem
-from afm_jax.impact.lasting_impact import LawImpact
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.impact.orbits import SteadyOrbits, amplitudes, near_fold, orbit_state, steady_orbits
 from afm_jax.impact.roots import COARSE, find_roots, follow_root
@@ -29,7 +28,7 @@ def problem_of(p: Parameters, order: int, *, delay: CollisionDelay | None = None
     law = ImpactLaw(p.r, p.epsilon, p.viscous_loss, CollisionDelay(*p.delay) if p.delay else delay)
     platform = afm.Platform(p.amplitude_nm, p.drive_frequency_khz, p.offset_nm)
     cantilever = afm.Cantilever(p.frequency_khz, p.quality_factor)
-    return OrbitProblem(cantilever, platform, LawImpact(law), jnp.asarray(float(order)))
+    return OrbitProblem(cantilever, platform, law, jnp.asarray(float(order)))
 
 
 def delayed(order: int, reduced: float, amplitude_nm: float, offset_nm: float) -> tuple[Parameters, int]:

@@ -117,8 +117,14 @@ def test_a_table_needs_what_the_fitter_needs(tmp_path):
     assert "free_frequency_khz is not known" in result.stderr
     assert not (tmp_path / "out" / "amplitudes.csv").exists()
     # drive and offset come from the platform's column
-    assert run(path, "--out", tmp_path / "out", "--free-frequency-khz", 90).exit_code == 0
+    given = ["--free-frequency-khz", 90, "--quality-factor", "none", "--spring-constant-n-per-m", 5.4]
+    assert run(path, "--out", tmp_path / "out", *given).exit_code == 0
     table = read_table(tmp_path / "out" / "amplitudes.csv")
+    assert (table.quality_factor, table.spring_constant_n_per_m) == (None, 5.4)
+    assert table.mass_ng == pytest.approx(5.4 / (2e-3 * np.pi * 90.0) ** 2, rel=1e-14)
+    twice = run(path, *given, "--mass-ng", 20)
+    assert twice.exit_code == 2
+    assert "mass_ng = 20 and spring_constant_n_per_m = 5.4 contradict each other" in twice.stderr
     assert table.drive_amplitude_nm is not None
     assert table.drive_amplitude_nm[0] == pytest.approx(4.0, rel=1e-6)
     assert table.offset_nm[0] == pytest.approx(-1.0, rel=1e-6)

@@ -9,6 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax.cli import main
+from tests.resonance_sweeps import synthetic_sweep
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -79,7 +80,7 @@ EXAMPLES = ROOT / "fitting" / "examples"
 STAND_FOR = {
     "TABLE.csv": str(EXAMPLES / "amplitudes_law.csv"),
     "my_amplitudes.csv": str(EXAMPLES / "amplitudes_law.csv"),
-    "SWEEP": str(EXAMPLES / "real" / "thermal_nanosurf.nid"),
+    "SWEEP": "resonance.csv",
     "trace1.csv": "trace/trace.csv",
 }
 FEWER = (
@@ -112,6 +113,10 @@ def desk(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with what the pages tell to save, and what their first commands write."""
     folder = tmp_path_factory.mktemp("desk")
     (folder / "fitting").symlink_to(ROOT / "fitting")
+    sweep = synthetic_sweep(noise=0.01)
+    points = zip(sweep.frequency_khz.tolist(), sweep.amplitude.tolist(), strict=True)
+    lines = [f"{khz!r},{amplitude!r}\n" for khz, amplitude in points]
+    (folder / "resonance.csv").write_text("".join(["frequency_khz,amplitude_nm\n", *lines]))
     (folder / "scene.toml").write_text(of_page("first_steps", "toml")[0])
     (folder / "sweep.toml").write_text(of_page("sweeps", "toml")[0].replace("201", "3"))
     return folder

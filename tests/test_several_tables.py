@@ -155,7 +155,12 @@ def test_names_tell_tables_apart():
     ("changes", "options", "message"),
     [
         ({"mass_ng": 2.0}, {}, "mass_ng is 1 in a.csv and 2 in b.csv: tips of different mass share no law"),
-        ({"quality_factor": None, "quality_factor_error": None}, {}, "b.csv lacks quality_factor, which a.csv gives"),
+        (
+            {"quality_factor": None, "quality_factor_error": None},
+            {},
+            "b.csv says that there is no air damping \\(quality_factor = none\\), a.csv gives",
+        ),
+        ({"mass_ng": None}, {}, "b.csv lacks mass_ng \\(or spring_constant_n_per_m\\), which a.csv gives; add it"),
         ({"quality_factor": 41.0}, {"share": ["quality_factor"]}, "a.csv says 40 \\+- 0.4, and b.csv says 41 \\+- 0.4"),
         ({}, {"share": ["all"], "constraints": {"quality": (1.0, 0.1)}}, "the constraint on 'quality' is on no"),
         ({}, {"share": ["r"]}, "`share` must be chosen from quality_factor, .* and all, but one is 'r'"),

@@ -15,7 +15,6 @@ NOT_MEASURED = "is not a number; leave the cell of a value that was not measured
 NOT_ORDER = "is not a positive whole number; write 1, 2, 3, ..."
 OR_BLANK = "correct it or leave it blank if it was not measured"
 OR_UNSEEN = ", or set no_orbit to 1 if the tip settled on no orbit there"
-AVERAGE = "average the measurements into one row or remove one"
 
 
 @pytest.mark.parametrize(
@@ -99,15 +98,6 @@ def test_rows_without_an_orbit(tmp_path: Path, row: str, message: str):
     assert fault_of(tmp_path, f"{KEY}{names}3,540,4,0,163.3,1.63,0\n{row}\n") == message
 
 
-@pytest.mark.parametrize("again", [ROW, "+1,180.0,4e0,-0,170,2\n"])
-def test_a_repeated_row_names_both_lines(tmp_path: Path, again: str):
-    other = "2,180,4,0,163.3,1.63\n1,181,4,0,163.3,1.63\n1,180,5,0,163.3,1.63\n1,180,4,1,163.3,1.63\n"
-    assert fault_of(tmp_path, KEY + NAMES + ROW + other + "# again\n" + again) == (
-        "line 9: repeats line 3 (same order, drive frequency, drive amplitude and offset); average the measurements "
-        "into one row or remove one"
-    )
-
-
 def test_several_faults_are_counted_and_the_first_line_is_shown(tmp_path: Path):
     one = fault_of(tmp_path, KEY + NAMES + "1,180,4,0,163.3,x\n2,180,-4,0,163.3,1\n")
     assert one == f"line 3, column peak_amplitude_error_nm: 'x' {NOT_NUMBER} (and 1 more fault)"
@@ -163,10 +153,6 @@ FIELDS: dict[str, Any] = {
         (
             {"lockin_amplitude_nm": None, "lockin_amplitude_error_nm": None},
             ": there is no amplitude; give peak_amplitude_nm or lockin_amplitude_nm",
-        ),
-        (
-            {"drive_frequency_khz": np.full(2, 180.0)},
-            f", row 2: repeats row 1 (same order, drive frequency, drive amplitude and offset); {AVERAGE}",
         ),
         (
             {"order": np.array([1, 0])},

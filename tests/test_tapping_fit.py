@@ -163,3 +163,57 @@ def test_light_taps_that_leave_adhesion_and_modulus_open_are_fitted_to_their_min
     known = places.known_by_range(found.coordinates)
     box = Box(places.lowest, places.highest, np.zeros(here.place.shape, dtype=bool), known=known)
     assert distance(here, box)[0] < 1e-6
+
+
+def with_free_ends(table: AmplitudeTable) -> AmplitudeTable:
+    """Return a table with three rows of the free tip before the others, three after, in order of time."""
+    names = (
+        "drive_frequency_khz",
+        "free_amplitude_nm",
+        "offset_nm",
+        "lockin_amplitude_nm",
+        "lockin_amplitude_error_nm",
+    )
+    names += ("phase_lag_deg", "phase_lag_error_deg")
+    lag = np.rad2deg(np.angle(1.0 - RATIO**2 + 1j * RATIO / (table.quality_factor or np.inf)))
+    ends = [np.array([90.0 * RATIO, one, -one - 30.0, one, 0.003 * one, lag, 0.2]) for one in (80.0, 40.0)]
+    columns = {
+        name: np.concatenate([np.full(3, ends[0][i]), np.asarray(getattr(table, name)), np.full(3, ends[1][i])])
+        for i, name in enumerate(names)
+    }
+    return dataclasses.replace(table, **columns, order=np.zeros(0, dtype=int), rows_in_order_of_time=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("degrees", "share", "begin"), [(0.3, 0.01, 0.0), (1.0, 0.03, -0.5), (5.0, 0.03, 0.0)])
+def test_drifts_along_the_rows_are_told_by_free_rows(degrees: float, share: float, begin: float):
+    truth = tapping_truth(0)
+    steady = with_free_ends(as_measured(exact_table(truth, RATIO, TABLES)))
+    # the phase drifts, and the free amplitude away from what the table says of it
+    course = np.linspace(begin, begin + 1.0, steady.rows)
+    noise = np.random.default_rng(1).normal(size=(3, steady.rows))
+    read = {name: np.asarray(getattr(steady, name)) for name in steady.form.names if getattr(steady, name) is not None}
+    drifted = dataclasses.replace(
+        steady,
+        phase_lag_deg=read["phase_lag_deg"] + degrees * course + read["phase_lag_error_deg"] * noise[0],
+        lockin_amplitude_nm=read["lockin_amplitude_nm"] + read["lockin_amplitude_error_nm"] * noise[1],
+        free_amplitude_nm=read["free_amplitude_nm"] / (1.0 + share * course),
+    )
+    result = fit(drifted, "viscous+delay")
+    assert result.valid, result.reasons
+    for name, drift, error in (("phase_drift_deg", degrees, 0.3), ("free_amplitude_drift", share, 0.005)):
+        found = result.parameters[name]
+        assert found.standard_error is not None
+        assert abs(found.value - drift) < 2.5 * found.standard_error < 2.5 * error
+    speeds = result.rows.approach_speed_nm_per_us[result.rows.used]
+    grid = np.linspace(max(np.nanmin(speeds), 1.05 * float(truth.impact.lowest)), np.nanmax(speeds), 60)
+    law, low, high = (
+        np.interp(grid, result.law.approach_speed_nm_per_us, column)
+        for column in (
+            result.law.rebound_speed_nm_per_us,
+            result.law.rebound_low_nm_per_us,
+            result.law.rebound_high_nm_per_us,
+        )
+    )
+    assert np.all(np.abs(law - truth.rebound(grid)) < 2.5 / 1.96 * 0.5 * (high - low))
+    np.testing.assert_allclose(law, truth.rebound(grid), rtol=0.02)

@@ -74,14 +74,6 @@ def test_a_written_curve_reads_back_the_same(tmp_path: Path, drive: str):
             "line 5, column phase_lag_deg: has no errors; add the column phase_lag_error_deg",
         ),
         (
-            ROW,
-            ROW + ROW,
-            (
-                "line 7: repeats line 6 (same order, drive frequency, free amplitude and offset); average the "
-                "measurements into one row or remove one"
-            ),
-        ),
-        (
             "5.4 +- 0.5\n",
             "5.4 +- 0.5\n# mass_ng = 3\n",
             (

@@ -1,5 +1,6 @@
 """Thermal spectra and stiffness: the likelihood, the real spectrum, Sader's method, slopes, and what intervals hold."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ from scipy.stats import gamma
 
 from afm_jax.cli.main import main
 from fitting import TableError, calibrate, equipartition, read_curves, read_sweep, sader, sensitivity
+from fitting.calibration.calibrate import _windows
 from fitting.calibration.model import deviance_root
 from fitting.calibration.result import CalibratedValue, Calibration
 from fitting.calibration.stiffness import BOLTZMANN, Stiffness, air_at, disagreement, hydrodynamic_function
@@ -23,12 +25,12 @@ THERMAL, FORCES = REAL / "thermal_nanosurf.nid", REAL / "tapping_normal_force_ws
 FREQUENCY_KHZ, QUALITY_FACTOR, STIFFNESS_N_PER_M, WARM_K = 90.0, 150.0, 5.4, 300.0
 
 
-def density(khz: np.ndarray, floor: float = 2e-8) -> np.ndarray:
+def density(khz: np.ndarray, floor: float = 2e-8, quality: float = QUALITY_FACTOR) -> np.ndarray:
     """Return the one-sided density (nm^2/Hz) of an oscillator in thermal motion, from Langevin's equation."""
     variance = 1e18 * BOLTZMANN * WARM_K / STIFFNESS_N_PER_M
     hz, natural = 1e3 * khz, 1e3 * FREQUENCY_KHZ
-    shape = natural**4 / ((natural**2 - hz**2) ** 2 + (hz * natural / QUALITY_FACTOR) ** 2)
-    return 2.0 * variance / (np.pi * QUALITY_FACTOR * natural) * shape + floor
+    shape = natural**4 / ((natural**2 - hz**2) ** 2 + (hz * natural / quality) ** 2)
+    return 2.0 * variance / (np.pi * quality * natural) * shape + floor
 
 
 def thermal_spectrum(averages: float, random: np.random.Generator, *, points: int = 128, known: bool = True):
@@ -157,6 +159,36 @@ def test_spectra_are_read_from_csv(tmp_path):
         read_sweep(cut)
 
 
+@pytest.mark.parametrize(("quality", "points"), [(60, 128), (150, 128), (400, 128), (150, 400), (1000, 400)])
+def test_a_line_of_three_points_hides_no_resonance(quality: float, points: int):
+    khz = np.linspace(86.0, 94.0, points)
+    power = density(khz, quality=quality) * np.random.default_rng(points).gamma(100.0, 0.01, points)
+    line = points // 10
+    power[line : line + 3] += 0.1 * power.max()
+    sweep = ResonanceSweep(frequency_khz=khz, amplitude=np.sqrt(power), amplitude_unit=DENSITY, averages=100.0)
+    parts = _windows(sweep)
+    assert all(part.frequency_khz[0] < FREQUENCY_KHZ < part.frequency_khz[-1] for part in parts)
+    assert khz[line + 2] < parts[-1].frequency_khz[0]
+
+
+@pytest.mark.slow
+def test_a_line_beside_the_resonance_changes_no_calibration():
+    plain = thermal_spectrum(100.0, np.random.default_rng(2))
+    power = plain.amplitude**2
+    power[12:15] += 0.1 * power.max()
+    found = calibrate(replace(plain, amplitude=np.sqrt(power)), compare=False)
+    assert found.valid, found.reasons
+    for one, truth in ((found.frequency_khz, FREQUENCY_KHZ), (found.quality_factor, QUALITY_FACTOR)):
+        low, high = one.interval95
+        assert low is not None
+        assert high is not None
+        assert low < truth < high
+    stiffness = equipartition(found, temperature_k=(WARM_K, 0.0)).value
+    # of the deflection's scale 5 % are assumed, which k has twice
+    assert stiffness.standard_error is not None
+    assert stiffness.standard_error / stiffness.value == pytest.approx(0.1, rel=0.1)
+
+
 @pytest.mark.slow
 def test_the_real_spectrum_meets_the_vendors_numbers(tmp_path):
     sizes = ["--length-um", "225 +- 2", "--width-um", "40 +- 1"]
@@ -169,10 +201,25 @@ def test_the_real_spectrum_meets_the_vendors_numbers(tmp_path):
     assert stiffness["sader"]["value"] == pytest.approx(27.13, rel=0.1)
     # the deflection's own scale says less than half: it was not calibrated, and that is said
     assert stiffness["equipartition"]["value"] == pytest.approx(9.7, rel=0.05)
+    assert stiffness["equipartition"]["standard_error"] is None
     assert "are 1.65 times the true ones" in answer["note"]
+    assert answer["valid"] is True
     assert any("Fitted from 178.5" in warning for warning in answer["warnings"])
     assert {row["quantity"] for row in answer["budget"]} >= {"quality_factor", "spring_constant_n_per_m (Sader)"}
     assert strictly((tmp_path / "calibration.json").read_text("utf-8")) == answer
+    # without the lever's size the instrument's own k tells as much, and no spring constant is left
+    for options in ([], ["--json"]):
+        alone = run(THERMAL, *options)
+        assert alone.exit_code == 3
+        assert "The spring constant is not calibrated." in alone.stderr
+        shown = alone.stdout.replace(" ", "")
+        assert "equipartition:9.69N/m,NOTVALID" in shown or options
+        assert "#spring_constant" not in shown
+    answer = strictly(alone.stdout)
+    assert answer["valid"] is False
+    lone = answer["spring_constant_n_per_m"]["equipartition"]
+    assert (lone["standard_error"], lone["interval95"]) == (None, [None, None])
+    assert answer["quality_factor"]["standard_error"] > 0.0
     half = run(THERMAL, "--length-um", "225")
     assert half.exit_code == 2
     assert "needs both --length-um and --width-um" in half.stderr
@@ -189,7 +236,7 @@ def test_intervals_hold_the_truth_as_often_as_they_say(known):
         result = calibrate(spectrum, background="floor", compare=False, whole=True)
         assert result.explained
         # the whole of kT here: the oscillator is a point, not a lever's first mode
-        stiffness = equipartition(result, temperature_k=(WARM_K, 0.0), static=False).value
+        stiffness = equipartition(result, temperature_k=(WARM_K, 0.0), static=False, scale_error=0.0).value
         found = [(one, 1.0) for one in (result.frequency_khz, result.quality_factor)] + [(stiffness, 0.971)]
         for place, ((one, factor), truth) in enumerate(zip(found, wanted, strict=True)):
             low, high = one.interval95

@@ -19,6 +19,7 @@ _REAL = EXAMPLES / "real"
 _SWEEP = 'scene = "figure2"\n[record]\nwhat = "orbits"\norders = [1]\n[[axes]]\n'
 _SWEEP += 'parameter = "platform.amplitude_nm"\nlinear = [2, 4, 3]\n'
 _CHART = ("figure2", "--x", "platform.reduced_frequency=0.9:1.1:3", "--y", "platform.amplitude_nm=2:4:3")
+_MAP = ("image.npz", "--free-frequency-khz", "90", "--quality-factor", "200", "--free-amplitude-nm", "10")
 CALLS = {
     "accuracy": ("map", "--quick"),
     "basins": ("figure2", "--grid", "8x8"),
@@ -43,6 +44,7 @@ CALLS = {
     "simulate": ("figure2", "--periods", "30", "--samples", "uniform"),
     "sweep": ("sweep.toml",),
     "tapping": (str(EXAMPLES / "tapping_resonance.csv"),),
+    "tapping-map": (*_MAP, "--format", "npz", "--format", "gwy", "--format", "zarr"),
     "verify": (),
 }
 """By the command and what tells its calls apart; files that they need are written by `prepare`."""
@@ -55,6 +57,7 @@ def prepare(folder: Path) -> None:
     np.savetxt(folder / "trace.csv", rows, delimiter=",", header="time_us,deflection_nm", comments="")
     text = (folder / "trace.csv").read_text(encoding="utf-8")
     (folder / "trace.csv").write_text(f"# drive_frequency_khz = 180\n{text}", encoding="utf-8")
+    np.savez(folder / "image.npz", amplitude=np.full((4, 5), 8.0), phase=np.full((4, 5), 70.0))
     (folder / "sweep.toml").write_text(_SWEEP, encoding="utf-8")
     frequency = np.linspace(85.0, 95.0, 41)
     response = 1.0 / np.hypot(1.0 - (frequency / 90.0) ** 2, frequency / 90.0 / 40.0)

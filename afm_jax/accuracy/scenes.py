@@ -31,8 +31,8 @@ from afm_jax.bench.timing import Compiled, compiled_for, progress, time_compiled
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.settings import DRIVEN_SETTINGS, DrivenSetting, QuickSetting
 from afm_jax.impact.first_impact import Flight, first_impact
-from afm_jax.impact.lasting_impact import LawImpact, speeds_of_impact
-from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from afm_jax.impact.lasting_impact import speeds_of_impact
+from afm_jax.impact.law import CollisionDelay, ImpactLaw, Law
 from afm_jax.impact.map import NextImpact, iterate_map
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.observe import peaks_between_contacts, peaks_of_flights
@@ -254,7 +254,7 @@ def first_departure(scene: Scene, start: State) -> tuple[Array, Array]:
         ValueError: if it never meets the platform, or is captured there.
     """
     platform, law = scene.platform, scene.interaction
-    assert isinstance(law, ImpactLaw)  # for laws alone  # noqa: S101
+    assert isinstance(law, Law)  # for laws alone  # noqa: S101
     height, _ = platform.position_and_velocity(start.time_us)
     gap = start.position_nm - height
     if abs(float(gap)) < 1e-9:
@@ -269,7 +269,7 @@ def first_departure(scene: Scene, start: State) -> tuple[Array, Array]:
     approach = platform.velocity(arrival) - before
     if bool(law.captures(approach)):
         raise ValueError("from its start the tip is captured at its first impact")
-    impact = speeds_of_impact(LawImpact(law), approach, arrival, scene.cantilever, platform)
+    impact = speeds_of_impact(law, approach, arrival, scene.cantilever, platform)
     leaves = arrival + impact.delay
     return leaves, platform.velocity(leaves) + impact.rebound
 

@@ -23,8 +23,8 @@ class Scene(eqx.Module):
     Args:
         cantilever: the tip and its spring.
         platform: the moving sample.
-        interaction: an `ImpactLaw`, with or without a collision delay, or a `Contact`; None: the tip never meets the
-            sample.
+        interaction: an `ImpactLaw` or a `TabulatedLaw`, with or without a collision delay, or a `Contact`; None: the
+            tip never meets the sample.
         base: a motion of the cantilever's base; None: it rests.
         force: a force on the tip; None: there is none.
     """
@@ -50,6 +50,7 @@ class Scene(eqx.Module):
             what = in_a_word(self.interaction)
             raise TypeError(f"the scene's `interaction` must be an ImpactLaw, a Contact or None, but is {what}")
         _check_frequencies(self)
+        check_mass(self.interaction, self.cantilever)
 
 
 SceneLike = Scene | str | os.PathLike[str]
@@ -68,6 +69,31 @@ def as_scene(given: SceneLike) -> Scene:
     check_kind("scene", given, SceneLike)
     # what reads files is built on scenes
     return import_module("afm_jax.scenefile.presets").scene_and_start(os.fspath(given))[0]
+
+
+_SAME_MASS = 1e-3
+"""Relative difference of two masses that are one."""
+
+
+def check_mass(interaction: Any, cantilever: Cantilever) -> None:
+    """Check that a law that was found with a tip of a known mass meets a tip of that mass.
+
+    Args:
+        interaction: of a scene; anything but a table of a law with a mass passes.
+        cantilever: of the scene.
+
+    Raises:
+        ValueError: if not.
+    """
+    of_law, mass = getattr(interaction, "mass_ng", None), cantilever.mass_ng
+    if of_law is None or is_traced(of_law) or is_traced(mass):
+        return
+    ratio = np.asarray(mass) / np.asarray(of_law)
+    if np.any(np.abs(ratio - 1.0) > _SAME_MASS):
+        raise ValueError(
+            f"the law is that of a tip of {np.asarray(of_law).flat[0]:.6g} ng, but the cantilever's `mass_ng` is "
+            f"{np.asarray(mass).flat[0]:.6g}: what an impact takes changes with the mass; give the law's"
+        )
 
 
 LARGEST_FREQUENCY_RATIO = 1e4

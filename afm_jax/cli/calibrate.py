@@ -43,6 +43,12 @@ BACKGROUNDS = ("none", "floor", "constant", "linear")
     show_default=True,
     help="How a thermal spectrum got its nm: by the slope of a force curve (static InvOLS), or for the mode itself.",
 )
+@click.option(
+    "--scale-error",
+    type=Share("a relative error"),
+    metavar="SHARE",
+    help="Relative error of the deflection's scale (its sensitivity), of which k has twice as much [default: 5 %].",
+)
 @click.option("--slope", is_flag=True, help="SWEEP holds force curves: the sensitivity (nm/V) from their slope.")
 @with_session
 def command(session: Session, sweep: Path, *, slope: bool, amplitude_only: bool, **options: Any) -> None:
@@ -72,14 +78,15 @@ def command(session: Session, sweep: Path, *, slope: bool, amplitude_only: bool,
         fit_options = {name: options[name] for name in ("background", "noise", "scale_errors", "whole")}
         result = calibrate(measured, **fit_options)
     found = _stiffnesses(result, options)
-    data = result.to_dict()
+    data, doubt = result.to_dict(), None
     if found:
-        from fitting.calibration.stiffness import stiffness_payload  # noqa: PLC0415
+        from fitting.calibration.stiffness import stiffness_payload, uncalibrated  # noqa: PLC0415
 
         data |= stiffness_payload(result, found)
+        doubt = uncalibrated(found)
 
     def summary() -> str:
-        text = calibration_summary(result)
+        text = calibration_summary(result, doubt)
         if not found:
             return text
         from fitting.calibration.stiffness import stiffness_lines  # noqa: PLC0415
@@ -92,8 +99,8 @@ def command(session: Session, sweep: Path, *, slope: bool, amplitude_only: bool,
 
         for path in write_calibration(result, session.out, session.write_table, summary(), data):
             session.note(f"wrote {path}")
-    if not result.valid:
-        raise NotValid(result.reasons[0])
+    if data["reasons"]:
+        raise NotValid(data["reasons"][0])
 
 
 def _stiffnesses(result: "Calibration", options: dict[str, Any]) -> "list[Stiffness]":
@@ -112,11 +119,13 @@ def _stiffnesses(result: "Calibration", options: dict[str, Any]) -> "list[Stiffn
     found = []
     if not result.valid:
         return found
-    if result.mean_square is not None:
-        found.append(equipartition(result, temperature_k=warm, static=options["deflection"] == "static"))
     if given:
         sides = {key: (value, error or 0.0) for key, (value, error) in given.items()}
         found.append(sader(result, **sides, temperature_k=warm or AIR_K))
+    if result.mean_square is not None:
+        known = {} if options["scale_error"] is None else {"scale_error": options["scale_error"]}
+        beside, static = next(iter(found), None), options["deflection"] == "static"
+        found.insert(0, equipartition(result, temperature_k=warm, static=static, beside=beside, **known))
     return found
 
 

@@ -1,6 +1,7 @@
 """The options of `afm-jax design` about what is believed: the cantilever, the law, or a fit of both."""
 
 import functools
+import math
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -8,14 +9,16 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import click
 
 from afm_jax.cli.values import Finite, ValueAndError, example_path, option_of, parse_number
-from fitting.parameters import DELAY, LAW, MODELS, NUISANCE_NAMES, NUISANCES, PARAMETERS, model_parameters
+from fitting.parameters import DELAY, DRIFT_NAMES, LAW, MODELS, NUISANCES, PARAMETERS, model_parameters
 
 if TYPE_CHECKING:
     from fitting.experiments.belief import Belief
 
 _LAW = tuple(parameter.name for parameter in (*LAW, *DELAY))
 _REMARKS = {"quality_factor": "; none: no air damping", "offset_origin_nm": "; not with a delay"}
-_BELONG = ("mass_ng", "free", "fix", "value", *_LAW, *NUISANCE_NAMES)
+_NUISANCES = tuple(nuisance for nuisance in NUISANCES if nuisance.name not in DRIFT_NAMES)
+_NUISANCE_NAMES = tuple(nuisance.name for nuisance in _NUISANCES)
+_BELONG = ("mass_ng", "spring_constant_n_per_m", "free", "fix", "value", *_LAW, *_NUISANCE_NAMES)
 
 
 class BeliefOptions(NamedTuple):
@@ -71,9 +74,10 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
         return function(*args, belief_options=BeliefOptions(fit, measured, model, uncertainty, drive, given), **options)
 
     # click lists options in the order of the decorators, the last one first
-    for nuisance in NUISANCES[::-1]:
+    for nuisance in _NUISANCES[::-1]:
         what = f"{nuisance.meaning}, such as '{nuisance.example}'{_REMARKS.get(nuisance.name, '')}."
-        command = click.option(option_of(nuisance.name), type=ValueAndError(), metavar="X", help=what)(command)
+        kind = ValueAndError(none=nuisance.name == "quality_factor")
+        command = click.option(option_of(nuisance.name), type=kind, metavar="X", help=what)(command)
     for name in _LAW[::-1]:
         what = ", ".join(filter(None, (PARAMETERS[name].meaning, PARAMETERS[name].unit)))
         command = click.option(option_of(name), type=Finite(), metavar="X", help=f"{what}; else the paper's.")(command)
@@ -91,7 +95,13 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
             type=click.Choice(("sample", "force", "base")),
             help="What is driven: the sample, or the cantilever itself; else the sample, or as measured.",
         ),
-        click.option("--mass-ng", type=Finite(), metavar="X", help="Effective mass of the tip; else 1."),
+        click.option("--mass-ng", type=Finite(), metavar="X", help="Effective mass of the tip."),
+        click.option(
+            "--spring-constant-n-per-m",
+            type=Finite(),
+            metavar="X",
+            help="Or its spring constant, whose mass is k/Omega^2.",
+        ),
         click.option("--model", type=click.Choice(MODELS), help="What will be fitted; else law+delay, or the fit's."),
         click.option(
             "--measured",
@@ -156,6 +166,8 @@ def _from_values(options: BeliefOptions) -> "Belief":
     if "free_frequency_khz" not in numbers:
         raise click.UsageError("give --free-frequency-khz (and --quality-factor), or --fit or --measured")
     quality_factor, _ = numbers.get("quality_factor", (None, None))
+    if quality_factor == math.inf:
+        quality_factor = None
     fixed = dict(numbers.get("fix", ()))
     try:
         own = model_parameters(model, free, fixed)
@@ -163,16 +175,17 @@ def _from_values(options: BeliefOptions) -> "Belief":
         raise click.UsageError(str(error).replace("`free`", "--free").replace("`fixed`", "--fix")) from error
     contact = dict(numbers.get("value", ()))
     values = {name: value for name, value in numbers.items() if name in _LAW}
-    for name in NUISANCE_NAMES:
+    for name in _NUISANCE_NAMES:
         if name not in {"quality_factor", "free_frequency_khz"} and name in numbers and numbers[name][1] is None:
             raise click.UsageError(f"{option_of(name)} needs its standard error; write '{PARAMETERS[name].example}'")
     return believe(
         model,
         free_frequency_khz=numbers["free_frequency_khz"][0],
         quality_factor=quality_factor,
-        mass_ng=numbers.get("mass_ng", 1.0),
+        mass_ng=numbers.get("mass_ng"),
+        spring_constant_n_per_m=numbers.get("spring_constant_n_per_m"),
         values=values | {name: value for name, value in contact.items() if name in own},
-        constraints={name: numbers[name] for name in NUISANCE_NAMES if numbers.get(name, (0, None))[1] is not None},
+        constraints={name: numbers[name] for name in _NUISANCE_NAMES if numbers.get(name, (0, None))[1] is not None},
         free=free,
         fixed=fixed | {name: value for name, value in contact.items() if name not in own},
         uncertainty=options.uncertainty,

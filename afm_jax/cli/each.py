@@ -5,21 +5,26 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session
 from afm_jax.cli.sweep import run_sweep
 from afm_jax.words import text_table, with_error
 
+if TYPE_CHECKING:
+    from fitting.tables.table import AmplitudeTable
 
-def fit_tables(session: Session, tables: Sequence[Path], record: Mapping[str, Any], workers: int | None) -> None:
+
+def fit_tables(
+    session: Session, tables: Sequence["AmplitudeTable"], record: Mapping[str, Any], workers: int | None
+) -> None:
     """Fit every table by itself and say what was found.
 
     Args:
         session: the call.
-        tables: files.
-        record: model, noise and settings of the fits.
+        tables: with their errors.
+        record: model and settings of the fits.
         workers: processes; None: one a core.
 
     Raises:
@@ -51,7 +56,7 @@ def fit_tables(session: Session, tables: Sequence[Path], record: Mapping[str, An
         raise NotValid(f"{len(bad)} of {len(rows)} fits are not valid")
 
 
-def _rows(tables: Sequence[Path], variables: Sequence[str], folder: Path | None) -> list[dict[str, Any]]:
+def _rows(tables: Sequence["AmplitudeTable"], variables: Sequence[str], folder: Path | None) -> list[dict[str, Any]]:
     """Return a row a table: each number by its column, and the parameters as `afm-jax fit` has them."""
     import xarray  # noqa: PLC0415
 
@@ -67,7 +72,7 @@ def _rows(tables: Sequence[Path], variables: Sequence[str], folder: Path | None)
         numbers = {name: found[name].values[number].item() for name in variables if name != "message"}
         outcome = words[numbers.pop("outcome")]
         parameters = {name: _parameter(name, numbers) for name in names}
-        told = {"table": str(table), "outcome": outcome, "valid": outcome == "valid"}
+        told = {"table": table.source, "outcome": outcome, "valid": outcome == "valid"}
         why = str(found["message"].values[number])
         rows.append(told | numbers | {"message": why, "parameters": parameters})
     return rows

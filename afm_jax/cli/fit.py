@@ -13,7 +13,14 @@ import click
 from afm_jax.cli.each import fit_tables
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, prepare_folder, with_session
-from afm_jax.cli.values import example_path, parse_around_plus_minus, parse_number, with_noise
+from afm_jax.cli.values import (
+    example_path,
+    parse_around_plus_minus,
+    parse_number,
+    tables_with,
+    with_noise,
+    with_quality_factor,
+)
 from afm_jax.contact.parameters import EFFECTS, REMOVABLE_EFFECTS, idle_without
 from afm_jax.words import text_table
 from fitting.parameters import CONTACT_DEFAULT, DELAY_LAW, LAWS, MODELS, NUISANCE_NAMES, model_parameters
@@ -98,6 +105,7 @@ class Names(click.ParamType):
     "of tapping curves on resonance too.",
 )
 @with_noise
+@with_quality_factor
 @click.option(
     "--scale-errors",
     is_flag=True,
@@ -174,13 +182,13 @@ def command(session: Session, tables: tuple[Path, ...], model: str, noise: float
     _check_each(tables, options)
     settings = _settings(model, options)
     if options["each"]:
-        fit_tables(session, tables, {"model": model, "noise": noise, **settings}, options["workers"])
+        read = tables_with(tables, noise, options["quality_factor"])
+        fit_tables(session, read, {"model": model, **settings}, options["workers"])
         return
     session.start_computing(*(f"fitting.forward:{name}" for name in ("impacts_of", "located", "linearise_pairs")))
     from fitting.fits.fit import find_fit, summarise  # noqa: PLC0415
     from fitting.report.report import summary  # noqa: PLC0415
     from fitting.tables.several import SeveralTables  # noqa: PLC0415
-    from fitting.tables.table import read_table  # noqa: PLC0415
 
     if options["arviz"] is not None:
         from fitting.sampling.inference_data import require_netcdf  # noqa: PLC0415
@@ -188,7 +196,7 @@ def command(session: Session, tables: tuple[Path, ...], model: str, noise: float
         prepare_folder(options["arviz"].absolute().parent)
         require_netcdf()
     options["posterior"] = options["posterior"] or options["trust"] or options["arviz"] is not None
-    read = [read_table(path, noise=noise) for path in tables or (example_path(),)]
+    read = tables_with(tables or (example_path(),), noise, options["quality_factor"])
     measured = read[0] if len(read) == 1 else SeveralTables(tuple(read))
     first = "the first run compiles for half a minute" if "delay" in model or model == "contact" else "some seconds"
     rows = f"{measured.rows} rows" + (f" of {len(read)} tables" if len(read) > 1 else "")
@@ -383,7 +391,8 @@ def _words(name: str, extra: Any) -> str:
         ]
         lines = text_table(["model", "chi2/dof", "AIC", "BIC", "law differs"], cells)
         lines += [f"  {model:<18} failed: {reason}" for model, reason in extra.failed.items()]
-        return "\n".join(["", "Models on the same rows, best first:", *lines, f"  {extra.verdict}"])
+        head = "Models, best first (AIC and BIC: of the formula alone, on the rows that all models use):"
+        return "\n".join(["", head, *lines, f"  {extra.verdict}"])
     intervals = {key: found["interval95"] for key, found in extra.to_dict()["parameters"].items()}
     head = "95 % credible intervals (posterior, flat priors):"
     if name == "bootstrap":

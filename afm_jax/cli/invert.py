@@ -7,12 +7,13 @@ import click
 
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import Finite, example_path, with_noise
+from afm_jax.cli.values import Finite, example_path, tables_with, with_noise, with_quality_factor
 
 
 @click.command()
 @click.argument("table", metavar="[TABLE.csv]", required=False, type=click.Path(path_type=Path))
 @with_noise
+@with_quality_factor
 @click.option(
     "--frequency-error",
     "frequency_error_khz",
@@ -34,10 +35,11 @@ from afm_jax.cli.values import Finite, example_path, with_noise
 )
 @click.option("--example", is_flag=True, help="Invert the bundled table instead of a file.")
 @with_session
-def command(
+def command(  # noqa: PLR0913
     session: Session,
     table: Path | None,
     noise: float | None,
+    quality_factor: tuple[float, float | None] | None,
     frequency_error_khz: float | None,
     truth: Path | None,
     law: Path | None,
@@ -60,9 +62,8 @@ def command(
         read_known_law,
     )
     from fitting.inversion.report import inversion_summary  # noqa: PLC0415
-    from fitting.tables.table import read_table  # noqa: PLC0415
 
-    measured = read_table(example_path() if table is None else table, noise=noise)
+    (measured,) = tables_with([example_path() if table is None else table], noise, quality_factor)
     known = None if truth is None else read_known_law(truth)
     fitted = None if law is None else read_fitted_law(law)
     with session.working(f"inverting {measured.rows} rows (the first run compiles for some seconds)"):

@@ -6,7 +6,7 @@ import click
 
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import Finite
+from afm_jax.cli.values import Finite, FiniteOrNone
 
 _SETTINGS = (
     ("sampling-rate-mhz", "MHz", "Samples per us; not needed with a column time_us."),
@@ -19,8 +19,9 @@ _SETTINGS = (
         "psi in platform = offset + beta cos(omega t + psi), t the trace's time [default: 0].",
     ),
     ("free-frequency-khz", "kHz", "Undamped natural frequency; else read off the trace, for counting impacts only."),
-    ("quality-factor", "Q", "Quality factor of the cantilever."),
+    ("quality-factor", "Q", "Quality factor of the cantilever; none: no air damping."),
     ("mass-ng", "ng", "Effective mass, for the table."),
+    ("spring-constant-n-per-m", "N_PER_M", "Or the spring constant, which says the mass k/Omega^2."),
     ("rest-nm", "nm", "What the deflection reads at the tip's rest position [default: 0]."),
 )
 
@@ -28,7 +29,8 @@ _SETTINGS = (
 def _with_settings(function):
     """Add an option for every setting of a trace."""
     for name, unit, text in reversed(_SETTINGS):
-        function = click.option(f"--{name}", type=Finite(), metavar=unit, help=text)(function)
+        kind = FiniteOrNone() if name == "quality-factor" else Finite()
+        function = click.option(f"--{name}", type=kind, metavar=unit, help=text)(function)
     return function
 
 

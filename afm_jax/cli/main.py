@@ -236,6 +236,7 @@ COMMANDS = {
     "simulate": ("afm_jax.cli.simulate", "Follow a scene in time: contacts, amplitudes, phases, energies."),
     "sweep": ("afm_jax.cli.sweep", "Compute many scenes, or fit many tables, over a grid of parameters; resumes."),
     "tapping": ("afm_jax.cli.tapping", "Read the energy of a tap, and the impact law, off a tapping curve."),
+    "tapping-map": ("afm_jax.cli.tapping_map", "Read the energy of a tap off every pixel of an image."),
     "verify": ("afm_jax.cli.verify", "Compare eqs. 5 to 8 with automatic differentiation and with 50 digits."),
 }
 """For every command the module whose `command` it is, and what the list of commands says of it."""

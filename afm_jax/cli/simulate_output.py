@@ -306,4 +306,5 @@ def _trace_comments(scene: Scene, drive: DrivePeriod) -> list[str]:
     known |= {"free_frequency_khz": cantilever.frequency_khz, "mass_ng": cantilever.mass_ng}
     if cantilever.quality_factor is not None:
         known["quality_factor"] = cantilever.quality_factor
-    return [f"{name} = {float(value)!r}" for name, value in known.items()]
+    damping = ["quality_factor = none"] if cantilever.quality_factor is None else []
+    return [*(f"{name} = {float(value)!r}" for name, value in known.items()), *damping]

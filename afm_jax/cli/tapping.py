@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from afm_jax.cli.main import NotValid
-from afm_jax.cli.read import NmPerVolt
-from afm_jax.cli.session import Session, prepare_folder, with_session
+from afm_jax.cli.read import READING_OPTIONS, with_reading
+from afm_jax.cli.session import Session, add_note, prepare_folder, with_session
 from afm_jax.cli.values import ValueAndError, with_noise
 
 if TYPE_CHECKING:
@@ -18,26 +18,21 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("curve_file", metavar="CURVE", type=click.Path(path_type=Path))
+@click.argument("curve_file", metavar="CURVE", required=False, type=click.Path(path_type=Path))
 @with_noise
-@click.option("--free-frequency-khz", type=ValueAndError(), metavar="KHZ", help="Instead of the file's; '90 +- 0.01'.")
-@click.option("--quality-factor", type=ValueAndError(), metavar="Q", help="Instead of the file's; '200 +- 2'.")
-@click.option(
-    "--spring-constant",
-    "--spring-constant-n-per-m",
-    "spring_constant_n_per_m",
-    type=ValueAndError(),
-    metavar="N_PER_M",
-    help="Instead of the file's; '5.4 +- 0.5'.",
-)
+@with_reading
 @click.option("--tip-calibration", type=ValueAndError(), metavar="C", help="True over stated amplitude; '1 +- 0.02'.")
-@click.option("--drive", type=click.Choice(["base", "force"]), help="Of an instrument's file: what shakes the tip.")
-@click.option("--nm-per-volt", type=NmPerVolt(), metavar="NM|slope", help="Of an instrument's file, as for `read`.")
 @click.option("--curve", type=click.IntRange(1), metavar="N", help="Only this curve of an instrument's file.")
 @click.option("--model", default="viscous+delay", show_default=True, help="Of the law, as for `afm-jax fit`.")
+@click.option("--example", is_flag=True, help="Analyse the bundled raw file, simulated with the defects of real ones.")
 @click.option("--no-law", is_flag=True, help="Leave the impact law out: energy, thresholds and speeds only, at once.")
+@click.option(
+    "--scale-errors",
+    is_flag=True,
+    help="Multiply the rows' errors where they scatter more (up to three times), instead of refusing their energy.",
+)
 @with_session
-def command(session: Session, curve_file: Path, *, no_law: bool, model: str, **options: Any) -> None:
+def command(session: Session, curve_file: Path | None, *, no_law: bool, model: str, **options: Any) -> None:
     """Read the energy of a tap off a tapping curve, and where the drive allows it the impact law.
 
     CURVE is a table of amplitude and phase against height (`# drive = force` or base, columns drive_frequency_khz,
@@ -50,17 +45,21 @@ def command(session: Session, curve_file: Path, *, no_law: bool, model: str, **o
     from fitting.tables.table import read_table  # noqa: PLC0415
     from fitting.tapping_curves.measured import is_table, read_measured  # noqa: PLC0415
 
+    how = {"no_law": no_law, "scale_errors": options.pop("scale_errors")}
+    if options.pop("example") == (curve_file is not None):
+        raise click.UsageError("give a curve, `afm-jax tapping CURVE`, or --example for a simulated raw file")
+    if curve_file is None:
+        curve_file, options = _example(options)
     if is_table(curve_file):
-        result = _analysed(
-            session, _given(read_table(curve_file, noise=options["noise"]), options), model, no_law=no_law
-        )
+        _refuse_reading(curve_file, options)
+        result = _analysed(session, _given(read_table(curve_file, noise=options["noise"]), options), model, **how)
         _finish(session, result)
         return
-    asked = ("free_frequency_khz", "quality_factor", "spring_constant_n_per_m", "drive", "nm_per_volt")
-    file = read_measured(curve_file, curve=options["curve"], **{name: options[name] for name in asked})
+    file = read_measured(curve_file, curve=options["curve"], **{name: options[name] for name in READING_OPTIONS})
+    for note in file.notes:
+        add_note(note)
     results = {
-        number: _analysed(session, _calibrated(table, options), model, no_law=no_law)
-        for number, table in file.tables.items()
+        number: _analysed(session, _calibrated(table, options), model, **how) for number, table in file.tables.items()
     }
     if len(results) == 1 and not file.refused:
         _finish(session, next(iter(results.values())))
@@ -68,10 +67,10 @@ def command(session: Session, curve_file: Path, *, no_law: bool, model: str, **o
     _finish_several(session, curve_file, file, results)
 
 
-def _analysed(session: Session, table: "AmplitudeTable", model: str, *, no_law: bool) -> "Tapping":
+def _analysed(session: Session, table: "AmplitudeTable", model: str, *, no_law: bool, scale_errors: bool) -> "Tapping":
     from fitting.tapping_curves.tapping import tapping, with_law  # noqa: PLC0415
 
-    result = tapping(table, law=False)
+    result = tapping(table, law=False, scale_errors=scale_errors)
     if no_law or not result.law_allowed:
         return result
     session.start_computing(*(f"fitting.forward:{name}" for name in ("impacts_of", "located", "linearise_pairs")))
@@ -132,6 +131,47 @@ def _finish_several(session: Session, path: Path, file: "MeasuredFile", results:
         raise NotValid(f"{path}: {'; '.join(named)}")
 
 
+def _example(options: dict[str, Any]) -> tuple[Path, dict[str, Any]]:
+    """Return the bundled raw file, and the options with what is known of its instrument where they say nothing."""
+    from fitting.examples.make_raw_curve import EXAMPLE, OPTIONS  # noqa: PLC0415
+
+    stated = {name: value for name, value in OPTIONS.items() if options[name] in {None, ""}}
+    path = EXAMPLE.relative_to(Path.cwd()) if EXAMPLE.is_relative_to(Path.cwd()) else EXAMPLE
+    words = " ".join(f"{_OPTION_OF.get(name, f'--{name}')} {_shown(value)}" for name, value in stated.items())
+    add_note(f"The example is simulated; as if it were measured: afm-jax tapping {path} {words}")
+    return path, options | stated
+
+
+_OPTION_OF = {
+    "nm_per_volt": "--nm-per-volt",
+    "spring_constant_n_per_m": "--spring-constant",
+    "quality_factor": "--quality-factor",
+    "free_frequency_khz": "--free-frequency-khz",
+}
+
+
+def _shown(value: Any) -> str:
+    return value if isinstance(value, str) else f"'{value[0]:g} +- {value[1]:g}'"
+
+
+def _refuse_reading(path: Path, options: dict[str, Any]) -> None:
+    """Refuse options that say how to read an instrument's file where a table says it all.
+
+    Raises:
+        click.UsageError: naming the first of them.
+    """
+    names = ("curve", *(name for name in READING_OPTIONS if name not in _OF_TABLES))
+    given = next((name for name in names if options[name] not in {None, ""}), None)
+    if given is not None:
+        raise click.UsageError(
+            f"--{given.replace('_', '-')} is for an instrument's file; {path} is a table, which says that itself"
+        )
+
+
+_OF_TABLES = ("free_frequency_khz", "quality_factor", "spring_constant_n_per_m")
+"""What the command line may say in place of a table."""
+
+
 def _given(table: "AmplitudeTable", options: dict[str, Any]) -> "AmplitudeTable":
     """Return a table with what the call says of the instrument in place of its own."""
     names = {
@@ -145,17 +185,10 @@ def _given(table: "AmplitudeTable", options: dict[str, Any]) -> "AmplitudeTable"
         if options[option] is not None
         for name, number in zip(pair, options[option], strict=True)
     }
-    return _calibrated(_with_mass(table, own), options)
-
-
-def _with_mass(table: "AmplitudeTable", own: dict[str, Any]) -> "AmplitudeTable":
-    """Return a table with numbers in place of its own; the mass is what spring constant and frequency make it."""
-    from fitting.tables.table import mass_of  # noqa: PLC0415
-
-    spring = own.get("spring_constant_n_per_m", table.spring_constant_n_per_m)
-    if own and spring is not None:
-        own = own | {"mass_ng": mass_of(spring, own.get("free_frequency_khz", table.free_frequency_khz))}
-    return replace(table, **own) if own else table
+    if own and own.get("spring_constant_n_per_m", table.spring_constant_n_per_m) is not None:
+        # what spring constant and frequency make it
+        own["mass_ng"] = None
+    return _calibrated(replace(table, **own) if own else table, options)
 
 
 def _calibrated(table: "AmplitudeTable", options: dict[str, Any]) -> "AmplitudeTable":

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
     from afm_jax.scenefile.parameter_paths import ParameterRange
     from afm_jax.scenefile.scenefile import Start
+    from fitting.tables.table import AmplitudeTable
 
 
 _MOST = 1_000_000
@@ -51,6 +52,14 @@ class Finite(click.ParamType):
             shown = cut_short(str(value), 60)
             self.fail(f"must be a {'positive' if self.positive else 'finite'} number, but is {shown}", param, ctx)
         return number
+
+
+class FiniteOrNone(Finite):
+    """A number, or the word "none", which stands for an infinite one."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> float:
+        """Return the number that a text says; see `Finite`."""
+        return math.inf if value in ("none", math.inf) else super().convert(value, param, ctx)
 
 
 class Numbers(click.ParamType):
@@ -141,6 +150,10 @@ class ValueAndError(click.ParamType):
 
     name = "value"
 
+    def __init__(self, *, none: bool = False):
+        """Say whether it may be the word "none", which stands for an infinite value."""
+        self.none = none
+
     def convert(
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> tuple[float, float | None]:
@@ -151,6 +164,8 @@ class ValueAndError(click.ParamType):
         """
         if isinstance(value, tuple):
             return value
+        if self.none and value == "none":
+            return math.inf, None
         try:
             numbers = parse_around_plus_minus(str(value))
         except ValueError as error:
@@ -213,6 +228,33 @@ with_noise = click.option(
     help="Relative error of amplitudes without one, such as 1%.",
 )
 """Give a command the option --noise."""
+with_quality_factor = click.option(
+    "--quality-factor",
+    type=ValueAndError(none=True),
+    metavar="Q",
+    help="Instead of the table's; '40 +- 2', or none: no air damping.",
+)
+"""Give a command the option --quality-factor."""
+
+
+def tables_with(
+    paths: Sequence[Path], noise: float | None, quality_factor: tuple[float, float | None] | None
+) -> "list[AmplitudeTable]":
+    """Return amplitude tables from their files, with the quality factor of the call, if it gives one.
+
+    Raises:
+        TableError: if one cannot be read, or the quality factor is impossible.
+    """
+    from dataclasses import replace  # noqa: PLC0415
+
+    from fitting.tables.table import read_table  # noqa: PLC0415
+
+    read = [read_table(path, noise=noise) for path in paths]
+    if quality_factor is None:
+        return read
+    value, error = quality_factor
+    own = None if math.isinf(value) else value
+    return [replace(table, quality_factor=own, quality_factor_error=error) for table in read]
 
 
 def parse_numbers(text: str, what: str = "number", *, positive: bool = False) -> tuple[float, ...]:

@@ -183,7 +183,7 @@ class _Finder:
         self.omega, self.top = float(scene.platform.angular_frequency), float(scene.platform.top_speed_nm_per_us)
 
     def scenes(self, count: int) -> Scene:
-        return jax.tree.map(lambda leaf: jnp.full(count, leaf), self.scene)
+        return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count, *leaf.shape)), self.scene)
 
     def tips(self, phase: np.ndarray, speed: np.ndarray) -> Tips:
         """Return tips that leave at drive phases with rebound speeds."""
@@ -341,7 +341,7 @@ def _towards(
     omega, top = scene.platform.angular_frequency, scene.platform.top_speed_nm_per_us
 
     def piece(tips: Tips) -> tuple[Tips, Array]:
-        scenes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, tips.time_us.shape), scene)
+        scenes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (*tips.time_us.shape, *leaf.shape)), scene)
         end = lax.fori_loop(0, impacts, lambda _, now: advance(scenes, now).end, tips)
         turn = omega * end.time_us[:, None] - points[:, 0]
         turn = turn - 2.0 * jnp.pi * jnp.round(turn / (2.0 * jnp.pi))

@@ -146,7 +146,7 @@ def highest_orbits(
         places = jax.tree.map(lambda part: part.ravel(), roots.place)
         rows = jnp.arange(count * slots) // slots
         nothing = (jnp.zeros(count * slots, bool),) * 2 + (jnp.full((count * slots, len(names) + 1), jnp.nan),)
-        there = frame.periodic & (impact_law_of(scenes).r > 0.0)
+        there = frame.periodic & impact_law_of(scenes).leaves
         few = max(count // _ORBITS_AT_ONCE, 1)
         known = for_few(orbit_of, roots.found.ravel() & jnp.repeat(there, slots), (places, rows), nothing, few)
         admissible, steady, numbers = (part.reshape(count, slots, *part.shape[1:]) for part in known)

@@ -16,7 +16,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.closed_loops import CAPTURE, Equations, Frame, frame_of, read_points
 from afm_jax.dynamics.contact_orbits import ContactFlights, contact_loops
 from afm_jax.dynamics.curves import CurveLeg, FollowedCurve, followed_both_ways, lies_on, root_on, tested_by
-from afm_jax.dynamics.impact_loop import coordinate_of, driven_part, samples_for
+from afm_jax.dynamics.impact_loop import driven_part, samples_for
 from afm_jax.dynamics.impact_orbits import MOST_IMPACTS, many_impact_orbits
 from afm_jax.dynamics.special_points import OrbitBranch, SpecialCurve, SpecialPoint, special_curves, special_points_of
 from afm_jax.impact.law import impact_law_of
@@ -173,7 +173,7 @@ def _single_impact_loops(scene: Scene, order: int) -> tuple[Float[np.ndarray, "o
     good = exists & np.asarray(found.admissible)
     omega = drive_of(scene).angular_frequency
     phases = np.asarray(found.phase_rad) - omega * np.asarray(found.delay_us)
-    coordinates = np.asarray(coordinate_of(found.approach_speed_nm_per_us, impact_law_of(scene)))
+    coordinates = np.asarray(impact_law_of(scene).coordinate(found.approach_speed_nm_per_us))
     return np.stack([phases, coordinates], axis=1)[good], int(np.sum(exists & ~good))
 
 

@@ -34,7 +34,6 @@ from afm_jax.dynamics.iteration import (
 )
 from afm_jax.dynamics.verdicts import RECORDED, WHY_UNRESOLVED, MotionKind, Verdicts, verdicts_of
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
-from afm_jax.impact.lasting_impact import LawImpact
 from afm_jax.impact.law import impact_law_of
 from afm_jax.motion.record import State
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
@@ -182,7 +181,7 @@ def _exponents_of_contacts(scenes: Scene, tips: Tips, *, impacts: int, transient
     known = np.isfinite(passed)
     steps = passed.shape[1]
     pairs = [np.where(known, part, 0.0).ravel() for part in (departure[:, :-1], velocity[:, :-1], passed)]
-    of_all = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), steps), scenes)
+    of_all = jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf), steps, axis=0), scenes)
 
     def work(rows: tuple[Scene, Array, Array, Array]) -> Array:
         each_scene, time, speed, duration = rows
@@ -290,7 +289,7 @@ def _jacobian(scenes: Scene, step: MapStep) -> tuple[tuple[Array, Array, Array, 
 
     def one(scene: Scene, time: Array, velocity: Array, arrival: Array, before: Array):
         cantilever, platform = scene.cantilever, scene.platform
-        law = LawImpact(impact_law_of(scene))
+        law = impact_law_of(scene)
         flight = flight_jacobian(cantilever, platform, time, velocity, arrival)
         contact = contact_jacobian(law, cantilever, platform, arrival, before)
         kept = jnp.exp(-2.0 * cantilever.decay_rate * (arrival - time))

@@ -1,9 +1,9 @@
 """The closing conditions of an orbit of m impacts in N drive periods, all its flights at once, and what it is good for.
 
-Unknowns are the drive phase at which the tip arrives at each impact and the coordinate of that impact (`speeds_at`), in
-which the law is smooth up to capture. Every flight has to end at height and velocity of the next arrival: 2 m smooth
-equations, with no search for a first impact in them, that go on through folds and past a graze. Whether the tip really
-makes those flights is another question, and that of the map: `flies`.
+Unknowns are the drive phase at which the tip arrives at each impact and the coordinate of that impact
+(`Law.speeds`), in which the law is smooth up to capture. Every flight has to end at height and velocity of the next
+arrival: 2 m smooth equations, with no search for a first impact in them, that go on through folds and past a graze.
+Whether the tip really makes those flights is another question, and that of the map: `flies`.
 
 The linearised map of the whole loop is the product of its flights' and impacts' Jacobians.
 """
@@ -24,8 +24,8 @@ from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.impact.amplitude import FlightEnds, highest_of_sum, peak_amplitude
 from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
-from afm_jax.impact.lasting_impact import LawImpact, lasting
-from afm_jax.impact.law import ImpactLaw, Speeds, impact_law_of
+from afm_jax.impact.lasting_impact import lasting
+from afm_jax.impact.law import Law, Speeds, impact_law_of
 from afm_jax.outcomes import Outcome
 from afm_jax.units import RAD_PER_US_PER_KHZ, within_turn
 
@@ -44,7 +44,7 @@ class ImpactLoop(NamedTuple):
     cantilever: Cantilever
     surface: Platform | Surface
     response: Surface | None
-    impact: LawImpact
+    impact: Law
     period_us: Float[Array, ""]
     """N drive periods."""
     angular_frequency: Float[Array, ""]
@@ -89,8 +89,8 @@ def loop_of(scene: Scene, order: Float[Array, ""], driven: str) -> ImpactLoop:
     """
     omega = RAD_PER_US_PER_KHZ * getattr(scene, driven).frequency_khz
     surface, response = surface_of(scene)
-    impact = LawImpact(impact_law_of(scene))
-    return ImpactLoop(scene.cantilever, surface, response, impact, 2.0 * jnp.pi * order / omega, omega)
+    law = impact_law_of(scene)
+    return ImpactLoop(scene.cantilever, surface, response, law, 2.0 * jnp.pi * order / omega, omega)
 
 
 def samples_for(scene: Scene, order: int, driven: str) -> int:
@@ -100,13 +100,6 @@ def samples_for(scene: Scene, order: int, driven: str) -> int:
     while samples < wanted and samples < _MOST_SAMPLES:
         samples *= 2
     return samples
-
-
-def coordinate_of(approach_speed: Float[Array, "..."], law: ImpactLaw) -> Float[Array, "..."]:
-    """Return the coordinate Y of `speeds_at` of an impact that comes at a speed in nm/us above capture."""
-    square = law.epsilon + (law.viscous_loss / (2.0 * law.r)) ** 2
-    rebound = law.rebound_speed(approach_speed)
-    return rebound + jnp.sqrt(jnp.maximum(rebound**2 + square, 1e-300))
 
 
 def impacts_at(unknowns: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoop) -> Impacts:

@@ -22,7 +22,6 @@ from afm_jax.dynamics.impact_loop import (
     ImpactLoop,
     LoopReading,
     closing_gaps,
-    coordinate_of,
     driven_part,
     loop_of,
     reading_of,
@@ -64,7 +63,7 @@ class ManyImpactOrbits(ResultTuple):
     left out.
 
     Attributes:
-        loops: drive phases at the arrivals in rad, ascending, then coordinates in nm/us (`speeds_at`).
+        loops: drive phases at the arrivals in rad, ascending, then coordinates in nm/us (`Law.speeds`).
         reading: what there is to know of each, a `LoopReading`; all are admissible.
         multipliers: eigenvalues of the linearised map, the larger first.
         stable: both lie inside the unit circle.
@@ -176,7 +175,7 @@ def _search(scene: Scene, order: Array, starts: Array, *, impacts: int, driven: 
         turns = (phase[:, -1] - phase[:, 0]) / (2.0 * jnp.pi) - order
         change = (speed[:, -1] - speed[:, 0]) / (speed[:, -1] + speed[:, 0])
         misfit.append(jnp.abs(turns) + jnp.abs(change))
-        coordinates = coordinate_of(speed[:, :-1], loop.impact.law)
+        coordinates = loop.impact.coordinate(speed[:, :-1])
         guesses.append(jnp.concatenate([phase[:, :-1], coordinates / top_speed], axis=1))
     guesses, misfit = jnp.concatenate(guesses), jnp.concatenate(misfit)
     near = jnp.argsort(jnp.where(jnp.isfinite(misfit), misfit, jnp.inf))[: starts.shape[0]]

@@ -25,7 +25,7 @@ from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, Flight
-from afm_jax.impact.law import ImpactLaw, impact_law_of
+from afm_jax.impact.law import Law, impact_law_of
 from afm_jax.impact.map import NextImpact, impact_after
 from afm_jax.impact.orbits import fastest_steady_orbit, orbit_problem
 from afm_jax.motion.law_motion import CONSTANT_PUSH, Bed, LawLeg, or_rest, through_impact
@@ -107,10 +107,10 @@ def _landed(scenes: Scene, tips: Tips, impact: NextImpact) -> MapStep:
     no = jnp.zeros_like(going)
     # without adhesion alone a tip that came to rest may leave again, and chatter comes to an end
     law = impact_law_of(scenes)
-    may_rest = landed & (law.epsilon == 0.0) & (captured | (rebound < jax.vmap(_slowest_chatter)(scenes)))
+    may_rest = landed & (~law.adheres) & (captured | (rebound < jax.vmap(_slowest_chatter)(scenes)))
 
     (time, gap, velocity), rested, held = for_few(_rest, may_rest, (scenes, impact), (leaving, no, no))
-    stuck = (captured & (law.epsilon > 0.0)) | held
+    stuck = (captured & law.adheres) | held
     goes_on = landed & ~stuck
     outcome = jnp.where(goes_on, Outcome.IMPACT, jnp.where(stuck, Outcome.CAPTURED, impact.outcome))
     whole = jnp.floor(jnp.where(goes_on, time, 0.0) / surface.period_us)
@@ -138,7 +138,7 @@ def _slowest_chatter(scene: Scene) -> Float[Array, ""]:
     omega, decay = scene.cantilever.angular_frequency, scene.cantilever.decay_rate
     reach = jnp.abs(surface.offset_nm) + surface.amplitude_nm
     push = surface.largest_acceleration_nm_per_us2 + 2.0 * decay * surface.top_speed_nm_per_us + omega**2 * reach
-    return 0.5 * CONSTANT_PUSH * push * (1.0 - impact_law_of(scene).r) / bed.fastest
+    return 0.5 * CONSTANT_PUSH * push * (1.0 - impact_law_of(scene).slow_restitution) / bed.fastest
 
 
 def for_few(
@@ -297,13 +297,13 @@ def _on_orbits(scenes: Scene, clearance_nm: Float[Array, " lanes"]) -> tuple[Boo
         height, speed = scene.cantilever.propagator(rise)(platform.position(start), velocity)
         gap = jnp.where(clearance > 0.0, height - platform.position(start + rise), 0.0)
         risen = (clearance == 0.0) | (gap > _RISEN * clearance)
-        return steady & risen & (law.r > 0.0), (start + rise) % platform.period_us, gap, speed
+        return steady & risen & law.leaves, (start + rise) % platform.period_us, gap, speed
 
     there, time, gap, velocity = jax.vmap(one)(scenes, clearance_nm)
     return there, tips_at(scenes, time, velocity)._replace(gap_nm=gap)
 
 
-def laws_of(scenes: Scene) -> tuple[ImpactLaw, Bool[np.ndarray, " lanes"]] | None:
+def laws_of(scenes: Scene) -> tuple[Law, Bool[np.ndarray, " lanes"]] | None:
     """Return a batch of laws, those closest to the contacts of scenes with one, and where there is one; None: nowhere.
 
     Args:

@@ -75,7 +75,7 @@ def sticking_orbit(scene: Scene) -> StickingOrbit | str:
     require_float64(scene)
     law, period = impact_law_of(scene), drive_of(scene).period_us
     driven_part(scene)
-    if float(law.epsilon) > 0.0 or law.delay is not None:
+    if bool(law.adheres) or law.delay is not None:
         return "with adhesion or a delay a tip that comes to rest stays"
     surface, response = surface_of(scene)
     bed = Bed(scene.cantilever, surface)

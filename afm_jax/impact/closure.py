@@ -5,7 +5,7 @@ assumed approach speed u the law gives the rebound speed w and the delay tau, an
 duration N T - tau ends where the next one begins are *linear* in a = cos(omega t_out), b = sin(omega t_out). Every root
 of a^2 + b^2 = 1 is an orbit. Both signs of eq. 9's root are among them, and nothing else, because w > 0 throughout.
 
-In place of u stands a coordinate of the impact in which the law is smooth up to capture (`speeds_at`). Without a delay
+In place of u stands a coordinate of the impact in which the law is smooth up to capture (`Law.speeds`). Without a delay
 the condition is then a quartic in it. Where the impact lasts, speeds and delay need the phase: three passes alternate
 between the two, close enough to find every orbit, and Newton's method closes the map itself from there.
 """
@@ -21,7 +21,7 @@ from afm_jax.apparatus.cantilever import Cantilever, Propagator
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.trigonometry import sine_cosine
 from afm_jax.impact.implicit import solved_pair
-from afm_jax.impact.lasting_impact import Impact, LawImpact, corrected, lasting, middle_of_contact
+from afm_jax.impact.lasting_impact import Impact, corrected, lasting, middle_of_contact
 from afm_jax.impact.law import ImpactLaw, Speeds
 
 _REGULAR = 1e-12
@@ -199,8 +199,8 @@ def instantaneous_quartic(problem: OrbitProblem) -> Float[Array, " 5"]:
 
 
 def _law_of(problem: OrbitProblem) -> ImpactLaw:
-    assert isinstance(problem.impact, LawImpact)  # all that takes no time  # noqa: S101
-    return problem.impact.law
+    assert isinstance(problem.impact, ImpactLaw)  # the formula alone makes a quartic  # noqa: S101
+    return problem.impact
 
 
 @jax.jit

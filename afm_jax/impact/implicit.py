@@ -21,9 +21,9 @@ _PAIR = 2
 
 
 def implicit_root(
-    residual: Callable[[Float[Array, ""], Any], Float[Array, ""]], root: Float[Array, ""], parameters: Any
-) -> Float[Array, ""]:
-    """Attach the implicit derivative to a root that a search has found.
+    residual: Callable[[Float[Array, "..."], Any], Float[Array, "..."]], root: Float[Array, "..."], parameters: Any
+) -> Float[Array, "..."]:
+    """Attach the implicit derivative to a root that a search has found, or to several, each of its own equation.
 
     Args:
         residual: f(x, parameters), smooth near the root; a plain function, the same object at every call.

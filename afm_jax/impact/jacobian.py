@@ -17,8 +17,8 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.apparatus.surface import Surface, seen_freely
 from afm_jax.checks import as_argument, check_parameter, checked
-from afm_jax.impact.lasting_impact import Impact, LawImpact, speeds_of_impact
-from afm_jax.impact.law import ImpactLaw, impact_law_of
+from afm_jax.impact.lasting_impact import Impact, speeds_of_impact
+from afm_jax.impact.law import Law, impact_law_of
 from afm_jax.impact.map import next_impact
 from afm_jax.outcomes import Outcome
 
@@ -154,7 +154,7 @@ def flight_jacobian(
 
 
 def impact_jacobian(
-    law: ImpactLaw, platform: Platform | Surface, arrival_us: ArrayLike, velocity_before: ArrayLike
+    law: Law, platform: Platform | Surface, arrival_us: ArrayLike, velocity_before: ArrayLike
 ) -> Float[Array, "2 2"]:
     """Return d(t_out, V')/d(t_in, V) of an impact: eq. 7 with viscous loss and collision delay, without corrections.
 
@@ -189,8 +189,8 @@ def contact_jacobian(
 
     Arguments as for `impact_jacobian`; ``cantilever`` pulls at the tip while the impact lasts.
     """
-    if isinstance(impact, LawImpact) and not impact.lasts:
-        return impact_jacobian(impact.law, platform, arrival_us, velocity_before)
+    if isinstance(impact, Law) and not impact.lasts:
+        return impact_jacobian(impact, platform, arrival_us, velocity_before)
 
     def through(arriving: Float[Array, " 2"]) -> Float[Array, " 2"]:
         arrival, before = arriving
@@ -236,7 +236,7 @@ def _map_jacobian(seen: Scene, response: Surface | None, time, velocity, impact)
     if response is not None:
         velocity, before = velocity - response.velocity(time), before - response.velocity(arrival)
     flight = flight_jacobian(seen.cantilever, seen.platform, time, velocity, arrival)
-    law = contact_jacobian(LawImpact(impact_law_of(seen)), seen.cantilever, seen.platform, arrival, before)
+    law = contact_jacobian(impact_law_of(seen), seen.cantilever, seen.platform, arrival, before)
     whole = law @ flight
     if response is not None:
         # lab velocities have the response's in them, which changes with the time

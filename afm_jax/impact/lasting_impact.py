@@ -35,7 +35,7 @@ from jaxtyping import Array, Bool, Float
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import Surface
-from afm_jax.impact.law import ImpactLaw, Speeds, capture_coordinate, speeds_at
+from afm_jax.impact.law import Law, Speeds
 
 PULLS = (-3.0, 4.0)
 """Range of kappa in which F and H are right to 1e-6 of themselves; beyond, they are held."""
@@ -75,8 +75,6 @@ SHALLOWER = 8.3576e-2
 """The same of the integral of its indentation."""
 SPREAD = 4.6448e-2
 """Mean square of the time from mid contact, weighted by a Hertz contact's indentation, over tau^2."""
-BRIDGE_NM = 4.7
-"""Length in nm over which a leaving tip keeps its energy, where nothing says it: the paper's bridge."""
 USUAL_LEAD = 1.3
 """Lead b of a tip that keeps its energy over a length, over that length: what comes closest for eight contacts."""
 
@@ -140,60 +138,6 @@ class Impact(Protocol):
     def at_approach(self, approach_speed: Float[Array, ""]) -> Speeds:
         """Return the same at an approach speed; a captured tip has no rebound and no delay."""
         ...
-
-
-class LawImpact(eqx.Module):
-    """An `ImpactLaw` as an impact; its coordinate is the Y of `speeds_at`."""
-
-    law: ImpactLaw
-
-    @property
-    def delayed(self) -> bool:
-        """Whether the law has a delay."""
-        return self.law.delay is not None
-
-    @property
-    def lasts(self) -> bool:
-        """Whether the delay has its corrections."""
-        return self.law.lasts
-
-    @property
-    def lowest(self) -> Float[Array, ""]:
-        """Y at which the tip is captured."""
-        return capture_coordinate(self.law)
-
-    @property
-    def reach(self) -> Float[Array, ""]:
-        """The same: adhesion counts up to twice the capture speed."""
-        return capture_coordinate(self.law)
-
-    @property
-    def lead(self) -> Float[Array, ""]:
-        """The delay's lead in nm."""
-        return jnp.zeros_like(self.law.r) if self.law.delay is None else self.law.delay.lead_nm
-
-    @property
-    def raised(self) -> Float[Array, ""]:
-        """Half the delay's offset."""
-        return jnp.zeros_like(self.law.r) if self.law.delay is None else 0.5 * self.law.delay.offset_nm
-
-    @property
-    def length(self) -> Float[Array, ""]:
-        """That of the paper's bridge."""
-        return jnp.full_like(self.law.r, BRIDGE_NM)
-
-    def hertz_time(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return a u^(-1/5) of the delay."""
-        hertz = jnp.zeros_like(self.law.r) if self.law.delay is None else self.law.delay.hertz
-        return hertz * approach_speed**-0.2
-
-    def speeds(self, coordinate: Float[Array, ""]) -> Speeds:
-        """Return approach and rebound speed and the delay at Y."""
-        return speeds_at(coordinate, self.law)
-
-    def at_approach(self, approach_speed: Float[Array, ""]) -> Speeds:
-        """Return what the law says of an approach speed."""
-        return Speeds(approach_speed, self.law.rebound_speed(approach_speed), self.law.collision_delay(approach_speed))
 
 
 class TabulatedImpact(eqx.Module):
@@ -711,7 +655,7 @@ def lasting(
 
 
 def delay_before(
-    impact: LawImpact,
+    law: Law,
     rebound_speed: Float[Array, ""],
     leaving_us: Float[Array, ""],
     cantilever: Cantilever,
@@ -721,23 +665,22 @@ def delay_before(
 
     Arguments as above; ``leaving_us`` is the end of contact. A tip that does not leave has none.
     """
-    law = impact.law
     leaves = rebound_speed > 0.0
     rebound = jnp.where(leaves, rebound_speed, 1.0)
 
     def of_free(free_rebound: Float[Array, ""]) -> Speeds:
         approach = law.approach_speed(free_rebound)
-        return Speeds(approach, free_rebound, impact.at_approach(approach).delay)
+        return Speeds(approach, free_rebound, law.collision_delay(approach))
 
     def improve(_, state: Speeds) -> Speeds:
         free = of_free(state.rebound)
         middle = middle_of_contact(cantilever, surface, leaving_us - 0.5 * state.delay)
-        found = corrected(free, middle, cantilever, impact)
+        found = corrected(free, middle, cantilever, law)
         square = free.rebound**2 + rebound**2 - found.rebound**2
         return Speeds(free.approach, jnp.sqrt(jnp.maximum(square, (0.1 * rebound) ** 2)), found.delay)
 
     begin = of_free(rebound)
-    found = lax.fori_loop(0, PASSES, improve, begin) if impact.lasts else begin
+    found = lax.fori_loop(0, PASSES, improve, begin) if law.lasts else begin
     return jnp.where(leaves, found.delay, 0.0)
 
 

@@ -1,17 +1,29 @@
 """The impact law: how fast the tip leaves for how fast it came, and how late.
 
-The squared rebound speed of eq. 6, with the viscous loss that the liquid bridge adds (linear in speed):
-u_out^2 = r^2 u_in^2 - c u_in - epsilon. All speeds are relative to the platform and positive.
+A law is a function from the approach speed to the rebound speed and the collision delay, with a capture speed up to
+which the tip stays. Two kinds: the formula of eq. 6 with the viscous loss that the liquid bridge adds (`ImpactLaw`),
+u_out^2 = r^2 u_in^2 - c u_in - epsilon, and a table of speeds, measured, fitted or computed (`TabulatedLaw`). All
+speeds are relative to the platform and positive.
 """
 
-from typing import NamedTuple
+import dataclasses
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
+from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from afm_jax.apparatus.scene import Scene
-from afm_jax.checks import as_argument, as_parameter, check_kind, check_parameter, readable
+from afm_jax.checks import as_argument, as_parameter, as_real, check_kind, check_parameter, is_traced, readable
+from afm_jax.impact.implicit import implicit_root
+
+BRIDGE_NM = 4.7
+"""Length in nm over which a leaving tip keeps its energy, where nothing says it: the paper's bridge."""
 
 
 def squared_rebound_speed(
@@ -73,7 +85,124 @@ class CollisionDelay(eqx.Module):
         return hertz + self.lead_nm * (rebound_slope / w**2 - 1.0 / u**2) + self.offset_nm / u**2
 
 
-class ImpactLaw(eqx.Module):
+class Law(eqx.Module):
+    """What the tip does at an impact, as functions of the approach speed: of a free tip on a sample at rest.
+
+    A delay with corrections adds to it what happens while the impact lasts (`afm_jax.impact.lasting_impact`). Near
+    capture speeds are singular functions of each other; orbits use a coordinate Y in which both are smooth.
+    """
+
+    @property
+    @abstractmethod
+    def delay(self) -> CollisionDelay | None:
+        """The formula of the delay, with or without its corrections; None: instantaneous impacts."""
+
+    @property
+    @abstractmethod
+    def capture_speed_nm_per_us(self) -> Float[Array, "..."]:
+        """Approach speed up to which the tip is captured."""
+
+    @property
+    def delayed(self) -> bool:
+        """Whether the next flight begins at another time than the last one ends."""
+        return self.delay is not None
+
+    @property
+    def lasts(self) -> bool:
+        """Whether platform, spring and air act during the contact: a delay, with its corrections."""
+        return self.delay is not None and self.delay.corrections
+
+    @property
+    @abstractmethod
+    def adheres(self) -> Bool[Array, "..."]:
+        """Whether adhesion holds a captured tip; if not, it leaves when the platform falls away fast enough."""
+
+    @property
+    @abstractmethod
+    def leaves(self) -> Bool[Array, "..."]:
+        """Whether any tip leaves: if not, every impact is a capture."""
+
+    @property
+    @abstractmethod
+    def slow_restitution(self) -> Float[Array, "..."]:
+        """Coefficient of restitution of the slowest impacts of a law without adhesion: what chatter dies out with."""
+
+    @property
+    @abstractmethod
+    def lowest(self) -> Float[Array, ""]:
+        """Coordinate Y in nm/us at which the tip is captured."""
+
+    @property
+    def reach(self) -> Float[Array, ""]:
+        """Distance in nm/us from the lowest coordinate over which adhesion counts: up to twice the capture speed."""
+        return self.lowest
+
+    @property
+    def lead(self) -> Float[Array, ""]:
+        """Length b in nm of the lead b (1/u_out - 1/u_in) that the delay contains."""
+        return jnp.zeros_like(self.lowest) if self.delay is None else self.delay.lead_nm
+
+    @property
+    def raised(self) -> Float[Array, ""]:
+        """Height in nm of the solid's surface over gap 0, as the delay tells it: half its offset."""
+        return jnp.zeros_like(self.lowest) if self.delay is None else 0.5 * self.delay.offset_nm
+
+    @property
+    def length(self) -> Float[Array, ""]:
+        """Length in nm over which a leaving tip keeps its energy: that of the paper's bridge."""
+        return jnp.full_like(self.lowest, BRIDGE_NM)
+
+    def hertz_time(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return the time in us that a Hertz contact of the same stiffness takes at a speed in nm/us: a u^(-1/5)."""
+        return jnp.zeros_like(approach_speed) if self.delay is None else self.delay.hertz * approach_speed**-0.2
+
+    @abstractmethod
+    def speeds(self, coordinate: Float[Array, "..."]) -> Speeds:
+        """Return approach and rebound speed and the delay at a coordinate Y above `lowest`, smooth up to capture."""
+
+    @abstractmethod
+    def coordinate(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return the coordinate Y in nm/us of an impact that comes at a speed in nm/us above capture."""
+
+    @abstractmethod
+    def captures(self, approach_speed: ArrayLike) -> Bool[Array, "..."]:
+        """Say whether the tip stays at an approach speed in nm/us."""
+
+    @abstractmethod
+    def rebound_speed(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return u_out in nm/us for u_in in nm/us; 0 where the tip is captured."""
+
+    @abstractmethod
+    def rebound_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return d u_out/d u_in, a number; 0 where the tip is captured."""
+
+    @abstractmethod
+    def approach_speed(self, rebound_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return the u_in in nm/us that leaves at u_out in nm/us: the law read backwards."""
+
+    @abstractmethod
+    def collision_delay(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return the delay tau in us at an approach speed in nm/us; 0 without a delay or where captured."""
+
+    @abstractmethod
+    def delay_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return d tau/d u_in in us^2/nm; 0 without a delay or where captured."""
+
+    def extrapolated(self, approach_speed: ArrayLike) -> Bool[Array, "..."]:
+        """Say whether an approach speed in nm/us is outside those that the law is known for: a formula's never is."""
+        return jnp.zeros(jnp.shape(approach_speed), bool)
+
+    def at_approach(self, approach_speed: Float[Array, "..."]) -> Speeds:
+        """Return the speeds in nm/us and the delay in us at an approach speed; a captured tip has neither."""
+        return Speeds(approach_speed, self.rebound_speed(approach_speed), self.collision_delay(approach_speed))
+
+    def energy_lost(self, approach_speed: ArrayLike, mass_ng: ArrayLike = 1.0) -> Float[Array, "..."]:
+        """Return the energy an impact takes in aJ, m (u_in^2 - u_out^2)/2; all of it where the tip is captured."""
+        u = as_argument(approach_speed)
+        return 0.5 * as_argument(mass_ng) * (u * u - self.rebound_speed(u) ** 2)
+
+
+class ImpactLaw(Law):
     """The impact law of eq. 6 with viscous loss and collision delay; eq. 1 is `epsilon=0`.
 
     Its methods tell the impact of a free tip on a sample at rest; a delay with corrections adds to it what happens
@@ -97,7 +226,7 @@ class ImpactLaw(eqx.Module):
     r: Float[Array, "..."] = eqx.field(converter=as_parameter)
     epsilon: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.0)
     viscous_loss: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.0)
-    delay: CollisionDelay | None = None
+    delay: CollisionDelay | None = None  # pyright: ignore[reportIncompatibleMethodOverride]
 
     __repr__ = readable
 
@@ -112,9 +241,26 @@ class ImpactLaw(eqx.Module):
         return squared_rebound_speed(approach_speed, self.r, self.epsilon, self.viscous_loss) <= 0.0
 
     @property
-    def lasts(self) -> bool:
-        """Whether impacts last: a delay, with the corrections of what happens meanwhile."""
-        return self.delay is not None and self.delay.corrections
+    def adheres(self) -> Bool[Array, "..."]:
+        """Whether epsilon is above 0: adhesion holds a captured tip."""
+        return self.epsilon > 0.0
+
+    @property
+    def leaves(self) -> Bool[Array, "..."]:
+        """Whether r is above 0: if not, every impact is a capture."""
+        return self.r > 0.0
+
+    @property
+    def slow_restitution(self) -> Float[Array, "..."]:
+        """The coefficient r."""
+        return self.r
+
+    @property
+    def lowest(self) -> Float[Array, ""]:
+        """Coordinate q = sqrt(epsilon + c^2/4r^2) in nm/us at which the tip is captured."""
+        square = self.epsilon + (self.viscous_loss / (2.0 * self.r)) ** 2
+        positive = square > 0.0
+        return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
 
     @property
     def capture_speed_nm_per_us(self) -> Float[Array, "..."]:
@@ -145,11 +291,6 @@ class ImpactLaw(eqx.Module):
         leaves = self.r > 0.0
         return jnp.where(leaves, (self.viscous_loss + root) / (2.0 * jnp.where(leaves, self.r, 1.0) ** 2), jnp.inf)
 
-    def energy_lost(self, approach_speed: ArrayLike, mass_ng: ArrayLike = 1.0) -> Float[Array, "..."]:
-        """Return the energy an impact takes in aJ, m (u_in^2 - u_out^2)/2; all of it where the tip is captured."""
-        u = as_argument(approach_speed)
-        return 0.5 * as_argument(mass_ng) * (u * u - self.rebound_speed(u) ** 2)
-
     def collision_delay(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
         """Return the delay tau in us at an approach speed in nm/us; 0 without a delay or where captured."""
         u = as_argument(approach_speed)
@@ -169,37 +310,663 @@ class ImpactLaw(eqx.Module):
         u, rebound = jnp.where(free, u, 1.0), jnp.where(free, rebound, 1.0)
         return jnp.where(free, self.delay.slope(u, rebound, self.rebound_slope(u)), 0.0)
 
+    def coordinate(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return the coordinate Y in nm/us of an impact that comes at a speed in nm/us above capture."""
+        square = self.epsilon + (self.viscous_loss / (2.0 * self.r)) ** 2
+        rebound = self.rebound_speed(approach_speed)
+        return rebound + jnp.sqrt(jnp.maximum(rebound**2 + square, 1e-300))
 
-def impact_law_of(scene: Scene) -> ImpactLaw:
-    """Return the scene's impact law.
+    def speeds(self, coordinate: Float[Array, "..."]) -> Speeds:
+        """Return the speeds and the delay at a coordinate Y > q in nm/us, in which the law is smooth up to capture.
+
+        u = c/2r^2 + (Y + q^2/Y)/2r, w = (Y - q^2/Y)/2, q^2 = epsilon + c^2/4r^2.
+        """
+        square = self.epsilon + (self.viscous_loss / (2.0 * self.r)) ** 2
+        middle = self.viscous_loss / (2.0 * self.r**2)
+        # without a loss besides r the tip is captured at Y = 0, where the quotient is 0
+        kept = square / jnp.where(coordinate == 0.0, 1.0, coordinate)
+        approach = middle + (coordinate + kept) / (2.0 * self.r)
+        rebound = 0.5 * (coordinate - kept)
+        delay = jnp.zeros_like(approach) if self.delay is None else self.delay(approach, rebound)
+        return Speeds(approach, rebound, delay)
+
+
+MOST_KNOTS = 24
+"""Knots of a table's splines: tables of more rows are smoothed by least squares, of fewer go through every row."""
+_LEAST_ROWS = 4
+_NEWTON_STEPS = 30
+_SETTLED = 1e-15
+
+
+class TabulatedLaw(Law):
+    """An impact law as a table: approach speeds, the rebound speeds that they lead to, and the collision delays.
+
+    Above the capture speed u_c, u_out^2 = (u^2 - u_c^2) (r^2 - c/(u + u_c)) exp(s): a formula of eq. 6 with the same
+    capture speed, close to the table, times what is left, a natural cubic spline s over v/(v + V), v^2 = u^2 - u_c^2.
+    That is smooth down to capture and positive for whatever s. The delay is that of a `CollisionDelay` and a spline of
+    the same kind. Outside the table's speeds the splines go on as straight lines: `extrapolated` says where.
+
+    A law that is known with errors has deviations: changes of its numbers, one for each of several independent unknowns
+    of unit variance (`with_errors`), from which `sample` draws laws.
+
+    Every number is traced, so that a law may be differentiated by them, and laws of as many rows share one compiled
+    program. Each array's last axis is the spline's; batches of laws have axes in front of it.
+
+    Args:
+        approach_speed_nm_per_us: u_in, at least four, increasing, shape (rows,).
+        rebound_speed_nm_per_us: u_out, not above u_in; 0: captured, for the slowest rows only.
+        collision_delay_us: of every row, where captured ignored; None: instantaneous impacts.
+        capture_speed_nm_per_us: u_c; None: extrapolated from the table.
+        delay: the formula of the delay that the spline is added to, and whose corrections count; None: the closest one,
+            with corrections.
+        mass_ng: the mass of the tip that the table is of; None: not known.
+        origin: what the table comes from, in words; it changes nothing.
 
     Raises:
-        TypeError: if the scene's interaction is something else.
+        ValueError: if there are fewer than four rows that rebound, speeds do not increase, a rebound is faster than its
+            approach, or a value is not finite.
+
+    >>> import jax
+    >>> with jax.enable_x64(True):
+    ...     law = TabulatedLaw([12.0, 20.0, 50.0, 200.0], [4.69, 16.7, 48.7, 199.6])
+    ...     print(round(float(law.rebound_speed(20.0)), 6), round(float(law.capture_speed_nm_per_us), 1))
+    16.7 11.0
     """
-    if not isinstance(scene.interaction, ImpactLaw):
-        raise TypeError(
-            f"the impact map needs a scene whose interaction is an ImpactLaw, not {type(scene.interaction).__name__}"
-        )
-    return scene.interaction
+
+    capture: Float[Array, "..."]
+    r: Float[Array, "..."]
+    viscous_loss: Float[Array, "..."]
+    scale_nm_per_us: Float[Array, "..."]
+    knots: Float[Array, "... knots"]
+    loss_spline: Float[Array, "... numbers"]
+    delay_spline: Float[Array, "... numbers"]
+    slowest_nm_per_us: Float[Array, "..."]
+    fastest_nm_per_us: Float[Array, "..."]
+    origin: "Origin" = eqx.field(static=True)
+    mass_ng: Float[Array, "..."] | None = None
+    delay: CollisionDelay | None = None
+    deviations: dict[str, Float[Array, "deviations ..."]] | None = None
+
+    def __init__(
+        self,
+        approach_speed_nm_per_us: ArrayLike | Sequence[float],
+        rebound_speed_nm_per_us: ArrayLike | Sequence[float],
+        collision_delay_us: ArrayLike | Sequence[float] | None = None,
+        *,
+        capture_speed_nm_per_us: ArrayLike | None = None,
+        delay: CollisionDelay | None = None,
+        mass_ng: ArrayLike | None = None,
+        origin: str = "",
+    ):
+        """Make a law of columns: see the class."""
+        columns = _columns(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us)
+        held, u, w, late = _free_rows(*columns)
+        check_parameter("mass_ng", mass_ng, "positive", optional=True)
+        check_kind("delay", delay, CollisionDelay | None)
+        if delay is not None and late is None:
+            raise ValueError("`delay` needs the column `collision_delay_us`, which the table does not have")
+        if capture_speed_nm_per_us is None:
+            capture = _capture_speed(u, w, held)
+        else:
+            check_parameter("capture_speed_nm_per_us", capture_speed_nm_per_us, "not negative")
+            capture = as_parameter(capture_speed_nm_per_us)
+            if not any(map(is_traced, (capture, u))) and not held <= float(capture) < float(u[0]):
+                raise ValueError(
+                    f"`capture_speed_nm_per_us` must lie below the slowest tip that leaves, {float(u[0]):g} nm/us"
+                    + (f", and not below the fastest that is captured, {held:g} nm/us" if held else "")
+                    + f", but is {float(capture):g}"
+                )
+        square = (u - capture) * (u + capture)
+        self.capture = capture
+        self.r, self.viscous_loss = _closest_formula(u, w, capture)
+        self.scale_nm_per_us = jnp.sqrt(u[0] * u[-1])
+        place = _place(jnp.sqrt(square), self.scale_nm_per_us)
+        count = min(place.shape[0], MOST_KNOTS)
+        # of more rows than knots every so many is one, first and last among them
+        self.knots = place[np.round(np.linspace(0, place.shape[0] - 1, count)).astype(int)]
+        formula = square * _formula(u, capture, self.r, self.viscous_loss)
+        self.loss_spline = _spline_through(place, jnp.log(w * w / formula), self.knots)
+        self.delay_spline = jnp.zeros_like(self.loss_spline)
+        if late is not None:
+            delay = closest_delay(u, w, late) if delay is None else delay
+            self.delay_spline = _spline_through(place, late - delay(u, w), self.knots)
+        self.delay = delay  # pyright: ignore[reportIncompatibleMethodOverride]
+        self.slowest_nm_per_us, self.fastest_nm_per_us = u[0], u[-1]
+        self.mass_ng = None if mass_ng is None else as_parameter(mass_ng)
+        self.origin = Origin(origin)
+
+    @classmethod
+    def with_errors(
+        cls,
+        approach_speed_nm_per_us: ArrayLike | Sequence[float],
+        rebound_speed_nm_per_us: ArrayLike | Sequence[float],
+        collision_delay_us: ArrayLike | Sequence[float] | None = None,
+        *,
+        rebound_changes: ArrayLike,
+        delay_changes: ArrayLike | None = None,
+        capture_changes: ArrayLike | None = None,
+        **options: Any,
+    ) -> "TabulatedLaw":
+        """Return a law whose table is known with errors: a factor of the covariance of all its columns.
+
+        Args:
+            approach_speed_nm_per_us: u_in, shape (rows,).
+            rebound_speed_nm_per_us: u_out.
+            collision_delay_us: of every row; None: instantaneous impacts.
+            rebound_changes: changes of u_out in nm/us, shape (unknowns, rows), by one standard deviation of each of
+                several independent unknowns.
+            delay_changes: likewise of the delay in us; None: it is known.
+            capture_changes: likewise of the capture speed, shape (unknowns,), for a speed that is given; None: where it
+                is extrapolated it changes with the rebounds, else it is known.
+            options: `capture_speed_nm_per_us`, `delay`, `mass_ng` and `origin` of a law.
+
+        Raises:
+            ValueError: as of a law, or if shapes do not fit.
+        """
+        law = cls(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us, **options)
+        columns = _columns(approach_speed_nm_per_us, rebound_speed_nm_per_us, collision_delay_us)
+        _, u, w, late = _free_rows(*columns)
+        free = slice(columns[0].shape[0] - u.shape[0], None)
+        by_rebound = jnp.asarray(rebound_changes, float)
+        if by_rebound.ndim != 2 or by_rebound.shape[1] != columns[0].shape[0]:
+            raise ValueError(f"`rebound_changes` must have the shape (unknowns, rows), but has {by_rebound.shape}")
+        by_rebound, count = by_rebound[:, free], by_rebound.shape[0]
+        by_delay = jnp.zeros_like(by_rebound) if delay_changes is None else jnp.asarray(delay_changes, float)[:, free]
+        by_capture = jnp.zeros(count) if capture_changes is None else jnp.asarray(capture_changes, float)
+        known = options.get("capture_speed_nm_per_us")
+
+        def numbers(w: Array, late: Array | None, capture: Array) -> dict[str, Array]:
+            # the formula beside the table and the splines' knots stay as they are
+            held = capture if known is not None else _capture_speed(u, w, 0.0)
+            square = (u - held) * (u + held)
+            place = _place(jnp.sqrt(square), law.scale_nm_per_us)
+            loss = jnp.log(w * w / (square * _formula(u, held, law.r, law.viscous_loss)))
+            changed = {"capture": held, "loss_spline": _spline_through(place, loss, law.knots)}
+            if late is None or law.delay is None:
+                return changed
+            return changed | {"delay_spline": _spline_through(place, late - law.delay(u, w), law.knots)}
+
+        def along(w_change: Array, late_change: Array, capture_change: Array) -> dict[str, Array]:
+            changes = w_change, late_change, capture_change
+            start = w, late, law.capture
+            if late is None:
+                return jax.jvp(lambda w, c: numbers(w, None, c), (w, law.capture), (changes[0], changes[2]))[1]
+            return jax.jvp(numbers, start, changes)[1]
+
+        deviations = jax.jit(jax.vmap(along))(by_rebound, by_delay, by_capture)
+        return _replaced(law, deviations=deviations)
+
+    def moved(self, unknowns: ArrayLike) -> "TabulatedLaw":
+        """Return the law for values of the unknowns of its errors, in standard deviations, shape (unknowns,)."""
+        if self.deviations is None:
+            return self
+        steps = jnp.asarray(unknowns)
+        changes = {name: jnp.tensordot(steps, change, axes=1) for name, change in self.deviations.items()}
+        made = _with_numbers(self, {name: getattr(self, name) + change for name, change in changes.items()})
+        # a loss so small that it is not sure to be one
+        return _replaced(made, capture=jnp.maximum(made.capture, 0.0), deviations=None)
+
+    def sample(self, key: Array, n: int) -> "TabulatedLaw":
+        """Return laws drawn from the errors of this one: one law whose every number has a first axis of length n.
+
+        `jax.vmap` maps over them; `jax.tree.map(lambda leaf: leaf[i], laws)` is the one of a number.
+
+        Args:
+            key: a key of `jax.random`.
+            n: how many.
+
+        Raises:
+            ValueError: if nothing is known of the law's errors.
+        """
+        if self.deviations is None:
+            raise ValueError(
+                "nothing is known of this law's errors: samples are of a fit's law, or of a table with errors"
+            )
+        return jax.vmap(self.moved)(jax.random.normal(key, (n, self.unknowns)))
+
+    @property
+    def unknowns(self) -> int:
+        """How many independent unknowns its errors have; 0 where nothing is known of them."""
+        return 0 if self.deviations is None else self.deviations["capture"].shape[-1 if self.capture.ndim else 0]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the law as numbers and lists, from which `law_of_dict` makes it again; what is absent is left out."""
+        v = self.scale_nm_per_us * self.knots / (1.0 - self.knots)
+        u = jnp.sqrt(v**2 + self.capture**2)
+        found = self.beyond_capture(u, v)
+        told: dict[str, Any] = {
+            "approach_speed_nm_per_us": np.asarray(found.approach).tolist(),
+            "rebound_speed_nm_per_us": np.asarray(found.rebound).tolist(),
+        }
+        if self.delay is not None:
+            told["collision_delay_us"] = np.asarray(found.delay).tolist()
+            told["corrections"] = self.delay.corrections
+        told["capture_speed_nm_per_us"] = float(self.capture)
+        told["speed_range_nm_per_us"] = [float(self.slowest_nm_per_us), float(self.fastest_nm_per_us)]
+        if self.mass_ng is not None:
+            told["mass_ng"] = float(self.mass_ng)
+        if self.origin.text:
+            told["origin"] = self.origin.text
+        numbers = {name: np.asarray(number).tolist() for name, number in _numbers_of(self).items()}
+        told["numbers"] = numbers | {"scale_nm_per_us": float(self.scale_nm_per_us)}
+        if self.deviations is not None:
+            told["deviations"] = {name: np.asarray(change).tolist() for name, change in self.deviations.items()}
+        return told
+
+    def __repr__(self) -> str:
+        """Return what the law is of, without its splines."""
+        end = self.slowest_nm_per_us
+        if not isinstance(end, Array | np.ndarray) or is_traced(end) or end.ndim:
+            return "TabulatedLaw(...)"
+        speeds = f"{float(self.slowest_nm_per_us):.6g} to {float(self.fastest_nm_per_us):.6g} nm/us"
+        captured = f"captured at {float(self.capture_speed_nm_per_us):.6g}"
+        return f"TabulatedLaw({speeds}, {captured}, delay={self.delay!r}, origin={self.origin.text!r})"
+
+    @property
+    def capture_speed_nm_per_us(self) -> Float[Array, "..."]:
+        """Approach speed up to which the tip is captured: given, or extrapolated from the table."""
+        return self.capture
+
+    @property
+    def epsilon(self) -> Float[Array, "..."]:
+        """Loss by adhesion of the formula that the table is written beside, in nm^2/us^2."""
+        return self.capture * (self.r**2 * self.capture - self.viscous_loss)
+
+    @property
+    def adheres(self) -> Bool[Array, "..."]:
+        """Whether there is a capture speed: what takes a tip's last energy holds it."""
+        return self.capture > 0.0
+
+    @property
+    def leaves(self) -> Bool[Array, "..."]:
+        """True: fast tips leave."""
+        return jnp.ones_like(self.capture, bool)
+
+    @property
+    def slow_restitution(self) -> Float[Array, "..."]:
+        """u_out/u_in of the slowest impacts where nothing is captured, extrapolated."""
+        return self.r * jnp.exp(0.5 * _spline(self.loss_spline, self.knots, jnp.zeros_like(self.r)))
+
+    @property
+    def lowest(self) -> Float[Array, ""]:
+        """Coordinate at which the tip is captured: the capture speed."""
+        return self.capture
+
+    def extrapolated(self, approach_speed: ArrayLike) -> Bool[Array, "..."]:
+        """Say whether an approach speed in nm/us is outside the table's."""
+        u = as_argument(approach_speed)
+        return (u < self.slowest_nm_per_us) | (u > self.fastest_nm_per_us)
+
+    def coordinate(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return Y = u + sqrt(u^2 - u_c^2) in nm/us."""
+        free = approach_speed > self.capture
+        return approach_speed + jnp.where(free, self._beyond(jnp.where(free, approach_speed, jnp.inf)), 0.0)
+
+    def speeds(self, coordinate: Float[Array, "..."]) -> Speeds:
+        """Return speeds and delay at Y: u = (Y + u_c^2/Y)/2, v = (Y - u_c^2/Y)/2."""
+        kept = self.capture**2 / jnp.where(coordinate == 0.0, 1.0, coordinate)
+        return self.beyond_capture(0.5 * (coordinate + kept), 0.5 * (coordinate - kept))
+
+    def _beyond(self, u: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return v = sqrt(u^2 - u_c^2) in nm/us."""
+        return jnp.sqrt((u - self.capture) * (u + self.capture))
+
+    def beyond_capture(self, u: Float[Array, "..."], v: Float[Array, "..."]) -> Speeds:
+        """Return speeds and delay where u and v = sqrt(u^2 - u_c^2), in nm/us, are both known."""
+        place = _place(v, self.scale_nm_per_us)
+        cubes = _cubes(self.knots, place)
+        rebound = v * jnp.sqrt(_formula(u, self.capture, self.r, self.viscous_loss))
+        rebound = rebound * jnp.exp(0.5 * _spline_of(self.loss_spline, self.knots, place, cubes))
+        if self.delay is None:
+            return Speeds(u, rebound, jnp.zeros_like(rebound))
+        late = _spline_of(self.delay_spline, self.knots, place, cubes)
+        return Speeds(u, rebound, self.delay(u, rebound) + late)
+
+    def captures(self, approach_speed: ArrayLike) -> Bool[Array, "..."]:
+        """Say whether an approach speed in nm/us is not above the capture speed."""
+        return as_argument(approach_speed) <= self.capture
+
+    def at_approach(self, approach_speed: ArrayLike) -> Speeds:
+        """Return the speeds in nm/us and the delay in us at an approach speed; a captured tip has neither."""
+        u = as_argument(approach_speed)
+        free = u > self.capture
+        safe = jnp.where(free, u, self.capture + self.scale_nm_per_us)
+        found = self.beyond_capture(safe, self._beyond(safe))
+        return Speeds(u, jnp.where(free, found.rebound, 0.0), jnp.where(free, found.delay, 0.0))
+
+    def rebound_speed(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return u_out in nm/us for u_in in nm/us; 0 where the tip is captured."""
+        return self.at_approach(approach_speed).rebound
+
+    def rebound_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return d u_out/d u_in, a number; 0 where the tip is captured."""
+        u = as_argument(approach_speed)
+        return jax.jvp(self.rebound_speed, (u,), (jnp.ones_like(u),))[1]
+
+    def collision_delay(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return the delay in us at an approach speed in nm/us; 0 without a delay or where captured."""
+        return self.at_approach(approach_speed).delay
+
+    def delay_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return d tau/d u_in in us^2/nm; 0 without a delay or where captured."""
+        u = as_argument(approach_speed)
+        return jax.jvp(self.collision_delay, (u,), (jnp.ones_like(u),))[1]
+
+    def approach_speed(self, rebound_speed: ArrayLike) -> Float[Array, "..."]:
+        """Return the u_in in nm/us that leaves at u_out in nm/us, by Newton's method; differentiable."""
+        w = as_argument(rebound_speed)
+        return _read_backwards(w, self)
 
 
-def capture_coordinate(law: ImpactLaw) -> Float[Array, ""]:
-    """Return q in nm/us: the coordinate Y of `speeds_at` at which the tip is captured."""
-    square = law.epsilon + (law.viscous_loss / (2.0 * law.r)) ** 2
+_NUMBERS = ("capture", "r", "viscous_loss", "knots", "loss_spline", "delay_spline")
+_SPLINES = ("knots", "loss_spline", "delay_spline")
+
+
+def _numbers_of(law: TabulatedLaw) -> dict[str, Array]:
+    """Return what a table's law is made of and what may be uncertain, by name."""
+    numbers = {name: getattr(law, name) for name in _NUMBERS}
+    return numbers if law.delay is None else numbers | {name: getattr(law.delay, name) for name in _OF_DELAY}
+
+
+_OF_DELAY = ("hertz", "lead_nm", "offset_nm")
+
+
+def _with_numbers(law: TabulatedLaw, numbers: dict[str, Array]) -> TabulatedLaw:
+    """Return a law with other numbers, of `_numbers_of`."""
+
+    def places(law: TabulatedLaw) -> list[Any]:
+        return [getattr(law, name) if name in _NUMBERS else getattr(law.delay, name) for name in numbers]
+
+    return eqx.tree_at(places, law, list(numbers.values()))
+
+
+def _replaced(law: TabulatedLaw, **parts: Any) -> TabulatedLaw:
+    """Return a law with other fields, without the checks of a table."""
+    made = object.__new__(TabulatedLaw)
+    for field in dataclasses.fields(law):
+        object.__setattr__(made, field.name, parts.get(field.name, getattr(law, field.name)))
+    return made
+
+
+def law_of_dict(told: Mapping[str, Any]) -> TabulatedLaw:
+    """Return the law that `TabulatedLaw.to_dict` tells, number for number.
+
+    Raises:
+        ValueError: if columns are missing or are no table of a law.
+    """
+    names = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us")
+    missing = [name for name in names[:2] if not isinstance(told.get(name), list | np.ndarray)]
+    if missing:
+        raise ValueError(f"the law lacks {' and '.join(missing)}")
+    numbers = told.get("numbers")
+    delay = None
+    if isinstance(numbers, Mapping) and told.get(names[2]) is not None:
+        delay = CollisionDelay(*(numbers[name] for name in _OF_DELAY), corrections=bool(told.get("corrections", True)))
+    u, w, late = (np.asarray(told.get(name, ()), float) for name in names)
+    law = TabulatedLaw(
+        u,
+        w,
+        late if late.size else None,
+        capture_speed_nm_per_us=told.get("capture_speed_nm_per_us"),
+        delay=delay,
+        mass_ng=told.get("mass_ng"),
+        origin=str(told.get("origin", "")),
+    )
+    if not isinstance(numbers, Mapping):
+        return law
+    made = _with_numbers(law, {name: jnp.asarray(numbers[name], float) for name in _numbers_of(law)})
+    scale, ends = numbers["scale_nm_per_us"], told["speed_range_nm_per_us"]
+    made = eqx.tree_at(
+        lambda law: (law.scale_nm_per_us, law.slowest_nm_per_us, law.fastest_nm_per_us),
+        made,
+        tuple(jnp.asarray(number, float) for number in (scale, *ends)),
+    )
+    if told.get("deviations") is None:
+        return made
+    deviations = {name: jnp.asarray(change, float) for name, change in told["deviations"].items()}
+    return _replaced(made, deviations=deviations)
+
+
+def axes_of_one(scene: Scene) -> Scene:
+    """Return how many axes each number of a scene has if it is one scene: those of a law's table have their own."""
+    axes = jax.tree.map(lambda _: 0, scene)
+    law = scene.interaction
+    if not isinstance(law, TabulatedLaw):
+        return axes
+    axes = eqx.tree_at(lambda scene: [getattr(scene.interaction, name) for name in _SPLINES], axes, [1] * len(_SPLINES))
+    if law.deviations is None:
+        return axes
+    own = {name: 2 if name in _SPLINES else 1 for name in law.deviations}
+    return eqx.tree_at(lambda scene: scene.interaction.deviations, axes, own)
+
+
+def _rebound_misfit(beyond: Array, law_and_rebound: tuple[TabulatedLaw, Array]) -> Array:
+    """Return by how much the rebound at v misses the wanted one, in nm/us."""
+    law, rebound = law_and_rebound
+    return law.beyond_capture(jnp.sqrt(beyond**2 + law.capture_speed_nm_per_us**2), beyond).rebound - rebound
+
+
+def _read_backwards(rebound: Float[Array, "..."], law: TabulatedLaw) -> Float[Array, "..."]:
+    wanted, fixed = lax.stop_gradient((rebound, law))
+    free = wanted > 0.0
+    safe = jnp.where(free, wanted, 1.0)
+
+    def unsettled(state):
+        step, v, move = state
+        return (step < _NEWTON_STEPS) & jnp.any(jnp.abs(move) > _SETTLED * v)
+
+    def improve(state):
+        step, v, _ = state
+        misfit, slope = jax.jvp(lambda v: _rebound_misfit(v, (fixed, safe)), (v,), (jnp.ones_like(v),))
+        move = jnp.clip(-misfit / jnp.where(slope > 0.0, slope, 1.0), -0.5 * v, v)
+        # the last step is rounding
+        return step + 1, v + move, jnp.where(jnp.abs(move) > 1e-9 * v, move, 0.0)
+
+    _, v, _ = lax.while_loop(unsettled, improve, (0, safe, safe))
+    at = implicit_root(_rebound_misfit, v, (law, jnp.where(free, rebound, 1.0)))
+    beyond = jnp.where(free, at, 0.0)
+    square = beyond**2 + law.capture_speed_nm_per_us**2
     positive = square > 0.0
     return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)
 
 
-def speeds_at(coordinate: Float[Array, ""], law: ImpactLaw) -> Speeds:
-    """Return the speeds and the delay at a coordinate Y > q in nm/us, in which the law is smooth up to capture.
+class Origin:
+    """What a law comes from, in words: static data of a module, all equal, so that no text compiles programs anew."""
 
-    u = c/2r^2 + (Y + q^2/Y)/2r, w = (Y - q^2/Y)/2, q^2 = epsilon + c^2/4r^2.
+    def __init__(self, text: str):
+        """Keep the words."""
+        self.text = text
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Origin)
+
+    def __hash__(self) -> int:
+        return hash(Origin)
+
+
+def _columns(approach: Any, rebound: Any, delay: Any) -> tuple[Any, Any, Any]:
+    """Return a table's columns as arrays of one length, checked.
+
+    Raises:
+        ValueError: as `TabulatedLaw`.
     """
-    square = law.epsilon + (law.viscous_loss / (2.0 * law.r)) ** 2
-    middle = law.viscous_loss / (2.0 * law.r**2)
-    # without a loss besides r the tip is captured at Y = 0, where the quotient is 0
-    kept = square / jnp.where(coordinate == 0.0, 1.0, coordinate)
-    approach = middle + (coordinate + kept) / (2.0 * law.r)
-    rebound = 0.5 * (coordinate - kept)
-    delay = jnp.zeros_like(approach) if law.delay is None else law.delay(approach, rebound)
-    return Speeds(approach, rebound, delay)
+    names = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us")
+    given = _column(approach), _column(rebound), None if delay is None else _column(delay)
+    for name, column in zip(names, given, strict=True):
+        if column is None or is_traced(column):
+            continue
+        known = as_real(name, column)
+        if known.ndim != 1:
+            raise ValueError(f"`{name}` must be a column of numbers, but has shape {known.shape}")
+        bad = np.flatnonzero(~np.isfinite(known))
+        if bad.size:
+            raise ValueError(f"`{name}` must be finite numbers, but is {known[bad[0]]} in row {bad[0] + 1}")
+    rows = given[0].shape[0]
+    for name, column in zip(names[1:], given[1:], strict=True):
+        if column is not None and column.shape != (rows,):
+            raise ValueError(f"`{name}` must have a number for each of the {rows} speeds, but has {column.shape[0]}")
+    return given
+
+
+def _column(values: Any) -> Any:
+    return as_parameter(jnp.asarray(values) if isinstance(values, list | tuple) else values)
+
+
+def _free_rows(u: Any, w: Any, delay: Any) -> tuple[float, Array, Array, Array | None]:
+    """Return the fastest approach speed that is captured, 0 if none is, and the rows of tips that leave, checked."""
+    held = 0.0
+    if u.shape[0] < _LEAST_ROWS:
+        raise ValueError(f"a table of a law needs at least four speeds, but has {u.shape[0]}")
+    if is_traced(u):
+        return held, u, w, delay
+    known = np.asarray(u)
+    fall = np.flatnonzero(np.diff(known) <= 0.0)
+    if fall.size:
+        first, second = known[fall[0]], known[fall[0] + 1]
+        raise ValueError(
+            f"`approach_speed_nm_per_us` must increase from row to row, but {second:g} follows {first:g} in row "
+            f"{fall[0] + 2}"
+        )
+    if known[0] <= 0.0:
+        raise ValueError(f"`approach_speed_nm_per_us` must be positive, but is {known[0]:g} in row 1")
+    if is_traced(w):
+        return held, u, w, delay
+    captured = _captured_rows(known, np.asarray(w))
+    if captured:
+        held = float(known[captured - 1])
+        u, w, delay = u[captured:], w[captured:], None if delay is None else delay[captured:]
+        if u.shape[0] < _LEAST_ROWS:
+            raise ValueError(f"a table of a law needs at least four speeds that leave, but has {u.shape[0]}")
+    return held, u, w, delay
+
+
+def _captured_rows(u: Float[np.ndarray, " n"], w: Float[np.ndarray, " n"]) -> int:
+    """Return how many rows, the slowest, have no rebound; check those that have."""
+    for bad, must in ((w < 0.0, "not be negative"), (w > u, "not be faster than the approach")):
+        if bad.any():
+            row = int(np.flatnonzero(bad)[0])
+            raise ValueError(f"`rebound_speed_nm_per_us` must {must}, but is {w[row]:g} at {u[row]:g} in row {row + 1}")
+    stays = np.flatnonzero(w == 0.0)
+    if stays.size and stays[-1] != stays.size - 1:
+        raise ValueError(f"`rebound_speed_nm_per_us` is 0 (captured) in row {stays[-1] + 1}, but slower tips leave")
+    return stays.size
+
+
+def _capture_speed(u: Float[Array, " n"], w: Float[Array, " n"], held: float) -> Float[Array, ""]:
+    """Return the capture speed in nm/us that a table points to.
+
+    That of u_out^2 = a u^2 - c u - b by linear least squares, slow rows counting most; with c = 0 where that is no law.
+    No loss but that of capture at the slowest row is the most it can be.
+    """
+    low = u[0]
+    ratio, one = (w / u) ** 2, jnp.ones_like(u)
+    columns = [one, -low / u, -((low / u) ** 2)]
+    weight = low / u
+
+    def fitted(chosen: list[Array]) -> Array:
+        return jnp.linalg.lstsq(jnp.stack(chosen, axis=1) * weight[:, None], ratio * weight)[0]
+
+    a, c, b = fitted(columns)
+    flat_a, flat_b = fitted(columns[::2])
+    curved = (a > 0.0) & (b > -_NOTHING) & (c >= 0.0)
+    a, c, b = jnp.where(curved, a, flat_a), jnp.where(curved, c, 0.0), jnp.where(curved, b, flat_b)
+    there = (a > 0.0) & (c * c + 4.0 * a * b > 0.0) & (b > -_NOTHING)
+    root = jnp.sqrt(jnp.where(there, c * c + 4.0 * a * jnp.maximum(b, _NOTHING), 1.0))
+    found = low * jnp.where(there & ((c > 0.0) | (b > _NOTHING)), (c + root) / (2.0 * jnp.where(there, a, 1.0)), 0.0)
+    most = jnp.maximum((u[0] - w[0]) * (u[0] + w[0]), 0.0)
+    most = jnp.where(most > 0.0, jnp.sqrt(jnp.where(most > 0.0, most, 1.0)), 0.0)
+    return jnp.clip(found, held, jnp.maximum(most, held))
+
+
+_NOTHING = 1e-12
+"""Share of the squared approach speed below which a loss by adhesion is rounding."""
+
+
+def _closest_formula(
+    u: Float[Array, " n"], w: Float[Array, " n"], capture: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return r and c of the formula with a capture speed that is closest to a table, in relative squared speeds."""
+    square = (u - capture) * (u + capture)
+    columns = jnp.stack([jnp.ones_like(u), -1.0 / (u + capture)], axis=1)
+    # relative to the rebound of the table
+    weight = square / (w * w)
+    kept, viscous = jnp.linalg.lstsq(columns * weight[:, None], jnp.ones_like(u))[0]
+    # a loss that grows with the speed alone, and no more than all there is at capture
+    good = (viscous > 0.0) & (kept > 0.0) & (viscous < 2.0 * kept * capture)
+    alone = jnp.sum(weight) / jnp.sum(weight**2)
+    return jnp.sqrt(jnp.where(good, kept, alone)), jnp.where(good, viscous, 0.0)
+
+
+def _formula(u: Array, capture: Array, r: Array, viscous_loss: Array) -> Array:
+    """Return u_out^2/(u^2 - u_c^2) of a formula with the capture speed u_c: r^2 - c/(u + u_c)."""
+    total = u + capture
+    return r**2 - viscous_loss / jnp.where(total > 0.0, total, 1.0)
+
+
+def _place(v: Array, scale: Array) -> Array:
+    """Return where a table's splines are looked at, 0 at capture, 1 at infinite speed."""
+    return v / (v + scale)
+
+
+def _cubes(knots: Float[Array, " knots"], place: Float[Array, "..."]) -> Float[Array, "... knots"]:
+    return jnp.maximum(place[..., None] - knots, 0.0) ** 3
+
+
+def _spline_of(
+    spline: Float[Array, "... numbers"], knots: Float[Array, "... knots"], place: Array, cubes: Array
+) -> Float[Array, "..."]:
+    return spline[..., 0] + spline[..., 1] * (place - knots[..., 0]) + jnp.sum(spline[..., 2:] * cubes, axis=-1)
+
+
+def _spline(spline: Float[Array, "... numbers"], knots: Float[Array, "... knots"], place: Array) -> Float[Array, "..."]:
+    """Return a natural cubic spline: value and slope at the first knot, and the factors of (x - knot)_+^3."""
+    return _spline_of(spline, knots, place, _cubes(knots, place))
+
+
+def _natural(knots: Float[Array, " knots"]) -> Float[Array, "numbers knots"]:
+    """Return what makes a natural spline's numbers of its values at the knots."""
+    count = knots.shape[0]
+    h = jnp.diff(knots)
+    one = jnp.eye(count)
+    steep = (one[1:] - one[:-1]) / h[:, None]
+    # second derivatives, 0 at both ends
+    inner = jnp.diag(2.0 * (h[:-1] + h[1:])) + jnp.diag(h[1:-1], 1) + jnp.diag(h[1:-1], -1)
+    bend = jnp.pad(jnp.linalg.solve(inner, 6.0 * (steep[1:] - steep[:-1])), ((1, 1), (0, 0)))
+    third = jnp.pad(jnp.diff(bend, axis=0) / h[:, None], ((1, 1), (0, 0)))
+    first = steep[0] - h[0] * bend[1] / 6.0
+    return jnp.concatenate([one[:1], first[None], jnp.diff(third, axis=0) / 6.0])
+
+
+def _spline_through(
+    place: Float[Array, " rows"], values: Float[Array, " rows"], knots: Float[Array, " knots"]
+) -> Float[Array, " numbers"]:
+    """Return the natural spline with knots through values, or of more values than knots the closest one."""
+    numbers = _natural(knots)
+    shapes = jnp.concatenate([jnp.ones_like(place)[:, None], (place - knots[0])[:, None], _cubes(knots, place)], axis=1)
+    # by their values at the knots
+    by_values = shapes @ numbers
+    at_knots = jnp.linalg.solve if place.shape == knots.shape else lambda a, b: jnp.linalg.lstsq(a, b)[0]
+    return numbers @ at_knots(by_values, values)
+
+
+def closest_delay(u: Float[Array, " n"], w: Float[Array, " n"], delay: Float[Array, " n"]) -> CollisionDelay:
+    """Return the delay formula closest to a table's delays in us, by linear least squares; speeds in nm/us."""
+    columns = jnp.stack([u**-0.2, 1.0 / u - 1.0 / w, -1.0 / u], axis=1)
+    hertz, lead, offset = jnp.linalg.lstsq(columns, delay)[0]
+    # a Hertz time must be one: where the three tell none, alone
+    good = hertz > 0.0
+    alone = jnp.maximum(jnp.sum(columns[:, 0] * delay) / jnp.sum(columns[:, 0] ** 2), 0.0)
+    return CollisionDelay(jnp.where(good, hertz, alone), jnp.where(good, lead, 0.0), jnp.where(good, offset, 0.0))
+
+
+def impact_law_of(scene: Scene) -> Law:
+    """Return the scene's impact law: a formula or a table.
+
+    Raises:
+        TypeError: if the scene's interaction is something else.
+    """
+    if not isinstance(scene.interaction, Law):
+        raise TypeError(
+            f"the impact map needs a scene whose interaction is an ImpactLaw, not {type(scene.interaction).__name__}"
+        )
+    return scene.interaction

@@ -19,8 +19,8 @@ from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.apparatus.surface import Surface, seen_freely
 from afm_jax.checks import check_count, check_parameter, check_scalar, checked, require_float64
 from afm_jax.impact.first_impact import DEFAULT_MAX_STEPS, DEFAULT_ROOT_TOLERANCE_US, Flight, first_impact
-from afm_jax.impact.lasting_impact import LawImpact, crawls, delay_before, speeds_of_impact
-from afm_jax.impact.law import impact_law_of
+from afm_jax.impact.lasting_impact import crawls, delay_before, speeds_of_impact
+from afm_jax.impact.law import Law, axes_of_one, impact_law_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, public_result
 
@@ -209,7 +209,7 @@ def impact_after(
     law = impact_law_of(scene)
     impact = first_impact(
         flight,
-        skip_us=_overlap(LawImpact(law), flight),
+        skip_us=_overlap(law, flight),
         latest_us=latest_us,
         max_steps=max_steps,
         root_tolerance_us=tolerance,
@@ -218,11 +218,11 @@ def impact_after(
     _, before = scene.cantilever.propagator(impact.duration_us)(flight.position, flight.velocity)
     hit = impact.outcome == Outcome.IMPACT
     approach = jnp.where(hit, scene.platform.velocity(arrival) - before, 1.0)
-    impact_speeds = speeds_of_impact(LawImpact(law), approach, arrival, scene.cantilever, scene.platform)
+    impact_speeds = speeds_of_impact(law, approach, arrival, scene.cantilever, scene.platform)
     captured = hit & law.captures(approach)
     if law.delay is not None:
-        free = LawImpact(law).at_approach(approach)
-        captured = captured | (hit & crawls(LawImpact(law), free, scene.cantilever))
+        free = law.at_approach(approach)
+        captured = captured | (hit & crawls(law, free, scene.cantilever))
         impact_speeds = impact_speeds._replace(
             rebound=jnp.where(captured, 0.0, impact_speeds.rebound), delay=jnp.where(captured, 0.0, impact_speeds.delay)
         )
@@ -238,12 +238,12 @@ def impact_after(
     )
 
 
-def _overlap(impact: LawImpact, flight: Flight) -> Float[Array, ""] | None:
+def _overlap(law: Law, flight: Flight) -> Float[Array, ""] | None:
     """Return how long a flight that a negative delay let begin early overlaps the last one, in us after its start."""
-    if not impact.delayed:
+    if not law.delayed:
         return None
     rebound = flight.velocity - flight.platform.velocity(flight.start_us)
-    delay = delay_before(impact, rebound, flight.start_us, flight.cantilever, flight.platform)
+    delay = delay_before(law, rebound, flight.start_us, flight.cantilever, flight.platform)
     overlap = jnp.maximum(-delay, 0.0)
     # a flight that begins above the surface follows no impact
     return overlap if flight.start_gap is None else jnp.where(flight.start_gap > 0.0, 0.0, overlap)
@@ -325,8 +325,8 @@ def _check(scene: Scene, times: Array, velocities: Array, impacts: int, block: i
             "`time_us` and `velocity_nm_per_us` must have one shape (batch,) with at least one row, "
             f"but have {times.shape} and {velocities.shape}"
         )
-    for leaf in jax.tree.leaves(scene):
-        if leaf.ndim and leaf.shape != times.shape:
+    for leaf, own in zip(jax.tree.leaves(scene), jax.tree.leaves(axes_of_one(scene)), strict=True):
+        if leaf.ndim > own and leaf.shape[: leaf.ndim - own] != times.shape:
             raise ValueError(
                 f"a parameter of the scene has shape {leaf.shape}; it must be a number or match {times.shape}"
             )
@@ -345,14 +345,15 @@ def _iterate_batch(
     block: int,
     max_steps: int,
 ) -> NextImpact:
-    own, shared = eqx.partition(scene, jax.tree.map(lambda leaf: leaf.ndim > 0, scene))
+    own, shared = eqx.partition(scene, jax.tree.map(lambda leaf, axes: leaf.ndim > axes, scene, axes_of_one(scene)))
     batch = starts[0].shape[0]
     blocks = -(-batch // block)
     width = -(-batch // blocks)
 
     def into_blocks(rows):
         # The last block is filled up with copies of the last row, so that every block is the same program.
-        return jnp.pad(rows, (0, blocks * width - batch), mode="edge").reshape(blocks, width)
+        filled = jnp.pad(rows, ((0, blocks * width - batch), *((0, 0),) * (rows.ndim - 1)), mode="edge")
+        return filled.reshape(blocks, width, *rows.shape[1:])
 
     def one_tip(row):
         own_parameters, (time, velocity) = row

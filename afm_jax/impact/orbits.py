@@ -30,8 +30,8 @@ from afm_jax.impact.closure import (
 from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.impact.implicit import absent, implicit_pair, implicit_root
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
-from afm_jax.impact.lasting_impact import Impact, LawImpact, PulledImpact, crawls, depth_of_impact, middle_of_contact
-from afm_jax.impact.law import ImpactLaw, Speeds, impact_law_of
+from afm_jax.impact.lasting_impact import Impact, PulledImpact, crawls, depth_of_impact, middle_of_contact
+from afm_jax.impact.law import ImpactLaw, Law, Speeds, impact_law_of
 from afm_jax.impact.roots import COARSE, TAPPED, find_roots
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, public_result
@@ -152,15 +152,16 @@ def _single_impact_orbits(scene: Scene, frame: FreeFrame, order: Float[Array, ""
     law = impact_law_of(scene)
     problem = orbit_problem(scene.cantilever, frame.platform, law, order)
     roots = find_roots(problem)
-    found = roots.found & frame.periodic & (law.r > 0.0)
+    found = roots.found & frame.periodic & law.leaves
     orbits = jax.vmap(orbit_at, in_axes=(0, 0, None, None))(roots.place, found, frame, problem)
     return eqx.tree_at(lambda result: result.complete, orbits, roots.complete)
 
 
-def orbit_problem(cantilever: Cantilever, platform: Platform, law: ImpactLaw, order: Float[Array, ""]) -> OrbitProblem:
+def orbit_problem(cantilever: Cantilever, platform: Platform, law: Law, order: Float[Array, ""]) -> OrbitProblem:
     """Return what orbits are of; for a law with r = 0, which captures every tip and has none, one with r = 1."""
-    leaving = eqx.tree_at(lambda law: law.r, law, jnp.where(law.r > 0.0, law.r, 1.0))
-    return OrbitProblem(cantilever, platform, LawImpact(leaving), order)
+    if isinstance(law, ImpactLaw):
+        law = eqx.tree_at(lambda law: law.r, law, jnp.where(law.r > 0.0, law.r, 1.0))
+    return OrbitProblem(cantilever, platform, law, order)
 
 
 def orbit_at(place: OrbitPlace, found: Bool[Array, ""], frame: FreeFrame, problem: OrbitProblem) -> SingleImpactOrbits:
@@ -306,7 +307,7 @@ def judge(place: OrbitPlace, found: Bool[Array, ""], state: OrbitState, problem:
     # the flight counts from max(t_in, t_out) on
     skip = jnp.maximum(-state.speeds.delay, 0.0) if impact.delayed else None
     flies = found & ends_at_its_own_impact(cantilever, platform, state.flight, found, skip)
-    if isinstance(impact, LawImpact) and impact.delayed:
+    if isinstance(impact, Law) and impact.delayed:
         flies = flies & ~crawls(impact, impact.at_approach(state.speeds.approach), cantilever)
     return Verdict(
         admissible=flies,

@@ -28,6 +28,7 @@ from afm_jax.impact.closure import (
     place_of,
 )
 from afm_jax.impact.lasting_impact import PulledImpact
+from afm_jax.impact.law import ImpactLaw
 
 _MAX_STEPS = 200  # Laguerre's method needs about 5; bisection alone over the widest interval about 100
 _SETTLED = 1e-12  # the last relative step; it has been cubed by then
@@ -176,7 +177,7 @@ def find_roots(problem: OrbitProblem, scan: Scan = FINE) -> OrbitRoots:
     """
     problem = lax.stop_gradient(problem)
     driven = (problem.platform.amplitude_nm > 0.0) & (problem.platform.offset_rate_nm_per_us == 0.0)
-    coordinate, found, complete = _scanned_roots(problem, scan) if problem.impact.delayed else _quartic_roots(problem)
+    coordinate, found, complete = _quartic_roots(problem) if _is_quartic(problem) else _scanned_roots(problem, scan)
     safe = jnp.where(found, coordinate, harmless_coordinate(problem))
     if problem.impact.lasts:
         place, there = jax.vmap(follow_root, in_axes=(0, None, 0))(safe, problem, found)
@@ -197,6 +198,11 @@ def follow_root(
     speeds, system = closure(near, problem)
     closed = close_map(place_of(near, speeds, system, problem), problem, _NEWTON, wanted)
     return OrbitPlace(*closed.unknowns), system.regular & jnp.all(jnp.abs(closed.gaps) < _CLOSED)
+
+
+def _is_quartic(problem: OrbitProblem) -> bool:
+    """Say whether the closing condition is a quartic: that of the formula without a delay."""
+    return isinstance(problem.impact, ImpactLaw) and not problem.impact.delayed
 
 
 def _seen_before(coordinate: Float[Array, " slots"], found: Bool[Array, " slots"]) -> Bool[Array, " slots"]:

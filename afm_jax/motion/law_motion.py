@@ -29,7 +29,7 @@ from afm_jax.apparatus.surface import Surface
 from afm_jax.contact.junction import Phase
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, Flight, time_above
 from afm_jax.impact.implicit import implicit_root
-from afm_jax.impact.law import ImpactLaw, impact_law_of
+from afm_jax.impact.law import Law, impact_law_of
 from afm_jax.impact.map import NextImpact, impact_after
 from afm_jax.motion.record import ContactKind, Contacts, MotionOutcome, Simulation, State, to_gap, to_lab
 from afm_jax.outcomes import Outcome
@@ -160,7 +160,7 @@ def take_off(
 
 
 def chatter(
-    bed: Bed, law: ImpactLaw, arrival_us: Float[Array, ""], rebound: Float[Array, ""]
+    bed: Bed, law: Law, arrival_us: Float[Array, ""], rebound: Float[Array, ""]
 ) -> tuple[Bool[Array, ""], Float[Array, ""]]:
     """Return whether the impacts that follow an impact may be summed up, and how long they last in us.
 
@@ -170,13 +170,13 @@ def chatter(
 
     Args:
         bed: what the tip comes to rest on.
-        law: with epsilon = 0; with adhesion the tip is captured, with a collision delay there is no series.
+        law: without adhesion; with it the tip is captured, with a collision delay there is no series.
         arrival_us: time of the impact.
         rebound: its rebound speed in nm/us.
     """
     push, rate = bed.push_and_rate(arrival_us)
-    loss = 1.0 - law.r
-    converges = (push > 0.0) & (loss > 0.0) & (law.epsilon == 0.0)
+    loss = 1.0 - law.slow_restitution
+    converges = (push > 0.0) & (loss > 0.0) & ~law.adheres
     lasts = 2.0 * rebound / jnp.where(converges, push * loss, 1.0)
     change = lasts * jnp.maximum(bed.fastest * push, jnp.abs(rate))
     short = converges & (change < CONSTANT_PUSH * push)
@@ -378,7 +378,7 @@ def through_impact(seen: Scene, impact: NextImpact, arrived: Array, until: Array
     chatters = chatters & arrived & ~captured
     rests = captured | chatters
     resting = jnp.minimum(arrival + jnp.where(chatters, lasts, 0.0), until)
-    release = first_release(bed, jnp.where(rests & (law.epsilon == 0.0), resting, until), until)
+    release = first_release(bed, jnp.where(rests & ~law.adheres, resting, until), until)
     away = LawLeg(*take_off(bed, release.time_us, until))
     leaving = jnp.where(arrived, impact.time_us, until)
     next_leg = LawLeg(leaving, jnp.zeros_like(leaving), jnp.where(arrived, impact.velocity_after_nm_per_us, 0.0))

@@ -23,8 +23,8 @@ from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.contact import Contact
 from afm_jax.impact.amplitude import FlightEnds, peak_amplitude
-from afm_jax.impact.lasting_impact import LawImpact, depth_of_impact, middle_of_contact
-from afm_jax.impact.law import ImpactLaw
+from afm_jax.impact.lasting_impact import depth_of_impact, middle_of_contact
+from afm_jax.impact.law import Law
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State, to_gap
 from afm_jax.motion.settle import Settled, Window, held_since, is_stuck, settled, window_of
 from afm_jax.motion.trajectory import DensePath, Trajectory, dense_path, flights_of, fly
@@ -46,7 +46,7 @@ def impact_integral(
         angular_frequency: nu in rad/us.
     """
     law, rows = scene.interaction, simulation.contacts
-    if not isinstance(law, ImpactLaw) or law.delay is None:
+    if not isinstance(law, Law) or law.delay is None:
         return 0j
     arrival, departure = np.asarray(rows.arrival_time_us), np.asarray(rows.departure_time_us)
     middle = 0.5 * (arrival + departure)
@@ -56,7 +56,7 @@ def impact_integral(
     if law.lasts:
         approach = jnp.asarray(rows.approach_speed_nm_per_us)[here]
         pulled = middle_of_contact(scene.cantilever, surface, jnp.asarray(middle[here]))
-        depth = np.asarray(depth_of_impact(LawImpact(law), approach, pulled, scene.cantilever, angular_frequency))
+        depth = np.asarray(depth_of_impact(law, approach, pulled, scene.cantilever, angular_frequency))
     total = -np.sum(depth * np.exp(-1j * angular_frequency * middle[here]))
     early = here[departure[here] < arrival[here]]
     if not early.size:

@@ -18,7 +18,7 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Driven, driven_by
 from afm_jax.contact.junction import explain_missing_junction, find_junction
 from afm_jax.contact.settings import DrivenSetting, driven_setting_of
-from afm_jax.impact.law import ImpactLaw
+from afm_jax.impact.law import Law
 from afm_jax.motion.contact_motion import ContactRow, begin, follow
 from afm_jax.motion.law_motion import follow_free, follow_law
 from afm_jax.motion.record import ContactDetail, ContactKind, Contacts, MotionOutcome, Simulation, State, to_gap, to_lab
@@ -91,7 +91,7 @@ def simulate(  # noqa: PLR0913
     world = (scene, surface, response, begin_at, until)
     if scene.interaction is None:
         return follow_free(*world)
-    if isinstance(scene.interaction, ImpactLaw):
+    if isinstance(scene.interaction, Law):
 
         def follow(room: int) -> Simulation:
             return follow_law(*world, max_contacts=room, reverse=reverse)

@@ -12,7 +12,7 @@ from afm_jax.checks import as_parameter
 from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
-from afm_jax.impact.law import ImpactLaw
+from afm_jax.impact.law import Law
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.record import State
 
@@ -82,7 +82,7 @@ def _clearance(scene: Scene) -> float:
     return float(scene.interaction.bridge_breaks_nm) if isinstance(scene.interaction, Contact) else 0.0
 
 
-def _on_orbit(scene: Scene, still: Scene, law: ImpactLaw) -> State | None:
+def _on_orbit(scene: Scene, still: Scene, law: Law) -> State | None:
     """Return the state just after the impact of the predicted orbit, that of the scene without ramp; None without."""
     omega = drive_of(still).angular_frequency
     order = max(1, round(omega / (2.0 * float(scene.cantilever.angular_frequency))))
@@ -133,7 +133,7 @@ def _leaving(scene: Scene) -> State:
     slowest = 0.0
     if isinstance(scene.interaction, Contact):
         slowest = float(capture_speed(scene.interaction, float(scene.cantilever.mass_ng)))
-    elif isinstance(scene.interaction, ImpactLaw):
+    elif isinstance(scene.interaction, Law):
         slowest = float(scene.interaction.capture_speed_nm_per_us)
     rebound = max(float(scene.platform.top_speed_nm_per_us), 2.0 * slowest if math.isfinite(slowest) else 0.0)
     return state(time, height + _clearance(scene), speed + (rebound or drive.angular_frequency))

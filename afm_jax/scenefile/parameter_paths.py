@@ -22,6 +22,8 @@ from afm_jax.checks import checked, is_traced
 from afm_jax.scenefile.scenefile import scene_of_tables, scene_tables
 
 _MOST_VALUES = 10_000_000
+UNKNOWN = "interaction.unknown_"
+"""Begins the paths of the unknowns of a law that is known with errors, numbered from 1, in standard deviations."""
 
 
 class ParameterRange(NamedTuple):
@@ -101,7 +103,11 @@ def parameter_values(scene: Scene) -> dict[str, float]:
 
 def _collect(table: str, contents: dict[str, Any], found: dict[str, float]) -> None:
     for key, value in contents.items():
-        if isinstance(value, dict):
+        if key == "table":
+            # of a law: its errors' unknowns, in standard deviations
+            unknowns = len(value.get("deviations", {}).get("capture", []))
+            found.update((f"{table}.unknown_{number}", 0.0) for number in range(1, unknowns + 1))
+        elif isinstance(value, dict):
             _collect(f"{table}.{key}", value, found)
         elif isinstance(value, float):
             found[f"{table}.{key}"] = value
@@ -214,6 +220,13 @@ def _contact_family(scene: Scene, names: tuple[str, ...]) -> Callable[..., objec
 def with_numbers(scene: Scene, values: Mapping[str, ArrayLike]) -> Scene:
     """Return a scene with numbers of cantilever, drives and law replaced, by their paths; they may be traced."""
     # the cantilever first: reduced frequencies are in its unit; free amplitudes last, which hang on both
+    unknowns = [path for path in values if path.startswith(UNKNOWN)]
+    if unknowns:
+        steps = jnp.zeros(scene.interaction.unknowns)
+        for path in unknowns:
+            steps = steps.at[int(path.removeprefix(UNKNOWN)) - 1].set(values[path])
+        scene = eqx.tree_at(lambda parts: parts.interaction, scene, scene.interaction.moved(steps))
+    values = {path: value for path, value in values.items() if path not in unknowns}
     for path in sorted(
         values, key=lambda path: (path.endswith("free_amplitude_nm"), not path.startswith("cantilever"))
     ):

@@ -62,11 +62,12 @@ from jaxtyping import ArrayLike
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
 from afm_jax.apparatus.platform import Platform
-from afm_jax.apparatus.scene import Scene, SceneLike, as_scene, drive_of
+from afm_jax.apparatus.scene import Scene, SceneLike, as_scene, check_mass, drive_of
 from afm_jax.apparatus.surface import check_steady_response, drive_per_free_height
 from afm_jax.checks import check_parameter, checked
-from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from afm_jax.impact.law import CollisionDelay, ImpactLaw, Law, TabulatedLaw, law_of_dict
 from afm_jax.motion.record import State
+from afm_jax.scenefile.law_files import law_beside
 from afm_jax.scenefile.tables import (
     INNER_TABLES,
     KEYS,
@@ -262,7 +263,7 @@ def check_start(start: Start, scene: Scene) -> None:
     check_parameter("height_above_platform_nm", height, "finite")
     if scene.interaction is None:
         return
-    if isinstance(scene.interaction, ImpactLaw):
+    if isinstance(scene.interaction, Law):
         check_parameter("height_above_platform_nm", height, "not negative")
         if height == 0.0:
             _check_leaves(start, scene.platform)
@@ -408,6 +409,12 @@ def scene_tables(scene: Scene) -> dict[str, dict[str, Any]]:
 def _interaction_table(interaction: Any) -> dict[str, Any]:
     if interaction is None:
         return {"model": "none"}
+    if isinstance(interaction, TabulatedLaw):
+        if interaction.capture.ndim:
+            raise ValueError(
+                f"the law has shape {interaction.capture.shape}, but a scene file holds one scene: save them one by one"
+            )
+        return {"model": "law", "table": interaction.to_dict()}
     return _law_table(interaction) if isinstance(interaction, ImpactLaw) else _contact_table(interaction)
 
 
@@ -502,7 +509,9 @@ def _scene_of(tables: dict[str, SceneTable]) -> Scene:
     )
     cantilever = table.build(Cantilever, **numbers)
     platform, base, force = read_drives(tables, cantilever)
-    return tables["platform"].build(Scene, cantilever, platform, _interaction_of(tables), base, force)
+    interaction = _interaction_of(tables)
+    tables["interaction"].build(check_mass, interaction, cantilever)
+    return tables["platform"].build(Scene, cantilever, platform, interaction, base, force)
 
 
 def _interaction_of(tables: dict[str, SceneTable]) -> Any:
@@ -511,8 +520,29 @@ def _interaction_of(tables: dict[str, SceneTable]) -> Any:
         return None
     if table.model == "contact":
         return _contact_of(table)
+    if "file" in table.values or "table" in table.values:
+        return _tabulated(table)
     law = table.numbers(required=("r",), optional=LAW_NUMBERS)
     return table.build(ImpactLaw, **law, delay=_delay_of(tables.get("interaction.delay")))
+
+
+def _tabulated(table: SceneTable) -> TabulatedLaw:
+    """Return the law of a file that the table names, or that is written out in it."""
+    source = "file" if "file" in table.values else "table"
+    others = [key for key in table.values if key not in ("model", source)]
+    if others:
+        table.fail(f"the law is that of `{source}`: leave out {', '.join(others)}")
+    given = table.values[source]
+    if source == "file":
+        if not isinstance(given, str):
+            table.fail(f"must be the path of a law's file, as text, but is {in_words(given)}", "file")
+        return table.build(law_beside, table.source, given)
+    if not isinstance(given, dict):
+        table.fail(f"must be a table, [interaction.table], but is {in_words(given)}", "table")
+    try:
+        return table.build(law_of_dict, given)
+    except (KeyError, TypeError) as error:
+        table.fail(f"is no law: {error}", "table")
 
 
 def _contact_of(table: SceneTable) -> "Contact":

@@ -19,13 +19,13 @@ KEYS = {
     "base.second": _MOTION,
     "force": (*_FORCE, "free_amplitude_nm", "second"),
     "force.second": _FORCE,
-    "interaction": ("model", "r", "epsilon", "viscous_loss", "delay"),
+    "interaction": ("model", "r", "epsilon", "viscous_loss", "delay", "file", "table"),
     "interaction.delay": ("hertz", "lead_nm", "offset_nm", "corrections"),
     "start": ("phase_deg", "height_above_platform_nm", "velocity_nm_per_us"),
 }
 """For every table of a scene file the keys it may have; those of the interaction are an impact law's."""
 
-LAW_NUMBERS = tuple(key for key in KEYS["interaction"] if key not in ("model", "r", "delay"))
+LAW_NUMBERS = tuple(key for key in KEYS["interaction"] if key in ("epsilon", "viscous_loss"))
 """The parameters of an impact law that a file may leave out."""
 
 TABLES = tuple(name for name in KEYS if "." not in name)

@@ -25,7 +25,7 @@ from afm_jax.dynamics.contact_orbits import CHART_ACCURACY, single_contact_orbit
 from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.dynamics.iteration import LANES, sample_driven
 from afm_jax.dynamics.verdicts import MotionKind
-from afm_jax.impact.law import impact_law_of
+from afm_jax.impact.law import axes_of_one, impact_law_of
 from afm_jax.motion.follow import follow_long
 from afm_jax.motion.observe import TOO_SHORT, observe
 from afm_jax.motion.record import MotionOutcome
@@ -185,7 +185,11 @@ def _scenes(scene: Scene, paths: Sequence[str]) -> Callable[[Columns], Scene]:
     def made(columns: Columns) -> Scene:
         count = len(next(iter(columns.values())))
         batch = jax.vmap(family)(*(columns[path] for path in paths)) if paths else scene
-        return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (count,)) if leaf.ndim == 0 else leaf, batch)
+        return jax.tree.map(
+            lambda leaf, axes: jnp.broadcast_to(leaf, (count, *leaf.shape)) if leaf.ndim == axes else leaf,
+            batch,
+            axes_of_one(scene),
+        )
 
     return made
 

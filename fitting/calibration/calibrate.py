@@ -88,20 +88,39 @@ def calibrate(
 
 _HALF_WIDTHS = (20.0, 10.0, 5.0)
 """Of a thermal spectrum so much is fitted on both sides of the resonance: as much as the model explains."""
+_WIDEST_LINE = 7
+"""Points over which the median is taken: what stands out over three of them at most, it does not see."""
+_SURROUNDINGS = (10, 4, 1)
+"""Parts of a spectrum that show how far a peak stands out."""
 
 
 def _windows(sweep: ResonanceSweep) -> list[ResonanceSweep]:
-    """Return parts of a spectrum around the peak that stands out most of its surroundings, the widest first."""
+    """Return parts of a spectrum around the peak that stands out most of its surroundings, the widest first.
+
+    Lines of a few points (mains, a clock) are no resonance, whose half-width holds at least three.
+    """
     power = sweep.amplitude**2
-    smooth = uniform_filter1d(power, 5)
-    floor = median_filter(smooth, max(sweep.points // 10, 5), mode="nearest")
-    top = int(np.argmax(smooth / floor))
+    smooth = uniform_filter1d(median_filter(power, _WIDEST_LINE, mode="nearest"), 5, mode="nearest")
+    top, floor = _standing_out(smooth)
     # few averages scatter: a wide peak is measured on a curve that is smoothed more
     widths = [(size, _points_above_half(uniform_filter1d(power, size), top, float(floor[top]))) for size in (5, 21, 85)]
     wide = max(width for size, width in widths if size == 5 or width > 2 * size)
     step = np.ptp(sweep.frequency_khz) / (sweep.points - 1)
     half, centre = max(0.5 * wide, 3.0) * step, float(sweep.frequency_khz[top])
     return [sweep.within(centre - times * half, centre + times * half) for times in _HALF_WIDTHS]
+
+
+def _standing_out(smooth: Float[np.ndarray, " n"]) -> tuple[int, Float[np.ndarray, " n"]]:
+    """Return where a curve stands out most of its surroundings, and these."""
+    top, floor = 0, smooth
+    for part in _SURROUNDINGS:
+        reach = max(smooth.size // part, _WIDEST_LINE)
+        floor = median_filter(smooth, reach, mode="nearest")
+        top = int(np.argmax(smooth / floor))
+        # surroundings that the peak itself fills do not show it
+        if 2 * _points_above_half(smooth, top, float(floor[top])) < reach:
+            break
+    return top, floor
 
 
 def _points_above_half(smooth: Float[np.ndarray, " n"], top: int, floor: float) -> int:

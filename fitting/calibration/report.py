@@ -41,20 +41,27 @@ _BACKGROUNDS = {
 }
 
 
-def calibration_summary(result: Calibration) -> str:
-    """Return the calibration as text: verdict first, then the values, their comparison, goodness of fit, notes."""
+def calibration_summary(result: Calibration, stiffness: str | None = None) -> str:
+    """Return the calibration as text: verdict first, then the values, their comparison, goodness of fit, notes.
+
+    Args:
+        result: of frequency and quality factor.
+        stiffness: why the spring constant is not calibrated; None: it is, or there is none.
+    """
     what = {"phase": "amplitude and phase", "power": "thermal spectrum"}.get(result.model, "amplitude")
     values = [
         _value_cells("frequency_khz", result.frequency_khz, "  kHz"),
         _value_cells("quality_factor", result.quality_factor, ""),
     ]
     verdict = "VALID" if result.valid else "NOT VALID: the numbers below are not a calibration."
+    if result.valid and stiffness is not None:
+        verdict = "NOT VALID: frequency and quality factor are calibrated, the spring constant is not."
     lines = [
         f"Free resonance of {result.sweep.source} ({result.sweep.points} points, {what}):",
         f"  background '{result.background}': {_BACKGROUNDS[result.model, result.background]}",
         "",
         verdict,
-        *(f"  - {reason}" for reason in result.reasons),
+        *(f"  - {reason}" for reason in (*result.reasons, *([] if stiffness is None else [stiffness]))),
         "",
         *text_table(["", "value", "std. error", "95 % interval"], values, words=(0, 3)),
         *_comparison_lines(result),

@@ -8,7 +8,7 @@ Sader's method (Sader, Chon, Mulvaney 1999), rectangular levers: k = 0.1906 rho 
 omega b^2/4 eta, with the hydrodynamic function Gamma of Sader 1998. It does not need the scale of the deflection.
 """
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -30,6 +30,8 @@ _SADER_FACTOR = 0.1906
 _95 = 1.959964
 AIR_K = (296.0, 3.0)
 """Temperature of lever and air where none is given."""
+SCALE_ERROR = 0.05
+"""Relative standard error of the deflection's scale where none is given: force curves repeat it to some per cent."""
 _SIZES = "; --length-um and --width-um give k by Sader's method, which needs no such scale"
 _REAL = (
     (0.91324, -0.48274, 0.46842, -0.12886, 0.044055, -0.0035117, 0.00069085),
@@ -50,6 +52,8 @@ class Stiffness(Result):
         method: "equipartition", "Sader" or "slope".
         value: in N/m, of a slope in nm/V; its errors with it.
         assumed: the assumptions, a sentence each.
+
+    It is a calibration only if it has a standard error.
     """
 
     method: str
@@ -83,32 +87,47 @@ def air_at(temperature_k: float, pressure_pa: float = 101325.0) -> tuple[float, 
 
 @checked
 def equipartition(
-    calibration: Calibration, *, temperature_k: tuple[float, float] | None = None, static: bool = True
+    calibration: Calibration,
+    *,
+    temperature_k: tuple[float, float] | None = None,
+    static: bool = True,
+    scale_error: float = SCALE_ERROR,
+    beside: Stiffness | None = None,
 ) -> Stiffness:
-    """Return the spring constant from the thermal motion.
+    """Return the spring constant from the thermal motion; without error if the deflection's scale proves to be wrong.
 
     Args:
         calibration: of a thermal spectrum in nm.
         temperature_k: of the lever, with its error; None: the file's, else 296 +- 3.
         static: the deflection was calibrated by the slope of a force curve (static InvOLS), not by the mode itself.
+        scale_error: relative standard error of the deflection's scale; k has twice that.
+        beside: the lever's spring constant by Sader's method; None: what the instrument says, if it does. Where that is
+            another one, the scale was not calibrated.
 
     Raises:
+        ValueError: if the scale's error is negative or not finite.
         TableError: if there is no valid thermal spectrum.
     """
+    if not 0.0 <= scale_error < np.inf:
+        raise ValueError(f"`scale_error` must be 0 or positive, but is {scale_error!r}; write 0.05 for 5 %")
     mean = calibration.mean_square
     if mean is None or mean.standard_error is None:
         raise TableError(f"{calibration.sweep.source}: gives no thermal motion; calibrate a thermal spectrum")
     temperature, error = temperature_k or (calibration.sweep.instrument.get("temperature_k", AIR_K[0]), AIR_K[1])
     factor = MODE_FACTOR / STATIC_TO_MODE**2 if static else MODE_FACTOR
     value = factor * BOLTZMANN * temperature / (1e-18 * mean.value)
-    share = float(np.hypot(mean.standard_error / mean.value, error / temperature))
+    share = float(np.sqrt((mean.standard_error / mean.value) ** 2 + (error / temperature) ** 2 + 4.0 * scale_error**2))
     how = "by the slope of a force curve (static InvOLS)" if static else "for the mode itself"
+    good = f"good to {100.0 * scale_error:g} % (--scale-error, 5 % unless given)"
     assumed = (
-        f"The scale of the deflection is exact and was calibrated {how}: factor {factor:.3f}.",
+        f"The scale of the deflection is {good} and was calibrated {how}: factor {factor:.3f}.",
         "First flexural mode of a rectangular lever, the laser on its end.",
         f"The lever is at {temperature:.1f} +- {error:.1f} K.",
     )
-    return Stiffness("equipartition", _with_share(value, share), assumed)
+    found = Stiffness("equipartition", _with_share(value, share), assumed)
+    others = [found] if beside is None else [found, beside]
+    note = disagreement(others, calibration.sweep.instrument.get("spring_constant_n_per_m"))
+    return found if note is None else replace(found, value=CalibratedValue(value, None, (None, None), note))
 
 
 @checked
@@ -264,24 +283,39 @@ def disagreement(found: list[Stiffness], stated_n_per_m: float | None = None) ->
     )
 
 
+def uncalibrated(found: list[Stiffness]) -> str | None:
+    """Return why none of the spring constants that were found is a calibration; None if one is."""
+    doubts = _doubts(found)
+    return f"The spring constant is not calibrated. {doubts[0]}" if doubts and len(doubts) == len(found) else None
+
+
+def _doubts(found: list[Stiffness]) -> list[str]:
+    return [one.value.interval_reason or "" for one in found if one.value.standard_error is None]
+
+
+def _in_words(value: CalibratedValue, unit: str) -> str:
+    """Return a value with its error and interval; without error it is no calibration."""
+    low, high = value.interval95
+    if value.standard_error is None or low is None or high is None:
+        return f"{value.value:.3g} {unit}, NOT VALID: no calibration"
+    return f"{with_error(value.value, value.standard_error)} {unit} (95 % {interval(low, high)})"
+
+
 def stiffness_lines(calibration: Calibration | None, found: list[Stiffness]) -> list[str]:
     """Return spring constants, sensitivity and budget as lines of text."""
     stated = None if calibration is None else calibration.sweep.instrument.get("spring_constant_n_per_m")
     lines = []
     for one in found:
         name, unit = ("deflection_nm_per_volt", "nm/V") if one.method == "slope" else (one.method, "N/m")
-        low, high = one.value.interval95
-        shown = interval(low or 0.0, high or 0.0)
-        lines.append(f"{name}: {with_error(one.value.value, one.value.standard_error)} {unit} (95 % {shown})")
+        lines.append(f"{name}: {_in_words(one.value, unit)}")
         lines += [f"  - {text}" for text in one.assumed]
         if stated is not None:
             lines.append(
                 f"  The instrument says {stated:g} N/m: this {100.0 * (one.value.value / stated - 1.0):+.1f} %."
             )
-    note = disagreement(found, stated)
-    if note is not None:
-        lines += ["", note]
-    if calibration is not None and (note is None or found[-1].method == "Sader"):
+    notes = _doubts(found)
+    lines += ["", *notes] if notes else []
+    if calibration is not None and found[-1].value.standard_error is not None:
         line = f"# spring_constant_n_per_m = {with_error(found[-1].value.value, found[-1].value.standard_error)}"
         lines += ["", "For the top of a table:", line]
     keys = ("share", *WORTH)
@@ -294,5 +328,8 @@ def stiffness_lines(calibration: Calibration | None, found: list[Stiffness]) -> 
 def stiffness_payload(calibration: Calibration, found: list[Stiffness]) -> dict[str, Any]:
     """Return spring constants and budget as plain lists, numbers and strings."""
     named = {one.method.lower(): asdict(one.value) | {"assumed": list(one.assumed)} for one in found}
-    note = disagreement(found, calibration.sweep.instrument.get("spring_constant_n_per_m"))
-    return plain({"spring_constant_n_per_m": named, "budget": budget(calibration, found), "note": note})
+    found_out = {"note": next(iter(_doubts(found)), None)}
+    reason = uncalibrated(found)
+    if reason is not None:
+        found_out |= {"valid": False, "reasons": [*calibration.reasons, reason]}
+    return plain({"spring_constant_n_per_m": named, "budget": budget(calibration, found)} | found_out)

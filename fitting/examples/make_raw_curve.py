@@ -1,21 +1,36 @@
 """A simulated tapping curve as instruments export it, with the defects of real ones.
 
-Eight columns without a head: Z, deflection, amplitude and phase, each out and back. Amplitude and deflection are in
-volts, heights repeat and are not in order, the free part drifts, the phase has a zero of its own, and an attractive
-plateau lies before the repulsive slope. What the energy of a tap is at each amplitude is known: amplitude and lag are
-prescribed over the height, and E = pi k A (A0 |gamma| sin lag - s A/Q) follows, gamma = 1 - s^2 + i s/Q.
+    python -m fitting.examples.make_raw_curve [FILE]
+
+makes `raw_tapping.txt`, which `afm-jax tapping --example` analyses. Eight columns without a head: Z, deflection,
+amplitude and phase, each out and back. Amplitude and deflection are in volts, heights repeat and are not in order, the
+free part drifts, the phase has a zero of its own, and an attractive plateau lies before the repulsive slope. What the
+energy of a tap is at each amplitude is known: amplitude and lag are prescribed over the height, and
+E = pi k A (A0 |gamma| sin lag - s A/Q) follows, gamma = 1 - s^2 + i s/Q.
 """
 
+import sys
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
+from scipy.ndimage import gaussian_filter1d
 
 SPRING_CONSTANT, QUALITY_FACTOR, FREE_FREQUENCY_KHZ, DRIVE_KHZ = 44.0, 230.0, 344.604, 344.6
 FREE_NM, NM_PER_VOLT, PHASE_ZERO_DEG = 13.4, 42.0, 12.3
-KNOWN = ("--spring-constant", "44 +- 4", "--quality-factor", "230 +- 5", "--free-frequency-khz", "344.60 +- 0.01")
-"""What is stated of the instrument."""
+EXAMPLE = Path(__file__).with_name("raw_tapping.txt")
+OPTIONS = {
+    "columns": "offset_nm=1/2:nm,deflection_nm=3/4:V,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8:deg",
+    "drive": "force",
+    "nm_per_volt": "slope",
+    "spring_constant_n_per_m": (44.0, 4.0),
+    "quality_factor": (230.0, 5.0),
+    "free_frequency_khz": (344.60, 0.01),
+}
+"""What its reader knows of the instrument: the arguments of `read_curves` for the example."""
 _HEIGHTS = (0.0, 30.0, 31.5, 34.0, 37.0, 40.0, 41.0, 41.5, 42.1, 42.7, 43.3)
 _RATIOS = (1.0, 1.0, 0.995, 0.98, 0.957, 0.936, 0.922, 0.897, 0.856, 0.812, 0.767)
 """Amplitude over the free one at heights of the sample in nm: a plateau, then 1 nm per nm."""
@@ -53,10 +68,31 @@ class RawCurve:
         return "".join("\t".join(form % cell for form, cell in zip(forms, row, strict=True)) + "\n" for row in rows)
 
 
+_ROUNDED_NM, _ROUNDED = 0.3, 0.008
+"""Widths that corners of the two shapes are rounded with, in height and in amplitude over the free one."""
+_FINE = 20001
+
+
+@cache
+def _shapes() -> tuple[PchipInterpolator, PchipInterpolator]:
+    """Return the amplitude over the free one against height, and the lag against that."""
+    height = np.linspace(_HEIGHTS[0], _HEIGHTS[-1] + 5.0 * _ROUNDED_NM, _FINE)
+    # beyond the nearest height 1 nm per nm goes on
+    deeper = np.maximum(height - _HEIGHTS[-1], 0.0) / FREE_NM
+    ratio = PchipInterpolator(_HEIGHTS, _RATIOS)(np.minimum(height, _HEIGHTS[-1])) - deeper
+    ratio = gaussian_filter1d(ratio, _ROUNDED_NM / (height[1] - height[0]), mode="nearest")
+    at = np.linspace(_LAG_RATIOS[0], 2.0 - _LAG_RATIOS[0], _FINE)
+    # odd about the free tip, whose lag is 90 degrees
+    lag = PchipInterpolator(_LAG_RATIOS, _LAGS)(1.0 - np.abs(at - 1.0)) - 90.0
+    lag = gaussian_filter1d(np.where(at > 1.0, -lag, lag), _ROUNDED / (at[1] - at[0]), mode="nearest")
+    return PchipInterpolator(height, ratio), PchipInterpolator(at, 90.0 + lag)
+
+
 def true_lag_deg(ratio: Float[np.ndarray, "..."], *, back: bool = False) -> Float[np.ndarray, "..."]:
     """Return the lag at an amplitude over the free one; on the way back a tap takes a little more."""
-    lag = PchipInterpolator(_LAG_RATIOS, _LAGS)(ratio)
-    return 90.0 + (lag - 90.0) * (0.985 if back else 1.0)
+    s = DRIVE_KHZ / FREE_FREQUENCY_KHZ
+    free = np.rad2deg(np.angle(1.0 - s**2 + 1j * s / QUALITY_FACTOR))
+    return free + (_shapes()[1](ratio) - 90.0) * (0.985 if back else 1.0)
 
 
 def true_energy_aj(ratio: Float[np.ndarray, "..."], *, back: bool = False) -> Float[np.ndarray, "..."]:
@@ -68,7 +104,7 @@ def true_energy_aj(ratio: Float[np.ndarray, "..."], *, back: bool = False) -> Fl
 
 
 def raw_curve(
-    points: int = 500, *, seed: int = 1, noise: float = 0.002, phase_noise_deg: float = 0.12, drift: float = 0.001
+    points: int = 1000, *, seed: int = 1, noise: float = 0.002, phase_noise_deg: float = 0.12, drift: float = 0.001
 ) -> RawCurve:
     """Return a simulated curve with the defects of measured ones.
 
@@ -82,7 +118,8 @@ def raw_curve(
     random = np.random.default_rng(seed)
     way = np.linspace(_HEIGHTS[0], _HEIGHTS[-1], points)
     true = np.stack([way, way[::-1]])
-    ratio = PchipInterpolator(_HEIGHTS, _RATIOS)(true - np.array([[0.0], [-0.15]]) * (true < _HEIGHTS[-1] - 0.2))
+    # on the way back the tip lets go a little later
+    ratio = _shapes()[0](true + np.array([[0.0], [0.15]]))
     lag = np.stack([true_lag_deg(ratio[0]), true_lag_deg(ratio[1], back=True)])
     time = np.linspace(0.0, 1.0, 2 * points).reshape(2, points)
     shape = true.shape
@@ -100,3 +137,15 @@ def raw_curve(
         amplitude_nm=amplitude,
         energy_aj=np.stack([true_energy_aj(ratio[0]), true_energy_aj(ratio[1], back=True)]),
     )
+
+
+def main() -> None:
+    """Write the example."""
+    target = Path(sys.argv[1]) if len(sys.argv) > 1 else EXAMPLE
+    made = raw_curve()
+    target.write_text(made.text, encoding="utf-8")
+    print(f"wrote {made.height_nm.shape[1]} rows to {target}; a tap takes at most {made.energy_aj.max():.2f} aJ")
+
+
+if __name__ == "__main__":
+    main()

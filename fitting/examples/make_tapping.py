@@ -29,7 +29,7 @@ from afm_jax.motion.settle import settled
 from afm_jax.motion.simulate import simulate
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.simulated.experiment import US_PER_MS
-from fitting.tables.table import AmplitudeTable, mass_of, write_table
+from fitting.tables.table import AmplitudeTable, write_table
 
 FREE_FREQUENCY_KHZ, QUALITY_FACTOR, SPRING_CONSTANT_N_PER_M = 90.0, 200.0, 5.4
 FREE_AMPLITUDE_NM, TIP_RADIUS_NM = 40.0, 10.0
@@ -125,7 +125,6 @@ def table_of(rows: list[SteadyRow], heights_nm: tuple[float, ...] = HEIGHTS_NM, 
         free_frequency_error_khz=0.01,
         quality_factor=QUALITY_FACTOR + QUALITY_OFF,
         quality_factor_error=2.0,
-        mass_ng=mass_of(SPRING_CONSTANT_N_PER_M, FREE_FREQUENCY_KHZ + FREQUENCY_OFF_KHZ),
         spring_constant_n_per_m=SPRING_CONSTANT_N_PER_M,
         spring_constant_error_n_per_m=0.1,
         remarks=(

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.apparatus.cantilever import mass_of
 from afm_jax.checks import check_parameter, checked
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.results import Result, public_result
@@ -50,7 +51,7 @@ class Belief(Result):
             direction of which nothing is known.
         free_frequency_khz: of the cantilever.
         quality_factor: of the cantilever; None: no air damping.
-        mass_ng: of the cantilever.
+        mass_ng: of the cantilever; None: not known.
         fixed: values of the model's parameters that are not fitted; of a contact those not the paper's.
         uncertainty: how far values may be off, relative, where `information` does not say: an orbit that is not there
             for some of these values is not planned with.
@@ -65,7 +66,7 @@ class Belief(Result):
     information: Float[np.ndarray, "p p"]
     free_frequency_khz: float
     quality_factor: float | None
-    mass_ng: float = 1.0
+    mass_ng: float | None = None
     fixed: dict[str, float] = field(default_factory=dict)
     uncertainty: float = UNCERTAINTY
     constraints: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -108,7 +109,8 @@ def believe(  # noqa: PLR0913
     *,
     free_frequency_khz: float,
     quality_factor: float | None = None,
-    mass_ng: float = 1.0,
+    mass_ng: float | None = None,
+    spring_constant_n_per_m: float | None = None,
     values: Mapping[str, float] | None = None,
     constraints: Mapping[str, tuple[float, float]] | None = None,
     free: Sequence[str] | None = None,
@@ -124,6 +126,7 @@ def believe(  # noqa: PLR0913
         free_frequency_khz: of the cantilever.
         quality_factor: of the cantilever; None: no air damping.
         mass_ng: of the cantilever.
+        spring_constant_n_per_m: or its spring constant, whose mass is k/Omega^2.
         values: of the model's parameters; those not given are the paper's contact's.
         constraints: value and standard error of what the instrument leaves uncertain: `quality_factor`,
             `tip_calibration`, `drive_calibration`, `offset_origin_nm`; or of a parameter of the model.
@@ -155,14 +158,20 @@ def believe(  # noqa: PLR0913
         raise ValueError(f"`uncertainty` must be between 0 and 1, but is {uncertainty!r}; write 0.1 for 10 %")
     problem = Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in known), tuple(effects), drive)
     assumed = [name for name in own if name not in given and name not in known]
-    start = paper_values(model, mass_ng) | {name: value for name, (value, _) in known.items()} | given
+    if spring_constant_n_per_m is not None:
+        mass_ng = float(mass_of(free_frequency_khz, mass_ng, spring_constant_n_per_m))
+    start = (
+        paper_values(model, 1.0 if mass_ng is None else mass_ng)
+        | {name: value for name, (value, _) in known.items()}
+        | given
+    )
     return Belief(
         problem=problem,
         values=checked_values(problem, start),
         information=np.diag([known[name][1] ** -2.0 if name in known else 0.0 for name in problem.names]),
         free_frequency_khz=float(free_frequency_khz),
         quality_factor=None if quality_factor is None else float(quality_factor),
-        mass_ng=float(mass_ng),
+        mass_ng=None if mass_ng is None else float(mass_ng),
         fixed=dict(fixed or {}),
         uncertainty=uncertainty,
         constraints=known,
@@ -271,7 +280,7 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
         information=_information(found, matrix),
         free_frequency_khz=float(table["free_frequency_khz"]),
         quality_factor=table.get("quality_factor"),
-        mass_ng=float(table.get("mass_ng", 1.0)),
+        mass_ng=table.get("mass_ng"),
         fixed=dict(settings.get("fixed") or {}),
         uncertainty=uncertainty,
         constraints={

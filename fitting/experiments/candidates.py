@@ -302,7 +302,7 @@ def forecast(
     """Return the standard errors that a fit will state, before and after each chosen point.
 
     Where impacts last these contain what the model leaves out, by the same step as after a fit, anew for these points,
-    and are those of the formula that is then closest to the law.
+    and are those of the formula that is then closest to the law. A belief that a fit left is of that formula already.
 
     Args:
         belief: the law and the instrument.
@@ -324,7 +324,7 @@ def forecast(
     strain = strain_of(objective, belief.values)
     rows = rows_of_fit(objective, objective.following(belief.values), belief.values, strain, 1.0)
     values = belief.fixed | dict(zip(problem.names, belief.values.tolist(), strict=True))
-    left_out = Unmodelled(problem, values, speed_range(rows.approach[: len(chosen)]), belief.mass_ng)
+    left_out = Unmodelled(problem, values, speed_range(rows.approach[: len(chosen)]), belief.mass_ng or 1.0)
     size = np.array([size_of(p, v) for p, v in zip(problem.parameters, belief.values.tolist(), strict=True)])
     known, axes = np.linalg.eigh(size[:, None] * belief.information * size)
     known = np.sqrt(np.maximum(known, 0.0))[:, None] * axes.T / size
@@ -337,7 +337,9 @@ def forecast(
         slopes = ImpactSlopes(*(seen * part for part in rows.slopes))
         some = rows._replace(slopes=slopes, jacobian=jacobian, residual=np.zeros(len(jacobian)))
         step = step_of(some, left_out, free)
-        member = member_after(step, left_out, objective.measurement, belief.values, rows.approach[:count], free)
-        covariance = step.covariance if member is None else member.covariance
+        covariance = step.covariance
+        if not len(belief.measured):
+            member = member_after(step, left_out, objective.measurement, belief.values, rows.approach[:count], free)
+            covariance = covariance if member is None else member.covariance
         errors[count] = np.sqrt(np.diag(covariance))[: len(size)]
     return errors

@@ -97,9 +97,10 @@ def table_to_fill_in(result: Design) -> str:
     lines = [f"# drive = {belief.problem.drive}"] if result.tapping else []
     if "free_frequency_khz" not in known:
         lines.append(f"# free_frequency_khz = {belief.free_frequency_khz!r}")
-    lines.append(f"# mass_ng = {belief.mass_ng!r}")
-    if belief.quality_factor is not None and "quality_factor" not in known:
-        lines.append(f"# quality_factor = {belief.quality_factor!r}")
+    if belief.mass_ng is not None:
+        lines.append(f"# mass_ng = {belief.mass_ng!r}")
+    if "quality_factor" not in known:
+        lines.append(f"# quality_factor = {'none' if belief.quality_factor is None else repr(belief.quality_factor)}")
     instrument = [(name, *known[name]) for name in NUISANCE_NAMES if name in known]
     lines += [f"# {name} = {value!r} +- {error!r}" for name, value, error in instrument]
     read = [kind for kind in ("peak", "lockin") if result.settings["amplitudes"] in ("both", kind)]

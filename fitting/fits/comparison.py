@@ -27,7 +27,9 @@ class Comparison(Result):
     """Models of one table, the best one first.
 
     Attributes:
-        rows: for each model its name, chi2, degrees_of_freedom, aic, bic, delta_aic (to the best), and law_change, the
+        rows: for each model its name, chi2, degrees_of_freedom and valid, those of its fit in `results`; aic and bic,
+            of the formula alone: without the model discrepancy, which would make up for what it lacks, on the rows that
+            all models use and with the largest of their own errors; delta_aic (to the best), and law_change, the
             largest relative difference of its rebound speed to the best one's over the measured speeds.
         verdict: what the measurement tells, a sentence or two.
         results: the fit of every model, by name.
@@ -69,8 +71,8 @@ def compare(
 ) -> Comparison:
     """Fit several models to one table and compare them on the same rows with the same errors.
 
-    A row that one model sets aside is set aside for all, and every row has the largest of the models' own errors. A
-    model that cannot be fitted is left out, and the comparison says so.
+    For the comparison a row that one model sets aside is set aside for all, and every row has the largest of the
+    models' own errors. A model that cannot be fitted is left out, and the comparison says so.
 
     Args:
         table: the amplitudes, of one table or of several.
@@ -161,7 +163,7 @@ def _options_of(model: str, options: dict[str, Any]) -> dict[str, Any]:
 def _row(model: str, found: Found, result: FitResult, common: Strain) -> dict[str, Any]:
     stated, minimum = found.stated, found.minimum
     objective = relaxed(stated, common)
-    if stated.problem.lasting:
+    if stated.problem.lasting or common.model_error.any():
         minimum = settle(objective, minimum)
     values = stated.problem.values(minimum.coordinates)
     chi2 = float(np.sum(objective.residual(values[None]) ** 2))
@@ -170,8 +172,8 @@ def _row(model: str, found: Found, result: FitResult, common: Strain) -> dict[st
     count = len(values)
     return {
         "model": model,
-        "chi2": chi2,
-        "degrees_of_freedom": data - count,
+        "chi2": result.chi2,
+        "degrees_of_freedom": result.degrees_of_freedom,
         "aic": chi2 + 2.0 * count,
         "bic": chi2 + count * float(np.log(data)),
         "valid": result.valid,

@@ -16,7 +16,8 @@ from jaxtyping import Array, Bool, Float
 
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.impact.lasting_impact import LawImpact, PulledImpact
+from afm_jax.impact.lasting_impact import PulledImpact
+from afm_jax.impact.law import Law
 from afm_jax.least_squares import chi2_tail
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.version import version_of
@@ -32,6 +33,7 @@ from fitting.fits.intervals import (
 )
 from fitting.fits.loss import (
     EV_PER_AJ,
+    NO_MASS,
     Loss,
     WithInterval,
     energy_lost,
@@ -81,7 +83,14 @@ from fitting.models import (
     measurement_of,
     readings_of,
 )
-from fitting.parameters import NUISANCE_NAMES, is_of_one_table, model_parameters, name_of_table, parameter_called
+from fitting.parameters import (
+    DRIFT_NAMES,
+    NUISANCE_NAMES,
+    is_of_one_table,
+    model_parameters,
+    name_of_table,
+    parameter_called,
+)
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable, as_table
 
@@ -184,7 +193,7 @@ def member_after(
 def loss_of(
     found: Callable[[Float[np.ndarray, " n"]], LawAfter],
     measured: tuple[float, float],
-    mass_ng: float,
+    mass_ng: float | None,
     parameters: Mapping[str, FittedParameter],
     formula: Mapping[str, float] | None,
 ) -> Loss:
@@ -193,7 +202,7 @@ def loss_of(
     Args:
         found: the law at approach speeds in nm/us.
         measured: slowest and fastest approach in nm/us.
-        mass_ng: of the tip.
+        mass_ng: of the tip; None: not known.
         parameters: of the fit.
         formula: values of the model's formula, those that are held included; None: it has none.
     """
@@ -210,13 +219,14 @@ def loss_of(
         WithInterval(one.value, one.interval95) if one is not None else None
         for one in (parameters.get("r"), parameters.get("epsilon"))
     )
-    delta = None if epsilon is None else scaled(epsilon, 0.5 * mass_ng)
+    delta = None if epsilon is None or mass_ng is None else scaled(epsilon, 0.5 * mass_ng)
     off = None
     if formula is not None:
         speeds = np.geomspace(*measured, _POINTS)
         off = nearness(speeds, found(speeds).law[0], rebound_by_formula(formula, speeds))
     return Loss(
         energies=tuple(dict.fromkeys(energies)),
+        energies_reason=NO_MASS if mass_ng is None else None,
         r=r,
         epsilon_nm2_per_us2=epsilon,
         delta_aj=delta,
@@ -248,9 +258,9 @@ def law_and_slope(
     """
 
     def law(impact):
-        if isinstance(impact, LawImpact):
-            capture = jnp.full((2, 1), impact.law.capture_speed_nm_per_us)
-            found = jnp.stack([impact.law.rebound_speed(speeds), impact.law.collision_delay(speeds)])
+        if isinstance(impact, Law):
+            capture = jnp.full((2, 1), impact.capture_speed_nm_per_us)
+            found = jnp.stack([impact.rebound_speed(speeds), impact.collision_delay(speeds)])
             return jnp.concatenate([found, capture], axis=1)
         impact = impact.free if isinstance(impact, PulledImpact) else impact
         found = jax.vmap(impact.speeds)(speeds)
@@ -262,7 +272,27 @@ def law_and_slope(
     return law(impact), jax.vmap(lambda turn: jax.jvp(law, (impact,), (turn,))[1], out_axes=-1)(slopes)
 
 
+def _untold_drifts(parameters: Mapping[str, FittedParameter]) -> list[str]:
+    """Return a sentence where drifts along the rows are hardly told by anything but what is assumed of them."""
+    untold = []
+    for name, known in parameters.items():
+        drift = parameter_called(name).name in DRIFT_NAMES
+        if drift and known.constraint is not None and (known.standard_error or np.inf) > 0.5 * known.constraint[1]:
+            untold.append(f"{name} = {known.constraint[0]:g} +- {known.constraint[1]:g}")
+    if not untold:
+        return []
+    said = (
+        f"Hardly told by the rows, which stand in order of time, only assumed: {', '.join(untold)}. Rows of the free "
+        "tip before and after the others tell drifts; `--constrain` takes what is known of them."
+    )
+    return [said]
+
+
 _PACKAGES = ("afm-jax", "jax", "optax", "numpy")
+_KINDS = (("peak amplitude", ""), ("lock-in amplitude", ""), ("phase", "degrees"))
+"""What is read, and its unit if it does not drift by a share."""
+_FOLLOWING = 4.0
+"""Standard errors of a course of the residuals along the rows beyond which it is no chance."""
 
 
 @dataclass(frozen=True)
@@ -306,6 +336,7 @@ class _Summary:
         self.residual = np.asarray(linear.residual)[0]
         self.amplitude_residual = self.searching.misfit(linear)
         self.prediction = linear.prediction
+        self.jacobian = np.asarray(linear.jacobian)[0]
         self.minimum_chi2 = float(np.sum(self.residual**2))
         self.constraints = dict(self.settings["constraints"])
         used = int(np.asarray(objective.measurement.rows.measured).sum())
@@ -420,6 +451,7 @@ class _Summary:
             untabulated=tuple(np.flatnonzero(missed).tolist()),
             contact_share=self.contact_share,
             refused=self.refused,
+            contact=self.problem.model == "contact",
             tapped=self.problem.pulled,
             pulls=tuple(pull.p_value for pull in self.pulls),
             scattering=self.between is not None,
@@ -430,6 +462,7 @@ class _Summary:
         if explained:
             evidence = replace(evidence, parameters=self._explained_parameters(moved))
         reasons, warnings = judge_fit(evidence)
+        warnings += self._follow_rows() + _untold_drifts(evidence.parameters)
         common = [i for i, name in enumerate(self.names) if not is_of_one_table(name)]
         return FitResult(
             model=self.problem.model,
@@ -438,8 +471,8 @@ class _Summary:
             chi2=self.chi2,
             degrees_of_freedom=self.freedom,
             p_value=evidence.p_value,
-            aic=self.chi2 + 2.0 * len(self.values),
-            bic=self.chi2 + len(self.values) * float(np.log(self.data)),
+            aic=self.minimum_chi2 + 2.0 * len(self.values),
+            bic=self.minimum_chi2 + len(self.values) * float(np.log(self.data)),
             valid=not reasons,
             reasons=reasons,
             warnings=warnings,
@@ -461,6 +494,46 @@ class _Summary:
             tables=self._fitted_tables(evidence.parameters),
             scatter=self._scatter() if explained else {},
         )
+
+    def _follow_rows(self) -> list[str]:
+        """Return a sentence for each table whose residuals follow its rows, though it says nothing of their order."""
+        count, kinds = self.amplitude_residual.shape
+        said, first = [], 0
+        scale = np.sqrt(max(1.0, self.minimum_chi2 / max(self.freedom, 1)))
+        for table, label in zip(self.table.tables, self.table.labels, strict=True):
+            rows, first = np.arange(first, first + table.rows), first + table.rows
+            found = []
+            for kind, (name, unit) in zip(range(kinds), _KINDS, strict=False):
+                along = np.zeros((count, kinds))
+                size = 1.0 if unit else np.abs(np.asarray(self.prediction.amplitude_nm)[0, rows, kind])
+                error = np.asarray(self.searching.measurement.rows.error_nm)[rows, kind]
+                seen = np.asarray(self.searching.measurement.rows.measured)[rows, kind]
+                along[rows, kind] = np.where(seen, np.linspace(-0.5, 0.5, table.rows) * size / error, 0.0)
+                slope, sigmas = self._slope_along(along.ravel())
+                if abs(sigmas) > _FOLLOWING * scale:
+                    found.append(f"{name} {f'{slope:+.2g} {unit}' if unit else f'{100.0 * slope:+.2g} %'}")
+            if found and not table.rows_in_order_of_time:
+                several = f"{label}: " if len(self.table.labels) > 1 else ""
+                said.append(
+                    f"{several}Residuals follow the rows ({', '.join(found)} from the first to the last), as drifts "
+                    "do. If the rows stand as they were measured, say `# rows = in order of time`: drifts are then "
+                    "fitted along."
+                )
+        return said
+
+    def _slope_along(self, along: Float[np.ndarray, " n"]) -> tuple[float, float]:
+        """Return how far readings follow a course that the fit leaves them, and that in standard errors."""
+        column = np.append(along, np.zeros(self.residual.size - along.size))
+        slopes = np.nan_to_num(self.jacobian)
+        slopes = slopes / np.maximum(np.linalg.norm(slopes, axis=0), 1e-300)
+        basis, size, _ = np.linalg.svd(slopes, full_matrices=False)
+        basis = basis[:, size > 1e-10 * max(size[0], 1e-300)]
+        left = column - basis @ (basis.T @ column)
+        length = float(left @ left)
+        if length <= 1e-6 * float(column @ column):
+            return 0.0, 0.0
+        slope = -float(left @ np.nan_to_num(self.residual)) / length
+        return slope, slope * np.sqrt(length)
 
     @property
     def _free_own(self) -> list[str]:
@@ -515,8 +588,7 @@ class _Summary:
         formula = None
         if self.problem.model != "contact":
             formula = self.settings["fixed"] | {name: one.value for name, one in parameters.items()}
-        mass = float(measurement.cantilever.mass_ng)
-        return loss_of(found, speed_range(self.used_speeds), mass, parameters, formula)
+        return loss_of(found, speed_range(self.used_speeds), self.table.mass_ng, parameters, formula)
 
     def _closest_member(self, step: LinearStep, left_out: Unmodelled) -> ClosestMember | None:
         """Return the model's law that is closest to the law after the step; None where the step is all there is."""
@@ -866,7 +938,9 @@ def _check_levers(tables: SeveralTables, model: str) -> None:
         )
 
 
-_NEUTRAL = {"tip_calibration": 1.0, "drive_calibration": 1.0, "offset_origin_nm": 0.0, "phase_zero_deg": 0.0}
+_NEUTRAL = {"tip_calibration": 1.0, "drive_calibration": 1.0} | dict.fromkeys(
+    ("offset_origin_nm", "phase_zero_deg", "phase_drift_deg", "free_amplitude_drift"), 0.0
+)
 """What stands for the absence of a nuisance."""
 
 

@@ -23,11 +23,11 @@ class WithInterval:
 
 @dataclass(frozen=True)
 class EnergyLost:
-    """The energy that an impact takes at an approach speed in nm/us, with its 95 % band."""
+    """What an impact takes at an approach speed in nm/us, with its 95 % band; None: its mass is not known."""
 
     approach_speed_nm_per_us: float
-    energy_aj: WithInterval
-    energy_ev: WithInterval
+    energy_aj: WithInterval | None
+    energy_ev: WithInterval | None
 
 
 @dataclass(frozen=True)
@@ -36,6 +36,7 @@ class Loss:
 
     Attributes:
         energies: at three speeds, of the law.
+        energies_reason: why they are not known; None where they are.
         r: the fit's parameter; None of a model without.
         epsilon_nm2_per_us2: likewise.
         delta_aj: energy lost to adhesion, m epsilon/2.
@@ -47,6 +48,7 @@ class Loss:
     """
 
     energies: tuple[EnergyLost, ...]
+    energies_reason: str | None
     r: WithInterval | None
     epsilon_nm2_per_us2: WithInterval | None
     delta_aj: WithInterval | None
@@ -70,15 +72,20 @@ def scaled(known: WithInterval, factor: float) -> WithInterval:
     return WithInterval(known.value * factor, (low, high))
 
 
-def energy_lost(speed: float, rebound: float, error: float, mass_ng: float) -> EnergyLost:
+NO_MASS = "the table gives neither mass_ng nor spring_constant_n_per_m"
+
+
+def energy_lost(speed: float, rebound: float, error: float, mass_ng: float | None) -> EnergyLost:
     """Return the energy that an impact takes; its interval ends at 0, for a sample at rest gives none.
 
     Args:
         speed: approach speed in nm/us.
         rebound: rebound speed.
         error: standard error of that.
-        mass_ng: of the tip.
+        mass_ng: of the tip; None: not known.
     """
+    if mass_ng is None:
+        return EnergyLost(speed, None, None)
     taken = interval_of(0.5 * mass_ng * (speed**2 - rebound**2), mass_ng * rebound * error, lowest=0.0)
     return EnergyLost(speed, taken, scaled(taken, EV_PER_AJ))
 

@@ -11,7 +11,7 @@ from afm_jax.strict_json import plain
 from fitting.fits.intervals import Convergence
 from fitting.fits.loss import Loss
 from fitting.tables.csv_text import FIT_FORMAT_VERSION
-from fitting.tables.several import SeveralTables
+from fitting.tables.several import RepeatedReadings, SeveralTables, repeats_of
 from fitting.tables.table import AmplitudeTable
 
 
@@ -147,8 +147,8 @@ class FitResult(Result):
             out; with a robust fit the soft sum of the residuals alone.
         degrees_of_freedom: measured amplitudes plus constraints minus parameters.
         p_value: probability of a larger chi2 if the model is right.
-        aic: chi2 + 2 k.
-        bic: chi2 + k log(n).
+        aic: chi2 + 2 k, chi2 here of the formula alone: the model discrepancy would make up for what it lacks.
+        bic: chi2 + k log(n), likewise.
         valid: converged, explained and determined; `reasons` say why not.
         reasons: what makes the result invalid.
         warnings: what a reader should know besides.
@@ -188,6 +188,11 @@ class FitResult(Result):
     tables: tuple[FittedTable, ...] = ()
     scatter: dict[str, Scatter] = field(default_factory=dict)
 
+    @property
+    def repeats(self) -> RepeatedReadings | None:
+        """How the readings of drives that were repeated scatter, over their errors; None where none was."""
+        return repeats_of(self.table)
+
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain lists, numbers and strings; what is not known is None."""
         return {
@@ -211,6 +216,7 @@ class FitResult(Result):
             "convergence": plain(asdict(self.convergence)),
             "input": plain({"tables": [*map(vars, self.table.tables)]} if self.tables else vars(self.table)),
             "settings": plain(self.settings),
+            "repeats": None if (repeats := self.repeats) is None else plain(asdict(repeats)),
             "versions": self.versions,
         } | (
             {

@@ -11,16 +11,15 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from afm_jax.least_squares import chi2_tail
+from afm_jax.least_squares import IMPROBABLE, chi2_tail
 from fitting.fits.intervals import Convergence
+from fitting.fits.loss import NO_MASS
 from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.result import FittedParameter, FittedRows
 from fitting.parameters import DELAY_NAMES, is_nuisance, name_of_table, parameter_called
-from fitting.tables.several import SeveralTables
+from fitting.tables.several import SeveralTables, repeats_of
 from fitting.tables.table import AmplitudeTable
 
-IMPROBABLE = 1e-3
-"""Probability of the chi2 below which the model does not explain the table."""
 _TIED = 0.995
 """Correlation beyond which two parameters are called determined only together."""
 _STATED = 0.003
@@ -79,6 +78,8 @@ class Evidence:
     """Largest share of a drive's period that the tip is in contact."""
     refused: bool = False
     """Hardly a row is left that a law of impacts can be read off."""
+    contact: bool = False
+    """Whether a contact was fitted."""
     tapped: bool = False
     """Whether a contact's own taps were fitted, not a law."""
     pulls: tuple[float, ...] = ()
@@ -343,6 +344,8 @@ def helpful_measurement(name: str) -> str:
 def _warnings(evidence: Evidence) -> list[str]:
     return [
         *_damping_warnings(evidence),
+        *_mass_warnings(evidence),
+        *_repeat_warnings(evidence),
         *_table_warnings(evidence),
         *_parameter_warnings(evidence),
         *_pair_warnings(evidence),
@@ -368,6 +371,26 @@ def _damping_warnings(evidence: Evidence) -> list[str]:
     return [f"{', '.join(labels)}: {said}" for said, labels in warnings.items()]
 
 
+def _mass_warnings(evidence: Evidence) -> list[str]:
+    """Return what there is to say of a contact's tip whose mass is not known: its forces act on it."""
+    if evidence.table.mass_ng is not None or not evidence.contact:
+        return []
+    return [f"1 ng assumed: {NO_MASS}. Each of the contact's parameters hangs on it."]
+
+
+def _repeat_warnings(evidence: Evidence) -> list[str]:
+    """Return what repeated readings say of the errors, where these are not theirs."""
+    repeats = repeats_of(evidence.table)
+    if repeats is None or IMPROBABLE <= repeats.p_value <= 1.0 - IMPROBABLE:
+        return []
+    large = repeats.error_ratio > 1.0
+    return [
+        f"Readings of a drive scatter {repeats.error_ratio:.2g} times as much as their errors say ({repeats.rows} rows "
+        f"of {repeats.drives} drives): "
+        + ("the errors are too small, or something drifted." if large else "the errors are larger than the noise.")
+    ]
+
+
 def _damping_warning(table: AmplitudeTable, along: FittedParameter | None) -> str:
     """Return what there is to say of a table's quality factor, which was fitted along or not; "" for nothing."""
     if along is not None:
@@ -380,10 +403,7 @@ def _damping_warning(table: AmplitudeTable, along: FittedParameter | None) -> st
             f"({given:g} +- {error:.3g}). The loss hangs on it: state it, like `# quality_factor = {given:g} +- 1`."
         )
     if table.quality_factor is None:
-        return (
-            "The table gives no quality_factor: air damping is left out, and what it takes is counted as impact loss. "
-            "Add a line like `# quality_factor = 40 +- 1`."
-        )
+        return ""
     if table.quality_factor_error is None:
         known = f"quality_factor = {table.quality_factor:g}"
         return (

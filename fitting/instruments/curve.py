@@ -9,6 +9,7 @@ said, what is missing is asked for by the option that gives it.
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -18,22 +19,15 @@ from jaxtyping import Bool, Float
 from afm_jax.checks import checked
 from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
+from fitting.instruments.bins import Binned, binned, faults_of_order, usual_width
 from fitting.instruments.branch import JUMP, BranchLook, look_at
+from fitting.instruments.columns import ROLES, ColumnSource, example_of_columns, laid_out, parse_columns, turns_of
 from fitting.instruments.formats import read_recording
-from fitting.instruments.recording import UNITS, Known, Recording, Segment, unit_named
-from fitting.tables.csv_text import NUMBER, TableError
+from fitting.instruments.lag import free_lag_deg, sense_of
+from fitting.instruments.recording import UNITS, Known, Recording, Segment
+from fitting.tables.csv_text import TableError
 
 FORMAT_VERSION = 1
-ROLES = {
-    "offset_nm": (("length",), ("offset.*", "z-axis sensor", "zsnsr", "z", "z rel", "z-axis", "height.*", "lvdt")),
-    "lockin_amplitude_nm": (
-        ("length", "voltage"),
-        ("lockin_amplitude.*", "m1a", r"amp(litude)?(_\w+)?", r"amp(litude)?\b.*"),
-    ),
-    "phase_lag_deg": (("angle",), ("phase_lag.*", "m1p", "phase?(_.*)?", r"phase\b.*")),
-    "deflection_nm": (("length", "voltage", "force"), ("defl.*", "normal force")),
-}
-"""What a channel can be: the quantities it may measure, and the names it goes by, likeliest first (no case)."""
 OPTIONS = {
     "drive_frequency_khz": "kHz",
     "free_frequency_khz": "kHz",
@@ -56,41 +50,6 @@ _NO_AMPLITUDE = "There is no lock-in amplitude"
 _WANTED = {"quality_factor": "Q", "spring_constant_n_per_m": "N_PER_M"}
 
 
-@dataclass(frozen=True)
-class ColumnSource:
-    """Where a column of the table comes from: a channel, its unit if the file's is wrong or missing, a factor."""
-
-    channel: str
-    unit: str = ""
-    factor: float = 1.0
-
-
-def parse_columns(text: str) -> dict[str, ColumnSource]:
-    """Return a column map: `column=CHANNEL[:UNIT][:FACTOR]`, separated by commas.
-
-    >>> parse_columns("offset_nm=Z:um:-1,lockin_amplitude_nm=Amp:0.5")["offset_nm"]
-    ColumnSource(channel='Z', unit='um', factor=-1.0)
-
-    Raises:
-        ValueError: if a part is none, with an example.
-    """
-    found = {}
-    for part in text.split(","):
-        column, sign, source = (piece.strip() for piece in part.partition("="))
-        channel, *rest = (piece.strip() for piece in source.split(":"))
-        units = [unit_named(piece) for piece in rest if not NUMBER.fullmatch(piece)]
-        factors = [float(piece) for piece in rest if NUMBER.fullmatch(piece)]
-        if not sign or not channel or len(units) > 1 or len(factors) > 1 or 0.0 in factors:
-            raise ValueError(f"`{part.strip()}` is no COLUMN=CHANNEL[:UNIT][:FACTOR]; write offset_nm=Z:um:-1")
-        if column not in ROLES:
-            raise ValueError(f"there is no column `{column}`; it is one of {', '.join(ROLES)}")
-        if units and UNITS.get(units[0], ("",))[0] not in ROLES[column][0]:
-            known = ", ".join(unit for unit, (what, _) in UNITS.items() if what in ROLES[column][0])
-            raise ValueError(f"`{units[0]}` is no unit of {column}; write one of {known}")
-        found[column] = ColumnSource(channel, units[0] if units else "", factors[0] if factors else 1.0)
-    return found
-
-
 @public_result()
 @dataclass(frozen=True, eq=False, kw_only=True)
 class MeasuredCurve(Result):
@@ -109,6 +68,7 @@ class MeasuredCurve(Result):
         deflection: mean deflection in `deflection_unit`, or None.
         deflection_unit: "nm", "V" or "nN".
         free: rows of the free tip.
+        bin_nm: width of the bins of height that a table of it has (0: equal heights are merged), None: rows as read.
         slope: change of the amplitude per nm of height in contact, in `amplitude_unit`, and its error; or None.
         known: what is known of the measurement, with unit and origin.
         missing: options that would give what a table needs.
@@ -128,6 +88,7 @@ class MeasuredCurve(Result):
     deflection: Float[np.ndarray, " rows"] | None = None
     deflection_unit: str = "nm"
     free: Bool[np.ndarray, " rows"]
+    bin_nm: float | None = None
     slope: tuple[float, float] | None = None
     known: dict[str, Known] = field(default_factory=dict)
     missing: tuple[str, ...] = ()
@@ -175,6 +136,7 @@ def read_curves(
     *,
     columns: str | Mapping[str, ColumnSource] = "",
     drive: str | None = None,
+    bin_nm: float | None = None,
     **numbers: Any,
 ) -> list[MeasuredCurve]:
     """Read every curve of an instrument's file.
@@ -182,8 +144,10 @@ def read_curves(
     Args:
         path: the file; its format is recognised by its content.
         columns: which channel becomes which column, as `parse_columns` takes it or returns it, where names and units
-            do not tell.
+            do not tell; `offset_nm=1/2` where approach and retract are two channels.
         drive: "base" (dither piezo) or "force" (photothermal, magnetic); None: taken as "base", and said.
+        bin_nm: width of the bins of height in the table of a curve, 0 to merge equal heights only; None: rows as they
+            are, or where heights repeat or are not in order bins of five rows or a 200th of a branch.
         numbers: what the file does not say, or says wrongly: the keys of `OPTIONS`, each a number or a pair with its
             standard error; `nm_per_volt="slope"` takes the sensitivity from the curve's own slope.
 
@@ -193,23 +157,36 @@ def read_curves(
     """
     if drive not in {None, "base", "force"}:
         raise ValueError(f"`drive` must be base or force, but is {drive!r}")
+    if bin_nm is not None and not 0.0 <= bin_nm < np.inf:
+        raise ValueError(f"`bin_nm` must be finite and not below 0, but is {bin_nm!r}")
     given = {key: _given(key, value) for key, value in numbers.items() if value is not None}
     wanted = parse_columns(columns) if isinstance(columns, str) and columns else dict(columns or {})
     recording = read_recording(path)
     _refuse_others(recording)
+    stated = any(segment.branch for segment in recording.segments)
+    recording, wanted = laid_out(recording, wanted)
     known = dict(recording.known)
     known["drive"] = Known(drive, "", "option --drive") if drive else Known("base", "", _ASSUMED_BASE)
     known |= {key: one for key, one in given.items() if one.value != "slope"}
+    if "drive_frequency_khz" not in known and "free_frequency_khz" in known:
+        # lock-ins are tuned to the resonance before a curve is taken
+        free = known["free_frequency_khz"]
+        known["drive_frequency_khz"] = Known(free.value, "kHz", _ASSUMED_RESONANCE)
     of_slope = "nm_per_volt" in given and given["nm_per_volt"].value == "slope"
     places = list(dict.fromkeys(segment.curve for segment in recording.segments))
     curves = []
     for place in places:
         segments = [segment for segment in recording.segments if segment.curve == place]
         curve = _joined(recording, segments, wanted, known, len(places))
-        curves.append(_judged(curve, of_slope=of_slope))
+        said = {role for role, source in wanted.items() if source.factor is not None}
+        curve = _turned(curve) if "offset_nm" not in said and _runs_away(curve) else curve
+        curve = curve if stated else _renamed(curve)
+        judged = _judged(curve, of_slope=of_slope, sign_given="phase_lag_deg" in said)
+        curves.append(_binning(judged, bin_nm))
     return curves
 
 
+_ASSUMED_RESONANCE = "assumed: on resonance, at the free frequency; else --drive-frequency-khz"
 _ASSUMED_BASE = "assumed: shaken at its base by a piezo; --drive force for a photothermal or magnetic drive"
 
 
@@ -251,7 +228,7 @@ def _joined(
     if sources["offset_nm"] is None:
         channels = ", ".join(recording.channels)
         raise TableError(
-            f"{recording.source}: no height among the channels {channels}; say --columns offset_nm=CHANNEL:UNIT"
+            f"{recording.source}: no height among the channels {channels}; {example_of_columns(recording)}"
         )
     taken = {source.channel for source in sources.values() if source is not None}
     others = ", ".join(name for name in segments[0].channels if name not in taken)
@@ -271,6 +248,9 @@ def _joined(
                     raise TableError(f"{where}: the {segment.branch} has no channel {source.channel}")
                 parts[role].append(_converted(recording, segment, source, role))
         branches += _branches(segment.branch, parts["offset_nm"][-1])
+    lags = parts["phase_lag_deg"]
+    # each was unwrapped from its own first row
+    lags[1:] = [lag - 360.0 * np.round((np.median(lag) - np.median(lags[0])) / 360.0) for lag in lags[1:]]
     columns = {role: np.concatenate(numbers) for role, numbers in parts.items() if numbers}
     units = {
         role: UNITS[source.unit][0] for role, source in sources.items() if source is not None and source.unit in UNITS
@@ -321,8 +301,9 @@ def _source(
         if not (fitting or unitless):
             return None
         name = (fitting or unitless)[0]
-        source = ColumnSource(name, "", -1.0 if role == "offset_nm" and name in recording.away else 1.0)
-        if source.factor < 0.0:
+        away = role == "offset_nm" and name in recording.away
+        source = ColumnSource(name, "", -1.0 if away else 1.0)
+        if away:
             notes.append(f"Sign: {name} grows away from the sample in this format; the offset is its negative.")
     unit = source.unit or recording.units.get(source.channel, "")
     if UNITS.get(unit, ("",))[0] not in quantities:
@@ -346,7 +327,7 @@ def _converted(recording: Recording, segment: Segment, source: ColumnSource, rol
             "remove the row, or export the file again"
         )
     with np.errstate(over="ignore"):
-        scaled = numbers * (UNITS[source.unit][1] * source.factor)
+        scaled = numbers * (UNITS[source.unit][1] * (source.factor or 1.0))
     if not np.all(np.abs(scaled) < 1e9):
         raise TableError(
             f"{recording.source}, curve {segment.curve}, channel {source.channel}: numbers beyond 1e9; the file is "
@@ -356,23 +337,75 @@ def _converted(recording: Recording, segment: Segment, source: ColumnSource, rol
 
 
 def _branches(branch: str, offset: Float[np.ndarray, " rows"]) -> list[str]:
-    """Return the branch of every row: as the file says, else by the heights, which turn round nearest to the sample."""
+    """Return the branch of every row: as the file says, else by the heights, towards the sample or away from it."""
     rows = len(offset)
     if branch:
         return [branch] * rows
-    turn = int(np.argmax(offset)) + 1
-    if turn > 0.9 * rows and offset[-1] > offset[0]:
-        turn = rows
-    elif turn < 0.1 * rows and offset[-1] < offset[0]:
-        turn = 0
-    return ["approach"] * turn + ["retract"] * (rows - turn)
+    names: list[str] = []
+    ends = [0, *turns_of(offset), rows]
+    for first, last in pairwise(ends):
+        rises = offset[last - 1] >= offset[first]
+        names += ["approach" if rises else "retract"] * (last - first)
+    return names
+
+
+_AWAY = 0.95
+"""Amplitude far from the sample over that near to it below which heights run the other way."""
+
+
+def _far_and_near(curve: MeasuredCurve) -> tuple[float, float]:
+    """Return the median amplitude of the twentieth of the rows that is farthest from the sample, and nearest to it."""
+    amplitude = np.ones(1) if curve.amplitude is None else curve.amplitude[np.argsort(curve.offset_nm, kind="stable")]
+    some = max(len(amplitude) // 20, 1)
+    return float(np.median(amplitude[:some])), float(np.median(amplitude[-some:]))
+
+
+def _runs_away(curve: MeasuredCurve) -> bool:
+    """Say whether heights grow away from the sample: the amplitude falls towards their lower end, and only there."""
+    far, near = _far_and_near(curve)
+    return far < _AWAY * near and all(look.slope is None for look in _looks(curve).values())
+
+
+def _turned(curve: MeasuredCurve) -> MeasuredCurve:
+    """Return a curve with its heights the other way round."""
+    note = (
+        "Direction: the amplitude falls where the heights are lowest: they grow away from the sample and were turned."
+    )
+    return replace(curve, offset_nm=-curve.offset_nm, notes=(*curve.notes, note))
+
+
+def _renamed(curve: MeasuredCurve) -> MeasuredCurve:
+    """Return a curve with approach and retract exchanged, where its heights fall in the one and rise in the other."""
+    ends = _ends(curve)
+    if any((last >= first) == (name == "approach") for name, (first, last) in ends.items()):
+        return curve
+    return replace(curve, branch=np.where(curve.branch == "approach", "retract", "approach"))
+
+
+def _ends(curve: MeasuredCurve) -> dict[str, tuple[float, float]]:
+    """Return the first and the last height of every branch."""
+    heights = {name: curve.offset_nm[curve.branch == name] for name in dict.fromkeys(curve.branch.tolist())}
+    return {name: (float(one[0]), float(one[-1])) for name, one in heights.items()}
+
+
+def _binning(curve: MeasuredCurve, bin_nm: float | None) -> MeasuredCurve:
+    """Return a curve with the width of its table's bins: as given, or the usual one where heights ask for bins."""
+    repeated, back = faults_of_order(curve.offset_nm, curve.branch)
+    width = usual_width(curve.offset_nm, curve.branch) if bin_nm is None else bin_nm
+    if width is None:
+        return curve
+    why = f"{repeated} rows repeat a height and {back} step back" if repeated or back else "asked for"
+    how = f"of {width:.3g} nm" if width else "of equal height"
+    error = ", with their scatter for an error" if width else ""
+    note = f"Bins: {why}; the table has the means of bins {how}{error} (--bin-nm)."
+    return replace(curve, bin_nm=width, notes=(*curve.notes, note))
 
 
 _ASSUMED_ORIGIN_NM = 1.0
 """Error of an origin read off the curve: attraction moves the contact by about so much."""
 
 
-def _judged(curve: MeasuredCurve, *, of_slope: bool) -> MeasuredCurve:
+def _judged(curve: MeasuredCurve, *, of_slope: bool, sign_given: bool) -> MeasuredCurve:
     """Return a curve with free rows, slope, origin and zero of the phase found, and everything doubtful named."""
     amplitude = curve.amplitude
     if amplitude is None:
@@ -392,7 +425,7 @@ def _judged(curve: MeasuredCurve, *, of_slope: bool) -> MeasuredCurve:
     known = curve.known | _free_amplitude(curve, looks)
     curve = replace(curve, known=_with_errors(replace(curve, known=known), looks))
     curve = _with_origin(curve, looks)
-    curve = _with_zero_of_phase(curve)
+    curve = _with_zero_of_phase(curve, sign_given=sign_given)
     missing = [key for key in _NEEDED if _is_missing(curve, key)] + [key for key in _WANTED if key not in curve.known]
     return replace(curve, notes=(*curve.notes, *_scale_notes(curve), *_phase_notes(curve)), missing=tuple(missing))
 
@@ -460,10 +493,8 @@ def _reasons(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> list[str]
     if np.ptp(levels) > JUMP * max(levels):
         text = " and ".join(f"{look.level:.4g} {unit} in the {branch}" for branch, look in looks.items())
         reasons.append(f"The free amplitude is {text}: the drive or the demodulation changed between them.")
-    amplitude = np.ones(1) if curve.amplitude is None else curve.amplitude[np.argsort(curve.offset_nm, kind="stable")]
-    some = max(len(amplitude) // 20, 1)
-    far, near = float(np.median(amplitude[:some])), float(np.median(amplitude[-some:]))
-    if far < 0.9 * near and all(look.slope is None for look in looks.values()):
+    far, near = _far_and_near(curve)
+    if _runs_away(curve):
         reasons.append(
             f"The amplitude is smaller far from the sample ({far:.4g} {unit}) than near it ({near:.4g} {unit}): the "
             "heights run the other way; turn them round with --columns offset_nm=CHANNEL:-1 (or drop that -1)."
@@ -528,32 +559,38 @@ def _with_origin(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> Measu
     return replace(curve, offset_nm=curve.offset_nm - height, known=known)
 
 
-def free_lag_deg(drive: str, frequency_ratio: float, quality_factor: float) -> float:
-    """Return the lag of the free tip behind its drive: of its height (force) or of the deflection (base).
-
-    With gamma = 1 - s^2 + i s/Q the height lags by arg gamma, the deflection behind the base by arg gamma - arg(1 -
-    gamma).
-
-    >>> free_lag_deg("force", 1.0, 200.0), round(free_lag_deg("base", 1.0, 200.0), 2)
-    (90.0, 90.29)
-    """
-    gamma = 1.0 - frequency_ratio**2 + 1j * frequency_ratio / quality_factor
-    lag = np.angle(gamma) - (np.angle(1.0 - gamma) if drive == "base" else 0.0)
-    return float(np.rad2deg(lag))
-
-
-def _with_zero_of_phase(curve: MeasuredCurve) -> MeasuredCurve:
-    """Return the curve with the lag of the free rows set to what theory says, where frequency and Q are known."""
+def _with_zero_of_phase(curve: MeasuredCurve, *, sign_given: bool) -> MeasuredCurve:
+    """Return the curve with sign and zero of the phase such that free rows lag as frequency and Q say, where known."""
     phase, numbers = curve.phase_lag_deg, [curve.number(k) for k in ("drive_frequency_khz", "free_frequency_khz")]
     quality_factor = curve.number("quality_factor")
     if phase is None or None in numbers or quality_factor is None or not curve.free.any():
         return curve
     lag = free_lag_deg(str(curve.known["drive"].value), numbers[0] / numbers[1], quality_factor)  # type: ignore[operator]
     free = phase[curve.free]
-    level, error = float(np.median(free)), float(np.std(free) / np.sqrt(len(free)))
+    level, scatter = float(np.median(free)), float(np.std(free) / np.sqrt(len(free)))
+    error = float(np.hypot(max(scatter, 0.01), _error_of_lag(curve)))
     how = f"measured: the free rows read {level:.2f} deg and are set to {lag:.2f}, what s and Q give"
-    known = curve.known | {"phase_zero_deg": Known(level - lag, "deg", how, max(error, 0.01))}
-    return replace(curve, phase_lag_deg=phase - (level - lag), known=known)
+    sense = sense_of(level, lag, sign_given=sign_given)
+    known = curve.known | {"phase_zero_deg": Known(sense.zero_deg, "deg", how, error)}
+    notes = (*curve.notes, sense.note) if sense.note else curve.notes
+    return replace(curve, phase_lag_deg=sense.lag_deg(phase), known=known, notes=notes)
+
+
+_USUAL = {"free_frequency_khz": 2e-4, "quality_factor": 0.05}
+"""Relative errors of what is given without one."""
+
+
+def _error_of_lag(curve: MeasuredCurve) -> float:
+    """Return the standard error of the free tip's lag in degrees, from those of its frequency and quality factor."""
+    at = {key: float(curve.known[key].value) for key in ("drive_frequency_khz", *_USUAL)}
+
+    def lag(**changed: float) -> float:
+        drive, free, quality_factor = (at | changed).values()
+        return free_lag_deg(str(curve.known["drive"].value), drive / free, quality_factor)
+
+    errors = {key: curve.known[key].error or share * at[key] for key, share in _USUAL.items()}
+    parts = [0.5 * (lag(**{key: at[key] + error}) - lag(**{key: at[key] - error})) for key, error in errors.items()]
+    return float(np.linalg.norm(parts))
 
 
 def _is_missing(curve: MeasuredCurve, key: str) -> bool:
@@ -590,7 +627,9 @@ def _phase_notes(curve: MeasuredCurve) -> list[str]:
     phase, amplitude, free = curve.phase_lag_deg, curve.amplitude, curve.number("free_amplitude_nm")
     if phase is None or amplitude is None:
         return ["There is no phase: the energy of a tap has an upper bound only."] if amplitude is not None else []
-    notes = ["Sign: a larger phase is taken as a larger lag; if it leads, --columns phase_lag_deg=CHANNEL:-1."]
+    turned = any(note.startswith("Sign: the free tip") for note in curve.notes)
+    taken = "Sign: a larger phase is taken as a larger lag; if it leads, --columns phase_lag_deg=CHANNEL:-1."
+    notes = [] if turned else [taken]
     zero = curve.known.get("phase_zero_deg")
     if zero is None:
         notes.append("Zero: the phase counts from the instrument's own zero; free frequency and Q would fix it.")
@@ -630,25 +669,27 @@ def table_text(curve: MeasuredCurve) -> str:
     if needed:
         options = " ".join(f"--{key.replace('_', '-')} {_NEEDED[key]}" for key in needed)
         raise TableError(f"{curve.source}: the file does not say {', '.join(needed)}; give {options}")
-    phase = curve.phase_lag_deg
+    rows = _rows(curve)
     columns: dict[str, Any] = {
         "drive_frequency_khz": curve.number("drive_frequency_khz"),
         "free_amplitude_nm": curve.number("free_amplitude_nm"),
-        "offset_nm": curve.offset_nm,
-        "lockin_amplitude_nm": curve.amplitude,
-        "lockin_amplitude_error_nm": curve.number("amplitude_error_nm"),
-        "phase_lag_deg": phase,
-        "phase_lag_error_deg": None if phase is None else curve.number("phase_error_deg"),
-        "retract": (curve.branch == "retract").astype(int),
+        "offset_nm": rows.offset_nm,
+        "lockin_amplitude_nm": rows.readings["amplitude"],
+        "lockin_amplitude_error_nm": rows.errors["amplitude"],
+        "phase_lag_deg": rows.readings.get("phase"),
+        "phase_lag_error_deg": rows.errors.get("phase"),
+        "retract": (rows.branch == "retract").astype(int),
     }
     # an offset of the detector may take the amplitude of a tip that does not move below zero
-    moving = curve.amplitude > 0.0
+    moving = rows.readings["amplitude"] > 0.0
     present = {
         name: np.broadcast_to(column, moving.shape)[moving].tolist()
         for name, column in columns.items()
         if column is not None
     }
     lines = [f"# drive = {curve.known['drive'].value}", *_setting_lines(curve)]
+    if rows.in_order_of_time:
+        lines.append("# rows = in order of time")
     remarks = [f"read from {Path(curve.source).name} ({curve.format}), curve {curve.curve}", *curve.notes]
     if not moving.all():
         remarks.append(f"left out: {np.sum(~moving)} rows whose amplitude is not above zero")
@@ -659,6 +700,28 @@ def table_text(curve: MeasuredCurve) -> str:
         for row in zip(*present.values(), strict=True)
     ]
     return "\n".join(lines) + "\n"
+
+
+def _rows(curve: MeasuredCurve) -> Binned:
+    """Return the rows of a curve's table: its bins, or the rows as they were read."""
+    keys = {"amplitude": "amplitude_error_nm", "phase": "phase_error_deg"}
+    values = {"amplitude": curve.amplitude, "phase": curve.phase_lag_deg}
+    readings = {name: column for name, column in values.items() if column is not None}
+    single = {name: curve.known[keys[name]] for name in readings}
+    errors = {name: float(one.value) for name, one in single.items()}
+    if curve.bin_nm is None:
+        count = np.ones(len(curve.offset_nm), dtype=int)
+        rows = {name: np.full(len(count), error) for name, error in errors.items()}
+        ways = all((last > first) == (name == "approach") for name, (first, last) in _ends(curve).items())
+        in_order = ways and not any(faults_of_order(curve.offset_nm, curve.branch))
+        return Binned(curve.offset_nm, readings, rows, count, curve.branch, in_order)
+    stated = {name: errors[name] for name, one in single.items() if not curve.bin_nm or one.origin.startswith("option")}
+    means = binned(curve.offset_nm, readings, curve.branch, curve.free, curve.bin_nm, stated)
+    # rows without any scatter (a resolution that is coarser than the noise) have that of the free tip
+    least = {
+        name: np.where(error > 0.0, error, errors[name] / np.sqrt(means.rows)) for name, error in means.errors.items()
+    }
+    return means._replace(errors=least)
 
 
 def _setting_lines(curve: MeasuredCurve) -> list[str]:

@@ -1,16 +1,18 @@
 """One parser for each format of file that instruments write; which one a file is its content says, not its name.
 
-neaSNOM text, WSxM curves, Nanonis text, NanoSurf .nid and separated text are read here; Asylum's .ibw and Gwyddion's
-.gwy by the packages igor2 and gwyfile (`pip install afm-jax[instruments]`), imported only for such a file.
+neaSNOM text, WSxM curves, Nanonis text, NanoSurf .nid, Gwyddion .gwy and separated text are read here; Asylum's .ibw by
+the package igor2 (`pip install afm-jax[instruments]`), imported only for such a file.
 """
 
 import csv
 import io
 import logging
 import re
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from importlib import import_module
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,7 @@ from jaxtyping import Float
 
 from afm_jax.scenefile.tables import printable
 from afm_jax.whole_files import MOST_VALUES
+from fitting.instruments.gwyddion import read_objects
 from fitting.instruments.recording import (
     HEADER_KEYS,
     UNITS,
@@ -246,6 +249,32 @@ _NANOSURF_KEYS = {
 
 def parse_nanosurf(data: bytes, name: str) -> Recording:
     """Read NanoSurf .nid: sections of `key=value`, the mark `#!`, then the data sets as integers, one after another."""
+    sets, known = nanosurf_sets(data, name)
+    branches = {"Spec forward": "approach", "Spec backward": "retract", "Spectrum FFT": "", "Spectrum Fit": ""}
+    parts: dict[tuple[int, str], dict[str, Any]] = {}
+    units: dict[str, str] = {}
+    for keys, lines in sets:
+        frame = keys.get("Frame", "")
+        if frame in branches:
+            ending = " (vendor's fit)" if frame == "Spectrum Fit" else ""
+            axis, channel = keys["Dim0Name"], keys["Dim2Name"] + ending
+            units |= {axis: unit_named(keys["Dim0Unit"]), channel: unit_named(keys["Dim2Unit"])}
+            for line, (at, numbers) in enumerate(lines):
+                channels = parts.setdefault((line + 1, branches[frame]), {})
+                channels.setdefault(axis, at)
+                channels[channel] = numbers
+    if not parts:
+        frames = ", ".join(dict.fromkeys(keys.get("Frame", "?") for keys, _ in sets)) or "none"
+        raise TableError(
+            f"{name}: holds no curve and no spectrum, but {frames}; export the spectroscopy data; energies of images: "
+            "afm-jax tapping-map"
+        )
+    segments = tuple(Segment(curve, branch, parts[curve, branch]) for curve, branch in sorted(parts))
+    return Recording("NanoSurf .nid", name, segments, units, known)
+
+
+def nanosurf_sets(data: bytes, name: str) -> tuple[list[tuple[dict[str, str], Iterator[Any]]], dict[str, Known]]:
+    """Return a NanoSurf file's data sets, each its keys and its lines (axis, numbers), and what the header says."""
     mark = data.find(b"#!")
     if mark < 0:
         raise cut_off(name, "the mark '#!' in front of the data is missing")
@@ -254,32 +283,15 @@ def parse_nanosurf(data: bytes, name: str) -> Recording:
     sizes = [int(keys["Points"]) * int(keys["Lines"]) * (int(keys["SaveBits"]) // 8) for keys in sets]
     if min(sizes, default=0) < 0 or sum(sizes) != len(data) - mark - 2:
         raise cut_off(name, f"the header announces {sum(sizes)} bytes of data, {len(data) - mark - 2} are there")
-    branches = {"Spec forward": "approach", "Spec backward": "retract", "Spectrum FFT": "", "Spectrum Fit": ""}
-    parts: dict[tuple[int, str], dict[str, Any]] = {}
-    units: dict[str, str] = {}
-    place = mark + 2
-    for keys, size in zip(sets, sizes, strict=True):
-        frame = keys.get("Frame", "")
-        if frame in branches:
-            ending = " (vendor's fit)" if frame == "Spectrum Fit" else ""
-            axis, channel = keys["Dim0Name"], keys["Dim2Name"] + ending
-            units |= {axis: unit_named(keys["Dim0Unit"]), channel: unit_named(keys["Dim2Unit"])}
-            for line, (at, numbers) in enumerate(_nid_lines(keys, data[place : place + size])):
-                channels = parts.setdefault((line + 1, branches[frame]), {})
-                channels.setdefault(axis, at)
-                channels[channel] = numbers
-        place += size
-    if not parts:
-        frames = ", ".join(dict.fromkeys(keys.get("Frame", "?") for keys in sets)) or "none"
-        raise TableError(f"{name}: holds no curve and no spectrum, but {frames}; export the spectroscopy data")
+    starts = mark + 2 + np.cumsum([0, *sizes])
     known = known_from(header, _NANOSURF_KEYS)
     warm = number_in(header.get("Cantilever temperature", ""))
     if warm is not None and -100.0 < warm[0] < 500.0:
         known["temperature_k"] = Known(
             warm[0] + 273.15, "K", "header: Cantilever temperature, taken in degrees Celsius"
         )
-    segments = tuple(Segment(curve, branch, parts[curve, branch]) for curve, branch in sorted(parts))
-    return Recording("NanoSurf .nid", name, segments, units, known)
+    lines = [_nid_lines(keys, data[a:b]) for keys, (a, b) in zip(sets, pairwise(starts.tolist()), strict=True)]
+    return list(zip(sets, lines, strict=True)), known
 
 
 def _nid_sections(text: str) -> tuple[list[tuple[str, dict[str, str]]], dict[str, str]]:
@@ -296,7 +308,7 @@ def _nid_sections(text: str) -> tuple[list[tuple[str, dict[str, str]]], dict[str
     return sections, together
 
 
-def _nid_lines(keys: dict[str, str], data: bytes):
+def _nid_lines(keys: dict[str, str], data: bytes) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Give the axis and the numbers of every line of a data set."""
     points, bits = int(keys["Points"]), int(keys["SaveBits"])
     whole = np.frombuffer(data, {16: "<i2", 32: "<i4"}[bits]).reshape(-1, points)
@@ -366,14 +378,17 @@ def parse_separated(data: bytes, name: str) -> Recording:
     if not rows:
         raise TableError(f"{name}: the file holds only comments; add rows of numbers")
     separator = max("\t;,", key=lambda sign: (rows[0][1].count(sign), rows[-1][1].count(sign)))
-    if separator not in rows[0][1]:
-        raise TableError(
-            f"{name}, line {rows[0][0]}: columns separated by tabs, semicolons or commas are expected here"
-        )
-    cells = [
-        (number, [cell.strip() for cell in next(csv.reader(io.StringIO(line), delimiter=separator))])
-        for number, line in rows
-    ]
+    if separator in rows[0][1]:
+        cells = [
+            (number, [cell.strip() for cell in next(csv.reader(io.StringIO(line), delimiter=separator))])
+            for number, line in rows
+        ]
+    else:
+        cells = [(number, line.split()) for number, line in rows]
+        if len(cells[0][1]) < 2 or not all(NUMBER.fullmatch(cell) for cell in cells[0][1]):
+            raise TableError(
+                f"{name}, line {rows[0][0]}: columns separated by tabs, semicolons or commas are expected here"
+            )
     decimal = "." if separator == "," else ","
     titles, units_row, body = _heads(cells, decimal)
     if not body:
@@ -446,26 +461,35 @@ _IGOR_KEYS = {
 _IGOR_UNITS = {"amp": "m", "defl": "m", "zsnsr": "m", "raw": "m", "lvdt": "m", "phase": "deg", "phas": "deg"}
 
 
-def parse_igor(data: bytes, name: str) -> Recording:
-    """Read Asylum's ramps in Igor's binary waves: a column for each channel, notes of `key: value`, SI units."""
+def igor_wave(data: bytes, name: str) -> tuple[np.ndarray, list[str], dict[str, str], dict[str, Known]]:
+    """Return the numbers of an Igor binary wave, the names of its channels, its note and what that says."""
     if len(data) < 64 or _igor_points(data) > min(len(data), MOST_VALUES):
         raise cut_off(name, "the header announces more numbers than the file holds")
     package = _package("igor2.binarywave", ".ibw")
     # of a damaged file it would log every number
     logging.getLogger("igor2").setLevel(logging.CRITICAL)
-    wave = package.load(io.BytesIO(data))["wave"]
-    numbers = np.asarray(wave["wData"], dtype=float)
-    if numbers.ndim != 2:
-        raise TableError(
-            f"{name}: holds an array of {numbers.ndim} dimensions, not a ramp of channels; export the ramp"
-        )
-    labels = [label.decode("latin-1") for label in wave["labels"][1] if label] if len(wave["labels"]) > 1 else []
-    if len(labels) != numbers.shape[1]:
-        raise cut_off(name, f"{numbers.shape[1]} channels, but {len(labels)} names")
+    with warnings.catch_warnings():
+        # numbers of a damaged file overflow
+        warnings.simplefilter("ignore", RuntimeWarning)
+        wave = package.load(io.BytesIO(data))["wave"]
+        numbers = np.asarray(wave["wData"], dtype=float)
+    side = min(numbers.ndim - 1, 2)
+    names = wave["labels"][side] if 0 < side < len(wave["labels"]) else []
+    labels = [label.decode("latin-1") for label in names if label]
     note = bytes(wave["note"]).decode("latin-1").replace("\r", "\n")
     header = {k.strip(): v.strip() for k, _, v in (line.partition(":") for line in note.split("\n") if ":" in line)}
     known = known_from(header, _IGOR_KEYS, "note")
-    known |= _igor_free(header, known)
+    return numbers, labels, header, known | _igor_free(header, known)
+
+
+def parse_igor(data: bytes, name: str) -> Recording:
+    """Read Asylum's ramps in Igor's binary waves: a column for each channel, notes of `key: value`, SI units."""
+    numbers, labels, header, known = igor_wave(data, name)
+    if numbers.ndim != 2:
+        what = "images; their energies: afm-jax tapping-map" if numbers.ndim == 3 else "no ramp of channels"
+        raise TableError(f"{name}: holds an array of {numbers.ndim} dimensions, {what}")
+    if len(labels) != numbers.shape[1]:
+        raise cut_off(name, f"{numbers.shape[1]} channels, but {len(labels)} names")
     units = {label: _IGOR_UNITS.get(label.lower(), "") for label in labels}
     columns = dict(zip(labels, numbers.T.copy(), strict=True))
     return Recording("Igor .ibw ramp", name, tuple(_igor_segments(header, columns)), units, known)
@@ -517,12 +541,11 @@ def _igor_segments(header: dict[str, str], columns: dict[str, Any]) -> list[Segm
 
 def parse_gwyddion(data: bytes, name: str) -> Recording:
     """Read the graphs of a Gwyddion file: every curve is a channel over the height, which is the channel Z."""
-    gwyfile = _package("gwyfile", ".gwy")
-    if int.from_bytes(data[4 + data[4:].find(b"\0") + 1 :][:4], "little") != len(data) - 4 - data[4:].find(b"\0") - 5:
-        raise cut_off(name, "the length in the header is not that of the file")
-    content = gwyfile.objects.GwyObject.frombuffer(data[4:])
+    content = read_objects(data, name)
     graphs = [value for key, value in sorted(content.items()) if "/graph/graph/" in key and "curves" in value]
     if not graphs:
+        if any(key.endswith("/data") for key in content):
+            raise TableError(f"{name}: holds images; their energies: afm-jax tapping-map")
         raise TableError(f"{name}: holds no graph; copy the curve into a graph in Gwyddion and save again")
     units: dict[str, str] = {}
     parts: list[dict[str, Any]] = []

@@ -15,7 +15,7 @@ from fitting.inversion.flight import Inverted, MeasuredRow, invert_rows
 from fitting.inversion.regression import Laws, compare_law, regressed_laws
 from fitting.inversion.result import Inversion, InvertedRows, RegressedLaw, SavedLaw, on_resonance, read_on_resonance
 from fitting.tables.csv_text import TableError
-from fitting.tables.table import AmplitudeTable, TableLike, as_table
+from fitting.tables.table import AmplitudeTable, TableLike, as_table, check_quality_factor
 
 _BLOCK = 64
 """Rows come filled up to a multiple of this, so that one program serves most tables."""
@@ -69,11 +69,13 @@ def invert(
         Rows with errors, regressed laws and a verdict; see `Inversion`.
 
     Raises:
-        TableError: if the table has no phase and no row on resonance, or the fitted law holds at other speeds.
+        TableError: if the table has no phase and no row on resonance, or does not say its quality factor, or the fitted
+            law holds at other speeds.
         ValueError: if the frequency's error is not positive.
         RuntimeError: if JAX is not set to 64-bit floats.
     """
     table = as_table(table)
+    check_quality_factor(table)
     require_float64()
     if frequency_error_khz is not None and not 0.0 < frequency_error_khz < table.free_frequency_khz:
         raise ValueError(f"`frequency_error_khz` must be positive, but is {frequency_error_khz!r}")
@@ -238,9 +240,7 @@ def _judged(table: AmplitudeTable, laws: Laws) -> tuple[list[str], list[str]]:
         reasons.append("the rows determine no coefficient of either law to two standard errors: measure more finely")
     if not phases.any():
         warnings.append("the table has no phase: only the paper's reading on resonance, whose phase is assumed")
-    if table.quality_factor is None:
-        warnings.append("Q is not known: the flight is taken as undamped, so air damping counts as loss on impact")
-    elif table.quality_factor_error is None:
+    if table.quality_factor is not None and table.quality_factor_error is None:
         warnings.append("Q comes without an error: its uncertainty is not in the errors here")
     lost = int((phases & ~rows.inverted).sum())
     if lost and rows.inverted.any():

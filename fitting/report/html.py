@@ -384,7 +384,9 @@ def _minimum(result: FitResult) -> Table:
 
 
 def _instrument(measured: AmplitudeTable) -> Table:
-    quality = "not given" if measured.quality_factor is None else f"{measured.quality_factor:g}"
+    quality = "none: no air damping" if measured.quality_factor is None else f"{measured.quality_factor:g}"
+    if measured.quality_factor is not None and np.isnan(measured.quality_factor):
+        quality = "not given"
     if measured.quality_factor_error is not None:
         quality += f" ± {measured.quality_factor_error:g}"
     spread = measured.free_frequency_error_khz
@@ -393,7 +395,7 @@ def _instrument(measured: AmplitudeTable) -> Table:
         "drive": measured.drive,
         "free_frequency_khz": f"{measured.free_frequency_khz:g}" + ("" if spread is None else f" ± {spread:g}"),
         "quality_factor": quality,
-        "mass_ng": f"{measured.mass_ng:g}",
+        "mass_ng": "not given" if measured.mass_ng is None else f"{measured.mass_ng:g}",
     }
     header |= {name: f"{value:g} ± {error:g}" for name, (value, error) in measured.calibration.items()}
     return pairs("What the table says of the instrument", ("", "value"), header)

@@ -78,7 +78,8 @@ def energy_figure(result: FitResult, loss: Loss) -> Figure:
     """Return the figure of the energy that an impact takes over the measured speeds, beside the formula."""
     figure = Figure(figsize=(_WIDTH_INCHES, 3.4), layout="constrained")
     axes = figure.subplots()
-    law, half = result.law, 0.5 * result.table.mass_ng
+    mass = result.table.mass_ng
+    law, half = result.law, 0.5 * (1.0 if mass is None else mass)
     speed = law.approach_speed_nm_per_us
     columns = (law.rebound_speed_nm_per_us, law.rebound_high_nm_per_us, law.rebound_low_nm_per_us)
     lost, least, most = (half * (speed**2 - column**2) for column in columns)
@@ -90,14 +91,19 @@ def energy_figure(result: FitResult, loss: Loss) -> Figure:
         rebound = rebound_by_formula(values, speed)
         label = "formula with the fitted parameters"
         axes.plot(speed, half * (speed**2 - rebound**2), color=COLOURS[1], ls="--", label=label)
-    known = [(one.approach_speed_nm_per_us, one.energy_aj.value, *one.energy_aj.interval95) for one in loss.energies]
+    known = [
+        (one.approach_speed_nm_per_us, one.energy_aj.value, *one.energy_aj.interval95)
+        for one in loss.energies
+        if one.energy_aj is not None
+    ]
     for u, energy, low, high in known:
         reach = None if low is None or high is None else [[energy - low], [high - energy]]
         axes.errorbar([u], [energy], yerr=reach, fmt="o", color="black", ms=3.5, capsize=3)
     _mark_speeds(axes, result)
     log_speed_axis(axes)
-    top = max(max(energy, high or 0.0) for _, energy, _, high in known)
-    bottom = min(energy if low is None else low for _, energy, low, _ in known)
+    ends = [end for _, energy, low, high in known for end in (energy, low, high) if end is not None]
+    ends = ends or [float(np.nanmin(lost)), float(np.nanmax(lost))]
+    bottom, top = min(ends), max(ends)
     if 0.0 < _MUCH * bottom < top:
         axes.set_yscale("log")
         axes.set_ylim(0.5 * bottom, 2.0 * top)
@@ -105,11 +111,14 @@ def energy_figure(result: FitResult, loss: Loss) -> Figure:
     else:
         axes.set_ylim(0.0, max(1.4 * top, 1e-12))
     axes.set_xlabel(_APPROACH)
-    axes.set_ylabel("energy lost in an impact (aJ)")
-    volts = axes.secondary_yaxis(
-        "right", functions=(lambda x: np.multiply(x, EV_PER_AJ), lambda x: np.divide(x, EV_PER_AJ))
+    axes.set_ylabel(
+        "energy lost in an impact (aJ)" if mass is not None else "energy over mass lost in an impact (aJ/ng)"
     )
-    volts.set_ylabel("(eV)")
+    if mass is not None:
+        volts = axes.secondary_yaxis(
+            "right", functions=(lambda x: np.multiply(x, EV_PER_AJ), lambda x: np.divide(x, EV_PER_AJ))
+        )
+        volts.set_ylabel("(eV)")
     axes.legend(fontsize=SMALL, loc="upper left")
     return figure
 

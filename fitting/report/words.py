@@ -12,6 +12,7 @@ from fitting.fits.result import FitResult, FittedParameter
 from fitting.fits.verdict import IMPROBABLE, value_at_bound
 from fitting.parameters import DELAY_LAW, LAWS, PARAMETERS
 from fitting.sampling.trust_pack import TrustPack
+from fitting.tables.several import RepeatedReadings
 
 SHARE_OF_BAND = 0.1
 """How far the rounded formula may be off, in half-widths of the 95 % band."""
@@ -71,6 +72,15 @@ def trust_in_words(pack: TrustPack) -> list[str]:
     ]
 
 
+def repeats_in_words(repeats: RepeatedReadings) -> str:
+    """Return what repeated readings say of the stated errors."""
+    return (
+        f"{repeats.rows} rows repeat {repeats.drives} drive{'s' if repeats.drives > 1 else ''}: they scatter "
+        f"{repeats.error_ratio:.2g} times as much as their errors say (chi2/dof = {repeats.chi2:.1f}/"
+        f"{repeats.degrees_of_freedom}, probability {repeats.p_value:.2g})"
+    )
+
+
 def rows_in_words(count: int) -> str:
     """Return '1 row' or '82 rows'."""
     return f"{count} row" if count == 1 else f"{count} rows"
@@ -100,7 +110,10 @@ def losses_in_words(result: FitResult) -> list[list[str]]:
             f"{known_in_words(one.energy_aj, 'aJ')}, {known_in_words(one.energy_ev, 'eV')}",
         ]
         for one in loss.energies
+        if one.energy_aj is not None and one.energy_ev is not None
     ]
+    if loss.energies_reason is not None:
+        rows.append(["energy lost", f"not known: {loss.energies_reason}"])
     if loss.delta_aj is not None and loss.delta_ev is not None:
         rows.append(
             ["delta = m epsilon/2", f"{known_in_words(loss.delta_aj, 'aJ')}, {known_in_words(loss.delta_ev, 'eV')}"]

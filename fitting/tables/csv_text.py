@@ -207,6 +207,7 @@ class FileSetting:
         lowest: what it must lie above.
         error: whether a standard error stands behind it: "never", "maybe" or "always".
         choices: of a word in place of a number: which there are.
+        none: whether the word "none" may stand in place of the number, which then is infinite.
     """
 
     key: str
@@ -215,6 +216,7 @@ class FileSetting:
     lowest: float = 0.0
     error: Literal["never", "maybe", "always"] = "never"
     choices: tuple[str, ...] = ()
+    none: bool = False
 
     @property
     def line(self) -> str:
@@ -377,6 +379,8 @@ def _parse_setting(setting: FileSetting, text: str, *, line: int, faults: Faults
             f"{key} must be {choices}, but is {quoted(match['value'].strip())}; write '{setting.line}'", line=line
         )
         return None
+    if setting.none and cells == ["none"]:
+        return float("inf"), None
     fault = _fault_in_cells(setting, cells)
     if fault is not None:
         faults.add(f"{key} {fault}", line=line)

@@ -1,4 +1,7 @@
-"""Several tables that are fitted together, as reports and verdicts see them: their rows one after the other."""
+"""Several tables that are fitted together, as reports and verdicts see them: their rows one after the other.
+
+Readings that were repeated at one drive: how much they scatter, over what their errors say.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int, Shaped
 
-from fitting.tables.table import AmplitudeTable
+from afm_jax.least_squares import chi2_tail
+from fitting.tables.table import MEASURED, AmplitudeTable, required
 
 
 @dataclass(frozen=True)
@@ -29,14 +33,23 @@ class SeveralTables:
             raise ValueError("a joint fit needs at least two tables")
         first, name = self.tables[0], self.labels[0]
         for table, label in zip(self.tables[1:], self.labels[1:], strict=True):
-            if abs(table.mass_ng / first.mass_ng - 1.0) > _SAME_MASS:
+            if table.mass_ng is None or first.mass_ng is None:
+                if table.mass_ng is not first.mass_ng:
+                    without, having = (label, name) if table.mass_ng is None else (name, label)
+                    raise ValueError(
+                        f"{without} lacks mass_ng (or spring_constant_n_per_m), which {having} gives; add it"
+                    )
+            elif abs(table.mass_ng / first.mass_ng - 1.0) > _SAME_MASS:
                 raise ValueError(
                     f"mass_ng is {first.mass_ng:g} in {name} and {table.mass_ng:g} in {label}: tips of different "
                     "mass share no law of impacts; fit them with --each"
                 )
             if (table.quality_factor is None) != (first.quality_factor is None):
                 without, having = (label, name) if table.quality_factor is None else (name, label)
-                raise ValueError(f"{without} lacks quality_factor, which {having} gives; add it, with its error")
+                raise ValueError(
+                    f"{without} says that there is no air damping (quality_factor = none), {having} gives a quality "
+                    "factor; correct one of them"
+                )
 
     def check_different(self) -> None:
         """Check that no table is there twice: its readings would count twice.
@@ -97,8 +110,8 @@ class SeveralTables:
         return self.tables[0].drive if self.tapping else "sample"
 
     @property
-    def mass_ng(self) -> float:
-        """Effective mass of the tip."""
+    def mass_ng(self) -> float | None:
+        """Effective mass of the tip; None: not known."""
         return self.tables[0].mass_ng
 
     @property
@@ -146,3 +159,88 @@ _SAME_MASS = 0.01
 """Relative difference of masses that is none: they come of spring constants."""
 _NAMED = 3
 """Tables that a title names."""
+
+
+@dataclass(frozen=True)
+class RepeatedReadings:
+    """How readings of one drive scatter about their mean.
+
+    Attributes:
+        drives: that were repeated.
+        rows: of these.
+        chi2: sum of squared deviations from each drive's mean, over the stated errors.
+        degrees_of_freedom: readings minus means.
+        error_ratio: scatter over stated error, sqrt(chi2 over degrees of freedom).
+        p_value: probability of a larger chi2 if the errors are right.
+    """
+
+    drives: int
+    rows: int
+    chi2: float
+    degrees_of_freedom: int
+    error_ratio: float
+    p_value: float
+
+
+def repeats_of(table: AmplitudeTable | SeveralTables) -> RepeatedReadings | None:
+    """Return how the readings of repeated drives scatter; None where no drive was repeated."""
+    found = [one for one in map(_sums, table.tables) if one[0]]
+    if not found:
+        return None
+    drives, rows, freedom, chi2 = (sum(column) for column in zip(*found, strict=True))
+    if not freedom:
+        return None
+    return RepeatedReadings(
+        drives=int(drives),
+        rows=int(rows),
+        chi2=float(chi2),
+        degrees_of_freedom=int(freedom),
+        error_ratio=float(np.sqrt(chi2 / freedom)),
+        p_value=chi2_tail(float(chi2), int(freedom)),
+    )
+
+
+def drive_of_rows(table: AmplitudeTable) -> Int[np.ndarray, " rows"]:
+    """Return the number of the drive that each row is of: the same for rows that repeat each other."""
+    names = [column.name for column in required(vars(table)) if getattr(table, column.name) is not None]
+    keys = [np.asarray(getattr(table, name), float) for name in dict.fromkeys([*names, "order"])]
+    if table.retract is not None:
+        keys.append(np.nan_to_num(table.retract))
+    return np.unique(np.stack(keys), axis=1, return_inverse=True)[1].ravel()
+
+
+def _sums(table: AmplitudeTable) -> tuple[int, int, int, float]:
+    """Return repeated drives, their rows, the degrees of freedom of their scatter and its chi2."""
+    drive = drive_of_rows(table)
+    count = np.bincount(drive)
+    freedom, chi2 = 0, 0.0
+    for column in MEASURED:
+        values = getattr(table, column.name)
+        if values is None:
+            continue
+        error = getattr(table, str(column.error))
+        there = np.isfinite(values) & (count[drive] > 1)
+        turn = None if column.amplitude else 360.0 / table.order
+        more, sum_of_squares = _scatter(
+            drive[there], values[there], error[there], None if turn is None else turn[there]
+        )
+        freedom, chi2 = freedom + more, chi2 + sum_of_squares
+    return int((count > 1).sum()), int(count[count > 1].sum()), freedom, chi2
+
+
+def _scatter(
+    drive: Int[np.ndarray, " n"],
+    values: Float[np.ndarray, " n"],
+    error: Float[np.ndarray, " n"],
+    turn: Float[np.ndarray, " n"] | None,
+) -> tuple[int, float]:
+    """Return degrees of freedom and chi2 about each drive's weighted mean; angles within half a turn of the first."""
+    if not drive.size:
+        return 0, 0.0
+    _, first, place = np.unique(drive, return_index=True, return_inverse=True)
+    apart = values - values[first][place]
+    if turn is not None:
+        apart = apart - turn * np.round(apart / turn)
+    weight = error**-2.0
+    mean = np.bincount(place, weight * apart) / np.bincount(place, weight)
+    return drive.size - first.size, float(np.sum(weight * (apart - mean[place]) ** 2))

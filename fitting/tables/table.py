@@ -1,20 +1,23 @@
 """Amplitude tables: read them from CSV, check them, write them.
 
-A table is a CSV file in UTF-8: comment lines about the cantilever, a row of column names, a row for each drive::
+A table is a CSV file in UTF-8: comment lines about the cantilever, a row of column names, a row for each reading (of
+drives that may be there repeatedly)::
 
     # free_frequency_khz = 90
     # quality_factor = 40 +- 2
     order,drive_frequency_khz,drive_amplitude_nm,offset_nm,peak_amplitude_nm,peak_amplitude_error_nm
     1,180,4,0,163.3,1.63
 
-``quality_factor`` may be left out (not known), its error too, and ``mass_ng`` (then 1). The columns ``order`` to
-``offset_nm`` and one of ``peak_amplitude_nm`` and ``lockin_amplitude_nm`` are needed; ``phase_deg`` may join them. Each
-measured column has a column of standard errors (``..._error_nm``, ``phase_error_deg``). A blank cell in a measured
-column says that this was not measured. A column ``no_orbit`` marks by 1 drives on which the tip settled on no steady
-single-impact orbit (it stuck, or moved chaotically): their amplitudes are blank. Comments such as
-``# tip_calibration = 1 +- 0.02``, ``# drive_calibration = 1 +- 0.01`` and ``# offset_origin_nm = 0 +- 0.3`` say what is
-known of the instrument. ``# rows = in order of time`` says that the rows stand as they were measured, so that a slow
-drift of phase and amplitude is told from what they mean. Other comments are kept as remarks.
+``quality_factor = none`` says that there is no air damping; a table that does not say it cannot be fitted. Its error
+may be left out, and ``mass_ng`` or ``spring_constant_n_per_m`` (m = k/Omega^2; without both, energies are not known).
+The columns ``order`` to ``offset_nm`` and one of ``peak_amplitude_nm`` and ``lockin_amplitude_nm`` are needed;
+``phase_deg`` may join them. Each measured column has a column of standard errors (``..._error_nm``,
+``phase_error_deg``). A blank cell in a measured column says that this was not measured. A column ``no_orbit`` marks by
+1 drives on which the tip settled on no steady single-impact orbit (it stuck, or moved chaotically): their amplitudes
+are blank. Comments such as ``# tip_calibration = 1 +- 0.02``, ``# drive_calibration = 1 +- 0.01`` and ``#
+offset_origin_nm = 0 +- 0.3`` say what is known of the instrument. ``# rows = in order of time`` says that the rows
+stand as they were measured, so that a slow drift of phase and amplitude is told from what they mean. Other comments are
+kept as remarks.
 
 A cantilever that is driven itself over a sample at rest (a tapping or amplitude-phase-distance curve) says so::
 
@@ -46,7 +49,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from afm_jax.checks import check_kind, checked
 from afm_jax.results import Result, public_result
-from afm_jax.units import RAD_PER_US_PER_KHZ
+from afm_jax.units import contradicting_mass, effective_mass_ng
 from afm_jax.whole_files import write_whole
 from fitting.tables.csv_text import (
     LARGEST,
@@ -81,7 +84,7 @@ SETTINGS = {
         FileSetting("drive", "force", choices=("sample", "force", "base")),
         FileSetting("rows", "in order of time", choices=("in order of time",)),
         FileSetting("free_frequency_khz", "90", unit="kHz", error="maybe"),
-        FileSetting("quality_factor", "40 (or 40 +- 2)", lowest=LOWEST_QUALITY_FACTOR, error="maybe"),
+        FileSetting("quality_factor", "40 (or 40 +- 2)", lowest=LOWEST_QUALITY_FACTOR, error="maybe", none=True),
         FileSetting("mass_ng", unit="ng"),
         FileSetting("spring_constant_n_per_m", "5.4 (or 5.4 +- 0.5)", unit="N/m", error="maybe"),
         FileSetting("tip_calibration", "1 +- 0.02", error="always"),
@@ -105,7 +108,7 @@ class Header:
     free_frequency_error_khz: float | None
     quality_factor: float | None
     quality_factor_error: float | None
-    mass_ng: float
+    mass_ng: float | None
     spring_constant_n_per_m: float | None
     spring_constant_error_n_per_m: float | None
     calibration: dict[str, tuple[float, float]]
@@ -125,16 +128,16 @@ def parse_comments(comments: list[tuple[int, str]], faults: Faults) -> Header:
         faults.add(f"the free frequency is missing; add a line such as '{example}' above the column names")
     drive, _ = numbers.get("drive", (0.0, None))
     frequency, frequency_error = numbers.get("free_frequency_khz", (float("nan"), None))
-    quality_factor, quality_factor_error = numbers.get("quality_factor", (None, None))
+    quality_factor, quality_factor_error = numbers.get("quality_factor", (float("nan"), None))
     spring, spring_error = numbers.get("spring_constant_n_per_m", (None, None))
     return Header(
         drive="" if np.isnan(drive) else DRIVES[int(drive)],
         rows_in_order_of_time="rows" in numbers,
         free_frequency_khz=frequency,
         free_frequency_error_khz=frequency_error,
-        quality_factor=quality_factor,
+        quality_factor=None if np.isinf(quality_factor) else quality_factor,
         quality_factor_error=quality_factor_error,
-        mass_ng=numbers.get("mass_ng", (1.0 if spring is None else mass_of(spring, frequency), None))[0],
+        mass_ng=numbers.get("mass_ng", (None, None))[0],
         spring_constant_n_per_m=spring,
         spring_constant_error_n_per_m=spring_error,
         calibration={key: (numbers[key][0], numbers[key][1] or 0.0) for key in CALIBRATION if key in numbers},
@@ -217,11 +220,6 @@ def _check_order(columns: Columns, lines: Int[np.ndarray, " rows"], faults: Faul
         faults.add(f"{message}; remove the row", line=int(lines[row]), column="order")
 
 
-def mass_of(spring_constant_n_per_m: float, free_frequency_khz: float) -> float:
-    """Return the effective mass k/Omega^2 in ng."""
-    return spring_constant_n_per_m / (RAD_PER_US_PER_KHZ * free_frequency_khz) ** 2
-
-
 def check_error_columns(head: Head, faults: Faults, noise: float | None) -> None:
     """Note measured columns without their errors, and errors without what they belong to.
 
@@ -287,7 +285,6 @@ def check_rows(
     blank = {name: np.isnan(values) & ~known_bad[name] for name, values in columns.items()}
     unseen = columns.get("no_orbit", np.zeros(rows)) == 1.0
     _check_measured(blank, unseen, lines, faults)
-    _check_duplicates(columns, lines, faults)
     if "free_amplitude_nm" in columns and "order" in columns:
         _check_order(columns, lines, faults)
 
@@ -346,25 +343,10 @@ def _check_measured(
             faults.add(message, line=int(lines[row]), column="no_orbit")
 
 
-def _check_duplicates(columns: Columns, lines: Int[np.ndarray, " rows"], faults: Faults) -> None:
-    keys = [columns[column.name] for column in required(columns)]
-    if "retract" in columns:
-        keys.append(np.nan_to_num(columns["retract"]))
-    keys = np.stack(keys)
-    # The sort is stable: of rows with equal keys the earlier one stays first.
-    order = np.lexsort(keys)
-    same = np.all(keys[:, order[1:]] == keys[:, order[:-1]], axis=0)
-    for position in np.flatnonzero(same):
-        first, second = int(lines[order[position]]), int(lines[order[position + 1]])
-        strength = "free" if "free_amplitude_nm" in columns else "drive"
-        what = f"repeats {faults.place} {first} (same order, drive frequency, {strength} amplitude and offset)"
-        faults.add(f"{what}; average the measurements into one row or remove one", line=second)
-
-
 @public_result()
 @dataclass(frozen=True, eq=False, kw_only=True)
 class AmplitudeTable(Result):
-    """Measured amplitudes of (1, N) orbits, one row for each drive; the arrays are read-only NumPy copies.
+    """Measured amplitudes of (1, N) orbits, a row for each reading; the arrays are read-only NumPy copies.
 
     A measured column is None if the table does not have it, and NaN in the rows where nothing was measured. A value
     always comes with its standard error, and every row has at least one amplitude or is marked ``no_orbit``.
@@ -389,10 +371,10 @@ class AmplitudeTable(Result):
         phase_lag_error_deg: its standard error.
         retract: 1 where the sample moves away, else 0, shape (rows,); or None.
         no_orbit: 1 where the tip settled on no single-impact orbit, else 0, shape (rows,); or None.
-        quality_factor: of the free cantilever, or None: not known.
+        quality_factor: of the free cantilever; None: no air damping; NaN: not known, which no fit takes.
         quality_factor_error: its standard error, or None.
-        mass_ng: effective mass of the cantilever.
-        spring_constant_n_per_m: of the cantilever, or None: mass and frequency say it.
+        mass_ng: effective mass of the cantilever; left out, that of the spring constant; None: not known.
+        spring_constant_n_per_m: of the cantilever, or None: mass and frequency say it, if anything.
         spring_constant_error_n_per_m: its standard error, or None.
         calibration: value and standard error of ``tip_calibration``, ``drive_calibration``, ``offset_origin_nm`` and
             ``phase_zero_deg``, as far as they are uncertain.
@@ -403,7 +385,7 @@ class AmplitudeTable(Result):
         remarks: free comments of the file.
 
     Raises:
-        TableError: if a value is impossible, an error is missing, a row repeats another or the lengths differ.
+        TableError: if a value is impossible, an error is missing or the lengths differ.
     """
 
     drive_frequency_khz: Float[np.ndarray, " rows"]
@@ -424,9 +406,9 @@ class AmplitudeTable(Result):
     phase_lag_error_deg: Float[np.ndarray, " rows"] | None = None
     retract: Float[np.ndarray, " rows"] | None = None
     no_orbit: Float[np.ndarray, " rows"] | None = None
-    quality_factor: float | None = None
+    quality_factor: float | None = float("nan")
     quality_factor_error: float | None = None
-    mass_ng: float = 1.0
+    mass_ng: float | None = None
     spring_constant_n_per_m: float | None = None
     spring_constant_error_n_per_m: float | None = None
     calibration: dict[str, tuple[float, float]] = field(default_factory=dict)
@@ -453,6 +435,9 @@ class AmplitudeTable(Result):
         faults.raise_any()
         check_rows(columns, np.asarray(lines), faults)
         faults.raise_any()
+        if self.mass_ng is None and self.spring_constant_n_per_m is not None:
+            mass = effective_mass_ng(self.spring_constant_n_per_m, self.free_frequency_khz)
+            object.__setattr__(self, "mass_ng", float(mass))
         columns["order"] = columns["order"].astype(np.int64)
         for name, values in (columns | {"lines": np.array(lines, dtype=np.int64)}).items():
             values.setflags(write=False)
@@ -560,15 +545,20 @@ def _check_header(table: AmplitudeTable, faults: Faults) -> None:
         ("spring_constant_n_per_m", table.spring_constant_error_n_per_m),
     ):
         value = getattr(table, key)
-        fault = None if value is None else fault_in_number(SETTINGS[key], value, error)
+        if value is None or (key == "quality_factor" and np.isnan(value)):
+            continue
+        fault = fault_in_number(SETTINGS[key], value, error)
         if fault is not None:
             faults.add(f"{key} {fault}")
-    if table.quality_factor is None and table.quality_factor_error is not None:
+    damped = table.quality_factor is not None and not np.isnan(table.quality_factor)
+    if not damped and table.quality_factor_error is not None:
         faults.add("quality_factor_error stands without quality_factor; give both or none")
     if table.spring_constant_n_per_m is None and table.spring_constant_error_n_per_m is not None:
         faults.add("spring_constant_error_n_per_m stands without spring_constant_n_per_m; give both or none")
-    if table.spring_constant_n_per_m is not None and faults.count == 0:
-        _check_mass(table, table.spring_constant_n_per_m, faults)
+    if table.spring_constant_n_per_m is not None and table.mass_ng is not None and faults.count == 0:
+        wrong = contradicting_mass(table.mass_ng, table.spring_constant_n_per_m, table.free_frequency_khz)
+        if wrong is not None:
+            faults.add(wrong)
     for remark in table.remarks:
         if (
             setting_in(remark, SETTINGS) is not None
@@ -579,17 +569,17 @@ def _check_header(table: AmplitudeTable, faults: Faults) -> None:
             faults.add(f"the remark {quoted(remark)} would not be read back as one; make it one line of free text")
 
 
-_SAME_MASS, _SIGMAS = 0.02, 3.0
-"""By how much a mass may differ from k/Omega^2: a share, and standard errors of k."""
+def check_quality_factor(table: AmplitudeTable) -> None:
+    """Check that a table says its quality factor, or that there is no air damping: the impacts' loss hangs on it.
 
-
-def _check_mass(table: AmplitudeTable, spring: float, faults: Faults) -> None:
-    """Note a mass that is not that of the spring constant."""
-    mass, error = mass_of(spring, table.free_frequency_khz), table.spring_constant_error_n_per_m or 0.0
-    if abs(table.mass_ng - mass) > max(_SAME_MASS, _SIGMAS * error / spring) * mass:
-        faults.add(
-            f"mass_ng = {table.mass_ng:g} and spring_constant_n_per_m = {spring:g} contradict each other: "
-            f"k/(2 pi f0)^2 is {mass:.4g} ng; correct or remove one of them"
+    Raises:
+        TableError: if it does not.
+    """
+    if table.quality_factor is not None and np.isnan(table.quality_factor):
+        raise TableError(
+            f"{printable(table.source)}: the quality factor is missing, and the loss of the impacts hangs on it; add a "
+            "line such as '# quality_factor = 40 +- 2' above the column names or give --quality-factor '40 +- 2' "
+            "(`afm-jax calibrate` measures it); '# quality_factor = none' says that there is no air damping"
         )
 
 
@@ -682,20 +672,31 @@ def write_table(table: TableLike, path: str | Path) -> None:
         raise TableError(f"{printable(str(path))}: {error.strerror}; choose another path") from error
 
 
+def _or_inf(quality_factor: float | None) -> float:
+    return float("inf") if quality_factor is None else quality_factor
+
+
+def _own_mass(table: AmplitudeTable) -> float | None:
+    """Return the mass, None where the spring constant says the same."""
+    spring = table.spring_constant_n_per_m
+    same = spring is not None and table.mass_ng == effective_mass_ng(spring, table.free_frequency_khz)
+    return None if same else table.mass_ng
+
+
 def csv_of(table: AmplitudeTable) -> str:
     """Return an amplitude table as the text of a CSV file that ``read_table`` reads back without loss."""
     known = [
         ("free_frequency_khz", table.free_frequency_khz, table.free_frequency_error_khz),
-        ("quality_factor", table.quality_factor, table.quality_factor_error),
-        ("mass_ng", table.mass_ng, None),
+        ("quality_factor", _or_inf(table.quality_factor), table.quality_factor_error),
+        ("mass_ng", _own_mass(table), None),
         ("spring_constant_n_per_m", table.spring_constant_n_per_m, table.spring_constant_error_n_per_m),
         *((name, *table.calibration[name]) for name in CALIBRATION if name in table.calibration),
     ]
     lines = [f"# drive = {table.drive}"] if table.tapping else []
     for name, value, error in known:
-        if value is not None:
+        if value is not None and not np.isnan(value):
             tail = "" if error is None else f" +- {float(error)!r}"
-            lines.append(f"# {name} = {float(value)!r}{tail}")
+            lines.append(f"# {name} = {'none' if np.isinf(value) else repr(float(value))}{tail}")
     lines += [SETTINGS["rows"].line] if table.rows_in_order_of_time else []
     lines += [f"# {remark}" for remark in table.remarks]
     names = [name for name in table.form.names if getattr(table, name) is not None]

@@ -80,6 +80,19 @@ def ways(curve: TappingCurve) -> list[np.ndarray]:
     return [part[np.argsort(curve.offset_nm[part], kind="stable")] for part in parts]
 
 
+_BOTH_ENDS = 0.6
+"""Share of a table between its first and last free row from which a drift along it is known."""
+_TIMED_NEIGHBOURS, _TIMED_DRIFT = 5, 0.05
+"""Where the order of rows in time is known: free rows that the next is compared with, and how far the amplitude may
+have drifted by the first."""
+
+
+def free_ends(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> bool:
+    """Say whether rows of the free tip stand at both ends of a table."""
+    places = np.flatnonzero(free)
+    return bool(len(places) > 1 and places[-1] - places[0] >= _BOTH_ENDS * (curve.rows - 1))
+
+
 def free_rows(curve: TappingCurve) -> Bool[np.ndarray, " rows"]:
     """Return the rows of the free tip: those farther away than the first that departs in amplitude or phase.
 
@@ -99,13 +112,75 @@ def _departs(curve: TappingCurve, row: int, before: np.ndarray) -> bool:
     """Say whether a row is not free, against those farther away."""
     free, amplitude = curve.free_amplitude_nm[row], curve.amplitude_nm[row]
     error = np.hypot(curve.amplitude_error_nm[row], curve.free_amplitude_error * free)
-    if abs(amplitude - free) > max(_FREE * error, _DRIFT * free):
+    before, drift = before[-_NEIGHBOURS:], _DRIFT
+    if curve.time is not None:
+        before = before[-_TIMED_NEIGHBOURS:]
+        free, drift = (np.mean(curve.amplitude_nm[before]), _DRIFT) if len(before) else (free, _TIMED_DRIFT)
+    if abs(amplitude - free) > max(_FREE * error, drift * free):
         return True
-    lags = curve.lag_deg[before[-_NEIGHBOURS:]]
+    lags = curve.lag_deg[before]
     if not np.isfinite(lags).any() or not np.isfinite(curve.lag_deg[row]):
         return False
     spread = curve.lag_error_deg[row] * np.sqrt(1.0 + 1.0 / np.isfinite(lags).sum())
     return bool(abs(curve.lag_deg[row] - np.nanmean(lags)) > max(_FREE * spread, _DRIFT_DEG))
+
+
+_STEADY = 3.0
+"""Errors of its lag from which a row says that it is attractive or repulsive; else it is as its neighbour."""
+_JUMP_ERRORS, _JUMP_STEPS = 6.0, 4.0
+"""A change of the lag between neighbours is a jump if larger than so many errors and so many of the steps around."""
+_AROUND = 4
+
+
+def repulsive_rows(
+    curve: TappingCurve, touching: Bool[np.ndarray, " rows"], departure: Rows
+) -> Bool[np.ndarray, " rows"]:
+    """Return the rows on the repulsive branch: those whose lag is below the free tip's.
+
+    Rows whose lag departs by less than three errors are as their neighbour on the side of the sample.
+
+    Args:
+        curve: the curve.
+        touching: rows that are neither free nor held.
+        departure: lag less that of the free tip, in degrees.
+    """
+    repulsive = departure < 0.0
+    for part in ways(curve):
+        rows = part[touching[part]]
+        clear = np.abs(departure[rows]) > _STEADY * curve.lag_error_deg[rows]
+        said = repulsive[rows]
+        for i in range(len(rows) - 2, -1, -1):
+            if not clear[i]:
+                said[i] = said[i + 1]
+        repulsive[rows] = said
+    return repulsive
+
+
+def smooth_stretches(
+    curve: TappingCurve, touching: Bool[np.ndarray, " rows"], repulsive: Bool[np.ndarray, " rows"]
+) -> list[np.ndarray]:
+    """Return the rows of each drive and way, cut where the lag jumps between attraction and repulsion.
+
+    Along each the energy is a smooth function.
+
+    Args:
+        curve: the curve, with a phase.
+        touching: the rows wanted.
+        repulsive: from `repulsive_rows`.
+    """
+    found = []
+    for part in ways(curve):
+        rows = part[touching[part]]
+        lag, error = curve.lag_deg[rows], curve.lag_error_deg[rows]
+        steps = np.abs(np.diff(lag))
+        cuts = []
+        for i in np.flatnonzero(np.diff(repulsive[rows])).tolist():
+            others = np.concatenate([steps[max(i - _AROUND, 0) : i], steps[i + 1 : i + 1 + _AROUND]])
+            usual = float(np.median(others)) if len(others) else 0.0
+            if steps[i] > max(_JUMP_ERRORS * np.hypot(error[i], error[i + 1]), _JUMP_STEPS * usual):
+                cuts.append(i + 1)
+        found += [stretch for stretch in np.split(rows, cuts) if len(stretch)]
+    return found
 
 
 def held_rows(curve: TappingCurve) -> Bool[np.ndarray, " rows"]:

@@ -29,6 +29,18 @@ class Given(NamedTuple):
 
 
 EXACTLY_ONE = Given(1.0)
+USUAL_ERRORS = {
+    "free_frequency_khz": 2e-4,
+    "quality_factor": 0.05,
+    "spring_constant_n_per_m": 0.05,
+    "tip_calibration": 0.01,
+}
+"""Relative standard errors of what is given without one."""
+
+
+def given_or_usual(name: str, value: float, error: float | None) -> Given:
+    """Return a number with its error, or with the usual one of `USUAL_ERRORS` where none is given."""
+    return Given(value, error or USUAL_ERRORS[name] * value)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,6 +69,8 @@ class TappingCurve:
         origin_error_nm: standard error of that position.
         harmonic_amplitudes_nm: amplitudes at multiples of the drive's frequency, by multiple.
         lines: where each row stands in its file.
+        time: place of each row in the order of measurement, from -1/2 to 1/2; None: that order is not known.
+        assumed: what of the instrument was given without an error: it has a usual one (`USUAL_ERRORS`).
     """
 
     source: str
@@ -80,6 +94,8 @@ class TappingCurve:
     origin_error_nm: float = 0.3
     harmonic_amplitudes_nm: dict[int, Rows] = field(default_factory=dict)
     lines: Int[np.ndarray, " rows"]
+    time: Rows | None = None
+    assumed: tuple[str, ...] = ()
 
     @property
     def rows(self) -> int:

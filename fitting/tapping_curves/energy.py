@@ -31,6 +31,8 @@ class Energies(NamedTuple):
         virial_aj: mean of force times height, of the first harmonic.
         amplitude_slope: change with the amplitude read, in aJ/nm.
         lag_slope: change with the lag, in aJ/degree.
+        virial_amplitude_slope: change of the virial with the amplitude read, in aJ/nm.
+        virial_lag_slope: change of the virial with the lag, in aJ/degree.
     """
 
     energy_aj: Rows
@@ -38,6 +40,8 @@ class Energies(NamedTuple):
     virial_aj: Rows
     amplitude_slope: Rows
     lag_slope: Rows
+    virial_amplitude_slope: Rows
+    virial_lag_slope: Rows
 
 
 def energies(curve: TappingCurve, instrument: Instrument) -> Energies:
@@ -54,29 +58,35 @@ def energies(curve: TappingCurve, instrument: Instrument) -> Energies:
     first = -np.pi * np.imag(force * np.conj(z))
 
     def change(dz):
-        return -np.pi * scale * np.imag(gamma * dz * np.conj(z) + force * np.conj(dz))
+        return scale * (gamma * dz * np.conj(z) + force * np.conj(dz))
 
     with np.errstate(invalid="ignore", divide="ignore"):
         by_amplitude = change(motion.reading / curve.amplitude_nm)
+    by_lag = change(-1j * motion.reading) * np.pi / 180.0
     harmonics = scale * _lost_at_harmonics(curve, instrument, np.abs(force))
     return Energies(
         energy_aj=scale * first - harmonics,
         harmonics_aj=harmonics,
         virial_aj=0.5 * scale * np.real(force * np.conj(z)),
-        amplitude_slope=by_amplitude,
-        lag_slope=change(-1j * motion.reading) * np.pi / 180.0,
+        amplitude_slope=-np.pi * by_amplitude.imag,
+        lag_slope=-np.pi * by_lag.imag,
+        virial_amplitude_slope=0.5 * by_amplitude.real,
+        virial_lag_slope=0.5 * by_lag.real,
     )
 
 
 def _lost_at_harmonics(curve: TappingCurve, instrument: Instrument, force: Rows) -> Rows:
     """Return what the air takes at the harmonics, over k; measured where they are, else those of a brief impact."""
-    s, q = curve.drive_frequency_khz / instrument.free_frequency_khz, instrument.quality_factor
+    q = instrument.quality_factor
     n = np.arange(2, _HARMONICS + 1)[:, None]
-    amplitudes = np.sqrt(max(instrument.harmonics_factor, 0.0)) * force / np.abs(1.0 - (n * s) ** 2 + 1j * n * s / q)
+    frequencies, row = np.unique(curve.drive_frequency_khz, return_inverse=True)
+    s = frequencies / instrument.free_frequency_khz
+    parts = max(instrument.harmonics_factor, 0.0) * n**2 / np.abs(1.0 - (n * s) ** 2 + 1j * n * s / q) ** 2
+    lost = parts.sum(axis=0)[row] * force**2
     for multiple, measured in curve.harmonic_amplitudes_nm.items():
         here = np.isfinite(measured) & (2 <= multiple <= _HARMONICS)
-        amplitudes[multiple - 2, here] = measured[here]
-    return np.pi * s / q * np.sum(n**2 * amplitudes**2, axis=0)
+        lost[here] += multiple**2 * measured[here] ** 2 - (parts[multiple - 2, row] * force**2)[here]
+    return np.pi * s[row] / q * lost
 
 
 def largest_energies(curve: TappingCurve, instrument: Instrument) -> Rows:
@@ -93,6 +103,12 @@ def largest_energies(curve: TappingCurve, instrument: Instrument) -> Rows:
 def noise_of(curve: TappingCurve, found: Energies) -> Rows:
     """Return the standard error of each energy from the noise of its own row, in aJ."""
     return np.hypot(found.amplitude_slope * curve.amplitude_error_nm, found.lag_slope * curve.lag_error_deg)
+
+
+def virial_noise_of(curve: TappingCurve, found: Energies) -> Rows:
+    """Return the standard error of each virial from the noise of its own row, in aJ."""
+    by_amplitude = found.virial_amplitude_slope * curve.amplitude_error_nm
+    return np.hypot(by_amplitude, found.virial_lag_slope * curve.lag_error_deg)
 
 
 def lags_of(curve: TappingCurve, instrument: Instrument, energy_aj: Rows) -> Rows:

@@ -24,11 +24,13 @@ class MeasuredFile:
         refused: why the others may not, by number.
         half_widths_nm: of every curve, refused ones too: by how many nm nearer the amplitude falls to half on the way
             in than it comes back on the way out; by number, as far as both ways show it.
+        notes: what was assumed and found in reading them.
     """
 
     tables: dict[int, AmplitudeTable]
     refused: dict[int, str]
     half_widths_nm: dict[int, float]
+    notes: tuple[str, ...] = ()
 
     @property
     def half_width_nm(self) -> tuple[float, float] | None:
@@ -64,7 +66,25 @@ def read_measured(path: str | Path, *, curve: int | None = None, **options: Any)
     names = {one.curve: f"{path}, curve {one.curve}" if len(curves) > 1 else str(path) for one in chosen}
     tables = {one.curve: parse_table(table_text(one), names[one.curve]) for one in chosen if one.valid}
     widths = {one.curve: width for one in chosen if (width := half_width(one)) is not None}
-    return MeasuredFile(tables, {one.curve: one.reasons[0] for one in chosen if not one.valid}, widths)
+    refused = {one.curve: one.reasons[0] for one in chosen if not one.valid}
+    return MeasuredFile(tables, refused, widths, tuple(dict.fromkeys(note for one in chosen for note in _notes(one))))
+
+
+def _notes(curve: MeasuredCurve) -> list[str]:
+    """Return what was assumed and found in reading a curve; its number in front where others need not share it."""
+    told = ("assumed", "measured")
+    shown = {"drive": "Drive", "drive_frequency_khz": "Drive frequency", "nm_per_volt": "Sensitivity"}
+    found = [
+        f"{name}: {one.value if isinstance(one.value, str) else f'{one.value:.5g} {one.unit}'}, {one.origin}"
+        for key, name in shown.items()
+        if (one := curve.known.get(key)) is not None and one.origin.startswith(told)
+    ]
+    of = f"curve {curve.curve}: " if curve.curves > 1 else ""
+    return [
+        *(of + text for text in found if not text.startswith("Drive")),
+        *(t for t in found if t.startswith("Drive")),
+        *curve.notes,
+    ]
 
 
 def half_width(curve: MeasuredCurve) -> float | None:

@@ -6,9 +6,9 @@ from matplotlib.figure import Figure
 
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, png_of, svg_of
 from afm_jax.units import RAD_PER_US_PER_KHZ
-from fitting.tapping_curves.constant_energy import plain_instrument
 from fitting.tapping_curves.curve import Instrument, TipMotion, motion_of
 from fitting.tapping_curves.energy import lags_of
+from fitting.tapping_curves.energy_fit import Z95, plain_instrument
 from fitting.tapping_curves.result import Tapping
 
 _SMALL = 9
@@ -43,13 +43,13 @@ def curve_figure(result: Tapping) -> Figure:
         _points(middle, result, curve.lag_deg, curve.lag_error_deg)
         _predicted_lag(middle, result)
         label_axes(middle, x="", y="lag (degrees)")
-        _points(
-            bottom, result, rows.energy_of_fit_aj if result.fit is not None else rows.energy_aj, rows.energy_noise_aj
-        )
+        _points(bottom, result, rows.energy_of_fit_aj, rows.energy_noise_aj)
         bottom.plot(curve.offset_nm, rows.energy_aj, "+", color=GRID, ms=4, label="instrument as given")
-        _energy_bands(bottom, result)
-        spread = np.nanpercentile(rows.energy_of_fit_aj, [5.0, 95.0])
-        bottom.set_ylim(min(spread[0], 0.0) - 0.3 * np.ptp(spread), spread[1] + 0.7 * np.ptp(spread))
+        drawn = _energy_bands(bottom, result)
+        touching = rows.energy_of_fit_aj[~rows.free & np.isfinite(rows.energy_of_fit_aj)]
+        # all points in contact are in the picture
+        low, high = min([drawn[0], *touching.tolist()]), max([drawn[1], *touching.tolist()])
+        bottom.set_ylim(low - 0.05 * (high - low), high + 0.05 * (high - low))
     else:
         _points(bottom, result, rows.largest_energy_aj, np.zeros(curve.rows))
     label_axes(
@@ -91,42 +91,54 @@ def _points(axes: Axes, result: Tapping, values: np.ndarray, errors: np.ndarray)
 
 def _predicted_lag(axes: Axes, result: Tapping) -> None:
     """Draw the lag at which a tap of the fitted energy leaves the amplitude that was read."""
-    if result.fit is None:
+    if result.functions is None:
         return
-    curve = result.curve
-    wanted = result.fit.energy_aj[np.maximum(result.group_of_rows, 0)]
-    lags = lags_of(curve, result.fit.instrument, np.where(result.fit.used, wanted, np.nan))
-    for group in range(len(result.groups)):
-        for back in (False, True):
-            rows = np.flatnonzero((result.group_of_rows == group) & (curve.retract == back) & np.isfinite(lags))
-            rows = rows[np.argsort(curve.offset_nm[rows])]
-            axes.plot(curve.offset_nm[rows], lags[rows], color=ACCENT if back else BLUE, lw=1.0, alpha=0.7)
+    curve, wanted = result.curve, np.full(result.curve.rows, np.nan)
+    for branch in result.branches:
+        along = branch.curve
+        order = np.argsort(along.height_nm)
+        wanted[branch.rows] = np.interp(curve.offset_nm[branch.rows], along.height_nm[order], along.energy_aj[order])
+    lags = lags_of(curve, result.functions.instrument, wanted)
+    for branch in result.branches:
+        rows = branch.rows[np.isfinite(lags[branch.rows])]
+        rows = rows[np.argsort(curve.offset_nm[rows])]
+        axes.plot(curve.offset_nm[rows], lags[rows], color=ACCENT if branch.retract else BLUE, lw=1.0, alpha=0.7)
 
 
-def _energy_bands(axes: Axes, result: Tapping) -> None:
-    if result.fit is None:
-        return
-    for i, group in enumerate(result.groups):
-        heights = result.curve.offset_nm[result.fit.used & (result.group_of_rows == i)]
-        energy = result.fit.energy_aj[i]
-        low, high = result.fit.interval95_aj[i]
-        colour = BLUE if group.repulsive else ACCENT
-        ends = [heights.min(), heights.max()]
-        axes.plot(
-            ends,
-            [energy, energy],
-            color=colour,
-            lw=1.2,
-            label=f"{'repulsive' if group.repulsive else 'attractive'}: {energy:.3g} aJ",
-        )
-        axes.fill_between(ends, [low, low], [high, high], color=colour, alpha=0.15, lw=0)
+def _energy_bands(axes: Axes, result: Tapping) -> tuple[float, float]:
+    """Draw the energy along the branches with its 95 % band, and where there is one energy that; return their range."""
+    ends = [0.0]
+    for branch in result.branches:
+        along = branch.curve
+        order = np.argsort(along.height_nm)
+        height, energy = along.height_nm[order], along.energy_aj[order]
+        error = Z95 * along.energy_error_aj[order]
+        colour = ACCENT if branch.retract else BLUE
+        axes.plot(height, energy, color=colour, lw=1.2)
+        axes.fill_between(height, energy - error, energy + error, color=colour, alpha=0.15, lw=0)
+        ends += [float(energy.min()), float(energy.max()), *np.percentile(energy + error, [0.0, 90.0]).tolist()]
+    if result.fit is not None and result.described:
+        for i, group in enumerate(result.groups):
+            heights = result.curve.offset_nm[result.fit.used & (result.group_of_rows == i)]
+            energy, _, (low, high) = result.constant(i)
+            axes.plot(
+                [heights.min(), heights.max()],
+                [energy, energy],
+                "--",
+                color=DARK,
+                lw=1.0,
+                label=f"one energy, {'repulsive' if group.repulsive else 'attractive'}: {energy:.3g} aJ",
+            )
+            ends += [low, high]
+    return min(ends), max(ends)
 
 
 def frames_figure(result: Tapping) -> Figure:
     """Return the motion of one row in two frames: the lab's, and that of the free motion."""
     curve = result.curve
     row = _example_row(result)
-    instrument = plain_instrument(curve, result.rows.free) if result.fit is None else result.fit.instrument
+    fit = result.functions or result.fit
+    instrument = plain_instrument(curve, result.rows.free) if fit is None else fit.instrument
     motion = motion_of(curve, instrument)
     free = float(motion.free_amplitude_nm[row])
     omega = RAD_PER_US_PER_KHZ * float(curve.drive_frequency_khz[row])

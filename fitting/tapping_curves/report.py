@@ -7,11 +7,14 @@ from typing import Any
 import numpy as np
 
 from afm_jax.strict_json import plain
-from afm_jax.words import bullets, interval, known, percent, text_table, with_error
+from afm_jax.words import broken, bullets, interval, known, percent, text_table, with_error
 from fitting.tapping_curves.branches import Height, Hysteresis
+from fitting.tapping_curves.energy_curve import HEADLINE
+from fitting.tapping_curves.energy_fit import EnergyFit
 from fitting.tapping_curves.result import Tapping, origin_in_words
 
 _EV_PER_AJ = 6.241509
+_WIDTH = 150
 _CHANGES = {
     "contact": "contact: the amplitude leaves the free one",
     "half": "half of the free amplitude is left",
@@ -24,13 +27,16 @@ def tapping_summary(result: Tapping) -> str:
     lines = [f"Tapping curve {result.table.source}: {_counts(result)}", "", "VALID" if result.valid else "NOT VALID"]
     lines += [f"  - {reason}" for reason in result.reasons]
     lines += ["", f"Energy of a tap: {energy_in_words(result)}"]
-    if result.fit is not None:
+    if result.functions is not None:
+        lines += _along_lines(result)
+    if result.fit is not None and result.described:
         lines += _energy_lines(result)
     lines += _threshold_lines(result)
     lines += _speed_lines(result)
-    lines += ["", law_in_words(result)]
-    lines += bullets("Assumed:", result.assumptions)
-    lines += bullets("Notes:", result.warnings)
+    law = law_in_words(result)
+    lines += ["", *(broken(law, _WIDTH) if result.law is None else [law])]
+    lines += [piece for line in bullets("Assumed:", result.assumptions) for piece in broken(line, _WIDTH, "    ")]
+    lines += [piece for line in bullets("Notes:", result.warnings) for piece in broken(line, _WIDTH, "    ")]
     return "\n".join(lines)
 
 
@@ -42,17 +48,20 @@ def _counts(result: Tapping) -> str:
 
 def energy_in_words(result: Tapping) -> str:
     """Return the energy of a tap in aJ and eV."""
-    energy = result.energy
-    if energy["kind"] == "none":
-        return "not known"
-    low, high = energy["interval95"]
-    if energy["kind"] == "bracket" and energy["value"] is None:
-        return f"between {low:.2g} and {high:.3g} aJ"
-    if energy["value"] is None:
+    energy, largest = result.energy, result.largest
+    if energy["kind"] == "upper bound":
+        high = energy["interval95"][1]
         return f"at most {high:.3g} aJ, {_EV_PER_AJ * high:.3g} eV"
+    if energy["value"] is None:
+        if largest is None or result.why_not_functions:
+            return "not known" if energy["kind"] != "several" else energy["reason"]
+        value = with_error(largest["value"], largest["standard_error"])
+        start = energy["reason"] + ";" if energy["kind"] == "several" else "changes along the curve,"
+        return f"{start} at most {value} aJ, at {largest['amplitude_ratio']:.2f} of the free amplitude"
+    low, high = energy["interval95"]
     value = with_error(energy["value"], energy["standard_error"])
     electronvolts = interval(_EV_PER_AJ * low, _EV_PER_AJ * high)
-    return f"{value} aJ (95 %: {interval(low, high)}), {electronvolts} eV"
+    return f"{value} aJ (95 %: {interval(low, high)}), {electronvolts} eV, if each takes the same"
 
 
 def law_in_words(result: Tapping) -> str:
@@ -64,9 +73,63 @@ def law_in_words(result: Tapping) -> str:
     return summary(result.law)
 
 
+def branch_name(result: Tapping, number: int) -> str:
+    """Return what a branch is called; its drive where there are several."""
+    branch = result.branches[number]
+    name = f"{branch.way}, {'repulsive' if branch.repulsive else 'attractive'}"
+    several = len({(b.drive_frequency_khz, b.free_amplitude_nm) for b in result.branches}) > 1
+    return name + (f", {branch.drive_frequency_khz:g} kHz, {branch.free_amplitude_nm:.4g} nm" if several else "")
+
+
+def along_cells(result: Tapping) -> list[list[str]]:
+    """Return the energy of each branch at some amplitudes."""
+    cells = []
+    for i, branch in enumerate(result.branches):
+        curve = branch.curve
+        row = [branch_name(result, i), f"{curve.amplitude_ratio[0]:.2f} to {curve.amplitude_ratio[-1]:.2f}"]
+        for ratio in HEADLINE:
+            found = curve.at(ratio)
+            row.append("-" if found is None else with_error(*found))
+        top = int(np.argmax(curve.energy_aj))
+        row.append(
+            f"{with_error(float(curve.energy_aj[top]), float(curve.energy_error_aj[top]))} "
+            f"at {curve.amplitude_ratio[top]:.2f}"
+        )
+        cells.append(row)
+    return cells
+
+
+ALONG_HEAD = ["energy (aJ) at A/A0 =", "measured", *(f"{ratio:g}" for ratio in HEADLINE), "largest"]
+
+
+def _along_lines(result: Tapping) -> list[str]:
+    fit = result.functions
+    assert fit is not None  # noqa: S101
+    lines = ["", *text_table(ALONG_HEAD, along_cells(result), words=(0,))]
+    for one in result.turning_points:
+        ratios, heights = one["amplitude_ratio"], one["height_nm"]
+        lines.append(
+            f"  {one['branch']}: attractive turns repulsive at A/A0 = {min(ratios):.3f} to {max(ratios):.3f}, "
+            f"height {min(heights):.4g} to {max(heights):.4g} nm"
+        )
+    for (i, _), one in result.way_differences.items():
+        side = "repulsive" if result.branches[i].repulsive else "attractive"
+        lines.append(
+            f"  retract less approach, {side}: {with_error(one.energy_aj, one.standard_error)} aJ "
+            f"at A/A0 = {one.amplitude_ratio:.2f}, where it is most in its errors"
+        )
+    head = ["instrument, fitted with the energy along the branches", "given", "fitted"]
+    lines += ["", *text_table(head, _instrument_cells(fit), words=(0,))]
+    probability = "" if fit.scale == 1.0 else f", errors of the rows times {fit.scale:.2f}"
+    lines.append(
+        f"  rows about it: chi2 {fit.rows_chi2:.1f} for {fit.rows_freedom:.0f} degrees of freedom{probability}"
+    )
+    return lines
+
+
 def _energy_lines(result: Tapping) -> list[str]:
     plainly, epsilon = result.plain_energy, result.epsilon
-    lines = []
+    lines = ["", "One energy for all taps of a branch (assumed: each takes the same):"]
     if epsilon["value"] is not None:
         value = with_error(epsilon["value"], epsilon["standard_error"])
         lines.append(f"  epsilon = 2 E/m = {value} nm^2/us^2, m = {result.mass_ng:.4g} ng")
@@ -79,12 +142,10 @@ def _energy_lines(result: Tapping) -> list[str]:
     shares = sorted(result.energy.get("share_of_variance", {}).items(), key=lambda pair: -pair[1])
     words = [f"{origin_in_words(name)} {percent(share)}" for name, share in shares if share > 0.005]
     lines += [f"  its variance comes from {', '.join(words)}"] if words else []
-    if not result.described:
-        return lines
     lines.append("")
     lines += text_table(["branch", "rows", "energy (aJ)", "95 %"], _group_cells(result), words=(0,))
-    lines += ["", *text_table(["instrument", "given", "fitted"], _instrument_cells(result), words=(0,))]
     assert result.fit is not None  # noqa: S101
+    lines += ["", *text_table(["instrument", "given", "fitted"], _instrument_cells(result.fit), words=(0,))]
     lines.append(
         f"  chi2/dof = {result.fit.chi2:.1f}/{result.fit.degrees_of_freedom}, probability {result.fit.p_value:.2g}"
     )
@@ -93,25 +154,26 @@ def _energy_lines(result: Tapping) -> list[str]:
 
 def _group_cells(result: Tapping) -> list[list[str]]:
     fit = result.fit
-    if fit is None:
+    if fit is None or not result.described:
         return []
     counts = [int(np.sum(fit.used & (result.group_of_rows == i))) for i in range(len(result.groups))]
-    return [
-        [
-            group.name,
-            f"{counts[i]}",
-            with_error(fit.energy_aj[i], fit.standard_error_aj[i] * result.stretch),
-            interval(*fit.interval95_aj[i]) if np.isfinite(fit.interval95_aj[i]).all() else "open",
-        ]
-        for i, group in enumerate(result.groups)
-    ]
-
-
-def _instrument_cells(result: Tapping) -> list[list[str]]:
-    if result.fit is None:
-        return []
     cells = []
-    for one in result.fit.nuisances:
+    for i, group in enumerate(result.groups):
+        value, error, ends = result.constant(i)
+        cells.append(
+            [
+                group.name,
+                f"{counts[i]}",
+                with_error(value, error),
+                interval(*ends) if np.isfinite(ends).all() else "open",
+            ]
+        )
+    return cells
+
+
+def _instrument_cells(fit: EnergyFit | None) -> list[list[str]]:
+    cells = []
+    for one in () if fit is None else fit.nuisances:
         given = str(one.given) if np.isfinite(one.given.error) else "not known"
         cells.append([one.name.removesuffix("_0"), given, with_error(one.value, one.standard_error)])
     return cells
@@ -222,8 +284,9 @@ def tapping_page(result: Tapping, pictures: list[bytes]) -> str:
 
     shows = (
         (
-            "Amplitude, phase and energy of a tap over the height of the sample. Lines: one energy a branch; "
-            "open: set aside; grey: free."
+            "Amplitude, phase and energy of a tap over the height of the sample. Lines: the energy along each branch "
+            "with its 95 % band, dashed one energy for all taps where that explains the rows; open: set aside; "
+            "grey: free."
         ),
         (
             "The same motion in two frames. Left, the lab: a shaken tip meets a sample at rest. Right, with its "
@@ -259,9 +322,14 @@ def tapping_page(result: Tapping, pictures: list[bytes]) -> str:
         energy=energy_in_words(result),
         law=f"No impact law: {result.reason}." if result.law is None else "The impact law is in fit.html.",
         plain_energy=result.plain_energy,
+        along=Table(
+            "Energy along the branches in aJ, by the amplitude over the free one", ALONG_HEAD, along_cells(result)
+        ),
         groups=Table("One energy for each branch", ["branch", "rows", "energy (aJ)", "95 %"], _group_cells(result)),
         instrument=Table(
-            "The instrument, fitted along within its errors", ["", "given", "fitted"], _instrument_cells(result)
+            "The instrument, fitted along within its errors",
+            ["", "given", "fitted"],
+            _instrument_cells(result.functions),
         ),
         shares=pairs("Where the variance of the energy comes from", ("", "share"), shares) if shares else None,
         thresholds=Table(

@@ -6,23 +6,38 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Bool, Int
 
+from afm_jax.least_squares import IMPROBABLE
 from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.tables.table import AmplitudeTable
-from fitting.tapping_curves.branches import Hysteresis
-from fitting.tapping_curves.constant_energy import ConstantEnergy
-from fitting.tapping_curves.curve import Rows, TappingCurve
+from fitting.tapping_curves.branches import Hysteresis, free_ends
+from fitting.tapping_curves.curve import USUAL_ERRORS, Rows, TappingCurve
+from fitting.tapping_curves.energy_curve import (
+    FEWEST_ROWS,
+    HEADLINE,
+    TappingBranch,
+    WayDifference,
+    differences_of_ways,
+)
+from fitting.tapping_curves.energy_fit import Z95, EnergyFit, Nuisance
 
 if TYPE_CHECKING:
     from fitting.fits.result import FitResult
 
-_BADLY = 1e-3
-"""Probability of chi2 below which noise does not explain the rows."""
-_WORST = 10.0
-"""chi2 per degree of freedom from which one energy is no description."""
 _BRACKET = 0.5
 """Relative standard error from which a number is only a bracket."""
+_LARGEST_SCALE = 2.0
+"""Scatter of rows in contact, of their errors, that is believed without being asked for: measured curves have up to
+1.8 times that of the free tip."""
+_MOST_SCALE = 3.0
+"""Likewise where it is asked for (`scale_errors`)."""
+_PULLED = 2.0
+"""Distance of a nuisance from what is given, in its errors, from which it is named."""
+_DRIFTING = 5.0
+"""Errors of a drift of the free rows from which it is one."""
+_NEGATIVE = 3.0
+"""Standard errors below zero from which an energy is impossible."""
 _ORIGINS = {
     "noise": "noise",
     "free_frequency_khz": "free frequency",
@@ -33,6 +48,14 @@ _ORIGINS = {
     "free_amplitude": "free amplitude",
     "harmonics_factor": "harmonics",
     "harmonics": "harmonics",
+    "phase_drift_deg": "drift of the phase",
+    "free_amplitude_drift": "drift of the free amplitude",
+}
+_ASSUMED = {
+    "free_frequency_khz": "the free frequency",
+    "quality_factor": "Q",
+    "spring_constant_n_per_m": "the spring constant",
+    "tip_calibration": "the calibration",
 }
 
 
@@ -67,7 +90,11 @@ class TapRows:
         energy_noise_aj: its standard error from the row's own noise.
         energy_errors_aj: by how much it moves with one standard error of what all rows share, by name.
         energy_of_fit_aj: with the instrument as fitted.
-        virial_aj: mean of force times height, of the first harmonic; negative: repulsive on the whole.
+        virial_aj: mean of force times height, of the first harmonic, with the instrument as given; positive where
+            attraction prevails, negative where repulsion does.
+        virial_noise_aj: its standard error from the row's own noise.
+        virial_errors_aj: by how much it moves with one standard error of what all rows share, by name.
+        virial_of_fit_aj: with the instrument as fitted.
         largest_energy_aj: the most that a tap can take at this amplitude, whatever the phase.
         used: whether it is in the fit of one energy.
         note: why not; or what it is for.
@@ -80,6 +107,9 @@ class TapRows:
     energy_errors_aj: dict[str, Rows]
     energy_of_fit_aj: Rows
     virial_aj: Rows
+    virial_noise_aj: Rows
+    virial_errors_aj: dict[str, Rows]
+    virial_of_fit_aj: Rows
     largest_energy_aj: Rows
     used: Bool[np.ndarray, " rows"]
     note: tuple[str, ...]
@@ -93,6 +123,11 @@ class TapRows:
     def energy_systematic_aj(self) -> Rows:
         """Standard error of each energy from what all rows share."""
         return np.sqrt(np.sum(np.square(list(self.energy_errors_aj.values())), axis=0))
+
+    @property
+    def virial_systematic_aj(self) -> Rows:
+        """Standard error of each virial from what all rows share."""
+        return np.sqrt(np.sum(np.square(list(self.virial_errors_aj.values())), axis=0))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -129,8 +164,11 @@ class Tapping(Result):
         table: what was read.
         curve: its rows with an amplitude, and what is known of the instrument.
         rows: point by point.
-        groups: the rows that share an energy.
+        groups: the kinds of rows that may share an energy.
         fit: one energy for each group, the instrument free within its errors; None without a phase or rows.
+        functions: the energy as a smooth function along each branch, likewise.
+        branches: each with its energy and virial over the amplitude.
+        scale_errors: whether errors are multiplied where the rows scatter more.
         bound_aj: what a tap takes at most, where only the amplitude was recorded; else None.
         hysteresis: thresholds on the way in and back.
         speeds: of the impacts; None where there is no energy.
@@ -142,7 +180,10 @@ class Tapping(Result):
     curve: TappingCurve
     rows: TapRows
     groups: tuple[EnergyGroup, ...]
-    fit: ConstantEnergy | None
+    fit: EnergyFit | None
+    functions: EnergyFit | None
+    branches: tuple[TappingBranch, ...]
+    scale_errors: bool
     bound_aj: float | None
     hysteresis: tuple[Hysteresis, ...]
     speeds: MeasuredSpeeds | None
@@ -173,54 +214,71 @@ class Tapping(Result):
         repulsive = [i for i, group in enumerate(self.groups) if group.repulsive]
         return repulsive or list(range(len(self.groups)))
 
+    def constant(self, number: int) -> tuple[float, float, tuple[float, float]]:
+        """Return the one energy of a group in aJ, its standard error and its 95 % interval."""
+        assert self.fit is not None  # noqa: S101
+        energy, variance, slopes = self.fit.function(number, np.zeros(1))
+        value, error = float(energy[0]), float(self.fit.error(energy, variance, slopes)[0])
+        alone = float(np.sqrt(variance + self.fit.by_instrument(slopes))[0])
+        return value, error, _interval(value, alone, self.fit.share)
+
     @property
-    def stretch(self) -> float:
-        """What errors are multiplied by because the rows scatter more than their noise."""
-        if self.fit is None or not self.fit.degrees_of_freedom or not self.fit.p_value < _BADLY:
-            return 1.0
-        return float(np.sqrt(self.fit.chi2 / self.fit.degrees_of_freedom))
+    def why_not_constant(self) -> str:
+        """Why one energy a branch does not explain the rows; empty where it does."""
+        fit = self.fit
+        if fit is None:
+            return "no branch has enough rows of taps that come every period for one energy"
+        if fit.scale == 1.0 and fit.p_value < IMPROBABLE:
+            return (
+                f"one energy a branch does not describe the rows (chi2 {fit.chi2:.0f} for {fit.degrees_of_freedom} "
+                f"degrees of freedom, probability {fit.p_value:.1g})"
+            )
+        if fit.scale > _MOST_SCALE:
+            return f"one energy a branch describes the rows only with errors {fit.scale:.1f} times as large"
+        if fit.torn:
+            return f"for one energy a branch {_torn_in_words(fit.torn)}"
+        return ""
 
     @property
     def energy(self) -> dict[str, Any]:
-        """The energy of a tap: `value`, `standard_error`, `interval95` in aJ, `kind`, and where they come from."""
+        """The one energy of all taps: `value`, `standard_error`, `interval95` in aJ, `kind`, and where they come from.
+
+        Where one energy does not explain the rows `value` is None and `reason` says why.
+        """
+        blank: dict[str, Any] = {"value": None, "standard_error": None, "interval95": None}
         if self.fit is None:
             bound = None if self.bound_aj is None else (0.0, self.bound_aj)
             kind = "none" if bound is None else "upper bound"
-            return {"value": None, "standard_error": None, "interval95": bound, "kind": kind}
-        if not self.described:
-            return {"value": None, "standard_error": None, "interval95": self._bracket(), "kind": "bracket"}
+            return blank | {"interval95": bound, "kind": kind, "reason": self.why_not_constant if bound is None else ""}
+        if self.why_not_constant:
+            return blank | {"kind": "none", "reason": self.why_not_constant}
         chosen = self.chief
-        covariance = self.fit.covariance[np.ix_(chosen, chosen)]
-        weights = np.linalg.pinv(covariance).sum(axis=0)
-        weights = weights / weights.sum() if len(chosen) > 1 else np.ones(1)
-        value = float(weights @ self.fit.energy_aj[chosen])
-        error = float(np.sqrt(weights @ covariance @ weights)) * self.stretch
-        interval = self.fit.interval95_aj[chosen[0]] if len(chosen) == 1 else value + 1.96 * np.array([-error, error])
-        if len(chosen) == 1:
-            interval = value + self.stretch * (interval - value)
-        interval = np.maximum(interval, 0.0) if value > 0.0 else interval
-        budget = {name: float(weights**2 @ part[chosen]) for name, part in self.fit.budget.items()}
+        if len(chosen) > 1:
+            each = "; ".join(f"{self.groups[i].name}: {self.constant(i)[0]:.3g} aJ" for i in chosen)
+            return blank | {"kind": "several", "reason": f"each drive has its own: {each}"}
+        value, error, interval = self.constant(chosen[0])
+        interval = np.maximum(interval, 0.0) if value > 0.0 else np.array(interval)
+        if not value > 0.0:
+            return blank | {
+                "kind": "none",
+                "reason": "the energy of a tap is not positive: frequency, Q or the zero of the phase is wrong",
+            }
+        budget = self.fit.budget(chosen[0])
         total = sum(budget.values()) or 1.0
         return {
             "value": value,
             "standard_error": error,
             "interval95": interval,
             "kind": "bracket" if not error < _BRACKET * value else "fit",
-            "share_of_variance": {name: part / total for name, part in budget.items()},
+            "reason": "",
+            "assumption": "each tap of the branch takes the same energy",
+            "share_of_variance": {name: part / total for name, part in budget.items() if part > 0.0},
         }
 
     @property
     def described(self) -> bool:
-        """Whether one energy a branch describes the rows, however badly."""
-        return self.fit is not None and not self.fit.chi2 > _WORST * max(self.fit.degrees_of_freedom, 1)
-
-    def _bracket(self) -> tuple[float, float]:
-        """Return what the energies of single rows, with all their errors, and the bound of each leave open, in aJ."""
-        rows = self.rows
-        used = rows.used & np.isfinite(rows.energy_aj)
-        error = 1.96 * np.hypot(rows.energy_noise_aj, rows.energy_systematic_aj)[used]
-        low = np.maximum(rows.energy_aj[used] - error, 0.0)
-        return float(low.min()), float(np.minimum(rows.energy_aj[used] + error, rows.largest_energy_aj[used]).max())
+        """Whether one energy a branch describes the rows."""
+        return not self.why_not_constant
 
     @property
     def plain_energy(self) -> dict[str, Any]:
@@ -234,6 +292,70 @@ class Tapping(Result):
             "standard_deviation": float(values.std(ddof=1)) if chosen.sum() > 1 else None,
             "systematic_error": float(self.rows.energy_systematic_aj[chosen].mean()),
         }
+
+    @property
+    def largest(self) -> dict[str, float] | None:
+        """The largest energy of a tap along the branches: `value`, `standard_error`, `amplitude_ratio`."""
+        tops = []
+        for branch in self.branches:
+            curve = branch.curve
+            top = int(np.argmax(curve.energy_aj))
+            tops.append((curve.energy_aj[top], curve.energy_error_aj[top], curve.amplitude_ratio[top]))
+        if not tops:
+            return None
+        return dict(zip(("value", "standard_error", "amplitude_ratio"), map(float, max(tops)), strict=True))
+
+    @property
+    def energies_at(self) -> list[dict[str, Any]]:
+        """Energy at some amplitudes of each branch that has them."""
+        return [
+            {
+                "branch": i,
+                "amplitude_ratio": ratio,
+                "energy_aj": found[0],
+                "standard_error_aj": found[1],
+            }
+            for i, branch in enumerate(self.branches)
+            for ratio in HEADLINE
+            if (found := branch.curve.at(ratio)) is not None
+        ]
+
+    @property
+    def turning_points(self) -> list[dict[str, Any]]:
+        """Where attraction gives way to repulsion on each drive and way: between which amplitudes and heights."""
+        found = []
+        keys = {(b.drive_frequency_khz, b.free_amplitude_nm, b.retract): None for b in self.branches}
+        for key in keys:
+            sides = [
+                [
+                    b
+                    for b in self.branches
+                    if (b.drive_frequency_khz, b.free_amplitude_nm, b.retract, b.repulsive) == (*key, state)
+                ]
+                for state in (False, True)
+            ]
+            if not all(sides):
+                continue
+            attractive, repulsive = sides[0][-1].curve, sides[1][0].curve
+            last, first = int(np.argmax(attractive.height_nm)), int(np.argmin(repulsive.height_nm))
+            found.append(
+                {
+                    "drive_frequency_khz": key[0],
+                    "free_amplitude_nm": key[1],
+                    "branch": "retract" if key[2] else "approach",
+                    "amplitude_ratio": [
+                        float(repulsive.amplitude_ratio[first]),
+                        float(attractive.amplitude_ratio[last]),
+                    ],
+                    "height_nm": [float(attractive.height_nm[last]), float(repulsive.height_nm[first])],
+                }
+            )
+        return found
+
+    @property
+    def way_differences(self) -> dict[tuple[int, int], WayDifference]:
+        """By how much the energy differs between approach and retract, by the numbers of the branches."""
+        return {} if self.functions is None else differences_of_ways(self.branches, self.functions)
 
     @property
     def epsilon(self) -> dict[str, Any]:
@@ -261,51 +383,115 @@ class Tapping(Result):
         return self.speeds.why_not or "not fitted"
 
     @property
+    def why_not_functions(self) -> str:
+        """Why the energy along the branches is not determined; empty where it is."""
+        fit, top = self.functions, self.largest
+        if fit is None or top is None:
+            return "no branch has enough rows in contact for an energy of a tap"
+        low = min((b.curve.energy_aj + _NEGATIVE * b.curve.energy_error_aj).min() for b in self.branches)
+        largest_scale = _MOST_SCALE if self.scale_errors else _LARGEST_SCALE
+        rules = {
+            f"the energy along the branches has no instrument as given: {_torn_in_words(fit.torn)}": bool(fit.torn),
+            f"the rows scatter {fit.scale:.1f} times as much about a smooth energy as their errors say": (
+                fit.scale > largest_scale
+            ),
+            self.drift: bool(self.drift),
+            "energies below zero beyond their errors: frequency, Q or the zero of the phase is wrong": low < 0.0,
+            f"the energy along the branches is only bracketed, {max(top['value'], 0.0):.2g} aJ at its largest with a "
+            f"standard error of {top['standard_error']:.2g}": not top["standard_error"] < _BRACKET * top["value"],
+        }
+        return next((sentence for sentence, holds in rules.items() if holds), "")
+
+    @property
+    def drift(self) -> str:
+        """What says that the free tip drifted along rows whose order in time the table does not state; or empty."""
+        curve, free = self.curve, self.rows.free
+        places = np.flatnonzero(free)
+        if curve.time is not None or len(places) < 2 * FEWEST_ROWS or not free_ends(curve, free):
+            return ""
+        if np.diff(places).max() <= FEWEST_ROWS:
+            # one way only: along it the free tip may feel the sample
+            return ""
+        place = np.arange(curve.rows) / (curve.rows - 1.0)
+        columns = {
+            "phase": (curve.lag_deg, curve.lag_error_deg, "degrees"),
+            "amplitude": (
+                100.0 * curve.amplitude_nm / curve.free_amplitude_nm,
+                100.0 * curve.amplitude_error_nm / curve.free_amplitude_nm,
+                "%",
+            ),
+        }
+        for name, (values, errors, unit) in columns.items():
+            here = free & np.isfinite(values)
+            if here.sum() < 2 * FEWEST_ROWS:
+                continue
+            x, y, w = place[here], values[here], errors[here] ** -2.0
+            x = x - np.average(x, weights=w)
+            slope = float(np.sum(w * x * y) / np.sum(w * x * x))
+            left = y - np.average(y, weights=w) - slope * x
+            scatter = max(1.0, float(np.sum(w * left**2)) / max(len(x) - 2, 1))
+            error = float(np.sqrt(scatter / np.sum(w * x * x)))
+            if abs(slope) > _DRIFTING * error:
+                return (
+                    f"the {name} of the free tip follows the order of the rows, by {slope:+.2g} +- {error:.1g} {unit} "
+                    "over the table: if they stand as they were measured, say so by '# rows = in order of time', and "
+                    "the drift is fitted along"
+                )
+        return ""
+
+    @property
     def reasons(self) -> list[str]:
-        """What makes the energy no measurement."""
-        if self.fit is None:
-            if self.bound_aj is not None:
-                return ["without a phase the curve gives no more than an upper bound of the energy of a tap"]
-            return ["no branch has enough rows in contact for an energy of a tap"]
-        found, energy = [], self.energy
-        if not self.described:
-            low, high = energy["interval95"]
-            found.append(
-                f"one energy a branch does not describe the rows (chi2 {self.fit.chi2:.0f} for "
-                f"{self.fit.degrees_of_freedom} degrees of freedom): only a bracket, {low:.2g} to {high:.2g} aJ"
-            )
-        elif not energy["value"] > 0.0:
-            found.append("the energy of a tap is not positive: frequency, Q or the zero of the phase is wrong")
-        elif energy["kind"] == "bracket":
+        """What makes the energy no measurement: neither one energy nor one along the branches is determined."""
+        if not self.curve.has_phase and self.bound_aj is not None:
+            return ["without a phase the curve gives no more than an upper bound of the energy of a tap"]
+        energy = self.energy
+        one = energy["reason"]
+        if energy["kind"] == "bracket":
             chief = max(energy["share_of_variance"], key=lambda name: energy["share_of_variance"][name])
             low, high = energy["interval95"]
-            found.append(
+            one = (
                 f"the energy of a tap is only bracketed, {low:.2g} to {high:.2g} aJ; most of that is "
                 f"{origin_in_words(chief)}"
             )
-        return found
+        several = energy["kind"] == "several" and not self._open_groups
+        if self.drift:
+            return [self.drift]
+        if not self.why_not_functions or not one or several:
+            return []
+        return list(dict.fromkeys([one, self.why_not_functions]))
+
+    @property
+    def _open_groups(self) -> list[int]:
+        """Numbers of the chief groups whose energy is not determined."""
+        found = {i: self.constant(i) for i in self.chief}
+        return [i for i, (value, error, _) in found.items() if not error < _BRACKET * value]
 
     @property
     def valid(self) -> bool:
-        """Whether the energy of a tap is determined."""
+        """Whether the energy of a tap is determined, as one or along the branches."""
         return not self.reasons
 
     @property
     def warnings(self) -> list[str]:
         """What a reader should know besides."""
         found = []
-        if self.fit is not None and self.described:
-            if self.stretch > 1.0:
-                found.append(
-                    f"the rows scatter {self.stretch:.2g} times more than their noise: errors are multiplied by that"
-                )
-            found += [
-                f"{origin_in_words(n.key)} ends {pull:+.1f} standard errors from what was given "
-                f"({n.given} to {n.value:.6g})"
-                for n in self.fit.nuisances
-                if abs(pull := (n.value - n.given.value) / n.given.error) > 2.0
-            ]
-            if not self.fit.free.any() and self.curve.phase_zero_deg is None:
+        if self.valid and self.curve.has_phase:
+            if self.why_not_functions:
+                found.append(f"as a function of the amplitude it is not determined: {self.why_not_functions}")
+            for what, fit in (("one energy a branch", self.fit), ("a smooth energy", self.functions)):
+                if fit is not None and fit.scale > 1.0:
+                    found.append(
+                        f"the rows scatter {fit.scale:.2g} times more about {what} than their errors say: its errors "
+                        "are multiplied by that"
+                    )
+            if self.fit is not None and self.described:
+                found += [
+                    f"{origin_in_words(n.kind)} ends {n.pull:+.1f} standard errors from what was given "
+                    f"({n.given} to {n.value:.6g})"
+                    for n in self.fit.nuisances
+                    if abs(n.pull) > _PULLED
+                ]
+            if not self.rows.free.any() and self.curve.phase_zero_deg is None:
                 found.append(
                     "no row of the free tip fixes the zero of the phase: it is fitted, and the energy hangs on it"
                 )
@@ -323,40 +509,46 @@ class Tapping(Result):
                 f"free frequency {curve.free_frequency_khz} kHz, Q {curve.quality_factor}, "
                 f"spring constant {curve.spring_constant_n_per_m} N/m, calibration {curve.tip_calibration}"
             ),
-            "the drive stays as it is along the curve, and each tap of a branch takes the same energy",
         ]
+        if curve.assumed:
+            usual = ", ".join(f"{_ASSUMED[name]} to {100.0 * USUAL_ERRORS[name]:g} %" for name in curve.assumed)
+            found.append(f"given without an error, so usual ones: {usual}")
+        if curve.time is None:
+            found.append("the drive stays as it is along the curve")
+        elif free_ends(curve, self.rows.free):
+            found.append("phase and free amplitude drift evenly along the rows, as free rows at both ends tell")
+        else:
+            found.append("phase and free amplitude drift evenly along the rows, usually by 1 degree and 1 %")
         if curve.has_phase:
-            free = self.fit is not None and bool(self.fit.free.any())
+            free = bool(self.rows.free.any())
             zero = (
                 "the zero of the phase from the free rows"
                 if free
                 else f"zero of phase {curve.phase_zero_deg or 'fitted'}"
             )
-            found.append(f"lag behind {'the base' if curve.drive == 'base' else 'the force on the tip'}, {zero}")
+            found.append(
+                f"lag behind {'the base' if curve.drive == 'base' else 'the force on the tip'}, {zero}; heights "
+                "upward, virial positive where attraction prevails"
+            )
         if not curve.harmonic_amplitudes_nm:
             found.append("harmonics were not measured: those of one brief impact a period, to 10 %")
-        exact = [
-            name
-            for name, given in (
-                ("the free frequency", curve.free_frequency_khz),
-                ("Q", curve.quality_factor),
-                ("the spring constant", curve.spring_constant_n_per_m),
-                ("the calibration", curve.tip_calibration),
-            )
-            if not given.error
-        ]
-        if exact:
-            found.append(f"taken as exact, for want of an error: {', '.join(exact)}")
         return found
 
     @property
     def set_aside(self) -> list[dict[str, Any]]:
-        """The rows that touch the sample and are not in the fit of one energy: line, height and why."""
+        """The rows that touch the sample and are in no energy: line, height and why."""
         return [
             {"line": int(self.curve.lines[i]), "offset_nm": float(self.curve.offset_nm[i]), "reason": note}
             for i, note in enumerate(self.rows.note)
             if note.startswith("set aside")
         ]
+
+    def _constant_of(self, number: int) -> dict[str, Any]:
+        """Return whether one energy explains the rows of a group, and which."""
+        blank: dict[str, Any] = {"energy_aj": None, "standard_error_aj": None, "interval95_aj": None}
+        if number < 0 or self.fit is None or not self.described:
+            return {"constant": False, **blank}
+        return {"constant": True, **dict(zip(blank, self.constant(number), strict=True))}
 
     def records(self) -> list[dict[str, Any]]:
         """Return a mapping per row; what is not known is None."""
@@ -374,12 +566,15 @@ class Tapping(Result):
             "energy_aj": rows.energy_aj,
             "energy_noise_aj": rows.energy_noise_aj,
             "energy_systematic_aj": rows.energy_systematic_aj,
+            "virial_aj": rows.virial_aj,
+            "virial_noise_aj": rows.virial_noise_aj,
+            "virial_systematic_aj": rows.virial_systematic_aj,
         }
         columns |= {f"energy_error_of_{name}_aj": part for name, part in rows.energy_errors_aj.items()}
         columns |= {
             "energy_of_fit_aj": rows.energy_of_fit_aj,
+            "virial_of_fit_aj": rows.virial_of_fit_aj,
             "residual": np.full(curve.rows, np.nan) if self.fit is None else self.fit.residual,
-            "virial_aj": rows.virial_aj,
             "largest_energy_aj": rows.largest_energy_aj,
         }
         if self.speeds is not None:
@@ -390,45 +585,53 @@ class Tapping(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain lists, numbers and strings; what is not known is None."""
-        fit = self.fit
-        groups = (
-            []
-            if fit is None
-            else [
-                {
-                    **vars(group),
-                    "energy_aj": fit.energy_aj[i],
-                    "standard_error_aj": fit.standard_error_aj[i] * self.stretch,
-                    "interval95_aj": fit.interval95_aj[i],
-                    "rows": int(np.sum(fit.used & (self.group_of_rows == i))),
-                }
-                for i, group in enumerate(self.groups)
-            ]
-        )
+        fit, functions, energy = self.fit, self.functions, self.energy
+        group = self.group_of_rows
+        branches = [
+            {
+                "drive_frequency_khz": branch.drive_frequency_khz,
+                "free_amplitude_nm": branch.free_amplitude_nm,
+                "branch": branch.way,
+                "repulsive": branch.repulsive,
+                "rows": len(branch.rows),
+                **self._constant_of(int(group[branch.rows[0]])),
+                "curve": branch.curve.to_dict(),
+            }
+            for branch in self.branches
+        ]
         return plain(
             {
                 "valid": self.valid,
                 "reasons": self.reasons,
                 "warnings": self.warnings,
-                "energy_per_tap_aj": self.energy,
+                "energy_per_tap_aj": None if energy["value"] is None and energy["interval95"] is None else energy,
+                "energy_per_tap_reason": energy["reason"] or None,
+                "largest_energy_aj": self.largest,
+                "energies_at": self.energies_at,
+                "turning_points": self.turning_points,
+                "way_differences": [
+                    {"approach": i, "retract": j, **vars(one)} for (i, j), one in self.way_differences.items()
+                ],
                 "plain_energy_aj": self.plain_energy,
                 "epsilon_nm2_per_us2": self.epsilon,
                 "assumptions": self.assumptions,
-                "branches": groups,
+                "assumed_errors": {name: USUAL_ERRORS[name] for name in self.curve.assumed},
+                "branches": branches,
+                "functions": None
+                if functions is None
+                else {
+                    "valid": not self.why_not_functions,
+                    "reason": self.why_not_functions or None,
+                    "rows_chi2": functions.rows_chi2,
+                    "rows_freedom": functions.rows_freedom,
+                    "scale": functions.scale,
+                    "nuisances": _nuisances(functions.nuisances),
+                },
                 "chi2": None if fit is None else fit.chi2,
                 "degrees_of_freedom": None if fit is None else fit.degrees_of_freedom,
                 "p_value": None if fit is None else fit.p_value,
-                "nuisances": {}
-                if fit is None
-                else {
-                    n.name: {
-                        "given": n.given.value,
-                        "given_error": n.given.error,
-                        "value": n.value,
-                        "standard_error": n.standard_error,
-                    }
-                    for n in fit.nuisances
-                },
+                "scale": None if fit is None else fit.scale,
+                "nuisances": {} if fit is None else _nuisances(fit.nuisances),
                 "hysteresis": [
                     {
                         **vars(one),
@@ -447,6 +650,35 @@ class Tapping(Result):
                 "versions": self.versions,
             }
         )
+
+
+def _nuisances(nuisances: tuple[Nuisance, ...]) -> dict[str, Any]:
+    return {
+        n.name: {
+            "given": n.given.value,
+            "given_error": n.given.error,
+            "value": n.value,
+            "standard_error": n.standard_error,
+        }
+        for n in nuisances
+    }
+
+
+def _torn_in_words(torn: list[Nuisance]) -> str:
+    """Return which nuisances had to go too far."""
+    parts = [f"{origin_in_words(n.kind)} {n.pull:+.1f} of its errors from what was given" for n in torn]
+    return f"{' and '.join(parts)} would be needed"
+
+
+def _interval(energy: float, error: float, share: float) -> tuple[float, float]:
+    """Return the 95 % interval of an energy, with the relative error of a factor in logarithms: it is positive."""
+    low, high = energy - Z95 * error, energy + Z95 * error
+    if share == 0.0 or energy <= 0.0:
+        return low, high
+    above = float(np.hypot(np.log(high / energy), Z95 * share))
+    if low <= 0.0:
+        return low, float(energy * np.exp(above))
+    return float(energy * np.exp(-np.hypot(np.log(energy / low), Z95 * share))), float(energy * np.exp(above))
 
 
 def _height(found: Any) -> dict[str, float] | None:

@@ -5,23 +5,38 @@ from importlib.metadata import version
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool
 
 from afm_jax.checks import checked
 from afm_jax.scenefile.tables import printable
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable, TableLike, as_table
-from fitting.tapping_curves.branches import changes, free_rows, hardly_touching_rows, held_rows, rough_rows
-from fitting.tapping_curves.constant_energy import ConstantEnergy, fit_constant_energy, plain_instrument, turned
-from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, TappingCurve, free_lag_deg, motion_of
-from fitting.tapping_curves.energy import energies, largest_energies, noise_of
+from fitting.tapping_curves.branches import (
+    changes,
+    free_rows,
+    hardly_touching_rows,
+    held_rows,
+    repulsive_rows,
+    rough_rows,
+    smooth_stretches,
+)
+from fitting.tapping_curves.curve import (
+    HARMONICS_FACTOR,
+    Given,
+    Instrument,
+    TappingCurve,
+    free_lag_deg,
+    given_or_usual,
+    motion_of,
+)
+from fitting.tapping_curves.energy import energies, largest_energies, noise_of, virial_noise_of
+from fitting.tapping_curves.energy_curve import FEWEST_ROWS, branches_of
+from fitting.tapping_curves.energy_fit import EnergyFit, fit_energy, plain_instrument, turned, usual_drifts
 from fitting.tapping_curves.result import EnergyGroup, MeasuredSpeeds, Tapping, TapRows
 from fitting.tapping_curves.speeds import speeds
 
 LAW_MODEL = "viscous+delay"
-_FEWEST_ROWS = 3
-"""Of a group of rows that gets an energy of its own."""
 _FEWEST_FOR_LAW = 6
 """Rows with a fast impact: the law has two parameters, its delay three."""
 _SLOWEST = 2.5
@@ -35,19 +50,20 @@ _ORIGIN_NM = 0.3
 
 
 @checked
-def tapping(table: TableLike, *, law: bool = True, model: str = LAW_MODEL) -> Tapping:
+def tapping(table: TableLike, *, law: bool = True, model: str = LAW_MODEL, scale_errors: bool = False) -> Tapping:
     """Return the energy of a tap along a tapping curve, its branches and hysteresis, and the law if rows allow it.
 
     Args:
         table: with `drive` "force" or "base"; see `read_table`.
         law: whether to fit the impact law where the rows allow it (that imports JAX and compiles for half a minute).
         model: of the law, as for `fit`.
+        scale_errors: multiply the errors of the rows where these scatter more, instead of refusing their energy.
 
     Raises:
         TableError: if the table is none of a driven cantilever, or something is missing that no energy can do without.
     """
     table = as_table(table)
-    result = _energies(table, curve_of(table))
+    result = _energies(table, curve_of(table), scale_errors=scale_errors)
     return with_law(result, model) if law and result.law_allowed else result
 
 
@@ -64,10 +80,10 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
             "driven, or use `afm-jax fit`"
         )
     missing = []
-    quality = table.quality_factor or 0.0
+    quality = np.nan_to_num(table.quality_factor or 0.0)
     if not quality:
         missing.append(("the quality factor", "quality_factor = 200 +- 2", "--quality-factor '200 +- 2'"))
-    if table.spring_constant_n_per_m is None and table.mass_ng == 1.0:
+    if table.mass_ng is None:
         missing.append(
             ("the spring constant", "spring_constant_n_per_m = 5.4 +- 0.5", "--spring-constant '5.4 +- 0.5'")
         )
@@ -82,7 +98,13 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
     rows = np.isfinite(table.lockin_amplitude_nm)
     blank = np.full(table.rows, np.nan)
     lag, lag_error = (blank if part is None else part for part in (table.phase_lag_deg, table.phase_lag_error_deg))
-    spring = Given(table.spring_constant_n_per_m or _stiffness(table), table.spring_constant_error_n_per_m or 0.0)
+    spring = table.spring_constant_n_per_m or _stiffness(table)
+    given = {
+        "free_frequency_khz": (table.free_frequency_khz, table.free_frequency_error_khz),
+        "quality_factor": (quality, table.quality_factor_error),
+        "spring_constant_n_per_m": (spring, table.spring_constant_error_n_per_m),
+        "tip_calibration": table.calibration.get("tip_calibration", (1.0, None)),
+    }
     noise = table.lockin_amplitude_error_nm / table.lockin_amplitude_nm
     zero = table.calibration.get("phase_zero_deg")
     whole = TappingCurve(
@@ -98,67 +120,78 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
         drive_frequency_khz=table.drive_frequency_khz,
         retract=np.zeros(table.rows, bool) if table.retract is None else table.retract == 1.0,
         both_ways=table.retract is not None,
-        free_frequency_khz=Given(table.free_frequency_khz, table.free_frequency_error_khz or 0.0),
-        quality_factor=Given(quality, table.quality_factor_error or 0.0),
-        spring_constant_n_per_m=spring,
-        tip_calibration=Given(*table.calibration.get("tip_calibration", (1.0, 0.0))),
+        free_frequency_khz=given_or_usual("free_frequency_khz", *given["free_frequency_khz"]),
+        quality_factor=given_or_usual("quality_factor", *given["quality_factor"]),
+        spring_constant_n_per_m=given_or_usual("spring_constant_n_per_m", *given["spring_constant_n_per_m"]),
+        tip_calibration=given_or_usual("tip_calibration", *given["tip_calibration"]),
+        assumed=tuple(name for name, (_, error) in given.items() if not error),
         phase_zero_deg=None if zero is None else Given(*zero),
         origin_error_nm=table.calibration.get("offset_origin_nm", (0.0, _ORIGIN_NM))[1],
         lines=np.asarray(table.lines),
+        time=np.linspace(-0.5, 0.5, table.rows) if table.rows_in_order_of_time and table.rows > 1 else None,
     )
     return whole.part(rows)
 
 
 def _stiffness(table: AmplitudeTable) -> float:
+    assert table.mass_ng is not None  # checked before  # noqa: S101
     return table.mass_ng * (RAD_PER_US_PER_KHZ * table.free_frequency_khz) ** 2
 
 
-def _energies(table: AmplitudeTable, curve: TappingCurve) -> Tapping:
+def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool) -> Tapping:
     """Return everything but the law."""
     free, held = free_rows(curve), held_rows(curve)
     given = plain_instrument(curve, free)
     plain = energies(curve, given)
-    noise = noise_of(curve, plain)
     departure = turned(curve.lag_deg - free_lag_deg(curve, given))
-    tapping = ~free & ~held & np.isfinite(curve.lag_deg)
-    repulsive = ~free & (departure < 0.0)
-    rough = rough_rows(curve, tapping & repulsive) | rough_rows(curve, tapping & ~repulsive)
-    early = tapping & hardly_touching_rows(motion_of(curve, given))
-    if (tapping & ~rough & ~early).sum() < _FEWEST_ROWS:
+    touching = ~free & ~held & np.isfinite(curve.lag_deg)
+    repulsive = ~free & repulsive_rows(curve, touching, departure)
+    rough = rough_rows(curve, touching & repulsive) | rough_rows(curve, touching & ~repulsive)
+    early = touching & hardly_touching_rows(motion_of(curve, given))
+    if (touching & ~rough & ~early).sum() < FEWEST_ROWS:
         early = np.zeros(curve.rows, bool)
-    usable = tapping & ~rough & ~early
-    keys, groups = _groups(curve, usable, repulsive)
-    fitted = None
-    if keys:
-        usable &= groups >= 0
-        fitted = fit_constant_energy(curve, np.maximum(groups, 0), tapping=usable, free=free)
-    instrument = given if fitted is None else fitted.instrument
-    at = energies(curve, instrument)
-    bound = None if curve.has_phase else _bound(curve, given, free)
-    energy = plain.energy_aj
-    hysteresis = changes(curve, free=free, repulsive=repulsive, energy=np.where(free, 0.0, at.energy_aj), noise=noise)
-    far = np.zeros(curve.rows, bool) if fitted is None else fitted.outliers
-    notes = _notes(curve, free=free, held=held, rough=rough, early=early, far=far, alone=tapping & (groups < 0))
+    kinds, alike = _kinds(curve, touching & ~rough & ~early, repulsive)
+    fitted = fit_energy(curve, alike, free, smooth=False, scale_errors=scale_errors) if kinds else None
+    stretches = [rows for rows in smooth_stretches(curve, touching, repulsive) if len(rows) >= FEWEST_ROWS]
+    functions = fit_energy(curve, stretches, free, smooth=True, scale_errors=scale_errors) if stretches else None
+    at = functions or fitted
+    found = plain if at is None else at.energies_at
+    noise = noise_of(curve, plain)
+    hysteresis = changes(
+        curve, free=free, repulsive=repulsive, energy=np.where(free, 0.0, found.energy_aj), noise=noise
+    )
+    far = np.zeros(curve.rows, bool)
+    if functions is not None:
+        far = functions.outliers
+    elif fitted is not None:
+        far = fitted.outliers
+    alone = touching & ~np.isin(np.arange(curve.rows), np.concatenate([*alike, *stretches, np.zeros(0, int)]))
+    shared, virial_shared = _errors(curve, given, free)
     rows = TapRows(
-        state=tuple(_state(*row) for row in zip(free.tolist(), held.tolist(), departure.tolist(), strict=True)),
+        state=tuple(_state(*row) for row in zip(free, held, np.isfinite(departure), repulsive, strict=True)),
         lag_departure_deg=departure,
-        energy_aj=energy,
+        energy_aj=plain.energy_aj,
         energy_noise_aj=noise,
-        energy_errors_aj=_errors(curve, given, free),
-        energy_of_fit_aj=at.energy_aj,
-        virial_aj=at.virial_aj,
+        energy_errors_aj=shared,
+        energy_of_fit_aj=found.energy_aj,
+        virial_aj=plain.virial_aj,
+        virial_noise_aj=virial_noise_of(curve, plain),
+        virial_errors_aj=virial_shared,
+        virial_of_fit_aj=found.virial_aj,
         largest_energy_aj=largest_energies(curve, given),
         used=np.zeros(curve.rows, bool) if fitted is None else fitted.used,
-        note=notes,
+        note=_notes(curve, free=free, held=held, rough=rough, early=early, far=far, alone=alone),
     )
-    named = [EnergyGroup(*key, repulsive=state) for key, state in keys]
     result = Tapping(
         table=table,
         curve=curve,
         rows=rows,
-        groups=tuple(named),
+        groups=tuple(EnergyGroup(*key, repulsive=state) for key, state in kinds),
         fit=fitted,
-        bound_aj=bound,
+        functions=functions,
+        branches=() if functions is None else branches_of(curve, functions, repulsive, free),
+        scale_errors=scale_errors,
+        bound_aj=None if curve.has_phase else _bound(curve, given, free),
         hysteresis=tuple(hysteresis),
         speeds=None,
         versions={name: version(name) for name in ("afm-jax", "numpy", "scipy")},
@@ -166,31 +199,43 @@ def _energies(table: AmplitudeTable, curve: TappingCurve) -> Tapping:
     return result if fitted is None else replace(result, speeds=_speeds(result, fitted))
 
 
-def _groups(
+def _energies_along(result: Tapping) -> np.ndarray:
+    """Return the energy of each row's tap: the one of its kind, or where none explains the rows that of its branch."""
+    found = np.full(result.curve.rows, np.nan)
+    if result.described:
+        constants = np.array([result.constant(i)[0] for i in range(len(result.groups))])
+        return np.where(result.group_of_rows >= 0, constants[np.maximum(result.group_of_rows, 0)], found)
+    for branch in result.branches:
+        order = np.argsort(branch.curve.height_nm)
+        height, energy = branch.curve.height_nm[order], branch.curve.energy_aj[order]
+        found[branch.rows] = np.interp(result.curve.offset_nm[branch.rows], height, energy)
+    return found
+
+
+def _kinds(
     curve: TappingCurve, usable: Bool[np.ndarray, " rows"], repulsive: Bool[np.ndarray, " rows"]
-) -> tuple[list[tuple[tuple[float, float], bool]], Int[np.ndarray, " rows"]]:
-    """Return the groups of rows that share an energy (drive, branch), and of every row the number of its own or -1."""
-    groups = np.full(curve.rows, -1)
-    keys = []
+) -> tuple[list[tuple[tuple[float, float], bool]], list[np.ndarray]]:
+    """Return the kinds of rows that may share an energy (drive, attractive or repulsive), and the rows of each."""
+    kinds, rows = [], []
     drives = sorted(set(zip(curve.drive_frequency_khz.tolist(), curve.free_amplitude_nm.tolist(), strict=True)))
     for drive in drives:
         of_drive = (curve.drive_frequency_khz == drive[0]) & (curve.free_amplitude_nm == drive[1])
         for state in (True, False):
-            here = usable & of_drive & (repulsive == state)
-            if here.sum() >= _FEWEST_ROWS:
-                groups[here] = len(keys)
-                keys.append((drive, state))
-    return keys, groups
+            here = np.flatnonzero(usable & of_drive & (repulsive == state))
+            if len(here) >= FEWEST_ROWS:
+                kinds.append((drive, state))
+                rows.append(here)
+    return kinds, rows
 
 
-def _state(free: bool, held: bool, departure: float) -> str:  # noqa: FBT001
+def _state(free: np.bool_, held: np.bool_, phase: np.bool_, repulsive: np.bool_) -> str:
     if free:
         return "free"
     if held:
         return "held"
-    if not np.isfinite(departure):
+    if not phase:
         return "touching"
-    return "repulsive" if departure < 0.0 else "attractive"
+    return "repulsive" if repulsive else "attractive"
 
 
 def _notes(curve: TappingCurve, **which: Bool[np.ndarray, " rows"]) -> tuple[str, ...]:
@@ -199,17 +244,19 @@ def _notes(curve: TappingCurve, **which: Bool[np.ndarray, " rows"]) -> tuple[str
         "free": "free: fixes the zero of the phase" if curve.has_phase else "free",
         "held": "set aside: the tip is held, a tenth of the free amplitude is left or less",
         "silent": "set aside: no phase, only a bound",
-        "rough": "set aside: off the smooth fall of its branch, so probably not one impact a period",
-        "early": "set aside: hardly touching yet, taps need not come every period",
+        "rough": "not in the one energy: off the smooth fall of its branch, so probably not one impact a period",
+        "early": "not in the one energy: hardly touching yet, taps need not come every period",
         "far": "set aside: its energy is more than 4 standard errors from the others'",
-        "alone": f"set aside: fewer than {_FEWEST_ROWS} rows of this branch",
+        "alone": f"set aside: fewer than {FEWEST_ROWS} rows of this branch",
     }
     which["silent"] = np.isnan(curve.lag_deg)
     return tuple(next((words for name, words in said.items() if which[name][i]), "") for i in range(curve.rows))
 
 
-def _errors(curve: TappingCurve, given: Instrument, free: Bool[np.ndarray, " rows"]) -> dict[str, np.ndarray]:
-    """Return by how much each energy changes with one standard error of what all rows share."""
+def _errors(
+    curve: TappingCurve, given: Instrument, free: Bool[np.ndarray, " rows"]
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Return by how much each energy and each virial changes with one standard error of what all rows share."""
     known = np.isfinite(curve.lag_error_deg) & free
     zero = curve.phase_zero_deg.error if curve.phase_zero_deg else 0.0
     if known.any():
@@ -219,20 +266,32 @@ def _errors(curve: TappingCurve, given: Instrument, free: Bool[np.ndarray, " row
         "free_frequency_khz": given._replace(free_frequency_khz=frequency.value + frequency.error),
         "quality_factor": given._replace(quality_factor=quality.value + quality.error),
         "phase_zero_deg": given._replace(phase_zero_deg=given.phase_zero_deg + zero),
-        "free_amplitude": given._replace(free_amplitude_factor=1.0 + curve.free_amplitude_error),
+        "free_amplitude": given._replace(
+            free_amplitude_factor=given.free_amplitude_factor + curve.free_amplitude_error
+        ),
         "harmonics": given._replace(harmonics_factor=HARMONICS_FACTOR.value + HARMONICS_FACTOR.error),
     }
     # with another frequency or Q the free rows fix another zero of the phase
     for name in ("free_frequency_khz", "quality_factor"):
         trial = replace(curve, **{name: Given(getattr(moved[name], name))})
         moved[name] = moved[name]._replace(phase_zero_deg=plain_instrument(trial, free).phase_zero_deg)
-    start = energies(curve, given).energy_aj
-    found = {name: np.abs(energies(curve, at).energy_aj - start) for name, at in moved.items()}
-    found["tip_calibration"] = np.abs(start) * 2.0 * curve.tip_calibration.error / curve.tip_calibration.value
-    found["spring_constant_n_per_m"] = (
-        np.abs(start) * curve.spring_constant_n_per_m.error / curve.spring_constant_n_per_m.value
-    )
-    return found
+    if curve.time is not None:
+        phase, amplitude = usual_drifts(curve, free)
+        moved["phase_drift_deg"] = given._replace(phase_zero_deg=given.phase_zero_deg + phase * curve.time)
+        factor = given.free_amplitude_factor + amplitude * curve.time
+        moved["free_amplitude_drift"] = given._replace(free_amplitude_factor=factor)
+    start = energies(curve, given)
+    ends = {name: energies(curve, at) for name, at in moved.items()}
+    relative = {
+        "tip_calibration": 2.0 * curve.tip_calibration.error / curve.tip_calibration.value,
+        "spring_constant_n_per_m": curve.spring_constant_n_per_m.error / curve.spring_constant_n_per_m.value,
+    }
+    found = [
+        {name: np.abs(getattr(end, column) - getattr(start, column)) for name, end in ends.items()}
+        | {name: share * np.abs(getattr(start, column)) for name, share in relative.items()}
+        for column in ("energy_aj", "virial_aj")
+    ]
+    return found[0], found[1]
 
 
 def _bound(curve: TappingCurve, given: Instrument, free: Bool[np.ndarray, " rows"]) -> float | None:
@@ -251,9 +310,10 @@ def _bound(curve: TappingCurve, given: Instrument, free: Bool[np.ndarray, " rows
     return float(np.max(largest) * np.exp(1.645 * share))
 
 
-def _speeds(result: Tapping, fitted: ConstantEnergy) -> MeasuredSpeeds:
+def _speeds(result: Tapping, fitted: EnergyFit) -> MeasuredSpeeds:
     """Return the impact speeds of the rows fitted, with their errors from noise, calibration and origin of height."""
-    curve, instrument = result.curve, fitted.instrument
+    curve = result.curve
+    instrument = fitted.instrument if result.described or result.functions is None else result.functions.instrument
     start = speeds(curve, instrument)
     calibration = curve.tip_calibration
     moved = [
@@ -268,7 +328,7 @@ def _speeds(result: Tapping, fitted: ConstantEnergy) -> MeasuredSpeeds:
     changes = np.where(np.isfinite(changes), changes, np.inf)
     error = np.sqrt(np.sum(changes**2, axis=0))
     known = fitted.used & np.isfinite(u) & (error < _VAGUE * u)
-    capture = np.sqrt(2.0 * np.maximum(fitted.energy_aj[np.maximum(result.group_of_rows, 0)], 0.0) / result.mass_ng)
+    capture = np.sqrt(2.0 * np.maximum(np.nan_to_num(_energies_along(result)), 0.0) / result.mass_ng)
     in_capture = np.where(known & (capture > 0.0), u / np.where(capture > 0.0, capture, 1.0), np.nan)
     fast = known & (in_capture >= _SLOWEST) & (np.abs(start.pull) < _PULLED)
     blank = np.where(known, 1.0, np.nan)
@@ -324,7 +384,8 @@ def _with_zero_of_phase(result: Tapping, table: AmplitudeTable) -> AmplitudeTabl
 
     With several drives its own is that of the first.
     """
-    found = [] if result.fit is None else [one for one in result.fit.nuisances if one.key == "phase_zero_deg"]
+    fit = result.fit if result.described else result.functions
+    found = [] if fit is None else [one for one in fit.nuisances if one.kind == "phase_zero_deg"]
     if not found:
         return table
     calibration = table.calibration | {"phase_zero_deg": (float(found[0].value), float(found[0].standard_error))}

@@ -207,6 +207,7 @@ def _impacts(trace: Trace, folded: Fold, peak: Peak, frequency: float | None) ->
     if frequency is None or peak.height_nm <= 0.0:
         return None
     quality = trace.settings.quality_factor
+    quality = None if quality is None or math.isinf(quality) else quality
     return count_impacts(folded, free_frequency_khz=frequency, quality_factor=quality, peak_nm=peak.height_nm)
 
 
@@ -279,7 +280,14 @@ def _warnings(
     return found
 
 
-_SHARED = ("free_frequency_khz", "quality_factor", "quality_factor_error", "mass_ng")
+_SHARED = (
+    "free_frequency_khz",
+    "quality_factor",
+    "quality_factor_error",
+    "mass_ng",
+    "spring_constant_n_per_m",
+    "spring_constant_error_n_per_m",
+)
 
 
 class _Row(NamedTuple):
@@ -341,9 +349,11 @@ def table_of(results: Sequence[LockinResult]) -> AmplitudeTable:
     return AmplitudeTable(
         **columns,
         free_frequency_khz=_or_nan(shared["free_frequency_khz"]),
-        quality_factor=shared["quality_factor"],
+        quality_factor=None if shared["quality_factor"] == math.inf else _or_nan(shared["quality_factor"]),
         quality_factor_error=shared["quality_factor_error"],
-        mass_ng=1.0 if shared["mass_ng"] is None else shared["mass_ng"],
+        mass_ng=shared["mass_ng"],
+        spring_constant_n_per_m=shared["spring_constant_n_per_m"],
+        spring_constant_error_n_per_m=shared["spring_constant_error_n_per_m"],
         source="amplitudes.csv",
         remarks=("read from time traces by afm-jax lockin", *remarks),
     )

@@ -33,6 +33,7 @@ from jaxtyping import Float
 from afm_jax.checks import checked
 from afm_jax.results import Result, public_result
 from afm_jax.scenefile.tables import cut_short, printable
+from afm_jax.units import contradicting_mass
 from afm_jax.whole_files import MOST_PACKED, MOST_VALUES
 from fitting.tables.csv_text import (
     Column,
@@ -64,12 +65,19 @@ SETTINGS = {
         FileSetting("offset_nm", lowest=_ANY),
         FileSetting("drive_phase_deg", lowest=_ANY),
         FileSetting("free_frequency_khz"),
-        FileSetting("quality_factor", "40 (or 40 +- 2)", lowest=LOWEST_QUALITY_FACTOR, error="maybe"),
+        FileSetting("quality_factor", "40 (or 40 +- 2)", lowest=LOWEST_QUALITY_FACTOR, error="maybe", none=True),
         FileSetting("quality_factor_error"),
         FileSetting("mass_ng"),
+        FileSetting("spring_constant_n_per_m", "5.4 (or 5.4 +- 0.5)", error="maybe"),
+        FileSetting("spring_constant_error_n_per_m"),
         FileSetting("rest_nm", lowest=_ANY),
     )
 }
+_ERRORS = {
+    "quality_factor": "quality_factor_error",
+    "spring_constant_n_per_m": "spring_constant_error_n_per_m",
+}
+"""Settings that may come with an error, and its name."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,9 +91,11 @@ class TraceSettings:
         offset_nm: mean height of the platform above the tip's rest position.
         drive_phase_deg: psi in z_p = offset + beta cos(omega t + psi), t the trace's own time.
         free_frequency_khz: undamped natural frequency of the cantilever.
-        quality_factor: of the cantilever.
+        quality_factor: of the cantilever; infinite: no air damping.
         quality_factor_error: its standard error.
         mass_ng: effective mass.
+        spring_constant_n_per_m: which says the mass, too.
+        spring_constant_error_n_per_m: its standard error.
         rest_nm: what the deflection reads at the tip's rest position.
     """
 
@@ -98,6 +108,8 @@ class TraceSettings:
     quality_factor: float | None = None
     quality_factor_error: float | None = None
     mass_ng: float | None = None
+    spring_constant_n_per_m: float | None = None
+    spring_constant_error_n_per_m: float | None = None
     rest_nm: float | None = None
 
 
@@ -109,7 +121,7 @@ def settings_of_comments(comments: list[tuple[int, str]], faults: Faults) -> tup
         faults: where a misspelt key, a value that is no number and a repeated key are noted.
     """
     found, remarks = settings_in(comments, SETTINGS, faults)
-    errors = {f"{key}_error": error for key, (_, error) in found.items() if error is not None}
+    errors = {_ERRORS[key]: error for key, (_, error) in found.items() if error is not None}
     return {key: value for key, (value, _) in found.items()} | errors, remarks
 
 
@@ -121,10 +133,11 @@ def settings_of_attributes(attributes: Mapping[str, Any], faults: Faults) -> dic
         faults: where a value that is no number is noted.
     """
     found = {}
-    for name in SETTINGS:
+    for name, setting in SETTINGS.items():
         if name in attributes:
             try:
-                found[name] = _checked(name, float(attributes[name]), faults)
+                none = setting.none and str(attributes[name]) == "none"
+                found[name] = float("inf") if none else _checked(name, float(attributes[name]), faults)
             except (TypeError, ValueError):
                 faults.add(f"the attribute {name} is {quoted(str(attributes[name]))}; it must be a number")
     return found
@@ -145,11 +158,21 @@ def joined_settings(found: Mapping[str, float], given: Mapping[str, float | None
     for name, value in stated.items():
         if name not in SETTINGS:
             raise TypeError(f"there is no setting `{name}`; the settings are {', '.join(SETTINGS)}")
-        _checked(name, value, faults)
-    # the error of a quality factor belongs to the value that it was stated with
-    if "quality_factor" in stated:
-        found = {name: value for name, value in found.items() if name != "quality_factor_error"}
-    return TraceSettings(**(dict(found) | stated))
+        if not (SETTINGS[name].none and value == float("inf")):
+            _checked(name, value, faults)
+    # an error belongs to the value that it was stated with; of mass and spring constant the one that is stated holds
+    gone = {_ERRORS[name] for name in stated if name in _ERRORS}
+    if "mass_ng" in stated:
+        gone |= {"spring_constant_n_per_m", "spring_constant_error_n_per_m"}
+    if "spring_constant_n_per_m" in stated:
+        gone |= {"mass_ng"}
+    joined = TraceSettings(**({name: value for name, value in found.items() if name not in gone} | stated))
+    mass, spring, frequency = joined.mass_ng, joined.spring_constant_n_per_m, joined.free_frequency_khz
+    if mass is not None and spring is not None and frequency is not None and faults.count == 0:
+        wrong = contradicting_mass(mass, spring, frequency)
+        if wrong is not None:
+            faults.add(wrong)
+    return joined
 
 
 def _checked(name: str, value: float, faults: Faults) -> float:

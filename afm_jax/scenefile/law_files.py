@@ -1,0 +1,232 @@
+"""Files that hold an impact law: a fit's, a contact's, or a table of speeds that somebody measured.
+
+Three kinds, told apart by what is in them: the fit.json of a fit's report, the JSON that `save_law` writes, and a CSV
+with a column of approach speeds, one of rebound speeds, and maybe one of delays, their units in their names:
+
+    # mass_ng = 1.2
+    # origin = laser and lamp, March
+    approach_speed_nm_per_us, rebound_speed_nm_per_us, rebound_speed_error_nm_per_us
+    12.5, 5.9, 0.1
+"""
+
+import csv
+import json
+import math
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NoReturn
+
+import numpy as np
+
+from afm_jax.checks import checked
+from afm_jax.impact.law import TabulatedLaw, law_of_dict
+from afm_jax.scenefile.tables import SceneError, printable
+from afm_jax.strict_json import strict_json
+from afm_jax.whole_files import read_whole, write_whole
+
+FORMAT, FORMAT_VERSION = "afm-jax law", 1
+_SPEED_UNITS = {"nm_per_us": 1.0, "um_per_s": 1e-3, "mm_per_s": 1.0, "m_per_s": 1e3}
+_TIME_UNITS = {"us": 1.0, "ns": 1e-3, "ms": 1e3, "s": 1e6}
+_COLUMNS = {"approach_speed": _SPEED_UNITS, "rebound_speed": _SPEED_UNITS, "rebound_speed_error": _SPEED_UNITS}
+_COLUMNS |= {"collision_delay": _TIME_UNITS, "collision_delay_error": _TIME_UNITS}
+_BANDS = ("rebound_low", "rebound_high", "delay_low", "delay_high")
+"""Columns of a fit's law.csv besides: its band, of which a table alone cannot draw."""
+_NUMBERS = ("mass_ng", "spring_constant_n_per_m", "frequency_khz", "capture_speed_nm_per_us")
+
+
+@checked
+def load_law(path: str | os.PathLike[str]) -> TabulatedLaw:
+    """Read an impact law from a file: a fit's fit.json or law.csv, what `collide --make-law` wrote, or a measured CSV.
+
+    Args:
+        path: the file.
+
+    Raises:
+        ValueError: if it cannot be read, is none of these, or its speeds are no law; one line.
+    """
+    name = printable(os.fspath(path))
+    try:
+        text = read_whole(path).decode("utf-8-sig")
+    except FileNotFoundError as error:
+        raise SceneError(f"{name}: there is no such file") from error
+    except OSError as error:
+        raise SceneError(f"{name}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise SceneError(f"{name}: is not UTF-8 text") from error
+    try:
+        return _of_json(text) if text.lstrip().startswith("{") else _of_csv(text)
+    except ValueError as error:
+        raise SceneError(f"{name}: {error}") from error
+
+
+@checked
+def save_law(law: TabulatedLaw, path: str | os.PathLike[str]) -> None:
+    """Write a law to a JSON file from which `load_law` returns an equal one, errors included.
+
+    Raises:
+        OSError: if the file cannot be written.
+    """
+    write_whole(path, strict_json({"format": FORMAT, "format_version": FORMAT_VERSION, **law.to_dict()}) + "\n")
+
+
+def _of_json(text: str) -> TabulatedLaw:
+    try:
+        found = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"is no JSON: {error}") from error
+    kind = found.get("format")
+    if kind == FORMAT:
+        if found.get("format_version") != FORMAT_VERSION:
+            raise ValueError(
+                f"has format_version {found.get('format_version')}, but {FORMAT_VERSION} is known here; write it anew "
+                "with `afm-jax collide --make-law --out DIR`"
+            )
+        return law_of_dict(found)
+    if kind != "afm-jax fit":
+        raise ValueError("holds no law: give a fit.json of `afm-jax fit --out`, a law.json or a CSV of speeds")
+    if not found.get("valid"):
+        raise ValueError("the fit is not valid, so that its law means nothing; give a valid one")
+    return _of_fit(found)
+
+
+def _of_fit(found: Mapping[str, Any]) -> TabulatedLaw:
+    """Return the law of a fit: with its errors where they are told, else its columns."""
+    law = found.get("law")
+    if not isinstance(law, Mapping):
+        _fail("is a fit without a law; fit again with `afm-jax fit TABLE --out DIR`")
+    if isinstance(law.get("numbers"), Mapping):
+        return law_of_dict(law)
+    raise ValueError(
+        "is a fit of an earlier version, whose law cannot be used; fit again with `afm-jax fit TABLE --out DIR`"
+    )
+
+
+def _of_csv(text: str) -> TabulatedLaw:
+    settings: dict[str, str] = {}
+    lines = []
+    for number, line in enumerate(text.splitlines(), 1):
+        if line.lstrip().startswith("#"):
+            key, equals, value = line.lstrip(" #\t").partition("=")
+            if equals:
+                settings[key.strip()] = value.strip()
+        elif line.strip():
+            lines.append((number, line))
+    if not lines:
+        raise ValueError("is empty: a law needs a column of approach speeds and one of rebound speeds")
+    delimiter = next((mark for mark in (",", ";", "\t") if mark in lines[0][1]), ",")
+    names = [cell.strip() for cell in next(csv.reader([lines[0][1]], delimiter=delimiter))]
+    columns = _columns_of(names)
+    values: dict[str, list[float]] = {kind: [] for kind, _, _ in columns}
+    for number, line in lines[1:]:
+        cells = next(csv.reader([line], delimiter=delimiter))
+        if len(cells) != len(names):
+            raise ValueError(f"line {number} has {len(cells)} values for {len(names)} columns")
+        for kind, place, unit in columns:
+            values[kind].append(_number(cells[place], names[place], number) * unit)
+    numbers = {key: _setting(key, settings[key]) for key in _NUMBERS if key in settings}
+    return _law_of_columns({kind: np.array(column) for kind, column in values.items()}, numbers, settings)
+
+
+def _law_of_columns(
+    values: Mapping[str, np.ndarray], numbers: Mapping[str, float], settings: Mapping[str, str]
+) -> TabulatedLaw:
+    mass = numbers.get("mass_ng")
+    if mass is None and "spring_constant_n_per_m" in numbers:
+        if "frequency_khz" not in numbers:
+            raise ValueError(
+                "`spring_constant_n_per_m` tells a mass with `# frequency_khz = ` only: add it, or mass_ng"
+            )
+        # N/m over (rad/us)^2 is 1e-12 kg = ng
+        mass = numbers["spring_constant_n_per_m"] / (2e-3 * math.pi * numbers["frequency_khz"]) ** 2
+    delay = values.get("collision_delay")
+    # how a fit of instantaneous impacts writes its law
+    delay = None if delay is not None and not delay.any() else delay
+    columns = values["approach_speed"], values["rebound_speed"], delay
+    options = {
+        "mass_ng": mass,
+        "origin": settings.get("origin", ""),
+        "capture_speed_nm_per_us": numbers.get("capture_speed_nm_per_us"),
+    }
+    errors = [values.get(f"{kind}_error") for kind in ("rebound_speed", "collision_delay")]
+    for column in errors:
+        if column is not None and not (np.isfinite(column).all() and (column >= 0.0).all()):
+            raise ValueError("errors must be finite and not negative")
+    if all(column is None for column in errors):
+        return TabulatedLaw(*columns, **options)
+    rows = len(columns[0])
+    of_rebound, of_delay = (np.zeros(rows) if column is None else column for column in errors)
+    # every reading has its own error
+    none = np.zeros((rows, rows))
+    return TabulatedLaw.with_errors(
+        *columns,
+        rebound_changes=np.concatenate([np.diag(of_rebound), none]),
+        delay_changes=None if columns[2] is None else np.concatenate([none, np.diag(of_delay)]),
+        **options,
+    )
+
+
+def _columns_of(names: list[str]) -> list[tuple[str, int, float]]:
+    """Return kind, place and unit of the columns that a law's table has."""
+    found: dict[str, tuple[str, int, float]] = {}
+    units: dict[str, str] = {}
+    for place, name in enumerate(names):
+        kind, unit = _kind_of(name)
+        if kind is None:
+            continue
+        if kind in found:
+            raise ValueError(f"has two columns of {kind}: {names[found[kind][1]]} and {name}")
+        found[kind], units[kind] = (kind, place, _COLUMNS[kind][unit]), unit
+    missing = [kind for kind in ("approach_speed", "rebound_speed") if kind not in found]
+    if missing:
+        raise ValueError(f"has no column {missing[0]}_nm_per_us; it has {', '.join(names)}")
+    speeds = {kind: unit for kind, unit in units.items() if _COLUMNS[kind] is _SPEED_UNITS}
+    if len(set(speeds.values())) > 1:
+        told = " and ".join(f"{kind} in {unit}" for kind, unit in speeds.items())
+        raise ValueError(f"has speeds in mixed units, {told}: write all in one")
+    return list(found.values())
+
+
+def _kind_of(name: str) -> tuple[str | None, str]:
+    """Return what a column is, None if it is nothing of a law, and its unit."""
+    for kind, units in _COLUMNS.items():
+        unit = name.removeprefix(f"{kind}_")
+        if unit in units and unit != name:
+            return kind, unit
+    if any(name == kind for kind in _COLUMNS):
+        usual = "nm_per_us" if _COLUMNS[name] is _SPEED_UNITS else "us"
+        raise ValueError(f"column {name}: the unit is missing; use {name}_{usual}")
+    known = re.match(r"(approach|rebound)_speed(_error)?_|collision_delay(_error)?_", name)
+    if known:
+        units = _SPEED_UNITS if "speed" in name else _TIME_UNITS
+        raise ValueError(f"column {printable(name)}: the unit is not known; use one of {', '.join(units)}")
+    if name.startswith(_BANDS):
+        return None, ""
+    raise ValueError(f"column {printable(name)} is none of a law's; it has {', '.join(_COLUMNS)}, each with its unit")
+
+
+def _number(cell: str, name: str, line: int) -> float:
+    try:
+        return float(cell)
+    except ValueError:
+        _fail(f"line {line}: `{name}` must be a number, but is {cell.strip()!r}")
+
+
+def _setting(key: str, text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        _fail(f"`# {key}` must be a number, but is {text!r}")
+    if not (math.isfinite(value) and value >= 0.0):
+        _fail(f"`# {key}` must be finite and not negative, but is {text}")
+    return value
+
+
+def _fail(message: str) -> NoReturn:
+    raise ValueError(message)
+
+
+def law_beside(scene_file: str, given: str) -> TabulatedLaw:
+    """Return the law of a file that a scene file names, its path relative to the scene file's folder."""
+    return load_law(Path(scene_file).parent / given)

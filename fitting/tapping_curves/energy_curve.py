@@ -1,0 +1,199 @@
+"""Energy and virial of a tap as functions of the amplitude, branch by branch, with their 95 % bands."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from fitting.tapping_curves.curve import Rows, TappingCurve
+from fitting.tapping_curves.energy_fit import Z95, EnergyFit, depths, smoother_along, virial_noise
+
+FEWEST_ROWS = 3
+"""Of a group of rows that gets an energy of its own."""
+_MOST_POINTS = 81
+HEADLINE = (0.95, 0.9, 0.8, 0.7, 0.5)
+"""Amplitudes, of the free one, at which a reader is told the energy."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EnergyCurve:
+    """Energy and virial along a branch, in the order of the amplitude; bands hold the truth in 95 of 100 places.
+
+    Attributes:
+        amplitude_ratio: amplitude read over the free one.
+        height_nm: of the sample.
+        energy_aj: of a tap, the mean over a period of the drive.
+        energy_error_aj: its standard error, everything in it.
+        virial_aj: mean of force times height, positive where attraction prevails.
+        virial_error_aj: its standard error.
+        energy_by_instrument: change of the energy by every unknown of the fit, in its unit, shape (points, unknowns).
+        energy_noise_aj: the part of the standard error that is the branch's own.
+    """
+
+    amplitude_ratio: Float[np.ndarray, " points"]
+    height_nm: Float[np.ndarray, " points"]
+    energy_aj: Float[np.ndarray, " points"]
+    energy_error_aj: Float[np.ndarray, " points"]
+    virial_aj: Float[np.ndarray, " points"]
+    virial_error_aj: Float[np.ndarray, " points"]
+    energy_by_instrument: Float[np.ndarray, "points unknowns"]
+    energy_noise_aj: Float[np.ndarray, " points"]
+
+    def at(self, ratio: float) -> tuple[float, float] | None:
+        """Return energy and standard error at an amplitude, of the free one; None beyond the branch."""
+        if not self.amplitude_ratio[0] <= ratio <= self.amplitude_ratio[-1]:
+            return None
+        columns = (self.energy_aj, self.energy_error_aj)
+        energy, error = (float(np.interp(ratio, self.amplitude_ratio, column)) for column in columns)
+        return energy, error
+
+    def to_dict(self) -> dict[str, np.ndarray]:
+        """Return amplitude ratio, height, energy and virial with their bands."""
+        return {
+            "amplitude_ratio": self.amplitude_ratio,
+            "height_nm": self.height_nm,
+            "energy_aj": self.energy_aj,
+            "energy_low_aj": self.energy_aj - Z95 * self.energy_error_aj,
+            "energy_high_aj": self.energy_aj + Z95 * self.energy_error_aj,
+            "virial_aj": self.virial_aj,
+            "virial_low_aj": self.virial_aj - Z95 * self.virial_error_aj,
+            "virial_high_aj": self.virial_aj + Z95 * self.virial_error_aj,
+        }
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TappingBranch:
+    """Rows of one drive, one way and one side of the phase, and the energy along them.
+
+    Attributes:
+        drive_frequency_khz: of the rows.
+        free_amplitude_nm: of the rows.
+        retract: whether the sample moves away.
+        repulsive: whether the lag is below the free tip's.
+        rows: numbers of the rows.
+        curve: energy and virial along them.
+    """
+
+    drive_frequency_khz: float
+    free_amplitude_nm: float
+    retract: bool
+    repulsive: bool
+    rows: Int[np.ndarray, " some"]
+    curve: EnergyCurve
+
+    @property
+    def way(self) -> str:
+        """Which way the sample moves."""
+        return "retract" if self.retract else "approach"
+
+
+def branches_of(
+    curve: TappingCurve, fit: EnergyFit, repulsive: Bool[np.ndarray, " rows"], free: Bool[np.ndarray, " rows"]
+) -> tuple[TappingBranch, ...]:
+    """Return the branches that the functions of a fit run along."""
+    place = depths(curve, free)
+    found = []
+    for number, rows in enumerate(fit.rows):
+        for state in (False, True):
+            here = rows[repulsive[rows] == state]
+            if len(here) >= FEWEST_ROWS:
+                found.append(
+                    TappingBranch(
+                        drive_frequency_khz=float(curve.drive_frequency_khz[here[0]]),
+                        free_amplitude_nm=float(curve.free_amplitude_nm[here[0]]),
+                        retract=bool(curve.retract[here[0]]),
+                        repulsive=state,
+                        rows=here,
+                        curve=_curve(curve, fit, number, here, place),
+                    )
+                )
+    return tuple(sorted(found, key=lambda b: (b.drive_frequency_khz, b.free_amplitude_nm, b.retract, b.repulsive)))
+
+
+def _curve(
+    curve: TappingCurve, fit: EnergyFit, number: int, here: Int[np.ndarray, " some"], place: Rows
+) -> EnergyCurve:
+    """Return the functions of a fit along some of their rows."""
+    rows = fit.rows[number]
+    ends = curve.offset_nm[here]
+    height = np.linspace(ends.min(), ends.max(), min(max(len(here), FEWEST_ROWS), _MOST_POINTS))
+    _, first = np.unique(curve.offset_nm[rows], return_index=True)
+    at = np.interp(height, curve.offset_nm[rows][first], place[rows][first])
+    energy, own, slopes = fit.function(number, at)
+    factor = np.broadcast_to(fit.instrument.free_amplitude_factor, (curve.rows,))[rows]
+    read = curve.amplitude_nm[rows] / (curve.free_amplitude_nm[rows] * factor)
+    read_noise = fit.scale * curve.amplitude_error_nm[rows] / curve.free_amplitude_nm[rows]
+    smoother = smoother_along(place[rows], read, read_noise, 0.3)
+    weights, ratio_variance = smoother.at(at)
+    ratio = weights @ (smoother.bins.averages @ read)
+    # an energy at a height is one at an amplitude that is known no better than it was read
+    fall = np.gradient(energy, ratio) if len(ratio) > 2 and np.all(np.diff(ratio) != 0.0) else np.zeros(len(ratio))
+    energy_error = np.hypot(fit.error(energy, own, slopes), np.abs(fall) * np.sqrt(ratio_variance))
+    read, noise = fit.energies_at.virial_aj[rows], virial_noise(curve, fit)[rows]
+    smoother = smoother_along(place[rows], read, noise, max(float(np.ptp(read)), float(noise.mean())))
+    weights, virial_own = smoother.at(at)
+    virial = weights @ (smoother.bins.averages @ read)
+    virial_slopes = weights @ (smoother.bins.averages @ fit.virial_slopes[rows])
+    order = np.argsort(ratio, kind="stable")
+    return EnergyCurve(
+        amplitude_ratio=ratio[order],
+        height_nm=height[order],
+        energy_aj=energy[order],
+        energy_error_aj=energy_error[order],
+        virial_aj=virial[order],
+        virial_error_aj=fit.error(virial, virial_own, virial_slopes)[order],
+        energy_by_instrument=slopes[order],
+        energy_noise_aj=np.sqrt(own)[order],
+    )
+
+
+@dataclass(frozen=True)
+class WayDifference:
+    """Retract less approach at the same amplitude and on the same side of the phase.
+
+    Attributes:
+        amplitude_ratio: where they differ most, in errors.
+        energy_aj: by how much there.
+        standard_error: its error; what both have in common cancels.
+    """
+
+    amplitude_ratio: float
+    energy_aj: float
+    standard_error: float
+
+
+def differences_of_ways(branches: tuple[TappingBranch, ...], fit: EnergyFit) -> dict[tuple[int, int], WayDifference]:
+    """Return by how much retract differs from approach, by the numbers of the two branches."""
+    found = {}
+    for i, one in enumerate(branches):
+        for j, other in enumerate(branches):
+            same = (one.drive_frequency_khz, one.free_amplitude_nm, one.repulsive) == (
+                other.drive_frequency_khz,
+                other.free_amplitude_nm,
+                other.repulsive,
+            )
+            if one.retract or not other.retract or not same:
+                continue
+            a, b = one.curve, other.curve
+            low, high = (
+                max(a.amplitude_ratio[0], b.amplitude_ratio[0]),
+                min(a.amplitude_ratio[-1], b.amplitude_ratio[-1]),
+            )
+            ratio = np.linspace(low, high, 41)
+            if not low < high:
+                continue
+
+            def of(curve: EnergyCurve, column: np.ndarray, ratio: np.ndarray = ratio) -> np.ndarray:
+                return np.interp(ratio, curve.amplitude_ratio, column)
+
+            slopes = np.stack(
+                [of(b, y) - of(a, x) for x, y in zip(a.energy_by_instrument.T, b.energy_by_instrument.T, strict=True)]
+                or [np.zeros(0)],
+                axis=-1,
+            )
+            off = of(b, b.energy_aj) - of(a, a.energy_aj)
+            own = of(a, a.energy_noise_aj) ** 2 + of(b, b.energy_noise_aj) ** 2 + (fit.share * off) ** 2
+            error = np.sqrt(own + (fit.by_instrument(slopes) if len(slopes) == len(ratio) else 0.0))
+            most = int(np.argmax(np.abs(off) / error))
+            found[i, j] = WayDifference(float(ratio[most]), float(off[most]), float(error[most]))
+    return found

@@ -1,0 +1,765 @@
+"""The energy of a tap as a smooth function along each branch, or as a constant, jointly with the instrument.
+
+Near resonance the energy of a single row hangs on f0 and Q far beyond their errors (10 Hz of 90 kHz at Q = 200 turn the
+phase by 2.5 degrees), but a wrong f0 bends the energy along the whole curve. Each branch has a function, a constant
+plus a Gaussian process (Matern 5/2) over the logarithm of the depth below the first contact, for energies change
+fastest there, and readings are energies(instrument) = function + noise of the
+row. Linear in small changes of the instrument, that is generalised least squares: function and instrument are
+determined together, and the band of the function holds what the instrument leaves open. A process of no size leaves
+the constant, one energy for all rows.
+"""
+
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from afm_jax.least_squares import IMPROBABLE, chi2_tail
+from fitting.tapping_curves.branches import free_ends, repulsive_rows, smooth_stretches, ways
+from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, Rows, TappingCurve, free_lag_deg
+from fitting.tapping_curves.energy import Energies, energies, noise_of, virial_noise_of
+
+_FAR = 4.0
+"""Residual in standard errors from which a row is excluded."""
+_MOST_OUTLIERS = 0.2
+_HARMONICS_THAT_TELL = 4
+"""With as many measured, what is left of the others does not matter."""
+Z95 = 1.959964
+TORN = 3.0
+"""Distance of a nuisance from what is given, in its standard errors, from which neither is believed."""
+_DRIFT_DEG, _DRIFT = 1.0, 0.01
+"""Usual drift of phase and of free amplitude over a table, where free rows do not determine it."""
+_WIDE_DRIFT_DEG, _WIDE_DRIFT = 30.0, 0.3
+"""Likewise where free rows at both ends determine it."""
+_MOST_BINS = 100
+"""Rows of a function beyond which neighbours are averaged."""
+_SIZES = tuple(0.005 * 2.0**k for k in range(7))
+"""Sizes of the process that are tried, of pi k A0^2 s/Q, what the air takes of the free tip in a period."""
+_USUAL_SIZE, _LOG_SIZE = 0.03, 1.0
+"""Measured curves of graphite: 4 aJ of 108; spread of the logarithm."""
+_LENGTHS = (0.3, 0.5, 0.8, 1.3)
+"""Lengths of the process that are tried, in the logarithm of the depth."""
+_USUAL_LENGTH, _LOG_LENGTH = 0.7, 0.5
+_SHALLOW = 0.03
+"""Depth, of the free amplitude, that is added to all: there the length in nm is that at contact."""
+_LEAST_SIZE = 0.3
+"""Least size of the process, of the largest energy: a constant that fits does not narrow a band."""
+_ROUNDS = 30
+_SHORTEST = 1e-3
+"""Fraction of a step below which the search stays as it is."""
+_RISE = 0.1
+"""By which a step may raise chi2: slopes are taken at smooth readings, not at those that chi2 is of."""
+_SETTLED = 1e-3
+"""Change of the unknowns in their standard errors from which the search has settled."""
+
+
+class Nuisance(NamedTuple):
+    """Something of the instrument that is fitted along.
+
+    Attributes:
+        name: its key, with a number where each drive has its own.
+        kind: its key without the number.
+        given: what is known of it, the unit that of the key; an error of infinity: nothing.
+        value: fitted.
+        standard_error: after the fit.
+    """
+
+    name: str
+    kind: str
+    given: Given
+    value: float
+    standard_error: float
+
+    @property
+    def pull(self) -> float:
+        """Distance of the value from what was given, in the error given."""
+        return (self.value - self.given.value) / self.given.error
+
+
+class _Unknown(NamedTuple):
+    """A nuisance: which rows it moves, what is known of it, and the unit it is counted in."""
+
+    name: str
+    kind: str
+    rows: Bool[np.ndarray, " rows"]
+    given: Given
+
+    @property
+    def unit(self) -> float:
+        return self.given.error if np.isfinite(self.given.error) else 1.0
+
+
+class Process(NamedTuple):
+    """Standard deviation of a Gaussian process, and its length."""
+
+    size: float
+    length: float
+
+    def covariance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """Return the Matern 5/2 covariance between two sets of places."""
+        distance = np.sqrt(5.0) * np.abs(a[:, None] - b[None, :]) / self.length
+        return self.size**2 * (1.0 + distance + distance**2 / 3.0) * np.exp(-distance)
+
+
+class Bins(NamedTuple):
+    """Rows of a function, neighbours averaged: places, what their average is of, and its variance."""
+
+    place: Float[np.ndarray, " bins"]
+    averages: Float[np.ndarray, "bins rows"]
+    variance: Float[np.ndarray, " bins"]
+
+    @classmethod
+    def of(cls, place: np.ndarray, noise: np.ndarray, most: int = _MOST_BINS) -> "Bins":
+        """Return bins of rows that stand in the order of their places."""
+        count = min(len(place), most)
+        number = np.arange(len(place)) * count // len(place)
+        weights = (number == np.arange(count)[:, None]) * noise**-2.0
+        total = weights.sum(axis=1, keepdims=True)
+        return cls(weights @ place / total[:, 0], weights / total, 1.0 / total[:, 0])
+
+
+class Smoother(NamedTuple):
+    """A constant and a process given binned readings: what a reading of a bin contributes anywhere."""
+
+    bins: Bins
+    process: Process
+    inverse: Float[np.ndarray, "bins bins"]
+    root: Float[np.ndarray, "bins bins"]
+    log_determinant: float
+
+    @classmethod
+    def of(cls, bins: Bins, process: Process) -> "Smoother":
+        """Return the smoother of some bins."""
+        covariance = np.diag(bins.variance)
+        if process.size > 0.0:
+            covariance += process.covariance(bins.place, bins.place)
+        factor = np.linalg.cholesky(covariance)
+        root = np.linalg.solve(factor, np.eye(len(bins.variance)))
+        ones = root.sum(axis=1)
+        # the constant is not known beforehand: what lies along it tells nothing
+        log_determinant = 2.0 * np.log(np.diag(factor)).sum() + np.log(ones @ ones)
+        return cls(bins, process, root.T @ root, root - np.outer(ones, ones @ root) / (ones @ ones), log_determinant)
+
+    def at(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return at some places the weights of the bins, shape (places, bins), and the variance besides."""
+        ones = self.inverse.sum(axis=1)
+        total = ones.sum()
+        if self.process.size == 0.0:
+            return np.tile(ones / total, (len(place), 1)), np.full(len(place), 1.0 / total)
+        cross = self.process.covariance(place, self.bins.place)
+        left = 1.0 - cross @ ones
+        weights = cross @ self.inverse + np.outer(left, ones / total)
+        variance = self.process.size**2 - np.sum((cross @ self.inverse) * cross, axis=1) + left**2 / total
+        return weights, np.maximum(variance, 0.0)
+
+
+@dataclass(frozen=True, kw_only=True)
+class EnergyFit:
+    """Functions of the height, or constants, fitted jointly with the instrument.
+
+    Attributes:
+        rows: of each function, in the order of their heights.
+        smoothers: of the energy of each function.
+        energies_at: of every row, with the instrument as fitted.
+        slopes: change of each row's energy by every unknown's unit, shape (rows, unknowns).
+        virial_slopes: likewise of its virial.
+        covariance: of the unknowns, in their units.
+        known: which unknowns have a finite error beforehand.
+        nuisances: of the instrument.
+        instrument: at the minimum.
+        used: rows that were fitted.
+        outliers: rows too far from the others.
+        residual: of the rows fitted, in standard errors; NaN elsewhere.
+        chi2: of rows, free rows and what is known beforehand.
+        degrees_of_freedom: of it.
+        rows_chi2: of the rows alone.
+        rows_freedom: of it, less what their functions take.
+        scale: what the rows' own errors were multiplied by.
+        relative_error: of every energy, by spring constant and calibration, by name.
+    """
+
+    rows: tuple[np.ndarray, ...]
+    smoothers: tuple[Smoother, ...]
+    energies_at: Energies
+    slopes: Float[np.ndarray, "rows unknowns"]
+    virial_slopes: Float[np.ndarray, "rows unknowns"]
+    covariance: Float[np.ndarray, "unknowns unknowns"]
+    known: Bool[np.ndarray, " unknowns"]
+    nuisances: tuple[Nuisance, ...]
+    instrument: Instrument
+    used: Bool[np.ndarray, " rows"]
+    outliers: Bool[np.ndarray, " rows"]
+    residual: Rows
+    chi2: float
+    degrees_of_freedom: int
+    rows_chi2: float
+    rows_freedom: float
+    scale: float
+    relative_error: dict[str, float]
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a larger chi2 if the model is right."""
+        if self.degrees_of_freedom < 1:
+            return float("nan")
+        return chi2_tail(self.chi2, self.degrees_of_freedom)
+
+    @property
+    def share(self) -> float:
+        """Relative error that all energies have in common, from spring constant and calibration."""
+        return float(np.linalg.norm(list(self.relative_error.values())))
+
+    @property
+    def torn(self) -> list[Nuisance]:
+        """Nuisances that had to go beyond three of their errors."""
+        return [one for one in self.nuisances if abs(one.pull) > TORN]
+
+    def function(self, number: int, place: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return a function's energy at some places in aJ, its own variance, and its change by every unknown."""
+        smoother, rows = self.smoothers[number], self.rows[number]
+        weights, variance = smoother.at(place)
+        averages = smoother.bins.averages
+        energy = weights @ (averages @ self.energies_at.energy_aj[rows])
+        return energy, variance, weights @ (averages @ self.slopes[rows])
+
+    def error(self, energy: np.ndarray, variance: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+        """Return the standard error of what `function` gives, that of spring constant and calibration included."""
+        return np.sqrt(variance + self.by_instrument(slopes) + (self.share * energy) ** 2)
+
+    def by_instrument(self, slopes: np.ndarray) -> np.ndarray:
+        """Return the variance that the instrument leaves in what changes by it with some slopes."""
+        return np.einsum("nu,uv,nv->n", slopes, self.covariance, slopes)
+
+    def budget(self, number: int) -> dict[str, float]:
+        """Return what the variance of a constant comes from, in aJ^2."""
+        energy, variance, slopes = self.function(number, np.zeros(1))
+        parts: dict[str, float] = {}
+        moved = (slopes[0] @ self.covariance) ** 2 * self.known
+        for one, part in zip(self.nuisances, moved.tolist(), strict=True):
+            parts[one.kind] = parts.get(one.kind, 0.0) + part
+        noise = float(variance[0] + self.by_instrument(slopes)[0] - sum(parts.values()))
+        relative = {name: (share * float(energy[0])) ** 2 for name, share in self.relative_error.items()}
+        return {"noise": max(noise, 0.0)} | parts | relative
+
+
+def depths(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> Rows:
+    """Return the logarithm of each row's depth below the contact of its way, in free amplitudes.
+
+    Contact is at the last free row, or as far before the first row in contact as the next one is behind it.
+    """
+    place = np.zeros(curve.rows)
+    for part in ways(curve):
+        before, touching = curve.offset_nm[part[free[part]]], curve.offset_nm[part[~free[part]]]
+        contact = curve.offset_nm[part[0]] if not len(before) else before.max()
+        if len(touching):
+            contact = max(contact, 2.0 * touching[0] - touching[min(1, len(touching) - 1)])
+        depth = (curve.offset_nm[part] - contact) / curve.free_amplitude_nm[part]
+        place[part] = np.log(_SHALLOW + np.maximum(depth, 0.0))
+    return place
+
+
+def turned(degrees: Rows) -> Rows:
+    """Return angles between -180 and 180 degrees."""
+    return (degrees + 180.0) % 360.0 - 180.0
+
+
+def plain_instrument(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> Instrument:
+    """Return the instrument as it is given; the free rows tell the zero of phase of each frequency, and drifts."""
+    given = Instrument(curve.free_frequency_khz.value, curve.quality_factor.value)
+    zero = np.full(curve.rows, 0.0 if curve.phase_zero_deg is None else curve.phase_zero_deg.value)
+    factor = np.ones(curve.rows)
+    departure = turned(curve.lag_deg - free_lag_deg(curve, given))
+    known = free & np.isfinite(departure)
+    if curve.time is not None and free_ends(curve, free):
+        share = curve.amplitude_nm / curve.free_amplitude_nm
+        factor += np.polyval(np.polyfit(curve.time[free], share[free], 1), curve.time) - 1.0
+        if known.any():
+            middle = departure[known][0]
+            slope = np.polyfit(curve.time[known], turned(departure[known] - middle), 1)[0]
+            departure, zero = departure - slope * curve.time, zero + slope * curve.time
+    for frequency in np.unique(curve.drive_frequency_khz):
+        here = curve.drive_frequency_khz == frequency
+        chosen = here & known
+        if chosen.any():
+            middle = departure[chosen][0]
+            mean = np.average(turned(departure[chosen] - middle), weights=curve.lag_error_deg[chosen] ** -2.0)
+            zero[here] += middle + mean - (0.0 if curve.phase_zero_deg is None else curve.phase_zero_deg.value)
+    return given._replace(phase_zero_deg=zero, free_amplitude_factor=factor)
+
+
+def fit_energy(
+    curve: TappingCurve,
+    groups: list[np.ndarray],
+    free: Bool[np.ndarray, " rows"],
+    *,
+    smooth: bool,
+    scale_errors: bool = False,
+) -> EnergyFit:
+    """Return an energy for each group of rows, a smooth function of the height or a constant, with the instrument free.
+
+    Args:
+        curve: the curve, with a phase.
+        groups: the rows of each function or constant.
+        free: the rows of the free tip.
+        smooth: whether the energy may change with the height.
+        scale_errors: multiply the rows' own errors such that chi2 is as large as its degrees of freedom, if larger.
+    """
+    groups = [rows[np.argsort(curve.offset_nm[rows], kind="stable")] for rows in groups]
+    touching = np.isin(np.arange(curve.rows), np.concatenate(groups))
+    search = _EnergySearch(curve, free, _unknowns(curve, free), touching, smooth=smooth)
+    found = search.fitted(groups, 1.0)
+    far = np.abs(found.residual) > _FAR * (max(1.0, _scale(found)) if smooth else 1.0)
+    if 0 < far.sum() <= _MOST_OUTLIERS * found.used.sum():
+        kept = [rows[~far[rows]] for rows in groups]
+        if all(len(rows) for rows in kept):
+            found = replace(search.fitted(kept, 1.0), outliers=far)
+            groups = kept
+    if not smooth and not scale_errors:
+        return found
+    scale = _scale(found) if smooth else float(np.sqrt(found.chi2 / max(found.degrees_of_freedom, 1)))
+    return replace(search.fitted(groups, scale), outliers=found.outliers) if scale > 1.0 else found
+
+
+def _scale(found: EnergyFit) -> float:
+    """Return by how much the rows scatter more about their functions than their errors say, 1 where chance does it."""
+    freedom = max(found.rows_freedom, 1.0)
+    probable = chi2_tail(found.rows_chi2, max(round(freedom), 1)) > IMPROBABLE
+    return 1.0 if probable else float(np.sqrt(found.rows_chi2 / freedom))
+
+
+def _unknowns(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> list[_Unknown]:
+    every = np.ones(curve.rows, bool)
+    found = [
+        _Unknown(name, name, every, given)
+        for name, given in (
+            ("free_frequency_khz", curve.free_frequency_khz),
+            ("quality_factor", curve.quality_factor),
+        )
+        if given.error > 0.0
+    ]
+    start = np.broadcast_to(plain_instrument(curve, free).phase_zero_deg, (curve.rows,))
+    for i, frequency in enumerate(np.unique(curve.drive_frequency_khz).tolist()):
+        here = curve.drive_frequency_khz == frequency
+        known = curve.phase_zero_deg or Given(float(np.mean(start[here])), np.inf)
+        if known.error > 0.0:
+            found.append(_Unknown(f"phase_zero_deg_{i}", "phase_zero_deg", here, known))
+    if len(curve.harmonic_amplitudes_nm) < _HARMONICS_THAT_TELL:
+        found.append(_Unknown("harmonics_factor", "harmonics_factor", every, HARMONICS_FACTOR))
+    if curve.free_amplitude_error > 0.0:
+        for i, here in enumerate(_levels(curve)):
+            found.append(
+                _Unknown(f"free_amplitude_{i}", "free_amplitude", here, Given(1.0, curve.free_amplitude_error))
+            )
+    if curve.time is not None:
+        phase, amplitude = (_WIDE_DRIFT_DEG, _WIDE_DRIFT) if free_ends(curve, free) else (_DRIFT_DEG, _DRIFT)
+        found.append(_Unknown("phase_drift_deg", "phase_drift_deg", every, Given(0.0, phase)))
+        found.append(_Unknown("free_amplitude_drift", "free_amplitude_drift", every, Given(0.0, amplitude)))
+    return found
+
+
+def usual_drifts(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> tuple[float, float]:
+    """Return by how much phase (degrees) and free amplitude (a share) may have drifted after what free rows tell."""
+    if curve.time is None or not free_ends(curve, free):
+        return _DRIFT_DEG, _DRIFT
+    known = free & np.isfinite(curve.lag_error_deg)
+    spread = np.sqrt(np.sum((curve.time[known] - curve.time[known].mean()) ** 2)) if known.any() else np.inf
+    share = np.median(curve.amplitude_error_nm[free] / curve.free_amplitude_nm[free])
+    return float(np.median(curve.lag_error_deg[known]) / spread) if known.any() else _DRIFT_DEG, float(share / spread)
+
+
+def _levels(curve: TappingCurve) -> list[Bool[np.ndarray, " rows"]]:
+    keys = np.stack([curve.drive_frequency_khz, curve.free_amplitude_nm])
+    which = np.unique(keys, axis=1, return_inverse=True)[1].reshape(-1)
+    return [which == i for i in range(which.max(initial=-1) + 1)]
+
+
+class _EnergySlopes(NamedTuple):
+    """Changes by one unit of each unknown, shape (rows, unknowns): energy, virial, free tip's lag and amplitude."""
+
+    energy: np.ndarray
+    virial: np.ndarray
+    free_lag: np.ndarray
+    factor: np.ndarray
+
+
+@dataclass
+class _EnergySearch:
+    """The least squares: readings of a curve, unknowns of its instrument, functions of groups of rows."""
+
+    curve: TappingCurve
+    free: Bool[np.ndarray, " rows"]
+    unknowns: list[_Unknown]
+    touching: Bool[np.ndarray, " rows"]
+    smooth: bool
+
+    def __post_init__(self):
+        curve, free = self.curve, self.free
+        self.place = depths(curve, free)
+        self.smoothed = _smoothed_readings(curve, self.touching, self.place, free)
+        frequency = np.unique(curve.drive_frequency_khz, return_inverse=True)[1]
+        level = np.argmax(np.stack(_levels(curve)), axis=0) if curve.rows else frequency
+        share = curve.amplitude_nm / curve.free_amplitude_nm
+        self.lags = _means(curve, curve.lag_deg, curve.lag_error_deg, frequency, free, turning=True)
+        self.shares = _means(curve, share, curve.amplitude_error_nm / curve.free_amplitude_nm, level, free)
+
+    def instrument(self, x: np.ndarray) -> Instrument:
+        """Return the instrument at values of the unknowns, in their units from what is given."""
+        curve, parts = self.curve, {}
+        time = np.zeros(curve.rows) if curve.time is None else curve.time
+        zero = np.full(curve.rows, 0.0 if curve.phase_zero_deg is None else curve.phase_zero_deg.value)
+        factor = np.ones(curve.rows)
+        for one, value in zip(self.unknowns, self.values(x).tolist(), strict=True):
+            if one.kind == "phase_zero_deg":
+                zero = np.where(one.rows, zero * 0.0 + value, zero)
+            elif one.kind == "free_amplitude":
+                factor = np.where(one.rows, value, factor)
+            else:
+                parts[one.kind] = value
+        zero = zero + parts.pop("phase_drift_deg", 0.0) * time
+        factor = factor + parts.pop("free_amplitude_drift", 0.0) * time
+        given = Instrument(curve.free_frequency_khz.value, curve.quality_factor.value, zero, factor)
+        return given._replace(**parts)
+
+    def values(self, x: np.ndarray) -> np.ndarray:
+        """Return the unknowns in the units of their keys; Q stays positive."""
+        values = np.array([one.given.value for one in self.unknowns]) + x * np.array([u.unit for u in self.unknowns])
+        for i, one in enumerate(self.unknowns):
+            if one.kind == "quality_factor":
+                values[i] = one.given.value * np.exp(x[i] * one.unit / one.given.value)
+        return values
+
+    def _as_fitted(self, x: np.ndarray, groups: list, smoothers: list[Smoother], found: Energies) -> TappingCurve:
+        """Return the curve with the most probable readings whose energies are those of the functions.
+
+        Slopes are taken there: at readings with noise they hang on the noise of the same rows, and pull the instrument
+        to where all energies, noise included, are smaller.
+        """
+        curve = self.smoothed
+        start = energies(curve, self.instrument(x))
+        variance = noise_of(curve, start) ** 2
+        amplitude, lag = curve.amplitude_nm.copy(), curve.lag_deg.copy()
+        for rows, smoother in zip(groups, smoothers, strict=True):
+            weights, _ = smoother.at(self.place[rows])
+            off = weights @ (smoother.bins.averages @ found.energy_aj[rows]) - start.energy_aj[rows]
+            off /= variance[rows]
+            amplitude[rows] += off * start.amplitude_slope[rows] * curve.amplitude_error_nm[rows] ** 2
+            lag[rows] += off * start.lag_slope[rows] * curve.lag_error_deg[rows] ** 2
+        return replace(curve, amplitude_nm=amplitude, lag_deg=lag)
+
+    def slopes(self, x: np.ndarray, curve: TappingCurve) -> _EnergySlopes:
+        """Return the changes by every unknown at some readings."""
+        at = self.instrument(x)
+        time = np.zeros(curve.rows) if curve.time is None else curve.time
+        steps = {
+            "free_frequency_khz": 1e-4 * at.free_frequency_khz / at.quality_factor,
+            "quality_factor": 1e-4 * at.quality_factor,
+            "phase_zero_deg": 1e-3,
+            "harmonics_factor": 1e-3,
+            "free_amplitude_factor": 1e-5,
+        }
+
+        def by(field: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            ends = [at._replace(**{field: getattr(at, field) + sign * steps[field]}) for sign in (1.0, -1.0)]
+            (up, down), lags = [energies(curve, end) for end in ends], [free_lag_deg(curve, end) for end in ends]
+            twice = 2.0 * steps[field]
+            return (
+                (up.energy_aj - down.energy_aj) / twice,
+                (up.virial_aj - down.virial_aj) / twice,
+                turned(lags[0] - lags[1]) / twice,
+            )
+
+        fields = {"phase_drift_deg": "phase_zero_deg", "free_amplitude_drift": "free_amplitude_factor"}
+        fields |= {"free_amplitude": "free_amplitude_factor"}
+        known: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
+        columns: list[list[np.ndarray]] = [[], [], [], []]
+        for i, one in enumerate(self.unknowns):
+            field = fields.get(one.kind, one.kind)
+            if field not in known:
+                known[field] = by(field)
+            # the logarithm of Q is what moves
+            unit = one.unit * (self.values(x)[i] / one.given.value if one.kind == "quality_factor" else 1.0)
+            here = unit * one.rows * (time if one.kind.endswith(("drift", "drift_deg")) else 1.0)
+            for column, part in zip(columns, known[field], strict=False):
+                column.append(part * here)
+            columns[3].append(here if field == "free_amplitude_factor" else np.zeros(curve.rows))
+        shape = (curve.rows, 0)
+        return _EnergySlopes(*(np.stack(c, axis=1) if c else np.zeros(shape) for c in columns))
+
+    def fitted(self, groups: list[np.ndarray], scale: float) -> EnergyFit:
+        """Return the fit of some groups, the rows' own errors multiplied by a scale."""
+        x = self._start()
+        processes = [Process(0.0, 1.0)] * len(groups)
+        for rounds in range(5 if self.smooth else 1):
+            if self.smooth:
+                processes = self._processes(x, groups, scale)
+            x = self._descended(x, groups, processes, scale)
+            if rounds and self.smooth and processes == self._processes(x, groups, scale):
+                break
+        return self._result(x, groups, processes, scale)
+
+    def _start(self) -> np.ndarray:
+        """Return the unknowns of the instrument as it is given."""
+        plain = plain_instrument(self.curve, self.free)
+        at = np.zeros(len(self.unknowns))
+        time = self.curve.time
+        for i, one in enumerate(self.unknowns):
+            if one.kind == "phase_drift_deg" and time is not None and np.ptp(time) > 0.0:
+                zero = np.broadcast_to(plain.phase_zero_deg, (self.curve.rows,))
+                at[i] = np.polyfit(time, zero, 1)[0] / one.unit
+            if one.kind == "free_amplitude_drift" and time is not None and np.ptp(time) > 0.0:
+                factor = np.broadcast_to(plain.free_amplitude_factor, (self.curve.rows,))
+                at[i] = np.polyfit(time, factor, 1)[0] / one.unit
+        return at
+
+    def _smoothers(self, x: np.ndarray, groups: list, processes: list[Process], scale: float) -> list[Smoother]:
+        noise = scale * self._noise(x)
+        return [
+            Smoother.of(Bins.of(self.place[rows], noise[rows]), process)
+            for rows, process in zip(groups, processes, strict=True)
+        ]
+
+    def _noise(self, x: np.ndarray) -> Rows:
+        return noise_of(self.smoothed, energies(self.smoothed, self.instrument(x)))
+
+    def _of_free(self, x: np.ndarray) -> np.ndarray:
+        """Return residuals of the free rows' means."""
+        at, lags, shares = self.instrument(x), self.lags, self.shares
+        factor = np.broadcast_to(at.free_amplitude_factor, (self.curve.rows,))
+        left = [-turned(lags.mean - lags.average(free_lag_deg(self.curve, at))) / lags.error]
+        left.append((shares.average(factor) - shares.mean) / shares.error)
+        return np.concatenate(left)
+
+    def _slopes_of_free(self, slopes: _EnergySlopes) -> np.ndarray:
+        """Return the changes of the residuals of the free rows' means."""
+        lags, shares = self.lags, self.shares
+        parts = [lags.average(slopes.free_lag) / lags.error[:, None]]
+        parts.append(shares.average(slopes.factor) / shares.error[:, None])
+        return np.concatenate(parts)
+
+    def _normal(
+        self, x: np.ndarray, slopes: _EnergySlopes, found: Energies, groups: list, smoothers: list[Smoother]
+    ) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return the normal matrix of the unknowns, the gradient, and the sum of squares."""
+        known = np.array([np.isfinite(one.given.error) for one in self.unknowns], bool)
+        left, parts = self._of_free(x), self._slopes_of_free(slopes)
+        matrix = np.diag(known.astype(float)) + parts.T @ parts
+        gradient, total = known * x + parts.T @ left, float(left @ left + np.sum((known * x) ** 2))
+        for rows, smoother in zip(groups, smoothers, strict=True):
+            averages = smoother.bins.averages
+            y = smoother.root @ (averages @ found.energy_aj[rows])
+            s = smoother.root @ (averages @ slopes.energy[rows])
+            matrix += s.T @ s
+            gradient += s.T @ y
+            total += float(y @ y)
+        return matrix, gradient, total
+
+    def _descended(self, x: np.ndarray, groups: list, processes: list[Process], scale: float) -> np.ndarray:
+        if not len(x):
+            return x
+        for _ in range(_ROUNDS):
+            found = energies(self.curve, self.instrument(x))
+            smoothers = self._smoothers(x, groups, processes, scale)
+            slopes = self.slopes(x, self._as_fitted(x, groups, smoothers, found))
+            matrix, gradient, total = self._normal(x, slopes, found, groups, smoothers)
+            step = -np.linalg.pinv(matrix, hermitian=True) @ gradient
+            if step @ matrix @ step < _SETTLED**2:
+                break
+            fraction = 1.0
+            while (
+                fraction > _SHORTEST and not self._total(x + fraction * step, groups, processes, scale) < total + _RISE
+            ):
+                fraction *= 0.5
+            x = x + fraction * step
+        return x
+
+    def _total(self, x: np.ndarray, groups: list, processes: list[Process], scale: float) -> float:
+        """Return the sum of squares."""
+        smoothers = self._smoothers(x, groups, processes, scale)
+        known = np.array([np.isfinite(one.given.error) for one in self.unknowns], bool)
+        found = energies(self.curve, self.instrument(x)).energy_aj
+        rows = [s.root @ (s.bins.averages @ found[r]) for r, s in zip(groups, smoothers, strict=True)]
+        left = np.concatenate([*rows, self._of_free(x), known * x])
+        total = float(left @ left)
+        return total if np.isfinite(total) else np.inf
+
+    def _processes(self, x: np.ndarray, groups: list, scale: float) -> list[Process]:
+        """Return the processes of the groups, of the size and length that the readings make most probable."""
+        curve = self.curve
+        found = energies(curve, self.instrument(x))
+        s = curve.drive_frequency_khz / curve.free_frequency_khz.value
+        tip = curve.spring_constant_n_per_m.value * curve.tip_calibration.value**2
+        free = curve.free_amplitude_nm
+        lost = np.pi * tip * free**2 * s / curve.quality_factor.value
+
+        def processes(size: float, length: float) -> list[Process]:
+            made = []
+            for rows in groups:
+                largest = np.max(np.abs(_smoothed(found.energy_aj[rows])))
+                made.append(Process(max(size * float(lost[rows].mean()), _LEAST_SIZE * float(largest)), length))
+            return made
+
+        best, most = processes(_USUAL_SIZE, _USUAL_LENGTH), -np.inf
+        usual = self._smoothers(x, groups, best, scale)
+        slopes = self.slopes(x, self._as_fitted(x, groups, usual, found))
+        for size in _SIZES:
+            for length in _LENGTHS:
+                trial = processes(size, length)
+                smoothers = self._smoothers(x, groups, trial, scale)
+                matrix, gradient, total = self._normal(x, slopes, found, groups, smoothers)
+                evidence = gradient @ np.linalg.pinv(matrix, hermitian=True) @ gradient - total
+                evidence -= np.linalg.slogdet(matrix)[1] + sum(one.log_determinant for one in smoothers)
+                evidence -= (np.log(size / _USUAL_SIZE) / _LOG_SIZE) ** 2
+                evidence -= (np.log(length / _USUAL_LENGTH) / _LOG_LENGTH) ** 2
+                if evidence > most:
+                    best, most = trial, evidence
+        return best
+
+    def _result(self, x: np.ndarray, groups: list, processes: list[Process], scale: float) -> EnergyFit:
+        curve, found = self.curve, energies(self.curve, self.instrument(x))
+        smoothers = self._smoothers(x, groups, processes, scale)
+        slopes = self.slopes(x, self._as_fitted(x, groups, smoothers, found))
+        matrix = self._normal(x, slopes, found, groups, smoothers)[0]
+        covariance = np.linalg.pinv(matrix, hermitian=True)
+        known = np.array([np.isfinite(one.given.error) for one in self.unknowns], bool)
+        units = self.values(x) - self.values(x - 1e-6) if len(x) else x
+        errors = np.sqrt(np.diag(covariance)) * units / 1e-6
+        noise = scale * self._noise(x)
+        residual, taken = np.full(curve.rows, np.nan), 0.0
+        for rows, smoother in zip(groups, smoothers, strict=True):
+            weights, _ = smoother.at(self.place[rows])
+            residual[rows] = (
+                found.energy_aj[rows] - weights @ (smoother.bins.averages @ found.energy_aj[rows])
+            ) / noise[rows]
+            taken += float(np.trace(weights @ smoother.bins.averages))
+        used = np.zeros(curve.rows, bool)
+        used[np.concatenate(groups)] = True
+        of_free = self._of_free(x)
+        rows_chi2 = float(np.nansum(residual**2))
+        # what the instrument takes of the rows' freedom: at most one each
+        return EnergyFit(
+            rows=tuple(groups),
+            smoothers=tuple(smoothers),
+            energies_at=found,
+            slopes=slopes.energy,
+            virial_slopes=slopes.virial,
+            covariance=covariance,
+            known=known,
+            nuisances=tuple(
+                Nuisance(one.name, one.kind, one.given, float(value), float(error))
+                for one, value, error in zip(self.unknowns, self.values(x), errors, strict=True)
+            ),
+            instrument=self.instrument(x),
+            used=used,
+            outliers=np.zeros(curve.rows, bool),
+            residual=residual,
+            chi2=rows_chi2 + float(of_free @ of_free + np.sum((known * x) ** 2)),
+            degrees_of_freedom=round(used.sum() + len(of_free) + known.sum() - len(x) - taken),
+            rows_chi2=rows_chi2,
+            rows_freedom=float(used.sum() - taken),
+            scale=scale,
+            relative_error={
+                "spring_constant_n_per_m": curve.spring_constant_n_per_m.error / curve.spring_constant_n_per_m.value,
+                "tip_calibration": 2.0 * curve.tip_calibration.error / curve.tip_calibration.value,
+            },
+        )
+
+
+def _smoothed(values: np.ndarray, width: int = 5) -> np.ndarray:
+    """Return running means."""
+    width = min(width, len(values))
+    return np.convolve(values, np.full(width, 1.0 / width), "valid")
+
+
+class _Means(NamedTuple):
+    """Means of free rows: the weights of the rows in each, its value and its error."""
+
+    weights: Float[np.ndarray, "means rows"]
+    mean: Float[np.ndarray, " means"]
+    error: Float[np.ndarray, " means"]
+
+    def average(self, values: np.ndarray) -> np.ndarray:
+        """Return averages over the rows of each mean of something that has a value for every row."""
+        return self.weights @ values
+
+
+_FEWEST_OF_MEAN, _MOST_MEANS = 4, 8
+
+
+def _means(
+    curve: TappingCurve,
+    values: Rows,
+    errors: Rows,
+    kinds: Int[np.ndarray, " rows"],
+    free: Bool[np.ndarray, " rows"],
+    *,
+    turning: bool = False,
+) -> _Means:
+    """Return means of the free rows of each kind, their errors with what they scatter beyond their noise.
+
+    Where the order of the rows is known each stretch of neighbours has means of its own, which tell a drift.
+    """
+    weights, means, error = [], [], []
+    for kind in np.unique(kinds).tolist():
+        rows = np.flatnonzero(free & (kinds == kind) & np.isfinite(values))
+        for part in _stretches(curve, rows):
+            off = values[part] - values[part[0]]
+            off = turned(off) if turning else off
+            own = errors[part] ** -2.0
+            mean = np.average(off, weights=own)
+            excess = np.sqrt(max(np.var(off) - 1.0 / own.mean(), 0.0))
+            row = np.zeros(curve.rows)
+            row[part] = own / own.sum()
+            weights.append(row)
+            means.append(values[part[0]] + mean)
+            error.append(np.hypot(own.sum() ** -0.5, excess))
+    return _Means(np.array(weights).reshape(-1, curve.rows), np.array(means), np.array(error))
+
+
+def _stretches(curve: TappingCurve, rows: Int[np.ndarray, " some"]) -> list[np.ndarray]:
+    """Return the rows in one piece, or where their order in time is known those that follow each other in several."""
+    if not len(rows) or curve.time is None:
+        return [rows] if len(rows) else []
+    runs = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1)
+    return [
+        part
+        for run in runs
+        for part in np.array_split(run, max(1, min(len(run) // _FEWEST_OF_MEAN, _MOST_MEANS)))
+        if len(part)
+    ]
+
+
+def _smoothed_readings(
+    curve: TappingCurve, touching: Bool[np.ndarray, " rows"], place: Rows, free: Bool[np.ndarray, " rows"]
+) -> TappingCurve:
+    """Return a curve with its readings smoothed along each branch: errors of energies are taken there."""
+    amplitude, lag = curve.amplitude_nm.copy(), curve.lag_deg.copy()
+    departure = turned(curve.lag_deg - free_lag_deg(curve, plain_instrument(curve, free)))
+    for rows in smooth_stretches(curve, touching, repulsive_rows(curve, touching, departure)):
+        for readings, errors in ((amplitude, curve.amplitude_error_nm), (lag, curve.lag_error_deg)):
+            values = readings[rows]
+            smoother = smoother_along(
+                place[rows], values, errors[rows], max(float(np.ptp(values)), float(errors[rows[0]]))
+            )
+            readings[rows] = smoother.at(place[rows])[0] @ (smoother.bins.averages @ values)
+    return replace(curve, amplitude_nm=amplitude, lag_deg=lag)
+
+
+def smoother_along(place: np.ndarray, values: np.ndarray, noise: np.ndarray, scale: float) -> Smoother:
+    """Return the most probable smoother of readings, for processes of some sizes and lengths.
+
+    Args:
+        place: of the readings, in order, as of `depths`.
+        values: the readings.
+        noise: their standard errors.
+        scale: size that the process may have, in the unit of the readings; those tried are 0.1 to 3 times as large.
+    """
+    bins = Bins.of(place, noise)
+    y = bins.averages @ values
+    trials = [Smoother.of(bins, Process(size * scale, length)) for size in (0.1, 0.3, 1.0, 3.0) for length in _LENGTHS]
+    return max(trials, key=lambda one: -float(np.sum((one.root @ y) ** 2)) - one.log_determinant)
+
+
+def virial_noise(curve: TappingCurve, fit: EnergyFit) -> Rows:
+    """Return the standard error of each virial from its own row's noise, as the fit takes it, in aJ."""
+    return fit.scale * virial_noise_of(curve, fit.energies_at)

@@ -1,0 +1,161 @@
+"""Laws in files and in scene files: written and read again, measured columns in other units, and what is none."""
+
+import json
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+import afm_jax as afm
+from afm_jax import CollisionDelay, ImpactLaw, TabulatedLaw
+
+WET = ImpactLaw(0.9999, 114.0, 0.48, CollisionDelay(0.206, 5.64, 0.726))
+SPEEDS = np.geomspace(13.0, 300.0, 12)
+SCENE = """[cantilever]
+frequency_khz = 90
+quality_factor = 40
+mass_ng = 1.5
+[platform]
+amplitude_nm = 4
+reduced_frequency = 1.01
+offset_nm = -1
+[interaction]
+model = "law"
+"""
+
+
+@pytest.fixture(scope="module")
+def law() -> TabulatedLaw:
+    """A law with independent errors of 0.2 % of each rebound speed."""
+    w = np.asarray(WET.rebound_speed(SPEEDS))
+    return TabulatedLaw.with_errors(
+        SPEEDS, w, WET.collision_delay(SPEEDS), rebound_changes=0.002 * np.diag(w), mass_ng=1.5, origin="a test"
+    )
+
+
+def test_a_law_is_written_and_read_again_number_for_number(law, tmp_path):
+    afm.save_law(law, tmp_path / "law.json")
+    again = afm.load_law(tmp_path / "law.json")
+    assert eqx.tree_equal(law, again)
+    assert again.origin.text == "a test"
+    told = json.loads((tmp_path / "law.json").read_text())
+    assert told["speed_range_nm_per_us"] == pytest.approx([13.0, 300.0], rel=1e-14)
+    assert told["mass_ng"] == 1.5
+
+
+def test_a_scene_file_names_a_law_beside_it(law, tmp_path):
+    (tmp_path / "deep").mkdir()
+    afm.save_law(law, tmp_path / "law.json")
+    (tmp_path / "deep" / "scene.toml").write_text(SCENE + 'file = "../law.json"\n')
+    scene = afm.load_scene(tmp_path / "deep" / "scene.toml")
+    assert eqx.tree_equal(scene.interaction, law)
+    # written out it needs no other file
+    afm.save_scene(scene, tmp_path / "whole.toml")
+    assert eqx.tree_equal(afm.load_scene(tmp_path / "whole.toml"), scene)
+
+
+def test_unknowns_of_a_law_are_parameters_of_its_scene(law):
+    scene = afm.Scene(afm.Cantilever(90.0, 40.0, 1.5), afm.Platform(4.0, 181.8, -1.0), law)
+    moved = afm.scene_family(scene, "interaction.unknown_3")(2.0).interaction
+    rise = np.asarray(moved.rebound_speed(SPEEDS)) / np.asarray(law.rebound_speed(SPEEDS)) - 1.0
+    # two standard errors of the third speed; the capture speed moves with it, but no other row
+    np.testing.assert_allclose(rise[2], 0.004, rtol=0.05)
+    np.testing.assert_allclose(np.delete(rise, 2), 0.0, atol=2e-4)
+
+
+def test_samples_have_the_errors_of_the_law(law):
+    laws = law.sample(jax.random.key(1), 400)
+    spread = np.std(np.asarray(jax.vmap(lambda law: law.rebound_speed(SPEEDS))(laws)), axis=0)
+    # 400 samples tell a standard deviation to 4 %
+    np.testing.assert_allclose(spread / np.asarray(law.rebound_speed(SPEEDS)), 0.002, rtol=0.15)
+    with pytest.raises(ValueError, match="nothing is known of this law's errors"):
+        TabulatedLaw(SPEEDS, WET.rebound_speed(SPEEDS)).sample(jax.random.key(1), 2)
+
+
+@pytest.mark.parametrize(
+    ("unit", "size"), [("nm_per_us", 1.0), ("mm_per_s", 1.0), ("m_per_s", 1e3), ("um_per_s", 1e-3)]
+)
+def test_measured_columns_in_other_units(unit, size, tmp_path):
+    w, late = np.asarray(WET.rebound_speed(SPEEDS)), np.asarray(WET.collision_delay(SPEEDS))
+    columns = np.stack([SPEEDS / size, w / size, 1e3 * late], axis=1).tolist()
+    rows = "\n".join("\t".join(map(repr, row)) for row in columns)
+    head = (
+        f"# mass_ng = 1.5\n# origin = laser and lamp\napproach_speed_{unit}\trebound_speed_{unit}\tcollision_delay_ns\n"
+    )
+    (tmp_path / "law.csv").write_text(head + rows)
+    law = afm.load_law(tmp_path / "law.csv")
+    np.testing.assert_allclose(law.rebound_speed(SPEEDS), w, rtol=1e-12)
+    np.testing.assert_allclose(law.collision_delay(SPEEDS), late, rtol=1e-9)
+    assert law.origin.text == "laser and lamp"
+    assert law.mass_ng is not None
+    assert float(law.mass_ng) == 1.5
+
+
+HEAD = "approach_speed_nm_per_us,rebound_speed_nm_per_us\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (HEAD + "1,0.5\n2,1\n3,2\n", "at least four speeds, but has 3"),
+        (HEAD + "1,0.5\n3,1\n2,1\n4,2\n", "must increase from row to row, but 2 follows 3 in row 3"),
+        (HEAD + "1,0.5\n2,1\n3,3.5\n4,2\n", "not be faster than the approach, but is 3.5 at 3 in row 3"),
+        (HEAD + "1,0.5\n2,nan\n3,2\n4,2\n", "must be finite numbers, but is nan in row 2"),
+        (HEAD + "1,0.5\n2,one\n3,2\n4,2\n", "line 3: `rebound_speed_nm_per_us` must be a number, but is 'one'"),
+        (HEAD + "1,0.5\n2\n", "line 3 has 1 values for 2 columns"),
+        (HEAD.replace("rebound_speed_nm_per_us", "rebound_speed_m_per_s") + "1,1\n", "speeds in mixed units"),
+        (HEAD.replace("_nm_per_us", "", 1) + "1,1\n", "the unit is missing; use approach_speed_nm_per_us"),
+        (HEAD.replace("_nm_per_us", "_miles_per_h", 1) + "1,1\n", "the unit is not known; use one of nm_per_us"),
+        ("u,w\n1,1\n", "column u is none of a law's"),
+        ("approach_speed_nm_per_us\n1\n", "has no column rebound_speed_nm_per_us"),
+        ("", "is empty"),
+        ('{"format": "afm-jax fit", "valid": false}', "the fit is not valid, so that its law means nothing"),
+        ('{"format": "afm-jax fit", "valid": true, "law": {}}', "fit again with `afm-jax fit TABLE --out DIR`"),
+        ('{"format": "afm-jax law", "format_version": 99}', "has format_version 99, but 1 is known here"),
+        ('{"format": "something"}', "holds no law"),
+        ("{", "is no JSON"),
+    ],
+)
+def test_what_is_no_law(text, said, tmp_path):
+    (tmp_path / "law.csv").write_text(text)
+    (tmp_path / "scene.toml").write_text(SCENE + 'file = "law.csv"\n')
+    for read in (lambda: afm.load_law(tmp_path / "law.csv"), lambda: afm.load_scene(tmp_path / "scene.toml")):
+        with pytest.raises(ValueError, match=r"law\.csv: ") as error:
+            read()
+        assert said in str(error.value)
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("lines", "said"),
+    [
+        ('file = "law.json"\nr = 0.9\n', "the law is that of `file`: leave out r"),
+        ("file = 3\n", "must be the path of a law's file, as text, but is a number"),
+        ('file = "nothing.json"\n', "nothing.json: there is no such file"),
+        ("table = 3\n", "must be a table, [interaction.table], but is a number"),
+        ("[interaction.table]\nnumbers = 3\n", "the law lacks approach_speed_nm_per_us and rebound_speed_nm_per_us"),
+    ],
+)
+def test_wrong_keys_of_a_tables_scene(lines, said, tmp_path):
+    (tmp_path / "scene.toml").write_text(SCENE + lines)
+    with pytest.raises(afm.SceneError) as error:
+        afm.load_scene(tmp_path / "scene.toml")
+    assert said in str(error.value)
+    assert "[interaction]" in str(error.value)
+
+
+def test_a_law_of_another_mass_is_refused(law, tmp_path):
+    afm.save_law(law, tmp_path / "law.json")
+    (tmp_path / "scene.toml").write_text(SCENE.replace("1.5", "2") + 'file = "law.json"\n')
+    with pytest.raises(afm.SceneError, match=r"\[interaction\] the law is that of a tip of 1\.5 ng, but .* is 2"):
+        afm.load_scene(tmp_path / "scene.toml")
+    with pytest.raises(ValueError, match=r"the law is that of a tip of 1\.5 ng"):
+        afm.Scene(afm.Cantilever(90.0), afm.Platform(4.0, 181.8), law)
+
+
+def test_a_batch_of_laws_is_no_scene_file(law, tmp_path):
+    scene = afm.Scene(afm.Cantilever(90.0, 40.0, 1.5), afm.Platform(4.0, 181.8, -1.0), law.sample(jax.random.key(1), 3))
+    with pytest.raises(ValueError, match="holds one scene: save them one by one"):
+        afm.save_scene(scene, Path(tmp_path) / "scene.toml")

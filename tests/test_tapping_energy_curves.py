@@ -1,0 +1,193 @@
+"""The energy of a tap as a function along a branch: shapes of measured curves, drifts, instruments without errors."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from afm_jax.cli.main import main
+from fitting.tables.table import write_table
+from fitting.tapping_curves.pictures import curve_figure
+from fitting.tapping_curves.result import Tapping
+from fitting.tapping_curves.tapping import tapping
+from tests.coverage_of_tapping import random_curve
+from tests.strict_reading import strictly
+from tests.tapping_truth_of_laws import (
+    GRAPHITE,
+    SHARP,
+    Stated,
+    Tip,
+    Truth,
+    curve_like_graphite,
+    curve_of_energy,
+    table_of,
+)
+
+ONE_ENERGY_AJ = 5.53
+
+
+def deviations(result: Tapping, truth: Truth, free_nm: float, name: str = "energy") -> np.ndarray:
+    """Return by how many of its errors a function is off, at all points of all branches."""
+    found = []
+    for branch in result.branches:
+        curve = branch.curve
+        true = truth.at(f"{name}_aj", curve.amplitude_ratio, free_nm)
+        found.append((getattr(curve, f"{name}_aj") - true) / getattr(curve, f"{name}_error_aj"))
+    return np.concatenate(found)
+
+
+def one_energy(rows: int = 60) -> Truth:
+    """Return a repulsive branch whose taps all take the same, on resonance."""
+    return curve_of_energy(Tip(), np.linspace(0.9, 0.15, rows), np.full(rows, ONE_ENERGY_AJ), np.ones(rows, bool))
+
+
+def test_a_curve_with_the_shape_of_measured_ones_has_its_energy_as_a_function(tmp_path: Path):
+    truth = curve_like_graphite()
+    # the figures it goes through
+    np.testing.assert_allclose(truth.at("energy_aj", np.array([0.98, 0.94, 0.86]), 13.4), [1.6, 4.2, 10.9], rtol=0.02)
+    table = table_of(GRAPHITE, truth, Stated(**SHARP), np.random.default_rng(1), free_rows=30)
+    path = tmp_path / "curve.csv"
+    write_table(table, path)
+    run = CliRunner().invoke(main, ["tapping", str(path), "--json"])
+    assert run.exit_code == 0, run.stderr
+    answer = strictly(run.stdout)
+    assert answer["valid"]
+    assert answer["energy_per_tap_aj"] is None
+    assert "one energy a branch does not describe the rows" in answer["energy_per_tap_reason"]
+    columns = ["amplitude_ratio", "height_nm"]
+    columns += [f"{name}_{end}" for name in ("energy", "virial") for end in ("aj", "low_aj", "high_aj")]
+    assert [one["repulsive"] for one in answer["branches"]] == [False, True]
+    for branch in answer["branches"]:
+        assert branch["constant"] is False
+        assert set(branch["curve"]) == set(columns)
+        along = {name: np.array(branch["curve"][name]) for name in columns}
+        assert np.all(np.diff(along["amplitude_ratio"]) >= 0.0)
+        for name in ("energy", "virial"):
+            true = truth.at(f"{name}_aj", along["amplitude_ratio"], 13.4)
+            held = (along[f"{name}_low_aj"] < true) & (true < along[f"{name}_high_aj"])
+            assert held.mean() > 0.9, name
+        # the sign of the virial says which side it is
+        assert (along["virial_aj"].mean() > 0.0) != branch["repulsive"]
+    assert [round(one["amplitude_ratio"], 2) for one in answer["energies_at"]] == [0.95, 0.9, 0.8]
+    (turn,) = answer["turning_points"]
+    assert min(turn["amplitude_ratio"]) < 0.916
+    assert max(turn["amplitude_ratio"]) > 0.908
+    assert answer["largest_energy_aj"]["value"] == pytest.approx(12.0, rel=0.08)
+    # by the figures it goes through
+    assert "changes along the curve" in CliRunner().invoke(main, ["tapping", str(path)]).stdout
+
+
+def test_energies_that_grow_along_a_branch_are_no_single_energy_with_the_frequency_pulled():
+    ratio = np.linspace(0.9, 0.3, 150)
+    truth = curve_of_energy(GRAPHITE, ratio, np.linspace(9.0, 12.0, 150), np.ones(150, bool))
+    result = tapping(table_of(GRAPHITE, truth, Stated(**SHARP), np.random.default_rng(0), free_rows=30), law=False)
+    assert result.valid
+    assert result.energy["value"] is None
+    assert result.to_dict()["energy_per_tap_aj"] is None
+    assert not any("95 %" in one for one in result.warnings)
+    assert np.abs(deviations(result, truth, 13.4)).max() < 2.0
+    functions = result.functions
+    assert functions is not None
+    assert max(abs(one.pull) for one in functions.nuisances) < 1.0
+    # errors may be multiplied, a single energy is refused all the same
+    assert tapping(result.table, law=False, scale_errors=True).energy["value"] is None
+
+
+@pytest.mark.slow
+def test_an_instrument_without_errors_has_usual_ones_and_ends_right_or_not_valid():
+    truth, rng = one_energy(), np.random.default_rng(25)
+    widths = []
+    for _ in range(10):
+        exact = Stated(frequency=1e-9, quality=1e-9, stiffness=1e-9, phase_noise_deg=0.2)
+        table = table_of(Tip(), truth, exact, rng)
+        off = 1.0 + 2e-4 * rng.uniform(-1.0, 1.0), 1.0 + 0.05 * rng.uniform(-1.0, 1.0)
+        table = replace(
+            table,
+            free_frequency_khz=table.free_frequency_khz * off[0],
+            free_frequency_error_khz=None,
+            quality_factor=(table.quality_factor or 0.0) * off[1],
+            quality_factor_error=None,
+        )
+        result = tapping(table, law=False)
+        answer = result.to_dict()
+        assert answer["assumed_errors"] == {"free_frequency_khz": 2e-4, "quality_factor": 0.05}
+        assert any("0.02 %" in one and "5 %" in one for one in answer["assumptions"])
+        if not result.valid:
+            continue
+        assert np.mean(np.abs(deviations(result, truth, 40.0)) < 1.96) > 0.9
+        if result.energy["value"] is not None:
+            low, high = result.energy["interval95"]
+            assert low < ONE_ENERGY_AJ < high
+            widths.append((high - low) / ONE_ENERGY_AJ)
+            (branch,) = answer["branches"]
+            # the branch says what the headline says
+            assert branch["energy_aj"] == pytest.approx(result.energy["value"])
+            assert branch["interval95_aj"] == pytest.approx(list(result.energy["interval95"]))
+    # it is no emptiness that holds the truth
+    assert len(widths) >= 5
+    assert np.median(widths) < 0.5
+
+
+@pytest.mark.parametrize(("phase", "amplitude"), [(0.3, 0.0), (1.0, 0.0), (5.0, 0.0), (0.0, 0.01), (0.0, 0.03)])
+def test_a_drift_along_the_rows_is_fitted_where_their_order_is_known_and_else_said(phase: float, amplitude: float):
+    truth, stated = one_energy(40), Stated(stiffness=1e-4, phase_noise_deg=0.2)
+    drifts = {"both_ways": True, "phase_drift_deg": phase, "amplitude_drift": amplitude}
+    table = table_of(Tip(), truth, stated, np.random.default_rng(7), **drifts, rows_in_order_of_time=True)
+    result = tapping(table, law=False)
+    assert result.valid, result.reasons
+    low, high = result.energy["interval95"]
+    assert low < ONE_ENERGY_AJ < high
+    assert np.mean(np.abs(deviations(result, truth, 40.0)) < 1.96) > 0.9
+    assert result.functions is not None
+    found = {one.kind: one for one in result.functions.nuisances}
+    for name, true in (("phase_drift_deg", phase), ("free_amplitude_drift", amplitude)):
+        assert abs(found[name].value - true) < 3.5 * found[name].standard_error
+    blind = tapping(replace(table, rows_in_order_of_time=False), law=False)
+    if phase >= 1.0 or amplitude:
+        assert not blind.valid
+        assert "# rows = in order of time" in blind.reasons[0]
+
+
+def test_each_free_amplitude_has_an_energy_of_its_own_and_the_picture_shows_all_points():
+    rng, rows = np.random.default_rng(3), 40
+    tables = []
+    for free, energy in ((40.0, 4.1), (60.0, 6.4)):
+        tip, ratio = Tip(free_nm=free), np.linspace(0.9, 0.15, rows)
+        truth = curve_of_energy(tip, ratio, np.full(rows, energy), np.ones(rows, bool))
+        stated = Stated(frequency=1e-9, quality=1e-9, stiffness=1e-9)
+        tables.append(table_of(tip, truth, stated, rng))
+    one, other = tables
+    both = {
+        name: np.concatenate([value, getattr(other, name)])
+        for name, value in vars(one).items()
+        if isinstance(value, np.ndarray) and value.shape == one.offset_nm.shape
+    }
+    error = {"free_frequency_error_khz": 9e-4, "quality_factor_error": 2.0, "spring_constant_error_n_per_m": 0.05}
+    result = tapping(replace(one, **both, **error), law=False)
+    assert result.valid
+    assert result.energy["value"] is None
+    assert "each drive has its own" in result.energy["reason"]
+    for branch, true in zip(result.to_dict()["branches"], (4.1, 6.4), strict=True):
+        assert branch["constant"]
+        low, high = branch["interval95_aj"]
+        assert low < true < high
+    bottom = curve_figure(result).axes[-1]
+    low, high = bottom.get_ylim()
+    touching = result.rows.energy_of_fit_aj[~result.rows.free]
+    assert low <= touching.min()
+    assert touching.max() <= high
+    assert np.allclose(
+        [np.asarray(line.get_ydata())[0] for line in bottom.lines if line.get_linestyle() == "--"], (4.1, 6.4), rtol=0.2
+    )
+
+
+@pytest.mark.slow
+def test_bands_hold_the_energies_of_random_laws():
+    for frequency_error in (1e-5, 1e-4):
+        found = [random_curve(number, frequency_error) for number in range(1000, 1024)]
+        off = np.abs(np.concatenate([one.energy for one in found]))
+        assert np.mean(off < 1.96) > 0.9
+        assert off.max() < 4.0
+        assert np.median(off) < 1.2 * 0.6745

@@ -1,0 +1,316 @@
+"""Maps: energies against the formula of a force on the tip, every format against its writer, masks counted."""
+
+import re
+import struct
+import time
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from afm_jax.cli.main import main
+from fitting import TableError, tapping_map
+from fitting.examples.make_raw_curve import (
+    DRIVE_KHZ,
+    FREE_FREQUENCY_KHZ,
+    FREE_NM,
+    QUALITY_FACTOR,
+    SPRING_CONSTANT,
+    raw_curve,
+    true_energy_aj,
+    true_lag_deg,
+)
+from fitting.instruments.gwyddion import images_as_bytes
+from fitting.instruments.images import read_images
+from fitting.tapping_curves.curve import Given, Instrument, TappingCurve
+from fitting.tapping_curves.energy import energies
+from tests.instrument_files import igor_wave
+from tests.strict_reading import strictly
+
+FREE_LAG = float(true_lag_deg(np.ones(1))[0])
+LEVER: dict[str, Any] = {
+    "spring_constant_n_per_m": (SPRING_CONSTANT, 4.0),
+    "quality_factor": (QUALITY_FACTOR, 5.0),
+    "free_frequency_khz": (FREE_FREQUENCY_KHZ, 0.01),
+    "drive_frequency_khz": DRIVE_KHZ,
+    "free_amplitude_nm": (FREE_NM, 0.03),
+    "free_phase_deg": (FREE_LAG, 0.2),
+    "drive": "force",
+}
+CALL = ["--spring-constant", "44", "--quality-factor", "230 +- 5", "--free-frequency-khz", "344.604 +- 0.01"]
+CALL += ["--drive-frequency-khz", "344.6", "--free-amplitude-nm", "13.4", "--free-phase-deg", str(FREE_LAG)]
+CALL += ["--drive", "force"]
+
+
+def lever(**changed: Any) -> dict[str, Any]:
+    """Return what is known of the lever, with some of it changed."""
+    return LEVER | changed
+
+
+def image(rows: int = 12, columns: int = 20) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return amplitude in nm, lag and true energy of an image whose amplitude rises from 0.78 to 0.98 of the free."""
+    ratio = np.linspace(0.78, 0.98, rows * columns).reshape(rows, columns)
+    return FREE_NM * ratio, true_lag_deg(ratio), true_energy_aj(ratio)
+
+
+def run(*arguments: object):
+    return CliRunner().invoke(main, ["tapping-map", *map(str, arguments)])
+
+
+def test_every_pixel_has_the_energy_of_the_formula_and_its_own_error():
+    amplitude, lag, energy = image()
+    found = tapping_map((amplitude, lag), amplitude_error_nm=0.03, phase_error_deg=0.12, **LEVER)
+    # what the air takes at harmonics is left out of the formula
+    np.testing.assert_allclose(found.energy, energy, rtol=2e-4)
+    random = np.random.default_rng(3)
+    shape = (400, *amplitude.shape)
+    noisy = FREE_NM**-2 * (amplitude + 0.03 * random.standard_normal(shape))
+    noisy *= FREE_NM
+    lags = np.deg2rad(lag + 0.12 * random.standard_normal(shape))
+    s = DRIVE_KHZ / FREE_FREQUENCY_KHZ
+    size = np.abs(1.0 - s**2 + 1j * s / QUALITY_FACTOR)
+    k = np.pi * SPRING_CONSTANT * FREE_NM**2
+    drawn = k * noisy * (size * np.sin(lags) - s * noisy / QUALITY_FACTOR)
+    np.testing.assert_allclose(found.energy_error, drawn.std(axis=0), rtol=0.15)
+    drawn = -0.5 * k / np.pi * noisy * (size * np.cos(lags) - noisy * (1.0 - s**2))
+    np.testing.assert_allclose(found.virial, drawn.mean(axis=0), atol=0.01)
+    np.testing.assert_allclose(found.virial_error, drawn.std(axis=0), rtol=0.15)
+    # the spring constant's part of the common error is its share of the median energy
+    assert found.common["spring_constant"] == pytest.approx(4.0 / 44.0 * np.median(energy), rel=0.02)
+    assert found.energy_common_error == pytest.approx(np.linalg.norm(list(found.common.values())))
+
+
+@pytest.mark.parametrize("drive", ["force", "base"])
+@pytest.mark.parametrize("ratio", [1.0, 1.03])
+def test_maps_are_the_energies_of_curves_row_by_row(drive: Literal["force", "base"], ratio: float):
+    random = np.random.default_rng(5)
+    amplitude, behind = random.uniform(5.0, 40.0, (6, 7)), random.uniform(-30.0, 10.0, (6, 7))
+    known: dict[str, Any] = {"free_frequency_khz": 90.0, "quality_factor": 200.0, "spring_constant_n_per_m": 5.4}
+    known |= {"free_amplitude_nm": 40.0, "drive_frequency_khz": 90.0 * ratio, "free_phase_deg": 33.0}
+    found = tapping_map((amplitude, 33.0 + behind), drive=drive, **known)
+    gamma = 1.0 - ratio**2 + 1j * ratio / 200.0
+    lag = np.rad2deg(np.angle(gamma) - (np.angle(1.0 - gamma) if drive == "base" else 0.0))
+    ones = np.ones(amplitude.size)
+    curve = TappingCurve(
+        drive=drive,
+        source="",
+        offset_nm=ones,
+        amplitude_nm=amplitude.ravel(),
+        amplitude_error_nm=ones,
+        lag_deg=lag + behind.ravel(),
+        lag_error_deg=ones,
+        free_amplitude_nm=40.0 * ones,
+        drive_frequency_khz=90.0 * ratio * ones,
+        retract=ones < 0.0,
+        free_frequency_khz=Given(90.0),
+        quality_factor=Given(200.0),
+        spring_constant_n_per_m=Given(5.4),
+        lines=np.arange(amplitude.size),
+    )
+    wanted = energies(curve, Instrument(90.0, 200.0))
+    used = (found.state == 0).ravel()
+    assert used.any()
+    np.testing.assert_allclose(found.energy.ravel()[used], wanted.energy_aj[used], rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(found.virial.ravel()[used], wanted.virial_aj[used], rtol=1e-9, atol=1e-9)
+
+
+def test_pixels_out_of_range_are_masked_and_counted():
+    amplitude, lag, energy = image()
+    amplitude[0, :4] = 1.1 * FREE_NM
+    lag[1, :3] = -30.0
+    amplitude[2, :2] = np.nan
+    found = tapping_map((amplitude, lag), amplitude_error_nm=0.03, phase_error_deg=0.12, **LEVER)
+    counts = {"used": 231, "amplitude above free": 4, "energy below zero": 3, "not measured": 2}
+    assert found.counts == counts
+    assert found.to_dict()["pixels"] == {"rows": 12, "columns": 20, **counts}
+    masked = found.state != 0
+    assert np.all(np.isnan(found.energy[masked]))
+    np.testing.assert_allclose(found.energy[~masked], energy[~masked], rtol=2e-4)
+    assert found.valid
+    wrong = tapping_map((amplitude, lag), **lever(free_amplitude_nm=9.0))
+    assert not wrong.valid
+    assert "free amplitude, its phase, quality factor or units do not belong" in wrong.reasons[0]
+
+
+def test_without_a_spring_constant_energies_are_over_it():
+    amplitude, lag, energy = image()
+    without: dict[str, Any] = {key: value for key, value in LEVER.items() if not key.startswith("spring")}
+    found = tapping_map((amplitude, lag), **without)
+    assert found.unit == "nm^2"
+    np.testing.assert_allclose(found.energy, energy / SPRING_CONSTANT, rtol=2e-4)
+    assert any("over it, in nm^2" in note for note in found.notes)
+    assert "spring_constant" not in found.common
+
+
+def test_a_phase_of_the_opposite_sign_is_told_by_the_free_tip():
+    amplitude, lag, _ = image()
+    straight = tapping_map((amplitude, lag), **LEVER)
+    turned = tapping_map((amplitude, -lag), **lever(free_phase_deg=(-FREE_LAG, 0.2)))
+    np.testing.assert_allclose(turned.energy, straight.energy, rtol=1e-12)
+    np.testing.assert_allclose(turned.virial, straight.virial, rtol=1e-9)
+    assert any(note.startswith("Sign: the free tip reads") for note in turned.notes)
+
+
+def nanosurf_image(amplitude: np.ndarray, phase: np.ndarray) -> bytes:
+    """Return a NanoSurf file of two images, amplitude in m and phase in degrees, as 32-bit integers of their range."""
+    header, data = ["[DataSet]", "Version=2"], b""
+    for number, (name, unit, values) in enumerate((("Amplitude", "m", 1e-9 * amplitude), ("Phase", "°", phase))):
+        low, width = float(values.min()), float(np.ptp(values))
+        rows, columns = values.shape
+        header += [f"[DataSet-0:{number}]", f"Points={columns}", f"Lines={rows}", "SaveBits=32", "Frame=Scan forward"]
+        header += ["Dim0Name=X*", "Dim0Unit=m", "Dim0Min=0", "Dim0Range=2e-6", "Dim1Range=1e-6"]
+        header += [f"Dim2Name={name}", f"Dim2Unit={unit}", f"Dim2Min={low!r}", f"Dim2Range={width!r}"]
+        counts = np.round((values - low) / width * (2.0**32 - 1.0) - 2.0**31).astype("<i4")
+        data += counts.tobytes()
+    return "\r\n".join(header).encode("latin-1") + b"\r\n\r\n#!" + data
+
+
+def written(folder: Path, kind: str) -> list[Path]:
+    amplitude, lag, _ = image()
+    path = folder / f"image.{kind}"
+    match kind:
+        case "npz":
+            np.savez(path, amplitude_nm=amplitude, phase_deg=lag)
+        case "npy":
+            np.save(path, np.stack([amplitude, lag]))
+        case "csv":
+            np.savetxt(path, amplitude, delimiter=",")
+            np.savetxt(folder / "phase.csv", lag, delimiter=",")
+            return [path, folder / "phase.csv"]
+        case "ibw":
+            pytest.importorskip("igor2")
+            channels = {"HeightRetrace": amplitude, "AmplitudeRetrace": 1e-9 * amplitude, "PhaseRetrace": lag}
+            note = "FastScanSize: 2e-06\rSlowScanSize: 1e-06\r"
+            path.write_bytes(igor_wave({name: values.T[:, ::-1] for name, values in channels.items()}, note))
+        case "gwy":
+            gwyfile = pytest.importorskip("gwyfile.objects")
+            content = gwyfile.GwyContainer()
+            for number, (title, unit, values) in enumerate(
+                (("Amplitude", "m", 1e-9 * amplitude), ("Phase", "deg", lag))
+            ):
+                content[f"/{number}/data/title"] = title
+                content[f"/{number}/data"] = gwyfile.GwyDataField(
+                    values, xreal=2e-6, yreal=1e-6, si_unit_xy="m", si_unit_z=unit
+                )
+            path.write_bytes(b"GWYP" + content.serialize())
+        case _:
+            path.write_bytes(nanosurf_image(amplitude, lag))
+    return [path]
+
+
+@pytest.mark.parametrize("kind", ["npz", "npy", "csv", "ibw", "gwy", "nid"])
+def test_images_of_every_format_are_read(tmp_path: Path, kind: str):
+    amplitude, lag, _ = image()
+    found = read_images(*written(tmp_path, kind))
+    np.testing.assert_allclose(found.amplitude, amplitude, rtol=3e-7)
+    np.testing.assert_allclose(found.phase_deg, lag, rtol=3e-7)
+    assert found.size_m == ((1e-6, 2e-6) if kind in {"ibw", "gwy", "nid"} else None)
+
+
+def test_the_command_writes_picture_and_arrays_and_says_the_common_error_once(tmp_path: Path):
+    pytest.importorskip("zarr")
+    (path,) = written(tmp_path, "gwy")
+    out = tmp_path / "report"
+    formats = ["--format", "npz", "--format", "gwy", "--format", "zarr"]
+    result = run(path, *CALL, *formats, "--out", out, "--json")
+    assert result.exit_code == 0, result.stderr
+    _, _, energy = image()
+    answer = strictly(result.stdout)
+    assert answer["pixels"]["used"] == 240
+    assert answer["energy"]["median"] == pytest.approx(np.median(energy), rel=1e-3)
+    assert set(answer["common"]) >= {"spring_constant", "quality_factor", "free_frequency", "free_phase"}
+    text = (out / "map.txt").read_text("utf-8")
+    assert len(re.findall(r"common error of the energy", text)) == 1
+    assert {one.name for one in out.iterdir()} == {"map.png", "map.json", "map.txt", "map.npz", "map.gwy", "map.zarr"}
+    np.testing.assert_allclose(np.load(out / "map.npz")["energy"], energy, rtol=2e-4)
+    import zarr  # noqa: PLC0415
+
+    stored = zarr.open_group(str(out / "map.zarr"), mode="r")
+    np.testing.assert_allclose(np.asarray(stored["energy"]), energy, rtol=2e-4)
+    theirs = pytest.importorskip("gwyfile").load(str(out / "map.gwy"))
+    assert theirs["/0/data/title"] == "Energy of a tap"
+    np.testing.assert_allclose(theirs["/0/data"].data, 1e-18 * energy, rtol=2e-4)
+    assert theirs["/0/data"].xreal == pytest.approx(2e-6)
+    data = tapping_map(path, **LEVER).to_xarray()
+    assert data["energy"].shape == (12, 20)
+    assert run(path, *CALL[:-4], "--free-amplitude-nm", "9").exit_code == 3
+
+
+def test_masked_pixels_are_masked_in_gwyddion_too():
+    pytest.importorskip("gwyfile")
+    from gwyfile.objects import GwyObject  # noqa: PLC0415
+
+    content: Any = GwyObject.frombuffer(
+        images_as_bytes({"e": (np.array([[1.0, np.nan], [2.0, 3.0]]), "J")}, (1.0, 1.0), "")[4:]
+    )
+    np.testing.assert_array_equal(content["/0/mask"].data, [[0.0, 1.0], [0.0, 0.0]])
+    np.testing.assert_array_equal(content["/0/data"].data, [[1.0, 1.0], [2.0, 3.0]])
+
+
+def test_a_grid_of_curves_is_read_at_one_amplitude(tmp_path: Path):
+    curves = [raw_curve(300, seed=seed, drift=0.0) for seed in range(6)]
+    path = tmp_path / "grid.npz"
+    arrays: dict[str, Any] = {
+        name: np.array([getattr(curve, field)[0] for curve in curves]).reshape(2, 3, 300)
+        for name, field in (("amplitude_v", "amplitude_v"), ("phase_deg", "phase_deg"), ("height_nm", "height_nm"))
+    }
+    np.savez(path, **arrays)
+    call = [word for word in CALL if word not in {"--free-amplitude-nm", "13.4", "--free-phase-deg", str(FREE_LAG)}]
+    result = run(path, *call, "--nm-per-volt", "42", "--at", "0.85", "--json")
+    assert result.exit_code == 0, result.stderr
+    answer = strictly(result.stdout)
+    masked = ("amplitude above free", "energy below zero", "not measured")
+    assert answer["pixels"] == {"rows": 2, "columns": 3, "used": 6} | dict.fromkeys(masked, 0)
+    assert answer["energy"]["median"] == pytest.approx(float(true_energy_aj(np.full(1, 0.85))[0]), rel=0.03)
+    # the same curves side by side in a file without a head
+    blocks = [[*c.height_nm, *c.deflection_v, *c.amplitude_v, *c.phase_deg] for c in curves]
+    np.savetxt(tmp_path / "grid.txt", np.concatenate(blocks).T, delimiter="\t")
+    columns = "offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8:deg"
+    words = [*call, "--nm-per-volt", "42", "--at", "0.85", "--columns", columns]
+    again = strictly(run(tmp_path / "grid.txt", *words, "--grid", "2x3", "--json").stdout)
+    assert again["energy"]["median"] == pytest.approx(answer["energy"]["median"], rel=0.01)
+    refused = run(tmp_path / "grid.txt", *words, "--grid", "2x2")
+    assert (refused.exit_code, len(refused.stderr.splitlines())) == (2, 1)
+    assert "holds 6 curves, not 2 x 2 = 4" in refused.stderr
+
+
+def test_wrong_images_are_one_line(tmp_path: Path):
+    amplitude, lag, _ = image()
+    np.savez(tmp_path / "one.npz", amplitude=amplitude)
+    np.savez(tmp_path / "sizes.npz", amplitude=amplitude, phase=lag[:-1])
+    np.savez(tmp_path / "volts.npz", amplitude_v=amplitude, phase_deg=lag)
+    (tmp_path / "ragged.csv").write_text("1,2\n3\n")
+    (tmp_path / "cut.gwy").write_bytes(b"GWYPGwyContainer\0" + struct.pack("<I", 1000) + b"/0/data\0o")
+    for name, said in (
+        ("one.npz", "none of the images amplitude is called"),
+        ("sizes.npz", "must be of one size"),
+        ("volts.npz", "give --nm-per-volt NM"),
+        ("ragged.csv", "an image is rows of numbers"),
+        ("cut.gwy", "damaged or cut off"),
+        ("missing.npz", "there is no such file"),
+    ):
+        result = run(tmp_path / name, *CALL)
+        assert (result.exit_code, result.stdout, len(result.stderr.splitlines())) == (2, "", 1), name
+        assert said in result.stderr
+    np.savez(tmp_path / "good.npz", amplitude=amplitude, phase=lag)
+    missing = run(tmp_path / "good.npz")
+    assert "give --free-frequency-khz KHZ --quality-factor Q --free-amplitude-nm NM" in missing.stderr
+    with pytest.raises(TableError, match="must be two arrays"):
+        tapping_map((amplitude, lag[0]), **LEVER)
+
+
+def test_curves_say_where_images_go_and_images_where_curves_go(tmp_path: Path):
+    (path,) = written(tmp_path, "gwy")
+    result = CliRunner().invoke(main, ["read", str(path)])
+    assert "holds images; their energies: afm-jax tapping-map" in result.stderr
+
+
+@pytest.mark.slow
+def test_a_million_pixels_take_less_than_two_seconds():
+    amplitude, lag, _ = image(1024, 1024)
+    begun = time.perf_counter()
+    found = tapping_map((amplitude, lag), **LEVER)
+    assert time.perf_counter() - begun < 2.0
+    assert found.counts["used"] == 1024**2
