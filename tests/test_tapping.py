@@ -1,5 +1,6 @@
 """The energy of a tap off a tapping curve: closed forms, simulated truths, thresholds, what is refused, the command."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from fitting.tables.table import AmplitudeTable
 from fitting.tapping_curves.branches import changes, free_rows
 from fitting.tapping_curves.curve import Given, Instrument, TappingCurve
 from fitting.tapping_curves.energy import energies, lags_of, largest_energies
+from fitting.tapping_curves.report import tapping_summary
 from fitting.tapping_curves.tapping import tapping
 from tests.strict_reading import strictly
 
@@ -217,10 +219,33 @@ def test_what_no_energy_can_do_without_is_asked_for():
     table = made_curve()
     with pytest.raises(TableError, match="--quality-factor '200 \\+- 2'"):
         tapping(replace(table, quality_factor=None, quality_factor_error=None))
-    with pytest.raises(TableError, match="--spring-constant"):
-        tapping(replace(table, spring_constant_n_per_m=None, mass_ng=None))
     with pytest.raises(TableError, match="use `afm-jax fit`"):
         tapping(fitting.read_table(AMPLITUDES))
+
+
+def test_without_a_spring_constant_energies_are_over_it():
+    table = made_curve()
+    exact = replace(table, spring_constant_error_n_per_m=1e-6)
+    known = tapping(exact, law=False)
+    found = tapping(
+        replace(table, spring_constant_n_per_m=None, spring_constant_error_n_per_m=None, mass_ng=None), law=False
+    )
+    answer, wanted = found.to_dict(), known.to_dict()
+    assert answer["energy_per_tap_aj"] is None
+    assert answer["energy_per_tap_reason"] == "the spring constant is not known: energies are over it, in nm^2"
+    per_tap = answer["energy_per_tap_over_k_nm2"]
+    assert per_tap["value"] == pytest.approx(wanted["energy_per_tap_aj"]["value"] / K, rel=1e-3)
+    for one, other in zip(answer["branches"], wanted["branches"], strict=True):
+        curve, theirs = one["curve"], other["curve"]
+        np.testing.assert_allclose(curve["energy_over_k_nm2"], np.array(theirs["energy_aj"]) / K, rtol=1e-2)
+        assert "energy_aj" not in curve
+    # m/k cancels in it
+    assert answer["epsilon_nm2_per_us2"]["value"] == pytest.approx(wanted["epsilon_nm2_per_us2"]["value"], rel=1e-3)
+    text = tapping_summary(found)
+    assert "spring constant not known: energies and virials are over it, in nm^2" in text
+    assert re.search(r"Energy of a tap: [\d.]+ \+- [\d.]+ nm\^2 ", text)
+    assert " eV" not in text
+    assert not re.search(r"\d aJ", text)
 
 
 def test_without_a_phase_there_is_a_bound():

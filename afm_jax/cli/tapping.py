@@ -91,7 +91,7 @@ def _finish(session: Session, result: "Tapping") -> None:
         for path in write_tapping(result, session.out, session.write_table):
             session.note(f"wrote {path}")
     if not result.valid:
-        raise NotValid(result.reasons[0])
+        raise NotValid(result.in_unit(result.reasons[0]))
 
 
 def _finish_several(session: Session, path: Path, file: "MeasuredFile", results: "dict[int, Tapping]") -> None:

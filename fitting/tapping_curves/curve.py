@@ -62,7 +62,8 @@ class TappingCurve:
         both_ways: whether the curve says which way the sample moves.
         free_frequency_khz: f0.
         quality_factor: Q.
-        spring_constant_n_per_m: k.
+        spring_constant_n_per_m: k, of the mode (1.03 times the static one of a rectangular cantilever).
+        over_spring_constant: whether k is not known: it counts as 1 N/m, and energies in aJ are those over k in nm^2.
         tip_calibration: true length over the length stated, of every amplitude.
         phase_zero_deg: lag that the instrument adds; None: nothing is known of it.
         height_known: whether heights count from the tip's rest position.
@@ -88,6 +89,7 @@ class TappingCurve:
     free_frequency_khz: Given
     quality_factor: Given
     spring_constant_n_per_m: Given
+    over_spring_constant: bool = False
     tip_calibration: Given = EXACTLY_ONE
     phase_zero_deg: Given | None = None
     height_known: bool = True

@@ -55,7 +55,7 @@ def curve_figure(result: Tapping) -> Figure:
     label_axes(
         bottom,
         x="height of the sample over the tip's rest position (nm)" if curve.height_known else "height (nm)",
-        y="energy of a tap (aJ)" if curve.has_phase else "at most (aJ)",
+        y=result.in_unit("energy of a tap (aJ)" if curve.has_phase else "at most (aJ)"),
     )
     # a legend in the panel would hide readings
     bottom.legend(fontsize=_SMALL, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=4)
@@ -127,7 +127,9 @@ def _energy_bands(axes: Axes, result: Tapping) -> tuple[float, float]:
                 "--",
                 color=DARK,
                 lw=1.0,
-                label=f"one energy, {'repulsive' if group.repulsive else 'attractive'}: {energy:.3g} aJ",
+                label=result.in_unit(
+                    f"one energy, {'repulsive' if group.repulsive else 'attractive'}: {energy:.3g} aJ"
+                ),
             )
             ends += [low, high]
     return min(ends), max(ends)

@@ -37,7 +37,7 @@ def tapping_summary(result: Tapping) -> str:
     lines += ["", *(broken(law, _WIDTH) if result.law is None else [law])]
     lines += [piece for line in bullets("Assumed:", result.assumptions) for piece in broken(line, _WIDTH, "    ")]
     lines += [piece for line in bullets("Notes:", result.warnings) for piece in broken(line, _WIDTH, "    ")]
-    return "\n".join(lines)
+    return result.in_unit("\n".join(lines))
 
 
 def _counts(result: Tapping) -> str:
@@ -48,10 +48,10 @@ def _counts(result: Tapping) -> str:
 
 def energy_in_words(result: Tapping) -> str:
     """Return the energy of a tap in aJ and eV."""
-    energy, largest = result.energy, result.largest
+    energy, largest, over_k = result.energy, result.largest, result.curve.over_spring_constant
     if energy["kind"] == "upper bound":
         high = energy["interval95"][1]
-        return f"at most {high:.3g} aJ, {_EV_PER_AJ * high:.3g} eV"
+        return f"at most {high:.3g} aJ" + ("" if over_k else f", {_EV_PER_AJ * high:.3g} eV")
     if energy["value"] is None:
         if largest is None or result.why_not_functions:
             return "not known" if energy["kind"] != "several" else energy["reason"]
@@ -60,8 +60,8 @@ def energy_in_words(result: Tapping) -> str:
         return f"{start} at most {value} aJ, at {largest['amplitude_ratio']:.2f} of the free amplitude"
     low, high = energy["interval95"]
     value = with_error(energy["value"], energy["standard_error"])
-    electronvolts = interval(_EV_PER_AJ * low, _EV_PER_AJ * high)
-    return f"{value} aJ (95 %: {interval(low, high)}), {electronvolts} eV, if each takes the same"
+    electronvolts = "" if over_k else f" {interval(_EV_PER_AJ * low, _EV_PER_AJ * high)} eV,"
+    return f"{value} aJ (95 %: {interval(low, high)}),{electronvolts} if each takes the same"
 
 
 def law_in_words(result: Tapping) -> str:
@@ -132,7 +132,8 @@ def _energy_lines(result: Tapping) -> list[str]:
     lines = ["", "One energy for all taps of a branch (assumed: each takes the same):"]
     if epsilon["value"] is not None:
         value = with_error(epsilon["value"], epsilon["standard_error"])
-        lines.append(f"  epsilon = 2 E/m = {value} nm^2/us^2, m = {result.mass_ng:.4g} ng")
+        of_mass = "" if result.curve.over_spring_constant else f", m = {result.mass_ng:.4g} ng"
+        lines.append(f"  epsilon = 2 E/m = {value} nm^2/us^2" + of_mass)
     if plainly["mean"] is not None:
         scatter = known(plainly["standard_deviation"], ".2g")
         lines.append(
@@ -267,7 +268,7 @@ def write_tapping(
     ]
     frames_path = folder / "tapping_frames.png"
     write_whole(frames_path, frames)
-    records = result.records()
+    records = result.keyed(result.records())
     write_table("tapping_rows.csv", records, tuple(records[0]))
     law = [] if result.law is None else write_report(result.law, folder, write_table)
     return [*written, frames_path, *law]
@@ -315,7 +316,7 @@ def tapping_page(result: Tapping, pictures: list[bytes]) -> str:
     aside = {i for i, record in enumerate(records) if (record["note"] or "").startswith("set aside")}
     energy = result.energy
     shares = {origin_in_words(name): percent(share) for name, share in energy.get("share_of_variance", {}).items()}
-    return page(
+    text = page(
         "tapping.html.jinja",
         result=result,
         title=f"Tapping curve {result.table.source}",
@@ -355,6 +356,7 @@ def tapping_page(result: Tapping, pictures: list[bytes]) -> str:
         ),
         versions=pairs("Versions of what computed it", ("package", "version"), result.versions),
     )
+    return result.in_unit(text)
 
 
 def _cell(value: Any, form: str) -> str:

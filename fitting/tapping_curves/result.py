@@ -1,5 +1,6 @@
 """What `tapping` found, row by row, as one energy, as thresholds and as a law, with everything that went into it."""
 
+import re
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -358,6 +359,26 @@ class Tapping(Result):
         return {} if self.functions is None else differences_of_ways(self.branches, self.functions)
 
     @property
+    def _spring_constant_in_words(self) -> str:
+        if self.curve.over_spring_constant:
+            return "spring constant not known: energies and virials are over it, in nm^2 (aJ over N/m)"
+        return f"spring constant {self.curve.spring_constant_n_per_m} N/m"
+
+    def in_unit(self, text: str) -> str:
+        """Return a text about energies in aJ with the unit that they have: nm^2 without a spring constant."""
+        return re.sub(r"\baJ\b(?! over)", "nm^2", text) if self.curve.over_spring_constant else text
+
+    def keyed(self, payload: Any) -> Any:
+        """Return mappings with keys `..._aj` as they are, or without a spring constant as `..._over_k_nm2`."""
+        if not self.curve.over_spring_constant:
+            return payload
+        if isinstance(payload, dict):
+            return {re.sub("_aj$", "_over_k_nm2", str(key)): self.keyed(value) for key, value in payload.items()}
+        if isinstance(payload, list):
+            return [self.keyed(value) for value in payload]
+        return self.in_unit(payload) if isinstance(payload, str) else payload
+
+    @property
     def epsilon(self) -> dict[str, Any]:
         """2 E/m in nm^2/us^2: what a tap takes, as the impact law counts it."""
         energy, factor = self.energy, 2.0 / self.mass_ng
@@ -507,7 +528,7 @@ class Tapping(Result):
         found = [
             (
                 f"free frequency {curve.free_frequency_khz} kHz, Q {curve.quality_factor}, "
-                f"spring constant {curve.spring_constant_n_per_m} N/m, calibration {curve.tip_calibration}"
+                f"{self._spring_constant_in_words}, calibration {curve.tip_calibration}"
             ),
         ]
         if curve.assumed:
@@ -599,7 +620,7 @@ class Tapping(Result):
             }
             for branch in self.branches
         ]
-        return plain(
+        payload = plain(
             {
                 "valid": self.valid,
                 "reasons": self.reasons,
@@ -650,6 +671,10 @@ class Tapping(Result):
                 "versions": self.versions,
             }
         )
+        if not self.curve.over_spring_constant:
+            return payload
+        why = "the spring constant is not known: energies are over it, in nm^2"
+        return {**self.keyed(payload), "energy_per_tap_aj": None, "energy_per_tap_reason": why}
 
 
 def _nuisances(nuisances: tuple[Nuisance, ...]) -> dict[str, Any]:

@@ -71,7 +71,7 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
     """Return a table's rows as a tapping curve.
 
     Raises:
-        TableError: if it is a table of another drive, or Q or the spring constant is missing.
+        TableError: if it is a table of another drive, or Q is missing.
     """
     name = printable(table.source)
     if not table.tapping:
@@ -79,26 +79,19 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
             f"{name}: is a table of a sample that moves; say '# drive = force' (or base) where the cantilever is "
             "driven, or use `afm-jax fit`"
         )
-    missing = []
     quality = np.nan_to_num(table.quality_factor or 0.0)
     if not quality:
-        missing.append(("the quality factor", "quality_factor = 200 +- 2", "--quality-factor '200 +- 2'"))
-    if table.mass_ng is None:
-        missing.append(
-            ("the spring constant", "spring_constant_n_per_m = 5.4 +- 0.5", "--spring-constant '5.4 +- 0.5'")
-        )
-    if missing:
-        what, lines, options = zip(*missing, strict=True)
         raise TableError(
-            f"{name}: {' and '.join(what)} {'is' if len(what) == 1 else 'are'} missing; give {' '.join(options)}, or "
-            f"the comment line '# {lines[0]}'"
+            f"{name}: the quality factor is missing; give --quality-factor '200 +- 2', or the comment line "
+            "'# quality_factor = 200 +- 2'"
         )
     if table.lockin_amplitude_nm is None or table.lockin_amplitude_error_nm is None:
         raise TableError(f"{name}: there is no lockin_amplitude_nm; the energy needs the lock-in's amplitude and phase")
     rows = np.isfinite(table.lockin_amplitude_nm)
     blank = np.full(table.rows, np.nan)
     lag, lag_error = (blank if part is None else part for part in (table.phase_lag_deg, table.phase_lag_error_deg))
-    spring = table.spring_constant_n_per_m or _stiffness(table)
+    unknown = table.spring_constant_n_per_m is None and table.mass_ng is None
+    spring = 1.0 if unknown else table.spring_constant_n_per_m or _stiffness(table)
     given = {
         "free_frequency_khz": (table.free_frequency_khz, table.free_frequency_error_khz),
         "quality_factor": (quality, table.quality_factor_error),
@@ -122,9 +115,14 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
         both_ways=table.retract is not None,
         free_frequency_khz=given_or_usual("free_frequency_khz", *given["free_frequency_khz"]),
         quality_factor=given_or_usual("quality_factor", *given["quality_factor"]),
-        spring_constant_n_per_m=given_or_usual("spring_constant_n_per_m", *given["spring_constant_n_per_m"]),
+        spring_constant_n_per_m=Given(spring)
+        if unknown
+        else given_or_usual("spring_constant_n_per_m", *given["spring_constant_n_per_m"]),
+        over_spring_constant=unknown,
         tip_calibration=given_or_usual("tip_calibration", *given["tip_calibration"]),
-        assumed=tuple(name for name, (_, error) in given.items() if not error),
+        assumed=tuple(
+            name for name, (_, error) in given.items() if not error and not (unknown and name.startswith("spring"))
+        ),
         phase_zero_deg=None if zero is None else Given(*zero),
         origin_error_nm=table.calibration.get("offset_origin_nm", (0.0, _ORIGIN_NM))[1],
         lines=np.asarray(table.lines),
