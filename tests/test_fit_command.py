@@ -162,6 +162,7 @@ def test_repeated_readings_count_and_tell_the_error(tmp_path, reported):
     assert strictly(reported[0].stdout)["repeats"] is None
 
 
+@pytest.mark.slow
 def test_a_drift_of_the_phase_is_noticed_and_fitted_along(tmp_path, reported):
     table = read_table(EXAMPLE)
     drift = 2.0 * np.linspace(0.0, 1.0, table.rows)
@@ -181,6 +182,42 @@ def test_a_drift_of_the_phase_is_noticed_and_fitted_along(tmp_path, reported):
         low, high = answer["parameters"][name]["interval95"]
         assert low < truth < high
     assert not any("follow the rows" in note for note in answer["warnings"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("columns", "factor", "words"),
+    [
+        (("peak_amplitude", "lockin_amplitude"), 1e-3, "the tip's amplitudes times 1000 (micrometres were written"),
+        (("peak_amplitude", "lockin_amplitude"), 2.0, "the tip's amplitudes halved (peak to peak"),
+        (("drive_amplitude",), 0.5**0.5, "the drive's amplitude times sqrt 2 (rms"),
+        (("drive_frequency",), 1e3, "the drive's frequency over 1000 (Hz"),
+    ],
+)
+def test_a_table_in_other_units_is_told_which(tmp_path, columns, factor, words):
+    table = read_table(EXAMPLE)
+    names = [f"{column}{end}_{unit}" for column in columns for end in ("", "_error") for unit in ("nm", "khz")]
+    scaled = {name: factor * column for name in names if (column := getattr(table, name, None)) is not None}
+    assert scaled
+    write_table(dataclasses.replace(table, **scaled), tmp_path / "other.csv")
+    result = run(tmp_path / "other.csv", "--json")
+    assert result.exit_code == 3
+    (said,) = [reason for reason in strictly(result.stdout)["reasons"] if "Check the units" in reason]
+    assert said.startswith(f"With {words}")
+
+
+@pytest.mark.slow
+def test_frequencies_and_lengths_that_no_cantilever_has_are_noted(tmp_path):
+    table = read_table(EXAMPLE)
+    hertz = dataclasses.replace(
+        table, free_frequency_khz=1e3 * table.free_frequency_khz, drive_frequency_khz=1e3 * table.drive_frequency_khz
+    )
+    lengths = [name for name in table.form.names if name.endswith("_nm") and getattr(table, name) is not None]
+    small = dataclasses.replace(table, **{name: 1e-3 * getattr(table, name) for name in lengths})
+    for scaled, words in ((hertz, "Hz for kHz"), (small, "micrometres for nanometres")):
+        write_table(scaled, tmp_path / "other.csv")
+        answer = strictly(run(tmp_path / "other.csv", "--json").stdout)
+        assert any(words in said for said in (*answer["warnings"], *answer["reasons"]))
 
 
 def test_contact_data_end_with_exit_code_3(contact_table_path):

@@ -12,7 +12,7 @@ from click.testing import CliRunner
 import fitting.instruments.formats as formats_module
 from afm_jax.cli.main import main
 from fitting import TableError, read_curve, read_curves, read_table
-from fitting.examples.make_raw_curve import EXAMPLE, FREE_NM, NM_PER_VOLT, raw_curve, true_energy_aj
+from fitting.examples.make_raw_curve import EXAMPLE, FREE_NM, NM_PER_VOLT, RawCurve, raw_curve, true_energy_aj
 from fitting.instruments.columns import parse_columns
 from fitting.instruments.curve import table_text
 from fitting.instruments.formats import read_recording
@@ -308,6 +308,30 @@ def test_slope_and_free_amplitude_of_a_curve_with_an_attractive_plateau(tmp_path
     free = curve.number("free_amplitude_nm")
     assert free is not None
     assert free / float(scale.value) == pytest.approx(FREE_NM / NM_PER_VOLT, rel=1.5e-3)
+
+
+def test_approach_and_retract_that_are_mixed_are_named(tmp_path: Path):
+    made = raw_curve(400, drift=0.0)
+    order = np.random.default_rng(2).permutation(400)
+    columns = {"Z (nm)": made.height_nm[0][order], "Amp (nm)": 42.0 * made.amplitude_v[0][order]}
+    curve = read_curve(saved(tmp_path, separated(columns)))
+    assert set(curve.branch) == {"approach"}
+    assert any("approach and retract cannot be told apart" in note for note in curve.notes)
+    # rows of two branches in turn, 1 nm apart in contact
+    there, back = (
+        42.0 * made.amplitude_v[0],
+        np.interp(made.height_nm[0] + 1.0, np.sort(made.height_nm[0]), there_sorted(made)),
+    )
+    heights = np.repeat(made.height_nm[0], 2)
+    both = np.stack([there, back], axis=1).ravel()
+    curve = read_curve(saved(tmp_path, separated({"Z (nm)": heights, "Amp (nm)": both})))
+    assert any("as where approach and retract are mixed" in note for note in curve.notes)
+    plain = read_curve(saved(tmp_path, separated({"Z (nm)": made.height_nm[0], "Amp (nm)": there})))
+    assert not any("mixed" in note or "told apart" in note for note in plain.notes)
+
+
+def there_sorted(made: RawCurve) -> np.ndarray:
+    return 42.0 * made.amplitude_v[0][np.argsort(made.height_nm[0], kind="stable")]
 
 
 def test_a_curve_without_a_free_part_is_refused(tmp_path: Path):

@@ -44,6 +44,7 @@ PARAMETERS = {
     "ImpactLaw",
     "Platform",
     "Scene",
+    "TabulatedLaw",
     "Tone",
 }
 """What a simulation is made of, and scene files hold."""

@@ -223,6 +223,29 @@ def test_what_no_energy_can_do_without_is_asked_for():
         tapping(fitting.read_table(AMPLITUDES))
 
 
+def test_phases_of_another_sign_or_zero_are_told_by_the_free_rows():
+    table = made_curve()
+    assert table.phase_lag_deg is not None
+    lag = table.phase_lag_deg
+    known = replace(table, calibration=table.calibration | {"phase_zero_deg": (0.0, 1.0)})
+    wanted = tapping(replace(known, phase_lag_deg=lag), law=False)
+    for other, said in (
+        (-lag, "the phase leads"),
+        (lag - 90.0, "zero is -90 degrees off"),
+        (lag + 90.0, "zero is +90"),
+    ):
+        found = tapping(replace(known, phase_lag_deg=other), law=False)
+        np.testing.assert_allclose(found.rows.energy_aj, wanted.rows.energy_aj, atol=1e-9)
+        assert any(said in one for one in found.assumptions)
+    with pytest.raises(TableError, match="write degrees, not radians"):
+        tapping(replace(known, phase_lag_deg=np.deg2rad(lag)), law=False)
+    wrong = lag.copy()
+    row = int(np.argmax(table.offset_nm * (np.asarray(table.lockin_amplitude_nm) > 0.6 * table.excitation_nm)))
+    wrong[row] = 250.0
+    with pytest.raises(TableError, match=r"lags by 250.0 degrees .*outside 0 to 180, as 1 of"):
+        tapping(replace(known, phase_lag_deg=wrong), law=False)
+
+
 def test_without_a_spring_constant_energies_are_over_it():
     table = made_curve()
     exact = replace(table, spring_constant_error_n_per_m=1e-6)

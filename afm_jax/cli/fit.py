@@ -186,7 +186,7 @@ def command(session: Session, tables: tuple[Path, ...], model: str, noise: float
         fit_tables(session, read, {"model": model, **settings}, options["workers"])
         return
     session.start_computing(*(f"fitting.forward:{name}" for name in ("impacts_of", "located", "linearise_pairs")))
-    from fitting.fits.fit import find_fit, summarise  # noqa: PLC0415
+    from fitting.fits.fit import find_fit, summarise_in_units  # noqa: PLC0415
     from fitting.report.report import summary  # noqa: PLC0415
     from fitting.tables.several import SeveralTables  # noqa: PLC0415
 
@@ -202,7 +202,7 @@ def command(session: Session, tables: tuple[Path, ...], model: str, noise: float
     rows = f"{measured.rows} rows" + (f" of {len(read)} tables" if len(read) > 1 else "")
     with session.working(f"fitting {rows}, model {model} ({first})"):
         found = find_fit(measured, model, **settings)
-        result = summarise(measured, found)
+        result = summarise_in_units(measured, found)
     extras, failure = _extras(session, found, result, settings, options)
     payload = result.to_dict() | {name: extra.to_dict() for name, extra in extras.items()}
     session.emit(payload, partial(summary, result), *(partial(_words, name, extra) for name, extra in extras.items()))

@@ -227,7 +227,6 @@ COMMANDS = {
     "effects": ("afm_jax.cli.effects", "Say what each effect of a scene changes and costs, and which can be left out."),
     "figures": ("afm_jax.cli.figures", "Draw figures 2 to 11 of the paper, with its statements checked."),
     "fit": ("afm_jax.cli.fit", "Fit the impact law to a table of vibration amplitudes."),
-    "fit-law": ("afm_jax.cli.fit_law", "Fit the impact law and the delay law to a simulated contact."),
     "invert": ("afm_jax.cli.invert", "Read speeds and delay of every impact off amplitude and phase, without a law."),
     "lockin": ("afm_jax.cli.lockin", "Read response order, amplitudes and phase off time traces of the deflection."),
     "lyapunov": ("afm_jax.cli.lyapunov", "Compute Lyapunov exponents of a motion, or along a parameter."),

@@ -1,10 +1,12 @@
 """`afm-jax orbits SCENE.toml|PRESET --order N [--impacts m]`: the orbits of a scene."""
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from afm_jax.cli.fitted_law import extrapolation_of, with_fitted_law, with_law_option
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import SceneName, scene_and_start
@@ -88,8 +90,9 @@ class PositiveInteger(click.ParamType):
     type=PositiveInteger(),
     help="Impacts in these periods, found by a search from many starts; without it, all single-impact orbits.",
 )
+@with_law_option
 @with_session
-def command(session: Session, scene: str, order: int, impacts: int | None) -> None:
+def command(session: Session, scene: str, order: int, impacts: int | None, law: Path | None) -> None:
     """Find all single-impact orbits of a scene, or with --impacts orbits of several impacts.
 
     Of every orbit: impact phase and velocities, peak and lock-in amplitude of the height, whether it is stable, and
@@ -106,6 +109,7 @@ def command(session: Session, scene: str, order: int, impacts: int | None) -> No
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
     loaded, _ = scene_and_start(scene)
+    loaded, _ = with_fitted_law(loaded, law)
     if impacts is not None or isinstance(loaded.interaction, Contact):
         _many(session, loaded, scene, order, impacts or 1)
         return
@@ -119,6 +123,7 @@ def command(session: Session, scene: str, order: int, impacts: int | None) -> No
     orbits = orbit_rows(found)
     reason = None if any(orbit["admissible"] for orbit in orbits) else why_none(loaded, order, rejected=len(orbits))
     near_fold = any(orbit["near_double"] for orbit in orbits)
+    beyond = extrapolation_of(loaded, [orbit["approach_speed_nm_per_us"] for orbit in orbits])
     if not bool(found.complete):
         session.note("there are more orbits than could be listed; the slowest are shown")
     session.write_table("orbits.csv", orbits, told)
@@ -129,10 +134,12 @@ def command(session: Session, scene: str, order: int, impacts: int | None) -> No
             "scene": scene_tables(loaded),
             "orbits": orbits,
             "complete": found.complete,
+            "extrapolated": beyond,
             "reason": reason,
         },
         orbit_table(orbits, title=f"Orbits with one impact in {order} drive period{'s' if order > 1 else ''}"),
         *(["Two of them nearly coincide (a fold): derivatives there have no meaning."] if near_fold else []),
+        *([] if beyond is None else [beyond]),
     )
     if reason is not None:
         raise NotValid(reason)
@@ -144,12 +151,16 @@ def refuse_other_than_law(scene: "Scene", path: str) -> None:
     Raises:
         ValueError: if not; says what gives one.
     """
-    from afm_jax.impact.law import ImpactLaw  # noqa: PLC0415
+    from afm_jax.impact.law import Law  # noqa: PLC0415
 
-    if isinstance(scene.interaction, ImpactLaw):
+    if isinstance(scene.interaction, Law):
         return
     absent = scene.interaction is None
-    advice = "a tip that meets nothing has none" if absent else f"`afm-jax fit-law {path}` gives a contact's law"
+    advice = (
+        "a tip that meets nothing has none"
+        if absent
+        else f"`afm-jax collide {path} --make-law --out DIR` gives a contact's law"
+    )
     raise ValueError(
         f'{path}: [interaction] model: must be "law" here, but is "{"none" if absent else "contact"}"; {advice}'
     )
@@ -276,7 +287,7 @@ def many_table(orbits: Sequence[Mapping[str, Any]], *, title: str) -> "Table":
 
 def columns_of(found: "SingleImpactOrbits") -> tuple[str, ...]:
     """Return what is told of orbits: what their scene has."""
-    return (*COLUMNS, *(name for name in DRIVEN_COLUMNS if getattr(found, name) is not None))
+    return (*COLUMNS, *(name for name in (*DRIVEN_COLUMNS, "extrapolated") if getattr(found, name) is not None))
 
 
 def orbit_rows(found: "SingleImpactOrbits") -> list[dict[str, Any]]:

@@ -1,10 +1,12 @@
 """`afm-jax simulate SCENE.toml|PRESET`: a scene in time, and what an experiment reads of it."""
 
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from afm_jax.cli.fitted_law import extrapolation_of, with_fitted_law, with_law_option
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import Finite, SceneName
@@ -83,6 +85,7 @@ class Multiples(click.ParamType):
     help="Write trace.csv into --out, too: the deflection over the last response periods at equal steps of time, as "
     "`afm-jax lockin` reads it.",
 )
+@with_law_option
 @with_session
 def command(  # noqa: PLR0913
     session: Session,
@@ -95,6 +98,7 @@ def command(  # noqa: PLR0913
     accuracy: float,
     method: str,
     samples: str | None,
+    law: Path | None,
 ) -> None:
     """Follow a scene in time: contacts, amplitudes, phases, forces, energies.
 
@@ -118,6 +122,7 @@ def command(  # noqa: PLR0913
     from afm_jax.motion.observe import observe  # noqa: PLC0415
 
     loaded, told = scene_and_start(scene)
+    loaded, _ = with_fitted_law(loaded, law)
     period = drive_of(loaded).period_us
     until_settled = until_settled or (duration_us is None and periods is None)
     longest = duration_us if duration_us is not None else (periods or DEFAULT_PERIODS) * period
@@ -141,12 +146,14 @@ def command(  # noqa: PLR0913
         "pieces": run.pieces,
     }
     payload = payload_of(loaded, run, seen, settings)
+    beyond = extrapolation_of(loaded, run.simulation.contacts.approach_speed_nm_per_us)
+    payload["extrapolated"] = beyond
     if session.out is not None:
         write_files(session, run, seen, dense, payload)
         if samples:
             write_trace(session, loaded, run, seen.window)
         _draw(session, loaded, run, dense)
-    session.emit(payload, *text_of(payload))
+    session.emit(payload, *text_of(payload), *([] if beyond is None else [beyond]))
     if not payload["valid"]:
         raise NotValid(payload["outcome"])
 

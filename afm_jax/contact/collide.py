@@ -91,7 +91,7 @@ class Collision(ResultTuple):
         outcome = np.asarray(self.outcome)
         lost = outcome > CollisionOutcome.CAPTURED_BY_JUNCTION
         stays = lost | np.asarray(self.captured)
-        return dict.fromkeys(ONLY_FREE, stays) | dict.fromkeys(("deepest_gap_nm", "end_energy_aj"), lost)
+        return {**dict.fromkeys(ONLY_FREE, stays), "deepest_gap_nm": lost, "end_energy_aj": lost}
 
 
 @checked

@@ -31,7 +31,7 @@ from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.impact.implicit import absent, implicit_pair, implicit_root
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
 from afm_jax.impact.lasting_impact import Impact, PulledImpact, crawls, depth_of_impact, middle_of_contact
-from afm_jax.impact.law import ImpactLaw, Law, Speeds, impact_law_of
+from afm_jax.impact.law import ImpactLaw, Law, Speeds, TabulatedLaw, impact_law_of
 from afm_jax.impact.roots import COARSE, TAPPED, find_roots
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, public_result
@@ -78,6 +78,7 @@ class SingleImpactOrbits(Result, eqx.Module):
         deflection_lockin_phase_deg: phase of the deflection at omega/N, modulo 360/N.
         deflection_drive_lockin_amplitude_nm: amplitude of the deflection at the drive's frequency omega.
         deflection_drive_lockin_phase_deg: phase of the deflection at omega.
+        extrapolated: of a law that is a table: the approach speed is outside the table's; None of a formula.
     """
 
     exists: Bool[Array, "..."]
@@ -104,6 +105,7 @@ class SingleImpactOrbits(Result, eqx.Module):
     deflection_lockin_phase_deg: Float[Array, "..."] | None = None
     deflection_drive_lockin_amplitude_nm: Float[Array, "..."] | None = None
     deflection_drive_lockin_phase_deg: Float[Array, "..."] | None = None
+    extrapolated: Bool[Array, "..."] | None = None
 
 
 @checked
@@ -182,7 +184,7 @@ def orbit_at(place: OrbitPlace, found: Bool[Array, ""], frame: FreeFrame, proble
     if frame.response is not None:
         ends = jnp.stack([flight.start_us, flight.start_us + flight.duration_us])
         velocities = velocities + _alone(frame.response).velocity(ends)
-    seen = _seen(state, frame, problem)
+    seen, law = _seen(state, frame, problem), problem.impact
 
     def known(value):
         return jnp.where(found, value, absent(value))
@@ -201,6 +203,7 @@ def orbit_at(place: OrbitPlace, found: Bool[Array, ""], frame: FreeFrame, proble
         trace=known(verdict.trace),
         determinant=known(verdict.determinant),
         complete=found,
+        extrapolated=found & law.extrapolated(speeds.approach) if isinstance(law, TabulatedLaw) else None,
         **{name: known(value) for name, value in seen.items()},
     )
 
@@ -253,8 +256,8 @@ def _seen(state: OrbitState, frame: FreeFrame, problem: OrbitProblem) -> dict[st
         """Return peak, readings at omega/N and at omega, and the lag, of the free motion with another one added."""
         with_it, alone = (along_and_across(amplitude, angle, wave) for wave in (motion, None))
         # the drive's frequency is the response's for N = 1 alone; the scene's own clock is ahead by the frame's phase
-        slow = (jnp.where(order == 1.0, one, other) for one, other in zip(with_it, alone, strict=True))
-        size, behind = size_and_lag(*slow, frame.phase_rad, order)
+        along, across = (jnp.where(order == 1.0, one, other) for one, other in zip(with_it, alone, strict=True))
+        size, behind = size_and_lag(along, across, frame.phase_rad, order)
         at_drive = along_and_across(drive_amplitude, drive_angle, motion)
         drive_size, drive_behind = size_and_lag(*at_drive, frame.phase_rad)
         _, lag = size_and_lag(*at_drive, frame.drive_phase_rad)

@@ -27,16 +27,17 @@ def draw_collisions(
         path: PNG file.
         title: of the picture.
     """
-    columns = (np.array([row[name] for row in rows], dtype=float) for name in _DRAWN)
+    approach, rebound, delay = (np.array([row[name] for row in rows], dtype=float) for name in _DRAWN)
     captured = np.array([bool(row["captured"]) for row in rows])
-    save(_collisions(*columns, captured, capture_speed_nm_per_us, title), path)
+    save(_collisions(approach, rebound, delay, captured, capture_speed_nm_per_us, title), path)
 
 
 def collisions_figure(found: Collision) -> Figure:
     """Return the picture of collisions that `afm-jax collide` draws, too."""
     columns = {name: array.ravel() for name, (array, _) in known_columns(found).items()}
     title = f"Collisions of {counted(columns['captured'].size, 'free tip')}"
-    return _collisions(*(columns[name] for name in _DRAWN), columns["captured"], None, title)
+    approach, rebound, delay = (columns[name] for name in _DRAWN)
+    return _collisions(approach, rebound, delay, columns["captured"], None, title)
 
 
 _DRAWN = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us")

@@ -339,7 +339,8 @@ def forecast(
         step = step_of(some, left_out, free)
         covariance = step.covariance
         if not len(belief.measured):
-            member = member_after(step, left_out, objective.measurement, belief.values, rows.approach[:count], free)
+            speeds = rows.approach[:count]
+            member = member_after(step, left_out, objective.measurement, belief.values, speeds, free, computed=False)
             covariance = covariance if member is None else member.covariance
         errors[count] = np.sqrt(np.diag(covariance))[: len(size)]
     return errors

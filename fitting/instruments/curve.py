@@ -248,6 +248,7 @@ def _joined(
                     raise TableError(f"{where}: the {segment.branch} has no channel {source.channel}")
                 parts[role].append(_converted(recording, segment, source, role))
         branches += _branches(segment.branch, parts["offset_nm"][-1])
+        notes += _mixed_note(segment.branch, parts["offset_nm"][-1])
     lags = parts["phase_lag_deg"]
     # each was unwrapped from its own first row
     lags[1:] = [lag - 360.0 * np.round((np.median(lag) - np.median(lags[0])) / 360.0) for lag in lags[1:]]
@@ -388,6 +389,20 @@ def _ends(curve: MeasuredCurve) -> dict[str, tuple[float, float]]:
     return {name: (float(one[0]), float(one[-1])) for name, one in heights.items()}
 
 
+_MIXED = 5.0
+"""Scatter of readings in contact over that of the free tip from which they may be of two branches."""
+_JUMPS = 0.05
+"""Median step of the heights, of their range, from which they are no ramp."""
+
+
+def _mixed_note(branch: str, offset: Float[np.ndarray, " rows"]) -> list[str]:
+    """Return a sentence where heights jump about, so that nothing says which rows are approach and which retract."""
+    if branch or len(offset) < 20 or np.median(np.abs(np.diff(offset))) < _JUMPS * np.ptp(offset):
+        return []
+    what = "approach and retract cannot be told apart: all rows are taken as one branch; else give a column branch"
+    return [f"Direction: heights jump to and fro, so that {what}."]
+
+
 def _binning(curve: MeasuredCurve, bin_nm: float | None) -> MeasuredCurve:
     """Return a curve with the width of its table's bins: as given, or the usual one where heights ask for bins."""
     repeated, back = faults_of_order(curve.offset_nm, curve.branch)
@@ -397,8 +412,19 @@ def _binning(curve: MeasuredCurve, bin_nm: float | None) -> MeasuredCurve:
     why = f"{repeated} rows repeat a height and {back} step back" if repeated or back else "asked for"
     how = f"of {width:.3g} nm" if width else "of equal height"
     error = ", with their scatter for an error" if width else ""
-    note = f"Bins: {why}; the table has the means of bins {how}{error} (--bin-nm)."
-    return replace(curve, bin_nm=width, notes=(*curve.notes, note))
+    notes = [f"Bins: {why}; the table has the means of bins {how}{error} (--bin-nm)."]
+    binned_curve = replace(curve, bin_nm=width)
+    if width and curve.amplitude is not None and curve.amplitude_unit == "nm" and curve.free.any():
+        rows = _rows(binned_curve)
+        single = rows.errors["amplitude"] * np.sqrt(rows.rows)
+        far = rows.readings["amplitude"] > np.median(curve.amplitude[curve.free]) - 3.0 * np.median(single)
+        times = np.percentile(single[~far], 90.0) / np.median(single[far]) if far.any() and not far.all() else 0.0
+        if times > _MIXED:
+            notes.append(
+                f"Scatter: in contact readings at one height scatter {times:.0f} times as much as far away, as where "
+                "approach and retract are mixed; give them as a column branch, or as OUT/BACK in --columns."
+            )
+    return replace(binned_curve, notes=(*curve.notes, *notes))
 
 
 _ASSUMED_ORIGIN_NM = 1.0

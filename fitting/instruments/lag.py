@@ -50,7 +50,7 @@ def sense_of(free_phase_deg: float, free_lag: float, *, sign_given: bool = False
     if not sign_given and abs(opposite) < _NEAR_DEG and abs(free_lag) > _NEAR_DEG:
         note = (
             f"Sign: the free tip reads {free_phase_deg:.1f} deg where its lag is {free_lag:.1f}: the phase leads, and "
-            "was taken with the opposite sign; else --columns phase_lag_deg=CHANNEL:1."
+            "was taken with the opposite sign."
         )
         return PhaseSense(-1.0, free_phase_deg + free_lag, note)
     zero = free_phase_deg - free_lag

@@ -71,6 +71,7 @@ class TappingCurve:
         harmonic_amplitudes_nm: amplitudes at multiples of the drive's frequency, by multiple.
         lines: where each row stands in its file.
         time: place of each row in the order of measurement, from -1/2 to 1/2; None: that order is not known.
+        phase_note: how the sign or the zero of the phase was told from the free rows, if that was odd.
         assumed: what of the instrument was given without an error: it has a usual one (`USUAL_ERRORS`).
     """
 
@@ -97,6 +98,7 @@ class TappingCurve:
     harmonic_amplitudes_nm: dict[int, Rows] = field(default_factory=dict)
     lines: Int[np.ndarray, " rows"]
     time: Rows | None = None
+    phase_note: str = ""
     assumed: tuple[str, ...] = ()
 
     @property

@@ -10,6 +10,7 @@ from jaxtyping import Bool
 from afm_jax.checks import checked
 from afm_jax.scenefile.tables import printable
 from afm_jax.units import RAD_PER_US_PER_KHZ
+from fitting.instruments.lag import sense_of
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable, TableLike, as_table
 from fitting.tapping_curves.branches import (
@@ -60,10 +61,12 @@ def tapping(table: TableLike, *, law: bool = True, model: str = LAW_MODEL, scale
         scale_errors: multiply the errors of the rows where these scatter more, instead of refusing their energy.
 
     Raises:
-        TableError: if the table is none of a driven cantilever, or something is missing that no energy can do without.
+        TableError: if the table is none of a driven cantilever, something is missing that no energy can do without, or
+            the free tip's lag is none that frequency and Q allow.
     """
     table = as_table(table)
-    result = _energies(table, curve_of(table), scale_errors=scale_errors)
+    table, note = _with_sense_of_phase(table)
+    result = _energies(table, replace(curve_of(table), phase_note=note), scale_errors=scale_errors)
     return with_law(result, model) if law and result.law_allowed else result
 
 
@@ -134,6 +137,69 @@ def curve_of(table: AmplitudeTable) -> TappingCurve:
 def _stiffness(table: AmplitudeTable) -> float:
     assert table.mass_ng is not None  # checked before  # noqa: S101
     return table.mass_ng * (RAD_PER_US_PER_KHZ * table.free_frequency_khz) ** 2
+
+
+_BEYOND_DEG = 20.0
+"""How far beyond its range a lag must be to be refused: zero and noise may take it a little beyond."""
+_OFF_DEG = 30.0
+"""What the free tip's lag may be off by: zeros and frequencies are known better."""
+
+
+def _with_sense_of_phase(table: AmplitudeTable) -> tuple[AmplitudeTable, str]:
+    """Return a table whose free rows lag as frequency and Q say, up to a small zero, and what was done to its phases.
+
+    Raises:
+        TableError: if the phases are radians, or the zero that is stated is none of the free rows.
+    """
+    curve = curve_of(table)
+    lag = table.phase_lag_deg
+    free = free_rows(curve) & np.isfinite(curve.lag_deg)
+    if lag is None or not free.any():
+        return table, ""
+    zero = 0.0 if curve.phase_zero_deg is None else curve.phase_zero_deg.value
+    expected = free_lag_deg(curve, Instrument(curve.free_frequency_khz.value, curve.quality_factor.value))[free]
+    read = curve.lag_deg[free] - zero
+    off = float(np.median(read - expected))
+    off = float(turned(np.array([off]))[0])
+    middle, wanted = float(np.median(read)), float(np.median(expected))
+    name = printable(table.source)
+    if abs(off) < _OFF_DEG:
+        _check_range(curve, zero + off, name)
+        return table, ""
+    if np.nanmax(np.abs(lag)) < 2.0 * np.pi and abs(np.rad2deg(middle) - wanted) < _OFF_DEG:
+        raise TableError(
+            f"{name}: phase_lag_deg is {middle:.3g} where the tip is free and lags by {wanted:.1f} degrees: write "
+            "degrees, not radians"
+        )
+    sense = sense_of(middle, wanted)
+    if sense.note:
+        # a zero that is stated keeps what it is known to
+        return replace(table, phase_lag_deg=sense.lag_deg(lag - zero) + zero), sense.note
+    if curve.phase_zero_deg is None:
+        return table, f"Zero: the free tip reads {middle:.1f} deg where its lag is {wanted:.1f}; it sets the zero."
+    raise TableError(
+        f"{name}: the free tip lags by {middle:.1f} degrees, by frequency and Q {wanted:.1f}: out of the range of "
+        "'# phase_zero_deg'; leave that line out and the free rows set the zero, or mend the phase"
+    )
+
+
+def _check_range(curve: TappingCurve, zero: float, name: str) -> None:
+    """Check that no row of a force on the tip lags by what no tap that takes energy does.
+
+    Raises:
+        TableError: naming the first row that lags by less than 0 or more than 180 degrees, by more than 20.
+    """
+    if curve.drive != "force":
+        return
+    beyond = np.abs(turned(curve.lag_deg - zero - 90.0)) > 90.0 + _BEYOND_DEG
+    beyond &= curve.amplitude_nm > 0.5 * curve.free_amplitude_nm
+    if beyond.any():
+        row = int(np.flatnonzero(beyond)[0])
+        raise TableError(
+            f"{name}, line {curve.lines[row]}: lags by {curve.lag_deg[row]:.1f} degrees (free tip's zero {zero:.1f}), "
+            f"outside 0 to 180, as {beyond.sum()} of {curve.rows} rows do: no tap that takes energy does; mend the "
+            "phase or leave its cell blank"
+        )
 
 
 def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool) -> Tapping:
