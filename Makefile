@@ -97,8 +97,9 @@ FUZZ ?= --flights 100000 --orbits 10000 --scenes 2000 --files 4000
 fuzz: $(SETUP) ## random work, seeded; FUZZ='--flights 1000000 --orbits 100000 --scenes 10000 --files 20000' for all of it
 	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_SOON)" $(BIN)/python -m tests.fuzz $(FUZZ)
 
-bands: $(SETUP) ## do the 95 % bands hold the laws of ten random contacts? (twenty minutes; the truths are kept in /tmp)
+bands: $(SETUP) ## do 95 % bands hold the laws of ten random contacts, intervals r and epsilon of twenty? (forty minutes; truths are kept in /tmp)
 	$(BIN)/python -m tests.coverage_of_bands
+	$(BIN)/python -m tests.coverage_of_bands --intervals
 
 tapping: $(SETUP) ## are tapping curves of random contacts predicted and fitted as they should be? (TAPPING="--model contact")
 	$(BIN)/python -m tests.tapping_accuracy $(TAPPING)

@@ -283,11 +283,12 @@ def _in_every_lane(
     measurement: Measurement,
     problem: Problem,
     near: Float[np.ndarray, "..."] | None,
+    program: Callable[..., "_Block"] | None = None,
 ) -> "_Block":
     """Return what `_in_lanes` finds, of several tables drive by drive; slopes are by the parameters of a row's own."""
     joint, table = measurement.joint, measurement.rows.table
     if joint is None or table is None:
-        return _in_lanes(filled, sets, impacts, measurement, problem, near)
+        return _in_lanes(filled, sets, impacts, measurement, problem, near, program)
     drives = np.array(joint.drives)[table]
     places, blocks = [], []
     for drive in dict.fromkeys(drives.tolist()):
@@ -295,7 +296,7 @@ def _in_every_lane(
         points = np.moveaxis(filled[:, table[mine]], 1, -2)
         one, known = replace(joint.problem, drive=drive), None if near is None else np.asarray(near)[..., mine]
         places.append(mine)
-        blocks.append(_in_lanes(points, sets, impacts, measurement.of_drive(drive), one, known))
+        blocks.append(_in_lanes(points, sets, impacts, measurement.of_drive(drive), one, known, program))
     order = np.argsort(np.concatenate(places))
     return jax.tree.map(lambda *parts: np.concatenate(parts, axis=1)[:, order], *blocks)
 
@@ -307,8 +308,13 @@ def _in_lanes(
     measurement: Measurement,
     problem: Problem,
     near: Float[np.ndarray, "..."] | None,
+    program: Callable[..., "_Block"] | None = None,
 ) -> "_Block":
-    """Return what `linearise_pairs` finds, as arrays of shape (sets, rows, ...); `filled` may differ row by row."""
+    """Return what a program finds, as arrays of shape (sets, rows, ...); `filled` may differ row by row.
+
+    The program is `linearise_pairs` if none is given.
+    """
+    program = linearise_pairs if program is None else program
     columns = jax.tree.map(np.asarray, measurement.rows)
     filling = _filling(columns)
     rows = columns.order.shape[0] - filling
@@ -323,7 +329,7 @@ def _in_lanes(
         points = filled[index] if filled.ndim == 2 else filled[index, lane % rows]
         branch = branch_near(known[lane]) if known is not None else located(points, impacts, index, some, problem)
         # not waited for: blocks are worked on side by side
-        blocks.append(linearise_pairs(points, impacts, index, some, problem, branch))
+        blocks.append(program(points, impacts, index, some, problem, branch))
 
     def whole(*parts):
         found = np.concatenate([np.asarray(part) for part in parts])[: sets * rows]
@@ -343,6 +349,49 @@ def _filling(rows: Rows) -> int:
     filling[0] = False
     filling[1:] &= (drives[:, 1:] == drives[:, :-1]).all(axis=0)
     return int(np.argmin(filling[::-1]))
+
+
+class Predicted(NamedTuple):
+    """Readings that several sets of a law and of values predict, and how far the measured ones are from these.
+
+    Attributes:
+        misfit: (predicted - measured)/error, 0 where nothing was measured, shape (sets, rows, k).
+        prediction: what is predicted, with leading axis (sets,).
+    """
+
+    misfit: Float[np.ndarray, "sets rows k"]
+    prediction: Prediction
+
+
+def predict(
+    values: Float[np.ndarray, "sets p"],
+    laws: AnyImpact,
+    measurement: Measurement,
+    problem: Problem,
+    near: Float[np.ndarray, "sets rows"],
+) -> Predicted:
+    """Return the readings that laws predict with an instrument: the forward model itself, nothing linearised.
+
+    Args:
+        values: of all parameters, of which only the nuisances (the instrument) count.
+        laws: what an impact does, one law a set, along a first axis.
+        measurement: the rows, and what they are compared with.
+        problem: the model that has these parameters.
+        near: coordinates of the orbits at laws close by, from which they are followed; NaN where there is none.
+    """
+    # one program for every model: parameters of laws do not matter here
+    own, joint = len(problem.own), measurement.joint
+    instrument = replace(problem, model="law+delay", names=problem.names[own:], effects=())
+    known = measurement._replace(constraint_value=np.zeros(0), constraint_error=np.zeros(0), fixed={})
+    points = values[:, own:]
+    if joint is not None:
+        alone = replace(
+            joint.problem, model="law+delay", names=joint.problem.names[len(joint.problem.own) :], effects=()
+        )
+        points = joint.values(values)[..., len(joint.problem.own) :]
+        known = known._replace(joint=replace(joint, problem=alone))
+    block = _in_every_lane(points, len(values), _Impacts(laws, None), known, instrument, near, predict_pairs)
+    return Predicted(np.asarray(block.misfit), block.prediction)
 
 
 class ImpactSlopes(NamedTuple):
@@ -405,7 +454,7 @@ class _Impacts(NamedTuple):
     """What an impact does at each set of values, and its derivatives by each parameter along a second axis."""
 
     impact: AnyImpact
-    slopes: AnyImpact
+    slopes: Any
 
     def first(self) -> "_Impacts":
         """Return those of the first set, without their leading axis."""
@@ -521,6 +570,11 @@ def linearise_pairs(
     impact, slopes = jax.tree.map(lambda leaf: leaf[index], tuple(impacts))
     rows = measurement.rows
     slope, prediction = jax.vmap(one)(points, impact, slopes, rows, branch)
+    return _block(prediction, slope, rows)
+
+
+def _block(prediction: Prediction, slope: Float[Array, "lanes k p"], rows: Rows) -> _Block:
+    """Return misfits and slopes in the rows' errors."""
     # far from any law (a start of the search) a root can be no motion at all: no orbit there
     sound = jnp.isfinite(prediction.amplitude_nm).all(axis=1) & jnp.isfinite(slope).all(axis=(1, 2))
     slope = jnp.where(sound[:, None, None], slope, 0.0)
@@ -535,6 +589,27 @@ def linearise_pairs(
         unseen=jnp.where(rows.no_orbit & (prediction.orbits > 0), CENSORED, 0.0),
         prediction=prediction,
     )
+
+
+@partial(jax.jit, static_argnames="problem")
+def predict_pairs(
+    points: Float[Array, "lanes p"],
+    impacts: _Impacts,
+    index: Int[Array, " lanes"],
+    measurement: Measurement,
+    problem: Problem,
+    branch: Branch,
+) -> _Block:
+    """Return misfits of pairs of a row, with its values, and the law that its index names; no slopes."""
+
+    def one(point: Float[Array, " p"], impact, row: Rows, known: Branch) -> Prediction:
+        orbit = orbit_problem(point, impact, row, measurement, problem)
+        branch = followed(orbit, known, row) if orbit.impact.lasts else known
+        return _prediction(branch, point, orbit, row, problem)
+
+    impact, rows = jax.tree.map(lambda leaf: leaf[index], impacts.impact), measurement.rows
+    prediction = jax.vmap(one)(points, impact, rows, branch)
+    return _block(prediction, jnp.zeros((*rows.amplitude_nm.shape, 0)), rows)
 
 
 def _impact_and_slopes(values: Float[Array, " p"], measurement: Measurement, problem: Problem) -> tuple[Any, Any]:

@@ -1,6 +1,10 @@
-"""Whole fits of random contacts: how often the 95 % band of the law holds the truth, which is not the fitted model.
+"""Whole fits of random contacts: how often 95 % bands and intervals hold the truth, which is not the fitted model.
 
     python -m tests.coverage_of_bands [--contacts 0:10] [--seeds 12] [--model viscous+delay] [--truths FOLDER]
+    python -m tests.coverage_of_bands --intervals [--contacts 0:20] [--seeds 3] [--model law+delay] [--truths FOLDER]
+
+Bands are those of the law. With `--intervals` those of r and epsilon are looked at: they are to hold the r and epsilon
+of the formula that is closest to the true law over the rows' speeds, as those of a fit are closest to its own.
 
 Every contact is measured with noise of 0.3, 1 and 3 % and a Q that scatters by its error; the amplitudes are those of
 the full scene (`contact_truths`), kept in the folder. Counted are the approach speeds between 30 and 200 nm/us that
@@ -16,12 +20,13 @@ import sys
 import tempfile
 import zlib
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from scipy.optimize import least_squares
 
-from fitting.fits.fit import find_fit, law_with_band, summarise
+from fitting.fits.fit import find_fit, fit, law_with_band, summarise
 from fitting.fits.intervals import at_bound, covariance
 from fitting.fits.result import FittedLaw
 from fitting.simulated.experiment import with_noise
@@ -103,6 +108,65 @@ def measured(truth: ContactTruth, table: AmplitudeTable, model: str) -> Measured
     )
 
 
+INTERVALS = 0.9, 0.98
+"""Between which the shares lie of the intervals of r, and of those of epsilon, that hold the truth's projection."""
+
+
+class Held(NamedTuple):
+    """Whether the intervals of r and of epsilon of a fit hold the projection of the true law; NaN: not a valid fit."""
+
+    contact: int
+    r: float
+    epsilon: float
+
+
+def projection(speeds: np.ndarray, rebound: np.ndarray, weight: np.ndarray) -> tuple[float, float]:
+    """Return r and epsilon of the formula of eq. 6 closest to a law: weighted least squares in u_out, within bounds."""
+
+    def off(at: np.ndarray) -> np.ndarray:
+        return weight * (np.sqrt(np.maximum((at[0] * speeds) ** 2 - 100.0 * at[1], 1e-6)) - rebound)
+
+    found = least_squares(off, [0.99, 1.0], bounds=([0.01, 0.0], [1.0, np.inf]), x_scale=[1e-3, 0.1], xtol=1e-14)
+    return float(found.x[0]), 100.0 * float(found.x[1])
+
+
+def held(truth: ContactTruth, table: AmplitudeTable, model: str) -> Held:
+    """Return whether the intervals of a fit to a table hold the projection of the true law."""
+    result = fit(table, model)
+    nothing = Held(truth.number, np.nan, np.nan)
+    if not result.valid:
+        return nothing
+    speeds = result.rows.approach_speed_nm_per_us[result.rows.used]
+    right = truth.rebound_and_delay(speeds)[0]
+    inside = np.isfinite(right)
+    _, half = _law(result.law, speeds)
+    values = projection(speeds[inside], right[inside], 1.0 / half[inside])
+    inner = []
+    for name, value in zip(("r", "epsilon"), values, strict=True):
+        low, high = result.parameters[name].interval95
+        # an end that is open is the end of the range
+        inner.append(float((low is None or low <= value) and (high is None or value <= high)))
+    return Held(truth.number, *inner)
+
+
+def intervals_missed(fits: list[Held]) -> tuple[str, int]:
+    """Return a line about the intervals, and how many of the two shares are not as wanted."""
+    valid = [fit for fit in fits if np.isfinite(fit.r)]
+    if not valid:
+        return "intervals: no valid fit", 2
+    shares = [float(np.mean([getattr(fit, name) for fit in valid])) for name in ("r", "epsilon")]
+    short = [not INTERVALS[0] <= share <= INTERVALS[1] for share in shares]
+    line = (
+        f"intervals: {len(valid)} of {len(fits)} fits of {len({fit.contact for fit in valid})} contacts valid; "
+        f"coverage of r {shares[0]:.3f}, of epsilon {shares[1]:.3f}"
+    )
+    return line + "".join(
+        f"\n    MISSED: {INTERVALS[0]:g} to {INTERVALS[1]:g} of {name}"
+        for name, missed in zip(("r", "epsilon"), short, strict=True)
+        if missed
+    ), sum(short)
+
+
 def _law(law: FittedLaw, speeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return rebound speeds and half-widths of the band at approach speeds."""
     columns = (law.rebound_speed_nm_per_us, law.rebound_high_nm_per_us - law.rebound_speed_nm_per_us)
@@ -143,25 +207,34 @@ def shortfalls(noise: float, fits: list[Measured], model: str) -> tuple[str, lis
 def main() -> int:
     """Measure, print and judge."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0] if __doc__ else None)
-    parser.add_argument("--contacts", default="0:10", help="numbers of the random contacts, first:end")
-    parser.add_argument("--seeds", type=int, default=12, help="tables of each contact and noise")
-    parser.add_argument("--model", default="viscous+delay")
+    parser.add_argument("--intervals", action="store_true", help="look at the intervals of r and epsilon, not at bands")
+    parser.add_argument("--contacts", help="numbers of the random contacts, first:end (0:10, of intervals 0:20)")
+    parser.add_argument("--seeds", type=int, help="tables of each contact and noise (12, of intervals 3)")
+    parser.add_argument("--model", help="viscous+delay, of intervals law+delay")
     parser.add_argument("--truths", type=Path, default=Path(tempfile.gettempdir()) / "afm-jax-truths")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)  # noqa: FBT003
-    first, end = (int(number) for number in options.contacts.split(":"))
-    fits: dict[float, list[Measured]] = {noise: [] for noise in NOISES}
+    contacts, seeds, model, look = (
+        ("0:20", 3, "law+delay", held) if options.intervals else ("0:10", 12, "viscous+delay", measured)
+    )
+    first, end = (int(number) for number in (options.contacts or contacts).split(":"))
+    model = options.model or model
+    fits: dict[float, list[Any]] = {noise: [] for noise in NOISES}
     for number in range(first, end):
         truth = contact_truth(number)
         exact = exact_table(truth, options.truths)
-        for noise, seed in ((noise, seed) for noise in NOISES for seed in range(options.seeds)):
+        for noise, seed in ((noise, seed) for noise in NOISES for seed in range(options.seeds or seeds)):
             random = np.random.default_rng([zlib.crc32(str(noise).encode()), number, seed])
-            found = measured(truth, noisy(exact, noise, random), options.model)
+            found = look(truth, noisy(exact, noise, random), model)
             fits[noise].append(found)
             sys.stderr.write(f"contact {number}, {100 * noise:g} %, table {seed}: {found}\n")
+    if options.intervals:
+        line, missed = intervals_missed([one for some in fits.values() for one in some])
+        sys.stdout.write(f"{line}\n")
+        return 1 if missed else 0
     missed = 0
     for noise, some in fits.items():
-        line, short = shortfalls(noise, some, options.model)
+        line, short = shortfalls(noise, some, model)
         missed += len(short)
         sys.stdout.write(f"{line}\n" + "".join(f"    MISSED: {name}\n" for name in short))
     return 1 if missed else 0

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from afm_jax.units import TWO_SIDED_95
 from fitting.fits.intervals import Convergence
 from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows
 from fitting.parameters import PARAMETERS
@@ -88,8 +89,21 @@ def made_law(values: dict[str, float], *, width: float, lasting: bool) -> Fitted
     if lasting:
         a, b, d = (values.get(name, 0.1) for name in ("delay_hertz", "delay_lead_nm", "delay_offset_nm"))
         delay = a * u**-0.2 - b * (1.0 / w - 1.0 / u) - d / u
-    shift = width * np.abs(delay)
-    return FittedLaw(u, w, w * (1.0 - width), w * (1.0 + width), delay, delay - shift, delay + shift)
+    u_c = values.get("viscous_loss", 0.0) + np.sqrt(
+        values.get("viscous_loss", 0.0) ** 2 + 4.0 * values.get("r", 1.0) ** 2 * values.get("epsilon", 0.0)
+    )
+    errors = width / TWO_SIDED_95 * np.stack([w, np.abs(delay)], axis=1)[:, :, None]
+    return FittedLaw(
+        u,
+        w,
+        delay,
+        capture_speed_nm_per_us=u_c / (2.0 * values.get("r", 1.0) ** 2),
+        delay=None,
+        lasting=lasting,
+        errors=(errors, np.zeros(1)),
+        mass_ng=1.0,
+        origin="made",
+    )
 
 
 def made_table(rows: int = 4, **changes: Any) -> AmplitudeTable:

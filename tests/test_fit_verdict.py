@@ -45,6 +45,25 @@ def test_a_contact_whose_table_is_not_reached_is_refused():
     )
 
 
+def test_a_discrepancy_that_lowers_chi2_to_first_order_alone_is_no_result():
+    given = evidence("law+delay", made_table())
+    assert not any("Not converged" in reason for reason in judge_fit(given)[0])
+    reasons, _ = judge_fit(dataclasses.replace(given, stuck=(150.2, 120.1)))
+    assert any("would lower chi2 from 150.2 to 120.1, but computed" in reason for reason in reasons)
+
+
+def test_correlations_are_those_of_what_rows_do_not_have_in_common():
+    given = evidence("law+delay", made_table(40))
+    rows = len(given.rows.used)
+    common = np.ones((rows, 2)) * 3.0
+    given = dataclasses.replace(given, rows=dataclasses.replace(given.rows, residual=common))
+    noise = np.random.default_rng(2).normal(size=(rows, 2))
+    assert correlation_excess(common) > 4.0 > abs(correlation_excess(noise))
+    for independent, correlated in ((None, True), (noise, False)):
+        reasons, _ = judge_fit(dataclasses.replace(given, independent_residual=independent))
+        assert any("neighbouring residuals" in reason for reason in reasons) is correlated
+
+
 def test_a_row_without_an_orbit_where_the_model_has_one_is_named():
     table = made_table()
     unseen = np.zeros(table.rows)

@@ -3,6 +3,7 @@
 import dataclasses
 from typing import Any
 
+import equinox as eqx
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -54,7 +55,7 @@ def not_valid(model: str) -> FitResult:
     return dataclasses.replace(
         fit,
         parameters={name: made_parameter(name, value, **unknown) for name, value in VALUES[model].items()},
-        law=dataclasses.replace(fit.law, **dict.fromkeys(bands, blank)),
+        law=eqx.tree_at(lambda law: [getattr(law, name) for name in bands], fit.law, [blank] * len(bands)),
         correlations=np.full_like(fit.correlations, np.nan),
     )
 
@@ -125,7 +126,8 @@ def test_width_of_the_band_is_the_worst_over_the_measured_speeds():
     # a band that widens with speed: 1 % at the slowest row, 10 % at the fastest, more beyond
     share = np.interp(np.log(law.approach_speed_nm_per_us), np.log(SPEEDS[[0, -1]]), [0.01, 0.1])
     share[-5:] = 0.5
-    law = dataclasses.replace(law, rebound_high_nm_per_us=law.rebound_speed_nm_per_us * (1.0 + share))
+    high = law.rebound_speed_nm_per_us * (1.0 + share)
+    law = eqx.tree_at(lambda law: law.rebound_high_nm_per_us, law, high)
     width = band_width(dataclasses.replace(fit, law=law))
     assert width is not None
     # the fastest row lies between two points of the law, over which the share rises by a hundredth of itself

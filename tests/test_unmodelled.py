@@ -1,6 +1,7 @@
 """What a law leaves out: the step against one least-squares problem, and bands on contacts that are not the law."""
 
 import dataclasses
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,8 +10,18 @@ from scipy.optimize import approx_fprime, least_squares
 from fitting import fit
 from fitting.fits.loss import EV_PER_AJ, Loss, WithInterval, energy_lost, interval_of, nearest_of, scaled
 from fitting.fits.objective import Objective
-from fitting.fits.unmodelled import LawBefore, StepRows, Unmodelled, closest_member, law_after, root_of, step_of
-from fitting.forward import ImpactSlopes, impact_slopes
+from fitting.fits.unmodelled import (
+    LawBefore,
+    StepRows,
+    Unmodelled,
+    closest_member,
+    descending_part,
+    law_after,
+    root_of,
+    step_of,
+    system_of,
+)
+from fitting.forward import ImpactSlopes, Predicted, Prediction, impact_slopes
 from fitting.models import Problem, measurement_of
 from fitting.parameters import DELAY_NAMES, DELAY_SHAPE, LOSS_SHAPE
 from fitting.report.words import losses_in_words, parting_in_words
@@ -93,6 +104,75 @@ def test_the_step_is_that_of_one_least_squares_problem(rows):
     covariance = np.linalg.inv(matrix.T @ matrix)
     np.testing.assert_allclose(step.covariance, covariance[:8, :8], rtol=1e-5)
     assert step.chi2 == pytest.approx(np.sum((right + matrix @ best) ** 2), rel=1e-8)
+
+
+def test_chi2_leaves_what_belongs_to_the_rows_at_its_most_likely(rows):
+    """The sum of squares with the remainders as unknowns of their own, minimised over these."""
+    step, system = step_of(rows, LEFT_OUT, np.ones(6, dtype=bool)), system_of(rows, LEFT_OUT)
+    misfit = np.random.default_rng(8).normal(size=2 * ROWS)
+    half = step.partly(0.5)
+    of_rows = system.unknown[:, system.of_law :]
+    assert of_rows.shape[1] == 7
+    white = np.linalg.inv(np.linalg.cholesky(system.noise))
+    matrix = np.concatenate([white @ of_rows, np.eye(7)])
+    right = np.concatenate([white @ misfit, np.zeros(7)])
+    likely, square, *_ = np.linalg.lstsq(matrix, -right, rcond=None)
+    known = (half.values[5] - 40.0) / 0.8 + rows.residual[-1]
+    shapes = [(half.values[6 + i] - mean) / error for i, (mean, error) in enumerate(LEFT_OUT.priors.values())]
+    rest = np.concatenate([[known], shapes, half.unknown[: system.of_law]])
+    assert system.chi2(half, misfit) == pytest.approx(float(square[0]) + float(rest @ rest), rel=1e-9)
+    np.testing.assert_allclose(system.alone(misfit)[0], misfit + of_rows @ likely, atol=1e-9)
+
+
+def test_to_first_order_chi2_after_the_step_is_that_of_the_step(rows):
+    step, system = step_of(rows, LEFT_OUT, np.ones(6, dtype=bool)), system_of(rows, LEFT_OUT)
+    size, law = 2 * ROWS, slice(0, system.of_law)
+    misfit = system.residual[:size] + system.jacobian[:size] @ step.change + system.unknown[:, law] @ step.unknown[law]
+    assert system.chi2(step, misfit) == pytest.approx(step.chi2, rel=1e-9)
+
+
+@pytest.mark.parametrize(("falls_from", "share"), [(1.0, 1.0), (0.25, 0.25), (0.0, 0.0)])
+def test_a_step_is_damped_until_chi2_falls(rows, falls_from, share):
+    step, system = step_of(rows, LEFT_OUT, np.ones(6, dtype=bool)), system_of(rows, LEFT_OUT)
+    size, law = 2 * ROWS, slice(0, system.of_law)
+
+    def predicted(parts):
+        taken = [float(part.change @ step.change / (step.change @ step.change)) for part in parts]
+        found = [
+            system.residual[:size]
+            + system.jacobian[:size] @ part.change
+            + system.unknown[:, law] @ part.unknown[law]
+            # beyond that amplitudes do something else
+            + 10.0 * (one > falls_from)
+            for part, one in zip(parts, taken, strict=True)
+        ]
+        nothing: Any = np.zeros((2, 1))
+        return Predicted(np.array(found).reshape(len(parts), ROWS, 2), Prediction(*(nothing,) * 7))
+
+    found = descending_part(step, system, predicted)
+    np.testing.assert_allclose(found.step.change, share * step.change)
+    np.testing.assert_allclose(found.step.unknown, share * step.unknown)
+    assert (found.stuck is None) == (share > 0.0)
+    if found.stuck is not None:
+        begin, expected = found.stuck
+        assert begin > expected
+
+
+def test_the_law_after_the_step_is_the_formula_with_its_discrepancy(rows):
+    """By hand, of a step large enough that first order is visibly not it."""
+    u, values = np.geomspace(25.0, 180.0, 7), np.array(list(VALUES.values()))
+    step = step_of(rows, LEFT_OUT, np.ones(6, dtype=bool))
+    before, moved = (
+        LawBefore(loss_and_delay(at, u), np.zeros((2, 7, 6)), 10.9, np.zeros(6)) for at in (values, step.values[:6])
+    )
+    found = law_after(step, LEFT_OUT, u, before, moved)
+    columns = LEFT_OUT.columns(u, before.law[0])
+    square, late = columns.unknown @ step.unknown[: columns.unknown.shape[2]]
+    epsilon, loss, hertz, lead, offset, _, q, f = step.values
+    w = np.sqrt(u**2 - loss * np.sqrt(u**2 + q) - epsilon + square)
+    np.testing.assert_allclose(found.law[0], w, rtol=1e-12)
+    delay = hertz * u**-0.2 - lead * (1.0 / w - 1.0 / u) - offset / u + f * (1.0 / w**2 - 1.0 / u**2) + late
+    np.testing.assert_allclose(found.law[1], delay, rtol=1e-10)
 
 
 def test_the_band_is_that_of_the_whole_covariance(rows):
@@ -210,6 +290,7 @@ def test_bands_hold_the_law_of_a_contact_that_is_not_the_models():
         worst.append(z.max())
         degrees.append(result.chi2 / result.degrees_of_freedom)
         assert result.loss is not None
+        assert result.loss.capture_speed_nm_per_us is not None
         low, top = result.loss.capture_speed_nm_per_us.interval95
         assert low is not None
         assert top is not None
@@ -222,12 +303,14 @@ def test_bands_hold_the_law_of_a_contact_that_is_not_the_models():
 def test_the_loss_is_said_in_energies_and_delta():
     energy = energy_lost(20.0, 10.0, 0.1, 2.0)
     # 2 ng (20^2 - 19.9^2)/2 -+ 39: no sample at rest gives energy
-    assert energy_lost(20.0, 19.9, 0.5, 2.0).energy_aj.interval95 == pytest.approx((0.0, 3.99 + 39.004), abs=1e-3)
+    least = energy_lost(20.0, 19.9, 0.5, 2.0).energy_aj
+    assert least is not None
+    assert least.interval95 == pytest.approx((0.0, 3.99 + 39.004), abs=1e-3)
     epsilon = WithInterval(80.0, (76.08, 83.92))
     delta = scaled(epsilon, 0.5 * 2.0)
     r = WithInterval(0.99, (0.988, 0.992))
     capture = interval_of(9.04, float("nan"))
-    loss = Loss((energy,), r, epsilon, delta, scaled(delta, EV_PER_AJ), 4e-3, 24.0, capture)
+    loss = Loss((energy,), None, r, epsilon, delta, scaled(delta, EV_PER_AJ), 4e-3, 24.0, capture)
     said = dict(losses_in_words(made_fit("law", loss=loss)))
     # 2 ng (20^2 - 10^2)/2, and 2 ng times 10 times 1.96 times 0.1 to either side
     assert said["energy lost at 20 nm/us"] == "300.0 aJ (296.1 to 303.9), 1872 eV (1848 to 1897)"

@@ -17,9 +17,8 @@ from jaxtyping import Array, Bool, Float
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.lasting_impact import PulledImpact
-from afm_jax.impact.law import Law
+from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw
 from afm_jax.least_squares import chi2_tail
-from afm_jax.units import TWO_SIDED_95
 from afm_jax.version import version_of
 from fitting.fits.intervals import (
     END_OF_RANGE,
@@ -55,8 +54,8 @@ from fitting.fits.minimum import (
     strain_of,
     untabulated,
 )
-from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective
-from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows, FittedTable, Scatter
+from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective, soft_square
+from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows, FittedTable, Scatter, table_of_law
 from fitting.fits.several import Between, Pull, departures_of, parts_of, pulls_of, scatter_between
 from fitting.fits.unmodelled import (
     ClosestMember,
@@ -66,6 +65,7 @@ from fitting.fits.unmodelled import (
     StepSystem,
     Unmodelled,
     closest_member,
+    descending_part,
     law_after,
     root_of,
     rows_of_fit,
@@ -73,7 +73,7 @@ from fitting.fits.unmodelled import (
     system_of,
 )
 from fitting.fits.verdict import ASSUMED_ERROR_OF_Q, IMPROBABLE, Evidence, judge_fit, misfits
-from fitting.forward import AnyImpact, impact_at, warm_up
+from fitting.forward import AnyImpact, Predicted, impact_at, predict, warm_up
 from fitting.models import (
     Joint,
     Measurement,
@@ -94,16 +94,20 @@ from fitting.parameters import (
 from fitting.tables.several import SeveralTables
 from fitting.tables.table import AmplitudeTable, as_table, in_other_units
 
-_POINTS = 121
+_POINTS, _FEWEST_POINTS = 121, 4
 
 
-def law_with_band(
+def law_with_band(  # noqa: PLR0913
     problem: Problem,
     measurement: Measurement,
     values: Float[np.ndarray, " p"],
     covariance: Float[np.ndarray, "k k"],
     approach_speeds: Float[np.ndarray, " rows"],
     after: tuple[LinearStep, Unmodelled] | None = None,
+    *,
+    formula: ImpactLaw | None = None,
+    mass_ng: float | None = None,
+    origin: str = "",
 ) -> FittedLaw:
     """Return the law from 0.8 times the slowest to 1.2 times the fastest approach, with its linearised 95 % band.
 
@@ -114,21 +118,46 @@ def law_with_band(
         covariance: of the values, or of those after the step; infinite entries give an open band (NaN).
         approach_speeds: of the rows' orbits in nm/us, NaN where a row has none.
         after: the step from these values with what the model leaves out; None: the model is taken at its word.
+        formula: the model's that is closest after the step.
+        mass_ng: of the tip; None: not known.
+        origin: what the law comes from, in words.
+    """
+    if after is None and problem.model != "contact":
+        formula = problem.law(jnp.asarray(values), measurement.fixed)
+
+    def law(speeds: Float[np.ndarray, " n"]) -> LawAfter:
+        return law_at(problem, measurement, values, covariance, speeds, after)
+
+    speeds, found = points_of_law(law, approach_speeds)
+    return FittedLaw(
+        speeds,
+        *found.law,
+        capture_speed_nm_per_us=found.capture,
+        delay=None if formula is None else formula.delay,
+        lasting=problem.lasting,
+        errors=(np.moveaxis(found.factor, 0, 1), found.capture_factor),
+        mass_ng=mass_ng,
+        origin=origin,
+    )
+
+
+def points_of_law(
+    found: Callable[[Float[np.ndarray, " n"]], LawAfter], approach_speeds: Float[np.ndarray, " rows"]
+) -> tuple[Float[np.ndarray, " points"], LawAfter]:
+    """Return a law from 0.8 times the slowest to 1.2 times the fastest approach in nm/us, and beyond its capture.
+
+    Args:
+        found: the law at approach speeds.
+        approach_speeds: of the rows, NaN where a row has none.
     """
     slow, fast = speed_range(approach_speeds)
     speeds = np.geomspace(0.8 * slow, 1.2 * fast, _POINTS)
-    found = law_at(problem, measurement, values, covariance, speeds, after)
-    rebound, delay = found.law
-    width = TWO_SIDED_95 * np.linalg.norm(found.factor, axis=2)
-    return FittedLaw(
-        approach_speed_nm_per_us=speeds,
-        rebound_speed_nm_per_us=rebound,
-        rebound_low_nm_per_us=np.maximum(rebound - width[0], 0.0),
-        rebound_high_nm_per_us=rebound + width[0],
-        collision_delay_us=delay,
-        delay_low_us=delay - width[1],
-        delay_high_us=delay + width[1],
-    )
+    law = found(speeds)
+    if np.count_nonzero(law.law[0] > 0.0) < _FEWEST_POINTS:
+        # a law that captures nearly all of these tips
+        speeds = np.geomspace(0.8 * slow, 3.0 * max(law.capture, fast), _POINTS)
+        law = found(speeds)
+    return speeds, law
 
 
 def law_at(
@@ -141,15 +170,16 @@ def law_at(
 ) -> LawAfter:
     """Return the law at approach speeds in nm/us; the other arguments as of `law_with_band`."""
     before = law_before(problem, measurement, values, speeds)
-    if not np.all(np.isfinite(covariance)) or after is None:
+    if after is None:
         root = root_of(covariance)[: before.slope.shape[2]]
-        found = LawAfter(before.law, before.slope @ root, before.capture, before.capture_slope @ root)
-        if after is None:
-            return found
-        unknown = [np.full_like(found.factor, np.nan), np.full_like(found.capture_factor, np.nan)]
-        moved = law_after(*after, speeds, before)
-        return LawAfter(moved.law, unknown[0], moved.capture, unknown[1])
-    return law_after(*after, speeds, before)
+        return LawAfter(before.law, before.slope @ root, before.capture, before.capture_slope @ root)
+    step, left_out = after
+    moved = law_before(problem, measurement, step.values[: len(problem.names)], speeds)
+    found = law_after(step, left_out, speeds, before, moved)
+    if not np.all(np.isfinite(covariance)):
+        unknown = [np.full_like(part, np.nan) for part in (found.factor, found.capture_factor)]
+        return LawAfter(found.law, unknown[0], found.capture, unknown[1])
+    return found
 
 
 def law_before(
@@ -169,6 +199,8 @@ def member_after(
     values: Float[np.ndarray, " p"],
     speeds: Float[np.ndarray, " n"],
     free: Bool[np.ndarray, " p"],
+    *,
+    computed: bool = True,
 ) -> ClosestMember | None:
     """Return the model's law that is closest to the law after a step; None where the step is all there is.
 
@@ -179,6 +211,7 @@ def member_after(
         values: from which the step was taken.
         speeds: approach speeds in nm/us of the rows that are used.
         free: which of the values are not at their bound.
+        computed: the law after the step is computed; False: to first order.
     """
     problem = left_out.problem
     if problem.model == "contact" or not problem.lasting:
@@ -187,7 +220,11 @@ def member_after(
     filled = np.append(speeds, np.full(-speeds.size % _POINTS, speeds[-1]))
     before = law_before(problem, measurement, values, filled)
     there = before._replace(law=before.law[:, : speeds.size], slope=before.slope[:, : speeds.size])
-    return closest_member(step, left_out, speeds, there, free)
+    moved = None
+    if computed:
+        whole = law_before(problem, measurement, step.values[: len(problem.names)], filled)
+        moved = whole._replace(law=whole.law[:, : speeds.size], slope=whole.slope[:, : speeds.size])
+    return closest_member(step, left_out, speeds, there, free, moved)
 
 
 def loss_of(
@@ -270,6 +307,12 @@ def law_and_slope(
         return jnp.concatenate([there, jnp.full((2, 1), impact.lowest)], axis=1)
 
     return law(impact), jax.vmap(lambda turn: jax.jvp(law, (impact,), (turn,))[1], out_axes=-1)(slopes)
+
+
+@jax.jit
+def coordinates(law: Law, speeds: Float[Array, " n"]) -> Float[Array, " n"]:
+    """Return the coordinates of orbits at approach speeds in nm/us."""
+    return law.coordinate(speeds)
 
 
 def _untold_drifts(parameters: Mapping[str, FittedParameter]) -> list[str]:
@@ -394,6 +437,8 @@ class _Summary:
         self.chi2, self.contact_share = self.minimum_chi2, 0.0
         self.pulls: list[Pull] = []
         self.between: tuple[Between, Float[np.ndarray, "tables l"]] | None = None
+        self.alone, self.system = self.rows.residual, None
+        self.stuck: tuple[float, float] | None = None
         self.after = self._step()
         if self.after is not None:
             self._take(*self.after)
@@ -417,11 +462,13 @@ class _Summary:
         values = self.settings["fixed"] | dict(zip(self.problem.names, self.values.tolist(), strict=True))
         mass = float(self.stated.measurement.cantilever.mass_ng)
         left_out = Unmodelled(self.problem, values, speed_range(self.used_speeds), mass)
+        self.system = system_of(rows, left_out)
         if joint is None:
             return step_of(rows, left_out, self.free), left_out
-        departing = self._tables_compared(system_of(rows, left_out), joint, scattering=scattering)
+        departing = self._tables_compared(self.system, joint, scattering=scattering)
         if not (self.problem.lasting or departing):
             return None
+        self.system = self.system.with_unknowns(departing[0] if departing else None)
         step, *cautious = (step_of(rows, left_out, self.free, one) for one in departing or [None])
         return step._replace(covariance=(*cautious, step)[0].covariance), left_out
 
@@ -450,26 +497,72 @@ class _Summary:
         return departing
 
     def _take(self, step: LinearStep, left_out: Unmodelled) -> None:
-        """Go on with values, errors and residuals after the step."""
+        """Go on with the law, values, errors and predictions after the step, or after a part of it that lowers chi2."""
+        assert self.system is not None  # noqa: S101
+        system = self.system
+
+        def look(parts: list[LinearStep]) -> Predicted:
+            return self._predicted(parts, left_out)
+
+        step, predicted, self.stuck = descending_part(step, system, look)
+        self.after = step, left_out
         count = len(self.names)
         self.ends, self.spread = step.values[:count], step.covariance[:count, :count]
         member = self._closest_member(step, left_out)
         if member is not None:
             self.ends, self.spread = member.values, member.covariance
-        if not self.searching.robust:
-            self.chi2 = step.chi2
-        count, error = self.table.rows, np.asarray(self.searching.measurement.rows.error_nm)
-        residual = step.residual[:count]
-        moved = error[:count] * (residual - self.amplitude_residual[:count])
-        used = np.isfinite(self.rows.residual)
-        moved = np.where(used, moved, 0.0)
-        phase = self.rows.predicted_phase_deg
+        rows, used = self.table.rows, np.isfinite(self.rows.residual)
+        residual, there = predicted.misfit[0], predicted.prediction.orbits[0][:rows] > 0
+        self.chi2 = system.chi2(step, residual.ravel())
+        self.alone = np.where(used, system.alone(residual.ravel())[0].reshape(residual.shape)[:rows], np.nan)
+        if self.searching.robust:
+            self.chi2 = float(np.sum(soft_square(np.append(residual, system.rest(step)), ROBUST)))
+        readings = np.where(there[:, None], predicted.prediction.amplitude_nm[0][:rows], np.nan)
         self.rows = replace(
             self.rows,
-            residual=np.where(used, residual, np.nan),
-            predicted_nm=self.rows.predicted_nm + moved[:, :2],
-            predicted_phase_deg=None if phase is None else phase + moved[:, 2],
+            residual=np.where(used, residual[:rows], np.nan),
+            predicted_nm=readings[:, :2],
+            predicted_phase_deg=None if self.rows.predicted_phase_deg is None else readings[:, 2],
+            approach_speed_nm_per_us=np.where(there, predicted.prediction.approach_speed_nm_per_us[0][:rows], np.nan),
+            orbits=np.where(there, self.rows.orbits, 0),
         )
+
+    def _predicted(self, parts: list[LinearStep], left_out: Unmodelled) -> Predicted:
+        """Return what the laws after parts of the step predict, with the instrument after it."""
+        measurement, problem = self.objective.measurement, self.problem
+        values = np.array([part.values[: len(problem.names)] for part in parts])
+        if problem.pulled or not problem.lasting:
+            # taps are no law of the free tip's speed, and instantaneous laws have no discrepancy
+            plain = Objective(measurement, problem, near=self.objective.near).at_values(values)
+            size = (len(parts), *measurement.rows.measured.shape)
+            return Predicted(plain.residual[:, : size[1] * size[2]].reshape(size), plain.prediction)
+        laws = [self._law_after(part, left_out) for part in parts]
+        speeds = self.prediction.approach_speed_nm_per_us[0]
+        exists = (self.prediction.orbits[0] > 0) & np.isfinite(speeds)
+        safe = jnp.asarray(np.where(exists, speeds, 100.0))
+        near = [np.where(exists, np.asarray(coordinates(law, safe)), np.nan) for law in laws]
+        both = jax.tree.map(lambda *leaves: np.stack(leaves), *laws)
+        return predict(values, both, measurement, problem, np.array(near))
+
+    def _law_after(self, step: LinearStep, left_out: Unmodelled) -> TabulatedLaw:
+        """Return the law after a step as the table that predictions are made of."""
+
+        def law(speeds: Float[np.ndarray, " n"]) -> LawAfter:
+            measurement = self.objective.measurement
+            return law_at(self.problem, measurement, self.values, self.covariance, speeds, (step, left_out))
+
+        speeds, found = points_of_law(law, self.used_speeds)
+        formula = self._formula(step, left_out)
+        delay = None if formula is None else formula.delay
+        return table_of_law(speeds, *found.law, capture_speed_nm_per_us=found.capture, delay=delay)
+
+    def _formula(self, step: LinearStep, left_out: Unmodelled) -> ImpactLaw | None:
+        """Return the formula that is closest to the law after a step; None of a contact, which has none."""
+        if self.problem.model == "contact":
+            return None
+        member = self._closest_member(step, left_out)
+        values = step.values[: len(self.problem.names)] if member is None else member.values
+        return self.problem.law(jnp.asarray(values), self.objective.measurement.fixed)
 
     def result(self) -> FitResult:
         judged = self.freedom > 0 and self.settings["error_scale"] is None and not self.searching.robust
@@ -487,7 +580,7 @@ class _Summary:
             chi2=self.chi2,
             freedom=self.freedom,
             p_value=p_value,
-            autocorrelation=_autocorrelation(rows.residual),
+            autocorrelation=_autocorrelation(self.alone),
             other_minimum=self._other_minimum(errors),
             error_scale=self.settings["error_scale"],
             lasting=self.problem.lasting,
@@ -500,6 +593,8 @@ class _Summary:
             tapped=self.problem.pulled,
             pulls=tuple(pull.p_value for pull in self.pulls),
             scattering=self.between is not None,
+            independent_residual=self.alone,
+            stuck=self.stuck,
         )
         # Errors that assume the model would be confident numbers about a law that is not there.
         explained = not misfits(evidence)
@@ -528,6 +623,9 @@ class _Summary:
                 shown_covariance,
                 self.used_speeds,
                 self.after,
+                formula=None if self.after is None else self._formula(*self.after),
+                mass_ng=self.table.mass_ng,
+                origin=f"{self.problem.model} fitted to {self.table.source}",
             ),
             loss=self._loss(shown_covariance, evidence.parameters),
             rows=rows,

@@ -1,13 +1,19 @@
 """What a fit found, and everything that went into it."""
 
+import dataclasses
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
+from afm_jax.impact.law import CollisionDelay, Origin, TabulatedLaw
 from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
+from afm_jax.units import TWO_SIDED_95
 from fitting.fits.intervals import Convergence
 from fitting.fits.loss import Loss
 from fitting.tables.csv_text import FIT_FORMAT_VERSION
@@ -44,20 +50,159 @@ class FittedParameter:
     constraint: tuple[float, float] | None
 
 
-@dataclass(frozen=True)
-class FittedLaw:
-    """The impact law over the speeds that the rows reached, with a pointwise 95 % band.
+@jax.jit
+def _tabulated(
+    speeds: Float[Array, " rows"],
+    rebound: Float[Array, " rows"],
+    late: Float[Array, " rows"] | None,
+    capture: Float[Array, ""],
+    delay: CollisionDelay | None,
+    changes: tuple[Float[Array, "m 2 rows"], Float[Array, " m"]] | None,
+) -> TabulatedLaw:
+    known: dict[str, Any] = {"capture_speed_nm_per_us": capture, "delay": delay}
+    if changes is None:
+        return TabulatedLaw(speeds, rebound, late, **known)
+    of_rows, of_capture = changes
+    return TabulatedLaw.with_errors(
+        speeds,
+        rebound,
+        late,
+        rebound_changes=of_rows[:, 0],
+        delay_changes=None if late is None else of_rows[:, 1],
+        capture_changes=of_capture,
+        **known,
+    )
 
-    Speeds in nm/us, the delay in us; it is 0 if impacts are instantaneous.
+
+_TOGETHER = 8
+"""Unknowns are filled up to a multiple of this, so that laws have few shapes and programs."""
+
+
+def table_of_law(
+    speeds: Float[np.ndarray, " points"],
+    rebound: Float[np.ndarray, " points"],
+    late: Float[np.ndarray, " points"] | None,
+    *,
+    capture_speed_nm_per_us: float,
+    delay: CollisionDelay | None,
+    errors: tuple[Float[np.ndarray, "points 2 m"], Float[np.ndarray, " m"]] | None = None,
+) -> TabulatedLaw:
+    """Return a law as the table that a scene takes, by one compiled program.
+
+    Args:
+        speeds: approach speeds in nm/us, four of which at least leave.
+        rebound: speeds in nm/us, 0 where the tip is captured.
+        late: delays in us; None: impacts are instantaneous.
+        capture_speed_nm_per_us: of the law, kept between the fastest tip that is captured and the slowest that leaves.
+        delay: the formula that the delay is written beside; None: the closest one.
+        errors: changes of rebound speeds and delays, and of the capture speed, with independent unknowns of unit
+            variance; None: nothing is known of them.
+    """
+    leaves = rebound > 0.0
+    u, w = speeds[leaves], np.minimum(rebound, speeds)[leaves]
+    captured = speeds[~leaves][-1] if not leaves.all() else 0.0
+    capture = np.clip(capture_speed_nm_per_us, captured, (1.0 - 1e-9) * u[0])
+    changes, count = None, 0
+    if errors is not None:
+        of_rows, of_capture = fewest_unknowns(errors[0][leaves], errors[1])
+        count = of_capture.size
+        spare = -count % _TOGETHER
+        changes = np.pad(np.moveaxis(of_rows, 2, 0), ((0, spare), (0, 0), (0, 0))).transpose(0, 2, 1)
+        changes = np.ascontiguousarray(changes), np.pad(of_capture, (0, spare))
+    law = _tabulated(u, w, None if late is None else late[leaves], capture, None if late is None else delay, changes)
+    if law.deviations is None:
+        return law
+    return eqx.tree_at(lambda law: law.deviations, law, {name: one[:count] for name, one in law.deviations.items()})
+
+
+def fewest_unknowns(
+    of_rows: Float[np.ndarray, "points 2 m"], of_capture: Float[np.ndarray, " m"]
+) -> tuple[Float[np.ndarray, "points 2 k"], Float[np.ndarray, " k"]]:
+    """Return changes with fewer independent unknowns that have the same covariance, to 3 parts in 1000 of every error.
+
+    What is not known of the capture speed (NaN) is left out.
+    """
+    flat = np.append(of_rows.reshape(-1, of_rows.shape[2]), np.nan_to_num(of_capture)[None], axis=0)
+    size = np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-300)
+    left, strength, _ = np.linalg.svd(flat / size, full_matrices=False)
+    parts = left * strength
+    missing = np.sqrt(np.maximum(np.cumsum((parts**2)[:, ::-1], axis=1)[:, ::-1], 0.0)).max(axis=0)
+    kept = (size * parts)[:, : max(int(np.sum(missing > _LEAST_PART)), 1)]
+    return kept[:-1].reshape(*of_rows.shape[:2], -1), kept[-1]
+
+
+_LEAST_PART = 3e-3
+"""Share of an error below which unknowns are left out."""
+
+
+class FittedLaw(TabulatedLaw):
+    """The impact law that a fit found, with its discrepancy: a law for scenes, and its points with a 95 % band.
+
+    The points go from 0.8 times the slowest to 1.2 times the fastest speed that the rows reached; beyond them the law
+    is `extrapolated`. `sample` draws laws that are as uncertain. NaN: nothing is known of the band.
+
+    Attributes:
+        approach_speed_nm_per_us: u_in at the points.
+        rebound_speed_nm_per_us: u_out; 0 where the tip is captured.
+        rebound_low_nm_per_us: lower end of its pointwise 95 % band.
+        rebound_high_nm_per_us: upper end.
+        collision_delay_us: the delay; 0 if impacts are instantaneous.
+        delay_low_us: lower end of its band.
+        delay_high_us: upper end.
     """
 
-    approach_speed_nm_per_us: Float[np.ndarray, " points"]
-    rebound_speed_nm_per_us: Float[np.ndarray, " points"]
-    rebound_low_nm_per_us: Float[np.ndarray, " points"]
-    rebound_high_nm_per_us: Float[np.ndarray, " points"]
-    collision_delay_us: Float[np.ndarray, " points"]
-    delay_low_us: Float[np.ndarray, " points"]
-    delay_high_us: Float[np.ndarray, " points"]
+    approach_speed_nm_per_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
+    rebound_speed_nm_per_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
+    rebound_low_nm_per_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
+    rebound_high_nm_per_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
+    collision_delay_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
+    delay_low_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
+    delay_high_us: Float[np.ndarray, " points"] = eqx.field(kw_only=True)
+
+    def __init__(  # noqa: PLR0913
+        self,
+        speeds: Float[np.ndarray, " points"],
+        rebound: Float[np.ndarray, " points"],
+        late: Float[np.ndarray, " points"],
+        *,
+        capture_speed_nm_per_us: float,
+        delay: CollisionDelay | None,
+        lasting: bool,
+        errors: tuple[Float[np.ndarray, "points 2 m"], Float[np.ndarray, " m"]],
+        mass_ng: float | None,
+        origin: str,
+    ):
+        """Make the law of its points; arguments as of `table_of_law`.
+
+        Errors are NaN where nothing is known of them.
+        """
+        table = table_of_law(
+            speeds,
+            rebound,
+            late if lasting else None,
+            capture_speed_nm_per_us=capture_speed_nm_per_us,
+            delay=delay,
+            errors=errors if np.isfinite(errors[0]).all() else None,
+        )
+        for part in dataclasses.fields(TabulatedLaw):
+            setattr(self, part.name, getattr(table, part.name))
+        self.mass_ng, self.origin = None if mass_ng is None else jnp.asarray(mass_ng), Origin(origin)
+        width = TWO_SIDED_95 * np.linalg.norm(errors[0], axis=2)
+        self.approach_speed_nm_per_us = speeds
+        self.rebound_speed_nm_per_us, self.collision_delay_us = map(np.asarray, _points(table, speeds))
+        self.rebound_low_nm_per_us = np.maximum(self.rebound_speed_nm_per_us - width[:, 0], 0.0)
+        self.rebound_high_nm_per_us = self.rebound_speed_nm_per_us + width[:, 0]
+        self.delay_low_us = self.collision_delay_us - width[:, 1]
+        self.delay_high_us = self.collision_delay_us + width[:, 1]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the law as fit.json has it: its points with units in their names, and all that makes it again."""
+        return super().to_dict() | {name: plain(getattr(self, name)) for name in FittedLaw.__annotations__}
+
+
+@jax.jit
+def _points(law: TabulatedLaw, speeds: Float[Array, " points"]) -> tuple[Array, Array]:
+    return law.rebound_speed(speeds), law.collision_delay(speeds)
 
 
 @dataclass(frozen=True)
@@ -210,7 +355,7 @@ class FitResult(Result):
             "aic": plain(self.aic),
             "bic": plain(self.bic),
             "residual_autocorrelation": plain(self.residual_autocorrelation),
-            "law": {name: plain(column) for name, column in vars(self.law).items()},
+            "law": self.law.to_dict(),
             "loss": None if self.loss is None else plain(asdict(self.loss)),
             "rows": {name: plain(column) for name, column in vars(self.rows).items()},
             "convergence": plain(asdict(self.convergence)),

@@ -10,9 +10,12 @@ its parameters as unknowns, each with a prior:
 - the corrections of impacts that last: the leading remainder of each, of either sign;
 - what slow impacts lack in any picture of impacts: common to peak and lock-in of a row.
 
-All of it is small, and enters to first order: one step from the fit's own linearisation.
+All of it is small: one step from the fit's own linearisation, of which as much is taken as lowers chi2 with the
+readings computed from the law after it, not linearised. Remainders and what slow impacts lack are no part of that law:
+they are in the covariance of the rows.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -23,7 +26,7 @@ from jaxtyping import Bool, Float
 from afm_jax.least_squares import covariance_of
 from fitting.fits.minimum import Strain, padding
 from fitting.fits.objective import ROBUST, Objective
-from fitting.forward import ImpactSlopes, free_impacts, impact_at, impact_slopes
+from fitting.forward import ImpactSlopes, Predicted, free_impacts, impact_at, impact_slopes
 from fitting.models import Problem
 from fitting.parameters import DELAY_NAMES, DELAY_SHAPE, LOSS_SHAPE, parameter_called
 
@@ -188,6 +191,12 @@ class LinearStep(NamedTuple):
     unknown_covariance: Float[np.ndarray, "m m"]
     follow: Float[np.ndarray, "m k"]
 
+    def partly(self, share: float) -> "LinearStep":
+        """Return what a part of the step leads to; covariances, chi2 and residuals are those of the whole one."""
+        return self._replace(
+            values=self.values - (1.0 - share) * self.change, change=share * self.change, unknown=share * self.unknown
+        )
+
 
 class StepSystem(NamedTuple):
     """A fit's rows, linearised, with all that is left out.
@@ -195,14 +204,43 @@ class StepSystem(NamedTuple):
     Attributes:
         residual: of the readings, then of what else there is, the shapes' priors last.
         jacobian: by the parameters, then by the shapes.
-        unknown: how the readings' residuals change with unknowns of unit variance.
+        unknown: how the readings' residuals change with unknowns of unit variance, those of the law first.
         noise: covariance of the readings' residuals, of each row by itself.
+        of_law: how many of the unknowns are coefficients of the law's discrepancy; the others belong to the rows.
     """
 
     residual: Float[np.ndarray, " n"]
     jacobian: Float[np.ndarray, "n k"]
     unknown: Float[np.ndarray, "readings m"]
     noise: Float[np.ndarray, "readings readings"]
+    of_law: int = 0
+
+    def with_unknowns(self, more: Float[np.ndarray, "readings m"] | None) -> "StepSystem":
+        """Return the same with further unknowns of unit variance, which belong to the rows."""
+        return self if more is None else self._replace(unknown=np.concatenate([self.unknown, more], axis=1))
+
+    def chi2(self, step: LinearStep, misfit: Float[np.ndarray, " readings"]) -> float:
+        """Return chi2 of a law's readings: r^T V^-1 r, with what is known of parameters, shapes and discrepancy.
+
+        V is the covariance of the rows: noise, errors of slow impacts, remainders of corrections.
+
+        Args:
+            step: that has led to the law.
+            misfit: (predicted - measured)/error of the readings.
+        """
+        rest, coefficients = self.rest(step), step.unknown[: self.of_law]
+        return float(misfit @ self.alone(misfit)[1] + rest @ rest + coefficients @ coefficients)
+
+    def rest(self, step: LinearStep) -> Float[np.ndarray, " n"]:
+        """Return the residuals besides the readings' after a step: of rows without orbit, and of what is known."""
+        size = self.noise.shape[0]
+        return self.residual[size:] + self.jacobian[size:] @ step.change
+
+    def alone(self, misfit: Float[np.ndarray, " readings"]) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+        """Return residuals without the rows' most likely remainders, and V^-1 r."""
+        of_rows = self.unknown[:, self.of_law :]
+        weighted = np.linalg.solve(self.noise + of_rows @ of_rows.T, misfit)
+        return self.noise @ weighted, weighted
 
 
 def system_of(rows: StepRows, left_out: Unmodelled) -> StepSystem:
@@ -232,7 +270,7 @@ def system_of(rows: StepRows, left_out: Unmodelled) -> StepSystem:
     unknown = [amplitudes(columns.unknown)]
     if left_out.problem.lasting:
         unknown.append(amplitudes(_remainders(rows, left_out.problem)))
-    return StepSystem(residual, jacobian, np.concatenate(unknown, axis=1), _noise(rows))
+    return StepSystem(residual, jacobian, np.concatenate(unknown, axis=1), _noise(rows), unknown[0].shape[1])
 
 
 def step_of(
@@ -251,9 +289,7 @@ def step_of(
     """
     size, names, priors = rows.measurement_error.size, left_out.problem.names, left_out.priors
     values = np.array([left_out.values[name] for name in names])
-    residual, jacobian, unknown, noise = system_of(rows, left_out)
-    if more is not None:
-        unknown = np.concatenate([unknown, more], axis=1)
+    residual, jacobian, unknown, noise, _ = system_of(rows, left_out).with_unknowns(more)
     variance = noise + unknown @ unknown.T
     root = np.linalg.cholesky(variance)
 
@@ -284,6 +320,52 @@ def step_of(
         unknown_covariance=np.eye(unknown.shape[1]) - gain @ unknown,
         follow=-gain @ jacobian[:size],
     )
+
+
+_PARTS = (1.0, 0.0), (0.5, 0.25), (0.125, 0.0625)
+"""Parts of a step that are looked at, two at a time."""
+_NOTHING = 1e-3
+"""What a step takes off chi2 at least, to first order, for it to count."""
+
+
+class Descended(NamedTuple):
+    """The part of a step that lowers chi2, and what the law after it predicts.
+
+    ``stuck``: chi2 that no part lowers, and what the whole step takes it to to first order; None: one does, or there is
+    nothing to gain.
+    """
+
+    step: LinearStep
+    predicted: Predicted
+    stuck: tuple[float, float] | None
+
+
+def descending_part(
+    step: LinearStep, system: StepSystem, predicted: Callable[[list[LinearStep]], Predicted]
+) -> Descended:
+    """Return the first of a whole step, its half, its quarter... that lowers chi2, computed; else none of it.
+
+    Args:
+        step: from a fit to its law with the model discrepancy.
+        system: of the fit.
+        predicted: what the laws after parts of the step predict.
+    """
+    begin, stay = np.inf, None
+    for shares in _PARTS:
+        parts = [step.partly(share) for share in shares]
+        found = predicted(parts)
+        looked = [
+            Descended(part, jax.tree.map(lambda leaf, i=i: leaf[i : i + 1], found), None)
+            for i, part in enumerate(parts)
+        ]
+        chi2 = [system.chi2(one.step, one.predicted.misfit.ravel()) for one in looked]
+        if stay is None:
+            begin, stay = chi2.pop(), looked.pop()
+        for one, here in zip(looked, chi2, strict=True):
+            if here < begin:
+                return one
+    assert stay is not None  # noqa: S101
+    return stay._replace(stuck=(begin, step.chi2) if begin - step.chi2 > _NOTHING else None)
 
 
 def _bounded(residual, slope, begin, ends, moving) -> Float[np.ndarray, " k"]:
@@ -401,14 +483,24 @@ class LawBefore(NamedTuple):
     capture_slope: Float[np.ndarray, " p"]
 
 
-def law_after(step: LinearStep, left_out: Unmodelled, speeds: Float[np.ndarray, " n"], before: LawBefore) -> LawAfter:
+def law_after(
+    step: LinearStep,
+    left_out: Unmodelled,
+    speeds: Float[np.ndarray, " n"],
+    before: LawBefore,
+    moved: LawBefore | None = None,
+) -> LawAfter:
     """Return the law after the step.
+
+    u_out^2 is that of the formula with the parameters after the step, less c (sqrt(u^2 + q) - u), and the discrepancy;
+    the delay that of the formula for this u_out, f (1/u_out^2 - 1/u^2), and its discrepancy.
 
     Args:
         step: the step.
         left_out: by the fitted model.
         speeds: approach speeds in nm/us.
         before: the fitted law there.
+        moved: the model's law with the parameters after the step; None: to first order.
     """
     law, slope = before.law, before.slope
     leaves = law[0] > 0.0
@@ -426,6 +518,8 @@ def law_after(step: LinearStep, left_out: Unmodelled, speeds: Float[np.ndarray, 
     found, factor = _moved(step, slope, Columns(*(seen(part) for part in columns)))
     found = np.where(leaves, law + found, law)
     found[0] = np.maximum(found[0], 0.0)
+    if moved is not None:
+        found = _with_discrepancy(step, left_out, speeds, columns, moved)
     whole = LawAfter(found, np.where(leaves[:, None], factor, 0.0), before.capture, np.full(factor.shape[2], np.nan))
     if not before.capture > 0.0:
         # without adhesion nothing is captured: what is left out cannot be told from there
@@ -435,8 +529,40 @@ def law_after(step: LinearStep, left_out: Unmodelled, speeds: Float[np.ndarray, 
     rising = 2.0 * left_out.values.get("r", 1.0) ** 2 * before.capture - left_out.values.get("viscous_loss", 0.0)
     at_capture = Columns(*(-part[:1, :1] / max(rising, 1e-9) for part in edge))
     shift, capture_factor = _moved(step, before.capture_slope[None, None], at_capture)
-    capture = max(before.capture + float(shift[0, 0]), 0.0)
+    capture = before.capture + float(shift[0, 0])
+    if moved is not None:
+        values = left_out.values | dict(zip(step.names, step.values, strict=True))
+        edge_u = np.array([moved.capture])
+        square = _discrepancy(step, values, edge_u, left_out.columns(edge_u, np.zeros(1)))[0, 0]
+        capture = moved.capture - float(square) / max(rising, 1e-9)
+    capture = max(capture, 0.0)
     return whole._replace(capture=capture, capture_factor=capture_factor[0, 0])
+
+
+def _with_discrepancy(
+    step: LinearStep, left_out: Unmodelled, u: Float[np.ndarray, " n"], columns: Columns, moved: LawBefore
+) -> Float[np.ndarray, "2 n"]:
+    """Return rebound speed and delay of the formula after the step with the most likely discrepancy."""
+    values = left_out.values | dict(zip(step.names, step.values, strict=True))
+    formula, delay = moved.law
+    square, late = _discrepancy(step, values, u, columns)
+    rebound = np.sqrt(np.maximum(formula**2 + square, 0.0))
+    leaves = (formula > 0.0) & (rebound > 0.0)
+    w, by_formula = (np.where(leaves, speed, 1.0) for speed in (rebound, formula))
+    late = late - values.get("delay_lead_nm", 0.0) * (1.0 / w - 1.0 / by_formula)
+    if DELAY_SHAPE in values:
+        late = late + values[DELAY_SHAPE] * (1.0 / np.maximum(w, 1.0) ** 2 - 1.0 / u**2)
+    return np.where(leaves, np.stack([rebound, delay + late]), 0.0)
+
+
+def _discrepancy(
+    step: LinearStep, values: dict[str, float], u: Float[np.ndarray, " n"], columns: Columns
+) -> Float[np.ndarray, "2 n"]:
+    """Return what the discrepancy adds to the squared rebound speed, with the drag's shape, and to the delay."""
+    square, late = columns.unknown @ step.unknown[: columns.unknown.shape[2]]
+    if LOSS_SHAPE in values:
+        square = square - values["viscous_loss"] * (np.sqrt(u**2 + values[LOSS_SHAPE]) - u)
+    return np.stack([square, late])
 
 
 class ClosestMember(NamedTuple):
@@ -456,6 +582,7 @@ def closest_member(
     speeds: Float[np.ndarray, " n"],
     before: LawBefore,
     free: Bool[np.ndarray, " p"],
+    moved: LawBefore | None = None,
 ) -> ClosestMember | None:
     """Return the parameters of the model's own formula that comes closest to the law after the step.
 
@@ -468,11 +595,12 @@ def closest_member(
         speeds: approach speeds in nm/us at which the formula is compared: those of the rows that were used.
         before: the fitted law there.
         free: which of the parameters are not at their bound.
+        moved: as of `law_after`.
 
     Returns:
         None where the parameters are not determined.
     """
-    after, names = law_after(step, left_out, speeds, before), left_out.problem.names
+    after, names = law_after(step, left_out, speeds, before, moved), left_out.problem.names
     if not (np.isfinite(step.covariance).all() and np.isfinite(after.factor).all()):
         return None
     there = (before.law[0] > 0.0) & (after.law[0] > 0.0)

@@ -86,6 +86,11 @@ class Evidence:
     """Of several tables, the probability that each one's law is that of the others."""
     scattering: bool = False
     """Laws were allowed to differ from table to table."""
+    independent_residual: Float[np.ndarray, "rows k"] | None = None
+    """Residuals without what is common to rows: the most likely remainders of corrections, and departures of tables;
+    None: those of the rows."""
+    stuck: tuple[float, float] | None = None
+    """chi2 that no part of the step with the model discrepancy lowers, and what the step takes it to to first order."""
 
     @property
     def refusal(self) -> str:
@@ -127,7 +132,7 @@ def _reasons(evidence: Evidence) -> list[str]:
     misfit = misfits(evidence)
     if misfit:
         reasons.append(f"The model does not explain the data: {'; '.join(misfit)}. {_why_not_explained(evidence)}")
-    reasons += [*_contradictions(evidence), *_different_laws(evidence)]
+    reasons += [*_no_way_down(evidence), *_contradictions(evidence), *_different_laws(evidence)]
     if evidence.freedom <= 0:
         reasons.append("As many parameters as amplitudes: the goodness of fit cannot be judged.")
     # a tapping curve tells those of the delay only together; the law does not hang on each
@@ -137,6 +142,19 @@ def _reasons(evidence: Evidence) -> list[str]:
         if parameter.interval95 == (None, None) and not misfit and not undetermined:
             reasons.append(f"{name} is not identified: {parameter.interval_reason}; {helpful_measurement(name)}.")
     return reasons
+
+
+def _no_way_down(evidence: Evidence) -> list[str]:
+    """Return what says that the model discrepancy was not found: no part of the step to it lowers chi2, computed."""
+    if evidence.stuck is None:
+        return []
+    begin, expected = evidence.stuck
+    said = (
+        "Not converged: to first order the model discrepancy would lower chi2 from "
+        f"{begin:.1f} to {expected:.1f}, but computed not even a sixteenth of it does; the amplitudes are far from "
+        "linear in the law, as they are near folds: leave such rows out."
+    )
+    return [said]
 
 
 def _undetermined(evidence: Evidence) -> list[str]:
@@ -254,11 +272,12 @@ def _outliers(evidence: Evidence, scale: float = 1.0) -> Bool[np.ndarray, " rows
 
 def _correlations(evidence: Evidence) -> list[tuple[str, float]]:
     """Return in which order of the rows neighbouring residuals are correlated, and how much."""
-    rows = evidence.rows
-    known = np.flatnonzero(np.isfinite(rows.residual).any(axis=1) & (rows.orbits > 0))
+    rows, residual = evidence.rows, evidence.independent_residual
+    residual = rows.residual if residual is None else residual
+    known = np.flatnonzero(np.isfinite(residual).any(axis=1) & (rows.orbits > 0))
     speed = rows.approach_speed_nm_per_us[known]
     orders = {"in the table's order": known, "over the approach speed": known[np.argsort(speed, kind="stable")]}
-    found = [(where, correlation_excess(rows.residual[order])) for where, order in orders.items()]
+    found = [(where, correlation_excess(residual[order])) for where, order in orders.items()]
     return [(where, excess) for where, excess in found if abs(excess) > _CORRELATED]
 
 
