@@ -188,6 +188,10 @@ class Law(eqx.Module):
     def delay_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
         """Return d tau/d u_in in us^2/nm; 0 without a delay or where captured."""
 
+    @abstractmethod
+    def without_delay(self) -> "Law":
+        """Return the law of instantaneous impacts with the same rebound speeds."""
+
     def extrapolated(self, approach_speed: ArrayLike) -> Bool[Array, "..."]:
         """Say whether an approach speed in nm/us is outside those that the law is known for: a formula's never is."""
         return jnp.zeros(jnp.shape(approach_speed), bool)
@@ -254,6 +258,10 @@ class ImpactLaw(Law):
     def slow_restitution(self) -> Float[Array, "..."]:
         """The coefficient r."""
         return self.r
+
+    def without_delay(self) -> "ImpactLaw":
+        """Return the law of instantaneous impacts with the same rebound speeds."""
+        return ImpactLaw(self.r, self.epsilon, self.viscous_loss)
 
     @property
     def lowest(self) -> Float[Array, ""]:
@@ -505,6 +513,10 @@ class TabulatedLaw(Law):
         made = _with_numbers(self, {name: getattr(self, name) + change for name, change in changes.items()})
         # a loss so small that it is not sure to be one
         return _replaced(made, capture=jnp.maximum(made.capture, 0.0), deviations=None)
+
+    def without_delay(self) -> "TabulatedLaw":
+        """Return the law of instantaneous impacts with the same rebound speeds; of its errors none are kept."""
+        return _replaced(self, delay=None, deviations=None)
 
     def sample(self, key: Array, n: int) -> "TabulatedLaw":
         """Return laws drawn from the errors of this one: one law whose every number has a first axis of length n.
