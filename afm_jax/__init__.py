@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from afm_jax.contact.collide import Collision, capture_speed, collide
     from afm_jax.contact.contact import Contact
     from afm_jax.contact.junction import Junction, Phase, find_junction
+    from afm_jax.contact.law_of_contact import make_law
     from afm_jax.contact.time_course import time_course
     from afm_jax.dynamics.basins import basins_of_attraction
     from afm_jax.dynamics.bifurcations import bifurcation_diagram
@@ -80,6 +81,7 @@ else:
         "load_scene": "afm_jax.scenefile.scenefile",
         "lyapunov_spectrum": "afm_jax.dynamics.exponents",
         "many_impact_orbits": "afm_jax.dynamics.impact_orbits",
+        "make_law": "afm_jax.contact.law_of_contact",
         "map_jacobian": "afm_jax.impact.jacobian",
         "next_impact": "afm_jax.impact.map",
         "save_law": "afm_jax.scenefile.law_files",
@@ -139,6 +141,7 @@ __all__ = [
     "load_law",
     "load_scene",
     "lyapunov_spectrum",
+    "make_law",
     "many_impact_orbits",
     "map_jacobian",
     "next_impact",

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from fitting.tapping_curves.maps import TappingMap, tapping_map
     from fitting.tapping_curves.result import Tapping
     from fitting.tapping_curves.tapping import tapping
+    from fitting.tapping_curves.together import TappingTogether, tapping_together
     from fitting.traces.lockin import LockinResult, lockin
     from fitting.traces.trace import Trace, read_trace
 else:
@@ -89,6 +90,8 @@ else:
         "simulate_experiment": "fitting.simulated.experiment",
         "tapping": "fitting.tapping_curves.tapping",
         "tapping_map": "fitting.tapping_curves.maps",
+        "TappingTogether": "fitting.tapping_curves.together",
+        "tapping_together": "fitting.tapping_curves.together",
         "trust": "fitting.sampling.trust_pack",
         "write_inference_data": "fitting.sampling.inference_data",
         "write_table": "fitting.tables.table",
@@ -122,6 +125,7 @@ __all__ = [
     "TableError",
     "Tapping",
     "TappingMap",
+    "TappingTogether",
     "Trace",
     "TrustPack",
     "amplitude_gradients",
@@ -150,6 +154,7 @@ __all__ = [
     "simulate_experiment",
     "tapping",
     "tapping_map",
+    "tapping_together",
     "trust",
     "write_inference_data",
     "write_table",

@@ -246,7 +246,7 @@ def test_remarks_stay_in_their_column_and_values_keep_their_errors(width: int):
 def test_presets_are_those_of_the_scene_files_and_are_completed():
     assert tuple(PRESETS) == PRESET_NAMES
     context = click.Context(main.main.get_command(click.Context(main.main), "orbits") or main.main)
-    for name in ("orbits", "simulate", "effects", "continue", "lyapunov", "basins", "chart", "fit-law", "collide"):
+    for name in ("orbits", "simulate", "effects", "continue", "lyapunov", "basins", "chart", "collide"):
         command = main.main.get_command(context, name)
         assert command is not None
         kind = next(each.type for each in command.params if each.name == "scene")

@@ -22,7 +22,7 @@ from afm_jax.effects.study import study_effects
 from afm_jax.impact import map as poincare
 from afm_jax.impact import orbits as orbits_module
 from afm_jax.impact.jacobian import map_jacobian
-from afm_jax.impact.law import CollisionDelay, ImpactLaw, impact_law_of
+from afm_jax.impact.law import CollisionDelay, ImpactLaw, TabulatedLaw, impact_law_of
 from afm_jax.impact.map import iterate_batch, iterate_map, next_impact
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.simulate import simulate
@@ -87,19 +87,40 @@ SCENES = [
 ]
 
 
-@pytest.mark.parametrize("function", OBJECTS)
-def test_compiled_batched_and_plain_agree(function: Callable[[Scene], Any]):
-    batch = np.asarray(jax.jit(jax.vmap(function))(stacked(SCENES)))
+def tabulated(scene: Scene, origin: str = "") -> Scene:
+    """Return the scene with a table in place of its formula, of a law that no formula has."""
+    law = impact_law_of(scene)
+    speeds = np.geomspace(1.1 * float(law.capture_speed_nm_per_us), 300.0, 15)
+    rebound = law.rebound_speed(speeds) * (0.98 - 0.01 * np.sin(np.log(speeds)))
+    late = law.collision_delay(speeds) + 0.002 * np.cos(np.log(speeds))
+    table = TabulatedLaw(speeds, rebound, late, delay=law.delay, origin=origin)
+    return Scene(scene.cantilever, scene.platform, table)
+
+
+TABLES = [tabulated(scene) for scene in SCENES]
+BOTH = [
+    *((function, SCENES) for function in OBJECTS),
+    *(pytest.param(function, TABLES, marks=pytest.mark.slow) for function in OBJECTS[2:]),
+]
+LIGHT_BOTH = [
+    *((function, SCENES) for function in LIGHT),
+    *(pytest.param(function, TABLES, marks=pytest.mark.slow) for function in LIGHT[2:]),
+]
+
+
+@pytest.mark.parametrize(("function", "scenes"), BOTH)
+def test_compiled_batched_and_plain_agree(function: Callable[[Scene], Any], scenes: list[Scene]):
+    batch = np.asarray(jax.jit(jax.vmap(function))(stacked(scenes)))
     assert np.all(np.isfinite(batch))
-    for row, scene in zip(batch, SCENES, strict=True):
+    for row, scene in zip(batch, scenes, strict=True):
         # Compiled code fuses multiply and add; the condition of an impact is below 1e3, of a trace near capture 1e4.
         np.testing.assert_allclose(function(scene), row, rtol=1e-11)
     assert not np.allclose(batch[0], batch[1])
 
 
-@pytest.mark.parametrize("function", LIGHT)
-def test_jvp_vjp_and_differences_agree(function: Callable[[Scene], Any]):
-    scene, random = SCENES[0], np.random.default_rng(5)
+@pytest.mark.parametrize(("function", "scenes"), LIGHT_BOTH)
+def test_jvp_vjp_and_differences_agree(function: Callable[[Scene], Any], scenes: list[Scene]):
+    scene, random = scenes[0], np.random.default_rng(5)
     direction = jax.tree.map(lambda leaf: leaf * random.uniform(-1, 1), scene)
     value, rate = jax.jvp(function, (scene,), (direction,))
     weight = jnp.asarray(random.normal(size=value.shape))
@@ -163,6 +184,19 @@ def test_one_compilation_serves_all_values(function: Callable[..., Any]):
 
     for scene, time, velocity in built_in_many_ways():
         jax.block_until_ready(counted(scene, jnp.asarray(time, float), jnp.asarray(velocity, float)))
+    assert len(traced) == 1
+
+
+def test_one_compilation_serves_all_tables_of_one_length():
+    traced = []
+
+    @jax.jit
+    def counted(scene):
+        traced.append(scene)
+        return impact_law(scene)
+
+    for number, scene in enumerate(SCENES):
+        jax.block_until_ready(counted(tabulated(scene, origin=f"table {number}")))
     assert len(traced) == 1
 
 

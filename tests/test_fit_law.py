@@ -188,7 +188,7 @@ def test_delay_fits_check_their_arguments():
 
 
 def run(*arguments: object):
-    return CliRunner().invoke(main, ["fit-law", *(str(argument) for argument in arguments)])
+    return CliRunner().invoke(main, ["collide", "--make-law", *(str(argument) for argument in arguments)])
 
 
 @pytest.fixture(scope="module")
@@ -215,9 +215,16 @@ def test_command_tells_what_the_functions_find(reported):
 
 def test_command_writes_tables_and_picture(reported):
     answer, folder = reported
-    assert {path.name for path in folder.iterdir()} == {"fit_law.csv", "fit_delay.csv", "fit_law.json", "fit_law.png"}
-    assert json.loads((folder / "fit_law.json").read_text("utf-8")) == answer
-    with (folder / "fit_law.csv").open(encoding="utf-8") as file:
+    assert {path.name for path in folder.iterdir()} == {
+        "law.json",
+        "law.csv",
+        "law_models.csv",
+        "law_delay.csv",
+        "collide.json",
+        "law.png",
+    }
+    assert json.loads((folder / "collide.json").read_text("utf-8")) == answer
+    with (folder / "law_models.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert len(rows) == answer["points"] == 512
     for model in answer["models"]:
@@ -226,10 +233,10 @@ def test_command_writes_tables_and_picture(reported):
             for row in rows
         ]
         np.testing.assert_allclose(np.abs(errors).max(), model["worst_relative_error"], rtol=1e-9, atol=0.0)
-    with (folder / "fit_delay.csv").open(encoding="utf-8") as file:
+    with (folder / "law_delay.csv").open(encoding="utf-8") as file:
         delays = list(csv.DictReader(file))
     assert all(abs(float(row["lag_us"]) - float(row["lead_us"]) - float(row["delay_us"])) < 1e-15 for row in delays)
-    pixels = imread(folder / "fit_law.png")[..., :3]
+    pixels = imread(folder / "law.png")[..., :3]
     _, width, _ = pixels.shape
     # Okabe and Ito's orange and blue: two laws on the left, lead and lag on the right
     for colour in ((0xD5, 0x5E, 0x00), (0x00, 0x72, 0xB2)):

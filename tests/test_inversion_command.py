@@ -102,7 +102,7 @@ def test_two_rows_end_with_exit_code_3(tmp_path):
         ([HEAD.rsplit(",", 2)[0], ROWS[0].rsplit(",", 2)[0]], (), "add the columns phase_deg and phase_error_deg"),
         ([HEAD, ROWS[0]], ("--frequency-error", "-1"), "frequency-error"),
         ([HEAD, ROWS[0]], ("--truth", "TABLE"), "there is no column approach_speed_nm_per_us"),
-        ([HEAD, ROWS[0]], ("--law", "TABLE"), "is no JSON; give the fit.json"),
+        ([HEAD, ROWS[0]], ("--law", "TABLE"), "is none of a law's"),
     ],
 )
 def test_wrong_calls_end_with_one_line_and_exit_code_2(tmp_path, table, arguments, said):

@@ -8,10 +8,12 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax.cli.main import main
+from fitting.tables.csv_text import TableError
 from fitting.tables.table import write_table
 from fitting.tapping_curves.pictures import curve_figure
 from fitting.tapping_curves.result import Tapping
 from fitting.tapping_curves.tapping import tapping
+from fitting.tapping_curves.together import tapping_together
 from tests.coverage_of_tapping import random_curve
 from tests.strict_reading import strictly
 from tests.tapping_truth_of_laws import (
@@ -22,6 +24,7 @@ from tests.tapping_truth_of_laws import (
     Truth,
     curve_like_graphite,
     curve_of_energy,
+    curve_of_law,
     table_of,
 )
 
@@ -191,3 +194,81 @@ def test_bands_hold_the_energies_of_random_laws():
         assert np.mean(off < 1.96) > 0.9
         assert off.max() < 4.0
         assert np.median(off) < 1.2 * 0.6745
+
+
+@pytest.mark.slow
+def test_curves_of_one_lever_share_frequency_and_q_and_tell_their_scatter(tmp_path: Path):
+    truth, rng = curve_like_graphite(120), np.random.default_rng(4)
+    tables = []
+    exact = Stated(frequency=1e-9, quality=1e-9, stiffness=1e-9, **SHARP)
+    for number in range(4):
+        # curves of one lever that differ by 0.4 aJ on average at the top
+        factor = 1.0 + 0.04 * (number - 1.5)
+        one = curve_of_energy(GRAPHITE, truth.amplitude_nm / 13.4, truth.energy_aj * factor, truth.lag_deg < 90.0)
+        table = table_of(GRAPHITE, one, exact, rng, free_rows=30, source=f"curve {number}")
+        stated = {"free_frequency_khz": 344.604, "quality_factor": 233.0, "spring_constant_n_per_m": 44.0}
+        errors = {"free_frequency_error_khz": 0.005, "quality_factor_error": 5.0, "spring_constant_error_n_per_m": 2.0}
+        tables.append(replace(table, **stated, **errors))
+        write_table(tables[-1], tmp_path / f"{number}.csv")
+    result = tapping_together(tables)
+    assert result.valid, result.reasons
+    values = [{n.name: n.value for n in one.functions.nuisances} for one in result.curves if one.functions is not None]
+    for name in ("free_frequency_khz", "quality_factor"):
+        assert len({round(one[name], 9) for one in values}) == 1
+    repulsive = next(one for one in result.scatter if one.repulsive)
+    mean, scatter, own, common = repulsive.at(0.85) or (0.0, 0.0, 0.0, 0.0)
+    # 4 % steps scatter by 5.2 %, far beyond a curve's own errors
+    assert scatter == pytest.approx(0.052 * mean, rel=0.2)
+    assert own < 0.5 * scatter
+    assert abs(mean - truth.at("energy_aj", np.array(0.85), 13.4)) < 2.0 * np.hypot(common, own)
+    files = [str(tmp_path / f"{number}.csv") for number in range(4)]
+    run = CliRunner().invoke(main, ["tapping", *files, "--no-law", "--json", "--out", str(tmp_path / "out")])
+    assert run.exit_code == 0, run.stderr
+    answer = strictly(run.stdout)
+    assert len(answer["curves"]) == 4
+    assert answer["together"]["valid"]
+    assert (tmp_path / "out" / "together.png").stat().st_size > 10000
+    # not one lever
+    other = replace(tables[1], quality_factor=150.0)
+    with pytest.raises(TableError, match="states the Q as 150 \\+- 5"):
+        tapping_together([tables[0], other])
+
+
+@pytest.mark.parametrize(("restitution", "viscous", "number"), [(0.95, 0.0, 0), (1.0, 1.0, 1)])
+def test_energies_against_speed_stand_beside_the_law_that_made_them(restitution: float, viscous: float, number: int):
+    tip = Tip(free_nm=80.0, ratio=1.05)
+    truth = curve_of_law(
+        tip,
+        -80.0 * np.linspace(0.95, 0.12, 60),
+        lambda u: np.sqrt(np.maximum((restitution * u) ** 2 - viscous * u - 0.3, 1e-6)),
+    )
+    result = tapping(table_of(tip, truth, Stated(), np.random.default_rng(2)), law=False)
+    answer = result.to_dict()["energy_by_speed"]
+    assert answer["reason"] is None
+    assert len(answer["approach_speed_nm_per_us"]) > 40
+    law = answer["laws"][number]
+    true = {"one_less_r_squared": 1.0 - restitution**2, "viscous_loss_nm_per_us": viscous, "epsilon_nm2_per_us2": 0.3}
+    for name, one in law["parameters"].items():
+        assert abs(one["value"] - true[name]) < 3.0 * one["standard_error"]
+    assert law["chi2"] < 2.0 * law["degrees_of_freedom"]
+    # on resonance the speed cannot be told, and why stands there
+    still = tapping(table_of(Tip(), one_energy(), Stated(), np.random.default_rng(2)), law=False)
+    unknown = still.to_dict()["energy_by_speed"]
+    assert unknown["laws"] == []
+    assert "driven at 1.000 of the free frequency" in unknown["reason"]
+
+
+@pytest.mark.parametrize(("phase", "amplitude"), [(1.0, 0.0), (5.0, 0.0), (0.0, 0.03)])
+def test_a_drift_that_free_rows_at_one_end_leave_open_is_fitted_or_said(phase: float, amplitude: float):
+    truth, stated = one_energy(60), Stated(stiffness=1e-4, phase_noise_deg=0.2)
+    drifts = {"phase_drift_deg": phase, "amplitude_drift": amplitude}
+    table = table_of(Tip(), truth, stated, np.random.default_rng(1), **drifts, rows_in_order_of_time=True)
+    result = tapping(table, law=False)
+    assert result.valid, result.reasons
+    low, high = result.energy["interval95"]
+    assert low < ONE_ENERGY_AJ < high
+    assert np.mean(np.abs(deviations(result, truth, 40.0)) < 1.96) > 0.9
+    blind = tapping(replace(table, rows_in_order_of_time=False), law=False)
+    assert blind.energy["value"] is None or not blind.valid
+    if phase == 1.0:
+        assert "# rows = in order of time" in blind.reasons[0]

@@ -35,7 +35,6 @@ CALLS = {
     "figures": ("--only", "4", "--coarse"),
     "fit": ("--example",),
     "fit --each": (str(EXAMPLES / "amplitudes_law.csv"), "--each", "--workers", "1"),
-    "fit-law": (),
     "invert": ("--example",),
     "lockin": ("trace.csv",),
     "lyapunov": ("figure2", "--parameter", "platform.amplitude_nm=3:4:3", "--impacts", "100"),

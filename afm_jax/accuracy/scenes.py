@@ -324,8 +324,8 @@ def fidelity_ladder(
     known = _law_of(law) if isinstance(full, Contact) and law is not None else full
     rungs: dict[str, Callable[[], tuple[float, float, int]]] = {}
     contacts = _expected_contacts(loaded, duration_us)
-    if isinstance(known, ImpactLaw):
-        plain = ImpactLaw(known.r, known.epsilon, known.viscous_loss)
+    if isinstance(known, Law):
+        plain = known.without_delay()
         laws = {"": plain, **({" with delay": known} if known.delay is not None else {})}
         scenes = {
             name: eqx.tree_at(_interaction, loaded, each, is_leaf=lambda x: x is full) for name, each in laws.items()

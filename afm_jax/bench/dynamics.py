@@ -19,7 +19,6 @@ from afm_jax.dynamics.basins import basins_of_attraction
 from afm_jax.dynamics.bifurcations import bifurcation_diagram
 from afm_jax.dynamics.charts import stability_chart
 from afm_jax.dynamics.exponents import lyapunov_spectrum
-from afm_jax.impact.law import impact_law_of
 from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
 
 Row = dict[str, Any]
@@ -131,7 +130,7 @@ def _seconds_of_a_point(plane: Callable[..., Scene], points: list[tuple[float, f
             float(scene.platform.angular_frequency),
             float(scene.platform.amplitude_nm),
             float(scene.platform.offset_nm),
-            float(impact_law_of(scene).r),
+            float(scene.interaction.r),
             order,
         )
         for scene, order in scenes

@@ -25,10 +25,10 @@ from afm_jax.bench.problems import (
     regular_scene,
     scattered_starts,
     settled_starts,
+    tabulated_scene,
 )
 from afm_jax.bench.scipy_impacts import scipy_impacts
 from afm_jax.bench.timing import Timing, compiled_for, progress, time_compiled
-from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.map import DEFAULT_BLOCK, NEAR_GRAZING, NextImpact, iterate_batch
 from afm_jax.outcomes import Outcome
 from afm_jax.verify.fifty_digits import ExactMap, derivatives_by_r
@@ -121,6 +121,7 @@ def one_core(*, batches: list[int], blocks: list[int], impacts: int, repetitions
         map_row(regular, some, **measuring, block=block, what=f"next_impact iterated, blocks of {block}")
         for block in blocks
     ]
+    rows.append(map_row(tabulated_scene(), some, **measuring, what="next_impact iterated, the law as a table"))
     spread = scattered_starts(regular.scene, derivative_batch)
     rows.append(map_row(regular, spread, **measuring, what="next_impact iterated, starts over the whole period"))
     rows.append(map_row(chaotic, settled_starts(chaotic.scene, derivative_batch), **measuring))
@@ -188,7 +189,7 @@ def derivative_rows(case: BenchmarkScene, starts: Starts, *, impacts: int, repet
         def by_r(r):
             return last(eqx.tree_at(lambda varied: varied.interaction.r, scene, r), starts)
 
-        return jax.jvp(by_r, (impact_law_of(scene).r,), (jnp.ones(()),))[1]
+        return jax.jvp(by_r, (scene.interaction.r,), (jnp.ones(()),))[1]
 
     def reverse(scene, starts):
         return jax.grad(lambda *varied: sum(jnp.sum(part) for part in last(*varied)), argnums=(0, 1))(scene, starts)
@@ -221,7 +222,7 @@ def _derivative_error(case: BenchmarkScene, starts: Starts, impacts: int) -> flo
         scene = eqx.tree_at(lambda varied: varied.interaction.r, case.scene, r)
         return iterate_batch(scene, starts.time_us, starts.velocity_nm_per_us, impacts).time_us
 
-    r = impact_law_of(case.scene).r
+    r = case.scene.interaction.r
     found, slopes = np.asarray(times(r)), np.asarray(jax.jacfwd(times)(r))
     states = np.stack([np.asarray(part) for part in starts], axis=1).tolist()
     exact = np.array([derivatives_by_r(case.scene, state, lane) for state, lane in zip(states, found, strict=True)])

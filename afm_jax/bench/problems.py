@@ -17,7 +17,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.driven import Place, driven_by
 from afm_jax.contact.settings import DrivenSetting, QuickSetting
 from afm_jax.dynamics.iteration import evenly_spread
-from afm_jax.impact.law import ImpactLaw
+from afm_jax.impact.law import MOST_KNOTS, ImpactLaw, TabulatedLaw
 from afm_jax.impact.map import iterate_batch
 from afm_jax.motion.contact_motion import cross
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State
@@ -47,6 +47,14 @@ class BenchmarkScene(NamedTuple):
 def regular_scene() -> BenchmarkScene:
     """Return the scene of the stated aims: n = 1, beta = 2 nm, sigma = -1 nm, r = 0.5, undamped."""
     return BenchmarkScene("regular", figure2_scene(1.0, 2.0), chaotic=False)
+
+
+def tabulated_scene() -> BenchmarkScene:
+    """Return the regular scene with its law as a table of 24 speeds."""
+    regular = regular_scene()
+    speeds = np.geomspace(0.5, 100.0, MOST_KNOTS)
+    law = TabulatedLaw(speeds, regular.scene.interaction.rebound_speed(speeds))
+    return BenchmarkScene("regular", Scene(regular.scene.cantilever, regular.scene.platform, law), chaotic=False)
 
 
 def chaotic_scene() -> BenchmarkScene:

@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.bench.integrators import Integrator, integrate_to_event
-from afm_jax.impact.law import impact_law_of
 
 _STEPS_A_PERIOD = 3
 """At least so many: an event is seen by its signs at the ends of a step, and longer ones would miss impacts."""
@@ -67,7 +66,7 @@ class _Constants(NamedTuple):
 
     @classmethod
     def of(cls, scene: Scene) -> "_Constants":
-        law, cantilever, platform = impact_law_of(scene), scene.cantilever, scene.platform
+        law, cantilever, platform = scene.interaction, scene.cantilever, scene.platform
         return cls(
             float(cantilever.angular_frequency) ** 2,
             2.0 * float(cantilever.decay_rate),

@@ -7,7 +7,7 @@ import click
 from afm_jax.cli.contact_options import ContactOptions, chosen_contact, with_contact_options
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session, write_json
-from afm_jax.cli.values import Finite, Numbers
+from afm_jax.cli.values import Ends, Finite, Numbers
 from afm_jax.words import known
 
 if TYPE_CHECKING:
@@ -54,22 +54,74 @@ _SHOWN = 40
     show_default=True,
     help="How the way through the bridge is integrated.",
 )
+@click.option(
+    "--make-law",
+    is_flag=True,
+    help="Make the impact law that the contact amounts to, in place of a table of collisions: with --out law.json and "
+    "law.csv, which scene files and --law take, and the formulas closest to it.",
+)
+@click.option(
+    "--speed-range",
+    type=Ends(),
+    metavar="LOW:HIGH",
+    help="With --make-law: approach speeds of the formulas in nm/us. Left out: 1.5 times the capture speed to 250.",
+)
+@click.option(
+    "--delay-range",
+    type=Ends(),
+    metavar="LOW:HIGH",
+    help="With --make-law: the same for the delay's formula. Left out: 1.37 times the capture speed to 700.",
+)
+@click.option(
+    "--residuals",
+    type=click.Choice(("relative", "absolute")),
+    help="With --make-law: what is made small, u_fit/u_out - 1 (this is what happens without) or u_fit - u_out.",
+)
+@click.option(
+    "--points",
+    type=click.IntRange(min=10, max=100_000),
+    help="With --make-law: number of speeds that formulas are fitted to; 512 without.",
+)
 @with_session
-def command(
+def command(  # noqa: PLR0913
     session: Session,
     *,
     contact_options: ContactOptions,
     speeds: tuple[float, ...] | None,
     accuracy: float,
     method: str,
+    make_law: bool,
+    speed_range: tuple[float, float] | None,
+    delay_range: tuple[float, float] | None,
+    residuals: str | None,
+    points: int | None,
 ) -> None:
     """Let free tips collide with a sample at rest, through liquid bridge and solid junction.
 
     The contact is the paper's, or that of SCENE.toml, changed by the options. Of every speed: rebound speed, collision
     delay, whether the tip is captured, times, deepest gap, and where the energy went; and the capture speed. With
     --out collide.csv, collide.json and collide.png. Captured tips are a result, even if all are; exit code 3 if the
-    integration does not resolve one.
+    integration does not resolve one. With --make-law the law that the contact amounts to.
     """
+    of_laws = {"--speed-range": speed_range, "--delay-range": delay_range, "--residuals": residuals, "--points": points}
+    given = [name for name, value in of_laws.items() if value is not None]
+    if given and not make_law:
+        raise click.UsageError(f"{given[0]} is of the formulas of a law: add --make-law")
+    if make_law and speeds is not None:
+        raise click.UsageError("--make-law chooses its own speeds: leave --speeds out")
+    if make_law:
+        from afm_jax.cli import contact_law  # noqa: PLC0415
+
+        session.start_computing()
+        contact_law.make_law(
+            session,
+            contact_options,
+            speed_range=speed_range,
+            delay_range=delay_range,
+            residuals=residuals or "relative",
+            points=points or 512,
+        )
+        return
     session.start_computing("afm_jax.contact.collide:_capture_speed", "afm_jax.contact.collide:_quick")
     from afm_jax.contact.collide import collisions  # noqa: PLC0415
 

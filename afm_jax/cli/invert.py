@@ -30,8 +30,9 @@ from afm_jax.cli.values import Finite, example_path, tables_with, with_noise, wi
 @click.option(
     "--law",
     type=click.Path(path_type=Path),
-    metavar="JSON",
-    help="A fit, as `afm-jax fit --out` writes it (fit.json), to draw over the rows; one of other speeds is refused.",
+    metavar="FILE",
+    help="A fit, as `afm-jax fit --out` writes it (fit.json), or another law's file, to draw over the rows; one of "
+    "other speeds is refused.",
 )
 @click.option("--example", is_flag=True, help="Invert the bundled table instead of a file.")
 @with_session

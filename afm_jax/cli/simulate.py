@@ -1,10 +1,12 @@
 """`afm-jax simulate SCENE.toml|PRESET`: a scene in time, and what an experiment reads of it."""
 
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
+from afm_jax.cli.fitted_law import extrapolation_of, with_fitted_law, with_law_option
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import Finite, SceneName
@@ -60,7 +62,8 @@ class Multiples(click.ParamType):
     default="1",
     show_default=True,
     metavar="K,...",
-    help="Multiples of the response frequency at which amplitude and phase are read.",
+    help="Multiples of the response frequency omega/N at which amplitude and phase are read, besides the drive's "
+    "(N times it), which always is.",
 )
 @click.option(
     "--accuracy",
@@ -82,6 +85,7 @@ class Multiples(click.ParamType):
     help="Write trace.csv into --out, too: the deflection over the last response periods at equal steps of time, as "
     "`afm-jax lockin` reads it.",
 )
+@with_law_option
 @with_session
 def command(  # noqa: PLR0913
     session: Session,
@@ -94,12 +98,14 @@ def command(  # noqa: PLR0913
     accuracy: float,
     method: str,
     samples: str | None,
+    law: Path | None,
 ) -> None:
     """Follow a scene in time: contacts, amplitudes, phases, forces, energies.
 
     SCENE.toml is a scene file, PRESET the name of one of the paper's scenes (figure2, figure8, ...). The start is the
     file's [start]; without one the tip starts on the single-impact orbit that the law with delay predicts, if there is
-    one. Amplitudes are read over the last response period once the motion has settled, else over the last fifth. With
+    one. Amplitudes are read over the last response period once the motion has settled, else over the last fifth, at the
+    drive's frequency and at the response's, which is 1/N of it where the motion repeats after N drive periods. With
     --out contacts.csv, trajectory.csv, simulate.json and pictures. A tip that sticks, or does not settle, is a result;
     exit code 3 if the simulation broke off.
     """
@@ -116,6 +122,7 @@ def command(  # noqa: PLR0913
     from afm_jax.motion.observe import observe  # noqa: PLC0415
 
     loaded, told = scene_and_start(scene)
+    loaded, _ = with_fitted_law(loaded, law)
     period = drive_of(loaded).period_us
     until_settled = until_settled or (duration_us is None and periods is None)
     longest = duration_us if duration_us is not None else (periods or DEFAULT_PERIODS) * period
@@ -139,12 +146,14 @@ def command(  # noqa: PLR0913
         "pieces": run.pieces,
     }
     payload = payload_of(loaded, run, seen, settings)
+    beyond = extrapolation_of(loaded, run.simulation.contacts.approach_speed_nm_per_us)
+    payload["extrapolated"] = beyond
     if session.out is not None:
         write_files(session, run, seen, dense, payload)
         if samples:
             write_trace(session, loaded, run, seen.window)
         _draw(session, loaded, run, dense)
-    session.emit(payload, *text_of(payload))
+    session.emit(payload, *text_of(payload), *([] if beyond is None else [beyond]))
     if not payload["valid"]:
         raise NotValid(payload["outcome"])
 

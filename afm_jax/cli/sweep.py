@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
+from afm_jax.cli.fitted_law import with_fitted_law, with_law_option
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import scene_and_start
 from afm_jax.compilation_cache import available_cores
@@ -34,9 +35,17 @@ _MOST_DRAWN = 2
 @click.option("--scheduler", metavar="tcp://...", help="A Dask scheduler whose workers do the work.")
 @click.option("--dry-run", is_flag=True, help="Measure a chunk and say what the sweep would take; keep nothing.")
 @click.option("--plot", is_flag=True, help="Draw a sweep of one or two axes, sweep.png.")
+@with_law_option
 @with_session
 def command(
-    session: Session, *, sweep: Path, workers: int | None, scheduler: str | None, dry_run: bool, plot: bool
+    session: Session,
+    *,
+    sweep: Path,
+    workers: int | None,
+    scheduler: str | None,
+    dry_run: bool,
+    plot: bool,
+    law: Path | None,
 ) -> None:
     """Compute what SWEEP.toml records over its grid, into DIR/sweep.zarr; call it again to go on after a fault.
 
@@ -73,7 +82,7 @@ def command(
     from afm_jax.sweeps.plan import plan_of  # noqa: PLC0415
 
     try:
-        plan = plan_of(_input(given, sweep))
+        plan = plan_of(_input(given, sweep, law))
     except (ValueError, TypeError) as error:
         raise ValueError(f"{sweep}: {error}") from error
     if plot and len(plan.axes) > _MOST_DRAWN:
@@ -174,10 +183,12 @@ def _read(path: Path) -> dict[str, Any]:
     return given
 
 
-def _input(given: Mapping[str, Any], path: Path) -> dict[str, Any]:
+def _input(given: Mapping[str, Any], path: Path, law: Path | None) -> dict[str, Any]:
     """Return the input of a plan: what the file names is read, relative to its folder."""
     common = {"axes": given.get("axes", []), "accuracy": given.get("accuracy"), "chunk": given.get("chunk")}
     if "tables" in given:
+        if law is not None:
+            raise ValueError("--law is of a sweep over a scene: fits of tables find their law")
         from fitting.bulk import table_input  # noqa: PLC0415
 
         if common.pop("accuracy") is not None:
@@ -192,6 +203,7 @@ def _input(given: Mapping[str, Any], path: Path) -> dict[str, Any]:
         name = str(given["scene"])
         beside = path.parent / name
         scene, start = scene_and_start(str(beside) if beside.exists() else name)
+    scene, _ = with_fitted_law(scene, law)
     # a start is of use for simulations alone
     told = start._asdict() if start is not None and given["record"].get("what") == "simulation" else None
     return {

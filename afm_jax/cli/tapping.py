@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@click.argument("curve_file", metavar="CURVE", required=False, type=click.Path(path_type=Path))
+@click.argument("curve_files", metavar="[CURVE]...", nargs=-1, type=click.Path(path_type=Path))
 @with_noise
 @with_reading
 @click.option("--tip-calibration", type=ValueAndError(), metavar="C", help="True over stated amplitude; '1 +- 0.02'.")
@@ -32,39 +32,45 @@ if TYPE_CHECKING:
     help="Multiply the rows' errors where they scatter more (up to three times), instead of refusing their energy.",
 )
 @with_session
-def command(session: Session, curve_file: Path | None, *, no_law: bool, model: str, **options: Any) -> None:
+def command(session: Session, curve_files: tuple[Path, ...], *, no_law: bool, model: str, **options: Any) -> None:
     """Read the energy of a tap off a tapping curve, and where the drive allows it the impact law.
 
     CURVE is a table of amplitude and phase against height (`# drive = force` or base, columns drive_frequency_khz,
     free_amplitude_nm, offset_nm, lockin_amplitude_nm, phase_lag_deg with their errors, retract), or an instrument's
     file, as for `afm-jax read`. Energy, thresholds and hysteresis, attractive or repulsive branch, impact speeds where
     they can be known; then the law from the rows with fast impacts, or why not and what to record instead. With --out
-    the report: tapping.html, .txt, .json, .png and tapping_rows.csv, and that of the law; of a file of several curves
-    in a folder each. Exit code 3 if the energy of a tap is not determined.
+    the report: tapping.html, .txt, .json, .png and tapping_rows.csv, and that of the law. Several files, or a file of
+    several curves, are taken as of one lever: frequency and Q are fitted to all, the scatter from curve to curve stands
+    beside the errors, with --out in together.png; each curve has a folder of its own.
+    Exit code 3 if the energy of a tap is not determined.
     """
-    from fitting.tables.table import read_table  # noqa: PLC0415
-    from fitting.tapping_curves.measured import is_table, read_measured  # noqa: PLC0415
-
     how = {"no_law": no_law, "scale_errors": options.pop("scale_errors")}
-    if options.pop("example") == (curve_file is not None):
+    if options.pop("example") == bool(curve_files):
         raise click.UsageError("give a curve, `afm-jax tapping CURVE`, or --example for a simulated raw file")
-    if curve_file is None:
+    if not curve_files:
         curve_file, options = _example(options)
-    if is_table(curve_file):
-        _refuse_reading(curve_file, options)
-        result = _analysed(session, _given(read_table(curve_file, noise=options["noise"]), options), model, **how)
-        _finish(session, result)
+        curve_files = (curve_file,)
+    files = [_read(path, options) for path in curve_files]
+    several = len(files) > 1 or len(files[0].tables) != 1 or bool(files[0].refused)
+    if several:
+        _finish_several(session, curve_files, files, model, how)
         return
-    file = read_measured(curve_file, curve=options["curve"], **{name: options[name] for name in READING_OPTIONS})
+    (table,) = files[0].tables.values()
+    _finish(session, _analysed(session, table, model, **how))
+
+
+def _read(path: Path, options: dict[str, Any]) -> "MeasuredFile":
+    """Return the curves of a file, a table or an instrument's, with what the call says of the instrument."""
+    from fitting.tables.table import read_table  # noqa: PLC0415
+    from fitting.tapping_curves.measured import MeasuredFile, is_table, read_measured  # noqa: PLC0415
+
+    if is_table(path):
+        _refuse_reading(path, options)
+        return MeasuredFile({1: _given(read_table(path, noise=options["noise"]), options)}, {}, {})
+    file = read_measured(path, curve=options["curve"], **{name: options[name] for name in READING_OPTIONS})
     for note in file.notes:
         add_note(note)
-    results = {
-        number: _analysed(session, _calibrated(table, options), model, **how) for number, table in file.tables.items()
-    }
-    if len(results) == 1 and not file.refused:
-        _finish(session, next(iter(results.values())))
-        return
-    _finish_several(session, curve_file, file, results)
+    return replace(file, tables={number: _calibrated(table, options) for number, table in file.tables.items()})
 
 
 def _analysed(session: Session, table: "AmplitudeTable", model: str, *, no_law: bool, scale_errors: bool) -> "Tapping":
@@ -94,41 +100,62 @@ def _finish(session: Session, result: "Tapping") -> None:
         raise NotValid(result.in_unit(result.reasons[0]))
 
 
-def _finish_several(session: Session, path: Path, file: "MeasuredFile", results: "dict[int, Tapping]") -> None:
-    """The same for the curves of one file, with the hysteresis of all of them.
+def _finish_several(
+    session: Session, paths: tuple[Path, ...], files: "list[MeasuredFile]", model: str, how: dict[str, bool]
+) -> None:
+    """The same for several curves of one lever, together and one by one, with the hysteresis of all of them.
 
     Raises:
-        NotValid: if the energy is not determined on every curve, or a curve is refused.
+        NotValid: if the energy is not determined on every curve, they disagree, or a curve is refused.
     """
-    from fitting.tapping_curves.report import tapping_summary, write_tapping  # noqa: PLC0415
+    from fitting.tapping_curves.report import tapping_summary, write_tapping, write_together  # noqa: PLC0415
+    from fitting.tapping_curves.together import together, together_lines  # noqa: PLC0415
 
-    width = file.half_width_nm
-    summaries = [lambda result=result: tapping_summary(result) + "\n" for result in results.values()]
-    text = [f"Curve {number} refused: {reason}" for number, reason in file.refused.items()]
-    if width is not None:
-        each = ", ".join(f"{one:.2f}" for one in file.half_widths_nm.values())
+    places = [(i, number) for i, file in enumerate(files) for number in file.tables]
+    tables = [files[i].tables[number] for i, number in places]
+    whole = together([_analysed(session, table, model, **how) for table in tables]) if tables else None
+    results = () if whole is None else whole.curves
+    numbers = [number for _, number in places] if len(files) == 1 else list(range(1, len(places) + 1))
+    named = {"curve " + str(number): result for number, result in zip(numbers, results, strict=True)}
+    refused = [
+        {"curve": number, "reason": reason} | ({} if len(files) == 1 else {"file": str(path)})
+        for path, file in zip(paths, files, strict=True)
+        for number, reason in file.refused.items()
+    ]
+    summaries = [lambda result=result: tapping_summary(result) + "\n" for result in results]
+    text = [f"Curve {one['curve']} refused: {one['reason']}" for one in refused]
+    width, widths = files[0].half_width_nm, files[0].half_widths_nm
+    if len(files) == 1 and width is not None:
+        each = ", ".join(f"{one:.2f}" for one in widths.values())
         text.append(
             f"Hysteresis at half of the free amplitude: {width[0]:.2f} nm, scatter {width[1]:.2f} nm over "
-            f"{len(file.half_widths_nm)} curves ({each}); it needs no calibration of the amplitude"
+            f"{len(widths)} curves ({each}); it needs no calibration of the amplitude"
         )
+    if whole is not None and len(results) > 1:
+        text.append("\n".join(together_lines(whole)))
     payload = {
-        "valid": bool(results) and not file.refused and all(result.valid for result in results.values()),
-        "curves": [{"curve": number, **result.to_dict()} for number, result in results.items()],
-        "refused": [{"curve": number, "reason": reason} for number, reason in file.refused.items()],
-        "half_width_nm": None if width is None else {"mean": width[0], "scatter": width[1]},
-        "half_widths_nm": [{"curve": number, "width_nm": one} for number, one in file.half_widths_nm.items()],
+        "valid": whole is not None and whole.valid and not refused,
+        "curves": [{"curve": number, **result.to_dict()} for number, result in zip(numbers, results, strict=True)],
+        "together": None if whole is None else whole.to_dict(),
+        "refused": refused,
+        "half_width_nm": None if len(files) > 1 or width is None else {"mean": width[0], "scatter": width[1]},
+        "half_widths_nm": [] if len(files) > 1 else [{"curve": n, "width_nm": one} for n, one in widths.items()],
     }
     session.emit(payload, *summaries, *text)
     if session.out is not None:
-        for number, result in results.items():
+        for number, result in zip(numbers, results, strict=True):
             own = replace(session, out=session.out / f"curve_{number}")
             prepare_folder(session.out / f"curve_{number}", within=session.out)
             for written in write_tapping(result, session.out / f"curve_{number}", own.write_table):
                 session.note(f"wrote {written}")
+        if whole is not None and whole.scatter:
+            for written in write_together(whole, session.out):
+                session.note(f"wrote {written}")
     if not payload["valid"]:
-        named = [f"curve {number} refused" for number in file.refused]
-        named += [f"curve {number}: {result.reasons[0]}" for number, result in results.items() if not result.valid]
-        raise NotValid(f"{path}: {'; '.join(named)}")
+        why = [f"curve {one['curve']} refused" for one in refused]
+        why += [f"{name}: {result.reasons[0]}" for name, result in named.items() if not result.valid]
+        why += [] if whole is None else [reason for reason in whole.reasons if "disagree" in reason]
+        raise NotValid(f"{paths[0] if len(paths) == 1 else f'{len(paths)} files'}: {'; '.join(why)}")
 
 
 def _example(options: dict[str, Any]) -> tuple[Path, dict[str, Any]]:

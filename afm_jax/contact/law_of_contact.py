@@ -35,7 +35,7 @@ from afm_jax.contact.forces import jkr
 from afm_jax.contact.junction import Junction, find_junction
 from afm_jax.contact.junction_leg import pass_through_junction
 from afm_jax.impact.lasting_impact import TabulatedImpact, polynomials, stretched
-from afm_jax.impact.law import CollisionDelay, ImpactLaw
+from afm_jax.impact.law import MOST_KNOTS, CollisionDelay, ImpactLaw, TabulatedLaw
 from afm_jax.least_squares import Box, Searches, descended, distance
 from afm_jax.results import Result, public_result
 
@@ -80,7 +80,7 @@ _LEAD_SPEEDS = np.geomspace(2.0, 30.0, 8)
 _PLACES = 0.5 - 0.5 * np.cos(np.pi * np.arange(TERMS) / (TERMS - 1))
 
 
-@public_result()
+@public_result(picture="afm_jax.plots.collisions:law_figure")
 @dataclass(frozen=True)
 class ContactLaw(Result):
     """A law fitted to a contact, and how far it is off.
@@ -224,6 +224,39 @@ def fit_law(
     )
 
 
+_NEAREST, _FASTEST = 0.2, 700.0
+"""Where the table of `make_law` begins, as sqrt(u^2 - u_c^2) over the capture speed, and ends, in nm/us."""
+
+
+@checked
+def make_law(contact: Contact, *, mass_ng: float = 1.0, points: int = MOST_KNOTS) -> TabulatedLaw:
+    """Return the law that a contact amounts to, as a table of free collisions: what a scene takes in its place.
+
+    Args:
+        contact: the contact, of numbers.
+        mass_ng: the tip's mass in ng.
+        points: number of speeds, from 2 % above the capture speed to 700 nm/us.
+
+    Raises:
+        RuntimeError: if JAX does not compute in 64 bits, or did not when the contact was built.
+        ValueError: if the contact has no junction, or captures tips of every speed.
+    """
+    require_float64(contact)
+    capture = float(capture_speed(contact, mass_ng))
+    if not capture < 0.5 * _FASTEST:
+        raise ValueError("the contact captures tips of every speed that was tried: there is no law to make")
+    # a contact that captures no tip still needs a positive speed
+    beyond = np.geomspace(max(_NEAREST * capture, 1e-3 * _FASTEST), _FASTEST, points)
+    found = rebounds(contact, np.hypot(beyond, capture), mass_ng)
+    names = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us")
+    return TabulatedLaw(
+        *(found[name] for name in names),
+        capture_speed_nm_per_us=capture,
+        mass_ng=mass_ng,
+        origin=f"contact: {', '.join(contact.effects)}",
+    )
+
+
 def closest_law(
     approach: Float[np.ndarray, " n"], rebound: Float[np.ndarray, " n"], model: str, residuals: str
 ) -> tuple[ImpactLaw, bool]:
@@ -306,7 +339,7 @@ def range_above_capture(
     return float(low), float(high)
 
 
-@public_result()
+@public_result(picture="afm_jax.plots.collisions:delay_figure")
 @dataclass(frozen=True)
 class ContactDelay(Result):
     """The delay of a contact against the approach speed, and the law fitted to it; times in us, shapes (n,).

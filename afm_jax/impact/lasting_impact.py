@@ -35,7 +35,7 @@ from jaxtyping import Array, Bool, Float
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import Surface
-from afm_jax.impact.law import Law, Speeds
+from afm_jax.impact.law import Law, Speeds, TabulatedLaw
 
 PULLS = (-3.0, 4.0)
 """Range of kappa in which F and H are right to 1e-6 of themselves; beyond, they are held."""
@@ -80,6 +80,8 @@ USUAL_LEAD = 1.3
 
 PASSES = 4
 """From the delay to mid contact and back."""
+_SECANTS = 6
+"""The same for a law that is a table, whose inverse is found along with it."""
 _ROUNDING = 1e-12
 NEAREST = 1.01
 """Approach speed in terms of the capture speed from which on a table's error is known."""
@@ -667,6 +669,8 @@ def delay_before(
     """
     leaves = rebound_speed > 0.0
     rebound = jnp.where(leaves, rebound_speed, 1.0)
+    if isinstance(law, TabulatedLaw):
+        return jnp.where(leaves, _delay_of_table(law, rebound, leaving_us, cantilever, surface), 0.0)
 
     def of_free(free_rebound: Float[Array, ""]) -> Speeds:
         approach = law.approach_speed(free_rebound)
@@ -682,6 +686,34 @@ def delay_before(
     begin = of_free(rebound)
     found = lax.fori_loop(0, PASSES, improve, begin) if law.lasts else begin
     return jnp.where(leaves, found.delay, 0.0)
+
+
+def _delay_of_table(
+    law: TabulatedLaw,
+    rebound: Float[Array, ""],
+    leaving_us: Float[Array, ""],
+    cantilever: Cantilever,
+    surface: Platform | Surface,
+) -> Float[Array, ""]:
+    """Return `delay_before` of a law that is a table: by secants in ln v, one look at the table each."""
+
+    def improve(_, state: tuple[Array, ...]) -> tuple[Array, ...]:
+        place, before, missed, delay = state
+        v = jnp.exp(place)
+        found = law.beyond_capture(jnp.sqrt(v * v + law.capture**2), v)
+        if law.lasts:
+            middle = middle_of_contact(cantilever, surface, leaving_us - 0.5 * delay)
+            found = corrected(found, middle, cantilever, law)
+        miss = jnp.log(found.rebound / rebound)
+        apart = place - before
+        # about 1: the rebound is nearly in proportion to v
+        slope = jnp.clip((miss - missed) / jnp.where(apart == 0.0, 1.0, apart), 0.5, 2.0)
+        slope = jnp.where(apart == 0.0, 1.0, slope)
+        return place - miss / slope, place, miss, found.delay
+
+    begin = jnp.log(rebound / law.r)
+    nothing = jnp.zeros_like(begin)
+    return lax.fori_loop(0, _SECANTS, improve, (begin, begin, nothing, nothing))[-1]
 
 
 def _lag(speed: Float[Array, ""], length: Float[Array, ""], acceleration: Float[Array, ""]) -> Float[Array, ""]:

@@ -188,6 +188,10 @@ class Law(eqx.Module):
     def delay_slope(self, approach_speed: ArrayLike) -> Float[Array, "..."]:
         """Return d tau/d u_in in us^2/nm; 0 without a delay or where captured."""
 
+    @abstractmethod
+    def without_delay(self) -> "Law":
+        """Return the law of instantaneous impacts with the same rebound speeds."""
+
     def extrapolated(self, approach_speed: ArrayLike) -> Bool[Array, "..."]:
         """Say whether an approach speed in nm/us is outside those that the law is known for: a formula's never is."""
         return jnp.zeros(jnp.shape(approach_speed), bool)
@@ -254,6 +258,10 @@ class ImpactLaw(Law):
     def slow_restitution(self) -> Float[Array, "..."]:
         """The coefficient r."""
         return self.r
+
+    def without_delay(self) -> "ImpactLaw":
+        """Return the law of instantaneous impacts with the same rebound speeds."""
+        return ImpactLaw(self.r, self.epsilon, self.viscous_loss)
 
     @property
     def lowest(self) -> Float[Array, ""]:
@@ -496,6 +504,10 @@ class TabulatedLaw(Law):
         deviations = jax.jit(jax.vmap(along))(by_rebound, by_delay, by_capture)
         return _replaced(law, deviations=deviations)
 
+    def for_scene(self) -> "TabulatedLaw":
+        """Return the law alone, without what a fit tells of it besides: what scenes hold."""
+        return self if type(self) is TabulatedLaw else _replaced(self)
+
     def moved(self, unknowns: ArrayLike) -> "TabulatedLaw":
         """Return the law for values of the unknowns of its errors, in standard deviations, shape (unknowns,)."""
         if self.deviations is None:
@@ -505,6 +517,10 @@ class TabulatedLaw(Law):
         made = _with_numbers(self, {name: getattr(self, name) + change for name, change in changes.items()})
         # a loss so small that it is not sure to be one
         return _replaced(made, capture=jnp.maximum(made.capture, 0.0), deviations=None)
+
+    def without_delay(self) -> "TabulatedLaw":
+        """Return the law of instantaneous impacts with the same rebound speeds; of its errors none are kept."""
+        return _replaced(self, delay=None, deviations=None)
 
     def sample(self, key: Array, n: int) -> "TabulatedLaw":
         """Return laws drawn from the errors of this one: one law whose every number has a first axis of length n.
@@ -683,7 +699,7 @@ def _with_numbers(law: TabulatedLaw, numbers: dict[str, Array]) -> TabulatedLaw:
 def _replaced(law: TabulatedLaw, **parts: Any) -> TabulatedLaw:
     """Return a law with other fields, without the checks of a table."""
     made = object.__new__(TabulatedLaw)
-    for field in dataclasses.fields(law):
+    for field in dataclasses.fields(TabulatedLaw):
         object.__setattr__(made, field.name, parts.get(field.name, getattr(law, field.name)))
     return made
 
@@ -700,9 +716,18 @@ def law_of_dict(told: Mapping[str, Any]) -> TabulatedLaw:
         raise ValueError(f"the law lacks {' and '.join(missing)}")
     numbers = told.get("numbers")
     delay = None
-    if isinstance(numbers, Mapping) and told.get(names[2]) is not None:
-        delay = CollisionDelay(*(numbers[name] for name in _OF_DELAY), corrections=bool(told.get("corrections", True)))
     u, w, late = (np.asarray(told.get(name, ()), float) for name in names)
+    if isinstance(numbers, Mapping):
+        known = [*_NUMBERS, "scale_nm_per_us", *([name for name in _OF_DELAY if "hertz" in numbers])]
+        lacking = [name for name in known if name not in numbers]
+        if lacking:
+            raise ValueError(f"the numbers of the law lack {' and '.join(lacking)}")
+        if "hertz" not in numbers:
+            # how a fit tells instantaneous impacts: delays of 0
+            late = np.zeros(0)
+        else:
+            values = (numbers[name] for name in _OF_DELAY)
+            delay = CollisionDelay(*values, corrections=bool(told.get("corrections", True)))
     law = TabulatedLaw(
         u,
         w,

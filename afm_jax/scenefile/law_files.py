@@ -46,6 +46,9 @@ def load_law(path: str | os.PathLike[str]) -> TabulatedLaw:
     Raises:
         ValueError: if it cannot be read, is none of these, or its speeds are no law; one line.
     """
+    if Path(path).is_dir():
+        # the folder of a report
+        path = next((Path(path) / name for name in ("law.json", "fit.json") if (Path(path) / name).exists()), path)
     name = printable(os.fspath(path))
     try:
         text = read_whole(path).decode("utf-8-sig")
@@ -61,6 +64,15 @@ def load_law(path: str | os.PathLike[str]) -> TabulatedLaw:
         raise SceneError(f"{name}: {error}") from error
 
 
+def holds_law(path: str | os.PathLike[str]) -> bool:
+    """Say whether a file is JSON that `save_law` wrote; what cannot be read is not."""
+    try:
+        found = json.loads(read_whole(path).decode("utf-8-sig"))
+    except (OSError, ValueError, RecursionError):
+        return False
+    return isinstance(found, dict) and found.get("format") == FORMAT
+
+
 @checked
 def save_law(law: TabulatedLaw, path: str | os.PathLike[str]) -> None:
     """Write a law to a JSON file from which `load_law` returns an equal one, errors included.
@@ -69,6 +81,20 @@ def save_law(law: TabulatedLaw, path: str | os.PathLike[str]) -> None:
         OSError: if the file cannot be written.
     """
     write_whole(path, strict_json({"format": FORMAT, "format_version": FORMAT_VERSION, **law.to_dict()}) + "\n")
+
+
+def save_law_csv(law: TabulatedLaw, path: str | os.PathLike[str]) -> None:
+    """Write a law's table to a CSV that `load_law` reads: its columns with their units, mass, range and origin."""
+    told = law.to_dict()
+    low, high = told["speed_range_nm_per_us"]
+    comments = [f"# speeds: {low:.6g} to {high:.6g} nm/us"]
+    comments += [f"# {key} = {told[key]}" for key in ("mass_ng", "origin", "capture_speed_nm_per_us") if key in told]
+    names = [
+        name for name in ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us") if name in told
+    ]
+    rows = zip(*(told[name] for name in names), strict=True)
+    lines = [*comments, ",".join(names), *(",".join(map(repr, row)) for row in rows)]
+    write_whole(path, "\n".join(lines) + "\n")
 
 
 def _of_json(text: str) -> TabulatedLaw:

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.least_squares import chi2_tail
+from afm_jax.scenefile.law_files import holds_law, load_law
 from fitting.inversion.result import (
     Coefficient,
     ComparedLaw,
@@ -342,12 +343,16 @@ def read_fitted_law(path: str | Path) -> SavedLaw:
     """Read the law of a fit.
 
     Args:
-        path: what `afm-jax fit --json` prints, or the fit.json of its report.
+        path: what `afm-jax fit --json` prints, or the fit.json of its report; or another law's file.
 
     Raises:
         TableError: if the file cannot be read, is no fit, or the fit is not valid.
     """
     name = printable(str(path))
+    if Path(path).suffix != ".json" or holds_law(path):
+        told = load_law(path).to_dict()
+        columns = [np.asarray(told.get(column, np.zeros(len(told[_COLUMNS[0]])))) for column in _COLUMNS]
+        return SavedLaw("table", *columns, source=told.get("origin", name), drives=np.zeros((len(DRIVE_COLUMNS), 0)))
     found = read_fit_json(path)
     if not isinstance(found.get("law"), dict):
         raise TableError(f"{name}: is no fit of a law; give the fit.json of `afm-jax fit --out`")

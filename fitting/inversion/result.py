@@ -203,6 +203,8 @@ class SavedLaw(NamedTuple):
         """What was fitted to what, over which speeds."""
         known = self.approach_speed_nm_per_us[np.isfinite(self.rebound_speed_nm_per_us)]
         over = f"over {known.min():.4g} to {known.max():.4g} nm/us" if known.size else "over no speed"
+        if self.model == "table":
+            return f"the law of {self.source} {over}"
         return f"{self.model} fitted to {self.source or 'a table without a name'} {over}"
 
 

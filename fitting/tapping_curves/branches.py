@@ -25,7 +25,7 @@ _HELD = 0.1
 _WINDOW = 0.6
 """Of the free amplitude: down to there the fall of the amplitude is fitted."""
 _MOST_ROWS = 60
-_STEPS = 21
+_STEPS, _MOST_STEPS = 21, 2000
 _STEEP = 0.2
 """Of the free amplitude: a fall between two rows that may come anywhere between them."""
 _UNIFORM = 12.0**-0.5
@@ -285,21 +285,26 @@ def _contact(curve: TappingCurve, part: np.ndarray, free: Bool[np.ndarray, " row
 
 def _hinge(height: np.ndarray, amplitude: np.ndarray, error: np.ndarray, level: float) -> Height | None:
     """Return where a straight fall from a level began, by least squares; None where a step explains it better."""
+    target = (amplitude - level) / error
 
-    def chi2(at: float, *, step: bool) -> float:
-        after = height > at
-        basis = (
-            np.stack([np.where(after, height - at, 0.0), *([after.astype(float)] if step else [])], axis=1)
-            / error[:, None]
-        )
-        target = (amplitude - level) / error
-        return float(np.sum((target - basis @ np.linalg.lstsq(basis, target, rcond=None)[0]) ** 2))
+    def chi2(at: np.ndarray, *, step: bool) -> np.ndarray:
+        """Return the least sum of squares of each place, in closed form."""
+        beyond = np.maximum(height - at[:, None], 0.0)
+        fall, jump = beyond / error, (beyond > 0.0) / error
+        ff, ft = np.sum(fall**2, axis=1), fall @ target
+        if not step:
+            return target @ target - ft**2 / ff
+        jj, fj, jt = np.sum(jump**2, axis=1), np.sum(fall * jump, axis=1), jump @ target
+        determinant = ff * jj - fj**2
+        # one row beyond tells a step only
+        both = determinant > 1e-9 * ff * jj
+        explained = (jj * ft**2 - 2.0 * fj * ft * jt + ff * jt**2) / np.where(both, determinant, 1.0)
+        return target @ target - np.where(both, explained, jt**2 / jj)
 
-    grid = np.linspace(height[0], height[-2], _STEPS * len(height))
-    hinges = np.array([chi2(at, step=False) for at in grid])
+    grid = np.linspace(height[0], height[-2], min(_STEPS * len(height), _MOST_STEPS))
+    hinges = chi2(grid, step=False)
     best = int(np.argmin(hinges))
-    middles = 0.5 * (height[1:-1] + height[:-2])
-    if min(chi2(at, step=True) for at in middles) < hinges[best] - 2.0 * _FREE:
+    if chi2(0.5 * (height[1:-1] + height[:-2]), step=True).min() < hinges[best] - 2.0 * _FREE:
         return None
     inside = grid[hinges < hinges[best] + max(1.0, hinges[best] / len(height))]
     return Height(float(grid[best]), float(max(0.5 * (inside[-1] - inside[0]), grid[1] - grid[0])))

@@ -9,11 +9,12 @@ determined together, and the band of the function holds what the instrument leav
 the constant, one energy for all rows.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.linalg import solve_triangular
 
 from afm_jax.least_squares import IMPROBABLE, chi2_tail
 from fitting.tapping_curves.branches import free_ends, repulsive_rows, smooth_stretches, ways
@@ -28,11 +29,11 @@ _HARMONICS_THAT_TELL = 4
 Z95 = 1.959964
 TORN = 3.0
 """Distance of a nuisance from what is given, in its standard errors, from which neither is believed."""
-_DRIFT_DEG, _DRIFT = 1.0, 0.01
+_DRIFT_DEG, _DRIFT = 3.0, 0.02
 """Usual drift of phase and of free amplitude over a table, where free rows do not determine it."""
 _WIDE_DRIFT_DEG, _WIDE_DRIFT = 30.0, 0.3
 """Likewise where free rows at both ends determine it."""
-_MOST_BINS = 100
+_MOST_BINS = 60
 """Rows of a function beyond which neighbours are averaged."""
 _SIZES = tuple(0.005 * 2.0**k for k in range(7))
 """Sizes of the process that are tried, of pi k A0^2 s/Q, what the air takes of the free tip in a period."""
@@ -135,7 +136,7 @@ class Smoother(NamedTuple):
         if process.size > 0.0:
             covariance += process.covariance(bins.place, bins.place)
         factor = np.linalg.cholesky(covariance)
-        root = np.linalg.solve(factor, np.eye(len(bins.variance)))
+        root = solve_triangular(factor, np.eye(len(factor)), lower=True, check_finite=False)
         ones = root.sum(axis=1)
         # the constant is not known beforehand: what lies along it tells nothing
         log_determinant = 2.0 * np.log(np.diag(factor)).sum() + np.log(ones @ ones)
@@ -177,6 +178,8 @@ class EnergyFit:
         rows_freedom: of it, less what their functions take.
         scale: what the rows' own errors were multiplied by.
         relative_error: of every energy, by spring constant and calibration, by name.
+        search: the least squares that it is the minimum of.
+        at: the unknowns, in their units from what is given.
     """
 
     rows: tuple[np.ndarray, ...]
@@ -197,6 +200,8 @@ class EnergyFit:
     rows_freedom: float
     scale: float
     relative_error: dict[str, float]
+    search: "_EnergySearch" = field(repr=False)
+    at: Float[np.ndarray, " unknowns"]
 
     @property
     def p_value(self) -> float:
@@ -496,7 +501,7 @@ class _EnergySearch:
             x = self._descended(x, groups, processes, scale)
             if rounds and self.smooth and processes == self._processes(x, groups, scale):
                 break
-        return self._result(x, groups, processes, scale)
+        return self.result(x, groups, processes, scale)
 
     def _start(self) -> np.ndarray:
         """Return the unknowns of the instrument as it is given."""
@@ -548,11 +553,29 @@ class _EnergySearch:
         for rows, smoother in zip(groups, smoothers, strict=True):
             averages = smoother.bins.averages
             y = smoother.root @ (averages @ found.energy_aj[rows])
-            s = smoother.root @ (averages @ slopes.energy[rows])
+            s = smoother.root @ self._without_scale(
+                smoother, averages @ slopes.energy[rows], averages @ found.energy_aj[rows]
+            )
             matrix += s.T @ s
             gradient += s.T @ y
             total += float(y @ y)
         return matrix, gradient, total
+
+    def _without_scale(self, smoother: Smoother, slopes: np.ndarray, energy: np.ndarray) -> np.ndarray:
+        """Return the changes of binned energies, for Q without what only makes all of them larger or smaller.
+
+        On resonance that is all that Q does, and the size of a process is no measure of it: larger Q would be preferred
+        for the smaller energies.
+        """
+        if smoother.process.size == 0.0:
+            return slopes
+        function = energy - smoother.bins.variance * (smoother.root.T @ (smoother.root @ energy))
+        function -= function.mean()
+        for i, one in enumerate(self.unknowns):
+            if one.kind == "quality_factor":
+                share = function @ slopes[:, i] / max(float(function @ function), 1e-300)
+                slopes[:, i] -= share * function
+        return slopes
 
     def _descended(self, x: np.ndarray, groups: list, processes: list[Process], scale: float) -> np.ndarray:
         if not len(x):
@@ -615,12 +638,20 @@ class _EnergySearch:
                     best, most = trial, evidence
         return best
 
-    def _result(self, x: np.ndarray, groups: list, processes: list[Process], scale: float) -> EnergyFit:
+    def result(
+        self,
+        x: np.ndarray,
+        groups: list,
+        processes: list[Process],
+        scale: float,
+        covariance: np.ndarray | None = None,
+    ) -> EnergyFit:
+        """Return the fit at some unknowns; their covariance is that of its readings where none is given."""
         curve, found = self.curve, energies(self.curve, self.instrument(x))
         smoothers = self._smoothers(x, groups, processes, scale)
         slopes = self.slopes(x, self._as_fitted(x, groups, smoothers, found))
-        matrix = self._normal(x, slopes, found, groups, smoothers)[0]
-        covariance = np.linalg.pinv(matrix, hermitian=True)
+        if covariance is None:
+            covariance = np.linalg.pinv(self._normal(x, slopes, found, groups, smoothers)[0], hermitian=True)
         known = np.array([np.isfinite(one.given.error) for one in self.unknowns], bool)
         units = self.values(x) - self.values(x - 1e-6) if len(x) else x
         errors = np.sqrt(np.diag(covariance)) * units / 1e-6
@@ -662,7 +693,73 @@ class _EnergySearch:
                 "spring_constant_n_per_m": curve.spring_constant_n_per_m.error / curve.spring_constant_n_per_m.value,
                 "tip_calibration": 2.0 * curve.tip_calibration.error / curve.tip_calibration.value,
             },
+            search=self,
+            at=x,
         )
+
+
+COMMON = ("free_frequency_khz", "quality_factor", "harmonics_factor")
+"""Nuisances that curves of one lever have in common."""
+
+
+class Common(NamedTuple):
+    """What curves of one lever tell together of what they have in common.
+
+    Attributes:
+        names: of the nuisances.
+        p_value: probability that the curves, each alone, disagree more on them.
+    """
+
+    names: tuple[str, ...]
+    p_value: float
+
+
+def fitted_together(fits: list[EnergyFit]) -> tuple[list[EnergyFit], Common]:
+    """Return fits of curves of one lever with frequency, Q and harmonics fitted to all of them.
+
+    Each curve alone tells them by a Gaussian, mostly by how smooth it makes the energy; energies of curves of one
+    sample are alike, so that this is counted as that of one curve: the weighted mean with the error of one. Each
+    curve's own unknowns and functions follow.
+
+    Args:
+        fits: of curves for which the same is given of the lever.
+    """
+    names = tuple(name for name in COMMON if all(name in [n.name for n in one.nuisances] for one in fits))
+    places = [np.array([[n.name for n in one.nuisances].index(name) for name in names], int) for one in fits]
+    prior = np.eye(len(names))
+    blocks = [one.covariance[np.ix_(place, place)] for one, place in zip(fits, places, strict=True)]
+    told = [np.linalg.inv(block) - prior for block in blocks]
+    # of each alone: what its own readings say, before what is given pulls it
+    weighted = [np.linalg.inv(b) @ one.at[p] for b, one, p in zip(blocks, fits, places, strict=True)]
+    covariance = np.linalg.inv(prior + np.mean(told, axis=0))
+    mean = covariance @ np.mean(weighted, axis=0)
+    moved = []
+    for one, place, block in zip(fits, places, blocks, strict=True):
+        gain = np.linalg.solve(block, one.covariance[place]).T
+        own = one.covariance - gain @ (block - covariance) @ gain.T
+        processes = [smoother.process for smoother in one.smoothers]
+        at = one.at + gain @ (mean - one.at[place])
+        again = one.search.result(at, list(one.rows), processes, one.scale, own)
+        moved.append(replace(again, outliers=one.outliers))
+    return moved, Common(names, _agreement(told, weighted))
+
+
+_TELLS = 0.01
+"""Information, of that known beforehand, from which a curve alone tells something of a nuisance."""
+
+
+def _agreement(told: list[np.ndarray], weighted: list[np.ndarray]) -> float:
+    """Return the probability that curves which tell the same disagree more, from what each tells."""
+
+    def of(information: np.ndarray, vector: np.ndarray) -> tuple[float, int]:
+        values, vectors = np.linalg.eigh(information)
+        chosen = values > _TELLS
+        return float(np.sum((vectors.T @ vector)[chosen] ** 2 / values[chosen])), int(chosen.sum())
+
+    each = [of(*pair) for pair in zip(told, weighted, strict=True)]
+    whole = of(np.sum(told, axis=0), np.sum(weighted, axis=0))
+    freedom = sum(count for _, count in each) - whole[1]
+    return chi2_tail(max(sum(part for part, _ in each) - whole[0], 0.0), freedom) if freedom > 0 else 1.0
 
 
 def _smoothed(values: np.ndarray, width: int = 5) -> np.ndarray:

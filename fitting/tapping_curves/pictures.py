@@ -10,14 +10,17 @@ from fitting.tapping_curves.curve import Instrument, TipMotion, motion_of
 from fitting.tapping_curves.energy import lags_of
 from fitting.tapping_curves.energy_fit import Z95, plain_instrument
 from fitting.tapping_curves.result import Tapping
+from fitting.tapping_curves.together import TappingTogether
 
 _SMALL = 9
 _PERIODS = 2.0
 
 
 def tapping_pictures(result: Tapping) -> tuple[list[bytes], list[bytes]]:
-    """Return as PNG and as SVG: the curve, the two frames, and the law if there is one."""
+    """Return as PNG and as SVG: the curve, the two frames, energy against speed and the law if they are known."""
     figures = [curve_figure(result), frames_figure(result)]
+    if result.laws_of_energies:
+        figures.append(speed_figure(result))
     if result.law is not None:
         from fitting.report.plots import law_figure  # noqa: PLC0415
 
@@ -133,6 +136,57 @@ def _energy_bands(axes: Axes, result: Tapping) -> tuple[float, float]:
             )
             ends += [low, high]
     return min(ends), max(ends)
+
+
+def speed_figure(result: Tapping) -> Figure:
+    """Return the energy of a tap against the tip's speed at the sample, with the lines of the laws."""
+    figure = new_figure(6.5, 4.5)
+    axes = figure.subplots()
+    rows, found = result.rows_of_known_speed, result.speeds
+    assert found is not None  # noqa: S101
+    u = found.approach_speed_nm_per_us[rows]
+    axes.errorbar(
+        u,
+        result.rows.energy_of_fit_aj[rows],
+        result.rows.energy_noise_aj[rows],
+        found.approach_speed_error_nm_per_us[rows],
+        fmt="o",
+        ms=4,
+        lw=0.8,
+        color=DARK,
+        label="rows of known speed",
+    )
+    for one, colour, style in zip(result.laws_of_energies, (BLUE, ACCENT), ("-", "--"), strict=False):
+        axes.plot(u, one.energy_aj, style, color=colour, label=one.formula)
+    label_axes(axes, x="speed of approach (nm/µs)", y="energy of a tap (aJ)")
+    axes.legend(fontsize=_SMALL)
+    axes.grid(color=GRID, alpha=0.25)
+    return figure
+
+
+def together_figure(result: TappingTogether) -> Figure:
+    """Return the energies of all curves over the amplitude, a panel a side, with their mean and its common error."""
+    sides = [state for state in (False, True) if any(b.repulsive == state for c in result.curves for b in c.branches)]
+    figure = new_figure(max(5.0 * len(sides), 6.5), 4.6)
+    for state, axes in zip(sides, np.atleast_1d(figure.subplots(1, max(len(sides), 1))), strict=False):
+        for one in result.curves:
+            for branch in one.branches:
+                if branch.repulsive == state:
+                    colour = ACCENT if branch.retract else BLUE
+                    axes.plot(branch.curve.amplitude_ratio, branch.curve.energy_aj, color=colour, lw=0.7, alpha=0.5)
+        for scatter in result.scatter:
+            if scatter.repulsive == state:
+                ratio, mean = scatter.amplitude_ratio, scatter.energy_aj
+                colour, way = (ACCENT, "retract") if scatter.retract else (BLUE, "approach")
+                axes.plot(ratio, mean, color=colour, lw=2.0, label=f"{way}, mean of {scatter.curves}")
+                for width, shade in ((Z95 * scatter.energy_common_error_aj, 0.12), (scatter.energy_scatter_aj, 0.25)):
+                    axes.fill_between(ratio, mean - width, mean + width, color=colour, alpha=shade, lw=0)
+        axes.set_title("repulsive" if state else "attractive", fontsize=_SMALL + 1)
+        label_axes(axes, x="amplitude over the free one", y=result.curves[0].in_unit("energy of a tap (aJ)"))
+        axes.grid(color=GRID, alpha=0.25)
+        if axes.get_legend_handles_labels()[0]:
+            axes.legend(fontsize=_SMALL)
+    return figure
 
 
 def frames_figure(result: Tapping) -> Figure:

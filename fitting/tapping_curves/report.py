@@ -12,6 +12,7 @@ from fitting.tapping_curves.branches import Height, Hysteresis
 from fitting.tapping_curves.energy_curve import HEADLINE
 from fitting.tapping_curves.energy_fit import EnergyFit
 from fitting.tapping_curves.result import Tapping, origin_in_words
+from fitting.tapping_curves.together import TappingTogether, together_lines
 
 _EV_PER_AJ = 6.241509
 _WIDTH = 150
@@ -228,7 +229,7 @@ def _speed_lines(result: Tapping) -> list[str]:
     if not here.any():
         return ["", "Impact speeds: in no row known to a quarter."]
     many = found.in_capture_speeds[here]
-    return [
+    lines = [
         "",
         (
             f"Impact speeds: {u[here].min():.3g} to {u[here].max():.3g} nm/us in {int(here.sum())} rows "
@@ -236,6 +237,13 @@ def _speed_lines(result: Tapping) -> list[str]:
             f"{percent(float(np.median(found.approach_speed_error_nm_per_us[here] / u[here])))} in the median"
         ),
     ]
+    for one in result.laws_of_energies:
+        values = ", ".join(f"{name} {with_error(*pair)}" for name, pair in one.parameters.items())
+        lines.append(
+            f"  energy against speed: {one.formula} with {values}, chi2 {one.chi2:.1f} for {one.degrees_of_freedom} "
+            "(errors of noise and speeds alone)"
+        )
+    return lines
 
 
 def write_tapping(
@@ -274,6 +282,32 @@ def write_tapping(
     return [*written, frames_path, *law]
 
 
+def write_together(result: TappingTogether, folder: Path) -> list[Path]:
+    """Write together.txt, .json and .png, what several curves of one lever say.
+
+    Args:
+        result: what was found.
+        folder: an existing folder; files of these names are replaced.
+
+    Returns:
+        The files.
+
+    Raises:
+        OSError: if a file cannot be written.
+    """
+    from afm_jax.plots.picture_style import png_of  # noqa: PLC0415
+    from fitting.report.report import write_report_files  # noqa: PLC0415
+    from fitting.tapping_curves.pictures import together_figure  # noqa: PLC0415
+
+    return write_report_files(
+        folder,
+        "together",
+        text="\n".join(together_lines(result)),
+        data={"format": "afm-jax tapping together", "format_version": 1, **result.to_dict()},
+        picture=png_of(together_figure(result)),
+    )
+
+
 def tapping_page(result: Tapping, pictures: list[bytes]) -> str:
     """Return the result as one HTML page.
 
@@ -292,6 +326,11 @@ def tapping_page(result: Tapping, pictures: list[bytes]) -> str:
         (
             "The same motion in two frames. Left, the lab: a shaken tip meets a sample at rest. Right, with its "
             "free motion taken away: the tip flies freely, and the sample moves up and down with the free amplitude."
+        ),
+        *(
+            ["Energy of a tap against the tip's speed at the sample, with the lines of two impact laws through it."]
+            if result.laws_of_energies
+            else []
         ),
         "The impact law from the rows with fast impacts, with its 95 % band.",
     )[: len(pictures)]

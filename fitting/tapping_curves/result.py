@@ -14,6 +14,7 @@ from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.tables.table import AmplitudeTable
 from fitting.tapping_curves.branches import Hysteresis, free_ends
 from fitting.tapping_curves.curve import USUAL_ERRORS, Rows, TappingCurve
+from fitting.tapping_curves.energy_by_speed import FEWEST_SPEEDS, LawOfEnergies, laws_of_energies
 from fitting.tapping_curves.energy_curve import (
     FEWEST_ROWS,
     HEADLINE,
@@ -37,6 +38,8 @@ _PULLED = 2.0
 """Distance of a nuisance from what is given, in its errors, from which it is named."""
 _DRIFTING = 5.0
 """Errors of a drift of the free rows from which it is one."""
+_FOLLOWING = 3.0
+"""Errors of a drift along the rows, of one energy for all taps, from which it is one."""
 _NEGATIVE = 3.0
 """Standard errors below zero from which an energy is impossible."""
 _ORIGINS = {
@@ -170,6 +173,7 @@ class Tapping(Result):
         functions: the energy as a smooth function along each branch, likewise.
         branches: each with its energy and virial over the amplitude.
         scale_errors: whether errors are multiplied where the rows scatter more.
+        followed: the fit of one energy with drifts along the rows, where their order in time is not stated.
         bound_aj: what a tap takes at most, where only the amplitude was recorded; else None.
         hysteresis: thresholds on the way in and back.
         speeds: of the impacts; None where there is no energy.
@@ -185,6 +189,7 @@ class Tapping(Result):
     functions: EnergyFit | None
     branches: tuple[TappingBranch, ...]
     scale_errors: bool
+    followed: EnergyFit | None
     bound_aj: float | None
     hysteresis: tuple[Hysteresis, ...]
     speeds: MeasuredSpeeds | None
@@ -388,6 +393,46 @@ class Tapping(Result):
         }
 
     @property
+    def rows_of_known_speed(self) -> Int[np.ndarray, " some"]:
+        """Numbers of the rows in which the tip's speed at the sample is known, in the order of the speeds."""
+        if self.speeds is None:
+            return np.zeros(0, int)
+        u = self.speeds.approach_speed_nm_per_us
+        known = np.flatnonzero(np.isfinite(u) & np.isfinite(self.rows.energy_of_fit_aj))
+        return known[np.argsort(u[known])]
+
+    @property
+    def laws_of_energies(self) -> list[LawOfEnergies]:
+        """What impact laws make of the energies against speed; none where too few speeds are known."""
+        rows = self.rows_of_known_speed
+        if self.speeds is None or len(rows) < FEWEST_SPEEDS:
+            return []
+        u, error = self.speeds.approach_speed_nm_per_us, self.speeds.approach_speed_error_nm_per_us
+        energy, noise = self.rows.energy_of_fit_aj, self.rows.energy_noise_aj
+        return laws_of_energies(u[rows], error[rows], energy[rows], noise[rows], self.mass_ng)
+
+    @property
+    def energy_by_speed(self) -> dict[str, Any]:
+        """Energies against the tip's speed at the sample, beside the laws'; a reason where they are not known."""
+        rows, laws = self.rows_of_known_speed, self.laws_of_energies
+        return {
+            "approach_speed_nm_per_us": [] if self.speeds is None else self.speeds.approach_speed_nm_per_us[rows],
+            "energy_aj": self.rows.energy_of_fit_aj[rows],
+            "energy_noise_aj": self.rows.energy_noise_aj[rows],
+            "laws": [
+                {
+                    "formula": one.formula,
+                    "parameters": {n: {"value": v, "standard_error": e} for n, (v, e) in one.parameters.items()},
+                    "chi2": one.chi2,
+                    "degrees_of_freedom": one.degrees_of_freedom,
+                    "energy_aj": one.energy_aj,
+                }
+                for one in laws
+            ],
+            "reason": None if laws else self.reason or "the tip's speed at the sample is known in too few rows",
+        }
+
+    @property
     def law_allowed(self) -> bool:
         """Whether enough rows have impacts that a law describes."""
         return self.speeds is not None and not self.speeds.why_not
@@ -427,6 +472,18 @@ class Tapping(Result):
     def drift(self) -> str:
         """What says that the free tip drifted along rows whose order in time the table does not state; or empty."""
         curve, free = self.curve, self.rows.free
+        if self.followed is not None and self.described and self.followed.p_value > IMPROBABLE:
+            for one in self.followed.nuisances:
+                if one.kind in {"phase_drift_deg", "free_amplitude_drift"} and (
+                    abs(one.value) > _FOLLOWING * one.standard_error
+                ):
+                    factor, unit = (1.0, "degrees") if "phase" in one.kind else (100.0, "%")
+                    return (
+                        "the rows follow their order in the table about one energy, as a "
+                        f"{origin_in_words(one.kind)} of {factor * one.value:+.2g} +- "
+                        f"{factor * one.standard_error:.1g} {unit} would make them: if they stand as they were "
+                        "measured, say so by '# rows = in order of time', and the drift is fitted along"
+                    )
         places = np.flatnonzero(free)
         if curve.time is not None or len(places) < 2 * FEWEST_ROWS or not free_ends(curve, free):
             return ""
@@ -539,7 +596,7 @@ class Tapping(Result):
         elif free_ends(curve, self.rows.free):
             found.append("phase and free amplitude drift evenly along the rows, as free rows at both ends tell")
         else:
-            found.append("phase and free amplitude drift evenly along the rows, usually by 1 degree and 1 %")
+            found.append("phase and free amplitude drift evenly along the rows, usually by 3 degrees and 2 %")
         if curve.phase_note:
             found.append(curve.phase_note)
         if curve.has_phase:
@@ -637,6 +694,7 @@ class Tapping(Result):
                 ],
                 "plain_energy_aj": self.plain_energy,
                 "epsilon_nm2_per_us2": self.epsilon,
+                "energy_by_speed": self.energy_by_speed,
                 "assumptions": self.assumptions,
                 "assumed_errors": {name: USUAL_ERRORS[name] for name in self.curve.assumed},
                 "branches": branches,
@@ -648,13 +706,13 @@ class Tapping(Result):
                     "rows_chi2": functions.rows_chi2,
                     "rows_freedom": functions.rows_freedom,
                     "scale": functions.scale,
-                    "nuisances": _nuisances(functions.nuisances),
+                    "nuisances": nuisances_as_dict(functions.nuisances),
                 },
                 "chi2": None if fit is None else fit.chi2,
                 "degrees_of_freedom": None if fit is None else fit.degrees_of_freedom,
                 "p_value": None if fit is None else fit.p_value,
                 "scale": None if fit is None else fit.scale,
-                "nuisances": {} if fit is None else _nuisances(fit.nuisances),
+                "nuisances": {} if fit is None else nuisances_as_dict(fit.nuisances),
                 "hysteresis": [
                     {
                         **vars(one),
@@ -679,7 +737,8 @@ class Tapping(Result):
         return {**self.keyed(payload), "energy_per_tap_aj": None, "energy_per_tap_reason": why}
 
 
-def _nuisances(nuisances: tuple[Nuisance, ...]) -> dict[str, Any]:
+def nuisances_as_dict(nuisances: tuple[Nuisance, ...]) -> dict[str, Any]:
+    """Return what is given and fitted of each, by name."""
     return {
         n.name: {
             "given": n.given.value,

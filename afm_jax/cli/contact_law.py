@@ -1,14 +1,11 @@
-"""`afm-jax fit-law [SCENE.toml]`: the impact law and the delay law of a simulated contact."""
+"""`afm-jax collide [SCENE.toml] --make-law`: the impact law that a contact amounts to, as a table and in formulas."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-import click
-
-from afm_jax.cli.contact_options import ContactOptions, chosen_contact, with_contact_options
+from afm_jax.cli.contact_options import ContactOptions, chosen_contact
 from afm_jax.cli.main import NotValid
-from afm_jax.cli.session import Session, with_session, write_json
-from afm_jax.cli.values import Ends
+from afm_jax.cli.session import Session, write_json
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -41,53 +38,26 @@ DELAY_COLUMNS = (
 _SHOWN = 9
 
 
-@click.command()
-@with_contact_options
-@click.option(
-    "--speed-range",
-    type=Ends(),
-    metavar="LOW:HIGH",
-    help="Approach speeds of the fit in nm/us. Left out: 1.5 times the capture speed to 250.",
-)
-@click.option(
-    "--delay-range",
-    type=Ends(),
-    metavar="LOW:HIGH",
-    help="The same for the delay law. Left out: 1.37 times the capture speed to 700.",
-)
-@click.option(
-    "--residuals",
-    type=click.Choice(("relative", "absolute")),
-    default="relative",
-    show_default=True,
-    help="What is made small: u_fit/u_out - 1 or u_fit - u_out.",
-)
-@click.option(
-    "--points", type=click.IntRange(min=10, max=100_000), default=512, show_default=True, help="Number of speeds."
-)
-@with_session
-def command(
+def make_law(
     session: Session,
-    *,
     contact_options: ContactOptions,
+    *,
     speed_range: tuple[float, float] | None,
     delay_range: tuple[float, float] | None,
     residuals: str,
     points: int,
 ) -> None:
-    """Fit the impact law and the delay law to a simulated contact.
+    """Make the law that a contact amounts to: a table, and the formulas that are closest to it.
 
-    Three laws of the rebound speed, at uniform speeds: the paper's (r and epsilon), a viscous one (epsilon and a loss
-    linear in speed), and all three. Beside them the collision delay, its lag (time in the solid junction) and lead
-    (the rest), and the compact delay law. The contact is the paper's, or that of SCENE.toml, changed by the options.
-    With --out fit_law.csv, fit_delay.csv, fit_law.json, fit_law.png.
+    Three formulas of the rebound speed, at uniform speeds: the paper's (r and epsilon), a viscous one (epsilon and a
+    loss linear in speed), and all three. Beside them the collision delay, its lag and lead, and its formula.
     """
-    session.start_computing()
     from afm_jax.contact.law_of_contact import (  # noqa: PLC0415
         FREE,
         fit_delay,
         fit_law,
     )
+    from afm_jax.contact.law_of_contact import make_law as table_of  # noqa: PLC0415
 
     contact, mass, description = chosen_contact(contact_options)
     with session.working("fitting (the first run compiles for some seconds)"):
@@ -96,6 +66,7 @@ def command(
             for model in FREE
         ]
         delay = fit_delay(contact, speed_range=delay_range, mass_ng=mass, points=points)
+        law = table_of(contact, mass_ng=mass)
     payload = {
         "residuals": residuals,
         "speed_range_nm_per_us": laws[0].speed_range,
@@ -103,18 +74,26 @@ def command(
         "models": [{name: getattr(law, name) for name in MODEL_KEYS} for law in laws],
         "contact_capture_speed_nm_per_us": laws[0].contact_capture_speed_nm_per_us,
         "delay": delay_payload(delay),
+        "law": law.to_dict(),
         "contact": description,
         "mass_ng": mass,
     }
-    session.write_table("fit_law.csv", *law_rows(laws))
-    session.write_table("fit_delay.csv", _delay_rows(delay), DELAY_COLUMNS)
+    session.write_table("law_models.csv", *law_rows(laws))
+    session.write_table("law_delay.csv", _delay_rows(delay), DELAY_COLUMNS)
+    ending = []
     if session.out is not None:
         from afm_jax.plots.collisions import draw_contact_law  # noqa: PLC0415
+        from afm_jax.scenefile.law_files import save_law, save_law_csv  # noqa: PLC0415
 
-        write_json(session.out / "fit_law.json", payload)
-        draw_contact_law(laws, delay, session.out / "fit_law.png")
-        session.note(f"wrote {session.out / 'fit_law.json'} and {session.out / 'fit_law.png'}")
-    session.emit(payload, law_table(laws), *law_sentences(laws), "", delay_table(delay), *delay_sentences(delay))
+        save_law(law, session.out / "law.json")
+        save_law_csv(law, session.out / "law.csv")
+        write_json(session.out / "collide.json", payload)
+        draw_contact_law(laws, delay, session.out / "law.png")
+        session.note(f"wrote {session.out / 'law.json'}, law.csv, collide.json and law.png")
+        ending = [f'In a scene file: [interaction] model = "law", file = "{session.out / "law.json"}"; or --law.']
+    session.emit(
+        payload, law_table(laws), *law_sentences(laws), "", delay_table(delay), *delay_sentences(delay), *ending
+    )
     lost = [law.model for law in laws if not law.converged]
     if lost:
         raise NotValid(f"the fit of {', '.join(lost)} did not converge; try another --speed-range")

@@ -1,0 +1,129 @@
+"""From a law's file to what commands say of a scene: made of a contact, measured, named by a scene file or by --law."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import afm_jax as afm
+from afm_jax.cli.main import main
+from afm_jax.impact.law import TabulatedLaw
+
+SCENE = """[cantilever]
+frequency_khz = 90
+quality_factor = 40
+mass_ng = 1
+[platform]
+amplitude_nm = 4
+reduced_frequency = 1.01
+offset_nm = -1
+[interaction]
+model = "law"
+"""
+MEASURED = """# origin = laser and lamp
+approach_speed_nm_per_us,rebound_speed_nm_per_us,rebound_speed_error_nm_per_us
+15,9.9,0.1
+20,16.5,0.1
+30,27.6,0.1
+60,57.0,0.2
+100,95.0,0.3
+"""
+
+
+def run(*arguments: object) -> dict:
+    result = CliRunner().invoke(main, [*(str(argument) for argument in arguments), "--json"])
+    assert result.exit_code == 0, result.stderr
+    return json.loads(result.stdout)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a formula's scene, a measured law, and the law made of the paper's contact with its scene."""
+    folder = tmp_path_factory.mktemp("laws")
+    (folder / "formula.toml").write_text(SCENE + "r = 0.9\n")
+    (folder / "measured.csv").write_text(MEASURED)
+    (folder / "scene.toml").write_text(SCENE + 'file = "law/law.json"\n')
+    run("collide", "--make-law", "--points", "40", "--out", folder / "law")
+    return folder
+
+
+@pytest.mark.slow
+def test_the_law_of_a_contact_is_its_collisions(folder):
+    contact, laws = afm.Contact.paper(), [afm.load_law(folder / "law" / name) for name in ("law.json", "law.csv")]
+    # between the table's speeds, down to 3 % above capture
+    u = np.array([11.3, 12.3, 17.7, 33.3, 77.7, 155.5, 410.0])
+    found = afm.collide(contact, u)
+    for law in laws:
+        np.testing.assert_allclose(law.rebound_speed(u), found.rebound_speed_nm_per_us, rtol=2e-4)
+        np.testing.assert_allclose(law.collision_delay(u), found.collision_delay_us, rtol=0.0, atol=2e-4)
+        assert float(law.capture_speed_nm_per_us) == pytest.approx(float(afm.capture_speed(contact)), rel=1e-9)
+        assert law.origin.text.startswith("contact: capillary")
+        assert law.mass_ng is not None
+        assert float(law.mass_ng) == 1.0
+
+
+@pytest.mark.slow
+def test_orbits_and_simulation_of_a_laws_scene_are_one_motion(folder):
+    orbits = run("orbits", folder / "scene.toml", "--order", 1)
+    best = orbits["orbits"][-1]
+    assert best["stable"]
+    assert best["extrapolated"] is False
+    assert orbits["extrapolated"] is None
+    told = run("simulate", folder / "scene.toml", "--periods", 40)
+    assert told["peak_amplitude_nm"] == pytest.approx(best["peak_amplitude_nm"], rel=1e-6)
+    assert told["lockin_amplitude_nm"] == pytest.approx(best["lockin_amplitude_nm"], rel=1e-6)
+    again = run("orbits", folder / "formula.toml", "--order", 1, "--law", folder / "law")
+    assert again["orbits"][-1] == best
+
+
+@pytest.mark.slow
+def test_a_measured_law_says_where_it_is_extrapolated(folder):
+    told = run("orbits", folder / "formula.toml", "--order", 1, "--law", folder / "measured.csv")
+    slow, fast = told["orbits"]
+    assert (slow["extrapolated"], fast["extrapolated"]) == (True, False)
+    assert told["extrapolated"].startswith("Extrapolated: the law is known from 15 to 100 nm/us, but 1 of 2 impacts")
+
+
+@pytest.mark.slow
+def test_a_measured_laws_errors_are_bands(folder, tmp_path):
+    law = ("--law", folder / "measured.csv")
+    ranges = ("--x", "platform.reduced_frequency=1:1.05:3", "--y", "platform.amplitude_nm=3:5:3")
+    chart = run("chart", folder / "formula.toml", *ranges, "--orders", "1", *law, "--draws", "3", "--out", tmp_path)
+    assert chart
+    followed = run(
+        "continue", folder / "formula.toml", "--order", 1, "--parameter", "platform.reduced_frequency=1:1.05", *law
+    )
+    assert followed["law_parameters"] == [f"interaction.unknown_{number}" for number in range(1, 11)]
+    found = afm.load_law(folder / "measured.csv")
+    assert isinstance(found, TabulatedLaw)
+    assert found.unknowns == 10
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (("--points", "40"), "--points is of the formulas of a law: add --make-law"),
+        (("--make-law", "--speeds", "12"), "--make-law chooses its own speeds: leave --speeds out"),
+    ],
+)
+def test_options_of_a_law_go_with_it(arguments, said):
+    result = CliRunner().invoke(main, ["collide", *arguments])
+    assert result.exit_code == 2
+    assert said in result.stderr
+    assert len(result.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize("command", ["orbits", "simulate", "continue", "chart", "basins", "lyapunov", "bifurcation"])
+def test_a_wrong_law_ends_with_one_line(command, tmp_path):
+    (tmp_path / "scene.toml").write_text(SCENE + "r = 0.9\n")
+    (tmp_path / "law.csv").write_text("approach_speed_nm_per_us,rebound_speed_nm_per_us\n1,0.5\n2,1\n3,2\n")
+    needed: dict[str, tuple[str, ...]] = {"orbits": ("--order", "1"), "simulate": ("--periods", "2")}
+    needed["continue"] = ("--order", "1", "--parameter", "platform.amplitude_nm=1:2")
+    needed["chart"] = ("--x", "platform.amplitude_nm=1:2:2", "--y", "platform.reduced_frequency=1:2:2")
+    needed["bifurcation"] = ("--parameter", "platform.amplitude_nm=1:2:2")
+    arguments = [command, str(tmp_path / "scene.toml"), *needed.get(command, ()), "--law", str(tmp_path / "law.csv")]
+    result = CliRunner().invoke(main, arguments)
+    assert result.exit_code == 2
+    assert result.stderr.strip().splitlines()[-1].endswith("a table of a law needs at least four speeds, but has 3")
