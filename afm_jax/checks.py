@@ -75,6 +75,8 @@ def check_parameter(name: str, value: Any, allowed: str, *, optional: bool = Fal
     if (value is None and optional) or is_traced(value):
         return
     number = as_real(name, value)
+    if not number.size:
+        raise ValueError(f"`{name}` must be a number or an array of them, but holds none")
     # An infinite quality factor is a meaningful limit; every other infinity is a mistake.
     finite = ~np.isnan(number) if allowed == "above 0.5" else np.abs(number) <= _LARGEST
     good = finite & _RANGES[allowed](number)
@@ -88,6 +90,32 @@ def check_parameter(name: str, value: Any, allowed: str, *, optional: bool = Fal
         elif allowed == "positive" and 0.0 < offender < 1.0 / _LARGEST:
             must = f"be at least {1.0 / _LARGEST:g}, so that its inverse stays a number"
         raise ValueError(f"`{name}` must {must}, but is {offender:g}")
+
+
+def check_scalar(name: str, value: Any, advice: str = "`jax.vmap` takes many") -> None:
+    """Check that a function of one number was given one.
+
+    Args:
+        name: what the message calls it.
+        value: the number; traced ones count, too.
+        advice: what takes many.
+
+    Raises:
+        ValueError: if it is an array.
+    """
+    shape = np.shape(value)
+    if shape:
+        raise ValueError(f"`{name}` must be one number, but has the shape {shape}: {advice}")
+
+
+def check_count(name: str, value: int, least: int = 1) -> None:
+    """Check a whole number of things.
+
+    Raises:
+        ValueError: if there are too few.
+    """
+    if value < least:
+        raise ValueError(f"`{name}` must be {least} or more, but is {value}")
 
 
 def as_real(name: str, value: Any) -> Shaped[np.ndarray, "..."]:

@@ -12,6 +12,8 @@ import platform
 import sys
 import tempfile
 import warnings
+from contextlib import suppress
+from importlib import import_module
 from pathlib import Path
 from typing import NamedTuple
 
@@ -30,8 +32,8 @@ class Cache(NamedTuple):
 def use_cache() -> Path | None:
     """Keep what JAX compiles from one Python session to the next, in the folder that the `afm-jax` commands use.
 
-    To be called before the first computation, best before JAX is imported: on processors with AVX-512 XLA writes an
-    error to standard error for every program that it reads, which can be switched off only then. A cache that was
+    To be called before the first computation. XLA's messages, which are errors of no consequence for every program that
+    it reads on processors with AVX-512, are switched off unless `TF_CPP_MIN_LOG_LEVEL` asks for them. A cache that was
     chosen before (`JAX_COMPILATION_CACHE_DIR`) or switched off (`JAX_ENABLE_COMPILATION_CACHE`) stays as it is.
 
     Returns:
@@ -47,12 +49,17 @@ def use_cache() -> Path | None:
 def silence_xla() -> None:
     """Keep XLA's messages off standard error, in programs started from here too, unless the user asked for them.
 
-    Its errors about "prefer-no-gather" (openxla/xla issue 44565) take tuning for a feature of the processor. It looks
-    when jaxlib is loaded, later calls change nothing.
+    Its errors about "prefer-no-gather" (openxla/xla issue 44565) take tuning for a feature of the processor, on the
+    very machine that compiled a program. XLA looks at the variable when jaxlib is loaded; later jaxlib itself is told.
     """
     # JAX itself sets 1, and so do sessions that have imported it for the programs they start
-    if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") == "1":
-        os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
+    if os.environ.get("TF_CPP_MIN_LOG_LEVEL", "1") != "1":
+        return
+    os.environ["TF_CPP_MIN_LOG_LEVEL"] = "3"
+    if "jaxlib" in sys.modules:
+        # what jax.config's jax_logging_level calls, which changes loggers of Python, too
+        with suppress(ImportError, AttributeError):
+            import_module("jaxlib.utils").absl_set_min_log_level(3)
 
 
 def open_cache() -> Cache:
@@ -67,6 +74,8 @@ def open_cache() -> Cache:
     folder = cache_folder()
     if chosen is not None and chosen != str(folder):
         return Cache(Path(chosen), "chosen by jax_compilation_cache_dir")
+    if folder is None:
+        return Cache(None, "there is no home folder: set HOME or XDG_CACHE_HOME", refused=True)
     try:
         make_private(folder)
     except OSError as error:
@@ -77,23 +86,33 @@ def open_cache() -> Cache:
     return Cache(folder, "the user's cache folder")
 
 
-def cache_folder() -> Path:
-    """Return where programs that this jaxlib compiles on this kind of processor are kept."""
+def cache_folder() -> Path | None:
+    """Return where programs that this jaxlib compiles on this kind of processor are kept; None without a home."""
     from jaxlib.version import __version__ as version  # noqa: PLC0415
 
-    return user_cache_folder() / f"jaxlib-{version}-{processor_key()}"
+    folder = user_cache_folder()
+    return None if folder is None else folder / f"jaxlib-{version}-{processor_key()}"
 
 
-def user_cache_folder() -> Path:
-    """Return where this platform keeps what a user's programs can do without, in a folder named afm-jax."""
-    if sys.platform == "win32":
-        base = os.environ.get("LOCALAPPDATA")
-        return Path(base) / "afm-jax" / "cache" if base else Path.home() / "AppData" / "Local" / "afm-jax" / "cache"
-    if sys.platform == "darwin":
-        return Path.home() / "Library" / "Caches" / "afm-jax"
-    base = os.environ.get("XDG_CACHE_HOME", "")
+def user_cache_folder() -> Path | None:
+    """Return where this platform keeps what a user's programs can do without, in a folder named afm-jax.
+
+    None where that hangs on a home folder and there is none: a user without an entry in the system's list, as
+    containers have, and without HOME; or one whose HOME is no absolute path.
+    """
+    base = os.environ.get("LOCALAPPDATA" if sys.platform == "win32" else "XDG_CACHE_HOME", "")
+    try:
+        home = Path.home()
+    except RuntimeError:
+        home = Path()
     # The specification says that a relative path there is to be ignored.
-    return (Path(base) if Path(base).is_absolute() else Path.home() / ".cache") / "afm-jax"
+    if sys.platform != "darwin" and Path(base).is_absolute():
+        return Path(base) / "afm-jax" / ("cache" if sys.platform == "win32" else "")
+    if not home.is_absolute():
+        return None
+    if sys.platform == "win32":
+        return home / "AppData" / "Local" / "afm-jax" / "cache"
+    return home / ("Library/Caches" if sys.platform == "darwin" else ".cache") / "afm-jax"
 
 
 def processor_key() -> str:

@@ -78,7 +78,7 @@ class Result:
         return figure
 
     def to_pandas(self) -> "DataFrame":
-        """Return this result as a table of pandas."""
+        """Return this result as a table of pandas; rows without a result are left out, numbers without a value NaN."""
         return _frame(self, self._rows)
 
     def to_xarray(self) -> "Dataset":
@@ -179,12 +179,29 @@ def columns_of(record: Any) -> dict[str, tuple[np.ndarray, tuple[str, ...]]]:
     return found
 
 
+def known_columns(record: Any) -> dict[str, tuple[np.ndarray, tuple[str, ...]]]:
+    """Return `columns_of` a record, NaN wherever its `_unknown` says that a number stands for no value."""
+    columns = columns_of(record)
+    gaps_of = getattr(record, "_unknown", dict)
+    for name, gaps in gaps_of().items():
+        array, dimensions = columns[name]
+        columns[name] = np.where(gaps, math.nan, array), dimensions
+    return columns
+
+
+def known_rows(record: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """Return which rows of a record's arrays of one shape are results: those that `_known_rows`, or `exists`, says."""
+    rows_of = getattr(record, "_known_rows", lambda: getattr(record, "exists", True))
+    told = np.asarray(rows_of())
+    return np.broadcast_to(told, shape) if told.shape in ((), shape) and shape else np.ones(shape, bool)
+
+
 def dataset_of(self: Any) -> "Dataset":
     """Return this result's arrays as a data set of xarray, with their units; texts are its attributes."""
     xarray = _needed("xarray", "xarray")
     sizes: dict[str, int] = {}
     variables = {}
-    for name, (array, dimensions) in columns_of(self).items():
+    for name, (array, dimensions) in known_columns(self).items():
         names: list[str] = []
         for dimension, size in zip(dimensions, array.shape, strict=True):
             free = dimension not in names and sizes.setdefault(dimension, size) == size
@@ -205,14 +222,15 @@ def _frame(self: Any, rows: str) -> "DataFrame":
             plain = {name: dict(fields_of(each)) if is_record(each) else each for name, each in records.items()}
             return pandas.DataFrame.from_dict(plain, orient="index")
         return pandas.DataFrame(list(records))
-    columns = {name: array for name, (array, _) in columns_of(self).items()}
+    columns = {name: array for name, (array, _) in known_columns(self).items()}
     shapes = [array.shape for array in columns.values() if array.ndim]
     shape = max(shapes, key=lambda each: (shapes.count(each), math.prod(each)), default=())
     table = pandas.DataFrame({name: array.ravel() for name, array in columns.items() if array.shape == shape})
     table.attrs = {name: value for name, value in fields_of(self) if isinstance(value, str | bool | int | float)}
     if len(shape) > 1:
         table.index = pandas.MultiIndex.from_product([range(size) for size in shape])
-    return table
+    known = known_rows(self, shape).ravel()
+    return table if known.all() else table[known]
 
 
 def _needed(package: str, extra: str) -> Any:

@@ -15,10 +15,17 @@ from jaxtyping import install_import_hook
 # Before the packages are imported for the first time: every annotated function checks its arguments and results.
 install_import_hook(["afm_jax", "fitting"], "beartype.beartype")
 
+from afm_jax.compilation_cache import processor_key, silence_xla  # noqa: E402
+
 jax.config.update("jax_enable_x64", True)  # noqa: FBT003
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 # Compilation is what a JAX test costs; a second run finds it done.
-jax.config.update("jax_compilation_cache_dir", str(Path(__file__).parent.parent / ".pytest_cache" / "jax"))
+silence_xla()
+jax.config.update(
+    # machine code: a folder that is taken along to another kind of processor is not read there
+    "jax_compilation_cache_dir",
+    str(Path(__file__).parent.parent / ".pytest_cache" / f"jax-{processor_key()}"),
+)
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0)
 
 # Tracing makes many short-lived objects beside the many that live as long as their programs: looking through all of

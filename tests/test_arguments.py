@@ -3,7 +3,9 @@
 import json
 import re
 from pathlib import Path
+from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -32,7 +34,7 @@ calls = {
     afm.ForceDrive: dict(amplitude_nn=4.0, frequency_khz=180.0, second=None),
     afm.ImpactLaw: dict(r=0.9, epsilon=1.0, delay=None),
     afm.CollisionDelay: dict(hertz=1.0, lead_nm=1.0, offset_nm=1.0),
-    afm.Contact: dict(forces=contact.forces),
+    afm.Contact: dict(forces=contact.forces, junction=contact.junction),
     afm.Scene: dict(cantilever=scene.cantilever, platform=scene.platform, interaction=law, base=None, force=None),
     afm.single_impact_orbits: dict(scene=scene, order=1),
     afm.many_impact_orbits: dict(scene=scene, order=1, impacts=2, starts=8),
@@ -51,6 +53,7 @@ calls = {
     afm.collide: dict(contact=contact, approach_speed_nm_per_us=30.0, mass_ng=1.0, accuracy=1e-9, method="diffrax"),
     afm.capture_speed: dict(contact=contact, mass_ng=1.0),
     afm.time_course: dict(contact=contact, approach_speed_nm_per_us=30.0),
+    afm.find_junction: dict(contact=contact),
     fitting.fit: dict(table=table, model="law", scale_errors=False, fixed={}, free=["r"]),
     fitting.compare: dict(table=table, models=("restitution", "law")),
     fitting.invert: dict(table=table),
@@ -75,7 +78,7 @@ for function, good in calls.items():
         for value in bad:
             if value is True and isinstance(good[name], bool):
                 continue
-            if name == "interaction" and value is contact.junction:
+            if value is contact.junction and name in ("interaction", "junction"):
                 continue
             try:
                 function(**{**good, name: value})
@@ -87,6 +90,61 @@ for function, good in calls.items():
             said.append([f"{function.__name__}({name}={value!r})", name, told])
 print(json.dumps(said))
 """
+
+
+SCENE = preset("figure3")
+START = afm.State(jnp.asarray(0.0), jnp.asarray(5.0), jnp.asarray(80.0))
+TWO = np.array([1.0, 2.0])
+IMPOSSIBLE: dict[str, tuple[Any, str]] = {
+    "nothing": (lambda: afm.Cantilever(TWO[:0]), "`frequency_khz` must be a number or an array .*, but holds none"),
+    "method": (lambda: afm.simulate(SCENE, START, 9.0, method="x"), "`method` must be one of collocation, diffrax"),
+    "accuracy": (lambda: afm.simulate(SCENE, START, 9.0, accuracy=-1.0), "`accuracy` must be "),
+    "no room": (lambda: afm.simulate(SCENE, START, 9.0, max_contacts=0), "`max_contacts` must be 1 or more, but is 0"),
+    "no rounds": (lambda: afm.simulate(SCENE, START, 9.0, max_rounds=0), "`max_rounds` must be 1 or more, but is 0"),
+    "durations": (lambda: afm.simulate(SCENE, START, TWO), r"`duration_us` must be one number, but has the shape \(2,"),
+    "times": (lambda: afm.next_impact(SCENE, TWO, 30.0), r"`time_us` must be one number.*: `iterate_batch` and"),
+    "no times": (
+        lambda: afm.iterate_map(SCENE, TWO[:0], 30.0, 3),
+        r"`time_us` must be one number, but has the shape \(0,",
+    ),
+    "no steps": (lambda: afm.next_impact(SCENE, 0.0, 30.0, max_steps=0), "`max_steps` must be 1 or more, but is 0"),
+    "tolerance": (lambda: afm.next_impact(SCENE, 0.0, 30.0, root_tolerance_us=-1.0), "`root_tolerance_us` must be pos"),
+    "NaN": (lambda: afm.map_jacobian(SCENE, np.nan, 30.0), "`time_us` must be a finite number, but is nan"),
+    "no starts": (lambda: afm.many_impact_orbits(SCENE, 1, 2, starts=0), "`starts` must be 1 or more, but is 0"),
+    "no values": (
+        lambda: afm.stability_chart(lambda *_: SCENE, x_values=TWO[:0], y_values=TWO, last_order=1),
+        "`x_values` must be rising numbers, one at least",
+    ),
+    "one tip": (lambda: afm.time_course(afm.Contact.paper(), TWO), "`approach_speed_nm_per_us` must be one number"),
+    "one mass": (lambda: afm.capture_speed(afm.Contact.paper(), TWO), "`mass_ng` must be one number"),
+    "twice": (lambda: afm.scene_family(SCENE, *["interaction.r"] * 2), "named twice: interaction.r, interaction.r"),
+    "frequency": (lambda: fitting.believe("law", free_frequency_khz=-9.0), "`free_frequency_khz` must be positive"),
+    "drive": (lambda: grid(drive="x"), "`drive` must be one of sample, force, base, but is 'x'"),
+    "resonance": (lambda: grid(free_frequency_khz=-1.0), "`free_frequency_khz` must be positive, but is -1"),
+    "an empty path": (lambda: afm.load_scene(""), "an empty path|no such file"),
+}
+
+
+def grid(**changes: Any) -> Any:
+    return fitting.drive_grid(**{"orders": [1], "amplitudes_nm": [4.0], "frequencies_khz": [180.0]} | changes)
+
+
+@pytest.mark.parametrize("name", IMPOSSIBLE)
+def test_impossible_sizes_numbers_and_words_are_one_line(name: str):
+    call, message = IMPOSSIBLE[name]
+    with pytest.raises(ValueError, match=message) as told:
+        call()
+    assert "\n" not in str(told.value)
+
+
+def test_a_family_without_scenes_and_a_sweep_into_a_file_are_named(tmp_path: Path):
+    with pytest.raises(TypeError, match=r"`scene_of\(...\)` must be a Scene, but is 1"):
+        afm.stability_chart(lambda *_: 1, x_values=TWO, y_values=TWO, last_order=1)  # pyright: ignore[reportArgumentType]
+    (tmp_path / "file").touch()
+    axes = [{"parameter": "platform.amplitude_nm", "list": [1.0, 2.0]}]
+    for out in (tmp_path / "file", tmp_path / "file" / "below"):
+        with pytest.raises(NotADirectoryError, match="is no folder, or lies in none; choose another `out`"):
+            afm.sweep(SCENE, axes, "orbits", out=out)
 
 
 @pytest.mark.slow

@@ -47,6 +47,20 @@ def test_cache_that_cannot_be_written_is_harmless(tmp_path: Path):
     assert start(XDG_CACHE_HOME=str(tmp_path / "file")) == ["True", "None"]
 
 
+@pytest.mark.skipif(sys.platform in {"win32", "darwin"}, reason="the cache folder is chosen by another variable")
+def test_a_user_without_a_home_folder_keeps_nothing():
+    # a user whom the system does not list, as in containers; and a HOME that means another folder wherever one is
+    nobody = "from pathlib import Path\ndef home():\n    raise RuntimeError('no home')\nPath.home = home\n"
+    ask = (
+        "import afm_jax\nfrom afm_jax.compilation_cache import cache_folder\nprint(cache_folder(), afm_jax.use_cache())"
+    )
+    for before, home in ((nobody, None), ("", "relative")):
+        variables = {"HOME": home, "XDG_CACHE_HOME": None, **dict.fromkeys(WITHOUT)}
+        printed, said = outputs(before + ask, variables)
+        assert printed == "None None"
+        assert "not kept: there is no home folder: set HOME or XDG_CACHE_HOME" in said
+
+
 @pytest.mark.parametrize(
     ("system", "variables", "expected"),
     [
@@ -145,6 +159,20 @@ def test_messages_of_xla_are_what_the_user_asked_for(monkeypatch: pytest.MonkeyP
         monkeypatch.setenv("TF_CPP_MIN_LOG_LEVEL", before)
     silence_xla()
     assert os.environ["TF_CPP_MIN_LOG_LEVEL"] == after
+
+
+@linux
+def test_xla_is_silent_in_a_session_that_has_imported_jax_before(tmp_path: Path):
+    # the second session reads what the first has compiled, about which XLA complains on processors with AVX-512
+    code = (
+        "import jax, afm_jax\nafm_jax.use_cache()\n"
+        "print(jax.jit(lambda x: jax.numpy.sin(x).sum())(jax.numpy.arange(9.0)))"
+    )
+    for _ in range(2):
+        _, said = outputs(code, {"XDG_CACHE_HOME": str(tmp_path), **dict.fromkeys(WITHOUT)})
+        assert said == ""
+    (entry,) = (tmp_path / "afm-jax").glob("*/jit__lambda*-cache")
+    assert entry.exists()
 
 
 DOCTOR = "import sys\nsys.argv = ['afm-jax', 'doctor', '--json', *sys.argv[1:]]\nimport afm_jax.__main__"

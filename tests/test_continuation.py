@@ -484,3 +484,16 @@ def test_a_ramp_does_not_repeat():
     ramped = Scene(Cantilever(90.0), Platform(2.0, 180.0, offset_rate_nm_per_us=1e-3), ImpactLaw(0.5))
     with pytest.raises(ValueError, match="ramps"):
         continue_orbits(ramped, 1, ParameterRange("platform.amplitude_nm", 1.0, 2.0))
+
+
+@pytest.mark.slow
+def test_a_tip_at_rest_that_the_sample_goes_through_is_no_grazing():
+    """Without adhesion loops of no speed close at both ends of the sample's motion; a tip can rest above it only."""
+    beta = 2.0
+    scene = Scene(Cantilever(90.0, 40.0), Platform(beta, 183.6), ImpactLaw(0.9))
+    found = continue_orbits(scene, 1, ParameterRange("platform.offset_nm", -6.0, 6.0))
+    grazes = [point for point in found.special if point.kind == "grazing"]
+    assert all(point.admissible for point in grazes)
+    # once each: at rest on the highest sample, and where the flight touches the sample on its way
+    assert [point.parameter for point in grazes] == [pytest.approx(-beta, abs=1e-9), pytest.approx(2.1222, abs=1e-3)]
+    assert not any(abs(point.parameter - beta) < 1e-3 for point in found.special)

@@ -133,14 +133,76 @@ def test_map_and_simulation_stay_on_the_orbit_and_read_its_numbers(kind: str, la
             "phase_lag_deg": seen.phase_lag_deg,
             "peak_deflection_nm": seen.peak_deflection_nm,
         }
-        if seen.deflection_harmonics is not None:
-            read["deflection_lockin_amplitude_nm"] = seen.deflection_harmonics[0].amplitude_nm
-            read["deflection_lockin_phase_deg"] = seen.deflection_harmonics[0].phase_deg
+        for name in ("lockin_amplitude_nm", "lockin_phase_deg"):
+            read[f"deflection_{name}"] = getattr(seen, f"deflection_{name}")
+            # at order 1 the response has the drive's frequency
+            assert getattr(seen, f"drive_{name}") == getattr(seen, name)
+            assert getattr(seen, f"deflection_drive_{name}") == getattr(seen, f"deflection_{name}")
         for name, value in read.items():
             if value is None:
                 assert getattr(found, name) is None
             else:
                 assert value == pytest.approx(float(getattr(found, name)[slot]), rel=1e-9), name
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["force", "base"])
+def test_at_higher_order_the_drives_frequency_is_read_as_a_direct_integration_has_it(kind: str):
+    """Orbits and simulations, read at omega/3 and at omega; Fourier sums over the flight that SciPy integrates."""
+    scene = driven(kind, INSTANT, 6.06, 4.0, -1.0, 40.0)
+    found = single_impact_orbits(scene, 3)
+    slot, omega = fastest(found), angular_frequency(scene)
+    start, drive = started(scene, found, slot), scene.force if scene.base is None else scene.base
+    assert drive is not None
+    times, heights = flight_of(scene, float(start.time_us), float(start.velocity_nm_per_us), 6.0 * np.pi / omega)
+    deflection = heights
+    if scene.base is not None:
+        base = float(drive.tones[0].amplitude) * np.cos(omega * times + np.radians(float(drive.phase_deg)))
+        deflection = heights - base
+    seen = observe(scene, simulate(scene, start, 180.0 * np.pi / omega), harmonics=(2,))
+    assert (seen.settled.periods, seen.drive.multiple, seen.response.multiple) == (3, 3, 1)
+    assert seen.drive.frequency_khz == pytest.approx(omega / PER_KHZ, rel=1e-12)
+    assert [one.multiple for one in seen.harmonics] == [2]
+    for motion, name in ((heights, ""), (deflection, "deflection_")):
+        for share, key in ((1.0, "drive_lockin"), (1.0 / 3.0, "lockin")):
+            turned = motion * np.exp(-1j * share * omega * times)
+            value = 2.0 * np.trapezoid(turned, times) / (times[-1] - times[0])
+            if name and scene.base is None:
+                assert getattr(seen, f"{name}{key}_amplitude_nm") is None
+                assert getattr(found, f"{name}{key}_amplitude_nm") is None
+                continue
+            for read in (seen, found):
+                size, phase = (
+                    np.asarray(getattr(read, f"{name}{key}_{what}")).reshape(-1)[slot if read is found else 0]
+                    for what in ("amplitude_nm", "phase_deg")
+                )
+                # 1e-7 nm of the sum's step, and what rounding has done to the orbit
+                assert size == pytest.approx(abs(value), abs=2e-6)
+                turn = 360.0 * share
+                away = (phase - np.degrees(np.angle(value)) + 0.5 * turn) % turn - 0.5 * turn
+                assert away == pytest.approx(0.0, abs=1e-4)
+    at_drive = np.trapezoid(deflection * np.exp(-1j * omega * times), times)
+    lag = (float(drive.phase_deg) - np.degrees(np.angle(at_drive))) % 360.0
+    assert seen.phase_lag_deg == pytest.approx(lag, abs=1e-4)
+    assert found.phase_lag_deg is not None
+    assert float(found.phase_lag_deg[slot]) == pytest.approx(lag, abs=1e-4)
+
+
+def flight_of(scene: Scene, time: float, velocity: float, duration: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return times and heights of the flight from an impact, by SciPy's DOP853 on the whole equation of motion."""
+    omega, free, damping = angular_frequency(scene), PER_KHZ * 90.0, 2.0 * float(scene.cantilever.decay_rate)
+    drive = scene.force if scene.base is None else scene.base
+    assert drive is not None
+    push = float(drive.tones[0].amplitude) * (1.0 / MASS if scene.base is None else free**2)
+
+    def motion(t, state):
+        force = push * np.cos(omega * t + np.radians(float(drive.phase_deg)))
+        return [state[1], force - damping * state[1] - free**2 * state[0]]
+
+    times = np.linspace(time, time + duration, 60_001)
+    start = [float(scene.platform.offset_nm), velocity]
+    path = solve_ivp(motion, (times[0], times[-1]), start, "DOP853", t_eval=times, rtol=1e-13, atol=1e-12)
+    return times, path.y[0]
 
 
 @pytest.mark.slow
@@ -201,6 +263,10 @@ def test_charts_sweeps_exponents_and_basins_of_driven_tips_come_to_the_orbit(kin
     place = float(orbits.phase_rad[slot]), float(orbits.velocity_after_nm_per_us[slot])
     swept = bifurcation_diagram(scene, "platform.offset_nm", np.array([-5.0, -4.9]), impacts=600)
     assert swept.verdicts.names()[0] == "(1,1)"
+    assert [axes.get_ylabel() for axes in swept.plot().axes] == [
+        "height at impact (nm)",
+        "height at drive phase 0 (nm)",
+    ]
     found = swept.phase_rad[0, -1], swept.velocity_after_nm_per_us[0, -1]
     assert found == pytest.approx(place, rel=1e-8)
     assert swept.height_nm[0, -1] == pytest.approx(-5.0, abs=1e-12)

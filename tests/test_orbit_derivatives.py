@@ -4,6 +4,7 @@ import dataclasses
 from itertools import pairwise
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -121,3 +122,22 @@ def test_both_modes_agree_and_stay_finite_in_empty_slots():
         assert np.any(reverse) == (count > 0)
         # The order of summation.
         np.testing.assert_allclose(forward, reverse, rtol=1e-10, atol=1e-12)
+
+
+def test_a_slot_without_an_orbit_has_no_derivative_and_takes_none_from_the_others():
+    made = scene_of(P)
+    there = np.asarray(single_impact_orbits(made, 1).exists)
+    assert there.any()
+    assert not there.all()
+
+    def peak(offset: Any, slot: Any) -> Any:
+        moved = eqx.tree_at(lambda scene: scene.platform.offset_nm, made, offset)
+        return single_impact_orbits(moved, 1).peak_amplitude_nm[slot]
+
+    offset = made.platform.offset_nm
+    for rule in (jax.jit(jax.grad(peak)), jax.jit(jax.jacfwd(peak))):
+        slopes = np.array([rule(offset, jnp.asarray(slot)) for slot in range(len(there))])
+        np.testing.assert_array_equal(np.isfinite(slopes), there)
+    # what is asked of the orbits alone knows nothing of the empty slots
+    total = jax.jit(jax.grad(lambda value: jnp.nansum(peak(value, slice(None)))))
+    assert float(total(offset)) == pytest.approx(slopes[there].sum(), rel=1e-12)

@@ -24,8 +24,10 @@ import pytest
 import afm_jax as afm
 import fitting
 from afm_jax import results, saved
+from afm_jax.contact.collide import _rows
 from afm_jax.impact.map import NextImpact
-from afm_jax.motion.record import State
+from afm_jax.motion.record import ContactKind, Contacts, State
+from afm_jax.plots.collisions import draw_collisions
 from afm_jax.scenefile.parameter_paths import ParameterRange
 from fitting.fits.comparison import Comparison
 from tests.fit_tables import EXAMPLE
@@ -42,6 +44,7 @@ PARAMETERS = {
     "ImpactLaw",
     "Platform",
     "Scene",
+    "TabulatedLaw",
     "Tone",
 }
 """What a simulation is made of, and scene files hold."""
@@ -50,6 +53,7 @@ OF_ONE_PIECE = {
     "Basins",
     "Bootstrap",
     "Comparison",
+    "ContactDelay",
     "Continuation",
     "Design",
     "FitResult",
@@ -57,7 +61,9 @@ OF_ONE_PIECE = {
     "LockinResult",
     "Posterior",
     "StabilityChart",
+    "Sweep",
     "Tapping",
+    "TappingMap",
     "TrustPack",
 }
 """What is drawn in its own way, from parts that belong together: these are made by computations."""
@@ -134,7 +140,7 @@ def array_of(hint: Any, draw: np.random.Generator) -> np.ndarray:
     if any("bool" in kind for kind in kinds):
         return draw.random(shape) < 0.5
     if any("int" in kind for kind in kinds):
-        return np.zeros(shape, int)
+        return np.ones(shape, int)
     numbers = draw.normal(size=shape) * 10.0 ** draw.integers(-9, 9, shape)
     if any("complex" in kind for kind in kinds):
         return numbers + 1j * numbers
@@ -372,7 +378,7 @@ def test_results_of_computations_come_back_with_pictures(tmp_path: Path):
         "lockin": fitting.lockin(noisy_bounce(1)[0]),
     }
     # these take longer, and are drawn by the tests of their own
-    later = {"Basins", "Posterior", "Tapping", "TrustPack"}
+    later = {"Basins", "ContactDelay", "Posterior", "Sweep", "Tapping", "TappingMap", "TrustPack"}
     assert OF_ONE_PIECE - {type(record).__name__ for record in found.values()} == later
     for name, record in found.items():
         path = tmp_path / f"{name}.json"
@@ -386,3 +392,69 @@ def test_results_of_computations_come_back_with_pictures(tmp_path: Path):
         assert len(record.to_pandas())
     payload = json.loads((tmp_path / "fit.json").read_text())
     assert payload["parameters"]["r"]["value"] == fitted.parameters["r"].value
+
+
+FEW = [("outcome", [0, 2, 0, 5]), ("captured", [False, True, False, False])]
+
+
+def collisions_of_four() -> Any:
+    """Return tips of which the second is captured and the last never began."""
+    ones: dict[str, Any] = {name: np.array([1.0, 0.0, 3.0, 0.0]) for name in afm.Collision._fields}
+    ones["approach_speed_nm_per_us"] = np.array([40.0, 5.0, 20.0, -1.0])
+    ones.update((name, np.array(values)) for name, values in FEW)
+    return afm.Collision(**ones)
+
+
+def test_what_captured_tips_do_not_have_is_masked_in_tables_and_pictures(tmp_path: Path):
+    found = collisions_of_four()
+    table, data = found.to_pandas(), found.to_xarray()
+    for name in ("rebound_speed_nm_per_us", "collision_delay_us", "time_in_junction_us", "viscous_loss_aj"):
+        assert table[name].isna().tolist() == [False, True, False, True], name
+        assert np.isnan(data[name].to_numpy()).tolist() == [False, True, False, True], name
+    # a captured tip has been deep; one that never began has not
+    assert table["deepest_gap_nm"].isna().tolist() == [False, False, False, True]
+    assert table["approach_speed_nm_per_us"].tolist() == [40.0, 5.0, 20.0, -1.0]
+    upper, lower = found.plot(tmp_path / "collide.png").axes
+    drawn = {line.get_label(): line.get_xydata() for line in upper.lines}
+    assert drawn["captured"].tolist() == [[5.0, 0.0]]
+    np.testing.assert_array_equal(drawn["contact"], [[5.0, np.nan], [20.0, 3.0], [40.0, 1.0]])
+    np.testing.assert_array_equal(lower.lines[0].get_ydata(), [np.nan, 3.0, 1.0])
+
+
+def test_the_command_draws_the_picture_of_the_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    drawn = []
+    monkeypatch.setattr("afm_jax.plots.collisions.save", lambda figure, _: drawn.append(figure))
+    found = collisions_of_four()
+    rows = _rows({name: np.asarray(part) for name, part in found._asdict().items()})
+    draw_collisions(rows, None, tmp_path / "collide.png", title="a title")
+    for one, other in zip(drawn[0].axes, found.plot().axes, strict=True):
+        assert (one.get_xlabel(), one.get_ylabel()) == (other.get_xlabel(), other.get_ylabel())
+        for line, its in zip(one.lines, other.lines, strict=True):
+            assert (line.get_label(), line.get_linestyle()) == (its.get_label(), its.get_linestyle())
+            np.testing.assert_array_equal(line.get_xydata(), its.get_xydata())
+
+
+def test_slots_without_an_orbit_are_in_no_table_and_no_picture(tmp_path: Path):
+    names = [field.name for field in dataclasses.fields(afm.SingleImpactOrbits)]
+    numbers = np.array([math.nan, 1.0, math.nan, 2.0])
+    flags = {"exists": [0, 1, 0, 1], "admissible": [0, 1, 0, 1], "stable": [0, 1, 0, 0], "near_double": [0, 0, 0, 0]}
+    fields = dict.fromkeys(names, numbers) | {name: np.array(one, bool) for name, one in flags.items()}
+    orbits: Any = saved._built(afm.SingleImpactOrbits, fields | {"complete": np.array(1, bool)})
+    assert orbits.to_pandas().index.tolist() == [1, 3]
+    assert orbits.to_pandas()["phase_rad"].tolist() == [1.0, 2.0]
+    left, right = orbits.plot(tmp_path / "orbits.png").axes
+    assert {line.get_label() for line in left.lines} == {"stable", "unstable"}
+    np.testing.assert_allclose([line.get_xydata()[0] for line in left.lines], [[57.29578, 1.0], [114.59156, 2.0]])
+    assert "speed" in right.get_xlabel()
+
+
+def test_rows_without_a_contact_are_in_no_table():
+    columns: dict[str, Any] = {name: jnp.zeros(4) for name in Contacts._fields if name != "detail"}
+    kinds = jnp.array([ContactKind.IMPACT, ContactKind.HELD, ContactKind.NONE, ContactKind.NONE])
+    where, zero = State(jnp.zeros(()), jnp.zeros(()), jnp.zeros(())), jnp.array(0)
+    columns.update(kind=kinds, approach_speed_nm_per_us=jnp.arange(4.0))
+    contacts = Contacts(**columns)
+    found = afm.Simulation(where, contacts, jnp.array(2), where, zero, jnp.array(1, bool), zero)
+    table = found.to_pandas()
+    assert table["contacts_approach_speed_nm_per_us"].tolist() == [0.0, 1.0]
+    assert table["contacts_rebound_speed_nm_per_us"].isna().tolist() == [False, True]

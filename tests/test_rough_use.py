@@ -297,6 +297,61 @@ def test_an_interrupt_that_is_swallowed_ends_the_program_all_the_same():
     assert said == "afm-jax: interrupted\n"
 
 
+IMPORTING = """
+import os, signal, sys, types
+import click
+from afm_jax.cli.main import COMMANDS, main
+signal.signal(signal.SIGINT, signal.default_int_handler)
+@click.command()
+def command():
+    try:
+        import taken_for_a_fault
+    except BaseException:
+        # as NumPy does, which then tries another way
+        raise RecursionError
+sys.modules["importing"] = types.SimpleNamespace(command=command)
+COMMANDS["importing"] = ("importing", "")
+sys.argv[1:] = ["importing"]
+main()
+"""
+
+
+def test_an_interrupt_while_packages_are_imported_is_one_line(tmp_path: Path):
+    (tmp_path / "taken_for_a_fault.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\nx = 1\n")
+    done = subprocess.run(
+        [sys.executable, "-c", IMPORTING],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "afm-jax: interrupted\n")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(os.name != "posix", reason="interrupts go to groups of processes")
+def test_an_interrupt_from_the_terminal_ends_measurements_in_processes_of_their_own_without_a_word():
+    # as a terminal does, to the whole group; started so that interrupts are heard even from the background
+    hear = "import signal; signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+    start = "import sys\nsys.argv = ['afm-jax', 'accuracy', 'map']\nimport afm_jax.__main__"
+    with subprocess.Popen(
+        [sys.executable, "-c", hear + start], cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True
+    ) as process:
+        children = Path(f"/proc/{process.pid}/task/{process.pid}/children")
+        deadline = time.monotonic() + 100.0
+        while not (children.exists() and children.read_text(encoding="ascii")) and time.monotonic() < deadline:
+            time.sleep(0.05)
+        child = children.read_text(encoding="ascii").split()[0]
+        time.sleep(2.0)
+        os.killpg(process.pid, signal.SIGINT)
+        _, said = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "Traceback" not in said
+    assert said.splitlines()[-1] == "afm-jax: interrupted"
+    assert not Path(f"/proc/{child}").exists()
+
+
 WRITING = """
 import sys
 from afm_jax.sweeps.store import STORE

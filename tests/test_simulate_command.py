@@ -96,7 +96,11 @@ def test_a_part_of_a_response_period_has_no_mean(law_file: Path):
     assert nulls(answer) == answer["null_reasons"].keys()
     short = {name for name, reason in answer["null_reasons"].items() if "shorter than a response period" in reason}
     assert short >= {"lockin_amplitude_nm", "lockin_phase_deg", "mean_height_nm", "given_by_drives_aj", "virial_aj"}
-    assert answer["harmonics"] == [{"multiple": k, "amplitude_nm": None, "phase_deg": None} for k in (1, 2)]
+    assert short >= {"drive_lockin_amplitude_nm", "drive_lockin_phase_deg"}
+    unread = {"amplitude_nm": None, "phase_deg": None}
+    assert answer["harmonics"] == [
+        {"multiple": k, "frequency_khz": pytest.approx(k * answer["response_frequency_khz"])} | unread for k in (1, 2)
+    ]
     # the highest it has been is known
     assert answer["peak_amplitude_nm"] > 0.0
 
@@ -198,14 +202,63 @@ def test_nothing_is_said_over_a_response_period_that_is_not_there():
     nothing = dict.fromkeys(("peak_deflection_nm", "phase_lag_deg", "peak_force_nn"))
     payload = dict.fromkeys(numbers, 1.0) | nothing | {"dissipated_in_contact_aj": 1.0, "stuck": False}
     payload |= {"impacts": 3, "settled": False, "settled_reason": "too short", "start": {"time_us": 0.0}}
-    payload |= {"harmonics": [{"multiple": 1, "amplitude_nm": 10.0, "phase_deg": 0.0}]}
+    payload |= {"harmonics": [], "drive_frequency_khz": 180.0}
+    payload |= dict.fromkeys(("lockin_amplitude_nm", "drive_lockin_amplitude_nm"), 10.0)
+    payload |= dict.fromkeys(("lockin_phase_deg", "drive_lockin_phase_deg"), 0.0)
     payload |= {"final": {"time_us": 9.0, "position_nm": 1.0, "velocity_nm_per_us": 1.0, "phase": "dry"}}
 
     def said(responses: int) -> str:
-        return " ".join(text_of(payload | {"window": {"from_us": 7.2, "to_us": 9.0, "responses": responses}}))
+        return " ".join(
+            text_of(payload | {"window": {"from_us": 7.2, "to_us": 9.0, "periods": 1, "responses": responses}})
+        )
 
-    assert "At the response frequency: 10 nm" in said(1)
+    assert "At the drive's frequency (180 kHz): 10 nm, 0 deg." in said(1)
     assert "Energy of a drive period" in said(1)
     assert "10 nm" not in said(0)
     assert "Energy" not in said(0)
     assert "Less than a response period" in said(0)
+
+
+FORCED = """\
+[cantilever]
+frequency_khz = 90
+quality_factor = 40
+[platform]
+amplitude_nm = 0
+frequency_khz = 33
+offset_nm = -1
+[force]
+free_amplitude_nm = 4
+frequency_khz = 545.4
+[interaction]
+model = "law"
+r = 0.99
+epsilon = 0.1
+viscous_loss = 0.01
+"""
+
+
+@pytest.mark.slow
+def test_the_drives_frequency_is_read_and_named_whatever_harmonics_are_asked_for(tmp_path: Path):
+    path = tmp_path / "forced.toml"
+    path.write_text(FORCED)
+    answers = [json.loads(simulate(path, "--json", "--harmonics", asked).stdout) for asked in ("1", "2", "3,4,6")]
+    keys = ("lockin_amplitude_nm", "lockin_phase_deg", "drive_lockin_amplitude_nm", "drive_lockin_phase_deg")
+    assert [answer["order"] for answer in answers] == [3] * 3
+    for answer in answers:
+        # neither is one of those asked for, nor hangs on them
+        assert [answer[key] for key in keys] == [answers[0][key] for key in keys]
+        assert answer["drive_frequency_khz"] == pytest.approx(545.4, rel=1e-12)
+        assert answer["response_frequency_khz"] == pytest.approx(181.8, rel=1e-12)
+    third = answers[2]["harmonics"][0]
+    assert (third["multiple"], third["amplitude_nm"]) == (3, answers[0]["drive_lockin_amplitude_nm"])
+    assert third["frequency_khz"] == pytest.approx(545.4, rel=1e-12)
+    text = simulate(path, "--harmonics", "3,4,6").stdout
+    one = answers[0]
+    size, phase, slow_size, slow_phase = (f"{one[key]:.6g}" for key in (*keys[2:], *keys[:2]))
+    lines = [line for line in text.splitlines() if line.startswith("At ")]
+    assert lines[0] == f"At the drive's frequency (545.4 kHz): {size} nm, {phase} deg."
+    assert lines[1] == f"At the response frequency (181.8 kHz, 1/3 of the drive's): {slow_size} nm, {slow_phase} deg."
+    assert lines[2].startswith("At 4 times the response frequency (727.2 kHz, 4/3 of the drive's): ")
+    assert lines[3].startswith("At 2 times the drive's frequency (1090.8 kHz): ")
+    assert f"Phase lag of the height behind the force at the drive's frequency: {one['phase_lag_deg']:.6g} deg." in text

@@ -42,9 +42,9 @@ def truth(contact: Contact, ratio: float, free_nm: float, offset_nm: float) -> R
     periods = run.verdict.periods
     if periods is None or run.verdict.contacts != periods:
         return Read(np.nan, np.nan)
-    # what dies away slowly may count as several periods: the drive's frequency is that multiple of theirs
-    seen = observe(scene, run.simulation, verdict=run.verdict, harmonics=(periods,))
-    return Read(seen.lockin_amplitude_nm, seen.phase_lag_deg)
+    # what dies away slowly may count as several periods: a lock-in reads the drive's frequency
+    seen = observe(scene, run.simulation, verdict=run.verdict)
+    return Read(seen.drive_lockin_amplitude_nm, seen.phase_lag_deg)
 
 
 @jax.jit

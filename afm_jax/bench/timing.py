@@ -84,6 +84,8 @@ def run_in_own_process(task: str, settings: Mapping[str, Any], *, cores: int) ->
         text=True,
         check=False,
         env={**os.environ, **threads, "XLA_FLAGS": flags.strip(), "JAX_PLATFORMS": "cpu"},
+        # an interrupt from the terminal is for the process that waits, and ends this one without a traceback of its own
+        process_group=0 if os.name == "posix" else None,
     )
     if done.returncode != 0:
         raise ValueError(f"the measurement in a process of its own ended with exit code {done.returncode}")

@@ -7,8 +7,9 @@ from typing import Any
 from rich.table import Table
 
 from afm_jax.cli.session import Session, write_json
-from afm_jax.effects.study import Cost, EffectReport, EffectStudy, Reduction
+from afm_jax.effects.study import Cost, EffectReport, EffectStudy, Reduction, periods_read
 from afm_jax.scenefile.scenefile import Start, scene_tables
+from afm_jax.units import RAD_PER_US_PER_KHZ
 from afm_jax.words import counted, known
 
 CHANGES = ("peak_amplitude", "lockin_amplitude", "lockin_phase_deg", "energy_per_impact")
@@ -43,6 +44,9 @@ def payload_of(study: EffectStudy, start: Start, *, written: Path | None) -> dic
         "compared": "steady orbits" if orbit is not None else "last fifth of the duration",
         "full": {
             **reading._asdict(),
+            "lockin_frequency_khz": study.view.drive.angular_frequency
+            / RAD_PER_US_PER_KHZ
+            / periods_read(study.scene, orbit),
             "drive_periods": None if orbit is None else orbit.periods,
             "contraction": None if orbit is None else orbit.contraction,
             **_cost(study.cost),
@@ -143,8 +147,9 @@ def _of_full(payload: Mapping[str, Any]) -> str:
         else f"no steady orbit, {full['impacts']} impacts in the {payload['compared']}"
     )
     lost = full["energy_per_impact_aj"]
+    lockin = f"lock-in at {full['lockin_frequency_khz']:.6g} kHz {full['lockin_amplitude_nm']:.5g} nm"
     return (
-        f"Full scene: {motion}; peak {full['peak_amplitude_nm']:.5g} nm, lock-in {full['lockin_amplitude_nm']:.5g} nm "
+        f"Full scene: {motion}; peak {full['peak_amplitude_nm']:.5g} nm, {lockin} "
         f"at {full['lockin_phase_deg']:.4g} deg{f', {lost:.4g} aJ lost per impact' if lost is not None else ''}; "
         f"{known(full['time_us_per_period'], '.4g')} us of processor time per drive period, "
         f"{full['operations']:.0f} operations."

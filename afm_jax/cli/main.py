@@ -14,6 +14,7 @@ import signal
 import socket
 import sys
 import threading
+import types
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
@@ -171,6 +172,9 @@ def _end_when_interrupted() -> threading.Event:
     ended = threading.Event()
     if threading.current_thread() is not threading.main_thread():
         return ended
+    # a shell starts what runs in the background with interrupts ignored
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _interrupt)
     heard, told = socket.socketpair()
     told.settimeout(0.0)
     signal.set_wakeup_fd(told.fileno(), warn_on_full_buffer=False)
@@ -192,6 +196,21 @@ def _end_when_interrupted() -> threading.Event:
 
     threading.Thread(target=wait, daemon=True).start()
     return ended
+
+
+def _interrupt(number: int, frame: types.FrameType | None) -> None:
+    """Raise an interrupt where it is understood; end the program where packages are being imported.
+
+    NumPy and JAX take an interrupt of their own import for a fault of the installation, try another way, and crash.
+    """
+    children = sys.modules.get("multiprocessing.process")
+    place = frame
+    while place is not None:
+        if place.f_code.co_filename.startswith("<frozen importlib") and not (children and children.active_children()):
+            click.echo("afm-jax: interrupted", err=True)
+            os._exit(_INTERRUPTED)
+        place = place.f_back
+    signal.default_int_handler(number, frame)
 
 
 COMMANDS = {

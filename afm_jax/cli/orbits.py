@@ -16,13 +16,18 @@ if TYPE_CHECKING:
 
     from afm_jax.apparatus.scene import Scene
     from afm_jax.dynamics.impact_loop import LoopReading
+    from afm_jax.dynamics.impact_orbits import ManyImpactOrbits
     from afm_jax.impact.orbits import SingleImpactOrbits
 
 DRIVEN_COLUMNS = (
+    "drive_lockin_amplitude_nm",
+    "drive_lockin_phase_deg",
     "phase_lag_deg",
     "peak_deflection_nm",
     "deflection_lockin_amplitude_nm",
     "deflection_lockin_phase_deg",
+    "deflection_drive_lockin_amplitude_nm",
+    "deflection_drive_lockin_phase_deg",
 )
 """What is told besides of a tip that base or force drives; the deflection's over a moving base only."""
 
@@ -91,8 +96,9 @@ def command(session: Session, scene: str, order: int, impacts: int | None, law: 
     """Find all single-impact orbits of a scene, or with --impacts orbits of several impacts.
 
     Of every orbit: impact phase and velocities, peak and lock-in amplitude of the height, whether it is stable, and
-    whether it is admissible (its flight stays above the platform). Where base or force drive, the phase lag too, and
-    the deflection against a moving base. With --out a table orbits.csv. Exit code 3 if none is admissible.
+    whether it is admissible (its flight stays above the platform). Where base or force drive, amplitude, phase
+    and lag at the drive's frequency, too, and the deflection against a moving base. With --out orbits.csv and
+    orbits.png. Exit code 3 if none is admissible.
     With --impacts every impact is told, the hardest first, and the orbit with a rest on the sample if there is one.
     A contact's are told so too: its impacts begin where the bridge forms and end, with phase and velocity, where it
     breaks.
@@ -121,6 +127,7 @@ def command(session: Session, scene: str, order: int, impacts: int | None, law: 
     if not bool(found.complete):
         session.note("there are more orbits than could be listed; the slowest are shown")
     session.write_table("orbits.csv", orbits, told)
+    _draw(session, found)
     session.emit(
         {
             "order": order,
@@ -186,6 +193,7 @@ def _many(session: Session, scene: "Scene", path: str, order: int, impacts: int)
     session.write_table("orbits.csv", [{**orbit, **orbit["impacts"][0]} for orbit in orbits], MANY_COLUMNS)
     rows = [{"orbit": k, **impact} for k, orbit in enumerate(orbits) for impact in orbit["impacts"]]
     session.write_table("impacts.csv", rows, ("orbit", *IMPACT_COLUMNS))
+    _draw(session, found)
     payload = {
         "order": order,
         "impacts": impacts,
@@ -202,6 +210,17 @@ def _many(session: Session, scene: "Scene", path: str, order: int, impacts: int)
     session.emit(payload, many_table(orbits, title=title), words)
     if reason is not None:
         raise NotValid(reason)
+
+
+def _draw(session: Session, found: "SingleImpactOrbits | ManyImpactOrbits") -> None:
+    """Write the picture of orbits into the `--out` folder."""
+    if session.out is None:
+        return
+    from afm_jax.plots.picture_style import save  # noqa: PLC0415
+
+    target = session.out / "orbits.png"
+    save(found.plot(), target)
+    session.note(f"wrote {target}")
 
 
 def _resting_words(rests: Mapping[str, Any]) -> str:
@@ -309,7 +328,7 @@ def why_none(scene: "Scene", order: int, *, rejected: int, impacts: int = 1) -> 
 
 
 def orbit_table(orbits: Sequence[Mapping[str, Any]], *, title: str) -> "Table":
-    """Return the orbits as a table to print."""
+    """Return orbits as a table to print; where base or force drive with what is read at the drive's frequency."""
     from rich.table import Table  # noqa: PLC0415
 
     table = Table(title=title, title_justify="left")
@@ -317,14 +336,17 @@ def orbit_table(orbits: Sequence[Mapping[str, Any]], *, title: str) -> "Table":
     for name, unit in (("velocity after", "nm/us"), ("approach", "nm/us"), ("rebound", "nm/us"), ("delay", "us")):
         table.add_column(f"{name}\n{unit}", justify="right")
     shown = ("phase_rad", "velocity_after_nm_per_us", "approach_speed_nm_per_us", "rebound_speed_nm_per_us", "delay_us")
-    shown += ("peak_amplitude_nm", "lockin_amplitude_nm", "lockin_phase_deg")
-    for name, unit in (("peak", "nm"), ("lock-in", "nm"), ("lock-in", "deg")):
-        table.add_column(f"{name}\n{unit}", justify="right")
-    seen = (("deflection_lockin_amplitude_nm", "deflection\nnm"), ("phase_lag_deg", "lag\ndeg"))
-    for key, title_of_it in seen:
-        if orbits and key in orbits[0]:
-            table.add_column(title_of_it, justify="right")
-            shown += (key,)
+    seen = {"peak_amplitude_nm": "peak\nnm"}
+    if orbits and "drive_lockin_amplitude_nm" in orbits[0]:
+        seen |= {"drive_lockin_amplitude_nm": "at drive\nnm", "drive_lockin_phase_deg": "at drive\ndeg"}
+        if "peak_deflection_nm" in orbits[0]:
+            seen |= {"deflection_drive_lockin_amplitude_nm": "deflection\nat drive nm"}
+        seen |= {"phase_lag_deg": "lag\ndeg"}
+    else:
+        seen |= {"lockin_amplitude_nm": "lock-in\nnm", "lockin_phase_deg": "lock-in\ndeg"}
+    for key, heading in seen.items():
+        table.add_column(heading, justify="right")
+        shown += (key,)
     for name in ("trace", "determinant"):
         table.add_column(f"{name}\n", justify="right")
         shown += (name,)

@@ -172,7 +172,7 @@ _MOST_WAITS = 200
 def _kept_waits() -> Path | None:
     """Return the file of how long waits took on this machine, beside the programs compiled for it, if any are kept."""
     folder = cache_folder()
-    return folder / "waits.json" if folder.is_dir() else None
+    return folder / "waits.json" if folder is not None and folder.is_dir() else None
 
 
 def _read_waits(path: Path) -> dict[str, float]:

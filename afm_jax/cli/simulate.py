@@ -62,7 +62,8 @@ class Multiples(click.ParamType):
     default="1",
     show_default=True,
     metavar="K,...",
-    help="Multiples of the response frequency at which amplitude and phase are read.",
+    help="Multiples of the response frequency omega/N at which amplitude and phase are read, besides the drive's "
+    "(N times it), which always is.",
 )
 @click.option(
     "--accuracy",
@@ -103,7 +104,8 @@ def command(  # noqa: PLR0913
 
     SCENE.toml is a scene file, PRESET the name of one of the paper's scenes (figure2, figure8, ...). The start is the
     file's [start]; without one the tip starts on the single-impact orbit that the law with delay predicts, if there is
-    one. Amplitudes are read over the last response period once the motion has settled, else over the last fifth. With
+    one. Amplitudes are read over the last response period once the motion has settled, else over the last fifth, at the
+    drive's frequency and at the response's, which is 1/N of it where the motion repeats after N drive periods. With
     --out contacts.csv, trajectory.csv, simulate.json and pictures. A tip that sticks, or does not settle, is a result;
     exit code 3 if the simulation broke off.
     """

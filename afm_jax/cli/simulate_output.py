@@ -31,8 +31,17 @@ _DEFLECTION = (
     "mean_deflection_nm",
     "deflection_lockin_amplitude_nm",
     "deflection_lockin_phase_deg",
+    "deflection_drive_lockin_amplitude_nm",
+    "deflection_drive_lockin_phase_deg",
     "deflection_harmonics",
 )
+_LOCKIN = {
+    "response": ("lockin_amplitude_nm", "lockin_phase_deg"),
+    "drive": ("drive_lockin_amplitude_nm", "drive_lockin_phase_deg"),
+    "deflection_response": ("deflection_lockin_amplitude_nm", "deflection_lockin_phase_deg"),
+    "deflection_drive": ("deflection_drive_lockin_amplitude_nm", "deflection_drive_lockin_phase_deg"),
+}
+"""Readings at one frequency, and the keys of their amplitude and phase."""
 _AS_THEY_ARE = (
     "peak_amplitude_nm",
     "mean_height_nm",
@@ -67,11 +76,10 @@ def payload_of(scene: Scene, run: LongRun, seen: Observables, settings: Mapping[
         "settled_reason": verdict.reason,
         "remaining_distance": verdict.remaining,
         **{name: getattr(seen, name) for name in _AS_THEY_ARE},
-        "lockin_amplitude_nm": seen.lockin_amplitude_nm,
-        "lockin_phase_deg": seen.lockin_phase_deg,
+        "drive_frequency_khz": seen.drive.frequency_khz,
+        "response_frequency_khz": seen.response.frequency_khz,
+        **{key: getattr(seen, key) for keys in _LOCKIN.values() for key in keys},
         "harmonics": [harmonic._asdict() for harmonic in seen.harmonics],
-        "deflection_lockin_amplitude_nm": seen.deflection_lockin_amplitude_nm,
-        "deflection_lockin_phase_deg": seen.deflection_lockin_phase_deg,
         "deflection_harmonics": _as_dicts(seen.deflection_harmonics),
         "window": {**seen.window._asdict(), "contacts": seen.contacts},
         "null_reasons": _reasons(scene, seen, verdict.stuck) | _too_short(seen),
@@ -117,31 +125,56 @@ def _too_short(seen: Observables) -> dict[str, str]:
     """Return for every key that is null for want of a whole response period that this is so."""
     if seen.window.responses:
         return {}
-    names = [
-        name.replace("harmonics", f"lockin_{what}")
-        for name in NEEDS_A_RESPONSE
-        for what in ("amplitude_nm", "phase_deg")
-    ]
+    names = [key for name in NEEDS_A_RESPONSE for key in _LOCKIN.get(name, (name,)) if "harmonics" not in key]
     return {name: TOO_SHORT for name in names if getattr(seen, name) is not None}
+
+
+def _frequency(payload: Mapping[str, Any], multiple: int) -> str:
+    """Return the name of a multiple of the response frequency, with its value."""
+    order = payload["window"]["periods"]
+    khz = f"{multiple * payload['drive_frequency_khz'] / order:.6g} kHz"
+    if multiple == order:
+        return f"the drive's frequency ({khz})"
+    if multiple == 1:
+        return f"the response frequency ({khz}, 1/{order} of the drive's)"
+    if multiple % order == 0:
+        return f"{multiple // order} times the drive's frequency ({khz})"
+    return f"{multiple} times the response frequency ({khz}, {multiple}/{order} of the drive's)"
+
+
+def _lockin_lines(payload: Mapping[str, Any]) -> list[str]:
+    """Return what a lock-in reads of the height: at the drive's frequency, the response's, and those asked for."""
+    order = payload["window"]["periods"]
+    read = {each["multiple"]: (each["amplitude_nm"], each["phase_deg"]) for each in payload["harmonics"]}
+    read[1] = payload["lockin_amplitude_nm"], payload["lockin_phase_deg"]
+    read[order] = payload["drive_lockin_amplitude_nm"], payload["drive_lockin_phase_deg"]
+    first = (order, 1) if payload["phase_lag_deg"] is not None else (1, order)
+    return [
+        f"At {_frequency(payload, multiple)}: {read[multiple][0]:.6g} nm, {read[multiple][1]:.6g} deg."
+        for multiple in dict.fromkeys((*first, *read))
+    ]
 
 
 def _over_a_response(payload: Mapping[str, Any]) -> list[str]:
     """Return the lines of what is read over whole response periods."""
-    lines = []
-    for harmonic in payload["harmonics"]:
-        which = "the response frequency" if harmonic["multiple"] == 1 else f"{harmonic['multiple']} times that"
-        lines.append(f"At {which}: {harmonic['amplitude_nm']:.6g} nm, {harmonic['phase_deg']:.6g} deg.")
+    lines, order = _lockin_lines(payload), payload["window"]["periods"]
     if payload["peak_deflection_nm"] is not None:
+        at = {
+            _frequency(payload, order): "deflection_drive_lockin",
+            _frequency(payload, 1): "deflection_lockin",
+        }
+        read = (
+            f"at {where} {payload[f'{key}_amplitude_nm']:.6g} nm, {payload[f'{key}_phase_deg']:.6g} deg"
+            for where, key in at.items()
+        )
         lines.append(
-            f"Against the moving base: peak deflection {payload['peak_deflection_nm']:.6g} nm; at the response "
-            f"frequency {payload['deflection_lockin_amplitude_nm']:.6g} nm, "
-            f"{payload['deflection_lockin_phase_deg']:.6g} deg."
+            f"Against the moving base: peak deflection {payload['peak_deflection_nm']:.6g} nm; {'; '.join(read)}."
         )
     if payload["phase_lag_deg"] is not None:
         what = (
             "the height behind the force" if payload["peak_deflection_nm"] is None else "the deflection behind the base"
         )
-        lines.append(f"Phase lag of {what}: {payload['phase_lag_deg']:.6g} deg.")
+        lines.append(f"Phase lag of {what} at the drive's frequency: {payload['phase_lag_deg']:.6g} deg.")
     if payload["peak_force_nn"] is not None:
         lines.append(
             f"In contact for {payload['time_in_contact_us']:.4g} us of a response period "
@@ -173,7 +206,7 @@ def text_of(payload: Mapping[str, Any]) -> list[str]:
         lines += _over_a_response(payload)
     else:
         lines.append(
-            "Less than a response period: means, energies, amplitude and phase at its frequency would be of a part; "
+            "Less than a response period: means, energies, amplitudes and phases would be of a part; "
             "follow the motion longer."
         )
     lines.append(

@@ -15,7 +15,15 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from afm_jax.checks import as_parameter, check_parameter, checked, is_traced, refuse_float32, require_float64
+from afm_jax.checks import (
+    as_parameter,
+    check_parameter,
+    check_scalar,
+    checked,
+    is_traced,
+    refuse_float32,
+    require_float64,
+)
 from afm_jax.contact.bridge_leg import (
     Passage,
     Turn,
@@ -47,7 +55,13 @@ _NEAR_CAPTURE = (-0.02, 0.2)
 """Energy at the end, of that at the start, between which a tip is close to capture: below 1.1 times that speed."""
 
 
-@public_result(outcome=CollisionOutcome)
+ONLY_FREE = ("rebound_speed_nm_per_us", "collision_delay_us", "time_in_contact_us", "time_in_junction_us")
+# a captured tip stops before it has lost all of that
+ONLY_FREE += ("bridge_hysteresis_aj", "junction_hysteresis_aj", "viscous_loss_aj")
+"""Fields that only a tip which leaves again has."""
+
+
+@public_result(outcome=CollisionOutcome, picture="afm_jax.plots.collisions:collisions_figure")
 class Collision(ResultTuple):
     """What collisions end with; arrays of one shape.
 
@@ -71,6 +85,13 @@ class Collision(ResultTuple):
     viscous_loss_aj: Float[Array, "..."]
     end_energy_aj: Float[Array, "..."]
     """Kinetic energy at the end, signed: for a captured tip minus what it lacks to leave; 0 at the capture speed."""
+
+    def _unknown(self) -> dict[str, np.ndarray]:
+        """Return by column which tips have no value there: a captured one does not leave, an unresolved one is lost."""
+        outcome = np.asarray(self.outcome)
+        lost = outcome > CollisionOutcome.CAPTURED_BY_JUNCTION
+        stays = lost | np.asarray(self.captured)
+        return {**dict.fromkeys(ONLY_FREE, stays), "deepest_gap_nm": lost, "end_energy_aj": lost}
 
 
 @checked
@@ -301,6 +322,7 @@ def capture_speed(contact: Contact, mass_ng: ArrayLike = 1.0) -> Float[Array, ""
     """
     refuse_float32(contact)
     check_parameter("mass_ng", mass_ng, "positive")
+    check_scalar("mass_ng", mass_ng)
     speed, exists = _capture_speed(contact, as_parameter(mass_ng))
     if not is_traced(exists) and not bool(exists):
         raise ValueError(f"the contact has no junction: {explain_missing_junction(contact)}")
@@ -502,9 +524,6 @@ def collision_of_turn(
 
 _POINTS = 20
 _TOP_SPEED = 200.0
-ONLY_FREE = ("rebound_speed_nm_per_us", "collision_delay_us", "time_in_contact_us", "time_in_junction_us")
-# a captured tip stops before it has lost all of that
-ONLY_FREE += ("bridge_hysteresis_aj", "junction_hysteresis_aj", "viscous_loss_aj")
 
 
 class Collisions(NamedTuple):

@@ -51,6 +51,7 @@ class Contact(eqx.Module):
     __repr__ = readable
 
     def __check_init__(self):
+        check_kind("junction", self.junction, Jkr)
         check_parameter("bridge_forms_nm", self.bridge_forms_nm, "positive")
         check_parameter("bridge_breaks_nm", self.bridge_breaks_nm, "positive")
         traced = is_traced(self.bridge_forms_nm) or is_traced(self.bridge_breaks_nm)

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from afm_jax.checks import as_argument
+from afm_jax.checks import as_argument, checked
 from afm_jax.contact.contact import Bridge, Contact, bridge_of
 from afm_jax.contact.forces import jkr
 from afm_jax.impact.implicit import implicit_root
@@ -61,12 +61,16 @@ class Junction(ResultTuple):
         return self.bridge_hysteresis_aj + self.junction_hysteresis_aj
 
 
+@checked
 @jax.jit
 def find_junction(contact: Contact) -> Junction:
     """Return the junction of a contact; differentiable in every parameter, for one set of them.
 
     Of several tangencies the one that an approaching tip meets with the bridge stiffening beyond the JKR contact is
     taken, at the largest gap; the spurious ones near the JKR pull-off cross the other way.
+
+    Raises:
+        TypeError: if it is no contact.
     """
     forces, solid = bridge_of(contact), contact.junction
     scales = solid.load_scale_nn, solid.depth_scale_nm

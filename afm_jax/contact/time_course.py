@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from afm_jax.checks import as_parameter, check_parameter, checked, refuse_float32
+from afm_jax.checks import as_parameter, check_parameter, check_scalar, checked, refuse_float32
 from afm_jax.contact.bridge_leg import Way, margin_of, sweep, way_through
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Driven, free_tip
@@ -72,6 +72,8 @@ def time_course(contact: Contact, approach_speed_nm_per_us: ArrayLike, mass_ng: 
     """
     refuse_float32(contact)
     check_parameter("approach_speed_nm_per_us", approach_speed_nm_per_us, "positive")
+    check_scalar("approach_speed_nm_per_us", approach_speed_nm_per_us, "draw them one by one")
+    check_scalar("mass_ng", mass_ng)
     check_parameter("mass_ng", mass_ng, "positive")
     speed, mass = as_parameter(approach_speed_nm_per_us), as_parameter(mass_ng)
     junction, legs, energies = _course(contact, speed, mass)

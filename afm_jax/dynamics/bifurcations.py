@@ -53,7 +53,7 @@ _SAME = 1e-4
 """Of the largest speed: points of orbits closer than this are the same."""
 
 
-@public_result()
+@public_result(picture="afm_jax.plots.dynamics:bifurcation_figure")
 class Sweep(ResultTuple):
     """A sweep of a parameter, arrays of one row a value, in the order of the values.
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, Shaped
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import FreeFrame
-from afm_jax.checks import checked
+from afm_jax.checks import check_kind, checked
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.bands import UncertainParameters
 from afm_jax.dynamics.contact_orbits import single_contact_orbits
@@ -103,7 +103,8 @@ ORBIT_NUMBERS = (
     "largest_multiplier",
 )
 """What is told of a scene's highest stable orbit: attributes of `SingleImpactOrbits`, and the multiplier's size."""
-_OF_ORBITS = ORBIT_NUMBERS[:-1]
+DRIVEN_NUMBERS = ("drive_lockin_amplitude_nm", "drive_lockin_phase_deg", "phase_lag_deg")
+"""What is told besides of one that base or force drives."""
 _ORBITS_AT_ONCE = 2
 """Blocks of roots are this many times smaller than blocks of scenes: few scenes have more than one."""
 
@@ -120,8 +121,10 @@ def highest_orbits(
         orders: N.
 
     Returns:
-        ``stable_orbits``, ``admissible_orbits``, and `ORBIT_NUMBERS`, NaN where no orbit is stable.
+        ``stable_orbits``, ``admissible_orbits``, `ORBIT_NUMBERS` and, where base or force drive, `DRIVEN_NUMBERS`, NaN
+        where no orbit is stable.
     """
+    names = ORBIT_NUMBERS[:-1] + (() if frame.response is None else DRIVEN_NUMBERS)
 
     def problem_of(scene: Scene, own: FreeFrame, order: Array) -> OrbitProblem:
         return orbit_problem(scene.cantilever, own.platform, impact_law_of(scene), order)
@@ -135,14 +138,14 @@ def highest_orbits(
             # a pair on a circle has the root of the determinant for its size
             pair = jnp.sqrt(jnp.abs(determinant))
             size = jnp.where(inside > 0.0, half + jnp.sqrt(jnp.where(inside > 0.0, inside, 1.0)), pair)
-            numbers = jnp.stack([*(getattr(orbit, name) for name in _OF_ORBITS), size])
+            numbers = jnp.stack([*(getattr(orbit, name) for name in names), size])
             return orbit.admissible, orbit.admissible & orbit.stable, numbers
 
         roots = jax.vmap(lambda scene, own: find_roots(problem_of(scene, own, order)))(scenes, frame)
         count, slots = roots.found.shape
         places = jax.tree.map(lambda part: part.ravel(), roots.place)
         rows = jnp.arange(count * slots) // slots
-        nothing = (jnp.zeros(count * slots, bool),) * 2 + (jnp.full((count * slots, len(ORBIT_NUMBERS)), jnp.nan),)
+        nothing = (jnp.zeros(count * slots, bool),) * 2 + (jnp.full((count * slots, len(names) + 1), jnp.nan),)
         there = frame.periodic & impact_law_of(scenes).leaves
         few = max(count // _ORBITS_AT_ONCE, 1)
         known = for_few(orbit_of, roots.found.ravel() & jnp.repeat(there, slots), (places, rows), nothing, few)
@@ -154,7 +157,7 @@ def highest_orbits(
             "stable_orbits": steady.sum(axis=1, dtype=jnp.int8),
             "admissible_orbits": admissible.sum(axis=1, dtype=jnp.int8),
         }
-        return counts | {name: chosen[:, column] for column, name in enumerate(ORBIT_NUMBERS)}
+        return counts | {name: chosen[:, column] for column, name in enumerate((*names, ORBIT_NUMBERS[-1]))}
 
     return jax.tree.map(jnp.transpose, lax.map(of_order, orders))
 
@@ -256,11 +259,16 @@ def stability_chart(
 
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
-        ValueError: if the scenes do not repeat with one drive period, or there is no order to look for.
+        TypeError: if `scene_of` gives something else than a scene.
+        ValueError: if the scenes do not repeat with one drive period, the values do not rise, or there is no order to
+            look for.
     """
     if last_order < 1:
         raise ValueError(f"`last_order` must be 1 or more, but is {last_order}")
     x, y = (np.asarray(values, float) for values in (x_values, y_values))
+    for name, values in (("x_values", x), ("y_values", y)):
+        if values.ndim != 1 or not values.size or not np.all(np.diff(values) > 0.0):
+            raise ValueError(f"`{name}` must be rising numbers, one at least")
     columns = (column.ravel() for column in np.meshgrid(x, y))
     verdicts = orbit_verdicts(batch_of_scenes(scene_of, *columns), last_order=last_order, report=report)
     return StabilityChart(scene_of, x, y, verdicts)
@@ -289,7 +297,13 @@ def stable_probability(
 
 def batch_of_scenes(scene_of: Callable[..., Scene], *columns: np.ndarray) -> Scene:
     """Return one scene a row of some columns of arguments, as a batch."""
-    return eqx.filter_jit(eqx.filter_vmap(scene_of))(*(jnp.asarray(column, float) for column in columns))
+
+    def made(*values: Array) -> Scene:
+        scene = scene_of(*values)
+        check_kind("scene_of(...)", scene, Scene)
+        return scene
+
+    return eqx.filter_jit(eqx.filter_vmap(made))(*(jnp.asarray(column, float) for column in columns))
 
 
 def share_above(chart: StabilityChart, *, last_order: int, stride: int) -> float:

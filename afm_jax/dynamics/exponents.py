@@ -48,7 +48,7 @@ _ARRIVED = 1e-8
 """Estimated distance from an orbit below which its multipliers are taken for the exponents."""
 
 
-@public_result()
+@public_result(picture="afm_jax.plots.dynamics:exponents_figure")
 class Lyapunov(ResultTuple):
     """Exponents of motions, arrays of one lane a motion; larger exponent first.
 

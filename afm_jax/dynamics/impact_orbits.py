@@ -17,7 +17,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Complex, Float
 
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
-from afm_jax.checks import checked, require_float64
+from afm_jax.checks import check_count, checked, require_float64
 from afm_jax.dynamics.impact_loop import (
     ImpactLoop,
     LoopReading,
@@ -55,7 +55,7 @@ _FASTEST = 100.0
 _STEPS = 2000
 
 
-@public_result()
+@public_result(picture="afm_jax.plots.dynamics:many_orbits_figure")
 class ManyImpactOrbits(ResultTuple):
     """Orbits of m impacts in N drive periods, by falling peak amplitude; NumPy arrays.
 
@@ -118,6 +118,7 @@ def many_impact_orbits(scene: SceneLike, order: int, impacts: int, *, starts: in
     impact_law_of(scene)
     driven = driven_part(scene)
     check_loop(order, impacts)
+    check_count("starts", starts)
     number = jnp.asarray(float(order))
     found, scale, good = _search(scene, number, _starts(starts), impacts=int(impacts), driven=driven)
     loops = loops_told_apart(np.asarray(found)[np.asarray(good)], order)

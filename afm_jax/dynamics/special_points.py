@@ -43,6 +43,8 @@ _ASIDE = 1e-5
 """Of a step between points: how far to either side of a grazing or a capture is looked."""
 _AT_AN_END = 1e-4
 """Test function below which a contact's curve has been lost at its root."""
+_SAME_POINT = 1e-7
+"""Of the range: distance below which special points of one kind that follow each other are one."""
 _LONG_ENOUGH = 1e-5
 """Length over which is extrapolated from there."""
 
@@ -121,8 +123,21 @@ def special_points_of(way: FollowedCurve, number: int, frame: Frame, equations: 
         first += len(seen)
         kind = _kind_of(test, step, frame, equations)
         parameter = low + width * float(step.point[-1])
-        special.append(SpecialPoint(kind, parameter, number, place, flown, step.point[:-1], own, test))
+        if test == CAPTURE and kind == KINDS[GRAZING] and not flown:
+            # the tip rests while the sample goes through it: no motion comes to that
+            continue
+        point = SpecialPoint(kind, parameter, number, place, flown, step.point[:-1], own, test)
+        if special and _is_the_same(special[-1], point, width):
+            # where an impact's speed vanishes, the lowest point of the flight is at the surface, too
+            special[-1] = special[-1]._replace(admissible=special[-1].admissible or flown)
+        else:
+            special.append(point)
     return special
+
+
+def _is_the_same(one: SpecialPoint, other: SpecialPoint, width: float) -> bool:
+    """Say whether two special points are one, which two test functions have found."""
+    return one.kind == other.kind and abs(one.parameter - other.parameter) < _SAME_POINT * width
 
 
 def _beside(leg: CurveLeg, share: float, test: int, frame: Frame, equations: Equations) -> list[np.ndarray]:

@@ -192,8 +192,17 @@ def _read_window(scene: Scene, motion: Simulation, view: View) -> Reading:
 def _read_orbit(scene: Scene, motion: Simulation, orbit: Orbit, view: View) -> Reading:
     """Return the reading of one response period; the window stays where it is while the scene changes."""
     begin = float(orbit.start.time_us)
-    frequency = view.drive.angular_frequency / orbit.periods
+    frequency = view.drive.angular_frequency / periods_read(scene, orbit)
     return _read(scene, motion, (begin, begin + orbit.period_us), frequency)
+
+
+def periods_read(scene: Scene, orbit: Orbit | None) -> int:
+    """Return how many drive periods a period of what the lock-in reads has.
+
+    Those of the orbit where the sample drives; one where base or force do, as every lock-in reads their frequency, and
+    where no orbit is steady.
+    """
+    return 1 if orbit is None or scene.base is not None or scene.force is not None else orbit.periods
 
 
 def _read(scene: Scene, motion: Simulation, window: tuple[float, float], angular_frequency: float) -> Reading:
@@ -442,7 +451,7 @@ def _change(full: Observed, less: Observed) -> tuple[Change, str | None]:
 
 def _turn(degrees: float, full: Observed) -> float:
     """Return a change of phase; which of the N equivalent periods is locked is unknown."""
-    turn = 360.0 / (full.orbit.periods if full.orbit is not None else 1)
+    turn = 360.0 / periods_read(full.scene, full.orbit)
     return (degrees + 0.5 * turn) % turn - 0.5 * turn
 
 

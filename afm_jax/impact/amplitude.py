@@ -84,7 +84,7 @@ def highest_of_sum(
     return at(lax.stop_gradient(top))[0]
 
 
-def lockin(
+def lockin(  # noqa: PLR0913
     cantilever: Cantilever,
     platform: Platform,
     flight: FlightEnds,
@@ -93,17 +93,20 @@ def lockin(
     delayed: bool,
     indentation: ArrayLike = 0.0,
     late_us: ArrayLike = 0.0,
+    at_drive: bool = False,
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return lock-in amplitude in nm and phase in degrees of an orbit at its response frequency omega/N.
+    """Return lock-in amplitude in nm and phase in degrees of an orbit at its response frequency omega/N, or omega.
 
-    a exp(i phi) = 2/T int z exp(-i omega t/N) dt over one response period T; phi modulo 360/N. The flight's integral
+    a exp(i phi) = 2/T int z exp(-i nu t) dt over one response period T; nu = omega/N, phi modulo 360/N, or with
+    `at_drive` the drive's nu = omega, phi modulo 360. The flight's integral
     is closed: with [.] the difference of the ends, I (Omega^2 - nu^2 + i nu Omega/Q) = -[v e] - (i nu + Omega/Q)[z e],
     e = exp(-i nu t). From the flight's end to the next start (a collision delay, if there is one: `delayed`) the tip
     rides on the platform, or below it: `indentation` is the time integral of how much, in nm us, and
     `late_us` by how much its mean time is behind the middle.
     """
     period = as_argument(order) * platform.period_us
-    nu = platform.angular_frequency / order
+    turns = 1.0 if at_drive else as_argument(order)
+    nu = platform.angular_frequency / turns
     loss = 2.0 * cantilever.decay_rate
     end_us = flight.start_us + flight.duration_us
     first, last = _turned_back(nu, flight.start_us), _turned_back(nu, end_us)
@@ -121,7 +124,7 @@ def lockin(
         flying = flying + _platform_integral(platform, nu, end_us, start_us)
         flying = flying - indentation * _turned_back(nu, 0.5 * (end_us + start_us) + late_us)
     cosine, sine = 2.0 / period * flying
-    phase = within_turn(jnp.rad2deg(jnp.arctan2(sine, cosine)), 360.0 / as_argument(order))
+    phase = within_turn(jnp.rad2deg(jnp.arctan2(sine, cosine)), 360.0 / turns)
     return jnp.sqrt(cosine**2 + sine**2), phase
 
 

@@ -126,3 +126,26 @@ def _map_over_batch(arguments, axes, *, residual, structure, pair):
 mlir.register_lowering(_implicit_root, _lower)
 ad.primitive_jvps[_implicit_root] = _differentiate
 batching.primitive_batchers[_implicit_root] = _map_over_batch
+
+
+_absent = Primitive("absent")
+
+
+def absent(number: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return NaN in place of a number that stands for nothing, with NaN for its derivative, too.
+
+    A plain NaN has the derivative 0, which looks like an answer. In reverse mode a number that nobody asks for gets
+    0 (NaN times 0 would be NaN, and spread to what is asked for).
+    """
+    return _absent.bind(number)
+
+
+def _nan_like(number: Array) -> Array:
+    return jnp.full_like(number, jnp.nan)
+
+
+_absent.def_impl(_nan_like)
+_absent.def_abstract_eval(lambda number: number)
+mlir.register_lowering(_absent, mlir.lower_fun(_nan_like, multiple_results=False))
+batching.primitive_batchers[_absent] = lambda numbers, axes: (_absent.bind(*numbers), axes[0])
+ad.deflinear2(_absent, lambda asked, _: [jnp.where(asked == 0.0, 0.0, jnp.nan)])

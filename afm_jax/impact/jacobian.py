@@ -16,7 +16,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.apparatus.surface import Surface, seen_freely
-from afm_jax.checks import as_argument, checked
+from afm_jax.checks import as_argument, check_parameter, checked
 from afm_jax.impact.lasting_impact import Impact, speeds_of_impact
 from afm_jax.impact.law import Law, impact_law_of
 from afm_jax.impact.map import next_impact
@@ -217,9 +217,12 @@ def map_jacobian(scene: SceneLike, time_us: ArrayLike, velocity_nm_per_us: Array
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats.
         TypeError: if the scene's interaction is not an impact law.
-        ValueError: if an undamped cantilever is driven at its free frequency.
+        ValueError: if time or velocity is an array or not finite, or an undamped cantilever is driven at its free
+            frequency.
     """
     scene = as_scene(scene)
+    check_parameter("time_us", time_us, "finite")
+    check_parameter("velocity_nm_per_us", velocity_nm_per_us, "finite")
     impact = next_impact(scene, time_us, velocity_nm_per_us)
     seen, response = seen_freely(scene)
     return _map_jacobian(seen, response, as_argument(time_us), as_argument(velocity_nm_per_us), impact)

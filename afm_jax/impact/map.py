@@ -11,12 +11,13 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.apparatus.surface import Surface, seen_freely
-from afm_jax.checks import checked, require_float64
+from afm_jax.checks import check_count, check_parameter, check_scalar, checked, require_float64
 from afm_jax.impact.first_impact import DEFAULT_MAX_STEPS, DEFAULT_ROOT_TOLERANCE_US, Flight, first_impact
 from afm_jax.impact.lasting_impact import crawls, delay_before, speeds_of_impact
 from afm_jax.impact.law import Law, axes_of_one, impact_law_of
@@ -48,6 +49,16 @@ class NextImpact(Result, eqx.Module):
     velocity_after_nm_per_us: Float[Array, "..."]
     outcome: Int[Array, "..."]
     near_grazing: Bool[Array, "..."]
+
+    def _known_rows(self) -> np.ndarray:
+        """Return which rows were reached at all."""
+        return np.asarray(self.outcome) != Outcome.NOT_REACHED
+
+    def _unknown(self) -> dict[str, np.ndarray]:
+        """Return by column which rows have no value there: without an impact there is none of its numbers."""
+        none = ~np.isin(np.asarray(self.outcome), (Outcome.IMPACT, Outcome.CAPTURED))
+        names = ("time_us", "arrival_time_us", "velocity_before_nm_per_us", "velocity_after_nm_per_us")
+        return dict.fromkeys(names, none)
 
 
 @checked
@@ -86,6 +97,7 @@ def next_impact(
     scene = as_scene(scene)
     require_float64(scene)
     impact_law_of(scene)
+    _check_search(time_us, velocity_nm_per_us, max_steps, root_tolerance_us)
     seen, response = seen_freely(scene)
     start = _start_of(scene, response, time_us, velocity_nm_per_us)
     tolerance = jnp.asarray(root_tolerance_us, scene.platform.frequency_khz.dtype)
@@ -126,6 +138,7 @@ def iterate_map(
     impact_law_of(scene)
     if impacts < 1:
         raise ValueError(f"`impacts` must be a positive integer, but is {impacts}")
+    _check_search(time_us, velocity_nm_per_us, max_steps, root_tolerance_us)
     seen, response = seen_freely(scene)
     start = _start_of(scene, response, time_us, velocity_nm_per_us)
     tolerance = jnp.asarray(root_tolerance_us, scene.platform.frequency_khz.dtype)
@@ -139,6 +152,19 @@ def _start_of(
     dtype = scene.platform.frequency_khz.dtype
     time, velocity = jnp.asarray(time_us, dtype), jnp.asarray(velocity_nm_per_us, dtype)
     return time, velocity if response is None else velocity - response.velocity(time)
+
+
+def _check_search(time_us: ArrayLike, velocity_nm_per_us: ArrayLike, max_steps: int, tolerance_us: ArrayLike) -> None:
+    """Check what a search for impacts is given; a start that is no flight is an outcome.
+
+    Raises:
+        ValueError: if something is an array, or the search has no step or no tolerance.
+    """
+    for name, value in (("time_us", time_us), ("velocity_nm_per_us", velocity_nm_per_us)):
+        check_scalar(name, value, "`iterate_batch` and `jax.vmap` take many")
+    check_scalar("root_tolerance_us", tolerance_us)
+    check_count("max_steps", max_steps)
+    check_parameter("root_tolerance_us", tolerance_us, "above 0")
 
 
 def _in_lab(found: NextImpact, response: Surface | None) -> NextImpact:

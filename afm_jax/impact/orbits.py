@@ -28,7 +28,7 @@ from afm_jax.impact.closure import (
     speeds_at_place,
 )
 from afm_jax.impact.first_impact import Flight, first_impact
-from afm_jax.impact.implicit import implicit_pair, implicit_root
+from afm_jax.impact.implicit import absent, implicit_pair, implicit_root
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
 from afm_jax.impact.lasting_impact import Impact, PulledImpact, crawls, depth_of_impact, middle_of_contact
 from afm_jax.impact.law import ImpactLaw, Law, Speeds, TabulatedLaw, impact_law_of
@@ -45,12 +45,12 @@ _ARRIVAL_TOLERANCE = 1e-7
 """How far (in drive periods) the first impact found may lie before the orbit's own, by rounding."""
 
 
-@public_result()
+@public_result(picture="afm_jax.plots.dynamics:orbits_figure")
 class SingleImpactOrbits(Result, eqx.Module):
     """All (1, N) orbits of a scene, ascending in approach speed, in a fixed number of slots.
 
     Without a collision delay there are 4 slots, as many as eq. 9 can have roots; with one there are 16. Every
-    attribute has the slots' shape; where ``exists`` is False the numbers are NaN.
+    attribute has the slots' shape; where ``exists`` is False the numbers are NaN, and so are their derivatives.
 
     Attributes:
         exists: the slot holds a root of eq. 9 with V' > v_p > V that satisfies eq. 6 with the positive root.
@@ -69,11 +69,15 @@ class SingleImpactOrbits(Result, eqx.Module):
         trace: T of the linearised map.
         determinant: D of the linearised map.
         complete: scalar; False if there were more orbits than slots (with a delay only).
-        phase_lag_deg: by how much the height, over a moving base the deflection, lags behind base or force, modulo
-            360/N; None where the platform alone drives, as the three that follow are without a base.
-        peak_deflection_nm: largest deflection z - z_b.
-        deflection_lockin_amplitude_nm: its amplitude at omega/N.
-        deflection_lockin_phase_deg: its phase.
+        drive_lockin_amplitude_nm: amplitude of the height at the drive's frequency omega, where every lock-in reads a
+            tip that base or force drives; None where the platform alone drives, as the two that follow.
+        drive_lockin_phase_deg: phase of the height at omega; t = 0 when the platform is highest.
+        phase_lag_deg: by how much the height, over a moving base the deflection, lags behind base or force at omega.
+        peak_deflection_nm: largest deflection z - z_b; None without a moving base, as those that follow.
+        deflection_lockin_amplitude_nm: amplitude of the deflection at the response frequency omega/N.
+        deflection_lockin_phase_deg: phase of the deflection at omega/N, modulo 360/N.
+        deflection_drive_lockin_amplitude_nm: amplitude of the deflection at the drive's frequency omega.
+        deflection_drive_lockin_phase_deg: phase of the deflection at omega.
         extrapolated: of a law that is a table: the approach speed is outside the table's; None of a formula.
     """
 
@@ -93,10 +97,14 @@ class SingleImpactOrbits(Result, eqx.Module):
     trace: Float[Array, "..."]
     determinant: Float[Array, "..."]
     complete: Bool[Array, "..."]
+    drive_lockin_amplitude_nm: Float[Array, "..."] | None = None
+    drive_lockin_phase_deg: Float[Array, "..."] | None = None
     phase_lag_deg: Float[Array, "..."] | None = None
     peak_deflection_nm: Float[Array, "..."] | None = None
     deflection_lockin_amplitude_nm: Float[Array, "..."] | None = None
     deflection_lockin_phase_deg: Float[Array, "..."] | None = None
+    deflection_drive_lockin_amplitude_nm: Float[Array, "..."] | None = None
+    deflection_drive_lockin_phase_deg: Float[Array, "..."] | None = None
     extrapolated: Bool[Array, "..."] | None = None
 
 
@@ -179,7 +187,7 @@ def orbit_at(place: OrbitPlace, found: Bool[Array, ""], frame: FreeFrame, proble
     seen, law = _seen(state, frame, problem), problem.impact
 
     def known(value):
-        return jnp.where(found, value, jnp.nan)
+        return jnp.where(found, value, absent(value))
 
     return SingleImpactOrbits(
         exists=found,
@@ -237,32 +245,37 @@ def _seen(state: OrbitState, frame: FreeFrame, problem: OrbitProblem) -> dict[st
     if frame.response is None:
         return {"peak_amplitude_nm": peak, "lockin_amplitude_nm": amplitude, "lockin_phase_deg": angle}
 
-    def read(motion: Wave) -> tuple[Float[Array, ""], ...]:
-        """Return peak, lock-in amplitude, phase and lag of the free motion with another motion added to it."""
-        turn = jnp.deg2rad(angle)
-        # the drive's frequency is the response's for N = 1 alone
-        same = order == 1.0
-        along = amplitude * jnp.cos(turn) + jnp.where(same, motion.cosine, 0.0)
-        across = amplitude * jnp.sin(turn) - jnp.where(same, motion.sine, 0.0)
-        # the scene's own clock is ahead by the frame's phase
-        size, behind = size_and_lag(along, across, frame.phase_rad, order)
-        _, lag = size_and_lag(along, across, frame.drive_phase_rad, order)
-        return highest_of_sum(cantilever, state.flight, _alone(motion)), size, within_turn(-behind, 360.0 / order), lag
+    drive_amplitude, drive_angle = _lockin(state, problem, at_drive=True)
 
-    peak, size, phase, lag = read(frame.response)
-    seen = {"peak_amplitude_nm": peak, "lockin_amplitude_nm": size, "lockin_phase_deg": phase, "phase_lag_deg": lag}
+    def along_and_across(size: Float[Array, ""], degrees: Float[Array, ""], wave: Wave | None) -> tuple[Array, Array]:
+        """Return x and y of Re((x + i y) exp(i nu t)) of the free motion, with a wave of the drive's added to it."""
+        along, across = size * jnp.cos(jnp.deg2rad(degrees)), size * jnp.sin(jnp.deg2rad(degrees))
+        return (along, across) if wave is None else (along + wave.cosine, across - wave.sine)
+
+    def read(motion: Wave) -> tuple[Float[Array, ""], ...]:
+        """Return peak, readings at omega/N and at omega, and the lag, of the free motion with another one added."""
+        with_it, alone = (along_and_across(amplitude, angle, wave) for wave in (motion, None))
+        # the drive's frequency is the response's for N = 1 alone; the scene's own clock is ahead by the frame's phase
+        along, across = (jnp.where(order == 1.0, one, other) for one, other in zip(with_it, alone, strict=True))
+        size, behind = size_and_lag(along, across, frame.phase_rad, order)
+        at_drive = along_and_across(drive_amplitude, drive_angle, motion)
+        drive_size, drive_behind = size_and_lag(*at_drive, frame.phase_rad)
+        _, lag = size_and_lag(*at_drive, frame.drive_phase_rad)
+        phases = within_turn(-behind, 360.0 / order), within_turn(-drive_behind, 360.0)
+        peak = highest_of_sum(cantilever, state.flight, _alone(motion))
+        return peak, size, phases[0], drive_size, phases[1], lag
+
+    names = ("lockin_amplitude_nm", "lockin_phase_deg", "drive_lockin_amplitude_nm", "drive_lockin_phase_deg")
+    peak, *readings, lag = read(frame.response)
+    seen = {"peak_amplitude_nm": peak, "phase_lag_deg": lag} | dict(zip(names, readings, strict=True))
     if frame.base is None:
         return seen
     response, base = frame.response, frame.base
-    peak, size, phase, lag = read(
+    peak, *readings, lag = read(
         Wave(response.cosine - base.cosine, response.sine - base.sine, response.angular_frequency)
     )
-    return seen | {
-        "peak_deflection_nm": peak,
-        "deflection_lockin_amplitude_nm": size,
-        "deflection_lockin_phase_deg": phase,
-        "phase_lag_deg": lag,
-    }
+    of_deflection = {f"deflection_{name}": value for name, value in zip(names, readings, strict=True)}
+    return seen | {"peak_deflection_nm": peak, "phase_lag_deg": lag} | of_deflection
 
 
 def _alone(wave: Wave) -> Surface:
@@ -370,13 +383,20 @@ def amplitudes(place: OrbitPlace, problem: OrbitProblem) -> Float[Array, " 3"]:
 
 @jax.jit
 def _observed(state: OrbitState, problem: OrbitProblem) -> Float[Array, " 3"]:
+    return jnp.stack([peak_amplitude(problem.cantilever, state.flight), *_lockin(state, problem)])
+
+
+def _lockin(
+    state: OrbitState, problem: OrbitProblem, *, at_drive: bool = False
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """Return lock-in amplitude in nm and phase in degrees of the free motion, at omega/N or at the drive's omega."""
     cantilever, platform, impact, order = problem
     depth, late = 0.0, 0.0
     if impact.lasts:
         # in contact the tip is below the platform's rest surface by the indentation
         approach, delay = state.speeds.approach, state.speeds.delay
         middle = middle_of_contact(cantilever, platform, state.flight.start_us - 0.5 * delay)
-        nu = platform.angular_frequency / order
+        nu = platform.angular_frequency / (1.0 if at_drive else order)
         if isinstance(impact, PulledImpact):
             tap = impact.during(approach, middle, cantilever)
             # the last term as of a parabola
@@ -385,8 +405,7 @@ def _observed(state: OrbitState, problem: OrbitProblem) -> Float[Array, " 3"]:
         else:
             depth = depth_of_impact(impact, approach, middle, cantilever, nu)
     below = {"indentation": depth, "late_us": late}
-    length, phase = lockin(cantilever, platform, state.flight, order, delayed=impact.delayed, **below)
-    return jnp.stack([peak_amplitude(cantilever, state.flight), length, phase])
+    return lockin(cantilever, platform, state.flight, order, delayed=impact.delayed, at_drive=at_drive, **below)
 
 
 def trace_and_determinant(

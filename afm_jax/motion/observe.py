@@ -28,7 +28,7 @@ from afm_jax.impact.law import Law
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation, State, to_gap
 from afm_jax.motion.settle import Settled, Window, held_since, is_stuck, settled, window_of
 from afm_jax.motion.trajectory import DensePath, Trajectory, dense_path, flights_of, fly
-from afm_jax.units import within_turn
+from afm_jax.units import RAD_PER_US_PER_KHZ, within_turn
 
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(12)
 
@@ -91,12 +91,17 @@ class Harmonic(NamedTuple):
     """The motion at a multiple k of the response frequency omega/N: z ~ a cos(k omega t/N + phi)."""
 
     multiple: int
+    """k; N at the drive's frequency."""
+    frequency_khz: float
+    """k omega/(2 pi N)."""
     amplitude_nm: float
     phase_deg: float
     """In [0, 360/N'): which of the N' = N/gcd(k, N) equivalent periods is locked is unknown."""
 
 
 NEEDS_A_RESPONSE = (
+    "response",
+    "drive",
     "harmonics",
     "mean_height_nm",
     "time_in_contact_us",
@@ -107,6 +112,8 @@ NEEDS_A_RESPONSE = (
     "given_by_drives_aj",
     "stored_aj",
     "virial_aj",
+    "deflection_response",
+    "deflection_drive",
     "deflection_harmonics",
     "mean_deflection_nm",
     "phase_lag_deg",
@@ -126,8 +133,12 @@ class Observables(NamedTuple):
     window: Window
     peak_amplitude_nm: float
     """Largest height above the rest position."""
+    response: Harmonic
+    """Of the height at the response frequency omega/N."""
+    drive: Harmonic
+    """Of the height at the drive's frequency omega, where every lock-in reads a tip that base or force drives."""
     harmonics: tuple[Harmonic, ...]
-    """Of the height; the first of them is the lock-in's."""
+    """Of the height, those asked for."""
     mean_height_nm: float
     contacts: int
     """Contacts that begin in the window."""
@@ -150,32 +161,54 @@ class Observables(NamedTuple):
     virial_aj: float
     """Mean of force times height."""
     peak_deflection_nm: float | None
-    """Largest z - z_b; None without a moving base, as the two that follow."""
+    """Largest z - z_b; None without a moving base, as the four that follow."""
+    deflection_response: Harmonic | None
+    deflection_drive: Harmonic | None
     deflection_harmonics: tuple[Harmonic, ...] | None
     mean_deflection_nm: float | None
     phase_lag_deg: float | None
-    """By how much the first of these harmonics, of the deflection over a moving base, else of the height, lags behind
-    base or force, modulo that harmonic's 360/N'; None where the platform alone drives."""
+    """By how much the deflection over a moving base, else the height, lags behind base or force at the drive's
+    frequency; None where the platform alone drives."""
 
     @property
     def lockin_amplitude_nm(self) -> float:
-        """Amplitude of the height at the first of the harmonics asked for."""
-        return self.harmonics[0].amplitude_nm
+        """Amplitude of the height at the response frequency omega/N, in nm."""
+        return self.response.amplitude_nm
 
     @property
     def lockin_phase_deg(self) -> float:
-        """Its phase."""
-        return self.harmonics[0].phase_deg
+        """Phase of the height at the response frequency omega/N, modulo 360/N."""
+        return self.response.phase_deg
+
+    @property
+    def drive_lockin_amplitude_nm(self) -> float:
+        """Amplitude of the height at the drive's frequency omega, in nm."""
+        return self.drive.amplitude_nm
+
+    @property
+    def drive_lockin_phase_deg(self) -> float:
+        """Phase of the height at the drive's frequency omega."""
+        return self.drive.phase_deg
 
     @property
     def deflection_lockin_amplitude_nm(self) -> float | None:
-        """The same of the deflection against a moving base."""
-        return None if self.deflection_harmonics is None else self.deflection_harmonics[0].amplitude_nm
+        """Amplitude of the deflection at the response frequency omega/N, in nm; None without a moving base."""
+        return None if self.deflection_response is None else self.deflection_response.amplitude_nm
 
     @property
     def deflection_lockin_phase_deg(self) -> float | None:
-        """Its phase."""
-        return None if self.deflection_harmonics is None else self.deflection_harmonics[0].phase_deg
+        """Phase of the deflection at the response frequency omega/N, modulo 360/N; None without a moving base."""
+        return None if self.deflection_response is None else self.deflection_response.phase_deg
+
+    @property
+    def deflection_drive_lockin_amplitude_nm(self) -> float | None:
+        """Amplitude of the deflection at the drive's frequency omega, in nm; None without a moving base."""
+        return None if self.deflection_drive is None else self.deflection_drive.amplitude_nm
+
+    @property
+    def deflection_drive_lockin_phase_deg(self) -> float | None:
+        """Phase of the deflection at the drive's frequency omega; None without a moving base."""
+        return None if self.deflection_drive is None else self.deflection_drive.phase_deg
 
 
 def observe(
@@ -188,14 +221,14 @@ def observe(
 ) -> Observables:
     """Return what is read of a motion: over the last response period once settled, else the last fifth.
 
-    The lock-in's amplitude and phase are 2/T int z exp(-i k omega t/N) dt over whole response periods T = N 2 pi/omega;
-    its subharmonics of the drive are k < N. Where nothing repeats N is the nearest integer to the drive periods between
-    two contacts.
+    The lock-in's amplitude and phase are 2/T int z exp(-i k omega t/N) dt over whole response periods T = N 2 pi/omega:
+    k = 1 is the response frequency, k = N the drive's; both are always read. Where nothing repeats N is the nearest
+    integer to the drive periods between two contacts.
 
     Args:
         scene: the scene that was simulated.
         simulation: of one scene, not of a batch.
-        harmonics: multiples k of the response frequency, positive integers.
+        harmonics: multiples k of the response frequency that are read besides, positive integers.
         verdict: what `settled` said, if it is known already.
         dense: the tip over the window and whatever else is looked at, if that is known already.
 
@@ -221,15 +254,16 @@ def observe(
     peak_force, attraction = _forces(scene, simulation, path, window)
     base = scene.base
     deflection = None if base is None else path.position_nm - np.asarray(base.position_and_velocity(times)[0])
-    of_height = _harmonics(dense, path.position_nm, times, weights, window, drive, harmonics)
-    of_deflection = None
-    if deflection is not None:
-        of_deflection = _harmonics(dense, deflection, times, weights, window, drive, harmonics)
+    read = partial(_harmonics, dense, times, weights, window, drive, (1, window.periods, *harmonics))
+    of_height = read(path.position_nm)
+    of_deflection = None if deflection is None else read(deflection)
     seen = Observables(
         settled=verdict,
         window=window,
         peak_amplitude_nm=_peak_height(dense, path, begin, end),
-        harmonics=of_height,
+        response=of_height[0],
+        drive=of_height[1],
+        harmonics=of_height[2:],
         mean_height_nm=_integral(dense, path.position_nm, times, weights, (begin, end), 0.0).real / span,
         contacts=begun,
         time_in_contact_us=touched / cycles * window.periods,
@@ -244,11 +278,13 @@ def observe(
         energy_imbalance=energy.imbalance,
         virial_aj=_virial(scene, simulation, path, weights, window),
         peak_deflection_nm=None if base is None else _peak_deflection(dense, path, begin, end),
-        deflection_harmonics=of_deflection,
+        deflection_response=None if of_deflection is None else of_deflection[0],
+        deflection_drive=None if of_deflection is None else of_deflection[1],
+        deflection_harmonics=None if of_deflection is None else of_deflection[2:],
         mean_deflection_nm=None
         if deflection is None
         else _integral(dense, deflection, times, weights, (begin, end), 0.0).real / span,
-        phase_lag_deg=_lag(scene, (of_deflection or of_height)[0], window),
+        phase_lag_deg=_lag(scene, (of_deflection or of_height)[1]),
     )
     return seen if window.responses else _of_a_part(seen)
 
@@ -257,21 +293,19 @@ def _of_a_part(seen: Observables) -> Observables:
     """Return readings with NaN for what needs a whole response period."""
 
     def unknown(value: Any) -> Any:
+        if isinstance(value, Harmonic):
+            return value._replace(amplitude_nm=math.nan, phase_deg=math.nan)
         if isinstance(value, tuple):
-            return tuple(Harmonic(one.multiple, math.nan, math.nan) for one in value)
+            return tuple(unknown(one) for one in value)
         return None if value is None else math.nan
 
     return seen._replace(**{name: unknown(getattr(seen, name)) for name in NEEDS_A_RESPONSE})
 
 
-def _lag(scene: Scene, harmonic: Harmonic, window: Window) -> float | None:
-    """Return by how much a harmonic lags behind base or force; None without."""
+def _lag(scene: Scene, at_drive: Harmonic) -> float | None:
+    """Return by how much the motion at the drive's frequency lags behind base or force; None without."""
     drive = scene.base if scene.base is not None else scene.force
-    if drive is None:
-        return None
-    share = harmonic.multiple / window.periods
-    turn = 360.0 * math.gcd(harmonic.multiple, window.periods) / window.periods
-    return within_turn(share * float(drive.phase_deg) - harmonic.phase_deg, turn)
+    return None if drive is None else within_turn(float(drive.phase_deg) - at_drive.phase_deg, 360.0)
 
 
 def _check_covered(found_us: float, wanted_us: float) -> None:
@@ -285,21 +319,24 @@ def _check_covered(found_us: float, wanted_us: float) -> None:
 
 def _harmonics(
     dense: DensePath,
-    height: Float[np.ndarray, " times"],
     times: Float[np.ndarray, " times"],
     weights: Float[np.ndarray, " times"],
     window: Window,
     drive: DrivePeriod,
     multiples: Sequence[int],
+    height: Float[np.ndarray, " times"],
 ) -> tuple[Harmonic, ...]:
-    """Return amplitudes and phases over a window."""
-    found = []
-    for k in multiples:
+    """Return amplitudes and phases over a window, at multiples of the response frequency."""
+    found = {}
+    for k in map(int, multiples):
+        if k in found:
+            continue
         omega = k * drive.angular_frequency / window.periods
         value = _lockin(dense, height, times, weights, (window.from_us, window.to_us), omega)
-        turn = 360.0 * math.gcd(int(k), window.periods) / window.periods
-        found.append(Harmonic(int(k), float(abs(value)), float(within_turn(np.degrees(np.angle(value)), turn))))
-    return tuple(found)
+        turn = 360.0 * math.gcd(k, window.periods) / window.periods
+        phase = float(within_turn(np.degrees(np.angle(value)), turn))
+        found[k] = Harmonic(k, omega / RAD_PER_US_PER_KHZ, float(abs(value)), phase)
+    return tuple(found[int(k)] for k in multiples)
 
 
 def _time_in_contact(scene: Scene, simulation: Simulation, begin: float, end: float) -> tuple[float, int]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple, Self
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from afm_jax.apparatus.platform import Platform
@@ -132,6 +133,25 @@ class Simulation(Result, eqx.Module):
     """Whether the tip is held at the end."""
     outcome: Int[Array, "..."]
     """A `MotionOutcome`."""
+
+    def _known_rows(self) -> np.ndarray:
+        """Return which rows are contacts."""
+        return np.asarray(self.contacts.kind) != ContactKind.NONE
+
+    def _unknown(self) -> dict[str, np.ndarray]:
+        """Return by column which contacts have no value there: one that holds the tip to the end has no departure."""
+        held = np.asarray(self.contacts.kind) == ContactKind.HELD
+        names = (
+            "departure_time_us",
+            "departure_position_nm",
+            "departure_velocity_nm_per_us",
+            "rebound_speed_nm_per_us",
+        )
+        unknown = {f"contacts_{name}": held for name in names}
+        if self.contacts.detail is not None:
+            dry = np.asarray(self.contacts.detail.junctions) == 0
+            unknown |= {f"contacts_detail_junction_{name}_us": dry for name in ("forms", "breaks")}
+        return unknown
 
 
 def to_gap(

@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Float
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.apparatus.surface import Surface, surface_of
-from afm_jax.checks import check_parameter, checked, is_traced, require_float64
+from afm_jax.checks import check_count, check_parameter, check_scalar, checked, is_traced, require_float64
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Driven, driven_by
 from afm_jax.contact.junction import explain_missing_junction, find_junction
@@ -76,12 +76,14 @@ def simulate(  # noqa: PLR0913
     Raises:
         RuntimeError: if JAX is not set to 64-bit floats, or was not when the scene was built.
         TypeError: if the interaction is neither a law nor a contact nor None.
-        ValueError: if the duration is not positive, the contact has no junction, the start is inside the sample, or
-            there is no such method or accuracy.
+        ValueError: if the duration is not positive, start or duration are arrays, there is room for nothing, the
+            contact has no junction, the start is inside the sample, or there is no such method or accuracy.
     """
     scene = as_scene(scene)
     require_float64(scene)
     check_parameter("duration_us", duration_us, "positive")
+    _check_sizes(start, duration_us, max_contacts=max_contacts, max_rounds=max_rounds)
+    setting = driven_setting_of(accuracy, method)
     surface, response = surface_of(scene)
     dtype = scene.cantilever.frequency_khz.dtype
     begin_at = State(*(jnp.asarray(value, dtype) for value in start))
@@ -96,7 +98,6 @@ def simulate(  # noqa: PLR0913
 
     elif isinstance(scene.interaction, Contact):
         _check_contact(scene, surface, response, begin_at)
-        setting = driven_setting_of(accuracy, method)
         if reverse:
             # the quick way tells by NaN that it does not hold, which reverse derivatives would spread
             setting = setting._replace(quick=None, trials=_TRIALS_BACKWARDS, agreement=None)
@@ -122,6 +123,19 @@ def simulate(  # noqa: PLR0913
             raise
         raise ValueError(_NOT_BACKWARDS) from error
     return found if reverse else jax.tree.map(_only_forwards, found)
+
+
+def _check_sizes(start: State, duration_us: ArrayLike, **counts: int | None) -> None:
+    """Check that start and duration are of one scene, and that there is room for something.
+
+    Raises:
+        ValueError: if not.
+    """
+    for name, value in (("duration_us", duration_us), *zip(State._fields, start, strict=True)):
+        check_scalar(name, value)
+    for name, count in counts.items():
+        if count is not None:
+            check_count(name, count)
 
 
 _forwards = Primitive("forwards")

@@ -1,11 +1,11 @@
-"""Pictures of what motions come to: exponents, bifurcation diagrams, charts of orbits, basins."""
+"""Pictures of what motions come to: orbits, exponents, bifurcation diagrams, charts of orbits, basins."""
 
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from matplotlib.axes import Axes
 from matplotlib.colors import BoundaryNorm, ListedColormap
 from matplotlib.figure import Figure
@@ -14,6 +14,9 @@ from matplotlib.patches import Patch
 from afm_jax.dynamics.basins import Basins
 from afm_jax.dynamics.bifurcations import Sweep
 from afm_jax.dynamics.charts import StabilityChart
+from afm_jax.dynamics.exponents import Lyapunov
+from afm_jax.dynamics.impact_orbits import ManyImpactOrbits
+from afm_jax.impact.orbits import SingleImpactOrbits
 from afm_jax.plots.charts import cell_edges
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save, with_zero_line
 from afm_jax.results import unit_of, words_of
@@ -47,6 +50,74 @@ def label_of(path: str) -> str:
     return f"{words} ({unit})" if unit else words
 
 
+def orbits_figure(orbits: SingleImpactOrbits) -> Figure:
+    """Return the picture of single-impact orbits, of one scene or of many: where they hit, and how high they go."""
+    names = ("phase_rad", "velocity_after_nm_per_us", "approach_speed_nm_per_us", "peak_amplitude_nm")
+    columns = [np.asarray(getattr(orbits, name), float).ravel() for name in names]
+    kinds = [np.asarray(getattr(orbits, name)).ravel() for name in ("exists", "admissible", "stable")]
+    return _orbits([part[:, None] for part in columns[:3]], columns[3], *kinds)
+
+
+def many_orbits_figure(orbits: ManyImpactOrbits) -> Figure:
+    """Return the picture of orbits of several impacts: where each hits, in their order, and how high it goes."""
+    names = ("phase_rad", "velocity_after_nm_per_us", "approach_speed_nm_per_us", "peak_amplitude_nm")
+    *impacts, peak = (np.asarray(getattr(orbits.reading, name), float) for name in names)
+    return _orbits(impacts, peak, np.isfinite(peak), np.asarray(orbits.reading.admissible), np.asarray(orbits.stable))
+
+
+def _orbits(
+    impacts: Sequence[Float[np.ndarray, "orbits impacts"]],
+    peak: Float[np.ndarray, " orbits"],
+    exists: Bool[np.ndarray, " orbits"],
+    admissible: Bool[np.ndarray, " orbits"],
+    stable: Bool[np.ndarray, " orbits"],
+) -> Figure:
+    """Return the picture of orbits.
+
+    Args:
+        impacts: drive phase in rad, velocity after and approach speed in nm/us of every impact.
+        peak: their largest heights in nm.
+        exists: which of them are orbits at all; the others are left out.
+        admissible: they stay above the sample.
+        stable: they last.
+    """
+    figure = new_figure(10.0, 4.8)
+    left, right = figure.subplots(1, 2)
+    kinds = {
+        "stable": (admissible & stable, {"marker": "o", "color": DARK}),
+        "unstable": (admissible & ~stable, {"marker": "o", "color": BLUE, "markerfacecolor": "white"}),
+        "not admissible": (~admissible, {"marker": "x", "color": ACCENT}),
+    }
+    phase, velocity, approach = impacts
+    exists = exists & np.isfinite(peak) & np.isfinite(phase).all(axis=1) & np.isfinite(velocity).all(axis=1)
+    for label, (which, style) in kinds.items():
+        chosen = np.flatnonzero(exists & which)
+        size = 8.0 if chosen.size <= _FEW else 3.0
+        for number, one in enumerate(chosen):
+            own = {**style, "ms": size, "label": label if number == 0 else None}
+            left.plot(np.degrees(phase[one]), velocity[one], ls=":", lw=0.8, **own)
+            right.plot(np.max(approach[one], initial=-np.inf), peak[one], ls="", **own)
+    left.set(xlim=(0.0, 360.0), xticks=range(0, 361, 90))
+    for axes in (left, right):
+        # one orbit alone would have an axis of its own rounding
+        axes.update_datalim([(0.0, 0.0)], updatex=axes is right)
+        axes.autoscale_view(scalex=axes is right)
+    label_axes(left, x="drive phase just after the impact (deg)", y=r"velocity after it (nm/$\mu$s)")
+    label_axes(right, x=r"approach speed, of the hardest impact (nm/$\mu$s)", y="peak amplitude (nm)")
+    for axes in (left, right):
+        axes.grid(color=GRID, alpha=0.25)
+    handles, labels = left.get_legend_handles_labels()
+    if handles:
+        figure.legend(handles, labels, loc="outside upper center", ncols=3, fontsize=11, frameon=False)
+    else:
+        left.set_title("no orbit", fontsize=12)
+    return figure
+
+
+_FEW = 100
+"""Orbits up to which marks are large."""
+
+
 def draw_exponents(
     path: str,
     values: Float[np.ndarray, " values"],
@@ -54,18 +125,33 @@ def draw_exponents(
     target: Path,
     band: Float[np.ndarray, "values 2"] | None = None,
 ) -> None:
-    """Draw both Lyapunov exponents per impact against a parameter; where they are minus infinity there is a tick below.
+    """Write the picture of exponents against a parameter, whose path is given, as PNG, PDF or SVG; see `_exponents`."""
+    save(_exponents(label_of(path), values, exponents, band), target)
+
+
+def exponents_figure(found: Lyapunov) -> Figure:
+    """Return the picture of the exponents of one motion, or of many in their order."""
+    exponents = np.asarray(found.exponents_per_impact, float).reshape(-1, 2)
+    return _exponents("number of the motion", np.arange(1.0, len(exponents) + 1.0), exponents)
+
+
+def _exponents(
+    label: str,
+    values: Float[np.ndarray, " values"],
+    exponents: Float[np.ndarray, "values 2"],
+    band: Float[np.ndarray, "values 2"] | None = None,
+) -> Figure:
+    """Return both Lyapunov exponents per impact in a row; where they are minus infinity there is a tick below.
 
     Args:
-        path: of the parameter.
+        label: what the values are.
         values: of the parameter.
         exponents: per impact.
-        target: PNG, PDF or SVG file.
         band: within which 95 % of the larger one's draws lie.
     """
     figure = new_figure(9.0, 4.8)
     axes: Axes = figure.subplots()
-    size = max(0.5, min(3.0, 3000.0 / len(values)))
+    size = 8.0 if len(values) < 10 else max(0.5, min(3.0, 3000.0 / len(values)))
     if band is not None:
         finite = np.where(np.isfinite(band), band, np.nan)
         axes.fill_between(values, finite[:, 0], finite[:, 1], color=ACCENT, alpha=0.25, linewidth=0.0)
@@ -77,14 +163,15 @@ def draw_exponents(
     gone = np.isneginf(exponents[:, 0])
     if gone.any():
         axes.plot(values[gone], np.full(gone.sum(), low), ".", color=DARK, ms=size, label="the tip rests or sticks")
-    axes.set(xlim=(values[0], values[-1]), ylim=(low - 0.1, high))
+    margin = 0.5 if len(values) == 1 else 0.0
+    axes.set(xlim=(values[0] - margin, values[-1] + margin), ylim=(low - 0.1, high))
     with_zero_line(axes)
     axes.axhline(0.0, color=GRID, linewidth=1.2)
-    label_axes(axes, x=label_of(path), y="Lyapunov exponent per impact")
+    label_axes(axes, x=label, y="Lyapunov exponent per impact")
     legend = figure.legend(loc="outside upper center", ncols=3, fontsize=11, frameon=False)
     for handle in legend.get_lines():
         handle.set_markersize(10.0)
-    save(figure, target)
+    return figure
 
 
 def draw_bifurcations(
@@ -93,12 +180,25 @@ def draw_bifurcations(
     target: Path,
     probabilities: Sequence[Float[np.ndarray, " values"]] | None = None,
 ) -> None:
-    """Draw a bifurcation diagram: height at impact, and the tip's height whenever the drive's phase is 0.
+    """Write a bifurcation diagram over a parameter, whose path is given, as PNG, PDF or SVG; see `_bifurcations`."""
+    save(_bifurcations(label_of(path), sweeps, probabilities), target)
+
+
+def bifurcation_figure(sweep: Sweep) -> Figure:
+    """Return the bifurcation diagram of one sweep, as `afm-jax bifurcation` draws it."""
+    return _bifurcations("parameter", [sweep])
+
+
+def _bifurcations(
+    label: str,
+    sweeps: Sequence[Sweep],
+    probabilities: Sequence[Float[np.ndarray, " values"]] | None = None,
+) -> Figure:
+    """Return a bifurcation diagram: height at impact, and the tip's height whenever the drive's phase is 0.
 
     Args:
-        path: of the parameter.
+        label: what the values are.
         sweeps: up, down or both; where both are, the one down lies over the one up.
-        target: PNG, PDF or SVG file.
         probabilities: of each sweep's verdicts; where one is below 95 % there is a grey ground.
     """
     figure = new_figure(9.0, 8.0)
@@ -117,7 +217,7 @@ def draw_bifurcations(
             ground = axes.get_xaxis_transform()
             axes.fill_between(sweep.values, 0.0, 1.0, where=sure < 0.95, color=GRID, alpha=0.3, lw=0, transform=ground)
     label_axes(panels[0], x="", y="height at impact (nm)")
-    label_axes(panels[1], x=label_of(path), y="height at drive phase 0 (nm)")
+    label_axes(panels[1], x=label, y="height at drive phase 0 (nm)")
     # also where the tip is stuck and there is nothing to draw
     ends = [end for sweep in sweeps for end in (sweep.values.min(), sweep.values.max())]
     margin = 0.5 * (max(ends) - min(ends)) / len(sweeps[0].values)
@@ -128,7 +228,7 @@ def draw_bifurcations(
     legend = figure.legend(handles, labels, loc="outside upper center", ncols=2, fontsize=11, frameon=False)
     for handle in legend.get_lines():
         handle.set(markersize=10.0, alpha=1.0)
-    save(figure, target)
+    return figure
 
 
 def draw_chart(

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from afm_jax.plots.picture_style import ACCENT, DARK, label_axes, new_figure
-from afm_jax.results import columns_of, unit_of, words_of
+from afm_jax.results import known_columns, known_rows, unit_of, words_of
 
 _MOST_PANELS = 4
 _COLOURS = (DARK, ACCENT, "#0072B2", "#009E73", "#CC79A7", "#7a6a00")
@@ -14,15 +14,18 @@ _COLOURS = (DARK, ACCENT, "#0072B2", "#009E73", "#CC79A7", "#7a6a00")
 
 def figure_of(result: Any) -> Figure:
     """Return the picture of a result: curves where it has arrays of one length, else maps, else numbers as bars."""
-    numbers = {name: array for name, (array, _) in columns_of(result).items() if array.dtype.kind in "biuf"}
+    numbers = {name: array for name, (array, _) in known_columns(result).items() if array.dtype.kind in "biuf"}
     shapes = [array.shape for array in numbers.values() if array.size > 1]
     shape = max(shapes, key=lambda each: (shapes.count(each), each), default=())
-    chosen = {name: array.astype(float) for name, array in numbers.items() if array.shape == shape}
+    # measured numbers first: the first is the axis of the others
+    ranked = sorted(numbers.items(), key=lambda column: column[1].dtype.kind != "f")
+    chosen = {name: array.astype(float) for name, array in ranked if array.shape == shape}
     if len(shape) > 1 and sum(each == shape for each in shapes) == 1:
         return _map(*chosen.popitem())
-    flat = {name: array.ravel() for name, array in chosen.items()}
+    known = known_rows(result, shape).ravel()
+    flat = {name: array.ravel()[known] for name, array in chosen.items()}
     if len(flat) < 2 or not shape:
-        flat = {"number": np.arange(float(np.prod(shape, initial=1.0, dtype=int))), **flat}
+        flat = {"number": np.flatnonzero(known).astype(float), **flat}
     return _curves(flat)
 
 

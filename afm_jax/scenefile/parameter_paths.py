@@ -171,10 +171,14 @@ def scene_family(scene: SceneLike, *paths: str) -> Callable[..., Scene]:
     for path in paths:
         if path not in known:
             raise ValueError(f"the scene has no parameter `{path}`; it has {', '.join(known)}")
+    if len(set(paths)) < len(paths):
+        raise ValueError(f"a parameter is named twice: {', '.join(paths)}")
     of_contact = [path for path in paths if path.startswith("interaction.") and _is_contact(scene)]
     contact = _contact_family(scene, tuple(path.partition(".")[2] for path in of_contact)) if of_contact else None
 
     def at(*values: ArrayLike) -> Scene:
+        if len(values) != len(paths):
+            raise TypeError(f"there are {len(values)} values for {len(paths)} parameters: {', '.join(paths)}")
         given = dict(zip(paths, values, strict=True))
         made = with_numbers(scene, {path: value for path, value in given.items() if path not in of_contact})
         if contact is not None:

@@ -51,6 +51,7 @@ import os
 import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, fields
+from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -308,16 +309,17 @@ def as_in_file(scene: Scene, state: State) -> Start:
 
 @checked
 def load_scene(path: str | os.PathLike[str]) -> Scene:
-    """Return the scene that a TOML file describes.
+    """Return the scene that a TOML file describes, or that a preset's name means.
 
     Args:
-        path: the file.
+        path: the file, or a name of `PRESETS` where there is no file of that name.
 
     Raises:
         SceneError: if the file cannot be read, a table, key, type or value in it is wrong, or its contact has no
             junction; the message names the place and says how to mend it.
     """
-    return load_scene_and_start(path)[0]
+    # presets are read from files of scenes
+    return import_module("afm_jax.scenefile.presets").scene_and_start(os.fspath(path))[0]
 
 
 def load_scene_and_start(path: str | os.PathLike[str]) -> tuple[Scene, Start | None]:
@@ -470,7 +472,7 @@ def read_toml(source: str) -> dict[str, Any]:
         # a byte order mark, as some editors write, is no part of the text
         text = read_whole(source).decode("utf-8-sig")
     except FileNotFoundError as error:
-        raise SceneError(f"{where}: there is no such file") from error
+        raise SceneError(f"{where or 'an empty path'}: there is no such file") from error
     except OSError as error:
         raise SceneError(f"{where}: cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:

@@ -207,6 +207,12 @@ _ORBIT_VARIABLES = (
     Variable("velocity_after_nm_per_us", "velocity in the lab just after the impact", dimensions=("order",)),
     Variable("largest_multiplier", "size of the larger multiplier of the map", dimensions=("order",), unit="1"),
 )
+_DRIVEN_ORBIT_VARIABLES = (
+    Variable("drive_lockin_amplitude_nm", "amplitude at the drive's frequency omega", dimensions=("order",)),
+    Variable("drive_lockin_phase_deg", "its phase", dimensions=("order",)),
+    Variable("phase_lag_deg", "lag of deflection or height behind base or force at omega", dimensions=("order",)),
+)
+"""What is recorded besides of orbits that base or force drives."""
 
 
 def _orbits(
@@ -228,7 +234,8 @@ def _orbits(
         return highest_orbits(scenes, free_frame(scenes), jnp.asarray(orders, float))
 
     points = 4096 if law.delay else 1 << 18
-    return Recorder(_ORBIT_VARIABLES, over_devices(record), points, extra)
+    driven = () if scene.base is None and scene.force is None else _DRIVEN_ORBIT_VARIABLES
+    return Recorder((*_ORBIT_VARIABLES, *driven), over_devices(record), points, extra)
 
 
 _CONTACT_ORBIT_VARIABLES = (
@@ -362,6 +369,8 @@ _OBSERVED = {
     "peak_amplitude_nm": "largest height above the rest position",
     "lockin_amplitude_nm": "amplitude at the response frequency omega/N",
     "lockin_phase_deg": "its phase, modulo 360/N",
+    "drive_lockin_amplitude_nm": "amplitude at the drive's frequency omega",
+    "drive_lockin_phase_deg": "its phase",
     "mean_height_nm": "mean height",
     "contact_share": "share of time in contact",
     "time_in_contact_us": "per response period",
@@ -378,7 +387,9 @@ _OBSERVED = {
     "mean_deflection_nm": "its mean",
     "deflection_lockin_amplitude_nm": "its amplitude at the response frequency",
     "deflection_lockin_phase_deg": "its phase, modulo 360/N",
-    "phase_lag_deg": "lag of deflection or height behind the base or force that drives the tip, modulo 360/N",
+    "deflection_drive_lockin_amplitude_nm": "amplitude of the deflection at the drive's frequency",
+    "deflection_drive_lockin_phase_deg": "its phase",
+    "phase_lag_deg": "lag of deflection or height behind base or force at the drive's frequency",
 }
 _REFUSED = -1
 _SIMULATION_VARIABLES = (

@@ -29,7 +29,7 @@ from afm_jax.sweeps.plan import Columns, SweepPlan, Variable, plan_of_worker, un
 from afm_jax.version import __version__
 from afm_jax.whole_files import check_plain, whole_folder, write_whole
 
-FORMAT_VERSION = 2
+FORMAT_VERSION = 3
 STORE = "sweep.zarr"
 _MARKERS, _LOCK = "done", "lock"
 _COMPUTED = "computed"

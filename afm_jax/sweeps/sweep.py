@@ -1,6 +1,7 @@
 """`sweep`: many scenes, or many fits, in one call that goes on where an earlier one was broken off."""
 
 import contextlib
+import errno
 import itertools
 import json
 import math
@@ -16,7 +17,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from afm_jax.apparatus.scene import SceneLike, as_scene
-from afm_jax.checks import checked, require_float64
+from afm_jax.checks import check_count, checked, require_float64
 from afm_jax.compilation_cache import available_cores, silence_xla
 from afm_jax.scenefile.scenefile import Start, scene_tables
 from afm_jax.sweeps.plan import Columns, SweepPlan, plan_of
@@ -95,6 +96,7 @@ def sweep(  # noqa: PLR0913
     """
     scene = as_scene(scene)
     require_float64(scene)
+    check_count("workers", workers)
     settings = {"what": record} if isinstance(record, str) else dict(record)
     given = {
         "builder": SCENE_BUILDER,
@@ -135,7 +137,12 @@ def run_plan(
     report: Progress | None = None,
 ) -> SweepRun:
     """Compute what a folder does not hold yet of a sweep; arguments and errors as of `sweep`."""
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except (FileExistsError, NotADirectoryError) as error:
+        raise NotADirectoryError(
+            errno.ENOTDIR, "is no folder, or lies in none; choose another `out`", str(folder)
+        ) from error
     begin = time.monotonic()
     kept, computed, first = None, 0, 0.0
     try:

@@ -85,9 +85,9 @@ def steady_curve(heights_nm: tuple[float, ...] = HEIGHTS_NM, ratio: float = 1.0)
             if verdict.settled:
                 break
         assert motion is not None  # noqa: S101
-        periods = observe(scene, motion, verdict=verdict).window.periods
-        seen = observe(scene, motion, verdict=verdict, harmonics=(periods,))
-        rows.append(SteadyRow(seen.lockin_amplitude_nm, -seen.lockin_phase_deg % 360.0, seen.dissipated_in_contact_aj))
+        seen = observe(scene, motion, verdict=verdict)
+        lag = -seen.drive_lockin_phase_deg % 360.0
+        rows.append(SteadyRow(seen.drive_lockin_amplitude_nm, lag, seen.dissipated_in_contact_aj))
     return rows
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.apparatus.cantilever import mass_of
-from afm_jax.checks import checked
+from afm_jax.checks import check_parameter, checked
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.results import Result, public_result
 from afm_jax.scenefile.tables import printable
@@ -141,6 +141,12 @@ def believe(  # noqa: PLR0913
     """
     if drive not in DRIVES:
         raise ValueError(f"`drive` must be one of {', '.join(DRIVES)}, but is {drive!r}")
+    for name, value, allowed in (
+        ("free_frequency_khz", free_frequency_khz, "positive"),
+        ("quality_factor", quality_factor, "above 0.5"),
+        ("mass_ng", mass_ng, "positive"),
+    ):
+        check_parameter(name, value, allowed, optional=True)
     own = model_parameters(model, None if free is None else tuple(free), fixed)
     known = {name: (float(value), float(error)) for name, (value, error) in (constraints or {}).items()}
     _check_constraints(model, own, known, drive)

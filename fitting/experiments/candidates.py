@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
-from afm_jax.checks import checked
+from afm_jax.checks import check_parameter, checked
 from afm_jax.least_squares import covariance_of
 from fitting.experiments.belief import Belief, size_of
 from fitting.fits.fit import member_after, speed_range
@@ -19,7 +19,7 @@ from fitting.fits.unmodelled import Unmodelled, rows_of_fit, step_of
 from fitting.forward import ImpactSlopes
 from fitting.models import Measurement, measurement_of
 from fitting.simulated.experiment import Drives
-from fitting.tables.table import AmplitudeTable
+from fitting.tables.table import DRIVES, AmplitudeTable
 
 MOST = 20_000
 """Drives that a design looks at: some minutes of computing."""
@@ -61,6 +61,8 @@ def drive_grid(  # noqa: PLR0913
         ValueError: if a list is empty or a number impossible, not exactly one of both kinds of frequency is given, or
             there are too many combinations.
     """
+    _check_drive(drive)
+    check_parameter("free_frequency_khz", free_frequency_khz, "positive", optional=True)
     _check_list("orders", orders, positive=True)
     if any(order != int(order) for order in orders):
         raise ValueError(f"`orders` must hold whole numbers, but is {list(orders)}")
@@ -119,7 +121,14 @@ def _frequencies(
     return [round(resonance * free_frequency_khz * detuning, 6) for detuning in detunings]
 
 
+def _check_drive(drive: str) -> None:
+    if drive not in DRIVES:
+        raise ValueError(f"`drive` must be one of {', '.join(DRIVES)}, but is {drive!r}")
+
+
 def _check_list(name: str, numbers: Numbers, *, positive: bool) -> None:
+    if np.ndim(numbers) != 1:
+        raise ValueError(f"`{name}` must be a list of numbers, but has the shape {np.shape(numbers)}")
     if len(numbers) == 0:
         raise ValueError(f"`{name}` is empty; give at least one number")
     for number in numbers:

@@ -16,7 +16,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import detected, height_of_free_deflection
-from afm_jax.checks import checked, require_float64
+from afm_jax.checks import check_count, check_parameter, checked, require_float64
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.impact.law import ImpactLaw
@@ -317,6 +317,9 @@ def simulate_experiment(  # noqa: PLR0913
     """
     require_float64(interaction, cantilever)
     _check(drives, drive, noise, phase_noise_deg)
+    check_count("seed", seed, 0)
+    check_count("pieces", pieces)
+    check_parameter("accuracy", accuracy, "positive")
     ratio = drives.frequency_khz / float(cantilever.frequency_khz)
     moved = drives
     if drive == "base":
