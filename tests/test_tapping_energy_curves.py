@@ -256,3 +256,19 @@ def test_energies_against_speed_stand_beside_the_law_that_made_them(restitution:
     unknown = still.to_dict()["energy_by_speed"]
     assert unknown["laws"] == []
     assert "driven at 1.000 of the free frequency" in unknown["reason"]
+
+
+@pytest.mark.parametrize(("phase", "amplitude"), [(1.0, 0.0), (5.0, 0.0), (0.0, 0.03)])
+def test_a_drift_that_free_rows_at_one_end_leave_open_is_fitted_or_said(phase: float, amplitude: float):
+    truth, stated = one_energy(60), Stated(stiffness=1e-4, phase_noise_deg=0.2)
+    drifts = {"phase_drift_deg": phase, "amplitude_drift": amplitude}
+    table = table_of(Tip(), truth, stated, np.random.default_rng(1), **drifts, rows_in_order_of_time=True)
+    result = tapping(table, law=False)
+    assert result.valid, result.reasons
+    low, high = result.energy["interval95"]
+    assert low < ONE_ENERGY_AJ < high
+    assert np.mean(np.abs(deviations(result, truth, 40.0)) < 1.96) > 0.9
+    blind = tapping(replace(table, rows_in_order_of_time=False), law=False)
+    assert blind.energy["value"] is None or not blind.valid
+    if phase == 1.0:
+        assert "# rows = in order of time" in blind.reasons[0]

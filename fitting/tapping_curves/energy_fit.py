@@ -29,7 +29,7 @@ _HARMONICS_THAT_TELL = 4
 Z95 = 1.959964
 TORN = 3.0
 """Distance of a nuisance from what is given, in its standard errors, from which neither is believed."""
-_DRIFT_DEG, _DRIFT = 1.0, 0.01
+_DRIFT_DEG, _DRIFT = 3.0, 0.02
 """Usual drift of phase and of free amplitude over a table, where free rows do not determine it."""
 _WIDE_DRIFT_DEG, _WIDE_DRIFT = 30.0, 0.3
 """Likewise where free rows at both ends determine it."""

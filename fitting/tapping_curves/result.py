@@ -38,6 +38,8 @@ _PULLED = 2.0
 """Distance of a nuisance from what is given, in its errors, from which it is named."""
 _DRIFTING = 5.0
 """Errors of a drift of the free rows from which it is one."""
+_FOLLOWING = 3.0
+"""Errors of a drift along the rows, of one energy for all taps, from which it is one."""
 _NEGATIVE = 3.0
 """Standard errors below zero from which an energy is impossible."""
 _ORIGINS = {
@@ -171,6 +173,7 @@ class Tapping(Result):
         functions: the energy as a smooth function along each branch, likewise.
         branches: each with its energy and virial over the amplitude.
         scale_errors: whether errors are multiplied where the rows scatter more.
+        followed: the fit of one energy with drifts along the rows, where their order in time is not stated.
         bound_aj: what a tap takes at most, where only the amplitude was recorded; else None.
         hysteresis: thresholds on the way in and back.
         speeds: of the impacts; None where there is no energy.
@@ -186,6 +189,7 @@ class Tapping(Result):
     functions: EnergyFit | None
     branches: tuple[TappingBranch, ...]
     scale_errors: bool
+    followed: EnergyFit | None
     bound_aj: float | None
     hysteresis: tuple[Hysteresis, ...]
     speeds: MeasuredSpeeds | None
@@ -468,6 +472,18 @@ class Tapping(Result):
     def drift(self) -> str:
         """What says that the free tip drifted along rows whose order in time the table does not state; or empty."""
         curve, free = self.curve, self.rows.free
+        if self.followed is not None and self.described and self.followed.p_value > IMPROBABLE:
+            for one in self.followed.nuisances:
+                if one.kind in {"phase_drift_deg", "free_amplitude_drift"} and (
+                    abs(one.value) > _FOLLOWING * one.standard_error
+                ):
+                    factor, unit = (1.0, "degrees") if "phase" in one.kind else (100.0, "%")
+                    return (
+                        "the rows follow their order in the table about one energy, as a "
+                        f"{origin_in_words(one.kind)} of {factor * one.value:+.2g} +- "
+                        f"{factor * one.standard_error:.1g} {unit} would make them: if they stand as they were "
+                        "measured, say so by '# rows = in order of time', and the drift is fitted along"
+                    )
         places = np.flatnonzero(free)
         if curve.time is not None or len(places) < 2 * FEWEST_ROWS or not free_ends(curve, free):
             return ""
@@ -580,7 +596,7 @@ class Tapping(Result):
         elif free_ends(curve, self.rows.free):
             found.append("phase and free amplitude drift evenly along the rows, as free rows at both ends tell")
         else:
-            found.append("phase and free amplitude drift evenly along the rows, usually by 1 degree and 1 %")
+            found.append("phase and free amplitude drift evenly along the rows, usually by 3 degrees and 2 %")
         if curve.phase_note:
             found.append(curve.phase_note)
         if curve.has_phase:

@@ -40,6 +40,8 @@ from fitting.tapping_curves.speeds import speeds
 LAW_MODEL = "viscous+delay"
 _FEWEST_FOR_LAW = 6
 """Rows with a fast impact: the law has two parameters, its delay three."""
+_FEWEST_TO_FOLLOW = 8
+"""Rows from which a drift along them is looked for."""
 _SLOWEST = 2.5
 """In capture speeds."""
 _PULLED = 0.8
@@ -255,12 +257,20 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
         functions=functions,
         branches=() if functions is None else branches_of(curve, functions, repulsive, free),
         scale_errors=scale_errors,
+        followed=_followed(curve, alike, free) if kinds and curve.time is None else None,
         bound_aj=None if curve.has_phase else _bound(curve, given, free),
         hysteresis=tuple(hysteresis),
         speeds=None,
         versions={name: version(name) for name in ("afm-jax", "numpy", "scipy")},
     )
     return result if fitted is None else replace(result, speeds=_speeds(result, fitted))
+
+
+def _followed(curve: TappingCurve, alike: list[np.ndarray], free: Bool[np.ndarray, " rows"]) -> EnergyFit | None:
+    """Return the fit of one energy with drifts as if the rows stood in the order of time; None for very few."""
+    if sum(map(len, alike)) < _FEWEST_TO_FOLLOW:
+        return None
+    return fit_energy(replace(curve, time=np.linspace(-0.5, 0.5, curve.rows)), alike, free, smooth=False)
 
 
 def _energies_along(result: Tapping) -> np.ndarray:

@@ -100,7 +100,7 @@ class TappingTogether(Result):
         """Return what all curves say together as plain lists, numbers and strings; each curve's own is in `curves`."""
         first = next((one.functions for one in self.curves if one.functions is not None), None)
         names = () if self.common is None else self.common.names
-        return plain(
+        payload = plain(
             {
                 "valid": self.valid,
                 "reasons": self.reasons,
@@ -112,6 +112,7 @@ class TappingTogether(Result):
                 "branches": [{**vars(one), "branch": "retract" if one.retract else "approach"} for one in self.scatter],
             }
         )
+        return self.curves[0].keyed(payload) if self.curves else payload
 
 
 @checked
@@ -267,4 +268,4 @@ def together_lines(result: TappingTogether) -> list[str]:
             if one.name in result.common.names:
                 lines.append(f"  {one.name}, fitted to all: {with_error(one.value, one.standard_error)} ({one.given})")
         lines.append(f"  probability that curves of one instrument disagree more: {result.common.p_value:.2g}")
-    return lines
+    return [result.curves[0].in_unit(line) for line in lines] if result.curves else lines
