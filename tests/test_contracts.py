@@ -91,7 +91,7 @@ def tabulated(scene: Scene, origin: str = "") -> Scene:
     """Return the scene with a table in place of its formula, of a law that no formula has."""
     law = impact_law_of(scene)
     speeds = np.geomspace(1.1 * float(law.capture_speed_nm_per_us), 300.0, 15)
-    rebound = law.rebound_speed(speeds) * (1.0 - 0.01 * np.sin(np.log(speeds)))
+    rebound = law.rebound_speed(speeds) * (0.98 - 0.01 * np.sin(np.log(speeds)))
     late = law.collision_delay(speeds) + 0.002 * np.cos(np.log(speeds))
     table = TabulatedLaw(speeds, rebound, late, delay=law.delay, origin=origin)
     return Scene(scene.cantilever, scene.platform, table)

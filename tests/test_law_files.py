@@ -159,3 +159,15 @@ def test_a_batch_of_laws_is_no_scene_file(law, tmp_path):
     scene = afm.Scene(afm.Cantilever(90.0, 40.0, 1.5), afm.Platform(4.0, 181.8, -1.0), law.sample(jax.random.key(1), 3))
     with pytest.raises(ValueError, match="holds one scene: save them one by one"):
         afm.save_scene(scene, Path(tmp_path) / "scene.toml")
+
+
+def test_a_fit_of_instantaneous_impacts_tells_delays_of_0(law, tmp_path):
+    instant = law.without_delay()
+    told = instant.to_dict() | {"collision_delay_us": [0.0] * 12}
+    fit = {"format": "afm-jax fit", "valid": True, "law": told}
+    (tmp_path / "fit.json").write_text(json.dumps(fit))
+    assert eqx.tree_equal(afm.load_law(tmp_path / "fit.json"), instant)
+    del told["numbers"]["knots"]
+    (tmp_path / "fit.json").write_text(json.dumps(fit))
+    with pytest.raises(ValueError, match="the numbers of the law lack knots"):
+        afm.load_law(tmp_path / "fit.json")

@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 
 from afm_jax.cli.main import main
-from fitting import TableError, tapping_map
+from fitting import TableError, load, tapping_map
 from fitting.examples.make_raw_curve import (
     DRIVE_KHZ,
     FREE_FREQUENCY_KHZ,
@@ -233,8 +233,10 @@ def test_the_command_writes_picture_and_arrays_and_says_the_common_error_once(tm
     assert theirs["/0/data/title"] == "Energy of a tap"
     np.testing.assert_allclose(theirs["/0/data"].data, 1e-18 * energy, rtol=2e-4)
     assert theirs["/0/data"].xreal == pytest.approx(2e-6)
-    data = tapping_map(path, **LEVER).to_xarray()
-    assert data["energy"].shape == (12, 20)
+    found = tapping_map(path, **LEVER)
+    assert found.to_xarray()["energy"].shape == (12, 20)
+    found.save(tmp_path / "map.json")
+    np.testing.assert_array_equal(load(tmp_path / "map.json").energy, found.energy)
     assert run(path, *CALL[:-4], "--free-amplitude-nm", "9").exit_code == 3
 
 

@@ -17,6 +17,11 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.checks import check_kind, in_a_word, is_traced, readable
 
 
+def _for_scene(interaction: Any) -> Any:
+    """Return what a scene holds of an interaction: of the law of a fit the law alone."""
+    return interaction.for_scene() if hasattr(interaction, "for_scene") else interaction
+
+
 class Scene(eqx.Module):
     """A container, nothing more: its parts are traced parameters, its structure says what is simulated.
 
@@ -31,7 +36,8 @@ class Scene(eqx.Module):
 
     cantilever: Cantilever
     platform: Platform
-    interaction: Any = None  # the modules of the interactions import this one, not the other way round
+    # the modules of the interactions import this one, not the other way round
+    interaction: Any = eqx.field(converter=_for_scene, default=None)
     base: BaseDrive | None = None
     force: ForceDrive | None = None
 

@@ -442,6 +442,7 @@ class TabulatedLaw(Law):
         self.slowest_nm_per_us, self.fastest_nm_per_us = u[0], u[-1]
         self.mass_ng = None if mass_ng is None else as_parameter(mass_ng)
         self.origin = Origin(origin)
+        self.deviations = None
 
     @classmethod
     def with_errors(
@@ -503,6 +504,10 @@ class TabulatedLaw(Law):
 
         deviations = jax.jit(jax.vmap(along))(by_rebound, by_delay, by_capture)
         return _replaced(law, deviations=deviations)
+
+    def for_scene(self) -> "TabulatedLaw":
+        """Return the law alone, without what a fit tells of it besides: what scenes hold."""
+        return self if type(self) is TabulatedLaw else _replaced(self)
 
     def moved(self, unknowns: ArrayLike) -> "TabulatedLaw":
         """Return the law for values of the unknowns of its errors, in standard deviations, shape (unknowns,)."""
@@ -695,7 +700,7 @@ def _with_numbers(law: TabulatedLaw, numbers: dict[str, Array]) -> TabulatedLaw:
 def _replaced(law: TabulatedLaw, **parts: Any) -> TabulatedLaw:
     """Return a law with other fields, without the checks of a table."""
     made = object.__new__(TabulatedLaw)
-    for field in dataclasses.fields(law):
+    for field in dataclasses.fields(TabulatedLaw):
         object.__setattr__(made, field.name, parts.get(field.name, getattr(law, field.name)))
     return made
 
@@ -712,9 +717,18 @@ def law_of_dict(told: Mapping[str, Any]) -> TabulatedLaw:
         raise ValueError(f"the law lacks {' and '.join(missing)}")
     numbers = told.get("numbers")
     delay = None
-    if isinstance(numbers, Mapping) and told.get(names[2]) is not None:
-        delay = CollisionDelay(*(numbers[name] for name in _OF_DELAY), corrections=bool(told.get("corrections", True)))
     u, w, late = (np.asarray(told.get(name, ()), float) for name in names)
+    if isinstance(numbers, Mapping):
+        known = [*_NUMBERS, "scale_nm_per_us", *([name for name in _OF_DELAY if "hertz" in numbers])]
+        lacking = [name for name in known if name not in numbers]
+        if lacking:
+            raise ValueError(f"the numbers of the law lack {' and '.join(lacking)}")
+        if "hertz" not in numbers:
+            # how a fit tells instantaneous impacts: delays of 0
+            late = np.zeros(0)
+        else:
+            values = (numbers[name] for name in _OF_DELAY)
+            delay = CollisionDelay(*values, corrections=bool(told.get("corrections", True)))
     law = TabulatedLaw(
         u,
         w,
