@@ -1,6 +1,7 @@
 """Fits at the edges: closed forms, parameters at their bound, what amplitudes cannot tell, rows without an orbit."""
 
 import dataclasses
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from afm_jax.impact.closure import OrbitPlace
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import SteadyOrbits
 from fitting import fit
-from fitting.fits.fit import problem_of
+from fitting.fits.fit import find_fit, problem_of, summarise
 from fitting.fits.objective import Objective
 from fitting.forward import branch_of, impact_of, orbit_problem
 from fitting.models import measurement_of
@@ -224,3 +225,27 @@ def test_of_coexisting_orbits_the_measured_one_is_taken(table, monkeypatch, meas
     assert int(branch.place.coordinate) == slot
     assert int(branch.orbits) == 2
     assert bool(branch.exists)
+
+
+def test_band_and_intervals_hold_another_minimum_that_the_data_hardly_tell(table, monkeypatch: pytest.MonkeyPatch):
+    found = find_fit(table, "law")
+    best = found.objective.problem.values(found.minimum.coordinates)
+    other = best + np.array([-0.02, 10.0, 0.0])[: best.size]
+    alone = summarise(table, replace(found, minimum=replace(found.minimum, ends=best[None], chi2=np.zeros(1))))
+    # as if chi2 said next to nothing
+    monkeypatch.setattr("fitting.fits.fit._HARDLY_TOLD", 1e9)
+    ends = replace(found.minimum, ends=np.stack([best, other]), chi2=np.zeros(2))
+    both = summarise(table, replace(found, minimum=ends))
+    law = both.law
+    u = law.approach_speed_nm_per_us
+    theirs = np.sqrt(np.maximum((other[0] * u) ** 2 - other[1], 0.0))
+    inside = theirs > 0.0
+    assert np.all(theirs[inside] >= law.rebound_low_nm_per_us[inside])
+    assert np.any(theirs[inside] < alone.law.rebound_low_nm_per_us[inside])
+    for i, name in enumerate(("r", "epsilon")):
+        # what is no minimum has no end to one side
+        low, high = both.parameters[name].interval95
+        assert low is None or low < min(best[i], other[i])
+        assert high is None or high > max(best[i], other[i])
+        assert 1.96 * (both.parameters[name].standard_error or 0.0) > abs(other[i] - best[i])
+    assert any("the band of the law and the intervals hold both" in warning for warning in both.warnings)

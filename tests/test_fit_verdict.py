@@ -262,5 +262,49 @@ def test_robust_loss_is_advised_only_where_the_rest_is_explained(share, advised)
 
 def test_another_minimum_is_named_with_its_chi2():
     given = evidence("law", made_table(), other_minimum=({"r": 0.9, "epsilon": 12.0}, 7.25))
-    said = "Another minimum explains the data about as well (chi2 7.2, here 5.0): r = 0.9, epsilon = 12."
-    assert said in judge_fit(given)[1]
+    said = "Another minimum explains the data about as well (chi2 7.2, here 5.0): r = 0.9, epsilon = 12; the band"
+    assert any(warning.startswith(said) for warning in judge_fit(given)[1])
+
+
+def test_rows_that_are_off_to_one_side_invalidate_though_chi2_is_as_it_should_be():
+    table = made_table(60)
+    given = evidence("law", table)
+    random = np.random.default_rng(4)
+    # what a model's own error in the weights leaves of independent noise
+    calm = 0.87 * random.normal(size=(60, 2))
+    off = calm.copy()
+    off[::10] -= 3.0
+    assert not judge_fit(with_residuals(given, calm))[0]
+    (reason,) = judge_fit(with_residuals(given, off))[0]
+    assert "off to one side" in reason
+    assert f"predicted below what was read for lines {table.lines[0]}, {table.lines[10]}" in reason
+    # a robust fit is for that
+    assert not any("to one side" in text for text in judge_fit(with_residuals(given, off, robust=True))[0])
+    honest = [judge_fit(with_residuals(given, random.normal(size=(60, 2))))[0] for _ in range(200)]
+    # one in three thousand
+    assert sum("to one side" in text for reasons in honest for text in reasons) <= 1
+
+
+@pytest.mark.parametrize(("left", "refused"), [(2.0, False), (4.0, True)])
+def test_residuals_that_run_together_over_the_speed_are_said_and_count(left, refused):
+    given = dataclasses.replace(evidence("law+delay", made_table()), run=(5.0, left), short=0.7)
+    reasons, warnings = judge_fit(given)
+    assert any("residuals run together over the approach speed (5.0" in text for text in reasons) is refused
+    assert any("a model discrepancy of 70 % of the loss" in text for text in warnings)
+
+
+def test_a_search_that_ends_at_no_minimum_is_not_said_to_be_infinitely_far_from_one():
+    given = evidence("law", made_table())
+    adrift = dataclasses.replace(given.convergence, converged=False, estimated_distance=float("inf"))
+    (reason,) = judge_fit(dataclasses.replace(given, convergence=adrift))[0]
+    assert reason == "Not converged: chi2 bends downwards where the search ended, which is no minimum."
+
+
+def test_an_interval_holds_that_of_another_minimum():
+    one, other = made_parameter("r", 0.95), made_parameter("r", 0.97)
+    both = one.containing(other)
+    assert both.value == one.value
+    assert both.interval95 == (one.interval95[0], other.interval95[1])
+    assert both.standard_error is not None
+    assert both.value + 1.96 * both.standard_error >= 0.97 + 1.95 * 0.0097
+    assert one.containing(dataclasses.replace(other, interval95=(None, None))).interval95 == (None, None)

@@ -11,15 +11,19 @@ from fitting import fit
 from fitting.fits.loss import EV_PER_AJ, Loss, WithInterval, energy_lost, interval_of, nearest_of, scaled
 from fitting.fits.objective import Objective
 from fitting.fits.unmodelled import (
+    LawAfter,
     LawBefore,
     StepRows,
     Unmodelled,
     closest_member,
+    containing,
     descending_part,
     law_after,
+    longest_run,
     root_of,
     step_of,
     system_of,
+    with_runs,
 )
 from fitting.forward import ImpactSlopes, Predicted, Prediction, impact_slopes
 from fitting.models import Problem, measurement_of
@@ -190,6 +194,41 @@ def test_the_band_is_that_of_the_whole_covariance(rows):
     size = square.shape[1]
     error = np.sqrt(np.einsum("nk,kj,nj->n", square, covariance[:size, :size], square)) / (2.0 * w)
     np.testing.assert_allclose(np.linalg.norm(found.factor[0], axis=1), error, rtol=1e-5)
+
+
+def test_residuals_that_run_together_over_the_speed_are_seen_and_only_widen(rows):
+    """A bump of the loss that no column of the model has, beside independent residuals of half an error."""
+    random, free = np.random.default_rng(8), np.ones(6, dtype=bool)
+    calm = rows._replace(residual=np.append(0.5 * random.normal(size=2 * ROWS), 0.0))
+    steps = [longest_run(calm, LEFT_OUT, free)]
+    bump = np.exp(-0.5 * (np.log(rows.approach / 60.0) / 0.2) ** 2) * (rows.approach**2 - rows.rebound**2)
+    for height in (0.1, 1.0):
+        bent = calm.residual.copy()
+        bent[: 2 * ROWS] += height * (rows.slopes.by_square * bump[:, None]).ravel()
+        steps.append(longest_run(calm._replace(residual=bent), LEFT_OUT, free))
+    assert steps[0] < 3.0
+    assert steps[2] > 10.0
+    assert with_runs(LEFT_OUT, 2.0) == LEFT_OUT
+    shares = [with_runs(LEFT_OUT, run).short for run in (2.2, 3.0, 5.0, 50.0)]
+    np.testing.assert_allclose(shares, [0.0, 0.2, 0.7, 1.0])
+    narrow, wide = (step_of(rows, one, free) for one in (LEFT_OUT, with_runs(LEFT_OUT, 5.0)))
+    assert np.all(np.diag(wide.covariance) >= np.diag(narrow.covariance))
+    assert wide.chi2 < narrow.chi2
+
+
+def test_a_band_holds_that_of_another_law_too():
+    factor = np.array([[[0.3, 0.4], [0.0, 1.0]], [[0.1, 0.0], [0.2, 0.0]]])
+    one = LawAfter(np.array([[10.0, 20.0], [0.1, 0.2]]), factor, 5.0, np.array([0.1, 0.0]))
+    other = LawAfter(one.law + np.array([[0.5, -3.0], [0.0, 0.01]]), 2.0 * factor, 5.5, np.array([0.0, 0.2]))
+    both = containing(one, other)
+    for law in (one, other):
+        own, mine = (np.linalg.norm(x.factor, axis=2) * 1.959964 for x in (law, both))
+        assert np.all(both.law - mine <= law.law - own + 1e-9)
+        assert np.all(both.law + mine >= law.law + own - 1e-9)
+        reach = 1.959964 * np.linalg.norm(law.capture_factor)
+        assert both.capture + 1.959964 * np.linalg.norm(both.capture_factor) >= law.capture + reach - 1e-9
+    same = containing(one, one._replace(factor=0.5 * factor))
+    np.testing.assert_allclose(same.factor, one.factor)
 
 
 def loss_and_delay(values: np.ndarray, u: np.ndarray) -> np.ndarray:

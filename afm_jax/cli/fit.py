@@ -125,7 +125,8 @@ class Names(click.ParamType):
     type=Constraint(),
     multiple=True,
     metavar="NAME=VALUE+-ERROR",
-    help=f"What is known beforehand: {', '.join(NUISANCE_NAMES)}, or a parameter of the model.",
+    help=f"What is known beforehand: {', '.join(NUISANCE_NAMES)}, or a parameter of the model; "
+    "of a contact also one that is held, at the value then.",
 )
 @click.option("--no", "left_out", type=Names(), metavar="EFFECT,...", help="contact: effects that it does not have.")
 @click.option("--compare", "comparing", is_flag=True, help="Fit the rival models too and say what the table can tell.")

@@ -34,6 +34,8 @@ class ContactParameter:
         spread: the factor to either side of the paper's value within which fits start.
         evenly: the range within which fits start, evenly; None: as ``width`` or ``spread`` say.
         serves: the effects of which it needs one to mean anything; none: it is always of use.
+        unsure: standard error that is assumed where a fit holds it and nothing better is said: in its unit where there
+            is a ``width`` or ``evenly``, else relative.
         advice: what to measure so that a fit determines it, if there is more to say than of any.
     """
 
@@ -43,11 +45,16 @@ class ContactParameter:
     allowed: str = "positive"
     meaning: str
     fitted: tuple[float, float]
+    unsure: float
     width: float = 0.0
     spread: float = 3.0
     evenly: tuple[float, float] | None = None
     serves: tuple[str, ...] = ()
     advice: str = ""
+
+    def error_at(self, value: float) -> float:
+        """Return the standard error that is assumed of a value at which a fit holds it."""
+        return self.unsure if self.width or self.evenly else self.unsure * abs(value)
 
     @property
     def starts(self) -> tuple[float, float]:
@@ -66,6 +73,7 @@ CONTACT_PARAMETERS = (
         default=0.5,
         allowed="between 0 and 1",
         meaning="p/p_s of the vapour",
+        unsure=0.1,
         fitted=(0.02, 0.99),
         evenly=(0.1, 0.9),
         serves=_LIQUID,
@@ -76,6 +84,7 @@ CONTACT_PARAMETERS = (
         unit="K",
         default=293.15,
         meaning="temperature",
+        unsure=0.02,
         fitted=(100.0, 1e3),
         spread=1.3,
         serves=_LIQUID,
@@ -85,6 +94,7 @@ CONTACT_PARAMETERS = (
         unit="N/m",
         default=0.0728,
         meaning="of the liquid",
+        unsure=0.2,
         fitted=(1e-3, 1.0),
         spread=1.3,
         serves=_LIQUID,
@@ -94,6 +104,7 @@ CONTACT_PARAMETERS = (
         unit="cm^3/mol",
         default=18.0795,
         meaning="of the liquid",
+        unsure=0.1,
         fitted=(1.0, 1e3),
         spread=1.3,
         serves=_LIQUID,
@@ -104,17 +115,19 @@ CONTACT_PARAMETERS = (
         default=1.005e-3,
         allowed="not negative",
         meaning="of the liquid",
+        unsure=0.3,
         fitted=(0.0, 1.0),
         serves=("viscous",),
         advice="measure over a wider range of drives, or hold it fixed at the liquid's known value",
     ),
-    ContactParameter(name="tip_radius_nm", unit="nm", default=100.0, meaning="R", fitted=(1.0, 1e4)),
+    ContactParameter(name="tip_radius_nm", unit="nm", default=100.0, meaning="R", unsure=0.3, fitted=(1.0, 1e4)),
     ContactParameter(
         name="structural_amplitude_n_per_m",
         unit="N/m",
         default=40.0,
         allowed="not negative",
         meaning="A_0 of the structural force",
+        unsure=0.3,
         fitted=(0.0, 1e4),
         serves=("structural",),
     ),
@@ -123,6 +136,7 @@ CONTACT_PARAMETERS = (
         unit="nm",
         default=0.6,
         meaning="tau of the structural force",
+        unsure=0.2,
         fitted=(0.05, 10.0),
         serves=("structural",),
     ),
@@ -132,6 +146,7 @@ CONTACT_PARAMETERS = (
         default=0.6,
         allowed="finite",
         meaning="delta of the structural force",
+        unsure=0.2,
         fitted=(-5.0, 5.0),
         width=0.2,
         serves=("structural",),
@@ -142,6 +157,7 @@ CONTACT_PARAMETERS = (
         unit="J m^6",
         default=1e-78,
         meaning="B of the core repulsion",
+        unsure=0.5,
         fitted=(1e-82, 1e-74),
     ),
     ContactParameter(
@@ -149,6 +165,7 @@ CONTACT_PARAMETERS = (
         unit="J/m^2",
         default=0.3,
         meaning="w of the JKR contact",
+        unsure=0.3,
         fitted=(0.02, 5.0),
         advice="measure slow impacts too, or hold it or the humidity fixed: both set the hysteresis",
     ),
@@ -157,6 +174,7 @@ CONTACT_PARAMETERS = (
         unit="GPa",
         default=100.0,
         meaning="reduced modulus K of the JKR contact",
+        unsure=0.3,
         fitted=(1.0, 2e3),
         advice="measure at several orders, detuned to both sides of each resonance",
     ),
@@ -165,6 +183,7 @@ CONTACT_PARAMETERS = (
         unit="nm",
         default=3.5,
         meaning="gap at which the bridge forms",
+        unsure=0.2,
         fitted=(0.5, 50.0),
         advice="hold it fixed: only slow impacts depend on it",
     ),
@@ -173,6 +192,7 @@ CONTACT_PARAMETERS = (
         unit="nm",
         default=4.7,
         meaning="gap at which the bridge breaks",
+        unsure=0.2,
         fitted=(0.5, 50.0),
         advice="measure slow impacts too: small drives, close to where the orbit is lost",
     ),

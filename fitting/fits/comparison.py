@@ -153,6 +153,9 @@ def _options_of(model: str, options: dict[str, Any]) -> dict[str, Any]:
     chosen = dict(options)
     if model != "contact":
         chosen.pop("effects", None)
+        known = chosen.get("constraints") or {}
+        # what is known of a contact's parameter is nothing that a law has
+        chosen["constraints"] = {name: pair for name, pair in known.items() if name not in CONTACT_NAMES} or None
     if any(name not in names for name in chosen.get("free") or ()):
         del chosen["free"]
     if chosen.get("fixed"):

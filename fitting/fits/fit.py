@@ -54,23 +54,31 @@ from fitting.fits.minimum import (
     strain_of,
     untabulated,
 )
-from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective, soft_square
+from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective, lowest, soft_square
 from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows, FittedTable, Scatter, table_of_law
 from fitting.fits.several import Between, Pull, departures_of, parts_of, pulls_of, scatter_between
 from fitting.fits.unmodelled import (
     ClosestMember,
+    Held,
     LawAfter,
     LawBefore,
     LinearStep,
+    StepRows,
     StepSystem,
     Unmodelled,
     closest_member,
+    containing,
     descending_part,
+    effects_of_held,
+    held_of,
     law_after,
+    longest_run,
     root_of,
     rows_of_fit,
+    split_held,
     step_of,
     system_of,
+    with_runs,
 )
 from fitting.fits.verdict import ASSUMED_ERROR_OF_Q, IMPROBABLE, Evidence, judge_fit, misfits
 from fitting.forward import AnyImpact, Predicted, impact_at, predict, warm_up
@@ -108,6 +116,7 @@ def law_with_band(  # noqa: PLR0913
     formula: ImpactLaw | None = None,
     mass_ng: float | None = None,
     origin: str = "",
+    beside: Callable[[Float[np.ndarray, " n"]], LawAfter] | None = None,
 ) -> FittedLaw:
     """Return the law from 0.8 times the slowest to 1.2 times the fastest approach, with its linearised 95 % band.
 
@@ -121,12 +130,14 @@ def law_with_band(  # noqa: PLR0913
         formula: the model's that is closest after the step.
         mass_ng: of the tip; None: not known.
         origin: what the law comes from, in words.
+        beside: another law at approach speeds in nm/us that may as well be the true one: the band holds its band too.
     """
     if after is None and problem.model != "contact":
         formula = problem.law(jnp.asarray(values), measurement.fixed)
 
     def law(speeds: Float[np.ndarray, " n"]) -> LawAfter:
-        return law_at(problem, measurement, values, covariance, speeds, after)
+        own = law_at(problem, measurement, values, covariance, speeds, after)
+        return own if beside is None else containing(own, beside(speeds))
 
     speeds, found = points_of_law(law, approach_speeds)
     return FittedLaw(
@@ -403,6 +414,12 @@ def _distance_from_law(table: AmplitudeTable) -> float:
     return float(np.min(objective.screen(_GRID)))
 
 
+_MUCH = 0.25
+"""Share of a parameter's variance that comes of a held one from which it is said to hang on that."""
+_HARDLY_TOLD, _LOOKED_AT = 4.0, 30.0
+"""Rise of chi2 up to which another minimum may as well be the true one; and from where it is followed to find that."""
+
+
 class _Summary:
     """Turns a minimum into a `FitResult`: the step with what the model leaves out, errors, intervals, checks, verdict.
 
@@ -411,7 +428,7 @@ class _Summary:
     """
 
     def __init__(self, table: AmplitudeTable | SeveralTables, found: Found):
-        objective, minimum = found.objective, found.minimum
+        objective, minimum, self.found = found.objective, found.minimum, found
         self.searching, self.table, self.minimum, self.strain = objective, table, minimum, found.strain
         self.settings, self.problem, self.stated = found.settings, objective.problem, found.stated
         self.refused = found.refused
@@ -434,11 +451,13 @@ class _Summary:
         self.rows = self._rows()
         self.used_speeds = np.where(self.rows.used, self.rows.approach_speed_nm_per_us, np.nan)
         self.names, self.ends, self.spread = self.problem.names, self.values, self.covariance
-        self.chi2, self.contact_share = self.minimum_chi2, 0.0
+        self.chi2, self.contact_share, self.run = self.minimum_chi2, 0.0, (0.0, 0.0)
         self.pulls: list[Pull] = []
         self.between: tuple[Between, Float[np.ndarray, "tables l"]] | None = None
         self.alone, self.system = self.rows.residual, None
         self.stuck: tuple[float, float] | None = None
+        self.step_rows: StepRows | None = None
+        self.unbent: Float[np.ndarray, "rows k"] | None = None
         self.after = self._step()
         if self.after is not None:
             self._take(*self.after)
@@ -455,6 +474,7 @@ class _Summary:
         rows = rows_of_fit(self.stated, self.objective, self.values, self.strain, scale)
         if not all(np.isfinite(part).all() for part in (rows.residual, rows.jacobian, *rows.slopes)):
             return None
+        self.step_rows = rows
         used = np.flatnonzero(np.isfinite(self.used_speeds))
         # of the Hertz time, in us and kHz
         shares = 1e-3 * rows.hertz_time[used] * self.table.drive_frequency_khz[used]
@@ -462,6 +482,15 @@ class _Summary:
         values = self.settings["fixed"] | dict(zip(self.problem.names, self.values.tolist(), strict=True))
         mass = float(self.stated.measurement.cantilever.mass_ng)
         left_out = Unmodelled(self.problem, values, speed_range(self.used_speeds), mass)
+        if self.problem.model == "contact" and not self.problem.pulled:
+            held = tuple(Held(*one) for one in self.settings.get("held", ()))
+            effects = effects_of_held(held, values, self.problem.effects, mass, left_out.speeds)
+            left_out = replace(left_out, held=effects)
+        if self.problem.lasting and not self.problem.pulled and not scattering:
+            run = longest_run(rows, left_out, self.free)
+            self.unbent = step_of(rows, left_out, self.free).residual
+            left_out = with_runs(left_out, run)
+            self.run = run, longest_run(rows, left_out, self.free) if left_out.short else run
         self.system = system_of(rows, left_out)
         if joint is None:
             return step_of(rows, left_out, self.free), left_out
@@ -572,6 +601,7 @@ class _Summary:
         moved = np.append(moved, np.ones(len(self.names) - len(moved), dtype=bool))
         unknown, rows = np.full(len(self.names), np.inf), self.rows
         missed = untabulated(self.objective, self.values, self.used_speeds)
+        beside = self._beside(errors)
         evidence = Evidence(
             table=self.table,
             parameters=self._parameters(unknown, "the model does not explain the data", moved),
@@ -581,7 +611,7 @@ class _Summary:
             freedom=self.freedom,
             p_value=p_value,
             autocorrelation=_autocorrelation(self.alone),
-            other_minimum=self._other_minimum(errors),
+            other_minimum=None if beside is None else (dict(zip(beside.names, beside.ends, strict=True)), beside.chi2),
             error_scale=self.settings["error_scale"],
             lasting=self.problem.lasting,
             robust=self.searching.robust,
@@ -593,6 +623,13 @@ class _Summary:
             tapped=self.problem.pulled,
             pulls=tuple(pull.p_value for pull in self.pulls),
             scattering=self.between is not None,
+            run=self.run,
+            short=0.0 if self.after is None else self.after[1].short,
+            held=tuple(one.held for one in self.after[1].held) if self.after is not None else (),
+            hanging=self._hanging(),
+            unbent=None
+            if self.unbent is None
+            else np.where(np.isfinite(rows.residual), self.unbent[: self.table.rows], np.nan),
             independent_residual=self.alone,
             stuck=self.stuck,
         )
@@ -600,7 +637,11 @@ class _Summary:
         explained = not misfits(evidence)
         shown_covariance = self.spread if explained else np.full_like(self.spread, np.inf)
         if explained:
-            evidence = replace(evidence, parameters=self._explained_parameters(moved))
+            parameters = self._explained_parameters(moved)
+            if beside is not None:
+                other = beside._explained_parameters(moved)  # noqa: SLF001
+                parameters = {name: one.containing(other[name]) for name, one in parameters.items()}
+            evidence = replace(evidence, parameters=parameters)
         reasons, warnings = judge_fit(evidence)
         warnings += self._follow_rows() + _untold_drifts(evidence.parameters)
         common = [i for i, name in enumerate(self.names) if not is_of_one_table(name)]
@@ -626,8 +667,9 @@ class _Summary:
                 formula=None if self.after is None else self._formula(*self.after),
                 mass_ng=self.table.mass_ng,
                 origin=f"{self.problem.model} fitted to {self.table.source}",
+                beside=None if beside is None else beside.law_at,
             ),
-            loss=self._loss(shown_covariance, evidence.parameters),
+            loss=self._loss(shown_covariance, evidence.parameters, beside),
             rows=rows,
             residual_autocorrelation=evidence.autocorrelation,
             convergence=self.convergence,
@@ -637,6 +679,20 @@ class _Summary:
             tables=self._fitted_tables(evidence.parameters),
             scatter=self._scatter() if explained else {},
         )
+
+    def _hanging(self) -> dict[str, tuple[str, ...]]:
+        """Return which held parameters' errors are much of each fitted one's."""
+        found: dict[str, tuple[str, ...]] = {}
+        if self.after is None or not self.after[1].held or self.step_rows is None:
+            return found
+        left_out, whole = self.after[1], np.diag(self.spread)
+        for one in left_out.held:
+            rest = replace(left_out, held=tuple(other for other in left_out.held if other is not one))
+            without = np.diag(step_of(self.step_rows, rest, self.free).covariance)
+            for i, name in enumerate(self.problem.own):
+                if np.isfinite(whole[i]) and whole[i] - without[i] > _MUCH * whole[i]:
+                    found[name] = (*found.get(name, ()), one.held.name)
+        return found
 
     def _follow_rows(self) -> list[str]:
         """Return a sentence for each table whose residuals follow its rows, though it says nothing of their order."""
@@ -719,14 +775,24 @@ class _Summary:
             )
         return tuple(told)
 
-    def _loss(self, shown: Float[np.ndarray, "k k"], parameters: Mapping[str, FittedParameter]) -> Loss | None:
-        """Return what impacts take; None where no row has a speed."""
+    def law_at(self, speeds: Float[np.ndarray, " n"]) -> LawAfter:
+        """Return the law at approach speeds in nm/us."""
+        return law_at(self.problem, self.objective.measurement, self.values, self.spread, speeds, self.after)
+
+    def _loss(
+        self,
+        shown: Float[np.ndarray, "k k"],
+        parameters: Mapping[str, FittedParameter],
+        beside: "_Summary | None" = None,
+    ) -> Loss | None:
+        """Return what impacts take, at another minimum too; None where no row has a speed."""
         if not np.isfinite(self.used_speeds).any():
             return None
         measurement = self.objective.measurement
 
         def found(speeds: Float[np.ndarray, " n"]) -> LawAfter:
-            return law_at(self.problem, measurement, self.values, shown, speeds, self.after)
+            own = law_at(self.problem, measurement, self.values, shown, speeds, self.after)
+            return own if beside is None else containing(own, beside.law_at(speeds))
 
         formula = None
         if self.problem.model != "contact":
@@ -820,23 +886,30 @@ class _Summary:
             **phases,
         )
 
-    def _other_minimum(self, errors: Float[np.ndarray, " p"]) -> tuple[dict[str, float], float] | None:
-        """Return values and chi2 of another minimum that the data hardly tell from the best one, if there is one."""
-        values, chi2 = self.minimum.ends, self.minimum.chi2
+    def _beside(self, errors: Float[np.ndarray, " p"]) -> "_Summary | None":
+        """Return another minimum that the data hardly tell from the best one, if there is one."""
         known = np.where(np.isfinite(errors) & (errors > 0.0), errors, np.inf)
-        apart = np.max(np.abs(values - self.values) / known, axis=1) > 5.0
-        if not apart.any():
+
+        def apart(values: Float[np.ndarray, "n p"]) -> Bool[np.ndarray, " n"]:
+            return np.max(np.abs(values - self.values) / known, axis=1) > 5.0
+
+        ends = self.minimum.ends[apart(self.minimum.ends)]
+        if not ends.size:
             return None
-        index = int(np.argmin(np.where(apart, chi2, np.inf)))
-        found = float(chi2[index])
+        # of impacts that last they were found with the errors as stated and outliers counting less
+        chi2 = np.sum(self.searching.residual(ends) ** 2, axis=1)
+        place = lowest(chi2)
+        if not chi2[place] < self.minimum_chi2 + (_LOOKED_AT if self.problem.lasting else _HARDLY_TOLD):
+            return None
+        here = self.problem.coordinates(ends[place])
+        minimum = replace(self.minimum, coordinates=here, ends=ends[place][None], chi2=chi2[place][None])
         if self.problem.lasting:
-            # it was found with the errors as stated and outliers counting less
-            found = float(np.sum(self.searching.residual(values[index : index + 1]) ** 2))
-        if not found < self.minimum_chi2 + 4.0:
+            minimum = settle(self.searching, minimum)
+        if not apart(self.problem.values(minimum.coordinates)[None]).any():
             return None
-        # what the model leaves out has lowered the one, and would have lowered the other
-        found += self.chi2 - self.minimum_chi2
-        return dict(zip(self.problem.names, values[index].tolist(), strict=True)), found
+        other = _Summary(self.table, replace(self.found, minimum=minimum))
+        above = min(other.minimum_chi2 - self.minimum_chi2, other.chi2 - self.chi2)
+        return other if above < _HARDLY_TOLD else None
 
 
 def _or_none(value: float) -> float | None:
@@ -901,7 +974,8 @@ def fit(  # noqa: PLR0913
         fixed: values at which other parameters of the model are held; of "contact" what is not named is the paper's.
         constraints: value and standard error of what else is known, by parameter: a nuisance (`quality_factor`,
             `tip_calibration`, `drive_calibration`, `offset_origin_nm`), which then is fitted along, or one of the
-            model's parameters. Of several tables every one's nuisance is known that well.
+            model's parameters. Of several tables every one's nuisance is known that well. What a fit of the contact
+            holds is held at the value then, and known that well; of the others an error is assumed, and named.
         effects: for "contact": the effects there are.
         robust: let outliers count linearly from two errors on; the result is valid only if they are few and the other
             amplitudes are explained.
@@ -956,6 +1030,10 @@ def find_fit(  # noqa: PLR0913
 ) -> Found:
     """Return the minimum of a fit; arguments and errors as of `fit`."""
     require_float64()
+    errors: dict[str, float] = {}
+    if model == "contact":
+        own = model_parameters(model, None if free is None else tuple(free), fixed)
+        fixed, constraints, errors = split_held(own, fixed, constraints)
     if isinstance(table, AmplitudeTable):
         for name, asked in (("share", share), ("hierarchical", hierarchical)):
             if asked:
@@ -987,6 +1065,7 @@ def find_fit(  # noqa: PLR0913
         "free": list(problem.own),
         "fixed": dict(fixed or {}),
         "effects": list(effects) if model == "contact" else None,
+        "held": held_of(problem.own, tuple(effects), fixed or {}, errors) if model == "contact" else (),
     }
     if isinstance(table, SeveralTables):
         settings |= {"share": list(share), "hierarchical": hierarchical}

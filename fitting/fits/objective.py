@@ -21,6 +21,9 @@ SOFT = 5.0
 """Residual, in errors, beyond which the screening and the first polish count a row linearly (soft-l1)."""
 ROBUST = 2.0
 """The same for a fit with robust loss."""
+OUTLIER, MOST_OUTLIERS = 4.0, 0.1
+"""Residual in errors from which a row is an outlier; and the share of rows that a robust fit may call so (one row it
+always may): more are a wrong model, not mishaps."""
 PLAIN = np.inf
 """The same for plain least squares: no residual gets there."""
 ROUGH, FINE = 1e-2, 1e-10

@@ -1,7 +1,7 @@
 """What a fit found, and everything that went into it."""
 
 import dataclasses
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import equinox as eqx
@@ -48,6 +48,19 @@ class FittedParameter:
     at_bound: bool
     did_not_move: bool
     constraint: tuple[float, float] | None
+
+    def containing(self, other: "FittedParameter") -> "FittedParameter":
+        """Return the parameter with error and interval so large that they hold those of another minimum too."""
+        (low, high), (lower, higher) = self.interval95, other.interval95
+        ends = (
+            None if low is None or lower is None else min(low, lower),
+            None if high is None or higher is None else max(high, higher),
+        )
+        error = self.standard_error
+        if error is not None and other.standard_error is not None:
+            error = max(error, abs(other.value - self.value) / TWO_SIDED_95 + other.standard_error)
+        reason = self.interval_reason or other.interval_reason
+        return replace(self, standard_error=error, interval95=ends, interval_reason=reason)
 
 
 @jax.jit

@@ -6,7 +6,7 @@ errors the scale, and what is known of the parameters; always that neighbouring 
 the table's order (a drift, a sweep the model does not follow) nor over the approach speed (a wrong law).
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -15,7 +15,9 @@ from afm_jax.least_squares import IMPROBABLE, chi2_tail
 from fitting.fits.intervals import Convergence
 from fitting.fits.loss import NO_MASS
 from fitting.fits.minimum import TOO_SLOW
+from fitting.fits.objective import MOST_OUTLIERS, OUTLIER
 from fitting.fits.result import FittedParameter, FittedRows
+from fitting.fits.unmodelled import Held
 from fitting.parameters import DELAY_NAMES, is_nuisance, name_of_table, parameter_called
 from fitting.tables.several import SeveralTables, repeats_of
 from fitting.tables.table import AmplitudeTable
@@ -24,10 +26,12 @@ _TIED = 0.995
 """Correlation beyond which two parameters are called determined only together."""
 _STATED = 0.003
 """Relative model error from which rows are named."""
-_OUTLIER = 4.0
-"""Residual in errors from which a row is an outlier."""
-MOST_OUTLIERS = 0.1
-"""Share of rows that a robust fit may call outliers (one row it always may): more are a wrong model, not mishaps."""
+_ONE_SIDED = 4.5
+"""Sum of the cubed residuals, in standard deviations of that of independent ones, from which rows are off to one side:
+by chance in one fit of three thousand."""
+_RUN, _LONGEST_RUN = 3.0, 3.5
+"""Standard deviations by which residuals run together over the speed from which that is said, and what is left of that
+beside a wider model discrepancy from which the model does not explain the table."""
 LARGEST_SCALE = 3.0
 """Scale of the errors that is believed: a spread given for that of a mean, a 3 sigma limit for 1 sigma. Errors that
 would have to be larger are no matter of scale, and have to be stated nearer to the truth."""
@@ -86,6 +90,16 @@ class Evidence:
     """Of several tables, the probability that each one's law is that of the others."""
     scattering: bool = False
     """Laws were allowed to differ from table to table."""
+    run: tuple[float, float] = (0.0, 0.0)
+    """Standard deviations by which residuals run together over the speed, and by which beside what that added."""
+    unbent: Float[np.ndarray, "rows k"] | None = None
+    """Residuals of the rows without that, where it was added: it goes after outliers."""
+    held: tuple[Held, ...] = ()
+    """What a fit of the contact holds, with its errors."""
+    hanging: dict[str, tuple[str, ...]] = field(default_factory=dict)
+    """Which of them decide how well a fitted one is known."""
+    short: float = 0.0
+    """Share of the loss by which the model discrepancy of short range was added for that."""
     independent_residual: Float[np.ndarray, "rows k"] | None = None
     """Residuals without what is common to rows: the most likely remainders of corrections, and departures of tables;
     None: those of the rows."""
@@ -116,7 +130,7 @@ def _reasons(evidence: Evidence) -> list[str]:
         )
     elif not convergence.converged:
         reasons.append(
-            f"Not converged: chi2 lies an estimated {convergence.estimated_distance:.2g} above its minimum"
+            ("Not converged: " + _distance_in_words(convergence.estimated_distance))
             + ("" if convergence.outward else ", and a parameter is held at a bound it would leave")
             + "."
         )
@@ -142,6 +156,12 @@ def _reasons(evidence: Evidence) -> list[str]:
         if parameter.interval95 == (None, None) and not misfit and not undetermined:
             reasons.append(f"{name} is not identified: {parameter.interval_reason}; {helpful_measurement(name)}.")
     return reasons
+
+
+def _distance_in_words(distance: float) -> str:
+    if not np.isfinite(distance):
+        return "chi2 bends downwards where the search ended, which is no minimum"
+    return f"chi2 lies an estimated {distance:.2g} above its minimum"
 
 
 def _no_way_down(evidence: Evidence) -> list[str]:
@@ -211,10 +231,34 @@ def misfits(evidence: Evidence) -> list[str]:
         found += _robust_misfits(evidence)
     if evidence.error_scale is not None:
         found += _scaled_misfits(evidence)
+    if evidence.run[1] > _LONGEST_RUN:
+        found.append(
+            f"residuals run together over the approach speed ({evidence.run[0]:.1f} standard deviations; "
+            f"{evidence.run[1]:.1f} beside a model discrepancy of {100.0 * evidence.short:.0f} % of the loss)"
+        )
+    if not evidence.robust:
+        found += _one_sided(evidence)
     return found + [
         f"neighbouring residuals {where} are correlated ({excess:+.1f} standard deviations)"
         for where, excess in _correlations(evidence)
     ]
+
+
+def _one_sided(evidence: Evidence) -> list[str]:
+    """Return that some rows are off to one side, in words: chance gives as large residuals of either sign."""
+    residual = evidence.rows.residual if evidence.unbent is None else evidence.unbent
+    count = np.isfinite(residual).sum(axis=1)
+    of_row = np.nansum(residual, axis=1) / np.sqrt(np.maximum(count, 1))
+    rows = int((count > 0).sum())
+    if rows <= _FEWEST_NEIGHBOURS:
+        return []
+    excess = float(np.sum(of_row**3) / np.sqrt(15.0 * rows))
+    if abs(excess) < _ONE_SIDED:
+        return []
+    far = np.sort(np.argsort(-np.sign(excess) * of_row)[: max(1, rows // 10)])
+    side = "above" if excess > 0.0 else "below"
+    said = f"residuals are far off to one side ({excess:+.1f} standard deviations of their cubes)"
+    return [f"{said}: predicted {side} what was read for {_rows_in_words(evidence.table, far)}"]
 
 
 def _robust_misfits(evidence: Evidence) -> list[str]:
@@ -222,7 +266,7 @@ def _robust_misfits(evidence: Evidence) -> list[str]:
     count, used = int(outliers.sum()), int(evidence.rows.used.sum())
     if count > max(1.0, MOST_OUTLIERS * used):
         bound = f"robust loss is for outliers in at most one row of {1.0 / MOST_OUTLIERS:g}"
-        return [f"{count} of {used} rows are off by more than {_OUTLIER:g} errors, and {bound}"]
+        return [f"{count} of {used} rows are off by more than {OUTLIER:g} errors, and {bound}"]
     chi2, freedom, p_value = _without_outliers(evidence)
     if p_value < IMPROBABLE:
         return [f"without outliers chi2/dof = {chi2 / freedom:.3g} (probability {p_value:.1g})"]
@@ -259,7 +303,7 @@ def _pull_in_words(evidence: Evidence, name: str, pull: float) -> str:
 def _without_outliers(evidence: Evidence) -> tuple[float, int, float]:
     """Return chi2 of the amplitudes that are no outliers and of what is known, its freedom and its probability."""
     residual, pulls = evidence.rows.residual, _pulls(evidence)
-    inside = residual[np.abs(residual) <= _OUTLIER]
+    inside = residual[np.abs(residual) <= OUTLIER]
     freedom = inside.size + len(pulls) - len(evidence.parameters)
     chi2 = float(np.sum(inside**2) + sum(pull**2 for pull in pulls.values()))
     return chi2, freedom, chi2_tail(chi2, freedom) if freedom > 0 else float("nan")
@@ -267,7 +311,7 @@ def _without_outliers(evidence: Evidence) -> tuple[float, int, float]:
 
 def _outliers(evidence: Evidence, scale: float = 1.0) -> Bool[np.ndarray, " rows"]:
     """Return which rows are far off; ``scale``: of the errors that residuals are in, over those that count here."""
-    return np.any(scale * np.abs(np.nan_to_num(evidence.rows.residual)) > _OUTLIER, axis=1)
+    return np.any(scale * np.abs(np.nan_to_num(evidence.rows.residual)) > OUTLIER, axis=1)
 
 
 def _correlations(evidence: Evidence) -> list[tuple[str, float]]:
@@ -291,7 +335,7 @@ def correlation_excess(residual: Float[np.ndarray, "rows k"]) -> float:
     Args:
         residual: of the readings in errors, row after row; NaN where nothing was measured.
     """
-    bounded = np.clip(np.nan_to_num(residual), -_OUTLIER, _OUTLIER)
+    bounded = np.clip(np.nan_to_num(residual), -OUTLIER, OUTLIER)
     count = len(bounded)
     if count <= _FEWEST_NEIGHBOURS or np.sum(bounded**2) < _NEGLIGIBLE**2 * np.isfinite(residual).sum():
         return 0.0
@@ -369,6 +413,8 @@ def _warnings(evidence: Evidence) -> list[str]:
         *_table_warnings(evidence),
         *_parameter_warnings(evidence),
         *_pair_warnings(evidence),
+        *_run_warnings(evidence),
+        *_held_warnings(evidence),
         *_row_warnings(evidence),
     ]
 
@@ -476,9 +522,33 @@ def _parameter_warnings(evidence: Evidence) -> list[str]:
         found, chi2 = evidence.other_minimum
         values = ", ".join(f"{name} = {value:.5g}" for name, value in found.items())
         warnings.append(
-            f"Another minimum explains the data about as well (chi2 {chi2:.1f}, here {evidence.chi2:.1f}): {values}."
+            f"Another minimum explains the data about as well (chi2 {chi2:.1f}, here {evidence.chi2:.1f}): {values}; "
+            "the band of the law and the intervals hold both."
         )
     return warnings
+
+
+def _held_warnings(evidence: Evidence) -> list[str]:
+    """Return what is held and how well it is taken to be known, and what hangs on it."""
+    values = {one.name: f"{one.name} = {one.value:.4g} +- {one.error:.2g}" for one in evidence.held}
+    assumed = [values[one.name] for one in evidence.held if one.assumed]
+    warnings = []
+    if assumed:
+        example = next(one for one in evidence.held if one.assumed)
+        known = f"{example.name}={example.value:.4g}+-{0.1 * example.error:.2g}"
+        said = f"Held, with errors that are assumed: {', '.join(assumed)}; law, band and intervals hang on them"
+        warnings.append(f"{said}: say what is known better, like --constrain {known}.")
+    for name, others in evidence.hanging.items():
+        warnings.append(f"{name} hangs on what is held: {', '.join(values[other] for other in others)}.")
+    return warnings
+
+
+def _run_warnings(evidence: Evidence) -> list[str]:
+    run, short = evidence.run[0], 100.0 * evidence.short
+    if run < _RUN or not short:
+        return []
+    said = f"Residuals run together over the approach speed ({run:.1f} standard deviations): the model lacks a shape"
+    return [f"{said}; a model discrepancy of {short:.0f} % of the loss at any speed is in law, band and intervals."]
 
 
 def _pair_warnings(evidence: Evidence) -> list[str]:
