@@ -271,4 +271,5 @@ def test_a_drift_that_free_rows_at_one_end_leave_open_is_fitted_or_said(phase: f
     blind = tapping(replace(table, rows_in_order_of_time=False), law=False)
     assert blind.energy["value"] is None or not blind.valid
     if phase == 1.0:
-        assert "# rows = in order of time" in blind.reasons[0]
+        assert "# rows = in order of time" in blind.energy["reason"]
+        assert any("# rows = in order of time" in one for one in blind.warnings)

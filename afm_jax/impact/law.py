@@ -442,6 +442,7 @@ class TabulatedLaw(Law):
         self.slowest_nm_per_us, self.fastest_nm_per_us = u[0], u[-1]
         self.mass_ng = None if mass_ng is None else as_parameter(mass_ng)
         self.origin = Origin(origin)
+        self.deviations = None
 
     @classmethod
     def with_errors(

@@ -107,14 +107,14 @@ def draw_contact_law(laws: Sequence[ContactLaw], delay: ContactDelay, path: Path
 
 
 def law_figure(law: ContactLaw) -> Figure:
-    """Return the picture of a law's relative errors, the left half of what `afm-jax fit-law` draws."""
+    """Return the picture of a law's relative errors, the left half of what `afm-jax collide --make-law` draws."""
     figure = new_figure(6.0, 5.0)
     _draw_laws(figure.subplots(), [law])
     return figure
 
 
 def delay_figure(delay: ContactDelay) -> Figure:
-    """Return the picture of a delay and its law, the right half of what `afm-jax fit-law` draws."""
+    """Return the picture of a delay and its law, the right half of what `afm-jax collide --make-law` draws."""
     figure = new_figure(6.0, 5.0)
     _draw_delay(figure.subplots(), delay)
     return figure

@@ -243,6 +243,23 @@ class Tapping(Result):
             return f"one energy a branch describes the rows only with errors {fit.scale:.1f} times as large"
         if fit.torn:
             return f"for one energy a branch {_torn_in_words(fit.torn)}"
+        return self._following
+
+    @property
+    def _following(self) -> str:
+        """What says that rows about one energy follow their order, which the table does not state as that in time."""
+        if self.followed is not None and self.followed.p_value > IMPROBABLE:
+            for one in self.followed.nuisances:
+                if one.kind in {"phase_drift_deg", "free_amplitude_drift"} and (
+                    abs(one.value) > _FOLLOWING * one.standard_error
+                ):
+                    factor, unit = (1.0, "degrees") if "phase" in one.kind else (100.0, "%")
+                    return (
+                        "the rows follow their order in the table about one energy, as a "
+                        f"{origin_in_words(one.kind)} of {factor * one.value:+.2g} +- "
+                        f"{factor * one.standard_error:.1g} {unit} would make them: if they stand as they were "
+                        "measured, say so by '# rows = in order of time', and the drift is fitted along"
+                    )
         return ""
 
     @property
@@ -472,18 +489,6 @@ class Tapping(Result):
     def drift(self) -> str:
         """What says that the free tip drifted along rows whose order in time the table does not state; or empty."""
         curve, free = self.curve, self.rows.free
-        if self.followed is not None and self.described and self.followed.p_value > IMPROBABLE:
-            for one in self.followed.nuisances:
-                if one.kind in {"phase_drift_deg", "free_amplitude_drift"} and (
-                    abs(one.value) > _FOLLOWING * one.standard_error
-                ):
-                    factor, unit = (1.0, "degrees") if "phase" in one.kind else (100.0, "%")
-                    return (
-                        "the rows follow their order in the table about one energy, as a "
-                        f"{origin_in_words(one.kind)} of {factor * one.value:+.2g} +- "
-                        f"{factor * one.standard_error:.1g} {unit} would make them: if they stand as they were "
-                        "measured, say so by '# rows = in order of time', and the drift is fitted along"
-                    )
         places = np.flatnonzero(free)
         if curve.time is not None or len(places) < 2 * FEWEST_ROWS or not free_ends(curve, free):
             return ""
@@ -554,6 +559,8 @@ class Tapping(Result):
         """What a reader should know besides."""
         found = []
         if self.valid and self.curve.has_phase:
+            if self.fit is not None and self.why_not_constant:
+                found.append(f"one energy for all taps is not given: {self.why_not_constant}")
             if self.why_not_functions:
                 found.append(f"as a function of the amplitude it is not determined: {self.why_not_functions}")
             for what, fit in (("one energy a branch", self.fit), ("a smooth energy", self.functions)):
