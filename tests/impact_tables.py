@@ -89,7 +89,7 @@ def deviation(
     """Return approach speeds that were measured, and how far the law is off there, in half-widths of its band."""
     known = result.rows.approach_speed_nm_per_us[result.rows.used]
     speeds = np.geomspace(max(slowest, np.nanmin(known)), min(fastest, np.nanmax(known)), 40)
-    right = np.asarray(impact.at_approach(jnp.asarray(speeds)).rebound)
+    right = np.asarray(impact.speeds(jnp.asarray(speeds)).rebound)
     law = result.law
     columns = (law.rebound_speed_nm_per_us, law.rebound_low_nm_per_us, law.rebound_high_nm_per_us)
     fitted, low, high = (np.interp(speeds, law.approach_speed_nm_per_us, column) for column in columns)
