@@ -8,7 +8,7 @@ import pytest
 
 from afm_jax import Scene, iterate_map
 from afm_jax.bench.problems import regular_scene, scattered_starts
-from afm_jax.impact.law import impact_law_of
+from afm_jax.impact.law import formula_of
 from afm_jax.impact.map import iterate_batch
 from afm_jax.verify.fifty_digits import derivatives_by_r
 
@@ -46,7 +46,7 @@ def test_forward_and_reverse_derivatives_agree_with_50_digits():
         varied = eqx.tree_at(lambda one: one.interaction.r, scene, r)
         return iterate_batch(varied, starts.time_us, starts.velocity_nm_per_us, IMPACTS, block=2).time_us
 
-    r = impact_law_of(scene).r
+    r = formula_of(scene).r
     found = np.asarray(jax.jit(times)(r))
     exact = [
         derivatives_by_r(scene, (float(time), float(speed)), lane)

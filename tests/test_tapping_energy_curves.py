@@ -261,8 +261,15 @@ def test_energies_against_speed_stand_beside_the_law_that_made_them(restitution:
 @pytest.mark.parametrize(("phase", "amplitude"), [(1.0, 0.0), (5.0, 0.0), (0.0, 0.03)])
 def test_a_drift_that_free_rows_at_one_end_leave_open_is_fitted_or_said(phase: float, amplitude: float):
     truth, stated = one_energy(60), Stated(stiffness=1e-4, phase_noise_deg=0.2)
-    drifts = {"phase_drift_deg": phase, "amplitude_drift": amplitude}
-    table = table_of(Tip(), truth, stated, np.random.default_rng(1), **drifts, rows_in_order_of_time=True)
+    table = table_of(
+        Tip(),
+        truth,
+        stated,
+        np.random.default_rng(1),
+        phase_drift_deg=phase,
+        amplitude_drift=amplitude,
+        rows_in_order_of_time=True,
+    )
     result = tapping(table, law=False)
     assert result.valid, result.reasons
     low, high = result.energy["interval95"]

@@ -995,3 +995,15 @@ def impact_law_of(scene: Scene) -> Law:
             f"the impact map needs a scene whose interaction is an ImpactLaw, not {type(scene.interaction).__name__}"
         )
     return scene.interaction
+
+
+def formula_of(scene: Scene) -> ImpactLaw:
+    """Return the scene's impact law, which must be a formula.
+
+    Raises:
+        TypeError: if the scene's interaction is something else.
+    """
+    law = impact_law_of(scene)
+    if not isinstance(law, ImpactLaw):
+        raise TypeError(f"this needs a law that is a formula, an ImpactLaw, not a {type(law).__name__}")
+    return law

@@ -18,7 +18,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import require_float64
 from afm_jax.impact import jacobian as formulas
-from afm_jax.impact.law import ImpactLaw, impact_law_of
+from afm_jax.impact.law import ImpactLaw, formula_of
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.verify.fifty_digits import exact_impact, exact_orbit, mpmath_or_reason
 from afm_jax.verify.samples import (
@@ -84,7 +84,7 @@ def digits_differences(mp: Any, sample: Sample, rows: NDArray[np.int64]) -> tupl
 def plain_rows(states: States) -> dict[str, Any]:
     """Return a batch of scenes as columns of plain numbers (a delay as triples), None for absent effects."""
     scene = states.scene
-    law = impact_law_of(scene)
+    law = formula_of(scene)
     columns = {
         "frequency_khz": scene.cantilever.frequency_khz,
         "quality_factor": scene.cantilever.quality_factor,
@@ -186,7 +186,7 @@ def _block(random: np.random.Generator, kind: Kind, find: Any, evaluate: Any) ->
 
 def _eq8(state: States, order: Any) -> dict[str, Pair]:
     scene, start, after = state
-    law = impact_law_of(scene)
+    law = formula_of(scene)
     end = start + order * scene.platform.period_us
     flight = formulas.paper_flight(scene.cantilever, scene.platform, start, after, end)
     determinant, trace = formulas.eq8(flight, after, law.r)
@@ -196,7 +196,7 @@ def _eq8(state: States, order: Any) -> dict[str, Pair]:
 def _damped_determinant(state: States, order: Any) -> dict[str, Pair]:
     """D = (r^2 - c/(2 u_in)) exp(-Omega T/Q): the flight shrinks areas, the law by d(u_out^2)/d(u_in^2)."""
     scene, start, after = state
-    law = impact_law_of(scene)
+    law = formula_of(scene)
     rebound = after - scene.platform.velocity(start)
     loss = law.viscous_loss / (2.0 * law.approach_speed(rebound))
     kept = jnp.exp(-2.0 * scene.cantilever.decay_rate * order * scene.platform.period_us)

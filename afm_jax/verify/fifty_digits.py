@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from afm_jax.apparatus.scene import Scene
-from afm_jax.impact.law import impact_law_of
+from afm_jax.impact.law import formula_of
 
 DIGITS = 50
 _GUARD_DIGITS = 15  # lost on the way, mostly where the closing velocity is small
@@ -331,7 +331,7 @@ def reference_error(scene: Scene, start: Sequence[float], guesses: NDArray[np.fl
 
 
 def _plain_row(scene: Scene) -> dict[str, Any]:
-    law = impact_law_of(scene)
+    law = formula_of(scene)
     if law.delay is not None or float(scene.platform.offset_rate_nm_per_us) != 0.0:
         raise ValueError("the 50-digit map knows neither a collision delay nor a ramp of the offset")
     quality = scene.cantilever.quality_factor

@@ -32,7 +32,7 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.impact import jacobian as formulas
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US
 from afm_jax.impact.jacobian import PaperFlight
-from afm_jax.impact.law import CollisionDelay, ImpactLaw, impact_law_of, squared_rebound_speed
+from afm_jax.impact.law import CollisionDelay, ImpactLaw, formula_of, squared_rebound_speed
 from afm_jax.impact.map import NextImpact, next_impact
 from afm_jax.outcomes import Outcome
 from afm_jax.units import RAD_PER_US_PER_KHZ
@@ -218,7 +218,7 @@ def _rebound_speed(parameters: Float[Array, " 4"]) -> Float[Array, ""]:
 
 def _differentiate(scene: Scene, time: Float[Array, ""], velocity: Float[Array, ""]) -> Automatic:
     start = jnp.stack([time, velocity])
-    law, platform = impact_law_of(scene), scene.platform
+    law, platform = formula_of(scene), scene.platform
     forward, impact = jax.jacfwd(_whole_map, has_aux=True)(start, scene)
     reverse, _ = jax.jacrev(_whole_map, has_aux=True)(start, scene)
     whole = jnp.stack([forward, reverse])
@@ -273,7 +273,7 @@ def is_ordinary(scene: Scene, automatic: Automatic) -> NDArray[np.bool_]:
     approach, margin = np.asarray(automatic.approach), np.asarray(automatic.margin)
     top_speed = np.asarray(scene.platform.top_speed_nm_per_us)
     amplification = (np.abs(np.asarray(automatic.before)) + top_speed) / approach / margin
-    law = impact_law_of(scene)
+    law = formula_of(scene)
     if law.delay is not None:
         rebound = np.asarray(law.r) * approach * np.sqrt(np.maximum(margin, 0.0))
         omega = np.asarray(scene.platform.angular_frequency)
@@ -305,7 +305,7 @@ def condition_number(states: States, automatic: Automatic) -> Floats:
     through_speed = (speed + top_speed + pull * time_error) / approach
     through_phase = omega * np.abs(np.tan(omega * arrival)) * time_error
     number = 1.0 + through_speed * (1.0 + 1.0 / np.asarray(automatic.margin)) + through_phase
-    law = impact_law_of(states.scene)
+    law = formula_of(states.scene)
     if law.delay is None:
         return number
     rebound = np.asarray(law.r) * approach * np.sqrt(np.asarray(automatic.margin))
@@ -480,7 +480,7 @@ def formula_evaluator(kind: Kind) -> Callable[[States, Automatic], dict[str, Pai
 def _paper_formulas(state: States, impact: Automatic) -> dict[str, Pair]:
     """Evaluate the paper's formulas as printed at one impact."""
     scene, time, velocity = state
-    law = impact_law_of(scene)
+    law = formula_of(scene)
     flight = formulas.paper_flight(scene.cantilever, scene.platform, time, velocity, impact.arrival_us)
     terms5, terms7 = eq5_terms(flight, time, impact.arrival_us), eq7_terms(flight, impact.before, law.r, law.epsilon)
     general = _general_formulas(state, impact)
@@ -495,7 +495,7 @@ def _paper_formulas(state: States, impact: Automatic) -> dict[str, Pair]:
 def _general_formulas(state: States, impact: Automatic) -> dict[str, Pair]:
     """Evaluate the formulas with damping, viscous loss and delay at one impact."""
     scene, time, velocity = state
-    law = impact_law_of(scene)
+    law = formula_of(scene)
     flight = scene.cantilever, scene.platform, time, velocity, impact.arrival_us
     arriving = law, scene.platform, impact.arrival_us, impact.before
     terms5, terms7 = flight_terms(*flight), impact_terms(*arriving)
@@ -509,7 +509,7 @@ def _general_formulas(state: States, impact: Automatic) -> dict[str, Pair]:
 
 def _eq6(scene: Scene, impact: Automatic) -> Pair:
     """Return u_out of eq. 6 and its four slopes, shape (5,)."""
-    law = impact_law_of(scene)
+    law = formula_of(scene)
     square = squared_rebound_speed(impact.approach, law.r, law.epsilon, law.viscous_loss)
     slopes, terms = eq6_slopes(impact.approach, law)
     moving = jnp.abs(impact.after) + jnp.abs(scene.platform.velocity(impact.leaving_us))
