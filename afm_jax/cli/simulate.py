@@ -148,6 +148,8 @@ def command(  # noqa: PLR0913
     payload = payload_of(loaded, run, seen, settings)
     beyond = extrapolation_of(loaded, run.simulation.contacts.approach_speed_nm_per_us)
     payload["extrapolated"] = beyond
+    if beyond is None:
+        payload["null_reasons"]["extrapolated"] = "No impact is faster or slower than the law is known for."
     if session.out is not None:
         write_files(session, run, seen, dense, payload)
         if samples:

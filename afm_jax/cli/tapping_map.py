@@ -8,7 +8,7 @@ import click
 
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import Finite, ValueAndError
+from afm_jax.cli.values import Finite, Share, ValueAndError
 
 if TYPE_CHECKING:
     from fitting.tapping_curves.maps import TappingMap
@@ -82,7 +82,7 @@ def _with_known(function):
 @click.option(
     "--at",
     "ratio",
-    type=click.FloatRange(0.05, 1.0, max_open=True),
+    type=Share("a share"),
     default=0.9,
     show_default=True,
     metavar="RATIO",

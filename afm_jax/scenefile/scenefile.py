@@ -52,6 +52,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, fields
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 import equinox as eqx
@@ -318,8 +319,11 @@ def load_scene(path: str | os.PathLike[str]) -> Scene:
         SceneError: if the file cannot be read, a table, key, type or value in it is wrong, or its contact has no
             junction; the message names the place and says how to mend it.
     """
+    source = os.fspath(path)
+    if Path(source).exists():
+        return read_scene(source).scene
     # presets are read from files of scenes
-    return import_module("afm_jax.scenefile.presets").scene_and_start(os.fspath(path))[0]
+    return import_module("afm_jax.scenefile.presets").scene_and_start(source)[0]
 
 
 def load_scene_and_start(path: str | os.PathLike[str]) -> tuple[Scene, Start | None]:

@@ -19,6 +19,8 @@ from jaxtyping import Float
 from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 
+from afm_jax.whole_files import write_whole
+
 SPRING_CONSTANT, QUALITY_FACTOR, FREE_FREQUENCY_KHZ, DRIVE_KHZ = 44.0, 230.0, 344.604, 344.6
 FREE_NM, NM_PER_VOLT, PHASE_ZERO_DEG = 13.4, 42.0, 12.3
 EXAMPLE = Path(__file__).with_name("raw_tapping.txt")
@@ -143,7 +145,7 @@ def main() -> None:
     """Write the example."""
     target = Path(sys.argv[1]) if len(sys.argv) > 1 else EXAMPLE
     made = raw_curve()
-    target.write_text(made.text, encoding="utf-8")
+    write_whole(target, made.text)
     print(f"wrote {made.height_nm.shape[1]} rows to {target}; a tap takes at most {made.energy_aj.max():.2f} aJ")
 
 

@@ -57,6 +57,7 @@ REFUSED: dict[str, Callable[[], object]] = {
     "iterate_map": lambda: afm.iterate_map(_scene(), 4.0, 60.0, 2),
     "lyapunov_spectrum": lambda: afm.lyapunov_spectrum(_scene()),
     "many_impact_orbits": lambda: afm.many_impact_orbits(_scene(), 1, 2),
+    "make_law": lambda: afm.make_law(afm.Contact.paper()),
     "map_jacobian": lambda: afm.map_jacobian(_scene(), 4.0, 60.0),
     "next_impact": lambda: afm.next_impact(_scene(), 4.0, 60.0),
     "simulate": lambda: afm.simulate(_contact(), state(0.0, 10.0, 0.0), 10.0),
@@ -85,9 +86,19 @@ LEFT: dict[str, Callable[[Any], Any]] = {
 
 NO_NUMBERS = {
     # read, write, remember; NumPy alone; or what one of the above hands to them
-    *("load", "load_scene", "save_scene", "scene_family", "use_cache", "trajectory"),
+    *("load", "load_law", "load_scene", "save_law", "save_scene", "scene_family", "use_cache", "trajectory"),
     *("believe", "design", "drive_grid", "equipartition", "fit_each", "lockin", "posterior", "read_curve"),
-    *("read_curves", "read_sweep", "read_table", "read_trace", "sader", "sensitivity", "trust"),
+    *(
+        "read_curves",
+        "read_sweep",
+        "read_table",
+        "read_trace",
+        "sader",
+        "sensitivity",
+        "tapping_map",
+        "tapping_together",
+        "trust",
+    ),
     *("write_inference_data", "write_table"),
 }
 
