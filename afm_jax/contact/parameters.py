@@ -35,7 +35,7 @@ class ContactParameter:
         evenly: the range within which fits start, evenly; None: as ``width`` or ``spread`` say.
         serves: the effects of which it needs one to mean anything; none: it is always of use.
         unsure: standard error that is assumed where a fit holds it and nothing better is said: in its unit where there
-            is a ``width`` or ``evenly``, else relative.
+            is a ``width`` or ``evenly``, else relative; 30 % unless said.
         advice: what to measure so that a fit determines it, if there is more to say than of any.
     """
 
@@ -45,7 +45,7 @@ class ContactParameter:
     allowed: str = "positive"
     meaning: str
     fitted: tuple[float, float]
-    unsure: float
+    unsure: float = 0.3
     width: float = 0.0
     spread: float = 3.0
     evenly: tuple[float, float] | None = None
