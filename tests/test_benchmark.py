@@ -32,6 +32,8 @@ def test_one_core_measures_what_it_says():
         ("regular", 1, 1),
         ("regular", 6, 6),
         ("regular", 6, 4),
+        # the law as a table, and starts over the whole period
+        ("regular", 6, 6),
         ("regular", 6, 6),
         ("chaotic", 6, 6),
     ]

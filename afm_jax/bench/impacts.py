@@ -121,7 +121,8 @@ def one_core(*, batches: list[int], blocks: list[int], impacts: int, repetitions
         map_row(regular, some, **measuring, block=block, what=f"next_impact iterated, blocks of {block}")
         for block in blocks
     ]
-    rows.append(map_row(tabulated_scene(), some, **measuring, what="next_impact iterated, the law as a table"))
+    table = "next_impact iterated, the law as a table"
+    rows.append(map_row(tabulated_scene(), some, **measuring, what=table, formula=regular))
     spread = scattered_starts(regular.scene, derivative_batch)
     rows.append(map_row(regular, spread, **measuring, what="next_impact iterated, starts over the whole period"))
     rows.append(map_row(chaotic, settled_starts(chaotic.scene, derivative_batch), **measuring))
@@ -149,7 +150,7 @@ def all_cores(*, batches: list[int], impacts: int, repetitions: int) -> dict:
     }
 
 
-def map_row(
+def map_row(  # noqa: PLR0913
     case: BenchmarkScene,
     starts: Starts,
     *,
@@ -158,8 +159,9 @@ def map_row(
     block: int = DEFAULT_BLOCK,
     devices: int = 1,
     what: str = "next_impact iterated",
+    formula: BenchmarkScene | None = None,
 ) -> Row:
-    """Measure time and error of the map for one batch."""
+    """Measure time and error of the map for one batch; of a law in a table beside the formula that it is of."""
     batch = starts.time_us.shape[0]
     progress(f"bench: {what}, {case.name} scene, batch {batch}, {devices} core{'s' if devices > 1 else ''}")
 
@@ -173,7 +175,7 @@ def map_row(
     compiled = compiled_for(run, case.scene, starts)
     timing, result = time_compiled(compiled, case.scene, starts, repetitions=repetitions)
     return _row(what, case, timing, batch=batch, impacts=impacts, cores=devices, block=min(block, batch)) | (
-        batch_errors(case, starts, result)
+        batch_errors(formula or case, starts, result)
     )
 
 
