@@ -81,6 +81,7 @@ STAND_FOR = {
     "TABLE.csv": str(EXAMPLES / "amplitudes_law.csv"),
     "my_amplitudes.csv": str(EXAMPLES / "amplitudes_law.csv"),
     "SWEEP": "resonance.csv",
+    **dict.fromkeys(("first.csv", "second.csv", "third.csv"), str(EXAMPLES / "tapping_resonance.csv")),
     "trace1.csv": "trace/trace.csv",
 }
 FEWER = (

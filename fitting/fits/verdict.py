@@ -236,7 +236,8 @@ def misfits(evidence: Evidence) -> list[str]:
             f"residuals run together over the approach speed ({evidence.run[0]:.1f} standard deviations; "
             f"{evidence.run[1]:.1f} beside a model discrepancy of {100.0 * evidence.short:.0f} % of the loss)"
         )
-    if not evidence.robust:
+    # rows of tables whose laws scatter about the predicted one are off together
+    if not (evidence.robust or evidence.scattering):
         found += _one_sided(evidence)
     return found + [
         f"neighbouring residuals {where} are correlated ({excess:+.1f} standard deviations)"
