@@ -144,11 +144,10 @@ def followed(orbit: OrbitProblem, known: Branch, row: Rows) -> Branch:
     wanted = known.exists & ~row.free
     root, found = follow_root(jnp.where(wanted, known.place.coordinate, harmless), orbit, wanted)
     there = wanted & found
-    exists = there | row.free
     return Branch(
         place=OrbitPlace(jnp.where(there, root.coordinate, harmless), root.phase),
-        exists=exists,
-        orbits=jnp.where(exists, known.orbits, 0),
+        exists=there | row.free,
+        orbits=jnp.where(row.free, 1, jnp.where(there, known.orbits, 0)),
         near_fold=there & near_fold(root.coordinate, orbit),
     )
 

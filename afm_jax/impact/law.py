@@ -496,11 +496,10 @@ class TabulatedLaw(Law):
             return changed | {"delay_spline": _spline_through(place, late - law.delay(u, w), law.knots)}
 
         def along(w_change: Array, late_change: Array, capture_change: Array) -> dict[str, Array]:
-            changes = w_change, late_change, capture_change
-            start = w, late, law.capture
             if late is None:
-                return jax.jvp(lambda w, c: numbers(w, None, c), (w, law.capture), (changes[0], changes[2]))[1]
-            return jax.jvp(numbers, start, changes)[1]
+                start, changes = (w, law.capture), (w_change, capture_change)
+                return jax.jvp(lambda w, capture: numbers(w, None, capture), start, changes)[1]
+            return jax.jvp(numbers, (w, late, law.capture), (w_change, late_change, capture_change))[1]
 
         deviations = jax.jit(jax.vmap(along))(by_rebound, by_delay, by_capture)
         return _replaced(law, deviations=deviations)
@@ -548,9 +547,7 @@ class TabulatedLaw(Law):
 
     def to_dict(self) -> dict[str, Any]:
         """Return the law as numbers and lists, from which `law_of_dict` makes it again; what is absent is left out."""
-        v = self.scale_nm_per_us * self.knots / (1.0 - self.knots)
-        u = jnp.sqrt(v**2 + self.capture**2)
-        found = self.beyond_capture(u, v)
+        found = _at_knots(self)
         told: dict[str, Any] = {
             "approach_speed_nm_per_us": np.asarray(found.approach).tolist(),
             "rebound_speed_nm_per_us": np.asarray(found.rebound).tolist(),
@@ -673,6 +670,12 @@ class TabulatedLaw(Law):
         """Return the u_in in nm/us that leaves at u_out in nm/us, by Newton's method; differentiable."""
         w = as_argument(rebound_speed)
         return _read_backwards(w, self)
+
+
+@jax.jit
+def _at_knots(law: TabulatedLaw) -> Speeds:
+    v = law.scale_nm_per_us * law.knots / (1.0 - law.knots)
+    return law.beyond_capture(jnp.sqrt(v**2 + law.capture**2), v)
 
 
 _NUMBERS = ("capture", "r", "viscous_loss", "knots", "loss_spline", "delay_spline")

@@ -797,7 +797,8 @@ class _Summary:
         formula = None
         if self.problem.model != "contact":
             formula = self.settings["fixed"] | {name: one.value for name, one in parameters.items()}
-        return loss_of(found, speed_range(self.used_speeds), self.table.mass_ng, parameters, formula)
+        reached = self.rows.approach_speed_nm_per_us[self.rows.used]
+        return loss_of(found, speed_range(reached), self.table.mass_ng, parameters, formula)
 
     def _closest_member(self, step: LinearStep, left_out: Unmodelled) -> ClosestMember | None:
         """Return the model's law that is closest to the law after the step; None where the step is all there is."""
