@@ -125,7 +125,9 @@ def table_of_law(
     law = _tabulated(u, w, None if late is None else late[leaves], capture, None if late is None else delay, changes)
     if law.deviations is None:
         return law
-    return eqx.tree_at(lambda law: law.deviations, law, {name: np.asarray(one)[:count] for name, one in law.deviations.items()})
+    return eqx.tree_at(
+        lambda law: law.deviations, law, {name: np.asarray(one)[:count] for name, one in law.deviations.items()}
+    )
 
 
 def fewest_unknowns(
