@@ -190,8 +190,8 @@ def _with_sense_of_phase(table: AmplitudeTable) -> tuple[AmplitudeTable, str]:
 def _with_zero_of_free_rows(curve: TappingCurve) -> TappingCurve:
     """Return a curve that knows no zero of the phase but that of its free rows, if what is stated tells no more.
 
-    A table that was read from an instrument's file states the zero that its free rows have at the frequency and Q given:
-    taken for knowledge besides, it would count both twice.
+    A table that was read from an instrument's file states the zero that its free rows have at the frequency and Q
+    given: taken for knowledge besides, it would count both twice.
     """
     stated, free = curve.phase_zero_deg, free_rows(curve) & np.isfinite(curve.lag_deg)
     if stated is None or not free.any():
