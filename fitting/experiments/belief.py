@@ -18,7 +18,7 @@ from afm_jax.apparatus.cantilever import Cantilever, mass_of
 from afm_jax.apparatus.scene import check_mass
 from afm_jax.checks import check_parameter, checked
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.impact.law import Law, TabulatedLaw, closest_delay, law_of_dict
+from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw, closest_delay, law_of_dict
 from afm_jax.results import Result, public_result
 from afm_jax.scenefile.tables import printable
 from fitting.fits.result import FitResult
@@ -79,7 +79,7 @@ class Belief(Result):
     measured: Float[np.ndarray, "rows 4"] = field(default_factory=lambda: np.zeros((0, 4)))
     source: str = "values given"
     notes: tuple[str, ...] = ()
-    law: Law | None = None
+    law: ImpactLaw | TabulatedLaw | None = None
 
     def draws(self, count: int, *, least: float = 0.0) -> Float[np.ndarray, "count p"]:
         """Return values that are as likely as the belief is uncertain, the believed ones first; seeded.
@@ -125,7 +125,7 @@ def believe(  # noqa: PLR0913
     effects: Sequence[str] = EFFECTS,
     uncertainty: float = UNCERTAINTY,
     drive: str = "sample",
-    law: Law | None = None,
+    law: ImpactLaw | TabulatedLaw | None = None,
 ) -> Belief:
     """Return a belief made of values, before anything was measured.
 
@@ -404,7 +404,7 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
     )
 
 
-def _law_of(result: FitResult | Mapping[str, Any], payload: Mapping[str, Any]) -> Law | None:
+def _law_of(result: FitResult | Mapping[str, Any], payload: Mapping[str, Any]) -> TabulatedLaw | None:
     if isinstance(result, FitResult):
         return result.law
     told = payload.get("law")

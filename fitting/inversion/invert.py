@@ -11,7 +11,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import check_mass
 from afm_jax.checks import checked, require_float64
-from afm_jax.impact.law import Law
+from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw
 from afm_jax.version import version_of
 from fitting.inversion.flight import Inverted, MeasuredRow, invert_rows
 from fitting.inversion.regression import Laws, distance_from, regressed_laws
@@ -60,7 +60,7 @@ def invert(
     *,
     frequency_error_khz: float | None = None,
     truth: KnownSpeeds | None = None,
-    law: Law | None = None,
+    law: ImpactLaw | TabulatedLaw | None = None,
 ) -> Inversion:
     """Return approach speed, rebound speed and collision delay of every row with a phase, and the laws they follow.
 

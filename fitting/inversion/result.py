@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from afm_jax.impact.law import Law, TabulatedLaw
+from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw
 from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from afm_jax.units import RAD_PER_US_PER_KHZ
@@ -244,7 +244,7 @@ class Inversion(Result):
     preferred: str | None
     verdict: str
     resonance: ResonanceReading
-    beside: Law | None
+    beside: ImpactLaw | TabulatedLaw | None
     distance: LawDistance | None
     valid: bool
     reasons: list[str]
