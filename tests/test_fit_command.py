@@ -11,6 +11,7 @@ import pytest
 from click.testing import CliRunner
 from scipy.stats import chi2
 
+from afm_jax import load_law
 from afm_jax.cli.fit import _settings
 from afm_jax.cli.main import main
 from fitting.tables.table import TABLE, read_table, write_table
@@ -86,6 +87,10 @@ def test_tables_of_the_report_hold_the_fit(reported):
         assert delays == [0.0, 0.0, 0.0]
         assert rebound == pytest.approx(math.sqrt(r**2 * speed**2 - epsilon), rel=1e-12)
         assert low < rebound < high
+    law, whole = load_law(folder / "law.csv"), answer["law"]
+    assert float(law.capture_speed_nm_per_us) == whole["capture_speed_nm_per_us"]
+    assert [float(law.mass_ng or 0.0), law.origin.text] == [1.0, whole["origin"]]
+    assert [float(law.slowest_nm_per_us), float(law.fastest_nm_per_us)] == whole["speed_range_nm_per_us"]
     rows = records(folder / "fit_rows.csv")
     pulls = []
     for row, given in zip(rows, records(EXAMPLE), strict=True):

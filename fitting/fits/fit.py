@@ -836,7 +836,8 @@ class _Summary:
         before = np.sqrt(np.diag(self.covariance))
         for i, name in enumerate(self.names):
             ends, reason = (profiles[i].low, profiles[i].high), profiles[i].reason
-            growth = errors[i] / before[i] if before[i] > 0.0 else 1.0
+            # at a bound the closest formula has no error of its own
+            growth = errors[i] / before[i] if self.free[i] and before[i] > 0.0 else 1.0
             low, high = (None if e is None else self.ends[i] + growth * (e - self.values[i]) for e in ends)
             intervals.append(within_range(parameter_called(name), Interval(low, high, reason)))
         return intervals
