@@ -34,6 +34,20 @@ FORMAT = "afm-jax result"
 FORMAT_VERSION = 1
 """Version of the layout above; a reader refuses a newer one."""
 _PACKAGES = ("afm_jax", "fitting")
+FIT_FORMAT, FIT_FORMAT_VERSION = "afm-jax fit", 2
+"""Of a fit's fit.json; the version is raised when a key changes its meaning or goes."""
+
+
+def why_no_fit(found: Any) -> str | None:
+    """Return what is wrong with JSON that should be a fit's, of the version that is known here; None: nothing."""
+    if not isinstance(found, dict) or found.get("format") != FIT_FORMAT:
+        return "is no fit; give the fit.json of `afm-jax fit --out`"
+    if found.get("format_version") != FIT_FORMAT_VERSION:
+        return (
+            f"has format_version {found.get('format_version')}, but {FIT_FORMAT_VERSION} is known here; write it anew: "
+            "afm-jax fit TABLE.csv --model MODEL --out FOLDER"
+        )
+    return None
 
 
 def fields_of(record: Any) -> Iterator[tuple[str, Any]]:

@@ -28,12 +28,12 @@ from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.record import ContactKind, MotionOutcome, State
 from afm_jax.motion.simulate import simulate
 from afm_jax.outcomes import Outcome
+from afm_jax.scenefile.law_files import load_law
 from afm_jax.scenefile.scenefile import load_scene_and_start, read_toml
 from afm_jax.sweeps.axes import axes_of
 from fitting.calibration.sweep import read_sweep
 from fitting.experiments.belief import read_belief
 from fitting.instruments.curve import read_curves
-from fitting.inversion.regression import read_fitted_law
 from fitting.tables.table import read_table
 from fitting.tapping_curves.tapping import tapping
 from fitting.traces.lockin import lockin
@@ -219,7 +219,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "psd": read_sweep,
     "curve": read_curves,
     "nanonis": read_curves,
-    "law": lambda path: (read_belief(path), read_fitted_law(path)),
+    "law": lambda path: (read_belief(path), load_law(path)),
 }
 """What reads a sound file of the corpus of malformed ones."""
 

@@ -16,7 +16,17 @@ import pytest
 from click.testing import CliRunner, Result
 from scipy.optimize import brentq
 
-from afm_jax import Cantilever, CollisionDelay, ForceDrive, ImpactLaw, Platform, Scene, save_scene, single_impact_orbits
+from afm_jax import (
+    Cantilever,
+    CollisionDelay,
+    ForceDrive,
+    ImpactLaw,
+    Platform,
+    Scene,
+    TabulatedLaw,
+    save_scene,
+    single_impact_orbits,
+)
 from afm_jax.cli.main import main
 from afm_jax.dynamics import closed_loops
 from afm_jax.dynamics.bands import UncertainParameters, special_errors
@@ -344,21 +354,26 @@ def test_the_command_tells_what_python_finds(doubled: Continuation, tmp_path: Pa
     assert {file.name for file in (tmp_path / "out").iterdir()} == names
 
 
+COVARIANCE = [[4e-4**2, 0.2 * 4e-4 * 0.93], [0.2 * 4e-4 * 0.93, 0.93**2]]
+"""Of r and epsilon."""
+
+
 def fit_file(path: Path, **changes: object) -> str:
-    """Write what `afm-jax fit --out` writes, as far as it is read, and return the path."""
-    errors, rows = (
-        {"r": (0.95, 4e-4), "epsilon": (60.0, 0.93)},
-        {key: [1.0] for key in ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")},
+    """Write what `afm-jax fit --out` writes of r = 0.95 and epsilon = 60, as far as it is read, and return the path."""
+    u = np.geomspace(10.0, 100.0, 12)
+    w = np.sqrt((0.95 * u) ** 2 - 60.0)
+    # r and epsilon change with two independent unknowns
+    by_r, by_epsilon = np.stack([0.95 * u**2 / w, np.full(12, -1.0) / (2.0 * w)])
+    of_capture = np.array([-np.sqrt(60.0) / 0.95**2, 0.5 / np.sqrt(60.0) / 0.95])
+    factor = np.linalg.cholesky(COVARIANCE)
+    law = TabulatedLaw.with_errors(
+        u,
+        w,
+        rebound_changes=factor.T @ np.stack([by_r, by_epsilon]),
+        capture_changes=factor.T @ of_capture,
+        capture_speed_nm_per_us=np.sqrt(60.0) / 0.95,
     )
-    payload = {
-        "format": "afm-jax fit",
-        "format_version": 2,
-        "model": "law",
-        "valid": True,
-        "parameters": {name: {"value": one, "standard_error": error} for name, (one, error) in errors.items()},
-        "correlations": {"names": list(errors), "matrix": [[1.0, 0.2], [0.2, 1.0]]},
-        "input": {"free_frequency_khz": 90.0, "quality_factor": None, **rows},
-    }
+    payload = {"format": "afm-jax fit", "format_version": 2, "valid": True, "law": law.to_dict()}
     path.write_text(json.dumps(payload | changes), encoding="utf-8")
     return str(path)
 
@@ -392,9 +407,9 @@ def test_the_law_of_a_fit_gives_intervals(tmp_path: Path):
 def test_charts_and_exponents_take_the_law_of_a_fit(tmp_path: Path):
     """The share of draws with a stable orbit is that of a plain loop over the same draws."""
     path, law = saved(tmp_path / "scene.toml", scene(4.0, 1.01, 0.5)), fit_file(tmp_path / "fit.json")
-    both, number = 0.2 * 4e-4 * 0.93, 20
-    covariance = [[4e-4**2, both], [both, 0.93**2]]
-    drawn = np.random.default_rng(0).multivariate_normal([0.95, 60.0], covariance, size=50 * number)[:number]
+    number = 20
+    unknowns = np.random.default_rng(0).multivariate_normal([0.0, 0.0], np.eye(2), size=50 * number)[:number]
+    drawn = [0.95, 60.0] + unknowns @ np.linalg.cholesky(COVARIANCE).T
 
     def steady(amplitude: float, r: float, epsilon: float) -> bool:
         platform = Platform(amplitude, 180.0 * 1.01, -1.0)
@@ -429,11 +444,10 @@ def test_where_axes_set_every_parameter_of_a_fit_nothing_is_drawn():
 def test_a_fit_that_says_nothing_is_refused(tmp_path: Path):
     path = saved(tmp_path / "scene.toml", scene(4.0, 1.01, 0.5))
     arguments = (path, "--order", "1", "--parameter", "platform.amplitude_nm=0.5:6", "--law")
-    unsure = {"r": {"value": 0.95, "standard_error": None}, "epsilon": {"value": 60.0, "standard_error": 1.0}}
     for changes, said in (
         ({"valid": False}, "the fit is not valid"),
-        ({"format": "other"}, "is no fit"),
-        ({"parameters": unsure, "correlations": {"matrix": [[None, None], [None, 1.0]]}}, "no standard error of r"),
+        ({"format": "other"}, "holds no law"),
+        ({"format_version": 1}, "has format_version 1, but 2 is known here; write it anew"),
     ):
         result = run(*arguments, fit_file(tmp_path / "fit.json", **changes))
         assert (result.exit_code, len(result.stderr.splitlines())) == (2, 1), result.stderr
@@ -497,3 +511,7 @@ def test_a_tip_at_rest_that_the_sample_goes_through_is_no_grazing():
     # once each: at rest on the highest sample, and where the flight touches the sample on its way
     assert [point.parameter for point in grazes] == [pytest.approx(-beta, abs=1e-9), pytest.approx(2.1222, abs=1e-3)]
     assert not any(abs(point.parameter - beta) < 1e-3 for point in found.special)
+    # nothing is captured without adhesion
+    ends = {end: one.parameter[place] for one in found.branches for place, end in ((0, one.ends[0]), (-1, one.ends[1]))}
+    assert "capture" not in ends
+    assert abs(ends["no_speed"]) == pytest.approx(beta, abs=1e-3)

@@ -320,5 +320,5 @@ def test_a_contact_built_before_64_bits_were_asked_for_is_refused(call: Callable
     "call", [lambda s: next_impact(s, TIME, VELOCITY), lambda s: iterate_map(s, TIME, VELOCITY, 2), jacobian, orbits]
 )
 def test_entry_points_ask_for_an_impact_law(call: Callable[[Scene], Any]):
-    with pytest.raises(TypeError, match="whose interaction is an ImpactLaw, not Contact"):
+    with pytest.raises(TypeError, match="whose interaction is a law, an ImpactLaw or a TabulatedLaw, not Contact"):
         call(Scene(Cantilever(90.0), Platform(1.0, 180.0), Contact.paper()))

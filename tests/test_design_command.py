@@ -188,7 +188,9 @@ def test_help_needs_no_jax():
 
 
 def test_what_is_held_is_not_forecast():
-    options = BeliefOptions(None, None, "full", 0.1, None, {"free_frequency_khz": (90.0, None), "fix": (("r", 0.9),)})
+    options = BeliefOptions(
+        None, None, "full", 0.1, None, None, {"free_frequency_khz": (90.0, None), "fix": (("r", 0.9),)}
+    )
     belief = believed(options, 0.01)
     assert belief.problem.names == ("epsilon", "viscous_loss")
     assert belief.fixed == {"r": 0.9}

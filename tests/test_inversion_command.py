@@ -8,6 +8,7 @@ import pytest
 from click.testing import CliRunner
 from matplotlib.image import imread
 
+from afm_jax import TabulatedLaw, save_law
 from afm_jax.cli.main import main
 from fitting.examples.make_contact_amplitudes import EXAMPLE
 from tests.strict_reading import strictly
@@ -135,24 +136,27 @@ def test_a_reading_whose_phase_is_assumed_is_not_called_valid(tmp_path):
 
 
 def test_a_fitted_law_is_drawn_over_the_rows(tmp_path):
-    speeds = np.geomspace(20.0, 700.0, 50)
-    law = {
-        "approach_speed_nm_per_us": speeds.tolist(),
-        "rebound_speed_nm_per_us": (0.99 * speeds).tolist(),
-        "collision_delay_us": [None, *[0.07] * 49],
-    }
-    path = tmp_path / "fit.json"
-    pictures = []
-    for drawn in ((), ("--law", path)):
-        path.write_text(
-            json.dumps({"format": "afm-jax fit", "format_version": 2, "valid": True, "model": "law+delay", "law": law})
-        )
-        assert run(on_resonance(tmp_path / "table.csv"), "--out", tmp_path, *drawn).exit_code == 0
-        pictures.append(imread(tmp_path / "invert.png"))
-    assert np.sum(np.any(pictures[0] != pictures[1], axis=2)) > 500
-    path.write_text(
-        json.dumps({"format": "afm-jax fit", "format_version": 2, "valid": False, "model": "law+delay", "law": law})
+    u = np.geomspace(20.0, 700.0, 12)
+    law = TabulatedLaw.with_errors(
+        u, 0.99 * u, np.full(12, 0.07), rebound_changes=np.diag(0.01 * u), origin="law+delay fitted to other.csv"
     )
+    save_law(law, tmp_path / "law.json")
+    fit = {"format": "afm-jax fit", "format_version": 2, "valid": True, "law": law.to_dict()}
+    path = tmp_path / "fit.json"
+    path.write_text(json.dumps(fit))
+    pictures, told = [], []
+    for drawn in ((), ("--law", path), ("--law", tmp_path / "law.json")):
+        result = run(on_resonance(tmp_path / "table.csv"), "--json", "--out", tmp_path / "out", *drawn)
+        assert result.exit_code == 0, result.stderr
+        pictures.append(imread(tmp_path / "out" / "invert.png"))
+        told.append(json.loads(result.stdout)["fitted_law"])
+    # band and curve
+    assert np.sum(np.any(pictures[0] != pictures[1], axis=2)) > 5000
+    assert np.array_equal(pictures[1], pictures[2])
+    assert told[0] is None
+    assert told[1] == told[2]
+    assert told[1]["law"] == "a law (law+delay fitted to other.csv), known from 20 to 700 nm/us"
+    path.write_text(json.dumps(fit | {"valid": False}))
     refused = run(tmp_path / "table.csv", "--law", path)
     assert refused.exit_code == 2
     assert "the fit is not valid" in refused.stderr

@@ -1,18 +1,18 @@
 """The regression of laws on correlated speeds, against a total least squares that fits every point."""
 
-import json
+import re
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from afm_jax import ImpactLaw, TabulatedLaw
 from fitting.inversion.regression import (
     DELAY_TERMS,
     LOSS_TERMS,
-    compare_law,
     delay,
+    distance_from,
     loss,
-    read_fitted_law,
     regress,
 )
 from fitting.inversion.result import InvertedRows, read_on_resonance
@@ -104,8 +104,8 @@ def test_too_few_rows_are_an_error():
         regress(loss, LOSS_TERMS["viscous"], x, covariance, np.zeros((1, 3, 0)))
 
 
-def beside(path, *, speeds: tuple[float, float], epsilon, drives=None):
-    """Return rows of the viscous law, 30 to 300 nm/us, beside a fit.json of a law that was fitted over some speeds."""
+def beside(law):
+    """Return how far 57 rows of the viscous law, 30 to 300 nm/us, are from a law."""
     table = read_table("fitting/examples/amplitudes_contact.csv")
     x, covariance = impacts("viscous", 57, 3)
     rows = InvertedRows(
@@ -117,44 +117,37 @@ def beside(path, *, speeds: tuple[float, float], epsilon, drives=None):
         regressed=np.ones(57, bool),
         note=("",) * 57,
     )
-    u = np.linspace(speeds[0], speeds[1], 50)
-    law = {
-        "approach_speed_nm_per_us": u.tolist(),
-        "rebound_speed_nm_per_us": np.sqrt(u * u - epsilon - 0.5 * u).tolist(),
-        "collision_delay_us": [0.0] * 50,
-    }
-    columns = ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")
-    fitted_to = {"source": "other.csv"} | {name: getattr(table, name).tolist() for name in columns} | (drives or {})
-    fit = {
-        "format": "afm-jax fit",
-        "format_version": 2,
-        "valid": True,
-        "model": "viscous",
-        "law": law,
-        "input": fitted_to,
-    }
-    path.write_text(json.dumps(fit), encoding="utf-8")
-    reading = read_on_resonance(table, law=None, reference="none")
-    return compare_law(read_fitted_law(path), table, rows, reading)
+    return distance_from(law, table, rows, read_on_resonance(table, law=None, reference="none"))
 
 
-def test_a_law_of_the_same_drives_agrees_with_their_rows(tmp_path):
-    found = beside(tmp_path / "fit.json", speeds=(20.0, 400.0), epsilon=EPSILON)
-    assert found.same_drives
-    assert found.agrees
+def viscous(low, high, epsilon, error=0.0) -> TabulatedLaw:
+    """Return the table of a viscous law over some speeds, each of its rebounds known with an error in nm/us."""
+    u = np.linspace(low, high, 20)
+    w = np.sqrt(u * u - epsilon - 0.5 * u)
+    return TabulatedLaw.with_errors(u, w, rebound_changes=error * np.eye(20), origin="other.csv")
+
+
+def test_the_law_of_the_rows_agrees_with_them():
+    found = beside(viscous(20.0, 400.0, EPSILON))
+    assert (found.rows_compared, found.agrees, found.extrapolated) == (57, True, None)
     # of a normal deviate 0.67; the median of 57 is known to 0.1
-    assert found.typical_pull == pytest.approx(0.67, abs=0.4)
-    assert "viscous fitted to other.csv over 20 to 400 nm/us; the losses of the 57 rows" in found.statement
+    far = found.median_distance_in_errors
+    assert far == pytest.approx(0.67, abs=0.4)
+    # a formula is a law, too
+    assert beside(ImpactLaw(1.0, EPSILON, 0.5)).median_distance_in_errors == pytest.approx(far, rel=1e-6)
+    unsure = beside(viscous(20.0, 400.0, EPSILON, error=3.0))
+    assert (unsure.median_distance_in_errors or 1.0) < 0.2 * (far or 1.0)
 
 
-def test_a_law_of_other_impacts_is_stated_to_be_far_from_the_rows(tmp_path):
-    found = beside(tmp_path / "fit.json", speeds=(20.0, 100.0), epsilon=10.0, drives={"offset_nm": [1.0] * 57})
-    assert not found.same_drives
+def test_a_law_of_other_impacts_is_far_from_the_rows():
+    found = beside(viscous(20.0, 100.0, 10.0))
     assert not found.agrees
     assert 20 < found.rows_compared < 40
-    assert "other drives than these" in found.statement
+    said = r"Extrapolated: the law is known from 20 to 100 nm/us, but \d+ of 57 impacts come at 10\d\.\d to 29\d nm/us"
+    assert re.match(said, found.extrapolated or "")
 
 
-def test_a_law_of_other_speeds_is_refused(tmp_path):
-    with pytest.raises(TableError, match=r"over 400 to 900 nm/us says nothing about .*come at 30.* to .* nm/us; give"):
-        beside(tmp_path / "fit.json", speeds=(400.0, 900.0), epsilon=EPSILON)
+def test_a_law_of_other_speeds_is_refused():
+    said = r"a law \(other\.csv\), known from 400 to 900 nm/us, says nothing about .*come at 30.* to .* nm/us; give"
+    with pytest.raises(TableError, match=said):
+        beside(viscous(400.0, 900.0, EPSILON))

@@ -32,6 +32,9 @@ approach_speed_nm_per_us,rebound_speed_nm_per_us,rebound_speed_error_nm_per_us
 """
 
 
+FAST = ["150,145,0.1", "200,194,0.1", "300,291,0.1", "400,388,0.1"]
+
+
 def run(*arguments: object) -> dict:
     result = CliRunner().invoke(main, [*(str(argument) for argument in arguments), "--json"])
     assert result.exit_code == 0, result.stderr
@@ -91,14 +94,40 @@ def test_a_measured_laws_errors_are_bands(folder, tmp_path):
     law = ("--law", folder / "measured.csv")
     ranges = ("--x", "platform.reduced_frequency=1:1.05:3", "--y", "platform.amplitude_nm=3:5:3")
     chart = run("chart", folder / "formula.toml", *ranges, "--orders", "1", *law, "--draws", "3", "--out", tmp_path)
-    assert chart
+    assert chart["extrapolated"] is None or chart["extrapolated"].startswith(
+        "Extrapolated: the law is known from 15 to"
+    )
     followed = run(
         "continue", folder / "formula.toml", "--order", 1, "--parameter", "platform.reduced_frequency=1:1.05", *law
     )
     assert followed["law_parameters"] == [f"interaction.unknown_{number}" for number in range(1, 11)]
+    # the unstable branch ends in capture, below the speeds that were measured
+    assert followed["extrapolated"].startswith("Extrapolated: the law is known from 15 to 100 nm/us")
     found = afm.load_law(folder / "measured.csv")
     assert isinstance(found, TabulatedLaw)
     assert found.unknowns == 10
+
+
+@pytest.mark.slow
+def test_every_study_says_where_the_law_is_extrapolated(folder, tmp_path):
+    (tmp_path / "fast.csv").write_text("\n".join(MEASURED.splitlines()[1:2] + FAST))
+    law, amplitude = ("--law", tmp_path / "fast.csv"), "platform.amplitude_nm"
+    (tmp_path / "sweep.toml").write_text(
+        f'scene = "{folder / "formula.toml"}"\n[record]\nwhat = "orbits"\n[[axes]]\nparameter = "{amplitude}"\n'
+        "linear = [3.0, 5.0, 3]\n"
+    )
+    asked: dict[str, tuple[object, ...]] = {
+        "lyapunov": ("--impacts", 40, "--transient", 100),
+        "basins": ("--grid", "4x4"),
+        "bifurcation": ("--parameter", f"{amplitude}=4:5:2", "--impacts", 200),
+    }
+    told = {name: run(name, folder / "formula.toml", *options, *law) for name, options in asked.items()}
+    told["sweep"] = run("sweep", tmp_path / "sweep.toml", "--workers", 1, "--out", tmp_path / "out", *law)
+    for name, payload in told.items():
+        assert payload["extrapolated"].startswith("Extrapolated: "), name
+        assert "known" in payload["extrapolated"]
+        assert "150 to 400 nm/us" in payload["extrapolated"]
+    assert told["sweep"]["extrapolated"].startswith("Extrapolated: at 3 of 3 points")
 
 
 @pytest.mark.parametrize(

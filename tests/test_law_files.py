@@ -10,9 +10,11 @@ import pytest
 
 import afm_jax as afm
 from afm_jax import CollisionDelay, ImpactLaw, TabulatedLaw
+from afm_jax.scenefile.law_files import save_law_csv
 
 WET = ImpactLaw(0.9999, 114.0, 0.48, CollisionDelay(0.206, 5.64, 0.726))
 SPEEDS = np.geomspace(13.0, 300.0, 12)
+HEAD = "approach_speed_nm_per_us,rebound_speed_nm_per_us\n"
 SCENE = """[cantilever]
 frequency_khz = 90
 quality_factor = 40
@@ -43,6 +45,32 @@ def test_a_law_is_written_and_read_again_number_for_number(law, tmp_path):
     told = json.loads((tmp_path / "law.json").read_text())
     assert told["speed_range_nm_per_us"] == pytest.approx([13.0, 300.0], rel=1e-14)
     assert told["mass_ng"] == 1.5
+
+
+def test_a_table_is_written_and_read_again(law, tmp_path):
+    """A CSV keeps speeds, range, capture, mass, origin and whether corrections count, but no errors."""
+    plain = CollisionDelay(0.2, 5.0, 0.7, corrections=False)
+    other = TabulatedLaw(SPEEDS, WET.rebound_speed(SPEEDS), plain(SPEEDS, WET.rebound_speed(SPEEDS)), delay=plain)
+    u = np.geomspace(13.0, 300.0, 50)
+    for one in (law, other, law.without_delay()):
+        save_law_csv(one, tmp_path / "law.csv")
+        again = afm.load_law(tmp_path / "law.csv")
+        np.testing.assert_allclose(again.rebound_speed(u), one.rebound_speed(u), rtol=1e-9)
+        np.testing.assert_allclose(again.collision_delay(u), one.collision_delay(u), rtol=0.0, atol=1e-9)
+        for name in ("capture_speed_nm_per_us", "slowest_nm_per_us", "fastest_nm_per_us", "mass_ng"):
+            known = getattr(one, name)
+            assert (getattr(again, name) is None) == (known is None)
+            if known is not None:
+                np.testing.assert_allclose(getattr(again, name), known, rtol=1e-12)
+        assert (again.origin.text, again.lasts, again.deviations) == (one.origin.text, one.lasts, None)
+
+
+def test_a_spring_constant_tells_the_mass(tmp_path):
+    head = "# spring_constant_n_per_m = 5.4\n# frequency_khz = 90\n" + HEAD
+    (tmp_path / "law.csv").write_text(head + "10,8\n20,18\n30,28\n40,38\n")
+    # k/(2 pi f0)^2
+    mass = 5.4 / (2.0 * np.pi * 90e3) ** 2 * 1e12
+    assert float(afm.load_law(tmp_path / "law.csv").mass_ng or 0.0) == pytest.approx(mass, rel=1e-12)
 
 
 def test_a_scene_file_names_a_law_beside_it(law, tmp_path):
@@ -93,9 +121,6 @@ def test_measured_columns_in_other_units(unit, size, tmp_path):
     assert float(law.mass_ng) == 1.5
 
 
-HEAD = "approach_speed_nm_per_us,rebound_speed_nm_per_us\n"
-
-
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -111,11 +136,19 @@ HEAD = "approach_speed_nm_per_us,rebound_speed_nm_per_us\n"
         ("u,w\n1,1\n", "column u is none of a law's"),
         ("approach_speed_nm_per_us\n1\n", "has no column rebound_speed_nm_per_us"),
         ("", "is empty"),
-        ('{"format": "afm-jax fit", "valid": false}', "the fit is not valid, so that its law means nothing"),
-        ('{"format": "afm-jax fit", "valid": true, "law": {}}', "fit again with `afm-jax fit TABLE --out DIR`"),
+        ('{"format": "afm-jax fit", "format_version": 2, "valid": false}', "not valid, so that its law means nothing"),
+        (
+            '{"format": "afm-jax fit", "format_version": 2, "valid": true, "law": {}}',
+            "fit again with `afm-jax fit TABLE",
+        ),
+        (
+            '{"format": "afm-jax fit", "format_version": 1, "valid": true}',
+            "has format_version 1, but 2 is known here; write it anew: afm-jax fit TABLE.csv --model MODEL --out",
+        ),
+        ("# corrections = perhaps\n" + HEAD + "1,0.5\n2,1\n3,2\n4,3\n", "must be true or false, but is 'perhaps'"),
         ('{"format": "afm-jax law", "format_version": 99}', "has format_version 99, but 1 is known here"),
         ('{"format": "something"}', "holds no law"),
-        ("{", "is no JSON"),
+        ("{", "line 1 is no JSON; give a fit.json"),
     ],
 )
 def test_what_is_no_law(text, said, tmp_path):
@@ -164,7 +197,7 @@ def test_a_batch_of_laws_is_no_scene_file(law, tmp_path):
 def test_a_fit_of_instantaneous_impacts_tells_delays_of_0(law, tmp_path):
     instant = law.without_delay()
     told = instant.to_dict() | {"collision_delay_us": [0.0] * 12}
-    fit = {"format": "afm-jax fit", "valid": True, "law": told}
+    fit = {"format": "afm-jax fit", "format_version": 2, "valid": True, "law": told}
     (tmp_path / "fit.json").write_text(json.dumps(fit))
     assert eqx.tree_equal(afm.load_law(tmp_path / "fit.json"), instant)
     del told["numbers"]["knots"]

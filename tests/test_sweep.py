@@ -114,7 +114,7 @@ def test_exponents_of_contacts_are_followed_in_rows_of_one_length(monkeypatch: p
         whole = values.astype(int)
         pairs = np.stack([values, -values], axis=1)
         return Lyapunov(
-            pairs, 2.0 * pairs, pairs, pairs, values, whole, whole, whole, Verdicts(whole, whole, whole, values)
+            pairs, 2.0 * pairs, pairs, pairs, values, whole, whole, whole, Verdicts(whole, whole, whole, values), pairs
         )
 
     monkeypatch.setattr("afm_jax.sweeps.scenes.lyapunov_spectrum", spectrum)

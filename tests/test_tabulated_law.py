@@ -7,7 +7,7 @@ import pytest
 
 import afm_jax as afm
 from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, TabulatedLaw
-from afm_jax.impact.law import MOST_KNOTS, Law
+from afm_jax.impact.law import MOST_KNOTS, Law, extrapolation_of
 
 DELAY = CollisionDelay(0.206, 5.64, 0.726)
 WET = ImpactLaw(0.9999, 114.0, 0.48, DELAY)
@@ -95,6 +95,10 @@ def test_it_says_where_it_is_extrapolated():
         law.extrapolated(np.array([slowest - 1.0, slowest + 1.0, 199.0, 201.0])), [True, False, False, True]
     )
     assert not bool(WET.extrapolated(1e4))
+    said = extrapolation_of(law, [[slowest + 1.0, 250.0], [np.nan, 300.0]])
+    known = f"the law is known from {slowest:.4g} to 200 nm/us"
+    assert said == f"Extrapolated: {known}, but 2 of 3 impacts come at 250 to 300 nm/us."
+    assert (extrapolation_of(law, [150.0, np.nan]), extrapolation_of(WET, [1e4])) == (None, None)
 
 
 def test_rows_that_are_captured_bound_the_capture_speed():

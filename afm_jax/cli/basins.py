@@ -67,6 +67,7 @@ def command(
     from afm_jax.dynamics.basins import basins_of_attraction  # noqa: PLC0415
     from afm_jax.dynamics.motion_bands import drawn_shares  # noqa: PLC0415
     from afm_jax.dynamics.verdicts import WHY_UNRESOLVED, MotionKind  # noqa: PLC0415
+    from afm_jax.impact.law import extrapolation_of  # noqa: PLC0415
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
     loaded, _ = scene_and_start(scene)
@@ -99,12 +100,15 @@ def command(
     ]
     for one, pair in zip(attractors, () if band is None else band.tolist(), strict=False):
         one["share_interval95"] = pair
+    approached = np.concatenate([attractor.approach_speed_nm_per_us for attractor in found.attractors])
+    beyond = extrapolation_of(loaded.interaction, approached)
     payload = {
         "scene": scene_tables(loaded),
         "starts": found.attractor.size,
         "attractors": attractors,
         "boundary_dimension": found.boundary_dimension,
         "boundary_dimension_error": found.boundary_dimension_error,
+        "extrapolated": beyond,
     }
     lines = [
         f"{one['name']}: {100.0 * one['share']:.4g} +- {100.0 * one['share_error']:.2g} % of the starts"
@@ -115,7 +119,7 @@ def command(
         lines.append(
             f"dimension of the boundaries: {found.boundary_dimension:.3f} +- {found.boundary_dimension_error:.3f}"
         )
-    session.emit(payload, *lines)
+    session.emit(payload, *lines, beyond)
     unresolved = sum(
         one["share"]
         for one, attractor in zip(attractors, found.attractors, strict=True)

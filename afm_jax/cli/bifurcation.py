@@ -61,6 +61,7 @@ def command(  # noqa: PLR0913
 
     from afm_jax.dynamics.bifurcations import bifurcation_diagram  # noqa: PLC0415
     from afm_jax.dynamics.motion_bands import verdict_probability  # noqa: PLC0415
+    from afm_jax.impact.law import extrapolation_of  # noqa: PLC0415
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
     loaded, start = scene_and_start(scene)
@@ -96,18 +97,21 @@ def command(  # noqa: PLR0913
         draw_bifurcations(swept.path, sweeps, target, probabilities)
         session.note(f"wrote {target}")
     went_on = any(np.isfinite(sweep.phase_rad).any() for sweep in sweeps)
+    speeds = np.concatenate([sweep.approach_nm_per_us.ravel() for sweep in sweeps])
+    beyond = extrapolation_of(loaded.interaction, speeds)
     payload = {
         "parameter": swept.path,
         "scene": scene_tables(loaded),
         "impacts_each": impacts,
         "sweeps": [_payload(sweep) for sweep in sweeps],
+        "extrapolated": beyond,
         "reason": None if went_on else _NONE_WENT_ON,
     }
     if probabilities is not None:
         payload["draws"] = draws
         for told, sure in zip(payload["sweeps"], probabilities, strict=True):
             told["verdict_probability"] = sure
-    session.emit(payload, *(_summary(sweep) for sweep in sweeps))
+    session.emit(payload, *(_summary(sweep) for sweep in sweeps), beyond)
     if not went_on:
         raise NotValid(_NONE_WENT_ON)
 

@@ -57,6 +57,7 @@ def command(  # noqa: PLR0913
         import zarr as _  # noqa: PLC0415
     session.start_computing()
     from afm_jax.dynamics.charts import stability_chart, stable_probability  # noqa: PLC0415
+    from afm_jax.impact.law import extrapolation_of  # noqa: PLC0415
     from afm_jax.scenefile.parameter_paths import scene_family  # noqa: PLC0415
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
@@ -112,7 +113,8 @@ def command(  # noqa: PLR0913
         )
     ]
     lines.append(f"several orders are stable at {100.0 * payload['several_stable_share']:.4g} % of the points")
-    session.emit(payload | {"reason": reason}, *lines)
+    beyond = extrapolation_of(loaded.interaction, verdicts.approach_speed_nm_per_us)
+    session.emit(payload | {"extrapolated": beyond, "reason": reason}, *lines, beyond)
     if reason is not None:
         raise NotValid(reason)
 

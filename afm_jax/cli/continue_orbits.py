@@ -15,6 +15,7 @@ from afm_jax.units import TWO_SIDED_95
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from afm_jax.apparatus.scene import Scene
     from afm_jax.dynamics.bands import UncertainParameters
     from afm_jax.dynamics.continuation import Continuation
     from afm_jax.dynamics.special_points import OrbitBranch, SpecialCurve
@@ -45,6 +46,7 @@ CURVE_COLUMNS = ("curve", "kind", "parameter", "second", "admissible")
 _ENDS = {
     "range": "the end of the range",
     "capture": "capture: an impact comes too slowly to leave again",
+    "no_speed": "where an impact's speed vanishes: the tip grazes the sample, or rests on it",
     "delay": "close to capture, where the law's delay is longer than half a drive period",
     "shorter": "where it becomes an orbit of fewer impacts",
     "closed": "where it began: it is closed",
@@ -120,11 +122,18 @@ def command(  # noqa: PLR0913
                 found = continue_orbits(loaded, order, first, impacts=impacts, second=others[0] if others else None)
     except ValueError as error:
         raise ValueError(f"{scene}: {error}") from error
-    _finish(session, found, known, picture)
+    _finish(session, loaded, found, known, picture)
 
 
-def _finish(session: Session, found: "Continuation", known: "UncertainParameters | None", picture: str) -> None:
+def _finish(
+    session: Session,
+    scene: "Scene",
+    found: "Continuation",
+    known: "UncertainParameters | None",
+    picture: str,
+) -> None:
     from afm_jax.dynamics.bands import amplitude_errors, special_errors  # noqa: PLC0415
+    from afm_jax.impact.law import extrapolation_of  # noqa: PLC0415
 
     bands = None if known is None else [amplitude_errors(found, branch, known) for branch in found.branches]
     errors = None if known is None else special_errors(found, known)
@@ -150,6 +159,8 @@ def _finish(session: Session, found: "Continuation", known: "UncertainParameters
         special.append(row)
     curves = [_curve(curve) for curve in found.curves]
     reason = None if any(point["admissible"] for point in points) else _why_none(found)
+    speeds = [impact["approach_speed_nm_per_us"] for point in points for impact in point["impacts"]]
+    beyond = extrapolation_of(scene.interaction, speeds)
     _write(session, found, points, special, curves)
     payload = {
         "order": found.order,
@@ -163,9 +174,10 @@ def _finish(session: Session, found: "Continuation", known: "UncertainParameters
         "branches": [{"points": len(one.parameter), "ends": list(one.ends)} for one in found.branches],
         "sticking": found.sticking,
         "law_parameters": None if known is None else list(known.paths),
+        "extrapolated": beyond,
         "reason": reason,
     }
-    session.emit(payload, *_text(found, special, curves))
+    session.emit(payload, *_text(found, special, curves), beyond)
     if session.out is not None:
         from afm_jax.plots.branches import draw_continuation, draw_curves  # noqa: PLC0415
 

@@ -12,6 +12,7 @@ from afm_jax.cli.values import Finite, ValueAndError, example_path, option_of, p
 from fitting.parameters import DELAY, DRIFT_NAMES, LAW, MODELS, NUISANCES, PARAMETERS, model_parameters
 
 if TYPE_CHECKING:
+    from afm_jax.impact.law import TabulatedLaw
     from fitting.experiments.belief import Belief
 
 _LAW = tuple(parameter.name for parameter in (*LAW, *DELAY))
@@ -29,6 +30,7 @@ class BeliefOptions(NamedTuple):
     model: str | None
     uncertainty: float
     drive: str | None
+    law: Path | None
     numbers: Mapping[str, Any]
 
 
@@ -63,6 +65,7 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
         model: str | None,
         uncertainty: float,
         drive: str | None,
+        law: Path | None,
         **options: Any,
     ) -> Any:
         if options.pop("example"):
@@ -71,7 +74,9 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
             measured, model = example_path(), model or "law"
         numbers = {name: options.pop(name) for name in _BELONG}
         given = {name: value for name, value in numbers.items() if value not in (None, ())}
-        return function(*args, belief_options=BeliefOptions(fit, measured, model, uncertainty, drive, given), **options)
+        return function(
+            *args, belief_options=BeliefOptions(fit, measured, model, uncertainty, drive, law, given), **options
+        )
 
     # click lists options in the order of the decorators, the last one first
     for nuisance in _NUISANCES[::-1]:
@@ -116,6 +121,13 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
             metavar="JSON",
             help="A fit to add to, as `afm-jax fit --json` writes it.",
         ),
+        click.option(
+            "--law",
+            type=click.Path(path_type=Path),
+            metavar="FILE",
+            help="A law.csv, a law.json of `collide --make-law`, or a CSV of measured speeds: the model's formula that "
+            "is closest to it is planned with. A fit.json is what --fit is.",
+        ),
     ):
         command = decorate(command)
     return command
@@ -132,11 +144,21 @@ def believed(options: BeliefOptions, noise: float) -> "Belief":
         click.UsageError: if they contradict each other, or say nothing of the cantilever.
         ValueError: if a value is impossible, or a file cannot be read.
     """
-    if options.fit is not None and options.measured is not None:
-        raise click.UsageError("--fit and --measured both say what is known; give one of them")
-    if options.fit is None and options.measured is None:
+    sources = {"--fit": options.fit, "--measured": options.measured, "--law": options.law}
+    known = [name for name, path in sources.items() if path is not None]
+    if len(known) > 1:
+        raise click.UsageError(f"{known[0]} and {known[1]} both say what is known; give one of them")
+    if not known:
         return _from_values(options)
-    source = "--fit" if options.measured is None else "--measured"
+    if options.law is not None:
+        from afm_jax.scenefile.law_files import law_and_fit  # noqa: PLC0415
+
+        law, found = law_and_fit(options.law)
+        if not found:
+            return _from_values(options, law)
+        fitted = options.law / "fit.json" if options.law.is_dir() else options.law
+        options = options._replace(fit=fitted)
+    (source,) = known
     for name in options.numbers:
         if options.measured is None or name not in {"free", "fix"}:
             raise click.UsageError(f"{option_of(name)} is what {source} says already; leave one of them out")
@@ -159,10 +181,11 @@ def believed(options: BeliefOptions, noise: float) -> "Belief":
     )
 
 
-def _from_values(options: BeliefOptions) -> "Belief":
+def _from_values(options: BeliefOptions, law: "TabulatedLaw | None" = None) -> "Belief":
     from fitting.experiments.belief import believe  # noqa: PLC0415
 
-    numbers, model, free = options.numbers, options.model or "law+delay", _names(options)
+    usual = "law+delay" if law is None or law.delayed else "law"
+    numbers, model, free = options.numbers, options.model or usual, _names(options)
     if "free_frequency_khz" not in numbers:
         raise click.UsageError("give --free-frequency-khz (and --quality-factor), or --fit or --measured")
     quality_factor, _ = numbers.get("quality_factor", (None, None))
@@ -190,6 +213,7 @@ def _from_values(options: BeliefOptions) -> "Belief":
         fixed=fixed | {name: value for name, value in contact.items() if name not in own},
         uncertainty=options.uncertainty,
         drive=options.drive or "sample",
+        law=law,
     )
 
 

@@ -31,8 +31,8 @@ from afm_jax.cli.values import Finite, example_path, tables_with, with_noise, wi
     "--law",
     type=click.Path(path_type=Path),
     metavar="FILE",
-    help="A fit, as `afm-jax fit --out` writes it (fit.json), or another law's file, to draw over the rows; one of "
-    "other speeds is refused.",
+    help="A fit's fit.json or law.csv, a law.json of `collide --make-law`, or a CSV of measured speeds: its law with "
+    "its band beside the rows; one of other speeds is refused.",
 )
 @click.option("--example", is_flag=True, help="Invert the bundled table instead of a file.")
 @with_session
@@ -57,18 +57,16 @@ def command(  # noqa: PLR0913
     if example == (table is not None):
         raise click.UsageError("give a table to invert, `afm-jax invert TABLE.csv`, or --example for the bundled one")
     session.start_computing()
+    from afm_jax.scenefile.law_files import load_law  # noqa: PLC0415
     from fitting.inversion.invert import invert  # noqa: PLC0415
-    from fitting.inversion.regression import (  # noqa: PLC0415
-        read_fitted_law,
-        read_known_law,
-    )
+    from fitting.inversion.regression import read_known_law  # noqa: PLC0415
     from fitting.inversion.report import inversion_summary  # noqa: PLC0415
 
     (measured,) = tables_with([example_path() if table is None else table], noise, quality_factor)
     known = None if truth is None else read_known_law(truth)
-    fitted = None if law is None else read_fitted_law(law)
+    beside = None if law is None else load_law(law)
     with session.working(f"inverting {measured.rows} rows (the first run compiles for some seconds)"):
-        result = invert(measured, frequency_error_khz=frequency_error_khz, truth=known, fitted=fitted)
+        result = invert(measured, frequency_error_khz=frequency_error_khz, truth=known, law=beside)
     session.emit(result.to_dict(), partial(inversion_summary, result))
     if session.out is not None:
         from fitting.inversion.report import write_inversion  # noqa: PLC0415

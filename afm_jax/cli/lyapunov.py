@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     import numpy as np
 
+    from afm_jax.apparatus.scene import Scene
     from afm_jax.dynamics.exponents import Lyapunov
 
 COLUMNS = (
@@ -105,18 +106,18 @@ def command(  # noqa: PLR0913
         target = session.out / f"lyapunov.{picture}"
         draw_exponents(ranges[0].path, given[ranges[0].path], many.exponents_per_impact, target, band)
         session.note(f"wrote {target}")
-    payload = _payload(found, verdicts if given else verdicts[0]) | {"scene": scene_tables(loaded)}
+    payload = _payload(found, loaded, verdicts if given else verdicts[0]) | {"scene": scene_tables(loaded)}
     if band is not None:
         payload |= {"draws": draws, "exponent_per_impact_interval95": band if given else band[0]}
     reason = payload["reason"] = _why_none(many, verdicts)
     if given:
         payload |= {"parameter": ranges[0].path, "values": given[ranges[0].path]}
-        session.emit(payload, _summary(many, str(ranges[0])))
+        session.emit(payload, _summary(many, str(ranges[0])), payload["extrapolated"])
     else:
         drawn = (
             [] if band is None else ["the larger per impact: {:.6g} to {:.6g} in 95 % of the draws".format(*band[0])]
         )
-        session.emit(payload, *_text(found, verdicts[0]), *drawn)
+        session.emit(payload, *_text(found, verdicts[0]), *drawn, payload["extrapolated"])
     if reason is not None:
         raise NotValid(reason)
 
@@ -139,7 +140,9 @@ def _as_batch(found: "Lyapunov") -> "Lyapunov":
     return jax.tree.map(lambda part: np.asarray(part)[None], found)
 
 
-def _payload(found: "Lyapunov", verdict: Any) -> dict[str, Any]:
+def _payload(found: "Lyapunov", scene: "Scene", verdict: Any) -> dict[str, Any]:
+    from afm_jax.impact.law import extrapolation_of  # noqa: PLC0415
+
     return {
         "exponents_per_us": found.exponents_per_us,
         "exponents_per_impact": found.exponents_per_impact,
@@ -151,6 +154,7 @@ def _payload(found: "Lyapunov", verdict: Any) -> dict[str, Any]:
         "rested": found.rested,
         "orbit": {"impacts": found.verdicts.impacts, "periods": found.verdicts.periods},
         "verdict": verdict,
+        "extrapolated": extrapolation_of(scene.interaction, found.approach_speed_nm_per_us),
     }
 
 

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.cli.fitted_law import extrapolation_of, with_fitted_law, with_law_option
+from afm_jax.cli.fitted_law import with_fitted_law, with_law_option
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import SceneName, scene_and_start
@@ -105,6 +105,7 @@ def command(session: Session, scene: str, order: int, impacts: int | None, law: 
     """
     session.start_computing()
     from afm_jax.contact.contact import Contact  # noqa: PLC0415
+    from afm_jax.impact.law import extrapolation_of  # noqa: PLC0415
     from afm_jax.impact.orbits import single_impact_orbits  # noqa: PLC0415
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
@@ -123,7 +124,7 @@ def command(session: Session, scene: str, order: int, impacts: int | None, law: 
     orbits = orbit_rows(found)
     reason = None if any(orbit["admissible"] for orbit in orbits) else why_none(loaded, order, rejected=len(orbits))
     near_fold = any(orbit["near_double"] for orbit in orbits)
-    beyond = extrapolation_of(loaded, [orbit["approach_speed_nm_per_us"] for orbit in orbits])
+    beyond = extrapolation_of(loaded.interaction, [orbit["approach_speed_nm_per_us"] for orbit in orbits])
     if not bool(found.complete):
         session.note("there are more orbits than could be listed; the slowest are shown")
     session.write_table("orbits.csv", orbits, told)
@@ -139,7 +140,7 @@ def command(session: Session, scene: str, order: int, impacts: int | None, law: 
         },
         orbit_table(orbits, title=f"Orbits with one impact in {order} drive period{'s' if order > 1 else ''}"),
         *(["Two of them nearly coincide (a fold): derivatives there have no meaning."] if near_fold else []),
-        *([] if beyond is None else [beyond]),
+        beyond,
     )
     if reason is not None:
         raise NotValid(reason)
@@ -172,6 +173,7 @@ def _many(session: Session, scene: "Scene", path: str, order: int, impacts: int)
     from afm_jax.dynamics.contact_orbits import contact_orbits  # noqa: PLC0415
     from afm_jax.dynamics.impact_orbits import many_impact_orbits  # noqa: PLC0415
     from afm_jax.dynamics.sticking_orbits import sticking_orbit  # noqa: PLC0415
+    from afm_jax.impact.law import extrapolation_of  # noqa: PLC0415
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
     resolved = isinstance(scene.interaction, Contact)
@@ -194,6 +196,7 @@ def _many(session: Session, scene: "Scene", path: str, order: int, impacts: int)
     rows = [{"orbit": k, **impact} for k, orbit in enumerate(orbits) for impact in orbit["impacts"]]
     session.write_table("impacts.csv", rows, ("orbit", *IMPACT_COLUMNS))
     _draw(session, found)
+    beyond = extrapolation_of(scene.interaction, [row["approach_speed_nm_per_us"] for row in rows])
     payload = {
         "order": order,
         "impacts": impacts,
@@ -201,13 +204,14 @@ def _many(session: Session, scene: "Scene", path: str, order: int, impacts: int)
         "orbits": orbits,
         "sticking": rests,
         "sticking_reason": resting if isinstance(resting, str) else None,
+        "extrapolated": beyond,
         "reason": reason,
     }
     title = (
         f"Orbits with {impacts} impact{'s' if impacts > 1 else ''} in {order} drive period{'s' if order > 1 else ''}"
     )
     words = f"No orbit with a rest: {resting}." if isinstance(resting, str) else _resting_words(payload["sticking"])
-    session.emit(payload, many_table(orbits, title=title), words)
+    session.emit(payload, many_table(orbits, title=title), words, beyond)
     if reason is not None:
         raise NotValid(reason)
 

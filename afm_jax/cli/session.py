@@ -272,8 +272,8 @@ class Session:
 
         Args:
             payload: the object; arrays become lists, NaN and infinity null.
-            text: strings, rich tables, and functions that return a string, one below the other. In a terminal lines
-                break between words, and tables that are too wide for it are turned.
+            text: strings, rich tables, and functions that return a string, one below the other; None: nothing. In a
+                terminal lines break between words, and tables that are too wide for it are turned.
         """
         if self.json:
             click.echo(strict_json(labelled(payload)))
@@ -281,6 +281,8 @@ class Session:
         console = _console(stderr=False)
         with lines_at_most(console.width):
             for part in (*text, *(f"Note: {note}" for note in _notes())):
+                if part is None:
+                    continue
                 words = part if isinstance(part, str) else part() if callable(part) else _table_text(console, part)
                 if isinstance(words, str):
                     words = _broken(shown(words), console.width)

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.cli.fitted_law import extrapolation_of, with_fitted_law, with_law_option
+from afm_jax.cli.fitted_law import with_fitted_law, with_law_option
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import Finite, SceneName
@@ -119,6 +119,7 @@ def command(  # noqa: PLR0913
     session.start_computing()
     from afm_jax.apparatus.scene import drive_of  # noqa: PLC0415
     from afm_jax.cli.values import scene_and_start  # noqa: PLC0415
+    from afm_jax.impact.law import extrapolation_of  # noqa: PLC0415
     from afm_jax.motion.observe import observe  # noqa: PLC0415
 
     loaded, told = scene_and_start(scene)
@@ -146,7 +147,7 @@ def command(  # noqa: PLR0913
         "pieces": run.pieces,
     }
     payload = payload_of(loaded, run, seen, settings)
-    beyond = extrapolation_of(loaded, run.simulation.contacts.approach_speed_nm_per_us)
+    beyond = extrapolation_of(loaded.interaction, run.simulation.contacts.approach_speed_nm_per_us)
     payload["extrapolated"] = beyond
     if beyond is None:
         payload["null_reasons"]["extrapolated"] = "No impact is faster or slower than the law is known for."
@@ -155,7 +156,7 @@ def command(  # noqa: PLR0913
         if samples:
             write_trace(session, loaded, run, seen.window)
         _draw(session, loaded, run, dense)
-    session.emit(payload, *text_of(payload), *([] if beyond is None else [beyond]))
+    session.emit(payload, *text_of(payload), beyond)
     if not payload["valid"]:
         raise NotValid(payload["outcome"])
 

@@ -116,6 +116,7 @@ def _tell(session: Session, plan: "SweepPlan", done: "SweepRun") -> None:
 
     assert session.out is not None  # asked before  # noqa: S101
     messages = _messages(plan, session.out / STORE)
+    beyond = _extrapolated(plan, session.out / STORE)
     payload = {
         "store": session.out / STORE,
         "points": plan.points,
@@ -127,9 +128,10 @@ def _tell(session: Session, plan: "SweepPlan", done: "SweepRun") -> None:
         "seconds": done.seconds,
         "without_result": sum(messages.values()),
         "messages": dict(messages.most_common(_MOST_MESSAGES)),
+        "extrapolated": beyond,
         "variables": {variable.name: variable.attributes() for variable in plan.recorder.variables},
     }
-    session.emit(payload, *_words(plan, done, messages, session.out / STORE))
+    session.emit(payload, *_words(plan, done, messages, session.out / STORE), beyond)
 
 
 def _messages(plan: "SweepPlan", store: Path) -> Counter[str]:
@@ -142,6 +144,20 @@ def _messages(plan: "SweepPlan", store: Path) -> Counter[str]:
         return Counter()
     with xarray.open_zarr(str(store)) as found:
         return Counter(text for text in found[MESSAGE.name].values.ravel().tolist() if text)
+
+
+def _extrapolated(plan: "SweepPlan", store: Path) -> str | None:
+    """Return a sentence on points whose impacts come at other speeds than their law is known for; None without any."""
+    import xarray  # noqa: PLC0415
+
+    from afm_jax.sweeps.scenes import EXTRAPOLATED  # noqa: PLC0415
+
+    (meaning,) = [one.meaning for one in plan.recorder.variables if one.name == EXTRAPOLATED] or [None]
+    if meaning is None:
+        return None
+    with xarray.open_zarr(str(store)) as found:
+        outside = found[EXTRAPOLATED].values.reshape(plan.points, -1).any(axis=1)
+    return f"Extrapolated: at {int(outside.sum())} of {plan.points} points {meaning}." if outside.any() else None
 
 
 def _words(plan: "SweepPlan", done: "SweepRun", messages: Counter[str], store: Path) -> list[str]:

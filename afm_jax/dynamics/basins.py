@@ -56,10 +56,14 @@ _NARROWEST = 16
 """Cells at least that the widest pair of the uncertainty exponent fits into the picture."""
 
 
+_NOTHING = np.zeros(0)
+
+
 class Attractor(NamedTuple):
     """What starts come to.
 
     ``phase_rad``, in [0, 2 pi), and ``velocity_nm_per_us``: of an orbit, just after each of its impacts; else empty.
+    ``approach_speed_nm_per_us``: of its impacts, or of the last ones that were seen of an irregular motion.
     """
 
     name: str
@@ -69,6 +73,7 @@ class Attractor(NamedTuple):
     periods: int
     phase_rad: Float[np.ndarray, " impacts"]
     velocity_nm_per_us: Float[np.ndarray, " impacts"]
+    approach_speed_nm_per_us: Float[np.ndarray, " seen"]
 
 
 @public_result(picture="afm_jax.plots.dynamics:basins_figure", rows="table")
@@ -220,10 +225,17 @@ class _Finder:
             phase = within_turn(self.omega * record.departure_us[lane, -m:], 2.0 * np.pi) if m else np.zeros(0)
             velocity = record.velocity_after_nm_per_us[lane, -m:] if m else np.zeros(0)
             kind = int(verdicts.kind[lane]), m, int(verdicts.periods[lane])
-            label[lane] = self._known(kind, phase, velocity)
+            approach = record.approach_nm_per_us[lane, -m:]
+            label[lane] = self._known(kind, phase, velocity, approach[np.isfinite(approach)])
         return label
 
-    def _known(self, kind: tuple[int, int, int], phase: np.ndarray, velocity: np.ndarray) -> int:
+    def _known(
+        self,
+        kind: tuple[int, int, int],
+        phase: np.ndarray = _NOTHING,
+        velocity: np.ndarray = _NOTHING,
+        approach: np.ndarray = _NOTHING,
+    ) -> int:
         for number, known in enumerate(self.attractors):
             if (known.kind, known.impacts, known.periods) != kind:
                 continue
@@ -233,7 +245,7 @@ class _Finder:
             if self._distance(known, phase[-1:], velocity[-1:])[0] < _SAME * size:
                 return number
         name = f"({kind[1]},{kind[2]})" if kind[1] else MotionKind(kind[0]).name.lower()
-        self.attractors.append(Attractor(name, *kind, phase, velocity))
+        self.attractors.append(Attractor(name, *kind, phase, velocity, approach))
         self.radius.append(0.0)
         return len(self.attractors) - 1
 
@@ -303,10 +315,10 @@ class _Finder:
             ):
                 ended = tips.outcome == outcome
                 if ended.any():
-                    found[ended] = self._known((int(kind), 0, 0), np.zeros(0), np.zeros(0))
+                    found[ended] = self._known((int(kind), 0, 0))
             lost = (tips.outcome != Outcome.IMPACT) & (found < 0)
             if lost.any():
-                found[lost] = self._known((int(MotionKind.UNRESOLVED), 0, 0), np.zeros(0), np.zeros(0))
+                found[lost] = self._known((int(MotionKind.UNRESOLVED), 0, 0))
             label[left] = found
             going = found < 0
             left, tips = left[going], jax.tree.map(lambda part, going=going: part[going], tips)
@@ -317,7 +329,7 @@ class _Finder:
         if left.size <= _LEFT:
             label[left] = self.told_apart(tips)
         else:
-            label[left] = self._known((int(MotionKind.IRREGULAR), 0, 0), np.zeros(0), np.zeros(0))
+            label[left] = self._known((int(MotionKind.IRREGULAR), 0, 0))
         return label
 
     def _targets(self) -> tuple[Array, Array, np.ndarray]:

@@ -24,7 +24,7 @@ from afm_jax.dynamics.bands import UncertainParameters
 from afm_jax.dynamics.contact_orbits import single_contact_orbits
 from afm_jax.dynamics.iteration import Report, SampleDriven, for_few, in_blocks, sample_driven
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem
-from afm_jax.impact.law import impact_law_of
+from afm_jax.impact.law import TabulatedLaw, impact_law_of
 from afm_jax.impact.orbits import orbit_at, orbit_problem
 from afm_jax.impact.roots import find_roots
 from afm_jax.results import Result, public_result
@@ -41,6 +41,7 @@ class OrbitVerdicts(NamedTuple):
     ``peak_amplitude_nm``: of the stable one (the highest, if there are several); NaN where there is none.
     ``largest_multiplier``: how stable that one is: the size of the larger multiplier of the linearised map.
     ``unresolved``, of contacts only: the closest law has an orbit, but none was found.
+    ``approach_speed_nm_per_us``, of laws that are tables only: of the stable one's impact.
     """
 
     stable: Bool[np.ndarray, "orders scenes"]
@@ -48,6 +49,7 @@ class OrbitVerdicts(NamedTuple):
     peak_amplitude_nm: Float[np.ndarray, "orders scenes"]
     largest_multiplier: Float[np.ndarray, "orders scenes"]
     unresolved: Bool[np.ndarray, "orders scenes"] | None = None
+    approach_speed_nm_per_us: Float[np.ndarray, "orders scenes"] | None = None
 
     def any_stable(self) -> Bool[np.ndarray, " scenes"]:
         """Return where an orbit of any order is stable."""
@@ -79,6 +81,7 @@ def orbit_verdicts(
         numbers = single_contact_orbits(seen, range(first_order, last_order + 1), report=report)
         return OrbitVerdicts(**{name: column.T for name, column in numbers.items()})
     orders = jnp.arange(first_order, last_order + 1, dtype=float)
+    table = isinstance(scenes.interaction, TabulatedLaw)
 
     def work(part: SampleDriven) -> OrbitVerdicts:
         found = highest_orbits(part.scenes, part.frame, orders)
@@ -87,6 +90,7 @@ def orbit_verdicts(
             admissible=found["admissible_orbits"] > 0,
             peak_amplitude_nm=found["peak_amplitude_nm"],
             largest_multiplier=found["largest_multiplier"],
+            approach_speed_nm_per_us=found["approach_speed_nm_per_us"] if table else None,
         )
 
     found = in_blocks(work, seen, block=_LANES, report=report)

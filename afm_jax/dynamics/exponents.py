@@ -63,6 +63,7 @@ class Lyapunov(ResultTuple):
         near_grazing: how many of them are near grazing.
         rested: how many of them ended in a rest.
         verdicts: what the motions have come to.
+        approach_speed_nm_per_us: of the last impacts of each motion.
     """
 
     exponents_per_impact: Float[np.ndarray, "lanes 2"]
@@ -74,6 +75,7 @@ class Lyapunov(ResultTuple):
     near_grazing: Int[np.ndarray, " lanes"]
     rested: Int[np.ndarray, " lanes"]
     verdicts: Verdicts
+    approach_speed_nm_per_us: Float[np.ndarray, "lanes last"]
 
 
 CHAOTIC_ERRORS = 3.0
@@ -195,7 +197,7 @@ def _exponents_of_contacts(scenes: Scene, tips: Tips, *, impacts: int, transient
     last = steps - (_PARTS + 1) * each
     sums = _sums_of(jacobians[last:], determinants[last:], known.T[last:], np.where(known, passed, 0.0).T[last:], each)
     flat = np.moveaxis(jacobians.reshape(steps, lanes, 4), 1, 2)
-    return _of_orbits(_of_sums(sums, verdicts), flat, determinants, period)
+    return _of_orbits(_of_sums(sums, verdicts, record.approach_nm_per_us[:, -RECORDED:]), flat, determinants, period)
 
 
 def _sums_of(
@@ -223,7 +225,7 @@ def _exponents_of_block(scenes: Scene, tips: Tips, *, impacts: int, transient: i
     period = np.asarray(scenes.platform.period_us)
     outcome = np.asarray(tips.outcome)
     verdicts = verdicts_of(record, outcome, period, tolerance=_ARRIVED)
-    found = _of_sums(_Sums(*(np.asarray(part) for part in sums)), verdicts)
+    found = _of_sums(_Sums(*(np.asarray(part) for part in sums)), verdicts, record.approach_nm_per_us)
     return _of_orbits(found, np.asarray(jacobians), np.asarray(determinants), period)
 
 
@@ -304,7 +306,7 @@ def _jacobian(scenes: Scene, step: MapStep) -> tuple[tuple[Array, Array, Array, 
     return jacobian, determinant, landed
 
 
-def _of_sums(sums: _Sums, verdicts: Verdicts) -> Lyapunov:
+def _of_sums(sums: _Sums, verdicts: Verdicts, approach: Float[np.ndarray, "lanes last"]) -> Lyapunov:
     """Return the exponents as means over all impacts."""
     impacts = sums.impacts.sum(axis=0)
     enough = (sums.impacts > 0).all(axis=0)
@@ -336,6 +338,7 @@ def _of_sums(sums: _Sums, verdicts: Verdicts) -> Lyapunov:
         near_grazing=sums.near_grazing.sum(axis=0).astype(int),
         rested=rested.astype(int),
         verdicts=verdicts,
+        approach_speed_nm_per_us=approach,
     )
 
 

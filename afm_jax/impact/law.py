@@ -720,7 +720,7 @@ def law_of_dict(told: Mapping[str, Any]) -> TabulatedLaw:
         raise ValueError(f"the law lacks {' and '.join(missing)}")
     numbers = told.get("numbers")
     delay = None
-    u, w, late = (np.asarray(told.get(name, ()), float) for name in names)
+    u, w, late = (_as_numbers(name, told.get(name, ())) for name in names)
     if isinstance(numbers, Mapping):
         known = [*_NUMBERS, "scale_nm_per_us", *([name for name in _OF_DELAY if "hertz" in numbers])]
         lacking = [name for name in known if name not in numbers]
@@ -743,17 +743,43 @@ def law_of_dict(told: Mapping[str, Any]) -> TabulatedLaw:
     )
     if not isinstance(numbers, Mapping):
         return law
-    made = _with_numbers(law, {name: jnp.asarray(numbers[name], float) for name in _numbers_of(law)})
-    scale, ends = numbers["scale_nm_per_us"], told["speed_range_nm_per_us"]
+    own = _numbers_of(law)
+    made = _with_numbers(law, {name: _told(name, numbers[name], own[name].shape) for name in own})
+    scale = _told("scale_nm_per_us", numbers["scale_nm_per_us"], ())
+    ends = _told("speed_range_nm_per_us", told.get("speed_range_nm_per_us"), (2,))
     made = eqx.tree_at(
         lambda law: (law.scale_nm_per_us, law.slowest_nm_per_us, law.fastest_nm_per_us),
         made,
-        tuple(jnp.asarray(number, float) for number in (scale, *ends)),
+        (scale, *ends),
     )
     if told.get("deviations") is None:
         return made
-    deviations = {name: jnp.asarray(change, float) for name, change in told["deviations"].items()}
+    count = len(told["deviations"]["capture"])
+    deviations = {
+        name: _told(f"deviations.{name}", change, (count, *own[name].shape))
+        for name, change in told["deviations"].items()
+    }
     return _replaced(made, deviations=deviations)
+
+
+def _told(name: str, number: Any, shape: tuple[int, ...]) -> Array:
+    """Return a number of a law that a file tells, or an array of them.
+
+    Raises:
+        ValueError: if it is not of that shape, or not finite.
+    """
+    found = _as_numbers(name, number)
+    if found.shape != shape or not np.isfinite(found).all():
+        many = f"{' x '.join(map(str, shape))} finite numbers" if shape else "a finite number"
+        raise ValueError(f"`{name}` of the law must be {many}")
+    return jnp.asarray(found)
+
+
+def _as_numbers(name: str, told: Any) -> Float[np.ndarray, "..."]:
+    try:
+        return np.asarray(told, float)
+    except (OverflowError, TypeError, ValueError) as error:
+        raise ValueError(f"`{name}` of the law must be numbers") from error
 
 
 def axes_of_one(scene: Scene) -> Scene:
@@ -995,9 +1021,41 @@ def impact_law_of(scene: Scene) -> Law:
     """
     if not isinstance(scene.interaction, Law):
         raise TypeError(
-            f"the impact map needs a scene whose interaction is an ImpactLaw, not {type(scene.interaction).__name__}"
+            "the impact map needs a scene whose interaction is a law, an ImpactLaw or a TabulatedLaw, not "
+            f"{type(scene.interaction).__name__}"
         )
     return scene.interaction
+
+
+def extrapolation_of(law: Any, speeds: Any) -> str | None:
+    """Return a sentence on approach speeds outside those that a law is known for; None where there are none.
+
+    Args:
+        law: a law, or what else a scene's interaction may be.
+        speeds: approach speeds in nm/us that count, of any shape; NaN: none.
+    """
+    if not isinstance(law, TabulatedLaw):
+        return None
+    known = np.asarray(speeds, float)
+    known = known[np.isfinite(known)]
+    outside = known[np.asarray(law.extrapolated(known))]
+    if not outside.size:
+        return None
+    low, high = float(law.slowest_nm_per_us), float(law.fastest_nm_per_us)
+    ends = " to ".join(dict.fromkeys(f"{end:.4g}" for end in (outside.min(), outside.max())))
+    return (
+        f"Extrapolated: the law is known from {low:.4g} to {high:.4g} nm/us, but {outside.size} of {known.size} "
+        f"impacts come at {ends} nm/us."
+    )
+
+
+def errors_of(law: Law, approach_speed: ArrayLike) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Return the standard errors of a law's rebound speeds in nm/us and delays in us; 0 where none are known of it."""
+    u = as_argument(approach_speed)
+    if not isinstance(law, TabulatedLaw) or law.deviations is None:
+        return np.zeros(u.shape), np.zeros(u.shape)
+    slopes = jax.jit(jax.jacfwd(lambda unknowns: law.moved(unknowns).at_approach(u)))(jnp.zeros(law.unknowns))
+    return np.linalg.norm(slopes.rebound, axis=1), np.linalg.norm(slopes.delay, axis=1)
 
 
 def formula_of(scene: Scene) -> ImpactLaw:

@@ -18,13 +18,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
+import equinox as eqx
 import numpy as np
 
 from afm_jax.checks import checked
-from afm_jax.impact.law import TabulatedLaw, law_of_dict
-from afm_jax.scenefile.tables import SceneError, printable
+from afm_jax.impact.law import CollisionDelay, TabulatedLaw, law_of_dict
+from afm_jax.saved import FIT_FORMAT, why_no_fit
+from afm_jax.scenefile.tables import SceneError, printable, read_text
 from afm_jax.strict_json import strict_json
-from afm_jax.whole_files import read_whole, write_whole
+from afm_jax.units import effective_mass_ng
+from afm_jax.whole_files import write_whole
 
 FORMAT, FORMAT_VERSION = "afm-jax law", 1
 _SPEED_UNITS = {"nm_per_us": 1.0, "um_per_s": 1e-3, "mm_per_s": 1.0, "m_per_s": 1e3}
@@ -33,6 +36,8 @@ _COLUMNS = {"approach_speed": _SPEED_UNITS, "rebound_speed": _SPEED_UNITS, "rebo
 _COLUMNS |= {"collision_delay": _TIME_UNITS, "collision_delay_error": _TIME_UNITS}
 _BANDS = ("rebound_low", "rebound_high", "delay_low", "delay_high")
 """Columns of a fit's law.csv besides: its band, of which a table alone cannot draw."""
+_WRITTEN = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "rebound_low_nm_per_us", "rebound_high_nm_per_us")
+_WRITTEN += ("collision_delay_us", "delay_low_us", "delay_high_us")
 _NUMBERS = ("mass_ng", "spring_constant_n_per_m", "frequency_khz", "capture_speed_nm_per_us")
 
 
@@ -41,36 +46,30 @@ def load_law(path: str | os.PathLike[str]) -> TabulatedLaw:
     """Read an impact law from a file: a fit's fit.json or law.csv, what `collide --make-law` wrote, or a measured CSV.
 
     Args:
-        path: the file.
+        path: the file, or the folder of a report.
 
     Raises:
-        ValueError: if it cannot be read, is none of these, or its speeds are no law; one line.
+        ValueError: if it cannot be read, is none of these, is of an older version, or its speeds are no law; one line.
+    """
+    return law_and_fit(path)[0]
+
+
+def law_and_fit(path: str | os.PathLike[str]) -> tuple[TabulatedLaw, Mapping[str, Any]]:
+    """Return the law of a file, and where it is a fit's the whole object of its JSON, else nothing.
+
+    Raises:
+        ValueError: as `load_law`.
     """
     if Path(path).is_dir():
-        # the folder of a report
+        # of a report
         path = next((Path(path) / name for name in ("law.json", "fit.json") if (Path(path) / name).exists()), path)
-    name = printable(os.fspath(path))
+    text = read_text(path)
     try:
-        text = read_whole(path).decode("utf-8-sig")
-    except FileNotFoundError as error:
-        raise SceneError(f"{name}: there is no such file") from error
-    except OSError as error:
-        raise SceneError(f"{name}: cannot be read ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        raise SceneError(f"{name}: is not UTF-8 text") from error
-    try:
-        return _of_json(text) if text.lstrip().startswith("{") else _of_csv(text)
+        if Path(path).suffix == ".json" or text.lstrip().startswith("{"):
+            return _of_json(text)
+        return _of_csv(text), {}
     except ValueError as error:
-        raise SceneError(f"{name}: {error}") from error
-
-
-def holds_law(path: str | os.PathLike[str]) -> bool:
-    """Say whether a file is JSON that `save_law` wrote; what cannot be read is not."""
-    try:
-        found = json.loads(read_whole(path).decode("utf-8-sig"))
-    except (OSError, ValueError, RecursionError):
-        return False
-    return isinstance(found, dict) and found.get("format") == FORMAT
+        raise SceneError(f"{printable(os.fspath(path))}: {error}") from error
 
 
 @checked
@@ -89,44 +88,46 @@ def save_law_csv(law: TabulatedLaw, path: str | os.PathLike[str]) -> None:
     low, high = told["speed_range_nm_per_us"]
     comments = [f"# speeds: {low:.6g} to {high:.6g} nm/us"]
     comments += [f"# {key} = {told[key]}" for key in ("mass_ng", "origin", "capture_speed_nm_per_us") if key in told]
-    names = [
-        name for name in ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us") if name in told
-    ]
+    if told.get("corrections") is False:
+        comments.append("# corrections = false")
+    names = [name for name in _WRITTEN if name in told]
     rows = zip(*(told[name] for name in names), strict=True)
-    lines = [*comments, ",".join(names), *(",".join(map(repr, row)) for row in rows)]
-    write_whole(path, "\n".join(lines) + "\n")
+    lines = [",".join("" if number is None else repr(number) for number in row) for row in rows]
+    write_whole(path, "\n".join([*comments, ",".join(names), *lines]) + "\n")
 
 
-def _of_json(text: str) -> TabulatedLaw:
+_GIVE = "give a fit.json of `afm-jax fit --out`, a law.json of `afm-jax collide --make-law` or a CSV of speeds"
+
+
+def _of_json(text: str) -> tuple[TabulatedLaw, Mapping[str, Any]]:
     try:
         found = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"is no JSON: {error}") from error
-    kind = found.get("format")
-    if kind == FORMAT:
-        if found.get("format_version") != FORMAT_VERSION:
-            raise ValueError(
-                f"has format_version {found.get('format_version')}, but {FORMAT_VERSION} is known here; write it anew "
-                "with `afm-jax collide --make-law --out DIR`"
-            )
-        return law_of_dict(found)
-    if kind != "afm-jax fit":
-        raise ValueError("holds no law: give a fit.json of `afm-jax fit --out`, a law.json or a CSV of speeds")
-    if not found.get("valid"):
-        raise ValueError("the fit is not valid, so that its law means nothing; give a valid one")
-    return _of_fit(found)
-
-
-def _of_fit(found: Mapping[str, Any]) -> TabulatedLaw:
-    """Return the law of a fit: with its errors where they are told, else its columns."""
-    law = found.get("law")
-    if not isinstance(law, Mapping):
-        _fail("is a fit without a law; fit again with `afm-jax fit TABLE --out DIR`")
-    if isinstance(law.get("numbers"), Mapping):
-        return law_of_dict(law)
-    raise ValueError(
-        "is a fit of an earlier version, whose law cannot be used; fit again with `afm-jax fit TABLE --out DIR`"
-    )
+    except ValueError as error:
+        raise ValueError(f"line {getattr(error, 'lineno', 1)} is no JSON; {_GIVE}") from error
+    except RecursionError:
+        raise ValueError(f"has too many brackets within each other; {_GIVE}") from None
+    kind = found.get("format") if isinstance(found, dict) else None
+    if kind not in (FORMAT, FIT_FORMAT):
+        raise ValueError(f"holds no law; {_GIVE}")
+    law, mend = found, "write it anew with `afm-jax collide --make-law --out DIR`"
+    if kind == FIT_FORMAT:
+        wrong = why_no_fit(found)
+        if wrong is not None:
+            raise ValueError(wrong)
+        if not found.get("valid"):
+            raise ValueError("the fit is not valid, so that its law means nothing; give a valid one")
+        law, mend = found.get("law"), "fit again with `afm-jax fit TABLE --out DIR`"
+        if not isinstance(law, dict) or not isinstance(law.get("numbers"), dict):
+            raise ValueError(f"is a fit without a law; {mend}")
+    elif found.get("format_version") != FORMAT_VERSION:
+        raise ValueError(
+            f"has format_version {found.get('format_version')}, but {FORMAT_VERSION} is known here; {mend}"
+        )
+    try:
+        return law_of_dict(law), found if kind == FIT_FORMAT else {}
+    except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
+        # an entry of another kind than is written there
+        raise ValueError(f"its law is damaged; {mend}") from error
 
 
 def _of_csv(text: str) -> TabulatedLaw:
@@ -152,7 +153,18 @@ def _of_csv(text: str) -> TabulatedLaw:
         for kind, place, unit in columns:
             values[kind].append(_number(cells[place], names[place], number) * unit)
     numbers = {key: _setting(key, settings[key]) for key in _NUMBERS if key in settings}
-    return _law_of_columns({kind: np.array(column) for kind, column in values.items()}, numbers, settings)
+    law = _law_of_columns({kind: np.array(column) for kind, column in values.items()}, numbers, settings)
+    return _as_corrected(law, settings.get("corrections", "true"))
+
+
+def _as_corrected(law: TabulatedLaw, corrections: str) -> TabulatedLaw:
+    """Return a law with or without what happens while an impact lasts."""
+    if corrections not in ("true", "false"):
+        raise ValueError(f"`# corrections` must be true or false, but is {corrections!r}")
+    if law.delay is None or corrections == "true":
+        return law
+    delay = CollisionDelay(law.delay.hertz, law.delay.lead_nm, law.delay.offset_nm, corrections=False)
+    return eqx.tree_at(lambda law: law.delay, law, delay)
 
 
 def _law_of_columns(
@@ -164,8 +176,7 @@ def _law_of_columns(
             raise ValueError(
                 "`spring_constant_n_per_m` tells a mass with `# frequency_khz = ` only: add it, or mass_ng"
             )
-        # N/m over (rad/us)^2 is 1e-12 kg = ng
-        mass = numbers["spring_constant_n_per_m"] / (2e-3 * math.pi * numbers["frequency_khz"]) ** 2
+        mass = effective_mass_ng(numbers["spring_constant_n_per_m"], numbers["frequency_khz"])
     delay = values.get("collision_delay")
     # how a fit of instantaneous impacts writes its law
     delay = None if delay is not None and not delay.any() else delay

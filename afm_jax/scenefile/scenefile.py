@@ -80,8 +80,9 @@ from afm_jax.scenefile.tables import (
     advise_table,
     in_words,
     printable,
+    read_text,
 )
-from afm_jax.whole_files import read_whole, write_whole
+from afm_jax.whole_files import write_whole
 
 if TYPE_CHECKING:
     from afm_jax.contact.contact import Contact
@@ -471,17 +472,7 @@ def read_toml(source: str) -> dict[str, Any]:
     Raises:
         SceneError: if it cannot be read, or is no TOML.
     """
-    where = printable(source)
-    try:
-        # a byte order mark, as some editors write, is no part of the text
-        text = read_whole(source).decode("utf-8-sig")
-    except FileNotFoundError as error:
-        raise SceneError(f"{where or 'an empty path'}: there is no such file") from error
-    except OSError as error:
-        raise SceneError(f"{where}: cannot be read ({error.strerror})") from error
-    except UnicodeDecodeError as error:
-        line = error.object[: error.start].count(b"\n") + 1
-        raise SceneError(f"{where}: line {line} is not UTF-8 text; save the file as UTF-8") from error
+    where, text = printable(source), read_text(source)
     try:
         return tomllib.loads(text)
     except ValueError as error:

@@ -4,8 +4,11 @@ One table of a scene file: its keys and types are checked, and every error says 
 """
 
 import difflib
+import os
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, NoReturn, TypeVar
+
+from afm_jax.whole_files import read_whole
 
 _FREQUENCY = ("frequency_khz", "reduced_frequency")
 _MOTION = ("amplitude_nm", *_FREQUENCY, "phase_deg")
@@ -132,6 +135,25 @@ Built = TypeVar("Built")
 
 class SceneError(ValueError):
     """A scene file that cannot be used; the message is one line: what, where, how to mend it."""
+
+
+def read_text(source: str | os.PathLike[str]) -> str:
+    """Return the text of a file that a scene is made of.
+
+    Raises:
+        SceneError: if there is no such file, it cannot be read or is not UTF-8 text.
+    """
+    where = printable(os.fspath(source))
+    try:
+        # a byte order mark, as some editors write, is no part of the text
+        return read_whole(source).decode("utf-8-sig")
+    except FileNotFoundError as error:
+        raise SceneError(f"{where or 'an empty path'}: there is no such file") from error
+    except OSError as error:
+        raise SceneError(f"{where}: cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        line = error.object[: error.start].count(b"\n") + 1
+        raise SceneError(f"{where}: line {line} is not UTF-8 text; save the file as UTF-8") from error
 
 
 class SceneTable(NamedTuple):

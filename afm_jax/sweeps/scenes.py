@@ -25,7 +25,7 @@ from afm_jax.dynamics.contact_orbits import CHART_ACCURACY, single_contact_orbit
 from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.dynamics.iteration import LANES, sample_driven
 from afm_jax.dynamics.verdicts import MotionKind
-from afm_jax.impact.law import axes_of_one, impact_law_of
+from afm_jax.impact.law import TabulatedLaw, axes_of_one, extrapolation_of, impact_law_of
 from afm_jax.motion.follow import follow_long
 from afm_jax.motion.observe import TOO_SHORT, observe
 from afm_jax.motion.record import MotionOutcome
@@ -194,6 +194,20 @@ def _scenes(scene: Scene, paths: Sequence[str]) -> Callable[[Columns], Scene]:
     return made
 
 
+EXTRAPOLATED = "extrapolated"
+"""The variable of scenes with a law that is a table."""
+
+
+def _beyond(scene: Scene, what: str, dimensions: tuple[str, ...] = ()) -> tuple[Variable, ...]:
+    """Return the variable that says whether a law that is a table is extrapolated; none of other scenes."""
+    law = scene.interaction
+    if not isinstance(law, TabulatedLaw):
+        return ()
+    low, high = float(law.slowest_nm_per_us), float(law.fastest_nm_per_us)
+    meaning = f"{what} outside the speeds that the law is known for, {low:.4g} to {high:.4g} nm/us"
+    return (Variable(EXTRAPOLATED, meaning, "bool", dimensions),)
+
+
 # --- single-impact orbits ---------------------------------------------------------------------------------------------
 
 _ORBIT_VARIABLES = (
@@ -229,13 +243,19 @@ def _orbits(
     law = impact_law_of(scene)
     made = _scenes(scene, paths)
 
+    beyond = _beyond(scene, "the stable orbit's impact comes", ("order",))
+
     def record(columns: Columns) -> dict[str, Array]:
         scenes = made(columns)
-        return highest_orbits(scenes, free_frame(scenes), jnp.asarray(orders, float))
+        found = highest_orbits(scenes, free_frame(scenes), jnp.asarray(orders, float))
+        if not beyond:
+            return found
+        laws, speeds = impact_law_of(scenes), found["approach_speed_nm_per_us"]
+        return found | {EXTRAPOLATED: jax.vmap(lambda law, speed: law.extrapolated(speed))(laws, speeds)}
 
     points = 4096 if law.delay else 1 << 18
     driven = () if scene.base is None and scene.force is None else _DRIVEN_ORBIT_VARIABLES
-    return Recorder((*_ORBIT_VARIABLES, *driven), over_devices(record), points, extra)
+    return Recorder((*_ORBIT_VARIABLES, *driven, *beyond), over_devices(record), points, extra)
 
 
 _CONTACT_ORBIT_VARIABLES = (
@@ -347,6 +367,7 @@ def _lyapunov(
     resolved = isinstance(scene.interaction, Contact)
     lanes = _CONTACTS if resolved else LANES
     made = jax.jit(_scenes(scene, paths))
+    beyond = _beyond(scene, "the last impacts come")
 
     def work(columns: Columns) -> Columns:
         count = len(next(iter(columns.values())))
@@ -357,10 +378,12 @@ def _lyapunov(
         verdicts = found.verdicts
         known = {name: getattr(found, name) for name in (*_EXPONENTS, "impacts")}
         known |= {"kind": verdicts.kind, "orbit_impacts": verdicts.impacts, "orbit_periods": verdicts.periods}
+        if beyond:
+            known[EXTRAPOLATED] = np.asarray(scene.interaction.extrapolated(found.approach_speed_nm_per_us)).any(axis=1)
         return {name: np.asarray(part)[:count] for name, part in known.items()}
 
     points = _CONTACTS if resolved else 4 * LANES
-    return Recorder(_EXPONENT_VARIABLES, work, points, {"exponent": [1.0, 2.0]}, alone=resolved)
+    return Recorder((*_EXPONENT_VARIABLES, *beyond), work, points, {"exponent": [1.0, 2.0]}, alone=resolved)
 
 
 # --- simulations ------------------------------------------------------------------------------------------------------
@@ -414,18 +437,19 @@ def _simulation(
 ) -> Recorder:
     """Record what an experiment reads of scenes in time, followed until they settle or for some drive periods."""
     family = scene_family(scene, *paths)
+    variables = (*_SIMULATION_VARIABLES, *_beyond(scene, "impacts come"))
 
     def work(columns: Columns) -> Columns:
         rows = zip(*(columns[path] for path in paths), strict=True)
         seen = [_seen(family(*row), periods, accuracy, start) for row in rows]
-        return {variable.name: [each[variable.name] for each in seen] for variable in _SIMULATION_VARIABLES}
+        return {variable.name: [each[variable.name] for each in seen] for variable in variables}
 
-    return Recorder(_SIMULATION_VARIABLES, work, 16, alone=True)
+    return Recorder(variables, work, 16, alone=True)
 
 
 def _seen(scene: Scene, periods: float, accuracy: float, start: Start | None) -> dict[str, Any]:
     """Return what is recorded of one scene; NaN where nothing is known, and of a motion that cannot be."""
-    nothing = dict.fromkeys(_OBSERVED, math.nan) | dict.fromkeys(("settled", "stuck"), False)
+    nothing = dict.fromkeys(_OBSERVED, math.nan) | dict.fromkeys(("settled", "stuck", EXTRAPOLATED), False)
     nothing |= dict.fromkeys(("order", "contacts_per_response", "impacts"), 0) | {MESSAGE.name: ""}
     try:
         longest = periods * drive_of(scene).period_us
@@ -441,6 +465,7 @@ def _seen(scene: Scene, periods: float, accuracy: float, start: Start | None) ->
         "contacts_per_response": verdict.contacts or 0,
         "impacts": int(found.count),
         "outcome": int(outcome),
+        EXTRAPOLATED: extrapolation_of(scene.interaction, found.contacts.approach_speed_nm_per_us) is not None,
     }
     if outcome not in (MotionOutcome.FINISHED, MotionOutcome.HELD):
         return nothing | told | {MESSAGE.name: outcome.sentence}

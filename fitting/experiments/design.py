@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from afm_jax.checks import checked, require_float64
+from afm_jax.impact.law import extrapolation_of
 from afm_jax.least_squares import covariance_of
 from afm_jax.version import version_of
 from fitting.experiments.belief import Belief, belief_of_fit, size_of
@@ -191,6 +192,8 @@ def judge_design(
                 "one-sided limit rather than a value."
             )
     warnings += _edges(candidates, chosen, tapping=belief.problem.tapping)
+    beyond = extrapolation_of(belief.law, candidates.approach_speed_nm_per_us[chosen])
+    warnings += [] if beyond is None else [beyond]
     return reasons, warnings
 
 

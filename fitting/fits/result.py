@@ -12,11 +12,11 @@ from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.impact.law import CollisionDelay, Origin, TabulatedLaw
 from afm_jax.results import Result, public_result
+from afm_jax.saved import FIT_FORMAT, FIT_FORMAT_VERSION
 from afm_jax.strict_json import plain
 from afm_jax.units import TWO_SIDED_95
 from fitting.fits.intervals import Convergence
 from fitting.fits.loss import Loss
-from fitting.tables.csv_text import FIT_FORMAT_VERSION
 from fitting.tables.several import RepeatedReadings, SeveralTables, repeats_of
 from fitting.tables.table import AmplitudeTable
 
@@ -356,7 +356,7 @@ class FitResult(Result):
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain lists, numbers and strings; what is not known is None."""
         return {
-            "format": "afm-jax fit",
+            "format": FIT_FORMAT,
             "format_version": FIT_FORMAT_VERSION,
             "model": self.model,
             "valid": self.valid,

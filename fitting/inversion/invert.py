@@ -9,11 +9,21 @@ from jaxtyping import Float
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
+from afm_jax.apparatus.scene import check_mass
 from afm_jax.checks import checked, require_float64
+from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw
 from afm_jax.version import version_of
 from fitting.inversion.flight import Inverted, MeasuredRow, invert_rows
-from fitting.inversion.regression import Laws, compare_law, regressed_laws
-from fitting.inversion.result import Inversion, InvertedRows, RegressedLaw, SavedLaw, on_resonance, read_on_resonance
+from fitting.inversion.regression import Laws, distance_from, regressed_laws
+from fitting.inversion.result import (
+    Inversion,
+    InvertedRows,
+    LawDistance,
+    RegressedLaw,
+    described,
+    on_resonance,
+    read_on_resonance,
+)
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable, TableLike, as_table, check_quality_factor
 
@@ -24,7 +34,7 @@ _OUTLIER = 16.0
 """chi2 of one degree of freedom (4 standard errors) above which a row contradicts itself."""
 _PACKAGES = ("afm-jax", "jax", "numpy")
 
-Law = tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]
+KnownSpeeds = tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]
 
 
 class _Instrument(NamedTuple):
@@ -49,8 +59,8 @@ def invert(
     table: TableLike,
     *,
     frequency_error_khz: float | None = None,
-    truth: Law | None = None,
-    fitted: SavedLaw | None = None,
+    truth: KnownSpeeds | None = None,
+    law: ImpactLaw | TabulatedLaw | None = None,
 ) -> Inversion:
     """Return approach speed, rebound speed and collision delay of every row with a phase, and the laws they follow.
 
@@ -63,15 +73,15 @@ def invert(
         frequency_error_khz: standard error of the free frequency; None: the table's, exactly known if it has none.
         truth: approach and rebound speeds in nm/us, ascending, where the law is known: what the reading on resonance
             is compared with.
-        fitted: a law from `read_fitted_law`, to be set beside the rows.
+        law: of a fit, from `load_law`, or any other, to be set beside the rows.
 
     Returns:
         Rows with errors, regressed laws and a verdict; see `Inversion`.
 
     Raises:
-        TableError: if the table has no phase and no row on resonance, or does not say its quality factor, or the fitted
-            law holds at other speeds.
-        ValueError: if the frequency's error is not positive.
+        TableError: if the table has no phase and no row on resonance, or does not say its quality factor, or the law
+            is known at other speeds only.
+        ValueError: if the frequency's error is not positive, or the law is that of a tip of another mass.
         RuntimeError: if JAX is not set to 64-bit floats.
     """
     table = as_table(table)
@@ -84,6 +94,8 @@ def invert(
             f"{table.source}: the {'cantilever' if table.drive == 'base' else 'tip'} is driven here, not the sample; "
             "`afm-jax tapping` reads energy and impact speeds off such rows without a law, `afm-jax fit` fits a law"
         )
+    if law is not None and table.mass_ng is not None:
+        check_mass(law, Cantilever(table.free_frequency_khz, None, table.mass_ng))
     frequency_error_khz = table.free_frequency_error_khz if frequency_error_khz is None else frequency_error_khz
     with_phase = _with_phase(table)
     if not with_phase.any() and not on_resonance(table).any():
@@ -93,13 +105,12 @@ def invert(
         )
     rows = _inverted_rows(table, _shared(table, frequency_error_khz))
     laws = regressed_laws(rows)
-    law, reference = _reference(truth, laws)
-    resonance = read_on_resonance(table, law=law, reference=reference)
+    known, reference = _reference(truth, laws)
+    resonance = read_on_resonance(table, law=known, reference=reference)
     reasons, warnings = _judged(table, laws)
-    compared = None if fitted is None else compare_law(fitted, table, laws.rows, resonance)
-    if compared is not None:
-        against = "" if compared.agrees else ": it is not the law of these impacts"
-        warnings.append(f"{compared.statement}{against}")
+    distance = None if law is None else distance_from(law, table, laws.rows, resonance)
+    if law is not None and distance is not None:
+        warnings.append(_beside(law, distance))
     return Inversion(
         table=table,
         rows=laws.rows,
@@ -109,12 +120,27 @@ def invert(
         preferred=laws.preferred,
         verdict=laws.verdict,
         resonance=resonance,
-        fitted=compared,
+        beside=law,
+        distance=distance,
         valid=not reasons,
         reasons=reasons,
         warnings=warnings,
         versions={name: version_of(name) for name in _PACKAGES},
     )
+
+
+def _beside(law: Law, distance: LawDistance) -> str:
+    """Return what a reader should know of a law beside the rows."""
+    said = f"beside the rows is {described(law)}"
+    far = distance.median_distance_in_errors
+    if far is not None:
+        said += (
+            f"; the {distance.rows_compared} rows within these speeds are "
+            f"{far:.2g} standard errors from it in the median"
+        )
+    if not distance.agrees:
+        said += ": it is not the law of these impacts"
+    return said if distance.extrapolated is None else f"{said}. {distance.extrapolated}"
 
 
 def _with_phase(table: AmplitudeTable) -> np.ndarray:
@@ -204,7 +230,7 @@ def _at(table: AmplitudeTable, chosen: np.ndarray, instrument: _Instrument) -> I
     return jax.tree.map(lambda part: np.asarray(part)[: chosen.size], invert_rows(rows, cantilever))
 
 
-def _reference(truth: Law | None, laws: Laws) -> tuple[Law | None, str]:
+def _reference(truth: KnownSpeeds | None, laws: Laws) -> tuple[KnownSpeeds | None, str]:
     """Return what the reading on resonance is compared with, and its name."""
     if truth is not None:
         return truth, "truth"

@@ -6,7 +6,7 @@ Both speeds and the delay of a row come from the same few numbers, so that their
 residual is weighted by the variance that the row's whole covariance gives it (total least squares to first order). What
 all rows share, an error of Q or of the free frequency, is a nuisance with its known uncertainty.
 
-The law that a fit found, read back from the JSON of `afm-jax fit`, to be drawn over rows inverted without it.
+How far rows are from a law that is known otherwise, a fit's or a table's.
 
 A law that is known otherwise, from a CSV file such as `afm-jax collide --out` writes.
 """
@@ -14,20 +14,19 @@ A law that is known otherwise, from a CSV file such as `afm-jax collide --out` w
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.impact.law import Law, errors_of, extrapolation_of
 from afm_jax.least_squares import chi2_tail
-from afm_jax.scenefile.law_files import holds_law, load_law
 from fitting.inversion.result import (
     Coefficient,
-    ComparedLaw,
     InvertedRows,
+    LawDistance,
     RegressedLaw,
     ResonanceReading,
-    SavedLaw,
+    described,
 )
 from fitting.parameters import PARAMETERS
 from fitting.tables.csv_text import (
@@ -37,7 +36,6 @@ from fitting.tables.csv_text import (
     TableError,
     parse_rows,
     printable,
-    read_fit_json,
     read_text,
     split_cells,
     split_lines,
@@ -335,96 +333,38 @@ def _verdict(laws: dict[str, RegressedLaw]) -> tuple[str | None, str]:
     return best.model, verdict
 
 
-_COLUMNS = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us")
-DRIVE_COLUMNS = ("order", "drive_frequency_khz", "drive_amplitude_nm", "offset_nm")
-
-
-def read_fitted_law(path: str | Path) -> SavedLaw:
-    """Read the law of a fit.
+def distance_from(law: Law, table: AmplitudeTable, rows: InvertedRows, reading: ResonanceReading) -> LawDistance:
+    """Return how far inverted rows are from a law that is known otherwise, the errors of both taken together.
 
     Args:
-        path: what `afm-jax fit --json` prints, or the fit.json of its report; or another law's file.
-
-    Raises:
-        TableError: if the file cannot be read, is no fit, or the fit is not valid.
-    """
-    name = printable(str(path))
-    if Path(path).suffix != ".json" or holds_law(path):
-        told = load_law(path).to_dict()
-        columns = [np.asarray(told.get(column, np.zeros(len(told[_COLUMNS[0]])))) for column in _COLUMNS]
-        return SavedLaw("table", *columns, source=told.get("origin", name), drives=np.zeros((len(DRIVE_COLUMNS), 0)))
-    found = read_fit_json(path)
-    if not isinstance(found.get("law"), dict):
-        raise TableError(f"{name}: is no fit of a law; give the fit.json of `afm-jax fit --out`")
-    if not found.get("valid"):
-        raise TableError(f"{name}: the fit is not valid, so that its law means nothing; give a valid one")
-    columns = [_numbers(found["law"].get(column)) for column in _COLUMNS]
-    alike = all(column.shape == columns[0].shape for column in columns) and columns[0].size > 1
-    if not alike or not np.isfinite(columns[0]).all():
-        raise TableError(f"{name}: its law lacks {', '.join(_COLUMNS)}; fit again with this version")
-    given = found.get("input")
-    given = given if isinstance(given, dict) else {}
-    drives = [_numbers(given.get(column)) for column in DRIVE_COLUMNS]
-    same_length = len({column.size for column in drives}) == 1
-    return SavedLaw(
-        str(found.get("model")),
-        columns[0],
-        columns[1],
-        columns[2],
-        source=printable(str(given.get("source", ""))),
-        drives=np.stack(drives) if same_length else np.zeros((len(drives), 0)),
-    )
-
-
-def compare_law(fitted: SavedLaw, table: AmplitudeTable, rows: InvertedRows, reading: ResonanceReading) -> ComparedLaw:
-    """Return what a law that was fitted elsewhere has to do with inverted rows.
-
-    Args:
-        fitted: the law.
+        law: a formula or a table.
         table: what was inverted.
         rows: its rows.
         reading: the paper's reading of it, for a table without phases.
 
     Raises:
-        TableError: if the law was fitted over none of the rows' approach speeds.
+        TableError: if the law is known at none of the rows' approach speeds.
     """
     u, w, _ = rows.impact[rows.inverted].T
     reached = u if u.size else reading.approach_speed_nm_per_us
-    known = np.isfinite(fitted.rebound_speed_nm_per_us)
-    speeds, rebounds = fitted.approach_speed_nm_per_us[known], fitted.rebound_speed_nm_per_us[known]
-    if not speeds.size or not np.any((reached >= speeds[0]) & (reached <= speeds[-1])):
+    if np.all(law.extrapolated(reached) | law.captures(reached)):
         raise TableError(
-            f"the law {fitted.described} says nothing about {table.source}, whose impacts come at "
-            f"{np.min(reached):.4g} to {np.max(reached):.4g} nm/us; give a fit of these drives"
+            f"{described(law)}, says nothing about {table.source}, whose impacts come at {np.min(reached):.4g} to "
+            f"{np.max(reached):.4g} nm/us; give a law of these speeds"
         )
-    inside = (u >= speeds[0]) & (u <= speeds[-1])
-    # the loss is all but linear in the speed
-    lost = np.interp(u, speeds, speeds**2 - rebounds**2)
-    apart = w**2 - u**2 + lost
-    slope = np.stack([-2.0 * u, 2.0 * w], axis=1)
-    variance = np.einsum("ni,nij,nj->n", slope, rows.covariance[rows.inverted][:, :2, :2], slope)
-    variance += np.sum(np.einsum("ni,nis->ns", slope, rows.shared[rows.inverted][:, :2]) ** 2, axis=1)
-    pulls = np.abs(apart[inside]) / np.sqrt(variance[inside])
-    here = np.stack([np.asarray(getattr(table, column), float) for column in DRIVE_COLUMNS])
-    return ComparedLaw(
-        law=fitted,
-        same_drives=fitted.drives.shape == here.shape and bool(np.all(fitted.drives == here)),
-        rows_compared=int(inside.sum()),
-        typical_pull=float(np.median(pulls)) if pulls.size else None,
-    )
+    inside = ~np.asarray(law.extrapolated(u) | law.captures(u))
+    rebound, slope = np.asarray(law.rebound_speed(u)), np.asarray(law.rebound_slope(u))
+    # of squares, which are all but linear in the speed
+    slopes = np.stack([-2.0 * rebound * slope, 2.0 * w], axis=1)
+    variance = np.einsum("ni,nij,nj->n", slopes, rows.covariance[rows.inverted][:, :2, :2], slopes)
+    variance += np.sum(np.einsum("ni,nis->ns", slopes, rows.shared[rows.inverted][:, :2]) ** 2, axis=1)
+    variance += (2.0 * rebound * errors_of(law, u)[0]) ** 2
+    pulls = (np.abs(w**2 - rebound**2) / np.sqrt(variance))[inside]
+    median = float(np.median(pulls)) if pulls.size else None
+    return LawDistance(int(inside.sum()), median, extrapolation_of(law, u))
 
 
-def _numbers(cells: Any) -> Float[np.ndarray, " points"]:
-    """Return a list of numbers as an array, NaN for null; an empty one for anything else."""
-    if not isinstance(cells, list) or any(not isinstance(cell, (int, float, type(None))) for cell in cells):
-        return np.zeros(0)
-    try:
-        return np.array([np.nan if cell is None else float(cell) for cell in cells], dtype=np.float64)
-    except OverflowError:
-        return np.zeros(0)
-
-
-_KNOWN_COLUMNS = _COLUMNS[:2]
+_KNOWN_COLUMNS = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us")
 _LAW = Form(tuple(Column(name) for name in _KNOWN_COLUMNS), "speed", open=True, blanks=True)
 
 

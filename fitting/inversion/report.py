@@ -8,13 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import ArrayLike, Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
+from afm_jax.impact.law import Law, TabulatedLaw, errors_of
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, with_zero_line
+from afm_jax.scenefile.tables import cut_short
+from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import bullets, decimals, known, text_table, with_error
-from fitting.inversion.result import Coefficient, Inversion, RegressedLaw, SavedLaw
+from fitting.inversion.result import Coefficient, Inversion, RegressedLaw
 from fitting.parameters import LAWS
 
 ROW_COLUMNS = (
@@ -186,6 +190,8 @@ _STYLES = {"viscous": (BLUE, "-", r"$\epsilon$, $c$"), "restitution": (ACCENT, "
 _NS_PER_US = 1e3
 _INVALID = "#B00020"
 _SMALL = 9
+_POINTS = 200
+_LONGEST_LABEL = 40
 
 
 def inversion_figure(result: Inversion) -> Figure:
@@ -224,9 +230,9 @@ def _draw_loss(axes: Axes, result: Inversion) -> None:
         label += "" if seen.any() else ", outside"
         axes.plot(speeds, lost, dashes, color=colour, lw=1.6, label=label)
         axes.fill_between(speeds, lost - law.curve_error, lost + law.curve_error, color=colour, alpha=0.15, lw=0)
-    if result.fitted is not None:
-        fitted = result.fitted.law
-        _curve_of_fit(axes, result, fitted, fitted.approach_speed_nm_per_us - fitted.rebound_speed_nm_per_us)
+    if result.beside is not None:
+        u = _speeds_beside(result, result.beside)
+        _curve_beside(axes, result.beside, u, u - result.beside.rebound_speed(u), errors_of(result.beside, u)[0])
     c = rows.covariance
     error = np.sqrt(np.maximum(c[:, 0, 0] + c[:, 1, 1] - 2.0 * c[:, 0, 1], 0.0))
     _points(axes, result, rows.impact[:, 0] - rows.impact[:, 1], error)
@@ -256,21 +262,21 @@ def _frame_of(axes: Axes, result: Inversion) -> tuple[float, float]:
     return (0.6 * float(lost.min()), 1.7 * float(lost.max())) if lost.size else axes.get_ylim()
 
 
-def _curve_of_fit(axes: Axes, result: Inversion, fitted: SavedLaw, values: np.ndarray) -> None:
-    """Draw what a fit found, over the speeds of the rows."""
+def _speeds_beside(result: Inversion, law: Law) -> Float[np.ndarray, " points"]:
+    """Return the speeds of the rows that a law is known for, and some more."""
     speeds = np.concatenate([result.rows.impact[:, 0], result.resonance.approach_speed_nm_per_us])
-    known = np.isfinite(values) & (fitted.approach_speed_nm_per_us >= 0.9 * np.nanmin(speeds))
-    known &= fitted.approach_speed_nm_per_us <= 1.1 * np.nanmax(speeds)
-    curve = values[known]
-    axes.plot(
-        fitted.approach_speed_nm_per_us[known],
-        curve,
-        ":",
-        color="black",
-        lw=1.8,
-        zorder=3,
-        label=f"fit, {fitted.model}",
-    )
+    speeds = np.geomspace(0.9 * np.nanmin(speeds), 1.1 * np.nanmax(speeds), _POINTS)
+    return speeds[~np.asarray(law.extrapolated(speeds) | law.captures(speeds))]
+
+
+def _curve_beside(axes: Axes, law: Law, speeds: np.ndarray, values: ArrayLike, errors: np.ndarray) -> None:
+    """Draw what a law that is known otherwise says, with its 95 % band."""
+    curve, half = np.asarray(values), TWO_SIDED_95 * errors
+    origin = law.origin.text if isinstance(law, TabulatedLaw) else ""
+    label = f"law: {cut_short(origin, _LONGEST_LABEL)}" if origin else "law given"
+    axes.plot(speeds, curve, ":", color="black", lw=1.8, zorder=3, label=label)
+    if half.any():
+        axes.fill_between(speeds, curve - half, curve + half, color="black", alpha=0.15, lw=0)
 
 
 def _draw_delay(axes: Axes, result: Inversion) -> None:
@@ -280,9 +286,10 @@ def _draw_delay(axes: Axes, result: Inversion) -> None:
         label = f"delay law: $\\chi^2$ {law.chi2:.1f}/{law.degrees_of_freedom}"
         axes.plot(speeds, curve, color=BLUE, lw=1.6, label=label)
         axes.fill_between(speeds, curve - band, curve + band, color=BLUE, alpha=0.15, lw=0)
-    if result.fitted is not None:
-        fitted = result.fitted.law
-        _curve_of_fit(axes, result, fitted, _NS_PER_US * fitted.collision_delay_us)
+    if result.beside is not None:
+        u = _speeds_beside(result, result.beside)
+        late, error = result.beside.collision_delay(u), errors_of(result.beside, u)[1]
+        _curve_beside(axes, result.beside, u, _NS_PER_US * late, _NS_PER_US * error)
     _points(axes, result, _NS_PER_US * result.rows.impact[:, 2], _NS_PER_US * result.rows.errors[:, 2])
     with_zero_line(axes)
     _speed_axis(axes, r"collision delay  $\tau$ (ns)")

@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw
 from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from afm_jax.units import RAD_PER_US_PER_KHZ
@@ -106,8 +107,8 @@ def read_on_resonance(
 
 
 _APART = 3.0
-"""Standard errors that losses may be from a fitted law in the median (0.67 expected) before it counts as another's."""
-FORMAT_VERSION = 1
+"""Standard errors that rows may be from a law in the median (0.67 expected) before it counts as another's."""
+FORMAT_VERSION = 2
 """Version of the JSON layout; raised when a key changes its meaning or goes."""
 
 
@@ -185,72 +186,32 @@ class RegressedLaw:
     curve_error: Float[np.ndarray, " points"]
 
 
-class SavedLaw(NamedTuple):
-    """A fitted law read back: rebound speed in nm/us and delay in us at approach speeds, and what it was fitted to.
-
-    ``drives`` are order, drive frequency (kHz), drive amplitude and offset (nm) of the fitted rows, of shape (4, rows).
-    """
-
-    model: str
-    approach_speed_nm_per_us: Float[np.ndarray, " points"]
-    rebound_speed_nm_per_us: Float[np.ndarray, " points"]
-    collision_delay_us: Float[np.ndarray, " points"]
-    source: str
-    drives: Float[np.ndarray, "4 rows"]
-
-    @property
-    def described(self) -> str:
-        """What was fitted to what, over which speeds."""
-        known = self.approach_speed_nm_per_us[np.isfinite(self.rebound_speed_nm_per_us)]
-        over = f"over {known.min():.4g} to {known.max():.4g} nm/us" if known.size else "over no speed"
-        if self.model == "table":
-            return f"the law of {self.source} {over}"
-        return f"{self.model} fitted to {self.source or 'a table without a name'} {over}"
-
-
-@dataclass(frozen=True, kw_only=True)
-class ComparedLaw:
-    """A law that was fitted elsewhere, beside inverted rows.
+class LawDistance(NamedTuple):
+    """How far inverted rows are from a law that is known otherwise.
 
     Attributes:
-        law: the law.
-        same_drives: whether it was fitted to these very drives.
-        rows_compared: inverted rows within the speeds that it was fitted over.
-        typical_pull: median distance of their loss from the law's, in standard errors; None without such rows.
+        rows_compared: inverted rows within the speeds that the law is known for.
+        median_distance_in_errors: median distance of their rebound speeds from the law's, in standard errors; None
+            without such rows.
+        extrapolated: a sentence on rows outside these speeds; None: there are none.
     """
 
-    law: SavedLaw
-    same_drives: bool
     rows_compared: int
-    typical_pull: float | None
+    median_distance_in_errors: float | None
+    extrapolated: str | None
 
     @property
     def agrees(self) -> bool:
         """Whether rows and law are apart by no more than noise explains."""
-        return self.typical_pull is None or self.typical_pull <= _APART
+        return self.median_distance_in_errors is None or self.median_distance_in_errors <= _APART
 
-    @property
-    def statement(self) -> str:
-        """What a reader should know of the law beside the rows."""
-        drives = "" if self.same_drives else ", other drives than these"
-        far = ""
-        if self.typical_pull is not None:
-            far = (
-                f"; the losses of the {self.rows_compared} rows within these speeds are {self.typical_pull:.2g} "
-                "standard errors from it in the median"
-            )
-        return f"the law beside the rows is {self.law.described}{drives}{far}"
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return what the JSON says of it."""
-        return {
-            "model": self.law.model,
-            "source": self.law.source,
-            "same_drives": self.same_drives,
-            "rows_compared": self.rows_compared,
-            "median_distance_in_errors": self.typical_pull,
-            "agrees": self.agrees,
-        }
+def described(law: Law) -> str:
+    """Return what a law comes from and over which speeds it is known, in words."""
+    if not isinstance(law, TabulatedLaw):
+        return "a law"
+    what = f"a law ({law.origin.text})" if law.origin.text else "a law"
+    return f"{what}, known from {float(law.slowest_nm_per_us):.4g} to {float(law.fastest_nm_per_us):.4g} nm/us"
 
 
 @public_result(picture="fitting.inversion.report:inversion_figure", rows="records")
@@ -267,7 +228,8 @@ class Inversion(Result):
         preferred: the model that chi2 prefers, or None where it does not tell.
         verdict: the same in words.
         resonance: the paper's own reading of the rows on resonance.
-        fitted: a law that was fitted elsewhere, if one was given.
+        beside: a law that is known otherwise, if one was given.
+        distance: how far the rows are from it; None without one.
         valid: whether rows determine what is asked; `reasons` say why not.
         reasons: what makes the result invalid.
         warnings: what a reader should know besides.
@@ -282,7 +244,8 @@ class Inversion(Result):
     preferred: str | None
     verdict: str
     resonance: ResonanceReading
-    fitted: ComparedLaw | None
+    beside: ImpactLaw | TabulatedLaw | None
+    distance: LawDistance | None
     valid: bool
     reasons: list[str]
     warnings: list[str]
@@ -343,7 +306,9 @@ class Inversion(Result):
             "law": law,
             "delay": None if self.delay is None else asdict(self.delay),
             "resonance": asdict(self.resonance),
-            "fitted_law": None if self.fitted is None else self.fitted.to_dict(),
+            "fitted_law": None
+            if self.beside is None or self.distance is None
+            else {"law": described(self.beside), **self.distance._asdict(), "agrees": self.distance.agrees},
             "input": {name: value for name, value in vars(self.table).items() if value is not None},
             "versions": self.versions,
         }

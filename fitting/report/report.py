@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from afm_jax.saved import saved
+from afm_jax.scenefile.law_files import save_law_csv
 from afm_jax.whole_files import write_whole
 from afm_jax.words import bullets, known, text_table
 from fitting.fits.result import FitResult, FittedParameter, FittedRows
@@ -51,15 +52,6 @@ ROW_COLUMNS = (
     "model_error",
     "used",
     "set_aside",
-)
-LAW_COLUMNS = (
-    "approach_speed_nm_per_us",
-    "rebound_speed_nm_per_us",
-    "rebound_low_nm_per_us",
-    "rebound_high_nm_per_us",
-    "collision_delay_us",
-    "delay_low_us",
-    "delay_high_us",
 )
 
 
@@ -166,12 +158,6 @@ def phase_columns(rows: FittedRows) -> dict[str, np.ndarray]:
     }
 
 
-def law_records(result: FitResult) -> list[dict[str, float]]:
-    """Return the law's points, with the columns `LAW_COLUMNS`."""
-    columns = [getattr(result.law, name).tolist() for name in LAW_COLUMNS]
-    return [dict(zip(LAW_COLUMNS, point, strict=True)) for point in zip(*columns, strict=True)]
-
-
 def write_report(
     result: FitResult,
     folder: Path,
@@ -182,7 +168,7 @@ def write_report(
     posterior: Sampled | None = None,
     trust: TrustPack | None = None,
 ) -> list[Path]:
-    """Write fit.html, fit.txt, fit.json, fit.png and the tables fit_rows.csv and law.csv into a folder.
+    """Write fit.html, fit.txt, fit.json, fit.png, the law as law.csv and the table fit_rows.csv into a folder.
 
     Args:
         result: the fit; `afm_jax.load` of fit.json gives it back.
@@ -218,8 +204,9 @@ def write_report(
     others = write_report_files(folder, "fit", text=summary(result), data=saved(result), picture=picture)
     records = row_records(result)
     write_table("fit_rows.csv", records, tuple(records[0]))
-    write_table("law.csv", law_records(result), LAW_COLUMNS)
-    return [page, *others, *([] if trust is None else [folder / "trust.png"])]
+    law = folder / "law.csv"
+    save_law_csv(result.law, law)
+    return [page, *others, law, *([] if trust is None else [folder / "trust.png"])]
 
 
 def write_report_files(folder: Path, name: str, *, text: str, data: dict[str, Any], picture: bytes) -> list[Path]:

@@ -18,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
 
+from afm_jax.saved import why_no_fit
 from afm_jax.scenefile.tables import printable
 from afm_jax.whole_files import read_whole
 
@@ -266,8 +267,6 @@ def read_bytes(path: str | Path, wanted: str) -> bytes:
 
 
 _AS_CSV = "save the table as CSV with the encoding UTF-8"
-FIT_FORMAT_VERSION = 2
-"""Version of the layout of fit.json; raised when a key changes its meaning or goes."""
 _A_FIT = "give the fit.json of `afm-jax fit --out`"
 
 
@@ -284,13 +283,9 @@ def read_fit_json(path: str | Path) -> dict[str, Any]:
         raise TableError(f"{name}, line {error.lineno}: is no JSON; {_A_FIT}") from None
     except RecursionError:
         raise TableError(f"{name}: has too many brackets within each other; {_A_FIT}") from None
-    if not isinstance(found, dict) or found.get("format") != "afm-jax fit":
-        raise TableError(f"{name}: is no fit; {_A_FIT}")
-    if found.get("format_version") != FIT_FORMAT_VERSION:
-        raise TableError(
-            f"{name}: has format_version {found.get('format_version')}, but {FIT_FORMAT_VERSION} is known here; write "
-            "it anew: afm-jax fit TABLE.csv --model MODEL --out FOLDER"
-        )
+    wrong = why_no_fit(found)
+    if wrong is not None:
+        raise TableError(f"{name}: {wrong}")
     return found
 
 
