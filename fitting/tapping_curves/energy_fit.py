@@ -640,15 +640,19 @@ class _EnergySearch:
         best, most, weights = processes(_USUAL_SIZE, _USUAL_LENGTH), -np.inf, self._weights(groups)
         usual = self._smoothers(x, groups, best, scale)
         slopes = self.slopes(x, self._as_fitted(x, groups, usual, found))
+        known: dict[tuple[Process, ...], float] = {}
         for size in _SIZES:
             for length in _LENGTHS:
                 trial = processes(size, length)
-                smoothers = self._smoothers(x, groups, trial, scale)
-                matrix, gradient, total = self._normal(x, slopes, found, groups, smoothers)
-                evidence = gradient @ np.linalg.pinv(matrix, hermitian=True) @ gradient - total
-                evidence -= np.linalg.slogdet(matrix)[1]
-                evidence -= sum(w * one.log_determinant for w, one in zip(weights, smoothers, strict=True))
-                evidence -= (np.log(size / _USUAL_SIZE) / _LOG_SIZE) ** 2
+                # small sizes are raised to the same least one
+                if tuple(trial) not in known:
+                    smoothers = self._smoothers(x, groups, trial, scale)
+                    matrix, gradient, total = self._normal(x, slopes, found, groups, smoothers)
+                    of_trial = gradient @ np.linalg.pinv(matrix, hermitian=True) @ gradient - total
+                    of_trial -= np.linalg.slogdet(matrix)[1]
+                    of_trial -= sum(w * one.log_determinant for w, one in zip(weights, smoothers, strict=True))
+                    known[tuple(trial)] = of_trial
+                evidence = known[tuple(trial)] - (np.log(size / _USUAL_SIZE) / _LOG_SIZE) ** 2
                 evidence -= (np.log(length / _USUAL_LENGTH) / _LOG_LENGTH) ** 2
                 if evidence > most:
                     best, most = trial, evidence
