@@ -32,7 +32,7 @@ A cantilever that is driven itself over a sample at rest (a tapping or amplitude
 is the default. ``free_amplitude_nm`` is the amplitude of the free tip, ``offset_nm`` the sample's height over the tip's
 rest position, ``phase_lag_deg`` how far the response lags behind the drive; under ``base`` free and lock-in amplitude
 are those of the deflection, the lag is behind the base. ``order`` may be left out (1), ``retract`` marks by 1 the rows
-of the way back, and ``# phase_zero_deg = 0 +- 0.2`` says how well the instrument's zero of phase is known.
+of the retract, and ``# phase_zero_deg = 0 +- 0.2`` says how well the instrument's zero of phase is known.
 
 The comment lines of an amplitude table: what `# key = value` says about the cantilever, and free remarks.
 
