@@ -106,7 +106,7 @@ tapping: $(SETUP) ## are tapping curves of random contacts predicted and fitted 
 
 ENERGIES ?= --curves 200
 
-energies: $(SETUP) ## do the 95 % bands of the energy of a tap hold the energies of 400 simulated curves? (fifteen minutes)
+energies: $(SETUP) ## do the 95 % bands of the energy of a tap hold the energies of 600 simulated curves? (fifteen minutes)
 	$(BIN)/python -m tests.coverage_of_tapping $(ENERGIES)
 
 ranks: $(SETUP) ## are true values anywhere in the posteriors of 1000 simulated tables equally often? (half an hour)

@@ -1,5 +1,28 @@
-"""`python -m afm_jax`: the same as `afm-jax`."""
+"""`afm-jax` and `python -m afm_jax`."""
 
-from afm_jax.cli.main import main
+import os
+import signal
+from typing import Any
 
-main(prog_name="afm-jax")
+
+def run() -> None:
+    """Run the command line; an interrupt ends it in one line while packages are still being imported, too."""
+    # a shell starts what runs in the background with interrupts ignored
+    heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if heard:
+        signal.signal(signal.SIGINT, _end)
+    from afm_jax.cli.main import main  # noqa: PLC0415
+
+    if heard:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    main(prog_name="afm-jax")
+
+
+def _end(_number: int, _frame: Any) -> None:
+    """End the program at once: nothing has been begun."""
+    os.write(2, b"afm-jax: interrupted\n")
+    os._exit(130)
+
+
+if __name__ == "__main__":
+    run()

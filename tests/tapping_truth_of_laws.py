@@ -152,14 +152,52 @@ class Stated(NamedTuple):
     phase_noise_deg: float = 0.15
 
 
+FREE_ROWS = 12
+"""In front of the rows in contact."""
+
+
+def error_implied(tip: Tip, truth: Truth, stated: Stated) -> np.ndarray:
+    """Return the standard error of each row's energy by its own noise and by what is stated of the instrument, in aJ.
+
+    By differences of the energy that amplitude and lag have at another instrument. Free rows set the zero of the lag
+    and the free amplitude; what the air takes at the harmonics of a brief impact is known to a tenth.
+    """
+    free, lag = tip.free_reading
+    departure, n = truth.lag_deg - lag, np.arange(2, 41)[:, None]
+
+    def parts(at: Tip = tip, amplitude: Any = truth.amplitude_nm, turn: float = 0.0, factor: float = 1.0) -> tuple:
+        shown = at.free_nm if at.drive == "force" else free / abs(1.0 - at.gamma)
+        shown *= factor
+        seen = -amplitude * np.exp(-1j * (np.radians(at.free_reading[1] + departure + turn) - np.angle(at.gamma)))
+        z = seen if at.drive == "force" else seen - at.gamma * shown
+        over_k = at.gamma * (z + shown)
+        at_harmonics = n * np.abs(over_k) / np.abs(1.0 - (n * at.ratio) ** 2 + 1j * n * at.ratio / at.quality)
+        lost = np.pi * at.stiffness * at.ratio / at.quality * np.sum(at_harmonics**2, axis=0)
+        return -np.pi * at.stiffness * np.imag(over_k * np.conj(z)) - lost, lost
+
+    energy, lost = parts()
+    of_means = FREE_ROWS**-0.5
+    changes = [
+        parts(amplitude=truth.amplitude_nm * (1.0 + stated.noise))[0],
+        parts(turn=stated.phase_noise_deg)[0],
+        parts(tip._replace(ratio=tip.ratio / (1.0 + stated.frequency)))[0],
+        parts(tip._replace(quality=tip.quality * (1.0 + stated.quality)))[0],
+        parts(tip._replace(stiffness=tip.stiffness * (1.0 + stated.stiffness)))[0],
+        parts(turn=of_means * stated.phase_noise_deg)[0],
+        parts(factor=1.0 + of_means * stated.noise)[0],
+        energy + 0.1 * lost,
+    ]
+    return np.linalg.norm([one - energy for one in changes], axis=0)
+
+
 def table_of(
     tip: Tip,
     truth: Truth,
     stated: Stated,
     rng: np.random.Generator,
     *,
-    free_rows: int = 12,
-    both_ways: bool = False,
+    free_rows: int = FREE_ROWS,
+    back: Truth | None = None,
     phase_drift_deg: float = 0.0,
     amplitude_drift: float = 0.0,
     **also: Any,
@@ -172,21 +210,26 @@ def table_of(
         stated: errors of the instrument and of the readings.
         rng: what they are drawn from.
         free_rows: how many there are.
-        both_ways: whether the same rows follow in the other order, as the sample goes.
+        back: what it does as the sample goes again, its rows in the order of those before.
         phase_drift_deg: of the lag, from the first row to the last.
         amplitude_drift: of the amplitude, as a fraction.
         also: columns and comments of the table.
     """
     free, lag = tip.free_reading
     ahead = truth.height_nm.min() - tip.free_nm * np.linspace(0.5, 0.1, free_rows)
-    columns = [
-        np.concatenate([ahead, truth.height_nm]),
-        np.concatenate([np.full(free_rows, free), truth.amplitude_nm]),
-        np.concatenate([np.full(free_rows, lag), truth.lag_deg]),
-    ]
-    if both_ways:
+
+    def rows(way: Truth) -> list[np.ndarray]:
+        parts = (
+            (ahead, way.height_nm),
+            (np.full(free_rows, free), way.amplitude_nm),
+            (np.full(free_rows, lag), way.lag_deg),
+        )
+        return [np.concatenate(part) for part in parts]
+
+    columns = rows(truth)
+    if back is not None:
         also = {"retract": np.repeat([0.0, 1.0], len(columns[0]))} | also
-        columns = [np.concatenate([column, column[::-1]]) for column in columns]
+        columns = [np.concatenate([out, way[::-1]]) for out, way in zip(columns, rows(back), strict=True)]
     height, amplitude, lags = columns
     every, time = np.ones(len(height)), np.linspace(-0.5, 0.5, len(height))
     frequency, quality, stiffness = (

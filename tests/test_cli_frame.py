@@ -320,6 +320,18 @@ def test_interrupt_ends_with_130():
     assert (process.returncode, complaint.strip()) == (130, b"afm-jax: interrupted")
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signal")
+def test_an_interrupt_while_packages_are_imported_is_one_line(tmp_path: Path):
+    (tmp_path / "click.py").write_text("import os, signal, time\nos.kill(os.getpid(), signal.SIGINT)\ntime.sleep(9)\n")
+    code = (
+        "import runpy, signal\nsignal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "runpy.run_module('afm_jax', run_name='__main__')"
+    )
+    there = {**os.environ, "PYTHONPATH": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", code], env=there, capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (130, b"afm-jax: interrupted\n")
+
+
 def test_compiling_is_not_counted_in_the_time_left(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     clock = iter([0.0, 0.0, *[30.0] * 3, *[33.0] * 3])
     monkeypatch.setattr("afm_jax.cli.session.time.monotonic", lambda: next(clock))

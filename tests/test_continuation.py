@@ -511,3 +511,7 @@ def test_a_tip_at_rest_that_the_sample_goes_through_is_no_grazing():
     # once each: at rest on the highest sample, and where the flight touches the sample on its way
     assert [point.parameter for point in grazes] == [pytest.approx(-beta, abs=1e-9), pytest.approx(2.1222, abs=1e-3)]
     assert not any(abs(point.parameter - beta) < 1e-3 for point in found.special)
+    # nothing is captured without adhesion
+    ends = {end: one.parameter[place] for one in found.branches for place, end in ((0, one.ends[0]), (-1, one.ends[1]))}
+    assert "capture" not in ends
+    assert abs(ends["no_speed"]) == pytest.approx(beta, abs=1e-3)

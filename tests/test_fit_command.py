@@ -165,6 +165,16 @@ def test_repeated_readings_count_and_tell_the_error(tmp_path, reported):
         "p_value": pytest.approx(chi2.sf(2.5 * table.rows, 3 * table.rows)),
     }
     assert strictly(reported[0].stdout)["repeats"] is None
+    # amplitudes without errors of their own take their scatter, and it is said
+    lines = (tmp_path / "twice.csv").read_text(encoding="utf-8").splitlines()
+    names = next(line for line in lines if line.startswith("order"))
+    kept = [i for i, name in enumerate(names.split(",")) if not name.endswith("_error_nm")]
+    bare = [one if one[0] == "#" else ",".join(one.split(",")[i] for i in kept) for one in lines]
+    (tmp_path / "bare.csv").write_text("\n".join(bare) + "\n", encoding="utf-8")
+    said = [one for one in strictly(run(tmp_path / "bare.csv", "--json").stdout)["warnings"] if "repeated" in one]
+    assert [one.split(" +- ")[0] for one in said] == [
+        f"Errors from repeated readings: {name}" for name in ("peak_amplitude_nm", "lockin_amplitude_nm")
+    ]
 
 
 @pytest.mark.slow
@@ -209,6 +219,22 @@ def test_a_table_in_other_units_is_told_which(tmp_path, columns, factor, words):
     assert result.exit_code == 3
     (said,) = [reason for reason in strictly(result.stdout)["reasons"] if "Check the units" in reason]
     assert said.startswith(f"With {words}")
+
+
+@pytest.mark.slow
+def test_one_of_several_tables_in_other_units_is_named(tmp_path):
+    table = read_table(EXAMPLE)
+    parts = []
+    for name, rows in (("first.csv", slice(0, None, 2)), ("second.csv", slice(1, None, 2))):
+        own = {one: np.asarray(getattr(table, one))[rows] for one in TABLE.names if getattr(table, one) is not None}
+        if name == "second.csv":
+            own = {one: 2.0 * column if one.startswith(("peak", "lockin")) else column for one, column in own.items()}
+        write_table(dataclasses.replace(table, **own), tmp_path / name)
+        parts.append(tmp_path / name)
+    result = run(*parts, "--json")
+    assert result.exit_code == 3
+    (said,) = [reason for reason in strictly(result.stdout)["reasons"] if "Check its units" in reason]
+    assert said.startswith("second.csv: With the tip's amplitudes halved (peak to peak")
 
 
 @pytest.mark.slow

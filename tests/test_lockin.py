@@ -6,6 +6,7 @@ import pytest
 from fitting import TableError, Trace, lockin
 from fitting.traces.fold import fit_harmonics
 from fitting.traces.lockin import LockinResult, table_of
+from fitting.traces.report import lockin_summary
 from fitting.traces.trace import TraceSettings
 from fitting.traces.verdict import TraceKind
 from tests.lockin_traces import (
@@ -39,8 +40,10 @@ def test_harmonics_are_those_of_least_squares():
     # well-conditioned normal equations of 300 numbers of order 1
     np.testing.assert_allclose(found.coefficients, wanted[5:], rtol=0.0, atol=1e-12)
     np.testing.assert_allclose(found(angle), (design @ wanted).real, rtol=0.0, atol=1e-11)
-    weights = found.first_weights(angle)
+    weights = found.weights(angle)
     np.testing.assert_allclose(weights @ height, wanted[6], rtol=0.0, atol=1e-12)
+    third = fit_harmonics(angle, height, 5, 3).weights(angle)
+    np.testing.assert_allclose(third @ height, wanted[8], rtol=0.0, atol=1e-12)
 
 
 @pytest.mark.parametrize("order", [1, 2, 5])
@@ -77,6 +80,18 @@ def test_orbits_of_the_law_with_damping_and_delay(reduced: float, order: int):
         assert error < 1e-3 * row[name]
     assert result.phase_error_deg is not None
     assert abs(phase_apart(result, row["lockin_phase_deg"])) < 4.0 * result.phase_error_deg
+    # what any lock-in reads, whatever the order
+    turns = np.arange(20_000) / 20_000 * order
+    value = 2.0 * np.mean(orbit_heights(scene, order, turns * 1e3 / drive)[0] * np.exp(-2j * np.pi * turns))
+    assert result.drive_lockin_amplitude_error_nm is not None
+    assert abs((result.drive_lockin_amplitude_nm or 0.0) - abs(value)) < 4.0 * result.drive_lockin_amplitude_error_nm
+    assert result.drive_lockin_amplitude_error_nm < 0.05
+    read = np.exp(1j * np.deg2rad(result.drive_lockin_phase_deg or 0.0))
+    assert abs(np.angle(read / value, deg=True)) < 4.0 * (result.drive_lockin_phase_error_deg or 0.0)
+    if order == 1:
+        assert result.drive_lockin_amplitude_nm == result.lockin_amplitude_nm
+    else:
+        assert f"at the drive's {drive:.7g} kHz" in lockin_summary(result)
     assert result.noise_nm == pytest.approx(0.2, rel=0.1)
 
 

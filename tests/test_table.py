@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scipy.stats import t as student_t
 
 from fitting.tables.csv_text import TableError, setting_in
 from fitting.tables.table import SETTINGS, TABLE, AmplitudeTable, read_table, write_table
@@ -293,3 +294,38 @@ def test_a_hundred_thousand_rows_read_in_seconds(tmp_path: Path):
 def test_reading_does_not_load_jax():
     code = "import sys, fitting.tables.table; sys.exit('jax' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_repeated_readings_give_the_errors_that_a_table_lacks(tmp_path: Path):
+    """Pooled standard deviations of NumPy, widened by SciPy's Student's t; phases about 0 and 120 degrees."""
+    random = np.random.default_rng(5)
+    drive = np.repeat(np.arange(5), 3)
+    peak = (100.0 + 20.0 * drive) * (1.0 + 0.01 * random.standard_normal(15))
+    phase = np.where(drive == 0, 119.9, 30.0 + drive) + 0.3 * random.standard_normal(15)
+    rows = [
+        f"3,{180 + 10 * one},4,-2,{float(peak[i])!r},{float(phase[i] % 120.0)!r}"
+        for i, one in enumerate(drive.tolist())
+    ]
+    # a drive that was measured once has the error too
+    rows.append("3,250,4,-2,80,7")
+    names = "order,drive_frequency_khz,drive_amplitude_nm,offset_nm,peak_amplitude_nm,phase_deg"
+    path = tmp_path / "repeated.csv"
+    path.write_text("\n".join(["# free_frequency_khz = 90", names, *rows]) + "\n", encoding="utf-8")
+    table = read_table(path)
+    wider = student_t.ppf(0.975, 10) / 1.959964
+    share = np.sqrt(np.mean([np.var(peak[drive == i], ddof=1) / np.mean(peak[drive == i]) ** 2 for i in range(5)]))
+    degrees = np.sqrt(np.mean([np.var(phase[drive == i], ddof=1) for i in range(5)]))
+    np.testing.assert_allclose(table.peak_amplitude_error_nm, wider * share * np.append(peak, 80.0), rtol=1e-6)
+    np.testing.assert_allclose(table.phase_error_deg, np.full(16, wider * degrees), rtol=1e-6)
+    assert table.remarks[0] == (
+        f"errors from repeated readings: peak_amplitude_nm +- {100.0 * wider * share:.3g} % (15 rows of 5 drives, "
+        "widened 1.14 times for their number)"
+    )
+    again = AmplitudeTable.from_dataframe(table.to_pandas().drop(columns=["peak_amplitude_error_nm"]))
+    np.testing.assert_allclose(again.peak_amplitude_error_nm, table.peak_amplitude_error_nm, rtol=1e-12)
+    write_table(table, tmp_path / "written.csv")
+    assert read_table(tmp_path / "written.csv").remarks == table.remarks
+    # three repeats are too few
+    path.write_text("\n".join(["# free_frequency_khz = 90", names, *rows[:4], rows[-1]]) + "\n", encoding="utf-8")
+    with pytest.raises(TableError, match=r"has no errors; add .* or repeat readings: 4 repeats tell them"):
+        read_table(path)

@@ -12,7 +12,8 @@ from tests.table_texts import KEY, NAMES, ROW, fault_of, message_of
 
 Q = "'# quality_factor = 40 (or 40 +- 2)'"
 NOT_UTF8 = "line 1: is not UTF-8 text; save the table as CSV with the encoding UTF-8"
-ADD_ERRORS = "add the column peak_amplitude_error_nm or give the relative noise (--noise 1%)"
+REPEAT = ", or repeat readings: 4 repeats tell them"
+ADD_ERRORS = f"add the column peak_amplitude_error_nm or give the relative noise (--noise 1%){REPEAT}"
 NEEDS_ERROR = (
     "needs its standard error; write '# tip_calibration = 1 +- 0.02', or correct the columns and remove this line"
 )
@@ -81,7 +82,11 @@ def test_a_file_without_end_is_refused(monkeypatch: pytest.MonkeyPatch):
             ", column peak_amplitude_error_nm: stands without peak_amplitude_nm; add that column or remove this one",
         ),
         (",peak_amplitude_error_nm", "", f", column peak_amplitude_nm: has no errors; {ADD_ERRORS}"),
-        ("\n", ",phase_deg\n", ", column phase_deg: has no errors; add the column phase_error_deg"),
+        (
+            "\n",
+            ",phase_deg\n",
+            f", column phase_deg: has no errors; add the column phase_error_deg{REPEAT}",
+        ),
         (
             "\n",
             ",phase_error_deg\n",

@@ -11,6 +11,8 @@ from matplotlib.image import imread
 
 import fitting
 from afm_jax.cli.main import main
+from fitting.examples import make_raw_curve
+from fitting.instruments.curve import read_curve, table_text
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable
 from fitting.tapping_curves.branches import changes, free_rows
@@ -172,7 +174,7 @@ def test_bundled_curve_gives_the_energy_of_the_simulations_ledger():
     branch = next(one for one in result.hysteresis if one.change == "branch")
     assert branch.approach is not None
     assert branch.retract is not None
-    # where the simulation jumps: between 38 and 36 nm on the way in, 40 and 40.5 nm on the way back
+    # where the simulation jumps: between 38 and 36 nm on approach, 40 and 40.5 nm on retract
     assert -38.0 < branch.approach.offset_nm < -36.0
     assert -40.5 < branch.retract.offset_nm < -40.0
     assert {"attractive", "repulsive", "free", "held"} <= set(result.rows.state)
@@ -221,6 +223,34 @@ def test_what_no_energy_can_do_without_is_asked_for():
         tapping(replace(table, quality_factor=None, quality_factor_error=None))
     with pytest.raises(TableError, match="use `afm-jax fit`"):
         tapping(fitting.read_table(AMPLITUDES))
+
+
+def test_a_zero_that_free_rows_were_set_to_is_no_knowledge_besides_frequency_and_q(tmp_path: Path):
+    path = tmp_path / "curve.csv"
+    path.write_text(table_text(read_curve(make_raw_curve.EXAMPLE, **make_raw_curve.OPTIONS)), "utf-8")
+    table = fitting.read_table(path)
+    assert "phase_zero_deg" in table.calibration
+    found, without = (
+        {one.kind: one for one in functions.nuisances}
+        for functions in (
+            tapping(one, law=False).functions
+            for one in (table, replace(table, calibration=table.calibration | {"phase_zero_deg": (0.0, 1e3)}))
+        )
+        if functions is not None
+    )
+    assert found["free_frequency_khz"].standard_error == without["free_frequency_khz"].standard_error
+    # the example's own frequency, which is not the one that is stated
+    assert (
+        abs(found["free_frequency_khz"].value - make_raw_curve.FREE_FREQUENCY_KHZ)
+        < found["free_frequency_khz"].standard_error
+    )
+    # a zero that is known better is used
+    true = found["phase_zero_deg"].value
+    sharp = tapping(
+        replace(table, calibration=table.calibration | {"phase_zero_deg": (true, 0.1)}), law=False
+    ).functions
+    assert sharp is not None
+    assert {one.kind: one for one in sharp.nuisances}["free_frequency_khz"].standard_error < 2e-3
 
 
 def test_phases_of_another_sign_or_zero_are_told_by_the_free_rows():
@@ -297,7 +327,7 @@ def test_command_prints_and_writes_the_report(tmp_path: Path):
     assert answer["law"] is None
     assert "above resonance" in answer["reason"]
     assert len(answer["rows"]) == 64
-    assert all(one["reason"].startswith("set aside") for one in answer["set_aside"])
+    assert all(one["reason"].startswith("excluded") for one in answer["set_aside"])
     page = (tmp_path / "tapping.html").read_text(encoding="utf-8")
     assert "VALID" in page
     assert page.count("<img") == 2

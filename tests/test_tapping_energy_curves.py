@@ -136,7 +136,7 @@ def test_an_instrument_without_errors_has_usual_ones_and_ends_right_or_not_valid
 @pytest.mark.parametrize(("phase", "amplitude"), [(0.3, 0.0), (1.0, 0.0), (5.0, 0.0), (0.0, 0.01), (0.0, 0.03)])
 def test_a_drift_along_the_rows_is_fitted_where_their_order_is_known_and_else_said(phase: float, amplitude: float):
     truth, stated = one_energy(40), Stated(stiffness=1e-4, phase_noise_deg=0.2)
-    drifts = {"both_ways": True, "phase_drift_deg": phase, "amplitude_drift": amplitude}
+    drifts = {"back": truth, "phase_drift_deg": phase, "amplitude_drift": amplitude}
     table = table_of(Tip(), truth, stated, np.random.default_rng(7), **drifts, rows_in_order_of_time=True)
     result = tapping(table, law=False)
     assert result.valid, result.reasons
@@ -187,13 +187,17 @@ def test_each_free_amplitude_has_an_energy_of_its_own_and_the_picture_shows_all_
 
 
 @pytest.mark.slow
-def test_bands_hold_the_energies_of_random_laws():
+def test_bands_hold_the_energies_of_random_curves():
     for frequency_error in (1e-5, 1e-4):
-        found = [random_curve(number, frequency_error) for number in range(1000, 1024)]
-        off = np.abs(np.concatenate([one.energy for one in found]))
+        found = [random_curve(number, Stated(frequency=frequency_error)) for number in range(1000, 1025)]
+        assert {one.kind.split(" ")[0] for one in found} == {"law", "contact", "two"}
+        off = np.abs(np.concatenate([one.points.energy for one in found]))
         assert np.mean(off < 1.96) > 0.9
         assert off.max() < 4.0
         assert np.median(off) < 1.2 * 0.6745
+        changes = np.concatenate([one.hysteresis for one in found])
+        assert len(changes) == 10
+        assert np.abs(changes).max() < 2.0
 
 
 @pytest.mark.slow

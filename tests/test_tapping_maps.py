@@ -278,6 +278,20 @@ def test_a_grid_of_curves_is_read_at_one_amplitude(tmp_path: Path):
     assert "holds 6 curves, not 2 x 2 = 4" in refused.stderr
 
 
+@pytest.mark.parametrize("ratio", [0.0, 0.049, 1.0, np.nan])
+def test_an_amplitude_at_which_no_curve_is_read_is_refused(tmp_path: Path, ratio: float):
+    (path,) = written(tmp_path, "npz")
+    with pytest.raises(ValueError, match="`ratio` must be at least 0\\.05 and below 1"):
+        read_images(path, ratio=ratio)
+
+
+def test_a_share_that_the_command_takes_and_no_curve_is_read_at_is_one_line(tmp_path: Path):
+    (path,) = written(tmp_path, "npz")
+    result = run(path, *CALL, "--at", "0.01")
+    assert (result.exit_code, result.stdout, len(result.stderr.splitlines())) == (2, "", 1)
+    assert "must be at least 0.05 and below 1" in result.stderr
+
+
 def test_wrong_images_are_one_line(tmp_path: Path):
     amplitude, lag, _ = image()
     np.savez(tmp_path / "one.npz", amplitude=amplitude)

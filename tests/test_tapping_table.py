@@ -71,7 +71,10 @@ def test_a_written_curve_reads_back_the_same(tmp_path: Path, drive: str):
         (
             ",phase_lag_error_deg\n",
             "\n",
-            "line 5, column phase_lag_deg: has no errors; add the column phase_lag_error_deg",
+            (
+                "line 5, column phase_lag_deg: has no errors; add the column phase_lag_error_deg, or repeat readings: "
+                "4 repeats tell them"
+            ),
         ),
         (
             "5.4 +- 0.5\n",

@@ -46,6 +46,7 @@ CURVE_COLUMNS = ("curve", "kind", "parameter", "second", "admissible")
 _ENDS = {
     "range": "the end of the range",
     "capture": "capture: an impact comes too slowly to leave again",
+    "no_speed": "where an impact's speed vanishes: the tip grazes the sample, or rests on it",
     "delay": "close to capture, where the law's delay is longer than half a drive period",
     "shorter": "where it becomes an orbit of fewer impacts",
     "closed": "where it began: it is closed",

@@ -18,7 +18,14 @@ from afm_jax.dynamics.contact_orbits import ContactFlights, contact_loops
 from afm_jax.dynamics.curves import CurveLeg, FollowedCurve, followed_both_ways, lies_on, root_on, tested_by
 from afm_jax.dynamics.impact_loop import driven_part, samples_for
 from afm_jax.dynamics.impact_orbits import MOST_IMPACTS, many_impact_orbits
-from afm_jax.dynamics.special_points import OrbitBranch, SpecialCurve, SpecialPoint, special_curves, special_points_of
+from afm_jax.dynamics.special_points import (
+    OrbitBranch,
+    SpecialCurve,
+    SpecialPoint,
+    captures_nothing,
+    special_curves,
+    special_points_of,
+)
 from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.results import ResultTuple, columns_of, public_result
@@ -178,13 +185,15 @@ def _single_impact_loops(scene: Scene, order: int) -> tuple[Float[np.ndarray, "o
 
 
 def _branch(way: FollowedCurve, frame: Frame, equations: Equations) -> OrbitBranch:
-    """Return what there is to know of a curve; where it ends at capture its last point is the one just before."""
-    points = way.points
-    for end, legs, place in ((way.ends[0], way.behind, 0), (way.ends[1], way.ahead, -1)):
-        if end == "capture":
+    """Return what there is to know of a curve; where an impact loses its speed the last point is just before."""
+    points, ends = way.points, list(way.ends)
+    for place, legs in ((0, way.behind), (-1, way.ahead)):
+        if ends[place] == "capture":
             points[place] = _before_capture(legs[-1], frame, equations)
+            if captures_nothing(points[place], frame, equations):
+                ends[place] = "no_speed"
     value = float(frame.low[0]) + float(frame.width[0]) * points[:, -1]
-    return OrbitBranch(value, points[:, :-1], read_points(points, frame, equations), way.ends)
+    return OrbitBranch(value, points[:, :-1], read_points(points, frame, equations), (ends[0], ends[1]))
 
 
 def _before_capture(leg: CurveLeg, frame: Frame, equations: Equations) -> Float[np.ndarray, " n"]:

@@ -171,11 +171,15 @@ def _at_lost_ends(way: FollowedCurve) -> list[tuple[float, int, CurvePoint, np.n
 
 def _kind_of(test: int, step: CurvePoint, frame: Frame, equations: Equations) -> str:
     """Return what a root of a test function is: where the law captures nothing, an impact that vanishes is a graze."""
-    if test == CAPTURE and equations.flights is None:
-        _, shares = split_point(jnp.asarray(step.point), equations)
-        if float(loop_at(shares, frame, equations).impact.lowest) == 0.0:
-            return KINDS[GRAZING]
-    return KINDS[test]
+    return KINDS[GRAZING] if test == CAPTURE and captures_nothing(step.point, frame, equations) else KINDS[test]
+
+
+def captures_nothing(point: Float[np.ndarray, " n"], frame: Frame, equations: Equations) -> bool:
+    """Say whether the impacts of a point of a curve are of a law without adhesion, which any speed leaves."""
+    if equations.flights is not None:
+        return False
+    _, shares = split_point(jnp.asarray(point), equations)
+    return float(loop_at(shares, frame, equations).impact.lowest) == 0.0
 
 
 def _is_complex(step: CurvePoint) -> bool:

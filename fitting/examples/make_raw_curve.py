@@ -20,6 +20,7 @@ from scipy.interpolate import PchipInterpolator
 from scipy.ndimage import gaussian_filter1d
 
 from afm_jax.whole_files import write_whole
+from fitting.instruments.lag import free_lag_deg
 
 SPRING_CONSTANT, QUALITY_FACTOR, FREE_FREQUENCY_KHZ, DRIVE_KHZ = 44.0, 230.0, 344.604, 344.6
 FREE_NM, NM_PER_VOLT, PHASE_ZERO_DEG = 13.4, 42.0, 12.3
@@ -92,8 +93,7 @@ def _shapes() -> tuple[PchipInterpolator, PchipInterpolator]:
 
 def true_lag_deg(ratio: Float[np.ndarray, "..."], *, back: bool = False) -> Float[np.ndarray, "..."]:
     """Return the lag at an amplitude over the free one; on the way back a tap takes a little more."""
-    s = DRIVE_KHZ / FREE_FREQUENCY_KHZ
-    free = np.rad2deg(np.angle(1.0 - s**2 + 1j * s / QUALITY_FACTOR))
+    free = free_lag_deg("force", DRIVE_KHZ / FREE_FREQUENCY_KHZ, QUALITY_FACTOR)
     return free + (_shapes()[1](ratio) - 90.0) * (0.985 if back else 1.0)
 
 

@@ -56,12 +56,15 @@ class SteadyRow(NamedTuple):
     energy_aj: float
 
 
-def steady_curve(heights_nm: tuple[float, ...] = HEIGHTS_NM, ratio: float = 1.0) -> list[SteadyRow]:
+def steady_curve(
+    heights_nm: tuple[float, ...] = HEIGHTS_NM, ratio: float = 1.0, contact: Contact | None = None
+) -> list[SteadyRow]:
     """Return what is read at each height, one after the other.
 
     Args:
         heights_nm: of the sample over the rest position.
         ratio: drive over free frequency.
+        contact: of tip and sample; None: the paper's, with a tip radius of 10 nm.
     """
     stiffness, omega = SPRING_CONSTANT_N_PER_M, RAD_PER_US_PER_KHZ * FREE_FREQUENCY_KHZ
     cantilever = Cantilever(FREE_FREQUENCY_KHZ, QUALITY_FACTOR, stiffness / omega**2)
@@ -69,8 +72,7 @@ def steady_curve(heights_nm: tuple[float, ...] = HEIGHTS_NM, ratio: float = 1.0)
     frequency = ratio * FREE_FREQUENCY_KHZ
     period = US_PER_MS / frequency
     force = ForceDrive(stiffness * FREE_AMPLITUDE_NM * abs(gamma), frequency)
-    contact = Contact.paper(tip_radius_nm=TIP_RADIUS_NM)
-    follow = jax.jit(lambda scene, start, time: simulate(scene, start, time, max_contacts=1024, accuracy=1e-7))
+    contact = contact or Contact.paper(tip_radius_nm=TIP_RADIUS_NM)
     # the free tip at the top of its swing
     state = State(*map(jnp.asarray, (float(np.angle(gamma)) / (2.0 * np.pi) * period, FREE_AMPLITUDE_NM, 0.0)))
     rows = []
@@ -78,7 +80,7 @@ def steady_curve(heights_nm: tuple[float, ...] = HEIGHTS_NM, ratio: float = 1.0)
         scene = Scene(cantilever, Platform(0.0, frequency, jnp.asarray(float(height))), contact, force=force)
         motion = verdict = None
         for _ in range(_PIECES):
-            motion = _to_flight(partial(_for_a_time, follow, scene, state), period, height)
+            motion = _to_flight(partial(_for_a_time, scene, state), period, height)
             end = motion.final
             state = State(jnp.asarray(float(end.time_us) % period), end.position_nm, end.velocity_nm_per_us)
             verdict = settled(scene, motion, tolerance=1e-5)
@@ -91,8 +93,13 @@ def steady_curve(heights_nm: tuple[float, ...] = HEIGHTS_NM, ratio: float = 1.0)
     return rows
 
 
-def _for_a_time(follow: Callable[..., Simulation], scene: Scene, start: State, time_us: float) -> Simulation:
-    return follow(scene, start, jnp.asarray(time_us))
+@jax.jit
+def _follow(scene: Scene, start: State, time_us: jax.Array) -> Simulation:
+    return simulate(scene, start, time_us, max_contacts=1024, accuracy=1e-7)
+
+
+def _for_a_time(scene: Scene, start: State, time_us: float) -> Simulation:
+    return _follow(scene, start, jnp.asarray(time_us))
 
 
 def _to_flight(follow: Callable[[float], Simulation], period: float, height: float) -> Simulation:

@@ -374,36 +374,50 @@ _GROSS = 10.0
 _GRID = np.array([[r, epsilon] for r in (0.5, 0.7, 0.85, 0.93, 0.97, 0.99) for epsilon in (0.0, 30.0, 300.0, 3000.0)])
 """Values of r and epsilon over which the law of eq. 6 is looked at."""
 _BETTER = 0.5
+_TRIED = 6
+"""Tables of several that are tried in other units: each takes a fit."""
 
 
 def summarise_in_units(table: AmplitudeTable | SeveralTables, found: Found) -> FitResult:
     """Return the summary of a minimum; a table far from the model is tried in other units, and one that fits is named.
 
     Amplitudes in micrometres, peak to peak or rms, frequencies in Hz. The law of eq. 6 on a coarse grid says which of
-    them is nearest; the model is fitted to that.
+    them is nearest; the model is fitted to that. Several tables are tried one by one, the first of them.
     """
     result = summarise(table, found)
     far = found.refused or not result.chi2 < _GROSS * max(result.degrees_of_freedom, 1)
-    if not isinstance(table, AmplitudeTable) or result.valid or not far:
+    if result.valid or not far:
         return result
+    reasons = []
+    for one, label in zip(table.tables[:_TRIED], table.labels, strict=False):
+        said = _other_units(one, label, found)
+        if said:
+            reasons.append(f"{said} Check the units." if one is table else f"{label}: {said} Check its units.")
+    return replace(result, reasons=[*result.reasons, *reasons])
+
+
+def _other_units(table: AmplitudeTable, label: str, found: Found) -> str:
+    """Return in which other units a table fits the model of a fit by itself; nothing where it fits in none."""
     nearest, meant = min(
         ((_distance_from_law(one), (words, one)) for words, one in in_other_units(table)), key=lambda pair: pair[0]
     )
     if not nearest < _BETTER * _distance_from_law(table):
-        return result
+        return ""
     words, other = meant
-    asked = {name: found.settings[name] for name in ("free", "fixed", "constraints")}
+    asked = {name: found.settings[name] for name in ("free", "fixed")}
+    known = {
+        parameter_called(name).name: pair
+        for name, pair in found.settings["constraints"].items()
+        if not is_of_one_table(name) or name == name_of_table(parameter_called(name).name, label)
+    }
+    model, effects = found.settings["model"], found.settings["effects"] or EFFECTS
     try:
-        again = summarise(
-            other,
-            find_fit(other, result.model, effects=found.settings["effects"] or EFFECTS, **asked),
-        )
+        again = summarise(other, find_fit(other, model, effects=effects, constraints=known, **asked))
     except ValueError:
-        return result
+        return ""
     if not again.p_value >= IMPROBABLE:
-        return result
-    said = f"With {words} the model explains the table (chi2/dof = {again.chi2:.1f}/{again.degrees_of_freedom})."
-    return replace(result, reasons=[*result.reasons, f"{said} Check the units."])
+        return ""
+    return f"With {words} the model explains the table (chi2/dof = {again.chi2:.1f}/{again.degrees_of_freedom})."
 
 
 def _distance_from_law(table: AmplitudeTable) -> float:

@@ -20,7 +20,7 @@ from fitting.fits.result import FittedParameter, FittedRows
 from fitting.fits.unmodelled import Held
 from fitting.parameters import DELAY_NAMES, is_nuisance, name_of_table, parameter_called
 from fitting.tables.several import SeveralTables, repeats_of
-from fitting.tables.table import AmplitudeTable
+from fitting.tables.table import ERRORS_OF_REPEATS, AmplitudeTable
 
 _TIED = 0.995
 """Correlation beyond which two parameters are called determined only together."""
@@ -463,7 +463,10 @@ def _unit_warnings(evidence: Evidence) -> list[str]:
 
 
 def _repeat_warnings(evidence: Evidence) -> list[str]:
-    """Return what repeated readings say of the errors, where these are not theirs."""
+    """Return what repeated readings say of the errors, or that these are theirs."""
+    said = [remark for one in evidence.table.tables for remark in one.remarks if remark.startswith(ERRORS_OF_REPEATS)]
+    if said:
+        return [f"{remark[0].upper()}{remark[1:]}." for remark in dict.fromkeys(said)]
     repeats = repeats_of(evidence.table)
     if repeats is None or IMPROBABLE <= repeats.p_value <= 1.0 - IMPROBABLE:
         return []

@@ -24,7 +24,7 @@ from fitting.instruments.branch import JUMP, BranchLook, look_at
 from fitting.instruments.columns import ROLES, ColumnSource, example_of_columns, laid_out, parse_columns, turns_of
 from fitting.instruments.formats import read_recording
 from fitting.instruments.lag import free_lag_deg, sense_of
-from fitting.instruments.recording import UNITS, Known, Recording, Segment
+from fitting.instruments.recording import ASSUMED_RESONANCE, UNITS, Known, Recording, Segment
 from fitting.tables.csv_text import TableError
 
 FORMAT_VERSION = 1
@@ -171,7 +171,7 @@ def read_curves(
     if "drive_frequency_khz" not in known and "free_frequency_khz" in known:
         # lock-ins are tuned to the resonance before a curve is taken
         free = known["free_frequency_khz"]
-        known["drive_frequency_khz"] = Known(free.value, "kHz", _ASSUMED_RESONANCE)
+        known["drive_frequency_khz"] = Known(free.value, "kHz", ASSUMED_RESONANCE)
     of_slope = "nm_per_volt" in given and given["nm_per_volt"].value == "slope"
     places = list(dict.fromkeys(segment.curve for segment in recording.segments))
     curves = []
@@ -186,7 +186,6 @@ def read_curves(
     return curves
 
 
-_ASSUMED_RESONANCE = "assumed: on resonance, at the free frequency; else --drive-frequency-khz"
 _ASSUMED_BASE = "assumed: shaken at its base by a piezo; --drive force for a photothermal or magnetic drive"
 
 
@@ -591,7 +590,8 @@ def _with_zero_of_phase(curve: MeasuredCurve, *, sign_given: bool) -> MeasuredCu
     quality_factor = curve.number("quality_factor")
     if phase is None or None in numbers or quality_factor is None or not curve.free.any():
         return curve
-    lag = free_lag_deg(str(curve.known["drive"].value), numbers[0] / numbers[1], quality_factor)  # type: ignore[operator]
+    ratio = numbers[0] / numbers[1]  # type: ignore[operator]
+    lag = float(free_lag_deg(str(curve.known["drive"].value), ratio, quality_factor))
     free = phase[curve.free]
     level, scatter = float(np.median(free)), float(np.std(free) / np.sqrt(len(free)))
     error = float(np.hypot(max(scatter, 0.01), _error_of_lag(curve)))
@@ -612,7 +612,7 @@ def _error_of_lag(curve: MeasuredCurve) -> float:
 
     def lag(**changed: float) -> float:
         drive, free, quality_factor = (at | changed).values()
-        return free_lag_deg(str(curve.known["drive"].value), drive / free, quality_factor)
+        return float(free_lag_deg(str(curve.known["drive"].value), drive / free, quality_factor))
 
     errors = {key: curve.known[key].error or share * at[key] for key, share in _USUAL.items()}
     parts = [0.5 * (lag(**{key: at[key] + error}) - lag(**{key: at[key] - error})) for key, error in errors.items()]
@@ -665,7 +665,7 @@ def _phase_notes(curve: MeasuredCurve) -> list[str]:
     quality_factor = float(curve.known["quality_factor"].value)
     if near.any() and free is not None and abs(ratio - 1.0) > 0.005 and curve.known["drive"].value == "force":
         response = abs(1.0 - ratio**2 + 1j * ratio / quality_factor)
-        lag = free_lag_deg("force", ratio, quality_factor)
+        lag = float(free_lag_deg("force", ratio, quality_factor))
         lost = [
             float(
                 np.median(

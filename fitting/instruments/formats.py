@@ -29,6 +29,7 @@ from fitting.instruments.recording import (
     Recording,
     Segment,
     cut_off,
+    damaged_as_one_line,
     known_from,
     number_in,
     unit_named,
@@ -54,13 +55,8 @@ def read_recording(path: str | Path) -> Recording:
     if not data.strip():
         raise TableError(f"{name}: the file is empty; copy it again from the instrument")
     parse = _parser_of(data, str(path))
-    try:
+    with damaged_as_one_line(name):
         recording = parse(data, name)
-    except TableError:
-        raise
-    except Exception as error:  # a damaged file makes parsers, ours and others', fail in many ways
-        what = " ".join(f"{type(error).__name__}: {error}".split())[:120]
-        raise cut_off(name, f"cannot be read ({printable(what)})") from error
     if not recording.segments or any(not np.size(v) for s in recording.segments for v in s.channels.values()):
         raise cut_off(name, "holds no rows of numbers")
     return recording if all(channel.isprintable() for channel in recording.channels) else _spelled(recording)

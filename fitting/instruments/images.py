@@ -15,7 +15,7 @@ from fitting.instruments.columns import ROLES, ColumnSource, parse_columns
 from fitting.instruments.curve import read_curves
 from fitting.instruments.formats import igor_wave, nanosurf_sets
 from fitting.instruments.gwyddion import MAGIC, read_objects
-from fitting.instruments.recording import UNITS, Known, cut_off, unit_named
+from fitting.instruments.recording import UNITS, Known, damaged_as_one_line, unit_named
 from fitting.tables.csv_text import TableError, read_bytes
 
 _NAMES = {"lockin_amplitude_nm": r"(lockin[_ ])?amp.*", "phase_lag_deg": r"pha.*"}
@@ -69,6 +69,10 @@ class AmplitudeAndPhase:
     notes: tuple[str, ...] = ()
 
 
+_LEAST_RATIO = 0.05
+"""Amplitude, of the free one, below which the sample holds the tip."""
+
+
 def read_images(
     path: str | Path,
     phase_path: str | Path | None = None,
@@ -84,11 +88,14 @@ def read_images(
         phase_path: file of the phase, where amplitude and phase are two.
         columns: which channel is which, as for `read_curves`.
         grid: rows and columns of a file of curves, one a pixel, in the order of the file.
-        ratio: amplitude over that of the free tip at which each pixel's curve is read.
+        ratio: amplitude over that of the free tip at which each pixel's curve is read, at least 0.05 and below 1.
 
     Raises:
         TableError: one line: the file is damaged, of no known format, or has no such channel.
+        ValueError: if the ratio is none.
     """
+    if not _LEAST_RATIO <= ratio < 1.0:
+        raise ValueError(f"`ratio` must be at least {_LEAST_RATIO} and below 1, but is {ratio!r}")
     wanted = parse_columns(columns) if isinstance(columns, str) and columns else dict(columns or {})
     if grid is not None:
         return _of_file_of_curves(path, wanted, grid, ratio)
@@ -171,7 +178,7 @@ def _images(path: str | Path) -> Images:
     name = printable(str(path))
     data = read_bytes(path, "one file")
     head = data[:16]
-    try:
+    with damaged_as_one_line(name):
         if head.startswith(MAGIC):
             return _of_gwyddion(data, name)
         if head.startswith((b"PK", b"\x93NUMPY")):
@@ -181,11 +188,6 @@ def _images(path: str | Path) -> Images:
         if head[:2] in {b"\x05\x00", b"\x00\x05", b"\x02\x00", b"\x00\x02"}:
             return _of_igor(data, name)
         return _of_text(data, name)
-    except TableError:
-        raise
-    except Exception as error:  # a damaged file makes parsers, ours and others', fail in many ways
-        what = " ".join(f"{type(error).__name__}: {error}".split())[:120]
-        raise cut_off(name, f"cannot be read ({printable(what)})") from error
 
 
 def _of_gwyddion(data: bytes, name: str) -> Images:

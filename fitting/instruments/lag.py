@@ -5,22 +5,23 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+Numbers = float | Float[np.ndarray, "..."]
 _NEAR_DEG = 20.0
 """How near to a lag of the opposite sign the free tip's phase must be to be told as one."""
 
 
-def free_lag_deg(drive: str, frequency_ratio: float, quality_factor: float) -> float:
-    """Return the lag of the free tip behind its drive: of its height (force) or of the deflection (base).
+def free_lag_deg(drive: str, frequency_ratio: Numbers, quality_factor: Numbers) -> Float[np.ndarray, "..."]:
+    """Return the lag of the free tip behind its drive in degrees: of its height (force) or of the deflection (base).
 
     With gamma = 1 - s^2 + i s/Q the height lags by arg gamma, the deflection behind the base by arg gamma - arg(1 -
     gamma).
 
-    >>> free_lag_deg("force", 1.0, 200.0), round(free_lag_deg("base", 1.0, 200.0), 2)
-    (90.0, 90.29)
+    >>> [round(float(free_lag_deg(drive, 1.0, 200.0)), 2) for drive in ("force", "base")]
+    [90.0, 90.29]
     """
     gamma = 1.0 - frequency_ratio**2 + 1j * frequency_ratio / quality_factor
     lag = np.angle(gamma) - (np.angle(1.0 - gamma) if drive == "base" else 0.0)
-    return float(np.rad2deg(lag))
+    return np.asarray(np.rad2deg(lag))
 
 
 class PhaseSense(NamedTuple):

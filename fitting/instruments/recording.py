@@ -5,12 +5,14 @@ by those who read it further.
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.scenefile.tables import printable
 from fitting.tables.csv_text import NUMBER, TableError
 
 UNITS = {
@@ -162,6 +164,26 @@ def known_from(
             # twelve digits: a change of unit must not add others
             found[key] = Known(float(f"{said[0] * factor:.12g}"), _NATIVE.get(quantity, ""), f"{where}: {name}")
     return found
+
+
+ASSUMED_RESONANCE = "assumed: on resonance, at the free frequency; else --drive-frequency-khz"
+"""Origin of a drive's frequency that nobody gave."""
+
+
+@contextmanager
+def damaged_as_one_line(source: str) -> Iterator[None]:
+    """Turn what a parser raises at a damaged file, in many ways and by others' code, into one line.
+
+    Raises:
+        TableError: that line, or the parser's own.
+    """
+    try:
+        yield
+    except TableError:
+        raise
+    except Exception as error:
+        what = " ".join(f"{type(error).__name__}: {error}".split())[:120]
+        raise cut_off(source, f"cannot be read ({printable(what)})") from error
 
 
 def cut_off(source: str, what: str) -> TableError:

@@ -12,7 +12,15 @@ import numpy as np
 from jaxtyping import Float, Int, Shaped
 
 from afm_jax.least_squares import chi2_tail
-from fitting.tables.table import MEASURED, AmplitudeTable, required
+from fitting.tables.table import (
+    MEASURED,
+    AmplitudeTable,
+    columns_of,
+    drive_numbers,
+    required,
+    scatter_about_means,
+    turn_of,
+)
 
 
 @dataclass(frozen=True)
@@ -202,45 +210,22 @@ def repeats_of(table: AmplitudeTable | SeveralTables) -> RepeatedReadings | None
 
 def drive_of_rows(table: AmplitudeTable) -> Int[np.ndarray, " rows"]:
     """Return the number of the drive that each row is of: the same for rows that repeat each other."""
-    names = [column.name for column in required(vars(table)) if getattr(table, column.name) is not None]
-    keys = [np.asarray(getattr(table, name), float) for name in dict.fromkeys([*names, "order"])]
-    if table.retract is not None:
-        keys.append(np.nan_to_num(table.retract))
-    return np.unique(np.stack(keys), axis=1, return_inverse=True)[1].ravel()
+    columns = columns_of(table)
+    return drive_numbers(columns, required(columns))
 
 
 def _sums(table: AmplitudeTable) -> tuple[int, int, int, float]:
     """Return repeated drives, their rows, the degrees of freedom of their scatter and its chi2."""
-    drive = drive_of_rows(table)
+    drive, columns = drive_of_rows(table), columns_of(table)
     count = np.bincount(drive)
     freedom, chi2 = 0, 0.0
     for column in MEASURED:
-        values = getattr(table, column.name)
-        if values is None:
+        if column.name not in columns:
             continue
-        error = getattr(table, str(column.error))
+        values, error, turn = columns[column.name], columns[str(column.error)], turn_of(column, columns)
         there = np.isfinite(values) & (count[drive] > 1)
-        turn = None if column.amplitude else 360.0 / table.order
-        more, sum_of_squares = _scatter(
+        more, sum_of_squares = scatter_about_means(
             drive[there], values[there], error[there], None if turn is None else turn[there]
         )
         freedom, chi2 = freedom + more, chi2 + sum_of_squares
     return int((count > 1).sum()), int(count[count > 1].sum()), freedom, chi2
-
-
-def _scatter(
-    drive: Int[np.ndarray, " n"],
-    values: Float[np.ndarray, " n"],
-    error: Float[np.ndarray, " n"],
-    turn: Float[np.ndarray, " n"] | None,
-) -> tuple[int, float]:
-    """Return degrees of freedom and chi2 about each drive's weighted mean; angles within half a turn of the first."""
-    if not drive.size:
-        return 0, 0.0
-    _, first, place = np.unique(drive, return_index=True, return_inverse=True)
-    apart = values - values[first][place]
-    if turn is not None:
-        apart = apart - turn * np.round(apart / turn)
-    weight = error**-2.0
-    mean = np.bincount(place, weight * apart) / np.bincount(place, weight)
-    return drive.size - first.size, float(np.sum(weight * (apart - mean[place]) ** 2))

@@ -12,12 +12,12 @@ drives that may be there repeatedly)::
 may be left out, and ``mass_ng`` or ``spring_constant_n_per_m`` (m = k/Omega^2; without both, energies are not known).
 The columns ``order`` to ``offset_nm`` and one of ``peak_amplitude_nm`` and ``lockin_amplitude_nm`` are needed;
 ``phase_deg`` may join them. Each measured column has a column of standard errors (``..._error_nm``,
-``phase_error_deg``). A blank cell in a measured column says that this was not measured. A column ``no_orbit`` marks by
-1 drives on which the tip settled on no steady single-impact orbit (it stuck, or moved chaotically): their amplitudes
-are blank. Comments such as ``# tip_calibration = 1 +- 0.02``, ``# drive_calibration = 1 +- 0.01`` and ``#
-offset_origin_nm = 0 +- 0.3`` say what is known of the instrument. ``# rows = in order of time`` says that the rows
-stand as they were measured, so that a slow drift of phase and amplitude is told from what they mean. Other comments are
-kept as remarks.
+``phase_error_deg``); without it the scatter of repeated readings is taken, where they suffice. A blank cell in a
+measured column says that this was not measured. A column ``no_orbit`` marks by 1 drives on which the tip settled on no
+steady single-impact orbit (it stuck, or moved chaotically): their amplitudes are blank. Comments such as ``#
+tip_calibration = 1 +- 0.02``, ``# drive_calibration = 1 +- 0.01`` and ``# offset_origin_nm = 0 +- 0.3`` say what is
+known of the instrument. ``# rows = in order of time`` says that the rows stand as they were measured, so that a slow
+drift of phase and amplitude is told from what they mean. Other comments are kept as remarks.
 
 A cantilever that is driven itself over a sample at rest (a tapping or amplitude-phase-distance curve) says so::
 
@@ -32,7 +32,7 @@ A cantilever that is driven itself over a sample at rest (a tapping or amplitude
 is the default. ``free_amplitude_nm`` is the amplitude of the free tip, ``offset_nm`` the sample's height over the tip's
 rest position, ``phase_lag_deg`` how far the response lags behind the drive; under ``base`` free and lock-in amplitude
 are those of the deflection, the lag is behind the base. ``order`` may be left out (1), ``retract`` marks by 1 the rows
-of the way back, and ``# phase_zero_deg = 0 +- 0.2`` says how well the instrument's zero of phase is known.
+of the retract, and ``# phase_zero_deg = 0 +- 0.2`` says how well the instrument's zero of phase is known.
 
 The comment lines of an amplitude table: what `# key = value` says about the cantilever, and free remarks.
 
@@ -40,6 +40,7 @@ The columns of an amplitude table, and the checks that every table must pass.
 """
 
 import os
+from collections.abc import Collection
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
@@ -49,7 +50,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from afm_jax.checks import check_kind, checked
 from afm_jax.results import Result, public_result
-from afm_jax.units import contradicting_mass, effective_mass_ng
+from afm_jax.units import TWO_SIDED_95, contradicting_mass, effective_mass_ng
 from afm_jax.whole_files import write_whole
 from fitting.tables.csv_text import (
     LARGEST,
@@ -76,6 +77,10 @@ from fitting.tables.csv_text import (
     split_lines,
 )
 
+LEAST_REPEATS = 4
+"""Readings beyond the first of each drive from which on their scatter gives errors."""
+ERRORS_OF_REPEATS = "errors from repeated readings: "
+"""How the remark begins that says so."""
 # An overdamped cantilever does not vibrate.
 LOWEST_QUALITY_FACTOR = 0.5
 SETTINGS = {
@@ -208,7 +213,12 @@ MEASURED = tuple(column for column in _ALL if column.error is not None)
 AMPLITUDES = tuple(column for column in _ALL if column.amplitude)
 
 
-def required(columns: Columns) -> tuple[Column, ...]:
+def columns_of(table: "AmplitudeTable") -> dict[str, Any]:
+    """Return the columns that a table has, by name."""
+    return {column.name: getattr(table, column.name) for column in _ALL if getattr(table, column.name) is not None}
+
+
+def required(columns: dict[str, Any]) -> tuple[Column, ...]:
     """Return the columns of which every row needs a number, of those that a table has."""
     return tuple(column for column in _ALL if column.required and column.name in columns)
 
@@ -220,26 +230,34 @@ def _check_order(columns: Columns, lines: Int[np.ndarray, " rows"], faults: Faul
         faults.add(f"{message}; remove the row", line=int(lines[row]), column="order")
 
 
-def check_error_columns(head: Head, faults: Faults, noise: float | None) -> None:
-    """Note measured columns without their errors, and errors without what they belong to.
+def check_error_columns(head: Head, faults: Faults) -> None:
+    """Note errors without what they belong to.
 
     Args:
         head: the column names.
         faults: where the faults are noted.
-        noise: relative noise for amplitudes without an error column, or None.
     """
     for column in MEASURED:
-        error, line = str(column.error), head.line
+        error = str(column.error)
         if error in head.present and column.name not in head.present:
             message = f"stands without {column.name}; add that column or remove this one"
-            faults.add(message, line=line, column=error)
-        if column.name not in head.present or error in head.present:
-            continue
-        if not column.amplitude:
-            faults.add(f"has no errors; add the column {error}", line=line, column=column.name)
-        elif noise is None:
-            hint = f"add the column {error} or give the relative noise (--noise 1%)"
-            faults.add(f"has no errors; {hint}", line=line, column=column.name)
+            faults.add(message, line=head.line, column=error)
+
+
+def check_errors(head: Head, present: Collection[str], faults: Faults) -> None:
+    """Note measured columns without their errors.
+
+    Args:
+        head: the column names.
+        present: names of the columns, with the errors that noise and repeated readings give.
+        faults: where the faults are noted.
+    """
+    for column in MEASURED:
+        if column.name in present and column.error not in present:
+            hint = f"add the column {column.error}"
+            hint += " or give the relative noise (--noise 1%)" if column.amplitude else ""
+            hint += f", or repeat readings: {LEAST_REPEATS} repeats tell them"
+            faults.add(f"has no errors; {hint}", line=head.line, column=column.name)
 
 
 def fill_errors(columns: Columns, unreadable: Masks, noise: float | None) -> None:
@@ -260,6 +278,91 @@ def fill_errors(columns: Columns, unreadable: Masks, noise: float | None) -> Non
             columns[error] = np.where(np.isnan(errors) & possible, noise * values, errors)
             value_is_bad = ~possible & (~np.isnan(values) | unreadable[column.name])
             unreadable[error] = unreadable.get(error, np.zeros(len(values), dtype=bool)) | value_is_bad
+
+
+def drive_numbers(columns: dict[str, Any], required: tuple[Column, ...]) -> Int[np.ndarray, " rows"]:
+    """Return the number of the drive that each row is of: the same for rows that repeat each other.
+
+    Args:
+        columns: of the table, by name.
+        required: those of which every row needs a number.
+    """
+    names = [column.name for column in required if column.name in columns]
+    names += ["order"] if "order" in columns else []
+    keys = [np.asarray(columns[name], float) for name in dict.fromkeys(names)]
+    if "retract" in columns:
+        keys.append(np.nan_to_num(columns["retract"]))
+    return np.unique(np.stack(keys), axis=1, return_inverse=True)[1].ravel()
+
+
+def scatter_about_means(
+    drive: Int[np.ndarray, " n"],
+    values: Float[np.ndarray, " n"],
+    error: Float[np.ndarray, " n"],
+    turn: Float[np.ndarray, " n"] | None,
+) -> tuple[int, float]:
+    """Return degrees of freedom and chi2 about each drive's weighted mean; angles within half a turn of the first."""
+    if not drive.size:
+        return 0, 0.0
+    _, first, place = np.unique(drive, return_index=True, return_inverse=True)
+    apart = values - values[first][place]
+    if turn is not None:
+        apart = apart - turn * np.round(apart / turn)
+    weight = error**-2.0
+    mean = np.bincount(place, weight * apart) / np.bincount(place, weight)
+    return drive.size - first.size, float(np.sum(weight * (apart - mean[place]) ** 2))
+
+
+def turn_of(column: Column, columns: dict[str, Any]) -> Float[np.ndarray, " rows"] | None:
+    """Return after how many degrees a phase repeats itself; None of an amplitude."""
+    if column.amplitude:
+        return None
+    rows = len(columns[column.name])
+    return 360.0 / np.asarray(columns.get("order", np.ones(rows)), float)
+
+
+def fill_errors_of_repeats(columns: Columns, required: tuple[Column, ...], measured: tuple[Column, ...]) -> list[str]:
+    """Add the errors that a table does not give, where repeated readings tell them: one scatter for all its rows.
+
+    Amplitudes scatter by a share of them, phases by an angle. Of few readings the scatter is itself uncertain: it is
+    widened by the quantile of Student's t over that of the normal distribution, so that 95 % intervals are that.
+
+    Args:
+        columns: of the table, by name, changed in place.
+        required: those of which every row needs a number.
+        measured: those that need errors.
+
+    Returns:
+        A remark for each column that errors were added for.
+    """
+    lacking = [column for column in measured if column.name in columns and str(column.error) not in columns]
+    readable = all(np.isfinite(columns[one.name]).all() for one in required if one.name in columns)
+    if not lacking or not columns[lacking[0].name].size or not readable:
+        return []
+    from scipy.stats import t as student_t  # noqa: PLC0415 - fits of other tables need no SciPy
+
+    drive, remarks = drive_numbers(columns, required), []
+    for column in lacking:
+        values = columns[column.name]
+        known = np.isfinite(values) & ((values > 0.0) | (not column.amplitude))
+        there = known & (np.bincount(drive[known], minlength=drive.max() + 1) > 1)[drive]
+        means = np.bincount(drive[there], values[there], drive.max() + 1)
+        means = means / np.maximum(np.bincount(drive[there], minlength=drive.max() + 1), 1)
+        size, turn = means[drive] if column.amplitude else np.ones(len(values)), turn_of(column, columns)
+        freedom, chi2 = scatter_about_means(
+            drive[there], values[there], size[there], None if turn is None else turn[there]
+        )
+        if freedom < LEAST_REPEATS or chi2 == 0.0:
+            continue
+        wider = float(student_t.ppf(0.975, freedom)) / TWO_SIDED_95
+        error = wider * float(np.sqrt(chi2 / freedom))
+        columns[str(column.error)] = np.where(known, error * (values if column.amplitude else 1.0), np.nan)
+        said = f"{100.0 * error:.3g} %" if column.amplitude else f"{error:.3g} degrees"
+        count = f"{int(there.sum())} rows of {len(np.unique(drive[there]))} drives"
+        remarks.append(
+            f"{ERRORS_OF_REPEATS}{column.name} +- {said} ({count}, widened {wider:.2f} times for their number)"
+        )
+    return remarks
 
 
 def check_rows(
@@ -425,7 +528,7 @@ class AmplitudeTable(Result):
         if self.drive not in FORMS:
             faults.add(f"drive must be one of {', '.join(FORMS)}, but is {self.drive!r}")
             faults.raise_any()
-        columns = {c.name: getattr(self, c.name) for c in _ALL if getattr(self, c.name) is not None}
+        columns = columns_of(self)
         if self.drive != "sample" and np.size(self.order) == 0:
             columns["order"] = np.ones(rows)
         lines = self.lines if own else np.arange(1, rows + 1)
@@ -472,6 +575,8 @@ class AmplitudeTable(Result):
                 faults.add(f"{name} is missing; give it {how if name in own else 'as a column'}")
         faults.raise_any()
         fill_errors(columns, {name: np.zeros(len(frame), dtype=bool) for name in columns}, noise)
+        repeats = fill_errors_of_repeats(columns, required(columns), MEASURED)
+        known["remarks"] = (*known.get("remarks", ()), *repeats)
         if "order" in columns:
             columns["order"] = columns["order"].astype(np.int64)
         return cls(**columns, **known)
@@ -640,14 +745,25 @@ def parse_table(text: str, source: str, noise: float | None = None) -> Amplitude
         faults.raise_any()
         raise AssertionError
     head, rows = named_rows(rows, form, faults)
-    check_error_columns(head, faults, noise)
+    check_error_columns(head, faults)
     if faults.count > found:
         # With a wrong name the cells below it cannot be judged.
+        if noise is None:
+            check_errors(head, head.present, faults)
+        faults.raise_any()
+    if any(column.name in head.present and column.error not in head.present for column in MEASURED):
+        # whether noise or repeated readings give them is known from the rows, whose own faults come later
+        columns, unreadable, _ = parse_rows(rows, head.names, form, Faults(source))
+        fill_errors(columns, unreadable, noise)
+        fill_errors_of_repeats(columns, required(columns), MEASURED)
+        check_errors(head, columns, faults)
         faults.raise_any()
     columns, unreadable, lines = parse_rows(rows, head.names, form, faults)
     fill_errors(columns, unreadable, noise)
+    repeats = fill_errors_of_repeats(columns, required(columns), MEASURED)
     check_rows(columns, lines, faults, unreadable)
     faults.raise_any()
+    header = replace(header, remarks=(*header.remarks, *repeats))
     arrays: dict[str, Any] = dict(columns)
     if "order" in columns:
         arrays["order"] = columns["order"].astype(np.int64)

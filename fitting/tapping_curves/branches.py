@@ -1,6 +1,6 @@
 """Free rows, attractive and repulsive rows, and the heights at which a curve changes between them, out and back.
 
-On the way in the bridge forms where the tip's lowest point comes near enough; on the way back it may hold longer. And
+On approach the bridge forms where the tip's lowest point comes near enough; on retract it may hold longer. And
 attractive and repulsive branch coexist over a stretch of heights, so that the jump between them comes at another height
 on the way back. Each such pair of heights, and the energy between the two branches, is a `Hysteresis`.
 """
@@ -51,8 +51,8 @@ class Hysteresis:
         approach: where it comes as the sample comes nearer; None where it does not show.
         retract: where it goes as the sample goes.
         energy_between_aj: retract less approach over the heights between, and its standard error: of a tap, or for
-            a tip that is held of the whole way in and out, (k/2)(retract^2 - approach^2).
-        energy_of: "a tap" or "the way in and out"; empty where there is none.
+            a tip that is held of approach and retract together, (k/2)(retract^2 - approach^2).
+        energy_of: "a tap" or "approach and retract"; empty where there is none.
     """
 
     change: str
@@ -70,6 +70,48 @@ class Hysteresis:
             return None
         error = float(np.hypot(self.approach.standard_error, self.retract.standard_error))
         return self.approach.offset_nm - self.retract.offset_nm, error
+
+
+def way_of(retract: bool | np.bool_) -> str:  # noqa: FBT001
+    """Return what the way of the sample is called."""
+    return "retract" if retract else "approach"
+
+
+def side_of(repulsive: bool | np.bool_) -> str:  # noqa: FBT001
+    """Return what the side of the phase is called."""
+    return "repulsive" if repulsive else "attractive"
+
+
+@dataclass(frozen=True, kw_only=True)
+class CurveBranch:
+    """What tells one branch of a curve from the others.
+
+    Attributes:
+        drive_frequency_khz: of the rows.
+        free_amplitude_nm: of the rows.
+        retract: whether the sample moves away.
+        repulsive: whether the lag is below the free tip's.
+    """
+
+    drive_frequency_khz: float
+    free_amplitude_nm: float
+    retract: bool
+    repulsive: bool
+
+    @property
+    def way(self) -> str:
+        """Which way the sample moves."""
+        return way_of(self.retract)
+
+    @property
+    def side(self) -> str:
+        """Whether the tip is attracted or repelled."""
+        return side_of(self.repulsive)
+
+    @property
+    def name(self) -> str:
+        """What the branch is called."""
+        return f"{self.way}, {self.side}"
 
 
 def ways(curve: TappingCurve) -> list[np.ndarray]:
@@ -196,7 +238,7 @@ def changes(
     energy: Rows,
     noise: Rows,
 ) -> list[Hysteresis]:
-    """Return the changes of each drive, as far as they show on the way in or back.
+    """Return the changes of each drive, as far as they show on approach or retract.
 
     Args:
         curve: the curve.
@@ -329,7 +371,7 @@ def _with_energy(
         if not curve.height_known:
             return found
         value = _energy_of_release(curve, found.approach.offset_nm, found.retract.offset_nm)
-        return replace(found, energy_between_aj=value, energy_of="the way in and out")
+        return replace(found, energy_between_aj=value, energy_of="approach and retract")
     if not all(np.isfinite(energy[p]).any() for p in between):
         return found
     (before, before_error), (after, after_error) = (_mean(energy[p], noise[p]) for p in between)
@@ -344,7 +386,7 @@ def _mean(values: Rows, errors: Rows) -> tuple[float, float]:
 
 
 def _energy_of_release(curve: TappingCurve, approach: float, retract: float) -> tuple[float, float]:
-    """Return what the way in and out takes of a tip that was held, with its error: the lever lets go of (k/2) h^2.
+    """Return what approach and retract take of a tip that was held, with its error: the lever lets go of (k/2) h^2.
 
     Heights are known far better to each other than to the tip's rest position.
     """

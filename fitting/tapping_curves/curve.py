@@ -14,6 +14,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
+from fitting.instruments.lag import free_lag_deg
+
 Rows = Float[np.ndarray, " rows"]
 Phasors = Complex[np.ndarray, " rows"]
 
@@ -173,8 +175,7 @@ def motion_of(curve: TappingCurve, instrument: Instrument) -> TipMotion:
     return TipMotion(gamma, free, reading, reading - gamma * free)
 
 
-def free_lag_deg(curve: TappingCurve, instrument: Instrument) -> Rows:
-    """Return the lag that the free tip shows on the instrument, in degrees."""
-    gamma = motion_of(curve, instrument).gamma
-    lag = np.angle(gamma) if curve.drive == "force" else np.angle(gamma) - np.angle(1.0 - gamma)
-    return np.rad2deg(lag) + instrument.phase_zero_deg
+def lag_of_free_tip(curve: TappingCurve, instrument: Instrument) -> Rows:
+    """Return the lag that the free tip shows on the instrument in every row, in degrees."""
+    ratio = curve.drive_frequency_khz / instrument.free_frequency_khz
+    return free_lag_deg(curve.drive, ratio, instrument.quality_factor) + instrument.phase_zero_deg

@@ -5,8 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from fitting.tapping_curves.branches import CurveBranch
 from fitting.tapping_curves.curve import Rows, TappingCurve
-from fitting.tapping_curves.energy_fit import Z95, EnergyFit, depths, smoother_along, virial_noise
+from fitting.tapping_curves.energy_fit import Z95, EnergyFit, losses, smoother_along, virial_noise
 
 FEWEST_ROWS = 3
 """Of a group of rows that gets an energy of its own."""
@@ -62,36 +63,21 @@ class EnergyCurve:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class TappingBranch:
+class TappingBranch(CurveBranch):
     """Rows of one drive, one way and one side of the phase, and the energy along them.
 
     Attributes:
-        drive_frequency_khz: of the rows.
-        free_amplitude_nm: of the rows.
-        retract: whether the sample moves away.
-        repulsive: whether the lag is below the free tip's.
         rows: numbers of the rows.
         curve: energy and virial along them.
     """
 
-    drive_frequency_khz: float
-    free_amplitude_nm: float
-    retract: bool
-    repulsive: bool
     rows: Int[np.ndarray, " some"]
     curve: EnergyCurve
 
-    @property
-    def way(self) -> str:
-        """Which way the sample moves."""
-        return "retract" if self.retract else "approach"
 
-
-def branches_of(
-    curve: TappingCurve, fit: EnergyFit, repulsive: Bool[np.ndarray, " rows"], free: Bool[np.ndarray, " rows"]
-) -> tuple[TappingBranch, ...]:
+def branches_of(curve: TappingCurve, fit: EnergyFit, repulsive: Bool[np.ndarray, " rows"]) -> tuple[TappingBranch, ...]:
     """Return the branches that the functions of a fit run along."""
-    place = depths(curve, free)
+    place = losses(curve)
     found = []
     for number, rows in enumerate(fit.rows):
         for state in (False, True):
@@ -127,13 +113,14 @@ def _curve(
     weights, ratio_variance = smoother.at(at)
     ratio = weights @ (smoother.bins.averages @ read)
     # an energy at a height is one at an amplitude that is known no better than it was read
-    fall = np.gradient(energy, ratio) if len(ratio) > 2 and np.all(np.diff(ratio) != 0.0) else np.zeros(len(ratio))
-    energy_error = np.hypot(fit.error(energy, own, slopes), np.abs(fall) * np.sqrt(ratio_variance))
+    ratio_error = np.sqrt(ratio_variance)
+    energy_error = np.hypot(fit.error(energy, own, slopes), _steepness(energy, ratio) * ratio_error)
     read, noise = fit.energies_at.virial_aj[rows], virial_noise(curve, fit)[rows]
     smoother = smoother_along(place[rows], read, noise, max(float(np.ptp(read)), float(noise.mean())))
     weights, virial_own = smoother.at(at)
     virial = weights @ (smoother.bins.averages @ read)
     virial_slopes = weights @ (smoother.bins.averages @ fit.virial_slopes[rows])
+    virial_error = np.hypot(fit.error(virial, virial_own, virial_slopes), _steepness(virial, ratio) * ratio_error)
     order = np.argsort(ratio, kind="stable")
     return EnergyCurve(
         amplitude_ratio=ratio[order],
@@ -141,10 +128,17 @@ def _curve(
         energy_aj=energy[order],
         energy_error_aj=energy_error[order],
         virial_aj=virial[order],
-        virial_error_aj=fit.error(virial, virial_own, virial_slopes)[order],
+        virial_error_aj=virial_error[order],
         energy_by_instrument=slopes[order],
         energy_noise_aj=np.sqrt(own)[order],
     )
+
+
+def _steepness(values: np.ndarray, ratio: np.ndarray) -> np.ndarray:
+    """Return the size of the slope of values over the amplitude, 0 where it cannot be told."""
+    if len(ratio) < 3 or not np.all(np.diff(ratio)):
+        return np.zeros(len(ratio))
+    return np.abs(np.gradient(values, ratio))
 
 
 @dataclass(frozen=True)

@@ -2,11 +2,10 @@
 
 Near resonance the energy of a single row hangs on f0 and Q far beyond their errors (10 Hz of 90 kHz at Q = 200 turn the
 phase by 2.5 degrees), but a wrong f0 bends the energy along the whole curve. Each branch has a function, a constant
-plus a Gaussian process (Matern 5/2) over the logarithm of the depth below the first contact, for energies change
-fastest there, and readings are energies(instrument) = function + noise of the
-row. Linear in small changes of the instrument, that is generalised least squares: function and instrument are
-determined together, and the band of the function holds what the instrument leaves open. A process of no size leaves
-the constant, one energy for all rows.
+plus a Gaussian process (Matern 5/2) over the logarithm of the amplitude lost, for energies change fastest at first
+contact, and readings are energies(instrument) = function + noise of the row. Linear in small changes of the instrument,
+that is generalised least squares: function and instrument are determined together, and the band of the function holds
+what the instrument leaves open. A process of no size leaves the constant, one energy for all rows.
 """
 
 from dataclasses import dataclass, field, replace
@@ -15,10 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.linalg import solve_triangular
+from scipy.optimize import isotonic_regression
 
 from afm_jax.least_squares import IMPROBABLE, chi2_tail
 from fitting.tapping_curves.branches import free_ends, repulsive_rows, smooth_stretches, ways
-from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, Rows, TappingCurve, free_lag_deg
+from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, Rows, TappingCurve, lag_of_free_tip
 from fitting.tapping_curves.energy import Energies, energies, noise_of, virial_noise_of
 
 _FAR = 4.0
@@ -40,12 +40,12 @@ _SIZES = tuple(0.005 * 2.0**k for k in range(7))
 _USUAL_SIZE, _LOG_SIZE = 0.03, 1.0
 """Measured curves of graphite: 4 aJ of 108; spread of the logarithm."""
 _LENGTHS = (0.3, 0.5, 0.8, 1.3)
-"""Lengths of the process that are tried, in the logarithm of the depth."""
+"""Lengths of the process that are tried, in the logarithm of the amplitude lost."""
 _USUAL_LENGTH, _LOG_LENGTH = 0.7, 0.5
 _SHALLOW = 0.03
-"""Depth, of the free amplitude, that is added to all: there the length in nm is that at contact."""
-_LEAST_SIZE = 0.3
-"""Least size of the process, of the largest energy: a constant that fits does not narrow a band."""
+"""Loss, of the free amplitude, that is added to all: there the length in nm is that at contact."""
+_LEAST_SIZE = 1.0
+"""Least size of the process, of the largest energy: one that a constant fits may change by as much as itself."""
 _ROUNDS = 30
 _SHORTEST = 1e-3
 """Fraction of a step below which the search stays as it is."""
@@ -248,19 +248,17 @@ class EnergyFit:
         return {"noise": max(noise, 0.0)} | parts | relative
 
 
-def depths(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> Rows:
-    """Return the logarithm of each row's depth below the contact of its way, in free amplitudes.
+def losses(curve: TappingCurve) -> Rows:
+    """Return the logarithm of what each row's amplitude has lost of the free one, smoothed along its way.
 
-    Contact is at the last free row, or as far before the first row in contact as the next one is behind it.
+    By amplitude an energy is smooth where by height it is not: an attractive plateau ends within a nanometre.
     """
     place = np.zeros(curve.rows)
     for part in ways(curve):
-        before, touching = curve.offset_nm[part[free[part]]], curve.offset_nm[part[~free[part]]]
-        contact = curve.offset_nm[part[0]] if not len(before) else before.max()
-        if len(touching):
-            contact = max(contact, 2.0 * touching[0] - touching[min(1, len(touching) - 1)])
-        depth = (curve.offset_nm[part] - contact) / curve.free_amplitude_nm[part]
-        place[part] = np.log(_SHALLOW + np.maximum(depth, 0.0))
+        free = curve.free_amplitude_nm[part]
+        weights = (free / curve.amplitude_error_nm[part]) ** 2
+        ratio = isotonic_regression(curve.amplitude_nm[part] / free, weights=weights, increasing=False).x
+        place[part] = np.log(_SHALLOW + np.maximum(1.0 - ratio, 0.0))
     return place
 
 
@@ -274,7 +272,7 @@ def plain_instrument(curve: TappingCurve, free: Bool[np.ndarray, " rows"]) -> In
     given = Instrument(curve.free_frequency_khz.value, curve.quality_factor.value)
     zero = np.full(curve.rows, 0.0 if curve.phase_zero_deg is None else curve.phase_zero_deg.value)
     factor = np.ones(curve.rows)
-    departure = turned(curve.lag_deg - free_lag_deg(curve, given))
+    departure = turned(curve.lag_deg - lag_of_free_tip(curve, given))
     known = free & np.isfinite(departure)
     if curve.time is not None and free_ends(curve, free):
         share = curve.amplitude_nm / curve.free_amplitude_nm
@@ -400,7 +398,7 @@ class _EnergySearch:
 
     def __post_init__(self):
         curve, free = self.curve, self.free
-        self.place = depths(curve, free)
+        self.place = losses(curve)
         self.smoothed = _smoothed_readings(curve, self.touching, self.place, free)
         frequency = np.unique(curve.drive_frequency_khz, return_inverse=True)[1]
         level = np.argmax(np.stack(_levels(curve)), axis=0) if curve.rows else frequency
@@ -466,7 +464,7 @@ class _EnergySearch:
 
         def by(field: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
             ends = [at._replace(**{field: getattr(at, field) + sign * steps[field]}) for sign in (1.0, -1.0)]
-            (up, down), lags = [energies(curve, end) for end in ends], [free_lag_deg(curve, end) for end in ends]
+            (up, down), lags = [energies(curve, end) for end in ends], [lag_of_free_tip(curve, end) for end in ends]
             twice = 2.0 * steps[field]
             return (
                 (up.energy_aj - down.energy_aj) / twice,
@@ -531,7 +529,7 @@ class _EnergySearch:
         """Return residuals of the free rows' means."""
         at, lags, shares = self.instrument(x), self.lags, self.shares
         factor = np.broadcast_to(at.free_amplitude_factor, (self.curve.rows,))
-        left = [-turned(lags.mean - lags.average(free_lag_deg(self.curve, at))) / lags.error]
+        left = [-turned(lags.mean - lags.average(lag_of_free_tip(self.curve, at))) / lags.error]
         left.append((shares.average(factor) - shares.mean) / shares.error)
         return np.concatenate(left)
 
@@ -550,16 +548,30 @@ class _EnergySearch:
         left, parts = self._of_free(x), self._slopes_of_free(slopes)
         matrix = np.diag(known.astype(float)) + parts.T @ parts
         gradient, total = known * x + parts.T @ left, float(left @ left + np.sum((known * x) ** 2))
-        for rows, smoother in zip(groups, smoothers, strict=True):
+        for rows, smoother, weight in zip(groups, smoothers, self._weights(groups), strict=True):
             averages = smoother.bins.averages
             y = smoother.root @ (averages @ found.energy_aj[rows])
             s = smoother.root @ self._without_scale(
                 smoother, averages @ slopes.energy[rows], averages @ found.energy_aj[rows]
             )
-            matrix += s.T @ s
-            gradient += s.T @ y
-            total += float(y @ y)
+            matrix += weight * s.T @ s
+            gradient += weight * s.T @ y
+            total += weight * float(y @ y)
         return matrix, gradient, total
+
+    def _weights(self, groups: list[np.ndarray]) -> list[float]:
+        """Return how much each function counts where it tells the instrument by how smooth it is.
+
+        Approach and retract of one sample have functions that are alike: both together count as one.
+        """
+        if not self.smooth:
+            return [1.0] * len(groups)
+        curve = self.curve
+        keys = [
+            (curve.drive_frequency_khz[rows[0]], curve.free_amplitude_nm[rows[0]], bool(curve.retract[rows[0]]))
+            for rows in groups
+        ]
+        return [1.0 / len({way for *other, way in keys if tuple(other) == key[:2]}) for key in keys]
 
     def _without_scale(self, smoother: Smoother, slopes: np.ndarray, energy: np.ndarray) -> np.ndarray:
         """Return the changes of binned energies, for Q without what only makes all of them larger or smaller.
@@ -601,7 +613,10 @@ class _EnergySearch:
         smoothers = self._smoothers(x, groups, processes, scale)
         known = np.array([np.isfinite(one.given.error) for one in self.unknowns], bool)
         found = energies(self.curve, self.instrument(x)).energy_aj
-        rows = [s.root @ (s.bins.averages @ found[r]) for r, s in zip(groups, smoothers, strict=True)]
+        rows = [
+            np.sqrt(weight) * s.root @ (s.bins.averages @ found[r])
+            for r, s, weight in zip(groups, smoothers, self._weights(groups), strict=True)
+        ]
         left = np.concatenate([*rows, self._of_free(x), known * x])
         total = float(left @ left)
         return total if np.isfinite(total) else np.inf
@@ -622,17 +637,22 @@ class _EnergySearch:
                 made.append(Process(max(size * float(lost[rows].mean()), _LEAST_SIZE * float(largest)), length))
             return made
 
-        best, most = processes(_USUAL_SIZE, _USUAL_LENGTH), -np.inf
+        best, most, weights = processes(_USUAL_SIZE, _USUAL_LENGTH), -np.inf, self._weights(groups)
         usual = self._smoothers(x, groups, best, scale)
         slopes = self.slopes(x, self._as_fitted(x, groups, usual, found))
+        known: dict[tuple[Process, ...], float] = {}
         for size in _SIZES:
             for length in _LENGTHS:
                 trial = processes(size, length)
-                smoothers = self._smoothers(x, groups, trial, scale)
-                matrix, gradient, total = self._normal(x, slopes, found, groups, smoothers)
-                evidence = gradient @ np.linalg.pinv(matrix, hermitian=True) @ gradient - total
-                evidence -= np.linalg.slogdet(matrix)[1] + sum(one.log_determinant for one in smoothers)
-                evidence -= (np.log(size / _USUAL_SIZE) / _LOG_SIZE) ** 2
+                # small sizes are raised to the same least one
+                if tuple(trial) not in known:
+                    smoothers = self._smoothers(x, groups, trial, scale)
+                    matrix, gradient, total = self._normal(x, slopes, found, groups, smoothers)
+                    of_trial = gradient @ np.linalg.pinv(matrix, hermitian=True) @ gradient - total
+                    of_trial -= np.linalg.slogdet(matrix)[1]
+                    of_trial -= sum(w * one.log_determinant for w, one in zip(weights, smoothers, strict=True))
+                    known[tuple(trial)] = of_trial
+                evidence = known[tuple(trial)] - (np.log(size / _USUAL_SIZE) / _LOG_SIZE) ** 2
                 evidence -= (np.log(length / _USUAL_LENGTH) / _LOG_LENGTH) ** 2
                 if evidence > most:
                     best, most = trial, evidence
@@ -831,7 +851,7 @@ def _smoothed_readings(
 ) -> TappingCurve:
     """Return a curve with its readings smoothed along each branch: errors of energies are taken there."""
     amplitude, lag = curve.amplitude_nm.copy(), curve.lag_deg.copy()
-    departure = turned(curve.lag_deg - free_lag_deg(curve, plain_instrument(curve, free)))
+    departure = turned(curve.lag_deg - lag_of_free_tip(curve, plain_instrument(curve, free)))
     for rows in smooth_stretches(curve, touching, repulsive_rows(curve, touching, departure)):
         for readings, errors in ((amplitude, curve.amplitude_error_nm), (lag, curve.lag_error_deg)):
             values = readings[rows]
@@ -846,7 +866,7 @@ def smoother_along(place: np.ndarray, values: np.ndarray, noise: np.ndarray, sca
     """Return the most probable smoother of readings, for processes of some sizes and lengths.
 
     Args:
-        place: of the readings, in order, as of `depths`.
+        place: of the readings, in order, as of `losses`.
         values: the readings.
         noise: their standard errors.
         scale: size that the process may have, in the unit of the readings; those tried are 0.1 to 3 times as large.

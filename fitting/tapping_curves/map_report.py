@@ -87,7 +87,7 @@ def write_map(result: TappingMap, folder: Path, formats: Sequence[str]) -> list[
 
 def _gwyddion(result: TappingMap) -> bytes:
     """Return the map as a Gwyddion file, in J or m^2."""
-    unit, size = ("J", 1e-18) if result.unit == "aJ" else ("m^2", 1e-18)
+    unit, size = "J" if result.unit == "aJ" else "m^2", 1e-18
     titles = {"energy": "Energy of a tap", "energy_error": "Error of the energy"}
     titles |= {"virial": "Virial", "virial_error": "Error of the virial"}
     images = {title: (getattr(result, name) * size, unit) for name, title in titles.items()}

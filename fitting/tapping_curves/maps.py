@@ -21,7 +21,7 @@ from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from fitting.instruments.images import AmplitudeAndPhase, read_images
 from fitting.instruments.lag import free_lag_deg, sense_of
-from fitting.instruments.recording import Known
+from fitting.instruments.recording import ASSUMED_RESONANCE, Known
 from fitting.tables.csv_text import TableError
 from fitting.tapping_curves.curve import HARMONICS_FACTOR, USUAL_ERRORS, Given, Instrument, TappingCurve
 from fitting.tapping_curves.energy import energies
@@ -183,11 +183,8 @@ def tapping_map(
     notes = list(images.notes)
     known = _known(images, given, notes)
     amplitude, free = _in_nm(images, known)
-    free_lag = free_lag_deg(
-        drive,
-        _value(known, "drive_frequency_khz") / _value(known, "free_frequency_khz"),
-        _value(known, "quality_factor"),
-    )
+    ratio = _value(known, "drive_frequency_khz") / _value(known, "free_frequency_khz")
+    free_lag = float(free_lag_deg(drive, ratio, _value(known, "quality_factor")))
     behind = _behind_free(images, known, free_lag, notes)
     errors = (
         _roughness(amplitude) if amplitude_error_nm is None else amplitude_error_nm,
@@ -228,9 +225,8 @@ def _known(images: AmplitudeAndPhase, given: dict[str, Any], notes: list[str]) -
             raise ValueError(f"`{key}` must be finite and above 0, but is {value!r}")
         known[key] = Known(float(number), units[key], f"option --{key.replace('_', '-')}", error)
     if "drive_frequency_khz" not in known and "free_frequency_khz" in known:
-        origin = "assumed: on resonance, at the free frequency; else --drive-frequency-khz"
-        known["drive_frequency_khz"] = Known(known["free_frequency_khz"].value, "kHz", origin)
-        notes.append(f"Drive frequency: {origin}.")
+        known["drive_frequency_khz"] = Known(known["free_frequency_khz"].value, "kHz", ASSUMED_RESONANCE)
+        notes.append(f"Drive frequency: {ASSUMED_RESONANCE}.")
     needed = {"free_frequency_khz": "KHZ", "quality_factor": "Q"}
     if images.free_amplitude is None:
         needed["free_amplitude_nm"] = "NM"

@@ -6,6 +6,7 @@ from matplotlib.figure import Figure
 
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, png_of, svg_of
 from afm_jax.units import RAD_PER_US_PER_KHZ
+from fitting.tapping_curves.branches import side_of, way_of
 from fitting.tapping_curves.curve import Instrument, TipMotion, motion_of
 from fitting.tapping_curves.energy import lags_of
 from fitting.tapping_curves.energy_fit import Z95, plain_instrument
@@ -68,14 +69,14 @@ def curve_figure(result: Tapping) -> Figure:
 
 
 def _points(axes: Axes, result: Tapping, values: np.ndarray, errors: np.ndarray) -> None:
-    """Draw rows: filled on the way in, hollow squares on the way back, crossed out where set aside, grey where free."""
+    """Draw rows: filled on approach, squares on retract, hollow where excluded, grey where free."""
     curve, free = result.curve, result.rows.free
-    aside = np.array([note.startswith("set aside") for note in result.rows.note])
-    for back, marker, way in ((False, "o", "way in"), (True, "s", "way back")):
+    aside = np.array([note.startswith("excluded") for note in result.rows.note])
+    for back, marker in ((False, "o"), (True, "s")):
         for chosen, colour, label in (
             (free, GRID, "free"),
-            (~free & ~aside, BLUE if not back else ACCENT, way if curve.both_ways else "rows"),
-            (~free & aside, "none", "set aside"),
+            (~free & ~aside, BLUE if not back else ACCENT, way_of(back) if curve.both_ways else "rows"),
+            (~free & aside, "none", "excluded"),
         ):
             here = chosen & (curve.retract == back) & np.isfinite(values)
             if here.any():
@@ -130,9 +131,7 @@ def _energy_bands(axes: Axes, result: Tapping) -> tuple[float, float]:
                 "--",
                 color=DARK,
                 lw=1.0,
-                label=result.in_unit(
-                    f"one energy, {'repulsive' if group.repulsive else 'attractive'}: {energy:.3g} aJ"
-                ),
+                label=result.in_unit(f"one energy, {side_of(group.repulsive)}: {energy:.3g} aJ"),
             )
             ends += [low, high]
     return min(ends), max(ends)
@@ -177,11 +176,11 @@ def together_figure(result: TappingTogether) -> Figure:
         for scatter in result.scatter:
             if scatter.repulsive == state:
                 ratio, mean = scatter.amplitude_ratio, scatter.energy_aj
-                colour, way = (ACCENT, "retract") if scatter.retract else (BLUE, "approach")
-                axes.plot(ratio, mean, color=colour, lw=2.0, label=f"{way}, mean of {scatter.curves}")
+                colour = ACCENT if scatter.retract else BLUE
+                axes.plot(ratio, mean, color=colour, lw=2.0, label=f"{scatter.way}, mean of {scatter.curves}")
                 for width, shade in ((Z95 * scatter.energy_common_error_aj, 0.12), (scatter.energy_scatter_aj, 0.25)):
                     axes.fill_between(ratio, mean - width, mean + width, color=colour, alpha=shade, lw=0)
-        axes.set_title("repulsive" if state else "attractive", fontsize=_SMALL + 1)
+        axes.set_title(side_of(state), fontsize=_SMALL + 1)
         label_axes(axes, x="amplitude over the free one", y=result.curves[0].in_unit("energy of a tap (aJ)"))
         axes.grid(color=GRID, alpha=0.25)
         if axes.get_legend_handles_labels()[0]:

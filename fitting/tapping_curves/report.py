@@ -77,7 +77,7 @@ def law_in_words(result: Tapping) -> str:
 def branch_name(result: Tapping, number: int) -> str:
     """Return what a branch is called; its drive where there are several."""
     branch = result.branches[number]
-    name = f"{branch.way}, {'repulsive' if branch.repulsive else 'attractive'}"
+    name = branch.name
     several = len({(b.drive_frequency_khz, b.free_amplitude_nm) for b in result.branches}) > 1
     return name + (f", {branch.drive_frequency_khz:g} kHz, {branch.free_amplitude_nm:.4g} nm" if several else "")
 
@@ -114,9 +114,8 @@ def _along_lines(result: Tapping) -> list[str]:
             f"height {min(heights):.4g} to {max(heights):.4g} nm"
         )
     for (i, _), one in result.way_differences.items():
-        side = "repulsive" if result.branches[i].repulsive else "attractive"
         lines.append(
-            f"  retract less approach, {side}: {with_error(one.energy_aj, one.standard_error)} aJ "
+            f"  retract less approach, {result.branches[i].side}: {with_error(one.energy_aj, one.standard_error)} aJ "
             f"at A/A0 = {one.amplitude_ratio:.2f}, where it is most in its errors"
         )
     head = ["instrument, fitted with the energy along the branches", "given", "fitted"]
@@ -187,7 +186,7 @@ def _threshold_lines(result: Tapping) -> list[str]:
     return [
         "",
         *text_table(
-            ["threshold (height in nm)", "way in", "way back", "later by", "between"],
+            ["threshold (height in nm)", "approach", "retract", "later by", "between"],
             threshold_cells(result),
             words=(0, 4),
         ),
@@ -320,7 +319,7 @@ def tapping_page(result: Tapping, pictures: list[bytes]) -> str:
     shows = (
         (
             "Amplitude, phase and energy of a tap over the height of the sample. Lines: the energy along each branch "
-            "with its 95 % band, dashed one energy for all taps where that explains the rows; open: set aside; "
+            "with its 95 % band, dashed one energy for all taps where that explains the rows; open: excluded; "
             "grey: free."
         ),
         (
@@ -352,7 +351,7 @@ def tapping_page(result: Tapping, pictures: list[bytes]) -> str:
         ("remarks", "note", ""),
     ]
     rows = [[_cell(record.get(key), form) for _, key, form in columns] for record in records]
-    aside = {i for i, record in enumerate(records) if (record["note"] or "").startswith("set aside")}
+    aside = {i for i, record in enumerate(records) if (record["note"] or "").startswith("excluded")}
     energy = result.energy
     shares = {origin_in_words(name): percent(share) for name, share in energy.get("share_of_variance", {}).items()}
     text = page(
@@ -374,7 +373,7 @@ def tapping_page(result: Tapping, pictures: list[bytes]) -> str:
         shares=pairs("Where the variance of the energy comes from", ("", "share"), shares) if shares else None,
         thresholds=Table(
             "Heights of the sample over the rest position in nm",
-            ["threshold", "way in", "way back", "later by", "between"],
+            ["threshold", "approach", "retract", "later by", "between"],
             threshold_cells(result),
             words=("between",),
         )
@@ -382,7 +381,7 @@ def tapping_page(result: Tapping, pictures: list[bytes]) -> str:
         else None,
         pictures=pictures_of(pictures, shows),
         rows=Table(
-            "Shaded: set aside",
+            "Shaded: excluded",
             [name for name, _, _ in columns],
             rows,
             words=("way", "branch", "remarks"),

@@ -10,9 +10,9 @@ from jaxtyping import Bool, Int
 from afm_jax.least_squares import IMPROBABLE
 from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
-from afm_jax.units import RAD_PER_US_PER_KHZ
+from afm_jax.units import effective_mass_ng
 from fitting.tables.table import AmplitudeTable
-from fitting.tapping_curves.branches import Hysteresis, free_ends
+from fitting.tapping_curves.branches import Hysteresis, free_ends, side_of, way_of
 from fitting.tapping_curves.curve import USUAL_ERRORS, Rows, TappingCurve
 from fitting.tapping_curves.energy_by_speed import FEWEST_SPEEDS, LawOfEnergies, laws_of_energies
 from fitting.tapping_curves.energy_curve import (
@@ -79,8 +79,8 @@ class EnergyGroup:
     @property
     def name(self) -> str:
         """What it is called."""
-        branch = "repulsive" if self.repulsive else "attractive"
-        return f"{branch}, {self.drive_frequency_khz:g} kHz, free amplitude {self.free_amplitude_nm:.4g} nm"
+        side = side_of(self.repulsive)
+        return f"{side}, {self.drive_frequency_khz:g} kHz, free amplitude {self.free_amplitude_nm:.4g} nm"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -175,7 +175,7 @@ class Tapping(Result):
         scale_errors: whether errors are multiplied where the rows scatter more.
         followed: the fit of one energy with drifts along the rows, where their order in time is not stated.
         bound_aj: what a tap takes at most, where only the amplitude was recorded; else None.
-        hysteresis: thresholds on the way in and back.
+        hysteresis: thresholds on approach and retract.
         speeds: of the impacts; None where there is no energy.
         law: the fit of the impact law, or None.
         versions: of the packages that computed it.
@@ -199,8 +199,7 @@ class Tapping(Result):
     @property
     def mass_ng(self) -> float:
         """Effective mass, from spring constant and free frequency."""
-        omega = RAD_PER_US_PER_KHZ * self.curve.free_frequency_khz.value
-        return self.curve.spring_constant_n_per_m.value / omega**2
+        return effective_mass_ng(self.curve.spring_constant_n_per_m.value, self.curve.free_frequency_khz.value)
 
     @property
     def group_of_rows(self) -> Int[np.ndarray, " rows"]:
@@ -210,8 +209,7 @@ class Tapping(Result):
             here = (self.curve.drive_frequency_khz == group.drive_frequency_khz) & (
                 self.curve.free_amplitude_nm == group.free_amplitude_nm
             )
-            branch = "repulsive" if group.repulsive else "attractive"
-            found[here & (np.array(self.rows.state) == branch)] = i
+            found[here & (np.array(self.rows.state) == side_of(group.repulsive))] = i
         return found
 
     @property
@@ -365,7 +363,7 @@ class Tapping(Result):
                 {
                     "drive_frequency_khz": key[0],
                     "free_amplitude_nm": key[1],
-                    "branch": "retract" if key[2] else "approach",
+                    "branch": way_of(key[2]),
                     "amplitude_ratio": [
                         float(repulsive.amplitude_ratio[first]),
                         float(attractive.amplitude_ratio[last]),
@@ -582,7 +580,7 @@ class Tapping(Result):
                 )
         aside = self.set_aside
         if aside:
-            found.append(f"{len(aside)} of {self.curve.rows} rows are set aside, each by name in the rows")
+            found.append(f"{len(aside)} of {self.curve.rows} rows are excluded, each by name in the rows")
         return found
 
     @property
@@ -627,7 +625,7 @@ class Tapping(Result):
         return [
             {"line": int(self.curve.lines[i]), "offset_nm": float(self.curve.offset_nm[i]), "reason": note}
             for i, note in enumerate(self.rows.note)
-            if note.startswith("set aside")
+            if note.startswith("excluded")
         ]
 
     def _constant_of(self, number: int) -> dict[str, Any]:
@@ -644,7 +642,7 @@ class Tapping(Result):
             "line": curve.lines,
             "drive_frequency_khz": curve.drive_frequency_khz,
             "free_amplitude_nm": curve.free_amplitude_nm,
-            "branch": ["retract" if back else "approach" for back in curve.retract],
+            "branch": [way_of(back) for back in curve.retract],
             "state": rows.state,
             "offset_nm": curve.offset_nm,
             "lockin_amplitude_nm": curve.amplitude_nm,

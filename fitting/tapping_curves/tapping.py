@@ -20,6 +20,7 @@ from fitting.tapping_curves.branches import (
     held_rows,
     repulsive_rows,
     rough_rows,
+    side_of,
     smooth_stretches,
 )
 from fitting.tapping_curves.curve import (
@@ -27,8 +28,8 @@ from fitting.tapping_curves.curve import (
     Given,
     Instrument,
     TappingCurve,
-    free_lag_deg,
     given_or_usual,
+    lag_of_free_tip,
     motion_of,
 )
 from fitting.tapping_curves.energy import energies, largest_energies, noise_of, virial_noise_of
@@ -68,7 +69,8 @@ def tapping(table: TableLike, *, law: bool = True, model: str = LAW_MODEL, scale
     """
     table = as_table(table)
     table, note = _with_sense_of_phase(table)
-    result = _energies(table, replace(curve_of(table), phase_note=note), scale_errors=scale_errors)
+    curve = _with_zero_of_free_rows(replace(curve_of(table), phase_note=note))
+    result = _energies(table, curve, scale_errors=scale_errors)
     return with_law(result, model) if law and result.law_allowed else result
 
 
@@ -159,7 +161,7 @@ def _with_sense_of_phase(table: AmplitudeTable) -> tuple[AmplitudeTable, str]:
     if lag is None or not free.any():
         return table, ""
     zero = 0.0 if curve.phase_zero_deg is None else curve.phase_zero_deg.value
-    expected = free_lag_deg(curve, Instrument(curve.free_frequency_khz.value, curve.quality_factor.value))[free]
+    expected = lag_of_free_tip(curve, Instrument(curve.free_frequency_khz.value, curve.quality_factor.value))[free]
     read = curve.lag_deg[free] - zero
     off = float(np.median(read - expected))
     off = float(turned(np.array([off]))[0])
@@ -183,6 +185,22 @@ def _with_sense_of_phase(table: AmplitudeTable) -> tuple[AmplitudeTable, str]:
         f"{name}: the free tip lags by {middle:.1f} degrees, by frequency and Q {wanted:.1f}: out of the range of "
         "'# phase_zero_deg'; leave that line out and the free rows set the zero, or mend the phase"
     )
+
+
+def _with_zero_of_free_rows(curve: TappingCurve) -> TappingCurve:
+    """Return a curve that knows no zero of the phase but that of its free rows, if what is stated tells no more.
+
+    A table that was read from an instrument's file states the zero that its free rows have at the frequency and Q
+    given: taken for knowledge besides, it would count both twice.
+    """
+    stated, free = curve.phase_zero_deg, free_rows(curve) & np.isfinite(curve.lag_deg)
+    if stated is None or not free.any():
+        return curve
+    frequency, quality = curve.free_frequency_khz, curve.quality_factor
+    start = lag_of_free_tip(curve, Instrument(frequency.value, quality.value))[free]
+    moved = [Instrument(sum(frequency), quality.value), Instrument(frequency.value, sum(quality))]
+    of_lag = np.linalg.norm([np.median(lag_of_free_tip(curve, at)[free] - start) for at in moved])
+    return curve if stated.error < of_lag else replace(curve, phase_zero_deg=None)
 
 
 def _check_range(curve: TappingCurve, zero: float, name: str) -> None:
@@ -209,7 +227,7 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
     free, held = free_rows(curve), held_rows(curve)
     given = plain_instrument(curve, free)
     plain = energies(curve, given)
-    departure = turned(curve.lag_deg - free_lag_deg(curve, given))
+    departure = turned(curve.lag_deg - lag_of_free_tip(curve, given))
     touching = ~free & ~held & np.isfinite(curve.lag_deg)
     repulsive = ~free & repulsive_rows(curve, touching, departure)
     rough = rough_rows(curve, touching & repulsive) | rough_rows(curve, touching & ~repulsive)
@@ -255,7 +273,7 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
         groups=tuple(EnergyGroup(*key, repulsive=state) for key, state in kinds),
         fit=fitted,
         functions=functions,
-        branches=() if functions is None else branches_of(curve, functions, repulsive, free),
+        branches=() if functions is None else branches_of(curve, functions, repulsive),
         scale_errors=scale_errors,
         followed=_followed(curve, alike, free) if kinds and curve.time is None else None,
         bound_aj=None if curve.has_phase else _bound(curve, given, free),
@@ -309,19 +327,19 @@ def _state(free: np.bool_, held: np.bool_, phase: np.bool_, repulsive: np.bool_)
         return "held"
     if not phase:
         return "touching"
-    return "repulsive" if repulsive else "attractive"
+    return side_of(repulsive)
 
 
 def _notes(curve: TappingCurve, **which: Bool[np.ndarray, " rows"]) -> tuple[str, ...]:
     """Return why each row is not in the fit, or what it is for; the first reason that holds."""
     said = {
         "free": "free: fixes the zero of the phase" if curve.has_phase else "free",
-        "held": "set aside: the tip is held, a tenth of the free amplitude is left or less",
-        "silent": "set aside: no phase, only a bound",
+        "held": "excluded: the tip is held, a tenth of the free amplitude is left or less",
+        "silent": "excluded: no phase, only a bound",
         "rough": "not in the one energy: off the smooth fall of its branch, so probably not one impact a period",
         "early": "not in the one energy: hardly touching yet, taps need not come every period",
-        "far": "set aside: its energy is more than 4 standard errors from the others'",
-        "alone": f"set aside: fewer than {FEWEST_ROWS} rows of this branch",
+        "far": "excluded: its energy is more than 4 standard errors from the others'",
+        "alone": f"excluded: fewer than {FEWEST_ROWS} rows of this branch",
     }
     which["silent"] = np.isnan(curve.lag_deg)
     return tuple(next((words for name, words in said.items() if which[name][i]), "") for i in range(curve.rows))

@@ -13,6 +13,7 @@ from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import TableLike, as_table
+from fitting.tapping_curves.branches import CurveBranch
 from fitting.tapping_curves.energy_curve import HEADLINE, TappingBranch, branches_of
 from fitting.tapping_curves.energy_fit import Common, fitted_together
 from fitting.tapping_curves.result import Tapping, nuisances_as_dict
@@ -24,14 +25,10 @@ _POINTS = 41
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class CurveScatter:
+class CurveScatter(CurveBranch):
     """A branch in several curves: mean energy, and its scatter from curve to curve beside what errors explain.
 
     Attributes:
-        drive_frequency_khz: of the rows.
-        free_amplitude_nm: of the rows, the mean.
-        retract: whether the sample moves away.
-        repulsive: whether the lag is below the free tip's.
         curves: number of curves that have it.
         amplitude_ratio: where at least half of them, and two, were measured.
         energy_aj: mean over the curves there.
@@ -40,21 +37,12 @@ class CurveScatter:
         energy_common_error_aj: standard error that all have in common.
     """
 
-    drive_frequency_khz: float
-    free_amplitude_nm: float
-    retract: bool
-    repulsive: bool
     curves: int
     amplitude_ratio: Float[np.ndarray, " points"]
     energy_aj: Float[np.ndarray, " points"]
     energy_scatter_aj: Float[np.ndarray, " points"]
     energy_own_error_aj: Float[np.ndarray, " points"]
     energy_common_error_aj: Float[np.ndarray, " points"]
-
-    @property
-    def name(self) -> str:
-        """What the branch is called."""
-        return f"{'retract' if self.retract else 'approach'}, {'repulsive' if self.repulsive else 'attractive'}"
 
     def at(self, ratio: float) -> tuple[float, float, float, float] | None:
         """Return mean, scatter, own and common error at an amplitude, of the free one; None where not measured."""
@@ -109,7 +97,7 @@ class TappingTogether(Result):
                 if first is None
                 else nuisances_as_dict(tuple(one for one in first.nuisances if one.name in names)),
                 "agreement_p_value": None if self.common is None else self.common.p_value,
-                "branches": [{**vars(one), "branch": "retract" if one.retract else "approach"} for one in self.scatter],
+                "branches": [{**vars(one), "branch": one.way} for one in self.scatter],
             }
         )
         return self.curves[0].keyed(payload) if self.curves else payload
@@ -147,7 +135,7 @@ def together(curves: Sequence[Tapping]) -> TappingTogether:
             rows = replace(
                 one.rows, energy_of_fit_aj=fit.energies_at.energy_aj, virial_of_fit_aj=fit.energies_at.virial_aj
             )
-            branches = branches_of(one.curve, fit, repulsive, one.rows.free)
+            branches = branches_of(one.curve, fit, repulsive)
             moved[i] = replace(one, functions=fit, branches=branches, rows=rows)
     single = [i for i in chosen if curves[i].fit is not None and curves[i].described]
     if len(single) > 1:

@@ -7,7 +7,7 @@ The response order: after how many drive periods a trace repeats; fits to half o
 When the platform is highest: the phase that a trace's response is compared with.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -30,30 +30,32 @@ class Harmonics:
 
     Attributes:
         coefficients: C_0 to C_K, shape (K + 1,).
-        of_first: what the inverse normal matrix makes of the unit vector k = 1, shape (2 K + 1,): its weights.
+        line: one of 1 to K, whose weights are kept.
+        of_line: what the inverse normal matrix makes of the unit vector k = line, shape (2 K + 1,): its weights.
     """
 
     coefficients: Complex[np.ndarray, " harmonics"]
-    of_first: Complex[np.ndarray, " lines"]
+    of_line: Complex[np.ndarray, " lines"]
+    line: int = 1
 
     def __call__(self, angle: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
         """Return the function at angles in rad."""
         return 2.0 * np.real(_polynomial(self.coefficients[1:], angle)) + float(self.coefficients[0].real)
 
-    def first_weights(self, angle: Float[np.ndarray, " n"]) -> Complex[np.ndarray, " n"]:
-        """Return the weights w of the samples in C_1 = sum of w z.
+    def weights(self, angle: Float[np.ndarray, " n"]) -> Complex[np.ndarray, " n"]:
+        """Return the weights w of the samples in C_line = sum of w z.
 
         Args:
             angle: of the samples that were fitted.
         """
         highest = len(self.coefficients) - 1
-        upper = _polynomial(self.of_first[highest + 1 :], angle)
-        lower = _polynomial(self.of_first[:highest][::-1], -angle)
-        return np.conj(upper + lower + self.of_first[highest])
+        upper = _polynomial(self.of_line[highest + 1 :], angle)
+        lower = _polynomial(self.of_line[:highest][::-1], -angle)
+        return np.conj(upper + lower + self.of_line[highest])
 
 
 def fit_harmonics(
-    angle: Float[np.ndarray, " samples"], height: Float[np.ndarray, " samples"], highest: int
+    angle: Float[np.ndarray, " samples"], height: Float[np.ndarray, " samples"], highest: int, line: int = 1
 ) -> Harmonics:
     """Fit the harmonics 0 to K to samples by least squares.
 
@@ -63,6 +65,7 @@ def fit_harmonics(
         angle: omega t/N of the samples, in rad.
         height: of the samples.
         highest: K, not above `highest_harmonic`.
+        line: the harmonic whose weights are kept, 1 to K.
     """
     turn = np.exp(1j * angle)
     sums = np.empty(2 * highest + 1, dtype=np.complex128)
@@ -75,10 +78,10 @@ def fit_harmonics(
         wave *= turn
     both = np.concatenate([np.conj(moments[:0:-1]), moments])
     unit = np.zeros(2 * highest + 1, dtype=np.complex128)
-    unit[highest + 1] = 1.0
+    unit[highest + line] = 1.0
     # the first column holds k - l = 0, 1, ...; the first row its conjugate
     found = solve_toeplitz((np.conj(sums), sums), np.stack([both, unit], axis=1))
-    return Harmonics(found[highest:, 0], found[:, 1])
+    return Harmonics(found[highest:, 0], found[:, 1], line)
 
 
 def highest_harmonic(angle: Float[np.ndarray, " samples"], order: int) -> int:
@@ -145,8 +148,15 @@ class Fold:
 
     @property
     def lockin(self) -> complex:
-        """2/T times the integral of z exp(-i omega t/N)."""
-        return complex(2.0 * self.waveform.coefficients[1])
+        """2/T times the integral of z exp(-i k omega t/N), k the waveform's line: 1 unless `at_drive`."""
+        return complex(2.0 * self.waveform.coefficients[self.waveform.line])
+
+    def at_drive(self) -> "Fold | None":
+        """Return the same, read at the drive's frequency omega; None where too few phases are sampled for that."""
+        highest = len(self.waveform.coefficients) - 1
+        if self.order > highest:
+            return None
+        return replace(self, waveform=fit_harmonics(self.angle, self.height, highest, self.order))
 
     @property
     def spread_nm(self) -> float:
@@ -180,7 +190,7 @@ class Fold:
     @property
     def lockin_deviations(self) -> Complex[np.ndarray, " cycles"]:
         """By how much each response period's lock-in value differs from that of all."""
-        return self.per_cycle(2.0 * self.cycles * self.waveform.first_weights(self.angle) * self.left)
+        return self.per_cycle(2.0 * self.cycles * self.waveform.weights(self.angle) * self.left)
 
 
 def fold(trace: Trace, order: int) -> Fold:
@@ -209,15 +219,17 @@ def sampling_error_nm(folded: Fold) -> float:
     """Return by how much harmonics beyond the sampling may falsify the lock-in amplitude.
 
     An impact's kink makes the harmonics fall as C/k^2. Sampled at M phases, the harmonics M - 1 and M + 1 look like the
-    first. C is read off the harmonics that were fitted; where there is only one it is that of |sin|, 3/4 of the first.
+    first (M - k and M + k like that of the drive). C is read off the harmonics that were fitted; where there is one
+    only it is that of |sin|, 3/4 of the first.
     """
     lines = 2.0 * np.abs(folded.waveform.coefficients[1:])
     squares = np.arange(1, len(lines) + 1) ** 2
     kink = float(np.max((squares * lines)[1:])) if len(lines) > 1 else 0.75 * float(lines[0])
     # in a long noisy trace high harmonics are noise times k^2; a kink never makes more than the whole signal's
     kink = min(kink, float(folded.order**2 * 4.0 * np.max(lines)))
-    m = max(folded.resolution, 2.0)
-    return kink * (1.0 / (m - 1.0) ** 2 + 1.0 / (m + 1.0) ** 2)
+    line = folded.waveform.line
+    m = max(folded.resolution, 2.0 * line)
+    return kink * (1.0 / (m - line) ** 2 + 1.0 / (m + line) ** 2)
 
 
 HIGHEST_ORDER = 16

@@ -53,6 +53,11 @@ class LockinResult(Result):
         lockin_amplitude_error_nm: from noise and sampling.
         phase_deg: phi in z ~ a cos(omega t/N + phi), modulo 360/N, t = 0 when the platform is highest.
         phase_error_deg: from the noise of deflection and reference.
+        drive_lockin_amplitude_nm: 2/T |integral of z exp(-i omega t)|, what every lock-in reads at the drive's
+            frequency, of a motion that does not repeat too; None where too few phases are sampled.
+        drive_lockin_amplitude_error_nm: from noise and sampling.
+        drive_lockin_phase_deg: phi in z ~ a cos(omega t + phi), t = 0 when the platform is highest.
+        drive_lockin_phase_error_deg: from the noise of deflection and reference.
         phase_reference: "column", "drive_phase_deg" or "time zero" (taken as when the platform is highest).
         noise_nm: standard deviation of one sample.
         sampling_error_nm: part of the lock-in amplitude's error that more samples per period would remove.
@@ -79,6 +84,10 @@ class LockinResult(Result):
     lockin_amplitude_error_nm: float | None
     phase_deg: float | None
     phase_error_deg: float | None
+    drive_lockin_amplitude_nm: float | None
+    drive_lockin_amplitude_error_nm: float | None
+    drive_lockin_phase_deg: float | None
+    drive_lockin_phase_error_deg: float | None
     phase_reference: str
     noise_nm: float
     sampling_error_nm: float
@@ -154,6 +163,10 @@ def lockin(trace: Trace | str | os.PathLike[str], *, order: int | None = None) -
     readings = _Readings(folded, peak, reference)
     repeats = verdict.kind not in _UNREPEATED
     phase, phase_error = readings.phase()
+    # what does not repeat is read over whole periods of the drive
+    whole = (folded if repeats else fold(trace, 1)).at_drive()
+    at_drive = None if whole is None else _Readings(whole, peak, reference)
+    drive_phase = (None, None) if at_drive is None else at_drive.phase()
     return LockinResult(
         steady=verdict.kind is TraceKind.STEADY,
         kind=verdict.kind,
@@ -166,6 +179,10 @@ def lockin(trace: Trace | str | os.PathLike[str], *, order: int | None = None) -
         lockin_amplitude_error_nm=readings.lockin_error() if repeats else None,
         phase_deg=phase if repeats else None,
         phase_error_deg=phase_error if repeats else None,
+        drive_lockin_amplitude_nm=None if whole is None else abs(whole.lockin),
+        drive_lockin_amplitude_error_nm=None if at_drive is None else at_drive.lockin_error(),
+        drive_lockin_phase_deg=drive_phase[0],
+        drive_lockin_phase_error_deg=drive_phase[1],
         phase_reference=reference.origin,
         noise_nm=folded.noise_nm,
         sampling_error_nm=sampling_error_nm(folded),
@@ -229,8 +246,9 @@ class _Readings(NamedTuple):
         return max(error, _ROUNDING * abs(self.peak.height_nm))
 
     def phase(self) -> tuple[float, float]:
-        """Return the phase in [0, 360/N) relative to the platform, and its error, in degrees."""
-        order, value = self.folded.order, self.folded.lockin
+        """Return the phase in [0, 360/N), [0, 360) at the drive's frequency, after the platform's, and its error."""
+        value = self.folded.lockin
+        order = self.folded.order / self.folded.waveform.line
         phase = np.degrees(np.angle(value)) - self.reference.phase_deg / order
         across = float(np.hypot(self._error_along(1j), sampling_error_nm(self.folded))) / max(abs(value), 1e-300)
         error = float(np.hypot(np.degrees(across), self.reference.phase_error_deg / order))
@@ -240,7 +258,7 @@ class _Readings(NamedTuple):
         """Return the error of the lock-in value along its own direction, turned by a unit complex number."""
         value = self.folded.lockin
         direction = np.conj(turned * value / max(abs(value), 1e-300))
-        weights = 2.0 * self.folded.waveform.first_weights(self.folded.angle)
+        weights = 2.0 * self.folded.waveform.weights(self.folded.angle)
         return self.folded.error_of((weights * direction).real)
 
 

@@ -45,12 +45,18 @@ def lockin_summary(result: LockinResult) -> str:
         f"  {size} of {trace.drive_frequency_khz:.7g} kHz, noise {result.noise_nm:.3g} nm a sample",
     ]
     if result.peak_amplitude_nm is not None:
+        order = result.order or 1
+        response = f"nm at the {'drive' if order == 1 else 'response'}'s {trace.drive_frequency_khz / order:.7g} kHz"
         values = (
             ("peak amplitude", result.peak_amplitude_nm, result.peak_amplitude_error_nm, "nm"),
-            ("lock-in amplitude", result.lockin_amplitude_nm, result.lockin_amplitude_error_nm, "nm"),
+            ("lock-in amplitude", result.lockin_amplitude_nm, result.lockin_amplitude_error_nm, response),
             ("phase", result.phase_deg, result.phase_error_deg, f"degrees, modulo {360.0 / (result.order or 1):g}"),
         )
         lines += [f"  {name:<18}{with_error(value, error)} {unit}" for name, value, error, unit in values]
+    if result.order != 1 and result.drive_lockin_amplitude_nm is not None:
+        read = with_error(result.drive_lockin_amplitude_nm, result.drive_lockin_amplitude_error_nm)
+        phase = with_error(result.drive_lockin_phase_deg, result.drive_lockin_phase_error_deg)
+        lines.append(f"  at the drive's {trace.drive_frequency_khz:.7g} kHz a lock-in reads {read} nm, {phase} degrees")
     if result.free_frequency_khz is not None and result.free_frequency_origin == "trace":
         frequency = f"{result.free_frequency_khz:.4g} kHz"
         lines.append(f"  {'free frequency':<18}{frequency} (from the bending at the top, for counting impacts only)")
