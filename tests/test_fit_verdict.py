@@ -165,6 +165,7 @@ def with_residuals(given: Evidence, residual: np.ndarray, **changes) -> Evidence
     return dataclasses.replace(given, rows=rows, **changes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{"robust": True}, {"scale_errors": True}, {"robust": True, "scale_errors": True}])
 def test_no_option_makes_a_law_without_delay_a_measurement_of_a_contact(options):
     """The contact's r is 0.998; the best instantaneous law has 0.76 and most rows far off."""
