@@ -84,6 +84,7 @@ def test_root_tolerances_bound_the_error_of_an_impact(law_file: str):
     assert result["peak_nm"] == pytest.approx(expected, rel=1e-9)
 
 
+@pytest.mark.slow
 def test_ladder_of_a_law_ends_at_its_own_map(law_file: str):
     _, start = scene_to_study(law_file)
     result = fidelity_ladder(scene=law_file, start=numbers(start), duration_us=800.0, law=None, repetitions=1)

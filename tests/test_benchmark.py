@@ -49,11 +49,13 @@ def test_one_core_measures_what_it_says():
     assert all(1e-14 < row["error_us"] < 1e-7 for row in scipy)
 
 
+@pytest.mark.slow
 def test_batches_that_no_number_of_devices_divides_still_run():
     rows = all_cores(batches=[1, 3], impacts=2, repetitions=1)["rows"]
     assert [(row["batch"], row["cores"]) for row in rows] == [(1, 1), (3, 1)]
 
 
+@pytest.mark.slow
 def test_all_cores_really_are_several():
     settings = {"batches": [3, 4], "impacts": 2, "repetitions": 1}
     rows = run_in_own_process("afm_jax.bench.impacts:all_cores", settings, cores=2)["rows"]

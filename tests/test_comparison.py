@@ -43,6 +43,7 @@ def compared(table):
     return compare(table, MODELS)
 
 
+@pytest.mark.slow
 def test_models_are_compared_by_their_information(compared):
     assert compared.failed == {}
     rows = {row["model"]: row for row in compared.rows}
@@ -123,6 +124,7 @@ def test_the_command_says_which_rival_failed(failing):
     assert answer["comparison"]["failed"] == {"viscous": "Eigenvalues did not converge"}
 
 
+@pytest.mark.slow
 def test_the_fit_stands_if_all_that_was_asked_for_besides_fails(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
     def fail(*_, **__):
         raise OverflowError("math range error")

@@ -26,6 +26,7 @@ def columns(path):
     return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
 
 
+@pytest.mark.slow
 def test_every_statement_of_the_paper_holds(drawn):
     _, figures = drawn
     assert sorted(figures) == [4, 5, 6, 7]
@@ -35,6 +36,7 @@ def test_every_statement_of_the_paper_holds(drawn):
         assert all(statement["holds"] for statement in figure["statements"])
 
 
+@pytest.mark.slow
 def test_forces_of_figure_4_are_those_of_mpmath(drawn):
     table = columns(drawn[0] / "figure4.csv")
     k = exact.constants(exact.ContactParameters())
@@ -45,6 +47,7 @@ def test_forces_of_figure_4_are_those_of_mpmath(drawn):
         assert table["sum_nn"][place] == pytest.approx(expected, rel=1e-12)
 
 
+@pytest.mark.slow
 def test_numbers_of_figures_5_to_7(drawn):
     _, figures = drawn
     junction = exact.junction(exact.ContactParameters())
@@ -59,6 +62,7 @@ def test_numbers_of_figures_5_to_7(drawn):
     assert figures[7]["lag_us"] == pytest.approx(float(slow.time_in_junction_us), abs=1e-8)
 
 
+@pytest.mark.slow
 def test_pictures_are_pictures(drawn):
     for number in (4, 5, 6, 7):
         picture = matplotlib.image.imread(drawn[0] / f"figure{number}.png")

@@ -74,6 +74,7 @@ def test_straight_contacts_are_those_of_an_independent_integration(contacts, acc
     np.testing.assert_allclose(np.asarray(leg.deepest_gap_nm)[holds], deepest[holds], rtol=0.0, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_nodes_and_sweeps_converge(contacts):
     rebound = column(contacts, "rebound_speed_nm_per_us")
     errors = []

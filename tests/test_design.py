@@ -129,6 +129,7 @@ def test_readings_and_information_are_those_of_other_orbits(of_law, drives):
     np.testing.assert_allclose(found.slope[usable] / largest, wanted / largest, rtol=1e-5, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_forecast_is_the_error_that_a_fit_reports(of_law):
     # without noise the fit ends at the believed law, where its errors must be the forecast's
     exact = other_amplitudes(of_law.drives)

@@ -312,6 +312,7 @@ def called(tmp_path_factory):
     return json.loads(result.stdout, parse_constant=refuse), folder
 
 
+@pytest.mark.slow
 def test_the_reduced_file_loads_and_is_as_accurate_as_wanted(called):
     payload, folder = called
     reduced = load_scene(folder / "reduced.toml")
@@ -324,6 +325,7 @@ def test_the_reduced_file_loads_and_is_as_accurate_as_wanted(called):
     assert start._asdict() == payload["start"]
 
 
+@pytest.mark.slow
 def test_the_command_writes_what_it_says(called):
     payload, folder = called
     with (folder / "out" / "effects.csv").open(encoding="utf-8") as file:

@@ -179,6 +179,7 @@ def test_amplitude_slopes_hold_and_can_fail():
     assert (amplitudes.rescaled_amplitude[:, 1:, amplitudes.zero] == 1.0).all()
 
 
+@pytest.mark.slow
 def test_share_above_tells_missing_orders(figure2: StabilityChart):
     frequency, amplitude = figure2.x_values, figure2.y_values
     short = stability_chart(presets.figure2_scene, x_values=frequency, y_values=amplitude, last_order=5)

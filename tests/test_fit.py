@@ -119,6 +119,7 @@ def test_profile_interval_ends_are_where_scipy_finds_chi2_risen_by_3_84(law, obj
             assert 2.0 * scipy.cost - law.chi2 == pytest.approx(3.8415, rel=5e-3)
 
 
+@pytest.mark.slow
 def test_other_models_are_refused_by_their_chi2(table):
     for model in ("restitution", "viscous"):
         result = fit(table, model=model)

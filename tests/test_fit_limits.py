@@ -227,6 +227,7 @@ def test_of_coexisting_orbits_the_measured_one_is_taken(table, monkeypatch, meas
     assert bool(branch.exists)
 
 
+@pytest.mark.slow
 def test_band_and_intervals_hold_another_minimum_that_the_data_hardly_tell(table, monkeypatch: pytest.MonkeyPatch):
     found = find_fit(table, "law")
     best = found.objective.problem.values(found.minimum.coordinates)

@@ -77,6 +77,7 @@ def test_the_papers_contact_predicts_the_tables_of_two_programs(shared):
         assert abs(square[used].sum() - count) < 4.0 * np.sqrt(2.0 * count)
 
 
+@pytest.mark.slow
 def test_viscous_law_and_delay_read_the_contact_off_the_shared_table(viscous):
     assert viscous.valid
     assert law_error(viscous) < 0.0035
@@ -93,6 +94,7 @@ def test_viscous_law_and_delay_read_the_contact_off_the_shared_table(viscous):
     np.testing.assert_allclose(viscous.law.collision_delay_us[inside], delay, rtol=0, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_rows_set_aside_are_named(viscous, shared):
     aside = np.flatnonzero(viscous.rows.set_aside)
     assert aside.size >= 1
@@ -109,6 +111,7 @@ def test_rows_set_aside_are_named(viscous, shared):
     assert viscous.degrees_of_freedom == used + given - len(viscous.parameters)
 
 
+@pytest.mark.slow
 def test_followed_orbits_are_those_that_a_search_finds(viscous, shared):
     problem = problem_of(shared, "viscous+delay")
     found = np.array([viscous.parameters[name].value for name in problem.names])

@@ -103,6 +103,7 @@ def test_state_is_the_phase_and_the_impact_of_the_dense_scan():
     np.testing.assert_allclose(orbits.amplitude_nm[slot, :2], [peak, lockin], rtol=1e-12)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("order", "reduced", "low", "high"), [(2, 1.96, 1.0, 1.4142), (1, 0.97, 2.0, 2.8284)])
 def test_a_close_pair_is_found(order, reduced, low, high):
     """The drive is lowered until two roots are about to meet: between neighbours of the search's own scan."""

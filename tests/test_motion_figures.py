@@ -59,6 +59,7 @@ def test_pieces_join_to_one_motion():
     assert heights.max() == pytest.approx(np.nanmax(whole.peak_height_nm), rel=3e-3)
 
 
+@pytest.mark.slow
 def test_the_amplitude_rises_above_resonance(rising):
     settled, ramps = rising
     # physics.md, independent code: 50.6 nm at -2 nm
@@ -70,6 +71,7 @@ def test_the_amplitude_rises_above_resonance(rising):
     assert not rise_statements(settled, ramps[::-1])[1].holds
 
 
+@pytest.mark.slow
 def test_the_tip_sticks_below_resonance(sticking, rising):
     settled, ramps = sticking
     assert holds(sticking_statements(settled, ramps)) == [True, True]

@@ -186,6 +186,7 @@ def test_a_vibration_that_dies_away_settles_when_it_has():
     assert follow_long(scene, state(0.0, 50.0, 0.0), 2500.0).verdict.settled
 
 
+@pytest.mark.slow
 def test_nothing_settles_under_a_ramp_or_two_frequencies():
     ramped = Scene(Cantilever(90.0, 40.0), Platform(4.0, 181.8, 0.0, 1e-3), TABULATED)
     beating = Scene(Cantilever(90.0, 40.0), Platform(4.0, 181.8, second=Tone(0.1, 33.0)), TABULATED)
@@ -227,6 +228,7 @@ def test_bad_arguments_are_told():
         settled(scene, simulation, tolerance=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("reduced", "amplitude", "offset", "peak"), PEAKS)
 def test_the_contact_reaches_the_heights_of_the_paper(reduced: float, amplitude: float, offset: float, peak: float):
     scene = contact_scene(reduced, amplitude, offset)

@@ -102,6 +102,7 @@ def test_trace_and_determinant_are_those_of_the_maps_derivative(orbits):
     np.testing.assert_allclose(orbits.one.determinant[orbits.there], determinant, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_long_iterations_settle_on_the_orbit(orbits):
     start, one = orbits.start, orbits.one
     iterate = jax.jit(jax.vmap(lambda scene, time, velocity: iterate_map(scene, time, velocity, IMPACTS)))
@@ -119,6 +120,7 @@ def test_long_iterations_settle_on_the_orbit(orbits):
     np.testing.assert_allclose(speeds[stays], expected[stays], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_simulations_stay_on_the_orbit_and_read_its_amplitudes(orbits):
     def follow(scene, start, duration):
         return simulate(scene, start, duration, max_contacts=PERIODS + 2)
@@ -144,6 +146,7 @@ def test_simulations_stay_on_the_orbit_and_read_its_amplitudes(orbits):
         assert np.sin(np.deg2rad(turn * orbits.order[lane] / 2.0)) == pytest.approx(0.0, abs=1e-9)
 
 
+@pytest.mark.slow
 def test_the_fit_predicts_the_orbits_amplitudes(orbits):
     laws, drives = made(DRIVES)
     known = np.stack([orbits.one.peak_amplitude_nm, orbits.one.lockin_amplitude_nm], axis=-1)[:DRIVES]

@@ -48,18 +48,21 @@ def minuit(residual):
     return minimiser
 
 
+@pytest.mark.slow
 def test_migrad_finds_the_same_minimum(result, minuit):
     # Minuit stops at an estimated distance of 2e-6
     assert minuit.fval == pytest.approx(result.chi2, abs=1e-4)
     assert list(minuit.values) == pytest.approx([0.0, 0.0, 0.0], abs=0.01)
 
 
+@pytest.mark.slow
 def test_hesse_finds_the_same_errors_and_correlations(result, minuit):
     # second derivatives against the Fisher information: they differ by the residuals times the curvature
     assert list(minuit.errors) == pytest.approx([1.0, 1.0, 1.0], rel=0.03)
     assert np.asarray(minuit.covariance.correlation()) == pytest.approx(result.correlations, abs=0.03)
 
 
+@pytest.mark.slow
 def test_minos_finds_the_same_profile_intervals(result, minuit):
     minuit.minos(cl=0.95)
     values, errors = values_of(result), standard_errors_of(result)
@@ -85,6 +88,7 @@ def lmfit_result(residual):
     return minimiser, minimiser.leastsq(ftol=1e-12, xtol=1e-10, epsfcn=1e-8)
 
 
+@pytest.mark.slow
 def test_lmfit_finds_the_same_minimum_and_errors(result, lmfit_result):
     _, found = lmfit_result
     assert found.success
@@ -95,6 +99,7 @@ def test_lmfit_finds_the_same_minimum_and_errors(result, lmfit_result):
     assert [found.params[name].stderr for name in NAMES] == pytest.approx([1.0, 1.0, 1.0], rel=1e-3)
 
 
+@pytest.mark.slow
 def test_lmfit_finds_the_same_profile_intervals(result, lmfit_result):
     lmfit = pytest.importorskip("lmfit")
     minimiser, found = lmfit_result

@@ -201,6 +201,7 @@ def test_capture_speed_divides_the_collisions(parameters: ContactParameters):
     assert slow.end_energy_aj < -10
 
 
+@pytest.mark.slow
 def test_own_error_is_below_the_digits_asked_for():
     for parameters, speed in ((PAPER, 15), (SOFT, 40)):
         assert max(own_error(parameters, speed, digits=25)) < mp.mpf("1e-25")
@@ -208,6 +209,7 @@ def test_own_error_is_below_the_digits_asked_for():
     assert 0 < abs(coarse.delay_us - fine.delay_us) < mp.mpf("1e-15")
 
 
+@pytest.mark.slow
 def test_differences_obey_the_scaling_of_time():
     # Slowing time by x takes mass to x^2 m, viscosity to x eta and speeds to u/x: Euler's identity for both results.
     speed = 15

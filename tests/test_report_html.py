@@ -285,6 +285,7 @@ def test_report_is_written_with_its_page(tmp_path):
     assert summary(again) == written[1].read_text(encoding="utf-8").rstrip("\n")
 
 
+@pytest.mark.slow
 def test_command_writes_the_page_of_the_bundled_table(tmp_path):
     result = CliRunner().invoke(main, ["fit", "--example", "--out", str(tmp_path)])
     assert result.exit_code == 0

@@ -68,6 +68,7 @@ def test_tenth_crossing_agrees_with_an_independent_integration(n, speed, double)
     np.testing.assert_allclose(np.asarray(detail.viscous_loss_aj)[:10], lost, rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("n", "speed"), [(1.01, 150.0), (5.277, 60.0)])
 def test_diffrax_in_time_goes_the_same_way(n, speed):
     system = reference(n, 4.0)
@@ -139,6 +140,7 @@ def test_the_end_may_lie_within_a_contact():
         assert Phase(int(simulation.phase)).name.lower() == course.phase
 
 
+@pytest.mark.slow
 def test_energy_of_a_contact_is_what_the_tip_loses():
     # no air, a resting sample: spring and kinetic energy change in contacts only
     scene = Scene(Cantilever(90.0, mass_ng=1.5), Platform(0.0, 180.0, -2.0), Contact.paper())
@@ -158,6 +160,7 @@ def test_energy_of_a_contact_is_what_the_tip_loses():
     )
 
 
+@pytest.mark.slow
 def test_dense_output_agrees_with_an_independent_integration():
     system = reference(5.277, 4.0)
     start = system.start(phase_deg=270, height_nm=5, velocity_nm_per_us=40.0)
@@ -180,6 +183,7 @@ def test_dense_output_agrees_with_an_independent_integration():
     assert work == pytest.approx(float(np.sum(simulation.contacts.energy_lost_aj)), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_batches_agree_with_single_scenes():
     speeds = np.array([40.0, 60.0, 150.0])
     scene = contact_scene(5.277, 4.0, 0.0)

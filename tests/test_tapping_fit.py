@@ -134,7 +134,8 @@ def test_a_soft_contact_is_predicted_as_wanted_above_resonance():
 def test_a_contact_comes_out_of_a_noisy_curve():
     """What its taps hold, and to one side what they hold no better; nothing but the tip's radius is known."""
     truth = tapping_truth(0)
-    result = contact_of(truth, noisy(as_measured(exact_table(truth, RATIO, TABLES)), truth, 0))
+    table = noisy(as_measured(exact_table(truth, RATIO, TABLES)), truth, 0)
+    result = contact_of(truth, table)
     assert result.valid, result.reasons
     found = against_truth(truth, result)
     # those next to the sample too
@@ -146,6 +147,22 @@ def test_a_contact_comes_out_of_a_noisy_curve():
         assert (low or 0.0) < truth.parameters[name] < (high or np.inf)
     assert result.parameters["viscosity_pa_s"].at_bound
     assert None not in result.parameters["modulus_gpa"].interval95
+    # a tip held at a radius that is 30 % too large
+    held = fit(table, "contact", fixed={"tip_radius_nm": 1.3 * truth.parameters["tip_radius_nm"]})
+    assert held.valid, held.reasons
+    for name in ("relative_humidity", "adhesion_energy_j_per_m2", "viscosity_pa_s", "modulus_gpa"):
+        low, high = held.parameters[name].interval95
+        assert (low or 0.0) < truth.parameters[name] < (high or np.inf)
+    band = held.law
+    there = held.rows.approach_speed_nm_per_us[held.rows.used]
+    speeds = np.linspace(max(np.nanmin(there), 1.05 * float(truth.impact.lowest)), np.nanmax(there), 60)
+    low, high = (
+        np.interp(speeds, band.approach_speed_nm_per_us, end)
+        for end in (band.rebound_low_nm_per_us, band.rebound_high_nm_per_us)
+    )
+    assert np.mean((low <= truth.rebound(speeds)) & (truth.rebound(speeds) <= high)) >= 0.9
+    assert any(one.startswith("Held, with errors that are assumed: ") for one in held.warnings)
+    assert any(one.startswith("modulus_gpa hangs on what is held: tip_radius_nm") for one in held.warnings)
 
 
 @pytest.mark.slow

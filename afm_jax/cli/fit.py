@@ -186,7 +186,9 @@ def command(session: Session, tables: tuple[Path, ...], model: str, noise: float
         read = tables_with(tables, noise, options["quality_factor"])
         fit_tables(session, read, {"model": model, **settings}, options["workers"])
         return
-    session.start_computing(*(f"fitting.forward:{name}" for name in ("impacts_of", "located", "linearise_pairs")))
+    session.start_computing(
+        *(f"fitting.forward:{name}" for name in ("impacts_of", "located", "linearise_pairs", "predict_pairs"))
+    )
     from fitting.fits.fit import find_fit, summarise_in_units  # noqa: PLC0415
     from fitting.report.report import summary  # noqa: PLC0415
     from fitting.tables.several import SeveralTables  # noqa: PLC0415

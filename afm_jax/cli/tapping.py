@@ -79,7 +79,9 @@ def _analysed(session: Session, table: "AmplitudeTable", model: str, *, no_law: 
     result = tapping(table, law=False, scale_errors=scale_errors)
     if no_law or not result.law_allowed:
         return result
-    session.start_computing(*(f"fitting.forward:{name}" for name in ("impacts_of", "located", "linearise_pairs")))
+    session.start_computing(
+        *(f"fitting.forward:{name}" for name in ("impacts_of", "located", "linearise_pairs", "predict_pairs"))
+    )
     with session.working("fitting the impact law (the first run compiles for half a minute)"):
         return with_law(result, model)
 

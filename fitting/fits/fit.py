@@ -71,10 +71,12 @@ from fitting.fits.unmodelled import (
     descending_part,
     effects_of_held,
     held_of,
+    held_values,
     law_after,
     longest_run,
     root_of,
     rows_of_fit,
+    seen_in_taps,
     split_held,
     step_of,
     system_of,
@@ -496,9 +498,11 @@ class _Summary:
         values = self.settings["fixed"] | dict(zip(self.problem.names, self.values.tolist(), strict=True))
         mass = float(self.stated.measurement.cantilever.mass_ng)
         left_out = Unmodelled(self.problem, values, speed_range(self.used_speeds), mass)
-        if self.problem.model == "contact" and not self.problem.pulled:
+        if self.problem.model == "contact":
             held = tuple(Held(*one) for one in self.settings.get("held", ()))
             effects = effects_of_held(held, values, self.problem.effects, mass, left_out.speeds)
+            if self.problem.pulled:
+                effects = seen_in_taps(effects, self.objective, self.values)
             left_out = replace(left_out, held=effects)
         if self.problem.lasting and not self.problem.pulled and not scattering:
             run = longest_run(rows, left_out, self.free)
@@ -576,9 +580,13 @@ class _Summary:
         values = np.array([part.values[: len(problem.names)] for part in parts])
         if problem.pulled or not problem.lasting:
             # taps are no law of the free tip's speed, and instantaneous laws have no discrepancy
-            plain = Objective(measurement, problem, near=self.objective.near).at_values(values)
-            size = (len(parts), *measurement.rows.measured.shape)
-            return Predicted(plain.residual[:, : size[1] * size[2]].reshape(size), plain.prediction)
+            size = measurement.rows.measured.shape
+            found = []
+            for one, part in zip(values, parts, strict=True):
+                there = measurement._replace(fixed=left_out.fixed_after(part, measurement.fixed))
+                plain = Objective(there, problem, near=self.objective.near).at_values(one[None])
+                found.append(Predicted(plain.residual[:, : size[0] * size[1]].reshape(1, *size), plain.prediction))
+            return jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
         laws = [self._law_after(part, left_out) for part in parts]
         speeds = self.prediction.approach_speed_nm_per_us[0]
         exists = (self.prediction.orbits[0] > 0) & np.isfinite(speeds)
@@ -1056,7 +1064,7 @@ def find_fit(  # noqa: PLR0913
                 raise ValueError(f"`{name}` is about several tables: leave it out, or give more than one")
         known = _known_of(table, model, constraints)
         problem = problem_of(table, model, free=free, fixed=fixed, constraints=known, effects=effects)
-        measurement = measurement_of(table, problem, known, fixed)
+        measurement = measurement_of(table, problem, known, held_values(problem, fixed))
     else:
         known, problem, measurement = _joint(table, model, share, constraints, free=free, fixed=fixed, effects=effects)
     amplitudes = int(np.asarray(measurement.rows.measured).sum())
@@ -1146,7 +1154,7 @@ def _joint(
     drives = tuple(table.drive for table in tables.tables)
     problem = Problem(model, tuple(names), tuple(options["effects"]), tables.drive)
     one = replace(problem, names=local, drive=drives[0])
-    parts = [measurement_of(table, one, known, options["fixed"]) for table in tables.tables]
+    parts = [measurement_of(table, one, known, held_values(one, options["fixed"])) for table in tables.tables]
     joint = Joint(one, tuple(part.cantilever for part in parts), drives, place, held)
     return known, problem, joint_measurement(tables, parts, problem, joint, known)
 

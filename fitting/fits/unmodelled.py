@@ -21,7 +21,7 @@ they are in the covariance of the rows.
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -82,13 +82,15 @@ class Held(NamedTuple):
 class HeldEffect(NamedTuple):
     """What one standard error of a held parameter does to the squared rebound speed and to the delay.
 
-    In nm^2/us^2 and us, at logarithms of approach speeds in nm/us.
+    In nm^2/us^2 and us, at logarithms of approach speeds in nm/us. ``readings``: what it does to the readings'
+    residuals; None: as the law says.
     """
 
     held: Held
     log_speed: Float[np.ndarray, " n"]
     square: Float[np.ndarray, " n"]
     late: Float[np.ndarray, " n"]
+    readings: Float[np.ndarray, " readings"] | None = None
 
     def at(self, speeds: Float[np.ndarray, " n"]) -> Float[np.ndarray, "2 n"]:
         """Return both at approach speeds in nm/us."""
@@ -187,6 +189,46 @@ def effects_of_held(
                 found.append(HeldEffect(one, np.log(u[there]), change[0, there], change[1, there]))
                 break
     return tuple(found)
+
+
+def held_values(problem: Problem, fixed: Mapping[str, float] | None) -> dict[str, float]:
+    """Return the values at which parameters are held: of taps on a contact all that they are varied about."""
+    if not problem.pulled:
+        return dict(fixed or {})
+    return {one.name: one.value for one in held_of(problem.own, problem.effects, fixed or {}, {})}
+
+
+def seen_in_taps(
+    effects: tuple[HeldEffect, ...], objective: Objective, values: Float[np.ndarray, " p"]
+) -> tuple[HeldEffect, ...]:
+    """Return the effects of held parameters with what they do to the readings of taps, which no law of speeds says.
+
+    Args:
+        effects: of the parameters on the law.
+        objective: the fit's, following its orbits.
+        values: the fitted ones.
+    """
+
+    def misfit(fixed: Mapping[str, Any]) -> tuple[Float[np.ndarray, "rows k"], Bool[np.ndarray, " rows"]]:
+        there = Objective(objective.measurement._replace(fixed=dict(fixed)), objective.problem, near=objective.near)
+        linear = there.at_values(values[None])
+        return there.misfit(linear), np.asarray(linear.prediction.orbits)[0] > 0
+
+    known = objective.measurement.fixed
+    (here, found), seen = misfit(known), []
+    for one in effects:
+        low, high = PARAMETERS[one.held.name].lowest, PARAMETERS[one.held.name].highest
+        for part in (_PARTS[1], -_PARTS[1]):
+            moved = float(np.clip(one.held.value + part * one.held.error, low, high)) - one.held.value
+            if moved == 0.0:
+                continue
+            there, left = misfit(known | {one.held.name: np.asarray(one.held.value + moved)})
+            # a row whose orbit is lost on the way says nothing
+            change = np.where((found & left)[:, None], (there - here) * one.held.error / moved, 0.0)
+            if np.isfinite(change).all():
+                seen.append(one._replace(readings=change.ravel()))
+                break
+    return tuple(seen)
 
 
 @partial(jax.jit, static_argnames="effects")
@@ -299,6 +341,15 @@ class Unmodelled:
         if self.held:
             unknown = np.concatenate([unknown, np.stack([one.at(u) for one in self.held], axis=2)], axis=2)
         return Columns(known, drag, _stacked(square, late, u.size), unknown)
+
+    def fixed_after(self, step: "LinearStep", fixed: Mapping[str, Any]) -> dict[str, Any]:
+        """Return the values of a contact's parameters after a step of a fit of taps that holds them at others."""
+        moved = {}
+        # of taps there are no other unknowns of the law
+        for one, unknown in zip(self.held, step.unknown, strict=False):
+            ends = PARAMETERS[one.held.name].lowest, PARAMETERS[one.held.name].highest
+            moved[one.held.name] = np.asarray(np.clip(one.held.value + one.held.error * unknown, *ends))
+        return dict(fixed) | moved
 
     def _unknown(self, u: Float[np.ndarray, " n"], w: Float[np.ndarray, " n"]):
         """Return columns of the squared speed and of the delay, for unknowns of unit variance."""
@@ -444,7 +495,11 @@ def system_of(rows: StepRows, left_out: Unmodelled) -> StepSystem:
     jacobian[:size, known:] = amplitudes(columns.shape)
     jacobian[residual.size :, known:] = np.diag([1.0 / error for _, error in priors.values()])
     residual = np.append(residual, np.zeros(len(priors)))
-    unknown = [amplitudes(columns.unknown)]
+    of_law = amplitudes(columns.unknown)
+    for place, one in enumerate(left_out.held, start=of_law.shape[1] - len(left_out.held)):
+        if one.readings is not None:
+            of_law[:, place] = one.readings
+    unknown = [of_law]
     if left_out.problem.lasting:
         unknown.append(amplitudes(_remainders(rows, left_out.problem)))
     return StepSystem(residual, jacobian, np.concatenate(unknown, axis=1), _noise(rows), unknown[0].shape[1])

@@ -52,7 +52,7 @@ _NO_TAPS = (
     "The contact's taps explain hardly a row of this curve: it has no steady tap a period there; fix what "
     "is known of it (--fix tip_radius_nm=20, for example), or leave out rows that are not one impact a period."
 )
-ASSUMED_ERROR_OF_Q = 0.02
+ASSUMED_ERROR_OF_Q = 0.05
 """Relative standard error of a quality factor that is given without one."""
 _AT_BOUND = 0.005
 _PULLED, _TORN = 2.0, 3.0

@@ -13,9 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-from afm_jax.impact.law import Law, TabulatedLaw, errors_of
+from afm_jax.impact.law import Law, errors_of
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, with_zero_line
-from afm_jax.scenefile.tables import cut_short
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import bullets, decimals, known, text_table, with_error
 from fitting.inversion.result import Coefficient, Inversion, RegressedLaw
@@ -191,7 +190,6 @@ _NS_PER_US = 1e3
 _INVALID = "#B00020"
 _SMALL = 9
 _POINTS = 200
-_LONGEST_LABEL = 40
 
 
 def inversion_figure(result: Inversion) -> Figure:
@@ -232,7 +230,7 @@ def _draw_loss(axes: Axes, result: Inversion) -> None:
         axes.fill_between(speeds, lost - law.curve_error, lost + law.curve_error, color=colour, alpha=0.15, lw=0)
     if result.beside is not None:
         u = _speeds_beside(result, result.beside)
-        _curve_beside(axes, result.beside, u, u - result.beside.rebound_speed(u), errors_of(result.beside, u)[0])
+        _curve_beside(axes, u, u - result.beside.rebound_speed(u), errors_of(result.beside, u)[0])
     c = rows.covariance
     error = np.sqrt(np.maximum(c[:, 0, 0] + c[:, 1, 1] - 2.0 * c[:, 0, 1], 0.0))
     _points(axes, result, rows.impact[:, 0] - rows.impact[:, 1], error)
@@ -269,12 +267,10 @@ def _speeds_beside(result: Inversion, law: Law) -> Float[np.ndarray, " points"]:
     return speeds[~np.asarray(law.extrapolated(speeds) | law.captures(speeds))]
 
 
-def _curve_beside(axes: Axes, law: Law, speeds: np.ndarray, values: ArrayLike, errors: np.ndarray) -> None:
+def _curve_beside(axes: Axes, speeds: np.ndarray, values: ArrayLike, errors: np.ndarray) -> None:
     """Draw what a law that is known otherwise says, with its 95 % band."""
     curve, half = np.asarray(values), TWO_SIDED_95 * errors
-    origin = law.origin.text if isinstance(law, TabulatedLaw) else ""
-    label = f"law: {cut_short(origin, _LONGEST_LABEL)}" if origin else "law given"
-    axes.plot(speeds, curve, ":", color="black", lw=1.8, zorder=3, label=label)
+    axes.plot(speeds, curve, ":", color="black", lw=1.8, zorder=3, label="law given")
     if half.any():
         axes.fill_between(speeds, curve - half, curve + half, color="black", alpha=0.15, lw=0)
 
@@ -289,7 +285,7 @@ def _draw_delay(axes: Axes, result: Inversion) -> None:
     if result.beside is not None:
         u = _speeds_beside(result, result.beside)
         late, error = result.beside.collision_delay(u), errors_of(result.beside, u)[1]
-        _curve_beside(axes, result.beside, u, _NS_PER_US * late, _NS_PER_US * error)
+        _curve_beside(axes, u, _NS_PER_US * late, _NS_PER_US * error)
     _points(axes, result, _NS_PER_US * result.rows.impact[:, 2], _NS_PER_US * result.rows.errors[:, 2])
     with_zero_line(axes)
     _speed_axis(axes, r"collision delay  $\tau$ (ns)")
