@@ -59,6 +59,8 @@ def test_a_curve_with_the_shape_of_measured_ones_has_its_energy_as_a_function(tm
     assert answer["valid"]
     assert answer["energy_per_tap_aj"] is None
     assert "one energy a branch does not describe the rows" in answer["energy_per_tap_reason"]
+    # the instrument is that of the functions, not the one that a constant would need
+    assert answer["nuisances"] == answer["functions"]["nuisances"]
     columns = ["amplitude_ratio", "height_nm"]
     columns += [f"{name}_{end}" for name in ("energy", "virial") for end in ("aj", "low_aj", "high_aj")]
     assert [one["repulsive"] for one in answer["branches"]] == [False, True]

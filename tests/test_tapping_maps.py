@@ -321,6 +321,11 @@ def test_curves_say_where_images_go_and_images_where_curves_go(tmp_path: Path):
     (path,) = written(tmp_path, "gwy")
     result = CliRunner().invoke(main, ["read", str(path)])
     assert "holds images; their energies: afm-jax tapping-map" in result.stderr
+    for command in ("read", "tapping"):
+        (arrays,) = written(tmp_path, "npz")
+        result = CliRunner().invoke(main, [command, str(arrays)])
+        assert (result.exit_code, len(result.stderr.splitlines())) == (2, 1)
+        assert "energies of images: afm-jax tapping-map" in result.stderr
 
 
 @pytest.mark.slow

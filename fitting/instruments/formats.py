@@ -81,9 +81,15 @@ def _parser_of(data: bytes, path: str) -> Callable[[bytes, str], Recording]:
     found = next((parse for start, parse in starts.items() if head.startswith(start)), None)
     if found is not None:
         return found
+    if head.startswith(b"\x93NUMPY") or (head.startswith(b"PK") and b".npy" in head):
+        return _refuse_arrays
     if b"neaspec" in head.lower():
         return parse_neasnom
     return parse_nanonis_text if re.search(rb"^\[DATA\]\s*$", data, re.MULTILINE) else parse_separated
+
+
+def _refuse_arrays(_: bytes, name: str) -> Recording:
+    raise TableError(f"{name}: holds NumPy's arrays, no curve; energies of images: afm-jax tapping-map")
 
 
 def holds_curves(head: bytes, path: str) -> bool:

@@ -671,6 +671,8 @@ class Tapping(Result):
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain lists, numbers and strings; what is not known is None."""
         fit, functions, energy = self.fit, self.functions, self.energy
+        # of one energy that does not describe the rows the instrument tells nothing
+        believed = fit if self.described or functions is None else functions
         group = self.group_of_rows
         branches = [
             {
@@ -717,7 +719,7 @@ class Tapping(Result):
                 "degrees_of_freedom": None if fit is None else fit.degrees_of_freedom,
                 "p_value": None if fit is None else fit.p_value,
                 "scale": None if fit is None else fit.scale,
-                "nuisances": {} if fit is None else nuisances_as_dict(fit.nuisances),
+                "nuisances": {} if believed is None else nuisances_as_dict(believed.nuisances),
                 "hysteresis": [
                     {
                         **vars(one),
