@@ -113,7 +113,7 @@ def test_traced_programs_of_a_folder_that_others_may_write_to_are_not_read(tmp_p
     folder = Path(python(f"import os\n{START}", **surroundings).split()[1])
     (folder / "traced").mkdir()
     (folder / "traced").chmod(0o777)
-    code = "import sys\nsys.argv = ['afm-jax', 'fit', 'none.csv', '--verbose']\nimport afm_jax.__main__"
+    code = "import sys\nsys.argv = ['afm-jax', 'fit', 'none.csv', '--verbose']\nfrom afm_jax.__main__ import run\nrun()"
     _, said = outputs(code, surroundings, (2,))
     assert f"traced programs are not kept: {folder}/traced: others may write to the folder" in said
 
@@ -175,7 +175,9 @@ def test_xla_is_silent_in_a_session_that_has_imported_jax_before(tmp_path: Path)
     assert entry.exists()
 
 
-DOCTOR = "import sys\nsys.argv = ['afm-jax', 'doctor', '--json', *sys.argv[1:]]\nimport afm_jax.__main__"
+DOCTOR = (
+    "import sys\nsys.argv = ['afm-jax', 'doctor', '--json', *sys.argv[1:]]\nfrom afm_jax.__main__ import run\nrun()"
+)
 
 
 @linux

@@ -108,5 +108,5 @@ def test_impossible_values_are_named(name, value):
 
 def test_a_scene_without_law_is_refused():
     scene = Scene(Cantilever(90.0), Platform(1.0, 180.0), None)
-    with pytest.raises(TypeError, match="an ImpactLaw, not None"):
+    with pytest.raises(TypeError, match="an ImpactLaw or a TabulatedLaw, not None"):
         impact_law_of(scene)

@@ -178,7 +178,9 @@ def test_inside_other_functions_it_is_the_function(folder):
 FIT = """
 import sys
 sys.argv = ["afm-jax", "fit", "--example", "--model", "law", "--json", "--verbose"]
-import afm_jax.__main__
+from afm_jax.__main__ import run
+
+run()
 """
 
 
