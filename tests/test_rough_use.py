@@ -373,7 +373,7 @@ for number in range(10**9):
 def test_a_kill_at_any_time_leaves_no_half_file(tmp_path):
     # all that commands write goes this way (above); what is left beside the file has a name of its own
     path, random, found = tmp_path / "fit.json", np.random.default_rng(4), set()
-    for _ in range(50):
+    for _ in range(20):
         with subprocess.Popen([sys.executable, "-c", WRITING, path], cwd=ROOT, stdout=subprocess.PIPE) as process:
             assert process.stdout is not None
             process.stdout.readline()

@@ -197,16 +197,16 @@ def test_each_free_amplitude_has_an_energy_of_its_own_and_the_picture_shows_all_
 
 @pytest.mark.slow
 def test_bands_hold_the_energies_of_random_curves():
-    for frequency_error in (1e-5, 1e-4):
-        found = [random_curve(number, Stated(frequency=frequency_error)) for number in range(1000, 1025)]
-        assert {one.kind.split(" ")[0] for one in found} == {"law", "contact", "two"}
-        off = np.abs(np.concatenate([one.points.energy for one in found]))
-        assert np.mean(off < 1.96) > 0.9
-        assert off.max() < 4.0
-        assert np.median(off) < 1.2 * 0.6745
-        changes = np.concatenate([one.hysteresis for one in found])
-        assert len(changes) == 10
-        assert np.abs(changes).max() < 2.0
+    # `make energies` takes more of them, and an instrument that is known better
+    found = [random_curve(number, Stated(frequency=1e-4)) for number in range(1000, 1025)]
+    assert {one.kind.split(" ")[0] for one in found} == {"law", "contact", "two"}
+    off = np.abs(np.concatenate([one.points.energy for one in found]))
+    assert np.mean(off < 1.96) > 0.9
+    assert off.max() < 4.0
+    assert np.median(off) < 1.2 * 0.6745
+    changes = np.concatenate([one.hysteresis for one in found])
+    assert len(changes) == 10
+    assert np.abs(changes).max() < 2.0
 
 
 @pytest.mark.slow
