@@ -12,7 +12,7 @@ import click
 
 from afm_jax.cli.each import fit_tables
 from afm_jax.cli.main import NotValid
-from afm_jax.cli.session import Session, prepare_folder, with_session
+from afm_jax.cli.session import FIT_PROGRAMS, Session, prepare_folder, with_session
 from afm_jax.cli.values import (
     example_path,
     parse_around_plus_minus,
@@ -186,9 +186,7 @@ def command(session: Session, tables: tuple[Path, ...], model: str, noise: float
         read = tables_with(tables, noise, options["quality_factor"])
         fit_tables(session, read, {"model": model, **settings}, options["workers"])
         return
-    session.start_computing(
-        *(f"fitting.forward:{name}" for name in ("impacts_of", "located", "linearise_pairs", "predict_pairs"))
-    )
+    session.start_computing(*FIT_PROGRAMS)
     from fitting.fits.fit import find_fit, summarise_in_units  # noqa: PLC0415
     from fitting.report.report import summary  # noqa: PLC0415
     from fitting.tables.several import SeveralTables  # noqa: PLC0415

@@ -37,6 +37,12 @@ if TYPE_CHECKING:
     from afm_jax.compilation_cache import Cache
 
 
+FIT_PROGRAMS = tuple(
+    f"fitting.forward:{name}" for name in ("impacts_of", "located", "linearise_pairs", "predict_pairs")
+)
+"""Jitted functions of a fit of the impact law whose traces are kept (see `Session.start_computing`)."""
+
+
 def prepare_folder(folder: Path, *, within: Path | None = None) -> None:
     """Make a folder, with those above it, and check that a file can be written there.
 

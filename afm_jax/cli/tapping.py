@@ -8,7 +8,7 @@ import click
 
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.read import READING_OPTIONS, with_reading
-from afm_jax.cli.session import Session, add_note, prepare_folder, with_session
+from afm_jax.cli.session import FIT_PROGRAMS, Session, add_note, prepare_folder, with_session
 from afm_jax.cli.values import ValueAndError, with_noise
 
 if TYPE_CHECKING:
@@ -79,9 +79,7 @@ def _analysed(session: Session, table: "AmplitudeTable", model: str, *, no_law: 
     result = tapping(table, law=False, scale_errors=scale_errors)
     if no_law or not result.law_allowed:
         return result
-    session.start_computing(
-        *(f"fitting.forward:{name}" for name in ("impacts_of", "located", "linearise_pairs", "predict_pairs"))
-    )
+    session.start_computing(*FIT_PROGRAMS)
     with session.working("fitting the impact law (the first run compiles for half a minute)"):
         return with_law(result, model)
 
