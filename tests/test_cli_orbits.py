@@ -1,7 +1,6 @@
 """`afm-jax orbits`, compared with the 50-digit orbits of the references."""
 
 import csv
-import json
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +13,7 @@ from afm_jax.cli.orbits import COLUMNS
 from tests.reference_examples import SCENES, scene
 from tests.reference_orbits import single_impact_orbits
 from tests.reference_systems import Parameters
+from tests.strict_reading import strictly
 
 KEYS = {*COLUMNS}
 
@@ -35,7 +35,7 @@ def orbits(*arguments: str) -> Result:
 def test_json_is_the_references_list(name: str, tmp_path: Path):
     result = orbits(saved(SCENES[name], tmp_path / "scene.toml"), "--order", "1", "--json")
     assert result.exit_code == 0, result.stderr
-    answer = json.loads(result.stdout)
+    answer = strictly(result.stdout)
     expected = single_impact_orbits(SCENES[name], 1)
     assert (answer["order"], answer["reason"], answer["complete"]) == (1, None, True)
     assert len(answer["orbits"]) == len(expected) > 0
@@ -63,7 +63,7 @@ def test_no_orbit_ends_with_3_and_says_why(tmp_path: Path):
     weak = scene(amplitude_nm=0.01)
     assert single_impact_orbits(weak, 1) == []
     result = orbits(saved(weak, tmp_path / "scene.toml"), "--order", "1", "--json")
-    answer = json.loads(result.stdout)
+    answer = strictly(result.stdout)
     assert (result.exit_code, answer["orbits"]) == (3, [])
     assert "larger drive amplitude" in answer["reason"]
     assert result.stderr == f"afm-jax: not valid: {answer['reason']}\n"
@@ -75,7 +75,7 @@ def test_orbits_through_the_platform_do_not_count(tmp_path: Path):
     assert expected
     assert not any(orbit.admissible for orbit in expected)
     result = orbits(saved(centred, tmp_path / "scene.toml"), "--order", "3", "--json")
-    answer = json.loads(result.stdout)
+    answer = strictly(result.stdout)
     assert (result.exit_code, len(answer["orbits"])) == (3, len(expected))
     assert "try --order 1" in answer["reason"]
 

@@ -81,7 +81,7 @@ OTHERS = [
     {"bridge_forms_nm": 0.13, "bridge_breaks_nm": 0.505},
     {"bridge_forms_nm": 3.5, "bridge_breaks_nm": 3.5},
     {"effects": ("capillary", "structural", "core", "jkr")},
-    {"effects": ("capillary", "core", "viscous", "jkr")},
+    pytest.param({"effects": ("capillary", "core", "viscous", "jkr")}, marks=pytest.mark.slow),
     {"mass_ng": 20.0},
 ]
 

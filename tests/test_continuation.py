@@ -34,6 +34,7 @@ from afm_jax.dynamics.continuation import Continuation, continue_orbits
 from afm_jax.impact.closure import OrbitProblem, closing_residual
 from afm_jax.plots.branches import draw_continuation, draw_curves
 from afm_jax.scenefile.parameter_paths import ParameterRange
+from tests.strict_reading import strictly
 
 FREE = 2.0 * np.pi * 0.09
 """Omega in rad/us."""
@@ -338,7 +339,7 @@ def test_the_command_tells_what_python_finds(doubled: Continuation, tmp_path: Pa
     arguments = (path, "--order", "1", "--parameter", "platform.reduced_frequency=0.9:1.4")
     result = run(*arguments, "--second", "platform.offset_nm=-1.9:0", "--json", "--out", str(tmp_path / "out"))
     assert result.exit_code == 0, result.stderr
-    answer = json.loads(result.stdout)
+    answer = strictly(result.stdout)
     assert [point["parameter"] for point in answer["points"]] == doubled.branches[0].parameter.tolist()
     assert {"phase_rad", "velocity_after_nm_per_us", "peak_amplitude_nm", "multipliers", "stable", "admissible"} <= set(
         answer["points"][0]
@@ -384,7 +385,7 @@ def test_the_law_of_a_fit_gives_intervals(tmp_path: Path):
     arguments = (path, "--order", "1", "--parameter", "platform.amplitude_nm=0.5:6", "--json")
     result = run(*arguments, "--law", fit_file(tmp_path / "fit.json"), "--out", str(tmp_path / "out"))
     assert result.exit_code == 0, result.stderr
-    answer = json.loads(result.stdout)
+    answer = strictly(result.stdout)
     captured = next(point for point in answer["special"] if point["kind"] == "capture")
     # undamped, closed: beta^2 = (u cot/2 Omega - sigma)^2 + (u/2 omega)^2 with u = sqrt(epsilon)/r
     omega = 2.02 * FREE
@@ -431,7 +432,7 @@ def test_charts_and_exponents_take_the_law_of_a_fit(tmp_path: Path):
     assert [float(row["stable_probability_1"]) for row in rows] == pytest.approx(shares)
     told = CliRunner().invoke(main, ["lyapunov", path, "--law", law, "--draws", "8", "--impacts", "200", "--json"])
     assert told.exit_code == 0, told.stderr
-    ends = json.loads(told.stdout)["exponent_per_impact_interval95"]
+    ends = strictly(told.stdout)["exponent_per_impact_interval95"]
     assert ends[0] < ends[1]
 
 
@@ -458,7 +459,7 @@ def test_a_fit_that_says_nothing_is_refused(tmp_path: Path):
 def test_nothing_in_the_range_ends_with_3_and_says_why(tmp_path: Path):
     path = saved(tmp_path / "scene.toml", scene(0.1, epsilon=5.0))
     result = run(path, "--order", "1", "--parameter", "platform.reduced_frequency=1.3:1.4", "--json")
-    answer = json.loads(result.stdout)
+    answer = strictly(result.stdout)
     assert (result.exit_code, answer["points"]) == (3, [])
     assert result.stderr == f"afm-jax: not valid: {answer['reason']}\n"
 

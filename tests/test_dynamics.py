@@ -19,6 +19,7 @@ from afm_jax.dynamics.bifurcations import bifurcation_diagram
 from afm_jax.dynamics.charts import stability_chart
 from afm_jax.dynamics.iteration import bouncing_tips
 from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
+from tests.strict_reading import strictly
 
 FREQUENCY = "platform.reduced_frequency"
 
@@ -277,7 +278,7 @@ def test_commands_write_tables_and_pictures(tmp_path: Path):
     for name, options in calls.items():
         run = CliRunner().invoke(main, [name, str(file), *options, "--json", "--out", str(tmp_path / name)])
         assert run.exit_code == 0, run.stderr
-        assert json.loads(run.stdout)
+        assert strictly(run.stdout)["format"] == f"afm-jax {name}"
         assert (tmp_path / name / f"{name}.csv").stat().st_size > 100
         assert list((tmp_path / name).glob(f"{name}.[ps][dnv][fg]"))
     run = CliRunner().invoke(main, ["chart", str(file), *calls["chart"], "--zarr", "--out", str(tmp_path / "arrays")])

@@ -138,20 +138,14 @@ def test_it_agrees_with_differences_of_fifty_digits(row):
             np.testing.assert_allclose(found.gradient[index, :, column], expected, rtol=1e-9)
 
 
-@pytest.mark.parametrize("mode", ["forward", "reverse"])
-def test_it_agrees_with_extrapolated_differences_of_a_delayed_law(mode):
+@pytest.mark.parametrize(("model", "values"), [("law+delay", DELAYED), ("contact", CONTACT)])
+def test_forward_and_reverse_agree_with_extrapolated_differences(model, values):
     table = table_of(*ROWS)
-    found = amplitude_gradients(table, "law+delay", DELAYED, mode=mode)
-    ordered = {name: DELAYED[name] for name in found.parameters}
-    agree(found, extrapolated(table, "law+delay", ordered))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("mode", ["forward", "reverse"])
-def test_it_agrees_with_extrapolated_differences_of_a_contact(mode):
-    table = table_of(*ROWS)
-    found = amplitude_gradients(table, "contact", CONTACT, mode=mode)
-    agree(found, extrapolated(table, "contact", {name: CONTACT[name] for name in found.parameters}))
+    forward, reverse = (amplitude_gradients(table, model, values, mode=mode) for mode in ("forward", "reverse"))
+    assert forward.parameters == reverse.parameters
+    expected = extrapolated(table, model, {name: values[name] for name in forward.parameters})
+    agree(forward, expected)
+    agree(reverse, expected)
 
 
 def test_more_rows_than_a_program_takes_change_nothing():

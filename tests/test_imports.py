@@ -64,9 +64,15 @@ FITTING_LEVELS = {
 LIBRARY = sorted(path.relative_to(ROOT) for name in ("afm_jax", "fitting") for path in (ROOT / name).rglob("*.py"))
 
 
+@cache
+def tree_of(path: Path) -> ast.Module:
+    """Return a file of the library as its syntax tree, which is only read."""
+    return ast.parse((ROOT / path).read_text())
+
+
 def imported(path: Path) -> Iterator[str]:
     """Give the full names of the modules that a file imports, anywhere in it."""
-    for node in ast.walk(ast.parse((ROOT / path).read_text())):
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
         elif isinstance(node, ast.ImportFrom):
@@ -137,7 +143,7 @@ Known = dict[tuple[str, str], tuple[str, str] | ast.AST]
 @cache
 def definitions() -> Known:
     """Return what every name of every module stands for: its definition, or module and name of what is imported."""
-    trees = {".".join(path.with_suffix("").parts): ast.parse((ROOT / path).read_text()) for path in LIBRARY}
+    trees = {".".join(path.with_suffix("").parts): tree_of(path) for path in LIBRARY}
     known: Known = {}
     for module, tree in trees.items():
         for node in ast.walk(tree):
@@ -190,7 +196,7 @@ def test_a_call_crosses_few_files(module: str, name: str, most: int):
 def test_no_two_classes_have_one_name():
     found: dict[str, list[str]] = {}
     for path in LIBRARY:
-        for node in ast.parse((ROOT / path).read_text()).body:
+        for node in tree_of(path).body:
             if isinstance(node, ast.ClassDef):
                 found.setdefault(node.name, []).append(str(path))
     assert not {name: paths for name, paths in found.items() if len(paths) > 1}
@@ -214,21 +220,23 @@ def test_fits_load_no_scipy():
     assert python("import sys, fitting.fits.fit, fitting.report.report; print('scipy' in sys.modules)") == "False"
 
 
-def test_no_module_takes_the_place_of_a_public_function():
+def test_importing_everything_changes_no_setting_and_takes_no_functions_place():
     # `import fitting.calibration.sweep` puts the name `calibration` into `fitting`: were a folder called `calibrate`,
     # the function of that name would be gone.
     code = (
-        "import importlib, pkgutil, afm_jax, fitting\n"
+        "import importlib, pkgutil, jax, afm_jax, fitting\n"
+        "before = dict(jax.config.values)\n"
         "for package in (afm_jax, fitting):\n"
         "    for module in pkgutil.walk_packages(package.__path__, package.__name__ + '.'):\n"
         "        if not module.name.endswith('__main__'):\n"
         "            importlib.import_module(module.name)\n"
         "    print([name for name in package.__all__ if type(getattr(package, name)).__name__ == 'module'])\n"
         "result = fitting.fit.__name__, fitting.calibrate.__name__, fitting.lockin.__name__, fitting.invert.__name__\n"
-        "print(*result, fitting.design.__name__, afm_jax.simulate.__name__, afm_jax.collide.__name__)"
+        "print(*result, fitting.design.__name__, afm_jax.simulate.__name__, afm_jax.collide.__name__)\n"
+        "print({name for name, value in before.items() if jax.config.values[name] != value})"
     )
     lines = python(code).splitlines()
-    assert lines == ["[]", "[]", "fit calibrate lockin invert design simulate collide"]
+    assert lines == ["[]", "[]", "fit calibrate lockin invert design simulate collide", "set()"]
 
 
 def changes_of_configuration(path: Path) -> list[int]:
@@ -236,7 +244,7 @@ def changes_of_configuration(path: Path) -> list[int]:
 
     Left out is what only runs when the file is a program: its `__main__` block and the functions called there.
     """
-    tree = ast.parse((ROOT / path).read_text())
+    tree = tree_of(path)
     programs = [node for node in tree.body if isinstance(node, ast.If) and "__main__" in ast.unparse(node.test)]
     called = {ast.unparse(inner.func) for node in programs for inner in ast.walk(node) if isinstance(inner, ast.Call)}
     programs += [node for node in tree.body if isinstance(node, ast.FunctionDef) and node.name in called]
@@ -266,16 +274,3 @@ def test_the_command_line_does_change_it():
     # So that the test above is known to see such lines.
     changed = [path for path in LIBRARY if path.parts[:2] == ("afm_jax", "cli") and changes_of_configuration(path)]
     assert changed
-
-
-def test_importing_everything_changes_no_setting():
-    code = (
-        "import importlib, pkgutil, jax, afm_jax, fitting\n"
-        "before = dict(jax.config.values)\n"
-        "for package in (afm_jax, fitting):\n"
-        "    for module in pkgutil.walk_packages(package.__path__, package.__name__ + '.'):\n"
-        "        if not module.name.endswith('__main__'):\n"
-        "            importlib.import_module(module.name)\n"
-        "print({name for name, value in before.items() if jax.config.values[name] != value})"
-    )
-    assert python(code) == "set()"

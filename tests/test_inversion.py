@@ -9,7 +9,7 @@ import pytest
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
-from afm_jax.impact.law import ImpactLaw
+from afm_jax.impact.law import ImpactLaw, TabulatedLaw
 from afm_jax.impact.orbits import single_impact_orbits
 from fitting.inversion.flight import _best_ends, _look
 from fitting.inversion.invert import invert
@@ -258,15 +258,15 @@ def test_reading_on_resonance_is_exact_where_its_assumptions_hold():
         peak_amplitude_nm=np.array([peak]),
         peak_amplitude_error_nm=np.array([0.01 * peak]),
     )
-    reading = invert(table, truth=(np.array([10.0, 500.0]), r * np.array([10.0, 500.0]))).resonance
-    # closed forms; the law is linear, so that the interpolated truth is r u but for the squares in between
+    reading = invert(table, truth=ImpactLaw(r)).resonance
+    # closed forms
     np.testing.assert_allclose(reading.approach_speed_nm_per_us, after + top, rtol=1e-12)
     np.testing.assert_allclose(reading.rebound_speed_nm_per_us, r * (after + top), rtol=1e-12)
 
 
 def test_bias_of_the_reading_on_resonance_is_shown_against_the_truth(exact):
     truth = np.geomspace(12.0, 700.0, 128)
-    found = invert(without_phase(paper_experiment().exact), truth=(truth, paper_collisions(truth)[0]))
+    found = invert(without_phase(paper_experiment().exact), truth=TabulatedLaw(truth, paper_collisions(truth)[0]))
     assert found.valid
     assert any("no phase" in warning for warning in found.warnings)
     reading = found.resonance

@@ -8,8 +8,9 @@ import pytest
 from click.testing import CliRunner
 from matplotlib.image import imread
 
-from afm_jax import TabulatedLaw, save_law
+from afm_jax import TabulatedLaw, load_law, save_law
 from afm_jax.cli.main import main
+from afm_jax.units import TWO_SIDED_95
 from fitting.examples.make_contact_amplitudes import EXAMPLE
 from tests.strict_reading import strictly
 
@@ -60,9 +61,16 @@ def test_report_is_written(reported):
     slow = [row for row in rows if row["regressed"] == "false"]
     assert slow
     assert all("slower than 2.5 sqrt(epsilon)" in row["note"] for row in slow)
+    # the law of the report is what a scene takes
+    law, told = load_law(folder / "law.csv"), strictly((folder / "invert.json").read_text(encoding="utf-8"))["law"]
+    np.testing.assert_allclose(
+        law.rebound_speed(np.array(told["approach_speed_nm_per_us"])), told["rebound_speed_nm_per_us"], rtol=1e-6
+    )
+    assert law.delay is not None
     with (folder / "law.csv").open(encoding="utf-8") as file:
-        law = list(csv.DictReader(file))
-    assert float(law[0]["rebound_speed_viscous_nm_per_us"]) < float(law[0]["approach_speed_nm_per_us"])
+        points = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    low, high = (float(points[0][f"rebound_{end}_nm_per_us"]) for end in ("low", "high"))
+    assert 2.0 * TWO_SIDED_95 * told["viscous"]["curve_error"][0] == pytest.approx(high - low, rel=1e-6)
     assert strictly((folder / "invert.json").read_text(encoding="utf-8"))["format"] == "afm-jax invert"
     text = (folder / "invert.txt").read_text(encoding="utf-8")
     assert "The rows support a viscous loss" in text
@@ -77,7 +85,8 @@ def test_reading_on_resonance_is_compared_with_a_truth_from_a_file(tmp_path):
     path.write_text(COMMENTS + "\n".join([HEAD.rsplit(",", 2)[0], *resonant]) + "\n", encoding="utf-8")
     # captured tips stay empty, as `collide` writes them
     lines = ["approach_speed_nm_per_us,rebound_speed_nm_per_us,captured", "10,,true", "15,10.1805,false"]
-    truth.write_text("\n".join([*lines, "200,199.4561,false", "400,399.6,false"]) + "\n", encoding="utf-8")
+    lines += ["60,58.79,false", "200,199.4561,false", "400,399.6,false"]
+    truth.write_text("\n".join(lines) + "\n", encoding="utf-8")
     result = run(path, "--truth", truth, "--json")
     assert result.exit_code == 0, result.stderr
     answer = strictly(result.stdout)
@@ -102,7 +111,7 @@ def test_two_rows_end_with_exit_code_3(tmp_path):
         (None, (), "give a table to invert"),
         ([HEAD.rsplit(",", 2)[0], ROWS[0].rsplit(",", 2)[0]], (), "add the columns phase_deg and phase_error_deg"),
         ([HEAD, ROWS[0]], ("--frequency-error", "-1"), "frequency-error"),
-        ([HEAD, ROWS[0]], ("--truth", "TABLE"), "there is no column approach_speed_nm_per_us"),
+        ([HEAD, ROWS[0]], ("--truth", "TABLE"), "is none of a law's"),
         ([HEAD, ROWS[0]], ("--law", "TABLE"), "is none of a law's"),
     ],
 )
@@ -165,15 +174,12 @@ def test_a_fitted_law_is_drawn_over_the_rows(tmp_path):
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        ("approach_speed_nm_per_us,rebound_speed_nm_per_us\n20,16.6\n", "two or more rebounding tips"),
-        ("approach_speed_nm_per_us,rebound_speed_nm_per_us\n20,16.6\n20,16.7\n", "each speed once"),
-        ("approach_speed_nm_per_us,rebound_speed_nm_per_us\n20,fast\n", "a speed is not a number"),
-        (
-            "# a law\napproach_speed_nm_per_us,rebound_speed_nm_per_us\n20,16\n30,fast\n",
-            "line 4: a speed is not a number",
-        ),
-        ("approach_speed_nm_per_us,rebound_speed_nm_per_us\n20,16\n30\n", "line 3: there are 1 cells for 2 columns"),
-        ("", "there is no column approach_speed_nm_per_us"),
+        ("approach_speed_nm_per_us,rebound_speed_nm_per_us\n20,16.6\n", "at least four speeds"),
+        ("approach_speed_nm_per_us,rebound_speed_nm_per_us\n20,16\n20,17\n30,26\n40,38\n", "must increase"),
+        ("# a law\napproach_speed_nm_per_us,rebound_speed_nm_per_us\n20,16\n30,fast\n", "line 4: `rebound_speed"),
+        ("approach_speed_nm_per_us,rebound_speed_nm_per_us\n20,16\n30,\n", "line 3: `rebound_speed"),
+        ("approach_speed_nm_per_us,rebound_speed_nm_per_us\n20,16\n30\n", "line 3 has 1 values for 2 columns"),
+        ("", "is empty"),
     ],
 )
 def test_faulty_truths_are_refused(tmp_path, text, said):

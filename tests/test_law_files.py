@@ -204,3 +204,18 @@ def test_a_fit_of_instantaneous_impacts_tells_delays_of_0(law, tmp_path):
     (tmp_path / "fit.json").write_text(json.dumps(fit))
     with pytest.raises(ValueError, match="the numbers of the law lack knots"):
         afm.load_law(tmp_path / "fit.json")
+
+
+def test_the_table_of_collisions_is_a_law(tmp_path):
+    """What `collide --out` writes, captured tips left empty."""
+    head = "approach_speed_nm_per_us,rebound_speed_nm_per_us,collision_delay_us,captured,outcome,end_energy_aj"
+    rows = ["8,,,true,captured,-1.5", "20,16.7,0.01,false,free,1.0", "30,28.0,0.012,false,free,1.0"]
+    rows += ["50,48.7,0.013,false,free,1.0", "200,199.6,0.014,false,free,1.0"]
+    (tmp_path / "collide.csv").write_text("\n".join([head, *rows]) + "\n")
+    law = afm.load_law(tmp_path / "collide.csv")
+    assert 8.0 <= float(law.capture_speed_nm_per_us) < 20.0
+    assert float(law.rebound_speed(30.0)) == pytest.approx(28.0, rel=1e-12)
+    # only of a captured tip there is nothing to say
+    (tmp_path / "collide.csv").write_text("\n".join([head, *rows]).replace("28.0", "") + "\n")
+    with pytest.raises(ValueError, match="line 4: `rebound_speed_nm_per_us` must be a number, but is ''"):
+        afm.load_law(tmp_path / "collide.csv")

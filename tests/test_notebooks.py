@@ -1,9 +1,10 @@
 """The notebooks: stored without outputs, run from the first cell to the last, ended by an assertion."""
 
-import nbformat
+from pathlib import Path
+
 import pytest
 
-from notebooks.run_notebooks import NOTEBOOKS, run
+NOTEBOOKS = sorted((Path(__file__).parent.parent / "notebooks").glob("*.ipynb"))
 
 
 def test_there_are_notebooks():
@@ -12,6 +13,8 @@ def test_there_are_notebooks():
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_stored_without_outputs_and_ending_with_an_assertion(path):
+    import nbformat  # noqa: PLC0415  # a second and a half, which listing the tests need not take
+
     notebook = nbformat.read(path, as_version=4)
     nbformat.validate(notebook)
     code = [cell for cell in notebook.cells if cell.cell_type == "code"]
@@ -22,6 +25,8 @@ def test_stored_without_outputs_and_ending_with_an_assertion(path):
 @pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_runs(path):
+    from notebooks.run_notebooks import run  # noqa: PLC0415  # imports nbformat
+
     notebook = run(path)  # kept for the site
     pictures = [
         output for cell in notebook.cells for output in cell.get("outputs", []) if "image/png" in output.get("data", {})

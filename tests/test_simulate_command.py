@@ -16,6 +16,7 @@ from afm_jax.scenefile.scenefile import Start
 from fitting.traces.lockin import lockin
 from fitting.traces.trace import read_trace
 from tests.fresh_python import python
+from tests.strict_reading import strictly
 
 LAW = Scene(Cantilever(90.0, 40.0), Platform(4.0, 181.8), ImpactLaw(0.9, 20.0))
 KEYS = {"impacts", "stuck", "settled", "order", "peak_amplitude_nm", "lockin_amplitude_nm", "final"}
@@ -46,7 +47,7 @@ def test_without_a_duration_it_ends_when_settled(law_file: Path, tmp_path: Path,
     assert result.exit_code == 0, result.stderr
     # observables, files and pictures look at one path
     assert len(worked_out) == 1
-    answer = json.loads(result.stdout)
+    answer = strictly(result.stdout)
     assert answer.keys() >= KEYS
     assert nulls(answer) == answer["null_reasons"].keys()
     orbits = single_impact_orbits(LAW, 1)
@@ -69,7 +70,7 @@ def test_without_a_duration_it_ends_when_settled(law_file: Path, tmp_path: Path,
 
 
 def test_the_text_says_the_same(law_file: Path):
-    answer = json.loads(simulate(law_file, "--periods", 60.5, "--json").stdout)
+    answer = strictly(simulate(law_file, "--periods", 60.5, "--json").stdout)
     text = simulate(law_file, "--periods", 60.5).stdout
     assert f"{answer['impacts']} contacts" in text
     assert "Settled: the motion repeats: 1 contact in 1 drive period." in text
@@ -82,7 +83,7 @@ def test_the_text_says_the_same(law_file: Path):
 
 def test_too_short_to_settle_is_said_and_no_failure(law_file: Path):
     result = simulate(law_file, "--duration-us", 20, "--json")
-    answer = json.loads(result.stdout)
+    answer = strictly(result.stdout)
     assert (result.exit_code, answer["settled"], answer["order"]) == (0, False, None)
     assert "no sequence" in answer["settled_reason"]
     assert "Not settled: " in simulate(law_file, "--duration-us", 20).stdout
@@ -91,7 +92,7 @@ def test_too_short_to_settle_is_said_and_no_failure(law_file: Path):
 @pytest.mark.slow
 def test_a_part_of_a_response_period_has_no_mean(law_file: Path):
     result = simulate(law_file, "--duration-us", 3, "--harmonics", "1,2", "--json")
-    answer = json.loads(result.stdout)
+    answer = strictly(result.stdout)
     assert (result.exit_code, answer["window"]["responses"]) == (0, 0)
     assert nulls(answer) == answer["null_reasons"].keys()
     short = {name for name, reason in answer["null_reasons"].items() if "shorter than a response period" in reason}
@@ -112,7 +113,7 @@ def test_lockin_reads_the_trace_it_writes(tmp_path: Path, order: int):
     save_scene(scene, tmp_path / "scene.toml")
     result = simulate(tmp_path / "scene.toml", "--json", "--out", tmp_path / "out", "--samples", "uniform")
     assert result.exit_code == 0, result.stderr
-    answer = json.loads(result.stdout)
+    answer = strictly(result.stdout)
     trace = read_trace(tmp_path / "out" / "trace.csv")
     assert (trace.settings.drive_amplitude_nm, trace.settings.offset_nm, trace.settings.quality_factor) == (4, -1, 40)
     read = lockin(trace)
@@ -133,7 +134,7 @@ def test_a_tip_too_slow_sticks(tmp_path: Path):
     scene = Scene(Cantilever(90.0, 40.0), Platform(0.1, 180.0), Contact.paper())
     save_scene(scene, path, start=Start(0.0, 8.0, -1.0))
     result = simulate(path, "--periods", 60, "--json")
-    answer = json.loads(result.stdout)
+    answer = strictly(result.stdout)
     assert result.exit_code == 0, result.stderr
     assert (answer["stuck"], answer["settled"], answer["order"], answer["impacts"]) == (True, True, None, 1)
     assert answer["final"]["phase"] in ("bridge", "junction")
@@ -145,7 +146,7 @@ def test_a_tip_too_slow_sticks(tmp_path: Path):
 def test_a_preset_has_its_start():
     result = simulate("figure2", "--periods", 30, "--json")
     assert result.exit_code == 0, result.stderr
-    answer = json.loads(result.stdout)
+    answer = strictly(result.stdout)
     assert answer["scene"]["platform"]["offset_nm"] == -1.0
 
 
@@ -242,7 +243,7 @@ viscous_loss = 0.01
 def test_the_drives_frequency_is_read_and_named_whatever_harmonics_are_asked_for(tmp_path: Path):
     path = tmp_path / "forced.toml"
     path.write_text(FORCED)
-    answers = [json.loads(simulate(path, "--json", "--harmonics", asked).stdout) for asked in ("1", "2", "3,4,6")]
+    answers = [strictly(simulate(path, "--json", "--harmonics", asked).stdout) for asked in ("1", "2", "3,4,6")]
     keys = ("lockin_amplitude_nm", "lockin_phase_deg", "drive_lockin_amplitude_nm", "drive_lockin_phase_deg")
     assert [answer["order"] for answer in answers] == [3] * 3
     for answer in answers:

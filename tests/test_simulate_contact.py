@@ -254,6 +254,11 @@ def test_impossible_calls_are_refused():
     no_junction = Scene(scene.cantilever, scene.platform, Contact.paper(adhesion_energy_j_per_m2=0.05))
     with pytest.raises(ValueError, match="no junction"):
         simulate(no_junction, state((0.0, 10.0, 60.0)), 20.0)
+
+
+@pytest.mark.slow
+def test_a_contact_without_junction_is_an_outcome_in_a_batch():
+    scene = contact_scene(1.01, 4.0, 0.0)
     many = jax.vmap(
         lambda w: (
             simulate(

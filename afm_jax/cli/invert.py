@@ -24,8 +24,9 @@ from afm_jax.cli.values import Finite, example_path, tables_with, with_noise, wi
 @click.option(
     "--truth",
     type=click.Path(path_type=Path),
-    metavar="CSV",
-    help="The law if it is known, as `afm-jax collide --out` writes it: compared with the reading on resonance.",
+    metavar="FILE",
+    help="The law if it is known, from a file as of --law or the collide.csv of `afm-jax collide --out`: compared with "
+    "the reading on resonance.",
 )
 @click.option(
     "--law",
@@ -59,11 +60,10 @@ def command(  # noqa: PLR0913
     session.start_computing()
     from afm_jax.scenefile.law_files import load_law  # noqa: PLC0415
     from fitting.inversion.invert import invert  # noqa: PLC0415
-    from fitting.inversion.regression import read_known_law  # noqa: PLC0415
     from fitting.inversion.report import inversion_summary  # noqa: PLC0415
 
     (measured,) = tables_with([example_path() if table is None else table], noise, quality_factor)
-    known = None if truth is None else read_known_law(truth)
+    known = None if truth is None else load_law(truth)
     beside = None if law is None else load_law(law)
     with session.working(f"inverting {measured.rows} rows (the first run compiles for some seconds)"):
         result = invert(measured, frequency_error_khz=frequency_error_khz, truth=known, law=beside)

@@ -1,7 +1,8 @@
 """Files that hold an impact law: a fit's, a contact's, or a table of speeds that somebody measured.
 
 Three kinds, told apart by what is in them: the fit.json of a fit's report, the JSON that `save_law` writes, and a CSV
-with a column of approach speeds, one of rebound speeds, and maybe one of delays, their units in their names:
+with a column of approach speeds, one of rebound speeds, and maybe one of delays, their units in their names. A tip that
+is captured leaves at 0, or nothing is said of how, where a column `captured` says true (as of `collide --out`):
 
     # mass_ng = 1.2
     # origin = laser and lamp, March
@@ -36,6 +37,8 @@ _COLUMNS = {"approach_speed": _SPEED_UNITS, "rebound_speed": _SPEED_UNITS, "rebo
 _COLUMNS |= {"collision_delay": _TIME_UNITS, "collision_delay_error": _TIME_UNITS}
 _BANDS = ("rebound_low", "rebound_high", "delay_low", "delay_high")
 """Columns of a fit's law.csv besides: its band, of which a table alone cannot draw."""
+_COLLIDED = ("captured", "outcome", "time_in_", "deepest_gap_", "bridge_", "junction_", "viscous_loss_", "end_energy_")
+"""How columns begin that `collide --out` writes besides."""
 _WRITTEN = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "rebound_low_nm_per_us", "rebound_high_nm_per_us")
 _WRITTEN += ("collision_delay_us", "delay_low_us", "delay_high_us")
 _NUMBERS = ("mass_ng", "spring_constant_n_per_m", "frequency_khz", "capture_speed_nm_per_us")
@@ -150,8 +153,10 @@ def _of_csv(text: str) -> TabulatedLaw:
         cells = next(csv.reader([line], delimiter=delimiter))
         if len(cells) != len(names):
             raise ValueError(f"line {number} has {len(cells)} values for {len(names)} columns")
+        stays = "captured" in names and cells[names.index("captured")].strip().lower() == "true"
         for kind, place, unit in columns:
-            values[kind].append(_number(cells[place], names[place], number) * unit)
+            left = stays and kind != "approach_speed" and not cells[place].strip()
+            values[kind].append(0.0 if left else _number(cells[place], names[place], number) * unit)
     numbers = {key: _setting(key, settings[key]) for key in _NUMBERS if key in settings}
     law = _law_of_columns({kind: np.array(column) for kind, column in values.items()}, numbers, settings)
     return _as_corrected(law, settings.get("corrections", "true"))
@@ -238,7 +243,7 @@ def _kind_of(name: str) -> tuple[str | None, str]:
     if known:
         units = _SPEED_UNITS if "speed" in name else _TIME_UNITS
         raise ValueError(f"column {printable(name)}: the unit is not known; use one of {', '.join(units)}")
-    if name.startswith(_BANDS):
+    if name.startswith((*_BANDS, *_COLLIDED)):
         return None, ""
     raise ValueError(f"column {printable(name)} is none of a law's; it has {', '.join(_COLUMNS)}, each with its unit")
 

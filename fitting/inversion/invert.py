@@ -20,6 +20,7 @@ from fitting.inversion.result import (
     Inversion,
     InvertedRows,
     LawDistance,
+    Rebound,
     RegressedLaw,
     described,
     on_resonance,
@@ -34,8 +35,6 @@ _IMPROBABLE = 1e-3
 _OUTLIER = 16.0
 """chi2 of one degree of freedom (4 standard errors) above which a row contradicts itself."""
 _PACKAGES = ("afm-jax", "jax", "numpy")
-
-KnownSpeeds = tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]
 
 
 class _Instrument(NamedTuple):
@@ -60,7 +59,7 @@ def invert(
     table: TableLike,
     *,
     frequency_error_khz: float | None = None,
-    truth: KnownSpeeds | None = None,
+    truth: ImpactLaw | TabulatedLaw | None = None,
     law: ImpactLaw | TabulatedLaw | None = None,
 ) -> Inversion:
     """Return approach speed, rebound speed and collision delay of every row with a phase, and the laws they follow.
@@ -72,8 +71,7 @@ def invert(
     Args:
         table: from `read_table`; a table without phases must have rows on resonance.
         frequency_error_khz: standard error of the free frequency; None: the table's, exactly known if it has none.
-        truth: approach and rebound speeds in nm/us, ascending, where the law is known: what the reading on resonance
-            is compared with.
+        truth: the law if it is known, as of `law`: what the reading on resonance is compared with.
         law: of a fit, from `load_law`, or any other, to be set beside the rows.
 
     Returns:
@@ -95,8 +93,9 @@ def invert(
             f"{table.source}: the {'cantilever' if table.drive == 'base' else 'tip'} is driven here, not the sample; "
             "`afm-jax tapping` reads energy and impact speeds off such rows without a law, `afm-jax fit` fits a law"
         )
-    if law is not None and table.mass_ng is not None:
-        check_mass(law, Cantilever(table.free_frequency_khz, None, table.mass_ng))
+    for known_law in (truth, law):
+        if known_law is not None and table.mass_ng is not None:
+            check_mass(known_law, Cantilever(table.free_frequency_khz, None, table.mass_ng))
     frequency_error_khz = table.free_frequency_error_khz if frequency_error_khz is None else frequency_error_khz
     with_phase = _with_phase(table)
     if not with_phase.any() and not on_resonance(table).any():
@@ -231,15 +230,28 @@ def _at(table: AmplitudeTable, chosen: np.ndarray, instrument: _Instrument) -> I
     return jax.tree.map(lambda part: np.asarray(part)[: chosen.size], invert_rows(rows, cantilever))
 
 
-def _reference(truth: KnownSpeeds | None, laws: Laws) -> tuple[KnownSpeeds | None, str]:
+def _reference(truth: Law | None, laws: Laws) -> tuple[Rebound | None, str]:
     """Return what the reading on resonance is compared with, and its name."""
     if truth is not None:
-        return truth, "truth"
+
+        def rebound(speeds: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+            known = ~np.asarray(truth.extrapolated(speeds) | truth.captures(speeds))
+            return np.where(known, np.asarray(truth.rebound_speed(speeds)), np.nan)
+
+        return rebound, "truth"
     best = laws.laws.get(laws.preferred or "viscous")
     if best is None:
         return None, "none"
     known = np.isfinite(best.curve)
-    return (laws.speeds[known], best.curve[known]), "law"
+    u, w = laws.speeds[known], best.curve[known]
+
+    def regressed(speeds: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        # the loss is all but linear in the speed, the rebound speed of slow tips is not
+        square = speeds**2 - np.interp(speeds, u, u**2 - w**2)
+        inside = (speeds >= u[0]) & (speeds <= u[-1])
+        return np.sqrt(np.where(inside & (square > 0.0), square, np.nan))
+
+    return regressed, "law"
 
 
 def _is_measured(law: RegressedLaw) -> bool:

@@ -7,13 +7,10 @@ residual is weighted by the variance that the row's whole covariance gives it (t
 all rows share, an error of Q or of the free frequency, is a nuisance with its known uncertainty.
 
 How far rows are from a law that is known otherwise, a fit's or a table's.
-
-A law that is known otherwise, from a CSV file such as `afm-jax collide --out` writes.
 """
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -29,17 +26,7 @@ from fitting.inversion.result import (
     described,
 )
 from fitting.parameters import PARAMETERS
-from fitting.tables.csv_text import (
-    Column,
-    Faults,
-    Form,
-    TableError,
-    parse_rows,
-    printable,
-    read_text,
-    split_cells,
-    split_lines,
-)
+from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable
 
 _PASSES = 25
@@ -271,14 +258,14 @@ def _loss_law(
     square = speeds**2 - basis @ found.value
     free = square > 0.0
     curve = np.sqrt(np.where(free, square, np.nan))
-    spread = np.sqrt(np.einsum("np,pq,nq->n", basis, found.covariance, basis))
+    changes = basis @ _factor(found.covariance) / (2.0 * curve[:, None])
     value, total, random = found.value.copy(), np.diag(found.covariance).copy(), np.diag(found.random_covariance).copy()
     if model == "restitution":
         # the coefficient is 1 - r^2
         r = float(np.sqrt(max(1.0 - value[1], 1e-12)))
         value[1] = r
         total[1], random[1] = total[1] / (4.0 * r * r), random[1] / (4.0 * r * r)
-    return _law(model, found, (value, total, random), shared, (curve, spread / (2.0 * curve)))
+    return _law(model, found, (value, total, random), shared, (curve, changes))
 
 
 def _delay_law(
@@ -288,9 +275,15 @@ def _delay_law(
     rebound: Float[np.ndarray, " points"],
 ) -> RegressedLaw:
     basis = np.stack([term(speeds, rebound, speeds) for term in DELAY_TERMS.values()], axis=1)
-    spread = np.sqrt(np.einsum("np,pq,nq->n", basis, found.covariance, basis))
+    changes = basis @ _factor(found.covariance)
     values = (found.value, np.diag(found.covariance), np.diag(found.random_covariance))
-    return _law("delay", found, values, shared, (basis @ found.value, spread))
+    return _law("delay", found, values, shared, (basis @ found.value, changes))
+
+
+def _factor(covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
+    """Return a matrix whose product with its transpose is a covariance."""
+    size = np.sqrt(np.diag(covariance))
+    return size[:, None] * np.linalg.cholesky(covariance / np.outer(size, size))
 
 
 def _law(
@@ -317,7 +310,7 @@ def _law(
         p_value=found.p_value,
         pulls=dict(zip(shared, found.pulls.tolist(), strict=True)),
         curve=curve[0],
-        curve_error=curve[1],
+        curve_changes=curve[1],
     )
 
 
@@ -362,34 +355,3 @@ def distance_from(law: Law, table: AmplitudeTable, rows: InvertedRows, reading: 
     pulls = (np.abs(w**2 - rebound**2) / np.sqrt(variance))[inside]
     median = float(np.median(pulls)) if pulls.size else None
     return LawDistance(int(inside.sum()), median, extrapolation_of(law, u))
-
-
-_KNOWN_COLUMNS = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us")
-_LAW = Form(tuple(Column(name) for name in _KNOWN_COLUMNS), "speed", open=True, blanks=True)
-
-
-def read_known_law(path: str | Path) -> tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]]:
-    """Return approach and rebound speeds in nm/us, ascending; rows of captured tips are left out.
-
-    Args:
-        path: a CSV file with at least the columns approach_speed_nm_per_us and rebound_speed_nm_per_us.
-
-    Raises:
-        TableError: if the file cannot be read, lacks a column or holds no two rebounding tips.
-    """
-    name = printable(str(path))
-    _, rows = split_lines(read_text(path))
-    names = split_cells(rows[0][1]) if rows else []
-    for column in _KNOWN_COLUMNS:
-        if column not in names:
-            raise TableError(f"{name}: there is no column {column}; give a CSV file as `afm-jax collide --out` writes")
-    columns, unreadable, lines = parse_rows(rows[1:], names, _LAW, faults := Faults(str(path)))
-    for row in np.flatnonzero(np.any(list(unreadable.values()), axis=0)):
-        raise TableError(f"{name}, line {lines[row]}: a speed is not a number; correct it")
-    faults.raise_any()
-    pairs = np.stack([columns[column] for column in _KNOWN_COLUMNS], axis=1)
-    pairs = pairs[np.all(np.isfinite(pairs) & (pairs > 0.0), axis=1)]
-    found = np.unique(pairs, axis=0)
-    if len(np.unique(found[:, 0])) < 2 or len(np.unique(found[:, 0])) < len(found):
-        raise TableError(f"{name}: there must be two or more rebounding tips, each speed once; give more speeds")
-    return found[:, 0], found[:, 1]

@@ -15,6 +15,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
 from afm_jax.impact.law import Law, errors_of
 from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, with_zero_line
+from afm_jax.scenefile.law_files import save_law_csv
 from afm_jax.units import TWO_SIDED_95
 from afm_jax.words import bullets, decimals, known, text_table, with_error
 from fitting.inversion.result import Coefficient, Inversion, RegressedLaw
@@ -39,15 +40,6 @@ ROW_COLUMNS = (
     "chi2",
     "regressed",
     "note",
-)
-LAW_COLUMNS = (
-    "approach_speed_nm_per_us",
-    "rebound_speed_viscous_nm_per_us",
-    "rebound_speed_viscous_error_nm_per_us",
-    "rebound_speed_restitution_nm_per_us",
-    "rebound_speed_restitution_error_nm_per_us",
-    "collision_delay_us",
-    "collision_delay_error_us",
 )
 _FORMULAS = {
     "viscous": LAWS["viscous"].formula,
@@ -86,7 +78,7 @@ def _heading(result: Inversion) -> str:
 
 
 def write_inversion(result: Inversion, folder: Path, write_table: Table) -> list[Path]:
-    """Write invert.txt, invert.json, invert.png, invert.csv and law.csv into a folder.
+    """Write invert.txt, invert.json, invert.png, invert.csv and, where one is regressed, law.csv into a folder.
 
     Args:
         result: the inversion.
@@ -105,8 +97,11 @@ def write_inversion(result: Inversion, folder: Path, write_table: Table) -> list
     text, data, picture = inversion_summary(result), result.to_dict(), png_of(inversion_figure(result))
     written = write_report_files(folder, "invert", text=text, data=data, picture=picture)
     write_table("invert.csv", result.records(), ROW_COLUMNS)
-    write_table("law.csv", result.law_records(), LAW_COLUMNS)
-    return written
+    if result.law is None:
+        return written
+    law = folder / "law.csv"
+    save_law_csv(result.law, law)
+    return [*written, law]
 
 
 def _law_lines(law: RegressedLaw) -> list[str]:

@@ -10,7 +10,9 @@ phase 3 pi/2) and the flight to be an undamped half oscillation: V' = Omega a, V
 Air damping and the collision delay are left out, and the offset; with them the phase is another.
 """
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -20,6 +22,7 @@ from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw
 from afm_jax.results import Result, public_result
 from afm_jax.strict_json import plain
 from afm_jax.units import RAD_PER_US_PER_KHZ
+from fitting.fits.result import FittedLaw
 from fitting.tables.table import AmplitudeTable
 
 ASSUMPTION = (
@@ -28,6 +31,9 @@ ASSUMPTION = (
 )
 TOLERANCE = 5e-4
 """Relative distance of the drive frequency from 2 N times the free one up to which a row counts as on resonance."""
+Rebound = Callable[[Float[np.ndarray, " n"]], Float[np.ndarray, " n"]]
+_FEWEST_POINTS = 4
+"""Speeds that a law needs at least."""
 _HALF_SINE = 4.0 / (3.0 * np.pi)
 """Lock-in amplitude of half sines at their own frequency, over their height."""
 
@@ -65,7 +71,7 @@ def on_resonance(table: AmplitudeTable) -> Bool[np.ndarray, " rows"]:
 def read_on_resonance(
     table: AmplitudeTable,
     *,
-    law: tuple[Float[np.ndarray, " points"], Float[np.ndarray, " points"]] | None,
+    law: Rebound | None,
     reference: str,
 ) -> ResonanceReading:
     """Return the paper's reading of the rows on resonance, beside a law that is known otherwise.
@@ -74,7 +80,7 @@ def read_on_resonance(
 
     Args:
         table: the table.
-        law: approach and rebound speeds in nm/us, ascending, to compare with; None: there is nothing.
+        law: rebound speed for approach speeds in nm/us to compare with, NaN where it says nothing; None: there is none.
         reference: what that law is called.
     """
     blank = np.full(table.rows, np.nan)
@@ -87,13 +93,7 @@ def read_on_resonance(
     speed = RAD_PER_US_PER_KHZ * table.free_frequency_khz * height[row]
     top = RAD_PER_US_PER_KHZ * table.drive_frequency_khz[row] * table.excitation_nm[row]
     approach, rebound = speed + top, speed - top
-    expected = np.full(len(row), np.nan)
-    if law is not None:
-        u, w = law
-        inside = (approach >= u[0]) & (approach <= u[-1])
-        # the loss is all but linear in the speed, the rebound speed of slow tips is not
-        square = approach**2 - np.interp(approach, u, u**2 - w**2)
-        expected = np.sqrt(np.where(inside & (square > 0.0), square, np.nan))
+    expected = np.full(len(row), np.nan) if law is None else law(approach)
     return ResonanceReading(
         assumption=ASSUMPTION,
         row=row,
@@ -173,7 +173,7 @@ class RegressedLaw:
         p_value: probability of a larger chi2 if the law is right.
         pulls: by how many standard errors Q and frequency are moved, by name.
         curve: the law at the result's speeds: rebound speed in nm/us (NaN where captured), or the delay in us.
-        curve_error: its standard error.
+        curve_changes: changes of the curve by one standard deviation of each of several independent unknowns.
     """
 
     model: str
@@ -183,7 +183,18 @@ class RegressedLaw:
     p_value: float
     pulls: dict[str, float]
     curve: Float[np.ndarray, " points"]
-    curve_error: Float[np.ndarray, " points"]
+    curve_changes: Float[np.ndarray, "points unknowns"]
+
+    @property
+    def curve_error(self) -> Float[np.ndarray, " points"]:
+        """Standard error of the curve."""
+        return np.linalg.norm(self.curve_changes, axis=1)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the law as plain numbers."""
+        told = asdict(self)
+        del told["curve_changes"]
+        return told | {"curve_error": self.curve_error}
 
 
 class LawDistance(NamedTuple):
@@ -275,20 +286,42 @@ class Inversion(Result):
         flat = {name: plain(column) for name, column in columns.items()}
         return [{name: column[i] for name, column in flat.items()} for i in range(table.rows)]
 
-    def law_records(self) -> list[dict[str, Any]]:
-        """Return the laws' curves, a mapping per speed."""
-        columns: dict[str, Any] = {"approach_speed_nm_per_us": self.approach_speed_nm_per_us}
-        for name, law in self.laws.items():
-            columns[f"rebound_speed_{name}_nm_per_us"] = law.curve
-            columns[f"rebound_speed_{name}_error_nm_per_us"] = law.curve_error
-        if self.delay is not None:
-            columns |= {"collision_delay_us": self.delay.curve, "collision_delay_error_us": self.delay.curve_error}
-        flat = {name: plain(column) for name, column in columns.items()}
-        return [{name: column[i] for name, column in flat.items()} for i in range(len(self.approach_speed_nm_per_us))]
+    @cached_property
+    def law(self) -> FittedLaw | None:
+        """The law that chi2 prefers, viscous where it does not tell, with the delay: what a scene takes.
+
+        None where none is regressed, or where it leaves faster than it comes.
+        """
+        found = self.laws.get(self.preferred or "viscous")
+        if found is None:
+            return None
+        u, rebound = self.approach_speed_nm_per_us, np.nan_to_num(found.curve)
+        if np.any(rebound > u) or np.count_nonzero(rebound) < _FEWEST_POINTS:
+            return None
+        delay = np.zeros_like(u) if self.delay is None else self.delay.curve
+        of_rebound = np.nan_to_num(found.curve_changes)
+        of_delay = np.zeros((u.size, 0)) if self.delay is None else self.delay.curve_changes
+        known = {name: one.value for name, one in found.parameters.items()}
+        formula = ImpactLaw(
+            known.get("r", 1.0), max(known.get("epsilon", 0.0), 0.0), max(known.get("viscous_loss", 0.0), 0.0)
+        )
+        loose, late = of_rebound.shape[1], of_delay.shape[1]
+        changes = np.pad(of_rebound, ((0, 0), (0, late))), np.pad(of_delay, ((0, 0), (loose, 0)))
+        return FittedLaw(
+            u,
+            rebound,
+            delay,
+            capture_speed_nm_per_us=float(formula.capture_speed_nm_per_us),
+            delay=None,
+            lasting=self.delay is not None,
+            errors=(np.stack(changes, axis=1), np.full(loose + late, np.nan)),
+            mass_ng=self.table.mass_ng,
+            origin=f"{found.model} law regressed on {self.table.source}",
+        )
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain lists, numbers and strings; what is not known is None."""
-        law = {name: asdict(found) for name, found in self.laws.items()}
+        law = {name: found.to_dict() for name, found in self.laws.items()}
         curve = self.laws.get(self.preferred or "viscous")
         law |= {
             "preferred": self.preferred,
@@ -304,7 +337,7 @@ class Inversion(Result):
             "warnings": self.warnings,
             "rows": self.records(),
             "law": law,
-            "delay": None if self.delay is None else asdict(self.delay),
+            "delay": None if self.delay is None else self.delay.to_dict(),
             "resonance": asdict(self.resonance),
             "fitted_law": None
             if self.beside is None or self.distance is None
