@@ -4,9 +4,18 @@ import os
 import signal
 from typing import Any
 
+_THREADS = ("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "BLIS_NUM_THREADS", "VECLIB_MAXIMUM_THREADS")
+"""What BLAS libraries read their number of threads from, when they are loaded."""
+
 
 def run() -> None:
-    """Run the command line; an interrupt ends it in one line while packages are still being imported, too."""
+    """Run the command line; an interrupt ends it in one line while packages are still being imported, too.
+
+    NumPy's and SciPy's linear algebra gets one thread unless the environment says otherwise: its matrices are so small
+    that threads take longer than the work. JAX has threads of its own.
+    """
+    for name in _THREADS:
+        os.environ.setdefault(name, os.environ.get("OMP_NUM_THREADS", "1"))
     # a shell starts what runs in the background with interrupts ignored
     heard = signal.getsignal(signal.SIGINT) is signal.default_int_handler
     if heard:

@@ -1,5 +1,6 @@
 """The versions of this package and of what it computes with."""
 
+from functools import cache
 from importlib.metadata import PackageNotFoundError, version
 
 EXCLUDED_JAX = {
@@ -9,6 +10,7 @@ EXCLUDED_JAX = {
 """What is wrong with the versions of JAX that pyproject.toml excludes; both faults are jaxlib's, on a CPU."""
 
 
+@cache
 def version_of(package: str) -> str:
     """Return the installed version of a package; "not installed" for one that runs from its source folder."""
     try:

@@ -1,6 +1,7 @@
 """Amplitude tables for the tests of the fit: the bundled one, parts of it, and tables of another law."""
 
 import dataclasses
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.impact.orbits import single_impact_orbits
+from fitting import fit
 from fitting.fits.result import FitResult
 from fitting.tables.table import AmplitudeTable, read_table
 
@@ -24,6 +26,12 @@ NOISE = 0.01
 def example_amplitudes() -> AmplitudeTable:
     """Return the bundled table without its phases."""
     return dataclasses.replace(read_table(EXAMPLE), phase_deg=None, phase_error_deg=None)
+
+
+@cache
+def example_fit() -> FitResult:
+    """Return the fit of the bundled table without its phases: made once for all tests of a process, which only read."""
+    return fit(example_amplitudes(), model="law")
 
 
 def rows(table: AmplitudeTable, keep: slice | np.ndarray, **changes: Any) -> AmplitudeTable:

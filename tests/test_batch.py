@@ -57,6 +57,7 @@ def test_forward_and_reverse_derivatives_agree_with_50_digits():
         np.testing.assert_allclose(np.asarray(jax.jit(derivative(times))(r)), np.array(exact), rtol=1e-12, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_hessian_agrees_with_differences_of_the_gradient():
     # jax.custom_jvp would fail here: inside lax.scan its rule is lost in second derivatives over reverse mode
     scene = regular_scene().scene

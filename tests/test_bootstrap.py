@@ -8,6 +8,7 @@ from fitting import bootstrap, fit
 from fitting.sampling.bootstrap import DataSets, compact, draw_data, fit_data_sets, objective_of
 from tests.fit_tables import (
     example_amplitudes,
+    example_fit,
     rows,
     simulated,
     standard_errors_of,
@@ -52,7 +53,7 @@ def test_scaled_and_robust_fits_are_rebuilt_too(table, options):
 
 
 def test_rows_that_say_nothing_are_left_out():
-    refit = objective_of(fit(example_amplitudes(), "law"))
+    refit = objective_of(example_fit())
     used = np.asarray(refit.objective.measurement.rows.measured).copy()
     assert used.shape == (96, 2)
     assert compact(refit) is refit

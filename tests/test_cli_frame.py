@@ -369,3 +369,22 @@ def test_a_terminal_is_told_how_long_it_took_the_last_time(monkeypatch: pytest.M
     wait.count(2, 5)
     now = 45.0
     assert (wait.line(), last) == ("sweeping up: 2 of 5 values, 0.5 a second, about 3 s left", {})
+
+
+THREADS = """
+import os, sys
+from afm_jax.__main__ import run
+sys.argv[1:] = ["--version"]
+try:
+    run()
+finally:
+    print(os.environ["OPENBLAS_NUM_THREADS"], os.environ["MKL_NUM_THREADS"], "numpy" in sys.modules)
+"""
+
+
+def test_commands_give_linear_algebra_one_thread_unless_the_user_says_otherwise():
+    unset = dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "OMP_NUM_THREADS"))
+    # a library reads it when it is loaded
+    assert python(THREADS, **unset).splitlines()[-1] == "1 1 False"
+    assert python(THREADS, **unset | {"MKL_NUM_THREADS": "3"}).splitlines()[-1] == "1 3 False"
+    assert python(THREADS, **unset | {"OMP_NUM_THREADS": "2"}).splitlines()[-1] == "2 2 False"

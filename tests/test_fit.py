@@ -15,7 +15,15 @@ from fitting.fits.result import FitResult
 from fitting.models import measurement_of
 from fitting.report.report import summary
 from fitting.tables.table import AmplitudeTable
-from tests.fit_tables import amplitudes_and_errors, example_amplitudes, rows, simulated, values_of, with_amplitudes
+from tests.fit_tables import (
+    amplitudes_and_errors,
+    example_amplitudes,
+    example_fit,
+    rows,
+    simulated,
+    values_of,
+    with_amplitudes,
+)
 from tests.reference_systems import Parameters, single_impact_orbits
 
 
@@ -25,8 +33,8 @@ def table() -> AmplitudeTable:
 
 
 @pytest.fixture(scope="module")
-def law(table) -> FitResult:
-    return fit(table, model="law")
+def law() -> FitResult:
+    return example_fit()
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from fitting.fits.objective import FINE, PLAIN, Objective, polish
 from fitting.fits.result import FitResult
 from fitting.models import measurement_of
 from fitting.tables.table import AmplitudeTable
-from tests.fit_tables import example_amplitudes, standard_errors_of, values_of
+from tests.fit_tables import example_amplitudes, example_fit, standard_errors_of, values_of
 from tests.strict_reading import strictly
 
 FREE = np.ones(3, dtype=bool)
@@ -28,8 +28,8 @@ def table() -> AmplitudeTable:
 
 
 @pytest.fixture(scope="module")
-def law(table) -> FitResult:
-    return fit(table, model="law")
+def law() -> FitResult:
+    return example_fit()
 
 
 @pytest.fixture(scope="module")

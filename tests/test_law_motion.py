@@ -180,6 +180,7 @@ def end_of_flights(offset: Any, r: Any) -> Any:
     return jnp.stack([final.position_nm, final.velocity_nm_per_us])
 
 
+@pytest.mark.slow
 def test_derivatives_are_differences():
     at = (-1.0, 0.98)
     value, slopes = jax.jit(lambda *at: (end_of_flights(*at), jax.jacfwd(end_of_flights, argnums=(0, 1))(*at)))(*at)

@@ -136,6 +136,7 @@ def test_derivatives_stay_finite_in_every_lane(delayed):
     np.testing.assert_array_equal(by_start[1:4], 0.0)
 
 
+@pytest.mark.slow
 def test_second_derivatives_through_a_sequence_are_right():
     # Reverse mode through a scan treats rules of differentiation in its own way: once a source of wrong Hessians.
     p = scene()

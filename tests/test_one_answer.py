@@ -88,6 +88,7 @@ def test_the_map_leads_back_to_where_an_orbit_begins(orbits):
     np.testing.assert_allclose(np.asarray(approach)[here], orbits.one.approach_speed_nm_per_us[here], rtol=1e-11)
 
 
+@pytest.mark.slow
 def test_trace_and_determinant_are_those_of_the_maps_derivative(orbits):
     def ends(scene, time, velocity):
         impact = next_impact(scene, time, velocity)

@@ -16,9 +16,11 @@ from fitting.instruments.curve import read_curve, table_text
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable
 from fitting.tapping_curves.branches import changes, free_rows
-from fitting.tapping_curves.curve import Given, Instrument, TappingCurve
-from fitting.tapping_curves.energy import energies, lags_of, largest_energies
+from fitting.tapping_curves.curve import Given, Instrument, TappingCurve, lag_of_free_tip
+from fitting.tapping_curves.energy import energies, instrument_slopes, lags_of, largest_energies
+from fitting.tapping_curves.energy_fit import Bins, Process, Smoother
 from fitting.tapping_curves.report import tapping_summary
+from fitting.tapping_curves.speeds import _flight, _Seen
 from fitting.tapping_curves.tapping import tapping
 from tests.strict_reading import strictly
 
@@ -87,6 +89,81 @@ def test_energy_and_virial_of_a_linear_sample_are_the_closed_forms(drive: str, s
     np.testing.assert_allclose(found.energy_aj, np.pi * 0.02 * omega * amplitude**2, rtol=1e-9)
     np.testing.assert_allclose(found.virial_aj, -0.15 * amplitude**2, rtol=1e-9)
     assert largest_energies(curve, Instrument(F0, Q))[0] >= found.energy_aj[0]
+
+
+@pytest.mark.parametrize("drive", ["force", "base"])
+def test_slopes_by_the_instrument_are_differences_of_energies(drive: str):
+    one, _, _ = linear_curve(drive=drive, s=1.0, damping=0.02, stiffness=0.3)
+    arrays = {name: np.tile(value, 4) for name, value in vars(one).items() if isinstance(value, np.ndarray)}
+    curve = replace(
+        one,
+        **arrays
+        | {
+            "drive_frequency_khz": np.array([88.0, 90.0, 90.0, 97.0]),
+            "amplitude_nm": np.array([20.0, 15.0, 30.0, 12.0]),
+        }
+        | {"lag_deg": np.array([70.0, 60.0, 110.0, 100.0])},
+        # measured, not measured, and beyond those that count
+        harmonic_amplitudes_nm={2: np.array([0.3, np.nan, 0.2, np.nan]), 5: np.full(4, 0.1), 60: np.full(4, 5.0)},
+    )
+    at = Instrument(F0 * 1.001, Q * 1.1, np.full(4, 1.5), np.full(4, 1.02), 0.8)
+    found = instrument_slopes(curve, at)
+    steps = {"free_frequency_khz": 1e-5, "quality_factor": 1e-3, "phase_zero_deg": 1e-4}
+    steps |= {"free_amplitude_factor": 1e-6, "harmonics_factor": 1e-4}
+    assert set(found) == set(steps) == set(at._fields)
+    for name, step in steps.items():
+        up, down = (at._replace(**{name: getattr(at, name) + sign * step}) for sign in (1.0, -1.0))
+        ends = [energies(curve, end) for end in (up, down)]
+        for column in ("energy_aj", "virial_aj"):
+            by = (getattr(ends[0], column) - getattr(ends[1], column)) / (2.0 * step)
+            np.testing.assert_allclose(getattr(found[name], column), by, rtol=1e-6, atol=1e-7, err_msg=name)
+        lag = (lag_of_free_tip(curve, up) - lag_of_free_tip(curve, down)) / (2.0 * step)
+        np.testing.assert_allclose(found[name].free_lag_deg, lag, rtol=1e-6, atol=1e-9, err_msg=name)
+
+
+def test_a_smoother_is_the_mean_of_a_constant_and_a_process():
+    rng = np.random.default_rng(3)
+    place, noise, values = np.sort(rng.uniform(-3.0, 0.0, 23)), rng.uniform(0.5, 2.0, 23), rng.normal(2.0, 1.0, 23)
+    bins, process, at = Bins.of(place, noise, most=7), Process(2.0, 0.5), np.linspace(-3.5, 0.5, 9)
+    smoother = Smoother.of(bins, process)
+    number = np.arange(23) * 7 // 23
+    average = np.array([np.average(values[number == i], weights=noise[number == i] ** -2.0) for i in range(7)])
+    np.testing.assert_allclose(bins.average(values), average, rtol=1e-12)
+    np.testing.assert_allclose(
+        bins.variance, [np.sum(noise[number == i] ** -2.0) ** -1.0 for i in range(7)], rtol=1e-12
+    )
+    # a constant that is known to a thousand: textbook regression with one covariance
+    wide = 1e3**2
+    covariance = process.covariance(bins.place, bins.place) + wide + np.diag(bins.variance)
+    cross = process.covariance(at, bins.place) + wide
+    mean, (weights, variance) = smoother.mean(at, average), smoother.at(at)
+    np.testing.assert_allclose(mean, cross @ np.linalg.solve(covariance, average), rtol=1e-4)
+    np.testing.assert_allclose(weights @ average, mean, rtol=1e-9)
+    left = wide + process.size**2 - np.sum(cross * np.linalg.solve(covariance, cross.T).T, axis=1)
+    np.testing.assert_allclose(variance, left, rtol=1e-4)
+    np.testing.assert_allclose(smoother.noise_in(average), average - smoother.mean(bins.place, average), rtol=1e-9)
+    whitened = smoother.whitened(average)
+    np.testing.assert_allclose(whitened @ whitened, average @ np.linalg.solve(covariance, average), rtol=1e-4)
+    np.testing.assert_allclose(smoother.whitened(np.stack([average, average**2], axis=1))[:, 0], whitened, rtol=1e-12)
+    np.testing.assert_allclose(smoother.log_determinant, np.linalg.slogdet(covariance)[1] - np.log(wide), atol=1e-4)
+    # how much a row moves its own mean
+    moved = [
+        smoother.mean(place[[i]], bins.average(values + np.eye(23)[i]))[0] - smoother.mean(place[[i]], average)[0]
+        for i in range(23)
+    ]
+    np.testing.assert_allclose(smoother.leverage(place), moved, rtol=1e-9)
+
+
+def test_slopes_of_flights_are_their_differences():
+    one = np.ones(3)
+    seen = _Seen(
+        0.57 * one, 0.565, 0.0014, np.array([-30.0, -20.0, 5.0]), 40.0 * one, np.array([3.0, 5.0 + 2.0j, 1.0j])
+    )
+    x = np.array([[2.0, 2.5, 1.0], [4.0, 6.0, 9.0], [0.1, 0.3, 0.0]])
+    slopes = _flight(seen, x).slopes
+    for i, unit in enumerate(1e-6 * np.eye(3)[:, :, None]):
+        by = (_flight(seen, x + unit).left - _flight(seen, x - unit).left) / 2e-6
+        np.testing.assert_allclose(slopes[:, :, i], by.T, rtol=1e-6, atol=1e-8)
 
 
 def test_lag_of_an_energy_is_the_one_it_came_from():

@@ -117,9 +117,8 @@ class CurveBranch:
 def ways(curve: TappingCurve) -> list[np.ndarray]:
     """Return the rows of each drive and way (in, back), numbers in the order of height, the farthest first."""
     keys = np.stack([curve.drive_frequency_khz, curve.free_amplitude_nm, curve.retract])
-    found, which = np.unique(keys, axis=1, return_inverse=True)
-    parts = [np.flatnonzero(which.reshape(-1) == i) for i in range(found.shape[1])]
-    return [part[np.argsort(curve.offset_nm[part], kind="stable")] for part in parts]
+    order = np.lexsort((curve.offset_nm, *keys[::-1]))
+    return np.split(order, np.flatnonzero(np.diff(keys[:, order]).any(axis=0)) + 1) if curve.rows else []
 
 
 _BOTH_ENDS = 0.6

@@ -63,7 +63,7 @@ def energies(curve: TappingCurve, instrument: Instrument) -> Energies:
     with np.errstate(invalid="ignore", divide="ignore"):
         by_amplitude = change(motion.reading / curve.amplitude_nm)
     by_lag = change(-1j * motion.reading) * np.pi / 180.0
-    harmonics = scale * _lost_at_harmonics(curve, instrument, np.abs(force))
+    harmonics = scale * _harmonics(curve, instrument, np.abs(force)).lost
     return Energies(
         energy_aj=scale * first - harmonics,
         harmonics_aj=harmonics,
@@ -75,18 +75,102 @@ def energies(curve: TappingCurve, instrument: Instrument) -> Energies:
     )
 
 
-def _lost_at_harmonics(curve: TappingCurve, instrument: Instrument, force: Rows) -> Rows:
-    """Return what the air takes at the harmonics, over k; measured where they are, else those of a brief impact."""
-    q = instrument.quality_factor
+class _Harmonics(NamedTuple):
+    """What the air takes at the harmonics, over k, of every row.
+
+    Attributes:
+        lost: all of it, in nm^2.
+        by_force: of those not measured, over |F_1/k|^2; measured ones do not hang on the force.
+        by_frequency: change of `lost` with f0 while the force stays, in nm^2/kHz.
+        by_quality: likewise with Q.
+    """
+
+    lost: Rows
+    by_force: Rows
+    by_frequency: Rows
+    by_quality: Rows
+
+
+def _harmonics(curve: TappingCurve, instrument: Instrument, force: Rows) -> _Harmonics:
+    """Return what the air takes at the harmonics; measured where they are, else those of a brief impact."""
+    q, f0 = instrument.quality_factor, instrument.free_frequency_khz
     n = np.arange(2, _HARMONICS + 1)[:, None]
-    frequencies, row = np.unique(curve.drive_frequency_khz, return_inverse=True)
-    s = frequencies / instrument.free_frequency_khz
-    parts = max(instrument.harmonics_factor, 0.0) * n**2 / np.abs(1.0 - (n * s) ** 2 + 1j * n * s / q) ** 2
-    lost = parts.sum(axis=0)[row] * force**2
+    frequencies, row = _distinct(curve.drive_frequency_khz)
+    s = frequencies / f0
+    gamma = 1.0 - (n * s) ** 2 + 1j * n * s / q
+    parts = max(instrument.harmonics_factor, 0.0) * n**2 / np.abs(gamma) ** 2
+    changes = [2.0 * (n * s) ** 2 - 1j * n * s / q, -1j * n * s / q]
+    # relative changes of each part with ln f0 and ln Q
+    slopes = [-2.0 * np.real(change / gamma) * parts for change in changes]
+    factor, square = np.pi * s[row] / q, force**2
+    by_force, by_frequency, by_quality = (part.sum(axis=0)[row] for part in (parts, *slopes))
+    others = np.zeros(curve.rows)
     for multiple, measured in curve.harmonic_amplitudes_nm.items():
         here = np.isfinite(measured) & (2 <= multiple <= _HARMONICS)
-        lost[here] += multiple**2 * measured[here] ** 2 - (parts[multiple - 2, row] * force**2)[here]
-    return np.pi * s[row] / q * lost
+        others[here] += multiple**2 * measured[here] ** 2
+        for column, part in zip((by_force, by_frequency, by_quality), (parts, *slopes), strict=True):
+            column[here] -= part[min(multiple, _HARMONICS) - 2, row][here]
+    lost = factor * (others + by_force * square)
+    return _Harmonics(
+        lost=lost,
+        by_force=factor * by_force,
+        by_frequency=(factor * by_frequency * square - lost) / f0,
+        by_quality=(factor * by_quality * square - lost) / q,
+    )
+
+
+def _distinct(values: Rows) -> tuple[np.ndarray, np.ndarray]:
+    """Return the different values, and which of them each row has; most curves have one."""
+    if len(values) and (values == values[0]).all():
+        return values[:1], np.zeros(len(values), int)
+    return np.unique(values, return_inverse=True)
+
+
+class InstrumentSlopes(NamedTuple):
+    """Changes of energy (aJ), virial (aJ) and the free tip's lag (degrees) of every row, by one unit of something."""
+
+    energy_aj: Rows
+    virial_aj: Rows
+    free_lag_deg: Rows
+
+
+def instrument_slopes(curve: TappingCurve, instrument: Instrument) -> dict[str, InstrumentSlopes]:
+    """Return the changes of each row's energy and virial by the fields of the instrument, by their names.
+
+    They are the derivatives of `energies`: of gamma, of the phasor read, which turns with arg gamma, and under a base
+    of the free amplitude A_free/|1 - gamma|.
+    """
+    motion = motion_of(curve, instrument)
+    gamma, z, free = motion.gamma, motion.height, motion.free_amplitude_nm
+    q, f0 = instrument.quality_factor, instrument.free_frequency_khz
+    scale = curve.spring_constant_n_per_m.value * curve.tip_calibration.value**2
+    force = gamma * (z + free)
+    harmonics = _harmonics(curve, instrument, np.abs(force))
+    base, nothing = curve.drive == "base", np.zeros(curve.rows)
+
+    def by(dgamma, dreading, dfree, dharmonics=0.0, dlag=nothing) -> InstrumentSlopes:
+        dz = dreading - (dgamma * free + gamma * dfree if base else 0.0)
+        dforce = dgamma * (z + free) + gamma * (dz + dfree)
+        product = dforce * np.conj(z) + force * np.conj(dz)
+        lost = dharmonics + 2.0 * harmonics.by_force * np.real(np.conj(force) * dforce)
+        return InstrumentSlopes(-scale * (np.pi * np.imag(product) + lost), 0.5 * scale * np.real(product), dlag)
+
+    def by_gamma(dgamma, dharmonics) -> InstrumentSlopes:
+        turn, other = np.imag(dgamma / gamma), dgamma / (1.0 - gamma)
+        dfree, dlag = (free * np.real(other), turn + np.imag(other)) if base else (nothing, turn)
+        return by(dgamma, 1j * turn * motion.reading, dfree, dharmonics, np.rad2deg(dlag))
+
+    s = curve.drive_frequency_khz / f0
+    of_force = harmonics.by_force * np.abs(force) ** 2
+    factor = instrument.harmonics_factor
+    stated = curve.free_amplitude_nm / np.abs(1.0 - gamma) if base else curve.free_amplitude_nm
+    return {
+        "free_frequency_khz": by_gamma((2.0 * s**2 - 1j * s / q) / f0, harmonics.by_frequency),
+        "quality_factor": by_gamma(-1j * s / q**2, harmonics.by_quality),
+        "phase_zero_deg": by(0.0, 1j * np.pi / 180.0 * motion.reading, 0.0, dlag=np.ones(curve.rows)),
+        "free_amplitude_factor": by(0.0, 0.0, stated),
+        "harmonics_factor": InstrumentSlopes(-scale * of_force / factor if factor > 0.0 else nothing, nothing, nothing),
+    }
 
 
 def largest_energies(curve: TappingCurve, instrument: Instrument) -> Rows:

@@ -111,15 +111,15 @@ def _curve(
     read_noise = fit.scale * curve.amplitude_error_nm[rows] / curve.free_amplitude_nm[rows]
     smoother = smoother_along(place[rows], read, read_noise, 0.3)
     weights, ratio_variance = smoother.at(at)
-    ratio = weights @ (smoother.bins.averages @ read)
+    ratio = weights @ smoother.bins.average(read)
     # an energy at a height is one at an amplitude that is known no better than it was read
     ratio_error = np.sqrt(ratio_variance)
     energy_error = np.hypot(fit.error(energy, own, slopes), _steepness(energy, ratio) * ratio_error)
     read, noise = fit.energies_at.virial_aj[rows], virial_noise(curve, fit)[rows]
     smoother = smoother_along(place[rows], read, noise, max(float(np.ptp(read)), float(noise.mean())))
     weights, virial_own = smoother.at(at)
-    virial = weights @ (smoother.bins.averages @ read)
-    virial_slopes = weights @ (smoother.bins.averages @ fit.virial_slopes[rows])
+    virial = weights @ smoother.bins.average(read)
+    virial_slopes = weights @ smoother.bins.average(fit.virial_slopes[rows])
     virial_error = np.hypot(fit.error(virial, virial_own, virial_slopes), _steepness(virial, ratio) * ratio_error)
     order = np.argsort(ratio, kind="stable")
     return EnergyCurve(

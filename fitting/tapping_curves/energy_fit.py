@@ -13,14 +13,15 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.linalg import solve_triangular
+from scipy.linalg import get_lapack_funcs
 from scipy.optimize import isotonic_regression
 
 from afm_jax.least_squares import IMPROBABLE, chi2_tail
 from fitting.tapping_curves.branches import free_ends, repulsive_rows, smooth_stretches, ways
 from fitting.tapping_curves.curve import HARMONICS_FACTOR, Given, Instrument, Rows, TappingCurve, lag_of_free_tip
-from fitting.tapping_curves.energy import Energies, energies, noise_of, virial_noise_of
+from fitting.tapping_curves.energy import Energies, energies, instrument_slopes, noise_of, virial_noise_of
 
+_inverse_triangle, _solve_triangle = get_lapack_funcs(("trtri", "trtrs"), dtype=float)
 _FAR = 4.0
 """Residual in standard errors from which a row is excluded."""
 _MOST_OUTLIERS = 0.2
@@ -46,6 +47,8 @@ _SHALLOW = 0.03
 """Loss, of the free amplitude, that is added to all: there the length in nm is that at contact."""
 _LEAST_SIZE = 1.0
 """Least size of the process, of the largest energy: one that a constant fits may change by as much as itself."""
+_MOST_PROCESSES = 5
+"""Processes that are tried one after the other, each with the instrument that the last led to."""
 _ROUNDS = 30
 _SHORTEST = 1e-3
 """Fraction of a step below which the search stays as it is."""
@@ -104,55 +107,128 @@ class Process(NamedTuple):
 
 
 class Bins(NamedTuple):
-    """Rows of a function, neighbours averaged: places, what their average is of, and its variance."""
+    """Rows of a function, neighbours averaged: places, where each bin starts, rows' weights in it, its variance."""
 
     place: Float[np.ndarray, " bins"]
-    averages: Float[np.ndarray, "bins rows"]
+    starts: Int[np.ndarray, " bins"]
+    weights: Float[np.ndarray, " rows"]
     variance: Float[np.ndarray, " bins"]
 
     @classmethod
     def of(cls, place: np.ndarray, noise: np.ndarray, most: int = _MOST_BINS) -> "Bins":
         """Return bins of rows that stand in the order of their places."""
         count = min(len(place), most)
-        number = np.arange(len(place)) * count // len(place)
-        weights = (number == np.arange(count)[:, None]) * noise**-2.0
-        total = weights.sum(axis=1, keepdims=True)
-        return cls(weights @ place / total[:, 0], weights / total, 1.0 / total[:, 0])
+        starts = -(-np.arange(count) * len(place) // count)
+        information = noise**-2.0
+        total = np.add.reduceat(information, starts)
+        weights = information / np.repeat(total, np.diff(starts, append=len(place)))
+        return cls(np.add.reduceat(weights * place, starts), starts, weights, 1.0 / total)
+
+    @property
+    def of_rows(self) -> Int[np.ndarray, " rows"]:
+        """Number of each row's bin."""
+        return np.repeat(np.arange(len(self.starts)), np.diff(self.starts, append=len(self.weights)))
+
+    def average(self, values: np.ndarray) -> np.ndarray:
+        """Return the weighted averages over the bins of values of the rows, shape (rows, ...)."""
+        return np.add.reduceat((self.weights * values.T).T, self.starts, axis=0)
 
 
 class Smoother(NamedTuple):
-    """A constant and a process given binned readings: what a reading of a bin contributes anywhere."""
+    """A constant and a process given binned readings: what a reading of a bin contributes anywhere.
+
+    Attributes:
+        bins: of the readings.
+        process: beside the constant.
+        factor: Cholesky factor of the readings' covariance, noise and process.
+        ones: `factor`'s inverse times a vector of ones.
+    """
 
     bins: Bins
     process: Process
-    inverse: Float[np.ndarray, "bins bins"]
-    root: Float[np.ndarray, "bins bins"]
-    log_determinant: float
+    factor: Float[np.ndarray, "bins bins"]
+    ones: Float[np.ndarray, " bins"]
 
     @classmethod
     def of(cls, bins: Bins, process: Process) -> "Smoother":
         """Return the smoother of some bins."""
-        covariance = np.diag(bins.variance)
-        if process.size > 0.0:
-            covariance += process.covariance(bins.place, bins.place)
-        factor = np.linalg.cholesky(covariance)
-        root = solve_triangular(factor, np.eye(len(factor)), lower=True, check_finite=False)
-        ones = root.sum(axis=1)
-        # the constant is not known beforehand: what lies along it tells nothing
-        log_determinant = 2.0 * np.log(np.diag(factor)).sum() + np.log(ones @ ones)
-        return cls(bins, process, root.T @ root, root - np.outer(ones, ones @ root) / (ones @ ones), log_determinant)
+        return cls.trials(bins, [process])[0]
+
+    @classmethod
+    def trials(cls, bins: Bins, processes: list[Process]) -> "list[Smoother]":
+        """Return the smoothers of some bins for several processes."""
+        lengths = {process.length for process in processes if process.size > 0.0}
+        alike = {length: Process(1.0, length).covariance(bins.place, bins.place) for length in lengths}
+        found = []
+        for process in processes:
+            if process.size > 0.0:
+                covariance = process.size**2 * alike[process.length]
+                covariance.flat[:: len(covariance) + 1] += bins.variance
+                factor = np.linalg.cholesky(covariance)
+            else:
+                factor = np.diag(np.sqrt(bins.variance))
+            found.append(cls(bins, process, factor, _solved(factor, np.ones(len(factor)))))
+        return found
+
+    @property
+    def log_determinant(self) -> float:
+        """Of the covariance; the constant is not known beforehand: what lies along it tells nothing."""
+        return float(2.0 * np.log(np.diag(self.factor)).sum() + np.log(self.ones @ self.ones))
+
+    def whitened(self, values: np.ndarray) -> np.ndarray:
+        """Return binned values, shape (bins, ...), in standard errors, without what lies along the constant."""
+        found = _solved(self.factor, values)
+        return found - np.multiply.outer(self.ones, self.ones @ found) / (self.ones @ self.ones)
+
+    def noise_in(self, values: np.ndarray) -> np.ndarray:
+        """Return what of binned values is noise, shape (bins,): what constant and process leave of them."""
+        return self.bins.variance * _solved(self.factor, self.whitened(values), transposed=True)
+
+    def mean(self, place: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return the function's mean at some places, given binned values."""
+        ones = _solved(self.factor, self.ones, transposed=True)
+        constant = float(ones @ values / ones.sum())
+        if self.process.size == 0.0:
+            return np.full(len(place), constant)
+        weighted = _solved(self.factor, self.whitened(values), transposed=True)
+        return constant + self.process.covariance(place, self.bins.place) @ weighted
 
     def at(self, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return at some places the weights of the bins, shape (places, bins), and the variance besides."""
-        ones = self.inverse.sum(axis=1)
+        inverse = self.inverse
+        ones = inverse.sum(axis=1)
         total = ones.sum()
         if self.process.size == 0.0:
             return np.tile(ones / total, (len(place), 1)), np.full(len(place), 1.0 / total)
         cross = self.process.covariance(place, self.bins.place)
-        left = 1.0 - cross @ ones
-        weights = cross @ self.inverse + np.outer(left, ones / total)
-        variance = self.process.size**2 - np.sum((cross @ self.inverse) * cross, axis=1) + left**2 / total
-        return weights, np.maximum(variance, 0.0)
+        left, weights = 1.0 - cross @ ones, cross @ inverse
+        variance = self.process.size**2 - np.sum(weights * cross, axis=1) + left**2 / total
+        return weights + np.outer(left, ones / total), np.maximum(variance, 0.0)
+
+    def leverage(self, place: np.ndarray) -> np.ndarray:
+        """Return for the rows in the bins, which stand at some places, by how much each moves its own mean."""
+        inverse, own = self.inverse, self.bins.of_rows
+        ones = inverse.sum(axis=1)
+        cross = self.process.covariance(place, self.bins.place)
+        weights = np.sum(cross * inverse[own], axis=1) + (1.0 - cross @ ones) * ones[own] / ones.sum()
+        return weights * self.bins.weights
+
+    @property
+    def inverse(self) -> np.ndarray:
+        """Of the readings' covariance, shape (bins, bins)."""
+        root = _inverse_triangle(self.factor.T)[0]
+        return root @ root.T
+
+
+def _solved(factor: np.ndarray, values: np.ndarray, *, transposed: bool = False) -> np.ndarray:
+    """Return what the inverse of a lower triangular factor, or of its transpose, makes of values, shape (bins, ...)."""
+    if values.ndim == 1:
+        return _solve_triangle(factor.T, values, trans=int(not transposed))[0]
+    found = np.empty_like(values)
+    # one by one: for several columns LAPACK starts threads, which on a busy machine take a thousand times as long
+    for i, column in enumerate(values.T):
+        found[:, i] = _solved(factor, column, transposed=transposed)
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -224,9 +300,8 @@ class EnergyFit:
         """Return a function's energy at some places in aJ, its own variance, and its change by every unknown."""
         smoother, rows = self.smoothers[number], self.rows[number]
         weights, variance = smoother.at(place)
-        averages = smoother.bins.averages
-        energy = weights @ (averages @ self.energies_at.energy_aj[rows])
-        return energy, variance, weights @ (averages @ self.slopes[rows])
+        energy = weights @ smoother.bins.average(self.energies_at.energy_aj[rows])
+        return energy, variance, weights @ smoother.bins.average(self.slopes[rows])
 
     def error(self, energy: np.ndarray, variance: np.ndarray, slopes: np.ndarray) -> np.ndarray:
         """Return the standard error of what `function` gives, that of spring constant and calibration included."""
@@ -386,6 +461,26 @@ class _EnergySlopes(NamedTuple):
     factor: np.ndarray
 
 
+class _State(NamedTuple):
+    """The search at some values of the unknowns.
+
+    Attributes:
+        x: the unknowns, in their units from what is given.
+        found: energies of the readings.
+        smooth: energies of the readings smoothed along their branches.
+        of_free: residuals of the free rows' means.
+        bins: of each function.
+        energies: in the bins of each function, in aJ.
+    """
+
+    x: np.ndarray
+    found: Energies
+    smooth: Energies
+    of_free: np.ndarray
+    bins: list[Bins]
+    energies: list[np.ndarray]
+
+
 @dataclass
 class _EnergySearch:
     """The least squares: readings of a curve, unknowns of its instrument, functions of groups of rows."""
@@ -405,6 +500,7 @@ class _EnergySearch:
         share = curve.amplitude_nm / curve.free_amplitude_nm
         self.lags = _means(curve, curve.lag_deg, curve.lag_error_deg, frequency, free, turning=True)
         self.shares = _means(curve, share, curve.amplitude_error_nm / curve.free_amplitude_nm, level, free)
+        self.known = np.array([np.isfinite(one.given.error) for one in self.unknowns], bool)
 
     def instrument(self, x: np.ndarray) -> Instrument:
         """Return the instrument at values of the unknowns, in their units from what is given."""
@@ -432,58 +528,44 @@ class _EnergySearch:
                 values[i] = one.given.value * np.exp(x[i] * one.unit / one.given.value)
         return values
 
-    def _as_fitted(self, x: np.ndarray, groups: list, smoothers: list[Smoother], found: Energies) -> TappingCurve:
-        """Return the curve with the most probable readings whose energies are those of the functions.
+    def _state(self, x: np.ndarray, groups: list, scale: float) -> _State:
+        """Return the search at some unknowns, the rows' own errors multiplied by a scale."""
+        at = self.instrument(x)
+        found, smooth = energies(self.curve, at), energies(self.smoothed, at)
+        noise = scale * noise_of(self.smoothed, smooth)
+        bins = [Bins.of(self.place[rows], noise[rows]) for rows in groups]
+        averages = [one.average(found.energy_aj[rows]) for one, rows in zip(bins, groups, strict=True)]
+        return _State(x, found, smooth, self._of_free(at), bins, averages)
 
-        Slopes are taken there: at readings with noise they hang on the noise of the same rows, and pull the instrument
-        to where all energies, noise included, are smaller.
+    def _slopes(self, state: _State, groups: list, smoothers: list[Smoother]) -> _EnergySlopes:
+        """Return the changes by every unknown at the most probable readings whose energies are those of the functions.
+
+        At readings with noise slopes hang on the noise of the same rows, and pull the instrument to where all energies,
+        noise included, are smaller.
         """
-        curve = self.smoothed
-        start = energies(curve, self.instrument(x))
+        curve, start = self.smoothed, state.smooth
         variance = noise_of(curve, start) ** 2
         amplitude, lag = curve.amplitude_nm.copy(), curve.lag_deg.copy()
-        for rows, smoother in zip(groups, smoothers, strict=True):
-            weights, _ = smoother.at(self.place[rows])
-            off = weights @ (smoother.bins.averages @ found.energy_aj[rows]) - start.energy_aj[rows]
+        for rows, smoother, values in zip(groups, smoothers, state.energies, strict=True):
+            off = smoother.mean(self.place[rows], values) - start.energy_aj[rows]
             off /= variance[rows]
             amplitude[rows] += off * start.amplitude_slope[rows] * curve.amplitude_error_nm[rows] ** 2
             lag[rows] += off * start.lag_slope[rows] * curve.lag_error_deg[rows] ** 2
-        return replace(curve, amplitude_nm=amplitude, lag_deg=lag)
+        return self._slopes_at(state.x, replace(curve, amplitude_nm=amplitude, lag_deg=lag))
 
-    def slopes(self, x: np.ndarray, curve: TappingCurve) -> _EnergySlopes:
+    def _slopes_at(self, x: np.ndarray, curve: TappingCurve) -> _EnergySlopes:
         """Return the changes by every unknown at some readings."""
-        at = self.instrument(x)
+        by = instrument_slopes(curve, self.instrument(x))
         time = np.zeros(curve.rows) if curve.time is None else curve.time
-        steps = {
-            "free_frequency_khz": 1e-4 * at.free_frequency_khz / at.quality_factor,
-            "quality_factor": 1e-4 * at.quality_factor,
-            "phase_zero_deg": 1e-3,
-            "harmonics_factor": 1e-3,
-            "free_amplitude_factor": 1e-5,
-        }
-
-        def by(field: str) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-            ends = [at._replace(**{field: getattr(at, field) + sign * steps[field]}) for sign in (1.0, -1.0)]
-            (up, down), lags = [energies(curve, end) for end in ends], [lag_of_free_tip(curve, end) for end in ends]
-            twice = 2.0 * steps[field]
-            return (
-                (up.energy_aj - down.energy_aj) / twice,
-                (up.virial_aj - down.virial_aj) / twice,
-                turned(lags[0] - lags[1]) / twice,
-            )
-
         fields = {"phase_drift_deg": "phase_zero_deg", "free_amplitude_drift": "free_amplitude_factor"}
         fields |= {"free_amplitude": "free_amplitude_factor"}
-        known: dict[str, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}
         columns: list[list[np.ndarray]] = [[], [], [], []]
         for i, one in enumerate(self.unknowns):
             field = fields.get(one.kind, one.kind)
-            if field not in known:
-                known[field] = by(field)
             # the logarithm of Q is what moves
             unit = one.unit * (self.values(x)[i] / one.given.value if one.kind == "quality_factor" else 1.0)
             here = unit * one.rows * (time if one.kind.endswith(("drift", "drift_deg")) else 1.0)
-            for column, part in zip(columns, known[field], strict=False):
+            for column, part in zip(columns, by[field], strict=False):
                 column.append(part * here)
             columns[3].append(here if field == "free_amplitude_factor" else np.zeros(curve.rows))
         shape = (curve.rows, 0)
@@ -492,13 +574,16 @@ class _EnergySearch:
     def fitted(self, groups: list[np.ndarray], scale: float) -> EnergyFit:
         """Return the fit of some groups, the rows' own errors multiplied by a scale."""
         x = self._start()
-        processes = [Process(0.0, 1.0)] * len(groups)
-        for rounds in range(5 if self.smooth else 1):
-            if self.smooth:
-                processes = self._processes(x, groups, scale)
+        if not self.smooth:
+            processes = [Process(0.0, 1.0)] * len(groups)
+            return self.result(self._descended(x, groups, processes, scale), groups, processes, scale)
+        processes = self._processes(x, groups, scale)
+        for _ in range(_MOST_PROCESSES):
             x = self._descended(x, groups, processes, scale)
-            if rounds and self.smooth and processes == self._processes(x, groups, scale):
+            again = self._processes(x, groups, scale)
+            if again == processes:
                 break
+            processes = again
         return self.result(x, groups, processes, scale)
 
     def _start(self) -> np.ndarray:
@@ -515,19 +600,9 @@ class _EnergySearch:
                 at[i] = np.polyfit(time, factor, 1)[0] / one.unit
         return at
 
-    def _smoothers(self, x: np.ndarray, groups: list, processes: list[Process], scale: float) -> list[Smoother]:
-        noise = scale * self._noise(x)
-        return [
-            Smoother.of(Bins.of(self.place[rows], noise[rows]), process)
-            for rows, process in zip(groups, processes, strict=True)
-        ]
-
-    def _noise(self, x: np.ndarray) -> Rows:
-        return noise_of(self.smoothed, energies(self.smoothed, self.instrument(x)))
-
-    def _of_free(self, x: np.ndarray) -> np.ndarray:
+    def _of_free(self, at: Instrument) -> np.ndarray:
         """Return residuals of the free rows' means."""
-        at, lags, shares = self.instrument(x), self.lags, self.shares
+        lags, shares = self.lags, self.shares
         factor = np.broadcast_to(at.free_amplitude_factor, (self.curve.rows,))
         left = [-turned(lags.mean - lags.average(lag_of_free_tip(self.curve, at))) / lags.error]
         left.append((shares.average(factor) - shares.mean) / shares.error)
@@ -541,23 +616,28 @@ class _EnergySearch:
         return np.concatenate(parts)
 
     def _normal(
-        self, x: np.ndarray, slopes: _EnergySlopes, found: Energies, groups: list, smoothers: list[Smoother]
-    ) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return the normal matrix of the unknowns, the gradient, and the sum of squares."""
-        known = np.array([np.isfinite(one.given.error) for one in self.unknowns], bool)
-        left, parts = self._of_free(x), self._slopes_of_free(slopes)
-        matrix = np.diag(known.astype(float)) + parts.T @ parts
-        gradient, total = known * x + parts.T @ left, float(left @ left + np.sum((known * x) ** 2))
-        for rows, smoother, weight in zip(groups, smoothers, self._weights(groups), strict=True):
-            averages = smoother.bins.averages
-            y = smoother.root @ (averages @ found.energy_aj[rows])
-            s = smoother.root @ self._without_scale(
-                smoother, averages @ slopes.energy[rows], averages @ found.energy_aj[rows]
-            )
-            matrix += weight * s.T @ s
-            gradient += weight * s.T @ y
-            total += weight * float(y @ y)
+        self, state: _State, slopes: _EnergySlopes, groups: list, trials: list[list[Smoother]]
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the normal matrix of the unknowns, the gradient, and the sum of squares of each trial's smoothers."""
+        parts, left, x = self._slopes_of_free(slopes), state.of_free, state.x
+        matrix, gradient = np.diag(self.known.astype(float)) + parts.T @ parts, self.known * x + parts.T @ left
+        matrix, gradient = np.tile(matrix, (len(trials), 1, 1)), np.tile(gradient, (len(trials), 1))
+        total = np.array([self._total(state, groups, smoothers) for smoothers in trials])
+        weights = self._weights(groups)
+        for i, (rows, one, values) in enumerate(zip(groups, state.bins, state.energies, strict=True)):
+            binned = one.average(slopes.energy[rows])
+            for j, smoothers in enumerate(trials):
+                s = smoothers[i].whitened(self._without_scale(smoothers[i], binned, values))
+                matrix[j] += weights[i] * s.T @ s
+                gradient[j] += weights[i] * s.T @ smoothers[i].whitened(values)
         return matrix, gradient, total
+
+    def _total(self, state: _State, groups: list, smoothers: list[Smoother]) -> float:
+        """Return the sum of squares."""
+        total = float(state.of_free @ state.of_free + np.sum((self.known * state.x) ** 2))
+        for smoother, values, weight in zip(smoothers, state.energies, self._weights(groups), strict=True):
+            total += weight * float(np.sum(smoother.whitened(values) ** 2))
+        return total if np.isfinite(total) else np.inf
 
     def _weights(self, groups: list[np.ndarray]) -> list[float]:
         """Return how much each function counts where it tells the instrument by how smooth it is.
@@ -581,8 +661,9 @@ class _EnergySearch:
         """
         if smoother.process.size == 0.0:
             return slopes
-        function = energy - smoother.bins.variance * (smoother.root.T @ (smoother.root @ energy))
+        function = energy - smoother.noise_in(energy)
         function -= function.mean()
+        slopes = slopes.copy()
         for i, one in enumerate(self.unknowns):
             if one.kind == "quality_factor":
                 share = function @ slopes[:, i] / max(float(function @ function), 1e-300)
@@ -592,39 +673,29 @@ class _EnergySearch:
     def _descended(self, x: np.ndarray, groups: list, processes: list[Process], scale: float) -> np.ndarray:
         if not len(x):
             return x
+
+        def at(x: np.ndarray) -> tuple[_State, list[Smoother], float]:
+            state = self._state(x, groups, scale)
+            smoothers = [Smoother.of(*pair) for pair in zip(state.bins, processes, strict=True)]
+            return state, smoothers, self._total(state, groups, smoothers)
+
+        state, smoothers, total = at(x)
         for _ in range(_ROUNDS):
-            found = energies(self.curve, self.instrument(x))
-            smoothers = self._smoothers(x, groups, processes, scale)
-            slopes = self.slopes(x, self._as_fitted(x, groups, smoothers, found))
-            matrix, gradient, total = self._normal(x, slopes, found, groups, smoothers)
+            slopes = self._slopes(state, groups, smoothers)
+            matrix, gradient, _ = (part[0] for part in self._normal(state, slopes, groups, [smoothers]))
             step = -np.linalg.pinv(matrix, hermitian=True) @ gradient
             if step @ matrix @ step < _SETTLED**2:
                 break
-            fraction = 1.0
-            while (
-                fraction > _SHORTEST and not self._total(x + fraction * step, groups, processes, scale) < total + _RISE
-            ):
+            fraction, start, most = 1.0, state.x, total + _RISE
+            state, smoothers, total = at(start + step)
+            while fraction > _SHORTEST and not total < most:
                 fraction *= 0.5
-            x = x + fraction * step
-        return x
-
-    def _total(self, x: np.ndarray, groups: list, processes: list[Process], scale: float) -> float:
-        """Return the sum of squares."""
-        smoothers = self._smoothers(x, groups, processes, scale)
-        known = np.array([np.isfinite(one.given.error) for one in self.unknowns], bool)
-        found = energies(self.curve, self.instrument(x)).energy_aj
-        rows = [
-            np.sqrt(weight) * s.root @ (s.bins.averages @ found[r])
-            for r, s, weight in zip(groups, smoothers, self._weights(groups), strict=True)
-        ]
-        left = np.concatenate([*rows, self._of_free(x), known * x])
-        total = float(left @ left)
-        return total if np.isfinite(total) else np.inf
+                state, smoothers, total = at(start + fraction * step)
+        return state.x
 
     def _processes(self, x: np.ndarray, groups: list, scale: float) -> list[Process]:
         """Return the processes of the groups, of the size and length that the readings make most probable."""
-        curve = self.curve
-        found = energies(curve, self.instrument(x))
+        curve, state = self.curve, self._state(x, groups, scale)
         s = curve.drive_frequency_khz / curve.free_frequency_khz.value
         tip = curve.spring_constant_n_per_m.value * curve.tip_calibration.value**2
         free = curve.free_amplitude_nm
@@ -633,30 +704,31 @@ class _EnergySearch:
         def processes(size: float, length: float) -> list[Process]:
             made = []
             for rows in groups:
-                largest = np.max(np.abs(_smoothed(found.energy_aj[rows])))
+                largest = np.max(np.abs(_smoothed(state.found.energy_aj[rows])))
                 made.append(Process(max(size * float(lost[rows].mean()), _LEAST_SIZE * float(largest)), length))
             return made
 
-        best, most, weights = processes(_USUAL_SIZE, _USUAL_LENGTH), -np.inf, self._weights(groups)
-        usual = self._smoothers(x, groups, best, scale)
-        slopes = self.slopes(x, self._as_fitted(x, groups, usual, found))
-        known: dict[tuple[Process, ...], float] = {}
-        for size in _SIZES:
-            for length in _LENGTHS:
-                trial = processes(size, length)
-                # small sizes are raised to the same least one
-                if tuple(trial) not in known:
-                    smoothers = self._smoothers(x, groups, trial, scale)
-                    matrix, gradient, total = self._normal(x, slopes, found, groups, smoothers)
-                    of_trial = gradient @ np.linalg.pinv(matrix, hermitian=True) @ gradient - total
-                    of_trial -= np.linalg.slogdet(matrix)[1]
-                    of_trial -= sum(w * one.log_determinant for w, one in zip(weights, smoothers, strict=True))
-                    known[tuple(trial)] = of_trial
-                evidence = known[tuple(trial)] - (np.log(size / _USUAL_SIZE) / _LOG_SIZE) ** 2
-                evidence -= (np.log(length / _USUAL_LENGTH) / _LOG_LENGTH) ** 2
-                if evidence > most:
-                    best, most = trial, evidence
-        return best
+        usual = processes(_USUAL_SIZE, _USUAL_LENGTH)
+        slopes = self._slopes(state, groups, [Smoother.of(*pair) for pair in zip(state.bins, usual, strict=True)])
+        tried = [(size, length, tuple(processes(size, length))) for size in _SIZES for length in _LENGTHS]
+        # small sizes are raised to the same least one
+        distinct = list(dict.fromkeys(trial for *_, trial in tried))
+        by_group = [
+            Smoother.trials(bins, list(some))
+            for bins, some in zip(state.bins, zip(*distinct, strict=True), strict=True)
+        ]
+        trials = [list(smoothers) for smoothers in zip(*by_group, strict=True)]
+        matrix, gradient, total = self._normal(state, slopes, groups, trials)
+        inverse, weights = np.linalg.pinv(matrix, hermitian=True), self._weights(groups)
+        found = np.einsum("tu,tuv,tv->t", gradient, inverse, gradient) - total - np.linalg.slogdet(matrix)[1]
+        found -= [sum(w * s.log_determinant for w, s in zip(weights, smoothers, strict=True)) for smoothers in trials]
+        known = dict(zip(distinct, found.tolist(), strict=True))
+
+        def evidence(size: float, length: float, trial: tuple[Process, ...]) -> float:
+            usual = (np.log(size / _USUAL_SIZE) / _LOG_SIZE) ** 2 + (np.log(length / _USUAL_LENGTH) / _LOG_LENGTH) ** 2
+            return known[trial] - usual
+
+        return list(max(tried, key=lambda one: evidence(*one))[2])
 
     def result(
         self,
@@ -667,25 +739,22 @@ class _EnergySearch:
         covariance: np.ndarray | None = None,
     ) -> EnergyFit:
         """Return the fit at some unknowns; their covariance is that of its readings where none is given."""
-        curve, found = self.curve, energies(self.curve, self.instrument(x))
-        smoothers = self._smoothers(x, groups, processes, scale)
-        slopes = self.slopes(x, self._as_fitted(x, groups, smoothers, found))
+        curve, state = self.curve, self._state(x, groups, scale)
+        found, of_free = state.found, state.of_free
+        smoothers = [Smoother.of(*pair) for pair in zip(state.bins, processes, strict=True)]
+        slopes = self._slopes(state, groups, smoothers)
         if covariance is None:
-            covariance = np.linalg.pinv(self._normal(x, slopes, found, groups, smoothers)[0], hermitian=True)
-        known = np.array([np.isfinite(one.given.error) for one in self.unknowns], bool)
+            matrix, *_ = self._normal(state, slopes, groups, [smoothers])
+            covariance = np.asarray(np.linalg.pinv(matrix[0], hermitian=True))
         units = self.values(x) - self.values(x - 1e-6) if len(x) else x
         errors = np.sqrt(np.diag(covariance)) * units / 1e-6
-        noise = scale * self._noise(x)
+        noise = scale * noise_of(self.smoothed, state.smooth)
         residual, taken = np.full(curve.rows, np.nan), 0.0
-        for rows, smoother in zip(groups, smoothers, strict=True):
-            weights, _ = smoother.at(self.place[rows])
-            residual[rows] = (
-                found.energy_aj[rows] - weights @ (smoother.bins.averages @ found.energy_aj[rows])
-            ) / noise[rows]
-            taken += float(np.trace(weights @ smoother.bins.averages))
+        for rows, smoother, values in zip(groups, smoothers, state.energies, strict=True):
+            residual[rows] = (found.energy_aj[rows] - smoother.mean(self.place[rows], values)) / noise[rows]
+            taken += float(smoother.leverage(self.place[rows]).sum())
         used = np.zeros(curve.rows, bool)
         used[np.concatenate(groups)] = True
-        of_free = self._of_free(x)
         rows_chi2 = float(np.nansum(residual**2))
         # what the instrument takes of the rows' freedom: at most one each
         return EnergyFit(
@@ -695,7 +764,7 @@ class _EnergySearch:
             slopes=slopes.energy,
             virial_slopes=slopes.virial,
             covariance=covariance,
-            known=known,
+            known=self.known,
             nuisances=tuple(
                 Nuisance(one.name, one.kind, one.given, float(value), float(error))
                 for one, value, error in zip(self.unknowns, self.values(x), errors, strict=True)
@@ -704,8 +773,8 @@ class _EnergySearch:
             used=used,
             outliers=np.zeros(curve.rows, bool),
             residual=residual,
-            chi2=rows_chi2 + float(of_free @ of_free + np.sum((known * x) ** 2)),
-            degrees_of_freedom=round(used.sum() + len(of_free) + known.sum() - len(x) - taken),
+            chi2=rows_chi2 + float(of_free @ of_free + np.sum((self.known * x) ** 2)),
+            degrees_of_freedom=round(used.sum() + len(of_free) + self.known.sum() - len(x) - taken),
             rows_chi2=rows_chi2,
             rows_freedom=float(used.sum() - taken),
             scale=scale,
@@ -858,7 +927,7 @@ def _smoothed_readings(
             smoother = smoother_along(
                 place[rows], values, errors[rows], max(float(np.ptp(values)), float(errors[rows[0]]))
             )
-            readings[rows] = smoother.at(place[rows])[0] @ (smoother.bins.averages @ values)
+            readings[rows] = smoother.mean(place[rows], smoother.bins.average(values))
     return replace(curve, amplitude_nm=amplitude, lag_deg=lag)
 
 
@@ -872,9 +941,11 @@ def smoother_along(place: np.ndarray, values: np.ndarray, noise: np.ndarray, sca
         scale: size that the process may have, in the unit of the readings; those tried are 0.1 to 3 times as large.
     """
     bins = Bins.of(place, noise)
-    y = bins.averages @ values
-    trials = [Smoother.of(bins, Process(size * scale, length)) for size in (0.1, 0.3, 1.0, 3.0) for length in _LENGTHS]
-    return max(trials, key=lambda one: -float(np.sum((one.root @ y) ** 2)) - one.log_determinant)
+    y = bins.average(values)
+    trials = [Process(size * scale, length) for size in (0.1, 0.3, 1.0, 3.0) for length in _LENGTHS]
+    return max(
+        Smoother.trials(bins, trials), key=lambda one: -float(np.sum(one.whitened(y) ** 2)) - one.log_determinant
+    )
 
 
 def virial_noise(curve: TappingCurve, fit: EnergyFit) -> Rows:

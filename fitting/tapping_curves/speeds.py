@@ -15,7 +15,6 @@ from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.tapping_curves.curve import Instrument, Rows, TappingCurve, motion_of
 
 _ROUNDS = 40
-_STEP = 1e-6
 _CLOSED = 1e-9
 """Of the free amplitude: what the equations may be off at a solution."""
 _SHORTEST_STEP = 1.0 / 64.0
@@ -74,14 +73,35 @@ def speeds(
     # rows that no flight fits run away
     with np.errstate(all="ignore"):
         x, found = _solve(seen, x)
-        _, approach, pull = _flight(seen, x)
-    good = found & (approach > 0.0) & (x[1] > 0.0)
-    columns = (approach, x[1], x[2], pull * x[2] / approach)
+        at = _flight(seen, x)
+    good = found & (at.approach > 0.0) & (x[1] > 0.0)
+    columns = (at.approach, x[1], x[2], at.pull * x[2] / at.approach)
     return TapSpeeds(*(np.where(good, column, np.nan) for column in columns))
 
 
-def _flight(seen: _Seen, x: np.ndarray) -> tuple[np.ndarray, Rows, Rows]:
-    """Return what is left of the three equations, the approach speed and the pull of flights.
+class _Flight(NamedTuple):
+    """Flights of all rows at trial values of their unknowns.
+
+    Attributes:
+        left: of the three equations, over the free amplitude, shape (3, rows).
+        slopes: change of `left` by the unknowns, shape (rows, 3, 3).
+        approach: relative speed at the end.
+        pull: of lever and drive during the contact.
+    """
+
+    left: np.ndarray
+    slopes: np.ndarray
+    approach: Rows
+    pull: Rows
+
+    @property
+    def off(self) -> Rows:
+        """How far each row is from a solution."""
+        return np.linalg.norm(self.left, axis=0)
+
+
+def _flight(seen: _Seen, x: np.ndarray) -> _Flight:
+    """Return flights.
 
     Args:
         seen: of the rows.
@@ -91,53 +111,68 @@ def _flight(seen: _Seen, x: np.ndarray) -> tuple[np.ndarray, Rows, Rows]:
     omega, period = seen.omega, 2.0 * np.pi / seen.omega
     ring = np.sqrt(seen.free_omega**2 - seen.decay**2)
     rate = -seen.decay + 1j * ring
-    start = seen.sigma + seen.free * np.cos(phase)
-    velocity = rebound - seen.free * omega * np.sin(phase)
     flown = period - contact
+    # the sample's motion at departure, in the middle of the contact and at the end of the flight
+    leaving, resting = np.exp(1j * phase), np.exp(1j * (phase - 0.5 * omega * contact))
+    ending = np.exp(1j * (phase - omega * contact))
+    start = seen.sigma + seen.free * leaving.real
+    velocity = rebound - seen.free * omega * leaving.imag
     # w = Re(c exp(rate t)) = (c exp(rate t) + its conjugate)/2
     c = start - 1j * (velocity + seen.decay * start) / ring
-    end, middle = phase + omega * flown, phase + omega * (flown + 0.5 * contact)
-    height, speed = np.real(c * np.exp(rate * flown)), np.real(rate * c * np.exp(rate * flown))
-    total = (
-        0.5
-        * np.exp(-1j * phase)
-        * (_integral(c, rate - 1j * omega, flown) + _integral(np.conj(c), np.conj(rate) - 1j * omega, flown))
-    )
-    total += contact * (seen.sigma + seen.free * np.cos(middle)) * np.exp(-1j * middle)
-    missing = 2.0 / period * total - seen.lockin
-    gap = height - seen.sigma - seen.free * np.cos(end)
-    approach = -seen.free * omega * np.sin(end) - speed
-    sample, rise = seen.sigma + seen.free * np.cos(middle), -seen.free * omega * np.sin(middle)
-    pull = -(seen.free_omega**2) * sample - 2.0 * seen.decay * rise + omega**2 * seen.free * np.cos(middle)
-    return np.stack([missing.real, missing.imag, gap]) / seen.free, approach, pull
+    c_by_phase = -seen.free * (leaving.imag - 1j * (omega * leaving.real + seen.decay * leaving.imag) / ring)
+    c_by_rebound = -1j / ring
+    grown, back = np.exp(rate * flown), np.exp(-1j * omega * flown)
+    up, down = (grown * back - 1.0) / (rate - 1j * omega), (grown.conj() * back - 1.0) / (rate.conjugate() - 1j * omega)
 
+    def flight_of(c):
+        return 0.5 * leaving.conj() * (c * up + np.conj(c) * down)
 
-def _integral(factor: np.ndarray, rate: np.ndarray, until: Rows) -> np.ndarray:
-    return factor * (np.exp(rate * until) - 1.0) / rate
+    height, speed = np.real(c * grown), np.real(rate * c * grown)
+    sample, rise = seen.sigma + seen.free * resting.real, -seen.free * omega * resting.imag
+    of_flight, of_contact = flight_of(c), sample * resting.conj()
+    turning = (rise / omega - 1j * sample) * resting.conj()
+    missing = 2.0 / period * (of_flight + contact * of_contact) - seen.lockin
+    gap = height - seen.sigma - seen.free * ending.real
+    approach = -seen.free * omega * ending.imag - speed
+    by = [
+        (
+            -1j * of_flight + flight_of(c_by_phase) + contact * turning,
+            np.real(c_by_phase * grown) + seen.free * ending.imag,
+        ),
+        (flight_of(c_by_rebound), np.real(c_by_rebound * grown)),
+        (of_contact - height * back * leaving.conj() - 0.5 * omega * contact * turning, approach),
+    ]
+    slopes = np.stack([np.stack([2.0 / period * m.real, 2.0 / period * m.imag, g], axis=1) for m, g in by], axis=2)
+    pull = -(seen.free_omega**2) * sample - 2.0 * seen.decay * rise + omega**2 * seen.free * resting.real
+    left = np.stack([missing.real, missing.imag, gap]) / seen.free
+    return _Flight(left, slopes / seen.free[:, None, None], approach, pull)
 
 
 def _solve(seen: _Seen, x: np.ndarray) -> tuple[np.ndarray, Bool[np.ndarray, " rows"]]:
     """Return the unknowns by Newton's method, every row with its own length of step, and which rows are solved."""
-    left = _flight(seen, x)[0]
+    at = _flight(seen, x)
     for _ in range(_ROUNDS):
-        slopes = np.stack(
-            [(_flight(seen, x + _STEP * unit)[0] - left) / _STEP for unit in np.eye(3)[:, :, None]], axis=1
-        )
-        matrices = np.moveaxis(slopes, 2, 0).copy()
+        matrices = at.slopes.copy()
         usable = np.isfinite(matrices).all(axis=(1, 2)) & (np.abs(np.linalg.det(matrices)) > 0.0)
         matrices[~usable] = np.eye(3)
-        step = np.linalg.solve(matrices, -left.T[:, :, None])[:, :, 0].T
+        step = np.linalg.solve(matrices, -at.left.T[:, :, None])[:, :, 0].T
         share = np.ones(x.shape[1])
         while True:
             trial = x + share * step
-            ahead = _flight(seen, trial)[0]
-            worse = ~(np.linalg.norm(ahead, axis=0) < np.linalg.norm(left, axis=0)) & (share > _SHORTEST_STEP)
+            ahead = _flight(seen, trial)
+            worse = ~(ahead.off < at.off) & (at.off > _CLOSED) & (share > _SHORTEST_STEP)
             if not worse.any():
                 break
             share = np.where(worse, 0.5 * share, share)
-        better = np.linalg.norm(ahead, axis=0) < np.linalg.norm(left, axis=0)
-        x, left = np.where(better, trial, x), np.where(better, ahead, left)
-        if not (better & (np.linalg.norm(left, axis=0) > _CLOSED)).any():
+        better = ahead.off < at.off
+        x = np.where(better, trial, x)
+        at = _Flight(
+            left=np.where(better, ahead.left, at.left),
+            slopes=np.where(better[:, None, None], ahead.slopes, at.slopes),
+            approach=np.where(better, ahead.approach, at.approach),
+            pull=np.where(better, ahead.pull, at.pull),
+        )
+        if not (better & (at.off > _CLOSED)).any():
             break
     period = 2.0 * np.pi / seen.omega
-    return x, (np.linalg.norm(left, axis=0) < _CLOSED) & (np.abs(x[2]) < 0.5 * period)
+    return x, (at.off < _CLOSED) & (np.abs(x[2]) < 0.5 * period)

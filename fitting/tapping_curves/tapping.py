@@ -1,7 +1,6 @@
 """`tapping`: what a tapping curve says of a tap, and where its drive allows it of the impact law."""
 
 from dataclasses import replace
-from importlib.metadata import version
 from typing import Any
 
 import numpy as np
@@ -10,6 +9,7 @@ from jaxtyping import Bool
 from afm_jax.checks import checked
 from afm_jax.scenefile.tables import printable
 from afm_jax.units import RAD_PER_US_PER_KHZ
+from afm_jax.version import version_of
 from fitting.instruments.lag import sense_of
 from fitting.tables.csv_text import TableError
 from fitting.tables.table import AmplitudeTable, TableLike, as_table
@@ -279,7 +279,7 @@ def _energies(table: AmplitudeTable, curve: TappingCurve, *, scale_errors: bool)
         bound_aj=None if curve.has_phase else _bound(curve, given, free),
         hysteresis=tuple(hysteresis),
         speeds=None,
-        versions={name: version(name) for name in ("afm-jax", "numpy", "scipy")},
+        versions={name: version_of(name) for name in ("afm-jax", "numpy", "scipy")},
     )
     return result if fitted is None else replace(result, speeds=_speeds(result, fitted))
 
