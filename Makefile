@@ -11,9 +11,13 @@ PYTEST ?= -m pytest
 # itself, `make mutations`, the notebooks and tests/test_as_compiled_for_users.py compile as users do. An XLA that does
 # not know a flag stops, as that of jax 0.12 does at the first one: it is given to those that take it.
 OLD_EMITTER := --xla_cpu_use_fusion_emitters=false
-KNOWN = $(shell XLA_FLAGS=$(OLD_EMITTER) $(BIN)/python -c 'import jax; jax.devices()' 2>/dev/null && echo $(OLD_EMITTER))
+# asked once, when a recipe needs it: the interpreter is there by then
+KNOWN = $(eval KNOWN := $(shell XLA_FLAGS=$(OLD_EMITTER) $(BIN)/python -c 'import jax; jax.devices()' 2>/dev/null && echo $(OLD_EMITTER)))$(KNOWN)
 COMPILED_AT_ONCE = $(KNOWN) --xla_backend_optimization_level=0
 COMPILED_SOON = $(KNOWN) --xla_backend_optimization_level=1
+# Slow tests that compile for most of their time: two thirds of it where nothing is optimised. (A fit then takes twice as
+# long, so those that fit again and again are none of them.)
+COMPILING := tests/test_collide_derivatives.py tests/test_gradients.py tests/test_inversion.py
 # Tests of the last digits, which the order of roundings decides.
 SHARP := tests/test_polynomial_roots.py tests/test_verification.py
 
@@ -81,7 +85,8 @@ coverage: $(SETUP) ## make test and make slow with the share of lines that they 
 	$(BIN)/python -m coverage report --fail-under=85
 
 slow: $(SETUP) ## the slow tests: long iterations, references, notebooks
-	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_SOON)" $(BIN)/python $(PYTEST) -m slow -n auto --dist worksteal --ignore tests/test_mutations.py
+	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_AT_ONCE)" $(BIN)/python $(PYTEST) -m slow -n auto --dist worksteal $(COMPILING)
+	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_SOON)" $(BIN)/python $(PYTEST) -m slow -n auto --dist worksteal --ignore tests/test_mutations.py $(COMPILING:%=--ignore %)
 
 docs: $(SETUP) ## the site, in build/site/index.html; notebooks are run unless `make slow` did
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --config-file notebooks/mkdocs.yml
