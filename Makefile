@@ -15,9 +15,6 @@ OLD_EMITTER := --xla_cpu_use_fusion_emitters=false
 KNOWN = $(eval KNOWN := $(shell XLA_FLAGS=$(OLD_EMITTER) $(BIN)/python -c 'import jax; jax.devices()' 2>/dev/null && echo $(OLD_EMITTER)))$(KNOWN)
 COMPILED_AT_ONCE = $(KNOWN) --xla_backend_optimization_level=0
 COMPILED_SOON = $(KNOWN) --xla_backend_optimization_level=1
-# Slow tests that compile for most of their time: two thirds of it where nothing is optimised. (A fit then takes twice as
-# long, so those that fit again and again are none of them.)
-COMPILING := tests/test_collide_derivatives.py tests/test_gradients.py tests/test_inversion.py
 # Tests of the last digits, which the order of roundings decides.
 SHARP := tests/test_polynomial_roots.py tests/test_verification.py
 
@@ -85,8 +82,7 @@ coverage: $(SETUP) ## make test and make slow with the share of lines that they 
 	$(BIN)/python -m coverage report --fail-under=85
 
 slow: $(SETUP) ## the slow tests: long iterations, references, notebooks
-	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_AT_ONCE)" $(BIN)/python $(PYTEST) -m slow -n auto --dist worksteal $(COMPILING)
-	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_SOON)" $(BIN)/python $(PYTEST) -m slow -n auto --dist worksteal --ignore tests/test_mutations.py $(COMPILING:%=--ignore %)
+	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_SOON)" $(BIN)/python $(PYTEST) -m slow -n auto --dist worksteal --ignore tests/test_mutations.py
 
 docs: $(SETUP) ## the site, in build/site/index.html; notebooks are run unless `make slow` did
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --quiet --config-file notebooks/mkdocs.yml
