@@ -37,6 +37,7 @@ from afm_jax.impact.map import NEAR_GRAZING
 from afm_jax.impact.orbits import amplitudes, near_fold, orbit_state, steady_orbits
 from afm_jax.impact.roots import follow_root, harmless_coordinate
 from afm_jax.results import Result, public_result
+from afm_jax.solve.lanes import in_blocks
 from fitting.models import ROWS_PER_PROGRAM, Measurement, Problem, Rows, measurement_of
 from fitting.parameters import CONTACT_NAMES, NUISANCE_NAMES, PARAMETERS, model_parameters
 from fitting.tables.table import TableLike, as_table
@@ -720,7 +721,12 @@ def amplitude_gradients(
     problem = replace(_problem(model, values, effects, fixed), drive=table.drive)
     measurement = measurement_of(table, problem, fixed=fixed)
     point = jnp.asarray([float(values[name]) for name in problem.names])
-    found = _in_blocks(point, measurement, problem, mode)
+    found = in_blocks(
+        lambda rows: _judged(point, measurement._replace(rows=rows), problem, mode),
+        measurement.rows,
+        block=ROWS_PER_PROGRAM,
+        widths=(),
+    )
     found = jax.tree.map(lambda column: column[: table.rows], found)
     reasons = tuple(
         _reason(*row) for row in zip(found.exists, found.near_fold, found.slow, found.touching, strict=True)
@@ -752,17 +758,6 @@ def _problem(
                 f"`values`: {name} must lie between {parameter.lowest:g} and {parameter.highest:g}, but is {value!r}"
             )
     return Problem(model, own + tuple(name for name in NUISANCE_NAMES if name in values), tuple(effects))
-
-
-def _in_blocks(point: Float[Array, " p"], measurement: Measurement, problem: Problem, mode: str) -> _Judged:
-    """Return all rows, some at a time: one compiled program serves tables of every size."""
-    columns = jax.tree.map(np.asarray, measurement.rows)
-    blocks = []
-    for begin in range(0, columns.order.shape[0], ROWS_PER_PROGRAM):
-        some = jax.tree.map(lambda column, begin=begin: column[begin : begin + ROWS_PER_PROGRAM], columns)
-        block = _judged(point, measurement._replace(rows=some), problem, mode)
-        blocks.append(jax.tree.map(np.asarray, block))
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *blocks)
 
 
 @partial(jax.jit, static_argnames=("problem", "mode"))

@@ -5,9 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from afm_jax.contact.collide import BLOCK, capture_speed, collide
+from afm_jax.contact.collide import capture_speed, collide
 from afm_jax.contact.contact import Contact
 from afm_jax.outcomes import CollisionOutcome
+from afm_jax.solve.lanes import LANES
 from tests import reference_contact as exact
 from tests.collisions_of_eight import collide_in_eights
 
@@ -149,10 +150,10 @@ def test_a_static_contact_loses_its_hysteresis_at_every_speed():
 def test_a_batch_is_its_tips_one_by_one():
     contact = Contact.paper()
     # more than two blocks, the last one not full, in a shape of its own
-    speeds = np.linspace(5.0, 250.0, 2 * (BLOCK + 44)).reshape(2, -1)
+    speeds = np.linspace(5.0, 250.0, 2 * (LANES + 44)).reshape(2, -1)
     result = collide(contact, speeds)
     assert result.rebound_speed_nm_per_us.shape == speeds.shape
-    for place in ((0, 0), (0, 30), (1, 1), (1, BLOCK + 43)):
+    for place in ((0, 0), (0, 30), (1, 1), (1, LANES + 43)):
         alone = collide(contact, speeds[place])
         for ours, one in zip(result, alone, strict=True):
             # another program for another size: fused differently
@@ -218,7 +219,7 @@ def test_the_same_program_serves_other_numbers():
 @pytest.mark.slow
 def test_a_gradient_of_many_tips_needs_little_memory():
     # were every stage of every careful step remembered, it would be 1.4 GB
-    speeds = jnp.linspace(30.0, 200.0, BLOCK)
+    speeds = jnp.linspace(30.0, 200.0, LANES)
     gradient = jax.jit(jax.grad(lambda speeds: jnp.sum(collide(Contact.paper(), speeds).rebound_speed_nm_per_us)))
     memory = gradient.lower(speeds).compile().memory_analysis()
     assert memory is not None

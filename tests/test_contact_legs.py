@@ -24,8 +24,9 @@ from afm_jax.contact.driven import Place, driven_by, free_tip
 from afm_jax.contact.junction import Phase, find_junction
 from afm_jax.contact.settings import DRIVEN_SETTINGS, METHODS, QuickSetting, driven_setting_of
 from afm_jax.contact.step import advance, eighth_order_step, fresh_touch
-from afm_jax.motion.contact_motion import cross, for_the_few
+from afm_jax.motion.contact_motion import cross
 from afm_jax.scenefile.presets import contact_scene
+from afm_jax.solve.lanes import repeat_for
 from tests.reference_driven_contact import DrivenContact, follow
 
 SYSTEM = DrivenContact(amplitude_nm=4.0, drive_frequency_khz=180.0 * 5.277)
@@ -212,7 +213,7 @@ def test_the_few_get_what_each_would_alone(block):
     def halved(value, limit):
         return jnp.where(value > limit, 0.5 * value, value)
 
-    few = for_the_few(halved, lambda value, limit: value > limit, changed=0, passes=9, block=block)
+    few = repeat_for(halved, lambda value, limit: value > limit, changed=0, passes=9, block=block)
     values, limit = jnp.linspace(0.5, 900.0, 40), jnp.asarray(1.0)
     together = jax.vmap(few, in_axes=(0, None))(values, limit)
     alone = jnp.stack([few(value, limit) for value in values])

@@ -24,6 +24,7 @@ LEVELS = {
     "saved": 1,
     "results": 1,
     "compilation_cache": 0,
+    "solve": 2,
     "apparatus": 2,
     "impact": 3,
     "contact": 4,
@@ -178,7 +179,7 @@ def crossed(start: tuple[str, str]) -> set[str]:
 @pytest.mark.parametrize(
     ("module", "name", "most"),
     [
-        ("afm_jax.motion.simulate", "simulate", 36),
+        ("afm_jax.motion.simulate", "simulate", 37),
         ("fitting.fits.fit", "fit", 52),
         ("afm_jax.contact.collide", "collide", 18),
         ("afm_jax.effects.study", "study_effects", 52),

@@ -290,6 +290,33 @@ def test_sign_and_zero_of_the_phase_are_told_by_the_free_rows(tmp_path: Path, si
     assert slope == pytest.approx(sign, abs=1e-3)
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_radians_that_are_taken_for_degrees_are_told_by_the_free_rows(tmp_path: Path, sign: float):
+    offset, amplitude, lag = tapping_rows()
+    columns = {"Z (nm)": offset, "Amp (nm)": amplitude, "Phase (deg)": sign * np.deg2rad(lag)}
+    known: dict[str, Any] = {"free_frequency_khz": 90.0, "quality_factor": 200.0, "drive": "force"}
+    path = saved(tmp_path, separated(columns))
+    with pytest.raises(TableError, match=r"it is in radians; say --columns phase_lag_deg=CHANNEL:rad"):
+        read_curve(path, **known)
+    curve = read_curve(path, columns="phase_lag_deg=Phase:rad", **known)
+    assert np.ptp(given(curve.phase_lag_deg)) == pytest.approx(np.ptp(lag), rel=1e-4)
+
+
+@pytest.mark.parametrize(("waver", "said"), [(0.03, 1), (0.0, 0)])
+def test_a_free_part_that_wavers_is_told(tmp_path: Path, waver: float, said: int):
+    # as interference of the detector's light does: a period of 8 nm, amplitude 3 %, standard deviation 2.1 %
+    height, rng = np.linspace(0.0, 60.0, 400), np.random.default_rng(2)
+    amplitude = np.where(height > 50.0, 63.0 - height, 13.0 * (1.0 + waver * np.sin(2.0 * np.pi * height / 8.0)))
+    amplitude *= 1.0 + 0.002 * rng.normal(size=400)
+    curve = read_curve(saved(tmp_path, separated({"Z (nm)": height, "Amp (nm)": amplitude})))
+    notes = [note for note in curve.notes if note.startswith("Free part: ")]
+    assert len(notes) == said
+    if said:
+        share = re.search(r"wavers by ([\d.]+)%", notes[0])
+        assert share is not None
+        assert float(share[1]) == pytest.approx(2.1, abs=0.3)
+
+
 def test_slope_and_free_amplitude_of_a_curve_with_an_attractive_plateau(tmp_path: Path):
     made = raw_curve(1200)
     columns = {

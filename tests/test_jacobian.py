@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
-from afm_jax.impact.implicit import implicit_root
 from afm_jax.impact.jacobian import eq7, map_jacobian, paper_flight
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.impact.map import next_impact
+from afm_jax.solve.derivatives import implicit_root
 from tests import reference_systems as reference
 from tests.reference_examples import SCENES
 from tests.reference_systems import Parameters

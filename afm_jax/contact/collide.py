@@ -35,18 +35,16 @@ from afm_jax.contact.bridge_leg import (
     turn_in_bridge,
     way_through,
 )
-from afm_jax.contact.by_tangents import by_tangents
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Driven, free_tip
 from afm_jax.contact.junction import Junction, explain_missing_junction, find_junction
 from afm_jax.contact.junction_leg import JunctionWay, pass_through_junction
 from afm_jax.contact.settings import CAREFUL, Setting, setting_of
-from afm_jax.impact.implicit import implicit_root
 from afm_jax.outcomes import CollisionOutcome
 from afm_jax.results import ResultTuple, public_result
+from afm_jax.solve.derivatives import by_tangents, implicit_root
+from afm_jax.solve.lanes import LANES, again_for_the_open, filled, map_in_blocks
 
-BLOCK = 512
-"""Tips computed side by side: few enough to stay in the processor's cache."""
 _CAPTURE_POINTS = 64
 _CAPTURE_ROUNDS = 9
 _MOST_SPENT = {"steps": 0.2, "collocation": 0.05}
@@ -142,7 +140,7 @@ def collide(
             )
     # one axis of tips inside, the speeds' own shape outside
     contact, mass = jax.tree.map(lambda leaf: leaf.ravel() if leaf.ndim else leaf, (contact, mass))
-    small = speeds.size <= BLOCK
+    small = speeds.size <= LANES
     result = by_tangents(_tips, contact, mass, speeds.ravel(), small=small, setting=setting)
     _complain(contact, result)
     return jax.tree.map(lambda part: part.reshape(speeds.shape), result)
@@ -161,9 +159,8 @@ def collide_in_blocks(
     Raises:
         ValueError: as `collide`.
     """
-    size = BLOCK * -(-len(speeds) // BLOCK)
-    filled = np.concatenate([speeds, np.full(size - len(speeds), speeds[-1])])
-    found = collide(contact, filled, mass_ng, accuracy=accuracy, method=method)
+    whole = filled(speeds, LANES * -(-len(speeds) // LANES))
+    found = collide(contact, whole, mass_ng, accuracy=accuracy, method=method)
     return {name: np.asarray(part)[: len(speeds)] for name, part in found._asdict().items()}
 
 
@@ -174,7 +171,7 @@ def batch_of(contact: Contact, mass_ng: ArrayLike, speeds: Float[Array, " tips"]
 
 def _tips(contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, " tips"], setting: Setting) -> Collision:
     quick, resolved, place = _quick(contact, mass, speeds, setting)
-    return _resolve((contact, place), mass, speeds, quick, resolved)
+    return again_for_the_open(_careful, resolved, ((contact, place), mass, speeds), quick)
 
 
 def _complain(contact: Contact, result: Collision) -> None:
@@ -202,7 +199,7 @@ def _quick(
         resolved = ways.resolved | ~valid | ~place.exists
         return _judged(found, speed, place.exists, valid), resolved, place if shared is None else None
 
-    found, resolved, own = _in_blocks(one, contact, mass, speeds)
+    found, resolved, own = _of_tips(one, contact, mass, speeds)
     return found, resolved, own if shared is None else shared
 
 
@@ -226,7 +223,18 @@ def _careful(joined: _Joined, mass: Float[Array, "..."], speeds: Float[Array, ".
         finite = jnp.isfinite(found.end_energy_aj) & jnp.isfinite(found.viscous_loss_aj) & (turn.settled | ~turns)
         return _judged(found, speed, place.exists, valid, finite)
 
-    return _in_blocks(one, joined, mass, speeds)
+    return _of_tips(one, joined, mass, speeds)
+
+
+def _of_tips(one: Callable, contact: Contact | _Joined, mass: Float[Array, "..."], speeds: Float[Array, "..."]) -> Any:
+    """Return a collision of every tip of a batch: memory does not grow with it."""
+    own, shared = eqx.partition((contact, mass), lambda leaf: leaf.ndim > 0)
+
+    def block(lanes: Any) -> Any:
+        varied, speed = lanes
+        return one(*eqx.combine(varied, shared), speed)
+
+    return map_in_blocks(block, (own, speeds), block=LANES, recompute=True)
 
 
 def _axes(tree: Any) -> Any:
@@ -255,53 +263,6 @@ def _judged(found: Collision, speed: Array, exists: Array, valid: Array, finite:
     good = outcome <= CollisionOutcome.CAPTURED_BY_JUNCTION
     cleared = jax.tree.map(lambda part: jnp.where(good, part, jnp.zeros_like(part)), found)
     return cleared._replace(approach_speed_nm_per_us=speed, outcome=outcome)
-
-
-def _in_blocks(
-    one: Callable, contact: Contact | _Joined, mass: Float[Array, "..."], speeds: Float[Array, "..."]
-) -> Any:
-    """Map a collision over a batch, in blocks that stay in the processor's cache: memory does not grow with it."""
-    leaves, structure = jax.tree.flatten((contact, mass))
-    varied = [leaf.ndim > 0 for leaf in leaves]
-
-    def block(columns: list[Array]) -> Any:
-        speed, *own = columns
-        rest = iter(own)
-        lanes = [next(rest) if varies else leaf for varies, leaf in zip(varied, leaves, strict=True)]
-        return one(*jax.tree.unflatten(structure, lanes), speed)
-
-    columns = [speeds, *(leaf for leaf, varies in zip(leaves, varied, strict=True) if varies)]
-    size = speeds.shape[0]
-    if size <= BLOCK:
-        return block(columns)
-    rows = -(-size // BLOCK)
-    # the last block is filled up with the last tip
-    filled = [jnp.concatenate([column, jnp.broadcast_to(column[-1:], (rows * BLOCK - size,))]) for column in columns]
-    result = lax.map(jax.checkpoint(block), [column.reshape(rows, BLOCK) for column in filled])
-    return jax.tree.map(lambda part: part.reshape(rows * BLOCK)[:size], result)
-
-
-def _resolve(
-    joined: _Joined, mass: Float[Array, "..."], speeds: Float[Array, "..."], quick: Collision, resolved: Array
-) -> Collision:
-    """Return the quick collisions, with those that few steps do not resolve computed again in many.
-
-    Where the numbers can be looked at, only those tips are computed again; inside `jit` all are, if any needs it.
-    """
-    if is_traced(resolved):
-        # recomputed in reverse mode: what many steps leave behind would not fit into memory
-        careful = jax.checkpoint(lambda: _careful(joined, mass, speeds))
-        again = lax.cond(jnp.all(resolved), lambda: quick, careful)
-        return jax.tree.map(lambda fast, slow: jnp.where(resolved, fast, slow), quick, again)
-    open_tips = np.flatnonzero(~np.asarray(resolved))
-    if not open_tips.size:
-        return quick
-    # sizes are rounded up to powers of two, so that few programs serve all batches
-    chosen = np.resize(open_tips, 1 << int(np.ceil(np.log2(open_tips.size))))
-    own, own_mass = jax.tree.map(lambda leaf: leaf[chosen] if leaf.ndim else leaf, (joined, mass))
-    slow = _careful(own, own_mass, speeds[chosen])
-    count = open_tips.size
-    return jax.tree.map(lambda fast, careful: fast.at[open_tips].set(careful[:count]), quick, slow)
 
 
 @checked

@@ -22,8 +22,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from afm_jax.checks import as_argument, checked
 from afm_jax.contact.contact import Bridge, Contact, bridge_of
 from afm_jax.contact.forces import jkr
-from afm_jax.impact.implicit import implicit_root
 from afm_jax.results import ResultTuple, public_result
+from afm_jax.solve.derivatives import implicit_root
 
 SMALLEST_GAP_NM = 0.01
 """The tangency is looked for between this gap and the one at which the bridge forms."""

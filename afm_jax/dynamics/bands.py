@@ -13,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from afm_jax.dynamics.closed_loops import Equations, Frame, by_blocks, equations_at, loop_at
+from afm_jax.dynamics.closed_loops import BLOCK, Equations, Frame, equations_at, loop_at
 from afm_jax.dynamics.continuation import Continuation
 from afm_jax.dynamics.impact_loop import closing_gaps, highest_point
 from afm_jax.dynamics.special_points import OrbitBranch, SpecialPoint
+from afm_jax.solve.lanes import in_blocks
 
 _NEVER_NEGATIVE = ("interaction.epsilon", "interaction.viscous_loss", "cantilever.quality_factor")
 
@@ -78,7 +79,7 @@ def amplitude_errors(
     frame, equations = _wide(found, known, None)
     share = (branch.parameter - found.range.low) / (found.range.high - found.range.low)
     points = np.column_stack([branch.unknowns, share, np.tile(known.values, (len(share), 1))])
-    slope = by_blocks(lambda block: _amplitude_slopes(frame, block, equations), points)
+    slope = in_blocks(lambda block: _amplitude_slopes(frame, block, equations), points, block=BLOCK, widths=())
     return np.sqrt(np.einsum("ni,ij,nj->n", slope, known.covariance, slope))
 
 

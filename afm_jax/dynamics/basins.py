@@ -20,21 +20,11 @@ from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.bifurcations import follow, settled_below
 from afm_jax.dynamics.exponents import CHAOTIC_ERRORS, exponents_of_law
-from afm_jax.dynamics.iteration import (
-    LANES,
-    Record,
-    Report,
-    Tips,
-    advance,
-    evenly_spread,
-    in_blocks,
-    leaving_tips,
-    sample_driven,
-    tips_at,
-)
+from afm_jax.dynamics.iteration import Record, Tips, advance, evenly_spread, leaving_tips, sample_driven, tips_at
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, verdicts_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import ResultTuple, public_result
+from afm_jax.solve.lanes import LANES, Report, in_blocks
 from afm_jax.units import within_turn
 
 _SAMPLE = 2048

@@ -21,22 +21,13 @@ from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.contact_sequence import follow_contacts
-from afm_jax.dynamics.iteration import (
-    Record,
-    Report,
-    SampleDriven,
-    Tips,
-    batch_and_tips,
-    in_blocks,
-    recorded,
-    sample_driven,
-    skipped,
-)
+from afm_jax.dynamics.iteration import Record, SampleDriven, Tips, batch_and_tips, recorded, sample_driven, skipped
 from afm_jax.dynamics.verdicts import RECORDED, MotionKind, Verdicts, verdicts_of
 from afm_jax.motion.start import start_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.scenefile.parameter_paths import scene_batch
+from afm_jax.solve.lanes import Report, in_blocks
 from afm_jax.units import within_turn
 
 _STRETCHES, _MORE_STRETCHES = 512, 1024

@@ -22,13 +22,14 @@ from afm_jax.checks import check_kind, checked
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.bands import UncertainParameters
 from afm_jax.dynamics.contact_orbits import single_contact_orbits
-from afm_jax.dynamics.iteration import Report, SampleDriven, for_few, in_blocks, sample_driven
+from afm_jax.dynamics.iteration import SampleDriven, sample_driven
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem
 from afm_jax.impact.law import TabulatedLaw, impact_law_of
 from afm_jax.impact.orbits import orbit_at, orbit_problem
 from afm_jax.impact.roots import find_roots
 from afm_jax.results import Result, public_result
 from afm_jax.scenefile.parameter_paths import scene_family
+from afm_jax.solve.lanes import Report, again_for, in_blocks
 
 _LANES = 1024
 """Scenes gone through together: few enough for the cache, many enough to fill the vector units."""
@@ -152,7 +153,8 @@ def highest_orbits(
         nothing = (jnp.zeros(count * slots, bool),) * 2 + (jnp.full((count * slots, len(names) + 1), jnp.nan),)
         there = frame.periodic & impact_law_of(scenes).leaves
         few = max(count // _ORBITS_AT_ONCE, 1)
-        known = for_few(orbit_of, roots.found.ravel() & jnp.repeat(there, slots), (places, rows), nothing, few)
+        found = roots.found.ravel() & jnp.repeat(there, slots)
+        known = again_for(jax.vmap(orbit_of), found, (places, rows), nothing, block=few)
         admissible, steady, numbers = (part.reshape(count, slots, *part.shape[1:]) for part in known)
         highest = jnp.argmax(jnp.where(steady, numbers[..., 0], -jnp.inf), axis=1)
         chosen = jnp.take_along_axis(numbers, highest[:, None, None], axis=1)[:, 0]

@@ -10,14 +10,13 @@ test function that vanishes besides on curves in two parameters:
     capture          the distance of the slowest impact from capture
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float
 
 from afm_jax.apparatus.scene import Scene
@@ -33,13 +32,15 @@ from afm_jax.dynamics.impact_loop import (
     trace_and_determinant_of,
 )
 from afm_jax.scenefile.parameter_paths import ParameterRange, with_numbers
+from afm_jax.solve.arclength import EquationsAt, point_in_plane
+from afm_jax.solve.lanes import in_blocks
 
 KINDS = ("fold", "period_doubling", "torus", "grazing", "capture")
 FOLD, DOUBLING, TORUS, GRAZING, CAPTURE = range(len(KINDS))
-_NEWTON_STEPS = 10
+_NEWTON_STEPS = 12
 _ARRIVED = 1e-11
-_BLOCK = 64
-"""Points read together: one program."""
+BLOCK = 64
+"""Points of a curve read together: one program."""
 
 
 class Frame(NamedTuple):
@@ -121,7 +122,7 @@ def equations_at(point: Float[Array, " n"], frame: Frame, equations: Equations) 
 
 
 class CurvePoint(NamedTuple):
-    """Where Newton's method arrived: the point, its last move, the tangent, test functions, the longest delay."""
+    """A point of a curve, the move that Newton's method would still make, the tangent, tests and the longest delay."""
 
     point: Any
     moved: Any
@@ -131,52 +132,45 @@ class CurvePoint(NamedTuple):
 
 
 @partial(jax.jit, static_argnames=("equations",))
-def _step(frame: Frame, guess: Array, row: Array, equations: Equations) -> CurvePoint:
-    """Return the point of a curve in the plane through a guess across a row."""
-
+def _linearised(frame: Frame, point: Array, equations: Equations) -> tuple[Array, Array]:
     def twice(point):
         value = equations_at(point, frame, equations)
         return value, value
 
-    def searching(state):
-        _, moved, steps, _ = state
-        return (moved > _ARRIVED * 0.01) & (steps < _NEWTON_STEPS)
+    slopes, value = jax.jacfwd(twice, has_aux=True)(point)
+    return value, slopes
 
-    def improve(state):
-        point, _, steps, _ = state
-        slopes, value = jax.jacfwd(twice, has_aux=True)(point)
-        matrix = jnp.concatenate([slopes, row[None]])
-        move = jnp.linalg.solve(matrix, jnp.append(value, row @ (point - guess)))
-        return point - move, jnp.max(jnp.abs(move)), steps + 1, matrix
 
-    count = guess.shape[0]
-    begin = (guess, jnp.asarray(jnp.inf), 0, jnp.eye(count))
-    point, moved, _, matrix = lax.while_loop(searching, improve, begin)
-    tangent = jnp.linalg.solve(matrix, jnp.zeros(count).at[-1].set(1.0))
-    tangent = tangent / jnp.linalg.norm(tangent)
+@partial(jax.jit, static_argnames=("equations",))
+def _tests_and_delay(frame: Frame, point: Array, equations: Equations) -> tuple[Array, Array]:
     unknowns, shares = split_point(point, equations)
     loop = loop_at(shares, frame, equations)
-    tests = _tests(unknowns, frame, loop, equations)
     delay = jnp.zeros(())
     if loop.impact.delayed:
         delays = impacts_at(unknowns, frame.scale, loop).speeds.delay
         delay = jnp.max(jnp.abs(delays)) * loop.angular_frequency / (2.0 * jnp.pi)
-    return CurvePoint(point, moved, tangent, jnp.stack(tests), delay)
+    return jnp.stack(_tests(unknowns, frame, loop, equations)), delay
 
 
 def solved_point(frame: Frame, guess: np.ndarray, row: np.ndarray, equations: Equations) -> CurvePoint | None:
-    """Return the same as NumPy arrays; None where the method does not arrive."""
-    if equations.flights is not None:
-        solved = equations.flights.solve(guess, row, units_of(frame), equations.kind)
-        if solved is None:
-            return None
-        found = CurvePoint(*solved, 0.0)
+    """Return the point of a curve in the plane through a guess across a row, NumPy arrays; None where there is none."""
+    flights = equations.flights
+
+    def linearised(point: np.ndarray) -> EquationsAt | None:
+        if flights is not None:
+            return flights.linearised(point, units_of(frame), equations.kind)
+        return EquationsAt(*(np.asarray(part) for part in _linearised(frame, jnp.asarray(point), equations)), None)
+
+    found = point_in_plane(linearised, guess, row, arrived=0.1 * _ARRIVED, steps=_NEWTON_STEPS)
+    if found is None or not (np.isfinite(found.point).all() and np.isfinite(found.tangent).all()):
+        return None
+    if not found.moved < _ARRIVED:
+        return None
+    if flights is None:
+        tests, delay = (np.asarray(part) for part in _tests_and_delay(frame, jnp.asarray(found.point), equations))
     else:
-        found = CurvePoint(
-            *(np.asarray(part) for part in _step(frame, jnp.asarray(guess), jnp.asarray(row), equations))
-        )
-    arrived = np.isfinite(found.point).all() and np.isfinite(found.tangent).all() and found.moved < _ARRIVED
-    return found if arrived else None
+        tests, delay = flights.tests(found.facts, units_of(frame)), 0.0
+    return CurvePoint(found.point, found.moved, found.tangent, tests, delay)
 
 
 def units_of(frame: Frame) -> CurveUnits:
@@ -197,12 +191,4 @@ def read_points(points: Float[np.ndarray, "points n"], frame: Frame, equations: 
     """Return what there is to know of the orbits at points of a curve, NumPy arrays."""
     if equations.flights is not None:
         return equations.flights.readings_of_points(points, units_of(frame))
-    return by_blocks(lambda block: _read(frame, block, equations), points)
-
-
-def by_blocks(work: Callable[[Array], Any], points: Float[np.ndarray, "points n"]) -> Any:
-    """Return the results of work on points, NumPy arrays; blocks of one size, the last filled up, share a program."""
-    blocks = -(-len(points) // _BLOCK)
-    padded = np.concatenate([points, np.repeat(points[-1:], blocks * _BLOCK - len(points), axis=0)])
-    done = [work(jnp.asarray(block)) for block in np.split(padded, blocks)]
-    return jax.tree.map(lambda *parts: np.concatenate([np.asarray(part) for part in parts])[: len(points)], *done)
+    return in_blocks(lambda block: _read(frame, block, equations), points, block=BLOCK, widths=())

@@ -30,13 +30,15 @@ from afm_jax.dynamics.impact_orbits import (
     many_impact_orbits,
     multipliers_of,
 )
-from afm_jax.dynamics.iteration import Report, SampleDriven, evenly_spread, in_blocks, laws_of, leaving_tips
+from afm_jax.dynamics.iteration import SampleDriven, evenly_spread, laws_of, leaving_tips
 from afm_jax.impact.amplitude import FlightEnds, highest_of_sum, peak_amplitude
 from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
 from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import ContactKind, Contacts
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.scenefile.parameter_paths import scene_family
+from afm_jax.solve.arclength import EquationsAt
+from afm_jax.solve.lanes import Report, in_blocks
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
 _STARTS = 8
@@ -62,8 +64,6 @@ _GRAZING = 3
 """Number of its test function in `closed_loops`."""
 _SAMPLES = 512
 """Of a flight, for its lowest points."""
-_CURVE_STEPS = 12
-_CURVE_ARRIVED = 1e-12
 _DIFFERENCE = 1e-5
 """Of unknowns without dimension, for derivatives of test functions."""
 _LONGEST_CONTACT = 0.5
@@ -472,7 +472,7 @@ class ContactFlights:
             return found
         lanes = (part[flies].ravel() for part in (phase, rebound, following + _LONGEST_CONTACT * shortest))
         whole = (*lanes, np.repeat(values[flies], count, axis=0))
-        flown = in_blocks(lambda part: self._fly(*part), whole, block=_LANES, widths=(_LANES,))
+        flown = in_blocks(lambda part: self._fly(*part), whole, block=_LANES, widths=())
         by_loops = jax.tree.map(lambda part: part.reshape(-1, count, *part.shape[1:]), flown)
         for place, one in enumerate(flies):
             later, contacts, slopes = jax.tree.map(lambda part, place=place: part[place], by_loops)
@@ -524,46 +524,31 @@ class ContactFlights:
         there = self.family(*flown.values)
         return there, phase / float(RAD_PER_US_PER_KHZ * getattr(there, self._driven).frequency_khz), rebound
 
-    def solve(
-        self, guess: Float[np.ndarray, " n"], row: Float[np.ndarray, " n"], units: CurveUnits, kind: int | None
-    ) -> tuple[np.ndarray, float, np.ndarray, np.ndarray] | None:
-        """Return the point of a curve in the plane through a guess across a row; None where it is not found.
+    def linearised(self, point: Float[np.ndarray, " n"], units: CurveUnits, kind: int | None) -> EquationsAt | None:
+        """Return the closing conditions at a point of a curve, and the test functions there; None where none flies.
 
         Args:
-            guess: m phases in rad, m rebound speeds in the unit of speeds, the parameters as shares of their ranges.
-            row: normal of the plane.
+            point: m phases in rad, m rebound speeds in the unit of speeds, the parameters as shares of their ranges.
             units: of the same.
-            kind: number of the test function that is 0 besides; None: the loop closes, and that is all.
-
-        Returns:
-            The point, Newton's last move, the curve's tangent and the test functions.
+            kind: number of the test function that is to be 0 besides; None: the loop closes, and that is all.
         """
-        point, size = guess, len(guess)
         # the test function's derivatives are differences, which only lead to its root
+        size = len(point)
         around = [np.eye(size), -np.eye(size)] if kind is not None else []
         aside = _DIFFERENCE * np.concatenate([np.zeros((1, size)), *around])
-        steps = 0
-        while True:
-            flown = [one for one in self.flown(*units.of_points(point + aside)) if one is not None]
-            if len(flown) < len(aside):
-                return None
-            here = flown[0]
-            scales = units.scales(len(here.loop) // 2)
-            value, matrix = here.gaps / scales, here.slopes * np.concatenate([scales, units.width]) / scales[:, None]
-            if kind is not None:
-                tests = np.array([self._tests(one, units, grazing=kind == _GRAZING)[kind] for one in flown])
-                value = np.append(value, tests[0])
-                matrix = np.vstack([matrix, (tests[1 : size + 1] - tests[size + 1 :]) / (2.0 * _DIFFERENCE)])
-            matrix = np.vstack([matrix, row])
-            move = np.linalg.solve(matrix, np.append(value, row @ (point - guess)))
-            moved, steps = float(np.abs(move).max()), steps + 1
-            if not moved > _CURVE_ARRIVED or steps == _CURVE_STEPS:
-                break
-            point = point - move
-        tangent = np.linalg.solve(matrix, np.eye(size)[-1])
-        return point, moved, tangent / np.linalg.norm(tangent), self._tests(here, units)
+        flown = [one for one in self.flown(*units.of_points(point + aside)) if one is not None]
+        if len(flown) < len(aside):
+            return None
+        here = flown[0]
+        scales = units.scales(len(here.loop) // 2)
+        value, slopes = here.gaps / scales, here.slopes * np.concatenate([scales, units.width]) / scales[:, None]
+        if kind is not None:
+            tests = np.array([self.tests(one, units, grazing=kind == _GRAZING)[kind] for one in flown])
+            value = np.append(value, tests[0])
+            slopes = np.vstack([slopes, (tests[1 : size + 1] - tests[size + 1 :]) / (2.0 * _DIFFERENCE)])
+        return EquationsAt(value, slopes, here)
 
-    def _tests(self, flown: FlownLoop, units: CurveUnits, *, grazing: bool = True) -> np.ndarray:
+    def tests(self, flown: FlownLoop, units: CurveUnits, *, grazing: bool = True) -> np.ndarray:
         """Return the test functions of `closed_loops`; that of grazing NaN where it is not asked for."""
         trace, determinant = flown.trace_and_determinant
         slowest = np.split(flown.loop, 2)[1].min() / units.speed_nm_per_us

@@ -20,18 +20,7 @@ from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.contact_sequence import departure_jacobians, follow_contacts
-from afm_jax.dynamics.iteration import (
-    MapStep,
-    Record,
-    Report,
-    Tips,
-    advance,
-    batch_and_tips,
-    in_blocks,
-    record_of,
-    sample_driven,
-    skipped,
-)
+from afm_jax.dynamics.iteration import MapStep, Record, Tips, advance, batch_and_tips, record_of, sample_driven, skipped
 from afm_jax.dynamics.verdicts import RECORDED, WHY_UNRESOLVED, MotionKind, Verdicts, verdicts_of
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
 from afm_jax.impact.law import impact_law_of
@@ -39,6 +28,7 @@ from afm_jax.motion.record import State
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.outcomes import Outcome
 from afm_jax.results import ResultTuple, public_result
+from afm_jax.solve.lanes import Report, in_blocks
 
 _PARTS = 20
 """Parts of a motion whose means tell the errors."""

@@ -6,8 +6,6 @@ needs (chatter summed up, the ride, the release) is computed in the steps in whi
 others. Times count within the drive's period, so that long motions keep the digits of their phase.
 """
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -20,7 +18,6 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import FreeFrame, free_frame
 from afm_jax.checks import require_float64
-from afm_jax.compilation_cache import available_cores
 from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
@@ -32,11 +29,8 @@ from afm_jax.motion.law_motion import CONSTANT_PUSH, Bed, LawLeg, or_rest, throu
 from afm_jax.motion.record import ContactKind, State
 from afm_jax.motion.start import default_start
 from afm_jax.outcomes import Outcome
+from afm_jax.solve.lanes import again_for, in_blocks
 
-LANES = 512
-"""Tips of a block; from 300 to 1000 differ little."""
-_WIDTHS = (1, 16, 128, LANES)
-"""Sizes of blocks: few, so that few programs are compiled."""
 MAX_STEPS = 2000
 """Steps of the search for one impact."""
 _QUICK_STEPS = 14
@@ -92,7 +86,8 @@ def advance(scenes: Scene, tips: Tips) -> MapStep:
     going = tips.outcome == Outcome.IMPACT
     impact = jax.vmap(partial(_one_impact, max_steps=_QUICK_STEPS))(scenes, tips)
     slow = going & (impact.outcome == Outcome.STEP_LIMIT)
-    impact = for_few(partial(_one_impact, max_steps=MAX_STEPS), slow, (scenes, tips), impact)
+    longer = jax.vmap(partial(_one_impact, max_steps=MAX_STEPS))
+    impact = again_for(longer, slow, (scenes, tips), impact, block=_FEW)
     return _landed(scenes, tips, impact)
 
 
@@ -109,7 +104,9 @@ def _landed(scenes: Scene, tips: Tips, impact: NextImpact) -> MapStep:
     law = impact_law_of(scenes)
     may_rest = landed & (~law.adheres) & (captured | (rebound < jax.vmap(_slowest_chatter)(scenes)))
 
-    (time, gap, velocity), rested, held = for_few(_rest, may_rest, (scenes, impact), (leaving, no, no))
+    (time, gap, velocity), rested, held = again_for(
+        jax.vmap(_rest), may_rest, (scenes, impact), (leaving, no, no), block=_FEW
+    )
     stuck = (captured & law.adheres) | held
     goes_on = landed & ~stuck
     outcome = jnp.where(goes_on, Outcome.IMPACT, jnp.where(stuck, Outcome.CAPTURED, impact.outcome))
@@ -139,32 +136,6 @@ def _slowest_chatter(scene: Scene) -> Float[Array, ""]:
     reach = jnp.abs(surface.offset_nm) + surface.amplitude_nm
     push = surface.largest_acceleration_nm_per_us2 + 2.0 * decay * surface.top_speed_nm_per_us + omega**2 * reach
     return 0.5 * CONSTANT_PUSH * push * (1.0 - impact_law_of(scene).slow_restitution) / bed.fastest
-
-
-def for_few(
-    work: Callable[..., Any], needed: Bool[Array, " lanes"], arguments: tuple[Any, ...], results: Any, few: int = _FEW
-) -> Any:
-    """Return results with those of work on the lanes that need it: gathered, few at a time, so that no others wait.
-
-    Args:
-        work: of one lane.
-        needed: which lanes.
-        arguments: of the work, arrays of all lanes.
-        results: of all lanes before.
-        few: how many at a time.
-    """
-    lanes = needed.shape[0]
-
-    def some(state):
-        left, found = state
-        chosen = jnp.nonzero(left, size=min(few, lanes), fill_value=lanes)[0]
-        # what is filled up is a copy of the last lane, computed and dropped
-        gathered = jax.tree.map(lambda leaf: leaf.at[chosen].get(mode="clip"), arguments)
-        new = jax.vmap(work)(*gathered)
-        found = jax.tree.map(lambda old, part: old.at[chosen].set(part, mode="drop"), found, new)
-        return left.at[chosen].set(False, mode="drop"), found
-
-    return lax.while_loop(lambda state: jnp.any(state[0]), some, (needed, results))[1]
 
 
 def _rest(scene: Scene, impact: NextImpact) -> tuple[_Leaving, Bool[Array, ""], Bool[Array, ""]]:
@@ -430,47 +401,3 @@ def sample_driven(scenes: Scene) -> SampleDriven:
     if frame.response is not None:
         scenes = Scene(scenes.cantilever, frame.platform, scenes.interaction)
     return SampleDriven(scenes, frame)
-
-
-Report = Callable[[int, int], object]
-"""Told how many of how many lanes are done."""
-
-
-def in_blocks(
-    work: Callable[[Any], Any],
-    lanes: Any,
-    *,
-    block: int = LANES,
-    widths: Sequence[int] = _WIDTHS,
-    report: Report | None = None,
-) -> Any:
-    """Return the results of work on lanes, done block by block on all cores.
-
-    Args:
-        work: takes a tree of arrays with a leading axis of lanes, gives one of NumPy arrays with the same axis.
-        lanes: the tree of all lanes.
-        block: lanes of a block; fewer lanes are one smaller block, filled up.
-        widths: sizes that a smaller block may have.
-        report: told how far it is.
-    """
-    count = len(jax.tree.leaves(lanes)[0])
-    width = next((width for width in widths if width >= min(count, block)), block)
-    whole = jax.tree.map(np.asarray, lanes)
-
-    def part(first: int) -> Any:
-        def cut(leaf: np.ndarray) -> Array:
-            rows = leaf[first : first + width]
-            return jnp.asarray(np.pad(rows, ((0, width - len(rows)),) + ((0, 0),) * (rows.ndim - 1), mode="edge"))
-
-        # a worker has JAX's usual precision, whatever its caller has said
-        with jax.enable_x64(True):  # noqa: FBT003
-            return jax.tree.map(np.asarray, work(jax.tree.map(cut, whole)))
-
-    firsts = range(0, count, width)
-    done = [part(0)]  # alone, so that programs are compiled once
-    with ThreadPoolExecutor(available_cores()) as pool:
-        for result in pool.map(part, firsts[1:]):
-            done.append(result)
-            if report is not None:
-                report(min(len(done) * width, count), count)
-    return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *done)

@@ -19,7 +19,6 @@ from afm_jax.checks import require_float64
 from afm_jax.dynamics.closed_loops import Equations, frame_of
 from afm_jax.dynamics.continuation import Continuation
 from afm_jax.dynamics.impact_loop import LoopReading, driven_part
-from afm_jax.dynamics.iteration import Report
 from afm_jax.dynamics.special_points import OrbitBranch, SpecialPoint
 from afm_jax.impact.law import impact_law_of
 from afm_jax.motion.law_motion import Bed, first_release, take_off
@@ -27,6 +26,7 @@ from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import ContactKind, to_lab
 from afm_jax.motion.simulate import simulate
 from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, scene_family
+from afm_jax.solve.lanes import Report
 from afm_jax.units import within_turn
 
 _MOST_RESTS = 32

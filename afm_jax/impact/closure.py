@@ -20,9 +20,9 @@ from jaxtyping import Array, Bool, Float
 from afm_jax.apparatus.cantilever import Cantilever, Propagator
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.trigonometry import sine_cosine
-from afm_jax.impact.implicit import solved_pair
 from afm_jax.impact.lasting_impact import Impact, corrected, lasting, middle_of_contact
 from afm_jax.impact.law import ImpactLaw, Speeds
+from afm_jax.solve.derivatives import solved_pair
 
 _REGULAR = 1e-12
 """Relative size below which a determinant is taken for the rounding of 0."""

@@ -17,8 +17,8 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import Surface
 from afm_jax.apparatus.trigonometry import sine_cosine
-from afm_jax.impact.implicit import implicit_root
 from afm_jax.outcomes import Outcome
+from afm_jax.solve.derivatives import implicit_root
 
 DEFAULT_MAX_STEPS = 2000
 DEFAULT_ROOT_TOLERANCE_US = 1e-13

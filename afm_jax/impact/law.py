@@ -20,7 +20,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.checks import as_argument, as_parameter, as_real, check_kind, check_parameter, is_traced, readable
-from afm_jax.impact.implicit import implicit_root
+from afm_jax.solve.derivatives import implicit_root
 
 BRIDGE_NM = 4.7
 """Length in nm over which a leaving tip keeps its energy, where nothing says it: the paper's bridge."""

@@ -23,6 +23,7 @@ from afm_jax.impact.lasting_impact import crawls, delay_before, speeds_of_impact
 from afm_jax.impact.law import Law, axes_of_one, impact_law_of
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, public_result
+from afm_jax.solve.lanes import map_in_blocks
 
 NEAR_GRAZING = 1e-3
 """Approach speed over beta omega below which an impact counts as near grazing: its derivatives lose their meaning."""
@@ -346,14 +347,6 @@ def _iterate_batch(
     max_steps: int,
 ) -> NextImpact:
     own, shared = eqx.partition(scene, jax.tree.map(lambda leaf, axes: leaf.ndim > axes, scene, axes_of_one(scene)))
-    batch = starts[0].shape[0]
-    blocks = -(-batch // block)
-    width = -(-batch // blocks)
-
-    def into_blocks(rows):
-        # The last block is filled up with copies of the last row, so that every block is the same program.
-        filled = jnp.pad(rows, ((0, blocks * width - batch), *((0, 0),) * (rows.ndim - 1)), mode="edge")
-        return filled.reshape(blocks, width, *rows.shape[1:])
 
     def one_tip(row):
         own_parameters, (time, velocity) = row
@@ -366,5 +359,4 @@ def _iterate_batch(
             root_tolerance_us=tolerance,
         )
 
-    rows = lax.map(jax.vmap(one_tip), jax.tree.map(into_blocks, (own, starts)))
-    return jax.tree.map(lambda part: part.reshape(blocks * width, impacts)[:batch], rows)
+    return map_in_blocks(jax.vmap(one_tip), (own, starts), block=block)

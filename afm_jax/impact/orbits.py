@@ -28,13 +28,13 @@ from afm_jax.impact.closure import (
     speeds_at_place,
 )
 from afm_jax.impact.first_impact import Flight, first_impact
-from afm_jax.impact.implicit import absent, implicit_pair, implicit_root
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
 from afm_jax.impact.lasting_impact import Impact, PulledImpact, crawls, depth_of_impact, middle_of_contact
 from afm_jax.impact.law import ImpactLaw, Law, Speeds, TabulatedLaw, impact_law_of
 from afm_jax.impact.roots import COARSE, TAPPED, find_roots
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, public_result
+from afm_jax.solve.derivatives import absent, implicit_pair, implicit_root
 from afm_jax.units import within_turn
 
 NEAR_DOUBLE = 1e-3

@@ -28,11 +28,11 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface
 from afm_jax.contact.junction import Phase
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, Flight, time_above
-from afm_jax.impact.implicit import implicit_root
 from afm_jax.impact.law import Law, impact_law_of
 from afm_jax.impact.map import NextImpact, impact_after
 from afm_jax.motion.record import ContactKind, Contacts, MotionOutcome, Simulation, State, to_gap, to_lab
 from afm_jax.outcomes import Outcome
+from afm_jax.solve.derivatives import implicit_root
 
 CONSTANT_PUSH = 1e-5
 """Largest relative change of the push during the rest of a series of impacts that is summed up."""

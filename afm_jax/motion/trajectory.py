@@ -34,6 +34,7 @@ from afm_jax.contact.junction import Junction, Phase, find_junction, force_in_ph
 from afm_jax.contact.step import Touch, advance, eighth_order_step, fresh_touch
 from afm_jax.motion.record import ContactKind, Simulation, State, to_gap, to_lab
 from afm_jax.results import ResultTuple, public_result
+from afm_jax.solve.lanes import filled, power_of_two
 
 _BLOCK = 128
 """Trials computed in one call."""
@@ -334,7 +335,7 @@ class DensePath(NamedTuple):
         _check(self.simulation, wanted)
         if not wanted.size:
             return Trajectory(wanted, *(np.zeros(wanted.shape, kind) for kind in (float,) * 4 + (int, float)))
-        times, world, pieces = _padded(wanted.reshape(-1)), self.world, self.pieces
+        times, world, pieces = _filled_up(wanted.reshape(-1)), self.world, self.pieces
         place = np.clip(np.searchsorted(pieces.begin_us, times, side="right") - 1, 0, None)
         kind = pieces.kind[place]
         flown = _flown(world.cantilever, world.surface, *(part[place] for part in _starts(pieces)), times)
@@ -345,7 +346,7 @@ class DensePath(NamedTuple):
         touching = kind >= 0
         if touching.any():
             count = int(touching.sum())
-            found = _in_contact(world, pieces, _padded(place[touching]), _padded(times[touching]))
+            found = _in_contact(world, pieces, _filled_up(place[touching]), _filled_up(times[touching]))
             gap[touching], rate[touching] = (part[:count] for part in found)
         phase = np.where(kind == FLIGHT, int(Phase.DRY), np.where(kind == REST, int(Phase.JUNCTION), kind))
         phase = np.where(straight, int(Phase.BRIDGE), phase)
@@ -436,10 +437,8 @@ def nodes(
     return dense_path(scene, simulation, from_us, to_us).nodes(from_us, to_us)
 
 
-def _padded(values: np.ndarray) -> np.ndarray:
-    """Return values filled up to a power of two with the last: few shapes, so that few programs are compiled."""
-    size = max(64, 1 << (values.size - 1).bit_length())
-    return np.concatenate([values, np.repeat(values[-1:], size - values.size)])
+def _filled_up(values: np.ndarray) -> np.ndarray:
+    return filled(values, power_of_two(values.size, 64))
 
 
 def _starts(pieces: Pieces) -> tuple[np.ndarray, ...]:

@@ -14,6 +14,8 @@ _PARTS = 20
 """Blocks that the rows in front of the contact are looked at in."""
 _FLAT, _FLAT_DEG = 0.005, 1.0
 """What blocks of the free tip may differ by: of the amplitude, and in degrees."""
+_WAVERS = 3.0
+"""Scatter of blocks, over that of their noise, from which the free amplitude is not flat."""
 _SLOPING = 0.01
 """Change of the amplitude over the farthest quarter of the rows, of the amplitude, from which there is no free part."""
 _WINDOW_NM = 1.0
@@ -60,6 +62,7 @@ class BranchLook:
         onset_nm: height at which the line through the rows in contact meets the free level; None without such rows.
         jump: levels before and after the largest jump of the free amplitude along the heights, None without one.
         change: of the amplitude over the farthest quarter of the rows, of the amplitude, if that is no free part.
+        waver: standard deviation of the free amplitude along the heights beyond its noise, of it, if it is not flat.
     """
 
     free: Bool[np.ndarray, " rows"]
@@ -70,6 +73,7 @@ class BranchLook:
     onset_nm: float | None
     jump: tuple[float, float] | None
     change: float | None = None
+    waver: float | None = None
 
 
 def look_at(
@@ -108,7 +112,7 @@ def look_at(
     mask[order] = free
     noise = _scatter(rows) if len(rows) >= _FEWEST else float("nan")
     error = float(np.std(rows) / np.sqrt(len(rows)))
-    return BranchLook(mask, float(np.median(rows)), error, noise, slope, onset, jump, change)
+    return BranchLook(mask, float(np.median(rows)), error, noise, slope, onset, jump, change, _waver(rows))
 
 
 def _plateau_end(values: Float[np.ndarray, " rows"], lag: Float[np.ndarray, " rows"] | None) -> int:
@@ -148,6 +152,20 @@ def _change(offset: Float[np.ndarray, " rows"], values: Float[np.ndarray, " rows
     of_line = float(np.sum((far - far.mean() - slope * place) ** 2))
     of_step = min(float(np.var(far[:k]) * k + np.var(far[k:]) * (rows - k)) for k in range(1, rows))
     return change if steep and of_line < of_step else None
+
+
+def _waver(values: Float[np.ndarray, " rows"]) -> float | None:
+    """Return how much blocks of free rows scatter about a straight line, of their mean; None where it is as noise does.
+
+    Noise is what neighbours differ by.
+    """
+    size = max(len(values) // _PARTS, _FEWEST)
+    if len(values) < 4 * size:
+        return None
+    parts = np.array([part.mean() for part in np.array_split(values, len(values) // size)])
+    noise = float(np.std(np.diff(values)) / np.sqrt(2.0 * size))
+    waver, level = _scatter(parts), float(np.mean(values))
+    return waver / level if waver > max(_FLAT * level, _WAVERS * noise) else None
 
 
 def _scatter(values: Float[np.ndarray, " rows"]) -> float:

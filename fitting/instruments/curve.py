@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float
 
 from afm_jax.checks import checked
 from afm_jax.results import Result, public_result
+from afm_jax.scenefile.tables import printable
 from afm_jax.strict_json import plain
 from fitting.instruments.bins import Binned, binned, faults_of_order, usual_width
 from fitting.instruments.branch import JUMP, BranchLook, look_at
@@ -452,7 +453,8 @@ def _judged(curve: MeasuredCurve, *, of_slope: bool, sign_given: bool) -> Measur
     curve = _with_origin(curve, looks)
     curve = _with_zero_of_phase(curve, sign_given=sign_given)
     missing = [key for key in _NEEDED if _is_missing(curve, key)] + [key for key in _WANTED if key not in curve.known]
-    return replace(curve, notes=(*curve.notes, *_scale_notes(curve), *_phase_notes(curve)), missing=tuple(missing))
+    notes = (*curve.notes, *_free_notes(looks), *_scale_notes(curve), *_phase_notes(curve))
+    return replace(curve, notes=notes, missing=tuple(missing))
 
 
 def _looks(curve: MeasuredCurve) -> dict[str, BranchLook]:
@@ -584,8 +586,16 @@ def _with_origin(curve: MeasuredCurve, looks: Mapping[str, BranchLook]) -> Measu
     return replace(curve, offset_nm=curve.offset_nm - height, known=known)
 
 
+_RADIANS_DEG = 30.0
+"""How near to the free tip's lag its phase, taken for radians, must be to be told as such."""
+
+
 def _with_zero_of_phase(curve: MeasuredCurve, *, sign_given: bool) -> MeasuredCurve:
-    """Return the curve with sign and zero of the phase such that free rows lag as frequency and Q say, where known."""
+    """Return the curve with sign and zero of the phase such that free rows lag as frequency and Q say, where known.
+
+    Raises:
+        TableError: if the phases are radians.
+    """
     phase, numbers = curve.phase_lag_deg, [curve.number(k) for k in ("drive_frequency_khz", "free_frequency_khz")]
     quality_factor = curve.number("quality_factor")
     if phase is None or None in numbers or quality_factor is None or not curve.free.any():
@@ -594,6 +604,11 @@ def _with_zero_of_phase(curve: MeasuredCurve, *, sign_given: bool) -> MeasuredCu
     lag = float(free_lag_deg(str(curve.known["drive"].value), ratio, quality_factor))
     free = phase[curve.free]
     level, scatter = float(np.median(free)), float(np.std(free) / np.sqrt(len(free)))
+    if np.nanmax(np.abs(phase)) < 2.0 * np.pi and abs(np.rad2deg(abs(level)) - lag) < _RADIANS_DEG:
+        raise TableError(
+            f"{printable(curve.source)}: the phase reads {level:.3g} where the tip is free and lags by {lag:.1f} "
+            "degrees: it is in radians; say --columns phase_lag_deg=CHANNEL:rad"
+        )
     error = float(np.hypot(max(scatter, 0.01), _error_of_lag(curve)))
     how = f"measured: the free rows read {level:.2f} deg and are set to {lag:.2f}, what s and Q give"
     sense = sense_of(level, lag, sign_given=sign_given)
@@ -625,6 +640,16 @@ def _is_missing(curve: MeasuredCurve, key: str) -> bool:
     if key == "free_amplitude_nm" and curve.amplitude_unit == "V":
         return False
     return key not in curve.known
+
+
+def _free_notes(looks: Mapping[str, BranchLook]) -> list[str]:
+    """Say where the free tip's amplitude wavers along the heights, as interference of the detector's light does."""
+    return [
+        f"Free part: in the {branch} the amplitude is not flat, it wavers by {look.waver:.1%} along the heights; that "
+        "is taken for the error of every amplitude, and widens the bands."
+        for branch, look in looks.items()
+        if look.waver is not None
+    ]
 
 
 def _scale_notes(curve: MeasuredCurve) -> list[str]:

@@ -12,6 +12,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import check_mass
 from afm_jax.checks import checked, require_float64
 from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw
+from afm_jax.solve.lanes import filled
 from afm_jax.version import version_of
 from fitting.inversion.flight import Inverted, MeasuredRow, invert_rows
 from fitting.inversion.regression import Laws, distance_from, regressed_laws
@@ -210,7 +211,7 @@ def _at(table: AmplitudeTable, chosen: np.ndarray, instrument: _Instrument) -> I
     """Return some rows inverted with an instrument."""
     value, error = _numbers(table)
     per_nm = np.array([instrument.tip_calibration, instrument.tip_calibration, 1.0])
-    fill = np.resize(chosen, -(-chosen.size // _BLOCK) * _BLOCK)
+    fill = filled(chosen, -(-chosen.size // _BLOCK) * _BLOCK)
     # every field an array of the rows' shape, for `vmap`
     amplitude, frequency, offset = (
         instrument.drive_calibration * table.excitation_nm,

@@ -28,6 +28,7 @@ from afm_jax.motion.record import MotionOutcome, Simulation, State
 from afm_jax.motion.settle import settled
 from afm_jax.motion.simulate import DEFAULT_ACCURACY, simulate
 from afm_jax.results import Result, ResultTuple, public_result
+from afm_jax.solve.lanes import in_blocks
 from fitting.tables.table import DRIVES, AmplitudeTable
 
 US_PER_MS = 1e3
@@ -185,14 +186,11 @@ def _starts(law: ImpactLaw, cantilever: Cantilever, drives: Drives) -> tuple[Flo
         place = cantilever.propagator(half)(platform.position(time), orbits.velocity_after_nm_per_us[slot])
         return jnp.stack([time + half, *place]), steady[slot]
 
-    # one size for all tables, so that one program serves them
-    size = -(-len(drives.order) // BATCH) * BATCH
-    filled = np.minimum(np.arange(size), len(drives.order) - 1).reshape(-1, BATCH)
     program = jax.jit(jax.vmap(one))
-    parts = [program(_platform(drives, rows), jnp.asarray(drives.order[rows], float)) for rows in filled]
-    starts = np.concatenate([np.asarray(part[0]) for part in parts])[: len(drives.order)].T
-    found = np.concatenate([np.asarray(part[1]) for part in parts])[: len(drives.order)]
-    return np.array(starts), found
+    rows = np.arange(len(drives.order))
+    lanes = (_platform(drives, rows), drives.order.astype(float))
+    starts, found = in_blocks(lambda some: program(*some), lanes, block=BATCH, widths=())
+    return np.array(starts.T), found
 
 
 def _starts_on_resonance(drives: Drives) -> tuple[Float[np.ndarray, "3 rows"], np.ndarray]:
@@ -215,17 +213,9 @@ def _follower(interaction: Contact | ImpactLaw, cantilever: Cantilever, drives: 
 
         return jax.vmap(one)(platforms, starts, durations)
 
-    def block(starts: np.ndarray, rows: np.ndarray, durations: np.ndarray) -> Simulation:
-        lanes = np.resize(np.arange(len(rows)), BATCH)
-        chosen = rows[lanes]
-        begin = State(*(jnp.asarray(part) for part in starts[:, lanes]))
-        found = program(interaction, cantilever, _platform(drives, chosen), begin, jnp.asarray(durations[lanes]))
-        return jax.tree.map(lambda part: np.asarray(part)[: len(rows)], found)
-
     def follow(starts: np.ndarray, rows: np.ndarray, durations: np.ndarray) -> Simulation:
-        cuts = range(0, len(rows), BATCH)
-        parts = [block(starts[:, i : i + BATCH], rows[i : i + BATCH], durations[i : i + BATCH]) for i in cuts]
-        return jax.tree.map(lambda *pieces: np.concatenate(pieces), *parts)
+        lanes = (_platform(drives, rows), State(*starts), durations)
+        return in_blocks(lambda some: program(interaction, cantilever, *some), lanes, block=BATCH, widths=())
 
     return follow
 

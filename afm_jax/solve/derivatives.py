@@ -1,0 +1,286 @@
+"""Derivatives that need a rule of their own: of a root, of a number that is absent, and of a batch of tips.
+
+A root x(p) of f(x, p) = 0 that some search has found obeys dx/dp = -(df/dp)/(df/dx). The rule calls itself for the
+root it differentiates at, so that second derivatives (forward over reverse, Hessians) are right as well; a Newton step
+behind `stop_gradient` would give wrong Hessians. So would `jax.custom_jvp` as soon as the root is found inside
+`lax.scan`: reverse mode evaluates a loop's body partially to move what does not change out of the loop, and drops
+custom rules on the way (jax 0.10.1). A primitive keeps its rule.
+
+What becomes of a tip of a batch depends on its own numbers only, and there are few of them: the derivatives of all
+results by all numbers that move are one forward pass along each (`by_tangents`). Reverse mode then has nothing of the
+way itself to turn round, which is what takes long to compile and leaves much behind in memory: a product of these
+derivatives is transposed. Second derivatives are found in the same way. Inside `lax.scan` JAX may drop the rule; the
+function itself is differentiated. Under `vmap` the tips of all examples are side by side: a question about all tips
+("do all get along with few steps?") stays one question, where a batch of questions would do both answers' work for
+every tip.
+"""
+
+from collections.abc import Callable, Hashable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_batching import custom_vmap
+from jax.custom_derivatives import SymbolicZero
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array, Float
+
+from afm_jax.checks import is_traced
+
+_implicit_root = Primitive("implicit_root")
+_PAIR = 2
+
+
+def implicit_root(
+    residual: Callable[[Float[Array, "..."], Any], Float[Array, "..."]], root: Float[Array, "..."], parameters: Any
+) -> Float[Array, "..."]:
+    """Attach the implicit derivative to a root that a search has found, or to several, each of its own equation.
+
+    Args:
+        residual: f(x, parameters), smooth near the root; a plain function, the same object at every call.
+        root: the value of x that the search found; its own derivative is ignored.
+        parameters: pytree of arrays, of what the root depends on.
+
+    Returns:
+        `root`, differentiable with respect to `parameters`. Where df/dx is 0 (grazing, fold) the derivative is 0: such
+        points have none, and the caller flags them.
+    """
+    leaves, structure = jax.tree.flatten(parameters)
+    return _implicit_root.bind(root, *leaves, residual=residual, structure=structure, pair=False)
+
+
+def implicit_pair(
+    residual: Callable[[Float[Array, " 2"], Any], Float[Array, " 2"]], root: Float[Array, " 2"], parameters: Any
+) -> Float[Array, " 2"]:
+    """Attach the implicit derivative to a root of two equations in two unknowns; as `implicit_root` otherwise."""
+    leaves, structure = jax.tree.flatten(parameters)
+    return _implicit_root.bind(root, *leaves, residual=residual, structure=structure, pair=True)
+
+
+class _Mapped(NamedTuple):
+    """A residual for a batch: row by row the same function; ``axes``: 0 or None for each leaf of the parameters."""
+
+    residual: Callable[[Any, Any], Any]
+    structure: Any
+    axes: tuple[int | None, ...]
+
+    def __call__(self, x: Array, parameters: Any) -> Array:
+        def one(value, *leaves):
+            return self.residual(value, jax.tree.unflatten(self.structure, leaves))
+
+        return jax.vmap(one, in_axes=(0, *self.axes))(x, *jax.tree.leaves(parameters))
+
+
+@_implicit_root.def_impl
+def _evaluate(root, *leaves, residual, structure, pair):
+    del leaves, residual, structure, pair
+    return root
+
+
+@_implicit_root.def_abstract_eval
+def _shape(root, *leaves, residual, structure, pair):
+    del leaves, residual, structure, pair
+    return root
+
+
+def _lower(context, root, *leaves, residual, structure, pair):
+    del context, leaves, residual, structure, pair
+    return [root]
+
+
+def _differentiate(primals, tangents, *, residual, structure, pair):
+    """Differentiate: dx = -(df/dp dp) / (df/dx) at the root, summed over the parameters that move."""
+    root, *leaves = primals
+    x = _implicit_root.bind(root, *leaves, residual=residual, structure=structure, pair=pair)
+    rates = {place: rate for place, rate in enumerate(tangents[1:]) if not isinstance(rate, ad.Zero)}
+    if not rates:
+        return x, jnp.zeros_like(x)
+
+    def at(value, moved):
+        return residual(value, jax.tree.unflatten(structure, [moved.get(i, leaf) for i, leaf in enumerate(leaves)]))
+
+    moving = {place: leaves[place] for place in rates}
+    _, shift = jax.jvp(lambda moved: at(x, moved), (moving,), (rates,))
+
+    def along(direction):
+        return jax.jvp(lambda value: at(value, moving), (x,), (direction,))[1]
+
+    if pair:
+        axes = [jnp.broadcast_to(row, x.shape) for row in jnp.eye(_PAIR, dtype=x.dtype)]
+        return x, -solved_pair(list(jax.vmap(along)(jnp.stack(axes))), shift)
+    slope = along(jnp.ones_like(x))
+    regular = slope != 0.0
+    return x, jnp.where(regular, -shift / jnp.where(regular, slope, 1.0), 0.0)
+
+
+def solved_pair(columns: list[Float[Array, "... 2"]], right: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
+    """Return the solution of two linear equations, given the matrix's columns; 0 where the matrix is singular."""
+    (a, c), (b, d), (first, second) = (jnp.moveaxis(part, -1, 0) for part in (*columns, right))
+    determinant = a * d - b * c
+    regular = determinant != 0.0
+    solution = jnp.stack([d * first - b * second, a * second - c * first], axis=-1)
+    return jnp.where(regular[..., None], solution / jnp.where(regular, determinant, 1.0)[..., None], 0.0)
+
+
+def _map_over_batch(arguments, axes, *, residual, structure, pair):
+    size = next(argument.shape[axis] for argument, axis in zip(arguments, axes, strict=True) if axis is not None)
+    root, *leaves = (
+        argument if axis is None else jnp.moveaxis(argument, axis, 0)
+        for argument, axis in zip(arguments, axes, strict=True)
+    )
+    if axes[0] is None:
+        root = jnp.broadcast_to(root, (size, *root.shape))
+    mapped = _Mapped(residual, structure, tuple(None if axis is None else 0 for axis in axes[1:]))
+    return _implicit_root.bind(root, *leaves, residual=mapped, structure=structure, pair=pair), 0
+
+
+mlir.register_lowering(_implicit_root, _lower)
+ad.primitive_jvps[_implicit_root] = _differentiate
+batching.primitive_batchers[_implicit_root] = _map_over_batch
+
+
+_absent = Primitive("absent")
+
+
+def absent(number: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return NaN in place of a number that stands for nothing, with NaN for its derivative, too.
+
+    A plain NaN has the derivative 0, which looks like an answer. In reverse mode a number that nobody asks for gets
+    0 (NaN times 0 would be NaN, and spread to what is asked for).
+    """
+    return _absent.bind(number)
+
+
+def _nan_like(number: Array) -> Array:
+    return jnp.full_like(number, jnp.nan)
+
+
+_absent.def_impl(_nan_like)
+_absent.def_abstract_eval(lambda number: number)
+mlir.register_lowering(_absent, mlir.lower_fun(_nan_like, multiple_results=False))
+batching.primitive_batchers[_absent] = lambda numbers, axes: (_absent.bind(*numbers), axes[0])
+ad.deflinear2(_absent, lambda asked, _: [jnp.where(asked == 0.0, 0.0, jnp.nan)])
+
+
+_FORWARD_BY = 4
+"""Numbers of a tip up to which passes forward take less time than one in reverse mode, whatever the batch."""
+
+
+def by_tangents(function: Callable[..., Any], *arguments: Any, small: bool, **settings: Hashable) -> Any:
+    """Return `function(*arguments, **settings)`, with derivatives that are computed forward.
+
+    Args:
+        function: a plain function of module level that returns a pytree of arrays, a value a tip, differentiable as it
+            stands.
+        arguments: pytrees of arrays: numbers for all tips, or one value a tip, of which only this tip's results depend.
+            At least one has an axis of tips.
+        small: whether the batch is so small that forward passes along all numbers are quick; else reverse mode goes
+            back through the function itself where more than a few numbers move.
+        settings: what is no array.
+    """
+    leaves, structure = jax.tree.flatten(arguments)
+    return _differentiable(_Work(function, structure, tuple(settings.items())), leaves, small=small)
+
+
+class _Work(NamedTuple):
+    """A function of flat arguments."""
+
+    function: Callable[..., Any]
+    structure: Any
+    settings: tuple[tuple[str, Hashable], ...]
+
+    def of(self, *leaves: Array) -> Any:
+        return self.function(*jax.tree.unflatten(self.structure, leaves), **dict(self.settings))
+
+
+class _Slopes(NamedTuple):
+    """The results of work, and their derivatives by those leaves that move, along an axis behind the tips'."""
+
+    work: "_Work | _Slopes"
+    moving: tuple[int, ...]
+
+    def of(self, *leaves: Array) -> Any:
+        return _with_slopes(leaves, self)
+
+
+def _differentiable(work: _Work | _Slopes, leaves: Sequence[Array], *, small: bool) -> Any:
+    ruled = jax.custom_jvp(partial(_side_by_side, work))
+
+    def derivative(values, tangents):
+        moving = tuple(i for i, tangent in enumerate(tangents) if not isinstance(tangent, SymbolicZero))
+        if not small and len(moving) > _FORWARD_BY:
+            given = [tangents[i] if i in moving else jnp.zeros_like(value) for i, value in enumerate(values)]
+            return jax.jvp(work.of, values, tuple(given))
+        results, slopes = _differentiable(_Slopes(work, moving), values, small=small)
+        return results, jax.tree.map(partial(_along, tangents=[tangents[i] for i in moving]), results, slopes)
+
+    ruled.defjvp(derivative, symbolic_zeros=True)
+    return ruled(*leaves)
+
+
+def _along(result: Array, slopes: Array, tangents: Sequence[Array]) -> Any:
+    """Return the tangent of a result; numbers for all tips in one product, whose transpose adds up before it parts."""
+    if not _is_real(result):
+        return np.zeros(result.shape, jax.dtypes.float0)
+    shared = [place for place, tangent in enumerate(tangents) if not tangent.ndim]
+    total = jnp.zeros_like(result)
+    for place, tangent in enumerate(tangents):
+        if tangent.ndim:
+            total = total + slopes[:, place] * tangent.reshape(-1, *(1,) * (result.ndim - 1))
+    if shared:
+        along = jnp.stack([tangents[place] for place in shared])
+        total = total + jnp.tensordot(along, slopes[:, np.array(shared)], axes=(0, 1))
+    return total
+
+
+@partial(jax.jit, static_argnames="asked")
+def _with_slopes(leaves: tuple[Array, ...], asked: _Slopes) -> tuple[Any, Any]:
+    def shifted(shifts):
+        moved = list(leaves)
+        for place, i in enumerate(asked.moving):
+            moved[i] = leaves[i] + shifts[place]
+        results = asked.work.of(*moved)
+        return jax.tree.map(lambda part: part if _is_real(part) else jnp.zeros(part.shape), results), results
+
+    at = jnp.zeros(len(asked.moving), jnp.result_type(*leaves))
+    if len(asked.moving) > 1:
+        slopes, results = jax.jacfwd(shifted, has_aux=True)(at)
+    else:
+        # one number needs no axis of directions
+        _, slopes, results = jax.jvp(shifted, (at,), (jnp.ones_like(at),), has_aux=True)
+        slopes = jax.tree.map(lambda part: part[..., None], slopes)
+    return results, jax.tree.map(lambda part: jnp.moveaxis(part, -1, 1), slopes)
+
+
+def _side_by_side(work: _Work | _Slopes, *leaves: Array) -> Any:
+    """Return what work comes to, on all tips of all examples at once under `vmap`."""
+    if not any(is_traced(leaf) for leaf in leaves):
+        return work.of(*leaves)
+
+    def all_examples(size, batched, *leaves):
+        if not any(batched):
+            # asked by derivatives of `custom_vmap` itself: one place, several directions
+            results = work.of(*leaves)
+            return results, jax.tree.map(lambda _: False, results)
+        tips = max(leaf.shape[-1] for leaf, has in zip(leaves, batched, strict=True) if leaf.ndim > has)
+
+        def merged(leaf, has):
+            if leaf.ndim == has == 0:
+                return leaf
+            rows = leaf if has else leaf[None]
+            return jnp.broadcast_to(rows if rows.ndim > 1 else rows[:, None], (size, tips)).ravel()
+
+        results = _side_by_side(work, *(merged(leaf, has) for leaf, has in zip(leaves, batched, strict=True)))
+        parted = jax.tree.map(lambda part: part.reshape(size, tips, *part.shape[1:]), results)
+        return parted, jax.tree.map(lambda _: True, parted)
+
+    mapped = custom_vmap(work.of)
+    mapped.def_vmap(all_examples)
+    return mapped(*leaves)
+
+
+def _is_real(part: Array) -> bool:
+    return jnp.issubdtype(part.dtype, jnp.floating)
