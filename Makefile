@@ -11,7 +11,8 @@ PYTEST ?= -m pytest
 # itself, `make mutations`, the notebooks and tests/test_as_compiled_for_users.py compile as users do. An XLA that does
 # not know a flag stops, as that of jax 0.12 does at the first one: it is given to those that take it.
 OLD_EMITTER := --xla_cpu_use_fusion_emitters=false
-KNOWN = $(shell XLA_FLAGS=$(OLD_EMITTER) $(BIN)/python -c 'import jax; jax.devices()' 2>/dev/null && echo $(OLD_EMITTER))
+# asked once, when a recipe needs it: the interpreter is there by then
+KNOWN = $(eval KNOWN := $(shell XLA_FLAGS=$(OLD_EMITTER) $(BIN)/python -c 'import jax; jax.devices()' 2>/dev/null && echo $(OLD_EMITTER)))$(KNOWN)
 COMPILED_AT_ONCE = $(KNOWN) --xla_backend_optimization_level=0
 COMPILED_SOON = $(KNOWN) --xla_backend_optimization_level=1
 # Tests of the last digits, which the order of roundings decides.

@@ -86,9 +86,18 @@ linux = pytest.mark.skipif(sys.platform in {"win32", "darwin"}, reason="the cach
 
 @linux
 @pytest.mark.parametrize("mode", [0o777, 0o770, 0o1777])
-def test_a_folder_that_others_may_write_to_is_not_used(tmp_path: Path, mode: int):
+def test_no_folder_that_others_may_write_to_is_private(tmp_path: Path, mode: int):
     (tmp_path / "afm-jax").mkdir()
     (tmp_path / "afm-jax").chmod(mode)
+    with pytest.raises(PermissionError, match="others may write to the folder") as error:
+        make_private(tmp_path / "afm-jax" / "own")
+    assert error.value.filename == str(tmp_path / "afm-jax")
+
+
+@linux
+def test_a_folder_that_others_may_write_to_is_not_used(tmp_path: Path):
+    (tmp_path / "afm-jax").mkdir()
+    (tmp_path / "afm-jax").chmod(0o777)
     *said, where = python(
         f"import os\n{START}", TOLD="1", XDG_CACHE_HOME=str(tmp_path), **dict.fromkeys(WITHOUT)
     ).split("\n")

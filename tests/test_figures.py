@@ -31,7 +31,6 @@ from afm_jax.paper.charts import (
     tongues_at_resonance,
 )
 from afm_jax.scenefile import presets
-from tests.fresh_python import python
 from tests.reference_flight import Parameters
 from tests.reference_orbits import single_impact_orbits
 
@@ -253,8 +252,3 @@ def test_other_figures_are_refused_in_one_line(only: str, says: str, tmp_path: P
     assert says in result.stderr
     assert "choose from 2, 3, 4, 5, 6, 7, 8, 9, 10, 11" in result.stderr
     assert result.stderr.count("\n") == 1
-
-
-def test_pictures_leave_pyplot_alone():
-    code = "import sys, afm_jax.plots.paper; print('matplotlib.pyplot' in sys.modules)"
-    assert python(code) == "False"

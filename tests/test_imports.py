@@ -215,9 +215,13 @@ def test_packages_start_without_jax():
     assert python(code).split() == ["False", "True"]
 
 
-def test_fits_load_no_scipy():
+def test_fits_load_no_scipy_and_pictures_no_pyplot():
     # its statistics alone take as long as JAX: they are for posteriors, which import them when they need them
-    assert python("import sys, fitting.fits.fit, fitting.report.report; print('scipy' in sys.modules)") == "False"
+    code = (
+        "import sys, fitting.fits.fit, fitting.report.report\nprint('scipy' in sys.modules)\n"
+        "import afm_jax.plots.paper\nprint('matplotlib.pyplot' in sys.modules)"
+    )
+    assert python(code).split() == ["False", "False"]
 
 
 def test_importing_everything_changes_no_setting_and_takes_no_functions_place():

@@ -10,7 +10,9 @@ import pytest
 
 import afm_jax as afm
 from afm_jax import CollisionDelay, ImpactLaw, TabulatedLaw
+from afm_jax.cli.fitted_law import as_drawn, with_fitted_law
 from afm_jax.scenefile.law_files import save_law_csv
+from afm_jax.scenefile.parameter_paths import scene_family
 
 WET = ImpactLaw(0.9999, 114.0, 0.48, CollisionDelay(0.206, 5.64, 0.726))
 SPEEDS = np.geomspace(13.0, 300.0, 12)
@@ -219,3 +221,16 @@ def test_the_table_of_collisions_is_a_law(tmp_path):
     (tmp_path / "collide.csv").write_text("\n".join([head, *rows]).replace("28.0", "") + "\n")
     with pytest.raises(ValueError, match="line 4: `rebound_speed_nm_per_us` must be a number, but is ''"):
         afm.load_law(tmp_path / "collide.csv")
+
+
+def test_a_scene_and_one_with_a_drawn_law_run_in_the_same_programs(tmp_path):
+    """Their numbers have the same shapes: a law's errors would compile every program of a diagram a second time."""
+    head = "approach_speed_nm_per_us,rebound_speed_nm_per_us,rebound_speed_error_nm_per_us\n"
+    (tmp_path / "law.csv").write_text(head + "12,4.7,0.1\n20,16.7,0.1\n50,48.7,0.1\n200,199.6,0.1\n")
+    scene = afm.Scene(afm.Cantilever(90.0, 40.0), afm.Platform(5.0, 190.0), afm.ImpactLaw(0.9))
+    made, known = with_fitted_law(scene, tmp_path / "law.csv")
+    assert known is not None
+    one = scene_family(made, *known.paths)(*np.zeros(len(known.paths)))
+    assert jax.tree.structure(as_drawn(made)) == jax.tree.structure(one)
+    assert jax.tree.map(jax.numpy.shape, as_drawn(made)) == jax.tree.map(jax.numpy.shape, one)
+    assert as_drawn(scene) is scene

@@ -4,7 +4,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.cli.fitted_law import with_fitted_law, with_law_options
+from afm_jax.cli.fitted_law import as_drawn, with_fitted_law, with_law_options
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import Ends, SceneName, scene_and_start, with_picture
@@ -75,7 +75,9 @@ def command(
     columns, rows = grid
     try:
         with session.working("following starts (the first run compiles for some seconds)", "starts") as report:
-            found = basins_of_attraction(loaded, columns=columns, rows=rows, speeds_nm_per_us=speeds, report=report)
+            found = basins_of_attraction(
+                as_drawn(loaded), columns=columns, rows=rows, speeds_nm_per_us=speeds, report=report
+            )
             band = None if known is None else drawn_shares(loaded, found, known, draws=draws)
     except ValueError as error:
         raise ValueError(f"{scene}: {error}") from error

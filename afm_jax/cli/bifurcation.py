@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.cli.fitted_law import with_fitted_law, with_law_options
+from afm_jax.cli.fitted_law import as_drawn, with_fitted_law, with_law_options
 from afm_jax.cli.main import NotValid
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import SceneName, ranges_of, scene_and_start, with_picture
@@ -75,7 +75,13 @@ def command(  # noqa: PLR0913
             with session.working(f"sweeping {way}", f"values {way}") as report:
                 sweeps.append(
                     bifurcation_diagram(
-                        loaded, swept.path, swept.values, start=start, upward=upward, impacts=impacts, report=report
+                        as_drawn(loaded),
+                        swept.path,
+                        swept.values,
+                        start=start,
+                        upward=upward,
+                        impacts=impacts,
+                        report=report,
                     )
                 )
         probabilities = None

@@ -76,3 +76,15 @@ def with_fitted_law(scene: "Scene", path: Path | None) -> "tuple[Scene, Uncertai
     if not law.unknowns:
         return made, None
     return made, UncertainParameters(tuple(paths), np.array(values), np.diag(np.array(errors) ** 2))
+
+
+def as_drawn(scene: "Scene") -> "Scene":
+    """Return a scene whose law has lost its errors, as that of a drawn scene has: both run in the same programs."""
+    import equinox as eqx  # noqa: PLC0415
+
+    from afm_jax.impact.law import TabulatedLaw  # noqa: PLC0415
+
+    law = scene.interaction
+    if not isinstance(law, TabulatedLaw) or law.deviations is None:
+        return scene
+    return eqx.tree_at(lambda scene: scene.interaction.deviations, scene, None)

@@ -12,7 +12,6 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import nnls
 
 from afm_jax.apparatus.cantilever import Cantilever, mass_of
 from afm_jax.apparatus.scene import check_mass
@@ -21,6 +20,7 @@ from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw, closest_delay, law_of_dict
 from afm_jax.results import Result, public_result
 from afm_jax.scenefile.tables import printable
+from fitting.fits.loss import closest_loss, nearness, rebound_by_formula
 from fitting.fits.result import FitResult
 from fitting.models import Problem
 from fitting.parameters import (
@@ -244,33 +244,21 @@ def _closest_to(law: Law, model: str, fixed: Mapping[str, float]) -> _Closest:
     if not late:
         own = [name for name in own if name not in DELAY_NAMES]
 
-    def losses(w: Float[np.ndarray, " n"]) -> dict[str, float]:
-        # u_in^2 - u_out^2 = (1 - r^2) u^2 + c u + epsilon, each term a loss
-        columns = {"r": u * u, "viscous_loss": u, "epsilon": np.ones_like(u)}
-        held = {name: 1.0 - value**2 if name == "r" else value for name, value in fixed.items() if name in columns}
-        lost = u * u - w * w - sum(value * columns[name] for name, value in held.items())
-        moving = [name for name in own if name in columns]
-        if not moving:
-            return {}
-        found, _ = nnls(np.stack([columns[name] / w for name in moving], axis=1), lost / w)
-        terms = dict(zip(moving, found.tolist(), strict=True))
-        return terms | ({"r": math.sqrt(max(1.0 - terms["r"], 0.0))} if "r" in terms else {})
+    losses = [name for name in own if name not in DELAY_NAMES]
 
     def values(one: Law) -> dict[str, float]:
         there = one.at_approach(jnp.asarray(u))
-        found = losses(np.asarray(there.rebound))
+        found = closest_loss(losses, u, np.asarray(there.rebound), np.ones_like(u), fixed)
         if late:
             delay = closest_delay(there.approach, there.rebound, there.delay)
             found |= {name: float(getattr(delay, name.removeprefix("delay_"))) for name in own if name in DELAY_NAMES}
         return found
 
     found = values(law)
-    r, c, epsilon = ({**found, **fixed}.get(*pair) for pair in (("r", 1.0), ("viscous_loss", 0.0), ("epsilon", 0.0)))
-    formula, rebound = np.sqrt(np.maximum((r * u) ** 2 - c * u - epsilon, 0.0)), np.asarray(law.rebound_speed(u))
-    off = np.abs(formula / rebound - 1.0)
+    off = nearness(u, np.asarray(law.rebound_speed(u)), rebound_by_formula({**found, **fixed}, u))
     note = (
-        f"The law is planned with as the closest formula of {model}: off by at most {100.0 * off.max():.2g} % of u_out,"
-        f" at {u[off.argmax()]:.3g} nm/us, over {low:.4g} to {high:.4g} nm/us."
+        f"The law is planned with as the closest formula of {model}: off by at most {100.0 * off.off:.2g} % of u_out,"
+        f" at {off.at_nm_per_us:.3g} nm/us, over {low:.4g} to {high:.4g} nm/us."
     )
     information = np.zeros((len(found), len(found)))
     if isinstance(law, TabulatedLaw) and law.unknowns:

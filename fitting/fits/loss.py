@@ -112,15 +112,51 @@ def nearness(
     return Nearness(float(off[worst]), float(speeds[worst]))
 
 
+_COLUMNS = {"r": 2, "viscous_loss": 1, "epsilon": 0}
+"""Powers of the speed: u_in^2 - u_out^2 = (1 - r^2) u^2 + c u + epsilon, each term a loss."""
+
+
+def closest_loss(
+    family: Sequence[str],
+    speeds: Float[np.ndarray, " n"],
+    rebound: Float[np.ndarray, " n"],
+    weight: Float[np.ndarray, " n"],
+    fixed: Mapping[str, float],
+) -> dict[str, float]:
+    """Return the parameters of the formula closest to a law from anywhere, to first order; no loss is negative.
+
+    Least squares in u_out^2 over 2 u_out of the law, a problem without other minima. `closest_member` polishes from
+    parameters close by, with errors.
+
+    Args:
+        family: of r, viscous_loss and epsilon those that are looked for.
+        speeds: approach speeds in nm/us.
+        rebound: of the law, all positive.
+        weight: of each.
+        fixed: values of others of them.
+    """
+    from scipy.optimize import nnls  # noqa: PLC0415 (half a second that most fits do not need)
+
+    lost = speeds**2 - rebound**2
+    for name in [name for name in _COLUMNS if name in fixed]:
+        lost = lost - (1.0 - fixed[name] ** 2 if name == "r" else fixed[name]) * speeds ** _COLUMNS[name]
+    if not family:
+        return {}
+    steep = 0.5 * weight / rebound
+    matrix = steep[:, None] * np.stack([speeds ** _COLUMNS[name] for name in family], axis=1)
+    scale = np.linalg.norm(matrix, axis=0)
+    size, _ = nnls(matrix / scale, steep * lost)
+    terms = zip(family, (size / scale).tolist(), strict=True)
+    return {name: max(1.0 - term, 0.0) ** 0.5 if name == "r" else term for name, term in terms}
+
+
 def nearest_of(
     family: Sequence[str],
     speeds: Float[np.ndarray, " n"],
     rebound: Float[np.ndarray, " n"],
     half_width: Float[np.ndarray, " n"],
 ) -> Nearness:
-    """Return how near the laws of a family of losses come to a law.
-
-    Least squares in the rebound speed over the half-width of its band, the losses not negative.
+    """Return how near the laws of a family of losses come to a law, in rebound speeds over the half-width of its band.
 
     Args:
         family: of r, viscous_loss and epsilon those that the family has.
@@ -128,12 +164,6 @@ def nearest_of(
         rebound: of the law.
         half_width: of its band.
     """
-    from scipy.optimize import nnls  # noqa: PLC0415 (half a second that most fits do not need)
-
     free = (rebound > 0.0) & (half_width > 0.0)
-    u, w, weight = speeds[free], rebound[free], 0.5 / (rebound[free] * half_width[free])
-    columns = {"r": u**2, "viscous_loss": u, "epsilon": np.ones_like(u)}
-    matrix = np.stack([columns[name] for name in family], axis=1)
-    scale = np.linalg.norm(weight[:, None] * matrix, axis=0)
-    size, _ = nnls(weight[:, None] * matrix / scale, weight * (u**2 - w**2))
-    return nearness(u, w, np.sqrt(np.maximum(u**2 - matrix @ (size / scale), 0.0)))
+    u, w = speeds[free], rebound[free]
+    return nearness(u, w, rebound_by_formula(closest_loss(family, u, w, 1.0 / half_width[free], {}), u))
