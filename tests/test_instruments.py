@@ -384,6 +384,18 @@ EIGHT = "offset_nm=1/2:nm,deflection_nm=3/4:V,lockin_amplitude_nm=5/6:V,phase_la
 LEVER: dict[str, Any] = {"quality_factor": (230.0, 5.0), "free_frequency_khz": (344.6, 0.01), "drive": "force"}
 
 
+@pytest.mark.parametrize("separator", ["\t", ";", " ", ", "])
+def test_decimal_commas_are_told_from_commas_that_separate(tmp_path: Path, separator: str):
+    offset, amplitude, lag = tapping_rows()
+    comma = separator.strip() != ","
+    lines = [separator.join(f"{value:.4f}" for value in row) for row in zip(offset, amplitude, lag, strict=True)]
+    text = "\n".join(line.replace(".", ",") if comma else line for line in lines)
+    columns = "offset_nm=1:nm,lockin_amplitude_nm=2:nm,phase_lag_deg=3:deg"
+    curve = read_curve(saved(tmp_path, text + "\n"), columns=columns)
+    np.testing.assert_allclose(given(curve.amplitude), amplitude, atol=1e-4)
+    np.testing.assert_allclose(given(curve.phase_lag_deg), lag, atol=1e-4)
+
+
 def test_eight_columns_without_a_head_become_bins_with_the_scatter_in_them(tmp_path: Path):
     made = raw_curve(1200, drift=0.0)
     path = saved(tmp_path, made.text)

@@ -380,14 +380,16 @@ def parse_separated(data: bytes, name: str) -> Recording:
     if not rows:
         raise TableError(f"{name}: the file holds only comments; add rows of numbers")
     separator = max("\t;,", key=lambda sign: (rows[0][1].count(sign), rows[-1][1].count(sign)))
-    if separator in rows[0][1]:
+    if separator == "," and (other := _beside_decimal_commas(rows[-1][1])) is not None:
+        separator = other
+    if separator and separator in rows[0][1]:
         cells = [
             (number, [cell.strip() for cell in next(csv.reader(io.StringIO(line), delimiter=separator))])
             for number, line in rows
         ]
     else:
         cells = [(number, line.split()) for number, line in rows]
-        if len(cells[0][1]) < 2 or not all(NUMBER.fullmatch(cell) for cell in cells[0][1]):
+        if len(cells[0][1]) < 2 or not all(NUMBER.fullmatch(cell.replace(",", ".")) for cell in cells[0][1]):
             raise TableError(
                 f"{name}, line {rows[0][0]}: columns separated by tabs, semicolons or commas are expected here"
             )
@@ -405,6 +407,16 @@ def parse_separated(data: bytes, name: str) -> Recording:
     keys = {key: (key, native.get(quantity, "")) for key, quantity in HEADER_KEYS.items() if key != "temperature_k"}
     segments = _by_branch(body, titles, {plain: columns[title] for title, plain, _ in named})
     return Recording("separated text", name, segments, units, known_from(settings, keys))
+
+
+def _beside_decimal_commas(line: str) -> str | None:
+    """Return what separates numbers with decimal commas (tab, semicolon, "" for blanks); None where commas separate."""
+    for sign in ("\t", ";", ""):
+        cells = [cell.strip() for cell in (line.split(sign) if sign else line.split())]
+        numbers = all(NUMBER.fullmatch(cell.replace(",", ".", 1)) for cell in cells if cell)
+        if len(cells) > 1 and numbers and not any("," in (cell[:1], cell[-1:]) for cell in cells):
+            return sign
+    return None
 
 
 def _heads(
