@@ -90,7 +90,8 @@ def every_other_period():
 
 
 def test_a_law_has_no_force_to_draw(every_other_period, tmp_path: Path):
-    files = draw_motion(*every_other_period, tmp_path)
+    scene, found = every_other_period
+    files = draw_motion(scene, found, tmp_path)
     assert [path.name for path in files] == ALL[:-1]
     check_pictures(files)
 

@@ -5,7 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.solve.arclength import EquationsAt, point_in_plane
+from afm_jax.solve.derivatives import largest
 from afm_jax.solve.lanes import again_for, again_for_the_open, filled, in_blocks, map_in_blocks, power_of_two
 
 VALUES = np.arange(1.0, 24.0)
@@ -125,3 +128,28 @@ def test_a_plane_without_a_point_of_the_curve_is_no_answer():
     # a normal along the equations' own gradient leaves the system singular
     flat = np.array([0.0, 1.0])
     assert point_in_plane(circle, np.array([0.0, 2.1]), flat, arrived=1e-13, steps=12) is None
+
+
+def test_the_largest_value_has_the_slope_of_one_of_them():
+    values = jnp.asarray([1.0, 4.0, 2.0, 4.0])
+    assert largest(values) == 4.0
+    np.testing.assert_array_equal(jax.grad(largest)(values), [0.0, 1.0, 0.0, 0.0])
+
+
+@pytest.mark.slow
+def test_slopes_of_a_contacts_table_do_not_hang_on_how_its_barrier_is_rounded():
+    # the barrier is the largest of many energies: computed twice by an XLA told to hurry, none was the largest
+    def table(humidity):
+        return tabulated(Contact.paper(relative_humidity=humidity), jnp.asarray(1.0)).lowest
+
+    def both(humidity):
+        return jax.jvp(table, (humidity,), (jnp.asarray(1.0),))
+
+    hurried = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
+    try:
+        quick = jax.jit(both, compiler_options=hurried).lower(0.5).compile()
+    except jax.errors.JaxRuntimeError:
+        pytest.skip("this XLA does not know the options")
+    for humidity in (0.499, 0.49975, 0.501):
+        near = [float(quick(jnp.asarray(humidity + shift))[0]) for shift in (-1e-4, 1e-4)]
+        assert float(quick(jnp.asarray(humidity))[1]) == pytest.approx((near[1] - near[0]) / 2e-4, rel=1e-5)

@@ -30,6 +30,7 @@ from afm_jax.contact.junction_leg import pass_through_junction
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.contact.leg import gauss_nodes
 from afm_jax.impact.lasting_impact import PulledImpact, Taps, polynomials, stretched
+from afm_jax.solve.derivatives import largest
 
 PULLS, SPEEDS = 7, 18
 """Pulls of a table, and speeds of light and of hard taps each."""
@@ -86,7 +87,7 @@ def tapped(contact: Contact, lever: Cantilever, pulls: Float[Array, " 2"]) -> Pu
     near, far, off = junction.forms_gap_nm, contact.bridge_forms_nm, junction.breaks_gap_nm
     between = near * (far / near) ** jnp.linspace(0.0, 1.0, _GAPS)
     # where the bridge draws more than the lever pulls no tip turns round
-    drawn = _DRAWN * jnp.max(-tip.bridge.force(between)) / lever.mass_ng - straight
+    drawn = _DRAWN * largest(-tip.bridge.force(between)) / lever.mass_ng - straight
     least = jnp.maximum(pulls[0], _WIDEST * pulls[1])
     weakest = jnp.stack([jnp.maximum(least, drawn), least])
     ends = jnp.stack([weakest, jnp.maximum(pulls[1], 1.01 * weakest)])
@@ -189,7 +190,7 @@ def _needed(contact: Contact, tip: Driven, plane: Float[Array, ""], taken: Float
     out, back = breaks * (plane / breaks) ** share, on * (contact.bridge_forms_nm / on) ** share
     leaving = elastic - tip.pulled_aj(on, breaks) + tip.potential(out) - tip.potential(breaks)
     coming = tip.potential(back) - tip.potential(on)
-    most = jnp.maximum(jnp.max(leaving), jnp.max(coming)) + _ABOVE * taken
+    most = jnp.maximum(largest(leaving), largest(coming)) + _ABOVE * taken
     # a rounded maximum with a little energy
     least, width = _ABOVE * taken, _ROUND * taken
     return 0.5 * (most + least + jnp.sqrt((most - least) ** 2 + width**2))

@@ -38,6 +38,7 @@ from afm_jax.impact.lasting_impact import TabulatedImpact, polynomials, stretche
 from afm_jax.impact.law import MOST_KNOTS, CollisionDelay, ImpactLaw, TabulatedLaw
 from afm_jax.least_squares import Box, Searches, descended, distance
 from afm_jax.results import Result, public_result
+from afm_jax.solve.derivatives import largest
 
 FREE = {"law": ("r", "epsilon"), "viscous": ("epsilon", "viscous_loss"), "full": ("r", "epsilon", "viscous_loss")}
 """For every model the parameters that are fitted; the others are r = 1 and no viscous loss."""
@@ -523,8 +524,8 @@ def tabulated(contact: Contact, mass_ng: Float[Array, ""]) -> TabulatedImpact:
         raised_nm=jnp.zeros(()),
         length_nm=contact.bridge_breaks_nm,
         loss_error=_tail(loss),
-        speed_error=jnp.max(jnp.abs(finer.approach_speed / u[_COMPARED] - 1.0)),
-        time_error=_tail(time_terms) + jnp.max(jnp.abs(finer.time - time[_COMPARED])),
+        speed_error=largest(jnp.abs(finer.approach_speed / u[_COMPARED] - 1.0)),
+        time_error=_tail(time_terms) + largest(jnp.abs(finer.time - time[_COMPARED])),
     )
     early, raised = _lead_and_height(table)
     return replace(table, early_nm=early, raised_nm=raised)
@@ -565,7 +566,7 @@ def _barrier(contact: Contact, bridge: Bridge, junction: Junction, outer: Float[
     elastic = contact.junction.energy_scale_aj * (jkr.work(jkr.FOLD) - jkr.work(junction.forms_root))
     inward = bridge.potential(on * (contact.bridge_forms_nm / on) ** share) - bridge.potential(on)
     before = inward - elastic + bridge.potential(breaks) - bridge.potential(outer)
-    return jnp.maximum(jnp.maximum(out.max(), before.max()), 0.0)
+    return jnp.maximum(jnp.maximum(largest(out), largest(before)), 0.0)
 
 
 def _lead_and_height(table: TabulatedImpact) -> tuple[Float[Array, ""], Float[Array, ""]]:

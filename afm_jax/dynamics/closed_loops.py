@@ -33,6 +33,7 @@ from afm_jax.dynamics.impact_loop import (
 )
 from afm_jax.scenefile.parameter_paths import ParameterRange, with_numbers
 from afm_jax.solve.arclength import EquationsAt, point_in_plane
+from afm_jax.solve.derivatives import largest
 from afm_jax.solve.lanes import in_blocks
 
 KINDS = ("fold", "period_doubling", "torus", "grazing", "capture")
@@ -88,7 +89,8 @@ def _tests(unknowns: Array, frame: Frame, loop: ImpactLoop, equations: Equations
     near = nearest_approach(unknowns, frame.scale, loop, equations.samples).gap_nm
     if equations.kind == CAPTURE:
         near = jnp.minimum(near, _rise_when_captured(unknowns, frame, loop))
-    slowest = jnp.min(unknowns[unknowns.shape[0] // 2 :], initial=jnp.inf)
+    speeds = unknowns[unknowns.shape[0] // 2 :]
+    slowest = -largest(-speeds) if speeds.size else jnp.inf
     return [
         1.0 - trace + determinant,
         1.0 + trace + determinant,
@@ -159,7 +161,8 @@ def solved_point(frame: Frame, guess: np.ndarray, row: np.ndarray, equations: Eq
     def linearised(point: np.ndarray) -> EquationsAt | None:
         if flights is not None:
             return flights.linearised(point, units_of(frame), equations.kind)
-        return EquationsAt(*(np.asarray(part) for part in _linearised(frame, jnp.asarray(point), equations)), None)
+        value, slopes = (np.asarray(part) for part in _linearised(frame, jnp.asarray(point), equations))
+        return EquationsAt(value, slopes, None)
 
     found = point_in_plane(linearised, guess, row, arrived=0.1 * _ARRIVED, steps=_NEWTON_STEPS)
     if found is None or not (np.isfinite(found.point).all() and np.isfinite(found.tangent).all()):

@@ -27,6 +27,7 @@ from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
 from afm_jax.impact.lasting_impact import lasting
 from afm_jax.impact.law import Law, Speeds, impact_law_of
 from afm_jax.outcomes import Outcome
+from afm_jax.solve.derivatives import largest
 from afm_jax.units import RAD_PER_US_PER_KHZ, within_turn
 
 SAMPLES_PER_TURN = 32
@@ -271,7 +272,7 @@ def highest_point(unknowns: Float[Array, " n"], scale: Float[Array, ""], loop: I
             return peak_amplitude(loop.cantilever, flight)
         return highest_of_sum(loop.cantilever, flight, response, samples)
 
-    return jnp.max(jax.vmap(highest)(flights))
+    return largest(jax.vmap(highest)(flights))
 
 
 class LoopReading(eqx.Module):

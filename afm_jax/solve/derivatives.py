@@ -1,4 +1,4 @@
-"""Derivatives that need a rule of their own: of a root, of a number that is absent, and of a batch of tips.
+"""Derivatives that need care: of a root, of the largest value, of a number that is absent, and of a batch of tips.
 
 A root x(p) of f(x, p) = 0 that some search has found obeys dx/dp = -(df/dp)/(df/dx). The rule calls itself for the
 root it differentiates at, so that second derivatives (forward over reverse, Hessians) are right as well; a Newton step
@@ -140,6 +140,15 @@ def _map_over_batch(arguments, axes, *, residual, structure, pair):
 mlir.register_lowering(_implicit_root, _lower)
 ad.primitive_jvps[_implicit_root] = _differentiate
 batching.primitive_batchers[_implicit_root] = _map_over_batch
+
+
+def largest(values: Float[Array, " n"]) -> Float[Array, ""]:
+    """Return the largest of some values, with the derivative of that one.
+
+    `jnp.max` compares the values with their maximum in its derivative, and is NaN (0/0) where a compiler has computed
+    the values twice, rounded differently, so that none of them is the maximum.
+    """
+    return values[jnp.argmax(values)]
 
 
 _absent = Primitive("absent")
