@@ -124,10 +124,9 @@ def equations_at(point: Float[Array, " n"], frame: Frame, equations: Equations) 
 
 
 class CurvePoint(NamedTuple):
-    """A point of a curve, the move that Newton's method would still make, the tangent, tests and the longest delay."""
+    """A point of a curve: its coordinates, the curve's tangent, the test functions, and the longest delay."""
 
     point: Any
-    moved: Any
     tangent: Any
     tests: Any
     delay: Any
@@ -165,15 +164,13 @@ def solved_point(frame: Frame, guess: np.ndarray, row: np.ndarray, equations: Eq
         return EquationsAt(value, slopes, None)
 
     found = point_in_plane(linearised, guess, row, arrived=0.1 * _ARRIVED, steps=_NEWTON_STEPS)
-    if found is None or not (np.isfinite(found.point).all() and np.isfinite(found.tangent).all()):
-        return None
-    if not found.moved < _ARRIVED:
+    if found is None or not (found.moved < _ARRIVED and np.isfinite((found.point, found.tangent)).all()):
         return None
     if flights is None:
         tests, delay = (np.asarray(part) for part in _tests_and_delay(frame, jnp.asarray(found.point), equations))
     else:
         tests, delay = flights.tests(found.facts, units_of(frame)), 0.0
-    return CurvePoint(found.point, found.moved, found.tangent, tests, delay)
+    return CurvePoint(found.point, found.tangent, tests, delay)
 
 
 def units_of(frame: Frame) -> CurveUnits:

@@ -26,7 +26,7 @@ from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import ContactKind, to_lab
 from afm_jax.motion.simulate import simulate
 from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, scene_family
-from afm_jax.solve.lanes import Report
+from afm_jax.solve.lanes import Report, filled
 from afm_jax.units import within_turn
 
 _MOST_RESTS = 32
@@ -107,7 +107,7 @@ def sticking_orbit(scene: Scene) -> StickingOrbit | str:
             np.append(np.asarray(part), np.asarray(column)[:row]) for part, column in zip(start, departed, strict=True)
         ]
         # filled up, so that few programs are compiled
-        flights = [np.pad(part, (0, -len(part) % _FLIGHTS), mode="edge") for part in (*begins, arrival[lands])]
+        flights = [filled(part, len(part) + -len(part) % _FLIGHTS) for part in (*begins, arrival[lands])]
         peak = max(peak, float(peaks_of_flights(scene, *flights).max()))
         apart = (again - first) / period
         if abs(apart - round(apart)) < 1e-6:

@@ -48,7 +48,6 @@ def in_blocks(
     block: int = LANES,
     widths: Sequence[int] = WIDTHS,
     report: Report | None = None,
-    cores: int | None = None,
 ) -> Any:
     """Return the results of work on lanes as NumPy arrays, done block by block on all cores.
 
@@ -58,7 +57,6 @@ def in_blocks(
         block: lanes of a block; of fewer lanes there is one smaller block.
         widths: sizes that a smaller block may have, in ascending order.
         report: told how far it is, from the second block on.
-        cores: blocks worked on side by side; None: as many as there are cores.
     """
     count = len(jax.tree.leaves(lanes)[0])
     width = next((width for width in widths if width >= min(count, block)), block)
@@ -75,7 +73,7 @@ def in_blocks(
     firsts = range(0, count, width)
     done = [part(0)]  # alone, so that programs are compiled once
     if len(firsts) > 1:
-        with ThreadPoolExecutor(cores or available_cores()) as pool:
+        with ThreadPoolExecutor(available_cores()) as pool:
             for result in pool.map(part, firsts[1:]):
                 done.append(result)
                 if report is not None:

@@ -34,7 +34,7 @@ from afm_jax.motion.start import start_of
 from afm_jax.outcomes import CollisionOutcome
 from afm_jax.scenefile.parameter_paths import ParameterRange, check_ranges, scene_batch, scene_family
 from afm_jax.scenefile.scenefile import Start, scene_of_tables
-from afm_jax.solve.lanes import LANES
+from afm_jax.solve.lanes import LANES, filled
 from afm_jax.sweeps.axes import Axis
 from afm_jax.sweeps.plan import MESSAGE, Columns, Recorder, Variable
 
@@ -123,9 +123,9 @@ def over_devices(record: Callable[[Columns], Columns]) -> Callable[[Columns], Co
     number = len(devices)
 
     def spread_out(column: np.ndarray, count: int) -> np.ndarray:
-        filled = np.empty((number, blocks, lanes))
-        filled[:, :count] = _filled(column, number * count * lanes).reshape(number, count, lanes)
-        return filled.reshape(-1, lanes)
+        rows = np.empty((number, blocks, lanes))
+        rows[:, :count] = filled(column, number * count * lanes).reshape(number, count, lanes)
+        return rows.reshape(-1, lanes)
 
     def gathered(found: Array, count: int, rows: int) -> np.ndarray:
         values = np.asarray(found)
@@ -173,10 +173,6 @@ def _first_blocks(record: Callable[[Columns], Columns], blocks: int) -> Callable
         return lax.fori_loop(0, count, block, empty)
 
     return each
-
-
-def _filled(column: np.ndarray, width: int) -> np.ndarray:
-    return np.pad(column, (0, width - len(column)), mode="edge")
 
 
 def _scenes(scene: Scene, paths: Sequence[str]) -> Callable[[Columns], Scene]:
@@ -374,8 +370,8 @@ def _lyapunov(
         count = len(next(iter(columns.values())))
         # always as many lanes, so that there is one shape of every program
         width = lanes * -(-count // lanes)
-        filled = {name: jnp.asarray(_filled(column, width)) for name, column in columns.items()}
-        found = lyapunov_spectrum(made(filled), impacts=impacts, transient=transient, accuracy=accuracy)
+        whole = {name: jnp.asarray(filled(column, width)) for name, column in columns.items()}
+        found = lyapunov_spectrum(made(whole), impacts=impacts, transient=transient, accuracy=accuracy)
         verdicts = found.verdicts
         known = {name: getattr(found, name) for name in (*_EXPONENTS, "impacts")}
         known |= {"kind": verdicts.kind, "orbit_impacts": verdicts.impacts, "orbit_periods": verdicts.periods}

@@ -137,11 +137,11 @@ def closest_loss(
     """
     from scipy.optimize import nnls  # noqa: PLC0415 (half a second that most fits do not need)
 
+    if not family:
+        return {}
     lost = speeds**2 - rebound**2
     for name in [name for name in _COLUMNS if name in fixed]:
         lost = lost - (1.0 - fixed[name] ** 2 if name == "r" else fixed[name]) * speeds ** _COLUMNS[name]
-    if not family:
-        return {}
     steep = 0.5 * weight / rebound
     matrix = steep[:, None] * np.stack([speeds ** _COLUMNS[name] for name in family], axis=1)
     scale = np.linalg.norm(matrix, axis=0)

@@ -17,6 +17,7 @@ from jaxtyping import Float
 
 from afm_jax.impact.law import Law, errors_of, extrapolation_of
 from afm_jax.least_squares import chi2_tail
+from fitting.fits.unmodelled import root_of
 from fitting.inversion.result import (
     Coefficient,
     InvertedRows,
@@ -258,7 +259,7 @@ def _loss_law(
     square = speeds**2 - basis @ found.value
     free = square > 0.0
     curve = np.sqrt(np.where(free, square, np.nan))
-    changes = basis @ _factor(found.covariance) / (2.0 * curve[:, None])
+    changes = basis @ root_of(found.covariance) / (2.0 * curve[:, None])
     value, total, random = found.value.copy(), np.diag(found.covariance).copy(), np.diag(found.random_covariance).copy()
     if model == "restitution":
         # the coefficient is 1 - r^2
@@ -275,15 +276,9 @@ def _delay_law(
     rebound: Float[np.ndarray, " points"],
 ) -> RegressedLaw:
     basis = np.stack([term(speeds, rebound, speeds) for term in DELAY_TERMS.values()], axis=1)
-    changes = basis @ _factor(found.covariance)
+    changes = basis @ root_of(found.covariance)
     values = (found.value, np.diag(found.covariance), np.diag(found.random_covariance))
     return _law("delay", found, values, shared, (basis @ found.value, changes))
-
-
-def _factor(covariance: Float[np.ndarray, "p p"]) -> Float[np.ndarray, "p p"]:
-    """Return a matrix whose product with its transpose is a covariance."""
-    size = np.sqrt(np.diag(covariance))
-    return size[:, None] * np.linalg.cholesky(covariance / np.outer(size, size))
 
 
 def _law(
