@@ -202,6 +202,10 @@ def test_rows_are_solved_each_on_its_own():
     # 60 has no value, 0 is a root, 3 flies away (3 -> -9.5 -> 124), 1 goes on alone
     assert seen[:3] == [[0, 1, 2, 3], [1, 2], [1, 2]]
     assert seen[3:] == [[1]] * (len(seen) - 3)
+    # x^2 is small long before its root is near: each step halves the distance
+    double = newton_rows(lambda x, _: Linearised(x**2, (2.0 * x)[:, :, None]), np.ones((1, 1)), EXACT)
+    assert double.outcome.tolist() == [NewtonOutcome.NOT_CONVERGED]
+    assert double.x[0, 0] == pytest.approx(0.5**30, rel=1e-12)
 
 
 def test_halved_and_shortened_steps_come_back():
