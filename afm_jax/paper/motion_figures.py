@@ -21,8 +21,8 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.follow import follow_long
-from afm_jax.motion.observe import Departures, departures
 from afm_jax.motion.record import ContactKind, Simulation, State
+from afm_jax.motion.section import Departures, departures
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start, start_of
 from afm_jax.paper.charts import PaperFigure, Statement
