@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from afm_jax.apparatus.scene import Scene, drive_of
-from afm_jax.motion.peaks import peaks_between_contacts
+from afm_jax.motion.observe import peaks_between_contacts
 from afm_jax.motion.record import MotionOutcome, Simulation, contacts_left
 from afm_jax.motion.settle import held_since, is_stuck
 from afm_jax.units import within_turn
