@@ -1,6 +1,6 @@
 """What an experiment reads of a simulated motion: amplitudes, phases, times, forces, energies.
 
-`OBSERVABLES` is the table of what is read: name with unit, meaning, function of a `Stretch` of the motion, and why it
+`OBSERVABLES` is the table of what is read: name with unit, meaning, function of a `MotionWindow`, and why it
 may be absent. Text, JSON and sweeps take names and meanings from there. Integrals over time are sums over the Gauss
 nodes of a dense path; the stretch is the window of `window_of`: the last response period once a motion has settled,
 else whole ones in the last fifth.
@@ -128,7 +128,7 @@ def observe(
     verdict = settled(scene, simulation) if verdict is None else verdict
     window = window_of(scene, simulation, verdict)
     dense = dense_path(scene, simulation, window.from_us, window.to_us) if dense is None else dense
-    motion = Stretch(dense, window.from_us, window.to_us, window.periods, window.responses)
+    motion = MotionWindow(dense, window.from_us, window.to_us, window.periods, window.responses)
     motion.check_covered()
     frequency = drive_of(scene).angular_frequency / RAD_PER_US_PER_KHZ
     moving_base = scene.base is not None
@@ -170,7 +170,7 @@ def read_window(dense: DensePath, from_us: float, to_us: float, *, angular_frequ
         to_us: its end.
         angular_frequency: of the lock-in, in rad/us.
     """
-    motion = Stretch(dense, from_us, to_us)
+    motion = MotionWindow(dense, from_us, to_us)
     value = motion.lockin(motion.heights("height"), angular_frequency)
     lost = np.asarray(dense.simulation.contacts.energy_lost_aj)[motion.begun]
     return Reading(
@@ -187,7 +187,7 @@ Coordinate = Literal["height", "deflection"]
 
 
 @dataclass(frozen=True)
-class Stretch:
+class MotionWindow:
     """A motion between two times, integrated over the Gauss nodes of its dense path.
 
     Attributes:
@@ -361,19 +361,19 @@ class Observable(NamedTuple):
     name: str
     """With its unit; of the attribute of `Observables`, the JSON key, the variable of a sweep."""
     meaning: str
-    read: Callable[[Stretch], float | None]
+    read: Callable[[MotionWindow], float | None]
     of_a_part: bool = False
     """Whether a part of a response period tells it."""
     absent: str = ""
     """Why it may be None; empty where it never is."""
 
-    def of(self, motion: Stretch) -> float | None:
+    def of(self, motion: MotionWindow) -> float | None:
         """Return the quantity of a stretch; None where the scene has none, NaN where the stretch is too short."""
         value = self.read(motion)
         return value if value is None or self.of_a_part or motion.responses else math.nan
 
 
-def _with_base(read: Callable[[Stretch], float]) -> Callable[[Stretch], float | None]:
+def _with_base(read: Callable[[MotionWindow], float]) -> Callable[[MotionWindow], float | None]:
     """Return a function of stretches that is None without a moving base."""
     return lambda s: None if s.scene.base is None else read(s)
 
@@ -522,7 +522,7 @@ class EnergyBalance(NamedTuple):
     """What is left, of the largest of them; None with a law."""
 
 
-def energy_balance(motion: Stretch) -> EnergyBalance:
+def energy_balance(motion: MotionWindow) -> EnergyBalance:
     """Return the energies of a stretch of time.
 
     m z'' + (m Omega/Q) z' + k z = F + f + k z_b, times z': with F z' = F D' + F z_p', the drives give
@@ -552,7 +552,7 @@ def energy_balance(motion: Stretch) -> EnergyBalance:
     return EnergyBalance(given, air, contact, stored, imbalance)
 
 
-def _ledger(motion: Stretch) -> float | None:
+def _ledger(motion: MotionWindow) -> float | None:
     """Return what the contacts dissipated, in aJ; None where one of a tip held to the end is among them."""
     rows = motion.dense.simulation.contacts
     lost = float(np.sum(np.asarray(rows.energy_lost_aj)[motion.begun]))
