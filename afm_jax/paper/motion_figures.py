@@ -1,10 +1,7 @@
 """The data of the paper's figures 8, 10 and 11, motions of the contact model, with what it says of them checked.
 
-Figures 10 and 11: a settled motion under a slowly rising offset, beside the orbits of the impact law.
-
-Figure 8: the Poincare section of several starts, told apart into what is broadband and what locks to the drive.
-
-What the paper says of figures 8, 10 and 11, as numbers worked out from the computed motions.
+Figure 8 is the Poincare section of several starts, told apart into what is broadband and what locks to the drive;
+figures 10 and 11 are settled motions under a slowly rising offset, beside the orbits of the impact law.
 """
 
 from collections.abc import Callable, Sequence
