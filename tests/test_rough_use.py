@@ -231,7 +231,8 @@ def command(session):
             # as in the callbacks of a garbage collection: nobody hears it
             Lost()
 sys.modules["deaf"] = types.SimpleNamespace(command=command)
-COMMANDS["deaf"] = Command(name="deaf", group="check", summary="", runs="deaf:command", help="", computes=False)
+row = Command(name="deaf", group="check", summary="", help="", runs="deaf:command", computes=False)
+COMMANDS["deaf"] = row
 sys.argv[1:] = ["deaf"]
 main()
 """
@@ -246,7 +247,8 @@ def command(session):
     print("whole")
     raise KeyboardInterrupt
 sys.modules["leaving"] = types.SimpleNamespace(command=command)
-COMMANDS["leaving"] = Command(name="leaving", group="check", summary="", runs="leaving:command", help="", computes=False)
+row = Command(name="leaving", group="check", summary="", help="", runs="leaving:command", computes=False)
+COMMANDS["leaving"] = row
 sys.argv[1:] = ["leaving"]
 main()
 """
@@ -284,7 +286,8 @@ def command(session):
         # as NumPy does, which then tries another way
         raise RecursionError
 sys.modules["importing"] = types.SimpleNamespace(command=command)
-COMMANDS["importing"] = Command(name="importing", group="check", summary="", runs="importing:command", help="", computes=False)
+row = Command(name="importing", group="check", summary="", help="", runs="importing:command", computes=False)
+COMMANDS["importing"] = row
 sys.argv[1:] = ["importing"]
 main()
 """
