@@ -23,8 +23,9 @@ import afm_jax
 import fitting
 from afm_jax import strict_json
 from afm_jax.cli import main, session
+from afm_jax.cli.command import Command
 from afm_jax.cli.main import NotValid
-from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.session import Session
 from afm_jax.cli.values import PRESET_NAMES, example_path
 from afm_jax.scenefile.presets import PRESETS
 from afm_jax.words import lines_at_most, text_table
@@ -39,9 +40,10 @@ def trial(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
 
     def run(body: Callable[[Session], None], *arguments: str) -> Result:
         module = ModuleType("trial_command")
-        module.__dict__["command"] = click.command()(with_session(body))
+        module.__dict__["body"] = body
         monkeypatch.setitem(sys.modules, "trial_command", module)
-        monkeypatch.setitem(main.COMMANDS, "trial", ("trial_command", "Try something."))
+        row = Command(name="trial", group="check", summary="Try.", runs="trial_command:body", help="", computes=False)
+        monkeypatch.setitem(main.COMMANDS, "trial", row)
         return CliRunner().invoke(main.main, ["trial", *arguments])
 
     return run
@@ -87,8 +89,8 @@ def test_exports_are_what_the_modules_define():
 def test_help_lists_all_commands():
     text = CliRunner().invoke(main.main, ["--help"]).stdout
     words = " ".join(text.split())
-    for name, (_, line) in main.COMMANDS.items():
-        assert f" {name} {line}" in words
+    for name, row in main.COMMANDS.items():
+        assert f" {name} {row.summary}" in words
 
 
 def test_version_is_the_installed_one():
@@ -290,11 +292,12 @@ def test_closed_pipe_is_quiet():
 def test_interrupt_ends_with_130():
     code = (
         # a test run in the background inherits that interrupts are ignored
-        "import signal, sys, time, types, click\nfrom afm_jax.cli import main\n"
+        "import signal, sys, time, types\nfrom afm_jax.cli import main\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "module = types.ModuleType('waiting')\n"
-        "module.command = click.command()(lambda: (print('ready', flush=True), time.sleep(60)))\n"
-        "sys.modules['waiting'] = module\nmain.COMMANDS['wait'] = ('waiting', 'Wait.')\nmain.main(['wait'])"
+        "module.wait = lambda session: (print('ready', flush=True), time.sleep(60))\nsys.modules['waiting'] = module\n"
+        "row = dict(name='wait', group='check', summary='Wait.', runs='waiting:wait', help='', computes=False)\n"
+        "main.COMMANDS['wait'] = main.Command(**row)\nmain.main(['wait'])"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None
