@@ -92,6 +92,6 @@ def public_names() -> str:
     """Return the page of all public names, for mkdocstrings to fill in from their docstrings."""
     parts = ["# Python reference"]
     for package, title in ((afm_jax, "afm_jax: scenes and what becomes of them"), (fitting, "fitting: laws from data")):
-        names = sorted(name for name in package.__all__ if not name.startswith("_"))
+        names = sorted(name for name in package.__all__ if not name.startswith("_") and name != "fitting")
         parts += [f"## {title}", *(f"::: {package.__name__}.{name}" for name in names)]
     return "\n\n".join(parts)

@@ -234,13 +234,13 @@ def test_importing_everything_changes_no_setting_and_takes_no_functions_place():
         "    for module in pkgutil.walk_packages(package.__path__, package.__name__ + '.'):\n"
         "        if not module.name.endswith('__main__'):\n"
         "            importlib.import_module(module.name)\n"
-        "    print([name for name in package.__all__ if type(getattr(package, name)).__name__ == 'module'])\n"
+        "    print([name for name in dir(package) if type(getattr(package, name)).__name__ == 'module'])\n"
         "result = fitting.fit.__name__, fitting.calibrate.__name__, fitting.lockin.__name__, fitting.invert.__name__\n"
         "print(*result, fitting.design.__name__, afm_jax.simulate.__name__, afm_jax.collide.__name__)\n"
         "print({name for name, value in before.items() if jax.config.values[name] != value})"
     )
     lines = python(code).splitlines()
-    assert lines == ["[]", "[]", "fit calibrate lockin invert design simulate collide", "set()"]
+    assert lines == ["['fitting']", "[]", "fit calibrate lockin invert design simulate collide", "set()"]
 
 
 def changes_of_configuration(path: Path) -> list[int]:

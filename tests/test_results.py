@@ -74,7 +74,7 @@ def public_results() -> dict[str, Any]:
     """Return every class of records that the packages export, or that one of their functions returns."""
     found = {}
     for package in (afm, fitting):
-        for name in package.__all__:
+        for name in dir(package):
             public = getattr(package, name)
             kinds = [public]
             if inspect.isfunction(public):

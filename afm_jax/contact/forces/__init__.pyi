@@ -1,0 +1,10 @@
+from afm_jax.contact.forces.force import DissipativeForce as DissipativeForce
+from afm_jax.contact.forces.force import ForceSum as ForceSum
+from afm_jax.contact.forces.force import StaticForce as StaticForce
+from afm_jax.contact.forces.jkr import Jkr as Jkr
+from afm_jax.contact.forces.liquid import Capillary as Capillary
+from afm_jax.contact.forces.liquid import Liquid as Liquid
+from afm_jax.contact.forces.liquid import Structural as Structural
+from afm_jax.contact.forces.liquid import Viscous as Viscous
+from afm_jax.contact.forces.solid import CoreRepulsion as CoreRepulsion
+from afm_jax.contact.forces.solid import VanDerWaals as VanDerWaals
