@@ -11,7 +11,7 @@ from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.solve.arclength import EquationsAt, point_in_plane
 from afm_jax.solve.derivatives import largest
 from afm_jax.solve.lanes import again_for, again_for_the_open, filled, in_blocks, map_in_blocks, power_of_two
-from afm_jax.solve.newton import Linearised, Newton, NewtonOutcome, newton, newton_rows, shortened
+from afm_jax.solve.newton import LinearisedRows, Newton, NewtonOutcome, newton, newton_rows, shortened
 
 VALUES = np.arange(1.0, 24.0)
 
@@ -187,7 +187,7 @@ def arctangents(seen=None):
         if seen is not None:
             seen.append(rows.tolist())
         residual = np.where(np.abs(x) < 50.0, np.arctan(x), np.nan)
-        return Linearised(residual, (1.0 / (1.0 + x**2))[:, :, None], [f"row {row}" for row in rows])
+        return LinearisedRows(residual, (1.0 / (1.0 + x**2))[:, :, None], [f"row {row}" for row in rows])
 
     return linearised
 
@@ -203,7 +203,7 @@ def test_rows_are_solved_each_on_its_own():
     assert seen[:3] == [[0, 1, 2, 3], [1, 2], [1, 2]]
     assert seen[3:] == [[1]] * (len(seen) - 3)
     # x^2 is small long before its root is near: each step halves the distance
-    double = newton_rows(lambda x, _: Linearised(x**2, (2.0 * x)[:, :, None]), np.ones((1, 1)), EXACT)
+    double = newton_rows(lambda x, _: LinearisedRows(x**2, (2.0 * x)[:, :, None]), np.ones((1, 1)), EXACT)
     assert double.outcome.tolist() == [NewtonOutcome.NOT_CONVERGED]
     assert double.x[0, 0] == pytest.approx(0.5**30, rel=1e-12)
 
@@ -219,7 +219,7 @@ def test_halved_and_shortened_steps_come_back():
 
     def minimum(x, _):
         # x^2 + 1 has no root, and x = 0 no step
-        return Linearised(x**2 + 1.0, (2.0 * x)[:, :, None])
+        return LinearisedRows(x**2 + 1.0, (2.0 * x)[:, :, None])
 
     lost = newton_rows(minimum, np.array([[0.3], [0.0]]), EXACT._replace(halvings=3))
     assert lost.outcome.tolist() == [NewtonOutcome.NOT_CONVERGED, NewtonOutcome.NO_STEP]

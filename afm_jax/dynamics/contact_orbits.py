@@ -39,7 +39,7 @@ from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.scenefile.parameter_paths import scene_family
 from afm_jax.solve.arclength import EquationsAt
 from afm_jax.solve.lanes import Report, in_blocks
-from afm_jax.solve.newton import Linearised, Newton, newton_rows, shortened
+from afm_jax.solve.newton import LinearisedRows, Newton, newton_rows, shortened
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
 _STARTS = 8
@@ -206,12 +206,12 @@ def _closed(
         fastest = loops[:, count:].max(axis=1, keepdims=True)
         return np.repeat(np.concatenate([np.ones_like(fastest), fastest], axis=1), count, axis=1)
 
-    def linearised(loops: Float[np.ndarray, "loops n"], _: Any) -> Linearised:
+    def linearised(loops: Float[np.ndarray, "loops n"], _: Any) -> LinearisedRows:
         residual, slopes = np.full_like(loops, np.nan), np.full((*loops.shape, loops.shape[1]), np.nan)
         for row, flown in enumerate(flights.flown(loops, np.tile(values, (len(loops), 1)))):
             if flown is not None:
                 residual[row], slopes[row] = flown.gaps, flown.slopes[:, : loops.shape[1]]
-        return Linearised(residual / units(loops), slopes / units(loops)[:, :, None])
+        return LinearisedRows(residual / units(loops), slopes / units(loops)[:, :, None])
 
     roots = newton_rows(linearised, guesses, _CLOSING._replace(unit=units, damping=_damped))
     return roots.x[roots.converged]
@@ -244,7 +244,7 @@ def single_contact_orbits(
     lanes, columns, phase, rebound, turns = _guesses_of_law(seen, orders)
     numpy_scenes = jax.tree.map(np.asarray, seen)
 
-    def linearised(departures: Float[np.ndarray, "open 2"], rows: Int[np.ndarray, " open"]) -> Linearised:
+    def linearised(departures: Float[np.ndarray, "open 2"], rows: Int[np.ndarray, " open"]) -> LinearisedRows:
         if report is not None:
             report(len(lanes) - len(rows), len(lanes))
 
@@ -255,7 +255,7 @@ def single_contact_orbits(
         flown = in_blocks(work, (scenes, *departures.T, turns[rows]), block=_CONTACTS_AT_ONCE)
         scale = np.stack([np.ones(len(rows)), departures[:, 1]], axis=1)
         details = list(zip(flown.trace, flown.determinant, flown.peak_amplitude_nm, strict=True))
-        return Linearised(flown.gaps / scale, flown.slopes / scale[:, :, None], details)
+        return LinearisedRows(flown.gaps / scale, flown.slopes / scale[:, :, None], details)
 
     roots = newton_rows(linearised, np.stack([phase, rebound], axis=1), _CLOSING_A_CHART)
     closed = np.flatnonzero(roots.converged)

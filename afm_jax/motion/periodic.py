@@ -15,7 +15,7 @@ from afm_jax.contact.junction import Phase, explain_missing_junction, find_junct
 from afm_jax.motion.follow import Run, follow_in_pieces, why_over
 from afm_jax.motion.record import MotionOutcome, Simulation, State
 from afm_jax.motion.trajectory import flights_of, state_at
-from afm_jax.solve.newton import Linearised, Newton, newton_rows
+from afm_jax.solve.newton import LinearisedRows, Newton, newton_rows
 
 _ORBIT_PIECE = 50.0
 """Drive periods after which a motion is looked at: is it near an orbit?"""
@@ -177,14 +177,14 @@ def close_periods(
         reach: how far from its first guess a start may end, of the tip's largest speed; on the way four times as far.
     """
 
-    def linearised(states: Float[np.ndarray, "open 2"], lanes: Int[np.ndarray, " open"]) -> Linearised:
+    def linearised(states: Float[np.ndarray, "open 2"], lanes: Int[np.ndarray, " open"]) -> LinearisedRows:
         trials = np.concatenate([starts[:1, lanes], states.T])
         gap, slopes = np.full_like(states, np.nan), np.full((len(lanes), 2, 2), np.nan)
         near = _apart(starts[:, lanes], trials, angular_frequency) <= _OVERSHOOT * reach
         if near.any():
             gap[near], slopes[near] = _map_of(ends, trials[:, near], rows[lanes[near]], angular_frequency)
         size = (_speed(trials, angular_frequency) / np.array([[angular_frequency], [1.0]])).T
-        return Linearised(gap / size, (slopes - np.eye(2)) / size[:, :, None], list(slopes))
+        return LinearisedRows(gap / size, (slopes - np.eye(2)) / size[:, :, None], list(slopes))
 
     roots = newton_rows(linearised, starts[1:].T, _CLOSING)
     slopes = np.array([np.full((2, 2), np.nan) if known is None else known for known in roots.details])

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.solve.newton import Linearised, Newton, newton_rows
+from afm_jax.solve.newton import LinearisedRows, Newton, newton_rows
 
 
 class EquationsAt(NamedTuple):
@@ -49,12 +49,12 @@ def point_in_plane(
         settings: of Newton's method.
     """
 
-    def bordered(points: Float[np.ndarray, "1 unknowns"], _: Any) -> Linearised:
+    def bordered(points: Float[np.ndarray, "1 unknowns"], _: Any) -> LinearisedRows:
         here = equations(points[0])
         if here is None:
-            return Linearised(np.full_like(points, np.nan), np.full((1, len(guess), len(guess)), np.nan))
+            return LinearisedRows(np.full_like(points, np.nan), np.full((1, len(guess), len(guess)), np.nan))
         residual = np.append(here.residual, normal @ (points[0] - guess))
-        return Linearised(residual[None], np.vstack([here.slopes, normal])[None], [here.details])
+        return LinearisedRows(residual[None], np.vstack([here.slopes, normal])[None], [here.details])
 
     root = newton_rows(bordered, guess[None], settings)
     if not root.converged[0]:

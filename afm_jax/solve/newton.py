@@ -158,7 +158,7 @@ def _quotient(value: Array, slope: Array) -> Array:
     return jnp.where(slope != 0.0, value / jnp.where(slope != 0.0, slope, 1.0), jnp.nan)
 
 
-class Linearised(NamedTuple):
+class LinearisedRows(NamedTuple):
     """Equations at the points of some rows; NaN in a row where they have no value."""
 
     residual: Float[np.ndarray, "rows n"]
@@ -167,10 +167,10 @@ class Linearised(NamedTuple):
     details: Sequence[Any] | None = None
     """What else the evaluation has found, one a row."""
 
-    def of(self, rows: Int[np.ndarray, " some"]) -> "Linearised":
+    def of(self, rows: Int[np.ndarray, " some"]) -> "LinearisedRows":
         """Return the equations of some of the rows."""
         details = None if self.details is None else [self.details[row] for row in rows]
-        return Linearised(self.residual[rows], self.slopes[rows], details)
+        return LinearisedRows(self.residual[rows], self.slopes[rows], details)
 
 
 class Roots(NamedTuple):
@@ -191,7 +191,7 @@ class Roots(NamedTuple):
 
 
 def newton_rows(
-    linearised: Callable[[Float[np.ndarray, "open n"], Int[np.ndarray, " open"]], Linearised],
+    linearised: Callable[[Float[np.ndarray, "open n"], Int[np.ndarray, " open"]], LinearisedRows],
     guesses: Float[np.ndarray, "rows n"],
     settings: Newton,
 ) -> Roots:
@@ -230,7 +230,7 @@ def newton_rows(
 
 
 def _advance(
-    roots: Roots, rows: Int[np.ndarray, " some"], here: Linearised, settings: Newton
+    roots: Roots, rows: Int[np.ndarray, " some"], here: LinearisedRows, settings: Newton
 ) -> Float[np.ndarray, "some n"]:
     """Take a step from the points of some rows, write down what becomes of them, and return the step."""
     x = roots.x[rows]

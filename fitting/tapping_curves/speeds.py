@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
-from afm_jax.solve.newton import Linearised, Newton, newton_rows
+from afm_jax.solve.newton import LinearisedRows, Newton, newton_rows
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.tapping_curves.curve import Instrument, Rows, TappingCurve, motion_of
 
@@ -150,9 +150,9 @@ def _flight(seen: _Seen, x: np.ndarray) -> _Flight:
 def _solve(seen: _Seen, x: np.ndarray) -> tuple[np.ndarray, Bool[np.ndarray, " rows"]]:
     """Return the unknowns by Newton's method, shape (3, rows), and which rows are solved."""
 
-    def linearised(unknowns: np.ndarray, rows: np.ndarray) -> Linearised:
+    def linearised(unknowns: np.ndarray, rows: np.ndarray) -> LinearisedRows:
         flight = _flight(seen.of(rows), unknowns.T)
-        return Linearised(flight.left.T, flight.slopes)
+        return LinearisedRows(flight.left.T, flight.slopes)
 
     roots = newton_rows(linearised, x.T, _CLOSING)
     return roots.x.T, roots.converged & (np.abs(roots.x[:, 2]) < np.pi / seen.omega)
