@@ -371,7 +371,7 @@ def _final(seen: Scene, response: Surface | None, departure: Departure, outcome:
     surface = seen.platform
     held = outcome == MotionOutcome.HELD
     time = jnp.where(held | (outcome == MotionOutcome.FINISHED), until, departure.time_us)
-    height = surface.position(departure.time_us) + departure.gap_nm
+    height = departure.position_nm(surface)
     position, velocity = seen.cantilever.propagator(time - departure.time_us)(height, departure.velocity_nm_per_us)
     gap, rate = to_gap(surface, None, State(time, position, velocity))
     return to_lab(surface, response, time, jnp.where(held, 0.0, gap), jnp.where(held, 0.0, rate))
