@@ -301,4 +301,24 @@ MUTATIONS = {
         "_NEAR_CAPTURE = (-0.0, 0.0)",
         "tests/test_accuracy_promise.py::test_every_level_holds_for_random_contacts[diffrax]",
     ),
+    "Newton's step taken in full": Mutation(
+        "step if self.damping is None else self.damping(x, step)",
+        "step",
+        "tests/test_solve.py::test_equations_of_elements_end_one_by_one_within_their_domain",
+    ),
+    "Newton's method content with a small residual or a small step": Mutation(
+        "found = finite & small & np.all(sizes <= settings.step_tolerance, axis=1)",
+        "found = finite & (small | np.all(sizes <= settings.step_tolerance, axis=1))",
+        "tests/test_solve.py::test_rows_are_solved_each_on_its_own",
+    ),
+    "implicit derivative of a system turned round": Mutation(
+        "return x, -solved_columns(",
+        "return x, solved_columns(",
+        "tests/test_solve.py::test_newton_finds_scipys_root_with_the_derivatives_of_differences",
+    ),
+    "a curve's plane through the origin": Mutation(
+        "normal @ (points[0] - guess)",
+        "normal @ points[0]",
+        "tests/test_solve.py::test_a_curve_is_followed_round_its_fold",
+    ),
 }

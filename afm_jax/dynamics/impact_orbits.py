@@ -33,13 +33,14 @@ from afm_jax.impact.law import impact_law_of
 from afm_jax.impact.map import impact_after
 from afm_jax.outcomes import Outcome
 from afm_jax.results import ResultTuple, public_result
+from afm_jax.solve.newton import Newton, newton
 
 DEFAULT_STARTS = 512
 MOST_IMPACTS = 64
 """m: the linear system that closes a loop has twice as many unknowns."""
 _WINDOWS = (0, 1, 2, 4, 8, 16, 48)
 """Impacts after a start at which a window may begin."""
-_NEWTON_STEPS = 30
+_CLOSING = Newton(rounds=30, step_tolerance=1e-14)
 _TURN = 0.5
 """Longest step of Newton's method in a phase, rad."""
 _SHARE = 0.7
@@ -219,17 +220,15 @@ def _walks(seen: Scene, loop: ImpactLoop, starts: Array, length: int) -> tuple[A
 def closed_loop(guess: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoop) -> Float[Array, " n"]:
     """Return the loop that Newton's method finds from a guess; whether it closes is for the caller to see."""
     count = guess.shape[0] // 2
-    lowest = loop.impact.lowest / scale
 
-    def improve(_, unknowns):
-        value, slopes = closing_gaps(unknowns, scale, loop), jax.jacfwd(closing_gaps)(unknowns, scale, loop)
-        step = -jnp.linalg.solve(slopes, value)
-        nearer = -_SHARE * (unknowns[count:] - lowest)
-        turn = jnp.clip(step[:count], -_TURN, _TURN)
-        moved = unknowns + jnp.concatenate([turn, jnp.maximum(step[count:], nearer)])
-        return jnp.where(jnp.isfinite(moved).all(), moved, unknowns)
+    def damped(unknowns: Array, step: Array) -> Array:
+        nearer = -_SHARE * (unknowns[count:] - loop.impact.lowest / scale)
+        return jnp.concatenate([jnp.clip(step[:count], -_TURN, _TURN), jnp.maximum(step[count:], nearer)])
 
-    return lax.fori_loop(0, _NEWTON_STEPS, improve, guess)
+    def gaps(unknowns: Array, scaled_loop: tuple[Array, ImpactLoop]) -> Array:
+        return closing_gaps(unknowns, *scaled_loop)
+
+    return newton(gaps, guess, (scale, loop), _CLOSING._replace(damping=damped)).x
 
 
 def loops_told_apart(loops: Float[np.ndarray, "found n"], order: int) -> Float[np.ndarray, "loops n"]:
