@@ -148,8 +148,8 @@ MUTATIONS = {
         f"{LASTING}test_air_takes_what_an_integrated_damped_contact_loses",
     ),
     "lead that a push lengthens": Mutation(
-        "longer - share",
-        "longer + share",
+        "longer - fraction",
+        "longer + fraction",
         f"{LASTING}test_a_lead_is_covered_sooner_with_a_push",
     ),
     "close pairs of roots stepped over": Mutation(

@@ -34,7 +34,7 @@ from afm_jax.contact.driven import free_tip
 from afm_jax.contact.forces import jkr
 from afm_jax.contact.junction import Junction, find_junction
 from afm_jax.contact.junction_leg import pass_through_junction
-from afm_jax.impact.lasting_impact import TabulatedImpact, polynomials, stretched
+from afm_jax.impact.contact_impact import TabulatedImpact, polynomials, stretched
 from afm_jax.impact.law import MOST_KNOTS, CollisionDelay, ImpactLaw, TabulatedLaw
 from afm_jax.least_squares import Box, Searches, descended, distance
 from afm_jax.results import Result, public_result
@@ -520,15 +520,15 @@ def tabulated(contact: Contact, mass_ng: Float[Array, ""]) -> TabulatedImpact:
         inner_nm=contact.bridge_forms_nm,
         outer_nm=outer,
         hertz=delay * u[-1] ** 0.2,
-        early_nm=jnp.zeros(()),
-        raised_nm=jnp.zeros(()),
-        length_nm=contact.bridge_breaks_nm,
+        lead=jnp.zeros(()),
+        raised=jnp.zeros(()),
+        length=contact.bridge_breaks_nm,
         loss_error=_tail(loss),
         speed_error=largest(jnp.abs(finer.approach_speed / u[_COMPARED] - 1.0)),
         time_error=_tail(time_terms) + largest(jnp.abs(finer.time - time[_COMPARED])),
     )
     early, raised = _lead_and_height(table)
-    return replace(table, early_nm=early, raised_nm=raised)
+    return replace(table, lead=early, raised=raised)
 
 
 def _traced_back(

@@ -17,8 +17,8 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.apparatus.surface import Surface, seen_freely
 from afm_jax.checks import as_argument, check_parameter, checked
-from afm_jax.impact.lasting_impact import Impact, speeds_of_impact
-from afm_jax.impact.law import Law, impact_law_of
+from afm_jax.impact.lasting_impact import speeds_of_impact
+from afm_jax.impact.law import Impact, Law, impact_law_of
 from afm_jax.impact.map import next_impact
 from afm_jax.outcomes import Outcome
 

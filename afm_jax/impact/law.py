@@ -85,11 +85,56 @@ class CollisionDelay(eqx.Module):
         return hertz + self.lead_nm * (rebound_slope / w**2 - 1.0 / u**2) + self.offset_nm / u**2
 
 
-class Law(eqx.Module):
+class Impact(eqx.Module):
+    """What an impact does to the tip, as functions of one coordinate that grows with the approach speed.
+
+    A `Law`, or a resolved contact as series (`afm_jax.impact.contact_impact`): of a free tip on a sample at rest. Where
+    an impact lasts, platform, spring and air change it (`afm_jax.impact.lasting_impact`).
+    """
+
+    lowest: eqx.AbstractVar[Float[Array, ""]]
+    """Coordinate in nm/us at which the tip is captured."""
+    lead: eqx.AbstractVar[Float[Array, ""]]
+    """Length b in nm of the lead b (1/u_out - 1/u_in) that the delay contains."""
+    raised: eqx.AbstractVar[Float[Array, ""]]
+    """Height in nm of the solid's surface over gap 0, as the delay tells it: half its offset."""
+    length: eqx.AbstractVar[Float[Array, ""]]
+    """Length in nm over which a leaving tip keeps its energy: the gap at which the bridge breaks."""
+
+    @property
+    def delayed(self) -> bool:
+        """Whether the next flight begins at another time than the last one ends; True of a resolved contact."""
+        return True
+
+    @property
+    def lasts(self) -> bool:
+        """Whether platform, spring and air act during the contact; True of a resolved contact."""
+        return True
+
+    @property
+    def reach(self) -> Float[Array, ""]:
+        """Distance in nm/us from the lowest coordinate over which adhesion counts: up to twice the capture speed."""
+        return self.lowest
+
+    @abstractmethod
+    def hertz_time(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return the time tau in us that a Hertz contact of the same stiffness takes at a speed in nm/us."""
+
+    @abstractmethod
+    def speeds(self, coordinate: Float[Array, "..."]) -> Speeds:
+        """Return approach and rebound speed in nm/us and the delay in us at a coordinate above `lowest`."""
+
+    def at_approach(self, approach_speed: Float[Array, "..."]) -> Speeds:
+        """Return the speeds in nm/us and the delay in us at an approach speed, which is a contact's coordinate."""
+        return self.speeds(approach_speed)
+
+
+class Law(Impact):
     """What the tip does at an impact, as functions of the approach speed: of a free tip on a sample at rest.
 
-    A delay with corrections adds to it what happens while the impact lasts (`afm_jax.impact.lasting_impact`). Near
-    capture speeds are singular functions of each other; orbits use a coordinate Y in which both are smooth.
+    Either a formula (`ImpactLaw`) or a table (`TabulatedLaw`). A delay with corrections adds what happens while the
+    impact lasts (`afm_jax.impact.lasting_impact`). Near capture speeds are singular functions of each other; orbits use
+    a coordinate Y in which both are smooth.
     """
 
     @property
@@ -128,16 +173,6 @@ class Law(eqx.Module):
         """Coefficient of restitution of the slowest impacts of a law without adhesion: what chatter dies out with."""
 
     @property
-    @abstractmethod
-    def lowest(self) -> Float[Array, ""]:
-        """Coordinate Y in nm/us at which the tip is captured."""
-
-    @property
-    def reach(self) -> Float[Array, ""]:
-        """Distance in nm/us from the lowest coordinate over which adhesion counts: up to twice the capture speed."""
-        return self.lowest
-
-    @property
     def lead(self) -> Float[Array, ""]:
         """Length b in nm of the lead b (1/u_out - 1/u_in) that the delay contains."""
         return jnp.zeros_like(self.lowest) if self.delay is None else self.delay.lead_nm
@@ -155,10 +190,6 @@ class Law(eqx.Module):
     def hertz_time(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return the time in us that a Hertz contact of the same stiffness takes at a speed in nm/us: a u^(-1/5)."""
         return jnp.zeros_like(approach_speed) if self.delay is None else self.delay.hertz * approach_speed**-0.2
-
-    @abstractmethod
-    def speeds(self, coordinate: Float[Array, "..."]) -> Speeds:
-        """Return approach and rebound speed and the delay at a coordinate Y above `lowest`, smooth up to capture."""
 
     @abstractmethod
     def coordinate(self, approach_speed: Float[Array, "..."]) -> Float[Array, "..."]:
