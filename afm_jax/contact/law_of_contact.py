@@ -514,21 +514,21 @@ def tabulated(contact: Contact, mass_ng: Float[Array, ""]) -> TabulatedImpact:
     table = TabulatedImpact(
         loss=loss,
         time=time_terms,
-        lowest=jnp.where(sound, lowest, 1e6),
+        capture=jnp.where(sound, lowest, 1e6),
         scale=scale,
         end=far[-1],
         inner_nm=contact.bridge_forms_nm,
         outer_nm=outer,
         hertz=delay * u[-1] ** 0.2,
-        lead=jnp.zeros(()),
-        raised=jnp.zeros(()),
-        length=contact.bridge_breaks_nm,
+        early_nm=jnp.zeros(()),
+        raised_nm=jnp.zeros(()),
+        length_nm=contact.bridge_breaks_nm,
         loss_error=_tail(loss),
         speed_error=largest(jnp.abs(finer.approach_speed / u[_COMPARED] - 1.0)),
         time_error=_tail(time_terms) + largest(jnp.abs(finer.time - time[_COMPARED])),
     )
     early, raised = _lead_and_height(table)
-    return replace(table, lead=early, raised=raised)
+    return replace(table, early_nm=early, raised_nm=raised)
 
 
 def _traced_back(

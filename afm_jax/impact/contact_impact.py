@@ -40,22 +40,22 @@ class Middle(NamedTuple):
 class TabulatedImpact(Impact):
     """The loss u_in^2 - u_out^2 and the time in contact of free collisions as series; the coordinate is u_in.
 
-    Both are smooth functions of the rebound speed down to 0, and so of v = sqrt(u_in^2 - lowest^2): Chebyshev series
+    Both are smooth functions of the rebound speed down to 0, and so of v = sqrt(u_in^2 - capture^2): Chebyshev series
     in asinh(v/scale), which is v itself at capture and its logarithm far from it. The delay is the time in contact less
     what the straight paths take, outer/u_out + inner/u_in, and so as singular at capture as it is.
 
     Attributes:
         loss: coefficients of the loss in nm^2/us^2, shape (terms,).
         time: coefficients of the time in contact in us, shape (terms,).
-        lowest: speed in nm/us at which the tip is captured.
+        capture: speed in nm/us at which the tip is captured.
         scale: v in nm/us from which on the variable is a logarithm.
         end: asinh(v/scale) where the table ends; beyond, loss and delay are held.
         inner_nm: gap at which contact begins.
         outer_nm: gap at which contact ends.
         hertz: Hertz time at 1 nm/us, in us (nm/us)^0.2: that of the table's end, where nothing else is left.
-        lead: lead b in nm of the delay formula that is closest to the delay.
-        raised: half the offset d in nm that is left then.
-        length: gap in nm at which the bridge breaks.
+        early_nm: lead b in nm of the delay formula that is closest to the delay.
+        raised_nm: half the offset d in nm that is left then.
+        length_nm: gap in nm at which the bridge breaks.
         loss_error: estimated error of the series for the loss, in nm^2/us^2.
         speed_error: estimated error of the approach speeds that it goes through, as a share.
         time_error: estimated error of the time in us.
@@ -63,18 +63,38 @@ class TabulatedImpact(Impact):
 
     loss: Float[Array, " terms"]
     time: Float[Array, " terms"]
-    lowest: Float[Array, ""]
+    capture: Float[Array, ""]
     scale: Float[Array, ""]
     end: Float[Array, ""]
     inner_nm: Float[Array, ""]
     outer_nm: Float[Array, ""]
     hertz: Float[Array, ""]
-    lead: Float[Array, ""]
-    raised: Float[Array, ""]
-    length: Float[Array, ""]
+    early_nm: Float[Array, ""]
+    raised_nm: Float[Array, ""]
+    length_nm: Float[Array, ""]
     loss_error: Float[Array, ""]
     speed_error: Float[Array, ""]
     time_error: Float[Array, ""]
+
+    @property
+    def lowest(self) -> Float[Array, ""]:
+        """Speed in nm/us at which the tip is captured."""
+        return self.capture
+
+    @property
+    def lead(self) -> Float[Array, ""]:
+        """Length b in nm of the lead b (1/u_out - 1/u_in) of the delay formula closest to the delay."""
+        return self.early_nm
+
+    @property
+    def raised(self) -> Float[Array, ""]:
+        """Height in nm of the solid's surface over gap 0: half the offset of the delay formula closest to the delay."""
+        return self.raised_nm
+
+    @property
+    def length(self) -> Float[Array, ""]:
+        """Gap in nm at which the bridge breaks: over this length a leaving tip keeps its energy."""
+        return self.length_nm
 
     @property
     def highest(self) -> Float[Array, ""]:

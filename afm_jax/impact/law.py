@@ -92,14 +92,25 @@ class Impact(eqx.Module):
     an impact lasts, platform, spring and air change it (`afm_jax.impact.lasting_impact`).
     """
 
-    lowest: eqx.AbstractVar[Float[Array, ""]]
-    """Coordinate in nm/us at which the tip is captured."""
-    lead: eqx.AbstractVar[Float[Array, ""]]
-    """Length b in nm of the lead b (1/u_out - 1/u_in) that the delay contains."""
-    raised: eqx.AbstractVar[Float[Array, ""]]
-    """Height in nm of the solid's surface over gap 0, as the delay tells it: half its offset."""
-    length: eqx.AbstractVar[Float[Array, ""]]
-    """Length in nm over which a leaving tip keeps its energy: the gap at which the bridge breaks."""
+    @property
+    @abstractmethod
+    def lowest(self) -> Float[Array, ""]:
+        """Coordinate in nm/us at which the tip is captured."""
+
+    @property
+    @abstractmethod
+    def lead(self) -> Float[Array, ""]:
+        """Length b in nm of the lead b (1/u_out - 1/u_in) that the delay contains."""
+
+    @property
+    @abstractmethod
+    def raised(self) -> Float[Array, ""]:
+        """Height in nm of the solid's surface over gap 0, as the delay tells it: half its offset."""
+
+    @property
+    @abstractmethod
+    def length(self) -> Float[Array, ""]:
+        """Length in nm over which a leaving tip keeps its energy: the gap at which the bridge breaks."""
 
     @property
     def delayed(self) -> bool:
