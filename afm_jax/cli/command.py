@@ -84,7 +84,11 @@ class Output:
 def later(function: str) -> Callable[..., Any]:
     """Return a function, "module:function", whose module is imported when it is called: pictures need matplotlib."""
     module, _, name = function.partition(":")
-    return lambda *arguments, **options: getattr(import_module(module), name)(*arguments, **options)
+
+    def call(*arguments: Any, **options: Any) -> Any:
+        return getattr(import_module(module), name)(*arguments, **options)
+
+    return call
 
 
 def columns_of(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[str, list[Any]]:
