@@ -58,20 +58,23 @@ def one_line(result: Result) -> str:
     return lines[0].removeprefix("afm-jax: ")
 
 
-@pytest.mark.parametrize("package", ["afm_jax", "fitting"])
-def test_packages_import_nothing_heavy(package: str):
-    assert python(f"import sys, {package}; print({HEAVY} & set(sys.modules))") == "set()"
-
-
-@pytest.mark.parametrize(
-    "arguments", [["--help"], ["--version"], ["orbit"], *([name, "--help"] for name in main.COMMANDS)]
-)
-def test_help_imports_nothing_heavy(arguments: list[str]):
-    code = (
-        "import sys\nfrom afm_jax.cli.main import main\n"
-        f"try:\n    main({arguments})\nexcept SystemExit:\n    print('found', {HEAVY} & set(sys.modules))"
-    )
-    assert python(code).splitlines()[-1] == "found set()"
+def test_packages_and_help_import_nothing_heavy():
+    # one after the other in one process: whatever imported something would be named, and all that come after it
+    calls = [["--help"], ["--version"], ["orbit"], *([name, "--help"] for name in main.COMMANDS)]
+    code = f"""
+import sys, afm_jax, fitting
+heavy = lambda: {HEAVY} & set(sys.modules)
+print("found packages", heavy())
+from afm_jax.cli.main import main
+for call in {calls}:
+    try:
+        main(call)
+    except SystemExit:
+        print("found", call, heavy())
+"""
+    found = [line for line in python(code).splitlines() if line.startswith("found ")]
+    assert len(found) == 1 + len(calls)
+    assert all(line.endswith(" set()") for line in found), found
 
 
 def test_exports_are_what_the_modules_define():
