@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import click
 
 from afm_jax.cli.command import Command
-from afm_jax.cli.commands import measure, simulate
+from afm_jax.cli.commands import check, contact, measure, simulate
 from afm_jax.cli.ending import INTERRUPTED, NotValid, exit_code_of
 
 __all__ = ["COMMANDS", "NotValid", "main"]
@@ -110,40 +110,10 @@ _OF_THEIR_OWN_FILES = (
     ),
     _OfItsOwnFile("bench", "check", "Measure impacts per second, next to SciPy.", "afm_jax.cli.bench"),
     _OfItsOwnFile(
-        "collide",
-        "contact",
-        "Let free tips collide with the sample: rebound, delay, capture, energy.",
-        "afm_jax.cli.collide",
-    ),
-    _OfItsOwnFile(
-        "continue",
-        "simulate",
-        "Follow orbits and their special points through parameters.",
-        "afm_jax.cli.continue_orbits",
-    ),
-    _OfItsOwnFile(
         "doctor", "check", "Say what is installed, how JAX computes, and whether its cache works.", "afm_jax.cli.doctor"
     ),
     _OfItsOwnFile(
-        "effects",
-        "simulate",
-        "Say what each effect of a scene changes and costs, and which can be left out.",
-        "afm_jax.cli.effects",
-    ),
-    _OfItsOwnFile(
         "figures", "check", "Draw figures 2 to 11 of the paper, with its statements checked.", "afm_jax.cli.figures"
-    ),
-    _OfItsOwnFile(
-        "orbits",
-        "simulate",
-        "Find the orbits of a scene, of one impact or more, and whether they are stable.",
-        "afm_jax.cli.orbits",
-    ),
-    _OfItsOwnFile(
-        "simulate",
-        "simulate",
-        "Follow a scene in time: contacts, amplitudes, phases, energies.",
-        "afm_jax.cli.simulate",
     ),
     _OfItsOwnFile(
         "sweep",
@@ -151,15 +121,10 @@ _OF_THEIR_OWN_FILES = (
         "Compute many scenes, or fit many tables, over a grid of parameters; resumes.",
         "afm_jax.cli.sweep",
     ),
-    _OfItsOwnFile(
-        "verify",
-        "check",
-        "Compare eqs. 5 to 8 with automatic differentiation and with 50 digits.",
-        "afm_jax.cli.verify",
-    ),
 )
 COMMANDS: dict[str, Command | _OfItsOwnFile] = {
-    row.name: row for row in (*measure.COMMANDS, *simulate.COMMANDS, *_OF_THEIR_OWN_FILES)
+    row.name: row
+    for row in (*measure.COMMANDS, *simulate.COMMANDS, *contact.COMMANDS, *check.COMMANDS, *_OF_THEIR_OWN_FILES)
 }
 _GROUPS = {
     "measure": "Measure: read data, fit and plan",
