@@ -6,17 +6,14 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
-
 from afm_jax.cli.main import NotValid
-from afm_jax.cli.session import Session, prepare_folder, with_session, write_csv
+from afm_jax.cli.session import Session, prepare_folder, write_csv
 
 if TYPE_CHECKING:
     from afm_jax.paper.charts import FigureData
     from afm_jax.paper.contact_figures import ContactFigure
     from afm_jax.paper.motion_figures import MotionFigure
 
-AVAILABLE = ("2", "3", "4", "5", "6", "7", "8", "9", "10", "11")
 _OF_THE_CONTACT = {"4": "forces", "5": "loading and unloading", "6": "impact law", "7": "one impact in time"}
 _OF_MOTIONS = {"8": "Poincare section", "10": "rising offset below resonance", "11": "rising offset above resonance"}
 _DEFAULT_FOLDER = Path("figures")
@@ -24,39 +21,8 @@ _SPOT_CHECKS = 60
 _COARSE_SPOT_CHECKS = 20
 
 
-def _chosen(ctx: click.Context, parameter: click.Parameter, text: str) -> tuple[str, ...]:
-    """Return the numbers in a comma list, without repetitions and in the order of the paper."""
-    numbers = {part.strip() for part in text.split(",") if part.strip()}
-    have = ", ".join(AVAILABLE)
-    for number in sorted(numbers):
-        if number not in AVAILABLE:
-            message = f"there is no figure `{number}` to draw; choose from {have}"
-            raise click.BadParameter(message, ctx=ctx, param=parameter)
-    if not numbers:
-        raise click.BadParameter(f"names no figure; choose from {have}", ctx=ctx, param=parameter)
-    return tuple(number for number in AVAILABLE if number in numbers)
-
-
-@click.command()
-@click.option(
-    "--only",
-    metavar="2,3,4,...",
-    default=",".join(AVAILABLE),
-    callback=_chosen,
-    help="Draw these figures of the paper only (comma list); all that there are if left out.",
-)
-@click.option("--coarse", is_flag=True, help="A quick look: fewer points, starts and ramps.")
-@click.option("--seed", type=click.IntRange(min=0), default=1, show_default=True, help="Of the random spot checks.")
-@with_session
-def command(session: Session, *, only: tuple[str, ...], coarse: bool, seed: int) -> None:
-    """Draw the paper's figures, with their data as CSV (into the folder `figures` without --out).
-
-    Figures 2 and 3: where single-impact orbits are stable, without and with adhesion. Figure 4: the forces of the
-    liquid bridge; 5: loading and unloading; 6: the impact law of the contact; 7: one impact in time; 8: Poincare
-    section of the contact in motion. Figure 9: amplitude of the (1,1) orbit against the tip-sample offset, below and
-    above resonance; 10 and 11: the contact in motion under a rising offset. What the paper says of each figure is
-    checked on the data, and random points of 2, 3 and 9 against long iterations of the impact map.
-    """
+def figures(session: Session, *, only: tuple[str, ...], coarse: bool, seed: int) -> None:
+    """Draw figures of the paper and check its statements."""
     folder = session.out or _DEFAULT_FOLDER
     prepare_folder(folder)
     session.start_computing()

@@ -9,9 +9,8 @@ import sys
 import threading
 import types
 from collections.abc import Sequence
-from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import click
 
@@ -89,42 +88,8 @@ def _interrupt(number: int, frame: types.FrameType | None) -> None:
     signal.default_int_handler(number, frame)
 
 
-class _OfItsOwnFile(NamedTuple):
-    """A command that is not yet a row: its module is imported when it is called."""
-
-    name: str
-    group: str
-    summary: str
-    module: str
-
-    def click_command(self) -> click.Command:
-        return import_module(self.module).command
-
-
-_OF_THEIR_OWN_FILES = (
-    _OfItsOwnFile(
-        "accuracy",
-        "check",
-        "Show error against time, and the cheapest setting for a wanted accuracy.",
-        "afm_jax.cli.accuracy",
-    ),
-    _OfItsOwnFile("bench", "check", "Measure impacts per second, next to SciPy.", "afm_jax.cli.bench"),
-    _OfItsOwnFile(
-        "doctor", "check", "Say what is installed, how JAX computes, and whether its cache works.", "afm_jax.cli.doctor"
-    ),
-    _OfItsOwnFile(
-        "figures", "check", "Draw figures 2 to 11 of the paper, with its statements checked.", "afm_jax.cli.figures"
-    ),
-    _OfItsOwnFile(
-        "sweep",
-        "simulate",
-        "Compute many scenes, or fit many tables, over a grid of parameters; resumes.",
-        "afm_jax.cli.sweep",
-    ),
-)
-COMMANDS: dict[str, Command | _OfItsOwnFile] = {
-    row.name: row
-    for row in (*measure.COMMANDS, *simulate.COMMANDS, *contact.COMMANDS, *check.COMMANDS, *_OF_THEIR_OWN_FILES)
+COMMANDS: dict[str, Command] = {
+    row.name: row for group in (measure, simulate, contact, check) for row in group.COMMANDS
 }
 _GROUPS = {
     "measure": "Measure: read data, fit and plan",

@@ -375,4 +375,47 @@ SIMULATE = Command(
     check=_check_simulation,
 )
 
-COMMANDS = (BASINS, BIFURCATION, CHART, CONTINUE, EFFECTS, LYAPUNOV, ORBITS, SIMULATE)
+
+SWEEP = Command(
+    name="sweep",
+    group="simulate",
+    summary="Compute many scenes, or fit many tables, over a grid of parameters; resumes.",
+    runs="afm_jax.cli.sweep:sweep",
+    help="""Compute what SWEEP.toml records over its grid, into DIR/sweep.zarr; call it again to go on after a fault.
+
+    \b
+    scene = "scene.toml"                  # or a preset; or tables = ["a.csv", "b.csv"]
+    accuracy = 1e-6                       # of resolved contacts; may be left out
+    [record]
+    what = "orbits"                       # simulation, collide, lyapunov; of tables: fit
+    orders = [1, 2]
+    [[axes]]
+    parameter = "platform.reduced_frequency"
+    linear = [0.9, 1.1, 1000]             # or log = [low, high, count], or list = [...]
+    [[axes]]
+    latin_hypercube = { "interaction.r" = [0.9, 0.99], "interaction.epsilon" = { log = [1, 100] } }
+    count = 500                           # or random = {...}
+    seed = 1
+
+    The results open with xarray.open_zarr; on other workers they differ in last digits at most. Chunks that are done
+    are kept, whatever happens, and computed again only if their bytes have changed.
+    """,
+    options=(
+        click.argument("sweep", metavar="SWEEP.toml", type=click.Path(path_type=Path)),
+        click.option(
+            "--workers",
+            type=click.IntRange(1, 1024),
+            metavar="N",
+            help="Processes of this machine that share its cores, by Dask; 1: this one alone.",
+        ),
+        click.option("--scheduler", metavar="tcp://...", help="A Dask scheduler whose workers do the work."),
+        click.option(
+            "--dry-run", is_flag=True, help="Measure a chunk and say what the sweep would take; keep nothing."
+        ),
+        click.option("--plot", is_flag=True, help="Draw a sweep of one or two axes, sweep.png."),
+        LAW,
+    ),
+    computes=False,
+)
+
+COMMANDS = (BASINS, BIFURCATION, CHART, CONTINUE, EFFECTS, LYAPUNOV, ORBITS, SIMULATE, SWEEP)
