@@ -227,18 +227,18 @@ def _contact(  # noqa: PLR0913
 ) -> Simulation:
     driven = driven_by(scene.interaction, scene.cantilever, surface)
     gap, rate = to_gap(surface, response, start)
-    tip = begin(driven, start.time_us, gap, rate, rows)
-    tip = follow(driven, tip, until, setting, rounds=rounds, reverse=reverse)
-    place, phase = tip.touch.state, tip.touch.phase
-    table = ContactRow(*jnp.moveaxis(tip.rows, -1, 0))
+    begun = begin(driven, start.time_us, gap, rate, rows)
+    end = follow(driven, begun, until, setting, rounds=rounds, reverse=reverse)
+    state, phase = end.tip.state, end.tip.phase
+    table = ContactRow(*jnp.moveaxis(end.rows, -1, 0))
     return Simulation(
         start=start,
         contacts=_contacts(table, scene, surface, response, driven),
-        count=jnp.minimum(tip.contacts, rows),
-        final=to_lab(surface, response, place.time_us, driven.gap(place.x, phase), place.gap_rate),
+        count=jnp.minimum(end.contacts, rows),
+        final=to_lab(surface, response, state.time_us, driven.gap(state.x, phase), state.gap_rate),
         phase=phase,
-        held=tip.outcome == MotionOutcome.HELD,
-        outcome=tip.outcome,
+        held=end.outcome == MotionOutcome.HELD,
+        outcome=end.outcome,
     )
 
 
