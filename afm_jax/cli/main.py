@@ -142,9 +142,6 @@ _OF_THEIR_OWN_FILES = (
         "Say what each effect of a scene changes and costs, and which can be left out.",
         "afm_jax.cli.effects",
     ),
-    _OfItsOwnFile(
-        "figures", "check", "Draw figures 2 to 11 of the paper, with its statements checked.", "afm_jax.cli.figures"
-    ),
     _OfItsOwnFile("fit", "measure", "Fit the impact law to a table of vibration amplitudes.", "afm_jax.cli.fit"),
     _OfItsOwnFile(
         "invert",
