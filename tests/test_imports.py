@@ -181,7 +181,7 @@ def crossed(start: tuple[str, str]) -> set[str]:
         ("afm_jax.motion.simulate", "simulate", 37),
         ("fitting.fits.fit", "fit", 52),
         ("afm_jax.contact.collide", "collide", 18),
-        ("afm_jax.effects.study", "study_effects", 52),
+        ("afm_jax.effects.study", "study_effects", 53),
     ],
 )
 def test_a_call_crosses_few_files(module: str, name: str, most: int):
