@@ -18,7 +18,6 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.contact.driven import Driven, Place
-from afm_jax.contact.forces import jkr
 from afm_jax.contact.junction import Phase
 
 _NEAR = 1e-7
@@ -63,6 +62,11 @@ class Trial(NamedTuple):
     low: Float[Array, "..."]
     """Thresholds of x in this phase: D_on and the breaking gap, or the fold and none."""
     high: Float[Array, "..."]
+
+    @property
+    def near_low(self) -> Float[Array, "..."]:
+        """Distance from the low threshold within which the correction is exact; that may be 0, at a dry contact's fold."""
+        return _NEAR * jnp.where(self.low > 0.0, self.low, self.start.x)
 
 
 def advance(
@@ -118,7 +122,7 @@ def _tried(
     driven: Driven, touch: Touch, until_us: Float[Array, "..."], fineness: float | Array, step: Callable[..., Place]
 ) -> Trial:
     start, solid = touch.place, touch.phase == Phase.JUNCTION
-    low = jnp.where(solid, jkr.FOLD, driven.junction.forms_gap_nm)
+    low = jnp.where(solid, driven.solid.fold, driven.junction.forms_gap_nm)
     high = jnp.where(solid, jnp.inf, driven.breaks_nm)
     rates = driven.rates(start, solid)
     fixed, slopes = lax.stop_gradient((start, rates))
@@ -176,7 +180,7 @@ def _where_next(trial: Trial, at_turn: Bool[Array, "..."], until_us: Float[Array
     below, above, late = (end.x < low), (end.x > high), end.time_us > until
 
     # a threshold nearly met needs no other trial
-    beyond_low = below & (low - end.x > _NEAR * low)
+    beyond_low = below & (low - end.x > lax.stop_gradient(trial.near_low))
     beyond_high = above & (end.x - high > _NEAR * high)
     beyond_time = late & (end.time_us - until > _NEAR * length * jnp.maximum(slopes.time_us, 1e-3))
     level = jnp.where(below, low, jnp.where(above, high, 0.0))
@@ -205,7 +209,7 @@ class _Landing(NamedTuple):
 def _land(trial: Trial, until_us: Float[Array, "..."], below: Array, above: Array, late: Array) -> _Landing:
     """Return the trial's end, moved onto the threshold that it has met."""
     end, rates = trial.end, trial.end_rates
-    near_low = below | (end.x - trial.low < _NEAR * trial.low) & (end.gap_rate != 0.0) & (rates.x < 0.0)
+    near_low = below | (end.x - trial.low < trial.near_low) & (end.gap_rate != 0.0) & (rates.x < 0.0)
     near_high = above | (trial.high - end.x < _NEAR * trial.high) & (rates.x > 0.0)
     target = jnp.where(near_low, trial.low, jnp.where(near_high, trial.high, end.x))
     at_threshold = near_low | near_high
@@ -253,14 +257,11 @@ def bridge_pace(driven: Driven, place: Place, acceleration: Float[Array, "..."])
 
 def junction_pace(driven: Driven, place: Place) -> Float[Array, "..."]:
     """Return the pace of a tip in the junction per unit of fictitious time, from the same three."""
-    s = place.x
-    cube = s**3
-    curvature = s * s * (cube * (36.0 * cube - 42.0 * jkr.SLOPE) + 12.0)
-    # where the curvature vanishes, at s = 1.196, its terms still tell how fast it comes back
-    bent = jnp.maximum(jnp.abs(curvature), 0.3 * s * s * (36.0 * cube * cube + 12.0))
-    elastic = bent * driven.load_scale_nn * driven.inverse_mass / driven.depth_scale_nm
-    passing = 3.0 * place.gap_rate / (driven.depth_scale_nm * s)
-    return 0.8 * jnp.sqrt(elastic + passing**2 + (_drive_pace(driven) * jkr.depth_slope(s)) ** 2)
+    s, curve = place.x, driven.solid
+    energy = 0.5 * driven.mass_ng * place.gap_rate**2 / curve.energy_scale_aj
+    elastic = curve.bend(s) * driven.load_scale_nn * driven.inverse_mass / driven.depth_scale_nm
+    passing = 3.0 * place.gap_rate / (driven.depth_scale_nm * curve.reach(s, energy))
+    return 0.8 * jnp.sqrt(elastic + passing**2 + (_drive_pace(driven) * curve.depth_slope(s)) ** 2)
 
 
 def _drive_pace(driven: Driven) -> Array:
