@@ -1,8 +1,9 @@
-"""Malformed files and the one line that each must end in: `tests/malformed.jsonl`, a line a file.
+"""Malformed files and wrong calls, and the one line that each must end in: `tests/malformed.jsonl`, a line a case.
 
 `{"base": NAME, "file": ..., "text": ...}` is a sound file of a format. `{"of": NAME, "call": ..., "old": ..., "new":
 ..., "says": ...}` is one with the first `old` replaced (all of them where it is a separator; the whole file without
-`old`; `new` as bytes of Latin-1 where `"bytes": true`), the command, and what it says after `afm-jax: `.
+`old`; `new` as bytes of Latin-1 where `"bytes": true`), the command, and what it says after `afm-jax: `. Without `new`
+the file stays sound and the call is wrong. All sound files lie in the folder where commands run.
 
 `python -m tests.malformed` writes the messages anew; read the difference before you keep it.
 """
@@ -30,7 +31,9 @@ def corpus() -> tuple[dict[str, dict[str, Any]], list[dict[str, Any]]]:
 
 
 def content(base: dict[str, Any], case: dict[str, Any]) -> bytes:
-    """Return the bytes of a malformed file."""
+    """Return the bytes of a malformed file, or of the sound one that a wrong call is about."""
+    if "new" not in case:
+        return base["text"].encode()
     new, old = case["new"] * case.get("times", 1), case.get("old")
     if old is not None:
         assert old in base["text"], case
@@ -38,11 +41,24 @@ def content(base: dict[str, Any], case: dict[str, Any]) -> bytes:
     return new.encode("latin-1" if case.get("bytes") else "utf-8")
 
 
+def write_sound_files() -> None:
+    """Write the sound file of every format into the working directory."""
+    for base in corpus()[0].values():
+        Path(base["file"]).write_text(base["text"], encoding="utf-8")
+
+
 def run(base: dict[str, Any], case: dict[str, Any]) -> Result:
     """Run the command on the malformed file, in the working directory."""
     Path(base["file"]).write_bytes(content(base, case))
     words = {"FILE": base["file"], "TABLE": str(TABLE)}
-    return CliRunner().invoke(afm_jax, [words.get(word, word) for word in shlex.split(case["call"])])
+    return CliRunner().invoke(
+        afm_jax, [words.get(word, word) for word in shlex.split(case["call"])], prog_name="afm-jax"
+    )
+
+
+def line_of(result: Result) -> str:
+    """Return what a command said on standard error, whatever the folders are called."""
+    return result.stderr.replace(str(TABLE), "TABLE").replace(str(Path.cwd()), "HERE")
 
 
 def main() -> None:
@@ -50,9 +66,9 @@ def main() -> None:
     bases, cases = corpus()
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
+        write_sound_files()
         for case in cases:
-            said = run(bases[case["of"]], case).stderr
-            case["says"] = said.strip().removeprefix("afm-jax: ").replace(str(TABLE), "TABLE")
+            case["says"] = line_of(run(bases[case["of"]], case)).strip().removeprefix("afm-jax: ")
     lines = [json.dumps(line, ensure_ascii=False) for line in (*bases.values(), *cases)]
     CORPUS.write_text("\n".join(lines) + "\n", encoding="utf-8")
 

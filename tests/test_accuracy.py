@@ -161,18 +161,3 @@ def test_overview_draws_a_panel_a_problem(tmp_path: Path, monkeypatch: pytest.Mo
     assert {row["own"] for row in payload["cheapest"]} == {None, "ours, a"}  # an error of 1e-8 is not one of 1e-9
     assert json.loads((tmp_path / "accuracy.json").read_text("utf-8")) == payload
     assert (tmp_path / "accuracy.png").read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "line"),
-    [
-        (["accuracy", "speed"], "there is no accuracy study of `speed`; choose: map, collide"),
-        (["accuracy", "--wanted-error-us", "0"], "must be a positive number, but is 0"),
-    ],
-)
-def test_wrong_calls_are_one_line(arguments: list[str], line: str):
-    result = CliRunner().invoke(main, arguments)
-    assert result.exit_code == 2
-    assert result.stdout == ""
-    assert line in result.stderr
-    assert len(result.stderr.splitlines()) == 1

@@ -160,15 +160,3 @@ def test_command_tells_all_of_a_law_scene(law_file: str, tmp_path: Path, monkeyp
     assert (tmp_path / "accuracy.png").read_bytes().startswith(b"\x89PNG")
     assert {"rows", "ladder", "reference_error_us", "reference_error_nm", "law"} <= set(payload)
     assert payload["contacts"] == 5
-
-
-def test_wrong_calls_are_one_line(tmp_path: Path):
-    save_scene(Scene(Cantilever(90.0, 40.0), Platform(1.0, 180.0)), tmp_path / "free.toml")
-    for name, line in (
-        (str(tmp_path / "free.toml"), "is free"),
-        (str(tmp_path / "none.toml"), "there is no such file"),
-    ):
-        result = CliRunner().invoke(main, ["accuracy", name])
-        assert (result.exit_code, result.stdout) == (2, "")
-        assert line in result.stderr
-        assert len(result.stderr.splitlines()) == 1

@@ -146,12 +146,6 @@ def test_command_writes_tables_and_one_json_object(tmp_path: Path, monkeypatch: 
     assert len(lines) == 1 + len(payload["rows"])
 
 
-def test_wrong_batch_is_one_line():
-    result = CliRunner().invoke(main, ["bench", "--batch", "0"])
-    assert result.exit_code == 2
-    assert "0 is not in the range" in result.stderr
-
-
 def batch_of_one(rows: NextImpact) -> NextImpact:
     """Return a tip's impacts with a leading axis of one."""
     return jax.tree.map(lambda part: part[None], rows)

@@ -61,25 +61,6 @@ def fit() -> Callable[..., Result]:
     return lambda *arguments: CliRunner().invoke(main, ["fit", *map(str, arguments)], prog_name="afm-jax")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["a.csv", "b.csv", "--bootstrap", "50"], "--bootstrap is about one table"),
-        (["a.csv", "b.csv", "--compare", "--hierarchical"], "--compare is about tables that have one law"),
-        (["a.csv", "--share", "all"], "--share is about several tables"),
-        (["a.csv", "b.csv", "--each", "--hierarchical"], "--hierarchical is about several tables"),
-        (["a.csv", "--workers", "2"], "--workers is about several tables: add --each"),
-        (["a.csv", "--each", "--compare"], "--compare is about one table: leave --each out"),
-        (["a.csv", "--each"], "a.csv"),
-    ],
-)
-def test_wrong_calls_are_one_line(fit: Callable[..., Result], arguments: list[str], message: str):
-    result = fit(*arguments)
-    assert result.exit_code == 2
-    assert message in result.stderr
-    assert len(result.stderr.splitlines()) == 1
-
-
 @pytest.mark.slow
 def test_every_fit_is_that_of_its_table_alone(tmp_path: Path, fit: Callable[..., Result]):
     tables = [table(), table(1.02)]

@@ -129,29 +129,3 @@ def test_a_sweep_beside_the_resonance_ends_with_exit_code_3(tmp_path, as_json):
         assert "NOT VALID" in result.stdout
         assert "free_frequency_khz" not in result.stdout
     assert (tmp_path / "out" / "calibration.png").read_bytes().startswith(b"\x89PNG")
-
-
-@pytest.mark.parametrize(
-    ("text", "arguments", "said"),
-    [
-        (None, [], "there is no such file"),
-        ("frequency_khz,amplitude_nm\n1,x\n", [], "line 2, column amplitude_nm: 'x' is not a number"),
-        ("frequency_khz,amplitude_nm\n1,2\n2,3\n", [], "2 frequencies are too few for the 5 parameters"),
-        (
-            "frequency_khz,amplitude_nm\n1,2\n2,3\n",
-            ["--background", "linear"],
-            "without phase is none, floor, constant",
-        ),
-        ("frequency_khz,amplitude_nm\n1,2\n", ["--noise", "0"], "must be a relative error such as 1% or 0.01"),
-        ("frequency_khz,amplitude_nm\n1,2\n", ["--background", "flat"], "is not one of 'none', 'floor'"),
-    ],
-)
-def test_wrong_calls_end_with_one_line_and_exit_code_2(tmp_path, text, arguments, said):
-    path = tmp_path / "sweep.csv"
-    if text is not None:
-        path.write_text(text, encoding="utf-8")
-    result = run(path, *arguments)
-    assert result.exit_code == 2
-    assert result.stdout == ""
-    assert len(result.stderr.strip().splitlines()) == 1
-    assert said in result.stderr

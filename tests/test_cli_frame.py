@@ -94,23 +94,6 @@ def test_version_is_the_installed_one():
 
 
 @pytest.mark.parametrize(
-    ("arguments", "expected"),
-    [
-        (["orbit"], "there is no command `orbit`; did you mean `orbits`?"),
-        (["--versoin"], "there is no option `--versoin`; did you mean `--version`?"),
-        (["orbits", "a.toml", "--ordr", "1"], "there is no option `--ordr`; did you mean `--order`?"),
-        (["orbits", "a.toml"], "Missing option '--order' (see afm-jax orbits --help)"),
-        (["orbits", "a.toml", "--order", "0"], "must be a positive integer up to 1000000, but is 0"),
-        (["orbits", "a.toml", "--order", "1.5"], "must be a positive integer up to 1000000, but is 1.5"),
-    ],
-)
-def test_wrong_calls_are_one_line(arguments: list[str], expected: str):
-    result = CliRunner().invoke(main.main, arguments, prog_name="afm-jax")
-    assert result.exit_code == 2
-    assert expected in one_line(result)
-
-
-@pytest.mark.parametrize(
     ("error", "code", "line"),
     [
         (ValueError("`r` must be in [0, 1],\nbut is 2"), 2, "`r` must be in [0, 1], but is 2"),

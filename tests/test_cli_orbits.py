@@ -78,21 +78,3 @@ def test_orbits_through_the_platform_do_not_count(tmp_path: Path):
     answer = strictly(result.stdout)
     assert (result.exit_code, len(answer["orbits"])) == (3, len(expected))
     assert "try --order 1" in answer["reason"]
-
-
-def test_a_ramp_has_no_periodic_orbit(tmp_path: Path):
-    path = saved(SCENES["damped"], tmp_path / "scene.toml", offset_rate=1e-3)
-    result = orbits(path, "--order", "1")
-    assert result.exit_code == 2
-    line = f"afm-jax: {path}: `offset_rate_nm_per_us` must be 0 for a periodic orbit, but is 0.001\n"
-    assert (result.stdout, result.stderr) == ("", line)
-
-
-def test_a_wrong_scene_is_one_line(tmp_path: Path):
-    path = tmp_path / "scene.toml"
-    path.write_text("[platform]\nfrequency_hz = 1\n", encoding="utf-8")
-    result = orbits(str(path), "--order", "1", "--json")
-    assert result.exit_code == 2
-    assert result.stdout == ""
-    assert len(result.stderr.splitlines()) == 1
-    assert str(path) in result.stderr

@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner
 from matplotlib.image import imread
 
-from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, save_scene
+from afm_jax import Cantilever, Contact, Platform, Scene, save_scene
 from afm_jax.cli.collide import COLUMNS
 from afm_jax.cli.main import main
 from afm_jax.cli.values import parse_numbers
@@ -230,40 +230,3 @@ def test_long_lists_are_cut_in_the_text_only():
     assert "The first 40 of 49 collisions" in result.stdout
     assert "unit" not in result.stderr
     assert len(answer("--speeds", "12:60:1")["captured"]) == 49
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["--speeds", "fast"], "the speed `fast` is not a positive number; write 12,15,20 or start:stop:step"),
-        (["--speeds=-3"], "the speed `-3` is not a positive number"),
-        (["--speeds", "nan"], "the speed `nan` is not a positive number"),
-        (["--speeds", "inf"], "the speed `inf` is not a positive number"),
-        (["--speeds", ""], "names no speed"),
-        (["--speeds", "12,,15"], "the speed `` is not a positive number"),
-        (["--speeds", "20:10:1"], "`20:10:1` ends below its start"),
-        (["--speeds", "10:20"], "`10:20` is no range"),
-        (["--speeds", "10:20:0"], "the step `0` is not a positive number"),
-        (["--speeds", "1:1e9:1e-3"], "has more than 1000000 speeds"),
-        (["--no-core"], "--no-core is not possible: without the core repulsion"),
-        (["--no-jkr"], "--no-jkr is not possible: the JKR contact is the solid junction itself"),
-        (["--no-viscous", "--viscosity-pa-s", "1"], "--viscosity-pa-s changes nothing without the effect viscous"),
-        (["--relative-humidity", "1.2"], "`--relative-humidity` must be between 0 and 1, but is 1.2"),
-        (["--relative-humidity", "wet"], "'--relative-humidity': must be a finite number, but is wet"),
-        (["--mass-ng", "0"], "`--mass-ng` must be positive, but is 0"),
-        (["--adhesion-energy-j-per-m2", "0.05"], "the contact has no junction: the bridge pulls harder"),
-        (["--accuracy", "1e-15"], "`accuracy` must be at least 1e-11"),
-        (["none.toml"], "none.toml: there is no such file"),
-        (["law.toml"], 'law.toml: [interaction] model: must be "contact" here, but is "law"'),
-    ],
-)
-def test_wrong_calls_end_with_one_line_and_exit_code_2(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[str], said: str
-):
-    monkeypatch.chdir(tmp_path)
-    save_scene(Scene(Cantilever(90.0), Platform(4.0, 180.0), ImpactLaw(r=0.9)), tmp_path / "law.toml")
-    result = run(*arguments)
-    assert result.exit_code == 2
-    assert result.stdout == ""
-    assert len(result.stderr.strip().splitlines()) == 1
-    assert said in result.stderr

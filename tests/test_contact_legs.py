@@ -20,10 +20,10 @@ from afm_jax.contact.bridge_leg import (
 )
 from afm_jax.contact.collide import collide
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.driven import Place, driven_by, free_tip
+from afm_jax.contact.driven import ContactState, driven_by, free_tip
 from afm_jax.contact.junction import Phase, find_junction
-from afm_jax.contact.settings import DRIVEN_SETTINGS, METHODS, QuickSetting, driven_setting_of
-from afm_jax.contact.step import advance, eighth_order_step, fresh_touch
+from afm_jax.contact.settings import DRIVEN_SETTINGS, QuickSetting, driven_setting_of
+from afm_jax.contact.step import TipInContact, advance, eighth_order_step
 from afm_jax.motion.contact_motion import cross
 from afm_jax.scenefile.presets import contact_scene
 from afm_jax.solve.lanes import repeat_for
@@ -44,8 +44,8 @@ def crossed(contacts, setting: QuickSetting):
     driven = driven_by(scene.interaction, scene.cantilever, scene.platform)
     time = jnp.asarray([contact.arrival_time_us for contact in contacts])
     speed = jnp.asarray([contact.approach_speed_nm_per_us for contact in contacts])
-    place = Place(jnp.full_like(time, driven.forms_nm), -speed, time, jnp.zeros_like(time))
-    return jax.jit(cross, static_argnums=2)(driven, place, setting)
+    state = ContactState(jnp.full_like(time, driven.forms_nm), -speed, time, jnp.zeros_like(time))
+    return jax.jit(cross, static_argnums=2)(driven, state, setting)
 
 
 def column(contacts, name: str) -> np.ndarray:
@@ -65,11 +65,11 @@ def test_straight_contacts_are_those_of_an_independent_integration(contacts, acc
     assert not holds[column(contacts, "junctions") != 1].any()
     assert (column(contacts, "junctions") != 1).any()
     rebound, left = column(contacts, "rebound_speed_nm_per_us"), column(contacts, "departure_time_us")
-    np.testing.assert_allclose(np.asarray(leg.place.gap_rate)[holds], rebound[holds], rtol=accuracy)
-    np.testing.assert_allclose(np.asarray(leg.place.time_us)[holds], left[holds], rtol=0.0, atol=0.1 * accuracy)
+    np.testing.assert_allclose(np.asarray(leg.state.gap_rate)[holds], rebound[holds], rtol=accuracy)
+    np.testing.assert_allclose(np.asarray(leg.state.time_us)[holds], left[holds], rtol=0.0, atol=0.1 * accuracy)
     lost = column(contacts, "viscous_loss_aj")
     # the loss is a small part of the energy, and no more accurate than that
-    np.testing.assert_allclose(np.asarray(leg.place.viscous_loss_aj)[holds], lost[holds], rtol=10.0 * accuracy)
+    np.testing.assert_allclose(np.asarray(leg.state.viscous_loss_aj)[holds], lost[holds], rtol=10.0 * accuracy)
     deepest = column(contacts, "deepest_gap_nm")
     # where the speed is 0 an error of it counts twice; the reference reads the turning point from its steps
     np.testing.assert_allclose(np.asarray(leg.deepest_gap_nm)[holds], deepest[holds], rtol=0.0, atol=1e-5)
@@ -83,7 +83,7 @@ def test_nodes_and_sweeps_converge(contacts):
         leg = crossed(contacts, QuickSetting(7 + more, 5 + more, 6 + more, 7 + more, 1e-2, 3 + more, 2 + more, 0.1))
         straight = column(contacts, "junctions") == 1
         held = np.asarray(leg.holds) & straight
-        errors.append(np.median(np.abs(np.asarray(leg.place.gap_rate) / rebound - 1.0)[held]))
+        errors.append(np.median(np.abs(np.asarray(leg.state.gap_rate) / rebound - 1.0)[held]))
     # geometric: every three nodes and sweeps win more than a digit and a half, down to the reference's own digits
     assert errors[1] < 0.03 * errors[0]
     assert errors[2] < max(0.03 * errors[1], 1e-12)
@@ -97,7 +97,7 @@ def test_a_leg_says_where_it_does_not_hold():
     # a platform that falls away as fast as the tip comes, one that rises: the first tips turn in the bridge
     rates = jnp.asarray([-0.1, -1.0, 20.0, jnp.nan, -60.0])
     time = jnp.full_like(rates, 0.5 * float(scene.platform.period_us))
-    leg = go_in(driven, Place(jnp.full_like(rates, 3.5), rates, time, jnp.zeros_like(rates)), quick)
+    leg = go_in(driven, ContactState(jnp.full_like(rates, 3.5), rates, time, jnp.zeros_like(rates)), quick)
     assert np.asarray(leg.holds).tolist() == [False, False, False, False, True]
 
 
@@ -106,41 +106,40 @@ def free():
     """Free tips where the bridge forms, and what `collide` says of them."""
     contact, speeds = Contact.paper(), jnp.asarray([12.5, 15.0, 22.0, 45.0, 120.0, 200.0])
     tip = free_tip(contact, find_junction(contact), jnp.asarray(1.0))
-    place = Place(jnp.full_like(speeds, tip.forms_nm), -speeds, jnp.zeros_like(speeds), jnp.zeros_like(speeds))
-    return tip, place, collide(contact, speeds, accuracy=1e-11)
+    state = ContactState(jnp.full_like(speeds, tip.forms_nm), -speeds, jnp.zeros_like(speeds), jnp.zeros_like(speeds))
+    return tip, state, collide(contact, speeds, accuracy=1e-11)
 
 
-def assert_leaves(place: Place, expected):
+def assert_leaves(state: ContactState, expected):
     """Compare with a collision: 1e-9 of the speed, 1e-10 us of the time, as driven contacts promise."""
-    np.testing.assert_allclose(place.gap_rate, expected.rebound_speed_nm_per_us, rtol=1e-9)
-    np.testing.assert_allclose(place.time_us, expected.time_in_contact_us, rtol=0.0, atol=1e-10)
-    np.testing.assert_allclose(place.viscous_loss_aj, expected.viscous_loss_aj, rtol=1e-9)
+    np.testing.assert_allclose(state.gap_rate, expected.rebound_speed_nm_per_us, rtol=1e-9)
+    np.testing.assert_allclose(state.time_us, expected.time_in_contact_us, rtol=0.0, atol=1e-10)
+    np.testing.assert_allclose(state.viscous_loss_aj, expected.viscous_loss_aj, rtol=1e-9)
 
 
 def test_the_legs_of_driven_contacts_take_a_free_tip_where_collide_does(free):
-    tip, place, expected = free
-    leg = jax.jit(cross, static_argnums=2)(tip, place, QuickSetting(24, 18, 30, 24, 1e-9, 12, 2, 1e-2))
+    tip, state, expected = free
+    leg = jax.jit(cross, static_argnums=2)(tip, state, QuickSetting(24, 18, 30, 24, 1e-9, 12, 2, 1e-2))
     assert np.asarray(leg.holds).all()
-    assert_leaves(leg.place, expected)
+    assert_leaves(leg.state, expected)
     np.testing.assert_allclose(leg.deepest_gap_nm, expected.deepest_gap_nm, rtol=1e-12)
 
 
-@pytest.mark.parametrize("method", METHODS)
-def test_steps_in_time_take_a_free_tip_where_collide_does(free, method):
-    tip, place, expected = free
+def test_steps_in_time_take_a_free_tip_where_collide_does(free):
+    tip, state, expected = free
 
     @jax.jit
-    def through(place):
+    def through(state):
         def more(touch):
-            after = advance(tip, touch, jnp.asarray(100.0), 6.0, method)
+            after = advance(tip, touch, jnp.asarray(100.0), 6.0)
             inside = touch.phase != Phase.DRY
             return jax.tree.map(lambda new, old: jnp.where(inside, new, old), after, touch)
 
-        touch = fresh_touch(place, jnp.full(place.x.shape, Phase.BRIDGE))
+        touch = TipInContact.at_start(state, jnp.full(state.x.shape, Phase.BRIDGE))
         return jax.lax.while_loop(lambda touch: jnp.any(touch.phase != Phase.DRY), more, touch)
 
-    touch = through(place)
-    assert_leaves(touch.place, expected)
+    touch = through(state)
+    assert_leaves(touch.state, expected)
     np.testing.assert_allclose(touch.time_in_junction_us, expected.time_in_junction_us, rtol=0.0, atol=1e-10)
 
 
@@ -151,18 +150,18 @@ def test_both_integrators_take_a_driven_tip_through_the_bridge(inward):
     rates = jnp.asarray([40.0, 60.0, 200.0]) * (-1.0 if inward else 1.0)
     time = jnp.asarray([0.1, 0.3, 0.8]) * scene.platform.period_us
     gaps = driven.forms_nm if inward else driven.breaks_nm, driven.junction.forms_gap_nm
-    place = Place(jnp.zeros_like(rates), rates, time, jnp.zeros_like(rates))
+    state = ContactState(jnp.zeros_like(rates), rates, time, jnp.zeros_like(rates))
 
     @jax.jit
-    def both(place):
-        way = driven_way(driven, gaps, place, inward=inward)
+    def both(state):
+        way = driven_way(driven, gaps, state, inward=inward)
         return pass_in_steps(way, 40), sweep(way, 30, 25).passage
 
-    for stepped, swept in zip(*both(place), strict=True):
+    for stepped, swept in zip(*both(state), strict=True):
         np.testing.assert_allclose(stepped, swept, rtol=1e-10)
     # the drive counts: a free tip ends elsewhere
-    alone = sweep(driven_way(driven._replace(drive=None), gaps, place, inward=inward), 30, 25).passage
-    assert (np.abs(np.asarray(alone.energy_aj) / np.asarray(both(place)[1].energy_aj) - 1.0) > 1e-3).all()
+    alone = sweep(driven_way(driven._replace(drive=None), gaps, state, inward=inward), 30, 25).passage
+    assert (np.abs(np.asarray(alone.energy_aj) / np.asarray(both(state)[1].energy_aj) - 1.0) > 1e-3).all()
 
 
 @pytest.mark.slow
@@ -190,18 +189,29 @@ def test_steps_in_the_gap_are_those_of_diffrax(solver):
     np.testing.assert_allclose(found.time_us, solution.ys[1][-1], rtol=1e-13)
 
 
-def test_a_step_is_of_order_eight():
-    # x'' = 2 x^3, of which x = 1/(1 + t) is a solution
-    def rates(place):
-        return Place(place.gap_rate, 2.0 * place.x**3, jnp.ones_like(place.x), jnp.zeros_like(place.x))
+def rates(state: ContactState) -> ContactState:
+    """X'' = 2 x^3, of which x = 1/(1 + t) is a solution."""
+    return ContactState(state.gap_rate, 2.0 * state.x**3, jnp.ones_like(state.x), jnp.zeros_like(state.x))
 
+
+def test_a_step_in_time_is_that_of_diffrax():
+    state, length = ContactState(*(jnp.array([value, 0.7]) for value in (1.0, -1.0, 0.0, 0.2))), jnp.array([0.3, 0.8])
+    solver = diffrax.Dopri8()
+    term = diffrax.ODETerm(lambda _, state, __: ContactState(*(length * rate for rate in rates(state))))
+    memory = solver.init(term, 0.0, 1.0, state, None)
+    expected = solver.step(term, 0.0, 1.0, state, None, memory, made_jump=False)[0]
+    for found, wanted in zip(eighth_order_step(rates, state, length), expected, strict=True):
+        np.testing.assert_allclose(found, wanted, rtol=1e-14, atol=1e-14)
+
+
+def test_a_step_is_of_order_eight():
     errors = []
     for count in (6, 12):
-        place = Place(*(jnp.asarray(value) for value in (1.0, -1.0, 0.0, 0.0)))
+        state = ContactState(*(jnp.asarray(value) for value in (1.0, -1.0, 0.0, 0.0)))
         for _ in range(count):
-            place = eighth_order_step(rates, place, jnp.asarray(1.5 / count))
-        errors.append(abs(float(place.x) * 2.5 - 1.0))
-        assert float(place.time_us) == pytest.approx(1.5, rel=1e-14)
+            state = eighth_order_step(rates, state, jnp.asarray(1.5 / count))
+        errors.append(abs(float(state.x) * 2.5 - 1.0))
+        assert float(state.time_us) == pytest.approx(1.5, rel=1e-14)
     slope = np.log(errors[0] / errors[1]) / np.log(2.0)
     # steps of a quarter and an eighth of the time scale leave some of the next order
     assert slope == pytest.approx(8.0, abs=0.5)

@@ -2,7 +2,6 @@
 
 import csv
 import json
-from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
@@ -137,46 +136,6 @@ def test_too_few_points_determine_nothing():
     assert found.exit_code == 3
     assert strictly(found.stdout)["expected"]["r"]["standard_error"] is None
     assert "do not determine r and epsilon" in found.stderr
-
-
-@pytest.mark.parametrize(
-    ("arguments", "fault"),
-    [
-        ((), "give --free-frequency-khz"),
-        (("--free-frequency-khz", 90, "--fit", "fit.json"), "leave one of them out"),
-        (("--free-frequency-khz", 90, "--model", "law", "--free", "r"), "held at a value (--fix)"),
-        (("--free-frequency-khz", 90, "--model", "law", "--fix", "lag=1"), "--fix must name parameters of the model"),
-        (("--fit", "a", "--measured", "b"), "give one of them"),
-        ((*CANTILEVER, "--frequencies-khz", 180, "--detuning", 1), "give one"),
-        ((*CANTILEVER, "--offsets-nm", "1;2"), "is not a number"),
-        ((*CANTILEVER, "--orders", "0"), "is no order"),
-        ((*CANTILEVER, "--drive-nm", "-2"), "must hold positive numbers"),
-        ((*CANTILEVER, "--for", "viscosity"), "names 'viscosity'"),
-        ((*CANTILEVER, "--r", 1.5), "r must be between"),
-        ((*CANTILEVER, "--viscous-loss", 0.5), "the model 'law+delay' has"),
-        ((*CANTILEVER, "--offset-origin-nm", "0 +- 1"), "shift the same thing"),
-        ((*CANTILEVER, "--tip-calibration", "1"), "needs its standard error"),
-        ((*CANTILEVER, "--value", "humidity"), "is no NAME=NUMBER"),
-        ((*CANTILEVER, "--largest-nm", -1), "`largest_nm` must be positive"),
-        ((*CANTILEVER, "--frequencies-khz", "100:200:0.01"), "take coarser steps"),
-        (("--fit", "nowhere.json"), "nowhere.json"),
-    ],
-)
-def test_a_wrong_call_is_one_line(arguments, fault):
-    found = run(*arguments)
-    assert found.exit_code == 2, found.output
-    assert fault in found.stderr
-    assert len(found.stderr.splitlines()) == 1
-    assert found.stdout == ""
-
-
-@pytest.mark.parametrize(("text", "fault"), [("{", "is no JSON"), ("[]", "is no fit"), ("{}", "is no fit")])
-def test_a_file_that_is_no_fit_is_named(tmp_path: Path, text, fault):
-    path = tmp_path / "fit.json"
-    path.write_text(text, encoding="utf-8")
-    found = run("--fit", path)
-    assert found.exit_code == 2
-    assert fault in found.stderr
 
 
 def test_help_needs_no_jax():

@@ -339,39 +339,6 @@ def test_the_command_writes_what_it_says(called):
     assert json.loads((folder / "out" / "effects.json").read_text(encoding="utf-8")) == payload
 
 
-@pytest.mark.parametrize("accuracy", ["0", "abc", "150%", "-1%", "nan", "1%1"])
-def test_a_bad_accuracy_is_one_line(tmp_path, accuracy):
-    save_scene(law_scene(), tmp_path / "scene.toml")
-    result = CliRunner().invoke(main, ["effects", str(tmp_path / "scene.toml"), f"--accuracy={accuracy}"])
-    assert result.exit_code == 2
-    assert result.stdout == ""
-    assert result.stderr.count("\n") == 1
-    assert "accuracy" in result.stderr
-
-
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (["--duration-us", "-3"], "--duration-us"),
-        (["--only", "gravity"], "no effect 'gravity'"),
-        (["--write", "no/such/folder/reduced.toml"], "there is no folder"),
-    ],
-)
-def test_a_bad_call_is_one_line(tmp_path, options, said):
-    save_scene(law_scene(), tmp_path / "scene.toml")
-    result = CliRunner().invoke(main, ["effects", str(tmp_path / "scene.toml"), *options])
-    assert result.exit_code == 2
-    assert result.stderr.count("\n") == 1
-    assert said in result.stderr
-
-
-def test_an_unknown_scene_is_one_line():
-    result = CliRunner().invoke(main, ["effects", "figure99"])
-    assert result.exit_code == 2
-    assert result.stderr.count("\n") == 1
-    assert "figure11" in result.stderr
-
-
 @pytest.mark.parametrize("text", ["1%", "0.01", "1 %", " 1% "])
 def test_a_share_can_be_written_in_two_ways(text):
     assert math.isclose(parse_share(text), 0.01, rel_tol=1e-15)

@@ -240,15 +240,3 @@ def test_without_out_the_folder_is_figures(monkeypatch: pytest.MonkeyPatch, tmp_
     assert len({tuple(row[name] for name in PARAMETERS) for row in rows}) == len(rows)
     assert all(float(row["r"]) <= 1.0 for row in rows)
     assert "holds: the amplitude falls" in result.stdout
-
-
-@pytest.mark.parametrize(
-    ("only", "says"),
-    [("1", "no figure `1`"), ("2,twelve", "no figure `twelve`"), (" , ", "names no figure")],
-)
-def test_other_figures_are_refused_in_one_line(only: str, says: str, tmp_path: Path):
-    result = figures("--only", only, "--out", str(tmp_path))
-    assert result.exit_code == 2
-    assert says in result.stderr
-    assert "choose from 2, 3, 4, 5, 6, 7, 8, 9, 10, 11" in result.stderr
-    assert result.stderr.count("\n") == 1

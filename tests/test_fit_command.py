@@ -301,33 +301,6 @@ def test_scaled_errors_are_said(tmp_path):
     assert any("errors were scaled" in warning for warning in answer["warnings"])
 
 
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["no.csv"], "there is no such file"),
-        ([], "give a table to fit"),
-        (["--example", str(EXAMPLE)], "give a table to fit"),
-        (["--example", "--model", "hertz"], "is not one of 'restitution', 'law', 'viscous'"),
-        (["--example", "--noise", "120%"], "must be a relative error such as 1% or 0.01"),
-        (["--example", "--free", "r"], "epsilon must be fitted (--free) or held at a value (--fix)"),
-        (["--example", "--free", "r", "--fix", "r=0.9"], "r is both fitted (--free) and held fixed (--fix)"),
-        (["--example", "--fix", "viscous_loss=1"], "--fix must name parameters of the model 'law' (r, epsilon)"),
-        (["--example", "--fix", "r=1.2"], "--fix: r must lie between 0.01 and 1, but is 1.2"),
-        (["--example", "--model", "restitution", "--fix", "r=0.9"], "--free must name at least one parameter that is"),
-        (["--example", "--no", "viscous"], "--no is about the contact's effects"),
-        (["--example", "--model", "contact", "--free", "modulus_gpa", "--fix", "modulus_gpa=90"], "both fitted"),
-        (["--example", "--model", "contact", "--free", "viscosity_pa_s", "--no", "viscous"], "changes nothing without"),
-        (["--example", "--model", "contact", "--fix", "viscosity_pa_s=1e-3", "--no", "viscous"], "changes nothing"),
-    ],
-)
-def test_wrong_calls_end_with_one_line_and_exit_code_2(arguments, said):
-    result = run(*arguments)
-    assert result.exit_code == 2
-    assert result.stdout == ""
-    assert len(result.stderr.strip().splitlines()) == 1
-    assert said in result.stderr
-
-
 def test_a_package_that_a_file_for_arviz_needs_is_asked_for_before_the_fit(tmp_path, monkeypatch):
     have = importlib.util.find_spec
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "h5netcdf" else have(name))

@@ -257,23 +257,3 @@ def test_command_takes_ranges_and_contacts():
     text = run("--no-viscous").stdout
     assert "Collision delay = lag - lead" in text
     assert "Delay law: hertz" in text
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["--speed-range", "20:5"], "`20:5` does not rise; write low:high, as 12:150"),
-        (["--speed-range", "20"], "`20` is no range"),
-        (["--speed-range", "x:5"], "the lower end `x` is not a positive number"),
-        (["--speed-range", "5:20"], "must begin above the capture speed"),
-        (["--points", "3"], "3 is not in the range"),
-        (["--no-jkr"], "--no-jkr is not possible"),
-        (["--viscosity-pa-s", "1e6"], "there is no law to fit"),
-    ],
-)
-def test_wrong_calls_end_with_one_line_and_exit_code_2(arguments: list[str], said: str):
-    result = run(*arguments)
-    assert result.exit_code == 2
-    assert result.stdout == ""
-    assert len(result.stderr.strip().splitlines()) == 1
-    assert said in result.stderr

@@ -484,26 +484,6 @@ def test_a_ramp_there_and_back_is_parted_where_it_turns(tmp_path: Path):
 # ---- wrong and damaged files
 
 
-@pytest.mark.parametrize(
-    ("data", "said"),
-    [
-        (b"", "the file is empty"),
-        (b"\x00\x01\x02 what", "is neither text nor a known format"),
-        (b"hello\n", "columns separated by tabs, semicolons or commas are expected"),
-        (HEAD.encode(), "there are column names but no rows of numbers"),
-        (HEAD.encode() + b"1,2,3\n2,3\n", "line 3: there are 2 cells for 3 columns"),
-        (HEAD.encode() + b"1,2,3\n2,x,4\n", "row 2, channel lockin_amplitude_nm: is not a number"),
-        (b"WSxM file copyright UAM\r\n", r"no '\[Header end\]'"),
-        (b"[DataSet]\r\nVersion=2\r\n", "the mark '#!' in front of the data is missing"),
-        (b"GWYP", "damaged or cut off"),
-    ],
-)
-def test_wrong_files_are_one_line(tmp_path: Path, data: bytes, said: str):
-    with pytest.raises(TableError, match=said) as caught:
-        read_curves(saved(tmp_path, data))
-    assert "\n" not in str(caught.value)
-
-
 def test_what_reads_a_format_is_named_where_it_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     def missing(name: str):
         raise ModuleNotFoundError(name=name)
@@ -609,22 +589,6 @@ def test_refused_curves_end_with_exit_code_3_beside_the_tables_of_the_others(tmp
     assert set(given(read_table(tmp_path / "wsxm_1.csv").retract)) == {0.0, 1.0}
     assert run(AMPLITUDES, "--curve", 1).exit_code == 0
     assert run(AMPLITUDES, "--curve", 9).exit_code == 2
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["--free-frequency-khz", "-1"], "`free_frequency_khz` must be finite and above 0"),
-        (["--columns", "offset_nm=Q:nm"], "there is no channel `Q` for offset_nm; it has Z, M0A"),
-        (["--columns", "offset_nm"], "is no COLUMN=CHANNEL"),
-        (["--nm-per-volt", "steep"], "steep"),
-    ],
-)
-def test_wrong_calls_are_one_line(arguments: list[str], said: str):
-    result = run(NEASNOM, *arguments)
-    assert (result.exit_code, result.stdout) == (2, "")
-    assert said in result.stderr
-    assert len(result.stderr.splitlines()) == 1
 
 
 def test_a_wave_that_is_no_ramp_is_named(tmp_path: Path):

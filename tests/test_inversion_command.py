@@ -105,27 +105,6 @@ def test_two_rows_end_with_exit_code_3(tmp_path):
     assert "NOT VALID" in result.stdout
 
 
-@pytest.mark.parametrize(
-    ("table", "arguments", "said"),
-    [
-        (None, (), "give a table to invert"),
-        ([HEAD.rsplit(",", 2)[0], ROWS[0].rsplit(",", 2)[0]], (), "add the columns phase_deg and phase_error_deg"),
-        ([HEAD, ROWS[0]], ("--frequency-error", "-1"), "frequency-error"),
-        ([HEAD, ROWS[0]], ("--truth", "TABLE"), "is none of a law's"),
-        ([HEAD, ROWS[0]], ("--law", "TABLE"), "is none of a law's"),
-    ],
-)
-def test_wrong_calls_end_with_one_line_and_exit_code_2(tmp_path, table, arguments, said):
-    path = tmp_path / "table.csv"
-    if table is not None:
-        path.write_text(COMMENTS + "\n".join(table) + "\n", encoding="utf-8")
-    given = [] if table is None else [path]
-    result = run(*given, *(path if argument == "TABLE" else argument for argument in arguments))
-    assert result.exit_code == 2
-    assert said in result.stderr
-    assert len(result.stderr.strip().splitlines()) == 1
-
-
 def on_resonance(path):
     """Write the bundled rows on resonance without their phase."""
     columns = HEAD.split(",")[:8]
@@ -169,22 +148,3 @@ def test_a_fitted_law_is_drawn_over_the_rows(tmp_path):
     refused = run(tmp_path / "table.csv", "--law", path)
     assert refused.exit_code == 2
     assert "the fit is not valid" in refused.stderr
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("approach_speed_nm_per_us,rebound_speed_nm_per_us\n20,16.6\n", "at least four speeds"),
-        ("approach_speed_nm_per_us,rebound_speed_nm_per_us\n20,16\n20,17\n30,26\n40,38\n", "must increase"),
-        ("# a law\napproach_speed_nm_per_us,rebound_speed_nm_per_us\n20,16\n30,fast\n", "line 4: `rebound_speed"),
-        ("approach_speed_nm_per_us,rebound_speed_nm_per_us\n20,16\n30,\n", "line 3: `rebound_speed"),
-        ("approach_speed_nm_per_us,rebound_speed_nm_per_us\n20,16\n30\n", "line 3 has 1 values for 2 columns"),
-        ("", "is empty"),
-    ],
-)
-def test_faulty_truths_are_refused(tmp_path, text, said):
-    path = tmp_path / "truth.csv"
-    path.write_text(text, encoding="utf-8")
-    result = run(EXAMPLE, "--truth", path)
-    assert result.exit_code == 2
-    assert said in result.stderr

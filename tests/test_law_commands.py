@@ -125,31 +125,3 @@ def test_motions_and_sweeps_say_where_the_law_is_extrapolated(tmp_path):
         assert "known" in payload["extrapolated"]
         assert "150 to 400 nm/us" in payload["extrapolated"]
     assert re.match(r"Extrapolated: at [123] of 3 points", told["sweep"]["extrapolated"])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (("--points", "40"), "--points is of the formulas of a law: add --make-law"),
-        (("--make-law", "--speeds", "12"), "--make-law chooses its own speeds: leave --speeds out"),
-    ],
-)
-def test_options_of_a_law_go_with_it(arguments, said):
-    result = CliRunner().invoke(main, ["collide", *arguments])
-    assert result.exit_code == 2
-    assert said in result.stderr
-    assert len(result.stderr.strip().splitlines()) == 1
-
-
-@pytest.mark.parametrize("command", ["orbits", "simulate", "continue", "chart", "basins", "lyapunov", "bifurcation"])
-def test_a_wrong_law_ends_with_one_line(command, tmp_path):
-    (tmp_path / "scene.toml").write_text(SCENE + "r = 0.9\n")
-    (tmp_path / "law.csv").write_text("approach_speed_nm_per_us,rebound_speed_nm_per_us\n1,0.5\n2,1\n3,2\n")
-    needed: dict[str, tuple[str, ...]] = {"orbits": ("--order", "1"), "simulate": ("--periods", "2")}
-    needed["continue"] = ("--order", "1", "--parameter", "platform.amplitude_nm=1:2")
-    needed["chart"] = ("--x", "platform.amplitude_nm=1:2:2", "--y", "platform.reduced_frequency=1:2:2")
-    needed["bifurcation"] = ("--parameter", "platform.amplitude_nm=1:2:2")
-    arguments = [command, str(tmp_path / "scene.toml"), *needed.get(command, ()), "--law", str(tmp_path / "law.csv")]
-    result = CliRunner().invoke(main, arguments)
-    assert result.exit_code == 2
-    assert result.stderr.strip().splitlines()[-1].endswith("a table of a law needs at least four speeds, but has 3")

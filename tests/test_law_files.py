@@ -123,64 +123,6 @@ def test_measured_columns_in_other_units(unit, size, tmp_path):
     assert float(law.mass_ng) == 1.5
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        (HEAD + "1,0.5\n2,1\n3,2\n", "at least four speeds, but has 3"),
-        (HEAD + "1,0.5\n3,1\n2,1\n4,2\n", "must increase from row to row, but 2 follows 3 in row 3"),
-        (HEAD + "1,0.5\n2,1\n3,3.5\n4,2\n", "not be faster than the approach, but is 3.5 at 3 in row 3"),
-        (HEAD + "1,0.5\n2,nan\n3,2\n4,2\n", "must be finite numbers, but is nan in row 2"),
-        (HEAD + "1,0.5\n2,one\n3,2\n4,2\n", "line 3: `rebound_speed_nm_per_us` must be a number, but is 'one'"),
-        (HEAD + "1,0.5\n2\n", "line 3 has 1 values for 2 columns"),
-        (HEAD.replace("rebound_speed_nm_per_us", "rebound_speed_m_per_s") + "1,1\n", "speeds in mixed units"),
-        (HEAD.replace("_nm_per_us", "", 1) + "1,1\n", "the unit is missing; use approach_speed_nm_per_us"),
-        (HEAD.replace("_nm_per_us", "_miles_per_h", 1) + "1,1\n", "the unit is not known; use one of nm_per_us"),
-        ("u,w\n1,1\n", "column u is none of a law's"),
-        ("approach_speed_nm_per_us\n1\n", "has no column rebound_speed_nm_per_us"),
-        ("", "is empty"),
-        ('{"format": "afm-jax fit", "format_version": 2, "valid": false}', "not valid, so that its law means nothing"),
-        (
-            '{"format": "afm-jax fit", "format_version": 2, "valid": true, "law": {}}',
-            "fit again with `afm-jax fit TABLE",
-        ),
-        (
-            '{"format": "afm-jax fit", "format_version": 1, "valid": true}',
-            "has format_version 1, but 2 is known here; write it anew: afm-jax fit TABLE.csv --model MODEL --out",
-        ),
-        ("# corrections = perhaps\n" + HEAD + "1,0.5\n2,1\n3,2\n4,3\n", "must be true or false, but is 'perhaps'"),
-        ('{"format": "afm-jax law", "format_version": 99}', "has format_version 99, but 1 is known here"),
-        ('{"format": "something"}', "holds no law"),
-        ("{", "line 1 is no JSON; give a fit.json"),
-    ],
-)
-def test_what_is_no_law(text, said, tmp_path):
-    (tmp_path / "law.csv").write_text(text)
-    (tmp_path / "scene.toml").write_text(SCENE + 'file = "law.csv"\n')
-    for read in (lambda: afm.load_law(tmp_path / "law.csv"), lambda: afm.load_scene(tmp_path / "scene.toml")):
-        with pytest.raises(ValueError, match=r"law\.csv: ") as error:
-            read()
-        assert said in str(error.value)
-        assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("lines", "said"),
-    [
-        ('file = "law.json"\nr = 0.9\n', "the law is that of `file`: leave out r"),
-        ("file = 3\n", "must be the path of a law's file, as text, but is a number"),
-        ('file = "nothing.json"\n', "nothing.json: there is no such file"),
-        ("table = 3\n", "must be a table, [interaction.table], but is a number"),
-        ("[interaction.table]\nnumbers = 3\n", "the law lacks approach_speed_nm_per_us and rebound_speed_nm_per_us"),
-    ],
-)
-def test_wrong_keys_of_a_tables_scene(lines, said, tmp_path):
-    (tmp_path / "scene.toml").write_text(SCENE + lines)
-    with pytest.raises(afm.SceneError) as error:
-        afm.load_scene(tmp_path / "scene.toml")
-    assert said in str(error.value)
-    assert "[interaction]" in str(error.value)
-
-
 def test_a_law_of_another_mass_is_refused(law, tmp_path):
     afm.save_law(law, tmp_path / "law.json")
     (tmp_path / "scene.toml").write_text(SCENE.replace("1.5", "2") + 'file = "law.json"\n')

@@ -140,23 +140,3 @@ def test_a_deflection_with_the_wrong_sign_is_named(tmp_path):
     assert result.exit_code == 3
     assert strictly(result.stdout)["traces"][0]["kind"] == "upside_down"
     assert "multiply it by -1" in result.stderr
-
-
-@pytest.mark.parametrize(
-    ("arguments", "said"),
-    [
-        (["--drive-frequency-khz", "-3"], "drive_frequency_khz must be finite and above 0"),
-        (["--drive-frequency-khz", "4000"], "samples per drive period, but 4 are needed"),
-        (["--group", "scan"], "is no HDF5 file and has no groups"),
-        (["--order", "0"], "0 is not in the range 1<=x<=16"),
-        (["--sampling-rate-mhz", "5"], "remove one"),
-        (["--drive-frequency-khz", "190"], "the reference column"),
-    ],
-)
-def test_wrong_calls_end_with_one_line_and_exit_code_2(tmp_path, arguments, said):
-    path, _ = written(tmp_path / "first.csv", order=1)
-    result = run(path, *arguments)
-    assert result.exit_code == 2
-    assert result.stdout == ""
-    assert len(result.stderr.strip().splitlines()) == 1
-    assert said in result.stderr

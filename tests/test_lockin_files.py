@@ -213,60 +213,6 @@ def test_hdf5_without_its_package_says_what_to_install(tmp_path: Path, monkeypat
         read_trace(path)
 
 
-def with_time(time: np.ndarray, comments: str = "# drive_frequency_khz = 181.8\n") -> str:
-    return csv_text({"time_us": time, "deflection_nm": np.sin(time)}, comments)
-
-
-GOOD = np.arange(200) * 0.1
-ROWS = "time_us,deflection_nm\n0,1\n0.1,{}\n0.2,3\n"
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("", "there are no samples"),
-        ("# drive_frequency_khz = 180\n", "there are no samples"),
-        ("time_us,deflection_nm\n", "line 1: there are column names but no rows below them"),
-        ("0,1\n1,2\n", "the first row holds numbers; put a row of column names above it"),
-        ("time_us,height\n0,1\n", "line 1: the column deflection_nm is missing (there are 'time_us', 'height')"),
-        ("time_us,deflection\n0,1\n", "unknown column 'deflection'; did you mean deflection_nm?"),
-        ("time_s,deflection_nm\n0,1\n", "unknown column 'time_s'; did you mean time_us?"),
-        ("deflection_nm,position_nm\n0,1\n", "column position_nm: says again what another column says"),
-        (ROWS.format("x"), "line 3, column deflection_nm: 'x' is not a number"),
-        (ROWS.format("nan"), "line 3, column deflection_nm"),
-        (ROWS.format("1e999"), "line 3, column deflection_nm: must be finite"),
-        (ROWS.format("1,2"), "line 3: there are 3 cells for 2 columns"),
-        (ROWS.format(""), "line 3, column deflection_nm: is blank"),
-        ("deflection_nm\n1\n2\n", "the sampling rate is missing"),
-        (with_time(GOOD, ""), "the drive frequency is missing"),
-        (with_time(np.delete(GOOD, 77)), "line 80, column time_us: the time steps are not equal: 0.2 us here"),
-        (with_time(GOOD[::-1]), "column time_us: the time steps are not equal"),
-        (
-            with_time(GOOD, "# drive_frequency_khz = 2600\n"),
-            "there are 3.85 samples per drive period, but 4 are needed",
-        ),
-        (with_time(GOOD[:100]), "the trace spans 1.82 drive periods, too short for two response periods"),
-        (with_time(GOOD, "# drive_frequency_khz = 181.8\n# sampling_rate_mhz = 5\n"), "remove one"),
-        (with_time(GOOD, "# drive_frequency_khz = 0\n"), "drive_frequency_khz must be finite and above 0, but is 0.0"),
-        (with_time(GOOD, "# drive_frequency_khz = 181,8\n"), "write the decimal comma as a point"),
-        (with_time(GOOD, "# drive_frequency_hz = 181800\n"), "the key is drive_frequency_khz"),
-        (
-            with_time(GOOD, "# offset_nm = 1\n# offset_nm = 2\n"),
-            "line 2: offset_nm was given in line 1 already; remove one of the two",
-        ),
-        (with_time(GOOD, "# offset_nm = 1 +- 2\n"), "offset_nm takes no such error"),
-    ],
-)
-def test_faults_are_one_line(tmp_path: Path, text: str, said: str):
-    path = saved(tmp_path, text)
-    with pytest.raises(TableError) as caught:
-        read_trace(path)
-    message = str(caught.value)
-    assert message.startswith(str(path))
-    assert said in message
-    assert "\n" not in message
-
-
 def test_a_trace_in_memory_is_checked_too():
     with pytest.raises(TableError, match=r"sample 3, column deflection_nm: must be finite"):
         Trace(

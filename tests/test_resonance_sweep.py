@@ -86,82 +86,9 @@ def test_points_are_sorted_with_their_lines(tmp_path, order, reordered):
     assert sweep.reordered is reordered
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("90,2.5", "90,abc", "line 3, column amplitude_nm: 'abc' is not a number; write it like 90.25 or 9.025e1"),
-        ("90,2.5", "90,nan", "line 3, column amplitude_nm: 'nan' is not a number"),
-        ("90,2.5", "90,", "line 3, column amplitude_nm: is blank; every point needs it"),
-        ("90,2.5", '"90,1",2.5', "line 3, column frequency_khz: '90,1' has a decimal comma; write a point"),
-        ("90,2.5,", "90,1,2,5,", "line 3: there are 5 cells for 3 columns; a decimal comma must be a point"),
-        ("90,2.5,-3.5e1", "90,2.5", "line 3: there are 2 cells for 3 columns; fill the row up"),
-        ("90,2.5", "0,2.5", "line 3, column frequency_khz: must be finite and above 0, but is 0; correct it or remove"),
-        ("90,2.5", "90,-2.5", "line 3, column amplitude: must be finite and not negative, but is -2.5"),
-        ("-3.5e1", "1e999", "line 3, column phase_deg: must be finite, but is inf"),
-        ("frequency_khz", "frequency_mhz", "line 1: unknown column 'frequency_mhz'; did you mean frequency_khz?"),
-        ("amplitude_nm", "signal", "line 1: unknown column 'signal'; the columns are frequency_khz, frequency_hz"),
-        ("phase_deg", "frequency_hz", "line 1, column frequency_hz: says again what another column says; remove one"),
-        ("phase_deg", "", "line 1: column 3 has no name; name it or remove its comma"),
-        ("phase_deg", "phase_error_deg", "column phase_error_deg: stands without phase_deg; add that column"),
-        ("frequency_khz,amplitude_nm,phase_deg\n", "", "line 1: the first row holds numbers; put the row of column"),
-        (",", ";", "line 1: the columns are separated by semicolons; separate them by commas, decimals by points"),
-        (",", "\t", "line 1: the columns are separated by tabs; separate them by commas"),
-        ("89.5,1.25,60\n90,2.5,-3.5e1\n90.5,1.125,-120\n", "", "line 1: there are column names but no rows below them"),
-        ("frequency_khz,amplitude_nm", "phase_error_deg,amplitude_nm", "line 1: there is no frequency column; add"),
-        ("amplitude_nm,phase_deg", "amplitude_error_nm,phase_deg", "line 1: there is no amplitude column; add"),
-    ],
-)
-def test_faults_of_plain_files(tmp_path, old, new, message):
-    assert old in PLAIN
-    assert fault_of(written(tmp_path, PLAIN.replace(old, new))).startswith(message)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        (
-            "520.545E-12",
-            "520,545E-12",
-            "line 9, column Amplitude (m): '520,545E-12' has a decimal comma; write a point",
-        ),
-        ("520.545E-12", "", "line 9, column Amplitude (m): is blank; every point needs it"),
-        ("\t520.545E-12", "", "line 9: there are 4 cells for 5 columns; fill the row up"),
-        ("520.545E-12", "-1E-12", "line 9, column amplitude: must be finite and not negative, but is -0.001"),
-        ("Amplitude (m)", "Current (A)", "line 8: the column is missing: Amplitude (m); export the sweep with it"),
-        (
-            "Frequency Shift (Hz)\tCenter Frequency (Hz)",
-            "a\tb",
-            "line 8: the columns are missing: Frequency Shift (Hz)",
-        ),
-        (NANONIS[NANONIS.index("Frequency Shift") :], "", "line 7: there is nothing below [DATA]; export"),
-        (NANONIS[NANONIS.index("-38.1") :], "", "line 8: there are column names but no rows below them"),
-    ],
-)
-def test_faults_of_nanonis_files(tmp_path, old, new, message):
-    assert old in NANONIS
-    assert fault_of(written(tmp_path, NANONIS.replace(old, new))).startswith(message)
-
-
-@pytest.mark.parametrize(
-    ("data", "message"),
-    [
-        ("", "the file holds nothing; add a row of column names"),
-        ("# only words\n", "the file holds only comments; add a row of column names"),
-        ("amplitude_nm\xb5\n".encode("latin-1"), "line 1: is not UTF-8 text"),
-    ],
-)
-def test_files_without_a_sweep(tmp_path, data, message):
-    assert fault_of(written(tmp_path, data)).startswith(message)
-
-
 def test_missing_files_are_named(tmp_path):
     assert fault_of(tmp_path / "none.csv").startswith("there is no such file")
     assert fault_of(tmp_path).startswith("is a folder")
-
-
-def test_the_first_fault_is_said_and_the_others_counted(tmp_path):
-    text = PLAIN.replace("1.125", "x").replace("2.5", "y")
-    assert fault_of(written(tmp_path, text)).endswith("(and 1 more fault)")
 
 
 def test_faults_of_sweeps_in_memory():

@@ -150,43 +150,6 @@ def test_a_preset_has_its_start():
     assert answer["scene"]["platform"]["offset_nm"] == -1.0
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (("--duration-us", "-1"), "--duration-us must be a positive number, but is -1"),
-        (("--duration-us", "nan"), "'--duration-us': must be a finite number, but is nan"),
-        (("--periods", "0"), "--periods must be a positive number, but is 0"),
-        (("--periods", "3", "--duration-us", "3"), "say the same: give one of them"),
-        (("--samples", "uniform"), "--samples writes a trace: say into which folder by --out DIR"),
-        (("--harmonics", "1,0"), "must be integers from 1 to 1000 as in 1,2,3, but is 1,0"),
-    ],
-)
-def test_wrong_calls_are_one_line(law_file: Path, arguments: tuple[str, ...], message: str):
-    result = simulate(law_file, *arguments)
-    assert (result.exit_code, result.stdout) == (2, "")
-    assert message in result.stderr
-    assert len(result.stderr.splitlines()) == 1
-
-
-def test_wrong_scenes_are_one_line(tmp_path: Path):
-    ramp = tmp_path / "ramp.toml"
-    save_scene(Scene(LAW.cantilever, Platform(4.0, 181.8, 0.0, 1.0), LAW.interaction), ramp)
-    inside = tmp_path / "inside.toml"
-    save_scene(LAW, inside, start=Start(0.0, 5.0, 0.0))
-    inside.write_text(inside.read_text().replace("height_above_platform_nm = 5.0", "height_above_platform_nm = -5.0"))
-    cases = {
-        (str(ramp), "--duration-us", "20000"): "out of the range of 10000 nm",
-        (str(inside),): "height_above_platform_nm",
-        ("figure99",): "there is no such file or preset; presets are figure2",
-        (str(tmp_path / "none.toml"),): "none.toml",
-    }
-    for arguments, message in cases.items():
-        result = simulate(*arguments, "--json")
-        assert (result.exit_code, result.stdout) == (2, ""), result.stderr
-        assert message in result.stderr
-        assert len(result.stderr.splitlines()) == 1
-
-
 def test_help_does_without_jax():
     code = (
         "import sys\n"

@@ -266,42 +266,8 @@ def test_a_disk_that_is_full_in_fact(tmp_path: Path):
     assert found["chunks_kept"] > 0
 
 
-def complaint(tmp_path: Path, text: str, *options: str) -> str:
-    """Return what the command says of a sweep file; it must say one line."""
-    (tmp_path / "sweep.toml").write_text(text)
-    result = CliRunner().invoke(main, ["sweep", str(tmp_path / "sweep.toml"), *options], prog_name="afm-jax")
-    assert result.exit_code == 2, result.output
-    lines = result.stderr.splitlines()
-    assert len(lines) == 1
-    return lines[0]
-
-
 ORBITS = '[record]\nwhat = "orbits"\n'
 AXIS = '[[axes]]\nparameter = "platform.amplitude_nm"\nlinear = [1, 2, 3]\n'
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("scene =", "not TOML"),
-        ("scenes = 1", "unknown key scenes; a sweep has scene, tables, axes, record, accuracy, chunk"),
-        (ORBITS, 'give scene = "scene.toml", or tables'),
-        ('scene = "figure2"', "[record] is missing"),
-        (f'scene = "figure2"\n{ORBITS}', "a sweep needs at least one axis"),
-        (f'scene = "nothing.toml"\n{ORBITS}{AXIS}', "nothing.toml: there is no such file"),
-        (f'scene = "figure2"\n[record]\nwhat = "amplitudes"\n{AXIS}', "`what` must be one of orbits, collide"),
-        (f'scene = "figure2"\n{ORBITS}order = 1\n{AXIS}', "unknown key order of 'orbits'; it has orders"),
-        (f'scene = "figure2"\n{ORBITS}orders = [0]\n{AXIS}', "`orders` must be a list of positive whole numbers"),
-        (f'scene = "figure2"\n{ORBITS}{AXIS.replace("amplitude", "amplitud")}', "did you mean platform.amplitude_nm?"),
-        (f'scene = "figure2"\n{ORBITS}{AXIS.replace("[1, 2", "[-1, 2")}', "`amplitude_nm` must not be negative"),
-        (f'scene = "figure2"\naccuracy = 1e-6\n{ORBITS}{AXIS}', "leave `accuracy` out"),
-        (f'scene = "figure2"\naccuracy = 1e-6\n[record]\nwhat = "simulation"\n{AXIS}', "this scene has none"),
-        (f'scene = "figure2"\nchunk = 0\n{ORBITS}{AXIS}', "`chunk` must be a positive whole number"),
-        (f'scene = "figure2"\n[record]\nwhat = "collide"\n{AXIS}', "is about a resolved contact"),
-    ],
-)
-def test_a_wrong_sweep_is_one_line(tmp_path: Path, text: str, message: str):
-    assert message in complaint(tmp_path, text, "--out", str(tmp_path / "out"))
 
 
 def test_the_command_says_why_points_have_no_result(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -323,13 +289,3 @@ def test_the_command_says_why_points_have_no_result(tmp_path: Path, monkeypatch:
     found = xarray.open_zarr(str(tmp_path / "sweep.zarr")).load()
     assert found["message"].values.tolist() == ["it will not go"] * 2 + ["too wide"]
     assert found["outcome"].values.tolist() == [-1] * 3
-
-
-def test_wrong_options_are_one_line(tmp_path: Path):
-    text = f'scene = "figure2"\n{ORBITS}{AXIS}'
-    assert "--out is missing" in complaint(tmp_path, text)
-    out = ("--out", str(tmp_path / "out"))
-    assert "--scheduler has workers of its own" in complaint(tmp_path, text, *out, "--workers", "2", "--scheduler", "a")
-    assert "computes nothing to --plot" in complaint(tmp_path, text, "--dry-run", "--plot")
-    three = text + AXIS.replace("amplitude_nm", "offset_nm") + AXIS.replace("amplitude_nm", "reduced_frequency")
-    assert "one or two axes, but this has 3" in complaint(tmp_path, three, *out, "--plot")

@@ -53,51 +53,6 @@ def test_a_written_curve_reads_back_the_same(tmp_path: Path, drive: str):
     assert_same(table, made, but=("source",))
 
 
-@pytest.mark.parametrize(
-    ("old", "new", "message"),
-    [
-        ("force", "tip", "line 1: drive must be sample, force or base, but is 'tip'; write '# drive = force'"),
-        (
-            "# drive = force\n",
-            "",
-            (
-                "line 4, column free_amplitude_nm: belongs to a cantilever that is driven itself; add the line "
-                "'# drive = force' or '# drive = base' above the names (and 4 more faults)"
-            ),
-        ),
-        ("free_amplitude_nm,", "", "line 5: the column free_amplitude_nm (in nm) is missing; add it"),
-        (",80,", ",-80,", "line 6, column free_amplitude_nm: must be finite and above 0, but is -80; correct it"),
-        (",0.2\n", ",\n", "line 6, column phase_lag_deg: the value has no error; fill phase_lag_error_deg in"),
-        (
-            ",phase_lag_error_deg\n",
-            "\n",
-            (
-                "line 5, column phase_lag_deg: has no errors; add the column phase_lag_error_deg, or repeat readings: "
-                "4 repeats tell them"
-            ),
-        ),
-        (
-            "5.4 +- 0.5\n",
-            "5.4 +- 0.5\n# mass_ng = 3\n",
-            (
-                "mass_ng = 3 and spring_constant_n_per_m = 5.4 contradict each other: k/(2 pi f0)^2 is 16.89 ng; "
-                "correct or remove one of them"
-            ),
-        ),
-        (
-            "= -1 +- 0.2",
-            "= -1",
-            (
-                "line 4: phase_zero_deg needs its standard error; write '# phase_zero_deg = 0 +- 0.2', or correct the "
-                "columns and remove this line"
-            ),
-        ),
-    ],
-)
-def test_faults(tmp_path: Path, old: str, new: str, message: str):
-    assert fault_of(tmp_path, (HEAD + NAMES + ROW).replace(old, new)) == message
-
-
 def test_orders_are_those_of_the_drive(tmp_path: Path):
     text = HEAD + NAMES.replace("\n", ",order\n")
     assert read(tmp_path, text + ROW.replace("\n", ",1\n")).order.tolist() == [1]
@@ -105,8 +60,3 @@ def test_orders_are_those_of_the_drive(tmp_path: Path):
         "line 6, column order: must be 1 where the cantilever is driven: amplitude and lag are read at the drive's "
         "frequency; remove the row"
     )
-
-
-def test_columns_of_a_driven_sample_are_refused(tmp_path: Path):
-    message = fault_of(tmp_path, HEAD + NAMES.replace("lockin_amplitude", "peak_amplitude") + ROW)
-    assert message.startswith("line 5, column peak_amplitude_nm: belongs to a sample that is driven; with ")

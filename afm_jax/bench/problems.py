@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
-from afm_jax.contact.driven import Place, driven_by
+from afm_jax.contact.driven import ContactState, driven_by
 from afm_jax.contact.settings import DrivenSetting, QuickSetting
 from afm_jax.dynamics.iteration import evenly_spread
 from afm_jax.impact.law import MOST_KNOTS, ImpactLaw, TabulatedLaw
@@ -242,5 +242,5 @@ def single_contacts(scene: Scene, found: Simulation, count: int) -> SingleContac
 
 def _goes_straight(scene: Scene, time: Array, approach_speed: Array) -> np.ndarray:
     driven = driven_by(scene.interaction, scene.cantilever, scene.platform)
-    place = Place(jnp.full_like(time, driven.forms_nm), -approach_speed, time, jnp.zeros_like(time))
-    return np.asarray(jax.jit(cross, static_argnums=2)(driven, place, _FINE).holds)
+    state = ContactState(jnp.full_like(time, driven.forms_nm), -approach_speed, time, jnp.zeros_like(time))
+    return np.asarray(jax.jit(cross, static_argnums=2)(driven, state, _FINE).holds)

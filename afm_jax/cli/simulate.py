@@ -77,7 +77,7 @@ class Multiples(click.ParamType):
     type=click.Choice(METHODS),
     default=METHODS[0],
     show_default=True,
-    help="The way through a resolved contact: leg by leg, or by Diffrax in time (ten times slower).",
+    help="The way through a resolved contact: leg by leg, or in time throughout with Diffrax's Dopri8 (slower).",
 )
 @click.option(
     "--samples",

@@ -21,7 +21,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.driven import Driven, Place, free_tip
+from afm_jax.contact.driven import ContactState, Driven, free_tip
 from afm_jax.contact.junction import Junction
 from afm_jax.contact.leg import Leg, gauss_nodes, nodes_along, settled
 from afm_jax.contact.settings import QuickSetting, Setting
@@ -342,55 +342,55 @@ def pass_bridge(way: Way, setting: Setting) -> Passage:
     return pass_in_steps(way, size, setting.solver)
 
 
-def go_in(driven: Driven, place: Place, setting: QuickSetting) -> Leg:
-    """Return a tip where the junction forms, from a place in the bridge with the gap closing; x is s at the end."""
+def go_in(driven: Driven, state: ContactState, setting: QuickSetting) -> Leg:
+    """Return a tip where the junction forms, from a state in the bridge with the gap closing; x is s at the end."""
     if not driven.bridge.spans:
         # it has formed where the contact began
-        return Leg(place, place.x + jnp.inf, jnp.zeros_like(place.x, bool))
-    gaps = place.x, driven.junction.forms_gap_nm
-    leg = _cross(driven, gaps, place, setting, setting.inward, inward=True)
-    root = driven.junction.forms_root + jnp.zeros_like(place.x)
-    return leg._replace(place=leg.place._replace(x=root), holds=leg.holds & (place.gap_rate < 0.0))
+        return Leg(state, state.x, jnp.zeros_like(state.x, bool))
+    gaps = state.x, driven.junction.forms_gap_nm
+    leg = _cross(driven, gaps, state, setting, setting.inward, inward=True)
+    root = driven.junction.forms_root + jnp.zeros_like(state.x)
+    return leg._replace(state=leg.state._replace(x=root), holds=leg.holds & (state.gap_rate < 0.0))
 
 
-def go_out(driven: Driven, place: Place, setting: QuickSetting) -> Leg:
+def go_out(driven: Driven, state: ContactState, setting: QuickSetting) -> Leg:
     """Return a tip where the bridge breaks, from where the junction has broken with the gap opening."""
     if not driven.bridge.spans:
-        return Leg(place, place.x + jnp.zeros_like(place.x), place.gap_rate > 0.0)
+        return Leg(state, state.x, state.gap_rate > 0.0)
     gaps = driven.breaks_nm, driven.junction.breaks_gap_nm
-    leg = _cross(driven, gaps, place, setting, setting.outward, inward=False)
-    return leg._replace(holds=leg.holds & (place.gap_rate > 0.0) & (gaps[1] < gaps[0]))
+    leg = _cross(driven, gaps, state, setting, setting.outward, inward=False)
+    return leg._replace(holds=leg.holds & (state.gap_rate > 0.0) & (gaps[1] < gaps[0]))
 
 
-def driven_way(driven: Driven, gaps: tuple[Array, Array], place: Place, *, inward: bool) -> Way:
-    """Return the way of a tip from a place at the outer (`inward`) or at the inner one of two gaps."""
+def driven_way(driven: Driven, gaps: tuple[Array, Array], state: ContactState, *, inward: bool) -> Way:
+    """Return the way of a tip from a state at the outer (`inward`) or at the inner one of two gaps."""
     outer, inner = gaps
-    start = 0.5 * driven.mass_ng * place.gap_rate**2
+    start = 0.5 * driven.mass_ng * state.gap_rate**2
     at_outer = start
     if not inward:
         at_outer = start + driven.potential(inner) - driven.potential(outer)
         if driven.drive is not None:
-            at_outer = at_outer + driven.mass_ng * driven.drive.push(place.time_us) * (outer - inner)
+            at_outer = at_outer + driven.mass_ng * driven.drive.push(state.time_us) * (outer - inner)
     pull = -driven.bridge.force(outer) * outer
     margin = lax.stop_gradient(margin_of(jnp.maximum(at_outer, 0.01 * pull), jnp.maximum(pull, 1e-30)))
-    return way_through(driven, gaps, start, margin, inward=inward, begin_us=place.time_us)
+    return way_through(driven, gaps, start, margin, inward=inward, begin_us=state.time_us)
 
 
 def _cross(
-    driven: Driven, gaps: tuple[Array, Array], place: Place, setting: QuickSetting, nodes: int, *, inward: bool
+    driven: Driven, gaps: tuple[Array, Array], state: ContactState, setting: QuickSetting, nodes: int, *, inward: bool
 ) -> Leg:
-    slowest = _SLOWEST * 0.5 * driven.mass_ng * place.gap_rate**2
-    way = driven_way(driven, gaps, place, inward=inward)._replace(slowest_aj=slowest)
+    slowest = _SLOWEST * 0.5 * driven.mass_ng * state.gap_rate**2
+    way = driven_way(driven, gaps, state, inward=inward)._replace(slowest_aj=slowest)
     swept = sweep(way, nodes, setting.sweeps)
     end = swept.passage
     leaving = jnp.sqrt(2.0 * driven.inverse_mass * end.energy_aj)
     holds = settled(swept.change_aj / swept.kinetic_aj, swept.pace, end.time_us, setting)
     return Leg(
-        place=Place(
+        state=ContactState(
             x=(gaps[1] if inward else gaps[0]) + jnp.zeros_like(leaving),
             gap_rate=-leaving if inward else leaving,
-            time_us=place.time_us + end.time_us,
-            viscous_loss_aj=place.viscous_loss_aj + end.dissipated_aj,
+            time_us=state.time_us + end.time_us,
+            viscous_loss_aj=state.viscous_loss_aj + end.dissipated_aj,
         ),
         deepest_gap_nm=gaps[1] + jnp.zeros_like(leaving),
         holds=holds & jnp.all(swept.kinetic_aj > slowest, axis=0) & (leaving > 0.0),

@@ -7,8 +7,10 @@ fictitious time that of time, dt = (d Delta/ds) d theta: both stay smooth throug
 A free tip is one without Omega and q; its program has neither.
 """
 
+from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
@@ -21,8 +23,8 @@ from afm_jax.contact.forces.elastic import ElasticCurve
 from afm_jax.contact.junction import Junction, Phase, find_junction
 
 
-class Place(NamedTuple):
-    """Where a tip in contact is; arrays of the tips' shape."""
+class ContactState(NamedTuple):
+    """Variables of a tip in contact, or their rates; arrays of the tips' shape."""
 
     x: Float[Array, "..."]
     """The gap D in nm in the bridge, s = sqrt(A) in the junction."""
@@ -130,30 +132,30 @@ class Driven(NamedTuple):
         """Return the gap in nm, from s in the junction."""
         return jnp.where(phase == Phase.JUNCTION, self.gap_of_root(x), x)
 
-    def rates(self, place: Place, solid: Bool[Array, "..."]) -> Place:
-        """Return the rates of a place per unit of time (bridge) or of fictitious time (junction).
+    def rates(self, state: ContactState, solid: Bool[Array, "..."]) -> ContactState:
+        """Return the rates of a state per unit of time (bridge) or of fictitious time (junction).
 
         Trial steps may leave the range of the bridge's forces: they are evaluated no nearer than a third of D_on.
         """
-        in_bridge = self._bridge_rates(place, jnp.where(solid, self.forms_nm, place.x))
-        in_junction = self._junction_rates(place, jnp.where(solid, place.x, 1.0))
-        return Place(*(jnp.where(solid, inside, wet) for inside, wet in zip(in_junction, in_bridge, strict=True)))
+        in_bridge = self._bridge_rates(state, jnp.where(solid, self.forms_nm, state.x))
+        in_junction = self._junction_rates(state, jnp.where(solid, state.x, 1.0))
+        return jax.tree.map(partial(jnp.where, solid), in_junction, in_bridge)
 
-    def _bridge_rates(self, place: Place, gap: Float[Array, "..."]) -> Place:
+    def _bridge_rates(self, state: ContactState, gap: Float[Array, "..."]) -> ContactState:
         near = jnp.maximum(gap, 0.3 * self.junction.forms_gap_nm)
         force = self.bridge.force(near)
         lost = jnp.zeros_like(gap)
         if not self.bridge.conserves:
-            drag = self.bridge.damping(near) * place.gap_rate
-            force, lost = force - drag, drag * place.gap_rate
-        acceleration = self.acceleration(gap, place.gap_rate, place.time_us, force)
-        return Place(place.gap_rate, acceleration, jnp.ones_like(gap), lost)
+            drag = self.bridge.damping(near) * state.gap_rate
+            force, lost = force - drag, drag * state.gap_rate
+        acceleration = self.acceleration(gap, state.gap_rate, state.time_us, force)
+        return ContactState(state.gap_rate, acceleration, jnp.ones_like(gap), lost)
 
-    def _junction_rates(self, place: Place, s: Float[Array, "..."]) -> Place:
+    def _junction_rates(self, state: ContactState, s: Float[Array, "..."]) -> ContactState:
         slope = self.solid.depth_slope(s)
         force = self.load_scale_nn * self.solid.load(s)
-        acceleration = self.acceleration(self.gap_of_root(s), place.gap_rate, place.time_us, force)
-        return Place(-place.gap_rate / self.depth_scale_nm, slope * acceleration, slope, jnp.zeros_like(s))
+        acceleration = self.acceleration(self.gap_of_root(s), state.gap_rate, state.time_us, force)
+        return ContactState(-state.gap_rate / self.depth_scale_nm, slope * acceleration, slope, jnp.zeros_like(s))
 
 
 def driven_by(contact: Contact, cantilever: Cantilever, surface: Platform | Surface) -> Driven:

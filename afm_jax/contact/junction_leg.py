@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from afm_jax.contact.driven import Driven, Place
+from afm_jax.contact.driven import ContactState, Driven
 from afm_jax.contact.forces.elastic import ElasticCurve
 from afm_jax.contact.leg import Leg, mean_matrix, nodes_along, settled
 from afm_jax.contact.settings import QuickSetting
@@ -115,31 +115,31 @@ def stretch_in_junction(
     return Stretch(cumulative @ pace, tip.gap_of_root(s), jnp.where(moving, speed, 0.0), weights @ pace)
 
 
-def go_through_junction(driven: Driven, place: Place, setting: QuickSetting) -> Leg:
+def go_through_junction(driven: Driven, state: ContactState, setting: QuickSetting) -> Leg:
     """Return a tip where the junction has broken, from where it has formed with the gap closing; x is the gap."""
-    form = driven.junction.forms_root + jnp.zeros_like(place.x)
+    form = driven.junction.forms_root + jnp.zeros_like(state.x)
     solid = driven.solid
     fold = jnp.full_like(form, solid.fold)
-    level = solid.work(form) + place.gap_rate**2 / _unit(driven)
+    level = solid.work(form) + state.gap_rate**2 / _unit(driven)
     turn = turning_root(solid, level)
-    others = driven.acceleration(driven.gap_of_root(form), place.gap_rate, place.time_us, jnp.zeros_like(turn))
+    others = driven.acceleration(driven.gap_of_root(form), state.gap_rate, state.time_us, jnp.zeros_like(turn))
     for _ in range(2):
         turn = _turn_under(driven, form, level, others, turn)
-    inward = _swept(_Half(driven, form, pressing=True), level, place.time_us, (turn, others), setting)
+    inward = _swept(_Half(driven, form, pressing=True), level, state.time_us, (turn, others), setting)
     turn, at_turn = inward.turn, inward.time_us
     others = driven.acceleration(driven.gap_of_root(turn), jnp.zeros_like(turn), at_turn, jnp.zeros_like(turn))
     outward = _swept(_Half(driven, fold, pressing=False), level, at_turn, (turn, others), setting)
     work, depth = (of(turn) - of(fold) for of in (solid.work, solid.depth))
     leaving = jnp.sqrt(_unit(driven) * work + 2.0 * driven.depth_scale_nm * outward.mean * depth)
     return Leg(
-        place=Place(
+        state=ContactState(
             x=driven.junction.breaks_gap_nm + jnp.zeros_like(turn),
             gap_rate=leaving,
             time_us=outward.time_us,
-            viscous_loss_aj=place.viscous_loss_aj,
+            viscous_loss_aj=state.viscous_loss_aj,
         ),
         deepest_gap_nm=driven.gap_of_root(turn),
-        holds=inward.holds & outward.holds & (leaving > 0.0) & (place.gap_rate < 0.0),
+        holds=inward.holds & outward.holds & (leaving > 0.0) & (state.gap_rate < 0.0),
     )
 
 

@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from afm_jax.contact.driven import Place
+from afm_jax.contact.driven import ContactState
 from afm_jax.contact.settings import QuickSetting
 
 
 class Leg(NamedTuple):
     """A leg of the quick way through a driven contact; arrays of the tips' shape."""
 
-    place: Place
+    state: ContactState
     """Where it ends."""
     deepest_gap_nm: Float[Array, "..."]
     holds: Bool[Array, "..."]

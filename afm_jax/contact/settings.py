@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 METHODS = ("collocation", "diffrax")
-"""How contacts are integrated: by sweeps over Gauss nodes, or in steps of Diffrax's solvers.
+"""How contacts are integrated: by sweeps over Gauss nodes, or in Runge-Kutta steps with Diffrax's coefficients.
 
-Free collisions take the steps in the gap, driven ones, which may turn anywhere, in time.
+Free collisions take the steps in the gap; driven contacts, which may turn anywhere, take them in time.
 """
 
 
@@ -88,16 +88,14 @@ class DrivenSetting(NamedTuple):
     """How driven contacts are resolved; hashable, for it shapes the program.
 
     `quick` is the way leg by leg, or None to go through every contact in time; `fineness` the steps per unit of the
-    local pace of the way in time; `trials` the trial steps that a tip in contact may take in one round; `method`
-    "diffrax" takes the steps in time by Diffrax's solver. Contacts that magnify errors (left at less than one in
-    `magnified` of their energy, or with more than one junction) are computed again in finer steps, until two in a row
-    agree within `agreement`; None: never.
+    local time scale of the way in time; `trials` the trial steps that a tip in contact may take in one round. Contacts
+    that magnify errors (left at less than one in `magnified` of their energy, or with more than one junction) are
+    computed again in finer steps, until two in a row agree within `agreement`; None: never.
     """
 
     quick: QuickSetting | None
     fineness: float
     trials: int
-    method: str = "collocation"
     agreement: float | None = None
     magnified: float = 1.0
 
@@ -113,7 +111,7 @@ DRIVEN_SETTINGS = {
 def driven_setting_of(accuracy: float, method: str = "collocation") -> DrivenSetting:
     """Return the cheapest setting of driven contacts by a method that reaches an accuracy.
 
-    With "collocation" they go leg by leg, and in time where that does not hold; with "diffrax" in time alone.
+    With "collocation" they go leg by leg, and in time where that does not hold; with "diffrax" in time throughout.
 
     Raises:
         ValueError: if none does, or there is no such method.
@@ -121,7 +119,7 @@ def driven_setting_of(accuracy: float, method: str = "collocation") -> DrivenSet
     if method not in METHODS:
         raise ValueError(f"`method` must be one of {', '.join(METHODS)}, but is {method!r}")
     setting = DRIVEN_SETTINGS[_level(DRIVEN_SETTINGS, accuracy)]
-    return setting if method == "collocation" else setting._replace(quick=None, method=method)
+    return setting if method == "collocation" else setting._replace(quick=None)
 
 
 def _level(settings: Mapping[float, Any], accuracy: float, by: str = "") -> float:

@@ -1,10 +1,23 @@
-"""Steps in time of a tip in contact: frozen phase, thresholds met exactly, turning points not passed over.
+"""One step in time of a tip in contact, and the search for the events that end a phase.
 
-A trial is one step of Dormand and Prince's method of order 8, Diffrax's own or a leaner one with the same coefficients.
-A trial that ends within the phase is taken. One that passes a threshold, or the end of the simulation, is not: its
-cubic says where to try again, until a trial ends so close to the threshold that a parabola corrects its length to
-rounding. Step lengths follow from the place alone (no error control), so that results are smooth in every parameter;
-the correction carries the derivative of the time at which the threshold is met.
+The equation of motion (eq. 16, `Driven.rates`) is smooth within a phase. A phase ends where x, the gap in the bridge
+and the root s in the junction, meets a threshold:
+
+    free (DRY) --- x = forms_nm, found by the flight's own search ---> BRIDGE
+    BRIDGE     --- x = breaks_nm ------------------------------------> free
+               --- x = forms_gap_nm ---------------------------------> JUNCTION
+    JUNCTION   --- s = fold -----------------------------------------> BRIDGE where that outlives it, else free
+
+A trial is one step of Dormand and Prince's method of order 8 (Diffrax's coefficients):
+
+    trial of length h --- ends within its phase --------------------> taken
+                      --- ends on a threshold or at the simulation's
+                          end, to 1e-7 of it -----------------------> taken, moved onto it by a parabola; next phase
+                      --- ends beyond one, or turned beyond one ----> repeated: h from the cubic through both ends
+                      --- is not finite ----------------------------> repeated with a quarter of h
+
+The length of a step follows from the state alone, without an error estimate, so that results are smooth functions of
+every parameter; the parabola carries the derivative of the time at which a threshold is met.
 """
 
 from collections.abc import Callable
@@ -17,143 +30,214 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from afm_jax.contact.driven import Driven, Place
+from afm_jax.contact.driven import ContactState, Driven
 from afm_jax.contact.junction import Phase
 
 _NEAR = 1e-7
-"""Share of a threshold from which on the correction by a parabola is exact to rounding."""
+"""Relative distance from a threshold within which the parabola is exact to rounding."""
 _SHORTEST = 1e-3
-"""Bounds of the share of a failed trial at which the next is tried: this, and 1 less a tenth of it."""
-_SHARE = 0.4
-"""Share of the gap where the junction forms: there the core's force varies in a fraction of the gap, 1 - this."""
+"""Bounds of a repeated trial's length over that of the failed one: this, and 1 less a tenth of it."""
+_CORE_FRACTION = 0.4
+"""Of the gap where the junction forms: there the core's force varies over the gap less this."""
 _FROM_REST = 0.5
 _CUBIC_STEPS = 4
 
 
-class Touch(NamedTuple):
-    """A tip in contact, and what the contact has been so far; arrays of the tips' shape."""
+class TipInContact(NamedTuple):
+    """A tip in contact, with a record of its contact so far; arrays of the tips' shape."""
 
-    place: Place
+    state: ContactState
     phase: Int[Array, "..."]
-    trial: Float[Array, "..."]
-    """Length of the next trial; 0: as the place suggests; negative: ends at a turning point."""
+    """A `Phase`."""
+    trial_length: Float[Array, "..."]
+    """Length of the next trial; 0: chosen from the state; negative: a trial that ends at a turning point."""
     junctions: Int[Array, "..."]
+    """How often the junction has formed."""
     junction_forms_us: Float[Array, "..."]
+    """When it first formed."""
     junction_breaks_us: Float[Array, "..."]
+    """When it last broke."""
     time_in_junction_us: Float[Array, "..."]
     deepest_gap_nm: Float[Array, "..."]
     trials: Int[Array, "..."]
 
+    @classmethod
+    def at_start(cls, state: ContactState, phase: Int[Array, "..."]) -> "TipInContact":
+        """Return a tip at the start of a contact, or a free tip (phase DRY)."""
+        none, zero = jnp.zeros_like(phase, dtype=jnp.int32), jnp.zeros_like(state.x)
+        return cls(state, phase.astype(jnp.int32), zero, none, zero, zero, zero, state.x, none)
 
-def fresh_touch(place: Place, phase: Int[Array, "..."]) -> Touch:
-    """Return a tip at the beginning of a contact (or a free one, in phase DRY)."""
-    none, zero = jnp.zeros_like(phase, dtype=jnp.int32), jnp.zeros_like(place.x)
-    return Touch(place, phase.astype(jnp.int32), zero, none, zero, zero, zero, place.x, none)
-
-
-class Trial(NamedTuple):
-    """A step that was tried."""
-
-    length: Float[Array, "..."]
-    start: Place
-    start_rates: Place
-    end: Place
-    end_rates: Place
-    low: Float[Array, "..."]
-    """Thresholds of x in this phase: D_on and the breaking gap, or the fold and none."""
-    high: Float[Array, "..."]
-
-    @property
-    def near_low(self) -> Float[Array, "..."]:
-        """Distance from the low threshold within which the correction is exact; that may be 0, at a dry contact's fold."""
-        return _NEAR * jnp.where(self.low > 0.0, self.low, self.start.x)
+    @classmethod
+    def arriving(cls, driven: Driven, state: ContactState, arrives: Bool[Array, "..."]) -> "TipInContact":
+        """Return a tip that meets the bridge, or solids between which nothing acts before; a free tip else."""
+        tip = cls.at_start(state, jnp.where(arrives, Phase.BRIDGE, Phase.DRY))
+        if driven.bridge.spans:
+            return tip
+        return tip._replace(
+            state=state._replace(x=jnp.where(arrives, driven.junction.forms_root, state.x)),
+            phase=jnp.where(arrives, Phase.JUNCTION, Phase.DRY).astype(jnp.int32),
+            junctions=arrives.astype(jnp.int32),
+            junction_forms_us=jnp.where(arrives, state.time_us, 0.0),
+        )
 
 
 def advance(
-    driven: Driven,
-    touch: Touch,
-    until_us: Float[Array, "..."],
-    fineness: float | Float[Array, "..."],
-    method: str = "collocation",
-) -> Touch:
+    driven: Driven, tip: TipInContact, until_us: Float[Array, "..."], fineness: float | Float[Array, "..."]
+) -> TipInContact:
     """Return a tip in contact after one trial.
 
     Args:
         driven: the equation of motion.
-        touch: the tip; its phase is not DRY.
+        tip: the tip; its phase is not DRY.
         until_us: end of the simulation.
-        fineness: steps per unit of the local pace; larger is more accurate.
-        method: "diffrax" for steps by Diffrax's solver, else leaner ones with the same coefficients.
+        fineness: steps per unit of the local time scale; larger is more accurate.
     """
-    trial = _tried(driven, touch, until_us, fineness, diffrax_step if method == "diffrax" else eighth_order_step)
-    solid = touch.phase == Phase.JUNCTION
-    early, late, spent = _passed(trial, until_us)
-    retry, again = _where_next(trial, touch.trial < 0.0, until_us)
-    landed = _land(trial, until_us, early, late, spent)
-    hit_low, hit_high = landed.low & ~retry, landed.high & ~retry
-    place = landed.place
-    # a broken junction leaves the tip in the bridge where that still holds, else free
-    wet = driven.junction.breaks_gap_nm < driven.breaks_nm
-    broken = solid & hit_low
-    formed = ~solid & hit_low
-    phase = jnp.where(formed, Phase.JUNCTION, touch.phase)
-    phase = jnp.where(broken, jnp.where(wet, Phase.BRIDGE, Phase.DRY), phase)
-    phase = jnp.where(~solid & hit_high, Phase.DRY, phase).astype(touch.phase.dtype)
-    x = jnp.where(formed, driven.junction.forms_root, place.x)
-    x = jnp.where(broken, driven.junction.breaks_gap_nm, x)
-    place = place._replace(x=x)
-    passed = jnp.where(solid, place.time_us - touch.place.time_us, 0.0)
-    return Touch(
-        place=_pick(retry, touch.place, place),
-        phase=jnp.where(retry, touch.phase, phase),
-        trial=jnp.where(retry, again, 0.0),
-        junctions=touch.junctions + formed.astype(touch.junctions.dtype),
-        junction_forms_us=jnp.where(formed & (touch.junctions == 0), place.time_us, touch.junction_forms_us),
-        junction_breaks_us=jnp.where(broken, place.time_us, touch.junction_breaks_us),
-        time_in_junction_us=touch.time_in_junction_us + jnp.where(retry, 0.0, passed),
-        deepest_gap_nm=jnp.where(
-            retry, touch.deepest_gap_nm, jnp.minimum(touch.deepest_gap_nm, _deepest(driven, trial, solid))
-        ),
-        trials=touch.trials + 1,
+    trial = _try_step(driven, tip, until_us, fineness)
+    solid = trial.solid
+    repeats, next_length = _repetition(trial, until_us)
+    landing = _land(trial, until_us)
+    forms, breaks = ~solid & landing.at_low & ~repeats, solid & landing.at_low & ~repeats
+    leaves = ~solid & landing.at_high & ~repeats
+    # the junction breaks into the bridge where that outlives it, else into free flight
+    after_junction = jnp.where(driven.junction.breaks_gap_nm < driven.breaks_nm, Phase.BRIDGE, Phase.DRY)
+    phase = jnp.where(forms, Phase.JUNCTION, jnp.where(leaves, Phase.DRY, tip.phase))
+    phase = jnp.where(breaks, after_junction, phase).astype(tip.phase.dtype)
+    end = landing.state
+    x = jnp.where(forms, driven.junction.forms_root, jnp.where(breaks, driven.junction.breaks_gap_nm, end.x))
+    in_junction = jnp.where(solid, end.time_us - tip.state.time_us, 0.0)
+    deepest = jnp.minimum(tip.deepest_gap_nm, _deepest_gap(driven, trial))
+    return TipInContact(
+        state=jax.tree.map(lambda old, new: jnp.where(repeats, old, new), tip.state, end._replace(x=x)),
+        phase=phase,
+        trial_length=jnp.where(repeats, next_length, 0.0),
+        junctions=tip.junctions + forms.astype(tip.junctions.dtype),
+        junction_forms_us=jnp.where(forms & (tip.junctions == 0), end.time_us, tip.junction_forms_us),
+        junction_breaks_us=jnp.where(breaks, end.time_us, tip.junction_breaks_us),
+        time_in_junction_us=tip.time_in_junction_us + jnp.where(repeats, 0.0, in_junction),
+        deepest_gap_nm=jnp.where(repeats, tip.deepest_gap_nm, deepest),
+        trials=tip.trials + 1,
     )
 
 
-def _tried(
-    driven: Driven, touch: Touch, until_us: Float[Array, "..."], fineness: float | Array, step: Callable[..., Place]
-) -> Trial:
-    start, solid = touch.place, touch.phase == Phase.JUNCTION
+class _Trial(NamedTuple):
+    """A step that was tried, within one phase."""
+
+    solid: Bool[Array, "..."]
+    """Whether the phase is the junction."""
+    to_turn: Bool[Array, "..."]
+    """Whether it should end at a turning point."""
+    length: Float[Array, "..."]
+    start: ContactState
+    start_rates: ContactState
+    end: ContactState
+    end_rates: ContactState
+    low: Float[Array, "..."]
+    """Thresholds of x: where the junction forms and the bridge breaks, or the fold and none."""
+    high: Float[Array, "..."]
+
+    @property
+    def near_low(self) -> Float[Array, "..."]:
+        """Distance from the low threshold within which the parabola is exact; s is 0 at the fold of a dry contact."""
+        return _NEAR * jnp.where(self.low > 0.0, self.low, self.start.x)
+
+    @property
+    def path(self) -> "_Cubic":
+        """The cubic of x along the step."""
+        return _Cubic.of(self.start.x, self.start_rates.x * self.length, self.end.x, self.end_rates.x * self.length)
+
+
+def _try_step(
+    driven: Driven, tip: TipInContact, until_us: Float[Array, "..."], fineness: float | Float[Array, "..."]
+) -> _Trial:
+    """Return a trial: to a threshold or the end if it lies within 1.2 usual steps, unless its length is given."""
+    start, solid = tip.state, tip.phase == Phase.JUNCTION
     low = jnp.where(solid, driven.solid.fold, driven.junction.forms_gap_nm)
     high = jnp.where(solid, jnp.inf, driven.breaks_nm)
     rates = driven.rates(start, solid)
-    fixed, slopes = lax.stop_gradient((start, rates))
-    natural = 1.0 / (fineness * _pace(driven, fixed, slopes, solid))
-    aim = _aimed(fixed, slopes, lax.stop_gradient((low, high)), lax.stop_gradient(until_us))
-    fresh = jnp.where(aim < 1.2 * natural, aim, natural)
-    length = lax.stop_gradient(jnp.where(touch.trial == 0.0, fresh, jnp.abs(touch.trial)))
-    end = step(lambda place: driven.rates(place, solid), start, length)
-    return Trial(length, start, rates, end, driven.rates(end, solid), low, high)
+    usual = 1.0 / (fineness * _inverse_step(driven, *lax.stop_gradient((start, rates)), solid))
+    aimed = _length_to_event(*lax.stop_gradient((start, rates, low, high, until_us)))
+    chosen = jnp.where(aimed < 1.2 * usual, aimed, usual)
+    length = lax.stop_gradient(jnp.where(tip.trial_length == 0.0, chosen, jnp.abs(tip.trial_length)))
+    end = eighth_order_step(lambda state: driven.rates(state, solid), start, length)
+    return _Trial(solid, tip.trial_length < 0.0, length, start, rates, end, driven.rates(end, solid), low, high)
 
 
-def _pace(driven: Driven, place: Place, rates: Place, solid: Bool[Array, "..."]) -> Float[Array, "..."]:
-    place = lax.stop_gradient(place)
-    in_bridge = place._replace(x=jnp.where(solid, driven.forms_nm, place.x))
-    in_junction = place._replace(x=jnp.where(solid, place.x, 1.0))
-    wet = bridge_pace(driven, in_bridge, rates.gap_rate)
-    return lax.stop_gradient(jnp.where(solid, junction_pace(driven, in_junction), wet))
+def _repetition(trial: _Trial, until_us: Float[Array, "..."]) -> tuple[Bool[Array, "..."], Float[Array, "..."]]:
+    """Return whether a trial must be repeated, and with which length (negative: to a turning point)."""
+    trial, until = lax.stop_gradient((trial, until_us))
+    start, rates, end, end_rates, length = trial.start, trial.start_rates, trial.end, trial.end_rates, trial.length
+    finite = jnp.isfinite(end.x) & jnp.isfinite(end.gap_rate) & jnp.isfinite(end_rates.gap_rate)
+    below, above, late = end.x < trial.low, end.x > trial.high, end.time_us > until
+
+    # a threshold met within rounding of the parabola needs no other trial
+    too_far = below & (trial.low - end.x > trial.near_low) | above & (end.x - trial.high > _NEAR * trial.high)
+    too_late = late & (end.time_us - until > _NEAR * length * jnp.maximum(end_rates.time_us, 1e-3))
+    level = jnp.where(below, trial.low, jnp.where(above, trial.high, 0.0))
+    in_x = _Cubic.of(start.x - level, rates.x * length, end.x - level, end_rates.x * length)
+    in_time = _Cubic.of(start.time_us - until, rates.time_us * length, end.time_us - until, end_rates.time_us * length)
+    fraction = jnp.minimum(jnp.where(too_far, in_x.crossing(), 1.0), jnp.where(too_late, in_time.crossing(), 1.0))
+
+    # a turning point beyond a threshold, both ends within: found by a trial that ends there
+    within = ~(below | above | late)
+    turning, extremum = trial.path.turning_point()
+    hidden = (rates.x * end_rates.x < 0.0) & ~trial.to_turn & within
+    hidden = hidden & ((extremum <= trial.low) | (extremum >= trial.high))
+    shortest, longest = _SHORTEST, 1.0 - 0.1 * _SHORTEST
+    again = length * jnp.clip(fraction, shortest, longest)
+    again = jnp.where(hidden, -length * jnp.clip(turning, shortest, longest), again)
+    # lengths at which rounding decides are taken as they are
+    resolved = length > 1e-15 * (1.0 + jnp.abs(start.time_us))
+    return (too_far | too_late | hidden | ~finite) & resolved, jnp.where(finite, again, 0.25 * length)
 
 
-def _aimed(place: Place, rates: Place, thresholds: tuple[Array, Array], until_us: Float[Array, "..."]) -> Array:
-    """Return the length after which the place's parabola meets the threshold ahead, or time ends; infinite if never."""
-    low, high = thresholds
-    aim = _to_meet(place, rates, jnp.where(rates.x < 0.0, low, high) - place.x)
-    left = (until_us - place.time_us) / rates.time_us
-    return jnp.minimum(jnp.where(aim > 0.0, aim, jnp.inf), jnp.where(left > 0.0, left, jnp.inf))
+class _Landing(NamedTuple):
+    """The end of a trial, moved onto the threshold or the time that it has met."""
+
+    state: ContactState
+    at_low: Bool[Array, "..."]
+    at_high: Bool[Array, "..."]
 
 
-def _to_meet(place: Place, rates: Place, distance: Array) -> Array:
-    """Return the length after which the place's parabola has gone a distance in x; infinite if never."""
+def _land(trial: _Trial, until_us: Float[Array, "..."]) -> _Landing:
+    """Return the end of a trial, moved by a parabola onto the threshold, or the end of the simulation, that it met."""
+    end, rates, low, high = trial.end, trial.end_rates, trial.low, trial.high
+    closing = (end.x - low < trial.near_low) & (end.gap_rate != 0.0) & (rates.x < 0.0)
+    opening = (high - end.x < _NEAR * high) & (rates.x > 0.0)
+    at_low, at_high = (end.x <= low) | closing, (end.x >= high) | opening
+    target = jnp.where(at_low, low, jnp.where(at_high, high, end.x))
+    at_threshold = at_low | at_high
+    # where the tip is slow, its acceleration counts even in so short a rest of the way
+    rest = _length_to_go(end, rates, target - end.x)
+    rest = jnp.where(at_threshold & jnp.isfinite(rest), rest, 0.0)
+    # a step shorter than the rounding of the time would never end
+    rounding = 8.0 * jnp.finfo(end.x.dtype).eps * (1.0 + jnp.abs(until_us))
+    over = (end.time_us >= until_us - rounding) & ~at_threshold
+    rest = jnp.where(over, (until_us - end.time_us) / jnp.where(over, rates.time_us, 1.0), rest)
+    moved = jax.tree.map(lambda value, rate: value + rate * rest, end, rates)
+    x, time = jnp.where(at_threshold, target, moved.x), jnp.where(over, until_us, moved.time_us)
+    return _Landing(moved._replace(x=x, time_us=time), at_low, at_high)
+
+
+def _deepest_gap(driven: Driven, trial: _Trial) -> Float[Array, "..."]:
+    """Return the smallest gap of a trial in nm: at its end, or where its cubic turns."""
+    turns = (trial.start.gap_rate < 0.0) & (trial.end.gap_rate > 0.0)
+    x = jnp.where(turns, trial.path.turning_point()[1], trial.end.x)
+    return jnp.where(trial.solid, driven.gap_of_root(jnp.where(trial.solid, x, 1.0)), x)
+
+
+def _length_to_event(
+    state: ContactState, rates: ContactState, low: Array, high: Array, until_us: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    """Return the length after which the parabola of x meets the threshold ahead, or time ends; infinite if never."""
+    to_threshold = _length_to_go(state, rates, jnp.where(rates.x < 0.0, low, high) - state.x)
+    to_end = (until_us - state.time_us) / rates.time_us
+    return jnp.minimum(*(jnp.where(length > 0.0, length, jnp.inf) for length in (to_threshold, to_end)))
+
+
+def _length_to_go(state: ContactState, rates: ContactState, distance: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the length after which the parabola of x has gone a distance; infinite if never."""
     # x'' along the step: in both phases x' is proportional to the gap's rate, whose slope is known
-    ratio = rates.x / jnp.where(place.gap_rate == 0.0, 1.0, place.gap_rate)
+    ratio = rates.x / jnp.where(state.gap_rate == 0.0, 1.0, state.gap_rate)
     bend = 0.5 * ratio * rates.gap_rate
     square = rates.x * rates.x + 4.0 * bend * distance
     meets = (square > 0.0) & jnp.isfinite(distance) & (rates.x != 0.0)
@@ -161,158 +245,84 @@ def _to_meet(place: Place, rates: Place, distance: Array) -> Array:
     return jnp.where(meets, 2.0 * jnp.where(meets, distance, 1.0) / jnp.where(meets, rates.x + root, 1.0), jnp.inf)
 
 
-def _passed(
-    trial: Trial, until_us: Float[Array, "..."]
-) -> tuple[Bool[Array, "..."], Bool[Array, "..."], Bool[Array, "..."]]:
-    """Say whether the trial ends at or beyond the low threshold, the high one, the end of the simulation."""
-    x = trial.end.x
-    # a step shorter than the rounding of the time would never end
-    rounding = 8.0 * jnp.finfo(x.dtype).eps * (1.0 + jnp.abs(until_us))
-    return x <= trial.low, x >= trial.high, trial.end.time_us >= until_us - rounding
+def _inverse_step(
+    driven: Driven, state: ContactState, rates: ContactState, solid: Bool[Array, "..."]
+) -> Float[Array, "..."]:
+    """Return the inverse of the time scale of either phase, its formula evaluated within the phase's range alone."""
+    bridge_state = state._replace(x=jnp.where(solid, driven.forms_nm, state.x))
+    junction_state = state._replace(x=jnp.where(solid, state.x, 1.0))
+    in_bridge = inverse_bridge_step(driven, bridge_state, rates.gap_rate)
+    return lax.stop_gradient(jnp.where(solid, inverse_junction_step(driven, junction_state), in_bridge))
 
 
-def _where_next(trial: Trial, at_turn: Bool[Array, "..."], until_us: Float[Array, "..."]) -> tuple[Array, Array]:
-    """Say whether a trial must be repeated, and with which length (negative: to a turning point)."""
-    start, rates, end, slopes = lax.stop_gradient((trial.start, trial.start_rates, trial.end, trial.end_rates))
-    low, high, until = lax.stop_gradient((trial.low, trial.high, until_us))
-    length = trial.length
-    finite = jnp.isfinite(end.x) & jnp.isfinite(end.gap_rate) & jnp.isfinite(slopes.gap_rate)
-    below, above, late = (end.x < low), (end.x > high), end.time_us > until
+def inverse_bridge_step(driven: Driven, state: ContactState, acceleration: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Return the inverse of the time scale of a tip in the bridge, in 1/us.
 
-    # a threshold nearly met needs no other trial
-    beyond_low = below & (low - end.x > lax.stop_gradient(trial.near_low))
-    beyond_high = above & (end.x - high > _NEAR * high)
-    beyond_time = late & (end.time_us - until > _NEAR * length * jnp.maximum(slopes.time_us, 1e-3))
-    level = jnp.where(below, low, jnp.where(above, high, 0.0))
-    in_x = _crossing_share(start.x - level, rates.x * length, end.x - level, slopes.x * length)
-    in_time = _crossing_share(
-        start.time_us - until, rates.time_us * length, end.time_us - until, slopes.time_us * length
-    )
-    shares = jnp.minimum(jnp.where(beyond_low | beyond_high, in_x, 1.0), jnp.where(beyond_time, in_time, 1.0))
-    missed = beyond_low | beyond_high | beyond_time
-    turns = (rates.x * slopes.x < 0.0) & ~at_turn & ~missed & ~(below | above | late)
-    turn, extremum = _turning_point(start.x, rates.x * length, end.x, slopes.x * length)
-    hidden = turns & ((extremum <= low) | (extremum >= high))
-    again = length * jnp.clip(shares, _SHORTEST, 1.0 - 0.1 * _SHORTEST)
-    again = jnp.where(hidden, -length * jnp.clip(turn, _SHORTEST, 1.0 - 0.1 * _SHORTEST), again)
-    # lengths at which rounding decides are taken as they are
-    resolved = length > 1e-15 * (1.0 + jnp.abs(start.time_us))
-    return (missed | hidden | ~finite) & resolved, jnp.where(finite, again, 0.25 * length)
-
-
-class _Landing(NamedTuple):
-    place: Place
-    low: Bool[Array, "..."]
-    high: Bool[Array, "..."]
-
-
-def _land(trial: Trial, until_us: Float[Array, "..."], below: Array, above: Array, late: Array) -> _Landing:
-    """Return the trial's end, moved onto the threshold that it has met."""
-    end, rates = trial.end, trial.end_rates
-    near_low = below | (end.x - trial.low < trial.near_low) & (end.gap_rate != 0.0) & (rates.x < 0.0)
-    near_high = above | (trial.high - end.x < _NEAR * trial.high) & (rates.x > 0.0)
-    target = jnp.where(near_low, trial.low, jnp.where(near_high, trial.high, end.x))
-    at_threshold = near_low | near_high
-    # where the tip is slow, its acceleration counts in that little, too
-    rest = _to_meet(end, rates, target - end.x)
-    rest = jnp.where(at_threshold & jnp.isfinite(rest), rest, 0.0)
-    ends = late & ~at_threshold
-    rest = jnp.where(ends, (until_us - end.time_us) / jnp.where(ends, rates.time_us, 1.0), rest)
-    moved = jax.tree.map(lambda value, rate: value + rate * rest, end, rates)
-    place = moved._replace(x=jnp.where(at_threshold, target, moved.x), time_us=jnp.where(ends, until_us, moved.time_us))
-    return _Landing(place, near_low, near_high)
-
-
-def _deepest(driven: Driven, trial: Trial, solid: Bool[Array, "..."]) -> Float[Array, "..."]:
-    """Return the smallest gap of a trial: at its ends, or where its cubic turns."""
-    length = trial.length
-    turns = (trial.start.gap_rate < 0.0) & (trial.end.gap_rate > 0.0)
-    _, extremum = _turning_point(trial.start.x, trial.start_rates.x * length, trial.end.x, trial.end_rates.x * length)
-    x = jnp.where(turns, extremum, trial.end.x)
-    return jnp.where(solid, driven.gap_of_root(jnp.where(solid, x, 1.0)), x)
-
-
-def _pick(condition: Bool[Array, "..."], first: Place, second: Place) -> Place:
-    return Place(*(jnp.where(condition, one, other) for one, other in zip(first, second, strict=True)))
-
-
-def bridge_pace(driven: Driven, place: Place, acceleration: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return the pace of a tip in the bridge in 1/us: the inverse of a step.
-
-    The root of the local stiffness over the mass, the speed over the distance in which the forces change, the root of
-    the acceleration over it, and the frequencies of cantilever and drive, in squares.
+    The root of the squares of: the frequency of the local stiffness, the speed over the distance in which the forces
+    change, the root of the acceleration over that distance, and the frequencies of cantilever and drive.
 
     Args:
         driven: the equation of motion.
-        place: where the tip is.
+        state: of the tip.
         acceleration: of the gap there, in nm/us^2.
     """
     nearest = driven.junction.forms_gap_nm
-    gap = jnp.maximum(place.x, 0.3 * nearest)
+    gap = jnp.maximum(state.x, 0.3 * nearest)
     stiffness = jnp.abs(driven.bridge.stiffness(gap)) * driven.inverse_mass
-    distance = jnp.maximum(gap - _SHARE * nearest, 0.3 * nearest)
-    moving = (place.gap_rate / distance) ** 2 + _FROM_REST * jnp.abs(acceleration) / distance
-    return jnp.sqrt(stiffness + moving + _drive_pace(driven) ** 2)
+    distance = jnp.maximum(gap - _CORE_FRACTION * nearest, 0.3 * nearest)
+    moving = (state.gap_rate / distance) ** 2 + _FROM_REST * jnp.abs(acceleration) / distance
+    return jnp.sqrt(stiffness + moving + _drive_frequency(driven) ** 2)
 
 
-def junction_pace(driven: Driven, place: Place) -> Float[Array, "..."]:
-    """Return the pace of a tip in the junction per unit of fictitious time, from the same three."""
-    s, curve = place.x, driven.solid
-    energy = 0.5 * driven.mass_ng * place.gap_rate**2 / curve.energy_scale_aj
+def inverse_junction_step(driven: Driven, state: ContactState) -> Float[Array, "..."]:
+    """Return the inverse of the scale of fictitious time of a tip in the junction.
+
+    The root of the squares of: the frequency of the junction's stiffness, the speed over the distance in s in which the load changes, and those of
+    cantilever and drive.
+    """
+    s, curve = state.x, driven.solid
+    energy = 0.5 * driven.mass_ng * state.gap_rate**2 / curve.energy_scale_aj
     elastic = curve.bend(s) * driven.load_scale_nn * driven.inverse_mass / driven.depth_scale_nm
-    passing = 3.0 * place.gap_rate / (driven.depth_scale_nm * curve.reach(s, energy))
-    return 0.8 * jnp.sqrt(elastic + passing**2 + (_drive_pace(driven) * curve.depth_slope(s)) ** 2)
+    passing = 3.0 * state.gap_rate / (driven.depth_scale_nm * curve.reach(s, energy))
+    return 0.8 * jnp.sqrt(elastic + passing**2 + (_drive_frequency(driven) * curve.depth_slope(s)) ** 2)
 
 
-def _drive_pace(driven: Driven) -> Array:
+def _drive_frequency(driven: Driven) -> Float[Array, "..."]:
+    """Return the sum of the angular frequencies of cantilever and surface in rad/us; 0 for a free tip."""
     if driven.drive is None:
         return jnp.zeros_like(driven.inverse_mass)
     return driven.cantilever.angular_frequency + driven.surface.fastest_angular_frequency
 
 
-def eighth_order_step(rates: Callable[[Place], Place], begin: Place, length: Float[Array, "..."]) -> Place:
-    """Return the place after a step, without an error estimate.
+def eighth_order_step(
+    rates: Callable[[ContactState], ContactState], start: ContactState, length: Float[Array, "..."]
+) -> ContactState:
+    """Return the state after a step of Dormand and Prince's method of order 8, without an error estimate.
 
     The stages are one small loop over one array, which costs less than half of a general solver's step and hardly
     grows with the number of tips up to a few dozen.
 
     Args:
-        rates: rates of a place, which do not depend on time but by the place.
-        begin: the place at the beginning; arrays of one shape.
+        rates: rates of a state, which do not depend on time but by the state.
+        start: the state at the beginning; arrays of one shape.
         length: of the step.
     """
-    rows, weights = (jnp.asarray(part, begin.x.dtype) for part in _coefficients())
-    start = jnp.stack(begin)
+    rows, weights = (jnp.asarray(part, start.x.dtype) for part in _coefficients())
+    begin = jnp.stack(start)
 
     def stage(number, slopes):
         row = lax.dynamic_index_in_dim(rows, number, keepdims=False)
-        place = start + length * jnp.tensordot(row, slopes, axes=1)
-        return slopes.at[number].set(jnp.stack(rates(Place(*place))))
+        state = begin + length * jnp.tensordot(row, slopes, axes=1)
+        return slopes.at[number].set(jnp.stack(rates(ContactState(*state))))
 
-    slopes = lax.fori_loop(0, len(weights), stage, jnp.zeros((len(weights), *start.shape), start.dtype))
-    return Place(*(start + length * jnp.tensordot(weights, slopes, axes=1)))
-
-
-def diffrax_step(rates: Callable[[Place], Place], begin: Place, length: Float[Array, "..."]) -> Place:
-    """Return the place after a step of Diffrax's own solver; arguments as of `eighth_order_step`."""
-    import diffrax  # noqa: PLC0415  # half a second
-
-    solver = diffrax.Dopri8(scan_kind="lax")
-
-    def field(share, place, args):
-        del share, args
-        return Place(*(length * rate for rate in rates(place)))
-
-    term = diffrax.ODETerm(field)
-    zero, one = jnp.zeros((), begin.x.dtype), jnp.ones((), begin.x.dtype)
-    memory = solver.init(term, zero, one, begin, None)
-    return solver.step(term, zero, one, begin, None, memory, made_jump=False)[0]
+    slopes = lax.fori_loop(0, len(weights), stage, jnp.zeros((len(weights), *begin.shape), begin.dtype))
+    return ContactState(*(begin + length * jnp.tensordot(weights, slopes, axes=1)))
 
 
 @cache
 def _coefficients() -> tuple[np.ndarray, np.ndarray]:
     """Return the matrix of the stages, and the weights; the tableau's last stage is the next step's first."""
-    from diffrax import Dopri8  # noqa: PLC0415
+    from diffrax import Dopri8  # noqa: PLC0415  # half a second
 
     tableau = Dopri8.tableau
     weights = np.asarray(tableau.b_sol)[:-1]
@@ -322,37 +332,43 @@ def _coefficients() -> tuple[np.ndarray, np.ndarray]:
     return rows, weights
 
 
-def _crossing_share(start: Array, start_slope: Array, end: Array, end_slope: Array) -> Float[Array, "..."]:
-    """Return the share of a step at which its cubic (values and slopes at both ends) vanishes, between two signs.
+class _Cubic(NamedTuple):
+    """The cubic f(u) = start + u (slope + u (bend + u twist)) along a step, u the fraction that is done."""
 
-    Args:
-        start: value at the start.
-        start_slope: slope there, times the length of the step.
-        end: value at the end, of the other sign.
-        end_slope: slope there, times the length of the step.
-    """
-    bend = 3.0 * (end - start) - 2.0 * start_slope - end_slope
-    twist = 2.0 * (start - end) + start_slope + end_slope
-    share = start / jnp.where(start == end, 1.0, start - end)
+    start: Float[Array, "..."]
+    slope: Float[Array, "..."]
+    bend: Float[Array, "..."]
+    twist: Float[Array, "..."]
+    end: Float[Array, "..."]
 
-    # a few steps of Newton's method: a miss is only tried again
-    def improve(_, share):
-        value = start + share * (start_slope + share * (bend + share * twist))
-        slope = start_slope + share * (2.0 * bend + 3.0 * share * twist)
-        return jnp.clip(share - value / jnp.where(slope == 0.0, 1.0, slope), 0.0, 1.0)
+    @classmethod
+    def of(cls, start: Array, start_slope: Array, end: Array, end_slope: Array) -> "_Cubic":
+        """Return the cubic of values at both ends, and of slopes there times the length of the step."""
+        bend = 3.0 * (end - start) - 2.0 * start_slope - end_slope
+        return cls(start, start_slope, bend, 2.0 * (start - end) + start_slope + end_slope, end)
 
-    return lax.fori_loop(0, _CUBIC_STEPS, improve, share)
+    def value(self, fraction: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return f at a fraction of the step."""
+        return self.start + fraction * (self.slope + fraction * (self.bend + fraction * self.twist))
 
+    def crossing(self) -> Float[Array, "..."]:
+        """Return the fraction of the step at which f vanishes, where its ends have different signs."""
 
-def _turning_point(start: Array, start_slope: Array, end: Array, end_slope: Array) -> tuple[Array, Array]:
-    """Return share and value of the extremum of a step's cubic whose slope changes sign; arguments as above."""
-    bend = 3.0 * (end - start) - 2.0 * start_slope - end_slope
-    twist = 2.0 * (start - end) + start_slope + end_slope
-    # 3 twist x^2 + 2 bend x + start_slope = 0, the root between 0 and 1 in the form that does not cancel
-    square = bend * bend - 3.0 * twist * start_slope
-    real = square > 0.0
-    root = jnp.where(real, jnp.sqrt(jnp.where(real, square, 1.0)), 0.0)
-    below = jnp.where(start_slope > 0.0, root, -root) - bend
-    share = start_slope / jnp.where(below == 0.0, 1.0, below)
-    share = jnp.clip(share, 0.0, 1.0)
-    return share, start + share * (start_slope + share * (bend + share * twist))
+        # a few steps of Newton's method: a miss is only tried again
+        def improve(_, fraction):
+            slope = self.slope + fraction * (2.0 * self.bend + 3.0 * fraction * self.twist)
+            correction = self.value(fraction) / jnp.where(slope == 0.0, 1.0, slope)
+            return jnp.clip(fraction - correction, 0.0, 1.0)
+
+        secant = self.start / jnp.where(self.start == self.end, 1.0, self.start - self.end)
+        return lax.fori_loop(0, _CUBIC_STEPS, improve, secant)
+
+    def turning_point(self) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Return fraction and value of the extremum, where the slopes at the ends have different signs."""
+        # 3 twist u^2 + 2 bend u + slope = 0, the root between 0 and 1 in the form that does not cancel
+        square = self.bend * self.bend - 3.0 * self.twist * self.slope
+        real = square > 0.0
+        root = jnp.where(real, jnp.sqrt(jnp.where(real, square, 1.0)), 0.0)
+        below = jnp.where(self.slope > 0.0, root, -root) - self.bend
+        fraction = jnp.clip(self.slope / jnp.where(below == 0.0, 1.0, below), 0.0, 1.0)
+        return fraction, self.value(fraction)

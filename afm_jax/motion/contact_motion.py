@@ -21,19 +21,19 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.contact.bridge_leg import go_in, go_out
-from afm_jax.contact.driven import Driven, Place
+from afm_jax.contact.driven import ContactState, Driven
 from afm_jax.contact.junction import Phase
 from afm_jax.contact.junction_leg import go_through_junction
 from afm_jax.contact.leg import Leg
 from afm_jax.contact.settings import DrivenSetting, QuickSetting
-from afm_jax.contact.step import Touch, advance, fresh_touch, junction_pace
+from afm_jax.contact.step import TipInContact, advance, inverse_junction_step
 from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.motion.record import ContactKind, MotionOutcome
 from afm_jax.outcomes import Outcome
 from afm_jax.solve.lanes import repeat_for
 
 
-def cross(driven: Driven, place: Place, setting: QuickSetting) -> Leg:
+def cross(driven: Driven, place: ContactState, setting: QuickSetting) -> Leg:
     """Return a tip beyond the contact that it has just begun.
 
     Args:
@@ -42,19 +42,19 @@ def cross(driven: Driven, place: Place, setting: QuickSetting) -> Leg:
         setting: how finely.
     """
     inward = go_in(driven, place, setting)
-    solid = go_through_junction(driven, inward.place, setting)
-    outward = go_out(driven, solid.place, setting)
+    solid = go_through_junction(driven, inward.state, setting)
+    outward = go_out(driven, solid.state, setting)
     return outward._replace(deepest_gap_nm=solid.deepest_gap_nm, holds=inward.holds & solid.holds & outward.holds)
 
 
-def at_junction(driven: Driven, touch: Touch) -> Bool[Array, "..."]:
+def at_junction(driven: Driven, touch: TipInContact) -> Bool[Array, "..."]:
     """Say whether a tip has just formed the junction, so that the quick way may go on from there."""
-    return (touch.phase == Phase.JUNCTION) & (touch.place.x == driven.junction.forms_root) & (touch.trial == 0.0)
+    return (touch.phase == Phase.JUNCTION) & (touch.state.x == driven.junction.forms_root) & (touch.trial_length == 0.0)
 
 
 def go_quickly(
-    driven: Driven, touch: Touch, arrived: Array, active: Array, until_us: Array, setting: DrivenSetting
-) -> Touch:
+    driven: Driven, touch: TipInContact, arrived: Array, active: Array, until_us: Array, setting: DrivenSetting
+) -> TipInContact:
     """Return a tip as far on its way through the contact as legs hold that end before a time.
 
     Args:
@@ -70,39 +70,40 @@ def go_quickly(
         raise ValueError("`setting` has no quick way")
 
     def taken(leg, wanted):
-        return wanted & leg.holds & (leg.place.time_us < until_us)
+        return wanted & leg.holds & (leg.state.time_us < until_us)
 
-    leg = go_in(driven, touch.place, quick)
+    leg = go_in(driven, touch.state, quick)
     formed = taken(leg, arrived)
     touch = _moved(touch, leg, formed, Phase.JUNCTION)
     touch = touch._replace(
         junctions=touch.junctions + formed.astype(touch.junctions.dtype),
-        junction_forms_us=jnp.where(formed, touch.place.time_us, touch.junction_forms_us),
+        junction_forms_us=jnp.where(formed, touch.state.time_us, touch.junction_forms_us),
     )
-    leg = go_through_junction(driven, touch.place, quick)
+    leg = go_through_junction(driven, touch.state, quick)
     wet = driven.junction.breaks_gap_nm < driven.breaks_nm
     waits = at_junction(driven, touch) & active
-    broken = taken(leg, waits & wet)
+    # where nothing acts outside the junction, the way out through the bridge has no length
+    broken = taken(leg, waits & (wet | (not driven.bridge.spans)))
     # one for which it does not hold is told how far to go in time, and waits no longer
-    there = lax.stop_gradient(touch.place._replace(x=driven.junction.forms_root))
-    step = lax.stop_gradient(1.0 / (setting.fineness * junction_pace(driven, there)))
-    touch = touch._replace(trial=jnp.where(waits & ~broken, step, touch.trial))
-    passed = touch.time_in_junction_us + leg.place.time_us - touch.place.time_us
+    there = lax.stop_gradient(touch.state._replace(x=driven.junction.forms_root))
+    step = lax.stop_gradient(1.0 / (setting.fineness * inverse_junction_step(driven, there)))
+    touch = touch._replace(trial_length=jnp.where(waits & ~broken, step, touch.trial_length))
+    passed = touch.time_in_junction_us + leg.state.time_us - touch.state.time_us
     touch = _moved(touch, leg, broken, Phase.BRIDGE)
     touch = touch._replace(
-        junction_breaks_us=jnp.where(broken, touch.place.time_us, touch.junction_breaks_us),
+        junction_breaks_us=jnp.where(broken, touch.state.time_us, touch.junction_breaks_us),
         time_in_junction_us=jnp.where(broken, passed, touch.time_in_junction_us),
     )
-    leg = go_out(driven, touch.place, quick)
+    leg = go_out(driven, touch.state, quick)
     return _moved(touch, leg, taken(leg, broken), Phase.DRY)
 
 
-def _moved(touch: Touch, leg: Leg, moves: Array, phase: Phase) -> Touch:
+def _moved(touch: TipInContact, leg: Leg, moves: Array, phase: Phase) -> TipInContact:
     """Return a tip at the end of a leg, where it takes it."""
     return touch._replace(
-        place=jax.tree.map(lambda new, old: jnp.where(moves, new, old), leg.place, touch.place),
+        state=jax.tree.map(lambda new, old: jnp.where(moves, new, old), leg.state, touch.state),
         phase=jnp.where(moves, phase, touch.phase).astype(touch.phase.dtype),
-        trial=jnp.where(moves, 0.0, touch.trial),
+        trial_length=jnp.where(moves, 0.0, touch.trial_length),
         deepest_gap_nm=jnp.where(moves, jnp.minimum(touch.deepest_gap_nm, leg.deepest_gap_nm), touch.deepest_gap_nm),
     )
 
@@ -158,7 +159,7 @@ class Repeats(NamedTuple):
 class ContactTip(NamedTuple):
     """A tip on its way; scalars of one tip, but for the rows."""
 
-    touch: Touch
+    touch: TipInContact
     """Its place and phase, and the contact it is in; the gap of a free tip."""
     arrival: Arrival
     """Where the present contact began."""
@@ -179,7 +180,7 @@ def begin(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, rows: int)
     phase = jnp.where(wet, Phase.BRIDGE, Phase.DRY)
     zero = jnp.zeros_like(time_us)
     return ContactTip(
-        touch=fresh_touch(Place(gap_nm, rate, time_us, zero), phase),
+        touch=TipInContact.at_start(ContactState(gap_nm, rate, time_us, zero), phase),
         arrival=Arrival(time_us, gap_nm, rate),
         repeats=Repeats(jnp.zeros_like(phase, dtype=jnp.int32), zero, zero),
         contacts=jnp.zeros_like(phase),
@@ -221,15 +222,15 @@ def follow(
 def _round(driven: Driven, tip: ContactTip, *, until_us: Array, setting: DrivenSetting, reverse: bool) -> ContactTip:
     """Return a tip after one round: flight, the quick way through the contact, trial steps where that does not hold."""
     free = (tip.touch.phase == Phase.DRY) & ~tip.done
-    arrived, lost, place = _fly(driven, tip.touch.place, free, until_us)
+    arrived, lost, place = _fly(driven, tip.touch.state, free, until_us)
     began = (place.time_us, place.x, place.gap_rate)
     arrival = Arrival(*(jnp.where(arrived, new, old) for new, old in zip(began, tip.arrival, strict=True)))
-    fresh = fresh_touch(place, jnp.where(arrived, Phase.BRIDGE, Phase.DRY))
+    fresh = TipInContact.arriving(driven, place, arrived)
     touch = jax.tree.map(lambda new, old: jnp.where(free, new, old), fresh, tip.touch)
     active, first = ~tip.done, tip.repeats.times == 0
     touch = _through(driven, touch, arrived, active & first, until_us, setting)
     touch = _step(driven, touch, active, tip.repeats.times, until_us, setting, reverse=reverse)
-    over = touch.place.time_us >= until_us
+    over = touch.state.time_us >= until_us
     left = touch.phase == Phase.DRY
     touched = arrived | ((tip.touch.phase != Phase.DRY) & active)
     again, repeats = _again(touch, arrival, tip.repeats, touched & left & ~over, setting)
@@ -241,11 +242,11 @@ def _round(driven: Driven, tip: ContactTip, *, until_us: Array, setting: DrivenS
     outcome = jnp.where(full, MotionOutcome.CONTACT_LIMIT, tip.outcome)
     outcome = jnp.where(ended & ~left, MotionOutcome.HELD, outcome)
     outcome = jnp.where(lost, MotionOutcome.STEP_LIMIT, outcome)
-    outcome = jnp.where(jnp.isfinite(touch.place.x), outcome, MotionOutcome.UNRESOLVED)
+    outcome = jnp.where(jnp.isfinite(touch.state.x), outcome, MotionOutcome.UNRESOLVED)
     flown = free & ~arrived
     if setting.agreement is not None:
-        came = Place(arrival.gap_nm, arrival.gap_rate, arrival.time_us, jnp.zeros_like(arrival.time_us))
-        back = fresh_touch(came, jnp.full_like(touch.phase, Phase.BRIDGE))
+        came = ContactState(arrival.gap_nm, arrival.gap_rate, arrival.time_us, jnp.zeros_like(arrival.time_us))
+        back = TipInContact.arriving(driven, came, jnp.ones_like(left))
         touch = jax.tree.map(lambda new, old: jnp.where(again, new, old), back, touch)
     return ContactTip(
         touch=touch,
@@ -254,19 +255,22 @@ def _round(driven: Driven, tip: ContactTip, *, until_us: Array, setting: DrivenS
         contacts=tip.contacts + ended.astype(tip.contacts.dtype),
         rows=tip.rows.at[place_of_row].set(row, mode="drop"),
         outcome=jnp.where(tip.done, tip.outcome, outcome).astype(jnp.int32),
-        done=tip.done | flown | (touched & over) | full | lost | ~jnp.isfinite(touch.place.x),
+        done=tip.done | flown | (touched & over) | full | lost | ~jnp.isfinite(touch.state.x),
         rounds=tip.rounds + 1,
     )
 
 
 def _again(
-    touch: Touch, arrival: Arrival, repeats: Repeats, left: Array, setting: DrivenSetting
+    touch: TipInContact, arrival: Arrival, repeats: Repeats, left: Array, setting: DrivenSetting
 ) -> tuple[Array, Repeats]:
     """Say whether a contact that a tip has left is to be computed again in finer steps, and what that will know."""
     if setting.agreement is None:
         return jnp.zeros_like(left), repeats
-    came, now, before = lax.stop_gradient((arrival, touch.place, repeats))
-    lasts = (now.time_us - came.time_us) * jnp.abs(came.gap_rate) > _LASTS_LONG * (came.gap_nm + now.x)
+    came, now, before = lax.stop_gradient((arrival, touch.state, repeats))
+    gaps = came.gap_nm + now.x
+    # without a bridge the way is that into the sample and back
+    gaps = jnp.where(gaps > 0.0, gaps, -2.0 * touch.deepest_gap_nm)
+    lasts = (now.time_us - came.time_us) * jnp.abs(came.gap_rate) > _LASTS_LONG * gaps
     slowed = setting.magnified * now.gap_rate**2 < came.gap_rate**2
     differs = jnp.maximum(
         jnp.abs(now.gap_rate - before.departure_rate),
@@ -279,11 +283,11 @@ def _again(
     return again, jax.tree.map(lambda new, old: jnp.where(again, new, old), known, kept)
 
 
-def _fly(driven: Driven, place: Place, free: Array, until_us: Array) -> tuple[Array, Array, Place]:
+def _fly(driven: Driven, place: ContactState, free: Array, until_us: Array) -> tuple[Array, Array, ContactState]:
     """Return whether a free tip meets the bridge before the end, whether the search gave up, and where the tip is."""
     surface, start = driven.surface, place.time_us
     # tips that are not free start below the level, so that their search ends at once
-    gap = jnp.where(free, place.x, 0.5 * driven.forms_nm)
+    gap = jnp.where(free, place.x, driven.forms_nm - 1.0)
     height, speed = surface.position_and_velocity(start)
     velocity = place.gap_rate + speed
     flight = Flight(driven.cantilever, surface, start, velocity, gap, driven.forms_nm)
@@ -294,13 +298,14 @@ def _fly(driven: Driven, place: Place, free: Array, until_us: Array) -> tuple[Ar
     position, velocity = driven.cantilever.propagator(duration)(gap + height, velocity)
     time = start + duration
     height, speed = surface.position_and_velocity(time)
-    moved = Place(jnp.where(arrives, driven.forms_nm, position - height), velocity - speed, time, jnp.zeros_like(time))
-    return arrives, lost, Place(*(jnp.where(free, new, old) for new, old in zip(moved, place, strict=True)))
+    gap = jnp.where(arrives, driven.forms_nm, position - height)
+    moved = ContactState(gap, velocity - speed, time, jnp.zeros_like(time))
+    return arrives, lost, ContactState(*(jnp.where(free, new, old) for new, old in zip(moved, place, strict=True)))
 
 
 def _through(
-    driven: Driven, touch: Touch, arrived: Array, active: Array, until_us: Array, setting: DrivenSetting
-) -> Touch:
+    driven: Driven, touch: TipInContact, arrived: Array, active: Array, until_us: Array, setting: DrivenSetting
+) -> TipInContact:
     """Return the tip as far through its contact as the quick way holds."""
     if setting.quick is None:
         return touch
@@ -318,20 +323,20 @@ def _through(
 
 def _step(
     driven: Driven,
-    touch: Touch,
+    touch: TipInContact,
     active: Array,
     repeats: Array,
     until_us: Array,
     setting: DrivenSetting,
     *,
     reverse: bool,
-) -> Touch:
+) -> TipInContact:
     """Return a tip in contact after some trial steps, or where the quick way may go on; a free one stays as it is."""
     fineness = setting.fineness * _FINER ** repeats.astype(until_us.dtype)
 
     def going(touch, active, until_us):
-        finite = jnp.isfinite(touch.place.x) & jnp.isfinite(touch.place.gap_rate)
-        return active & (touch.phase != Phase.DRY) & (touch.place.time_us < until_us) & finite
+        finite = jnp.isfinite(touch.state.x) & jnp.isfinite(touch.state.gap_rate)
+        return active & (touch.phase != Phase.DRY) & (touch.state.time_us < until_us) & finite
 
     def waits_not(driven, touch, active, fineness, until_us):
         # a tip that has just formed the junction waits for the quick way; one for which that did not hold does not,
@@ -342,7 +347,7 @@ def _step(
         return moves & ~(at_junction(driven, touch) & (fineness == setting.fineness))
 
     def advanced(driven, touch, moves, fineness, until_us):
-        after = advance(driven, touch, until_us, fineness, setting.method)
+        after = advance(driven, touch, until_us, fineness)
         return jax.tree.map(lambda new, old: jnp.where(moves, new, old), after, touch)
 
     if reverse:
@@ -369,8 +374,8 @@ def _step(
     return few(driven, touch, active, fineness, until_us)
 
 
-def _row(touch: Touch, arrival: Arrival, *, held: Array) -> Float[Array, " columns"]:
-    place = touch.place
+def _row(touch: TipInContact, arrival: Arrival, *, held: Array) -> Float[Array, " columns"]:
+    place = touch.state
     row = ContactRow(
         kind=jnp.where(held, float(ContactKind.HELD), float(ContactKind.IMPACT)),
         arrival_us=arrival.time_us,

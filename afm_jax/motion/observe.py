@@ -367,7 +367,8 @@ def _forces(
     if here.any():
         peaks.append(float(np.asarray(detail.peak_force_nn)[here].max()))
     if np.any(np.asarray(detail.junctions)[here] > 0):
-        loads = contact.junction.force(np.linspace(float(contact.junction.pull_off_depth_nm), 0.0, _LOADS))
+        solid = contact.solid
+        loads = solid.force(np.linspace(float(solid.depth_scale_nm * solid.depth(solid.fold)), 0.0, _LOADS))
         least.append(float(np.min(np.asarray(loads))))
     return max(peaks), min(least)
 

@@ -65,7 +65,7 @@ def simulate(  # noqa: PLR0913
             that magnify errors are computed again in finer steps until two in a row agree so well (not in reverse
             mode). At least 99.5 % of random contacts hold it, from the capture speed on.
         method: the way through a resolved contact: "collocation" (leg by leg, and in time where a tip turns in the
-            bridge or is held) or "diffrax" (in time throughout, by Diffrax's Dopri8; some ten times slower).
+            bridge or is held) or "diffrax" (in time throughout, with the coefficients of Diffrax's Dopri8; slower).
         reverse: make it differentiable in reverse mode, in memory that grows with the square root of the length.
         max_rounds: most rounds; a tip that is held takes one every 60 steps of its oscillation. None: as many as it
             takes, four for every contact in reverse mode, where all of them are run.
@@ -229,7 +229,7 @@ def _contact(  # noqa: PLR0913
     gap, rate = to_gap(surface, response, start)
     tip = begin(driven, start.time_us, gap, rate, rows)
     tip = follow(driven, tip, until, setting, rounds=rounds, reverse=reverse)
-    place, phase = tip.touch.place, tip.touch.phase
+    place, phase = tip.touch.state, tip.touch.phase
     table = ContactRow(*jnp.moveaxis(tip.rows, -1, 0))
     return Simulation(
         start=start,
@@ -256,7 +256,7 @@ def _contacts(
     solid = row.junctions * junction.junction_hysteresis_aj
     shift, contact = junction.shift_nm, scene.interaction
     touched = row.junctions > 0.0
-    force = jnp.where(touched, contact.junction.force(shift - jnp.where(touched, row.deepest_gap_nm, 0.0)), 0.0)
+    force = jnp.where(touched, contact.solid.force(shift - jnp.where(touched, row.deepest_gap_nm, 0.0)), 0.0)
 
     def where(condition, value):
         return jnp.where(condition, value, 0.0)

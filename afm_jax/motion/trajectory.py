@@ -29,9 +29,9 @@ from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.apparatus.surface import Surface, surface_of
 from afm_jax.checks import checked
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.driven import Driven, Place, driven_by
+from afm_jax.contact.driven import ContactState, Driven, driven_by
 from afm_jax.contact.junction import Junction, Phase, find_junction, force_in_phase
-from afm_jax.contact.step import Touch, advance, eighth_order_step, fresh_touch
+from afm_jax.contact.step import TipInContact, advance, eighth_order_step
 from afm_jax.motion.record import ContactKind, Simulation, State, to_gap, to_lab
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.lanes import filled, power_of_two
@@ -54,7 +54,7 @@ class Steps(NamedTuple):
     """Gap rate in nm/us at the beginning."""
 
 
-def contact_steps(driven: Driven, begin: Place, phase: Int[np.ndarray, " contacts"], until_us: float) -> Steps:
+def contact_steps(driven: Driven, begin: ContactState, phase: Int[np.ndarray, " contacts"], until_us: float) -> Steps:
     """Return the steps of contacts from their beginnings to their ends, or to a time.
 
     Args:
@@ -65,12 +65,12 @@ def contact_steps(driven: Driven, begin: Place, phase: Int[np.ndarray, " contact
     """
     # filled up with tips in no contact to a power of two: few shapes, so that few programs are compiled
     spare = (1 << max(len(phase) - 1, 0).bit_length()) - len(phase)
-    place = Place(*(jnp.concatenate([jnp.asarray(part), jnp.ones(spare)]) for part in begin))
+    place = ContactState(*(jnp.concatenate([jnp.asarray(part), jnp.ones(spare)]) for part in begin))
     phases = np.concatenate([phase, np.full(spare, int(Phase.DRY))])
-    touch = fresh_touch(place, jnp.asarray(phases, jnp.int32))
-    until = jnp.asarray(until_us, touch.place.x.dtype)
+    touch = TipInContact.arriving(driven, place, jnp.asarray(phases != Phase.DRY))
+    until = jnp.asarray(until_us, touch.state.x.dtype)
     parts = []
-    while np.any((np.asarray(touch.phase) != Phase.DRY) & (np.asarray(touch.place.time_us) < until_us)):
+    while np.any((np.asarray(touch.phase) != Phase.DRY) & (np.asarray(touch.state.time_us) < until_us)):
         touch, record = _some_trials(driven, touch, until)
         taken, *columns = (np.asarray(part) for part in jax.tree.leaves(record))
         parts.append([column[taken] for column in columns])
@@ -81,20 +81,20 @@ def contact_steps(driven: Driven, begin: Place, phase: Int[np.ndarray, " contact
 
 
 @jax.jit
-def _some_trials(driven: Driven, touch: Touch, until: Float[Array, ""]) -> tuple[Touch, tuple]:
+def _some_trials(driven: Driven, touch: TipInContact, until: Float[Array, ""]) -> tuple[TipInContact, tuple]:
     def once(touch, _):
-        going = (touch.phase != Phase.DRY) & (touch.place.time_us < until)
+        going = (touch.phase != Phase.DRY) & (touch.state.time_us < until)
         after = advance(driven, touch, until, _FINENESS)
-        taken = going & (after.trial == 0.0)
+        taken = going & (after.trial_length == 0.0)
         kept = jax.tree.map(lambda new, old: jnp.where(going, new, old), after, touch)
-        return kept, (taken, *touch.place, touch.phase, after.place.time_us)
+        return kept, (taken, *touch.state, touch.phase, after.state.time_us)
 
     return lax.scan(once, touch, None, length=_BLOCK)
 
 
 @jax.jit
 def places_at(
-    driven: Driven, start: Place, phase: Int[Array, " times"], time_us: Float[Array, " times"]
+    driven: Driven, start: ContactState, phase: Int[Array, " times"], time_us: Float[Array, " times"]
 ) -> tuple[Float[Array, " times"], Float[Array, " times"]]:
     """Return gap in nm and its rate in nm/us at times within steps, by one step of order 8 from where each began.
 
@@ -265,7 +265,7 @@ def _contact_pieces(world: World, simulation: Simulation, rows: np.ndarray, high
         np.asarray(part)[rows] for part in (contacts.arrival_position_nm, contacts.arrival_velocity_nm_per_us)
     )
     gap, rate = world.gaps(arrival, position, velocity)
-    begin = Place(*(jnp.asarray(part) for part in (gap, rate, arrival, np.zeros(arrival.shape))))
+    begin = ContactState(*(jnp.asarray(part) for part in (gap, rate, arrival, np.zeros(arrival.shape))))
     # to the end of the last step that a wanted time may lie in
     steps = contact_steps(world.driven, begin, np.full(rows.shape, int(Phase.BRIDGE)), high)
     columns = (steps.begin_us, steps.end_us, steps.phase, steps.begin_us, steps.x, steps.rate)
@@ -487,7 +487,7 @@ def _force(
 def _in_contact(world: World, pieces: Pieces, place: np.ndarray, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return gap and gap rate at times within steps of contacts."""
     parts = (pieces.x, pieces.rate, pieces.origin_us, np.zeros(pieces.x.shape))
-    start = Place(*(jnp.asarray(part[place]) for part in parts))
+    start = ContactState(*(jnp.asarray(part[place]) for part in parts))
     phase = jnp.asarray(pieces.kind[place], jnp.int32)
     assert world.driven is not None  # steps of contacts are of resolved contacts  # noqa: S101
     gap, rate = places_at(world.driven, start, phase, jnp.asarray(times))
