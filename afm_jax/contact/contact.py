@@ -37,7 +37,7 @@ class Contact(eqx.Module):
     are cut, to where the solids meet. Hertz's contact has no forces and begins at gap 0.
 
     Args:
-        forces: the forces outside the solid contact, as a sum (`Capillary() + CoreRepulsion()`) or a sequence; no order.
+        forces: the forces outside the solid contact, a sum (`Capillary() + CoreRepulsion()`) or a sequence; no order.
         junction: the solid contact: `Jkr()`, `Dmt()` or `Hertz()`.
         bridge_forms_nm: gap at which an approaching tip meets the bridge, in nm; of a dry contact its range.
         bridge_breaks_nm: gap at which a leaving tip breaks it, in nm; of a dry contact its range.
@@ -53,10 +53,10 @@ class Contact(eqx.Module):
     ('van_der_waals', 'dmt')
     """
 
-    forces: ForceSum = eqx.field(converter=_flat)
+    forces: ForceSum
     junction: Jkr | Dmt | Hertz
-    bridge_forms_nm: Float[Array, "..."] = eqx.field(converter=as_parameter)
-    bridge_breaks_nm: Float[Array, "..."] = eqx.field(converter=as_parameter)
+    bridge_forms_nm: Float[Array, "..."]
+    bridge_breaks_nm: Float[Array, "..."]
 
     __repr__ = readable
 
@@ -69,7 +69,8 @@ class Contact(eqx.Module):
         *,
         range_nm: ArrayLike | None = None,
     ):
-        self.forces = forces  # type: ignore  # converted by its field
+        """Fill in the gaps that are not given."""
+        self.forces = _flat(forces)
         self.junction = Jkr() if junction is None else junction
         forms, breaks = PAPER["bridge_forms_nm"], PAPER["bridge_breaks_nm"]
         if isinstance(junction, Dmt):
@@ -78,8 +79,8 @@ class Contact(eqx.Module):
             forms = breaks = 0.0
         if range_nm is not None and not isinstance(junction, Dmt):
             raise ValueError("`range_nm` is that of a contact with Dmt(): a bridge has two gaps, Hertz() has no range")
-        self.bridge_forms_nm = forms if bridge_forms_nm is None else bridge_forms_nm  # type: ignore
-        self.bridge_breaks_nm = breaks if bridge_breaks_nm is None else bridge_breaks_nm  # type: ignore
+        self.bridge_forms_nm = as_parameter(forms if bridge_forms_nm is None else bridge_forms_nm)
+        self.bridge_breaks_nm = as_parameter(breaks if bridge_breaks_nm is None else bridge_breaks_nm)
 
     def __check_init__(self):
         check_kind("junction", self.junction, Jkr | Dmt | Hertz)
@@ -234,9 +235,9 @@ def _check_solid(forces: ForceSum, junction: Jkr | Dmt | Hertz) -> None:
     for term in forces.terms:
         name = type(term).__name__
         if isinstance(junction, Dmt) and isinstance(term, Capillary | Structural | CoreRepulsion):
-            raise ValueError(f"{name}() is a force of the liquid bridge, whose solid contact is Jkr(), not Dmt()")
+            raise ValueError(f"{name}() is a force of the liquid bridge, whose solid contact is Jkr(), not Dmt()")  # noqa: TRY004
         if isinstance(junction, Hertz) and not isinstance(junction, Dmt):
-            raise ValueError(f"Hertz() is a contact without other forces; {name}() acts with Dmt()")
+            raise ValueError(f"Hertz() is a contact without other forces; {name}() acts with Dmt()")  # noqa: TRY004
 
 
 def check_effects(effects: Sequence[str]) -> None:
@@ -276,7 +277,8 @@ class Bridge(eqx.Module):
     """The forces of a bridge, reduced to their coefficients.
 
     A force's parameters enter thousands of evaluations of its potential; what depends on them alone is computed here.
-    ``spans``: whether there is a gap between where the contact begins and where the solids meet. ``arrow``: -1 where time runs backwards, so that drag gives the energy that it takes; None: it does not.
+    ``spans``: whether there is a gap between where the contact begins and where the solids meet. ``arrow``: -1 where
+    time runs backwards, so that drag gives the energy that it takes; None: it does not.
     """
 
     static_kinds: tuple[type[StaticForce], ...] = eqx.field(static=True)

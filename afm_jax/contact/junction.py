@@ -68,8 +68,9 @@ class Junction(ResultTuple):
 def find_junction(contact: Contact) -> Junction:
     """Return the junction of a contact; differentiable in every parameter, for one set of them.
 
-    A dry contact forms and breaks where its solids meet. Of several tangencies the one that an approaching tip meets with the bridge stiffening beyond the JKR contact is
-    taken, at the largest gap; the spurious ones near the JKR pull-off cross the other way.
+    A dry contact forms and breaks where its solids meet. Of several tangencies the one that an approaching tip meets
+    with the bridge stiffening beyond the JKR contact is taken, at the largest gap; the spurious ones near the JKR
+    pull-off cross the other way.
 
     Raises:
         TypeError: if it is no contact.

@@ -248,9 +248,12 @@ def make_law(contact: Contact, *, mass_ng: float = 1.0, points: int = MOST_KNOTS
     # a contact that captures no tip still needs a positive speed
     beyond = np.geomspace(max(_NEAREST * capture, 1e-3 * _FASTEST), _FASTEST, points)
     found = rebounds(contact, np.hypot(beyond, capture), mass_ng)
-    names = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us")
+    approach, rebound = found["approach_speed_nm_per_us"], found["rebound_speed_nm_per_us"]
     return TabulatedLaw(
-        *(found[name] for name in names),
+        approach,
+        # without any loss rounding may add to the speed
+        np.minimum(rebound, approach),
+        found["collision_delay_us"],
         capture_speed_nm_per_us=capture,
         mass_ng=mass_ng,
         origin=f"contact: {', '.join(contact.effects)}",

@@ -35,6 +35,8 @@ from afm_jax.contact.junction import Phase
 
 _NEAR = 1e-7
 """Relative distance from a threshold within which the parabola is exact to rounding."""
+_NEAR_FOLD = 1e-5
+"""That of a fold at s = 0, relative to where the step began: s bends little there."""
 _SHORTEST = 1e-3
 """Bounds of a repeated trial's length over that of the failed one: this, and 1 less a tenth of it."""
 _CORE_FRACTION = 0.4
@@ -138,7 +140,7 @@ class _Trial(NamedTuple):
     @property
     def near_low(self) -> Float[Array, "..."]:
         """Distance from the low threshold within which the parabola is exact; s is 0 at the fold of a dry contact."""
-        return _NEAR * jnp.where(self.low > 0.0, self.low, self.start.x)
+        return jnp.where(self.low > 0.0, _NEAR * self.low, _NEAR_FOLD * self.start.x)
 
     @property
     def path(self) -> "_Cubic":
@@ -277,8 +279,8 @@ def inverse_bridge_step(driven: Driven, state: ContactState, acceleration: Float
 def inverse_junction_step(driven: Driven, state: ContactState) -> Float[Array, "..."]:
     """Return the inverse of the scale of fictitious time of a tip in the junction.
 
-    The root of the squares of: the frequency of the junction's stiffness, the speed over the distance in s in which the load changes, and those of
-    cantilever and drive.
+    The root of the squares of: the frequency of the junction's stiffness, the speed over the distance in s in which the
+    load changes, and the frequencies of cantilever and drive.
     """
     s, curve = state.x, driven.solid
     energy = 0.5 * driven.mass_ng * state.gap_rate**2 / curve.energy_scale_aj

@@ -1,9 +1,9 @@
 """The elastic contact of a dry sphere and a plane: Hertz's, and with an attraction that does not change (DMT).
 
 From the gap a0 inwards the load is K sqrt(R) delta^(3/2) - P, delta = a0 - D the depth, K the reduced modulus as in JKR
-(K sqrt(R) delta^(3/2) is Hertz's law). P is the attraction of the forces outside where the contact begins: of van der
-Waals' H R/(6 a0^2), the result of Derjaguin, Muller and Toporov. The force is thereby continuous, and the contact
-breaks where it has formed. With s = sqrt(delta/unit), load s^3 - p, depth s^2 and work (2/5) s^5 - p s^2 are polynomials.
+(K sqrt(R) delta^(3/2) is Hertz's law). P is what the forces outside pull with where the solids meet: H R/(6 a0^2) by
+van der Waals' force (Derjaguin, Muller and Toporov). So the force is continuous, and the contact breaks where it has
+formed. With s = sqrt(delta/unit), load s^3 - p, depth s^2 and work (2/5) s^5 - p s^2 are polynomials.
 """
 
 import equinox as eqx
