@@ -6,7 +6,6 @@ import math
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from click.testing import CliRunner
@@ -88,7 +87,7 @@ def test_what_happens_while_an_impact_lasts_is_an_effect_of_its_delay():
 @pytest.mark.slow
 def test_leaving_the_corrections_out_changes_what_the_closed_form_says(programs, tmp_path):
     scene = law_scene(LASTING)
-    study = study_effects(scene, accuracy=0.02, only=["delay_corrections"], derivatives=False, programs=programs)
+    study = study_effects(scene, accuracy=0.02, only=["delay_corrections"], programs=programs)
     expected = orbit_of(law_scene()) / orbit_of(scene) - 1.0
     # 0.2-0.7 % is what the corrections are there for
     assert 1e-3 < np.abs(expected[:2]).max() < 1e-2
@@ -126,20 +125,6 @@ def test_leaving_an_effect_of_a_law_out_changes_what_the_closed_form_says(law_st
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["restitution", "adhesion", "viscous_loss", "delay", "air_damping"])
-def test_the_prediction_is_the_slope_of_the_closed_form(law_study, name):
-    effect = {effect.name: effect for effect in effects_in(law_scene())}[name]
-    assert effect.scaled is not None
-    # central difference: its error of second order is far below what is compared
-    step = 1e-4
-    ends = [orbit_of(effect.scaled(law_scene(), jnp.asarray(s))) for s in (step, -step)]
-    slope = (ends[0] - ends[1]) / (2.0 * step) / orbit_of(law_scene())
-    predicted = by_name(law_study)[name].predicted
-    found = numbers(predicted)
-    np.testing.assert_allclose(found, -slope, rtol=1e-3, atol=1e-6)
-
-
-@pytest.mark.slow
 def test_numbers_of_a_law_cost_nothing(law_study):
     for name in ("restitution", "adhesion", "viscous_loss"):
         assert by_name(law_study)[name].cost == law_study.cost
@@ -164,7 +149,7 @@ def test_what_a_law_does_not_need_is_known_from_the_closed_form(law_study):
 def test_air_damping_is_needed_near_resonance_unless_there_is_nearly_none(programs, quality_factor, needed):
     # lossy impacts, so that the motion settles without air too
     scene = law_scene(ImpactLaw(0.9, 1.0), quality_factor)
-    study = study_effects(scene, accuracy=0.01, only=["air_damping"], derivatives=False, programs=programs)
+    study = study_effects(scene, accuracy=0.01, only=["air_damping"], programs=programs)
     bare = orbit_of(law_scene(ImpactLaw(0.9, 1.0), None)) / orbit_of(scene) - 1.0
     change = by_name(study)["air_damping"].change
     # as above
@@ -174,7 +159,7 @@ def test_air_damping_is_needed_near_resonance_unless_there_is_nearly_none(progra
 
 def test_a_free_cantilever_without_air_at_resonance_has_no_steady_response(programs):
     scene = Scene(Cantilever(90.0, 40.0), Platform(0.0, 90.0, -100.0), None, force=ForceDrive(0.1, 90.0))
-    study = study_effects(scene, accuracy=0.01, derivatives=False, programs=programs)
+    study = study_effects(scene, accuracy=0.01, programs=programs)
     report = by_name(study)
     assert report["air_damping"].change.peak_amplitude is None
     assert "free frequency" in reason_of(report["air_damping"])
@@ -195,8 +180,6 @@ def test_a_second_frequency_is_compared_over_the_last_fifth(programs):
     report = by_name(study)["second_frequency"]
     assert study.observed.orbit is None
     assert 0.0 < size_of(report.change) < 1e-5
-    # so weak a drive acts to first order
-    np.testing.assert_allclose(amplitudes(report.predicted), amplitudes(report.change), rtol=0.01, atol=1e-9)
     assert reduction_of(study).left_out == ("second_frequency",)
     assert reduction_of(study).scene.platform.second is None
 
@@ -219,20 +202,11 @@ def test_all_effects_are_named():
 
 
 @pytest.mark.parametrize("name", ["capillary", "structural", "viscous"])
-def test_a_force_is_proportional_to_its_strength_and_absent_without_it(name):
+def test_a_force_is_absent_from_the_scene_without_it(name):
     scene = contact_scene(1.01, 4.0, 0.0)
-    effect = {effect.name: effect for effect in effects_in(scene)}[name]
-    assert effect.scaled is not None
-    gap, rate = 0.7, -50.0
-
-    def force(scene: Scene) -> float:
-        return float(scene.interaction.forces(gap, rate))
-
-    own = force(scene) - force(effect.without(scene))
-    # rounding of a sum of forces
-    np.testing.assert_allclose(force(effect.scaled(scene, jnp.asarray(0.5))), force(scene) + 0.5 * own, rtol=1e-12)
-    assert name not in effect.without(scene).interaction.effects
-    assert len(jax.tree.leaves(effect.without(scene))) < len(jax.tree.leaves(scene))
+    without = {effect.name: effect for effect in effects_in(scene)}[name].without(scene)
+    assert name not in without.interaction.effects
+    assert len(jax.tree.leaves(without)) < len(jax.tree.leaves(scene))
 
 
 def contact_study(programs: Programs, viscosity_pa_s: float):
@@ -243,7 +217,6 @@ def contact_study(programs: Programs, viscosity_pa_s: float):
         start_of(scene, START),
         accuracy=0.01,
         only=["structural", "core", "viscous", "jkr"],
-        derivatives=False,
         programs=programs,
     )
 

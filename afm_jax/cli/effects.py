@@ -38,10 +38,10 @@ def command(
     """Say what each effect of a scene changes and costs.
 
     Each effect is left out, absent from the program, and the steady motion compared with that of the full scene: peak
-    and lock-in amplitude, phase, energy lost per impact; beside it what the derivative with respect to its strength
-    predicts. All motions begin at the file's [start], or else at the scene's default one. Where nothing repeats (a
-    ramp, several frequencies) the last fifth of the duration is compared. Costs are processor time of a drive period
-    and operations of the compiled program. With --out effects.csv, effects.json and effects.png.
+    and lock-in amplitude, phase, energy lost per impact. All motions begin at the file's [start], or else at the
+    scene's default one. Where nothing repeats (a ramp, several frequencies) the last fifth of the duration is compared.
+    Costs are processor time of a drive period and operations of the compiled program. With --out effects.csv,
+    effects.json and effects.png.
     """
     if duration_us is not None and not (duration_us > 0.0 and math.isfinite(duration_us)):
         raise click.UsageError(f"--duration-us must be a positive number, but is {duration_us:g}")

@@ -23,11 +23,9 @@ COLUMNS = (
     "zero_strength",
     "needed",
     *(f"change_{name}" for name in CHANGES),
-    *(f"predicted_{name}" for name in CHANGES),
     *COSTS,
     *(f"saved_{name}" for name in COSTS),
     "reason",
-    "predicted_reason",
 )
 """The columns of effects.csv, and the keys of an effect in the JSON object but for the nested ones."""
 
@@ -68,8 +66,6 @@ def _effect(report: EffectReport, full: Cost, left_out: tuple[str, ...]) -> dict
         "needed": effect.name not in left_out,
         "change": report.change._asdict(),
         "reason": report.reason,
-        "predicted": report.predicted._asdict(),
-        "predicted_reason": report.predicted_reason,
         **cost,
         **{f"saved_{name}": _difference(whole[name], cost[name]) for name in COSTS},
     }
@@ -110,27 +106,25 @@ def write_files(session: Session, payload: Mapping[str, Any]) -> None:
 
 
 def _flat(effect: Mapping[str, Any]) -> dict[str, Any]:
-    nested = {f"{kind}_{name}": effect[kind][name] for kind in ("change", "predicted") for name in CHANGES}
-    return {**{name: value for name, value in effect.items() if name not in ("change", "predicted")}, **nested}
+    changes = {f"change_{name}": effect["change"][name] for name in CHANGES}
+    return {**{name: value for name, value in effect.items() if name != "change"}, **changes}
 
 
 def text_of(payload: Mapping[str, Any]) -> list[Any]:
     """Return a table and sentences to print."""
     table = Table(title="Without the effect", title_justify="left")
     headings = ("effect", "peak\nchange", "lock-in\nchange", "phase\ndeg", "loss/impact\nchange")
-    headings += ("predicted\npeak", "predicted\nlock-in", "time\nus/period", "saved", "operations\nsaved", "")
+    headings += ("time\nus/period", "saved", "operations\nsaved", "")
     for place, heading in enumerate(headings):
         table.add_column(heading, justify="left" if place in (0, len(headings) - 1) else "right")
     for effect in payload["effects"]:
-        change, predicted = effect["change"], effect["predicted"]
+        change = effect["change"]
         table.add_row(
             effect["name"],
             _percent(change["peak_amplitude"]),
             _percent(change["lockin_amplitude"]),
             known(change["lockin_phase_deg"], ".3g"),
             _percent(change["energy_per_impact"]),
-            _percent(predicted["peak_amplitude"]),
-            _percent(predicted["lockin_amplitude"]),
             known(effect["time_us_per_period"], ".4g"),
             known(effect["saved_time_us_per_period"], ".3g"),
             known(effect["saved_operations"], ".0f"),

@@ -38,13 +38,10 @@ def draw_effects(
 
 def _draw_changes(axes: Axes, effects: Sequence[Mapping[str, Any]], accuracy: float | None) -> None:
     for row, effect in enumerate(effects):
-        change, predicted = effect["change"]["peak_amplitude"], effect["predicted"]["peak_amplitude"]
-        lockin = effect["change"]["lockin_amplitude"]
+        change, lockin = effect["change"]["peak_amplitude"], effect["change"]["lockin_amplitude"]
         for value, place, colour in ((change, row - 0.17, DARK), (lockin, row + 0.17, BLUE)):
             if value is not None:
                 axes.barh(place, max(abs(value), _LEAST), left=0.0, height=0.3, color=colour)
-        if predicted is not None and change is not None:
-            axes.plot(max(abs(predicted), _LEAST), row - 0.17, "D", color=ACCENT, ms=6, zorder=3)
         if change is None:
             words = "required" if effect["required"] else "no steady motion without it"
             axes.text(0.02, row, words, transform=axes.get_yaxis_transform(), va="center", fontsize=10)
@@ -53,7 +50,6 @@ def _draw_changes(axes: Axes, effects: Sequence[Mapping[str, Any]], accuracy: fl
         abs(effect["change"][name] or 0.0) for effect in effects for name in ("peak_amplitude", "lockin_amplitude")
     ]
     axes.set_xlim(_LEAST, 3.0 * max([*values, 0.1]))
-    axes.plot([], [], "D", color=ACCENT, ms=6, label="peak, by derivative")
     if accuracy is not None:
         axes.axvline(accuracy, color=ACCENT, lw=1.2, ls="--", label=f"wanted, {100.0 * accuracy:g} %")
     bars = [Patch(color=DARK, label="peak amplitude"), Patch(color=BLUE, label="lock-in amplitude")]
