@@ -175,7 +175,7 @@ class ValueAndError(click.ParamType):
         return numbers[0], numbers[1] if len(numbers) == 2 else None
 
 
-PRESET_NAMES = ("figure2", "figure3", "figure8", "figure9a", "figure9b", "figure10", "figure11")
+PRESET_NAMES = ("figure2", "figure3", "figure8", "figure9a", "figure9b", "figure10", "figure11", "dry")
 """Of `afm_jax.scenefile.presets`; said here as well, because help and completion must not wait for JAX."""
 
 

@@ -7,15 +7,21 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.checks import as_parameter, check_kind, check_parameter, is_traced, readable
 from afm_jax.contact.forces.dry import Dmt, Hertz, dry_curve
-from afm_jax.contact.forces.elastic import ElasticCurve
-from afm_jax.contact.forces.force import DissipativeForce, Force, ForceSum, StaticForce, terms_of
+from afm_jax.contact.forces.force import (
+    DissipativeForce,
+    ElasticCurve,
+    Force,
+    ForceSum,
+    StaticForce,
+    slope_of,
+    terms_of,
+)
 from afm_jax.contact.forces.jkr import Jkr
 from afm_jax.contact.forces.liquid import Capillary, Liquid, Structural, Viscous
 from afm_jax.contact.forces.solid import CoreRepulsion, VanDerWaals
@@ -300,11 +306,11 @@ class Bridge(eqx.Module):
 
     def force(self, gap: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return the force of all static forces in nN at a gap in nm."""
-        return -jax.jvp(self.potential, (gap,), (jnp.ones_like(gap),))[1]
+        return -slope_of(self.potential, gap)
 
     def stiffness(self, gap: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return -dF/dD of all static forces in nN/nm at a gap in nm."""
-        return -jax.jvp(self.force, (gap,), (jnp.ones_like(gap),))[1]
+        return -slope_of(self.force, gap)
 
     def damping(self, gap: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return the damping of all dissipative forces in nN us/nm at a gap in nm."""

@@ -19,7 +19,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import Surface, Wave
 from afm_jax.apparatus.trigonometry import sine_cosine
 from afm_jax.contact.contact import Bridge, Contact, bridge_of
-from afm_jax.contact.forces.elastic import ElasticCurve
+from afm_jax.contact.forces.force import ElasticCurve
 from afm_jax.contact.junction import Junction, Phase, find_junction
 
 

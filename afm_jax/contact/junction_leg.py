@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from afm_jax.contact.driven import ContactState, Driven
-from afm_jax.contact.forces.elastic import ElasticCurve
+from afm_jax.contact.forces.force import ElasticCurve
 from afm_jax.contact.leg import Leg, mean_matrix, nodes_along, settled
 from afm_jax.contact.settings import QuickSetting
 

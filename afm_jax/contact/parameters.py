@@ -11,14 +11,19 @@ EFFECTS = ("capillary", "structural", "core", "viscous", "jkr")
 DRY_EFFECTS = ("van_der_waals", "viscous", "dmt", "hertz")
 """The effects of which a dry contact has some: one of the last two, which are its solid contact."""
 
-ALL_EFFECTS = ("capillary", "structural", "core", "van_der_waals", "viscous", "jkr", "dmt", "hertz")
-"""All of them, forces first, in the order of scene files."""
+ALL_EFFECTS = (*EFFECTS, *(name for name in DRY_EFFECTS if name not in EFFECTS))
+"""All of them."""
 
 REQUIRED_EFFECTS = {
     "core": "without the core repulsion the bridge never gets as stiff as the JKR contact, so that no junction forms",
     "jkr": "the JKR contact is the solid junction itself: without it the tip would fall through the sample",
 }
-"""The effects that a contact cannot do without, and why."""
+"""The effects that the paper's contact cannot do without, and why."""
+
+WHY_REQUIRED = REQUIRED_EFFECTS | dict.fromkeys(
+    ("dmt", "hertz"), "it is the solid contact itself: without it the tip would fall through the sample"
+)
+"""Why an effect that a contact has cannot be left out of it."""
 
 REMOVABLE_EFFECTS = tuple(name for name in EFFECTS[::-1] if name not in REQUIRED_EFFECTS)
 """The effects that it can do without."""

@@ -128,7 +128,10 @@ def _largest(holds: Callable[[Array], Array], low: Float[Array, ""], high: Float
 
 
 def _crossing(way: Way) -> tuple[_Leg, Float[Array, ""]]:
-    """Return a crossing of the bridge and the kinetic energy at its end."""
+    """Return a crossing of the bridge and the kinetic energy at its end; of no length where nothing acts before."""
+    if not way.tip.bridge.spans:
+        nothing = jnp.zeros(_NODES)
+        return _Leg(nothing, nothing, nothing, jnp.zeros(())), way.total_aj - way.end_potential_aj
     swept = sweep(way, _NODES, _SWEEPS)
     end = swept.passage
     return _Leg(swept.lasted_us, swept.at.gap_nm, -way.sense * swept.speed, end.time_us), end.energy_aj
@@ -163,8 +166,8 @@ def _joined(
     begin = 0.0
     _, off, rebound = energies
     for phase, leg in zip((Phase.BRIDGE, Phase.JUNCTION, Phase.JUNCTION, Phase.BRIDGE), legs, strict=True):
-        if leg is legs[-1] and (off <= 0.0 or not leg.duration > 0.0):
-            break
+        if not leg.duration > 0.0 or (leg is legs[-1] and off <= 0.0):
+            continue
         parts.append((phase, begin + np.asarray(leg.time), np.asarray(leg.gap), np.asarray(leg.velocity)))
         begin += float(leg.duration)
     captured = not rebound > 0.0

@@ -6,13 +6,11 @@ van der Waals' force (Derjaguin, Muller and Toporov). So the force is continuous
 formed. With s = sqrt(delta/unit), load s^3 - p, depth s^2 and work (2/5) s^5 - p s^2 are polynomials.
 """
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from afm_jax.checks import as_argument, as_parameter, check_parameter, readable
-from afm_jax.contact.forces.elastic import ElasticCurve, Terms
-from afm_jax.contact.parameters import DEFAULTS
+from afm_jax.checks import as_argument
+from afm_jax.contact.forces.force import ElasticCurve, Parameters, Terms, parameter_field
 
 _LEAST_ENERGY = 1e-24
 
@@ -78,7 +76,7 @@ class DryCurve(ElasticCurve):
         return (s**5 + 2.5 * jnp.maximum(energy, _LEAST_ENERGY)) ** 0.2
 
 
-class Hertz(eqx.Module):
+class Hertz(Parameters):
     """Hertz's contact of a sphere and a plane, without attraction: F = K sqrt(R) (-D)^(3/2) below gap 0.
 
     A contact has it alone, without forces, and begins and ends at its surface, gap 0.
@@ -91,14 +89,8 @@ class Hertz(eqx.Module):
         ValueError: if a value is not positive.
     """
 
-    modulus_gpa: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["modulus_gpa"])
-    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["tip_radius_nm"])
-
-    __repr__ = readable
-
-    def __check_init__(self):
-        check_parameter("modulus_gpa", self.modulus_gpa, "positive")
-        check_parameter("tip_radius_nm", self.tip_radius_nm, "positive")
+    modulus_gpa: Float[Array, "..."] = parameter_field("modulus_gpa")
+    tip_radius_nm: Float[Array, "..."] = parameter_field("tip_radius_nm")
 
     @property
     def begins_nm(self) -> Float[Array, "..."]:
@@ -120,12 +112,7 @@ class Dmt(Hertz):
         ValueError: if a value is not positive.
     """
 
-    contact_distance_nm: Float[Array, "..."] = eqx.field(
-        converter=as_parameter, default=DEFAULTS["contact_distance_nm"]
-    )
-
-    def __check_init__(self):
-        check_parameter("contact_distance_nm", self.contact_distance_nm, "positive")
+    contact_distance_nm: Float[Array, "..."] = parameter_field("contact_distance_nm")
 
     @property
     def begins_nm(self) -> Float[Array, "..."]:

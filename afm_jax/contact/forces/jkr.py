@@ -7,13 +7,11 @@ breaks under displacement control at the fold s = 6^(-1/6), where dP/dDelta is i
 
 import math
 
-import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from afm_jax.checks import as_argument, as_parameter, check_parameter, readable
-from afm_jax.contact.forces.elastic import ElasticCurve, Terms
-from afm_jax.contact.parameters import PAPER
+from afm_jax.checks import as_argument
+from afm_jax.contact.forces.force import ElasticCurve, Parameters, Terms, parameter_field
 
 SLOPE = 2.0 * math.sqrt(6.0) / 3.0
 """The linear coefficient of the depth: Delta = s^4 - SLOPE s."""
@@ -124,7 +122,7 @@ class JkrCurve(ElasticCurve):
 _CURVATURE = -6.0 * (FOLD**6 - 6.0**0.5 * FOLD**3) * FOLD**2
 
 
-class Jkr(eqx.Module):
+class Jkr(Parameters):
     """The JKR contact of a sphere and a plane, eq. 15.
 
     Args:
@@ -136,18 +134,9 @@ class Jkr(eqx.Module):
         ValueError: if a value is not positive.
     """
 
-    adhesion_energy_j_per_m2: Float[Array, "..."] = eqx.field(
-        converter=as_parameter, default=PAPER["adhesion_energy_j_per_m2"]
-    )
-    modulus_gpa: Float[Array, "..."] = eqx.field(converter=as_parameter, default=PAPER["modulus_gpa"])
-    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=PAPER["tip_radius_nm"])
-
-    __repr__ = readable
-
-    def __check_init__(self):
-        check_parameter("adhesion_energy_j_per_m2", self.adhesion_energy_j_per_m2, "positive")
-        check_parameter("modulus_gpa", self.modulus_gpa, "positive")
-        check_parameter("tip_radius_nm", self.tip_radius_nm, "positive")
+    adhesion_energy_j_per_m2: Float[Array, "..."] = parameter_field("adhesion_energy_j_per_m2")
+    modulus_gpa: Float[Array, "..."] = parameter_field("modulus_gpa")
+    tip_radius_nm: Float[Array, "..."] = parameter_field("tip_radius_nm")
 
     @property
     def load_scale_nn(self) -> Float[Array, "..."]:
