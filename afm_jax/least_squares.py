@@ -1,7 +1,4 @@
-"""Damped Gauss-Newton steps (Levenberg, Marquardt), for several searches side by side and between bounds.
-
-The covariance that a Fisher matrix stands for.
-"""
+"""Damped Gauss-Newton steps (Levenberg, Marquardt), for several searches side by side and between bounds."""
 
 import math
 from collections.abc import Callable

@@ -1,12 +1,9 @@
 """From parameters to predicted amplitudes: each row's steady single-impact orbit, on the branch that was measured.
 
-The orbit that a row of a table is taken to be on: its scene, and which of its steady motions was measured.
-
-Derivatives of predicted amplitudes by every parameter, forward or reverse, refused where there are none.
-
 A steady orbit is a root of its closing condition; by the implicit function theorem it moves smoothly with the
 parameters, except at a fold, where it meets another root and ends, and where the tip grazes the platform, at the impact
-or on the way. There, and where there is no steady orbit, the gradient is NaN and a sentence says why.
+or on the way. There, and where there is no steady orbit, the derivatives of amplitudes by parameters, forward or
+reverse, are NaN and a sentence says why.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,7 @@
-"""What is fitted and what it is compared with.
+"""What is fitted and what it is compared with: a model's parameters as vectors, and a table's rows as arrays.
 
-A model's parameters as vectors, in the optimiser's coordinates and as the law that they stand for; a table's rows as
-arrays, with the cantilever and the Gaussian constraints.
+The vectors are in the optimiser's coordinates and stand for a law; the rows come with the cantilever and the Gaussian
+constraints.
 """
 
 from collections.abc import Mapping, Sequence

@@ -21,7 +21,7 @@ import numpy as np
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
-from afm_jax.cli.main import _is_inner
+from afm_jax.cli.ending import is_inner
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
 from afm_jax.impact.map import next_impact
 from afm_jax.impact.orbits import single_impact_orbits
@@ -240,7 +240,7 @@ def fuzz_files(count: int, seed: int) -> None:
                     warnings.simplefilter("error")
                     read(path)
             except ValueError as error:
-                if _is_inner(error) or not str(error).isprintable():
+                if is_inner(error) or not str(error).isprintable():
                     raise AssertionError(f"{where}: {error!r}\n{path.read_bytes()!r}") from error
             except Exception as error:
                 raise AssertionError(f"{where}: {error!r}\n{path.read_bytes()!r}") from error

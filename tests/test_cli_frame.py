@@ -23,8 +23,9 @@ import afm_jax
 import fitting
 from afm_jax import strict_json
 from afm_jax.cli import main, session
+from afm_jax.cli.command import Command
 from afm_jax.cli.main import NotValid
-from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.session import Session
 from afm_jax.cli.values import PRESET_NAMES, example_path
 from afm_jax.scenefile.presets import PRESETS
 from afm_jax.words import lines_at_most, text_table
@@ -39,9 +40,10 @@ def trial(monkeypatch: pytest.MonkeyPatch) -> Callable[..., Result]:
 
     def run(body: Callable[[Session], None], *arguments: str) -> Result:
         module = ModuleType("trial_command")
-        module.__dict__["command"] = click.command()(with_session(body))
+        module.__dict__["body"] = body
         monkeypatch.setitem(sys.modules, "trial_command", module)
-        monkeypatch.setitem(main.COMMANDS, "trial", ("trial_command", "Try something."))
+        row = Command(name="trial", group="check", summary="Try.", runs="trial_command:body", help="", computes=False)
+        monkeypatch.setitem(main.COMMANDS, "trial", row)
         return CliRunner().invoke(main.main, ["trial", *arguments])
 
     return run
@@ -56,20 +58,23 @@ def one_line(result: Result) -> str:
     return lines[0].removeprefix("afm-jax: ")
 
 
-@pytest.mark.parametrize("package", ["afm_jax", "fitting"])
-def test_packages_import_nothing_heavy(package: str):
-    assert python(f"import sys, {package}; print({HEAVY} & set(sys.modules))") == "set()"
-
-
-@pytest.mark.parametrize(
-    "arguments", [["--help"], ["--version"], ["orbit"], *([name, "--help"] for name in main.COMMANDS)]
-)
-def test_help_imports_nothing_heavy(arguments: list[str]):
-    code = (
-        "import sys\nfrom afm_jax.cli.main import main\n"
-        f"try:\n    main({arguments})\nexcept SystemExit:\n    print('found', {HEAVY} & set(sys.modules))"
-    )
-    assert python(code).splitlines()[-1] == "found set()"
+def test_packages_and_help_import_nothing_heavy():
+    # one after the other in one process: whatever imported something would be named, and all that come after it
+    calls = [["--help"], ["--version"], ["orbit"], *([name, "--help"] for name in main.COMMANDS)]
+    code = f"""
+import sys, afm_jax, fitting
+heavy = lambda: {HEAVY} & set(sys.modules)
+print("found packages", heavy())
+from afm_jax.cli.main import main
+for call in {calls}:
+    try:
+        main(call)
+    except SystemExit:
+        print("found", call, heavy())
+"""
+    found = [line for line in python(code).splitlines() if line.startswith("found ")]
+    assert len(found) == 1 + len(calls)
+    assert all(line.endswith(" set()") for line in found), found
 
 
 def test_exports_are_what_the_modules_define():
@@ -84,8 +89,8 @@ def test_exports_are_what_the_modules_define():
 def test_help_lists_all_commands():
     text = CliRunner().invoke(main.main, ["--help"]).stdout
     words = " ".join(text.split())
-    for name, (_, line) in main.COMMANDS.items():
-        assert f" {name} {line}" in words
+    for name, row in main.COMMANDS.items():
+        assert f" {name} {row.summary}" in words
 
 
 def test_version_is_the_installed_one():
@@ -287,11 +292,12 @@ def test_closed_pipe_is_quiet():
 def test_interrupt_ends_with_130():
     code = (
         # a test run in the background inherits that interrupts are ignored
-        "import signal, sys, time, types, click\nfrom afm_jax.cli import main\n"
+        "import signal, sys, time, types\nfrom afm_jax.cli import main\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "module = types.ModuleType('waiting')\n"
-        "module.command = click.command()(lambda: (print('ready', flush=True), time.sleep(60)))\n"
-        "sys.modules['waiting'] = module\nmain.COMMANDS['wait'] = ('waiting', 'Wait.')\nmain.main(['wait'])"
+        "module.wait = lambda session: (print('ready', flush=True), time.sleep(60))\nsys.modules['waiting'] = module\n"
+        "row = dict(name='wait', group='check', summary='Wait.', runs='waiting:wait', help='', computes=False)\n"
+        "main.COMMANDS['wait'] = main.Command(**row)\nmain.main(['wait'])"
     )
     with subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
         assert process.stdout is not None

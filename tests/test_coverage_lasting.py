@@ -1,7 +1,8 @@
 """A thousand simulated experiments a model, fitted at once: 95 % intervals hold the truth 95 times of a hundred.
 
 The truth is the fitted model itself: what is proved is the fit and its errors, not the model. Intervals are Wald's for
-all thousand, and of the instantaneous law profile intervals for two hundred of them.
+all thousand, and of the instantaneous law profile intervals for two hundred of them; twenty are fitted one by one as
+users do, and come to the values of the batch.
 """
 
 import numpy as np
@@ -10,17 +11,18 @@ from scipy.stats import binom, kstest
 
 import fitting.examples
 from afm_jax.impact.law import ImpactLaw
-from fitting import read_table
+from fitting import fit, read_table
 from fitting.fits.intervals import profile_intervals
 from fitting.fits.minimum import relaxed, strain_of
 from fitting.fits.objective import Objective
 from fitting.models import Problem, measurement_of
 from fitting.sampling.bootstrap import BatchFit, DataSets, Refit, draw_data, fit_data_sets
-from tests.fit_tables import example_amplitudes, rows, simulated
+from fitting.tables.table import AmplitudeTable
+from tests.fit_tables import amplitudes_and_errors, example_amplitudes, rows, simulated, values_of, with_amplitudes
 
 pytestmark = pytest.mark.slow
 
-EXPERIMENTS, PROFILED = 1000, 200
+EXPERIMENTS, PROFILED, WHOLE = 1000, 200, 20
 CONTACT_EXAMPLE = fitting.examples.__path__[0] + "/amplitudes_contact.csv"
 TRUTHS = {
     "law": {"r": 0.95, "epsilon": 60.0, "quality_factor": 40.0},
@@ -36,13 +38,17 @@ TRUTHS = {
 }
 
 
+def table_of(model: str) -> AmplitudeTable:
+    """Return the drives of a bundled table, with errors of 1 %."""
+    if model != "law":
+        return read_table(CONTACT_EXAMPLE)
+    example = example_amplitudes()
+    return simulated(rows(example, np.arange(0, example.rows, 3)), ImpactLaw(0.95, 60.0), seed=None)
+
+
 def experiment(model: str) -> Refit:
-    """Return a model at its truth on the drives of a bundled table, with its errors of 1 %."""
-    if model == "law":
-        example = example_amplitudes()
-        table = simulated(rows(example, np.arange(0, example.rows, 3)), ImpactLaw(0.95, 60.0), seed=None)
-    else:
-        table = read_table(CONTACT_EXAMPLE)
+    """Return a model at its truth on the drives of a bundled table."""
+    table = table_of(model)
     problem = Problem(model, tuple(TRUTHS[model]))
     values = np.array(list(TRUTHS[model].values()))
     stated = Objective(measurement_of(table, problem), problem).following(values)
@@ -111,3 +117,30 @@ def test_profile_intervals_cover_the_truth(fits):
     # once in ten thousand of right intervals would lie outside on either side
     limits = binom.ppf(1e-4, PROFILED, 0.95), binom.ppf(1.0 - 1e-4, PROFILED, 0.95)
     assert np.all((limits[0] <= covered) & (covered <= limits[1])), dict(zip(names, covered.tolist(), strict=True))
+
+
+def test_whole_fits_are_those_of_the_batch_and_rarely_warn(fits):
+    refit, data, batch = fits
+    if refit.objective.problem.lasting:
+        pytest.skip("its rows are relaxed at the truth, those of a fit where it ends")
+    table = table_of("law")
+    (quality,) = np.flatnonzero(np.isfinite(np.asarray(refit.objective.measurement.constraint_error)))
+    _, error = amplitudes_and_errors(table)
+    results = [
+        fit(
+            with_amplitudes(
+                table, data.amplitude_nm[k, : table.rows, :2], error, quality_factor=data.constraint_value[k, quality]
+            ),
+            "law",
+        )
+        for k in range(WHOLE)
+    ]
+    deviation = np.sqrt(np.diagonal(batch.covariance, axis1=1, axis2=2))[:WHOLE]
+    # a fit ends within a thousandth of an error of its minimum
+    np.testing.assert_allclose(
+        [values_of(one) for one in results] / deviation, (batch.values[:WHOLE]) / deviation, atol=2e-3, rtol=0
+    )
+    np.testing.assert_allclose([one.chi2 for one in results], batch.chi2[:WHOLE], rtol=1e-5)
+    # left to chance: chi2 improbable at 1e-3, and an alarm beyond three standard deviations (0.27 %)
+    assert sum(not one.valid for one in results) <= binom.ppf(1 - 1e-4, WHOLE, 1e-3)
+    assert sum("correlated" in " ".join(one.warnings) for one in results) <= binom.ppf(1 - 1e-4, WHOLE, 2.7e-3)

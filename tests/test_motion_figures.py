@@ -11,7 +11,7 @@ from click.testing import CliRunner
 
 from afm_jax.cli.main import main
 from afm_jax.motion.follow import follow_long
-from afm_jax.motion.observe import departures
+from afm_jax.motion.section import departures
 from afm_jax.motion.start import default_start
 from afm_jax.paper import motion_figures
 from afm_jax.paper.motion_figures import (

@@ -9,8 +9,9 @@ from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene, sing
 from afm_jax.apparatus.drives import BaseDrive, Tone
 from afm_jax.apparatus.scene import drive_of
 from afm_jax.motion.follow import LongRun, follow_long
-from afm_jax.motion.observe import Observables, observe, poincare_section
+from afm_jax.motion.observe import OBSERVABLES, Observables, observe
 from afm_jax.motion.periodic import close_periods
+from afm_jax.motion.section import poincare_section
 from afm_jax.motion.settle import find_repetition, find_repetitions, last_fifth, settled
 from afm_jax.motion.start import default_start, start_of, state
 from afm_jax.scenefile.presets import contact_scene, figure10_scene, figure11_scene
@@ -133,6 +134,12 @@ def test_a_law_settles_on_its_orbit():
     np.testing.assert_allclose(
         section.approach_speed_nm_per_us[-1], float(orbits.approach_speed_nm_per_us[slot]), rtol=1e-7
     )
+
+
+def test_the_table_of_observables_is_complete():
+    assert Observables._fields[-len(OBSERVABLES) :] == tuple(observable.name for observable in OBSERVABLES)
+    # what may be None says why
+    assert all(("None" in str(Observables.__annotations__[one.name])) == bool(one.absent) for one in OBSERVABLES)
 
 
 def test_the_platform_gives_what_air_and_impacts_take():

@@ -215,13 +215,11 @@ DEAF = """
 import signal, sys, time, types
 # a job in the background of a shell is born deaf
 signal.signal(signal.SIGINT, signal.default_int_handler)
-import click
-from afm_jax.cli.main import COMMANDS, main
+from afm_jax.cli.main import COMMANDS, Command, main
 class Lost:
     def __del__(self):
         raise KeyboardInterrupt
-@click.command()
-def command():
+def command(session):
     ready = False
     while True:
         try:
@@ -233,7 +231,8 @@ def command():
             # as in the callbacks of a garbage collection: nobody hears it
             Lost()
 sys.modules["deaf"] = types.SimpleNamespace(command=command)
-COMMANDS["deaf"] = ("deaf", "")
+row = Command(name="deaf", group="check", summary="", help="", runs="deaf:command", computes=False)
+COMMANDS["deaf"] = row
 sys.argv[1:] = ["deaf"]
 main()
 """
@@ -241,16 +240,15 @@ main()
 
 LEAVING = """
 import atexit, os, signal, sys, types
-import click
-from afm_jax.cli.main import COMMANDS, main
+from afm_jax.cli.main import COMMANDS, Command, main
 # as of JAX's threads, which still compute while the interpreter is taken down
 atexit.register(lambda: os.kill(os.getpid(), signal.SIGSEGV))
-@click.command()
-def command():
+def command(session):
     print("whole")
     raise KeyboardInterrupt
 sys.modules["leaving"] = types.SimpleNamespace(command=command)
-COMMANDS["leaving"] = ("leaving", "")
+row = Command(name="leaving", group="check", summary="", help="", runs="leaving:command", computes=False)
+COMMANDS["leaving"] = row
 sys.argv[1:] = ["leaving"]
 main()
 """
@@ -279,18 +277,17 @@ def test_an_interrupt_that_is_swallowed_ends_the_program_all_the_same():
 
 IMPORTING = """
 import os, signal, sys, types
-import click
-from afm_jax.cli.main import COMMANDS, main
+from afm_jax.cli.main import COMMANDS, Command, main
 signal.signal(signal.SIGINT, signal.default_int_handler)
-@click.command()
-def command():
+def command(session):
     try:
         import taken_for_a_fault
     except BaseException:
         # as NumPy does, which then tries another way
         raise RecursionError
 sys.modules["importing"] = types.SimpleNamespace(command=command)
-COMMANDS["importing"] = ("importing", "")
+row = Command(name="importing", group="check", summary="", help="", runs="importing:command", computes=False)
+COMMANDS["importing"] = row
 sys.argv[1:] = ["importing"]
 main()
 """

@@ -26,6 +26,8 @@ from tests.made_fits import made_fit
 EVERY_FOURTH = slice(0, None, 4)
 FEWER = 16
 """Draws of a set, where many sets are looked at."""
+SETS = 50
+"""Of wrong posteriors: as improbable as is asked for all the same."""
 
 
 @pytest.mark.parametrize("shape", [-0.2, 0.3, 0.8])
@@ -187,7 +189,7 @@ def test_a_wrong_posterior_is_flagged(believed, monkeypatch, widened, shifted):
     drawn = values_believed(believed)
     middle, error = drawn.mean(axis=0), drawn.std(axis=0)
     wrong = middle + widened * (drawn - middle) + shifted * error
-    ranks = calibrate_ranks(refit_of_rows(result)[0], np.clip(wrong, None, [1.0, np.inf, np.inf]), sets=100)
+    ranks = calibrate_ranks(refit_of_rows(result)[0], np.clip(wrong, None, [1.0, np.inf, np.inf]), sets=SETS)
     assert ranks.p_value < rank_calibration.IMPROBABLE
 
 
@@ -203,7 +205,7 @@ def test_wrong_standard_errors_are_flagged(believed, monkeypatch):
 
     monkeypatch.setattr(rank_calibration, "fit_data_sets", too_sure)
     monkeypatch.setattr(rank_calibration, "DRAWS", FEWER)
-    ranks = calibrate_ranks(refit_of_rows(result)[0], drawn, sets=100)
+    ranks = calibrate_ranks(refit_of_rows(result)[0], drawn, sets=SETS)
     assert ranks.gaussian_p_value < rank_calibration.IMPROBABLE
 
 

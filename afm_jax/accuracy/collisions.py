@@ -1,12 +1,9 @@
 """Error of a collision against the time it takes: solvers, tolerances, variables, precisions, SciPy.
 
 Runs in a process of its own on one core. Errors are achieved ones, against a quadrature converged to rounding that is
-none of the contestants; just above the capture speed, where a tip hardly leaves, they are shown apart.
-
-Adaptive Diffrax solves of the bridge crossing, in the gap and in time: contestants of the accuracy study.
-
-In the gap the crossing's own equations (`afm_jax.contact.bridge_leg`) are solved with error control. In time gap and
-rate are the state, the phase is frozen, and Diffrax's events end the crossing.
+none of the contestants; just above the capture speed, where a tip hardly leaves, they are shown apart. Diffrax takes
+part twice: over the gap, where the crossing's own equations (`afm_jax.contact.bridge_leg`) are solved with error
+control, and in time, where gap and rate are the state, the phase is frozen, and Diffrax's events end the crossing.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence

@@ -1,14 +1,9 @@
-"""Error against time of one scene with a resolved contact: settings of its contacts.
+"""Error against time of one scene: settings of its contacts or of its search for an impact, and ever simpler models.
 
 Runs in a process of its own on one core. Errors are achieved ones, against the finest setting, whose own error is the
-difference to the second finest.
-
-Error against time of one scene with an impact law: tolerances of the search for an impact; see `contact_accuracy`.
-
-The fidelity ladder of a scene: the same amplitude from ever fuller models, each with its error and its time.
-
-Orbit of the impact law (closed form), the law's map, both with the collision delay, and the resolved contact, which is
-taken for true. Every rung answers one question: how high the tip gets once the motion has settled.
+difference to the second finest. Simpler models answer one question, how high the tip gets once the motion has settled:
+the orbit of the impact law in closed form, the law's map, both with the collision delay, and the resolved contact,
+which is taken for true.
 """
 
 import math

@@ -1,9 +1,8 @@
-"""One cosine of a drive: what a platform, a base or a force does at one frequency.
+"""What drives the tip besides the sample: the cantilever's base that moves, or a force on the tip.
 
-What drives the tip besides the sample: the cantilever's base that moves, or a force on the tip.
-
-With both, eq. 16 reads m z'' + (m Omega/Q) z' + k z = F(D, D') + f(t) + k z_b(t): the base acts through the spring,
-the air damps the motion in the lab. What a detector sees of a tip on a moving base is the deflection z - z_b.
+A drive is one cosine, or two. With both drives eq. 16 reads m z'' + (m Omega/Q) z' + k z = F(D, D') + f(t) + k z_b(t):
+the base acts through the spring, the air damps the motion in the lab. What a detector sees of a tip on a moving base
+is the deflection z - z_b.
 """
 
 import equinox as eqx

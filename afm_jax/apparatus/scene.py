@@ -1,7 +1,4 @@
-"""A scene: a cantilever, a moving platform, what happens when they meet, and what drives the tip besides.
-
-The period that a scene is driven with, and whether there is only one.
-"""
+"""A scene: a cantilever, a moving platform, what happens when they meet, and what drives the tip besides."""
 
 import math
 import os

@@ -1,6 +1,6 @@
 """The scenes that speed and accuracy are measured on, and where their tips start.
 
-Batches of driven tips for measurements: starts that keep bouncing, and single contacts taken out of their motion.
+Batches of driven tips start so that they keep bouncing; single contacts are taken out of their motion.
 """
 
 from collections.abc import Callable

@@ -1,9 +1,8 @@
 """Time of a compiled JAX function: compilation apart, several repetitions, the best and the median of them.
 
-A computation in a Python process of its own that may use a stated number of cores.
-
-How many cores JAX uses is settled before it is imported, and a process that has run other programs is a poor place to
-measure time in. Settings go in as JSON on standard input, results come back as JSON on standard output.
+A measurement runs in a Python process of its own that may use a stated number of cores: how many cores JAX uses is
+settled before it is imported, and a process that has run other programs is a poor place to measure time in. Settings go
+in as JSON on standard input, results come back as JSON on standard output.
 """
 
 import json

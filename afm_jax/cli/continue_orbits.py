@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.cli.fitted_law import with_fitted_law, with_law_option
 from afm_jax.cli.main import NotValid
+from afm_jax.cli.options import LAW, PICTURE
 from afm_jax.cli.orbits import IMPACT_COLUMNS, PositiveInteger, impact_rows, orbit_facts, refuse_other_than_law
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import SceneName, ranges_of, scene_and_start, with_picture
+from afm_jax.cli.values import SceneName, ranges_of, scene_and_start
 from afm_jax.units import TWO_SIDED_95
 
 if TYPE_CHECKING:
@@ -77,8 +77,8 @@ _ENDS = {
 )
 @click.option("--second", metavar="P=A:B", help="Another one: the special points are followed as curves in both.")
 @click.option("--sticking", is_flag=True, help="Follow the orbit with a rest on the sample: chatter, ride, release.")
-@with_law_option
-@with_picture
+@LAW
+@PICTURE
 @with_session
 def command(  # noqa: PLR0913
     session: Session,
@@ -108,6 +108,8 @@ def command(  # noqa: PLR0913
     from afm_jax.dynamics.continuation import continue_orbits  # noqa: PLC0415
 
     loaded, _ = scene_and_start(scene)
+    from afm_jax.cli.fitted_law import with_fitted_law  # noqa: PLC0415
+
     loaded, known = with_fitted_law(loaded, law)
     if sticking or not isinstance(loaded.interaction, Contact):
         refuse_other_than_law(loaded, scene)

@@ -12,14 +12,13 @@ import click
 
 from afm_jax.cli.each import fit_tables
 from afm_jax.cli.main import NotValid
+from afm_jax.cli.options import NOISE, QUALITY_FACTOR
 from afm_jax.cli.session import FIT_PROGRAMS, Session, prepare_folder, with_session
 from afm_jax.cli.values import (
     example_path,
     parse_around_plus_minus,
     parse_number,
     tables_with,
-    with_noise,
-    with_quality_factor,
 )
 from afm_jax.contact.parameters import EFFECTS, REMOVABLE_EFFECTS, idle_without
 from afm_jax.words import text_table
@@ -104,8 +103,8 @@ class Names(click.ParamType):
     + f"; each with {DELAY_LAW.meaning} (+delay); contact: physical parameters through the resolved contact, "
     "of tapping curves on resonance too.",
 )
-@with_noise
-@with_quality_factor
+@NOISE
+@QUALITY_FACTOR
 @click.option(
     "--scale-errors",
     is_flag=True,

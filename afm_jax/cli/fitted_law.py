@@ -1,36 +1,19 @@
 """`--law FILE`: a scene with the law of a file, and what the file says of the law's errors."""
 
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
-import click
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
 
-if TYPE_CHECKING:
-    from afm_jax.apparatus.scene import Scene
-    from afm_jax.dynamics.bands import UncertainParameters
-
-
-def with_law_option(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a command the option --law."""
-    return click.option(
-        "--law",
-        type=click.Path(path_type=Path),
-        metavar="FILE",
-        help="A fit's fit.json or law.csv, a law.json of `collide --make-law`, or a CSV of measured speeds: its law in "
-        "place of the scene's, its errors as bands.",
-    )(function)
+from afm_jax.apparatus.scene import Scene, check_mass
+from afm_jax.dynamics.bands import UncertainParameters
+from afm_jax.impact.law import TabulatedLaw
+from afm_jax.scenefile.law_files import law_and_fit
+from afm_jax.scenefile.parameter_paths import UNKNOWN
 
 
-def with_law_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a command the options --law and --draws."""
-    draws = click.option(
-        "--draws", type=click.IntRange(2), default=20, show_default=True, help="Laws drawn from the fit for the bands."
-    )
-    return with_law_option(draws(function))
-
-
-def with_fitted_law(scene: "Scene", path: Path | None) -> "tuple[Scene, UncertainParameters | None]":
+def with_fitted_law(scene: Scene, path: Path | None) -> tuple[Scene, UncertainParameters | None]:
     """Return a scene with the law of a file in place of its own, and the unknowns of its errors.
 
     Without a file it is the scene itself, of which nothing is uncertain; so it is of a law whose file tells no errors.
@@ -46,15 +29,6 @@ def with_fitted_law(scene: "Scene", path: Path | None) -> "tuple[Scene, Uncertai
     """
     if path is None:
         return scene, None
-    import equinox as eqx  # noqa: PLC0415
-    import jax.numpy as jnp  # noqa: PLC0415
-    import numpy as np  # noqa: PLC0415
-
-    from afm_jax.apparatus.scene import check_mass  # noqa: PLC0415
-    from afm_jax.dynamics.bands import UncertainParameters  # noqa: PLC0415
-    from afm_jax.scenefile.law_files import law_and_fit  # noqa: PLC0415
-    from afm_jax.scenefile.parameter_paths import UNKNOWN  # noqa: PLC0415
-
     law, fit = law_and_fit(path)
     try:
         check_mass(law, scene.cantilever)
@@ -78,12 +52,8 @@ def with_fitted_law(scene: "Scene", path: Path | None) -> "tuple[Scene, Uncertai
     return made, UncertainParameters(tuple(paths), np.array(values), np.diag(np.array(errors) ** 2))
 
 
-def as_drawn(scene: "Scene") -> "Scene":
+def as_drawn(scene: Scene) -> Scene:
     """Return a scene whose law has lost its errors, as that of a drawn scene has: both run in the same programs."""
-    import equinox as eqx  # noqa: PLC0415
-
-    from afm_jax.impact.law import TabulatedLaw  # noqa: PLC0415
-
     law = scene.interaction
     if not isinstance(law, TabulatedLaw) or law.deviations is None:
         return scene

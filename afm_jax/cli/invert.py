@@ -6,14 +6,15 @@ from pathlib import Path
 import click
 
 from afm_jax.cli.main import NotValid
+from afm_jax.cli.options import NOISE, QUALITY_FACTOR
 from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import Finite, example_path, tables_with, with_noise, with_quality_factor
+from afm_jax.cli.values import Finite, example_path, tables_with
 
 
 @click.command()
 @click.argument("table", metavar="[TABLE.csv]", required=False, type=click.Path(path_type=Path))
-@with_noise
-@with_quality_factor
+@NOISE
+@QUALITY_FACTOR
 @click.option(
     "--frequency-error",
     "frequency_error_khz",

@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.cli.fitted_law import with_fitted_law, with_law_option
 from afm_jax.cli.main import NotValid
+from afm_jax.cli.options import LAW
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import SceneName, scene_and_start
 
@@ -90,7 +90,7 @@ class PositiveInteger(click.ParamType):
     type=PositiveInteger(),
     help="Impacts in these periods, found by a search from many starts; without it, all single-impact orbits.",
 )
-@with_law_option
+@LAW
 @with_session
 def command(session: Session, scene: str, order: int, impacts: int | None, law: Path | None) -> None:
     """Find all single-impact orbits of a scene, or with --impacts orbits of several impacts.
@@ -110,6 +110,8 @@ def command(session: Session, scene: str, order: int, impacts: int | None, law: 
     from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
 
     loaded, _ = scene_and_start(scene)
+    from afm_jax.cli.fitted_law import with_fitted_law  # noqa: PLC0415
+
     loaded, _ = with_fitted_law(loaded, law)
     if impacts is not None or isinstance(loaded.interaction, Contact):
         _many(session, loaded, scene, order, impacts or 1)

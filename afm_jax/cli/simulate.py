@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.cli.fitted_law import with_fitted_law, with_law_option
 from afm_jax.cli.main import NotValid
+from afm_jax.cli.options import LAW
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import Finite, SceneName
 
@@ -85,7 +85,7 @@ class Multiples(click.ParamType):
     help="Write trace.csv into --out, too: the deflection over the last response periods at equal steps of time, as "
     "`afm-jax lockin` reads it.",
 )
-@with_law_option
+@LAW
 @with_session
 def command(  # noqa: PLR0913
     session: Session,
@@ -123,6 +123,8 @@ def command(  # noqa: PLR0913
     from afm_jax.motion.observe import observe  # noqa: PLC0415
 
     loaded, told = scene_and_start(scene)
+    from afm_jax.cli.fitted_law import with_fitted_law  # noqa: PLC0415
+
     loaded, _ = with_fitted_law(loaded, law)
     period = drive_of(loaded).period_us
     until_settled = until_settled or (duration_us is None and periods is None)

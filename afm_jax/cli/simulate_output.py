@@ -10,7 +10,7 @@ from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.cli.session import Session, write_json
 from afm_jax.contact.junction import Phase
 from afm_jax.motion.follow import LongRun
-from afm_jax.motion.observe import NEEDS_A_RESPONSE, TOO_SHORT, Harmonic, Observables
+from afm_jax.motion.observe import OBSERVABLES, Observables, why_absent
 from afm_jax.motion.record import ContactKind, MotionOutcome, Simulation
 from afm_jax.motion.settle import Window
 from afm_jax.motion.trajectory import DensePath, dense_path
@@ -26,40 +26,6 @@ _TRACE_RESPONSES = 24
 """Response periods of trace.csv at most: enough for an instrument's errors from their scatter."""
 _SAMPLES_A_PERIOD = 400
 """Of the drive."""
-_DEFLECTION = (
-    "peak_deflection_nm",
-    "mean_deflection_nm",
-    "deflection_lockin_amplitude_nm",
-    "deflection_lockin_phase_deg",
-    "deflection_drive_lockin_amplitude_nm",
-    "deflection_drive_lockin_phase_deg",
-    "deflection_harmonics",
-)
-_LOCKIN = {
-    "response": ("lockin_amplitude_nm", "lockin_phase_deg"),
-    "drive": ("drive_lockin_amplitude_nm", "drive_lockin_phase_deg"),
-    "deflection_response": ("deflection_lockin_amplitude_nm", "deflection_lockin_phase_deg"),
-    "deflection_drive": ("deflection_drive_lockin_amplitude_nm", "deflection_drive_lockin_phase_deg"),
-}
-"""Readings at one frequency, and the keys of their amplitude and phase."""
-_AS_THEY_ARE = (
-    "peak_amplitude_nm",
-    "mean_height_nm",
-    "time_in_contact_us",
-    "contact_share",
-    "peak_force_nn",
-    "most_attractive_force_nn",
-    "dissipated_in_contact_aj",
-    "dissipated_per_contact_aj",
-    "dissipated_in_air_aj",
-    "given_by_drives_aj",
-    "stored_aj",
-    "energy_imbalance",
-    "virial_aj",
-    "peak_deflection_nm",
-    "mean_deflection_nm",
-    "phase_lag_deg",
-)
 
 
 def payload_of(scene: Scene, run: LongRun, seen: Observables, settings: Mapping[str, Any]) -> dict[str, Any]:
@@ -75,14 +41,13 @@ def payload_of(scene: Scene, run: LongRun, seen: Observables, settings: Mapping[
         "contacts_per_response": verdict.contacts,
         "settled_reason": verdict.reason,
         "remaining_distance": verdict.remaining,
-        **{name: getattr(seen, name) for name in _AS_THEY_ARE},
-        "drive_frequency_khz": seen.drive.frequency_khz,
-        "response_frequency_khz": seen.response.frequency_khz,
-        **{key: getattr(seen, key) for keys in _LOCKIN.values() for key in keys},
+        **{observable.name: getattr(seen, observable.name) for observable in OBSERVABLES},
+        "drive_frequency_khz": seen.drive_frequency_khz,
+        "response_frequency_khz": seen.response_frequency_khz,
         "harmonics": [harmonic._asdict() for harmonic in seen.harmonics],
-        "deflection_harmonics": _as_dicts(seen.deflection_harmonics),
+        "deflection_harmonics": seen.deflection_harmonics and [each._asdict() for each in seen.deflection_harmonics],
         "window": {**seen.window._asdict(), "contacts": seen.contacts},
-        "null_reasons": _reasons(scene, seen, verdict.stuck) | _too_short(seen),
+        "null_reasons": _reasons(scene, seen),
         "start": {name: float(value) for name, value in simulation.start._asdict().items()},
         "final": {
             **{name: float(value) for name, value in final._asdict().items()},
@@ -95,38 +60,14 @@ def payload_of(scene: Scene, run: LongRun, seen: Observables, settings: Mapping[
     }
 
 
-def _as_dicts(harmonics: tuple[Harmonic, ...] | None) -> list[dict[str, Any]] | None:
-    return None if harmonics is None else [harmonic._asdict() for harmonic in harmonics]
-
-
-def _reasons(scene: Scene, seen: Observables, stuck: bool) -> dict[str, str]:  # noqa: FBT001
+def _reasons(scene: Scene, seen: Observables) -> dict[str, str]:
     """Return for every key that is null why."""
-    reasons = {}
-    if seen.settled.periods is None:
-        reasons["order"] = reasons["contacts_per_response"] = seen.settled.reason
-    if seen.settled.remaining is None:
-        reasons["remaining_distance"] = "the tip is held" if stuck else seen.settled.reason
-    if seen.peak_force_nn is None:
-        for name in ("peak_force_nn", "most_attractive_force_nn"):
-            reasons[name] = "only a resolved contact has a force" if scene.interaction is not None else "no contact"
-    if seen.dissipated_per_contact_aj is None:
-        reasons["dissipated_per_contact_aj"] = "no contact begins in the window"
-    if seen.energy_imbalance is None:
-        reasons["energy_imbalance"] = "with an impact law the energy given by the drives closes the balance"
-    if scene.base is None:
-        for name in _DEFLECTION:
-            reasons[name] = "the base rests: the deflection is the height"
-    if seen.phase_lag_deg is None:
-        reasons["phase_lag_deg"] = "no base and no force drives the tip"
+    reasons, verdict = why_absent(scene, seen), seen.settled
+    if verdict.periods is None:
+        reasons["order"] = reasons["contacts_per_response"] = verdict.reason
+    if verdict.remaining is None:
+        reasons["remaining_distance"] = "the tip is held" if verdict.stuck else verdict.reason
     return reasons
-
-
-def _too_short(seen: Observables) -> dict[str, str]:
-    """Return for every key that is null for want of a whole response period that this is so."""
-    if seen.window.responses:
-        return {}
-    names = [key for name in NEEDS_A_RESPONSE for key in _LOCKIN.get(name, (name,)) if "harmonics" not in key]
-    return {name: TOO_SHORT for name in names if getattr(seen, name) is not None}
 
 
 def _frequency(payload: Mapping[str, Any], multiple: int) -> str:

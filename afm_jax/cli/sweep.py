@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.cli.fitted_law import with_fitted_law, with_law_option
+from afm_jax.cli.options import LAW
 from afm_jax.cli.session import Session, with_session
 from afm_jax.cli.values import scene_and_start
 from afm_jax.compilation_cache import available_cores
@@ -35,7 +35,7 @@ _MOST_DRAWN = 2
 @click.option("--scheduler", metavar="tcp://...", help="A Dask scheduler whose workers do the work.")
 @click.option("--dry-run", is_flag=True, help="Measure a chunk and say what the sweep would take; keep nothing.")
 @click.option("--plot", is_flag=True, help="Draw a sweep of one or two axes, sweep.png.")
-@with_law_option
+@LAW
 @with_session
 def command(
     session: Session,
@@ -219,6 +219,8 @@ def _input(given: Mapping[str, Any], path: Path, law: Path | None) -> dict[str, 
         name = str(given["scene"])
         beside = path.parent / name
         scene, start = scene_and_start(str(beside) if beside.exists() else name)
+    from afm_jax.cli.fitted_law import with_fitted_law  # noqa: PLC0415
+
     scene, _ = with_fitted_law(scene, law)
     # a start is of use for simulations alone
     told = start._asdict() if start is not None and given["record"].get("what") == "simulation" else None

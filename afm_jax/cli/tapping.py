@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from afm_jax.cli.main import NotValid
+from afm_jax.cli.options import NOISE
 from afm_jax.cli.read import READING_OPTIONS, with_reading
 from afm_jax.cli.session import FIT_PROGRAMS, Session, add_note, prepare_folder, with_session
-from afm_jax.cli.values import ValueAndError, with_noise
+from afm_jax.cli.values import ValueAndError
 
 if TYPE_CHECKING:
     from fitting.tables.table import AmplitudeTable
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("curve_files", metavar="[CURVE]...", nargs=-1, type=click.Path(path_type=Path))
-@with_noise
+@NOISE
 @with_reading
 @click.option("--tip-calibration", type=ValueAndError(), metavar="C", help="True over stated amplitude; '1 +- 0.02'.")
 @click.option("--curve", type=click.IntRange(1), metavar="N", help="Only this curve of an instrument's file.")

@@ -175,6 +175,27 @@ class ValueAndError(click.ParamType):
         return numbers[0], numbers[1] if len(numbers) == 2 else None
 
 
+_MOST_STARTS = 16_000_000
+
+
+class Grid(click.ParamType):
+    """Columns and rows, 1000x1000."""
+
+    name = "grid"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        """Return columns and rows.
+
+        Raises:
+            click.BadParameter: if it is no such grid, or one of too many starts.
+        """
+        parts = str(value).lower().split("x")
+        good = len(parts) == 2 and all(part.isascii() and part.isdigit() and len(part) < 6 for part in parts)
+        if not good or min(map(int, parts)) < 2 or int(parts[0]) * int(parts[1]) > _MOST_STARTS:
+            self.fail(f"must be COLUMNSxROWS as in 1000x1000, 2 to {_MOST_STARTS} starts, but is {value}", param, ctx)
+        return int(parts[0]), int(parts[1])
+
+
 PRESET_NAMES = ("figure2", "figure3", "figure8", "figure9a", "figure9b", "figure10", "figure11", "dry")
 """Of `afm_jax.scenefile.presets`; said here as well, because help and completion must not wait for JAX."""
 
@@ -215,26 +236,6 @@ class PictureFormat(click.ParamType):
         if suffix not in ("png", "pdf", "svg"):
             self.fail(f"must be png, pdf or svg, but is {value}", param, ctx)
         return suffix
-
-
-with_picture = click.option(
-    "--picture", type=PictureFormat(), default="png", show_default=True, help="png, pdf or svg."
-)
-"""Give a command the option --picture."""
-with_noise = click.option(
-    "--noise",
-    type=Share("a relative error"),
-    metavar="SHARE",
-    help="Relative error of amplitudes without one, such as 1%.",
-)
-"""Give a command the option --noise."""
-with_quality_factor = click.option(
-    "--quality-factor",
-    type=ValueAndError(none=True),
-    metavar="Q",
-    help="Instead of the table's; '40 +- 2', or none: no air damping.",
-)
-"""Give a command the option --quality-factor."""
 
 
 def tables_with(

@@ -154,6 +154,11 @@ class Simulation(Result, eqx.Module):
         return unknown
 
 
+def contacts_left(simulation: Simulation) -> Bool[np.ndarray, " rows"]:
+    """Return which rows of a simulation's contacts are contacts that the tip left."""
+    return np.isin(np.asarray(simulation.contacts.kind), (ContactKind.IMPACT, ContactKind.CHATTER))
+
+
 def to_gap(
     surface: Platform | Surface, response: Surface | None, state: State
 ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:

@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.contact.contact import Contact
-from afm_jax.motion.record import ContactKind, Simulation, to_gap
+from afm_jax.motion.record import ContactKind, Simulation, contacts_left, to_gap
 from afm_jax.motion.trajectory import flights_of
 
 DEFAULT_TOLERANCE = 1e-4
@@ -182,8 +182,8 @@ def settled(scene: Scene, simulation: Simulation, *, tolerance: float = DEFAULT_
             return _settled(why, contacts=0, periods=1, remaining=free)
         return _not(f"the tip does not meet the sample, but its transient is still {free:.1e} of the velocity scale")
     rows = simulation.contacts
-    left = np.isin(np.asarray(rows.kind), (ContactKind.IMPACT, ContactKind.CHATTER))
-    times, velocities = (np.asarray(part)[left] for part in (rows.departure_time_us, rows.departure_velocity_nm_per_us))
+    departures = (rows.departure_time_us, rows.departure_velocity_nm_per_us)
+    times, velocities = (np.asarray(column)[contacts_left(simulation)] for column in departures)
     found = find_repetition(times, velocities, drive.period_us, tolerance=tolerance)
     if found is None:
         return _not(f"no sequence of up to {LONGEST} contacts repeats to {tolerance:g} (of {len(times)} contacts)")

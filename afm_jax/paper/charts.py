@@ -1,11 +1,8 @@
 """The data of the paper's figures 2, 3 and 9, with what the paper says of them checked on the data.
 
-What the paper says of figures 2, 3 and 9, as numbers worked out from the computed data.
-
-Verdicts on single-impact orbits against the motion itself: long iterations of the impact map.
-
-The verdicts come from eq. 9 and the linearised map; the iteration knows neither. A stable orbit must draw a disturbed
-tip back, an unstable one must let it go, and where there is no stable orbit no start may settle on one.
+The verdicts on single-impact orbits, which come from eq. 9 and the linearised map, are compared with long iterations of
+the impact map, which know neither: a stable orbit must draw a disturbed tip back, an unstable one must let it go, and
+where there is no stable orbit no start may settle on one.
 """
 
 from collections.abc import Callable, Mapping

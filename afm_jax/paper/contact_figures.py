@@ -1,7 +1,4 @@
-"""The data of the paper's figures 4 to 7, on the contact of section IV, with what it says of them checked.
-
-What the paper says of figures 4 to 7, as numbers worked out from the computed data.
-"""
+"""The data of the paper's figures 4 to 7, on the contact of section IV, with what it says of them checked."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

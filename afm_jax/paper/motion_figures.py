@@ -1,10 +1,7 @@
 """The data of the paper's figures 8, 10 and 11, motions of the contact model, with what it says of them checked.
 
-Figures 10 and 11: a settled motion under a slowly rising offset, beside the orbits of the impact law.
-
-Figure 8: the Poincare section of several starts, told apart into what is broadband and what locks to the drive.
-
-What the paper says of figures 8, 10 and 11, as numbers worked out from the computed motions.
+Figure 8 is the Poincare section of several starts, told apart into what is broadband and what locks to the drive;
+figures 10 and 11 are settled motions under a slowly rising offset, beside the orbits of the impact law.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,8 +18,8 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.law_of_contact import law_of_contact
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.follow import follow_long
-from afm_jax.motion.observe import Departures, departures
 from afm_jax.motion.record import ContactKind, Simulation, State
+from afm_jax.motion.section import Departures, departures
 from afm_jax.motion.simulate import simulate
 from afm_jax.motion.start import default_start, start_of
 from afm_jax.paper.charts import PaperFigure, Statement

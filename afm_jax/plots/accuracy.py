@@ -1,9 +1,4 @@
-"""The picture of an accuracy study: time of an impact against its achieved error.
-
-The picture of the accuracy study of collisions: time of an impact against its achieved error.
-
-The picture of a scene's accuracy study: time against error of its settings, and of ever fuller models.
-"""
+"""Pictures of accuracy studies: the time of an impact, of a collision or of a scene against its achieved error."""
 
 import textwrap
 from collections.abc import Mapping, Sequence

@@ -1,6 +1,7 @@
-"""Pictures of stability charts: light where a single-impact orbit is stable, a colour an order, as figures 2 and 3.
+"""Pictures of stability charts, as figures 2 and 3, and of the amplitude against the offset, as figure 9.
 
-Pictures of the amplitude against the offset, as in figure 9: a curve for each coefficient of restitution.
+In a chart it is light where a single-impact orbit is stable, a colour an order; against the offset there is a curve for
+each coefficient of restitution.
 """
 
 from pathlib import Path

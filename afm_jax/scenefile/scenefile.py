@@ -41,10 +41,6 @@ velocity_nm_per_us = 80
 A resolved contact instead of a law: `model = "contact"`, `effects = ["capillary", "structural", "core", "viscous",
 "jkr"]` (all of them if left out) and any of the parameters of `Contact.paper`; the paper's values if left out.
 With [base] or [force] the platform may rest: without `amplitude_nm` and frequency its phase counts in the drive's.
-
-The drives of a scene file: the platform, the base and the force on the tip, each with a second frequency or not.
-
-Where a simulation begins: the start of a scene file, whether it is possible in its scene, and that of a state.
 """
 
 import os

@@ -1,6 +1,6 @@
-"""The keys of a scene file, and what to advise where somebody wrote another one.
+"""The tables of a scene file: their keys and types are checked, and every error says file, table and key.
 
-One table of a scene file: its keys and types are checked, and every error says file, table and key.
+Where somebody wrote a key that there is not, the message advises the one to use instead.
 """
 
 import difflib

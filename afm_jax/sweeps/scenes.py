@@ -27,7 +27,7 @@ from afm_jax.dynamics.iteration import sample_driven
 from afm_jax.dynamics.verdicts import MotionKind
 from afm_jax.impact.law import TabulatedLaw, axes_of_one, extrapolation_of, impact_law_of
 from afm_jax.motion.follow import follow_long
-from afm_jax.motion.observe import TOO_SHORT, observe
+from afm_jax.motion.observe import OBSERVABLES, TOO_SHORT, observe
 from afm_jax.motion.record import MotionOutcome
 from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.motion.start import start_of
@@ -385,32 +385,7 @@ def _lyapunov(
 
 # --- simulations ------------------------------------------------------------------------------------------------------
 
-_OBSERVED = {
-    "peak_amplitude_nm": "largest height above the rest position",
-    "lockin_amplitude_nm": "amplitude at the response frequency omega/N",
-    "lockin_phase_deg": "its phase, modulo 360/N",
-    "drive_lockin_amplitude_nm": "amplitude at the drive's frequency omega",
-    "drive_lockin_phase_deg": "its phase",
-    "mean_height_nm": "mean height",
-    "contact_share": "share of time in contact",
-    "time_in_contact_us": "per response period",
-    "peak_force_nn": "largest force on the tip; only a resolved contact has one",
-    "most_attractive_force_nn": "most attractive force on the tip; only a resolved contact has one",
-    "dissipated_in_contact_aj": "energy lost to the sample per drive period",
-    "dissipated_per_contact_aj": "the same per contact",
-    "dissipated_in_air_aj": "energy lost to the air per drive period",
-    "given_by_drives_aj": "energy given by the drives per drive period",
-    "stored_aj": "growth of the energy of tip and spring per drive period",
-    "energy_imbalance": "what these energies leave unexplained, of the largest; only of a resolved contact",
-    "virial_aj": "mean of force times height",
-    "peak_deflection_nm": "largest deflection against a moving base",
-    "mean_deflection_nm": "its mean",
-    "deflection_lockin_amplitude_nm": "its amplitude at the response frequency",
-    "deflection_lockin_phase_deg": "its phase, modulo 360/N",
-    "deflection_drive_lockin_amplitude_nm": "amplitude of the deflection at the drive's frequency",
-    "deflection_drive_lockin_phase_deg": "its phase",
-    "phase_lag_deg": "lag of deflection or height behind base or force at the drive's frequency",
-}
+_OBSERVED = {observable.name: observable.meaning for observable in OBSERVABLES}
 _REFUSED = -1
 _SIMULATION_VARIABLES = (
     *(Variable(name, meaning) for name, meaning in _OBSERVED.items()),

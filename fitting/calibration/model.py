@@ -16,12 +16,6 @@ in parameters that the amplitude determines; A and B themselves it leaves ambigu
 
 An averaged periodogram of K spectra scatters as a gamma distribution: -2 log L = 2 K sum(u - 1 - ln u) + const with u =
 measured/fitted density. Each term is the square of a residual, so that least squares maximises the likelihood.
-
-Where the fit of a sweep starts: a grid of frequencies and quality factors, the linear parameters solved for.
-
-The standard errors of a sweep's points: from the file, from a stated noise, or estimated from the misfit.
-
-One fit of a sweep in front of one background: start, polish, errors, check of the minimum.
 """
 
 from dataclasses import dataclass

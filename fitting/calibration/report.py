@@ -1,6 +1,6 @@
 """A calibration as a person reads it: text for the terminal, files for the drawer (JSON, CSV, PNG).
 
-The picture of a calibration: the sweep with the fit, and the residuals below.
+The picture shows the sweep with the fit, and the residuals below.
 """
 
 from collections.abc import Callable

@@ -13,12 +13,9 @@ form is recognised by its line ``[DATA]``.
 A thermal spectrum is a sweep whose amplitude is the root of a spectral density: NanoSurf's .nid, or a CSV file with
 ``asd_nm_per_sqrt_hz`` or ``psd_nm2_per_hz`` and a comment ``# averages = 1000``, the number of spectra averaged.
 
-A resonance sweep as plain CSV.
-
-A resonance sweep as Nanonis writes it: a header of tab-separated lines, then a block of data.
-
-The columns read are ``Frequency Shift (Hz)`` with ``Center Frequency (Hz)`` (or ``Frequency (Hz)``), ``Amplitude (m)``
-and, where it is there, ``Phase (deg)``; others are passed over.
+Nanonis writes a header of tab-separated lines, then a block of data. The columns read are ``Frequency Shift (Hz)`` with
+``Center Frequency (Hz)`` (or ``Frequency (Hz)``), ``Amplitude (m)`` and, where it is there, ``Phase (deg)``; others are
+passed over.
 """
 
 import contextlib

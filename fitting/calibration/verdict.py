@@ -1,6 +1,6 @@
 """Whether to believe a calibration, in words: what makes it invalid, and what a reader should know besides.
 
-Patterns in the residuals of a sweep that chance does not bring about.
+Patterns in the residuals of the sweep that chance does not bring about belong to it.
 """
 
 from dataclasses import dataclass

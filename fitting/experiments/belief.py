@@ -1,6 +1,6 @@
 """What is believed before an experiment is designed: parameter values, and what measurements so far say of them.
 
-The belief that a fit leaves: its values, its covariance, and the drives that were measured.
+A fit leaves such a belief: its values, its covariance, and the drives that were measured.
 """
 
 import math

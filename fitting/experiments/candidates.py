@@ -1,7 +1,4 @@
-"""Candidates of an experiment: what a measurement at each drive would read, and what it would say of the law.
-
-What can be driven: the grid of drives among which an experiment is designed.
-"""
+"""The drives among which an experiment is designed: what each would read, and what it would say of the law."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

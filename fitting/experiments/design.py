@@ -1,10 +1,8 @@
 """The design of an experiment: which drives to measure next, so that the law is known best.
 
-What measurements say of parameters: Fisher information, its inverse, and how good a set of measurements is by it.
-
-Choosing points: greedily, then exchanged one by one until no exchange helps (Fedorov), then in the best order.
-
-Whether to follow a design, in words: what makes it pointless, and what would help more than its points.
+What a set of measurements says of the parameters is its Fisher information; its inverse says how good the set is.
+Points are chosen greedily, then exchanged one by one until no exchange helps (Fedorov), then put into the best order.
+Whether to follow the design is said in words: what makes it pointless, and what would help more than its points.
 """
 
 from collections.abc import Sequence

@@ -1,6 +1,6 @@
 """A design as a person reads it: text for the terminal, files to take to the instrument (JSON, CSV, PNG).
 
-The picture of a design: errors against the number of points, and what each drive would add.
+The picture shows errors against the number of points, and what each drive would add.
 """
 
 from collections.abc import Callable

@@ -1,8 +1,7 @@
-"""The fit: screen, polish, check, and say what was found and whether to believe it.
+"""The fit of an impact law to amplitude tables: screen, polish, check, and say whether to believe what was found.
 
-The fitted impact law over the speeds that were measured, with the band that its parameters' errors leave.
-
-What a minimum amounts to: errors, intervals, checks, and a verdict on whether to believe it.
+A minimum amounts to values with errors and intervals, the law over the measured speeds with the band that its
+parameters' errors leave, checks, and a verdict.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -1,6 +1,6 @@
 """Profile-likelihood intervals: how far a parameter can go while the others follow and chi2 rises by 3.84.
 
-What is asked of a minimum, whatever the optimiser says: gradient, curvature, distance to the true minimum.
+Gradient, curvature and distance to the true minimum are asked of a minimum, whatever the optimiser says.
 """
 
 from dataclasses import dataclass

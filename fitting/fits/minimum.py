@@ -1,19 +1,15 @@
 """The minimum of chi2: screened, polished from the best starts, and again where the errors are only relative.
 
-Where a fit starts: a coarse grid over what a model's parameters can be.
+The screening is a coarse grid over what a model's parameters can be. Where a law has no orbit on a row that was
+measured, chi2 is a plateau there: nothing tells a minimisation which way the orbit lies. The laws around the minimum
+are then asked for these rows alone, and the minimisation goes on from the best ones.
 
-Minima at which measured orbits have got lost: a way back to laws that have them.
-
-Where a law has no orbit on a row that was measured, chi2 is a plateau there: nothing tells a minimisation which way the
-orbit lies. The laws around the minimum are asked for these rows alone, and the minimisation goes on from the best ones.
-
-Rows that strain the event-driven picture: how far a law of impacts is off there, and which are set aside.
-
-What is left out grows with the share of the drive's cycle that a leaving tip takes to lose its energy, s = omega L/w
-(L: the length over which it does, w: its rebound speed). The error of the amplitude was measured on eight full contacts
-(other humidities, adhesion, viscosity, modulus, quality factor, frequency, mass): it stays below about half of what is
-taken, 0.05 % + 1.2 % s^3 + 1.6 % (1.5 u_c/u)^6 with the approach speed u and the capture speed u_c.
-The three-parameter delay law is right to 0.15 ns, which counts where the delay alone fixes the amplitude.
+Slow impacts are more than a law of impacts describes; rows where it is too far off are excluded. What is left out grows
+with the share of the drive's cycle that a leaving tip takes to lose its energy, s = omega L/w (L: the length over which
+it does, w: its rebound speed). The error of the amplitude was measured on eight full contacts (other humidities,
+adhesion, viscosity, modulus, quality factor, frequency, mass): it stays below about half of what is taken,
+0.05 % + 1.2 % s^3 + 1.6 % (1.5 u_c/u)^6 with the approach speed u and the capture speed u_c. The three-parameter delay
+law is right to 0.15 ns, which counts where the delay alone fixes the amplitude.
 """
 
 from dataclasses import dataclass, replace

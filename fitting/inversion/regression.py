@@ -1,12 +1,9 @@
-"""The laws that inverted rows follow, and which of them chi2 prefers.
+"""The laws that inverted rows follow, which of them chi2 prefers, and how far rows are from a law known otherwise.
 
-Laws regressed on inverted impacts: the loss u_in^2 - u_out^2 on (1, u) and on (1, u^2), and the delay law.
-
-Both speeds and the delay of a row come from the same few numbers, so that their errors are strongly correlated; each
-residual is weighted by the variance that the row's whole covariance gives it (total least squares to first order). What
-all rows share, an error of Q or of the free frequency, is a nuisance with its known uncertainty.
-
-How far rows are from a law that is known otherwise, a fit's or a table's.
+Regressed are the loss u_in^2 - u_out^2 on (1, u) and on (1, u^2), and the delay law. Both speeds and the delay of a row
+come from the same few numbers, so that their errors are strongly correlated; each residual is weighted by the variance
+that the row's whole covariance gives it (total least squares to first order). What all rows share, an error of Q or of
+the free frequency, is a nuisance with its known uncertainty.
 """
 
 from collections.abc import Callable, Mapping

@@ -1,6 +1,6 @@
 """A direct inversion as a person reads it: text for the terminal, files for the drawer (JSON, CSV, PNG).
 
-The picture of a direct inversion: the loss and the delay point by point, over the laws regressed on them.
+The picture shows the loss and the delay point by point, over the laws regressed on them.
 """
 
 from collections.abc import Callable

@@ -1,13 +1,12 @@
 """What a direct inversion found, point by point and as laws, and everything that went into it.
 
-The paper's own reading of amplitudes on resonance: the velocities from the amplitudes alone, the phase assumed.
-
-On a subharmonic resonance, omega = 2 N Omega, the paper takes the impact to occur where the sample is fastest (drive
-phase 3 pi/2) and the flight to be an undamped half oscillation: V' = Omega a, V = -Omega a, so that
+Beside it stands the paper's own reading of amplitudes on resonance: the velocities from the amplitudes alone, the phase
+assumed. On a subharmonic resonance, omega = 2 N Omega, the paper takes the impact to occur where the sample is fastest
+(drive phase 3 pi/2) and the flight to be an undamped half oscillation: V' = Omega a, V = -Omega a, so that
 
     u_in = Omega a + beta omega,    u_out = Omega a - beta omega.
 
-Air damping and the collision delay are left out, and the offset; with them the phase is another.
+Air damping, the collision delay and the offset are left out; with them the phase is another.
 """
 
 from collections.abc import Callable

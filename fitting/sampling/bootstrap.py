@@ -1,10 +1,7 @@
 """The parametric bootstrap: how fitted values scatter when the fitted law is the truth of repeated experiments.
 
-The objective of a finished fit, rebuilt from its result: what bootstrap and posterior start from.
-
-Many synthetic data sets of one table fitted at once: what bootstrap and coverage are made of.
-
-A data set enters the residuals only as a shift: (predicted - measured_k)/error = (predicted - measured)/error +
+Many synthetic data sets of one table are fitted at once, from the objective of the finished fit, rebuilt from its
+result. A data set enters the residuals only as a shift: (predicted - measured_k)/error = (predicted - measured)/error +
 (measured - measured_k)/error. One compiled program therefore serves all of them, and since every fit starts at the same
 values, the first linearisation serves all of them too.
 """

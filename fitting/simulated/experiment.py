@@ -1,6 +1,6 @@
 """Simulated experiments: an amplitude table as an instrument would read it off the full scene.
 
-Settled motions of many drives: every row of a table to be, simulated in time until it repeats, then observed.
+Every row of the table to be is a motion simulated in time until it repeats, then observed.
 """
 
 from collections.abc import Callable, Sequence

@@ -1,6 +1,6 @@
 """Several tables that are fitted together, as reports and verdicts see them: their rows one after the other.
 
-Readings that were repeated at one drive: how much they scatter, over what their errors say.
+Where readings were repeated at one drive, their scatter is compared with what their errors say.
 """
 
 from collections.abc import Sequence

@@ -33,10 +33,6 @@ is the default. ``free_amplitude_nm`` is the amplitude of the free tip, ``offset
 rest position, ``phase_lag_deg`` how far the response lags behind the drive; under ``base`` free and lock-in amplitude
 are those of the deflection, the lag is behind the base. ``order`` may be left out (1), ``retract`` marks by 1 the rows
 of the retract, and ``# phase_zero_deg = 0 +- 0.2`` says how well the instrument's zero of phase is known.
-
-The comment lines of an amplitude table: what `# key = value` says about the cantilever, and free remarks.
-
-The columns of an amplitude table, and the checks that every table must pass.
 """
 
 import os

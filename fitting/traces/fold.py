@@ -1,10 +1,8 @@
 """A trace folded onto one response period: its waveform, what each period leaves, and the errors that follow.
 
-Periodic functions fitted to samples: harmonics of the response frequency by least squares.
-
-The response order: after how many drive periods a trace repeats; fits to half of it predict the other half.
-
-When the platform is highest: the phase that a trace's response is compared with.
+Harmonics of the response frequency are fitted to the samples by least squares. The response order, after how many drive
+periods the trace repeats, is the one whose fit to half of the trace predicts the other half. The phase is that of the
+response against the time at which the platform is highest.
 """
 
 from dataclasses import dataclass, replace

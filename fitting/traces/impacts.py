@@ -1,10 +1,8 @@
-"""Counting impacts in a folded trace: where the velocity jumps between two free flights.
+"""What a folded trace shows of impacts and of its top: their number, the peak height, and whether it repeats.
 
-The peak height of a folded trace: a polynomial through the samples around the top, or a parabola through few.
-
-Whether a trace repeats: what its response periods do beyond the noise, and whether they drift.
-
-Whether a trace that does not is a tip that rings down freely.
+An impact is where the velocity jumps between two free flights. The peak height is that of a polynomial through the
+samples around the top, or of a parabola through few. A trace repeats if its response periods differ by the noise alone
+and do not drift; one that does not may be a tip that rings down freely.
 """
 
 from typing import NamedTuple

@@ -1,8 +1,6 @@
 """From a time trace to response order, peak and lock-in amplitude and phase, with errors and a verdict.
 
-What a lock-in reads of a trace, and everything a table of amplitudes needs of it.
-
-From readings of traces to an amplitude table that the fitter reads.
+Readings of several traces make an amplitude table that the fitter reads.
 """
 
 import math

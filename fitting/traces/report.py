@@ -1,6 +1,6 @@
 """Readings of traces as a person reads them: text for the terminal, files for the drawer (JSON, CSV, PNG).
 
-The picture of a reading: the trace folded onto its response period, and the spectrum with the drive's fractions.
+The picture shows the trace folded onto its response period, and the spectrum with the drive's fractions.
 """
 
 import json

@@ -12,12 +12,6 @@ The CSV form is a file in UTF-8 with comment lines and a row of column names::
 The deflection is the tip's height; ``position_nm`` is another name of it. ``time_us`` may be replaced by a comment
 ``# sampling_rate_mhz = 50``. ``platform_nm`` (the platform's height) or ``drive`` (any signal in phase with it) gives
 the reference of the phase. HDF5 files hold data sets and attributes of the same names.
-
-What a trace says about its measurement besides the samples: `# key = value` comments, HDF5 attributes, options.
-
-A time trace as plain CSV: comment lines, a row of column names, a row for each sample.
-
-A time trace in an HDF5 file: the data sets are named like the columns of a CSV trace, settings are attributes.
 """
 
 import io

@@ -1,0 +1,187 @@
+"""A command is a row: name, group, the function that it calls, its options and its help. The runner is here, too.
+
+The rows stand in `measure.py`, `simulate.py`, `contact.py` and `check.py` of `afm_jax/cli/commands`, without JAX, so
+that help needs none. The function that a row names stands in a module that imports all that it needs at its top: the
+runner starts JAX before it imports the module. The function gets the session (for progress and messages) and the
+options by their names, and returns an `Output`, which the runner writes (None: the function has written all itself):
+
+    def basins(session: Session, scene: NamedScene, *, grid, speeds, draws, picture) -> Output:
+        with session.working("following starts", "starts") as report:
+            found = basins_of_attraction(scene.scene, columns=grid[0], rows=grid[1], report=report)
+        return Output({"share": found.share}, ["..."], tables={"basins.csv": found.columns()})
+"""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import click
+
+from afm_jax.cli.ending import NotValid, is_inner
+from afm_jax.cli.options import SCENE
+from afm_jax.cli.session import Session, with_session, write_json
+from afm_jax.cli.values import scene_and_start
+
+if TYPE_CHECKING:
+    from afm_jax.apparatus.scene import Scene
+    from afm_jax.dynamics.bands import UncertainParameters
+    from afm_jax.scenefile.scenefile import Start
+
+Options = dict[str, Any]
+
+
+class NamedScene(NamedTuple):
+    """The scene of a call: what the argument SCENE named, with the law of --law in place of its own.
+
+    Attributes:
+        name: as it was given, for messages.
+        scene: the scene.
+        start: the start that its file states, if it does.
+        unknowns: what is uncertain of the law of --law, if its file tells errors.
+    """
+
+    name: str
+    scene: "Scene"
+    start: "Start | None"
+    unknowns: "UncertainParameters | None"
+
+
+@dataclass(frozen=True, kw_only=True)
+class Output:
+    """What a command hands out.
+
+    Attributes:
+        payload: the JSON object.
+        text: what is printed without --json, as `Session.emit` takes it.
+        tables: columns by their names for each CSV file of the --out folder, by its name.
+        files: functions that write a file of the --out folder at a path each, by its name.
+        json_file: name of the file of the --out folder that holds the JSON object; empty: none does.
+        report: writes a report into a folder and returns the paths; it gets the folder and `Session.write_table`.
+        not_valid: why the result is not valid, which makes the exit code 3; None: it is valid.
+        failure: what ended the command after this much of its result.
+    """
+
+    payload: Mapping[str, Any]
+    text: Sequence[Any] = ()
+    tables: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    files: Mapping[str, Callable[[Path], object]] = field(default_factory=dict)
+    json_file: str = ""
+    report: Callable[..., Sequence[Path]] | None = None
+    not_valid: str | None = None
+    failure: Exception | None = None
+
+
+def columns_of(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[str, list[Any]]:
+    """Return the columns of rows; what a row lacks is None."""
+    return {name: [row.get(name) for row in rows] for name in names}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Command:
+    """A command of `afm-jax`.
+
+    Attributes:
+        name: what is typed.
+        group: under which heading `afm-jax --help` lists it: measure, simulate, contact or check.
+        summary: the line of that list.
+        runs: the function that is called, "module:function".
+        help: what `afm-jax NAME --help` says above the options.
+        options: arguments and options, decorators of click; `SCENE` is loaded, with the law of `LAW` if that is there.
+        check: what is refused before JAX starts (it raises `click.UsageError`); it may change the options.
+        computes: whether JAX is started, before the function's module is imported.
+        programs: from the options the jitted functions whose traces are kept (see `Session.start_computing`).
+        out_file: what the file is called that --out names, for a command that writes a single one; empty: a folder.
+    """
+
+    name: str
+    group: str
+    summary: str
+    runs: str
+    help: str
+    options: tuple[Callable[..., Any], ...] = ()
+    check: Callable[[Session, Options], None] | None = None
+    computes: bool = True
+    programs: Callable[[Options], Sequence[str]] = lambda _: ()
+    out_file: str = ""
+
+    def click_command(self) -> click.Command:
+        """Return the command for click."""
+        function = with_session(partial(run_command, self), out_file=self.out_file)
+        # click lists options in the order of decorators, of which the last is applied first
+        for option in reversed(self.options):
+            function = option(function)
+        return click.command(self.name, help=self.help)(function)
+
+
+def run_command(row: Command, session: Session, **options: Any) -> None:
+    """Run a command: check the call, start JAX, load the scene, call the function, hand out the result.
+
+    Args:
+        row: the command.
+        session: the call's.
+        **options: of the command line, by their names.
+
+    Raises:
+        NotValid: if the result is not valid; it has been handed out then.
+    """
+    if row.check is not None:
+        row.check(session, options)
+    if row.computes:
+        session.start_computing(*row.programs(options))
+    if SCENE in row.options:
+        options["scene"] = _loaded(options)
+    module, _, name = row.runs.partition(":")
+    function = getattr(import_module(module), name)
+    with _naming(options.get("scene")):
+        output = function(session, **options)
+    if output is not None:
+        hand_out(session, output)
+
+
+def hand_out(session: Session, output: Output) -> None:
+    """Write a result into the --out folder and to standard output.
+
+    Raises:
+        NotValid: if the result says that it is not valid.
+    """
+    if session.out is not None:
+        for name, columns in output.tables.items():
+            session.write_columns(name, columns)
+        writers = dict(output.files)
+        if output.json_file:
+            writers[output.json_file] = partial(write_json, payload=output.payload)
+        for name, write in writers.items():
+            write(session.out / name)
+            session.note(f"wrote {session.out / name}")
+        for path in () if output.report is None else output.report(session.out, session.write_table):
+            session.note(f"wrote {path}")
+    session.emit(output.payload, *output.text)
+    if output.failure is not None:
+        raise output.failure
+    if output.not_valid is not None:
+        raise NotValid(output.not_valid)
+
+
+def _loaded(options: Options) -> NamedScene:
+    """Return the scene of a call, and take the option --law out of the options."""
+    name, law = options["scene"], options.pop("law", None)
+    scene, start = scene_and_start(name)
+    if law is None:
+        return NamedScene(name, scene, start, None)
+    scene, unknowns = import_module("afm_jax.cli.fitted_law").with_fitted_law(scene, law)
+    return NamedScene(name, scene, start, unknowns)
+
+
+@contextmanager
+def _naming(scene: NamedScene | None) -> Iterator[None]:
+    """Let messages about wrong values begin with the scene's name."""
+    try:
+        yield
+    except ValueError as error:
+        if not isinstance(scene, NamedScene) or is_inner(error) or str(error).startswith(scene.name):
+            raise
+        raise ValueError(f"{scene.name}: {error}") from error

@@ -1,0 +1,1 @@
+"""The rows of all commands, a file for each group."""

@@ -1,0 +1,34 @@
+"""Options that several commands have."""
+
+from pathlib import Path
+
+import click
+
+from afm_jax.cli.values import PictureFormat, SceneName, Share, ValueAndError
+
+SCENE = click.argument("scene", metavar="SCENE.toml|PRESET", type=SceneName())
+"""The scene that is loaded before the command's function is called, which gets it as a `NamedScene`."""
+LAW = click.option(
+    "--law",
+    type=click.Path(path_type=Path),
+    metavar="FILE",
+    help="A fit's fit.json or law.csv, a law.json of `collide --make-law`, or a CSV of measured speeds: its law in "
+    "place of the scene's, its errors as bands.",
+)
+"""With `SCENE` it is loaded, too: the scene has its law then."""
+DRAWS = click.option(
+    "--draws", type=click.IntRange(2), default=20, show_default=True, help="Laws drawn from the fit for the bands."
+)
+PICTURE = click.option("--picture", type=PictureFormat(), default="png", show_default=True, help="png, pdf or svg.")
+NOISE = click.option(
+    "--noise",
+    type=Share("a relative error"),
+    metavar="SHARE",
+    help="Relative error of amplitudes without one, such as 1%.",
+)
+QUALITY_FACTOR = click.option(
+    "--quality-factor",
+    type=ValueAndError(none=True),
+    metavar="Q",
+    help="Instead of the table's; '40 +- 2', or none: no air damping.",
+)
