@@ -12,25 +12,22 @@ polynomial too.
 import abc
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from afm_jax.checks import as_argument, as_parameter, check_parameter, readable
-from afm_jax.contact.parameters import CONTACT_RANGES, DEFAULTS
-
-
-def parameter_field(name: str) -> Any:
-    """Return a field whose default and range are those of a contact's parameter (`afm_jax.contact.parameters`)."""
-    allowed = {"allowed": CONTACT_RANGES[name]}
-    return eqx.field(converter=as_parameter, default=DEFAULTS[name], metadata=allowed)
+from afm_jax.checks import as_argument, check_parameter, readable
+from afm_jax.contact.parameters import CONTACT_RANGES
 
 
 class Parameters(eqx.Module):
-    """Fields with a range (`parameter_field`), which are checked while their values are concrete."""
+    """Fields with the name of a contact's parameter, in full or without the effect's name in front, have its range.
+
+    Values are checked while they are concrete (`afm_jax.contact.parameters` has the ranges).
+    """
 
     __repr__ = readable
 
@@ -44,8 +41,9 @@ class Parameters(eqx.Module):
             ValueError: if a value is outside its range.
         """
         for field in dataclasses.fields(self):
-            if "allowed" in field.metadata:
-                check_parameter(field.name, getattr(self, field.name), field.metadata["allowed"])
+            for name in (field.name, f"{type(self).__name__.lower()}_{field.name}"):
+                if name in CONTACT_RANGES:
+                    check_parameter(field.name, getattr(self, field.name), CONTACT_RANGES[name])
 
 
 class Force(Parameters):
@@ -236,7 +234,10 @@ class ElasticCurve(eqx.Module):
         self, first: Float[Array, "..."], second: Float[Array, "..."]
     ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
         """Return the mean slopes by s of work and depth between two roots, without the cancellation of differences."""
-        work, depth = (sum(factor * _mean_power(k, first, second) for k, factor in terms) for terms in self.terms)
+        nothing = jnp.zeros_like(second)
+        work, depth = (
+            sum((factor * _mean_power(k, first, second) for k, factor in terms), start=nothing) for terms in self.terms
+        )
         return work, depth
 
 

@@ -7,11 +7,13 @@ breaks under displacement control at the fold s = 6^(-1/6), where dP/dDelta is i
 
 import math
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from afm_jax.checks import as_argument
-from afm_jax.contact.forces.force import ElasticCurve, Parameters, Terms, parameter_field
+from afm_jax.checks import as_argument, as_parameter
+from afm_jax.contact.forces.force import ElasticCurve, Parameters, Terms
+from afm_jax.contact.parameters import DEFAULTS
 
 SLOPE = 2.0 * math.sqrt(6.0) / 3.0
 """The linear coefficient of the depth: Delta = s^4 - SLOPE s."""
@@ -80,11 +82,25 @@ class JkrCurve(ElasticCurve):
     fold = FOLD
     reversible = False
 
-    load = staticmethod(load)
-    depth = staticmethod(depth)
-    depth_slope = staticmethod(depth_slope)
-    work = staticmethod(work)
-    root_of_depth = staticmethod(root_of_depth)
+    def load(self, s: ArrayLike) -> Float[Array, "..."]:
+        """Return the normalised load s^6 - sqrt(6) s^3."""
+        return load(s)
+
+    def depth(self, s: ArrayLike) -> Float[Array, "..."]:
+        """Return the normalised depth s^4 - (2 sqrt(6)/3) s."""
+        return depth(s)
+
+    def depth_slope(self, s: ArrayLike) -> Float[Array, "..."]:
+        """Return the derivative of the normalised depth by s, 0 at the fold."""
+        return depth_slope(s)
+
+    def work(self, s: ArrayLike) -> Float[Array, "..."]:
+        """Return the normalised potential (2/5) s^10 - (2 sqrt(6)/3) s^7 + s^4."""
+        return work(s)
+
+    def root_of_depth(self, normalised_depth: ArrayLike) -> Float[Array, "..."]:
+        """Return s of the branch that is stable when pulled; below the depth of the fold that of the fold."""
+        return root_of_depth(normalised_depth)
 
     @property
     def terms(self) -> tuple[Terms, Terms]:
@@ -134,9 +150,11 @@ class Jkr(Parameters):
         ValueError: if a value is not positive.
     """
 
-    adhesion_energy_j_per_m2: Float[Array, "..."] = parameter_field("adhesion_energy_j_per_m2")
-    modulus_gpa: Float[Array, "..."] = parameter_field("modulus_gpa")
-    tip_radius_nm: Float[Array, "..."] = parameter_field("tip_radius_nm")
+    adhesion_energy_j_per_m2: Float[Array, "..."] = eqx.field(
+        converter=as_parameter, default=DEFAULTS["adhesion_energy_j_per_m2"]
+    )
+    modulus_gpa: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["modulus_gpa"])
+    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["tip_radius_nm"])
 
     @property
     def load_scale_nn(self) -> Float[Array, "..."]:

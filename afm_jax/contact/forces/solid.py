@@ -6,9 +6,9 @@ The attraction is that of a sphere and a plane at gaps small against the radius,
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from afm_jax.checks import as_parameter
-from afm_jax.contact.forces.force import StaticForce, parameter_field
-from afm_jax.contact.parameters import CONTACT_RANGES, DEFAULTS
+from afm_jax.checks import as_parameter, check_parameter
+from afm_jax.contact.forces.force import StaticForce
+from afm_jax.contact.parameters import DEFAULTS
 from afm_jax.units import AJ_NM6_PER_J_M6
 
 
@@ -26,9 +26,11 @@ class CoreRepulsion(StaticForce):
     constant_aj_nm6: Float[Array, "..."] = eqx.field(
         converter=as_parameter,
         default=DEFAULTS["core_constant_j_m6"] * AJ_NM6_PER_J_M6,
-        metadata={"allowed": CONTACT_RANGES["core_constant_j_m6"]},
     )
-    tip_radius_nm: Float[Array, "..."] = parameter_field("tip_radius_nm")
+    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["tip_radius_nm"])
+
+    def __check_init__(self):
+        check_parameter("constant_aj_nm6", self.constant_aj_nm6, "above 0")
 
     def coefficients(self) -> tuple[Float[Array, "..."], ...]:
         """Return B R / 1260."""
@@ -51,8 +53,10 @@ class VanDerWaals(StaticForce):
         ValueError: if the Hamaker constant is negative or the radius not positive.
     """
 
-    hamaker_constant_aj: Float[Array, "..."] = parameter_field("hamaker_constant_aj")
-    tip_radius_nm: Float[Array, "..."] = parameter_field("tip_radius_nm")
+    hamaker_constant_aj: Float[Array, "..."] = eqx.field(
+        converter=as_parameter, default=DEFAULTS["hamaker_constant_aj"]
+    )
+    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["tip_radius_nm"])
 
     def coefficients(self) -> tuple[Float[Array, "..."], ...]:
         """Return -H R / 6."""
