@@ -88,8 +88,8 @@ MUTATIONS = {
         GRAZING,
     ),
     "tip leaves with the platform's velocity at arrival": Mutation(
-        "scene.platform.velocity(leaving) +",
-        "scene.platform.velocity(arrival) +",
+        "surface.velocity(leaving) + speeds",
+        "surface.velocity(arrival) + speeds",
         IMPACTS,
     ),
     "overlap of late instead of early starts": Mutation(
@@ -98,7 +98,7 @@ MUTATIONS = {
         f"{MAP}test_every_end_of_a_flight_is_said",
     ),
     "rows after a capture look alive": Mutation(
-        "jnp.where(flying, impact.outcome, Outcome.NOT_REACHED)",
+        "jnp.where(tip.flies, impact.outcome, Outcome.NOT_REACHED)",
         "impact.outcome",
         f"{MAP}test_after_a_capture_the_rows_say_so",
     ),
@@ -310,5 +310,25 @@ MUTATIONS = {
         "_NEAR_CAPTURE = (-0.02, 0.2)",
         "_NEAR_CAPTURE = (-0.0, 0.0)",
         "tests/test_accuracy_promise.py::test_every_level_holds_for_random_contacts[diffrax]",
+    ),
+    "Newton's step taken in full": Mutation(
+        "step if self.damping is None else self.damping(x, step)",
+        "step",
+        "tests/test_solve.py::test_equations_of_elements_end_one_by_one_within_their_domain",
+    ),
+    "Newton's method content with a small residual or a small step": Mutation(
+        "found = finite & small & np.all(sizes <= settings.step_tolerance, axis=1)",
+        "found = finite & (small | np.all(sizes <= settings.step_tolerance, axis=1))",
+        "tests/test_solve.py::test_rows_are_solved_each_on_its_own",
+    ),
+    "implicit derivative of a system turned round": Mutation(
+        "return x, -solved_columns(",
+        "return x, solved_columns(",
+        "tests/test_solve.py::test_newton_finds_scipys_root_with_the_derivatives_of_differences",
+    ),
+    "a curve's plane through the origin": Mutation(
+        "normal @ (points[0] - guess)",
+        "normal @ points[0]",
+        "tests/test_solve.py::test_a_curve_is_followed_round_its_fold",
     ),
 }

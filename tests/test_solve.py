@@ -1,15 +1,17 @@
-"""Numerics without physics: blocks of lanes, the hard few again, and points of curves of solutions."""
+"""Numerics without physics: blocks of lanes, the hard few again, roots, and points of curves of solutions."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import optimize
 
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.solve.arclength import EquationsAt, point_in_plane
 from afm_jax.solve.derivatives import largest
 from afm_jax.solve.lanes import again_for, again_for_the_open, filled, in_blocks, map_in_blocks, power_of_two
+from afm_jax.solve.newton import LinearisedRows, Newton, NewtonOutcome, newton, newton_rows, shortened
 
 VALUES = np.arange(1.0, 24.0)
 
@@ -94,10 +96,143 @@ def test_open_lanes_are_computed_again_whether_numbers_are_known_or_not():
     np.testing.assert_array_equal(nothing["found"], 1.0)
 
 
+def coupled(x, p):
+    """Return three equations with one root near (1, 0.1, 0.1) for p near (1.1, 2)."""
+    return jnp.stack([x[0] ** 3 + x[1] - p[0], jnp.exp(x[1]) - x[0] * x[2] - 0.5 * p[1], x[2] * (1.0 + x[0]) - x[1]])
+
+
+def coupled_jacobian(x, p):
+    slopes = [[3.0 * x[0] ** 2, 1.0, 0.0], [-x[2], jnp.exp(x[1]), -x[0]], [x[2], -1.0, 1.0 + x[0]]]
+    return coupled(x, p), jnp.stack([jnp.stack([jnp.asarray(part) for part in row]) for row in slopes])
+
+
+def pair(x, p):
+    return jnp.stack([x[0] * x[1] - 0.5 * p[0], x[0] ** 2 + x[1] - p[1]])
+
+
+def below_a_fold(x, p):
+    """Return two equations with roots x = +-sqrt(p) that meet at p = 0."""
+    return jnp.stack([x[0] ** 2 - x[1], x[1] - p])
+
+
+def logarithm(x, p):
+    return jnp.log(x) - p
+
+
+EXACT = Newton(rounds=30, step_tolerance=1e-12, residual_tolerance=1e-13)
+
+
+@pytest.mark.parametrize(
+    ("equations", "jacobian", "guess"),
+    [(coupled, None, [1.0, 0.5, 0.5]), (coupled, coupled_jacobian, [1.0, 0.5, 0.5]), (pair, None, [1.3, 0.5])],
+    ids=["three", "three-written-jacobian", "two"],
+)
+def test_newton_finds_scipys_root_with_the_derivatives_of_differences(equations, jacobian, guess):
+    @jax.jit
+    def root(p):
+        return newton(equations, jnp.asarray(guess), p, EXACT, jacobian=jacobian)
+
+    def by_scipy(p):
+        return optimize.root(lambda x: np.asarray(equations(x, p)), guess, tol=1e-14).x
+
+    p, direction = jnp.asarray([1.2, 2.1]), jnp.asarray([0.6, -0.8])
+    assert root(p).outcome == NewtonOutcome.CONVERGED
+    np.testing.assert_allclose(root(p).x, by_scipy(p), rtol=1e-12)
+    difference = (by_scipy(p + 1e-5 * direction) - by_scipy(p - 1e-5 * direction)) / 2e-5
+    np.testing.assert_allclose(jax.jvp(lambda p: root(p).x, (p,), (direction,))[1], difference, rtol=1e-7)
+    np.testing.assert_allclose(jax.jacrev(lambda p: root(p).x)(p) @ direction, difference, rtol=1e-7)
+    several = jnp.stack([p, p + 0.1, p - 0.1])
+    alone = np.stack([root(each).x for each in several])
+    np.testing.assert_allclose(jax.vmap(root)(several).x, alone, rtol=1e-14)
+
+
+def test_a_fold_and_what_is_beyond_it_are_told():
+    def root(p, guess=(1.0, 1.0)):
+        return newton(below_a_fold, jnp.asarray(guess), jnp.asarray(p), EXACT)
+
+    np.testing.assert_allclose(root(0.25).x, [0.5, 0.25], rtol=1e-14)
+    assert jax.grad(lambda p: root(p).x[0])(0.25) == pytest.approx(1.0, rel=1e-14)
+    assert jax.grad(jax.grad(lambda p: root(p).x[0]))(0.25) == pytest.approx(-2.0, rel=1e-13)
+    # at the fold each step halves the distance: 30 are not enough; beyond it there is nothing
+    assert root(0.0).outcome == root(-0.25).outcome == NewtonOutcome.NOT_CONVERGED
+    assert float(root(0.0).x[0]) == pytest.approx(0.5**30, rel=1e-6)
+    # df/dx is singular where x = 0
+    stuck = root(0.25, (0.0, 1.0))
+    assert stuck.outcome == NewtonOutcome.NO_STEP
+    np.testing.assert_array_equal(stuck.x, [0.0, 1.0])
+
+
+def test_equations_of_elements_end_one_by_one_within_their_domain():
+    def damped(x, step):
+        return jnp.maximum(step, -0.7 * x)
+
+    limited = EXACT._replace(damping=damped, unit=lambda x: x)
+    guess, p = jnp.asarray([5.0, 1.0, 0.1, 2.0]), jnp.asarray([0.0, 0.0, 1.5, -2.0])
+    where = jnp.asarray([True, True, True, False])
+
+    def roots(p, settings=limited):
+        return newton(logarithm, guess, p, settings, elementwise=True, where=where)
+
+    np.testing.assert_array_equal(roots(p).outcome, [0, 0, 0, NewtonOutcome.NOT_ASKED])
+    np.testing.assert_allclose(roots(p).x[:3], np.exp([0.0, 0.0, 1.5]), rtol=1e-14)
+    assert roots(p).x[3] == 2.0
+    # x - x ln(x) < 0 from 5: the full step leaves the domain of the logarithm
+    undamped = roots(p, EXACT)
+    assert undamped.outcome[0] == NewtonOutcome.NO_STEP
+    np.testing.assert_allclose(jax.jacobian(lambda p: roots(p).x)(p)[:3, :3], np.diag(np.exp(p[:3])), rtol=1e-13)
+
+
+def arctangents(seen=None):
+    def linearised(x, rows):
+        if seen is not None:
+            seen.append(rows.tolist())
+        residual = np.where(np.abs(x) < 50.0, np.arctan(x), np.nan)
+        return LinearisedRows(residual, (1.0 / (1.0 + x**2))[:, :, None], [f"row {row}" for row in rows])
+
+    return linearised
+
+
+def test_rows_are_solved_each_on_its_own():
+    seen, rows = [], np.array([[0.0], [1.0], [3.0], [60.0]])
+    roots = newton_rows(arctangents(seen), rows, EXACT)
+    assert roots.outcome.tolist() == [NewtonOutcome.CONVERGED] * 2 + [NewtonOutcome.NO_STEP] * 2
+    assert roots.converged.tolist() == [True, True, False, False]
+    np.testing.assert_allclose(roots.x[:2], 0.0, atol=1e-15)
+    assert roots.details[:2] == ["row 0", "row 1"]
+    # 60 has no value, 0 is a root, 3 flies away (3 -> -9.5 -> 124), 1 goes on alone
+    assert seen[:3] == [[0, 1, 2, 3], [1, 2], [1, 2]]
+    assert seen[3:] == [[1]] * (len(seen) - 3)
+    # x^2 is small long before its root is near: each step halves the distance
+    double = newton_rows(lambda x, _: LinearisedRows(x**2, (2.0 * x)[:, :, None]), np.ones((1, 1)), EXACT)
+    assert double.outcome.tolist() == [NewtonOutcome.NOT_CONVERGED]
+    assert double.x[0, 0] == pytest.approx(0.5**30, rel=1e-12)
+
+
+def test_halved_and_shortened_steps_come_back():
+    rows = np.array([[3.0], [-45.0]])
+    halved = newton_rows(arctangents(), rows, EXACT._replace(halvings=8))
+    assert halved.converged.all()
+    np.testing.assert_allclose(halved.x, 0.0, atol=1e-15)
+    shorter = EXACT._replace(damping=lambda x, step: shortened(step, np.full_like(x, 1.0)), rounds=60)
+    np.testing.assert_allclose(newton_rows(arctangents(), rows, shorter).x, 0.0, atol=1e-15)
+    np.testing.assert_allclose(shortened(np.array([3.0, -4.0]), np.array([1.0, 8.0])), [1.0, -4.0 / 3.0])
+
+    def minimum(x, _):
+        # x^2 + 1 has no root, and x = 0 no step
+        return LinearisedRows(x**2 + 1.0, (2.0 * x)[:, :, None])
+
+    lost = newton_rows(minimum, np.array([[0.3], [0.0]]), EXACT._replace(halvings=3))
+    assert lost.outcome.tolist() == [NewtonOutcome.NOT_CONVERGED, NewtonOutcome.NO_STEP]
+    assert abs(lost.x[0, 0]) <= 0.3
+
+
 def circle(point: np.ndarray) -> EquationsAt | None:
     """Return a circle of radius 2: it turns back in its last unknown at (0, 2)."""
     x, y = point
     return None if abs(x) > 3.0 else EquationsAt(np.array([x * x + y * y - 4.0]), np.array([[2.0 * x, 2.0 * y]]), x)
+
+
+IN_PLANE = Newton(rounds=12, step_tolerance=1e-9)
 
 
 def test_a_curve_is_followed_round_its_fold():
@@ -105,29 +240,25 @@ def test_a_curve_is_followed_round_its_fold():
     length = 0.3
     turned = 0.0
     while turned < 2.0 * np.pi:
-        found = point_in_plane(circle, here + length * tangent, tangent, arrived=1e-13, steps=12)
-        assert found is not None
-        assert found.point @ found.point == pytest.approx(4.0, rel=1e-14)
+        step = point_in_plane(circle, here + length * tangent, tangent, IN_PLANE)
+        assert step is not None
+        assert step.x @ step.x == pytest.approx(4.0, rel=1e-14)
         # in the plane through the guess, at the angle whose tangent is length over radius
-        assert (found.point - here) @ tangent == pytest.approx(length, rel=1e-13)
-        turn = np.arcsin(length / 2.0)
-        np.testing.assert_allclose(found.tangent, np.array([-found.point[1], found.point[0]]) / 2.0, atol=1e-14)
-        assert found.facts == found.point[0]
-        assert found.moved < 1e-13
-        turned += turn
-        np.testing.assert_allclose(found.point, 2.0 * np.array([np.cos(turned), np.sin(turned)]), atol=1e-12)
-        here, tangent = found.point, found.tangent
+        assert (step.x - here) @ tangent == pytest.approx(length, rel=1e-13)
+        np.testing.assert_allclose(step.tangent, np.array([-step.x[1], step.x[0]]) / 2.0, atol=1e-9)
+        assert step.details == pytest.approx(step.x[0], abs=1e-9)
+        turned += np.arcsin(length / 2.0)
+        np.testing.assert_allclose(step.x, 2.0 * np.array([np.cos(turned), np.sin(turned)]), atol=1e-8)
+        here, tangent = step.x, step.tangent
 
 
 def test_a_plane_without_a_point_of_the_curve_is_no_answer():
     aside = np.array([1.0, 0.0])
-    assert point_in_plane(circle, np.array([3.5, 0.0]), aside, arrived=1e-13, steps=12) is None
-    # Newton's method wanders where plane and circle do not meet: the move that is left says so
-    missed = point_in_plane(circle, np.array([2.5, 0.1]), aside, arrived=1e-13, steps=12)
-    assert missed is None or missed.moved > 1e-3
+    assert point_in_plane(circle, np.array([3.5, 0.0]), aside, IN_PLANE) is None
+    # Newton's method wanders where plane and circle do not meet
+    assert point_in_plane(circle, np.array([2.5, 0.1]), aside, IN_PLANE) is None
     # a normal along the equations' own gradient leaves the system singular
-    flat = np.array([0.0, 1.0])
-    assert point_in_plane(circle, np.array([0.0, 2.1]), flat, arrived=1e-13, steps=12) is None
+    assert point_in_plane(circle, np.array([0.0, 2.1]), np.array([0.0, 1.0]), IN_PLANE) is None
 
 
 def test_the_largest_value_has_the_slope_of_one_of_them():

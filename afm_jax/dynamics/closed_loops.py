@@ -35,11 +35,12 @@ from afm_jax.scenefile.parameter_paths import ParameterRange, with_numbers
 from afm_jax.solve.arclength import EquationsAt, point_in_plane
 from afm_jax.solve.derivatives import largest
 from afm_jax.solve.lanes import in_blocks
+from afm_jax.solve.newton import Newton
 
 KINDS = ("fold", "period_doubling", "torus", "grazing", "capture")
 FOLD, DOUBLING, TORUS, GRAZING, CAPTURE = range(len(KINDS))
-_NEWTON_STEPS = 12
-_ARRIVED = 1e-11
+_CLOSING = Newton(rounds=12, step_tolerance=1e-11)
+"""Steps towards a point: phases in rad, speeds of the fastest impact, parameters of their ranges."""
 BLOCK = 64
 """Points of a curve read together: one program."""
 
@@ -160,17 +161,16 @@ def solved_point(frame: Frame, guess: np.ndarray, row: np.ndarray, equations: Eq
     def linearised(point: np.ndarray) -> EquationsAt | None:
         if flights is not None:
             return flights.linearised(point, units_of(frame), equations.kind)
-        value, slopes = (np.asarray(part) for part in _linearised(frame, jnp.asarray(point), equations))
-        return EquationsAt(value, slopes, None)
+        return EquationsAt(*(np.asarray(part) for part in _linearised(frame, jnp.asarray(point), equations)))
 
-    found = point_in_plane(linearised, guess, row, arrived=0.1 * _ARRIVED, steps=_NEWTON_STEPS)
-    if found is None or not (found.moved < _ARRIVED and np.isfinite((found.point, found.tangent)).all()):
+    point = point_in_plane(linearised, guess, row, _CLOSING)
+    if point is None:
         return None
     if flights is None:
-        tests, delay = (np.asarray(part) for part in _tests_and_delay(frame, jnp.asarray(found.point), equations))
+        tests, delay = (np.asarray(part) for part in _tests_and_delay(frame, jnp.asarray(point.x), equations))
     else:
-        tests, delay = flights.tests(found.facts, units_of(frame)), 0.0
-    return CurvePoint(found.point, found.tangent, tests, delay)
+        tests, delay = flights.tests(point.details, units_of(frame)), 0.0
+    return CurvePoint(point.x, point.tangent, tests, delay)
 
 
 def units_of(frame: Frame) -> CurveUnits:

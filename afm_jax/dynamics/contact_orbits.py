@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Shaped
+from jaxtyping import Array, Float, Int, Shaped
 
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene, drive_of
 from afm_jax.apparatus.surface import Surface, surface_of
@@ -39,6 +39,7 @@ from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.scenefile.parameter_paths import scene_family
 from afm_jax.solve.arclength import EquationsAt
 from afm_jax.solve.lanes import Report, in_blocks
+from afm_jax.solve.newton import LinearisedRows, Newton, newton_rows, shortened
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
 _STARTS = 8
@@ -47,19 +48,13 @@ _SETTLING = 60
 """Contacts before their guesses."""
 _WINDOW = 0.05
 """Periods by which the contacts of a guess may miss N drive periods."""
-_NEWTON_STEPS = 25
-_TURN, _SHARE = 0.3, 0.3
+_LARGEST_CHANGE = 0.3
 """Longest step of Newton's method: in a phase, rad, and of a speed."""
-_ARRIVED = 1e-10
-"""Largest last step and remaining gap of a closed loop, in rad and of the fastest speed."""
 _LANES = 16
 """Contacts followed together, one program."""
 _CONTACTS_AT_ONCE = 128
 """Of a chart."""
 CHART_ACCURACY = 1e-6
-_CHART_STEPS = 15
-_CHART_ARRIVED = 1e-7
-"""Of a phase in rad and of a speed."""
 _GRAZING = 3
 """Number of its test function in `closed_loops`."""
 _SAMPLES = 512
@@ -205,23 +200,27 @@ def _closed(
     guesses: Float[np.ndarray, "guesses n"], flights: "ContactFlights", values: Float[np.ndarray, " parameters"]
 ) -> Float[np.ndarray, "loops n"]:
     """Return the loops that Newton's method finds, departure phases and rebound speeds."""
-    loops, count = guesses.copy(), guesses.shape[1] // 2
-    left, arrived = np.arange(len(loops)), np.zeros(len(loops), bool)
-    for _ in range(_NEWTON_STEPS):
-        goes_on = np.zeros(len(loops), bool)
-        for place, flown in zip(left, flights.flown(loops[left], np.tile(values, (len(left), 1))), strict=True):
-            if flown is None:
-                continue
-            loop = loops[place]
-            step = -np.linalg.lstsq(flown.slopes[:, : len(loop)], flown.gaps, rcond=None)[0]
-            relative = np.concatenate([step[:count] / _TURN, step[count:] / (_SHARE * loop[count:])])
-            weights = np.repeat([1.0, 1.0 / loop[count:].max()], count)
-            loops[place] = loop + step / max(1.0, np.abs(relative).max())
-            missing = max(np.abs(step * weights).max(), np.abs(flown.gaps * weights).max())
-            arrived[place] = missing < _ARRIVED
-            goes_on[place] = not arrived[place]
-        left = np.flatnonzero(goes_on)
-    return loops[arrived]
+    count = guesses.shape[1] // 2
+
+    def units(loops: Float[np.ndarray, "loops n"]) -> Float[np.ndarray, "loops n"]:
+        fastest = loops[:, count:].max(axis=1, keepdims=True)
+        return np.repeat(np.concatenate([np.ones_like(fastest), fastest], axis=1), count, axis=1)
+
+    def linearised(loops: Float[np.ndarray, "loops n"], _: Any) -> LinearisedRows:
+        residual, slopes = np.full_like(loops, np.nan), np.full((*loops.shape, loops.shape[1]), np.nan)
+        for row, flown in enumerate(flights.flown(loops, np.tile(values, (len(loops), 1)))):
+            if flown is not None:
+                residual[row], slopes[row] = flown.gaps, flown.slopes[:, : loops.shape[1]]
+        return LinearisedRows(residual / units(loops), slopes / units(loops)[:, :, None])
+
+    roots = newton_rows(linearised, guesses, _CLOSING._replace(unit=units, damping=_damped))
+    return roots.x[roots.converged]
+
+
+def _damped(loops: Float[np.ndarray, "loops n"], step: Float[np.ndarray, "loops n"]) -> Float[np.ndarray, "loops n"]:
+    """Return a step of Newton's method that turns no phase and changes no speed by too much."""
+    phases, speeds = np.split(loops, 2, axis=1)
+    return shortened(step, np.concatenate([np.full_like(phases, _LARGEST_CHANGE), _LARGEST_CHANGE * speeds], axis=1))
 
 
 def single_contact_orbits(
@@ -243,45 +242,40 @@ def single_contact_orbits(
         ``peak_amplitude_nm`` and ``largest_multiplier``, NaN where there is none.
     """
     lanes, columns, phase, rebound, turns = _guesses_of_law(seen, orders)
-    shape = len(seen.scenes.platform.frequency_khz), len(orders)
-    found = {name: np.zeros(shape, bool) for name in ("stable", "admissible", "unresolved")}
-    found |= {name: np.full(shape, np.nan) for name in ("peak_amplitude_nm", "largest_multiplier")}
-    whole = jax.tree.map(np.asarray, seen)
-    left, done = np.arange(len(lanes)), np.zeros(len(lanes), bool)
-    for _ in range(_CHART_STEPS):
-        if not left.size:
-            break
+    numpy_scenes = jax.tree.map(np.asarray, seen)
+
+    def linearised(departures: Float[np.ndarray, "open 2"], rows: Int[np.ndarray, " open"]) -> LinearisedRows:
+        if report is not None:
+            report(len(lanes) - len(rows), len(lanes))
 
         def work(part: tuple[SampleDriven, Array, Array, Array]) -> _Return:
             return _returns(*part, accuracy=accuracy)
 
-        rows = jax.tree.map(lambda leaf, left=left: leaf[lanes[left]], whole)
-        flown = in_blocks(work, (rows, phase[left], rebound[left], turns[left]), block=_CONTACTS_AT_ONCE)
-        scale = np.stack([np.ones(left.size), rebound[left]], axis=1)
-        arrived = np.abs(flown.gaps / scale).max(axis=1) < _CHART_ARRIVED
-        at, column = lanes[left[arrived]], columns[left[arrived]]
-        multipliers = np.abs(multipliers_of(flown.trace[arrived], flown.determinant[arrived])[:, 0])
-        done[left[arrived]] = True
-        found["admissible"][at, column] = True
-        # the highest last: of several values for one place the last one stays
-        peak = flown.peak_amplitude_nm[arrived]
-        steady = np.flatnonzero(multipliers < 1.0)
-        steady = steady[np.argsort(peak[steady], kind="stable")]
-        steady = steady[~(peak[steady] <= found["peak_amplitude_nm"][at[steady], column[steady]])]
-        place = at[steady], column[steady]
-        found["stable"][place] = True
-        found["peak_amplitude_nm"][place], found["largest_multiplier"][place] = peak[steady], multipliers[steady]
-        goes_on = ~arrived & np.isfinite(flown.step).all(axis=1)
-        change = flown.step[goes_on] / scale[goes_on]
-        left = left[goes_on]
-        change /= np.maximum(1.0, np.abs(change / [_TURN, _SHARE]).max(axis=1))[:, None]
-        phase[left] += change[:, 0]
-        rebound[left] *= 1.0 + change[:, 1]
-        if report is not None:
-            report(len(lanes) - left.size, len(lanes))
-    found["unresolved"][lanes[~done], columns[~done]] = True
-    found["unresolved"] &= ~found["admissible"]
-    return found
+        scenes = jax.tree.map(lambda leaf: leaf[lanes[rows]], numpy_scenes)
+        flown = in_blocks(work, (scenes, *departures.T, turns[rows]), block=_CONTACTS_AT_ONCE)
+        scale = np.stack([np.ones(len(rows)), departures[:, 1]], axis=1)
+        details = list(zip(flown.trace, flown.determinant, flown.peak_amplitude_nm, strict=True))
+        return LinearisedRows(flown.gaps / scale, flown.slopes / scale[:, :, None], details)
+
+    roots = newton_rows(linearised, np.stack([phase, rebound], axis=1), _CLOSING_A_CHART)
+    closed = np.flatnonzero(roots.converged)
+    if report is not None and len(lanes):
+        report(len(lanes), len(lanes))
+    trace, determinant, peak = np.array([roots.details[row] for row in closed]).reshape(-1, 3).T
+    multipliers = np.abs(multipliers_of(trace, determinant)[:, 0])
+    shape = len(seen.scenes.platform.frequency_khz), len(orders)
+    orbits = {name: np.zeros(shape, bool) for name in ("stable", "admissible", "unresolved")}
+    orbits |= {name: np.full(shape, np.nan) for name in ("peak_amplitude_nm", "largest_multiplier")}
+    orbits["admissible"][lanes[closed], columns[closed]] = True
+    # the highest last: of several values for one place the last one stays
+    stable = np.flatnonzero(multipliers < 1.0)
+    stable = stable[np.argsort(peak[stable], kind="stable")]
+    place = lanes[closed[stable]], columns[closed[stable]]
+    orbits["stable"][place] = True
+    orbits["peak_amplitude_nm"][place], orbits["largest_multiplier"][place] = peak[stable], multipliers[stable]
+    orbits["unresolved"][lanes[~roots.converged], columns[~roots.converged]] = True
+    orbits["unresolved"] &= ~orbits["admissible"]
+    return orbits
 
 
 def _guesses_of_law(
@@ -316,8 +310,8 @@ class _Return(NamedTuple):
 
     gaps: Any
     """By how much the next departure misses this one: phase in rad, rebound speed in nm/us."""
-    step: Any
-    """Of Newton's method."""
+    slopes: Any
+    """Their derivatives by phase and rebound speed."""
     trace: Any
     determinant: Any
     peak_amplitude_nm: Any
@@ -340,7 +334,6 @@ def _returns(seen: SampleDriven, phase: Array, rebound: Array, turns: Array, *, 
         (value, contact), slopes = _with_slopes(departs, unknowns)
         good = contact.kind == ContactKind.IMPACT
         gaps = jnp.where(good, value - unknowns - jnp.array([1.0, 0.0]) * turn, jnp.nan)
-        step = -jnp.linalg.solve(slopes - jnp.eye(2), gaps)
         start = phase / omega
         height, rate = platform.position_and_velocity(start)
         height, rate, lasts = (
@@ -355,7 +348,7 @@ def _returns(seen: SampleDriven, phase: Array, rebound: Array, turns: Array, *, 
             still = jnp.zeros_like(start)
             peak = highest_of_sum(scene.cantilever, flight, Surface(still, still, (seen.frame.response,)))
         determinant = slopes[0, 0] * slopes[1, 1] - slopes[0, 1] * slopes[1, 0]
-        return _Return(gaps, step, slopes[0, 0] + slopes[1, 1], determinant, peak)
+        return _Return(gaps, slopes - jnp.eye(2), slopes[0, 0] + slopes[1, 1], determinant, peak)
 
     return jax.vmap(one)(seen, phase, rebound, turns)
 
@@ -367,6 +360,12 @@ def _with_slopes(function: Any, unknowns: Array) -> tuple[Any, Array]:
 
     slopes, found = jax.jacfwd(twice, has_aux=True)(unknowns)
     return found, slopes
+
+
+_CLOSING = Newton(rounds=25, step_tolerance=1e-10, residual_tolerance=1e-10)
+"""Of loops: phases in rad, speeds of the fastest one."""
+_CLOSING_A_CHART = Newton(rounds=15, residual_tolerance=1e-7, damping=_damped)
+"""Of single contacts: a phase in rad, a speed relative to itself."""
 
 
 class CurveUnits(NamedTuple):

@@ -13,7 +13,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Complex, Float
 
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
@@ -28,18 +27,19 @@ from afm_jax.dynamics.impact_loop import (
     samples_for,
 )
 from afm_jax.dynamics.iteration import evenly_spread
-from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, Flight
+from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US
 from afm_jax.impact.law import impact_law_of
-from afm_jax.impact.map import impact_after
+from afm_jax.impact.map import Departure, follow_impacts
 from afm_jax.outcomes import Outcome
 from afm_jax.results import ResultTuple, public_result
+from afm_jax.solve.newton import Newton, newton
 
 DEFAULT_STARTS = 512
 MOST_IMPACTS = 64
 """m: the linear system that closes a loop has twice as many unknowns."""
 _WINDOWS = (0, 1, 2, 4, 8, 16, 48)
 """Impacts after a start at which a window may begin."""
-_NEWTON_STEPS = 30
+_CLOSING = Newton(rounds=30, step_tolerance=1e-14)
 _TURN = 0.5
 """Longest step of Newton's method in a phase, rad."""
 _SHARE = 0.7
@@ -190,46 +190,33 @@ def _search(scene: Scene, order: Array, starts: Array, *, impacts: int, driven: 
 
 def _walks(seen: Scene, loop: ImpactLoop, starts: Array, length: int) -> tuple[Array, Array]:
     """Return arrival phases in rad and approach speeds in nm/us of starts through the map; NaN where it ends."""
-    top_speed = loop.surface.top_speed_nm_per_us
+    surface = loop.surface
     tolerance = jnp.asarray(DEFAULT_ROOT_TOLERANCE_US)
 
     def one(start):
         time = start[0] * 2.0 * jnp.pi / loop.angular_frequency
-        velocity = loop.surface.velocity(time) + top_speed * 0.03 * (_FASTEST / 0.03) ** start[1]
+        velocity = surface.velocity(time) + surface.top_speed_nm_per_us * 0.03 * (_FASTEST / 0.03) ** start[1]
+        rows = follow_impacts(seen, Departure(time, None, velocity), tolerance, impacts=length, max_steps=_STEPS)
+        hit = rows.outcome == Outcome.IMPACT
+        arrival = jnp.where(hit, rows.arrival_time_us, 0.0)
+        approach = surface.velocity(arrival) - rows.velocity_before_nm_per_us
+        return jnp.where(hit, arrival * loop.angular_frequency, jnp.nan), jnp.where(hit, approach, jnp.nan)
 
-        def step(state, _):
-            flying, time, velocity = state
-            resting = loop.surface.velocity(time) - 1.0
-            flight = Flight(loop.cantilever, loop.surface, time, jnp.where(flying, velocity, resting))
-            impact = impact_after(seen, flight, tolerance, max_steps=_STEPS)
-            goes_on = flying & (impact.outcome == Outcome.IMPACT)
-            arrival = jnp.where(goes_on, impact.arrival_time_us, time)
-            approach = loop.surface.velocity(arrival) - impact.velocity_before_nm_per_us
-            row = jnp.where(goes_on, jnp.stack([arrival * loop.angular_frequency, approach]), jnp.nan)
-            after = jnp.where(goes_on, impact.velocity_after_nm_per_us, velocity)
-            return (goes_on, jnp.where(goes_on, impact.time_us, time), after), row
-
-        flying = jnp.ones((), bool)
-        return lax.scan(step, (flying, time, velocity), length=length)[1]
-
-    rows = jax.vmap(one)(starts)
-    return rows[:, :, 0], rows[:, :, 1]
+    return jax.vmap(one)(starts)
 
 
 def closed_loop(guess: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoop) -> Float[Array, " n"]:
     """Return the loop that Newton's method finds from a guess; whether it closes is for the caller to see."""
     count = guess.shape[0] // 2
-    lowest = loop.impact.lowest / scale
 
-    def improve(_, unknowns):
-        value, slopes = closing_gaps(unknowns, scale, loop), jax.jacfwd(closing_gaps)(unknowns, scale, loop)
-        step = -jnp.linalg.solve(slopes, value)
-        nearer = -_SHARE * (unknowns[count:] - lowest)
-        turn = jnp.clip(step[:count], -_TURN, _TURN)
-        moved = unknowns + jnp.concatenate([turn, jnp.maximum(step[count:], nearer)])
-        return jnp.where(jnp.isfinite(moved).all(), moved, unknowns)
+    def damped(unknowns: Array, step: Array) -> Array:
+        nearer = -_SHARE * (unknowns[count:] - loop.impact.lowest / scale)
+        return jnp.concatenate([jnp.clip(step[:count], -_TURN, _TURN), jnp.maximum(step[count:], nearer)])
 
-    return lax.fori_loop(0, _NEWTON_STEPS, improve, guess)
+    def gaps(unknowns: Array, scaled_loop: tuple[Array, ImpactLoop]) -> Array:
+        return closing_gaps(unknowns, *scaled_loop)
+
+    return newton(gaps, guess, (scale, loop), _CLOSING._replace(damping=damped)).x
 
 
 def loops_told_apart(loops: Float[np.ndarray, "found n"], order: int) -> Float[np.ndarray, "loops n"]:

@@ -34,7 +34,7 @@ from afm_jax.impact.law import ImpactLaw, Law, Speeds, TabulatedLaw, impact_law_
 from afm_jax.impact.roots import COARSE, TAPPED, find_roots
 from afm_jax.outcomes import Outcome
 from afm_jax.results import Result, public_result
-from afm_jax.solve.derivatives import absent, implicit_pair, implicit_root
+from afm_jax.solve.derivatives import absent, implicit_root, implicit_system
 from afm_jax.units import within_turn
 
 NEAR_DOUBLE = 1e-3
@@ -288,7 +288,7 @@ def orbit_state(place: OrbitPlace, problem: OrbitProblem) -> OrbitState:
     """Return the motion at a root, with the root's derivatives (implicit function theorem)."""
     cantilever, platform, impact, order = problem
     if impact.lasts:
-        place = OrbitPlace(*implicit_pair(map_gaps, jnp.stack(place), problem))
+        place = OrbitPlace(*implicit_system(map_gaps, jnp.stack(place), problem))
         speeds = speeds_at_place(place, problem)
         phase = place.phase + platform.angular_frequency * speeds.delay
     else:

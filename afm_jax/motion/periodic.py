@@ -15,6 +15,7 @@ from afm_jax.contact.junction import Phase, explain_missing_junction, find_junct
 from afm_jax.motion.follow import Run, follow_in_pieces, why_over
 from afm_jax.motion.record import MotionOutcome, Simulation, State
 from afm_jax.motion.trajectory import flights_of, state_at
+from afm_jax.solve.newton import LinearisedRows, Newton, newton_rows
 
 _ORBIT_PIECE = 50.0
 """Drive periods after which a motion is looked at: is it near an orbit?"""
@@ -23,9 +24,8 @@ _LONGEST_RESPONSE = 12
 _NEAR = 0.05
 """Distance, of the tip's largest speed, within which an orbit belongs to a simulated motion."""
 _OVERSHOOT = 4.0
-_CLOSED = 1e-9
-"""Distance from closing, of the tip's largest speed, at which an orbit is found."""
-_NEWTON_STEPS = 12
+_CLOSING = Newton(rounds=12, residual_tolerance=7e-10)
+"""An orbit is found where height and velocity come back to within 7e-10 of the tip's largest speed, 1e-9 together."""
 _DIFFERENCE = 1e-5
 """Of the tip's largest speed: between the error of a simulated period, 1e-9 of it, and the map's curvature."""
 _ATTRACTS = 1.0 - 1e-7
@@ -176,35 +176,29 @@ def close_periods(
         angular_frequency: of the free tip in rad/us; turns lengths into velocities.
         reach: how far from its first guess a start may end, of the tip's largest speed; on the way four times as far.
     """
-    near, starts, count = starts, np.array(starts), len(rows)
-    closed, contraction = np.zeros(count, bool), np.full(count, np.inf)
-    slopes = np.full((count, 2, 2), np.nan)
-    alive = np.arange(count)
-    for _ in range(_NEWTON_STEPS):
-        if not alive.size:
-            break
-        place = starts[1:, alive]
-        gap, jacobian = _map_of(ends, starts[:, alive], rows[alive], angular_frequency)
-        known = np.asarray(np.isfinite(jacobian).all(axis=(1, 2)) & np.isfinite(gap).all(axis=0))
-        known &= np.linalg.det(np.eye(2) - np.where(known[:, None, None], jacobian, 0.0)) != 0.0
-        safe = np.where(known[:, None, None], jacobian, 0.0)
-        slopes[alive] = jacobian
-        contraction[alive] = np.where(known, np.abs(np.linalg.eigvals(safe)).max(axis=1), np.inf)
-        end = np.concatenate([starts[:1, alive], place + gap])
-        done = known & (_apart(starts[:, alive], end, angular_frequency) <= _CLOSED)
-        closed[alive[done]] = True
-        step = np.linalg.solve(np.eye(2) - safe, np.where(known, gap, 0.0).T[:, :, None])[:, :, 0].T
-        go = known & ~done
-        starts[1:, alive[go]] += step[:, go]
-        alive = alive[go]
-        alive = alive[_apart(near[:, alive], starts[:, alive], angular_frequency) <= _OVERSHOOT * reach]
-    closed &= _apart(near, starts, angular_frequency) <= reach
-    return ClosedPeriods(starts, closed, contraction, slopes)
+
+    def linearised(states: Float[np.ndarray, "open 2"], lanes: Int[np.ndarray, " open"]) -> LinearisedRows:
+        trials = np.concatenate([starts[:1, lanes], states.T])
+        gap, slopes = np.full_like(states, np.nan), np.full((len(lanes), 2, 2), np.nan)
+        near = _apart(starts[:, lanes], trials, angular_frequency) <= _OVERSHOOT * reach
+        if near.any():
+            gap[near], slopes[near] = _map_of(ends, trials[:, near], rows[lanes[near]], angular_frequency)
+        size = (_speed(trials, angular_frequency) / np.array([[angular_frequency], [1.0]])).T
+        return LinearisedRows(gap / size, (slopes - np.eye(2)) / size[:, :, None], list(slopes))
+
+    roots = newton_rows(linearised, starts[1:].T, _CLOSING)
+    slopes = np.array([np.full((2, 2), np.nan) if known is None else known for known in roots.details])
+    known = np.isfinite(slopes).all(axis=(1, 2))
+    contraction = np.full(len(rows), np.inf)
+    contraction[known] = np.abs(np.linalg.eigvals(slopes[known])).max(axis=1)
+    ending = np.concatenate([starts[:1], roots.x.T])
+    closed = roots.converged & (_apart(starts, ending, angular_frequency) <= reach)
+    return ClosedPeriods(ending, closed, contraction, slopes)
 
 
 def _map_of(
     ends: Callable[..., np.ndarray], starts: Float[np.ndarray, "3 n"], rows: Int[np.ndarray, " n"], omega: float
-) -> tuple[Float[np.ndarray, "2 n"], Float[np.ndarray, "n 2 2"]]:
+) -> tuple[Float[np.ndarray, "n 2"], Float[np.ndarray, "n 2 2"]]:
     """Return by how much position and velocity change in a period, and the slopes of where they end."""
     steps = _DIFFERENCE * _speed(starts, omega) * np.array([[1.0 / omega], [1.0]])
     moves = np.concatenate([np.zeros((1, 2)), np.eye(2), -np.eye(2)])
@@ -212,9 +206,9 @@ def _map_of(
     trials = np.stack(
         [starts + np.concatenate([np.zeros(starts[:1].shape), move[:, None] * steps]) for move in moves], 1
     )
-    found = ends(trials.reshape(3, -1), np.tile(rows, len(moves))).reshape(2, len(moves), -1)
-    jacobian = (found[:, 1:3] - found[:, 3:]) / (2.0 * steps)
-    return found[:, 0] - starts[1:], np.moveaxis(jacobian, -1, 0)
+    after = ends(trials.reshape(3, -1), np.tile(rows, len(moves))).reshape(2, len(moves), -1)
+    jacobian = (after[:, 1:3] - after[:, 3:]) / (2.0 * steps)
+    return (after[:, 0] - starts[1:]).T, np.moveaxis(jacobian, -1, 0)
 
 
 def _speed(starts: Float[np.ndarray, "3 n"], omega: float) -> Float[np.ndarray, " n"]:

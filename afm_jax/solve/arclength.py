@@ -1,7 +1,8 @@
-"""A point of a curve of solutions: Newton's method in a plane, and the tangent there (pseudo-arclength continuation).
+"""A point of a curve of solutions in a plane across the curve, and the tangent there (pseudo-arclength continuation).
 
-n equations in n + 1 unknowns have curves of solutions. A step along the tangent is a guess; Newton's method comes back
-to the curve in the plane through the guess, across the tangent. It passes folds, where the parameter turns back.
+n equations f in n + 1 unknowns x have curves of solutions. A step along the tangent is a guess; Newton's method for f
+and the plane's equation, normal . (x - guess) = 0, comes back to the curve. It passes folds, where a parameter turns
+back.
 """
 
 from collections.abc import Callable
@@ -10,58 +11,53 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from afm_jax.solve.newton import LinearisedRows, Newton, newton_rows
+
 
 class EquationsAt(NamedTuple):
-    """The equations at a point."""
+    """The equations of a curve at a point."""
 
-    value: Float[np.ndarray, " n"]
+    residual: Float[np.ndarray, " n"]
     slopes: Float[np.ndarray, "n unknowns"]
-    """Derivatives by all unknowns."""
-    facts: Any
-    """What else is known there."""
+    """Derivatives of the residuals by all unknowns."""
+    details: Any = None
+    """What else the evaluation has found there."""
 
 
 class PointInPlane(NamedTuple):
-    """Where Newton's method ended."""
+    """A point of a curve."""
 
-    point: Float[np.ndarray, " unknowns"]
-    moved: float
-    """Largest part of the move that Newton's method would make from there: the error."""
+    x: Float[np.ndarray, " unknowns"]
     tangent: Float[np.ndarray, " unknowns"]
-    """Of the curve, of length 1, along the plane's normal."""
-    facts: Any
-    """What else the equations know at the point."""
+    """Unit vector along the curve, on the side of the plane's normal."""
+    details: Any
+    """What the last evaluation of the equations has found besides, one Newton step before the point."""
 
 
 def point_in_plane(
-    linearised: Callable[[Float[np.ndarray, " unknowns"]], EquationsAt | None],
+    equations: Callable[[Float[np.ndarray, " unknowns"]], EquationsAt | None],
     guess: Float[np.ndarray, " unknowns"],
     normal: Float[np.ndarray, " unknowns"],
-    *,
-    arrived: float,
-    steps: int,
+    settings: Newton,
 ) -> PointInPlane | None:
-    """Return where a curve meets the plane through a guess across a normal; None where the equations have no value.
+    """Return where a curve meets the plane through a guess across a normal; None where Newton's method finds no point.
 
     Args:
-        linearised: the equations and their derivatives at a point.
-        guess: point near the curve.
+        equations: the equations and their derivatives at a point; None where they have no value.
+        guess: point near the curve, in the plane.
         normal: of the plane.
-        arrived: largest part of a move that ends the search.
-        steps: most of them.
+        settings: of Newton's method.
     """
-    point, unit = guess, np.eye(len(guess))[-1]
-    for step in range(steps):
-        known = linearised(point)
-        if known is None:
-            return None
-        right = np.stack([np.append(known.value, normal @ (point - guess)), unit], axis=1)
-        try:
-            move, tangent = np.linalg.solve(np.vstack([known.slopes, normal]), right).T
-        except np.linalg.LinAlgError:
-            return None
-        moved = float(np.abs(move).max())
-        if not moved > arrived or step == steps - 1:
-            return PointInPlane(point, moved, tangent / np.linalg.norm(tangent), known.facts)
-        point = point - move
-    return None
+
+    def bordered(points: Float[np.ndarray, "1 unknowns"], _: Any) -> LinearisedRows:
+        here = equations(points[0])
+        if here is None:
+            return LinearisedRows(np.full_like(points, np.nan), np.full((1, len(guess), len(guess)), np.nan))
+        residual = np.append(here.residual, normal @ (points[0] - guess))
+        return LinearisedRows(residual[None], np.vstack([here.slopes, normal])[None], [here.details])
+
+    root = newton_rows(bordered, guess[None], settings)
+    if not root.converged[0]:
+        return None
+    along = np.linalg.solve(root.slopes[0], np.eye(len(guess))[-1])
+    return PointInPlane(root.x[0], along / np.linalg.norm(along), root.details[0])

@@ -31,7 +31,6 @@ from jaxtyping import Array, Float
 from afm_jax.checks import is_traced
 
 _implicit_root = Primitive("implicit_root")
-_PAIR = 2
 
 
 def implicit_root(
@@ -49,15 +48,25 @@ def implicit_root(
         points have none, and the caller flags them.
     """
     leaves, structure = jax.tree.flatten(parameters)
-    return _implicit_root.bind(root, *leaves, residual=residual, structure=structure, pair=False)
+    return _implicit_root.bind(root, *leaves, residual=residual, structure=structure, system=False)
 
 
-def implicit_pair(
-    residual: Callable[[Float[Array, " 2"], Any], Float[Array, " 2"]], root: Float[Array, " 2"], parameters: Any
-) -> Float[Array, " 2"]:
-    """Attach the implicit derivative to a root of two equations in two unknowns; as `implicit_root` otherwise."""
+def implicit_system(
+    residual: Callable[[Float[Array, " n"], Any], Float[Array, " n"]], root: Float[Array, " n"], parameters: Any
+) -> Float[Array, " n"]:
+    """Attach the implicit derivative dx/dp = -(df/dx)^-1 df/dp to a root of n equations in n unknowns.
+
+    Args:
+        residual: f(x, parameters), smooth near the root; a plain function, the same object at every call.
+        root: the value of x that the search found; its own derivative is ignored.
+        parameters: pytree of arrays, of what the root depends on.
+
+    Returns:
+        `root`, differentiable with respect to `parameters`. Of two equations the derivative is 0 where df/dx is
+        singular, of more it is not finite there.
+    """
     leaves, structure = jax.tree.flatten(parameters)
-    return _implicit_root.bind(root, *leaves, residual=residual, structure=structure, pair=True)
+    return _implicit_root.bind(root, *leaves, residual=residual, structure=structure, system=True)
 
 
 class _Mapped(NamedTuple):
@@ -75,26 +84,26 @@ class _Mapped(NamedTuple):
 
 
 @_implicit_root.def_impl
-def _evaluate(root, *leaves, residual, structure, pair):
-    del leaves, residual, structure, pair
+def _evaluate(root, *leaves, residual, structure, system):
+    del leaves, residual, structure, system
     return root
 
 
 @_implicit_root.def_abstract_eval
-def _shape(root, *leaves, residual, structure, pair):
-    del leaves, residual, structure, pair
+def _shape(root, *leaves, residual, structure, system):
+    del leaves, residual, structure, system
     return root
 
 
-def _lower(context, root, *leaves, residual, structure, pair):
-    del context, leaves, residual, structure, pair
+def _lower(context, root, *leaves, residual, structure, system):
+    del context, leaves, residual, structure, system
     return [root]
 
 
-def _differentiate(primals, tangents, *, residual, structure, pair):
+def _differentiate(primals, tangents, *, residual, structure, system):
     """Differentiate: dx = -(df/dp dp) / (df/dx) at the root, summed over the parameters that move."""
     root, *leaves = primals
-    x = _implicit_root.bind(root, *leaves, residual=residual, structure=structure, pair=pair)
+    x = _implicit_root.bind(root, *leaves, residual=residual, structure=structure, system=system)
     rates = {place: rate for place, rate in enumerate(tangents[1:]) if not isinstance(rate, ad.Zero)}
     if not rates:
         return x, jnp.zeros_like(x)
@@ -108,12 +117,19 @@ def _differentiate(primals, tangents, *, residual, structure, pair):
     def along(direction):
         return jax.jvp(lambda value: at(value, moving), (x,), (direction,))[1]
 
-    if pair:
-        axes = [jnp.broadcast_to(row, x.shape) for row in jnp.eye(_PAIR, dtype=x.dtype)]
-        return x, -solved_pair(list(jax.vmap(along)(jnp.stack(axes))), shift)
+    if system:
+        axes = [jnp.broadcast_to(row, x.shape) for row in jnp.eye(x.shape[-1], dtype=x.dtype)]
+        return x, -solved_columns(list(jax.vmap(along)(jnp.stack(axes))), shift)
     slope = along(jnp.ones_like(x))
     regular = slope != 0.0
     return x, jnp.where(regular, -shift / jnp.where(regular, slope, 1.0), 0.0)
+
+
+def solved_columns(columns: list[Float[Array, "... n"]], right: Float[Array, "... n"]) -> Float[Array, "... n"]:
+    """Return the solution of n linear equations, given the matrix's columns; of two equations as `solved_pair`."""
+    if len(columns) == 2:
+        return solved_pair(columns, right)
+    return jnp.linalg.solve(jnp.stack(columns, axis=-1), right[..., None])[..., 0]
 
 
 def solved_pair(columns: list[Float[Array, "... 2"]], right: Float[Array, "... 2"]) -> Float[Array, "... 2"]:
@@ -125,7 +141,7 @@ def solved_pair(columns: list[Float[Array, "... 2"]], right: Float[Array, "... 2
     return jnp.where(regular[..., None], solution / jnp.where(regular, determinant, 1.0)[..., None], 0.0)
 
 
-def _map_over_batch(arguments, axes, *, residual, structure, pair):
+def _map_over_batch(arguments, axes, *, residual, structure, system):
     size = next(argument.shape[axis] for argument, axis in zip(arguments, axes, strict=True) if axis is not None)
     root, *leaves = (
         argument if axis is None else jnp.moveaxis(argument, axis, 0)
@@ -134,7 +150,7 @@ def _map_over_batch(arguments, axes, *, residual, structure, pair):
     if axes[0] is None:
         root = jnp.broadcast_to(root, (size, *root.shape))
     mapped = _Mapped(residual, structure, tuple(None if axis is None else 0 for axis in axes[1:]))
-    return _implicit_root.bind(root, *leaves, residual=mapped, structure=structure, pair=pair), 0
+    return _implicit_root.bind(root, *leaves, residual=mapped, structure=structure, system=system), 0
 
 
 mlir.register_lowering(_implicit_root, _lower)

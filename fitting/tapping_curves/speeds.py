@@ -11,13 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool
 
+from afm_jax.solve.newton import LinearisedRows, Newton, newton_rows
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.tapping_curves.curve import Instrument, Rows, TappingCurve, motion_of
 
-_ROUNDS = 40
-_CLOSED = 1e-9
-"""Of the free amplitude: what the equations may be off at a solution."""
-_SHORTEST_STEP = 1.0 / 64.0
+_CLOSING = Newton(rounds=120, residual_tolerance=5e-10, halvings=6)
+"""Of the free amplitude, each of three equations: 1e-9 together."""
 
 
 class TapSpeeds(NamedTuple):
@@ -45,6 +44,11 @@ class _Seen(NamedTuple):
     sigma: Rows
     free: Rows
     lockin: np.ndarray
+
+    def of(self, rows: np.ndarray) -> "_Seen":
+        """Return what the flights of some rows are solved from."""
+        omega, sigma, free, lockin = (part[rows] for part in (self.omega, self.sigma, self.free, self.lockin))
+        return _Seen(omega, self.free_omega, self.decay, sigma, free, lockin)
 
 
 def speeds(
@@ -93,11 +97,6 @@ class _Flight(NamedTuple):
     slopes: np.ndarray
     approach: Rows
     pull: Rows
-
-    @property
-    def off(self) -> Rows:
-        """How far each row is from a solution."""
-        return np.linalg.norm(self.left, axis=0)
 
 
 def _flight(seen: _Seen, x: np.ndarray) -> _Flight:
@@ -149,30 +148,11 @@ def _flight(seen: _Seen, x: np.ndarray) -> _Flight:
 
 
 def _solve(seen: _Seen, x: np.ndarray) -> tuple[np.ndarray, Bool[np.ndarray, " rows"]]:
-    """Return the unknowns by Newton's method, every row with its own length of step, and which rows are solved."""
-    at = _flight(seen, x)
-    for _ in range(_ROUNDS):
-        matrices = at.slopes.copy()
-        usable = np.isfinite(matrices).all(axis=(1, 2)) & (np.abs(np.linalg.det(matrices)) > 0.0)
-        matrices[~usable] = np.eye(3)
-        step = np.linalg.solve(matrices, -at.left.T[:, :, None])[:, :, 0].T
-        share = np.ones(x.shape[1])
-        while True:
-            trial = x + share * step
-            ahead = _flight(seen, trial)
-            worse = ~(ahead.off < at.off) & (at.off > _CLOSED) & (share > _SHORTEST_STEP)
-            if not worse.any():
-                break
-            share = np.where(worse, 0.5 * share, share)
-        better = ahead.off < at.off
-        x = np.where(better, trial, x)
-        at = _Flight(
-            left=np.where(better, ahead.left, at.left),
-            slopes=np.where(better[:, None, None], ahead.slopes, at.slopes),
-            approach=np.where(better, ahead.approach, at.approach),
-            pull=np.where(better, ahead.pull, at.pull),
-        )
-        if not (better & (at.off > _CLOSED)).any():
-            break
-    period = 2.0 * np.pi / seen.omega
-    return x, (at.off < _CLOSED) & (np.abs(x[2]) < 0.5 * period)
+    """Return the unknowns by Newton's method, shape (3, rows), and which rows are solved."""
+
+    def linearised(unknowns: np.ndarray, rows: np.ndarray) -> LinearisedRows:
+        flight = _flight(seen.of(rows), unknowns.T)
+        return LinearisedRows(flight.left.T, flight.slopes)
+
+    roots = newton_rows(linearised, x.T, _CLOSING)
+    return roots.x.T, roots.converged & (np.abs(roots.x[:, 2]) < np.pi / seen.omega)

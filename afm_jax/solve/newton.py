@@ -1,0 +1,256 @@
+"""Newton's method for n equations f(x, p) = 0 in n unknowns: x <- x - (df/dx)^-1 f, with limits on the step.
+
+`newton` solves for one guess inside a compiled program, under `vmap` for many, and gives the root the derivative of the
+implicit function theorem, dx/dp = -(df/dx)^-1 df/dp. `newton_rows` solves for many guesses in NumPy where f is itself a
+program, such as a simulation: each round evaluates the rows that are still open, and no others.
+
+A scalar equation for every element of an array is `newton(misfit, guess, parameters, settings, elementwise=True)`. A
+search over a batch of slots of which few hold a guess names those by `where`. A step that must not leave the domain of
+f is limited by `Newton.damping`; a step that may overshoot is halved by `Newton.halvings`.
+"""
+
+import enum
+import math
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from afm_jax.solve.derivatives import implicit_root, implicit_system, solved_columns
+
+
+class NewtonOutcome(enum.IntEnum):
+    """How a search by Newton's method ended."""
+
+    CONVERGED = 0
+    """The last step and the residual before it are within their tolerances."""
+    NOT_CONVERGED = 1
+    """All rounds are used up, or no halved step lowers the residual."""
+    NO_STEP = 2
+    """The residual is not finite there, or its derivative is singular."""
+    NOT_ASKED = 3
+    """No root was asked for: `where` is False."""
+
+
+class Newton(NamedTuple):
+    """Settings of Newton's method.
+
+    A root counts as found in the round in which residual and step are both within their tolerances. This step is still
+    taken, so that the error left is of the order of the step's square.
+    """
+
+    rounds: int
+    """Evaluations of residual and Jacobian at most."""
+    step_tolerance: float = math.inf
+    """Largest component of the last step, in units of `unit`."""
+    residual_tolerance: float = math.inf
+    """Largest component of the residual."""
+    unit: Callable[[Any], Any] | None = None
+    """Natural size of the unknowns at x, to which `step_tolerance` refers; None: 1."""
+    damping: Callable[[Any, Any], Any] | None = None
+    """Returns the step to be taken from x in place of the full one; None: the full step."""
+    halvings: int = 0
+    """How often a step is halved that does not lower the norm of the residual (`newton_rows` alone)."""
+
+    def limited(self, x: Any, step: Any) -> tuple[Any, Any]:
+        """Return the step to be taken from x, and the sizes of its components."""
+        step = step if self.damping is None else self.damping(x, step)
+        return step, abs(step if self.unit is None else step / self.unit(x))
+
+
+def shortened(step: Any, longest: Any) -> Any:
+    """Return a step in its own direction, at most so long that every component is within `longest`."""
+    return step / abs(step / longest).max(axis=-1, keepdims=True).clip(1.0)
+
+
+class Root(NamedTuple):
+    """Where a search inside a program ended."""
+
+    x: Float[Array, "..."]
+    outcome: Int[Array, "..."]
+    """A `NewtonOutcome`; of each element where the equations are elementwise."""
+    residual: Float[Array, "..."]
+    """The residual before the last step; infinite where no round was made."""
+
+
+def newton(
+    residual: Callable[[Array, Any], Array],
+    guess: Float[Array, "..."],
+    parameters: Any,
+    settings: Newton,
+    *,
+    jacobian: Callable[[Array, Any], tuple[Array, Array]] | None = None,
+    elementwise: bool = False,
+    where: Bool[Array, "..."] | None = None,
+) -> Root:
+    """Return the root of f(x, parameters) = 0 that Newton's method finds from a guess, differentiable.
+
+    Args:
+        residual: f, a plain function that takes everything that may have a derivative from its parameters.
+        guess: shape (n,); any shape where the equations are elementwise. Its own derivative is ignored.
+        parameters: pytree of arrays.
+        settings: rounds, tolerances and limits.
+        jacobian: returns f and df/dx at (x, parameters), shapes (n,) and (n, n); None: by forward differentiation.
+        elementwise: f is a scalar equation for every element of x on its own; df/dx has then the shape of x.
+        where: whether a root is asked for; elsewhere the guess is returned, and no round is made for it.
+
+    Returns:
+        The root with its implicit derivative, also where the search has not converged; 0 where df/dx is singular.
+    """
+    fixed = lax.stop_gradient(parameters)
+    begin = lax.stop_gradient(guess)
+    evaluate = jacobian or _forward(residual, elementwise=elementwise)
+
+    def within(sizes: Array, tolerance: float) -> Array:
+        return sizes <= tolerance if elementwise else jnp.all(sizes <= tolerance)
+
+    def improve(state: tuple[Array, Root]) -> tuple[Array, Root]:
+        count, (x, outcome, old) = state
+        value, slopes = evaluate(x, fixed)
+        full = -_quotient(value, slopes) if elementwise else -solved_columns(list(slopes.T), value)
+        step, sizes = settings.limited(x, full)
+        # of two equations the solution is 0 where the matrix is singular
+        stands = jnp.all(full == 0.0) & jnp.any(value != 0.0)
+        finite = jnp.isfinite(step) if elementwise else jnp.all(jnp.isfinite(step)) & ~stands
+        found = within(jnp.abs(value), settings.residual_tolerance) & within(sizes, settings.step_tolerance)
+        going = outcome == NewtonOutcome.NOT_CONVERGED
+        now = jnp.where(found, NewtonOutcome.CONVERGED, outcome)
+        now = jnp.where(finite, now, NewtonOutcome.NO_STEP)
+        return count + 1, Root(
+            jnp.where(going & finite, x + step, x), jnp.where(going, now, outcome), jnp.where(going, value, old)
+        )
+
+    def unsettled(state: tuple[Array, Root]) -> Array:
+        return (state[0] < settings.rounds) & jnp.any(state[1].outcome == NewtonOutcome.NOT_CONVERGED)
+
+    asked = jnp.ones((), bool) if where is None else where
+    first = jnp.where(asked, NewtonOutcome.NOT_CONVERGED, NewtonOutcome.NOT_ASKED).astype(jnp.int32)
+    first = jnp.broadcast_to(first, begin.shape) if elementwise else first
+    start = Root(begin, first, jnp.full_like(begin, jnp.inf))
+    root = lax.while_loop(unsettled, improve, (jnp.zeros((), jnp.int32), start))[1]
+    with_derivative = implicit_root if elementwise else implicit_system
+    return root._replace(x=with_derivative(residual, root.x, parameters))
+
+
+def _forward(residual: Callable[[Array, Any], Array], *, elementwise: bool) -> Callable[[Array, Any], Any]:
+    """Return the function that gives f and df/dx from one evaluation with forward derivatives."""
+
+    def slopes_of_elements(x: Array, parameters: Any) -> tuple[Array, Array]:
+        return jax.jvp(lambda x: residual(x, parameters), (x,), (jnp.ones_like(x),))
+
+    def slopes_of_system(x: Array, parameters: Any) -> tuple[Array, Array]:
+        def twice(x: Array) -> tuple[Array, Array]:
+            value = residual(x, parameters)
+            return value, value
+
+        slopes, value = jax.jacfwd(twice, has_aux=True)(x)
+        return value, slopes
+
+    return slopes_of_elements if elementwise else slopes_of_system
+
+
+def _quotient(value: Array, slope: Array) -> Array:
+    """Return value/slope, NaN where the slope is 0."""
+    return jnp.where(slope != 0.0, value / jnp.where(slope != 0.0, slope, 1.0), jnp.nan)
+
+
+class LinearisedRows(NamedTuple):
+    """Equations at the points of some rows; NaN in a row where they have no value."""
+
+    residual: Float[np.ndarray, "rows n"]
+    slopes: Float[np.ndarray, "rows n n"]
+    """Derivatives of the residuals by the unknowns."""
+    details: Sequence[Any] | None = None
+    """What else the evaluation has found, one a row."""
+
+    def of(self, rows: Int[np.ndarray, " some"]) -> "LinearisedRows":
+        """Return the equations of some of the rows."""
+        details = None if self.details is None else [self.details[row] for row in rows]
+        return LinearisedRows(self.residual[rows], self.slopes[rows], details)
+
+
+class Roots(NamedTuple):
+    """Where the searches of all rows ended."""
+
+    x: Float[np.ndarray, "rows n"]
+    outcome: Int[np.ndarray, " rows"]
+    """A `NewtonOutcome` each."""
+    slopes: Float[np.ndarray, "rows n n"]
+    """Derivatives of the residuals before the last step; NaN where there are none."""
+    details: list[Any]
+    """What the last evaluation of each row has found besides; None where there is nothing."""
+
+    @property
+    def converged(self) -> Bool[np.ndarray, " rows"]:
+        """Which rows have a root."""
+        return self.outcome == NewtonOutcome.CONVERGED
+
+
+def newton_rows(
+    linearised: Callable[[Float[np.ndarray, "open n"], Int[np.ndarray, " open"]], LinearisedRows],
+    guesses: Float[np.ndarray, "rows n"],
+    settings: Newton,
+) -> Roots:
+    """Return the roots that Newton's method finds from many guesses, each row on its own.
+
+    Args:
+        linearised: equations and derivatives at points, given with the numbers of their rows.
+        guesses: first points.
+        settings: rounds, tolerances and limits.
+    """
+    count, unknowns = np.shape(guesses)
+    roots = Roots(
+        x=np.array(guesses, float),
+        outcome=np.full(count, NewtonOutcome.NOT_CONVERGED),
+        slopes=np.full((count, unknowns, unknowns), np.nan),
+        details=[None] * count,
+    )
+    step, lowest, halved = np.zeros((count, unknowns)), np.full(count, np.inf), np.zeros(count, int)
+    rows = np.arange(count)
+    for _ in range(settings.rounds):
+        if not rows.size:
+            break
+        here = linearised(roots.x[rows], rows)
+        size = np.linalg.norm(here.residual, axis=1)
+        too_far = ~(size < lowest[rows]) if settings.halvings else np.zeros(len(rows), bool)
+        on, back = rows[~too_far], rows[too_far]
+        step[back] *= 0.5
+        roots.x[back] -= step[back]
+        halved[back] += 1
+        lowest[on], halved[on] = size[~too_far], 0
+        step[on] = _advance(roots, on, here.of(np.flatnonzero(~too_far)), settings)
+        given_up = back[halved[back] > settings.halvings]
+        roots.x[given_up] -= step[given_up]
+        rows = np.setdiff1d(rows[roots.outcome[rows] == NewtonOutcome.NOT_CONVERGED], given_up)
+    return roots
+
+
+def _advance(
+    roots: Roots, rows: Int[np.ndarray, " some"], here: LinearisedRows, settings: Newton
+) -> Float[np.ndarray, "some n"]:
+    """Take a step from the points of some rows, write down what becomes of them, and return the step."""
+    x = roots.x[rows]
+    step, sizes = settings.limited(x, -_solved(here.slopes, here.residual))
+    finite = np.isfinite(step).all(axis=1)
+    roots.x[rows] = np.where(finite[:, None], x + step, x)
+    small = np.all(np.abs(here.residual) <= settings.residual_tolerance, axis=1)
+    found = finite & small & np.all(sizes <= settings.step_tolerance, axis=1)
+    roots.outcome[rows[found]], roots.outcome[rows[~finite]] = NewtonOutcome.CONVERGED, NewtonOutcome.NO_STEP
+    roots.slopes[rows] = here.slopes
+    for row, detail in zip(rows, here.details or (), strict=bool(here.details)):
+        roots.details[row] = detail
+    return step
+
+
+def _solved(slopes: Float[np.ndarray, "rows n n"], right: Float[np.ndarray, "rows n"]) -> Float[np.ndarray, "rows n"]:
+    """Return the solutions of linear equations, row by row; NaN where a matrix is singular."""
+    try:
+        return np.linalg.solve(slopes, right[:, :, None])[:, :, 0]
+    except np.linalg.LinAlgError:
+        if len(slopes) == 1:
+            return np.full_like(right, np.nan)
+        return np.concatenate([_solved(slopes[row : row + 1], right[row : row + 1]) for row in range(len(slopes))])
