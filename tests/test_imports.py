@@ -182,7 +182,7 @@ def crossed(start: tuple[str, str]) -> set[str]:
         ("afm_jax.motion.simulate", "simulate", 39),
         ("fitting.fits.fit", "fit", 53),
         ("afm_jax.contact.collide", "collide", 20),
-        ("afm_jax.effects.study", "study_effects", 53),
+        ("afm_jax.effects.study", "study_effects", 54),
     ],
 )
 def test_a_call_crosses_few_files(module: str, name: str, most: int):
