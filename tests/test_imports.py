@@ -36,7 +36,6 @@ LEVELS = {
     "verify": 7,
     "bench": 8,
     "accuracy": 9,
-    "paper": 9,
     "plots": 10,
     "cli": 11,
     "__main__": 12,
@@ -219,7 +218,7 @@ def test_fits_load_no_scipy_and_pictures_no_pyplot():
     # its statistics alone take as long as JAX: they are for posteriors, which import them when they need them
     code = (
         "import sys, fitting.fits.fit, fitting.report.report\nprint('scipy' in sys.modules)\n"
-        "import afm_jax.plots.paper\nprint('matplotlib.pyplot' in sys.modules)"
+        "import afm_jax.plots.motion\nprint('matplotlib.pyplot' in sys.modules)"
     )
     assert python(code).split() == ["False", "False"]
 

@@ -131,9 +131,6 @@ _OF_THEIR_OWN_FILES = (
         "afm_jax.cli.effects",
     ),
     _OfItsOwnFile(
-        "figures", "check", "Draw figures 2 to 11 of the paper, with its statements checked.", "afm_jax.cli.figures"
-    ),
-    _OfItsOwnFile(
         "orbits",
         "simulate",
         "Find the orbits of a scene, of one impact or more, and whether they are stable.",
