@@ -27,6 +27,7 @@ RESPONSE = f"{OBSERVED}test_a_free_cantilever_responds_as_it_must"
 LAW_MOTION = "tests/test_law_motion.py::"
 COLLIDE = "tests/test_collide.py::"
 COLLISIONS = f"{COLLIDE}test_default_accuracy_is_reached_from_11_times_the_capture_speed[diffrax]"
+STEPS = "tests/test_contact_legs.py::test_steps_in_time_take_a_free_tip_where_collide_does"
 COLLOCATION = f"{COLLIDE}test_default_accuracy_is_reached_from_11_times_the_capture_speed[collocation]"
 
 
@@ -241,6 +242,9 @@ MUTATIONS = {
         "if not transient <= tolerance",
         "if transient <= tolerance",
         f"{OBSERVED}test_a_vibration_that_dies_away_settles_when_it_has",
+    ),
+    "a junction that breaks past the bridge": Mutation(
+        "driven.breaks_nm, Phase.BRIDGE, Phase.DRY)", "driven.breaks_nm, Phase.DRY, Phase.DRY)", STEPS
     ),
     "push of the platform without its acceleration": Mutation(
         "return self.surface.acceleration(time_us) - self.cantilever",
