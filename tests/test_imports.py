@@ -178,10 +178,10 @@ def crossed(start: tuple[str, str]) -> set[str]:
 @pytest.mark.parametrize(
     ("module", "name", "most"),
     [
-        ("afm_jax.motion.simulate", "simulate", 37),
-        ("fitting.fits.fit", "fit", 52),
-        ("afm_jax.contact.collide", "collide", 18),
-        ("afm_jax.effects.study", "study_effects", 53),
+        ("afm_jax.motion.simulate", "simulate", 39),
+        ("fitting.fits.fit", "fit", 53),
+        ("afm_jax.contact.collide", "collide", 20),
+        ("afm_jax.effects.study", "study_effects", 54),
     ],
 )
 def test_a_call_crosses_few_files(module: str, name: str, most: int):

@@ -148,7 +148,7 @@ def _round(driven: Driven, course: ContactTip, *, until_us: Array, setting: Driv
     """Return a tip after one round: flight, legs through the contact, steps in time where those do not hold."""
     active, free = ~course.done, (course.tip.phase == Phase.DRY) & ~course.done
     flown, arrives, lost = _fly(driven, course.tip.state, free, until_us)
-    tip = TipInContact.at_start(flown, jnp.where(arrives, Phase.BRIDGE, Phase.DRY))
+    tip = TipInContact.arriving(driven, flown, arrives)
     tip, arrival = _where(free, tip, course.tip), _where(arrives, flown, course.arrival)
     tip = _through_legs(driven, tip, arrives, active & (course.repeats.times == 0), until_us, setting)
     tip = _step_in_time(driven, tip, active, course.repeats.times, until_us, setting, reverse=reverse)
@@ -163,7 +163,7 @@ def _round(driven: Driven, course: ContactTip, *, until_us: Array, setting: Driv
     outcome = jnp.where(lost, MotionOutcome.STEP_LIMIT, outcome)
     outcome = jnp.where(finite, outcome, MotionOutcome.UNRESOLVED)
     if setting.agreement is not None:
-        tip = _where(again, TipInContact.at_start(arrival, jnp.full_like(tip.phase, Phase.BRIDGE)), tip)
+        tip = _where(again, TipInContact.arriving(driven, arrival, jnp.ones_like(again)), tip)
     place = jnp.where(ends & ~full, course.contacts, room)
     return ContactTip(
         tip=tip,
@@ -190,7 +190,7 @@ def _fly(
     A tip that is not free stays where it is: its search starts below the level and ends at once.
     """
     surface = driven.surface
-    gap = jnp.where(free, start.x, 0.5 * driven.forms_nm)
+    gap = jnp.where(free, start.x, driven.forms_nm - 1.0)
     height, speed = surface.position_and_velocity(start.time_us)
     velocity = start.gap_rate + speed
     flight = Flight(driven.cantilever, surface, start.time_us, velocity, gap, driven.forms_nm)
@@ -270,7 +270,9 @@ def legs_through(
     )
     solid = go_through_junction(driven, tip.state, quick)
     waits = at_junction(driven, tip) & active
-    breaks = takes(solid, waits & (driven.junction.breaks_gap_nm < driven.breaks_nm))
+    # where nothing acts outside the junction, the way out has no length
+    goes_out = (driven.junction.breaks_gap_nm < driven.breaks_nm) | (not driven.bridge.spans)
+    breaks = takes(solid, waits & goes_out)
     # one for which the leg does not hold is told how far to go in time, and waits no longer
     at_forming = lax.stop_gradient(tip.state._replace(x=driven.junction.forms_root))
     first_step = lax.stop_gradient(1.0 / (setting.fineness * inverse_junction_step(driven, at_forming)))
@@ -353,7 +355,10 @@ def _repetition(
     if setting.agreement is None:
         return jnp.zeros_like(has_left), repeats
     came, left, before = lax.stop_gradient((arrival, tip.state, repeats))
-    lasts = (left.time_us - came.time_us) * jnp.abs(came.gap_rate) > _LASTS_LONG * (came.x + left.x)
+    gaps = came.x + left.x
+    # without a bridge the way is that into the sample and back
+    gaps = jnp.where(gaps > 0.0, gaps, -2.0 * tip.deepest_gap_nm)
+    lasts = (left.time_us - came.time_us) * jnp.abs(came.gap_rate) > _LASTS_LONG * gaps
     slowed = setting.magnified * left.gap_rate**2 < came.gap_rate**2
     differs = jnp.maximum(
         jnp.abs(left.gap_rate - before.departure_rate),

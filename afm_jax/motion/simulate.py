@@ -271,7 +271,7 @@ def _contacts(
     bridge = jnp.where(has_left, junction.bridge_hysteresis_aj, 0.0)
     solid = row.junctions * junction.junction_hysteresis_aj
     depth = junction.shift_nm - jnp.where(touched, row.deepest_gap_nm, 0.0)
-    force = jnp.where(touched, scene.interaction.junction.force(depth), 0.0)
+    force = jnp.where(touched, scene.interaction.solid.force(depth), 0.0)
     detail = ContactDetail(
         junctions=row.junctions.astype(jnp.int32),
         junction_forms_us=row.junction_forms_us,

@@ -77,9 +77,15 @@ def state(time_us: float, position_nm: float, velocity_nm_per_us: float) -> Stat
     return State(*(as_parameter(float(value)) for value in (time_us, position_nm, velocity_nm_per_us)))
 
 
+_FREE_NM = 1e-6
+
+
 def _clearance(scene: Scene) -> float:
     """Return the gap, in nm, at which a tip that leaves the sample is free."""
-    return float(scene.interaction.bridge_breaks_nm) if isinstance(scene.interaction, Contact) else 0.0
+    if not isinstance(scene.interaction, Contact):
+        return 0.0
+    # a contact without forces begins at gap 0: rounding must not put the tip below it
+    return max(float(scene.interaction.bridge_breaks_nm), _FREE_NM)
 
 
 def _on_orbit(scene: Scene, still: Scene, law: Law) -> State | None:

@@ -34,6 +34,7 @@ _BLOCK = 128
 """Trials computed in one call."""
 _FINENESS = 4.5
 _NEWTON_STEPS = 6
+_SHORTEST_US = 1e-13
 
 
 class Steps(NamedTuple):
@@ -61,7 +62,7 @@ def contact_steps(driven: Driven, begin: ContactState, phase: Int[np.ndarray, " 
     spare = (1 << max(len(phase) - 1, 0).bit_length()) - len(phase)
     place = ContactState(*(jnp.concatenate([jnp.asarray(part), jnp.ones(spare)]) for part in begin))
     phases = np.concatenate([phase, np.full(spare, int(Phase.DRY))])
-    touch = TipInContact.at_start(place, jnp.asarray(phases, jnp.int32))
+    touch = TipInContact.arriving(driven, place, jnp.asarray(phases != Phase.DRY))
     until = jnp.asarray(until_us, touch.state.x.dtype)
     parts = []
     while np.any((np.asarray(touch.phase) != Phase.DRY) & (np.asarray(touch.state.time_us) < until_us)):
@@ -69,6 +70,9 @@ def contact_steps(driven: Driven, begin: ContactState, phase: Int[np.ndarray, " 
         taken, *columns = (np.asarray(part) for part in jax.tree.leaves(record))
         parts.append([column[taken] for column in columns])
     joined = [np.concatenate(columns) for columns in zip(*parts, strict=True)] if parts else [np.zeros(0)] * 6
+    # a step within the rounding of its time could come to stand behind the flight after it
+    last = joined[5] - joined[2] > _SHORTEST_US * (1.0 + np.abs(joined[2]))
+    joined = [column[last] for column in joined]
     order = np.argsort(joined[2], kind="stable")
     x, rate, time, _, kinds, ends = (column[order] for column in joined)
     return Steps(time, ends, kinds.astype(int), x, rate)
@@ -108,9 +112,18 @@ def places_at(
 
     def newton(_, length):
         end = stepped(length)
-        return length + (time_us - end.time_us) / driven.rates(end, solid).time_us
+        passing = driven.rates(end, solid).time_us
+        # time stands still at the fold
+        return length + (time_us - end.time_us) / jnp.where(passing == 0.0, 1.0, passing)
 
-    first = (time_us - start.time_us) / jnp.where(solid, jnp.maximum(rate, 1e-3), 1.0)
+    elapsed = time_us - start.time_us
+    first = elapsed / jnp.where(solid, jnp.maximum(rate, 1e-3), 1.0)
+    if driven.solid.reversible:
+        # time stands still where a dry contact begins, and grows with the square of the variable
+        s_rate = driven.rates(start, solid).x
+        _, growth = jax.jvp(driven.solid.depth_slope, (start.x,), (s_rate,))
+        root = jnp.sqrt(jnp.maximum(rate * rate + 2.0 * growth * elapsed, 0.0))
+        first = jnp.where(solid, 2.0 * elapsed / jnp.maximum(rate + root, 1e-9), first)
     length = lax.fori_loop(0, _NEWTON_STEPS, newton, first)
     end = stepped(length)
     return driven.gap(end.x, phase), end.gap_rate

@@ -118,6 +118,12 @@ def contact_scene(
     return Scene(Cantilever(FREE_FREQUENCY_KHZ, QUALITY_FACTOR, 1.0), platform, Contact.paper())
 
 
+def dry_scene() -> Scene:
+    """Return figure 10's scene at offset 0 with a dry contact in place of the liquid bridge and the JKR junction."""
+    scene = contact_scene(0.97, 2.0, 0.0)
+    return Scene(scene.cantilever, scene.platform, Contact.of(("van_der_waals", "dmt")))
+
+
 def drive_frequency_khz(reduced_frequency: ArrayLike) -> Float[Array, "..."]:
     """Return the drive frequency 2 n Omega / 2 pi of a reduced frequency n."""
     return 2.0 * FREE_FREQUENCY_KHZ * as_argument(reduced_frequency)
@@ -158,6 +164,10 @@ _PRESETS = {
     "figure11": _Preset(
         "Contact above resonance, n = 1.01, drive amplitude 4 nm; the offset rises from -2 nm, to 2 nm in 4000 us.",
         lambda: figure11_scene(offset_rate_nm_per_us=RAMP_NM_PER_US),
+    ),
+    "dry": _Preset(
+        "Dry contact (van der Waals, DMT) below resonance, n = 0.97, drive amplitude 2 nm, offset 0.",
+        dry_scene,
     ),
 }
 
