@@ -27,9 +27,8 @@ from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.contact.parameters import EFFECTS
 from afm_jax.impact.closure import OrbitPlace, OrbitProblem
-from afm_jax.impact.contact_impact import PulledImpact, TabulatedImpact
 from afm_jax.impact.first_impact import Flight, flight_gap
-from afm_jax.impact.lasting_impact import middle_of_contact
+from afm_jax.impact.lasting_impact import PulledImpact, TabulatedImpact, middle_of_contact
 from afm_jax.impact.law import Law, Speeds
 from afm_jax.impact.map import NEAR_GRAZING
 from afm_jax.impact.orbits import amplitudes, near_fold, orbit_state, steady_orbits

@@ -13,7 +13,7 @@ import numpy as np
 
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
-from afm_jax.impact.contact_impact import TabulatedImpact
+from afm_jax.impact.lasting_impact import TabulatedImpact
 from afm_jax.impact.orbits import steady_orbits
 from fitting import read_table
 from fitting.examples.make_contact_amplitudes import EXAMPLE

@@ -25,8 +25,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import detected
 from afm_jax.impact.closure import OrbitProblem
-from afm_jax.impact.contact_impact import TabulatedImpact
-from afm_jax.impact.lasting_impact import middle_of_contact
+from afm_jax.impact.lasting_impact import TabulatedImpact, middle_of_contact
 from afm_jax.impact.orbits import amplitudes, orbit_state, steady_orbits
 from afm_jax.least_squares import covariance_of
 from fitting.fits.fit import fit, problem_of

@@ -16,7 +16,7 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.contact.parameters import PAPER
-from afm_jax.impact.contact_impact import TabulatedImpact
+from afm_jax.impact.lasting_impact import TabulatedImpact
 from fitting import read_table
 from fitting.simulated.experiment import drives_of, simulate_experiment
 from fitting.tables.table import AmplitudeTable, write_table

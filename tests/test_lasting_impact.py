@@ -13,7 +13,6 @@ import afm_jax as afm
 from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.junction import find_junction
 from afm_jax.contact.law_of_contact import DELAY_ERROR_US, SPEED_ERROR, tabulated
-from afm_jax.impact.contact_impact import Middle
 from afm_jax.impact.lasting_impact import (
     AIR,
     PULLS,
@@ -21,6 +20,7 @@ from afm_jax.impact.lasting_impact import (
     SPREAD,
     STIFFER,
     USUAL_LEAD,
+    Middle,
     corrected,
     depth_of_impact,
     hertz_under_pull,

@@ -15,8 +15,7 @@ from afm_jax.apparatus.surface import detected, drive_per_free_height
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.impact.closure import OrbitProblem
-from afm_jax.impact.contact_impact import TabulatedImpact
-from afm_jax.impact.lasting_impact import middle_of_contact
+from afm_jax.impact.lasting_impact import TabulatedImpact, middle_of_contact
 from afm_jax.impact.orbits import amplitudes, orbit_state, steady_orbits
 from afm_jax.motion.follow import follow_long
 from afm_jax.motion.observe import observe

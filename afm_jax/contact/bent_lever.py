@@ -28,7 +28,7 @@ from afm_jax.contact.junction import find_junction
 from afm_jax.contact.junction_leg import pass_through_junction
 from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.contact.leg import gauss_nodes
-from afm_jax.impact.contact_impact import PulledImpact, Taps, polynomials, stretched
+from afm_jax.impact.lasting_impact import PulledImpact, Taps, polynomials, stretched
 from afm_jax.solve.derivatives import largest
 
 PULLS, SPEEDS = 7, 18

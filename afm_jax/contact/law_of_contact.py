@@ -33,7 +33,7 @@ from afm_jax.contact.contact import Bridge, Contact, bridge_of
 from afm_jax.contact.driven import free_tip
 from afm_jax.contact.junction import Junction, find_junction
 from afm_jax.contact.junction_leg import pass_through_junction
-from afm_jax.impact.contact_impact import TabulatedImpact, polynomials, stretched
+from afm_jax.impact.lasting_impact import TabulatedImpact, polynomials, stretched
 from afm_jax.impact.law import MOST_KNOTS, CollisionDelay, ImpactLaw, TabulatedLaw
 from afm_jax.least_squares import Box, Searches, descended, distance
 from afm_jax.results import Result, public_result

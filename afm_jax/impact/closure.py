@@ -22,7 +22,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.trigonometry import sine_cosine
 from afm_jax.impact.lasting_impact import corrected, lasting, middle_of_contact
 from afm_jax.impact.law import Impact, ImpactLaw, Speeds
-from afm_jax.solve.newton import Newton, Root, newton
+from afm_jax.solve.derivatives import solved_pair
 
 _REGULAR = 1e-12
 """Relative size below which a determinant is taken for the rounding of 0."""
@@ -30,9 +30,7 @@ _PASSES = 3
 _CLOSE = 1e-10
 """Gaps, and the last step of Newton's method, that leave an error of the order of their square."""
 _LONGEST_STEP = 0.3
-"""Longest step of Newton's method: fraction of the distance from capture, and rad."""
-_NEWTON = 6
-"""Steps of Newton's method at most."""
+"""Of Newton's method: share of the distance from capture, and rad."""
 
 
 class OrbitProblem(NamedTuple):
@@ -143,24 +141,46 @@ def map_gaps(unknowns: Float[Array, " 2"], problem: OrbitProblem) -> Float[Array
     return jnp.stack([(position - height) / platform.amplitude_nm, missing])
 
 
-def close_map(place: OrbitPlace, problem: OrbitProblem, wanted: Bool[Array, ""]) -> Root:
-    """Return coordinate and phase where the map of a lasting impact closes, by Newton's method from a place near by.
+class ClosedMap(NamedTuple):
+    """Coordinate and phase where Newton's method has ended, and the last gaps it has seen."""
+
+    unknowns: Float[Array, " 2"]
+    gaps: Float[Array, " 2"]
+
+
+def close_map(place: OrbitPlace, problem: OrbitProblem, steps: int, wanted: Bool[Array, ""]) -> ClosedMap:
+    """Return where steps of Newton's method towards the orbit of the map end: as many as it takes.
 
     Args:
         place: where to begin.
         problem: what orbits are of.
-        wanted: whether an orbit is sought; if not, the place is returned.
+        steps: at most.
+        wanted: False: none at all.
     """
 
-    def longest(unknowns: Array) -> Array:
+    def twice(unknowns):
+        value = map_gaps(unknowns, problem)
+        return value, value
+
+    def longest(unknowns):
         return jnp.stack([unknowns[0] - problem.impact.lowest, jnp.ones_like(unknowns[1])])
 
-    def damped(unknowns: Array, step: Array) -> Array:
-        most = longest(unknowns) * _LONGEST_STEP
-        return jnp.clip(step, -most, most)
+    def unsettled(state):
+        count, unknowns, gaps, step = state
+        small = (jnp.abs(gaps) < _CLOSE) & (jnp.abs(step) < _CLOSE * longest(unknowns))
+        return wanted & (count < steps) & ~jnp.all(small)
 
-    settings = Newton(_NEWTON, step_tolerance=_CLOSE, residual_tolerance=_CLOSE, unit=longest, damping=damped)
-    return newton(map_gaps, jnp.stack(place), problem, settings, where=wanted)
+    def improve(state):
+        count, unknowns, _, _ = state
+        slopes, gaps = jax.jacfwd(twice, has_aux=True)(unknowns)
+        most = longest(unknowns) * _LONGEST_STEP
+        step = jnp.clip(-solved_pair([slopes[:, 0], slopes[:, 1]], gaps), -most, most)
+        return count + 1, unknowns + step, gaps, step
+
+    first = jnp.stack(place)
+    far = jnp.full_like(first, jnp.inf)
+    _, unknowns, gaps, _ = lax.while_loop(unsettled, improve, (0, first, far, far))
+    return ClosedMap(unknowns, gaps)
 
 
 def instantaneous_quartic(problem: OrbitProblem) -> Float[Array, " 5"]:

@@ -88,7 +88,7 @@ class CollisionDelay(eqx.Module):
 class Impact(eqx.Module):
     """What an impact does to the tip, as functions of one coordinate that grows with the approach speed.
 
-    A `Law`, or a resolved contact as series (`afm_jax.impact.contact_impact`): of a free tip on a sample at rest. Where
+    A `Law`, or a resolved contact as series (`afm_jax.impact.lasting_impact`): of a free tip on a sample at rest. Where
     an impact lasts, platform, spring and air change it (`afm_jax.impact.lasting_impact`).
     """
 

@@ -27,10 +27,9 @@ from afm_jax.impact.closure import (
     map_gaps,
     speeds_at_place,
 )
-from afm_jax.impact.contact_impact import PulledImpact
 from afm_jax.impact.first_impact import Flight, first_impact
 from afm_jax.impact.jacobian import contact_jacobian, flight_jacobian
-from afm_jax.impact.lasting_impact import crawls, depth_of_impact, middle_of_contact
+from afm_jax.impact.lasting_impact import PulledImpact, crawls, depth_of_impact, middle_of_contact
 from afm_jax.impact.law import Impact, ImpactLaw, Law, Speeds, TabulatedLaw, impact_law_of
 from afm_jax.impact.roots import COARSE, TAPPED, find_roots
 from afm_jax.outcomes import Outcome

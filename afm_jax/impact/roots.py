@@ -27,7 +27,7 @@ from afm_jax.impact.closure import (
     instantaneous_quartic,
     place_of,
 )
-from afm_jax.impact.contact_impact import PulledImpact
+from afm_jax.impact.lasting_impact import PulledImpact
 from afm_jax.impact.law import ImpactLaw
 
 _MAX_STEPS = 200  # Laguerre's method needs about 5; bisection alone over the widest interval about 100
@@ -123,6 +123,7 @@ _REGULA_FALSI, _BEFORE_NEWTON = 20, 10
 """Steps towards a root of the scalar condition: to its last digit, and to where Newton's method goes on."""
 _SECTIONS = 16
 _GOLDEN = 0.6180339887498949
+_NEWTON = 6
 _SAME = 1e-7
 """Relative difference of approach speeds below which roots are one."""
 _CLOSED = 1e-9
@@ -195,8 +196,8 @@ def follow_root(
     """Return where the map of a lasting impact closes, close to a coordinate, and whether it does; if that is asked."""
     problem = lax.stop_gradient(problem)
     speeds, system = closure(near, problem)
-    closed = close_map(place_of(near, speeds, system, problem), problem, wanted)
-    return OrbitPlace(*closed.x), system.regular & jnp.all(jnp.abs(closed.residual) < _CLOSED)
+    closed = close_map(place_of(near, speeds, system, problem), problem, _NEWTON, wanted)
+    return OrbitPlace(*closed.unknowns), system.regular & jnp.all(jnp.abs(closed.gaps) < _CLOSED)
 
 
 def _is_quartic(problem: OrbitProblem) -> bool:

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.parameters import EFFECTS
-from afm_jax.impact.contact_impact import PulledImpact
+from afm_jax.impact.lasting_impact import PulledImpact
 from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw
 from afm_jax.least_squares import chi2_tail
 from afm_jax.version import version_of

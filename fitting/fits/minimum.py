@@ -19,7 +19,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Shaped
 
-from afm_jax.impact.contact_impact import TabulatedImpact
+from afm_jax.impact.lasting_impact import TabulatedImpact
 from afm_jax.least_squares import Box, descended
 from afm_jax.units import RAD_PER_US_PER_KHZ
 from fitting.fits.intervals import Places
