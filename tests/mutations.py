@@ -88,8 +88,8 @@ MUTATIONS = {
         GRAZING,
     ),
     "tip leaves with the platform's velocity at arrival": Mutation(
-        "scene.platform.velocity(leaving) +",
-        "scene.platform.velocity(arrival) +",
+        "surface.velocity(leaving) + speeds",
+        "surface.velocity(arrival) + speeds",
         IMPACTS,
     ),
     "overlap of late instead of early starts": Mutation(
@@ -98,7 +98,7 @@ MUTATIONS = {
         f"{MAP}test_every_end_of_a_flight_is_said",
     ),
     "rows after a capture look alive": Mutation(
-        "jnp.where(flying, impact.outcome, Outcome.NOT_REACHED)",
+        "jnp.where(tip.flies, impact.outcome, Outcome.NOT_REACHED)",
         "impact.outcome",
         f"{MAP}test_after_a_capture_the_rows_say_so",
     ),

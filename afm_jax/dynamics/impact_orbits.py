@@ -13,7 +13,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Complex, Float
 
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
@@ -28,9 +27,9 @@ from afm_jax.dynamics.impact_loop import (
     samples_for,
 )
 from afm_jax.dynamics.iteration import evenly_spread
-from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, Flight
+from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US
 from afm_jax.impact.law import impact_law_of
-from afm_jax.impact.map import impact_after
+from afm_jax.impact.map import Departure, follow_impacts
 from afm_jax.outcomes import Outcome
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.newton import Newton, newton
@@ -191,30 +190,19 @@ def _search(scene: Scene, order: Array, starts: Array, *, impacts: int, driven: 
 
 def _walks(seen: Scene, loop: ImpactLoop, starts: Array, length: int) -> tuple[Array, Array]:
     """Return arrival phases in rad and approach speeds in nm/us of starts through the map; NaN where it ends."""
-    top_speed = loop.surface.top_speed_nm_per_us
+    surface = loop.surface
     tolerance = jnp.asarray(DEFAULT_ROOT_TOLERANCE_US)
 
     def one(start):
         time = start[0] * 2.0 * jnp.pi / loop.angular_frequency
-        velocity = loop.surface.velocity(time) + top_speed * 0.03 * (_FASTEST / 0.03) ** start[1]
+        velocity = surface.velocity(time) + surface.top_speed_nm_per_us * 0.03 * (_FASTEST / 0.03) ** start[1]
+        rows = follow_impacts(seen, Departure(time, None, velocity), tolerance, impacts=length, max_steps=_STEPS)
+        hit = rows.outcome == Outcome.IMPACT
+        arrival = jnp.where(hit, rows.arrival_time_us, 0.0)
+        approach = surface.velocity(arrival) - rows.velocity_before_nm_per_us
+        return jnp.where(hit, arrival * loop.angular_frequency, jnp.nan), jnp.where(hit, approach, jnp.nan)
 
-        def step(state, _):
-            flying, time, velocity = state
-            resting = loop.surface.velocity(time) - 1.0
-            flight = Flight(loop.cantilever, loop.surface, time, jnp.where(flying, velocity, resting))
-            impact = impact_after(seen, flight, tolerance, max_steps=_STEPS)
-            goes_on = flying & (impact.outcome == Outcome.IMPACT)
-            arrival = jnp.where(goes_on, impact.arrival_time_us, time)
-            approach = loop.surface.velocity(arrival) - impact.velocity_before_nm_per_us
-            row = jnp.where(goes_on, jnp.stack([arrival * loop.angular_frequency, approach]), jnp.nan)
-            after = jnp.where(goes_on, impact.velocity_after_nm_per_us, velocity)
-            return (goes_on, jnp.where(goes_on, impact.time_us, time), after), row
-
-        flying = jnp.ones((), bool)
-        return lax.scan(step, (flying, time, velocity), length=length)[1]
-
-    rows = jax.vmap(one)(starts)
-    return rows[:, :, 0], rows[:, :, 1]
+    return jax.vmap(one)(starts)
 
 
 def closed_loop(guess: Float[Array, " n"], scale: Float[Array, ""], loop: ImpactLoop) -> Float[Array, " n"]:

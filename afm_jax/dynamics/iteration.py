@@ -21,11 +21,10 @@ from afm_jax.checks import require_float64
 from afm_jax.contact.collide import capture_speed
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.law_of_contact import law_of_contact
-from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, Flight
 from afm_jax.impact.law import Law, impact_law_of
-from afm_jax.impact.map import NextImpact, impact_after
+from afm_jax.impact.map import Departure, NextImpact, Search, impact_after
 from afm_jax.impact.orbits import fastest_steady_orbit, orbit_problem
-from afm_jax.motion.law_motion import CONSTANT_PUSH, Bed, LawLeg, or_rest, through_impact
+from afm_jax.motion.law_motion import CONSTANT_PUSH, Bed, or_rest, through_impact
 from afm_jax.motion.record import ContactKind, State
 from afm_jax.motion.start import default_start
 from afm_jax.outcomes import Outcome
@@ -46,8 +45,6 @@ _FEW = 16
 _ORBITS_AT_ONCE = 128
 _RISEN = 0.9
 """Of the gap at which the bridge breaks: from there a tip on its way up is free."""
-_Leaving = tuple[Array, Array, Array]
-"""Time in us, gap in nm, velocity in nm/us."""
 
 
 class Tips(NamedTuple):
@@ -98,7 +95,7 @@ def _landed(scenes: Scene, tips: Tips, impact: NextImpact) -> MapStep:
     landed = captured | (going & (impact.outcome == Outcome.IMPACT))
     surface = scenes.platform
     rebound = impact.velocity_after_nm_per_us - surface.velocity(impact.time_us)
-    leaving = (impact.time_us, jnp.zeros_like(rebound), impact.velocity_after_nm_per_us)
+    leaving = Departure(impact.time_us, jnp.zeros_like(rebound), impact.velocity_after_nm_per_us)
     no = jnp.zeros_like(going)
     # without adhesion alone a tip that came to rest may leave again, and chatter comes to an end
     law = impact_law_of(scenes)
@@ -122,11 +119,8 @@ def _landed(scenes: Scene, tips: Tips, impact: NextImpact) -> MapStep:
 
 
 def _one_impact(scene: Scene, tip: Tips, *, max_steps: int) -> NextImpact:
-    # a tip whose motion has ended does not leave the platform, so that its search ends at once
-    velocity = jnp.where(tip.outcome == Outcome.IMPACT, tip.velocity_nm_per_us, -jnp.inf)
-    flight = Flight(scene.cantilever, scene.platform, tip.time_us, velocity, tip.gap_nm)
-    tolerance = jnp.asarray(DEFAULT_ROOT_TOLERANCE_US, velocity.dtype)
-    return impact_after(scene, flight, tolerance, max_steps=max_steps)
+    departure = Departure(tip.time_us, tip.gap_nm, tip.velocity_nm_per_us)
+    return impact_after(scene, departure, Search(max_steps), flies=tip.outcome == Outcome.IMPACT)
 
 
 def _slowest_chatter(scene: Scene) -> Float[Array, ""]:
@@ -138,14 +132,14 @@ def _slowest_chatter(scene: Scene) -> Float[Array, ""]:
     return 0.5 * CONSTANT_PUSH * push * (1.0 - impact_law_of(scene).slow_restitution) / bed.fastest
 
 
-def _rest(scene: Scene, impact: NextImpact) -> tuple[_Leaving, Bool[Array, ""], Bool[Array, ""]]:
+def _rest(scene: Scene, impact: NextImpact) -> tuple[Departure, Bool[Array, ""], Bool[Array, ""]]:
     """Return where the next flight begins, whether the tip rested before, and whether it does for ever."""
     landed = (impact.outcome == Outcome.IMPACT) | (impact.outcome == Outcome.CAPTURED)
     until = jnp.where(landed, impact.arrival_time_us, 0.0) + _RIDE_PERIODS * scene.platform.period_us
-    row, leg, _ = through_impact(scene, impact, landed, until)
+    row, departure, _ = through_impact(scene, impact, landed, until)
     held = row.kind == ContactKind.HELD
     rested = (row.kind == ContactKind.CHATTER) | (impact.outcome == Outcome.CAPTURED)
-    return (leg.time_us, leg.gap_nm, leg.velocity), rested & ~held, held
+    return departure, rested & ~held, held
 
 
 class Record(NamedTuple):
@@ -316,11 +310,8 @@ def landed_tips(scenes: Scene, start: State) -> Tips:
         gap = start.position_nm - scene.platform.position(start.time_us)
         # on the surface but for rounding
         gap = jnp.where(jnp.abs(gap) < _TOUCHING * (jnp.abs(start.position_nm) + scene.platform.amplitude_nm), 0.0, gap)
-        flight = Flight(
-            scene.cantilever, scene.platform, start.time_us, start.velocity_nm_per_us, gap, jnp.zeros_like(gap)
-        )
-        impact = impact_after(scene, flight, jnp.asarray(DEFAULT_ROOT_TOLERANCE_US), max_steps=MAX_STEPS)
-        return or_rest(scene, LawLeg(start.time_us, gap, start.velocity_nm_per_us), impact)
+        departure = Departure(start.time_us, gap, start.velocity_nm_per_us)
+        return or_rest(scene, departure, impact_after(scene, departure, Search(MAX_STEPS, from_above=True)))
 
     whole = State(*(jnp.broadcast_to(part, scenes.platform.frequency_khz.shape) for part in start))
     return _landed(scenes, tips_at(scenes, whole.time_us, whole.velocity_nm_per_us), jax.vmap(one)(scenes, whole)).end

@@ -1,12 +1,14 @@
-"""The impact map: from just after one impact to just after the next, and its iteration.
+"""The impact map of a law: from the departure of the tip after one impact to that after the next (eqs. 2-4 and 6).
 
-Many tips at once, at full speed: blocks of lanes that fit the processor's cache, one after the other.
-
-A plain `vmap` over 100,000 tips streams every intermediate result through main memory, and all tips wait for the one
-that needs most steps. Blocks of some hundred lanes do neither; `afm-jax bench` shows the difference.
+`next_impact` is the map of one tip, `iterate_map` a sequence of impacts, `iterate_batch` such sequences of many tips.
+Below them, for any surface that the tip sees: `impact_after` ends one flight, and `follow_tip` follows flight after
+flight until a number of impacts is reached, or until the motion has ended. Simulations of law scenes, the search for
+orbits of many impacts and the sequences here are all followed by it.
 """
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -15,6 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene
 from afm_jax.apparatus.surface import Surface, seen_freely
 from afm_jax.checks import check_count, check_parameter, check_scalar, checked, require_float64
@@ -60,6 +63,50 @@ class NextImpact(Result, eqx.Module):
         none = ~np.isin(np.asarray(self.outcome), (Outcome.IMPACT, Outcome.CAPTURED))
         names = ("time_us", "arrival_time_us", "velocity_before_nm_per_us", "velocity_after_nm_per_us")
         return dict.fromkeys(names, none)
+
+
+class Departure(NamedTuple):
+    """The beginning of a free flight: time in us, gap in nm and lab velocity in nm/us.
+
+    A gap of None is 0: the tip has just left the surface. Where base or force drive, the velocity is that of the free
+    motion, without the steady response (`seen_freely`).
+    """
+
+    time_us: Float[Array, "..."]
+    gap_nm: Float[Array, "..."] | None
+    velocity_nm_per_us: Float[Array, "..."]
+
+    def position_nm(self, surface: Platform | Surface) -> Float[Array, "..."]:
+        """Return the height of the tip in nm over a surface."""
+        height = surface.position(self.time_us)
+        return height if self.gap_nm is None else height + self.gap_nm
+
+
+class Search(NamedTuple):
+    """How far the impact that ends a flight is searched for."""
+
+    max_steps: int
+    """Steps before the search gives up with `Outcome.STEP_LIMIT`."""
+    root_tolerance_us: ArrayLike = DEFAULT_ROOT_TOLERANCE_US
+    """Remaining error of the impact time at which the search stops."""
+    until_us: Float[Array, ""] | None = None
+    """Time at which the search ends with `Outcome.NO_FURTHER_IMPACT`; None: never."""
+    from_above: bool = False
+    """Whether a flight may begin above the surface on its way down; if not, the tip leaves the surface."""
+
+
+class FollowedTip(NamedTuple):
+    """A tip that is followed from flight to flight."""
+
+    departure: Departure
+    flies: Bool[Array, ""]
+    """Whether the flight takes place: False once the motion has ended."""
+    record: Any = None
+    """What the one who follows writes down on the way."""
+
+
+ThroughImpact = Callable[[FollowedTip, NextImpact], tuple[FollowedTip, Any]]
+"""Takes a tip at a departure and the impact that ends the flight, returns the tip at its next departure, and a row."""
 
 
 @checked
@@ -143,16 +190,14 @@ def iterate_map(
     seen, response = seen_freely(scene)
     start = _start_of(scene, response, time_us, velocity_nm_per_us)
     tolerance = jnp.asarray(root_tolerance_us, scene.platform.frequency_khz.dtype)
-    return _in_lab(_iterate_map(seen, start, tolerance, impacts=impacts, max_steps=max_steps), response)
+    return _in_lab(follow_impacts(seen, start, tolerance, impacts=impacts, max_steps=max_steps), response)
 
 
-def _start_of(
-    scene: Scene, response: Surface | None, time_us: ArrayLike, velocity_nm_per_us: ArrayLike
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return time and velocity of a start, the velocity without the steady response's."""
+def _start_of(scene: Scene, response: Surface | None, time_us: ArrayLike, velocity_nm_per_us: ArrayLike) -> Departure:
+    """Return the departure at a time and with a velocity in the lab, from which the steady response is taken out."""
     dtype = scene.platform.frequency_khz.dtype
     time, velocity = jnp.asarray(time_us, dtype), jnp.asarray(velocity_nm_per_us, dtype)
-    return time, velocity if response is None else velocity - response.velocity(time)
+    return Departure(time, None, velocity if response is None else velocity - response.velocity(time))
 
 
 def _check_search(time_us: ArrayLike, velocity_nm_per_us: ArrayLike, max_steps: int, tolerance_us: ArrayLike) -> None:
@@ -184,58 +229,105 @@ def _in_lab(found: NextImpact, response: Surface | None) -> NextImpact:
     )
 
 
+_IMPACTS_EACH = 8
+"""Impacts between two looks at whether all tips of a batch have ended."""
+
+
+def follow_tip(
+    scene: Scene,
+    tip: FollowedTip,
+    through: ThroughImpact,
+    search: Search,
+    *,
+    impacts: int,
+    until_ended: bool = False,
+    reverse: bool = False,
+) -> tuple[FollowedTip, Any]:
+    """Return a tip followed from flight to flight, and the rows of its impacts.
+
+    Args:
+        scene: the interaction is a law, the platform the surface that the free tip sees.
+        tip: at its first departure.
+        through: what an impact, and a rest after it, makes of the tip.
+        search: for the impact of each flight.
+        impacts: how many flights are followed at most.
+        until_ended: stop as soon as the tip no longer flies, in a batch all tips; there are no rows then, what is to be
+            kept is in `FollowedTip.record`. False: follow all flights; those of a tip that has ended cost one step.
+        reverse: make the stop differentiable in reverse mode: all flights are followed, in blocks that are recomputed
+            backwards.
+    """
+
+    def one_flight(tip: FollowedTip, _: None) -> tuple[FollowedTip, Any]:
+        return through(tip, impact_after(scene, tip.departure, search, flies=tip.flies))
+
+    def some_flights(tip: FollowedTip) -> FollowedTip:
+        return lax.scan(lambda tip, _: (one_flight(tip, None)[0], None), tip, length=_IMPACTS_EACH)[0]
+
+    if not until_ended:
+        return lax.scan(one_flight, tip, length=impacts)
+    blocks = -(-impacts // _IMPACTS_EACH)
+    if reverse:
+        again = jax.checkpoint(lambda tip, _: (some_flights(tip), None))
+        return lax.scan(again, tip, length=blocks)[0], None
+
+    def under_way(state: tuple[Array, FollowedTip]) -> Array:
+        return state[1].flies & (state[0] < blocks)
+
+    return lax.while_loop(under_way, lambda state: (state[0] + 1, some_flights(state[1])), (jnp.zeros((), int), tip))[
+        1
+    ], None
+
+
 @partial(jax.jit, static_argnames=("max_steps",))
-def _next_impact(scene: Scene, start, tolerance: Float[Array, ""], *, max_steps: int) -> NextImpact:
-    flight = Flight(scene.cantilever, scene.platform, *start)
-    return impact_after(scene, flight, tolerance, max_steps=max_steps)
+def _next_impact(scene: Scene, departure: Departure, tolerance: Float[Array, ""], *, max_steps: int) -> NextImpact:
+    return impact_after(scene, departure, Search(max_steps, tolerance))
 
 
 def impact_after(
-    scene: Scene,
-    flight: Flight,
-    tolerance: Float[Array, ""],
-    *,
-    max_steps: int,
-    latest_us: Float[Array, ""] | None = None,
+    scene: Scene, departure: Departure, search: Search, *, flies: Bool[Array, ""] | None = None
 ) -> NextImpact:
     """Return the impact that ends a flight: `next_impact` without its checks, from any start and over any surface.
 
     Args:
-        scene: the interaction is an `ImpactLaw`, the platform the surface that the flight is over.
-        flight: the flight; where it begins at gap 0 the tip has just left.
-        tolerance: remaining error of the impact time at which the search stops, in us.
-        max_steps: steps of the search for the impact before it gives up.
-        latest_us: the search ends at this time (us) after the flight's start; None: never.
+        scene: the interaction is a law, the platform the surface that the flight is over.
+        departure: the flight's beginning.
+        search: for the impact.
+        flies: whether there is a flight; where there is none the search ends at once with `Outcome.INVALID_START`.
     """
-    law = impact_law_of(scene)
-    impact = first_impact(
+    law, cantilever, surface = impact_law_of(scene), scene.cantilever, scene.platform
+    time, gap, velocity = departure
+    if flies is not None:
+        # a tip that sinks into the surface from the start is in no flight
+        velocity = jnp.where(flies, velocity, surface.velocity(time) - 1.0)
+        gap = gap if gap is None else jnp.where(flies, gap, 0.0)
+    flight = Flight(cantilever, surface, time, velocity, gap, jnp.zeros_like(time) if search.from_above else None)
+    first = first_impact(
         flight,
         skip_us=_overlap(law, flight),
-        latest_us=latest_us,
-        max_steps=max_steps,
-        root_tolerance_us=tolerance,
+        latest_us=None if search.until_us is None else search.until_us - time,
+        max_steps=search.max_steps,
+        root_tolerance_us=search.root_tolerance_us,
     )
-    arrival = flight.start_us + impact.duration_us
-    _, before = scene.cantilever.propagator(impact.duration_us)(flight.position, flight.velocity)
-    hit = impact.outcome == Outcome.IMPACT
-    approach = jnp.where(hit, scene.platform.velocity(arrival) - before, 1.0)
-    impact_speeds = speeds_of_impact(law, approach, arrival, scene.cantilever, scene.platform)
+    arrival = flight.start_us + first.duration_us
+    _, before = cantilever.propagator(first.duration_us)(flight.position, flight.velocity)
+    hit = first.outcome == Outcome.IMPACT
+    approach = jnp.where(hit, surface.velocity(arrival) - before, 1.0)
+    speeds = speeds_of_impact(law, approach, arrival, cantilever, surface)
     captured = hit & law.captures(approach)
     if law.delay is not None:
-        free = law.at_approach(approach)
-        captured = captured | (hit & crawls(law, free, scene.cantilever))
-        impact_speeds = impact_speeds._replace(
-            rebound=jnp.where(captured, 0.0, impact_speeds.rebound), delay=jnp.where(captured, 0.0, impact_speeds.delay)
+        captured = captured | (hit & crawls(law, law.at_approach(approach), cantilever))
+        speeds = speeds._replace(
+            rebound=jnp.where(captured, 0.0, speeds.rebound), delay=jnp.where(captured, 0.0, speeds.delay)
         )
-    leaving = arrival + impact_speeds.delay if law.delay is not None else arrival
-    after = scene.platform.velocity(leaving) + impact_speeds.rebound
+    leaving = arrival if law.delay is None else arrival + speeds.delay
+    after = surface.velocity(leaving) + speeds.rebound
     return NextImpact(
         time_us=jnp.where(hit, leaving, jnp.inf),
         arrival_time_us=jnp.where(hit, arrival, jnp.inf),
         velocity_before_nm_per_us=jnp.where(hit, before, jnp.nan),
         velocity_after_nm_per_us=jnp.where(hit, after, jnp.nan),
-        outcome=jnp.where(captured, Outcome.CAPTURED, impact.outcome),
-        near_grazing=hit & (approach < NEAR_GRAZING * scene.platform.top_speed_nm_per_us),
+        outcome=jnp.where(captured, Outcome.CAPTURED, first.outcome),
+        near_grazing=hit & (approach < NEAR_GRAZING * surface.top_speed_nm_per_us),
     )
 
 
@@ -251,33 +343,34 @@ def _overlap(law: Law, flight: Flight) -> Float[Array, ""] | None:
 
 
 @partial(jax.jit, static_argnames=("impacts", "max_steps"))
-def _iterate_map(scene: Scene, start, tolerance: Float[Array, ""], *, impacts: int, max_steps: int) -> NextImpact:
-    def one(state, _):
-        flying, time, velocity = state
-        # A finished tip does not leave the platform, so that its search ends at once; its rows are marked below.
-        resting = scene.platform.velocity(time) - 1.0
-        impact = _next_impact(scene, (time, jnp.where(flying, velocity, resting)), tolerance, max_steps=max_steps)
-        outcome = jnp.where(flying, impact.outcome, Outcome.NOT_REACHED)
-        impact = eqx.tree_at(lambda row: row.outcome, impact, outcome)
-        flying = outcome == Outcome.IMPACT
-        time = jnp.where(flying, impact.time_us, time)
-        velocity = jnp.where(flying, impact.velocity_after_nm_per_us, velocity)
-        return (flying, time, velocity), impact
+def follow_impacts(
+    scene: Scene, departure: Departure, tolerance: Float[Array, ""], *, impacts: int, max_steps: int
+) -> NextImpact:
+    """Return the impacts that follow a departure, with a leading axis of their number: `iterate_map` without checks.
 
-    _, rows = lax.scan(one, (jnp.array(True), *start), length=impacts)  # noqa: FBT003
-    ended = rows.outcome == Outcome.NOT_REACHED
-    return NextImpact(
-        time_us=jnp.where(ended, jnp.inf, rows.time_us),
-        arrival_time_us=jnp.where(ended, jnp.inf, rows.arrival_time_us),
-        velocity_before_nm_per_us=jnp.where(ended, jnp.nan, rows.velocity_before_nm_per_us),
-        velocity_after_nm_per_us=jnp.where(ended, jnp.nan, rows.velocity_after_nm_per_us),
-        outcome=rows.outcome,
-        near_grazing=rows.near_grazing & ~ended,
-    )
+    Args:
+        scene: the interaction is a law, the platform the surface that the free tip sees.
+        departure: just after an impact.
+        tolerance: remaining error in us of an impact time at which a search stops.
+        impacts: how many are followed.
+        max_steps: steps of the search for one impact before it gives up.
+    """
+
+    def through(tip: FollowedTip, impact: NextImpact) -> tuple[FollowedTip, NextImpact]:
+        outcome = jnp.where(tip.flies, impact.outcome, Outcome.NOT_REACHED)
+        goes_on = outcome == Outcome.IMPACT
+        time = jnp.where(goes_on, impact.time_us, tip.departure.time_us)
+        velocity = jnp.where(goes_on, impact.velocity_after_nm_per_us, tip.departure.velocity_nm_per_us)
+        row = eqx.tree_at(lambda row: row.outcome, impact, outcome)
+        return FollowedTip(Departure(time, None, velocity), goes_on), row
+
+    tip = FollowedTip(departure, jnp.array(True))  # noqa: FBT003
+    # the row of a flight that does not take place has neither times nor velocities
+    return follow_tip(scene, tip, through, Search(max_steps, tolerance), impacts=impacts)[1]
 
 
 DEFAULT_BLOCK = 1000
-"""Lanes that run together; 300 to 2000 differ little on processors with vector units and 0.5 to 2 MB of cache."""
+"""Tips that run together; 300 to 2000 differ little on processors with vector units and 0.5 to 2 MB of cache."""
 
 
 @checked

@@ -1,9 +1,8 @@
 """Law scenes in time: the impact map over whatever surface the tip sees, and rests on it, to the end of a duration.
 
-Every round takes a tip from the beginning of a flight through its next impact to the beginning of the flight after it,
-the rest between them included, and writes one row. All shapes are fixed; a batch goes on until its last tip is done.
-
-Where a law lets the tip rest: on the surface, for as long as the surface pushes it.
+The tip is followed from flight to flight (`follow_tip`); each impact, with the rest after it, is written into one row.
+All shapes are fixed; a batch goes on until its last tip has ended. The tip rests on the surface for as long as the
+surface pushes it.
 
 A tip that moves with the surface s, without adhesion, needs the push N/m = s'' + (Omega/Q) s' + Omega^2 s from it, and
 is let go when the push would turn into a pull. It comes to rest by a capture, or by infinitely many impacts in finite
@@ -27,9 +26,9 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.scene import Scene
 from afm_jax.apparatus.surface import Surface
 from afm_jax.contact.junction import Phase
-from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, Flight, time_above
+from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, time_above
 from afm_jax.impact.law import Law, impact_law_of
-from afm_jax.impact.map import NextImpact, impact_after
+from afm_jax.impact.map import Departure, FollowedTip, NextImpact, Search, follow_tip
 from afm_jax.motion.record import ContactKind, Contacts, MotionOutcome, Simulation, State, to_gap, to_lab
 from afm_jax.outcomes import Outcome
 from afm_jax.solve.derivatives import implicit_root
@@ -189,8 +188,6 @@ def _push_at(time_us: Float[Array, ""], bed: Bed) -> Float[Array, ""]:
     return bed.push(time_us)
 
 
-_ROUNDS = 8
-"""Rounds between two looks at whether all tips have arrived at the end."""
 _FLIGHT_STEPS = 1_000_000
 """Steps of the search of one flight: as many as it takes, a flight that never lands needs some every period."""
 _ON_SURFACE_NM = 1e-9
@@ -208,23 +205,16 @@ class LawRow(NamedTuple):
     rebound: Float[Array, "..."]
 
 
-class LawLeg(NamedTuple):
-    """The beginning of a flight: time in us, gap in nm, velocity in nm/us of the freely moving y = z - response."""
+class LawRecord(NamedTuple):
+    """What is written down of one tip on the way."""
 
-    time_us: Float[Array, ""]
-    gap_nm: Float[Array, ""]
-    velocity: Float[Array, ""]
-
-
-class LawTip(NamedTuple):
-    """A tip on its way; scalars of one tip, but for the rows."""
-
-    leg: LawLeg
     used: Int[Array, ""]
+    """Rows that are filled."""
     rows: Float[Array, "rows columns"]
     outcome: Int[Array, ""]
-    done: Bool[Array, ""]
-    rounds: Int[Array, ""]
+    """A `MotionOutcome`."""
+    flights: Int[Array, ""]
+    """Flights that were followed."""
 
 
 @partial(jax.jit, static_argnames=("max_contacts", "reverse"))
@@ -265,95 +255,70 @@ def follow_law(
     touches = (gap < 0.0) & (gap > -_ON_SURFACE_NM)
     gap = gap + lax.stop_gradient(jnp.where(touches, -gap, 0.0))
     none = jnp.zeros((), jnp.int32)
-    tip = LawTip(
-        leg=LawLeg(start.time_us, gap, rate + surface.velocity(start.time_us)),
-        used=none,
-        rows=jnp.zeros((max_contacts, len(LawRow._fields)), gap.dtype),
-        outcome=none + jnp.int32(MotionOutcome.FINISHED),
-        done=jnp.zeros((), bool),
-        rounds=none,
-    )
-    tip = _to_the_end(seen, tip, until, rounds=max_contacts + 1, reverse=reverse)
-    held = tip.outcome == MotionOutcome.HELD
-    return Simulation(
-        start=start,
-        contacts=_contacts(scene, surface, response, LawRow(*jnp.moveaxis(tip.rows, -1, 0))),
-        count=tip.used,
-        final=_final(seen, response, tip, until),
-        phase=jnp.where(held, jnp.int32(Phase.JUNCTION), jnp.int32(Phase.DRY)),
-        held=held,
-        outcome=tip.outcome,
-    )
-
-
-def _to_the_end(seen: Scene, tip: LawTip, until: Array, *, rounds: int, reverse: bool) -> LawTip:
-    """Return a tip after as many rounds as it needs."""
-    blocks = -(-rounds // _ROUNDS)
-
-    def block(tip, _):
-        return lax.scan(lambda state, _: (_round(seen, state, until), None), tip, None, length=_ROUNDS)
-
-    if reverse:
-        return lax.scan(jax.checkpoint(block), tip, None, length=blocks)[0]
-    limit = blocks * _ROUNDS
-    return lax.while_loop(lambda tip: ~tip.done & (tip.rounds < limit), lambda tip: block(tip, None)[0], tip)
-
-
-def _round(seen: Scene, tip: LawTip, until: Array) -> LawTip:
-    """Return a tip after its next impact, or as it was where there is none."""
-    leg, surface = tip.leg, seen.platform
-    # a tip that is done does not leave the surface, so that its search ends at once
-    resting = surface.velocity(leg.time_us) - 1.0
-    flight = Flight(
-        seen.cantilever,
-        surface,
-        leg.time_us,
-        jnp.where(tip.done, resting, leg.velocity),
-        jnp.where(tip.done, 0.0, leg.gap_nm),
-        jnp.zeros_like(leg.gap_nm),
+    rows = jnp.zeros((max_contacts, len(LawRow._fields)), gap.dtype)
+    tip = FollowedTip(
+        Departure(start.time_us, gap, rate + surface.velocity(start.time_us)),
+        jnp.ones((), bool),
+        LawRecord(none, rows, none + jnp.int32(MotionOutcome.FINISHED), none),
     )
     tolerance = jnp.asarray(DEFAULT_ROOT_TOLERANCE_US, until.dtype)
-    impact = impact_after(seen, flight, tolerance, max_steps=_FLIGHT_STEPS, latest_us=until - leg.time_us)
-    rested = or_rest(seen, leg, impact)
-    impact = jax.tree.map(lambda one, other: jnp.where(tip.rounds == 0, one, other), rested, impact)
+    search = Search(_FLIGHT_STEPS, tolerance, until, from_above=True)
+    through = partial(_written_down, seen, until)
+    tip, _ = follow_tip(seen, tip, through, search, impacts=max_contacts + 1, until_ended=True, reverse=reverse)
+    record = tip.record
+    held = record.outcome == MotionOutcome.HELD
+    return Simulation(
+        start=start,
+        contacts=_contacts(scene, surface, response, LawRow(*jnp.moveaxis(record.rows, -1, 0))),
+        count=record.used,
+        final=_final(seen, response, tip.departure, record.outcome, until),
+        phase=jnp.where(held, jnp.int32(Phase.JUNCTION), jnp.int32(Phase.DRY)),
+        held=held,
+        outcome=record.outcome,
+    )
+
+
+def _written_down(seen: Scene, until: Array, tip: FollowedTip, impact: NextImpact) -> tuple[FollowedTip, None]:
+    """Return a tip after an impact and the rest that follows it, with its row; as it was where there is none."""
+    departure, flies, (used, rows, outcome_before, flights) = tip
+    rested = or_rest(seen, departure, impact)
+    impact = jax.tree.map(lambda at_start, later: jnp.where(flights == 0, at_start, later), rested, impact)
     ended = impact.outcome
     landed = (ended == Outcome.IMPACT) | (ended == Outcome.CAPTURED)
-    arrived = ~tip.done & landed & (impact.arrival_time_us < until)
-    failed = ~tip.done & ~landed & (ended != Outcome.NO_FURTHER_IMPACT)
+    arrived = flies & landed & (impact.arrival_time_us < until)
+    failed = flies & ~landed & (ended != Outcome.NO_FURTHER_IMPACT)
     row, beyond, lost = through_impact(seen, impact, arrived, until)
-    room = tip.used < tip.rows.shape[0]
+    room = used < rows.shape[0]
     held, full = arrived & (row.kind == ContactKind.HELD), arrived & ~room
     outcome = jnp.where(held, MotionOutcome.HELD, MotionOutcome.FINISHED)
-    outcome = jnp.where(failed, _failure(ended, tip.rounds), outcome)
+    outcome = jnp.where(failed, _failure(ended, flights), outcome)
     outcome = jnp.where(lost, MotionOutcome.STEP_LIMIT, outcome)
     outcome = jnp.where(full, MotionOutcome.CONTACT_LIMIT, outcome)
     goes_on = arrived & ~held & ~full & ~lost
     written = arrived & room & ~lost
-    place = jnp.where(written, tip.used, tip.rows.shape[0])
-    return LawTip(
-        leg=jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), beyond, leg),
-        used=jnp.where(written, tip.used + 1, tip.used),
-        rows=tip.rows.at[place].set(jnp.stack(row), mode="drop"),
-        outcome=jnp.where(tip.done, tip.outcome, outcome).astype(jnp.int32),
-        done=tip.done | ~goes_on,
-        rounds=tip.rounds + 1,
+    place = jnp.where(written, used, rows.shape[0])
+    record = LawRecord(
+        used=jnp.where(written, used + 1, used),
+        rows=rows.at[place].set(jnp.stack(row), mode="drop"),
+        outcome=jnp.where(flies, outcome, outcome_before).astype(jnp.int32),
+        flights=flights + 1,
     )
+    departure = jax.tree.map(lambda new, old: jnp.where(goes_on, new, old), beyond, departure)
+    return FollowedTip(departure, flies & goes_on, record), None
 
 
-def or_rest(seen: Scene, leg: LawLeg, impact: NextImpact) -> NextImpact:
+def or_rest(seen: Scene, departure: Departure, impact: NextImpact) -> NextImpact:
     """Return the capture that a tip at rest on the surface at its start has had, or the impact that was found."""
     surface = seen.platform
-    speed = surface.velocity(leg.time_us)
-    rate = jnp.abs(leg.velocity - speed)
-    slow = rate <= _ON_SURFACE_NM * Bed(seen.cantilever, surface).fastest
-    rests = (leg.gap_nm == 0.0) & slow
-    captured = NextImpact(
-        leg.time_us, leg.time_us, speed, speed, jnp.full_like(impact.outcome, Outcome.CAPTURED), rests
-    )
-    return jax.tree.map(lambda one, other: jnp.where(rests, one, other), captured, impact)
+    time, gap, velocity = departure
+    speed = surface.velocity(time)
+    slow = jnp.abs(velocity - speed) <= _ON_SURFACE_NM * Bed(seen.cantilever, surface).fastest
+    rests = (gap == 0.0) & slow
+    captured = NextImpact(time, time, speed, speed, jnp.full_like(impact.outcome, Outcome.CAPTURED), rests)
+    return jax.tree.map(lambda resting, flying: jnp.where(rests, resting, flying), captured, impact)
 
 
-def through_impact(seen: Scene, impact: NextImpact, arrived: Array, until: Array) -> tuple[LawRow, LawLeg, Array]:
+def through_impact(seen: Scene, impact: NextImpact, arrived: Array, until: Array) -> tuple[LawRow, Departure, Array]:
     """Return the row of an impact and the beginning of the next flight; where there is none, numbers without meaning.
 
     The third: whether the search for the end of a rest gave up.
@@ -379,9 +344,9 @@ def through_impact(seen: Scene, impact: NextImpact, arrived: Array, until: Array
     rests = captured | chatters
     resting = jnp.minimum(arrival + jnp.where(chatters, lasts, 0.0), until)
     release = first_release(bed, jnp.where(rests & ~law.adheres, resting, until), until)
-    away = LawLeg(*take_off(bed, release.time_us, until))
+    away = Departure(*take_off(bed, release.time_us, until))
     leaving = jnp.where(arrived, impact.time_us, until)
-    next_leg = LawLeg(leaving, jnp.zeros_like(leaving), jnp.where(arrived, impact.velocity_after_nm_per_us, 0.0))
+    next_flight = Departure(leaving, jnp.zeros_like(leaving), jnp.where(arrived, impact.velocity_after_nm_per_us, 0.0))
     left = jnp.where(rests, release.happens, leaving < until)
     kind = jnp.where(chatters, float(ContactKind.CHATTER), float(ContactKind.IMPACT))
     row = LawRow(
@@ -391,23 +356,23 @@ def through_impact(seen: Scene, impact: NextImpact, arrived: Array, until: Array
         departure_us=jnp.where(left, jnp.where(rests, release.time_us, leaving), jnp.inf),
         rebound=jnp.where(left & ~rests, rebound, 0.0),
     )
-    return row, jax.tree.map(lambda new, old: jnp.where(rests, new, old), away, next_leg), arrived & release.lost
+    return row, jax.tree.map(lambda new, old: jnp.where(rests, new, old), away, next_flight), arrived & release.lost
 
 
-def _failure(ended: Array, rounds: Array) -> Array:
+def _failure(ended: Array, flights: Array) -> Array:
     """Return the outcome of a simulation whose flight failed."""
-    start = jnp.where(rounds == 0, MotionOutcome.INVALID_START, MotionOutcome.UNRESOLVED)
+    start = jnp.where(flights == 0, MotionOutcome.INVALID_START, MotionOutcome.UNRESOLVED)
     other = jnp.where(ended == Outcome.STEP_LIMIT, MotionOutcome.STEP_LIMIT, MotionOutcome.UNRESOLVED)
     return jnp.where(ended == Outcome.INVALID_START, start, other)
 
 
-def _final(seen: Scene, response: Surface | None, tip: LawTip, until: Array) -> State:
-    """Return the last state in the lab."""
-    leg, surface = tip.leg, seen.platform
-    held = tip.outcome == MotionOutcome.HELD
-    time = jnp.where(held | (tip.outcome == MotionOutcome.FINISHED), until, leg.time_us)
-    height = surface.position(leg.time_us) + leg.gap_nm
-    position, velocity = seen.cantilever.propagator(time - leg.time_us)(height, leg.velocity)
+def _final(seen: Scene, response: Surface | None, departure: Departure, outcome: Array, until: Array) -> State:
+    """Return the last state in the lab, given the last departure and the simulation's outcome."""
+    surface = seen.platform
+    held = outcome == MotionOutcome.HELD
+    time = jnp.where(held | (outcome == MotionOutcome.FINISHED), until, departure.time_us)
+    height = departure.position_nm(surface)
+    position, velocity = seen.cantilever.propagator(time - departure.time_us)(height, departure.velocity_nm_per_us)
     gap, rate = to_gap(surface, None, State(time, position, velocity))
     return to_lab(surface, response, time, jnp.where(held, 0.0, gap), jnp.where(held, 0.0, rate))
 
