@@ -56,7 +56,7 @@ _CONTACTS_AT_ONCE = 128
 """Of a chart."""
 CHART_ACCURACY = 1e-6
 _GRAZING = 3
-"""Number of its test function in `closed_loops`."""
+"""Number of its test function in `curves`."""
 _SAMPLES = 512
 """Of a flight, for its lowest points."""
 _DIFFERENCE = 1e-5
@@ -596,7 +596,7 @@ class ContactFlights:
         return EquationsAt(value, slopes, here)
 
     def tests(self, flown: FlownLoop, units: CurveUnits, *, grazing: bool = True) -> np.ndarray:
-        """Return the test functions of `closed_loops`; that of grazing NaN where it is not asked for."""
+        """Return the test functions of `curves`; that of grazing NaN where it is not asked for."""
         trace, determinant = flown.trace_and_determinant
         slowest = np.split(flown.loop, 2)[1].min() / units.speed_nm_per_us
         near = np.nan

@@ -1,7 +1,7 @@
 """Orbits followed through a parameter by pseudo-arclength, round folds, with the points where their nature changes.
 
 The unknowns of `impact_loop`, followed by the parameter as a share of its range, lie on a curve (`curves`); what is
-solved at a point of it is in `closed_loops`, special points and their curves in two parameters in `special_points`.
+solved at a point of it is in `curves`, special points and their curves in two parameters in `special_points`.
 """
 
 from collections.abc import Sequence
@@ -13,9 +13,20 @@ from jaxtyping import Float
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene, drive_of
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.closed_loops import CAPTURE, Equations, Frame, frame_of, read_points
 from afm_jax.dynamics.contact_orbits import ContactFlights, contact_loops
-from afm_jax.dynamics.curves import CurveLeg, FollowedCurve, followed_both_ways, lies_on, root_on, tested_by
+from afm_jax.dynamics.curves import (
+    CAPTURE,
+    CurveLeg,
+    Equations,
+    FollowedCurve,
+    Frame,
+    followed_both_ways,
+    frame_of,
+    lies_on,
+    read_points,
+    root_on,
+    tested_by,
+)
 from afm_jax.dynamics.impact_loop import driven_part, samples_for
 from afm_jax.dynamics.impact_orbits import MOST_IMPACTS, many_impact_orbits
 from afm_jax.dynamics.special_points import (

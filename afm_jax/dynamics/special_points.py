@@ -12,28 +12,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.dynamics.closed_loops import (
+from afm_jax.dynamics.contact_orbits import ContactFlights
+from afm_jax.dynamics.curves import (
+    AT_A_ROOT,
     CAPTURE,
     DOUBLING,
     FOLD,
     GRAZING,
     KINDS,
     TORUS,
+    CurveLeg,
     CurvePoint,
     Equations,
-    Frame,
-    loop_at,
-    read_points,
-    split_point,
-)
-from afm_jax.dynamics.contact_orbits import ContactFlights
-from afm_jax.dynamics.curves import (
-    AT_A_ROOT,
-    CurveLeg,
     FollowedCurve,
+    Frame,
     followed_both_ways,
     lies_on,
+    loop_at,
+    read_points,
     root_on,
+    split_point,
     tested_by,
 )
 from afm_jax.dynamics.impact_loop import LoopReading
