@@ -16,9 +16,16 @@ def paper_experiment() -> SimulatedExperiment:
     return example_experiment()
 
 
-def paper_collisions(approach_speeds: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return rebound speeds and delays of free tips at the paper's contact: no orbit, no platform, no air."""
+def paper_collisions(approach_speeds: np.ndarray, **changes: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return rebound speeds and delays of free tips at the paper's contact: no orbit, no platform, no air.
+
+    One program for any contact and number of speeds.
+
+    Args:
+        approach_speeds: at most 128, in nm/us.
+        changes: parameters of another contact.
+    """
     padded = np.resize(approach_speeds, 128)
-    found = collide(Contact.paper(), jnp.asarray(padded))
+    found = collide(Contact.paper(**changes), jnp.asarray(padded))
     count = len(approach_speeds)
     return np.asarray(found.rebound_speed_nm_per_us)[:count], np.asarray(found.collision_delay_us)[:count]

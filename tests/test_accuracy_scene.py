@@ -1,24 +1,22 @@
 """`afm-jax accuracy SCENE.toml`: achieved errors, the fidelity ladder, and the command. No times are judged."""
 
-import json
 from pathlib import Path
 
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from afm_jax import Cantilever, CollisionDelay, ImpactLaw, Platform, Scene
 from afm_jax.accuracy.scenes import contact_accuracy, fidelity_ladder, law_accuracy
 from afm_jax.apparatus.drives import BaseDrive
 from afm_jax.bench import timing as own_process
 from afm_jax.cli.accuracy_scene import COLUMNS, LADDER_COLUMNS, fitted_law, scene_to_study
-from afm_jax.cli.main import main
 from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.observe import peaks_of_flights
 from afm_jax.motion.record import State
 from afm_jax.motion.simulate import simulate
 from afm_jax.scenefile.presets import contact_scene
 from afm_jax.scenefile.scenefile import Start, save_scene
+from tests.answers import answer, table
 from tests.reference_driven_contact import DrivenContact, follow
 from tests.run_here import run_here
 
@@ -150,13 +148,9 @@ def test_law_of_a_scene_is_fitted_over_its_own_speeds(contact_file: str):
 @pytest.mark.slow
 def test_command_tells_all_of_a_law_scene(law_file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(own_process, "run_in_own_process", run_here)
-    arguments = ["accuracy", law_file, "--quick", "--contacts", "5", "--json", "--out", str(tmp_path)]
-    result = CliRunner().invoke(main, arguments)
-    assert result.exit_code == 0, result.stderr
-    payload = json.loads(result.stdout)
-    assert json.loads((tmp_path / "accuracy.json").read_text("utf-8")) == payload
-    assert (tmp_path / "accuracy.csv").read_text("utf-8").splitlines()[0] == ",".join(COLUMNS)
-    assert (tmp_path / "ladder.csv").read_text("utf-8").splitlines()[0] == ",".join(LADDER_COLUMNS)
-    assert (tmp_path / "accuracy.png").read_bytes().startswith(b"\x89PNG")
+    payload = answer(tmp_path, "accuracy", law_file, "--quick", "--contacts", 5)
+    assert tuple(table(tmp_path / "accuracy.csv")[0]) == tuple(COLUMNS)
+    assert tuple(table(tmp_path / "ladder.csv")[0]) == tuple(LADDER_COLUMNS)
+    assert (tmp_path / "accuracy.png").exists()
     assert {"rows", "ladder", "reference_error_us", "reference_error_nm", "law"} <= set(payload)
     assert payload["contacts"] == 5

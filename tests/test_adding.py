@@ -15,7 +15,7 @@ FORCE = {
         (
             '    ContactParameter(name="tip_radius_nm"',
             (
-                '    ContactParameter(name="hamaker_constant_aj", unit="aJ", default=0.01, allowed="not negative",\n'
+                '    ContactParameter(name="attraction_constant_aj", unit="aJ", default=0.01, allowed="not negative",\n'
                 '        meaning="H of the attraction", fitted=(1e-4, 10.0), serves=("attraction",)),\n'
                 '    ContactParameter(name="tip_radius_nm"'
             ),
@@ -23,14 +23,14 @@ FORCE = {
     ],
     "afm_jax/contact/contact.py": [
         ("import CoreRepulsion", "import Attraction, CoreRepulsion"),
-        ('"viscous": Viscous}', '"viscous": Viscous, "attraction": Attraction}'),
+        ('    "viscous": Viscous,\n', '{}    "attraction": Attraction,\n'),
         (
             "        tip_radius_nm: ArrayLike",
-            '        hamaker_constant_aj: ArrayLike = PAPER["hamaker_constant_aj"],\n{}',
+            '        attraction_constant_aj: ArrayLike = PAPER["attraction_constant_aj"],\n{}',
         ),
         (
             '            "viscous": lambda',
-            '            "attraction": lambda: Attraction(hamaker_constant_aj, tip_radius_nm),\n{}',
+            '            "attraction": lambda: Attraction(attraction_constant_aj, tip_radius_nm),\n{}',
         ),
     ],
     "afm_jax/contact/forces/solid.py": [("class VanDerWaals(", "class Attraction(StaticForce):{body}\n\n\n{}")],
@@ -101,12 +101,14 @@ def said(folder: Path, code: str) -> str:
 def test_a_force_is_added_in_three_files(tmp_path: Path):
     assert len(FORCE) == 3
     changed(tmp_path, FORCE)
-    assert "--hamaker-constant-aj X" in said(tmp_path, "from afm_jax.cli.main import main; main(['collide', '--help'])")
+    assert "--attraction-constant-aj X" in said(
+        tmp_path, "from afm_jax.cli.main import main; main(['collide', '--help'])"
+    )
     code = (
         "from afm_jax import Contact; from fitting.parameters import CONTACT_NAMES\n"
         "less = Contact.paper(effects=('capillary', 'structural', 'core', 'viscous', 'jkr'))\n"
         "more = float(Contact.paper().forces.static(2.0) - less.forces.static(2.0))\n"
-        "print(more, 'hamaker_constant_aj' in CONTACT_NAMES)"
+        "print(more, 'attraction_constant_aj' in CONTACT_NAMES)"
     )
     force, fitted = said(tmp_path, code).split()
     # -H R / (6 D^2)

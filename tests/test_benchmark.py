@@ -1,13 +1,11 @@
 """The benchmark: its rows, its errors, its processes. Nothing here looks at how long something took."""
 
-import json
 import os
 from pathlib import Path
 
 import jax
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from afm_jax import NextImpact, iterate_map
 from afm_jax.bench import timing as own_process
@@ -16,8 +14,8 @@ from afm_jax.bench.problems import chaotic_scene, regular_scene, settled_starts
 from afm_jax.bench.scipy_impacts import scipy_impacts
 from afm_jax.bench.timing import run_in_own_process
 from afm_jax.cli.bench import AIMED_BATCH, COLUMNS, aim_sentence, aims
-from afm_jax.cli.main import main
 from afm_jax.verify.fifty_digits import ExactMap, reference_error
+from tests.answers import answer, table
 from tests.run_here import run_here
 
 
@@ -133,17 +131,13 @@ def test_aims_are_judged_and_not_invented():
 @pytest.mark.slow
 def test_command_writes_tables_and_one_json_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(own_process, "run_in_own_process", run_here)
-    arguments = ["bench", "--only", "map", "--quick", "--batch", "2", "--json", "--out", str(tmp_path)]
-    result = CliRunner().invoke(main, arguments)
-    assert result.exit_code == 0, result.stderr
-    payload = json.loads(result.stdout)
+    payload = answer(tmp_path, "bench", "--only", "map", "--quick", "--batch", 2)
     assert {"format", "format_version", "rows", "contact_rows", "scene_rows", "aims", "machine"} == set(payload)
     assert payload["contact_rows"] == []
     assert not (tmp_path / "bench_contact.csv").exists()
-    assert json.loads((tmp_path / "bench.json").read_text("utf-8")) == payload
-    lines = (tmp_path / "bench.csv").read_text("utf-8").splitlines()
-    assert lines[0] == ",".join(COLUMNS)
-    assert len(lines) == 1 + len(payload["rows"])
+    rows = table(tmp_path / "bench.csv")
+    assert tuple(rows[0]) == tuple(COLUMNS)
+    assert len(rows) == len(payload["rows"])
 
 
 def batch_of_one(rows: NextImpact) -> NextImpact:

@@ -1,21 +1,17 @@
 """The contact's benchmark and accuracy study: their reference, their baseline, their choices."""
 
-import csv
-import json
-
 import numpy as np
 import pytest
-from click.testing import CliRunner
 
 from afm_jax.accuracy.collisions import cheapest_collision
 from afm_jax.bench import timing as own_process
 from afm_jax.bench.collisions import REFERENCE, aims, errors_against, speeds_of
 from afm_jax.bench.scipy_contacts import scipy_collision
-from afm_jax.cli.main import main
 from afm_jax.contact.collide import batch_of
 from afm_jax.contact.contact import Contact
 from afm_jax.plots.accuracy import collide_accuracy_figure
 from tests import reference_contact as exact
+from tests.answers import answer, table
 from tests.run_here import run_here
 
 
@@ -94,14 +90,7 @@ def test_aims_name_what_was_reached():
 def run_quickly(monkeypatch, folder, *arguments):
     """Return what a command prints as JSON, its measurement made in this process."""
     monkeypatch.setattr(own_process, "run_in_own_process", run_here)
-    result = CliRunner().invoke(main, [*arguments, "--quick", "--json", "--out", str(folder)])
-    assert result.exit_code == 0, result.stderr
-    return json.loads(result.stdout)
-
-
-def lines_of(path):
-    with path.open(encoding="utf-8") as file:
-        return list(csv.DictReader(file))
+    return answer(folder, *arguments, "--quick")
 
 
 @pytest.mark.slow
@@ -115,8 +104,8 @@ def test_accuracy_command_shows_errors_and_the_cheapest(monkeypatch, tmp_path):
         assert row["delay_error_us"] <= 10.0 * accuracy
         assert row["slope_error"] is None or row["slope_error"] <= 10.0 * accuracy
     assert payload["cheapest"]["method"].startswith("collide")
-    assert len(lines_of(tmp_path / "accuracy.csv")) == len(payload["rows"])
-    assert (tmp_path / "accuracy.png").read_bytes().startswith(b"\x89PNG")
+    assert len(table(tmp_path / "accuracy.csv")) == len(payload["rows"])
+    assert (tmp_path / "accuracy.png").exists()
 
 
 @pytest.mark.slow
@@ -128,4 +117,4 @@ def test_bench_command_measures_the_contact_alone(monkeypatch, tmp_path):
     errors = [aim for aim in payload["aims"] if "error" in aim["aim"]]
     assert len(errors) == 2
     assert all(aim["met"] for aim in errors)
-    assert len(lines_of(tmp_path / "bench_contact.csv")) == len(payload["contact_rows"])
+    assert len(table(tmp_path / "bench_contact.csv")) == len(payload["contact_rows"])

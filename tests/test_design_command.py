@@ -10,7 +10,6 @@ from afm_jax.cli.design_belief import BeliefOptions, believed
 from afm_jax.cli.main import main
 from fitting import fit, read_table
 from tests.fit_tables import EXAMPLE, rows
-from tests.fresh_python import python
 from tests.strict_reading import strictly
 
 pytestmark = pytest.mark.slow
@@ -136,14 +135,6 @@ def test_too_few_points_determine_nothing():
     assert found.exit_code == 3
     assert strictly(found.stdout)["expected"]["r"]["standard_error"] is None
     assert "do not determine r and epsilon" in found.stderr
-
-
-def test_help_needs_no_jax():
-    code = (
-        "import sys\nfrom afm_jax.cli.main import main\n"
-        "try:\n    main(['design', '--help'])\nexcept SystemExit:\n    pass\nprint('jax' in sys.modules)"
-    )
-    assert python(code).split()[-1] == "False"
 
 
 def test_what_is_held_is_not_forecast():

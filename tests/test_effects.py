@@ -1,19 +1,14 @@
 """`afm-jax effects`: on scenes where it is known what an effect changes."""
 
-import csv
-import json
 import math
 
 import equinox as eqx
 import jax
 import numpy as np
 import pytest
-from click.testing import CliRunner
-from matplotlib.image import imread
 
 from afm_jax import Cantilever, CollisionDelay, Contact, ImpactLaw, Platform, Scene, load_scene, save_scene
 from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
-from afm_jax.cli.main import main
 from afm_jax.cli.values import parse_share
 from afm_jax.effects.scene_effects import effects_in
 from afm_jax.effects.study import Change, Programs, Reduction, study_effects
@@ -21,6 +16,7 @@ from afm_jax.impact.orbits import single_impact_orbits
 from afm_jax.motion.start import start_of
 from afm_jax.scenefile.presets import contact_scene
 from afm_jax.scenefile.scenefile import load_scene_and_start
+from tests.answers import answer, table
 
 LAW = ImpactLaw(0.998, 100.0, 0.1, CollisionDelay(0.206, 5.64, 0.726, corrections=False))
 DRIVE = Platform(4.0, 181.8)
@@ -267,22 +263,8 @@ def called(tmp_path_factory):
     """Return the JSON object of the command, and the folder it wrote into."""
     folder = tmp_path_factory.mktemp("effects")
     save_scene(law_scene(), folder / "scene.toml")
-    arguments = [
-        "effects",
-        str(folder / "scene.toml"),
-        "--accuracy",
-        "1 %",
-        "--only",
-        "restitution,viscous_loss,adhesion",
-    ]
-    arguments += ["--write", str(folder / "reduced.toml"), "--out", str(folder / "out"), "--json"]
-    result = CliRunner().invoke(main, arguments)
-    assert result.exit_code == 0, result.stderr
-
-    def refuse(constant: str):
-        raise AssertionError(constant)
-
-    return json.loads(result.stdout, parse_constant=refuse), folder
+    options = ("--accuracy", "1 %", "--only", "restitution,viscous_loss,adhesion", "--write", folder / "reduced.toml")
+    return answer(folder / "out", "effects", folder / "scene.toml", *options), folder
 
 
 @pytest.mark.slow
@@ -301,15 +283,13 @@ def test_the_reduced_file_loads_and_is_as_accurate_as_wanted(called):
 @pytest.mark.slow
 def test_the_command_writes_what_it_says(called):
     payload, folder = called
-    with (folder / "out" / "effects.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
+    rows = table(folder / "out" / "effects.csv")
     assert [row["name"] for row in rows] == [effect["name"] for effect in payload["effects"]]
     assert all(
         float(row["change_peak_amplitude"]) == effect["change"]["peak_amplitude"]
         for row, effect in zip(rows, payload["effects"], strict=True)
     )
-    assert np.ptp(imread(folder / "out" / "effects.png")) > 0.5
-    assert json.loads((folder / "out" / "effects.json").read_text(encoding="utf-8")) == payload
+    assert {path.name for path in (folder / "out").iterdir()} >= {"effects.json", "effects.png"}
 
 
 @pytest.mark.parametrize("text", ["1%", "0.01", "1 %", " 1% "])

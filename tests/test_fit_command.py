@@ -12,7 +12,7 @@ from click.testing import CliRunner
 from scipy.stats import chi2
 
 from afm_jax import load_law
-from afm_jax.cli.fit import _settings
+from afm_jax.cli.fit_options import fit_settings
 from afm_jax.cli.main import main
 from fitting.tables.table import TABLE, read_table, write_table
 from tests.fit_tables import EXAMPLE
@@ -313,7 +313,7 @@ def test_a_package_that_a_file_for_arviz_needs_is_asked_for_before_the_fit(tmp_p
 
 def test_a_contact_without_an_effect_is_not_fitted_by_its_parameters():
     options = {"scale_errors": False, "robust": False, "constrain": (), "free": None}
-    settings = _settings("contact", options | {"left_out": ("viscous",), "fix": (("modulus_gpa", 90.0),)})
+    settings = fit_settings("contact", options | {"left_out": ("viscous",), "fix": (("modulus_gpa", 90.0),)})
     assert settings["free"] == ("relative_humidity", "adhesion_energy_j_per_m2")
     assert settings["effects"] == ("capillary", "structural", "core", "jkr")
 

@@ -1,6 +1,5 @@
 """The impact law and the delay law of a contact: the published table, closed forms, SciPy, and the command."""
 
-import csv
 import json
 from typing import Any
 
@@ -14,6 +13,7 @@ from afm_jax import Contact, ImpactLaw, find_junction
 from afm_jax.cli.main import main
 from afm_jax.contact.law_of_contact import closest_law
 from fitting import ContactLaw, fit_delay, fit_law
+from tests.answers import answer, table
 from tests.reference_contact import ContactParameters, collision
 
 PAPER = Contact.paper()
@@ -194,27 +194,25 @@ def run(*arguments: object):
 @pytest.fixture(scope="module")
 def reported(tmp_path_factory: pytest.TempPathFactory):
     folder = tmp_path_factory.mktemp("fit_law")
-    result = run("--json", "--out", folder)
-    assert result.exit_code == 0, result.stderr
-    return json.loads(result.stdout), folder
+    return answer(folder, "collide", "--make-law"), folder
 
 
 def test_command_tells_what_the_functions_find(reported):
-    answer, _ = reported
-    assert [row["model"] for row in answer["models"]] == ["law", "viscous", "full"]
-    for row in answer["models"]:
+    payload, _ = reported
+    assert [row["model"] for row in payload["models"]] == ["law", "viscous", "full"]
+    for row in payload["models"]:
         law = fit_law(PAPER, model=row["model"])
         for name, value in row.items():
             assert value == getattr(law, name)
     found = fit_delay(PAPER)
-    assert answer["delay"]["hertz"] == float(found.delay.hertz)
-    assert answer["delay"]["lag_us"][0] == found.lag_us[0]
-    assert answer["delay"]["approach_speed_nm_per_us"][-1] == found.speed_range[1]
-    assert answer["contact"]["effects"] == list(PAPER.effects)
+    assert payload["delay"]["hertz"] == float(found.delay.hertz)
+    assert payload["delay"]["lag_us"][0] == found.lag_us[0]
+    assert payload["delay"]["approach_speed_nm_per_us"][-1] == found.speed_range[1]
+    assert payload["contact"]["effects"] == list(PAPER.effects)
 
 
 def test_command_writes_tables_and_picture(reported):
-    answer, folder = reported
+    payload, folder = reported
     assert {path.name for path in folder.iterdir()} == {
         "law.json",
         "law.csv",
@@ -223,18 +221,15 @@ def test_command_writes_tables_and_picture(reported):
         "collide.json",
         "law.png",
     }
-    assert json.loads((folder / "collide.json").read_text("utf-8")) == answer
-    with (folder / "law_models.csv").open(encoding="utf-8") as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == answer["points"] == 512
-    for model in answer["models"]:
+    rows = table(folder / "law_models.csv")
+    assert len(rows) == payload["points"] == 512
+    for model in payload["models"]:
         errors = [
             float(row[f"{model['model']}_speed_nm_per_us"]) / float(row["rebound_speed_nm_per_us"]) - 1.0
             for row in rows
         ]
         np.testing.assert_allclose(np.abs(errors).max(), model["worst_relative_error"], rtol=1e-9, atol=0.0)
-    with (folder / "law_delay.csv").open(encoding="utf-8") as file:
-        delays = list(csv.DictReader(file))
+    delays = table(folder / "law_delay.csv")
     assert all(abs(float(row["lag_us"]) - float(row["lead_us"]) - float(row["delay_us"])) < 1e-15 for row in delays)
     pixels = imread(folder / "law.png")[..., :3]
     _, width, _ = pixels.shape

@@ -36,7 +36,6 @@ LEVELS = {
     "verify": 7,
     "bench": 8,
     "accuracy": 9,
-    "paper": 9,
     "plots": 10,
     "cli": 11,
     "__main__": 12,
@@ -179,10 +178,10 @@ def crossed(start: tuple[str, str]) -> set[str]:
 @pytest.mark.parametrize(
     ("module", "name", "most"),
     [
-        ("afm_jax.motion.simulate", "simulate", 37),
-        ("fitting.fits.fit", "fit", 52),
-        ("afm_jax.contact.collide", "collide", 18),
-        ("afm_jax.effects.study", "study_effects", 53),
+        ("afm_jax.motion.simulate", "simulate", 39),
+        ("fitting.fits.fit", "fit", 53),
+        ("afm_jax.contact.collide", "collide", 20),
+        ("afm_jax.effects.study", "study_effects", 54),
     ],
 )
 def test_a_call_crosses_few_files(module: str, name: str, most: int):
@@ -219,7 +218,7 @@ def test_fits_load_no_scipy_and_pictures_no_pyplot():
     # its statistics alone take as long as JAX: they are for posteriors, which import them when they need them
     code = (
         "import sys, fitting.fits.fit, fitting.report.report\nprint('scipy' in sys.modules)\n"
-        "import afm_jax.plots.paper\nprint('matplotlib.pyplot' in sys.modules)"
+        "import afm_jax.plots.motion\nprint('matplotlib.pyplot' in sys.modules)"
     )
     assert python(code).split() == ["False", "False"]
 

@@ -18,6 +18,7 @@ CAPTIONS = {
     "figure9b": (1.03, 0.75, 0.0),
     "figure10": (0.97, 2.0, -0.5),
     "figure11": (1.01, 4.0, -2.0),
+    "dry": (0.97, 2.0, 0.0),
 }
 RAMPS = {"figure10": (5.0, 5500.0), "figure11": (2.0, 4000.0)}
 
@@ -42,7 +43,7 @@ def test_a_preset_is_the_scene_of_its_caption(name: str, tmp_path: Path):
             end, rel=1e-15
         )
         assert f"to {end:g} nm in {after:g} us" in presets.PRESETS[name]
-    resolved = name in ("figure8", "figure10", "figure11")
+    resolved = name in ("figure8", "figure10", "figure11", "dry")
     assert isinstance(scene.interaction, Contact if resolved else ImpactLaw)
     assert (scene.cantilever.quality_factor is not None) == resolved
     path = tmp_path / "scene.toml"

@@ -87,9 +87,7 @@ def test_nothing_writes_files_another_way():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "call", ["calibrate", "chart --zarr", "figures", "lockin", "orbits", "read", "simulate", "sweep"]
-)
+@pytest.mark.parametrize("call", ["calibrate", "chart --zarr", "lockin", "orbits", "read", "simulate", "sweep"])
 def test_files_of_commands_are_checked_for_links_first(tmp_path, call):
     prepare(tmp_path)
     code, said, written, loose = unchecked(call, tmp_path)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from afm_jax import Cantilever, Contact, Platform, Scene, load_scene, save_scene
 from afm_jax.contact.forces import Capillary, CoreRepulsion, Jkr, VanDerWaals
-from afm_jax.contact.parameters import CONTACT_RANGES, EFFECTS
+from afm_jax.contact.parameters import CONTACT_RANGES, DRY_PARAMETERS, EFFECTS, PAPER
 from afm_jax.scenefile import presets
 from tests.fresh_python import python
 
@@ -47,8 +47,9 @@ def path(tmp_path: Path) -> Path:
 
 def test_keys_and_ranges_are_those_of_the_contact():
     keywords = inspect.signature(Contact.paper).parameters
-    assert {"effects", *CONTACT_RANGES} == set(keywords)
-    assert set(CHANGED) == set(CONTACT_RANGES)
+    assert {"effects", *PAPER} == set(keywords)
+    assert set(CHANGED) == set(PAPER)
+    assert {*PAPER, *(parameter.name for parameter in DRY_PARAMETERS)} == set(CONTACT_RANGES)
 
 
 def test_what_is_left_out_is_the_papers(path: Path):
@@ -107,7 +108,7 @@ def test_loop_is_exact_in_32_bits(path: Path):
 @pytest.mark.parametrize(
     ("contact", "said"),
     [
-        (Contact(Capillary() + CoreRepulsion() + VanDerWaals()), "the contact has capillary, core, VanDerWaals, jkr"),
+        (Contact(Capillary() + CoreRepulsion() + VanDerWaals()), "the contact has capillary, core, van_der_waals, jkr"),
         (Contact(CoreRepulsion() + CoreRepulsion()), "the contact has core, core, jkr"),
         (Contact(Capillary() + CoreRepulsion(tip_radius_nm=90.0)), "one `tip_radius_nm`, but the contact's forces"),
         (Contact(CoreRepulsion(), junction=Jkr(tip_radius_nm=90.0)), "one `tip_radius_nm`, but the contact's forces"),

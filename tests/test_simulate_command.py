@@ -15,7 +15,6 @@ from afm_jax.motion.trajectory import pieces_between
 from afm_jax.scenefile.scenefile import Start
 from fitting.traces.lockin import lockin
 from fitting.traces.trace import read_trace
-from tests.fresh_python import python
 from tests.strict_reading import strictly
 
 LAW = Scene(Cantilever(90.0, 40.0), Platform(4.0, 181.8), ImpactLaw(0.9, 20.0))
@@ -148,17 +147,6 @@ def test_a_preset_has_its_start():
     assert result.exit_code == 0, result.stderr
     answer = strictly(result.stdout)
     assert answer["scene"]["platform"]["offset_nm"] == -1.0
-
-
-def test_help_does_without_jax():
-    code = (
-        "import sys\n"
-        "from click.testing import CliRunner\n"
-        "from afm_jax.cli.main import main\n"
-        "result = CliRunner().invoke(main, ['simulate', '--help'])\n"
-        "print(result.exit_code, 'PRESET' in result.output, 'jax' in sys.modules)"
-    )
-    assert python(code) == "0 True False"
 
 
 def test_nothing_is_said_over_a_response_period_that_is_not_there():

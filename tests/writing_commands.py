@@ -32,7 +32,6 @@ CALLS = {
     "continue": ("figure2", "--order", "1", "--parameter", "platform.amplitude_nm=3:4"),
     "design": ("--points", "2", "--orders", "1,2", "--free-frequency-khz", "90", "--quality-factor", "40"),
     "effects": ("figure8", "--accuracy", "10%", "--duration-us", "100", "--only", "viscous"),
-    "figures": ("--only", "4", "--coarse"),
     "fit": ("--example",),
     "fit --each": (str(EXAMPLES / "amplitudes_law.csv"), "--each", "--workers", "1"),
     "invert": ("--example",),

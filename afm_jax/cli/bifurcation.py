@@ -6,15 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from afm_jax.cli.command import NamedScene, Output
+from afm_jax.cli.command import NamedScene, Output, later
 from afm_jax.cli.fitted_law import as_drawn
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import ranges_of
 from afm_jax.dynamics.bands import verdict_probability
 from afm_jax.dynamics.bifurcations import Sweep, bifurcation_diagram
 from afm_jax.impact.law import extrapolation_of
-from afm_jax.plots.dynamics import draw_bifurcations
 from afm_jax.scenefile.scenefile import scene_tables
+
+draw_bifurcations = later("afm_jax.plots.dynamics:draw_bifurcations")
 
 _NONE_WENT_ON = (
     "no motion went on at any value: the tip sticks or flies away; try a larger drive amplitude, or a [start]"

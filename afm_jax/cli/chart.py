@@ -6,15 +6,16 @@ from typing import Any
 
 import numpy as np
 
-from afm_jax.cli.command import NamedScene, Output
+from afm_jax.cli.command import NamedScene, Output, later
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import ranges_of
 from afm_jax.dynamics.charts import StabilityChart, stability_chart, stable_probability
 from afm_jax.impact.law import extrapolation_of
-from afm_jax.plots.dynamics import draw_chart
 from afm_jax.scenefile.parameter_paths import ParameterRange, scene_family
 from afm_jax.scenefile.scenefile import scene_tables
 from afm_jax.whole_files import whole_folder
+
+draw_chart = later("afm_jax.plots.dynamics:draw_chart")
 
 _MOST_POINTS = 4_000_000
 

@@ -74,6 +74,22 @@ class Output:
     not_valid: str | None = None
     failure: Exception | None = None
 
+    @classmethod
+    def of(cls, result: Any, summary: Callable[[], str], report: Callable[..., Sequence[Path]]) -> "Output":
+        """Return what is handed out of a result that has `to_dict`, `valid` and `reasons`."""
+        not_valid = None if result.valid else result.reasons[0]
+        return cls(payload=result.to_dict(), text=[summary], report=report, not_valid=not_valid)
+
+
+def later(function: str) -> Callable[..., Any]:
+    """Return a function, "module:function", whose module is imported when it is called: pictures need matplotlib."""
+    module, _, name = function.partition(":")
+
+    def call(*arguments: Any, **options: Any) -> Any:
+        return getattr(import_module(module), name)(*arguments, **options)
+
+    return call
+
 
 def columns_of(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[str, list[Any]]:
     """Return the columns of rows; what a row lacks is None."""

@@ -11,8 +11,9 @@ from afm_jax.cli.values import Finite, SceneName, option_of, scene_and_start
 from afm_jax.contact.parameters import (
     CONTACT_PARAMETERS,
     CONTACT_RANGES,
+    DEFAULTS,
+    DRY_PARAMETERS,
     EFFECTS,
-    PAPER,
     REMOVABLE_EFFECTS,
     REQUIRED_EFFECTS,
     idle_without,
@@ -53,7 +54,7 @@ def with_contact_options(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(function)
     def command(*args: Any, scene: str | None, **options: Any) -> Any:
-        parameters = {name: value for name in PAPER if (value := options.pop(name)) is not None}
+        parameters = {name: value for name in DEFAULTS if (value := options.pop(name)) is not None}
         left_out = tuple(name for name in (*REMOVABLE_EFFECTS, *REQUIRED_EFFECTS) if options.pop(f"no_{name}"))
         chosen = ContactOptions(scene, parameters, left_out, *(options.pop(name) for name in _OF_THE_TIP))
         return function(*args, contact_options=chosen, **options)
@@ -65,8 +66,9 @@ def with_contact_options(function: Callable[..., Any]) -> Callable[..., Any]:
         command = click.option(f"--no-{name}", is_flag=True, help=f"Leave the {name} force out.")(command)
     for name, text in list(_OF_THE_TIP.items())[::-1]:
         command = click.option(option_of(name), type=Finite(), metavar="X", help=text)(command)
-    for parameter in CONTACT_PARAMETERS[::-1]:
-        text = f"{parameter.meaning}; paper: {parameter.default:g}."
+    for parameter in (*CONTACT_PARAMETERS, *DRY_PARAMETERS)[::-1]:
+        source = "of a dry contact" if parameter in DRY_PARAMETERS else "paper"
+        text = f"{parameter.meaning}; {source}: {parameter.default:g}."
         command = click.option(option_of(parameter.name), type=Finite(), metavar="X", help=text)(command)
     argument = click.argument("scene", metavar="[SCENE.toml|PRESET]", required=False, type=SceneName())
     return argument(command)

@@ -5,62 +5,51 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from afm_jax.cli.main import NotValid
+from afm_jax.cli.command import Output, columns_of
 from afm_jax.cli.session import Session
 from afm_jax.cli.sweep import run_sweep
+from afm_jax.sweeps.plan import plan_of
+from afm_jax.sweeps.store import STORE
 from afm_jax.words import text_table, with_error
+from fitting.bulk import table_input
+from fitting.tables.table import AmplitudeTable
 
-if TYPE_CHECKING:
-    from fitting.tables.table import AmplitudeTable
 
-
-def fit_tables(
-    session: Session, tables: Sequence["AmplitudeTable"], record: Mapping[str, Any], workers: int | None
-) -> None:
-    """Fit every table by itself and say what was found.
+def fit_each(
+    session: Session, tables: Sequence[AmplitudeTable], record: Mapping[str, Any], workers: int | None
+) -> Output:
+    """Fit every table by itself and return what was found.
 
     Args:
         session: the call.
         tables: with their errors.
         record: model and settings of the fits.
         workers: processes; None: one a core.
-
-    Raises:
-        NotValid: if a fit is not valid.
     """
-    session.start_computing()
-    from afm_jax.sweeps.plan import plan_of  # noqa: PLC0415
-    from fitting.bulk import table_input  # noqa: PLC0415
-
     plan = plan_of(table_input(tables, record))
     with tempfile.TemporaryDirectory() as scratch:
         where = session if session.out is not None else replace(session, out=Path(scratch))
         done = run_sweep(where, plan, workers=workers, scheduler=None)
         rows = _rows(tables, [variable.name for variable in plan.recorder.variables], where.out)
-    columns = [name for name in rows[0] if name not in ("parameters", "valid")]
-    session.write_table("fits.csv", rows, columns)
-    fits = [
-        {
-            name: row[name]
-            for name in ("table", "outcome", "valid", "message", "chi2", "degrees_of_freedom", "parameters")
-        }
-        for row in rows
-    ]
+    told = ("table", "outcome", "valid", "message", "chi2", "degrees_of_freedom", "parameters")
+    fits = [{name: row[name] for name in told} for row in rows]
     payload = {"model": record["model"], "fits": fits, "seconds": done.seconds, "fits_kept": len(done.kept.done)}
     why = [f"{row['table']}: {row['message']}" for row in rows if row["message"]]
-    session.emit(payload, lambda: "\n".join(_table(rows)), *why)
-    bad = [row["table"] for row in rows if not row["valid"]]
-    if bad:
-        raise NotValid(f"{len(bad)} of {len(rows)} fits are not valid")
+    bad = sum(not row["valid"] for row in rows)
+    columns = [name for name in rows[0] if name not in ("parameters", "valid")]
+    return Output(
+        payload=payload,
+        text=["\n".join(_table(rows)), *why],
+        tables={"fits.csv": columns_of(rows, columns)},
+        not_valid=f"{bad} of {len(rows)} fits are not valid" if bad else None,
+    )
 
 
-def _rows(tables: Sequence["AmplitudeTable"], variables: Sequence[str], folder: Path | None) -> list[dict[str, Any]]:
+def _rows(tables: Sequence[AmplitudeTable], variables: Sequence[str], folder: Path | None) -> list[dict[str, Any]]:
     """Return a row a table: each number by its column, and the parameters as `afm-jax fit` has them."""
-    import xarray  # noqa: PLC0415
-
-    from afm_jax.sweeps.store import STORE  # noqa: PLC0415
+    import xarray  # noqa: PLC0415 (an extra package, which --each alone needs)
 
     with xarray.open_zarr(f"{folder}/{STORE}") as store:
         found = store.load()

@@ -196,7 +196,7 @@ class Grid(click.ParamType):
         return int(parts[0]), int(parts[1])
 
 
-PRESET_NAMES = ("figure2", "figure3", "figure8", "figure9a", "figure9b", "figure10", "figure11")
+PRESET_NAMES = ("figure2", "figure3", "figure8", "figure9a", "figure9b", "figure10", "figure11", "dry")
 """Of `afm_jax.scenefile.presets`; said here as well, because help and completion must not wait for JAX."""
 
 

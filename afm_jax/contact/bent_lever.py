@@ -24,7 +24,6 @@ from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.contact.bridge_leg import Way, sweep
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Driven, free_tip
-from afm_jax.contact.forces import jkr
 from afm_jax.contact.junction import find_junction
 from afm_jax.contact.junction_leg import pass_through_junction
 from afm_jax.contact.law_of_contact import tabulated
@@ -183,10 +182,10 @@ def _solved(matrix: Float[Array, "n n"], values: Float[Array, "n k"]) -> Float[A
 
 def _needed(contact: Contact, tip: Driven, plane: Float[Array, ""], taken: Float[Array, ""]) -> Float[Array, ""]:
     """Return the energy in aJ with which the junction must form for the tip to come from the plane and to get back."""
-    junction, solid = tip.junction, contact.junction
+    junction, solid = tip.junction, tip.solid
     share = jnp.asarray(np.linspace(0.0, 1.0, _BARRIER_GAPS))
     on, breaks = junction.forms_gap_nm, junction.breaks_gap_nm
-    elastic = solid.energy_scale_aj * (jkr.work(jkr.FOLD) - jkr.work(junction.forms_root))
+    elastic = solid.energy_scale_aj * (solid.work(solid.fold) - solid.work(junction.forms_root))
     out, back = breaks * (plane / breaks) ** share, on * (contact.bridge_forms_nm / on) ** share
     leaving = elastic - tip.pulled_aj(on, breaks) + tip.potential(out) - tip.potential(breaks)
     coming = tip.potential(back) - tip.potential(on)

@@ -330,7 +330,10 @@ def way_rates(way: Way, share: Any, state: tuple[Float[Array, "..."], ...]) -> t
 
 
 def pass_bridge(way: Way, setting: Setting) -> Passage:
-    """Return the passage by the integrator of a setting."""
+    """Return the passage by the integrator of a setting; none where the solids meet where the contact begins."""
+    if not way.tip.bridge.spans:
+        nothing = jnp.zeros_like(way.total_aj)
+        return way.end(nothing, nothing)
     size = setting.inward if setting.careful or way.inward else setting.outward
     if way.quiet:
         return pass_by_collocation(way, max(size, setting.junction_nodes), 0)
@@ -341,6 +344,9 @@ def pass_bridge(way: Way, setting: Setting) -> Passage:
 
 def go_in(driven: Driven, state: ContactState, setting: QuickSetting) -> Leg:
     """Return a tip where the junction forms, from a state in the bridge with the gap closing; x is s at the end."""
+    if not driven.bridge.spans:
+        # it has formed where the contact began
+        return Leg(state, state.x, jnp.zeros_like(state.x, bool))
     gaps = state.x, driven.junction.forms_gap_nm
     leg = _cross(driven, gaps, state, setting, setting.inward, inward=True)
     root = driven.junction.forms_root + jnp.zeros_like(state.x)
@@ -349,6 +355,8 @@ def go_in(driven: Driven, state: ContactState, setting: QuickSetting) -> Leg:
 
 def go_out(driven: Driven, state: ContactState, setting: QuickSetting) -> Leg:
     """Return a tip where the bridge breaks, from where the junction has broken with the gap opening."""
+    if not driven.bridge.spans:
+        return Leg(state, state.x, state.gap_rate > 0.0)
     gaps = driven.breaks_nm, driven.junction.breaks_gap_nm
     leg = _cross(driven, gaps, state, setting, setting.outward, inward=False)
     return leg._replace(holds=leg.holds & (state.gap_rate > 0.0) & (gaps[1] < gaps[0]))

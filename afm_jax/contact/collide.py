@@ -35,7 +35,7 @@ from afm_jax.contact.bridge_leg import (
     turn_in_bridge,
     way_through,
 )
-from afm_jax.contact.contact import Contact
+from afm_jax.contact.contact import Contact, bridge_of
 from afm_jax.contact.driven import Driven, free_tip
 from afm_jax.contact.junction import Junction, explain_missing_junction, find_junction
 from afm_jax.contact.junction_leg import JunctionWay, pass_through_junction
@@ -215,8 +215,10 @@ def _careful(joined: _Joined, mass: Float[Array, "..."], speeds: Float[Array, ".
         valid = (speed > 0.0) & jnp.isfinite(speed)
         safe = jnp.where(valid, speed, 1.0)
         ways = go_through(contact, place, safe, mass, CAREFUL)
-        turn = _turns(contact, place, mass, safe, ways.inward.dissipated_aj)
         through = collision_of(contact, place, safe, mass, ways)
+        if not contact.spans:
+            return _judged(through, speed, place.exists, valid, jnp.isfinite(through.end_energy_aj))
+        turn = _turns(contact, place, mass, safe, ways.inward.dissipated_aj)
         turned = collision_of_turn(contact, place, safe, mass, turn)
         turns = turn.turns & (ways.inward.energy_aj <= 0.0)
         found = jax.tree.map(lambda a, b: jnp.where(turns, a, b), turned, through)
@@ -295,7 +297,12 @@ def _capture_speed(contact: Contact, mass: Float[Array, ""]) -> tuple[Array, Arr
     junction = find_junction(contact)
     fixed = lax.stop_gradient((contact, junction, mass))
     # sqrt(2 hysteresis / m) without dissipation, which raises it; less where the bridge turns the tip round
-    scale = jnp.log(jnp.sqrt(2.0 * jnp.maximum(fixed[1].hysteresis_aj, 1e-6) / fixed[2]))
+    taken = fixed[1].hysteresis_aj
+    if contact.dry and contact.forces.terms:
+        # drag alone captures a tip, on its way out of the well of the attraction
+        bridge = bridge_of(fixed[0])
+        taken = bridge.potential(fixed[0].bridge_forms_nm) - bridge.potential(fixed[1].forms_gap_nm)
+    scale = jnp.log(jnp.sqrt(2.0 * jnp.maximum(taken, 1e-6) / fixed[2]))
     width = jnp.asarray([math.log(0.01), math.log(1e3)], scale.dtype)
 
     def narrow(ends, _):
@@ -320,6 +327,8 @@ def _end_energy(
     contact, junction, mass = model
     ways = go_through(contact, junction, approach_speed, mass, CAREFUL)
     through = jnp.minimum(ways.junction.energy_aj, ways.outward.energy_aj)
+    if not contact.spans:
+        return through
     turn = turn_in_bridge(contact, junction, approach_speed, mass, ways.inward.dissipated_aj)
     return jnp.where(turn.turns & (ways.inward.energy_aj <= 0.0), turn.energy_aj, through)
 

@@ -7,17 +7,25 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from afm_jax.checks import as_parameter, check_kind, check_parameter, is_traced, readable
-from afm_jax.contact.forces.force import DissipativeForce, Force, ForceSum, StaticForce, terms_of
+from afm_jax.contact.forces.dry import Dmt, Hertz, dry_curve
+from afm_jax.contact.forces.force import (
+    DissipativeForce,
+    ElasticCurve,
+    Force,
+    ForceSum,
+    StaticForce,
+    slope_of,
+    terms_of,
+)
 from afm_jax.contact.forces.jkr import Jkr
 from afm_jax.contact.forces.liquid import Capillary, Liquid, Structural, Viscous
-from afm_jax.contact.forces.solid import CoreRepulsion
-from afm_jax.contact.parameters import EFFECTS, PAPER, REQUIRED_EFFECTS
+from afm_jax.contact.forces.solid import CoreRepulsion, VanDerWaals
+from afm_jax.contact.parameters import ALL_EFFECTS, DEFAULTS, DRY_EFFECTS, EFFECTS, PAPER, REQUIRED_EFFECTS
 from afm_jax.units import AJ_NM6_PER_J_M6
 
 
@@ -28,35 +36,77 @@ def _flat(forces: Force | Sequence[Force]) -> ForceSum:
 
 
 class Contact(eqx.Module):
-    """What happens when the tip meets the sample: bridge, junction and their hysteresis (section IV).
+    """What happens when the tip meets the sample: forces over a gap, and a solid contact (section IV of the paper).
+
+    With `Jkr()` a liquid bridge forms, in it the solid junction, and both break at larger gaps than they form. With
+    `Dmt()` or `Hertz()` the contact is dry and without hysteresis: the forces act from `range_nm` inwards, where they
+    are cut, to where the solids meet. Hertz's contact has no forces and begins at gap 0.
 
     Args:
-        forces: the bridge's forces, as a sum (`Capillary() + CoreRepulsion()`) or a sequence; no order.
-        junction: the solid junction's elastic contact.
-        bridge_forms_nm: gap at which an approaching tip meets the bridge, in nm.
-        bridge_breaks_nm: gap at which a leaving tip breaks it, in nm.
+        forces: the forces outside the solid contact, a sum (`Capillary() + CoreRepulsion()`) or a sequence; no order.
+        junction: the solid contact: `Jkr()`, `Dmt()` or `Hertz()`.
+        bridge_forms_nm: gap at which an approaching tip meets the bridge, in nm; of a dry contact its range.
+        bridge_breaks_nm: gap at which a leaving tip breaks it, in nm; of a dry contact its range.
+        range_nm: gap at which a contact with `Dmt()` begins and ends, in nm.
 
     Raises:
-        ValueError: if a gap is not positive, or the bridge breaks at a smaller gap than it forms.
+        ValueError: if a gap is not positive, the bridge breaks at a smaller gap than it forms, the range of a dry
+            contact ends before the solids meet, or forces and solid contact do not go together.
 
     >>> Contact(forces=Capillary() + CoreRepulsion(), junction=Jkr()).effects
     ('capillary', 'core', 'jkr')
+    >>> Contact(forces=(VanDerWaals(),), junction=Dmt()).effects
+    ('van_der_waals', 'dmt')
     """
 
-    forces: ForceSum = eqx.field(converter=_flat)
-    junction: Jkr = eqx.field(default_factory=Jkr)
-    bridge_forms_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=PAPER["bridge_forms_nm"])
-    bridge_breaks_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=PAPER["bridge_breaks_nm"])
+    forces: ForceSum
+    junction: Jkr | Dmt | Hertz
+    bridge_forms_nm: Float[Array, "..."]
+    bridge_breaks_nm: Float[Array, "..."]
 
     __repr__ = readable
 
+    def __init__(
+        self,
+        forces: Force | Sequence[Force],
+        junction: Jkr | Dmt | Hertz | None = None,
+        bridge_forms_nm: ArrayLike | None = None,
+        bridge_breaks_nm: ArrayLike | None = None,
+        *,
+        range_nm: ArrayLike | None = None,
+    ):
+        """Fill in the gaps that are not given."""
+        self.forces = _flat(forces)
+        self.junction = Jkr() if junction is None else junction
+        forms, breaks = PAPER["bridge_forms_nm"], PAPER["bridge_breaks_nm"]
+        if isinstance(junction, Dmt):
+            forms = breaks = DEFAULTS["range_nm"] if range_nm is None else range_nm
+        elif isinstance(junction, Hertz):
+            forms = breaks = 0.0
+        if range_nm is not None and not isinstance(junction, Dmt):
+            raise ValueError("`range_nm` is that of a contact with Dmt(): a bridge has two gaps, Hertz() has no range")
+        self.bridge_forms_nm = as_parameter(forms if bridge_forms_nm is None else bridge_forms_nm)
+        self.bridge_breaks_nm = as_parameter(breaks if bridge_breaks_nm is None else bridge_breaks_nm)
+
     def __check_init__(self):
-        check_kind("junction", self.junction, Jkr)
-        check_parameter("bridge_forms_nm", self.bridge_forms_nm, "positive")
-        check_parameter("bridge_breaks_nm", self.bridge_breaks_nm, "positive")
-        traced = is_traced(self.bridge_forms_nm) or is_traced(self.bridge_breaks_nm)
-        # in NumPy: inside a traced function JAX would trace the comparison of two known numbers, too
-        if not traced and bool((np.asarray(self.bridge_breaks_nm) < np.asarray(self.bridge_forms_nm)).any()):
+        check_kind("junction", self.junction, Jkr | Dmt | Hertz)
+        _check_solid(self.forces, self.junction)
+        if not self.spans:
+            return
+        names = ("range_nm",) * 2 if self.dry else ("bridge_forms_nm", "bridge_breaks_nm")
+        check_parameter(names[0], self.bridge_forms_nm, "positive")
+        check_parameter(names[1], self.bridge_breaks_nm, "positive")
+        gaps = self.bridge_forms_nm, self.bridge_breaks_nm, getattr(self.junction, "begins_nm", 0.0)
+        if any(is_traced(gap) for gap in gaps):
+            return
+        # in NumPy: inside a traced function JAX would trace the comparison of known numbers, too
+        forms, breaks, solid = (np.asarray(gap) for gap in gaps)
+        if self.dry and not (bool(np.all(forms == breaks)) and bool(np.all(forms > solid))):
+            raise ValueError(
+                f"`range_nm`, where a dry contact begins and ends, must be larger than `contact_distance_nm` of "
+                f"{solid.max():g}, but is {forms.min():g}"
+            )
+        if bool((breaks < forms).any()):
             raise ValueError(
                 "`bridge_breaks_nm` must not be smaller than `bridge_forms_nm`: a bridge that breaks before it forms "
                 "would give energy away"
@@ -122,29 +172,108 @@ class Contact(eqx.Module):
             bridge_breaks_nm=bridge_breaks_nm,
         )
 
+    @classmethod
+    def of(cls, effects: Sequence[str], **parameters: ArrayLike) -> "Contact":
+        """Return the contact of some effects, the paper's or a dry one; parameters that they do not need are ignored.
+
+        Args:
+            effects: names of `EFFECTS` with "jkr", or of `DRY_EFFECTS` with "dmt" or "hertz".
+            parameters: keywords of `Contact.paper`, and "hamaker_constant_aj", "contact_distance_nm", "range_nm".
+
+        Raises:
+            ValueError: if an effect is unknown, a required one missing, two do not go together, or a value is outside
+                its range.
+
+        >>> Contact.of(["van_der_waals", "dmt"], modulus_gpa=1.0).junction.modulus_gpa.item()
+        1.0
+        """
+        check_effects(effects)
+        if not {"dmt", "hertz"} & set(effects):
+            return cls.paper(effects=effects, **{name: parameters[name] for name in PAPER if name in parameters})
+        value = DEFAULTS | parameters
+        radius, solid = value["tip_radius_nm"], (value["modulus_gpa"], value["tip_radius_nm"])
+        if "hertz" in effects:
+            return cls((), Hertz(*solid))
+        forces: list[Force] = []
+        if "van_der_waals" in effects:
+            forces.append(VanDerWaals(value["hamaker_constant_aj"], radius))
+        if "viscous" in effects:
+            forces.append(Viscous(value["viscosity_pa_s"], radius))
+        return cls(forces, Dmt(*solid, value["contact_distance_nm"]), range_nm=value["range_nm"])
+
     @property
     def effects(self) -> tuple[str, ...]:
         """The names of the effects that this contact has, forces first; own forces by their class."""
-        return (*(_NAMES.get(type(term), type(term).__name__) for term in self.forces.terms), "jkr")
+        return tuple(_NAMES.get(type(part), type(part).__name__) for part in (*self.forces.terms, self.junction))
+
+    @property
+    def dry(self) -> bool:
+        """Whether there is no bridge and no hysteresis."""
+        return isinstance(self.junction, Hertz)
+
+    @property
+    def spans(self) -> bool:
+        """Whether there is a gap between where the contact begins and where its solids meet: not with `Hertz`."""
+        return isinstance(self.junction, Jkr | Dmt)
+
+    @property
+    def solid(self) -> ElasticCurve:
+        """The solid contact in normalised variables, with what the forces pull where a dry one begins."""
+        if isinstance(self.junction, Jkr):
+            return self.junction.curve
+        return dry_curve(self.junction, -bridge_of(self).force(self.junction.begins_nm))
 
 
-FORCES = {"capillary": Capillary, "structural": Structural, "core": CoreRepulsion, "viscous": Viscous}
+FORCES = {
+    "capillary": Capillary,
+    "structural": Structural,
+    "core": CoreRepulsion,
+    "van_der_waals": VanDerWaals,
+    "viscous": Viscous,
+}
 """The force behind each effect."""
 
-_NAMES = {force: name for name, force in FORCES.items()}
+_NAMES = {force: name for name, force in FORCES.items()} | {Jkr: "jkr", Dmt: "dmt", Hertz: "hertz"}
+
+
+def _check_solid(forces: ForceSum, junction: Jkr | Dmt | Hertz) -> None:
+    """Raise where the forces do not go together with the solid contact."""
+    for term in forces.terms:
+        name = type(term).__name__
+        if isinstance(junction, Dmt) and isinstance(term, Capillary | Structural | CoreRepulsion):
+            raise ValueError(f"{name}() is a force of the liquid bridge, whose solid contact is Jkr(), not Dmt()")  # noqa: TRY004
+        if isinstance(junction, Hertz) and not isinstance(junction, Dmt):
+            raise ValueError(f"Hertz() is a contact without other forces; {name}() acts with Dmt()")  # noqa: TRY004
 
 
 def check_effects(effects: Sequence[str]) -> None:
     """Check a choice of effects.
 
     Raises:
-        ValueError: if one is unknown or named twice, or a required one is missing; says which and why.
+        ValueError: if one is unknown or named twice, two do not go together, or a required one is missing; says which
+            and why.
     """
     for name in effects:
-        if name not in EFFECTS:
-            raise ValueError(f"`effects` must be chosen from {', '.join(EFFECTS)}, but one is {name!r}")
+        if name not in ALL_EFFECTS:
+            raise ValueError(f"`effects` must be chosen from {', '.join(ALL_EFFECTS)}, but one is {name!r}")
     if len(set(effects)) < len(effects):
         raise ValueError("`effects` must not name an effect twice")
+    solid = next((name for name in ("hertz", "dmt") if name in effects), None)
+    allowed = {"hertz": ("hertz",), "dmt": DRY_EFFECTS[:-1]}.get(solid or "", EFFECTS)
+    for name in effects:
+        if name not in allowed:
+            raise ValueError(
+                f"`effects` cannot hold {name!r} with {solid!r}: "
+                + (
+                    "Hertz's contact has no other forces; take 'dmt'"
+                    if solid == "hertz"
+                    else "there is no liquid bridge"
+                )
+                if solid
+                else "`effects` with 'van_der_waals' must hold 'dmt': it is the attraction of a dry contact"
+            )
+    if solid:
+        return
     for name, reason in REQUIRED_EFFECTS.items():
         if name not in effects:
             raise ValueError(f"`effects` must hold {name!r}: {reason}")
@@ -154,13 +283,15 @@ class Bridge(eqx.Module):
     """The forces of a bridge, reduced to their coefficients.
 
     A force's parameters enter thousands of evaluations of its potential; what depends on them alone is computed here.
-    ``arrow``: -1 where time runs backwards, so that drag gives the energy that it takes; None: it does not.
+    ``spans``: whether there is a gap between where the contact begins and where the solids meet. ``arrow``: -1 where
+    time runs backwards, so that drag gives the energy that it takes; None: it does not.
     """
 
     static_kinds: tuple[type[StaticForce], ...] = eqx.field(static=True)
     static: tuple[tuple[Float[Array, "..."], ...], ...]
     dissipative_kinds: tuple[type[DissipativeForce], ...] = eqx.field(static=True)
     dissipative: tuple[tuple[Float[Array, "..."], ...], ...]
+    spans: bool = eqx.field(static=True, default=True)
     arrow: Float[Array, "..."] | float | None = None
 
     @property
@@ -175,11 +306,11 @@ class Bridge(eqx.Module):
 
     def force(self, gap: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return the force of all static forces in nN at a gap in nm."""
-        return -jax.jvp(self.potential, (gap,), (jnp.ones_like(gap),))[1]
+        return -slope_of(self.potential, gap)
 
     def stiffness(self, gap: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return -dF/dD of all static forces in nN/nm at a gap in nm."""
-        return -jax.jvp(self.force, (gap,), (jnp.ones_like(gap),))[1]
+        return -slope_of(self.force, gap)
 
     def damping(self, gap: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return the damping of all dissipative forces in nN us/nm at a gap in nm."""
@@ -208,4 +339,5 @@ def bridge_of(contact: Contact) -> Bridge:
         static=tuple(term.coefficients() for term in static),
         dissipative_kinds=tuple(type(term) for term in dissipative),
         dissipative=tuple(term.coefficients() for term in dissipative),
+        spans=contact.spans,
     )

@@ -2,7 +2,7 @@
 
 With D = y - s(t), y the free cantilever's coordinate and s the surface it moves over, eq. 16 reads
 D'' = F(D, D')/m - Omega^2 D - (Omega/Q) D' + q(t), with q = -(s'' + (Omega/Q) s' + Omega^2 s) all that depends on time.
-Within a phase everything is smooth. In the junction s = sqrt(A) of the JKR contact takes the place of the gap, and
+Within a phase everything is smooth. In the junction the root s of the elastic contact takes the place of the gap, and
 fictitious time that of time, dt = (d Delta/ds) d theta: both stay smooth through the fold where the contact breaks.
 A free tip is one without Omega and q; its program has neither.
 """
@@ -19,7 +19,7 @@ from afm_jax.apparatus.platform import Platform
 from afm_jax.apparatus.surface import Surface, Wave
 from afm_jax.apparatus.trigonometry import sine_cosine
 from afm_jax.contact.contact import Bridge, Contact, bridge_of
-from afm_jax.contact.forces import jkr
+from afm_jax.contact.forces.force import ElasticCurve
 from afm_jax.contact.junction import Junction, Phase, find_junction
 
 
@@ -64,14 +64,24 @@ class Driven(NamedTuple):
     inverse_mass: Float[Array, "..."]
     forms_nm: Float[Array, "..."]
     breaks_nm: Float[Array, "..."]
-    load_scale_nn: Float[Array, "..."]
-    depth_scale_nm: Float[Array, "..."]
+    solid: ElasticCurve
+    """The junction's elastic contact."""
     drive: Drive | None
     """None: a free tip over a sample at rest."""
     pull: Float[Array, "..."] | None = None
     """What a bent lever without drive makes of D'' at gap 0, away from the sample, in nm/us^2; None: a free tip."""
     lever_n_per_m: Float[Array, "..."] | None = None
     """Its stiffness; None: it has none."""
+
+    @property
+    def load_scale_nn(self) -> Float[Array, "..."]:
+        """The unit of the junction's load in nN."""
+        return self.solid.load_scale_nn
+
+    @property
+    def depth_scale_nm(self) -> Float[Array, "..."]:
+        """The unit of the junction's depth in nm."""
+        return self.solid.depth_scale_nm
 
     @property
     def cantilever(self) -> Cantilever:
@@ -116,7 +126,7 @@ class Driven(NamedTuple):
 
     def gap_of_root(self, s: Float[Array, "..."]) -> Float[Array, "..."]:
         """Return the gap in nm at s = sqrt(A)."""
-        return self.junction.shift_nm - self.depth_scale_nm * jkr.depth(s)
+        return self.junction.shift_nm - self.depth_scale_nm * self.solid.depth(s)
 
     def gap(self, x: Float[Array, "..."], phase: Int[Array, "..."]) -> Float[Array, "..."]:
         """Return the gap in nm, from s in the junction."""
@@ -142,8 +152,8 @@ class Driven(NamedTuple):
         return ContactState(state.gap_rate, acceleration, jnp.ones_like(gap), lost)
 
     def _junction_rates(self, state: ContactState, s: Float[Array, "..."]) -> ContactState:
-        slope = jkr.depth_slope(s)
-        force = self.load_scale_nn * jkr.load(s)
+        slope = self.solid.depth_slope(s)
+        force = self.load_scale_nn * self.solid.load(s)
         acceleration = self.acceleration(self.gap_of_root(s), state.gap_rate, state.time_us, force)
         return ContactState(-state.gap_rate / self.depth_scale_nm, slope * acceleration, slope, jnp.zeros_like(s))
 
@@ -169,7 +179,6 @@ def driven_by(contact: Contact, cantilever: Cantilever, surface: Platform | Surf
 
 def free_tip(contact: Contact, junction: Junction, mass_ng: Float[Array, "..."]) -> Driven:
     """Return the equation of motion of a free tip that meets a sample at rest."""
-    solid = contact.junction
     return Driven(
         bridge=bridge_of(contact),
         junction=junction,
@@ -177,8 +186,7 @@ def free_tip(contact: Contact, junction: Junction, mass_ng: Float[Array, "..."])
         inverse_mass=1.0 / mass_ng,
         forms_nm=contact.bridge_forms_nm,
         breaks_nm=contact.bridge_breaks_nm,
-        load_scale_nn=solid.load_scale_nn,
-        depth_scale_nm=solid.depth_scale_nm,
+        solid=contact.solid,
         drive=None,
     )
 

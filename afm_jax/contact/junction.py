@@ -22,6 +22,8 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from afm_jax.checks import as_argument, checked
 from afm_jax.contact.contact import Bridge, Contact, bridge_of
 from afm_jax.contact.forces import jkr
+from afm_jax.contact.forces.dry import Hertz
+from afm_jax.contact.forces.jkr import Jkr
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.derivatives import implicit_root
 
@@ -66,12 +68,15 @@ class Junction(ResultTuple):
 def find_junction(contact: Contact) -> Junction:
     """Return the junction of a contact; differentiable in every parameter, for one set of them.
 
-    Of several tangencies the one that an approaching tip meets with the bridge stiffening beyond the JKR contact is
-    taken, at the largest gap; the spurious ones near the JKR pull-off cross the other way.
+    A dry contact forms and breaks where its solids meet. Of several tangencies the one that an approaching tip meets
+    with the bridge stiffening beyond the JKR contact is taken, at the largest gap; the spurious ones near the JKR
+    pull-off cross the other way.
 
     Raises:
         TypeError: if it is no contact.
     """
+    if not isinstance(contact.junction, Jkr):
+        return _dry_junction(contact, contact.junction)
     forces, solid = bridge_of(contact), contact.junction
     scales = solid.load_scale_nn, solid.depth_scale_nm
     found, exists = _tangency(lax.stop_gradient((forces, *scales)), lax.stop_gradient(contact.bridge_forms_nm))
@@ -94,6 +99,22 @@ def find_junction(contact: Contact) -> Junction:
         stiffness_nn_per_nm=forces.stiffness(gap),
         bridge_hysteresis_aj=stretched,
         junction_hysteresis_aj=elastic - regained,
+    )
+
+
+def _dry_junction(contact: Contact, junction: Hertz) -> Junction:
+    bridge, gap = bridge_of(contact), junction.begins_nm
+    none = jnp.zeros_like(gap)
+    return Junction(
+        exists=(gap < contact.bridge_forms_nm) | (not bridge.spans),
+        forms_gap_nm=gap,
+        forms_root=none,
+        shift_nm=gap,
+        breaks_gap_nm=gap,
+        force_nn=bridge.force(gap),
+        stiffness_nn_per_nm=bridge.stiffness(gap),
+        bridge_hysteresis_aj=none,
+        junction_hysteresis_aj=none,
     )
 
 
@@ -175,11 +196,13 @@ def _meniscus_fits(contact: Contact) -> Bool[Array, "..."]:
 
 def explain_missing_junction(contact: Contact) -> str:
     """Say in one line why a contact has no junction, and what would mend it."""
+    if contact.dry:
+        return "the solids meet outside the range of the forces; make `range_nm` larger than `contact_distance_nm`"
     if not bool(_meniscus_fits(contact)):
         return "the Kelvin radius exceeds the tip radius; lower `relative_humidity` or take a larger `tip_radius_nm`"
     gaps = jnp.geomspace(SMALLEST_GAP_NM, contact.bridge_forms_nm, 400)
     stiffness, force = contact.forces.static.stiffness(gaps), contact.forces.static(gaps)
-    tension = 1.5 * contact.junction.load_scale_nn
+    tension = 1.5 * contact.solid.load_scale_nn
     if not bool((stiffness[0] > 0) & (force[0] > 0)):
         return "the bridge does not get stiffer than the JKR contact as the gap closes: it needs a core repulsion"
     if bool(((force < -tension) & (stiffness > 0.0)).any()):
@@ -207,12 +230,12 @@ def force_in_phase(
 ) -> Float[Array, "..."]:
     """Return the force on the tip in nN in a phase, at a gap in nm that changes at a rate in nm/us.
 
-    Nothing acts in DRY, all forces of the bridge in BRIDGE, the JKR contact alone in JUNCTION.
+    Nothing acts in DRY, all forces of the bridge in BRIDGE, the solid contact alone in JUNCTION.
     """
     gap = as_argument(gap_nm)
     dry = jnp.zeros_like(gap)
     # the bridge's forces have no value at contact: there the junction's are meant, and the other branch is guarded
     bridge = contact.forces(jnp.where(gap > 0.0, gap, 1.0), gap_rate_nm_per_us)
-    solid = contact.junction.force(junction.shift_nm - gap)
+    solid = contact.solid.force(junction.shift_nm - gap)
     here = jnp.asarray(phase)
     return jnp.where(here == Phase.DRY, dry, jnp.where(here == Phase.BRIDGE, bridge, solid))

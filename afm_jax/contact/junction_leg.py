@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from afm_jax.contact.driven import ContactState, Driven
-from afm_jax.contact.forces import jkr
+from afm_jax.contact.forces.force import ElasticCurve
 from afm_jax.contact.leg import Leg, mean_matrix, nodes_along, settled
 from afm_jax.contact.settings import QuickSetting
 
@@ -47,10 +47,11 @@ def pass_through_junction(tip: Driven, energy_aj: Float[Array, "..."], nodes: in
         energy_aj: kinetic energy where it forms, in aJ.
         nodes: number of Gauss nodes of each quadrature.
     """
-    form, unit = tip.junction.forms_root, tip.load_scale_nn * tip.depth_scale_nm
-    level = jkr.work(form) + jnp.maximum(energy_aj, 0.0) / unit
-    turn = turning_root(level)
-    leaving = energy_aj + unit * (jkr.work(form) - jkr.work(jkr.FOLD))
+    form, solid = tip.junction.forms_root, tip.solid
+    unit = solid.energy_scale_aj
+    level = solid.work(form) + jnp.maximum(energy_aj, 0.0) / unit
+    turn = turning_root(solid, level)
+    leaving = energy_aj + unit * (solid.work(form) - solid.work(solid.fold))
     points, weights, _ = nodes_along(nodes, turn)
     if tip.pull is not None:
         leaving, pull = leaving + tip.pulled_aj(tip.gap_of_root(form), tip.junction.breaks_gap_nm), tip.pull
@@ -60,10 +61,12 @@ def pass_through_junction(tip: Driven, energy_aj: Float[Array, "..."], nodes: in
             return _turn_under(tip, form, level, _mean_pull(tip, pull, form, turn), turn)
 
         turn = lax.fori_loop(0, _TURNS, improve, turn)
-    at = _Half(tip, form).along(turn, points)
+    # both ways go from the inner root to the turning point; one that forms at the fold passes the rest both ways, too
+    inner, rests = (0.5 * turn, 2.0) if solid.reversible else (form, 1.0)
+    at = _Half(tip, inner).along(turn, points)
     inside = _sums(weights, at.pace, tip.gap_of_root(at.s), at.y * at.over_y)
-    outside = _to_fold(tip, form, jnp.maximum(leaving, 0.0) / unit, nodes)
-    time, gap, action = (2.0 * one + other for one, other in zip(inside, outside, strict=True))
+    outside = _to_fold(tip, inner, jnp.maximum(leaving, 0.0) / unit, nodes)
+    time, gap, action = (2.0 * one + rests * other for one, other in zip(inside, outside, strict=True))
     return JunctionWay(leaving, time, tip.gap_of_root(turn), gap, action)
 
 
@@ -104,10 +107,10 @@ def stretch_in_junction(
     # both ends may be turning points: sin^2 takes the square roots out
     share, bend = jnp.sin(0.5 * jnp.pi * points) ** 2, 0.5 * jnp.pi * jnp.sin(jnp.pi * points)
     s = turn - (turn - end) * share
-    missing = level - jkr.work(s)
+    missing = level - tip.solid.work(s)
     moving = missing > 0.0
     speed = _speed_scale(tip) * jnp.sqrt(jnp.where(moving, missing, 1.0))
-    path = tip.depth_scale_nm * (turn - end) * bend * jkr.depth_slope(s)
+    path = tip.depth_scale_nm * (turn - end) * bend * tip.solid.depth_slope(s)
     pace = jnp.where(moving, path / speed, 0.0)
     return Stretch(cumulative @ pace, tip.gap_of_root(s), jnp.where(moving, speed, 0.0), weights @ pace)
 
@@ -115,9 +118,10 @@ def stretch_in_junction(
 def go_through_junction(driven: Driven, state: ContactState, setting: QuickSetting) -> Leg:
     """Return a tip where the junction has broken, from where it has formed with the gap closing; x is the gap."""
     form = driven.junction.forms_root + jnp.zeros_like(state.x)
-    fold = jnp.full_like(form, jkr.FOLD)
-    level = jkr.work(form) + state.gap_rate**2 / _unit(driven)
-    turn = turning_root(level)
+    solid = driven.solid
+    fold = jnp.full_like(form, solid.fold)
+    level = solid.work(form) + state.gap_rate**2 / _unit(driven)
+    turn = turning_root(solid, level)
     others = driven.acceleration(driven.gap_of_root(form), state.gap_rate, state.time_us, jnp.zeros_like(turn))
     for _ in range(2):
         turn = _turn_under(driven, form, level, others, turn)
@@ -125,7 +129,7 @@ def go_through_junction(driven: Driven, state: ContactState, setting: QuickSetti
     turn, at_turn = inward.turn, inward.time_us
     others = driven.acceleration(driven.gap_of_root(turn), jnp.zeros_like(turn), at_turn, jnp.zeros_like(turn))
     outward = _swept(_Half(driven, fold, pressing=False), level, at_turn, (turn, others), setting)
-    work, depth = (of(turn) - of(fold) for of in (jkr.work, jkr.depth))
+    work, depth = (of(turn) - of(fold) for of in (solid.work, solid.depth))
     leaving = jnp.sqrt(_unit(driven) * work + 2.0 * driven.depth_scale_nm * outward.mean * depth)
     return Leg(
         state=ContactState(
@@ -139,27 +143,27 @@ def go_through_junction(driven: Driven, state: ContactState, setting: QuickSetti
     )
 
 
-def turning_root(level: Float[Array, "..."]) -> Float[Array, "..."]:
+def turning_root(solid: ElasticCurve, level: Float[Array, "..."]) -> Float[Array, "..."]:
     """Return the largest s at which the normalised work is `level`, by Newton's method from above.
 
-    The work is convex to the right of its minimum at s = 6^(1/6), so that Newton's steps from above never pass the
-    root. The last two carry the derivatives (two: first and second are right).
+    The work is convex to the right of its minimum, so that Newton's steps from above never pass the root. The last two
+    carry the derivatives (two: first and second are right).
     """
-    fixed = lax.stop_gradient(level)
-    far = (2.5 * jnp.maximum(fixed, 0.0)) ** 0.1
-    root = lax.fori_loop(0, 7, lambda _, root: _newton(root, fixed), jnp.cbrt(far**3 + 3.4))
-    return _newton(_newton(lax.stop_gradient(root), level), level)
+    fixed_curve, fixed = lax.stop_gradient((solid, level))
+    far = fixed_curve.beyond(fixed)
+    root = lax.fori_loop(0, 7, lambda _, root: _newton(fixed_curve, root, fixed), far)
+    return _newton(solid, _newton(solid, lax.stop_gradient(root), level), level)
 
 
-def _newton(root: Float[Array, "..."], level: Float[Array, "..."]) -> Float[Array, "..."]:
-    slope = jkr.load(root) * jkr.depth_slope(root)
+def _newton(solid: ElasticCurve, root: Float[Array, "..."], level: Float[Array, "..."]) -> Float[Array, "..."]:
+    slope = solid.load(root) * solid.depth_slope(root)
     uphill = slope > 0.0
-    return root - jnp.where(uphill, (jkr.work(root) - level) / jnp.where(uphill, slope, 1.0), 0.0)
+    return root - jnp.where(uphill, (solid.work(root) - level) / jnp.where(uphill, slope, 1.0), 0.0)
 
 
 def _unit(driven: Driven) -> Array:
     """Return twice the unit of the junction's energy over the mass: w^2 is that times the normalised energy."""
-    return 2.0 * driven.load_scale_nn * driven.depth_scale_nm * driven.inverse_mass
+    return 2.0 * driven.solid.energy_scale_aj * driven.inverse_mass
 
 
 def _speed_scale(driven: Driven) -> Array:
@@ -194,12 +198,13 @@ class _Half(NamedTuple):
         twice = 2.0 * self.driven.depth_scale_nm
         y = reach * points
         s = turn - y * y
-        square = _unit(self.driven) * _mean_work_slope(turn, s)
+        work_slope, depth_slope = self.driven.solid.mean_slopes(turn, s)
+        square = _unit(self.driven) * work_slope
         if means is None and self.driven.pull is not None:
             means = _mean_pull(self.driven, self.driven.pull, s, turn)
         if means is not None:
-            square = square + twice * _mean_depth_slope(turn, s) * means
-        over_y, slope = jnp.sqrt(square), jkr.depth_slope(s)
+            square = square + twice * depth_slope * means
+        over_y, slope = jnp.sqrt(square), self.driven.solid.depth_slope(s)
         return _Along(s, y, over_y, slope, twice * reach * slope / over_y)
 
 
@@ -228,6 +233,10 @@ def _swept(half: _Half, level: Array, begin_us: Array, guess: tuple[Array, Array
     turn, mean = guess
     points, weights, cumulative = nodes_along(nodes, turn)
     averages = jnp.asarray(mean_matrix(nodes), turn.dtype)
+
+    def mean_depth_slope(turn, s):
+        return driven.solid.mean_slopes(turn, s)[1]
+
     passing = weights - cumulative if half.pressing else cumulative
 
     def sweep(_, swept):
@@ -238,40 +247,23 @@ def _swept(half: _Half, level: Array, begin_us: Array, guess: tuple[Array, Array
         others = driven.acceleration(driven.gap_of_root(at.s), rate, moment, jnp.zeros_like(rate))
         # in the mean over the depth every node counts by its slope
         total = jnp.tensordot(averages, others * at.slope, axes=1)
-        mean = total[-1] / _mean_depth_slope(turn, half.end)
+        mean = total[-1] / mean_depth_slope(turn, half.end)
         after = _turn_under(driven, half.end, level, mean, turn) if half.pressing else turn
-        return after, total[:-1] / _mean_depth_slope(turn, at.s), means, mean
+        return after, total[:-1] / mean_depth_slope(turn, at.s), means, mean
 
     begin = mean + jnp.zeros_like(points)
     turn, means, before, mean = lax.fori_loop(0, setting.junction_sweeps, sweep, (turn, begin, begin, mean))
     at = half.along(turn, points, means)
     duration = jnp.tensordot(weights, at.pace, axes=1)
-    change = jnp.abs((means - before) * twice * _mean_depth_slope(turn, at.s)) / at.over_y**2
+    change = jnp.abs((means - before) * twice * mean_depth_slope(turn, at.s)) / at.over_y**2
     return _Swept(turn, begin_us + duration, mean, settled(change, at.pace, duration, setting))
 
 
 def _turn_under(driven: Driven, form: Array, level: Array, mean: Array, turn: Array) -> Array:
     """Return the turning point, improved by a step of Newton's method, under a mean of the other forces."""
-    unit, twice = _unit(driven), 2.0 * driven.depth_scale_nm
-    excess = unit * (jkr.work(turn) - level) + twice * mean * (jkr.depth(turn) - jkr.depth(form))
-    return turn - excess / (jkr.depth_slope(turn) * (unit * jkr.load(turn) + twice * mean))
-
-
-def _mean_work_slope(turn: Float[Array, "..."], s: Float[Array, "..."]) -> Float[Array, "..."]:
-    """Return (work(turn) - work(s)) / (turn - s) without cancellation: sums of turn^k s^(n-1-k)."""
-    total = jnp.zeros_like(s)
-    for degree, factor in ((10, 0.4), (7, -jkr.SLOPE), (4, 1.0)):
-        powers, power = jnp.ones_like(s), jnp.ones_like(s)
-        for _ in range(degree - 1):
-            power = power * s
-            powers = powers * turn + power
-        total = total + factor * powers
-    return total
-
-
-def _mean_depth_slope(turn: Array, s: Array) -> Array:
-    """Return (depth(turn) - depth(s)) / (turn - s)."""
-    return (turn + s) * (turn * turn + s * s) - jkr.SLOPE
+    unit, twice, solid = _unit(driven), 2.0 * driven.depth_scale_nm, driven.solid
+    excess = unit * (solid.work(turn) - level) + twice * mean * (solid.depth(turn) - solid.depth(form))
+    return turn - excess / (solid.depth_slope(turn) * (unit * solid.load(turn) + twice * mean))
 
 
 def _to_fold(
@@ -279,22 +271,18 @@ def _to_fold(
 ) -> tuple[Array, Array, Array]:
     """Return time and integrals between the fold, left with a kinetic energy in the unit of the work, and s = start."""
     points, weights, _ = nodes_along(nodes, leaving)
-    # work(fold) - work(s) is _CURVATURE (s - fold)^2 to leading order
-    width = jnp.sqrt(jnp.maximum(leaving, 1e-12) / _CURVATURE)
-    reach = jnp.arcsinh((start - jkr.FOLD) / width)
+    solid = tip.solid
+    fold, width = solid.fold, solid.width(leaving)
+    reach = jnp.arcsinh((start - fold) / width)
     # sinh and cosh from one exponential: the library's own are ten times slower
     grown = jnp.exp(reach * points)
-    s = jkr.FOLD + 0.5 * width * (grown - 1.0 / grown)
-    kinetic = leaving + (jkr.work(jkr.FOLD) - jkr.work(s))
+    s = fold + 0.5 * width * (grown - 1.0 / grown)
+    kinetic = leaving + (solid.work(fold) - solid.work(s))
     if tip.pull is not None:
         pulled = tip.pulled_aj(tip.gap_of_root(s), tip.junction.breaks_gap_nm)
-        kinetic = kinetic - pulled / (tip.load_scale_nn * tip.depth_scale_nm)
+        kinetic = kinetic - pulled / solid.energy_scale_aj
     moving = kinetic > 0.0
     rate = jnp.sqrt(jnp.where(moving, kinetic, 1.0))
-    pace = jnp.where(moving, jkr.depth_slope(s) * 0.5 * width * (grown + 1.0 / grown) / rate, 0.0)
+    pace = jnp.where(moving, solid.depth_slope(s) * 0.5 * width * (grown + 1.0 / grown) / rate, 0.0)
     scale = _speed_scale(tip)
     return _sums(weights, reach * pace * (tip.depth_scale_nm / scale), tip.gap_of_root(s), scale * rate)
-
-
-# work' = P Delta' and Delta'(fold) = 0, so that work''(fold) = P(fold) Delta''(fold) = P(fold) 12 fold^2
-_CURVATURE = -6.0 * (jkr.FOLD**6 - 6.0**0.5 * jkr.FOLD**3) * jkr.FOLD**2

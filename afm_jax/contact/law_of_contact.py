@@ -31,7 +31,6 @@ from afm_jax.contact.bridge_leg import margin_of, pass_by_collocation, way_throu
 from afm_jax.contact.collide import capture_speed, collide, collide_in_blocks
 from afm_jax.contact.contact import Bridge, Contact, bridge_of
 from afm_jax.contact.driven import free_tip
-from afm_jax.contact.forces import jkr
 from afm_jax.contact.junction import Junction, find_junction
 from afm_jax.contact.junction_leg import pass_through_junction
 from afm_jax.impact.lasting_impact import TabulatedImpact, polynomials, stretched
@@ -249,9 +248,12 @@ def make_law(contact: Contact, *, mass_ng: float = 1.0, points: int = MOST_KNOTS
     # a contact that captures no tip still needs a positive speed
     beyond = np.geomspace(max(_NEAREST * capture, 1e-3 * _FASTEST), _FASTEST, points)
     found = rebounds(contact, np.hypot(beyond, capture), mass_ng)
-    names = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us")
+    approach, rebound = found["approach_speed_nm_per_us"], found["rebound_speed_nm_per_us"]
     return TabulatedLaw(
-        *(found[name] for name in names),
+        approach,
+        # without any loss rounding may add to the speed
+        np.minimum(rebound, approach),
+        found["collision_delay_us"],
         capture_speed_nm_per_us=capture,
         mass_ng=mass_ng,
         origin=f"contact: {', '.join(contact.effects)}",
@@ -537,12 +539,12 @@ def _traced_back(
     """Return where a tip comes from that leaves with an energy: out, junction and in, each followed against time."""
     tip = free_tip(contact, junction, mass)
     tip = tip._replace(bridge=tip.bridge.reversed())
-    bridge, solid = tip.bridge, contact.junction
+    bridge, solid = tip.bridge, tip.solid
     forms, breaks = contact.bridge_forms_nm, junction.breaks_gap_nm
     outer = jnp.maximum(contact.bridge_breaks_nm, breaks)
     margin = margin_of(left, bridge.force(outer) * -outer)
     out = pass_by_collocation(way_through(tip, (outer, breaks), left, margin, inward=True), rule.nodes, rule.sweeps)
-    elastic = solid.energy_scale_aj * (jkr.work(jkr.FOLD) - jkr.work(junction.forms_root))
+    elastic = solid.energy_scale_aj * (solid.work(solid.fold) - solid.work(junction.forms_root))
     formed = out.energy_aj + elastic
     inside = pass_through_junction(tip, formed, rule.junction)
     came = formed + bridge.potential(junction.forms_gap_nm) - bridge.potential(forms)
@@ -563,7 +565,8 @@ def _barrier(contact: Contact, bridge: Bridge, junction: Junction, outer: Float[
     on, breaks = junction.forms_gap_nm, junction.breaks_gap_nm
     out = bridge.potential(breaks * (outer / breaks) ** share) - bridge.potential(outer)
     # the junction's fold stands as high as the bridge where it breaks; what it takes, the tip had before
-    elastic = contact.junction.energy_scale_aj * (jkr.work(jkr.FOLD) - jkr.work(junction.forms_root))
+    solid = contact.solid
+    elastic = solid.energy_scale_aj * (solid.work(solid.fold) - solid.work(junction.forms_root))
     inward = bridge.potential(on * (contact.bridge_forms_nm / on) ** share) - bridge.potential(on)
     before = inward - elastic + bridge.potential(breaks) - bridge.potential(outer)
     return jnp.maximum(jnp.maximum(largest(out), largest(before)), 0.0)

@@ -8,11 +8,22 @@ from dataclasses import dataclass
 EFFECTS = ("capillary", "structural", "core", "viscous", "jkr")
 """The effects of the paper's contact, by the names of scene files and options."""
 
+DRY_EFFECTS = ("van_der_waals", "viscous", "dmt", "hertz")
+"""The effects of which a dry contact has some: one of the last two, which are its solid contact."""
+
+ALL_EFFECTS = (*EFFECTS, *(name for name in DRY_EFFECTS if name not in EFFECTS))
+"""All of them."""
+
 REQUIRED_EFFECTS = {
     "core": "without the core repulsion the bridge never gets as stiff as the JKR contact, so that no junction forms",
     "jkr": "the JKR contact is the solid junction itself: without it the tip would fall through the sample",
 }
-"""The effects that a contact cannot do without, and why."""
+"""The effects that the paper's contact cannot do without, and why."""
+
+WHY_REQUIRED = REQUIRED_EFFECTS | dict.fromkeys(
+    ("dmt", "hertz"), "it is the solid contact itself: without it the tip would fall through the sample"
+)
+"""Why an effect that a contact has cannot be left out of it."""
 
 REMOVABLE_EFFECTS = tuple(name for name in EFFECTS[::-1] if name not in REQUIRED_EFFECTS)
 """The effects that it can do without."""
@@ -159,6 +170,7 @@ CONTACT_PARAMETERS = (
         meaning="B of the core repulsion",
         unsure=0.5,
         fitted=(1e-82, 1e-74),
+        serves=("core",),
     ),
     ContactParameter(
         name="adhesion_energy_j_per_m2",
@@ -168,6 +180,7 @@ CONTACT_PARAMETERS = (
         unsure=0.3,
         fitted=(0.02, 5.0),
         advice="measure slow impacts too, or hold it or the humidity fixed: both set the hysteresis",
+        serves=("jkr",),
     ),
     ContactParameter(
         name="modulus_gpa",
@@ -186,6 +199,7 @@ CONTACT_PARAMETERS = (
         unsure=0.2,
         fitted=(0.5, 50.0),
         advice="hold it fixed: only slow impacts depend on it",
+        serves=("jkr",),
     ),
     ContactParameter(
         name="bridge_breaks_nm",
@@ -195,9 +209,39 @@ CONTACT_PARAMETERS = (
         unsure=0.2,
         fitted=(0.5, 50.0),
         advice="measure slow impacts too: small drives, close to where the orbit is lost",
+        serves=("jkr",),
     ),
 )
-"""All of them, in the order of scene files and help texts."""
+"""Those of the paper's contact, in the order of scene files and help texts."""
+
+DRY_PARAMETERS = (
+    ContactParameter(
+        name="hamaker_constant_aj",
+        unit="aJ",
+        default=0.1,
+        allowed="not negative",
+        meaning="H of the van der Waals force; 0.1 is typical in air",
+        fitted=(0.0, 10.0),
+        serves=("van_der_waals",),
+    ),
+    ContactParameter(
+        name="contact_distance_nm",
+        unit="nm",
+        default=0.165,
+        meaning="a0, the gap at which the solids of a DMT contact meet",
+        fitted=(0.05, 5.0),
+        serves=("dmt",),
+    ),
+    ContactParameter(
+        name="range_nm",
+        unit="nm",
+        default=20.0,
+        meaning="gap at which a DMT contact begins and ends: the force is cut there",
+        fitted=(1.0, 1e3),
+        serves=("dmt",),
+    ),
+)
+"""Those that only a dry contact has; it shares modulus, tip radius and viscosity."""
 
 CONTACT_PARAMETER = {parameter.name: parameter for parameter in CONTACT_PARAMETERS}
 """The same by name."""
@@ -205,12 +249,14 @@ CONTACT_PARAMETER = {parameter.name: parameter for parameter in CONTACT_PARAMETE
 PAPER = {parameter.name: parameter.default for parameter in CONTACT_PARAMETERS}
 """The paper's value of each."""
 
+DEFAULTS = PAPER | {parameter.name: parameter.default for parameter in DRY_PARAMETERS}
+"""The value of each that is taken where nothing is said, those of dry contacts included."""
 
-CONTACT_RANGES = {parameter.name: parameter.allowed for parameter in CONTACT_PARAMETERS}
+CONTACT_RANGES = {parameter.name: parameter.allowed for parameter in (*CONTACT_PARAMETERS, *DRY_PARAMETERS)}
 """Which values of each `afm_jax.checks.check_parameter` lets pass."""
 
 
 def idle_without(name: str, effects: tuple[str, ...]) -> tuple[str, ...]:
     """Return the effects that a parameter lacks to mean anything; none if it is of use with those given."""
-    serves = CONTACT_PARAMETER[name].serves if name in CONTACT_PARAMETER else ()
+    serves = next((known.serves for known in (*CONTACT_PARAMETERS, *DRY_PARAMETERS) if known.name == name), ())
     return () if not serves or set(serves) & set(effects) else serves

@@ -1,12 +1,12 @@
 """One step in time of a tip in contact, and the search for the events that end a phase.
 
 The equation of motion (eq. 16, `Driven.rates`) is smooth within a phase. A phase ends where x, the gap in the bridge
-and s = sqrt(A) in the junction, meets a threshold:
+and the root s in the junction, meets a threshold:
 
     free (DRY) --- x = forms_nm, found by the flight's own search ---> BRIDGE
     BRIDGE     --- x = breaks_nm ------------------------------------> free
                --- x = forms_gap_nm ---------------------------------> JUNCTION
-    JUNCTION   --- s = FOLD -----------------------------------------> BRIDGE where that outlives it, else free
+    JUNCTION   --- s = fold -----------------------------------------> BRIDGE where that outlives it, else free
 
 A trial is one step of Dormand and Prince's method of order 8 (Diffrax's coefficients):
 
@@ -31,11 +31,12 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.contact.driven import ContactState, Driven
-from afm_jax.contact.forces import jkr
 from afm_jax.contact.junction import Phase
 
 _NEAR = 1e-7
 """Relative distance from a threshold within which the parabola is exact to rounding."""
+_NEAR_FOLD = 1e-5
+"""That of a fold at s = 0, relative to where the step began: s bends little there."""
 _SHORTEST = 1e-3
 """Bounds of a repeated trial's length over that of the failed one: this, and 1 less a tenth of it."""
 _CORE_FRACTION = 0.4
@@ -67,6 +68,19 @@ class TipInContact(NamedTuple):
         """Return a tip at the start of a contact, or a free tip (phase DRY)."""
         none, zero = jnp.zeros_like(phase, dtype=jnp.int32), jnp.zeros_like(state.x)
         return cls(state, phase.astype(jnp.int32), zero, none, zero, zero, zero, state.x, none)
+
+    @classmethod
+    def arriving(cls, driven: Driven, state: ContactState, arrives: Bool[Array, "..."]) -> "TipInContact":
+        """Return a tip that meets the bridge, or solids between which nothing acts before; a free tip else."""
+        tip = cls.at_start(state, jnp.where(arrives, Phase.BRIDGE, Phase.DRY))
+        if driven.bridge.spans:
+            return tip
+        return tip._replace(
+            state=state._replace(x=jnp.where(arrives, driven.junction.forms_root, state.x)),
+            phase=jnp.where(arrives, Phase.JUNCTION, Phase.DRY).astype(jnp.int32),
+            junctions=arrives.astype(jnp.int32),
+            junction_forms_us=jnp.where(arrives, state.time_us, 0.0),
+        )
 
 
 def advance(
@@ -124,6 +138,11 @@ class _Trial(NamedTuple):
     high: Float[Array, "..."]
 
     @property
+    def near_low(self) -> Float[Array, "..."]:
+        """Distance from the low threshold within which the parabola is exact; s is 0 at the fold of a dry contact."""
+        return jnp.where(self.low > 0.0, _NEAR * self.low, _NEAR_FOLD * self.start.x)
+
+    @property
     def path(self) -> "_Cubic":
         """The cubic of x along the step."""
         return _Cubic.of(self.start.x, self.start_rates.x * self.length, self.end.x, self.end_rates.x * self.length)
@@ -134,7 +153,7 @@ def _try_step(
 ) -> _Trial:
     """Return a trial: to a threshold or the end if it lies within 1.2 usual steps, unless its length is given."""
     start, solid = tip.state, tip.phase == Phase.JUNCTION
-    low = jnp.where(solid, jkr.FOLD, driven.junction.forms_gap_nm)
+    low = jnp.where(solid, driven.solid.fold, driven.junction.forms_gap_nm)
     high = jnp.where(solid, jnp.inf, driven.breaks_nm)
     rates = driven.rates(start, solid)
     usual = 1.0 / (fineness * _inverse_step(driven, *lax.stop_gradient((start, rates)), solid))
@@ -153,7 +172,7 @@ def _repetition(trial: _Trial, until_us: Float[Array, "..."]) -> tuple[Bool[Arra
     below, above, late = end.x < trial.low, end.x > trial.high, end.time_us > until
 
     # a threshold met within rounding of the parabola needs no other trial
-    too_far = below & (trial.low - end.x > _NEAR * trial.low) | above & (end.x - trial.high > _NEAR * trial.high)
+    too_far = below & (trial.low - end.x > trial.near_low) | above & (end.x - trial.high > _NEAR * trial.high)
     too_late = late & (end.time_us - until > _NEAR * length * jnp.maximum(end_rates.time_us, 1e-3))
     level = jnp.where(below, trial.low, jnp.where(above, trial.high, 0.0))
     in_x = _Cubic.of(start.x - level, rates.x * length, end.x - level, end_rates.x * length)
@@ -184,7 +203,7 @@ class _Landing(NamedTuple):
 def _land(trial: _Trial, until_us: Float[Array, "..."]) -> _Landing:
     """Return the end of a trial, moved by a parabola onto the threshold, or the end of the simulation, that it met."""
     end, rates, low, high = trial.end, trial.end_rates, trial.low, trial.high
-    closing = (end.x - low < _NEAR * low) & (end.gap_rate != 0.0) & (rates.x < 0.0)
+    closing = (end.x - low < trial.near_low) & (end.gap_rate != 0.0) & (rates.x < 0.0)
     opening = (high - end.x < _NEAR * high) & (rates.x > 0.0)
     at_low, at_high = (end.x <= low) | closing, (end.x >= high) | opening
     target = jnp.where(at_low, low, jnp.where(at_high, high, end.x))
@@ -260,17 +279,14 @@ def inverse_bridge_step(driven: Driven, state: ContactState, acceleration: Float
 def inverse_junction_step(driven: Driven, state: ContactState) -> Float[Array, "..."]:
     """Return the inverse of the scale of fictitious time of a tip in the junction.
 
-    The root of the squares of: the frequency of the junction's stiffness, the speed over s, and the frequencies of
-    cantilever and drive.
+    The root of the squares of: the frequency of the junction's stiffness, the speed over the distance in s in which the
+    load changes, and the frequencies of cantilever and drive.
     """
-    s = state.x
-    cube = s**3
-    curvature = s * s * (cube * (36.0 * cube - 42.0 * jkr.SLOPE) + 12.0)
-    # where the curvature vanishes, at s = 1.196, its terms still tell how fast it comes back
-    bent = jnp.maximum(jnp.abs(curvature), 0.3 * s * s * (36.0 * cube * cube + 12.0))
-    elastic = bent * driven.load_scale_nn * driven.inverse_mass / driven.depth_scale_nm
-    passing = 3.0 * state.gap_rate / (driven.depth_scale_nm * s)
-    return 0.8 * jnp.sqrt(elastic + passing**2 + (_drive_frequency(driven) * jkr.depth_slope(s)) ** 2)
+    s, curve = state.x, driven.solid
+    energy = 0.5 * driven.mass_ng * state.gap_rate**2 / curve.energy_scale_aj
+    elastic = curve.bend(s) * driven.load_scale_nn * driven.inverse_mass / driven.depth_scale_nm
+    passing = 3.0 * state.gap_rate / (driven.depth_scale_nm * curve.reach(s, energy))
+    return 0.8 * jnp.sqrt(elastic + passing**2 + (_drive_frequency(driven) * curve.depth_slope(s)) ** 2)
 
 
 def _drive_frequency(driven: Driven) -> Float[Array, "..."]:

@@ -17,7 +17,6 @@ from afm_jax.checks import as_parameter, check_parameter, check_scalar, checked,
 from afm_jax.contact.bridge_leg import Way, margin_of, sweep, way_through
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Driven, free_tip
-from afm_jax.contact.forces import jkr
 from afm_jax.contact.junction import Junction, Phase, explain_missing_junction, find_junction, force_in_phase
 from afm_jax.contact.junction_leg import stretch_in_junction, turning_root
 from afm_jax.results import ResultTuple, public_result
@@ -90,7 +89,8 @@ def _course(
 ) -> tuple[Junction, list[_Leg], Float[Array, "3"]]:
     """Return the four legs, and kinetic energies where the junction forms and breaks with the rebound speed."""
     junction = find_junction(contact)
-    tip, solid = free_tip(contact, junction, mass), contact.junction
+    tip = free_tip(contact, junction, mass)
+    solid = tip.solid
     forms, breaks = contact.bridge_forms_nm, jnp.maximum(contact.bridge_breaks_nm, junction.breaks_gap_nm)
     pull_in, pull_out = (-tip.bridge.force(gap) * gap for gap in (forms, breaks))
     start = 0.5 * mass * speed * speed
@@ -98,9 +98,9 @@ def _course(
     inward, on = _crossing(
         way_through(tip, (forms, junction.forms_gap_nm), start, margin_of(start, pull_in), inward=True)
     )
-    level = jkr.work(junction.forms_root) + on / solid.energy_scale_aj
+    level = solid.work(junction.forms_root) + on / solid.energy_scale_aj
     loading, unloading = _junction_legs(tip, level)
-    off = (level - jkr.work(jkr.FOLD)) * solid.energy_scale_aj
+    off = (level - solid.work(solid.fold)) * solid.energy_scale_aj
 
     def way_out(outer: Float[Array, ""], margin: Float[Array, ""]) -> Way:
         return way_through(tip, (outer, junction.breaks_gap_nm), off, margin, inward=False)
@@ -128,7 +128,10 @@ def _largest(holds: Callable[[Array], Array], low: Float[Array, ""], high: Float
 
 
 def _crossing(way: Way) -> tuple[_Leg, Float[Array, ""]]:
-    """Return a crossing of the bridge and the kinetic energy at its end."""
+    """Return a crossing of the bridge and the kinetic energy at its end; of no length where nothing acts before."""
+    if not way.tip.bridge.spans:
+        nothing = jnp.zeros(_NODES)
+        return _Leg(nothing, nothing, nothing, jnp.zeros(())), way.total_aj - way.end_potential_aj
     swept = sweep(way, _NODES, _SWEEPS)
     end = swept.passage
     return _Leg(swept.lasted_us, swept.at.gap_nm, -way.sense * swept.speed, end.time_us), end.energy_aj
@@ -136,11 +139,12 @@ def _crossing(way: Way) -> tuple[_Leg, Float[Array, ""]]:
 
 def _junction_legs(tip: Driven, level: Float[Array, ""]) -> tuple[_Leg, _Leg]:
     """Return the ways from the formation of the junction to the turning point, and from there to the fold."""
-    turn = turning_root(level)
-    lowest = jnp.full_like(turn, 6.0 ** (1.0 / 6.0))  # of the work: left of it the contact pulls
-    fold = jnp.full_like(turn, jkr.FOLD)
-    breaks = level > jkr.work(fold)
-    stop = lowest + fold - _largest(lambda s: jkr.work(lowest + fold - s) < level, fold, lowest)
+    solid = tip.solid
+    turn = turning_root(solid, level)
+    lowest = solid.unloaded  # of the work: left of it the contact pulls
+    fold = jnp.full_like(turn, solid.fold)
+    breaks = level > solid.work(fold)
+    stop = lowest + fold - _largest(lambda s: solid.work(lowest + fold - s) < level, fold, lowest)
     out = stretch_in_junction(tip, level, turn, jnp.where(breaks, fold, stop), _NODES)
     into = stretch_in_junction(tip, level, turn, tip.junction.forms_root, _NODES)
     # the way in is the way out of the same energy, backwards
@@ -162,8 +166,8 @@ def _joined(
     begin = 0.0
     _, off, rebound = energies
     for phase, leg in zip((Phase.BRIDGE, Phase.JUNCTION, Phase.JUNCTION, Phase.BRIDGE), legs, strict=True):
-        if leg is legs[-1] and (off <= 0.0 or not leg.duration > 0.0):
-            break
+        if not leg.duration > 0.0 or (leg is legs[-1] and off <= 0.0):
+            continue
         parts.append((phase, begin + np.asarray(leg.time), np.asarray(leg.gap), np.asarray(leg.velocity)))
         begin += float(leg.duration)
     captured = not rebound > 0.0

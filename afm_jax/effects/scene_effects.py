@@ -10,9 +10,11 @@ import jax.numpy as jnp
 
 from afm_jax.apparatus.scene import Scene
 from afm_jax.contact.contact import Contact
+from afm_jax.contact.forces.dry import Dmt, Hertz
+from afm_jax.contact.forces.jkr import Jkr
 from afm_jax.contact.forces.liquid import Capillary, Structural, Viscous
-from afm_jax.contact.forces.solid import CoreRepulsion
-from afm_jax.contact.parameters import REQUIRED_EFFECTS
+from afm_jax.contact.forces.solid import CoreRepulsion, VanDerWaals
+from afm_jax.contact.parameters import WHY_REQUIRED
 from afm_jax.impact.law import ImpactLaw
 
 
@@ -37,7 +39,7 @@ def effects_in(scene: Scene) -> list[SceneEffect]:
     effects: list[SceneEffect] = []
     if isinstance(interaction, Contact):
         effects += [_force(interaction, place) for place in range(len(interaction.forces.terms))]
-        effects.append(_required("jkr", "solid junction (JKR)"))
+        effects.append(_required(*_SOLIDS[type(interaction.junction)]))
     elif isinstance(interaction, ImpactLaw):
         effects += _of_law(interaction)
     if scene.cantilever.quality_factor is not None:
@@ -45,8 +47,15 @@ def effects_in(scene: Scene) -> list[SceneEffect]:
     return effects + list(_of_drives(scene))
 
 
+_SOLIDS: dict[type, tuple[str, str]] = {
+    Jkr: ("jkr", "solid junction (JKR)"),
+    Dmt: ("dmt", "solid contact (DMT)"),
+    Hertz: ("hertz", "solid contact (Hertz)"),
+}
+
+
 def _required(name: str, sentence: str) -> SceneEffect:
-    return SceneEffect(name, sentence, without=lambda scene: scene, required=REQUIRED_EFFECTS[name])
+    return SceneEffect(name, sentence, without=lambda scene: scene, required=WHY_REQUIRED[name])
 
 
 def _replacing(part: Callable[[Scene], Any], left_out: Any) -> Callable[[Scene], Scene]:
@@ -59,6 +68,7 @@ _FORCES: dict[type, tuple[str, str, str]] = {
     # in the Kelvin radius too)
     Capillary: ("capillary", "capillary attraction of the liquid bridge", "tip_radius_nm"),
     Structural: ("structural", "structural repulsion of the confined liquid", "amplitude_n_per_m"),
+    VanDerWaals: ("van_der_waals", "van der Waals attraction", "hamaker_constant_aj"),
     Viscous: ("viscous", "viscous force of the liquid bridge", "viscosity_pa_s"),
 }
 

@@ -1,19 +1,18 @@
 """A contact scene in time: closed-form flight to the bridge, through the contact, and so on to the end.
 
-Every tip of a batch goes at its own pace. A round takes each free tip to its next contact, as far through it as the
-quick way leg by leg holds, and tips that are still in contact some trial steps in time, until they are where the quick
-way may go on; so a batch does not wait for the few contacts that turn inside the bridge. All shapes are fixed.
+A round takes a tip through its flight to the next contact, as far through the contact as its legs hold
+(`legs_through`), and from there some steps in time (`contact/step.py`) until a leg begins again or the tip has left. A
+leg holds for a tip that goes straight on: in the bridge the gap is the variable, in the junction s = sqrt(A), so that
+thresholds are met without a search, and the speed follows from the energy. One that turns in the bridge, or is slow
+somewhere, goes in time from where the last leg that held has left it. Contacts that magnify errors are computed again
+in finer steps.
 
-The quick way through a driven contact: in through the bridge, through the junction, and out again, leg by leg.
-
-The gap is the variable in the bridge, s = sqrt(A) in the junction, so that thresholds are met without a search, and the
-speed follows from the energy: the static forces, which vary most, need no integration. A leg holds for a tip that goes
-straight on. One that turns in the bridge, or is slow somewhere, stays where the last leg that held has left it. It goes
-on from there in time, until it is where a leg begins again.
+Every tip of a batch goes at its own rate, and a batch does not wait for the few contacts that turn inside the bridge.
+All shapes are fixed.
 """
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -32,88 +31,13 @@ from afm_jax.motion.record import ContactKind, MotionOutcome
 from afm_jax.outcomes import Outcome
 from afm_jax.solve.lanes import repeat_for
 
-
-def cross(driven: Driven, place: ContactState, setting: QuickSetting) -> Leg:
-    """Return a tip beyond the contact that it has just begun.
-
-    Args:
-        driven: the equation of motion.
-        place: where the bridge forms; the gap closes.
-        setting: how finely.
-    """
-    inward = go_in(driven, place, setting)
-    solid = go_through_junction(driven, inward.state, setting)
-    outward = go_out(driven, solid.state, setting)
-    return outward._replace(deepest_gap_nm=solid.deepest_gap_nm, holds=inward.holds & solid.holds & outward.holds)
-
-
-def at_junction(driven: Driven, touch: TipInContact) -> Bool[Array, "..."]:
-    """Say whether a tip has just formed the junction, so that the quick way may go on from there."""
-    return (touch.phase == Phase.JUNCTION) & (touch.state.x == driven.junction.forms_root) & (touch.trial_length == 0.0)
-
-
-def go_quickly(
-    driven: Driven, touch: TipInContact, arrived: Array, active: Array, until_us: Array, setting: DrivenSetting
-) -> TipInContact:
-    """Return a tip as far on its way through the contact as legs hold that end before a time.
-
-    Args:
-        driven: the equation of motion.
-        touch: the tip.
-        arrived: it has just begun the contact.
-        active: it moves.
-        until_us: the time.
-        setting: how finely.
-    """
-    quick = setting.quick
-    if quick is None:
-        raise ValueError("`setting` has no quick way")
-
-    def taken(leg, wanted):
-        return wanted & leg.holds & (leg.state.time_us < until_us)
-
-    leg = go_in(driven, touch.state, quick)
-    formed = taken(leg, arrived)
-    touch = _moved(touch, leg, formed, Phase.JUNCTION)
-    touch = touch._replace(
-        junctions=touch.junctions + formed.astype(touch.junctions.dtype),
-        junction_forms_us=jnp.where(formed, touch.state.time_us, touch.junction_forms_us),
-    )
-    leg = go_through_junction(driven, touch.state, quick)
-    wet = driven.junction.breaks_gap_nm < driven.breaks_nm
-    waits = at_junction(driven, touch) & active
-    broken = taken(leg, waits & wet)
-    # one for which it does not hold is told how far to go in time, and waits no longer
-    there = lax.stop_gradient(touch.state._replace(x=driven.junction.forms_root))
-    step = lax.stop_gradient(1.0 / (setting.fineness * inverse_junction_step(driven, there)))
-    touch = touch._replace(trial_length=jnp.where(waits & ~broken, step, touch.trial_length))
-    passed = touch.time_in_junction_us + leg.state.time_us - touch.state.time_us
-    touch = _moved(touch, leg, broken, Phase.BRIDGE)
-    touch = touch._replace(
-        junction_breaks_us=jnp.where(broken, touch.state.time_us, touch.junction_breaks_us),
-        time_in_junction_us=jnp.where(broken, passed, touch.time_in_junction_us),
-    )
-    leg = go_out(driven, touch.state, quick)
-    return _moved(touch, leg, taken(leg, broken), Phase.DRY)
-
-
-def _moved(touch: TipInContact, leg: Leg, moves: Array, phase: Phase) -> TipInContact:
-    """Return a tip at the end of a leg, where it takes it."""
-    return touch._replace(
-        state=jax.tree.map(lambda new, old: jnp.where(moves, new, old), leg.state, touch.state),
-        phase=jnp.where(moves, phase, touch.phase).astype(touch.phase.dtype),
-        trial_length=jnp.where(moves, 0.0, touch.trial_length),
-        deepest_gap_nm=jnp.where(moves, jnp.minimum(touch.deepest_gap_nm, leg.deepest_gap_nm), touch.deepest_gap_nm),
-    )
-
-
 _ROUNDS = 8
-"""Rounds between two looks at whether all tips have arrived at the end."""
+"""Rounds between two checks whether all tips have arrived at the end."""
 _FLIGHT_STEPS = 2000
 _LEGS_AT_ONCE, _TRIALS_AT_ONCE = 256, 64
-"""Tips of a batch that go the quick way together, and that try steps in time together."""
+"""Tips of a batch that go through legs together, and that try steps in time together."""
 _TRIALS = 4
-"""Trial steps between two looks at which tips of a batch need more."""
+"""Trial steps between two checks which tips of a batch need more."""
 _LASTS_LONG = 10.0
 """Times that a tip as fast as it came takes for the bridge's gaps, in and out."""
 _FINER, _MOST_REPEATS = 1.5, 5
@@ -139,14 +63,6 @@ class ContactRow(NamedTuple):
     viscous_loss_aj: Float[Array, "..."]
 
 
-class Arrival(NamedTuple):
-    """Where a contact began; scalars of one tip."""
-
-    time_us: Float[Array, ""]
-    gap_nm: Float[Array, ""]
-    gap_rate: Float[Array, ""]
-
-
 class Repeats(NamedTuple):
     """How often the present contact was computed again, and what it ended with the last time; scalars of one tip."""
 
@@ -156,11 +72,11 @@ class Repeats(NamedTuple):
 
 
 class ContactTip(NamedTuple):
-    """A tip on its way; scalars of one tip, but for the rows."""
+    """A tip on its way through a scene; scalars of one tip, but for the rows."""
 
-    touch: TipInContact
-    """Its place and phase, and the contact it is in; the gap of a free tip."""
-    arrival: Arrival
+    tip: TipInContact
+    """State and phase, and a record of the present contact; x of a free tip is the gap."""
+    arrival: ContactState
     """Where the present contact began."""
     repeats: Repeats
     contacts: Int[Array, ""]
@@ -171,33 +87,41 @@ class ContactTip(NamedTuple):
 
 
 def begin(driven: Driven, time_us: Array, gap_nm: Array, rate: Array, rows: int) -> ContactTip:
-    """Return a tip at its start: free above the gap where the bridge forms, in the bridge below it."""
-    wet = gap_nm <= driven.forms_nm
+    """Return a tip at its start: free above the gap where the bridge forms, in the bridge below it.
+
+    Args:
+        driven: the equation of motion.
+        time_us: of the start.
+        gap_nm: at the start.
+        rate: of the gap, in nm/us.
+        rows: contacts there is room for.
+    """
     sane = jnp.isfinite(time_us) & jnp.isfinite(rate) & (gap_nm > driven.junction.forms_gap_nm)
     outcome = jnp.where(sane, MotionOutcome.FINISHED, MotionOutcome.INVALID_START)
     outcome = jnp.where(driven.junction.exists, outcome, MotionOutcome.NO_JUNCTION)
-    phase = jnp.where(wet, Phase.BRIDGE, Phase.DRY)
-    zero = jnp.zeros_like(time_us)
+    phase = jnp.where(gap_nm <= driven.forms_nm, Phase.BRIDGE, Phase.DRY)
+    none, zero = jnp.zeros_like(phase), jnp.zeros_like(time_us)
+    start = ContactState(gap_nm, rate, time_us, zero)
     return ContactTip(
-        touch=TipInContact.at_start(ContactState(gap_nm, rate, time_us, zero), phase),
-        arrival=Arrival(time_us, gap_nm, rate),
-        repeats=Repeats(jnp.zeros_like(phase, dtype=jnp.int32), zero, zero),
-        contacts=jnp.zeros_like(phase),
+        tip=TipInContact.at_start(start, phase),
+        arrival=start,
+        repeats=Repeats(none.astype(jnp.int32), zero, zero),
+        contacts=none,
         rows=jnp.zeros((rows, len(ContactRow._fields)), time_us.dtype),
         outcome=outcome.astype(jnp.int32),
         done=outcome != MotionOutcome.FINISHED,
-        rounds=jnp.zeros_like(phase),
+        rounds=none,
     )
 
 
 def follow(
-    driven: Driven, tip: ContactTip, until_us: Array, setting: DrivenSetting, *, rounds: int, reverse: bool
+    driven: Driven, start: ContactTip, until_us: Array, setting: DrivenSetting, *, rounds: int, reverse: bool
 ) -> ContactTip:
     """Return a tip at the end of the simulation.
 
     Args:
         driven: the equation of motion.
-        tip: the tip at its start.
+        start: the tip at its start.
         until_us: the end.
         setting: how finely contacts are resolved.
         rounds: most rounds.
@@ -206,120 +130,176 @@ def follow(
     blocks = -(-rounds // _ROUNDS)
     advance_round = partial(_round, driven, until_us=until_us, setting=setting, reverse=reverse)
 
-    def block(tip, _):
-        return lax.scan(lambda state, _: (advance_round(state), None), tip, None, length=_ROUNDS)
+    def block(course, _):
+        return lax.scan(lambda state, _: (advance_round(state), None), course, None, length=_ROUNDS)
 
     if reverse:
-        tip, _ = lax.scan(jax.checkpoint(block), tip, None, length=blocks)
+        course, _ = lax.scan(jax.checkpoint(block), start, None, length=blocks)
     else:
         limit = blocks * _ROUNDS
-        tip = lax.while_loop(lambda tip: ~tip.done & (tip.rounds < limit), lambda tip: block(tip, None)[0], tip)
-    outcome = jnp.where(tip.done, tip.outcome, MotionOutcome.STEP_LIMIT)
-    return tip._replace(outcome=outcome.astype(jnp.int32))
+        course = lax.while_loop(
+            lambda course: ~course.done & (course.rounds < limit), lambda course: block(course, None)[0], start
+        )
+    outcome = jnp.where(course.done, course.outcome, MotionOutcome.STEP_LIMIT)
+    return course._replace(outcome=outcome.astype(jnp.int32))
 
 
-def _round(driven: Driven, tip: ContactTip, *, until_us: Array, setting: DrivenSetting, reverse: bool) -> ContactTip:
-    """Return a tip after one round: flight, the quick way through the contact, trial steps where that does not hold."""
-    free = (tip.touch.phase == Phase.DRY) & ~tip.done
-    arrived, lost, place = _fly(driven, tip.touch.state, free, until_us)
-    began = (place.time_us, place.x, place.gap_rate)
-    arrival = Arrival(*(jnp.where(arrived, new, old) for new, old in zip(began, tip.arrival, strict=True)))
-    fresh = TipInContact.at_start(place, jnp.where(arrived, Phase.BRIDGE, Phase.DRY))
-    touch = jax.tree.map(lambda new, old: jnp.where(free, new, old), fresh, tip.touch)
-    active, first = ~tip.done, tip.repeats.times == 0
-    touch = _through(driven, touch, arrived, active & first, until_us, setting)
-    touch = _step(driven, touch, active, tip.repeats.times, until_us, setting, reverse=reverse)
-    over = touch.state.time_us >= until_us
-    left = touch.phase == Phase.DRY
-    touched = arrived | ((tip.touch.phase != Phase.DRY) & active)
-    again, repeats = _again(touch, arrival, tip.repeats, touched & left & ~over, setting)
-    ended = touched & (left | over) & ~again
-    room = tip.contacts < tip.rows.shape[0]
-    row = _row(touch, arrival, held=~left)
-    place_of_row = jnp.where(ended & room, tip.contacts, tip.rows.shape[0])
-    full = ended & ~room
-    outcome = jnp.where(full, MotionOutcome.CONTACT_LIMIT, tip.outcome)
-    outcome = jnp.where(ended & ~left, MotionOutcome.HELD, outcome)
+def _round(driven: Driven, course: ContactTip, *, until_us: Array, setting: DrivenSetting, reverse: bool) -> ContactTip:
+    """Return a tip after one round: flight, legs through the contact, steps in time where those do not hold."""
+    active, free = ~course.done, (course.tip.phase == Phase.DRY) & ~course.done
+    flown, arrives, lost = _fly(driven, course.tip.state, free, until_us)
+    tip = TipInContact.arriving(driven, flown, arrives)
+    tip, arrival = _where(free, tip, course.tip), _where(arrives, flown, course.arrival)
+    tip = _through_legs(driven, tip, arrives, active & (course.repeats.times == 0), until_us, setting)
+    tip = _step_in_time(driven, tip, active, course.repeats.times, until_us, setting, reverse=reverse)
+
+    in_contact, leaves, over = active & (arrives | ~free), tip.phase == Phase.DRY, tip.state.time_us >= until_us
+    again, repeats = _repetition(tip, arrival, course.repeats, in_contact & leaves & ~over, setting)
+    ends = in_contact & (leaves | over) & ~again
+    room = course.rows.shape[0]
+    full, finite = ends & (course.contacts >= room), jnp.isfinite(tip.state.x)
+    outcome = jnp.where(full, MotionOutcome.CONTACT_LIMIT, course.outcome)
+    outcome = jnp.where(ends & ~leaves, MotionOutcome.HELD, outcome)
     outcome = jnp.where(lost, MotionOutcome.STEP_LIMIT, outcome)
-    outcome = jnp.where(jnp.isfinite(touch.state.x), outcome, MotionOutcome.UNRESOLVED)
-    flown = free & ~arrived
+    outcome = jnp.where(finite, outcome, MotionOutcome.UNRESOLVED)
     if setting.agreement is not None:
-        came = ContactState(arrival.gap_nm, arrival.gap_rate, arrival.time_us, jnp.zeros_like(arrival.time_us))
-        back = TipInContact.at_start(came, jnp.full_like(touch.phase, Phase.BRIDGE))
-        touch = jax.tree.map(lambda new, old: jnp.where(again, new, old), back, touch)
+        tip = _where(again, TipInContact.arriving(driven, arrival, jnp.ones_like(again)), tip)
+    place = jnp.where(ends & ~full, course.contacts, room)
     return ContactTip(
-        touch=touch,
+        tip=tip,
         arrival=arrival,
         repeats=repeats,
-        contacts=tip.contacts + ended.astype(tip.contacts.dtype),
-        rows=tip.rows.at[place_of_row].set(row, mode="drop"),
-        outcome=jnp.where(tip.done, tip.outcome, outcome).astype(jnp.int32),
-        done=tip.done | flown | (touched & over) | full | lost | ~jnp.isfinite(touch.state.x),
-        rounds=tip.rounds + 1,
+        contacts=course.contacts + ends.astype(course.contacts.dtype),
+        rows=course.rows.at[place].set(_row(tip, arrival, held=~leaves), mode="drop"),
+        outcome=jnp.where(course.done, course.outcome, outcome).astype(jnp.int32),
+        done=course.done | (free & ~arrives) | (in_contact & over) | full | lost | ~finite,
+        rounds=course.rounds + 1,
     )
 
 
-def _again(
-    touch: TipInContact, arrival: Arrival, repeats: Repeats, left: Array, setting: DrivenSetting
-) -> tuple[Array, Repeats]:
-    """Say whether a contact that a tip has left is to be computed again in finer steps, and what that will know."""
-    if setting.agreement is None:
-        return jnp.zeros_like(left), repeats
-    came, now, before = lax.stop_gradient((arrival, touch.state, repeats))
-    lasts = (now.time_us - came.time_us) * jnp.abs(came.gap_rate) > _LASTS_LONG * (came.gap_nm + now.x)
-    slowed = setting.magnified * now.gap_rate**2 < came.gap_rate**2
-    differs = jnp.maximum(
-        jnp.abs(now.gap_rate - before.departure_rate),
-        10.0 * jnp.abs(now.time_us - before.departure_us) * jnp.abs(now.gap_rate),
-    ) > _LESS * setting.agreement * jnp.abs(now.gap_rate)
-    magnified = slowed | lasts | (touch.junctions != 1)
-    again = left & jnp.where(repeats.times == 0, magnified, differs & (repeats.times < _MOST_REPEATS))
-    known = Repeats(repeats.times + 1, now.time_us, now.gap_rate)
-    kept = repeats._replace(times=jnp.where(left, 0, repeats.times))
-    return again, jax.tree.map(lambda new, old: jnp.where(again, new, old), known, kept)
+def _where(condition: Array, new: Any, old: Any) -> Any:
+    """Return a tree with the leaves of one where a condition holds, else those of another."""
+    return jax.tree.map(partial(jnp.where, condition), new, old)
 
 
-def _fly(driven: Driven, place: ContactState, free: Array, until_us: Array) -> tuple[Array, Array, ContactState]:
-    """Return whether a free tip meets the bridge before the end, whether the search gave up, and where the tip is."""
-    surface, start = driven.surface, place.time_us
-    # tips that are not free start below the level, so that their search ends at once
-    gap = jnp.where(free, place.x, 0.5 * driven.forms_nm)
-    height, speed = surface.position_and_velocity(start)
-    velocity = place.gap_rate + speed
-    flight = Flight(driven.cantilever, surface, start, velocity, gap, driven.forms_nm)
-    found = first_impact(flight, max_steps=_FLIGHT_STEPS, latest_us=until_us - start)
-    arrives = free & (found.outcome == Outcome.IMPACT) & (start + found.duration_us < until_us)
-    lost = free & (found.outcome == Outcome.STEP_LIMIT)
-    duration = jnp.where(arrives, found.duration_us, jnp.where(free, until_us - start, 0.0))
+def _fly(
+    driven: Driven, start: ContactState, free: Array, until_us: Array
+) -> tuple[ContactState, Bool[Array, ""], Bool[Array, ""]]:
+    """Return where a free tip meets the bridge or is at the end, whether it meets it, and whether the search gave up.
+
+    A tip that is not free stays where it is: its search starts below the level and ends at once.
+    """
+    surface = driven.surface
+    gap = jnp.where(free, start.x, driven.forms_nm - 1.0)
+    height, speed = surface.position_and_velocity(start.time_us)
+    velocity = start.gap_rate + speed
+    flight = Flight(driven.cantilever, surface, start.time_us, velocity, gap, driven.forms_nm)
+    arrival = first_impact(flight, max_steps=_FLIGHT_STEPS, latest_us=until_us - start.time_us)
+    in_time = start.time_us + arrival.duration_us < until_us
+    arrives = free & (arrival.outcome == Outcome.IMPACT) & in_time
+    lost = free & (arrival.outcome == Outcome.STEP_LIMIT)
+    duration = jnp.where(arrives, arrival.duration_us, jnp.where(free, until_us - start.time_us, 0.0))
     position, velocity = driven.cantilever.propagator(duration)(gap + height, velocity)
-    time = start + duration
+    time = start.time_us + duration
     height, speed = surface.position_and_velocity(time)
     gap = jnp.where(arrives, driven.forms_nm, position - height)
-    moved = ContactState(gap, velocity - speed, time, jnp.zeros_like(time))
-    return arrives, lost, ContactState(*(jnp.where(free, new, old) for new, old in zip(moved, place, strict=True)))
+    end = ContactState(gap, velocity - speed, time, jnp.zeros_like(time))
+    return _where(free, end, start), arrives, lost
 
 
-def _through(
-    driven: Driven, touch: TipInContact, arrived: Array, active: Array, until_us: Array, setting: DrivenSetting
+def cross(driven: Driven, start: ContactState, setting: QuickSetting) -> Leg:
+    """Return a tip beyond the contact that it has just begun, leg by leg.
+
+    Args:
+        driven: the equation of motion.
+        start: where the bridge forms; the gap closes.
+        setting: how finely.
+    """
+    inward = go_in(driven, start, setting)
+    solid = go_through_junction(driven, inward.state, setting)
+    outward = go_out(driven, solid.state, setting)
+    return outward._replace(deepest_gap_nm=solid.deepest_gap_nm, holds=inward.holds & solid.holds & outward.holds)
+
+
+def at_junction(driven: Driven, tip: TipInContact) -> Bool[Array, "..."]:
+    """Return whether a tip has just formed the junction, so that legs may go on from there."""
+    return (tip.phase == Phase.JUNCTION) & (tip.state.x == driven.junction.forms_root) & (tip.trial_length == 0.0)
+
+
+def _through_legs(
+    driven: Driven, tip: TipInContact, arrives: Array, active: Array, until_us: Array, setting: DrivenSetting
 ) -> TipInContact:
-    """Return the tip as far through its contact as the quick way holds."""
+    """Return `legs_through`, of a batch for the tips alone that begin a leg."""
     if setting.quick is None:
-        return touch
+        return tip
 
-    def needed(driven, touch, arrived, active, until_us):
+    def needed(driven, tip, arrives, active, until_us):
         del until_us
-        return arrived | (active & at_junction(driven, touch))
+        return arrives | (active & at_junction(driven, tip))
 
-    def through(driven, touch, arrived, active, until_us):
-        return go_quickly(driven, touch, arrived, active, until_us, setting)
-
-    one_pass = repeat_for(through, needed, changed=1, passes=1, block=_LEGS_AT_ONCE)
-    return one_pass(driven, touch, arrived, active, until_us)
+    one_pass = repeat_for(partial(legs_through, setting), needed, changed=1, passes=1, block=_LEGS_AT_ONCE)
+    return one_pass(driven, tip, arrives, active, until_us)
 
 
-def _step(
+def legs_through(
+    setting: DrivenSetting, driven: Driven, tip: TipInContact, arrives: Array, active: Array, until_us: Array
+) -> TipInContact:
+    """Return a tip as far on its way through the contact as legs hold that end before a time.
+
+    Args:
+        setting: how finely; with a `quick` one.
+        driven: the equation of motion.
+        tip: the tip.
+        arrives: whether it has just begun the contact.
+        active: whether it moves.
+        until_us: the time.
+    """
+    quick = setting.quick
+    if quick is None:
+        raise ValueError("`setting` has no legs")
+
+    def takes(leg, wanted):
+        return wanted & leg.holds & (leg.state.time_us < until_us)
+
+    inward = go_in(driven, tip.state, quick)
+    forms = takes(inward, arrives)
+    tip = _at_end_of(inward, tip, forms, Phase.JUNCTION)
+    tip = tip._replace(
+        junctions=tip.junctions + forms.astype(tip.junctions.dtype),
+        junction_forms_us=jnp.where(forms, tip.state.time_us, tip.junction_forms_us),
+    )
+    solid = go_through_junction(driven, tip.state, quick)
+    waits = at_junction(driven, tip) & active
+    # where nothing acts outside the junction, the way out has no length
+    goes_out = (driven.junction.breaks_gap_nm < driven.breaks_nm) | (not driven.bridge.spans)
+    breaks = takes(solid, waits & goes_out)
+    # one for which the leg does not hold is told how far to go in time, and waits no longer
+    at_forming = lax.stop_gradient(tip.state._replace(x=driven.junction.forms_root))
+    first_step = lax.stop_gradient(1.0 / (setting.fineness * inverse_junction_step(driven, at_forming)))
+    tip = tip._replace(trial_length=jnp.where(waits & ~breaks, first_step, tip.trial_length))
+    in_junction = tip.time_in_junction_us + solid.state.time_us - tip.state.time_us
+    tip = _at_end_of(solid, tip, breaks, Phase.BRIDGE)
+    tip = tip._replace(
+        junction_breaks_us=jnp.where(breaks, tip.state.time_us, tip.junction_breaks_us),
+        time_in_junction_us=jnp.where(breaks, in_junction, tip.time_in_junction_us),
+    )
+    outward = go_out(driven, tip.state, quick)
+    return _at_end_of(outward, tip, takes(outward, breaks), Phase.DRY)
+
+
+def _at_end_of(leg: Leg, tip: TipInContact, takes: Array, phase: Phase) -> TipInContact:
+    """Return a tip in a phase at the end of a leg where it takes the leg, else as it was."""
+    return tip._replace(
+        state=_where(takes, leg.state, tip.state),
+        phase=jnp.where(takes, phase, tip.phase).astype(tip.phase.dtype),
+        trial_length=jnp.where(takes, 0.0, tip.trial_length),
+        deepest_gap_nm=jnp.where(takes, jnp.minimum(tip.deepest_gap_nm, leg.deepest_gap_nm), tip.deepest_gap_nm),
+    )
+
+
+def _step_in_time(
     driven: Driven,
-    touch: TipInContact,
+    tip: TipInContact,
     active: Array,
     repeats: Array,
     until_us: Array,
@@ -327,64 +307,85 @@ def _step(
     *,
     reverse: bool,
 ) -> TipInContact:
-    """Return a tip in contact after some trial steps, or where the quick way may go on; a free one stays as it is."""
+    """Return a tip in contact after some trial steps, or where legs may go on; a free one stays as it is."""
     fineness = setting.fineness * _FINER ** repeats.astype(until_us.dtype)
 
-    def going(touch, active, until_us):
-        finite = jnp.isfinite(touch.state.x) & jnp.isfinite(touch.state.gap_rate)
-        return active & (touch.phase != Phase.DRY) & (touch.state.time_us < until_us) & finite
+    def moves(tip, active, until_us):
+        finite = jnp.isfinite(tip.state.x) & jnp.isfinite(tip.state.gap_rate)
+        return active & (tip.phase != Phase.DRY) & (tip.state.time_us < until_us) & finite
 
-    def waits_not(driven, touch, active, fineness, until_us):
-        # a tip that has just formed the junction waits for the quick way; one for which that did not hold does not,
-        # nor one that repeats its contact
-        moves = going(touch, active, until_us)
+    def needs_steps(driven, tip, active, fineness, until_us):
+        # a tip that has just formed the junction waits for its leg, unless that did not hold or the contact is repeated
         if setting.quick is None:
-            return moves
-        return moves & ~(at_junction(driven, touch) & (fineness == setting.fineness))
+            return moves(tip, active, until_us)
+        waits = at_junction(driven, tip) & (fineness == setting.fineness)
+        return moves(tip, active, until_us) & ~waits
 
-    def advanced(driven, touch, moves, fineness, until_us):
-        after = advance(driven, touch, until_us, fineness)
-        return jax.tree.map(lambda new, old: jnp.where(moves, new, old), after, touch)
+    def advanced(driven, tip, moving, fineness, until_us):
+        return _where(moving, advance(driven, tip, until_us, fineness), tip)
 
     if reverse:
 
-        def once(touch, _):
-            return advanced(driven, touch, going(touch, active, until_us), fineness, until_us), None
+        def once(tip, _):
+            return advanced(driven, tip, moves(tip, active, until_us), fineness, until_us), None
 
-        return lax.scan(once, touch, None, length=setting.trials)[0]
+        return lax.scan(once, tip, None, length=setting.trials)[0]
 
-    def run(driven, touch, active, fineness, until_us):
-        def on(state):
-            touch, count = state
-            return jnp.any(waits_not(driven, touch, active, fineness, until_us)) & (count < _TRIALS)
+    def some_trials(driven, tip, active, fineness, until_us):
+        def goes_on(state):
+            tip, count = state
+            return jnp.any(needs_steps(driven, tip, active, fineness, until_us)) & (count < _TRIALS)
 
-        def more(state):
-            touch, count = state
-            moves = waits_not(driven, touch, active, fineness, until_us)
-            return advanced(driven, touch, moves, fineness, until_us), count + 1
+        def one_trial(state):
+            tip, count = state
+            moving = needs_steps(driven, tip, active, fineness, until_us)
+            return advanced(driven, tip, moving, fineness, until_us), count + 1
 
-        return lax.while_loop(on, more, (touch, 0))[0]
+        return lax.while_loop(goes_on, one_trial, (tip, 0))[0]
 
     passes = -(-setting.trials // _TRIALS)
-    few = repeat_for(run, waits_not, changed=1, passes=passes, block=_TRIALS_AT_ONCE)
-    return few(driven, touch, active, fineness, until_us)
+    repeated = repeat_for(some_trials, needs_steps, changed=1, passes=passes, block=_TRIALS_AT_ONCE)
+    return repeated(driven, tip, active, fineness, until_us)
 
 
-def _row(touch: TipInContact, arrival: Arrival, *, held: Array) -> Float[Array, " columns"]:
-    place = touch.state
+def _repetition(
+    tip: TipInContact, arrival: ContactState, repeats: Repeats, has_left: Array, setting: DrivenSetting
+) -> tuple[Bool[Array, ""], Repeats]:
+    """Return whether a contact that a tip has left is to be computed again in finer steps, and what it ended with."""
+    if setting.agreement is None:
+        return jnp.zeros_like(has_left), repeats
+    came, left, before = lax.stop_gradient((arrival, tip.state, repeats))
+    gaps = came.x + left.x
+    # without a bridge the way is that into the sample and back
+    gaps = jnp.where(gaps > 0.0, gaps, -2.0 * tip.deepest_gap_nm)
+    lasts = (left.time_us - came.time_us) * jnp.abs(came.gap_rate) > _LASTS_LONG * gaps
+    slowed = setting.magnified * left.gap_rate**2 < came.gap_rate**2
+    differs = jnp.maximum(
+        jnp.abs(left.gap_rate - before.departure_rate),
+        10.0 * jnp.abs(left.time_us - before.departure_us) * jnp.abs(left.gap_rate),
+    ) > _LESS * setting.agreement * jnp.abs(left.gap_rate)
+    magnified = slowed | lasts | (tip.junctions != 1)
+    again = has_left & jnp.where(repeats.times == 0, magnified, differs & (repeats.times < _MOST_REPEATS))
+    over = repeats._replace(times=jnp.where(has_left, 0, repeats.times))
+    return again, _where(again, Repeats(repeats.times + 1, left.time_us, left.gap_rate), over)
+
+
+def _row(tip: TipInContact, arrival: ContactState, *, held: Array) -> Float[Array, " columns"]:
+    """Return a contact as a row; without departure where the tip is held."""
+    state = tip.state
     row = ContactRow(
         kind=jnp.where(held, float(ContactKind.HELD), float(ContactKind.IMPACT)),
         arrival_us=arrival.time_us,
-        arrival_gap_nm=arrival.gap_nm,
+        arrival_gap_nm=arrival.x,
         arrival_rate=arrival.gap_rate,
-        departure_us=jnp.where(held, jnp.inf, place.time_us),
-        departure_gap_nm=jnp.where(held, 0.0, place.x),
-        departure_rate=jnp.where(held, 0.0, place.gap_rate),
-        junctions=touch.junctions.astype(place.x.dtype),
-        junction_forms_us=touch.junction_forms_us,
-        junction_breaks_us=touch.junction_breaks_us,
-        time_in_junction_us=touch.time_in_junction_us,
-        deepest_gap_nm=touch.deepest_gap_nm,
-        viscous_loss_aj=place.viscous_loss_aj,
+        departure_us=jnp.where(held, jnp.inf, state.time_us),
+        departure_gap_nm=jnp.where(held, 0.0, state.x),
+        departure_rate=jnp.where(held, 0.0, state.gap_rate),
+        junctions=tip.junctions.astype(state.x.dtype),
+        junction_forms_us=tip.junction_forms_us,
+        junction_breaks_us=tip.junction_breaks_us,
+        time_in_junction_us=tip.time_in_junction_us,
+        deepest_gap_nm=tip.deepest_gap_nm,
+        viscous_loss_aj=state.viscous_loss_aj,
     )
     return jnp.stack(row)

@@ -1,4 +1,4 @@
-"""Following a motion: piece by piece, until it is over, has settled, or is enough.
+"""Long motions, followed piece by piece until they are over, have settled, or are enough.
 
 A piece ends at a departure, and the next one continues from there, so that no contact is cut in two and counted twice.
 """
@@ -23,7 +23,7 @@ _PIECE_PERIODS = 256
 _ROOM = 1040
 """Contacts in a piece: four for every period, as `simulate` reckons."""
 _LITTLE = 1.001
-"""What is left is followed with the piece before, if it is next to nothing."""
+"""A remainder next to nothing is followed with the piece before it."""
 _HELD_LONG_ENOUGH = 12.0
 """Drive periods (and free periods) for which a tip that is held is followed, where the end is left open: reading what
 it does takes longer than following it."""
@@ -76,8 +76,8 @@ def follow_in_pieces(
     """
     state, stretch = start, 1.0
     while True:
-        left = until_us - float(state.time_us)
-        length = stretch * piece_us if left > stretch * piece_us * _LITTLE else left
+        to_end = until_us - float(state.time_us)
+        length = stretch * piece_us if to_end > stretch * piece_us * _LITTLE else to_end
         motion = run(state, length)
         outcome = MotionOutcome(int(motion.outcome))
         stuck = outcome in _GOES_ON and is_stuck(scene, motion)
@@ -85,25 +85,25 @@ def follow_in_pieces(
         goes_on = goes_on and outcome in _GOES_ON and not stuck
         yield Piece(motion, length, row, goes_on, stuck)
         full = outcome == MotionOutcome.CONTACT_LIMIT
-        if outcome not in _GOES_ON or (length == left and not (full and goes_on)):
+        if outcome not in _GOES_ON or (length == to_end and not (full and goes_on)):
             return
         if goes_on:
             state, stretch = place_after(motion, row), 1.0
         else:
-            stretch = math.ceil(left / piece_us) if stuck else 2.0 * stretch
+            stretch = math.ceil(to_end / piece_us) if stuck else 2.0 * stretch
 
 
 def where_to_go_on(motion: Simulation) -> tuple[int | None, bool]:
     """Return the last contact that the tip left, None: the end of a motion in flight; and whether there is either."""
-    left = np.flatnonzero(np.asarray(motion.contacts.kind) == ContactKind.IMPACT)
-    if left.size:
-        return int(left[-1]), True
+    departures = np.flatnonzero(np.asarray(motion.contacts.kind) == ContactKind.IMPACT)
+    if departures.size:
+        return int(departures[-1]), True
     flying = int(motion.phase) == Phase.DRY and not bool(motion.held) and motion.outcome == MotionOutcome.FINISHED
     return None, bool(flying)
 
 
 def place_after(motion: Simulation, row: int | None) -> State:
-    """Return where the tip departs after a contact, or is at the end; of a motion's derivative: how that changes."""
+    """Return the tip at its departure from a contact (its row), or at the end of the motion (None)."""
     rows = motion.contacts
     if row is None:
         return State(*motion.final)
@@ -113,19 +113,14 @@ def place_after(motion: Simulation, row: int | None) -> State:
 def joined(pieces: Sequence[Piece]) -> Simulation:
     """Return pieces that follow each other as one simulation that ended as the last one did; arrays of NumPy's."""
     counts = [*(piece.contacts for piece in pieces[:-1]), int(pieces[-1].motion.count)]
-    return joined_motions([piece.motion for piece in pieces], counts)
-
-
-def joined_motions(motions: Sequence[Simulation], counts: Sequence[int]) -> Simulation:
-    """Return simulations that follow each other, or their derivatives, as one; of each the first few contacts count."""
     rows = [
-        jax.tree.map(lambda column, count=count: np.asarray(column)[:count], motion.contacts)
-        for motion, count in zip(motions, counts, strict=True)
+        jax.tree.map(lambda column, count=count: np.asarray(column)[:count], piece.motion.contacts)
+        for piece, count in zip(pieces, counts, strict=True)
     ]
     contacts = jax.tree.map(lambda *columns: np.concatenate(columns), *rows)
-    last = motions[-1]
+    last = pieces[-1].motion
     return Simulation(
-        start=motions[0].start,
+        start=pieces[0].motion.start,
         contacts=contacts,
         count=jnp.asarray(len(contacts.kind), jnp.int32),
         final=last.final,
@@ -181,11 +176,9 @@ def follow_long(  # noqa: PLR0913
         return simulate(scene, state, length_us, max_contacts=room, accuracy=accuracy, method=method)
 
     count, pieces, whole, verdict = 0, [], None, None
-    for found in follow_in_pieces(scene, start, float(start.time_us) + duration_us, run, piece_us=piece_us):
-        piece = found
-        if until_settled and found.stuck:
-            shown_us = _end_of_held(scene, found.motion) - float(found.motion.start.time_us)
-            piece = found._replace(motion=run(found.motion.start, min(found.length_us, shown_us)))
+    for piece in follow_in_pieces(scene, start, float(start.time_us) + duration_us, run, piece_us=piece_us):
+        if until_settled and piece.stuck:
+            piece = _shortened(scene, piece, run)  # noqa: PLW2901
         count, pieces = count + 1, [*(done for done in pieces if done.goes_on), piece]
         whole = joined(pieces)
         if report is not None:
@@ -201,6 +194,8 @@ def follow_long(  # noqa: PLR0913
     return LongRun(whole, settled(scene, whole) if verdict is None else verdict, count)
 
 
-def _end_of_held(scene: Scene, motion: Simulation) -> float:
-    """Return the time in us until which a tip that the sample holds is followed."""
-    return held_since(motion) + _HELD_LONG_ENOUGH * slower_period_us(scene)
+def _shortened(scene: Scene, piece: Piece, run: Run) -> Piece:
+    """Return a piece at whose end the sample holds the tip, followed no longer than shows what the tip does."""
+    start, motion = piece.motion.start, piece.motion
+    end_us = held_since(motion) + _HELD_LONG_ENOUGH * slower_period_us(scene)
+    return piece._replace(motion=run(start, min(piece.length_us, end_us - float(start.time_us))))

@@ -29,7 +29,16 @@ from afm_jax.contact.junction import Phase
 from afm_jax.impact.first_impact import DEFAULT_ROOT_TOLERANCE_US, time_above
 from afm_jax.impact.law import Law, impact_law_of
 from afm_jax.impact.map import Departure, FollowedTip, NextImpact, Search, follow_tip
-from afm_jax.motion.record import ContactKind, Contacts, MotionOutcome, Simulation, State, to_gap, to_lab
+from afm_jax.motion.record import (
+    ContactKind,
+    Contacts,
+    MotionOutcome,
+    Simulation,
+    State,
+    contacts_in_lab,
+    to_gap,
+    to_lab,
+)
 from afm_jax.outcomes import Outcome
 from afm_jax.solve.derivatives import implicit_root
 
@@ -379,28 +388,11 @@ def _final(seen: Scene, response: Surface | None, departure: Departure, outcome:
 
 def _contacts(scene: Scene, surface: Platform | Surface, response: Surface | None, row: LawRow) -> Contacts:
     """Return the rows as contacts in the lab."""
-    kind = row.kind.astype(jnp.int32)
-    used = kind != ContactKind.NONE
-    left = used & (kind != ContactKind.HELD)
     zero = jnp.zeros_like(row.approach)
-    arrival = to_lab(surface, response, row.arrival_us, zero, -row.approach)
-    departure = to_lab(surface, response, jnp.where(left, row.departure_us, 0.0), zero, row.rebound)
-
-    def where(condition, value):
-        return jnp.where(condition, value, 0.0)
-
-    return Contacts(
-        kind=kind,
-        arrival_time_us=row.arrival_us,
-        arrival_position_nm=where(used, arrival.position_nm),
-        arrival_velocity_nm_per_us=where(used, arrival.velocity_nm_per_us),
-        approach_speed_nm_per_us=jnp.maximum(row.approach, 0.0),  # of a tip that rests, rounding
-        departure_time_us=row.departure_us,
-        departure_position_nm=where(left, departure.position_nm),
-        departure_velocity_nm_per_us=where(left, departure.velocity_nm_per_us),
-        rebound_speed_nm_per_us=row.rebound,
-        energy_lost_aj=0.5 * scene.cantilever.mass_ng * (row.approach**2 - row.rebound**2),
-    )
+    arrival = State(row.arrival_us, zero, -row.approach)
+    departure = State(row.departure_us, zero, row.rebound)
+    lost = 0.5 * scene.cantilever.mass_ng * (row.approach**2 - row.rebound**2)
+    return contacts_in_lab(surface, response, row.kind, arrival, departure, lost)
 
 
 @jax.jit

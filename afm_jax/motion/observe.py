@@ -339,7 +339,8 @@ class MotionWindow:
         largest, least = [max(float(force.max()), 0.0)], [min(float(force.min()), 0.0)]
         largest += np.asarray(rows.detail.peak_force_nn)[whole].tolist()
         if np.any(np.asarray(rows.detail.junctions)[whole] > 0):
-            loads = contact.junction.force(np.linspace(float(contact.junction.pull_off_depth_nm), 0.0, _LOADS))
+            solid = contact.solid
+            loads = solid.force(np.linspace(float(solid.depth_scale_nm * solid.depth(solid.fold)), 0.0, _LOADS))
             least.append(float(np.min(np.asarray(loads))))
         return min(least), max(largest)
 

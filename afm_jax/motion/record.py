@@ -1,6 +1,7 @@
 """What a simulation hands out: its contacts in order, its last state, and how it ended.
 
-Between the lab and the gap: heights and velocities of the tip against the surface that it sees.
+States of the tip are heights and velocities in the lab; `to_gap` and `to_lab` go between these and the gap over the
+surface that the free tip sees (`surface_of`), `contacts_in_lab` does so for contacts.
 """
 
 import enum
@@ -181,3 +182,44 @@ def to_lab(
         steady, rate = response.position_and_velocity(time_us)
         position, velocity = position + steady, velocity + rate
     return State(jnp.asarray(time_us), position, velocity)
+
+
+def contacts_in_lab(
+    surface: Platform | Surface,
+    response: Surface | None,
+    kind: ArrayLike,
+    arrival: State,
+    departure: State,
+    energy_lost_aj: Float[Array, "..."],
+    detail: ContactDetail | None = None,
+) -> Contacts:
+    """Return contacts in the lab, from gaps and gap rates; arrays of any shape.
+
+    Args:
+        surface: what the free tip sees (`surface_of`).
+        response: the steady response to drives of base and tip, or None.
+        kind: numbers of `ContactKind`.
+        arrival: time, gap and gap rate at the beginnings.
+        departure: time, gap and gap rate at the ends; time infinite and zeros where the tip is held.
+        energy_lost_aj: what each dissipated.
+        detail: of resolved contacts.
+    """
+    kind = jnp.asarray(kind, jnp.int32)
+    used = kind != ContactKind.NONE
+    has_left = used & (kind != ContactKind.HELD)
+    came = to_lab(surface, response, *arrival)
+    went = to_lab(surface, response, jnp.where(has_left, departure.time_us, 0.0), *departure[1:])
+    approach = jnp.maximum(-arrival.velocity_nm_per_us, 0.0)  # of a tip that rests, rounding
+    return Contacts(
+        kind=kind,
+        arrival_time_us=arrival.time_us,
+        arrival_position_nm=jnp.where(used, came.position_nm, 0.0),
+        arrival_velocity_nm_per_us=jnp.where(used, came.velocity_nm_per_us, 0.0),
+        approach_speed_nm_per_us=jnp.where(used, approach, 0.0),
+        departure_time_us=departure.time_us,
+        departure_position_nm=jnp.where(has_left, went.position_nm, 0.0),
+        departure_velocity_nm_per_us=jnp.where(has_left, went.velocity_nm_per_us, 0.0),
+        rebound_speed_nm_per_us=departure.velocity_nm_per_us,
+        energy_lost_aj=energy_lost_aj,
+        detail=detail,
+    )

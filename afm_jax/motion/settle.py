@@ -1,6 +1,7 @@
 """Whether a motion has settled, on what, and the window that is read of it.
 
-Whether a motion has settled is a criterion on its contacts, not a number of periods.
+The criterion is on the sequence of departures (drive phase, velocity), not on a number of periods: it repeats after m
+contacts in N drive periods, and what a geometric extrapolation leaves of the distance between repetitions is small.
 """
 
 from typing import NamedTuple
@@ -22,7 +23,7 @@ LONGEST = 32
 _REPETITIONS = 6
 """Repetitions in each of the two blocks whose comparison gives the rate of approach."""
 _BOTH = 2.0
-"""Two departures of a motion that tends to one are as far apart as each is from it, together."""
+"""Two departures are as far apart as both together are from the motion they tend to."""
 ROUNDING = 1e-8
 """Distance below which a block has arrived, its rate being rounding; not of the tolerance, lest slow motion passes."""
 _LAST_SHARE = 0.2
@@ -60,10 +61,8 @@ def find_repetition(
         tolerance: largest remaining distance that counts as none.
     """
     turns = np.asarray(times_us)[None] / period_us
-    found = find_repetitions(turns, np.asarray(velocities)[None], tolerance=tolerance)
-    if not found.contacts[0]:
-        return None
-    return Repetition(int(found.contacts[0]), int(found.periods[0]), float(found.remaining[0]))
+    contacts, periods, remaining = find_repetitions(turns, np.asarray(velocities)[None], tolerance=tolerance)
+    return Repetition(int(contacts[0]), int(periods[0]), float(remaining[0])) if contacts[0] else None
 
 
 class Repetitions(NamedTuple):
@@ -82,24 +81,24 @@ def find_repetitions(
     repeated: int = _REPETITIONS,
     rounding: float = ROUNDING,
 ) -> Repetitions:
-    """Return the shortest repetition of each of many sequences, as `find_repetition` does.
+    """Return the shortest repetition of each of many sequences of departures, by the criterion of `find_repetition`.
 
     Args:
         turns: times of the departures in drive periods.
-        velocities: as there; a sequence with NaN in its end repeats nothing.
-        tolerance: as there.
+        velocities: of the tip then, in nm/us; a sequence with NaN in its end repeats nothing.
+        tolerance: largest remaining distance that counts as none.
         repeated: repetitions in each of the two blocks that are compared.
         rounding: distance below which departures are the same, and a rate of approach says nothing.
     """
     lanes, count = turns.shape
-    found = Repetitions(np.zeros(lanes, int), np.zeros(lanes, int), np.full(lanes, np.inf))
-    left = np.arange(lanes)
+    shortest = Repetitions(np.zeros(lanes, int), np.zeros(lanes, int), np.full(lanes, np.inf))
+    still_open = np.arange(lanes)
     for contacts in range(1, LONGEST + 1):
         block = repeated * contacts
-        if count < 2 * block + contacts or not left.size:
+        if count < 2 * block + contacts or not still_open.size:
             break
         last = slice(count - 2 * block - contacts, None)
-        periods, distance = _steps(turns[left, last], velocities[left, last], contacts)
+        periods, distance = _distances(turns[still_open, last], velocities[still_open, last], contacts)
         before, now = distance[:, :block].max(axis=1), distance[:, block:].max(axis=1)
         # where something is infinite nothing repeats; a distance of 0 before is one that has arrived
         near = np.isfinite(now) & np.isfinite(before)
@@ -107,20 +106,20 @@ def find_repetitions(
         slowly = np.where(rate < 1.0, rate / np.where(rate < 1.0, 1.0 - rate, 1.0), np.inf)
         remaining = np.where(now <= rounding, now, np.where(near, now, 1.0) * slowly)
         repeats = near & (np.maximum(now, remaining) <= tolerance)
-        chosen = left[repeats]
-        found.contacts[chosen], found.periods[chosen] = contacts, periods[repeats]
-        found.remaining[chosen] = remaining[repeats]
-        for fewer in (part for part in range(1, contacts) if contacts % part == 0 and chosen.size):
+        chosen = still_open[repeats]
+        shortest.contacts[chosen], shortest.periods[chosen] = contacts, periods[repeats]
+        shortest.remaining[chosen] = remaining[repeats]
+        for fewer in (divisor for divisor in range(1, contacts) if contacts % divisor == 0 and chosen.size):
             # what dies away as it turns comes back after some rounds, long before one round is as near
-            periods, distance = _steps(turns[chosen, last], velocities[chosen, last], fewer)
-            within = distance[:, -repeated * fewer :].max(axis=1) <= _BOTH * found.remaining[chosen]
-            found.contacts[chosen[within]], found.periods[chosen[within]] = fewer, periods[within]
+            periods, distance = _distances(turns[chosen, last], velocities[chosen, last], fewer)
+            within = distance[:, -repeated * fewer :].max(axis=1) <= _BOTH * shortest.remaining[chosen]
+            shortest.contacts[chosen[within]], shortest.periods[chosen[within]] = fewer, periods[within]
             chosen = chosen[~within]
-        left = left[~repeats]
-    return found
+        still_open = still_open[~repeats]
+    return shortest
 
 
-def _steps(
+def _distances(
     turns: np.ndarray, velocities: np.ndarray, contacts: int
 ) -> tuple[Float[np.ndarray, " lanes"], Float[np.ndarray, "lanes steps"]]:
     """Return N and the distances between departures m contacts apart; infinite where their N differ or are 0."""
@@ -169,42 +168,34 @@ def settled(scene: Scene, simulation: Simulation, *, tolerance: float = DEFAULT_
         raise ValueError(f"`tolerance` must be positive, but is {tolerance!r}")
     drive = drive_of(scene)
     stuck = is_stuck(scene, simulation)
+    unsettled = Settled(settled=False, contacts=None, periods=None, stuck=stuck, remaining=None, reason="")
     if drive.aperiodic is not None:
         held = "the sample holds the tip; " if stuck else ""
-        return _not(held + drive.aperiodic, stuck=stuck)
+        return unsettled._replace(reason=held + drive.aperiodic)
     if stuck:
-        return _settled("the sample holds the tip to the end", stuck=True)
-    free = _free_of_the_sample(scene, simulation, drive.period_us)
-    if free is not None:
-        if free <= tolerance:
-            where = "the tip no longer meets the sample" if scene.interaction is not None else "the cantilever is free"
-            why = f"{where}, and its transient has decayed"
-            return _settled(why, contacts=0, periods=1, remaining=free)
-        return _not(f"the tip does not meet the sample, but its transient is still {free:.1e} of the velocity scale")
+        return unsettled._replace(settled=True, reason="the sample holds the tip to the end")
+    transient = _transient_of_a_free_tip(scene, simulation, drive.period_us)
+    if transient is not None:
+        if not transient <= tolerance:
+            why = f"the tip does not meet the sample, but its transient is still {transient:.1e} of the velocity scale"
+            return unsettled._replace(reason=why)
+        where = "the tip no longer meets the sample" if scene.interaction is not None else "the cantilever is free"
+        why = f"{where}, and its transient has decayed"
+        return Settled(settled=True, contacts=0, periods=1, stuck=False, remaining=transient, reason=why)
     rows = simulation.contacts
     departures = (rows.departure_time_us, rows.departure_velocity_nm_per_us)
     times, velocities = (np.asarray(column)[contacts_left(simulation)] for column in departures)
-    found = find_repetition(times, velocities, drive.period_us, tolerance=tolerance)
-    if found is None:
-        return _not(f"no sequence of up to {LONGEST} contacts repeats to {tolerance:g} (of {len(times)} contacts)")
-    what = f"{found.contacts} contact{'s' if found.contacts > 1 else ''} in {found.periods} drive period"
-    why = f"the motion repeats: {what}{'s' if found.periods > 1 else ''}"
-    return _settled(why, contacts=found.contacts, periods=found.periods, remaining=found.remaining)
+    repetition = find_repetition(times, velocities, drive.period_us, tolerance=tolerance)
+    if repetition is None:
+        why = f"no sequence of up to {LONGEST} contacts repeats to {tolerance:g} (of {len(times)} contacts)"
+        return unsettled._replace(reason=why)
+    contacts, periods = _counted(repetition.contacts, "contact"), _counted(repetition.periods, "drive period")
+    why = f"the motion repeats: {contacts} in {periods}"
+    return Settled(settled=True, stuck=False, reason=why, **repetition._asdict())
 
 
-def _settled(
-    reason: str,
-    *,
-    contacts: int | None = None,
-    periods: int | None = None,
-    stuck: bool = False,
-    remaining: float | None = None,
-) -> Settled:
-    return Settled(settled=True, contacts=contacts, periods=periods, stuck=stuck, remaining=remaining, reason=reason)
-
-
-def _not(reason: str, *, stuck: bool = False) -> Settled:
-    return Settled(settled=False, contacts=None, periods=None, stuck=stuck, remaining=None, reason=reason)
+def _counted(count: int, what: str) -> str:
+    return f"{count} {what}{'s' if count > 1 else ''}"
 
 
 def is_stuck(scene: Scene, simulation: Simulation) -> bool:
@@ -224,7 +215,7 @@ def slower_period_us(scene: Scene) -> float:
     return max(drive_of(scene).period_us, 2.0 * np.pi / float(scene.cantilever.angular_frequency))
 
 
-def _free_of_the_sample(scene: Scene, simulation: Simulation, period_us: float) -> float | None:
+def _transient_of_a_free_tip(scene: Scene, simulation: Simulation, period_us: float) -> float | None:
     """Return the transient of a tip that cannot meet the sample any more, of the velocity scale; None where it can."""
     surface, response = surface_of(scene)
     gap, rate = (float(part) for part in to_gap(surface, response, simulation.final))

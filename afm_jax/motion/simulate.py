@@ -1,8 +1,9 @@
-"""`simulate`: a scene followed in time, whatever its interaction."""
+"""A scene followed in time, whatever its interaction: free, from impact to impact of a law, or through contacts."""
 
 import math
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +22,18 @@ from afm_jax.contact.settings import DrivenSetting, driven_setting_of
 from afm_jax.impact.law import Law
 from afm_jax.motion.contact_motion import ContactRow, begin, follow
 from afm_jax.motion.law_motion import follow_free, follow_law
-from afm_jax.motion.record import ContactDetail, ContactKind, Contacts, MotionOutcome, Simulation, State, to_gap, to_lab
+from afm_jax.motion.record import (
+    ContactDetail,
+    ContactKind,
+    Contacts,
+    MotionOutcome,
+    Simulation,
+    State,
+    contacts_in_lab,
+    to_gap,
+    to_lab,
+)
+from afm_jax.solve.lanes import power_of_two
 
 DEFAULT_ACCURACY = 1e-9
 _ROUNDS_PER_CONTACT = 4
@@ -91,38 +103,48 @@ def simulate(  # noqa: PLR0913
     world = (scene, surface, response, begin_at, until)
     if scene.interaction is None:
         return follow_free(*world)
-    if isinstance(scene.interaction, Law):
-
-        def follow(room: int) -> Simulation:
-            return follow_law(*world, max_contacts=room, reverse=reverse)
-
-    elif isinstance(scene.interaction, Contact):
-        _check_contact(scene, surface, response, begin_at)
-        if reverse:
-            # the quick way tells by NaN that it does not hold, which reverse derivatives would spread
-            setting = setting._replace(quick=None, trials=_TRIALS_BACKWARDS, agreement=None)
-
-        def follow(room: int) -> Simulation:
-            rounds = max_rounds if max_rounds is not None else _rounds(room, reverse=reverse)
-            return _contact(*world, rows=room, setting=setting, rounds=rounds, reverse=reverse)
-
-    else:
-        raise TypeError(
-            f"the interaction must be an ImpactLaw, a Contact or None, not {type(scene.interaction).__name__}"
-        )
+    follow_with = _follower(world, setting, max_rounds, reverse=reverse)
     try:
         if max_contacts is not None:
-            found = follow(max_contacts)
+            simulation = follow_with(max_contacts)
         else:
             room = _room(scene, surface, duration_us)
             # in reverse mode every round is run, needed or not
-            found = _with_room(follow, room if reverse else max(_LEAST_ROOM, 1 << (room - 1).bit_length()))
+            rows = room if reverse else max(_LEAST_ROOM, power_of_two(room))
+            simulation = _with_room(follow_with, rows)
     except TypeError as error:
         # JAX's own, where reverse derivatives through its loop are differentiated once more
         if reverse or "NoneType" not in str(error):
             raise
         raise ValueError(_NOT_BACKWARDS) from error
-    return found if reverse else jax.tree.map(_only_forwards, found)
+    return simulation if reverse else jax.tree.map(_only_forwards, simulation)
+
+
+def _follower(
+    world: tuple[Any, ...], setting: DrivenSetting, max_rounds: int | None, *, reverse: bool
+) -> Callable[[int], Simulation]:
+    """Return the function that follows a scene with room for some contacts.
+
+    Raises:
+        TypeError: if the interaction is neither a law nor a contact.
+        ValueError: if the contact has no junction, or the start is inside the sample.
+    """
+    scene, surface, response, start, _ = world
+    if isinstance(scene.interaction, Law):
+        return lambda room: follow_law(*world, max_contacts=room, reverse=reverse)
+    if not isinstance(scene.interaction, Contact):
+        kind = type(scene.interaction).__name__
+        raise TypeError(f"the interaction must be an ImpactLaw, a Contact or None, not {kind}")
+    _check_contact(scene, surface, response, start)
+    if reverse:
+        # legs tell by NaN that they do not hold, which reverse derivatives would spread
+        setting = setting._replace(quick=None, trials=_TRIALS_BACKWARDS, agreement=None)
+
+    def follow_contacts(room: int) -> Simulation:
+        rounds = max_rounds if max_rounds is not None else _rounds(room, reverse=reverse)
+        return _contact(*world, rows=room, setting=setting, rounds=rounds, reverse=reverse)
+
+    return follow_contacts
 
 
 def _check_sizes(start: State, duration_us: ArrayLike, **counts: int | None) -> None:
@@ -171,17 +193,15 @@ def _rounds(room: int, *, reverse: bool) -> int:
     return max(_HELD_ROUNDS_PER_CONTACT * room, _LEAST_HELD_ROUNDS)
 
 
-def _with_room(follow: Callable[[int], Simulation], room: int) -> Simulation:
+def _with_room(follow_with: Callable[[int], Simulation], room: int) -> Simulation:
     """Return a motion with room for all its contacts: as long as there is too little, followed again with more."""
-    found = follow(room)
-    while room < _MOST_CONTACTS and not is_traced(found.outcome) and _is_full(found):
+    simulation = follow_with(room)
+    while room < _MOST_CONTACTS and not is_traced(simulation.outcome):
+        if not bool(jnp.any(simulation.outcome == MotionOutcome.CONTACT_LIMIT)):
+            break
         room = min(_MORE_ROOM * room, _MOST_CONTACTS)
-        found = follow(room)
-    return found
-
-
-def _is_full(found: Simulation) -> bool:
-    return bool(jnp.any(found.outcome == MotionOutcome.CONTACT_LIMIT))
+        simulation = follow_with(room)
+    return simulation
 
 
 def _room(scene: Scene, surface: Platform | Surface, duration_us: ArrayLike) -> int:
@@ -227,18 +247,18 @@ def _contact(  # noqa: PLR0913
 ) -> Simulation:
     driven = driven_by(scene.interaction, scene.cantilever, surface)
     gap, rate = to_gap(surface, response, start)
-    tip = begin(driven, start.time_us, gap, rate, rows)
-    tip = follow(driven, tip, until, setting, rounds=rounds, reverse=reverse)
-    place, phase = tip.touch.state, tip.touch.phase
-    table = ContactRow(*jnp.moveaxis(tip.rows, -1, 0))
+    begun = begin(driven, start.time_us, gap, rate, rows)
+    end = follow(driven, begun, until, setting, rounds=rounds, reverse=reverse)
+    state, phase = end.tip.state, end.tip.phase
+    table = ContactRow(*jnp.moveaxis(end.rows, -1, 0))
     return Simulation(
         start=start,
         contacts=_contacts(table, scene, surface, response, driven),
-        count=jnp.minimum(tip.contacts, rows),
-        final=to_lab(surface, response, place.time_us, driven.gap(place.x, phase), place.gap_rate),
+        count=jnp.minimum(end.contacts, rows),
+        final=to_lab(surface, response, state.time_us, driven.gap(state.x, phase), state.gap_rate),
         phase=phase,
-        held=tip.outcome == MotionOutcome.HELD,
-        outcome=tip.outcome,
+        held=end.outcome == MotionOutcome.HELD,
+        outcome=end.outcome,
     )
 
 
@@ -246,41 +266,24 @@ def _contacts(
     row: ContactRow, scene: Scene, surface: Platform | Surface, response: Surface | None, driven: Driven
 ) -> Contacts:
     """Return the rows as contacts in the lab."""
-    kind = row.kind.astype(jnp.int32)
-    left, used = kind == ContactKind.IMPACT, kind != ContactKind.NONE
-    arrival = to_lab(surface, response, row.arrival_us, row.arrival_gap_nm, row.arrival_rate)
-    when = jnp.where(left, row.departure_us, 0.0)
-    departure = to_lab(surface, response, when, row.departure_gap_nm, row.departure_rate)
     junction = driven.junction
-    bridge = jnp.where(left, junction.bridge_hysteresis_aj, 0.0)
+    has_left, touched = row.kind == ContactKind.IMPACT, row.junctions > 0.0
+    bridge = jnp.where(has_left, junction.bridge_hysteresis_aj, 0.0)
     solid = row.junctions * junction.junction_hysteresis_aj
-    shift, contact = junction.shift_nm, scene.interaction
-    touched = row.junctions > 0.0
-    force = jnp.where(touched, contact.junction.force(shift - jnp.where(touched, row.deepest_gap_nm, 0.0)), 0.0)
-
-    def where(condition, value):
-        return jnp.where(condition, value, 0.0)
-
-    return Contacts(
-        kind=kind,
-        arrival_time_us=row.arrival_us,
-        arrival_position_nm=where(used, arrival.position_nm),
-        arrival_velocity_nm_per_us=where(used, arrival.velocity_nm_per_us),
-        approach_speed_nm_per_us=where(used, -row.arrival_rate),
-        departure_time_us=row.departure_us,
-        departure_position_nm=where(left, departure.position_nm),
-        departure_velocity_nm_per_us=where(left, departure.velocity_nm_per_us),
-        rebound_speed_nm_per_us=row.departure_rate,
-        energy_lost_aj=bridge + solid + row.viscous_loss_aj,
-        detail=ContactDetail(
-            junctions=row.junctions.astype(jnp.int32),
-            junction_forms_us=row.junction_forms_us,
-            junction_breaks_us=row.junction_breaks_us,
-            time_in_junction_us=row.time_in_junction_us,
-            deepest_gap_nm=row.deepest_gap_nm,
-            peak_force_nn=jnp.maximum(force, 0.0),
-            bridge_hysteresis_aj=bridge,
-            junction_hysteresis_aj=solid,
-            viscous_loss_aj=row.viscous_loss_aj,
-        ),
+    depth = junction.shift_nm - jnp.where(touched, row.deepest_gap_nm, 0.0)
+    force = jnp.where(touched, scene.interaction.solid.force(depth), 0.0)
+    detail = ContactDetail(
+        junctions=row.junctions.astype(jnp.int32),
+        junction_forms_us=row.junction_forms_us,
+        junction_breaks_us=row.junction_breaks_us,
+        time_in_junction_us=row.time_in_junction_us,
+        deepest_gap_nm=row.deepest_gap_nm,
+        peak_force_nn=jnp.maximum(force, 0.0),
+        bridge_hysteresis_aj=bridge,
+        junction_hysteresis_aj=solid,
+        viscous_loss_aj=row.viscous_loss_aj,
     )
+    arrival = State(row.arrival_us, row.arrival_gap_nm, row.arrival_rate)
+    departure = State(row.departure_us, row.departure_gap_nm, row.departure_rate)
+    lost = bridge + solid + row.viscous_loss_aj
+    return contacts_in_lab(surface, response, row.kind, arrival, departure, lost, detail)

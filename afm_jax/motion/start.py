@@ -1,4 +1,4 @@
-"""Where a simulation begins: on an orbit that the impact law predicts, leaving the platform, or where it was told."""
+"""Where a simulation begins: on an orbit that the impact law predicts, leaving the platform, or as a file says."""
 
 import math
 
@@ -21,7 +21,7 @@ _NEWTON_STEPS = 30
 
 
 def default_start(scene: Scene) -> State:
-    """Return where a simulation of a scene begins that was not told.
+    """Return where a simulation of a scene begins that has no start of its own.
 
     Driven with one frequency: just after the impact of the single-impact orbit that the scene's law, or the law with
     delay closest to its contact, has for the order nearest to resonance; the stable one, the fastest if there are
@@ -46,9 +46,9 @@ def default_start(scene: Scene) -> State:
         lambda s: s.platform.offset_rate_nm_per_us, scene, jnp.zeros_like(scene.platform.offset_rate_nm_per_us)
     )
     periodic = not any(second is not None for second in seconds) and drive_of(still).aperiodic is None
-    found = _on_orbit(scene, still, law) if periodic and law is not None else None
-    if found is not None:
-        return found
+    on_orbit = _on_orbit(scene, still, law) if periodic and law is not None else None
+    if on_orbit is not None:
+        return on_orbit
     sample_alone = scene.base is None and scene.force is None
     if not sample_alone and -float(scene.platform.position(0.0)) > 2.0 * _clearance(scene) + 1.0:
         return state(0.0, 0.0, 0.0)
@@ -77,9 +77,15 @@ def state(time_us: float, position_nm: float, velocity_nm_per_us: float) -> Stat
     return State(*(as_parameter(float(value)) for value in (time_us, position_nm, velocity_nm_per_us)))
 
 
+_FREE_NM = 1e-6
+
+
 def _clearance(scene: Scene) -> float:
     """Return the gap, in nm, at which a tip that leaves the sample is free."""
-    return float(scene.interaction.bridge_breaks_nm) if isinstance(scene.interaction, Contact) else 0.0
+    if not isinstance(scene.interaction, Contact):
+        return 0.0
+    # a contact without forces begins at gap 0: rounding must not put the tip below it
+    return max(float(scene.interaction.bridge_breaks_nm), _FREE_NM)
 
 
 def _on_orbit(scene: Scene, still: Scene, law: Law) -> State | None:

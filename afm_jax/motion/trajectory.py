@@ -1,16 +1,10 @@
 """Dense output: where the tip is at any time of a simulation, worked out on request.
 
-A simulation keeps its contacts. Between them the flight is a closed form; the contacts asked for are integrated once
-more, step by step, and a place inside a step is one step of order 8 from its beginning. Where contacts need not be
-known so well they may be straight between the points that the simulation keeps of them.
-
-The path of a tip through its contacts, step by step: what a simulation does not keep, integrated once more.
-
-A simulation in pieces that follow each other: flights, steps of contacts, rests on the surface of a law.
-
-Instead of its steps a contact may have the straight lines between the points that a simulation keeps of it: bridge
-formed, junction formed, deepest, junction broken, bridge broken. Short against the drive period, it then costs no
-second integration, and whatever is read of it is a smooth function of the simulation's numbers.
+A simulation keeps its contacts alone. `DensePath` makes of it pieces in the order of time: flights, in closed form;
+steps of contacts, which are integrated once more, a place inside a step being one step of order 8 from its beginning;
+rests on the surface of a law. Where contacts need not be known so well they are straight lines between the points that
+a simulation keeps of them (bridge formed, junction formed, deepest, junction broken, bridge broken), without a second
+integration.
 """
 
 import math
@@ -40,6 +34,7 @@ _BLOCK = 128
 """Trials computed in one call."""
 _FINENESS = 4.5
 _NEWTON_STEPS = 6
+_SHORTEST_US = 1e-13
 
 
 class Steps(NamedTuple):
@@ -67,7 +62,7 @@ def contact_steps(driven: Driven, begin: ContactState, phase: Int[np.ndarray, " 
     spare = (1 << max(len(phase) - 1, 0).bit_length()) - len(phase)
     place = ContactState(*(jnp.concatenate([jnp.asarray(part), jnp.ones(spare)]) for part in begin))
     phases = np.concatenate([phase, np.full(spare, int(Phase.DRY))])
-    touch = TipInContact.at_start(place, jnp.asarray(phases, jnp.int32))
+    touch = TipInContact.arriving(driven, place, jnp.asarray(phases != Phase.DRY))
     until = jnp.asarray(until_us, touch.state.x.dtype)
     parts = []
     while np.any((np.asarray(touch.phase) != Phase.DRY) & (np.asarray(touch.state.time_us) < until_us)):
@@ -75,6 +70,9 @@ def contact_steps(driven: Driven, begin: ContactState, phase: Int[np.ndarray, " 
         taken, *columns = (np.asarray(part) for part in jax.tree.leaves(record))
         parts.append([column[taken] for column in columns])
     joined = [np.concatenate(columns) for columns in zip(*parts, strict=True)] if parts else [np.zeros(0)] * 6
+    # a step within the rounding of its time could come to stand behind the flight after it
+    last = joined[5] - joined[2] > _SHORTEST_US * (1.0 + np.abs(joined[2]))
+    joined = [column[last] for column in joined]
     order = np.argsort(joined[2], kind="stable")
     x, rate, time, _, kinds, ends = (column[order] for column in joined)
     return Steps(time, ends, kinds.astype(int), x, rate)
@@ -114,9 +112,18 @@ def places_at(
 
     def newton(_, length):
         end = stepped(length)
-        return length + (time_us - end.time_us) / driven.rates(end, solid).time_us
+        passing = driven.rates(end, solid).time_us
+        # time stands still at the fold
+        return length + (time_us - end.time_us) / jnp.where(passing == 0.0, 1.0, passing)
 
-    first = (time_us - start.time_us) / jnp.where(solid, jnp.maximum(rate, 1e-3), 1.0)
+    elapsed = time_us - start.time_us
+    first = elapsed / jnp.where(solid, jnp.maximum(rate, 1e-3), 1.0)
+    if driven.solid.reversible:
+        # time stands still where a dry contact begins, and grows with the square of the variable
+        s_rate = driven.rates(start, solid).x
+        _, growth = jax.jvp(driven.solid.depth_slope, (start.x,), (s_rate,))
+        root = jnp.sqrt(jnp.maximum(rate * rate + 2.0 * growth * elapsed, 0.0))
+        first = jnp.where(solid, 2.0 * elapsed / jnp.maximum(rate + root, 1e-9), first)
     length = lax.fori_loop(0, _NEWTON_STEPS, newton, first)
     end = stepped(length)
     return driven.gap(end.x, phase), end.gap_rate
@@ -140,7 +147,7 @@ class Pieces(NamedTuple):
 
 
 class World(NamedTuple):
-    """What is the same at all times of a simulation."""
+    """A scene prepared for evaluation at many times: surface, response, and equation of motion in contact."""
 
     cantilever: Cantilever
     surface: Platform | Surface
@@ -152,7 +159,7 @@ class World(NamedTuple):
 
     @classmethod
     def of(cls, scene: Scene, *, integrated: bool = True) -> "World":
-        """Return what is the same at all times of a scene, its contacts integrated once more or straight."""
+        """Return a scene prepared, its contacts to be integrated once more or straight."""
         surface, response = surface_of(scene)
         contact = scene.interaction
         if not isinstance(contact, Contact):
@@ -165,9 +172,8 @@ class World(NamedTuple):
 
     def gaps(self, times: Any, positions: Any, velocities: Any) -> tuple[np.ndarray, np.ndarray]:
         """Return gaps and their rates of places in the lab."""
-        gap, rate = to_gap(
-            self.surface, self.response, State(*(jnp.asarray(p) for p in (times, positions, velocities)))
-        )
+        states = State(*(jnp.asarray(column) for column in (times, positions, velocities)))
+        gap, rate = to_gap(self.surface, self.response, states)
         return np.asarray(gap), np.asarray(rate)
 
 
@@ -201,14 +207,14 @@ def _flights(surface: Platform | Surface, response: Surface | None, simulation: 
     origin, position, velocity = (
         np.concatenate([first, np.asarray(column)[used]]) for first, column in zip(start, departures, strict=True)
     )
-    left = np.isfinite(origin)
-    state = State(*(jnp.asarray(part) for part in (np.where(left, origin, 0.0), position, velocity)))
-    gap, rate = (np.asarray(part) for part in to_gap(surface, response, state))
+    flies = np.isfinite(origin)
+    state = State(*(jnp.asarray(column) for column in (np.where(flies, origin, 0.0), position, velocity)))
+    gap, rate = (np.asarray(column) for column in to_gap(surface, response, state))
     # a negative delay lets a flight begin before the last one has ended: the earlier one is kept to its end
     begin = np.maximum(origin, np.concatenate([start[0], arrival]))
     end = np.append(arrival, float(simulation.final.time_us))
-    here = left & (end > begin)
-    return Flights(begin[here], end[here], origin[here], gap[here], rate[here])
+    exists = flies & (end > begin)
+    return Flights(*(column[exists] for column in (begin, end, origin, gap, rate)))
 
 
 def fly(scene: Scene, flights: Flights, times_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -256,7 +262,7 @@ def _contact_pieces(world: World, simulation: Simulation, rows: np.ndarray, high
     if world.kept_gaps is not None:
         ends = zip(rows.tolist(), stops.tolist(), strict=True)
         corners = [_corners(simulation, row, end, world.kept_gaps) for row, end in ends]
-        return [piece for each in corners for piece in _straight_pieces(each)]
+        return [piece for points in corners for piece in _straight_pieces(points)]
     if world.driven is None:
         return [(begin, end, float(REST), begin, 0.0, 0.0) for begin, end in zip(arrival, stops, strict=True)]
     if not rows.size:
@@ -358,7 +364,10 @@ class DensePath(NamedTuple):
         return Trajectory(wanted, *(np.asarray(part)[: wanted.size].reshape(wanted.shape) for part in parts))
 
     def nodes(self, from_us: float, to_us: float) -> tuple[Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]:
-        """Return times and weights in us between two times of the stretch, as `nodes` does."""
+        """Return times and weights in us whose weighted sums are integrals between two times of the stretch.
+
+        Gauss-Legendre nodes in every flight and every step of a contact, so that no phase change is crossed.
+        """
         world, pieces = self.world, self.pieces
         fastest = max(float(world.cantilever.angular_frequency), float(world.surface.fastest_angular_frequency))
         in_flight, in_contact = (np.polynomial.legendre.leggauss(n) for n in (_NODES_PER_PANEL, _NODES_PER_STEP))
@@ -416,25 +425,6 @@ def trajectory(scene: SceneLike, simulation: Simulation, times_us: ArrayLike) ->
     # without times: a stretch of no length
     ends = (wanted.min(), wanted.max()) if wanted.size else (simulation.start.time_us,) * 2
     return dense_path(scene, simulation, *(float(end) for end in ends)).at(wanted)
-
-
-def nodes(
-    scene: Scene, simulation: Simulation, from_us: float, to_us: float
-) -> tuple[Float[np.ndarray, " nodes"], Float[np.ndarray, " nodes"]]:
-    """Return times and weights in us: sums of weights times what a trajectory has at the times are integrals over time.
-
-    Gauss-Legendre nodes in every flight and every step of a contact, so that no phase change is crossed.
-
-    Args:
-        scene: the scene that was simulated.
-        simulation: of one scene.
-        from_us: beginning of the integral.
-        to_us: its end.
-
-    Raises:
-        ValueError: if a time lies outside the simulation, or the simulation is a batch.
-    """
-    return dense_path(scene, simulation, from_us, to_us).nodes(from_us, to_us)
 
 
 def _filled_up(values: np.ndarray) -> np.ndarray:

@@ -17,8 +17,17 @@ from afm_jax.dynamics.charts import StabilityChart
 from afm_jax.dynamics.exponents import Lyapunov
 from afm_jax.dynamics.impact_orbits import ManyImpactOrbits
 from afm_jax.impact.orbits import SingleImpactOrbits
-from afm_jax.plots.charts import cell_edges
-from afm_jax.plots.picture_style import ACCENT, BLUE, DARK, GRID, label_axes, new_figure, save, with_zero_line
+from afm_jax.plots.picture_style import (
+    ACCENT,
+    BLUE,
+    DARK,
+    GRID,
+    cell_edges,
+    label_axes,
+    new_figure,
+    save,
+    with_zero_line,
+)
 from afm_jax.results import unit_of, words_of
 
 KINDS = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#56B4E9", "#D55E00", "#F0E442", "#8c6bb1", "#a6761d", "#999999")

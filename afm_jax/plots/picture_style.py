@@ -4,7 +4,7 @@ import io
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Shaped
+from jaxtyping import Float, Shaped
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -95,3 +95,11 @@ def _bytes_of(figure: Figure, suffix: str, dpi: float) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format=suffix, dpi=dpi)
     return buffer.getvalue()
+
+
+def cell_edges(centres: Float[np.ndarray, " cells"]) -> Float[np.ndarray, " edges"]:
+    """Return the borders of cells, half-way between their centres."""
+    if len(centres) == 1:
+        return centres[0] + np.array([-0.5, 0.5])
+    borders = 0.5 * (centres[1:] + centres[:-1])
+    return np.concatenate([[2.0 * centres[0] - borders[0]], borders, [2.0 * centres[-1] - borders[-1]]])

@@ -10,9 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
-from afm_jax.plots.charts import cell_edges
 from afm_jax.plots.dynamics import label_of
-from afm_jax.plots.picture_style import GRID, label_axes, new_figure, save
+from afm_jax.plots.picture_style import GRID, cell_edges, label_axes, new_figure, save
 from afm_jax.sweeps.axes import dimension_of
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 
 from afm_jax.checks import check_parameter
-from afm_jax.contact.contact import FORCES, Contact
+from afm_jax.contact.contact import FORCES, Contact, check_effects
 from afm_jax.contact.forces.force import Force
 from afm_jax.contact.forces.liquid import Liquid
 from afm_jax.contact.forces.solid import CoreRepulsion
@@ -17,14 +17,14 @@ from afm_jax.units import AJ_NM6_PER_J_M6
 
 
 def make_contact(effects: Sequence[str], parameters: Mapping[str, float]) -> Contact:
-    """Return the contact of chosen effects with some of the paper's parameters changed.
+    """Return the contact of chosen effects, with some of its parameters changed.
 
     Parameters of an effect that is left out are checked, and then have no meaning: an effect can be left out without
     rewriting the rest.
 
     Args:
-        effects: names of `EFFECTS`.
-        parameters: keyword arguments of `Contact.paper`.
+        effects: names of `ALL_EFFECTS`.
+        parameters: keyword arguments of `Contact.of`.
 
     Raises:
         ValueError: if an effect is unknown or a required one missing, a value outside its range, or the contact has no
@@ -32,14 +32,14 @@ def make_contact(effects: Sequence[str], parameters: Mapping[str, float]) -> Con
     """
     for name, value in parameters.items():
         check_parameter(name, value, CONTACT_RANGES[name])
-    contact = Contact.paper(effects=tuple(effects), **parameters)
+    contact = Contact.of(tuple(effects), **parameters)
     if not bool(junction_of(contact).exists):
         raise ValueError(f"the contact has no junction: {explain_missing_junction(contact)}")
     return contact
 
 
 def contact_parameters(contact: Contact) -> dict[str, Any]:
-    """Return the parameters with which `Contact.paper` makes a contact again, by name.
+    """Return the parameters with which `Contact.of` makes a contact again, by name.
 
     Those of effects that it does not have are left out.
 
@@ -47,18 +47,19 @@ def contact_parameters(contact: Contact) -> dict[str, Any]:
         ValueError: if it holds something that a scene file has no key for: another force, the same one twice, or
             different radii or liquids in its forces.
     """
-    known = [FORCES.get(name) for name in contact.effects[:-1]]
-    if None in known or len(set(known)) < len(known):
+    effects = contact.effects
+    try:
+        check_effects(effects)
+    except ValueError as error:
         raise ValueError(
-            f"a scene file holds each of {', '.join(EFFECTS)} once, but the contact has {', '.join(contact.effects)}"
-        )
-    values: dict[str, Any] = {
-        "adhesion_energy_j_per_m2": contact.junction.adhesion_energy_j_per_m2,
-        "modulus_gpa": contact.junction.modulus_gpa,
-        "tip_radius_nm": contact.junction.tip_radius_nm,
-        "bridge_forms_nm": contact.bridge_forms_nm,
-        "bridge_breaks_nm": contact.bridge_breaks_nm,
-    }
+            f"a scene file holds each of {', '.join(EFFECTS)} once, or a dry contact, but the contact has "
+            f"{', '.join(effects)}: {error}"
+        ) from error
+    values: dict[str, Any] = dict(vars(contact.junction))
+    if contact.dry and contact.spans:
+        values["range_nm"] = contact.bridge_forms_nm
+    elif contact.spans:
+        values |= {"bridge_forms_nm": contact.bridge_forms_nm, "bridge_breaks_nm": contact.bridge_breaks_nm}
     for term in contact.forces.terms:
         for name, value in _own_parameters(term).items():
             if name in values and not np.array_equal(values[name], value):

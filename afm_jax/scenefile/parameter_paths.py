@@ -209,12 +209,11 @@ def _is_contact(scene: Scene) -> bool:
 def _contact_family(scene: Scene, names: tuple[str, ...]) -> Callable[..., object]:
     # only here, so that scenes with a law do without the contact's modules
     from afm_jax.contact.contact import Contact  # noqa: PLC0415
-    from afm_jax.contact.parameters import EFFECTS  # noqa: PLC0415
     from afm_jax.scenefile.contact import contact_parameters  # noqa: PLC0415
 
     numbers = contact_parameters(scene.interaction)
-    effects = tuple(name for name in EFFECTS if name in scene.interaction.effects)
-    return lambda *values: Contact.paper(effects=effects, **(numbers | dict(zip(names, values, strict=True))))
+    effects = scene.interaction.effects
+    return lambda *values: Contact.of(effects, **(numbers | dict(zip(names, values, strict=True))))
 
 
 def with_numbers(scene: Scene, values: Mapping[str, ArrayLike]) -> Scene:

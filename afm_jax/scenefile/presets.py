@@ -76,7 +76,7 @@ def figure9_scene(reduced_frequency: ArrayLike, offset_nm: ArrayLike, r: ArrayLi
 def figure8_scene() -> Scene:
     """Return the scene of figure 8: n = 5.277, beta = 4 nm, sigma = 0; the paper's strange attractor.
 
-    Followed longer, it is transient chaos: from all twelve starts of `afm-jax figures --only 8` (drive phase 270
+    Followed longer, it is transient chaos: from all twelve starts of the notebook on motions (drive phase 270
     degrees, 5 nm above the platform, upward at 40 to 110 nm/us) the motion locks to the (1,5) orbit in the end, after
     some tens to a thousand broadband impacts. After how many is a matter of rounding, and so of the machine; while it
     lasts, small distances grow by an exponent of about 0.8 an impact.
@@ -116,6 +116,12 @@ def contact_scene(
     drive = drive_frequency_khz(reduced_frequency)
     platform = Platform(drive_amplitude_nm, drive, offset_nm, offset_rate_nm_per_us)
     return Scene(Cantilever(FREE_FREQUENCY_KHZ, QUALITY_FACTOR, 1.0), platform, Contact.paper())
+
+
+def dry_scene() -> Scene:
+    """Return figure 10's scene at offset 0 with a dry contact in place of the liquid bridge and the JKR junction."""
+    scene = contact_scene(0.97, 2.0, 0.0)
+    return Scene(scene.cantilever, scene.platform, Contact.of(("van_der_waals", "dmt")))
 
 
 def drive_frequency_khz(reduced_frequency: ArrayLike) -> Float[Array, "..."]:
@@ -158,6 +164,10 @@ _PRESETS = {
     "figure11": _Preset(
         "Contact above resonance, n = 1.01, drive amplitude 4 nm; the offset rises from -2 nm, to 2 nm in 4000 us.",
         lambda: figure11_scene(offset_rate_nm_per_us=RAMP_NM_PER_US),
+    ),
+    "dry": _Preset(
+        "Dry contact (van der Waals, DMT) below resonance, n = 0.97, drive amplitude 2 nm, offset 0.",
+        dry_scene,
     ),
 }
 

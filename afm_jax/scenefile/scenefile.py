@@ -431,13 +431,13 @@ def _law_table(law: ImpactLaw) -> dict[str, Any]:
 def _contact_table(contact: Any) -> dict[str, Any]:
     # only here, so that scenes with a law do without the contact's modules
     from afm_jax.contact.contact import Contact  # noqa: PLC0415
-    from afm_jax.contact.parameters import EFFECTS  # noqa: PLC0415
+    from afm_jax.contact.parameters import ALL_EFFECTS  # noqa: PLC0415
     from afm_jax.scenefile.contact import contact_parameters  # noqa: PLC0415
 
     if not isinstance(contact, Contact):
         raise TypeError(f"a scene file holds an ImpactLaw or a Contact as interaction, not {type(contact).__name__}")
     numbers = {key: number_of(value, key) for key, value in contact_parameters(contact).items()}
-    return {"model": "contact", "effects": [name for name in EFFECTS if name in contact.effects], **numbers}
+    return {"model": "contact", "effects": [name for name in ALL_EFFECTS if name in contact.effects], **numbers}
 
 
 def _checked(contents: Mapping[str, Any], source: str) -> dict[str, SceneTable]:
@@ -538,11 +538,11 @@ def _tabulated(table: SceneTable) -> TabulatedLaw:
 
 def _contact_of(table: SceneTable) -> "Contact":
     # only here, so that scenes with a law do without the contact's modules
-    from afm_jax.contact.parameters import EFFECTS, PAPER  # noqa: PLC0415
+    from afm_jax.contact.parameters import DEFAULTS, EFFECTS  # noqa: PLC0415
     from afm_jax.scenefile.contact import make_contact  # noqa: PLC0415
 
     effects = table.texts("effects")
-    numbers = table.numbers(optional=tuple(PAPER))
+    numbers = table.numbers(optional=tuple(DEFAULTS))
     return table.build(make_contact, EFFECTS if effects is None else effects, numbers)
 
 

@@ -51,9 +51,9 @@ def keys_of(table: str, model: str) -> tuple[str, ...]:
     if model != "contact":
         return ("model",)
     # only here, so that scenes with a law do without the contact's modules
-    from afm_jax.contact.parameters import PAPER  # noqa: PLC0415
+    from afm_jax.contact.parameters import DEFAULTS  # noqa: PLC0415
 
-    return ("model", "effects", *PAPER)
+    return ("model", "effects", *DEFAULTS)
 
 
 def advise_key(table: str, key: str, model: str = "law") -> str:

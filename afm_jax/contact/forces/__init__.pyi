@@ -1,3 +1,5 @@
+from afm_jax.contact.forces.dry import Dmt as Dmt
+from afm_jax.contact.forces.dry import Hertz as Hertz
 from afm_jax.contact.forces.force import DissipativeForce as DissipativeForce
 from afm_jax.contact.forces.force import ForceSum as ForceSum
 from afm_jax.contact.forces.force import StaticForce as StaticForce

@@ -11,7 +11,9 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from afm_jax.checks import as_argument, as_parameter, check_parameter, readable
+from afm_jax.checks import as_argument, as_parameter
+from afm_jax.contact.forces.force import ElasticCurve, Parameters, Terms
+from afm_jax.contact.parameters import DEFAULTS
 
 SLOPE = 2.0 * math.sqrt(6.0) / 3.0
 """The linear coefficient of the depth: Delta = s^4 - SLOPE s."""
@@ -74,7 +76,69 @@ def root_of_depth(normalised_depth: ArrayLike) -> Float[Array, "..."]:
     return 0.5 * (jnp.sqrt(2.0 * y) + jnp.where(inside, jnp.sqrt(jnp.where(inside, inner, 1.0)), 0.0))
 
 
-class Jkr(eqx.Module):
+class JkrCurve(ElasticCurve):
+    """The JKR contact in normalised variables: load in units of pi w R, depth in units of (pi^2 w^2 R / K^2)^(1/3)."""
+
+    fold = FOLD
+    reversible = False
+
+    def load(self, s: ArrayLike) -> Float[Array, "..."]:
+        """Return the normalised load s^6 - sqrt(6) s^3."""
+        return load(s)
+
+    def depth(self, s: ArrayLike) -> Float[Array, "..."]:
+        """Return the normalised depth s^4 - (2 sqrt(6)/3) s."""
+        return depth(s)
+
+    def depth_slope(self, s: ArrayLike) -> Float[Array, "..."]:
+        """Return the derivative of the normalised depth by s, 0 at the fold."""
+        return depth_slope(s)
+
+    def work(self, s: ArrayLike) -> Float[Array, "..."]:
+        """Return the normalised potential (2/5) s^10 - (2 sqrt(6)/3) s^7 + s^4."""
+        return work(s)
+
+    def root_of_depth(self, normalised_depth: ArrayLike) -> Float[Array, "..."]:
+        """Return s of the branch that is stable when pulled; below the depth of the fold that of the fold."""
+        return root_of_depth(normalised_depth)
+
+    @property
+    def terms(self) -> tuple[Terms, Terms]:
+        """Work and depth as polynomials of s."""
+        return ((10, 0.4), (7, -SLOPE), (4, 1.0)), ((4, 1.0), (1, -SLOPE))
+
+    @property
+    def unloaded(self) -> Float[Array, "..."]:
+        """S without load, 6^(1/6)."""
+        return jnp.full_like(self.load_scale_nn, 6.0 ** (1.0 / 6.0))
+
+    def beyond(self, work: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return an s that is not smaller than the one at which the work has a value."""
+        far = (2.5 * jnp.maximum(work, 0.0)) ** 0.1
+        return jnp.cbrt(far**3 + 3.4)
+
+    def width(self, energy: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return the distance from the fold at which the work has fallen by a normalised kinetic energy there."""
+        # work(fold) - work(s) is _CURVATURE (s - fold)^2 to leading order
+        return jnp.sqrt(jnp.maximum(energy, 1e-12) / _CURVATURE)
+
+    def bend(self, s: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return the derivative of load times depth slope by s; at s = 1.196, where it vanishes, 0.3 of its terms."""
+        cube = s**3
+        curvature = s * s * (cube * (36.0 * cube - 42.0 * SLOPE) + 12.0)
+        return jnp.maximum(jnp.abs(curvature), 0.3 * s * s * (36.0 * cube * cube + 12.0))
+
+    def reach(self, s: Float[Array, "..."], energy: Float[Array, "..."]) -> Float[Array, "..."]:
+        """Return the distance in s over which the load changes: s itself, however fast the tip is."""
+        del energy
+        return s
+
+
+# work' = P Delta' and Delta'(fold) = 0, so that work''(fold) = P(fold) Delta''(fold) = P(fold) 12 fold^2
+_CURVATURE = -6.0 * (FOLD**6 - 6.0**0.5 * FOLD**3) * FOLD**2
+
+
+class Jkr(Parameters):
     """The JKR contact of a sphere and a plane, eq. 15.
 
     Args:
@@ -86,16 +150,11 @@ class Jkr(eqx.Module):
         ValueError: if a value is not positive.
     """
 
-    adhesion_energy_j_per_m2: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.3)
-    modulus_gpa: Float[Array, "..."] = eqx.field(converter=as_parameter, default=100.0)
-    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=100.0)
-
-    __repr__ = readable
-
-    def __check_init__(self):
-        check_parameter("adhesion_energy_j_per_m2", self.adhesion_energy_j_per_m2, "positive")
-        check_parameter("modulus_gpa", self.modulus_gpa, "positive")
-        check_parameter("tip_radius_nm", self.tip_radius_nm, "positive")
+    adhesion_energy_j_per_m2: Float[Array, "..."] = eqx.field(
+        converter=as_parameter, default=DEFAULTS["adhesion_energy_j_per_m2"]
+    )
+    modulus_gpa: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["modulus_gpa"])
+    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["tip_radius_nm"])
 
     @property
     def load_scale_nn(self) -> Float[Array, "..."]:
@@ -106,6 +165,11 @@ class Jkr(eqx.Module):
     def depth_scale_nm(self) -> Float[Array, "..."]:
         """The unit of the depth, (pi^2 w^2 R / K^2)^(1/3), in nm."""
         return jnp.cbrt(self.tip_radius_nm * (jnp.pi * self.adhesion_energy_j_per_m2 / self.modulus_gpa) ** 2)
+
+    @property
+    def curve(self) -> JkrCurve:
+        """The contact in normalised variables."""
+        return JkrCurve(self.load_scale_nn, self.depth_scale_nm)
 
     @property
     def energy_scale_aj(self) -> Float[Array, "..."]:
@@ -123,11 +187,8 @@ class Jkr(eqx.Module):
         The depth counts into the sample; below `pull_off_depth_nm` there is no contact and the value at the fold is
         returned.
         """
-        return self.load_scale_nn * load(self._root(depth_nm))
+        return self.curve.force(depth_nm)
 
     def potential(self, depth_nm: ArrayLike) -> Float[Array, "..."]:
         """Return the potential energy in aJ at a depth in nm, 0 where the contact radius would vanish."""
-        return self.energy_scale_aj * work(self._root(depth_nm))
-
-    def _root(self, depth_nm: ArrayLike) -> Float[Array, "..."]:
-        return root_of_depth(as_argument(depth_nm) / self.depth_scale_nm)
+        return self.energy_scale_aj * work(root_of_depth(as_argument(depth_nm) / self.depth_scale_nm))

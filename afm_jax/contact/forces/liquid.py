@@ -1,23 +1,22 @@
-"""The liquid of the bridge, and its radius of curvature in equilibrium with the humid air (eq. 11).
+"""Forces of the liquid bridge: capillary attraction, structural repulsion, viscous drag (eqs. 10 to 13).
 
-The capillary attraction of a liquid bridge (eq. 10).
-
-The structural repulsion of a confined liquid, averaged over its oscillations (eq. 13).
-
-The viscous force of a liquid bridge that is squeezed or stretched (eq. 12).
+The liquid is in equilibrium with its vapour, whose humidity sets the meniscus' radius of curvature (eq. 11). The
+structural repulsion of the confined liquid is averaged over its oscillations; the viscous force resists squeezing and
+stretching.
 """
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from afm_jax.checks import as_argument, as_parameter, check_parameter, is_traced, readable
-from afm_jax.contact.forces.force import DissipativeForce, StaticForce
+from afm_jax.checks import as_parameter, is_traced
+from afm_jax.contact.forces.force import DissipativeForce, Parameters, StaticForce
+from afm_jax.contact.parameters import DEFAULTS
 from afm_jax.units import GAS_CONSTANT_J_PER_MOL_K, NM_PER_CM3_PER_M2, NN_US_PER_NM2_PER_PA_S
 
 
-class Liquid(eqx.Module):
+class Liquid(Parameters):
     """A liquid in equilibrium with its vapour; the defaults are water at the paper's 50 % relative humidity.
 
     Args:
@@ -30,18 +29,14 @@ class Liquid(eqx.Module):
         ValueError: if a value is not positive, or the relative humidity not below 1.
     """
 
-    relative_humidity: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.5)
-    temperature_k: Float[Array, "..."] = eqx.field(converter=as_parameter, default=293.15)
-    surface_tension_n_per_m: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.0728)
-    molar_volume_cm3_per_mol: Float[Array, "..."] = eqx.field(converter=as_parameter, default=18.0795)
-
-    __repr__ = readable
-
-    def __check_init__(self):
-        check_parameter("relative_humidity", self.relative_humidity, "between 0 and 1")
-        check_parameter("temperature_k", self.temperature_k, "positive")
-        check_parameter("surface_tension_n_per_m", self.surface_tension_n_per_m, "positive")
-        check_parameter("molar_volume_cm3_per_mol", self.molar_volume_cm3_per_mol, "positive")
+    relative_humidity: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["relative_humidity"])
+    temperature_k: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["temperature_k"])
+    surface_tension_n_per_m: Float[Array, "..."] = eqx.field(
+        converter=as_parameter, default=DEFAULTS["surface_tension_n_per_m"]
+    )
+    molar_volume_cm3_per_mol: Float[Array, "..."] = eqx.field(
+        converter=as_parameter, default=DEFAULTS["molar_volume_cm3_per_mol"]
+    )
 
     @property
     def kelvin_radius_nm(self) -> Float[Array, "..."]:
@@ -79,22 +74,17 @@ class Capillary(StaticForce):
         ValueError: if the radius is not positive, or below the Kelvin radius (no such meniscus).
     """
 
-    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=100.0)
+    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["tip_radius_nm"])
     liquid: Liquid = eqx.field(default_factory=Liquid)
 
     def __check_init__(self):
-        check_parameter("tip_radius_nm", self.tip_radius_nm, "positive")
+        self.check_ranges()
         check_meniscus(self.tip_radius_nm, self.liquid)
 
     @property
     def pull_nn(self) -> Float[Array, "..."]:
         """The attraction at gap 0, 4 pi R gamma_l, in nN."""
         return 4.0 * jnp.pi * self.tip_radius_nm * self.liquid.surface_tension_n_per_m
-
-    def __call__(self, gap_nm: ArrayLike, gap_rate_nm_per_us: ArrayLike = 0.0) -> Float[Array, "..."]:
-        """Return the force in nN at a gap in nm; the rate does not matter."""
-        del gap_rate_nm_per_us
-        return -self.pull_nn / (1.0 + as_argument(gap_nm) / (2.0 * self.liquid.kelvin_radius_nm))
 
     def coefficients(self) -> tuple[Float[Array, "..."], ...]:
         """Return 8 pi R gamma_l r_K and 1/(2 r_K)."""
@@ -122,17 +112,16 @@ class Structural(StaticForce):
         ValueError: if a value is outside its range, or the Kelvin radius exceeds the tip's (no such meniscus).
     """
 
-    amplitude_n_per_m: Float[Array, "..."] = eqx.field(converter=as_parameter, default=40.0)
-    decay_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.6)
-    offset_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.6)
-    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=100.0)
+    amplitude_n_per_m: Float[Array, "..."] = eqx.field(
+        converter=as_parameter, default=DEFAULTS["structural_amplitude_n_per_m"]
+    )
+    decay_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["structural_decay_nm"])
+    offset_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["structural_offset_nm"])
+    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["tip_radius_nm"])
     liquid: Liquid = eqx.field(default_factory=Liquid)
 
     def __check_init__(self):
-        check_parameter("amplitude_n_per_m", self.amplitude_n_per_m, "not negative")
-        check_parameter("decay_nm", self.decay_nm, "positive")
-        check_parameter("offset_nm", self.offset_nm, "finite")
-        check_parameter("tip_radius_nm", self.tip_radius_nm, "positive")
+        self.check_ranges()
         check_meniscus(self.tip_radius_nm, self.liquid)
 
     @property
@@ -142,11 +131,6 @@ class Structural(StaticForce):
         kelvin = self.liquid.kelvin_radius_nm
         share = -jnp.expm1(-2.0 * kelvin * (1.0 - kelvin / self.tip_radius_nm) / self.decay_nm)
         return self.amplitude_n_per_m * self.decay_nm * jnp.exp(self.offset_nm / self.decay_nm) * share
-
-    def __call__(self, gap_nm: ArrayLike, gap_rate_nm_per_us: ArrayLike = 0.0) -> Float[Array, "..."]:
-        """Return the force in nN at a gap in nm; the rate does not matter."""
-        del gap_rate_nm_per_us
-        return self.strength_nn * jnp.exp(-as_argument(gap_nm) / self.decay_nm)
 
     def coefficients(self) -> tuple[Float[Array, "..."], ...]:
         """Return tau times the force at gap 0, and -1/tau."""
@@ -170,12 +154,8 @@ class Viscous(DissipativeForce):
         ValueError: if the viscosity is negative or the radius not positive.
     """
 
-    viscosity_pa_s: Float[Array, "..."] = eqx.field(converter=as_parameter, default=1.005e-3)
-    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=100.0)
-
-    def __check_init__(self):
-        check_parameter("viscosity_pa_s", self.viscosity_pa_s, "not negative")
-        check_parameter("tip_radius_nm", self.tip_radius_nm, "positive")
+    viscosity_pa_s: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["viscosity_pa_s"])
+    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["tip_radius_nm"])
 
     def coefficients(self) -> tuple[Float[Array, "..."], ...]:
         """Return (3 pi/2) eta R^2 in nN us."""

@@ -1,13 +1,15 @@
-"""The repulsion of the atomic cores of tip and sample (eq. 14).
+"""Forces between the solids: the repulsion of their atomic cores (eq. 14), and the van der Waals attraction.
 
-The van der Waals attraction between a sphere and a plane, not retarded (Hamaker 1937).
+The attraction is that of a sphere and a plane at gaps small against the radius, not retarded (Hamaker 1937).
 """
 
 import equinox as eqx
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
-from afm_jax.checks import as_argument, as_parameter, check_parameter
+from afm_jax.checks import as_parameter, check_parameter
 from afm_jax.contact.forces.force import StaticForce
+from afm_jax.contact.parameters import DEFAULTS
+from afm_jax.units import AJ_NM6_PER_J_M6
 
 
 class CoreRepulsion(StaticForce):
@@ -21,17 +23,14 @@ class CoreRepulsion(StaticForce):
         ValueError: if a value is not positive.
     """
 
-    constant_aj_nm6: Float[Array, "..."] = eqx.field(converter=as_parameter, default=1e-6)
-    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=100.0)
+    constant_aj_nm6: Float[Array, "..."] = eqx.field(
+        converter=as_parameter,
+        default=DEFAULTS["core_constant_j_m6"] * AJ_NM6_PER_J_M6,
+    )
+    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["tip_radius_nm"])
 
     def __check_init__(self):
         check_parameter("constant_aj_nm6", self.constant_aj_nm6, "above 0")
-        check_parameter("tip_radius_nm", self.tip_radius_nm, "positive")
-
-    def __call__(self, gap_nm: ArrayLike, gap_rate_nm_per_us: ArrayLike = 0.0) -> Float[Array, "..."]:
-        """Return the force in nN at a gap in nm; the rate does not matter."""
-        del gap_rate_nm_per_us
-        return self.constant_aj_nm6 * self.tip_radius_nm / 180.0 / as_argument(gap_nm) ** 8
 
     def coefficients(self) -> tuple[Float[Array, "..."], ...]:
         """Return B R / 1260."""
@@ -54,17 +53,10 @@ class VanDerWaals(StaticForce):
         ValueError: if the Hamaker constant is negative or the radius not positive.
     """
 
-    hamaker_constant_aj: Float[Array, "..."] = eqx.field(converter=as_parameter, default=0.1)
-    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=100.0)
-
-    def __check_init__(self):
-        check_parameter("hamaker_constant_aj", self.hamaker_constant_aj, "not negative")
-        check_parameter("tip_radius_nm", self.tip_radius_nm, "positive")
-
-    def __call__(self, gap_nm: ArrayLike, gap_rate_nm_per_us: ArrayLike = 0.0) -> Float[Array, "..."]:
-        """Return the force in nN at a gap in nm; the rate does not matter."""
-        del gap_rate_nm_per_us
-        return -self.hamaker_constant_aj * self.tip_radius_nm / (6.0 * as_argument(gap_nm) ** 2)
+    hamaker_constant_aj: Float[Array, "..."] = eqx.field(
+        converter=as_parameter, default=DEFAULTS["hamaker_constant_aj"]
+    )
+    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["tip_radius_nm"])
 
     def coefficients(self) -> tuple[Float[Array, "..."], ...]:
         """Return -H R / 6."""

@@ -1,0 +1,646 @@
+"""Commands that read data of instruments, fit them, and plan what to measure next."""
+
+import re
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import click
+
+from afm_jax.cli.command import Command, Options
+from afm_jax.cli.design_belief import with_belief_options
+from afm_jax.cli.fit_options import Constraint, Fixed, Names, check_fit
+from afm_jax.cli.options import NOISE, QUALITY_FACTOR
+from afm_jax.cli.session import FIT_PROGRAMS, Session
+from afm_jax.cli.values import Finite, FiniteOrNone, Numbers, Orders, Share, ValueAndError
+from fitting.parameters import CONTACT_DEFAULT, DELAY_LAW, LAWS, MODELS, NUISANCE_NAMES
+
+
+def _number(name: str, unit: str, text: str) -> Any:
+    """Return the option of a number with its error."""
+    short = ("--spring-constant",) if name.startswith("spring") else ()
+    return click.option(f"--{name}", *short, type=ValueAndError(), metavar=unit, help=text)
+
+
+def _check_lever(_: Session, options: Options) -> None:
+    """Check that a lever has both sides or none."""
+    if (options["length_um"] is None) != (options["width_um"] is None):
+        raise click.UsageError("Sader's method needs both --length-um and --width-um")
+
+
+CALIBRATE = Command(
+    name="calibrate",
+    group="measure",
+    summary="Fit a resonance sweep or a thermal spectrum: frequency, Q, stiffness.",
+    runs="afm_jax.cli.calibrate:calibration",
+    help="""Fit frequency and quality factor to a free resonance sweep or a thermal spectrum.
+
+    SWEEP is Nanonis text, or CSV with the columns frequency_khz (or frequency_hz), amplitude_nm (or amplitude, any
+    unit) and, where known, phase_deg, amplitude_error_nm (or amplitude_error), phase_error_deg. Without errors and
+    --noise the errors are estimated from the misfit. frequency_khz is the undamped natural frequency, not that of the
+    maximum. A thermal spectrum (NanoSurf .nid, or CSV with asd_nm_per_sqrt_hz or psd_nm2_per_hz and a comment
+    `# averages = 1000`) gives the spring constant besides, by equipartition and, with the lever's length and width, by
+    Sader's method; --slope gives the sensitivity from force curves. With --out the report: calibration.txt, .json, .png
+    and (without --slope) calibration_points.csv. Exit code 3 if the result is not valid: no resonance, at the edge, not
+    converged, or not explained by the model.
+    """,
+    options=(
+        click.argument("sweep", metavar="SWEEP", type=click.Path(path_type=Path)),
+        click.option(
+            "--background",
+            type=click.Choice(("none", "floor", "constant", "linear")),
+            help="What is added to the response: with phase none, constant or linear; without none, floor or constant. "
+            "Without this option constant, or what Akaike's criterion prefers clearly.",
+        ),
+        click.option("--amplitude-only", is_flag=True, help="Leave the phase of the sweep aside."),
+        click.option(
+            "--noise",
+            type=Share("a relative error"),
+            metavar="SHARE",
+            help="Error of every point as a share of the largest amplitude.",
+        ),
+        click.option(
+            "--scale-errors", is_flag=True, help="Take given errors as relative: scale them until chi2/dof is 1."
+        ),
+        click.option("--whole", is_flag=True, help="Fit all of a thermal spectrum, not what the model explains of it."),
+        click.option(
+            "--length-um", type=ValueAndError(), metavar="UM", help="Length of a rectangular lever: Sader's method."
+        ),
+        click.option("--width-um", type=ValueAndError(), metavar="UM", help="Its width, '40 +- 1' with its error."),
+        click.option(
+            "--temperature-k", type=ValueAndError(), metavar="K", help="Of lever and air [default: the file's, 296]."
+        ),
+        click.option(
+            "--deflection",
+            type=click.Choice(["static", "mode"]),
+            default="static",
+            show_default=True,
+            help="How a thermal spectrum got its nm: by the slope of a force curve (static InvOLS), or for the mode "
+            "itself.",
+        ),
+        click.option(
+            "--scale-error",
+            type=Share("a relative error"),
+            metavar="SHARE",
+            help="Relative error of the deflection's scale (its sensitivity), of which k has twice as much [default: "
+            "5 %].",
+        ),
+        click.option(
+            "--slope", is_flag=True, help="SWEEP holds force curves: the sensitivity (nm/V) from their slope."
+        ),
+    ),
+    check=_check_lever,
+)
+
+
+def _check_lists(_: Session, options: Options) -> None:
+    """Check that frequencies and places are said once."""
+    if options["frequencies_khz"] is not None and options["detuning"] is not None:
+        raise click.UsageError("--frequencies-khz and --detuning both say what the drive frequency can be; give one")
+    if options["offsets_nm"] is not None and options["heights"] is not None:
+        raise click.UsageError("--offsets-nm and --heights both say where the sample can be; give one")
+
+
+DESIGN = Command(
+    name="design",
+    group="measure",
+    summary="Choose the drives to measure next, and forecast what they will determine.",
+    runs="afm_jax.cli.design:planned",
+    help="""Choose the drives to measure next, and forecast how well the law will then be known.
+
+    Say what is believed: the cantilever (--free-frequency-khz, --quality-factor '40 +- 2') and the law (--r,
+    --epsilon, ...), or what was measured so far (--fit, --measured); and what can be driven: every combination of
+    orders, frequencies, amplitudes and offsets is a candidate; with --drive force or base (the cantilever is driven
+    itself, amplitude and lag are read) of frequencies, free amplitudes and heights. LISTs are numbers and ranges, 1,2,5
+    or 170:190:1. With --out the report: design.csv, to_fill_in.csv (a table for `afm-jax fit`, readings left blank),
+    candidates.csv, design.txt, .json, .png. Exit code 3 if no drive can be planned with, or the points do not determine
+    the law.
+    """,
+    options=(
+        click.option(
+            "--orders",
+            type=Orders(),
+            metavar="LIST",
+            help="Drive periods an impact; else 1-4, or 1 where the tip is driven.",
+        ),
+        click.option(
+            "--frequencies-khz", type=Numbers(), metavar="LIST", help="Drive frequencies, the same for every order."
+        ),
+        click.option(
+            "--detuning",
+            type=Numbers(),
+            metavar="LIST",
+            help="Drive frequencies as multiples of each order's resonance 2 N f0, else 0.97:1.05:0.01; or of f0 where "
+            "the tip is driven, else 1.02:1.1:0.02.",
+        ),
+        click.option(
+            "--drive-nm",
+            type=Numbers(),
+            metavar="LIST",
+            help="Drive amplitudes, else 2,4,7,10; or free ones, else 40,80.",
+        ),
+        click.option("--offsets-nm", type=Numbers(positive=False), metavar="LIST", help="Offsets; else -1,0,1."),
+        click.option(
+            "--heights",
+            type=Numbers(positive=False),
+            metavar="LIST",
+            help="Where the tip is driven, in place of offsets: distances of the sample as shares of each free "
+            "amplitude; else "
+            "0.1:0.9:0.1.",
+        ),
+        click.option("--largest-nm", type=Finite(), metavar="X", help="Peak amplitude that the instrument takes."),
+        click.option("--points", type=click.IntRange(1, 200), default=8, show_default=True, help="How many to choose."),
+        click.option(
+            "--for", "interest", metavar="NAMES", help="Parameters to be known well, as r,epsilon; else the law's."
+        ),
+        click.option(
+            "--criterion",
+            type=click.Choice(("D", "A")),
+            default="D",
+            show_default=True,
+            help="Smallest joint region, or sum of variances.",
+        ),
+        click.option(
+            "--noise",
+            type=Share("a relative error"),
+            default="1%",
+            show_default=True,
+            metavar="SHARE",
+            help="Relative error of an amplitude.",
+        ),
+        click.option(
+            "--phase-noise-deg",
+            type=Finite(),
+            default=0.2,
+            show_default=True,
+            metavar="X",
+            help="Error of a lag, tip driven.",
+        ),
+        click.option(
+            "--amplitudes",
+            type=click.Choice(("both", "peak", "lockin")),
+            default="both",
+            show_default=True,
+            help="What is read of a point.",
+        ),
+        click.option(
+            "--uncertainty",
+            type=Share("a relative error"),
+            default="10%",
+            show_default=True,
+            metavar="SHARE",
+            help="How far the law may be off where no fit says.",
+        ),
+        with_belief_options,
+    ),
+    check=_check_lists,
+)
+
+
+FIT = Command(
+    name="fit",
+    group="measure",
+    summary="Fit the impact law to a table of vibration amplitudes.",
+    runs="afm_jax.cli.fit:fit",
+    help="""Fit the impact law to a table of vibration amplitudes, or one law to several tables.
+
+    The table is a CSV file: comment lines `# free_frequency_khz = 90`, `# quality_factor = 40 +- 1`, and columns
+    order, drive_frequency_khz, drive_amplitude_nm, offset_nm, peak_amplitude_nm and/or lockin_amplitude_nm, each
+    with its ..._error_nm; a column no_orbit marks by 1 drives on which the tip settled on nothing; phase_deg
+    counts too. With a line `# drive = force` (or base) it is a tapping curve: drive_frequency_khz, free_amplitude_nm,
+    offset_nm, lockin_amplitude_nm and phase_lag_deg. Several tables have one law, each nuisances of its own or shared
+    ones, and the report says how far each is from the others (its pull). With --out the report: fit.html, fit.txt,
+    fit.json, fit.png, fit_rows.csv, law.csv, and with --trust trust.png, trust_rows.csv. Exit code 3 if the result is
+    not valid: not converged, not explained by the model, or a parameter not identified.
+    """,
+    options=(
+        click.argument("tables", metavar="[TABLE.csv]...", nargs=-1, type=click.Path(path_type=Path)),
+        click.option(
+            "--model",
+            default="law",
+            show_default=True,
+            type=click.Choice(MODELS),
+            help="; ".join(f"{name}: {law.meaning}" for name, law in LAWS.items())
+            + f"; each with {DELAY_LAW.meaning} (+delay); contact: physical parameters through the resolved contact, "
+            "of tapping curves on resonance too.",
+        ),
+        NOISE,
+        QUALITY_FACTOR,
+        click.option(
+            "--scale-errors",
+            is_flag=True,
+            help="Take the errors as relative: scale them, by 3 at most, until chi2/dof is 1.",
+        ),
+        click.option(
+            "--robust", is_flag=True, help="Let outliers, one row in ten at most, count linearly from two errors on."
+        ),
+        click.option(
+            "--free",
+            type=Names(),
+            metavar="NAME,...",
+            help="The parameters that are fitted, if not all that are not fixed; of a contact, if left out, "
+            f"{','.join(CONTACT_DEFAULT)}.",
+        ),
+        click.option("--fix", type=Fixed(), multiple=True, metavar="NAME=VALUE", help="Hold a parameter at a value."),
+        click.option(
+            "--constrain",
+            type=Constraint(),
+            multiple=True,
+            metavar="NAME=VALUE+-ERROR",
+            help=f"What is known beforehand: {', '.join(NUISANCE_NAMES)}, or a parameter of the model; "
+            "of a contact also one that is held, at the value then.",
+        ),
+        click.option(
+            "--no", "left_out", type=Names(), metavar="EFFECT,...", help="contact: effects that it does not have."
+        ),
+        click.option(
+            "--compare", "comparing", is_flag=True, help="Fit the rival models too and say what the table can tell."
+        ),
+        click.option(
+            "--bootstrap",
+            type=click.IntRange(min=50, max=100_000),
+            metavar="SAMPLES",
+            help="Intervals by refitting this many synthetic tables, too.",
+        ),
+        click.option(
+            "--posterior",
+            is_flag=True,
+            help="Credible intervals, too: by a grid, or NUTS for more than two parameters.",
+        ),
+        click.option(
+            "--trust",
+            is_flag=True,
+            help="What speaks for the posterior and against it, too (with --posterior): predicted readings, ranks in "
+            "100 "
+            "simulated tables, leave-one-out, influence of single rows.",
+        ),
+        click.option(
+            "--arviz",
+            metavar="FILE.nc",
+            type=click.Path(path_type=Path, dir_okay=False),
+            help="Write the posterior for ArviZ (with --posterior; extra `arviz`).",
+        ),
+        click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of everything random."),
+        click.option(
+            "--share",
+            type=Names(),
+            metavar="NAME,...",
+            help="Of several tables: nuisances (of --constrain) that all have in common, or all; left out, each has "
+            "its own.",
+        ),
+        click.option(
+            "--hierarchical",
+            is_flag=True,
+            help="Let the laws of several tables scatter around their mean, and say how much.",
+        ),
+        click.option("--example", is_flag=True, help="Fit the bundled table instead of a file."),
+        click.option(
+            "--each", is_flag=True, help="Fit each of several tables by itself; with --out what is done is kept."
+        ),
+        click.option(
+            "--workers", type=click.IntRange(1, 1024), metavar="N", help="Processes that --each takes, by Dask."
+        ),
+    ),
+    check=check_fit,
+    programs=lambda options: () if options["each"] else FIT_PROGRAMS,
+)
+
+
+def _check_table(_: Session, options: Options) -> None:
+    """Check that there is a table, or the example alone."""
+    if options["example"] == (options["table"] is not None):
+        raise click.UsageError("give a table to invert, `afm-jax invert TABLE.csv`, or --example for the bundled one")
+
+
+INVERT = Command(
+    name="invert",
+    group="measure",
+    summary="Read speeds and delay of every impact off amplitude and phase, without a law.",
+    runs="afm_jax.cli.invert:inversion",
+    help="""Read approach speed, rebound speed and collision delay off amplitude and phase, row by row, without any law.
+
+    The table is that of `afm-jax fit` with phase_deg and phase_error_deg. The losses are then regressed on both laws
+    (restitution, viscous loss), the delays on the delay law. Rows on resonance are also read as the paper proposes,
+    without their phase. With --out the report: invert.txt, .json, .png, .csv and law.csv. Exit code 3 if the rows
+    determine no law, or none explains them.
+    """,
+    options=(
+        click.argument("table", metavar="[TABLE.csv]", required=False, type=click.Path(path_type=Path)),
+        NOISE,
+        QUALITY_FACTOR,
+        click.option(
+            "--frequency-error",
+            "frequency_error_khz",
+            type=Finite(positive=True),
+            metavar="KHZ",
+            help="Standard error of the free frequency; without it, exactly known.",
+        ),
+        click.option(
+            "--truth",
+            type=click.Path(path_type=Path),
+            metavar="FILE",
+            help="The law if it is known, from a file as of --law or the collide.csv of `afm-jax collide --out`: "
+            "compared with the reading on resonance.",
+        ),
+        click.option(
+            "--law",
+            type=click.Path(path_type=Path),
+            metavar="FILE",
+            help="A fit's fit.json or law.csv, a law.json of `collide --make-law`, or a CSV of measured speeds: its "
+            "law "
+            "with its band beside the rows; one of other speeds is refused.",
+        ),
+        click.option("--example", is_flag=True, help="Invert the bundled table instead of a file."),
+    ),
+    check=_check_table,
+)
+
+_OF_A_TRACE = (
+    ("sampling-rate-mhz", "MHz", "Samples per us; not needed with a column time_us."),
+    ("drive-frequency-khz", "kHz", "Frequency of the platform."),
+    ("drive-amplitude-nm", "nm", "Amplitude of the platform, for the table; else the column platform_nm tells it."),
+    ("offset-nm", "nm", "Mean height of the platform above the tip's rest position, for the table."),
+    (
+        "drive-phase-deg",
+        "DEGREES",
+        "psi in platform = offset + beta cos(omega t + psi), t the trace's time [default: 0].",
+    ),
+    ("free-frequency-khz", "kHz", "Undamped natural frequency; else read off the trace, for counting impacts only."),
+    ("quality-factor", "Q", "Quality factor of the cantilever; none: no air damping."),
+    ("mass-ng", "ng", "Effective mass, for the table."),
+    ("spring-constant-n-per-m", "N_PER_M", "Or the spring constant, which says the mass k/Omega^2."),
+    ("rest-nm", "nm", "What the deflection reads at the tip's rest position [default: 0]."),
+)
+_TRACE_SETTINGS = tuple(
+    click.option(f"--{name}", type=FiniteOrNone() if name == "quality-factor" else Finite(), metavar=unit, help=text)
+    for name, unit, text in _OF_A_TRACE
+)
+
+LOCKIN = Command(
+    name="lockin",
+    group="measure",
+    summary="Read response order, amplitudes and phase off time traces of the deflection.",
+    runs="afm_jax.cli.lockin:lockin_of_traces",
+    help="""Turn time traces of the deflection into response order, amplitudes and phase.
+
+    TRACE is CSV or HDF5 with the columns deflection_nm (the tip's height), time_us (or a sampling rate) and, as
+    reference of the phase, platform_nm or drive. Every setting below may stand in the file instead, as a comment
+    `# drive_frequency_khz = 180` or an HDF5 attribute; options hold for all traces. Orbits that are not steady with
+    one impact are flagged: several impacts, period doubled, chaotic, drifting, ringing, stuck, no response. With --out
+    a picture of every trace, lockin.json, and amplitudes.csv for `afm-jax fit` with the steady ones; traces of one
+    drive give one row, their mean. Exit code 3 if a trace is flagged.
+    """,
+    options=(
+        click.argument("traces", metavar="TRACE...", nargs=-1, required=True, type=click.Path(path_type=Path)),
+        *_TRACE_SETTINGS,
+        click.option(
+            "--order", type=click.IntRange(1, 16), metavar="N", help="Flag responses of another order than N."
+        ),
+        click.option("--group", metavar="NAME", help="Group of an HDF5 file that holds the data sets."),
+    ),
+    computes=False,
+)
+
+_READING_NUMBERS = (
+    ("drive-frequency-khz", "KHZ", "Frequency of the drive; where nothing says it, the free frequency."),
+    ("free-frequency-khz", "KHZ", "Natural frequency of the free cantilever, '90 +- 0.01' with its error."),
+    ("quality-factor", "Q", "Its quality factor, '200 +- 5' with its error."),
+    ("spring-constant-n-per-m", "N_PER_M", "Its modal spring constant (1.03 times the static one), '5.4 +- 0.5'."),
+    ("free-amplitude-nm", "NM", "Amplitude of the free tip; else the median of the rows far from the sample."),
+    ("offset-origin-nm", "NM", "Height (growing towards the tip) at which the sample is at the tip's rest position."),
+    ("amplitude-error-nm", "NM", "Standard error of every amplitude; else the scatter of the free rows."),
+    ("phase-error-deg", "DEGREES", "Standard error of every phase; else the scatter of the free rows."),
+)
+
+
+class NmPerVolt(ValueAndError):  # noqa: N818 (no exception)
+    """A value with its error, or the word `slope`."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the value and its error, or the word."""
+        return value if value == "slope" else super().convert(value, param, ctx)
+
+
+READING = (
+    click.option(
+        "--columns",
+        metavar="COLUMN=CHANNEL[:UNIT][:FACTOR],...",
+        default="",
+        help="Which channel becomes which column (offset_nm, lockin_amplitude_nm, phase_lag_deg, deflection_nm), as "
+        "offset_nm=Z:um,lockin_amplitude_nm=Amp:V; without a head channels are numbers, and with approach and retract "
+        "in two of them OUT/BACK: offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8.",
+    ),
+    click.option(
+        "--drive",
+        type=click.Choice(["base", "force"]),
+        help="What shakes the tip: a piezo at its base (assumed without this option), or a force (photothermal, "
+        "magnetic).",
+    ),
+    click.option(
+        "--nm-per-volt",
+        type=NmPerVolt(),
+        metavar="NM|slope",
+        help="Sensitivity of an amplitude in volts; `slope`: such that the amplitude falls by 1 nm per nm in contact.",
+    ),
+    click.option(
+        "--bin-nm",
+        type=Finite(),
+        metavar="NM",
+        help="Width of the bins of height whose means and scatter are the rows (0: equal heights only); else bins of "
+        "five rows where heights repeat or are not in order.",
+    ),
+    *(_number(*row) for row in _READING_NUMBERS),
+)
+"""How an instrument's file becomes rows of a table: `read`, and `tapping` of such a file."""
+READING_OPTIONS = (
+    "columns",
+    "drive",
+    "nm_per_volt",
+    "bin_nm",
+    *(name.replace("-", "_") for name, _, _ in _READING_NUMBERS),
+)
+"""Names of the arguments that `READING` adds, as `read_curves` takes them."""
+
+READ = Command(
+    name="read",
+    group="measure",
+    summary="Read tapping curves out of an instrument's file, as tables.",
+    runs="afm_jax.cli.read:curves_of_a_file",
+    help="""Read amplitude and phase against height out of an instrument's file.
+
+    FILE is neaSNOM text, WSxM curves, an Asylum .ibw ramp, a NanoSurf .nid, Nanonis .dat or Gwyddion .gwy file, or text
+    separated by tabs, semicolons, commas or blanks, with a head or without (--columns). Says what was found, where each
+    number comes from, what was assumed and what is missing. With --out the table for `afm-jax tapping` and `afm-jax
+    fit`; of a file of several curves one table each, TABLE_1.csv and so on. Repeated and unordered heights become bins.
+    Curves that must not be used (a free amplitude that jumps) are refused by name, and the exit code is 3. Package
+    extra for .ibw: `pip install 'afm-jax[instruments]'`.
+    """,
+    options=(
+        click.argument("file", metavar="FILE", type=click.Path(path_type=Path)),
+        click.option("--curve", type=click.IntRange(1), metavar="N", help="Only this curve of the file."),
+        *READING,
+    ),
+    computes=False,
+    out_file="TABLE.csv",
+)
+
+
+def _check_curves(_: Session, options: Options) -> None:
+    """Check that there are curves, or the example alone."""
+    if options["example"] == bool(options["curve_files"]):
+        raise click.UsageError("give a curve, `afm-jax tapping CURVE`, or --example for a simulated raw file")
+
+
+TAPPING = Command(
+    name="tapping",
+    group="measure",
+    summary="Read the energy of a tap, and the impact law, off a tapping curve.",
+    runs="afm_jax.cli.tapping:energy_of_taps",
+    help="""Read the energy of a tap off a tapping curve, and where the drive allows it the impact law.
+
+    CURVE is a table of amplitude and phase against height (`# drive = force` or base, columns drive_frequency_khz,
+    free_amplitude_nm, offset_nm, lockin_amplitude_nm, phase_lag_deg with their errors, retract), or an instrument's
+    file, as for `afm-jax read`. Energy, thresholds and hysteresis, attractive or repulsive branch, impact speeds where
+    they can be known; then the law from the rows with fast impacts, or why not and what to record instead. With --out
+    the report: tapping.html, .txt, .json, .png and tapping_rows.csv, and that of the law. Several files, or a file of
+    several curves, are taken as of one lever: frequency and Q are fitted to all, the scatter from curve to curve stands
+    beside the errors, with --out in together.png; each curve has a folder of its own.
+    Exit code 3 if the energy of a tap is not determined.
+    """,
+    options=(
+        click.argument("curve_files", metavar="[CURVE]...", nargs=-1, type=click.Path(path_type=Path)),
+        NOISE,
+        *READING,
+        click.option(
+            "--tip-calibration", type=ValueAndError(), metavar="C", help="True over stated amplitude; '1 +- 0.02'."
+        ),
+        click.option("--curve", type=click.IntRange(1), metavar="N", help="Only this curve of an instrument's file."),
+        click.option("--model", default="viscous+delay", show_default=True, help="Of the law, as for `afm-jax fit`."),
+        click.option(
+            "--example", is_flag=True, help="Analyse the bundled raw file, simulated with the defects of real ones."
+        ),
+        click.option(
+            "--no-law", is_flag=True, help="Leave the impact law out: energy, thresholds and speeds only, at once."
+        ),
+        click.option(
+            "--scale-errors",
+            is_flag=True,
+            help="Multiply the rows' errors where they scatter more (up to three times), instead of refusing their "
+            "energy.",
+        ),
+    ),
+    check=_check_curves,
+    computes=False,
+)
+
+
+_IMAGE_NUMBERS = (
+    ("free-frequency-khz", "KHZ", "Natural frequency of the free cantilever, '90 +- 0.01' with its error."),
+    ("quality-factor", "Q", "Its quality factor, '200 +- 5' with its error."),
+    (
+        "spring-constant-n-per-m",
+        "N_PER_M",
+        "Its modal spring constant (1.03 times the static one), '5.4 +- 0.5'; else energies are over it, in nm^2.",
+    ),
+    ("free-amplitude-nm", "NM", "Amplitude of the free tip."),
+    ("drive-frequency-khz", "KHZ", "Frequency of the drive; where nothing says it, the free frequency."),
+    ("nm-per-volt", "NM", "Sensitivity of an amplitude in volts."),
+    ("tip-calibration", "C", "True over stated amplitude; '1 +- 0.02'."),
+)
+_IMAGE_SETTINGS = tuple(_number(*row) for row in _IMAGE_NUMBERS)
+
+
+class RowsAndColumns(click.ParamType):
+    """Rows and columns, as 10x12."""
+
+    name = "grid"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
+        """Return rows and columns.
+
+        Raises:
+            click.BadParameter: if it is no such pair.
+        """
+        if isinstance(value, tuple):
+            return value
+        match = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", str(value))
+        if match is None:
+            self.fail(f"`{value}` is no ROWSxCOLUMNS; write 10x12", param, ctx)
+        return int(match[1]), int(match[2])
+
+
+def _check_zarr(_: Session, options: Options) -> None:
+    """Check that Zarr is there before anything is computed."""
+    if "zarr" in options["formats"]:
+        import_module("zarr")
+
+
+TAPPING_MAP = Command(
+    name="tapping-map",
+    group="measure",
+    summary="Read the energy of a tap off every pixel of an image.",
+    runs="afm_jax.cli.tapping_map:map_of_an_image",
+    help="""Read the energy of a tap and the virial off every pixel of an image of amplitude and phase.
+
+    IMAGE is an Asylum .ibw, Gwyddion .gwy or NanoSurf .nid with channels of both, a NumPy file (.npz with the arrays
+    amplitude and phase, or .npy of the two), or text of numbers with amplitude, PHASE_IMAGE then the phase; or a grid
+    of curves: arrays (rows, columns, points) with their height_nm, or with --grid a file of curves. Each pixel has its
+    own error; what all have in common (spring constant, frequency, Q, calibration, free amplitude and phase) is said
+    once. Pixels out of range (amplitude above the free one, energy below zero beyond its error) are masked and counted.
+    With --out the report: map.png, map.json, map.txt and the arrays. Exit code 3 if most pixels are out of range.
+    """,
+    options=(
+        click.argument("image", metavar="IMAGE", type=click.Path(path_type=Path)),
+        click.argument("phase_image", metavar="[PHASE_IMAGE]", required=False, type=click.Path(path_type=Path)),
+        click.option(
+            "--columns",
+            metavar="COLUMN=CHANNEL[:UNIT][:FACTOR],...",
+            default="",
+            help="Which image is which, as lockin_amplitude_nm=Amplitude:V,phase_lag_deg=Phase:-1.",
+        ),
+        click.option(
+            "--drive", type=click.Choice(["base", "force"]), default="base", show_default=True, help="What shakes."
+        ),
+        *_IMAGE_SETTINGS,
+        click.option(
+            "--free-phase-deg",
+            type=Finite(),
+            metavar="DEGREES",
+            help="What the instrument reads with the tip free; else its lag.",
+        ),
+        click.option(
+            "--amplitude-error-nm", type=Finite(positive=True), metavar="NM", help="Standard error of a pixel's."
+        ),
+        click.option(
+            "--phase-error-deg", type=Finite(positive=True), metavar="DEGREES", help="Standard error of a pixel's."
+        ),
+        click.option(
+            "--grid",
+            type=RowsAndColumns(),
+            metavar="ROWSxCOLUMNS",
+            help="IMAGE is a file of curves, one a pixel, as for `read`.",
+        ),
+        click.option(
+            "--at",
+            "ratio",
+            type=Share("a share"),
+            default=0.9,
+            show_default=True,
+            metavar="RATIO",
+            help="Of a grid of curves: amplitude over the free one at which each pixel is read.",
+        ),
+        click.option(
+            "--format",
+            "formats",
+            type=click.Choice(["npz", "gwy", "zarr"]),
+            multiple=True,
+            default=("npz",),
+            show_default=True,
+            help="Of the arrays written into --out; may be given several times.",
+        ),
+    ),
+    check=_check_zarr,
+    computes=False,
+)
+
+COMMANDS = (CALIBRATE, DESIGN, FIT, INVERT, LOCKIN, READ, TAPPING, TAPPING_MAP)

@@ -1,0 +1,174 @@
+"""Options of `afm-jax fit`: their kinds of values (NAME=VALUE, NAME=VALUE+-ERROR, lists), and which go together."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import click
+
+from afm_jax.cli.session import Session
+from afm_jax.cli.values import parse_around_plus_minus, parse_number
+from afm_jax.contact.parameters import EFFECTS, REMOVABLE_EFFECTS, idle_without
+from fitting.parameters import CONTACT_DEFAULT, model_parameters
+
+
+class Fixed(click.ParamType):
+    """A parameter held at a value: NAME=VALUE."""
+
+    name = "value"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, float]:
+        """Return name and value.
+
+        Raises:
+            click.BadParameter: if the text is something else.
+        """
+        name, sign, text = str(value).partition("=")
+        try:
+            number = parse_number(text)
+        except ValueError:
+            sign, number = "", math.nan
+        if not sign or not name.strip():
+            self.fail(f"must be NAME=VALUE such as modulus_gpa=80, but is {value}", param, ctx)
+        return name.strip(), number
+
+
+class Constraint(click.ParamType):
+    """What is known of a parameter: NAME=VALUE+-ERROR."""
+
+    name = "constraint"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> tuple[str, tuple[float, float]]:
+        """Return name, value and standard error.
+
+        Raises:
+            click.BadParameter: if the text is something else.
+        """
+        name, sign, text = str(value).partition("=")
+        try:
+            numbers = parse_around_plus_minus(text)
+        except ValueError:
+            numbers = []
+        if not sign or not name.strip() or len(numbers) != 2:
+            self.fail(f"must be NAME=VALUE+-ERROR such as tip_calibration=1+-0.02, but is {value}", param, ctx)
+        return name.strip(), (numbers[0], numbers[1])
+
+
+class Names(click.ParamType):
+    """Names in a comma list."""
+
+    name = "names"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
+        """Return the names.
+
+        Raises:
+            click.BadParameter: if one is blank.
+        """
+        names = tuple(part.strip() for part in str(value).split(","))
+        if not all(names):
+            self.fail(f"must be names separated by commas, but is {value}", param, ctx)
+        return names
+
+
+def check_fit(_: Session, options: dict[str, Any]) -> None:
+    """Check that the options go together, and add the keywords of `fitting.fit` to them as ``settings``.
+
+    Raises:
+        click.UsageError: if options contradict each other or the model.
+    """
+    if options["example"] == bool(options["tables"]):
+        both = "not both: " if options["example"] else ""
+        raise click.UsageError(f"{both}give a table to fit, `afm-jax fit TABLE.csv`, or --example for the bundled one")
+    _check_each(options["tables"], options)
+    options["settings"] = fit_settings(options["model"], options)
+
+
+def _check_each(tables: tuple[Path, ...], options: dict[str, Any]) -> None:
+    """Check that options are those of one table, of several together, or of each of several by itself.
+
+    Raises:
+        click.UsageError: if not.
+    """
+    for option in ("share", "hierarchical"):
+        if options[option] and (len(tables) < 2 or options["each"]):
+            raise click.UsageError(f"--{option} is about several tables that are fitted together; leave it out")
+    if options["workers"] is not None and not options["each"]:
+        raise click.UsageError("--workers is about several tables: add --each")
+    alone = {
+        "--example": "example",
+        "--compare": "comparing",
+        "--bootstrap": "bootstrap",
+        "--posterior": "posterior",
+        "--trust": "trust",
+        "--arviz": "arviz",
+    }
+    for option, name in alone.items():
+        if options["each"] and options[name]:
+            raise click.UsageError(f"{option} is about one table: leave --each out")
+        if len(tables) > 1 and options[name] and option != "--compare":
+            raise click.UsageError(f"{option} is about one table: give one, or leave it out")
+    if options["comparing"] and options["hierarchical"]:
+        raise click.UsageError("--compare is about tables that have one law: leave --hierarchical out")
+
+
+def fit_settings(model: str, options: dict[str, Any]) -> dict[str, Any]:
+    """Return the keywords of `fitting.fit`.
+
+    Raises:
+        click.UsageError: if options contradict each other or the model.
+    """
+    if options["left_out"] and model != "contact":
+        raise click.UsageError("--no is about the contact's effects; add --model contact")
+    fixed, free = dict(options["fix"]), options["free"]
+    settings: dict[str, Any] = {
+        "scale_errors": options["scale_errors"],
+        "robust": options["robust"],
+        **{name: options[name] for name in ("share", "hierarchical") if options.get(name)},
+        "constraints": dict(options["constrain"]),
+        "free": free,
+        "fixed": fixed,
+    }
+    for name in free or ():
+        if name in fixed:
+            raise click.UsageError(f"{name} is both fitted (--free) and held fixed (--fix); remove it from one")
+    if model == "contact":
+        settings["effects"] = effects = _effects(options["left_out"] or ())
+        _check_of_use(free or (), fixed, effects)
+        settings["free"] = free or _usual_parameters(fixed, effects)
+    try:
+        model_parameters(model, settings["free"], fixed)
+    except ValueError as error:
+        raise click.UsageError(str(error).replace("`free`", "--free").replace("`fixed`", "--fix")) from error
+    return settings
+
+
+def _effects(left_out: tuple[str, ...]) -> tuple[str, ...]:
+    """Return the contact's effects without those left out."""
+    for name in left_out:
+        if name not in REMOVABLE_EFFECTS:
+            raise click.UsageError(f"--no takes {', '.join(REMOVABLE_EFFECTS)}, but one is {name!r}")
+    return tuple(name for name in EFFECTS if name not in left_out)
+
+
+def _usual_parameters(fixed: dict[str, float], effects: tuple[str, ...]) -> tuple[str, ...]:
+    """Return which parameters are fitted if the call names none: the usual ones that are neither fixed nor idle."""
+    chosen = [name for name in CONTACT_DEFAULT if name not in fixed and not idle_without(name, effects)]
+    if not chosen:
+        raise click.UsageError("--fix holds every parameter that is usually fitted; name others to fit with --free")
+    return tuple(chosen)
+
+
+def _check_of_use(free: tuple[str, ...], fixed: dict[str, float], effects: tuple[str, ...]) -> None:
+    """Check that each parameter of a contact is of use.
+
+    Raises:
+        click.UsageError: if one is not.
+    """
+    for option, names in (("--free", free), ("--fix", tuple(fixed))):
+        for name in names:
+            missing = idle_without(name, effects)
+            if missing:
+                raise click.UsageError(f"{option} {name} changes nothing without the effect {' or '.join(missing)}")

@@ -1,0 +1,133 @@
+"""Stability charts of single-impact orbits (figures 2, 3, 9): 50-digit orbits, closed forms and long iterations."""
+
+import numpy as np
+import pytest
+
+from afm_jax.dynamics.charts import OrbitVerdicts, StabilityChart, batch_of_scenes, orbit_verdicts, stability_chart
+from afm_jax.scenefile import presets
+from tests.long_iterations import SpotChecks, spot_check
+from tests.reference_flight import Parameters
+from tests.reference_orbits import single_impact_orbits
+
+POINTS = 100  # spot checks of each verdict
+
+
+def chart_of(scene_of) -> StabilityChart:
+    # Off round numbers: where n is N/2k the flight lasts k free periods, every state returns, and rounding decides.
+    return stability_chart(
+        scene_of, x_values=np.linspace(0.326, 6.476, 124), y_values=np.linspace(0.025, 2.975, 60), last_order=14
+    )
+
+
+@pytest.fixture(scope="module")
+def figure2() -> StabilityChart:
+    return chart_of(presets.figure2_scene)
+
+
+@pytest.fixture(scope="module")
+def figure3() -> StabilityChart:
+    return chart_of(presets.figure3_scene)
+
+
+def adhesion_limit_nm(reduced_frequency: np.ndarray) -> np.ndarray:
+    """Return the drive amplitude below which adhesion leaves no orbit: beta omega = sqrt((1 - r^2) epsilon)/2r."""
+    r = presets.STABILITY_R
+    top_speed = np.sqrt((1.0 - r**2) * presets.ADHESION) / (2.0 * r)
+    return top_speed / (2e-3 * np.pi * 2.0 * presets.FREE_FREQUENCY_KHZ * reduced_frequency)
+
+
+def verdicts_at(chart: StabilityChart, verdicts: OrbitVerdicts, points: int) -> SpotChecks:
+    columns = chart.points()
+
+    def scenes(chosen: np.ndarray):
+        return batch_of_scenes(chart.scene_of, *(column[chosen] for column in columns))
+
+    return spot_check(scenes, verdicts, seed=7, points=points, impacts=2000)
+
+
+@pytest.mark.parametrize("epsilon", [0.0, presets.ADHESION])
+def test_verdicts_are_those_of_the_50_digit_orbits(epsilon: float, figure2: StabilityChart, figure3: StabilityChart):
+    chart = figure3 if epsilon else figure2
+    frequency, amplitude = chart.points()
+    generator = np.random.default_rng(11)
+    # Stable for half of the points, anything for the others; the order nearest to resonance has most to tell.
+    stable = generator.choice(np.flatnonzero(chart.verdicts.any_stable()), 10, replace=False)
+    for point in (*stable, *generator.choice(frequency.size, 10, replace=False)):
+        order = int(chart.lowest_stable_order.ravel()[point]) or max(1, round(float(frequency[point])))
+        parameters = Parameters(
+            frequency_khz=90.0,
+            quality_factor=None,
+            amplitude_nm=float(amplitude[point]),
+            drive_frequency_khz=float(180.0 * frequency[point]),
+            offset_nm=-1.0,
+            r=0.5,
+            epsilon=epsilon,
+        )
+        orbits = [orbit for orbit in single_impact_orbits(parameters, order) if orbit.admissible]
+        assert chart.verdicts.admissible[order - 1, point] == bool(orbits)
+        steady = [orbit for orbit in orbits if orbit.stable]
+        assert chart.verdicts.stable[order - 1, point] == bool(steady)
+        if steady:
+            exact = max(orbit.peak_amplitude_nm for orbit in steady)
+            # the reference samples its peak; a root near a fold keeps half of float64's digits at worst
+            np.testing.assert_allclose(chart.verdicts.peak_amplitude_nm[order - 1, point], exact, rtol=1e-7)
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 6])
+def test_at_resonance_an_orbit_needs_a_drive_that_reaches_the_rest_position(order: int):
+    """Omega = omega/2N: the tangent of eq. 9 is infinite, so the impact height is 0, beta cos(omega t) = -sigma."""
+    amplitude = np.array([0.9, 0.999, 1.001, 1.1])
+    scenes = batch_of_scenes(presets.figure2_scene, np.full(4, float(order)), amplitude)
+    verdicts = orbit_verdicts(scenes, first_order=order, last_order=order)
+    assert verdicts.stable[0].tolist() == [False, False, True, True]
+    # Half a free period above the rest position, leaving at V' = v_p (1 + r)/(1 - r) (eq. 1 with V = -V').
+    platform_speed = 2e-3 * np.pi * 180.0 * order * np.sqrt(amplitude[2:] ** 2 - 1.0)
+    height = 3.0 * platform_speed / (2e-3 * np.pi * 90.0)
+    # V' is a closed form; rounding only
+    np.testing.assert_allclose(verdicts.peak_amplitude_nm[0, 2:], height, rtol=1e-9)
+
+
+def test_no_orbit_where_adhesion_takes_more_than_the_platform_gives():
+    """On an undamped orbit v_p = (u_in - u_out)/2, at least sqrt((1 - r^2) epsilon)/2r by eq. 6."""
+    frequency = np.linspace(0.6, 6.4, 200)
+    for factor, some in ((0.999, False), (1.05, True)):
+        scenes = batch_of_scenes(presets.figure3_scene, frequency, factor * adhesion_limit_nm(frequency))
+        assert orbit_verdicts(scenes, last_order=8).admissible.any() == some
+
+
+@pytest.mark.parametrize(("n", "side"), [(0.97, -1.0), (1.03, 1.0)])
+def test_elastic_limit_of_the_amplitude(n: float, side: float):
+    """For r -> 1 the platform stands still at impact: half a free oscillation about 0 from z = sigma -+ beta."""
+    offset = np.array([-0.2, 0.0, 0.2])
+    scenes = batch_of_scenes(presets.figure9_scene, np.full(3, n), offset, np.full(3, 0.9999))
+    height = (offset + side * 0.75) / np.cos(np.pi / (2.0 * n))
+    # 1 - r = 1e-4, with the square root of the loss's effect on the phase: some parts in a thousand
+    np.testing.assert_allclose(orbit_verdicts(scenes, last_order=1).peak_amplitude_nm[0], height, rtol=5e-3)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("adhesion", [False, True])
+def test_long_iterations_agree(adhesion: bool, figure2: StabilityChart, figure3: StabilityChart):  # noqa: FBT001
+    chart = figure3 if adhesion else figure2
+    checks = verdicts_at(chart, chart.verdicts, POINTS)
+    assert checks.failures == []
+    assert all(checks.checked[verdict] > 0.9 * POINTS for verdict in ("stable", "unstable", "none"))
+    assert checks.excluded_share < 0.05
+
+
+@pytest.mark.slow
+def test_long_iterations_find_wrong_verdicts(figure2: StabilityChart):
+    none = np.zeros_like(figure2.verdicts.stable)
+    stable = figure2.verdicts.stable
+    denied = figure2.verdicts._replace(stable=none, admissible=stable)
+    checks = verdicts_at(figure2, denied, 20)
+    # `none`: about half of the points do have a stable orbit. `unstable`: there is no unstable one to depart from.
+    problems = [failure["problem"] for failure in checks.failures]
+    assert sum("settles" in str(problem) for problem in problems) >= 5
+
+
+@pytest.mark.slow
+def test_orders_above_14_add_nothing(figure2: StabilityChart):
+    frequency, amplitude = (column.reshape(60, 124)[::2, ::2].ravel() for column in figure2.points())
+    higher = orbit_verdicts(batch_of_scenes(presets.figure2_scene, frequency, amplitude), first_order=15, last_order=20)
+    assert (higher.any_stable() & ~figure2.any_stable[::2, ::2].ravel()).mean() < 1e-3

@@ -1,0 +1,189 @@
+"""Dry contacts (Hertz, DMT): closed form, an independent integration, ledger, derivatives, scenes, refusals."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import quad, solve_ivp
+
+from afm_jax import Cantilever, Platform, Scene, capture_speed, collide, find_junction, make_law, simulate, trajectory
+from afm_jax.contact.contact import Contact
+from afm_jax.contact.forces import Capillary, Dmt, Hertz, VanDerWaals, Viscous
+from afm_jax.motion.record import MotionOutcome
+from afm_jax.motion.start import default_start
+from afm_jax.outcomes import CollisionOutcome
+from afm_jax.scenefile.scenefile import load_scene, save_scene
+from fitting import fit_law
+
+DRY = {"hamaker_constant_aj": 0.1, "contact_distance_nm": 0.165, "range_nm": 20.0, "modulus_gpa": 100.0}
+DRY |= {"tip_radius_nm": 100.0, "viscosity_pa_s": 1.005e-3}
+SPEEDS = np.array([2.0, 8.0, 30.0, 120.0])
+
+
+def integrated(speed, *, mass=1.0, viscous=False, **changed):
+    """Return rebound speed, delay, deepest gap and viscous loss by SciPy, from the forces as the issue writes them."""
+    value = DRY | changed
+    h, a0, reach, modulus, radius, eta = (value[name] for name in DRY)
+    drag = 1.5 * np.pi * eta * 1e-3 * radius**2 if viscous else 0.0
+
+    def rates(_, y):
+        gap, rate, _ = y
+        if gap > a0:
+            lost = drag * rate / gap
+            return [rate, (-h * radius / (6.0 * gap**2) - lost) / mass, lost * rate]
+        force = modulus * np.sqrt(radius) * max(a0 - gap, 0.0) ** 1.5 - h * radius / (6.0 * a0**2)
+        return [rate, force / mass, 0.0]
+
+    def leg(y, event, direction, from_us):
+        event.terminal, event.direction = True, direction
+        way = solve_ivp(rates, (from_us, from_us + 1e3), y, "DOP853", events=event, rtol=1e-13, atol=1e-13)
+        return way.y_events[0][0], way.t_events[0][0]
+
+    at_a0, at_end = (lambda _, y: y[0] - a0), (lambda _, y: y[0] - reach)
+    state, time = leg([reach, -speed, 0.0], at_a0, -1.0, 0.0)
+    turn, _ = leg(state - np.array([1e-15, 0.0, 0.0]), lambda _, y: y[1], 1.0, time)
+    state, time = leg(state - np.array([1e-15, 0.0, 0.0]), at_a0, 1.0, time)
+    state, time = leg(state + np.array([1e-15, 0.0, 0.0]), at_end, 1.0, time)
+    return state[1], time - reach / speed - reach / state[1], turn[0], state[2]
+
+
+@pytest.mark.parametrize("speed", [0.5, 20.0, 300.0])
+def test_hertz_collision_time_is_the_closed_form(speed):
+    contact = Contact(forces=(), junction=Hertz(modulus_gpa=3.0, tip_radius_nm=20.0))
+    result = collide(contact, speed, 2.0)
+    # m u^2/2 = (2/5) K sqrt(R) delta^(5/2); T = 2 delta/u int_0^1 dx/sqrt(1 - x^(5/2)), x = 1 - y^2
+    deepest = (1.25 * 2.0 * speed**2 / (3.0 * np.sqrt(20.0))) ** 0.4
+    integral = quad(lambda y: 2.0 * y / np.sqrt(1.0 - (1.0 - y * y) ** 2.5) if y else 0.0, 0.0, 1.0, epsabs=1e-13)[0]
+    assert integral == pytest.approx(2.943275 / 2.0, rel=1e-6)
+    assert float(result.deepest_gap_nm) == pytest.approx(-deepest, rel=1e-12)
+    assert float(result.collision_delay_us) == pytest.approx(2.0 * integral * deepest / speed, rel=1e-9)
+    assert float(result.time_in_contact_us) == float(result.time_in_junction_us) == float(result.collision_delay_us)
+    assert float(result.rebound_speed_nm_per_us) == pytest.approx(speed, rel=1e-14)
+
+
+@pytest.mark.parametrize("viscous", [False, True])
+@pytest.mark.parametrize(
+    "changed", [{}, {"modulus_gpa": 0.1}, {"hamaker_constant_aj": 1.0, "range_nm": 50.0}, {"contact_distance_nm": 0.4}]
+)
+def test_collisions_are_those_of_an_independent_integration(changed, viscous):
+    effects = ["van_der_waals", "dmt"] + ["viscous"] * viscous
+    result = collide(Contact.of(effects, **(DRY | changed)), SPEEDS)
+    for place, speed in enumerate(SPEEDS):
+        if float(result.rebound_speed_nm_per_us[place]) == 0.0:
+            continue
+        rebound, delay, deepest, lost = integrated(speed, viscous=viscous, **changed)
+        assert float(result.rebound_speed_nm_per_us[place]) == pytest.approx(rebound, rel=1e-9)
+        assert float(result.collision_delay_us[place]) == pytest.approx(delay, rel=1e-8, abs=1e-8)
+        assert float(result.deepest_gap_nm[place]) == pytest.approx(deepest, rel=1e-9)
+        assert float(result.viscous_loss_aj[place]) == pytest.approx(lost, rel=1e-7, abs=1e-9)
+    assert (np.asarray(result.outcome) == CollisionOutcome.REBOUND).sum() >= 3
+
+
+def test_without_damping_nothing_is_lost_and_no_tip_is_captured():
+    contact = Contact(forces=(VanDerWaals(),), junction=Dmt())
+    result = collide(contact, np.geomspace(0.01, 500.0, 12))
+    np.testing.assert_allclose(result.rebound_speed_nm_per_us, result.approach_speed_nm_per_us, rtol=1e-11)
+    assert not result.captured.any()
+    assert float(capture_speed(contact)) == 0.0
+    junction = find_junction(contact)
+    assert float(junction.hysteresis_aj) == 0.0
+    # the force is continuous where the solids meet, -H R/(6 a0^2) there
+    assert float(junction.force_nn) == pytest.approx(-0.1 * 100.0 / (6.0 * 0.165**2), rel=1e-12)
+    assert float(contact.solid.force(0.0)) == pytest.approx(float(junction.force_nn), rel=1e-12)
+
+
+def test_the_ledger_closes_with_drag_alone_and_the_slowest_tip_is_captured():
+    contact = Contact(forces=VanDerWaals() + Viscous(), junction=Dmt())
+    threshold = float(capture_speed(contact))
+    result = collide(contact, threshold * np.array([0.999, 1.001, 2.0, 20.0]))
+    assert result.captured.tolist() == [True, False, False, False]
+    lost = 0.5 * (result.approach_speed_nm_per_us**2 - result.rebound_speed_nm_per_us**2)
+    np.testing.assert_allclose(result.viscous_loss_aj[1:], lost[1:], rtol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("effects", [["van_der_waals", "dmt"], ["van_der_waals", "viscous", "dmt"], ["hertz"]])
+def test_derivatives_forward_and_reverse_are_central_differences(effects):
+    names = ["modulus_gpa", "tip_radius_nm"] if "hertz" in effects else list(DRY)
+    start = jnp.array([DRY[name] for name in names] + [25.0])
+
+    def outputs(values):
+        contact = Contact.of(effects, **dict(zip(names, values[:-1], strict=True)))
+        result = collide(contact, values[-1], accuracy=1e-11)
+        return jnp.stack([result.rebound_speed_nm_per_us, result.collision_delay_us, result.deepest_gap_nm])
+
+    forward, reverse = jax.jit(jax.jacfwd(outputs))(start), jax.jit(jax.jacrev(outputs))(start)
+    np.testing.assert_allclose(reverse, forward, rtol=1e-9, atol=1e-12)
+    for place, value in enumerate(np.asarray(start)):
+        step = 1e-4 * value
+        high, low = (jax.jit(outputs)(start.at[place].add(sign * step)) for sign in (1.0, -1.0))
+        expected = (high - low) / (2.0 * step)
+        # error of the difference: step^2 times the third derivative, and rounding over the step
+        np.testing.assert_allclose(forward[:, place], expected, rtol=2e-6, atol=1e-9 / value)
+
+
+def test_law_of_a_dry_contact_gives_back_the_speed():
+    contact = Contact(forces=(VanDerWaals(),), junction=Dmt())
+    table = make_law(contact)
+    assert float(table.capture_speed_nm_per_us) == 0.0
+    np.testing.assert_allclose(table.rebound_speed(SPEEDS), SPEEDS, rtol=1e-6)
+    law = fit_law(contact)
+    assert law.epsilon == pytest.approx(0.0, abs=1e-6)
+    assert law.r == pytest.approx(1.0, abs=1e-9)
+
+
+SCENE = Scene(Cantilever(90.0, 40.0, 1.0), Platform(4.0, 180.0, 0.0), Contact(VanDerWaals() + Viscous(), Dmt()))
+
+
+@pytest.mark.parametrize("contact", [SCENE.interaction, Contact((), Hertz())], ids=["dmt", "hertz"])
+def test_simulated_contacts_are_collisions_and_the_trajectory_follows_them(contact):
+    scene = Scene(SCENE.cantilever, SCENE.platform, contact)
+    simulation = simulate(scene, default_start(scene), 4.5 * float(SCENE.platform.period_us), max_contacts=16)
+    assert int(simulation.outcome) == MotionOutcome.FINISHED
+    rows = simulation.contacts
+    approach, rebound = float(rows.approach_speed_nm_per_us[1]), float(rows.rebound_speed_nm_per_us[1])
+    free = collide(contact, approach)
+    # drive and spring change the speeds during the contact by what they do in its duration
+    assert rebound == pytest.approx(float(free.rebound_speed_nm_per_us), rel=0.02)
+    assert int(rows.detail.junctions[1]) == 1
+    assert float(rows.energy_lost_aj[1]) == pytest.approx(float(free.viscous_loss_aj), rel=0.02, abs=1e-9)
+    times = np.linspace(float(rows.arrival_time_us[1]), float(rows.departure_time_us[1]), 513)
+    path = trajectory(scene, simulation, times)
+    assert path.gap_nm.min() == pytest.approx(float(rows.detail.deepest_gap_nm[1]), rel=1e-3)
+    assert path.gap_nm[-1] == pytest.approx(float(contact.bridge_breaks_nm), abs=1e-6)
+    moved = np.concatenate(
+        [[0.0], np.cumsum(0.5 * np.diff(times) * (path.gap_rate_nm_per_us[1:] + path.gap_rate_nm_per_us[:-1]))]
+    )
+    # the trapezoidal rule's error, from the acceleration's jump where the solids meet
+    np.testing.assert_allclose(path.gap_nm, path.gap_nm[0] + moved, atol=2e-3)
+
+
+@pytest.mark.parametrize("effects", [["van_der_waals", "dmt"], ["van_der_waals", "viscous", "dmt"], ["hertz"]])
+def test_scene_file_round_trip(tmp_path, effects):
+    contact = Contact.of(effects, range_nm=12.0, contact_distance_nm=0.2, hamaker_constant_aj=0.3, modulus_gpa=7.0)
+    scene = Scene(SCENE.cantilever, SCENE.platform, contact)
+    save_scene(scene, tmp_path / "scene.toml")
+    again = load_scene(tmp_path / "scene.toml")
+    assert again.interaction.effects == tuple(effects)
+    for one, other in zip(jax.tree.leaves(scene), jax.tree.leaves(again), strict=True):
+        assert np.array_equal(one, other)
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Contact((VanDerWaals(),), Hertz()), r"Hertz\(\) is a contact without other forces; VanDerWaals\(\)"),
+        (lambda: Contact((Capillary(),), Dmt()), r"Capillary\(\) is a force of the liquid bridge"),
+        (lambda: Contact((), Hertz(), range_nm=3.0), "`range_nm` is that of a contact with Dmt"),
+        (lambda: Contact((VanDerWaals(),), Dmt(), range_nm=0.1), "must be larger than `contact_distance_nm` of 0.165"),
+        (lambda: Contact.of(["van_der_waals", "hertz"]), "'van_der_waals' with 'hertz': Hertz's contact has no other"),
+        (lambda: Contact.of(["capillary", "dmt"]), "'capillary' with 'dmt': there is no liquid bridge"),
+        (lambda: Contact.of(["van_der_waals", "core", "jkr"]), "'van_der_waals' must hold 'dmt'"),
+        (lambda: Contact.of(["dmt", "jkr"]), "'jkr' with 'dmt'"),
+        (lambda: Dmt(contact_distance_nm=0.0), "`contact_distance_nm` must be positive"),
+    ],
+)
+def test_what_does_not_go_together_is_refused_in_one_line(make, message):
+    with pytest.raises(ValueError, match=message) as caught:
+        make()
+    assert "\n" not in str(caught.value)
