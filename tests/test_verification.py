@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from afm_jax.cli.main import NotValid
-from afm_jax.cli.verify import command
+from afm_jax.cli.main import main
 from afm_jax.impact import jacobian as formulas
 from afm_jax.verify import checks as verification
 from afm_jax.verify.checks import draw_orbits
@@ -96,8 +95,8 @@ def test_command_writes_json_and_fails_on_a_wrong_formula(monkeypatch, tmp_path)
     right = formulas.eq7
     monkeypatch.setattr(formulas, "eq7", lambda *args: right(*args).T)
     options = ["--json", "--states", "20", "--exact-states", "5", "--out", str(tmp_path)]
-    result = CliRunner().invoke(command, options)
-    assert isinstance(result.exception, NotValid)  # which `afm-jax` turns into exit code 3
+    result = CliRunner().invoke(main, ["verify", *options])
+    assert result.exit_code == 3
     payload = json.loads(result.stdout)
     assert next(row["equation"] for row in payload["checks"] if row["passed"] is False) == "eq. 7"
     assert payload["states"] == 20

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from afm_jax.cli.accuracy_scene import scene_study, write_study
-from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import PRESET_NAMES, Finite, SceneName
+from afm_jax.cli.session import Session
+from afm_jax.cli.values import PRESET_NAMES
 from afm_jax.words import known
 
 if TYPE_CHECKING:
@@ -126,47 +126,10 @@ OVERVIEW_COLUMNS = ("problem", "method", "setting", "microseconds", "error", "re
 WANTED = [1e-3, 1e-6, 1e-9, 1e-11]
 
 
-@click.command()
-@click.argument("study", required=False, metavar="[map|collide|SCENE.toml|PRESET]", type=SceneName("map", "collide"))
-@click.option(
-    "--wanted-error-us",
-    type=Finite(positive=True),
-    default=1e-9,
-    show_default=True,
-    help="Error of an impact time for which to find the cheapest setting.",
-)
-@click.option(
-    "--accuracy",
-    type=Finite(positive=True),
-    default=1e-9,
-    show_default=True,
-    help="For collide: relative error of the rebound speed (a tenth of the delay's in us) to find the cheapest for.",
-)
-@click.option(
-    "--contacts",
-    type=click.IntRange(1, 10_000),
-    default=10,
-    show_default=True,
-    help="For a scene: the arrival of which contact is compared.",
-)
-@click.option("--quick", is_flag=True, help="Few and small measurements: to see that it works.")
-@with_session
-def command(
+def accuracy(
     session: Session, study: str | None, wanted_error_us: float, accuracy: float, *, contacts: int, quick: bool
 ) -> None:
-    """Show errors against the time they take: of everything in one overview, the map, `collide`, or one scene.
-
-    Without an argument: impacts, collisions, driven contacts, orbits, fits and gradients, and general-purpose
-    integrators of SciPy, Diffrax and SUNDIALS (extra `sundials`) beside them; some minutes.
-
-    map: root tolerances in float32 and float64, and SciPy's solve_ivp with events, on three scenes: regular, near
-    grazing with chatter, and of order 5; errors are against 50 digits. collide: Diffrax solvers with fixed and adaptive
-    steps, in the gap and in time, values and derivatives, float32 and float64, SciPy beside them; errors are against a
-    quadrature converged to rounding. SCENE.toml (or a preset's name): settings of the scene's contacts or of its root
-    search against the finest, and the fidelity ladder: what orbit, map and map with delay of the fitted law make of the
-    amplitude. With --out accuracy.csv, accuracy.json, accuracy.png (a scene: ladder.csv too).
-    """
-    session.start_computing()
+    """Measure errors against time, of everything or of one study."""
     if study is None:
         overview_study(session, quick=quick)
         return

@@ -11,9 +11,7 @@ from collections.abc import Mapping, Sequence
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
-import click
-
-from afm_jax.cli.session import Session, with_session, write_json
+from afm_jax.cli.session import Session, write_json
 from afm_jax.compilation_cache import available_cores
 from afm_jax.words import known
 
@@ -257,32 +255,8 @@ CONTACT_COLUMNS = (
 """What `bench_contact.csv` tells of a measurement."""
 
 
-@click.command()
-@click.option("--quick", is_flag=True, help="Few and small measurements: to see that it works.")
-@click.option(
-    "--batch",
-    "batches",
-    type=click.IntRange(1, 10_000_000),
-    multiple=True,
-    metavar="N",
-    help="How many tips at once; may be given several times. Default: 1, 100, 10000 and 100000.",
-)
-@click.option(
-    "--only",
-    type=click.Choice(["map", "contact", "scenes", "dynamics", "sweep", "fits"]),
-    help="The impact map alone, the contact of free tips, driven contacts, charts, sweeps, or fits from the shell.",
-)
-@with_session
-def command(session: Session, batches: tuple[int, ...], only: str | None, *, quick: bool) -> None:
-    """Measure impacts per second: next_impact iterated, collide through the contact, driven contacts; and fits.
-
-    The impact map is measured on one core and on all. The same run measures a chaotic scene, derivatives, and SciPy's
-    solve_ivp with events on the same problems. Errors of impact times are against 50 digits, those of contacts against
-    finer settings. Times are the best of several repetitions, compilation apart; the machine should have nothing else
-    to do. Fits of 100 rows are timed as commands. With --out bench.csv, bench_contact.csv, bench_scenes.csv,
-    bench_dynamics.csv, bench_sweep.csv, bench_fits.csv and bench.json.
-    """
-    session.start_computing()
+def bench(session: Session, batches: tuple[int, ...], only: str | None, *, quick: bool) -> None:
+    """Measure impacts per second, and fits."""
     cores = available_cores()
     machine = machine_facts(cores)
     if (machine["load_before"] or 0.0) > 0.3 * cores:

@@ -1,16 +1,18 @@
 """`afm-jax collide [SCENE.toml] --make-law`: the impact law that a contact amounts to, as a table and in formulas."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
+from rich.table import Table
+
+from afm_jax.cli.command import Output, columns_of, later
 from afm_jax.cli.contact_options import ContactOptions, chosen_contact
-from afm_jax.cli.main import NotValid
-from afm_jax.cli.session import Session, write_json
+from afm_jax.cli.session import Session
+from afm_jax.contact.law_of_contact import FREE, ContactDelay, ContactLaw, fit_delay, fit_law
+from afm_jax.contact.law_of_contact import make_law as table_of
+from afm_jax.scenefile.law_files import save_law, save_law_csv
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from afm_jax.contact.law_of_contact import ContactDelay, ContactLaw
+draw_contact_law = later("afm_jax.plots.collisions:draw_contact_law")
 
 MODEL_KEYS = (
     "model",
@@ -46,19 +48,12 @@ def make_law(
     delay_range: tuple[float, float] | None,
     residuals: str,
     points: int,
-) -> None:
-    """Make the law that a contact amounts to: a table, and the formulas that are closest to it.
+) -> Output:
+    """Return the law that a contact amounts to: a table, and the formulas that are closest to it.
 
     Three formulas of the rebound speed, at uniform speeds: the paper's (r and epsilon), a viscous one (epsilon and a
     loss linear in speed), and all three. Beside them the collision delay, its lag and lead, and its formula.
     """
-    from afm_jax.contact.law_of_contact import (  # noqa: PLC0415
-        FREE,
-        fit_delay,
-        fit_law,
-    )
-    from afm_jax.contact.law_of_contact import make_law as table_of  # noqa: PLC0415
-
     contact, mass, description = chosen_contact(contact_options)
     with session.working("fitting (the first run compiles for some seconds)"):
         laws = [
@@ -78,28 +73,29 @@ def make_law(
         "contact": description,
         "mass_ng": mass,
     }
-    session.write_table("law_models.csv", *law_rows(laws))
-    session.write_table("law_delay.csv", _delay_rows(delay), DELAY_COLUMNS)
-    ending = []
+    text = [law_table(laws), *law_sentences(laws), "", delay_table(delay), *delay_sentences(delay)]
     if session.out is not None:
-        from afm_jax.plots.collisions import draw_contact_law  # noqa: PLC0415
-        from afm_jax.scenefile.law_files import save_law, save_law_csv  # noqa: PLC0415
-
-        save_law(law, session.out / "law.json")
-        save_law_csv(law, session.out / "law.csv")
-        write_json(session.out / "collide.json", payload)
-        draw_contact_law(laws, delay, session.out / "law.png")
-        session.note(f"wrote {session.out / 'law.json'}, law.csv, collide.json and law.png")
-        ending = [f'In a scene file: [interaction] model = "law", file = "{session.out / "law.json"}"; or --law.']
-    session.emit(
-        payload, law_table(laws), *law_sentences(laws), "", delay_table(delay), *delay_sentences(delay), *ending
-    )
+        text.append(f'In a scene file: [interaction] model = "law", file = "{session.out / "law.json"}"; or --law.')
     lost = [law.model for law in laws if not law.converged]
-    if lost:
-        raise NotValid(f"the fit of {', '.join(lost)} did not converge; try another --speed-range")
+
+    return Output(
+        payload=payload,
+        text=text,
+        tables={
+            "law_models.csv": law_columns(laws),
+            "law_delay.csv": columns_of(_delay_rows(delay), DELAY_COLUMNS),
+        },
+        files={
+            "law.json": lambda path: save_law(law, path),
+            "law.csv": lambda path: save_law_csv(law, path),
+            "law.png": lambda path: draw_contact_law(laws, delay, path),
+        },
+        json_file="collide.json",
+        not_valid=f"the fit of {', '.join(lost)} did not converge; try another --speed-range" if lost else None,
+    )
 
 
-def delay_payload(delay: "ContactDelay") -> dict[str, Any]:
+def delay_payload(delay: ContactDelay) -> dict[str, Any]:
     """Return the delay law, its errors, and delay, lag and lead at a few speeds."""
     shown = _thinned(delay)
     return {
@@ -113,33 +109,29 @@ def delay_payload(delay: "ContactDelay") -> dict[str, Any]:
     }
 
 
-def law_rows(laws: Sequence["ContactLaw"]) -> tuple[list[dict[str, float]], tuple[str, ...]]:
-    """Return contact and laws speed by speed as rows, and their columns."""
-    columns = {
+def law_columns(laws: Sequence[ContactLaw]) -> dict[str, Any]:
+    """Return contact and laws speed by speed as columns."""
+    return {
         "approach_speed_nm_per_us": laws[0].approach_speed_nm_per_us,
         "rebound_speed_nm_per_us": laws[0].rebound_speed_nm_per_us,
         **{f"{law.model}_speed_nm_per_us": law.fitted_speed_nm_per_us for law in laws},
         **{f"{law.model}_relative_error": law.relative_error for law in laws},
     }
-    lists = [column.tolist() for column in columns.values()]
-    return [dict(zip(columns, row, strict=True)) for row in zip(*lists, strict=True)], tuple(columns)
 
 
-def _delay_rows(delay: "ContactDelay") -> list[dict[str, float]]:
+def _delay_rows(delay: ContactDelay) -> list[dict[str, float]]:
     lists = [getattr(delay, name).tolist() for name in DELAY_COLUMNS]
     return [dict(zip(DELAY_COLUMNS, row, strict=True)) for row in zip(*lists, strict=True)]
 
 
-def _thinned(delay: "ContactDelay") -> list[dict[str, float]]:
+def _thinned(delay: ContactDelay) -> list[dict[str, float]]:
     """Return a few rows, first and last among them."""
     rows = _delay_rows(delay)
     return [rows[round(place * (len(rows) - 1) / (_SHOWN - 1))] for place in range(_SHOWN)]
 
 
-def law_table(laws: Sequence["ContactLaw"]) -> "Table":
+def law_table(laws: Sequence[ContactLaw]) -> Table:
     """Return the laws as a table to print."""
-    from rich.table import Table  # noqa: PLC0415
-
     low, high = laws[0].speed_range
     title = f"u_out^2 = r^2 u_in^2 - c u_in - epsilon from {low:.5g} to {high:.5g} nm/us, {laws[0].residuals} residuals"
     table = Table(title=title, title_justify="left")
@@ -164,7 +156,7 @@ def law_table(laws: Sequence["ContactLaw"]) -> "Table":
     return table
 
 
-def law_sentences(laws: Sequence["ContactLaw"]) -> list[str]:
+def law_sentences(laws: Sequence[ContactLaw]) -> list[str]:
     """Return what is said below the laws."""
     return [
         f"Capture speed of the contact: {laws[0].contact_capture_speed_nm_per_us:.6g} nm/us.",
@@ -172,10 +164,8 @@ def law_sentences(laws: Sequence["ContactLaw"]) -> list[str]:
     ]
 
 
-def delay_table(delay: "ContactDelay") -> "Table":
+def delay_table(delay: ContactDelay) -> Table:
     """Return the delay at a few speeds as a table to print."""
-    from rich.table import Table  # noqa: PLC0415
-
     table = Table(title="Collision delay = lag - lead", title_justify="left")
     for name in ("approach\nnm/us", "rebound\nnm/us", "delay\nus", "lag\nus", "lead\nus", "delay law\nus"):
         table.add_column(name, justify="right")
@@ -185,7 +175,7 @@ def delay_table(delay: "ContactDelay") -> "Table":
     return table
 
 
-def delay_sentences(delay: "ContactDelay") -> list[str]:
+def delay_sentences(delay: ContactDelay) -> list[str]:
     """Return what is said below the delays."""
     law, (low, high) = delay.delay, delay.speed_range
     values = ", ".join(f"{name} {float(getattr(law, name)):.4g}" for name in ("hertz", "lead_nm", "offset_nm"))

@@ -1,24 +1,25 @@
 """`afm-jax continue SCENE.toml --order N --parameter P=a:b`: orbits followed through one parameter, or two."""
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
-import click
+import numpy as np
+from rich.table import Table
 
-from afm_jax.cli.main import NotValid
-from afm_jax.cli.options import LAW, PICTURE
-from afm_jax.cli.orbits import IMPACT_COLUMNS, PositiveInteger, impact_rows, orbit_facts, refuse_other_than_law
-from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import SceneName, ranges_of, scene_and_start
+from afm_jax.cli.command import NamedScene, Output, columns_of, later
+from afm_jax.cli.orbits import IMPACT_COLUMNS, impact_rows, orbit_facts, refuse_other_than_law
+from afm_jax.cli.session import Session
+from afm_jax.cli.values import ranges_of
+from afm_jax.contact.contact import Contact
+from afm_jax.dynamics.bands import amplitude_errors, special_errors
+from afm_jax.dynamics.continuation import Continuation, continue_orbits
+from afm_jax.dynamics.special_points import OrbitBranch, SpecialCurve
+from afm_jax.dynamics.sticking_orbits import follow_sticking
+from afm_jax.impact.law import extrapolation_of
 from afm_jax.units import TWO_SIDED_95
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from afm_jax.apparatus.scene import Scene
-    from afm_jax.dynamics.bands import UncertainParameters
-    from afm_jax.dynamics.continuation import Continuation
-    from afm_jax.dynamics.special_points import OrbitBranch, SpecialCurve
+draw_continuation = later("afm_jax.plots.branches:draw_continuation")
+draw_curves = later("afm_jax.plots.branches:draw_curves")
 
 POINT_COLUMNS = (
     "branch",
@@ -58,85 +59,32 @@ _ENDS = {
 }
 
 
-@click.command(name="continue")
-@click.argument("scene", metavar="SCENE.toml|PRESET", type=SceneName())
-@click.option("--order", metavar="N", required=True, type=PositiveInteger(), help="Drive periods of the orbit.")
-@click.option(
-    "--impacts",
-    metavar="M",
-    default=1,
-    show_default=True,
-    type=click.IntRange(0, 64),
-    help="Impacts in them; 0: the tip meets nothing.",
-)
-@click.option(
-    "--parameter",
-    metavar="P=A:B",
-    required=True,
-    help="A parameter of the scene file and its range, such as platform.reduced_frequency=0.9:1.1.",
-)
-@click.option("--second", metavar="P=A:B", help="Another one: the special points are followed as curves in both.")
-@click.option("--sticking", is_flag=True, help="Follow the orbit with a rest on the sample: chatter, ride, release.")
-@LAW
-@PICTURE
-@with_session
-def command(  # noqa: PLR0913
+def follow(  # noqa: PLR0913
     session: Session,
-    scene: str,
+    scene: NamedScene,
     *,
     order: int,
     impacts: int,
     parameter: str,
     second: str | None,
     sticking: bool,
-    law: Path | None,
     picture: str,
-) -> None:
-    """Follow the (m, N) orbits of a scene through a parameter, round folds, by pseudo-arclength.
-
-    Folds, period doublings, torus points, grazings and captures are located to rounding; with --second they are
-    followed as curves in two parameters, with cusps and meetings. In a scene with a contact the simulation is closed
-    instead of the map, and curves end where the orbit grazes or is captured. With --sticking the phase is that of the
-    release, and the branches end where the rest is lost, the sample lets go no more or a flight grazes. With --law
-    every special point has a 95 % interval. With --out tables and pictures. Exit code 3 if there is no admissible
-    orbit in the range.
-    """
-    if sticking and (second is not None or law is not None or impacts != 1):
-        raise ValueError("--sticking goes without --impacts, --second and --law: an orbit with a rest has no equations")
-    session.start_computing()
-    from afm_jax.contact.contact import Contact  # noqa: PLC0415
-    from afm_jax.dynamics.continuation import continue_orbits  # noqa: PLC0415
-
-    loaded, _ = scene_and_start(scene)
-    from afm_jax.cli.fitted_law import with_fitted_law  # noqa: PLC0415
-
-    loaded, known = with_fitted_law(loaded, law)
-    if sticking or not isinstance(loaded.interaction, Contact):
-        refuse_other_than_law(loaded, scene)
-    first, *others = ranges_of(scene, loaded, [parameter, *([] if second is None else [second])], counted=False)
-    try:
-        with session.working("following orbits (the first run compiles for some seconds)", "values") as report:
-            if sticking:
-                from afm_jax.dynamics.sticking_orbits import follow_sticking  # noqa: PLC0415
-
-                found = follow_sticking(loaded, order, first, report=report)
-            else:
-                found = continue_orbits(loaded, order, first, impacts=impacts, second=others[0] if others else None)
-    except ValueError as error:
-        raise ValueError(f"{scene}: {error}") from error
-    _finish(session, loaded, found, known, picture)
+) -> Output:
+    """Return the branches of orbits through a parameter, their special points, and these as curves in two."""
+    if sticking or not isinstance(scene.scene.interaction, Contact):
+        refuse_other_than_law(scene.scene, scene.name)
+    given = [parameter, *([] if second is None else [second])]
+    first, *others = ranges_of(scene.name, scene.scene, given, counted=False)
+    with session.working("following orbits (the first run compiles for some seconds)", "values") as report:
+        if sticking:
+            found = follow_sticking(scene.scene, order, first, report=report)
+        else:
+            found = continue_orbits(scene.scene, order, first, impacts=impacts, second=others[0] if others else None)
+    return _output(scene, found, picture)
 
 
-def _finish(
-    session: Session,
-    scene: "Scene",
-    found: "Continuation",
-    known: "UncertainParameters | None",
-    picture: str,
-) -> None:
-    from afm_jax.dynamics.bands import amplitude_errors, special_errors  # noqa: PLC0415
-    from afm_jax.impact.law import extrapolation_of  # noqa: PLC0415
-
+def _output(scene: NamedScene, found: Continuation, picture: str) -> Output:
+    known = scene.unknowns
     bands = None if known is None else [amplitude_errors(found, branch, known) for branch in found.branches]
     errors = None if known is None else special_errors(found, known)
     points = [
@@ -162,8 +110,7 @@ def _finish(
     curves = [_curve(curve) for curve in found.curves]
     reason = None if any(point["admissible"] for point in points) else _why_none(found)
     speeds = [impact["approach_speed_nm_per_us"] for point in points for impact in point["impacts"]]
-    beyond = extrapolation_of(scene.interaction, speeds)
-    _write(session, found, points, special, curves)
+    beyond = extrapolation_of(scene.scene.interaction, speeds)
     payload = {
         "order": found.order,
         "impacts": found.impacts,
@@ -179,23 +126,20 @@ def _finish(
         "extrapolated": beyond,
         "reason": reason,
     }
-    session.emit(payload, *_text(found, special, curves), beyond)
-    if session.out is not None:
-        from afm_jax.plots.branches import draw_continuation, draw_curves  # noqa: PLC0415
+    files = {f"branches.{picture}": lambda path: draw_continuation(found, path, bands=bands, errors=errors)}
+    if found.curves:
+        files[f"curves.{picture}"] = lambda path: draw_curves(found, path)
+    return Output(
+        payload=payload,
+        text=[*_text(found, special, curves), beyond],
+        tables=_tables(found, points, special, curves),
+        files=files,
+        not_valid=reason,
+    )
 
-        draw_continuation(found, session.out / f"branches.{picture}", bands=bands, errors=errors)
-        session.note(f"wrote {session.out / f'branches.{picture}'}")
-        if found.curves:
-            draw_curves(found, session.out / f"curves.{picture}")
-            session.note(f"wrote {session.out / f'curves.{picture}'}")
-    if reason is not None:
-        raise NotValid(reason)
 
-
-def point_rows(number: int, branch: "OrbitBranch", band: Any = None) -> list[dict[str, Any]]:
+def point_rows(number: int, branch: OrbitBranch, band: Any = None) -> list[dict[str, Any]]:
     """Return the points of a branch as plain mappings, with the first impact's numbers and all impacts."""
-    import numpy as np  # noqa: PLC0415
-
     rows = []
     for index, value in enumerate(branch.parameter.tolist()):
         row = {"branch": number, "parameter": value, **orbit_facts(branch.reading, index)}
@@ -205,7 +149,7 @@ def point_rows(number: int, branch: "OrbitBranch", band: Any = None) -> list[dic
     return rows
 
 
-def _curve(curve: "SpecialCurve") -> dict[str, Any]:
+def _curve(curve: SpecialCurve) -> dict[str, Any]:
     return {
         "kind": curve.kind,
         "parameter": curve.parameter.tolist(),
@@ -216,32 +160,33 @@ def _curve(curve: "SpecialCurve") -> dict[str, Any]:
     }
 
 
-def _write(
-    session: Session,
-    found: "Continuation",
-    points: list[dict[str, Any]],
-    special: list[dict[str, Any]],
-    curves: list[dict[str, Any]],
-) -> None:
-    session.write_table("branches.csv", points, POINT_COLUMNS)
+def _tables(
+    found: Continuation,
+    points: Sequence[Mapping[str, Any]],
+    special: Sequence[Mapping[str, Any]],
+    curves: Sequence[Mapping[str, Any]],
+) -> dict[str, dict[str, Any]]:
+    """Return the columns of the CSV files: points, their impacts if there are several, special points, curves."""
+    tables = {"branches.csv": columns_of(points, POINT_COLUMNS)}
     if found.impacts > 1:
         rows = [{"point": k, **impact} for k, point in enumerate(points) for impact in point["impacts"]]
-        session.write_table("impacts.csv", rows, ("point", *IMPACT_COLUMNS))
+        tables["impacts.csv"] = columns_of(rows, ("point", *IMPACT_COLUMNS))
     flat = [
         {**row, **dict(zip(("interval95_low", "interval95_high"), row.get("interval95", ()), strict=False))}
         for row in special
     ]
-    session.write_table("special.csv", flat, SPECIAL_COLUMNS)
+    tables["special.csv"] = columns_of(flat, SPECIAL_COLUMNS)
     if found.second is not None:
         rows = [
             {"curve": k, "kind": curve["kind"], "parameter": p, "second": q, "admissible": flown}
             for k, curve in enumerate(curves)
             for p, q, flown in zip(curve["parameter"], curve["second"], curve["admissible"], strict=True)
         ]
-        session.write_table("curves.csv", rows, CURVE_COLUMNS)
+        tables["curves.csv"] = columns_of(rows, CURVE_COLUMNS)
+    return tables
 
 
-def _why_none(found: "Continuation") -> str:
+def _why_none(found: Continuation) -> str:
     if found.sticking:
         return f"no tip rests on the sample, is let go and rests again after {found.order} periods with {found.range}"
     what = f"orbit of {found.impacts} impact{'s' if found.impacts != 1 else ''} in {found.order} drive periods"
@@ -252,9 +197,7 @@ def _why_none(found: "Continuation") -> str:
     return f"no {what} was found with {found.range}; try another order or range"
 
 
-def _text(found: "Continuation", special: list[dict[str, Any]], curves: list[dict[str, Any]]) -> "list[str | Table]":
-    from rich.table import Table  # noqa: PLC0415
-
+def _text(found: Continuation, special: list[dict[str, Any]], curves: list[dict[str, Any]]) -> list[str | Table]:
     kind = f"Orbits with a rest, N = {found.order}," if found.sticking else f"({found.impacts}, {found.order}) orbits"
     what = f"{kind} with {found.range}"
     lines: list[str | Table] = [what if found.branches else f"No {what}"]

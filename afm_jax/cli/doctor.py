@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import click
 
 from afm_jax.cli.main import NotValid
-from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.session import Session
 from afm_jax.compilation_cache import silence_xla
 from afm_jax.version import EXCLUDED_JAX
 
@@ -24,15 +24,8 @@ _IMPACTS = 20
 _TIPS = 1000
 
 
-@click.command()
-@with_session
-def command(session: Session) -> None:
-    """Say what is installed, how JAX computes, and whether its compilation cache works.
-
-    A small program is compiled by two fresh processes: the second should find it in the cache. Exit code 3 if it does
-    not, or if the cache's folder cannot be used; every command then compiles anew, which takes up to a minute. Exit
-    code 3, too, where a version of JAX is installed that computes wrongly or very slowly.
-    """
+def doctor(session: Session) -> None:
+    """Tell what is installed, how JAX computes, and whether its compilation cache works."""
     cache = session.start_computing()
     import jax  # noqa: PLC0415
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from rich.table import Table
 
-from afm_jax.cli.session import Session, write_json
+from afm_jax.cli.command import columns_of
 from afm_jax.effects.study import Cost, EffectReport, EffectStudy, Reduction, periods_read
 from afm_jax.scenefile.scenefile import Start, scene_tables
 from afm_jax.units import RAD_PER_US_PER_KHZ
@@ -92,17 +92,9 @@ def _reduction(reduction: Reduction | None, written: Path | None) -> dict[str, A
     }
 
 
-def write_files(session: Session, payload: Mapping[str, Any]) -> None:
-    """Write effects.csv, effects.json and effects.png into the session's folder."""
-    from afm_jax.plots.effects import draw_effects  # noqa: PLC0415
-
-    folder = session.out
-    if folder is None:
-        return
-    session.write_table("effects.csv", [_flat(effect) for effect in payload["effects"]], COLUMNS)
-    write_json(folder / "effects.json", payload)
-    draw_effects(payload["effects"], payload["full"], payload["accuracy"], folder / "effects.png")
-    session.note(f"wrote {folder / 'effects.json'} and {folder / 'effects.png'}")
+def table_of(payload: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the columns of effects.csv."""
+    return columns_of([_flat(effect) for effect in payload["effects"]], COLUMNS)
 
 
 def _flat(effect: Mapping[str, Any]) -> dict[str, Any]:

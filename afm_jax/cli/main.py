@@ -9,14 +9,13 @@ import sys
 import threading
 import types
 from collections.abc import Sequence
-from importlib import import_module
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import click
 
 from afm_jax.cli.command import Command
-from afm_jax.cli.commands import measure, simulate
+from afm_jax.cli.commands import check, contact, measure, simulate
 from afm_jax.cli.ending import INTERRUPTED, NotValid, exit_code_of
 
 __all__ = ["COMMANDS", "NotValid", "main"]
@@ -89,74 +88,8 @@ def _interrupt(number: int, frame: types.FrameType | None) -> None:
     signal.default_int_handler(number, frame)
 
 
-class _OfItsOwnFile(NamedTuple):
-    """A command that is not yet a row: its module is imported when it is called."""
-
-    name: str
-    group: str
-    summary: str
-    module: str
-
-    def click_command(self) -> click.Command:
-        return import_module(self.module).command
-
-
-_OF_THEIR_OWN_FILES = (
-    _OfItsOwnFile(
-        "accuracy",
-        "check",
-        "Show error against time, and the cheapest setting for a wanted accuracy.",
-        "afm_jax.cli.accuracy",
-    ),
-    _OfItsOwnFile("bench", "check", "Measure impacts per second, next to SciPy.", "afm_jax.cli.bench"),
-    _OfItsOwnFile(
-        "collide",
-        "contact",
-        "Let free tips collide with the sample: rebound, delay, capture, energy.",
-        "afm_jax.cli.collide",
-    ),
-    _OfItsOwnFile(
-        "continue",
-        "simulate",
-        "Follow orbits and their special points through parameters.",
-        "afm_jax.cli.continue_orbits",
-    ),
-    _OfItsOwnFile(
-        "doctor", "check", "Say what is installed, how JAX computes, and whether its cache works.", "afm_jax.cli.doctor"
-    ),
-    _OfItsOwnFile(
-        "effects",
-        "simulate",
-        "Say what each effect of a scene changes and costs, and which can be left out.",
-        "afm_jax.cli.effects",
-    ),
-    _OfItsOwnFile(
-        "orbits",
-        "simulate",
-        "Find the orbits of a scene, of one impact or more, and whether they are stable.",
-        "afm_jax.cli.orbits",
-    ),
-    _OfItsOwnFile(
-        "simulate",
-        "simulate",
-        "Follow a scene in time: contacts, amplitudes, phases, energies.",
-        "afm_jax.cli.simulate",
-    ),
-    _OfItsOwnFile(
-        "sweep",
-        "simulate",
-        "Compute many scenes, or fit many tables, over a grid of parameters; resumes.",
-        "afm_jax.cli.sweep",
-    ),
-    _OfItsOwnFile(
-        "verify",
-        "check",
-        "Compare eqs. 5 to 8 with automatic differentiation and with 50 digits.",
-        "afm_jax.cli.verify",
-    ),
-)
-COMMANDS: dict[str, Command | _OfItsOwnFile] = {
-    row.name: row for row in (*measure.COMMANDS, *simulate.COMMANDS, *_OF_THEIR_OWN_FILES)
+COMMANDS: dict[str, Command] = {
+    row.name: row for group in (measure, simulate, contact, check) for row in group.COMMANDS
 }
 _GROUPS = {
     "measure": "Measure: read data, fit and plan",

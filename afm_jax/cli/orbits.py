@@ -1,23 +1,24 @@
 """`afm-jax orbits SCENE.toml|PRESET --order N [--impacts m]`: the orbits of a scene."""
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import click
+import numpy as np
+from rich.table import Table
 
-from afm_jax.cli.main import NotValid
-from afm_jax.cli.options import LAW
-from afm_jax.cli.session import Session, with_session
-from afm_jax.cli.values import SceneName, scene_and_start
+from afm_jax.apparatus.scene import Scene, drive_of
+from afm_jax.cli.command import NamedScene, Output, columns_of, later
+from afm_jax.cli.session import Session
+from afm_jax.contact.contact import Contact
+from afm_jax.dynamics.contact_orbits import contact_orbits
+from afm_jax.dynamics.impact_loop import LoopReading
+from afm_jax.dynamics.impact_orbits import is_stable, many_impact_orbits, multipliers_of
+from afm_jax.dynamics.sticking_orbits import sticking_orbit
+from afm_jax.impact.law import Law, extrapolation_of
+from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
+from afm_jax.scenefile.scenefile import scene_tables
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
-    from afm_jax.apparatus.scene import Scene
-    from afm_jax.dynamics.impact_loop import LoopReading
-    from afm_jax.dynamics.impact_orbits import ManyImpactOrbits
-    from afm_jax.impact.orbits import SingleImpactOrbits
+save = later("afm_jax.plots.picture_style:save")
 
 DRIVEN_COLUMNS = (
     "drive_lockin_amplitude_nm",
@@ -58,104 +59,46 @@ MANY_COLUMNS = (*IMPACT_COLUMNS, "peak_amplitude_nm", "trace", "determinant", "s
 """What is told of an orbit of several impacts, of its impacts the first."""
 
 
-class PositiveInteger(click.ParamType):
-    """An integer from 1 to a million."""
-
-    name = "integer"
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Return the integer that a text says.
-
-        Raises:
-            click.BadParameter: if it is none, or none in the range.
-        """
-        text = str(value).strip()
-        if not (text.isascii() and text.isdigit() and len(text) < 8 and 1 <= int(text) <= 1_000_000):
-            self.fail(f"must be a positive integer up to 1000000, but is {value}", param, ctx)
-        return int(text)
-
-
-@click.command()
-@click.argument("scene", metavar="SCENE.toml|PRESET", type=SceneName())
-@click.option(
-    "--order",
-    metavar="N",
-    required=True,
-    type=PositiveInteger(),
-    help="Drive periods between two impacts, a positive integer.",
-)
-@click.option(
-    "--impacts",
-    metavar="M",
-    type=PositiveInteger(),
-    help="Impacts in these periods, found by a search from many starts; without it, all single-impact orbits.",
-)
-@LAW
-@with_session
-def command(session: Session, scene: str, order: int, impacts: int | None, law: Path | None) -> None:
-    """Find all single-impact orbits of a scene, or with --impacts orbits of several impacts.
-
-    Of every orbit: impact phase and velocities, peak and lock-in amplitude of the height, whether it is stable, and
-    whether it is admissible (its flight stays above the platform). Where base or force drive, amplitude, phase
-    and lag at the drive's frequency, too, and the deflection against a moving base. With --out orbits.csv and
-    orbits.png. Exit code 3 if none is admissible.
-    With --impacts every impact is told, the hardest first, and the orbit with a rest on the sample if there is one.
-    A contact's are told so too: its impacts begin where the bridge forms and end, with phase and velocity, where it
-    breaks.
-    """
-    session.start_computing()
-    from afm_jax.contact.contact import Contact  # noqa: PLC0415
-    from afm_jax.impact.law import extrapolation_of  # noqa: PLC0415
-    from afm_jax.impact.orbits import single_impact_orbits  # noqa: PLC0415
-    from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
-
-    loaded, _ = scene_and_start(scene)
-    from afm_jax.cli.fitted_law import with_fitted_law  # noqa: PLC0415
-
-    loaded, _ = with_fitted_law(loaded, law)
-    if impacts is not None or isinstance(loaded.interaction, Contact):
-        _many(session, loaded, scene, order, impacts or 1)
-        return
-    refuse_other_than_law(loaded, scene)
-    try:
-        with session.working("searching for orbits"):
-            found = single_impact_orbits(loaded, order)
-    except ValueError as error:
-        raise ValueError(f"{scene}: {error}") from error
-    told = columns_of(found)
-    orbits = orbit_rows(found)
-    reason = None if any(orbit["admissible"] for orbit in orbits) else why_none(loaded, order, rejected=len(orbits))
-    near_fold = any(orbit["near_double"] for orbit in orbits)
-    beyond = extrapolation_of(loaded.interaction, [orbit["approach_speed_nm_per_us"] for orbit in orbits])
-    if not bool(found.complete):
+def orbits(session: Session, scene: NamedScene, *, order: int, impacts: int | None) -> Output:
+    """Return the single-impact orbits of a scene; of a contact, or with ``impacts``, those of several impacts."""
+    if impacts is not None or isinstance(scene.scene.interaction, Contact):
+        return _many(session, scene.scene, scene.name, order, impacts or 1)
+    refuse_other_than_law(scene.scene, scene.name)
+    with session.working("searching for orbits"):
+        result = single_impact_orbits(scene.scene, order)
+    rows = orbit_rows(result)
+    reason = None
+    if not any(orbit["admissible"] for orbit in rows):
+        reason = why_none(scene.scene, order, rejected=len(rows))
+    near_fold = any(orbit["near_double"] for orbit in rows)
+    speeds = [orbit["approach_speed_nm_per_us"] for orbit in rows]
+    extrapolated = extrapolation_of(scene.scene.interaction, speeds)
+    if not bool(result.complete):
         session.note("there are more orbits than could be listed; the slowest are shown")
-    session.write_table("orbits.csv", orbits, told)
-    _draw(session, found)
-    session.emit(
-        {
+    title = f"Orbits with one impact in {order} drive period{'s' if order > 1 else ''}"
+    fold = "Two of them nearly coincide (a fold): derivatives there have no meaning."
+    return Output(
+        payload={
             "order": order,
-            "scene": scene_tables(loaded),
-            "orbits": orbits,
-            "complete": found.complete,
-            "extrapolated": beyond,
+            "scene": scene_tables(scene.scene),
+            "orbits": rows,
+            "complete": result.complete,
+            "extrapolated": extrapolated,
             "reason": reason,
         },
-        orbit_table(orbits, title=f"Orbits with one impact in {order} drive period{'s' if order > 1 else ''}"),
-        *(["Two of them nearly coincide (a fold): derivatives there have no meaning."] if near_fold else []),
-        beyond,
+        text=[orbit_table(rows, title=title), fold if near_fold else None, extrapolated],
+        tables={"orbits.csv": columns_of(rows, names_of(result))},
+        files={"orbits.png": lambda path: save(result.plot(), path)},
+        not_valid=reason,
     )
-    if reason is not None:
-        raise NotValid(reason)
 
 
-def refuse_other_than_law(scene: "Scene", path: str) -> None:
+def refuse_other_than_law(scene: Scene, path: str) -> None:
     """Check that a scene's interaction is a law.
 
     Raises:
         ValueError: if not; says what gives one.
     """
-    from afm_jax.impact.law import Law  # noqa: PLC0415
-
     if isinstance(scene.interaction, Law):
         return
     absent = scene.interaction is None
@@ -169,64 +112,49 @@ def refuse_other_than_law(scene: "Scene", path: str) -> None:
     )
 
 
-def _many(session: Session, scene: "Scene", path: str, order: int, impacts: int) -> None:
-    """Tell the orbits of several impacts, or of a resolved contact."""
-    from afm_jax.contact.contact import Contact  # noqa: PLC0415
-    from afm_jax.dynamics.contact_orbits import contact_orbits  # noqa: PLC0415
-    from afm_jax.dynamics.impact_orbits import many_impact_orbits  # noqa: PLC0415
-    from afm_jax.dynamics.sticking_orbits import sticking_orbit  # noqa: PLC0415
-    from afm_jax.impact.law import extrapolation_of  # noqa: PLC0415
-    from afm_jax.scenefile.scenefile import scene_tables  # noqa: PLC0415
-
+def _many(session: Session, scene: Scene, name: str, order: int, impacts: int) -> Output:
+    """Return the orbits of several impacts, or of a resolved contact."""
     resolved = isinstance(scene.interaction, Contact)
     if not resolved:
-        refuse_other_than_law(scene, path)
-    try:
-        with session.working("searching for orbits (the first run compiles for some seconds)"):
-            if resolved:
-                found, resting = contact_orbits(scene, order, impacts), "a tip that the liquid bridge holds stays"
-            else:
-                found, resting = many_impact_orbits(scene, order, impacts), sticking_orbit(scene)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-    orbits = [orbit_facts(found.reading, index) for index in range(len(found.stable))]
+        refuse_other_than_law(scene, name)
+    with session.working("searching for orbits (the first run compiles for some seconds)"):
+        if resolved:
+            result, resting = contact_orbits(scene, order, impacts), "a tip that the liquid bridge holds stays"
+        else:
+            result, resting = many_impact_orbits(scene, order, impacts), sticking_orbit(scene)
+    orbits = [orbit_facts(result.reading, index) for index in range(len(result.stable))]
     rests = None if isinstance(resting, str) else resting._asdict()
     reason = None
     if not orbits and (rests is None or rests["order"] != order):
         reason = why_none(scene, order, rejected=0, impacts=impacts)
-    session.write_table("orbits.csv", [{**orbit, **orbit["impacts"][0]} for orbit in orbits], MANY_COLUMNS)
     rows = [{"orbit": k, **impact} for k, orbit in enumerate(orbits) for impact in orbit["impacts"]]
-    session.write_table("impacts.csv", rows, ("orbit", *IMPACT_COLUMNS))
-    _draw(session, found)
-    beyond = extrapolation_of(scene.interaction, [row["approach_speed_nm_per_us"] for row in rows])
-    payload = {
-        "order": order,
-        "impacts": impacts,
-        "scene": scene_tables(scene),
-        "orbits": orbits,
-        "sticking": rests,
-        "sticking_reason": resting if isinstance(resting, str) else None,
-        "extrapolated": beyond,
-        "reason": reason,
-    }
+    extrapolated = extrapolation_of(scene.interaction, [row["approach_speed_nm_per_us"] for row in rows])
     title = (
         f"Orbits with {impacts} impact{'s' if impacts > 1 else ''} in {order} drive period{'s' if order > 1 else ''}"
     )
-    words = f"No orbit with a rest: {resting}." if isinstance(resting, str) else _resting_words(payload["sticking"])
-    session.emit(payload, many_table(orbits, title=title), words, beyond)
-    if reason is not None:
-        raise NotValid(reason)
-
-
-def _draw(session: Session, found: "SingleImpactOrbits | ManyImpactOrbits") -> None:
-    """Write the picture of orbits into the `--out` folder."""
-    if session.out is None:
-        return
-    from afm_jax.plots.picture_style import save  # noqa: PLC0415
-
-    target = session.out / "orbits.png"
-    save(found.plot(), target)
-    session.note(f"wrote {target}")
+    return Output(
+        payload={
+            "order": order,
+            "impacts": impacts,
+            "scene": scene_tables(scene),
+            "orbits": orbits,
+            "sticking": rests,
+            "sticking_reason": resting if rests is None else None,
+            "extrapolated": extrapolated,
+            "reason": reason,
+        },
+        text=[
+            many_table(orbits, title=title),
+            f"No orbit with a rest: {resting}." if rests is None else _resting_words(rests),
+            extrapolated,
+        ],
+        tables={
+            "orbits.csv": columns_of([{**orbit, **orbit["impacts"][0]} for orbit in orbits], MANY_COLUMNS),
+            "impacts.csv": columns_of(rows, ("orbit", *IMPACT_COLUMNS)),
+        },
+        files={"orbits.png": lambda path: save(result.plot(), path)},
+        not_valid=reason,
+    )
 
 
 def _resting_words(rests: Mapping[str, Any]) -> str:
@@ -238,19 +166,15 @@ def _resting_words(rests: Mapping[str, Any]) -> str:
     )
 
 
-def impact_rows(reading: "LoopReading", index: int | None = None) -> list[dict[str, float]]:
+def impact_rows(reading: LoopReading, index: int | None = None) -> list[dict[str, float]]:
     """Return what is told of each impact of an orbit; of one of many, or of the only one."""
     columns = {name: getattr(reading, name) for name in IMPACT_COLUMNS}
     own = {name: (part if index is None else part[index]).tolist() for name, part in columns.items()}
     return [dict(zip(own, values, strict=True)) for values in zip(*own.values(), strict=True)]
 
 
-def orbit_facts(reading: "LoopReading", index: int) -> dict[str, Any]:
+def orbit_facts(reading: LoopReading, index: int) -> dict[str, Any]:
     """Return what is told of one orbit of several impacts: the first one's numbers, and all in `impacts`."""
-    import numpy as np  # noqa: PLC0415
-
-    from afm_jax.dynamics.impact_orbits import is_stable, multipliers_of  # noqa: PLC0415
-
     trace, determinant = float(reading.trace[index]), float(reading.determinant[index])
     multipliers = multipliers_of(np.asarray(trace), np.asarray(determinant))
     impacts = impact_rows(reading, index)
@@ -268,10 +192,8 @@ def orbit_facts(reading: "LoopReading", index: int) -> dict[str, Any]:
     }
 
 
-def many_table(orbits: Sequence[Mapping[str, Any]], *, title: str) -> "Table":
+def many_table(orbits: Sequence[Mapping[str, Any]], *, title: str) -> Table:
     """Return orbits of several impacts as a table to print, a line an impact."""
-    from rich.table import Table  # noqa: PLC0415
-
     table = Table(title=title, title_justify="left")
     for column in ("orbit", "phase\nrad", "velocity after\nnm/us", "approach\nnm/us", "rebound\nnm/us", "delay\nus"):
         table.add_column(column, justify="right")
@@ -291,19 +213,19 @@ def many_table(orbits: Sequence[Mapping[str, Any]], *, title: str) -> "Table":
     return table
 
 
-def columns_of(found: "SingleImpactOrbits") -> tuple[str, ...]:
+def names_of(found: SingleImpactOrbits) -> tuple[str, ...]:
     """Return what is told of orbits: what their scene has."""
     return (*COLUMNS, *(name for name in (*DRIVEN_COLUMNS, "extrapolated") if getattr(found, name) is not None))
 
 
-def orbit_rows(found: "SingleImpactOrbits") -> list[dict[str, Any]]:
+def orbit_rows(found: SingleImpactOrbits) -> list[dict[str, Any]]:
     """Return the orbits that exist as one dict of plain numbers each, by rising approach speed."""
-    columns = {name: getattr(found, name).tolist() for name in columns_of(found)}
+    columns = {name: getattr(found, name).tolist() for name in names_of(found)}
     slots = [slot for slot, exists in enumerate(found.exists.tolist()) if exists]
     return [{name: values[slot] for name, values in columns.items()} for slot in slots]
 
 
-def why_none(scene: "Scene", order: int, *, rejected: int, impacts: int = 1) -> str:
+def why_none(scene: Scene, order: int, *, rejected: int, impacts: int = 1) -> str:
     """Return a sentence on why a scene has no admissible orbit of an order, and what to try.
 
     Args:
@@ -319,8 +241,6 @@ def why_none(scene: "Scene", order: int, *, rejected: int, impacts: int = 1) -> 
             f"the search found no orbit of {impacts} impacts in {order} drive periods; `afm-jax orbits --order` and "
             "`afm-jax continue` say where orbits of one impact double their period"
         )
-    from afm_jax.apparatus.scene import drive_of  # noqa: PLC0415
-
     reduced = float(drive_of(scene).angular_frequency) / (2.0 * float(scene.cantilever.angular_frequency))
     nearest = max(1, round(reduced))
     what = (
@@ -333,10 +253,8 @@ def why_none(scene: "Scene", order: int, *, rejected: int, impacts: int = 1) -> 
     return f"{what}; try a larger drive amplitude, another offset or a drive nearer to resonance"
 
 
-def orbit_table(orbits: Sequence[Mapping[str, Any]], *, title: str) -> "Table":
+def orbit_table(orbits: Sequence[Mapping[str, Any]], *, title: str) -> Table:
     """Return orbits as a table to print; where base or force drive with what is read at the drive's frequency."""
-    from rich.table import Table  # noqa: PLC0415
-
     table = Table(title=title, title_justify="left")
     table.add_column("phase\nrad", justify="right")
     for name, unit in (("velocity after", "nm/us"), ("approach", "nm/us"), ("rebound", "nm/us"), ("delay", "us")):

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from afm_jax.apparatus.scene import DrivePeriod, Scene, drive_of
-from afm_jax.cli.session import Session, write_json
+from afm_jax.cli.session import Session
 from afm_jax.contact.junction import Phase
 from afm_jax.motion.follow import LongRun
 from afm_jax.motion.observe import OBSERVABLES, Observables, why_absent
@@ -155,21 +155,6 @@ def text_of(payload: Mapping[str, Any]) -> list[str]:
         f"{'; the sample holds the tip' if payload['stuck'] else ''}."
     )
     return lines
-
-
-def write_files(
-    session: Session, run: LongRun, seen: Observables, dense: DensePath, payload: Mapping[str, Any]
-) -> None:
-    """Write contacts.csv, trajectory.csv and simulate.json into the `--out` folder."""
-    if session.out is None:
-        return
-    rows, columns = contact_rows(run.simulation)
-    session.write_table("contacts.csv", rows, columns)
-    rows, columns = trajectory_rows(dense, *stretch_written(run.simulation, seen.window))
-    session.write_table("trajectory.csv", rows, columns)
-    path = session.out / "simulate.json"
-    write_json(path, payload)
-    session.note(f"wrote {path}")
 
 
 def contact_rows(simulation: Simulation) -> tuple[list[dict[str, Any]], list[str]]:

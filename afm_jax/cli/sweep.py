@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.cli.options import LAW
-from afm_jax.cli.session import Session, with_session
+from afm_jax.cli.session import Session
 from afm_jax.cli.values import scene_and_start
 from afm_jax.compilation_cache import available_cores
 
@@ -24,20 +23,7 @@ _MOST_DRAWN = 2
 """Axes of a sweep that a picture can show."""
 
 
-@click.command()
-@click.argument("sweep", metavar="SWEEP.toml", type=click.Path(path_type=Path))
-@click.option(
-    "--workers",
-    type=click.IntRange(1, 1024),
-    metavar="N",
-    help="Processes of this machine that share its cores, by Dask; 1: this one alone.",
-)
-@click.option("--scheduler", metavar="tcp://...", help="A Dask scheduler whose workers do the work.")
-@click.option("--dry-run", is_flag=True, help="Measure a chunk and say what the sweep would take; keep nothing.")
-@click.option("--plot", is_flag=True, help="Draw a sweep of one or two axes, sweep.png.")
-@LAW
-@with_session
-def command(
+def sweep(
     session: Session,
     *,
     sweep: Path,
@@ -47,25 +33,7 @@ def command(
     plot: bool,
     law: Path | None,
 ) -> None:
-    """Compute what SWEEP.toml records over its grid, into DIR/sweep.zarr; call it again to go on after a fault.
-
-    \b
-    scene = "scene.toml"                  # or a preset; or tables = ["a.csv", "b.csv"]
-    accuracy = 1e-6                       # of resolved contacts; may be left out
-    [record]
-    what = "orbits"                       # simulation, collide, lyapunov; of tables: fit
-    orders = [1, 2]
-    [[axes]]
-    parameter = "platform.reduced_frequency"
-    linear = [0.9, 1.1, 1000]             # or log = [low, high, count], or list = [...]
-    [[axes]]
-    latin_hypercube = { "interaction.r" = [0.9, 0.99], "interaction.epsilon" = { log = [1, 100] } }
-    count = 500                           # or random = {...}
-    seed = 1
-
-    The results open with xarray.open_zarr; on other workers they differ in last digits at most. Chunks that are done
-    are kept, whatever happens, and computed again only if their bytes have changed.
-    """  # noqa: D301 (click's mark of lines that stay as they are)
+    """Run a sweep, or estimate what it would take."""
     if workers is not None and scheduler is not None:
         raise click.UsageError("--scheduler has workers of its own: leave --workers out")
     if session.out is None and not dry_run:

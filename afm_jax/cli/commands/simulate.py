@@ -1,13 +1,16 @@
 """Commands about the motions of a scene."""
 
+import math
 from importlib import import_module
+from pathlib import Path
+from typing import Any
 
 import click
 
 from afm_jax.cli.command import Command, Options
 from afm_jax.cli.options import DRAWS, LAW, PICTURE, SCENE
 from afm_jax.cli.session import Session
-from afm_jax.cli.values import Ends, Grid
+from afm_jax.cli.values import Ends, Finite, Grid, Share
 
 BASINS = Command(
     name="basins",
@@ -129,4 +132,290 @@ LYAPUNOV = Command(
     ),
 )
 
-COMMANDS = (BASINS, BIFURCATION, CHART, LYAPUNOV)
+
+class PositiveInteger(click.ParamType):
+    """An integer from 1 to a million."""
+
+    name = "integer"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
+        """Return the integer that a text says.
+
+        Raises:
+            click.BadParameter: if it is none, or none in the range.
+        """
+        text = str(value).strip()
+        if not (text.isascii() and text.isdigit() and len(text) < 8 and 1 <= int(text) <= 1_000_000):
+            self.fail(f"must be a positive integer up to 1000000, but is {value}", param, ctx)
+        return int(text)
+
+
+class Multiples(click.ParamType):
+    """Positive integers in a comma list."""
+
+    name = "list"
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
+        """Return the integers that a text says, without repetitions.
+
+        Raises:
+            click.BadParameter: if one is none, or not from 1 to 1000.
+        """
+        parts = [part.strip() for part in str(value).split(",")]
+        if not all(part.isascii() and part.isdigit() and len(part) < 5 and 1 <= int(part) <= 1000 for part in parts):
+            self.fail(f"must be integers from 1 to 1000 as in 1,2,3, but is {value}", param, ctx)
+        return tuple(dict.fromkeys(int(part) for part in parts))
+
+
+def _check_sticking(_: Session, options: Options) -> None:
+    """Check that an orbit with a rest is followed through one parameter."""
+    others = options["second"] is not None or options["law"] is not None or options["impacts"] != 1
+    if options["sticking"] and others:
+        raise ValueError("--sticking goes without --impacts, --second and --law: an orbit with a rest has no equations")
+
+
+CONTINUE = Command(
+    name="continue",
+    group="simulate",
+    summary="Follow orbits and their special points through parameters.",
+    runs="afm_jax.cli.continue_orbits:follow",
+    help="""Follow the (m, N) orbits of a scene through a parameter, round folds, by pseudo-arclength.
+
+    Folds, period doublings, torus points, grazings and captures are located to rounding; with --second they are
+    followed as curves in two parameters, with cusps and meetings. In a scene with a contact the simulation is closed
+    instead of the map, and curves end where the orbit grazes or is captured. With --sticking the phase is that of the
+    release, and the branches end where the rest is lost, the sample lets go no more or a flight grazes. With --law
+    every special point has a 95 % interval. With --out tables and pictures. Exit code 3 if there is no admissible
+    orbit in the range.
+    """,
+    options=(
+        SCENE,
+        click.option("--order", metavar="N", required=True, type=PositiveInteger(), help="Drive periods of the orbit."),
+        click.option(
+            "--impacts",
+            metavar="M",
+            default=1,
+            show_default=True,
+            type=click.IntRange(0, 64),
+            help="Impacts in them; 0: the tip meets nothing.",
+        ),
+        click.option(
+            "--parameter",
+            metavar="P=A:B",
+            required=True,
+            help="A parameter of the scene file and its range, such as platform.reduced_frequency=0.9:1.1.",
+        ),
+        click.option(
+            "--second", metavar="P=A:B", help="Another one: the special points are followed as curves in both."
+        ),
+        click.option(
+            "--sticking", is_flag=True, help="Follow the orbit with a rest on the sample: chatter, ride, release."
+        ),
+        LAW,
+        PICTURE,
+    ),
+    check=_check_sticking,
+)
+
+
+def _check_effects(_: Session, options: Options) -> None:
+    """Check the duration, and that the scene can be written."""
+    duration_us, write = options["duration_us"], options["write"]
+    if duration_us is not None and not (duration_us > 0.0 and math.isfinite(duration_us)):
+        raise click.UsageError(f"--duration-us must be a positive number, but is {duration_us:g}")
+    if write is not None and not write.absolute().parent.is_dir():
+        raise click.UsageError(f"--write {write}: there is no folder {write.absolute().parent}; choose another place")
+
+
+EFFECTS = Command(
+    name="effects",
+    group="simulate",
+    summary="Say what each effect of a scene changes and costs, and which can be left out.",
+    runs="afm_jax.cli.effects:effects",
+    help="""Say what each effect of a scene changes and costs.
+
+    Each effect is left out, absent from the program, and the steady motion compared with that of the full scene: peak
+    and lock-in amplitude, phase, energy lost per impact. All motions begin at the file's [start], or else at the
+    scene's default one. Where nothing repeats (a ramp, several frequencies) the last fifth of the duration is compared.
+    Costs are processor time of a drive period and operations of the compiled program. With --out effects.csv,
+    effects.json and effects.png.
+    """,
+    options=(
+        SCENE,
+        click.option(
+            "--accuracy",
+            type=Share(),
+            default="1%",
+            show_default=True,
+            help="Wanted accuracy of the amplitudes, 1% or 0.01: which effects does it not need?",
+        ),
+        click.option("--duration-us", type=Finite(), metavar="T", help="How long to follow each scene at most, in us."),
+        click.option("--only", metavar="NAME,...", help="The effects to look at; all if left out."),
+        click.option(
+            "--write",
+            metavar="FILE",
+            type=click.Path(path_type=Path, dir_okay=False),
+            help="Save the scene without what the accuracy does not need, and its start, as a scene file.",
+        ),
+    ),
+    check=_check_effects,
+)
+
+
+ORBITS = Command(
+    name="orbits",
+    group="simulate",
+    summary="Find the orbits of a scene, of one impact or more, and whether they are stable.",
+    runs="afm_jax.cli.orbits:orbits",
+    help="""Find all single-impact orbits of a scene, or with --impacts orbits of several impacts.
+
+    Of every orbit: impact phase and velocities, peak and lock-in amplitude of the height, whether it is stable, and
+    whether it is admissible (its flight stays above the platform). Where base or force drive, amplitude, phase
+    and lag at the drive's frequency, too, and the deflection against a moving base. With --out orbits.csv and
+    orbits.png. Exit code 3 if none is admissible.
+    With --impacts every impact is told, the hardest first, and the orbit with a rest on the sample if there is one.
+    A contact's are told so too: its impacts begin where the bridge forms and end, with phase and velocity, where it
+    breaks.
+    """,
+    options=(
+        SCENE,
+        click.option(
+            "--order",
+            metavar="N",
+            required=True,
+            type=PositiveInteger(),
+            help="Drive periods between two impacts, a positive integer.",
+        ),
+        click.option(
+            "--impacts",
+            metavar="M",
+            type=PositiveInteger(),
+            help="Impacts in these periods, found by a search from many starts; without it, all single-impact orbits.",
+        ),
+        LAW,
+    ),
+)
+
+
+DEFAULT_PERIODS = 2000
+"""Drive periods followed at most where no duration is given."""
+
+
+def _check_simulation(session: Session, options: Options) -> None:
+    """Check the duration, and that a trace has a folder."""
+    for option, name in (("--duration-us", "duration_us"), ("--periods", "periods")):
+        value = options[name]
+        if value is not None and not (value > 0.0 and math.isfinite(value)):
+            raise click.UsageError(f"{option} must be a positive number, but is {value:g}")
+    if options["duration_us"] is not None and options["periods"] is not None:
+        raise click.UsageError("--duration-us and --periods say the same: give one of them")
+    if options["samples"] and session.out is None:
+        raise click.UsageError("--samples writes a trace: say into which folder by --out DIR")
+
+
+SIMULATE = Command(
+    name="simulate",
+    group="simulate",
+    summary="Follow a scene in time: contacts, amplitudes, phases, energies.",
+    runs="afm_jax.cli.simulate:simulation",
+    help="""Follow a scene in time: contacts, amplitudes, phases, forces, energies.
+
+    SCENE.toml is a scene file, PRESET the name of one of the paper's scenes (figure2, figure8, ...). The start is the
+    file's [start]; without one the tip starts on the single-impact orbit that the law with delay predicts, if there is
+    one. Amplitudes are read over the last response period once the motion has settled, else over the last fifth, at the
+    drive's frequency and at the response's, which is 1/N of it where the motion repeats after N drive periods. With
+    --out contacts.csv, trajectory.csv, simulate.json and pictures. A tip that sticks, or does not settle, is a result;
+    exit code 3 if the simulation broke off.
+    """,
+    options=(
+        SCENE,
+        click.option("--duration-us", type=Finite(), metavar="T", help="How long to follow the scene, in us."),
+        click.option("--periods", type=Finite(), metavar="P", help="How long, in periods of the drive."),
+        click.option(
+            "--until-settled",
+            is_flag=True,
+            help=f"End when the motion has settled; at the latest after the duration, or {DEFAULT_PERIODS} drive "
+            f"periods. "
+            "This is what happens without a duration.",
+        ),
+        click.option(
+            "--harmonics",
+            type=Multiples(),
+            default="1",
+            show_default=True,
+            metavar="K,...",
+            help="Multiples of the response frequency omega/N at which amplitude and phase are read, besides the "
+            "drive's "
+            "(N times it), which always is.",
+        ),
+        click.option(
+            "--accuracy",
+            type=Finite(positive=True),
+            default=1e-9,
+            show_default=True,
+            help="Of every resolved contact: relative of the rebound speed.",
+        ),
+        click.option(
+            "--method",
+            type=click.Choice(("collocation", "diffrax")),
+            default="collocation",
+            show_default=True,
+            help="The way through a resolved contact: leg by leg, or in time throughout with Diffrax's Dopri8 "
+            "(slower).",
+        ),
+        click.option(
+            "--samples",
+            type=click.Choice(["uniform"]),
+            help="Write trace.csv into --out, too: the deflection over the last response periods at equal steps of "
+            "time, as "
+            "`afm-jax lockin` reads it.",
+        ),
+        LAW,
+    ),
+    check=_check_simulation,
+)
+
+
+SWEEP = Command(
+    name="sweep",
+    group="simulate",
+    summary="Compute many scenes, or fit many tables, over a grid of parameters; resumes.",
+    runs="afm_jax.cli.sweep:sweep",
+    help="""Compute what SWEEP.toml records over its grid, into DIR/sweep.zarr; call it again to go on after a fault.
+
+    \b
+    scene = "scene.toml"                  # or a preset; or tables = ["a.csv", "b.csv"]
+    accuracy = 1e-6                       # of resolved contacts; may be left out
+    [record]
+    what = "orbits"                       # simulation, collide, lyapunov; of tables: fit
+    orders = [1, 2]
+    [[axes]]
+    parameter = "platform.reduced_frequency"
+    linear = [0.9, 1.1, 1000]             # or log = [low, high, count], or list = [...]
+    [[axes]]
+    latin_hypercube = { "interaction.r" = [0.9, 0.99], "interaction.epsilon" = { log = [1, 100] } }
+    count = 500                           # or random = {...}
+    seed = 1
+
+    The results open with xarray.open_zarr; on other workers they differ in last digits at most. Chunks that are done
+    are kept, whatever happens, and computed again only if their bytes have changed.
+    """,
+    options=(
+        click.argument("sweep", metavar="SWEEP.toml", type=click.Path(path_type=Path)),
+        click.option(
+            "--workers",
+            type=click.IntRange(1, 1024),
+            metavar="N",
+            help="Processes of this machine that share its cores, by Dask; 1: this one alone.",
+        ),
+        click.option("--scheduler", metavar="tcp://...", help="A Dask scheduler whose workers do the work."),
+        click.option(
+            "--dry-run", is_flag=True, help="Measure a chunk and say what the sweep would take; keep nothing."
+        ),
+        click.option("--plot", is_flag=True, help="Draw a sweep of one or two axes, sweep.png."),
+        LAW,
+    ),
+    computes=False,
+)
+
+COMMANDS = (BASINS, BIFURCATION, CHART, CONTINUE, EFFECTS, LYAPUNOV, ORBITS, SIMULATE, SWEEP)

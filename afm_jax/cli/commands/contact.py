@@ -1,0 +1,95 @@
+"""Commands about the contact between tip and sample."""
+
+import click
+
+from afm_jax.cli.command import Command, Options
+from afm_jax.cli.contact_options import with_contact_options
+from afm_jax.cli.session import Session
+from afm_jax.cli.values import Ends, Finite, Numbers
+
+_PROGRAMS = ("afm_jax.contact.collide:_capture_speed", "afm_jax.contact.collide:_quick")
+
+
+def _check_law(_: Session, options: Options) -> None:
+    """Check that options of a law go with --make-law, and others without."""
+    of_laws = ("speed_range", "delay_range", "residuals", "points")
+    given = [name for name in of_laws if options[name] is not None]
+    if given and not options["make_law"]:
+        raise click.UsageError(f"--{given[0].replace('_', '-')} is of the formulas of a law: add --make-law")
+    if options["make_law"] and options["speeds"] is not None:
+        raise click.UsageError("--make-law chooses its own speeds: leave --speeds out")
+
+
+COLLIDE = Command(
+    name="collide",
+    group="contact",
+    summary="Let free tips collide with the sample: rebound, delay, capture, energy.",
+    runs="afm_jax.cli.collide:collide",
+    help="""Let free tips collide with a sample at rest, through liquid bridge and solid junction.
+
+    The contact is the paper's, or that of SCENE.toml, changed by the options. Of every speed: rebound speed, collision
+    delay, whether the tip is captured, times, deepest gap, and where the energy went; and the capture speed. With
+    --out collide.csv, collide.json and collide.png. Captured tips are a result, even if all are; exit code 3 if the
+    integration does not resolve one. With --make-law the law that the contact amounts to.
+    """,
+    options=(
+        with_contact_options,
+        click.option(
+            "--speeds",
+            type=Numbers("speed", example="12,15,20"),
+            metavar="LIST",
+            help="Approach speeds in nm/us: 12,15,20 or start:stop:step as 12:200:10 (with the stop where it fits), "
+            "or both. "
+            "Left out: 20 speeds from 1.1 times the capture speed to 200.",
+        ),
+        click.option(
+            "--accuracy",
+            type=Finite(positive=True),
+            default=1e-9,
+            show_default=True,
+            help="Wanted relative accuracy of the rebound speed.",
+        ),
+        click.option(
+            "--method",
+            type=click.Choice(("diffrax", "collocation")),
+            default="diffrax",
+            show_default=True,
+            help="How the way through the bridge is integrated.",
+        ),
+        click.option(
+            "--make-law",
+            is_flag=True,
+            help="Make the impact law that the contact amounts to, in place of a table of collisions: with --out "
+            "law.json and "
+            "law.csv, which scene files and --law take, and the formulas closest to it.",
+        ),
+        click.option(
+            "--speed-range",
+            type=Ends(),
+            metavar="LOW:HIGH",
+            help="With --make-law: approach speeds of the formulas in nm/us. Left out: 1.5 times the capture speed to "
+            "250.",
+        ),
+        click.option(
+            "--delay-range",
+            type=Ends(),
+            metavar="LOW:HIGH",
+            help="With --make-law: the same for the delay's formula. Left out: 1.37 times the capture speed to 700.",
+        ),
+        click.option(
+            "--residuals",
+            type=click.Choice(("relative", "absolute")),
+            help="With --make-law: what is made small, u_fit/u_out - 1 (this is what happens without) or u_fit - "
+            "u_out.",
+        ),
+        click.option(
+            "--points",
+            type=click.IntRange(min=10, max=100_000),
+            help="With --make-law: number of speeds that formulas are fitted to; 512 without.",
+        ),
+    ),
+    check=_check_law,
+    programs=lambda options: () if options["make_law"] else _PROGRAMS,
+)
+
+COMMANDS = (COLLIDE,)
