@@ -28,7 +28,7 @@ from afm_jax import (
     single_impact_orbits,
 )
 from afm_jax.cli.main import main
-from afm_jax.dynamics import closed_loops
+from afm_jax.dynamics import curves
 from afm_jax.dynamics.bands import UncertainParameters, special_errors
 from afm_jax.dynamics.continuation import Continuation, continue_orbits
 from afm_jax.impact.closure import OrbitProblem, closing_residual
@@ -217,13 +217,13 @@ def test_a_resting_and_a_driven_tip_graze_where_they_must():
 @pytest.fixture
 def feeding(monkeypatch: pytest.MonkeyPatch):
     """Let every impact feed the motion by a hundredth more than it does: no law of the package does."""
-    true = closed_loops.trace_and_determinant_of
+    true = curves.trace_and_determinant_of
 
     def more(*arguments):
         trace, determinant = true(*arguments)
         return trace, 1.02 * determinant
 
-    monkeypatch.setattr(closed_loops, "trace_and_determinant_of", more)
+    monkeypatch.setattr(curves, "trace_and_determinant_of", more)
     jax.clear_caches()
     yield
     jax.clear_caches()

@@ -42,5 +42,5 @@ def test_every_command_labels_its_json(name: str):
 
 def test_only_the_session_writes_json():
     folder = Path(main.__file__).parent
-    writing = [path.name for path in sorted(folder.glob("*.py")) if "strict_json(" in path.read_text("utf-8")]
+    writing = [path.name for path in sorted(folder.rglob("*.py")) if "strict_json(" in path.read_text("utf-8")]
     assert writing == ["session.py"]

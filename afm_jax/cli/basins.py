@@ -8,8 +8,8 @@ import numpy as np
 from afm_jax.cli.command import NamedScene, Output, later
 from afm_jax.cli.fitted_law import as_drawn
 from afm_jax.cli.session import Session
+from afm_jax.dynamics.bands import drawn_shares
 from afm_jax.dynamics.basins import Basins, basins_of_attraction
-from afm_jax.dynamics.motion_bands import drawn_shares
 from afm_jax.dynamics.verdicts import WHY_UNRESOLVED, MotionKind
 from afm_jax.impact.law import extrapolation_of
 from afm_jax.scenefile.scenefile import scene_tables

@@ -10,8 +10,8 @@ from afm_jax.cli.command import NamedScene, Output, later
 from afm_jax.cli.fitted_law import as_drawn
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import ranges_of
+from afm_jax.dynamics.bands import verdict_probability
 from afm_jax.dynamics.bifurcations import Sweep, bifurcation_diagram
-from afm_jax.dynamics.motion_bands import verdict_probability
 from afm_jax.impact.law import extrapolation_of
 from afm_jax.scenefile.scenefile import scene_tables
 

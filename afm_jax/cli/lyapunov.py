@@ -9,8 +9,8 @@ from afm_jax.apparatus.scene import Scene
 from afm_jax.cli.command import NamedScene, Output, later
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import ranges_of
+from afm_jax.dynamics.bands import drawn_exponents
 from afm_jax.dynamics.exponents import CHAOTIC_ERRORS, Lyapunov, exponent_verdicts, lyapunov_spectrum
-from afm_jax.dynamics.motion_bands import drawn_exponents
 from afm_jax.impact.law import extrapolation_of
 from afm_jax.motion.start import start_of
 from afm_jax.scenefile.parameter_paths import scene_batch

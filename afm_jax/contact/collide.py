@@ -1,6 +1,8 @@
-"""Collisions of free tips: batches of many speeds or many contacts, in blocks of flat memory, and the capture speed.
+"""Collisions of free tips with a sample at rest: rebound speed, delay and losses for an approach speed (section IV).
 
-A table of collisions: what becomes of free tips of many speeds, with the capture speed and the junction beside.
+One collision is `collision`: the approach through the bridge, the junction, and the retraction, each from the kinetic
+energy that the one before leaves. `collide` takes batches of speeds and contacts, in few steps and again in many for
+the few tips that need it; `capture_speed` is the root of the energy at the end; `collisions` makes a table of them.
 """
 
 import math
@@ -43,7 +45,7 @@ from afm_jax.contact.settings import CAREFUL, Setting, setting_of
 from afm_jax.outcomes import CollisionOutcome
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.derivatives import by_tangents, implicit_root
-from afm_jax.solve.lanes import LANES, again_for_the_open, filled, map_in_blocks
+from afm_jax.solve.lanes import LANES, again_for_the_open, filled, rows_in_blocks
 
 _CAPTURE_POINTS = 64
 _CAPTURE_ROUNDS = 9
@@ -190,53 +192,25 @@ def _quick(
     leaves = jax.tree.leaves(contact)
     shared = None if any(leaf.ndim for leaf in leaves) else find_junction(contact)
 
-    def one(contact, mass, speed):
-        place = _junctions(contact) if shared is None else shared
-        valid = (speed > 0.0) & jnp.isfinite(speed)
-        safe = jnp.where(valid, speed, 1.0)
-        ways = go_through(contact, place, safe, mass, setting)
-        found = collision_of(contact, place, safe, mass, ways)
-        resolved = ways.resolved | ~valid | ~place.exists
-        return _judged(found, speed, place.exists, valid), resolved, place if shared is None else None
+    def block(parameters, speed):
+        contact, mass = parameters
+        junction = _junctions(contact) if shared is None else shared
+        result, resolved = collision(contact, junction, speed, mass, setting)
+        return result, resolved, junction if shared is None else None
 
-    found, resolved, own = _of_tips(one, contact, mass, speeds)
-    return found, resolved, own if shared is None else shared
-
-
-_Joined = tuple[Contact, Junction]
+    result, resolved, junctions = rows_in_blocks(block, (contact, mass), speeds)
+    return result, resolved, junctions if shared is None else shared
 
 
 @jax.jit
-def _careful(joined: _Joined, mass: Float[Array, "..."], speeds: Float[Array, "..."]) -> Collision:
+def _careful(contact: tuple[Contact, Junction], mass: Float[Array, "..."], speeds: Float[Array, "..."]) -> Collision:
     """Return the collisions of a batch in many steps, turning points in the bridge included."""
 
-    def one(joined, mass, speed):
-        contact, place = joined
-        valid = (speed > 0.0) & jnp.isfinite(speed)
-        safe = jnp.where(valid, speed, 1.0)
-        ways = go_through(contact, place, safe, mass, CAREFUL)
-        through = collision_of(contact, place, safe, mass, ways)
-        if not contact.spans:
-            return _judged(through, speed, place.exists, valid, jnp.isfinite(through.end_energy_aj))
-        turn = _turns(contact, place, mass, safe, ways.inward.dissipated_aj)
-        turned = collision_of_turn(contact, place, safe, mass, turn)
-        turns = turn.turns & (ways.inward.energy_aj <= 0.0)
-        found = jax.tree.map(lambda a, b: jnp.where(turns, a, b), turned, through)
-        finite = jnp.isfinite(found.end_energy_aj) & jnp.isfinite(found.viscous_loss_aj) & (turn.settled | ~turns)
-        return _judged(found, speed, place.exists, valid, finite)
+    def block(parameters, speed):
+        (contact, junction), mass = parameters
+        return collision(contact, junction, speed, mass, CAREFUL)[0]
 
-    return _of_tips(one, joined, mass, speeds)
-
-
-def _of_tips(one: Callable, contact: Contact | _Joined, mass: Float[Array, "..."], speeds: Float[Array, "..."]) -> Any:
-    """Return a collision of every tip of a batch: memory does not grow with it."""
-    own, shared = eqx.partition((contact, mass), lambda leaf: leaf.ndim > 0)
-
-    def block(lanes: Any) -> Any:
-        varied, speed = lanes
-        return one(*eqx.combine(varied, shared), speed)
-
-    return map_in_blocks(block, (own, speeds), block=LANES, recompute=True)
+    return rows_in_blocks(block, (contact, mass), speeds)
 
 
 def _axes(tree: Any) -> Any:
@@ -257,7 +231,7 @@ def _turns(contact: Contact, place: Junction, mass: Array, speeds: Array, spent:
     )
 
 
-def _judged(found: Collision, speed: Array, exists: Array, valid: Array, finite: ArrayLike = True) -> Collision:  # noqa: FBT002
+def _judged(found: Collision, speed: Array, exists: Array, valid: Array, finite: Array) -> Collision:
     """Return a collision with its outcome, and with zeros where there is none."""
     outcome = jnp.where(finite, found.outcome, CollisionOutcome.UNRESOLVED)
     outcome = jnp.where(exists, outcome, CollisionOutcome.NO_JUNCTION)
@@ -265,6 +239,97 @@ def _judged(found: Collision, speed: Array, exists: Array, valid: Array, finite:
     good = outcome <= CollisionOutcome.CAPTURED_BY_JUNCTION
     cleared = jax.tree.map(lambda part: jnp.where(good, part, jnp.zeros_like(part)), found)
     return cleared._replace(approach_speed_nm_per_us=speed, outcome=outcome)
+
+
+def collision(
+    contact: Contact,
+    junction: Junction,
+    approach_speed: Float[Array, "..."],
+    mass: Float[Array, "..."],
+    setting: Setting,
+) -> tuple[Collision, Bool[Array, "..."]]:
+    """Return the collision of a free tip, and whether the setting resolves it.
+
+    The tip approaches through the bridge, passes the junction, and retracts through the bridge; each part begins with
+    the kinetic energy that the one before leaves (`go_through`). A careful setting also follows tips that the bridge
+    turns round before the junction forms.
+
+    Args:
+        contact: the contact.
+        junction: its junction.
+        approach_speed: in nm/us; speeds that are not positive and finite have an outcome that says so.
+        mass: in ng.
+        setting: how finely.
+    """
+    valid = (approach_speed > 0.0) & jnp.isfinite(approach_speed)
+    speed = jnp.where(valid, approach_speed, 1.0)
+    ways = go_through(contact, junction, speed, mass, setting)
+    result = collision_of(contact, junction, speed, mass, ways)
+    finite = jnp.ones_like(valid)
+    if setting.careful and contact.spans:
+        turn = _turns(contact, junction, mass, speed, ways.approach.dissipated_aj)
+        turns = turn.turns & (ways.approach.energy_aj <= 0.0)
+        turned = collision_of_turn(contact, junction, speed, mass, turn)
+        result = jax.tree.map(lambda a, b: jnp.where(turns, a, b), turned, result)
+        finite = turn.settled | ~turns
+    if setting.careful:
+        finite = finite & jnp.isfinite(result.end_energy_aj) & jnp.isfinite(result.viscous_loss_aj)
+    resolved = ways.resolved | ~valid | ~junction.exists
+    return _judged(result, approach_speed, junction.exists, valid, finite), resolved
+
+
+class Ways(NamedTuple):
+    """The three parts of a collision that forms the junction: through the bridge, the junction, the bridge again."""
+
+    approach: Passage
+    junction: JunctionWay
+    retract: Passage
+    outer_gap_nm: Float[Array, "..."]
+    """Gap at which contact ends."""
+    resolved: Bool[Array, "..."]
+    """Whether the setting's few steps are enough."""
+
+
+def go_through(
+    contact: Contact,
+    junction: Junction,
+    approach_speed: Float[Array, "..."],
+    mass: Float[Array, "..."],
+    setting: Setting,
+    crossing: Callable[[Way], Passage] | None = None,
+) -> Ways:
+    """Return the three parts of one collision, each from the energy that the one before leaves.
+
+    `crossing`, if not None, replaces the setting's way of crossing the bridge.
+    """
+    cross = crossing or (lambda way: pass_bridge(way, setting))
+    tip = free_tip(contact, junction, mass)
+    forms, breaks = contact.bridge_forms_nm, junction.breaks_gap_nm
+    outer = jnp.maximum(contact.bridge_breaks_nm, breaks)
+    pull_in, pull_out = (-tip.bridge.force(gap) * gap for gap in (forms, outer))
+
+    start = 0.5 * mass * approach_speed * approach_speed
+    crossings = _Crossings((forms, junction.forms_gap_nm), (outer, breaks), pull_in, pull_out)
+    if setting.careful and crossing is None and not tip.bridge.conserves:
+        approach, solid, retract = _in_a_loop(tip, start, crossings, setting)
+    else:
+        approach, solid, retract = _one_by_one(tip, start, crossings, setting, cross)
+
+    # at an end that pulls, a slow tip's drag must be small against the pull for the substitution to hold
+    calm_in, calm_out = (
+        (pull <= 0.0) | (tip.bridge.damping(gap) * gap * jnp.sqrt(2.0 * jnp.maximum(pull, 0.0) / mass) <= 0.1 * pull)
+        for gap, pull in ((forms, pull_in), (outer, pull_out))
+    )
+    # Few steps are enough where dissipation is small against the energies along the way and no repulsion almost stops
+    # the tip inside the bridge.
+    reach = jnp.minimum(start + jnp.maximum(pull_in, 0.0), approach.energy_aj)
+    spent = _MOST_SPENT[setting.rule]
+    easy_in = (approach.dissipated_aj < spent * reach) & (approach.energy_aj > 0.1 * start) & calm_in
+    easy_out = (retract.dissipated_aj < spent * solid.energy_aj) & calm_out
+    # what is left of the energy at the end has the error of all of it: close to capture that is many times its own
+    energy_left = jnp.where(solid.energy_aj > 0.0, retract.energy_aj, solid.energy_aj)
+    clear = (energy_left > _NEAR_CAPTURE[1] * start) | (energy_left < _NEAR_CAPTURE[0] * start)
+    return Ways(approach, solid, retract, outer, easy_in & clear & (easy_out | (solid.energy_aj <= 0.0)))
 
 
 @checked
@@ -326,65 +391,11 @@ def _end_energy(
     """Return the kinetic energy left where the tip has least on its way out, in aJ; negative by what is missing."""
     contact, junction, mass = model
     ways = go_through(contact, junction, approach_speed, mass, CAREFUL)
-    through = jnp.minimum(ways.junction.energy_aj, ways.outward.energy_aj)
+    through = jnp.minimum(ways.junction.energy_aj, ways.retract.energy_aj)
     if not contact.spans:
         return through
-    turn = turn_in_bridge(contact, junction, approach_speed, mass, ways.inward.dissipated_aj)
-    return jnp.where(turn.turns & (ways.inward.energy_aj <= 0.0), turn.energy_aj, through)
-
-
-class Ways(NamedTuple):
-    """The three parts of a collision that forms the junction."""
-
-    inward: Passage
-    junction: JunctionWay
-    outward: Passage
-    outer_gap_nm: Float[Array, "..."]
-    """Gap at which contact ends."""
-    resolved: Bool[Array, "..."]
-    """Whether the setting's few steps are enough."""
-
-
-def go_through(
-    contact: Contact,
-    junction: Junction,
-    approach_speed: Float[Array, "..."],
-    mass: Float[Array, "..."],
-    setting: Setting,
-    crossing: Callable[[Way], Passage] | None = None,
-) -> Ways:
-    """Return the three parts of one collision, each from the energy that the one before leaves.
-
-    `crossing`, if not None, replaces the setting's way of crossing the bridge.
-    """
-    cross = crossing or (lambda way: pass_bridge(way, setting))
-    tip = free_tip(contact, junction, mass)
-    forms, breaks = contact.bridge_forms_nm, junction.breaks_gap_nm
-    outer = jnp.maximum(contact.bridge_breaks_nm, breaks)
-    pull_in, pull_out = (-tip.bridge.force(gap) * gap for gap in (forms, outer))
-
-    start = 0.5 * mass * approach_speed * approach_speed
-    crossings = _Crossings((forms, junction.forms_gap_nm), (outer, breaks), pull_in, pull_out)
-    if setting.careful and crossing is None and not tip.bridge.conserves:
-        inward, solid, outward = _in_a_loop(tip, start, crossings, setting)
-    else:
-        inward, solid, outward = _one_by_one(tip, start, crossings, setting, cross)
-
-    # at an end that pulls, a slow tip's drag must be small against the pull for the substitution to hold
-    calm_in, calm_out = (
-        (pull <= 0.0) | (tip.bridge.damping(gap) * gap * jnp.sqrt(2.0 * jnp.maximum(pull, 0.0) / mass) <= 0.1 * pull)
-        for gap, pull in ((forms, pull_in), (outer, pull_out))
-    )
-    # Few steps are enough where dissipation is small against the energies along the way and no repulsion almost stops
-    # the tip inside the bridge.
-    reach = jnp.minimum(start + jnp.maximum(pull_in, 0.0), inward.energy_aj)
-    spent = _MOST_SPENT[setting.rule]
-    easy_in = (inward.dissipated_aj < spent * reach) & (inward.energy_aj > 0.1 * start) & calm_in
-    easy_out = (outward.dissipated_aj < spent * solid.energy_aj) & calm_out
-    # what is left of the energy at the end has the error of all of it: close to capture that is many times its own
-    left = jnp.where(solid.energy_aj > 0.0, outward.energy_aj, solid.energy_aj)
-    clear = (left > _NEAR_CAPTURE[1] * start) | (left < _NEAR_CAPTURE[0] * start)
-    return Ways(inward, solid, outward, outer, easy_in & clear & (easy_out | (solid.energy_aj <= 0.0)))
+    turn = turn_in_bridge(contact, junction, approach_speed, mass, ways.approach.dissipated_aj)
+    return jnp.where(turn.turns & (ways.approach.energy_aj <= 0.0), turn.energy_aj, through)
 
 
 class _Crossings(NamedTuple):
@@ -398,24 +409,27 @@ class _Crossings(NamedTuple):
 
 _Parts = tuple[Passage, JunctionWay, Passage]
 _TRIAL_MARGIN = 1e-3
-"""Of a first pass on the way out, which tells how fast the tip is at the end: so which variable takes the root out."""
+"""Margin of a first pass of the retraction, which tells how fast the tip is at its end."""
 
 
 def _one_by_one(
     tip: Driven, start: Float[Array, "..."], at: _Crossings, setting: Setting, cross: Callable[[Way], Passage]
 ) -> _Parts:
-    """Return the way in, through the junction and out, after a short first pass of the way out."""
-    inward = cross(way_through(tip, at.gaps_in, start, margin_of(start, at.pull_in), inward=True))
-    solid = pass_through_junction(tip, inward.energy_aj, setting.junction_nodes)
+    """Return approach, junction and retraction, after a short first pass of the retraction."""
+    approach = cross(way_through(tip, at.gaps_in, start, margin_of(start, at.pull_in), inward=True))
+    solid = pass_through_junction(tip, approach.energy_aj, setting.junction_nodes)
 
     trial = way_through(tip, at.gaps_out, solid.energy_aj, jnp.full_like(start, _TRIAL_MARGIN), inward=False)
     end = trial.total_aj - trial.end_potential_aj if trial.quiet else pass_by_collocation(trial, 6, 1).energy_aj
     course = exit_course(at.gaps_out, margin_of(end, at.pull_out), inward=False)
-    return inward, solid, cross(trial._replace(course=course))
+    return approach, solid, cross(trial._replace(course=course))
 
 
 def _in_a_loop(tip: Driven, start: Float[Array, "..."], at: _Crossings, setting: Setting) -> _Parts:
-    """Return the same with a first pass as long as the way: one program in a loop, for each takes long to compile."""
+    """Return approach, junction and retraction from one program in a loop, for each copy takes long to compile.
+
+    The first pass of the retraction has as many steps as the retraction itself.
+    """
 
     def leg(before, number):
         came_in, last = before
@@ -428,21 +442,21 @@ def _in_a_loop(tip: Driven, start: Float[Array, "..."], at: _Crossings, setting:
         return (jnp.where(goes_in, passage.energy_aj, came_in), passage.energy_aj), (passage, solid)
 
     _, (passages, solids) = lax.scan(leg, (start, start), jnp.arange(3))
-    inward, outward = (jax.tree.map(lambda part, k=k: part[k], passages) for k in (0, 2))
-    return inward, jax.tree.map(lambda part: part[2], solids), outward
+    approach, retract = (jax.tree.map(lambda part, k=k: part[k], passages) for k in (0, 2))
+    return approach, jax.tree.map(lambda part: part[2], solids), retract
 
 
 def collision_of(
     contact: Contact, junction: Junction, approach_speed: Float[Array, "..."], mass: Float[Array, "..."], ways: Ways
 ) -> Collision:
     """Return the collision that three ways make, for a tip that forms the junction."""
-    energy = ways.outward.energy_aj
-    reached = ways.inward.energy_aj > 0.0
+    energy = ways.retract.energy_aj
+    reached = ways.approach.energy_aj > 0.0
     broke = ways.junction.energy_aj > 0.0
     free = reached & broke & (energy > 0.0)
     square = 2.0 * jnp.where(free, energy, 1.0) / mass
     rebound = jnp.where(free, jnp.sqrt(square), 0.0)
-    contact_time = ways.inward.time_us + ways.junction.time_us + ways.outward.time_us
+    contact_time = ways.approach.time_us + ways.junction.time_us + ways.retract.time_us
     outside = contact.bridge_forms_nm / approach_speed + ways.outer_gap_nm / jnp.where(free, rebound, 1.0)
     outcome = jnp.where(
         free,
@@ -460,9 +474,9 @@ def collision_of(
         deepest_gap_nm=ways.junction.deepest_gap_nm,
         bridge_hysteresis_aj=junction.bridge_hysteresis_aj,
         junction_hysteresis_aj=junction.junction_hysteresis_aj,
-        viscous_loss_aj=ways.inward.dissipated_aj + ways.outward.dissipated_aj,
+        viscous_loss_aj=ways.approach.dissipated_aj + ways.retract.dissipated_aj,
         end_energy_aj=jnp.where(
-            free, energy, jnp.minimum(energy, jnp.minimum(ways.junction.energy_aj, ways.inward.energy_aj))
+            free, energy, jnp.minimum(energy, jnp.minimum(ways.junction.energy_aj, ways.approach.energy_aj))
         ),
     )
 

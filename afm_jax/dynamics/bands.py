@@ -1,10 +1,12 @@
-"""What the errors of a scene's parameters make of its orbits: special points and branches with their errors.
+"""Errors of orbits, exponents, verdicts and basins that follow from the errors of a scene's parameters.
 
 A special point obeys G(x, p; a) = 0, the closing conditions and its test function, for parameters a that are known up
 to a covariance C. By the implicit function theorem it moves by d(x, p)/da = -(dG/d(x, p))^-1 dG/da, and the parameter
-where it lies has the variance (dp/da) C (dp/da)^T.
+where it lies has the variance (dp/da) C (dp/da)^T. What motions come to is no smooth function of a: it is computed
+again for parameters drawn from the normal distribution with covariance C.
 """
 
+from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import NamedTuple
 
@@ -13,12 +15,21 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from afm_jax.dynamics.closed_loops import BLOCK, Equations, Frame, equations_at, loop_at
+from afm_jax.apparatus.scene import Scene
+from afm_jax.dynamics.basins import Basins, basins_of_attraction
+from afm_jax.dynamics.bifurcations import Sweep, bifurcation_diagram
 from afm_jax.dynamics.continuation import Continuation
+from afm_jax.dynamics.curves import BLOCK, Equations, Frame, equations_at, loop_at
+from afm_jax.dynamics.exponents import lyapunov_spectrum
 from afm_jax.dynamics.impact_loop import closing_gaps, highest_point
 from afm_jax.dynamics.special_points import OrbitBranch, SpecialPoint
+from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
 from afm_jax.solve.lanes import in_blocks
 
+_BETWEEN = (0.025, 0.975)
+"""Quantiles between which 95 % of the draws lie."""
+_STARTS = 100
+"""Starts along each axis of the basins of a draw, at most."""
 _NEVER_NEGATIVE = ("interaction.epsilon", "interaction.viscous_loss", "cantilever.quality_factor")
 
 
@@ -30,13 +41,13 @@ class UncertainParameters(NamedTuple):
     covariance: Float[np.ndarray, "parameters parameters"]
 
     def without(self, path: str) -> "UncertainParameters":
-        """Return the others, with the path's own value taken as given: it is the one that is varied."""
-        keep = np.array([own != path for own in self.paths])
-        paths = tuple(own for own in self.paths if own != path)
-        return UncertainParameters(paths, self.values[keep], self.covariance[np.ix_(keep, keep)])
+        """Return the parameters without the one of a path, which is varied and has no error of its own."""
+        others = np.array([other != path for other in self.paths])
+        paths = tuple(other for other in self.paths if other != path)
+        return UncertainParameters(paths, self.values[others], self.covariance[np.ix_(others, others)])
 
     def possible_draws(self, number: int, seed: int = 0) -> Float[np.ndarray, "draws parameters"]:
-        """Return draws that can be: the coefficient of restitution at most 1, nothing else below 0.
+        """Return draws that are physical: the coefficient of restitution in (0, 1], nothing else below 0.
 
         Raises:
             ValueError: if hardly any can be.
@@ -57,80 +68,164 @@ class UncertainParameters(NamedTuple):
         return np.random.default_rng(seed).multivariate_normal(self.values, self.covariance, size=number)
 
 
-def special_errors(found: Continuation, known: UncertainParameters) -> Float[np.ndarray, " special"]:
+def special_errors(continuation: Continuation, uncertain: UncertainParameters) -> Float[np.ndarray, " special"]:
     """Return the standard error of the parameter at each special point.
 
     Args:
-        found: of the scene with the known parameters' values.
-        known: those parameters; if the one that was followed is among them, its own error does not count.
+        continuation: of the scene with the values of the uncertain parameters.
+        uncertain: parameters; if the one that was followed is among them, its own error does not count.
     """
-    known = known.without(found.range.path)
-    return np.array([_error(_sensitivity(found, point, known), known) for point in found.special])
+    uncertain = uncertain.without(continuation.range.path)
+    slopes = [_slopes_of_special_point(continuation, point, uncertain) for point in continuation.special]
+    return np.array([np.sqrt(slope @ uncertain.covariance @ slope) for slope in slopes])
 
 
 def amplitude_errors(
-    found: Continuation, branch: OrbitBranch, known: UncertainParameters
+    continuation: Continuation, branch: OrbitBranch, uncertain: UncertainParameters
 ) -> Float[np.ndarray, " points"]:
-    """Return the standard error of the peak amplitude in nm at each point of a branch, the parameter held.
+    """Return the standard error of the peak amplitude in nm at each point of a branch, its own parameter held.
 
     It grows without bound towards a fold, where the orbit of a held parameter ceases to exist.
     """
-    known = known.without(found.range.path)
-    frame, equations = _wide(found, known, None)
-    share = (branch.parameter - found.range.low) / (found.range.high - found.range.low)
-    points = np.column_stack([branch.unknowns, share, np.tile(known.values, (len(share), 1))])
+    uncertain = uncertain.without(continuation.range.path)
+    frame, equations = _with_uncertain(continuation, uncertain, None)
+    followed = (branch.parameter - continuation.range.low) / (continuation.range.high - continuation.range.low)
+    points = np.column_stack([branch.unknowns, followed, np.tile(uncertain.values, (len(followed), 1))])
     slope = in_blocks(lambda block: _amplitude_slopes(frame, block, equations), points, block=BLOCK, widths=())
-    return np.sqrt(np.einsum("ni,ij,nj->n", slope, known.covariance, slope))
+    return np.sqrt(np.einsum("ni,ij,nj->n", slope, uncertain.covariance, slope))
 
 
-def _wide(found: Continuation, known: UncertainParameters, test: int | None) -> tuple[Frame, Equations]:
-    """Return the same problem with the known parameters behind the followed one, each as it is."""
-    zero, one = jnp.zeros(len(known.paths)), jnp.ones(len(known.paths))
-    low, width = found.frame.low[:1], found.frame.width[:1]
-    frame = found.frame._replace(low=jnp.concatenate([low, zero]), width=jnp.concatenate([width, one]))
-    return frame, found.equations._replace(paths=(found.range.path, *known.paths), kind=test)
+def _with_uncertain(
+    continuation: Continuation, uncertain: UncertainParameters, test: int | None
+) -> tuple[Frame, Equations]:
+    """Return frame and equations of a continuation with the uncertain parameters behind the followed one."""
+    zero, unit = jnp.zeros(len(uncertain.paths)), jnp.ones(len(uncertain.paths))
+    low, width = continuation.frame.low[:1], continuation.frame.width[:1]
+    frame = continuation.frame._replace(low=jnp.concatenate([low, zero]), width=jnp.concatenate([width, unit]))
+    paths = (continuation.range.path, *uncertain.paths)
+    return frame, continuation.equations._replace(paths=paths, kind=test)
 
 
-def _problem(
-    found: Continuation, point: SpecialPoint, known: UncertainParameters
-) -> tuple[Frame, Equations, Float[np.ndarray, " n"]]:
-    frame, equations = _wide(found, known, point.test)
-    share = (point.parameter - found.range.low) / (found.range.high - found.range.low)
-    return frame, equations, np.concatenate([point.unknowns, [share], known.values])
-
-
-def _sensitivity(found: Continuation, point: SpecialPoint, known: UncertainParameters) -> Float[np.ndarray, " p"]:
-    """Return dp/da."""
-    frame, equations, start = _problem(found, point, known)
-    slope = np.asarray(_slopes_by_known(frame, jnp.asarray(start), equations))[-1]
-    return slope * (found.range.high - found.range.low)
-
-
-def _error(slope: np.ndarray, known: UncertainParameters) -> float:
-    return float(np.sqrt(slope @ known.covariance @ slope))
+def _slopes_of_special_point(
+    continuation: Continuation, point: SpecialPoint, uncertain: UncertainParameters
+) -> Float[np.ndarray, " uncertain"]:
+    """Return dp/da: the derivatives of the parameter of a special point by the uncertain ones."""
+    frame, equations = _with_uncertain(continuation, uncertain, point.test)
+    width = continuation.range.high - continuation.range.low
+    followed = (point.parameter - continuation.range.low) / width
+    at = jnp.asarray(np.concatenate([point.unknowns, [followed], uncertain.values]))
+    return np.asarray(_slopes_by_uncertain(frame, at, equations))[-1] * width
 
 
 @partial(jax.jit, static_argnames=("equations",))
-def _slopes_by_known(frame: Frame, point: Array, equations: Equations) -> Float[Array, "n known"]:
-    slopes = jax.jacfwd(lambda all_: equations_at(all_, frame, equations))(point)
-    own = slopes.shape[0]
-    return -jnp.linalg.solve(slopes[:, :own], slopes[:, own:])
+def _slopes_by_uncertain(frame: Frame, point: Array, equations: Equations) -> Float[Array, "n uncertain"]:
+    slopes = jax.jacfwd(lambda unknowns: equations_at(unknowns, frame, equations))(point)
+    solved = slopes.shape[0]
+    return -jnp.linalg.solve(slopes[:, :solved], slopes[:, solved:])
 
 
 @partial(jax.jit, static_argnames=("equations",))
-def _amplitude_slopes(frame: Frame, points: Array, equations: Equations) -> Float[Array, "points known"]:
-    known = len(equations.paths) - 1
+def _amplitude_slopes(frame: Frame, points: Array, equations: Equations) -> Float[Array, "points uncertain"]:
+    """Return the derivatives of the peak amplitude of closed loops by the uncertain parameters."""
 
-    def one(point):
-        count = point.shape[0] - 1 - known
-        shares = point[count:]
+    def slopes_at(point):
+        count = point.shape[0] - len(equations.paths)
+        followed, uncertain = point[count : count + 1], point[count + 1 :]
 
-        def at(unknowns, values):
-            loop = loop_at(jnp.concatenate([shares[:1], values]), frame, equations)
+        def gaps_and_peak(unknowns, values):
+            loop = loop_at(jnp.concatenate([followed, values]), frame, equations)
             gaps = closing_gaps(unknowns, frame.scale, loop)
             return gaps, highest_point(unknowns, frame.scale, loop, equations.samples)
 
-        (by_own, by_known), (top_by_own, top_by_known) = jax.jacfwd(at, argnums=(0, 1))(point[:count], shares[1:])
-        return top_by_known - top_by_own @ jnp.linalg.solve(by_own, by_known)
+        slopes = jax.jacfwd(gaps_and_peak, argnums=(0, 1))(point[:count], uncertain)
+        (gaps_by_loop, gaps_by_uncertain), (peak_by_loop, peak_by_uncertain) = slopes
+        return peak_by_uncertain - peak_by_loop @ jnp.linalg.solve(gaps_by_loop, gaps_by_uncertain)
 
-    return jax.vmap(one)(points)
+    return jax.vmap(slopes_at)(points)
+
+
+def drawn_exponents(
+    scene: Scene,
+    given: Mapping[str, Float[np.ndarray, " values"]],
+    uncertain: UncertainParameters,
+    *,
+    draws: int,
+    impacts: int,
+    transient: int,
+) -> Float[np.ndarray, "values 2"]:
+    """Return the interval that holds 95 % of the larger exponents per impact of drawn scenes; NaN where unknown.
+
+    Args:
+        scene: the scene.
+        given: values of a parameter by its path, or nothing.
+        uncertain: what is drawn.
+        draws: how many.
+        impacts: of `lyapunov_spectrum`.
+        transient: of `lyapunov_spectrum`.
+    """
+    for path in given:
+        uncertain = uncertain.without(path)
+    drawn = uncertain.possible_draws(draws)
+    count = len(next(iter(given.values()), np.zeros(1)))
+    columns = {path: np.repeat(values, draws) for path, values in given.items()}
+    columns |= {path: np.tile(column, count) for path, column in zip(uncertain.paths, drawn.T, strict=True)}
+    exponents = lyapunov_spectrum(scene_batch(scene, columns), impacts=impacts, transient=transient)
+    larger = exponents.exponents_per_impact[:, 0].reshape(count, draws)
+    return np.stack([np.quantile(larger, level, axis=1, method="nearest") for level in _BETWEEN], axis=1)
+
+
+def verdict_probability(
+    scene: Scene,
+    parameter: str,
+    sweep: Sweep,
+    uncertain: UncertainParameters,
+    *,
+    start: tuple[float, float, float] | None = None,
+    draws: int,
+    impacts: int,
+) -> Float[np.ndarray, " values"]:
+    """Return the share of drawn scenes whose sweep comes to the same verdict, at each value.
+
+    Args:
+        scene: the scene.
+        parameter: that is swept.
+        sweep: of the scene.
+        uncertain: what is drawn.
+        start: of the sweeps, as of `bifurcation_diagram`.
+        draws: how many.
+        impacts: at each value.
+    """
+    names, same = np.array(sweep.verdicts.names()), np.zeros(len(sweep.values))
+    for drawn in _drawn(scene, uncertain.without(parameter), draws):
+        other = bifurcation_diagram(drawn, parameter, sweep.values, start=start, upward=sweep.upward, impacts=impacts)
+        same += names == np.array(other.verdicts.names())
+    return same / draws
+
+
+def drawn_shares(
+    scene: Scene, basins: Basins, uncertain: UncertainParameters, *, draws: int
+) -> Float[np.ndarray, "attractors 2"]:
+    """Return the interval that holds 95 % of the shares of each attractor in drawn scenes, matched by their names.
+
+    Args:
+        scene: the scene.
+        basins: of the scene.
+        uncertain: what is drawn.
+        draws: how many.
+    """
+    speed = basins.rebound_speed_nm_per_us
+    half = 0.5 * (speed[1] - speed[0])
+    rows, columns = (min(count, _STARTS) for count in basins.attractor.shape)
+    ends = max(float(speed[0] - half), 0.0), float(speed[-1] + half)
+    shares = np.zeros((draws, len(basins.attractors)))
+    for number, drawn in enumerate(_drawn(scene, uncertain, draws)):
+        other = basins_of_attraction(drawn, columns=columns, rows=rows, speeds_nm_per_us=ends)
+        there = {attractor.name: share for attractor, share in zip(other.attractors, other.share, strict=True)}
+        shares[number] = [there.get(attractor.name, 0.0) for attractor in basins.attractors]
+    return np.quantile(shares, _BETWEEN, axis=0).T
+
+
+def _drawn(scene: Scene, uncertain: UncertainParameters, draws: int) -> Iterator[Scene]:
+    family = scene_family(scene, *uncertain.paths)
+    for values in uncertain.possible_draws(draws):
+        yield family(*values)

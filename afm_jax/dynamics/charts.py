@@ -1,8 +1,8 @@
-"""Which of many scenes have a stable single-impact orbit: the question behind charts and amplitude curves.
+"""Which of many scenes have a stable single-impact orbit of which order, and its peak amplitude.
 
-Where single-impact orbits are stable in the plane of drive frequency and drive amplitude (figures 2 and 3).
-
-The amplitude of the stable (1, 1) orbit against the offset, for several coefficients of restitution (figure 9).
+For every scene and every order N the roots of the closing condition are found; where there is one the orbit is read and
+judged. A `StabilityChart` asks this in the plane of two parameters (figures 2 and 3: drive frequency and amplitude),
+`OffsetAmplitudes` of order 1 over drive frequency, restitution and offset (figure 9).
 """
 
 from collections.abc import Callable
@@ -85,17 +85,16 @@ def orbit_verdicts(
     table = isinstance(scenes.interaction, TabulatedLaw)
 
     def work(part: SampleDriven) -> OrbitVerdicts:
-        found = highest_orbits(part.scenes, part.frame, orders)
+        orbits = highest_orbits(part.scenes, part.frame, orders)
         return OrbitVerdicts(
-            stable=found["stable_orbits"] > 0,
-            admissible=found["admissible_orbits"] > 0,
-            peak_amplitude_nm=found["peak_amplitude_nm"],
-            largest_multiplier=found["largest_multiplier"],
-            approach_speed_nm_per_us=found["approach_speed_nm_per_us"] if table else None,
+            stable=orbits["stable_orbits"] > 0,
+            admissible=orbits["admissible_orbits"] > 0,
+            peak_amplitude_nm=orbits["peak_amplitude_nm"],
+            largest_multiplier=orbits["largest_multiplier"],
+            approach_speed_nm_per_us=orbits["approach_speed_nm_per_us"] if table else None,
         )
 
-    found = in_blocks(work, seen, block=_LANES, report=report)
-    return jax.tree.map(np.transpose, found)
+    return jax.tree.map(np.transpose, in_blocks(work, seen, block=_LANES, report=report))
 
 
 ORBIT_NUMBERS = (
@@ -281,21 +280,21 @@ def stability_chart(
 
 
 def stable_probability(
-    scene: Scene, chart: StabilityChart, known: UncertainParameters, paths: tuple[str, str], *, draws: int
+    scene: Scene, chart: StabilityChart, uncertain: UncertainParameters, paths: tuple[str, str], *, draws: int
 ) -> Float[np.ndarray, "orders points"]:
     """Return the share of draws of uncertain parameters in which an orbit of each order is stable.
 
     Args:
         scene: that of the chart.
         chart: whose points are meant.
-        known: what is drawn; a parameter of the chart counts as its axis says.
+        uncertain: parameters that are drawn; a parameter of the chart counts as its axis says.
         paths: of the chart's parameters.
         draws: how many.
     """
-    known = known.without(paths[0]).without(paths[1])
-    family, columns = scene_family(scene, *paths, *known.paths), chart.points()
+    uncertain = uncertain.without(paths[0]).without(paths[1])
+    family, columns = scene_family(scene, *paths, *uncertain.paths), chart.points()
     total = np.zeros(chart.verdicts.stable.shape)
-    for drawn in known.possible_draws(draws):
+    for drawn in uncertain.possible_draws(draws):
         scenes = batch_of_scenes(family, *columns, *(np.full(len(columns[0]), value) for value in drawn))
         total += orbit_verdicts(scenes, last_order=chart.orders).stable
     return total / draws

@@ -5,7 +5,7 @@ tips come to that are simulated for a while. The map's Jacobian is the forward d
 loop is closed to rounding and its multipliers are exact.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -39,7 +39,7 @@ from afm_jax.motion.simulate import DEFAULT_ACCURACY
 from afm_jax.scenefile.parameter_paths import scene_family
 from afm_jax.solve.arclength import EquationsAt
 from afm_jax.solve.lanes import Report, in_blocks
-from afm_jax.solve.newton import LinearisedRows, Newton, newton_rows, shortened
+from afm_jax.solve.newton import LinearisedRows, Newton, Roots, newton_rows, shortened
 from afm_jax.units import RAD_PER_US_PER_KHZ
 
 _STARTS = 8
@@ -56,7 +56,7 @@ _CONTACTS_AT_ONCE = 128
 """Of a chart."""
 CHART_ACCURACY = 1e-6
 _GRAZING = 3
-"""Number of its test function in `closed_loops`."""
+"""Number of its test function in `curves`."""
 _SAMPLES = 512
 """Of a flight, for its lowest points."""
 _DIFFERENCE = 1e-5
@@ -95,27 +95,40 @@ def contact_orbits(
         raise TypeError("`scene` must have a `Contact`; `many_impact_orbits` has the orbits of a law")
     check_loop(order, impacts)
     flights = ContactFlights(scene, order, (), accuracy=accuracy)
-    told = contact_loops(flights, np.zeros(0), impacts)
-    readings = flights.readings(told, np.zeros((len(told), 0)))
-    known = [(reading, loop) for reading, loop in zip(readings, told, strict=True) if reading is not None]
-    known.sort(key=lambda one: -float(one[0].peak_amplitude_nm))
-    fields = [*[jnp.zeros((0, impacts))] * 6, *[jnp.zeros(0)] * 3, jnp.zeros(0, bool), jnp.zeros(0)]
-    reading = LoopReading(*fields)
-    if known:
-        reading = jax.tree.map(
-            lambda *parts: np.stack([np.asarray(part) for part in parts]), *(one for one, _ in known)
-        )
-    loops = np.array([loop for _, loop in known]).reshape(-1, 2 * impacts)
+    loops = contact_loops(flights, np.zeros(0), impacts)
+    readings = flights.readings(loops, np.zeros((len(loops), 0)))
+    flown = [(reading, loop) for reading, loop in zip(readings, loops, strict=True) if reading is not None]
+    flown.sort(key=lambda orbit: -float(orbit[0].peak_amplitude_nm))
+    reading = _stacked([reading for reading, _ in flown], impacts)
     multipliers = multipliers_of(np.asarray(reading.trace), np.asarray(reading.determinant))
+    loops = np.array([loop for _, loop in flown]).reshape(-1, 2 * impacts)
     return ManyImpactOrbits(loops, reading, multipliers, is_stable(multipliers))
+
+
+def _stacked(readings: Sequence[LoopReading], impacts: int) -> LoopReading:
+    """Return readings of loops of m contacts as one of NumPy arrays with a leading axis of loops."""
+    if not readings:
+        each, whole = jnp.zeros((0, impacts)), jnp.zeros(0)
+        fields = [*[each] * 6, *[whole] * 3, jnp.zeros(0, bool), whole]
+        return LoopReading(*fields)
+    return jax.tree.map(lambda *numbers: np.stack([np.asarray(number) for number in numbers]), *readings)
 
 
 def contact_loops(
     flights: "ContactFlights", values: Float[np.ndarray, " parameters"], impacts: int
 ) -> Float[np.ndarray, "loops n"]:
-    """Return the loops of m contacts that are found at values of a scene's parameters, each once (`FlownLoop`)."""
+    """Return the loops of m contacts that are found where parameters have some values, each loop once.
+
+    Args:
+        flights: of the scene and its parameters.
+        values: of the parameters.
+        impacts: m.
+
+    Returns:
+        One row a loop: m departure phases in rad, ascending, and m rebound speeds in nm/us.
+    """
     scene, order = flights.family(*values), flights.order
-    guesses = [*_orbits_of_law(scene, order, impacts), *_simulated(scene, order, impacts, flights.accuracy)]
+    guesses = [*_orbits_of_law(scene, order, impacts), *_repetitions(scene, order, impacts, flights.accuracy)]
     loops = _closed(np.array(guesses).reshape(-1, 2 * impacts), flights, values)
     return loops_told_apart(loops, order)
 
@@ -125,19 +138,18 @@ def _orbits_of_law(scene: Scene, order: int, impacts: int) -> list[np.ndarray]:
     law = law_of_contact(scene.interaction, float(scene.cantilever.mass_ng))
     if law is None:
         return []
-    simple = eqx.tree_at(lambda parts: parts.interaction, scene, law)
+    law_scene = eqx.tree_at(lambda scene: scene.interaction, scene, law)
     if impacts == 1:
         # all of them, close to capture too, where no start of a search stays
-        single = single_impact_orbits(simple, order)
-        there = np.asarray(single.exists & single.admissible)
-        phases, rebounds = (
-            np.asarray(part)[there, None] for part in (single.phase_rad, single.rebound_speed_nm_per_us)
-        )
+        orbits = single_impact_orbits(law_scene, order)
+        admissible = np.asarray(orbits.exists & orbits.admissible)
+        phases = np.asarray(orbits.phase_rad)[admissible, None]
+        rebounds = np.asarray(orbits.rebound_speed_nm_per_us)[admissible, None]
     else:
-        reading = many_impact_orbits(simple, order, impacts).reading
+        reading = many_impact_orbits(law_scene, order, impacts).reading
         phases, rebounds = np.asarray(reading.phase_rad), np.asarray(reading.rebound_speed_nm_per_us)
-    # `phase_rad` is within a turn: the impacts follow one another
-    starts = np.array([_rising(phase) for phase in phases]).reshape(rebounds.shape)
+    # `phase_rad` is within [0, 2 pi): the impacts follow one another
+    starts = np.array([_ascending(phase) for phase in phases]).reshape(rebounds.shape)
     departures, speeds = _where_the_bridge_breaks(scene, starts, rebounds)
     return [
         np.concatenate(guess)
@@ -158,24 +170,28 @@ def _where_the_bridge_breaks(
     begin, after = phases[..., None] / omega, np.linspace(0.0, 2.0 * np.pi / omega, _SAMPLES)
     height, rate = surface.position_and_velocity(begin)
     position, velocity = scene.cantilever.propagator(after)(height, rate + rebounds[..., None])
-    level, moves = surface.position_and_velocity(begin + after)
-    above = np.asarray(position - level) - float(scene.interaction.bridge_breaks_nm)
-    place = np.argmax(above > 0.0, axis=-1)[..., None]
-    before, now = (np.take_along_axis(above, np.maximum(place - back, 0), axis=-1)[..., 0] for back in (1, 0))
-    share = np.where(now > 0.0, now / np.maximum(now - before, 1e-300), np.nan)
-    risen = (place[..., 0] - share) * after[1]
-    return phases + omega * risen, np.take_along_axis(np.asarray(velocity - moves), place, axis=-1)[..., 0]
+    surface_height, surface_rate = surface.position_and_velocity(begin + after)
+    above = np.asarray(position - surface_height) - float(scene.interaction.bridge_breaks_nm)
+    crossing = np.argmax(above > 0.0, axis=-1)[..., None]
+    before = np.take_along_axis(above, np.maximum(crossing - 1, 0), axis=-1)[..., 0]
+    behind = np.take_along_axis(above, crossing, axis=-1)[..., 0]
+    # linear between two samples
+    fraction = np.where(behind > 0.0, behind / np.maximum(behind - before, 1e-300), np.nan)
+    rise_us = (crossing[..., 0] - fraction) * after[1]
+    speed = np.take_along_axis(np.asarray(velocity - surface_rate), crossing, axis=-1)[..., 0]
+    return phases + omega * rise_us, speed
 
 
-def _rising(phase: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
-    turned = phase.copy()
-    for place in range(1, len(turned)):
-        turned[place] += 2.0 * np.pi * np.ceil((turned[place - 1] - turned[place]) / (2.0 * np.pi))
-    return turned
+def _ascending(phases: Float[np.ndarray, " m"]) -> Float[np.ndarray, " m"]:
+    """Return phases in rad that ascend, by whole turns that are added."""
+    ascending = phases.copy()
+    for place in range(1, len(phases)):
+        ascending[place] += 2.0 * np.pi * np.ceil((ascending[place - 1] - ascending[place]) / (2.0 * np.pi))
+    return ascending
 
 
-def _simulated(scene: Scene, order: int, impacts: int, accuracy: float) -> list[np.ndarray]:
-    """Return what a few tips do after a while, where it nearly repeats, as guesses."""
+def _repetitions(scene: Scene, order: int, impacts: int, accuracy: float) -> list[np.ndarray]:
+    """Return stretches of m contacts in nearly N drive periods that a few simulated tips come to, as guesses."""
     scenes = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (_STARTS, *leaf.shape)), scene)
     tips = leaving_tips(scenes)
     period = drive_of(scene).period_us
@@ -186,14 +202,14 @@ def _simulated(scene: Scene, order: int, impacts: int, accuracy: float) -> list[
     _, record = follow_contacts(scenes, tips, skip=_SETTLING, record=2 * impacts + 1, accuracy=accuracy)
     turns = record.departure_periods + record.departure_us / period
     rebound = record.velocity_after_nm_per_us - np.asarray(scene.platform.velocity(record.departure_us))
-    found = []
+    guesses = []
     for lane in range(_STARTS):
         for begin in range(impacts + 1):
-            own = turns[lane, begin : begin + impacts + 1]
-            if abs(own[-1] - own[0] - order) < _WINDOW:
-                phases = 2.0 * np.pi * (own[:-1] - np.floor(own[0]))
-                found.append(np.concatenate([phases, rebound[lane, begin : begin + impacts]]))
-    return found
+            window = turns[lane, begin : begin + impacts + 1]
+            if abs(window[-1] - window[0] - order) < _WINDOW:
+                phases = 2.0 * np.pi * (window[:-1] - np.floor(window[0]))
+                guesses.append(np.concatenate([phases, rebound[lane, begin : begin + impacts]]))
+    return guesses
 
 
 def _closed(
@@ -241,77 +257,96 @@ def single_contact_orbits(
         ``stable``, ``admissible`` and ``unresolved``, and of the stable orbit, the highest if there are several,
         ``peak_amplitude_nm`` and ``largest_multiplier``, NaN where there is none.
     """
-    lanes, columns, phase, rebound, turns = _guesses_of_law(seen, orders)
-    numpy_scenes = jax.tree.map(np.asarray, seen)
+    guesses = _guesses_of_law(seen, orders)
+    count = len(guesses.lane)
+    scenes = jax.tree.map(np.asarray, seen)
 
     def linearised(departures: Float[np.ndarray, "open 2"], rows: Int[np.ndarray, " open"]) -> LinearisedRows:
         if report is not None:
-            report(len(lanes) - len(rows), len(lanes))
+            report(count - len(rows), count)
 
-        def work(part: tuple[SampleDriven, Array, Array, Array]) -> _Return:
-            return _returns(*part, accuracy=accuracy)
+        def work(block: tuple[SampleDriven, Array, Array, Array]) -> _Return:
+            return _returns(*block, accuracy=accuracy)
 
-        scenes = jax.tree.map(lambda leaf: leaf[lanes[rows]], numpy_scenes)
-        flown = in_blocks(work, (scenes, *departures.T, turns[rows]), block=_CONTACTS_AT_ONCE)
+        flown = jax.tree.map(lambda leaf: leaf[guesses.lane[rows]], scenes), *departures.T, guesses.turn_rad[rows]
+        returns = in_blocks(work, flown, block=_CONTACTS_AT_ONCE)
         scale = np.stack([np.ones(len(rows)), departures[:, 1]], axis=1)
-        details = list(zip(flown.trace, flown.determinant, flown.peak_amplitude_nm, strict=True))
-        return LinearisedRows(flown.gaps / scale, flown.slopes / scale[:, :, None], details)
+        details = np.stack([returns.trace, returns.determinant, returns.peak_amplitude_nm], axis=1)
+        return LinearisedRows(returns.gaps / scale, returns.slopes / scale[:, :, None], list(details))
 
-    roots = newton_rows(linearised, np.stack([phase, rebound], axis=1), _CLOSING_A_CHART)
+    roots = newton_rows(linearised, np.stack([guesses.phase_rad, guesses.rebound_speed], axis=1), _CLOSING_A_CHART)
+    if report is not None and count:
+        report(count, count)
+    return _chart_columns(guesses, roots, (len(seen.scenes.platform.frequency_khz), len(orders)))
+
+
+class _Guesses(NamedTuple):
+    """Orbits of laws as guesses for orbits of contacts, one row each."""
+
+    lane: Int[np.ndarray, " guesses"]
+    """Number of the scene."""
+    column: Int[np.ndarray, " guesses"]
+    """Number of the order."""
+    phase_rad: Float[np.ndarray, " guesses"]
+    """At the departure from where the bridge breaks."""
+    rebound_speed: Float[np.ndarray, " guesses"]
+    turn_rad: Float[np.ndarray, " guesses"]
+    """Drive phase that an orbit takes: 2 pi N."""
+
+
+def _guesses_of_law(seen: SampleDriven, orders: Sequence[int]) -> _Guesses:
+    """Return the admissible single-impact orbits of the laws closest to contacts, where these let the tip go."""
+    scenes = jax.tree.map(jnp.asarray, seen.scenes)
+    columns = [_Guesses(*[np.zeros(0, int)] * 2, *[np.zeros(0)] * 3)]
+    laws = laws_of(scenes)
+    law, exists = laws or (None, np.zeros(0, bool))
+    with_law = np.flatnonzero(exists)
+    law_scenes = jax.tree.map(lambda leaf: leaf[with_law], Scene(scenes.cantilever, scenes.platform, law))
+    rise = np.asarray(scenes.platform.angular_frequency * scenes.interaction.bridge_breaks_nm)
+    for column, order in enumerate(orders if with_law.size else ()):
+
+        def work(block: Scene, order: int = order) -> SingleImpactOrbits:
+            return jax.vmap(lambda scene: single_impact_orbits(scene, order))(block)
+
+        orbits = in_blocks(work, law_scenes, block=_CONTACTS_AT_ONCE)
+        row, slot = np.nonzero(orbits.exists & orbits.admissible)
+        rebound, lane = orbits.rebound_speed_nm_per_us[row, slot], with_law[row]
+        # a straight path to the gap at which the bridge breaks
+        phase = orbits.phase_rad[row, slot] + rise[lane] / rebound
+        columns.append(
+            _Guesses(lane, np.full(len(row), column), phase, rebound, np.full(len(row), 2.0 * np.pi * order))
+        )
+    return _Guesses(*(np.concatenate(parts) for parts in zip(*columns, strict=True)))
+
+
+def _chart_columns(
+    guesses: _Guesses, roots: Roots, shape: tuple[int, int]
+) -> dict[str, Shaped[np.ndarray, "lanes orders"]]:
+    """Return what `single_contact_orbits` returns, from the closed orbits of single contacts."""
     closed = np.flatnonzero(roots.converged)
-    if report is not None and len(lanes):
-        report(len(lanes), len(lanes))
     trace, determinant, peak = np.array([roots.details[row] for row in closed]).reshape(-1, 3).T
     multipliers = np.abs(multipliers_of(trace, determinant)[:, 0])
-    shape = len(seen.scenes.platform.frequency_khz), len(orders)
-    orbits = {name: np.zeros(shape, bool) for name in ("stable", "admissible", "unresolved")}
-    orbits |= {name: np.full(shape, np.nan) for name in ("peak_amplitude_nm", "largest_multiplier")}
-    orbits["admissible"][lanes[closed], columns[closed]] = True
-    # the highest last: of several values for one place the last one stays
+    columns = {name: np.zeros(shape, bool) for name in ("stable", "admissible", "unresolved")}
+    columns |= {name: np.full(shape, np.nan) for name in ("peak_amplitude_nm", "largest_multiplier")}
+    columns["admissible"][guesses.lane[closed], guesses.column[closed]] = True
     stable = np.flatnonzero(multipliers < 1.0)
+    # the highest last: of several values for one place the last one stays
     stable = stable[np.argsort(peak[stable], kind="stable")]
-    place = lanes[closed[stable]], columns[closed[stable]]
-    orbits["stable"][place] = True
-    orbits["peak_amplitude_nm"][place], orbits["largest_multiplier"][place] = peak[stable], multipliers[stable]
-    orbits["unresolved"][lanes[~roots.converged], columns[~roots.converged]] = True
-    orbits["unresolved"] &= ~orbits["admissible"]
-    return orbits
-
-
-def _guesses_of_law(
-    seen: SampleDriven, orders: Sequence[int]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Return guesses: numbers of scenes and of orders, departure phases, rebound speeds, rad that an orbit takes."""
-    scenes = jax.tree.map(jnp.asarray, seen.scenes)
-    found = laws_of(scenes)
-    if found is None:
-        none = np.zeros(0)
-        return none.astype(int), none.astype(int), none, none, none
-    law, known = found
-    own, parts = np.flatnonzero(known), []
-    simple = jax.tree.map(lambda leaf: leaf[own], Scene(scenes.cantilever, scenes.platform, law))
-    rise = np.asarray(scenes.platform.angular_frequency * scenes.interaction.bridge_breaks_nm)
-    for column, order in enumerate(orders):
-
-        def work(part: Scene, order: int = order) -> SingleImpactOrbits:
-            return jax.vmap(lambda scene: single_impact_orbits(scene, order))(part)
-
-        orbits = in_blocks(work, simple, block=_CONTACTS_AT_ONCE)
-        lane, slot = np.nonzero(orbits.exists & orbits.admissible)
-        rebound, at = orbits.rebound_speed_nm_per_us[lane, slot], own[lane]
-        phase, turn = orbits.phase_rad[lane, slot] + rise[at] / rebound, np.full(len(lane), 2.0 * np.pi * order)
-        parts.append((at, np.full(len(lane), column), phase, rebound, turn))
-    lanes, columns, phase, rebound, turns = (np.concatenate(part) for part in zip(*parts, strict=True))
-    return lanes, columns, phase, rebound, turns
+    place = guesses.lane[closed[stable]], guesses.column[closed[stable]]
+    columns["stable"][place] = True
+    columns["peak_amplitude_nm"][place], columns["largest_multiplier"][place] = peak[stable], multipliers[stable]
+    columns["unresolved"][guesses.lane[~roots.converged], guesses.column[~roots.converged]] = True
+    columns["unresolved"] &= ~columns["admissible"]
+    return columns
 
 
 class _Return(NamedTuple):
-    """What comes of departures after a contact, arrays of one lane each; NaN where it does not end in time."""
+    """What follows departures after a contact, arrays of one lane each; NaN where the contact does not end in time."""
 
     gaps: Any
     """By how much the next departure misses this one: phase in rad, rebound speed in nm/us."""
     slopes: Any
-    """Their derivatives by phase and rebound speed."""
+    """Derivatives of the gaps by phase and rebound speed."""
     trace: Any
     determinant: Any
     peak_amplitude_nm: Any
@@ -321,45 +356,61 @@ class _Return(NamedTuple):
 def _returns(seen: SampleDriven, phase: Array, rebound: Array, turns: Array, *, accuracy: float) -> _Return:
     def one(seen: SampleDriven, phase: Array, rebound: Array, turn: Array) -> _Return:
         scene = seen.scenes
-        platform, omega = scene.platform, scene.platform.angular_frequency
+        omega, until = scene.platform.angular_frequency, phase + (1.0 + _LONGEST_CONTACT) * turn
 
         def departs(unknowns: Array) -> tuple[Array, Contacts]:
-            time = unknowns[0] / omega
-            velocity = unknowns[1] + platform.velocity(time)
-            contact = next_contact(scene, time, velocity, (phase + (1.0 + _LONGEST_CONTACT) * turn) / omega, accuracy)
-            return jnp.stack([omega * contact.departure_time_us, contact.rebound_speed_nm_per_us]), contact
+            return _next_departure(scene, omega, unknowns, until, accuracy)
 
         unknowns = jnp.stack([phase, rebound])
-        # forward once: value and derivatives of one simulation
-        (value, contact), slopes = _with_slopes(departs, unknowns)
-        good = contact.kind == ContactKind.IMPACT
-        gaps = jnp.where(good, value - unknowns - jnp.array([1.0, 0.0]) * turn, jnp.nan)
-        start = phase / omega
-        height, rate = platform.position_and_velocity(start)
-        height, rate, lasts = (
-            height + scene.interaction.bridge_breaks_nm,
-            rate + rebound,
-            contact.arrival_time_us - start,
-        )
-        flight = FlightEnds(start, lasts, height, rate, *scene.cantilever.propagator(lasts)(height, rate))
-        if seen.frame.response is None:
-            peak = peak_amplitude(scene.cantilever, flight)
-        else:
-            still = jnp.zeros_like(start)
-            peak = highest_of_sum(scene.cantilever, flight, Surface(still, still, (seen.frame.response,)))
+        (following, contact), slopes = _with_slopes(departs, unknowns)
+        closes = following - unknowns - jnp.array([1.0, 0.0]) * turn
+        gaps = jnp.where(contact.kind == ContactKind.IMPACT, closes, jnp.nan)
+        peak = _peak_of_flight(seen, phase / omega, rebound, contact.arrival_time_us)
         determinant = slopes[0, 0] * slopes[1, 1] - slopes[0, 1] * slopes[1, 0]
         return _Return(gaps, slopes - jnp.eye(2), slopes[0, 0] + slopes[1, 1], determinant, peak)
 
     return jax.vmap(one)(seen, phase, rebound, turns)
 
 
-def _with_slopes(function: Any, unknowns: Array) -> tuple[Any, Array]:
-    def twice(unknowns: Array) -> tuple[Array, Any]:
-        value, other = function(unknowns)
-        return value, (value, other)
+def _peak_of_flight(seen: SampleDriven, begin_us: Array, rebound: Array, arrival_us: Array) -> Array:
+    """Return the largest height in nm, in the lab, of the flight between two contacts of one scene."""
+    scene = seen.scenes
+    height, rate = scene.platform.position_and_velocity(begin_us)
+    height, velocity, lasts = height + scene.interaction.bridge_breaks_nm, rate + rebound, arrival_us - begin_us
+    flight = FlightEnds(begin_us, lasts, height, velocity, *scene.cantilever.propagator(lasts)(height, velocity))
+    if seen.frame.response is None:
+        return peak_amplitude(scene.cantilever, flight)
+    still = jnp.zeros_like(begin_us)
+    return highest_of_sum(scene.cantilever, flight, Surface(still, still, (seen.frame.response,)))
 
-    slopes, found = jax.jacfwd(twice, has_aux=True)(unknowns)
-    return found, slopes
+
+def _next_departure(
+    scene: Scene, omega: Array, departure: Array, until_rad: Array, accuracy: float
+) -> tuple[Float[Array, " 2"], Contacts]:
+    """Return drive phase in rad and rebound speed in nm/us of the departure after this one, and the contact between.
+
+    Args:
+        scene: one scene with a contact.
+        omega: angular frequency of its drive in rad/us.
+        departure: phase and rebound speed.
+        until_rad: phase until which the tip is followed.
+        accuracy: of `simulate`.
+    """
+    time = departure[0] / omega
+    velocity = departure[1] + scene.platform.velocity(time)
+    contact = next_contact(scene, time, velocity, until_rad / omega, accuracy)
+    return jnp.stack([omega * contact.departure_time_us, contact.rebound_speed_nm_per_us]), contact
+
+
+def _with_slopes(function: Callable[[Array], tuple[Array, Any]], unknowns: Array) -> tuple[tuple[Array, Any], Array]:
+    """Return a value with what is computed besides, and the value's derivatives, from one simulation forward."""
+
+    def twice(unknowns: Array) -> tuple[Array, Any]:
+        value, besides = function(unknowns)
+        return value, (value, besides)
+
+    slopes, value_and_besides = jax.jacfwd(twice, has_aux=True)(unknowns)
+    return value_and_besides, slopes
 
 
 _CLOSING = Newton(rounds=25, step_tolerance=1e-10, residual_tolerance=1e-10)
@@ -442,13 +493,10 @@ class ContactFlights:
             def departs(unknowns: Array) -> tuple[Array, Contacts]:
                 there = self.family(*unknowns[2:])
                 omega = RAD_PER_US_PER_KHZ * getattr(there, self._driven).frequency_khz
-                time = unknowns[0] / omega
-                velocity = unknowns[1] + there.platform.velocity(time)
-                contact = next_contact(there, time, velocity, until / omega, accuracy)
-                return jnp.stack([omega * contact.departure_time_us, contact.rebound_speed_nm_per_us]), contact
+                return _next_departure(there, omega, unknowns[:2], until, accuracy)
 
-            (value, contact), slopes = _with_slopes(departs, jnp.concatenate([jnp.stack([phase, rebound]), values]))
-            return value, contact, slopes
+            (following, contact), slopes = _with_slopes(departs, jnp.concatenate([jnp.stack([phase, rebound]), values]))
+            return following, contact, slopes
 
         self._fly = jax.jit(jax.vmap(one))
 
@@ -512,10 +560,10 @@ class ContactFlights:
 
     def readings_of_points(self, points: Float[np.ndarray, "points n"], units: CurveUnits) -> LoopReading:
         """Return what there is to know of the loops at points of a curve (`solve`), NumPy arrays."""
-        read = [one for one in self.readings(*units.of_points(points)) if one is not None]
-        if len(read) < len(points):
+        readings = [reading for reading in self.readings(*units.of_points(points)) if reading is not None]
+        if len(readings) < len(points):
             raise ValueError("a loop that was closed does not fly")
-        return jax.tree.map(lambda *parts: np.stack([np.asarray(part) for part in parts]), *read)
+        return _stacked(readings, len(readings[0].phase_rad))
 
     def _departures(self, flown: FlownLoop) -> tuple[Scene, np.ndarray, np.ndarray]:
         """Return the scene of a loop, its departure times in us and rebound speeds in nm/us."""
@@ -548,7 +596,7 @@ class ContactFlights:
         return EquationsAt(value, slopes, here)
 
     def tests(self, flown: FlownLoop, units: CurveUnits, *, grazing: bool = True) -> np.ndarray:
-        """Return the test functions of `closed_loops`; that of grazing NaN where it is not asked for."""
+        """Return the test functions of `curves`; that of grazing NaN where it is not asked for."""
         trace, determinant = flown.trace_and_determinant
         slowest = np.split(flown.loop, 2)[1].min() / units.speed_nm_per_us
         near = np.nan

@@ -1,7 +1,8 @@
 """Orbits followed through a parameter by pseudo-arclength, round folds, with the points where their nature changes.
 
-The unknowns of `impact_loop`, followed by the parameter as a share of its range, lie on a curve (`curves`); what is
-solved at a point of it is in `closed_loops`, special points and their curves in two parameters in `special_points`.
+The unknowns of a closed loop, followed by the parameter as a fraction of its range, lie on a curve (`curves`). Orbits
+are looked for at some values of the parameter, the curves through them are followed, and on these the special points
+are located (`special_points`), which are followed through a second parameter in turn.
 """
 
 from collections.abc import Sequence
@@ -13,9 +14,20 @@ from jaxtyping import Float
 from afm_jax.apparatus.scene import Scene, SceneLike, as_scene, drive_of
 from afm_jax.checks import checked, require_float64
 from afm_jax.contact.contact import Contact
-from afm_jax.dynamics.closed_loops import CAPTURE, Equations, Frame, frame_of, read_points
 from afm_jax.dynamics.contact_orbits import ContactFlights, contact_loops
-from afm_jax.dynamics.curves import CurveLeg, FollowedCurve, followed_both_ways, lies_on, root_on, tested_by
+from afm_jax.dynamics.curves import (
+    CAPTURE,
+    CurveLeg,
+    Equations,
+    FollowedCurve,
+    Frame,
+    followed_both_ways,
+    frame_of,
+    lies_on,
+    read_points,
+    root_on,
+    tested_by,
+)
 from afm_jax.dynamics.impact_loop import driven_part, samples_for
 from afm_jax.dynamics.impact_orbits import MOST_IMPACTS, many_impact_orbits
 from afm_jax.dynamics.special_points import (
@@ -39,7 +51,7 @@ _BEFORE_CAPTURE = 1e-6
 
 @public_result(picture="afm_jax.plots.branches:continuation_figure", rows="points")
 class Continuation(ResultTuple):
-    """What `continue_orbits` finds."""
+    """Orbits followed through a parameter, their special points, and curves of these in two parameters."""
 
     order: int
     impacts: int
@@ -57,13 +69,13 @@ class Continuation(ResultTuple):
 
     def points(self) -> list[dict[str, Any]]:
         """Return a mapping for each point of the branches: the branch, the parameter, what is read of the orbit."""
-        found = []
+        rows = []
         for number, branch in enumerate(self.branches):
-            read = {name: array for name, (array, _) in columns_of(branch.reading).items() if array.ndim == 1}
+            columns = {name: array for name, (array, _) in columns_of(branch.reading).items() if array.ndim == 1}
             for i, value in enumerate(branch.parameter.tolist()):
-                orbit = {name: array[i].item() for name, array in read.items()}
-                found.append({"branch": number, "parameter": value, **orbit})
-        return found
+                orbit = {name: array[i].item() for name, array in columns.items()}
+                rows.append({"branch": number, "parameter": value, **orbit})
+        return rows
 
 
 @checked
@@ -96,29 +108,29 @@ def continue_orbits(
     _check(scene, order, impacts, ranges)
     driven = driven_part(scene)
     if second is not None:
-        own = parameter_values(scene)[second.path]
-        if not second.low <= own <= second.high:
-            raise ValueError(f"{second}: the range must hold the scene's own value, {own:g}, where the curves begin")
+        value = parameter_values(scene)[second.path]
+        if not second.low <= value <= second.high:
+            raise ValueError(f"{second}: the range must hold the scene's own value, {value:g}, where the curves begin")
     flights = ContactFlights(scene, order, (given.path,)) if isinstance(scene.interaction, Contact) else None
     equations = Equations((given.path,), driven, samples_for(scene, order, driven), flights=flights)
     starts, rejected = _orbits_in_range(scene, order, impacts, given, flights)
     scale = max((loop[impacts:].max() for _, loop in starts if impacts), default=1.0)
     frame = frame_of(scene, order, scale, (given,))
-    ways: list[FollowedCurve] = []
-    for place, loop in starts:
-        start = np.concatenate([loop[:impacts], loop[impacts:] / scale, [place]])
-        if not any(lies_on(start, way, frame, equations) for way in ways):
-            way = followed_both_ways(start, frame, equations)
-            if way is not None:
-                ways.append(way)
-    branches = tuple(_branch(way, frame, equations) for way in ways)
+    followed: list[FollowedCurve] = []
+    for fraction, loop in starts:
+        start = np.concatenate([loop[:impacts], loop[impacts:] / scale, [fraction]])
+        if not any(lies_on(start, curve, frame, equations) for curve in followed):
+            curve = followed_both_ways(start, frame, equations)
+            if curve is not None:
+                followed.append(curve)
+    branches = tuple(_branch(curve, frame, equations) for curve in followed)
     special = tuple(
-        point for number, way in enumerate(ways) for point in special_points_of(way, number, frame, equations)
+        point for number, curve in enumerate(followed) for point in special_points_of(curve, number, frame, equations)
     )
     curves = ()
     if second is not None:
-        wide, own = frame_of(scene, order, scale, ranges), parameter_values(scene)[second.path]
-        curves = special_curves(special, wide, equations, second, own)
+        both = frame_of(scene, order, scale, ranges)
+        curves = special_curves(special, both, equations, second, parameter_values(scene)[second.path])
     return Continuation(order, impacts, given, second, branches, special, curves, rejected, frame, equations)
 
 
@@ -144,50 +156,49 @@ def _check(scene: Scene, order: int, impacts: int, ranges: Sequence[ParameterRan
 def _orbits_in_range(
     scene: Scene, order: int, impacts: int, given: ParameterRange, flights: ContactFlights | None
 ) -> tuple[list[tuple[float, np.ndarray]], int]:
-    """Return orbits in the range, and how many were left out as not admissible.
+    """Return orbits at some values in the range, and how many were left out as not admissible.
 
-    Each as its share of the range, and phases in rad and coordinates in nm/us (of a contact: rebound speeds).
+    Each as the fraction of the range at which it is, and phases in rad with coordinates in nm/us (of a contact with
+    rebound speeds).
     """
-    own = parameter_values(scene)[given.path]
+    value = parameter_values(scene)[given.path]
     tried = np.linspace(0.0, 1.0, (_VALUES_TRIED if impacts == 1 and flights is None else _FEWER_TRIED) + 2)[1:-1]
     # the middle first
-    shares = list(tried[np.argsort(np.abs(tried - 0.5), kind="stable")])
-    if given.low <= own <= given.high:
-        shares = [(own - given.low) / (given.high - given.low), *shares]
+    fractions = list(tried[np.argsort(np.abs(tried - 0.5), kind="stable")])
+    if given.low <= value <= given.high:
+        fractions = [(value - given.low) / (given.high - given.low), *fractions]
     if impacts == 0:
-        return [(float(shares[0]), np.zeros(0))], 0
-    family, found, rejected = scene_family(scene, given.path), [], 0
-    for share in shares:
-        value = given.low + (given.high - given.low) * share
-        there = family(value)
+        return [(float(fractions[0]), np.zeros(0))], 0
+    family, orbits, rejected = scene_family(scene, given.path), [], 0
+    one_cosine = all(part is None or part.second is None for part in (scene.platform, scene.base, scene.force))
+    for fraction in fractions:
+        value = given.low + (given.high - given.low) * fraction
         if flights is not None:
             loops = contact_loops(flights, np.array([value]), impacts)
-        elif impacts == 1 and all(
-            part is None or part.second is None for part in (scene.platform, scene.base, scene.force)
-        ):
-            loops, passed = _single_impact_loops(there, order)
-            rejected += passed
+        elif impacts == 1 and one_cosine:
+            loops, passing = _single_impact_loops(family(value), order)
+            rejected += passing
         else:
-            loops = many_impact_orbits(there, order, impacts).loops
-        found += [(float(share), loop) for loop in loops]
-    return found, rejected
+            loops = many_impact_orbits(family(value), order, impacts).loops
+        orbits += [(float(fraction), loop) for loop in loops]
+    return orbits, rejected
 
 
 def _single_impact_loops(scene: Scene, order: int) -> tuple[Float[np.ndarray, "orbits 2"], int]:
     """Return arrival phases in rad and coordinates in nm/us of the admissible orbits, and how many are not."""
-    found = single_impact_orbits(scene, order)
-    exists = np.asarray(found.exists)
-    good = exists & np.asarray(found.admissible)
+    orbits = single_impact_orbits(scene, order)
+    exists = np.asarray(orbits.exists)
+    admissible = exists & np.asarray(orbits.admissible)
     omega = drive_of(scene).angular_frequency
-    phases = np.asarray(found.phase_rad) - omega * np.asarray(found.delay_us)
-    coordinates = np.asarray(impact_law_of(scene).coordinate(found.approach_speed_nm_per_us))
-    return np.stack([phases, coordinates], axis=1)[good], int(np.sum(exists & ~good))
+    phases = np.asarray(orbits.phase_rad) - omega * np.asarray(orbits.delay_us)
+    coordinates = np.asarray(impact_law_of(scene).coordinate(orbits.approach_speed_nm_per_us))
+    return np.stack([phases, coordinates], axis=1)[admissible], int(np.sum(exists & ~admissible))
 
 
-def _branch(way: FollowedCurve, frame: Frame, equations: Equations) -> OrbitBranch:
-    """Return what there is to know of a curve; where an impact loses its speed the last point is just before."""
-    points, ends = way.points, list(way.ends)
-    for place, legs in ((0, way.behind), (-1, way.ahead)):
+def _branch(curve: FollowedCurve, frame: Frame, equations: Equations) -> OrbitBranch:
+    """Return the orbits along a curve; where an impact loses its speed the last point is just before."""
+    points, ends = curve.points, list(curve.ends)
+    for place, legs in ((0, curve.behind), (-1, curve.ahead)):
         if ends[place] == "capture":
             points[place] = _before_capture(legs[-1], frame, equations)
             if captures_nothing(points[place], frame, equations):
@@ -199,5 +210,5 @@ def _branch(way: FollowedCurve, frame: Frame, equations: Equations) -> OrbitBran
 def _before_capture(leg: CurveLeg, frame: Frame, equations: Equations) -> Float[np.ndarray, " n"]:
     """Return the last point of a leg before capture, to a millionth of the way."""
     root = root_on(leg, tested_by(CAPTURE, equations), frame, equations)
-    step = None if root is None else leg.at((1.0 - _BEFORE_CAPTURE) * root[0], frame, equations)
-    return leg.begin.point if step is None else step.point
+    point = None if root is None else leg.at((1.0 - _BEFORE_CAPTURE) * root[0], frame, equations)
+    return leg.begin.point if point is None else point.point

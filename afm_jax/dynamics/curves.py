@@ -1,19 +1,53 @@
-"""Curves of closed loops, followed by pseudo-arclength round folds, and the roots of test functions on them.
+"""Curves of closed loops in one or two parameters, followed by pseudo-arclength round folds, and their test functions.
 
-From a point of a curve a step along the tangent is a guess, and Newton's method closes the loop again in the plane
-across the tangent.
+A point of a curve is the unknowns of a loop (`impact_loop`, or departures of simulated contacts) followed by the
+parameters as fractions of their ranges. A step along the tangent is a guess, and Newton's method closes the loop again
+in the plane across the tangent. Where the nature of the orbit changes one of five test functions is 0:
+
+    fold             the tangent's component along the parameter, on curves in two parameters 1 - T + D
+    period_doubling  1 + T + D, a multiplier -1
+    torus            D - 1 with |T| < 2, a pair of multipliers on the unit circle
+    grazing          the lowest point of a flight above the surface; or an impact without adhesion whose speed vanishes
+    capture          the distance of the slowest impact from capture
+
+On curves in two parameters the test function is solved for together with the closing conditions.
 """
 
 import math
-from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from scipy.optimize import brentq
 
-from afm_jax.dynamics.closed_loops import CAPTURE, FOLD, CurvePoint, Equations, Frame, solved_point
+from afm_jax.apparatus.scene import Scene
+from afm_jax.dynamics.contact_orbits import ContactFlights, CurveUnits
+from afm_jax.dynamics.impact_loop import (
+    ImpactLoop,
+    LoopReading,
+    closing_gaps,
+    impacts_at,
+    loop_of,
+    nearest_approach,
+    reading_of,
+    trace_and_determinant_of,
+)
+from afm_jax.scenefile.parameter_paths import ParameterRange, with_numbers
+from afm_jax.solve.arclength import EquationsAt, point_in_plane
+from afm_jax.solve.derivatives import largest
+from afm_jax.solve.lanes import in_blocks
+from afm_jax.solve.newton import Newton
 
+KINDS = ("fold", "period_doubling", "torus", "grazing", "capture")
+FOLD, DOUBLING, TORUS, GRAZING, CAPTURE = range(len(KINDS))
+_CLOSING = Newton(rounds=12, step_tolerance=1e-11)
+"""Steps towards a point: phases in rad, speeds of the fastest impact, parameters of their ranges."""
+BLOCK = 64
+"""Points of a curve read together: one program."""
 FIRST_STEP = 0.01
 LONGEST_STEP = 0.05
 """Steps along a curve: phases in rad, speeds of the fastest impact, parameters of their ranges."""
@@ -36,23 +70,181 @@ _UNLIKE = 1e-3
 _SAME = 1e-5
 
 
+class Frame(NamedTuple):
+    """The scene of a curve, its order N, the unit of its speeds in nm/us, and the ranges of its parameters."""
+
+    scene: Scene
+    order: Float[Array, ""]
+    scale: Float[Array, ""]
+    low: Float[Array, " parameters"]
+    width: Float[Array, " parameters"]
+
+
+class Equations(NamedTuple):
+    """Which equations are solved, static: each is a program of its own."""
+
+    paths: tuple[str, ...]
+    """Of the parameters that move."""
+    driven: str
+    """The part of the scene that sets the period (`driven_part`)."""
+    samples: int
+    """Heights at which every flight is evaluated for its lowest point."""
+    kind: int | None = None
+    """Number of the test function that is 0 besides; None: none is."""
+    flights: ContactFlights | None = None
+    """Simulates the loops of a scene with a contact; None: the scene has a law."""
+
+
+def frame_of(scene: Scene, order: int, scale: float, ranges: Sequence[ParameterRange]) -> Frame:
+    """Return the frame of curves through the ranges of some parameters; the scale of speeds in nm/us."""
+    low, high = (jnp.asarray([getattr(given, end) for given in ranges]) for end in ("low", "high"))
+    return Frame(scene, jnp.asarray(float(order)), jnp.asarray(scale), low, high - low)
+
+
+def loop_at(fractions: Float[Array, " parameters"], frame: Frame, equations: Equations) -> ImpactLoop:
+    """Return the loop of a law scene where the parameters are at fractions of their ranges."""
+    values = dict(zip(equations.paths, frame.low + frame.width * fractions, strict=True))
+    return loop_of(with_numbers(frame.scene, values), frame.order, equations.driven)
+
+
+def split_point(point: Array, equations: Equations) -> tuple[Array, Array]:
+    """Return the unknowns of a point, and the parameters as fractions of their ranges."""
+    count = point.shape[0] - len(equations.paths)
+    return point[:count], point[count:]
+
+
+def _tests(unknowns: Array, frame: Frame, loop: ImpactLoop, equations: Equations) -> list[Array]:
+    """Return the test functions in the order of `KINDS`, without dimension."""
+    trace, determinant = trace_and_determinant_of(unknowns, frame.scale, loop)
+    near = nearest_approach(unknowns, frame.scale, loop, equations.samples).gap_nm
+    if equations.kind == CAPTURE:
+        near = jnp.minimum(near, _rise_when_captured(unknowns, frame, loop))
+    speeds = unknowns[unknowns.shape[0] // 2 :]
+    slowest = -largest(-speeds) if speeds.size else jnp.inf
+    return [
+        1.0 - trace + determinant,
+        1.0 + trace + determinant,
+        determinant - 1.0,
+        near * loop.cantilever.angular_frequency / frame.scale,
+        slowest - loop.impact.lowest / frame.scale,
+    ]
+
+
+def _rise_when_captured(unknowns: Array, frame: Frame, loop: ImpactLoop) -> Array:
+    """Return how the gap opens after the slowest impact, which leaves without speed: z'' - z_p'' over Omega^2, in nm.
+
+    Where it is negative the tip passes through the surface, in a dip too shallow and short to be seen among samples.
+    """
+    impacts = impacts_at(unknowns, frame.scale, loop)
+    slowest = jnp.argmin(unknowns[unknowns.shape[0] // 2 :])
+    leaving, height, velocity = impacts.leaving_us[slowest], impacts.height[slowest], impacts.velocity[slowest]
+    omega, decay = loop.cantilever.angular_frequency, loop.cantilever.decay_rate
+    return -height - (2.0 * decay * velocity + jax.grad(loop.surface.velocity)(leaving)) / omega**2
+
+
+def equations_at(point: Float[Array, " n"], frame: Frame, equations: Equations) -> Float[Array, " rows"]:
+    """Return the closing conditions at a point of a curve, and behind them the test function that is to be 0."""
+    unknowns, fractions = split_point(point, equations)
+    loop = loop_at(fractions, frame, equations)
+    gaps = closing_gaps(unknowns, frame.scale, loop)
+    if equations.kind is None:
+        return gaps
+    test = _tests(unknowns, frame, loop, equations)[equations.kind]
+    return jnp.append(gaps, test)
+
+
+class CurvePoint(NamedTuple):
+    """A point of a curve of closed loops, NumPy arrays."""
+
+    point: Any
+    tangent: Any
+    """Unit vector along the curve."""
+    tests: Any
+    """The five test functions, in the order of `KINDS`."""
+    delay: Any
+    """Longest delay of an impact, in drive periods."""
+
+
+@partial(jax.jit, static_argnames=("equations",))
+def _linearised(frame: Frame, point: Array, equations: Equations) -> tuple[Array, Array]:
+    def twice(point):
+        value = equations_at(point, frame, equations)
+        return value, value
+
+    slopes, value = jax.jacfwd(twice, has_aux=True)(point)
+    return value, slopes
+
+
+@partial(jax.jit, static_argnames=("equations",))
+def _tests_and_delay(frame: Frame, point: Array, equations: Equations) -> tuple[Array, Array]:
+    unknowns, fractions = split_point(point, equations)
+    loop = loop_at(fractions, frame, equations)
+    delay = jnp.zeros(())
+    if loop.impact.delayed:
+        delays = impacts_at(unknowns, frame.scale, loop).speeds.delay
+        delay = jnp.max(jnp.abs(delays)) * loop.angular_frequency / (2.0 * jnp.pi)
+    return jnp.stack(_tests(unknowns, frame, loop, equations)), delay
+
+
+def solved_point(frame: Frame, guess: np.ndarray, normal: np.ndarray, equations: Equations) -> CurvePoint | None:
+    """Return the point of a curve in the plane through a guess across a normal; None where no loop closes there."""
+    flights = equations.flights
+
+    def linearised(point: np.ndarray) -> EquationsAt | None:
+        if flights is not None:
+            return flights.linearised(point, units_of(frame), equations.kind)
+        return EquationsAt(*(np.asarray(part) for part in _linearised(frame, jnp.asarray(point), equations)))
+
+    point = point_in_plane(linearised, guess, normal, _CLOSING)
+    if point is None:
+        return None
+    if flights is None:
+        tests, delay = (np.asarray(part) for part in _tests_and_delay(frame, jnp.asarray(point.x), equations))
+    else:
+        tests, delay = flights.tests(point.details, units_of(frame)), 0.0
+    return CurvePoint(point.x, point.tangent, tests, delay)
+
+
+def units_of(frame: Frame) -> CurveUnits:
+    """Return what a frame measures speeds and parameters in."""
+    return CurveUnits(float(frame.scale), np.asarray(frame.low), np.asarray(frame.width))
+
+
+@partial(jax.jit, static_argnames=("equations",))
+def _read(frame: Frame, points: Array, equations: Equations) -> LoopReading:
+    def reading_at(point):
+        unknowns, fractions = split_point(point, equations)
+        return reading_of(unknowns, frame.scale, loop_at(fractions, frame, equations), equations.samples)
+
+    return jax.vmap(reading_at)(points)
+
+
+def read_points(points: Float[np.ndarray, "points n"], frame: Frame, equations: Equations) -> LoopReading:
+    """Return the readings of the orbits at points of a curve, NumPy arrays."""
+    if equations.flights is not None:
+        return equations.flights.readings_of_points(points, units_of(frame))
+    return in_blocks(lambda block: _read(frame, block, equations), points, block=BLOCK, widths=())
+
+
 class CurveLeg(NamedTuple):
-    """One step of a curve: from a point to another; the guess for the second, and across what it was found."""
+    """One step of a curve from a point to the next one."""
 
     begin: CurvePoint
     end: CurvePoint
     guess: np.ndarray
-    row: np.ndarray
+    """From which the next point was solved for."""
+    normal: np.ndarray
+    """Of the plane in which it was."""
 
-    def at(self, share: float, frame: Frame, equations: Equations) -> CurvePoint | None:
-        """Return the curve's point in the plane at a share of the way."""
-        guess = self.begin.point + share * (self.guess - self.begin.point)
-        step = solved_point(frame, guess, self.row, equations)
-        return step if step is None or step.tangent @ self.begin.tangent > 0.0 else _turned(step)
+    def at(self, fraction: float, frame: Frame, equations: Equations) -> CurvePoint | None:
+        """Return the curve's point in the plane at a fraction of the step."""
+        guess = self.begin.point + fraction * (self.guess - self.begin.point)
+        point = solved_point(frame, guess, self.normal, equations)
+        return point if point is None or point.tangent @ self.begin.tangent > 0.0 else _reversed(point)
 
 
 class FollowedCurve(NamedTuple):
-    """A curve as it was followed from a point on it: backwards, and ahead."""
+    """A curve as it was followed from one of its points both ways."""
 
     first: CurvePoint
     behind: list[CurveLeg]
@@ -66,23 +258,23 @@ class FollowedCurve(NamedTuple):
 
     @property
     def points(self) -> Float[np.ndarray, "points n"]:
-        """The same as an array."""
+        """The coordinates of the points from one end to the other."""
         return np.stack([step.point for step in self.steps])
 
     def places(self) -> Iterator[tuple[CurveLeg, Callable[[float], float]]]:
-        """Give the legs, each with the function from a share of it to a place between the points."""
+        """Give the legs, each with the function from a fraction of it to a position along the points."""
         count = len(self.behind)
         for index, leg in enumerate(self.behind):
-            yield leg, lambda share, index=index: count - index - share
+            yield leg, lambda fraction, index=index: count - index - fraction
         for index, leg in enumerate(self.ahead):
-            yield leg, lambda share, index=index: count + index + share
+            yield leg, lambda fraction, index=index: count + index + fraction
 
 
 def followed_both_ways(start: np.ndarray, frame: Frame, equations: Equations) -> FollowedCurve | None:
     """Return the curve through a point, followed both ways; None where the point is none of a curve."""
-    rows = np.eye(len(start))[-1], np.full(len(start), 1.0 / np.sqrt(len(start)))
-    solved = (solved_point(frame, start, row, equations) for row in rows)
-    first = next((step for step in solved if step is not None and np.abs(step.point - start).max() < _NEAR), None)
+    normals = np.eye(len(start))[-1], np.full(len(start), 1.0 / np.sqrt(len(start)))
+    solved = (solved_point(frame, start, normal, equations) for normal in normals)
+    first = next((point for point in solved if point is not None and np.abs(point.point - start).max() < _NEAR), None)
     if first is None:
         return None
     ahead, why_ahead = _follow(first, first.tangent, frame, equations)
@@ -96,128 +288,131 @@ def _follow(first: CurvePoint, tangent: np.ndarray, frame: Frame, equations: Equ
     """Return the legs of a curve from a point in a direction, and why they end."""
     parameters = len(equations.paths)
     here, legs, length = first._replace(tangent=tangent), [], FIRST_STEP
-    shorter = _likeness(first, frame, parameters)
+    begin, unlike_shorter = here, _unlike_a_shorter_loop(first, frame, parameters)
     while len(legs) < _MOST_POINTS:
         guess = here.point + length * here.tangent
-        found = solved_point(frame, guess, here.tangent, equations)
-        if found is None or not _is_next(found, guess, length, here):
+        ahead = solved_point(frame, guess, here.tangent, equations)
+        if ahead is None or not _is_next(ahead, guess, length, here):
             length *= 0.5
             if length < _SHORTEST_STEP:
                 return legs, "lost"
             continue
-        shares = found.point[-parameters:]
-        if np.any(shares < 0.0) or np.any(shares > 1.0):
-            last = _at_the_border(here, found, frame, equations, parameters)
+        fractions = ahead.point[-parameters:]
+        if np.any(fractions < 0.0) or np.any(fractions > 1.0):
+            last = _at_the_border(here, ahead, frame, equations)
             return (legs if last is None else [*legs, last]), "range"
-        legs.append(CurveLeg(here, found, guess, here.tangent))
-        over = _why_over(found, shorter, equations)
+        legs.append(CurveLeg(here, ahead, guess, here.tangent))
+        over = _why_over(ahead, unlike_shorter, equations)
         if over is not None:
             return (legs if over == "capture" else legs[:-1]), over
-        if len(legs) > 10 and _closes(found, first._replace(tangent=tangent), length, parameters):
+        if len(legs) > 10 and _closes(ahead, begin, length, parameters):
             return legs, "closed"
-        if here.tangent @ found.tangent > _LONGER:
+        if here.tangent @ ahead.tangent > _LONGER:
             length = min(1.5 * length, LONGEST_STEP)
-        here = found
+        here = ahead
     return legs, "too long"
 
 
-def _why_over(found: CurvePoint, shorter: Callable[[CurvePoint], float] | None, equations: Equations) -> str | None:
-    """Return why a curve ends before a point; None where it does not."""
-    if equations.kind != CAPTURE and found.tests[CAPTURE] < 0.0:
+def _why_over(
+    point: CurvePoint, unlike_shorter: Callable[[CurvePoint], float] | None, equations: Equations
+) -> str | None:
+    """Return why a curve ends before a point; None where it goes on."""
+    if equations.kind != CAPTURE and point.tests[CAPTURE] < 0.0:
         return "capture"
-    if found.delay > _LONGEST_DELAY:
+    if point.delay > _LONGEST_DELAY:
         return "delay"
-    return "shorter" if shorter is not None and shorter(found) < _UNLIKE else None
+    return "shorter" if unlike_shorter is not None and unlike_shorter(point) < _UNLIKE else None
 
 
-def _likeness(first: CurvePoint, frame: Frame, parameters: int) -> Callable[[CurvePoint], float] | None:
-    """Return how far a loop is from repeating itself after a part of its impacts, with a sign; None where it cannot.
+def _unlike_a_shorter_loop(first: CurvePoint, frame: Frame, parameters: int) -> Callable[[CurvePoint], float] | None:
+    """Return the function that tells how far a loop is from repeating itself after fewer impacts, with a sign.
 
-    A curve that comes to a loop of fewer impacts goes through it, back along its own loops begun with another impact.
+    None where a loop of so many impacts and periods cannot. A curve that comes to a loop of fewer impacts goes through
+    it, back along its own loops begun with another impact: the sign changes there.
     """
     count = (len(first.point) - parameters) // 2
-    parts = math.gcd(count, int(frame.order))
-    turns = [count // part for part in range(2, parts + 1) if parts % part == 0]
-    if not turns:
+    divisor = math.gcd(count, int(frame.order))
+    shifts = [count // parts for parts in range(2, divisor + 1) if divisor % parts == 0]
+    if not shifts:
         return None
 
-    def apart(step: CurvePoint) -> np.ndarray:
-        phases, coordinates = step.point[:count], step.point[count : 2 * count]
-        state = np.stack([np.cos(phases), np.sin(phases), coordinates])
-        return np.stack([np.roll(state, turn, axis=1) - state for turn in turns]).reshape(len(turns), -1)
+    def differences(point: CurvePoint) -> np.ndarray:
+        state = _state(point.point, count)
+        return np.stack([np.roll(state, shift, axis=1) - state for shift in shifts]).reshape(len(shifts), -1)
 
-    towards = apart(first)
+    towards = differences(first)
     towards = towards / np.linalg.norm(towards, axis=1, keepdims=True)
-    return lambda step: float(np.min(np.sum(apart(step) * towards, axis=1)))
+    return lambda point: float(np.min(np.sum(differences(point) * towards, axis=1)))
 
 
-def _turned(step: CurvePoint) -> CurvePoint:
-    return step._replace(tangent=-step.tangent)
+def _state(point: np.ndarray, count: int) -> Float[np.ndarray, "3 m"]:
+    """Return the impacts of a loop, whole turns of the phases left out: cosine, sine, coordinate."""
+    return np.stack([np.cos(point[:count]), np.sin(point[:count]), point[count : 2 * count]])
 
 
-def _is_next(found: CurvePoint, guess: np.ndarray, length: float, here: CurvePoint) -> bool:
-    return bool(np.linalg.norm(found.point - guess) < _OFF * length and here.tangent @ found.tangent > _STRAIGHT)
+def _reversed(point: CurvePoint) -> CurvePoint:
+    return point._replace(tangent=-point.tangent)
 
 
-def _closes(found: CurvePoint, first: CurvePoint, length: float, parameters: int) -> bool:
+def _is_next(ahead: CurvePoint, guess: np.ndarray, length: float, here: CurvePoint) -> bool:
+    return bool(np.linalg.norm(ahead.point - guess) < _OFF * length and here.tangent @ ahead.tangent > _STRAIGHT)
+
+
+def _closes(here: CurvePoint, first: CurvePoint, length: float, parameters: int) -> bool:
     """Say whether a curve has come back to its beginning; whole turns of the phases count as none."""
     count = (len(first.point) - parameters) // 2
-    apart = found.point - first.point
+    apart = here.point - first.point
     apart[:count] = (apart[:count] + np.pi) % (2.0 * np.pi) - np.pi
-    return bool(np.linalg.norm(apart) < length and found.tangent @ first.tangent > _STRAIGHT)
+    return bool(np.linalg.norm(apart) < length and here.tangent @ first.tangent > _STRAIGHT)
 
 
-def _at_the_border(
-    here: CurvePoint, beyond: CurvePoint, frame: Frame, equations: Equations, parameters: int
-) -> CurveLeg | None:
-    """Return the leg to where a curve leaves the range of a parameter; None where it cannot be found."""
-    old, new = here.point[-parameters:], beyond.point[-parameters:]
-    border = np.clip(new, 0.0, 1.0)
+def _at_the_border(here: CurvePoint, beyond: CurvePoint, frame: Frame, equations: Equations) -> CurveLeg | None:
+    """Return the leg to where a curve leaves the range of a parameter; None where no loop closes there."""
+    parameters = len(equations.paths)
+    inside, outside = here.point[-parameters:], beyond.point[-parameters:]
+    border = np.clip(outside, 0.0, 1.0)
     with np.errstate(divide="ignore", invalid="ignore"):
-        shares = np.where(new == border, np.inf, (border - old) / (new - old))
-    which, share = int(np.argmin(shares)), float(np.min(shares))
-    guess = here.point + share * (beyond.point - here.point)
+        fractions = np.where(outside == border, np.inf, (border - inside) / (outside - inside))
+    which, fraction = int(np.argmin(fractions)), float(np.min(fractions))
+    guess = here.point + fraction * (beyond.point - here.point)
     place = len(guess) - parameters + which
     guess[place] = border[which]
-    row = np.eye(len(guess))[place]
-    found = solved_point(frame, guess, row, equations)
-    if found is None or np.linalg.norm(found.point - guess) > LONGEST_STEP:
+    normal = np.eye(len(guess))[place]
+    end = solved_point(frame, guess, normal, equations)
+    if end is None or np.linalg.norm(end.point - guess) > LONGEST_STEP:
         return None
-    if found.tangent @ here.tangent < 0.0:
-        found = _turned(found)
-    return CurveLeg(here, found, guess, row)
+    return CurveLeg(here, end if end.tangent @ here.tangent >= 0.0 else _reversed(end), guess, normal)
 
 
-def lies_on(point: np.ndarray, way: FollowedCurve, frame: Frame, equations: Equations) -> bool:
+def lies_on(point: np.ndarray, curve: FollowedCurve, frame: Frame, equations: Equations) -> bool:
     """Say whether a curve goes through a point, up to whole drive periods and the choice of the first impact."""
-    points, parameters = way.points, len(equations.paths)
+    points, parameters = curve.points, len(equations.paths)
     between = np.flatnonzero((points[:-1, -1] - point[-1]) * (points[1:, -1] - point[-1]) <= 0.0)
     for index in between:
         low, high = points[index], points[index + 1]
         rise = high[-1] - low[-1]
-        share = (point[-1] - low[-1]) / rise if rise else 0.0
-        guess = low + share * (high - low)
+        guess = low + ((point[-1] - low[-1]) / rise if rise else 0.0) * (high - low)
         guess[-1] = point[-1]
-        found = solved_point(frame, guess, np.eye(len(guess))[-1], equations)
-        if found is not None and _same_loop(found.point, point, parameters):
+        on_curve = solved_point(frame, guess, np.eye(len(guess))[-1], equations)
+        if on_curve is not None and _same_loop(on_curve.point, point, parameters):
             return True
     return False
 
 
-def _same_loop(one: np.ndarray, other: np.ndarray, parameters: int) -> bool:
-    count = (len(one) - parameters) // 2
-    states = [np.stack([np.cos(a[:count]), np.sin(a[:count]), a[count : 2 * count]]) for a in (one, other)]
-    apart = min(np.abs(np.roll(states[0], turn, axis=1) - states[1]).max(initial=0.0) for turn in range(max(count, 1)))
-    return bool(apart < _SAME and np.abs(one - other)[-parameters:].max() < _SAME)
+def _same_loop(point: np.ndarray, other: np.ndarray, parameters: int) -> bool:
+    count = (len(point) - parameters) // 2
+    state, other_state = _state(point, count), _state(other, count)
+    apart = min(np.abs(np.roll(state, turn, axis=1) - other_state).max(initial=0.0) for turn in range(max(count, 1)))
+    return bool(apart < _SAME and np.abs(point - other)[-parameters:].max() < _SAME)
 
 
 def tested_by(test: int, equations: Equations) -> Callable[[CurvePoint], float]:
     """Return the function from a point to the value of a test function by its number; 1 where it has none."""
     along = test == FOLD and equations.kind is None
 
-    def value(step: CurvePoint) -> float:
-        found = float(step.tangent[-1] if along else step.tests[test])
-        return found if np.isfinite(found) else 1.0
+    def value(point: CurvePoint) -> float:
+        tested = float(point.tangent[-1] if along else point.tests[test])
+        return tested if np.isfinite(tested) else 1.0
 
     return value
 
@@ -225,19 +420,19 @@ def tested_by(test: int, equations: Equations) -> Callable[[CurvePoint], float]:
 def root_on(
     leg: CurveLeg, test: Callable[[CurvePoint], float], frame: Frame, equations: Equations
 ) -> tuple[float, CurvePoint] | None:
-    """Return where on a leg a test function is 0, as a share of it, and the point there; None where it is nowhere."""
+    """Return where on a leg a test function is 0, as a fraction of the leg, and the point there; None: nowhere."""
     if not test(leg.begin) * test(leg.end) < 0.0:
         return None
 
-    def at(share: float) -> float:
-        step = leg.at(share, frame, equations)
-        return np.nan if step is None else test(step)
+    def tested_at(fraction: float) -> float:
+        point = leg.at(fraction, frame, equations)
+        return np.nan if point is None else test(point)
 
     try:
-        share = float(np.asarray(brentq(at, 0.0, 1.0, xtol=1e-15)))
+        fraction = float(np.asarray(brentq(tested_at, 0.0, 1.0, xtol=1e-15)))
     except ValueError:
         # the guesses on the way led elsewhere
         return None
-    step = leg.at(share, frame, equations)
+    point = leg.at(fraction, frame, equations)
     # a jump or a pole is no root
-    return None if step is None or not abs(test(step)) < AT_A_ROOT else (share, step)
+    return None if point is None or not abs(test(point)) < AT_A_ROOT else (fraction, point)

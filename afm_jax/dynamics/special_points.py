@@ -12,28 +12,26 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from afm_jax.dynamics.closed_loops import (
+from afm_jax.dynamics.contact_orbits import ContactFlights
+from afm_jax.dynamics.curves import (
+    AT_A_ROOT,
     CAPTURE,
     DOUBLING,
     FOLD,
     GRAZING,
     KINDS,
     TORUS,
+    CurveLeg,
     CurvePoint,
     Equations,
-    Frame,
-    loop_at,
-    read_points,
-    split_point,
-)
-from afm_jax.dynamics.contact_orbits import ContactFlights
-from afm_jax.dynamics.curves import (
-    AT_A_ROOT,
-    CurveLeg,
     FollowedCurve,
+    Frame,
     followed_both_ways,
     lies_on,
+    loop_at,
+    read_points,
     root_on,
+    split_point,
     tested_by,
 )
 from afm_jax.dynamics.impact_loop import LoopReading
@@ -96,66 +94,90 @@ class SpecialCurve(NamedTuple):
     ends: tuple[str, str]
 
 
-def special_points_of(way: FollowedCurve, number: int, frame: Frame, equations: Equations) -> list[SpecialPoint]:
-    """Return the special points of a branch in their order along it, and where a contact's curve was lost at one."""
-    found = []
-    for leg, place in way.places():
-        for test in range(len(KINDS)):
-            root = root_on(leg, tested_by(test, equations), frame, equations)
-            if root is not None and (test != TORUS or _is_complex(root[1])):
-                share, step = root
-                position = place(share)
-                if test == CAPTURE:
-                    # there the branch ends: its last point is beside it
-                    position = 0.0 if position < 1.0 and way.ends[0] == "capture" else np.ceil(position)
-                found.append((position, test, step, [step.point, *_beside(leg, share, test, frame, equations)]))
-    if equations.flights is not None:
-        found += [(place, test, step, [seen]) for place, test, step, seen in _at_lost_ends(way)]
-    if not found:
+class _Root(NamedTuple):
+    """A root of a test function on a branch."""
+
+    position: float
+    """Along the branch, in points."""
+    test: int
+    point: CurvePoint
+    seen: list[np.ndarray]
+    """Points whose orbits are read: that of the root first, then its neighbours on either side."""
+
+
+def special_points_of(curve: FollowedCurve, number: int, frame: Frame, equations: Equations) -> list[SpecialPoint]:
+    """Return the special points of a branch in their order along it, and where a contact's curve was lost at one.
+
+    Args:
+        curve: the branch.
+        number: of the branch.
+        frame: in which it was followed.
+        equations: of its loops.
+    """
+    roots = [*_roots_on(curve, frame, equations), *(_at_lost_ends(curve) if equations.flights is not None else ())]
+    if not roots:
         return []
-    found.sort(key=lambda one: one[0])
-    reading = read_points(np.stack([point for *_, seen in found for point in seen]), frame, equations)
+    roots.sort(key=lambda root: root.position)
+    readings = read_points(np.stack([point for root in roots for point in root.seen]), frame, equations)
     low, width = float(frame.low[0]), float(frame.width[0])
     special, first = [], 0
-    for place, test, step, seen in found:
-        own = jax.tree.map(lambda part, first=first: part[first], reading)
-        flown = bool(reading.admissible[first : first + len(seen)].any())
-        first += len(seen)
-        kind = _kind_of(test, step, frame, equations)
-        parameter = low + width * float(step.point[-1])
-        if test == CAPTURE and kind == KINDS[GRAZING] and not flown:
+    for root in roots:
+        reading = jax.tree.map(lambda column, first=first: column[first], readings)
+        admissible = bool(readings.admissible[first : first + len(root.seen)].any())
+        first += len(root.seen)
+        kind = _kind_of(root.test, root.point, frame, equations)
+        if root.test == CAPTURE and kind == KINDS[GRAZING] and not admissible:
             # the tip rests while the sample goes through it: no motion comes to that
             continue
-        point = SpecialPoint(kind, parameter, number, place, flown, step.point[:-1], own, test)
+        unknowns, parameter = root.point.point[:-1], low + width * float(root.point.point[-1])
+        point = SpecialPoint(kind, parameter, number, root.position, admissible, unknowns, reading, root.test)
         if special and _is_the_same(special[-1], point, width):
             # where an impact's speed vanishes, the lowest point of the flight is at the surface, too
-            special[-1] = special[-1]._replace(admissible=special[-1].admissible or flown)
+            special[-1] = special[-1]._replace(admissible=special[-1].admissible or admissible)
         else:
             special.append(point)
     return special
 
 
-def _is_the_same(one: SpecialPoint, other: SpecialPoint, width: float) -> bool:
-    """Say whether two special points are one, which two test functions have found."""
-    return one.kind == other.kind and abs(one.parameter - other.parameter) < _SAME_POINT * width
+def _roots_on(curve: FollowedCurve, frame: Frame, equations: Equations) -> list[_Root]:
+    """Return the roots of all test functions between the points of a branch."""
+    roots = []
+    for leg, position_of in curve.places():
+        for test in range(len(KINDS)):
+            root = root_on(leg, tested_by(test, equations), frame, equations)
+            if root is None or (test == TORUS and not _is_complex(root[1])):
+                continue
+            fraction, point = root
+            position = position_of(fraction)
+            if test == CAPTURE:
+                # there the branch ends: its last point is beside it
+                position = 0.0 if position < 1.0 and curve.ends[0] == "capture" else float(np.ceil(position))
+            roots.append(_Root(position, test, point, [point.point, *_beside(leg, fraction, test, frame, equations)]))
+    return roots
 
 
-def _beside(leg: CurveLeg, share: float, test: int, frame: Frame, equations: Equations) -> list[np.ndarray]:
+def _is_the_same(point: SpecialPoint, other: SpecialPoint, width: float) -> bool:
+    """Say whether two special points, roots of two test functions, are one point."""
+    return point.kind == other.kind and abs(point.parameter - other.parameter) < _SAME_POINT * width
+
+
+def _beside(leg: CurveLeg, fraction: float, test: int, frame: Frame, equations: Equations) -> list[np.ndarray]:
     """Return the points on either side of a grazing or a capture: on one of them the orbit may be flown."""
     if test not in (GRAZING, CAPTURE):
         return []
-    steps = (leg.at(share + apart, frame, equations) for apart in (-_ASIDE, _ASIDE))
-    return [step.point for step in steps if step is not None]
+    points = (leg.at(fraction + apart, frame, equations) for apart in (-_ASIDE, _ASIDE))
+    return [point.point for point in points if point is not None]
 
 
-def _at_lost_ends(way: FollowedCurve) -> list[tuple[float, int, CurvePoint, np.ndarray]]:
+def _at_lost_ends(curve: FollowedCurve) -> list[_Root]:
     """Return grazings and captures at which a contact's curve ends: beyond, its map flies otherwise, or not at all.
 
-    The curve has come within a millionth and less; the rest is extrapolated. Last is the curve's own last point.
+    The curve has come within a millionth and less; the rest is extrapolated. The orbit that is read is that of the
+    curve's own last point.
     """
-    found = []
-    for legs, end, place in ((way.behind, 0, 0.0), (way.ahead, 1, float(len(way.steps) - 1))):
-        if way.ends[end] != "lost" or not legs:
+    roots = []
+    for legs, end, position in ((curve.behind, 0, 0.0), (curve.ahead, 1, float(len(curve.steps) - 1))):
+        if curve.ends[end] != "lost" or not legs:
             continue
         last = legs[-1].end
         apart = (leg.begin for leg in reversed(legs) if np.linalg.norm(leg.begin.point - last.point) > _LONG_ENOUGH)
@@ -163,87 +185,89 @@ def _at_lost_ends(way: FollowedCurve) -> list[tuple[float, int, CurvePoint, np.n
         for test in (GRAZING, CAPTURE):
             falls = float(before.tests[test] - last.tests[test])
             if 0.0 <= last.tests[test] < _AT_AN_END and falls > 0.0:
-                share = float(last.tests[test]) / falls
-                point = last.point + share * (last.point - before.point)
-                found.append((place, test, last._replace(point=point), last.point))
-    return found
+                ahead = float(last.tests[test]) / falls * (last.point - before.point)
+                roots.append(_Root(position, test, last._replace(point=last.point + ahead), [last.point]))
+    return roots
 
 
-def _kind_of(test: int, step: CurvePoint, frame: Frame, equations: Equations) -> str:
+def _kind_of(test: int, point: CurvePoint, frame: Frame, equations: Equations) -> str:
     """Return what a root of a test function is: where the law captures nothing, an impact that vanishes is a graze."""
-    return KINDS[GRAZING] if test == CAPTURE and captures_nothing(step.point, frame, equations) else KINDS[test]
+    return KINDS[GRAZING] if test == CAPTURE and captures_nothing(point.point, frame, equations) else KINDS[test]
 
 
 def captures_nothing(point: Float[np.ndarray, " n"], frame: Frame, equations: Equations) -> bool:
     """Say whether the impacts of a point of a curve are of a law without adhesion, which any speed leaves."""
     if equations.flights is not None:
         return False
-    _, shares = split_point(jnp.asarray(point), equations)
-    return float(loop_at(shares, frame, equations).impact.lowest) == 0.0
+    _, fractions = split_point(jnp.asarray(point), equations)
+    return float(loop_at(fractions, frame, equations).impact.lowest) == 0.0
 
 
-def _is_complex(step: CurvePoint) -> bool:
+def _is_complex(point: CurvePoint) -> bool:
     """Say whether the multipliers are a complex pair, given D = 1: |T| < 2."""
-    return abs(float(step.tests[DOUBLING] - step.tests[FOLD])) < 4.0
+    return abs(float(point.tests[DOUBLING] - point.tests[FOLD])) < 4.0
 
 
 def special_curves(
-    special: Sequence[SpecialPoint], frame: Frame, equations: Equations, second: ParameterRange, own: float
+    special: Sequence[SpecialPoint], frame: Frame, equations: Equations, second: ParameterRange, value: float
 ) -> tuple[SpecialCurve, ...]:
-    """Return the curves in two parameters through special points that the map flies, each once."""
-    curves: list[tuple[int, FollowedCurve]] = []
-    found, both = [], None
-    share = (own - second.low) / (second.high - second.low)
+    """Return the curves in two parameters through special points that the map flies, each once.
+
+    Args:
+        special: points of branches in the first parameter.
+        frame: of both parameters.
+        equations: of the branches.
+        second: the second parameter and its range.
+        value: of the second parameter at the special points.
+    """
+    followed: list[tuple[int, FollowedCurve]] = []
+    curves, flights = [], None
+    paths = (*equations.paths, second.path)
     for point in special:
-        first = (point.parameter - float(frame.low[0])) / float(frame.width[0])
-        start = np.concatenate([point.unknowns, [first, share]])
-        paths = (*equations.paths, second.path)
-        own_equations = equations._replace(paths=paths, kind=point.test)
-        if equations.flights is not None:
-            both = both or ContactFlights(frame.scene, int(frame.order), paths)
-            own_equations = own_equations._replace(flights=both)
-        passed = (way for test, way in curves if test == point.test)
-        if not point.admissible or any(lies_on(start, way, frame, own_equations) for way in passed):
+        if not point.admissible:
             continue
-        way = followed_both_ways(start, frame, own_equations)
-        if way is not None:
-            curves.append((point.test, way))
-            found.append(_special_curve(point.kind, way, frame, own_equations))
-    return tuple(found)
+        fraction = (point.parameter - float(frame.low[0])) / float(frame.width[0])
+        start = np.concatenate([point.unknowns, [fraction, (value - second.low) / (second.high - second.low)]])
+        with_test = equations._replace(paths=paths, kind=point.test)
+        if equations.flights is not None:
+            flights = flights or ContactFlights(frame.scene, int(frame.order), paths)
+            with_test = with_test._replace(flights=flights)
+        if any(lies_on(start, curve, frame, with_test) for test, curve in followed if test == point.test):
+            continue
+        curve = followed_both_ways(start, frame, with_test)
+        if curve is not None:
+            followed.append((point.test, curve))
+            curves.append(_special_curve(point.kind, curve, frame, with_test))
+    return tuple(curves)
 
 
-def _special_curve(kind: str, way: FollowedCurve, frame: Frame, equations: Equations) -> SpecialCurve:
+def _special_curve(kind: str, curve: FollowedCurve, frame: Frame, equations: Equations) -> SpecialCurve:
     low, width = np.asarray(frame.low), np.asarray(frame.width)
-
-    def at(step: CurvePoint) -> np.ndarray:
-        return low + width * step.point[-2:]
-
+    # an impact without speed, or of a captured tip, has no linearised map
+    others = [GRAZING] if equations.kind == CAPTURE else [test for test in range(len(KINDS)) if test != equations.kind]
     meetings = []
-    for leg, _ in way.places():
-        for test in range(len(KINDS)):
-            # an impact without speed, or of a captured tip, has no linearised map
-            if test == equations.kind or (equations.kind == CAPTURE and test != GRAZING):
-                continue
+    for leg, _ in curve.places():
+        for test in others:
             root = root_on(leg, tested_by(test, equations), frame, equations)
             if root is not None:
                 name = f"{kind}_{_kind_of(test, root[1], frame, equations)}"
-                meetings.append(Meeting(name, *at(root[1]).tolist()))
+                meetings.append(Meeting(name, *(low + width * root[1].point[-2:]).tolist()))
         if equations.kind == FOLD:
             root = root_on(leg, _cusp_function(leg), frame, equations)
             if root is not None:
-                meetings.append(Meeting("cusp", *at(root[1]).tolist()))
-    values = np.stack([at(step) for step in way.steps])
+                meetings.append(Meeting("cusp", *(low + width * root[1].point[-2:]).tolist()))
+    values = low + width * curve.points[:, -2:]
     if equations.kind in (GRAZING, CAPTURE):
         # they are the border of what the map flies: only the other border can be passed
-        other = np.array([step.tests[GRAZING + CAPTURE - equations.kind] for step in way.steps])
+        other = np.array([point.tests[GRAZING + CAPTURE - equations.kind] for point in curve.steps])
         admissible = ~(other < -AT_A_ROOT)
     else:
-        admissible = np.asarray(read_points(way.points, frame, equations).admissible)
-    return SpecialCurve(kind, values[:, 0], values[:, 1], admissible, tuple(meetings), way.ends)
+        admissible = np.asarray(read_points(curve.points, frame, equations).admissible)
+    return SpecialCurve(kind, values[:, 0], values[:, 1], admissible, tuple(meetings), curve.ends)
 
 
 def _cusp_function(leg: CurveLeg) -> Callable[[CurvePoint], float]:
-    """Return the test function of cusps: where both parameters turn round, their share in the tangent vanishes."""
+    """Return the test function of cusps: where both parameters turn round, their part of the tangent vanishes."""
     direction = leg.begin.tangent[-2:]
     direction = direction / np.linalg.norm(direction)
-    return lambda step: float(step.tangent[-2:] @ direction)
+    return lambda point: float(point.tangent[-2:] @ direction)

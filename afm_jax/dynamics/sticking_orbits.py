@@ -16,8 +16,8 @@ from scipy.optimize import brentq
 from afm_jax.apparatus.scene import Scene, drive_of
 from afm_jax.apparatus.surface import surface_of
 from afm_jax.checks import require_float64
-from afm_jax.dynamics.closed_loops import Equations, frame_of
 from afm_jax.dynamics.continuation import Continuation
+from afm_jax.dynamics.curves import Equations, frame_of
 from afm_jax.dynamics.impact_loop import LoopReading, driven_part
 from afm_jax.dynamics.special_points import OrbitBranch, SpecialPoint
 from afm_jax.impact.law import impact_law_of

@@ -309,27 +309,19 @@ def _step_in_time(
 ) -> TipInContact:
     """Return a tip in contact after some trial steps, or where legs may go on; a free one stays as it is."""
     fineness = setting.fineness * _FINER ** repeats.astype(until_us.dtype)
+    if reverse:
 
-    def moves(tip, active, until_us):
-        finite = jnp.isfinite(tip.state.x) & jnp.isfinite(tip.state.gap_rate)
-        return active & (tip.phase != Phase.DRY) & (tip.state.time_us < until_us) & finite
+        def once(tip, _):
+            return _advanced(driven, tip, _moves(tip, active, until_us), fineness, until_us), None
+
+        return lax.scan(once, tip, None, length=setting.trials)[0]
 
     def needs_steps(driven, tip, active, fineness, until_us):
         # a tip that has just formed the junction waits for its leg, unless that did not hold or the contact is repeated
         if setting.quick is None:
-            return moves(tip, active, until_us)
+            return _moves(tip, active, until_us)
         waits = at_junction(driven, tip) & (fineness == setting.fineness)
-        return moves(tip, active, until_us) & ~waits
-
-    def advanced(driven, tip, moving, fineness, until_us):
-        return _where(moving, advance(driven, tip, until_us, fineness), tip)
-
-    if reverse:
-
-        def once(tip, _):
-            return advanced(driven, tip, moves(tip, active, until_us), fineness, until_us), None
-
-        return lax.scan(once, tip, None, length=setting.trials)[0]
+        return _moves(tip, active, until_us) & ~waits
 
     def some_trials(driven, tip, active, fineness, until_us):
         def goes_on(state):
@@ -339,13 +331,24 @@ def _step_in_time(
         def one_trial(state):
             tip, count = state
             moving = needs_steps(driven, tip, active, fineness, until_us)
-            return advanced(driven, tip, moving, fineness, until_us), count + 1
+            return _advanced(driven, tip, moving, fineness, until_us), count + 1
 
         return lax.while_loop(goes_on, one_trial, (tip, 0))[0]
 
     passes = -(-setting.trials // _TRIALS)
     repeated = repeat_for(some_trials, needs_steps, changed=1, passes=passes, block=_TRIALS_AT_ONCE)
     return repeated(driven, tip, active, fineness, until_us)
+
+
+def _moves(tip: TipInContact, active: Array, until_us: Array) -> Bool[Array, "..."]:
+    """Return whether a tip is in contact before the end, its state finite."""
+    finite = jnp.isfinite(tip.state.x) & jnp.isfinite(tip.state.gap_rate)
+    return active & (tip.phase != Phase.DRY) & (tip.state.time_us < until_us) & finite
+
+
+def _advanced(driven: Driven, tip: TipInContact, moving: Array, fineness: Array, until_us: Array) -> TipInContact:
+    """Return a tip after one trial where it moves."""
+    return _where(moving, advance(driven, tip, until_us, fineness), tip)
 
 
 def _repetition(

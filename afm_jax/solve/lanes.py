@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -101,6 +102,20 @@ def map_in_blocks(work: Callable[[Any], Any], lanes: Any, *, block: int, recompu
 
     results = lax.map(jax.checkpoint(work) if recompute else work, jax.tree.map(parted, lanes))
     return jax.tree.map(lambda part: part.reshape(blocks * width, *part.shape[2:])[:size], results)
+
+
+def rows_in_blocks(work: Callable[[Any, Any], Any], parameters: Any, rows: Any) -> Any:
+    """Return the results of work on rows inside a compiled program, so that memory does not grow with their number.
+
+    Args:
+        work: takes parameters and rows of a block, gives a tree of arrays with the rows' axis.
+        parameters: a tree of numbers for all rows, and of arrays with one value a row.
+        rows: an array of one value a row.
+    """
+    varied, shared = eqx.partition(parameters, lambda leaf: leaf.ndim > 0)
+    return map_in_blocks(
+        lambda lanes: work(eqx.combine(lanes[0], shared), lanes[1]), (varied, rows), block=LANES, recompute=True
+    )
 
 
 def again_for(
