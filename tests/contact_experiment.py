@@ -7,6 +7,7 @@ import numpy as np
 
 from afm_jax.contact.collide import collide
 from afm_jax.contact.contact import Contact
+from afm_jax.contact.parameters import EFFECTS
 from fitting.examples.make_contact_amplitudes import example_experiment
 from fitting.simulated.experiment import SimulatedExperiment
 
@@ -26,6 +27,6 @@ def paper_collisions(approach_speeds: np.ndarray, **changes: float) -> tuple[np.
         changes: parameters of another contact.
     """
     padded = np.resize(approach_speeds, 128)
-    found = collide(Contact.paper(**changes), jnp.asarray(padded))
+    found = collide(Contact.of(EFFECTS, **changes), jnp.asarray(padded))
     count = len(approach_speeds)
     return np.asarray(found.rebound_speed_nm_per_us)[:count], np.asarray(found.collision_delay_us)[:count]

@@ -141,6 +141,7 @@ def test_simulated_contacts_are_collisions_and_the_trajectory_follows_them(conta
     simulation = simulate(scene, default_start(scene), 4.5 * float(SCENE.platform.period_us), max_contacts=16)
     assert int(simulation.outcome) == MotionOutcome.FINISHED
     rows = simulation.contacts
+    assert rows.detail is not None
     approach, rebound = float(rows.approach_speed_nm_per_us[1]), float(rows.rebound_speed_nm_per_us[1])
     free = collide(contact, approach)
     # drive and spring change the speeds during the contact by what they do in its duration

@@ -106,6 +106,7 @@ def scipy_collision(contact: Contact, approach_speed_nm_per_us: float, *, method
 def _numbers(contact: Contact) -> _ContactNumbers:
     terms: dict[type, Any] = {type(term): term for term in contact.forces.terms}
     junction, solid = _junction_of(contact), contact.junction
+    assert isinstance(solid, jkr.Jkr)  # the paper's contact  # noqa: S101
     capillary, structural = terms[Capillary], terms[Structural]
     values = (
         capillary.pull_nn,
