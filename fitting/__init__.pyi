@@ -12,10 +12,10 @@ from fitting.calibration.stiffness import sader as sader
 from fitting.calibration.stiffness import sensitivity as sensitivity
 from fitting.calibration.sweep import ResonanceSweep as ResonanceSweep
 from fitting.calibration.sweep import read_sweep as read_sweep
-from fitting.experiments.belief import Belief as Belief
-from fitting.experiments.belief import believe as believe
 from fitting.experiments.candidates import drive_grid as drive_grid
 from fitting.experiments.design import design as design
+from fitting.experiments.prior import Prior as Prior
+from fitting.experiments.prior import prior_of_values as prior_of_values
 from fitting.experiments.result import Design as Design
 from fitting.fits.comparison import Comparison as Comparison
 from fitting.fits.comparison import compare as compare

@@ -15,7 +15,7 @@ import jax
 
 import fitting.examples
 from fitting import fit, posterior, read_table
-from fitting.sampling.draws import believe_draws, refit_of_rows
+from fitting.sampling.draws import posterior_draws, refit_of_rows
 from fitting.sampling.rank_calibration import calibrate_ranks
 
 TABLES = (
@@ -34,7 +34,7 @@ def main() -> int:
     missed = 0
     for name, model in TABLES:
         result = fit(read_table(Path(fitting.examples.__path__[0]) / name), model)
-        drawn = believe_draws(result, posterior(result)).values
+        drawn = posterior_draws(result, posterior(result)).values
         drawn = drawn.reshape(-1, drawn.shape[2])
         middle, error = drawn.mean(axis=0), drawn.std(axis=0)
         narrow, shifted = middle + 0.8 * (drawn - middle), drawn + 0.5 * error

@@ -32,7 +32,7 @@ from afm_jax.scenefile.law_files import load_law
 from afm_jax.scenefile.scenefile import load_scene_and_start, read_toml
 from afm_jax.sweeps.axes import axes_of
 from fitting.calibration.sweep import read_sweep
-from fitting.experiments.belief import read_belief
+from fitting.experiments.prior import read_prior
 from fitting.instruments.curve import read_curves
 from fitting.tables.table import read_table
 from fitting.tapping_curves.tapping import tapping
@@ -219,7 +219,7 @@ READERS: dict[str, Callable[[Path], Any]] = {
     "psd": read_sweep,
     "curve": read_curves,
     "nanonis": read_curves,
-    "law": lambda path: (read_belief(path), load_law(path)),
+    "law": lambda path: (read_prior(path), load_law(path)),
 }
 """What reads a sound file of the corpus of malformed ones."""
 

@@ -310,7 +310,7 @@ MUTATIONS = {
     "slow impacts' padding of peak and lock-in as if independent": Mutation(
         "0.5 * (_TOGETHER - _APART)",
         "0.0 * (_TOGETHER - _APART)",
-        "tests/test_unmodelled.py::test_the_step_is_that_of_one_least_squares_problem",
+        "tests/test_discrepancy.py::test_the_step_is_that_of_one_least_squares_problem",
     ),
     "collisions beside capture in few steps": Mutation(
         "_NEAR_CAPTURE = (-0.02, 0.2)",

@@ -13,7 +13,7 @@ import fitting.examples
 from afm_jax.impact.law import ImpactLaw
 from fitting import fit, read_table
 from fitting.fits.intervals import profile_intervals
-from fitting.fits.minimum import relaxed, strain_of
+from fitting.fits.minimum import model_errors_of, with_inflated_errors
 from fitting.fits.objective import Objective
 from fitting.models import Problem, measurement_of
 from fitting.sampling.bootstrap import BatchFit, DataSets, Refit, draw_data, fit_data_sets
@@ -53,7 +53,7 @@ def experiment(model: str) -> Refit:
     values = np.array(list(TRUTHS[model].values()))
     stated = Objective(measurement_of(table, problem), problem).following(values)
     # without the rows that a fit would set aside
-    return Refit(relaxed(stated, strain_of(stated, values)), values)
+    return Refit(with_inflated_errors(stated, model_errors_of(stated, values)), values)
 
 
 @pytest.fixture(scope="module", params=list(TRUTHS))
@@ -122,7 +122,7 @@ def test_profile_intervals_cover_the_truth(fits):
 def test_whole_fits_are_those_of_the_batch_and_rarely_warn(fits):
     refit, data, batch = fits
     if refit.objective.problem.lasting:
-        pytest.skip("its rows are relaxed at the truth, those of a fit where it ends")
+        pytest.skip("its errors are inflated at the truth, those of a fit where it ends")
     table = table_of("law")
     (quality,) = np.flatnonzero(np.isfinite(np.asarray(refit.objective.measurement.constraint_error)))
     _, error = amplitudes_and_errors(table)

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from afm_jax.impact.law import CollisionDelay, ImpactLaw, TabulatedLaw
-from fitting import believe, design, drive_grid, fit
-from fitting.experiments.belief import Belief, belief_of_fit
+from fitting import design, drive_grid, fit, prior_of_values
 from fitting.experiments.candidates import candidates_of
+from fitting.experiments.prior import Prior, prior_of_fit
 from fitting.experiments.result import Design, Forecast
 from fitting.fits.result import FittedParameter
 from fitting.simulated.experiment import Drives
@@ -21,14 +21,14 @@ QUALITY_FACTOR = (40.0, 0.4)
 NOISE = 0.01
 
 
-def law_belief(**changes) -> Belief:
+def law_prior(**changes) -> Prior:
     given = {
         "free_frequency_khz": 90.0,
         "quality_factor": QUALITY_FACTOR[0],
         "values": LAW,
         "constraints": {"quality_factor": QUALITY_FACTOR},
     }
-    return believe("law", **(given | changes))
+    return prior_of_values("law", **(given | changes))
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +44,7 @@ def drives() -> Drives:
 
 @pytest.fixture(scope="module")
 def of_law(drives) -> Design:
-    return design(law_belief(), drives, points=5, noise=NOISE)
+    return design(law_prior(), drives, points=5, noise=NOISE)
 
 
 def test_a_law_is_believed_as_its_closest_formula():
@@ -54,31 +54,31 @@ def test_a_law_is_believed_as_its_closest_formula():
     # u_out changes with r and epsilon, which change with two independent unknowns
     changes = np.linalg.cholesky(covariance).T @ np.stack([0.95 * u**2 / w, -0.5 / w])
     law = TabulatedLaw.with_errors(u, w, rebound_changes=changes, mass_ng=2.0, origin="a test")
-    found = believe("law", free_frequency_khz=90.0, quality_factor=40.0, law=law)
+    found = prior_of_values("law", free_frequency_khz=90.0, quality_factor=40.0, law=law)
     np.testing.assert_allclose(found.values, [0.95, 60.0], rtol=1e-9)
     np.testing.assert_allclose(np.linalg.inv(found.information), covariance, rtol=0.02)
     assert (found.mass_ng, found.source) == (2.0, "a law (a test)")
     assert found.notes[0].startswith("The law is planned with as the closest formula of law: off by at most")
     # what is given counts more; of what the law does not tell the paper's is taken
-    found = believe("law+delay", free_frequency_khz=90.0, law=law, values={"r": 0.9})
+    found = prior_of_values("law+delay", free_frequency_khz=90.0, law=law, values={"r": 0.9})
     assert found.values[0] == 0.9
     assert (
         "Not given, and taken from the paper's contact: delay_hertz, delay_lead_nm, delay_offset_nm" in found.notes[1]
     )
     # a formula is a law, too; one that no member is meets it as far as it says
     wet = ImpactLaw(1.0, 114.0, 0.48, CollisionDelay(0.2, 5.6, 0.7))
-    found = believe("viscous+delay", free_frequency_khz=90.0, law=wet)
+    found = prior_of_values("viscous+delay", free_frequency_khz=90.0, law=wet)
     np.testing.assert_allclose(found.values, [114.0, 0.48, 0.2, 5.6, 0.7], rtol=1e-6)
-    found = believe("law", free_frequency_khz=90.0, law=wet)
+    found = prior_of_values("law", free_frequency_khz=90.0, law=wet)
     u = np.geomspace(1.05 * float(wet.capture_speed_nm_per_us), 500.0, 1000)
     other = ImpactLaw(*found.values).rebound_speed(u)
     off = 100.0 * np.abs(np.asarray(other / wet.rebound_speed(u)) - 1.0).max()
     # two digits are told
     assert float(found.notes[0].split("at most ")[1].split(" %")[0]) == pytest.approx(off, rel=0.05)
     with pytest.raises(ValueError, match=r"the law is that of a tip of 2 ng, but the cantilever's `mass_ng` is 1"):
-        believe("law", free_frequency_khz=90.0, mass_ng=1.0, law=law)
+        prior_of_values("law", free_frequency_khz=90.0, mass_ng=1.0, law=law)
     with pytest.raises(ValueError, match="a law says nothing of a contact's parameters"):
-        believe("contact", free_frequency_khz=90.0, law=law)
+        prior_of_values("contact", free_frequency_khz=90.0, law=law)
 
 
 def table_of(drives: Drives, amplitude: np.ndarray | None = None) -> AmplitudeTable:
@@ -141,7 +141,7 @@ def test_forecast_is_the_error_that_a_fit_reports(of_law):
 
 def determinant(result: Design, chosen: np.ndarray) -> float:
     """Return the log of the determinant of the covariance of r and epsilon, from the inverse; infinite if singular."""
-    information = result.belief.information + result.candidates.information[chosen].sum(axis=0)
+    information = result.prior.information + result.candidates.information[chosen].sum(axis=0)
     return float(np.linalg.slogdet(np.linalg.inv(information)[:2, :2])[1])
 
 
@@ -157,7 +157,7 @@ def test_points_are_better_than_random_ones(of_law):
 
 def test_points_are_the_best_of_all_choices(drives):
     few = Drives(*(column[::3] for column in drives))
-    result = design(law_belief(), few, points=3, noise=NOISE)
+    result = design(law_prior(), few, points=3, noise=NOISE)
     usable = np.flatnonzero(result.candidates.usable)
     assert usable.size > 8
     best = min(determinant(result, np.array(some)) for some in itertools.combinations(usable.tolist(), 3))
@@ -167,12 +167,12 @@ def test_points_are_the_best_of_all_choices(drives):
 
 def test_a_choice_for_one_parameter_is_better_for_it(drives, of_law):
     for name, other in (("r", "epsilon"), ("epsilon", "r")):
-        ours, theirs = (design(law_belief(), drives, points=3, noise=NOISE, interest=(n,)) for n in (name, other))
+        ours, theirs = (design(law_prior(), drives, points=3, noise=NOISE, interest=(n,)) for n in (name, other))
         mine, yours = ours.expected[name].standard_error, theirs.expected[name].standard_error
         assert mine is not None
         assert yours is None or mine <= yours
     with pytest.raises(ValueError, match="`interest` names 'viscosity'"):
-        design(law_belief(), drives, interest=("viscosity",))
+        design(law_prior(), drives, interest=("viscosity",))
     assert of_law.interest == ("r", "epsilon")
 
 
@@ -182,14 +182,14 @@ def test_more_points_never_know_less(of_law):
 
 
 def test_information_follows_the_noise(drives, of_law):
-    doubled = candidates_of(law_belief(), drives, noise=2.0 * NOISE)
+    doubled = candidates_of(law_prior(), drives, noise=2.0 * NOISE)
     # the instantaneous law has no error of its own: variances are those of the noise
     np.testing.assert_allclose(4.0 * doubled.information, of_law.candidates.information, rtol=1e-12)
 
 
 def test_one_amplitude_tells_less_than_two(drives, of_law):
-    peak = candidates_of(law_belief(), drives, noise=NOISE, amplitudes="peak")
-    lockin = candidates_of(law_belief(), drives, noise=NOISE, amplitudes="lockin")
+    peak = candidates_of(law_prior(), drives, noise=NOISE, amplitudes="peak")
+    lockin = candidates_of(law_prior(), drives, noise=NOISE, amplitudes="lockin")
     np.testing.assert_allclose(peak.information + lockin.information, of_law.candidates.information, rtol=1e-12)
     assert not np.isfinite(peak.error_nm[:, 1]).any()
 
@@ -199,15 +199,15 @@ def test_drives_are_left_out_for_a_reason(drives, of_law):
     exact = other_amplitudes(drives)
     missing = [why == "no orbit" for why in of_law.candidates.why_not]
     assert missing == np.isnan(exact[:, 0]).tolist()
-    limited = candidates_of(law_belief(), drives, noise=NOISE, largest_nm=100.0)
+    limited = candidates_of(law_prior(), drives, noise=NOISE, largest_nm=100.0)
     assert np.nanmax(exact[limited.usable, 0]) <= 100.0
     assert limited.left_out["too large"] > 0
     sure, unsure = (
-        candidates_of(law_belief(uncertainty=share), drives, noise=NOISE).usable.sum() for share in (0.01, 0.9)
+        candidates_of(law_prior(uncertainty=share), drives, noise=NOISE).usable.sum() for share in (0.01, 0.9)
     )
     assert unsure < sure
     weak = drive_grid(orders=(1,), amplitudes_nm=(1e-3,), frequencies_khz=(175.0, 180.0))
-    nothing = design(law_belief(), weak)
+    nothing = design(law_prior(), weak)
     assert not nothing.valid
     assert "No drive can be planned with" in nothing.reasons[0]
 
@@ -215,24 +215,24 @@ def test_drives_are_left_out_for_a_reason(drives, of_law):
 def test_a_fit_is_added_to(drives, of_law):
     exact = other_amplitudes(of_law.drives)
     result = fit(table_of(of_law.drives, exact), "law")
-    belief = belief_of_fit(result)
-    again = design(belief, drives, points=3, noise=NOISE)
+    prior = prior_of_fit(result)
+    again = design(prior, drives, points=3, noise=NOISE)
     for name, parameter in result.parameters.items():
         # a covariance through its correlations and back
         np.testing.assert_allclose(error_of(again.measured_so_far[name]), error_of(parameter), rtol=1e-6)
     assert again.candidates.left_out["measured"] == 5
     assert not {*again.chosen.tolist()} & {*of_law.chosen.tolist()}
     # as good as both measured at once
-    together = of_law.belief.information + of_law.candidates.information[[*of_law.chosen, *again.chosen]].sum(axis=0)
+    together = of_law.prior.information + of_law.candidates.information[[*of_law.chosen, *again.chosen]].sum(axis=0)
     wanted = np.sqrt(np.diag(np.linalg.inv(together)))
     # the fit ends within 1e-5 standard errors of the believed law
     np.testing.assert_allclose(again.errors[-1], wanted, rtol=1e-3)
 
 
 def test_an_unsure_cantilever_is_named(drives):
-    loose = design(law_belief(constraints={"quality_factor": (40.0, 8.0)}), drives, points=6)
+    loose = design(law_prior(constraints={"quality_factor": (40.0, 8.0)}), drives, points=6)
     assert any("Most of the error comes from quality_factor" in warning for warning in loose.warnings)
-    assert any("exactly known" in note for note in law_belief(constraints={}).notes)
+    assert any("exactly known" in note for note in law_prior(constraints={}).notes)
 
 
 @pytest.mark.parametrize("correlation", [1.0, -1.0, 1.5])
@@ -249,7 +249,7 @@ def test_a_saved_fit_whose_correlations_contradict_each_other_is_refused(correla
         "input": columns | {"free_frequency_khz": 90.0},
     }
     with pytest.raises(ValueError, match="correlations contradict each other"):
-        belief_of_fit(payload)
+        prior_of_fit(payload)
 
 
 @pytest.mark.slow
@@ -262,7 +262,7 @@ def test_drives_have_orbits_in_a_truth_that_is_a_little_off():
         detunings=np.linspace(0.9, 1.1, 21),
         free_frequency_khz=90.0,
     )
-    sure = law_belief()
+    sure = law_prior()
     sure = replace(sure, information=sure.information + np.diag([1e10, 1e4, 1e2]))
     found = design(sure, drives, points=8)
     chosen = Drives(*(column[found.chosen] for column in found.candidates.drives))

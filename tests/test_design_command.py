@@ -6,7 +6,7 @@ import json
 import pytest
 from click.testing import CliRunner
 
-from afm_jax.cli.design_belief import BeliefOptions, believed
+from afm_jax.cli.design_prior import PriorOptions, prior_of_options
 from afm_jax.cli.main import main
 from fitting import fit, read_table
 from tests.fit_tables import EXAMPLE, rows
@@ -112,8 +112,8 @@ def test_a_measured_table_is_fitted_first(tmp_path):
     found = run("--measured", path, "--model", "law", *grid, "--points", 1, "--json")
     assert found.exit_code == 0, found.stderr
     answer = strictly(found.stdout)
-    assert answer["belief"]["rows_measured"] == 20
-    assert answer["belief"]["source"] == f"fit of {path}"
+    assert answer["prior"]["rows_measured"] == 20
+    assert answer["prior"]["source"] == f"fit of {path}"
     # what is in the table already is not planned again
     assert answer["left_out"]["measured"] == 1
     assert [point["offset_nm"] for point in answer["points"]] == [table.offset_nm[0] + 0.125]
@@ -138,9 +138,9 @@ def test_too_few_points_determine_nothing():
 
 
 def test_what_is_held_is_not_forecast():
-    options = BeliefOptions(
+    options = PriorOptions(
         None, None, "full", 0.1, None, None, {"free_frequency_khz": (90.0, None), "fix": (("r", 0.9),)}
     )
-    belief = believed(options, 0.01)
-    assert belief.problem.names == ("epsilon", "viscous_loss")
-    assert belief.fixed == {"r": 0.9}
+    prior = prior_of_options(options, 0.01)
+    assert prior.problem.names == ("epsilon", "viscous_loss")
+    assert prior.fixed == {"r": 0.9}

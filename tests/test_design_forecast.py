@@ -8,7 +8,7 @@ from scipy.stats import chi2, kstest, norm
 
 from afm_jax.apparatus.cantilever import Cantilever
 from afm_jax.impact.law import CollisionDelay, ImpactLaw
-from fitting import believe, design, drive_grid, fit, simulate_experiment
+from fitting import design, drive_grid, fit, prior_of_values, simulate_experiment
 from fitting.experiments.design import standard_errors
 from fitting.experiments.result import Design
 from fitting.fits.objective import BATCH, Objective
@@ -36,7 +36,7 @@ def tapping_design() -> Design:
         free_frequency_khz=90.0,
         drive="force",
     )
-    belief = believe(
+    prior = prior_of_values(
         "viscous+delay",
         free_frequency_khz=90.0,
         quality_factor=200.0,
@@ -45,7 +45,7 @@ def tapping_design() -> Design:
         constraints=KNOWN,
         drive="force",
     )
-    return design(belief, drives, points=14, noise=2e-4, phase_noise_deg=0.01)
+    return design(prior, drives, points=14, noise=2e-4, phase_noise_deg=0.01)
 
 
 @pytest.fixture(scope="module", params=["sample", "force"])
@@ -59,23 +59,23 @@ def designed(request) -> Design:
         detunings=(0.98, 0.99, 1.0, 1.02),
         free_frequency_khz=90.0,
     )
-    belief = believe(
+    prior = prior_of_values(
         "law+delay",
         free_frequency_khz=90.0,
         quality_factor=40.0,
         values=VALUES,
         constraints={"quality_factor": (40.0, 0.4)},
     )
-    return design(belief, drives, points=14, noise=0.003)
+    return design(prior, drives, points=14, noise=0.003)
 
 
 def by_noise(result: Design) -> np.ndarray:
     """Standard errors after all points if the law were the model's own, without what that leaves out."""
-    return standard_errors(result.belief.information + result.candidates.information[result.chosen].sum(axis=0))
+    return standard_errors(result.prior.information + result.candidates.information[result.chosen].sum(axis=0))
 
 
 def exact_table(result: Design) -> AmplitudeTable:
-    """Return the readings that the belief expects at the points, without noise."""
+    """Return the readings that the prior expects at the points, without noise."""
     drives, found = result.drives, result.candidates
     if result.tapping:
         (_, lockin, lag), (_, lockin_error, lag_error) = (
@@ -117,13 +117,13 @@ def exact_table(result: Design) -> AmplitudeTable:
 @pytest.fixture(scope="module")
 def refitted(designed) -> np.ndarray:
     """The values (experiments, p) that Gauss-Newton steps find for data with noise, Q measured anew each time."""
-    belief, errors = designed.belief, by_noise(designed)
-    searching = Objective(measurement_of(exact_table(designed), belief.problem), belief.problem)
-    objective = searching.following(belief.values)
+    prior, errors = designed.prior, by_noise(designed)
+    searching = Objective(measurement_of(exact_table(designed), prior.problem), prior.problem)
+    objective = searching.following(prior.values)
     random = np.random.default_rng(11)
     answers = []
     for _ in range(EXPERIMENTS // BATCH):
-        values, step, noise = np.repeat(belief.values[None], BATCH, axis=0), np.zeros(0), np.zeros(0)
+        values, step, noise = np.repeat(prior.values[None], BATCH, axis=0), np.zeros(0), np.zeros(0)
         for count in range(STEPS):
             linear = objective.at_values(values)
             jacobian = np.asarray(linear.jacobian) * errors
@@ -159,7 +159,7 @@ def test_the_forecast_is_what_a_fit_states(designed):
     )
     result = fit(table, "law+delay")
     assert result.valid
-    stated = np.array([result.parameters[name].standard_error for name in designed.belief.problem.names], float)
+    stated = np.array([result.parameters[name].standard_error for name in designed.prior.problem.names], float)
     # the fit ends beside the believed law: its loss has a viscous part of its own
     np.testing.assert_allclose(designed.errors[-1], stated, rtol=0.05)
     assert np.all(designed.errors[-1] > by_noise(designed))
@@ -169,11 +169,11 @@ def test_scatter_is_the_forecast(designed, refitted):
     ratio = refitted.var(axis=0) / by_noise(designed) ** 2
     # once in ten thousand of right forecasts would lie outside on either side
     low, high = chi2.ppf([1e-4, 1.0 - 1e-4], EXPERIMENTS - 1) / (EXPERIMENTS - 1)
-    assert np.all((low < ratio) & (ratio < high)), dict(zip(designed.belief.problem.names, ratio, strict=True))
+    assert np.all((low < ratio) & (ratio < high)), dict(zip(designed.prior.problem.names, ratio, strict=True))
 
 
 def test_intervals_hold_the_truth(designed, refitted):
-    pulls = (refitted - designed.belief.values) / by_noise(designed)
+    pulls = (refitted - designed.prior.values) / by_noise(designed)
     covered = np.mean(np.abs(pulls) < norm.ppf(0.975), axis=0)
     # 95 % +- 1.5 %: four standard deviations
     assert np.all(np.abs(covered - 0.95) < 0.062), covered
@@ -182,10 +182,10 @@ def test_intervals_hold_the_truth(designed, refitted):
 
 
 def test_joint_scatter_is_the_forecast(designed, refitted):
-    information = designed.belief.information + designed.candidates.information[designed.chosen].sum(axis=0)
-    miss = refitted - designed.belief.values
+    information = designed.prior.information + designed.candidates.information[designed.chosen].sum(axis=0)
+    miss = refitted - designed.prior.values
     distance = np.einsum("sp,pq,sq->s", miss, information, miss)
-    assert kstest(distance, chi2(len(designed.belief.values)).cdf).pvalue > 1e-3
+    assert kstest(distance, chi2(len(designed.prior.values)).cdf).pvalue > 1e-3
 
 
 def test_readings_of_tapping_points_are_those_of_the_motion_in_time(designed):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from afm_jax.cli.values import Numbers, Orders, ValueAndError, parse_numbers, parse_orders
-from fitting import believe
+from fitting import prior_of_values
 from fitting.experiments.candidates import drive_grid, same_drives
 
 
@@ -99,13 +99,13 @@ def test_wrong_values_are_refused(text):
 
 def test_a_frequency_is_believed_to_its_error_and_no_share_of_it():
     known = {"quality_factor": (200.0, 2.0), "free_frequency_khz": (90.0, 0.01)}
-    belief = believe("law", free_frequency_khz=90.0, quality_factor=200.0, constraints=known, drive="base")
-    drawn = belief.draws(200, least=0.05)[:, belief.problem.names.index("free_frequency_khz")]
+    prior = prior_of_values("law", free_frequency_khz=90.0, quality_factor=200.0, constraints=known, drive="base")
+    drawn = prior.draws(200, least=0.05)[:, prior.problem.names.index("free_frequency_khz")]
     assert np.std(drawn) == pytest.approx(0.01, rel=0.5)
 
 
 def test_what_is_assumed_of_the_papers_contact_goes_with_the_mass():
-    light, heavy = (believe("viscous+delay", free_frequency_khz=90.0, mass_ng=mass) for mass in (1.0, 16.0))
+    light, heavy = (prior_of_values("viscous+delay", free_frequency_khz=90.0, mass_ng=mass) for mass in (1.0, 16.0))
     ratio = dict(zip(light.problem.names, heavy.values / light.values, strict=True))
     # a loss of squared speed is an energy over m; the Hertz time goes with m^(2/5)
     wanted = {"epsilon": 1.0 / 16.0, "viscous_loss": 1.0 / 16.0, "delay_hertz": 16.0**0.4, "delay_lead_nm": 1.0}

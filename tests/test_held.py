@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from afm_jax.contact.parameters import CONTACT_PARAMETERS, EFFECTS
-from fitting.fits.unmodelled import Held, HeldEffect, Unmodelled, held_of, split_held, step_of
+from fitting.fits.discrepancy import Held, HeldEffect, ModelDiscrepancy, held_of, split_held, step_of
 from fitting.models import Problem
-from tests.test_unmodelled import LEFT_OUT, VALUES, rows
+from tests.test_discrepancy import LEFT_OUT, VALUES, rows
 
 OWN = ("relative_humidity", "modulus_gpa")
 __all__ = ["rows"]
@@ -52,7 +52,7 @@ def test_the_error_of_what_is_held_is_one_more_unknown_of_the_law(rows):
     jacobian = rows.jacobian.copy()
     jacobian[:-1, 0] = -rows.slopes.by_square.ravel()
     rows = rows._replace(jacobian=jacobian)
-    other = Unmodelled(problem, VALUES, LEFT_OUT.speeds, held=(of_epsilon,))
+    other = ModelDiscrepancy(problem, VALUES, LEFT_OUT.speeds, held=(of_epsilon,))
     alone, held = step_of(rows, LEFT_OUT, free), step_of(rows, other, free)
     # a standard error of it takes 7 off the squared rebound speed, as 7 of epsilon do, which it makes up for
     assert held.covariance[0, 0] - alone.covariance[0, 0] == pytest.approx(49.0, rel=1e-4)

@@ -9,7 +9,7 @@ import afm_jax as afm
 from fitting import fit, read_table
 from fitting.examples.make_contact_amplitudes import EXAMPLE, example_drives
 from fitting.fits.fit import problem_of
-from fitting.fits.minimum import relaxed, strain_of
+from fitting.fits.minimum import model_errors_of, with_inflated_errors
 from fitting.fits.objective import Objective
 from fitting.fits.result import FitResult
 from fitting.models import measurement_of
@@ -54,8 +54,8 @@ def test_a_law_that_captures_nothing_has_a_finite_model_error(shared):
     problem = problem_of(shared, "viscous+delay")
     stated = Objective(measurement_of(shared, problem), problem)
     values = {"epsilon": 0.0, "viscous_loss": 0.0, "delay_hertz": 0.2, "delay_lead_nm": 6.0, "delay_offset_nm": 0.5}
-    strain = strain_of(stated, np.array([values.get(name, 40.0) for name in problem.names]))
-    assert np.all(np.isfinite(strain.model_error))
+    model_errors = model_errors_of(stated, np.array([values.get(name, 40.0) for name in problem.names]))
+    assert np.all(np.isfinite(model_errors.model_error))
 
 
 def amplitude_chi2(table: AmplitudeTable) -> tuple[np.ndarray, Any]:
@@ -64,7 +64,7 @@ def amplitude_chi2(table: AmplitudeTable) -> tuple[np.ndarray, Any]:
     known = PAPER | {"quality_factor": 40.0}
     values = np.array([known[name] for name in problem.names])
     stated = Objective(measurement_of(table, problem), problem)
-    objective = relaxed(stated, strain_of(stated, values))
+    objective = with_inflated_errors(stated, model_errors_of(stated, values))
     used = np.all(np.asarray(objective.measurement.rows.measured)[: table.rows], axis=1)
     return objective.amplitude_residuals(values)[: table.rows] ** 2, used
 

@@ -92,7 +92,7 @@ def test_every_kind_of_fit_is_a_valid_page(model, valid):
     assert all(figure(fit).axes for figure in (rows_figure, law_figure, speed_figure))
     seen = first_screen(root)
     assert ("NOT VALID" in seen) is not valid
-    assert ("You can believe it" in seen) is valid
+    assert ("You can trust it" in seen) is valid
     assert valid or "a < b" in seen
     assert ("no band can be given" in seen) is not valid
 

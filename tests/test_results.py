@@ -358,7 +358,7 @@ def test_results_of_computations_come_back_with_pictures(tmp_path: Path):
         "fit": fitted,
         "inversion": fitting.invert(table),
         "design": fitting.design(
-            fitting.believe("law", free_frequency_khz=90.0, quality_factor=40.0),
+            fitting.prior_of_values("law", free_frequency_khz=90.0, quality_factor=40.0),
             fitting.drive_grid(
                 orders=(1,), amplitudes_nm=(2.0, 4.0), offsets_nm=(0.0,), detunings=(0.98, 1.0), free_frequency_khz=90.0
             ),

@@ -14,12 +14,12 @@ import fitting
 from afm_jax.cli.main import main
 from afm_jax.impact.law import ImpactLaw
 from afm_jax.saved import save
-from fitting.experiments.belief import belief_of_fit
+from fitting.experiments.prior import prior_of_fit
+from fitting.fits.discrepancy import StepSystem
 from fitting.fits.fit import fit
 from fitting.fits.objective import Objective
 from fitting.fits.result import FitResult, FittedTable, Scatter
 from fitting.fits.several import Parts, departures_of, parts_of, pulls_of, scatter_between
-from fitting.fits.unmodelled import StepSystem
 from fitting.models import Problem, measurement_of
 from fitting.report.html import fit_page
 from fitting.report.report import row_records, summary
@@ -218,12 +218,12 @@ def test_reports_say_each_tables_pull(tmp_path: Path):
     assert [table["pull"] for table in told["tables"]] == [1.25, None]
     assert [table["source"] for table in told["input"]["tables"]] == ["a.csv", "b.csv"]
     assert told["scatter"]["r"]["interval95"] == [0.01, None]
-    # saved and read again, and as a belief
+    # saved and read again, and as a prior
     save(result, tmp_path / "fit.json")
     again = fitting.load(tmp_path / "fit.json")
     assert again.tables[0].pulls == {"r": -0.5, "epsilon": None}
     assert again.table.labels == ("a.csv", "b.csv")
-    assert belief_of_fit(json.loads((tmp_path / "fit.json").read_text())).measured.shape == (8, 4)
+    assert prior_of_fit(json.loads((tmp_path / "fit.json").read_text())).measured.shape == (8, 4)
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from fitting.fits.objective import Objective
 from fitting.report.report import write_report
 from fitting.sampling import rank_calibration
 from fitting.sampling.bootstrap import BatchFit, Refit
-from fitting.sampling.draws import believe_draws, densities, noise_of, refit_of_rows
+from fitting.sampling.draws import densities, noise_of, posterior_draws, refit_of_rows
 from fitting.sampling.influence import _moves
 from fitting.sampling.leave_one_out import leave_one_out, pareto_smoothed
 from fitting.sampling.posterior_result import PosteriorChains, posterior_of_chains
@@ -113,13 +113,13 @@ def pack(believed):
 
 
 def values_believed(believed) -> np.ndarray:
-    return believe_draws(*believed).values.reshape(-1, 3)
+    return posterior_draws(*believed).values.reshape(-1, 3)
 
 
 @pytest.mark.slow
 def test_draws_from_a_grid_are_the_posteriors(believed):
     result, found = believed
-    drawn = believe_draws(result, found)
+    drawn = posterior_draws(result, found)
     flat = drawn.values.reshape(-1, 3)
     for k, name in enumerate(drawn.names):
         # 1000 draws: a mean to 0.03 deviations, a width to 2.2 %; four times that, and 0.5 % of the triangles
@@ -133,7 +133,7 @@ def test_draws_from_a_grid_are_the_posteriors(believed):
 @pytest.mark.slow
 def test_likelihoods_are_those_of_another_programs_amplitudes(believed):
     result, found = believed
-    drawn = believe_draws(result, found)
+    drawn = posterior_draws(result, found)
     r, epsilon, quality = drawn.values[2, 7]
     table = result.table
     predicted = steady_amplitudes(table, ImpactLaw(float(r), float(epsilon)), quality_factor=float(quality))

@@ -5,7 +5,7 @@ from functools import partial
 from typing import Any
 
 from afm_jax.cli.command import Output
-from afm_jax.cli.design_belief import BeliefOptions, believed
+from afm_jax.cli.design_prior import PriorOptions, prior_of_options
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Numbers, Orders
 from fitting.experiments.candidates import drive_grid
@@ -19,7 +19,7 @@ _SAMPLE = {"orders": "1-4", "detuning": "0.97:1.05:0.01", "drive_nm": "2,4,7,10"
 def planned(  # noqa: PLR0913
     session: Session,
     *,
-    belief_options: BeliefOptions,
+    prior_options: PriorOptions,
     frequencies_khz: tuple[float, ...] | None,
     largest_nm: float | None,
     points: int,
@@ -32,8 +32,8 @@ def planned(  # noqa: PLR0913
 ) -> Output:
     """Return the drives to measure next, of all combinations of the lists, and what they will determine."""
     with session.working("forecasting (the first run compiles for some seconds)"):
-        belief = believed(belief_options, noise)
-        chosen = _with_defaults(lists, tapping=belief.problem.tapping)
+        prior = prior_of_options(prior_options, noise)
+        chosen = _with_defaults(lists, tapping=prior.problem.tapping)
         drives = drive_grid(
             orders=chosen["orders"],
             amplitudes_nm=chosen["drive_nm"],
@@ -41,12 +41,12 @@ def planned(  # noqa: PLR0913
             heights=chosen["heights"],
             frequencies_khz=frequencies_khz,
             detunings=chosen["detuning"] if frequencies_khz is None else None,
-            free_frequency_khz=belief.free_frequency_khz,
-            drive=belief.problem.drive,
+            free_frequency_khz=prior.free_frequency_khz,
+            drive=prior.problem.drive,
         )
         names = None if interest is None else tuple(name.strip().replace("-", "_") for name in interest.split(","))
         result = design(
-            belief,
+            prior,
             drives,
             points=points,
             noise=noise,

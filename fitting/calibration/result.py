@@ -105,7 +105,7 @@ class Calibration(Result):
         convergence: what the checks of the minimum found.
         alternatives: the other backgrounds.
         curves: fit and residuals, point by point.
-        valid: whether to believe it; `reasons` say why not.
+        valid: whether to trust it; `reasons` say why not.
         reasons: what makes the result invalid.
         warnings: what a reader should know besides.
         sweep: what was fitted.

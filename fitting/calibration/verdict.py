@@ -1,4 +1,4 @@
-"""Whether to believe a calibration, in words: what makes it invalid, and what a reader should know besides.
+"""Whether to trust a calibration, in words: what makes it invalid, and what a reader should know besides.
 
 Patterns in the residuals of the sweep that chance does not bring about belong to it.
 """

@@ -8,11 +8,11 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from afm_jax.checks import check_parameter, checked
 from afm_jax.least_squares import covariance_of
-from fitting.experiments.belief import Belief, size_of
+from fitting.experiments.prior import Prior, size_of
+from fitting.fits.discrepancy import ModelDiscrepancy, rows_of_fit, step_of
 from fitting.fits.fit import member_after, speed_range
-from fitting.fits.minimum import padding, strain_of
+from fitting.fits.minimum import model_errors_of, padding
 from fitting.fits.objective import BATCH, Objective
-from fitting.fits.unmodelled import Unmodelled, rows_of_fit, step_of
 from fitting.forward import ImpactSlopes
 from fitting.models import Measurement, measurement_of
 from fitting.simulated.experiment import Drives
@@ -140,9 +140,9 @@ LEFT_OUT = {
     "no orbit": "no steady single-impact orbit",
     "several orbits": "several steady orbits: which one is seen depends on the start",
     "fold": "near a fold, where the orbit ends and has no derivative",
-    "unsure": "no single steady orbit for some of the values that the belief, or a law's own misfit, allows",
+    "unsure": "no single steady orbit for some of the values that the prior, or a law's own misfit, allows",
     "too large": "amplitudes above what the instrument takes",
-    "strained": "impacts too slow, or too strongly pulled, for the model: a fit sets such rows aside",
+    "inaccurate": "impacts too slow, or too strongly pulled, for the model: a fit sets such rows aside",
 }
 """Why a drive is no candidate, in words."""
 
@@ -185,7 +185,7 @@ class Candidates:
 
 
 def candidates_of(
-    belief: Belief,
+    prior: Prior,
     drives: Drives,
     *,
     noise: float,
@@ -196,7 +196,7 @@ def candidates_of(
     """Return what a measurement at every drive would say, by derivatives of the predicted readings.
 
     Args:
-        belief: the law and the instrument; orbits must be there for values as uncertain as it is.
+        prior: the law and the instrument; orbits must be there for values as uncertain as it is.
         drives: what can be driven.
         noise: standard error of an amplitude relative to it.
         amplitudes: what is read: "peak", "lockin" or "both"; of a cantilever that is driven itself always the lock-in
@@ -204,17 +204,17 @@ def candidates_of(
         largest_nm: peak amplitude that the instrument takes; of a cantilever that is driven itself the free one.
         phase_noise_deg: standard error of the lag in degrees.
     """
-    objective = Objective(_measurement(belief, drives, amplitudes), belief.problem)
-    linear = objective.at_values(belief.draws(BATCH, least=MARGIN))
-    count, tapping = len(drives.order), belief.problem.tapping
+    objective = Objective(_measurement(prior, drives, amplitudes), prior.problem)
+    linear = objective.at_values(prior.draws(BATCH, least=MARGIN))
+    count, tapping = len(drives.order), prior.problem.tapping
     prediction = linear.prediction
     expected = np.asarray(prediction.amplitude_nm)[0]
     # the model's own error goes with what is read
-    strain = strain_of(
-        objective.with_rows(amplitude_nm=np.where(expected, expected, 1.0)) if tapping else objective, belief.values
+    model_errors = model_errors_of(
+        objective.with_rows(amplitude_nm=np.where(expected, expected, 1.0)) if tapping else objective, prior.values
     )
     amplitude, kinds = expected[:count], expected.shape[1]
-    own = padding(strain.model_error, expected)[:count]
+    own = padding(model_errors.model_error, expected)[:count]
     read = np.array([False, True, True] if tapping else [amplitudes != "lockin", amplitudes != "peak"])
     stated = _stated(amplitude, noise, phase_noise_deg)
     error = np.where(read, np.hypot(stated, own), np.inf)
@@ -222,13 +222,13 @@ def candidates_of(
     orbits = np.asarray(prediction.orbits)[:, :count]
     fold = np.asarray(prediction.near_fold)[:, :count]
     holds = {
-        "measured": same_drives(drives, belief.measured),
+        "measured": same_drives(drives, prior.measured),
         "no orbit": orbits[0] == 0,
         "several orbits": orbits[0] > 1,
         "fold": fold[0] | ~np.isfinite(raw).all(axis=(1, 2)),
         "unsure": np.any((orbits != 1) | fold, axis=0),
         "too large": (drives.amplitude_nm if tapping else amplitude[:, 0]) > largest_nm,
-        "strained": strain.set_aside[:count],
+        "inaccurate": model_errors.set_aside[:count],
     }
     why_not = tuple(next((name for name in LEFT_OUT if holds[name][row]), USABLE) for row in range(count))
     usable = np.array([reason == USABLE for reason in why_not])
@@ -243,12 +243,12 @@ def candidates_of(
     )
 
 
-def _measurement(belief: Belief, drives: Drives, amplitudes: str) -> Measurement:
+def _measurement(prior: Prior, drives: Drives, amplitudes: str) -> Measurement:
     """Return the drives as a measurement of 1 nm with an error of 1 nm: its Jacobian is that of the amplitudes."""
-    columns = 3 if belief.problem.tapping else 2
+    columns = 3 if prior.problem.tapping else 2
     one = np.ones((len(drives.order), columns))
-    read = [False, True, True] if belief.problem.tapping else [amplitudes != "lockin", amplitudes != "peak"]
-    return _measured(belief, drives, np.where(read, one, np.nan), one)
+    read = [False, True, True] if prior.problem.tapping else [amplitudes != "lockin", amplitudes != "peak"]
+    return _measured(prior, drives, np.where(read, one, np.nan), one)
 
 
 def _stated(
@@ -260,27 +260,27 @@ def _stated(
 
 
 def _measured(
-    belief: Belief, drives: Drives, amplitude: Float[np.ndarray, "rows k"], error: Float[np.ndarray, "rows k"]
+    prior: Prior, drives: Drives, amplitude: Float[np.ndarray, "rows k"], error: Float[np.ndarray, "rows k"]
 ) -> Measurement:
     """Return readings (a column of NaN: not read) with their errors as a measurement."""
-    tapping, columns = belief.problem.tapping, {}
+    tapping, columns = prior.problem.tapping, {}
     columns["free_amplitude_nm" if tapping else "drive_amplitude_nm"] = drives.amplitude_nm
     kinds = (("peak_amplitude", "nm"), ("lockin_amplitude", "nm"), ("phase_lag", "deg"))
     for i, (name, unit) in enumerate(kinds[: amplitude.shape[1]]):
         if np.isfinite(amplitude[:, i]).all():
             columns |= {f"{name}_{unit}": amplitude[:, i], f"{name}_error_{unit}": error[:, i]}
     table = AmplitudeTable(
-        drive=belief.problem.drive,
+        drive=prior.problem.drive,
         order=drives.order,
         drive_frequency_khz=drives.frequency_khz,
         offset_nm=drives.offset_nm,
-        free_frequency_khz=belief.free_frequency_khz,
-        quality_factor=belief.quality_factor,
-        mass_ng=belief.mass_ng,
+        free_frequency_khz=prior.free_frequency_khz,
+        quality_factor=prior.quality_factor,
+        mass_ng=prior.mass_ng,
         source="the drives",
         **columns,
     )
-    found = measurement_of(table, belief.problem, fixed=belief.fixed)
+    found = measurement_of(table, prior.problem, fixed=prior.fixed)
     if not tapping:
         return found
     # nothing was read that could tell which rows are free
@@ -290,7 +290,7 @@ def _measured(
 
 
 def forecast(
-    belief: Belief,
+    prior: Prior,
     candidates: Candidates,
     chosen: Int[np.ndarray, " points"],
     noise: float,
@@ -299,17 +299,17 @@ def forecast(
     """Return the standard errors that a fit will state, before and after each chosen point.
 
     Where impacts last these contain what the model leaves out, by the same step as after a fit, anew for these points,
-    and are those of the formula that is then closest to the law. A belief that a fit left is of that formula already.
+    and are those of the formula that is then closest to the law. A prior that a fit left is of that formula already.
 
     Args:
-        belief: the law and the instrument.
+        prior: the law and the instrument.
         candidates: all drives.
         chosen: numbers of the points.
         noise: standard error of an amplitude relative to it.
         phase_noise_deg: standard error of a lag in degrees.
     """
-    problem, each = belief.problem, candidates.information[chosen]
-    steps = belief.information + np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each, axis=0)])
+    problem, each = prior.problem, candidates.information[chosen]
+    steps = prior.information + np.concatenate([np.zeros((1, *each.shape[1:])), np.cumsum(each, axis=0)])
     errors = np.array([np.sqrt(np.diag(covariance_of(information))) for information in steps])
     if not problem.lasting or not chosen.size:
         return errors
@@ -317,13 +317,13 @@ def forecast(
     amplitude = candidates.amplitude_nm[chosen]
     read = np.where(np.isfinite(candidates.error_nm[chosen]), amplitude, np.nan)
     stated = _stated(amplitude, noise, phase_noise_deg)
-    objective = Objective(_measured(belief, drives, read, stated), problem)
-    strain = strain_of(objective, belief.values)
-    rows = rows_of_fit(objective, objective.following(belief.values), belief.values, strain, 1.0)
-    values = belief.fixed | dict(zip(problem.names, belief.values.tolist(), strict=True))
-    left_out = Unmodelled(problem, values, speed_range(rows.approach[: len(chosen)]), belief.mass_ng or 1.0)
-    size = np.array([size_of(p, v) for p, v in zip(problem.parameters, belief.values.tolist(), strict=True)])
-    known, axes = np.linalg.eigh(size[:, None] * belief.information * size)
+    objective = Objective(_measured(prior, drives, read, stated), problem)
+    model_errors = model_errors_of(objective, prior.values)
+    rows = rows_of_fit(objective, objective.following(prior.values), prior.values, model_errors, 1.0)
+    values = prior.fixed | dict(zip(problem.names, prior.values.tolist(), strict=True))
+    discrepancy = ModelDiscrepancy(problem, values, speed_range(rows.approach[: len(chosen)]), prior.mass_ng or 1.0)
+    size = np.array([size_of(p, v) for p, v in zip(problem.parameters, prior.values.tolist(), strict=True)])
+    known, axes = np.linalg.eigh(size[:, None] * prior.information * size)
     known = np.sqrt(np.maximum(known, 0.0))[:, None] * axes.T / size
     readings, free = rows.measurement_error.shape, np.ones(len(size), dtype=bool)
     by_row = rows.jacobian[: rows.measurement_error.size].reshape(*readings, -1)
@@ -333,11 +333,11 @@ def forecast(
         jacobian = np.concatenate([(seen[..., None] * by_row).reshape(-1, len(size)), known])
         slopes = ImpactSlopes(*(seen * part for part in rows.slopes))
         some = rows._replace(slopes=slopes, jacobian=jacobian, residual=np.zeros(len(jacobian)))
-        step = step_of(some, left_out, free)
+        step = step_of(some, discrepancy, free)
         covariance = step.covariance
-        if not len(belief.measured):
+        if not len(prior.measured):
             speeds = rows.approach[:count]
-            member = member_after(step, left_out, objective.measurement, belief.values, speeds, free, computed=False)
+            member = member_after(step, discrepancy, objective.measurement, prior.values, speeds, free, computed=False)
             covariance = covariance if member is None else member.covariance
         errors[count] = np.sqrt(np.diag(covariance))[: len(size)]
     return errors

@@ -15,8 +15,8 @@ from afm_jax.checks import checked, require_float64
 from afm_jax.impact.law import extrapolation_of
 from afm_jax.least_squares import covariance_of
 from afm_jax.version import version_of
-from fitting.experiments.belief import Belief, belief_of_fit, size_of
 from fitting.experiments.candidates import AMPLITUDES, LEFT_OUT, PHASE_NOISE_DEG, Candidates, candidates_of, forecast
+from fitting.experiments.prior import Prior, prior_of_fit, size_of
 from fitting.experiments.result import Design
 from fitting.fits.result import FitResult
 from fitting.parameters import DELAY_NAMES, NUISANCE_NAMES
@@ -145,7 +145,7 @@ _ROUGH = 0.5
 
 
 def judge_design(
-    belief: Belief,
+    prior: Prior,
     candidates: Candidates,
     chosen: Int[np.ndarray, " points"],
     reached: Float[np.ndarray, "p p"],
@@ -156,7 +156,7 @@ def judge_design(
     """Return what makes a design invalid, and its warnings; each a sentence.
 
     Args:
-        belief: what it rests on.
+        prior: what it rests on.
         candidates: among which was chosen.
         chosen: their numbers.
         reached: information after all points, by noise alone.
@@ -164,40 +164,40 @@ def judge_design(
         wanted: the parameters that matter.
         points: how many were asked for.
     """
-    names = belief.problem.names
+    names = prior.problem.names
     errors = dict(zip(names, forecasts.tolist(), strict=True))
     unknown = [name for name in wanted if not np.isfinite(errors[name])]
     if not len(chosen):
         counts = [f"{LEFT_OUT[name]}: {count}" for name, count in candidates.left_out.items()]
-        return [f"No drive can be planned with ({'; '.join(counts)}); try others."], list(belief.notes)
+        return [f"No drive can be planned with ({'; '.join(counts)}); try others."], list(prior.notes)
     reasons = []
     if unknown:
         reasons.append(
             f"The chosen points do not determine {' and '.join(unknown)}: choose more points, or drives at more "
             "frequencies, amplitudes, orders or offsets."
         )
-    warnings = list(belief.notes)
+    warnings = list(prior.notes)
     if len(chosen) < points:
         warnings.append(f"Only {len(chosen)} of the {points} points asked for can be planned with: all are chosen.")
-    warnings += _dominated(belief, reached, wanted)
+    warnings += _dominated(prior, reached, wanted)
     for name in wanted:
         index = names.index(name)
-        size = size_of(belief.problem.parameters[index], float(belief.values[index]))
+        size = size_of(prior.problem.parameters[index], float(prior.values[index]))
         if np.isfinite(errors[name]) and errors[name] > _ROUGH * size:
             what = "1 - r" if name == "r" else name
             warnings.append(
                 f"The forecast for {name} is rough: its error is {errors[name] / size:.0%} of {what} itself. Expect a "
                 "one-sided limit rather than a value."
             )
-    warnings += _edges(candidates, chosen, tapping=belief.problem.tapping)
-    beyond = extrapolation_of(belief.law, candidates.approach_speed_nm_per_us[chosen])
+    warnings += _edges(candidates, chosen, tapping=prior.problem.tapping)
+    beyond = extrapolation_of(prior.law, candidates.approach_speed_nm_per_us[chosen])
     warnings += [] if beyond is None else [beyond]
     return reasons, warnings
 
 
-def _dominated(belief: Belief, information: Float[np.ndarray, "p p"], wanted: tuple[str, ...]) -> list[str]:
+def _dominated(prior: Prior, information: Float[np.ndarray, "p p"], wanted: tuple[str, ...]) -> list[str]:
     """Name the quantities of the instrument whose uncertainty is most of the error of a parameter that matters."""
-    names = belief.problem.names
+    names = prior.problem.names
     errors = dict(zip(names, standard_errors(information).tolist(), strict=True))
     warnings = []
     for nuisance in (name for name in names if name in NUISANCE_NAMES and name not in wanted):
@@ -236,7 +236,7 @@ _PACKAGES = ("afm-jax", "jax", "numpy")
 
 @checked
 def design(  # noqa: PLR0913
-    belief: Belief | FitResult,
+    prior: Prior | FitResult,
     drives: Drives,
     *,
     points: int = 8,
@@ -249,13 +249,13 @@ def design(  # noqa: PLR0913
 ) -> Design:
     """Choose the drives to measure next, and forecast how well the parameters will then be known.
 
-    The forecast is the Fisher information: derivatives of the predicted amplitudes by every parameter at the believed
+    The forecast is the Fisher information: derivatives of the predicted amplitudes by every parameter at the prior
     values, by automatic differentiation through the orbits; of laws with a delay the errors contain what the model
     leaves out, as those of a fit. Every drive is chosen once. A drive is left out where the
-    belief has no steady single-impact orbit, or several, or is not sure of it, and where a fit would set its row aside.
+    prior has no steady single-impact orbit, or several, or is not sure of it, and where a fit would set its row aside.
 
     Args:
-        belief: from `believe`, or a fit whose measurements are to be added to.
+        prior: from `prior_of_values`, or a fit whose measurements are to be added to.
         drives: what can be driven, from `drive_grid`.
         points: how many to choose.
         noise: standard error of an amplitude relative to it (0.01 stands for 1 %).
@@ -276,21 +276,21 @@ def design(  # noqa: PLR0913
         RuntimeError: if JAX is not set to 64-bit floats.
     """
     require_float64()
-    believed = belief_of_fit(belief) if isinstance(belief, FitResult) else belief
-    wanted = _interest(believed, interest)
+    prior = prior_of_fit(prior) if isinstance(prior, FitResult) else prior
+    wanted = _interest(prior, interest)
     _check_options(points, noise, criterion, amplitudes, largest_nm, phase_noise_deg)
     largest = np.inf if largest_nm is None else float(largest_nm)
     candidates = candidates_of(
-        believed, drives, noise=noise, amplitudes=amplitudes, largest_nm=largest, phase_noise_deg=phase_noise_deg
+        prior, drives, noise=noise, amplitudes=amplitudes, largest_nm=largest, phase_noise_deg=phase_noise_deg
     )
-    measure = _criterion(believed, candidates, wanted, criterion)
+    measure = _criterion(prior, candidates, wanted, criterion)
     usable, each = np.flatnonzero(candidates.usable), candidates.information
-    chosen = usable[choose_points(believed.information, each[usable], points, measure)]
-    reached = believed.information + each[chosen].sum(axis=0)
-    errors = forecast(believed, candidates, chosen, float(noise), phase_noise_deg)
-    reasons, warnings = judge_design(believed, candidates, chosen, reached, errors[-1], wanted, points)
+    chosen = usable[choose_points(prior.information, each[usable], points, measure)]
+    reached = prior.information + each[chosen].sum(axis=0)
+    errors = forecast(prior, candidates, chosen, float(noise), phase_noise_deg)
+    reasons, warnings = judge_design(prior, candidates, chosen, reached, errors[-1], wanted, points)
     return Design(
-        belief=believed,
+        prior=prior,
         interest=wanted,
         criterion=criterion,
         noise=float(noise),
@@ -308,18 +308,18 @@ def design(  # noqa: PLR0913
             "criterion": criterion,
             "amplitudes": amplitudes,
             "largest_nm": largest_nm,
-            "phase_noise_deg": phase_noise_deg if believed.problem.tapping else None,
-            "drive": believed.problem.drive,
-            "uncertainty": believed.uncertainty,
+            "phase_noise_deg": phase_noise_deg if prior.problem.tapping else None,
+            "drive": prior.problem.drive,
+            "uncertainty": prior.uncertainty,
             "drives": len(drives.order),
         },
         versions={name: version_of(name) for name in _PACKAGES},
     )
 
 
-def _interest(belief: Belief, interest: Sequence[str] | None) -> tuple[str, ...]:
+def _interest(prior: Prior, interest: Sequence[str] | None) -> tuple[str, ...]:
     """Return the parameters that matter: those asked for, or the law's without its delay."""
-    problem = belief.problem
+    problem = prior.problem
     if interest is None:
         return tuple(name for name in problem.own if name not in DELAY_NAMES)
     for name in interest:
@@ -347,13 +347,13 @@ def _check_options(
         raise ValueError(f"`largest_nm` must be positive, but is {largest_nm!r}")
 
 
-def _criterion(belief: Belief, candidates: Candidates, wanted: tuple[str, ...], kind: str) -> Criterion:
-    problem = belief.problem
+def _criterion(prior: Prior, candidates: Candidates, wanted: tuple[str, ...], kind: str) -> Criterion:
+    problem = prior.problem
     return criterion_of(
         kind,
         matters=np.array([name in wanted for name in problem.names]),
-        size=np.array([size_of(p, v) for p, v in zip(problem.parameters, belief.values.tolist(), strict=True)]),
-        largest=belief.information + candidates.information.sum(axis=0),
+        size=np.array([size_of(p, v) for p, v in zip(problem.parameters, prior.values.tolist(), strict=True)]),
+        largest=prior.information + candidates.information.sum(axis=0),
     )
 
 

@@ -19,8 +19,8 @@ from matplotlib.transforms import ScaledTranslation
 from afm_jax.plots.picture_style import ACCENT, BLUE, GRID, label_axes, new_figure
 from afm_jax.whole_files import write_whole
 from afm_jax.words import bullets, interval, known, text_table, value_alone
-from fitting.experiments.belief import size_of
 from fitting.experiments.candidates import LEFT_OUT
+from fitting.experiments.prior import size_of
 from fitting.experiments.result import Design, Forecast
 from fitting.parameters import NUISANCE_NAMES
 
@@ -46,9 +46,9 @@ def _drive_columns(result: Design) -> tuple[str, ...]:
 
 def design_summary(result: Design) -> str:
     """Return the design as text: verdict, the points, what they will determine, notes."""
-    belief, count = result.belief, int(result.candidates.usable.sum())
+    prior, count = result.prior, int(result.candidates.usable.sum())
     lines = [
-        f"{len(result.chosen)} points to measure next, of {count} candidates ({belief.problem.model}, {belief.source})",
+        f"{len(result.chosen)} points to measure next, of {count} candidates ({prior.problem.model}, {prior.source})",
         f"  {_CRITERIA[result.criterion]} {', '.join(result.interest)}; {100.0 * result.noise:g} % noise",
         "",
         "VALID" if result.valid else "NOT VALID: do not follow this design.",
@@ -93,14 +93,14 @@ def write_design(result: Design, folder: Path, write_table: Table) -> list[Path]
 
 def table_to_fill_in(result: Design) -> str:
     """Return an amplitude table of the points, the measured columns empty."""
-    belief, known = result.belief, result.belief.constraints
-    lines = [f"# drive = {belief.problem.drive}"] if result.tapping else []
+    prior, known = result.prior, result.prior.constraints
+    lines = [f"# drive = {prior.problem.drive}"] if result.tapping else []
     if "free_frequency_khz" not in known:
-        lines.append(f"# free_frequency_khz = {belief.free_frequency_khz!r}")
-    if belief.mass_ng is not None:
-        lines.append(f"# mass_ng = {belief.mass_ng!r}")
+        lines.append(f"# free_frequency_khz = {prior.free_frequency_khz!r}")
+    if prior.mass_ng is not None:
+        lines.append(f"# mass_ng = {prior.mass_ng!r}")
     if "quality_factor" not in known:
-        lines.append(f"# quality_factor = {'none' if belief.quality_factor is None else repr(belief.quality_factor)}")
+        lines.append(f"# quality_factor = {'none' if prior.quality_factor is None else repr(prior.quality_factor)}")
     instrument = [(name, *known[name]) for name in NUISANCE_NAMES if name in known]
     lines += [f"# {name} = {value!r} +- {error!r}" for name, value, error in instrument]
     read = [kind for kind in ("peak", "lockin") if result.settings["amplitudes"] in ("both", kind)]
@@ -139,7 +139,7 @@ def _point_lines(result: Design) -> list[str]:
 
 
 def _forecast_lines(result: Design) -> list[str]:
-    head = ["", "believed", "+- now", "+- then", "95 % interval then"]
+    head = ["", "prior", "+- now", "+- then", "95 % interval then"]
     now, then = result.measured_so_far, result.expected
     rows = [
         [
@@ -149,7 +149,7 @@ def _forecast_lines(result: Design) -> list[str]:
             known(then[name].standard_error, ".2g"),
             _interval(then[name]),
         ]
-        for name in result.belief.problem.names
+        for name in result.prior.problem.names
     ]
     return [*text_table(head, rows, words=(0, 4)), "  * what the points are chosen for"]
 
@@ -206,7 +206,7 @@ def design_figure(result: Design) -> Figure:
     if not result.tapping:
         offsets = ", ".join(f"{offset:g}" for offset in np.unique(drives.offset_nm))
         right.supxlabel(f"at each drive from left to right: offsets {offsets} nm", fontsize=_SMALL)
-    title = f"{len(result.chosen)} points for {', '.join(result.interest)} ({result.belief.problem.model})"
+    title = f"{len(result.chosen)} points for {', '.join(result.interest)} ({result.prior.problem.model})"
     figure.suptitle(title if result.valid else f"NOT VALID: {title}", color="black" if result.valid else _INVALID)
     return figure
 
@@ -217,7 +217,7 @@ def _draw_errors(axes: Axes, result: Design) -> None:
     colours, dashes = iter(_COLOURS * len(result.interest)), iter(_DASHES * len(result.errors.T))
     marks = iter(_MARKS * len(result.interest))
     for parameter, value, errors in zip(
-        result.belief.problem.parameters, result.belief.values.tolist(), result.errors.T, strict=True
+        result.prior.problem.parameters, result.prior.values.tolist(), result.errors.T, strict=True
     ):
         share = 100.0 * np.where(np.isfinite(errors), errors, np.nan) / size_of(parameter, value)
         if not np.isfinite(share).any():

@@ -8,8 +8,8 @@ from jaxtyping import Float, Int
 
 from afm_jax.results import Result, public_result
 from afm_jax.units import TWO_SIDED_95
-from fitting.experiments.belief import Belief
 from fitting.experiments.candidates import LEFT_OUT, Candidates
+from fitting.experiments.prior import Prior
 from fitting.parameters import Parameter
 from fitting.simulated.experiment import Drives
 
@@ -22,7 +22,7 @@ class Forecast:
     """How well a parameter is known at some point of the experiment.
 
     Attributes:
-        value: as believed.
+        value: as prior.
         unit: of value and error; empty for a number.
         standard_error: from the Fisher information, everything else unknown too; None: not determined.
         interval95: value -+ 1.96 standard errors, within what the parameter can be; ends are None if not determined.
@@ -42,7 +42,7 @@ class Design(Result):
     """The outcome of `design`; attributes are named like the keys of its JSON.
 
     Attributes:
-        belief: what the design rests on.
+        prior: what the design rests on.
         interest: names of the parameters that are to be known well.
         criterion: "D" or "A".
         noise: standard error of an amplitude relative to it.
@@ -59,7 +59,7 @@ class Design(Result):
         versions: of the packages that computed it.
     """
 
-    belief: Belief
+    prior: Prior
     interest: tuple[str, ...]
     criterion: str
     noise: float
@@ -91,11 +91,11 @@ class Design(Result):
     @property
     def tapping(self) -> bool:
         """Whether the cantilever is driven itself, not the sample."""
-        return self.belief.problem.tapping
+        return self.prior.problem.tapping
 
     def points(self) -> list[dict[str, Any]]:
         """Return the points as mappings: the drive, what is expected to be read, and the errors once it is."""
-        names = self.belief.problem.names
+        names = self.prior.problem.names
         return [
             self.candidate(int(row)) | {"standard_errors": {n: _finite(e) for n, e in zip(names, errors, strict=True)}}
             for row, errors in zip(self.chosen, self.errors[1:].tolist(), strict=True)
@@ -132,12 +132,12 @@ class Design(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything as plain lists, numbers and strings; what is not known is None."""
-        belief = self.belief
+        prior = self.prior
         return {
             "format": "afm-jax design",
             "format_version": FORMAT_VERSION,
-            "drive": belief.problem.drive,
-            "model": belief.problem.model,
+            "drive": prior.problem.drive,
+            "model": prior.problem.model,
             "valid": self.valid,
             "reasons": self.reasons,
             "warnings": self.warnings,
@@ -149,21 +149,21 @@ class Design(Result):
             "measured_so_far": {name: _entry(forecast) for name, forecast in self.measured_so_far.items()},
             "candidates": int(self.candidates.usable.sum()),
             "left_out": self.candidates.left_out,
-            "belief": {
-                "source": belief.source,
-                "values": dict(zip(belief.problem.names, belief.values.tolist(), strict=True)),
-                "fixed": belief.fixed,
-                "free_frequency_khz": belief.free_frequency_khz,
-                "quality_factor": belief.quality_factor,
-                "mass_ng": belief.mass_ng,
-                "rows_measured": len(belief.measured),
+            "prior": {
+                "source": prior.source,
+                "values": dict(zip(prior.problem.names, prior.values.tolist(), strict=True)),
+                "fixed": prior.fixed,
+                "free_frequency_khz": prior.free_frequency_khz,
+                "quality_factor": prior.quality_factor,
+                "mass_ng": prior.mass_ng,
+                "rows_measured": len(prior.measured),
             },
             "settings": self.settings,
             "versions": self.versions,
         }
 
     def _forecasts(self, errors: Float[np.ndarray, " p"]) -> dict[str, Forecast]:
-        columns = zip(self.belief.problem.parameters, self.belief.values.tolist(), errors.tolist(), strict=True)
+        columns = zip(self.prior.problem.parameters, self.prior.values.tolist(), errors.tolist(), strict=True)
         return {parameter.name: _forecast(parameter, value, error) for parameter, value, error in columns}
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from afm_jax.checks import checked, require_float64
 from afm_jax.results import Result, public_result
 from fitting.fits.fit import Found, find_fit, summarise, tables_of
-from fitting.fits.minimum import Strain, relaxed, settle
+from fitting.fits.minimum import ModelErrors, settle, with_inflated_errors
 from fitting.fits.result import FitResult
 from fitting.parameters import CONTACT_NAMES, LAWS, MODELS, model_parameters
 from fitting.tables.several import SeveralTables
@@ -106,10 +106,10 @@ def compare(
         return found, _finite(summarise(whole, found))
 
     fits, failed = _attempted(fitted, dict.fromkeys(models))
-    errors = np.max([one.strain.model_error for one, _ in fits.values()], axis=0)
+    errors = np.max([one.model_errors.model_error for one, _ in fits.values()], axis=0)
     # the strings' maximum: any reason rather than none
-    reasons = np.max([one.strain.reasons for one, _ in fits.values()], axis=0)
-    judged, lost = _attempted(lambda model: _row(model, *fits[model], Strain(errors, errors, reasons)), fits)
+    reasons = np.max([one.model_errors.reasons for one, _ in fits.values()], axis=0)
+    judged, lost = _attempted(lambda model: _row(model, *fits[model], ModelErrors(errors, errors, reasons)), fits)
     results = {model: fits[model][1] for model in judged}
     rows = sorted(judged.values(), key=lambda row: row["aic"])
     for row in rows:
@@ -163,9 +163,9 @@ def _options_of(model: str, options: dict[str, Any]) -> dict[str, Any]:
     return chosen
 
 
-def _row(model: str, found: Found, result: FitResult, common: Strain) -> dict[str, Any]:
+def _row(model: str, found: Found, result: FitResult, common: ModelErrors) -> dict[str, Any]:
     stated, minimum = found.stated, found.minimum
-    objective = relaxed(stated, common)
+    objective = with_inflated_errors(stated, common)
     if stated.problem.lasting or common.model_error.any():
         minimum = settle(objective, minimum)
     values = stated.problem.values(minimum.coordinates)

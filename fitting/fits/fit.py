@@ -1,4 +1,4 @@
-"""The fit of an impact law to amplitude tables: screen, polish, check, and say whether to believe what was found.
+"""The fit of an impact law to amplitude tables: screen, polish, check, and say whether to trust what was found.
 
 A minimum amounts to values with errors and intervals, the law over the measured speeds with the band that its
 parameters' errors leave, checks, and a verdict.
@@ -19,6 +19,31 @@ from afm_jax.impact.lasting_impact import PulledImpact
 from afm_jax.impact.law import ImpactLaw, Law, TabulatedLaw
 from afm_jax.least_squares import chi2_tail
 from afm_jax.version import version_of
+from fitting.fits.discrepancy import (
+    ClosestMember,
+    Held,
+    LawAfter,
+    LawBefore,
+    LinearStep,
+    ModelDiscrepancy,
+    StepRows,
+    StepSystem,
+    closest_member,
+    containing,
+    descending_part,
+    effects_of_held,
+    held_of,
+    held_values,
+    law_after,
+    longest_run,
+    root_of,
+    rows_of_fit,
+    seen_in_taps,
+    split_held,
+    step_of,
+    system_of,
+    with_runs,
+)
 from fitting.fits.intervals import (
     END_OF_RANGE,
     Convergence,
@@ -43,44 +68,19 @@ from fitting.fits.loss import (
 from fitting.fits.minimum import (
     ATTRACTED,
     Minimum,
-    Strain,
+    ModelErrors,
     lost_rows,
     minimise,
-    relaxed,
+    model_errors_of,
     rescale_errors,
     settle,
     starts,
-    strain_of,
     untabulated,
+    with_inflated_errors,
 )
 from fitting.fits.objective import BATCH, ROBUST, SOFT, Objective, lowest, soft_square
 from fitting.fits.result import FitResult, FittedLaw, FittedParameter, FittedRows, FittedTable, Scatter, table_of_law
 from fitting.fits.several import Between, Pull, departures_of, parts_of, pulls_of, scatter_between
-from fitting.fits.unmodelled import (
-    ClosestMember,
-    Held,
-    LawAfter,
-    LawBefore,
-    LinearStep,
-    StepRows,
-    StepSystem,
-    Unmodelled,
-    closest_member,
-    containing,
-    descending_part,
-    effects_of_held,
-    held_of,
-    held_values,
-    law_after,
-    longest_run,
-    root_of,
-    rows_of_fit,
-    seen_in_taps,
-    split_held,
-    step_of,
-    system_of,
-    with_runs,
-)
 from fitting.fits.verdict import ASSUMED_ERROR_OF_Q, IMPROBABLE, Evidence, judge_fit, misfits
 from fitting.forward import AnyImpact, Predicted, impact_at, predict, warm_up
 from fitting.models import (
@@ -112,7 +112,7 @@ def law_with_band(  # noqa: PLR0913
     values: Float[np.ndarray, " p"],
     covariance: Float[np.ndarray, "k k"],
     approach_speeds: Float[np.ndarray, " rows"],
-    after: tuple[LinearStep, Unmodelled] | None = None,
+    after: tuple[LinearStep, ModelDiscrepancy] | None = None,
     *,
     formula: ImpactLaw | None = None,
     mass_ng: float | None = None,
@@ -178,16 +178,16 @@ def law_at(
     values: Float[np.ndarray, " p"],
     covariance: Float[np.ndarray, "k k"],
     speeds: Float[np.ndarray, " n"],
-    after: tuple[LinearStep, Unmodelled] | None = None,
+    after: tuple[LinearStep, ModelDiscrepancy] | None = None,
 ) -> LawAfter:
     """Return the law at approach speeds in nm/us; the other arguments as of `law_with_band`."""
     before = law_before(problem, measurement, values, speeds)
     if after is None:
         root = root_of(covariance)[: before.slope.shape[2]]
         return LawAfter(before.law, before.slope @ root, before.capture, before.capture_slope @ root)
-    step, left_out = after
+    step, discrepancy = after
     moved = law_before(problem, measurement, step.values[: len(problem.names)], speeds)
-    found = law_after(step, left_out, speeds, before, moved)
+    found = law_after(step, discrepancy, speeds, before, moved)
     if not np.all(np.isfinite(covariance)):
         unknown = [np.full_like(part, np.nan) for part in (found.factor, found.capture_factor)]
         return LawAfter(found.law, unknown[0], found.capture, unknown[1])
@@ -206,7 +206,7 @@ def law_before(
 
 def member_after(
     step: LinearStep,
-    left_out: Unmodelled,
+    discrepancy: ModelDiscrepancy,
     measurement: Measurement,
     values: Float[np.ndarray, " p"],
     speeds: Float[np.ndarray, " n"],
@@ -218,14 +218,14 @@ def member_after(
 
     Args:
         step: the step.
-        left_out: by the model.
+        discrepancy: by the model.
         measurement: gives the contact's fixed parameters.
         values: from which the step was taken.
         speeds: approach speeds in nm/us of the rows that are used.
         free: which of the values are not at their bound.
         computed: the law after the step is computed; False: to first order.
     """
-    problem = left_out.problem
+    problem = discrepancy.problem
     if problem.model == "contact" or not problem.lasting:
         return None
     # one program for rows of any number up to that of a law's points
@@ -236,7 +236,7 @@ def member_after(
     if computed:
         whole = law_before(problem, measurement, step.values[: len(problem.names)], filled)
         moved = whole._replace(law=whole.law[:, : speeds.size], slope=whole.slope[:, : speeds.size])
-    return closest_member(step, left_out, speeds, there, free, moved)
+    return closest_member(step, discrepancy, speeds, there, free, moved)
 
 
 def loss_of(
@@ -360,7 +360,7 @@ class Found:
     stated: Objective
     objective: Objective
     minimum: Minimum
-    strain: Strain
+    model_errors: ModelErrors
     settings: dict[str, Any]
     refused: bool = False
 
@@ -444,7 +444,7 @@ class _Summary:
 
     def __init__(self, table: AmplitudeTable | SeveralTables, found: Found):
         objective, minimum, self.found = found.objective, found.minimum, found
-        self.searching, self.table, self.minimum, self.strain = objective, table, minimum, found.strain
+        self.searching, self.table, self.minimum, self.model_errors = objective, table, minimum, found.model_errors
         self.settings, self.problem, self.stated = found.settings, objective.problem, found.stated
         self.refused = found.refused
         self.values = self.problem.values(minimum.coordinates)
@@ -477,7 +477,7 @@ class _Summary:
         if self.after is not None:
             self._take(*self.after)
 
-    def _step(self) -> tuple[LinearStep, Unmodelled] | None:
+    def _step(self) -> tuple[LinearStep, ModelDiscrepancy] | None:
         """Return the step with what the model leaves out, and the scatter between tables; None where there is neither.
 
         Nor is there one without slopes.
@@ -486,7 +486,7 @@ class _Summary:
         if not (self.problem.lasting or joint) or self.refused or not np.isfinite(self.used_speeds).any():
             return None
         scale = self.settings["error_scale"] or 1.0
-        rows = rows_of_fit(self.stated, self.objective, self.values, self.strain, scale)
+        rows = rows_of_fit(self.stated, self.objective, self.values, self.model_errors, scale)
         if not all(np.isfinite(part).all() for part in (rows.residual, rows.jacobian, *rows.slopes)):
             return None
         self.step_rows = rows
@@ -496,27 +496,27 @@ class _Summary:
         self.contact_share = float(shares.max())
         values = self.settings["fixed"] | dict(zip(self.problem.names, self.values.tolist(), strict=True))
         mass = float(self.stated.measurement.cantilever.mass_ng)
-        left_out = Unmodelled(self.problem, values, speed_range(self.used_speeds), mass)
+        discrepancy = ModelDiscrepancy(self.problem, values, speed_range(self.used_speeds), mass)
         if self.problem.model == "contact":
             held = tuple(Held(*one) for one in self.settings.get("held", ()))
-            effects = effects_of_held(held, values, self.problem.effects, mass, left_out.speeds)
+            effects = effects_of_held(held, values, self.problem.effects, mass, discrepancy.speeds)
             if self.problem.pulled:
                 effects = seen_in_taps(effects, self.objective, self.values)
-            left_out = replace(left_out, held=effects)
+            discrepancy = replace(discrepancy, held=effects)
         if self.problem.lasting and not self.problem.pulled and not scattering:
-            run = longest_run(rows, left_out, self.free)
-            self.unbent = step_of(rows, left_out, self.free).residual
-            left_out = with_runs(left_out, run)
-            self.run = run, longest_run(rows, left_out, self.free) if left_out.short else run
-        self.system = system_of(rows, left_out)
+            run = longest_run(rows, discrepancy, self.free)
+            self.unbent = step_of(rows, discrepancy, self.free).residual
+            discrepancy = with_runs(discrepancy, run)
+            self.run = run, longest_run(rows, discrepancy, self.free) if discrepancy.short else run
+        self.system = system_of(rows, discrepancy)
         if joint is None:
-            return step_of(rows, left_out, self.free), left_out
+            return step_of(rows, discrepancy, self.free), discrepancy
         departing = self._tables_compared(self.system, joint, scattering=scattering)
         if not (self.problem.lasting or departing):
             return None
         self.system = self.system.with_unknowns(departing[0] if departing else None)
-        step, *cautious = (step_of(rows, left_out, self.free, one) for one in departing or [None])
-        return step._replace(covariance=(*cautious, step)[0].covariance), left_out
+        step, *cautious = (step_of(rows, discrepancy, self.free, one) for one in departing or [None])
+        return step._replace(covariance=(*cautious, step)[0].covariance), discrepancy
 
     def _tables_compared(
         self, system: StepSystem, joint: Joint, *, scattering: bool
@@ -542,19 +542,19 @@ class _Summary:
         self.pulls = pulls_of(parts)
         return departing
 
-    def _take(self, step: LinearStep, left_out: Unmodelled) -> None:
+    def _take(self, step: LinearStep, discrepancy: ModelDiscrepancy) -> None:
         """Go on with the law, values, errors and predictions after the step, or after a part of it that lowers chi2."""
         assert self.system is not None  # noqa: S101
         system = self.system
 
         def look(parts: list[LinearStep]) -> Predicted:
-            return self._predicted(parts, left_out)
+            return self._predicted(parts, discrepancy)
 
         step, predicted, self.stuck = descending_part(step, system, look)
-        self.after = step, left_out
+        self.after = step, discrepancy
         count = len(self.names)
         self.ends, self.spread = step.values[:count], step.covariance[:count, :count]
-        member = self._closest_member(step, left_out)
+        member = self._closest_member(step, discrepancy)
         if member is not None:
             self.ends, self.spread = member.values, member.covariance
         rows, used = self.table.rows, np.isfinite(self.rows.residual)
@@ -573,7 +573,7 @@ class _Summary:
             orbits=np.where(there, self.rows.orbits, 0),
         )
 
-    def _predicted(self, parts: list[LinearStep], left_out: Unmodelled) -> Predicted:
+    def _predicted(self, parts: list[LinearStep], discrepancy: ModelDiscrepancy) -> Predicted:
         """Return what the laws after parts of the step predict, with the instrument after it."""
         measurement, problem = self.objective.measurement, self.problem
         values = np.array([part.values[: len(problem.names)] for part in parts])
@@ -582,11 +582,11 @@ class _Summary:
             size = measurement.rows.measured.shape
             found = []
             for one, part in zip(values, parts, strict=True):
-                there = measurement._replace(fixed=left_out.fixed_after(part, measurement.fixed))
+                there = measurement._replace(fixed=discrepancy.fixed_after(part, measurement.fixed))
                 plain = Objective(there, problem, near=self.objective.near).at_values(one[None])
                 found.append(Predicted(plain.residual[:, : size[0] * size[1]].reshape(1, *size), plain.prediction))
             return jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
-        laws = [self._law_after(part, left_out) for part in parts]
+        laws = [self._law_after(part, discrepancy) for part in parts]
         speeds = self.prediction.approach_speed_nm_per_us[0]
         exists = (self.prediction.orbits[0] > 0) & np.isfinite(speeds)
         safe = jnp.asarray(np.where(exists, speeds, 100.0))
@@ -594,23 +594,23 @@ class _Summary:
         both = jax.tree.map(lambda *leaves: np.stack(leaves), *laws)
         return predict(values, both, measurement, problem, np.array(near))
 
-    def _law_after(self, step: LinearStep, left_out: Unmodelled) -> TabulatedLaw:
+    def _law_after(self, step: LinearStep, discrepancy: ModelDiscrepancy) -> TabulatedLaw:
         """Return the law after a step as the table that predictions are made of."""
 
         def law(speeds: Float[np.ndarray, " n"]) -> LawAfter:
             measurement = self.objective.measurement
-            return law_at(self.problem, measurement, self.values, self.covariance, speeds, (step, left_out))
+            return law_at(self.problem, measurement, self.values, self.covariance, speeds, (step, discrepancy))
 
         speeds, found = points_of_law(law, self.used_speeds)
-        formula = self._formula(step, left_out)
+        formula = self._formula(step, discrepancy)
         delay = None if formula is None else formula.delay
         return table_of_law(speeds, *found.law, capture_speed_nm_per_us=found.capture, delay=delay)
 
-    def _formula(self, step: LinearStep, left_out: Unmodelled) -> ImpactLaw | None:
+    def _formula(self, step: LinearStep, discrepancy: ModelDiscrepancy) -> ImpactLaw | None:
         """Return the formula that is closest to the law after a step; None of a contact, which has none."""
         if self.problem.model == "contact":
             return None
-        member = self._closest_member(step, left_out)
+        member = self._closest_member(step, discrepancy)
         values = step.values[: len(self.problem.names)] if member is None else member.values
         return self.problem.law(jnp.asarray(values), self.objective.measurement.fixed)
 
@@ -706,9 +706,9 @@ class _Summary:
         found: dict[str, tuple[str, ...]] = {}
         if self.after is None or not self.after[1].held or self.step_rows is None:
             return found
-        left_out, whole = self.after[1], np.diag(self.spread)
-        for one in left_out.held:
-            rest = replace(left_out, held=tuple(other for other in left_out.held if other is not one))
+        discrepancy, whole = self.after[1], np.diag(self.spread)
+        for one in discrepancy.held:
+            rest = replace(discrepancy, held=tuple(other for other in discrepancy.held if other is not one))
             without = np.diag(step_of(self.step_rows, rest, self.free).covariance)
             for i, name in enumerate(self.problem.own):
                 if np.isfinite(whole[i]) and whole[i] - without[i] > _MUCH * whole[i]:
@@ -821,10 +821,10 @@ class _Summary:
         reached = self.rows.approach_speed_nm_per_us[self.rows.used]
         return loss_of(found, speed_range(reached), self.table.mass_ng, parameters, formula)
 
-    def _closest_member(self, step: LinearStep, left_out: Unmodelled) -> ClosestMember | None:
+    def _closest_member(self, step: LinearStep, discrepancy: ModelDiscrepancy) -> ClosestMember | None:
         """Return the model's law that is closest to the law after the step; None where the step is all there is."""
         speeds = self.used_speeds[np.isfinite(self.used_speeds)]
-        return member_after(step, left_out, self.objective.measurement, self.values, speeds, self.free)
+        return member_after(step, discrepancy, self.objective.measurement, self.values, speeds, self.free)
 
     def _explained_parameters(self, moved: Bool[np.ndarray, " k"]) -> dict[str, FittedParameter]:
         """Return the parameters with their errors and, where all are determined, their intervals."""
@@ -885,7 +885,7 @@ class _Summary:
         exists = prediction.orbits[0][:count] > 0
         predicted = np.where(exists[:, None], prediction.amplitude_nm[0][:count], np.nan)
         error = np.where(used, np.asarray(rows.error_nm)[:count], np.nan)
-        reasons = self.strain.reasons[:count].copy()
+        reasons = self.model_errors.reasons[:count].copy()
         read = readings_of(self.table)[0]
         stated = np.asarray(self.stated.measurement.rows.measured)[:count]
         reasons[np.isfinite(read).any(axis=1) & ~stated.any(axis=1)] = ATTRACTED
@@ -899,7 +899,7 @@ class _Summary:
             measured_nm=measured[:, :2],
             residual=np.where(used, self.amplitude_residual[:count], np.nan),
             error_nm=error[:, :2],
-            model_error=self.strain.model_error[:count],
+            model_error=self.model_errors.model_error[:count],
             used=np.any(used, axis=1, keepdims=False).astype(bool),
             set_aside=(reasons != "").astype(bool),
             approach_speed_nm_per_us=np.where(exists, prediction.approach_speed_nm_per_us[0][:count], np.nan),
@@ -957,7 +957,7 @@ def _autocorrelation(residual: Float[np.ndarray, "rows k"]) -> float:
     return float(np.sum(before[both] * after[both]) / both.sum() / (total / np.isfinite(residual).sum()))
 
 
-_STRAIN_ROUNDS = 3
+_MODEL_ERROR_ROUNDS = 3
 _FEWEST_LEFT, _LEAST_LEFT = 4, 0.2
 """Rows of a driven tip, and their share, of which at least a law of impacts is read off."""
 
@@ -1074,7 +1074,7 @@ def find_fit(  # noqa: PLR0913
         )
     warm_up(starts(problem, measurement)[0], measurement, problem)
     stated = Objective(measurement, problem, robust=robust)
-    objective, minimum, strain, refused = unstrained_minimum(stated)
+    objective, minimum, model_errors, refused = minimum_with_model_errors(stated)
     scale = None
     if scale_errors:
         objective, minimum, scale = rescale_errors(objective, minimum, len(problem.own))
@@ -1092,7 +1092,7 @@ def find_fit(  # noqa: PLR0913
     }
     if isinstance(table, SeveralTables):
         settings |= {"share": list(share), "hierarchical": hierarchical}
-    return Found(stated, objective, minimum, strain, settings, refused)
+    return Found(stated, objective, minimum, model_errors, settings, refused)
 
 
 def _known_of(
@@ -1241,37 +1241,37 @@ def problem_of(
     return Problem(model, own + nuisances, tuple(effects), table.drive)
 
 
-def unstrained_minimum(stated: Objective) -> tuple[Objective, Minimum, Strain, bool]:
-    """Return the minimum with the model's own error in the weights and strained rows set aside, until both settle.
+def minimum_with_model_errors(stated: Objective) -> tuple[Objective, Minimum, ModelErrors, bool]:
+    """Return the minimum with the model's own error in the weights and inaccurate rows set aside, until both settle.
 
     The last is True if hardly a row of a driven tip is left then: they are not set aside, and the law is refused.
     """
     minimum = minimise(stated)
-    strain = strain_of(stated, stated.problem.values(minimum.coordinates))
+    model_errors = model_errors_of(stated, stated.problem.values(minimum.coordinates))
     if not stated.problem.lasting:
-        return stated, minimum, strain, False
-    if _few_left(stated, strain, minimum):
-        return stated, minimum, strain, True
-    objective = relaxed(stated, strain)
-    for _ in range(_STRAIN_ROUNDS):
+        return stated, minimum, model_errors, False
+    if _few_left(stated, model_errors, minimum):
+        return stated, minimum, model_errors, True
+    objective = with_inflated_errors(stated, model_errors)
+    for _ in range(_MODEL_ERROR_ROUNDS):
         minimum = settle(objective, minimum)
-        again = strain_of(stated, stated.problem.values(minimum.coordinates))
-        same = np.array_equal(again.set_aside, strain.set_aside)
-        close = np.allclose(again.model_error, strain.model_error, rtol=0.02)
+        again = model_errors_of(stated, stated.problem.values(minimum.coordinates))
+        same = np.array_equal(again.set_aside, model_errors.set_aside)
+        close = np.allclose(again.model_error, model_errors.model_error, rtol=0.02)
         if _few_left(stated, again, minimum):
             return stated, minimum, again, True
         if same and close:
-            return objective, minimum, strain, False
-        objective, strain = relaxed(stated, again), again
-    return objective, settle(objective, minimum), strain, False
+            return objective, minimum, model_errors, False
+        objective, model_errors = with_inflated_errors(stated, again), again
+    return objective, settle(objective, minimum), model_errors, False
 
 
-def _few_left(stated: Objective, strain: Strain, minimum: Minimum) -> bool:
-    """Say whether the law has an orbit on fewer than four unstrained rows of a driven tip, or on fewer than a fifth."""
+def _few_left(stated: Objective, model_errors: ModelErrors, minimum: Minimum) -> bool:
+    """Say whether the law has an orbit on fewer than four accurate rows of a driven tip, or on fewer than a fifth."""
     if not stated.problem.tapping:
         return False
     rows = stated.measurement.rows
     hits = np.asarray(rows.measured).any(axis=1) & ~np.asarray(rows.free)
     lost = lost_rows(stated, stated.problem.values(minimum.coordinates))
-    left = int((hits & ~lost & ~strain.set_aside).sum())
+    left = int((hits & ~lost & ~model_errors.set_aside).sum())
     return bool(left < max(_FEWEST_LEFT, _LEAST_LEFT * hits.sum()))

@@ -371,7 +371,7 @@ ATTRACTED = "none: the sample only draws the tip"
 
 
 @dataclass(frozen=True)
-class Strain:
+class ModelErrors:
     """How far a model's picture holds for each row.
 
     Attributes:
@@ -396,22 +396,22 @@ def padding(share: Float[np.ndarray, " rows"], readings: Float[np.ndarray, "rows
     return share[:, None] * np.concatenate([readings[:, :2], of_phase], axis=1)
 
 
-def strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
-    """Return the strain of every row (padded) at a set of values; none where impacts are instantaneous."""
+def model_errors_of(objective: Objective, values: Float[np.ndarray, " p"]) -> ModelErrors:
+    """Return the model errors of every row (padded) at a set of values; none where impacts are instantaneous."""
     count = objective.measurement.rows.order.shape[0]
-    found = Strain(np.zeros(count), np.zeros(count), np.full(count, "", dtype=object))
+    found = ModelErrors(np.zeros(count), np.zeros(count), np.full(count, "", dtype=object))
     if objective.problem.lasting:
         for mine, part in objective.by_instrument():
-            strain = _strain_of(part, values)
-            for whole, some in zip(vars(found).values(), vars(strain).values(), strict=True):
+            model_errors = _model_errors_of_part(part, values)
+            for whole, some in zip(vars(found).values(), vars(model_errors).values(), strict=True):
                 whole[mine] = some
     return found
 
 
-def _strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
-    """Return the strain of every row of one instrument."""
+def _model_errors_of_part(objective: Objective, values: Float[np.ndarray, " p"]) -> ModelErrors:
+    """Return the model errors of every row of one instrument."""
     if objective.problem.pulled:
-        return _strain_of_taps(objective, values)
+        return _model_errors_of_taps(objective, values)
     rows = objective.measurement.rows
     impact = impact_at(values, objective.measurement, objective.problem).impact
     linear = objective.at_values(values[None])
@@ -440,11 +440,11 @@ def _strain_of(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
     error, slow_error = (np.where(exists, part, BASE) for part in (error, slow_error))
     if tapping:
         error, slow_error = (np.where(free, 0.0, part) for part in (error, slow_error))
-    return Strain(error, slow_error, reasons)
+    return ModelErrors(error, slow_error, reasons)
 
 
-def _strain_of_taps(objective: Objective, values: Float[np.ndarray, " p"]) -> Strain:
-    """Return the strain of the rows of a contact under a bent lever, which pulls the slowest tips out of the bridge."""
+def _model_errors_of_taps(objective: Objective, values: Float[np.ndarray, " p"]) -> ModelErrors:
+    """Return the model errors of rows of a contact under a bent lever, which pulls the slowest tips free."""
     rows = objective.measurement.rows
     prediction = jax.tree.map(lambda part: np.asarray(part)[0], objective.at_values(values[None]).prediction)
     exists = prediction.orbits > 0
@@ -455,7 +455,7 @@ def _strain_of_taps(objective: Objective, values: Float[np.ndarray, " p"]) -> St
     share = np.minimum(np.where(hardly, time, 0.0) * np.asarray(rows.drive_frequency_khz) * 1e-3, 0.5)
     error = _OF_TAPS + _LONG_TAPS * share**8 + np.where(exists, _frame_error(rows), 0.0)
     error = np.where(rows.free, 0.0, error)
-    return Strain(error, error, reasons)
+    return ModelErrors(error, error, reasons)
 
 
 def _frame_error(rows: Rows) -> Float[np.ndarray, " rows"]:
@@ -513,15 +513,15 @@ def _sensitivity(
     return approach * np.where(amplitude > 0.0, relative, 0.0).max(axis=1)
 
 
-def relaxed(objective: Objective, strain: Strain) -> Objective:
+def with_inflated_errors(objective: Objective, model_errors: ModelErrors) -> Objective:
     """Return the objective with the model's error added to the measured one, without the rows set aside.
 
     Args:
         objective: with the errors as measured.
-        strain: of its rows.
+        model_errors: of its rows.
     """
     rows = objective.measurement.rows
     amplitude, error = np.asarray(rows.amplitude_nm), np.asarray(rows.error_nm)
-    total = np.hypot(error, padding(strain.model_error, amplitude))
-    used = np.asarray(rows.measured) & ~strain.set_aside[:, None]
+    total = np.hypot(error, padding(model_errors.model_error, amplitude))
+    used = np.asarray(rows.measured) & ~model_errors.set_aside[:, None]
     return objective.with_rows(error_nm=np.where(used, total, 1.0), measured=used)

@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from afm_jax.least_squares import chi2_tail, covariance_of
+from fitting.fits.discrepancy import StepSystem
 from fitting.fits.intervals import CHI2_95
-from fitting.fits.unmodelled import StepSystem
 
 _LEAST_SHARE = 1e-9
 """Variance that a table takes from a direction of the law, over the variance there, below which it says nothing."""

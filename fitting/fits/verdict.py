@@ -1,4 +1,4 @@
-"""Whether to believe a fit, in words: what makes it invalid, and what a reader should know besides.
+"""Whether to trust a fit, in words: what makes it invalid, and what a reader should know besides.
 
 A fit is valid only if what is left of the amplitudes passes an absolute test, whatever the options:
 chi2 by its probability; with a robust loss the share of outliers, and chi2 without them by its probability; with scaled
@@ -12,12 +12,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from afm_jax.least_squares import IMPROBABLE, chi2_tail
+from fitting.fits.discrepancy import Held
 from fitting.fits.intervals import Convergence
 from fitting.fits.loss import NO_MASS
 from fitting.fits.minimum import TOO_SLOW
 from fitting.fits.objective import MOST_OUTLIERS, OUTLIER
 from fitting.fits.result import FittedParameter, FittedRows
-from fitting.fits.unmodelled import Held
 from fitting.parameters import DELAY_NAMES, is_nuisance, name_of_table, parameter_called
 from fitting.tables.several import SeveralTables, repeats_of
 from fitting.tables.table import ERRORS_OF_REPEATS, AmplitudeTable
@@ -577,13 +577,13 @@ def _row_warnings(evidence: Evidence) -> list[str]:
     for reason in dict.fromkeys(reasons[row] for row in aside):
         named = np.array([row for row in aside if reasons[row] == reason])
         warnings.append(f"Set aside, because these impacts are {reason}: {_rows_in_words(evidence.table, named)}.")
-    strained = np.flatnonzero(evidence.rows.used & (evidence.rows.model_error > _STATED))
-    if strained.size:
-        worst = 100.0 * float(evidence.rows.model_error[strained].max())
+    inaccurate = np.flatnonzero(evidence.rows.used & (evidence.rows.model_error > _STATED))
+    if inaccurate.size:
+        worst = 100.0 * float(evidence.rows.model_error[inaccurate].max())
         small = "small amplitudes" if evidence.table.tapping else "slow impacts"
         warnings.append(
             f"A model error of up to {worst:.1f} % was added to the errors of {small}: "
-            f"{_rows_in_words(evidence.table, strained)}."
+            f"{_rows_in_words(evidence.table, inaccurate)}."
         )
     unseen = np.zeros(evidence.table.rows) if evidence.table.no_orbit is None else evidence.table.no_orbit
     contradicted = np.flatnonzero((unseen > 0) & (evidence.rows.orbits > 0))

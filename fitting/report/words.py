@@ -1,4 +1,4 @@
-"""A fit in words: how sure the law is, its formula with the digits that count, whether to believe it."""
+"""A fit in words: how sure the law is, its formula with the digits that count, whether to trust it."""
 
 from dataclasses import dataclass
 from typing import Any, Protocol, runtime_checkable
@@ -318,8 +318,8 @@ def band_in_words(result: FitResult) -> str:
     )
 
 
-def belief_in_words(result: FitResult) -> str:
-    """Return whether to believe the fit, on which grounds, and over which speeds."""
+def prior_in_words(result: FitResult) -> str:
+    """Return whether to trust the fit, on which grounds, and over which speeds."""
     if not result.valid:
         return "Do not take these numbers for a measurement of the law, because:"
     limited = any(parameter.at_bound or None in parameter.interval95 for parameter in result.parameters.values())
@@ -331,7 +331,7 @@ def belief_in_words(result: FitResult) -> str:
         explained = "the law explains the amplitudes within their errors but for a few outliers"
     open_ = [name for name, parameter in result.parameters.items() if parameter.undetermined]
     which = f"every parameter but {' and '.join(open_)}" if open_ else "every parameter"
-    words = f"You can believe it: the fit converged, {explained}, and {which} is {determined} by the data."
+    words = f"You can trust it: the fit converged, {explained}, and {which} is {determined} by the data."
     width = band_width(result)
     if width is not None:
         words += (

@@ -1,1 +1,1 @@
-"""Many synthetic tables of one fit, and what is believed after the data."""
+"""Many synthetic tables of one fit, and their posterior."""

@@ -18,7 +18,7 @@ CHAINS, DRAWS = 4, 250
 
 
 @dataclass(frozen=True, eq=False)
-class Believed:
+class PosteriorDraws:
     """Draws of a posterior and what they predict for the rows that say something.
 
     Attributes:
@@ -62,7 +62,7 @@ def refit_of_rows(result: FitResult) -> tuple[Refit, Int[np.ndarray, " rows"]]:
     return Refit(refit.objective.of_rows(told), refit.values), told
 
 
-def believe_draws(result: FitResult, found: Posterior, *, seed: int = 0) -> Believed:
+def posterior_draws(result: FitResult, found: Posterior, *, seed: int = 0) -> PosteriorDraws:
     """Return draws of a fit's posterior, and what they predict.
 
     Args:
@@ -82,7 +82,7 @@ def believe_draws(result: FitResult, found: Posterior, *, seed: int = 0) -> Beli
     def in_chains(column):
         return column.reshape(*shape, *column.shape[1:])
 
-    return Believed(
+    return PosteriorDraws(
         names=refit.objective.problem.names,
         rows=told,
         measured=np.where(used, np.asarray(rows.amplitude_nm), np.nan),

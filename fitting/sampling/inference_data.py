@@ -12,7 +12,7 @@ from afm_jax.checks import checked
 from afm_jax.version import __version__
 from afm_jax.whole_files import write_whole
 from fitting.fits.result import FitResult
-from fitting.sampling.draws import believe_draws
+from fitting.sampling.draws import posterior_draws
 from fitting.sampling.posterior_result import Posterior
 from fitting.sampling.trust_pack import READINGS
 
@@ -49,7 +49,7 @@ def write_inference_data(result: FitResult, found: Posterior, path: str | Path, 
         OSError: if the file cannot be written.
     """
     xarray = require_netcdf()
-    believed = believe_draws(result, found, seed=seed)
+    believed = posterior_draws(result, found, seed=seed)
     lines, draw = result.table.lines[believed.rows], ("chain", "draw")
     steps = {name: np.arange(size) for name, size in zip(draw, believed.values.shape, strict=False)}
     predictive, observed, places = {}, {}, {}

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from afm_jax.least_squares import whole_covariance_of
+from fitting.fits.discrepancy import LawBefore
 from fitting.fits.fit import law_before, speed_range
 from fitting.fits.intervals import at_bound
 from fitting.fits.objective import Objective
-from fitting.fits.unmodelled import LawBefore
 from fitting.sampling.bootstrap import BatchFit, DataSets, Refit, fit_data_sets
 
 CHECKED = 7

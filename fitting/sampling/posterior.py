@@ -29,7 +29,7 @@ def posterior(
     samples: int = 1000,
     seed: int = 0,
 ) -> Posterior:
-    """Return what is believed of the parameters after the data, with priors flat in their values.
+    """Return the posterior of the parameters, with priors flat in their values.
 
     Constraints of the fit (the quality factor's, calibrations) are Gaussian priors.
 

@@ -1,4 +1,4 @@
-"""What is believed of the parameters after the data: densities on a grid, or samples with what says they are enough."""
+"""The posterior of the parameters: densities on a grid, or samples with what says they are enough."""
 
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -63,7 +63,7 @@ class Posterior(Result):
         mean: by parameter.
         standard_deviation: by parameter.
         interval95: equal-tailed credible interval by parameter.
-        converged: whether to believe it; `reasons` say why not.
+        converged: whether to trust it; `reasons` say why not.
         reasons: a sentence each.
         grid: for "grid".
         chains: for "nuts".

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
+from fitting.fits.discrepancy import root_of
 from fitting.fits.objective import Objective
-from fitting.fits.unmodelled import root_of
 from fitting.sampling.bootstrap import DataSets, Refit, fit_data_sets, shifts
 from fitting.sampling.draws import densities, noise_of
 from fitting.sampling.leave_one_out import pareto_smoothed

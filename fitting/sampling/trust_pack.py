@@ -11,7 +11,7 @@ from afm_jax.checks import checked
 from afm_jax.results import Result, public_result
 from fitting.fits.result import FitResult
 from fitting.sampling.bootstrap import require_valid
-from fitting.sampling.draws import Believed, believe_draws, refit_of_rows
+from fitting.sampling.draws import PosteriorDraws, posterior_draws, refit_of_rows
 from fitting.sampling.influence import Influence, influence_of_rows
 from fitting.sampling.leave_one_out import LeaveOneOut, leave_one_out
 from fitting.sampling.posterior_result import Posterior
@@ -140,7 +140,7 @@ def trust(
     require_valid(result)
     if sets < FEWEST_SETS:
         raise ValueError(f"`sets` must be at least {FEWEST_SETS}, but is {sets}")
-    believed = believe_draws(result, found, seed=seed)
+    believed = posterior_draws(result, found, seed=seed)
     refit, told = refit_of_rows(result)
     flat = believed.values.reshape(-1, believed.values.shape[2])
     ranks = calibrate_ranks(refit, flat, sets=sets, seed=seed, log_uniform=found.log_uniform, report=report)
@@ -160,7 +160,7 @@ def trust(
     )
 
 
-def _bands(believed: Believed) -> PredictiveBands:
+def _bands(believed: PosteriorDraws) -> PredictiveBands:
     replicated = believed.replicated.reshape(-1, *believed.measured.shape)
     quantiles = np.quantile(replicated, SHARES, axis=0)
     return PredictiveBands(believed.measured, np.where(np.isfinite(believed.measured), quantiles, np.nan))

@@ -87,7 +87,7 @@ LEFT: dict[str, Callable[[Any], Any]] = {
 NO_NUMBERS = {
     # read, write, remember; NumPy alone; or what one of the above hands to them
     *("load", "load_law", "load_scene", "save_law", "save_scene", "scene_family", "use_cache", "trajectory"),
-    *("believe", "design", "drive_grid", "equipartition", "fit_each", "lockin", "posterior", "read_curve"),
+    *("prior_of_values", "design", "drive_grid", "equipartition", "fit_each", "lockin", "posterior", "read_curve"),
     *(
         "read_curves",
         "read_sweep",

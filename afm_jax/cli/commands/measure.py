@@ -8,7 +8,7 @@ from typing import Any
 import click
 
 from afm_jax.cli.command import Command, Options
-from afm_jax.cli.design_belief import with_belief_options
+from afm_jax.cli.design_prior import with_prior_options
 from afm_jax.cli.fit_options import Constraint, Fixed, Names, check_fit
 from afm_jax.cli.options import NOISE, QUALITY_FACTOR
 from afm_jax.cli.session import FIT_PROGRAMS, Session
@@ -108,7 +108,7 @@ DESIGN = Command(
     runs="afm_jax.cli.design:planned",
     help="""Choose the drives to measure next, and forecast how well the law will then be known.
 
-    Say what is believed: the cantilever (--free-frequency-khz, --quality-factor '40 +- 2') and the law (--r,
+    Say what is known: the cantilever (--free-frequency-khz, --quality-factor '40 +- 2') and the law (--r,
     --epsilon, ...), or what was measured so far (--fit, --measured); and what can be driven: every combination of
     orders, frequencies, amplitudes and offsets is a candidate; with --drive force or base (the cantilever is driven
     itself, amplitude and lag are read) of frequencies, free amplitudes and heights. LISTs are numbers and ranges, 1,2,5
@@ -191,7 +191,7 @@ DESIGN = Command(
             metavar="SHARE",
             help="How far the law may be off where no fit says.",
         ),
-        with_belief_options,
+        with_prior_options,
     ),
     check=_check_lists,
 )

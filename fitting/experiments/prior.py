@@ -1,6 +1,6 @@
-"""What is believed before an experiment is designed: parameter values, and what measurements so far say of them.
+"""The prior of a design: what is known of cantilever and law before the experiment, and how well.
 
-A fit leaves such a belief: its values, its covariance, and the drives that were measured.
+A fit leaves one: its values, its covariance, and the drives that were measured.
 """
 
 import math
@@ -36,7 +36,7 @@ from fitting.tables.csv_text import TableError, beyond, read_fit_json
 from fitting.tables.table import DRIVES
 
 UNCERTAINTY = 0.1
-"""How far a belief is off, relative, where no measurement says."""
+"""How far a prior is off, relative, where no measurement says."""
 DRAW_SEED = 1997
 EXACT_QUALITY_FACTOR = (
     "The quality factor is taken as exactly known, which makes every forecast too good: give it with its error, such "
@@ -46,12 +46,12 @@ EXACT_QUALITY_FACTOR = (
 
 @public_result()
 @dataclass(frozen=True, eq=False, kw_only=True)
-class Belief(Result):
-    """What is believed of cantilever and law, and how sure that is.
+class Prior(Result):
+    """What is known of cantilever and law before an experiment, with its covariance.
 
     Attributes:
         problem: the model, its parameters and the uncertain quantities of the instrument.
-        values: believed values in the problem's order.
+        values: the expected values in the problem's order.
         information: Fisher information of everything known so far, shape (p, p): measurements and constraints; 0 in a
             direction of which nothing is known.
         free_frequency_khz: of the cantilever.
@@ -62,7 +62,7 @@ class Belief(Result):
             for some of these values is not planned with.
         constraints: value and standard error of what is known apart from the measured drives; part of `information`.
         measured: drives that were measured already, rows of order, frequency, amplitude, offset.
-        source: where the belief comes from, in words.
+        source: where the prior comes from, in words.
         notes: what a reader of the design should know of it; a sentence each.
         law: that the values are the closest formula's to; None: they were given.
     """
@@ -82,7 +82,7 @@ class Belief(Result):
     law: ImpactLaw | TabulatedLaw | None = None
 
     def draws(self, count: int, *, least: float = 0.0) -> Float[np.ndarray, "count p"]:
-        """Return values that are as likely as the belief is uncertain, the believed ones first; seeded.
+        """Return values that are as likely as the prior is uncertain, the prior ones first; seeded.
 
         Args:
             count: how many.
@@ -111,7 +111,7 @@ def size_of(parameter: Parameter, value: float) -> float:
 
 
 @checked
-def believe(  # noqa: PLR0913
+def prior_of_values(  # noqa: PLR0913
     model: str = "law+delay",
     *,
     free_frequency_khz: float,
@@ -126,8 +126,8 @@ def believe(  # noqa: PLR0913
     uncertainty: float = UNCERTAINTY,
     drive: str = "sample",
     law: ImpactLaw | TabulatedLaw | None = None,
-) -> Belief:
-    """Return a belief made of values, before anything was measured.
+) -> Prior:
+    """Return a prior made of values, before anything was measured.
 
     Args:
         model: a model of `fitting.fit`.
@@ -190,7 +190,7 @@ def believe(  # noqa: PLR0913
     if closest.information.size and told.size:
         among = np.array(places)[told]
         information[np.ix_(among, among)] += closest.information[np.ix_(told, told)]
-    return Belief(
+    return Prior(
         problem=problem,
         values=checked_values(problem, start),
         information=information,
@@ -320,8 +320,8 @@ def _assumptions(
     return tuple(notes)
 
 
-def read_belief(path: str | Path, uncertainty: float = UNCERTAINTY) -> tuple[Belief, dict[str, Any]]:
-    """Return the belief that a saved fit leaves, and the fit's own object.
+def read_prior(path: str | Path, uncertainty: float = UNCERTAINTY) -> tuple[Prior, dict[str, Any]]:
+    """Return the prior that a saved fit leaves, and the fit's own object.
 
     Args:
         path: what `afm-jax fit --json` prints, or the fit.json of its report.
@@ -332,7 +332,7 @@ def read_belief(path: str | Path, uncertainty: float = UNCERTAINTY) -> tuple[Bel
     """
     payload = read_fit_json(path)
     try:
-        return belief_of_fit(payload, uncertainty), payload
+        return prior_of_fit(payload, uncertainty), payload
     except ValueError as error:
         raise TableError(f"{printable(str(path))}: {error}") from error
     except (ArithmeticError, AttributeError, LookupError, TypeError) as error:
@@ -346,8 +346,8 @@ def _columns_of(drive: str | None) -> tuple[str, str, str, str]:
     return "order", "drive_frequency_khz", amplitude, "offset_nm"
 
 
-def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNCERTAINTY) -> Belief:
-    """Return the belief that a fit leaves: its values, its covariance, and the drives that it used.
+def prior_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UNCERTAINTY) -> Prior:
+    """Return the prior that a fit leaves: its values, its covariance, and the drives that it used.
 
     Args:
         result: from `fitting.fit`, or its JSON (`afm-jax fit --json`) as a mapping.
@@ -363,7 +363,7 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
     table, drive = tables[0], tables[0].get("drive") or "sample"
     driven = [one for one in tables if (one.get("drive") or "sample") == drive]
     found, matrix = payload["parameters"], payload["correlations"]["matrix"]
-    believed = {name: entry["value"] for name, entry in found.items()}
+    prior = {name: entry["value"] for name, entry in found.items()}
     problem = Problem(payload["model"], tuple(found), tuple(settings.get("effects") or EFFECTS), drive)
     notes = []
     if not payload["valid"]:
@@ -371,9 +371,9 @@ def belief_of_fit(result: FitResult | Mapping[str, Any], uncertainty: float = UN
         notes.append(f"The fit that the design rests on is not valid: {reason}")
     if table.get("quality_factor") is not None and "quality_factor" not in found:
         notes.append(EXACT_QUALITY_FACTOR)
-    return Belief(
+    return Prior(
         problem=problem,
-        values=checked_values(problem, believed),
+        values=checked_values(problem, prior),
         information=_information(found, matrix),
         free_frequency_khz=float(table["free_frequency_khz"]),
         quality_factor=table.get("quality_factor"),
@@ -433,7 +433,7 @@ def _check_payload(payload: Mapping[str, Any]) -> None:
 
 
 def _is_whole(payload: Mapping[str, Any]) -> bool:
-    """Say whether a saved fit has the numbers that belief rests on, as many as it should."""
+    """Say whether a saved fit has the numbers that prior rests on, as many as it should."""
     try:
         entries = [(entry["value"], entry["standard_error"] or 0.0) for entry in payload["parameters"].values()]
         matrix = [[np.nan if c is None else c for c in row] for row in payload["correlations"]["matrix"]]

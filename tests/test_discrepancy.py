@@ -9,13 +9,11 @@ from scipy.optimize import approx_fprime, least_squares
 
 from fitting import fit, read_table
 from fitting.examples.make_amplitudes import EXAMPLE
-from fitting.fits.loss import EV_PER_AJ, Loss, WithInterval, energy_lost, interval_of, nearest_of, scaled
-from fitting.fits.objective import Objective
-from fitting.fits.unmodelled import (
+from fitting.fits.discrepancy import (
     LawAfter,
     LawBefore,
+    ModelDiscrepancy,
     StepRows,
-    Unmodelled,
     closest_member,
     containing,
     descending_part,
@@ -26,6 +24,8 @@ from fitting.fits.unmodelled import (
     system_of,
     with_runs,
 )
+from fitting.fits.loss import EV_PER_AJ, Loss, WithInterval, energy_lost, interval_of, nearest_of, scaled
+from fitting.fits.objective import Objective
 from fitting.forward import ImpactSlopes, Predicted, Prediction, impact_slopes
 from fitting.models import Problem, measurement_of
 from fitting.parameters import DELAY_NAMES, DELAY_SHAPE, LOSS_SHAPE
@@ -43,7 +43,7 @@ VALUES = {
     "quality_factor": 40.0,
 }
 PROBLEM = Problem("viscous+delay", tuple(VALUES))
-LEFT_OUT = Unmodelled(PROBLEM, VALUES, (20.0, 200.0))
+LEFT_OUT = ModelDiscrepancy(PROBLEM, VALUES, (20.0, 200.0))
 ROWS = 12
 
 

@@ -32,7 +32,7 @@ from afm_jax.contact.law_of_contact import tabulated
 from afm_jax.contact.parameters import CONTACT_PARAMETER, PAPER, idle_without
 from afm_jax.least_squares import covariance_of
 from afm_jax.units import TWO_SIDED_95
-from fitting.fits.minimum import Strain, padding
+from fitting.fits.minimum import ModelErrors, padding
 from fitting.fits.objective import MOST_OUTLIERS, OUTLIER, ROBUST, Objective
 from fitting.forward import ImpactSlopes, Predicted, free_impacts, impact_at, impact_slopes
 from fitting.models import Problem
@@ -289,7 +289,7 @@ class Columns(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Unmodelled:
+class ModelDiscrepancy:
     """What a model with fitted values leaves out.
 
     Attributes:
@@ -471,24 +471,24 @@ class StepSystem(NamedTuple):
         return self.noise @ weighted, weighted
 
 
-def system_of(rows: StepRows, left_out: Unmodelled) -> StepSystem:
+def system_of(rows: StepRows, discrepancy: ModelDiscrepancy) -> StepSystem:
     """Return the rows of a fit, linearised, with what its model leaves out."""
-    size, names = rows.measurement_error.size, left_out.problem.names
-    columns = left_out.columns(rows.approach, rows.rebound)
+    size, names = rows.measurement_error.size, discrepancy.problem.names
+    columns = discrepancy.columns(rows.approach, rows.rebound)
     slopes = np.stack([rows.slopes.by_square, rows.slopes.by_delay])
 
     def amplitudes(change):
         """Return changes of the amplitudes' residuals that changes of the impacts make."""
         return np.einsum("krc,kr...->rc...", slopes, change).reshape(size, *change.shape[2:])
 
-    known, priors = len(names), left_out.priors
+    known, priors = len(names), discrepancy.priors
     residual = rows.residual.copy()
     residual[:size] += amplitudes(columns.known)
     jacobian = np.zeros((residual.size + len(priors), known + len(priors)))
     jacobian[: residual.size, :known] = rows.jacobian
     # what may stay open has its range, around where the fit ended; the rows' last residuals are what is known of each
     place = residual.size - known + np.arange(known), np.arange(known)
-    ranges = np.sqrt(left_out.problem.known_by_range(np.array([left_out.values[name] for name in names])))
+    ranges = np.sqrt(discrepancy.problem.known_by_range(np.array([discrepancy.values[name] for name in names])))
     jacobian[place] = np.where(jacobian[place] == 0.0, ranges, jacobian[place])
     if "viscous_loss" in names:
         jacobian[:size, names.index("viscous_loss")] += amplitudes(columns.drag)
@@ -496,18 +496,18 @@ def system_of(rows: StepRows, left_out: Unmodelled) -> StepSystem:
     jacobian[residual.size :, known:] = np.diag([1.0 / error for _, error in priors.values()])
     residual = np.append(residual, np.zeros(len(priors)))
     of_law = amplitudes(columns.unknown)
-    for place, one in enumerate(left_out.held, start=of_law.shape[1] - len(left_out.held)):
+    for place, one in enumerate(discrepancy.held, start=of_law.shape[1] - len(discrepancy.held)):
         if one.readings is not None:
             of_law[:, place] = one.readings
     unknown = [of_law]
-    if left_out.problem.lasting:
-        unknown.append(amplitudes(_remainders(rows, left_out.problem)))
+    if discrepancy.problem.lasting:
+        unknown.append(amplitudes(_remainders(rows, discrepancy.problem)))
     return StepSystem(residual, jacobian, np.concatenate(unknown, axis=1), _noise(rows), unknown[0].shape[1])
 
 
 def step_of(
     rows: StepRows,
-    left_out: Unmodelled,
+    discrepancy: ModelDiscrepancy,
     free: Bool[np.ndarray, " p"],
     more: Float[np.ndarray, "readings m"] | None = None,
 ) -> LinearStep:
@@ -515,13 +515,13 @@ def step_of(
 
     Args:
         rows: of the fit.
-        left_out: by the fitted model.
+        discrepancy: by the fitted model.
         free: which of its parameters are not at their bound.
         more: how the readings' residuals change with further unknowns of unit variance, which the law does not have.
     """
-    size, names, priors = rows.measurement_error.size, left_out.problem.names, left_out.priors
-    values = np.array([left_out.values[name] for name in names])
-    residual, jacobian, unknown, noise, _ = system_of(rows, left_out).with_unknowns(more)
+    size, names, priors = rows.measurement_error.size, discrepancy.problem.names, discrepancy.priors
+    values = np.array([discrepancy.values[name] for name in names])
+    residual, jacobian, unknown, noise, _ = system_of(rows, discrepancy).with_unknowns(more)
     variance = noise + unknown @ unknown.T
     root = np.linalg.cholesky(variance)
 
@@ -556,7 +556,7 @@ def step_of(
 
 def longest_run(
     rows: StepRows,
-    left_out: Unmodelled,
+    discrepancy: ModelDiscrepancy,
     free: Bool[np.ndarray, " p"],
     more: Float[np.ndarray, "readings m"] | None = None,
 ) -> float:
@@ -567,12 +567,12 @@ def longest_run(
 
     Args:
         rows: of the fit.
-        left_out: by the fitted model.
+        discrepancy: by the fitted model.
         free: which of its parameters are not at their bound.
         more: as of `step_of`.
     """
     size = rows.measurement_error.size
-    system = system_of(rows, left_out)
+    system = system_of(rows, discrepancy)
     residual, jacobian = system.residual, system.jacobian
     unknown = system.unknown if more is None else np.concatenate([system.unknown, more], axis=1)
     root = np.linalg.cholesky(system.noise + unknown @ unknown.T)
@@ -596,14 +596,14 @@ def longest_run(
     return float(np.max(np.abs(others[:, 1:].T @ others[:, 0])[told] / after[told], initial=0.0))
 
 
-def with_runs(left_out: Unmodelled, run: float) -> Unmodelled:
+def with_runs(discrepancy: ModelDiscrepancy, run: float) -> ModelDiscrepancy:
     """Return what a model leaves out, wider where residuals run together: never narrower.
 
     Args:
-        left_out: by the model, without it.
+        discrepancy: by the model, without it.
         run: as `longest_run` says.
     """
-    return replace(left_out, short=float(np.clip(_SHARE_PER_RUN * (run - _RUN_BY_CHANCE), 0.0, _LARGEST_SHARE)))
+    return replace(discrepancy, short=float(np.clip(_SHARE_PER_RUN * (run - _RUN_BY_CHANCE), 0.0, _LARGEST_SHARE)))
 
 
 _STEP_PARTS = (1.0, 0.0), (0.5, 0.25), (0.125, 0.0625)
@@ -708,7 +708,7 @@ def _remainders(rows: StepRows, problem: Problem) -> Float[np.ndarray, "2 rows m
 
 
 def rows_of_fit(
-    stated: Objective, objective: Objective, values: Float[np.ndarray, " p"], strain: Strain, scale: float
+    stated: Objective, objective: Objective, values: Float[np.ndarray, " p"], model_errors: ModelErrors, scale: float
 ) -> StepRows:
     """Return the rows of a fit as the step sees them.
 
@@ -716,7 +716,7 @@ def rows_of_fit(
         stated: the objective with the errors as measured.
         objective: the fit's, following its orbits.
         values: the fitted ones.
-        strain: of the rows.
+        model_errors: of the rows.
         scale: of the errors.
     """
     problem, rows = objective.problem, jax.tree.map(np.asarray, objective.measurement.rows)
@@ -741,7 +741,7 @@ def rows_of_fit(
         jacobian=np.asarray(linear.jacobian)[0],
         slopes=impact_slopes(values, objective.measurement, problem, objective.near),
         measurement_error=np.where(measured, scale * np.asarray(stated.measurement.rows.error_nm) / error, 1.0),
-        slow_error=np.where(measured, scale * padding(strain.slow_error, rows.amplitude_nm) / error, 0.0),
+        slow_error=np.where(measured, scale * padding(model_errors.slow_error, rows.amplitude_nm) / error, 0.0),
         approach=np.where(there, speeds.approach, 100.0),
         rebound=np.where(there, speeds.rebound, 99.0),
         pull=np.where(there, prediction.pull_nm_per_us2, 0.0),
@@ -789,7 +789,7 @@ class LawBefore(NamedTuple):
 
 def law_after(
     step: LinearStep,
-    left_out: Unmodelled,
+    discrepancy: ModelDiscrepancy,
     speeds: Float[np.ndarray, " n"],
     before: LawBefore,
     moved: LawBefore | None = None,
@@ -801,7 +801,7 @@ def law_after(
 
     Args:
         step: the step.
-        left_out: by the fitted model.
+        discrepancy: by the fitted model.
         speeds: approach speeds in nm/us.
         before: the fitted law there.
         moved: the model's law with the parameters after the step; None: to first order.
@@ -810,7 +810,7 @@ def law_after(
     leaves = law[0] > 0.0
     w = np.where(leaves, law[0], 1.0)
     # what changes the speed changes the delay along with it
-    lead = left_out.values.get("delay_lead_nm", 0.0) / (2.0 * w**3)
+    lead = discrepancy.values.get("delay_lead_nm", 0.0) / (2.0 * w**3)
 
     def seen(change):
         """Return changes of speed and delay for changes of squared speed and delay."""
@@ -818,36 +818,36 @@ def law_after(
         along = (slice(None), *(None,) * (square.ndim - 1))
         return np.stack([square / (2.0 * w)[along], late + lead[along] * square])
 
-    columns = left_out.columns(speeds, w)
+    columns = discrepancy.columns(speeds, w)
     found, factor = _moved(step, slope, Columns(*(seen(part) for part in columns)))
     found = np.where(leaves, law + found, law)
     found[0] = np.maximum(found[0], 0.0)
     if moved is not None:
-        found = _with_discrepancy(step, left_out, speeds, columns, moved)
+        found = _with_discrepancy(step, discrepancy, speeds, columns, moved)
     whole = LawAfter(found, np.where(leaves[:, None], factor, 0.0), before.capture, np.full(factor.shape[2], np.nan))
     if not before.capture > 0.0:
         # without adhesion nothing is captured: what is left out cannot be told from there
         return whole
     # where the squared rebound speed vanishes
-    edge = left_out.columns(np.array([before.capture]), np.zeros(1))
-    rising = 2.0 * left_out.values.get("r", 1.0) ** 2 * before.capture - left_out.values.get("viscous_loss", 0.0)
+    edge = discrepancy.columns(np.array([before.capture]), np.zeros(1))
+    rising = 2.0 * discrepancy.values.get("r", 1.0) ** 2 * before.capture - discrepancy.values.get("viscous_loss", 0.0)
     at_capture = Columns(*(-part[:1, :1] / max(rising, 1e-9) for part in edge))
     shift, capture_factor = _moved(step, before.capture_slope[None, None], at_capture)
     capture = before.capture + float(shift[0, 0])
     if moved is not None:
-        values = left_out.values | dict(zip(step.names, step.values, strict=True))
+        values = discrepancy.values | dict(zip(step.names, step.values, strict=True))
         edge_u = np.array([moved.capture])
-        square = _discrepancy(step, values, edge_u, left_out.columns(edge_u, np.zeros(1)))[0, 0]
+        square = _discrepancy(step, values, edge_u, discrepancy.columns(edge_u, np.zeros(1)))[0, 0]
         capture = moved.capture - float(square) / max(rising, 1e-9)
     capture = max(capture, 0.0)
     return whole._replace(capture=capture, capture_factor=capture_factor[0, 0])
 
 
 def _with_discrepancy(
-    step: LinearStep, left_out: Unmodelled, u: Float[np.ndarray, " n"], columns: Columns, moved: LawBefore
+    step: LinearStep, discrepancy: ModelDiscrepancy, u: Float[np.ndarray, " n"], columns: Columns, moved: LawBefore
 ) -> Float[np.ndarray, "2 n"]:
     """Return rebound speed and delay of the formula after the step with the most likely discrepancy."""
-    values = left_out.values | dict(zip(step.names, step.values, strict=True))
+    values = discrepancy.values | dict(zip(step.names, step.values, strict=True))
     formula, delay = moved.law
     square, late = _discrepancy(step, values, u, columns)
     rebound = np.sqrt(np.maximum(formula**2 + square, 0.0))
@@ -882,7 +882,7 @@ _TURNS = 8
 
 def closest_member(
     step: LinearStep,
-    left_out: Unmodelled,
+    discrepancy: ModelDiscrepancy,
     speeds: Float[np.ndarray, " n"],
     before: LawBefore,
     free: Bool[np.ndarray, " p"],
@@ -895,7 +895,7 @@ def closest_member(
 
     Args:
         step: the step.
-        left_out: by the fitted model.
+        discrepancy: by the fitted model.
         speeds: approach speeds in nm/us at which the formula is compared: those of the rows that were used.
         before: the fitted law there.
         free: which of the parameters are not at their bound.
@@ -904,7 +904,7 @@ def closest_member(
     Returns:
         None where the parameters are not determined.
     """
-    after, names = law_after(step, left_out, speeds, before, moved), left_out.problem.names
+    after, names = law_after(step, discrepancy, speeds, before, moved), discrepancy.problem.names
     if not (np.isfinite(step.covariance).all() and np.isfinite(after.factor).all()):
         return None
     there = (before.law[0] > 0.0) & (after.law[0] > 0.0)
@@ -912,7 +912,7 @@ def closest_member(
     weight = 1.0 / np.maximum(np.linalg.norm(factor, axis=2), 1e-300)
     values, ends = (
         step.values[: len(names)].copy(),
-        np.array([(p.lowest, p.highest) for p in left_out.problem.parameters]),
+        np.array([(p.lowest, p.highest) for p in discrepancy.problem.parameters]),
     )
     spread = np.zeros((len(names), factor.shape[2]))
     spread[:, : len(step.names)] = root_of(step.covariance)[: len(names)]
@@ -920,10 +920,10 @@ def closest_member(
         np.array([i for i, name in enumerate(names) if name in some and free[i]], dtype=int)
         for some in (("r", "epsilon", "viscous_loss"), DELAY_NAMES)
     )
-    spread[[i for i, name in enumerate(names) if name in left_out.problem.own]] = 0.0
+    spread[[i for i, name in enumerate(names) if name in discrepancy.problem.own]] = 0.0
 
     def known(name: str, absent: float) -> float:
-        return float(values[names.index(name)]) if name in names else left_out.values.get(name, absent)
+        return float(values[names.index(name)]) if name in names else discrepancy.values.get(name, absent)
 
     def turned(places: np.ndarray, weights: np.ndarray, slope: np.ndarray, miss: np.ndarray) -> None:
         moving = np.ones(places.size, dtype=bool)

@@ -1,4 +1,4 @@
-"""The options of `afm-jax design` about what is believed: the cantilever, the law, or a fit of both."""
+"""The options of `afm-jax design` about what is known before: the cantilever, the law, or a fit of both."""
 
 import functools
 import math
@@ -13,7 +13,7 @@ from fitting.parameters import DELAY, DRIFT_NAMES, LAW, MODELS, NUISANCES, PARAM
 
 if TYPE_CHECKING:
     from afm_jax.impact.law import TabulatedLaw
-    from fitting.experiments.belief import Belief
+    from fitting.experiments.prior import Prior
 
 _LAW = tuple(parameter.name for parameter in (*LAW, *DELAY))
 _REMARKS = {"quality_factor": "; none: no air damping", "offset_origin_nm": "; not with a delay"}
@@ -22,7 +22,7 @@ _NUISANCE_NAMES = tuple(nuisance.name for nuisance in _NUISANCES)
 _BELONG = ("mass_ng", "spring_constant_n_per_m", "free", "fix", "value", *_LAW, *_NUISANCE_NAMES)
 
 
-class BeliefOptions(NamedTuple):
+class PriorOptions(NamedTuple):
     """The options as they were given; None where they were not."""
 
     fit: Path | None
@@ -54,8 +54,8 @@ class Assignment(click.ParamType):
             self.fail(f"`{value}` is no NAME=NUMBER, such as relative_humidity=0.4", param, ctx)
 
 
-def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Give a command the options of a belief; it gets them as `belief_options`."""
+def with_prior_options(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Give a command the options of a prior; it gets them as `prior_options`."""
 
     @functools.wraps(function)
     def command(
@@ -75,7 +75,7 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
         numbers = {name: options.pop(name) for name in _BELONG}
         given = {name: value for name, value in numbers.items() if value not in (None, ())}
         return function(
-            *args, belief_options=BeliefOptions(fit, measured, model, uncertainty, drive, law, given), **options
+            *args, prior_options=PriorOptions(fit, measured, model, uncertainty, drive, law, given), **options
         )
 
     # click lists options in the order of the decorators, the last one first
@@ -133,8 +133,8 @@ def with_belief_options(function: Callable[..., Any]) -> Callable[..., Any]:
     return command
 
 
-def believed(options: BeliefOptions, noise: float) -> "Belief":
-    """Return the belief that the options describe.
+def prior_of_options(options: PriorOptions, noise: float) -> "Prior":
+    """Return the prior that the options describe.
 
     Args:
         options: as given.
@@ -164,25 +164,25 @@ def believed(options: BeliefOptions, noise: float) -> "Belief":
             raise click.UsageError(f"{option_of(name)} is what {source} says already; leave one of them out")
     if options.drive is not None:
         raise click.UsageError(f"--drive is what {source} says already; leave one of them out")
-    from fitting.experiments.belief import belief_of_fit, read_belief  # noqa: PLC0415
+    from fitting.experiments.prior import prior_of_fit, read_prior  # noqa: PLC0415
 
     if options.fit is not None:
-        belief, _ = read_belief(options.fit, options.uncertainty)
-        if options.model not in (None, belief.problem.model):
-            raise click.UsageError(f"{options.fit} is a fit of the model {belief.problem.model}, not {options.model}")
-        return belief
+        prior, _ = read_prior(options.fit, options.uncertainty)
+        if options.model not in (None, prior.problem.model):
+            raise click.UsageError(f"{options.fit} is a fit of the model {prior.problem.model}, not {options.model}")
+        return prior
     from fitting.fits.fit import fit  # noqa: PLC0415
     from fitting.tables.table import read_table  # noqa: PLC0415
 
     table = read_table(options.measured or "", noise=noise)
-    return belief_of_fit(
+    return prior_of_fit(
         fit(table, options.model or "law+delay", free=_names(options), fixed=dict(options.numbers.get("fix", ()))),
         options.uncertainty,
     )
 
 
-def _from_values(options: BeliefOptions, law: "TabulatedLaw | None" = None) -> "Belief":
-    from fitting.experiments.belief import believe  # noqa: PLC0415
+def _from_values(options: PriorOptions, law: "TabulatedLaw | None" = None) -> "Prior":
+    from fitting.experiments.prior import prior_of_values  # noqa: PLC0415
 
     usual = "law+delay" if law is None or law.delayed else "law"
     numbers, model, free = options.numbers, options.model or usual, _names(options)
@@ -201,7 +201,7 @@ def _from_values(options: BeliefOptions, law: "TabulatedLaw | None" = None) -> "
     for name in _NUISANCE_NAMES:
         if name not in {"quality_factor", "free_frequency_khz"} and name in numbers and numbers[name][1] is None:
             raise click.UsageError(f"{option_of(name)} needs its standard error; write '{PARAMETERS[name].example}'")
-    return believe(
+    return prior_of_values(
         model,
         free_frequency_khz=numbers["free_frequency_khz"][0],
         quality_factor=quality_factor,
@@ -217,6 +217,6 @@ def _from_values(options: BeliefOptions, law: "TabulatedLaw | None" = None) -> "
     )
 
 
-def _names(options: BeliefOptions) -> tuple[str, ...] | None:
+def _names(options: PriorOptions) -> tuple[str, ...] | None:
     names = options.numbers.get("free")
     return None if names is None else tuple(name.strip().replace("-", "_") for name in names.split(","))
