@@ -74,12 +74,12 @@ types: $(SETUP)
 # From Python 3.12 on lines are counted by sys.monitoring, which costs little; the tracer before it doubles the time.
 TRACED := COVERAGE_CORE=$$($(BIN)/python -c 'import sys; print("sysmon" if sys.version_info >= (3, 12) else "ctrace")')
 
-coverage: $(SETUP) ## make test and make slow with the share of lines that they run (85 % at least)
+coverage: $(SETUP) ## make test and make slow with the share of lines that they run (90 % at least)
 	$(BIN)/python -m coverage erase
 	$(TRACED) $(MAKE) test PYTEST='-m coverage run -m pytest'
 	$(TRACED) $(MAKE) slow PYTEST='-m coverage run -m pytest'
 	$(BIN)/python -m coverage combine --quiet
-	$(BIN)/python -m coverage report --fail-under=85
+	$(BIN)/python -m coverage report --fail-under=90
 
 slow: $(SETUP) ## the slow tests: long iterations, references, notebooks
 	XLA_FLAGS="$$XLA_FLAGS $(COMPILED_SOON)" $(BIN)/python $(PYTEST) -m slow -n auto --dist worksteal --ignore tests/test_mutations.py
