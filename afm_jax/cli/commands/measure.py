@@ -12,7 +12,7 @@ from afm_jax.cli.design_prior import with_prior_options
 from afm_jax.cli.fit_options import Constraint, Fixed, Names, check_fit
 from afm_jax.cli.options import NOISE, QUALITY_FACTOR
 from afm_jax.cli.session import FIT_PROGRAMS, Session
-from afm_jax.cli.values import Finite, FiniteOrNone, Numbers, Orders, Share, ValueAndError
+from afm_jax.cli.values import Finite, Kind, Numbers, Orders, Share, ValueAndError
 from fitting.parameters import CONTACT_DEFAULT, DELAY_LAW, LAWS, MODELS, NUISANCE_NAMES
 
 
@@ -372,7 +372,7 @@ _OF_A_TRACE = (
     ("rest-nm", "nm", "What the deflection reads at the tip's rest position [default: 0]."),
 )
 _TRACE_SETTINGS = tuple(
-    click.option(f"--{name}", type=FiniteOrNone() if name == "quality-factor" else Finite(), metavar=unit, help=text)
+    click.option(f"--{name}", type=Finite(none=name == "quality-factor"), metavar=unit, help=text)
     for name, unit, text in _OF_A_TRACE
 )
 
@@ -416,9 +416,9 @@ _READING_NUMBERS = (
 class NmPerVolt(ValueAndError):  # noqa: N818 (no exception)
     """A value with its error, or the word `slope`."""
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+    def read(self, text: str) -> Any:
         """Return the value and its error, or the word."""
-        return value if value == "slope" else super().convert(value, param, ctx)
+        return text if text == "slope" else super().read(text)
 
 
 READING = (
@@ -550,22 +550,16 @@ _IMAGE_NUMBERS = (
 _IMAGE_SETTINGS = tuple(_number(*row) for row in _IMAGE_NUMBERS)
 
 
-class RowsAndColumns(click.ParamType):
+class RowsAndColumns(Kind):
     """Rows and columns, as 10x12."""
 
     name = "grid"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
-        """Return rows and columns.
-
-        Raises:
-            click.BadParameter: if it is no such pair.
-        """
-        if isinstance(value, tuple):
-            return value
-        match = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", str(value))
+    def read(self, text: str) -> tuple[int, int]:
+        """Return rows and columns."""
+        match = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", text)
         if match is None:
-            self.fail(f"`{value}` is no ROWSxCOLUMNS; write 10x12", param, ctx)
+            raise ValueError(f"`{text}` is no ROWSxCOLUMNS; write 10x12")
         return int(match[1]), int(match[2])
 
 

@@ -1,16 +1,16 @@
 """Commands about the motions of a scene."""
 
 import math
+import re
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import click
 
 from afm_jax.cli.command import Command, Options
 from afm_jax.cli.options import DRAWS, LAW, PICTURE, SCENE
 from afm_jax.cli.session import Session
-from afm_jax.cli.values import Ends, Finite, Grid, Share
+from afm_jax.cli.values import Ends, Finite, Grid, Kind, Share
 
 BASINS = Command(
     name="basins",
@@ -133,38 +133,29 @@ LYAPUNOV = Command(
 )
 
 
-class PositiveInteger(click.ParamType):
+class PositiveInteger(Kind):
     """An integer from 1 to a million."""
 
     name = "integer"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Return the integer that a text says.
-
-        Raises:
-            click.BadParameter: if it is none, or none in the range.
-        """
-        text = str(value).strip()
-        if not (text.isascii() and text.isdigit() and len(text) < 8 and 1 <= int(text) <= 1_000_000):
-            self.fail(f"must be a positive integer up to 1000000, but is {value}", param, ctx)
+    def read(self, text: str) -> int:
+        """Return the integer."""
+        if not re.fullmatch(r"\s*[0-9]{1,7}\s*", text) or not 1 <= int(text) <= 1_000_000:
+            raise ValueError(f"must be a positive integer up to 1000000, but is {text}")
         return int(text)
 
 
-class Multiples(click.ParamType):
+class Multiples(Kind):
     """Positive integers in a comma list."""
 
     name = "list"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
-        """Return the integers that a text says, without repetitions.
-
-        Raises:
-            click.BadParameter: if one is none, or not from 1 to 1000.
-        """
-        parts = [part.strip() for part in str(value).split(",")]
-        if not all(part.isascii() and part.isdigit() and len(part) < 5 and 1 <= int(part) <= 1000 for part in parts):
-            self.fail(f"must be integers from 1 to 1000 as in 1,2,3, but is {value}", param, ctx)
-        return tuple(dict.fromkeys(int(part) for part in parts))
+    def read(self, text: str) -> tuple[int, ...]:
+        """Return the integers, without repetitions."""
+        parts = text.split(",")
+        if not all(re.fullmatch(r"\s*[0-9]{1,4}\s*", part) and 1 <= int(part) <= 1000 for part in parts):
+            raise ValueError(f"must be integers from 1 to 1000 as in 1,2,3, but is {text}")
+        return tuple(dict.fromkeys(map(int, parts)))
 
 
 def _check_sticking(_: Session, options: Options) -> None:
