@@ -6,7 +6,7 @@ from typing import Any
 
 from rich.table import Table
 
-from afm_jax.cli.command import columns_of
+from afm_jax.cli.columns import columns_of
 from afm_jax.effects.study import Cost, EffectReport, EffectStudy, Reduction, periods_read
 from afm_jax.scenefile.scenefile import Start, scene_tables
 from afm_jax.units import RAD_PER_US_PER_KHZ

@@ -3,7 +3,8 @@
 from typing import Any
 
 from afm_jax.apparatus.scene import Scene, drive_of
-from afm_jax.cli.command import NamedScene, Output, columns_of, later
+from afm_jax.cli.columns import columns_of
+from afm_jax.cli.command import NamedScene, Output, later
 from afm_jax.cli.commands.simulate import DEFAULT_PERIODS
 from afm_jax.cli.session import Session
 from afm_jax.cli.simulate_output import contact_rows, payload_of, stretch_written, text_of, trajectory_rows, write_trace
