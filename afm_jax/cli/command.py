@@ -128,7 +128,7 @@ class Command:
         # click lists options in the order of decorators, of which the last is applied first
         for option in reversed(self.options):
             function = option(function)
-        return click.command(self.name, help=self.help)(function)
+        return click.command(self.name, help=self.help, context_settings={"show_default": True})(function)
 
 
 def run_command(row: Command, session: Session, **options: Any) -> None:

@@ -16,10 +16,8 @@ LAW = click.option(
     "place of the scene's, its errors as bands.",
 )
 """With `SCENE` it is loaded, too: the scene has its law then."""
-DRAWS = click.option(
-    "--draws", type=click.IntRange(2), default=20, show_default=True, help="Laws drawn from the fit for the bands."
-)
-PICTURE = click.option("--picture", type=PictureFormat(), default="png", show_default=True, help="png, pdf or svg.")
+DRAWS = click.option("--draws", type=click.IntRange(2), default=20, help="Laws drawn from the fit for the bands.")
+PICTURE = click.option("--picture", type=PictureFormat(), default="png", help="png, pdf or svg.")
 NOISE = click.option(
     "--noise",
     type=Share("a relative error"),

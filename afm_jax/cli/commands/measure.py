@@ -49,8 +49,8 @@ CALIBRATE = Command(
         click.option(
             "--background",
             type=click.Choice(("none", "floor", "constant", "linear")),
-            help="What is added to the response: with phase none, constant or linear; without none, floor or constant. "
-            "Without this option constant, or what Akaike's criterion prefers clearly.",
+            help="What is added to the response: with phase none, constant or linear; without none, floor or "
+            "constant. Without this option constant, or what Akaike's criterion prefers clearly.",
         ),
         click.option("--amplitude-only", is_flag=True, help="Leave the phase of the sweep aside."),
         click.option(
@@ -74,7 +74,6 @@ CALIBRATE = Command(
             "--deflection",
             type=click.Choice(["static", "mode"]),
             default="static",
-            show_default=True,
             help="How a thermal spectrum got its nm: by the slope of a force curve (static InvOLS), or for the mode "
             "itself.",
         ),
@@ -82,8 +81,8 @@ CALIBRATE = Command(
             "--scale-error",
             type=Share("a relative error"),
             metavar="SHARE",
-            help="Relative error of the deflection's scale (its sensitivity), of which k has twice as much [default: "
-            "5 %].",
+            help="Relative error of the deflection's scale (its sensitivity), of which k has twice as much "
+            "[default: 5 %].",
         ),
         click.option(
             "--slope", is_flag=True, help="SWEEP holds force curves: the sensitivity (nm/V) from their slope."
@@ -130,8 +129,8 @@ DESIGN = Command(
             "--detuning",
             type=Numbers(),
             metavar="LIST",
-            help="Drive frequencies as multiples of each order's resonance 2 N f0, else 0.97:1.05:0.01; or of f0 where "
-            "the tip is driven, else 1.02:1.1:0.02.",
+            help="Drive frequencies as multiples of each order's resonance 2 N f0, else 0.97:1.05:0.01; or of f0 "
+            "where the tip is driven, else 1.02:1.1:0.02.",
         ),
         click.option(
             "--drive-nm",
@@ -145,11 +144,10 @@ DESIGN = Command(
             type=Numbers(positive=False),
             metavar="LIST",
             help="Where the tip is driven, in place of offsets: distances of the sample as shares of each free "
-            "amplitude; else "
-            "0.1:0.9:0.1.",
+            "amplitude; else 0.1:0.9:0.1.",
         ),
         click.option("--largest-nm", type=Finite(), metavar="X", help="Peak amplitude that the instrument takes."),
-        click.option("--points", type=click.IntRange(1, 200), default=8, show_default=True, help="How many to choose."),
+        click.option("--points", type=click.IntRange(1, 200), default=8, help="How many to choose."),
         click.option(
             "--for", "interest", metavar="NAMES", help="Parameters to be known well, as r,epsilon; else the law's."
         ),
@@ -157,37 +155,26 @@ DESIGN = Command(
             "--criterion",
             type=click.Choice(("D", "A")),
             default="D",
-            show_default=True,
             help="Smallest joint region, or sum of variances.",
         ),
         click.option(
             "--noise",
             type=Share("a relative error"),
             default="1%",
-            show_default=True,
             metavar="SHARE",
             help="Relative error of an amplitude.",
         ),
-        click.option(
-            "--phase-noise-deg",
-            type=Finite(),
-            default=0.2,
-            show_default=True,
-            metavar="X",
-            help="Error of a lag, tip driven.",
-        ),
+        click.option("--phase-noise-deg", type=Finite(), default=0.2, metavar="X", help="Error of a lag, tip driven."),
         click.option(
             "--amplitudes",
             type=click.Choice(("both", "peak", "lockin")),
             default="both",
-            show_default=True,
             help="What is read of a point.",
         ),
         click.option(
             "--uncertainty",
             type=Share("a relative error"),
             default="10%",
-            show_default=True,
             metavar="SHARE",
             help="How far the law may be off where no fit says.",
         ),
@@ -218,7 +205,6 @@ FIT = Command(
         click.option(
             "--model",
             default="law",
-            show_default=True,
             type=click.Choice(MODELS),
             help="; ".join(f"{name}: {law.meaning}" for name, law in LAWS.items())
             + f"; each with {DELAY_LAW.meaning} (+delay); contact: physical parameters through the resolved contact, "
@@ -270,9 +256,8 @@ FIT = Command(
         click.option(
             "--trust",
             is_flag=True,
-            help="What speaks for the posterior and against it, too (with --posterior): predicted readings, ranks in "
-            "100 "
-            "simulated tables, leave-one-out, influence of single rows.",
+            help="What speaks for the posterior and against it, too (with --posterior): predicted readings, ranks "
+            "in 100 simulated tables, leave-one-out, influence of single rows.",
         ),
         click.option(
             "--arviz",
@@ -280,7 +265,7 @@ FIT = Command(
             type=click.Path(path_type=Path, dir_okay=False),
             help="Write the posterior for ArviZ (with --posterior; extra `arviz`).",
         ),
-        click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of everything random."),
+        click.option("--seed", type=click.IntRange(min=0), default=0, help="Of everything random."),
         click.option(
             "--share",
             type=Names(),
@@ -347,8 +332,7 @@ INVERT = Command(
             type=click.Path(path_type=Path),
             metavar="FILE",
             help="A fit's fit.json or law.csv, a law.json of `collide --make-law`, or a CSV of measured speeds: its "
-            "law "
-            "with its band beside the rows; one of other speeds is refused.",
+            "law with its band beside the rows; one of other speeds is refused.",
         ),
         click.option("--example", is_flag=True, help="Invert the bundled table instead of a file."),
     ),
@@ -426,9 +410,10 @@ READING = (
         "--columns",
         metavar="COLUMN=CHANNEL[:UNIT][:FACTOR],...",
         default="",
+        show_default=False,
         help="Which channel becomes which column (offset_nm, lockin_amplitude_nm, phase_lag_deg, deflection_nm), as "
-        "offset_nm=Z:um,lockin_amplitude_nm=Amp:V; without a head channels are numbers, and with approach and retract "
-        "in two of them OUT/BACK: offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8.",
+        "offset_nm=Z:um,lockin_amplitude_nm=Amp:V; without a head channels are numbers, and with approach and "
+        "retract in two of them OUT/BACK: offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8.",
     ),
     click.option(
         "--drive",
@@ -446,8 +431,8 @@ READING = (
         "--bin-nm",
         type=Finite(),
         metavar="NM",
-        help="Width of the bins of height whose means and scatter are the rows (0: equal heights only); else bins of "
-        "five rows where heights repeat or are not in order.",
+        help="Width of the bins of height whose means and scatter are the rows (0: equal heights only); else bins "
+        "of five rows where heights repeat or are not in order.",
     ),
     *(_number(*row) for row in _READING_NUMBERS),
 )
@@ -515,7 +500,7 @@ TAPPING = Command(
             "--tip-calibration", type=ValueAndError(), metavar="C", help="True over stated amplitude; '1 +- 0.02'."
         ),
         click.option("--curve", type=click.IntRange(1), metavar="N", help="Only this curve of an instrument's file."),
-        click.option("--model", default="viscous+delay", show_default=True, help="Of the law, as for `afm-jax fit`."),
+        click.option("--model", default="viscous+delay", help="Of the law, as for `afm-jax fit`."),
         click.option(
             "--example", is_flag=True, help="Analyse the bundled raw file, simulated with the defects of real ones."
         ),
@@ -590,11 +575,10 @@ TAPPING_MAP = Command(
             "--columns",
             metavar="COLUMN=CHANNEL[:UNIT][:FACTOR],...",
             default="",
+            show_default=False,
             help="Which image is which, as lockin_amplitude_nm=Amplitude:V,phase_lag_deg=Phase:-1.",
         ),
-        click.option(
-            "--drive", type=click.Choice(["base", "force"]), default="base", show_default=True, help="What shakes."
-        ),
+        click.option("--drive", type=click.Choice(["base", "force"]), default="base", help="What shakes."),
         *_IMAGE_SETTINGS,
         click.option(
             "--free-phase-deg",
@@ -619,7 +603,6 @@ TAPPING_MAP = Command(
             "ratio",
             type=Share("a share"),
             default=0.9,
-            show_default=True,
             metavar="RATIO",
             help="Of a grid of curves: amplitude over the free one at which each pixel is read.",
         ),
@@ -629,7 +612,6 @@ TAPPING_MAP = Command(
             type=click.Choice(["npz", "gwy", "zarr"]),
             multiple=True,
             default=("npz",),
-            show_default=True,
             help="Of the arrays written into --out; may be given several times.",
         ),
     ),

@@ -28,9 +28,7 @@ BASINS = Command(
     """,
     options=(
         SCENE,
-        click.option(
-            "--grid", type=Grid(), default="300x300", show_default=True, help="Drive phases x rebound speeds."
-        ),
+        click.option("--grid", type=Grid(), default="300x300", help="Drive phases x rebound speeds."),
         click.option("--speeds", type=Ends(), metavar="LOW:HIGH", help="Range of the rebound speed, in nm/us."),
         LAW,
         DRAWS,
@@ -60,7 +58,7 @@ BIFURCATION = Command(
         ),
         click.option("--both", is_flag=True, help="Sweep up and then down, so that hysteresis shows."),
         click.option("--down", is_flag=True, help="Sweep down instead of up."),
-        click.option("--impacts", type=click.IntRange(200), default=2000, show_default=True, help="At every value."),
+        click.option("--impacts", type=click.IntRange(200), default=2000, help="At every value."),
         LAW,
         DRAWS,
         PICTURE,
@@ -93,7 +91,7 @@ CHART = Command(
             "--x", metavar="P=a:b:n", required=True, help="A parameter of the scene file: the chart's columns."
         ),
         click.option("--y", metavar="P=a:b:n", required=True, help="Another one: its rows."),
-        click.option("--orders", type=click.IntRange(1, 100), default=8, show_default=True, help="Highest order N."),
+        click.option("--orders", type=click.IntRange(1, 100), default=8, help="Highest order N."),
         click.option(
             "--zarr", is_flag=True, help="Write the table as chart.zarr instead of chart.csv; needs the extra `zarr`."
         ),
@@ -119,10 +117,8 @@ LYAPUNOV = Command(
     """,
     options=(
         SCENE,
-        click.option(
-            "--impacts", type=click.IntRange(20), default=2000, show_default=True, help="Impacts to average over."
-        ),
-        click.option("--transient", type=click.IntRange(0), default=500, show_default=True, help="Impacts before."),
+        click.option("--impacts", type=click.IntRange(20), default=2000, help="Impacts to average over."),
+        click.option("--transient", type=click.IntRange(0), default=500, help="Impacts before."),
         click.option(
             "--parameter", metavar="P=a:b:n", help="A parameter of the scene file and its values, one motion each."
         ),
@@ -186,7 +182,6 @@ CONTINUE = Command(
             "--impacts",
             metavar="M",
             default=1,
-            show_default=True,
             type=click.IntRange(0, 64),
             help="Impacts in them; 0: the tip meets nothing.",
         ),
@@ -237,7 +232,6 @@ EFFECTS = Command(
             "--accuracy",
             type=Share(),
             default="1%",
-            show_default=True,
             help="Wanted accuracy of the amplitudes, 1% or 0.01: which effects does it not need?",
         ),
         click.option("--duration-us", type=Finite(), metavar="T", help="How long to follow each scene at most, in us."),
@@ -333,24 +327,20 @@ SIMULATE = Command(
             "--harmonics",
             type=Multiples(),
             default="1",
-            show_default=True,
             metavar="K,...",
             help="Multiples of the response frequency omega/N at which amplitude and phase are read, besides the "
-            "drive's "
-            "(N times it), which always is.",
+            "drive's (N times it), which always is.",
         ),
         click.option(
             "--accuracy",
             type=Finite(positive=True),
             default=1e-9,
-            show_default=True,
             help="Of every resolved contact: relative of the rebound speed.",
         ),
         click.option(
             "--method",
             type=click.Choice(("collocation", "diffrax")),
             default="collocation",
-            show_default=True,
             help="The way through a resolved contact: leg by leg, or in time throughout with Diffrax's Dopri8 "
             "(slower).",
         ),
@@ -358,8 +348,7 @@ SIMULATE = Command(
             "--samples",
             type=click.Choice(["uniform"]),
             help="Write trace.csv into --out, too: the deflection over the last response periods at equal steps of "
-            "time, as "
-            "`afm-jax lockin` reads it.",
+            "time, as `afm-jax lockin` reads it.",
         ),
         LAW,
     ),
