@@ -5,7 +5,7 @@ from typing import Any
 from afm_jax.cli.columns import Column, columns_of, printed_table
 from afm_jax.cli.command import Output, later
 from afm_jax.cli.contact_law import make_law as law_of
-from afm_jax.cli.contact_options import ContactOptions, chosen_contact
+from afm_jax.cli.contact_options import chosen_contact
 from afm_jax.cli.session import Session
 from afm_jax.contact.collide import collisions
 
@@ -44,19 +44,16 @@ _MOST_PRINTED = 40
 def collide(
     session: Session,
     *,
-    contact_options: ContactOptions,
     speeds: tuple[float, ...] | None,
     accuracy: float,
     method: str,
     make_law: bool,
-    **of_law: Any,
+    **options: Any,
 ) -> Output:
     """Return the collisions of free tips with a contact; with ``make_law`` the law that the contact amounts to."""
     if make_law:
-        of_law["residuals"] = of_law["residuals"] or "relative"
-        of_law["points"] = of_law["points"] or 512
-        return law_of(session, contact_options, **of_law)
-    contact, mass, description = chosen_contact(contact_options)
+        return law_of(session, **options)
+    contact, mass, description = chosen_contact(options)
     with session.working("colliding (the first run compiles for some seconds)"):
         result = collisions(contact, speeds, mass, accuracy=accuracy, method=method)
     rows = result.rows

@@ -23,8 +23,9 @@ import click
 
 from afm_jax.cli.ending import NotValid, is_inner
 from afm_jax.cli.options import SCENE
-from afm_jax.cli.session import Session, with_session, write_json
+from afm_jax.cli.session import Session, session_options, write_json
 from afm_jax.cli.values import scene_and_start
+from afm_jax.compilation_cache import silence_xla
 
 if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
@@ -124,24 +125,29 @@ class Command:
 
     def click_command(self) -> click.Command:
         """Return the command for click."""
-        function = with_session(partial(run_command, self), out_file=self.out_file)
+        function = partial(run_command, self)
         # click lists options in the order of decorators, of which the last is applied first
-        for option in reversed(self.options):
+        for option in reversed((*self.options, *session_options(self.out_file))):
             function = option(function)
         return click.command(self.name, help=self.help, context_settings={"show_default": True})(function)
 
 
-def run_command(row: Command, session: Session, **options: Any) -> None:
+def run_command(row: Command, *, json: bool, out: Path | None, verbose: bool, **options: Any) -> None:
     """Run a command: check the call, start JAX, load the scene, call the function, hand out the result.
 
     Args:
         row: the command.
-        session: the call's.
+        json: as in `Session`, like the two that follow.
+        out: the folder, or the file.
+        verbose: whether to say what goes on behind.
         **options: of the command line, by their names.
 
     Raises:
         NotValid: if the result is not valid; it has been handed out then.
     """
+    session = Session(json, out, verbose)
+    # before anything loads JAX: checks of options may
+    silence_xla()
     if row.check is not None:
         row.check(session, options)
     if row.computes:

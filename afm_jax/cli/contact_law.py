@@ -8,7 +8,7 @@ from rich.table import Table
 
 from afm_jax.cli.columns import Column, printed_table
 from afm_jax.cli.command import Output, later
-from afm_jax.cli.contact_options import ContactOptions, chosen_contact
+from afm_jax.cli.contact_options import chosen_contact
 from afm_jax.cli.session import Session
 from afm_jax.contact.law_of_contact import FREE, ContactDelay, ContactLaw, fit_delay, fit_law
 from afm_jax.contact.law_of_contact import make_law as table_of
@@ -44,19 +44,20 @@ _SHOWN = 9
 
 def make_law(
     session: Session,
-    contact_options: ContactOptions,
     *,
     speed_range: tuple[float, float] | None,
     delay_range: tuple[float, float] | None,
-    residuals: str,
-    points: int,
+    residuals: str | None,
+    points: int | None,
+    **options: Any,
 ) -> Output:
     """Return the law that a contact amounts to: a table, and the formulas that are closest to it.
 
     Three formulas of the rebound speed, at uniform speeds: the paper's (r and epsilon), a viscous one (epsilon and a
     loss linear in speed), and all three. Beside them the collision delay, its lag and lead, and its formula.
     """
-    contact, mass, description = chosen_contact(contact_options)
+    residuals, points = residuals or "relative", points or 512
+    contact, mass, description = chosen_contact(options)
     with session.working("fitting (the first run compiles for some seconds)"):
         laws = [
             fit_law(contact, speed_range=speed_range, model=model, residuals=residuals, mass_ng=mass, points=points)

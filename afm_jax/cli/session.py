@@ -1,13 +1,5 @@
 """What every command shares: `--json`, `--out`, `--verbose`, messages and progress, files, and how computing starts.
 
->>> import click
->>> from afm_jax.cli.session import Session, with_session
->>> @click.command()
-... @with_session
-... def command(session: Session) -> None:
-...     session.start_computing()  # only then import JAX and what needs it
-...     session.emit({"answer": 42}, "The answer is 42.")
-
 The `--out` folder is made and tried out before the computation.
 """
 
@@ -28,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from afm_jax.cli.columns import columns_of, csv_cells
-from afm_jax.compilation_cache import cache_folder, make_private, silence_xla
+from afm_jax.compilation_cache import cache_folder, make_private
 from afm_jax.strict_json import strict_json
 from afm_jax.whole_files import check_plain, write_whole
 from afm_jax.words import broken, lines_at_most, shown, text_table
@@ -230,30 +222,25 @@ class Session:
         self.note(f"wrote {self.out / name}")
 
 
-def with_session(function: Callable[..., Any], *, out_file: str = "") -> Callable[..., Any]:
-    """Give a command `--json`, `--out` and `--verbose`, and pass it a `Session` as first argument.
+def session_options(out_file: str) -> tuple[Callable[..., Any], ...]:
+    """Return the options of every command, which are the attributes of its session.
 
     Args:
-        function: the command's function.
         out_file: what the file is called that `--out` names, for a command that writes a single one; empty: a folder.
     """
-
-    @click.option("--json", "as_json", is_flag=True, help="Write one JSON object to standard output, nothing else.")
-    @click.option(
-        "--out",
-        metavar=out_file or "DIR",
-        type=click.Path(path_type=Path),
-        callback=functools.partial(_prepared, is_file=bool(out_file)),
-        help="Write this table." if out_file else "Write tables (CSV) and pictures (PNG) into this folder.",
+    return (
+        click.option("--json", is_flag=True, help="Write one JSON object to standard output, nothing else."),
+        click.option(
+            "--out",
+            metavar=out_file or "DIR",
+            type=click.Path(path_type=Path),
+            callback=functools.partial(_prepared, is_file=bool(out_file)),
+            help="Write this table." if out_file else "Write tables (CSV) and pictures (PNG) into this folder.",
+        ),
+        click.option(
+            "--verbose", is_flag=True, help="Say on standard error what is kept, read and compiled, and where."
+        ),
     )
-    @click.option("--verbose", is_flag=True, help="Say on standard error what is kept, read and compiled, and where.")
-    @functools.wraps(function)
-    def command(*args: Any, as_json: bool, out: Path | None, verbose: bool, **options: Any) -> Any:
-        # before anything loads JAX: checks of options may
-        silence_xla()
-        return function(Session(as_json, out, verbose), *args, **options)
-
-    return command
 
 
 def _prepared(ctx: click.Context, parameter: click.Parameter, folder: Path | None, *, is_file: bool) -> Path | None:

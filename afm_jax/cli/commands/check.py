@@ -3,6 +3,7 @@
 import click
 
 from afm_jax.cli.command import Command
+from afm_jax.cli.options import flag
 from afm_jax.cli.values import Finite, SceneName
 
 VERIFY = Command(
@@ -69,7 +70,7 @@ ACCURACY = Command(
             default=10,
             help="For a scene: the arrival of which contact is compared.",
         ),
-        click.option("--quick", is_flag=True, help="Few and small measurements: to see that it works."),
+        flag("--quick", "Few and small measurements: to see that it works."),
     ),
 )
 
@@ -88,7 +89,7 @@ BENCH = Command(
     bench_dynamics.csv, bench_sweep.csv, bench_fits.csv and bench.json.
     """,
     options=(
-        click.option("--quick", is_flag=True, help="Few and small measurements: to see that it works."),
+        flag("--quick", "Few and small measurements: to see that it works."),
         click.option(
             "--batch",
             "batches",

@@ -3,7 +3,8 @@
 import click
 
 from afm_jax.cli.command import Command, Options
-from afm_jax.cli.contact_options import with_contact_options
+from afm_jax.cli.contact_options import CONTACT_OPTIONS
+from afm_jax.cli.options import flag
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Ends, Finite, Numbers
 
@@ -33,7 +34,7 @@ COLLIDE = Command(
     integration does not resolve one. With --make-law the law that the contact amounts to.
     """,
     options=(
-        with_contact_options,
+        *CONTACT_OPTIONS,
         click.option(
             "--speeds",
             type=Numbers("speed", example="12,15,20"),
@@ -53,10 +54,9 @@ COLLIDE = Command(
             default="diffrax",
             help="How the way through the bridge is integrated.",
         ),
-        click.option(
+        flag(
             "--make-law",
-            is_flag=True,
-            help="Make the impact law that the contact amounts to, in place of a table of collisions: with --out "
+            "Make the impact law that the contact amounts to, in place of a table of collisions: with --out "
             "law.json and law.csv, which scene files and --law take, and the formulas closest to it.",
         ),
         click.option(

@@ -10,7 +10,7 @@ import click
 from afm_jax.cli.command import Command, Options
 from afm_jax.cli.design_prior import with_prior_options
 from afm_jax.cli.fit_options import Constraint, Fixed, Names, check_fit
-from afm_jax.cli.options import NOISE, QUALITY_FACTOR
+from afm_jax.cli.options import NOISE, QUALITY_FACTOR, flag
 from afm_jax.cli.session import FIT_PROGRAMS, Session
 from afm_jax.cli.values import Finite, Kind, Numbers, Orders, Share, ValueAndError
 from fitting.parameters import CONTACT_DEFAULT, DELAY_LAW, LAWS, MODELS, NUISANCE_NAMES
@@ -52,17 +52,15 @@ CALIBRATE = Command(
             help="What is added to the response: with phase none, constant or linear; without none, floor or "
             "constant. Without this option constant, or what Akaike's criterion prefers clearly.",
         ),
-        click.option("--amplitude-only", is_flag=True, help="Leave the phase of the sweep aside."),
+        flag("--amplitude-only", "Leave the phase of the sweep aside."),
         click.option(
             "--noise",
             type=Share("a relative error"),
             metavar="SHARE",
             help="Error of every point as a share of the largest amplitude.",
         ),
-        click.option(
-            "--scale-errors", is_flag=True, help="Take given errors as relative: scale them until chi2/dof is 1."
-        ),
-        click.option("--whole", is_flag=True, help="Fit all of a thermal spectrum, not what the model explains of it."),
+        flag("--scale-errors", "Take given errors as relative: scale them until chi2/dof is 1."),
+        flag("--whole", "Fit all of a thermal spectrum, not what the model explains of it."),
         click.option(
             "--length-um", type=ValueAndError(), metavar="UM", help="Length of a rectangular lever: Sader's method."
         ),
@@ -84,9 +82,7 @@ CALIBRATE = Command(
             help="Relative error of the deflection's scale (its sensitivity), of which k has twice as much "
             "[default: 5 %].",
         ),
-        click.option(
-            "--slope", is_flag=True, help="SWEEP holds force curves: the sensitivity (nm/V) from their slope."
-        ),
+        flag("--slope", "SWEEP holds force curves: the sensitivity (nm/V) from their slope."),
     ),
     check=_check_lever,
 )
@@ -212,14 +208,8 @@ FIT = Command(
         ),
         NOISE,
         QUALITY_FACTOR,
-        click.option(
-            "--scale-errors",
-            is_flag=True,
-            help="Take the errors as relative: scale them, by 3 at most, until chi2/dof is 1.",
-        ),
-        click.option(
-            "--robust", is_flag=True, help="Let outliers, one row in ten at most, count linearly from two errors on."
-        ),
+        flag("--scale-errors", "Take the errors as relative: scale them, by 3 at most, until chi2/dof is 1."),
+        flag("--robust", "Let outliers, one row in ten at most, count linearly from two errors on."),
         click.option(
             "--free",
             type=Names(),
@@ -239,24 +229,17 @@ FIT = Command(
         click.option(
             "--no", "left_out", type=Names(), metavar="EFFECT,...", help="contact: effects that it does not have."
         ),
-        click.option(
-            "--compare", "comparing", is_flag=True, help="Fit the rival models too and say what the table can tell."
-        ),
+        flag("--compare", "Fit the rival models too and say what the table can tell.", into="comparing"),
         click.option(
             "--bootstrap",
             type=click.IntRange(min=50, max=100_000),
             metavar="SAMPLES",
             help="Intervals by refitting this many synthetic tables, too.",
         ),
-        click.option(
-            "--posterior",
-            is_flag=True,
-            help="Credible intervals, too: by a grid, or NUTS for more than two parameters.",
-        ),
-        click.option(
+        flag("--posterior", "Credible intervals, too: by a grid, or NUTS for more than two parameters."),
+        flag(
             "--trust",
-            is_flag=True,
-            help="What speaks for the posterior and against it, too (with --posterior): predicted readings, ranks "
+            "What speaks for the posterior and against it, too (with --posterior): predicted readings, ranks "
             "in 100 simulated tables, leave-one-out, influence of single rows.",
         ),
         click.option(
@@ -273,15 +256,9 @@ FIT = Command(
             help="Of several tables: nuisances (of --constrain) that all have in common, or all; left out, each has "
             "its own.",
         ),
-        click.option(
-            "--hierarchical",
-            is_flag=True,
-            help="Let the laws of several tables scatter around their mean, and say how much.",
-        ),
-        click.option("--example", is_flag=True, help="Fit the bundled table instead of a file."),
-        click.option(
-            "--each", is_flag=True, help="Fit each of several tables by itself; with --out what is done is kept."
-        ),
+        flag("--hierarchical", "Let the laws of several tables scatter around their mean, and say how much."),
+        flag("--example", "Fit the bundled table instead of a file."),
+        flag("--each", "Fit each of several tables by itself; with --out what is done is kept."),
         click.option(
             "--workers", type=click.IntRange(1, 1024), metavar="N", help="Processes that --each takes, by Dask."
         ),
@@ -334,7 +311,7 @@ INVERT = Command(
             help="A fit's fit.json or law.csv, a law.json of `collide --make-law`, or a CSV of measured speeds: its "
             "law with its band beside the rows; one of other speeds is refused.",
         ),
-        click.option("--example", is_flag=True, help="Invert the bundled table instead of a file."),
+        flag("--example", "Invert the bundled table instead of a file."),
     ),
     check=_check_table,
 )
@@ -501,17 +478,11 @@ TAPPING = Command(
         ),
         click.option("--curve", type=click.IntRange(1), metavar="N", help="Only this curve of an instrument's file."),
         click.option("--model", default="viscous+delay", help="Of the law, as for `afm-jax fit`."),
-        click.option(
-            "--example", is_flag=True, help="Analyse the bundled raw file, simulated with the defects of real ones."
-        ),
-        click.option(
-            "--no-law", is_flag=True, help="Leave the impact law out: energy, thresholds and speeds only, at once."
-        ),
-        click.option(
+        flag("--example", "Analyse the bundled raw file, simulated with the defects of real ones."),
+        flag("--no-law", "Leave the impact law out: energy, thresholds and speeds only, at once."),
+        flag(
             "--scale-errors",
-            is_flag=True,
-            help="Multiply the rows' errors where they scatter more (up to three times), instead of refusing their "
-            "energy.",
+            "Multiply the rows' errors where they scatter more (up to three times), instead of refusing their energy.",
         ),
     ),
     check=_check_curves,

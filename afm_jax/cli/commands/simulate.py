@@ -8,7 +8,7 @@ from pathlib import Path
 import click
 
 from afm_jax.cli.command import Command, Options
-from afm_jax.cli.options import DRAWS, LAW, PICTURE, SCENE
+from afm_jax.cli.options import DRAWS, LAW, PICTURE, SCENE, flag
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Ends, Finite, Grid, Kind, Share
 
@@ -56,8 +56,8 @@ BIFURCATION = Command(
         click.option(
             "--parameter", metavar="P=a:b:n", required=True, help="A parameter of the scene file and its values."
         ),
-        click.option("--both", is_flag=True, help="Sweep up and then down, so that hysteresis shows."),
-        click.option("--down", is_flag=True, help="Sweep down instead of up."),
+        flag("--both", "Sweep up and then down, so that hysteresis shows."),
+        flag("--down", "Sweep down instead of up."),
         click.option("--impacts", type=click.IntRange(200), default=2000, help="At every value."),
         LAW,
         DRAWS,
@@ -92,9 +92,7 @@ CHART = Command(
         ),
         click.option("--y", metavar="P=a:b:n", required=True, help="Another one: its rows."),
         click.option("--orders", type=click.IntRange(1, 100), default=8, help="Highest order N."),
-        click.option(
-            "--zarr", is_flag=True, help="Write the table as chart.zarr instead of chart.csv; needs the extra `zarr`."
-        ),
+        flag("--zarr", "Write the table as chart.zarr instead of chart.csv; needs the extra `zarr`."),
         LAW,
         DRAWS,
         PICTURE,
@@ -194,9 +192,7 @@ CONTINUE = Command(
         click.option(
             "--second", metavar="P=A:B", help="Another one: the special points are followed as curves in both."
         ),
-        click.option(
-            "--sticking", is_flag=True, help="Follow the orbit with a rest on the sample: chatter, ride, release."
-        ),
+        flag("--sticking", "Follow the orbit with a rest on the sample: chatter, ride, release."),
         LAW,
         PICTURE,
     ),
@@ -316,10 +312,9 @@ SIMULATE = Command(
         SCENE,
         click.option("--duration-us", type=Finite(), metavar="T", help="How long to follow the scene, in us."),
         click.option("--periods", type=Finite(), metavar="P", help="How long, in periods of the drive."),
-        click.option(
+        flag(
             "--until-settled",
-            is_flag=True,
-            help=f"End when the motion has settled; at the latest after the duration, or {DEFAULT_PERIODS} drive "
+            f"End when the motion has settled; at the latest after the duration, or {DEFAULT_PERIODS} drive "
             f"periods. "
             "This is what happens without a duration.",
         ),
@@ -389,10 +384,8 @@ SWEEP = Command(
             help="Processes of this machine that share its cores, by Dask; 1: this one alone.",
         ),
         click.option("--scheduler", metavar="tcp://...", help="A Dask scheduler whose workers do the work."),
-        click.option(
-            "--dry-run", is_flag=True, help="Measure a chunk and say what the sweep would take; keep nothing."
-        ),
-        click.option("--plot", is_flag=True, help="Draw a sweep of one or two axes, sweep.png."),
+        flag("--dry-run", "Measure a chunk and say what the sweep would take; keep nothing."),
+        flag("--plot", "Draw a sweep of one or two axes, sweep.png."),
         LAW,
     ),
     computes=False,
