@@ -1,5 +1,6 @@
 """The frame of the command line: what is imported when, what goes to which stream, and how a command ends."""
 
+import io
 import json
 import math
 import os
@@ -7,7 +8,6 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from contextlib import nullcontext
 from pathlib import Path
 from types import ModuleType
 
@@ -319,43 +319,34 @@ def test_an_interrupt_while_packages_are_imported_is_one_line(tmp_path: Path):
     assert (done.returncode, done.stderr) == (130, b"afm-jax: interrupted\n")
 
 
-def test_compiling_is_not_counted_in_the_time_left(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    clock = iter([0.0, 0.0, *[30.0] * 3, *[33.0] * 3])
-    monkeypatch.setattr("afm_jax.cli.session.time.monotonic", lambda: next(clock))
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """A clock that stands still at its only number, in s."""
+    now = [0.0]
+    monkeypatch.setattr("afm_jax.cli.session.time.monotonic", lambda: now[0])
+    return now
+
+
+def test_compiling_is_not_counted_in_the_time_left(clock: list[float], capsys: pytest.CaptureFixture[str]):
     with Session(json=False, out=None).working("computing", "points") as report:
-        for done in (100, 200):
+        for clock[0], done in ((30.0, 100), (33.0, 200)):
             report(done, 400)
     first, second = capsys.readouterr().err.splitlines()
     assert first == "100 of 400 points"
     assert second == "200 of 400 points, 33 a second, about 6 s left"
 
 
-def test_a_terminal_is_told_how_long_it_took_the_last_time(monkeypatch: pytest.MonkeyPatch, tmp_path: Path):
-    now = 0.0
-    monkeypatch.setattr("afm_jax.cli.session.time.monotonic", lambda: now)
-    monkeypatch.setattr("afm_jax.cli.session.cache_folder", lambda: tmp_path)
-    monkeypatch.setattr(Console, "is_terminal", True)
-    waits: list[session._Wait] = []
-    monkeypatch.setattr(Console, "status", lambda _, wait: waits.append(wait) or nullcontext())
-    lines = []
-    for seconds in (1.0, 5.0, 3.0):
-        now = 0.0
-        with Session(json=False, out=None).working("fitting 9 rows (the first run compiles)"):
-            now = seconds
-            lines.append(waits[-1].line())
-    assert lines == [
-        "fitting 9 rows (the first run compiles)",
-        "fitting 9 rows (the first run compiles): 5 s",
-        "fitting 9 rows: 3 s, last time 5 s",
-    ]
-    (tmp_path / "waits.json").write_text("{")
-    wait = session._Wait("sweeping up", "values", None)
-    now, last = 40.0, session._read_waits(tmp_path / "waits.json")
-    wait.count(1, 5)
-    now = 42.0
-    wait.count(2, 5)
-    now = 45.0
-    assert (wait.line(), last) == ("sweeping up: 2 of 5 values, 0.5 a second, about 3 s left", {})
+def test_a_terminal_shows_a_clock_and_what_is_counted(clock: list[float], monkeypatch: pytest.MonkeyPatch):
+    screen = io.StringIO()
+    monkeypatch.setattr(session, "_console", lambda **_: Console(file=screen, force_terminal=True, width=120))
+    with Session(json=False, out=None).working("fitting [9] rows (the first run compiles)", "rows") as report:
+        clock[0] = 41.0
+        report(1, 5)
+        clock[0] = 43.0
+        report(2, 5)
+    assert "fitting [9] rows (the first run compiles)" in screen.getvalue()
+    assert "fitting [9] rows: 2 of 5 rows, 0.5 a second, about 6 s left" in screen.getvalue()
+    assert "0:00:43" in screen.getvalue()
 
 
 THREADS = """

@@ -14,7 +14,7 @@ from matplotlib.image import imread
 from afm_jax import Cantilever, Contact, Platform, Scene, save_scene
 from afm_jax.cli.collide import COLUMNS
 from afm_jax.cli.main import main
-from afm_jax.cli.values import parse_numbers
+from afm_jax.cli.values import Numbers
 from afm_jax.contact.collide import default_speeds
 from afm_jax.contact.parameters import PAPER
 from tests.reference_contact import ContactParameters, capture_speed, collision, junction
@@ -196,13 +196,13 @@ def test_default_speeds_begin_above_the_capture_speed():
     ],
 )
 def test_speeds_are_read(text: str, speeds: tuple[float, ...]):
-    assert parse_numbers(text) == speeds
+    assert Numbers().read(text) == speeds
 
 
 def test_a_range_holds_its_stop_in_spite_of_rounding():
     # 0.1 is no binary number: eighty steps of it reach 20 only nearly
-    assert len(parse_numbers("12:20:0.1")) == 81
-    assert len(parse_numbers("0.1:0.3:0.1")) == 3
+    assert len(Numbers().read("12:20:0.1")) == 81
+    assert len(Numbers().read("0.1:0.3:0.1")) == 3
 
 
 def test_that_all_are_captured_is_a_result():

@@ -136,7 +136,8 @@ def test_the_fit_stands_if_all_that_was_asked_for_besides_fails(monkeypatch: pyt
     def fail(*_, **__):
         raise OverflowError("math range error")
 
-    monkeypatch.setattr(comparison, "compare", fail)
+    # the command has imported the function by its name
+    monkeypatch.setattr("afm_jax.cli.fit.compare", fail)
     done = CliRunner().invoke(main, ["fit", str(EXAMPLE), "--compare", "--json", "--out", str(tmp_path)])
     assert done.exit_code == 1
     assert strictly(done.stdout)["valid"] is True

@@ -9,7 +9,7 @@ import pytest
 
 from afm_jax import Cantilever, CollisionDelay, Contact, ImpactLaw, Platform, Scene, load_scene, save_scene
 from afm_jax.apparatus.drives import BaseDrive, ForceDrive, Tone
-from afm_jax.cli.values import parse_share
+from afm_jax.cli.values import Share
 from afm_jax.effects.scene_effects import effects_in
 from afm_jax.effects.study import Change, Programs, Reduction, study_effects
 from afm_jax.impact.orbits import single_impact_orbits
@@ -294,4 +294,4 @@ def test_the_command_writes_what_it_says(called):
 
 @pytest.mark.parametrize("text", ["1%", "0.01", "1 %", " 1% "])
 def test_a_share_can_be_written_in_two_ways(text):
-    assert math.isclose(parse_share(text), 0.01, rel_tol=1e-15)
+    assert math.isclose(Share().read(text), 0.01, rel_tol=1e-15)

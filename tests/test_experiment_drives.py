@@ -4,7 +4,7 @@ import click
 import numpy as np
 import pytest
 
-from afm_jax.cli.values import Numbers, Orders, ValueAndError, parse_numbers, parse_orders
+from afm_jax.cli.values import Numbers, Orders, ValueAndError
 from fitting import prior_of_values
 from fitting.experiments.candidates import drive_grid, same_drives
 
@@ -58,11 +58,11 @@ def test_measured_drives_are_recognised_up_to_rounding():
     [("-1,0,1", (-1.0, 0.0, 1.0)), ("0.97:1:0.01", (0.97, 0.98, 0.99, 1.0)), ("170:190:8", (170.0, 178.0, 186.0))],
 )
 def test_numbers_are_read(text, numbers):
-    assert parse_numbers(text) == numbers
+    assert Numbers(positive=False).read(text) == numbers
 
 
 def test_orders_are_read():
-    assert parse_orders("1-3, 2,7") == (1, 2, 3, 7)
+    assert Orders().read("1-3, 2,7") == (1, 2, 3, 7)
 
 
 @pytest.mark.parametrize("text", ["", "a", "1:2", "2:1:1", "1:2:0", "0:1:1e-9", "nan", "1,,2"])

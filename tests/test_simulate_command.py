@@ -10,7 +10,7 @@ from click.testing import CliRunner, Result
 
 from afm_jax import Cantilever, Contact, ImpactLaw, Platform, Scene, save_scene, single_impact_orbits
 from afm_jax.cli.main import main
-from afm_jax.cli.simulate_output import text_of
+from afm_jax.cli.simulate import text_of
 from afm_jax.motion.trajectory import pieces_between
 from afm_jax.scenefile.scenefile import Start
 from fitting.traces.lockin import lockin

@@ -11,7 +11,6 @@ from afm_jax.cli.session import Session
 from afm_jax.dynamics.bands import drawn_shares
 from afm_jax.dynamics.basins import Basins, basins_of_attraction
 from afm_jax.dynamics.verdicts import WHY_UNRESOLVED, MotionKind
-from afm_jax.impact.law import extrapolation_of
 from afm_jax.scenefile.scenefile import scene_tables
 
 draw_basins = later("afm_jax.plots.dynamics:draw_basins")
@@ -36,19 +35,17 @@ def basins(
         if scene.unknowns is not None:
             band = drawn_shares(scene.scene, result, scene.unknowns, draws=draws)
     attractors = _attractors(result, band)
-    approached = np.concatenate([attractor.approach_speed_nm_per_us for attractor in result.attractors])
-    extrapolated = extrapolation_of(scene.scene.interaction, approached)
     payload = {
         "scene": scene_tables(scene.scene),
         "starts": result.attractor.size,
         "attractors": attractors,
         "boundary_dimension": result.boundary_dimension,
         "boundary_dimension_error": result.boundary_dimension_error,
-        "extrapolated": extrapolated,
     }
     return Output(
         payload=payload,
-        text=[*_lines(result, attractors), extrapolated],
+        text=_lines(result, attractors),
+        impact_speeds=np.concatenate([attractor.approach_speed_nm_per_us for attractor in result.attractors]),
         tables={"basins.csv": _starts(result), "attractors.csv": _points(result)},
         files={f"basins.{picture}": partial(draw_basins, result)},
         not_valid=_why_not_valid(result),
@@ -56,20 +53,19 @@ def basins(
 
 
 def _attractors(result: Basins, band: np.ndarray | None) -> list[dict[str, Any]]:
-    attractors = [
-        {
+    """Return what is told of each attractor."""
+    attractors = []
+    for number, attractor in enumerate(result.attractors):
+        told = {
             "name": attractor.name,
             "impacts": attractor.impacts,
             "periods": attractor.periods,
-            "share": share,
-            "share_error": error,
+            "share": result.share[number],
+            "share_error": result.share_error[number],
             "phase_rad": attractor.phase_rad,
             "velocity_after_nm_per_us": attractor.velocity_nm_per_us,
         }
-        for attractor, share, error in zip(result.attractors, result.share, result.share_error, strict=True)
-    ]
-    for attractor, interval in zip(attractors, () if band is None else band.tolist(), strict=False):
-        attractor["share_interval95"] = interval
+        attractors.append(told if band is None else told | {"share_interval95": band[number].tolist()})
     return attractors
 
 
@@ -103,16 +99,12 @@ def _starts(result: Basins) -> dict[str, Any]:
 
 def _points(result: Basins) -> dict[str, list[Any]]:
     """Return the columns of a table with a row an impact of each attractor; one row of an attractor without any."""
-    columns: dict[str, list[Any]] = {
-        name: [] for name in ("attractor", "share", "share_error", "phase_rad", "velocity_after_nm_per_us")
-    }
+    rows = []
     for attractor, share, error in zip(result.attractors, result.share, result.share_error, strict=True):
         impacts = zip(attractor.phase_rad.tolist(), attractor.velocity_nm_per_us.tolist(), strict=True)
-        for impact in list(impacts) or [(None, None)]:
-            row = (attractor.name, float(share), float(error), *impact)
-            for column, value in zip(columns.values(), row, strict=True):
-                column.append(value)
-    return columns
+        rows += [(attractor.name, share, error, *impact) for impact in list(impacts) or [(None, None)]]
+    names = ("attractor", "share", "share_error", "phase_rad", "velocity_after_nm_per_us")
+    return {name: [row[place] for row in rows] for place, name in enumerate(names)}
 
 
 def _why_not_valid(result: Basins) -> str | None:

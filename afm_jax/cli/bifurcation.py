@@ -12,7 +12,6 @@ from afm_jax.cli.session import Session
 from afm_jax.cli.values import ranges_of
 from afm_jax.dynamics.bands import verdict_probability
 from afm_jax.dynamics.bifurcations import Sweep, bifurcation_diagram
-from afm_jax.impact.law import extrapolation_of
 from afm_jax.scenefile.scenefile import scene_tables
 
 draw_bifurcations = later("afm_jax.plots.dynamics:draw_bifurcations")
@@ -60,13 +59,11 @@ def bifurcation(  # noqa: PLR0913
     if not all(sweep.complete for sweep in sweeps):
         session.note("some stretches were not followed to the end of a branch: sweep fewer values, or a smaller range")
     went_on = any(np.isfinite(sweep.phase_rad).any() for sweep in sweeps)
-    speeds = np.concatenate([sweep.approach_nm_per_us.ravel() for sweep in sweeps])
     payload = {
         "parameter": swept.path,
         "scene": scene_tables(scene.scene),
         "impacts_each": impacts,
         "sweeps": [_payload(sweep) for sweep in sweeps],
-        "extrapolated": extrapolation_of(scene.scene.interaction, speeds),
         "reason": None if went_on else _NONE_WENT_ON,
     }
     if probabilities is not None:
@@ -75,7 +72,8 @@ def bifurcation(  # noqa: PLR0913
             of_sweep["verdict_probability"] = probability
     return Output(
         payload=payload,
-        text=[*map(_summary, sweeps), payload["extrapolated"]],
+        text=[_summary(sweep) for sweep in sweeps],
+        impact_speeds=np.concatenate([sweep.approach_nm_per_us.ravel() for sweep in sweeps]),
         tables=_tables(swept.path, sweeps, probabilities),
         files={f"bifurcation.{picture}": lambda path: draw_bifurcations(swept.path, sweeps, path, probabilities)},
         not_valid=payload["reason"],
@@ -84,7 +82,7 @@ def bifurcation(  # noqa: PLR0913
 
 def _payload(sweep: Sweep) -> dict[str, Any]:
     return {
-        "direction": "up" if sweep.upward else "down",
+        "direction": _direction(sweep),
         "complete": sweep.complete,
         "values": sweep.values,
         "verdicts": sweep.verdicts.names(),
@@ -100,41 +98,45 @@ def _summary(sweep: Sweep) -> str:
     counts = Counter(sweep.verdicts.names()).most_common()
     words = ", ".join(f"{name} at {count}" for name, count in counts[:_LISTED])
     rest = sum(count for _, count in counts[_LISTED:])
-    return f"swept {'up' if sweep.upward else 'down'}: {words}" + (f", others at {rest}" if rest else "")
+    return f"swept {_direction(sweep)}: {words}" + (f", others at {rest}" if rest else "")
 
 
 def _tables(path: str, sweeps: Sequence[Sweep], probabilities: list[np.ndarray] | None) -> dict[str, dict[str, Any]]:
     """Return the columns of three tables: a row a value, an impact, and a stroboscopic height."""
-    tables = {"bifurcation.csv": [], "impacts.csv": [], "strobe.csv": []}
-    for sweep in sweeps:
-        tables["bifurcation.csv"].append(
-            {path: sweep.values, "verdict": np.array(sweep.verdicts.names()), "restarted": sweep.restarted}
+    values, impacts, strobe = [], [], []
+    for number, sweep in enumerate(sweeps):
+        values.append(
+            {
+                "direction": np.full(len(sweep.values), _direction(sweep)),
+                path: sweep.values,
+                "verdict": np.array(sweep.verdicts.names()),
+                "restarted": sweep.restarted,
+                **({} if probabilities is None else {"verdict_probability": probabilities[number]}),
+            }
         )
-        impacts = {
+        of_impacts = {
             "phase_rad": sweep.phase_rad,
             "approach_speed_nm_per_us": sweep.approach_nm_per_us,
             "velocity_after_nm_per_us": sweep.velocity_after_nm_per_us,
             "platform_height_nm": sweep.height_nm,
         }
-        tables["impacts.csv"].append(_finite(path, sweep, impacts))
-        tables["strobe.csv"].append(_finite(path, sweep, {"height_nm": sweep.strobe_height_nm}))
-    for columns in tables.values():
-        for sweep, of_sweep in zip(sweeps, columns, strict=True):
-            direction = "up" if sweep.upward else "down"
-            of_sweep["direction"] = np.full(len(of_sweep[path]), direction)
-    joined = {
-        name: {
-            column: np.concatenate([of_sweep[column] for of_sweep in columns])
-            for column in ("direction", *(column for column in columns[0] if column != "direction"))
-        }
-        for name, columns in tables.items()
+        impacts.append(_finite(path, sweep, of_impacts))
+        strobe.append(_finite(path, sweep, {"height_nm": sweep.strobe_height_nm}))
+    return {
+        name: {column: np.concatenate([part[column] for part in parts]) for column in parts[0]}
+        for name, parts in (("bifurcation.csv", values), ("impacts.csv", impacts), ("strobe.csv", strobe))
     }
-    if probabilities is not None:
-        joined["bifurcation.csv"]["verdict_probability"] = np.concatenate(probabilities)
-    return joined
 
 
 def _finite(path: str, sweep: Sweep, arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Return the columns of arrays (values, places) where the first is finite, after the column of the values."""
+    """Return direction and value, and arrays (values, places) where the first of them is finite, as columns."""
     there = np.isfinite(next(iter(arrays.values())))
-    return {path: np.repeat(sweep.values, there.sum(axis=1)), **{name: array[there] for name, array in arrays.items()}}
+    return {
+        "direction": np.full(there.sum(), _direction(sweep)),
+        path: np.repeat(sweep.values, there.sum(axis=1)),
+        **{name: array[there] for name, array in arrays.items()},
+    }
+
+
+def _direction(sweep: Sweep) -> str:
+    return "up" if sweep.upward else "down"

@@ -10,7 +10,6 @@ from afm_jax.cli.command import NamedScene, Output, later
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import ranges_of
 from afm_jax.dynamics.charts import StabilityChart, stability_chart, stable_probability
-from afm_jax.impact.law import extrapolation_of
 from afm_jax.scenefile.parameter_paths import ParameterRange, scene_family
 from afm_jax.scenefile.scenefile import scene_tables
 from afm_jax.whole_files import whole_folder
@@ -43,7 +42,8 @@ def chart(  # noqa: PLR0913
     arrays = _arrays(result, probability)
     return Output(
         payload=payload,
-        text=[*_lines(payload), payload["extrapolated"]],
+        text=_lines(payload),
+        impact_speeds=result.verdicts.approach_speed_nm_per_us,
         tables={} if zarr else {"chart.csv": _columns(result, across.path, up.path, arrays)},
         files={
             **({"chart.zarr": partial(_write_zarr, result, across.path, up.path, arrays)} if zarr else {}),
@@ -81,7 +81,6 @@ def _payload(
     if probability is not None:
         payload["draws"] = draws
         payload["uncertain_share"] = ((probability > 0.0) & (probability < 1.0)).mean(axis=1)
-    payload["extrapolated"] = extrapolation_of(scene.scene.interaction, verdicts.approach_speed_nm_per_us)
     payload["reason"] = None
     if not verdicts.admissible.any():
         payload["reason"] = (

@@ -2,14 +2,12 @@
 
 from typing import Any
 
-from rich.table import Table
-
-from afm_jax.cli.command import Output, columns_of, later
+from afm_jax.cli.columns import Column, columns_of, printed_table
+from afm_jax.cli.command import Output, later
 from afm_jax.cli.contact_law import make_law as law_of
-from afm_jax.cli.contact_options import ContactOptions, chosen_contact
+from afm_jax.cli.contact_options import chosen_contact
 from afm_jax.cli.session import Session
 from afm_jax.contact.collide import collisions
-from afm_jax.words import known
 
 draw_collisions = later("afm_jax.plots.collisions:draw_collisions")
 
@@ -28,25 +26,34 @@ COLUMNS = (
     "end_energy_aj",
 )
 """What is told of a tip."""
-_SHOWN = 40
+_PRINTED = (
+    Column("approach\nnm/us", "approach_speed_nm_per_us"),
+    Column("rebound\nnm/us", "rebound_speed_nm_per_us"),
+    Column("delay\nus", "collision_delay_us"),
+    Column("in junction\nus", "time_in_junction_us"),
+    Column("deepest gap\nnm", "deepest_gap_nm"),
+    Column("bridge\naJ lost", "bridge_hysteresis_aj"),
+    Column("junction\naJ lost", "junction_hysteresis_aj"),
+    Column("viscous\naJ lost", "viscous_loss_aj"),
+    Column("outcome", "outcome_name", "", left=True),
+)
+_MOST_PRINTED = 40
+"""Tips."""
 
 
 def collide(
     session: Session,
     *,
-    contact_options: ContactOptions,
     speeds: tuple[float, ...] | None,
     accuracy: float,
     method: str,
     make_law: bool,
-    **of_law: Any,
+    **options: Any,
 ) -> Output:
     """Return the collisions of free tips with a contact; with ``make_law`` the law that the contact amounts to."""
     if make_law:
-        of_law["residuals"] = of_law["residuals"] or "relative"
-        of_law["points"] = of_law["points"] or 512
-        return law_of(session, contact_options, **of_law)
-    contact, mass, description = chosen_contact(contact_options)
+        return law_of(session, **options)
+    contact, mass, description = chosen_contact(options)
     with session.working("colliding (the first run compiles for some seconds)"):
         result = collisions(contact, speeds, mass, accuracy=accuracy, method=method)
     rows = result.rows
@@ -62,7 +69,10 @@ def collide(
     title = f"Collisions of a free tip of {mass:g} ng: {', '.join(description['effects'])}"
     return Output(
         payload=payload,
-        text=[collision_table(rows), *sentences(payload)],
+        text=[
+            printed_table("Collisions of a free tip with the sample at rest", _PRINTED, rows[:_MOST_PRINTED]),
+            *sentences(payload),
+        ],
         tables={"collide.csv": columns_of(rows, COLUMNS)},
         files={"collide.png": lambda to: draw_collisions(rows, result.capture_speed_nm_per_us, to, title=title)},
         json_file="collide.json",
@@ -72,27 +82,12 @@ def collide(
     )
 
 
-def collision_table(rows: list[dict[str, Any]]) -> Table:
-    """Return the collisions as a table to print."""
-    table = Table(title="Collisions of a free tip with the sample at rest", title_justify="left")
-    headings = (("approach", "nm/us"), ("rebound", "nm/us"), ("delay", "us"), ("in junction", "us"))
-    headings += (("deepest gap", "nm"), ("bridge", "aJ lost"), ("junction", "aJ lost"), ("viscous", "aJ lost"))
-    for name, unit in headings:
-        table.add_column(f"{name}\n{unit}", justify="right")
-    table.add_column("outcome")
-    names = ("approach_speed_nm_per_us", "rebound_speed_nm_per_us", "collision_delay_us", "time_in_junction_us")
-    names += ("deepest_gap_nm", "bridge_hysteresis_aj", "junction_hysteresis_aj", "viscous_loss_aj")
-    for row in rows[:_SHOWN]:
-        table.add_row(*(known(row[name], ".6g") for name in names), row["outcome_name"])
-    return table
-
-
 def sentences(payload: dict[str, Any]) -> list[str]:
     """Return what is said below the table: the capture speed, the junction, and what the outcomes mean."""
     junction, speeds, captured = payload["junction"], payload["approach_speed_nm_per_us"], payload["captured"]
     lines = []
-    if len(speeds) > _SHOWN:
-        lines.append(f"The first {_SHOWN} of {len(speeds)} collisions; --json and --out give all.")
+    if len(speeds) > _MOST_PRINTED:
+        lines.append(f"The first {_MOST_PRINTED} of {len(speeds)} collisions; --json and --out give all.")
     lines += sorted(set(payload["outcome"]))
     capture = payload["capture_speed_nm_per_us"]
     if all(captured):

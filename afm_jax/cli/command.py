@@ -13,7 +13,7 @@ options by their names, and returns an `Output`, which the runner writes (None: 
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -23,8 +23,9 @@ import click
 
 from afm_jax.cli.ending import NotValid, is_inner
 from afm_jax.cli.options import SCENE
-from afm_jax.cli.session import Session, with_session, write_json
+from afm_jax.cli.session import Session, session_options, write_json
 from afm_jax.cli.values import scene_and_start
+from afm_jax.compilation_cache import silence_xla
 
 if TYPE_CHECKING:
     from afm_jax.apparatus.scene import Scene
@@ -57,6 +58,8 @@ class Output:
     Attributes:
         payload: the JSON object.
         text: what is printed without --json, as `Session.emit` takes it.
+        impact_speeds: approach speeds of its impacts: whether the scene's law is known at them is told in the text's
+            last line and under `extrapolated`; None: that is not told.
         tables: columns by their names for each CSV file of the --out folder, by its name.
         files: functions that write a file of the --out folder at a path each, by its name.
         json_file: name of the file of the --out folder that holds the JSON object; empty: none does.
@@ -67,6 +70,7 @@ class Output:
 
     payload: Mapping[str, Any]
     text: Sequence[Any] = ()
+    impact_speeds: Any = None
     tables: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
     files: Mapping[str, Callable[[Path], object]] = field(default_factory=dict)
     json_file: str = ""
@@ -89,11 +93,6 @@ def later(function: str) -> Callable[..., Any]:
         return getattr(import_module(module), name)(*arguments, **options)
 
     return call
-
-
-def columns_of(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[str, list[Any]]:
-    """Return the columns of rows; what a row lacks is None."""
-    return {name: [row.get(name) for row in rows] for name in names}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -126,24 +125,29 @@ class Command:
 
     def click_command(self) -> click.Command:
         """Return the command for click."""
-        function = with_session(partial(run_command, self), out_file=self.out_file)
+        function = partial(run_command, self)
         # click lists options in the order of decorators, of which the last is applied first
-        for option in reversed(self.options):
+        for option in reversed((*self.options, *session_options(self.out_file))):
             function = option(function)
-        return click.command(self.name, help=self.help)(function)
+        return click.command(self.name, help=self.help, context_settings={"show_default": True})(function)
 
 
-def run_command(row: Command, session: Session, **options: Any) -> None:
+def run_command(row: Command, *, json: bool, out: Path | None, verbose: bool, **options: Any) -> None:
     """Run a command: check the call, start JAX, load the scene, call the function, hand out the result.
 
     Args:
         row: the command.
-        session: the call's.
+        json: as in `Session`, like the two that follow.
+        out: the folder, or the file.
+        verbose: whether to say what goes on behind.
         **options: of the command line, by their names.
 
     Raises:
         NotValid: if the result is not valid; it has been handed out then.
     """
+    session = Session(json, out, verbose)
+    # before anything loads JAX: checks of options may
+    silence_xla()
     if row.check is not None:
         row.check(session, options)
     if row.computes:
@@ -155,7 +159,7 @@ def run_command(row: Command, session: Session, **options: Any) -> None:
     with _naming(options.get("scene")):
         output = function(session, **options)
     if output is not None:
-        hand_out(session, output)
+        hand_out(session, output if output.impact_speeds is None else _saying_if_extrapolated(output, options["scene"]))
 
 
 def hand_out(session: Session, output: Output) -> None:
@@ -180,6 +184,13 @@ def hand_out(session: Session, output: Output) -> None:
         raise output.failure
     if output.not_valid is not None:
         raise NotValid(output.not_valid)
+
+
+def _saying_if_extrapolated(output: Output, scene: NamedScene) -> Output:
+    """Return a result that says whether its impacts are faster or slower than the scene's law is known for."""
+    extrapolation_of = import_module("afm_jax.impact.law").extrapolation_of
+    sentence = extrapolation_of(scene.scene.interaction, output.impact_speeds)
+    return replace(output, payload={**output.payload, "extrapolated": sentence}, text=[*output.text, sentence])
 
 
 def _loaded(options: Options) -> NamedScene:

@@ -3,10 +3,12 @@
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 from rich.table import Table
 
-from afm_jax.cli.command import Output, columns_of, later
-from afm_jax.cli.contact_options import ContactOptions, chosen_contact
+from afm_jax.cli.columns import Column, printed_table
+from afm_jax.cli.command import Output, later
+from afm_jax.cli.contact_options import chosen_contact
 from afm_jax.cli.session import Session
 from afm_jax.contact.law_of_contact import FREE, ContactDelay, ContactLaw, fit_delay, fit_law
 from afm_jax.contact.law_of_contact import make_law as table_of
@@ -42,19 +44,20 @@ _SHOWN = 9
 
 def make_law(
     session: Session,
-    contact_options: ContactOptions,
     *,
     speed_range: tuple[float, float] | None,
     delay_range: tuple[float, float] | None,
-    residuals: str,
-    points: int,
+    residuals: str | None,
+    points: int | None,
+    **options: Any,
 ) -> Output:
     """Return the law that a contact amounts to: a table, and the formulas that are closest to it.
 
     Three formulas of the rebound speed, at uniform speeds: the paper's (r and epsilon), a viscous one (epsilon and a
     loss linear in speed), and all three. Beside them the collision delay, its lag and lead, and its formula.
     """
-    contact, mass, description = chosen_contact(contact_options)
+    residuals, points = residuals or "relative", points or 512
+    contact, mass, description = chosen_contact(options)
     with session.working("fitting (the first run compiles for some seconds)"):
         laws = [
             fit_law(contact, speed_range=speed_range, model=model, residuals=residuals, mass_ng=mass, points=points)
@@ -77,13 +80,12 @@ def make_law(
     if session.out is not None:
         text.append(f'In a scene file: [interaction] model = "law", file = "{session.out / "law.json"}"; or --law.')
     lost = [law.model for law in laws if not law.converged]
-
     return Output(
         payload=payload,
         text=text,
         tables={
             "law_models.csv": law_columns(laws),
-            "law_delay.csv": columns_of(_delay_rows(delay), DELAY_COLUMNS),
+            "law_delay.csv": {name: getattr(delay, name) for name in DELAY_COLUMNS},
         },
         files={
             "law.json": lambda path: save_law(law, path),
@@ -97,7 +99,6 @@ def make_law(
 
 def delay_payload(delay: ContactDelay) -> dict[str, Any]:
     """Return the delay law, its errors, and delay, lag and lead at a few speeds."""
-    shown = _thinned(delay)
     return {
         "hertz": delay.delay.hertz,
         "lead_nm": delay.delay.lead_nm,
@@ -105,7 +106,7 @@ def delay_payload(delay: ContactDelay) -> dict[str, Any]:
         "rms_us": delay.rms_us,
         "worst_us": delay.worst_us,
         "speed_range_nm_per_us": delay.speed_range,
-        **{name: [row[name] for row in shown] for name in DELAY_COLUMNS},
+        **_thinned(delay),
     }
 
 
@@ -119,41 +120,28 @@ def law_columns(laws: Sequence[ContactLaw]) -> dict[str, Any]:
     }
 
 
-def _delay_rows(delay: ContactDelay) -> list[dict[str, float]]:
-    lists = [getattr(delay, name).tolist() for name in DELAY_COLUMNS]
-    return [dict(zip(DELAY_COLUMNS, row, strict=True)) for row in zip(*lists, strict=True)]
-
-
-def _thinned(delay: ContactDelay) -> list[dict[str, float]]:
-    """Return a few rows, first and last among them."""
-    rows = _delay_rows(delay)
-    return [rows[round(place * (len(rows) - 1) / (_SHOWN - 1))] for place in range(_SHOWN)]
+def _thinned(delay: ContactDelay) -> dict[str, list[float]]:
+    """Return the delay at a few speeds as columns, first and last among them."""
+    places = np.round(np.linspace(0, len(delay.delay_us) - 1, _SHOWN)).astype(int)
+    return {name: getattr(delay, name)[places].tolist() for name in DELAY_COLUMNS}
 
 
 def law_table(laws: Sequence[ContactLaw]) -> Table:
     """Return the laws as a table to print."""
     low, high = laws[0].speed_range
     title = f"u_out^2 = r^2 u_in^2 - c u_in - epsilon from {low:.5g} to {high:.5g} nm/us, {laws[0].residuals} residuals"
-    table = Table(title=title, title_justify="left")
-    table.add_column("law")
-    headings = (("r", ""), ("epsilon", "nm^2/us^2"), ("c", "nm/us"), ("worst error", "%"), ("rms error", "%"))
-    headings += (("worst error", "nm/us"), ("of top speed", "%"), ("capture speed", "nm/us"))
-    for name, unit in headings:
-        table.add_column(f"{name}\n{unit}", justify="right")
-    for law in laws:
-        errors = (100.0 * law.worst_relative_error, 100.0 * law.rms_relative_error, law.worst_error_nm_per_us)
-        shares = (100.0 * law.worst_share_of_top_speed, law.capture_speed_nm_per_us)
-        numbers = (f"{number:.3g}" for number in errors)
-        table.add_row(
-            law.model,
-            f"{law.r:.5f}",
-            f"{law.epsilon:.5g}",
-            f"{law.viscous_loss:.3g}",
-            *numbers,
-            f"{shares[0]:.2g}",
-            f"{shares[1]:.5g}",
-        )
-    return table
+    columns = [
+        Column("law", lambda law: law.model, "", left=True),
+        Column("r\n", lambda law: law.r, ".5f"),
+        Column("epsilon\nnm^2/us^2", lambda law: law.epsilon, ".5g"),
+        Column("c\nnm/us", lambda law: law.viscous_loss, ".3g"),
+        Column("worst error\n%", lambda law: 100.0 * law.worst_relative_error, ".3g"),
+        Column("rms error\n%", lambda law: 100.0 * law.rms_relative_error, ".3g"),
+        Column("worst error\nnm/us", lambda law: law.worst_error_nm_per_us, ".3g"),
+        Column("of top speed\n%", lambda law: 100.0 * law.worst_share_of_top_speed, ".2g"),
+        Column("capture speed\nnm/us", lambda law: law.capture_speed_nm_per_us, ".5g"),
+    ]
+    return printed_table(title, columns, laws)
 
 
 def law_sentences(laws: Sequence[ContactLaw]) -> list[str]:
@@ -166,13 +154,15 @@ def law_sentences(laws: Sequence[ContactLaw]) -> list[str]:
 
 def delay_table(delay: ContactDelay) -> Table:
     """Return the delay at a few speeds as a table to print."""
-    table = Table(title="Collision delay = lag - lead", title_justify="left")
-    for name in ("approach\nnm/us", "rebound\nnm/us", "delay\nus", "lag\nus", "lead\nus", "delay law\nus"):
-        table.add_column(name, justify="right")
-    for row in _thinned(delay):
-        speeds, times = list(row.values())[:2], list(row.values())[2:]
-        table.add_row(*(f"{value:.5g}" for value in speeds), *(f"{value:.4f}" for value in times))
-    return table
+    times = (("delay", "delay_us"), ("lag", "lag_us"), ("lead", "lead_us"), ("delay law", "fitted_us"))
+    columns = [
+        Column("approach\nnm/us", "approach_speed_nm_per_us", ".5g"),
+        Column("rebound\nnm/us", "rebound_speed_nm_per_us", ".5g"),
+        *(Column(f"{heading}\nus", name, ".4f") for heading, name in times),
+    ]
+    shown = _thinned(delay)
+    rows = [dict(zip(shown, values, strict=True)) for values in zip(*shown.values(), strict=True)]
+    return printed_table("Collision delay = lag - lead", columns, rows)
 
 
 def delay_sentences(delay: ContactDelay) -> list[str]:

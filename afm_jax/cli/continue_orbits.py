@@ -6,7 +6,8 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from afm_jax.cli.command import NamedScene, Output, columns_of, later
+from afm_jax.cli.columns import Column, columns_of, printed_table
+from afm_jax.cli.command import NamedScene, Output, later
 from afm_jax.cli.orbits import IMPACT_COLUMNS, impact_rows, orbit_facts, refuse_other_than_law
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import ranges_of
@@ -15,7 +16,6 @@ from afm_jax.dynamics.bands import amplitude_errors, special_errors
 from afm_jax.dynamics.continuation import Continuation, continue_orbits
 from afm_jax.dynamics.special_points import OrbitBranch, SpecialCurve
 from afm_jax.dynamics.sticking_orbits import follow_sticking
-from afm_jax.impact.law import extrapolation_of
 from afm_jax.units import TWO_SIDED_95
 
 draw_continuation = later("afm_jax.plots.branches:draw_continuation")
@@ -84,15 +84,47 @@ def follow(  # noqa: PLR0913
 
 
 def _output(scene: NamedScene, found: Continuation, picture: str) -> Output:
-    known = scene.unknowns
-    bands = None if known is None else [amplitude_errors(found, branch, known) for branch in found.branches]
-    errors = None if known is None else special_errors(found, known)
+    unknowns = scene.unknowns
+    bands = None if unknowns is None else [amplitude_errors(found, branch, unknowns) for branch in found.branches]
+    errors = None if unknowns is None else special_errors(found, unknowns)
     points = [
         row
         for number, branch in enumerate(found.branches)
         for row in point_rows(number, branch, None if bands is None else bands[number])
     ]
-    special = []
+    special = _special_rows(found, errors)
+    curves = [_curve(curve) for curve in found.curves]
+    reason = None if any(point["admissible"] for point in points) else _why_none(found)
+    payload = {
+        "order": found.order,
+        "impacts": found.impacts,
+        "parameter": found.range.path,
+        "range": [found.range.low, found.range.high],
+        "second": None if found.second is None else found.second.path,
+        "points": points,
+        "special": special,
+        "curves": curves,
+        "branches": [{"points": len(branch.parameter), "ends": list(branch.ends)} for branch in found.branches],
+        "sticking": found.sticking,
+        "law_parameters": None if unknowns is None else list(unknowns.paths),
+        "reason": reason,
+    }
+    files = {f"branches.{picture}": lambda path: draw_continuation(found, path, bands=bands, errors=errors)}
+    if found.curves:
+        files[f"curves.{picture}"] = lambda path: draw_curves(found, path)
+    return Output(
+        payload=payload,
+        text=_text(found, special, curves),
+        impact_speeds=[impact["approach_speed_nm_per_us"] for point in points for impact in point["impacts"]],
+        tables=_tables(found, points, special, curves),
+        files=files,
+        not_valid=reason,
+    )
+
+
+def _special_rows(found: Continuation, errors: Any) -> list[dict[str, Any]]:
+    """Return the special points as plain mappings, with an interval where the law has errors."""
+    rows = []
     for index, point in enumerate(found.special):
         row = {
             "kind": point.kind,
@@ -106,36 +138,8 @@ def _output(scene: NamedScene, found: Continuation, picture: str) -> Output:
             half = TWO_SIDED_95 * float(errors[index])
             row["parameter_error"] = float(errors[index])
             row["interval95"] = [point.parameter - half, point.parameter + half]
-        special.append(row)
-    curves = [_curve(curve) for curve in found.curves]
-    reason = None if any(point["admissible"] for point in points) else _why_none(found)
-    speeds = [impact["approach_speed_nm_per_us"] for point in points for impact in point["impacts"]]
-    beyond = extrapolation_of(scene.scene.interaction, speeds)
-    payload = {
-        "order": found.order,
-        "impacts": found.impacts,
-        "parameter": found.range.path,
-        "range": [found.range.low, found.range.high],
-        "second": None if found.second is None else found.second.path,
-        "points": points,
-        "special": special,
-        "curves": curves,
-        "branches": [{"points": len(one.parameter), "ends": list(one.ends)} for one in found.branches],
-        "sticking": found.sticking,
-        "law_parameters": None if known is None else list(known.paths),
-        "extrapolated": beyond,
-        "reason": reason,
-    }
-    files = {f"branches.{picture}": lambda path: draw_continuation(found, path, bands=bands, errors=errors)}
-    if found.curves:
-        files[f"curves.{picture}"] = lambda path: draw_curves(found, path)
-    return Output(
-        payload=payload,
-        text=[*_text(found, special, curves), beyond],
-        tables=_tables(found, points, special, curves),
-        files=files,
-        not_valid=reason,
-    )
+        rows.append(row)
+    return rows
 
 
 def point_rows(number: int, branch: OrbitBranch, band: Any = None) -> list[dict[str, Any]]:
@@ -155,7 +159,7 @@ def _curve(curve: SpecialCurve) -> dict[str, Any]:
         "parameter": curve.parameter.tolist(),
         "second": curve.second.tolist(),
         "admissible": curve.admissible.tolist(),
-        "meetings": [one._asdict() for one in curve.meetings],
+        "meetings": [meeting._asdict() for meeting in curve.meetings],
         "ends": list(curve.ends),
     }
 
@@ -206,25 +210,24 @@ def _text(found: Continuation, special: list[dict[str, Any]], curves: list[dict[
         ends = " and ".join(dict.fromkeys(_ENDS[end] for end in branch.ends))
         lines.append(f"  branch {number}: {len(branch.parameter)} points from {low:.6g} to {high:.6g}; ends at {ends}")
     if special:
-        table = Table(title="Special points", title_justify="left")
-        for column in ("kind", found.range.path, "95 % interval", "peak\nnm", "branch", "admissible"):
-            table.add_column(column, justify="left" if column in ("kind", "admissible") else "right")
-        for row in special:
-            interval = row.get("interval95")
-            table.add_row(
-                row["kind"].replace("_", " "),
-                f"{row['parameter']:.9g}",
-                "" if interval is None else f"{interval[0]:.5g} to {interval[1]:.5g}",
-                f"{row['peak_amplitude_nm']:.5g}",
-                str(row["branch"]),
-                "yes" if row["admissible"] else "no",
-            )
-        lines.append(table)
+        columns = [
+            Column("kind", lambda row: row["kind"].replace("_", " "), "", left=True),
+            Column(found.range.path, "parameter", ".9g"),
+            Column("95 % interval", _interval, ""),
+            Column("peak\nnm", "peak_amplitude_nm", ".5g"),
+            Column("branch", lambda row: str(row["branch"]), ""),
+            Column("admissible", "admissible", "yes", left=True),
+        ]
+        lines.append(printed_table("Special points", columns, special))
     for curve in curves:
         ends = [f"({p:.5g}, {q:.5g})" for p, q in zip(curve["parameter"], curve["second"], strict=True)]
         lines.append(f"  curve of {curve['kind'].replace('_', ' ')} from {ends[0]} to {ends[-1]}")
         lines += [
-            f"    {one['kind'].replace('_', ' ')} at ({one['parameter']:.6g}, {one['second']:.6g})"
-            for one in curve["meetings"]
+            f"    {meeting['kind'].replace('_', ' ')} at ({meeting['parameter']:.6g}, {meeting['second']:.6g})"
+            for meeting in curve["meetings"]
         ]
     return lines
+
+
+def _interval(row: Mapping[str, Any]) -> str:
+    return "{:.5g} to {:.5g}".format(*row["interval95"]) if "interval95" in row else ""

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import click
 
-from afm_jax.cli.main import NotValid
+from afm_jax.cli.command import Output
 from afm_jax.cli.session import Session
 from afm_jax.compilation_cache import silence_xla
 from afm_jax.version import EXCLUDED_JAX
@@ -24,8 +24,8 @@ _IMPACTS = 20
 _TIPS = 1000
 
 
-def doctor(session: Session) -> None:
-    """Tell what is installed, how JAX computes, and whether its compilation cache works."""
+def doctor(session: Session) -> Output:
+    """Return what is installed, how JAX computes, and whether its compilation cache works."""
     cache = session.start_computing()
     import jax  # noqa: PLC0415
 
@@ -35,9 +35,6 @@ def doctor(session: Session) -> None:
             entry.unlink()
         first, again = try_cache(cache.folder), try_cache(cache.folder)
     works = again is not None and again.found
-    complaint = cache.reason if cache.refused else None
-    if cache.folder is not None and not works:
-        complaint = f"{cache.folder}: a program that one process compiled was not found by the next"
     excluded = excluded_version()
     payload = {
         "versions": {"python": platform.python_version()} | {name: _version(name) for name in _PACKAGES},
@@ -55,12 +52,13 @@ def doctor(session: Session) -> None:
         },
         "microseconds_per_impact": time_impacts(),
     }
-    session.emit(payload, *_lines(payload))
     complaints = [] if excluded is None else [excluded]
-    if complaint is not None:
-        complaints.append(f"the compilation cache does not work: {complaint}")
-    if complaints:
-        raise NotValid("; ".join(complaints))
+    if cache.refused:
+        complaints.append(f"the compilation cache does not work: {cache.reason}")
+    elif cache.folder is not None and not works:
+        fault = "a program that one process compiled was not found by the next"
+        complaints.append(f"the compilation cache does not work: {cache.folder}: {fault}")
+    return Output(payload=payload, text=_lines(payload), not_valid="; ".join(complaints) or None)
 
 
 def excluded_version() -> str | None:

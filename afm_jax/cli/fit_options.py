@@ -1,75 +1,62 @@
 """Options of `afm-jax fit`: their kinds of values (NAME=VALUE, NAME=VALUE+-ERROR, lists), and which go together."""
 
-import math
 from pathlib import Path
 from typing import Any
 
 import click
 
 from afm_jax.cli.session import Session
-from afm_jax.cli.values import parse_around_plus_minus, parse_number
+from afm_jax.cli.values import Kind, parse_around_plus_minus
 from afm_jax.contact.parameters import EFFECTS, REMOVABLE_EFFECTS, idle_without
 from fitting.parameters import CONTACT_DEFAULT, model_parameters
 
 
-class Fixed(click.ParamType):
+class Fixed(Kind):
     """A parameter held at a value: NAME=VALUE."""
 
     name = "value"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, float]:
-        """Return name and value.
-
-        Raises:
-            click.BadParameter: if the text is something else.
-        """
-        name, sign, text = str(value).partition("=")
+    def read(self, text: str) -> tuple[str, float]:
+        """Return name and value."""
         try:
-            number = parse_number(text)
-        except ValueError:
-            sign, number = "", math.nan
-        if not sign or not name.strip():
-            self.fail(f"must be NAME=VALUE such as modulus_gpa=80, but is {value}", param, ctx)
-        return name.strip(), number
+            name, (value,) = _assigned(text)
+        except ValueError as error:
+            raise ValueError(f"must be NAME=VALUE such as modulus_gpa=80, but is {text}") from error
+        return name, value
 
 
-class Constraint(click.ParamType):
+class Constraint(Kind):
     """What is known of a parameter: NAME=VALUE+-ERROR."""
 
     name = "constraint"
 
-    def convert(
-        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
-    ) -> tuple[str, tuple[float, float]]:
-        """Return name, value and standard error.
-
-        Raises:
-            click.BadParameter: if the text is something else.
-        """
-        name, sign, text = str(value).partition("=")
+    def read(self, text: str) -> tuple[str, tuple[float, float]]:
+        """Return name, value and standard error."""
         try:
-            numbers = parse_around_plus_minus(text)
-        except ValueError:
-            numbers = []
-        if not sign or not name.strip() or len(numbers) != 2:
-            self.fail(f"must be NAME=VALUE+-ERROR such as tip_calibration=1+-0.02, but is {value}", param, ctx)
-        return name.strip(), (numbers[0], numbers[1])
+            name, (value, error) = _assigned(text)
+        except ValueError as fault:
+            raise ValueError(f"must be NAME=VALUE+-ERROR such as tip_calibration=1+-0.02, but is {text}") from fault
+        return name, (value, error)
 
 
-class Names(click.ParamType):
+def _assigned(text: str) -> tuple[str, list[float]]:
+    """Return the name before an equals sign and the numbers after it."""
+    name, _, numbers = text.partition("=")
+    if not name.strip():
+        raise ValueError("names no parameter")
+    return name.strip(), parse_around_plus_minus(numbers)
+
+
+class Names(Kind):
     """Names in a comma list."""
 
     name = "names"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[str, ...]:
-        """Return the names.
-
-        Raises:
-            click.BadParameter: if one is blank.
-        """
-        names = tuple(part.strip() for part in str(value).split(","))
+    def read(self, text: str) -> tuple[str, ...]:
+        """Return the names."""
+        names = tuple(part.strip() for part in text.split(","))
         if not all(names):
-            self.fail(f"must be names separated by commas, but is {value}", param, ctx)
+            raise ValueError(f"must be names separated by commas, but is {text}")
         return names
 
 

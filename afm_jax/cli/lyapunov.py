@@ -5,13 +5,11 @@ from typing import Any
 import jax
 import numpy as np
 
-from afm_jax.apparatus.scene import Scene
 from afm_jax.cli.command import NamedScene, Output, later
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import ranges_of
 from afm_jax.dynamics.bands import drawn_exponents
 from afm_jax.dynamics.exponents import CHAOTIC_ERRORS, Lyapunov, exponent_verdicts, lyapunov_spectrum
-from afm_jax.impact.law import extrapolation_of
 from afm_jax.motion.start import start_of
 from afm_jax.scenefile.parameter_paths import scene_batch
 from afm_jax.scenefile.scenefile import scene_tables
@@ -41,9 +39,9 @@ def lyapunov(
         if scene.unknowns is not None:
             chosen = {"draws": draws, "impacts": impacts, "transient": transient}
             band = drawn_exponents(scene.scene, values, scene.unknowns, **chosen)
-    many = result if values else _as_batch(result)
+    many = result if values else jax.tree.map(lambda part: np.asarray(part)[None], result)
     verdicts = exponent_verdicts(many)
-    payload = _payload(result, scene.scene, verdicts if values else verdicts[0])
+    payload = _payload(result, verdicts if values else verdicts[0])
     payload |= {"scene": scene_tables(scene.scene), "reason": _why_none(many, verdicts)}
     columns = _columns(many, verdicts)
     if band is not None:
@@ -62,7 +60,8 @@ def lyapunov(
         files[f"lyapunov.{picture}"] = lambda to: draw_exponents(path, along, many.exponents_per_impact, to, band)
     return Output(
         payload=payload,
-        text=[*text, payload["extrapolated"]],
+        text=text,
+        impact_speeds=result.approach_speed_nm_per_us,
         tables={"lyapunov.csv": columns},
         files=files,
         not_valid=payload["reason"],
@@ -78,11 +77,7 @@ def _why_none(found: Lyapunov, verdicts: list[str]) -> str | None:
     return f"{words}; there were {most}{int(found.impacts.max())} impacts to average over"
 
 
-def _as_batch(found: Lyapunov) -> Lyapunov:
-    return jax.tree.map(lambda part: np.asarray(part)[None], found)
-
-
-def _payload(found: Lyapunov, scene: Scene, verdict: Any) -> dict[str, Any]:
+def _payload(found: Lyapunov, verdict: Any) -> dict[str, Any]:
     return {
         "exponents_per_us": found.exponents_per_us,
         "exponents_per_impact": found.exponents_per_impact,
@@ -94,7 +89,6 @@ def _payload(found: Lyapunov, scene: Scene, verdict: Any) -> dict[str, Any]:
         "rested": found.rested,
         "orbit": {"impacts": found.verdicts.impacts, "periods": found.verdicts.periods},
         "verdict": verdict,
-        "extrapolated": extrapolation_of(scene.interaction, found.approach_speed_nm_per_us),
     }
 
 

@@ -1,10 +1,18 @@
 """Options that several commands have."""
 
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import click
 
 from afm_jax.cli.values import PictureFormat, SceneName, Share, ValueAndError
+
+
+def flag(name: str, text: str, *, into: str | None = None) -> Callable[..., Any]:
+    """Return an option without a value: its name, what help says of it, and the function's argument if not its name."""
+    return click.option(*((name,) if into is None else (name, into)), is_flag=True, help=text)
+
 
 SCENE = click.argument("scene", metavar="SCENE.toml|PRESET", type=SceneName())
 """The scene that is loaded before the command's function is called, which gets it as a `NamedScene`."""
@@ -16,10 +24,8 @@ LAW = click.option(
     "place of the scene's, its errors as bands.",
 )
 """With `SCENE` it is loaded, too: the scene has its law then."""
-DRAWS = click.option(
-    "--draws", type=click.IntRange(2), default=20, show_default=True, help="Laws drawn from the fit for the bands."
-)
-PICTURE = click.option("--picture", type=PictureFormat(), default="png", show_default=True, help="png, pdf or svg.")
+DRAWS = click.option("--draws", type=click.IntRange(2), default=20, help="Laws drawn from the fit for the bands.")
+PICTURE = click.option("--picture", type=PictureFormat(), default="png", help="png, pdf or svg.")
 NOISE = click.option(
     "--noise",
     type=Share("a relative error"),

@@ -1,22 +1,24 @@
 """`afm-jax orbits SCENE.toml|PRESET --order N [--impacts m]`: the orbits of a scene."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 from rich.table import Table
 
 from afm_jax.apparatus.scene import Scene, drive_of
-from afm_jax.cli.command import NamedScene, Output, columns_of, later
+from afm_jax.cli.columns import Column, columns_of, printed_table
+from afm_jax.cli.command import NamedScene, Output, later
 from afm_jax.cli.session import Session
 from afm_jax.contact.contact import Contact
 from afm_jax.dynamics.contact_orbits import contact_orbits
 from afm_jax.dynamics.impact_loop import LoopReading
 from afm_jax.dynamics.impact_orbits import is_stable, many_impact_orbits, multipliers_of
 from afm_jax.dynamics.sticking_orbits import sticking_orbit
-from afm_jax.impact.law import Law, extrapolation_of
+from afm_jax.impact.law import Law
 from afm_jax.impact.orbits import SingleImpactOrbits, single_impact_orbits
 from afm_jax.scenefile.scenefile import scene_tables
+from afm_jax.words import counted
 
 save = later("afm_jax.plots.picture_style:save")
 
@@ -58,6 +60,14 @@ COLUMNS = (
 MANY_COLUMNS = (*IMPACT_COLUMNS, "peak_amplitude_nm", "trace", "determinant", "stable", "admissible")
 """What is told of an orbit of several impacts, of its impacts the first."""
 
+_IMPACT_CELLS = (
+    Column("phase\nrad", "phase_rad"),
+    Column("velocity after\nnm/us", "velocity_after_nm_per_us"),
+    Column("approach\nnm/us", "approach_speed_nm_per_us"),
+    Column("rebound\nnm/us", "rebound_speed_nm_per_us"),
+    Column("delay\nus", "delay_us"),
+)
+
 
 def orbits(session: Session, scene: NamedScene, *, order: int, impacts: int | None) -> Output:
     """Return the single-impact orbits of a scene; of a contact, or with ``impacts``, those of several impacts."""
@@ -70,12 +80,9 @@ def orbits(session: Session, scene: NamedScene, *, order: int, impacts: int | No
     reason = None
     if not any(orbit["admissible"] for orbit in rows):
         reason = why_none(scene.scene, order, rejected=len(rows))
-    near_fold = any(orbit["near_double"] for orbit in rows)
-    speeds = [orbit["approach_speed_nm_per_us"] for orbit in rows]
-    extrapolated = extrapolation_of(scene.scene.interaction, speeds)
     if not bool(result.complete):
         session.note("there are more orbits than could be listed; the slowest are shown")
-    title = f"Orbits with one impact in {order} drive period{'s' if order > 1 else ''}"
+    title = f"Orbits with one impact in {counted(order, 'drive period')}"
     fold = "Two of them nearly coincide (a fold): derivatives there have no meaning."
     return Output(
         payload={
@@ -83,10 +90,10 @@ def orbits(session: Session, scene: NamedScene, *, order: int, impacts: int | No
             "scene": scene_tables(scene.scene),
             "orbits": rows,
             "complete": result.complete,
-            "extrapolated": extrapolated,
             "reason": reason,
         },
-        text=[orbit_table(rows, title=title), fold if near_fold else None, extrapolated],
+        text=[orbit_table(rows, title=title), fold if any(orbit["near_double"] for orbit in rows) else None],
+        impact_speeds=[orbit["approach_speed_nm_per_us"] for orbit in rows],
         tables={"orbits.csv": columns_of(rows, names_of(result))},
         files={"orbits.png": lambda path: save(result.plot(), path)},
         not_valid=reason,
@@ -128,10 +135,7 @@ def _many(session: Session, scene: Scene, name: str, order: int, impacts: int) -
     if not orbits and (rests is None or rests["order"] != order):
         reason = why_none(scene, order, rejected=0, impacts=impacts)
     rows = [{"orbit": k, **impact} for k, orbit in enumerate(orbits) for impact in orbit["impacts"]]
-    extrapolated = extrapolation_of(scene.interaction, [row["approach_speed_nm_per_us"] for row in rows])
-    title = (
-        f"Orbits with {impacts} impact{'s' if impacts > 1 else ''} in {order} drive period{'s' if order > 1 else ''}"
-    )
+    title = f"Orbits with {counted(impacts, 'impact')} in {counted(order, 'drive period')}"
     return Output(
         payload={
             "order": order,
@@ -140,14 +144,13 @@ def _many(session: Session, scene: Scene, name: str, order: int, impacts: int) -
             "orbits": orbits,
             "sticking": rests,
             "sticking_reason": resting if rests is None else None,
-            "extrapolated": extrapolated,
             "reason": reason,
         },
         text=[
             many_table(orbits, title=title),
             f"No orbit with a rest: {resting}." if rests is None else _resting_words(rests),
-            extrapolated,
         ],
+        impact_speeds=[row["approach_speed_nm_per_us"] for row in rows],
         tables={
             "orbits.csv": columns_of([{**orbit, **orbit["impacts"][0]} for orbit in orbits], MANY_COLUMNS),
             "impacts.csv": columns_of(rows, ("orbit", *IMPACT_COLUMNS)),
@@ -192,27 +195,6 @@ def orbit_facts(reading: LoopReading, index: int) -> dict[str, Any]:
     }
 
 
-def many_table(orbits: Sequence[Mapping[str, Any]], *, title: str) -> Table:
-    """Return orbits of several impacts as a table to print, a line an impact."""
-    table = Table(title=title, title_justify="left")
-    for column in ("orbit", "phase\nrad", "velocity after\nnm/us", "approach\nnm/us", "rebound\nnm/us", "delay\nus"):
-        table.add_column(column, justify="right")
-    for column in ("peak\nnm", "multipliers", "stable"):
-        table.add_column(column, justify="right")
-    shown = ("phase_rad", "velocity_after_nm_per_us", "approach_speed_nm_per_us", "rebound_speed_nm_per_us", "delay_us")
-    for number, orbit in enumerate(orbits):
-        sizes = ", ".join(f"{complex(*one):.4g}" if one[1] else f"{one[0]:.4g}" for one in orbit["multipliers"])
-        for place, impact in enumerate(orbit["impacts"]):
-            whole = (f"{orbit['peak_amplitude_nm']:.6g}", sizes, "yes" if orbit["stable"] else "no")
-            first = place == 0
-            table.add_row(
-                str(number) if first else "",
-                *(f"{impact[name]:.6g}" for name in shown),
-                *(whole if first else ("",) * 3),
-            )
-    return table
-
-
 def names_of(found: SingleImpactOrbits) -> tuple[str, ...]:
     """Return what is told of orbits: what their scene has."""
     return (*COLUMNS, *(name for name in (*DRIVEN_COLUMNS, "extrapolated") if getattr(found, name) is not None))
@@ -255,28 +237,40 @@ def why_none(scene: Scene, order: int, *, rejected: int, impacts: int = 1) -> st
 
 def orbit_table(orbits: Sequence[Mapping[str, Any]], *, title: str) -> Table:
     """Return orbits as a table to print; where base or force drive with what is read at the drive's frequency."""
-    table = Table(title=title, title_justify="left")
-    table.add_column("phase\nrad", justify="right")
-    for name, unit in (("velocity after", "nm/us"), ("approach", "nm/us"), ("rebound", "nm/us"), ("delay", "us")):
-        table.add_column(f"{name}\n{unit}", justify="right")
-    shown = ("phase_rad", "velocity_after_nm_per_us", "approach_speed_nm_per_us", "rebound_speed_nm_per_us", "delay_us")
-    seen = {"peak_amplitude_nm": "peak\nnm"}
+    columns = [*_IMPACT_CELLS, Column("peak\nnm", "peak_amplitude_nm")]
     if orbits and "drive_lockin_amplitude_nm" in orbits[0]:
-        seen |= {"drive_lockin_amplitude_nm": "at drive\nnm", "drive_lockin_phase_deg": "at drive\ndeg"}
+        columns.append(Column("at drive\nnm", "drive_lockin_amplitude_nm"))
+        columns.append(Column("at drive\ndeg", "drive_lockin_phase_deg"))
         if "peak_deflection_nm" in orbits[0]:
-            seen |= {"deflection_drive_lockin_amplitude_nm": "deflection\nat drive nm"}
-        seen |= {"phase_lag_deg": "lag\ndeg"}
+            columns.append(Column("deflection\nat drive nm", "deflection_drive_lockin_amplitude_nm"))
+        columns.append(Column("lag\ndeg", "phase_lag_deg"))
     else:
-        seen |= {"lockin_amplitude_nm": "lock-in\nnm", "lockin_phase_deg": "lock-in\ndeg"}
-    for key, heading in seen.items():
-        table.add_column(heading, justify="right")
-        shown += (key,)
-    for name in ("trace", "determinant"):
-        table.add_column(f"{name}\n", justify="right")
-        shown += (name,)
-    table.add_column("stable")
-    table.add_column("admissible")
-    for orbit in orbits:
-        words = ("yes" if orbit[name] else "no" for name in ("stable", "admissible"))
-        table.add_row(*(f"{orbit[name]:.6g}" for name in shown), *words)
-    return table
+        columns += [Column("lock-in\nnm", "lockin_amplitude_nm"), Column("lock-in\ndeg", "lockin_phase_deg")]
+    columns += [Column(f"{name}\n", name) for name in ("trace", "determinant")]
+    columns += [Column(name, name, "yes", left=True) for name in ("stable", "admissible")]
+    return printed_table(title, columns, orbits)
+
+
+def many_table(orbits: Sequence[Mapping[str, Any]], *, title: str) -> Table:
+    """Return orbits of several impacts as a table to print, a line an impact; the orbit's own numbers in its first."""
+
+    def of_orbit(heading: str, cell: Callable[[Any], str]) -> Column:
+        return Column(heading, lambda row: cell(row["whole"]) if row["first"] else "", "")
+
+    rows = [
+        {**impact, "whole": {**orbit, "number": number}, "first": place == 0}
+        for number, orbit in enumerate(orbits)
+        for place, impact in enumerate(orbit["impacts"])
+    ]
+    columns = [
+        of_orbit("orbit", lambda orbit: str(orbit["number"])),
+        *_IMPACT_CELLS,
+        of_orbit("peak\nnm", lambda orbit: f"{orbit['peak_amplitude_nm']:.6g}"),
+        of_orbit("multipliers", lambda orbit: ", ".join(map(_multiplier, orbit["multipliers"]))),
+        of_orbit("stable", lambda orbit: "yes" if orbit["stable"] else "no"),
+    ]
+    return printed_table(title, columns, rows)
+
+
+def _multiplier(parts: Sequence[float]) -> str:
+    return f"{complex(*parts):.4g}" if parts[1] else f"{parts[0]:.4g}"

@@ -1,34 +1,26 @@
-"""What every command shares: `--json`, `--out`, `--verbose`, messages on standard error, and how computing starts.
+"""What every command shares: `--json`, `--out`, `--verbose`, messages and progress, files, and how computing starts.
 
->>> import click
->>> from afm_jax.cli.session import Session, with_session
->>> @click.command()
-... @with_session
-... def command(session: Session) -> None:
-...     session.start_computing()  # only then import JAX and what needs it
-...     session.emit({"answer": 42}, "The answer is 42.")
-
-The `--out` folder: made and tried out before the computation, and the tables in it.
+The `--out` folder is made and tried out before the computation.
 """
 
 import csv
 import functools
 import io
-import json
 import math
 import os
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import click
 
-from afm_jax.compilation_cache import cache_folder, make_private, silence_xla
+from afm_jax.cli.columns import columns_of, csv_cells
+from afm_jax.compilation_cache import cache_folder, make_private
 from afm_jax.strict_json import strict_json
 from afm_jax.whole_files import check_plain, write_whole
 from afm_jax.words import broken, lines_at_most, shown, text_table
@@ -58,41 +50,6 @@ def prepare_folder(folder: Path, *, within: Path | None = None) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryFile(dir=folder):
         pass
-
-
-def write_csv(path: Path, rows: Sequence[Mapping[str, Any]], columns: Sequence[str]) -> None:
-    """Write rows as CSV; numbers with all their digits, true and false in words, what is unknown as an empty cell."""
-    _write_rows(path, columns, ([_cell(row.get(column)) for column in columns] for row in rows))
-
-
-def _write_rows(path: Path, head: Iterable[str], rows: Iterable[Iterable[Any]], comments: Iterable[str] = ()) -> None:
-    text = io.StringIO()
-    text.writelines(f"# {comment}\n" for comment in comments)
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(head)
-    writer.writerows(rows)
-    write_whole(path, text.getvalue())
-
-
-def _cell(value: Any) -> Any:
-    plain = value.tolist() if hasattr(value, "tolist") else value
-    if isinstance(plain, bool):
-        return "true" if plain else "false"
-    if plain is None or (isinstance(plain, float) and not math.isfinite(plain)):
-        return ""
-    return plain
-
-
-def _cells(column: Any) -> Any:
-    """Return the cells of a column, many at a time."""
-    if not hasattr(column, "dtype") or column.dtype.kind not in "fb":
-        return (_cell(value) for value in column)
-    if column.dtype.kind == "b":
-        return ("true" if value else "false" for value in column.tolist())
-    return (value if math.isfinite(value) else "" for value in column.tolist())
-
-
-_SECONDS_BETWEEN_NOTES = 2.0
 
 
 def labelled(payload: Mapping[str, Any]) -> dict[str, Any]:
@@ -126,73 +83,7 @@ def write_json(path: Path, payload: Mapping[str, Any]) -> None:
 
 _WIDTH_OF_A_PIPE = 10_000
 """Columns of text that nobody looks at in a terminal: no line is broken, no table turned."""
-
-
-class _Wait:
-    """Something being done, as the line that a terminal shows of it."""
-
-    def __init__(self, what: str, parts: str, last_s: float | None) -> None:
-        self.what, self.parts, self.last_s = what, parts, last_s
-        self.begun = time.monotonic()
-        self.first: tuple[float, int] | None = None
-        self.done, self.total, self.rate, self.until = 0, 0, 0.0, math.inf
-
-    def seconds(self) -> float:
-        return time.monotonic() - self.begun
-
-    def count(self, done: int, total: int) -> None:
-        """Take note of how much is done; until the first call programs were compiled, which the rest need not be."""
-        now = time.monotonic()
-        since, before = self.first = self.first or (now, done)
-        self.done, self.total = done, total
-        self.rate = (done - before) / (now - since) if now > since else 0.0
-        self.until = now + (total - done) / self.rate if self.rate > 0.0 else math.inf
-
-    def counted(self, now: float) -> str:
-        left = self.until - now
-        return f"{self.done} of {self.total} {self.parts}" + (
-            f", {_rate(self.rate)} a second, about {_duration(left)} left" if 0.0 < left < 1e6 else ""
-        )
-
-    def __rich__(self) -> Any:
-        from rich.text import Text  # noqa: PLC0415
-
-        return Text(shown(self.line()), overflow="ellipsis", no_wrap=True)
-
-    def line(self) -> str:
-        """Return what is known by now."""
-        now = time.monotonic()
-        known = self.what.partition(" (")[0]
-        if self.first is not None:
-            return f"{known}: {self.counted(now)}"
-        if now - self.begun < _SECONDS_BETWEEN_NOTES:
-            return self.what
-        if self.last_s is None:
-            return f"{self.what}: {_duration(now - self.begun)}"
-        return f"{known}: {_duration(now - self.begun)}, last time {_duration(self.last_s)}"
-
-
-_MOST_WAITS = 200
-
-
-def _kept_waits() -> Path | None:
-    """Return the file of how long waits took on this machine, beside the programs compiled for it, if any are kept."""
-    folder = cache_folder()
-    return folder / "waits.json" if folder is not None and folder.is_dir() else None
-
-
-def _read_waits(path: Path) -> dict[str, float]:
-    """Return the seconds that each wait took the last time; none where the file is missing or damaged."""
-    try:
-        return {name: float(seconds) for name, seconds in json.loads(path.read_text(encoding="utf-8")).items()}
-    except (OSError, ValueError, TypeError, AttributeError):
-        return {}
-
-
-def _keep_wait(path: Path, key: str, seconds: float) -> None:
-    others = {name: value for name, value in _read_waits(path).items() if name != key}
-    with suppress(OSError):
-        write_whole(path, json.dumps(dict([*others.items(), (key, round(seconds, 1))][-_MOST_WAITS:])))
+_SECONDS_BETWEEN_NOTES = 2.0
 
 
 @dataclass(frozen=True)
@@ -242,36 +133,41 @@ class Session:
 
     @contextmanager
     def working(self, what: str, parts: str = "") -> Iterator[Callable[[int, int], None]]:
-        """Tell on standard error what is being done, and from two seconds on how long it takes.
+        """Tell on standard error what is being done, for as long as a block lasts.
 
-        A terminal shows for how long it has been going on and what it took the last time on this machine. What is
-        counted is shown with the time that the rest takes: there, and where no terminal is as a line every two seconds.
+        A terminal shows it with a clock; what is counted also with its rate and the time that the rest takes, which is
+        told as a line every two seconds where no terminal is. Rates are those since the first count: before it
+        programs were compiled.
 
         Args:
             what: is done; in brackets at its end what is told of a first run.
             parts: what is counted, by calls of what this gives: how many are done, of how many.
         """
+        from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn  # noqa: PLC0415
+        from rich.table import Column  # noqa: PLC0415
+
         console = _console(stderr=True)
-        command = click.get_current_context(silent=True)
-        key = f"{command and command.info_name}: {what}"
-        kept = _kept_waits() if console.is_terminal else None
-        wait = _Wait(what, parts, None if kept is None else _read_waits(kept).get(key))
-        if kept is None:
-            last = time.monotonic()
+        words = TextColumn("{task.description}", markup=False, table_column=Column(no_wrap=True, overflow="ellipsis"))
+        columns = [SpinnerColumn(), words, *([BarColumn()] if parts else []), TimeElapsedColumn()]
+        terminal = {"console": console, "transient": True, "disable": not console.is_terminal}
+        progress = Progress(*columns, **terminal, get_time=time.monotonic, speed_estimate_period=math.inf)
+        number = progress.add_task(shown(what), total=None)
+        (task,) = progress.tasks
+        last = time.monotonic()
 
-            def report(done: int, total: int) -> None:
-                nonlocal last
-                wait.count(done, total)
-                if time.monotonic() - last > _SECONDS_BETWEEN_NOTES:
-                    last = time.monotonic()
-                    self.note(wait.counted(last))
+        def report(done: int, total: int) -> None:
+            nonlocal last
+            progress.update(number, completed=done, total=total)
+            told = f"{done} of {total} {parts}"
+            if task.speed and task.time_remaining:
+                told += f", {_rate(task.speed)} a second, about {_duration(float(task.time_remaining))} left"
+            task.description = f"{shown(what.partition(' (')[0])}: {told}"
+            if progress.disable and time.monotonic() - last > _SECONDS_BETWEEN_NOTES:
+                last = time.monotonic()
+                self.note(told)
 
+        with progress:
             yield report
-            return
-        with console.status(wait):
-            yield wait.count
-        if wait.seconds() > _SECONDS_BETWEEN_NOTES:
-            _keep_wait(kept, key, wait.seconds())
 
     def emit(self, payload: Mapping[str, Any], *text: Any) -> None:
         """Write the result to standard output: the JSON object if asked for, else the text.
@@ -305,50 +201,46 @@ class Session:
             rows: a mapping from column to value each; what is missing, None or not finite stays empty.
             columns: the columns in order.
         """
-        if self.out is not None:
-            write_csv(self.out / name, rows, columns)
-            self.note(f"wrote {self.out / name}")
+        self.write_columns(name, columns_of(rows, columns))
 
     def write_columns(self, name: str, columns: Mapping[str, Any], comments: Iterable[str] = ()) -> None:
-        """Write a long table as CSV into the `--out` folder, if there is one, and say so.
+        """Write a table as CSV into the `--out` folder, if there is one, and say so.
 
         Args:
             name: file name.
-            columns: lists or arrays of one length, in order; what is not finite stays empty.
+            columns: lists or arrays of one length, in order; what is None or not finite stays empty.
             comments: lines above the table, each after a number sign.
         """
         if self.out is None:
             return
-        _write_rows(self.out / name, columns, zip(*map(_cells, columns.values()), strict=True), comments)
+        text = io.StringIO()
+        text.writelines(f"# {comment}\n" for comment in comments)
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(columns)
+        writer.writerows(zip(*map(csv_cells, columns.values()), strict=True))
+        write_whole(self.out / name, text.getvalue())
         self.note(f"wrote {self.out / name}")
 
 
-def with_session(function: Callable[..., Any] | None = None, *, out_file: str = "") -> Any:
-    """Give a command `--json`, `--out` and `--verbose`, and pass it a `Session` as first argument.
+def session_options(out_file: str) -> tuple[Callable[..., Any], ...]:
+    """Return the options of every command, which are the attributes of its session.
 
     Args:
-        function: the command's function; None gives the decorator.
         out_file: what the file is called that `--out` names, for a command that writes a single one; empty: a folder.
     """
-    if function is None:
-        return functools.partial(with_session, out_file=out_file)
-
-    @click.option("--json", "as_json", is_flag=True, help="Write one JSON object to standard output, nothing else.")
-    @click.option(
-        "--out",
-        metavar=out_file or "DIR",
-        type=click.Path(path_type=Path),
-        callback=functools.partial(_prepared, is_file=bool(out_file)),
-        help="Write this table." if out_file else "Write tables (CSV) and pictures (PNG) into this folder.",
+    return (
+        click.option("--json", is_flag=True, help="Write one JSON object to standard output, nothing else."),
+        click.option(
+            "--out",
+            metavar=out_file or "DIR",
+            type=click.Path(path_type=Path),
+            callback=functools.partial(_prepared, is_file=bool(out_file)),
+            help="Write this table." if out_file else "Write tables (CSV) and pictures (PNG) into this folder.",
+        ),
+        click.option(
+            "--verbose", is_flag=True, help="Say on standard error what is kept, read and compiled, and where."
+        ),
     )
-    @click.option("--verbose", is_flag=True, help="Say on standard error what is kept, read and compiled, and where.")
-    @functools.wraps(function)
-    def command(*args: Any, as_json: bool, out: Path | None, verbose: bool, **options: Any) -> Any:
-        # before anything loads JAX: checks of options may
-        silence_xla()
-        return function(Session(as_json, out, verbose), *args, **options)
-
-    return command
 
 
 def _prepared(ctx: click.Context, parameter: click.Parameter, folder: Path | None, *, is_file: bool) -> Path | None:

@@ -10,6 +10,7 @@ import click
 from afm_jax.cli.command import Output
 from afm_jax.cli.commands.measure import READING_OPTIONS
 from afm_jax.cli.session import FIT_PROGRAMS, Session, add_note, prepare_folder
+from afm_jax.cli.values import option_of
 from fitting.examples.make_raw_curve import EXAMPLE, OPTIONS
 from fitting.tables.table import AmplitudeTable, read_table
 from fitting.tapping_curves.measured import MeasuredFile, is_table, read_measured
@@ -69,41 +70,42 @@ def _together(
     session: Session, paths: tuple[Path, ...], files: list[MeasuredFile], model: str, how: dict[str, bool]
 ) -> Output:
     """Return what is known of several curves of one lever, together and one by one, with the hysteresis of all."""
-    places = [(i, number) for i, file in enumerate(files) for number in file.tables]
-    tables = [files[i].tables[number] for i, number in places]
-    whole = together([_analysed(session, table, model, **how) for table in tables]) if tables else None
-    results = () if whole is None else whole.curves
-    numbers = [number for _, number in places] if len(files) == 1 else list(range(1, len(places) + 1))
-    named = {"curve " + str(number): result for number, result in zip(numbers, results, strict=True)}
+    only_file = files[0] if len(files) == 1 else None
+    tables = [(number, table) for file in files for number, table in file.tables.items()]
+    whole = together([_analysed(session, table, model, **how) for _, table in tables]) if tables else None
+    numbers = [number for number, _ in tables] if only_file is not None else range(1, len(tables) + 1)
+    curves = {} if whole is None else dict(zip(numbers, whole.curves, strict=True))
     refused = [
-        {"curve": number, "reason": reason} | ({} if len(files) == 1 else {"file": str(path)})
+        {"curve": number, "reason": reason} | ({} if only_file is not None else {"file": str(path)})
         for path, file in zip(paths, files, strict=True)
         for number, reason in file.refused.items()
     ]
-    summaries = [lambda result=result: tapping_summary(result) + "\n" for result in results]
-    text = [f"Curve {one['curve']} refused: {one['reason']}" for one in refused]
-    width, widths = files[0].half_width_nm, files[0].half_widths_nm
-    if len(files) == 1 and width is not None:
-        each = ", ".join(f"{one:.2f}" for one in widths.values())
+    width = None if only_file is None else only_file.half_width_nm
+    widths = {} if only_file is None else only_file.half_widths_nm
+    text = [lambda result=result: tapping_summary(result) + "\n" for result in curves.values()]
+    text += [f"Curve {each['curve']} refused: {each['reason']}" for each in refused]
+    if width is not None:
         text.append(
             f"Hysteresis at half of the free amplitude: {width[0]:.2f} nm, scatter {width[1]:.2f} nm over "
-            f"{len(widths)} curves ({each}); it needs no calibration of the amplitude"
+            f"{len(widths)} curves ({', '.join(f'{each:.2f}' for each in widths.values())}); it needs no calibration "
+            "of the amplitude"
         )
-    if whole is not None and len(results) > 1:
+    if whole is not None and len(curves) > 1:
         text.append("\n".join(together_lines(whole)))
+    valid = whole is not None and whole.valid and not refused
     payload = {
-        "valid": whole is not None and whole.valid and not refused,
-        "curves": [{"curve": number, **result.to_dict()} for number, result in zip(numbers, results, strict=True)],
+        "valid": valid,
+        "curves": [{"curve": number, **result.to_dict()} for number, result in curves.items()],
         "together": None if whole is None else whole.to_dict(),
         "refused": refused,
-        "half_width_nm": None if len(files) > 1 or width is None else {"mean": width[0], "scatter": width[1]},
-        "half_widths_nm": [] if len(files) > 1 else [{"curve": n, "width_nm": one} for n, one in widths.items()],
+        "half_width_nm": None if width is None else {"mean": width[0], "scatter": width[1]},
+        "half_widths_nm": [{"curve": number, "width_nm": each} for number, each in widths.items()],
     }
     return Output(
         payload=payload,
-        text=[*summaries, *text],
-        report=partial(_write_curves, session, dict(zip(numbers, results, strict=True)), whole),
-        not_valid=None if payload["valid"] else _why_not(paths, refused, named, whole),
+        text=text,
+        report=partial(_write_curves, session, curves, whole),
+        not_valid=None if valid else _why_not(paths, refused, curves, whole),
     )
 
 
@@ -113,19 +115,19 @@ def _write_curves(
     """Write a report of each curve into a folder of its own, and of all together if they scatter; return the paths."""
     written: list[Path] = []
     for number, result in curves.items():
-        own = replace(session, out=folder / f"curve_{number}")
-        prepare_folder(folder / f"curve_{number}", within=folder)
-        written += write_tapping(result, folder / f"curve_{number}", own.write_table)
+        below = folder / f"curve_{number}"
+        prepare_folder(below, within=folder)
+        written += write_tapping(result, below, replace(session, out=below).write_table)
     if whole is not None and whole.scatter:
         written += write_together(whole, folder)
     return written
 
 
 def _why_not(
-    paths: tuple[Path, ...], refused: list[dict[str, Any]], named: dict[str, Tapping], whole: TappingTogether | None
+    paths: tuple[Path, ...], refused: list[dict[str, Any]], curves: dict[int, Tapping], whole: TappingTogether | None
 ) -> str:
-    why = [f"curve {one['curve']} refused" for one in refused]
-    why += [f"{name}: {result.reasons[0]}" for name, result in named.items() if not result.valid]
+    why = [f"curve {each['curve']} refused" for each in refused]
+    why += [f"curve {number}: {result.reasons[0]}" for number, result in curves.items() if not result.valid]
     why += [] if whole is None else [reason for reason in whole.reasons if "disagree" in reason]
     return f"{paths[0] if len(paths) == 1 else f'{len(paths)} files'}: {'; '.join(why)}"
 
@@ -134,21 +136,22 @@ def _example(options: dict[str, Any]) -> tuple[Path, dict[str, Any]]:
     """Return the bundled raw file, and the options with what is known of its instrument where they say nothing."""
     stated = {name: value for name, value in OPTIONS.items() if options[name] in {None, ""}}
     path = EXAMPLE.relative_to(Path.cwd()) if EXAMPLE.is_relative_to(Path.cwd()) else EXAMPLE
-    words = " ".join(f"{_OPTION_OF.get(name, f'--{name}')} {_shown(value)}" for name, value in stated.items())
+    # --spring-constant stands for --spring-constant-n-per-m
+    words = " ".join(f"{option_of(name.removesuffix('_n_per_m'))} {_shown(value)}" for name, value in stated.items())
     add_note(f"The example is simulated; as if it were measured: afm-jax tapping {path} {words}")
     return path, options | stated
 
 
-_OPTION_OF = {
-    "nm_per_volt": "--nm-per-volt",
-    "spring_constant_n_per_m": "--spring-constant",
-    "quality_factor": "--quality-factor",
-    "free_frequency_khz": "--free-frequency-khz",
-}
-
-
 def _shown(value: Any) -> str:
     return value if isinstance(value, str) else f"'{value[0]:g} +- {value[1]:g}'"
+
+
+_OF_TABLES = {
+    "free_frequency_khz": ("free_frequency_khz", "free_frequency_error_khz"),
+    "quality_factor": ("quality_factor", "quality_factor_error"),
+    "spring_constant_n_per_m": ("spring_constant_n_per_m", "spring_constant_error_n_per_m"),
+}
+"""What the command line may say in place of a table, and what a table calls value and error."""
 
 
 def _refuse_reading(path: Path, options: dict[str, Any]) -> None:
@@ -157,35 +160,25 @@ def _refuse_reading(path: Path, options: dict[str, Any]) -> None:
     Raises:
         click.UsageError: naming the first of them.
     """
-    names = ("curve", *(name for name in READING_OPTIONS if name not in _OF_TABLES))
-    given = next((name for name in names if options[name] not in {None, ""}), None)
-    if given is not None:
-        raise click.UsageError(
-            f"--{given.replace('_', '-')} is for an instrument's file; {path} is a table, which says that itself"
-        )
-
-
-_OF_TABLES = ("free_frequency_khz", "quality_factor", "spring_constant_n_per_m")
-"""What the command line may say in place of a table."""
+    for name in ("curve", *READING_OPTIONS):
+        if name not in _OF_TABLES and options[name] not in {None, ""}:
+            raise click.UsageError(
+                f"{option_of(name)} is for an instrument's file; {path} is a table, which says that itself"
+            )
 
 
 def _given(table: AmplitudeTable, options: dict[str, Any]) -> AmplitudeTable:
     """Return a table with what the call says of the instrument in place of its own."""
-    names = {
-        "free_frequency_khz": ("free_frequency_khz", "free_frequency_error_khz"),
-        "quality_factor": ("quality_factor", "quality_factor_error"),
-        "spring_constant_n_per_m": ("spring_constant_n_per_m", "spring_constant_error_n_per_m"),
-    }
-    own = {
+    stated = {
         name: number
-        for option, pair in names.items()
+        for option, value_and_error in _OF_TABLES.items()
         if options[option] is not None
-        for name, number in zip(pair, options[option], strict=True)
+        for name, number in zip(value_and_error, options[option], strict=True)
     }
-    if own and own.get("spring_constant_n_per_m", table.spring_constant_n_per_m) is not None:
+    if stated and stated.get("spring_constant_n_per_m", table.spring_constant_n_per_m) is not None:
         # what spring constant and frequency make it
-        own["mass_ng"] = None
-    return _calibrated(replace(table, **own) if own else table, options)
+        stated["mass_ng"] = None
+    return _calibrated(replace(table, **stated) if stated else table, options)
 
 
 def _calibrated(table: AmplitudeTable, options: dict[str, Any]) -> AmplitudeTable:

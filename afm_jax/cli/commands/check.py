@@ -3,6 +3,7 @@
 import click
 
 from afm_jax.cli.command import Command
+from afm_jax.cli.options import flag
 from afm_jax.cli.values import Finite, SceneName
 
 VERIFY = Command(
@@ -17,21 +18,12 @@ VERIFY = Command(
     one is too large.
     """,
     options=(
-        click.option(
-            "--states",
-            type=click.IntRange(min=1),
-            default=10_000,
-            show_default=True,
-            help="Random states of each kind.",
-        ),
-        click.option(
-            "--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Seed of the random states."
-        ),
+        click.option("--states", type=click.IntRange(min=1), default=10_000, help="Random states of each kind."),
+        click.option("--seed", type=click.IntRange(min=0), default=0, help="Seed of the random states."),
         click.option(
             "--exact-states",
             type=click.IntRange(min=1),
             default=200,
-            show_default=True,
             help="States of each kind compared with 50 digits (needs mpmath).",
         ),
     ),
@@ -63,14 +55,12 @@ ACCURACY = Command(
             "--wanted-error-us",
             type=Finite(positive=True),
             default=1e-9,
-            show_default=True,
             help="Error of an impact time for which to find the cheapest setting.",
         ),
         click.option(
             "--accuracy",
             type=Finite(positive=True),
             default=1e-9,
-            show_default=True,
             help="For collide: relative error of the rebound speed (a tenth of the delay's in us) to find the "
             "cheapest for.",
         ),
@@ -78,10 +68,9 @@ ACCURACY = Command(
             "--contacts",
             type=click.IntRange(1, 10_000),
             default=10,
-            show_default=True,
             help="For a scene: the arrival of which contact is compared.",
         ),
-        click.option("--quick", is_flag=True, help="Few and small measurements: to see that it works."),
+        flag("--quick", "Few and small measurements: to see that it works."),
     ),
 )
 
@@ -100,7 +89,7 @@ BENCH = Command(
     bench_dynamics.csv, bench_sweep.csv, bench_fits.csv and bench.json.
     """,
     options=(
-        click.option("--quick", is_flag=True, help="Few and small measurements: to see that it works."),
+        flag("--quick", "Few and small measurements: to see that it works."),
         click.option(
             "--batch",
             "batches",

@@ -3,7 +3,8 @@
 import click
 
 from afm_jax.cli.command import Command, Options
-from afm_jax.cli.contact_options import with_contact_options
+from afm_jax.cli.contact_options import CONTACT_OPTIONS
+from afm_jax.cli.options import flag
 from afm_jax.cli.session import Session
 from afm_jax.cli.values import Ends, Finite, Numbers
 
@@ -33,42 +34,37 @@ COLLIDE = Command(
     integration does not resolve one. With --make-law the law that the contact amounts to.
     """,
     options=(
-        with_contact_options,
+        *CONTACT_OPTIONS,
         click.option(
             "--speeds",
             type=Numbers("speed", example="12,15,20"),
             metavar="LIST",
             help="Approach speeds in nm/us: 12,15,20 or start:stop:step as 12:200:10 (with the stop where it fits), "
-            "or both. "
-            "Left out: 20 speeds from 1.1 times the capture speed to 200.",
+            "or both. Left out: 20 speeds from 1.1 times the capture speed to 200.",
         ),
         click.option(
             "--accuracy",
             type=Finite(positive=True),
             default=1e-9,
-            show_default=True,
             help="Wanted relative accuracy of the rebound speed.",
         ),
         click.option(
             "--method",
             type=click.Choice(("diffrax", "collocation")),
             default="diffrax",
-            show_default=True,
             help="How the way through the bridge is integrated.",
         ),
-        click.option(
+        flag(
             "--make-law",
-            is_flag=True,
-            help="Make the impact law that the contact amounts to, in place of a table of collisions: with --out "
-            "law.json and "
-            "law.csv, which scene files and --law take, and the formulas closest to it.",
+            "Make the impact law that the contact amounts to, in place of a table of collisions: with --out "
+            "law.json and law.csv, which scene files and --law take, and the formulas closest to it.",
         ),
         click.option(
             "--speed-range",
             type=Ends(),
             metavar="LOW:HIGH",
-            help="With --make-law: approach speeds of the formulas in nm/us. Left out: 1.5 times the capture speed to "
-            "250.",
+            help="With --make-law: approach speeds of the formulas in nm/us. Left out: 1.5 times the capture speed "
+            "to 250.",
         ),
         click.option(
             "--delay-range",

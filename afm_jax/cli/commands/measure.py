@@ -10,9 +10,9 @@ import click
 from afm_jax.cli.command import Command, Options
 from afm_jax.cli.design_prior import with_prior_options
 from afm_jax.cli.fit_options import Constraint, Fixed, Names, check_fit
-from afm_jax.cli.options import NOISE, QUALITY_FACTOR
+from afm_jax.cli.options import NOISE, QUALITY_FACTOR, flag
 from afm_jax.cli.session import FIT_PROGRAMS, Session
-from afm_jax.cli.values import Finite, FiniteOrNone, Numbers, Orders, Share, ValueAndError
+from afm_jax.cli.values import Finite, Kind, Numbers, Orders, Share, ValueAndError
 from fitting.parameters import CONTACT_DEFAULT, DELAY_LAW, LAWS, MODELS, NUISANCE_NAMES
 
 
@@ -49,20 +49,18 @@ CALIBRATE = Command(
         click.option(
             "--background",
             type=click.Choice(("none", "floor", "constant", "linear")),
-            help="What is added to the response: with phase none, constant or linear; without none, floor or constant. "
-            "Without this option constant, or what Akaike's criterion prefers clearly.",
+            help="What is added to the response: with phase none, constant or linear; without none, floor or "
+            "constant. Without this option constant, or what Akaike's criterion prefers clearly.",
         ),
-        click.option("--amplitude-only", is_flag=True, help="Leave the phase of the sweep aside."),
+        flag("--amplitude-only", "Leave the phase of the sweep aside."),
         click.option(
             "--noise",
             type=Share("a relative error"),
             metavar="SHARE",
             help="Error of every point as a share of the largest amplitude.",
         ),
-        click.option(
-            "--scale-errors", is_flag=True, help="Take given errors as relative: scale them until chi2/dof is 1."
-        ),
-        click.option("--whole", is_flag=True, help="Fit all of a thermal spectrum, not what the model explains of it."),
+        flag("--scale-errors", "Take given errors as relative: scale them until chi2/dof is 1."),
+        flag("--whole", "Fit all of a thermal spectrum, not what the model explains of it."),
         click.option(
             "--length-um", type=ValueAndError(), metavar="UM", help="Length of a rectangular lever: Sader's method."
         ),
@@ -74,7 +72,6 @@ CALIBRATE = Command(
             "--deflection",
             type=click.Choice(["static", "mode"]),
             default="static",
-            show_default=True,
             help="How a thermal spectrum got its nm: by the slope of a force curve (static InvOLS), or for the mode "
             "itself.",
         ),
@@ -82,12 +79,10 @@ CALIBRATE = Command(
             "--scale-error",
             type=Share("a relative error"),
             metavar="SHARE",
-            help="Relative error of the deflection's scale (its sensitivity), of which k has twice as much [default: "
-            "5 %].",
+            help="Relative error of the deflection's scale (its sensitivity), of which k has twice as much "
+            "[default: 5 %].",
         ),
-        click.option(
-            "--slope", is_flag=True, help="SWEEP holds force curves: the sensitivity (nm/V) from their slope."
-        ),
+        flag("--slope", "SWEEP holds force curves: the sensitivity (nm/V) from their slope."),
     ),
     check=_check_lever,
 )
@@ -130,8 +125,8 @@ DESIGN = Command(
             "--detuning",
             type=Numbers(),
             metavar="LIST",
-            help="Drive frequencies as multiples of each order's resonance 2 N f0, else 0.97:1.05:0.01; or of f0 where "
-            "the tip is driven, else 1.02:1.1:0.02.",
+            help="Drive frequencies as multiples of each order's resonance 2 N f0, else 0.97:1.05:0.01; or of f0 "
+            "where the tip is driven, else 1.02:1.1:0.02.",
         ),
         click.option(
             "--drive-nm",
@@ -145,11 +140,10 @@ DESIGN = Command(
             type=Numbers(positive=False),
             metavar="LIST",
             help="Where the tip is driven, in place of offsets: distances of the sample as shares of each free "
-            "amplitude; else "
-            "0.1:0.9:0.1.",
+            "amplitude; else 0.1:0.9:0.1.",
         ),
         click.option("--largest-nm", type=Finite(), metavar="X", help="Peak amplitude that the instrument takes."),
-        click.option("--points", type=click.IntRange(1, 200), default=8, show_default=True, help="How many to choose."),
+        click.option("--points", type=click.IntRange(1, 200), default=8, help="How many to choose."),
         click.option(
             "--for", "interest", metavar="NAMES", help="Parameters to be known well, as r,epsilon; else the law's."
         ),
@@ -157,37 +151,26 @@ DESIGN = Command(
             "--criterion",
             type=click.Choice(("D", "A")),
             default="D",
-            show_default=True,
             help="Smallest joint region, or sum of variances.",
         ),
         click.option(
             "--noise",
             type=Share("a relative error"),
             default="1%",
-            show_default=True,
             metavar="SHARE",
             help="Relative error of an amplitude.",
         ),
-        click.option(
-            "--phase-noise-deg",
-            type=Finite(),
-            default=0.2,
-            show_default=True,
-            metavar="X",
-            help="Error of a lag, tip driven.",
-        ),
+        click.option("--phase-noise-deg", type=Finite(), default=0.2, metavar="X", help="Error of a lag, tip driven."),
         click.option(
             "--amplitudes",
             type=click.Choice(("both", "peak", "lockin")),
             default="both",
-            show_default=True,
             help="What is read of a point.",
         ),
         click.option(
             "--uncertainty",
             type=Share("a relative error"),
             default="10%",
-            show_default=True,
             metavar="SHARE",
             help="How far the law may be off where no fit says.",
         ),
@@ -218,7 +201,6 @@ FIT = Command(
         click.option(
             "--model",
             default="law",
-            show_default=True,
             type=click.Choice(MODELS),
             help="; ".join(f"{name}: {law.meaning}" for name, law in LAWS.items())
             + f"; each with {DELAY_LAW.meaning} (+delay); contact: physical parameters through the resolved contact, "
@@ -226,14 +208,8 @@ FIT = Command(
         ),
         NOISE,
         QUALITY_FACTOR,
-        click.option(
-            "--scale-errors",
-            is_flag=True,
-            help="Take the errors as relative: scale them, by 3 at most, until chi2/dof is 1.",
-        ),
-        click.option(
-            "--robust", is_flag=True, help="Let outliers, one row in ten at most, count linearly from two errors on."
-        ),
+        flag("--scale-errors", "Take the errors as relative: scale them, by 3 at most, until chi2/dof is 1."),
+        flag("--robust", "Let outliers, one row in ten at most, count linearly from two errors on."),
         click.option(
             "--free",
             type=Names(),
@@ -253,26 +229,18 @@ FIT = Command(
         click.option(
             "--no", "left_out", type=Names(), metavar="EFFECT,...", help="contact: effects that it does not have."
         ),
-        click.option(
-            "--compare", "comparing", is_flag=True, help="Fit the rival models too and say what the table can tell."
-        ),
+        flag("--compare", "Fit the rival models too and say what the table can tell.", into="comparing"),
         click.option(
             "--bootstrap",
             type=click.IntRange(min=50, max=100_000),
             metavar="SAMPLES",
             help="Intervals by refitting this many synthetic tables, too.",
         ),
-        click.option(
-            "--posterior",
-            is_flag=True,
-            help="Credible intervals, too: by a grid, or NUTS for more than two parameters.",
-        ),
-        click.option(
+        flag("--posterior", "Credible intervals, too: by a grid, or NUTS for more than two parameters."),
+        flag(
             "--trust",
-            is_flag=True,
-            help="What speaks for the posterior and against it, too (with --posterior): predicted readings, ranks in "
-            "100 "
-            "simulated tables, leave-one-out, influence of single rows.",
+            "What speaks for the posterior and against it, too (with --posterior): predicted readings, ranks "
+            "in 100 simulated tables, leave-one-out, influence of single rows.",
         ),
         click.option(
             "--arviz",
@@ -280,7 +248,7 @@ FIT = Command(
             type=click.Path(path_type=Path, dir_okay=False),
             help="Write the posterior for ArviZ (with --posterior; extra `arviz`).",
         ),
-        click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True, help="Of everything random."),
+        click.option("--seed", type=click.IntRange(min=0), default=0, help="Of everything random."),
         click.option(
             "--share",
             type=Names(),
@@ -288,15 +256,9 @@ FIT = Command(
             help="Of several tables: nuisances (of --constrain) that all have in common, or all; left out, each has "
             "its own.",
         ),
-        click.option(
-            "--hierarchical",
-            is_flag=True,
-            help="Let the laws of several tables scatter around their mean, and say how much.",
-        ),
-        click.option("--example", is_flag=True, help="Fit the bundled table instead of a file."),
-        click.option(
-            "--each", is_flag=True, help="Fit each of several tables by itself; with --out what is done is kept."
-        ),
+        flag("--hierarchical", "Let the laws of several tables scatter around their mean, and say how much."),
+        flag("--example", "Fit the bundled table instead of a file."),
+        flag("--each", "Fit each of several tables by itself; with --out what is done is kept."),
         click.option(
             "--workers", type=click.IntRange(1, 1024), metavar="N", help="Processes that --each takes, by Dask."
         ),
@@ -347,10 +309,9 @@ INVERT = Command(
             type=click.Path(path_type=Path),
             metavar="FILE",
             help="A fit's fit.json or law.csv, a law.json of `collide --make-law`, or a CSV of measured speeds: its "
-            "law "
-            "with its band beside the rows; one of other speeds is refused.",
+            "law with its band beside the rows; one of other speeds is refused.",
         ),
-        click.option("--example", is_flag=True, help="Invert the bundled table instead of a file."),
+        flag("--example", "Invert the bundled table instead of a file."),
     ),
     check=_check_table,
 )
@@ -372,7 +333,7 @@ _OF_A_TRACE = (
     ("rest-nm", "nm", "What the deflection reads at the tip's rest position [default: 0]."),
 )
 _TRACE_SETTINGS = tuple(
-    click.option(f"--{name}", type=FiniteOrNone() if name == "quality-factor" else Finite(), metavar=unit, help=text)
+    click.option(f"--{name}", type=Finite(none=name == "quality-factor"), metavar=unit, help=text)
     for name, unit, text in _OF_A_TRACE
 )
 
@@ -416,9 +377,9 @@ _READING_NUMBERS = (
 class NmPerVolt(ValueAndError):  # noqa: N818 (no exception)
     """A value with its error, or the word `slope`."""
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+    def read(self, text: str) -> Any:
         """Return the value and its error, or the word."""
-        return value if value == "slope" else super().convert(value, param, ctx)
+        return text if text == "slope" else super().read(text)
 
 
 READING = (
@@ -426,9 +387,10 @@ READING = (
         "--columns",
         metavar="COLUMN=CHANNEL[:UNIT][:FACTOR],...",
         default="",
+        show_default=False,
         help="Which channel becomes which column (offset_nm, lockin_amplitude_nm, phase_lag_deg, deflection_nm), as "
-        "offset_nm=Z:um,lockin_amplitude_nm=Amp:V; without a head channels are numbers, and with approach and retract "
-        "in two of them OUT/BACK: offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8.",
+        "offset_nm=Z:um,lockin_amplitude_nm=Amp:V; without a head channels are numbers, and with approach and "
+        "retract in two of them OUT/BACK: offset_nm=1/2:nm,lockin_amplitude_nm=5/6:V,phase_lag_deg=7/8.",
     ),
     click.option(
         "--drive",
@@ -446,8 +408,8 @@ READING = (
         "--bin-nm",
         type=Finite(),
         metavar="NM",
-        help="Width of the bins of height whose means and scatter are the rows (0: equal heights only); else bins of "
-        "five rows where heights repeat or are not in order.",
+        help="Width of the bins of height whose means and scatter are the rows (0: equal heights only); else bins "
+        "of five rows where heights repeat or are not in order.",
     ),
     *(_number(*row) for row in _READING_NUMBERS),
 )
@@ -515,18 +477,12 @@ TAPPING = Command(
             "--tip-calibration", type=ValueAndError(), metavar="C", help="True over stated amplitude; '1 +- 0.02'."
         ),
         click.option("--curve", type=click.IntRange(1), metavar="N", help="Only this curve of an instrument's file."),
-        click.option("--model", default="viscous+delay", show_default=True, help="Of the law, as for `afm-jax fit`."),
-        click.option(
-            "--example", is_flag=True, help="Analyse the bundled raw file, simulated with the defects of real ones."
-        ),
-        click.option(
-            "--no-law", is_flag=True, help="Leave the impact law out: energy, thresholds and speeds only, at once."
-        ),
-        click.option(
+        click.option("--model", default="viscous+delay", help="Of the law, as for `afm-jax fit`."),
+        flag("--example", "Analyse the bundled raw file, simulated with the defects of real ones."),
+        flag("--no-law", "Leave the impact law out: energy, thresholds and speeds only, at once."),
+        flag(
             "--scale-errors",
-            is_flag=True,
-            help="Multiply the rows' errors where they scatter more (up to three times), instead of refusing their "
-            "energy.",
+            "Multiply the rows' errors where they scatter more (up to three times), instead of refusing their energy.",
         ),
     ),
     check=_check_curves,
@@ -550,22 +506,16 @@ _IMAGE_NUMBERS = (
 _IMAGE_SETTINGS = tuple(_number(*row) for row in _IMAGE_NUMBERS)
 
 
-class RowsAndColumns(click.ParamType):
+class RowsAndColumns(Kind):
     """Rows and columns, as 10x12."""
 
     name = "grid"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, int]:
-        """Return rows and columns.
-
-        Raises:
-            click.BadParameter: if it is no such pair.
-        """
-        if isinstance(value, tuple):
-            return value
-        match = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", str(value))
+    def read(self, text: str) -> tuple[int, int]:
+        """Return rows and columns."""
+        match = re.fullmatch(r"([1-9]\d{0,4})x([1-9]\d{0,4})", text)
         if match is None:
-            self.fail(f"`{value}` is no ROWSxCOLUMNS; write 10x12", param, ctx)
+            raise ValueError(f"`{text}` is no ROWSxCOLUMNS; write 10x12")
         return int(match[1]), int(match[2])
 
 
@@ -596,11 +546,10 @@ TAPPING_MAP = Command(
             "--columns",
             metavar="COLUMN=CHANNEL[:UNIT][:FACTOR],...",
             default="",
+            show_default=False,
             help="Which image is which, as lockin_amplitude_nm=Amplitude:V,phase_lag_deg=Phase:-1.",
         ),
-        click.option(
-            "--drive", type=click.Choice(["base", "force"]), default="base", show_default=True, help="What shakes."
-        ),
+        click.option("--drive", type=click.Choice(["base", "force"]), default="base", help="What shakes."),
         *_IMAGE_SETTINGS,
         click.option(
             "--free-phase-deg",
@@ -625,7 +574,6 @@ TAPPING_MAP = Command(
             "ratio",
             type=Share("a share"),
             default=0.9,
-            show_default=True,
             metavar="RATIO",
             help="Of a grid of curves: amplitude over the free one at which each pixel is read.",
         ),
@@ -635,7 +583,6 @@ TAPPING_MAP = Command(
             type=click.Choice(["npz", "gwy", "zarr"]),
             multiple=True,
             default=("npz",),
-            show_default=True,
             help="Of the arrays written into --out; may be given several times.",
         ),
     ),

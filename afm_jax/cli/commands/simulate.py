@@ -1,16 +1,16 @@
 """Commands about the motions of a scene."""
 
 import math
+import re
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import click
 
 from afm_jax.cli.command import Command, Options
-from afm_jax.cli.options import DRAWS, LAW, PICTURE, SCENE
+from afm_jax.cli.options import DRAWS, LAW, PICTURE, SCENE, flag
 from afm_jax.cli.session import Session
-from afm_jax.cli.values import Ends, Finite, Grid, Share
+from afm_jax.cli.values import Ends, Finite, Grid, Kind, Share
 
 BASINS = Command(
     name="basins",
@@ -28,9 +28,7 @@ BASINS = Command(
     """,
     options=(
         SCENE,
-        click.option(
-            "--grid", type=Grid(), default="300x300", show_default=True, help="Drive phases x rebound speeds."
-        ),
+        click.option("--grid", type=Grid(), default="300x300", help="Drive phases x rebound speeds."),
         click.option("--speeds", type=Ends(), metavar="LOW:HIGH", help="Range of the rebound speed, in nm/us."),
         LAW,
         DRAWS,
@@ -58,9 +56,9 @@ BIFURCATION = Command(
         click.option(
             "--parameter", metavar="P=a:b:n", required=True, help="A parameter of the scene file and its values."
         ),
-        click.option("--both", is_flag=True, help="Sweep up and then down, so that hysteresis shows."),
-        click.option("--down", is_flag=True, help="Sweep down instead of up."),
-        click.option("--impacts", type=click.IntRange(200), default=2000, show_default=True, help="At every value."),
+        flag("--both", "Sweep up and then down, so that hysteresis shows."),
+        flag("--down", "Sweep down instead of up."),
+        click.option("--impacts", type=click.IntRange(200), default=2000, help="At every value."),
         LAW,
         DRAWS,
         PICTURE,
@@ -93,10 +91,8 @@ CHART = Command(
             "--x", metavar="P=a:b:n", required=True, help="A parameter of the scene file: the chart's columns."
         ),
         click.option("--y", metavar="P=a:b:n", required=True, help="Another one: its rows."),
-        click.option("--orders", type=click.IntRange(1, 100), default=8, show_default=True, help="Highest order N."),
-        click.option(
-            "--zarr", is_flag=True, help="Write the table as chart.zarr instead of chart.csv; needs the extra `zarr`."
-        ),
+        click.option("--orders", type=click.IntRange(1, 100), default=8, help="Highest order N."),
+        flag("--zarr", "Write the table as chart.zarr instead of chart.csv; needs the extra `zarr`."),
         LAW,
         DRAWS,
         PICTURE,
@@ -119,10 +115,8 @@ LYAPUNOV = Command(
     """,
     options=(
         SCENE,
-        click.option(
-            "--impacts", type=click.IntRange(20), default=2000, show_default=True, help="Impacts to average over."
-        ),
-        click.option("--transient", type=click.IntRange(0), default=500, show_default=True, help="Impacts before."),
+        click.option("--impacts", type=click.IntRange(20), default=2000, help="Impacts to average over."),
+        click.option("--transient", type=click.IntRange(0), default=500, help="Impacts before."),
         click.option(
             "--parameter", metavar="P=a:b:n", help="A parameter of the scene file and its values, one motion each."
         ),
@@ -133,38 +127,29 @@ LYAPUNOV = Command(
 )
 
 
-class PositiveInteger(click.ParamType):
+class PositiveInteger(Kind):
     """An integer from 1 to a million."""
 
     name = "integer"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> int:
-        """Return the integer that a text says.
-
-        Raises:
-            click.BadParameter: if it is none, or none in the range.
-        """
-        text = str(value).strip()
-        if not (text.isascii() and text.isdigit() and len(text) < 8 and 1 <= int(text) <= 1_000_000):
-            self.fail(f"must be a positive integer up to 1000000, but is {value}", param, ctx)
+    def read(self, text: str) -> int:
+        """Return the integer."""
+        if not re.fullmatch(r"\s*[0-9]{1,7}\s*", text) or not 1 <= int(text) <= 1_000_000:
+            raise ValueError(f"must be a positive integer up to 1000000, but is {text}")
         return int(text)
 
 
-class Multiples(click.ParamType):
+class Multiples(Kind):
     """Positive integers in a comma list."""
 
     name = "list"
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> tuple[int, ...]:
-        """Return the integers that a text says, without repetitions.
-
-        Raises:
-            click.BadParameter: if one is none, or not from 1 to 1000.
-        """
-        parts = [part.strip() for part in str(value).split(",")]
-        if not all(part.isascii() and part.isdigit() and len(part) < 5 and 1 <= int(part) <= 1000 for part in parts):
-            self.fail(f"must be integers from 1 to 1000 as in 1,2,3, but is {value}", param, ctx)
-        return tuple(dict.fromkeys(int(part) for part in parts))
+    def read(self, text: str) -> tuple[int, ...]:
+        """Return the integers, without repetitions."""
+        parts = text.split(",")
+        if not all(re.fullmatch(r"\s*[0-9]{1,4}\s*", part) and 1 <= int(part) <= 1000 for part in parts):
+            raise ValueError(f"must be integers from 1 to 1000 as in 1,2,3, but is {text}")
+        return tuple(dict.fromkeys(map(int, parts)))
 
 
 def _check_sticking(_: Session, options: Options) -> None:
@@ -195,7 +180,6 @@ CONTINUE = Command(
             "--impacts",
             metavar="M",
             default=1,
-            show_default=True,
             type=click.IntRange(0, 64),
             help="Impacts in them; 0: the tip meets nothing.",
         ),
@@ -208,9 +192,7 @@ CONTINUE = Command(
         click.option(
             "--second", metavar="P=A:B", help="Another one: the special points are followed as curves in both."
         ),
-        click.option(
-            "--sticking", is_flag=True, help="Follow the orbit with a rest on the sample: chatter, ride, release."
-        ),
+        flag("--sticking", "Follow the orbit with a rest on the sample: chatter, ride, release."),
         LAW,
         PICTURE,
     ),
@@ -246,7 +228,6 @@ EFFECTS = Command(
             "--accuracy",
             type=Share(),
             default="1%",
-            show_default=True,
             help="Wanted accuracy of the amplitudes, 1% or 0.01: which effects does it not need?",
         ),
         click.option("--duration-us", type=Finite(), metavar="T", help="How long to follow each scene at most, in us."),
@@ -331,10 +312,9 @@ SIMULATE = Command(
         SCENE,
         click.option("--duration-us", type=Finite(), metavar="T", help="How long to follow the scene, in us."),
         click.option("--periods", type=Finite(), metavar="P", help="How long, in periods of the drive."),
-        click.option(
+        flag(
             "--until-settled",
-            is_flag=True,
-            help=f"End when the motion has settled; at the latest after the duration, or {DEFAULT_PERIODS} drive "
+            f"End when the motion has settled; at the latest after the duration, or {DEFAULT_PERIODS} drive "
             f"periods. "
             "This is what happens without a duration.",
         ),
@@ -342,24 +322,20 @@ SIMULATE = Command(
             "--harmonics",
             type=Multiples(),
             default="1",
-            show_default=True,
             metavar="K,...",
             help="Multiples of the response frequency omega/N at which amplitude and phase are read, besides the "
-            "drive's "
-            "(N times it), which always is.",
+            "drive's (N times it), which always is.",
         ),
         click.option(
             "--accuracy",
             type=Finite(positive=True),
             default=1e-9,
-            show_default=True,
             help="Of every resolved contact: relative of the rebound speed.",
         ),
         click.option(
             "--method",
             type=click.Choice(("collocation", "diffrax")),
             default="collocation",
-            show_default=True,
             help="The way through a resolved contact: leg by leg, or in time throughout with Diffrax's Dopri8 "
             "(slower).",
         ),
@@ -367,8 +343,7 @@ SIMULATE = Command(
             "--samples",
             type=click.Choice(["uniform"]),
             help="Write trace.csv into --out, too: the deflection over the last response periods at equal steps of "
-            "time, as "
-            "`afm-jax lockin` reads it.",
+            "time, as `afm-jax lockin` reads it.",
         ),
         LAW,
     ),
@@ -409,10 +384,8 @@ SWEEP = Command(
             help="Processes of this machine that share its cores, by Dask; 1: this one alone.",
         ),
         click.option("--scheduler", metavar="tcp://...", help="A Dask scheduler whose workers do the work."),
-        click.option(
-            "--dry-run", is_flag=True, help="Measure a chunk and say what the sweep would take; keep nothing."
-        ),
-        click.option("--plot", is_flag=True, help="Draw a sweep of one or two axes, sweep.png."),
+        flag("--dry-run", "Measure a chunk and say what the sweep would take; keep nothing."),
+        flag("--plot", "Draw a sweep of one or two axes, sweep.png."),
         LAW,
     ),
     computes=False,

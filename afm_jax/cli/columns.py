@@ -1,0 +1,63 @@
+"""Rows of a result as columns of a CSV file, and as a table to print."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from afm_jax.words import known
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+def columns_of(rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> dict[str, list[Any]]:
+    """Return the columns of rows; what a row lacks is None."""
+    return {name: [row.get(name) for row in rows] for name in names}
+
+
+def csv_cells(column: Any) -> Iterable[Any]:
+    """Return the cells of a column: numbers with all their digits, true and false in words, the unknown empty."""
+    if hasattr(column, "tolist"):
+        return map(_csv_cell, column.tolist())
+    return (_csv_cell(value.tolist() if hasattr(value, "tolist") else value) for value in column)
+
+
+def _csv_cell(value: Any) -> Any:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    return "" if value is None or (isinstance(value, float) and not math.isfinite(value)) else value
+
+
+class Column(NamedTuple):
+    """A column of a table to print.
+
+    Attributes:
+        heading: what stands above it, with the unit in a second line.
+        value: the key of the rows, or a function of a row.
+        form: format of its numbers; what is unknown is a dash. "yes" writes yes and no, an empty one words.
+        left: whether it is set to the left.
+    """
+
+    heading: str
+    value: str | Callable[[Any], Any]
+    form: str = ".6g"
+    left: bool = False
+
+    def cell(self, row: Any) -> str:
+        """Return the cell of a row."""
+        value = self.value(row) if callable(self.value) else row[self.value]
+        if self.form == "yes":
+            return "yes" if value else "no"
+        return known(value, self.form) if self.form else value
+
+
+def printed_table(title: str, columns: Sequence[Column], rows: Iterable[Any]) -> "Table":
+    """Return a table to print, a row a line."""
+    from rich.table import Table  # noqa: PLC0415 (help is there without it)
+
+    table = Table(title=title, title_justify="left")
+    for column in columns:
+        table.add_column(column.heading, justify="left" if column.left else "right")
+    for row in rows:
+        table.add_row(*(column.cell(row) for column in columns))
+    return table
