@@ -33,8 +33,6 @@ from fitting.sampling.bootstrap import bootstrap as bootstrap
 from fitting.sampling.inference_data import write_inference_data as write_inference_data
 from fitting.sampling.posterior import posterior as posterior
 from fitting.sampling.posterior_result import Posterior as Posterior
-from fitting.sampling.trust_pack import TrustPack as TrustPack
-from fitting.sampling.trust_pack import trust as trust
 from fitting.simulated.experiment import SimulatedExperiment as SimulatedExperiment
 from fitting.simulated.experiment import simulate_experiment as simulate_experiment
 from fitting.tables.csv_text import TableError as TableError

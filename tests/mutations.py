@@ -283,9 +283,9 @@ MUTATIONS = {
         "tests/test_calibrate.py::test_a_sweep_without_noise_gives_its_parameters_back[3.0-True]",
     ),
     "posterior of twice the misfit": Mutation(
-        "-0.5 * chi2 + volume",
-        "-1.0 * chi2 + volume",
-        "tests/test_posterior.py::test_one_parameter_agrees_with_quadrature",
+        "residual**2 / (1.0 + root)",
+        "2.0 * residual**2 / (1.0 + root)",
+        "tests/test_posterior.py::test_the_samplers_density_is_the_objectives",
     ),
     "nuisances that help": Mutation(
         "whole - np.linalg.slogdet",

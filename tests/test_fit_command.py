@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import importlib.util
 import math
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -307,7 +308,16 @@ def test_a_package_that_a_file_for_arviz_needs_is_asked_for_before_the_fit(tmp_p
     result = run("--example", "--arviz", tmp_path / "posterior.nc")
     assert (result.exit_code, result.stdout) == (2, "")
     assert result.stderr.splitlines() == [
-        "afm-jax: the Python package `h5netcdf` is missing; install it with: pip install h5netcdf"
+        "afm-jax: a file for ArviZ needs the package h5netcdf: pip install 'afm-jax[arviz]'"
+    ]
+
+
+def test_the_sampler_is_asked_for_before_the_fit(monkeypatch):
+    monkeypatch.setitem(sys.modules, "blackjax", None)
+    result = run("--example", "--posterior")
+    assert (result.exit_code, result.stdout) == (2, "")
+    assert result.stderr.splitlines() == [
+        "afm-jax: sampling a posterior needs the package blackjax: pip install 'afm-jax[nuts]'"
     ]
 
 
@@ -319,9 +329,8 @@ def test_a_contact_without_an_effect_is_not_fitted_by_its_parameters():
 
 
 def test_what_an_invalid_fit_leaves_out_is_said(tmp_path):
-    result = run(shortened(tmp_path / "one.csv", 1, without_errors=False), "--bootstrap", "50", "--trust")
+    result = run(shortened(tmp_path / "one.csv", 1, without_errors=False), "--bootstrap", "50", "--posterior")
     assert result.exit_code == 3
     assert "(1 row)" in result.stdout
     assert "no bootstrap: the fit is not valid" in result.stderr
     assert "no posterior: the fit is not valid" in result.stderr
-    assert "no trust: the fit is not valid" in result.stderr

@@ -1,4 +1,4 @@
-"""The posterior against quadrature of another program's amplitudes and importance sampling; NUTS against the grid."""
+"""The posterior against quadrature of another program's amplitudes and importance sampling."""
 
 import dataclasses
 import sys
@@ -10,10 +10,8 @@ from scipy.integrate import quad
 
 from afm_jax.impact.law import ImpactLaw
 from fitting import fit, posterior
-from fitting.models import Problem
 from fitting.sampling.bootstrap import objective_of, standard_covariance
-from fitting.sampling.nuts import log_density_of, space_around
-from fitting.sampling.posterior import grid_posterior
+from fitting.sampling.posterior import log_density_of, space_around
 from fitting.sampling.posterior_result import PosteriorChains, posterior_of_chains
 from tests.fit_tables import (
     amplitudes_and_errors,
@@ -46,8 +44,17 @@ def law():
 
 
 @pytest.fixture(scope="module")
-def law_grid(law):
+def sampled(law):
+    pytest.importorskip("blackjax", reason="the sampler is an extra")
     return posterior(law)
+
+
+def assert_close(found, name: str, mean: float, deviation: float) -> None:
+    """Demand mean and standard deviation within four standard errors of the independent samples."""
+    count = found.chains.effective_samples[list(found.mean).index(name)]
+    assert count > 400
+    assert found.mean[name] == pytest.approx(mean, abs=4.0 * deviation / np.sqrt(count))
+    assert found.standard_deviation[name] == pytest.approx(deviation, rel=4.0 / np.sqrt(2.0 * count))
 
 
 def test_one_parameter_agrees_with_quadrature(exact_q):
@@ -66,44 +73,40 @@ def test_one_parameter_agrees_with_quadrature(exact_q):
     total = quad(density, *ends, epsrel=1e-8)[0]
     mean = quad(lambda r: r * density(r), *ends, epsrel=1e-8)[0] / total
     variance = quad(lambda r: (r - mean) ** 2 * density(r), *ends, epsrel=1e-8)[0] / total
-    # a trapezoidal sum with four points a standard deviation is exact for what is nearly Gaussian
-    assert found.mean["r"] == pytest.approx(mean, abs=1e-4 * sigma)
-    assert found.standard_deviation["r"] == pytest.approx(np.sqrt(variance), rel=1e-4)
+    assert_close(found, "r", mean, np.sqrt(variance))
+    count = found.chains.effective_samples[0]
     for end, share in zip(found.interval95["r"], (0.025, 0.975), strict=True):
-        # monotone cubic interpolation of the density between the points
-        assert quad(density, ends[0], end, epsrel=1e-8)[0] / total == pytest.approx(share, abs=3e-4)
+        # four binomial deviations of the share below
+        deviation = np.sqrt(0.025 * 0.975 / count)
+        assert quad(density, ends[0], end, epsrel=1e-8)[0] / total == pytest.approx(share, abs=4.0 * deviation)
 
 
 def test_a_loss_that_vanishes_has_a_one_sided_density(exact_q):
     result = fit(exact_q, "law")
     found = posterior(result)
-    assert found.grid is not None
-    assert found.grid.axes[1][0] == 0.0
+    assert found.chains.samples[..., 1].min() >= 0.0
     assert found.interval95["epsilon"][0] > 0.0
     assert found.mean["epsilon"] > 0.0
     with pytest.raises(ValueError, match="epsilon may be at its bound"):
         posterior(result, log_uniform=["epsilon"])
 
 
-def test_the_density_is_normalised_and_close_to_the_fisher_information(law, law_grid):
-    grid = law_grid.grid
-    inner = np.trapezoid(grid.density, grid.axes[1], axis=1)
-    assert np.trapezoid(inner, grid.axes[0]) == pytest.approx(1.0, rel=1e-12)
-    deviations = [law_grid.standard_deviation[name] for name in law.parameters]
-    # the problem is nearly linear: 1 % of noise
-    assert deviations == pytest.approx(standard_errors_of(law), rel=0.03)
-    # flat priors: the profile interval and the credible one say nearly the same
+def test_flat_priors_give_the_intervals_of_the_profile(law, sampled):
+    deviations = [sampled.standard_deviation[name] for name in law.parameters]
+    # the problem is nearly linear: 1 % of noise; and the widths of a thousand independent samples, 2 %
+    assert deviations == pytest.approx(standard_errors_of(law), rel=0.08)
     for name, parameter in law.parameters.items():
-        assert law_grid.interval95[name] == pytest.approx(parameter.interval95, abs=0.1 * parameter.standard_error)
+        assert sampled.interval95[name] == pytest.approx(parameter.interval95, abs=0.25 * parameter.standard_error)
 
 
-def test_nuisances_integrated_out_agree_with_importance_sampling(law, law_grid):
-    refit = objective_of(law)
-    mean, deviation = importance_sampling(refit, 4000)
+def test_the_sampler_agrees_with_importance_sampling(law, sampled):
+    assert sampled.converged, sampled.reasons
+    assert sampled.chains.statistics["diverging"].sum() == sampled.chains.divergences
+    assert sampled.chains.statistics["energy"].shape == (4, 1000)
+    # 20,000 draws: half as uncertain as two thousand samples at most
+    mean, deviation = importance_sampling(objective_of(law), 20_000)
     for k, name in enumerate(law.parameters):
-        # 4000 draws: a mean to 0.016 deviations, a width to 1.1 %; four times that
-        assert law_grid.mean[name] == pytest.approx(mean[k], abs=0.065 * deviation[k])
-        assert law_grid.standard_deviation[name] == pytest.approx(deviation[k], rel=0.045)
+        assert_close(sampled, name, mean[k], deviation[k])
 
 
 def importance_sampling(refit, draws: int) -> tuple[np.ndarray, np.ndarray]:
@@ -118,14 +121,6 @@ def importance_sampling(refit, draws: int) -> tuple[np.ndarray, np.ndarray]:
     assert 1.0 / np.sum(weight**2) > 0.5 * draws
     mean = weight @ values
     return mean, np.sqrt(weight @ (values - mean) ** 2)
-
-
-def test_a_prior_flat_in_the_logarithm_shifts_the_mean_by_what_it_must(law, law_grid):
-    found = grid_posterior(objective_of(law), ("epsilon",))
-    deviation, mean = law_grid.standard_deviation["epsilon"], law_grid.mean["epsilon"]
-    # a Gaussian times 1/x: the mean moves by -variance/mean to first order, the next one being its square
-    shift = -(deviation**2) / mean
-    assert found.mean["epsilon"] - mean == pytest.approx(shift, rel=0.05)
 
 
 @pytest.fixture(scope="module")
@@ -145,7 +140,7 @@ def test_parameters_that_are_one_have_no_space(law, tie):
 
 def test_the_samplers_density_is_the_objectives(law, space):
     refit = objective_of(law)
-    log_density = log_density_of(refit, space)
+    log_density = log_density_of(refit, standard_covariance(refit))
     here, there = np.array([0.3, -0.4, 0.2]), np.array([-0.6, 0.5, 0.1])
     values, priors = zip(*(space.values_and_log_prior(jnp.asarray(z)) for z in (here, there)), strict=True)
     chi2 = np.sum(refit.objective.residual(np.array(values)) ** 2, axis=1)
@@ -166,6 +161,16 @@ def test_the_prior_is_the_derivative_of_the_values(space):
     # up to the constant determinant of axes and errors; central differences to 1e-10
     constant = np.linalg.slogdet(space.axes)[1] + np.sum(np.log(space.errors))
     assert np.linalg.slogdet(jacobian)[1] - constant == pytest.approx(float(log_prior), abs=1e-6)
+
+
+def test_a_prior_flat_in_the_logarithm_is_divided_by_the_loss(space):
+    logarithmic = dataclasses.replace(space, log_uniform=("epsilon",))
+    differences = []
+    for z in (jnp.zeros(3), jnp.array([0.4, 2.0, -0.3])):
+        (values, flat), (_, found) = space.values_and_log_prior(z), logarithmic.values_and_log_prior(z)
+        differences.append(float(found - flat + jnp.log(values[1])))
+    # up to a constant; sums of numbers of about ten
+    assert differences[0] == pytest.approx(differences[1], abs=1e-12)
 
 
 def test_the_space_starts_at_the_fit_with_steps_of_its_errors(law, space):
@@ -198,40 +203,19 @@ def test_wrong_calls_are_refused_in_one_line(law, monkeypatch):
     with pytest.raises(ValueError, match="`log_uniform` must name losses"):
         posterior(law, log_uniform=["quality_factor"])
     with pytest.raises(ValueError, match="`samples` must be at least"):
-        posterior(law, method="nuts", samples=10)
-    refit = objective_of(law)
-    refit.objective.problem = Problem("viscous+delay", ("epsilon", "viscous_loss", "delay_hertz"))
-    with pytest.raises(ValueError, match="a grid takes one or two parameters"):
-        grid_posterior(refit)
+        posterior(law, samples=10)
     monkeypatch.setitem(sys.modules, "blackjax", None)
-    with pytest.raises(ImportError, match="pip install blackjax"):
-        posterior(law, method="nuts")
+    with pytest.raises(ImportError, match=r"pip install 'afm-jax\[nuts\]'"):
+        posterior(law)
 
 
-def test_the_picture_of_a_grid_has_its_parameters_at_the_axes(law_grid):
-    axes = law_grid.plot().axes[0]
-    assert (axes.get_xlabel(), axes.get_ylabel()) == ("r", "epsilon")
+def test_the_picture_has_its_parameters_at_the_axes(sampled):
+    axes = sampled.plot().axes
+    assert (axes[6].get_xlabel(), axes[7].get_xlabel()) == ("r", "epsilon")
 
 
-def test_everything_goes_to_json(law_grid):
-    plain = law_grid.to_dict()
-    assert plain["method"] == "grid"
-    assert plain["parameters"]["epsilon"]["mean"] == law_grid.mean["epsilon"]
-    assert len(plain["grid"]["axes"]["r"]) == len(plain["grid"]["density"])
-
-
-@pytest.mark.slow
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_nuts_agrees_with_the_grid(law, law_grid):
-    pytest.importorskip("blackjax", reason="NUTS needs blackjax")
-    found = posterior(law, method="nuts", samples=500)
-    assert found.converged, found.reasons
-    assert found.chains is not None
-    assert found.chains.statistics["diverging"].sum() == found.chains.divergences
-    assert found.chains.statistics["energy"].shape == (4, 500)
-    for k, name in enumerate(law.parameters):
-        # four standard errors of a mean and of a width of this many independent samples
-        count = found.chains.effective_samples[k]
-        deviation = law_grid.standard_deviation[name]
-        assert found.mean[name] == pytest.approx(law_grid.mean[name], abs=4.0 * deviation / np.sqrt(count))
-        assert found.standard_deviation[name] == pytest.approx(deviation, rel=4.0 / np.sqrt(2.0 * count))
+def test_everything_goes_to_json(sampled):
+    plain = sampled.to_dict()
+    assert plain["method"] == "nuts"
+    assert plain["parameters"]["epsilon"]["mean"] == sampled.mean["epsilon"]
+    assert plain["chains"]["draws"] == 1000

@@ -94,7 +94,7 @@ FEWER = (
 LEFT_OUT = {
     "simulate figure8": "tests/test_presets.py simulates it",
     "fit monday.csv": "three tables are fitted by tests/test_several_tables.py",
-    "fit my_amplitudes.csv --model law --trust": "minutes: tests/test_trust_pack.py",
+    "fit my_amplitudes.csv --model law --posterior": "samples for a minute: tests/test_posterior.py",
     **dict.fromkeys(
         ("basins", "bifurcation", "lyapunov"),
         "compile for twenty seconds: tests/test_dynamics.py, tests/test_lyapunov.py",

@@ -64,7 +64,6 @@ OF_ONE_PIECE = {
     "Sweep",
     "Tapping",
     "TappingMap",
-    "TrustPack",
 }
 """What is drawn in its own way, from parts that belong together: these are made by computations."""
 SIZES = {"rows": 7, "points": 5, "p": 2, "columns": 3, "orders": 2, "scenes": 21}
@@ -378,7 +377,7 @@ def test_results_of_computations_come_back_with_pictures(tmp_path: Path):
         "lockin": fitting.lockin(noisy_bounce(1)[0]),
     }
     # these take longer, and are drawn by the tests of their own
-    later = {"Basins", "ContactDelay", "Posterior", "Sweep", "Tapping", "TappingMap", "TrustPack"}
+    later = {"Basins", "ContactDelay", "Posterior", "Sweep", "Tapping", "TappingMap"}
     assert OF_ONE_PIECE - {type(record).__name__ for record in found.values()} == later
     for name, record in found.items():
         path = tmp_path / f"{name}.json"

@@ -131,4 +131,7 @@ def _missing_package(error: ModuleNotFoundError) -> str:
     package = (error.name or "").partition(".")[0]
     if package in {"", *_OWN_PACKAGES}:
         return ""
+    if "afm-jax[" in error.msg:
+        # the extra is named
+        return error.msg
     return f"the Python package `{package}` is missing; install it with: pip install {package}"

@@ -13,12 +13,9 @@ from fitting.fits.comparison import compare, rivals
 from fitting.fits.fit import Found, find_fit, summarise_in_units
 from fitting.fits.result import FitResult
 from fitting.report.report import summary, write_report
-from fitting.report.words import trust_in_words
 from fitting.sampling.bootstrap import bootstrap
 from fitting.sampling.inference_data import require_netcdf, write_inference_data
-from fitting.sampling.posterior import posterior
-from fitting.sampling.posterior_result import Posterior
-from fitting.sampling.trust_pack import TrustPack, trust
+from fitting.sampling.posterior import posterior, require_blackjax
 from fitting.tables.several import SeveralTables
 
 
@@ -35,10 +32,12 @@ def fit(
     if options["arviz"] is not None:
         prepare_folder(options["arviz"].absolute().parent)
         require_netcdf()
+        options["posterior"] = True
+    if options["posterior"]:
+        require_blackjax()
     read = tables_with(tables or (example_path(),), noise, options["quality_factor"])
     if options["each"]:
         return fit_each(session, read, {"model": model, **settings}, options["workers"])
-    options["posterior"] = options["posterior"] or options["trust"] or options["arviz"] is not None
     measured = read[0] if len(read) == 1 else SeveralTables(tuple(read))
     first = "the first run compiles for half a minute" if "delay" in model or model == "contact" else "some seconds"
     rows = f"{measured.rows} rows" + (f" of {len(read)} tables" if len(read) > 1 else "")
@@ -60,20 +59,21 @@ def _extras(
 ) -> tuple[dict[str, Any], Exception | None]:
     """Return what was asked for besides the fit, as far as it came, and what ended it: the fit itself stands."""
     extras: dict[str, Any] = {}
-    for name in ("bootstrap", "posterior", "trust", "arviz"):
+    for name in ("bootstrap", "posterior", "arviz"):
         if options[name] and not result.valid:
             session.note(f"no {name}: the fit is not valid")
     try:
         if options["comparing"]:
             extras["comparison"] = _comparison(session, found, result, settings)
         if options["bootstrap"] and result.valid:
-            extras["bootstrap"] = _bootstrap(session, result, options["bootstrap"], options["seed"])
+            with session.working(f"fitting {options['bootstrap']} synthetic tables"):
+                extras["bootstrap"] = bootstrap(result, samples=options["bootstrap"], seed=options["seed"])
         if options["posterior"] and result.valid:
-            extras["posterior"] = believed = _posterior(session, result, options["seed"])
-            if options["arviz"]:
-                _write_arviz(session, result, believed, options)
-            if options["trust"]:
-                extras["trust"] = _trust(session, result, believed, options["seed"])
+            with session.working("sampling the posterior"):
+                extras["posterior"] = posterior(result, seed=options["seed"])
+        if options["arviz"] and result.valid:
+            write_inference_data(result, extras["posterior"], options["arviz"], seed=options["seed"])
+            session.note(f"wrote {options['arviz']}")
     except Exception as error:  # noqa: BLE001
         return extras, error
     return extras, None
@@ -91,31 +91,8 @@ def _comparison(session: Session, found: Found, result: FitResult, settings: dic
         )
 
 
-def _bootstrap(session: Session, result: FitResult, samples: int, seed: int) -> Any:
-    with session.working(f"fitting {samples} synthetic tables"):
-        return bootstrap(result, samples=samples, seed=seed)
-
-
-def _posterior(session: Session, result: FitResult, seed: int) -> Any:
-    with session.working("sampling the posterior"):
-        return posterior(result, seed=seed)
-
-
-def _write_arviz(session: Session, result: FitResult, found: Posterior, options: dict[str, Any]) -> None:
-    write_inference_data(result, found, options["arviz"], seed=options["seed"])
-    session.note(f"wrote {options['arviz']}")
-
-
-def _trust(session: Session, result: FitResult, found: Posterior, seed: int) -> TrustPack:
-    with session.working("checking the posterior", "simulated tables") as report:
-        return trust(result, found, seed=seed, report=report)
-
-
 def _words(name: str, extra: Any) -> str:
-    """Return a comparison, a bootstrap, a posterior or what speaks for it as text."""
-    if name == "trust":
-        head = [f"  - {line}" for line in extra.complaints] or ["  Nothing speaks against it."]
-        return "\n".join(["", "Trust in the posterior:", *head, *(f"  {line}" for line in trust_in_words(extra))])
+    """Return a comparison, a bootstrap or a posterior as text."""
     if name == "comparison":
         cells = [
             [

@@ -89,7 +89,6 @@ def _check_each(tables: tuple[Path, ...], options: dict[str, Any]) -> None:
         "--compare": "comparing",
         "--bootstrap": "bootstrap",
         "--posterior": "posterior",
-        "--trust": "trust",
         "--arviz": "arviz",
     }
     for option, name in alone.items():

@@ -31,10 +31,8 @@ from fitting.report.words import (
     rounded_values,
     scatter_in_words,
     tables_in_words,
-    trust_in_words,
     value_in_words,
 )
-from fitting.sampling.trust_pack import TrustPack
 from fitting.tables.table import AmplitudeTable
 
 _MOST_ROWS = 1500
@@ -70,7 +68,6 @@ def fit_page(
     comparison: ComparedModels | None = None,
     bootstrap: Sampled | None = None,
     posterior: Sampled | None = None,
-    trust: tuple[TrustPack, Sequence[bytes]] | None = None,
 ) -> str:
     """Return the page; it is well-formed XML too.
 
@@ -80,7 +77,6 @@ def fit_page(
         comparison: other models of the same table, or None.
         bootstrap: intervals from synthetic data sets, or None.
         posterior: credible intervals, or None.
-        trust: what speaks for the posterior, and its pictures, or None.
     """
     names = [*result.parameters, *(result.settings.get("fixed") or {})]
     numbers = {name: PARAMETERS[name].symbol or name for name in names}
@@ -108,7 +104,6 @@ def fit_page(
         goodness=_goodness(result),
         correlations=_correlations(result),
         samples=[_sampled(title, one, list(result.parameters)) for title, one in samples.items() if one is not None],
-        trust=None if trust is None else _trusted(*trust),
         rows=_rows(result),
         minimum=_minimum(result),
         tables=_tables(result),
@@ -236,32 +231,6 @@ def _sampled(title: str, sampled: Sampled, parameters: Sequence[str]) -> dict[st
         "failed": found.get("converged") is False,
         "by_parameter": Table("By parameter", ["parameter", *map(_title, columns)], rows) if columns else None,
         "besides": pairs("Besides", ("", "value"), others) if others else None,
-    }
-
-
-def _trusted(pack: TrustPack, files: Sequence[bytes]) -> dict[str, Any]:
-    """Return what speaks for a posterior and what against it."""
-    shows = (
-        "What was read, and the bands of replicated readings, as deviations from their median.",
-        "How far the law moves without each row, and how far the posterior without it is from the whole one.",
-        "Ranks of true values in the posteriors of simulated tables; grey, where 95 % of uniform ones stay.",
-        "The posterior's parameters in pairs; the ellipses of a Gaussian hold 68 and 95 %.",
-    )
-    heads = {
-        "line": "line",
-        "law_moves": "law moves (errors)",
-        "law_moves_refitted": "refitted",
-        "cooks_distance": "Cook's distance",
-        "elpd": "elpd",
-        "pareto_k": "Pareto k",
-    }
-    records = pack.row_records()
-    rows = [[known(records[i][name], ".4g") for name in heads] for i in pack.influence.checked.tolist()]
-    return {
-        "complaints": pack.complaints,
-        "words": [in_signs(line) for line in trust_in_words(pack)],
-        "pictures": pictures_of(files, shows),
-        "rows": Table("Rows that move the law most; all of them are in trust_rows.csv", list(heads.values()), rows),
     }
 
 

@@ -29,7 +29,6 @@ from fitting.report.words import (
     tables_in_words,
     value_in_words,
 )
-from fitting.sampling.trust_pack import TrustPack
 from fitting.tables.several import SeveralTables
 
 _MANY_PARAMETERS = 3
@@ -166,7 +165,6 @@ def write_report(
     comparison: ComparedModels | None = None,
     bootstrap: Sampled | None = None,
     posterior: Sampled | None = None,
-    trust: TrustPack | None = None,
 ) -> list[Path]:
     """Write fit.html, fit.txt, fit.json, fit.png, the law as law.csv and the table fit_rows.csv into a folder.
 
@@ -177,7 +175,6 @@ def write_report(
         comparison: other models of the same table, for fit.html.
         bootstrap: intervals from synthetic data sets, for fit.html.
         posterior: credible intervals, for fit.html.
-        trust: what speaks for the posterior, for fit.html, trust.png and trust_rows.csv.
 
     Returns:
         The files written here (the tables are `write_table`'s).
@@ -190,23 +187,14 @@ def write_report(
 
     picture, *pictures = fit_pictures(result)
     page = folder / "fit.html"
-    trusted = None
-    if trust is not None:
-        from fitting.report.trust_plots import trust_pictures  # noqa: PLC0415
-
-        whole, *parts = trust_pictures(trust)
-        write_whole(folder / "trust.png", whole)
-        records = trust.row_records()
-        write_table("trust_rows.csv", records, tuple(records[0]))
-        trusted = trust, parts
-    markup = fit_page(result, pictures, comparison=comparison, bootstrap=bootstrap, posterior=posterior, trust=trusted)
+    markup = fit_page(result, pictures, comparison=comparison, bootstrap=bootstrap, posterior=posterior)
     write_whole(page, markup)
     others = write_report_files(folder, "fit", text=summary(result), data=saved(result), picture=picture)
     records = row_records(result)
     write_table("fit_rows.csv", records, tuple(records[0]))
     law = folder / "law.csv"
     save_law_csv(result.law, law)
-    return [page, *others, law, *([] if trust is None else [folder / "trust.png"])]
+    return [page, *others, law]
 
 
 def write_report_files(folder: Path, name: str, *, text: str, data: dict[str, Any], picture: bytes) -> list[Path]:

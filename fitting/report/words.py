@@ -11,7 +11,6 @@ from fitting.fits.loss import WithInterval, nearest_of
 from fitting.fits.result import FitResult, FittedParameter
 from fitting.fits.verdict import IMPROBABLE, value_at_bound
 from fitting.parameters import DELAY_LAW, LAWS, PARAMETERS
-from fitting.sampling.trust_pack import TrustPack
 from fitting.tables.several import RepeatedReadings
 
 SHARE_OF_BAND = 0.1
@@ -49,27 +48,6 @@ class Sampled(Protocol):
     def to_dict(self) -> dict[str, Any]:
         """Return everything; what is a mapping by parameter becomes a table."""
         ...
-
-
-def trust_in_words(pack: TrustPack) -> list[str]:
-    """Return what a trust pack found, in lines."""
-    (inside50, readings), (inside95, _) = pack.predictive.inside(1, 3), pack.predictive.inside(0, 4)
-    ranks, loo, influence = pack.calibration, pack.loo, pack.influence
-    first = int(influence.checked[0])
-    without = f"; {ranks.failed} more could not be fitted" if ranks.failed else ""
-    predicted = (
-        f"{inside50} of {readings} readings lie in the 50 % bands of replicated ones, {inside95} in the 95 % bands"
-    )
-    uniform = f"probability if uniform {ranks.p_value:.2g}, of the Gaussian ones {ranks.gaussian_p_value:.2g}"
-    most = f"Pareto k at most {np.max(loo.pareto_k):.2f} (line {pack.lines[np.argmax(loo.pareto_k)]})"
-    move = f"{known(influence.law_moves[first], '.2f')} of its standard errors, refitted "
-    move += known(influence.law_moves_refitted[0], ".2f")
-    return [
-        predicted,
-        f"ranks in the posteriors of {len(ranks.ranks)} simulated tables{without}: {uniform}",
-        f"leave-one-out: elpd {loo.elpd:.1f} +- {loo.elpd_error:.1f}, {loo.p_loo:.1f} effective parameters, {most}",
-        f"the law moves most without line {pack.lines[first]}: by {move}",
-    ]
 
 
 def repeats_in_words(repeats: RepeatedReadings) -> str:

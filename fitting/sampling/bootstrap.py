@@ -166,31 +166,27 @@ def draw_data(refit: Refit, sets: int, random: np.random.Generator) -> DataSets:
     )
 
 
-def fit_data_sets(refit: Refit, data: DataSets, kept: Bool[np.ndarray, "sets rows"] | None = None) -> BatchFit:
+def fit_data_sets(refit: Refit, data: DataSets) -> BatchFit:
     """Fit every data set by damped Gauss-Newton steps (Levenberg, Marquardt) from the fit's values.
 
     Args:
         refit: the fit that the data sets resemble; its orbits are followed.
         data: from `draw_data`.
-        kept: the rows that each data set has; None: all.
 
     Returns:
         The fits. A parameter at an end of its range is held there while chi2 falls towards the outside.
     """
-    objective, (sets, count, kinds) = refit.objective, data.amplitude_nm.shape
+    objective, sets = refit.objective, len(data.amplitude_nm)
     shift = shifts(objective, data)
-    there = np.ones(shift.shape)
-    if kept is not None:
-        there[:, : count * (kinds + 1)] = np.concatenate([np.repeat(kept, kinds, axis=1), kept], axis=1)
     start = np.broadcast_to(refit.values, (1, refit.values.size))
     one = plain(objective).at_values(start)
-    residual = there * (np.asarray(one.residual) + shift)
-    start = _searches(objective, np.repeat(start, sets, axis=0), residual, there[:, :, None] * np.asarray(one.jacobian))
+    residual = np.asarray(one.residual) + shift
+    jacobian = np.repeat(np.asarray(one.jacobian), sets, axis=0)
+    start = _searches(objective, np.repeat(start, sets, axis=0), residual, jacobian)
 
     def look(values: Float[np.ndarray, "some p"], some: Int[np.ndarray, " some"]) -> Searches:
         found = plain(objective).at_values(values)
-        residual = there[some] * (np.asarray(found.residual) + shift[some])
-        return _searches(objective, values, residual, there[some][:, :, None] * np.asarray(found.jacobian))
+        return _searches(objective, values, np.asarray(found.residual) + shift[some], np.asarray(found.jacobian))
 
     parameters = objective.problem.parameters
     box = Box(
@@ -234,7 +230,7 @@ FEWEST = 40
 """With fewer samples the 2.5 % quantile is the smallest value or next to it."""
 
 
-@public_result(picture="fitting.report.trust_plots:bootstrap_figure")
+@public_result(picture="fitting.report.pair_plots:bootstrap_figure")
 @dataclass(frozen=True, eq=False)
 class Bootstrap(Result):
     """Fitted values of synthetic data sets.

@@ -1,313 +1,286 @@
-"""The posterior of a fit: on a grid that fits itself to the density for one or two parameters, by NUTS for more.
+"""The posterior of a fit, by the no-U-turn sampler of blackjax, an optional package.
 
-On the grid nuisances have a Gaussian constraint each: they are integrated out by Laplace's method at every point.
+The density is exp(-chi2/2) with the objective's chi2, constraints of the fit included, times priors flat in the values.
+The sampler moves in coordinates without ends: each parameter's range on the whole line, with its prior. A value with an
+end, such as a loss, is its end plus or minus e log(1 + exp(y)), with e its standard error: linear where the end is
+errors away, exponential close to it. A posterior that is Gaussian but for the end stays nearly so in y.
 """
 
-from collections.abc import Callable, Sequence
-from typing import Literal, NamedTuple
+from collections.abc import Sequence
+from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from afm_jax.checks import checked
-from afm_jax.units import TWO_SIDED_95
-from fitting.fits.objective import Objective
+from fitting.fits.objective import ROBUST
 from fitting.fits.result import FitResult
-from fitting.models import Problem
+from fitting.forward import branch_near, impacts_of, linearise_pairs, located
+from fitting.models import Measurement, Problem
+from fitting.parameters import Parameter
 from fitting.sampling.bootstrap import Refit, compact, objective_of, require_valid, standard_covariance
-from fitting.sampling.posterior_result import Posterior, PosteriorGrid
+from fitting.sampling.posterior_result import Posterior, PosteriorChains, posterior_of_chains
 
 FEWEST_SAMPLES = 100
+CHAINS = 4
+WARM_UP = 300
+_SPREAD = 1.0
+"""Chains start this many standard deviations apart: R-hat can then tell whether they came together."""
+
+_NEGLIGIBLE = 5.7
+"""Standard errors beyond which the density is negligible, a ten-millionth of its maximum."""
 
 
 @checked
 def posterior(
     result: FitResult,
     *,
-    method: Literal["auto", "grid", "nuts"] = "auto",
     log_uniform: Sequence[str] = (),
     samples: int = 1000,
     seed: int = 0,
 ) -> Posterior:
-    """Return the posterior of the parameters, with priors flat in their values.
+    """Return samples of the posterior of all parameters, nuisances included, with priors flat in their values.
 
     Constraints of the fit (the quality factor's, calibrations) are Gaussian priors.
 
     Args:
         result: from `fitting.fit`; it must be valid.
-        method: "grid" for models with one or two parameters of their own, nuisances integrated out by Laplace's method;
-            "nuts" for any, with the optional package blackjax; "auto": the grid where it can.
         log_uniform: losses whose prior is flat in their logarithm instead.
-        samples: for NUTS: draws of each of four chains.
-        seed: for NUTS.
+        samples: draws of each of four chains.
+        seed: of the sampler.
 
     Raises:
         ValueError: if the fit is not valid, an option is impossible, or the data do not determine every parameter.
-        ImportError: if NUTS is asked for and blackjax is not installed.
+        ModuleNotFoundError: if blackjax is not installed (extra `nuts`).
     """
     require_valid(result)
-    # the packages of the methods are loaded when they are needed
-    from fitting.sampling.nuts import nuts_posterior, require_blackjax  # noqa: PLC0415
-
     refit = compact(objective_of(result))
     problem = refit.objective.problem
-    if method not in {"auto", "grid", "nuts"}:
-        raise ValueError(f"`method` must be 'auto', 'grid' or 'nuts', but is {method!r}")
     for name in log_uniform:
         if name not in problem.own or not any(p.name == name and not p.width for p in problem.parameters):
             raise ValueError(f"`log_uniform` must name losses of the model {result.model!r}, but one is {name!r}")
-    if method == "grid" or (method == "auto" and len(problem.own) <= 2):
-        return grid_posterior(refit, tuple(log_uniform))
     if samples < FEWEST_SAMPLES:
         raise ValueError(f"`samples` must be at least {FEWEST_SAMPLES}, but is {samples}")
-    require_blackjax()
-    return nuts_posterior(refit, tuple(log_uniform), samples, seed)
+    blackjax = require_blackjax()
+    covariance = standard_covariance(refit)
+    _require_proper(refit, covariance, log_uniform)
+    density = log_density_of(refit, covariance, tuple(log_uniform))
+    # blackjax mixes integers of 32 and 64 bits, which strict promotion would refuse
+    with jax.numpy_dtype_promotion("standard"):
+        drawn, statistics = _chains(density, jax.random.split(jax.random.key(seed), CHAINS), samples)
+        values = np.asarray(_values_of(density.space, drawn))
+        halves = jnp.asarray(values[:, : samples // 2 * 2].reshape(2 * CHAINS, samples // 2, -1))
+        r_hat = np.asarray(blackjax.diagnostics.potential_scale_reduction(halves))
+        effective = np.asarray(blackjax.diagnostics.effective_sample_size(halves))
+    statistics = {name: np.asarray(each) for name, each in statistics.items()}
+    chains = PosteriorChains(values, r_hat, effective, int(statistics["diverging"].sum()), seed, statistics)
+    return posterior_of_chains(chains, problem.names, tuple(log_uniform))
 
 
-POINTS = 49
-_COARSE = 17
-_FIRST_REACH = 6.0
-"""Half the width of the first box in standard errors."""
-_NEGLIGIBLE = 16.0
-"""A fall of the log density by more than this, a factor of 1e-7, ends the box."""
-_ROUNDS = 8
-_NUISANCE_STEPS = 4
-_SETTLED = 1e-3
-_FINE = 4001
-
-
-class _Axis(NamedTuple):
-    """One axis of the box: its ends, and where the parameter's range ends."""
-
-    low: float
-    high: float
-    lowest: float
-    highest: float
-
-    def points(self, count: int) -> Float[np.ndarray, " count"]:
-        return np.linspace(self.low, self.high, count)
-
-
-def grid_posterior(refit: Refit, log_uniform: tuple[str, ...] = ()) -> Posterior:
-    """Return the posterior of a model with one or two parameters of its own.
-
-    Args:
-        refit: the fit, from `fitting.sampling.bootstrap.objective_of`.
-        log_uniform: parameters whose prior is flat in the logarithm of their loss, not in their value.
-
-    Raises:
-        ValueError: if there are more parameters, or a prior flat in a logarithm has no end where the density is.
-    """
-    own = refit.objective.problem.own
-    if len(own) > 2:
-        raise ValueError(f"a grid takes one or two parameters, but the model has {', '.join(own)}; use NUTS")
-    density = _Density(refit, log_uniform)
-    axes = _box(density)
-    points = tuple(axis.points(POINTS) for axis in axes)
-    log_density, nuisance_mean, nuisance_square = density(points)
-    weight = np.exp(log_density - log_density.max())
-    weight /= _integral(weight, points)
-    _require_proper(weight, points, own, density)
-    mean, deviation, interval = {}, {}, {}
-    for k, name in enumerate(own):
-        marginal = weight if len(own) == 1 else np.trapezoid(weight, points[1 - k], axis=1 - k)
-        mean[name], deviation[name], interval[name] = _summary(points[k], marginal)
-    for k, name in enumerate(refit.objective.problem.names[len(own) :]):
-        middle = _integral(weight * nuisance_mean[..., k], points)
-        variance = _integral(weight * nuisance_square[..., k], points) - middle**2
-        mean[name], deviation[name] = middle, float(np.sqrt(variance))
-        # Gaussian to the order that Laplace's method keeps
-        interval[name] = middle - TWO_SIDED_95 * deviation[name], middle + TWO_SIDED_95 * deviation[name]
-    return Posterior(
-        method="grid",
-        log_uniform=log_uniform,
-        mean=mean,
-        standard_deviation=deviation,
-        interval95=interval,
-        converged=True,
-        reasons=[],
-        grid=PosteriorGrid(own, points, weight),
-    )
-
-
-class _Density:
-    """The log density on a grid, with mean and mean square of the nuisances there."""
-
-    def __init__(self, refit: Refit, log_uniform: tuple[str, ...]):
-        self.objective, self.values = refit
-        self.covariance = standard_covariance(refit)
-        self.own = len(self.objective.problem.own)
-        self.log_uniform = log_uniform
-        block = self.covariance[: self.own, : self.own]
-        # where the nuisances go, to first order, when the own parameters move
-        self.follow = self.covariance[self.own :, : self.own] @ np.linalg.inv(block)
-
-    @property
-    def objective_parameters(self):
-        return self.objective.problem.parameters[: self.own]
-
-    def __call__(self, points: tuple[Float[np.ndarray, "..."], ...]):
-        """Return the log density, and mean and mean square of the nuisances, each of the grid's shape."""
-        shape = tuple(len(axis) for axis in points)
-        mesh = np.stack([axis.ravel() for axis in np.meshgrid(*points, indexing="ij")], axis=1)
-        nuisance = self.values[self.own :] + (mesh - self.values[: self.own]) @ self.follow.T
-        chi2, nuisance, variance, volume = _integrate_nuisances(
-            self.objective, np.concatenate([mesh, nuisance], axis=1), self.own
-        )
-        log_density = -0.5 * chi2 + volume + log_prior(self.objective.problem, mesh, self.log_uniform)
-        square = nuisance**2 + np.einsum("spp->sp", variance)
-        return log_density.reshape(shape), nuisance.reshape(*shape, -1), square.reshape(*shape, -1)
-
-
-def log_prior(
-    problem: Problem, values: Float[np.ndarray, "points k"], log_uniform: Sequence[str]
-) -> Float[np.ndarray, " points"]:
-    """Return the logarithm of the prior of a problem's first parameters, but for constraints and a constant."""
-    total = np.zeros(len(values))
-    for parameter, column in zip(problem.parameters, values.T, strict=False):
-        if parameter.name in log_uniform:
-            total -= np.log(np.maximum(np.abs(column - parameter.reference), 1e-300))
-    return total
-
-
-class _Nuisances(NamedTuple):
-    """A parabola of chi2 in the nuisances at every point: its value and curvature, the step to its minimum."""
-
-    chi2: Float[np.ndarray, " points"]
-    curvature: Float[np.ndarray, "points q q"]
-    step: Float[np.ndarray, "points q"]
-    fall: Float[np.ndarray, " points"]
-
-
-def _nuisances(objective: Objective, values: Float[np.ndarray, "points p"], own: int) -> _Nuisances:
-    found = objective.at_values(values)
-    residual, jacobian = np.asarray(found.residual), np.asarray(found.jacobian)[:, :, own:]
-    curvature = np.einsum("snp,snq->spq", jacobian, jacobian)
-    gradient = np.einsum("snp,sn->sp", jacobian, residual)
-    step = -np.linalg.solve(curvature, gradient[:, :, None])[:, :, 0]
-    return _Nuisances(np.sum(residual**2, axis=1), curvature, step, -np.einsum("sp,sp->s", gradient, step))
-
-
-def _integrate_nuisances(objective: Objective, values: Float[np.ndarray, "points p"], own: int):
-    """Return chi2 at its minimum over the nuisances, where that is, their covariance, and the log volume around it."""
-    values = values.copy()
-    found = _nuisances(objective, values, own)
-    for _ in range(_NUISANCE_STEPS):
-        # far from the fit nothing hangs on it
-        moving = (found.fall > _SETTLED) & (found.chi2 - found.fall < found.chi2.min() + 4.0 * _NEGLIGIBLE)
-        if not moving.any():
-            break
-        values[:, own:] += np.where(moving[:, None], found.step, 0.0)
-        found = _nuisances(objective, values, own)
-    volume = -0.5 * np.linalg.slogdet(found.curvature)[1]
-    return found.chi2 - found.fall, values[:, own:] + found.step, np.linalg.inv(found.curvature), volume
-
-
-def _box(density: _Density) -> list[_Axis]:
-    """Return a box that ends where the density is negligible, or where a parameter's range does."""
-    errors = np.sqrt(np.diag(density.covariance))[: density.own]
-    axes = [
-        _Axis(
-            max(value - _FIRST_REACH * error, parameter.lowest),
-            min(value + _FIRST_REACH * error, parameter.highest),
-            parameter.lowest,
-            parameter.highest,
-        )
-        for value, error, parameter in zip(density.values, errors, density.objective_parameters, strict=False)
-    ]
-    for _ in range(_ROUNDS):
-        points = tuple(axis.points(_COARSE) for axis in axes)
-        log_density, _, _ = density(points)
-        again = [_fitted(axis, log_density, k) for k, axis in enumerate(axes)]
-        settled = all(new == old for new, old in zip(again, axes, strict=True))
-        axes = again
-        if settled:
-            break
-    return axes
-
-
-def _fitted(axis: _Axis, log_density: Float[np.ndarray, "..."], k: int) -> _Axis:
-    """Return an axis widened where the density is cut off, narrowed where most of it holds nothing."""
-    others = tuple(j for j in range(log_density.ndim) if j != k)
-    height = log_density.max(axis=others) - log_density.max()
-    points, width = axis.points(len(height)), axis.high - axis.low
-    above = np.flatnonzero(height > -_NEGLIGIBLE)
-    first, last = int(above[0]), int(above[-1])
-    low, high = axis.low, axis.high
-    if first == 0:
-        low = max(axis.low - 0.5 * width, axis.lowest)
-    elif first > 3:
-        low = float(points[first - 2])
-    if last == len(points) - 1:
-        high = min(axis.high + 0.5 * width, axis.highest)
-    elif last < len(points) - 4:
-        high = float(points[last + 2])
-    return axis._replace(low=low, high=high)
-
-
-def _require_proper(weight, points, own: tuple[str, ...], density: _Density) -> None:
+def _require_proper(refit: Refit, covariance: Float[np.ndarray, "p p"], log_uniform: Sequence[str]) -> None:
     """Refuse a prior flat in a logarithm where the loss may be zero: its integral does not exist.
 
     Raises:
         ValueError: if so.
     """
-    for k, parameter in enumerate(density.objective_parameters):
-        edge = 0 if parameter.sign >= 0 else -1
-        there = np.take(weight, edge, axis=k).max()
-        reached = parameter.bound is not None and points[k][edge] == parameter.bound
-        if parameter.name in density.log_uniform and reached and there > np.exp(-_NEGLIGIBLE) * weight.max():
+    errors = np.sqrt(np.diag(covariance))
+    for parameter, value, error in zip(refit.objective.problem.parameters, refit.values, errors, strict=True):
+        bound = parameter.bound
+        if parameter.name in log_uniform and bound is not None and abs(value - bound) < _NEGLIGIBLE * error:
             raise ValueError(
-                f"log_uniform: {own[k]} may be at its bound, {parameter.bound:g}, where such a prior has no end; leave "
+                f"log_uniform: {parameter.name} may be at its bound, {bound:g}, where such a prior has no end; leave "
                 "it flat in the value"
             )
 
 
-def _summary(points: Float[np.ndarray, " n"], marginal: Float[np.ndarray, " n"]):
-    """Return mean, standard deviation and equal-tailed 95 % interval of a tabulated density."""
-    from scipy.interpolate import PchipInterpolator  # noqa: PLC0415 (most fits need no SciPy)
+def require_blackjax() -> Any:
+    """Return the sampler's package.
 
-    mean = float(np.trapezoid(points * marginal, points))
-    deviation = float(np.sqrt(np.trapezoid((points - mean) ** 2 * marginal, points)))
-    fine = np.linspace(points[0], points[-1], _FINE)
-    rising: Callable[[np.ndarray], np.ndarray] = PchipInterpolator(points, marginal).antiderivative()
-    cumulated = rising(fine)
-    low, high = np.interp([0.025, 0.975], cumulated / cumulated[-1], fine)
-    return mean, deviation, (float(low), float(high))
-
-
-def _integral(weight: Float[np.ndarray, "..."], points: tuple[Float[np.ndarray, "..."], ...]) -> float:
-    for axis in reversed(points):
-        weight = np.trapezoid(weight, axis, axis=-1)
-    return float(weight)
+    Raises:
+        ModuleNotFoundError: if it is not installed, with what to do.
+    """
+    try:
+        import blackjax  # noqa: PLC0415
+        import blackjax.diagnostics  # noqa: PLC0415
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            "sampling a posterior needs the package blackjax: pip install 'afm-jax[nuts]'", name="blackjax"
+        ) from error
+    return blackjax
 
 
-def grid_draws(
-    refit: Refit, grid: PosteriorGrid, log_uniform: tuple[str, ...], count: int, random: np.random.Generator
-) -> Float[np.ndarray, "count p"]:
-    """Return draws of a posterior on a grid, nuisances included.
+class Space(eqx.Module):
+    """Where the sampler moves: the parameters' coordinates are `middle` + `axes` z, with z about standard normal.
 
-    Between the points the density is linear, a sum of triangles around them: a draw is a point and a triangle's. The
-    nuisances are Gaussian for given parameters (Laplace).
+    Attributes:
+        problem: the model.
+        log_uniform: parameters whose prior is flat in the logarithm of their loss.
+        errors: standard errors e of the values, shape (p,).
+        middle: coordinates of the fit, shape (p,).
+        axes: its columns are steps of about one standard deviation each, shape (p, p).
+    """
+
+    problem: Problem = eqx.field(static=True)
+    log_uniform: tuple[str, ...] = eqx.field(static=True)
+    errors: Float[Array, " p"]
+    middle: Float[Array, " p"]
+    axes: Float[Array, "p p"]
+
+    def values_and_log_prior(self, z: Float[Array, " p"]) -> tuple[Float[Array, " p"], Float[Array, ""]]:
+        """Return the parameters' values at z, and the logarithm of the prior's density by z."""
+        coordinates = self.middle + self.axes @ z
+        values, logs = [], jnp.zeros(())
+        for i, parameter in enumerate(self.problem.parameters):
+            y = coordinates[i]
+            if parameter.width:
+                values.append(parameter.reference + parameter.width * y)
+                continue
+            distance = jax.nn.softplus(y)
+            values.append(parameter.reference + (parameter.sign or 1) * self.errors[i] * distance)
+            # d value/d y, up to a constant; a prior flat in the logarithm is divided by the distance to the end
+            logs = logs + jax.nn.log_sigmoid(y)
+            logs = logs - (jnp.log(distance) if parameter.name in self.log_uniform else 0.0)
+        return jnp.stack(values), logs
+
+
+def space_around(
+    problem: Problem,
+    values: Float[np.ndarray, " p"],
+    covariance: Float[np.ndarray, "p p"],
+    log_uniform: tuple[str, ...],
+) -> Space:
+    """Return the space in which a posterior is about standard normal.
+
+    A loss at its bound is taken to be half a standard error away from it: that is where its posterior lies.
 
     Args:
-        refit: the fit, from `fitting.sampling.bootstrap.objective_of`.
-        grid: its posterior.
-        log_uniform: as the posterior's.
-        count: of the draws.
-        random: the generator that is drawn from.
+        problem: the model.
+        values: of the fit.
+        covariance: its, finite.
+        log_uniform: parameters whose prior is flat in the logarithm of their loss.
+
+    Raises:
+        ValueError: if the data hardly tell parameters apart.
     """
-    weight = grid.density.copy()
-    for k in range(weight.ndim):
-        # a triangle at an end is a half
-        np.moveaxis(weight, k, 0)[[0, -1]] *= 0.5
-    chosen = np.unravel_index(random.choice(weight.size, count, p=weight.ravel() / weight.sum()), weight.shape)
-    columns = []
-    for axis, index in zip(grid.axes, chosen, strict=True):
-        drawn = axis[index] + (axis[1] - axis[0]) * random.triangular(-1.0, 0.0, 1.0, count)
-        # folded at an end: the half that is there
-        columns.append(axis[-1] - np.abs(axis[-1] - (axis[0] + np.abs(drawn - axis[0]))))
-    own, density = np.stack(columns, axis=1), _Density(refit, log_uniform)
-    nuisance = refit.values[density.own :] + (own - refit.values[: density.own]) @ density.follow.T
-    _, mean, variance, _ = _integrate_nuisances(refit.objective, np.concatenate([own, nuisance], axis=1), density.own)
-    scatter = np.einsum("spq,sq->sp", np.linalg.cholesky(variance), random.normal(size=mean.shape))
-    return np.concatenate([own, mean + scatter], axis=1)
+    errors = np.sqrt(np.diag(covariance))
+    triples = zip(problem.parameters, values, errors, strict=True)
+    middle, slope = np.array([_coordinate_and_slope(*triple) for triple in triples]).T
+    scaled = covariance / np.outer(slope, slope)
+    if not np.all(np.isfinite(scaled)) or np.linalg.eigvalsh(scaled / np.trace(scaled))[0] < 1e-15:
+        raise ValueError(f"the data hardly tell {', '.join(problem.names)} apart: hold one fixed, or constrain it")
+    axes = np.linalg.cholesky(scaled)
+    return Space(problem, log_uniform, jnp.asarray(errors), jnp.asarray(middle), jnp.asarray(axes))
+
+
+def _coordinate_and_slope(parameter: Parameter, value: float, error: float) -> tuple[float, float]:
+    """Return the coordinate y of a value, and d value/d y there."""
+    if parameter.width:
+        return (value - parameter.reference) / parameter.width, parameter.width
+    distance = max(abs(value - parameter.reference) / error, 0.5)
+    share = -float(np.expm1(-distance))
+    return distance + float(np.log(share)), (parameter.sign or 1) * error * share
+
+
+class LogDensity(eqx.Module):
+    """The logarithm of the posterior's density at coordinates z of a space, with its gradient by forward mode.
+
+    All numbers are traced: one program serves all tables with as many rows.
+
+    Attributes:
+        space: of the sampler.
+        measurement: the rows, and what is known of parameters.
+        near: approach speeds of the orbits to follow; None: they are searched for.
+        robust: whether outliers count linearly.
+    """
+
+    space: Space
+    measurement: Measurement
+    near: Float[Array, " rows"] | None
+    robust: bool = eqx.field(static=True)
+
+    def __call__(self, z: Float[Array, " p"]) -> Float[Array, ""]:
+        """Return the logarithm of the density by z, but for a constant; minus infinity outside the ranges."""
+        # the orbits' slopes come by forward mode: nothing of the search is differentiated backward
+        log_likelihood = jax.custom_jvp(lambda values: self._log_likelihood_and_gradient(values)[0])
+
+        @log_likelihood.defjvp
+        def _(primals, tangents):
+            value, gradient = self._log_likelihood_and_gradient(*primals)
+            return value, gradient @ tangents[0]
+
+        values, log_prior = self.space.values_and_log_prior(z)
+        lowest, highest = (
+            jnp.asarray(ends)
+            for ends in zip(*((p.lowest, p.highest) for p in self.space.problem.parameters), strict=True)
+        )
+        inside = jnp.all((values >= lowest) & (values <= highest))
+        return jnp.where(inside, log_likelihood(jnp.clip(values, lowest, highest)) + log_prior, -jnp.inf)
+
+    def _log_likelihood_and_gradient(self, values: Float[Array, " p"]) -> tuple[Float[Array, ""], Float[Array, " p"]]:
+        measurement, problem = self.measurement, self.space.problem
+        lanes = jnp.zeros(measurement.rows.order.shape[0], dtype=int)
+        impacts = impacts_of(values[None], measurement, problem)
+        points = jnp.broadcast_to(values, (lanes.size, values.size))
+        branch = located(points, impacts, lanes, measurement, problem) if self.near is None else branch_near(self.near)
+        block = linearise_pairs(points, impacts, lanes, measurement, problem, branch)
+        constraint = (values - measurement.constraint_value) / measurement.constraint_error
+        residual = jnp.concatenate([block.misfit.ravel(), block.unseen, constraint])
+        root = jnp.sqrt(1.0 + (residual / ROBUST) ** 2) if self.robust else jnp.ones_like(residual)
+        # half the loss: r^2/2, or s^2 (sqrt(1 + r^2/s^2) - 1) with the softness s; its derivative is r/root
+        half, weight = residual**2 / (1.0 + root), residual / root
+        count = block.misfit.size
+        slope = block.slope.reshape(count, -1).T @ weight[:count]
+        return -jnp.sum(half), -(slope + weight[-constraint.size :] / measurement.constraint_error)
+
+
+def log_density_of(refit: Refit, covariance: Float[np.ndarray, "p p"], log_uniform: tuple[str, ...] = ()) -> LogDensity:
+    """Return the log density of a fit's posterior, in the space that is scaled by its covariance.
+
+    Args:
+        refit: the fit, from `fitting.sampling.bootstrap.objective_of`; its orbits are followed.
+        covariance: of its values.
+        log_uniform: parameters whose prior is flat in the logarithm of their loss.
+
+    Raises:
+        ValueError: if the data hardly tell parameters apart.
+    """
+    objective = refit.objective
+    space = space_around(objective.problem, refit.values, covariance, log_uniform)
+    near = None if objective.near is None else jnp.asarray(objective.near)
+    measurement = jax.tree.map(jnp.asarray, objective.measurement)
+    return LogDensity(space, measurement, near, robust=objective.robust)
+
+
+@eqx.filter_jit
+def _chains(density: LogDensity, keys, samples: int):
+    """Return draws (chains, draws, p), and of shape (chains, draws) what ArviZ knows of the steps, by its names."""
+    blackjax = require_blackjax()
+
+    def chain(key):
+        start, warm, draw = jax.random.split(key, 3)
+        place = _SPREAD * jax.random.normal(start, density.space.middle.shape)
+        adaptation = blackjax.window_adaptation(blackjax.nuts, density, is_mass_matrix_diagonal=False)
+        (state, parameters), _ = adaptation.run(warm, place, WARM_UP)
+        kernel = blackjax.nuts(density, **parameters)
+
+        def step(state, key):
+            state, info = kernel.step(key, state)
+            told = {
+                "diverging": info.is_divergent,
+                "energy": info.energy,
+                "acceptance_rate": info.acceptance_rate,
+                "n_steps": info.num_integration_steps,
+            }
+            return state, (state.position, told)
+
+        return jax.lax.scan(step, state, jax.random.split(draw, samples))[1]
+
+    return jax.vmap(chain)(keys)
+
+
+@eqx.filter_jit
+def _values_of(space: Space, drawn: Float[Array, "chains draws p"]) -> Float[Array, "chains draws p"]:
+    return jax.vmap(jax.vmap(lambda z: space.values_and_log_prior(z)[0]))(drawn)

@@ -1,7 +1,7 @@
-"""The posterior of the parameters: densities on a grid, or samples with what says they are enough."""
+"""The posterior of a fit's parameters: samples, their means and intervals, and whether they are enough."""
 
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -14,21 +14,6 @@ FEWEST_EFFECTIVE = 100.0
 """Independent samples that a 95 % interval needs at least."""
 MOST_DIVERGENCES = 0.01
 """Share of divergent transitions beyond which part of the posterior may be missing."""
-
-
-@dataclass(frozen=True, eq=False)
-class PosteriorGrid:
-    """The normalised density over one or two parameters; nuisances are integrated out.
-
-    Attributes:
-        names: of the axes.
-        axes: values along each.
-        density: of shape (len(axis), ...), integral 1.
-    """
-
-    names: tuple[str, ...]
-    axes: tuple[Float[np.ndarray, "..."], ...]
-    density: Float[np.ndarray, "..."]
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,37 +37,34 @@ class PosteriorChains:
     statistics: dict[str, np.ndarray] = field(default_factory=dict)
 
 
-@public_result(picture="fitting.report.trust_plots:posterior_figure")
+@public_result(picture="fitting.report.pair_plots:posterior_figure")
 @dataclass(frozen=True, eq=False)
 class Posterior(Result):
     """The posterior of a fit's parameters.
 
     Attributes:
-        method: "grid" or "nuts".
         log_uniform: parameters with a prior flat in the logarithm of their loss; the others' are flat in their value.
         mean: by parameter.
         standard_deviation: by parameter.
         interval95: equal-tailed credible interval by parameter.
         converged: whether to trust it; `reasons` say why not.
         reasons: a sentence each.
-        grid: for "grid".
-        chains: for "nuts".
+        chains: the samples and their diagnostics.
     """
 
-    method: Literal["grid", "nuts"]
     log_uniform: tuple[str, ...]
     mean: dict[str, float]
     standard_deviation: dict[str, float]
     interval95: dict[str, tuple[float, float]]
     converged: bool
     reasons: list[str]
-    grid: PosteriorGrid | None = None
-    chains: PosteriorChains | None = None
+    chains: PosteriorChains
 
     def to_dict(self) -> dict[str, Any]:
         """Return everything but the single samples as plain lists, numbers and strings."""
+        chains, draws, _ = self.chains.samples.shape
         return {
-            "method": self.method,
+            "method": "nuts",
             "converged": self.converged,
             "reasons": self.reasons,
             "log_uniform": list(self.log_uniform),
@@ -94,27 +76,14 @@ class Posterior(Result):
                 }
                 for name in self.mean
             },
-            "grid": self._grid(),
-            "chains": self._chains(),
-        }
-
-    def _grid(self) -> dict[str, Any] | None:
-        if self.grid is None:
-            return None
-        axes = {name: axis.tolist() for name, axis in zip(self.grid.names, self.grid.axes, strict=True)}
-        return {"axes": axes, "density": self.grid.density.tolist()}
-
-    def _chains(self) -> dict[str, Any] | None:
-        if self.chains is None:
-            return None
-        chains, draws, _ = self.chains.samples.shape
-        return {
-            "chains": chains,
-            "draws": draws,
-            "seed": self.chains.seed,
-            "divergences": self.chains.divergences,
-            "r_hat": dict(zip(self.mean, _finite(self.chains.r_hat), strict=True)),
-            "effective_samples": dict(zip(self.mean, _finite(self.chains.effective_samples), strict=True)),
+            "chains": {
+                "chains": chains,
+                "draws": draws,
+                "seed": self.chains.seed,
+                "divergences": self.chains.divergences,
+                "r_hat": dict(zip(self.mean, _finite(self.chains.r_hat), strict=True)),
+                "effective_samples": dict(zip(self.mean, _finite(self.chains.effective_samples), strict=True)),
+            },
         }
 
 
@@ -124,7 +93,6 @@ def posterior_of_chains(chains: PosteriorChains, names: tuple[str, ...], log_uni
     low, high = np.quantile(flat, [0.025, 0.975], axis=0)
     reasons = _complaints(chains, names)
     return Posterior(
-        method="nuts",
         log_uniform=log_uniform,
         mean=dict(zip(names, flat.mean(axis=0).tolist(), strict=True)),
         standard_deviation=dict(zip(names, flat.std(axis=0, ddof=1).tolist(), strict=True)),

@@ -97,7 +97,6 @@ NO_NUMBERS = {
         "sensitivity",
         "tapping_map",
         "tapping_together",
-        "trust",
     ),
     *("write_inference_data", "write_table"),
 }

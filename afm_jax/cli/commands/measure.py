@@ -193,8 +193,8 @@ FIT = Command(
     counts too. With a line `# drive = force` (or base) it is a tapping curve: drive_frequency_khz, free_amplitude_nm,
     offset_nm, lockin_amplitude_nm and phase_lag_deg. Several tables have one law, each nuisances of its own or shared
     ones, and the report says how far each is from the others (its pull). With --out the report: fit.html, fit.txt,
-    fit.json, fit.png, fit_rows.csv, law.csv, and with --trust trust.png, trust_rows.csv. Exit code 3 if the result is
-    not valid: not converged, not explained by the model, or a parameter not identified.
+    fit.json, fit.png, fit_rows.csv, law.csv. Exit code 3 if the result is not valid: not converged, not explained by
+    the model, or a parameter not identified.
     """,
     options=(
         click.argument("tables", metavar="[TABLE.csv]...", nargs=-1, type=click.Path(path_type=Path)),
@@ -236,17 +236,12 @@ FIT = Command(
             metavar="SAMPLES",
             help="Intervals by refitting this many synthetic tables, too.",
         ),
-        flag("--posterior", "Credible intervals, too: by a grid, or NUTS for more than two parameters."),
-        flag(
-            "--trust",
-            "What speaks for the posterior and against it, too (with --posterior): predicted readings, ranks "
-            "in 100 simulated tables, leave-one-out, influence of single rows.",
-        ),
+        flag("--posterior", "Credible intervals, too, by the no-U-turn sampler (extra `nuts`)."),
         click.option(
             "--arviz",
             metavar="FILE.nc",
             type=click.Path(path_type=Path, dir_okay=False),
-            help="Write the posterior for ArviZ (with --posterior; extra `arviz`).",
+            help="Write the posterior for ArviZ (with --posterior; extras `arviz` and `nuts`).",
         ),
         click.option("--seed", type=click.IntRange(min=0), default=0, help="Of everything random."),
         click.option(

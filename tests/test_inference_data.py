@@ -1,0 +1,146 @@
+"""The file for ArviZ against another program's amplitudes; ranks of true values in right and wrong posteriors."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import kstest, norm
+
+from afm_jax.impact.law import ImpactLaw
+from fitting import fit, posterior, write_inference_data
+from fitting.sampling.bootstrap import BatchFit, Refit
+from fitting.sampling.inference_data import densities, noise_of, posterior_draws, refit_of_rows
+from tests import coverage_of_ranks
+from tests.coverage_of_ranks import _deviation, _ranks, calibrate_ranks
+from tests.fit_tables import example_amplitudes, rows, simulated, steady_amplitudes
+
+EVERY_FOURTH = slice(0, None, 4)
+FEWER = 16
+"""Draws of a set, where many sets are looked at."""
+SETS = 50
+"""Of wrong posteriors: as improbable as is asked for all the same."""
+IMPROBABLE = 0.01
+
+
+def test_ranks_are_uniform_only_in_the_right_posterior():
+    random = np.random.default_rng(4)
+    uniform = _deviation(np.random.default_rng(0).random((2000, 200)).T)
+
+    def probability(widened: float, shifted: float) -> float:
+        # of the mean of a reading y ~ N(mu, 1) with mu ~ N(0, 1) beforehand: N(y/2, 1/2)
+        found = []
+        for _ in range(200):
+            true = random.normal(size=1)
+            middle = 0.5 * (true + random.normal(size=1)) + shifted
+            drawn = middle + widened * np.sqrt(0.5) * random.normal(size=(64, 1))
+            found.append(_ranks(drawn, np.full(64, 1.0 / 64), true, random))
+        return float(np.mean(uniform >= _deviation(np.array(found))))
+
+    assert probability(1.0, 0.0) > 0.05
+    assert probability(0.7, 0.0) < IMPROBABLE
+    assert probability(1.6, 0.0) < IMPROBABLE
+    assert probability(1.0, 0.3) < IMPROBABLE
+
+
+@pytest.fixture(scope="module")
+def believed():
+    pytest.importorskip("blackjax", reason="the sampler is an extra")
+    table = rows(example_amplitudes(), EVERY_FOURTH)
+    result = fit(simulated(table, ImpactLaw(0.95, 60.0), seed=8), "law")
+    return result, posterior(result)
+
+
+def values_believed(believed) -> np.ndarray:
+    return posterior_draws(*believed).values.reshape(-1, 3)
+
+
+@pytest.mark.slow
+def test_likelihoods_are_those_of_another_programs_amplitudes(believed):
+    result, found = believed
+    drawn = posterior_draws(result, found)
+    r, epsilon, quality = drawn.values[2, 7]
+    table = result.table
+    predicted = steady_amplitudes(table, ImpactLaw(float(r), float(epsilon)), quality_factor=float(quality))
+    expected = norm.logpdf(drawn.measured, predicted, drawn.error).sum(axis=1)
+    assert drawn.predicted[2, 7] == pytest.approx(predicted, rel=1e-9)
+    assert drawn.log_likelihood[2, 7] == pytest.approx(expected, abs=1e-7)
+    known = norm.logpdf(drawn.values[2, :, 2], table.quality_factor, table.quality_factor_error)
+    here = drawn.log_likelihood.sum(axis=2)[2] + known - drawn.statistics["lp"][2]
+    # up to a constant it is the posterior's
+    assert here == pytest.approx(np.full(250, here[0]), abs=1e-8)
+    z = (drawn.replicated - drawn.predicted) / drawn.error
+    assert kstest(z.ravel(), "norm").pvalue > 0.01
+
+
+@pytest.mark.slow
+def test_a_robust_loss_is_a_distribution_of_errors(believed):
+    refit, _ = refit_of_rows(believed[0])
+    plain, robust = refit.objective, refit.objective.with_rows()
+    robust.robust = True
+    z = np.linspace(-60.0, 60.0, 200_001)
+    density = np.exp(-4.0 * (np.sqrt(1.0 + z**2 / 4.0) - 1.0))
+    norms = float(np.trapezoid(density, z))
+    misfit = plain.amplitude_residuals(refit.values)
+    error = np.asarray(plain.measurement.rows.error_nm)
+    expected = -4.0 * (np.sqrt(1.0 + misfit**2 / 4.0) - 1.0) - np.log(norms * error)
+    found = densities(robust, refit.values[None])
+    assert found.log_likelihood[0] == pytest.approx(expected.sum(axis=1), abs=1e-8)
+    noise = noise_of(robust, 400, np.random.default_rng(1))[:, 0, 0] / error[0, 0]
+    assert kstest(noise, lambda x: np.interp(x, z, np.cumsum(density) / density.sum())).pvalue > 0.01
+    assert calibrate_ranks(refit._replace(objective=robust), values_believed(believed), sets=20).failed < 5
+
+
+@pytest.mark.slow
+def test_a_right_posterior_is_not_complained_of(believed):
+    result, _ = believed
+    ranks = calibrate_ranks(refit_of_rows(result)[0], values_believed(believed), sets=100)
+    assert ranks.p_value > 0.05
+    assert ranks.gaussian_p_value > 0.05
+    assert ranks.failed == 0
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("widened", "shifted"), [(0.3, 0.0), (2.5, 0.0), (1.0, 1.0)])
+def test_a_wrong_posterior_is_flagged(believed, monkeypatch, widened, shifted):
+    result, _ = believed
+    monkeypatch.setattr(coverage_of_ranks, "DRAWS", FEWER)
+    drawn = values_believed(believed)
+    middle, error = drawn.mean(axis=0), drawn.std(axis=0)
+    wrong = middle + widened * (drawn - middle) + shifted * error
+    ranks = calibrate_ranks(refit_of_rows(result)[0], np.clip(wrong, None, [1.0, np.inf, np.inf]), sets=SETS)
+    assert ranks.p_value < IMPROBABLE
+
+
+@pytest.mark.slow
+def test_wrong_standard_errors_are_flagged(believed, monkeypatch):
+    result, _ = believed
+    drawn = values_believed(believed)
+    whole = coverage_of_ranks.fit_data_sets
+
+    def too_sure(refit: Refit, data) -> BatchFit:
+        fits = whole(refit, data)
+        return fits._replace(covariance=0.5 * fits.covariance)
+
+    monkeypatch.setattr(coverage_of_ranks, "fit_data_sets", too_sure)
+    monkeypatch.setattr(coverage_of_ranks, "DRAWS", FEWER)
+    ranks = calibrate_ranks(refit_of_rows(result)[0], drawn, sets=SETS)
+    assert ranks.gaussian_p_value < IMPROBABLE
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::FutureWarning:arviz", "ignore:Estimated shape parameter of Pareto")
+def test_arviz_reads_the_file_and_predicts_each_row_by_the_others(believed, tmp_path: Path):
+    arviz = pytest.importorskip("arviz", reason="ArviZ is an extra")
+    result, found = believed
+    path = tmp_path / "posterior.nc"
+    write_inference_data(result, found, path)
+    data = arviz.from_netcdf(path)
+    groups = {"posterior", "sample_stats", "log_likelihood", "posterior_predictive", "observed_data"}
+    # a DataTree since ArviZ 1
+    assert groups <= set(data.children if hasattr(data, "children") else data.groups())
+    assert data.posterior["r"].shape == (4, 250)
+    assert np.asarray(data.observed_data["peak_amplitude_nm"]) == pytest.approx(result.table.peak_amplitude_nm)
+    loo = arviz.loo(data, pointwise=True)
+    assert np.asarray(loo.pareto_k).shape == (result.table.rows,)
+    # rows that the law explains: as many effective parameters as there are, give or take the scatter of the rows
+    assert 1.0 < (loo.p if hasattr(loo, "p") else loo.p_loo) < 6.0
