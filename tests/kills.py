@@ -40,11 +40,16 @@ def command(place: Path, folder: str, workers: int) -> list[str]:
     return [sys.executable, "-m", "afm_jax", *arguments]
 
 
+def chunks_done(folder: Path) -> int:
+    """Return how many chunks of a sweep's folder are marked as computed, without looking into them."""
+    return sum(path.suffix == "" and path.is_file() for path in folder.glob("sweep.zarr/computed/c/**/*"))
+
+
 def killed(line: list[str], folder: Path, enough: int, later_s: float) -> bool:
     """Start a program and kill it some time after it has done some more chunks; say whether it was not done before."""
-    before = len(list(folder.glob("done/*.json")))
+    before = chunks_done(folder)
     with subprocess.Popen(line, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
-        while process.poll() is None and len(list(folder.glob("done/*.json"))) < before + enough:
+        while process.poll() is None and chunks_done(folder) < before + enough:
             time.sleep(0.005)
         time.sleep(later_s)
         alive = process.poll() is None
@@ -64,7 +69,7 @@ def survive(line: list[str], folder: Path, *, times: int, chunks: int, seed: int
         # now and then before the first chunk, else after a share of those that are left
         enough = chance.choice([0, 1, max((chunks - done) // (times + 1), 1)])
         killed(line, folder, enough, chance.uniform(0.0, 0.2 if enough else 3.0))
-        now = len(list(folder.glob("done/*.json")))
+        now = chunks_done(folder)
         assert now >= done, "a chunk was lost"
         computed.append(now - done)
         done = now

@@ -79,8 +79,8 @@ def test_a_full_standard_output_is_named(tmp_path):
 
 def test_nothing_writes_files_another_way():
     other = re.compile(r"\.write_text\(|\.write_bytes\(|\.savefig\((?!buffer)|open\([^)]*[\"']w|\.to_(csv|zarr|json)\(")
-    # into new folders that `whole_folder` then puts in their place, and into memory
-    new = re.compile(r"open_group\((str\((fresh|path)\)|MemoryStore)")
+    # into new folders that `whole_folder` then puts in their place
+    new = re.compile(r"open_group\(str\((fresh|path)\)")
     found = {str(path) for path in LIBRARY if other.search(new.sub("", (ROOT / path).read_text(encoding="utf-8")))}
     # the writer itself, and a standard error that is closed
     assert found == {"afm_jax/whole_files.py", "afm_jax/cli/main.py"}
@@ -95,7 +95,7 @@ def test_files_of_commands_are_checked_for_links_first(tmp_path, call):
     assert written
     assert loose == []
     # a link in place of each file, and of each folder that holds some; those in a sweep's have tests of their own
-    for place in {name.partition("/")[0] for name in written} - {"done", STORE}:
+    for place in {name.partition("/")[0] for name in written} - {STORE}:
         whole = tmp_path / f"out of {call}" / place
         kept = whole.with_name("kept")
         whole.rename(kept)

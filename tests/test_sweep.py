@@ -27,7 +27,7 @@ from afm_jax.scenefile.parameter_paths import scene_batch, scene_family
 from afm_jax.scenefile.presets import preset
 from afm_jax.sweeps.sweep import run_plan, sweep
 from tests.fresh_python import python
-from tests.kills import ROOT, killed, survive
+from tests.kills import ROOT, chunks_done, killed, survive
 from tests.sweep_numbers import contents, plan
 
 FREQUENCY, AMPLITUDE = "platform.reduced_frequency", "platform.amplitude_nm"
@@ -191,7 +191,7 @@ def test_a_killed_worker_costs_nothing_but_time(tmp_path: Path, monkeypatch: pyt
     def kill() -> None:
         until = time.monotonic() + 120.0
         while not victims and time.monotonic() < until:
-            done = len(list((tmp_path / "out" / "done").glob("*.json")))
+            done = chunks_done(tmp_path / "out")
             victims.extend(int(path.name) for path in list(told.iterdir())[:1] if done >= 2)
             time.sleep(0.05)
         os.kill(victims[0], signal.SIGKILL)
@@ -215,7 +215,7 @@ def test_an_interrupt_is_one_message(tmp_path: Path):
     # fourteen seconds of work: it has not ended when it is interrupted, however busy the machine
     # the keyboard interrupts the whole group of processes
     with subprocess.Popen(line, cwd=ROOT, stderr=subprocess.PIPE, text=True, start_new_session=True) as process:
-        while process.poll() is None and len(list((tmp_path / "out").glob("done/*.json"))) < 1:
+        while process.poll() is None and chunks_done(tmp_path / "out") < 1:
             time.sleep(0.05)
         os.killpg(process.pid, signal.SIGINT)
         told = process.communicate(timeout=200)[1]

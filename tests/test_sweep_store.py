@@ -18,8 +18,8 @@ from afm_jax import compilation_cache
 from afm_jax.plots.sweeps import draw_sweep
 from afm_jax.sweeps.axes import axes_of
 from afm_jax.sweeps.plan import plan_of
-from afm_jax.sweeps.store import STORE, SweepStore, compute_chunk, locked
-from afm_jax.sweeps.sweep import dataset_of, estimate, run_plan
+from afm_jax.sweeps.store import FORMAT_VERSION, STORE, SweepStore, locked
+from afm_jax.sweeps.sweep import compute_chunk, dataset_of, estimate, run_plan
 from tests.sweep_numbers import SIZES, contents, plan
 
 X, Y = np.linspace(0.0, 6.0, SIZES[0]), np.linspace(0.0, 11.0, SIZES[1])
@@ -49,7 +49,7 @@ def test_points_without_a_result_say_why(tmp_path: Path):
         found = xarray.open_zarr(str(tmp_path / STORE)).load()
     np.testing.assert_array_equal(found["message"], np.where(SUM < 2.0, "the sum is below 2 \u00e4", ""))
     before = contents(tmp_path)
-    (tmp_path / "done" / "0.json").unlink()
+    (tmp_path / STORE / "computed" / "c" / "0" / "0").unlink()
     run_plan(plan(explained=True), tmp_path)
     assert contents(tmp_path) == before
 
@@ -66,12 +66,12 @@ def test_chunks_that_are_done_are_kept(tmp_path: Path, monkeypatch: pytest.Monke
     run_plan(plan(), tmp_path / "whole")
     write, count = SweepStore.write, 0
 
-    def breaking(store: SweepStore, chunk: int, files: dict) -> None:
+    def breaking(store: SweepStore, chunk: int, results: dict) -> None:
         nonlocal count
         count += 1
         if count > 5:
             raise KeyboardInterrupt
-        write(store, chunk, files)
+        write(store, chunk, results)
 
     monkeypatch.setattr(SweepStore, "write", breaking)
     with pytest.raises(KeyboardInterrupt):
@@ -91,7 +91,7 @@ def test_damaged_chunks_are_computed_again(tmp_path: Path, fault: str):
     before = contents(tmp_path)
     path = tmp_path / STORE / "sum_nm" / "c" / "3" / "0"
     if fault == "marker":
-        path = tmp_path / "done" / "6.json"
+        path = tmp_path / STORE / "computed" / "c" / "3" / "0"
     data = bytearray(path.read_bytes())
     if fault == "gone":
         path.unlink()
@@ -133,16 +133,19 @@ def test_a_changed_input_is_refused_and_named(tmp_path: Path):
     other = replace(same, recorder=replace(same.recorder, points=24))
     with pytest.raises(ValueError, match=r"shape of its chunks is \[1, 10\], not \[2, 12\]: choose another folder"):
         run_plan(other, tmp_path)
-    (tmp_path / STORE / "zarr.json").write_text("{}")
-    with pytest.raises(ValueError, match="is not a sweep of afm-jax; choose another folder"):
-        run_plan(plan(), tmp_path)
+    known = (tmp_path / STORE / "zarr.json").read_text()
+    older = known.replace(f'"format_version": {FORMAT_VERSION}', '"format_version": 3')
+    for text, fault in ((older, "has format_version 3, not 4"), ("{}", "is not a sweep of afm-jax")):
+        (tmp_path / STORE / "zarr.json").write_text(text)
+        with pytest.raises(ValueError, match=f"{fault}; choose another folder"):
+            run_plan(plan(), tmp_path)
 
 
 def test_a_full_disk_keeps_what_is_done(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    def full(store: SweepStore, chunk: int, files: dict) -> None:
+    def full(store: SweepStore, chunk: int, results: dict) -> None:
         if chunk >= 3:
             raise OSError(errno.ENOSPC, "No space left on device", str(store.folder / "sum_nm"))
-        write(store, chunk, files)
+        write(store, chunk, results)
 
     write = SweepStore.write
     monkeypatch.setattr(SweepStore, "write", full)
@@ -177,13 +180,13 @@ def test_two_sweeps_on_one_folder(tmp_path: Path):
 def test_what_a_killed_sweep_left_unfinished_is_cleared(tmp_path: Path):
     run_plan(plan(), tmp_path)
     before = contents(tmp_path)
-    (tmp_path / STORE / "sum_nm" / "c" / "3" / ".0.abc.part").touch()
-    (tmp_path / "done" / ".3.json.abcd.part").touch()
+    (tmp_path / STORE / "sum_nm" / "c" / "3" / "0.abc.partial").touch()
+    (tmp_path / STORE / "computed" / "c" / "3" / "0.abcd.partial").touch()
     run_plan(plan(), tmp_path)
     assert contents(tmp_path) == before
 
 
-LINKED = ["done", "done/0.json", "done/3.json", "lock", STORE, f"{STORE}/sum_nm", f"{STORE}/sum_nm/c/3/0", f"{STORE}/x"]
+LINKED = ["lock", STORE, *(f"{STORE}/{name}" for name in ("computed", "computed/c/0/0", "sum_nm", "sum_nm/c/3/0", "x"))]
 LINKED += [f"{STORE}/zarr.json", f"{STORE}/x/c/0", f".{STORE}.part", f".{STORE}.0a1b2c3d.part"]
 
 
@@ -197,7 +200,7 @@ def test_a_folder_with_links_is_refused_and_nothing_outside_it_changes(tmp_path:
     out.mkdir()
     if begun:
         run_plan(plan(), out)
-        (out / "done" / "3.json").unlink()
+        (out / STORE / "computed" / "c" / "1" / "1").unlink()
     link = out / place
     if link.is_dir():
         shutil.rmtree(link)
@@ -224,7 +227,7 @@ def test_other_files_by_another_name_and_pipes_are_refused(tmp_path: Path):
     assert (tmp_path / "letter").read_text() == "mine"
     (tmp_path / "out" / "lock").unlink()
     run_plan(plan(), tmp_path / "out")
-    for name in ("lock", "done/5.json", f"{STORE}/sum_nm/c/3/0"):
+    for name in ("lock", f"{STORE}/computed/c/2/1", f"{STORE}/sum_nm/c/3/0"):
         place = tmp_path / "out" / name
         before = place.read_bytes()
         place.unlink()
@@ -234,19 +237,6 @@ def test_other_files_by_another_name_and_pipes_are_refused(tmp_path: Path):
         assert refused.value.filename == str(place)
         place.unlink()
         place.write_bytes(before)
-
-
-@pytest.mark.parametrize("name", ["0.json", "99.json", "01.json", "-1.json", "mine.json", "letter"])
-def test_what_is_no_mark_of_a_chunk_is_named(tmp_path: Path, name: str):
-    run_plan(plan(), tmp_path)
-    place = tmp_path / "done" / name
-    place.unlink(missing_ok=True)
-    if name == "0.json":
-        place.mkdir()
-    else:
-        place.write_text("{}")
-    with pytest.raises(ValueError, match=f"done/{name}: is no mark of a chunk of this sweep; delete it"):
-        run_plan(plan(), tmp_path)
 
 
 def test_the_plan_of_a_billion_points_is_quick():
@@ -327,7 +317,7 @@ def test_a_worker_with_other_versions_is_refused(tmp_path: Path, monkeypatch: py
     given = plan().given
     found = compute_chunk(json.dumps(given), 5)
     run_plan(plan(), tmp_path)
-    assert found["sum_nm"] == (tmp_path / STORE / "sum_nm" / "c" / "2" / "1").read_bytes()
+    np.testing.assert_array_equal(found["sum_nm"], xarray.open_zarr(str(tmp_path / STORE))["sum_nm"].values[2:3, 10:])
     other = given | {"versions": given["versions"] | {"jax": "0.0.1"}}
     with pytest.raises(RuntimeError, match=r"a worker would compute otherwise than the others: jax is .*, not 0.0.1"):
         compute_chunk(json.dumps(other), 5)

@@ -1,12 +1,11 @@
-"""Where the results of a sweep lie: a Zarr store that xarray opens alone, and beside it which chunks are done.
+"""Where the results of a sweep lie: a Zarr store that xarray opens alone, with an array `computed` over its points.
 
-A chunk is done when its marker says so: a file of its own, written whole after the chunk's, with the checksums of their
-bytes. A chunk without one, or whose bytes are others, is computed anew. One sweep at a time has the folder.
+A chunk is done when `computed` says so, which is written last, and when every array's chunk is there and has the
+checksum (crc32c) that it was written with; else it is computed anew. One sweep at a time has the folder.
 """
 
 import contextlib
 import errno
-import hashlib
 import json
 import math
 import os
@@ -14,33 +13,28 @@ import shutil
 import socket
 import warnings
 from collections.abc import Iterator, Mapping
-from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import zarr
-from zarr.codecs import ZstdCodec
-from zarr.storage import MemoryStore
+from zarr.codecs import Crc32cCodec, ZstdCodec
 
-from afm_jax.strict_json import strict_json
 from afm_jax.sweeps.axes import dimension_of
-from afm_jax.sweeps.plan import Columns, SweepPlan, Variable, plan_of_worker, unit_of
+from afm_jax.sweeps.plan import Columns, SweepPlan, Variable, unit_of
 from afm_jax.version import __version__
-from afm_jax.whole_files import check_plain, whole_folder, write_whole
+from afm_jax.whole_files import check_plain, whole_folder
 
-FORMAT_VERSION = 3
+FORMAT_VERSION = 4
 STORE = "sweep.zarr"
-_MARKERS, _LOCK = "done", "lock"
+_LOCK = "lock"
 _COMPUTED = "computed"
 _SLAB = 1_000_000
 """Values of a coordinate that are written, and lie, together."""
+# twice as fast as the usual level, and no larger; the checksum is of what lies on the disk
+_CODECS = (ZstdCodec(level=1), Crc32cCodec())
 _FILLS = {"float64": math.nan, "string": ""}
 _MOST_SHOWN = 60
-
-
-ChunkFiles = dict[str, bytes | None]
-"""What a chunk's files hold, by the variable; None where there is none, all of it being the fill value."""
 
 
 class Kept(NamedTuple):
@@ -57,116 +51,45 @@ class SweepStore:
     def __init__(self, folder: Path, plan: SweepPlan):
         """Take the store of a folder; see `open_store`."""
         self.folder, self.plan = folder, plan
+        # a chunk that is all fill value is written, too, so that one which is not there is missing
+        with zarr.config.set({"array.write_empty_chunks": True}):
+            group = zarr.open_group(str(folder / STORE), mode="r+", zarr_format=3)
+            names = (*(variable.name for variable in plan.recorder.variables), _COMPUTED)
+            self._arrays: dict[str, Any] = {name: group[name] for name in names}
 
     def kept(self) -> Kept:
-        """Return which chunks are done, every byte of them looked at.
+        """Return which chunks are done, every byte of them looked at."""
+        begun = [chunk for chunk in range(self.plan.chunks) if self._path(_COMPUTED, chunk).is_file()]
+        done = frozenset(chunk for chunk in begun if self._whole(chunk))
+        return Kept(done, frozenset(begun) - done)
 
-        Raises:
-            ValueError: if something else lies among the markers; says what.
-        """
-        done, damaged = set(), set()
-        for path in (self.folder / _MARKERS).iterdir():
-            if path.name.startswith(".") and path.is_file():
-                # what systems leave in folders
-                continue
-            chunk = int(path.stem) if path.stem.isascii() and path.stem.isdecimal() and len(path.stem) < 20 else -1
-            if not 0 <= chunk < self.plan.chunks or path.name != f"{chunk}.json" or not path.is_file():
-                raise ValueError(f"{path}: is no mark of a chunk of this sweep; delete it")
-            try:
-                sums = json.loads(path.read_bytes())
-            except ValueError:
-                sums = None
-            (done if sums == _sums(self._there(chunk)) else damaged).add(chunk)
-        return Kept(frozenset(done), frozenset(damaged))
+    def _whole(self, chunk: int) -> bool:
+        region = (*self.plan.region(chunk), ...)
+        if not all(self._path(name, chunk).is_file() for name in self._arrays):
+            return False
+        try:
+            values = {name: array[region] for name, array in self._arrays.items()}
+        # what a damaged chunk does the codec decides
+        except (OSError, RuntimeError, ValueError):
+            return False
+        return bool(np.all(values[_COMPUTED]))
 
-    def write(self, chunk: int, files: ChunkFiles) -> None:
-        """Write the files of a chunk, and then that it is done.
+    def write(self, chunk: int, results: Columns) -> None:
+        """Write the results of a chunk, and then that it is computed; each array's chunk appears whole or not at all.
 
         Raises:
             OSError: if there is no room, or the folder is gone; the chunk then counts as not done.
         """
-        # what a power cut takes, the checksums tell: the disk's time is saved
-        for name, data in files.items():
-            path = self._path(name, chunk)
-            check_plain(path, within=self.folder)
-            if data is None:
-                path.unlink(missing_ok=True)
-                continue
-            try:
-                write_whole(path, data, synced=False, within=self.folder)
-            except FileNotFoundError:
-                path.parent.mkdir(parents=True, exist_ok=True)
-                write_whole(path, data, synced=False, within=self.folder)
-        write_whole(self._marker(chunk), strict_json(_sums(files)), synced=False, within=self.folder)
-
-    def _marker(self, chunk: int) -> Path:
-        return self.folder / _MARKERS / f"{chunk}.json"
+        for name, array in self._arrays.items():
+            check_plain(self._path(name, chunk), within=self.folder)
+            array[(*self.plan.region(chunk), ...)] = True if name == _COMPUTED else results[name]
 
     def _path(self, name: str, chunk: int) -> Path:
-        return self.folder / STORE / _key(self.plan, name, chunk)
-
-    def _there(self, chunk: int) -> ChunkFiles:
-        """Return the files of a chunk as they lie on the disk."""
-        files: ChunkFiles = {}
-        for name in _names(self.plan):
-            try:
-                files[name] = self._path(name, chunk).read_bytes()
-            except FileNotFoundError:
-                files[name] = None
-        return files
-
-
-def _names(plan: SweepPlan) -> list[str]:
-    return [*(variable.name for variable in plan.recorder.variables), _COMPUTED]
-
-
-def _key(plan: SweepPlan, name: str, chunk: int) -> str:
-    """Return where in a Zarr store the chunk of a variable lies."""
-    behind = {variable.name: len(variable.dimensions) for variable in plan.recorder.variables}
-    return "/".join([name, "c", *map(str, plan.place(chunk) + (0,) * behind.get(name, 0))])
-
-
-def _sums(files: ChunkFiles) -> dict[str, str | None]:
-    return {name: None if data is None else hashlib.sha256(data).hexdigest() for name, data in files.items()}
-
-
-class ChunkEncoder:
-    """Makes files of results, as Zarr would write them: a worker does, so that writing is all that is left."""
-
-    def __init__(self, plan: SweepPlan):
-        """Take a plan."""
-        self.plan = plan
-        self._files: dict[str, Any] = {}
-        self._arrays = _make(zarr.open_group(MemoryStore(self._files), mode="w", zarr_format=3), plan)
-
-    def files(self, chunk: int, results: Columns) -> ChunkFiles:
-        """Return the files of a chunk, from what was computed."""
-        region = self.plan.region(chunk)
-        files: ChunkFiles = {}
-        for name in _names(self.plan):
-            self._arrays[name][(*region, ...)] = True if name == _COMPUTED else results[name]
-            data = self._files.pop(_key(self.plan, name, chunk), None)
-            files[name] = None if data is None else data.to_bytes()
-        return files
-
-
-def compute_chunk(text: str, chunk: int) -> ChunkFiles:
-    """Return the files of a chunk, for a process that knows nothing but the input.
-
-    Args:
-        text: `SweepPlan.given` as JSON.
-        chunk: its number.
-
-    Raises:
-        RuntimeError: if this process would compute otherwise than the one that asks.
-    """
-    encoder = _known_encoder(text)
-    return encoder.files(chunk, encoder.plan.compute(chunk))
-
-
-@lru_cache(maxsize=4)
-def _known_encoder(text: str) -> ChunkEncoder:
-    return ChunkEncoder(plan_of_worker(text))
+        """Return where Zarr keeps the chunk of an array."""
+        array = self._arrays[name]
+        place = self.plan.place(chunk)
+        place += (0,) * (array.ndim - len(place))
+        return self.folder / STORE / name / array.metadata.encode_chunk_key(place)
 
 
 def open_store(folder: Path, plan: SweepPlan, *, coordinates: bool = True) -> SweepStore:
@@ -181,37 +104,35 @@ def open_store(folder: Path, plan: SweepPlan, *, coordinates: bool = True) -> Sw
         ValueError: if there is one of another sweep; says what differs.
         OSError: if there is a link, a device or a pipe in it; names it.
     """
-    for unfinished in _unfinished(folder):
+    for unfinished in _unfinished(folder / STORE):
         unfinished.unlink()
-    for left in folder.glob(f".{STORE}.*part"):
-        check_plain(left)
-        shutil.rmtree(left)
+    for part in folder.glob(f".{STORE}.*part"):
+        check_plain(part)
+        shutil.rmtree(part)
     if (folder / STORE / "zarr.json").exists():
         _check_same(folder, plan)
-        # of the axes no checksum is kept: they are what the plan says
+        # what the axes hold is what the plan says
         _write_axes(zarr.open_group(str(folder / STORE), mode="r+", zarr_format=3), plan, coordinates=coordinates)
     else:
         with whole_folder(folder / STORE) as fresh:
             _make_whole(fresh, plan, coordinates=coordinates)
-            shutil.rmtree(folder / _MARKERS, ignore_errors=True)
-    (folder / _MARKERS).mkdir(exist_ok=True)
     return SweepStore(folder, plan)
 
 
-def _unfinished(folder: Path) -> list[Path]:
+def _unfinished(top: Path) -> list[Path]:
     """Return the files of a store that a killed process left unfinished; everything in it is looked at.
 
     Raises:
         OSError: if there is a link, a device or a pipe in it; names it.
     """
-    found = []
-    for top in (folder / STORE, folder / _MARKERS):
-        check_plain(top)
-        for place, folders, files in os.walk(top):
-            for name in (*folders, *files):
-                check_plain(Path(place, name))
-            found += [Path(place, name) for name in files if name.startswith(".") and name.endswith(".part")]
-    return found
+    check_plain(top)
+    unfinished = []
+    for place, folders, files in os.walk(top):
+        for name in (*folders, *files):
+            check_plain(Path(place, name))
+        # as Zarr names them until they are whole
+        unfinished += [Path(place, name) for name in files if name.endswith(".partial")]
+    return unfinished
 
 
 def _make_whole(path: Path, plan: SweepPlan, *, coordinates: bool) -> None:
@@ -263,23 +184,20 @@ def _write_once(group: zarr.Group, name: str, first: int, values: Any) -> None:
         array[place] = wanted
 
 
-def _make(group: zarr.Group, plan: SweepPlan) -> dict[str, zarr.Array]:
+def _make(group: zarr.Group, plan: SweepPlan) -> None:
     """Make the arrays of what is recorded."""
-    arrays = {}
     for variable in (*plan.recorder.variables, Variable(_COMPUTED, "this point has been computed", "bool")):
         extra = tuple(len(plan.recorder.extra[name]) for name in variable.dimensions)
-        arrays[variable.name] = group.create_array(
+        group.create_array(
             variable.name,
             shape=plan.shape + extra,
             chunks=plan.block + extra,
             dtype=variable.dtype,
-            # twice as fast as the usual level, and no larger
-            compressors=ZstdCodec(level=1),
+            compressors=_CODECS,
             fill_value=_FILLS.get(variable.dtype, 0),
             dimension_names=tuple(axis.dimension for axis in plan.axes) + variable.dimensions,
             attributes={**variable.attributes(), "coordinates": _others(plan)},
         )
-    return arrays
 
 
 def _others(plan: SweepPlan) -> str:
@@ -289,12 +207,13 @@ def _others(plan: SweepPlan) -> str:
     )
 
 
-def _coordinate(group: zarr.Group, name: str, dimension: str, attributes: Mapping[str, Any], size: int) -> zarr.Array:
-    return group.create_array(
+def _coordinate(group: zarr.Group, name: str, dimension: str, attributes: Mapping[str, Any], size: int) -> None:
+    group.create_array(
         name,
         shape=(size,),
         chunks=(min(size, _SLAB),),
         dtype="float64",
+        compressors=_CODECS,
         fill_value=math.nan,
         dimension_names=(dimension,),
         attributes=dict(attributes),
@@ -334,17 +253,18 @@ def changes(old: Any, new: Any, place: str = "") -> list[str]:
             for name in names
             for line in changes(old.get(name), new.get(name), f"{place}.{name}" if place else name)
         ]
-    if isinstance(old, list) and isinstance(new, list) and len(old) == len(new) and any(map(_is_table, old)):
+    if (
+        isinstance(old, list)
+        and isinstance(new, list)
+        and len(old) == len(new)
+        and any(isinstance(value, dict) for value in old)
+    ):
         return [
             line
             for number, pair in enumerate(zip(old, new, strict=True))
             for line in changes(*pair, f"{place}[{number + 1}]")
         ]
     return [f"{place} is {_short(old)}, not {_short(new)}"]
-
-
-def _is_table(value: Any) -> bool:
-    return isinstance(value, dict)
 
 
 def _short(value: Any) -> str:

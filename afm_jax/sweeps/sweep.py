@@ -11,6 +11,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -20,9 +21,9 @@ from afm_jax.apparatus.scene import SceneLike, as_scene
 from afm_jax.checks import check_count, checked, require_float64
 from afm_jax.compilation_cache import available_cores, silence_xla
 from afm_jax.scenefile.scenefile import Start, scene_tables
-from afm_jax.sweeps.plan import Columns, SweepPlan, plan_of
+from afm_jax.sweeps.plan import Columns, SweepPlan, plan_of, plan_of_worker
 from afm_jax.sweeps.scenes import SCENE_BUILDER
-from afm_jax.sweeps.store import STORE, ChunkEncoder, ChunkFiles, Kept, SweepStore, compute_chunk, locked, open_store
+from afm_jax.sweeps.store import STORE, Kept, SweepStore, locked, open_store
 
 if TYPE_CHECKING:
     import xarray
@@ -177,17 +178,16 @@ def _computed(store: SweepStore, chunks: Sequence[int], *, workers: int, schedul
         yield from _computed_here(store, chunks)
     elif chunks:
         with _client(min(workers, len(chunks)), scheduler) as client:
-            for chunk, files in _handed_out(client, store.plan, chunks):
-                store.write(chunk, files)
+            for chunk, results in _handed_out(client, store.plan, chunks):
+                store.write(chunk, results)
                 yield chunk
 
 
 def _computed_here(store: SweepStore, chunks: Sequence[int]) -> Iterator[int]:
     """Compute chunks in this process, each while the one before is written."""
-    encoder = ChunkEncoder(store.plan)
 
     def write(chunk: int, results: Columns) -> int:
-        store.write(chunk, encoder.files(chunk, results))
+        store.write(chunk, results)
         return chunk
 
     with ThreadPoolExecutor(1) as aside:
@@ -201,8 +201,8 @@ def _computed_here(store: SweepStore, chunks: Sequence[int]) -> Iterator[int]:
             yield last.result()
 
 
-def _handed_out(client: "Client", plan: SweepPlan, chunks: Iterable[int]) -> Iterator[tuple[int, ChunkFiles]]:
-    """Give chunks with their files as workers have done them; no more are under way than keep them busy."""
+def _handed_out(client: "Client", plan: SweepPlan, chunks: Iterable[int]) -> Iterator[tuple[int, Columns]]:
+    """Give chunks with their results as workers have done them; no more are under way than keep them busy."""
     from distributed import KilledWorker, as_completed  # noqa: PLC0415
 
     text = json.dumps(plan.given)
@@ -229,13 +229,29 @@ def _handed_out(client: "Client", plan: SweepPlan, chunks: Iterable[int]) -> Ite
     fill()
     for future in under_way:
         try:
-            files = future.result()
+            results = future.result()
         except KilledWorker as error:
             raise RuntimeError(
                 f"chunk {numbers[future.key]} has killed every worker that was given it (out of memory?)"
             ) from error
-        yield numbers.pop(future.key), files
+        yield numbers.pop(future.key), results
         fill()
+
+
+def compute_chunk(text: str, chunk: int) -> Columns:
+    """Return the results of a chunk, for a process that knows nothing but the input.
+
+    Args:
+        text: `SweepPlan.given` as JSON.
+        chunk: its number.
+
+    Raises:
+        RuntimeError: if this process would compute otherwise than the one that asks.
+    """
+    return _plan_of_worker(text).compute(chunk)
+
+
+_plan_of_worker = lru_cache(maxsize=4)(plan_of_worker)
 
 
 def _threads(client: "Client") -> int:
