@@ -27,9 +27,9 @@ from afm_jax.contact.driven import Driven, free_tip
 from afm_jax.contact.junction import find_junction
 from afm_jax.contact.junction_leg import pass_through_junction
 from afm_jax.contact.law_of_contact import tabulated
-from afm_jax.contact.leg import gauss_nodes
 from afm_jax.impact.lasting_impact import PulledImpact, Taps, polynomials, stretched
 from afm_jax.solve.derivatives import largest
+from afm_jax.solve.quadrature import gauss_nodes
 
 PULLS, SPEEDS = 7, 18
 """Pulls of a table, and speeds of light and of hard taps each."""

@@ -21,10 +21,10 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.driven import ContactState, Driven, free_tip
+from afm_jax.contact.driven import ContactState, Driven, Leg, free_tip
 from afm_jax.contact.junction import Junction
-from afm_jax.contact.leg import Leg, gauss_nodes, nodes_along, settled
 from afm_jax.contact.settings import QuickSetting, Setting
+from afm_jax.solve.quadrature import gauss_nodes, nodes_along
 
 _NEAREST = 1e-14
 """Lower bound of b: at 0 speed and square root would vanish together."""
@@ -174,21 +174,12 @@ def way_through(
     """
     potentials = tuple(tip.potential(gap) for gap in gaps_nm)
     start, end = _either(potentials, potentials[::-1], inward=inward)
-    total, course = start_energy_aj + start, exit_course(gaps_nm, margin, inward=inward)
-    return Way(tip, course.sense, jnp.asarray(begin_us, total.dtype), total, end, course)
-
-
-def exit_course(
-    gaps_nm: tuple[Float[Array, "..."], Float[Array, "..."]],
-    margin: Float[Array, "..."],
-    *,
-    inward: bool | Bool[Array, ""],
-) -> Exit:
-    """Return the gaps along a way; arguments as of `way_through`."""
+    total = start_energy_aj + start
     outer, inner = gaps_nm
     at_outer, at_inner = jnp.sqrt(margin), jnp.sqrt(margin + jnp.log(outer / inner))
     start_y, sense = _either(at_outer, at_inner, inward=inward), _either(1.0, -1.0, inward=inward)
-    return Exit(outer * jnp.exp(margin), start_y, at_inner - at_outer, sense)
+    course = Exit(outer * jnp.exp(margin), start_y, at_inner - at_outer, sense)
+    return Way(tip, sense, jnp.asarray(begin_us, total.dtype), total, end, course)
 
 
 def _either(one: Any, other: Any, *, inward: bool | Bool[Array, ""]) -> Any:
@@ -384,7 +375,7 @@ def _cross(
     swept = sweep(way, nodes, setting.sweeps)
     end = swept.passage
     leaving = jnp.sqrt(2.0 * driven.inverse_mass * end.energy_aj)
-    holds = settled(swept.change_aj / swept.kinetic_aj, swept.pace, end.time_us, setting)
+    holds = setting.suffices(swept.change_aj / swept.kinetic_aj, swept.pace, end.time_us)
     return Leg(
         state=ContactState(
             x=(gaps[1] if inward else gaps[0]) + jnp.zeros_like(leaving),

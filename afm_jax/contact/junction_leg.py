@@ -15,10 +15,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from afm_jax.contact.driven import ContactState, Driven
+from afm_jax.contact.driven import ContactState, Driven, Leg
 from afm_jax.contact.forces.force import ElasticCurve
-from afm_jax.contact.leg import Leg, mean_matrix, nodes_along, settled
 from afm_jax.contact.settings import QuickSetting
+from afm_jax.solve.quadrature import mean_matrix, nodes_along
 
 _TURNS = 6
 """Steps of Newton's method to the turning point under a pull."""
@@ -256,7 +256,7 @@ def _swept(half: _Half, level: Array, begin_us: Array, guess: tuple[Array, Array
     at = half.along(turn, points, means)
     duration = jnp.tensordot(weights, at.pace, axes=1)
     change = jnp.abs((means - before) * twice * mean_depth_slope(turn, at.s)) / at.over_y**2
-    return _Swept(turn, begin_us + duration, mean, settled(change, at.pace, duration, setting))
+    return _Swept(turn, begin_us + duration, mean, setting.suffices(change, at.pace, duration))
 
 
 def _turn_under(driven: Driven, form: Array, level: Array, mean: Array, turn: Array) -> Array:

@@ -6,6 +6,11 @@ Measured by `afm-jax accuracy collide` and `afm-jax bench --only scenes`.
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from afm_jax.solve.quadrature import series_tail
+
 METHODS = ("collocation", "diffrax")
 """How contacts are integrated: by sweeps over Gauss nodes, or in Runge-Kutta steps with Diffrax's coefficients.
 
@@ -82,6 +87,19 @@ class QuickSetting(NamedTuple):
     sweeps: int = 10
     junction_sweeps: int = 6
     tail: float = 0.1
+
+    def suffices(
+        self, change: Float[Array, "nodes ..."], pace: Float[Array, "nodes ..."], duration_us: Float[Array, "..."]
+    ) -> Bool[Array, "..."]:
+        """Say whether the sweeps of a leg have settled, and its nodes are enough for the series of its pace.
+
+        Args:
+            change: relative change of the kinetic energies in the last sweep.
+            pace: time per fraction of the leg, at the nodes.
+            duration_us: of the leg.
+        """
+        settled = jnp.max(change, axis=0) < self.tolerance
+        return settled & (series_tail(pace) < self.tail * duration_us) & jnp.isfinite(duration_us)
 
 
 class DrivenSetting(NamedTuple):

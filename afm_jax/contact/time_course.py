@@ -17,7 +17,7 @@ from afm_jax.checks import as_parameter, check_parameter, check_scalar, checked,
 from afm_jax.contact.bridge_leg import Way, margin_of, sweep, way_through
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Driven, free_tip
-from afm_jax.contact.junction import Junction, Phase, explain_missing_junction, find_junction, force_in_phase
+from afm_jax.contact.junction import Junction, Phase, find_junction, force_in_phase, require_junction
 from afm_jax.contact.junction_leg import stretch_in_junction, turning_root
 from afm_jax.results import ResultTuple, public_result
 
@@ -76,8 +76,7 @@ def time_course(contact: Contact, approach_speed_nm_per_us: ArrayLike, mass_ng: 
     check_parameter("mass_ng", mass_ng, "positive")
     speed, mass = as_parameter(approach_speed_nm_per_us), as_parameter(mass_ng)
     junction, legs, energies = _course(contact, speed, mass)
-    if not bool(junction.exists):
-        raise ValueError(f"the contact has no junction: {explain_missing_junction(contact)}")
+    require_junction(contact, junction.exists)
     return _joined(
         contact, junction, float(speed), [jax.tree.map(np.asarray, leg) for leg in legs], np.asarray(energies)
     )
