@@ -49,7 +49,7 @@ from afm_jax.solve.lanes import LANES, again_for_the_open, filled, for_each_lane
 _CAPTURE_POINTS = 64
 _CAPTURE_ROUNDS = 9
 _MOST_SPENT = {"steps": 0.2, "collocation": 0.05}
-"""Share of the energy that dissipation may take where few steps, or few sweeps, are enough."""
+"""Fraction of the energy that dissipation may take where few steps, or few iterations, are enough."""
 _NEAR_CAPTURE = (-0.02, 0.2)
 """Energy at the end, of that at the start, between which a tip is close to capture: below 1.1 times that speed."""
 _TRIAL_MARGIN = 1e-3

@@ -42,7 +42,7 @@ class Leg(NamedTuple):
     """Where it ends."""
     deepest_gap_nm: Float[Array, "..."]
     holds: Bool[Array, "..."]
-    """Whether the tip goes straight on and the leg's nodes and sweeps are enough."""
+    """Whether the tip goes straight on and the leg's nodes and iterations are enough."""
 
 
 class Drive(NamedTuple):

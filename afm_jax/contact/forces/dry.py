@@ -6,11 +6,13 @@ van der Waals' force (Derjaguin, Muller and Toporov). So the force is continuous
 formed. With s = sqrt(delta/unit), load s^3 - p, depth s^2 and work (2/5) s^5 - p s^2 are polynomials.
 """
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from afm_jax.checks import as_argument
-from afm_jax.contact.forces.force import ElasticCurve, Parameters, Terms, parameter
+from afm_jax.checks import as_argument, as_parameter
+from afm_jax.contact.forces.force import ElasticCurve, Parameters, Terms
+from afm_jax.contact.parameters import DEFAULTS
 
 _LEAST_ENERGY = 1e-24
 
@@ -89,8 +91,8 @@ class Hertz(Parameters):
         ValueError: if a value is not positive.
     """
 
-    modulus_gpa: Float[Array, "..."] = parameter("modulus_gpa")
-    tip_radius_nm: Float[Array, "..."] = parameter("tip_radius_nm")
+    modulus_gpa: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["modulus_gpa"])
+    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["tip_radius_nm"])
 
     @property
     def begins_nm(self) -> Float[Array, "..."]:
@@ -112,7 +114,9 @@ class Dmt(Hertz):
         ValueError: if a value is not positive.
     """
 
-    contact_distance_nm: Float[Array, "..."] = parameter("contact_distance_nm")
+    contact_distance_nm: Float[Array, "..."] = eqx.field(
+        converter=as_parameter, default=DEFAULTS["contact_distance_nm"]
+    )
 
     @property
     def begins_nm(self) -> Float[Array, "..."]:

@@ -12,15 +12,15 @@ polynomial too.
 import abc
 import dataclasses
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from afm_jax.checks import as_argument, as_parameter, check_parameter, readable
-from afm_jax.contact.parameters import CONTACT_RANGES, DEFAULTS
+from afm_jax.checks import as_argument, check_parameter, readable
+from afm_jax.contact.parameters import CONTACT_RANGES
 
 
 class Parameters(eqx.Module):
@@ -44,16 +44,6 @@ class Parameters(eqx.Module):
             for name in (field.name, f"{type(self).__name__.lower()}_{field.name}"):
                 if name in CONTACT_RANGES:
                     check_parameter(field.name, getattr(self, field.name), CONTACT_RANGES[name])
-
-
-def parameter(name: str, unit: float = 1.0) -> Any:
-    """Return a field for a parameter of the contact, by default its value in `afm_jax.contact.parameters`.
-
-    Args:
-        name: of the parameter.
-        unit: that of the parameter in the field's unit.
-    """
-    return eqx.field(converter=as_parameter, default=DEFAULTS[name] * unit)
 
 
 class Force(Parameters):

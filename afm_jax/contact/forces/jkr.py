@@ -7,11 +7,13 @@ breaks under displacement control at the fold s = 6^(-1/6), where dP/dDelta is i
 
 import math
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from afm_jax.checks import as_argument
-from afm_jax.contact.forces.force import ElasticCurve, Parameters, Terms, parameter
+from afm_jax.checks import as_argument, as_parameter
+from afm_jax.contact.forces.force import ElasticCurve, Parameters, Terms
+from afm_jax.contact.parameters import DEFAULTS
 
 SLOPE = 2.0 * math.sqrt(6.0) / 3.0
 """The linear coefficient of the depth: Delta = s^4 - SLOPE s."""
@@ -148,9 +150,11 @@ class Jkr(Parameters):
         ValueError: if a value is not positive.
     """
 
-    adhesion_energy_j_per_m2: Float[Array, "..."] = parameter("adhesion_energy_j_per_m2")
-    modulus_gpa: Float[Array, "..."] = parameter("modulus_gpa")
-    tip_radius_nm: Float[Array, "..."] = parameter("tip_radius_nm")
+    adhesion_energy_j_per_m2: Float[Array, "..."] = eqx.field(
+        converter=as_parameter, default=DEFAULTS["adhesion_energy_j_per_m2"]
+    )
+    modulus_gpa: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["modulus_gpa"])
+    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["tip_radius_nm"])
 
     @property
     def load_scale_nn(self) -> Float[Array, "..."]:

@@ -10,8 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from afm_jax.checks import is_traced
-from afm_jax.contact.forces.force import DissipativeForce, Parameters, StaticForce, parameter
+from afm_jax.checks import as_parameter, is_traced
+from afm_jax.contact.forces.force import DissipativeForce, Parameters, StaticForce
+from afm_jax.contact.parameters import DEFAULTS
 from afm_jax.units import GAS_CONSTANT_J_PER_MOL_K, NM_PER_CM3_PER_M2, NN_US_PER_NM2_PER_PA_S
 
 
@@ -28,10 +29,14 @@ class Liquid(Parameters):
         ValueError: if a value is not positive, or the relative humidity not below 1.
     """
 
-    relative_humidity: Float[Array, "..."] = parameter("relative_humidity")
-    temperature_k: Float[Array, "..."] = parameter("temperature_k")
-    surface_tension_n_per_m: Float[Array, "..."] = parameter("surface_tension_n_per_m")
-    molar_volume_cm3_per_mol: Float[Array, "..."] = parameter("molar_volume_cm3_per_mol")
+    relative_humidity: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["relative_humidity"])
+    temperature_k: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["temperature_k"])
+    surface_tension_n_per_m: Float[Array, "..."] = eqx.field(
+        converter=as_parameter, default=DEFAULTS["surface_tension_n_per_m"]
+    )
+    molar_volume_cm3_per_mol: Float[Array, "..."] = eqx.field(
+        converter=as_parameter, default=DEFAULTS["molar_volume_cm3_per_mol"]
+    )
 
     @property
     def kelvin_radius_nm(self) -> Float[Array, "..."]:
@@ -69,7 +74,7 @@ class Capillary(StaticForce):
         ValueError: if the radius is not positive, or below the Kelvin radius (no such meniscus).
     """
 
-    tip_radius_nm: Float[Array, "..."] = parameter("tip_radius_nm")
+    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["tip_radius_nm"])
     liquid: Liquid = eqx.field(default_factory=Liquid)
 
     def __check_init__(self):
@@ -107,10 +112,12 @@ class Structural(StaticForce):
         ValueError: if a value is outside its range, or the Kelvin radius exceeds the tip's (no such meniscus).
     """
 
-    amplitude_n_per_m: Float[Array, "..."] = parameter("structural_amplitude_n_per_m")
-    decay_nm: Float[Array, "..."] = parameter("structural_decay_nm")
-    offset_nm: Float[Array, "..."] = parameter("structural_offset_nm")
-    tip_radius_nm: Float[Array, "..."] = parameter("tip_radius_nm")
+    amplitude_n_per_m: Float[Array, "..."] = eqx.field(
+        converter=as_parameter, default=DEFAULTS["structural_amplitude_n_per_m"]
+    )
+    decay_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["structural_decay_nm"])
+    offset_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["structural_offset_nm"])
+    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["tip_radius_nm"])
     liquid: Liquid = eqx.field(default_factory=Liquid)
 
     def __check_init__(self):
@@ -147,8 +154,8 @@ class Viscous(DissipativeForce):
         ValueError: if the viscosity is negative or the radius not positive.
     """
 
-    viscosity_pa_s: Float[Array, "..."] = parameter("viscosity_pa_s")
-    tip_radius_nm: Float[Array, "..."] = parameter("tip_radius_nm")
+    viscosity_pa_s: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["viscosity_pa_s"])
+    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["tip_radius_nm"])
 
     def coefficients(self) -> tuple[Float[Array, "..."], ...]:
         """Return (3 pi/2) eta R^2 in nN us."""

@@ -3,10 +3,12 @@
 The attraction is that of a sphere and a plane at gaps small against the radius, not retarded (Hamaker 1937).
 """
 
+import equinox as eqx
 from jaxtyping import Array, Float
 
-from afm_jax.checks import check_parameter
-from afm_jax.contact.forces.force import StaticForce, parameter
+from afm_jax.checks import as_parameter, check_parameter
+from afm_jax.contact.forces.force import StaticForce
+from afm_jax.contact.parameters import DEFAULTS
 from afm_jax.units import AJ_NM6_PER_J_M6
 
 
@@ -21,8 +23,11 @@ class CoreRepulsion(StaticForce):
         ValueError: if a value is not positive.
     """
 
-    constant_aj_nm6: Float[Array, "..."] = parameter("core_constant_j_m6", AJ_NM6_PER_J_M6)
-    tip_radius_nm: Float[Array, "..."] = parameter("tip_radius_nm")
+    constant_aj_nm6: Float[Array, "..."] = eqx.field(
+        converter=as_parameter,
+        default=DEFAULTS["core_constant_j_m6"] * AJ_NM6_PER_J_M6,
+    )
+    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["tip_radius_nm"])
 
     def __check_init__(self):
         check_parameter("constant_aj_nm6", self.constant_aj_nm6, "above 0")
@@ -48,8 +53,10 @@ class VanDerWaals(StaticForce):
         ValueError: if the Hamaker constant is negative or the radius not positive.
     """
 
-    hamaker_constant_aj: Float[Array, "..."] = parameter("hamaker_constant_aj")
-    tip_radius_nm: Float[Array, "..."] = parameter("tip_radius_nm")
+    hamaker_constant_aj: Float[Array, "..."] = eqx.field(
+        converter=as_parameter, default=DEFAULTS["hamaker_constant_aj"]
+    )
+    tip_radius_nm: Float[Array, "..."] = eqx.field(converter=as_parameter, default=DEFAULTS["tip_radius_nm"])
 
     def coefficients(self) -> tuple[Float[Array, "..."], ...]:
         """Return -H R / 6."""
