@@ -196,7 +196,7 @@ MUTATIONS = {
         "- self.end_potential_aj + spent",
         COLLISIONS,
     ),
-    "collocation that sweeps from the end": Mutation(
+    "collocation that integrates from the end": Mutation(
         "integrals[:, 0] = roots + 1.0",
         "integrals[:, 0] = 1.0 - roots",
         COLLOCATION,

@@ -10,11 +10,11 @@ import pytest
 
 from afm_jax.contact.bridge_leg import (
     GRADING,
+    collocate,
     driven_way,
     go_in,
     nothing_spent,
     pass_in_steps,
-    sweep,
     way_rates,
     way_through,
 )
@@ -155,12 +155,12 @@ def test_both_integrators_take_a_driven_tip_through_the_bridge(inward):
     @jax.jit
     def both(state):
         way = driven_way(driven, gaps, state, inward=inward)
-        return pass_in_steps(way, 40), sweep(way, 30, 25).passage
+        return pass_in_steps(way, 40), collocate(way, 30, 25).passage
 
     for stepped, swept in zip(*both(state), strict=True):
         np.testing.assert_allclose(stepped, swept, rtol=1e-10)
     # the drive counts: a free tip ends elsewhere
-    alone = sweep(driven_way(driven._replace(drive=None), gaps, state, inward=inward), 30, 25).passage
+    alone = collocate(driven_way(driven._replace(drive=None), gaps, state, inward=inward), 30, 25).passage
     assert (np.abs(np.asarray(alone.energy_aj) / np.asarray(both(state)[1].energy_aj) - 1.0) > 1e-3).all()
 
 
@@ -174,7 +174,7 @@ def test_steps_in_the_gap_are_those_of_diffrax(solver):
     way = way_through(tip, gaps, 0.5 * speeds**2, jnp.ones_like(speeds), inward=True)
     ends = 1.0 - (1.0 - np.linspace(0.0, 1.0, 4)) ** GRADING
     solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda share, state, _: way_rates(way, share, state)),
+        diffrax.ODETerm(lambda fraction, state, _: way_rates(way, fraction, state)),
         getattr(diffrax, solver)(),
         0.0,
         1.0,

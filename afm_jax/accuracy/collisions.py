@@ -22,7 +22,7 @@ from afm_jax.bench.integrators import title
 from afm_jax.bench.scipy_contacts import scipy_collision
 from afm_jax.bench.timing import compiled_for, progress, time_compiled
 from afm_jax.contact.bridge_leg import Passage, Way, nothing_spent, way_rates
-from afm_jax.contact.collide import Collision, batch_of, capture_speed, collision_of, go_through
+from afm_jax.contact.collide import Collision, batch_of, capture_speed, collision_of, three_parts
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.junction import Junction, find_junction
 from afm_jax.contact.settings import SETTINGS, Setting
@@ -277,8 +277,8 @@ def adaptive_collisions(variable: str, solver: str) -> Callable[[Contact, Juncti
     def one(contact, junction, speed, tolerance):
         mass = jnp.ones_like(speed)
         finest = SETTINGS["diffrax"][1e-11]
-        ways = go_through(contact, junction, speed, mass, finest, lambda way: crossing(way, solver, tolerance))
-        return collision_of(contact, junction, speed, mass, ways)
+        parts = three_parts(contact, junction, speed, mass, finest, lambda way: crossing(way, solver, tolerance))
+        return collision_of(contact, junction, speed, mass, parts)
 
     return jax.vmap(one, in_axes=(None, None, 0, None))
 

@@ -68,8 +68,8 @@ def quick_setting(level: int) -> DrivenSetting:
         releasing=level + 5,
         outward=2 * level + 4,
         tolerance=10.0 ** (-level - 2),
-        sweeps=level + 3,
-        junction_sweeps=level + 1,
+        iterations=level + 3,
+        junction_iterations=level + 1,
         tail=3e-3,
     )
     return DrivenSetting(nodes, 0.8 + 0.7 * level, 60 + 20 * level)

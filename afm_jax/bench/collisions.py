@@ -20,9 +20,9 @@ from afm_jax.contact.settings import SETTINGS, Setting
 Row = dict[str, Any]
 
 SPEEDS_NM_PER_US = (12.0, 200.0)
-REFERENCE = Setting("collocation", 40, 40, 48, sweeps=14)
+REFERENCE = Setting("collocation", 40, 40, 48, iterations=14)
 """Converged to rounding; the tests compare it with 20 digits to 1e-12."""
-COARSER_REFERENCE = Setting("collocation", 32, 32, 40, sweeps=12)
+COARSER_REFERENCE = Setting("collocation", 32, 32, 40, iterations=12)
 
 
 def speeds_of(batch: int) -> Float[Array, " batch"]:

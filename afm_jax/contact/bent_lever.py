@@ -21,40 +21,40 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from afm_jax.apparatus.cantilever import Cantilever
-from afm_jax.contact.bridge_leg import Way, sweep
+from afm_jax.contact.bridge_leg import Way, collocate
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Driven, free_tip
 from afm_jax.contact.junction import find_junction
 from afm_jax.contact.junction_leg import pass_through_junction
 from afm_jax.contact.law_of_contact import tabulated
-from afm_jax.contact.leg import gauss_nodes
 from afm_jax.impact.lasting_impact import PulledImpact, Taps, polynomials, stretched
 from afm_jax.solve.derivatives import largest
+from afm_jax.solve.quadrature import gauss_nodes
 
 PULLS, SPEEDS = 7, 18
 """Pulls of a table, and speeds of light and of hard taps each."""
-_NODES, _SWEEPS, _JUNCTION, _ARC = 16, 6, 16, 6
+_NODES, _ITERATIONS, _JUNCTION, _ARC = 16, 6, 16, 6
 _BARRIER_GAPS, _GAPS, _TURN_GAPS = 24, 32, 128
 _DRAWN, _WIDEST = 1.1, 0.02
 """Weakest pull of light taps: over what the bridge draws, and over the strongest."""
 _FARTHEST = 100.0
 """Speed with which a junction forms at most, in terms of the speed that hysteresis takes."""
 _ABOVE, _ROUND = 0.05, 0.05
-"""Energy above what a hard tap needs to get away, and rounding of that where its reason changes: shares of what
+"""Energy above what a hard tap needs to get away, and rounding of that where its reason changes: fractions of what
 hysteresis takes."""
 
 
 class _Near(NamedTuple):
-    """D = scale exp(y^2), y linear in the share: takes the square root out where the tip is slow at the inner end."""
+    """D = scale exp(y^2), y linear in the fraction: smooth where the tip is slow at the inner end."""
 
     scale_nm: Float[Array, "..."]
     start_y: Float[Array, "..."]
     end_y: Float[Array, "..."]
 
-    def at(self, share: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Return the gap, and the path per share."""
+    def at(self, fraction: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Return the gap in nm, and the path |dD| per fraction of the way."""
         width = self.end_y - self.start_y
-        y = self.start_y + width * share
+        y = self.start_y + width * fraction
         gap = self.scale_nm * jnp.exp(y * y)
         return gap, 2.0 * width * y * gap
 
@@ -95,14 +95,14 @@ def tapped(contact: Contact, lever: Cantilever, pulls: Float[Array, " 2"]) -> Pu
     more = jnp.maximum(straight - ends[0], 0.0) * jnp.array([0.0, 0.0, 1.0])
     first, last = ends + more
     pull = straight + first * (last / first) ** jnp.asarray(0.5 - 0.5 * _points(PULLS))[:, None] - more
-    share = jnp.asarray(0.5 - 0.5 * _points(SPEEDS))
+    fraction = jnp.asarray(0.5 - 0.5 * _points(SPEEDS))
     turns = jax.vmap(lambda g: _turns(tip._replace(pull=g), near, far))(pull[:, 0])
     taken = jnp.maximum(junction.hysteresis_aj, 1e-6)
     scale = jnp.sqrt(2.0 * taken / lever.mass_ng)
 
     def of_hard(g):
         bent = tip._replace(pull=g)
-        formed = 0.5 * lever.mass_ng * (scale * jnp.sinh(stretched(jnp.asarray(_FARTHEST)) * share)) ** 2
+        formed = 0.5 * lever.mass_ng * (scale * jnp.sinh(stretched(jnp.asarray(_FARTHEST)) * fraction)) ** 2
         formed = formed + _needed(contact, bent, plane, taken)
         return formed, jax.vmap(lambda energy: pass_through_junction(bent, energy, _JUNCTION))(formed)
 
@@ -183,10 +183,10 @@ def _solved(matrix: Float[Array, "n n"], values: Float[Array, "n k"]) -> Float[A
 def _needed(contact: Contact, tip: Driven, plane: Float[Array, ""], taken: Float[Array, ""]) -> Float[Array, ""]:
     """Return the energy in aJ with which the junction must form for the tip to come from the plane and to get back."""
     junction, solid = tip.junction, tip.solid
-    share = jnp.asarray(np.linspace(0.0, 1.0, _BARRIER_GAPS))
+    fraction = jnp.asarray(np.linspace(0.0, 1.0, _BARRIER_GAPS))
     on, breaks = junction.forms_gap_nm, junction.breaks_gap_nm
     elastic = solid.energy_scale_aj * (solid.work(solid.fold) - solid.work(junction.forms_root))
-    out, back = breaks * (plane / breaks) ** share, on * (contact.bridge_forms_nm / on) ** share
+    out, back = breaks * (plane / breaks) ** fraction, on * (contact.bridge_forms_nm / on) ** fraction
     leaving = elastic - tip.pulled_aj(on, breaks) + tip.potential(out) - tip.potential(breaks)
     coming = tip.potential(back) - tip.potential(on)
     most = jnp.maximum(largest(leaving), largest(coming)) + _ABOVE * taken
@@ -258,24 +258,26 @@ def _outward(tip: Driven, inner, outer, energy) -> _Stretch:
     course: Any = _Near(inner * jnp.exp(-margin), start, jnp.sqrt(margin + jnp.log(outer / inner)))
     total = energy + tip.potential(inner)
     slowest = 1e-9 * jnp.abs(tip.potential(outer) - tip.potential(inner)) + 1e-12
-    swept = sweep(Way(tip, -1.0, jnp.zeros(()), total, tip.potential(outer), course, slowest), _NODES, _SWEEPS)
-    return _stretch(swept.passage.energy_aj, swept.at.gap_nm, swept.speed, swept.pace)
+    collocation = collocate(
+        Way(tip, -1.0, jnp.zeros(()), total, tip.potential(outer), course, slowest), _NODES, _ITERATIONS
+    )
+    return _stretch(collocation.passage.energy_aj, collocation.at.gap_nm, collocation.speed, collocation.time_slope)
 
 
 def _arc(tip: Driven, inner, outer, energy) -> _Stretch:
     """Return the way of the lever alone: at the places of a steady pull, whose square root is thereby gone."""
     end = energy + tip.pulled_aj(inner, outer)
     first, last = (jnp.sqrt(2.0 / tip.mass_ng * jnp.maximum(one, 1e-9)) for one in (energy, end))
-    share = jnp.asarray(gauss_nodes(_ARC)[0])
-    time, steady = 2.0 * (outer - inner) / (first + last), first + (last - first) * share
-    gap = inner + 0.5 * time * share * (first + steady)
+    fraction = jnp.asarray(gauss_nodes(_ARC)[0])
+    time, steady = 2.0 * (outer - inner) / (first + last), first + (last - first) * fraction
+    gap = inner + 0.5 * time * fraction * (first + steady)
     speed = jnp.sqrt(2.0 / tip.mass_ng * jnp.maximum(energy + tip.pulled_aj(inner, gap), 1e-9))
     return _stretch(end, gap, speed, time * steady / speed)
 
 
-def _stretch(energy, gap, speed, pace) -> _Stretch:
-    """Return a way from what it ends with, and gap, speed and time per share at Gauss nodes."""
+def _stretch(energy, gap, speed, time_slope) -> _Stretch:
+    """Return a way from what it ends with, and gap, speed and time per fraction at Gauss nodes."""
     _, weights, cumulative = (jnp.asarray(part) for part in gauss_nodes(gap.shape[0]))
-    lasted = cumulative @ pace
+    lasted = cumulative @ time_slope
     parts = jnp.ones_like(gap), gap, speed**2, gap * lasted, gap * lasted**2
-    return _Stretch(energy, *(weights @ (pace * part) for part in parts))
+    return _Stretch(energy, *(weights @ (time_slope * part) for part in parts))

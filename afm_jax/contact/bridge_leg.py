@@ -1,14 +1,17 @@
-"""The way through the liquid bridge, with the gap as independent variable: of free tips and of driven ones.
+"""The way of a tip through the liquid bridge, free or driven, with the gap D as independent variable.
 
-Where the bridge is crossed monotonically the gap D can replace time. With the kinetic energy K = m w^2/2, w the gap's
-rate, and the potential U of the static forces and the spring, K + U + S is the energy at the start. The static forces,
-which vary most, thereby leave the equation, and only what is spent is integrated,
+Where the bridge is crossed monotonically the gap can replace time. With the kinetic energy K = m w^2/2, w the size of
+the gap's rate, the potential U of the static forces and the spring, and the energy S that is spent, K + U + S is the
+energy at the start. The static forces, which vary most, thereby leave the equation, and only S is integrated,
 
-    dS/dD = (damping(D) + m Omega/Q) w - m q(t),    dt/dD = 1/w,
+    dS/d|path| = (damping(D) + m Omega/Q) w -+ m q(t),    dt/d|path| = 1/w,
 
-q the push of the surface's motion (`Drive`). A free tip has neither Omega nor q. The gap is a function of the share of
-the way that takes the square roots out of w at its ends (`Exit`, `Turning`). Two integrators follow the share: sweeps
-over Gauss nodes (speeds from what is spent, times from the speeds, what is spent from both), and Diffrax's steps.
+q the push of the surface's motion (`Drive`). A free tip has neither Omega nor q. The gap is a function of the fraction
+of the way that is done, chosen so that the square roots of w at the ends are gone (`Exit`, `Turning`).
+
+`way_through` states the problem, `pass_bridge` solves it for a free tip by one of two integrators: Picard's iterations
+over Gauss nodes (`collocate`), or Diffrax's steps (`pass_in_steps`). `go_in` and `go_out` are the legs of driven
+tips, `turn_in_bridge` is the impact of a tip that never reaches the junction.
 """
 
 from collections.abc import Callable
@@ -21,28 +24,28 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from afm_jax.contact.contact import Contact
-from afm_jax.contact.driven import ContactState, Driven, free_tip
+from afm_jax.contact.driven import ContactState, Driven, Leg, free_tip
 from afm_jax.contact.junction import Junction
-from afm_jax.contact.leg import Leg, gauss_nodes, nodes_along, settled
 from afm_jax.contact.settings import QuickSetting, Setting
+from afm_jax.solve.quadrature import gauss_nodes, nodes_along
 
 _NEAREST = 1e-14
 """Lower bound of b: at 0 speed and square root would vanish together."""
 GRADING = 1.6
 """Steps towards the inner end shrink on the way in, where the core repulsion rises as the 8th power."""
 _SLOWEST = 0.01
-"""Share of K at the start below which no sweep lets it fall; a driven tip that gets slower is not for the quick way."""
+"""Fraction of K at the start below which no iteration lets it fall: a slower driven tip is followed in time."""
 _WRITTEN_OUT = 3
-"""So many sweeps are written out in the program; more are a loop."""
+"""Iterations up to which they are written out in the program; more are a loop."""
 _REMEMBERED = 20
-"""So many steps leave behind what their derivatives in reverse mode need."""
-_TURN_NODES, _TURN_SWEEPS = 48, 12
+"""Steps up to which reverse mode keeps what it needs of each; of more it computes them again."""
+_TURN_NODES, _TURN_ITERATIONS = 48, 12
 _TURN_ROUNDS = 2
 _SCAN = 256
 
 
 class Exit(NamedTuple):
-    """D = scale exp(-y^2), y linear in the share: takes the square root out where the tip is slow at the outer end.
+    """D = scale exp(-y^2), y linear in the fraction: smooth where the tip is slow at the outer end.
 
     The scale is exp(b) times the outer gap; b is the distance in ln D of the turning point that a slow tip would have
     beyond that end, at most 1.
@@ -53,24 +56,24 @@ class Exit(NamedTuple):
     length: Float[Array, "..."]
     sense: float | Float[Array, ""]
 
-    def at(self, share: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Return the gap, and the path |dD| per share."""
-        y = self.start_y + self.sense * (self.length * share)
+    def at(self, fraction: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Return the gap in nm, and the path |dD| per fraction of the way."""
+        y = self.start_y + self.sense * (self.length * fraction)
         gap = self.scale_nm * jnp.exp(-y * y)
         return gap, 2.0 * self.length * y * gap
 
 
 class Turning(NamedTuple):
-    """ln D from start to end as sin^2(pi share/2): takes the square roots out of the speed at both ends."""
+    """ln D from start to end as sin^2(pi fraction/2): smooth where the tip turns round at either end."""
 
     start_nm: Float[Array, "..."]
     end_nm: Float[Array, "..."]
 
-    def at(self, share: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Return the gap, and the path |dD| per share."""
+    def at(self, fraction: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
+        """Return the gap in nm, and the path |dD| per fraction of the way."""
         width = jnp.log(self.end_nm / self.start_nm)
-        gap = self.start_nm * jnp.exp(width * jnp.sin(0.5 * jnp.pi * share) ** 2)
-        return gap, jnp.abs(width) * 0.5 * jnp.pi * jnp.sin(jnp.pi * share) * gap
+        gap = self.start_nm * jnp.exp(width * jnp.sin(0.5 * jnp.pi * fraction) ** 2)
+        return gap, jnp.abs(width) * 0.5 * jnp.pi * jnp.sin(jnp.pi * fraction) * gap
 
 
 class Passage(NamedTuple):
@@ -85,11 +88,11 @@ class Passage(NamedTuple):
 
 
 class Along(NamedTuple):
-    """Places along a way."""
+    """What does not depend on the speed, at points of a way."""
 
     gap_nm: Float[Array, "..."]
     path_nm: Float[Array, "..."]
-    """Per share of the way."""
+    """|dD| per fraction of the way."""
     drag: Float[Array, "..."]
     """Path times damping."""
     available_aj: Float[Array, "..."]
@@ -108,7 +111,7 @@ class Way(NamedTuple):
     end_potential_aj: Float[Array, "..."]
     course: Exit | Turning
     slowest_aj: Float[Array, "..."] | None = None
-    """Kinetic energies below count as this much; None: a tip without any has stopped, and nothing goes on."""
+    """Floor of the kinetic energy, which keeps the integrand finite; None: a tip stops where it has none."""
 
     @property
     def inward(self) -> bool | Bool[Array, ""]:
@@ -120,16 +123,21 @@ class Way(NamedTuple):
         """Whether nothing is spent along the way."""
         return self.tip.drive is None and self.tip.bridge.conserves
 
-    def along(self, share: Float[Array, "..."]) -> Along:
-        """Return the places at shares of the way."""
-        gap, path = self.course.at(share)
+    def along(self, fraction: Float[Array, "..."]) -> Along:
+        """Return gap, path, drag and energy at fractions of the way."""
+        gap, path = self.course.at(fraction)
         drag = jnp.zeros_like(path) if self.tip.bridge.conserves else path * self.tip.bridge.damping(gap)
         return Along(gap, path, drag, self.total_aj - self.tip.potential(gap))
 
-    def pace(
+    def speed_and_time_slope(
         self, path: Float[Array, "..."], kinetic: Float[Array, "..."]
     ) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Return the speed, and the time per share; both 0 where the tip is stopped."""
+        """Return the speed in nm/us, and the time in us per fraction; both 0 where the tip has stopped.
+
+        Args:
+            path: |dD| per fraction.
+            kinetic: kinetic energy in aJ.
+        """
         twice_inverse_mass = 2.0 * self.tip.inverse_mass
         if self.slowest_aj is not None:
             speed = jnp.sqrt(twice_inverse_mass * jnp.maximum(kinetic, self.slowest_aj))
@@ -139,7 +147,7 @@ class Way(NamedTuple):
         return jnp.where(moving, speed, 0.0), jnp.where(moving, path / speed, 0.0)
 
     def spending(self, at: Along, speed: Float[Array, "..."], lasted_us: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return the kinetic energy spent per share, at times since the start."""
+        """Return the kinetic energy in aJ spent per fraction, at times in us since the start."""
         drive, lost = self.tip.drive, at.drag * speed
         if drive is None:
             return lost
@@ -149,7 +157,7 @@ class Way(NamedTuple):
     def end(
         self, spent: Float[Array, "..."], time: Float[Array, "..."], dissipated: Float[Array, "..."] | None = None
     ) -> Passage:
-        """Return the passage that spends so much and takes so long; what is spent is dissipated, if not said."""
+        """Return the passage from the energy spent, the time, and the energy dissipated; None: all that is spent."""
         return Passage(self.total_aj - self.end_potential_aj - spent, time, spent if dissipated is None else dissipated)
 
 
@@ -168,31 +176,22 @@ def way_through(
         tip: the tip.
         gaps_nm: the outer and the inner gap, whatever the direction.
         start_energy_aj: kinetic energy at the start.
-        margin: b, how far beyond the outer end the speed would vanish, in ln D.
+        margin: b, how far beyond the outer end the speed would vanish, in ln D (`margin_of`).
         inward: whether the tip goes from the outer to the inner gap.
         begin_us: time at the start.
     """
     potentials = tuple(tip.potential(gap) for gap in gaps_nm)
     start, end = _either(potentials, potentials[::-1], inward=inward)
-    total, course = start_energy_aj + start, exit_course(gaps_nm, margin, inward=inward)
-    return Way(tip, course.sense, jnp.asarray(begin_us, total.dtype), total, end, course)
-
-
-def exit_course(
-    gaps_nm: tuple[Float[Array, "..."], Float[Array, "..."]],
-    margin: Float[Array, "..."],
-    *,
-    inward: bool | Bool[Array, ""],
-) -> Exit:
-    """Return the gaps along a way; arguments as of `way_through`."""
+    total = start_energy_aj + start
     outer, inner = gaps_nm
     at_outer, at_inner = jnp.sqrt(margin), jnp.sqrt(margin + jnp.log(outer / inner))
     start_y, sense = _either(at_outer, at_inner, inward=inward), _either(1.0, -1.0, inward=inward)
-    return Exit(outer * jnp.exp(margin), start_y, at_inner - at_outer, sense)
+    course = Exit(outer * jnp.exp(margin), start_y, at_inner - at_outer, sense)
+    return Way(tip, sense, jnp.asarray(begin_us, total.dtype), total, end, course)
 
 
 def _either(one: Any, other: Any, *, inward: bool | Bool[Array, ""]) -> Any:
-    """Return what belongs to a direction, which a program may know only when it runs."""
+    """Return the one for a tip that goes in, the other for one that goes out; a loop's program knows it at run time."""
     if not isinstance(inward, jax.Array):
         return one if inward else other
     return jax.tree.map(lambda a, b: jnp.where(inward, a, b), one, other)
@@ -204,58 +203,60 @@ def margin_of(energy: Float[Array, "..."], pull: Float[Array, "..."]) -> Float[A
     return jnp.where(near, jnp.maximum(energy, _NEAREST * pull) / jnp.where(near, pull, 1.0), 1.0)
 
 
-class Swept(NamedTuple):
-    """A way by sweeps: its end, and what it is at the Gauss nodes; of these what nobody reads is not computed."""
+class Collocation(NamedTuple):
+    """A way by Picard's iterations: its end, and values at the Gauss nodes."""
 
     passage: Passage
     at: Along
     kinetic_aj: Float[Array, "nodes ..."]
     speed: Float[Array, "nodes ..."]
-    pace: Float[Array, "nodes ..."]
-    """Time per share."""
+    time_slope: Float[Array, "nodes ..."]
+    """Time in us per fraction."""
     lasted_us: Float[Array, "nodes ..."]
     """Time from the start."""
     change_aj: Float[Array, "nodes ..."]
-    """Of what is spent, in the last sweep."""
+    """By how much the last iteration has changed the energy spent at the nodes."""
     end_change_aj: Float[Array, "..."]
-    """The same at the end."""
+    """By how much the last iteration has changed the energy spent at the end."""
 
 
-def sweep(way: Way, nodes: int, sweeps: int) -> Swept:
-    """Return a way from the values at Gauss nodes, improved in sweeps.
+def collocate(way: Way, nodes: int, iterations: int) -> Collocation:
+    """Return a way by collocation at Gauss nodes.
+
+    Each iteration takes the speeds from the energy spent, the times from the speeds, and the energy spent from both.
 
     Args:
         way: the way.
         nodes: number of Gauss nodes.
-        sweeps: how often what is spent is recomputed from the speeds that it leaves.
+        iterations: how many.
     """
     points, weights, cumulative = nodes_along(nodes, way.total_aj)
     at, drive = way.along(points), way.tip.drive
 
     def again(_, state):
         spent, _, _ = state
-        speed, pace = way.pace(at.path_nm, at.available_aj - spent)
-        spending = way.spending(at, speed, jnp.tensordot(cumulative, pace, axes=1))
+        speed, time_slope = way.speed_and_time_slope(at.path_nm, at.available_aj - spent)
+        spending = way.spending(at, speed, jnp.tensordot(cumulative, time_slope, axes=1))
         return jnp.tensordot(cumulative, spending, axes=1), spent, spending
 
     guess = jnp.zeros_like(at.available_aj)
     if drive is not None:
-        # a push that stays as it is
+        # of a push that does not change on the way
         start_nm = way.course.at(jnp.zeros_like(way.total_aj))[0]
         guess = guess - way.tip.mass_ng * drive.push(way.begin_us) * (at.gap_nm - start_nm)
-    spent, before, spending = _repeated(again, (guess, guess, guess), 0 if way.quiet else sweeps)
+    spent, before, spending = _repeated(again, (guess, guess, guess), 0 if way.quiet else iterations)
     kinetic = at.available_aj - spent
-    speed, pace = way.pace(at.path_nm, kinetic)
+    speed, time_slope = way.speed_and_time_slope(at.path_nm, kinetic)
     lost = at.drag * speed
-    ends = [jnp.tensordot(weights, part, axes=1) for part in (lost, pace, spending)]
-    return Swept(
-        # the push at the nodes costs more than another sweep's digits of the end are worth
+    ends = [jnp.tensordot(weights, part, axes=1) for part in (lost, time_slope, spending)]
+    return Collocation(
+        # the push at the nodes costs more than another iteration's digits of the end are worth
         passage=way.end(ends[0], ends[1]) if drive is None else way.end(ends[2], ends[1], ends[0]),
         at=at,
         kinetic_aj=kinetic,
         speed=speed,
-        pace=pace,
-        lasted_us=jnp.tensordot(cumulative, pace, axes=1),
+        time_slope=time_slope,
+        lasted_us=jnp.tensordot(cumulative, time_slope, axes=1),
         change_aj=jnp.abs(spent - before),
         end_change_aj=jnp.abs(ends[0] - ends[2]),
     )
@@ -269,16 +270,16 @@ def _repeated(step: Callable[[Any, Any], Any], state: Any, count: int) -> Any:
     return state
 
 
-def pass_by_collocation(way: Way, nodes: int, sweeps: int) -> Passage:
-    """Return the passage by sweeps over Gauss nodes; where nothing is spent, by one quadrature of the time."""
+def pass_by_collocation(way: Way, nodes: int, iterations: int) -> Passage:
+    """Return the passage by collocation; where nothing is spent, by one quadrature of the time."""
     if not way.quiet:
-        return sweep(way, nodes, sweeps).passage
+        return collocate(way, nodes, iterations).passage
     points, weights, _ = gauss_nodes(nodes)
 
     # the nodes in a loop of one small body
     def add(total, node):
         at = way.along(node[0])
-        return total + node[1] * way.pace(at.path_nm, at.available_aj)[1], None
+        return total + node[1] * way.speed_and_time_slope(at.path_nm, at.available_aj)[1], None
 
     nothing = jnp.zeros_like(way.total_aj)
     pairs = jnp.asarray(np.stack([points, weights], axis=1), nothing.dtype)
@@ -297,9 +298,9 @@ def pass_in_steps(way: Way, steps: int, solver: str = "Dopri8") -> Passage:
 
     # the kind of scan that can be differentiated both ways
     chosen = getattr(diffrax, solver)(scan_kind="bounded")
-    term = diffrax.ODETerm(lambda share, state, _: way_rates(way, share, state))
+    term = diffrax.ODETerm(lambda fraction, state, _: way_rates(way, fraction, state))
 
-    # The share of the way is the time of the solver, one for all tips: a batch is an axis of the state, which costs
+    # The fraction of the way is the time of the solver, one for all tips: a batch is an axis of the state, which costs
     # less than a batch of solvers.
     def step(carried, ends):
         state, memory = carried
@@ -321,16 +322,16 @@ def nothing_spent(way: Way) -> tuple[Float[Array, "..."], ...]:
     return (jnp.zeros_like(way.total_aj),) * (2 if way.tip.drive is None else 3)
 
 
-def way_rates(way: Way, share: Any, state: tuple[Float[Array, "..."], ...]) -> tuple[Float[Array, "..."], ...]:
-    """Return the rates per share of a state of kinetic energy spent, time, and (of a driven tip) energy dissipated."""
-    at = way.along(share)
-    speed, pace = way.pace(at.path_nm, at.available_aj - state[0])
+def way_rates(way: Way, fraction: Any, state: tuple[Float[Array, "..."], ...]) -> tuple[Float[Array, "..."], ...]:
+    """Return the rates per fraction of the state: energy spent, time, and for a driven tip energy dissipated."""
+    at = way.along(fraction)
+    speed, time_slope = way.speed_and_time_slope(at.path_nm, at.available_aj - state[0])
     spending = way.spending(at, speed, state[1])
-    return (spending, pace) if way.tip.drive is None else (spending, pace, at.drag * speed)
+    return (spending, time_slope) if way.tip.drive is None else (spending, time_slope, at.drag * speed)
 
 
 def pass_bridge(way: Way, setting: Setting) -> Passage:
-    """Return the passage by the integrator of a setting; none where the solids meet where the contact begins."""
+    """Return the passage by the integrator of a setting; of no length where the solids meet where contact begins."""
     if not way.tip.bridge.spans:
         nothing = jnp.zeros_like(way.total_aj)
         return way.end(nothing, nothing)
@@ -338,7 +339,7 @@ def pass_bridge(way: Way, setting: Setting) -> Passage:
     if way.quiet:
         return pass_by_collocation(way, max(size, setting.junction_nodes), 0)
     if setting.rule == "collocation":
-        return pass_by_collocation(way, size, setting.sweeps)
+        return pass_by_collocation(way, size, setting.iterations)
     return pass_in_steps(way, size, setting.solver)
 
 
@@ -381,10 +382,10 @@ def _cross(
 ) -> Leg:
     slowest = _SLOWEST * 0.5 * driven.mass_ng * state.gap_rate**2
     way = driven_way(driven, gaps, state, inward=inward)._replace(slowest_aj=slowest)
-    swept = sweep(way, nodes, setting.sweeps)
-    end = swept.passage
+    collocation = collocate(way, nodes, setting.iterations)
+    end = collocation.passage
     leaving = jnp.sqrt(2.0 * driven.inverse_mass * end.energy_aj)
-    holds = settled(swept.change_aj / swept.kinetic_aj, swept.pace, end.time_us, setting)
+    holds = setting.suffices(collocation.change_aj / collocation.kinetic_aj, collocation.time_slope, end.time_us)
     return Leg(
         state=ContactState(
             x=(gaps[1] if inward else gaps[0]) + jnp.zeros_like(leaving),
@@ -393,7 +394,7 @@ def _cross(
             viscous_loss_aj=state.viscous_loss_aj + end.dissipated_aj,
         ),
         deepest_gap_nm=gaps[1] + jnp.zeros_like(leaving),
-        holds=holds & jnp.all(swept.kinetic_aj > slowest, axis=0) & (leaving > 0.0),
+        holds=holds & jnp.all(collocation.kinetic_aj > slowest, axis=0) & (leaving > 0.0),
     )
 
 
@@ -412,7 +413,7 @@ class Turn(NamedTuple):
     time_us: Float[Array, "..."]
     """From the formation of the bridge to its breaking."""
     settled: Bool[Array, "..."]
-    """Whether the sweeps for the dissipated energy settled."""
+    """Whether the iterations for the dissipated energy settled."""
 
 
 def turn_in_bridge(
@@ -461,7 +462,7 @@ def turn_in_bridge(
 def _to_or_from(
     tip: Driven, gaps: tuple[Float[Array, "..."], Float[Array, "..."]], level: Float[Array, "..."]
 ) -> tuple[Passage, Bool[Array, "..."]]:
-    """Return the passage between two gaps one of which is the turning point, and whether its sweeps settled.
+    """Return the passage between two gaps one of which is the turning point, and whether its iterations settled.
 
     Args:
         tip: a free tip.
@@ -469,9 +470,9 @@ def _to_or_from(
         level: its energy at the start, kinetic and potential.
     """
     way = Way(tip, 1.0, jnp.zeros_like(level), level, tip.potential(gaps[1]), Turning(*gaps))
-    swept = sweep(way, _TURN_NODES, _TURN_SWEEPS)
-    lost = swept.passage.dissipated_aj
-    return swept.passage, swept.end_change_aj <= 1e-9 * (jnp.abs(level) + jnp.abs(lost)) + 1e-12
+    collocation = collocate(way, _TURN_NODES, _TURN_ITERATIONS)
+    lost = collocation.passage.dissipated_aj
+    return collocation.passage, collocation.end_change_aj <= 1e-9 * (jnp.abs(level) + jnp.abs(lost)) + 1e-12
 
 
 def _turning_gap(tip: Driven, level: Float[Array, "..."]) -> tuple[Float[Array, "..."], Bool[Array, "..."]]:

@@ -1,8 +1,9 @@
 """Collisions of free tips with a sample at rest: rebound speed, delay and losses for an approach speed (section IV).
 
-One collision is `collision`: the approach through the bridge, the junction, and the retraction, each from the kinetic
-energy that the one before leaves. `collide` takes batches of speeds and contacts, in few steps and again in many for
-the few tips that need it; `capture_speed` is the root of the energy at the end; `collisions` makes a table of them.
+One collision is `three_parts`: the approach through the bridge, the junction, and the retraction, each from the kinetic
+energy that the one before leaves; `collision` says how it ends. `collide` takes batches of speeds and contacts, in few
+steps and again in many for the few tips that need it; `capture_speed` is the root of the energy at the end;
+`collisions` makes a table of them.
 """
 
 import math
@@ -22,7 +23,6 @@ from afm_jax.checks import (
     check_parameter,
     check_scalar,
     checked,
-    is_traced,
     refuse_float32,
     require_float64,
 )
@@ -30,7 +30,6 @@ from afm_jax.contact.bridge_leg import (
     Passage,
     Turn,
     Way,
-    exit_course,
     margin_of,
     pass_bridge,
     pass_by_collocation,
@@ -39,21 +38,22 @@ from afm_jax.contact.bridge_leg import (
 )
 from afm_jax.contact.contact import Contact, bridge_of
 from afm_jax.contact.driven import Driven, free_tip
-from afm_jax.contact.junction import Junction, explain_missing_junction, find_junction
+from afm_jax.contact.junction import Junction, find_junction, require_junction
 from afm_jax.contact.junction_leg import JunctionWay, pass_through_junction
 from afm_jax.contact.settings import CAREFUL, Setting, setting_of
 from afm_jax.outcomes import CollisionOutcome
 from afm_jax.results import ResultTuple, public_result
 from afm_jax.solve.derivatives import by_tangents, implicit_root
-from afm_jax.solve.lanes import LANES, again_for_the_open, filled, rows_in_blocks
+from afm_jax.solve.lanes import LANES, again_for_the_open, filled, for_each_lane, rows_in_blocks
 
 _CAPTURE_POINTS = 64
 _CAPTURE_ROUNDS = 9
 _MOST_SPENT = {"steps": 0.2, "collocation": 0.05}
-"""Share of the energy that dissipation may take where few steps, or few sweeps, are enough."""
+"""Fraction of the energy that dissipation may take where few steps, or few iterations, are enough."""
 _NEAR_CAPTURE = (-0.02, 0.2)
 """Energy at the end, of that at the start, between which a tip is close to capture: below 1.1 times that speed."""
-
+_TRIAL_MARGIN = 1e-3
+"""Margin of a first pass of the retraction, which tells how fast the tip is at its end."""
 
 ONLY_FREE = ("rebound_speed_nm_per_us", "collision_delay_us", "time_in_contact_us", "time_in_junction_us")
 # a captured tip stops before it has lost all of that
@@ -144,101 +144,9 @@ def collide(
     contact, mass = jax.tree.map(lambda leaf: leaf.ravel() if leaf.ndim else leaf, (contact, mass))
     small = speeds.size <= LANES
     result = by_tangents(_tips, contact, mass, speeds.ravel(), small=small, setting=setting)
-    _complain(contact, result)
-    return jax.tree.map(lambda part: part.reshape(speeds.shape), result)
-
-
-def collide_in_blocks(
-    contact: Contact,
-    speeds: Float[np.ndarray, " n"],
-    mass_ng: float = 1.0,
-    *,
-    accuracy: float = 1e-9,
-    method: str = "diffrax",
-) -> dict[str, np.ndarray]:
-    """Return the fields of `Collision` of many speeds, filled up to whole blocks so that one program serves all.
-
-    Raises:
-        ValueError: as `collide`.
-    """
-    whole = filled(speeds, LANES * -(-len(speeds) // LANES))
-    found = collide(contact, whole, mass_ng, accuracy=accuracy, method=method)
-    return {name: np.asarray(part)[: len(speeds)] for name, part in found._asdict().items()}
-
-
-def batch_of(contact: Contact, mass_ng: ArrayLike, speeds: Float[Array, " tips"], setting: Setting) -> Collision:
-    """Return a batch by one setting, without a second look at what its few steps do not resolve: for measurements."""
-    return _quick(contact, jnp.asarray(mass_ng, speeds.dtype), speeds, setting)[0]
-
-
-def _tips(contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, " tips"], setting: Setting) -> Collision:
-    quick, resolved, place = _quick(contact, mass, speeds, setting)
-    return again_for_the_open(_careful, resolved, ((contact, place), mass, speeds), quick)
-
-
-def _complain(contact: Contact, result: Collision) -> None:
-    """Raise for a single contact that has no junction at all."""
-    if is_traced(result.outcome) or any(leaf.ndim for leaf in jax.tree.leaves(contact)):
-        return
-    if np.any(np.asarray(result.outcome) == CollisionOutcome.NO_JUNCTION):
-        raise ValueError(f"the contact has no junction: {explain_missing_junction(contact)}")
-
-
-@partial(jax.jit, static_argnames="setting")
-def _quick(
-    contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."], setting: Setting
-) -> tuple[Collision, Bool[Array, "..."], Junction]:
-    """Return the collisions of a batch in few steps, which of them these resolve, and the contacts' junctions."""
-    leaves = jax.tree.leaves(contact)
-    shared = None if any(leaf.ndim for leaf in leaves) else find_junction(contact)
-
-    def block(parameters, speed):
-        contact, mass = parameters
-        junction = _junctions(contact) if shared is None else shared
-        result, resolved = collision(contact, junction, speed, mass, setting)
-        return result, resolved, junction if shared is None else None
-
-    result, resolved, junctions = rows_in_blocks(block, (contact, mass), speeds)
-    return result, resolved, junctions if shared is None else shared
-
-
-@jax.jit
-def _careful(contact: tuple[Contact, Junction], mass: Float[Array, "..."], speeds: Float[Array, "..."]) -> Collision:
-    """Return the collisions of a batch in many steps, turning points in the bridge included."""
-
-    def block(parameters, speed):
-        (contact, junction), mass = parameters
-        return collision(contact, junction, speed, mass, CAREFUL)[0]
-
-    return rows_in_blocks(block, (contact, mass), speeds)
-
-
-def _axes(tree: Any) -> Any:
-    """Return the axes of `vmap` for parameters that are numbers or have one value a tip."""
-    return jax.tree.map(lambda leaf: 0 if leaf.ndim else None, tree)
-
-
-def _junctions(contact: Contact) -> Junction:
-    """Return the junction of a contact, or of each of many."""
     if not any(leaf.ndim for leaf in jax.tree.leaves(contact)):
-        return find_junction(contact)
-    return jax.vmap(find_junction, in_axes=(_axes(contact),))(contact)
-
-
-def _turns(contact: Contact, place: Junction, mass: Array, speeds: Array, spent: Array) -> Turn:
-    return jax.vmap(turn_in_bridge, in_axes=(_axes(contact), _axes(place), 0, _axes(mass), 0))(
-        contact, place, speeds, mass, spent
-    )
-
-
-def _judged(found: Collision, speed: Array, exists: Array, valid: Array, finite: Array) -> Collision:
-    """Return a collision with its outcome, and with zeros where there is none."""
-    outcome = jnp.where(finite, found.outcome, CollisionOutcome.UNRESOLVED)
-    outcome = jnp.where(exists, outcome, CollisionOutcome.NO_JUNCTION)
-    outcome = jnp.where(valid, outcome, CollisionOutcome.INVALID_START).astype(jnp.int32)
-    good = outcome <= CollisionOutcome.CAPTURED_BY_JUNCTION
-    cleared = jax.tree.map(lambda part: jnp.where(good, part, jnp.zeros_like(part)), found)
-    return cleared._replace(approach_speed_nm_per_us=speed, outcome=outcome)
+        require_junction(contact, result.outcome != CollisionOutcome.NO_JUNCTION)
+    return jax.tree.map(lambda part: part.reshape(speeds.shape), result)
 
 
 def collision(
@@ -250,86 +158,211 @@ def collision(
 ) -> tuple[Collision, Bool[Array, "..."]]:
     """Return the collision of a free tip, and whether the setting resolves it.
 
-    The tip approaches through the bridge, passes the junction, and retracts through the bridge; each part begins with
-    the kinetic energy that the one before leaves (`go_through`). A careful setting also follows tips that the bridge
-    turns round before the junction forms.
+    The tip approaches through the bridge, passes the junction, and retracts through the bridge (`three_parts`). A
+    careful setting also follows tips that the bridge turns round before the junction forms.
 
     Args:
         contact: the contact.
-        junction: its junction.
+        junction: of the contact.
         approach_speed: in nm/us; speeds that are not positive and finite have an outcome that says so.
         mass: in ng.
         setting: how finely.
     """
     valid = (approach_speed > 0.0) & jnp.isfinite(approach_speed)
     speed = jnp.where(valid, approach_speed, 1.0)
-    ways = go_through(contact, junction, speed, mass, setting)
-    result = collision_of(contact, junction, speed, mass, ways)
+    parts = three_parts(contact, junction, speed, mass, setting)
+    result = collision_of(contact, junction, speed, mass, parts)
     finite = jnp.ones_like(valid)
     if setting.careful and contact.spans:
-        turn = _turns(contact, junction, mass, speed, ways.approach.dissipated_aj)
-        turns = turn.turns & (ways.approach.energy_aj <= 0.0)
-        turned = collision_of_turn(contact, junction, speed, mass, turn)
+        turn = for_each_lane(turn_in_bridge, contact, junction, speed, mass, parts.approach.dissipated_aj)
+        turns = turn.turns & (parts.approach.energy_aj <= 0.0)
+        turned = _collision_of_turn(contact, junction, speed, mass, turn)
         result = jax.tree.map(lambda a, b: jnp.where(turns, a, b), turned, result)
         finite = turn.settled | ~turns
     if setting.careful:
         finite = finite & jnp.isfinite(result.end_energy_aj) & jnp.isfinite(result.viscous_loss_aj)
-    resolved = ways.resolved | ~valid | ~junction.exists
-    return _judged(result, approach_speed, junction.exists, valid, finite), resolved
+    outcome = jnp.where(finite, result.outcome, CollisionOutcome.UNRESOLVED)
+    outcome = jnp.where(junction.exists, outcome, CollisionOutcome.NO_JUNCTION)
+    outcome = jnp.where(valid, outcome, CollisionOutcome.INVALID_START).astype(jnp.int32)
+    # what has no result holds zeros
+    ends = outcome <= CollisionOutcome.CAPTURED_BY_JUNCTION
+    result = jax.tree.map(lambda part: jnp.where(ends, part, jnp.zeros_like(part)), result)
+    resolved = parts.resolved | ~valid | ~junction.exists
+    return result._replace(approach_speed_nm_per_us=approach_speed, outcome=outcome), resolved
 
 
-class Ways(NamedTuple):
-    """The three parts of a collision that forms the junction: through the bridge, the junction, the bridge again."""
+class Parts(NamedTuple):
+    """The three parts of a collision that forms the junction."""
 
     approach: Passage
     junction: JunctionWay
     retract: Passage
     outer_gap_nm: Float[Array, "..."]
-    """Gap at which contact ends."""
+    """Gap at which contact ends: where the bridge breaks, or the junction if that lasts longer."""
     resolved: Bool[Array, "..."]
     """Whether the setting's few steps are enough."""
 
 
-def go_through(
+def three_parts(
     contact: Contact,
     junction: Junction,
     approach_speed: Float[Array, "..."],
     mass: Float[Array, "..."],
     setting: Setting,
     crossing: Callable[[Way], Passage] | None = None,
-) -> Ways:
-    """Return the three parts of one collision, each from the energy that the one before leaves.
+) -> Parts:
+    """Return approach, junction and retraction of one tip, each from the kinetic energy that the one before leaves.
 
-    `crossing`, if not None, replaces the setting's way of crossing the bridge.
+    Args:
+        contact: the contact.
+        junction: of the contact.
+        approach_speed: in nm/us, positive.
+        mass: in ng.
+        setting: how finely.
+        crossing: integrates a way through the bridge in place of the setting's integrator; None: the setting's.
     """
-    cross = crossing or (lambda way: pass_bridge(way, setting))
     tip = free_tip(contact, junction, mass)
-    forms, breaks = contact.bridge_forms_nm, junction.breaks_gap_nm
+    breaks = junction.breaks_gap_nm
     outer = jnp.maximum(contact.bridge_breaks_nm, breaks)
-    pull_in, pull_out = (-tip.bridge.force(gap) * gap for gap in (forms, outer))
-
+    gaps_in, gaps_out = (contact.bridge_forms_nm, junction.forms_gap_nm), (outer, breaks)
+    # aJ: what the bridge's pull at an outer gap does along such a gap; tells how slow a tip is there (`margin_of`)
+    pull_in, pull_out = (-tip.bridge.force(gap) * gap for gap, _ in (gaps_in, gaps_out))
     start = 0.5 * mass * approach_speed * approach_speed
-    crossings = _Crossings((forms, junction.forms_gap_nm), (outer, breaks), pull_in, pull_out)
-    if setting.careful and crossing is None and not tip.bridge.conserves:
-        approach, solid, retract = _in_a_loop(tip, start, crossings, setting)
-    else:
-        approach, solid, retract = _one_by_one(tip, start, crossings, setting, cross)
 
-    # at an end that pulls, a slow tip's drag must be small against the pull for the substitution to hold
+    if setting.careful and crossing is None and not tip.bridge.conserves:
+        approach, solid, retract = _parts_in_a_loop(tip, start, (gaps_in, gaps_out), (pull_in, pull_out), setting)
+    else:
+        cross = crossing or partial(pass_bridge, setting=setting)
+        approach = cross(way_through(tip, gaps_in, start, margin_of(start, pull_in), inward=True))
+        solid = pass_through_junction(tip, approach.energy_aj, setting.junction_nodes)
+        trial = way_through(tip, gaps_out, solid.energy_aj, jnp.full_like(start, _TRIAL_MARGIN), inward=False)
+        end = trial.total_aj - trial.end_potential_aj if trial.quiet else pass_by_collocation(trial, 6, 1).energy_aj
+        retract = cross(way_through(tip, gaps_out, solid.energy_aj, margin_of(end, pull_out), inward=False))
+
+    # at an end that pulls, a slow tip's drag must be small against the pull for the substitution of the gap to hold
     calm_in, calm_out = (
         (pull <= 0.0) | (tip.bridge.damping(gap) * gap * jnp.sqrt(2.0 * jnp.maximum(pull, 0.0) / mass) <= 0.1 * pull)
-        for gap, pull in ((forms, pull_in), (outer, pull_out))
+        for (gap, _), pull in ((gaps_in, pull_in), (gaps_out, pull_out))
     )
     # Few steps are enough where dissipation is small against the energies along the way and no repulsion almost stops
     # the tip inside the bridge.
-    reach = jnp.minimum(start + jnp.maximum(pull_in, 0.0), approach.energy_aj)
+    least = jnp.minimum(start + jnp.maximum(pull_in, 0.0), approach.energy_aj)
     spent = _MOST_SPENT[setting.rule]
-    easy_in = (approach.dissipated_aj < spent * reach) & (approach.energy_aj > 0.1 * start) & calm_in
+    easy_in = (approach.dissipated_aj < spent * least) & (approach.energy_aj > 0.1 * start) & calm_in
     easy_out = (retract.dissipated_aj < spent * solid.energy_aj) & calm_out
     # what is left of the energy at the end has the error of all of it: close to capture that is many times its own
     energy_left = jnp.where(solid.energy_aj > 0.0, retract.energy_aj, solid.energy_aj)
     clear = (energy_left > _NEAR_CAPTURE[1] * start) | (energy_left < _NEAR_CAPTURE[0] * start)
-    return Ways(approach, solid, retract, outer, easy_in & clear & (easy_out | (solid.energy_aj <= 0.0)))
+    return Parts(approach, solid, retract, outer, easy_in & clear & (easy_out | (solid.energy_aj <= 0.0)))
+
+
+_Pair = tuple[Any, Any]
+"""Of the way in and the way out."""
+
+
+def _parts_in_a_loop(
+    tip: Driven, start: Float[Array, "..."], gaps_nm: _Pair, pulls_aj: _Pair, setting: Setting
+) -> tuple[Passage, JunctionWay, Passage]:
+    """Return approach, junction and retraction by one program in a loop, since three copies of it compile for long.
+
+    The three rounds are: the approach; the retraction for its energy at the end; the retraction.
+    """
+
+    def leg(before, number):
+        formed_aj, end_aj = before
+        goes_in, first_out = number == 0, number == 1
+        solid = pass_through_junction(tip, formed_aj, setting.junction_nodes)
+        gaps, pull = jax.tree.map(lambda a, b: jnp.where(goes_in, a, b), *zip(gaps_nm, pulls_aj, strict=True))
+        margin = jnp.where(first_out, _TRIAL_MARGIN, margin_of(end_aj, pull))
+        energy = jnp.where(goes_in, start, solid.energy_aj)
+        passage = pass_bridge(way_through(tip, gaps, energy, margin, inward=goes_in), setting)
+        return (jnp.where(goes_in, passage.energy_aj, formed_aj), passage.energy_aj), (passage, solid)
+
+    _, (passages, solids) = lax.scan(leg, (start, start), jnp.arange(3))
+    approach, solid, retract = (
+        jax.tree.map(lambda part, k=k: part[k], parts) for parts, k in ((passages, 0), (solids, 2), (passages, 2))
+    )
+    return approach, solid, retract
+
+
+def collision_of(
+    contact: Contact, junction: Junction, approach_speed: Float[Array, "..."], mass: Float[Array, "..."], parts: Parts
+) -> Collision:
+    """Return the collision that three parts make, for a tip that forms the junction."""
+    approach, solid, retract = parts[:3]
+    reached, broke = approach.energy_aj > 0.0, solid.energy_aj > 0.0
+    leaves = reached & broke & (retract.energy_aj > 0.0)
+    lacking = jnp.minimum(retract.energy_aj, jnp.minimum(solid.energy_aj, approach.energy_aj))
+    captured = jnp.where(reached & ~broke, CollisionOutcome.CAPTURED_BY_JUNCTION, CollisionOutcome.CAPTURED_BY_BRIDGE)
+    return _collision(
+        approach_speed,
+        mass,
+        leaves,
+        energy_aj=jnp.where(leaves, retract.energy_aj, lacking),
+        time_us=approach.time_us + solid.time_us + retract.time_us,
+        gaps_nm=(contact.bridge_forms_nm, parts.outer_gap_nm),
+        outcome=jnp.where(leaves, CollisionOutcome.REBOUND, captured),
+        time_in_junction_us=jnp.where(leaves, solid.time_us, 0.0),
+        deepest_gap_nm=solid.deepest_gap_nm,
+        bridge_hysteresis_aj=junction.bridge_hysteresis_aj,
+        junction_hysteresis_aj=junction.junction_hysteresis_aj,
+        viscous_loss_aj=approach.dissipated_aj + retract.dissipated_aj,
+    )
+
+
+def _collision_of_turn(
+    contact: Contact, junction: Junction, approach_speed: Float[Array, "..."], mass: Float[Array, "..."], turn: Turn
+) -> Collision:
+    """Return the collision of a tip that turns in the bridge."""
+    leaves = turn.energy_aj > 0.0
+    return _collision(
+        approach_speed,
+        mass,
+        leaves,
+        energy_aj=turn.energy_aj,
+        time_us=turn.time_us,
+        gaps_nm=(contact.bridge_forms_nm, contact.bridge_breaks_nm),
+        outcome=jnp.where(leaves, CollisionOutcome.TURNED_IN_BRIDGE, CollisionOutcome.CAPTURED_BY_BRIDGE),
+        time_in_junction_us=jnp.zeros_like(turn.time_us),
+        deepest_gap_nm=turn.gap_nm,
+        bridge_hysteresis_aj=junction.bridge_hysteresis_aj,
+        junction_hysteresis_aj=jnp.zeros_like(junction.junction_hysteresis_aj),
+        viscous_loss_aj=turn.dissipated_aj,
+    )
+
+
+def _collision(
+    approach_speed: Array,
+    mass: Array,
+    leaves: Array,
+    *,
+    energy_aj: Array,
+    time_us: Array,
+    gaps_nm: _Pair,
+    **others: Any,
+) -> Collision:
+    """Return a collision with rebound speed and delay, from its energy at the end and its duration.
+
+    Args:
+        approach_speed: in nm/us.
+        mass: in ng.
+        leaves: whether the tip leaves.
+        energy_aj: kinetic energy at the end.
+        time_us: from the beginning of the contact to its end.
+        gaps_nm: where it begins and where it ends.
+        others: the other fields.
+    """
+    rebound = jnp.where(leaves, jnp.sqrt(2.0 * jnp.where(leaves, energy_aj, 1.0) / mass), 0.0)
+    straight = gaps_nm[0] / approach_speed + gaps_nm[1] / jnp.where(leaves, rebound, 1.0)
+    return Collision(
+        approach_speed_nm_per_us=approach_speed,
+        rebound_speed_nm_per_us=rebound,
+        collision_delay_us=jnp.where(leaves, time_us - straight, 0.0),
+        captured=~leaves,
+        time_in_contact_us=jnp.where(leaves, time_us, 0.0),
+        end_energy_aj=energy_aj,
+        **others,
+    )
 
 
 @checked
@@ -352,8 +385,7 @@ def capture_speed(contact: Contact, mass_ng: ArrayLike = 1.0) -> Float[Array, ""
     check_parameter("mass_ng", mass_ng, "positive")
     check_scalar("mass_ng", mass_ng)
     speed, exists = _capture_speed(contact, as_parameter(mass_ng))
-    if not is_traced(exists) and not bool(exists):
-        raise ValueError(f"the contact has no junction: {explain_missing_junction(contact)}")
+    require_junction(contact, exists)
     return speed
 
 
@@ -390,120 +422,69 @@ def _end_energy(
 ) -> Float[Array, ""]:
     """Return the kinetic energy left where the tip has least on its way out, in aJ; negative by what is missing."""
     contact, junction, mass = model
-    ways = go_through(contact, junction, approach_speed, mass, CAREFUL)
-    through = jnp.minimum(ways.junction.energy_aj, ways.retract.energy_aj)
+    parts = three_parts(contact, junction, approach_speed, mass, CAREFUL)
+    through = jnp.minimum(parts.junction.energy_aj, parts.retract.energy_aj)
     if not contact.spans:
         return through
-    turn = turn_in_bridge(contact, junction, approach_speed, mass, ways.approach.dissipated_aj)
-    return jnp.where(turn.turns & (ways.approach.energy_aj <= 0.0), turn.energy_aj, through)
+    turn = turn_in_bridge(contact, junction, approach_speed, mass, parts.approach.dissipated_aj)
+    return jnp.where(turn.turns & (parts.approach.energy_aj <= 0.0), turn.energy_aj, through)
 
 
-class _Crossings(NamedTuple):
-    """Where the bridge is crossed in and out: outer and inner gap in nm; pull times gap at the outer one."""
+def collide_in_blocks(
+    contact: Contact,
+    speeds: Float[np.ndarray, " n"],
+    mass_ng: float = 1.0,
+    *,
+    accuracy: float = 1e-9,
+    method: str = "diffrax",
+) -> dict[str, np.ndarray]:
+    """Return the fields of `Collision` of many speeds, filled up to whole blocks so that one program serves all.
 
-    gaps_in: tuple[Float[Array, "..."], Float[Array, "..."]]
-    gaps_out: tuple[Float[Array, "..."], Float[Array, "..."]]
-    pull_in: Float[Array, "..."]
-    pull_out: Float[Array, "..."]
-
-
-_Parts = tuple[Passage, JunctionWay, Passage]
-_TRIAL_MARGIN = 1e-3
-"""Margin of a first pass of the retraction, which tells how fast the tip is at its end."""
-
-
-def _one_by_one(
-    tip: Driven, start: Float[Array, "..."], at: _Crossings, setting: Setting, cross: Callable[[Way], Passage]
-) -> _Parts:
-    """Return approach, junction and retraction, after a short first pass of the retraction."""
-    approach = cross(way_through(tip, at.gaps_in, start, margin_of(start, at.pull_in), inward=True))
-    solid = pass_through_junction(tip, approach.energy_aj, setting.junction_nodes)
-
-    trial = way_through(tip, at.gaps_out, solid.energy_aj, jnp.full_like(start, _TRIAL_MARGIN), inward=False)
-    end = trial.total_aj - trial.end_potential_aj if trial.quiet else pass_by_collocation(trial, 6, 1).energy_aj
-    course = exit_course(at.gaps_out, margin_of(end, at.pull_out), inward=False)
-    return approach, solid, cross(trial._replace(course=course))
-
-
-def _in_a_loop(tip: Driven, start: Float[Array, "..."], at: _Crossings, setting: Setting) -> _Parts:
-    """Return approach, junction and retraction from one program in a loop, for each copy takes long to compile.
-
-    The first pass of the retraction has as many steps as the retraction itself.
+    Raises:
+        ValueError: as `collide`.
     """
-
-    def leg(before, number):
-        came_in, last = before
-        goes_in, first_out = number == 0, number == 1
-        solid = pass_through_junction(tip, came_in, setting.junction_nodes)
-        gaps = jax.tree.map(lambda a, b: jnp.where(goes_in, a, b), at.gaps_in, at.gaps_out)
-        margin = jnp.where(first_out, _TRIAL_MARGIN, margin_of(last, jnp.where(goes_in, at.pull_in, at.pull_out)))
-        energy = jnp.where(goes_in, start, solid.energy_aj)
-        passage = pass_bridge(way_through(tip, gaps, energy, margin, inward=goes_in), setting)
-        return (jnp.where(goes_in, passage.energy_aj, came_in), passage.energy_aj), (passage, solid)
-
-    _, (passages, solids) = lax.scan(leg, (start, start), jnp.arange(3))
-    approach, retract = (jax.tree.map(lambda part, k=k: part[k], passages) for k in (0, 2))
-    return approach, jax.tree.map(lambda part: part[2], solids), retract
+    whole = filled(speeds, LANES * -(-len(speeds) // LANES))
+    result = collide(contact, whole, mass_ng, accuracy=accuracy, method=method)
+    return {name: np.asarray(part)[: len(speeds)] for name, part in result._asdict().items()}
 
 
-def collision_of(
-    contact: Contact, junction: Junction, approach_speed: Float[Array, "..."], mass: Float[Array, "..."], ways: Ways
-) -> Collision:
-    """Return the collision that three ways make, for a tip that forms the junction."""
-    energy = ways.retract.energy_aj
-    reached = ways.approach.energy_aj > 0.0
-    broke = ways.junction.energy_aj > 0.0
-    free = reached & broke & (energy > 0.0)
-    square = 2.0 * jnp.where(free, energy, 1.0) / mass
-    rebound = jnp.where(free, jnp.sqrt(square), 0.0)
-    contact_time = ways.approach.time_us + ways.junction.time_us + ways.retract.time_us
-    outside = contact.bridge_forms_nm / approach_speed + ways.outer_gap_nm / jnp.where(free, rebound, 1.0)
-    outcome = jnp.where(
-        free,
-        CollisionOutcome.REBOUND,
-        jnp.where(reached & ~broke, CollisionOutcome.CAPTURED_BY_JUNCTION, CollisionOutcome.CAPTURED_BY_BRIDGE),
-    )
-    return Collision(
-        approach_speed_nm_per_us=approach_speed,
-        rebound_speed_nm_per_us=rebound,
-        collision_delay_us=jnp.where(free, contact_time - outside, 0.0),
-        captured=~free,
-        outcome=outcome.astype(jnp.int32),
-        time_in_contact_us=jnp.where(free, contact_time, 0.0),
-        time_in_junction_us=jnp.where(free, ways.junction.time_us, 0.0),
-        deepest_gap_nm=ways.junction.deepest_gap_nm,
-        bridge_hysteresis_aj=junction.bridge_hysteresis_aj,
-        junction_hysteresis_aj=junction.junction_hysteresis_aj,
-        viscous_loss_aj=ways.approach.dissipated_aj + ways.retract.dissipated_aj,
-        end_energy_aj=jnp.where(
-            free, energy, jnp.minimum(energy, jnp.minimum(ways.junction.energy_aj, ways.approach.energy_aj))
-        ),
-    )
+def batch_of(contact: Contact, mass_ng: ArrayLike, speeds: Float[Array, " tips"], setting: Setting) -> Collision:
+    """Return a batch by one setting, without a second look at what its few steps do not resolve: for measurements."""
+    return _quick(contact, jnp.asarray(mass_ng, speeds.dtype), speeds, setting)[0]
 
 
-def collision_of_turn(
-    contact: Contact, junction: Junction, approach_speed: Float[Array, "..."], mass: Float[Array, "..."], turn: Turn
-) -> Collision:
-    """Return the collision of a tip that turns in the bridge."""
-    free = turn.energy_aj > 0.0
-    rebound = jnp.where(free, jnp.sqrt(2.0 * jnp.where(free, turn.energy_aj, 1.0) / mass), 0.0)
-    outside = contact.bridge_forms_nm / approach_speed + contact.bridge_breaks_nm / jnp.where(free, rebound, 1.0)
-    outcome = jnp.where(free, CollisionOutcome.TURNED_IN_BRIDGE, CollisionOutcome.CAPTURED_BY_BRIDGE)
-    forces = contact.forces
-    return Collision(
-        approach_speed_nm_per_us=approach_speed,
-        rebound_speed_nm_per_us=rebound,
-        collision_delay_us=jnp.where(free, turn.time_us - outside, 0.0),
-        captured=~free,
-        outcome=outcome.astype(jnp.int32),
-        time_in_contact_us=jnp.where(free, turn.time_us, 0.0),
-        time_in_junction_us=jnp.zeros_like(rebound),
-        deepest_gap_nm=turn.gap_nm,
-        bridge_hysteresis_aj=forces.potential(contact.bridge_breaks_nm) - forces.potential(contact.bridge_forms_nm),
-        junction_hysteresis_aj=jnp.zeros_like(junction.junction_hysteresis_aj),
-        viscous_loss_aj=turn.dissipated_aj,
-        end_energy_aj=turn.energy_aj,
-    )
+def _tips(contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, " tips"], setting: Setting) -> Collision:
+    """Return the collisions of a batch: in few steps, and those that these do not resolve again in many."""
+    quick, resolved, junction = _quick(contact, mass, speeds, setting)
+    return again_for_the_open(_careful, resolved, ((contact, junction), mass, speeds), quick)
+
+
+@partial(jax.jit, static_argnames="setting")
+def _quick(
+    contact: Contact, mass: Float[Array, "..."], speeds: Float[Array, "..."], setting: Setting
+) -> tuple[Collision, Bool[Array, "..."], Junction]:
+    """Return the collisions of a batch in few steps, which of them these resolve, and the junction or junctions."""
+    if any(leaf.ndim for leaf in jax.tree.leaves(contact)):
+        junction = rows_in_blocks(lambda some, _: for_each_lane(find_junction, some), contact, speeds)
+    else:
+        junction = find_junction(contact)
+    return *_in_blocks((contact, junction), mass, speeds, setting), junction
+
+
+@jax.jit
+def _careful(contact: tuple[Contact, Junction], mass: Float[Array, "..."], speeds: Float[Array, "..."]) -> Collision:
+    """Return the collisions of a batch in many steps, turning points in the bridge included."""
+    return _in_blocks(contact, mass, speeds, CAREFUL)[0]
+
+
+def _in_blocks(
+    contact: tuple[Contact, Junction], mass: Float[Array, "..."], speeds: Float[Array, "..."], setting: Setting
+) -> tuple[Collision, Bool[Array, "..."]]:
+    def block(parameters, speed):
+        (contact, junction), mass = parameters
+        return collision(contact, junction, speed, mass, setting)
+
+    return rows_in_blocks(block, (contact, mass), speeds)
 
 
 _POINTS = 20

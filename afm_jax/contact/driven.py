@@ -35,6 +35,16 @@ class ContactState(NamedTuple):
     """Energy that the dissipative forces have taken since the contact began."""
 
 
+class Leg(NamedTuple):
+    """A leg of the quick way through a driven contact: bridge or junction as a whole; arrays of the tips' shape."""
+
+    state: ContactState
+    """Where it ends."""
+    deepest_gap_nm: Float[Array, "..."]
+    holds: Bool[Array, "..."]
+    """Whether the tip goes straight on and the leg's nodes and iterations are enough."""
+
+
 class Drive(NamedTuple):
     """What acts on the gap beside the contact: spring, air, and the motion of the surface."""
 

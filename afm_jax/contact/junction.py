@@ -16,10 +16,11 @@ import math
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from afm_jax.checks import as_argument, checked
+from afm_jax.checks import as_argument, checked, is_traced
 from afm_jax.contact.contact import Bridge, Contact, bridge_of
 from afm_jax.contact.forces import jkr
 from afm_jax.contact.forces.dry import Hertz
@@ -192,6 +193,16 @@ def _meniscus_fits(contact: Contact) -> Bool[Array, "..."]:
         if liquid is not None:
             fits = fits & (liquid.kelvin_radius_nm < getattr(term, "tip_radius_nm", jnp.inf))
     return fits
+
+
+def require_junction(contact: Contact, exists: Bool[Array, "..."]) -> None:
+    """Raise where a contact of numbers has no junction; whether it has one may be traced, and is then not looked at.
+
+    Raises:
+        ValueError: says why there is none.
+    """
+    if not is_traced(exists) and not np.all(np.asarray(exists)):
+        raise ValueError(f"the contact has no junction: {explain_missing_junction(contact)}")
 
 
 def explain_missing_junction(contact: Contact) -> str:

@@ -3,7 +3,7 @@
 In s = sqrt(A) the JKR potential is a polynomial and the fold, where the contact breaks, is smooth. With s = turn - y^2,
 w^2 = y^2 (unit mean(work') + 2 scale mean(depth') g), where mean(f') is the mean slope from s to the turning point and
 g the mean over that depth of what accelerates the gap beside the contact: drive, spring and air. Both square roots at
-the turning point are thereby gone. The means of g, which varies little, are improved in sweeps.
+the turning point are thereby gone. The means of g, which varies little, are improved in iterations.
 
 For a free tip g = 0 and the junction conserves energy: the turning point is a root of the polynomial, and the times are
 quadratures. A free tip that hardly gets away is slow at the fold; from there s = s_fold + sigma sinh(q).
@@ -15,10 +15,10 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
-from afm_jax.contact.driven import ContactState, Driven
+from afm_jax.contact.driven import ContactState, Driven, Leg
 from afm_jax.contact.forces.force import ElasticCurve
-from afm_jax.contact.leg import Leg, mean_matrix, nodes_along, settled
 from afm_jax.contact.settings import QuickSetting
+from afm_jax.solve.quadrature import mean_matrix, nodes_along
 
 _TURNS = 6
 """Steps of Newton's method to the turning point under a pull."""
@@ -64,15 +64,17 @@ def pass_through_junction(tip: Driven, energy_aj: Float[Array, "..."], nodes: in
     # both ways go from the inner root to the turning point; one that forms at the fold passes the rest both ways, too
     inner, rests = (0.5 * turn, 2.0) if solid.reversible else (form, 1.0)
     at = _Half(tip, inner).along(turn, points)
-    inside = _sums(weights, at.pace, tip.gap_of_root(at.s), at.y * at.over_y)
+    inside = _sums(weights, at.time_slope, tip.gap_of_root(at.s), at.y * at.over_y)
     outside = _to_fold(tip, inner, jnp.maximum(leaving, 0.0) / unit, nodes)
     time, gap, action = (2.0 * one + rests * other for one, other in zip(inside, outside, strict=True))
     return JunctionWay(leaving, time, tip.gap_of_root(turn), gap, action)
 
 
-def _sums(weights: Array, pace: Array, gap: Array, speed: Array) -> tuple[Array, Array, Array]:
+def _sums(weights: Array, time_slope: Array, gap: Array, speed: Array) -> tuple[Array, Array, Array]:
     """Return the integrals over time of 1, of the gap and of the squared speed."""
-    time, below, action = (jnp.tensordot(weights, pace * part, axes=1) for part in (jnp.ones_like(pace), gap, speed**2))
+    time, below, action = (
+        jnp.tensordot(weights, time_slope * part, axes=1) for part in (jnp.ones_like(time_slope), gap, speed**2)
+    )
     return time, below, action
 
 
@@ -105,14 +107,14 @@ def stretch_in_junction(
     """
     points, weights, cumulative = nodes_along(nodes, turn)
     # both ends may be turning points: sin^2 takes the square roots out
-    share, bend = jnp.sin(0.5 * jnp.pi * points) ** 2, 0.5 * jnp.pi * jnp.sin(jnp.pi * points)
-    s = turn - (turn - end) * share
+    fraction, bend = jnp.sin(0.5 * jnp.pi * points) ** 2, 0.5 * jnp.pi * jnp.sin(jnp.pi * points)
+    s = turn - (turn - end) * fraction
     missing = level - tip.solid.work(s)
     moving = missing > 0.0
     speed = _speed_scale(tip) * jnp.sqrt(jnp.where(moving, missing, 1.0))
     path = tip.depth_scale_nm * (turn - end) * bend * tip.solid.depth_slope(s)
-    pace = jnp.where(moving, path / speed, 0.0)
-    return Stretch(cumulative @ pace, tip.gap_of_root(s), jnp.where(moving, speed, 0.0), weights @ pace)
+    time_slope = jnp.where(moving, path / speed, 0.0)
+    return Stretch(cumulative @ time_slope, tip.gap_of_root(s), jnp.where(moving, speed, 0.0), weights @ time_slope)
 
 
 def go_through_junction(driven: Driven, state: ContactState, setting: QuickSetting) -> Leg:
@@ -125,10 +127,10 @@ def go_through_junction(driven: Driven, state: ContactState, setting: QuickSetti
     others = driven.acceleration(driven.gap_of_root(form), state.gap_rate, state.time_us, jnp.zeros_like(turn))
     for _ in range(2):
         turn = _turn_under(driven, form, level, others, turn)
-    inward = _swept(_Half(driven, form, pressing=True), level, state.time_us, (turn, others), setting)
+    inward = _iterated(_Half(driven, form, pressing=True), level, state.time_us, (turn, others), setting)
     turn, at_turn = inward.turn, inward.time_us
     others = driven.acceleration(driven.gap_of_root(turn), jnp.zeros_like(turn), at_turn, jnp.zeros_like(turn))
-    outward = _swept(_Half(driven, fold, pressing=False), level, at_turn, (turn, others), setting)
+    outward = _iterated(_Half(driven, fold, pressing=False), level, at_turn, (turn, others), setting)
     work, depth = (of(turn) - of(fold) for of in (solid.work, solid.depth))
     leaving = jnp.sqrt(_unit(driven) * work + 2.0 * driven.depth_scale_nm * outward.mean * depth)
     return Leg(
@@ -179,8 +181,8 @@ class _Along(NamedTuple):
     """The speed over y."""
     slope: Array
     """Of the depth."""
-    pace: Array
-    """Time per share of the half."""
+    time_slope: Array
+    """Time in us per fraction of the half."""
 
 
 class _Half(NamedTuple):
@@ -208,8 +210,8 @@ class _Half(NamedTuple):
         return _Along(s, y, over_y, slope, twice * reach * slope / over_y)
 
 
-class _Swept(NamedTuple):
-    """A half of the way through the junction, swept."""
+class _IteratedHalf(NamedTuple):
+    """A half of the way through the junction under a drive."""
 
     turn: Float[Array, "..."]
     time_us: Float[Array, "..."]
@@ -218,7 +220,9 @@ class _Swept(NamedTuple):
     holds: Bool[Array, "..."]
 
 
-def _swept(half: _Half, level: Array, begin_us: Array, guess: tuple[Array, Array], setting: QuickSetting) -> _Swept:
+def _iterated(
+    half: _Half, level: Array, begin_us: Array, guess: tuple[Array, Array], setting: QuickSetting
+) -> _IteratedHalf:
     """Return a half under a drive.
 
     Args:
@@ -226,7 +230,7 @@ def _swept(half: _Half, level: Array, begin_us: Array, guess: tuple[Array, Array
         level: the energy in the unit of the normalised work where the junction forms.
         begin_us: time at the start.
         guess: s at the turning point, to be improved on the way to it, and the mean of g.
-        setting: numbers of nodes and sweeps, and what is allowed.
+        setting: numbers of nodes and iterations, and what is allowed.
     """
     driven, twice = half.driven, 2.0 * half.driven.depth_scale_nm
     nodes = setting.pressing if half.pressing else setting.releasing
@@ -239,10 +243,10 @@ def _swept(half: _Half, level: Array, begin_us: Array, guess: tuple[Array, Array
 
     passing = weights - cumulative if half.pressing else cumulative
 
-    def sweep(_, swept):
-        turn, means, _, _ = swept
+    def improve(_, state):
+        turn, means, _, _ = state
         at = half.along(turn, points, means)
-        moment = begin_us + jnp.tensordot(passing, at.pace, axes=1)
+        moment = begin_us + jnp.tensordot(passing, at.time_slope, axes=1)
         rate = -at.y * at.over_y if half.pressing else at.y * at.over_y
         others = driven.acceleration(driven.gap_of_root(at.s), rate, moment, jnp.zeros_like(rate))
         # in the mean over the depth every node counts by its slope
@@ -252,11 +256,11 @@ def _swept(half: _Half, level: Array, begin_us: Array, guess: tuple[Array, Array
         return after, total[:-1] / mean_depth_slope(turn, at.s), means, mean
 
     begin = mean + jnp.zeros_like(points)
-    turn, means, before, mean = lax.fori_loop(0, setting.junction_sweeps, sweep, (turn, begin, begin, mean))
+    turn, means, before, mean = lax.fori_loop(0, setting.junction_iterations, improve, (turn, begin, begin, mean))
     at = half.along(turn, points, means)
-    duration = jnp.tensordot(weights, at.pace, axes=1)
+    duration = jnp.tensordot(weights, at.time_slope, axes=1)
     change = jnp.abs((means - before) * twice * mean_depth_slope(turn, at.s)) / at.over_y**2
-    return _Swept(turn, begin_us + duration, mean, settled(change, at.pace, duration, setting))
+    return _IteratedHalf(turn, begin_us + duration, mean, setting.suffices(change, at.time_slope, duration))
 
 
 def _turn_under(driven: Driven, form: Array, level: Array, mean: Array, turn: Array) -> Array:
@@ -283,6 +287,6 @@ def _to_fold(
         kinetic = kinetic - pulled / solid.energy_scale_aj
     moving = kinetic > 0.0
     rate = jnp.sqrt(jnp.where(moving, kinetic, 1.0))
-    pace = jnp.where(moving, solid.depth_slope(s) * 0.5 * width * (grown + 1.0 / grown) / rate, 0.0)
+    time_slope = jnp.where(moving, solid.depth_slope(s) * 0.5 * width * (grown + 1.0 / grown) / rate, 0.0)
     scale = _speed_scale(tip)
-    return _sums(weights, reach * pace * (tip.depth_scale_nm / scale), tip.gap_of_root(s), scale * rate)
+    return _sums(weights, reach * time_slope * (tip.depth_scale_nm / scale), tip.gap_of_root(s), scale * rate)

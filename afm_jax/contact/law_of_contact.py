@@ -65,10 +65,10 @@ SPEED_ERROR, DELAY_ERROR_US = 1e-7, 1e-6
 
 
 class _Rule(NamedTuple):
-    """Gauss nodes and sweeps of a way through the bridge, and Gauss nodes of the junction."""
+    """Gauss nodes and iterations of a way through the bridge, and Gauss nodes of the junction."""
 
     nodes: int
-    sweeps: int
+    iterations: int
     junction: int
 
 
@@ -543,14 +543,14 @@ def _traced_back(
     forms, breaks = contact.bridge_forms_nm, junction.breaks_gap_nm
     outer = jnp.maximum(contact.bridge_breaks_nm, breaks)
     margin = margin_of(left, bridge.force(outer) * -outer)
-    out = pass_by_collocation(way_through(tip, (outer, breaks), left, margin, inward=True), rule.nodes, rule.sweeps)
+    out = pass_by_collocation(way_through(tip, (outer, breaks), left, margin, inward=True), rule.nodes, rule.iterations)
     elastic = solid.energy_scale_aj * (solid.work(solid.fold) - solid.work(junction.forms_root))
     formed = out.energy_aj + elastic
     inside = pass_through_junction(tip, formed, rule.junction)
     came = formed + bridge.potential(junction.forms_gap_nm) - bridge.potential(forms)
     margin = margin_of(jnp.maximum(came, 0.0), bridge.force(forms) * -forms)
     back = pass_by_collocation(
-        way_through(tip, (forms, junction.forms_gap_nm), formed, margin, inward=False), rule.nodes, rule.sweeps
+        way_through(tip, (forms, junction.forms_gap_nm), formed, margin, inward=False), rule.nodes, rule.iterations
     )
     approach = jnp.sqrt(2.0 * jnp.maximum(back.energy_aj, 1e-12) / mass)
     return TracedBack(approach, out.time_us + inside.time_us + back.time_us)

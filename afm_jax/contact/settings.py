@@ -1,4 +1,4 @@
-"""How many nodes, sweeps and steps a wanted accuracy of a contact needs: of free collisions and of driven contacts.
+"""How many nodes, iterations and steps a wanted accuracy of a contact needs: of free collisions and of driven contacts.
 
 Measured by `afm-jax accuracy collide` and `afm-jax bench --only scenes`.
 """
@@ -6,8 +6,13 @@ Measured by `afm-jax accuracy collide` and `afm-jax bench --only scenes`.
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from afm_jax.solve.quadrature import series_tail
+
 METHODS = ("collocation", "diffrax")
-"""How contacts are integrated: by sweeps over Gauss nodes, or in Runge-Kutta steps with Diffrax's coefficients.
+"""How contacts are integrated: by Picard's iterations over Gauss nodes, or in Runge-Kutta steps of Diffrax.
 
 Free collisions take the steps in the gap; driven contacts, which may turn anywhere, take them in time.
 """
@@ -16,16 +21,16 @@ Free collisions take the steps in the gap; driven contacts, which may turn anywh
 class Setting(NamedTuple):
     """The numbers of steps and nodes of one collision; hashable, for it shapes the program.
 
-    `rule` is "steps" (a Diffrax solver with fixed steps) or "collocation" (`sweeps` Picard sweeps at `inward` and
-    `outward` Gauss nodes). Without dissipation both are one quadrature. `careful`: the short first pass of the way out
-    takes as many steps as the way itself.
+    `rule` is "steps" (a Diffrax solver with fixed steps) or "collocation" (so many of Picard's `iterations` at `inward`
+    and `outward` Gauss nodes). Without dissipation both are one quadrature. `careful`: the short first pass of the way
+    out takes as many steps as the way itself, and turning points in the bridge are looked for.
     """
 
     rule: str
     inward: int
     outward: int
     junction_nodes: int
-    sweeps: int = 0
+    iterations: int = 0
     solver: str = "Dopri8"
     careful: bool = False
 
@@ -38,9 +43,9 @@ SETTINGS = {
         1e-11: Setting("steps", 7, 8, 16),
     },
     "collocation": {
-        1e-6: Setting("collocation", 6, 6, 8, sweeps=2),
-        1e-9: Setting("collocation", 10, 10, 12, sweeps=3),
-        1e-11: Setting("collocation", 13, 13, 16, sweeps=5),
+        1e-6: Setting("collocation", 6, 6, 8, iterations=2),
+        1e-9: Setting("collocation", 10, 10, 12, iterations=3),
+        1e-11: Setting("collocation", 13, 13, 16, iterations=5),
     },
 }
 """For each method the settings of free collisions by the accuracy that they reach.
@@ -69,9 +74,10 @@ class QuickSetting(NamedTuple):
     """How finely the quick way through a driven contact is resolved; hashable, for it shapes the program.
 
     Every leg of the way has its number of Gauss nodes: `inward` through the bridge, `pressing` to the turning point of
-    the junction, `releasing` from there to the fold, `outward` through the bridge. Each is computed in so many sweeps.
-    Contacts whose last sweep still changes a kinetic energy by more than `tolerance` (relative), or whose last Legendre
-    coefficients are more than `tail` (relative, of the durations), go the careful way in time.
+    the junction, `releasing` from there to the fold, `outward` through the bridge. Legs of the bridge take
+    `iterations`, those of the junction `junction_iterations`. Contacts whose last iteration still changes a kinetic
+    energy by more than `tolerance` (relative), or whose last Legendre coefficients are more than `tail` (relative, of
+    the durations), go the careful way in time.
     """
 
     inward: int
@@ -79,9 +85,22 @@ class QuickSetting(NamedTuple):
     releasing: int
     outward: int
     tolerance: float
-    sweeps: int = 10
-    junction_sweeps: int = 6
+    iterations: int = 10
+    junction_iterations: int = 6
     tail: float = 0.1
+
+    def suffices(
+        self, change: Float[Array, "nodes ..."], pace: Float[Array, "nodes ..."], duration_us: Float[Array, "..."]
+    ) -> Bool[Array, "..."]:
+        """Say whether the iterations of a leg have settled, and its nodes are enough for the series of its pace.
+
+        Args:
+            change: relative change of the kinetic energies in the last iteration.
+            pace: time per fraction of the leg, at the nodes.
+            duration_us: of the leg.
+        """
+        settled = jnp.max(change, axis=0) < self.tolerance
+        return settled & (series_tail(pace) < self.tail * duration_us) & jnp.isfinite(duration_us)
 
 
 class DrivenSetting(NamedTuple):

@@ -14,17 +14,17 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from afm_jax.checks import as_parameter, check_parameter, check_scalar, checked, refuse_float32
-from afm_jax.contact.bridge_leg import Way, margin_of, sweep, way_through
+from afm_jax.contact.bridge_leg import Way, collocate, margin_of, way_through
 from afm_jax.contact.contact import Contact
 from afm_jax.contact.driven import Driven, free_tip
-from afm_jax.contact.junction import Junction, Phase, explain_missing_junction, find_junction, force_in_phase
+from afm_jax.contact.junction import Junction, Phase, find_junction, force_in_phase, require_junction
 from afm_jax.contact.junction_leg import stretch_in_junction, turning_root
 from afm_jax.results import ResultTuple, public_result
 
 _NODES = 64
-_SWEEPS = 12
-_FLIGHT_SHARE = 0.5
-"""Free flight shown before and after contact, as a share of the gap at which the bridge breaks."""
+_ITERATIONS = 12
+_FLIGHT = 0.5
+"""Free flight shown before and after contact, as a fraction of the gap at which the bridge breaks."""
 
 
 @public_result(phase=Phase)
@@ -76,8 +76,7 @@ def time_course(contact: Contact, approach_speed_nm_per_us: ArrayLike, mass_ng: 
     check_parameter("mass_ng", mass_ng, "positive")
     speed, mass = as_parameter(approach_speed_nm_per_us), as_parameter(mass_ng)
     junction, legs, energies = _course(contact, speed, mass)
-    if not bool(junction.exists):
-        raise ValueError(f"the contact has no junction: {explain_missing_junction(contact)}")
+    require_junction(contact, junction.exists)
     return _joined(
         contact, junction, float(speed), [jax.tree.map(np.asarray, leg) for leg in legs], np.asarray(energies)
     )
@@ -132,9 +131,11 @@ def _crossing(way: Way) -> tuple[_Leg, Float[Array, ""]]:
     if not way.tip.bridge.spans:
         nothing = jnp.zeros(_NODES)
         return _Leg(nothing, nothing, nothing, jnp.zeros(())), way.total_aj - way.end_potential_aj
-    swept = sweep(way, _NODES, _SWEEPS)
-    end = swept.passage
-    return _Leg(swept.lasted_us, swept.at.gap_nm, -way.sense * swept.speed, end.time_us), end.energy_aj
+    collocation = collocate(way, _NODES, _ITERATIONS)
+    end = collocation.passage
+    return _Leg(
+        collocation.lasted_us, collocation.at.gap_nm, -way.sense * collocation.speed, end.time_us
+    ), end.energy_aj
 
 
 def _junction_legs(tip: Driven, level: Float[Array, ""]) -> tuple[_Leg, _Leg]:
@@ -161,7 +162,7 @@ def _joined(
     forms, breaks = float(contact.bridge_forms_nm), max(float(contact.bridge_breaks_nm), float(junction.breaks_gap_nm))
     if not energies[0] > 0.0:
         raise ValueError("the bridge turns the tip round before the junction forms; take a higher speed")
-    flight = _FLIGHT_SHARE * breaks
+    flight = _FLIGHT * breaks
     parts = [(Phase.DRY, np.array([-flight / speed, 0.0]), np.array([forms + flight, forms]), np.full(2, -speed))]
     begin = 0.0
     _, off, rebound = energies

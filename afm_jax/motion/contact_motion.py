@@ -20,10 +20,9 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from afm_jax.contact.bridge_leg import go_in, go_out
-from afm_jax.contact.driven import ContactState, Driven
+from afm_jax.contact.driven import ContactState, Driven, Leg
 from afm_jax.contact.junction import Phase
 from afm_jax.contact.junction_leg import go_through_junction
-from afm_jax.contact.leg import Leg
 from afm_jax.contact.settings import DrivenSetting, QuickSetting
 from afm_jax.contact.step import TipInContact, advance, inverse_junction_step
 from afm_jax.impact.first_impact import Flight, first_impact

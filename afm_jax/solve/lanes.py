@@ -118,6 +118,18 @@ def rows_in_blocks(work: Callable[[Any, Any], Any], parameters: Any, rows: Any) 
     )
 
 
+def for_each_lane(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Return the results of a function of one lane, lane by lane.
+
+    Args:
+        function: written for numbers.
+        arguments: trees of numbers for all lanes, and of arrays with a value a lane; without such an array there is
+            one lane.
+    """
+    axes = jax.tree.map(lambda leaf: 0 if leaf.ndim else None, arguments)
+    return jax.vmap(function, in_axes=axes)(*arguments) if jax.tree.leaves(axes) else function(*arguments)
+
+
 def again_for(
     work: Callable[..., Any], needed: Bool[Array, " lanes"], arguments: tuple[Any, ...], results: Any, *, block: int
 ) -> Any:
